@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Mapping
 
 from .errors import UsageError
+from .files import check_distinct
+
+#: Largest size or count, and largest seed: Dr.Jit and Mitsuba hold them in 32 bits.
+MOST, MOST_NATURAL = 2**31 - 1, 2**32 - 1
 
 
 class Argument:
     """Argument of ``fit`` or ``decode`` that a task adds.
 
     Flags and options are those of ``argparse.ArgumentParser.add_argument``; of the arguments of one ``group``, at most
-    one may be given.
+    one may be given. ``file`` is "read" or "written" for the path of a file (which a command may read, too), lest two
+    arguments name the same file.
     """
 
-    def __init__(self, *flags: str, group: str = "", **options):
-        self.flags, self.group, self.options = flags, group, options
+    def __init__(self, *flags: str, group: str = "", file: str = "", **options):
+        self.flags, self.group, self.file, self.options = flags, group, file, options
 
     @property
     def name(self) -> str:
@@ -53,22 +59,35 @@ def add_arguments(parser: argparse.ArgumentParser, arguments: tuple[Argument, ..
         groups.get(argument.group, parser).add_argument(*argument.flags, **argument.options)
 
 
+def check_files(arguments: tuple[Argument, ...], options: Mapping, outputs: Mapping) -> None:
+    """Refuse ``outputs`` or files of ``arguments`` to write that are another one of them, or a file to read.
+
+    ``options`` are the values of the arguments by name. Raises :class:`~mi_diffind.errors.UsageError`.
+    """
+    files = {use: {a.flags[0]: options[a.name] for a in arguments if a.file == use} for use in ("read", "written")}
+    check_distinct({**outputs, **files["written"]}, files["read"])
+
+
 def positive(text: str) -> int:
-    """Return a whole number ≥ 1. Raises ``ArgumentTypeError``."""
+    """Return a whole number from 1 to :data:`MOST`. Raises ``ArgumentTypeError``."""
     value = natural(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+    if value > MOST:
+        raise argparse.ArgumentTypeError(f"found {text:.40}, allowed are whole numbers up to {MOST:,}")
     return value
 
 
 def natural(text: str) -> int:
-    """Return a whole number ≥ 0. Raises ``ArgumentTypeError``."""
+    """Return a whole number from 0 to :data:`MOST_NATURAL`. Raises ``ArgumentTypeError``."""
     try:
         value = int(text)
     except ValueError:
         value = -1
     if value < 0:
-        raise argparse.ArgumentTypeError(f"{text} is not a whole number ≥ 0")
+        raise argparse.ArgumentTypeError(f"{text:.40} is not a whole number ≥ 0")
+    if value > MOST_NATURAL:
+        raise argparse.ArgumentTypeError(f"found {text:.40}, allowed are whole numbers up to {MOST_NATURAL:,}")
     return value
 
 

@@ -11,8 +11,9 @@ import os
 import sys
 
 from . import __version__
-from .errors import DiffindError
-from .files import writable_file, write_json
+from .commands.common import check_files
+from .errors import DiffindError, reason, shortened
+from .files import shown, writable_file, write_json
 
 #: In the order of the help.
 VERBS = ("render", "capture", "compare", "convert", "regress", "inspect", "tradeoff", "decode", "fit")
@@ -22,7 +23,11 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     argv = sys.argv[1:] if argv is None else argv
     arguments = _parser(argv).parse_args(argv)
+    for stream in (sys.stdout, sys.stderr):  # names of files may hold bytes that are no text
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
     try:
+        check_files(arguments)
         if arguments.json is not None:
             writable_file(arguments.json)
         result = arguments.run(arguments)
@@ -30,14 +35,21 @@ def main(argv: list[str] | None = None) -> int:
             write_json(arguments.json, result)
         return 130 if result.get("interrupted") else 1 if result.get("failed") else 0
     except DiffindError as e:
-        print(f"mi-diffind: error: {e}", file=sys.stderr)
+        print(f"mi-diffind: error: {shortened(str(e))}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("mi-diffind: interrupted", file=sys.stderr)
         return 130
+    except MemoryError:
+        print("mi-diffind: error: the memory of this machine does not suffice", file=sys.stderr)
+        return 2
     except BrokenPipeError:  # the reader of a pipe has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except OSError as e:  # a file that no reader refuses by itself, such as one that may not be read
+        named = f'"{shown(e.filename)}": ' if isinstance(e.filename, (str, os.PathLike)) else ""
+        print(f"mi-diffind: error: {named}{e.strerror or reason(e)}", file=sys.stderr)
+        return 2
 
 
 def _parser(argv: list[str]) -> argparse.ArgumentParser:

@@ -6,19 +6,26 @@ import time
 from collections.abc import Callable
 
 from . import compat
+from .errors import UsageError
 
 #: Least time that a stage is given, in seconds: a stage that comes too late still takes one step.
 LEAST = 1e-3
+
+#: Longest time limit, in seconds: 31 years.
+LONGEST = 10**9
 
 
 class Deadline:
     """Moment at which a command is to be over, ``seconds`` after the deadline was created.
 
     A training takes the time that is left, a stage before another one a part of it. The reserve is the time of what
-    follows the last training, such as the measurement of the result: nobody gets it.
+    follows the last training, such as the measurement of the result: nobody gets it. Raises
+    :class:`~mi_diffind.errors.UsageError` for a time that is not positive or longer than :data:`LONGEST`.
     """
 
     def __init__(self, seconds: float):
+        if not 0 < seconds <= LONGEST:
+            raise UsageError(f"seconds: found {seconds!s:.40}, allowed are more than 0 and at most {LONGEST:,}")
         self.seconds, self.reserve = seconds, 0.0
         self.end = time.perf_counter() + seconds
 

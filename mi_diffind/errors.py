@@ -15,6 +15,15 @@ class UsageError(DiffindError):
     """Bad input that the argument parser cannot detect."""
 
 
+#: Longest message of an error on the command line, in characters.
+LONGEST = 260
+
+
+def shortened(text: str, most: int = LONGEST) -> str:
+    """Return a text of at most ``most`` characters: of a longer one, the beginning and the end."""
+    return text if len(text) <= most else f"{text[: most // 2]}…{text[1 - (most - most // 2) :]}"
+
+
 def reason(error: BaseException, **names: str) -> str:
     """Return the message of ``error`` on one line of at most 100 characters, to be quoted in a sentence.
 

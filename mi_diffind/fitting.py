@@ -22,7 +22,8 @@ from tqdm import tqdm
 
 from . import compat
 from .deadline import duration
-from .files import replacing, writable_file
+from .errors import reason
+from .files import irregular, replacing, shown, writable_file
 from .indirection import aligned_copy, unfolded
 from .interrupt import interruptible
 from .progress import in_terminal, progress_bar
@@ -425,7 +426,8 @@ class _Trainer:
         # A number that changes with the step must not be part of the kernel, or each step would compile anew:
         # the seed is opaque, and Adam makes a learning rate opaque if it is a Python float set parameter by parameter.
         # After a restart others are drawn, lest the same batch ends it again.
-        seed = dr.opaque(self.module.UInt64, (settings.seed << 32) + self.restarts * settings.steps + self.step)
+        drawn = self.restarts * settings.steps + self.step
+        seed = dr.opaque(self.module.UInt64, ((settings.seed << 32) + drawn) % 2**64)
         rng = dr.rng(seed=seed)
         net.update(self.optimizer)
         self.phase = self.problem.begin(self.step, self.share)
@@ -517,7 +519,29 @@ def _is_checkpoint(path) -> bool:
         return False
 
 
+def _check_meta(meta: dict) -> None:
+    """Raise ``KeyError`` or ``TypeError`` unless the numbers and lists of a checkpoint are those of a training."""
+    for key in ("step", "best_step", "restarts"):
+        if type(meta[key]) is not int or not 0 <= meta[key] < 2**63:
+            raise TypeError(f"{key} is {meta[key]!r:.40}")
+    for key in ("lr_scale", "seconds"):
+        if type(meta[key]) not in (int, float) or not 0 <= meta[key] < math.inf:
+            raise TypeError(f"{key} is {meta[key]!r:.40}")
+    figures = [meta["best_measured"], *meta["history"]]
+    if not figures[0] or not all(isinstance(row.get("step", 0), int) for row in figures):
+        raise TypeError("the measurements are not lists of numbers")
+    name = next(iter(figures[0]))
+    values = [v for row in figures for v in row.values() if v is not None] + list(meta["references"].values())
+    factor, best, since = meta["plateau"]
+    if not all(type(v) in (int, float) for v in (*values, factor, since, best or 0)) or any(
+        name not in r for r in figures
+    ):
+        raise TypeError("the measurements are not lists of numbers")
+
+
 def _load_checkpoint(path, settings: dict, trainer: _Trainer) -> tuple[_State, dict]:
+    if fault := irregular(path):
+        raise FittingError(f'the checkpoint "{shown(path)}" {fault}')
     if not os.path.exists(path):
         raise FittingError(f'the checkpoint "{path}" does not exist, there is nothing to resume')
     try:
@@ -530,11 +554,10 @@ def _load_checkpoint(path, settings: dict, trainer: _Trainer) -> tuple[_State, d
             {k: (int(arrays[f"t/{k}"]), arrays[f"m/{k}"], arrays[f"v/{k}"]) for k in keys},
         )  # fmt: skip
         best = {k: arrays[f"best/{k}"] for k in keys}
-        for key in ("best_measured", "best_step", "history", "restarts", "seconds", "plateau", "references"):
-            meta[key]  # a KeyError here, not later
+        _check_meta(meta)
         stored_settings = dict(meta["settings"])
     except Exception as e:  # zipfile, json and numpy each have their own for a damaged file
-        raise FittingError(f'the checkpoint "{path}" is damaged or of another task ({type(e).__name__}: {e})') from None
+        raise FittingError(f'the checkpoint "{path}" is damaged or of another task ({reason(e)})') from None
     sources = [s["source"] for s in (stored_settings, settings) if "source" in s]
     if len(sources) == 2 and sources[0] != sources[1]:
         raise FittingError(f'the checkpoint "{path}" is of another source, or the source has changed since')

@@ -17,7 +17,7 @@ import numpy as np
 
 from . import compat, plugins
 from .errors import DiffindError, UsageError
-from .files import replacing
+from .files import MOST_TEXT, irregular, replacing, shown
 from .measure.operations import bsdf_operations
 from .plugins.support import footprint, omissions
 from .runtime import use_variant
@@ -65,6 +65,8 @@ class ParsedScene:
                 _, self._state = compat.parse(source)
                 self.description = _description(self._state)
                 return
+            if fault := irregular(path, MOST_TEXT):
+                raise RuntimeError(f"{shown(path)}: {fault}")
             if not self.path.is_file():
                 raise RuntimeError(f"{path}: no such scene file")
             if self.path.suffix.lower() == ".npz":

@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 import math
+import numbers
 from dataclasses import dataclass
 
+from .arguments import MOST
+from .arguments import MOST_NATURAL as MOST_SEED
 from .errors import DiffindError
+from .units import check_memory
+
+#: Memory that a step takes for each sample of its batch, in bytes: 4 to 80 were measured.
+SAMPLE_BYTES = 64
 
 SCHEDULES = ("constant", "cosine", "plateau")
 LOSSES = ("mae", "mse")
@@ -39,11 +46,25 @@ class FitSettings:
 
     def __post_init__(self):
         for name, low in (("steps", 1), ("batch", 1), ("measure_every", 1), ("check_every", 1), ("seed", 0)):
-            if getattr(self, name) < low:
-                raise FittingError(f"{name}: found {getattr(self, name)}, at least {low} is needed")
-        if not (math.isfinite(self.lr) and self.lr > 0):
+            value, most = getattr(self, name), MOST_SEED if name == "seed" else MOST
+            if isinstance(value, bool) or not isinstance(value, numbers.Integral):
+                raise FittingError(f"{name}: found {value!r:.40}, a whole number is needed")
+            if value < low:
+                raise FittingError(f"{name}: found {value}, at least {low} is needed")
+            if value > most:
+                raise FittingError(f"{name}: found {value!s:.40}, at most {most:,} is allowed")
+        if not (isinstance(self.lr, numbers.Real) and math.isfinite(self.lr) and self.lr > 0):
             raise FittingError(f"lr: found {self.lr}, a positive number is needed")
         if self.schedule not in SCHEDULES:
             raise FittingError(f'schedule: found "{self.schedule}", allowed are {SCHEDULES}')
         if self.loss not in LOSSES:
             raise FittingError(f'loss: found "{self.loss}", allowed are {LOSSES}')
+
+
+def within_memory(settings: FitSettings) -> FitSettings:
+    """Return the settings. Raises :class:`~mi_diffind.errors.UsageError` if their batch exceeds this machine's memory.
+
+    Dr.Jit ends the process where memory cannot be allocated.
+    """
+    check_memory("batch", settings.batch, SAMPLE_BYTES * settings.batch)
+    return settings

@@ -17,6 +17,8 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from .errors import DiffindError, reason
+from .files import irregular, shown
+from .units import memory
 
 #: Names of properties that every Gaussian of a PLY file has.
 NAMES = (
@@ -80,6 +82,8 @@ def _ply(path: Path) -> tuple[dict[str, np.ndarray], str]:
     """Return the arrays of a PLY file, with logarithms of the scales and quaternions of any length."""
     from trimesh.exchange.ply import load_ply
 
+    if fault := irregular(path, memory() // 4):
+        raise SplatsError(f"{shown(path)}: {fault}")
     try:
         content = path.read_bytes()
         with path.open("rb") as file:
@@ -156,6 +160,8 @@ class _SogFiles:
 
     def __enter__(self) -> _SogFiles:
         if self.path.suffix.lower() == ".sog":
+            if fault := irregular(self.path, memory() // 4):
+                raise SplatsError(f"{shown(self.path)}: {fault}")
             try:
                 self.archive = zipfile.ZipFile(self.path)
             except OSError as e:

@@ -21,7 +21,7 @@ import numpy as np
 
 from .bits import pack_bits, unpack_bits
 from .errors import DiffindError, reason
-from .files import replacing
+from .files import irregular, replacing, shown
 from .indirection import DifferentiableArray
 from .lookup import BORDERS, STORAGES, gathers, pair_words, quantize
 from .pages import SIDE_BITS, PagedArray
@@ -31,6 +31,9 @@ FORMAT_VERSION = 2
 
 #: Largest file content that is accepted, in bytes: a header that claims more is refused before anything is allocated.
 MAX_BYTES = 2**30
+
+#: Longest path of a file in the settings, in characters.
+LONGEST_PATH = 4096
 
 _DTYPES = {"float32": np.dtype("<f4"), "float16": np.dtype("<f2"), "uint8": np.dtype("u1")}
 
@@ -277,6 +280,8 @@ def load_table(path: str | os.PathLike, task: str | None = None, shapes: dict[st
     :data:`MAX_BYTES`.
     """
     path = Path(path)
+    if fault := irregular(path, 2 * MAX_BYTES):
+        raise TableError(f"{shown(path)}: {fault}")
     try:
         with zipfile.ZipFile(path) as archive:
             return _read(archive, path, task, shapes)
@@ -363,6 +368,11 @@ def _read(archive: zipfile.ZipFile, path: Path, task, shapes) -> Table:
         preset, settings, seed, measured = (meta[key] for key in ("preset", "settings", "seed", "measured"))
         if not isinstance(settings, dict) or not isinstance(measured, dict):
             raise TypeError("the settings and the measurements have to be objects")
+        if not all(type(value) in (int, float) for value in measured.values()):
+            raise TypeError("the measurements have to be numbers")
+        for key, value in settings.items():
+            if key.endswith("_path") and not (isinstance(value, str) and 0 < len(value) <= LONGEST_PATH):
+                raise TypeError(f'the setting "{key:.40}" has to be the path of a file')
     except TableError:
         raise
     except (ValueError, TypeError, KeyError, AttributeError) as e:

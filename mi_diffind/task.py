@@ -31,11 +31,11 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from . import discovery
-from .arguments import Argument
+from .arguments import Argument, check_files
 from .compat import module_of
 from .deadline import Deadline
 from .errors import UsageError
-from .settings import FitSettings
+from .settings import FitSettings, within_memory
 from .units import labelled
 
 if TYPE_CHECKING:
@@ -583,14 +583,14 @@ def fit(
             raise UsageError(f'{task}: found the argument "{key}", allowed are {allowed}')
         if key in options:
             options[key] = arguments[key].parsed(value)
-    settings = chosen.settings(preset, {k: v for k, v in given.items() if k in fields}, options)
+    settings = within_memory(chosen.settings(preset, {k: v for k, v in given.items() if k in fields}, options))
     request = FitRequest(preset, settings, None, storage or next(iter(chosen.storages), ""), options)
     request.deadline, request.seconds = deadline, None if deadline is None else deadline.seconds
     request.checkpoint, request.resume, request.progress = checkpoint, resume, progress
-    request.output = None if output is None else chosen.output_path(output)
+    request.output, request.task = None if output is None else chosen.output_path(output), task
+    check_files(chosen.arguments, options, {"-o": request.output, "--checkpoint": checkpoint})
     if resume and seconds is not None:
         raise UsageError("--resume needs the --steps of the run that it goes on with: leave out --seconds")
-    request.task = task
     chosen.check(request)
     request.types = array_module(variant)
     fitted = chosen.fit(request)

@@ -224,7 +224,7 @@ def views_of_splats(request: FitRequest) -> Path:
 def _render(camera: CaptureCamera, splits: dict, folder: Path, split: str, i: int) -> bool:
     """Render a view, write it, and return whether it is opaque everywhere."""
     settings = camera.settings
-    image = camera.render(splits[split][i], (settings.seed << 16) + 2 * i + (split == "test"))
+    image = camera.render(splits[split][i], ((settings.seed << 16) + 2 * i + (split == "test")) % 2**32)
     _write(folder / _name(split, i, settings), image)
     return bool((image[..., 3] > 0.999).all())
 

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 
 from .. import runtime
 from ..arguments import define, natural, positive
 from ..errors import UsageError
+from ..files import check_distinct, irregular, shown
 
 
-def verb(commands, name: str, run, help: str, example: str) -> argparse.ArgumentParser:
+def verb(
+    commands, name: str, run, help: str, example: str, reads: tuple[str, ...] = (), writes: tuple[str, ...] = ()
+) -> argparse.ArgumentParser:
     """Add a verb to ``commands`` and return its parser; ``--json`` writes what ``run(arguments)`` returns.
 
-    The help ends in the ``example``.
+    The help ends in the ``example``. ``reads`` and ``writes`` name the arguments that are paths of files.
     """
     sub = commands.add_parser(name, help=help, description=help, epilog=f"example: {example}")
-    sub.set_defaults(run=run)
+    sub.set_defaults(run=run, reads=reads, writes=writes)
     _json_option(sub, None)
     return sub
 
@@ -31,6 +35,19 @@ def alternative(parsers, name: str, help: str, example: str) -> argparse.Argumen
     sub = parsers.add_parser(name, help=help, description=help, epilog=f"example: {example}")
     _json_option(sub, argparse.SUPPRESS)  # a default would replace what was given before the task
     return sub
+
+
+def check_files(arguments: argparse.Namespace) -> None:
+    """Raise :class:`UsageError` if an argument that is written, as ``--json``, is the file of another argument."""
+    writes = {**dict.fromkeys(arguments.writes), "json": None}
+    outputs = {_label(name): getattr(arguments, name, None) for name in writes}
+    check_distinct(outputs, {_label(name): getattr(arguments, name, None) for name in arguments.reads})
+
+
+def _label(name: str) -> str:
+    """Return the name of an argument for a sentence."""
+    names = {"output": "-o", "scene": "the scene", "scenes": "a scene", "file": "the file to read", "source": "source"}
+    return names.get(name, f"--{name.replace('_', '-')}")
 
 
 def _json_option(sub: argparse.ArgumentParser, default: str | None) -> None:
@@ -93,8 +110,10 @@ def set_variant(name: str | None) -> None:
 
 def require_scene(path: str) -> None:
     """Raise :class:`UsageError` if there is no file ``path``, or if it is a table file."""
-    if not Path(path).is_file():
-        raise UsageError(f"{path}: no such scene file")
+    if fault := irregular(path):
+        raise UsageError(f"{shown(path)}: {fault}")
+    if not os.path.isfile(path):
+        raise UsageError(f"{shown(path)}: no such scene file")
     if Path(path).suffix.lower() == ".npz":
         raise UsageError(
             f'{path}: found a table file, a scene (.xml) is needed; "mi-diffind inspect {path}" prints the lines by '

@@ -12,7 +12,7 @@ EXAMPLE = "mi-diffind compare scene.xml --spp 64 --out out"
 
 def add(commands) -> None:
     """Add the verb and its options to ``commands``, the subparsers of the command line."""
-    sub = verb(commands, "compare", run, HELP, EXAMPLE)
+    sub = verb(commands, "compare", run, HELP, EXAMPLE, reads=("scene",))
     sub.add_argument("scene", metavar="SCENE.xml")
     sub.add_argument("--out", default="out", metavar="DIR", help="folder for pictures (default: out)")
     sub.add_argument(

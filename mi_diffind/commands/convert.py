@@ -11,7 +11,7 @@ EXAMPLE = "mi-diffind convert scene.xml -o learned.xml"
 
 def add(commands) -> None:
     """Add the verb and its options to ``commands``, the subparsers of the command line."""
-    sub = verb(commands, "convert", run, HELP, EXAMPLE)
+    sub = verb(commands, "convert", run, HELP, EXAMPLE, reads=("scene",), writes=("output",))
     sub.add_argument("scene", metavar="SCENE.xml")
     sub.add_argument("-o", "--output", required=True, metavar="NEW.xml", help="scene file to write")
     sub.add_argument("--tables", metavar="DIR", help="folder of the table files (default: NEW_tables beside NEW.xml)")

@@ -17,7 +17,7 @@ EXAMPLE = "mi-diffind decode material.npz -o material.png"
 
 def add(commands) -> None:
     """Add the verb and its options to ``commands``, the subparsers of the command line."""
-    sub = verb(commands, "decode", run, HELP, EXAMPLE)
+    sub = verb(commands, "decode", run, HELP, EXAMPLE, reads=("file",), writes=("output",))
     sub.add_argument("file", metavar="FILE.npz")
     sub.add_argument(
         "-o", "--output", required=True, metavar="OUT", help="file to write; several parts become OUT_NAME each"

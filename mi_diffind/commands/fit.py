@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from ..arguments import add_arguments, natural, positive
 from ..deadline import Deadline
-from ..errors import UsageError
 from ..files import writable_file, writable_folder
 from ..settings import LOSSES, SCHEDULES, FittingError
 from ..task import Task, fit, tasks
@@ -37,6 +34,8 @@ def add(commands) -> None:
 
 def _add(sub, task: Task) -> None:
     add_arguments(sub, task.arguments)
+    files = {use: tuple(a.name for a in task.arguments if a.file == use) for use in ("read", "written")}
+    sub.set_defaults(reads=files["read"], writes=("output", "checkpoint", *files["written"]))
     sub.add_argument("-o", "--output", required=True, metavar="FILE.npz", help="table file to write")
     preset = next(iter(task.presets))
     sub.add_argument(
@@ -69,14 +68,12 @@ def _default(task: Task, name: str) -> str:
 def run(arguments) -> dict:
     """Train, write the table file, and return its size, its accuracy and the history of the training.
 
-    After Ctrl-C, these are of the best state so far. Raises :class:`UsageError`,
+    After Ctrl-C, these are of the best state so far. Raises :class:`~mi_diffind.errors.UsageError`,
     :class:`~mi_diffind.files.OutputError`, :class:`FittingError` and what the task's own input raises.
     """
     deadline = None if arguments.seconds is None else Deadline(arguments.seconds)
     task = tasks()[arguments.task]
     output = task.output_path(arguments.output)
-    if arguments.checkpoint is not None and Path(arguments.checkpoint).resolve() == output.resolve():
-        raise UsageError(f'"{output}" cannot be the output and the checkpoint')
     if output.suffix.lower() == ".npz":
         writable_file(output)
     else:  # a folder, for the tables of several files

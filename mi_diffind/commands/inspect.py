@@ -13,7 +13,7 @@ EXAMPLE = "mi-diffind inspect material.npz --measure"
 
 def add(commands) -> None:
     """Add the verb and its options to ``commands``, the subparsers of the command line."""
-    sub = verb(commands, "inspect", run, HELP, EXAMPLE)
+    sub = verb(commands, "inspect", run, HELP, EXAMPLE, reads=("file",))
     sub.add_argument("file", metavar="FILE.npz|SCENE.xml")
     sub.add_argument("--measure", action="store_true", help="measure the accuracy of tables in each storage form")
     sub.add_argument(

@@ -14,7 +14,7 @@ EXAMPLE = "mi-diffind regress scene.xml --references references"
 
 def add(commands) -> None:
     """Add the verb and its options to ``commands``, the subparsers of the command line."""
-    sub = verb(commands, "regress", run, HELP, EXAMPLE)
+    sub = verb(commands, "regress", run, HELP, EXAMPLE, reads=("scenes",))
     sub.add_argument("scenes", nargs="+", metavar="SCENE.xml")
     sub.add_argument("--update", action="store_true", help="render the references again and store them")
     sub.add_argument(

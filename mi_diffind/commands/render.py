@@ -28,7 +28,7 @@ EXAMPLE = "mi-diffind render scene.xml -o image.png --spp 64"
 
 def add(commands) -> None:
     """Add the verb and its options to ``commands``, the subparsers of the command line."""
-    sub = verb(commands, "render", run, HELP, EXAMPLE)
+    sub = verb(commands, "render", run, HELP, EXAMPLE, reads=("scene",), writes=("output",))
     sub.add_argument("scene", metavar="SCENE.xml")
     sub.add_argument(
         "-o", "--output", metavar="FILE",

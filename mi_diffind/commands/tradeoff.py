@@ -9,12 +9,15 @@ from .common import alternative, alternatives, require_scene, scene_options, set
 
 HELP = "measure time against accuracy, of all forms of a task or of a scene"
 
+#: Arguments of studies that are files, as far as a study has them.
+READS = ("source", "scene", "scenes", "materials", "table", "renders", "errors_of")
+
 EXAMPLE = "mi-diffind tradeoff ggx --quick --out out"
 
 
 def add(commands) -> None:
     """Add the verb and the studies that are found to ``commands``, the subparsers of the command line."""
-    parsers = alternatives(verb(commands, "tradeoff", run, HELP, EXAMPLE), "study")
+    parsers = alternatives(verb(commands, "tradeoff", run, HELP, EXAMPLE, reads=READS), "study")
     for name, study in studies().items():
         words = " ".join(filter(None, ("mi-diffind tradeoff", name, study.example, "--quick --out out")))
         sub = alternative(parsers, name, f"measure time against accuracy of {study.title}", words)

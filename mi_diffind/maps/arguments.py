@@ -16,7 +16,9 @@ _SIZES = (
     ("psnr", decibels, "the smallest file of at least so many dB (several trainings)"),
 )
 
-SOURCE = Argument("source", metavar="IMAGE|MATERIAL.json", help="an image, or a manifest of the maps of a material")
+SOURCE = Argument(
+    "source", file="read", metavar="IMAGE|MATERIAL.json", help="an image, or a manifest of the maps of a material"
+)
 
 #: Ways to give the size of the arrays, of which at most one is allowed.
 SIZES = tuple(
@@ -37,7 +39,10 @@ SOURCES = (
 
 #: Picture of a training that is written at each measurement.
 PREVIEW = Argument(
-    "--preview", metavar="FILE.png", help="write reference | render | 4x their difference at measurements"
+    "--preview",
+    file="written",
+    metavar="FILE.png",
+    help="write reference | render | 4x their difference at measurements",
 )
 
 #: Least and largest bias of the level of detail that a file may hold, in levels; a negative one reads finer.

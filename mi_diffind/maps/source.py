@@ -24,6 +24,8 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import DiffindError, reason
+from ..files import MOST_TEXT, irregular, shown
+from ..units import memory
 
 #: Largest number of channels of all maps together.
 MAX_CHANNELS = 16
@@ -312,7 +314,10 @@ def _in_memory(array, where: str) -> _ImageFile:
 
 
 def _read_bytes(path: Path) -> bytes:
-    """Return the content of a file. Raises :class:`SourceError`."""
+    """Return the content of a file. Raises :class:`SourceError`, also for pipes, devices and very large files."""
+    most = MOST_TEXT if path.suffix.lower() == ".json" else memory() // 4
+    if fault := irregular(path, most):
+        raise SourceError(f"{shown(path)}: {fault}")
     try:
         return path.read_bytes()
     except FileNotFoundError:

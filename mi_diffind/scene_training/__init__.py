@@ -33,7 +33,7 @@ class SceneTraining(Task):
     measurements = 10
     arguments = (
         Argument(
-            "source", metavar="SCENE.xml",
+            "source", file="read", metavar="SCENE.xml",
             help="a scene with neural_textures or neural_materials, whose arrays are trained",
         ),
         Argument(

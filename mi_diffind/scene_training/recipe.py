@@ -95,12 +95,12 @@ FILE_ARGUMENTS = (
         "-D", dest="defines", action="append", type=define, metavar="NAME=VALUE", help="set a <default> of the scene"
     ),
     Argument(
-        "--start", action="append", metavar="FILE.npz",
+        "--start", action="append", file="read", metavar="FILE.npz",
         help="arrays to start from, of the same maps, such as those of fit shading; may be repeated, once for each "
         "texture (default: the scene's files)",
     ),
     Argument(
-        "--texture", action="append", metavar="FILE.npz",
+        "--texture", action="append", file="read", metavar="FILE.npz",
         help="file of a trained texture, may be repeated (default: all that the scene reads); several are trained "
         "together, and -o names a folder, in which each keeps its name",
     ),

@@ -242,7 +242,7 @@ def test_bad_values(folder, capsys, option, value):
         (["--lr", "nan"], "lr: found nan"),
         (["--resume"], "--checkpoint FILE"),
         (["--resume", "--checkpoint", "c.npz"], "there is nothing to resume"),
-        (["--checkpoint", "out.npz"], "cannot be the output and the checkpoint"),
+        (["--checkpoint", "out.npz"], "the same file as -o"),
         (["--checkpoint", "a.png"], "would replace a file that is not one"),
         (["--checkpoint", "c.npz", "--psnr", "30"], "--checkpoint: for one training"),
         (["--checkpoint", "c.npz", "--ratio-search"], "--checkpoint: for one training"),

@@ -59,7 +59,7 @@ class BSDFTask(Task):
     storages = ()
     arguments = (
         Argument(
-            "source", metavar="SOURCE",
+            "source", file="read", metavar="SOURCE",
             help="scene or BSDF (.xml), measured file (.bsdf, .pbsdf, .binary), table of measurements (.csv), or a "
             "folder of such files",
         ),

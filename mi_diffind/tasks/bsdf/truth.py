@@ -11,8 +11,10 @@ import drjit as dr
 import numpy as np
 
 from ...errors import UsageError, reason
+from ...files import irregular, shown
 from ...lookup import clamp
 from ...tables import Table, TableError
+from ...units import memory
 from .measured_files import ILLUMINANTS, PolarisedTruth, measured_bsdf
 from .scattered import ScatteredTruth
 from .source import Truth
@@ -138,6 +140,8 @@ def truth_of(
             _chosen(_built(name, lambda: mi.load_dict(source)), name, material), name, _hash(content), uv
         )
     path = Path(os.fspath(source))
+    if fault := irregular(path, memory() // 4):
+        raise UsageError(f"{shown(path)}: {fault}")
     if not path.is_file():
         raise UsageError(f"{path}: no such file")
     suffix = path.suffix.lower()

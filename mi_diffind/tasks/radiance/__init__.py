@@ -40,7 +40,7 @@ class RadianceField(Task):
     measurements = 2
     arguments = (
         Argument(
-            "source", metavar="FOLDER",
+            "source", file="read", metavar="FOLDER",
             help="folder of views of mi-diffind capture, Blender, nerfstudio, instant-ngp (transforms*.json), COLMAP, "
             "or SPLATS.ply: 3D Gaussians, of which views are rendered first"
         ),
@@ -84,7 +84,9 @@ class RadianceField(Task):
             "--downscale", type=positive, metavar="N",
             help="factor by which the sides of images are reduced (default: the least at which they have 1600 pixels)"
         ),
-        Argument("--grid", metavar="FILE", help="grid to compress; if the file does not exist, it is made"),
+        Argument(
+            "--grid", file="written", metavar="FILE", help="grid to compress; if the file does not exist, it is made"
+        ),
         Argument(
             "--box", type=float, nargs=6, metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
             help="of 3D Gaussians, those inside, lower corner first (default: all but strays)",

@@ -11,7 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import DiffindError, reason
+from ...files import irregular, shown
 from ...srgb import from_linear, to_linear
+from ...units import memory
 
 #: Extensions tried in turn for an image name without one.
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".exr")
@@ -31,10 +33,12 @@ def image_file(root: Path, name: str, file: Path) -> Path:
     """Return the path of an image in the folder ``root``, which the ``file`` with a list of views names."""
     path = root / name
     for candidate in (path, *(path.with_name(path.name + e) for e in EXTENSIONS)):
+        if fault := irregular(candidate, memory() // 4):
+            raise ViewsError(f"{shown(candidate)}: {fault}, {file.name} names it")
         if candidate.is_file():
             return candidate
     more = "" if path.suffix.lower() in EXTENSIONS else f", nor with {', '.join(EXTENSIONS)}"
-    raise ViewsError(f"{path}: no such image{more}, {file.name} names it")
+    raise ViewsError(f"{shown(path)}: no such image{more}, {file.name} names it")
 
 
 def is_linear(path: Path) -> bool:

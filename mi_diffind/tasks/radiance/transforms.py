@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import reason
+from ...files import MOST_TEXT, irregular, shown
 from .image_files import ViewsError
 from .lenses import DISTORTION
 
@@ -72,6 +73,8 @@ def listed_frames(folder: Path, split: str) -> FrameList:
 
 def _frames(folder: Path, split: str) -> tuple[Path, dict, list[dict]]:
     """Return the file that lists the views of a split, its content, and the entries of these views."""
+    if fault := irregular(folder):
+        raise ViewsError(f"{shown(folder)}: {fault}")
     if not folder.is_dir():
         raise ViewsError(f"{folder}: {'is not a folder' if folder.exists() else 'no such folder'}")
     listed_split, train, single = (folder / f"transforms{s}.json" for s in (f"_{split}", "_train", ""))
@@ -109,6 +112,8 @@ def _frames(folder: Path, split: str) -> tuple[Path, dict, list[dict]]:
 
 
 def _parse(file: Path) -> tuple[dict, list[dict]]:
+    if fault := irregular(file, MOST_TEXT):
+        raise ViewsError(f"{shown(file)}: {fault}")
     try:
         content = json.loads(file.read_text(encoding="utf-8-sig"))
     except (ValueError, RecursionError) as e:

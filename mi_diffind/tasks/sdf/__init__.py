@@ -46,7 +46,7 @@ class Sdf(Task):
     files = "model"
     arguments = (
         Argument(
-            "source", metavar="MESH",
+            "source", file="read", metavar="MESH",
             help="a mesh: ply, obj, stl, off, glb, serialized, …; SCENE.xml, or one shape of it: SCENE.xml#ID",
         ),
         Argument(

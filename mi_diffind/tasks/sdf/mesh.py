@@ -18,6 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import DiffindError, reason
+from ...files import irregular, shown
+from ...units import memory
 from . import scene_meshes, serialized
 
 #: Extent along an axis, relative to the longest side, below which a mesh is flat: float32 resolves no volume in it.
@@ -124,6 +126,8 @@ def load_mesh(mesh) -> Mesh:
     if not isinstance(mesh, (str, os.PathLike)):
         return make_mesh(*_in_memory(mesh))
     path, part = split_part(mesh)
+    if fault := irregular(path, memory() // 4):
+        raise MeshError(f"{shown(path)}: {fault}")
     if not path.is_file():
         raise MeshError(f"{path}: {'is a folder' if path.is_dir() else 'there is no such file'}, expected a mesh")
     vertices, faces = _read(path, part)
@@ -182,7 +186,7 @@ def split_part(path: str | os.PathLike) -> tuple[Path, str]:
     """Return the file and the part of ``FILE#PART``; the part is "" without one, or if there is a file of that name."""
     path = Path(path)
     name, _, part = path.name.rpartition("#")
-    if path.is_file() or Path(name).suffix.lower() not in PARTS:
+    if os.path.isfile(path) or Path(name).suffix.lower() not in PARTS:
         return path, ""
     return path.with_name(name), part
 

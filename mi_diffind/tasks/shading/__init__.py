@@ -30,11 +30,11 @@ class Shading(Task):
     measurements = 10
     arguments = (
         Argument(
-            "source", metavar="MATERIAL.json", help="a manifest of the maps of a material",
+            "source", file="read", metavar="MATERIAL.json", help="a manifest of the maps of a material",
         ),
         *(size for size in SIZES if size.name != "psnr"),
         Argument(
-            "--start", metavar="FILE.npz",
+            "--start", file="read", metavar="FILE.npz",
             help="arrays to start from, as written by fit texture (default: trained first, with half of --seconds)",
         ),
         Argument(

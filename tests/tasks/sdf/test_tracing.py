@@ -1,6 +1,9 @@
 """Where rays meet a signed distance field, against formulas and a slow march."""
 
 import functools
+import os
+import subprocess
+import sys
 
 import drjit as dr
 import numpy as np
@@ -8,6 +11,7 @@ import pytest
 from arrays import aligned
 from sdf_fields import Ball, Slab, Steps, TrilinearField, sparse_table, torus
 
+import mi_diffind.runtime
 from mi_diffind.tasks.sdf import codes, grids, marching, model, tracing
 from mi_diffind.tasks.sdf.nodes import MIDDLE
 
@@ -118,6 +122,36 @@ def test_what_is_no_ray_ends(types):
     d = np.array([*bad, [1.0, 0, 0], [1.0, 0, 0], [0, 0, 0]])
     _, is_hit, _, _ = trace(Ball(types), o, d, 4.0)
     assert not is_hit.any()
+
+
+#: Rays inside the box of a ball's field and of a torus's cells, in a process of its own, since without an end they
+#: could not be interrupted.
+ENDLESS = """
+import drjit as dr, mitsuba as mi, numpy as np
+mi.set_variant("VARIANT")
+from mi_diffind.compat import module_of
+from mi_diffind.tasks.sdf import model, tracing
+from sdf_fields import Ball, sparse_table
+types = module_of(mi.Float)
+table = sparse_table()
+arrays = {name: array.allocate(mi.TensorXf) for name, array in table.arrays.items()}
+nan, inf = np.nan, np.inf
+d = np.array([[0, 0, 0], [-0.0, 0, 0], [0, 0, 1e-30], [0, 1e-42, 0], [0, 0, 1e-7], [1e-3, 0, 0], [0, 0, 100],
+              [nan, 0, 0], [0, nan, 1], [inf, 0, 0], [0, -inf, 0], [inf, inf, inf], [3e38, 3e38, 0]], np.float32)
+o = np.array([[0, 0, 0], [0.3, 0.2, 0.1], [0.01, 0.49, 0]], np.float32)
+o, d = np.repeat(o, len(d), axis=0), np.tile(d, (len(o), 1))
+for field in (Ball(types), model.field_of(table, arrays, types)):
+    ray = *(types.Array3f(*(types.Float(x.copy()) for x in v.T)) for v in (o, d)), types.Float(inf)
+    assert not tracing.trace(field, *ray)[1].numpy().any() and not tracing.occluded(field, *ray).numpy().any()
+print("ended")
+"""
+
+
+def test_directions_without_a_length_end(types):
+    script = ENDLESS.replace("VARIANT", mi_diffind.runtime.use_variant())
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    done = subprocess.run([sys.executable, "-c", script], env=env, capture_output=True, text=True, timeout=100)
+    assert done.stdout.strip() == "ended", done.stderr
 
 
 @pytest.mark.parametrize("thickness", [3e-4, 0.02])

@@ -1,0 +1,210 @@
+"""Files to write and to read: which ones are refused, and what stays behind."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from commands import refused
+from PIL import Image
+
+from mi_diffind.errors import UsageError
+from mi_diffind.files import (
+    LONGEST_NAME,
+    OutputError,
+    check_distinct,
+    irregular,
+    replacing,
+    same_file,
+    shown,
+    writable_file,
+)
+
+#: Process that begins to write a file, says so, and waits to be killed.
+WRITER = """
+import sys, time
+from mi_diffind.files import replacing
+with replacing(sys.argv[1]) as temporary:
+    temporary.write_bytes(b"half of it")
+    print(temporary, flush=True)
+    time.sleep(600)
+"""
+
+
+def begun(path):
+    """A process that writes a file, and the path of its temporary file."""
+    process = subprocess.Popen([sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE, text=True)
+    return process, process.stdout.readline().strip()
+
+
+@pytest.mark.parametrize("name", ["a.npz", "noextension", "ä" * 120 + ".json", "a" * 250 + ".npz", "a[b].(c)*.npz"])
+def test_a_killed_run_leaves_nothing_to_the_next(tmp_path, name):
+    path = tmp_path / name
+    path.write_bytes(b"before")
+    process, temporary = begun(path)
+    assert os.path.dirname(temporary) == str(tmp_path) and os.path.getsize(temporary) == 10
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    process.stdout.close()
+    assert os.path.exists(temporary) and path.read_bytes() == b"before"
+    with replacing(path) as other:
+        assert not os.path.exists(temporary)
+        assert other.name.endswith(path.suffix)
+        other.write_bytes(b"after")
+    assert os.listdir(tmp_path) == [name] and path.read_bytes() == b"after"
+
+
+def test_a_living_run_keeps_its_temporary_file(tmp_path):
+    path = tmp_path / "a.npz"
+    process, temporary = begun(path)
+    try:
+        with replacing(path) as other:
+            other.write_bytes(b"first")
+        assert os.path.getsize(temporary) == 10
+        with replacing(path) as one, replacing(path) as two:  # within a process, too
+            one.write_bytes(b"outer")
+            two.write_bytes(b"inner")
+        assert path.read_bytes() == b"outer"
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+def test_other_files_are_not_taken_for_temporary_ones(tmp_path):
+    others = [".a.npz", ".a-20240101.npz", ".a.unfinished-2024.npz", ".b.unfinished-0123abcd.npz", "a.json"]
+    others += [".a.unfinished-0123abcd.json", ".a.unfinished-0123abcz.npz"]
+    for name in others:
+        (tmp_path / name).write_bytes(b"kept")
+    os.symlink(tmp_path / "a.json", tmp_path / ".a.unfinished-00000000.npz")
+    with replacing(tmp_path / "a.npz") as temporary:
+        temporary.write_bytes(b"new")
+    assert (tmp_path / "a.json").read_bytes() == b"kept"
+    assert set(others) <= set(os.listdir(tmp_path))
+
+
+def test_only_regular_files_are_replaced(tmp_path):
+    """A device as a file to write was replaced by a file, with the rights to do so: /dev/null, as root."""
+    pipe, folder = tmp_path / "pipe", tmp_path / "folder"
+    os.mkfifo(pipe)
+    folder.mkdir()
+    os.symlink(pipe, tmp_path / "link")
+    for path, fault in ((pipe, "is a pipe"), (folder, "is a folder"), (tmp_path / "link", "is a pipe")):
+        with pytest.raises(OutputError, match=fault), replacing(path):
+            raise AssertionError("reached")
+    assert os.stat(pipe).st_mode == os.lstat(pipe).st_mode and len(os.listdir(tmp_path)) == 3
+
+
+def test_names_that_are_too_long(tmp_path):
+    writable_file(tmp_path / ("a" * LONGEST_NAME))
+    for name in ("a" * (LONGEST_NAME + 1), "ä" * 128):
+        with pytest.raises(OutputError, match=f"has a name of 256 bytes, at most {LONGEST_NAME} are allowed"):
+            writable_file(tmp_path / name)
+    with pytest.raises(OutputError, match="File name too long") as error:
+        writable_file(tmp_path / ("a/" * 4000) / "b")
+    assert len(str(error.value)) < 250
+    assert len(shown("a" * 500)) == 120 and shown("a" * 120) == "a" * 120
+
+
+def test_files_that_must_not_be_opened(tmp_path):
+    pipe, file = tmp_path / "pipe", tmp_path / "file"
+    os.mkfifo(pipe)
+    file.write_bytes(bytes(10))
+    assert irregular(pipe) == "is a pipe, a regular file is needed"
+    assert irregular("/dev/zero") == "is a device, a regular file is needed"
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(str(tmp_path / "s"))
+        assert irregular(tmp_path / "s") == "is a socket, a regular file is needed"
+    assert irregular(file, 9) == "has 10 bytes, at most 9 are read"
+    assert irregular("a" * 5000) == "cannot be read (file name too long)"
+    assert irregular(file, 10) == irregular(tmp_path) == irregular(tmp_path / "no") == irregular("a\0b") == ""
+
+
+def test_one_file_by_several_names(tmp_path):
+    folder, file = tmp_path / "folder", tmp_path / "folder" / "a.npz"
+    folder.mkdir()
+    os.symlink(folder, tmp_path / "other")
+    assert same_file(file, tmp_path / "other" / "a.npz")  # neither exists
+    assert same_file(file, f"{folder}/../folder/./a.npz") and not same_file(file, folder / "b.npz")
+    file.write_bytes(b"")
+    os.symlink(file, tmp_path / "soft")
+    os.link(file, tmp_path / "hard")
+    os.symlink(tmp_path / "nowhere", tmp_path / "dangling")
+    for name in ("soft", "hard"):
+        assert same_file(file, tmp_path / name) and same_file(tmp_path / name, file)
+        with pytest.raises(UsageError, match=r'^--json: found ".*", the same file as -o, allowed is another one$'):
+            check_distinct({"-o": file, "--json": tmp_path / name}, {})
+        with pytest.raises(UsageError, match=r"-o: .* the same file as --start"):
+            check_distinct({"-o": file}, {"--start": ["x", str(tmp_path / name)]})
+    assert same_file(tmp_path / "dangling", tmp_path / "nowhere") and not same_file(file, "a" * 5000)
+    with pytest.raises(UsageError, match="the same file as source"):
+        check_distinct({"--json": file}, {"source": f"{file}#part"})
+    check_distinct({"-o": file, "--json": None, "x": ""}, {"a": file.with_name("b"), "b": np.zeros(3), "c": folder})
+    check_distinct({}, {"a": file, "b": file})
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A current folder with an image, a manifest, a scene and a link to the folder."""
+    monkeypatch.chdir(tmp_path)
+    Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save("a.png")
+    (tmp_path / "m.json").write_text(json.dumps({"albedo": "a.png"}))
+    (tmp_path / "scene.xml").write_text('<scene version="3.0.0"/>')
+    (tmp_path / "t.npz").write_bytes(b"a table")
+    os.link("t.npz", "hard.npz")
+    os.symlink("t.npz", "soft.npz")
+    os.symlink(".", "here")
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "command, sentence",
+    [
+        ("fit ggx -o t.npz --json t.npz", "--json: found"),
+        ("fit ggx -o t.npz --json here/t.npz", "the same file as -o"),
+        ("fit ggx -o t.npz --json hard.npz", "the same file as -o"),
+        ("fit ggx -o soft.npz --json t.npz", "the same file as -o"),
+        ("fit ggx -o t.npz --checkpoint hard.npz", "--checkpoint: found"),
+        ("fit ggx -o new.npz --checkpoint here/new.npz", "the same file as -o"),
+        ("fit ggx -o new.npz --checkpoint ck --json ./ck", "the same file as --checkpoint"),
+        ("fit image a.png -o new.npz --checkpoint here/a.png", "the same file as source"),
+        ("fit image a.png -o new.npz --json a.png", "the same file as source"),
+        ("fit shading m.json -o new.npz --preview m.json", "--preview: found"),
+        ("fit texture m.json -o new.npz --json here/m.json", "the same file as source"),
+        ("fit shading m.json -o t.npz --start hard.npz", "the same file as --start"),
+        ("fit shading m.json -o new.npz --start t.npz --checkpoint soft.npz", "the same file as --start"),
+        ("fit field . -o t.npz --grid here/t.npz", "--grid: found"),
+        ("fit field . -o new.npz --grid g.npz --json g.npz", "the same file as --grid"),
+        ("fit sdf scene.xml#ball -o new.npz --json scene.xml", "the same file as source"),
+        ("fit scene scene.xml -o t.npz --start soft.npz", "the same file as --start"),
+        ("inspect t.npz --json soft.npz", "the same file as the file to read"),
+        ("decode t.npz -o hard.npz", "the same file as the file to read"),
+        ("decode t.npz -o out.png --json here/out.png", "the same file as -o"),
+        ("render scene.xml --json scene.xml", "the same file as the scene"),
+        ("render scene.xml -o x.exr --json x.exr", "the same file as -o"),
+        ("convert scene.xml -o new.xml --json here/new.xml", "the same file as -o"),
+        ("regress scene.xml --json scene.xml", "the same file as a scene"),
+        ("compare scene.xml --json scene.xml", "the same file as the scene"),
+        ("capture scene.xml -o views --json scene.xml", "the same file as the scene"),
+        ("tradeoff image a.png --json a.png", "the same file as source"),
+    ],
+)
+def test_a_file_is_not_written_over_another_one(folder, capsys, command, sentence):
+    before = {name: (folder / name).read_bytes() for name in os.listdir(folder) if (folder / name).is_file()}
+    message = refused(capsys, *command.split())
+    assert sentence in message and len(message) < 300
+    names = [name for name in os.listdir(folder) if (folder / name).is_file()]
+    assert {name: (folder / name).read_bytes() for name in names} == before
+
+
+def test_the_function_refuses_as_the_command_does(folder):
+    import mi_diffind
+
+    with pytest.raises(UsageError, match=r"-o: found .* the same file as --start"):
+        mi_diffind.fit("shading", "m.json", start="t.npz", output="hard.npz")
+    with pytest.raises(UsageError, match=r"--checkpoint: found .* the same file as source"):
+        mi_diffind.fit("image", "a.png", checkpoint="here/a.png")
