@@ -22,7 +22,7 @@ FLOORS = (
         "progress",
         "jobs",
     ),
-    ("bits", "bounds", "metrics", "rays", "splat_files", "srgb", "units"),
+    ("archives", "bits", "bounds", "limits", "metrics", "rays", "splat_files", "srgb", "units"),
     ("lookup",),
     ("indirection", "pages"),
     ("tables",),
