@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from .errors import DiffindError, reason
-from .limits import JSON_BYTES, Allowance
+from .limits import Allowance, json_bytes
 
 #: Methods of compression that are read. Members in bz2 or lzma, which NumPy never writes, grow faster than deflate.
 METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
@@ -108,10 +108,10 @@ class Archive:
 
         Raises ``ValueError`` for text that is no JSON, and the errors of :meth:`array`.
         """
-        text = self.array(name, np.dtype("u1"))
-        self.allowance.take((JSON_BYTES - 1) * text.size, f'the array "{name:.80}"')
+        text = self.array(name, np.dtype("u1")).tobytes()
+        self.allowance.take(len(text) + json_bytes(text), f'the array "{name:.80}"')
         try:
-            return json.loads(text.tobytes())
+            return json.loads(text)
         except RecursionError:
             raise ValueError("too many lists within lists") from None
 

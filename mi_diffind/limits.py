@@ -8,7 +8,7 @@ memory of the machine. The environment variable :data:`VARIABLE` raises the limi
 What a reader counts:
 
 - arrays of an archive (:mod:`.archives`): their bytes, decompressed and with the bits of each entry unpacked;
-- JSON: :data:`JSON_BYTES` for each of its bytes, the most that Python's objects take (lists within lists);
+- JSON: an upper bound of what Python's objects take (:func:`json_bytes`);
 - entries of a table file: four bytes more each, since readers use them in single precision;
 - pictures: the bytes of their pixels in the depth of the file, 1 to 4 bytes a channel, that is, what a decoder returns.
   Maps in single precision take up to four times as much, and all images of a capture together at most the memory of the
@@ -31,8 +31,9 @@ FREE, FACTOR = 64 * 2**20, 20
 #: Environment variable with another limit, in bytes, such as ``4G``; limits below those of the rule change nothing.
 VARIABLE = "MI_DIFFIND_MEMORY"
 
-#: Most bytes in memory for each byte of JSON: lists within lists take 72 bytes for every ``[]``, and text is copied.
-JSON_BYTES = 48
+#: Characters of JSON → most bytes in memory for what each begins or separates: an object, a list, an entry, half of a
+#: text, a value of an object.
+_JSON_BYTES = {b"{": 240, b"[": 96, b",": 48, b'"': 40, b":": 100}
 
 
 class LimitError(DiffindError, ValueError):
@@ -51,6 +52,12 @@ def allowed(file_bytes: int) -> int:
         except ValueError as e:
             raise UsageError(f"environment variable {VARIABLE}: {e}") from None
     return min(limit, units.memory())
+
+
+def json_bytes(text: bytes) -> int:
+    """Return a bound of the bytes of memory that the content of JSON ``text`` takes, without parsing it."""
+    characters = 2 if text.isascii() else 8  # the whole text, and the texts within; Python has 1 to 4 bytes a character
+    return characters * len(text) + sum(count * text.count(mark) for mark, count in _JSON_BYTES.items())
 
 
 class Allowance:
