@@ -16,10 +16,12 @@ import numpy as np
 from mi_diffind import compat
 from mi_diffind.compat import module_of
 from mi_diffind.files import relative_path, write_json
+from mi_diffind.limits import LimitError
 from mi_diffind.maps.compressed import CompressedMaps
 from mi_diffind.maps.layout import Layout, MapLayout
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import Source, SourceError, from_arrays, load_source
+from mi_diffind.picture_sizes import check_picture
 from mi_diffind.tables import Table, TableError
 from mi_diffind.task import Task, stamp
 
@@ -237,6 +239,10 @@ def manifest_of(image: Path, folder: Path, raw: bool, normal: bool) -> Path:
 
     ``raw``: values are left as they are; ``normal``: they are a normal map. Raises ``RuntimeError``.
     """
+    try:
+        check_picture(image)
+    except LimitError as e:
+        raise RuntimeError(str(e)) from None
     bitmap = mi.Bitmap(str(image))
     formats = mi.Bitmap.PixelFormat
     entry = {
