@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import DiffindError, reason
+from ..files import OutsideError, path_within
 from ..limits import Allowance, LimitError, json_bytes
 from ..picture_sizes import check_picture
 
@@ -209,7 +210,10 @@ def _load_manifest(path: Path, nonfinite: str) -> Source:
             raise SourceError(
                 f'{path}: map "{name}" has the color space {color_space!r:.40}, allowed are {COLOR_SPACES}'
             )
-        file = path.parent / file
+        try:
+            file = path_within(path.parent, file, path)
+        except OutsideError as e:
+            raise SourceError(str(e)) from None
         if file not in images:
             images[file] = _read(file)
         role = role_of(name)

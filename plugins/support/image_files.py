@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import shutil
 import threading
 import weakref
 from collections.abc import Callable
@@ -15,7 +16,7 @@ import numpy as np
 
 from mi_diffind import compat
 from mi_diffind.compat import module_of
-from mi_diffind.files import relative_path, write_json
+from mi_diffind.files import OutsideError, path_within, relative_path, write_json
 from mi_diffind.limits import LimitError
 from mi_diffind.maps.compressed import CompressedMaps
 from mi_diffind.maps.layout import Layout, MapLayout
@@ -252,9 +253,25 @@ def manifest_of(image: Path, folder: Path, raw: bool, normal: bool) -> Path:
     if bitmap.pixel_format() in (formats.YA, formats.RGBA):
         entry["channels"] = "rgb" if bitmap.pixel_format() == formats.RGBA else "r"
     name = "normal" if normal else "data" if raw else "albedo"
-    path = folder / f"{image.stem}_{hashlib.sha256(str([name, entry]).encode()).hexdigest()[:12]}.json"
+    digest = hashlib.sha256(str([name, entry]).encode()).hexdigest()[:12]
+    path = folder / f"{image.stem}_{digest}.json"
+    try:
+        path_within(folder, entry["file"], path)
+    except OutsideError:
+        link = folder / f"{image.stem}_{digest}{image.suffix}"
+        _link(link, entry["file"])
+        entry["file"] = link.name
     write_json(path, {"maps": {name: entry}})
     return path
+
+
+def _link(link: Path, target: str) -> None:
+    """Make a symbolic link to a file at ``target``, relative to the link's folder; a copy where there are no links."""
+    link.unlink(missing_ok=True)
+    try:
+        link.symlink_to(target)
+    except OSError:
+        shutil.copyfile(link.parent / target, link)
 
 
 def _original(props, path: Path, settings: dict) -> Path:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import DiffindError, reason
+from ...files import OutsideError, path_within
 from ...limits import Allowance, LimitError
 from ...picture_sizes import check_picture
 from ...srgb import from_linear, to_linear
@@ -31,7 +32,10 @@ class ViewsError(DiffindError, ValueError):
 
 def image_file(root: Path, name: str, file: Path) -> Path:
     """Return the path of an image in the folder ``root``, which the ``file`` with a list of views names."""
-    path = root / name
+    try:
+        path = path_within(root, name, file)
+    except OutsideError as e:
+        raise ViewsError(str(e)) from None
     for candidate in (path, *(path.with_name(path.name + e) for e in EXTENSIONS)):
         if candidate.is_file():
             return candidate
