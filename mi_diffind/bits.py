@@ -4,19 +4,33 @@ from __future__ import annotations
 
 import numpy as np
 
+#: Numbers that are packed or unpacked at a time, a multiple of 8.
+PART = 2**16
+
 
 def pack_bits(numbers: np.ndarray, bits: int) -> np.ndarray:
     """Pack the lowest ``bits`` bits of each unsigned number, in the order of the flat array: flat ``uint8``."""
     numbers = np.ascontiguousarray(numbers).reshape(-1, 1)
-    if numbers.dtype != np.uint8:
-        numbers = numbers.astype("<u4").view(np.uint8)
-    return np.packbits(np.unpackbits(numbers, axis=1, bitorder="little")[:, :bits], bitorder="little")
+    packed = np.empty(-(-len(numbers) * bits // 8), np.uint8)
+    for first in range(0, len(numbers), PART):  # flags take 8 or 32 bytes a number
+        part = numbers[first : first + PART]
+        if part.dtype != np.uint8:
+            part = part.astype("<u4").view(np.uint8)
+        flags = np.packbits(np.unpackbits(part, axis=1, bitorder="little")[:, :bits], bitorder="little")
+        packed[first * bits // 8 : first * bits // 8 + len(flags)] = flags
+    return packed
 
 
 def unpack_bits(packed: np.ndarray, count: int, bits: int) -> np.ndarray:
     """Return the first ``count`` numbers of up to 8 bits that :func:`pack_bits` packed: flat ``uint8``."""
-    flags = np.unpackbits(packed, count=count * bits, bitorder="little").reshape(count, bits)
-    return np.packbits(np.pad(flags, ((0, 0), (0, 8 - bits))), axis=1, bitorder="little").reshape(count)
+    numbers = np.empty(count, np.uint8)
+    for first in range(0, count, PART):  # flags take 8 bytes a number
+        part = numbers[first : first + PART]
+        begin = first * bits // 8
+        flags = np.unpackbits(packed[begin : begin + PART * bits // 8], count=len(part) * bits, bitorder="little")
+        flags = np.pad(flags.reshape(-1, bits), ((0, 0), (0, 8 - bits)))
+        part[:] = np.packbits(flags, axis=1, bitorder="little").reshape(-1)
+    return numbers
 
 
 def as_words(packed: np.ndarray, spare: int = 0) -> np.ndarray:

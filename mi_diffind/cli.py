@@ -35,7 +35,7 @@ def main(argv: list[str] | None = None) -> int:
             write_json(arguments.json, result)
         return 130 if result.get("interrupted") else 1 if result.get("failed") else 0
     except DiffindError as e:
-        print(f"mi-diffind: error: {shortened(str(e))}", file=sys.stderr)
+        print(f"mi-diffind: error: {shortened(str(e), 280)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("mi-diffind: interrupted", file=sys.stderr)

@@ -1,27 +1,48 @@
-"""Base class of all errors that a user can cause."""
+"""Base class of all errors that a user can cause, and text from files in a form that a terminal may show."""
 
 from __future__ import annotations
+
+import unicodedata
+
+#: Most characters of a message.
+LONGEST_MESSAGE = 300
+
+#: Unicode categories of characters that a terminal obeys or hides: controls, formats (such as changes of the writing
+#: direction), halves of surrogate pairs, and separators of lines and paragraphs.
+_HIDDEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}
+
+
+def printable(text: str) -> str:
+    r"""Return a text on one line without control characters: escape sequences such as ``\x1b`` replace them."""
+    if text.isascii() and text.isprintable():
+        return text
+    return "".join(
+        character.encode("unicode_escape").decode() if unicodedata.category(character) in _HIDDEN else character
+        for character in text
+    )
+
+
+def shortened(text: str, most: int = LONGEST_MESSAGE) -> str:
+    """Return a text of at most ``most`` characters; the middle of a longer one is left out."""
+    if len(text) <= most:
+        return text
+    end = (most - 3) // 2
+    return f"{text[: most - 3 - end]} … {text[-end:]}"
 
 
 class DiffindError(Exception):
     """Bad input, or a place that cannot be written.
 
-    The message is one sentence: the file or the parameter, what was found, what is allowed. The command line prints it
-    and ends with exit code 2.
+    The message is one sentence: the file or the parameter, what was found, what is allowed. It has no control
+    characters and at most :data:`LONGEST_MESSAGE` characters. The command line prints it and ends with exit code 2.
     """
+
+    def __init__(self, *arguments):
+        super().__init__(*(shortened(printable(a)) if isinstance(a, str) else a for a in arguments))
 
 
 class UsageError(DiffindError):
     """Bad input that the argument parser cannot detect."""
-
-
-#: Longest message of an error on the command line, in characters.
-LONGEST = 260
-
-
-def shortened(text: str, most: int = LONGEST) -> str:
-    """Return a text of at most ``most`` characters: of a longer one, the beginning and the end."""
-    return text if len(text) <= most else f"{text[: most // 2]}…{text[1 - (most - most // 2) :]}"
 
 
 def reason(error: BaseException, **names: str) -> str:
@@ -34,4 +55,4 @@ def reason(error: BaseException, **names: str) -> str:
     text = str(error)
     for shown, name in names.items():
         text = text.replace(name, shown)
-    return textwrap.shorten(text, 100, placeholder="…") or type(error).__name__
+    return printable(textwrap.shorten(text, 100, placeholder="…")) or type(error).__name__

@@ -40,6 +40,13 @@ _TYPES = (
     (stat.S_ISBLK, "a device"),
 )
 
+#: Environment variable that lets files name others outside of their folder: ``any``.
+PATHS = "MI_DIFFIND_PATHS"
+
+
+class OutsideError(DiffindError, ValueError):
+    """A file names another one outside of its folder; the message is one sentence that names both."""
+
 
 class OutputError(DiffindError, OSError):
     """An output file or folder cannot be written; the message is one sentence that names it."""
@@ -230,6 +237,21 @@ def write_json(path: str | os.PathLike, content) -> None:
     """Write ``content`` as indented JSON, in one piece."""
     with replacing(path) as temporary:
         temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
+
+def path_within(folder: str | os.PathLike, name: str, file: str | os.PathLike) -> Path:
+    """Return the path of the file ``name`` in a folder, as the content of a ``file`` names it.
+
+    Raises :class:`OutsideError` for a path that leads out of the folder, unless :data:`PATHS` allows any. Symbolic
+    links are not resolved: whoever unpacks a folder has put them there.
+    """
+    path, inside = os.path.abspath(os.path.join(folder, name)), os.path.abspath(folder)
+    if os.environ.get(PATHS) != "any" and os.path.commonpath([path, inside]) != inside:
+        raise OutsideError(
+            f"{file}: names {name!r:.80}, which lies outside of its folder: the environment variable {PATHS}=any "
+            f"allows it"
+        )
+    return Path(folder) / name
 
 
 def relative_path(file: str | os.PathLike, folder: str | os.PathLike) -> str:

@@ -21,11 +21,13 @@ from drjit.opt import Adam
 from tqdm import tqdm
 
 from . import compat
+from .archives import Archive, ArchiveError
 from .deadline import duration
 from .errors import reason
 from .files import irregular, replacing, shown, writable_file
 from .indirection import aligned_copy, unfolded
 from .interrupt import interruptible
+from .limits import LimitError
 from .progress import in_terminal, progress_bar
 from .settings import LOSSES, SCHEDULES, FitSettings, FittingError
 from .sparse_adam import SparseAdam
@@ -505,16 +507,16 @@ def _save_checkpoint(path, settings: dict, state: _State, extra: dict) -> None:
 def checkpoint_settings(path) -> dict:
     """Return the settings of the training and the identity of the problem in a checkpoint; {} if it holds none."""
     try:
-        with np.load(path, allow_pickle=False) as data:
-            return dict(json.loads(data["meta"].tobytes())["settings"])
+        with Archive(path) as archive:
+            return dict(archive.json("meta")["settings"])
     except Exception:  # zipfile, json and numpy each have their own for another kind of file
         return {}
 
 
 def _is_checkpoint(path) -> bool:
     try:
-        with np.load(path, allow_pickle=False) as data:
-            return "lr_scale" in json.loads(data["meta"].tobytes())
+        with Archive(path) as archive:
+            return "lr_scale" in archive.json("meta")
     except Exception:  # zipfile, json and numpy each have their own for another kind of file
         return False
 
@@ -545,9 +547,9 @@ def _load_checkpoint(path, settings: dict, trainer: _Trainer) -> tuple[_State, d
     if not os.path.exists(path):
         raise FittingError(f'the checkpoint "{path}" does not exist, there is nothing to resume')
     try:
-        with np.load(path, allow_pickle=False) as data:
-            arrays = {k: aligned_copy(data[k]) for k in data.files}
-        meta = json.loads(arrays["meta"].tobytes())
+        with Archive(path) as archive:
+            meta = archive.json("meta")
+            arrays = {k: aligned_copy(archive.array(k)) for k in archive.members if k != "meta"}
         keys = list(trainer.optimizer)
         state = _State(
             meta["step"], meta["lr_scale"], {k: arrays[f"value/{k}"] for k in keys},
@@ -556,6 +558,8 @@ def _load_checkpoint(path, settings: dict, trainer: _Trainer) -> tuple[_State, d
         best = {k: arrays[f"best/{k}"] for k in keys}
         _check_meta(meta)
         stored_settings = dict(meta["settings"])
+    except (ArchiveError, LimitError) as e:
+        raise FittingError(f"the checkpoint {e}") from None
     except Exception as e:  # zipfile, json and numpy each have their own for a damaged file
         raise FittingError(f'the checkpoint "{path}" is damaged or of another task ({reason(e)})') from None
     sources = [s["source"] for s in (stored_settings, settings) if "source" in s]

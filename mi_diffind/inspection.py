@@ -13,7 +13,7 @@ from pathlib import Path
 import mitsuba as mi
 
 from . import plugins, scenes
-from .errors import UsageError
+from .errors import UsageError, printable
 from .runtime import array_module, use_variant
 from .tables import gathers_of, load_table
 from .task import task_of
@@ -43,7 +43,8 @@ class Inspection:
 
         With ``verbose``, arrays, settings of the training, values of transforms and counts of operations are included.
         """
-        return (_scene_lines if "reports" in self.figures else _table_lines)(self, verbose)
+        lines = (_scene_lines if "reports" in self.figures else _table_lines)(self, verbose)
+        return [printable(line) for line in lines]  # strings of the file are among them
 
     def __str__(self) -> str:
         return "\n".join(self.lines())

@@ -16,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from . import scenes
+from .archives import Archive
 from .files import OutputError, replacing
 from .z_test import PassMoments
 
@@ -126,9 +127,10 @@ def write_partial(path: Path, moments: PassMoments, key: dict) -> None:
 
 def read_partial(path: Path, key: dict) -> PassMoments:
     """Return the kept passes of the render with the same ``key``; none if missing or damaged."""
-    with contextlib.suppress(Exception), np.load(path, allow_pickle=False) as data:
-        about = json.loads(data["about"].tobytes())
-        moments = PassMoments(data["mean"], data["squares"], about.pop("samples"), about.pop("passes"))
+    with contextlib.suppress(Exception), Archive(path) as archive:
+        about = archive.json("about")
+        sums = archive.array("mean"), archive.array("squares")
+        moments = PassMoments(*sums, about.pop("samples"), about.pop("passes"))
         if about == key and np.isfinite(moments.mean + moments.squares).all():
             return moments
     return PassMoments()

@@ -19,21 +19,29 @@ from pathlib import Path
 
 import numpy as np
 
+from .archives import Archive, ArchiveError
 from .bits import pack_bits, unpack_bits
-from .errors import DiffindError, reason
+from .errors import DiffindError, printable, reason
 from .files import irregular, replacing, shown
 from .indirection import DifferentiableArray
+from .limits import Allowance, LimitError
 from .lookup import BORDERS, STORAGES, gathers, pair_words, quantize
 from .pages import SIDE_BITS, PagedArray
 
 #: Version of the format that is written. A file with another version is refused.
 FORMAT_VERSION = 2
 
-#: Largest file content that is accepted, in bytes: a header that claims more is refused before anything is allocated.
+#: Largest file content that is written or accepted, in bytes. Small files may hold less: :mod:`.limits`.
 MAX_BYTES = 2**30
 
 #: Longest path of a file in the settings, in characters.
 LONGEST_PATH = 4096
+
+#: Entries of all channels that are dequantised at a time.
+_ROWS = 2**16
+
+#: Bytes of an entry in single precision, in which readers use it.
+_SINGLE = 4
 
 _DTYPES = {"float32": np.dtype("<f4"), "float16": np.dtype("<f2"), "uint8": np.dtype("u1")}
 
@@ -96,7 +104,12 @@ class StoredArray:
         """The entries as float32, dequantised if they are bytes."""
         if self.storage != "uint8":
             return self.entries.astype(np.float32)
-        return (np.asarray(self.offset) + np.asarray(self.scale) * self.entries.astype(np.float64)).astype(np.float32)
+        values, rows = np.empty(self.entries.shape, np.float32), self.entries.reshape(-1, self.entries.shape[-1])
+        flat, offset, scale = values.reshape(rows.shape), np.asarray(self.offset), np.asarray(self.scale)
+        for first in range(0, len(rows), _ROWS):  # double precision takes eight times the memory of the bytes
+            part = slice(first, first + _ROWS)
+            flat[part] = offset + scale * rows[part].astype(np.float64)
+        return values
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -277,13 +290,13 @@ def load_table(path: str | os.PathLike, task: str | None = None, shapes: dict[st
     ``task`` and ``shapes`` (array name → shape, ``None`` in place of a free dimension) say what is expected. Raises
     :class:`TableError` with one sentence on anything else: a file that is missing, truncated or no archive, an
     unknown version, a missing, additional, misshapen or mistyped array, NaN or infinity, sizes beyond
-    :data:`MAX_BYTES`.
+    :data:`MAX_BYTES` or beyond what a file of this size may hold (:mod:`.limits`).
     """
     path = Path(path)
     if fault := irregular(path, 2 * MAX_BYTES):
         raise TableError(f"{shown(path)}: {fault}")
     try:
-        with zipfile.ZipFile(path) as archive:
+        with Archive(path) as archive:
             return _read(archive, path, task, shapes)
     except FileNotFoundError:
         raise TableError(f"{path}: no such file") from None
@@ -293,7 +306,9 @@ def load_table(path: str | os.PathLike, task: str | None = None, shapes: dict[st
         raise TableError(f"{path}: not a table file (.npz), or a truncated one ({reason(e)})") from None
     except TableError:
         raise
-    except Exception as e:  # zipfile, zlib, lzma and numpy each have their own for a damaged file
+    except (ArchiveError, LimitError) as e:
+        raise TableError(str(e)) from None
+    except Exception as e:  # zipfile, zlib and numpy each have their own for a damaged file
         raise TableError(f"{path}: cannot be read ({reason(e)})") from None
 
 
@@ -330,30 +345,37 @@ def check_numbers(table: Table, name: str, count: int, positive: bool = False, w
         raise TableError(f'{table.path}: its setting "{name}" is {value!r}, expected {allowed}')
 
 
+def check_allowance(table: Table, nbytes: int, content: str) -> None:
+    """Raise :class:`TableError` if a file's arrays and ``nbytes`` for its ``content`` are more than it may take.
+
+    The rule is that of :mod:`.limits`. Tables in memory have no limit.
+    """
+    if table.path is None:
+        return
+    stored = sum(array.entries.nbytes for array in table.arrays.values())
+    try:
+        Allowance(table.path).check(stored + nbytes, content)
+    except LimitError as e:
+        raise TableError(str(e)) from None
+
+
 def byte_array(values: np.ndarray, scale: float = 1.0, offset: float = 0.0) -> StoredArray:
     """Return bytes ``(…, c)`` that stand for ``offset`` + ``scale`` · byte as an array of a file."""
     channels = values.shape[-1]
     return StoredArray(np.ascontiguousarray(values, np.uint8), (), (scale,) * channels, (offset,) * channels)
 
 
-def _read(archive: zipfile.ZipFile, path: Path, task, shapes) -> Table:
-    members = {}
-    total = 0
-    for info in archive.infolist():
-        if not info.filename.endswith(".npy") or not info.filename.isprintable():
-            raise TableError(f"{path}: contains {info.filename!r}, which is not an array")
-        if info.filename[:-4] in members:
-            raise TableError(f'{path}: contains the array "{info.filename[:-4]}" twice')
-        members[info.filename[:-4]] = info
-        total += info.file_size
+def _read(archive: Archive, path: Path, task, shapes) -> Table:
+    members = set(archive.members)
+    total = sum(info.file_size for info in archive.members.values())
     if total > MAX_BYTES:
         raise TableError(f"{path}: claims {total:,} bytes of content, at most {MAX_BYTES:,} are accepted")
     if "meta" not in members:
         raise TableError(f'{path}: has no "meta" array, it was not written by this package')
+    members.remove("meta")
 
-    raw = _array(archive, members.pop("meta"), path, "meta", np.dtype("u1"), None)
     try:
-        meta = json.loads(raw.tobytes())
+        meta = archive.json("meta")
         if "lr_scale" in meta:
             raise TableError(
                 f"{path}: is the checkpoint of a training, the table file is what it writes at its end (-o)"
@@ -368,12 +390,12 @@ def _read(archive: zipfile.ZipFile, path: Path, task, shapes) -> Table:
         preset, settings, seed, measured = (meta[key] for key in ("preset", "settings", "seed", "measured"))
         if not isinstance(settings, dict) or not isinstance(measured, dict):
             raise TypeError("the settings and the measurements have to be objects")
-        if not all(type(value) in (int, float) for value in measured.values()):
+        if any(type(value) not in (int, float) for value in measured.values()):
             raise TypeError("the measurements have to be numbers")
         for key, value in settings.items():
             if key.endswith("_path") and not (isinstance(value, str) and 0 < len(value) <= LONGEST_PATH):
                 raise TypeError(f'the setting "{key:.40}" has to be the path of a file')
-    except TableError:
+    except (ArchiveError, LimitError, TableError):
         raise
     except (ValueError, TypeError, KeyError, AttributeError) as e:
         raise TableError(f'{path}: its "meta" array is damaged ({type(e).__name__}: {e})') from None
@@ -381,9 +403,9 @@ def _read(archive: zipfile.ZipFile, path: Path, task, shapes) -> Table:
         raise TableError(f'{path}: holds tables for the task "{stored_task}", expected "{task}"')
 
     expected = set(shapes) if shapes is not None else set(described)
-    for name in sorted(expected - set(members)):
+    for name in sorted(expected - members):
         raise TableError(f'{path}: the array "{name}" is missing')
-    for name in sorted(set(members) - expected) + sorted(set(described) ^ set(members)):
+    for name in sorted(members - expected) + sorted(set(described) ^ members):
         raise TableError(f'{path}: has an unexpected array "{name}"')
 
     table = Table(str(stored_task), {}, str(preset), settings, seed, measured, path)
@@ -406,9 +428,10 @@ def _read(archive: zipfile.ZipFile, path: Path, task, shapes) -> Table:
         _check_shape(path, name, shape, border)
         _check_bits(path, name, bits)
         stored = shape if bits == 8 else (math.ceil(math.prod(shape) * bits / 8),)
-        entries = _array(archive, members[name], path, name, _DTYPES[storage], stored)
+        entries, count = archive.array(name, _DTYPES[storage], stored), math.prod(shape)
+        archive.allowance.take(count * (_SINGLE + (bits < 8)), f'the array "{printable(name):.80}", {count:,} entries,')
         if bits < 8:
-            entries = unpack_bits(entries, math.prod(shape), bits).reshape(shape)
+            entries = unpack_bits(entries, count, bits).reshape(shape)
         table.arrays[name] = StoredArray(entries, border, scale, offset, bits)
         _check(path, name, table.arrays[name])
     return table
@@ -452,25 +475,3 @@ def _check_shape(path, name: str, shape: tuple, border: tuple) -> None:
 def _check_bits(path, name: str, bits) -> None:
     if type(bits) is not int or not 1 <= bits <= 8:
         raise TableError(f'{path}: array "{name}" has {bits} bits an entry, allowed are 1 to 8')
-
-
-def _array(archive, info, path, name: str, dtype: np.dtype, shape: tuple | None) -> np.ndarray:
-    """Read one member of the archive; its header is checked against the claimed size before memory is allocated."""
-    with archive.open(info) as stream:
-        try:
-            version = np.lib.format.read_magic(stream)
-            reader = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}[version]
-            stored_shape, fortran, stored_dtype = reader(stream)
-        except (ValueError, KeyError) as e:
-            raise TableError(f'{path}: array "{name}" has a damaged header ({reason(e)})') from None
-        if stored_dtype != dtype:
-            raise TableError(f'{path}: array "{name}" has the type {stored_dtype}, expected {dtype}')
-        if fortran or (shape is not None and stored_shape != shape):
-            raise TableError(f'{path}: array "{name}" has the shape {stored_shape}, expected {shape}')
-        nbytes = math.prod(stored_shape) * dtype.itemsize
-        if nbytes > info.file_size:
-            raise TableError(f'{path}: array "{name}" claims {nbytes:,} bytes but the file holds {info.file_size:,}')
-        data = stream.read()  # checks the CRC
-    if len(data) != nbytes:
-        raise TableError(f'{path}: array "{name}" holds {len(data):,} bytes, expected {nbytes:,}')
-    return np.frombuffer(data, dtype).reshape(stored_shape)

@@ -126,6 +126,8 @@ def labelled(figures: Mapping[str, float]) -> list[str]:
         unit, digits = _FIGURE_UNITS.get(end, ("", None))
         words = ["of levels" if re.fullmatch(r"l\d+", word) else word for word in name.removesuffix(end).split("_")]
         label = " ".join(_WORDS.get(word, word) for word in words)
+        if name.startswith("psnr_map_"):  # a map that is called as another figure
+            label = "PSNR map " + name.removeprefix("psnr_map_").removesuffix(end)
         label = re.sub(r"(\d[\d.]*) (\d[\d.]*)$", r"\1 to \2", label)  # a range
         rows.setdefault((label, unit), []).append(f"{value:.4g}" if digits is None else f"{value:.{digits}f}")
     width = max((len(label) for label, _ in rows), default=0)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ..arguments import WORKER_ARGUMENTS, add_arguments
 from ..files import writable_folder
-from .common import natural, positive, require_scene, scene_options, set_variant, verb
+from .common import natural, positive, require_scene, say, scene_options, set_variant, verb
 
 HELP = "render views of a scene, or of 3D Gaussians, from all sides, with their poses"
 
@@ -75,5 +75,5 @@ def run(arguments) -> dict:
     names = ("views", "test", "resolution", "spp", "fov", "radius", "path", "seed", "format", "workers", "scheduler")
     given = {name: getattr(arguments, name) for name in (*names, "centre", "elevation", "up", "objects", "box")}
     captured = capture(arguments.scene, arguments.output, defines=dict(arguments.defines), **given)
-    print(captured)
+    say(captured)
     return {"scene": arguments.scene, **captured.figures}

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from .. import runtime
 from ..arguments import define, natural, positive
-from ..errors import UsageError
+from ..errors import UsageError, printable
 from ..files import check_distinct, irregular, shown
 
 
@@ -88,12 +88,18 @@ def learn_option(sub: argparse.ArgumentParser, default: str) -> None:
     )
 
 
+def say(text) -> None:
+    """Print a text of one or more lines; control characters, which strings of files may hold, are escaped."""
+    for line in str(text).splitlines():
+        print(printable(line))
+
+
 def print_conversions(conversions: list[dict]) -> None:
     """Print what was replaced and what was kept."""
     from .. import conversion
 
     for line in conversion.summary(conversions):
-        print(line)
+        say(line)
 
 
 def set_variant(name: str | None) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ..files import writable_folder
-from .common import learn_option, positive, require_scene, scene_options, set_variant, verb
+from .common import learn_option, positive, require_scene, say, scene_options, set_variant, verb
 
 HELP = "render a scene as written and with exact plugins, and show the difference"
 
@@ -50,6 +50,6 @@ def run(arguments) -> dict:
         defines=dict(arguments.defines),
     )
     paths = result.save(arguments.out)
-    print(result)
-    print(f"picture     {paths['figure']}")
+    say(result)
+    say(f"picture     {paths['figure']}")
     return {**result.figures, "further": [one.figures for one in result.further], "files": paths}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .common import learn_option, print_conversions, require_scene, scene_options, set_variant, verb
+from .common import learn_option, print_conversions, require_scene, say, scene_options, set_variant, verb
 
 HELP = "write a scene with learned plugins in place of Mitsuba's, fitted to what they show"
 
@@ -39,5 +39,5 @@ def run(arguments) -> dict:
         )
     ]
     print_conversions(conversions)
-    print(f"scene       {arguments.output}")
+    say(f"scene       {arguments.output}")
     return {"output": arguments.output, "conversions": conversions}

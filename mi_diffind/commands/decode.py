@@ -8,7 +8,7 @@ from ..arguments import add_arguments
 from ..errors import UsageError
 from ..files import writable_file
 from ..task import load_model, task_of, tasks
-from .common import set_variant, variant_option, verb
+from .common import say, set_variant, variant_option, verb
 
 HELP = "turn a table file back into ordinary files, as images"
 
@@ -45,5 +45,5 @@ def run(arguments) -> dict:
     model = load_model(arguments.file, array_module(arguments.variant).TensorXf)
     files = model.decode(Path(output), **given)
     for path, line in files:
-        print(f"{path}: {line}")
+        say(f"{path}: {line}")
     return {"file": arguments.file, "files": [str(path) for path, _ in files]}

@@ -7,7 +7,7 @@ from ..deadline import Deadline
 from ..files import writable_file, writable_folder
 from ..settings import LOSSES, SCHEDULES, FittingError
 from ..task import Task, fit, tasks
-from .common import alternative, alternatives, set_variant, variant_option, verb
+from .common import alternative, alternatives, say, set_variant, variant_option, verb
 
 #: Settings of a training that every task has: what they are, and the options of their parsers.
 SETTINGS = (
@@ -91,5 +91,5 @@ def run(arguments) -> dict:
     except RuntimeError as e:
         raise FittingError(str(e)) from e
     fitted.save(output)
-    print("\n".join(fitted.summary(output)))
+    say("\n".join(fitted.summary(output)))
     return {"output": str(output), **fitted.report, "task": task.name}

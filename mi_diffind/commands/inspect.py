@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .common import require_scene, scene_options, set_variant, verb
+from .common import require_scene, say, scene_options, set_variant, verb
 
 HELP = "describe a table file, or the plugins of this package in a scene"
 
@@ -30,5 +30,5 @@ def run(arguments) -> dict:
     from ..inspection import inspect
 
     inspection = inspect(arguments.file, arguments.measure, defines=dict(arguments.defines))
-    print("\n".join(inspection.lines(arguments.verbose)))
+    say("\n".join(inspection.lines(arguments.verbose)))
     return inspection.figures

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..files import writable_folder
-from .common import UsageError, natural, positive, require_scene, scene_options, set_variant, verb
+from .common import UsageError, natural, positive, require_scene, say, scene_options, set_variant, verb
 
 HELP = "check that scenes render as their stored references do"
 
@@ -55,12 +55,12 @@ def run(arguments) -> dict:
             result = regression.regress(path, update=arguments.update, references=arguments.references, **options)
             results.append(result.figures)
             if arguments.update and str(result):
-                print(result)
+                say(result)
             if result.figures["interrupted"]:
                 break
     finally:
         if results and not arguments.update:
-            print("\n".join(regression.summary(results)))
+            say("\n".join(regression.summary(results)))
     return {
         "interrupted": results[-1]["interrupted"],
         "failed": sum(r.get("passed") is False for r in results),

@@ -13,6 +13,7 @@ from .common import (
     positive,
     print_conversions,
     require_scene,
+    say,
     scene_options,
     set_variant,
     verb,
@@ -97,17 +98,17 @@ def run(arguments) -> dict:
     figures = rendering.figures
     print_conversions(figures["conversions"])
     if arguments.depth == "auto":
-        print("\n".join(depth.summary(figures["depth"])))
+        say("\n".join(depth.summary(figures["depth"])))
     rendering.save(output)
     size = f"{figures['width']} x {figures['height']}"
     time = f"{figures['seconds_render']:.1f} s in {figures['variant']}"
     if arguments.orbit:
         count, wanted = figures["frames"], figures["frames_requested"]
         kept = f"interrupted, kept {count} of {wanted}" if figures["interrupted"] else count
-        print(f"{output}: {kept} frames of {size}, {figures['spp']} spp, {time}")
+        say(f"{output}: {kept} frames of {size}, {figures['spp']} spp, {time}")
     else:
         kept = f"interrupted, kept {figures['spp']} of {figures['spp_requested']}"
-        print(f"{output}: {size}, {kept if figures['interrupted'] else figures['spp']} spp, {time}")
+        say(f"{output}: {size}, {kept if figures['interrupted'] else figures['spp']} spp, {time}")
     reports = scenes.reports(rendering.scene) if arguments.json is not None and not arguments.orbit else []
     return {**figures, "output": str(output), "reports": reports}
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from .. import tradeoffs
 from ..arguments import WORKER_ARGUMENTS, add_arguments
 from ..studies import studies
-from .common import alternative, alternatives, require_scene, scene_options, set_variant, variant_option, verb
+from .common import alternative, alternatives, require_scene, say, scene_options, set_variant, variant_option, verb
 
 HELP = "measure time against accuracy, of all forms of a task or of a scene"
 
@@ -42,5 +42,5 @@ def run(arguments) -> dict:
         require_scene(arguments.scene)
         arguments.defines = dict(arguments.defines)
     result = tradeoffs.run(study, arguments, lambda: set_variant(arguments.variant))
-    print(result)
+    say(result)
     return result.figures

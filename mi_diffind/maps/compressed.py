@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from types import ModuleType
 
@@ -85,7 +86,7 @@ class CompressedMaps:
             error = layout.encode(decoded[m.name]) - layout.encode(m.values)
             errors.append(float(np.mean(error**2, dtype=np.float64)))
             weights.append(layout.channels)
-            by_map[f"psnr_{m.name}_db"] = decibel(errors[-1])
+            by_map[map_figure(m.name)] = decibel(errors[-1])
         return {
             "psnr_db": decibel(float(np.average(errors, weights=weights))),
             "psnr_mean_db": float(np.mean(list(by_map.values()))),
@@ -158,6 +159,15 @@ class FilteredMaps(CompressedMaps):
         rows, columns = self.level_size(int(level))
         stored = self.stored if level == 0 else lambda u, v: self.filtered(u, v, dr.opaque(type(u), level))
         return self._decoded(stored, names, width or columns, height or rows)
+
+
+#: Words that stand for something else than a map in the names of figures.
+_FIGURES = re.compile(r"mean|between|worst|seen|shaded|scene|l\d+|seen_.*|shaded_.*|map_.*")
+
+
+def map_figure(name: str) -> str:
+    """Return the name of the PSNR of a map: ``psnr_NAME_db``, or ``psnr_map_NAME_db`` if that is another figure's."""
+    return f"psnr_map_{name}_db" if _FIGURES.fullmatch(name) else f"psnr_{name}_db"
 
 
 def taps(x: np.ndarray, n: int, border: str) -> list:

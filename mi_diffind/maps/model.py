@@ -16,7 +16,7 @@ from ..pages import SIDE_BITS, page_counts, page_shift
 from ..tables import PAGES, Table, TableError, allocate_pages, page_sides
 from ..task import Model
 from . import as_seen
-from .compressed import CompressedMaps
+from .compressed import CompressedMaps, map_figure
 from .source import load_source
 
 
@@ -76,7 +76,7 @@ class MapsModel(Model):
         size += f"{sum(m.channels for m in layout.maps)}, {layout.source_nbytes:,} bytes uncompressed: "
         lines = [size + (f"{ratio:.2f}x" if ratio else "of one colour"), f"{self.memory_nbytes:,} bytes in memory"]
         for m in layout.maps:
-            psnr = table.measured.get(f"psnr_{m.name}_db")
+            psnr = table.measured.get(map_figure(m.name))
             stored = [w if isinstance(w, int) else "from x and y" if w == "z" else f"is {w[1]:.4g}" for w in m.where]
             maps[m.name] = {"channels": m.channels, "color_space": m.color_space, "stored_as": stored, "psnr_db": psnr}
             error = f", {psnr:.2f} dB" if psnr is not None else ""

@@ -24,7 +24,9 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import DiffindError, reason
-from ..files import MOST_TEXT, irregular, shown
+from ..files import MOST_TEXT, OutsideError, irregular, path_within, shown
+from ..limits import Allowance, LimitError, json_bytes
+from ..picture_sizes import check_picture
 from ..units import memory
 
 #: Largest number of channels of all maps together.
@@ -169,7 +171,11 @@ def role_of(name: str) -> str:
 def _load_manifest(path: Path, nonfinite: str) -> Source:
     """Read a manifest and its images. Raises :class:`SourceError`."""
     try:
-        content = json.loads(_read_bytes(path).decode("utf-8-sig"), object_pairs_hook=_unique)
+        data = _read_bytes(path)
+        Allowance(path).check(json_bytes(data), "a manifest")
+        content = json.loads(data.decode("utf-8-sig"), object_pairs_hook=_unique)
+    except LimitError as e:
+        raise SourceError(str(e)) from None
     except (ValueError, RecursionError) as e:
         if isinstance(e, SourceError):
             raise
@@ -183,6 +189,8 @@ def _load_manifest(path: Path, nonfinite: str) -> Source:
     if not isinstance(entries, dict) or not entries:
         raise SourceError(f"{path}: has no maps, expected an object that gives each map's name a file")
 
+    if len(entries) > MAX_CHANNELS:  # of one channel or more, each an image in memory
+        raise SourceError(f"{path}: has {len(entries):,} maps, at most {MAX_CHANNELS} channels in all are supported")
     maps, images = [], {}
     for name, entry in entries.items():
         _check_name(path, name)
@@ -203,7 +211,10 @@ def _load_manifest(path: Path, nonfinite: str) -> Source:
             raise SourceError(
                 f'{path}: map "{name}" has the color space {color_space!r:.40}, allowed are {COLOR_SPACES}'
             )
-        file = path.parent / file
+        try:
+            file = path_within(path.parent, file, path)
+        except OutsideError as e:
+            raise SourceError(str(e)) from None
         if file not in images:
             images[file] = _read(file)
         role = role_of(name)
@@ -266,10 +277,18 @@ class _ImageFile:
 
 
 def _read(path: Path) -> _ImageFile:
-    """Read an image file. Raises :class:`SourceError` if ``mitsuba.Bitmap`` cannot read it or it is cut short."""
+    """Read an image file.
+
+    Raises :class:`SourceError` if ``mitsuba.Bitmap`` cannot read it, it is cut short, or it takes more memory than a
+    file of its size may (:mod:`~mi_diffind.limits`).
+    """
     import mitsuba as mi
 
     _check_complete(path, _read_bytes(path))
+    try:
+        check_picture(path)
+    except LimitError as e:
+        raise SourceError(str(e)) from None
     # A TGA file has no signature
     file_format = mi.Bitmap.FileFormat.TGA if path.suffix.lower() == ".tga" else mi.Bitmap.FileFormat.Auto
     try:

@@ -16,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from .. import __version__, plugins, scenes
+from ..archives import Archive
 from ..deadline import Deadline
 from ..errors import DiffindError
 from ..files import replacing, writable_folder
@@ -167,8 +168,8 @@ class ReferenceRenders:
         if path is None or not path.is_file():
             return 0.0, 0
         try:
-            with np.load(path, allow_pickle=False) as data:
-                total, done = data["total"], int(data["done"])
+            with Archive(path) as archive:
+                total, done = archive.array("total"), int(archive.array("done"))
         except Exception:  # zipfile and numpy each have their own for a damaged file
             return 0.0, 0
         return (total, done) if total.ndim == 3 and 0 < done <= self.spp else (0.0, 0)

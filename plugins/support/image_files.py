@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import shutil
 import threading
 import weakref
 from collections.abc import Callable
@@ -15,11 +16,13 @@ import numpy as np
 
 from mi_diffind import compat
 from mi_diffind.compat import module_of
-from mi_diffind.files import relative_path, write_json
+from mi_diffind.files import OutsideError, path_within, relative_path, write_json
+from mi_diffind.limits import LimitError
 from mi_diffind.maps.compressed import CompressedMaps
 from mi_diffind.maps.layout import Layout, MapLayout
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import Source, SourceError, from_arrays, load_source
+from mi_diffind.picture_sizes import check_picture
 from mi_diffind.tables import Table, TableError
 from mi_diffind.task import Task, stamp
 
@@ -237,6 +240,10 @@ def manifest_of(image: Path, folder: Path, raw: bool, normal: bool) -> Path:
 
     ``raw``: values are left as they are; ``normal``: they are a normal map. Raises ``RuntimeError``.
     """
+    try:
+        check_picture(image)
+    except LimitError as e:
+        raise RuntimeError(str(e)) from None
     bitmap = mi.Bitmap(str(image))
     formats = mi.Bitmap.PixelFormat
     entry = {
@@ -246,9 +253,25 @@ def manifest_of(image: Path, folder: Path, raw: bool, normal: bool) -> Path:
     if bitmap.pixel_format() in (formats.YA, formats.RGBA):
         entry["channels"] = "rgb" if bitmap.pixel_format() == formats.RGBA else "r"
     name = "normal" if normal else "data" if raw else "albedo"
-    path = folder / f"{image.stem}_{hashlib.sha256(str([name, entry]).encode()).hexdigest()[:12]}.json"
+    digest = hashlib.sha256(str([name, entry]).encode()).hexdigest()[:12]
+    path = folder / f"{image.stem}_{digest}.json"
+    try:
+        path_within(folder, entry["file"], path)
+    except OutsideError:
+        link = folder / f"{image.stem}_{digest}{image.suffix}"
+        _link(link, entry["file"])
+        entry["file"] = link.name
     write_json(path, {"maps": {name: entry}})
     return path
+
+
+def _link(link: Path, target: str) -> None:
+    """Make a symbolic link to a file at ``target``, relative to the link's folder; a copy where there are no links."""
+    link.unlink(missing_ok=True)
+    try:
+        link.symlink_to(target)
+    except OSError:
+        shutil.copyfile(link.parent / target, link)
 
 
 def _original(props, path: Path, settings: dict) -> Path:

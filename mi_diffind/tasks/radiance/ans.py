@@ -102,6 +102,8 @@ class SymbolDecoder:
         self.state = data[4 : 4 * (lanes + 1)].view("<u4").astype(np.int64)
         self.words = data[4 * (lanes + 1) :].view("<u2").astype(np.int64)
         self.place, self.probabilities, self.tables = 0, probabilities, {}
+        # A lane decodes one symbol after the other: few lanes for many symbols would take hours
+        self.left = np.inf if lanes == MOST_LANES else LANE_SYMBOLS * (lanes + 1)
 
     def code(self, group: str, contexts: int, symbols: int, context: np.ndarray, given=None) -> np.ndarray:
         """Return the symbol in each ``context``, for the same arguments as :meth:`SymbolEncoder.code`."""
@@ -115,6 +117,9 @@ class SymbolDecoder:
             self.tables[group] = share, total - share, lookup
         share, start, lookup = self.tables[group]
         context = np.asarray(context, np.int64)
+        self.left -= len(context)
+        if self.left < 0:
+            raise ValueError("found more symbols than its lanes hold")
         result = np.empty(len(context), np.int64)
         lanes, mask = len(self.state), (1 << PRECISION) - 1
         for first in range(0, len(context), lanes):

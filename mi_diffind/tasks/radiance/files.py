@@ -10,11 +10,21 @@ from pathlib import Path
 import numpy as np
 
 from ...indirection import Indirection, device_array, device_tensor
-from ...tables import StoredArray, Table, TableError, byte_array, check_numbers, load_layout, restored
+from ...limits import allowed
+from ...tables import (
+    StoredArray,
+    Table,
+    TableError,
+    byte_array,
+    check_allowance,
+    check_numbers,
+    load_layout,
+    restored,
+)
 from . import node_codes
 from .compression import INDEX_BITS, MOST_BITS, as_bytes
 from .grid import NodeGrid
-from .nodes import Nodes
+from .nodes import Nodes, layer_count, layers, unpacked
 from .paper import PairsField
 from .presets import COLOURS
 from .reflection import COLUMNS, DIRECTIONS, ENTRIES
@@ -37,6 +47,10 @@ LAYOUTS = {
 
 #: Most nodes of a grid, counting those that are not stored.
 MOST_NODES = 2**28
+
+#: Bytes of memory for each place of a grid, each one of the layers that are processed at a time, and each stored node,
+#: while a file is decoded and its field built, measured.
+PLACE_BYTES, LAYER_BYTES, NODE_BYTES = 0.55, 8, 30
 
 #: Bits of a density level of the layout "sparse", and most bits of one.
 SPARSE_BITS, MOST_DENSITY_BITS = 6, 6
@@ -80,15 +94,19 @@ def sparse(table: Table) -> Table:
         return table
     settings, palette = table.settings, table.arrays["palette"]
     probabilities, data = (table.arrays[name].entries.tobytes() for name in ("probabilities", "nodes"))
+    shape, count = tuple(settings["shape"]), 2 ** settings["density_bits"]
     try:
-        shape, count = tuple(settings["shape"]), 2 ** settings["density_bits"]
-        stored, levels, index = decoded(probabilities, data, shape, count, len(palette.entries))
+        most = _most_nodes(table.path, shape)
+        cells, levels, index = decoded(probabilities, data, shape, count, len(palette.entries), most)
+    except node_codes.TooManyNodes as e:
+        check_nodes(table, e.count)
+        raise TableError(f"{table.path}: is damaged: {e}") from None
     except ValueError as e:
         raise TableError(f"{table.path}: is damaged: {e}") from None
     arrays = {
-        "cells": byte_array(np.packbits(stored.reshape(-1))[:, None]),
+        "cells": byte_array(cells[:, None]),
         "density": byte_array(levels[:, None], settings["density_scale"], settings["density_offset"]),
-        "index": byte_array(np.stack([index & 255, index >> 8], axis=1)),
+        "index": byte_array(index.astype("<u2", copy=False).view(np.uint8).reshape(-1, 2)),
         "palette": palette,
     }
     if "environment" in table.arrays:
@@ -99,10 +117,45 @@ def sparse(table: Table) -> Table:
 
 @functools.lru_cache(maxsize=1)
 def decoded(probabilities: bytes, data: bytes, *sizes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return what :func:`.node_codes.decoded` does for bytes, with first entries for no node; the last call is kept."""
-    stored, *numbers = node_codes.decoded(*(np.frombuffer(b, np.uint8) for b in (probabilities, data)), *sizes)
-    levels, index = (np.concatenate([[0], values]) for values in numbers)
-    return stored, levels.astype(np.uint8), index.astype(np.uint32)
+    """Return flags of the stored nodes, eight to a byte, and their levels and indices; the last result is kept.
+
+    Levels (uint8) and indices (uint16) have a first entry of 0 for no node. Raises ``ValueError`` as
+    :func:`.node_codes.decoded_places` does, for the same arguments.
+    """
+    coding = (np.frombuffer(part, np.uint8) for part in (probabilities, data))
+    places, *numbers = node_codes.decoded_places(*coding, *sizes)
+    levels, index = (np.concatenate([np.zeros(1, values.dtype), values]) for values in numbers)
+    return _packed(places, math.prod(sizes[0])), levels, index
+
+
+def _packed(places: np.ndarray, size: int) -> np.ndarray:
+    """Return ``size`` flags, packed as ``np.packbits`` does, that are set at ``places`` in ascending order."""
+    packed, bytes_ = np.zeros(-(-size // 8), np.uint8), places >> 3
+    first = np.flatnonzero(np.diff(bytes_, prepend=-1))
+    if len(places):
+        packed[bytes_[first]] = np.bitwise_or.reduceat(np.uint8(128) >> (places & 7).astype(np.uint8), first)
+    return packed
+
+
+def check_nodes(table: Table, nodes: int = 0) -> None:
+    """Raise :class:`TableError` if the grid of a table and so many stored ``nodes`` take more memory than they may."""
+    shape = table.settings["shape"]
+    size = math.prod(shape)
+    content = f"a field of {nodes:,} nodes in a grid of {size:,}" if nodes else f"a field in a grid of {size:,} nodes"
+    check_allowance(table, _grid_bytes(shape) + NODE_BYTES * nodes, content)
+
+
+def _grid_bytes(shape) -> int:
+    """Return the bytes of memory of a grid without its stored nodes."""
+    return int(PLACE_BYTES * math.prod(shape) + LAYER_BYTES * (layer_count(shape) + 1) * math.prod(shape[1:]))
+
+
+def _most_nodes(path, shape) -> int:
+    """Return the most nodes that a coded file may store: those of :func:`check_nodes`."""
+    if path is None:
+        return node_codes.MOST_STORED
+    left = allowed(Path(path).stat().st_size) - _grid_bytes(shape)
+    return min(node_codes.MOST_STORED, max(0, left) // NODE_BYTES)
 
 
 def grid_table(grid: NodeGrid, dtype=np.float16) -> Table:
@@ -144,6 +197,7 @@ def load(path) -> Table:
     shape = table.settings["shape"]
     if min(shape) < 2 or math.prod(shape) > MOST_NODES:
         raise TableError(f"{path}: is damaged: found a grid of {shape}, allowed are at most {MOST_NODES:,} nodes")
+    check_nodes(table)
     if layout == "coded":
         check_numbers(table, "density_scale", 1, positive=True)
         check_numbers(table, "density_offset", 1)
@@ -158,7 +212,8 @@ def load(path) -> Table:
         for name in ("low", "high"):
             check_numbers(table, name, 13)
         return table
-    entries = int(np.count_nonzero(stored_of(table))) + 1
+    entries = sum(int(np.count_nonzero(part)) for part in layers(cells_of_file(table), shape)) + 1
+    check_nodes(table, entries - 1)
     names = ("density", "index") if layout == "sparse" else ("density", "colour")
     for name in names:
         stored = len(table.arrays[name].entries)
@@ -241,15 +296,19 @@ def stored(table: Table, entries: dict, storage: str = "") -> Table:
 
 def stored_of(table: Table) -> np.ndarray:
     """Return the mask of stored nodes: bool of the ``shape`` of the grid."""
-    shape = table.settings["shape"]
-    bits = np.unpackbits(np.ascontiguousarray(table.arrays["cells"].entries[:, 0]), count=math.prod(shape))
-    return bits.reshape(shape).astype(bool)
+    return unpacked(cells_of_file(table), table.settings["shape"])
+
+
+def cells_of_file(table: Table) -> np.ndarray:
+    """Return the flags of stored nodes, eight to a byte."""
+    return np.ascontiguousarray(table.arrays["cells"].entries[:, 0])
 
 
 def nodes_of(table: Table, types, packed: bool = False) -> Nodes:
     """Return the nodes of a checked table."""
     settings = table.settings
-    place = types, settings["lower"], settings["spacing"], settings["shape"], stored_of(table), packed
+    stored = cells_of_file(table) if packed else stored_of(table)
+    place = types, settings["lower"], settings["spacing"], settings["shape"], stored, packed
     return ContractedNodes(*place, inner=settings["inner"]) if "inner" in settings else Nodes(*place)
 
 

@@ -11,7 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import DiffindError, reason
-from ...files import irregular, shown
+from ...files import OutsideError, irregular, path_within, shown
+from ...limits import Allowance, LimitError
+from ...picture_sizes import check_picture
 from ...srgb import from_linear, to_linear
 from ...units import memory
 
@@ -31,7 +33,10 @@ class ViewsError(DiffindError, ValueError):
 
 def image_file(root: Path, name: str, file: Path) -> Path:
     """Return the path of an image in the folder ``root``, which the ``file`` with a list of views names."""
-    path = root / name
+    try:
+        path = path_within(root, name, file)
+    except OutsideError as e:
+        raise ViewsError(str(e)) from None
     for candidate in (path, *(path.with_name(path.name + e) for e in EXTENSIONS)):
         if fault := irregular(candidate, memory() // 4):
             raise ViewsError(f"{shown(candidate)}: {fault}, {file.name} names it")
@@ -56,6 +61,8 @@ def read_image(path: Path) -> tuple[np.ndarray, bool]:
         values = _read_bytes(path) if encoded else _read_exr(path)
     except (ViewsError, ImportError):
         raise
+    except LimitError as e:
+        raise ViewsError(str(e)) from None
     except Exception as e:  # each decoder raises errors of its own for a damaged file
         raise ViewsError(
             f"{path}: cannot be read as an image, it is damaged or of an unknown format ({reason(e)})"
@@ -119,11 +126,11 @@ def read_mask(path: Path, image: np.ndarray, image_path: Path) -> np.ndarray:
 
     Raises :class:`ViewsError`, also if the sizes differ.
     """
-    from PIL import Image
-
     try:
-        with Image.open(path) as opened:
+        with _opened(path, 1) as opened:
             mask = np.array(opened.convert("L")) > 0
+    except LimitError as e:
+        raise ViewsError(str(e)) from None
     except Exception as e:
         raise ViewsError(f"{path}: cannot be read as a mask ({reason(e)})") from None
     if mask.shape != image.shape[:2]:
@@ -132,11 +139,30 @@ def read_mask(path: Path, image: np.ndarray, image_path: Path) -> np.ndarray:
     return mask
 
 
-def _read_bytes(path: Path) -> np.ndarray:
-    """Return an image of 8 bits, ``(height, width, 1 to 4)``, uint8."""
+def _opened(path: Path, channels: int):
+    """Return an open image file of Pillow, not yet decoded, that may have so many ``channels`` of a byte.
+
+    Raises :class:`~mi_diffind.limits.LimitError` for one that takes more memory than a file of its size may.
+    """
     from PIL import Image
 
-    with Image.open(path) as image:
+    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None  # the limit here is the one of all readers
+    try:
+        image = Image.open(path)
+    finally:
+        Image.MAX_IMAGE_PIXELS = limit
+    try:
+        content = f"a picture of {image.width:,} x {image.height:,} pixels"
+        Allowance(path).check(channels * image.width * image.height, content)
+    except LimitError:
+        image.close()
+        raise
+    return image
+
+
+def _read_bytes(path: Path) -> np.ndarray:
+    """Return an image of 8 bits, ``(height, width, 1 to 4)``, uint8."""
+    with _opened(path, 4) as image:
         if image.mode not in ("RGB", "RGBA", "L", "LA"):
             if image.mode in ("CMYK", "YCbCr", "LAB", "HSV", "1", "F", "I") or image.mode.startswith("I;"):
                 raise ViewsError(f"{path}: has pixels of the mode {image.mode}, allowed are 8 bits of grey or RGB")
@@ -151,6 +177,7 @@ def _read_exr(path: Path) -> np.ndarray:
     """Return an EXR image, ``(height, width, 1 to 4)``, float32: R, G, B or Y, and A."""
     import OpenEXR
 
+    check_picture(path)
     with OpenEXR.File(str(path), separate_channels=True) as file:
         planes = {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}
     colours = next((c for c in (("R", "G", "B"), ("Y",)) if set(c) <= set(planes)), None)

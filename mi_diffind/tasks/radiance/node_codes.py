@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from . import ans
-from .nodes import cells_of, corners_of
+from .nodes import cells_of
 
 #: Parities of the coordinates of nodes, and of cells of twice the size, in the order in which they are coded.
 PARITIES = ((0, 0, 0), (1, 1, 1), (0, 1, 1), (1, 0, 1), (1, 1, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1))
@@ -37,6 +37,21 @@ HALVINGS = 4
 #: Most stored nodes of a file: a few bytes may claim any number.
 MOST_STORED = 2**25
 
+#: Nodes whose contexts are computed at a time.
+PART = 2**15
+
+#: Number of bits that are set in each 16-bit word.
+_COUNTS = np.unpackbits(np.arange(2**16, dtype="<u2").view(np.uint8)).reshape(-1, 16).sum(axis=1, dtype=np.uint8)
+
+
+class TooManyNodes(ValueError):
+    """Coded bytes hold more than the most nodes that are accepted; ``count`` is a lower bound of their number."""
+
+    def __init__(self, count: int, most: int):
+        super().__init__(f"found {count:,} nodes or more, at most {most:,} are accepted")
+        self.count = count
+
+
 _AROUND = np.array([o for o in np.ndindex(3, 3, 3) if o != (1, 1, 1)]) - 1
 _AROUND = _AROUND[np.argsort(np.square(_AROUND).sum(axis=1), kind="stable")]
 
@@ -45,17 +60,25 @@ _AROUND = _AROUND[np.argsort(np.square(_AROUND).sum(axis=1), kind="stable")]
 class Pass:
     """Nodes of a pass: their numbers ``rows`` from 0 on, in a ``group`` that shares probabilities.
 
-    ``near`` ``(m, k)`` are the numbers of coded neighbours, −1 where there is none, the nearest first, with ``weight``.
+    ``near`` ``(m, k)`` are the numbers of coded neighbours, −1 where there is none, the nearest first, with ``weight``;
+    in a decoder, parts of them are computed when they are needed.
     """
 
     rows: np.ndarray
-    near: np.ndarray
+    near: np.ndarray | _Near
     weight: np.ndarray
     group: str
 
     def level_context(self, levels: np.ndarray, count: int) -> np.ndarray:
         """Return the context of the level of each node, below ``7 * count + 1``, given those of coded nodes."""
-        here, known = levels.astype(np.int64)[self.near], self.near >= 0
+        context = np.empty(len(self.near), np.int64)
+        for first in range(0, len(context), PART):
+            part = slice(first, first + PART)
+            context[part] = self._level_context(self.near[part], levels, count)
+        return context
+
+    def _level_context(self, near: np.ndarray, levels: np.ndarray, count: int) -> np.ndarray:
+        here, known = levels[near].astype(np.int64), near >= 0
         weight = known * self.weight
         total = weight.sum(axis=1)
         whole = np.maximum(total, 1)
@@ -66,7 +89,14 @@ class Pass:
 
     def named(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return different indices of coded neighbours, ``(m, NAMED)``, −1 where there are fewer, and a context."""
-        here = np.where(self.near >= 0, index.astype(np.int64)[self.near], -1)
+        names, context = np.empty((len(self.near), NAMED), np.int32), np.empty(len(self.near), np.int64)
+        for first in range(0, len(context), PART):
+            part = slice(first, first + PART)
+            names[part], context[part] = self._named(self.near[part], index)
+        return names, context
+
+    def _named(self, near: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        here = np.where(near >= 0, index[near].astype(np.int64), -1)
         here = np.pad(here, ((0, 0), (0, NEAR - here.shape[1])), constant_values=-1)
         names, count = np.full((len(here), NAMED), -1), np.zeros(len(here), int)
         first = np.where(here[:, 0] >= 0, here[:, 0], here.max(axis=1, initial=-1))
@@ -82,36 +112,89 @@ class Pass:
 NAMED_CONTEXTS = (NAMED + 1) * (NEAR + 1)
 
 
+class _Rows:
+    """Rows of stored nodes by their place in the grid, from one bit for each place and a rank for each 16 places.
+
+    ``keys`` are the places in ascending order.
+    """
+
+    def __init__(self, keys: np.ndarray, size: int):
+        words = keys >> 4
+        first = np.flatnonzero(np.diff(words, prepend=-1))
+        self._words = np.zeros(-(-size // 16), np.uint16)
+        if len(keys):
+            self._words[words[first]] = np.bitwise_or.reduceat(np.uint16(1) << (keys & 15).astype(np.uint16), first)
+        self._ranks = np.cumsum(_COUNTS[self._words], dtype=np.int32)
+        self._keys = keys
+
+    def __call__(self, keys: np.ndarray) -> np.ndarray:
+        """Return the row of each place, −1 where no node is stored."""
+        at, bit = keys >> 4, (keys & 15).astype(np.uint16)
+        above = self._words[at] >> bit
+        return np.where(above & 1, self._ranks[at] - _COUNTS[above], np.int32(-1))
+
+    def around(self, rows: np.ndarray, offsets: list[int]) -> np.ndarray:
+        """Return the rows of the places at ``offsets`` from those of some ``rows``, (m, k) int32."""
+        at = self._keys[rows]
+        near = np.empty((len(rows), max(1, len(offsets))), np.int32)
+        near[:, len(offsets) :] = -1
+        for column, offset in enumerate(offsets):
+            near[:, column] = self(at + np.int32(offset))
+        return near
+
+
+@dataclass
+class _Near:
+    """Rows of the places at ``offsets`` from those of some ``rows``: computed for each part of them that is read."""
+
+    rows_at: _Rows
+    rows: np.ndarray
+    offsets: list[int]
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __getitem__(self, part: slice) -> np.ndarray:
+        return self.rows_at.around(self.rows[part], self.offsets)
+
+
 def passes_of(stored: np.ndarray) -> list[Pass]:
     """Return the passes of a mask of stored nodes; a node is in one of them."""
-    place = np.argwhere(stored).astype(np.int32)
+    return passes_at(np.flatnonzero(stored).astype(np.int32), stored.shape)
+
+
+def passes_at(places: np.ndarray, shape: tuple, keep: bool = True) -> list[Pass]:
+    """Return the passes of the nodes at ``places`` (n,) int32, flat and in ascending order, in a grid of ``shape``.
+
+    With ``keep``, their neighbours stay in memory, 32 bytes a node.
+    """
     room = STRIDES[0]
-    sides = np.array(stored.shape) + 2 * room
-    numbers = np.full(sides, -1, np.int32)
-    numbers[tuple((place + room).T)] = np.arange(len(place))
-    numbers = numbers.reshape(-1)
+    sides = np.array(shape) + 2 * room
     steps = np.array([sides[1] * sides[2], sides[2], 1])
-    flat = (place + room) @ steps
-    kind_of = {parity: rank for rank, parity in enumerate(PARITIES)}
-    finest = ((place % (2 * STRIDES[0])) == 0).all(axis=1)
-    result = [_pass(np.flatnonzero(finest), np.zeros((0, 3), int), 1, flat, steps, numbers, "first")]
+    flat, bits = np.empty(len(places), np.int32), {stride: np.empty(len(places), np.uint8) for stride in STRIDES}
+    for first in range(0, len(places), PART):
+        part = slice(first, first + PART)
+        place = _unravelled(places[part], shape)
+        flat[part] = (place + room) @ steps
+        for stride in STRIDES:
+            # Bits of the coordinates, one above the stride, and all bits below it
+            on = ((place & (stride - 1)) == 0).all(axis=1)
+            bits[stride][part] = np.where(on, (place // stride & 1) @ np.array([4, 2, 1]), 8)
+    rows_at = _Rows(flat, int(np.prod(sides)))
+    rank_of = {parity: rank for rank, parity in enumerate(PARITIES)}
+
+    def of(rows: np.ndarray, around: list, stride: int, group: str) -> Pass:
+        rows, offsets = rows.astype(np.int32), [stride * int(o @ steps) for o in around]
+        weight = np.array([WEIGHTS[int(o @ o)] for o in around] or [1], np.int64)
+        return Pass(rows, rows_at.around(rows, offsets) if keep else _Near(rows_at, rows, offsets), weight, group)
+
+    result = [of(np.flatnonzero(bits[STRIDES[0]] == 0), [], 1, "first")]
     for stride in STRIDES:
-        on = ((place % stride) == 0).all(axis=1)
         for rank, parity in enumerate(PARITIES[1:], 1):
-            rows = np.flatnonzero(on & ((place // stride & 1) == parity).all(axis=1))
-            coded = [o for o in _AROUND if kind_of[tuple((np.array(parity) + o) & 1)] < rank]
-            group = "coarse" if stride > 1 else str(sum(parity))
-            result.append(_pass(rows, np.array(coded[:NEAR]), stride, flat, steps, numbers, group))
+            coded = [o for o in _AROUND if rank_of[tuple((np.array(parity) + o) & 1)] < rank]
+            rows = np.flatnonzero(bits[stride] == _bit_of(parity))
+            result.append(of(rows, coded[:NEAR], stride, "coarse" if stride > 1 else str(sum(parity))))
     return result
-
-
-def _pass(rows, around, stride, flat, steps, numbers, group) -> Pass:
-    near = np.stack([numbers[flat[rows] + stride * int(o @ steps)] for o in around], axis=1) if len(around) else None
-    weight = np.array([WEIGHTS[int(o @ o)] for o in around], np.int64)
-    if near is None:
-        near = np.full((len(rows), 1), -1, np.int32)
-        weight = np.ones(1, np.int64)
-    return Pass(rows, near, weight, group)
 
 
 def encoded(stored: np.ndarray, levels: np.ndarray, index: np.ndarray, level_count: int, colours: int) -> tuple:
@@ -122,21 +205,50 @@ def encoded(stored: np.ndarray, levels: np.ndarray, index: np.ndarray, level_cou
     """
     coder = ans.SymbolEncoder()
     _cells(coder, tuple(n - 1 for n in stored.shape), cells_of(stored))
-    _numbers(coder, stored, level_count, colours, levels, index)
+    _numbers(coder, passes_of(stored), level_count, colours, levels, index)
     return coder.finish()
 
 
-def decoded(probabilities, data, shape, level_count: int, colours: int) -> tuple:
-    """Return the mask of stored nodes, their levels and their indices. Raises ``ValueError`` for damaged bytes."""
+def decoded(probabilities, data, shape, level_count: int, colours: int, most: int = MOST_STORED) -> tuple:
+    """Return the mask of stored nodes, their levels and their indices, as :func:`decoded_places` does."""
+    places, levels, index = decoded_places(probabilities, data, shape, level_count, colours, most)
+    stored = np.zeros(int(np.prod(shape)), bool)
+    stored[places] = True
+    return stored.reshape(shape), levels, index
+
+
+def decoded_places(probabilities, data, shape, level_count: int, colours: int, most: int = MOST_STORED) -> tuple:
+    """Return the places of stored nodes, flat and in ascending order, their levels and their indices.
+
+    Memory grows with the nodes, and takes half a byte for each place of the grid. Raises ``ValueError`` for damaged
+    bytes, :class:`TooManyNodes` for more than ``most`` nodes.
+    """
     coder = ans.SymbolDecoder(probabilities, data)
-    stored = corners_of(_cells(coder, tuple(n - 1 for n in shape)))
-    if (count := np.count_nonzero(stored)) > MOST_STORED:
-        raise ValueError(f"found {count:,} nodes, at most {MOST_STORED:,} are accepted")
-    return stored, *_numbers(coder, stored, level_count, colours)
+    places = _corners(_cells(coder, tuple(n - 1 for n in shape), most=most), shape, most)
+    return places, *_numbers(coder, passes_at(places, shape, keep=False), level_count, colours)
 
 
-def _cells(coder, shape: tuple, cells: np.ndarray | None = None) -> np.ndarray:
-    """Code a mask of cells from coarse to fine: the halves of occupied cells, given the cells around them."""
+def _corners(cells: np.ndarray, shape: tuple, most: int) -> np.ndarray:
+    """Return the places of the corners of ``cells``, in a grid of ``shape`` nodes, flat and in ascending order.
+
+    Cells are given by the places of their first corners.
+    """
+    places = cells
+    for step in (1, shape[2], shape[1] * shape[2]):
+        places = np.concatenate([places, places + np.int32(step)])
+        places.sort()
+        places = places[np.concatenate([[True], places[1:] != places[:-1]])[: len(places)]]
+        if len(places) > most:
+            raise TooManyNodes(len(places), most)
+    return places
+
+
+def _cells(coder, shape: tuple, cells: np.ndarray | None = None, most: int = MOST_STORED) -> np.ndarray:
+    """Code a mask of cells from coarse to fine: the halves of occupied cells, given the cells around them.
+
+    Returns the places of the first corners of the occupied cells, int32, in ascending order. Raises
+    :class:`TooManyNodes` for more than ``most`` cells.
+    """
     sides = [shape]
     for _ in range(HALVINGS):
         sides.append(tuple(-(-n // 2) for n in sides[-1]))
@@ -148,38 +260,61 @@ def _cells(coder, shape: tuple, cells: np.ndarray | None = None) -> np.ndarray:
             masks[level] = before.reshape(x, 2, y, 2, z, 2).any(axis=(1, 3, 5))
     count = int(np.prod(sides[-1]))
     known = None if cells is None else masks[-1].reshape(-1)
-    mask = np.asarray(coder.code("blocks", 1, 2, np.zeros(count, int), known)).reshape(sides[-1]).astype(bool)
+    occupied = np.asarray(coder.code("blocks", 1, 2, np.zeros(count, np.int64), known)).astype(bool)
+    parents = _unravelled(np.flatnonzero(occupied), sides[-1])
     for level in reversed(range(HALVINGS)):
-        inside = np.array(sides[level])
-        parents = np.argwhere(mask)
-        around = np.zeros(2 * np.array(mask.shape) + 2, np.uint8)
-        around[1:-1, 1:-1, 1:-1] = mask.repeat(2, axis=0).repeat(2, axis=1).repeat(2, axis=2)
-        steps = np.array([around.shape[1] * around.shape[2], around.shape[2], 1])
-        flat = around.reshape(-1)
+        inside, room = np.array(sides[level]), np.array(sides[level + 1]) + 2
+        steps = np.array([room[1] * room[2], room[2], 1])
+        # A byte for each larger cell, with a border of empty ones, and a bit for each of its halves: first all, if the
+        # larger cell is occupied, then those that are
+        halves, flat = np.zeros(int(np.prod(room)), np.uint8), (parents + 1) @ steps
+        halves[flat] = 255
         for rank, parity in enumerate(PARITIES):
-            place = 2 * parents + parity
-            outside = (place >= inside).any(axis=1)
-            at = (place + 1) @ steps
-            flat[at[outside]] = 0
-            place, at = place[~outside], at[~outside]
+            within = (2 * parents + np.int32(parity) < inside).all(axis=1)
+            halves[flat[~within]] &= np.uint8(255 ^ 1 << _bit_of(parity))
+            at = flat[within]
             beside, near = np.zeros(len(at), np.uint8), np.zeros(len(at), np.uint8)
             for o in _AROUND:
-                value = flat[at + int(o @ steps)]
+                place = np.array(parity) + o
+                value = halves[at + int((place >> 1) @ steps)] >> np.uint8(_bit_of(place & 1)) & np.uint8(1)
                 if o @ o == 1:
                     beside += value
                 else:
                     near += value
-            context = (rank * 7 + beside.astype(int)) * 7 + np.minimum(near // 3, 6)
-            known = None if cells is None else masks[level][tuple(place.T)]
-            flat[at] = coder.code(f"cells {min(level, 2)}", 8 * 49, 2, context, known)
-        mask = around[1:-1, 1:-1, 1:-1][tuple(slice(n) for n in sides[level])].astype(bool)
-    return mask
+            context = (rank * 7 + beside.astype(np.int64)) * 7 + np.minimum(near // 3, 6)
+            known = None if cells is None else masks[level][tuple((2 * parents[within] + parity).T)]
+            symbol = np.asarray(coder.code(f"cells {min(level, 2)}", 8 * 49, 2, context, known))
+            halves[at[symbol == 0]] &= np.uint8(255 ^ 1 << _bit_of(parity))
+        if (count := int(_COUNTS[halves[flat]].sum())) > most:
+            raise TooManyNodes(count, most)
+        grid = tuple(n + 1 for n in shape) if level == 0 else sides[level]
+        places = []
+        for parity in PARITIES:
+            owner = np.flatnonzero(halves[flat] & 1 << _bit_of(parity))
+            corner = (2 * parents[owner] + np.int32(parity)).T
+            places.append(np.ravel_multi_index(corner, grid).astype(np.int32))
+        places = np.concatenate(places)
+        places.sort()
+        if level:
+            parents = _unravelled(places, grid)
+    return places
 
 
-def _numbers(coder, stored, level_count: int, colours: int, levels=None, index=None) -> tuple:
+def _unravelled(places: np.ndarray, shape: tuple) -> np.ndarray:
+    """Return flat places of a grid as coordinates, (n, 3) int32."""
+    return np.stack([x.astype(np.int32) for x in np.unravel_index(places, shape)], axis=1)
+
+
+def _bit_of(parity) -> int:
+    """Return the bit of a half by its place in the larger cell, three numbers 0 or 1."""
+    x, y, z = parity
+    return int(4 * x + 2 * y + z)
+
+
+def _numbers(coder, passes: list[Pass], level_count: int, colours: int, levels=None, index=None) -> tuple:
     """Code the levels and the indices of nodes, each given those of its coded neighbours."""
-    passes, count = passes_of(stored), int(np.count_nonzero(stored))
-    coded_levels, coded_index = np.zeros(count, np.int64), np.zeros(count, np.int64)
+    count = sum(len(part.rows) for part in passes)
+    coded_levels, coded_index = np.zeros(count, np.uint8), np.zeros(count, np.uint16)
     for part in passes:
         context = part.level_context(coded_levels, level_count)
         known = None if levels is None else levels[part.rows]

@@ -20,6 +20,12 @@ COARSE = 2
 #: Largest stored distance, in cells of the coarser grid: 4 bits.
 FARTHEST = 15
 
+#: Nodes of a dense grid that are processed at a time, in whole layers (:func:`layer_count`): each takes several bytes.
+PART = 2**20
+
+#: Cells along a side of the parts of the coarser grid whose distances are computed at a time, 12 bytes each.
+TILE = 64
+
 #: Cells of a column, along z. Each of its 32 nodes has a bit; the last node is also the first of the next column.
 COLUMN = 31
 
@@ -30,13 +36,14 @@ class Nodes:
     ``stored``, bool of this shape, marks the nodes of a sparse grid. They are numbered from 1 in lexicographic order,
     and 0 stands for no node. Without ``stored``, all nodes are numbered from 0. The index that maps positions to
     numbers has a word for each node of the grid or, if ``packed``, bit masks and ranks in a tenth of that memory.
+    ``stored`` may then be the flags as ``np.packbits`` returns them, uint8, and the mask takes no memory.
     """
 
     def __init__(self, types, lower, spacing: float, shape, stored: np.ndarray | None = None, packed: bool = False):
         self.types = types
         self.lower, self.spacing = tuple(map(float, lower)), float(spacing)
         self.shape = tuple(int(n) for n in shape)
-        self.stored = stored
+        self._stored = stored
         #: Contraction of space (:class:`.surroundings.Contraction`), if the grid has one.
         self.contraction = None
         # Opaque: grids of another size use the same kernels
@@ -46,15 +53,21 @@ class Nodes:
         self._sides = dr.opaque(types.Array3u, self.shape)
         self.index = self.columns = self.filled = self.distances = None
         if stored is not None:
-            self.coarse_distances = chessboard_distances(cells_of(stored))
+            self.coarse_distances = _farthest(_occupied(stored, self.shape))
             self.distances = device_array(types.UInt32, nibbles(self.coarse_distances))
             self._coarse = dr.opaque(types.Array3u, self.coarse_distances.shape)
             if packed:
-                filled, columns = column_words(stored)
+                filled, columns = column_words(stored, self.shape)
                 self._columns = dr.opaque(types.UInt32, columns_of(self.shape[2]))
                 self.filled, self.columns = (device_array(types.UInt32, v) for v in (filled, columns))
             else:
                 self.index = device_array(types.UInt32, numbered(stored))
+
+    @property
+    def stored(self) -> np.ndarray | None:
+        """Mask of the stored nodes, ``None`` for all."""
+        packed = self._stored is not None and self._stored.dtype == np.uint8
+        return unpacked(self._stored, self.shape) if packed else self._stored
 
     @property
     def nbytes(self) -> int:
@@ -65,12 +78,14 @@ class Nodes:
     @property
     def count(self) -> int:
         """Number of stored nodes."""
-        return int(np.count_nonzero(self.stored)) if self.stored is not None else int(np.prod(self.shape))
+        if self._stored is None:
+            return int(np.prod(self.shape))
+        return sum(int(np.count_nonzero(part)) for part in layers(self._stored, self.shape))
 
     @property
     def entries(self) -> int:
         """Entries of an array indexed by node numbers: one for each node and, in a sparse grid, one for no node."""
-        return self.count + (self.stored is not None)
+        return self.count + (self._stored is not None)
 
     @property
     def upper(self) -> tuple[float, float, float]:
@@ -101,7 +116,7 @@ class Nodes:
         """Return the number of the first corner of the cell that holds ``p``; 0 if the cell is empty."""
         (x, y, z), _ = self._place(p)
         at = dr.fma(dr.fma(x, self._sides.y, y), self._sides.z, z)
-        return at if self.stored is None else dr.gather(self.types.UInt32, self.index, at, active)
+        return at if self._stored is None else dr.gather(self.types.UInt32, self.index, at, active)
 
     def cells_where(self, chosen: np.ndarray) -> np.ndarray:
         """Return the cells ``(X − 1, Y − 1, Z − 1)`` whose first corners are ``chosen``, bool for each entry."""
@@ -164,6 +179,45 @@ class Nodes:
         return dr.select(active & (steps > 0), length, 0)
 
 
+def unpacked(flags: np.ndarray, shape) -> np.ndarray:
+    """Return the mask of ``shape`` that ``np.packbits`` has packed, bool."""
+    return np.unpackbits(flags, count=int(np.prod(shape))).view(bool).reshape(shape)
+
+
+def layer_count(shape) -> int:
+    """Return how many layers of a grid of ``shape`` are processed at a time, a multiple of :data:`COARSE`."""
+    return COARSE * max(1, PART // (COARSE * int(shape[1]) * int(shape[2])))
+
+
+def layers(stored: np.ndarray, shape, more: int = 0):
+    """Yield parts of :func:`layer_count` layers along the first axis of a mask, or of its packed flags, one by one.
+
+    Each part has ``more`` layers of the next part at its end, as far as there are any.
+    """
+    layer, count = int(shape[1]) * int(shape[2]), layer_count(shape)
+    for first in range(0, shape[0], count):
+        last = min(first + count + more, shape[0])
+        if stored.dtype == np.uint8:
+            begin, end = first * layer // 8, -(-last * layer // 8)
+            flags = np.unpackbits(stored[begin:end])[first * layer - 8 * begin :][: (last - first) * layer]
+            yield flags.view(bool).reshape(last - first, *shape[1:])
+        else:
+            yield stored[first:last]
+
+
+def _occupied(stored: np.ndarray, shape) -> np.ndarray:
+    """Return the cells of the coarser grid that hold an occupied cell, of a mask or its packed flags."""
+    parts = [_coarser(cells_of(part)) for part in layers(stored, shape, 1) if len(part) > 1]
+    return np.concatenate(parts)
+
+
+def _coarser(cells: np.ndarray) -> np.ndarray:
+    """Return which cells of the coarser grid hold one of the ``cells``."""
+    padded = np.pad(cells, [(0, -n % COARSE) for n in cells.shape])
+    x, y, z = (n // COARSE for n in padded.shape)
+    return padded.reshape(x, COARSE, y, COARSE, z, COARSE).any(axis=(1, 3, 5))
+
+
 def cells_of(stored: np.ndarray) -> np.ndarray:
     """Return the occupied cells, bool ``(X − 1, Y − 1, Z − 1)``, of ``stored`` nodes: all their corners are stored."""
     cells = np.ones(tuple(n - 1 for n in stored.shape), bool)
@@ -185,12 +239,20 @@ def chessboard_distances(cells: np.ndarray) -> np.ndarray:
 
     Distances are in cells of the coarser grid, in the maximum norm, at most :data:`FARTHEST`; uint8.
     """
-    padded = np.pad(cells, [(0, -n % COARSE) for n in cells.shape])
-    x, y, z = (n // COARSE for n in padded.shape)
-    occupied = padded.reshape(x, COARSE, y, COARSE, z, COARSE).any(axis=(1, 3, 5))
-    if not occupied.any():
-        return np.full(occupied.shape, FARTHEST, np.uint8)
-    return np.minimum(distance_transform_cdt(~occupied, "chessboard"), FARTHEST).astype(np.uint8)
+    return _farthest(_coarser(cells))
+
+
+def _farthest(occupied: np.ndarray) -> np.ndarray:
+    """Return the distance of each cell of the coarser grid to the nearest ``occupied`` one, as above."""
+    result = np.full(occupied.shape, FARTHEST, np.uint8)
+    for tile in np.ndindex(*(-(-n // TILE) for n in occupied.shape)):
+        begin = [max(0, TILE * i - FARTHEST) for i in tile]
+        part = occupied[tuple(slice(b, TILE * (i + 1) + FARTHEST) for b, i in zip(begin, tile, strict=True))]
+        if part.any():
+            inner = tuple(slice(TILE * i - b, TILE * (i + 1) - b) for b, i in zip(begin, tile, strict=True))
+            distance = distance_transform_cdt(~part, "chessboard")[inner]
+            result[tuple(slice(TILE * i, TILE * (i + 1)) for i in tile)] = np.minimum(distance, FARTHEST)
+    return result
 
 
 def nibbles(values: np.ndarray) -> np.ndarray:
@@ -209,24 +271,30 @@ def numbered(stored: np.ndarray) -> np.ndarray:
     return numbers
 
 
-def column_words(stored: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the numbers of nodes as masks and ranks: two uint32 arrays.
+def column_words(stored: np.ndarray, shape=None) -> tuple[np.ndarray, np.ndarray]:
+    """Return the numbers of nodes as masks and ranks, of a mask or its packed flags: two uint32 arrays.
 
     The first, ``(w, 2)``, holds a bit for each column, set if the column has stored nodes, 32 to a word, and the number
     of set bits before. The second, ``(c, 2)``, holds the mask of each such column and the number of its first node.
     """
-    x, y, z = stored.shape
-    count = columns_of(z)
-    padded = np.pad(stored, [(0, 0), (0, 0), (0, count * COLUMN + 1 - z)])
-    bits = np.stack([padded[:, :, c * COLUMN : c * COLUMN + 32] for c in range(count)], axis=2).reshape(-1, 32)
-    counts = bits[:, :COLUMN].sum(axis=1)  # the last node is the next column's first
-    counts.reshape(x * y, count)[:, -1] += bits.reshape(x * y, count, 32)[:, -1, -1]
-    first = 1 + np.cumsum(counts) - counts
-    filled = bits.any(axis=1)
-    columns = np.stack([mask_words(bits[filled])[:, 0], first[filled].astype(np.uint32)], axis=1)
+    shape = stored.shape if shape is None else shape
+    count = columns_of(shape[2])
+    filled, columns, nodes = [], [], 1
+    for part in layers(stored, shape):
+        lines = part.shape[0] * part.shape[1]
+        padded = np.pad(part, [(0, 0), (0, 0), (0, count * COLUMN + 1 - shape[2])])
+        bits = np.stack([padded[:, :, c * COLUMN : c * COLUMN + 32] for c in range(count)], axis=2).reshape(-1, 32)
+        counts = bits[:, :COLUMN].sum(axis=1)  # the last node is the next column's first
+        counts.reshape(lines, count)[:, -1] += bits.reshape(lines, count, 32)[:, -1, -1]
+        first = nodes + np.cumsum(counts) - counts
+        nodes += int(counts.sum())
+        some = bits.any(axis=1)
+        filled.append(some)
+        columns.append(np.stack([mask_words(bits[some])[:, 0], first[some].astype(np.uint32)], axis=1))
+    filled = np.concatenate(filled)
     masks = np.pad(filled, (0, -len(filled) % 32)).reshape(-1, 32)
     before = np.cumsum(masks.sum(axis=1)) - masks.sum(axis=1)
-    return np.stack([mask_words(masks)[:, 0], before.astype(np.uint32)], axis=1), columns
+    return np.stack([mask_words(masks)[:, 0], before.astype(np.uint32)], axis=1), np.concatenate(columns)
 
 
 def columns_of(nodes: int) -> int:

@@ -16,6 +16,7 @@ import numpy as np
 
 from ...errors import reason
 from ...files import MOST_TEXT, irregular, shown
+from ...limits import Allowance, LimitError, json_bytes
 from .image_files import ViewsError
 from .lenses import DISTORTION
 
@@ -115,7 +116,11 @@ def _parse(file: Path) -> tuple[dict, list[dict]]:
     if fault := irregular(file, MOST_TEXT):
         raise ViewsError(f"{shown(file)}: {fault}")
     try:
-        content = json.loads(file.read_text(encoding="utf-8-sig"))
+        data = file.read_bytes()
+        Allowance(file).check(json_bytes(data), "a list of views")
+        content = json.loads(data.decode("utf-8-sig"))
+    except LimitError as e:
+        raise ViewsError(str(e)) from None
     except (ValueError, RecursionError) as e:
         raise ViewsError(f"{file}: is not valid JSON ({reason(e)})") from None
     except OSError as e:

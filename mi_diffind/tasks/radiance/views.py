@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ... import units
 from ...indirection import aligned
 from ...progress import progress_bar
 from . import background as backgrounds
@@ -298,6 +299,12 @@ class _Images:
         words, size = self.pixels.shape[1], image.shape[0] * image.shape[1]
         end = self.count + size
         if end > len(self.pixels):  # the first time, or if a larger image follows: memory that nobody writes is free
+            needed = 4 * words * (self.count + (self.views - len(self.sizes) + 1) * size)
+            if needed > units.memory():
+                raise ViewsError(
+                    f"{self.views:,} images of {size:,} pixels take {needed:,} bytes of memory, this machine has "
+                    f"{units.memory():,}: a larger --downscale makes them smaller"
+                )
             grown = aligned((self.count + (self.views - len(self.sizes) + 1) * size, words), np.uint32)
             grown[: self.count] = self.pixels[: self.count]
             self.pixels = grown

@@ -23,7 +23,7 @@ from ...bits import mask_flags, mask_words
 from ...indirection import device_array
 from . import codes
 from .nodes import CORNERS, MIDDLE, bernstein
-from .structure import ACTIVE, BLOCK, place_of
+from .structure import ACTIVE, BLOCK, first_ranks, place_of
 
 #: Places along the ray at which the field is evaluated in a cell, and steps by false position from there.
 SAMPLES, ROOTS = 3, 3
@@ -47,6 +47,9 @@ SLAB, STEPS, MARGIN = 10.0, 65535, 1e-3
 
 _lock = threading.RLock()  # a thread that waits for the copy of an array may load another shape
 
+#: Blocks whose cells are processed at a time.
+PART = 2**10
+
 
 class GridCells:
     """Cells of a structure's blocks, for B blocks with nodes (NumPy).
@@ -54,46 +57,71 @@ class GridCells:
     - ``crossed`` (B, 64) bool: whether all corners of each cell are stored;
     - ``inside`` (B, 64) bool: the sign of the other cells;
     - ``beside`` (B, 8): the blocks that the corners of cells lie in, the block itself where there is none;
-    - ``empty_signs`` (X, Y, Z) bool: signs of blocks without nodes, at their places in the grid of blocks;
-    - ``node`` (B, 5, 5, 5): the numbers of the nodes at the corners of cells, −1 where none is stored.
+    - ``empty_signs`` (X, Y, Z) bool: signs of blocks without nodes, at their places in the grid of blocks.
     """
 
     def __init__(self, structure):
+        self._structure, self._first = structure, first_ranks(structure.block_masks).astype(np.int32)
         place = structure.block_positions() // BLOCK
-        number = np.full([n // BLOCK + 1 for n in structure.shape], -1)
-        number[tuple(place.T)] = np.arange(len(place))
-        beside = np.stack([number[tuple((place + n).T)] for n in CORNERS], axis=1)
-
+        self._neighbours = _neighbours(place, [n // BLOCK + 1 for n in structure.shape])
         # Signs of blocks without nodes; beyond the grid outside
         regions = structure.regions.shape
         signs = np.repeat((structure.regions & 1).astype(bool)[..., None], 64, axis=-1)
         signs[structure.regions == ACTIVE] = mask_flags(structure.region_signs)
         signs = signs.reshape(*regions, 4, 4, 4).transpose(0, 3, 1, 4, 2, 5)
         self.empty_signs = signs.reshape([4 * n for n in regions])
+        del signs  # a dense grid takes most of the memory
         empty = np.pad(self.empty_signs, [(0, 1)] * 3)
 
-        stored_nodes = np.concatenate(
-            [mask_flags(structure.block_masks).reshape(-1, 4, 4, 4), np.zeros((1, 4, 4, 4), bool)]
-        )
         groups = (structure.block_signs[:, None] >> np.arange(8) & 1).astype(bool).reshape(-1, 2, 2, 2)
-        node_signs = groups.repeat(2, 1).repeat(2, 2).repeat(2, 3)
-        inside = np.zeros((len(place), 5, 5, 5), bool)
-        numbers, self.node = np.full((len(place) + 1, 4, 4, 4), -1), np.full((len(place), 5, 5, 5), -1)
-        numbers[stored_nodes] = np.arange(stored_nodes.sum())
-        for neighbour, n in zip(beside.T, CORNERS, strict=True):
-            target = (slice(None), *(slice(4 * e, 4 + e) for e in n))
-            source = (slice(None), *(slice(0, 1 if e else 4) for e in n))
-            self.node[target] = numbers[neighbour][source]
-            sign = empty[tuple((place + n).T)][:, None, None, None]
-            inside[target] = np.where(neighbour[:, None, None, None] >= 0, node_signs[neighbour], sign)[source]
-        stored = self.node >= 0
-        crossed, within = np.ones((len(place), 4, 4, 4), bool), np.zeros((len(place), 4, 4, 4), bool)
-        for a, b, c in CORNERS:
-            corner = (slice(None), slice(a, a + 4), slice(b, b + 4), slice(c, c + 4))
-            crossed &= stored[corner]
-            within |= ~stored[corner] & inside[corner]
-        self.crossed, self.inside = crossed.reshape(-1, 64), within.reshape(-1, 64)
-        self.beside = np.where(beside < 0, np.arange(len(place))[:, None], beside)
+        self.crossed, self.inside = np.empty((2, len(place), 4, 4, 4), bool)
+        for part in self.parts():
+            inside, neighbours = np.zeros((len(place[part]), 5, 5, 5), bool), self._neighbours[part]
+            for neighbour, n in zip(neighbours.T, CORNERS, strict=True):
+                target, source = _shared(n)
+                signs = groups[neighbour].repeat(2, 1).repeat(2, 2).repeat(2, 3)
+                sign = empty[tuple((place[part] + n).T)][:, None, None, None]
+                inside[target] = np.where(neighbour[:, None, None, None] >= 0, signs, sign)[source]
+            stored = self.nodes(part) >= 0
+            crossed, within = np.ones((len(stored), 4, 4, 4), bool), np.zeros((len(stored), 4, 4, 4), bool)
+            for a, b, c in CORNERS:
+                corner = (slice(None), slice(a, a + 4), slice(b, b + 4), slice(c, c + 4))
+                crossed &= stored[corner]
+                within |= ~stored[corner] & inside[corner]
+            self.crossed[part], self.inside[part] = crossed, within
+        self.crossed, self.inside = self.crossed.reshape(-1, 64), self.inside.reshape(-1, 64)
+        self.beside = np.where(self._neighbours < 0, np.arange(len(place), dtype=np.int32)[:, None], self._neighbours)
+
+    def parts(self) -> list[slice]:
+        """Return slices of :data:`PART` blocks, which are processed at a time."""
+        return [slice(first, first + PART) for first in range(0, len(self._neighbours), PART)]
+
+    def nodes(self, part: slice) -> np.ndarray:
+        """Return the numbers of the nodes at the corners of the cells of some blocks, −1 where none is stored.
+
+        They have the shape (m, 5, 5, 5).
+        """
+        neighbours = self._neighbours[part]
+        node = np.full((len(neighbours), 5, 5, 5), -1, np.int32)
+        for neighbour, n in zip(neighbours.T, CORNERS, strict=True):
+            target, source = _shared(n)
+            stored = mask_flags(self._structure.block_masks[neighbour]) & (neighbour >= 0)[:, None]
+            numbers = self._first[neighbour, None] + np.cumsum(stored, axis=1, dtype=np.int32) - 1
+            node[target] = np.where(stored, numbers, -1).reshape(-1, 4, 4, 4)[source]
+        return node
+
+
+def _neighbours(place: np.ndarray, shape: list[int]) -> np.ndarray:
+    """Return the numbers of the blocks that the corners of the cells of each block lie in, (B, 8), −1 for none."""
+    number = np.full(shape, -1, np.int32)
+    number[tuple(place.T)] = np.arange(len(place))
+    return np.stack([number[tuple((place + n).T)] for n in CORNERS], axis=1)
+
+
+def _shared(corner: tuple) -> tuple[tuple, tuple]:
+    """Return the part of the nodes (m, 5, 5, 5) of cells that a neighbour holds, and its place in the neighbour."""
+    target = (slice(None), *(slice(4 * e, 4 + e) for e in corner))
+    return target, (slice(None), *(slice(0, 1 if e else 4) for e in corner))
 
 
 def slab_words(cells: GridCells, nodes, frames) -> np.ndarray:
@@ -107,22 +135,23 @@ def slab_words(cells: GridCells, nodes, frames) -> np.ndarray:
     normals = np.stack([nx, ny, nz], axis=1)
     lower, upper = np.full((2, len(frames)), np.inf)
     upper *= -1
-    block, bit = np.nonzero(cells.crossed)
-    cell, corners, part = place_of(bit), np.array(CORNERS), 2**17
-    for first in range(0, len(block), part):
-        b, at = block[first : first + part], cell[first : first + part, None] + corners
-        residual = nodes[cells.node[b[:, None], at[..., 0], at[..., 1], at[..., 2]]].astype(np.float64)
-        residual[..., 0] -= distances[b, None] + np.einsum("mki,mi->mk", at - MIDDLE, normals[b])
-        residual[..., 1:] -= normals[b, None]
+    corners = np.array(CORNERS)
+    half = np.abs(normals).sum(axis=1) / 2
+    for part in cells.parts():
+        node, distance, normal = cells.nodes(part), distances[part], normals[part]
+        block, bit = np.nonzero(cells.crossed[part])
+        at = place_of(bit)[:, None] + corners
+        residual = nodes[node[block[:, None], at[..., 0], at[..., 1], at[..., 2]]].astype(np.float64)
+        residual[..., 0] -= distance[block, None] + np.einsum("mki,mi->mk", at - MIDDLE, normal[block])
+        residual[..., 1:] -= normal[block, None]
         coefficients = bernstein(residual)
-        np.minimum.at(lower, b, -coefficients.max(axis=1))
-        np.maximum.at(upper, b, -coefficients.min(axis=1))
-    block, bit = np.nonzero(~cells.crossed)
-    within = cells.inside[block, bit]
-    planes = distances[block] + np.einsum("mi,mi->m", place_of(bit) - MIDDLE + 0.5, normals[block])
-    half = np.abs(normals[block]).sum(axis=1) / 2
-    np.maximum.at(upper, block[within], (planes + half)[within])
-    np.minimum.at(lower, block[~within], (planes - half)[~within])
+        np.minimum.at(lower[part], block, -coefficients.max(axis=1))
+        np.maximum.at(upper[part], block, -coefficients.min(axis=1))
+        block, bit = np.nonzero(~cells.crossed[part])
+        within = cells.inside[part][block, bit]
+        planes = distance[block] + np.einsum("mi,mi->m", place_of(bit) - MIDDLE + 0.5, normal[block])
+        np.maximum.at(upper[part], block[within], (planes + half[part][block])[within])
+        np.minimum.at(lower[part], block[~within], (planes - half[part][block])[~within])
     scale = STEPS / (2 * SLAB)
     lower = np.floor((np.clip(lower - MARGIN, -SLAB, SLAB) + SLAB) * scale).astype(np.uint32)
     upper = np.ceil((np.clip(upper + MARGIN, -SLAB, SLAB) + SLAB) * scale).astype(np.uint32)
@@ -135,27 +164,40 @@ def empty_space_words(structure, cells: GridCells) -> tuple[np.ndarray, np.ndarr
     A region's word is the number of its blocks' words, or flags and distance (:data:`EMPTY`); the words of the blocks
     ``(R, 64)`` of regions that are not empty are the number of the block, or flags and distance.
     """
-    empty = cells.empty_signs
-    number, full = np.zeros(empty.shape, np.uint32), np.zeros(empty.shape, bool)
-    at = tuple((structure.block_positions() // BLOCK).T)
-    full[at] = cells.crossed.any(axis=1)
-    number[at] = np.arange(len(cells.crossed))
-    sign = empty.copy()
-    sign[at] = cells.inside[:, 0]  # where no cell is crossed, all have the same
-    shape = structure.regions.shape
-
-    def by_region(v):
-        return v.reshape(np.stack([shape, (4, 4, 4)], 1).ravel()).transpose(0, 2, 4, 1, 3, 5).reshape(-1, 64)
-
-    def flags(full, sign):
-        far = distance_transform_cdt(~full, "chessboard") if full.any() else np.full(full.shape, max(full.shape))
-        return np.int64(EMPTY) | np.where(sign, INSIDE, 0) | far
-
-    blocks = by_region(np.where(full, number, flags(full, sign)).astype(np.uint32))
-    some = by_region(full).any(axis=1)
-    regions = flags(some.reshape(shape), by_region(sign)[:, 0].reshape(shape)).ravel()
+    sign, place = cells.empty_signs.copy(), structure.block_positions() // BLOCK
+    full = np.zeros(sign.shape, bool)
+    full[tuple(place.T)] = crossed = cells.crossed.any(axis=1)
+    sign[tuple(place.T)] = cells.inside[:, 0]  # where no cell is crossed, all have the same
+    layers, first_blocks = structure.regions.shape[0], place[:, 0] // 4
+    some, region_signs, words = [], [], []
+    for layer in range(layers):
+        inner = slice(4 * layer, 4 * layer + 4)
+        # A region that is not empty has a crossed block, at most three blocks from any other: one layer more each way
+        halo = slice(max(0, inner.start - 4), min(4 * layers, inner.stop + 4))
+        word = _empty_words(full[halo], sign[halo])[inner.start - halo.start :][:4]
+        rows = np.arange(*np.searchsorted(first_blocks, [layer, layer + 1]))
+        rows = rows[crossed[rows]]
+        x, y, z = place[rows].T
+        word[x - inner.start, y, z] = rows
+        some.append(_by_region(full[inner]).any(axis=1))
+        region_signs.append(_by_region(sign[inner])[:, 0].copy())
+        words.append(_by_region(word)[some[-1]])
+    some, shape = np.concatenate(some), structure.regions.shape
+    regions = _empty_words(some.reshape(shape), np.concatenate(region_signs).reshape(shape)).ravel()
     regions[some] = np.arange(some.sum())
-    return regions.astype(np.uint32), blocks[some]
+    return regions, np.concatenate(words)
+
+
+def _by_region(values: np.ndarray) -> np.ndarray:
+    """Return the values of a grid of blocks (4 X, 4 Y, 4 Z) by region: (X Y Z, 64)."""
+    shape = [n // 4 for n in values.shape]
+    return values.reshape(np.stack([shape, (4, 4, 4)], 1).ravel()).transpose(0, 2, 4, 1, 3, 5).reshape(-1, 64)
+
+
+def _empty_words(full: np.ndarray, sign: np.ndarray) -> np.ndarray:
+    """Return the flags of the elements of a grid and their distances to the nearest one that is ``full``, uint32."""
+    far = distance_transform_cdt(~full, "chessboard") if full.any() else np.full(full.shape, max(full.shape), np.int32)
+    return np.uint32(EMPTY) | np.where(sign, np.uint32(INSIDE), np.uint32(0)) | far.astype(np.uint32)
 
 
 class Marcher:

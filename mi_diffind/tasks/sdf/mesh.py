@@ -11,6 +11,7 @@ import functools
 import hashlib
 import logging
 import os
+import re
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -154,8 +155,7 @@ def make_mesh(vertices: np.ndarray, faces: np.ndarray, name: str = "mesh") -> Me
         raise MeshError(f"{name}: has vertices {vertices.shape} and faces {faces.shape}, expected (V, 3) and (F, 3)")
     if len(faces) == 0:
         raise MeshError(f"{name}: has no triangles, expected a surface that encloses a solid")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise MeshError(f"{name}: a triangle names vertex {int(faces.max())} of {len(vertices)}")
+    _check_indices(name, faces, len(vertices))
     vertices, faces = _joined(vertices, faces)
     if not np.all(np.isfinite(vertices)):
         raise MeshError(f"{name}: has vertices that are NaN or infinite, allowed are finite ones")
@@ -180,6 +180,14 @@ def make_mesh(vertices: np.ndarray, faces: np.ndarray, name: str = "mesh") -> Me
     if mesh.watertight and abs(mesh.volume) < NO_VOLUME:
         raise MeshError(f"{name}: encloses no volume, expected the surface of a solid")
     return mesh
+
+
+def _check_indices(name, faces: np.ndarray, count: int) -> None:
+    """Raise :class:`MeshError` for a triangle that names a vertex which does not exist."""
+    lowest, highest = int(faces.min()), int(faces.max())
+    if lowest < 0 or highest >= count:
+        wrong = lowest if lowest < 0 else highest
+        raise MeshError(f"{name}: a triangle names vertex {wrong}, there are vertices 0 to {count - 1}")
 
 
 def split_part(path: str | os.PathLike) -> tuple[Path, str]:
@@ -207,8 +215,15 @@ def _read(path: Path, part: str = "") -> tuple[np.ndarray, np.ndarray]:
                 loaded = trimesh.load(path, process=False)
     except MemoryError:
         raise
+    except ImportError as e:
+        quoted = re.search(r"pip install ([\w\[\]-]+)|No module named '(\w+)", str(e))
+        module = e.name or (quoted and (quoted[1] or quoted[2])) or "trimesh[easy]"
+        raise MeshError(
+            f"{path}: {path.suffix} files need a Python module that is not installed: pip install {module}"
+        ) from None
     except Exception as e:  # readers of a dozen formats raise whatever they like
-        raise MeshError(f"{path}: cannot be read as a mesh ({reason(e)})") from None
+        fault = f"{type(e).__name__}: {reason(e)}"
+        raise MeshError(f"{path}: cannot be read as a mesh, it is damaged or of an unknown format ({fault})") from None
     finally:
         logging.getLogger("trimesh").setLevel(level)
     if isinstance(loaded, trimesh.Scene):
@@ -222,8 +237,7 @@ def _read(path: Path, part: str = "") -> tuple[np.ndarray, np.ndarray]:
             continue
         triangles, mirrored = np.asarray(geometry.faces), np.linalg.det(matrix[:3, :3]) < 0
         points = np.asarray(geometry.vertices, dtype=np.float64)
-        if triangles.min() < 0 or triangles.max() >= len(points):
-            raise MeshError(f"{path}: a triangle names vertex {int(triangles.max())} of {len(points)}")
+        _check_indices(path, triangles, len(points))
         vertices.append(points if np.array_equal(matrix, np.eye(4)) else points @ matrix[:3, :3].T + matrix[:3, 3])
         faces.append((triangles[:, ::-1] if mirrored else triangles) + first)
         first += len(points)

@@ -13,7 +13,16 @@ from ...compat import module_of
 from ...errors import UsageError
 from ...files import replacing
 from ...indirection import Indirection, device_tensor
-from ...tables import StoredArray, Table, TableError, byte_array, check_numbers, load_layout, restored
+from ...tables import (
+    StoredArray,
+    Table,
+    TableError,
+    byte_array,
+    check_allowance,
+    check_numbers,
+    load_layout,
+    restored,
+)  # fmt: skip
 from ...task import Model
 from ...units import check_memory
 from . import codes
@@ -30,6 +39,9 @@ LAYOUTS = {
 
 #: Bytes of memory for each cell of a side's square while a surface is extracted, roughly.
 TRIANGLES = 128
+
+#: Bytes of memory for each region, block and node while a sparse field and its index for rays are built, measured.
+REGION_BYTES, BLOCK_BYTES, NODE_BYTES = 300, 400, 28
 
 #: Extensions of the mesh formats that ``decode`` writes, through trimesh.
 MESHES = (".ply", ".obj", ".stl", ".off", ".glb")
@@ -62,6 +74,10 @@ def load(path) -> Table:
     for name in ("scale", "slope", *(("spacing", "bits", "nodes") if sparse else ("band",))):
         check_numbers(table, name, 1, positive=True)
     if sparse:
+        check_numbers(table, "nodes", 1, positive=True, whole=True)
+        regions, blocks = table.arrays["regions"].entries.size, len(table.arrays["blocks"].entries)
+        nbytes = REGION_BYTES * regions + BLOCK_BYTES * blocks + NODE_BYTES * table.settings["nodes"]
+        check_allowance(table, nbytes, f"a field of {regions:,} regions and {blocks:,} blocks")
         structure_of(table)
     return table
 
@@ -113,7 +129,7 @@ def field_of(table: Table, arrays: dict, types, storage: str = "") -> DistanceFi
     entries = table.arrays["entries"].values
     if storage == "float32":
         pointers = codes.pointers_of(words, settings["bits"], structure.nodes)
-        nodes = decoded_nodes(structure, frames, entries[pointers])
+        nodes = decoded_nodes(structure, frames, entries, pointers)
         return SparseNodes(types, structure, settings["slope"], nodes=device_tensor(types.TensorXf, nodes))
     return coded_field(types, structure, settings["slope"], frames, words, settings["bits"], entries)
 

@@ -13,13 +13,17 @@ from __future__ import annotations
 import drjit as dr
 import numpy as np
 
+from ...bits import mask_flags
 from ...indirection import device_array
 from . import codes
 from .field import DistanceField
-from .structure import ACTIVE, BLOCK, Structure, first_ranks
+from .structure import ACTIVE, BLOCK, Structure, first_ranks, place_of
 
 #: Largest distance that a field returns, in spacings.
 BAND = 2.0
+
+#: Blocks whose nodes are decoded at a time.
+PART = 2**10
 
 CORNERS = [(a, b, c) for a in (0, 1) for b in (0, 1) for c in (0, 1)]
 
@@ -229,7 +233,7 @@ class SparseNodes(DistanceField):
             return None
         pointers = codes.pointers_of(np.array(self._pointers), self.bits, self.structure.nodes)
         entries = np.stack(codes.entries(np.array(self._entries), *self._affine), axis=1)
-        return decoded_nodes(self.structure, self.frames(), entries[pointers])
+        return decoded_nodes(self.structure, self.frames(), entries, pointers)
 
     @property
     def nbytes(self) -> int:
@@ -302,11 +306,23 @@ def middles(positions: np.ndarray) -> np.ndarray:
     return positions % BLOCK - MIDDLE
 
 
-def decoded_nodes(structure: Structure, frames: np.ndarray, entries: np.ndarray) -> np.ndarray:
-    """Decode nodes: distances in spacings and normals, (n, 4) float32, from frames (B,) and entries of nodes (n, 3)."""
-    positions, block = structure.node_positions()
-    n, d, scale = codes.frames(frames)
-    distance, normal = codes.decode_nodes(
-        entries.astype(np.float64).T, [v[block] for v in n], d[block], scale[block], middles(positions).T
-    )
-    return np.stack([distance, *normal], axis=1).astype(np.float32)
+def decoded_nodes(
+    structure: Structure, frames: np.ndarray, entries: np.ndarray, pointers: np.ndarray | None = None
+) -> np.ndarray:
+    """Decode nodes: distances in spacings and normals, (n, 4) float32, from the frames (B,) of their blocks.
+
+    ``entries`` are those of the nodes (n, 3) or, with ``pointers`` (n,), those that the pointers name.
+    """
+    result, first = np.empty((structure.nodes, 4), np.float32), 0
+    for part in range(0, structure.blocks, PART):
+        block, bit = np.nonzero(mask_flags(structure.block_masks[part : part + PART]))
+        rows = slice(first, first + len(block))
+        n, d, scale = (
+            [v[block] for v in value] if isinstance(value, tuple) else value[block]
+            for value in codes.frames(frames[part : part + PART])
+        )
+        entry = entries[rows] if pointers is None else entries[pointers[rows]]
+        distance, normal = codes.decode_nodes(entry.astype(np.float64).T, n, d, scale, middles(place_of(bit)).T)
+        result[rows] = np.stack([distance, *normal], axis=1)
+        first = rows.stop
+    return result

@@ -14,7 +14,7 @@ from ...errors import UsageError
 from ...indirection import DifferentiableArray, aligned_copy
 from ...lookup import BORDERS
 from ...maps.arguments import BIAS_RANGE
-from ...maps.compressed import FilteredMaps, decibel
+from ...maps.compressed import FilteredMaps, decibel, map_figure
 from ...maps.layout import Layout
 from ...maps.model import MapsModel, allocate_maps, page_entries
 from ...maps.pyramid import Pyramid, level_sizes
@@ -89,7 +89,7 @@ class CompressedTexture(FilteredMaps):
                 errors.append(float(np.mean((got - expected) ** 2, dtype=np.float64)))
                 weights.append(layout.channels)
                 if level == 0:
-                    by_map[f"psnr_{m.name}_db"] = decibel(errors[-1])
+                    by_map[map_figure(m.name)] = decibel(errors[-1])
                     means = [x.mean(axis=(0, 1), dtype=np.float64) for x in (got, expected)]
                     worst_mean = max(worst_mean, float(np.abs(means[0] - means[1]).max()))
             by_level.append(decibel(float(np.average(errors, weights=weights))))

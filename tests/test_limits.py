@@ -1,0 +1,423 @@
+"""Files of strangers: a small file takes little memory, whatever it claims, and its text cannot steer a terminal."""
+
+import io
+import json
+import os
+import struct
+import subprocess
+import sys
+import textwrap
+import zipfile
+import zlib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mi_diffind import DiffindError, TableError, load_table, save_table
+from mi_diffind.archives import ArchiveError, read_arrays
+from mi_diffind.errors import LONGEST_MESSAGE, UsageError
+from mi_diffind.files import PATHS, OutputError
+from mi_diffind.fitting import checkpoint_settings
+from mi_diffind.inspection import Inspection
+from mi_diffind.limits import FACTOR, FREE, VARIABLE, Allowance, LimitError, allowed, json_bytes
+from mi_diffind.maps.compressed import map_figure
+from mi_diffind.maps.source import SourceError, from_arrays, load_source
+from mi_diffind.picture_sizes import picture_size
+from mi_diffind.tables import StoredArray, Table, byte_array
+from mi_diffind.tasks.radiance import ans, files, node_codes
+from mi_diffind.tasks.radiance.image_files import ViewsError, image_file, read_image
+from mi_diffind.tasks.sdf.mesh import MeshError, load_mesh, make_mesh
+from mi_diffind.units import labelled
+
+ROOT = Path(__file__).resolve().parents[1]
+
+#: Bytes that a process may take beside the content of a file, for what it imports and its allocator.
+SLACK = 24 * 2**20
+
+CHILD = """
+import resource, sys
+from pathlib import Path
+import numpy, PIL.Image, OpenEXR, mitsuba, scipy.ndimage
+from mi_diffind.errors import DiffindError
+from mi_diffind.fitting import checkpoint_settings
+from mi_diffind.maps.source import load_source
+from mi_diffind.tables import load_table
+from mi_diffind.tasks.radiance import files
+from mi_diffind.tasks.radiance.image_files import read_image
+from mi_diffind.tasks.sdf import model
+READERS = {"table": load_table, "sdf": model.load, "field": files.load, "source": load_source, "image": read_image,
+           "checkpoint": checkpoint_settings}
+peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+for line in sys.stdin.read().splitlines():
+    reader, path = line.split(" ", 1)
+    before = peak()
+    try:
+        READERS[reader](Path(path))
+        outcome = "read"
+    except DiffindError as e:
+        outcome = str(e)
+    print(peak() - before, outcome)
+"""
+
+
+def npy(array) -> bytes:
+    buffer = io.BytesIO()
+    np.lib.format.write_array(buffer, np.asarray(array), version=(1, 0))
+    return buffer.getvalue()
+
+
+def archive(path, members: dict) -> Path:
+    """Write an archive of members in bytes, deflated."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as file:
+        for name, content in members.items():
+            file.writestr(f"{name}.npy", content)
+    return path
+
+
+def meta_of(arrays: dict, settings=(), task="a task", **more) -> np.ndarray:
+    meta = {"format_version": 2, "task": task, "preset": "", "arrays": arrays, "settings": dict(settings), "seed": 0}
+    return np.frombuffer(json.dumps({**meta, "measured": {}, **more}).encode(), np.uint8)
+
+
+def described(shape, bits=8) -> dict:
+    return {
+        "shape": list(shape), "border": ["clamp"] * (len(shape) - 1), "storage": "uint8", "scale": [1.0] * shape[-1],
+        "offset": [0.0] * shape[-1], "bits": bits,
+    }  # fmt: skip
+
+
+def few_bits(path) -> Path:
+    """A table of 2²⁹ entries of one bit, all 0, in 65 KB."""
+    shape = (2**29, 1)
+    return archive(path, {"meta": npy(meta_of({"a": described(shape, 1)})), "a": npy(np.zeros(2**26, np.uint8))})
+
+
+def long_meta(path) -> Path:
+    """A description of 60 MB, lists within lists, in 60 KB."""
+    text = meta_of({}, {"x": None}).tobytes().replace(b"null", b"[" + b"[],[]," * 10**7 + b"0]")
+    return archive(path, {"meta": npy(np.frombuffer(text, np.uint8))})
+
+
+def lying_sizes(path) -> Path:
+    """An array of 400 bytes by its header in the archive, of 400 MB by its stream."""
+    archive(path, {"meta": npy(meta_of({"a": described((400, 1))})), "a": npy(np.zeros(400 * 10**6, np.uint8))})
+    content = bytearray(path.read_bytes())
+    real, claimed = (struct.pack("<I", n + 128) for n in (400 * 10**6, 400))
+    assert content.count(real) == 2  # of the member, and in the directory
+    path.write_bytes(content.replace(real, claimed))
+    return path
+
+
+def many_regions(path) -> Path:
+    """A distance field of 128³ empty regions beside those of a real one."""
+    table = load_table(ROOT / "scenes/assets/knot.npz")
+    regions = np.zeros((128, 128, 128, 1), np.uint8)
+    real = table.arrays["regions"]
+    regions[tuple(slice(n) for n in real.shape)] = real.entries
+    save_table(path, replace(table, arrays={**table.arrays, "regions": replace(real, entries=regions)}))
+    return path
+
+
+def wide_grid(path, side=600) -> Path:
+    """A radiance field with a grid of ``side``³ nodes, none of them stored."""
+    table = load_table(ROOT / "scenes/assets/group.npz")
+    cells = byte_array(np.zeros((side**3 // 8, 1), np.uint8))
+    first = {n: replace(table.arrays[n], entries=table.arrays[n].entries[:1]) for n in ("density", "index")}
+    settings = {**table.settings, "shape": [side] * 3}
+    save_table(path, replace(table, arrays={**table.arrays, **first, "cells": cells}, settings=settings))
+    return path
+
+
+def coded_table(path, shape, claimed) -> Path:
+    """A coded radiance field whose nodes are all stored; its settings claim the shape ``claimed``."""
+    table = load_table(ROOT / "scenes/assets/group.npz")
+    count = int(np.prod(shape))
+    palette = table.arrays["palette"]
+    numbers = np.zeros(count, int), np.zeros(count, int)
+    coding = node_codes.encoded(np.ones(shape, bool), *numbers, 64, len(palette.entries))
+    arrays = dict(zip(("probabilities", "nodes"), (byte_array(c[:, None]) for c in coding), strict=True))
+    settings = {**table.settings, "layout": "coded", "shape": list(claimed), "density_bits": 6, "density_scale": 1.0}
+    others = {n: a for n, a in table.arrays.items() if n in ("palette", "environment")}
+    save_table(path, replace(table, arrays=arrays | others, settings={**settings, "density_offset": 0.0}))
+    return path
+
+
+def png(path, width: int, height: int, depth: int, colour: int = 0) -> Path:
+    """A black PNG."""
+
+    def chunk(name, data):
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    stream = zlib.compressobj(9)
+    row = bytes(1 + (width * depth * {0: 1, 2: 3}[colour] + 7) // 8)
+    data = b"".join(stream.compress(row) for _ in range(height)) + stream.flush()
+    head = struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0)
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", data) + chunk(b"IEND", b""))
+    return path
+
+
+def checkpoint(path) -> Path:
+    text = b'{"lr_scale": 1, "settings": {}, "history": [' + b"[],[]," * 10**7 + b"0]}"
+    return archive(path, {"meta": npy(np.frombuffer(text, np.uint8))})
+
+
+def test_small_files_take_little_memory(tmp_path):
+    """The attacks of a small file on each reader, in a child process: refused, within the rule's memory."""
+    attacks = {
+        "table few_bits": few_bits, "table long_meta": long_meta, "table lying_sizes": lying_sizes,
+        "sdf many_regions": many_regions, "field wide_grid": wide_grid,
+        "field coded_wide": lambda path: coded_table(path, (60,) * 3, (600,) * 3),
+        "source black.png": lambda path: png(path, 16000, 16000, 1),
+        "image black.png": lambda path: png(path, 12000, 12000, 1),
+        "checkpoint long": checkpoint,
+    }  # fmt: skip
+    lines, sizes = [], []
+    for name, write in attacks.items():
+        reader, file = name.split(" ")
+        path = tmp_path / reader / (file if "." in file else f"{file}.npz")
+        path.parent.mkdir(exist_ok=True)
+        lines.append(f"{reader} {write(path)}")
+        sizes.append(path.stat().st_size)
+    assert max(sizes) < 500_000
+    child = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(CHILD)], input="\n".join(lines), capture_output=True, text=True, cwd=ROOT
+    )
+    assert child.returncode == 0, child.stderr
+    outcomes = child.stdout.splitlines()
+    assert len(outcomes) == len(attacks)
+    for name, size, line in zip(attacks, sizes, outcomes, strict=True):
+        grown, outcome = line.split(" ", 1)
+        assert int(grown) < FREE + FACTOR * size + SLACK, (name, grown)
+        if not name.startswith("checkpoint"):  # of a file that is none, there are no settings
+            assert outcome != "read" and len(outcome) <= LONGEST_MESSAGE, (name, outcome)
+
+
+def test_the_limit_and_how_to_raise_it(tmp_path, monkeypatch):
+    monkeypatch.delenv(VARIABLE, raising=False)
+    assert allowed(0) == FREE and allowed(10**6) == FREE + FACTOR * 10**6
+    path = tmp_path / "file"
+    path.write_bytes(bytes(1000))
+    allowance = Allowance(path)
+    allowance.take(FREE, "a part")
+    with pytest.raises(LimitError, match=rf"file: a part .* file of 1,000 bytes .*{VARIABLE}=1G allows more"):
+        allowance.take(FREE, "a part")
+    monkeypatch.setenv(VARIABLE, "1G")
+    assert allowed(0) == 2**30 and allowed(10**8) == FREE + FACTOR * 10**8  # it raises only
+    with pytest.raises(LimitError, match="this machine has"):
+        Allowance(path).take(2**60, "a part")
+    monkeypatch.setenv(VARIABLE, "much")
+    with pytest.raises(UsageError, match=rf"{VARIABLE}: 'much' is not a number of bytes"):
+        allowed(0)
+
+
+def test_a_raised_limit_reads_the_file(tmp_path, monkeypatch):
+    path = archive(
+        tmp_path / "t.npz",
+        {"meta": npy(meta_of({"a": described((2**24, 1))})), "a": npy(np.zeros((2**24, 1), np.uint8))},
+    )
+    with pytest.raises(TableError, match=VARIABLE):
+        load_table(path)
+    monkeypatch.setenv(VARIABLE, "200M")
+    assert load_table(path).arrays["a"].shape == (2**24, 1)
+
+
+def test_the_bound_of_json_holds():
+    """Against the memory that parsing takes, for the texts that take the most."""
+    import tracemalloc
+
+    for part in (
+        b"[],",
+        b"{},",
+        b'{"a":1},',
+        b"1.5,",
+        b'"\xc3\xa9",',
+        "\U0001f600".join(('"', '",')).encode(),
+        b"[[]],",
+    ):
+        text = b"[" + part * 20_000 + b"0]"
+        tracemalloc.start()
+        content = json.loads(text)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert len(content) == 20_001 and peak <= json_bytes(text), part
+
+
+def test_archives_hold_plain_numbers(tmp_path):
+    path = archive(tmp_path / "a.npz", {"x": npy(np.arange(3)), "y": npy(np.float64(2))})
+    assert {n: a.tolist() for n, a in read_arrays(path).items()} == {"x": [0, 1, 2], "y": 2.0}
+    for members, fault in (
+        ({"x": npy(np.array(["a"]))}, "allowed are numbers"),
+        ({"x": npy(np.zeros(3))[:-1]}, "holds 23 bytes|claims"),
+        ({"x": npy(np.zeros(3)) + b"0"}, "holds more"),
+        ({"x": npy(np.zeros(3)).replace(b"NUMPY\x01", b"NUMPY\x02")}, "damaged header"),
+    ):
+        with pytest.raises(ArchiveError, match=fault):
+            read_arrays(archive(tmp_path / "b.npz", members))
+    assert checkpoint_settings(tmp_path / "b.npz") == {}
+
+
+def test_few_lanes_hold_few_symbols():
+    """A lane decodes one symbol after the other: many symbols in one lane would take hours."""
+    coder = ans.SymbolEncoder()
+    context = np.zeros(100, int)
+    coder.code("x", 1, 2, context, context)
+    decoder = ans.SymbolDecoder(*coder.finish())
+    with pytest.raises(ValueError, match="more symbols than its lanes"):
+        decoder.code("x", 1, 2, np.zeros(10**6, int))
+
+
+def test_coded_nodes_are_those_of_a_dense_grid(tmp_path, rng):
+    """Places, neighbours and packed flags, against masks of the whole grid."""
+    shape = (37, 18, 45)
+    from mi_diffind.tasks.radiance.nodes import corners_of, layers
+
+    stored = corners_of(rng.random(tuple(n - 1 for n in shape)) < 0.02)
+    count = int(stored.sum())
+    numbers = rng.integers(0, 16, count), rng.integers(0, 300, count)
+    places, *again = node_codes.decoded_places(*node_codes.encoded(stored, *numbers, 16, 300), shape, 16, 300)
+    np.testing.assert_array_equal(places, np.flatnonzero(stored))
+    assert all(np.array_equal(a, b) for a, b in zip(again, numbers, strict=True))
+    with pytest.raises(node_codes.TooManyNodes, match="at most 100 are accepted"):
+        node_codes.decoded(*node_codes.encoded(stored, *numbers, 16, 300), shape, 16, 300, 100)
+    assert np.array_equal(files._packed(places, stored.size), np.packbits(stored.reshape(-1)))
+    for mask in (stored, np.packbits(stored.reshape(-1))):
+        np.testing.assert_array_equal(np.concatenate([*layers(mask, shape)]), stored)
+    number = np.full(np.array(shape) + 8, -1)
+    number[4:-4, 4:-4, 4:-4][stored] = np.arange(count)
+    place = np.argwhere(stored) + 4
+    for part in node_codes.passes_of(stored):
+        around = {int(number[tuple(place[part.rows[0]] + np.array(o) - 2)]) for o in np.ndindex(5, 5, 5)}
+        assert set(part.near[0].tolist()) <= around | {-1}
+
+
+def test_sizes_of_pictures(tmp_path, rng):
+    """Against what Mitsuba decodes."""
+    import mitsuba as mi
+    from PIL import Image
+
+    values = rng.integers(0, 255, (13, 17, 3)).astype(np.uint8)
+    for name in ("x.png", "x.jpg", "x.bmp", "x.tga", "x.ppm"):
+        Image.fromarray(values).save(tmp_path / name)
+    for name in ("x.exr", "x.hdr", "x.pfm"):
+        mi.Bitmap(values.astype(np.float32)).write(str(tmp_path / name))
+    mi.Bitmap(values.astype(np.float16)).write(str(tmp_path / "half.exr"))
+    for path in tmp_path.iterdir():
+        size = picture_size(path)
+        assert (size.width, size.height) == (17, 13), path
+        depth = {".ppm": 2, ".exr": 2 if path.stem == "half" else 4, ".hdr": 4, ".pfm": 4}.get(path.suffix, 1)
+        assert size.nbytes == 17 * 13 * 3 * depth, path
+        assert picture_size(path) is not None
+    (tmp_path / "cut.png").write_bytes((tmp_path / "x.png").read_bytes()[:20])
+    (tmp_path / "text").write_text("no picture")
+    assert picture_size(tmp_path / "cut.png") is None and picture_size(tmp_path / "text") is None
+
+
+def test_a_picture_of_30000_squared_is_refused_by_its_size(tmp_path):
+    path = png(tmp_path / "wide.png", 30000, 30, 8, 2)
+    content = bytearray(path.read_bytes())
+    content[20:24] = struct.pack(">I", 30000)
+    content[29:33] = struct.pack(">I", zlib.crc32(content[12:29]))
+    path.write_bytes(content)
+    with pytest.raises(ViewsError, match="30,000 x 30,000 pixels would take 3,600,000,000 bytes"):
+        read_image(path)
+    with pytest.raises(SourceError, match="30,000 x 30,000 pixels would take 2,700,000,000 bytes"):
+        load_source(path)
+
+
+# -- terminals and paths -----------------------------------------------------------------------------------------------
+
+
+def test_messages_cannot_steer_a_terminal():
+    for error in (DiffindError, TableError, OutputError):
+        message = str(error("t.npz: \x1b[31m is red\x07,\n \x9b and \u202e turned, α stays"))
+        assert message == "t.npz: \\x1b[31m is red\\x07,\\n \\x9b and \\u202e turned, α stays"
+        long = str(error("begin " + "x" * 5000 + " end"))
+        assert len(long) == LONGEST_MESSAGE and long.startswith("begin") and long.endswith("end")
+
+
+def test_inspection_cannot_steer_a_terminal(tmp_path):
+    figures = {
+        "file": "t.npz", "task": "a\x1b]0;title\x07", "preset": "\x1b[2J", "bytes": 1, "storage": "uint8", "arrays": {},
+        "settings": {"name": "\x1b[31m"}, "seed": 0, "measured": {"psnr_\x1b_db": 1.0},
+    }  # fmt: skip
+    for verbose in (False, True):
+        lines = Inspection(figures, ["remark \x1b"], ["usage \x1b"]).lines(verbose)
+        assert lines and all(line.isprintable() for line in lines)
+
+
+def test_measurements_of_a_file_are_numbers(tmp_path):
+    path = archive(tmp_path / "t.npz", {"meta": npy(meta_of({}, measured={"psnr_db": "\x1b[31m"}))})
+    with pytest.raises(TableError, match="measurements have to be numbers"):
+        load_table(path)
+    save_table(path, Table("a task", {"a": StoredArray(np.zeros((2, 1), np.float32))}, measured={"psnr_db": 1.5}))
+    assert load_table(path).measured == {"psnr_db": 1.5}
+
+
+def test_files_name_others_in_their_folder(tmp_path, monkeypatch):
+    folder = tmp_path / "material"
+    (folder / "maps").mkdir(parents=True)
+    png(tmp_path / "outside.png", 4, 4, 8, 2)
+    png(folder / "maps" / "inside.png", 4, 4, 8, 2)
+    manifest = folder / "m.json"
+    for name in ("../outside.png", str(tmp_path / "outside.png"), "maps/../../outside.png"):
+        manifest.write_text(json.dumps({"albedo": name}))
+        with pytest.raises(SourceError, match=rf"outside of its folder.*{PATHS}=any"):
+            load_source(manifest)
+        with pytest.raises(ViewsError, match="outside of its folder"):
+            image_file(folder, name, folder / "transforms.json")
+        monkeypatch.setenv(PATHS, "any")
+        assert load_source(manifest).texels == 16
+        assert image_file(folder, name, folder / "transforms.json").samefile(tmp_path / "outside.png")
+        monkeypatch.delenv(PATHS)
+    for name in ("maps/inside.png", "./maps/../maps/inside.png", os.path.join(folder, "maps", "inside.png")):
+        manifest.write_text(json.dumps({"albedo": name}))
+        assert load_source(manifest).texels == 16
+
+
+def test_meshes_say_what_is_wrong(tmp_path):
+    corners = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]
+    with pytest.raises(MeshError, match="names vertex -7, there are vertices 0 to 3"):
+        make_mesh(np.array(corners), np.array([(0, 1, 2), (-7, 1, 3)]))
+    with pytest.raises(MeshError, match="names vertex 9, there are vertices 0 to 3"):
+        make_mesh(np.array(corners), np.array([(0, 1, 2), (9, 1, 3)]))
+    (tmp_path / "a.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nend_header\n")
+    with pytest.raises(MeshError, match=r"a\.ply: cannot be read as a mesh, it is damaged or of an unknown format"):
+        load_mesh(tmp_path / "a.ply")
+
+
+def test_readers_that_are_not_installed(tmp_path, monkeypatch):
+    import trimesh
+
+    (tmp_path / "a.3mf").write_bytes(b"")
+    for error, package in (
+        (ImportError("No module named 'lxml'"), "lxml"), (ImportError("missing `pip install pycollada`"), "pycollada"),
+        (ModuleNotFoundError("x", name="openctm"), "openctm"),
+    ):  # fmt: skip
+
+        def missing(*arguments, error=error, **options):
+            raise error
+
+        monkeypatch.setattr(trimesh, "load", missing)
+        with pytest.raises(MeshError, match=rf"\.3mf files need a Python module .*: pip install {package}$"):
+            load_mesh(tmp_path / "a.3mf")
+
+
+def test_maps_may_be_called_as_figures(rng):
+    """A map's PSNR has a name of its own, whatever the map is called."""
+    from mi_diffind.maps.compressed import CompressedMaps
+    from mi_diffind.maps.layout import Layout
+
+    names = ("mean", "between", "worst", "l0", "map_mean", "albedo")
+    source = from_arrays({name: np.full((2, 2, 1), 0.1 * i, np.float32) for i, name in enumerate(names)})
+    image = CompressedMaps()
+    image.layout, image.types, image.border = Layout.of(source), None, ("clamp", "clamp")
+    image.stored = lambda u, v, active=True: []
+    figures = image.measure(source)
+    assert len({map_figure(name) for name in names}) == len(names)
+    assert set(figures) == {"psnr_db", "psnr_mean_db", "psnr_between_db", *map(map_figure, names)}
+    assert map_figure("albedo") == "psnr_albedo_db" and map_figure("mean") == "psnr_map_mean_db"
+    assert labelled({"psnr_map_between_db": 1.0, "psnr_map_l0_db": 2.0}) == [
+        "PSNR map between  1.00 dB", "PSNR map l0       2.00 dB",
+    ]  # fmt: skip
