@@ -39,8 +39,9 @@ MOST_BITS, INDEX_BITS, DEFAULT_BITS = 14, (6, 8, 10, 12, 14), 12
 #: levels counts less, since errors of neighbouring densities add up.
 SLOPE, LEVEL_SLOPE = 0.007, 0.1
 
-#: Least and largest slope for a size of the file, trials between them, and nodes of a trial.
-SLOPES, TRIALS, TRIAL_NODES = (1e-3, 0.2), 6, 60_000
+#: Least and largest slope for a size of the file, trials between them, and nodes of a trial. Where a larger slope is
+#: needed, a coarser grid is better.
+SLOPES, TRIALS, TRIAL_NODES = (1e-3, 0.05), 6, 60_000
 
 #: Planes of nodes that stay together in a trial.
 PLANES = 8

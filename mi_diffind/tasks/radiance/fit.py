@@ -47,7 +47,7 @@ LADDER = (
 )  # fmt: skip
 
 #: Shares of the resolution that ``--disk`` tries in turn.
-SHARES = (1.0, 0.8, 0.65, 0.5, 0.4, 0.3, 0.2)
+SHARES = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2)
 
 #: Training of pairs on the numbers of the grid, before the images: steps, samples of a step, and learning rate.
 VALUE_STEPS, VALUE_BATCH, VALUE_RATE = 300, 2**15, 1e-2
