@@ -7,6 +7,9 @@ import unicodedata
 #: Most characters of a message.
 LONGEST_MESSAGE = 300
 
+#: Most characters of a path in a message that would be too long.
+LONGEST_PATH = 40
+
 #: Unicode categories of characters that a terminal obeys or hides: controls, formats (such as changes of the writing
 #: direction), halves of surrogate pairs, and separators of lines and paragraphs.
 _HIDDEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}
@@ -23,7 +26,15 @@ def printable(text: str) -> str:
 
 
 def shortened(text: str, most: int = LONGEST_MESSAGE) -> str:
-    """Return a text of at most ``most`` characters; the middle of a longer one is left out."""
+    """Return a text of at most ``most`` characters.
+
+    A longer one has only the ends of its long paths, then, if that is not enough, no middle.
+    """
+    if len(text) <= most:
+        return text
+    text = " ".join(
+        f"…{word[-LONGEST_PATH:]}" if "/" in word and len(word) > LONGEST_PATH else word for word in text.split(" ")
+    )
     if len(text) <= most:
         return text
     end = (most - 3) // 2

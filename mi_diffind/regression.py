@@ -227,7 +227,7 @@ def update_reference(
         def refusal(verdict: str, failing: str, more: str = "") -> scenes.SceneError:
             return scenes.SceneError(
                 f"{path}: {verdict} the check at {budget} samples a pixel although nothing has changed ({failing}, "
-                f"{1 - REQUIRED:.2%} may), since bright paths are too rare; {_advice(budget, failing_part, stop)}{more}"
+                f"{1 - REQUIRED:.2%} may): bright paths are too rare; {_advice(budget, failing_part, stop)}{more}"
             )
 
         failing = failing_part(budget)
@@ -255,7 +255,7 @@ def update_reference(
         result |= {"failing_pixels": int(test.failing.sum()), "fraction": test.fraction}
         if not test.passed:
             write_partial(partial, moments, key)
-            kept = f'; what was rendered is kept in "{partial}", and the same command goes on from there'
+            kept = f"; the same command continues from {partial.name} beside the reference"
             raise refusal("fails", f"{result['failing_pixels']} of {test.failing.size} pixels", kept)
     del key["sources"]
     versions = {"mi_diffind": __version__, "mitsuba": mi.__version__}
@@ -279,10 +279,10 @@ def _advice(spp: int, failing_part: Callable[[int], float], stop: threading.Even
     for factor in _FACTORS:
         failing = failing_part(factor * spp)
         if failing <= 1 - REQUIRED:
-            return f"--spp {factor * spp} should do, or fewer bounces (the scene's max_depth)"
+            return f"--spp {factor * spp} should do, or a lower max_depth"
         if stop.is_set():
-            return "more samples (--spp) or fewer bounces (the scene's max_depth) are needed"
-    return f"not even {factor} times the samples would do: give fewer bounces (the scene's max_depth)"
+            return "more samples (--spp) or a lower max_depth are needed"
+    return f"not even {factor} times the samples would do: give a lower max_depth"
 
 
 def _render_check(scene, spp: int, seed: int, title: str, progress: bool, stop: threading.Event) -> np.ndarray:

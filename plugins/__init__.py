@@ -198,8 +198,9 @@ def _refusal(name: str, variant: str):
     def make(props):
         import mitsuba as mi
 
-        usable = ", ".join(v for v in mi.variants() if supported(v))
-        raise RuntimeError(f'the plugin "{name}" does not run in the variant "{variant}"; use one of {usable}')
+        usable = [v for v in mi.variants() if supported(v)]
+        shown = ", ".join(usable[:2]) + (", …" if usable[2:] else "")
+        raise RuntimeError(f'the plugin "{name}" does not run in the variant "{variant}"; use one of {shown}')
 
     return make
 

@@ -133,7 +133,7 @@ def test_the_command_and_a_comparison_with_the_stock_scene(mi_rgb, tmp_path, cap
     ]  # fmt: skip
     assert [c["learned"] for c in json.loads((tmp_path / "a.json").read_text())["conversions"]] == ["neural_disney", ""]
     assert new.read_text().count("neural_disney") == 1 and not (tmp_path / "new_tables").exists()
-    for output, fault in (("scene.xml", "is the scene itself"), ("new.json", "allowed is .xml")):
+    for output, fault in (("scene.xml", "the same file as the scene"), ("new.json", "allowed is .xml")):
         assert main(["convert", scene, "-o", str(tmp_path / output)]) == 2 and fault in capsys.readouterr().err
     result = mi_diffind.compare(scene, 8, learn=["principled"], progress=False)
     assert comparison.truth_label(result.figures) == "stock (principled), 8 spp" and result.further == ()

@@ -368,8 +368,8 @@ def test_a_reference_that_would_fail_unchanged_is_refused(regress, rng, tmp_path
         patch.setattr(regress, "probe", lambda scene, spp, *_: 0.01 if 1000 < spp < 4000 else 0.0)
         message = refused(capsys, *update, "--spp", "1000")
         assert "fails the check at 1000 samples a pixel although nothing has changed (" in message
-        assert "--spp 4000 should do, or fewer bounces" in message
-        assert f'what was rendered is kept in "{partial}", and the same command goes on from there' in message
+        assert "--spp 4000 should do, or a lower max_depth" in message
+        assert f"the same command continues from {partial.name} beside the reference" in message
     monkeypatch.setattr(regress.scenes, "render_pass", lambda *_: np.full((12, 16, 3), 0.5))
     assert [f.name for f in partial.parent.iterdir()] == [partial.name]
     kept = partial.read_bytes()

@@ -204,7 +204,26 @@ def distance_shape(mesh: type) -> type:
     return DistanceShape
 
 
-def distance_shapes_in(scene: mi.Scene) -> list:
+class DistanceShapes:
+    """Sequence of distance shapes that loops do not traverse: no arrays of a shape are part of a loop's state.
+
+    In a list, they would be: Dr.Jit looks for arrays in the attributes of Mitsuba's objects.
+    """
+
+    def __init__(self, shapes: list):
+        self._shapes = tuple(shapes)
+
+    def __len__(self) -> int:
+        return len(self._shapes)
+
+    def __iter__(self):
+        return iter(self._shapes)
+
+    def __getitem__(self, i: int):
+        return self._shapes[i]
+
+
+def distance_shapes_in(scene: mi.Scene) -> DistanceShapes:
     """Return the distance shapes of a scene. Raises ``RuntimeError`` if one is in a shape group."""
     shapes = [shape for shape in scene.shapes() if hasattr(shape, "local_ray")]
     hidden = [s for s in compat.objects_of(scene) if hasattr(s, "local_ray") and s not in shapes]
@@ -213,7 +232,7 @@ def distance_shapes_in(scene: mi.Scene) -> list:
             f'"{hidden[0].id()}": is in a shapegroup, where its arrays cannot be traced; several shapes of one file '
             f'with a "to_world" of their own share its memory, and trace="grid" may be instanced'
         )
-    return shapes
+    return DistanceShapes(shapes)
 
 
 def crop_grid(values: np.ndarray, lower, spacing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -280,7 +299,7 @@ class ShapeHit:
     p: mi.Point3f
 
 
-def intersect(shapes: list, o, d, maxt, active=True, rest=0) -> ShapeHit:
+def intersect(shapes: DistanceShapes, o, d, maxt, active=True, rest=0) -> ShapeHit:
     """Return the first hit of rays before ``maxt``; without a hit, ``t`` is ``maxt``.
 
     Rays start at ``o`` + ``rest``, as :func:`spawn` returns them.
@@ -295,7 +314,7 @@ def intersect(shapes: list, o, d, maxt, active=True, rest=0) -> ShapeHit:
     return nearest
 
 
-def occluded(shapes: list, o, d, maxt, active=True, rest=0):
+def occluded(shapes: DistanceShapes, o, d, maxt, active=True, rest=0):
     """Return whether rays from ``o`` + ``rest`` hit any distance shape before ``maxt``."""
     blocked = mi.Bool(False)
     for shape in shapes:
@@ -304,7 +323,7 @@ def occluded(shapes: list, o, d, maxt, active=True, rest=0):
     return blocked
 
 
-def interaction(shapes: list, hit: ShapeHit, ray, si, active=True):
+def interaction(shapes: DistanceShapes, hit: ShapeHit, ray, si, active=True):
     """Replace ``si`` (``mi.SurfaceInteraction3f``) where a distance shape was hit."""
     for i, shape in enumerate(shapes):
         here = (hit.number == i + 1) & active
@@ -321,7 +340,7 @@ def interaction(shapes: list, hit: ShapeHit, ray, si, active=True):
     return si
 
 
-def shift(shapes: list, hit: ShapeHit, d, active=True):
+def shift(shapes: DistanceShapes, hit: ShapeHit, d, active=True):
     """Return zero with the derivative of the hit's place in the world, for rays with the direction ``d``."""
     change = mi.Vector3f(0)
     for i, shape in enumerate(shapes):
@@ -331,7 +350,7 @@ def shift(shapes: list, hit: ShapeHit, d, active=True):
     return change
 
 
-def spawn(shapes: list, hit: ShapeHit, si, d) -> tuple:
+def spawn(shapes: DistanceShapes, hit: ShapeHit, si, d) -> tuple:
     """Return the origin of a ray from ``si`` in the direction ``d``, and the rest that single precision rounds off.
 
     The origin of a ray from a distance shape is off the surface by :data:`OFFSET`, in the unit frame; that from any
@@ -347,7 +366,7 @@ def spawn(shapes: list, hit: ShapeHit, si, d) -> tuple:
         return dr.detach(o), dr.detach(rest)
 
 
-def occluded_from(shapes: list, hit: ShapeHit, si, ds, active=True):
+def occluded_from(shapes: DistanceShapes, hit: ShapeHit, si, ds, active=True):
     """Return whether a distance shape lies between ``si`` and a sample of an emitter (``mi.DirectionSample3f``)."""
     start, rest = spawn(shapes, hit, si, ds.d)
     to = mi.Vector3f(ds.p - start) - rest

@@ -243,7 +243,7 @@ def test_bad_values(folder, capsys, option, value):
         (["--resume"], "--checkpoint FILE"),
         (["--resume", "--checkpoint", "c.npz"], "there is nothing to resume"),
         (["--checkpoint", "out.npz"], "the same file as -o"),
-        (["--checkpoint", "a.png"], "would replace a file that is not one"),
+        (["--checkpoint", "a.png"], "the same file as source"),
         (["--checkpoint", "c.npz", "--psnr", "30"], "--checkpoint: for one training"),
         (["--checkpoint", "c.npz", "--ratio-search"], "--checkpoint: for one training"),
         (["--ratio-search", "--cascaded", "8"], "leave out --psnr and --cascaded"),
@@ -543,10 +543,9 @@ def test_what_decode_refuses(folder, capsys):
     ):
         assert sentence in refused(capsys, "decode", *arguments)
     assert sorted(os.listdir(folder)) == before
-    for size in ("100000", "9" * 30):
-        message = refused(capsys, "decode", "t.npz", "-o", "b.png", "--width", size, "--height", size)
-        assert "texels are more than fit into memory" in message
-    for option in (["--width", "0"], ["--height", "-3"]):
+    message = refused(capsys, "decode", "t.npz", "-o", "b.png", "--width", "100000", "--height", "100000")
+    assert "texels are more than fit into memory" in message
+    for option in (["--width", "0"], ["--height", "-3"], ["--width", "9" * 30]):
         with pytest.raises(SystemExit):
             main(["decode", "t.npz", "-o", "b.png", *option])
     assert main(["decode", "many.npz", "-o", "b.exr"]) == 0 and read("b.exr").shape == (5, 7, 6)

@@ -218,6 +218,8 @@ def _read(path: Path, part: str = "") -> tuple[np.ndarray, np.ndarray]:
     except ImportError as e:
         quoted = re.search(r"pip install ([\w\[\]-]+)|No module named '(\w+)", str(e))
         module = e.name or (quoted and (quoted[1] or quoted[2])) or "trimesh[easy]"
+        if module == "charset_normalizer":  # what trimesh would guess the encoding with
+            raise MeshError(f"{path}: cannot be read as a mesh, its text is not UTF-8") from None
         raise MeshError(
             f"{path}: {path.suffix} files need a Python module that is not installed: pip install {module}"
         ) from None

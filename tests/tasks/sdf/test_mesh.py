@@ -141,7 +141,7 @@ NOTHING = np.zeros((0, 3), int)
     [
         (np.zeros((0, 3)), NOTHING, "has no triangles"),
         (np.eye(3), NOTHING, "has no triangles"),
-        (np.eye(3), [[0, 1, 3]], "names vertex 3 of 3"),
+        (np.eye(3), [[0, 1, 3]], "names vertex 3, there are vertices 0 to 2"),
         (np.eye(3), [[0, 1, -1]], "a triangle names vertex"),
         (np.eye(3), [[0, 1]], "expected (V, 3) and (F, 3)"),
         ([[0, 0, 0], [1, 0, 0], [0, 1, np.nan]], [[0, 1, 2]], "NaN or infinite"),
