@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import json
 import os
+import tempfile
+from pathlib import Path
 
 from hostile_files import SIDES, VALUES, Archive
 from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
+from hypothesis.configuration import set_hypothesis_home_dir
+
+# Hypothesis keeps tables of constants beside the tests otherwise
+set_hypothesis_home_dir(Path(tempfile.gettempdir()) / "hypothesis")
 
 #: Number of mutants of a long run; of a default run, a hundredth.
 MUTANTS = int(os.environ.get("MI_DIFFIND_MUTANTS", "2000"))
