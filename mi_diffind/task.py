@@ -320,6 +320,9 @@ class Task:
     files: str = "files"
     #: Number of measurements during a training; 0: as the settings of the preset say.
     measurements: int = 0
+    #: Name → keywords of :func:`fit` for a fit of seconds, one for each layout of the task's files. Their ``source`` is
+    #: "maps", "mesh", "bsdf" or "views", a small source of this sort. Tests of trust damage the files of these fits.
+    trials: Mapping[str, Mapping[str, Any]] = {}
     #: Object type and name of the plugin that reads the tables ("texture", "neural_image"); none: no plugin does.
     plugin: tuple[str, str] | None = None
 

@@ -1,0 +1,62 @@
+"""Small valid files of every task, from the fits that each task declares (:attr:`mi_diffind.task.Task.trials`).
+
+Some of these fits take minutes: their files are kept in ``tests/trust/corpus/seeds``, which ``python
+tests/trust/run.py --seeds`` writes anew.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+import numpy as np
+
+from mi_diffind.task import DATA, Task, tasks
+
+SEEDS = Path(__file__).resolve().parents[1] / "trust" / "corpus" / "seeds"
+
+
+def has_files(task: Task) -> bool:
+    """Return whether a task has table files of its own: it reads them, or a plugin does."""
+    return task.plugin is not None or task._implementation("load", task.files) is not None
+
+
+def seeds(task: Task) -> dict[str, Path]:
+    """Return the small files of a task by name: those of its trials, and those that ship."""
+    trials = {f"{task.name}_{name}": SEEDS / f"{task.name}_{name}.npz" for name in task.trials}
+    return {**trials, **{f"{task.name}_shipped_{name}": DATA / file for name, file in task.shipped.items()}}
+
+
+def all_seeds() -> dict[str, tuple[Task, Path]]:
+    """Return the small files of all tasks."""
+    return {name: (task, path) for task in tasks().values() if has_files(task) for name, path in seeds(task).items()}
+
+
+def sources(folder: Path) -> dict:
+    """Return small sources by the names that trials use."""
+    import captures
+    import solid_meshes
+
+    y, x = np.mgrid[:16, :24] / 16
+    colour = np.stack([0.5 + 0.4 * np.sin(5 * x + 3 * y), 0.5 + 0.3 * np.cos(4 * y), x * y / 1.5], axis=-1)
+    maps = {"base_color": colour.astype(np.float32), "roughness": (0.3 + 0.2 * np.sin(7 * x)).astype(np.float32)}
+    return {
+        "maps": lambda: maps,
+        "mesh": lambda: solid_meshes.write(folder / "ball.ply", solid_meshes.sphere(8, 0.8)),
+        "bsdf": lambda: {"type": "roughplastic", "alpha": 0.2},
+        "views": lambda: captures.write(folder / "views", 8, 2, 16),
+    }
+
+
+def make(task: Task, name: str, folder: Path, output: Path) -> Path:
+    """Carry out a trial of a task and write its file."""
+    import mi_diffind
+
+    options = dict(task.trials[name])
+    source = options.pop("source", None)
+    source = sources(folder)[source]() if source else None
+    with contextlib.redirect_stdout(None):
+        fitted = mi_diffind.fit(task.name, source, variant="llvm_ad_rgb", progress=False, **options)
+    for key in [key for key in fitted.table.settings if key.endswith("_path")]:
+        del fitted.table.settings[key]  # a folder of this machine
+    return fitted.save(output)

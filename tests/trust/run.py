@@ -1,0 +1,85 @@
+"""Attack all readers with damaged files: ``python tests/trust/run.py --mutants N --raw M``.
+
+Prints a table of figures a file (refused, loaded, and every sort of fault) and writes it as JSON, with the shortest
+recipe of each fault. ``--seeds`` writes the small valid files of all tasks anew instead.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "helpers"))
+
+import campaigns
+import trial_files
+from limited_child import FAULTS, GOOD, LimitedChild
+
+from mi_diffind import __version__
+from mi_diffind.task import tasks
+
+
+def make_seeds(only: list[str]) -> None:
+    """Carry out the trials of all tasks, or those whose names are given, and keep their files."""
+    for task in tasks().values():
+        for name in task.trials if trial_files.has_files(task) else ():
+            path = trial_files.SEEDS / f"{task.name}_{name}.npz"
+            if not only or path.stem in only:
+                with tempfile.TemporaryDirectory() as folder:
+                    trial_files.make(task, name, Path(folder), path)
+                print(f"{path}: {path.stat().st_size:,} bytes")
+
+
+def main() -> int:
+    """Run the campaigns; return 1 if there was a fault."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--mutants", type=int, default=1000, help="structured mutants of each file (default: 1000)")
+    parser.add_argument("--raw", type=int, default=1000, help="mutants by bytes of each file (default: 1000)")
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="limit of the time of all together")
+    parser.add_argument("--json", type=Path, default=Path("trust_files.json"), help="report to write")
+    parser.add_argument("--seeds", action="store_true", help="write the valid files of all tasks anew, and end")
+    parser.add_argument("only", nargs="*", help="names of files (default: all)")
+    arguments = parser.parse_args()
+    if arguments.seeds:
+        make_seeds(arguments.only)
+        return 0
+    names = arguments.only or [*campaigns.tables(), *campaigns.OTHERS]
+    began, tables, results = time.monotonic(), campaigns.tables(), []
+    columns = ("mutants", *GOOD, *FAULTS)
+    print(f"{'file':24} {'recipes':10} " + " ".join(f"{c:>13}" for c in columns))
+    for number, name in enumerate(names):
+        # Each file has an equal share of the time that is left
+        share = (arguments.seconds - (time.monotonic() - began)) / (len(names) - number)
+        with tempfile.TemporaryDirectory() as folder, LimitedChild(Path(folder)) as child:
+            target = tables[name] if name in tables else campaigns.OTHERS[name](child)
+            for form, recipes, count in (
+                ("structured", target.structured, arguments.mutants),
+                ("raw", target.raw, arguments.raw),
+            ):
+                end = time.monotonic() + share * count / max(1, arguments.mutants + arguments.raw)
+                if count < 1:
+                    continue
+                campaign = campaigns.run(child, target, recipes, count, lambda end=end: time.monotonic() < end)
+                figures = {"recipes": form, **campaign.figures()}
+                results.append(figures)
+                print(f"{name:24} {form:10} " + " ".join(f"{figures[c]:13,}" for c in columns), flush=True)
+        report = {
+            "version": __version__, "machine": platform.processor() or platform.machine(),
+            "date": time.strftime("%Y-%m-%d"), "seconds": round(time.monotonic() - began), "results": results,
+        }  # fmt: skip
+        arguments.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    total = {c: sum(r[c] for r in results) for c in columns}
+    print(f"{'all':35} " + " ".join(f"{total[c]:13,}" for c in columns))
+    for result in results:
+        for key, (message, recipe) in result["faults"].items():
+            print(f"\n{result['target']}: {key}\n  {message[:300]!r}\n  {json.dumps(recipe)[:300]}")
+    return int(any(total[fault] for fault in FAULTS))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
