@@ -567,6 +567,30 @@ def field_nerf() -> str:
     return table(["scene", "method", "dB, white", "SSIM", "MB on disk", "minutes", "peak memory, GB", "machine"], rows)
 
 
+def trust() -> str:
+    """Return one row a plugin: the worst figure of each property over the variants that were measured."""
+    rows = []
+    for name, by_variant in measured("trust")["cells"].items():
+        row = [f"`{name}`"]
+        for prop in next(iter(by_variant.values())):
+            cells = [by_variant[variant][prop] for variant in by_variant]
+            failed, held = ([c for c in cells if c["result"] == word] for word in ("fails", "holds"))
+            figures = [c["figure"] for c in failed or held if c["figure"] is not None]
+            text = f"{max(figures):.3g}" if figures else "error" if failed else ""
+            if failed:
+                text = f"**fails: {text}** ({len(failed)} of {len(failed) + len(held)})"
+            elif not held:
+                text = "–" if any(c["result"] == "does not apply" for c in cells) else "not run"
+            row.append(text if failed or not held else f"{text} ({len(held)})")
+        rows.append(row)
+    study = measured("trust")
+    results = [c["result"] for by in study["cells"].values() for row in by.values() for c in row.values()]
+    run = len(results) - results.count("not run")
+    corner = f"{study['date']}{', quick' * study['quick']}: {run} of {len(results)} cells"
+    head = [corner, "albedo, at most", "reciprocity", "χ² rejected", "furnace", "gradients", "gradients, float32"]
+    return table(head, rows)
+
+
 def mean(values) -> float:
     """Return the mean of an iterable."""
     values = list(values)
@@ -589,6 +613,7 @@ TABLES = {
         texture_memory,
         texture_presets,
         texture_reads,
+        trust,
     )
 }
 for source in ("", "_boombox"):

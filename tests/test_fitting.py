@@ -12,14 +12,13 @@ import drjit as dr
 import numpy as np
 import pytest
 from drjit import nn
+from variants import BACKENDS
 
 from mi_diffind import DifferentiableArray, DiffindError, Indirection, fitting
 from mi_diffind.files import OutputError
 from mi_diffind.fitting import FitResult, FitSettings, FittingError, Problem, fit
 from mi_diffind.indirection import unfolded
 from mi_diffind.runtime import array_module
-
-BACKENDS = ["llvm", "cuda"] if dr.has_backend(dr.JitBackend.CUDA) else ["llvm"]
 
 
 @pytest.fixture(params=BACKENDS)

@@ -7,12 +7,12 @@ from arrays import aligned
 from drjit import nn
 from drjit.opt import Adam
 from scipy.ndimage import map_coordinates
+from variants import BACKENDS
 
 from mi_diffind import DifferentiableArray, Indirection, fold, lookup
 from mi_diffind.indirection import ramp, unfolded
 from mi_diffind.runtime import array_module
 
-BACKENDS = ["llvm", "cuda"] if dr.has_backend(dr.JitBackend.CUDA) else ["llvm"]
 BELOW_ONE = np.float32(1) - np.float32(2**-23)
 
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from arrays import aligned
 from scipy.interpolate import RegularGridInterpolator
+from variants import BACKENDS
 
 from mi_diffind import DifferentiableArray, lookup
 from mi_diffind.runtime import array_module
 
-BACKENDS = ["llvm", "cuda"] if dr.has_backend(dr.JitBackend.CUDA) else ["llvm"]
 CHANNELS = (1, 2, 3, 4, 7, 12)
 RESOLUTION = (5, 4, 6, 3)
 DENORMAL = 1e-45

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from arrays import aligned
 from scipy.ndimage import map_coordinates
+from variants import BACKENDS
 
 from mi_diffind.indirection import DifferentiableArray, Indirection, unfolded
 from mi_diffind.maps.source import from_arrays
@@ -17,8 +18,6 @@ from mi_diffind.tables import PAGES, TableError, gathers_of, load_table, save_ta
 from mi_diffind.task import FitRequest
 from mi_diffind.tasks.image import TASK, presets, search, training
 from mi_diffind.tasks.image.compressed import CompressedImage
-
-BACKENDS = ["llvm", "cuda"] if dr.has_backend(dr.JitBackend.CUDA) else ["llvm"]
 
 SHAPES = {1: (7,), 2: (5, 3), 3: (2, 3, 2)}
 
