@@ -108,8 +108,10 @@ class Archive:
 
         Raises ``ValueError`` for text that is no JSON, and the errors of :meth:`array`.
         """
-        text = self.array(name, np.dtype("u1")).tobytes()
-        self.allowance.take(len(text) + json_bytes(text), f'the array "{name:.80}"')
+        array, content = self.array(name, np.dtype("u1")), f'the array "{name:.80}"'
+        self.allowance.take(array.size, content)
+        text = array.tobytes()
+        self.allowance.take(json_bytes(text), content)
         try:
             return json.loads(text)
         except RecursionError:

@@ -234,7 +234,8 @@ CASES["a picture that is an endless file"] = Case(changed_view(file_path="/dev/z
 
 recipe("a layout that is an object: sdf", "sdf_sparse", ["set_value", ["settings", "layout"], {"a": 1}])
 recipe("a layout that is an object: field", "field_coded", ["set_value", ["settings", "layout"], {"a": 1}])
-recipe("a layout that is a list: bsdf", "bsdf_single", ["set_value", ["settings", "layout"], [1]])
+recipe("a layout that is a list: bsdf, which has none", "bsdf_single",
+       ["set_value", ["settings", "layout"], [1]], outcomes=("loaded",))  # fmt: skip
 recipe("a box without volume", "sdf_paper", ["set_value", ["settings", "upper"], [0, 0, 0]],
        ["set_value", ["settings", "lower"], [0, 0, 0]])  # fmt: skip
 recipe("a primary array of one entry: sdf", "sdf_paper",

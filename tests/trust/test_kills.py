@@ -76,7 +76,6 @@ def test_a_study(tmp_path):
         assert names and all(a[name].tobytes() == b[name].tobytes() for name in names)
 
 
-@pytest.mark.xfail(strict=True, reason="being mended")
 def test_no_temporary_file_outlives_the_next_run(tmp_path):
     """A run that is killed before its file has its name leaves a temporary one, which the next run removes."""
     command = ["inspect", str(next(iter(trial_files.seeds(tasks()["ggx"]).values()))), "--json", "report.json"]

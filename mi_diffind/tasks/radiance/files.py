@@ -52,6 +52,9 @@ MOST_NODES = 2**28
 #: while a file is decoded and its field built, measured.
 PLACE_BYTES, LAYER_BYTES, NODE_BYTES = 0.55, 8, 30
 
+#: Range of the largest coordinate of a grid.
+SMALLEST, LARGEST = 1e-9, 1e9
+
 #: Bits of a density level of the layout "sparse", and most bits of one.
 SPARSE_BITS, MOST_DENSITY_BITS = 6, 6
 
@@ -189,6 +192,7 @@ def load(path) -> Table:
     check_numbers(table, "lower", 3)
     check_numbers(table, "spacing", 1, positive=True)
     check_numbers(table, "shape", 3, positive=True, whole=True)
+    check_place(table)
     if "inner" in table.settings:
         check_numbers(table, "inner", 4)
         half = table.settings["inner"][3]
@@ -204,6 +208,7 @@ def load(path) -> Table:
         bits, colours = table.settings.get("density_bits"), len(table.arrays["palette"].entries)
         if bits not in range(1, MOST_DENSITY_BITS + 1) or colours > 2**MOST_BITS:
             raise TableError(f"{path}: is damaged: found {bits!r} bits of a density and {colours:,} colours")
+        check_palette(table)
         sparse(table)
         return table
     if len(table.arrays["cells"].entries) != -(-math.prod(shape) // 8):
@@ -220,6 +225,7 @@ def load(path) -> Table:
         if stored != entries:
             raise TableError(f'{path}: is damaged: the array "{name}" has {stored} entries, expected {entries}')
     if layout == "sparse":
+        check_palette(table)
         bits = table.settings.get("index_bits")
         if bits not in INDEX_BITS:
             raise TableError(f"{path}: is damaged: found indices of {bits!r} bits, allowed are {INDEX_BITS}")
@@ -231,6 +237,25 @@ def load(path) -> Table:
         if density.storage != "uint8" or density.entries.max() > last:
             raise TableError(f"{path}: is damaged: found a density level that is not a number from 0 to {last}")
     return table
+
+
+def check_place(table: Table) -> None:
+    """Raise :class:`TableError` unless single precision tells the nodes of a grid apart."""
+    lower, spacing, shape = (np.float64(table.settings[name]) for name in ("lower", "spacing", "shape"))
+    largest = max(np.abs(lower).max(), np.abs(lower + spacing * shape).max())
+    if not SMALLEST < largest < LARGEST or spacing < np.spacing(np.float32(largest)):
+        raise TableError(
+            f"{table.path}: is damaged: found nodes at a distance of {spacing:g} from {table.settings['lower']} on, "
+            f"allowed are coordinates between {SMALLEST:g} and {LARGEST:g} that single precision tells apart"
+        )
+
+
+def check_palette(table: Table) -> None:
+    """Raise :class:`TableError` unless the colours of a palette are bytes."""
+    for name in {"palette", "environment"} & set(table.arrays):
+        if table.arrays[name].storage != "uint8":
+            found = table.arrays[name].storage
+            raise TableError(f'{table.path}: is damaged: its array "{name}" is stored as {found}, allowed is uint8')
 
 
 def check_colours(table: Table) -> None:

@@ -28,6 +28,9 @@ RIGID = 1e-3
 #: Interval of the test views in a list without splits, beginning with the first view (as in LLFF's data).
 EVERY = 8
 
+#: Focal lengths and sizes in pixels are smaller.
+LONGEST = 1e9
+
 #: Camera models that are read; a distortion may be 0.
 CAMERA_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 
@@ -172,7 +175,7 @@ def _camera(file: Path, content: dict, frame: dict) -> Frame:
     if not {"fl_x", "camera_angle_x"} & set(numbers):
         raise ViewsError(f'{where} has no focal length: neither "camera_angle_x" nor "fl_x" is given')
     for names, limit, allowed in (
-        (("fl_x", "fl_y", "w", "h"), np.inf, "a number > 0"),
+        (("fl_x", "fl_y", "w", "h"), LONGEST, f"a number > 0 and < {LONGEST:g}"),
         (("camera_angle_x", "camera_angle_y"), np.pi, "radians between 0 and π"),
     ):
         for name in names:

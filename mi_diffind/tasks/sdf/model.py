@@ -43,6 +43,9 @@ TRIANGLES = 128
 #: Bytes of memory for each region, block and node while a sparse field and its index for rays are built, measured.
 REGION_BYTES, BLOCK_BYTES, NODE_BYTES = 300, 400, 28
 
+#: Coordinates of a box are smaller.
+LARGEST = 1e9
+
 #: Extensions of the mesh formats that ``decode`` writes, through trimesh.
 MESHES = (".ply", ".obj", ".stl", ".off", ".glb")
 
@@ -79,7 +82,25 @@ def load(path) -> Table:
         nbytes = REGION_BYTES * regions + BLOCK_BYTES * blocks + NODE_BYTES * table.settings["nodes"]
         check_allowance(table, nbytes, f"a field of {regions:,} regions and {blocks:,} blocks")
         structure_of(table)
+    else:
+        check_pair(table)
     return table
+
+
+def check_pair(table: Table) -> None:
+    """Raise :class:`~mi_diffind.tables.TableError` unless the box of two arrays has a volume, and cells."""
+    sides = table.arrays["primary"].shape[:-1]
+    if min(sides) < 2:
+        raise TableError(
+            f'{table.path}: its array "primary" has the shape {sides}, allowed are 2 or more along each axis'
+        )
+    lower, upper = (np.array(table.settings[name], np.float32) for name in ("lower", "upper"))
+    largest = max(np.abs(lower).max(), np.abs(upper).max())
+    if not (largest < LARGEST and ((upper - lower) / sides > np.spacing(largest)).all()):
+        raise TableError(
+            f"{table.path}: is damaged: found the box from {table.settings['lower']} to {table.settings['upper']}, "
+            f"allowed are boxes with a volume that single precision can divide into {sides} entries"
+        )
 
 
 def _words(table: Table, name: str, part=slice(None)) -> np.ndarray:
