@@ -19,7 +19,7 @@ def marked(name):
     return pytest.param(name, marks=[mending] if name in MENDED_NEXT else [])
 
 
-@pytest.mark.parametrize("name", map(marked, CASES))
+@pytest.mark.parametrize("name", [*map(marked, CASES)])
 def test_what_once_failed(child, name):
     probe, arguments = CASES[name].write(child.folder)
     answer = child.check(probe, **arguments)

@@ -57,12 +57,12 @@ def test_every_task_declares_small_files(name):
         assert task.load(file).arrays, f"{file} is out of date: python tests/trust/run.py --seeds {file.stem}"
 
 
-@pytest.mark.parametrize("name", map(marked, TABLES))
+@pytest.mark.parametrize("name", [*map(marked, TABLES)])
 def test_damaged_tables(child, name):
     check(child, TABLES[name], STRUCTURED, RAW, SHARE)
 
 
-@pytest.mark.parametrize("name", map(marked, campaigns.OTHERS))
+@pytest.mark.parametrize("name", [*map(marked, campaigns.OTHERS)])
 def test_damaged_inputs(child, name):
     check(child, campaigns.OTHERS[name](child), STRUCTURED, RAW)
 

@@ -41,10 +41,10 @@ SLOPE, LEVEL_SLOPE = 0.007, 0.1
 
 #: Least and largest slope for a size of the file, trials between them, and nodes of a trial. Where a larger slope is
 #: needed, a coarser grid is better.
-SLOPES, TRIALS, TRIAL_NODES = (1e-3, 0.05), 6, 60_000
+SLOPES, TRIALS, TRIAL_NODES = (1e-3, 0.05), 6, 100_000
 
-#: Planes of nodes that stay together in a trial.
-PLANES = 8
+#: Side of the columns of nodes that stay together in a trial.
+COLUMN = 24
 
 #: Share of the bytes of a file that its palette may have, that of a file before its training, which adds to it, and
 #: bytes of a file beside its nodes and its palette.
@@ -191,12 +191,18 @@ def coding_in(
 
 
 def trial_part(grid: NodeGrid, importance: Importance) -> tuple[NodeGrid, Importance]:
-    """Return planes of a grid with about :data:`TRIAL_NODES` nodes, and their importance."""
-    every = max(1, grid.nodes.count // TRIAL_NODES)
+    """Return random columns of a grid with about :data:`TRIAL_NODES` nodes, and their importance."""
     nodes = grid.nodes
-    planes = np.arange(nodes.shape[0]) // PLANES % every == 0
-    # Nodes of cells that other planes cut are left out: a file holds corners of whole cells
-    stored = corners_of(cells_of(nodes.stored & planes[:, None, None]))
+    side = -(-max(nodes.shape) // COLUMN)
+    x, y = (np.arange(n) // COLUMN for n in nodes.shape[:2])
+    column = x[:, None] * side + y
+    counts = np.bincount(column.ravel(), nodes.stored.sum(axis=2).ravel(), side * side)
+    order = np.random.default_rng(0).permutation(np.flatnonzero(counts))
+    last = np.searchsorted(np.cumsum(counts[order]), TRIAL_NODES)
+    chosen = np.zeros(side * side, bool)
+    chosen[order[: last + 1]] = True
+    # Nodes of cells that other columns cut are left out: a file holds corners of whole cells
+    stored = corners_of(cells_of(nodes.stored & chosen[column][..., None]))
     here = stored[nodes.stored]
     part = nodes.like(nodes.spacing, nodes.shape, stored)
     entries = np.concatenate([[True], here])
