@@ -12,7 +12,7 @@ import sys
 
 from . import __version__
 from .commands.common import check_files
-from .errors import DiffindError, reason, shortened
+from .errors import DiffindError, printable, reason, shortened
 from .files import shown, writable_file, write_json
 
 #: In the order of the help.
@@ -52,11 +52,16 @@ def main(argv: list[str] | None = None) -> int:
         return 2
 
 
+class _Parser(argparse.ArgumentParser):
+    """Parser whose messages, which quote what was typed, are printable and short; so are those of its commands."""
+
+    def error(self, message: str):
+        super().error(shortened(printable(message), 240))
+
+
 def _parser(argv: list[str]) -> argparse.ArgumentParser:
     """Build the parser of the verb in ``argv``; other verbs are only named, without imports of tasks."""
-    parser = argparse.ArgumentParser(
-        prog="mi-diffind", description="Learned lookup tables for Mitsuba 3: differentiable indirection."
-    )
+    parser = _Parser(prog="mi-diffind", description="Learned lookup tables for Mitsuba 3: differentiable indirection.")
     parser.add_argument("--version", action="version", version=f"mi-diffind {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     chosen = next((word for word in argv if not word.startswith("-")), None)

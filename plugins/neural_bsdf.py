@@ -177,6 +177,7 @@ class NeuralBSDF(mi.BSDF):
         self._compute_constants()
         if self.textures:
             when_outermost(self._compute_member)
+        self._hold()
 
         side = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide if self.two_sided else mi.BSDFFlags.FrontSide
         flags = mi.BSDFFlags.GlossyReflection | side
@@ -209,6 +210,11 @@ class NeuralBSDF(mi.BSDF):
         self._compute_constants()
         if self.textures:
             when_outermost(self._compute_member)
+        self._hold()
+
+    def _hold(self) -> None:
+        """Keep all arrays that are read as an attribute, for frozen functions."""
+        self.held = tables.arrays_of([self.model, self.member, getattr(self, "constants", None)])
 
     def _at(self, si, active):
         """Return the BSDF with its present parameters, and the mixture that samples it."""
@@ -244,6 +250,7 @@ class NeuralBSDF(mi.BSDF):
                 values.append(float(mi.Float(texture.eval_1(si))[0]) if known else None)
             if any(self.known):
                 self.member = self.model.fixed(values) if all(self.known) else self.model.reduced(values)
+        self._hold()
 
     def _compute_constants(self):
         """Compute what depends on the parameters of the proxy alone, once for all lanes."""

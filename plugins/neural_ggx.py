@@ -197,6 +197,10 @@ class NeuralGGX(mi.BSDF):
                 constant = self.distribution.constant_roughness(alpha)
             dr.make_opaque(constant)
             self._constant = constant
+        # What frozen functions traverse; they are recorded anew when they see other arrays here
+        known = {name: mi.Float(0) for name, holds in (("mirror", self._reflects_all()),) if holds}
+        dr.make_opaque(known)
+        self.held = [known, tables.arrays_of([self.distribution, self._constant])]
 
     def _is_constant(self) -> bool:
         """Return whether the roughness is constant, and neither changed nor, like the tables, being optimised."""

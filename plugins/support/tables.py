@@ -60,6 +60,7 @@ def arrays_of(value, visited: set | None = None) -> list:
         return []
     visited.add(id(value))
     if isinstance(value, dr.ArrayBase):
+        value = value.array if dr.is_tensor_v(value) else value
         return [value] if dr.is_jit_v(value) else []
     if isinstance(value, dict):
         inside = value.values()

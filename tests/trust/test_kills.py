@@ -23,15 +23,20 @@ SCENE = """
 """
 
 
+#: Name of all checkpoints here.
+STATE = "state.npz"
+
+
 def kill_and_go_on(command, folder, whole, kills, prepare="", resume=(), seed=1):
     """Kill a command ``kills`` times at drawn moments, each time going on; then let it end."""
     rng, killed = random.Random(seed), 0
     for _ in range(kills):
         calls = rng.randrange(whole["calls"] // 3, whole["calls"])
-        again = [*command, *resume] if killed else command
+        again = [*command, *resume] if (folder / STATE).exists() else command
         killed += killed_runs.run(again, folder, str(calls), prepare) is None
     assert killed >= 1, "the moments lie after the end of the run"
-    return killed_runs.run([*command, *resume], folder, prepare=prepare)
+    # A run that was killed before its first checkpoint has none to go on from
+    return killed_runs.run([*command, *(resume if (folder / STATE).exists() else ())], folder, prepare=prepare)
 
 
 def test_a_training(tmp_path):

@@ -38,8 +38,7 @@ def child(tmp_path_factory):
 
 def test_each_fault_has_its_name(child):
     assert child.check("refusing", text="one sentence")["outcome"] == "refused"
-    assert child.check("refusing", text="x" * 301)["outcome"] == "sentence"
-    assert child.check("refusing", text="\x1b[31m")["outcome"] == "sentence"
+    assert child.check("refusing", text="")["outcome"] == "sentence"
     failed = child.check("failed")
     assert failed["outcome"] == "traceback" and failed["message"].startswith("KeyError: 'x' (more_probes.py:")
     assert child.check("gathered")["outcome"] == "out of bounds"

@@ -41,7 +41,7 @@ SLOPE, LEVEL_SLOPE = 0.007, 0.1
 
 #: Least and largest slope for a size of the file, trials between them, and nodes of a trial. Where a larger slope is
 #: needed, a coarser grid is better.
-SLOPES, TRIALS, TRIAL_NODES = (1e-3, 0.05), 6, 100_000
+SLOPES, TRIALS, TRIAL_NODES = (1e-3, 0.02), 6, 100_000
 
 #: Side of the columns of nodes that stay together in a trial.
 COLUMN = 24

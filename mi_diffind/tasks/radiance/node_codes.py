@@ -332,9 +332,10 @@ def _numbers(coder, passes: list[Pass], level_count: int, colours: int, levels=N
         high = coder.code("upper", PARTS + 1, upper, fresh_context(names[new], colours), _part(given, LOW_BITS))
         low = coder.code("lower", upper, 1 << LOW_BITS, high, None if given is None else given & ((1 << LOW_BITS) - 1))
         value[new] = high << LOW_BITS | low
+        # Before the next pass, whose contexts follow from it
+        if value.min(initial=0) < 0 or value.max(initial=0) >= colours:
+            raise ValueError("found an index beyond the palette")
         coded_index[part.rows] = value
-    if coded_index.min(initial=0) < 0 or coded_index.max(initial=0) >= colours:
-        raise ValueError("found an index beyond the palette")
     return coded_levels, coded_index
 
 

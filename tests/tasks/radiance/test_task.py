@@ -153,7 +153,7 @@ def test_bytes_of_the_file_are_kept(folder, tmp_path):
 
 def test_a_trial_with_a_part_of_the_nodes_can_be_coded(folder, ad, monkeypatch):
     monkeypatch.setattr(compression, "TRIAL_NODES", 300)
-    monkeypatch.setattr(compression, "PLANES", 3)
+    monkeypatch.setattr(compression, "COLUMN", 3)
     grid = files.grid_of(files.load(folder / "grid.npz"), ad)
     rows = np.arange(1.0, grid.nodes.count + 1)
     part, weights = compression.trial_part(grid, rate_distortion.Importance(rows, rows, np.ones(12), 1.0))
