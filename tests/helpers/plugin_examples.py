@@ -20,7 +20,7 @@ PARAMETERS = {
                "anisotropic": 0.4, "spec_tint": 0.3, "sheen": 0.5, "sheen_tint": 0.4, "flatness": 0.3,
                 "clearcoat": 0.6, "clearcoat_gloss": 0.4},
     "mipmap": {"filename": "tiles_albedo.png"},
-    "neural_bsdf": {"filename": "library/copper.npz"},
+    "neural_bsdf": {"filename": "library/copper.npz", "scale": 0.9},
     "neural_field": {"filename": "group.npz"},
     "neural_ggx": {"alpha": 0.3, "eta": 0.4, "k": 2.0},
     "neural_image": {"filename": "tiles.npz", "channels": "albedo"},
