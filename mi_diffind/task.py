@@ -320,8 +320,7 @@ class Task:
     files: str = "files"
     #: Number of measurements during a training; 0: as the settings of the preset say.
     measurements: int = 0
-    #: Name → keywords of :func:`fit` for a fit of seconds, one for each layout of the task's files. Their ``source`` is
-    #: "maps", "mesh", "bsdf" or "views", a small source of this sort. Tests of trust damage the files of these fits.
+    #: Name → keywords of :func:`fit` for fits of seconds, one for each layout, whose files the tests of trust damage.
     trials: Mapping[str, Mapping[str, Any]] = {}
     #: Object type and name of the plugin that reads the tables ("texture", "neural_image"); none: no plugin does.
     plugin: tuple[str, str] | None = None
@@ -575,8 +574,7 @@ def fit(
     if source is not None:
         given["source"] = source
     arguments = {argument.name: argument for argument in chosen.arguments}
-    options = {key: argument.default for key, argument in arguments.items()}
-    fields = {f.name for f in dataclasses.fields(FitSettings)}
+    options, fields = {k: a.default for k, a in arguments.items()}, {f.name for f in dataclasses.fields(FitSettings)}
     deadline = Deadline(seconds) if isinstance(seconds, (int, float)) else seconds
     for key, value in given.items():
         if key == "source" and key not in options:
@@ -584,8 +582,7 @@ def fit(
         if key not in options and key not in fields:
             allowed = ", ".join(sorted({*options, *fields}))
             raise UsageError(f'{task}: found the argument "{key}", allowed are {allowed}')
-        if key in options:
-            options[key] = arguments[key].parsed(value)
+        options |= {key: arguments[key].parsed(value)} if key in options else {}
     settings = within_memory(chosen.settings(preset, {k: v for k, v in given.items() if k in fields}, options))
     request = FitRequest(preset, settings, None, storage or next(iter(chosen.storages), ""), options)
     request.deadline, request.seconds = deadline, None if deadline is None else deadline.seconds

@@ -254,8 +254,8 @@ def check_palette(table: Table) -> None:
     """Raise :class:`TableError` unless the colours of a palette are bytes."""
     for name in {"palette", "environment"} & set(table.arrays):
         if table.arrays[name].storage != "uint8":
-            found = table.arrays[name].storage
-            raise TableError(f'{table.path}: is damaged: its array "{name}" is stored as {found}, allowed is uint8')
+            kept = table.arrays[name].storage
+            raise TableError(f'{table.path}: is damaged: its array "{name}" is stored as {kept}, allowed is uint8')
 
 
 def check_colours(table: Table) -> None:
