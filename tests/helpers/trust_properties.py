@@ -389,7 +389,7 @@ def gradients_float32(mi, name: str, effort: Effort) -> Cell:
     """Derivatives with the storage form float32, whose tables can be optimised."""
     if not plugins.declared()[name].task:
         return Cell(NOT_APPLICABLE, reason="reads no table")
-    if examples.example(name).get("trace") == "grid":
+    if plugins.declared()[name].object_type == "shape" and "polarized" in mi.variant():
         return Cell(NOT_APPLICABLE, reason="a polarised variant renders a grid that was decoded from the tables")
     return gradients(mi, name, effort, "float32")
 

@@ -4,7 +4,8 @@ Measure what docs/trust.md promises: every plugin, in every variant, for every p
     python tests/trust/measure.py -o docs/measured/trust.json [--variants llvm_ad_rgb,llvm_ad_mono] [--quick]
 
 A cell says "holds" or "fails" with its figure, "does not apply" or "not run" with a reason. The file is written after
-each cell, so that an interrupted run leaves what it has measured. Cells of other variants and properties are "not run".
+each cell, so that an interrupted run leaves what it has measured. Cells of other variants and properties stay as they
+are in the file, or are "not run".
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import datetime
+import json
 import os
 import sys
 import tempfile
@@ -48,7 +50,12 @@ def table(variants, properties, effort: trust.Effort, output: str | None, report
     set_variant(VARIANTS[0])
     names = sorted(plugins.declared())
     left_out = dataclasses.asdict(trust.Cell(trust.NOT_RUN, reason="left out of this run"))
-    cells = {name: {v: {p: left_out for p in trust.PROPERTIES} for v in VARIANTS} for name in names}
+    before = json.loads(Path(output).read_text(encoding="utf-8"))["cells"] if output and Path(output).exists() else {}
+
+    def kept(name: str, variant: str, prop: str) -> dict:
+        return before.get(name, {}).get(variant, {}).get(prop, left_out)
+
+    cells = {name: {v: {p: kept(name, v, p) for p in trust.PROPERTIES} for v in VARIANTS} for name in names}
     report |= {"cells": cells, "complete": False}
     for variant in variants:
         mi = set_variant(variant)
@@ -61,7 +68,8 @@ def table(variants, properties, effort: trust.Effort, output: str | None, report
                 print(f"{variant} {name} {prop}: {cell['result']}{figure} ({cell['reason']})", flush=True)
                 if output:
                     write_json(output, report)
-    report["complete"] = list(variants) == VARIANTS and list(properties) == list(trust.PROPERTIES)
+    every = [cell for by_variant in cells.values() for row in by_variant.values() for cell in row.values()]
+    report["complete"] = left_out not in every
     return report
 
 
