@@ -312,15 +312,16 @@ class Disney(mi.BSDF):
         groups = sorted({*self.decoder.required(effects), *sampling.required(effects)})
         parameters = self._point(mi.BSDFContext(), dr.zeros(mi.SurfaceInteraction3f), True).parameters
         with dr.suspend_grad():
-            self._constant = {
+            constant = {
                 group: self.decoder.coefficients(group, parameters, effects)
                 for group in groups
                 if self._is_constant(group)
             }
-        # A frozen function is recorded anew when it sees other arrays here
-        self._constant["effects"] = {name: mi.Float(0) for name in effects.names}
-        dr.make_opaque(self._constant)
-        self._constant_for = effects
+        known = {name: mi.Float(0) for name in effects.names}
+        dr.make_opaque(constant, known)
+        self._constant, self._constant_for = constant, effects
+        # What frozen functions traverse; they are recorded anew when they see other arrays here
+        self.held = [known, tables.arrays_of([constant, self._arrays()])]
 
     def _arrays(self) -> dict:
         """Return the tables that are read, by name."""
@@ -337,7 +338,7 @@ class Disney(mi.BSDF):
             **tables.described(self.preset, self._arrays()),
             "effects_in_use": list(effects.names),
             "effects_left_out": reasons,
-            "evaluated_once": sorted(group for group in self._constant if group != "effects"),
+            "evaluated_once": sorted(self._constant),
         }
 
     def _read(self, name: str, si: mi.SurfaceInteraction3f, active: mi.Bool):

@@ -96,7 +96,7 @@ class NeuralDisney(Disney):
     def _set_up(self, props):
         opened = tables.open_tables(props, TASK, STORAGE)
         self.decoder, self.preset, self._table = opened.decoder, opened.table.preset, opened.table
-        self.held = tables.arrays_of(self.decoder)  # what frozen functions traverse
+        tables.own(self._arrays())
 
     def _arrays(self) -> dict:
         return {name: getattr(self.decoder.arrays, name) for name in self.decoder.arrays.SHAPES}
@@ -120,7 +120,6 @@ class NeuralDisney(Disney):
     def parameters_changed(self, keys: list[str] = ()):
         tables.check_shapes(self._tables())
         super().parameters_changed(keys)
-        self.held = tables.arrays_of(self.decoder)
 
 
 def _from_principled(node: StockNode) -> None:

@@ -34,6 +34,19 @@ def exposed(arrays: dict) -> dict:
     return {name: array for name, array in arrays.items() if array.storage == "float32"}
 
 
+def own(arrays: dict) -> None:
+    """Copy the entries of arrays that can be optimised from NumPy's memory to that of Dr.Jit.
+
+    Frozen functions (``dr.freeze``) of Dr.Jit 1.5 take entries in foreign memory for constants: a change would not be
+    seen.
+    """
+    for array in exposed(arrays).values():
+        entries, shape = array.data.array, array.data.shape
+        # An operation that changes no number, which Dr.Jit does not know
+        array.data = type(array.data)(dr.minimum(entries, dr.opaque(type(entries), dr.inf)), shape)
+        dr.eval(array.data)
+
+
 def traverse(cb: mi.TraversalCallback, arrays: dict) -> None:
     """Expose the entries of arrays as parameters ``tables.NAME``."""
     for name, array in arrays.items():

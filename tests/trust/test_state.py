@@ -26,9 +26,6 @@ UNSEEN = ("level0", "level1", "level2"), ("spec_tint.value", "sheen_tint.value")
 RECOMPUTED = {"mipmap": 2e-6}
 
 
-#: Examples whose frozen renders do not see a change of tables.
-STALE = (("neural_ggx", ""), ("neural_ggx", "float32"), ("neural_disney", "float32"))
-
 #: Variant × plugin × storage form ("": the default form).
 CASES = [
     pytest.param(variant, name, storage, id=f"{variant}-{name}-{storage or 'default'}",
@@ -107,8 +104,6 @@ def test_frozen_renders(variant, name, storage, no_garbage_collection):
     mi = loaded(variant, name, storage)
     scene = examples.load(mi, name, storage)
     params, keys = examples.exposed(mi, scene, name)
-    if (name, storage) in STALE:
-        keys = [key for key in keys if "tables." not in key]
     dr.eval(mi.render(scene, spp=SPP))
     frozen = dr.freeze(lambda scene, seed: mi.render(scene, spp=SPP, seed=seed))
     for changes in (False, True):
