@@ -349,7 +349,7 @@ def test_too_few_samples_are_refused_early(regress, tmp_path, monkeypatch):
     assert len(rendered) % regress.PROBE_PASSES == 0 and wanted == 4 * 2 ** (factor - 1) > 4
     assert regress.update_reference(path, spp=wanted, **options)["expected_fraction"] >= 0.9975
     monkeypatch.setattr(regress, "probe", lambda *_: 0.02)
-    with pytest.raises(regress.scenes.SceneError, match="not even 16 times the samples would do: give fewer"):
+    with pytest.raises(regress.scenes.SceneError, match="not even 16 times the samples would do: give a lower"):
         regress.update_reference(path, **options)
 
 

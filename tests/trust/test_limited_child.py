@@ -21,7 +21,7 @@ def refusing(text):
 def gathered():
     import drjit as dr
     from drjit.llvm.ad import Float, UInt32
-    dr.eval(dr.gather(Float, Float([1, 2, 3]), UInt32([7])))
+    dr.eval(dr.gather(Float, Float([1, 2, 3]), dr.opaque(UInt32, 7)))
 def grew():
     return bounded(lambda: np.ones(1 << 25), __file__) and None
 """
