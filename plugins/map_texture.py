@@ -40,7 +40,6 @@ class MapTexture(mi.Texture):
         #: Path of the file, for :meth:`to_string`.
         self._path = ""
         self._shared = self._open(props)
-        tables.own(self._shared.tables)
         self.image = self._shared.image
         #: The arrays, where frozen functions (``dr.freeze``) look for them.
         self.net = getattr(self.image, "net", None)

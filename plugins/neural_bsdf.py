@@ -174,7 +174,7 @@ class NeuralBSDF(mi.BSDF):
         self.proxy = _parameters(self.model) if self.model.form.terms and not self.textures else {}
         self._tracked = [TrackedParameter(texture) for texture in self.textures.values()]
         self.known, self.member = [], None
-        tables.own(self._arrays())
+        tables.copy_entries(self._arrays())
         self._compute_constants()
         if self.textures:
             when_outermost(self._compute_member)

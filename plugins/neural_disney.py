@@ -96,7 +96,7 @@ class NeuralDisney(Disney):
     def _set_up(self, props):
         opened = tables.open_tables(props, TASK, STORAGE)
         self.decoder, self.preset, self._table = opened.decoder, opened.table.preset, opened.table
-        tables.own(self._arrays())
+        tables.copy_entries(self._arrays())
 
     def _arrays(self) -> dict:
         return {name: getattr(self.decoder.arrays, name) for name in self.decoder.arrays.SHAPES}

@@ -141,7 +141,7 @@ class NeuralGGX(mi.BSDF):
 
         opened = tables.open_tables(props, TASK)
         self.distribution, self.preset, self._table = opened.distribution, opened.table.preset, opened.table
-        tables.own(self._arrays())
+        tables.copy_entries(self._arrays())
 
         self._tracked_alpha = TrackedParameter(self.alpha)
         self._tracked_ior = [TrackedParameter(self.eta, colour=True), TrackedParameter(self.k, colour=True)]

@@ -27,7 +27,7 @@ from mi_diffind.tables import Table, TableError
 from mi_diffind.task import Task, stamp
 
 from . import properties
-from .tables import exposed
+from .tables import copy_entries, exposed
 
 STORAGES = ("uint8", "float32")
 
@@ -95,6 +95,7 @@ def open_file(task: Task, path: str | Path, storage: str) -> SharedMaps:
 
     def load():
         model = task.model(task.load(path), mi.TensorXf, storage)
+        copy_entries(model.arrays)
         return SharedMaps(model.image, model.arrays, model.table)
 
     return shared((task.name, str(path.resolve()), *stamp(path), storage, mi.TensorXf), load)

@@ -34,7 +34,7 @@ def exposed(arrays: dict) -> dict:
     return {name: array for name, array in arrays.items() if array.storage == "float32"}
 
 
-def own(arrays: dict) -> None:
+def copy_entries(arrays: dict) -> None:
     """Copy the entries of arrays that can be optimised from NumPy's memory to that of Dr.Jit.
 
     Frozen functions (``dr.freeze``) of Dr.Jit 1.5 take entries in foreign memory for constants: a change would not be
@@ -42,8 +42,8 @@ def own(arrays: dict) -> None:
     """
     for array in exposed(arrays).values():
         entries, shape = array.data.array, array.data.shape
-        # An operation that changes no number, which Dr.Jit does not know
-        array.data = type(array.data)(dr.minimum(entries, dr.opaque(type(entries), dr.inf)), shape)
+        one, zero = (dr.opaque(type(entries), number) for number in (1.0, -0.0))
+        array.data = type(array.data)(dr.fma(entries, one, zero), shape)  # no number changes, not even −0 and NaN
         dr.eval(array.data)
 
 

@@ -174,7 +174,7 @@ def test_entries_of_any_value_are_harmless(mi_rgb, rng, preset, constant):
     wi, wo = (vectors(mi, with_cosines(rng, c)) for c in cosines)
     si, u = interactions(mi, wi, index, len(materials)), uniform(mi, rng, n)
     params = mi.traverse(bsdf)
-    tables = {key: params[key].numpy() for key in params.keys() if key.startswith("tables.")}
+    tables = {key: np.array(params[key].numpy()) for key in params.keys() if key.startswith("tables.")}
     assert len(tables) >= 6
     for key, entries in tables.items():
         params[key] = mi.TensorXf(aligned(entries))
