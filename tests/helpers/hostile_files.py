@@ -301,7 +301,7 @@ STEPS = {
 def set_bytes(data: bytes, edits: list) -> bytes:
     """Replace bytes: pairs of a share of the file's length and a value."""
     changed = bytearray(data)
-    for share, value in edits:
+    for share, value in edits if data else ():
         changed[min(len(data) - 1, int(share * len(data)))] = value
     return bytes(changed)
 

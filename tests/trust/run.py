@@ -40,6 +40,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--mutants", type=int, default=1000, help="structured mutants of each file (default: 1000)")
     parser.add_argument("--raw", type=int, default=1000, help="mutants by bytes of each file (default: 1000)")
+    parser.add_argument("--share", type=int, default=1, help="one in so many tables that load is rendered (default: 1)")
     parser.add_argument("--seconds", type=float, default=float("inf"), help="limit of the time of all together")
     parser.add_argument("--json", type=Path, default=Path("trust_files.json"), help="report to write")
     parser.add_argument("--seeds", action="store_true", help="write the valid files of all tasks anew, and end")
@@ -64,7 +65,9 @@ def main() -> int:
                 end = time.monotonic() + share * count / max(1, arguments.mutants + arguments.raw)
                 if count < 1:
                     continue
-                campaign = campaigns.run(child, target, recipes, count, lambda end=end: time.monotonic() < end)
+                campaign = campaigns.run(
+                    child, target, recipes, count, lambda end=end: time.monotonic() < end, arguments.share
+                )
                 figures = {"recipes": form, **campaign.figures()}
                 results.append(figures)
                 print(f"{name:24} {form:10} " + " ".join(f"{figures[c]:13,}" for c in columns), flush=True)
