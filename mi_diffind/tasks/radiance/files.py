@@ -251,8 +251,8 @@ def check_place(table: Table) -> None:
 
 
 def check_palette(table: Table) -> None:
-    """Raise :class:`TableError` unless the colours of a palette are bytes."""
-    for name in {"palette", "environment"} & set(table.arrays):
+    """Raise :class:`TableError` unless the arrays of a field with a palette are bytes."""
+    for name in table.arrays:
         if table.arrays[name].storage != "uint8":
             kept = table.arrays[name].storage
             raise TableError(f'{table.path}: is damaged: its array "{name}" is stored as {kept}, allowed is uint8')
