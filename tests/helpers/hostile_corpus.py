@@ -229,6 +229,8 @@ def changed_view(**changes):
 
 
 CASES["a focal length of 1e300"] = Case(changed_view(fl_x=1e300))
+CASES["a focal length of 2**64"] = Case(changed_view(fl_x=2**64))
+CASES["a camera of 10**400"] = Case(changed_view(transform_matrix=[[10**400, 0, 0, 0]] * 4))
 CASES["a picture of a long path"] = Case(changed_view(file_path="x" * 5000))
 CASES["a picture that is an endless file"] = Case(changed_view(file_path="/dev/zero"))
 
@@ -245,6 +247,11 @@ recipe("a primary array of one entry: ggx", "ggx_small",
 recipe("spacing 1e-30", "field_coded", ["set_value", ["settings", "spacing"], 1e-30])
 recipe("spacing 1e-30 of a grid", "field_grid", ["set_value", ["settings", "spacing"], 1e-30])
 recipe("a palette of floats", "field_coded", ["convert", "palette", "float32"])
+recipe("probabilities of floats", "field_coded", ["convert", "probabilities", "float32"])
+recipe("arrays of which one is of floats, nothing inside", "sdf_paper", ["convert", "cascaded", "float32"],
+       ["set_record", "end", 0, 4, 4, 65536])  # fmt: skip
+recipe("a primary array of floats", "sdf_paper", ["convert", "primary", "float32"],
+       ["set_record", "local", 2, 6, 1, 2], outcomes=("refused", "loaded"))  # fmt: skip
 recipe("no crossed cell", "sdf_sparse", ["set_entries", "region_masks", "all", 0, 0])
 recipe("control characters in a setting", "ggx_small", ["set_value", ["settings", "inputs"], "\x1b[31mred"])
 recipe("control characters in the task", "ggx_small", ["set_value", ["task"], "\x1b]0;title\x07"])

@@ -11,6 +11,7 @@ import inspect
 import io
 import json
 import os
+import re
 from pathlib import Path
 
 import drjit as dr
@@ -19,6 +20,8 @@ import numpy as np
 from limited_child import Growth, fault_of_sentence
 
 import mi_diffind
+from mi_diffind import compat
+from mi_diffind.errors import DiffindError
 from mi_diffind.runtime import array_module
 
 #: Memory that reading a file may take: bytes, and multiples of the file's size.
@@ -141,6 +144,13 @@ class Growing(MemoryError):
         super().__init__(f"{nbytes / 2**20:,.0f} MB for {os.path.getsize(path):,} bytes")
 
 
+def refuse(error: RuntimeError, path: str) -> None:
+    """Raise :class:`DiffindError` if a plugin refused a file, by a sentence that Mitsuba wrapped in its own."""
+    raised = re.findall(r"^([\w.]+): (.*)", str(error), re.MULTILINE)
+    if raised and raised[-1][0] == "RuntimeError" and f"{Path(path).name}: " in raised[-1][1]:
+        raise DiffindError(compat.one_sentence(error)) from None
+
+
 def decoded(model) -> object:
     """Return the content of a model in an ordinary format, ``None`` if there is no such format."""
     from mi_diffind.task import Model, task_of
@@ -176,7 +186,12 @@ def rendered(task, loaded, path: str) -> str:
         scene = scene_with({"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": plugin}})
     else:
         scene = scene_with({"type": "rectangle", "bsdf": plugin})
-    picture = mi.render(scenes.load_dict(scene), spp=SAMPLES).numpy()
+    try:
+        scene = scenes.load_dict(scene)
+    except RuntimeError as e:
+        refuse(e, path)
+        raise
+    picture = mi.render(scene, spp=SAMPLES).numpy()
     return "" if np.isfinite(picture).all() else "a picture"
 
 

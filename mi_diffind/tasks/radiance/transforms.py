@@ -144,7 +144,7 @@ def _box(file: Path, content: dict) -> np.ndarray | None:
         return None
     try:
         box = np.array(content["aabb"], np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         box = np.zeros(0)
     if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[0] < box[1]).all():
         raise ViewsError(
@@ -169,9 +169,12 @@ def _camera(file: Path, content: dict, frame: dict) -> Frame:
         value = entries.get(name)
         if value is None:
             continue
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < float("inf"):
             raise ViewsError(f'{where} has the "{name}" {value!r:.40}, expected a number')
-        numbers[name] = float(value)
+        try:
+            numbers[name] = float(value)
+        except OverflowError:  # a whole number of more than 308 digits
+            raise ViewsError(f'{where} has a "{name}" above 1e308, expected a number') from None
     if not {"fl_x", "camera_angle_x"} & set(numbers):
         raise ViewsError(f'{where} has no focal length: neither "camera_angle_x" nor "fl_x" is given')
     for names, limit, allowed in (
@@ -191,7 +194,7 @@ def _pose(where: str, matrix) -> np.ndarray:
         raise ViewsError(f'{where} has no "transform_matrix"')
     try:
         pose = np.array(matrix, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ViewsError(f"{where} has a transform_matrix that is not a matrix of numbers") from None
     if pose.shape == (3, 4):
         pose = np.vstack([pose, [0, 0, 0, 1]])
