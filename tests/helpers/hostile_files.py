@@ -80,7 +80,7 @@ class Archive:
             meta = b"{}"
         content = {"meta": npy(np.frombuffer(meta, np.uint8)), **{n: npy(a) for n, a in self.arrays.items()}}
         content |= self.raw
-        return [(f"{name}.npy", content[name]) for name in [*content, *self.order]]
+        return [(f"{name}.npy", content[name]) for name in [*content, *self.order] if name in content]
 
     def write(self) -> bytes:
         """Return the file."""
