@@ -326,6 +326,8 @@ class FieldFit:
                     rest = 0 if over else steps - chosen.steps
             if rest:
                 problem, grid = grids.GridProblem(grid, self.session, SIDE if last else 1), None
+                if number:
+                    problem.draw_by_errors()
                 checkpoint = f"{request.checkpoint}.stage{number}" if request.checkpoint else None
                 stage_request = dataclasses.replace(
                     limited_stage,

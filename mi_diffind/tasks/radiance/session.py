@@ -33,6 +33,15 @@ PATCH = 2
 #: Pixels along a side of a tile, and the share of patches that are drawn from all tiles, with something in them or not.
 TILE, ANYWHERE = 8, 0.05
 
+#: Share of the patches in tiles that are drawn by the errors of tiles, and the share of the mean that is added to each.
+BY_ERRORS, LEAST_ERROR = 0.75, 0.25
+
+#: Pixels of a tile whose error is measured: columns and rows.
+SAMPLED = np.array([(2 * i + j % 2, 2 * j + i % 2) for j in range(TILE // 2) for i in range(TILE // 2)]).T
+
+#: Linear grey before which errors of tiles are measured.
+GREY = 0.2
+
 #: Distance at which training rays of a field with surroundings begin, as a share of the distance from the point that
 #: the cameras look at to the nearest one.
 NEAR = 0.4
@@ -149,11 +158,45 @@ class ViewImages:
             return [grey] * 3
         return [types.Float(float(LINEAR[byte])) for byte in self.views.background]
 
-    def random_pixels(self, rng, size: int, side: int = PATCH) -> tuple:
+    def cumulative_errors(self, field: VolumeField):
+        """Return the chances of all :attr:`tiles` by the errors of a field, summed up to each: a Float from 0 to 1.
+
+        The chance of a tile is proportional to the root of the mean squared difference of sRGB values before grey, at
+        one ray through each of 16 pixels. ``None`` if there are no errors.
+        """
+        types, views = self.types, self.views
+        tile_views, tile_columns, tile_rows = (n.numpy() for n in self.tiles)
+        errors = np.zeros(len(tile_views))
+        for view in range(len(views)):
+            chosen = np.nonzero(tile_views == view)[0]
+            if len(chosen) == 0:
+                continue
+            height, width = views.sizes[view].tolist()
+            column, row = tile_columns[chosen, None] + SAMPLED[0], tile_rows[chosen, None] + SAMPLED[1]
+            inside = (column < width) & (row < height)
+            column, row = np.minimum(column, width - 1), np.minimum(row, height - 1)
+            place = dr.opaque(types.UInt32, view), *(device_array(types.UInt32, n) for n in (column, row))
+            seen = march(field, *self.rays(*place), self.near, dr.inf)
+            truth, total = self.colours(*place), types.Float(0)
+            for c in range(3):
+                shown, reference = (
+                    srgb.from_linear(colour + clear * GREY, fused=False)
+                    for colour, clear in ((seen.colour[c], seen.transmittance), (truth[c], 1 - truth[3]))
+                )
+                total += dr.square(shown - reference)
+            total = dr.select(self.counted(*place), total, 0).numpy().reshape(inside.shape)
+            errors[chosen] = (total * inside).sum(axis=1) / np.maximum(1, inside.sum(axis=1))
+        if not errors.any():
+            return None
+        chances = np.cumsum(np.sqrt(errors + errors.mean() * LEAST_ERROR))
+        return device_array(types.Float, chances / chances[-1])
+
+    def random_pixels(self, rng, size: int, side: int = PATCH, cumulative=None) -> tuple:
         """Return view, column and row of ``size`` random pixels, in patches of ``side``².
 
         The share :data:`ANYWHERE` of the patches is drawn from all pixels of a view, and each view is as likely as the
-        others; the rest is drawn from the tiles in which something is seen.
+        others; the rest is drawn from the tiles in which something is seen. With ``cumulative`` chances
+        (:meth:`cumulative_errors`), the share :data:`BY_ERRORS` of these is drawn by them.
         """
         types, views = self.types, self.views
         patches = max(1, size // side**2)
@@ -169,6 +212,10 @@ class ViewImages:
         x, y = (whole(dr.maximum(limit, side) - (side - 1)) for limit in (width, height))
         if tiles := dr.width(self.tiles):
             chosen, of_tile = whole(dr.opaque(types.UInt32, tiles)), number() >= ANYWHERE
+            if cumulative is not None:
+                sought = number()
+                by_error = dr.binary_search(0, tiles - 1, lambda i: dr.gather(types.Float, cumulative, i) < sought)
+                chosen = dr.select(number() < BY_ERRORS, by_error, chosen)
             place = [dr.gather(types.UInt32, values, chosen) for values in self.tiles]
             place[1:] = (value + whole(types.UInt32(TILE)) for value in place[1:])
             view, x, y = (dr.select(of_tile, a, b) for a, b in zip(place, (view, x, y), strict=True))

@@ -32,6 +32,10 @@ class ImagesProblem(Problem):
 
     side = SIDE
 
+    #: Chances of tiles by the errors of the field at the beginning (:meth:`.ViewImages.cumulative_errors`), if rays are
+    #: drawn by them.
+    cumulative = None
+
     def __init__(self, session: FieldSession, net, field_of: Callable[..., VolumeField]):
         if session.exposures is not None:
             net = {**net, "exposures": device_tensor(session.types.TensorXf, session.exposures)}
@@ -41,7 +45,7 @@ class ImagesProblem(Problem):
     def loss(self, net, rng, size: int):
         types, images = self.session.types, self.session.images
         rays = self.side**2
-        view, x, y = images.random_pixels(rng, size // rays, PATCH * SIDE // self.side)
+        view, x, y = images.random_pixels(rng, size // rays, PATCH * SIDE // self.side, self.cumulative)
         count = dr.width(view)
         o, d = images.pixel_rays(view, x, y, self.side)
         offset = rng.random(types.TensorXf, (dr.width(o),)).array
@@ -57,6 +61,11 @@ class ImagesProblem(Problem):
             shown = srgb.from_linear(gain * colour[c] + transmittance * behind[c], fused=False)
             total += dr.square(shown - reference)
         return dr.select(images.counted(view, x, y), total, 0) * (1 / (3 * count))
+
+    def draw_by_errors(self) -> None:
+        """Draw rays by the errors of the present state from now on, unless exposures are trained."""
+        if self.session.exposures is None:
+            self.cumulative = self.session.images.cumulative_errors(self.field_of(self.net))
 
     def gain(self, net, view):
         """Return the factor of the colours of the field in a view."""

@@ -13,6 +13,8 @@ import pytest
 from captures import SIZE, Fog, change, pose, write_blender, write_image, write_json
 from PIL import Image
 
+from mi_diffind import srgb
+from mi_diffind.tasks.radiance import session
 from mi_diffind.tasks.radiance.session import TILE, FieldSession, ViewImages
 from mi_diffind.tasks.radiance.training import ImagesProblem
 from mi_diffind.tasks.radiance.views import ViewsError, load_views
@@ -428,3 +430,35 @@ def test_what_nerfstudio_applied_is_kept_and_recorded(studio):
     change(studio, "transforms.json", aabb_scale=16, scale=0.33, offset=[0.5, 0.5, 0.5], applied_transform=None)
     again = load_views(studio)
     assert again.settings == {} and np.array_equal(again.poses, views.poses) and again.box is None
+
+
+class Clear(Fog):
+    """Nothing."""
+
+    def density_at(self, p, active=True):
+        return self.types.Float(0), []
+
+
+def test_patches_are_drawn_where_errors_are(blender):
+    """Of the tiles, in proportion to the root of their error before grey; an empty field errs where something is."""
+    stored = np.zeros((64, 48, 4), np.uint8)
+    stored[8:16, 8:16] = 255  # one tile of white, among eight empty ones that count as seen
+    for i in range(4):
+        Image.fromarray(stored * (i == 2)).save(blender / "train" / f"r_{i}.png")
+    images = ViewImages(llvm, load_views(blender))
+    empty = Clear(llvm, (-1, -1, -1), (1, 1, 1), 0.5, {})
+    cumulative = images.cumulative_errors(empty)
+    # White before grey, of sRGB
+    grey = srgb.from_linear(np.float64(session.GREY))
+    error = 3 * (1 - grey) ** 2 * np.array([x == y == 8 for _, x, y in images.tiles.numpy().T])
+    chances = np.sqrt(error + error.mean() * session.LEAST_ERROR)
+    np.testing.assert_allclose(cumulative.numpy(), np.cumsum(chances / chances.sum()), rtol=1e-4)
+    view, x, y = (a.numpy() for a in images.random_pixels(dr.rng(seed=0), 2**15, 1, cumulative))
+    white = ((view == 2) & (x // TILE == 1) & (y // TILE == 1)).mean()
+    share = (chances / chances.sum()).max()
+    expected = (1 - session.ANYWHERE) * (session.BY_ERRORS * share + (1 - session.BY_ERRORS) / len(error))
+    expected += session.ANYWHERE / 4 * TILE**2 / (64 * 48)
+    assert white == pytest.approx(expected, abs=5 * np.sqrt(expected / 2**15))
+    stored[:] = 0
+    Image.fromarray(stored).save(blender / "train" / "r_2.png")
+    assert ViewImages(llvm, load_views(blender)).cumulative_errors(empty) is None
