@@ -111,8 +111,7 @@ class NeuralMaterial(Disney):
     {footprint}
 
     Without ``two_sided`` the material reflects on the front side only. Components are those of
-    :ref:`disney <bsdf-disney>`. Sampling is detached, as there. Frozen functions (``dr.freeze``) keep the entries of
-    their recording, as those of :ref:`neural_texture <texture-neural_texture>` do.
+    :ref:`disney <bsdf-disney>`. Sampling is detached, as there.
 
     {executable}
 

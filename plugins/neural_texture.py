@@ -63,9 +63,6 @@ class NeuralTexture(FilteredTexture):
 
     {footprint}
 
-    **Frozen functions** (``dr.freeze``) that render keep the entries of their recording, here and in
-    :monosp:`neural_image`: record them again after an optimiser has changed ``tables.NAME``.
-
     {gradient}
 
     {executable}
