@@ -239,14 +239,19 @@ def write_json(path: str | os.PathLike, content) -> None:
         temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
+def is_within(folder: str | os.PathLike, name: str | os.PathLike) -> bool:
+    """Return whether the path ``name``, from a folder, stays in the folder."""
+    path, inside = os.path.abspath(os.path.join(folder, name)), os.path.abspath(folder)
+    return os.path.commonpath([path, inside]) == inside
+
+
 def path_within(folder: str | os.PathLike, name: str, file: str | os.PathLike) -> Path:
     """Return the path of the file ``name`` in a folder, as the content of a ``file`` names it.
 
     Raises :class:`OutsideError` for a path that leads out of the folder, unless :data:`PATHS` allows any. Symbolic
     links are not resolved: whoever unpacks a folder has put them there.
     """
-    path, inside = os.path.abspath(os.path.join(folder, name)), os.path.abspath(folder)
-    if os.environ.get(PATHS) != "any" and os.path.commonpath([path, inside]) != inside:
+    if os.environ.get(PATHS) != "any" and not is_within(folder, name):
         raise OutsideError(
             f"{file}: names {name!r:.80}, which lies outside of its folder: the environment variable {PATHS}=any "
             f"allows it"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import shutil
 import threading
@@ -16,7 +17,8 @@ import numpy as np
 
 from mi_diffind import compat
 from mi_diffind.compat import module_of
-from mi_diffind.files import OutsideError, path_within, relative_path, write_json
+from mi_diffind.errors import DiffindError
+from mi_diffind.files import OutsideError, is_within, path_within, relative_path, write_json
 from mi_diffind.limits import LimitError
 from mi_diffind.maps.compressed import CompressedMaps
 from mi_diffind.maps.layout import Layout, MapLayout
@@ -286,7 +288,23 @@ def _original(props, path: Path, settings: dict) -> Path:
     if not original.is_file():
         advice = "" if given else '; if it was moved, give its path as the parameter "source"'
         raise RuntimeError(f"{original}: no such file, {path.name} was made from it{advice}")
+    # A stranger's file must not show any file of this machine
+    if (
+        not given
+        and not is_within(path.parent, recorded)
+        and _digest(original, stamp(original)) != settings.get("source")
+    ):
+        raise RuntimeError(f"{original}: has changed since {path.name} was made from it")
     return original
+
+
+@functools.lru_cache
+def _digest(path: Path, stamp: tuple) -> str:
+    """Return the digest of an image or manifest."""
+    try:
+        return load_source(path, nonfinite="clean").digest
+    except DiffindError as e:
+        raise RuntimeError(str(e)) from None
 
 
 def _values(original: Path, layout: MapLayout) -> np.ndarray:

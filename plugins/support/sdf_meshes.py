@@ -14,6 +14,7 @@ import numpy as np
 import trimesh
 
 from mi_diffind.errors import DiffindError
+from mi_diffind.files import is_within
 from mi_diffind.tables import TableError
 from mi_diffind.task import stamp
 from mi_diffind.tasks.sdf import TASK, serialized
@@ -40,6 +41,8 @@ def to_mesh(props: mi.Properties) -> None:
     file, _ = split_part(mesh)
     if not file.is_file():
         raise RuntimeError(f"{file}: no such file, {path.name} was made from it")
+    if not is_within(path.resolve().parent, recorded) and _digest(mesh, stamp(file)) != settings.get("source"):
+        raise RuntimeError(f"{file}: has changed since {path.name} was made from it")
     props["filename"] = str(mesh) if mesh.suffix.lower() == ".ply" else _as_ply(mesh, stamp(file))
 
 
@@ -70,6 +73,15 @@ def _folder() -> Path:
     folder = Path(tempfile.mkdtemp(prefix="mi_diffind_"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder
+
+
+@functools.lru_cache
+def _digest(path: Path, stamp: tuple) -> str:
+    """Return the digest of a mesh file."""
+    try:
+        return load_mesh(path).digest
+    except DiffindError as e:
+        raise RuntimeError(str(e)) from None
 
 
 @functools.lru_cache

@@ -1025,6 +1025,26 @@ def test_exact_counterpart_without_a_source(mi_rgb, material, tmp_path):
         assert expected in found
 
 
+def test_exact_counterpart_elsewhere(mi_rgb, material, tmp_path):
+    """A recorded source outside of the file's folder is shown only if it is what the file was made from."""
+    folder, albedo, _ = material
+    table = load_table(folder / "wall.npz")
+    table.settings["source_path"] = os.path.relpath(folder / "wall.json", tmp_path)
+    (tmp_path / "s.xml").write_text(wall_xml("diffuse", texture_xml("reflectance", "elsewhere.npz", channels="albedo")))
+    digest = load_source(folder / "wall.json").digest
+    for recorded in (None, "0" * 64, digest):
+        table.settings["source"] = recorded
+        save_table(tmp_path / "elsewhere.npz", table)
+        if recorded == digest:
+            exact = scenes.load(tmp_path / "s.xml", exact=True).shapes()[0].bsdf()
+            bitmap = mi_rgb.load_dict({"type": "bitmap", "bitmap": mi_rgb.Bitmap(albedo)})
+            si = interactions(mi_rgb, np.float32([0.2, 0.7]), np.float32([0.4, 0.1]))
+            np.testing.assert_array_equal(exact.eval_diffuse_reflectance(si).numpy(), bitmap.eval(si).numpy())
+        else:
+            with pytest.raises(scenes.SceneError, match="has changed since"):
+                scenes.load(tmp_path / "s.xml", exact=True)
+
+
 # -- what scenes do to a texture ---------------------------------------------------------------------------------------
 
 

@@ -1,6 +1,7 @@
 """The plugin ``neural_sdf``: files, places, the two ways in which it is traced, what it refuses."""
 
 import json
+import os
 import time
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
@@ -14,7 +15,8 @@ from sdf_fields import dense_table, sparse_table, torus
 
 from mi_diffind import compat, plugins, scenes
 from mi_diffind.scenes import SceneError
-from mi_diffind.tables import save_table
+from mi_diffind.tables import load_table, save_table
+from mi_diffind.tasks.sdf.mesh import load_mesh
 
 SCALE, CENTRE = 2.0, (0.5, -1.0, 0.25)
 
@@ -575,6 +577,21 @@ def test_arrays_that_other_integrators_do_not_see(mi_rgb, folder, tmp_path, monk
     assert len(loaded.shapes()) == 1
     mesh = scenes.load(path, exact=True).shapes()[0]
     assert mesh.face_count() == 96 * 48 * 2 and type(mesh) is mi_rgb.Mesh
+
+
+def test_mesh_elsewhere(mi_rgb, folder, tmp_path):
+    """A recorded mesh outside of the file's folder is shown only if it is what the file was made from."""
+    table, digest = load_table(folder / "torus.npz"), load_mesh(folder / "torus.ply").digest
+    table.settings["mesh_path"] = os.path.relpath(folder / "torus.ply", tmp_path)
+    for recorded in ("0" * 64, digest):
+        table.settings["source"] = recorded
+        save_table(tmp_path / "torus.npz", table)
+        path = written(tmp_path, tmp_path)
+        if recorded == digest:
+            assert scenes.load(path, exact=True).shapes()[0].face_count() == 96 * 48 * 2
+        else:
+            with pytest.raises(SceneError, match="has changed since"):
+                scenes.load(path, exact=True)
 
 
 def test_load_file_takes_what_mitsuba_takes(mi_rgb, folder, tmp_path):
