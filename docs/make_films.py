@@ -1,0 +1,214 @@
+"""
+Render the films of the documentation.
+
+    python docs/make_films.py [suite] [zoom] [orbit] [shading] [--frames 24] [--out docs/films] [--json docs/measured]
+
+Each film is written as NAME.webp, which pages show, as NAME.mp4 (H.264; it needs the package imageio-ffmpeg), and its
+first frame as NAME.jpg. JSON named film_NAME.json holds the settings, the bytes of the films and of the table files,
+and the PSNR of each panel against the panel "truth", of values as displayed.
+
+Cameras start and end slowly, and a film returns by the same frames. Frame ``i`` has the random numbers of seed ``i``:
+the same command gives the same films.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from mi_diffind import films, orbit, poses, scenes
+from mi_diffind.files import write_json
+from mi_diffind.progress import progress_bar
+from mi_diffind.studies.texture import test_scenes
+from mi_diffind.studies.texture.zoom import TextureZoom
+
+DOCS = Path(__file__).resolve().parent
+SCENES = DOCS.parent / "scenes"
+ASSETS = SCENES / "assets"
+
+#: Frames a second, and samples a pixel of the truth.
+RATE, TRUTH = 12, 64
+
+#: Settings of panels of the scenes, without "spp".
+FLOOR = {"max_depth": 3}
+METAL = {"sky": 0, "max_depth": 2}
+
+#: Panels of a film: label → frames of bytes.
+Panels = dict[str, list[np.ndarray]]
+
+
+def turned(degrees: float, centre: Sequence[float] = (0, 0, 0)) -> Callable[[float], np.ndarray]:
+    """Return a motion about the vertical through ``centre``, from ``-degrees`` at 0 to ``degrees`` at 1."""
+    return lambda t: poses.rotation((0, 1, 0), degrees * (2 * t - 1), centre)
+
+
+def moved(*offset: float) -> Callable[[float], np.ndarray]:
+    """Return a motion along a line, by ``offset`` at 1."""
+
+    def motion(t: float) -> np.ndarray:
+        matrix = np.eye(4)
+        matrix[:3, 3] = np.asarray(offset) * t
+        return matrix
+
+    return motion
+
+
+def rendered(
+    name: str,
+    motion: Callable[[float], np.ndarray],
+    frames: int,
+    size: tuple[int, int],
+    spp: int = 1,
+    against: str | None = None,
+    scale: int = 1,
+    **defines,
+) -> list[np.ndarray]:
+    """Render the frames of one panel: a scene of ``scenes/``, its learned plugins replaced by those of ``against``.
+
+    The panel has ``size`` (width, height); each pixel of the render is enlarged to ``scale`` × ``scale`` of it.
+    """
+    defines |= {"spp": spp, "width": size[0] // scale, "height": size[1] // scale}
+    options = {"exact": True, "against": against} if against else {}
+    scene = scenes.load(SCENES / f"{name}.xml", defines, **options)
+    times = [(1 - math.cos(math.pi * i / max(frames - 1, 1))) / 2 for i in range(frames)]
+    with progress_bar(f"{name} {against or ''}", frames, "frame", True) as bar:
+        images = orbit.along(scene, [motion(t) for t in times], new_seeds=True, on_frame=bar.update)
+    return [films.displayed(image).repeat(scale, axis=0).repeat(scale, axis=1) for image in images]
+
+
+def suite(frames: int) -> tuple[Panels, int, list[str]]:
+    """Return the panels of the README's film, their columns and the table files that they read."""
+    size, back = (320, 192), moved(0.0, 0.5, 2.2)
+    around = turned(22.0)
+    panels = {
+        "bitmap, 1 sample a pixel": rendered("horizon", back, frames, size, against="exact", **FLOOR),
+        "neural_texture, 1 sample a pixel": rendered("horizon", back, frames, size, **FLOOR),
+        "neural_field among mirrors and glass": rendered("field", around, frames, size, 32, max_depth=6),
+        "material from filtered maps": metal("rust_plain.npz", frames, size),
+        "neural_material, trained for shading": metal("rust_shaded.npz", frames, size),
+        "neural_bsdf: left exact, right learned": rendered("library", turned(14.0), frames, size, 32),
+    }
+    files = ["tiles_filtered.npz", "group.npz", "rust_plain.npz", "rust_shaded.npz", "library/copper.npz"]
+    return panels, 3, files
+
+
+def metal(file: str, frames: int, size: tuple[int, int], **options) -> list[np.ndarray]:
+    """Render a panel of the hammered metal, its pixels enlarged."""
+    return rendered("rust", turned(8.0), frames, size, scale=2, metal=file, **METAL, **options)
+
+
+def floor(frames: int) -> tuple[Panels, int, list[str]]:
+    """Return the panels of an orbit around the pillars of ``horizon.xml``."""
+    size, around = (288, 162), turned(40.0)
+    panels = {
+        "bitmap, 1 sample a pixel": rendered("horizon", around, frames, size, against="exact", **FLOOR),
+        "mipmap, 1 sample a pixel": rendered("horizon", around, frames, size, against="mipmap", **FLOOR),
+        "neural_texture, 1 sample a pixel": rendered("horizon", around, frames, size, **FLOOR),
+        f"truth, {TRUTH} samples a pixel": rendered("horizon", around, frames, size, TRUTH, "exact", **FLOOR),
+    }
+    return panels, 2, ["tiles_filtered.npz"]
+
+
+def shading(frames: int) -> tuple[Panels, int, list[str]]:
+    """Return the panels of hammered metal, by textures and by one that is trained for its shading."""
+    size = (288, 162)
+    panels = {
+        "bitmap, 1 sample a pixel": metal("rust_plain.npz", frames, size, against="exact"),
+        "filtered maps, 1 sample a pixel": metal("rust_plain.npz", frames, size),
+        "trained for shading, 1 sample a pixel": metal("rust_shaded.npz", frames, size),
+        f"truth, {TRUTH} samples a pixel": metal("rust_plain.npz", frames, size, spp=TRUTH, against="exact"),
+    }
+    return panels, 2, ["rust_plain.npz", "rust_shaded.npz"]
+
+
+def zoom(frames: int) -> tuple[Panels, int, list[str]]:
+    """Return the panels of the zoom of the texture study, over the tiles."""
+    size, albedo = (288, 162), str(ASSETS / "tiles_albedo.png")
+    with_levels = {"filter": "anisotropic"}
+    textures = {
+        "bitmap, 1 sample a pixel": {"type": "bitmap", "filename": albedo},
+        "mipmap, 1 sample a pixel": {"type": "mipmap", "filename": albedo, **with_levels},
+        "neural_texture, 1 sample a pixel": {
+            "type": "neural_texture", "filename": str(ASSETS / "tiles_filtered.npz"), "channels": "albedo",
+            **with_levels,
+        },
+        f"truth, {TRUTH} samples a pixel": {"type": "bitmap", "filename": albedo},
+    }  # fmt: skip
+    side = mi.Bitmap(albedo).size()[0]
+    view = TextureZoom(test_scenes.zoom_scene(), size, (side, side), frames)
+    panels = {}
+    for label, texture in textures.items():
+        truth = label.startswith("truth")
+        reader = test_scenes.TextureReader(
+            lambda repeats, texture=texture: {**texture, "to_uv": test_scenes.to_uv(repeats)},
+            spp=TRUTH if truth else 1,
+            sampler="multijitter" if truth else "independent",
+            prepare=scenes.attach,
+        )
+        panels[label] = [np.round(255 * image).astype(np.uint8) for image in view.render(reader)]
+    return panels, 2, ["tiles_filtered.npz"]
+
+
+#: Films by name.
+FILMS = {"suite": suite, "zoom": zoom, "orbit": floor, "shading": shading}
+
+
+def psnr(panels: Panels) -> dict[str, float]:
+    """Return the PSNR of all frames together of each panel against the panel "truth", if there is one."""
+    truth = next((np.stack(panel).astype(float) for label, panel in panels.items() if label.startswith("truth")), None)
+    if truth is None:
+        return {}
+    errors = {label: np.mean((np.stack(panel) - truth) ** 2) / 255**2 for label, panel in panels.items()}
+    return {label: float(-10 * np.log10(error)) for label, error in errors.items() if not label.startswith("truth")}
+
+
+def make(name: str, frames: int, out: Path, json_folder: Path | None, quality: float) -> None:
+    """Render a film and write it."""
+    panels, columns, files = FILMS[name](frames)
+    shown = films.beside(panels, columns)
+    shown += shown[-2:0:-1]  # the way back
+    seconds = len(shown) / RATE
+    films.write(out / f"{name}.webp", shown, seconds, quality)
+    films.write(out / f"{name}.mp4", shown, seconds, 23)
+    films.write(out / f"{name}.gif", shown, seconds)
+    mi.Bitmap(shown[0]).write(str(out / f"{name}.jpg"), quality=85)
+    height, width, _ = shown[0].shape
+    figures = {
+        "command": f"python docs/make_films.py {name} --frames {frames}",
+        "width": width, "height": height, "frames": len(shown), "frames_rendered": frames, "frames_per_second": RATE,
+        "variant": mi.variant(), "psnr_db": psnr(panels),
+        "table_file_bytes": {file: (ASSETS / file).stat().st_size for file in files},
+        "bytes": {e: (out / f"{name}.{e}").stat().st_size for e in ("webp", "gif", "mp4", "jpg")},
+    }  # fmt: skip
+    (out / f"{name}.gif").unlink()
+    print(name, figures["bytes"], figures["psnr_db"])
+    if json_folder:
+        write_json(json_folder / f"film_{name}.json", figures)
+
+
+def main() -> None:
+    """Write the films."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"films: {', '.join(FILMS)} (default: all)")
+    parser.add_argument("--frames", type=int, default=24, help="frames that are rendered of each (default: 24)")
+    parser.add_argument("--quality", type=float, default=60, help="quality of WebP (default: 60)")
+    parser.add_argument("--out", type=Path, default=DOCS / "films", help="folder of the films (default: docs/films)")
+    parser.add_argument("--json", type=Path, metavar="FOLDER", help="folder of the figures, such as docs/measured")
+    arguments = parser.parse_args()
+    if unknown := set(arguments.names) - set(FILMS):
+        parser.error(f"NAME: found {', '.join(sorted(unknown))}, allowed are {', '.join(FILMS)}")
+    if arguments.frames < 2:
+        parser.error(f"--frames: found {arguments.frames}, allowed are whole numbers from 2 on")
+    mi.set_variant("llvm_ad_rgb")
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    for name in arguments.names or FILMS:
+        make(name, arguments.frames, arguments.out, arguments.json, arguments.quality)
+
+
+if __name__ == "__main__":
+    main()
