@@ -1,7 +1,7 @@
 """
 Render the films of the documentation.
 
-    python docs/make_films.py [suite] [zoom] [orbit] [shading] [--frames 24] [--out docs/films] [--json docs/measured]
+    python docs/make_films.py [suite] [zoom] [orbit] [shading] [--frames 20] [--out docs/films] [--json docs/measured]
 
 Each film is written as NAME.webp, which pages show, as NAME.mp4 (H.264; it needs the package imageio-ffmpeg), and its
 first frame as NAME.jpg. JSON named film_NAME.json holds the settings, the bytes of the films and of the table files,
@@ -31,8 +31,8 @@ DOCS = Path(__file__).resolve().parent
 SCENES = DOCS.parent / "scenes"
 ASSETS = SCENES / "assets"
 
-#: Frames a second, and samples a pixel of the truth.
-RATE, TRUTH = 12, 64
+#: Frames a second; samples a pixel of the floor, whose light has noise, and of the truth.
+RATE, SAMPLES, TRUTH = 12, 4, 64
 
 #: Settings of panels of the scenes, without "spp".
 FLOOR = {"max_depth": 3}
@@ -83,15 +83,17 @@ def rendered(
 
 def suite(frames: int) -> tuple[Panels, int, list[str]]:
     """Return the panels of the README's film, their columns and the table files that they read."""
-    size, back = (320, 192), moved(0.0, 0.5, 2.2)
+    size, back = (288, 172), moved(0.0, 0.5, 2.2)
     around = turned(22.0)
     panels = {
-        "bitmap, 1 sample a pixel": rendered("horizon", back, frames, size, against="exact", **FLOOR),
-        "neural_texture, 1 sample a pixel": rendered("horizon", back, frames, size, **FLOOR),
-        "neural_field among mirrors and glass": rendered("field", around, frames, size, 32, max_depth=6),
-        "material from filtered maps": metal("rust_plain.npz", frames, size),
+        f"bitmap, {SAMPLES} samples a pixel": rendered(
+            "horizon", back, frames, size, SAMPLES, against="exact", **FLOOR
+        ),
+        f"neural_texture, {SAMPLES} samples a pixel": rendered("horizon", back, frames, size, SAMPLES, **FLOOR),
+        "neural_field among mirrors and glass": rendered("field", around, frames, size, 48, max_depth=6),
+        "neural_material, filtered maps": metal("rust_plain.npz", frames, size),
         "neural_material, trained for shading": metal("rust_shaded.npz", frames, size),
-        "neural_bsdf: left exact, right learned": rendered("library", turned(14.0), frames, size, 32),
+        "neural_bsdf: left exact, right learned": rendered("library", turned(14.0), frames, size, 64),
     }
     files = ["tiles_filtered.npz", "group.npz", "rust_plain.npz", "rust_shaded.npz", "library/copper.npz"]
     return panels, 3, files
@@ -106,9 +108,13 @@ def floor(frames: int) -> tuple[Panels, int, list[str]]:
     """Return the panels of an orbit around the pillars of ``horizon.xml``."""
     size, around = (288, 162), turned(40.0)
     panels = {
-        "bitmap, 1 sample a pixel": rendered("horizon", around, frames, size, against="exact", **FLOOR),
-        "mipmap, 1 sample a pixel": rendered("horizon", around, frames, size, against="mipmap", **FLOOR),
-        "neural_texture, 1 sample a pixel": rendered("horizon", around, frames, size, **FLOOR),
+        f"bitmap, {SAMPLES} samples a pixel": rendered(
+            "horizon", around, frames, size, SAMPLES, against="exact", **FLOOR
+        ),
+        f"mipmap, {SAMPLES} samples a pixel": rendered(
+            "horizon", around, frames, size, SAMPLES, against="mipmap", **FLOOR
+        ),
+        f"neural_texture, {SAMPLES} samples a pixel": rendered("horizon", around, frames, size, SAMPLES, **FLOOR),
         f"truth, {TRUTH} samples a pixel": rendered("horizon", around, frames, size, TRUTH, "exact", **FLOOR),
     }
     return panels, 2, ["tiles_filtered.npz"]
@@ -195,7 +201,7 @@ def main() -> None:
     """Write the films."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"films: {', '.join(FILMS)} (default: all)")
-    parser.add_argument("--frames", type=int, default=24, help="frames that are rendered of each (default: 24)")
+    parser.add_argument("--frames", type=int, default=20, help="frames that are rendered of each (default: 20)")
     parser.add_argument("--quality", type=float, default=60, help="quality of WebP (default: 60)")
     parser.add_argument("--out", type=Path, default=DOCS / "films", help="folder of the films (default: docs/films)")
     parser.add_argument("--json", type=Path, metavar="FOLDER", help="folder of the figures, such as docs/measured")

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import sys
 import threading
 
 import numpy as np
@@ -124,6 +125,16 @@ def test_what_is_refused(mi_rgb, path, tmp_path, capsys):
     ):
         assert cli.main(["render", str(path), *options]) == 2
         assert message in capsys.readouterr().err
+
+
+def test_h264_is_refused_before_frames_are_rendered(mi_rgb, path, tmp_path, monkeypatch, capsys):
+    from mi_diffind import orbit
+
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)  # as if it were not installed
+    monkeypatch.setattr(orbit, "along", lambda *_, **__: pytest.fail("rendered"))
+    assert cli.main(["render", str(path), "--orbit", "3", "-o", str(tmp_path / "film.mp4")]) == 2
+    assert 'film.mp4": H.264 needs the package imageio-ffmpeg, which is not installed' in capsys.readouterr().err
+    assert [file.name for file in tmp_path.iterdir()] == ["scene.xml"]
 
 
 def test_a_rotation_leaves_its_axis_in_place():
