@@ -7,15 +7,17 @@ Each film is written as NAME.webp, which pages show, as NAME.mp4 (H.264; it need
 first frame as NAME.jpg. JSON named film_NAME.json holds the settings, the bytes of the films and of the table files,
 and the PSNR of each panel against the panel "truth", of values as displayed.
 
-Cameras start and end slowly, and a film returns by the same frames. Frame ``i`` has the random numbers of seed ``i``:
-the same command gives the same films.
+Cameras start and end slowly, and a film returns by the same frames; ``orbit`` goes once around instead. Frame ``i`` has
+the random numbers of seed ``i``: the same command gives the same films.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable, Sequence
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import mitsuba as mi
@@ -41,27 +43,48 @@ METAL = {"sky": 0, "max_depth": 2}
 #: Panels of a film: label → frames of bytes.
 Panels = dict[str, list[np.ndarray]]
 
-
-def turned(degrees: float, centre: Sequence[float] = (0, 0, 0)) -> Callable[[float], np.ndarray]:
-    """Return a motion about the vertical through ``centre``, from ``-degrees`` at 0 to ``degrees`` at 1."""
-    return lambda t: poses.rotation((0, 1, 0), degrees * (2 * t - 1), centre)
+#: Motions of the camera, a matrix in world space for each frame.
+Motions = list[np.ndarray]
 
 
-def moved(*offset: float) -> Callable[[float], np.ndarray]:
-    """Return a motion along a line, by ``offset`` at 1."""
+@dataclass
+class Film:
+    """Panels with their labels, how many stand in a row, the table files that they read, and whether they return.
 
-    def motion(t: float) -> np.ndarray:
-        matrix = np.eye(4)
-        matrix[:3, 3] = np.asarray(offset) * t
-        return matrix
+    A film that ``returns`` shows its frames forwards and then backwards.
+    """
 
-    return motion
+    panels: Panels
+    columns: int
+    files: list[str]
+    returns: bool = True
+
+
+def times(frames: int) -> list[float]:
+    """Return a number for each frame that goes from 0 to 1, slowly at both ends."""
+    return [(1 - math.cos(math.pi * i / (frames - 1))) / 2 for i in range(frames)]
+
+
+def turned(degrees: float, frames: int) -> Motions:
+    """Return motions about the vertical through the origin, from ``-degrees`` to ``degrees``."""
+    return [poses.rotation((0, 1, 0), degrees * (2 * t - 1)) for t in times(frames)]
+
+
+def moved(offset: Sequence[float], frames: int) -> Motions:
+    """Return motions along a line."""
+    motions = np.tile(np.eye(4), (frames, 1, 1))
+    motions[:, :3, 3] = np.outer(times(frames), offset)
+    return list(motions)
+
+
+def once_around(frames: int) -> Motions:
+    """Return motions once about the vertical through the origin, at equal steps."""
+    return [poses.rotation((0, 1, 0), 360 * i / frames) for i in range(frames)]
 
 
 def rendered(
     name: str,
-    motion: Callable[[float], np.ndarray],
-    frames: int,
+    motions: Motions,
     size: tuple[int, int],
     spp: int = 1,
     against: str | None = None,
@@ -75,53 +98,45 @@ def rendered(
     defines |= {"spp": spp, "width": size[0] // scale, "height": size[1] // scale}
     options = {"exact": True, "against": against} if against else {}
     scene = scenes.load(SCENES / f"{name}.xml", defines, **options)
-    times = [(1 - math.cos(math.pi * i / max(frames - 1, 1))) / 2 for i in range(frames)]
-    with progress_bar(f"{name} {against or ''}", frames, "frame", True) as bar:
-        images = orbit.along(scene, [motion(t) for t in times], new_seeds=True, on_frame=bar.update)
+    with progress_bar(" ".join(filter(None, (name, against))), len(motions), "frame", True) as bar:
+        images = orbit.along(scene, motions, new_seeds=True, on_frame=bar.update)
     return [films.displayed(image).repeat(scale, axis=0).repeat(scale, axis=1) for image in images]
 
 
-def suite(frames: int) -> tuple[Panels, int, list[str]]:
-    """Return the panels of the README's film, their columns and the table files that they read."""
-    size, back = (288, 172), moved(0.0, 0.5, 2.2)
-    around = turned(22.0)
+def suite(frames: int) -> Film:
+    """Render the README's film."""
+    size, back = (288, 172), moved((0.0, 0.5, 2.2), frames)
     panels = {
-        f"bitmap, {SAMPLES} samples a pixel": rendered(
-            "horizon", back, frames, size, SAMPLES, against="exact", **FLOOR
-        ),
-        f"neural_texture, {SAMPLES} samples a pixel": rendered("horizon", back, frames, size, SAMPLES, **FLOOR),
-        "neural_field among mirrors and glass": rendered("field", around, frames, size, 48, max_depth=6),
+        f"bitmap, {SAMPLES} samples a pixel": rendered("horizon", back, size, SAMPLES, against="exact", **FLOOR),
+        f"neural_texture, {SAMPLES} samples a pixel": rendered("horizon", back, size, SAMPLES, **FLOOR),
+        "neural_field among mirrors and glass": rendered("field", turned(22.0, frames), size, 48, max_depth=6),
         "neural_material, filtered maps": metal("rust_plain.npz", frames, size),
         "neural_material, trained for shading": metal("rust_shaded.npz", frames, size),
-        "neural_bsdf: left exact, right learned": rendered("library", turned(14.0), frames, size, 64),
+        "neural_bsdf: left exact, right learned": rendered("library", turned(14.0, frames), size, 64),
     }
-    files = ["tiles_filtered.npz", "group.npz", "rust_plain.npz", "rust_shaded.npz", "library/copper.npz"]
-    return panels, 3, files
+    wall = [f"library/{path.name}" for path in sorted((ASSETS / "library").glob("*.npz"))]
+    return Film(panels, 3, ["tiles_filtered.npz", "group.npz", "rust_plain.npz", "rust_shaded.npz", *wall])
 
 
 def metal(file: str, frames: int, size: tuple[int, int], **options) -> list[np.ndarray]:
-    """Render a panel of the hammered metal, its pixels enlarged."""
-    return rendered("rust", turned(8.0), frames, size, scale=2, metal=file, **METAL, **options)
+    """Render a panel of hammered metal, its pixels enlarged."""
+    return rendered("rust", turned(8.0, frames), size, scale=2, metal=file, **METAL, **options)
 
 
-def floor(frames: int) -> tuple[Panels, int, list[str]]:
-    """Return the panels of an orbit around the pillars of ``horizon.xml``."""
-    size, around = (288, 162), turned(40.0)
+def floor(frames: int) -> Film:
+    """Render an orbit through the pillars of ``horizon.xml``, of three times as many frames."""
+    size, around = (288, 162), once_around(3 * frames)
     panels = {
-        f"bitmap, {SAMPLES} samples a pixel": rendered(
-            "horizon", around, frames, size, SAMPLES, against="exact", **FLOOR
-        ),
-        f"mipmap, {SAMPLES} samples a pixel": rendered(
-            "horizon", around, frames, size, SAMPLES, against="mipmap", **FLOOR
-        ),
-        f"neural_texture, {SAMPLES} samples a pixel": rendered("horizon", around, frames, size, SAMPLES, **FLOOR),
-        f"truth, {TRUTH} samples a pixel": rendered("horizon", around, frames, size, TRUTH, "exact", **FLOOR),
+        f"bitmap, {SAMPLES} samples a pixel": rendered("horizon", around, size, SAMPLES, against="exact", **FLOOR),
+        f"mipmap, {SAMPLES} samples a pixel": rendered("horizon", around, size, SAMPLES, against="mipmap", **FLOOR),
+        f"neural_texture, {SAMPLES} samples a pixel": rendered("horizon", around, size, SAMPLES, **FLOOR),
+        f"truth, {TRUTH} samples a pixel": rendered("horizon", around, size, TRUTH, "exact", **FLOOR),
     }
-    return panels, 2, ["tiles_filtered.npz"]
+    return Film(panels, 2, ["tiles_filtered.npz"], returns=False)
 
 
-def shading(frames: int) -> tuple[Panels, int, list[str]]:
-    """Return the panels of hammered metal, by textures and by one that is trained for its shading."""
+def shading(frames: int) -> Film:
+    """Render hammered metal, by textures and by one that is trained for its shading."""
     size = (288, 162)
     panels = {
         "bitmap, 1 sample a pixel": metal("rust_plain.npz", frames, size, against="exact"),
@@ -129,11 +144,11 @@ def shading(frames: int) -> tuple[Panels, int, list[str]]:
         "trained for shading, 1 sample a pixel": metal("rust_shaded.npz", frames, size),
         f"truth, {TRUTH} samples a pixel": metal("rust_plain.npz", frames, size, spp=TRUTH, against="exact"),
     }
-    return panels, 2, ["rust_plain.npz", "rust_shaded.npz"]
+    return Film(panels, 2, ["rust_plain.npz", "rust_shaded.npz"])
 
 
-def zoom(frames: int) -> tuple[Panels, int, list[str]]:
-    """Return the panels of the zoom of the texture study, over the tiles."""
+def zoom(frames: int) -> Film:
+    """Render the zoom of the texture study over the tiles."""
     size, albedo = (288, 162), str(ASSETS / "tiles_albedo.png")
     with_levels = {"filter": "anisotropic"}
     textures = {
@@ -157,7 +172,7 @@ def zoom(frames: int) -> tuple[Panels, int, list[str]]:
             prepare=scenes.attach,
         )
         panels[label] = [np.round(255 * image).astype(np.uint8) for image in view.render(reader)]
-    return panels, 2, ["tiles_filtered.npz"]
+    return Film(panels, 2, ["tiles_filtered.npz"])
 
 
 #: Films by name.
@@ -175,23 +190,27 @@ def psnr(panels: Panels) -> dict[str, float]:
 
 def make(name: str, frames: int, out: Path, json_folder: Path | None, quality: float) -> None:
     """Render a film and write it."""
-    panels, columns, files = FILMS[name](frames)
-    shown = films.beside(panels, columns)
-    shown += shown[-2:0:-1]  # the way back
+    film = FILMS[name](frames)
+    shown = films.beside(film.panels, film.columns)
+    rendered_frames = len(shown)
+    if film.returns:
+        shown += shown[-2:0:-1]
     seconds = len(shown) / RATE
     films.write(out / f"{name}.webp", shown, seconds, quality)
     films.write(out / f"{name}.mp4", shown, seconds, 23)
-    films.write(out / f"{name}.gif", shown, seconds)
     mi.Bitmap(shown[0]).write(str(out / f"{name}.jpg"), quality=85)
+    files = [out / f"{name}.{extension}" for extension in ("webp", "mp4", "jpg")]
+    with tempfile.TemporaryDirectory() as folder:  # for its size alone
+        films.write(gif := Path(folder) / f"{name}.gif", shown, seconds)
+        sizes = {file.suffix[1:]: file.stat().st_size for file in (*files, gif)}
     height, width, _ = shown[0].shape
     figures = {
         "command": f"python docs/make_films.py {name} --frames {frames}",
-        "width": width, "height": height, "frames": len(shown), "frames_rendered": frames, "frames_per_second": RATE,
-        "variant": mi.variant(), "psnr_db": psnr(panels),
-        "table_file_bytes": {file: (ASSETS / file).stat().st_size for file in files},
-        "bytes": {e: (out / f"{name}.{e}").stat().st_size for e in ("webp", "gif", "mp4", "jpg")},
+        "width": width, "height": height, "frames": len(shown), "frames_rendered": rendered_frames,
+        "frames_per_second": RATE, "variant": mi.variant(), "psnr_db": psnr(film.panels),
+        "table_file_bytes": {file: (ASSETS / file).stat().st_size for file in film.files},
+        "bytes": sizes,
     }  # fmt: skip
-    (out / f"{name}.gif").unlink()
     print(name, figures["bytes"], figures["psnr_db"])
     if json_folder:
         write_json(json_folder / f"film_{name}.json", figures)

@@ -643,11 +643,10 @@ for source, study in (("", "tradeoff_texture"), ("_boombox", "texture_levels_boo
 
 def film_errors() -> str:
     """PSNR of the panels of films against their truth."""
-    names = {"zoom": "zoom", "orbit": "orbit", "shading": "metal"}
-    figures = {title: measured(f"film_{name}")["psnr_db"] for name, title in names.items()}
+    figures = {f"`{name}`": measured(f"film_{name}")["psnr_db"] for name in ("zoom", "orbit", "shading")}
     return table(
         ["film", "panel", "PSNR, dB"],
-        [[title, label, f"{db:.1f}"] for title, panels in figures.items() for label, db in panels.items()],
+        [[name, label, f"{db:.1f}"] for name, panels in figures.items() for label, db in panels.items()],
     )
 
 

@@ -65,10 +65,12 @@ def write(
     (default :data:`WEBP_QUALITY`) or the constant rate factor of H.264 (:data:`CRF`). The same frames give the same
     bytes with the same version of the encoder.
 
-    Raises :class:`~mi_diffind.errors.UsageError` without an encoder, and :class:`~mi_diffind.files.OutputError`.
+    Raises :class:`~mi_diffind.errors.UsageError` for other frames or without an encoder, and
+    :class:`~mi_diffind.files.OutputError`.
     """
     path = Path(path)
     check_encoder(path)
+    _check_frames(frames, (3,) if path.suffix.lower() == ".mp4" else (3, 4))
     with replacing(path) as temporary:
         if path.suffix.lower() == ".mp4":
             _write_h264(path, temporary, frames, seconds, CRF if quality is None else quality)
@@ -89,6 +91,17 @@ def write(
         images[0].save(temporary, **options)
 
 
+def _check_frames(frames: Sequence[np.ndarray], channels: tuple[int, ...]) -> None:
+    """Refuse frames that are not bytes of one size, with one of the numbers of ``channels``."""
+    if not len(frames):
+        raise UsageError("frames: found none, a film needs one or more")
+    first = frames[0].shape
+    for i, frame in enumerate(frames):
+        if frame.dtype != np.uint8 or len(first) != 3 or first[2] not in channels or frame.shape != first:
+            allowed = f"(height, width, {' or '.join(map(str, channels))}), one size for all"
+            raise UsageError(f"frames: found {frame.dtype} {frame.shape} as number {i}, allowed are uint8 {allowed}")
+
+
 def _write_h264(path: Path, temporary: Path, frames: Sequence[np.ndarray], seconds: float, crf: float) -> None:
     """Encode frames by x264 on one thread, since its bytes depend on the number of threads."""
     from imageio_ffmpeg import get_ffmpeg_exe
@@ -104,7 +117,7 @@ def _write_h264(path: Path, temporary: Path, frames: Sequence[np.ndarray], secon
         "setparams=color_primaries=bt709:color_trc=iec61966-2-1",
         "-c:v", "libx264", "-preset", "slow", "-crf", f"{crf:g}", "-pix_fmt", "yuv420p", "-threads", "1",
         "-fflags", "+bitexact", "-flags:v", "+bitexact", "-map_metadata", "-1", "-movflags", "+faststart",
-        os.fspath(temporary),
+        os.path.abspath(temporary),  # "http:film.mp4" would be an address
     ]  # fmt: skip
     raw = b"".join(np.ascontiguousarray(frame).tobytes() for frame in frames)
     encoder = subprocess.run(command, input=raw, capture_output=True, check=False)
@@ -127,9 +140,15 @@ def beside(
 
     ``panels``: label → frames of bytes, ``(height, width, 3)``. The label stands above its panel, in text of
     ``text_height`` pixels; ``gap`` pixels separate columns.
+
+    Raises :class:`~mi_diffind.errors.UsageError` for panels of different lengths or sizes.
     """
     from PIL import Image, ImageDraw, ImageFont
 
+    if len({len(frames) for frames in panels.values()}) != 1:
+        counts = ", ".join(f"{len(frames)} of {label!r}" for label, frames in panels.items()) or "no panel"
+        raise UsageError(f"panels: found {counts}, allowed are one or more panels of equally many frames")
+    _check_frames([frame for frames in panels.values() for frame in frames], (3,))
     height, width, _ = next(iter(panels.values()))[0].shape
     columns, band = min(columns, len(panels)), round(LABEL * text_height)
     rows = -(-len(panels) // columns)

@@ -54,6 +54,14 @@ def test_the_same_frames_give_the_same_bytes(tmp_path):
 
 
 @needs_ffmpeg
+def test_a_name_like_an_address_is_a_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("http:film.mp4", "-y.mp4"):
+        films.write(name, smooth_frames(2, 16, 16))
+        assert decoded(tmp_path / name).shape[0] == 2
+
+
+@needs_ffmpeg
 def test_one_frame_is_a_film(tmp_path):
     """An interrupted orbit keeps as few."""
     frame = smooth_frames(1, 32, 32)[0]
@@ -63,7 +71,7 @@ def test_one_frame_is_a_film(tmp_path):
 
 @needs_ffmpeg
 def test_a_failed_encoder_leaves_nothing(tmp_path):
-    """Frames without width, which x264 refuses."""
+    """Frames without pixels, which the encoder refuses."""
     with pytest.raises(OutputError, match=r'output file ".*film\.mp4" cannot be written: .+'):
         films.write(tmp_path / "film.mp4", [np.zeros((0, 0, 3), np.uint8)])
     assert not os.listdir(tmp_path)
@@ -77,6 +85,33 @@ def test_h264_needs_an_encoder(tmp_path, monkeypatch):
         films.write(tmp_path / "film.mp4", smooth_frames(2, 8, 8))
     assert not os.listdir(tmp_path)
     films.write(tmp_path / "film.webp", smooth_frames(2, 8, 8))
+
+
+def test_refused_frames(tmp_path):
+    frame = smooth_frames(1, 8, 8)[0]
+    for frames, message in (
+        ([], "frames: found none"),
+        ([frame, frame[:4]], r"found uint8 \(4, 8, 3\) as number 1, allowed are uint8 \(height, width, 3 or 4\)"),
+        ([frame / 255], r"found float64 \(8, 8, 3\) as number 0"),
+        ([frame[..., :1]], r"found uint8 \(8, 8, 1\)"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            films.write(tmp_path / "film.webp", frames)
+    with pytest.raises(UsageError, match="panels: found 1 of 'a', 2 of 'b', allowed are"):
+        films.beside({"a": [frame], "b": [frame, frame]}, columns=2)
+    with pytest.raises(UsageError, match=r"frames: found uint8 \(4, 8, 3\) as number 1"):
+        films.beside({"a": [frame], "b": [frame[:4]]}, columns=2)
+    with pytest.raises(UsageError, match="panels: found no panel"):
+        films.beside({}, columns=2)
+    assert not os.listdir(tmp_path)
+
+
+@needs_ffmpeg
+def test_h264_has_no_alpha(tmp_path):
+    with pytest.raises(
+        UsageError, match=r"found uint8 \(8, 8, 4\) as number 0, allowed are uint8 \(height, width, 3\)"
+    ):
+        films.write(tmp_path / "film.mp4", [np.zeros((8, 8, 4), np.uint8)])
 
 
 def test_panels_stand_beside_one_another():
