@@ -641,6 +641,31 @@ for source, study in (("", "tradeoff_texture"), ("_boombox", "texture_levels_boo
     TABLES["texture_levels" + source] = lambda study=study: texture_levels(measured(study))
 
 
+def film_errors() -> str:
+    """PSNR of the panels of films against their truth."""
+    figures = {f"`{name}`": measured(f"film_{name}")["psnr_db"] for name in ("zoom", "orbit", "shading")}
+    return table(
+        ["film", "panel", "PSNR, dB"],
+        [[name, label, f"{db:.1f}"] for name, panels in figures.items() for label, db in panels.items()],
+    )
+
+
+def film_bytes() -> str:
+    """Sizes of films in three formats."""
+    films = {name: measured(f"film_{name}") for name in ("suite", "zoom", "orbit", "shading")}
+    return table(
+        ["film", "pixels", "frames", "WebP, kB", "GIF, kB", "H.264, kB"],
+        [
+            [f"`{name}`", f"{f['width']} × {f['height']}", f["frames"],
+             *(f"{f['bytes'][extension] / 1000:,.0f}" for extension in ("webp", "gif", "mp4"))]
+            for name, f in films.items()
+        ],
+    )  # fmt: skip
+
+
+TABLES |= {f.__name__: f for f in (film_errors, film_bytes)}
+
+
 def written() -> dict[Path, str]:
     """Return the text of each page by its path."""
     pages = {DOCS / "tasks.md": page_of_tasks()}

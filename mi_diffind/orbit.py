@@ -1,4 +1,4 @@
-"""Orbit of a camera around a scene: rendered frames, and a film or a film strip of them."""
+"""Cameras that move through a scene, such as once around it: rendered frames, and a film or a film strip of them."""
 
 from __future__ import annotations
 
@@ -10,13 +10,10 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from . import scenes, srgb
+from . import films, scenes
 from .files import replacing
 from .plugins.support import footprint
 from .poses import rotation
-
-#: Extensions of films.
-FILMS = (".webp", ".gif")
 
 #: Largest number of frames in a row of a film strip.
 COLUMNS = 6
@@ -41,13 +38,34 @@ def orbit(
     Returns the linear images; once ``stop`` is set, the frames that are done. Raises
     :class:`~mi_diffind.scenes.SceneError` if there is no camera that can be moved.
     """
+    centre = middle(scene) if centre is None else np.array(centre, np.float64)
+    turns = [rotation(up, 360 * i / frames, centre) for i in range(frames)]
+    return along(scene, turns, spp, seed, on_frame=on_frame, stop=stop)
+
+
+def along(
+    scene,
+    motions: Sequence[np.ndarray],
+    spp: int | None = None,
+    seed: int = 0,
+    new_seeds: bool = False,
+    on_frame: Callable[[], object] | None = None,
+    stop: threading.Event | None = None,
+) -> list[np.ndarray]:
+    """Render a loaded scene once for each of ``motions`` of its first camera, which then returns to its place.
+
+    A motion is a matrix ``(4, 4)`` in world space that moves the camera from its place in the scene. All frames have
+    the random numbers of ``seed``; with ``new_seeds``, frame ``i`` has those of ``seed + i``.
+
+    Returns the linear images; once ``stop`` is set, the frames that are done. Raises
+    :class:`~mi_diffind.scenes.SceneError` if there is no camera that can be moved.
+    """
     if not scene.sensors():
         raise scenes.SceneError("orbit: the scene has no sensor")
     sensor = scene.sensors()[0]
     parameters = mi.traverse(sensor)
     if "to_world" not in parameters:
         raise scenes.SceneError(f"orbit: the sensor {sensor.class_name()} cannot be moved")
-    centre = middle(scene) if centre is None else np.array(centre, np.float64)
     transform, before = type(parameters["to_world"]), np.array(parameters["to_world"].matrix, np.float64).reshape(4, 4)
 
     def move(matrix: np.ndarray) -> None:
@@ -57,9 +75,9 @@ def orbit(
 
     images = []
     try:
-        for i in range(frames):
-            move(rotation(up, 360 * i / frames, centre) @ before)
-            images.append(scenes.render(scene, spp, seed)[0])
+        for i, motion in enumerate(motions):
+            move(motion @ before)
+            images.append(scenes.render(scene, spp, seed + i * new_seeds)[0])
             if on_frame is not None:
                 on_frame()
             if stop is not None and stop.is_set():
@@ -90,39 +108,20 @@ def strip(frames: Sequence[np.ndarray], columns: int = COLUMNS) -> np.ndarray:
 
 
 def write(path: str | os.PathLike, frames: Sequence[np.ndarray], seconds: float = 4.0) -> None:
-    """Write linear frames as a film that loops in ``seconds`` (``.webp``, ``.gif``), or as one image (:func:`strip`).
+    """Write linear frames as a film of ``seconds`` (:data:`.films.FILMS`), or as one image (:func:`strip`).
 
-    Alpha is kept in formats that support it.
+    Alpha is kept in formats that support it; H.264 shows what is transparent in front of black.
     """
     path = Path(path)
-    if path.suffix.lower() not in (*FILMS, ".png"):
+    extension = path.suffix.lower()
+    if extension not in (*films.FILMS, ".png"):
         scenes.write_image(path, strip(frames))
         return
-    from PIL import Image
+    if extension == ".png":
+        from PIL import Image
 
-    if path.suffix.lower() == ".png":
         with replacing(path) as temporary:
-            Image.fromarray(displayed(strip(frames))).save(temporary)
+            Image.fromarray(films.displayed(strip(frames))).save(temporary)
         return
-
-    shown = [Image.fromarray(displayed(frame)) for frame in frames]
-    options = {"save_all": True, "append_images": shown[1:], "duration": round(1000 * seconds / len(shown)), "loop": 0}
-    if path.suffix.lower() == ".webp":
-        options |= {"quality": 85, "method": 4}
-    else:
-        options |= {"disposal": 2}
-    with replacing(path) as temporary:
-        shown[0].save(temporary, **options)
-
-
-def displayed(image: np.ndarray) -> np.ndarray:
-    """Return an image as displayed: bytes ``(height, width, 3)``, or 4 channels for an image with alpha (2 or 4)."""
-    channels = image.shape[2]
-    has_alpha = channels in (2, 4)
-    colours, alpha = (image[..., :-1], image[..., -1:]) if has_alpha else (image, np.ones_like(image[..., :1]))
-    if colours.shape[2] == 1:
-        colours = colours.repeat(3, axis=2)
-    shown = srgb.for_display(colours[..., :3] / np.maximum(alpha, 1e-6))
-    if has_alpha:
-        shown = np.concatenate([shown, np.clip(alpha, 0, 1)], axis=-1)
-    return np.round(255 * shown).astype(np.uint8)
+    shown = films.over_black if extension == ".mp4" else films.displayed
+    films.write(path, [shown(frame) for frame in frames], seconds)

@@ -13,7 +13,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from . import conversion, scenes
+from . import conversion, films, scenes
 from . import depth as depths
 from . import orbit as orbits
 from .errors import UsageError
@@ -44,7 +44,7 @@ class Rendering:
         return self.frames[0] if len(self.frames) == 1 else orbits.strip(self.frames)
 
     def save(self, path: str | os.PathLike) -> Path:
-        """Write the image (``.exr``, ``.png``) or a film of the frames (``.webp``, ``.gif``), and return the path.
+        """Write the image (``.exr``, ``.png``) or a film (``.mp4``, ``.webp``, ``.gif``), and return the path.
 
         Raises :class:`~mi_diffind.errors.UsageError` and :class:`~mi_diffind.files.OutputError`.
         """
@@ -60,7 +60,7 @@ class Rendering:
         from PIL import Image
 
         stream = io.BytesIO()
-        Image.fromarray(orbits.displayed(self.image)).save(stream, "PNG")
+        Image.fromarray(films.displayed(self.image)).save(stream, "PNG")
         return stream.getvalue()
 
 
@@ -80,10 +80,11 @@ def channels_of(scene) -> int:
 
 def image_path(path: str | os.PathLike, film: bool = False) -> Path:
     """Return the path of a picture, or with ``film`` of a film. Raises :class:`~mi_diffind.errors.UsageError`."""
-    path, allowed = Path(path), (".exr", ".png", *(orbits.FILMS if film else ()))
+    path, allowed = Path(path), (".exr", ".png", *(films.FILMS if film else ()))
     if path.suffix.lower() not in allowed:
         names = ", ".join(allowed) if film else " and ".join(allowed)
         raise UsageError(f'output "{path}": found the extension "{path.suffix}", allowed are {names}')
+    films.check_encoder(path)
     return path
 
 

@@ -2,10 +2,12 @@
 
 import contextlib
 import json
+import sys
 import threading
 
 import numpy as np
 import pytest
+from film_files import decoded, needs_ffmpeg
 from PIL import Image
 
 from mi_diffind import cli
@@ -77,6 +79,31 @@ def test_films_and_strips(mi_rgb, path, tmp_path, capsys):
     assert pixels[24:, : 2 * 32, 3].any() and not pixels[24:, 2 * 32 :].any()
 
 
+@needs_ffmpeg
+def test_an_orbit_as_h264(mi_rgb, path, tmp_path, capsys):
+    """The frames of the decoded film are those of the orbit, in front of black, and each is nearest to its own."""
+    from mi_diffind import films, orbit, scenes
+
+    film = tmp_path / "film.mp4"
+    options = ("--orbit", "4", "--spp", "64", "-o", str(film))
+    path.write_text(SCENE.replace('name="width" value="32"', 'name="width" value="31"'))
+    assert cli.main(["render", str(path), *options]) == 0
+    out = capsys.readouterr().out
+    assert "film.mp4: 4 frames of 31 x 24, 64 spp" in out and "even width and height" in out
+    frames = decoded(film)
+    assert frames.shape == (4, 24, 32, 3)
+    expected = orbit.orbit(scenes.load(path), 4, spp=64)
+    shown = np.stack([films.displayed(frame[..., :3]) for frame in expected])
+    errors = np.square(frames[:, None, :, :31].astype(float) - shown[None]).mean(axis=(2, 3, 4))
+    assert (10 * np.log10(255**2 / np.diag(errors)) > 30).all()
+    assert (errors.argmin(axis=1) == np.arange(4)).all()
+    # The empty corner is black, as far as H.264 holds it
+    assert frames[:, 0, 0].max() <= 3
+    first = film.read_bytes()
+    assert cli.main(["render", str(path), *options]) == 0
+    assert film.read_bytes() == first
+
+
 def test_an_interrupted_orbit_keeps_its_frames(mi_rgb, path, tmp_path, monkeypatch, capsys):
     from mi_diffind import rendering
 
@@ -91,12 +118,23 @@ def test_an_interrupted_orbit_keeps_its_frames(mi_rgb, path, tmp_path, monkeypat
 
 def test_what_is_refused(mi_rgb, path, tmp_path, capsys):
     for options, message in (
-        (("--orbit", "3", "-o", str(tmp_path / "film.mp4")), "allowed are .exr, .png, .webp, .gif"),
+        (("--orbit", "3", "-o", str(tmp_path / "film.avi")), "allowed are .exr, .png, .mp4, .webp, .gif"),
+        (("-o", str(tmp_path / "film.mp4")), "allowed are .exr and .png"),
         (("-o", str(tmp_path / "film.webp")), "allowed are .exr and .png"),
         (("--centre", "0", "0", "0"), "--centre needs --orbit"),
     ):
         assert cli.main(["render", str(path), *options]) == 2
         assert message in capsys.readouterr().err
+
+
+def test_h264_is_refused_before_frames_are_rendered(mi_rgb, path, tmp_path, monkeypatch, capsys):
+    from mi_diffind import orbit
+
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)  # as if it were not installed
+    monkeypatch.setattr(orbit, "along", lambda *_, **__: pytest.fail("rendered"))
+    assert cli.main(["render", str(path), "--orbit", "3", "-o", str(tmp_path / "film.mp4")]) == 2
+    assert 'film.mp4": H.264 needs the package imageio-ffmpeg, which is not installed' in capsys.readouterr().err
+    assert [file.name for file in tmp_path.iterdir()] == ["scene.xml"]
 
 
 def test_a_rotation_leaves_its_axis_in_place():

@@ -27,6 +27,7 @@ FLOORS = (
         "archives",
         "bits",
         "bounds",
+        "films",
         "limits",
         "metrics",
         "picture_sizes",

@@ -19,8 +19,8 @@ from .common import (
     verb,
 )
 
-#: Extensions of films (:data:`mi_diffind.orbit.FILMS`, without importing Mitsuba).
-FILMS = (".webp", ".gif")
+#: Extensions of films (:data:`mi_diffind.films.FILMS`, without importing NumPy).
+FILMS = (".mp4", ".webp", ".gif")
 
 HELP = "render a scene that names learned plugins"
 
@@ -33,7 +33,7 @@ def add(commands) -> None:
     sub.add_argument("scene", metavar="SCENE.xml")
     sub.add_argument(
         "-o", "--output", metavar="FILE",
-        help="image, .exr or .png, or with --orbit a film, .webp or .gif (default: SCENE.exr)",
+        help="image, .exr or .png, or with --orbit a film, .mp4, .webp or .gif (default: SCENE.exr)",
     )  # fmt: skip
     sub.add_argument(
         "--orbit",
@@ -79,6 +79,10 @@ def run(arguments) -> dict:
         allowed = ", ".join((".exr", ".png", *films)) if films else ".exr and .png"
         raise UsageError(f'output "{output}": found the extension "{output.suffix}", allowed are {allowed}')
     writable_file(output)
+    if arguments.orbit:
+        from ..films import check_encoder
+
+        check_encoder(output)
     set_variant(arguments.variant)
     from .. import depth, scenes
     from ..rendering import render
@@ -106,6 +110,8 @@ def run(arguments) -> dict:
         count, wanted = figures["frames"], figures["frames_requested"]
         kept = f"interrupted, kept {count} of {wanted}" if figures["interrupted"] else count
         say(f"{output}: {kept} frames of {size}, {figures['spp']} spp, {time}")
+        if output.suffix.lower() == ".mp4" and (figures["width"] % 2 or figures["height"] % 2):
+            say("H.264 needs an even width and height: the last column or row is there twice")
     else:
         kept = f"interrupted, kept {figures['spp']} of {figures['spp_requested']}"
         say(f"{output}: {size}, {kept if figures['interrupted'] else figures['spp']} spp, {time}")

@@ -1,0 +1,154 @@
+"""Films of frames: H.264 that another decoder call reads back, panels with labels, what is refused."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from film_files import decoded, needs_ffmpeg
+from PIL import Image
+
+from mi_diffind import films
+from mi_diffind.errors import UsageError
+from mi_diffind.files import OutputError
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def smooth_frames(count, height, width):
+    """Frames of bytes, a slow wave that moves."""
+    y, x = np.mgrid[:height, :width]
+    waves = [(np.sin(x / 17 + k), np.cos(y / 13 + k), np.sin((x + y) / 23 - k)) for k in np.arange(count) / 3]
+    return [np.round(127 + 100 * np.stack(wave, axis=-1)).astype(np.uint8) for wave in waves]
+
+
+@needs_ffmpeg
+@pytest.mark.parametrize("size", [(48, 64), (47, 63)])
+def test_h264_is_read_back(tmp_path, size):
+    frames, path = smooth_frames(9, *size), tmp_path / "film.mp4"
+    films.write(path, frames, seconds=3.0)
+    import imageio_ffmpeg
+
+    count, seconds = imageio_ffmpeg.count_frames_and_secs(str(path))
+    assert count == 9 and seconds == pytest.approx(3.0)
+    read = decoded(path)
+    assert read.shape == (9, 48, 64, 3)
+    error = read[:, : size[0], : size[1]].astype(float) - np.stack(frames)
+    assert (10 * np.log10(255**2 / np.square(error).mean(axis=(1, 2, 3))) > 38).all()
+    assert np.abs(error.mean(axis=(1, 2))).max() < 0.7  # no shift of colours by another matrix or range
+    if size[0] % 2:
+        assert np.abs(read[:, -1].astype(int) - read[:, -2]).mean() < 4
+
+
+@needs_ffmpeg
+def test_the_same_frames_give_the_same_bytes(tmp_path):
+    frames = smooth_frames(5, 32, 32)
+    for name in ("a.mp4", "b.mp4"):
+        films.write(tmp_path / name, frames)
+    assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
+    films.write(tmp_path / "b.mp4", frames, quality=40)
+    assert (tmp_path / "b.mp4").stat().st_size < (tmp_path / "a.mp4").stat().st_size
+    assert sorted(os.listdir(tmp_path)) == ["a.mp4", "b.mp4"]
+
+
+@needs_ffmpeg
+def test_a_name_like_an_address_is_a_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("http:film.mp4", "-y.mp4"):
+        films.write(name, smooth_frames(2, 16, 16))
+        assert decoded(tmp_path / name).shape[0] == 2
+
+
+@needs_ffmpeg
+def test_one_frame_is_a_film(tmp_path):
+    """An interrupted orbit keeps as few."""
+    frame = smooth_frames(1, 32, 32)[0]
+    films.write(tmp_path / "film.mp4", [frame])
+    assert np.abs(decoded(tmp_path / "film.mp4").astype(float) - frame).mean() < 4
+
+
+@needs_ffmpeg
+def test_a_failed_encoder_leaves_nothing(tmp_path):
+    """Frames without pixels, which the encoder refuses."""
+    with pytest.raises(OutputError, match=r'output file ".*film\.mp4" cannot be written: .+'):
+        films.write(tmp_path / "film.mp4", [np.zeros((0, 0, 3), np.uint8)])
+    assert not os.listdir(tmp_path)
+
+
+def test_h264_needs_an_encoder(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(
+        UsageError, match=r"film\.mp4.*needs the package imageio-ffmpeg.*pip install 'mi-diffind\[film\]'"
+    ):
+        films.write(tmp_path / "film.mp4", smooth_frames(2, 8, 8))
+    assert not os.listdir(tmp_path)
+    films.write(tmp_path / "film.webp", smooth_frames(2, 8, 8))
+
+
+def test_refused_frames(tmp_path):
+    frame = smooth_frames(1, 8, 8)[0]
+    for frames, message in (
+        ([], "frames: found none"),
+        ([frame, frame[:4]], r"found uint8 \(4, 8, 3\) as number 1, allowed are uint8 \(height, width, 3 or 4\)"),
+        ([frame / 255], r"found float64 \(8, 8, 3\) as number 0"),
+        ([frame[..., :1]], r"found uint8 \(8, 8, 1\)"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            films.write(tmp_path / "film.webp", frames)
+    with pytest.raises(UsageError, match="panels: found 1 of 'a', 2 of 'b', allowed are"):
+        films.beside({"a": [frame], "b": [frame, frame]}, columns=2)
+    with pytest.raises(UsageError, match=r"frames: found uint8 \(4, 8, 3\) as number 1"):
+        films.beside({"a": [frame], "b": [frame[:4]]}, columns=2)
+    with pytest.raises(UsageError, match="panels: found no panel"):
+        films.beside({}, columns=2)
+    assert not os.listdir(tmp_path)
+
+
+@needs_ffmpeg
+def test_h264_has_no_alpha(tmp_path):
+    with pytest.raises(
+        UsageError, match=r"found uint8 \(8, 8, 4\) as number 0, allowed are uint8 \(height, width, 3\)"
+    ):
+        films.write(tmp_path / "film.mp4", [np.zeros((8, 8, 4), np.uint8)])
+
+
+def test_panels_stand_beside_one_another():
+    red, blue = (np.full((3, 20, 40, 3), colour, np.uint8) for colour in ((200, 0, 0), (0, 0, 200)))
+    blue[2] = 90
+    frames = films.beside(
+        {"left": list(red), "right": list(blue), "below": list(red)}, columns=2, text_height=10, gap=4
+    )
+    assert len(frames) == 3 and all(frame.shape == (2 * (20 + 17), 84, 3) for frame in frames)
+    first = frames[0]
+    assert (first[17:37, :40] == red[0]).all() and (first[17:37, 44:] == blue[0]).all()
+    assert (first[17:37, 40:44] == 255).all() and (first[54:74, 44:] == 255).all()
+    assert (frames[2][17:37, 44:] == 90).all()
+    for label in (first[:17, :40], first[:17, 44:], first[37:54, :40]):
+        assert label.min() < 120  # text
+    assert not (first[:17, :40] == first[37:54, :40]).all()
+
+
+def test_films_that_begin_again(tmp_path):
+    frames = smooth_frames(6, 24, 32)
+    for name in ("film.webp", "film.gif"):
+        films.write(tmp_path / name, frames, seconds=1.2)
+        with Image.open(tmp_path / name) as film:
+            assert film.n_frames == 6 and film.info["loop"] == 0
+            film.seek(4)
+            film.load()
+            assert film.info["duration"] == 200
+            assert np.abs(np.array(film.convert("RGB")).astype(float) - frames[4]).mean() < 8
+
+
+@needs_ffmpeg
+@pytest.mark.long
+def test_the_films_of_the_pages_are_rendered(tmp_path):
+    command = [sys.executable, str(ROOT / "docs" / "make_films.py"), "zoom", "--frames", "3"]
+    subprocess.run([*command, "--out", str(tmp_path), "--json", str(tmp_path)], check=True, capture_output=True)
+    names = ["film_zoom.json", "zoom.jpg", "zoom.mp4", "zoom.webp"]
+    assert sorted(os.listdir(tmp_path)) == names
+    with Image.open(tmp_path / "zoom.webp") as film:
+        assert film.n_frames == 4  # 1 2 3 2
+    assert decoded(tmp_path / "zoom.mp4").shape[0] == 4
