@@ -27,6 +27,8 @@ FLOORS = (
         "archives",
         "bits",
         "bounds",
+        "downloads",
+        "example_files",
         "limits",
         "metrics",
         "picture_sizes",
@@ -44,6 +46,7 @@ FLOORS = (
     ("tasks",),
     ("plugins",),
     (
+        "mitsuba_entry",
         "poses",
         "saving",
         "rendering",
