@@ -17,6 +17,7 @@ FLOORS = (
         "interrupt",
         "files",
         "compat",
+        "mitsuba_versions",
         "runtime",
         "deadline",
         "progress",
