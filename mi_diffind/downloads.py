@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from .errors import DiffindError, UsageError, reason
-from .files import irregular, replacing, shown, writable_folder
+from .files import irregular, replacing, shown, writable_folder, write_json
 
 #: Bytes that are read at a time, and seconds without an answer after which a download fails.
 BLOCK, TIMEOUT = 2**16, 30.0
@@ -44,12 +44,16 @@ class File:
 
 @dataclass(frozen=True)
 class Download:
-    """Files of one name in a folder: what they are, the licence, and the address that those of the files end."""
+    """Files of one name in a folder: what they are, the licence, and the address that those of the files end.
+
+    Of a material, ``maps`` is the content of a manifest of its maps (:mod:`mi_diffind.maps.source`), ``NAME.json``.
+    """
 
     what: str
     licence: str
     base: str
     files: tuple[File, ...]
+    maps: dict | None = None
 
     @property
     def size(self) -> int:
@@ -86,6 +90,13 @@ DOWNLOADS = {
                 "04feedd2189fc4f1f83d9c05fb0a7d7da0c27d80f7a31eacdd37d8682776f81b",
             ),
         ),
+        {
+            "albedo": "BoomBox_baseColor.png",
+            "normal": "BoomBox_normal.png",
+            "ao": {"file": "BoomBox_occlusionRoughnessMetallic.png", "channels": "r"},
+            "roughness": {"file": "BoomBox_occlusionRoughnessMetallic.png", "channels": "g"},
+            "metallic": {"file": "BoomBox_occlusionRoughnessMetallic.png", "channels": "b"},
+        },
     ),
     "brick": Download(
         "base in grey, normals and roughness, 2048²",
@@ -96,6 +107,7 @@ DOWNLOADS = {
             File("brick_normal.jpg", 3_690_871, "9f9be6b8eb54c50c0c875762e9493c8672f3a62b89bef4635ac3868debf7f55d"),
             File("brick_roughness.jpg", 849_467, "00cd23d5d58729039dc00e73169fafaf9bae32472d3ea415abc2c4dbe5246f81"),
         ),
+        {"albedo": "brick_base_gray.jpg", "normal": "brick_normal.jpg", "roughness": "brick_roughness.jpg"},
     ),
     "armadillo": Download(
         "mesh of 52,000 triangles, watertight",
@@ -144,9 +156,10 @@ def fetch(
 ) -> Fetched:
     """Fetch the files of ``names``, of :data:`DOWNLOADS`, into ``folder/NAME``, and return what is there.
 
-    Files that are there and have the right SHA-256 stay. ``base``: another address, of a mirror, that ends in a folder
-    of the files of each name. ``progress`` is called with a line for each file to fetch. Raises :class:`UsageError`,
-    :class:`DownloadError` and :class:`~mi_diffind.files.OutputError`; no unfinished file stays.
+    A material gets a manifest, ``NAME.json``. Files that are there and have the right SHA-256 stay. ``base``: another
+    address, of a mirror, that ends in a folder of the files of each name. ``progress`` is called with a line for each
+    file to fetch. Raises :class:`UsageError`, :class:`DownloadError` and :class:`~mi_diffind.files.OutputError`; no
+    unfinished file stays.
     """
     names = tuple(dict.fromkeys([names] if isinstance(names, str) else names))
     if unknown := next((name for name in names if name not in DOWNLOADS), None):
@@ -169,6 +182,10 @@ def fetch(
             with replacing(path) as temporary:
                 _load(address, file, temporary)
             loaded += 1
+        if DOWNLOADS[name].maps is not None:
+            paths.append(place / f"{name}.json")
+            if not os.path.lexists(paths[-1]):
+                write_json(paths[-1], {"maps": DOWNLOADS[name].maps})
     return Fetched(target, names, tuple(paths), loaded)
 
 

@@ -5,6 +5,7 @@ import hashlib
 import http.server
 import json
 import re
+import shutil
 import subprocess
 import sys
 import tarfile
@@ -119,7 +120,7 @@ def server(tmp_path, monkeypatch):
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Handler, directory=served)) as found:
         threading.Thread(target=found.serve_forever, daemon=True).start()
         address = f"http://127.0.0.1:{found.server_port}"
-        known = {"thing": downloads.Download("a thing", "CC0", f"{address}/thing", files)}
+        known = {"thing": downloads.Download("a thing", "CC0", f"{address}/thing", files, {"albedo": "one.bin"})}
         monkeypatch.setattr(downloads, "DOWNLOADS", known)
         yield address
         found.shutdown()
@@ -128,9 +129,11 @@ def server(tmp_path, monkeypatch):
 def test_fetch(server, tmp_path, capsys):
     folder, report = tmp_path / "data", tmp_path / "report.json"
     assert main(["fetch", "thing", "thing", "-o", str(folder), "--json", str(report)]) == 0
-    assert below(folder) == {f"thing/{name}": content for name, content in CONTENT.items()}
+    manifest = below(folder).pop("thing/thing.json")
+    assert json.loads(manifest) == {"maps": {"albedo": "one.bin"}}
+    assert below(folder) == {"thing/thing.json": manifest, **{f"thing/{n}": content for n, content in CONTENT.items()}}
     assert Handler.asked == ["/thing/one.bin", "/thing/two.bin"]
-    assert "2 files, 2 fetched" in capsys.readouterr().out and json.loads(report.read_text())["loaded"] == 2
+    assert "3 files, 2 fetched" in capsys.readouterr().out and json.loads(report.read_text())["loaded"] == 2
     (folder / "thing" / "two.bin").unlink()
     assert mi_diffind.fetch("thing", folder).loaded == 1 and Handler.asked[2:] == ["/thing/two.bin"]
     mirror = mi_diffind.fetch(["thing"], tmp_path / "other", base=f"{server}/")
@@ -187,6 +190,8 @@ def test_what_can_be_fetched(capsys):
         assert re.search(r"/[0-9a-f]{40}/|/v\d+\.\d+\.\d+/", each.base)
         for file in each.files:
             assert re.fullmatch(r"[0-9a-f]{64}", file.sha256) and 0 < file.size < 2**24
+        mapped = {m if isinstance(m, str) else m["file"] for m in (each.maps or {}).values()}
+        assert mapped <= {file.name for file in each.files}
 
 
 # -- The release -------------------------------------------------------------------------------------------------------
@@ -201,7 +206,9 @@ def test_one_version():
 @pytest.mark.long
 def test_wheel(tmp_path):
     """The wheel, built from the source archive, holds all modules, tables and scenes, and works without a checkout."""
-    command = [sys.executable, "-m", "build", "--outdir", str(tmp_path / "dist"), str(ROOT)]
+    ignored = shutil.ignore_patterns(".*", "out", "build", "dist", "*.egg-info", "__pycache__")
+    copy = shutil.copytree(ROOT, tmp_path / "copy", ignore=ignored)  # setuptools works beside the sources
+    command = [sys.executable, "-m", "build", "--outdir", str(tmp_path / "dist"), str(copy)]
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 0, done.stderr[-2000:]
     (wheel,), (archive,) = (tmp_path / "dist").glob("*.whl"), (tmp_path / "dist").glob("*.tar.gz")
