@@ -12,7 +12,7 @@ from pathlib import Path as _Path
 from . import runtime as _runtime
 from .errors import DiffindError
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _here = _Path(__file__).resolve().parent
 if not (_here / "plugins").is_dir():  # a checkout has the folder `plugins` beside this one, an installation inside
@@ -37,6 +37,8 @@ _NAMES = {
     "inspect": "inspection",
     "regress": "regression",
     "render": "rendering",
+    "examples": "example_files",
+    "fetch": "downloads",
     # Measurements
     "tradeoff": "tradeoffs",
     # Errors between images, and images as displayed

@@ -16,7 +16,10 @@ from .errors import DiffindError, printable, reason, shortened
 from .files import shown, writable_file, write_json
 
 #: In the order of the help.
-VERBS = ("render", "capture", "compare", "convert", "regress", "inspect", "tradeoff", "decode", "fit")
+VERBS = (
+    *("render", "capture", "compare", "convert", "regress", "inspect", "tradeoff", "decode", "fit"),
+    *("examples", "fetch"),
+)
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -3,10 +3,7 @@
 Each has a test that names the hook which broke (``tests/test_compat.py``). Where another version differs, this file
 changes and no other.
 
-What Mitsuba 3.10 brings, and where it belongs: *footprints* (``si.footprint``, a ``Matrix2f`` of which the columns are
-conjugate diameters in uv; ``RayFlags.Footprint``; a texture's ``filtered()``) replace footprints that we estimate;
-*Python shapes* (``mi.Shape`` with ``primitive_count`` and ``ray_intersect_preliminary``) replace factories that return
-native shapes; the *new mesh* interface concerns ``mi.Mesh`` subclasses alone. None of these three is used yet.
+What Mitsuba 3.10 does in another way is in :mod:`.mitsuba_versions`.
 
 Functions import Mitsuba and Dr.Jit when they are called, so that this module may be imported before LLVM is chosen
 (:mod:`.runtime`).

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from . import compat, plugins
+from . import compat, mitsuba_versions, plugins
 from .errors import DiffindError, UsageError
 from .files import relative_path, replacing, writable_file, writable_folder
 from .plugins.support.stock import Kept, StockNode
@@ -134,7 +134,7 @@ def _convert(state, groups: dict[str, plugins.Plugin], folder: Path, progress: b
         if (before := props.plugin_name()) not in stock:
             continue
         word, plugin = stock[before]
-        if getattr(mi.ObjectType, plugins.OBJECT_TYPES[plugin.object_type]) != types[index]:
+        if mitsuba_versions.object_type(plugins.OBJECT_TYPES[plugin.object_type]) != types[index]:
             continue
         around = list(_around(references, index))
         name = next(filter(None, (nodes[i].id() for i in (index, *around))), "") or compat.parsed_place(state, index)

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from mi_diffind import compat, discovery
+from mi_diffind import compat, discovery, mitsuba_versions
 
 #: Modules of this package that are no plugins.
 IGNORED = ("support",)
@@ -169,8 +169,6 @@ def _on_variant_change(old: str | None, new: str) -> None:
 
 def register(variant: str) -> None:
     """Register every plugin with ``variant``, which must be the one that is set; only the first call does anything."""
-    import mitsuba as mi
-
     if variant in _declared:
         return
     _declared[variant] = declarations = {}
@@ -182,9 +180,7 @@ def register(variant: str) -> None:
             factory = _refusal(plugin.name, variant)
         else:
             continue
-        # Mitsuba has no `register_volume`; in a scene, volumes are looked up among textures
-        register_as = "texture" if plugin.object_type == "volume" else plugin.object_type
-        getattr(mi, f"register_{register_as}")(plugin.name, factory)
+        mitsuba_versions.register(plugin.object_type, plugin.name, factory)
 
 
 def _load() -> list[Plugin]:
@@ -209,10 +205,9 @@ def _checked(plugin: Plugin):
     """Return the factory to register: it checks the type of the instance and records the properties it came from."""
 
     def make(props):
-        import mitsuba as mi
-
         instance = plugin.factory(props)
-        if not isinstance(instance, getattr(mi, OBJECT_TYPES[plugin.object_type])):  # Mitsuba would crash
+        needed = mitsuba_versions.base_class(OBJECT_TYPES[plugin.object_type])
+        if not isinstance(instance, needed):  # Mitsuba would crash
             returned = "nothing" if instance is None else f"a {type(instance).__name__}"
             raise RuntimeError(
                 f'plugin "{plugin.name}": the factory returned {returned}, a {plugin.object_type} is needed'

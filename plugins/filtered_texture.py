@@ -5,7 +5,7 @@ from __future__ import annotations  # Delayed parsing of type annotations
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind import compat
+from mi_diffind import compat, mitsuba_versions
 from mi_diffind.lookup import clamp
 
 from .map_texture import MapTexture
@@ -142,6 +142,10 @@ class FilteredTexture(MapTexture):
             gradient.append((ahead - behind) / width)
         return self._before(*gradient)
 
+    def filtered(self) -> bool:
+        """Return whether footprints are read; if no texture says so, Mitsuba 3.10 computes none."""
+        return self.filter.name != "off" and self.is_spatially_varying()
+
     def report(self) -> dict:
         """Return the description of :meth:`.MapTexture.report` and three more keys.
 
@@ -154,7 +158,7 @@ class FilteredTexture(MapTexture):
         if self.filter.name == "off" or not self.is_spatially_varying():
             left_out["footprint"] = "the filter is off" if self.filter.name == "off" else "the map is constant"
         else:
-            sources = [*(["interaction"] if hasattr(mi.SurfaceInteraction3f, "footprint") else []), "uv partials"]
+            sources = [*(["interaction"] if mitsuba_versions.has_footprints() else []), "uv partials"]
             if self.cone is not None:
                 sources.append("sensor" if self.cone is not self._cone_of_parameters else "parameters")
             else:

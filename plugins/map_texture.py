@@ -12,6 +12,7 @@ from mi_diffind import srgb
 from mi_diffind.bounds import ValueBounds
 from mi_diffind.lookup import clamp
 from mi_diffind.maps.layout import MapLayout
+from mi_diffind.mitsuba_versions import base_class
 
 from .support import properties, tables, textures, upsampling
 from .support.image_files import SharedMaps, is_data, map_of
@@ -25,7 +26,7 @@ DECODED = 2**22
 BRIGHTEST = 1e9
 
 
-class MapTexture(mi.Texture):
+class MapTexture(base_class("Texture")):
     """Texture of one map of a :class:`~mi_diffind.maps.compressed.CompressedMaps`.
 
     The class implements colours and data, wrapping, transformation, spectra and the sampling of positions. A derived

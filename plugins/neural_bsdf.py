@@ -10,6 +10,7 @@ from mi_diffind import compat
 from mi_diffind.errors import UsageError
 from mi_diffind.indirection import DifferentiableArray
 from mi_diffind.lookup import clamp
+from mi_diffind.mitsuba_versions import base_class
 from mi_diffind.tables import TableError
 from mi_diffind.tasks.bsdf import TASK
 from mi_diffind.tasks.bsdf.family_files import ARRAYS
@@ -465,7 +466,7 @@ def _learned_or_source(props: mi.Properties):
 def _is_textured(bsdf) -> bool:
     """Return whether a BSDF differs from place to place; plugins of Mitsuba do not all set a flag."""
     nodes = compat.objects_of(bsdf)
-    varies = any(isinstance(node, mi.Texture) and node.is_spatially_varying() for node in nodes)
+    varies = any(isinstance(node, base_class("Texture")) and node.is_spatially_varying() for node in nodes)
     return varies or mi.has_flag(bsdf.flags(), mi.BSDFFlags.SpatiallyVarying)
 
 

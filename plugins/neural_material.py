@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_diffind import compat
+from mi_diffind.mitsuba_versions import base_class
 from mi_diffind.tasks.disney import TASK as DISNEY
 from mi_diffind.tasks.disney.model import clamp
 from mi_diffind.tasks.shading.material import frame, shadowing
@@ -141,7 +142,11 @@ class NeuralMaterial(Disney):
             raise RuntimeError(f'parameter "two_sided": found {self.two_sided}, allowed are true and false')
         self.maps = MaterialMaps(props)
         for name in ("base_color", *self.scalars, "subsurface", "specular", "eta"):
-            if name in props and isinstance(props[name], mi.Texture) and not compat.is_constant_texture(props[name]):
+            if (
+                name in props
+                and isinstance(props[name], base_class("Texture"))
+                and not compat.is_constant_texture(props[name])
+            ):
                 raise RuntimeError(f'parameter "{name}": found a texture, allowed are numbers: maps come from the file')
         for name, m in self.maps.maps.items():
             others = {"flatness": ("subsurface",), "specular": ("eta",)}.get(name, ())

@@ -20,7 +20,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_diffind import compat
+from mi_diffind import compat, mitsuba_versions
 
 from . import omissions
 
@@ -176,9 +176,8 @@ def footprint(si: mi.SurfaceInteraction3f, cone: Cone | None = None) -> tuple[mi
     or no source at all is 0, the sharpest footprint.
     """
     sources = []
-    if hasattr(si, "footprint"):
-        m = si.footprint
-        sources.append((mi.Vector2f(m[0, 0], m[1, 0]), mi.Vector2f(m[0, 1], m[1, 1])))
+    if (given := mitsuba_versions.footprint_of(si)) is not None:
+        sources.append(given)
     sources.append((si.duv_dx, si.duv_dy))
     ddx, ddy = (mi.Vector2f(0), mi.Vector2f(0)) if cone is None else seen_by(cone, si)
     for x, y in reversed(sources):

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ... import mitsuba_versions
 from ...tasks.sdf import grids, tracing
 from ...tasks.sdf.field import DistanceField
 from ...tasks.sdf.mesh import Mesh
@@ -56,10 +57,10 @@ class MeshView:
 
     def mesh_scene(self, lit: bool = False):
         """Return a scene of the mesh, alone or ``lit`` on a floor."""
-        shape = mi.Mesh("mesh", len(self.mesh.vertices), len(self.mesh.faces), props=_material())
+        counts = len(self.mesh.vertices), len(self.mesh.faces)
+        shape = mi.Mesh(*mitsuba_versions.mesh_arguments(_material(), *counts))
         buffers = mi.traverse(shape)
-        buffers["vertex_positions"] = np.ascontiguousarray(self.mesh.vertices, np.float32).ravel()
-        buffers["faces"] = np.ascontiguousarray(self.mesh.faces, np.uint32).ravel()
+        mitsuba_versions.set_triangles(buffers, self.mesh.vertices, self.mesh.faces)
         buffers.update()
         return self._scene(shape, "path", lit)
 

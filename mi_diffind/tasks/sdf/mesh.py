@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ... import mitsuba_versions
 from ...errors import DiffindError, reason
 from ...files import irregular, shown
 from ...units import memory
@@ -137,8 +138,8 @@ def load_mesh(mesh) -> Mesh:
 
 def _in_memory(mesh) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices and faces of a mesh in memory. Raises :class:`MeshError` for an object that is none."""
-    if hasattr(mesh, "vertex_positions_buffer"):  # mi.Mesh
-        return (b.numpy().reshape(-1, 3) for b in (mesh.vertex_positions_buffer(), mesh.faces_buffer()))
+    if hasattr(mesh, "vertex_positions_buffer") or hasattr(mesh, "from_fields"):  # mi.Mesh
+        return mitsuba_versions.triangles(mesh)
     if hasattr(mesh, "to_geometry"):  # trimesh.Scene
         mesh = mesh.to_geometry()
     if hasattr(mesh, "vertices") and hasattr(mesh, "faces"):

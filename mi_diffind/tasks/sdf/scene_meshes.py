@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ... import mitsuba_versions
 from ...runtime import use_variant
 
 
@@ -23,7 +24,4 @@ def read(path: Path, name: str = "") -> list[tuple[np.ndarray, np.ndarray]]:
     if not chosen:
         names = ", ".join(f'"{shape.id()}"' for shape in shapes) or "none"
         raise ValueError(f'holds no mesh "{name}", found {names}')
-    return [
-        tuple(buffer.numpy().reshape(-1, 3) for buffer in (shape.vertex_positions_buffer(), shape.faces_buffer()))
-        for shape in chosen
-    ]
+    return [mitsuba_versions.triangles(shape) for shape in chosen]

@@ -1,0 +1,29 @@
+"""``mi-diffind examples``: the example scenes, for an installation without a checkout."""
+
+from __future__ import annotations
+
+from .common import say, verb
+
+HELP = "copy the example scenes, and what they read, to a folder"
+
+EXAMPLE = "mi-diffind examples scenes && mi-diffind compare scenes/materials.xml"
+
+
+def add(commands) -> None:
+    """Add the verb and its options to ``commands``, the subparsers of the command line."""
+    sub = verb(commands, "examples", run, HELP, EXAMPLE)
+    sub.add_argument("folder", metavar="FOLDER", help="folder to copy to; files that differ are never replaced")
+
+
+def run(arguments) -> dict:
+    """Copy the scenes and return what is printed.
+
+    Raises :class:`~mi_diffind.errors.UsageError` and :class:`~mi_diffind.files.OutputError`.
+    """
+    from ..example_files import examples
+
+    written = examples(arguments.folder)
+    say(written)
+    for path in written.figures["scenes"]:
+        say(path)
+    return written.figures

@@ -1,0 +1,251 @@
+"""What a user without a checkout gets: the example scenes, the data of the pages, the wheel and the source archive."""
+
+import functools
+import hashlib
+import http.server
+import json
+import re
+import shutil
+import subprocess
+import sys
+import tarfile
+import threading
+import xml.etree.ElementTree as ElementTree
+import zipfile
+from pathlib import Path
+
+import pytest
+from commands import refused
+
+import mi_diffind
+from mi_diffind import downloads
+from mi_diffind.cli import main
+from mi_diffind.errors import UsageError
+
+ROOT = Path(__file__).resolve().parents[1]
+
+CONTENT = {"one.bin": bytes(range(256)) * 700, "two.bin": b"two"}
+
+
+def below(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+# -- Example scenes ----------------------------------------------------------------------------------------------------
+
+
+def test_examples(tmp_path, capsys):
+    folder, report = tmp_path / "scenes", tmp_path / "report.json"
+    assert main(["examples", str(folder), "--json", str(report)]) == 0
+    text, written = capsys.readouterr().out, below(folder)
+    assert {f"{name.stem}.xml" for name in (ROOT / "scenes").glob("*.xml")} == {n for n in written if "/" not in n} - {
+        "README.md"
+    }
+    for name, content in written.items():
+        assert content == (ROOT / "scenes" / name).read_bytes(), name
+    assert not [name for name in written if name.startswith("references") or name.endswith((".py", ".jpg"))]
+    figures = json.loads(report.read_text())
+    assert figures["files"] == len(written) and figures["bytes"] == sum(map(len, written.values()))
+    assert all(Path(scene).is_file() and scene in text for scene in figures["scenes"])
+
+
+def test_examples_hold_all_that_they_read(tmp_path):
+    """Each file that a scene names, with the values of its ``<default>``s, is in the folder."""
+    mi_diffind.examples(tmp_path / "scenes")
+    checked = 0
+    for scene in (tmp_path / "scenes").glob("*.xml"):
+        tree = ElementTree.parse(scene)
+        defaults = {node.get("name"): node.get("value") for node in tree.iter("default")}
+        names = [node.get("filename") for node in tree.iter("include")]
+        names += [n.get("value") for n in tree.iter("string") if n.get("name") in ("filename", "file")]
+        for name in names:
+            name = re.sub(r"\$(\w+)", lambda match, known=defaults: known[match[1]], name)
+            assert (scene.parent / name).is_file(), f"{scene.name} reads {name}"
+            checked += 1
+    assert checked > 30
+
+
+def test_examples_again(tmp_path, capsys):
+    folder = tmp_path / "scenes"
+    mi_diffind.examples(folder)
+    before = below(folder)
+    (folder / "mine.txt").write_text("mine")
+    (folder / "tiles.xml").unlink()
+    mi_diffind.examples(folder)
+    assert below(folder) == {**before, "mine.txt": b"mine"}
+    (folder / "tiles.xml").write_text("<scene/>")
+    (folder / "field.xml").unlink()
+    message = refused(capsys, "examples", str(folder))
+    assert "tiles.xml: differs from the example scene of that name; choose another folder" in message
+    assert not (folder / "field.xml").exists() and (folder / "tiles.xml").read_text() == "<scene/>"
+    assert "does not exist" in refused(capsys, "examples", str(tmp_path / "a" / "b"))
+
+
+# -- Data of the pages -------------------------------------------------------------------------------------------------
+
+
+class Handler(http.server.SimpleHTTPRequestHandler):
+    """Serves a folder; counts requests, redirects ``/moved``, and breaks off what lies in ``/broken``."""
+
+    asked: list = []  # noqa: RUF012
+
+    def do_GET(self):
+        self.asked.append(self.path)
+        if self.path.startswith("/moved"):
+            self.send_response(302)
+            self.send_header("Location", "file:///etc/passwd")
+            self.end_headers()
+        elif self.path.startswith("/broken"):
+            self.send_response(200)
+            self.send_header("Content-Length", str(len(CONTENT["one.bin"])))
+            self.end_headers()
+            self.wfile.write(CONTENT["one.bin"][:1000])
+        else:
+            super().do_GET()
+
+    def log_message(self, *_):
+        pass
+
+
+@pytest.fixture
+def server(tmp_path, monkeypatch):
+    """The address of a server on this machine whose folder, ``tmp_path/served``, has the files of the name "thing"."""
+    served = tmp_path / "served"
+    (served / "thing").mkdir(parents=True)
+    for name, content in CONTENT.items():
+        (served / "thing" / name).write_bytes(content)
+    files = tuple(downloads.File(n, len(c), hashlib.sha256(c).hexdigest()) for n, c in CONTENT.items())
+    monkeypatch.setattr(Handler, "asked", [])
+    monkeypatch.setenv("no_proxy", "*")
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Handler, directory=served)) as found:
+        threading.Thread(target=found.serve_forever, daemon=True).start()
+        address = f"http://127.0.0.1:{found.server_port}"
+        known = {"thing": downloads.Download("a thing", "CC0", f"{address}/thing", files, {"albedo": "one.bin"})}
+        monkeypatch.setattr(downloads, "DOWNLOADS", known)
+        yield address
+        found.shutdown()
+
+
+def test_fetch(server, tmp_path, capsys):
+    folder, report = tmp_path / "data", tmp_path / "report.json"
+    assert main(["fetch", "thing", "thing", "-o", str(folder), "--json", str(report)]) == 0
+    manifest = below(folder).pop("thing/thing.json")
+    assert json.loads(manifest) == {"maps": {"albedo": "one.bin"}}
+    assert below(folder) == {"thing/thing.json": manifest, **{f"thing/{n}": content for n, content in CONTENT.items()}}
+    assert Handler.asked == ["/thing/one.bin", "/thing/two.bin"]
+    assert "3 files, 2 fetched" in capsys.readouterr().out and json.loads(report.read_text())["loaded"] == 2
+    (folder / "thing" / "two.bin").unlink()
+    assert mi_diffind.fetch("thing", folder).loaded == 1 and Handler.asked[2:] == ["/thing/two.bin"]
+    mirror = mi_diffind.fetch(["thing"], tmp_path / "other", base=f"{server}/")
+    assert mirror.loaded == 2 and below(tmp_path / "other") == below(folder)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda served: (served / "one.bin").unlink(), "cannot be fetched: HTTP 404"),
+        (lambda served: (served / "one.bin").write_bytes(CONTENT["one.bin"][:-1]), "found 179,199 bytes, 179,200 are"),
+        (lambda served: (served / "one.bin").write_bytes(CONTENT["one.bin"] + b"x"), "found more than 179,200 bytes"),
+        (lambda served: (served / "one.bin").write_bytes(CONTENT["one.bin"][::-1]), "found the SHA-256"),
+    ],
+)
+def test_fetch_of_other_content(server, tmp_path, capsys, change, message):
+    change(tmp_path / "served" / "thing")
+    folder = tmp_path / "data"
+    found = refused(capsys, "fetch", "thing", "-o", str(folder))
+    assert message in found and "/thing/one.bin: " in found
+    assert below(folder) == {}  # no temporary file, and nothing of the second one
+
+
+def test_fetch_that_fails(server, tmp_path, capsys):
+    folder = tmp_path / "data"
+    for word, message in (("moved", "cannot be fetched: HTTP 302"), ("broken", "")):
+        found = refused(capsys, "fetch", "thing", "-o", str(folder), "--from", f"{server}/{word}")
+        assert f"error: {server}/{word}/thing/one.bin: " in found and message in found
+        assert below(folder) == {}
+    with http.server.HTTPServer(("127.0.0.1", 0), Handler) as closed:
+        nobody = f"http://127.0.0.1:{closed.server_port}"
+    assert "cannot be fetched: " in refused(capsys, "fetch", "thing", "-o", str(folder), "--from", nobody)
+    assert below(folder) == {}
+
+
+def test_fetch_refuses(server, tmp_path, capsys):
+    assert 'data "lego": is not known, allowed are thing' in refused(capsys, "fetch", "lego", "-o", str(tmp_path))
+    assert "found no http" in refused(capsys, "fetch", "thing", "-o", str(tmp_path), "--from", "file:///etc")
+    (tmp_path / "thing").mkdir()
+    (tmp_path / "thing" / "one.bin").write_bytes(b"mine")
+    assert "one.bin: is another file of that name" in refused(capsys, "fetch", "thing", "-o", str(tmp_path))
+    assert (tmp_path / "thing" / "one.bin").read_bytes() == b"mine" and Handler.asked == []
+    with pytest.raises(UsageError):
+        mi_diffind.fetch("lego", tmp_path)
+
+
+def test_what_can_be_fetched(capsys):
+    """The list shows the licence of each; addresses name a commit or a version, so that they keep their content."""
+    assert main(["fetch"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == list(downloads.DOWNLOADS)
+    for line, each in zip(lines, downloads.DOWNLOADS.values(), strict=True):
+        assert each.licence in line and each.base.startswith("https://")
+        assert re.search(r"/[0-9a-f]{40}/|/v\d+\.\d+\.\d+/", each.base)
+        for file in each.files:
+            assert re.fullmatch(r"[0-9a-f]{64}", file.sha256) and 0 < file.size < 2**24
+        mapped = {m if isinstance(m, str) else m["file"] for m in (each.maps or {}).values()}
+        assert mapped <= {file.name for file in each.files}
+
+
+# -- The release -------------------------------------------------------------------------------------------------------
+
+
+def test_one_version():
+    cited = re.search(r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text(), re.M)[1]
+    changes = re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.M)[1]
+    assert mi_diffind.__version__ == cited == changes
+
+
+@pytest.mark.long
+def test_wheel(tmp_path):
+    """The wheel, built from the source archive, holds all modules, tables and scenes, and works without a checkout."""
+    ignored = shutil.ignore_patterns(".*", "out", "build", "dist", "*.egg-info", "__pycache__")
+    copy = shutil.copytree(ROOT, tmp_path / "copy", ignore=ignored)  # setuptools works beside the sources
+    command = [sys.executable, "-m", "build", "--outdir", str(tmp_path / "dist"), str(copy)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr[-2000:]
+    (wheel,), (archive,) = (tmp_path / "dist").glob("*.whl"), (tmp_path / "dist").glob("*.tar.gz")
+    assert wheel.name.startswith(f"mi_diffind-{mi_diffind.__version__}-py3-none-any")
+
+    names = set(zipfile.ZipFile(wheel).namelist())
+    modules = {f"mi_diffind/{p.relative_to(ROOT / 'mi_diffind')}" for p in (ROOT / "mi_diffind").rglob("*.py")}
+    modules |= {f"mi_diffind/plugins/{p.relative_to(ROOT / 'plugins')}" for p in (ROOT / "plugins").rglob("*.py")}
+    tables = {f"mi_diffind/data/{p.name}" for p in (ROOT / "mi_diffind" / "data").glob("*.npz")}
+    scenes = {f"mi_diffind/example_scenes/{p.name}" for p in (ROOT / "scenes").glob("*.xml")}
+    assert len(modules) > 200 and len(tables) >= 4 and len(scenes) >= 12
+    assert modules | tables | scenes <= names, sorted((modules | tables | scenes) - names)
+    strange = {n for n in names if not n.startswith(("mi_diffind/", f"mi_diffind-{mi_diffind.__version__}.dist-info/"))}
+    assert not strange and not [n for n in names if "references" in n or "__pycache__" in n or n.endswith(".jpg")]
+    assert wheel.stat().st_size < 2**23
+    with tarfile.open(archive) as sources:
+        kept = {name.partition("/")[2] for name in sources.getnames()}
+    assert {"CHANGELOG.md", "LICENSE", "scenes/materials.xml", "tests/conftest.py", "docs/trust.md"} <= kept
+
+    installed = tmp_path / "installed"
+    zipfile.ZipFile(wheel).extractall(installed)
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    code = "import sys; sys.path.insert(0, sys.argv.pop(1)); import mi_diffind; from mi_diffind.cli import main\n"
+    code += "print(mi_diffind.__file__); sys.exit(main())"
+
+    def run(*arguments):
+        done = subprocess.run(
+            [sys.executable, "-P" if sys.version_info >= (3, 11) else "-s", "-c", code, str(installed), *arguments],
+            cwd=empty, capture_output=True, text=True,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    assert run("examples", "scenes").startswith(str(installed))
+    small = ("-D", "width=48", "-D", "height=28", "--spp", "2")
+    run("compare", "scenes/materials.xml", "--passes", "2", *small)
+    assert (empty / "out" / "comparison.png").stat().st_size > 1000
+    points = (installed / f"mi_diffind-{mi_diffind.__version__}.dist-info" / "entry_points.txt").read_text()
+    assert "[mitsuba]\nmi_diffind = mi_diffind.mitsuba_entry" in points
