@@ -37,6 +37,7 @@ _NAMES = {
     "inspect": "inspection",
     "regress": "regression",
     "render": "rendering",
+    "view": "viewer",
     # Measurements
     "tradeoff": "tradeoffs",
     # Errors between images, and images as displayed

@@ -16,7 +16,7 @@ from .errors import DiffindError, printable, reason, shortened
 from .files import shown, writable_file, write_json
 
 #: In the order of the help.
-VERBS = ("render", "capture", "compare", "convert", "regress", "inspect", "tradeoff", "decode", "fit")
+VERBS = ("render", "view", "capture", "compare", "convert", "regress", "inspect", "tradeoff", "decode", "fit")
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -61,7 +61,7 @@ FLOORS = (
         "inspection",
         "measure",
     ),
-    ("scene_training",),
+    ("scene_training", "viewer"),
     ("studies",),
     ("tradeoffs",),
     ("commands",),

@@ -137,23 +137,23 @@ class _Side:
 
     def _render(self, spp: int, seed: int) -> np.ndarray:
         """Return a pass ``(height, columns, 3)``, float64."""
-        width, height, first, after = self.region
+        _, height, first, after = self.region
         if self.region not in self.grids:
             if len(self.grids) >= RECORDED:
                 self.grids, self.frozen, self.counts = {}, None if self.frozen is None else {}, {}
             self.grids[self.region] = _pixels(*self.region)
-        count = self.counts[self.region] = self.counts.get(self.region, 0) + 1
-        arguments = (*self.grids[self.region], mi.UInt32(seed), spp)
+        self.counts[self.region] = self.counts.get(self.region, 0) + 1
+        arguments = (*self.grids[self.region], dr.opaque(mi.UInt32, seed), spp)
         render = _sample_pixels if self.by_pixels else _render_film
         with scenes.scene_errors(None), dr.suspend_grad():
             values = None
-            if count > 1 and self.frozen is not None:  # a changed scene is compiled, and may refuse, before
+            if self.frozen is not None:
                 if self.region not in self.frozen:
                     self.frozen[self.region] = dr.freeze(render)
                 try:
                     with _no_collection():
                         values = np.array(self.frozen[self.region](self.scene, *arguments))
-                except RuntimeError:  # what a third party's plugin computes outside Dr.Jit cannot be recorded
+                except RuntimeError:  # an error of the scene, or a plugin that computes outside Dr.Jit
                     self.frozen = None
             if values is None:
                 values = np.array(render(self.scene, *arguments))
@@ -174,8 +174,11 @@ def samples_pixels(scene) -> bool:
 
 def _pixels(width: int, height: int, first: int, after: int) -> tuple:
     """Return the columns and rows of the pixels of a region, row by row, and the size of a pixel in the film."""
-    rows, columns = (n.ravel().astype(np.float32) for n in np.mgrid[:height, first:after])
-    return mi.Float(columns), mi.Float(rows), dr.opaque(mi.Vector2f, [1 / width, 1 / height])
+    index, count = dr.arange(mi.UInt32, height * (after - first)), dr.opaque(mi.UInt32, after - first)
+    row = index // count
+    column, row = mi.Float(index - row * count + first), mi.Float(row)
+    dr.eval(column, row)  # memory of NumPy may be aligned otherwise, and have another kernel
+    return column, row, dr.opaque(mi.Vector2f, [1 / width, 1 / height])
 
 
 def _sample_pixels(scene, column, row, step, seed, spp: int):
@@ -418,18 +421,14 @@ class Session:
         return self.picture()
 
     def _resize(self) -> None:
-        """Give films the size of the picture, for the footprints of its pixels; those with a crop window keep theirs."""
+        """Give films the size of the picture, for footprints; those with a crop window keep theirs."""
         for side in filter(None, (self.learned, self.exact)):
             compat.set_film_size(side.sensor, *self.full)
 
     def _place(self) -> None:
         matrix = self._pose.matrix @ self._residue
         for side in filter(None, (self.learned, self.exact)):
-            side.place(matrix, self._samples())
-
-    def _samples(self) -> int:
-        """Return the samples per pixel that footprints are meant for."""
-        return 1 if self.moving else self.spp
+            side.place(matrix, self.spp)
 
     def _size(self) -> tuple[int, int]:
         """Return the size of the picture: reduced while the camera moves."""
@@ -446,7 +445,7 @@ class Session:
                 column = min(max(round(self.divider * width), 0), width)
                 first, after = (0, column) if side is self.learned else (column, width)
             if first < after:
-                side.add_pass((width, height, first, after), self._samples(), self.seed)
+                side.add_pass((width, height, first, after), self.spp, self.seed)
             else:
                 side.region = (width, height, 0, 0)
                 side.passes += 1
@@ -553,8 +552,8 @@ class Session:
         """Figures of the picture.
 
         ``seconds`` of the last pass of each visible side, ``psnr_db`` between the sides as they are now, noise
-        included (``None`` unless both are rendered as a whole), ``table_bytes`` of the learned plugins, ``samples``, ``spp``,
-        ``width`` and ``height``.
+        included (``None`` unless both are rendered as a whole), ``table_bytes`` of the learned plugins, ``samples``,
+        ``spp``, ``width`` and ``height``.
         """
         sides, names = self._visible(), {id(self.learned): "learned", id(self.exact): "exact"}
         both = len(sides) == 2 and self.passes and not (self.moving and self.view == VIEWS[0])

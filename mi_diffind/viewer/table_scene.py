@@ -44,7 +44,9 @@ def table_scene(file: str | os.PathLike) -> dict:
         plugin["channels"] = next((shown for shown in SHOWN if shown in maps), maps[0])
     if object_type == "texture":
         square = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": plugin}}
-        return _scene({"square": square}, [-1, -1, 0], [1, 1, 0], way=(0, 0, 1), lamp=False, integrator="path_footprint")
+        return _scene(
+            {"square": square}, [-1, -1, 0], [1, 1, 0], way=(0, 0, 1), lamp=False, integrator="path_footprint"
+        )
     if object_type == "bsdf":
         return _scene({"ball": {"type": "sphere", "bsdf": plugin}}, [-1, -1, -1], [1, 1, 1], integrator="path")
     if object_type == "shape":
