@@ -564,30 +564,22 @@ def property_kind(props, key: str) -> str:
 def film_size(sensor, width: int, height: int):
     """Give the film of a loaded sensor another size (pixels) while the context is open; yield whether that is possible.
 
-    A film with a crop window keeps its size (:func:`set_film_size`).
-    """
-    before = [int(n) for n in sensor.film().size()]
-    possible = set_film_size(sensor, width, height)
-    try:
-        yield possible
-    finally:
-        if possible:
-            set_film_size(sensor, *before)
-
-
-def set_film_size(sensor, width: int, height: int) -> bool:
-    """Give the film of a loaded sensor another size (pixels), and return whether that is possible.
-
     The parameter ``film.size`` is not in the manual, and a film with a crop window keeps its size.
     """
     import mitsuba as mi
 
     film, params = sensor.film(), mi.traverse(sensor)
-    if "film.size" not in params or [int(n) for n in film.size()] != [int(n) for n in film.crop_size()]:
-        return False
-    params["film.size"] = mi.ScalarVector2u(width, height)
-    params.update()
-    return True
+    before = [int(n) for n in film.size()]
+    if "film.size" not in params or before != [int(n) for n in film.crop_size()]:
+        yield False
+        return
+    try:
+        params["film.size"] = mi.ScalarVector2u(width, height)
+        params.update()
+        yield True
+    finally:
+        params["film.size"] = mi.ScalarVector2u(*before)
+        params.update()
 
 
 def one_sentence(error: BaseException) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import math
 import queue
 import socket
@@ -51,7 +52,8 @@ def server(host: str, port: int):
     except (OSError, UnicodeError) as e:
         problem = e.strerror if isinstance(e, OSError) and e.strerror else "no such address"
         raise UsageError(f"{host}:{port}: the page cannot be served there ({problem})") from None
-    return viser.ViserServer(host=host, port=port, verbose=False)
+    with contextlib.redirect_stdout(io.StringIO()):  # a banner
+        return viser.ViserServer(host=host, port=port, verbose=False)
 
 
 class Page:

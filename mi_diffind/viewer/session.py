@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import gc
 import math
 import os
 import time
@@ -11,16 +9,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from .. import compat, metrics, plugins, scenes, srgb
 from ..errors import DiffindError, UsageError
 from ..orbit import middle
-from ..plugins.support import footprint
 from ..runtime import use_variant
-from .parameters import Parameter, Parameters, counterparts
+from .parameters import Parameter, counterparts
+from .passes import Side
 from .table_scene import table_scene
 
 #: Contents of the picture.
@@ -34,12 +31,6 @@ SLOW, FAST = 0.18, 0.04
 
 #: Factors by which the sides of a picture are smaller while the camera moves.
 REDUCTIONS = (1, 2, 4)
-
-#: Passes of a size, the first ones, whose times include compilation and recording.
-SETTLED = 3
-
-#: Sizes and parts of pictures whose renders are kept as recordings.
-RECORDED = 12
 
 #: Option of a choice that leaves the file's own value.
 AS_WRITTEN = "as written"
@@ -67,167 +58,6 @@ class Pose:
         matrix = np.eye(4)
         matrix[:3] = np.stack([-self.right, self.up, self.forward, self.position], axis=1)
         return matrix
-
-
-class _Side:
-    """Scene, the sum of its passes, and renders that repeat without tracing.
-
-    ``oversampling``: passes for each pass of the scene as written.
-    """
-
-    def __init__(self, scene, oversampling: int):
-        self.scene, self.oversampling = scene, oversampling
-        self.sensor = scene.sensors()[0]
-        self.placement = mi.traverse(self.sensor)
-        self.parameters = Parameters(scene)
-        self.by_pixels = samples_pixels(scene)
-        self.region: tuple[int, int, int, int] = (0, 0, 0, 0)
-        self.grids: dict[tuple[int, int, int, int], tuple] = {}
-        self.frozen: dict[tuple[int, int, int, int], object] | None = {}
-        self.counts: dict[tuple[int, int, int, int], int] = {}
-        self.restart()
-
-    def restart(self) -> None:
-        self.total, self.passes, self.seconds = 0.0, 0, math.nan
-
-    def place(self, matrix: np.ndarray, spp: int) -> None:
-        """Move the camera, and give textures the footprint of ``spp`` samples per pixel."""
-        transform = type(self.placement["to_world"])
-        self.placement["to_world"] = transform(mi.ScalarTransform4f(matrix))
-        self.placement.update()
-        footprint.attach(self.scene, 0, spp)
-        self.restart()
-
-    def change(self, values: Mapping[str, object]) -> None:
-        """Change parameters. Plugins may then compute something else, so that recorded renders are of no use."""
-        self.parameters.set(values)
-        self.counts = {}
-        if self.frozen is not None:
-            self.frozen = {}
-        self.restart()
-
-    def add_pass(self, region: tuple[int, int, int, int], spp: int, seed: int) -> None:
-        """Render one sample of the pixels of a ``region``, or as many as the side is oversampled, and add them.
-
-        The region is the ``width`` and ``height`` of the picture, its first column and the one after its last.
-        Filtering textures get the footprint of ``spp`` samples per pixel.
-        """
-        start = time.perf_counter()
-        if region != self.region:
-            self.region = region
-            self.restart()
-        for i in range(self.oversampling):
-            self.total = self.total + self._render(spp, ((seed << 16) + self.passes * self.oversampling + i) % 2**32)
-        self.passes += 1
-        self.seconds = time.perf_counter() - start
-
-    @property
-    def settled(self) -> bool:
-        """Whether the last pass compiled and recorded nothing."""
-        return self.counts.get(self.region, 0) > SETTLED
-
-    @property
-    def image(self) -> np.ndarray:
-        """Mean of the passes, ``(height, width, 3)`` float32, black outside of the rendered columns."""
-        width, height, first, after = self.region
-        image = np.zeros((height, width, 3), np.float32)
-        if self.passes:
-            image[:, first:after] = self.total / (self.passes * self.oversampling)
-        return image
-
-    def _render(self, spp: int, seed: int) -> np.ndarray:
-        """Return a pass ``(height, columns, 3)``, float64."""
-        _, height, first, after = self.region
-        if self.region not in self.grids:
-            if len(self.grids) >= RECORDED:
-                self.grids, self.frozen, self.counts = {}, None if self.frozen is None else {}, {}
-            self.grids[self.region] = _pixels(*self.region)
-        self.counts[self.region] = self.counts.get(self.region, 0) + 1
-        arguments = (*self.grids[self.region], dr.opaque(mi.UInt32, seed), spp)
-        render = _sample_pixels if self.by_pixels else _render_film
-        with scenes.scene_errors(None), dr.suspend_grad():
-            values = None
-            if self.frozen is not None:
-                if self.region not in self.frozen:
-                    self.frozen[self.region] = dr.freeze(render)
-                try:
-                    with _no_collection():
-                        values = np.array(self.frozen[self.region](self.scene, *arguments))
-                except RuntimeError:  # an error of the scene, or a plugin that computes outside Dr.Jit
-                    self.frozen = None
-            if values is None:
-                values = np.array(render(self.scene, *arguments))
-        if self.by_pixels:
-            image = values.astype(np.float64).T.reshape(height, after - first, -1)
-        else:
-            image = scenes.colour_channels(values.astype(np.float64))[:, first:after]
-        return image.repeat(3, axis=2) if image.shape[2] == 1 else image
-
-
-def samples_pixels(scene) -> bool:
-    """Return whether single pixels of a scene can be sampled: its integrator follows rays of a camera, without spectra.
-
-    Others are rendered as whole films by ``mi.render``.
-    """
-    return isinstance(scene.integrator(), mi.SamplingIntegrator) and not mi.is_spectral and not mi.is_polarized
-
-
-def _pixels(width: int, height: int, first: int, after: int) -> tuple:
-    """Return the columns and rows of the pixels of a region, row by row, and the size of a pixel in the film."""
-    index, count = dr.arange(mi.UInt32, height * (after - first)), dr.opaque(mi.UInt32, after - first)
-    row = index // count
-    column, row = mi.Float(index - row * count + first), mi.Float(row)
-    dr.eval(column, row)  # memory of NumPy may be aligned otherwise, and have another kernel
-    return column, row, dr.opaque(mi.Vector2f, [1 / width, 1 / height])
-
-
-def _sample_pixels(scene, column, row, step, seed, spp: int):
-    """Return one sample of each pixel, channels first.
-
-    This is ``mi.render`` with one sample per pixel, a box filter and the same random numbers, for any pixels: neither
-    their number nor the size of the picture is part of the kernel, so that another size needs no new one.
-    """
-    sensor, integrator = scene.sensors()[0], scene.integrator()
-    sampler = sensor.sampler().clone()
-    sampler.set_sample_count(1)
-    sampler.set_samples_per_wavefront(1)
-    sampler.seed(seed, dr.width(column))
-    surfaces = getattr(integrator, "surfaces", integrator)  # inside a radiance field
-    centre = not getattr(surfaces, "jitter", True)
-    place = (mi.Vector2f(column, row) + (0.5 if centre else sampler.next_2d())) * step
-    on_lens = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
-    moment = mi.Float(sensor.shutter_open())
-    if sensor.shutter_open_time() > 0:
-        moment += sampler.next_1d() * sensor.shutter_open_time()
-    ray, weight = sensor.sample_ray_differential(moment, 0, place, on_lens)
-    sampler.set_sample_count(spp)
-    if hasattr(surfaces, "narrow"):
-        surfaces.narrow(scene, sensor, sampler, ray)
-    if compat.written_in_python(integrator):
-        light, *_ = integrator.sample(
-            mode=dr.ADMode.Primal, scene=scene, sampler=sampler, ray=ray, depth=mi.UInt32(0), δL=None, δaovs=None,
-            state_in=None, active=mi.Bool(True),
-        )  # fmt: skip
-    else:
-        light, *_ = integrator.sample(scene, sampler, ray, None, mi.Bool(True))
-    return light * weight
-
-
-def _render_film(scene, column, row, step, seed, spp: int):
-    """Return one sample of each pixel of the film; the other arguments are those of :func:`_sample_pixels`."""
-    return mi.render(scene, spp=1, seed=seed)
-
-
-@contextlib.contextmanager
-def _no_collection():
-    """Keep Python from collecting garbage: Dr.Jit aborts if arrays are freed while it records."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
 
 
 class Session:
@@ -263,7 +93,7 @@ class Session:
         if against != "exact" and not plugins.with_counterpart(against):
             others = dict.fromkeys(c.name for plugin in plugins.declared().values() for c in plugin.others)
             raise UsageError(f'against: found "{against}", allowed are exact, {", ".join(others)}')
-        self.against, self.seed, self._values, self._chosen = against, seed, {}, {}
+        self.against, self.seed, self._width, self._values, self._chosen = against, seed, width, {}, {}
         self.name = "scene" if isinstance(source, dict) else Path(source).name
         if not isinstance(source, dict) and Path(source).suffix.lower() == ".npz":
             if defines:
@@ -276,10 +106,7 @@ class Session:
             raise scenes.SceneError(f"{self._parsed.path}: the sensor {sensor.class_name()} cannot be moved")
         self._written = np.array(self.learned.placement["to_world"].matrix, np.float64).reshape(4, 4)
         film = scenes.film_size(self.learned.scene)
-        self.full = (width, max(1, round(width * film[1] / film[0])))
-        if not self.learned.by_pixels and not compat.set_film_size(sensor, *self.full):
-            self.full = film  # a crop window
-        self._resize()
+        self.full = (width, max(1, round(width * film[1] / film[0]))) if self.learned.by_pixels else film
         self.spp = spp or sensor.sampler().sample_count()
         if not isinstance(self.spp, int) or not 1 <= self.spp <= 2**16:
             raise UsageError(f"spp: found {self.spp}, allowed are whole numbers from 1 to {2**16}")
@@ -291,8 +118,9 @@ class Session:
         self.table_bytes = self._parsed.table_bytes(self._parsed.learned_plugins())
         self._place()
 
-    def _load(self, chosen: Mapping[str, str]) -> tuple[_Side, _Side | None, str]:
+    def _load(self, chosen: Mapping[str, str]) -> tuple[Side, Side | None, str]:
         def change(state):
+            _resize(state, self._width)
             for props, plugin in _of_plugins(state):
                 for name, word in chosen.items():
                     if _has_choice(props, plugin, name) and word in plugin.choices[name]:
@@ -304,14 +132,14 @@ class Session:
         names = tuple(dict.fromkeys((self.against, "exact")))
         replaced = self._parsed.learned_plugins(names)
         if not replaced:
-            return _Side(learned, 1), None, "the scene names no learned plugin, so there is nothing to compare"
+            return Side(learned, 1), None, "the scene names no learned plugin, so there is nothing to compare"
         declared = plugins.declared()
         oversampling = max(declared[entry["plugin"]].counterpart(names).oversampling for entry in replaced)
         try:
             exact = self._parsed.load(exact=True, against=names, change=change)
         except DiffindError as e:
-            return _Side(learned, 1), None, str(e)
-        return _Side(learned, 1), _Side(exact, oversampling), ""
+            return Side(learned, 1), None, str(e)
+        return Side(learned, 1), Side(exact, oversampling), ""
 
     # -- what is shown ------------------------------------------------------------------------------------------------
 
@@ -339,7 +167,7 @@ class Session:
             if len({side.passes for side in self._visible()}) > 1 or self.passes == 0:
                 self._restart()
 
-    def _visible(self) -> list[_Side]:
+    def _visible(self) -> list[Side]:
         if self.exact is None or self.view == "learned":
             return [self.learned]
         return [self.exact] if self.view == "exact" else [self.learned, self.exact]
@@ -419,11 +247,6 @@ class Session:
                 self._place()
             self._add_pass()
         return self.picture()
-
-    def _resize(self) -> None:
-        """Give films the size of the picture, for footprints; those with a crop window keep theirs."""
-        for side in filter(None, (self.learned, self.exact)):
-            compat.set_film_size(side.sensor, *self.full)
 
     def _place(self) -> None:
         matrix = self._pose.matrix @ self._residue
@@ -518,7 +341,6 @@ class Session:
         sides = self._load(chosen)
         self.learned, self.exact, self.refusal = sides
         self._chosen = chosen
-        self._resize()
         if self.view not in self.views:
             self.view = self.views[0]
         kept = {path: value for path, value in self._values.items() if path in self.learned.parameters}
@@ -591,6 +413,17 @@ def combined(learned: np.ndarray, exact: np.ndarray, view: str, divider: float, 
     if 0 < column < width:
         shown[:, column] = 255
     return shown
+
+
+def _resize(state, width: int) -> None:
+    """Give the films of a parsed scene the width of the picture, for footprints; those with a crop window keep theirs.
+
+    The default size of a film is 768 x 576 pixels.
+    """
+    for props in compat.properties_of(state, mi.ObjectType.Film):
+        if not any(key.startswith("crop_") for key in props):
+            props["height"] = max(1, round(width * props.get("height", 576) / props.get("width", 768)))
+            props["width"] = width
 
 
 def _of_plugins(state) -> list[tuple]:
