@@ -77,7 +77,8 @@ class Page:
 
     def _controls(self) -> None:
         session, gui = self.session, self.server.gui
-        gui.configure_theme(control_layout="fixed", control_width="medium", show_logo=False, show_share_button=False)
+        gui.configure_theme(control_width="medium", show_logo=False, show_share_button=False)
+        gui.main_panel.dock_right()
         gui.set_panel_label(f"mi-diffind view: {session.name}")
         self.server.scene.set_up_direction(tuple(session.up()))
         camera = self.server.initial_camera

@@ -181,10 +181,10 @@ class Session:
 
     def look(self, pose: Pose) -> bool:
         """Move the camera, and return whether it moved; the next :meth:`moving_picture` shows it."""
-        if np.allclose(pose.matrix, self._pose.matrix, rtol=1e-6, atol=1e-6 * (1 + np.abs(pose.position).max())):
-            return False
         if not np.isfinite(pose.matrix).all():
             raise UsageError("camera: found a position or a direction that is not finite")
+        if np.allclose(pose.matrix, self._pose.matrix, rtol=1e-6, atol=1e-6 * (1 + np.abs(pose.position).max())):
+            return False
         self._pose = pose
         self._restart()
         return True
@@ -384,8 +384,8 @@ class Session:
             "variant": mi.variant(),
             "view": self.view,
             "against": self.against if self.exact else None,
-            "width": self._size()[0],
-            "height": self._size()[1],
+            "width": sides[0].region[0] or self.full[0],
+            "height": sides[0].region[1] or self.full[1],
             "samples": self.passes,
             "spp": self.spp,
             "pictures": self.pictures,

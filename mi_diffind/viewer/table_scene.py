@@ -69,7 +69,7 @@ def _scene(shapes: dict, lower, upper, way=CAMERA, lamp: bool = True, light: boo
         "type": "perspective",
         "fov": 40,
         "fov_axis": "y",
-        "to_world": transform().look_at((middle + 2.9 * radius * towards).tolist(), middle.tolist(), [0, 1, 0]),
+        "to_world": transform().look_at((middle + 2.3 * radius * towards).tolist(), middle.tolist(), [0, 1, 0]),
         "film": film,
         "sampler": {"type": "independent", "sample_count": 64},
     }
