@@ -39,6 +39,7 @@ _NAMES = {
     "render": "rendering",
     "examples": "example_files",
     "fetch": "downloads",
+    "view": "viewer",
     # Measurements
     "tradeoff": "tradeoffs",
     # Errors between images, and images as displayed

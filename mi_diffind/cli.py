@@ -17,7 +17,7 @@ from .files import shown, writable_file, write_json
 
 #: In the order of the help.
 VERBS = (
-    *("render", "capture", "compare", "convert", "regress", "inspect", "tradeoff", "decode", "fit"),
+    *("render", "view", "capture", "compare", "convert", "regress", "inspect", "tradeoff", "decode", "fit"),
     *("examples", "fetch"),
 )
 

@@ -105,8 +105,8 @@ def _scene_inspection(file: str | None, reports: list[dict], learned: list[dict]
 
 def _reports(scene) -> list[dict]:
     """Return the report on each plugin of this package, with the ``owner`` of its parameters."""
-    paths, learned = _paths(scene), plugins.with_counterpart()
-    owners, reports = _owners(paths), []
+    paths, learned = paths_of(scene), plugins.with_counterpart()
+    owners, reports = owners_of(paths), []
     for path, node in paths.items():
         if plugins.origin(node) is not None:
             report = scenes.report_of(node, scene)
@@ -114,7 +114,7 @@ def _reports(scene) -> list[dict]:
     return reports
 
 
-def _paths(scene) -> dict[str, object]:
+def paths_of(scene) -> dict[str, object]:
     """Return all objects of a loaded scene, each once, by the path of its parameters in ``mi.traverse``.
 
     The scene's own path is "". Mitsuba names objects without an id ``object_…``, by their address.
@@ -147,7 +147,7 @@ def _paths(scene) -> dict[str, object]:
     return paths
 
 
-def _owners(paths: dict[str, object]) -> dict[str, str]:
+def owners_of(paths: dict[str, object]) -> dict[str, str]:
     """Return the name of each path for people.
 
     A path that begins with an address begins instead with the first id on it, else with the plugin in parentheses.

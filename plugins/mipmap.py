@@ -10,6 +10,7 @@ from mi_diffind.maps.pyramid import TexelPyramid
 
 from . import Plugin
 from .filtered_texture import FilteredTexture
+from .support.filtering import FILTERS
 from .support.image_files import SharedMaps, open_uncompressed
 from .support.manual import shared_parts
 
@@ -175,4 +176,4 @@ class MipMap(FilteredTexture):
         return {"preset": "", "storage": "float32", "table_bytes": self.image.memory_nbytes}
 
 
-PLUGIN = Plugin("mipmap", "texture", MipMap)
+PLUGIN = Plugin("mipmap", "texture", MipMap, choices={"filter": FILTERS})

@@ -4,6 +4,7 @@ from __future__ import annotations  # Delayed parsing of type annotations
 
 import mitsuba as mi
 
+from mi_diffind.task import STORAGES
 from mi_diffind.tasks.disney import TASK
 from mi_diffind.tasks.disney.decoder import GROUPS
 
@@ -142,5 +143,6 @@ PLUGIN = Plugin(
     storage=STORAGE,
     exact=Counterpart("disney", ("preset", "filename", "storage")),
     others=(PRINCIPLED,),
+    choices={"preset": tuple(TASK.shipped), "storage": STORAGES, "effects": ("used", "all")},
     stock=Stock("principled", ("principled",), _from_principled),
 )

@@ -5,6 +5,7 @@ from __future__ import annotations  # Delayed parsing of type annotations
 import drjit as dr
 import mitsuba as mi
 
+from mi_diffind.task import STORAGES
 from mi_diffind.tasks.ggx import TASK
 from mi_diffind.tasks.ggx.model import Roughness
 
@@ -395,5 +396,6 @@ PLUGIN = Plugin(
     "bsdf",
     NeuralGGX,
     task="ggx",
+    choices={"preset": tuple(TASK.shipped), "storage": STORAGES},
     exact=Counterpart("roughconductor", ("preset", "filename", "storage"), {"distribution": "ggx"}),
 )

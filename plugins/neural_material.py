@@ -18,6 +18,7 @@ from . import Counterpart, Plugin
 from .disney import Disney, Parameters, ShadedPoint, to_principled
 from .material_maps import MaterialMaps, ignored, material_maps
 from .support import properties, textures
+from .support.filtering import FILTERS
 from .support.filtering import PROPERTIES as FILTERING
 from .support.image_files import layout_of, to_bitmap, to_mipmap
 from .support.manual import shared_parts
@@ -361,5 +362,6 @@ PLUGIN = Plugin(
     task=TASK.name,
     exact=_counterpart("disney", "disney", "bitmap", 8),
     others=(_counterpart("mipmap", "disney", "mipmap", 1), _counterpart("principled", "principled", "bitmap", 8)),
+    choices={"filter": FILTERS},
     truths=("mipmap", "exact"),
 )

@@ -10,8 +10,8 @@ from mi_diffind.tasks.texture import TASK
 
 from . import Counterpart, Plugin, Stock
 from .filtered_texture import FilteredTexture
+from .support.filtering import FILTERS, TYPES
 from .support.filtering import PROPERTIES as FILTERING
-from .support.filtering import TYPES
 from .support.image_files import SharedMaps, manifest_of, open_compressed, to_bitmap, to_mipmap
 from .support.manual import shared_parts
 from .support.stock import Kept, StockNode
@@ -121,6 +121,7 @@ PLUGIN = Plugin(
     task=TASK.name,
     exact=Counterpart("bitmap", ("filename", "channels", "storage", "source"), convert=_to_bitmap, oversampling=8),
     others=(Counterpart("mipmap", ("storage", "source"), convert=functools.partial(to_mipmap, TASK)),),
+    choices={"filter": FILTERS},
     truths=("mipmap", "exact"),
     stock=Stock("bitmap", ("bitmap",), _from_bitmap),
 )

@@ -156,9 +156,14 @@ def integrator() -> type:
         def sample_rays(self, scene, sensor, sampler):
             """Sample rays as Mitsuba does, but with differentials of samples in place of pixels."""
             ray, weight, place = super().sample_rays(scene, sensor, sampler if self.jitter else Centred(sampler))
+            self.narrow(scene, sensor, sampler, ray)
+            return ray, weight, place
+
+        def narrow(self, scene, sensor, sampler, ray) -> None:
+            """Change the differentials of camera rays from those of pixels to those of samples."""
             ray.has_differentials = len(footprint.textures(scene)) > 0
             if not ray.has_differentials:
-                return ray, weight, place
+                return
             scale = dr.opaque(mi.Float, footprint.scale_of(sampler.sample_count()))
             axis = sensor.world_transform() @ mi.Vector3f(0, 0, 1)
             # Rays start at the near clipping plane, and Mitsuba lets their neighbours start at the same point of it
@@ -167,7 +172,6 @@ def integrator() -> type:
                 turn = (getattr(ray, f"d_{x}") - ray.d) * scale
                 setattr(ray, f"o_{x}", ray.o + (getattr(ray, f"o_{x}") - ray.o) * scale + start * turn)
                 setattr(ray, f"d_{x}", ray.d + turn)
-            return ray, weight, place
 
         @dr.syntax
         def sample(self, mode, scene, sampler, ray, δL=None, state_in=None, active=True, **kwargs):

@@ -66,7 +66,7 @@ FLOORS = (
         "inspection",
         "measure",
     ),
-    ("scene_training",),
+    ("scene_training", "viewer"),
     ("studies",),
     ("tradeoffs",),
     ("commands",),

@@ -1,0 +1,316 @@
+"""The viewer without a browser: passes, parts of pictures, parameters, choices, table files, refused input."""
+
+import dataclasses
+import json
+import socket
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import mi_diffind
+from mi_diffind import scenes, srgb
+from mi_diffind.cli import main
+from mi_diffind.errors import UsageError
+from mi_diffind.viewer.page import padded, pose, server, status_lines
+from mi_diffind.viewer.session import Pose, Session, combined
+
+ROOT = Path(__file__).resolve().parents[1]
+ASSETS = ROOT / "scenes" / "assets"
+WIDTH, HEIGHT = 24, 16
+
+
+def content(mi, integrator="path", roughness=0.3, origin=(0.6, 0.4, 3.5), paint="neural_disney", **given):
+    """A ball in white surroundings, as for ``mi.load_dict``."""
+    film = {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "rfilter": {"type": "box"}}
+    bsdf = {"type": paint, "base_color": {"type": "rgb", "value": [0.8, 0.2, 0.1]}, "roughness": roughness}
+    return {
+        "type": "scene",
+        "integrator": {"type": integrator, "max_depth": 3},
+        "light": {"type": "constant"},
+        "sensor": {
+            "type": "perspective",
+            "fov": 40,
+            "to_world": mi.ScalarTransform4f().look_at(origin, [0, 0, 0], [0, 1, 0]),
+            "film": film,
+            "sampler": {"type": "independent", "sample_count": 16},
+        },
+        "ball": {"type": "sphere", "bsdf": {**bsdf, **given}},
+    }
+
+
+def session(mi, **options):
+    return Session(content(mi), WIDTH, seed=3, **options)
+
+
+def reference(mi, passes=3, **options):
+    """The same passes by ``mi.render``."""
+    return scenes.render(scenes.load_dict(content(mi, **options)), passes, 3, passes)[0]
+
+
+@pytest.mark.parametrize("integrator", ["path", "path_sdf", "path_footprint", "prb"])
+def test_a_picture_is_the_mean_of_mitsubas_passes(mi_rgb, integrator):
+    """At equal seeds, of both sides; ``prb`` is written in Python by Mitsuba."""
+    shown = Session(content(mi_rgb, integrator), WIDTH, seed=3)
+    for _ in range(3):
+        shown.refine()
+    np.testing.assert_allclose(shown.learned.image, reference(mi_rgb, integrator=integrator), atol=2e-6)
+    np.testing.assert_allclose(shown.exact.image, reference(mi_rgb, integrator=integrator, paint="disney"), atol=2e-6)
+    assert shown.figures["samples"] == 3 and not shown.finished
+    assert shown.figures["psnr_db"] == pytest.approx(
+        -10 * np.log10(np.mean((np.clip(shown.learned.image, 0, 1) - np.clip(shown.exact.image, 0, 1)) ** 2)), abs=1e-4
+    )
+
+
+def test_an_integrator_without_rays_of_a_camera_is_rendered_by_mitsuba(mi_rgb):
+    shown = Session(content(mi_rgb, "ptracer"), WIDTH, seed=3)
+    shown.refine()
+    assert not shown.learned.by_pixels and shown.picture().shape == (HEIGHT, WIDTH, 3)
+    np.testing.assert_allclose(shown.learned.image, reference(mi_rgb, 1, integrator="ptracer"), atol=1e-3)
+
+
+def test_the_camera_moves_as_a_sensor_elsewhere(mi_rgb):
+    shown, origin = session(mi_rgb), (-0.5, 1.5, 3.0)
+    first = shown.refine()
+    to_world = mi_rgb.ScalarTransform4f().look_at(origin, [0, 0, 0], [0, 1, 0])
+    place = Pose.of(np.array(to_world.matrix, np.float64))
+    assert shown.look(place) and not shown.look(place)
+    assert shown.moving_picture().shape == (HEIGHT, WIDTH, 3)
+    for _ in range(3):
+        picture = shown.refine()
+    np.testing.assert_allclose(shown.learned.image, reference(mi_rgb, origin=origin), atol=1e-4)
+    assert np.abs(picture.astype(float) - first).mean() > 1
+    assert shown.figures["samples"] == 3 and shown.figures["to_world"][0][3] == pytest.approx(-0.5)
+
+
+def test_while_it_moves_each_side_renders_its_part(mi_rgb):
+    """Also at a reduced size; the parts meet at the divider, and are no whole images to compare."""
+    shown = session(mi_rgb)
+    shown.show(divider=0.25)
+    shown.reduction = 2
+    picture = shown.moving_picture()
+    assert picture.shape == (HEIGHT // 2, WIDTH // 2, 3)
+    assert shown.learned.region == (12, 8, 0, 3) and shown.exact.region == (12, 8, 3, 12)
+    assert (picture[:, 3] == 255).all() and (shown.learned.image[:, 3:] == 0).all()
+    # A sample of the ball may be black
+    assert (shown.learned.image[:, :3] > 0).mean() > 0.9 and (shown.exact.image[:, 3:] > 0).mean() > 0.9
+    assert shown.figures["psnr_db"] is None and shown.figures["width"] == 12
+    for divider in (0, 1):
+        shown.show(divider=divider)
+        assert (shown.moving_picture() > 0).mean() > 0.9
+    shown.refine()
+    assert shown.figures["psnr_db"] > 30 and shown.figures["width"] == WIDTH
+
+
+def test_samples_end(mi_rgb):
+    shown = session(mi_rgb, spp=2)
+    for _ in range(4):
+        shown.refine()
+    assert shown.finished and shown.learned.passes == 2
+    shown.samples(3)
+    assert shown.passes == 0 and not shown.finished
+
+
+def test_divider_and_difference(rng):
+    learned, exact = (rng.uniform(-0.2, 1.3, (5, 10, 3)).astype(np.float32) for _ in range(2))
+    shown = combined(learned, exact, "side by side", 0.4, 1.0)
+    for side, columns in ((learned, slice(0, 4)), (exact, slice(5, None))):
+        expected = 255 * srgb.from_linear(np.clip(side, 0, 1))
+        assert np.abs(shown[:, columns] - expected[:, columns]).max() <= 0.5 + 1e-3
+    assert (shown[:, 4] == 255).all()
+    a, b = (np.minimum(np.maximum(side, 0), 1) for side in (learned, exact))
+    difference = 255 * srgb.from_linear(np.minimum(3 * np.abs(a - b), 1))
+    assert np.abs(combined(learned, exact, "difference", 0.4, 3.0) - difference).max() <= 0.5 + 1e-3
+
+
+def test_views(mi_rgb):
+    shown = session(mi_rgb)
+    shown.refine()
+    for view in shown.views:
+        shown.show(view, gain=50)
+        shown.refine()
+    shown.show("exact")
+    assert shown.refine().mean() == pytest.approx(255 * srgb.for_display(shown.exact.image).mean(), abs=0.5)
+    assert list(shown.figures["seconds"]) == ["exact"] and shown.figures["psnr_db"] is None
+
+
+def test_parameters_are_numbers_and_colours(mi_rgb):
+    shown = session(mi_rgb)
+    roughness, colour = (shown.parameters[f"ball.bsdf.{name}"] for name in ("roughness", "base_color"))
+    assert (roughness.value, roughness.low, roughness.high) == (pytest.approx(0.3), 0, 1)
+    assert colour.is_colour and colour.value == pytest.approx((0.8, 0.2, 0.1))
+    fov = next(p for p in shown.parameters.values() if p.name == "x_fov")
+    assert fov.value == pytest.approx(40) and (fov.low, fov.high) == (1, 170)
+    assert next(iter(shown.parameters)).startswith("ball.bsdf.")  # of a plugin of the package: first
+    assert not [path for path in shown.parameters if "to_world" in path or "size" in path]
+    assert all(shown.on_both(path) for path in shown.parameters)
+
+
+def test_a_changed_parameter_is_that_of_a_scene_written_so(mi_rgb):
+    shown = session(mi_rgb)
+    shown.refine()
+    shown.set({"ball.bsdf.roughness": 0.9})
+    for _ in range(3):
+        shown.refine()
+    np.testing.assert_allclose(shown.learned.image, reference(mi_rgb, roughness=0.9), atol=1e-4)
+    np.testing.assert_allclose(shown.exact.image, reference(mi_rgb, roughness=0.9, paint="disney"), atol=1e-4)
+    shown.set({"ball.bsdf.base_color": (0.1, 0.2, 0.9)})
+    shown.refine()
+    assert shown.learned.image[HEIGHT // 2, WIDTH // 2, 2] > shown.learned.image[HEIGHT // 2, WIDTH // 2, 0]
+    assert shown.figures["values"]["ball.bsdf.base_color"] == [0.1, 0.2, 0.9]
+
+
+@pytest.mark.parametrize(
+    "values, sentence",
+    [
+        ({"ball.color": 1}, r'parameter "ball\.color": not one of the \d+ numbers and colours of the scene'),
+        ({"ball.bsdf.roughness": float("nan")}, "found nan, expected a finite number"),
+        ({"ball.bsdf.roughness": "rough"}, "found rough, expected a finite number"),
+        ({"ball.bsdf.base_color": (1, 2)}, r"found \(1, 2\), expected three finite numbers"),
+    ],
+)
+def test_refused_values_leave_the_scene(mi_rgb, values, sentence):
+    shown = session(mi_rgb)
+    with pytest.raises(UsageError, match=sentence):
+        shown.set({"ball.bsdf.metallic": 1.0, **values})
+    assert shown.learned.parameters.value("ball.bsdf.metallic") == 0 and not shown.figures["values"]
+
+
+def test_a_choice_loads_the_scene_again(mi_rgb):
+    """With the values that were set, and from where the camera is; the exact side has no such choice."""
+    shown = session(mi_rgb)
+    assert shown.choices["preset"] == ("as written", "tables", "paper")
+    shown.set({"ball.bsdf.roughness": 0.9})
+    shown.choose("preset", "paper")
+    for _ in range(3):
+        shown.refine()
+    np.testing.assert_allclose(shown.learned.image, reference(mi_rgb, roughness=0.9, preset="paper"), atol=1e-4)
+    shown.choose("preset", "as written")
+    assert shown.chosen == {}
+    for name, word in (("preset", "x"), ("colour", "x")):
+        with pytest.raises(UsageError, match=rf'{name}: found "x", allowed are '):
+            shown.choose(name, word)
+
+
+@pytest.mark.parametrize(
+    "file, mean",
+    [
+        ("tiles_filtered.npz", (20, 200)),
+        ("tiles.npz", (20, 200)),
+        ("library/chrome.npz", (20, 200)),
+        ("knot.npz", (20, 200)),
+        ("group.npz", (5, 200)),
+        (ROOT / "mi_diffind/data/ggx_tables.npz", (20, 200)),
+    ],
+)
+def test_table_files_are_shown(mi_rgb, file, mean):
+    """Texture, image, BSDF, distance field, radiance field, GGX: something in the middle, and not everywhere."""
+    shown = Session(ASSETS / file, 32)
+    picture = shown.refine()
+    assert picture.shape == (18, 32, 3) and mean[0] < picture[6:12, 12:20].mean() < mean[1]
+    assert shown.figures["table_bytes"] > 500
+    assert picture.astype(float).std(axis=(0, 1)).max() > 8
+    assert shown.exact is not None or "exist" in shown.refusal or "source" in shown.refusal
+
+
+def test_a_scene_without_learned_plugins_has_one_side(mi_rgb):
+    shown = Session(content(mi_rgb, paint="principled"), WIDTH)
+    shown.refine()
+    assert shown.views == ("learned",) and "names no learned plugin" in shown.refusal
+    assert any("names no learned plugin" in line for line in status_lines(shown))
+    with pytest.raises(UsageError, match=r'view: found "exact", allowed are learned \(the scene names no'):
+        shown.show("exact")
+
+
+def test_refused_input(mi_rgb, tmp_path):
+    scene = content(mi_rgb)
+    for options, sentence in (
+        ({"width": 8}, "width: found 8, allowed are whole numbers from 16 to 4096"),
+        ({"spp": 2**17}, "spp: found 131072, allowed are whole numbers from 1 to 65536"),
+        ({"against": "bitmap"}, 'against: found "bitmap", allowed are exact, '),
+        ({"defines": {"a": 1}}, "defines: given with a scene in memory"),
+    ):
+        with pytest.raises(UsageError, match=sentence):
+            Session(scene, **options)
+    with pytest.raises(UsageError, match=r"tiles\.npz: found a table file with defines"):
+        Session(ASSETS / "tiles.npz", defines={"a": 1})
+    with pytest.raises(scenes.SceneError, match="has no sensor"):
+        Session({key: value for key, value in scene.items() if key != "sensor"})
+    still = {"type": "irradiancemeter", "film": scene["sensor"]["film"]}
+    with pytest.raises(scenes.SceneError, match="the sensor IrradianceMeter cannot be moved"):
+        Session({**scene, "sensor": {"type": "rectangle", "meter": still}})
+    with pytest.raises(mi_diffind.TableError):
+        (tmp_path / "broken.npz").write_bytes(b"PK")
+        Session(tmp_path / "broken.npz")
+    shown = session(mi_rgb)
+    for options, sentence in (
+        ({"divider": 2}, "divider: found 2, allowed are numbers from 0 to 1"),
+        ({"gain": -1}, "gain: found -1"),
+        ({"view": "both"}, 'view: found "both", allowed are side by side, learned, exact, difference'),
+    ):
+        with pytest.raises(UsageError, match=sentence):
+            shown.show(**options)
+    with pytest.raises(UsageError, match="camera: found a position or a direction that is not finite"):
+        shown.look(dataclasses.replace(shown.pose, position=np.array([np.nan, 0, 0])))
+
+
+def test_pose_of_the_page(rng):
+    """viser's camera looks along +z with y down; Mitsuba's looks along +z with y up and x to the left."""
+    rotation = Rotation.from_quat(rng.normal(size=4))
+    x, y, z, w = rotation.as_quat()
+    place = pose(np.array([w, x, y, z]), np.array([1.0, 2.0, 3.0]))
+    axes = rotation.as_matrix()
+    np.testing.assert_allclose(place.matrix[:3, :3], axes @ np.diag([-1, -1, 1]), atol=1e-12)
+    np.testing.assert_allclose(Pose.of(place.matrix).matrix, place.matrix, atol=1e-12)
+
+
+def test_the_first_view_is_that_of_the_sensor(mi_rgb):
+    shown = session(mi_rgb)
+    np.testing.assert_allclose(shown.up(), [0, 1, 0])
+    target = shown.target()
+    np.testing.assert_allclose(target, 0, atol=1e-5)
+    assert not shown.look(dataclasses.replace(shown.start, position=shown.start.position + 1e-9))
+
+
+def test_bars_beside_a_picture(rng):
+    picture = rng.integers(1, 255, (10, 20, 3)).astype(np.uint8)
+    for aspect, shape in ((2.0, (10, 20)), (1.0, (20, 20)), (4.0, (10, 40)), (0.0, (10, 20))):
+        shown = padded(picture, aspect)
+        assert shown.shape[:2] == shape and (shown > 0).sum() == picture.size
+        np.testing.assert_array_equal(shown[(shown > 0).all(-1)], picture.reshape(-1, 3))
+
+
+def test_without_viser_a_sentence_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(UsageError, match=r'the package viser is not installed: pip install "mi-diffind\[view\]"'):
+        server("127.0.0.1", 0)
+
+
+def test_addresses_that_cannot_be_served():
+    pytest.importorskip("viser", reason="the optional package viser is not installed")
+    with socket.socket() as busy:
+        busy.bind(("127.0.0.1", 0))
+        busy.listen()
+        port = busy.getsockname()[1]
+        for host, number, sentence in (
+            ("127.0.0.1", port, f"127.0.0.1:{port}: the page cannot be served there"),
+            ("203.0.113.1", 0, "203.0.113.1:0: the page cannot be served there"),
+            ("127.0.0.1", 70000, "port: found 70000, allowed are whole numbers from 0 to 65535"),
+        ):
+            with pytest.raises(UsageError, match=sentence):
+                server(host, number)
+
+
+def test_the_command_serves_a_page(mi_rgb, tmp_path, monkeypatch, capsys):
+    """At the loopback address; it ends by itself after some seconds, and writes the figures."""
+    pytest.importorskip("viser", reason="the optional package viser is not installed")
+    monkeypatch.chdir(tmp_path)
+    words = ["view", str(ASSETS / "library/chrome.npz"), "--port", "0", "--width", "16", "--seconds", "1"]
+    assert main([*words, "--variant", mi_rgb.variant(), "--spp", "2", "--json", "a.json"]) == 0
+    assert "http://127.0.0.1:" in capsys.readouterr().out
+    figures = json.loads((tmp_path / "a.json").read_text())
+    assert figures["spp"] == 2 and figures["width"] == 16 and figures["url"].startswith("http://127.0.0.1:")
+    assert main(["view", "missing.xml"]) == 2
+    assert "missing.xml: no such scene file" in capsys.readouterr().err
