@@ -1,11 +1,12 @@
 """
-Write the tables of the documentation.
+Write the tables and the figures of the documentation.
 
     python docs/make_tables.py [--check]
 
 ``tasks.md`` is made from the declarations of tasks. In the other pages, the text between ``<!-- table NAME -->`` and
 ``<!-- end -->`` is made from JSON in ``docs/measured/``, which ``mi-diffind … --json docs/measured/NAME.json`` wrote;
-the pages show the commands. With ``--check`` nothing is written, and the exit code is 1 if a page would change.
+the pages show the commands. Figures in sentences are inserted from the same files, as ``claims.toml`` says
+(``claims.py``). With ``--check`` nothing is written, and the exit code is 1 if a page would change.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ import json
 import re
 import sys
 from pathlib import Path
+
+from claims import ClaimError, claims
 
 import mi_diffind
 from mi_diffind.task import tasks
@@ -652,14 +655,32 @@ def written() -> dict[Path, str]:
     return pages
 
 
+def figures(pages: dict[Path, str]) -> tuple[dict[Path, str], list[str]]:
+    """Return the pages with the numbers of ``claims.toml``, and a sentence for each claim that cannot stand."""
+    troubles, readme = [], DOCS.parent / "README.md"
+    pages = {readme: readme.read_text(encoding="utf-8"), **pages}
+    for claim in claims():
+        path = readme if claim.page == readme.name else DOCS / claim.page
+        try:
+            pages[path] = claim.written(pages[path])
+        except KeyError:
+            troubles.append(f"claims.toml: no page {claim.page!r}; allowed: README.md and the pages of docs")
+        except ClaimError as error:
+            troubles.append(str(error))
+    return pages, troubles
+
+
 def main(check: bool) -> int:
     """Write the pages that differ, or with ``check`` name them; return the exit code."""
-    differing = [p for p, text in written().items() if not p.is_file() or p.read_text(encoding="utf-8") != text]
+    pages, troubles = figures(written())
+    differing = [p for p, text in pages.items() if not p.is_file() or p.read_text(encoding="utf-8") != text]
+    for trouble in troubles:
+        print(trouble, file=sys.stderr)
     for path in differing:
         print(f"{path.name}: {'would change' if check else 'written'} ({mi_diffind.__version__})")
         if not check:
-            path.write_text(written()[path], encoding="utf-8")
-    return int(check and bool(differing))
+            path.write_text(pages[path], encoding="utf-8")
+    return int(bool(troubles) or (check and bool(differing)))
 
 
 if __name__ == "__main__":
