@@ -5,8 +5,8 @@ List the numbers of the README and of the pages that no file backs.
 
 A number is *backed* if ``make_tables.py`` inserts it: in a table, or by a sentence of ``claims.toml``. It is a *trial*
 between ``<!-- trials: … -->`` and ``<!-- /trials -->``, where the comment says what became of the script. It is a
-*setting* if it counts what was chosen and not what came out: bits, samples, views, steps, sides of images and arrays,
-ratios such as 12x, and whatever stands between ``<!-- settings -->`` and ``<!-- /settings -->``. All others are listed.
+*setting* if it says what was chosen and not what came out: bits, samples, views, steps, sides of images and arrays,
+ratios such as 12x, and the phrases of ``settings.toml``. All others are listed.
 
 Not numbers: code, addresses, versions, years, numbers of sections, tables, figures, equations, tasks and notebooks,
 and digits that are a part of a name (``float32``, ``BC7``). ``--headlines`` lists those of the README's tables and
@@ -20,15 +20,16 @@ import re
 import sys
 from collections import Counter
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
-from claims import ROOT, claims
+from claims import ROOT, claims, tomllib
 
 NUMBER = re.compile(r"(?<![\w.])\d+(?:[.,]\d+)*(?:·10[⁻⁰-⁹]+|e-?\d+)?")
 
 #: Parts of a page in which no number is a claim.
 CODE = (
-    r"^```.*?^```", r"`[^`\n]+`", r"(?<=\])\([^)\n]*\)", r"https?://\S+", r"<[a-z/][^>\n]*>",
+    r"^```.*?^```", r"(?<!`)`(?!`)[^`]+`", r"(?<=\])\([^)\n]*\)", r"https?://\S+", r"<[a-z/][^>\n]*>",
 )  # fmt: skip
 #: Versions, years, parts of papers, names.
 NAMES = (
@@ -37,7 +38,7 @@ NAMES = (
     r"\b(?:19[89]\d|20[0-3][1-9]|20[1-3]\d)(?:-\d\d-\d\d)?\b(?! (?:steps|samples|rays|texels|pixels|spp|views))",
     r"(?:[Ss]upplement(?:al)?|[Ss]ections?|[Tt]ables?|[Ff]igures?|[Ee]quations?|[Ee]q\.|[Tt]asks?|[Nn]otebooks?|"
     r"[Ll]evels?|paper) \(?\d[\d.]*(?:(?:, | and | to )\d[\d.]*)*",
-    r"^\s*\d+\. ", r"BSD-\d", r"\[\^?\d+\]", r"2D|3D|4D|x86-64|§\s*[\d.]+", r"[Rr]ec\. \d+", r"[Ee]xit codes?:?.*$",
+    r"^\s*\d+\. ", r"BSD-\d", r"\[\^?\d+\]", r"[1234]D\b|x86-64|AVX-512|\[10\.\d+/[^\]]+\]|^\| 1\.\d(?:\.\d)?\b|§\s*[\d.]+", r"[Rr]ec\. \d+", r"[Ee]xit codes?:?.*$",
 )  # fmt: skip
 #: Nouns of which a page says how many were chosen.
 CHOSEN = (
@@ -55,7 +56,7 @@ SETTINGS = (
     r"\b\d+x\b",
     r"(?:λ|α|ρ|gloss|roughness|depth|L|σ|γ|r|spp)(?: =| of)? ?\d[\d.]*(?:(?:, | and | to )\d[\d.]*)*",
     r"\[-?\d+, -?\d+\]", r"[<>≤≥=] ?\d[\d.]*", r"(?:defaults? is|by default,?) \d[\d.]*",
-    r"10[⁰-⁹⁻]+|2[⁰-⁹⁻]+|\d²", r"\b(?:1|2|4|256|512) [MK]iB",
+    r"10[⁰-⁹⁻]+|2[⁰-⁹⁻]+|\d²", r"\b(?:1|2|4|256|512) [MK]iB", r"\b(?:128|256) kB",
 )  # fmt: skip
 
 
@@ -69,6 +70,17 @@ class Found:
     kind: str
     headline: bool
     context: str
+
+
+@cache
+def settings() -> dict[str, list[str]]:
+    """Return the phrases of ``settings.toml`` by page."""
+    return tomllib.loads((ROOT / "docs" / "settings.toml").read_text(encoding="utf-8"))
+
+
+def phrase_pattern(phrase: str) -> str:
+    """Return the regular expression of a phrase, with any white space between its words."""
+    return r"\s+".join(map(re.escape, phrase.split()))
 
 
 def _blank(text: str, pattern: str, flags: int = re.M) -> str:
@@ -100,7 +112,7 @@ def numbers(page: str, text: str) -> list[Found]:
         "trial": _spans(text, r"<!-- trials: .*?<!-- /trials -->", re.S),
     }  # fmt: skip
     top = headlines(page, text)
-    chosen = _spans(text, r"<!-- settings -->.*?<!-- /settings -->", re.S)
+    chosen = [span for phrase in settings().get(page, ()) for span in _spans(text, phrase_pattern(phrase))]
     bare = text
     for pattern in CODE:
         bare = _blank(bare, pattern, re.M | re.S)

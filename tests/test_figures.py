@@ -139,6 +139,13 @@ def test_numbers_are_classed():
     }  # fmt: skip
 
 
+def test_each_phrase_of_the_settings_stands_in_its_page():
+    pages = list_numbers.pages()
+    for page, phrases in list_numbers.settings().items():
+        for phrase in phrases:
+            assert re.search(list_numbers.phrase_pattern(phrase), pages[page]), f"{page}: {phrase}"
+
+
 def test_numbers_without_a_file_only_become_fewer():
     counts = {page: count["unbacked"] for page, count in list_numbers.counts().items()}
     more = {page: n for page, n in counts.items() if n > UNBACKED.get(page, 0)}
