@@ -110,7 +110,7 @@ FUNCTIONS = {
     f.__name__: f
     for f in (
         *(min, max, mean, one, sum, len, round, abs, all, any, sorted),
-        *(derived.ratio, derived.time_over, derived.equal_samples, derived.shading, derived.flip),
+        *(derived.ratio, derived.time_over, derived.equal_samples, derived.shading, derived.flip, derived.shipped),
     )
 }
 

@@ -74,3 +74,11 @@ def flip(study: Any, material: str, which: str) -> float:
     (way,) = curve.remedies
     runs = curve.runs[way, 0.9]
     return sum(map(average, runs)) / len(runs)
+
+
+def shipped(task: str, preset: str) -> float:
+    """Return the PSNR in dB that is stored in the file that ships for a preset of a task."""
+    from mi_diffind.task import tasks
+
+    task = tasks()[task]
+    return task.load(task.file(preset=preset)).measured["psnr_db"]

@@ -110,6 +110,73 @@ def comparisons() -> str:
     return table(columns, rows)
 
 
+def ggx_quality() -> str:
+    """Return costs of each family at the quality of an indirection, as multiples of it, beside the paper's."""
+    from mi_diffind.studies.ggx.conclusions import equal_quality
+
+    study, reference = measured("tradeoff_ggx"), "16→8"
+    goal, rows = study["candidates"][reference]["errors"]["psnr_db"], []
+    for row in equal_quality(study, reference):
+        paper = [f" ({value:g})" for value in row.paper or ()] or [""] * 3
+        ratios = [f"{ratio:.3g}{note}" for ratio, note in zip(row.ratios, [*paper, ""], strict=True)]
+        rows.append([f"{row.family}: {row.name}", *ratios, f"{row.psnr_db - goal:+.1f}"])
+    return table(["", "flops", "bytes read", "bytes stored", "time", "PSNR beside it, dB"], rows)
+
+
+def ggx_candidates() -> str:
+    """Return bytes, PSNR and times of the float32 candidates for both kinds of inputs, without tensor networks."""
+    study, rows = measured("tradeoff_ggx"), []
+    for case, timings in ((name, case["queries"].get("read", {})) for name, case in study["cases"].items()):
+        for name, timing in timings.items():
+            c = study["candidates"][name]
+            if name in GGX_CANDIDATES:
+                rows.append([
+                    case, name.removesuffix(", log"), f"{c['bytes']:,}", f"{c['errors']['psnr_db']:.1f}",
+                    f"{timing['time']:.2f}", "yes" if c["converged"] else "no",
+                ])  # fmt: skip
+    return table(["inputs", "", "bytes", "PSNR, dB", "a read, ns", "converged"], rows)
+
+
+#: Rows of the table of GGX; all others are in the JSON file.
+GGX_CANDIDATES = (
+    "16→8", "16→8 u8", "24²", "96²", "192²", "MLP 32x3", "16→8, log", "16→8 u8, log", "24², log", "MLP 32x3, log",
+)  # fmt: skip
+
+
+def scenes_bias() -> str:
+    """Return bias of the tables, the samples at which noise equals it, and times of scenes, learned over exact."""
+    rows = []
+    for name, tables in (
+        ("materials_paper", "`neural_disney`, `-D preset=paper`"), ("metals", "`neural_ggx`"),
+        ("still_life", "`neural_disney`"),
+    ):  # fmt: skip
+        if not (DOCS / "measured" / f"tradeoff_scene_{name}.json").is_file():
+            continue
+        study = measured(f"tradeoff_scene_{name}")
+        bias, spp = study["bias"], study["crossover"]["spp"]
+        times = [ratio["median"] for ratio in study["ratios"]]
+        rows.append([
+            f"`{Path(study['scene']).name}`, {study['width']} × {study['height']}", tables,
+            f"{100 * bias['rmse']:.2g}%, {bias['psnr_db']:.1f} dB", f"{float(f'{spp:.2g}'):,.0f} spp",
+            f"{min(times):.2f} to {max(times):.2f}",
+        ])  # fmt: skip
+    return table(["scene", "tables", "bias", "the noise equals it at", "time, learned / exact"], rows)
+
+
+def image_contenders() -> str:
+    """Return quality of a compressed material beside that of codecs in as many bytes."""
+    rows = []
+    for name, c in measured("tradeoff_image")["candidates"].items():
+        e = c["errors"]
+        if e and not name.startswith("bitmap"):
+            steps = c["details"].get("steps")
+            rows.append([
+                name + (f", {steps:,} steps" if steps else ""), f"{c['bytes']:,}", f"{e['psnr_db']:.1f}",
+                f"{e['psnr_between_db']:.1f}", f"{e['flip']:.4f}", f"{e['seen_db']:.1f}",
+            ])  # fmt: skip
+    return table(["", "bytes", "PSNR at texels, dB", "between texels", "FLIP", "as seen, dB"], rows)
+
+
 def image_pages() -> str:
     """Return PSNR of images and materials as one grid and as pages, in equal bytes and seconds."""
     rows = []
@@ -605,6 +672,10 @@ TABLES = {
     for f in (
         disney_forms,
         comparisons,
+        ggx_candidates,
+        ggx_quality,
+        scenes_bias,
+        image_contenders,
         image_bytes,
         image_pages,
         image_seen,
