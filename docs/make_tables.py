@@ -288,6 +288,31 @@ def texture_presets() -> str:
     return table(head, rows)
 
 
+def texture_footprints() -> str:
+    """Return relative errors of footprints, medians and 90th percentiles, of the side and of the major axis."""
+    rows = [
+        [name, *(f"{100 * median:.2g}, {100 * worst:.2g}%" for median, worst in errors)]
+        for name, errors in measured("bench_footprint")["rows"].items()
+    ]
+    return table(["", "side", "major axis"], rows)
+
+
+def texture_equal_samples() -> str:
+    """Return how many samples of a bitmap have the error of one filtered sample, on the plane of boombox."""
+    from claims import measured as node
+    from derived import equal_samples
+
+    study, rows = node("tradeoff_texture_boombox"), []
+    for name, label in (
+        ("ours 12x, trilinear", "`trilinear`, the default"),
+        ("ours 12x, anisotropic, centred", "`anisotropic`, `jitter` false (centred)"),
+    ):  # fmt: skip
+        psnr = study.candidates[name].errors.psnr_plane_db
+        counts = [equal_samples(study, "plane", name, sampling) for sampling in ("", "multijittered")]
+        rows.append([label, f"{psnr:.1f} dB", *(f"{count:.0f}" for count in counts)])
+    return table(["filter", "PSNR", "independent samples", "multijittered samples"], rows)
+
+
 def texture_memory() -> str:
     """Return the resident memory of a scene with many textures."""
     memory = measured("texture_memory")
@@ -684,6 +709,8 @@ TABLES = {
         bsdf_times,
         shading_distances,
         scene_training,
+        texture_equal_samples,
+        texture_footprints,
         texture_memory,
         texture_presets,
         texture_reads,
