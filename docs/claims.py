@@ -110,7 +110,8 @@ FUNCTIONS = {
     f.__name__: f
     for f in (
         *(min, max, mean, one, sum, len, round, abs, all, any, sorted),
-        *(derived.ratio, derived.time_over, derived.equal_samples, derived.shading, derived.flip, derived.shipped),
+        *(derived.ratio, derived.time_over, derived.equal_samples, derived.shading, derived.shading_level),
+        *(derived.shading_spread, derived.flip, derived.held_out, derived.rendered, derived.shipped),
     )
 }
 

@@ -46,34 +46,61 @@ def equal_samples(study: Any, stage: str, name: str, sampling: str = "") -> floa
     raise ValueError(f"{name}: no sample count of the study has this error")
 
 
-def shading(study: Any, material: str, which: str, letter: str = "C") -> float:
-    """Return the PSNR in dB of a material: ``trained``, or by the best filter, ``uncompressed`` or ``equal bytes``."""
+def _runs(study: Any, material: str, which: str) -> list[dict]:
+    """Return the records of a material: of a filter by its name, of the best one, or of all seeds of a training.
+
+    ``which`` is the name of a filter, ``uncompressed`` or ``equal bytes`` for the best of either, ``trained`` for the
+    weight λ = 0.9, or another weight as ``λ 0.5``; ``, no schedule`` after it names that way of a study with several.
+    """
     from mi_diffind.studies.shading.conclusions import curves
 
     curve = curves(study.content)[material]
+    filters = {**curve.classical, **curve.compressed}
+    if which in filters:
+        return [filters[which]]
     if which in ("uncompressed", "equal bytes"):
         filters = curve.classical if which == "uncompressed" else curve.compressed
-        return max(f[letter]["mean_db"] for f in filters.values())
-    (way,) = curve.remedies
-    runs = curve.runs[way, float(which.removeprefix("λ ")) if which.startswith("λ") else 0.9]
-    return sum(d[letter]["mean_db"] for d in runs) / len(runs)
+        return [max(filters.values(), key=lambda f: f["C"]["mean_db"])]
+    way = "clip, no schedule" if which.endswith(", no schedule") else "clip, schedule"
+    weight = which.removesuffix(", no schedule")
+    return curve.runs[way, 0.9 if weight == "trained" else float(weight.removeprefix("λ "))]
+
+
+def shading(study: Any, material: str, which: str, letter: str = "C") -> float:
+    """Return the PSNR in dB of a material in the mean of levels and seeds, ``which`` as of :func:`_runs`."""
+    return _mean(d[letter]["mean_db"] for d in _runs(study, material, which))
+
+
+def shading_level(study: Any, material: str, which: str, level: int) -> float:
+    """Return the PSNR in dB of a material at one level against the converged truth, in the mean of seeds."""
+    return _mean(d["C"]["psnr_db"][level] for d in _runs(study, material, which))
+
+
+def shading_spread(study: Any, material: str, which: str) -> float:
+    """Return the range in dB of the mean PSNR of the seeds."""
+    values = [d["C"]["mean_db"] for d in _runs(study, material, which)]
+    return max(values) - min(values)
 
 
 def flip(study: Any, material: str, which: str) -> float:
-    """Return the mean FLIP of a material against the converged truth, as :func:`shading`."""
-    from mi_diffind.studies.shading.conclusions import curves
+    """Return the mean FLIP of a material against the converged truth, ``which`` as of :func:`_runs`."""
+    return _mean(_mean(d["C"]["flip"]) for d in _runs(study, material, which))
 
-    def average(record):
-        values = record["C"]["flip"]
-        return sum(values) / len(values)
 
-    curve = curves(study.content)[material]
-    if which in ("uncompressed", "equal bytes"):
-        filters = curve.classical if which == "uncompressed" else curve.compressed
-        return average(max(filters.values(), key=lambda f: f["C"]["mean_db"]))
-    (way,) = curve.remedies
-    runs = curve.runs[way, 0.9]
-    return sum(map(average, runs)) / len(runs)
+def _mean(values: Any) -> float:
+    values = list(values)
+    return sum(values) / len(values)
+
+
+def held_out(study: Any, run: str) -> float:
+    """Return the PSNR in dB of held-out views and lights after a training inside a scene."""
+    (scene,) = study.content["details"]["scenes"]
+    return study.content["jobs"][f"{scene}, {run}"]["details"]["psnr_db"]
+
+
+def rendered(study: Any, scene: str, name: str, spp: int = 1) -> float:
+    """Return the PSNR in dB of a whole render."""
+    return next(p for p in study.content["scenes"][scene]["points"] if (p["name"], p["spp"]) == (name, spp))["psnr_db"]
 
 
 def shipped(task: str, preset: str) -> float:
