@@ -38,7 +38,8 @@ NAMES = (
     r"\b(?:19[89]\d|20[0-3][1-9]|20[1-3]\d)(?:-\d\d-\d\d)?\b(?! (?:steps|samples|rays|texels|pixels|spp|views))",
     r"(?:[Ss]upplement(?:al)?|[Ss]ections?|[Tt]ables?|[Ff]igures?|[Ee]quations?|[Ee]q\.|[Tt]asks?|[Nn]otebooks?|"
     r"[Ll]evels?|paper) \(?\d[\d.]*(?:(?:, | and | to )\d[\d.]*)*",
-    r"^\s*\d+\. ", r"BSD-\d", r"\[\^?\d+\]", r"[1234]D\b|x86-64|AVX-512|\[10\.\d+/[^\]]+\]|^\| 1\.\d(?:\.\d)?\b|§\s*[\d.]+", r"[Rr]ec\. \d+", r"[Ee]xit codes?:?.*$",
+    r"^\s*\d+\. ", r"BSD-\d", r"\[\^?\d+\]", r"[1234]D\b|x86-64|AVX-512",
+    r"\[10\.\d+/[^\]]+\]|^\| 1\.\d(?:\.\d)?\b|§\s*[\d.]+", r"[Rr]ec\. \d+", r"[Ee]xit codes?:?.*$",
 )  # fmt: skip
 #: Nouns of which a page says how many were chosen.
 CHOSEN = (
@@ -54,7 +55,7 @@ SETTINGS = (
     r"\d[\d.,]*(?: ?× ?\d[\d.,]*)+",
     r"\d[\d.,]*(?:(?:, | and | or | to |; )\d[\d.,]*)*[- ](?:" + CHOSEN + r")\b",
     r"\b\d+x\b",
-    r"(?:λ|α|ρ|gloss|roughness|depth|L|σ|γ|r|spp)(?: =| of)? ?\d[\d.]*(?:(?:, | and | to )\d[\d.]*)*",
+    r"(?<!\w)(?:λ|α|ρ|gloss|roughness|depth|L|σ|γ|r|spp)(?: =| of)? ?\d[\d.]*(?:(?:, | and | to )\d[\d.]*)*",
     r"\[-?\d+, -?\d+\]", r"[<>≤≥=] ?\d[\d.]*", r"(?:defaults? is|by default,?) \d[\d.]*",
     r"10[⁰-⁹⁻]+|2[⁰-⁹⁻]+|\d²", r"\b(?:1|2|4|256|512) [MK]iB", r"\b(?:128|256) kB",
 )  # fmt: skip
@@ -135,7 +136,7 @@ def numbers(page: str, text: str) -> list[Found]:
 def pages() -> dict[str, str]:
     """Return the text of the README and of each page that is written by hand, by its name."""
     paths = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-    return {p.name: p.read_text(encoding="utf-8") for p in paths if p.name != "tasks.md"}
+    return {p.name: p.read_text(encoding="utf-8") for p in paths if p.name not in ("tasks.md", "figures.md")}
 
 
 def counts() -> dict[str, Counter]:

@@ -16,7 +16,7 @@ import re
 import sys
 from pathlib import Path
 
-from claims import ClaimError, claims
+from claims import ClaimError, claims, commands, files
 
 import mi_diffind
 from mi_diffind.task import tasks
@@ -66,6 +66,45 @@ def page_of_tasks() -> str:
                 f"`mi-diffind fit {task.name} --help`.\n"
             )
     return "\n".join(parts)
+
+
+def page_of_figures(texts: dict[str, str]) -> str:
+    """Return the page that names file and command of each headline, and of each other sentence with figures.
+
+    ``texts`` has the pages by their names, with their figures.
+    """
+    from list_numbers import headlines
+
+    made, top, rest = commands(), [], []
+    for claim in claims():
+        text = texts[claim.page]
+        link = "../README.md" if claim.page == "README.md" else claim.page
+        names = sorted(set().union(*(files(e) for e in [*claim.values.values(), *filter(None, [claim.holds])])))
+        sources = ", ".join(f"[{n}](measured/{n}.json)" for n in names) or "files that ship"
+        spans = headlines(claim.page, text)
+        matches = claim.matches(text)
+        headline = any(a <= m.start() < b for m in matches for a, b in spans)
+        sentence = re.sub(r"\s+", " ", matches[0][0]).replace("|", "\\|").replace("**", "") if matches else claim.text
+        (top if headline else rest).append([f"[{claim.page}]({link})", sentence, sources])
+    head = ["page", "sentence", "files"]
+    written_by = [
+        [f"[{name}](measured/{name}.json)", "`{}`".format(command.replace("|", "\\|"))]
+        for name, command in sorted(made.items())
+    ]
+    parts = [
+        "# Where the figures come from",
+        "Each figure of the README and of the pages is inserted from a file in `docs/measured`, which the command below "
+        "wrote.\nThis page is made by `python docs/make_tables.py`; `python docs/list_numbers.py` lists the numbers that "
+        "no file backs.",
+        "## Headlines",
+        "Tables and lists of the README, and the first paragraph of each page.",
+        table(head, top),
+        "## Files and commands",
+        table(["file", "command"], written_by),
+        "## Other sentences",
+        table(head, rest),
+    ]
+    return "\n\n".join(parts) + "\n"
 
 
 def disney_forms() -> str:
@@ -464,6 +503,25 @@ def bsdf_times() -> str:
     return table(head, rows)
 
 
+def bsdf_families() -> str:
+    """Return the errors of learned families at random members."""
+    rows = []
+    for name, label in (
+        ("plastic", "`roughplastic`, nonlinear, alpha from 0.02 to 0.8"),
+        ("principled", "`principled`, roughness from 0.05 to 1, metallic from 0 to 1"),
+    ):  # fmt: skip
+        if not (DOCS / "measured" / f"inspect_family_{name}.json").is_file():
+            continue
+        f = measured(f"inspect_family_{name}")
+        e = f["measured"]
+        psnr = (e[key] for key in ("psnr_db", "psnr_median_db", "psnr_minimum_db"))
+        rows.append([
+            label, f"{f['bytes']:,}", " / ".join(f"{value:.1f}" for value in psnr), f"{100 * e['albedo_excess']:.2f}%",
+            f"{e['sample_weight_moment']:.2f}",
+        ])  # fmt: skip
+    return table(["family", "bytes", "PSNR, dB: mean / median / least", "albedo", "moment"], rows)
+
+
 def shading_distances() -> str:
     """Return the PSNR of materials before and after training for their shading, as seen from three distances."""
     rows = []
@@ -706,6 +764,7 @@ TABLES = {
         image_seen,
         material_times,
         bsdf,
+        bsdf_families,
         bsdf_times,
         shading_distances,
         scene_training,
@@ -765,6 +824,8 @@ def figures(pages: dict[Path, str]) -> tuple[dict[Path, str], list[str]]:
             troubles.append(f"claims.toml: no page {claim.page!r}; allowed: README.md and the pages of docs")
         except ClaimError as error:
             troubles.append(str(error))
+    if not troubles:
+        pages[DOCS / "figures.md"] = page_of_figures({path.name: text for path, text in pages.items()})
     return pages, troubles
 
 

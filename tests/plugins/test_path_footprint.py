@@ -35,7 +35,7 @@ def shown(mi, shapes: dict, **sensor) -> tuple:
 
 
 def trusted(scene, chain: tuple, seen) -> tuple:
-    """Finite differences, and where they are to be trusted: all of the way belongs to the mirrors, its end to the room."""
+    """Finite differences, and where to trust them: all of the way belongs to the mirrors, its end to the room."""
     si, ddx, ddy, where = fp.truth(scene, chain)
     for mirror in fp.hits(scene, chain)[:-1]:
         where &= ~np.array(mirror.shape.is_emitter())

@@ -66,7 +66,7 @@ def _eight_bit_reads(result: dict) -> list[str]:
 class EqualQuality:
     """The smallest member of a family as good as a reference, else its best member.
 
-    ``ratios`` are flops, bytes read, bytes stored and time, relative to the reference; ``paper`` the paper's of the first
+    ``ratios`` are flops, bytes read, bytes stored and time, relative to the reference; ``paper`` has the paper's first
     three.
     """
 
