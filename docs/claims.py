@@ -1,7 +1,8 @@
 """
 Numbers in the sentences of the pages, inserted from JSON in ``docs/measured``.
 
-``claims.toml`` maps sentences to figures. Each entry names a page, a part of a sentence with fields as of
+``claims.toml`` maps sentences to figures. Each entry names a page (the README, a page of ``docs``, or the file of a
+plugin, whose docstring is a page of the manual), a part of a sentence with fields as of
 ``str.format``, and an expression for each field:
 
     [["README.md"]]
@@ -138,6 +139,11 @@ class Claim:
     text: str
     values: dict[str, str] = field(default_factory=dict)
     holds: str | None = None
+
+    @property
+    def path(self) -> Path:
+        """The file of the page: the README, a page of ``docs``, or the source of a plugin with its docstring."""
+        return ROOT / self.page if self.page == "README.md" or "/" in self.page else DOCS / self.page
 
     def pattern(self) -> re.Pattern:
         """Return the regular expression of the sentence: any number in each field, any white space."""

@@ -97,6 +97,8 @@ def headlines(page: str, text: str) -> list[tuple[int, int]]:
     """Return where a page makes its headlines: tables and lists of the README, the first paragraph of others."""
     if page == "README.md":
         return _spans(text, r"^(?:\||- |  \S).*$")
+    if not page.endswith(".md"):
+        return []
     first = re.search(r"^(?![#!\[<\s`|]).+(?:\n(?!\n).+)*", text, re.M)
     return [first.span()] if first else []
 

@@ -17,6 +17,9 @@ import sys
 from pathlib import Path
 
 from claims import ClaimError, claims, commands, files
+from claims import measured as node
+from derived import equal_samples
+from list_numbers import headlines
 
 import mi_diffind
 from mi_diffind.task import tasks
@@ -68,17 +71,15 @@ def page_of_tasks() -> str:
     return "\n".join(parts)
 
 
-def page_of_figures(texts: dict[str, str]) -> str:
+def page_of_figures(pages: dict[Path, str]) -> str:
     """Return the page that names file and command of each headline, and of each other sentence with figures.
 
-    ``texts`` has the pages by their names, with their figures.
+    ``pages`` has the texts of the pages, with their figures.
     """
-    from list_numbers import headlines
-
     made, top, rest = commands(), [], []
     for claim in claims():
-        text = texts[claim.page]
-        link = "../README.md" if claim.page == "README.md" else claim.page
+        text = pages[claim.path]
+        link = claim.page if claim.path.parent == DOCS else f"../{claim.page}"
         names = sorted(set().union(*(files(e) for e in [*claim.values.values(), *filter(None, [claim.holds])])))
         sources = ", ".join(f"[{n}](measured/{n}.json)" for n in names) or "files that ship"
         spans = headlines(claim.page, text)
@@ -93,9 +94,9 @@ def page_of_figures(texts: dict[str, str]) -> str:
     ]
     parts = [
         "# Where the figures come from",
-        "Each figure of the README and of the pages is inserted from a file in `docs/measured`, which the command below "
-        "wrote.\nThis page is made by `python docs/make_tables.py`; `python docs/list_numbers.py` lists the numbers that "
-        "no file backs.",
+        "Each figure of the README and of the pages is inserted from a file in `docs/measured`, which the command "
+        "below wrote.\nThis page is made by `python docs/make_tables.py`; `python docs/list_numbers.py` lists the "
+        "numbers that no file backs.",
         "## Headlines",
         "Tables and lists of the README, and the first paragraph of each page.",
         table(head, top),
@@ -338,9 +339,6 @@ def texture_footprints() -> str:
 
 def texture_equal_samples() -> str:
     """Return how many samples of a bitmap have the error of one filtered sample, on the plane of boombox."""
-    from claims import measured as node
-    from derived import equal_samples
-
     study, rows = node("tradeoff_texture_boombox"), []
     for name, label in (
         ("ours 12x, trilinear", "`trilinear`, the default"),
@@ -814,18 +812,17 @@ def written() -> dict[Path, str]:
 
 def figures(pages: dict[Path, str]) -> tuple[dict[Path, str], list[str]]:
     """Return the pages with the numbers of ``claims.toml``, and a sentence for each claim that cannot stand."""
-    troubles, readme = [], DOCS.parent / "README.md"
-    pages = {readme: readme.read_text(encoding="utf-8"), **pages}
+    troubles = []
     for claim in claims():
-        path = readme if claim.page == readme.name else DOCS / claim.page
         try:
-            pages[path] = claim.written(pages[path])
-        except KeyError:
-            troubles.append(f"claims.toml: no page {claim.page!r}; allowed: README.md and the pages of docs")
+            pages.setdefault(claim.path, claim.path.read_text(encoding="utf-8"))
+            pages[claim.path] = claim.written(pages[claim.path])
+        except FileNotFoundError:
+            troubles.append(f"claims.toml: no page {claim.page!r}; allowed: README.md, pages of docs, files of plugins")
         except ClaimError as error:
             troubles.append(str(error))
     if not troubles:
-        pages[DOCS / "figures.md"] = page_of_figures({path.name: text for path, text in pages.items()})
+        pages[DOCS / "figures.md"] = page_of_figures(pages)
     return pages, troubles
 
 

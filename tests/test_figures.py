@@ -33,7 +33,8 @@ def copy(tmp_path):
     """A copy of README and docs, to be spoiled."""
     shutil.copytree(DOCS, tmp_path / "docs", ignore=shutil.ignore_patterns("*.jpg", "*.png", "__pycache__"))
     shutil.copy(ROOT / "README.md", tmp_path)
-    (tmp_path / "scenes").symlink_to(ROOT / "scenes")
+    for name in ("scenes", "plugins"):
+        (tmp_path / name).symlink_to(ROOT / name)
     return tmp_path
 
 
@@ -69,8 +70,7 @@ def test_one_digit_that_is_changed_by_hand_is_refused(copy):
 def test_each_figure_of_a_claim_is_checked():
     """A digit of any figure makes a page that differs from the one written."""
     for claim in claims.claims():
-        path = ROOT / claim.page if claim.page == "README.md" else DOCS / claim.page
-        text = path.read_text(encoding="utf-8")
+        text = claim.path.read_text(encoding="utf-8")
         for match in claim.matches(text):
             for group in range(1, len(match.groups()) + 1):
                 place = match.start(group) + re.search(r"\d", match[group]).start()
