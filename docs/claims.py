@@ -19,6 +19,7 @@ values, and the functions of ``derived.py``. ``holds`` is an expression that mus
 from __future__ import annotations
 
 import ast
+import inspect
 import json
 import re
 import string
@@ -107,14 +108,9 @@ def mean(values: Iterable[float]) -> float:
     return sum(values) / len(values)
 
 
-FUNCTIONS = {
-    f.__name__: f
-    for f in (
-        *(min, max, mean, one, sum, len, round, abs, all, any, sorted),
-        *(derived.ratio, derived.time_over, derived.equal_samples, derived.shading, derived.shading_level),
-        *(derived.shading_spread, derived.flip, derived.held_out, derived.rendered, derived.shipped),
-    )
-}
+#: Functions of an expression, by name: these of Python, those above, and the public ones of ``derived.py``.
+FUNCTIONS = {f.__name__: f for f in (min, max, mean, one, sum, len, round, abs, all, any, sorted)}
+FUNCTIONS |= {name: f for name, f in inspect.getmembers(derived, inspect.isfunction) if name[0] != "_"}
 
 
 def files(expression: str) -> set[str]:

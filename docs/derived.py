@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from pathlib import Path
 from typing import Any
 
 
@@ -109,3 +110,8 @@ def shipped(task: str, preset: str) -> float:
 
     task = tasks()[task]
     return task.load(task.file(preset=preset)).measured["psnr_db"]
+
+
+def asset_bytes(name: str) -> int:
+    """Return the bytes of a file in ``scenes/assets``."""
+    return (Path(__file__).resolve().parents[1] / "scenes" / "assets" / name).stat().st_size

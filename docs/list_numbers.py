@@ -38,7 +38,8 @@ NAMES = (
     r"\b(?:19[89]\d|20[0-3][1-9]|20[1-3]\d)(?:-\d\d-\d\d)?\b(?! (?:steps|samples|rays|texels|pixels|spp|views))",
     r"(?:[Ss]upplement(?:al)?|[Ss]ections?|[Tt]ables?|[Ff]igures?|[Ee]quations?|[Ee]q\.|[Tt]asks?|[Nn]otebooks?|"
     r"[Ll]evels?|paper) \(?\d[\d.]*(?:(?:, | and | to )\d[\d.]*)*",
-    r"^\s*\d+\. ", r"BSD-\d", r"\[\^?\d+\]", r"[1234]D\b|x86-64|AVX-512",
+    r"^\s*\d+\. ", r"BSD-\d", r"#\d+", r"\b3\.(?:9|10)(?:\.\d+)?\b(?! (?:times|dB|ms|ns|s|MB|kB|GB)|%)",
+    r"\[\^?\d+\]", r"[1234]D\b|x86-64|AVX-512",
     r"\[10\.\d+/[^\]]+\]|^\| 1\.\d(?:\.\d)?\b|§\s*[\d.]+", r"[Rr]ec\. \d+", r"[Ee]xit codes?:?.*$",
 )  # fmt: skip
 #: Nouns of which a page says how many were chosen.

@@ -15,6 +15,7 @@ DOCS = ROOT / "docs"
 sys.path.insert(0, str(DOCS))
 
 import claims  # noqa: E402
+import derived  # noqa: E402
 import list_numbers  # noqa: E402
 import make_tables  # noqa: E402
 
@@ -102,6 +103,47 @@ def test_a_claim_in_words_that_does_not_hold_is_refused():
 def test_expressions_name_what_is_missing(expression, message):
     with pytest.raises(claims.ClaimError, match=message):
         claims.evaluate(expression)
+
+
+def test_samples_at_equal_error():
+    """Halfway between two counts in dB is their geometric mean; at a count, it is that count."""
+    errors = {"bitmap, 1 spp": 10, "bitmap, 4 spp": 16, "bitmap, 16 spp": 22, "bitmap, 4 spp, multijittered": 20}
+    errors |= {"ours": 19, "as four": 16}
+    study = claims.Node({"candidates": {n: {"errors": {"psnr_plane_db": e}} for n, e in errors.items()}}, "study")
+    assert derived.equal_samples(study, "plane", "ours") == pytest.approx(8)
+    assert derived.equal_samples(study, "plane", "as four") == pytest.approx(4)
+    assert derived.equal_samples(study, "plane", "as four", "multijittered") == pytest.approx(4**0.6)
+    errors["ours"] = 30
+    study = claims.Node({"candidates": {n: {"errors": {"psnr_plane_db": e}} for n, e in errors.items()}}, "study")
+    with pytest.raises(ValueError, match="no sample count"):
+        derived.equal_samples(study, "plane", "ours")
+
+
+def test_ratios_are_medians_in_either_order():
+    case = {
+        "ratios": {"eval": {"a / b": {"median": 4.0}}},
+        "queries": {"eval": {"a": {"time": 9}, "b": {"time": 3}, "c": {"time": 6}}},
+    }
+    study = claims.Node({"cases": {"plain": case}}, "study")
+    assert derived.ratio(study, "plain", "eval", "a", "b") == 4
+    assert derived.ratio(study, "plain", "eval", "b", "a") == 0.25
+    assert derived.ratio(study, "plain", "eval", "c", "b") == 2
+    assert derived.time_over(study, "plain", "eval", "a", "b") == 3
+
+
+def test_figures_of_shading_are_those_of_its_table():
+    """The function that sentences use, against the rows that the table has."""
+    rows = [line.split(" | ") for line in make_tables.shading_best("tradeoff_shading").splitlines()[2:]]
+    for material in ("hammered", "weave", "lacquer"):
+        by_label = {r[1]: r for r in rows if r[0].strip("| ") == material}
+        (trained,) = [r for label, r in by_label.items() if label.startswith("trained")]
+        (best,) = [r for label, r in by_label.items() if label.endswith("equal bytes")]
+        study = claims.measured("tradeoff_shading")
+        assert f"{derived.shading(study, material, 'trained'):.2f}" == trained[2].split()[0]
+        assert f"{derived.shading(study, material, 'equal bytes'):.2f}" == best[2].split()[0]
+        assert f"{derived.shading_level(study, material, 'trained', 3):.1f}" == trained[7]
+        assert f"{derived.flip(study, material, 'trained'):.3f}" == trained[3]
+        assert f"{derived.shading(study, material, 'trained', 'P'):.2f}" == trained[-1].strip(" |")
 
 
 def test_each_file_has_its_command():
