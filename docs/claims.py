@@ -65,8 +65,7 @@ class Node:
         return self[key]
 
     def __iter__(self) -> Iterator:
-        entries = enumerate(self.content) if isinstance(self.content, list) else None
-        return iter([self[i] for i, _ in entries] if entries else self.content)
+        return iter([self[i] for i in range(len(self))] if isinstance(self.content, list) else self.content)
 
     def __len__(self) -> int:
         return len(self.content)
@@ -115,16 +114,18 @@ FUNCTIONS |= {name: f for name, f in inspect.getmembers(derived, inspect.isfunct
 
 def files(expression: str) -> set[str]:
     """Return the names of the files that an expression of ``claims.toml`` reads."""
-    names = {node.id for node in ast.walk(ast.parse(expression, mode="eval")) if isinstance(node, ast.Name)}
-    bound = {node.arg for node in ast.walk(ast.parse(expression, mode="eval")) if isinstance(node, ast.arg)}
-    stored = set(re.findall(r"\bfor (\w+)(?:, (\w+))? in\b", expression))
-    return names - FUNCTIONS.keys() - bound - {name for pair in stored for name in pair}
+    names = [node for node in ast.walk(ast.parse(expression, mode="eval")) if isinstance(node, ast.Name)]
+    bound = {node.id for node in names if isinstance(node.ctx, ast.Store)}
+    return {node.id for node in names} - bound - FUNCTIONS.keys()
 
 
 def evaluate(expression: str) -> Any:
     """Return the value of an expression of ``claims.toml``."""
     names = {name: measured(name) for name in files(expression)}
-    return eval(expression, {"__builtins__": {}, **FUNCTIONS, **names})
+    try:
+        return eval(expression, {"__builtins__": {}, **FUNCTIONS, **names})
+    except (ArithmeticError, LookupError, StopIteration, TypeError, ValueError) as error:
+        raise ClaimError(f"claims.toml: {expression}: {error}") from error
 
 
 @dataclass

@@ -98,6 +98,7 @@ def test_a_claim_in_words_that_does_not_hold_is_refused():
         ("nerf_scenes.row", "nerf_scenes\\['row'\\]; allowed: 'rows'"),
         ("nerf_scenes.rows[99].minutes", "allowed: 0 to 3"),
         ('one(nerf_scenes.rows, scene="chair")', "0 rows have"),
+        ("nerf_scenes.rows[0].minutes / 0", "claims.toml: nerf_scenes.rows.*division by zero"),
     ],
 )
 def test_expressions_name_what_is_missing(expression, message):
