@@ -1,5 +1,5 @@
 """
-List the numbers of the README and of the pages that no file backs.
+List the numbers of the README, the pages and the notebooks that no file backs.
 
     python docs/list_numbers.py [--all] [--headlines] [PAGE …]
 
@@ -16,6 +16,7 @@ lists and of the first paragraph of each page alone; ``--all`` lists all classes
 from __future__ import annotations
 
 import argparse
+import json
 import re
 import sys
 from collections import Counter
@@ -29,7 +30,7 @@ NUMBER = re.compile(r"(?<![\w.])\d+(?:[.,]\d+)*(?:·10[⁻⁰-⁹]+|e-?\d+)?")
 
 #: Parts of a page in which no number is a claim.
 CODE = (
-    r"^```.*?^```", r"(?<!`)`(?!`)[^`]+`", r"(?<=\])\([^)\n]*\)", r"https?://\S+", r"<[a-z/][^>\n]*>",
+    r"^ *```.*?^ *```", r"(?<!`)`(?!`)[^`]+`", r"(?<=\])\([^)\n]*\)", r"https?://\S+", r"<[a-z/][^>\n]*>",
 )  # fmt: skip
 #: Versions, years, parts of papers, names.
 NAMES = (
@@ -111,7 +112,7 @@ def numbers(page: str, text: str) -> list[Found]:
     spans = {
         "backed": [
             *_spans(text, r"<!-- table \w+ -->\n.*?<!-- end -->", re.S),
-            *(span for c in claims() if c.page == page for m in c.matches(text) for span in m.regs[1:]),
+            *(span for c in claims() if c.path.name == page for m in c.matches(text) for span in m.regs[1:]),
         ],
         "trial": _spans(text, r"<!-- trials: .*?<!-- /trials -->", re.S),
     }  # fmt: skip
@@ -137,9 +138,13 @@ def numbers(page: str, text: str) -> list[Found]:
 
 
 def pages() -> dict[str, str]:
-    """Return the text of the README and of each page that is written by hand, by its name."""
+    """Return the text of the README, of each page that is written by hand, and of each notebook, by its name."""
     paths = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-    return {p.name: p.read_text(encoding="utf-8") for p in paths if p.name not in ("tasks.md", "figures.md")}
+    texts = {p.name: p.read_text(encoding="utf-8") for p in paths if p.name not in ("tasks.md", "figures.md")}
+    for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
+        cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+        texts[path.name] = "\n\n".join("".join(c["source"]) for c in cells if c["cell_type"] == "markdown")
+    return texts
 
 
 def counts() -> dict[str, Counter]:
@@ -164,9 +169,9 @@ def main(arguments: list[str]) -> int:
             if (chosen.all or n.kind == "unbacked") and (n.headline or not chosen.headlines):
                 mark = f"{n.kind} headline" if n.headline else n.kind
                 print(f"{Path(n.page).name}:{n.line}: {n.number}  ({mark})  …{n.context}…")
-    print(f"\n{'page':16} {'backed':>8} {'trials':>8} {'settings':>8} {'unbacked':>8}")
+    print(f"\n{'page':32} {'backed':>8} {'trials':>8} {'settings':>8} {'unbacked':>8}")
     for page, count in counts().items():
-        print(f"{page:16} " + " ".join(f"{count[k]:8}" for k in ("backed", "trial", "setting", "unbacked")))
+        print(f"{page:32} " + " ".join(f"{count[k]:8}" for k in ("backed", "trial", "setting", "unbacked")))
     return 0
 
 

@@ -34,7 +34,7 @@ def copy(tmp_path):
     """A copy of README and docs, to be spoiled."""
     shutil.copytree(DOCS, tmp_path / "docs", ignore=shutil.ignore_patterns("*.jpg", "*.png", "__pycache__"))
     shutil.copy(ROOT / "README.md", tmp_path)
-    for name in ("scenes", "plugins"):
+    for name in ("scenes", "plugins", "notebooks"):
         (tmp_path / name).symlink_to(ROOT / name)
     return tmp_path
 
