@@ -819,7 +819,7 @@ def figures(pages: dict[Path, str]) -> tuple[dict[Path, str], list[str]]:
             pages[claim.path] = claim.written(pages[claim.path])
         except FileNotFoundError:
             troubles.append(
-                f"claims.toml: no page {claim.page!r}; allowed: README.md, pages of docs, paths of other files"
+                f"claims.toml: no page {claim.page!r}; allowed: README.md, pages of docs, paths of files"
             )
         except ClaimError as error:
             troubles.append(str(error))
