@@ -54,11 +54,11 @@ CHOSEN = (
 )
 SETTINGS = (
     r"\d[\d.,]*(?:²|³|⁴)",
-    r"\d[\d.,]*(?: ?× ?\d[\d.,]*)+",
+    r"\d[\d.,]*(?: ?[×x] ?\d[\d.,]*)+",
     r"\d[\d.,]*(?:(?:, | and | or | to |; )\d[\d.,]*)*[- ](?:" + CHOSEN + r")\b",
     r"\b\d+x\b",
     r"(?<!\w)(?:λ|α|ρ|gloss|roughness|depth|L|σ|γ|r|spp)(?: =| of)? ?\d[\d.]*(?:(?:, | and | to )\d[\d.]*)*",
-    r"\[-?\d+, -?\d+\]", r"[<>≤≥=] ?\d[\d.]*", r"(?:defaults? is|by default,?) \d[\d.]*",
+    r"\[-?\d+, -?\d+[\])]", r"[<>≤≥=] ?\d[\d.]*", r"(?:defaults? is|by default,?) \d[\d.]*",
     r"10[⁰-⁹⁻]+|2[⁰-⁹⁻]+|\d²", r"\b(?:1|2|4|256|512) [MK]iB", r"\b(?:128|256) kB",
 )  # fmt: skip
 
