@@ -152,7 +152,7 @@ def test_each_file_has_its_command():
     commands = claims.commands()
     assert set(commands) == set(files)
     for name, command in commands.items():
-        assert command.split()[0] in ("mi-diffind", "python") and f"docs/measured/{name}.json" in command
+        assert command.split()[0] in ("mi-diffind", "python") and "docs/measured" in command
         json.loads(files[name].read_text(encoding="utf-8"))
         if command.startswith("python"):
             assert (ROOT / command.split()[1]).is_file(), command
