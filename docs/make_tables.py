@@ -1,11 +1,12 @@
 """
-Write the tables of the documentation.
+Write the tables and the figures of the documentation.
 
     python docs/make_tables.py [--check]
 
 ``tasks.md`` is made from the declarations of tasks. In the other pages, the text between ``<!-- table NAME -->`` and
 ``<!-- end -->`` is made from JSON in ``docs/measured/``, which ``mi-diffind … --json docs/measured/NAME.json`` wrote;
-the pages show the commands. With ``--check`` nothing is written, and the exit code is 1 if a page would change.
+the pages show the commands. Figures in sentences are inserted from the same files, as ``claims.toml`` says
+(``claims.py``). With ``--check`` nothing is written, and the exit code is 1 if a page would change.
 """
 
 from __future__ import annotations
@@ -14,6 +15,11 @@ import json
 import re
 import sys
 from pathlib import Path
+
+from claims import ClaimError, claims, commands, files
+from claims import measured as node
+from derived import equal_samples
+from list_numbers import headlines
 
 import mi_diffind
 from mi_diffind.task import tasks
@@ -65,6 +71,43 @@ def page_of_tasks() -> str:
     return "\n".join(parts)
 
 
+def page_of_figures(pages: dict[Path, str]) -> str:
+    """Return the page that names file and command of each headline, and of each other sentence with figures.
+
+    ``pages`` has the texts of the pages, with their figures.
+    """
+    made, top, rest = commands(), [], []
+    for claim in claims():
+        text = pages[claim.path]
+        link = claim.page if claim.path.parent == DOCS else f"../{claim.page}"
+        names = sorted(set().union(*(files(e) for e in [*claim.values.values(), *filter(None, [claim.holds])])))
+        sources = ", ".join(f"[{n}](measured/{n}.json)" for n in names) or "files that ship"
+        spans = headlines(claim.page, text)
+        matches = claim.matches(text)
+        headline = any(a <= m.start() < b for m in matches for a, b in spans)
+        sentence = re.sub(r"\s+", " ", matches[0][0]).replace("|", "\\|").replace("**", "") if matches else claim.text
+        (top if headline else rest).append([f"[{claim.page}]({link})", sentence, sources])
+    head = ["page", "sentence", "files"]
+    written_by = [
+        [f"[{name}](measured/{name}.json)", "`{}`".format(command.replace("|", "\\|"))]
+        for name, command in sorted(made.items())
+    ]
+    parts = [
+        "# Where the figures come from",
+        "Each figure of the README and of the pages is inserted from a file in `docs/measured`, which the command "
+        "below wrote.\nThis page is made by `python docs/make_tables.py`; `python docs/list_numbers.py` lists the "
+        "numbers that no file backs.",
+        "## Headlines",
+        "Tables and lists of the README, and the first paragraph of each page.",
+        table(head, top),
+        "## Files and commands",
+        table(["file", "command"], written_by),
+        "## Other sentences",
+        table(head, rest),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
 def disney_forms() -> str:
     """Return accuracy, bytes and time of each form of the Disney BRDF."""
     study = measured("tradeoff_disney")
@@ -105,6 +148,73 @@ def comparisons() -> str:
             ])  # fmt: skip
     columns = ["scene", "against", "PSNR, dB", "without noise", "FLIP", "time of a pass over that of the other"]
     return table(columns, rows)
+
+
+def ggx_quality() -> str:
+    """Return costs of each family at the quality of an indirection, as multiples of it, beside the paper's."""
+    from mi_diffind.studies.ggx.conclusions import equal_quality
+
+    study, reference = measured("tradeoff_ggx"), "16→8"
+    goal, rows = study["candidates"][reference]["errors"]["psnr_db"], []
+    for row in equal_quality(study, reference):
+        paper = [f" ({value:g})" for value in row.paper or ()] or [""] * 3
+        ratios = [f"{ratio:.3g}{note}" for ratio, note in zip(row.ratios, [*paper, ""], strict=True)]
+        rows.append([f"{row.family}: {row.name}", *ratios, f"{row.psnr_db - goal:+.1f}"])
+    return table(["", "flops", "bytes read", "bytes stored", "time", "PSNR beside it, dB"], rows)
+
+
+def ggx_candidates() -> str:
+    """Return bytes, PSNR and times of the float32 candidates for both kinds of inputs, without tensor networks."""
+    study, rows = measured("tradeoff_ggx"), []
+    for case, timings in ((name, case["queries"].get("read", {})) for name, case in study["cases"].items()):
+        for name, timing in timings.items():
+            c = study["candidates"][name]
+            if name in GGX_CANDIDATES:
+                rows.append([
+                    case, name.removesuffix(", log"), f"{c['bytes']:,}", f"{c['errors']['psnr_db']:.1f}",
+                    f"{timing['time']:.2f}", "yes" if c["converged"] else "no",
+                ])  # fmt: skip
+    return table(["inputs", "", "bytes", "PSNR, dB", "a read, ns", "converged"], rows)
+
+
+#: Rows of the table of GGX; all others are in the JSON file.
+GGX_CANDIDATES = (
+    "16→8", "16→8 u8", "24²", "96²", "192²", "MLP 32x3", "16→8, log", "16→8 u8, log", "24², log", "MLP 32x3, log",
+)  # fmt: skip
+
+
+def scenes_bias() -> str:
+    """Return bias of the tables, the samples at which noise equals it, and times of scenes, learned over exact."""
+    rows = []
+    for name, tables in (
+        ("materials_paper", "`neural_disney`, `-D preset=paper`"), ("metals", "`neural_ggx`"),
+        ("still_life", "`neural_disney`"),
+    ):  # fmt: skip
+        if not (DOCS / "measured" / f"tradeoff_scene_{name}.json").is_file():
+            continue
+        study = measured(f"tradeoff_scene_{name}")
+        bias, spp = study["bias"], study["crossover"]["spp"]
+        times = [ratio["median"] for ratio in study["ratios"]]
+        rows.append([
+            f"`{Path(study['scene']).name}`, {study['width']} × {study['height']}", tables,
+            f"{100 * bias['rmse']:.2g}%, {bias['psnr_db']:.1f} dB", f"{float(f'{spp:.2g}'):,.0f} spp",
+            f"{min(times):.2f} to {max(times):.2f}",
+        ])  # fmt: skip
+    return table(["scene", "tables", "bias", "the noise equals it at", "time, learned / exact"], rows)
+
+
+def image_contenders() -> str:
+    """Return quality of a compressed material beside that of codecs in as many bytes."""
+    rows = []
+    for name, c in measured("tradeoff_image")["candidates"].items():
+        e = c["errors"]
+        if e and not name.startswith("bitmap"):
+            steps = c["details"].get("steps")
+            rows.append([
+                name + (f", {steps:,} steps" if steps else ""), f"{c['bytes']:,}", f"{e['psnr_db']:.1f}",
+                f"{e['psnr_between_db']:.1f}", f"{e['flip']:.4f}", f"{e['seen_db']:.1f}",
+            ])  # fmt: skip
+    return table(["", "bytes", "PSNR at texels, dB", "between texels", "FLIP", "as seen, dB"], rows)
 
 
 def image_pages() -> str:
@@ -216,6 +326,28 @@ def texture_presets() -> str:
             )
     head = ["source", "preset", "bytes", "best step", *(f"L{i}" for i in range(len(by_level))), "mean off by"]
     return table(head, rows)
+
+
+def texture_footprints() -> str:
+    """Return relative errors of footprints, medians and 90th percentiles, of the side and of the major axis."""
+    rows = [
+        [name, *(f"{100 * median:.2g}, {100 * worst:.2g}%" for median, worst in errors)]
+        for name, errors in measured("bench_footprint")["rows"].items()
+    ]
+    return table(["", "side", "major axis"], rows)
+
+
+def texture_equal_samples() -> str:
+    """Return how many samples of a bitmap have the error of one filtered sample, on the plane of boombox."""
+    study, rows = node("tradeoff_texture_boombox"), []
+    for name, label in (
+        ("ours 12x, trilinear", "`trilinear`, the default"),
+        ("ours 12x, anisotropic, centred", "`anisotropic`, `jitter` false (centred)"),
+    ):  # fmt: skip
+        psnr = study.candidates[name].errors.psnr_plane_db
+        counts = [equal_samples(study, "plane", name, sampling) for sampling in ("", "multijittered")]
+        rows.append([label, f"{psnr:.1f} dB", *(f"{count:.0f}" for count in counts)])
+    return table(["filter", "PSNR", "independent samples", "multijittered samples"], rows)
 
 
 def texture_memory() -> str:
@@ -367,6 +499,25 @@ def bsdf_times() -> str:
         ])  # fmt: skip
     head = ["material", "albedo", "moment", "of `principled`'s time", "of the source's", "of `measured`'s"]
     return table(head, rows)
+
+
+def bsdf_families() -> str:
+    """Return the errors of learned families at random members."""
+    rows = []
+    for name, label in (
+        ("plastic", "`roughplastic`, nonlinear, alpha from 0.02 to 0.8"),
+        ("principled", "`principled`, roughness from 0.05 to 1, metallic from 0 to 1"),
+    ):  # fmt: skip
+        if not (DOCS / "measured" / f"inspect_family_{name}.json").is_file():
+            continue
+        f = measured(f"inspect_family_{name}")
+        e = f["measured"]
+        psnr = (e[key] for key in ("psnr_db", "psnr_median_db", "psnr_minimum_db"))
+        rows.append([
+            label, f"{f['bytes']:,}", " / ".join(f"{value:.1f}" for value in psnr), f"{100 * e['albedo_excess']:.2f}%",
+            f"{e['sample_weight_moment']:.2f}",
+        ])  # fmt: skip
+    return table(["family", "bytes", "PSNR, dB: mean / median / least", "albedo", "moment"], rows)
 
 
 def shading_distances() -> str:
@@ -602,14 +753,21 @@ TABLES = {
     for f in (
         disney_forms,
         comparisons,
+        ggx_candidates,
+        ggx_quality,
+        scenes_bias,
+        image_contenders,
         image_bytes,
         image_pages,
         image_seen,
         material_times,
         bsdf,
+        bsdf_families,
         bsdf_times,
         shading_distances,
         scene_training,
+        texture_equal_samples,
+        texture_footprints,
         texture_memory,
         texture_presets,
         texture_reads,
@@ -677,14 +835,35 @@ def written() -> dict[Path, str]:
     return pages
 
 
+def figures(pages: dict[Path, str]) -> tuple[dict[Path, str], list[str]]:
+    """Return the pages with the numbers of ``claims.toml``, and a sentence for each claim that cannot stand."""
+    troubles = []
+    for claim in claims():
+        try:
+            pages.setdefault(claim.path, claim.path.read_text(encoding="utf-8"))
+            pages[claim.path] = claim.written(pages[claim.path])
+        except FileNotFoundError:
+            troubles.append(
+                f"claims.toml: no page {claim.page!r}; allowed: README.md, pages of docs, paths of files"
+            )
+        except ClaimError as error:
+            troubles.append(str(error))
+    if not troubles:
+        pages[DOCS / "figures.md"] = page_of_figures(pages)
+    return pages, troubles
+
+
 def main(check: bool) -> int:
     """Write the pages that differ, or with ``check`` name them; return the exit code."""
-    differing = [p for p, text in written().items() if not p.is_file() or p.read_text(encoding="utf-8") != text]
+    pages, troubles = figures(written())
+    differing = [p for p, text in pages.items() if not p.is_file() or p.read_text(encoding="utf-8") != text]
+    for trouble in troubles:
+        print(trouble, file=sys.stderr)
     for path in differing:
         print(f"{path.name}: {'would change' if check else 'written'} ({mi_diffind.__version__})")
         if not check:
-            path.write_text(written()[path], encoding="utf-8")
-    return int(check and bool(differing))
+            path.write_text(pages[path], encoding="utf-8")
+    return int(bool(troubles) or (check and bool(differing)))
 
 
 if __name__ == "__main__":

@@ -121,13 +121,13 @@ class Disney(mi.BSDF):
        - |exposed|
 
     The reflection model of *Physically Based Shading at Disney* (Burley 2012), rearranged for speed: equal to the
-    published formulas up to rounding (158 dB). It is the exact counterpart of
+    published formulas up to rounding (159 dB). It is the exact counterpart of
     :ref:`neural_disney <bsdf-neural_disney>`. Names and meaning of the parameters follow Mitsuba's
     :monosp:`principled`: to switch, change ``type``. All parameters but ``eta`` are in [0, 1]: numbers outside are
     refused, textures are clamped.
 
     **The model differs from** :monosp:`principled`: it has Schlick's Fresnel term in place of the dielectric one, which
-    makes images 0.1% to 1% darker, up to 4% in places; it has no transmission; and ``eta`` is limited to 1 to 3.
+    makes images of two scenes 0.1% and 0.8% darker; it has no transmission; and ``eta`` is limited to 1 to 3.
     ``mi-diffind compare --against principled`` shows a scene with both.
 
     **Only the effects in use are computed.** A part of the model that the parameters make zero (``clearcoat`` 0,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 from ...lookup import STORAGES
 from ...measure.formatting import grid
@@ -61,6 +62,49 @@ def _eight_bit_reads(result: dict) -> list[str]:
     return lines
 
 
+@dataclass(frozen=True)
+class EqualQuality:
+    """The smallest member of a family as good as a reference, else its best member.
+
+    ``ratios`` are flops, bytes read, bytes stored and time, relative to the reference; ``paper`` has the paper's first
+    three.
+    """
+
+    family: str
+    name: str
+    psnr_db: float
+    ratios: tuple[float, float, float, float]
+    paper: tuple[float, float, float] | None
+    converged: bool
+    reaches: bool
+
+
+def equal_quality(result: dict, reference: str) -> list[EqualQuality]:
+    """Return a member of each family beside the candidate ``reference``, for the inputs of the paper."""
+    timings, candidates = result["cases"][PLAIN]["queries"]["read"], result["candidates"]
+    goal, operations = _psnr(result, reference), timings[reference]["operations"]
+    rows = []
+    for family, paper in {**PAPER, "hash grid + network": None}.items():
+        members = [
+            name for name in timings
+            if candidates[name]["representation"] == family and candidates[name]["setting"] not in STORAGES[1:]
+            and "raw" not in name and candidates[name]["setting"] != "tensors"
+        ]  # fmt: skip
+        if not members:
+            continue
+        good = [name for name in members if _psnr(result, name) >= goal - EQUAL_DB]
+        name = min(good or members, key=lambda n: candidates[n]["bytes"] if good else -_psnr(result, n))
+        timing = timings[name]
+        ratios = (
+            timing["operations"]["flops"] / operations["flops"],
+            timing["operations"]["bytes_gathered"] / operations["bytes_gathered"],
+            candidates[name]["bytes"] / candidates[reference]["bytes"], timing["time"] / timings[reference]["time"],
+        )  # fmt: skip
+        converged = bool(candidates[name]["converged"])
+        rows.append(EqualQuality(family, name, _psnr(result, name), ratios, paper, converged, bool(good)))
+    return rows
+
+
 def _equal_quality(result: dict, reference: str) -> list[str]:
     """List, for each family, the smallest member as good as the reference and its cost relative to the reference."""
     measured, goal = result["cases"].get(PLAIN), _psnr(result, reference)
@@ -77,26 +121,12 @@ def _equal_quality(result: dict, reference: str) -> list[str]:
     if not candidates[reference]["converged"]:
         return [head, f"  {reference} has not converged: no statement is made"]
     cells, notes = [["", "", "dB", "flops", "bytes read", "bytes", "time"]], ["   the paper's: flops, read, bytes"]
-    for family, paper in {**PAPER, "hash grid + network": None}.items():
-        members = [
-            name for name in timings
-            if candidates[name]["representation"] == family and candidates[name]["setting"] not in STORAGES[1:]
-            and "raw" not in name and candidates[name]["setting"] != "tensors"
-        ]  # fmt: skip
-        if not members:
-            continue
-        good = [name for name in members if _psnr(result, name) >= goal - EQUAL_DB]
-        name = min(good or members, key=lambda n: candidates[n]["bytes"] if good else -_psnr(result, n))
-        timing, candidate = timings[name], candidates[name]
-        ratios = (
-            timing["operations"]["flops"] / flops, timing["operations"]["bytes_gathered"] / bytes_read,
-            candidate["bytes"] / nbytes, timing["time"] / time,
-        )  # fmt: skip
-        cells.append([family, name, f"{_psnr(result, name):.1f}", *(f"{r:.2f}x" for r in ratios)])
-        note = "   " + ", ".join(f"{r:g}x" for r in paper) if paper else ""
-        if not candidate["converged"]:
+    for row in equal_quality(result, reference):
+        cells.append([row.family, row.name, f"{row.psnr_db:.1f}", *(f"{r:.2f}x" for r in row.ratios)])
+        note = "   " + ", ".join(f"{r:g}x" for r in row.paper) if row.paper else ""
+        if not row.converged:
             note += "; has not converged: no statement about equal quality"
-        elif not good:
+        elif not row.reaches:
             note += "; the best of its family, which does NOT reach it"
         notes.append(note)
     return [head, *(line + note for line, note in zip(grid(cells), notes, strict=True))]
