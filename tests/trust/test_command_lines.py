@@ -46,6 +46,8 @@ SHORT = {
     "regress": ["scene.xml", "--spp", "1"],
     "inspect": ["image.npz"],
     "decode": ["image.npz", "-o", "out.png"],
+    "examples": ["scenes"],
+    "fetch": [],  # lists what there is; names would ask other machines
     "fit ggx": ["-o", "out.npz", "--steps", "1", "--batch", "64", "--primary", "4", "--cascaded", "3"],
 }
 
