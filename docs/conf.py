@@ -4,6 +4,8 @@ Warnings are errors: a link to a page, a heading or a file of the repository tha
 External links are checked on request: ``sphinx-build -b linkcheck docs out/links``.
 """
 
+import os
+import re
 import sys
 from pathlib import Path
 
@@ -35,6 +37,9 @@ autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 
 repository_root = str(ROOT)
+#: Address of the repository; without one, the site carries copies of the files that pages link to.
+declared = re.search(r'^Source = "(.+)"$', (ROOT / "pyproject.toml").read_text(encoding="utf-8"), re.MULTILINE)
+repository_url = os.environ.get("MI_DIFFIND_REPOSITORY", declared[1] if declared else "").rstrip("/")
 
 html_theme = "furo"
 html_title = f"mi_diffind {version}"

@@ -41,7 +41,7 @@ CAPTIONS = {
     "on the right, a twelfth of the bytes.",
     "path_footprint": "Filtered tiles in mirror balls, one sample a pixel: ``path`` on the left, "
     "``path_footprint`` on the right.",
-    "path_sdf": "Fields of glass and gold among meshes: they reflect, refract and cast shadows.",
+    "path_sdf": "Fields of glass and gold, beside a ball and before a mirror: they refract, reflect and cast shadows.",
 }
 
 

@@ -73,7 +73,7 @@ def titled(title: str, mark: str = "=") -> list[str]:
 
 def literal(text: str) -> str:
     """Return a text in which reStructuredText finds no markup."""
-    return re.sub(r"([\\*`|_])", r"\\\1", text)
+    return re.sub(r"([\\*`|_]|(?=://))", r"\\\1", text)
 
 
 def toctree(names) -> list[str]:
@@ -290,7 +290,7 @@ def generate(app, config) -> None:
 def other_pages(app, docname: str, source: list[str]) -> None:
     """List, in place of :data:`OTHER`, the pages of ``docs`` that no table of contents of the start page names."""
     if docname == "index":
-        named = {line.strip() for line in source[0].splitlines()}
+        named = {re.sub(r"^.*<(\w+)>$", r"\1", line.strip()) for line in source[0].splitlines()}
         others = sorted(path.stem for path in DOCS.glob("*.md") if path.stem not in named | {"index"})
         source[0] = source[0].replace(OTHER, "\n".join(others))
 

@@ -71,9 +71,9 @@ class Monospaced(SphinxRole):
         page = self.env.config.plugin_pages.get(self.text)
         if page is None or page == self.env.docname:
             return [literal], []
-        link = addnodes.pending_xref(
-            "", literal, refdomain="std", reftype="doc", reftarget=f"/{page}", refexplicit=True, refdoc=self.env.docname
-        )
+        # MyST's link to a page, unlike Sphinx's, keeps the font
+        options = {"refdomain": "doc", "reftype": "myst", "refdoc": self.env.docname, "refexplicit": True}
+        link = addnodes.pending_xref("", literal, reftarget=page, reftargetid=None, **options)
         return [link], []
 
 
