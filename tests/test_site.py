@@ -115,7 +115,7 @@ def test_a_docstring_becomes_a_page(small):
     assert cells[:2] == ["roughness", "float or texture"] and cells[3] == "exposed, differentiable"
     assert re.findall(r'<th class="head"><p>(\w+)</p>', text) == ["Parameter", "Type", "Description", "Flags"]
     assert "<msup>" in text  # a formula without a script
-    linked = re.findall(r'<a [^>]*href="index.html"[^>]*><code[^>]*>(.+?)</code></a>', text)
+    linked = re.findall(r'<a [^>]*href="index.html"[^>]*><span[^>]*><code[^>]*>(.+?)</code>', text)
     assert [re.sub("<.+?>", "", name) for name in linked] == ["other"]
     assert re.search(r"<code[^>]*>(<span[^>]*>)?unknown", text)
     assert re.findall(r'<label class="sd-tab-label"[^>]*>\s*(\w+)', text) == ["XML", "Python"]

@@ -71,9 +71,9 @@ class Monospaced(SphinxRole):
         page = self.env.config.plugin_pages.get(self.text)
         if page is None or page == self.env.docname:
             return [literal], []
-        # MyST's link to a page, unlike Sphinx's, keeps the font
+        # MyST's link to a page keeps the nodes inside of the first child; Sphinx's keeps the text only
         options = {"refdomain": "doc", "reftype": "myst", "refdoc": self.env.docname, "refexplicit": True}
-        link = addnodes.pending_xref("", literal, reftarget=page, reftargetid=None, **options)
+        link = addnodes.pending_xref("", nodes.inline("", "", literal), reftarget=page, reftargetid=None, **options)
         return [link], []
 
 
