@@ -66,8 +66,9 @@ class NeuralDisney(Disney):
     densities are analytic, so they stay normalised although tables are approximate. Only the effects in use are traced,
     read and sampled.
 
-    **``paper`` gains energy** at the horizon, where its masking is inaccurate: at roughness 0.2, ``anisotropic`` 1 and
-    an angle of 89° the mean weight of a sample reaches 2.44, where the exact one stays below 1. ``tables`` does not.
+    The preset ``paper`` **gains energy** at the horizon, where its masking is inaccurate: at roughness 0.2,
+    ``anisotropic`` 1 and an angle of 89° the mean weight of a sample reaches 2.44, where the exact one stays below 1.
+    ``tables`` does not.
 
     {executable}
 

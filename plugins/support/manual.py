@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 import textwrap
+from types import ModuleType
 
 #: Name of a placeholder → the text that stands for it: rows of the parameter table, and paragraphs.
 PARTS = {
@@ -91,9 +93,26 @@ PARTS = {
 
 def shared_parts(plugin: type) -> type:
     """Fill the placeholders ``{NAME}`` (:data:`PARTS`) of a plugin's docstring: a class decorator."""
+    plugin.__doc__ = _filled(plugin.__doc__)
+    return plugin
 
-    def filled(line: re.Match) -> str:
+
+def manual_page(module: ModuleType) -> str:
+    """Return the manual page of a plugin's module, without indentation: its ``MANUAL`` or the docstring of its class.
+
+    Raises ``ValueError`` if it has none.
+    """
+    texts = [getattr(module, "MANUAL", "")]
+    texts += [value.__doc__ or "" for value in vars(module).values() if isinstance(value, type)]
+    name = module.__name__.rpartition(".")[2]
+    for text in texts:
+        if f"(:monosp:`{name}`)" in text and ".. pluginparameters::" in text:
+            return _filled(inspect.cleandoc(text))
+    raise ValueError(f"{module.__name__}: found no manual page, a docstring with a table of parameters is needed")
+
+
+def _filled(text: str) -> str:
+    def part(line: re.Match) -> str:
         return textwrap.indent(textwrap.dedent(PARTS[line[2]]), line[1])
 
-    plugin.__doc__ = re.sub(r"^( *)\{(\w+)\}$", filled, plugin.__doc__, flags=re.MULTILINE)
-    return plugin
+    return re.sub(r"^( *)\{(\w+)\}$", part, text, flags=re.MULTILINE)
