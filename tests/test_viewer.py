@@ -76,7 +76,7 @@ def test_the_camera_moves_as_a_sensor_elsewhere(mi_rgb):
     first = shown.refine()
     to_world = mi_rgb.ScalarTransform4f().look_at(origin, [0, 0, 0], [0, 1, 0])
     place = Pose.of(np.array(to_world.matrix, np.float64))
-    assert shown.look(place) and not shown.look(place)
+    assert shown.move_camera(place) and not shown.move_camera(place)
     assert shown.moving_picture().shape == (HEIGHT, WIDTH, 3)
     for _ in range(3):
         picture = shown.refine()
@@ -253,7 +253,7 @@ def test_refused_input(mi_rgb, tmp_path):
         with pytest.raises(UsageError, match=sentence):
             shown.show(**options)
     with pytest.raises(UsageError, match="camera: found a position or a direction that is not finite"):
-        shown.look(dataclasses.replace(shown.pose, position=np.array([np.nan, 0, 0])))
+        shown.move_camera(dataclasses.replace(shown.pose, position=np.array([np.nan, 0, 0])))
 
 
 def test_pose_of_the_page(rng):
@@ -271,7 +271,7 @@ def test_the_first_view_is_that_of_the_sensor(mi_rgb):
     np.testing.assert_allclose(shown.up(), [0, 1, 0])
     target = shown.target()
     np.testing.assert_allclose(target, 0, atol=1e-5)
-    assert not shown.look(dataclasses.replace(shown.start, position=shown.start.position + 1e-9))
+    assert not shown.move_camera(dataclasses.replace(shown.start, position=shown.start.position + 1e-9))
 
 
 def test_bars_beside_a_picture(rng):

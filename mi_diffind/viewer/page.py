@@ -174,7 +174,7 @@ class Page:
                 client.camera.up_direction = tuple(session.up())
                 client.camera.position = tuple(session.start.position)
                 client.camera.look_at = tuple(session.target())
-        self._look(session.start)
+        self._move(session.start)
 
     # -- events of viser, in its threads ------------------------------------------------------------------------------
 
@@ -223,7 +223,7 @@ class Page:
             self._show(self.session.picture())
         with self._lock:
             camera, self._camera = self._camera, None
-        if camera is not None and self._look(pose(*camera)):
+        if camera is not None and self._move(pose(*camera)):
             self._show(self.session.moving_picture())
             return True
         if self.session.moving and time.monotonic() - self._moved < QUIET:
@@ -235,8 +235,8 @@ class Page:
             return True
         return worked
 
-    def _look(self, place: Pose) -> bool:
-        moved = self.session.look(place)
+    def _move(self, place: Pose) -> bool:
+        moved = self.session.move_camera(place)
         if moved:
             self._moved = time.monotonic()
         return moved

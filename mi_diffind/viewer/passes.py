@@ -14,7 +14,7 @@ import numpy as np
 
 from .. import compat, scenes
 from ..plugins.support import footprint
-from .parameters import Parameters
+from .parameters import NamedParameters
 
 #: Passes of a size, the first ones, whose times include compilation and recording.
 SETTLED = 3
@@ -23,7 +23,7 @@ SETTLED = 3
 RECORDED = 12
 
 
-class Side:
+class RenderedSide:
     """Scene, the sum of its passes, and renders that repeat without tracing.
 
     ``oversampling``: passes for each pass of the scene as written.
@@ -33,7 +33,7 @@ class Side:
         self.scene, self.oversampling = scene, oversampling
         self.sensor = scene.sensors()[0]
         self.placement = mi.traverse(self.sensor)
-        self.parameters = Parameters(scene)
+        self.parameters = NamedParameters(scene)
         self.by_pixels = samples_pixels(scene)
         self.region: tuple[int, int, int, int] = (0, 0, 0, 0)
         self.grids: dict[tuple[int, int, int, int], tuple] = {}

@@ -16,8 +16,8 @@ from .. import compat, metrics, plugins, scenes, srgb
 from ..errors import DiffindError, UsageError
 from ..orbit import middle
 from ..runtime import use_variant
-from .parameters import Parameter, counterparts
-from .passes import Side
+from .parameters import NamedParameter, counterparts
+from .passes import RenderedSide
 from .table_scene import table_scene
 
 #: Contents of the picture.
@@ -118,7 +118,7 @@ class Session:
         self.table_bytes = self._parsed.table_bytes(self._parsed.learned_plugins())
         self._place()
 
-    def _load(self, chosen: Mapping[str, str]) -> tuple[Side, Side | None, str]:
+    def _load(self, chosen: Mapping[str, str]) -> tuple[RenderedSide, RenderedSide | None, str]:
         def change(state):
             _resize(state, self._width)
             for props, plugin in _of_plugins(state):
@@ -132,14 +132,14 @@ class Session:
         names = tuple(dict.fromkeys((self.against, "exact")))
         replaced = self._parsed.learned_plugins(names)
         if not replaced:
-            return Side(learned, 1), None, "the scene names no learned plugin, so there is nothing to compare"
+            return RenderedSide(learned, 1), None, "the scene names no learned plugin, so there is nothing to compare"
         declared = plugins.declared()
         oversampling = max(declared[entry["plugin"]].counterpart(names).oversampling for entry in replaced)
         try:
             exact = self._parsed.load(exact=True, against=names, change=change)
         except DiffindError as e:
-            return Side(learned, 1), None, str(e)
-        return Side(learned, 1), Side(exact, oversampling), ""
+            return RenderedSide(learned, 1), None, str(e)
+        return RenderedSide(learned, 1), RenderedSide(exact, oversampling), ""
 
     # -- what is shown ------------------------------------------------------------------------------------------------
 
@@ -167,7 +167,7 @@ class Session:
             if len({side.passes for side in self._visible()}) > 1 or self.passes == 0:
                 self._restart()
 
-    def _visible(self) -> list[Side]:
+    def _visible(self) -> list[RenderedSide]:
         if self.exact is None or self.view == "learned":
             return [self.learned]
         return [self.exact] if self.view == "exact" else [self.learned, self.exact]
@@ -179,7 +179,7 @@ class Session:
         """Camera."""
         return self._pose
 
-    def look(self, pose: Pose) -> bool:
+    def move_camera(self, pose: Pose) -> bool:
         """Move the camera, and return whether it moved; the next :meth:`moving_picture` shows it."""
         if not np.isfinite(pose.matrix).all():
             raise UsageError("camera: found a position or a direction that is not finite")
@@ -281,8 +281,8 @@ class Session:
     # -- values -------------------------------------------------------------------------------------------------------
 
     @property
-    def parameters(self) -> dict[str, Parameter]:
-        """Numbers and colours of the scene by their paths (:class:`.parameters.Parameters`)."""
+    def parameters(self) -> dict[str, NamedParameter]:
+        """Numbers and colours of the scene by their paths (:class:`.parameters.NamedParameters`)."""
         return self.learned.parameters.listed
 
     def set(self, values: Mapping[str, object]) -> None:

@@ -45,7 +45,7 @@ def turned(pose, centre, up, degrees):
 def shown(session, pose) -> tuple[float, tuple[int, int]]:
     """Seconds of a picture from a pose, and its size."""
     start = time.perf_counter()
-    session.look(pose)
+    session.move_camera(pose)
     picture = session.moving_picture()
     Image.fromarray(picture).save(BytesIO(), "JPEG", quality=QUALITY[0])
     return time.perf_counter() - start, picture.shape[1::-1]
@@ -54,7 +54,7 @@ def shown(session, pose) -> tuple[float, tuple[int, int]]:
 def by_mitsuba(session, pose, seed) -> float:
     """Seconds of the same picture by ``mi.render``, both sides as a whole."""
     start = time.perf_counter()
-    session.look(pose)
+    session.move_camera(pose)
     session._place()
     images = [scenes.render_pass(side.scene, 1, seed) for side in (session.learned, session.exact) if side]
     for image in images:
