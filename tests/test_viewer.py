@@ -64,6 +64,17 @@ def test_a_picture_is_the_mean_of_mitsubas_passes(mi_rgb, integrator):
     )
 
 
+def test_every_variant_shows_a_picture(mi_any):
+    """Spectral and polarised ones by whole renders of Mitsuba; pixels of mono variants are grey."""
+    shown = Session(content(mi_any), WIDTH, seed=3)
+    for _ in range(2):
+        picture = shown.refine()
+    assert picture.shape == (HEIGHT, WIDTH, 3) and 20 < picture.mean() < 250
+    expected = scenes.colour_channels(reference(mi_any, 2))
+    np.testing.assert_allclose(shown.learned.image, np.broadcast_to(expected, (HEIGHT, WIDTH, 3)), atol=1e-4)
+    assert shown.learned.by_pixels == (not mi_any.is_spectral and not mi_any.is_polarized)
+
+
 def test_an_integrator_without_rays_of_a_camera_is_rendered_by_mitsuba(mi_rgb):
     shown = Session(content(mi_rgb, "ptracer"), WIDTH, seed=3)
     shown.refine()
@@ -187,8 +198,12 @@ def test_a_choice_loads_the_scene_again(mi_rgb):
     for _ in range(3):
         shown.refine()
     np.testing.assert_allclose(shown.learned.image, reference(mi_rgb, roughness=0.9, preset="paper"), atol=1e-4)
+    paper = mi_diffind.open(task="disney", preset="paper", storage="uint8")
+    assert shown.figures["table_bytes"] == paper.nbytes
+    shown.choose("storage", "float32")
+    assert shown.figures["table_bytes"] == 4 * paper.nbytes
     shown.choose("preset", "as written")
-    assert shown.chosen == {}
+    assert shown.chosen == {"storage": "float32"}
     for name, word in (("preset", "x"), ("colour", "x")):
         with pytest.raises(UsageError, match=rf'{name}: found "x", allowed are '):
             shown.choose(name, word)

@@ -135,6 +135,9 @@ def test_the_page(chromium, served, tmp_path):
         moved = picture(page, tmp_path / "moved.png")
         assert np.abs(moved - first).mean() > 3
 
+        page.get_by_role("button", name="first view").click()
+        assert np.abs(picture(page, tmp_path / "back.png") - first).mean() < 1
+
         # A slider of a plugin
         after(page, "find", "input").fill("paint.metallic")
         wait_for(page, "metallic")
@@ -142,7 +145,7 @@ def test_the_page(chromium, served, tmp_path):
         slider.focus()
         slider.press("End")
         changed = picture(page, tmp_path / "changed.png")
-        assert np.abs(changed - moved).mean() > 3
+        assert np.abs(changed - first).mean() > 3
         assert not complaints, complaints
     assert listening(process.pid) == {"0100007F"}  # 127.0.0.1 alone
     process.send_signal(signal.SIGINT)

@@ -69,6 +69,7 @@ class Page:
         self._lock, self._wake = threading.Lock(), threading.Event()
         self._moved, self._sent = -math.inf, -math.inf
         self._message, self._picture = "", None
+        self._halted = False  # after a refused picture, until something changes
         self._values: dict[str, object] = {}  # parameters that were asked to change, and have not
         self._controls()
         self.server.on_client_connect(self._connected)
@@ -196,7 +197,8 @@ class Page:
     def run(self, stop: threading.Event, seconds: float | None = None) -> None:
         """Render until ``stop`` is set, or for some seconds: while the camera moves, then until all samples are there.
 
-        A refusal of a value is shown on the page, and the scene stays as it was.
+        A refusal is shown on the page, and the scene stays as it was. Raises
+        :class:`~mi_diffind.scenes.SceneError` if the scene cannot be rendered at all.
         """
         start = time.monotonic()
         while not stop.is_set() and (seconds is None or time.monotonic() - start < seconds):
@@ -204,7 +206,9 @@ class Page:
             try:
                 busy = self._step()
             except DiffindError as e:
-                self._message, busy = str(e), False
+                if self._picture is None:  # a scene that cannot be rendered at all
+                    raise
+                self._message, self._halted, busy = str(e), True, False
                 self._show(None)
             if not busy:
                 self._wake.wait(0.1)
@@ -217,18 +221,23 @@ class Page:
                 request = self._requests.get_nowait()
             except queue.Empty:
                 break
-            self._message, worked = "", True
-            request()
-        if worked and self._picture is not None and self.session.passes:
-            self._show(self.session.picture())
+            self._message, self._halted, worked = "", False, True
+            try:
+                request()
+            except DiffindError as e:
+                self._message = str(e)
+                self._list_parameters()  # sliders of the values that the scene kept
+        if worked:
+            self._show(self.session.picture() if self._picture is not None and self.session.passes else None)
         with self._lock:
             camera, self._camera = self._camera, None
         if camera is not None and self._move(pose(*camera)):
+            self._halted = False
             self._show(self.session.moving_picture())
             return True
         if self.session.moving and time.monotonic() - self._moved < QUIET:
             return worked
-        if not self.session.finished:
+        if not self.session.finished and not self._halted:
             picture = self.session.refine()
             if self.session.finished or time.monotonic() - self._sent > INTERVAL:
                 self._show(picture)

@@ -114,8 +114,8 @@ class Session:
         self._pose, self._residue = self.start, np.linalg.inv(self.start.matrix) @ self._written
         self.view = VIEWS[0] if self.exact else VIEWS[1]
         self.divider, self.gain = 0.5, 10.0
+        self.table_bytes = self._bytes({})
         self.moving, self.reduction, self.pictures = False, REDUCTIONS[0], 0
-        self.table_bytes = self._parsed.table_bytes(self._parsed.learned_plugins())
         self._place()
 
     def _load(self, chosen: Mapping[str, str]) -> tuple[RenderedSide, RenderedSide | None, str]:
@@ -140,6 +140,16 @@ class Session:
         except DiffindError as e:
             return RenderedSide(learned, 1), None, str(e)
         return RenderedSide(learned, 1), RenderedSide(exact, oversampling), ""
+
+    def _bytes(self, chosen: Mapping[str, str]) -> int:
+        """Return the bytes of all tables, with another preset or storage form if it was chosen."""
+        entries = self._parsed.learned_plugins()
+        for entry in entries:
+            options = plugins.declared()[entry["plugin"]].choices
+            for name, word in chosen.items():
+                if word in options.get(name, ()) and not (name == "preset" and "filename" in entry):
+                    entry[name] = word
+        return self._parsed.table_bytes(entries)
 
     # -- what is shown ------------------------------------------------------------------------------------------------
 
@@ -338,9 +348,9 @@ class Session:
         chosen = {**self._chosen, name: word}
         if word == AS_WRITTEN:
             del chosen[name]
-        sides = self._load(chosen)
+        sides, table_bytes = self._load(chosen), self._bytes(chosen)
         self.learned, self.exact, self.refusal = sides
-        self._chosen = chosen
+        self._chosen, self.table_bytes = chosen, table_bytes
         if self.view not in self.views:
             self.view = self.views[0]
         kept = {path: value for path, value in self._values.items() if path in self.learned.parameters}

@@ -91,7 +91,7 @@ def measure(name: str, pictures: int) -> dict:
         seconds, adapted_size = shown(session, turned(session.start, centre, up, 0.7 * step))
         adapted.append(seconds)
         sizes.append(list(adapted_size))
-    path = next(path for path, p in session.parameters.items() if not p.is_colour and p.high == 1)
+    path = next(path for path in session.parameters if path.endswith("roughness"))
     changes = []
     for i in range(6):
         start_change = time.perf_counter()
