@@ -14,7 +14,8 @@ import mi_diffind
 from mi_diffind import scenes, srgb
 from mi_diffind.cli import main
 from mi_diffind.errors import UsageError
-from mi_diffind.viewer.page import padded, pose, server, status_lines
+from mi_diffind.viewer import passes
+from mi_diffind.viewer.page import Page, padded, pose, server, status_lines
 from mi_diffind.viewer.session import Pose, Session, combined
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -189,6 +190,34 @@ def test_refused_values_leave_the_scene(mi_rgb, values, sentence):
     assert shown.learned.parameters.value("ball.bsdf.metallic") == 0 and not shown.figures["values"]
 
 
+def test_renders_that_cannot_be_recorded_are_traced_each_time(mi_rgb, monkeypatch):
+    def refuse(function):
+        def recorded(*arguments):
+            raise RuntimeError("cannot be recorded")
+
+        return recorded
+
+    monkeypatch.setattr(passes.dr, "freeze", refuse)
+    shown = session(mi_rgb)
+    for _ in range(3):
+        shown.refine()
+    assert shown.learned.frozen is None
+    np.testing.assert_allclose(shown.learned.image, reference(mi_rgb), atol=2e-6)
+
+
+def test_a_scene_that_cannot_be_rendered_is_one_sentence(mi_rgb, monkeypatch):
+    def fail(*arguments):
+        raise RuntimeError("[path.cpp:12] no light")
+
+    shown = session(mi_rgb)
+    with monkeypatch.context() as patched:
+        patched.setattr(passes, "_sample_pixels", fail)
+        with pytest.raises(scenes.SceneError, match="^no light$"):
+            shown.refine()
+    shown.refine()  # nothing stays behind
+    assert shown.figures["samples"] == 1 and shown.learned.frozen
+
+
 def test_a_choice_loads_the_scene_again(mi_rgb):
     """With the values that were set, and from where the camera is; the exact side has no such choice."""
     shown = session(mi_rgb)
@@ -316,6 +345,39 @@ def test_addresses_that_cannot_be_served():
         ):
             with pytest.raises(UsageError, match=sentence):
                 server(host, number)
+
+
+def test_requests_of_the_page(mi_rgb):
+    """Without a browser: a moved camera, a value, a refused one, which the page reports, and all samples."""
+    pytest.importorskip("viser", reason="the optional package viser is not installed")
+    served = server("127.0.0.1", 0)
+    try:
+        shown = session(mi_rgb, spp=2)
+        page = Page(shown, served)
+        while page._step():
+            pass
+        assert shown.finished and "**samples** 2 of 2" in page._status.content
+        before = page._picture
+        page._camera = (np.array([0.0, 1.0, 0.0, 0.0]), np.array([0.2, 0.0, 4.0]))
+        assert page._step() and shown.moving and shown.pose.position[2] == 4
+        np.testing.assert_allclose(shown.pose.forward, [0, 0, -1], atol=1e-12)
+        assert (page._picture != before).any()
+        page._change("ball.bsdf.roughness", 0.7)
+        page._change("ball.bsdf.roughness", 0.8)  # the newest counts
+        page._step()
+        assert shown.figures["values"] == {"ball.bsdf.roughness": 0.8}
+        page._change("ball.bsdf.roughness", float("nan"))
+        page._step()
+        assert 'parameter "ball.bsdf.roughness": found nan' in page._status.content
+        assert shown.figures["values"] == {"ball.bsdf.roughness": 0.8}
+        page._search.value = "base_color"
+        page._list_parameters()
+        assert len(page._folders) == 1
+        page._ask(page._first_view)
+        page._step()
+        assert shown.pose is shown.start
+    finally:
+        served.stop()
 
 
 def test_the_command_serves_a_page(mi_rgb, tmp_path, monkeypatch, capsys):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import io
 import math
 import queue
@@ -15,6 +16,7 @@ import numpy as np
 
 from .. import srgb
 from ..errors import DiffindError, UsageError
+from .passes import no_collection
 from .session import Pose, Session
 
 #: Seconds without a movement after which the picture is refined.
@@ -28,6 +30,9 @@ STEPS = 200
 
 #: Quality of pictures as JPEG, while the camera moves and else.
 QUALITY = (75, 92)
+
+#: Seconds between two collections of garbage.
+COLLECTED = 20.0
 
 #: Seconds between two refined pictures that are sent; all samples are in each.
 INTERVAL = 0.1
@@ -200,18 +205,22 @@ class Page:
         A refusal is shown on the page, and the scene stays as it was. Raises
         :class:`~mi_diffind.scenes.SceneError` if the scene cannot be rendered at all.
         """
-        start = time.monotonic()
-        while not stop.is_set() and (seconds is None or time.monotonic() - start < seconds):
-            self._wake.clear()
-            try:
-                busy = self._step()
-            except DiffindError as e:
-                if self._picture is None:  # a scene that cannot be rendered at all
-                    raise
-                self._message, self._halted, busy = str(e), True, False
-                self._show(None)
-            if not busy:
-                self._wake.wait(0.1)
+        start = collected = time.monotonic()
+        with no_collection():  # in this thread alone: those of viser must not free what is rendered here
+            while not stop.is_set() and (seconds is None or time.monotonic() - start < seconds):
+                self._wake.clear()
+                try:
+                    busy = self._step()
+                except DiffindError as e:
+                    if self._picture is None:  # a scene that cannot be rendered at all
+                        raise
+                    self._message, self._halted, busy = str(e), True, False
+                    self._show(None)
+                if time.monotonic() - collected > COLLECTED:
+                    gc.collect()
+                    collected = time.monotonic()
+                if not busy:
+                    self._wake.wait(0.1)
 
     def _step(self) -> bool:
         """Do the next piece of work; return whether there was one."""

@@ -17,7 +17,7 @@ from ..errors import DiffindError, UsageError
 from ..orbit import middle
 from ..runtime import use_variant
 from .parameters import NamedParameter, counterparts
-from .passes import RenderedSide
+from .passes import RenderedSide, no_collection
 from .table_scene import table_scene
 
 #: Contents of the picture.
@@ -126,7 +126,8 @@ class Session:
                     if _has_choice(props, plugin, name) and word in plugin.choices[name]:
                         props[name] = word
 
-        learned = self._parsed.load(change=change)
+        with no_collection():
+            learned = self._parsed.load(change=change)
         if not learned.sensors():
             raise scenes.SceneError(f"{self._parsed.path}: has no sensor")
         names = tuple(dict.fromkeys((self.against, "exact")))
@@ -136,7 +137,8 @@ class Session:
         declared = plugins.declared()
         oversampling = max(declared[entry["plugin"]].counterpart(names).oversampling for entry in replaced)
         try:
-            exact = self._parsed.load(exact=True, against=names, change=change)
+            with no_collection():
+                exact = self._parsed.load(exact=True, against=names, change=change)
         except DiffindError as e:
             return RenderedSide(learned, 1), None, str(e)
         return RenderedSide(learned, 1), RenderedSide(exact, oversampling), ""
