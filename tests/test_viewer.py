@@ -212,7 +212,7 @@ def test_a_scene_that_cannot_be_rendered_is_one_sentence(mi_rgb, monkeypatch):
     shown = session(mi_rgb)
     with monkeypatch.context() as patched:
         patched.setattr(passes, "_sample_pixels", fail)
-        with pytest.raises(scenes.SceneError, match="^no light$"):
+        with pytest.raises(scenes.SceneError, match=r"^no light$"):
             shown.refine()
     shown.refine()  # nothing stays behind
     assert shown.figures["samples"] == 1 and shown.learned.frozen
