@@ -742,6 +742,18 @@ def trust() -> str:
     return table(head, rows)
 
 
+def viewer() -> str:
+    """Return pictures a second of the viewer."""
+    rows = []
+    for row in measured("bench_view")["rows"]:
+        sides, (width, height) = "" if row["sides"] == 2 else ", learned side only", row["size"]
+        rows.append([
+            f"`{row['scene']}.xml`{sides}", f"{width} x {height}", f"{row['pictures_a_second']:.1f}",
+            f"{row['speedup']:.1f}", f"{row['seconds_changed']['median']:.2f}",
+        ])  # fmt: skip
+    return table(["scene", "pixels", "pictures a second", "speedup", "s after a slider moved"], rows)
+
+
 def mean(values) -> float:
     """Return the mean of an iterable."""
     values = list(values)
@@ -797,6 +809,7 @@ TABLES |= {
 }  # fmt: skip
 for source, study in (("", "tradeoff_texture"), ("_boombox", "texture_levels_boombox")):
     TABLES["texture_levels" + source] = lambda study=study: texture_levels(measured(study))
+TABLES["viewer"] = viewer
 
 
 def film_errors() -> str:

@@ -14,7 +14,8 @@ import mi_diffind
 from mi_diffind import scenes, srgb
 from mi_diffind.cli import main
 from mi_diffind.errors import UsageError
-from mi_diffind.viewer.page import padded, pose, server, status_lines
+from mi_diffind.viewer import passes
+from mi_diffind.viewer.page import Page, padded, pose, server, status_lines
 from mi_diffind.viewer.session import Pose, Session, combined
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -64,6 +65,17 @@ def test_a_picture_is_the_mean_of_mitsubas_passes(mi_rgb, integrator):
     )
 
 
+def test_every_variant_shows_a_picture(mi_any):
+    """Spectral and polarised ones by whole renders of Mitsuba; pixels of mono variants are grey."""
+    shown = Session(content(mi_any), WIDTH, seed=3)
+    for _ in range(2):
+        picture = shown.refine()
+    assert picture.shape == (HEIGHT, WIDTH, 3) and 20 < picture.mean() < 250
+    expected = scenes.colour_channels(reference(mi_any, 2))
+    np.testing.assert_allclose(shown.learned.image, np.broadcast_to(expected, (HEIGHT, WIDTH, 3)), atol=1e-4)
+    assert shown.learned.by_pixels == (not mi_any.is_spectral and not mi_any.is_polarized)
+
+
 def test_an_integrator_without_rays_of_a_camera_is_rendered_by_mitsuba(mi_rgb):
     shown = Session(content(mi_rgb, "ptracer"), WIDTH, seed=3)
     shown.refine()
@@ -76,7 +88,7 @@ def test_the_camera_moves_as_a_sensor_elsewhere(mi_rgb):
     first = shown.refine()
     to_world = mi_rgb.ScalarTransform4f().look_at(origin, [0, 0, 0], [0, 1, 0])
     place = Pose.of(np.array(to_world.matrix, np.float64))
-    assert shown.look(place) and not shown.look(place)
+    assert shown.move_camera(place) and not shown.move_camera(place)
     assert shown.moving_picture().shape == (HEIGHT, WIDTH, 3)
     for _ in range(3):
         picture = shown.refine()
@@ -178,6 +190,34 @@ def test_refused_values_leave_the_scene(mi_rgb, values, sentence):
     assert shown.learned.parameters.value("ball.bsdf.metallic") == 0 and not shown.figures["values"]
 
 
+def test_renders_that_cannot_be_recorded_are_traced_each_time(mi_rgb, monkeypatch):
+    def refuse(function):
+        def recorded(*arguments):
+            raise RuntimeError("cannot be recorded")
+
+        return recorded
+
+    monkeypatch.setattr(passes.dr, "freeze", refuse)
+    shown = session(mi_rgb)
+    for _ in range(3):
+        shown.refine()
+    assert shown.learned.frozen is None
+    np.testing.assert_allclose(shown.learned.image, reference(mi_rgb), atol=2e-6)
+
+
+def test_a_scene_that_cannot_be_rendered_is_one_sentence(mi_rgb, monkeypatch):
+    def fail(*arguments):
+        raise RuntimeError("[path.cpp:12] no light")
+
+    shown = session(mi_rgb)
+    with monkeypatch.context() as patched:
+        patched.setattr(passes, "_sample_pixels", fail)
+        with pytest.raises(scenes.SceneError, match=r"^no light$"):
+            shown.refine()
+    shown.refine()  # nothing stays behind
+    assert shown.figures["samples"] == 1 and shown.learned.frozen
+
+
 def test_a_choice_loads_the_scene_again(mi_rgb):
     """With the values that were set, and from where the camera is; the exact side has no such choice."""
     shown = session(mi_rgb)
@@ -187,8 +227,12 @@ def test_a_choice_loads_the_scene_again(mi_rgb):
     for _ in range(3):
         shown.refine()
     np.testing.assert_allclose(shown.learned.image, reference(mi_rgb, roughness=0.9, preset="paper"), atol=1e-4)
+    paper = mi_diffind.open(task="disney", preset="paper", storage="uint8")
+    assert shown.figures["table_bytes"] == paper.nbytes
+    shown.choose("storage", "float32")
+    assert shown.figures["table_bytes"] == 4 * paper.nbytes
     shown.choose("preset", "as written")
-    assert shown.chosen == {}
+    assert shown.chosen == {"storage": "float32"}
     for name, word in (("preset", "x"), ("colour", "x")):
         with pytest.raises(UsageError, match=rf'{name}: found "x", allowed are '):
             shown.choose(name, word)
@@ -253,7 +297,7 @@ def test_refused_input(mi_rgb, tmp_path):
         with pytest.raises(UsageError, match=sentence):
             shown.show(**options)
     with pytest.raises(UsageError, match="camera: found a position or a direction that is not finite"):
-        shown.look(dataclasses.replace(shown.pose, position=np.array([np.nan, 0, 0])))
+        shown.move_camera(dataclasses.replace(shown.pose, position=np.array([np.nan, 0, 0])))
 
 
 def test_pose_of_the_page(rng):
@@ -271,7 +315,7 @@ def test_the_first_view_is_that_of_the_sensor(mi_rgb):
     np.testing.assert_allclose(shown.up(), [0, 1, 0])
     target = shown.target()
     np.testing.assert_allclose(target, 0, atol=1e-5)
-    assert not shown.look(dataclasses.replace(shown.start, position=shown.start.position + 1e-9))
+    assert not shown.move_camera(dataclasses.replace(shown.start, position=shown.start.position + 1e-9))
 
 
 def test_bars_beside_a_picture(rng):
@@ -301,6 +345,39 @@ def test_addresses_that_cannot_be_served():
         ):
             with pytest.raises(UsageError, match=sentence):
                 server(host, number)
+
+
+def test_requests_of_the_page(mi_rgb):
+    """Without a browser: a moved camera, a value, a refused one, which the page reports, and all samples."""
+    pytest.importorskip("viser", reason="the optional package viser is not installed")
+    served = server("127.0.0.1", 0)
+    try:
+        shown = session(mi_rgb, spp=2)
+        page = Page(shown, served)
+        while page._step():
+            pass
+        assert shown.finished and "**samples** 2 of 2" in page._status.content
+        before = page._picture
+        page._camera = (np.array([0.0, 1.0, 0.0, 0.0]), np.array([0.2, 0.0, 4.0]))
+        assert page._step() and shown.moving and shown.pose.position[2] == 4
+        np.testing.assert_allclose(shown.pose.forward, [0, 0, -1], atol=1e-12)
+        assert (page._picture != before).any()
+        page._change("ball.bsdf.roughness", 0.7)
+        page._change("ball.bsdf.roughness", 0.8)  # the newest counts
+        page._step()
+        assert shown.figures["values"] == {"ball.bsdf.roughness": 0.8}
+        page._change("ball.bsdf.roughness", float("nan"))
+        page._step()
+        assert 'parameter "ball.bsdf.roughness": found nan' in page._status.content
+        assert shown.figures["values"] == {"ball.bsdf.roughness": 0.8}
+        page._search.value = "base_color"
+        page._list_parameters()
+        assert len(page._folders) == 1
+        page._ask(page._first_view)
+        page._step()
+        assert shown.pose is shown.start
+    finally:
+        served.stop()
 
 
 def test_the_command_serves_a_page(mi_rgb, tmp_path, monkeypatch, capsys):

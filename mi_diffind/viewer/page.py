@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import io
 import math
 import queue
@@ -15,6 +16,7 @@ import numpy as np
 
 from .. import srgb
 from ..errors import DiffindError, UsageError
+from .passes import no_collection
 from .session import Pose, Session
 
 #: Seconds without a movement after which the picture is refined.
@@ -28,6 +30,9 @@ STEPS = 200
 
 #: Quality of pictures as JPEG, while the camera moves and else.
 QUALITY = (75, 92)
+
+#: Seconds between two collections of garbage.
+COLLECTED = 20.0
 
 #: Seconds between two refined pictures that are sent; all samples are in each.
 INTERVAL = 0.1
@@ -69,6 +74,7 @@ class Page:
         self._lock, self._wake = threading.Lock(), threading.Event()
         self._moved, self._sent = -math.inf, -math.inf
         self._message, self._picture = "", None
+        self._halted = False  # after a refused picture, until something changes
         self._values: dict[str, object] = {}  # parameters that were asked to change, and have not
         self._controls()
         self.server.on_client_connect(self._connected)
@@ -174,7 +180,7 @@ class Page:
                 client.camera.up_direction = tuple(session.up())
                 client.camera.position = tuple(session.start.position)
                 client.camera.look_at = tuple(session.target())
-        self._look(session.start)
+        self._move(session.start)
 
     # -- events of viser, in its threads ------------------------------------------------------------------------------
 
@@ -196,18 +202,25 @@ class Page:
     def run(self, stop: threading.Event, seconds: float | None = None) -> None:
         """Render until ``stop`` is set, or for some seconds: while the camera moves, then until all samples are there.
 
-        A refusal of a value is shown on the page, and the scene stays as it was.
+        A refusal is shown on the page, and the scene stays as it was. Raises
+        :class:`~mi_diffind.scenes.SceneError` if the scene cannot be rendered at all.
         """
-        start = time.monotonic()
-        while not stop.is_set() and (seconds is None or time.monotonic() - start < seconds):
-            self._wake.clear()
-            try:
-                busy = self._step()
-            except DiffindError as e:
-                self._message, busy = str(e), False
-                self._show(None)
-            if not busy:
-                self._wake.wait(0.1)
+        start = collected = time.monotonic()
+        with no_collection():  # in this thread alone: those of viser must not free what is rendered here
+            while not stop.is_set() and (seconds is None or time.monotonic() - start < seconds):
+                self._wake.clear()
+                try:
+                    busy = self._step()
+                except DiffindError as e:
+                    if self._picture is None:  # a scene that cannot be rendered at all
+                        raise
+                    self._message, self._halted, busy = str(e), True, False
+                    self._show(None)
+                if time.monotonic() - collected > COLLECTED:
+                    gc.collect()
+                    collected = time.monotonic()
+                if not busy:
+                    self._wake.wait(0.1)
 
     def _step(self) -> bool:
         """Do the next piece of work; return whether there was one."""
@@ -217,26 +230,31 @@ class Page:
                 request = self._requests.get_nowait()
             except queue.Empty:
                 break
-            self._message, worked = "", True
-            request()
-        if worked and self._picture is not None and self.session.passes:
-            self._show(self.session.picture())
+            self._message, self._halted, worked = "", False, True
+            try:
+                request()
+            except DiffindError as e:
+                self._message = str(e)
+                self._list_parameters()  # sliders of the values that the scene kept
+        if worked:
+            self._show(self.session.picture() if self._picture is not None and self.session.passes else None)
         with self._lock:
             camera, self._camera = self._camera, None
-        if camera is not None and self._look(pose(*camera)):
+        if camera is not None and self._move(pose(*camera)):
+            self._halted = False
             self._show(self.session.moving_picture())
             return True
         if self.session.moving and time.monotonic() - self._moved < QUIET:
             return worked
-        if not self.session.finished:
+        if not self.session.finished and not self._halted:
             picture = self.session.refine()
             if self.session.finished or time.monotonic() - self._sent > INTERVAL:
                 self._show(picture)
             return True
         return worked
 
-    def _look(self, place: Pose) -> bool:
-        moved = self.session.look(place)
+    def _move(self, place: Pose) -> bool:
+        moved = self.session.move_camera(place)
         if moved:
             self._moved = time.monotonic()
         return moved

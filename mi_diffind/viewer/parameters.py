@@ -22,7 +22,7 @@ WIDEST = 100
 
 
 @dataclass(frozen=True)
-class Parameter:
+class NamedParameter:
     """A number or a colour of a scene.
 
     ``owner`` is the name of the object that groups it, ``name`` its name within. ``value`` is a number or the three
@@ -46,8 +46,8 @@ class Parameter:
         return isinstance(self.value, tuple)
 
 
-class Parameters:
-    """Scalars and colours of a loaded scene, by :attr:`Parameter.path`; objects of this package's plugins come first.
+class NamedParameters:
+    """Scalars and colours of a loaded scene, by :attr:`NamedParameter.path`; this package's plugins come first.
 
     A parameter of ``mi.traverse`` is listed if it is one number or one colour, and finite. Tables, transformations,
     switches and whole numbers are not.
@@ -70,7 +70,7 @@ class Parameters:
             owner, _, inner = owners[path].partition(".") if not owners[path].startswith("(") else _nested(owners[path])
             name = ".".join(filter(None, (inner, key[len(path) :].strip("."))))
             limits = OF_SENSORS.get(name) or _limits(value)
-            parameter = Parameter(owner, name.removesuffix(".value") or "value", value, *limits)
+            parameter = NamedParameter(owner, name.removesuffix(".value") or "value", value, *limits)
             if parameter.path not in self._keys:
                 self._keys[parameter.path] = key
                 listed.append((_is_ours(paths, path), parameter))
@@ -114,7 +114,7 @@ class Parameters:
         return numbers
 
 
-def counterparts(paths: Iterable[str], exact: Parameters) -> dict[str, str]:
+def counterparts(paths: Iterable[str], exact: NamedParameters) -> dict[str, str]:
     """Return the parameters of the exact scene by those of the learned one, as far as both have them.
 
     Objects without an id are named by their plugin, which differs between the two.

@@ -14,7 +14,7 @@ import numpy as np
 
 from .. import compat, scenes
 from ..plugins.support import footprint
-from .parameters import Parameters
+from .parameters import NamedParameters
 
 #: Passes of a size, the first ones, whose times include compilation and recording.
 SETTLED = 3
@@ -23,7 +23,7 @@ SETTLED = 3
 RECORDED = 12
 
 
-class Side:
+class RenderedSide:
     """Scene, the sum of its passes, and renders that repeat without tracing.
 
     ``oversampling``: passes for each pass of the scene as written.
@@ -33,7 +33,7 @@ class Side:
         self.scene, self.oversampling = scene, oversampling
         self.sensor = scene.sensors()[0]
         self.placement = mi.traverse(self.sensor)
-        self.parameters = Parameters(scene)
+        self.parameters = NamedParameters(scene)
         self.by_pixels = samples_pixels(scene)
         self.region: tuple[int, int, int, int] = (0, 0, 0, 0)
         self.grids: dict[tuple[int, int, int, int], tuple] = {}
@@ -99,18 +99,17 @@ class Side:
         self.counts[self.region] = self.counts.get(self.region, 0) + 1
         arguments = (*self.grids[self.region], dr.opaque(mi.UInt32, seed), spp)
         render = _sample_pixels if self.by_pixels else _render_film
-        with scenes.scene_errors(None), dr.suspend_grad():
+        with scenes.scene_errors(None), dr.suspend_grad(), no_collection():
             values = None
             if self.frozen is not None:
                 if self.region not in self.frozen:
                     self.frozen[self.region] = dr.freeze(render)
-                try:
-                    with no_collection():
-                        values = np.array(self.frozen[self.region](self.scene, *arguments))
-                except RuntimeError:  # an error of the scene, or a plugin that computes outside Dr.Jit
-                    self.frozen = None
+                with contextlib.suppress(RuntimeError):  # of the scene, or of a plugin that computes outside Dr.Jit
+                    values = np.array(self.frozen[self.region](self.scene, *arguments))
             if values is None:
+                self.frozen = {}
                 values = np.array(render(self.scene, *arguments))
+                self.frozen = None  # it renders, and cannot be recorded
         if self.by_pixels:
             image = values.astype(np.float64).T.reshape(height, after - first, -1)
         else:
@@ -174,7 +173,10 @@ def _render_film(scene, column, row, step, seed, spp: int):
 
 @contextlib.contextmanager
 def no_collection():
-    """Keep Python from collecting garbage: Dr.Jit aborts if arrays are freed while it records."""
+    """Keep Python from collecting garbage: Dr.Jit aborts if arrays are freed while it records.
+
+    Mitsuba loads scenes in several threads, none of which should free another scene either.
+    """
     enabled = gc.isenabled()
     gc.disable()
     try:

@@ -16,8 +16,8 @@ from .. import compat, metrics, plugins, scenes, srgb
 from ..errors import DiffindError, UsageError
 from ..orbit import middle
 from ..runtime import use_variant
-from .parameters import Parameter, counterparts
-from .passes import Side
+from .parameters import NamedParameter, counterparts
+from .passes import RenderedSide, no_collection
 from .table_scene import table_scene
 
 #: Contents of the picture.
@@ -114,11 +114,11 @@ class Session:
         self._pose, self._residue = self.start, np.linalg.inv(self.start.matrix) @ self._written
         self.view = VIEWS[0] if self.exact else VIEWS[1]
         self.divider, self.gain = 0.5, 10.0
+        self.table_bytes = self._bytes({})
         self.moving, self.reduction, self.pictures = False, REDUCTIONS[0], 0
-        self.table_bytes = self._parsed.table_bytes(self._parsed.learned_plugins())
         self._place()
 
-    def _load(self, chosen: Mapping[str, str]) -> tuple[Side, Side | None, str]:
+    def _load(self, chosen: Mapping[str, str]) -> tuple[RenderedSide, RenderedSide | None, str]:
         def change(state):
             _resize(state, self._width)
             for props, plugin in _of_plugins(state):
@@ -126,20 +126,32 @@ class Session:
                     if _has_choice(props, plugin, name) and word in plugin.choices[name]:
                         props[name] = word
 
-        learned = self._parsed.load(change=change)
+        with no_collection():
+            learned = self._parsed.load(change=change)
         if not learned.sensors():
             raise scenes.SceneError(f"{self._parsed.path}: has no sensor")
         names = tuple(dict.fromkeys((self.against, "exact")))
         replaced = self._parsed.learned_plugins(names)
         if not replaced:
-            return Side(learned, 1), None, "the scene names no learned plugin, so there is nothing to compare"
+            return RenderedSide(learned, 1), None, "the scene names no learned plugin, so there is nothing to compare"
         declared = plugins.declared()
         oversampling = max(declared[entry["plugin"]].counterpart(names).oversampling for entry in replaced)
         try:
-            exact = self._parsed.load(exact=True, against=names, change=change)
+            with no_collection():
+                exact = self._parsed.load(exact=True, against=names, change=change)
         except DiffindError as e:
-            return Side(learned, 1), None, str(e)
-        return Side(learned, 1), Side(exact, oversampling), ""
+            return RenderedSide(learned, 1), None, str(e)
+        return RenderedSide(learned, 1), RenderedSide(exact, oversampling), ""
+
+    def _bytes(self, chosen: Mapping[str, str]) -> int:
+        """Return the bytes of all tables, with another preset or storage form if it was chosen."""
+        entries = self._parsed.learned_plugins()
+        for entry in entries:
+            options = plugins.declared()[entry["plugin"]].choices
+            for name, word in chosen.items():
+                if word in options.get(name, ()) and not (name == "preset" and "filename" in entry):
+                    entry[name] = word
+        return self._parsed.table_bytes(entries)
 
     # -- what is shown ------------------------------------------------------------------------------------------------
 
@@ -167,7 +179,7 @@ class Session:
             if len({side.passes for side in self._visible()}) > 1 or self.passes == 0:
                 self._restart()
 
-    def _visible(self) -> list[Side]:
+    def _visible(self) -> list[RenderedSide]:
         if self.exact is None or self.view == "learned":
             return [self.learned]
         return [self.exact] if self.view == "exact" else [self.learned, self.exact]
@@ -179,7 +191,7 @@ class Session:
         """Camera."""
         return self._pose
 
-    def look(self, pose: Pose) -> bool:
+    def move_camera(self, pose: Pose) -> bool:
         """Move the camera, and return whether it moved; the next :meth:`moving_picture` shows it."""
         if not np.isfinite(pose.matrix).all():
             raise UsageError("camera: found a position or a direction that is not finite")
@@ -281,8 +293,8 @@ class Session:
     # -- values -------------------------------------------------------------------------------------------------------
 
     @property
-    def parameters(self) -> dict[str, Parameter]:
-        """Numbers and colours of the scene by their paths (:class:`.parameters.Parameters`)."""
+    def parameters(self) -> dict[str, NamedParameter]:
+        """Numbers and colours of the scene by their paths (:class:`.parameters.NamedParameters`)."""
         return self.learned.parameters.listed
 
     def set(self, values: Mapping[str, object]) -> None:
@@ -338,9 +350,9 @@ class Session:
         chosen = {**self._chosen, name: word}
         if word == AS_WRITTEN:
             del chosen[name]
-        sides = self._load(chosen)
+        sides, table_bytes = self._load(chosen), self._bytes(chosen)
         self.learned, self.exact, self.refusal = sides
-        self._chosen = chosen
+        self._chosen, self.table_bytes = chosen, table_bytes
         if self.view not in self.views:
             self.view = self.views[0]
         kept = {path: value for path, value in self._values.items() if path in self.learned.parameters}

@@ -45,7 +45,7 @@ def turned(pose, centre, up, degrees):
 def shown(session, pose) -> tuple[float, tuple[int, int]]:
     """Seconds of a picture from a pose, and its size."""
     start = time.perf_counter()
-    session.look(pose)
+    session.move_camera(pose)
     picture = session.moving_picture()
     Image.fromarray(picture).save(BytesIO(), "JPEG", quality=QUALITY[0])
     return time.perf_counter() - start, picture.shape[1::-1]
@@ -54,7 +54,7 @@ def shown(session, pose) -> tuple[float, tuple[int, int]]:
 def by_mitsuba(session, pose, seed) -> float:
     """Seconds of the same picture by ``mi.render``, both sides as a whole."""
     start = time.perf_counter()
-    session.look(pose)
+    session.move_camera(pose)
     session._place()
     images = [scenes.render_pass(side.scene, 1, seed) for side in (session.learned, session.exact) if side]
     for image in images:
@@ -91,7 +91,7 @@ def measure(name: str, pictures: int) -> dict:
         seconds, adapted_size = shown(session, turned(session.start, centre, up, 0.7 * step))
         adapted.append(seconds)
         sizes.append(list(adapted_size))
-    path = next(path for path, p in session.parameters.items() if not p.is_colour and p.high == 1)
+    path = next(path for path in session.parameters if path.endswith("roughness"))
     changes = []
     for i in range(6):
         start_change = time.perf_counter()
