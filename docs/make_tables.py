@@ -10,6 +10,7 @@ the pages show the commands. With ``--check`` nothing is written, and the exit c
 
 from __future__ import annotations
 
+import importlib
 import json
 import re
 import sys
@@ -639,6 +640,8 @@ TABLES |= {
 }  # fmt: skip
 for source, study in (("", "tradeoff_texture"), ("_boombox", "texture_levels_boombox")):
     TABLES["texture_levels" + source] = lambda study=study: texture_levels(measured(study))
+sys.path.insert(0, str(DOCS))
+TABLES |= importlib.import_module("cost_table").tables(table)
 
 
 def written() -> dict[Path, str]:
