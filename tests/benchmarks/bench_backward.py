@@ -12,8 +12,9 @@ Times are those of the processor, on one core, and include the tracing of the ke
 run in turn; ratios are medians over the rounds of the ratio to the first contender in the same round. Each
 contender has a process of its own, because Dr.Jit compiles the materials of all scenes that a process holds into each
 kernel. Bytes are those of all maps of a file, in memory in the storage form that a plugin reads by default, and on
-disk. The paper's recipes are trained for half a minute, and fields of a small capture briefly: times depend on the
-arrays, not on the quality of their entries.
+disk. Distance fields have 1 MiB and are trained by the whole recipe, because the steps of rays depend on their entries.
+The paper's recipe for images and textures is trained for half a minute, and fields of a small capture briefly: their
+times depend on the arrays alone.
 """
 
 from __future__ import annotations
@@ -162,8 +163,9 @@ CONTENDERS = {
         "sdfgrid": lambda folder, **_: {
             "shape": {"type": "sdfgrid", "normals": "smooth", **grid_of(folder / "sdf_grid.npz")}
         },
-        "ours": lambda storage, **_: {
-            "shape": {"type": "neural_sdf", "filename": asset("suzanne.npz"), "storage": storage, "trace": "arrays"},
+        "ours": lambda storage, folder: {
+            "shape": {"type": "neural_sdf", "filename": str(folder / "sdf_ours.npz"), "storage": storage,
+                      "trace": "arrays"},
             "traced": True,
         },
         "paper": lambda storage, folder: {
@@ -246,7 +248,7 @@ def sizes(folder: Path, tasks: list[str]) -> dict[str, dict]:
             ASSETS / "rust_shaded.npz", "shading_paper.npz", **{name: bitmaps(maps[name]) for name in maps}
         ),
         "sdf": lambda: files(
-            ASSETS / "suzanne.npz", "sdf_paper.npz", mesh={"disk": (ASSETS / "suzanne.ply").stat().st_size},
+            folder / "sdf_ours.npz", "sdf_paper.npz", mesh={"disk": (ASSETS / "suzanne.ply").stat().st_size},
             sdfgrid={"memory": int(np.load(folder / "sdf_grid.npz")["values"].nbytes)},
         ),
         "field": lambda: {name: file_sizes(folder / f"field_{name}.npz", "") for name in ("grid", "ours", "paper")},
@@ -274,8 +276,9 @@ def prepare(folder: Path, tasks: list[str]) -> None:
         from mi_diffind.plugins.support.distance_shapes import crop_grid
         from mi_diffind.tasks.sdf import grids
 
-        fitted("sdf", asset("suzanne.ply"), "sdf_paper", preset="paper", bytes="1m")
-        values, lower, upper = grids.grid(mi_diffind.open(asset("suzanne.npz")).field, CELLS)
+        for preset, name in (("sparse", "sdf_ours"), ("paper", "sdf_paper")):
+            fitted("sdf", asset("suzanne.ply"), name, preset=preset, bytes="1m")
+        values, lower, upper = grids.grid(mi_diffind.open(folder / "sdf_ours.npz").field, CELLS)
         values, lower, upper = crop_grid(values, lower, (upper[0] - lower[0]) / (values.shape[2] - 1))
         np.savez(folder / "sdf_grid.npz", values=values[..., None].astype(np.float32), lower=lower, upper=upper)
     if "field" in tasks:
