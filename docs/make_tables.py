@@ -11,6 +11,7 @@ the pages show the commands. Figures in sentences are inserted from the same fil
 
 from __future__ import annotations
 
+import importlib
 import json
 import re
 import sys
@@ -835,6 +836,8 @@ def film_bytes() -> str:
 
 
 TABLES |= {f.__name__: f for f in (film_errors, film_bytes)}
+sys.path.insert(0, str(DOCS))
+TABLES |= importlib.import_module("cost_table").tables(table)
 
 
 def written() -> dict[Path, str]:

@@ -1,8 +1,9 @@
 """Plan of the image study: contenders in equal bytes, with their errors, seconds of training and time of a read.
 
 *Bytes*: at each compression ratio, indirection into cascaded arrays of 2, 3 and 4 dimensions by our preset and the
-paper's is compared with codecs (:mod:`..baselines.codecs`) at the largest size that is not above; ASTC with one block
-size for all maps and with the best block size of each map. *Seconds*: trainings of several lengths by both presets,
+paper's is compared with a hash grid and network (:mod:`..baselines.image_networks`) and with codecs
+(:mod:`..baselines.codecs`) at the largest size that is not above; ASTC with one block size for all maps and with the
+best block size of each map. *Seconds*: trainings of several lengths by both presets,
 each with its own schedule. *Time*: kernels read all maps of a material at random and at coherent places, from
 ``neural_image`` and from ``bitmap`` with 8 bits and with floats.
 
@@ -12,6 +13,7 @@ Materials with normals or roughness are also compared as they are seen (:mod:`mi
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 from collections.abc import Callable
@@ -23,13 +25,15 @@ import mitsuba as mi
 import numpy as np
 
 from ... import metrics
+from ...fitting import FitSettings, fit
 from ...maps import as_seen
 from ...maps.compressed import decibel
 from ...maps.source import Source
 from ...measure.study import FLOOR, Candidate, Case, Plan
 from ...runtime import array_module
 from ...tasks.image.presets import IMPROVEMENTS
-from ..baselines import codecs
+from ..baselines import codecs, image_networks
+from ..baselines.hash_grids import halved
 from ..equal_memory import Contender, PresetContender, StudyContext
 from ..maps import source_details
 from .conclusions import conclusions, table
@@ -178,8 +182,34 @@ class EncodedImage(ImageContender):
         return self.record(nbytes, None, maps, how=names, encoding_seconds=seconds)
 
 
-def _trainings(context: ImageStudyContext) -> list[TrainedImage]:
-    jobs, settings = [], context.settings
+#: Training of the network; ``seconds`` end it.
+NETWORK_SETTINGS = FitSettings(steps=10**6, batch=2**12, lr=1e-2, schedule="cosine", loss="mse", measure_every=200)
+
+
+@dataclass
+class NetworkImage(ImageContender):
+    """Hash grid and network in half precision, trained for ``seconds``."""
+
+    has_file = False
+    seconds: float = 0.0
+
+    def run(self, folder: Path | None, progress: bool) -> dict | None:
+        source = self.context.source
+        net = image_networks.network(source, source.nbytes / self.budget)
+        problem = image_networks.ImageNetworkProblem(net, self.context.types, source)
+        title = f"train {self.name}" if progress else None
+        result = fit(problem, NETWORK_SETTINGS, progress=progress, title=title, seconds=self.seconds)
+        if result.interrupted:
+            return None
+        halved(problem.net)
+        curve = [(h["step"] * result.seconds / result.steps, h["psnr_db"]) for h in result.history]
+        maps = problem.decode(problem.net)
+        return self.record(2 * problem.net.parameters, result.seconds, maps, steps=result.steps, course=curve)
+
+
+def _trainings(context: ImageStudyContext) -> list[ImageContender]:
+    jobs: list[ImageContender] = []
+    settings = context.settings
     shortest = min(settings.seconds)
 
     def train(name: str, compression: float, seconds: float, method: str = "indirection", **options) -> None:
@@ -193,6 +223,11 @@ def _trainings(context: ImageStudyContext) -> list[TrainedImage]:
         train("ours", first, seconds)
     for seconds in settings.paper_seconds:
         train("paper", first, seconds, "indirection, paper's preset")
+    with contextlib.suppress(ValueError):  # too few bytes for a network
+        image_networks.network(context.source, context.source.nbytes / first)
+        longest = max(settings.seconds)
+        name = f"hash grid + network {first:g}x {longest:g} s"
+        jobs.append(NetworkImage("network", first, context, name, seconds=longest))
     for dims in sorted({*settings.dims} - {4}):
         train(f"ours 2D→{dims}D", first, shortest, dims=dims)
     for name in IMPROVEMENTS if settings.ablation else ():

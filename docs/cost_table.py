@@ -1,0 +1,430 @@
+"""Cost of accuracy, task by task: ours, what a user would take instead, the paper's recipe, from ``docs/measured``.
+
+:func:`rows` reads the JSON of the studies and of ``bench_backward``. :func:`tables` makes the tables of ``cost.md`` for
+``make_tables.py``; ``make_cost.py`` draws ``cost.jpg`` from the same rows.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import statistics
+from dataclasses import dataclass, field
+from pathlib import Path
+
+MEASURED = Path(__file__).resolve().parent / "measured"
+
+#: Why files of the paper's recipe are not counted.
+BRIEF = (
+    "Bytes on disk of the paper's recipe are not measured: `bench_backward` trains its files briefly, and entries that "
+    "have hardly moved deflate to little."
+)
+
+#: Error of a contender that defines the truth of its row.
+EXACT = math.inf
+
+MISSING = "not measured"
+
+#: JSON file → command that writes it.
+COMMANDS = {
+    "bench_backward": "python tests/benchmarks/bench_backward.py --rounds 11",
+    "bench_large_material": "python tests/benchmarks/bench_large_material.py FOLDER",
+    "tradeoff_bsdf": "mi-diffind tradeoff bsdf MATERIAL… --workers 2",
+    "tradeoff_disney": "mi-diffind tradeoff disney",
+    "tradeoff_field": "mi-diffind tradeoff field out/group --compression 75 --compression 200",
+    "tradeoff_ggx": "mi-diffind tradeoff ggx",
+    "tradeoff_image": "mi-diffind tradeoff image scenes/assets/tiles.json --compression 12 --seconds 60 "
+    "--paper-seconds 60 --dims 4 --astc thorough",
+    "tradeoff_image_network": "mi-diffind tradeoff image scenes/assets/tiles.json --compression 12 --seconds 60 "
+    "--paper-seconds 60 --dims 4 --astc thorough",
+    "tradeoff_scene_training_floor": "mi-diffind tradeoff scene-training scenes/training_floor.xml --lambda 0.9 "
+    "--spp 1 --steps 60 --width 64",
+    "tradeoff_sdf_suzanne": "mi-diffind tradeoff sdf --bytes 1M --bytes 256k",
+    "tradeoff_shading": "mi-diffind tradeoff shading hammered weave lacquer --side 256 --steps 1500 "
+    "--pretrain-steps 300 --seeds 3 --remedies on --lambda 0.9 --frames 8",
+    "tradeoff_shading_paper": "mi-diffind tradeoff shading weave --side 256 --preset paper --remedies clip "
+    "--steps 300 --pretrain-steps 300 --seeds 3 --lambda 0.1 --lambda 0.25 --lambda 0.5 --lambda 1 --frames 8",
+    "tradeoff_texture": "mi-diffind tradeoff texture --compression 12x --seconds 40 --footprints --astc thorough "
+    "--width 300 --frames 20",
+}
+
+
+def measured(name: str) -> dict:
+    """Return the JSON that a command wrote."""
+    return json.loads((MEASURED / f"{name}.json").read_text(encoding="utf-8"))
+
+
+@dataclass(frozen=True)
+class Contender:
+    """Figures of a contender; ``None``: not measured.
+
+    ``error`` in the unit of its row; ``render`` and ``step``: times over those of what a user would take instead;
+    ``memory`` and ``disk`` in bytes.
+    """
+
+    error: float | None = None
+    render: float | None = None
+    step: float | None = None
+    memory: float | None = None
+    disk: float | None = None
+
+
+@dataclass(frozen=True)
+class Row:
+    """A task: names of what a user would take instead, unit of the error, contenders.
+
+    ``better``: whether a larger ``error`` is better, as for a PSNR. ``others`` are shown in the picture alone.
+    ``sources``: figures and the JSON files that they come from. ``note``: why cells are not
+    measured, and what else a reader should know. ``cells``: texts in place of cells.
+    """
+
+    task: str
+    page: str
+    instead: str
+    error: str
+    unit: str
+    ours: Contender
+    theirs: Contender
+    paper: Contender
+    sources: dict[str, str]
+    note: str = ""
+    better: bool = True
+    others: dict[str, Contender] = field(default_factory=dict)
+    cells: dict[str, str] = field(default_factory=dict)
+
+
+def size_text(nbytes: float) -> str:
+    """Return a number of bytes with three digits."""
+    for unit, scale in (("MB", 1e6), ("kB", 1e3)):
+        if nbytes >= scale:
+            return f"{nbytes / scale:.3g} {unit}"
+    return f"{nbytes:.0f} B" if nbytes else "none"
+
+
+def times(task: str, contender: str, base: str = "") -> dict[str, float | None]:
+    """Return ``render`` and ``step`` of a contender of ``bench_backward``, over those of the first contender.
+
+    Over those of ``base``, if it is given, as a ratio of medians. A step without a finite derivative that differs from
+    zero is not measured.
+    """
+    result, ratios = measured("bench_backward")["tasks"][task], {}
+    for size in ("render", "step"):
+        figures, of_base = result[size][contender], result[size].get(base or contender, {})
+        if base and "cpu_ms" in figures and "cpu_ms" in of_base:
+            ratios[size] = figures["cpu_ms"]["median"] / of_base["cpu_ms"]["median"]
+        else:
+            ratios[size] = figures["ratio"]["median"] if "ratio" in figures and not base else None
+    return ratios | ({} if result["step"][contender].get("parameters") else {"step": None})
+
+
+def benched(error: float | None, task: str, contender: str, base: str = "", **sizes) -> Contender:
+    """Return a contender with times and bytes of ``bench_backward``; ``sizes`` take the place of its bytes."""
+    known = measured("bench_backward")["bytes"][task].get(contender, {})
+    return Contender(error, **times(task, contender, base), **{**known, **sizes})
+
+
+def ggx() -> Row:
+    """Return the row of the distribution of normals."""
+    study = measured("tradeoff_ggx")["candidates"]
+    ours, paper = (study[name]["errors"]["psnr_db"] for name in ("neural_ggx", "16→8 raw"))
+    return Row(
+        "`neural_ggx`", "ggx", "`roughconductor`", "PSNR of D", "dB",
+        benched(ours, "ggx", "ours"), benched(EXACT, "ggx", "roughconductor"),
+        benched(paper, "ggx", "paper"), {"errors": "tradeoff_ggx", "all others": "bench_backward"},
+    )  # fmt: skip
+
+
+def disney() -> Row:
+    """Return the row of the Disney BRDF."""
+    study = measured("tradeoff_disney")["candidates"]
+    ours, paper = (study[name]["errors"]["psnr_db_training"] for name in ("tables, uint8", "paper, uint8"))
+    return Row(
+        "`neural_disney`", "disney", "`principled`", "PSNR of BRDF · cosine", "dB",
+        benched(ours, "disney", "ours"), benched(EXACT, "disney", "principled"), benched(paper, "disney", "paper"),
+        {"errors": "tradeoff_disney", "all others": "bench_backward"},
+        others={"disney, exact": benched(EXACT, "disney", "disney")},
+    )  # fmt: skip
+
+
+def bsdf() -> Row:
+    """Return the row of learned BSDFs: medians of the study's materials."""
+    study = measured("tradeoff_bsdf")
+    psnr = {
+        name: statistics.median(study["candidates"][f"{m}: {name}"]["errors"]["psnr_db"] for m in study["cases"])
+        for name in ("ours", "measured", "paper")
+    }
+    return Row(
+        "`neural_bsdf`", "bsdf", "`measured`", "PSNR, median of materials", "dB",
+        *(benched(psnr[name], "bsdf", name) for name in ("ours", "measured", "paper")),
+        {"errors": "tradeoff_bsdf", "all others": "bench_backward"},
+        "A step is not measured: `measured` has no parameters that can be optimised.",
+        others={"roughconductor, exact": benched(EXACT, "bsdf", "roughconductor")},
+    )  # fmt: skip
+
+
+def bsdf_source() -> Row:
+    """Return the row of a learned BSDF beside the analytic one that it was fitted to."""
+    study, material, base = measured("tradeoff_bsdf")["candidates"], "GGX copper, α 0.01", "roughconductor"
+    ours, paper = (study[f"{material}: {name}"]["errors"]["psnr_db"] for name in ("ours", "paper"))
+    return Row(
+        "`neural_bsdf`", "bsdf", "its source, `roughconductor`", "PSNR, copper", "dB",
+        benched(ours, "bsdf", "ours", base), benched(EXACT, "bsdf", base, base, memory=0, disk=0),
+        benched(paper, "bsdf", "paper", base), {"errors": "tradeoff_bsdf", "all others": "bench_backward"},
+        "A step of ours has the derivatives of all parameters of the proxy; the paper's form has no proxy, and `scale` "
+        "alone.",
+    )  # fmt: skip
+
+
+def image() -> Row:
+    """Return the row of compressed maps of a material."""
+    study = measured("tradeoff_image")["candidates"]
+    ours, paper = (
+        next(c for name, c in study.items() if name.startswith(f"{preset} 12x ")) for preset in ("ours", "paper")
+    )
+    codec = study["ASTC 12x, each map its own"]
+    decoded = measured("bench_backward")["bytes"]["image"]["bitmap"]["memory"]
+    again = measured("tradeoff_image_network")["candidates"]
+    network = next(c for name, c in again.items() if name.startswith("hash grid + network"))
+    return Row(
+        "`neural_image`", "image", "`bitmap`, decoded from ASTC", "PSNR of 4 maps", "dB",
+        benched(ours["errors"]["psnr_db"], "image", "ours"),
+        benched(codec["errors"]["psnr_db"], "image", "bitmap", memory=decoded, disk=codec["bytes"]),
+        benched(paper["errors"]["psnr_db"], "image", "paper", disk=None),
+        {"errors, bytes of ASTC": "tradeoff_image", "all others": "bench_backward",
+         "the network": "tradeoff_image_network"},
+        f"A hash grid with a network in {size_text(network['bytes'])} has {network['errors']['psnr_db']:.1f} dB after "
+        f"{network['training_seconds']:.0f} s; Mitsuba has no plugin that renders it. {BRIEF}",
+    )  # fmt: skip
+
+
+def large_material() -> Row:
+    """Return the row of a material of 4096² texels."""
+    study = measured("bench_large_material")
+    ours, paper, raw, codec = (study[name] for name in ("ours", "paper", "raw", "ASTC"))
+
+    def contender(c: dict) -> Contender:
+        return Contender(c["psnr_db"], None, None, c["memory_bytes"], c["file_bytes"])
+
+    return Row(
+        f"`neural_image`, {study['side']}²", "image", "`bitmap`, decoded from ASTC", "PSNR of 3 maps", "dB",
+        contender(ours), Contender(codec["psnr_db"], memory=raw["bytes"], disk=codec["bytes"]), contender(paper),
+        {"all": "bench_large_material"},
+        f"Trained for {ours['seconds'] / 60:.0f} minutes each. The cascaded array takes "
+        f"{size_text(ours['cascaded_bytes'])} "
+        f"(the paper's recipe: {size_text(paper['cascaded_bytes'])}), the bound of the paper's equation 1 is 1 MB. "
+        f"ASTC has blocks of {codec['block']} for all maps, encoded by the preset `fast`. "
+        "Times are not measured: the arrays are read as in the row above.",
+    )  # fmt: skip
+
+
+def texture() -> Row:
+    """Return the row of filtered textures, of renders of a plane."""
+    study = measured("tradeoff_texture")
+    base, renders = "bitmap, 4 spp, multijittered", study["cases"]["plane"]["ratios"]["render"]
+    scale = renders[f"{base} / bitmap, 1 spp"]["median"]
+
+    def contender(name: str, of_bench: str = "") -> Contender:
+        error = study["candidates"][name]["errors"]["psnr_plane_db"]
+        ratio = 1 if name == "bitmap, 1 spp" else renders[f"{name} / bitmap, 1 spp"]["median"]
+        found = benched(error, "texture", of_bench) if of_bench else Contender(error)
+        return Contender(error, ratio / scale, found.step, found.memory, None if of_bench == "paper" else found.disk)
+
+    others = [name for name, c in study["candidates"].items() if "psnr_plane_db" in c["errors"]]
+    fits = [measured(f"fit_texture_boombox_{preset}") for preset in ("ours", "paper")]
+    level, seconds = [f["measured"]["psnr_l0_db"] for f in fits], fits[0]["settings"]["seconds"]
+    named = ("ours 12x, anisotropic", base, "paper 12x, trilinear")
+    return Row(
+        "`neural_texture`", "texture", "`bitmap`, 4 samples a pixel", "PSNR of a plane", "dB",
+        *(contender(name, key) for name, key in zip(named, ("ours", "bitmap", "paper"), strict=True)),
+        {"errors, renders": "tradeoff_texture", "all others": "bench_backward"},
+        f"Both presets had {study['details']['request']['seconds']:.0f} s, too few for the paper's recipe to converge. "
+        f"After {seconds:.0f} s of each on boombox, the finest level has {level[0]:.1f} dB by ours and "
+        f"{level[1]:.1f} dB by the paper's (`fit_texture_boombox_….json`). {BRIEF}",
+        others={name: contender(name) for name in others if name not in named},
+    )  # fmt: skip
+
+
+def shading() -> Row:
+    """Return the row of textures trained for shaded values, of the material that the paper's recipe has run on."""
+    study, material = measured("tradeoff_shading")["candidates"], "weave"
+    mine = {name.removeprefix(f"{material}, "): c for name, c in study.items() if name.startswith(f"{material}, ")}
+    psnr = {name: c["errors"]["c_mean_db"] for name, c in mine.items()}
+    equal = [name for name in psnr if name.endswith((", ASTC", ", compressed"))]
+    best = max(equal, key=psnr.get)
+    paper = measured("tradeoff_shading_paper")["candidates"]
+    recipes = [c for name, c in paper.items() if name.startswith(f"{material}, lambda")]
+    recipe = max(recipes, key=lambda c: c["errors"]["c_mean_db"])
+    names = ("ours", "normalmap + principled + bitmaps", "paper")
+    shares = [
+        scene["equal_error"]["neural_material, trained"]["principled + bitmaps, multijittered"]["share"]
+        for scene in measured("tradeoff_shading_renders")["scenes"].values()
+    ]
+    best_text = best.replace(", ASTC", " filters in ASTC").replace(", compressed", " filters, compressed")
+    errors = (psnr["lambda 0.9, clip, schedule"], psnr[best], recipe["errors"]["c_mean_db"])
+    return Row(
+        "`neural_material`", "shading", f"`normalmap`, `principled`, 4 maps ({best_text})", "PSNR of shaded values",
+        "dB",
+        *(benched(error, "shading", name) for error, name in zip(errors[:2], names[:2], strict=True)),
+        benched(errors[2], "shading", names[2], disk=None),
+        {"errors": "tradeoff_shading", "error of the paper's recipe": "tradeoff_shading_paper",
+         "all others": "bench_backward"},
+        f"Errors are those of {material}; instead of ours, the best classical filter in equal bytes with mip maps, "
+        "which Mitsuba does not read. Times and bytes are those of rust and of its bitmaps without a filter. At equal "
+        f"error of whole renders of rust, ours takes {min(shares):.2f} to {max(shares):.2f} of the time of "
+        "multijittered bitmaps (`tradeoff_shading_renders.json`). The paper's recipe had 300 steps, ours 1,500 (the "
+        "commands). " + BRIEF,
+    )  # fmt: skip
+
+
+def scene() -> Row:
+    """Return the row of textures trained inside a scene; its arrays are those of the row before."""
+    study = measured("tradeoff_scene_training_floor")["jobs"]
+    psnr = {r["details"]["way"]: r["details"]["psnr_db"] for r in study.values()}
+    return Row(
+        "`fit scene`", "shading", "`fit shading`, as long", "PSNR of held-out views, floor", "dB",
+        Contender(psnr["scene"]), Contender(psnr["hemisphere"]), Contender(),
+        {"errors": "tradeoff_scene_training_floor"},
+        "Times and bytes are those of the row above: the arrays have the same form. The paper's recipe is not "
+        "measured: it does not train inside scenes.",
+        cells=dict.fromkeys(("render", "step", "memory", "disk"), "as above"),
+    )  # fmt: skip
+
+
+def sdf() -> Row:
+    """Return the row of distance fields."""
+    study = measured("tradeoff_sdf_suzanne")["candidates"]
+    ours, paper = (study[f"{name} 1 MiB"]["errors"]["normal_deg"] for name in ("ours", "paper"))
+    return Row(
+        "`neural_sdf`", "sdf", "mesh, Embree", "mean angle of normals", "°",
+        benched(ours, "sdf", "ours"),
+        benched(EXACT, "sdf", "mesh", memory=study["mesh (Embree)"]["bytes"]), benched(paper, "sdf", "paper"),
+        {"errors, bytes of the mesh": "tradeoff_sdf_suzanne", "all others": "bench_backward"}, better=False,
+    )  # fmt: skip
+
+
+def sdf_grid() -> Row:
+    """Return the row of distance fields beside Mitsuba's grid of distances, which can be optimised, too."""
+    study, base = measured("tradeoff_sdf_suzanne")["candidates"], "sdfgrid"
+    ours, paper = (study[f"{name} 1 MiB"]["errors"]["normal_deg"] for name in ("ours", "paper"))
+    return Row(
+        "`neural_sdf`", "sdf", "`sdfgrid`, 128 cells along the longest side", "mean angle of normals", "°",
+        benched(ours, "sdf", "ours", base), benched(None, "sdf", base, base), benched(paper, "sdf", "paper", base),
+        {"errors": "tradeoff_sdf_suzanne", "all others": "bench_backward"},
+        "The error of the grid is not measured, because the grid is decoded from our arrays. It has no file on disk.",
+        better=False,
+    )  # fmt: skip
+
+
+def radiance() -> Row:
+    """Return the row of radiance fields, 75 times smaller than a dense grid."""
+    study = measured("tradeoff_field")
+    base, passes = "codebook 75×", study["cases"]["reads"]["passes"]["render"]
+
+    def contender(name: str) -> Contender:
+        c = study["candidates"][name]
+        render = passes[name]["time"] / passes[base]["time"] if name in passes else None
+        sizes = (c["details"].get(key) for key in ("memory_bytes", "file_bytes"))
+        return Contender(c["errors"]["psnr_foreground_db"], render, None, *sizes)
+
+    named = ("ours 75×", base, "paper 75×")
+    small, codes = (study["candidates"][f"{name} 200×"] for name in ("ours", "codebook"))
+    steps = [times("field", name)["step"] for name in ("ours", "paper")]
+    return Row(
+        "`neural_field`", "field", "codebook (VQRF)", "PSNR of the foreground", "dB",
+        *map(contender, named), {"all": "tradeoff_field"},
+        "The codebook is the best contender of the study in equal bytes of memory. A step of it is not measured, since "
+        f"it is no plugin; a step takes {steps[0]:.2f} (the paper's recipe: {steps[1]:.2f}) of that of a grid in "
+        "single precision (`bench_backward.json`). Mitsuba's `volprim_rf_basic` is not measured: it needs 3D "
+        f"Gaussians of the capture. At 200x, ours has {small['errors']['psnr_foreground_db']:.1f} dB in "
+        f"{size_text(small['details']['memory_bytes'])}, the codebook {codes['errors']['psnr_foreground_db']:.1f} dB "
+        f"in {size_text(codes['details']['memory_bytes'])}.",
+        others={name: contender(name) for name in study["candidates"] if name not in named},
+    )  # fmt: skip
+
+
+#: Functions that make the rows, in the order of the table.
+ROWS = (ggx, disney, bsdf, bsdf_source, image, large_material, texture, shading, scene, sdf, sdf_grid, radiance)
+
+
+def rows() -> list[Row]:
+    """Return all rows."""
+    return [make() for make in ROWS]
+
+
+def three(row: Row, text, key: str) -> str:
+    """Return the cell of ours / theirs / the paper's recipe."""
+    values = [getattr(c, key) for c in (row.ours, row.theirs, row.paper)]
+    if key in row.cells:
+        return row.cells[key]
+    if all(v is None for v in values):
+        return MISSING
+    return " / ".join(MISSING if v is None else text(v) for v in values)
+
+
+def cost(table) -> str:
+    """Return errors, times and bytes of all tasks, as a table."""
+    lines = []
+    for row in rows():
+
+        def error(value, row=row):
+            return "exact" if value == EXACT else f"{value:.2f}°" if row.unit == "°" else f"{value:.1f}"
+
+        lines.append([
+            f"[{row.task}]({row.page}.md)", row.instead, f"{row.error}, {row.unit}" if row.unit != "°" else row.error,
+            three(row, error, "error"), *(three(row, lambda v: f"{v:.2f}", key) for key in ("render", "step")),
+            *(three(row, size_text, key) for key in ("memory", "disk")),
+        ])  # fmt: skip
+    head = ["task", "instead", "measure", "error", "a render", "a step", "bytes in memory", "bytes on disk"]
+    return table(head, lines)
+
+
+#: Figure → its name in a list of losses, and the text of ours and another contender's.
+COMPARED = {
+    "error": ("error", ""), "render": ("a render", " of the time"), "step": ("a step", " of the time"),
+    "memory": ("memory", ""), "disk": ("disk", ""),
+}  # fmt: skip
+
+
+#: Unit of an error → differences below which two errors are equal.
+SAME = {"dB": 0.1, "°": 0.02}
+
+
+def compared(row: Row, other: Contender) -> tuple[list[str], list[str]]:
+    """Return texts of the figures in which ours is better and worse than ``other``; 5% of a ratio are equal."""
+    wins, losses = [], []
+    for key, (name, unit) in COMPARED.items():
+        a, b = getattr(row.ours, key), getattr(other, key)
+        if a is None or b is None:
+            continue
+        if key == "error":
+            text = "not exact" if b == EXACT else f"{name} {a - b:+.{2 if row.unit == '°' else 1}f} {row.unit}"
+            if b == EXACT or abs(a - b) > SAME[row.unit]:
+                (wins if (a > b) == row.better and b != EXACT else losses).append(text)
+        elif b == 0:
+            losses.append(f"{name} {size_text(a)}")
+        elif not 0.95 < a / b < 1.05:
+            (wins if a < b else losses).append(f"{name} {a / b:.2g}{unit or ' of the bytes'}")
+    return wins, losses
+
+
+def cost_losses(table) -> str:
+    """Return where ours is better and worse than what a user would take instead, and worse than the paper's recipe."""
+    lines = []
+    for row in rows():
+        (wins, losses), (_, behind) = (compared(row, other) for other in (row.theirs, row.paper))
+        lines.append([row.task, *("; ".join(texts) or "–" for texts in (wins, losses, behind))])
+    return table(["task", "better", "worse", "worse than the paper's recipe"], lines)
+
+
+def cost_sources(table) -> str:
+    """Return the commands behind each row, and why cells are missing, as a table."""
+    lines = []
+    for row in rows():
+        sources = [f"{figures}: `{COMMANDS[name]}`" for figures, name in row.sources.items()]
+        lines.append([row.task, "; ".join(sources), row.note])
+    return table(["task", "commands", "notes"], lines)
+
+
+def tables(table) -> dict:
+    """Return the functions of the tables by name; ``table(head, rows)`` writes a table in Markdown."""
+    return {f.__name__: lambda f=f: f(table) for f in (cost, cost_losses, cost_sources)}
