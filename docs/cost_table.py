@@ -310,7 +310,8 @@ def sdf_grid() -> Row:
         "`neural_sdf`", "sdf", "`sdfgrid`, 128 cells along the longest side", "mean angle of normals", "°",
         benched(ours, "sdf", "ours", base), benched(None, "sdf", base, base), benched(paper, "sdf", "paper", base),
         {"errors": "tradeoff_sdf_suzanne", "all others": "bench_backward"},
-        "The error of the grid is not measured, because the grid is decoded from our arrays. It has no file on disk.",
+        "The error of the grid is not measured, because the grid is decoded from our arrays. It has no file on disk. "
+        "Its bytes are those of its values; Mitsuba holds a box of each cell besides.",
         better=False,
     )  # fmt: skip
 
