@@ -190,6 +190,13 @@ KEYS = {
     "field": r"integrator\..*tables\..*",
 }  # fmt: skip
 
+#: Task → place of the camera and its target. Balls and the distance field fill the picture, planes three quarters.
+VIEWS = {
+    **dict.fromkeys(("ggx", "disney", "bsdf"), ([0, 1.5, 2.1], [0, 0.8, 0])),
+    "sdf": ([0.8, 1.1, 2.7], [0, 0.67, 0]),
+    "field": ([2.6, 2.6, 5.6], [0, 0.85, 0]),
+}
+
 #: Cells of ``sdfgrid`` along the longest side.
 CELLS = 128
 
@@ -278,9 +285,12 @@ def prepare(folder: Path, tasks: list[str]) -> None:
 
         for preset, name in (("sparse", "sdf_ours"), ("paper", "sdf_paper")):
             fitted("sdf", asset("suzanne.ply"), name, preset=preset, bytes="1m")
-        values, lower, upper = grids.grid(mi_diffind.open(folder / "sdf_ours.npz").field, CELLS)
+        model = mi_diffind.open(folder / "sdf_ours.npz")
+        values, lower, upper = grids.grid(model.field, CELLS)
         values, lower, upper = crop_grid(values, lower, (upper[0] - lower[0]) / (values.shape[2] - 1))
-        np.savez(folder / "sdf_grid.npz", values=values[..., None].astype(np.float32), lower=lower, upper=upper)
+        lower, upper = (np.array(model.centre) + model.scale * corner for corner in (lower, upper))
+        values = values[..., None] * model.scale
+        np.savez(folder / "sdf_grid.npz", values=values.astype(np.float32), lower=lower, upper=upper)
     if "field" in tasks:
         views = folder / "views"
         mi_diffind.capture(ROOT / "scenes" / "capture_group.xml", views, views=24, test=4, resolution=64, spp=16)
@@ -292,8 +302,7 @@ def prepare(folder: Path, tasks: list[str]) -> None:
 def scene(task: str, contender: str, size: str, folder: Path):
     """Return the scene of a contender."""
     parts = CONTENDERS[task][contender](storage="float32" if size == "step" else "uint8", folder=folder)
-    eye = {"sdf": [0.9, 0.6, 2.4], "field": [2.6, 2.6, 5.6]}.get(task, [0, 2.2, 4.2])
-    target = {"sdf": [0, 0, 0], "field": [0, 0.85, 0]}.get(task, [0, 0.5, 0])
+    eye, target = VIEWS.get(task, ([0, 2.2, 4.2], [0, 0.5, 0]))
     integrator = {"type": "path_sdf" if parts.pop("traced", False) else "prb", "max_depth": 3}
     side = SIDES[size]
     return mi_diffind.load_dict({
