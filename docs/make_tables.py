@@ -859,9 +859,7 @@ def figures(pages: dict[Path, str]) -> tuple[dict[Path, str], list[str]]:
             pages.setdefault(claim.path, claim.path.read_text(encoding="utf-8"))
             pages[claim.path] = claim.written(pages[claim.path])
         except FileNotFoundError:
-            troubles.append(
-                f"claims.toml: no page {claim.page!r}; allowed: README.md, pages of docs, paths of files"
-            )
+            troubles.append(f"claims.toml: no page {claim.page!r}; allowed: README.md, pages of docs, paths of files")
         except ClaimError as error:
             troubles.append(str(error))
     if not troubles:
