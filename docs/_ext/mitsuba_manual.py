@@ -90,7 +90,7 @@ def _inline(translator, node):
 
 
 def _displayed(translator, node):
-    translator.body.append(tex2mathml(node.astext(), as_block=True))
+    translator.body.append(f'<div class="math">{tex2mathml(node.astext())}</div>')
     raise nodes.SkipNode
 
 
