@@ -116,6 +116,22 @@ def test_while_it_moves_each_side_renders_its_part(mi_rgb):
     assert shown.figures["psnr_db"] > 30 and shown.figures["width"] == WIDTH
 
 
+def test_an_oversampled_truth_has_more_samples_unless_the_camera_moves(mi_rgb):
+    square = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": {
+        "type": "neural_texture", "filename": str(ASSETS / "tiles_filtered.npz"), "channels": "albedo",
+    }}}  # fmt: skip
+    shown = Session(content(mi_rgb) | {"ball": square}, WIDTH)
+    shown.moving_picture()
+    assert shown.exact.samples == shown.learned.samples == 1
+    shown.refine()
+    shown.refine()
+    assert (shown.learned.samples, shown.exact.samples, shown.figures["samples"]) == (2, 16, 2)
+    assert shown.figures["psnr_db"] > 15
+    mipmap = Session(content(mi_rgb) | {"ball": square}, WIDTH, against="mipmap")
+    mipmap.refine()
+    assert mipmap.exact.samples == 1 and mipmap.figures["against"] == "mipmap"
+
+
 def test_samples_end(mi_rgb):
     shown = session(mi_rgb, spp=2)
     for _ in range(4):

@@ -280,7 +280,7 @@ class Session:
                 column = min(max(round(self.divider * width), 0), width)
                 first, after = (0, column) if side is self.learned else (column, width)
             if first < after:
-                side.add_pass((width, height, first, after), self.spp, self.seed)
+                side.add_pass((width, height, first, after), self.spp, self.seed, self.moving)
             else:
                 side.region = (width, height, 0, 0)
                 side.passes += 1
