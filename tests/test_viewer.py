@@ -116,6 +116,22 @@ def test_while_it_moves_each_side_renders_its_part(mi_rgb):
     assert shown.figures["psnr_db"] > 30 and shown.figures["width"] == WIDTH
 
 
+def test_an_oversampled_truth_has_more_samples_unless_the_camera_moves(mi_rgb):
+    square = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": {
+        "type": "neural_texture", "filename": str(ASSETS / "tiles_filtered.npz"), "channels": "albedo",
+    }}}  # fmt: skip
+    shown = Session(content(mi_rgb) | {"ball": square}, WIDTH)
+    shown.moving_picture()
+    assert shown.exact.samples == shown.learned.samples == 1
+    shown.refine()
+    shown.refine()
+    assert (shown.learned.samples, shown.exact.samples, shown.figures["samples"]) == (2, 16, 2)
+    assert shown.figures["psnr_db"] > 15
+    mipmap = Session(content(mi_rgb) | {"ball": square}, WIDTH, against="mipmap")
+    mipmap.refine()
+    assert mipmap.exact.samples == 1 and mipmap.figures["against"] == "mipmap"
+
+
 def test_samples_end(mi_rgb):
     shown = session(mi_rgb, spp=2)
     for _ in range(4):
@@ -278,6 +294,8 @@ def test_refused_input(mi_rgb, tmp_path):
     ):
         with pytest.raises(UsageError, match=sentence):
             Session(scene, **options)
+    with pytest.raises(UsageError, match="found a loaded scene, which cannot be changed any more"):
+        Session(scenes.load_dict(scene))
     with pytest.raises(UsageError, match=r"tiles\.npz: found a table file with defines"):
         Session(ASSETS / "tiles.npz", defines={"a": 1})
     with pytest.raises(scenes.SceneError, match="has no sensor"):
@@ -308,6 +326,16 @@ def test_pose_of_the_page(rng):
     axes = rotation.as_matrix()
     np.testing.assert_allclose(place.matrix[:3, :3], axes @ np.diag([-1, -1, 1]), atol=1e-12)
     np.testing.assert_allclose(Pose.of(place.matrix).matrix, place.matrix, atol=1e-12)
+
+
+def test_a_mirrored_sensor_stays_mirrored(mi_rgb):
+    flipped = content(mi_rgb)
+    flipped["sensor"]["to_world"] = flipped["sensor"]["to_world"].scale([-1, 1, 1])
+    flipped["lamp"] = {"type": "point", "position": [3, 0, 3], "intensity": 30.0}
+    shown = Session(flipped, WIDTH, seed=3)
+    shown.refine()
+    expected = scenes.render(scenes.load_dict(flipped), 1, 3, 1)[0]
+    np.testing.assert_allclose(shown.learned.image, expected, atol=1e-4)
 
 
 def test_the_first_view_is_that_of_the_sensor(mi_rgb):

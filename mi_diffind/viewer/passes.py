@@ -42,7 +42,7 @@ class RenderedSide:
         self.restart()
 
     def restart(self) -> None:
-        self.total, self.passes, self.seconds = 0.0, 0, math.nan
+        self.total, self.samples, self.passes, self.seconds = 0.0, 0, 0, math.nan
 
     def place(self, matrix: np.ndarray, spp: int) -> None:
         """Move the camera, and give textures the footprint of ``spp`` samples per pixel."""
@@ -60,8 +60,8 @@ class RenderedSide:
             self.frozen = {}
         self.restart()
 
-    def add_pass(self, region: tuple[int, int, int, int], spp: int, seed: int) -> None:
-        """Render one sample of the pixels of a ``region``, or as many as the side is oversampled, and add them.
+    def add_pass(self, region: tuple[int, int, int, int], spp: int, seed: int, moving: bool = False) -> None:
+        """Render one sample of the pixels of a ``region``, or unless ``moving`` as many as oversampled, and add them.
 
         The region is the ``width`` and ``height`` of the picture, its first column and the one after its last.
         Filtering textures get the footprint of ``spp`` samples per pixel.
@@ -70,8 +70,9 @@ class RenderedSide:
         if region != self.region:
             self.region = region
             self.restart()
-        for i in range(self.oversampling):
-            self.total = self.total + self._render(spp, ((seed << 16) + self.passes * self.oversampling + i) % 2**32)
+        for _ in range(1 if moving else self.oversampling):
+            self.total = self.total + self._render(spp, ((seed << 16) + self.samples) % 2**32)
+            self.samples += 1
         self.passes += 1
         self.seconds = time.perf_counter() - start
 
@@ -85,8 +86,8 @@ class RenderedSide:
         """Mean of the passes, ``(height, width, 3)`` float32, black outside of the rendered columns."""
         width, height, first, after = self.region
         image = np.zeros((height, width, 3), np.float32)
-        if self.passes:
-            image[:, first:after] = self.total / (self.passes * self.oversampling)
+        if self.samples:
+            image[:, first:after] = self.total / self.samples
         return image
 
     def _render(self, spp: int, seed: int) -> np.ndarray:

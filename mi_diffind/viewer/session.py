@@ -48,9 +48,8 @@ class Pose:
     @classmethod
     def of(cls, to_world: np.ndarray) -> Pose:
         """Return the pose of a sensor's matrix ``(4, 4)``; Mitsuba's x axis points to the left."""
-        left, up, forward = (to_world[:3, i] / np.linalg.norm(to_world[:3, i]) for i in range(3))
-        right = np.cross(forward, up)  # also of a mirrored sensor
-        return cls(to_world[:3, 3].copy(), right if np.dot(right, -left) != 0 else -left, up, forward)
+        up, forward = (to_world[:3, i] / np.linalg.norm(to_world[:3, i]) for i in (1, 2))
+        return cls(to_world[:3, 3].copy(), np.cross(forward, up), up, forward)  # also of a mirrored sensor
 
     @property
     def matrix(self) -> np.ndarray:
@@ -94,8 +93,9 @@ class Session:
             others = dict.fromkeys(c.name for plugin in plugins.declared().values() for c in plugin.others)
             raise UsageError(f'against: found "{against}", allowed are exact, {", ".join(others)}')
         self.against, self.seed, self._width, self._values, self._chosen = against, seed, width, {}, {}
-        self.name = "scene" if isinstance(source, dict) else Path(source).name
-        if not isinstance(source, dict) and Path(source).suffix.lower() == ".npz":
+        in_file = isinstance(source, (str, os.PathLike))
+        self.name = Path(source).name if in_file else "scene"
+        if in_file and Path(source).suffix.lower() == ".npz":
             if defines:
                 raise UsageError(f"{source}: found a table file with defines, which only a scene file has")
             source = table_scene(source)
@@ -104,14 +104,14 @@ class Session:
         sensor = self.learned.scene.sensors()[0]
         if "to_world" not in self.learned.placement:
             raise scenes.SceneError(f"{self._parsed.path}: the sensor {sensor.class_name()} cannot be moved")
-        self._written = np.array(self.learned.placement["to_world"].matrix, np.float64).reshape(4, 4)
+        written = np.array(self.learned.placement["to_world"].matrix, np.float64).reshape(4, 4)
         film = scenes.film_size(self.learned.scene)
         self.full = (width, max(1, round(width * film[1] / film[0]))) if self.learned.by_pixels else film
         self.spp = spp or sensor.sampler().sample_count()
         if not isinstance(self.spp, int) or not 1 <= self.spp <= 2**16:
             raise UsageError(f"spp: found {self.spp}, allowed are whole numbers from 1 to {2**16}")
-        self.start = Pose.of(self._written)
-        self._pose, self._residue = self.start, np.linalg.inv(self.start.matrix) @ self._written
+        self.start = Pose.of(written)
+        self._pose, self._residue = self.start, np.linalg.inv(self.start.matrix) @ written
         self.view = VIEWS[0] if self.exact else VIEWS[1]
         self.divider, self.gain = 0.5, 10.0
         self.table_bytes = self._bytes({})
@@ -280,7 +280,7 @@ class Session:
                 column = min(max(round(self.divider * width), 0), width)
                 first, after = (0, column) if side is self.learned else (column, width)
             if first < after:
-                side.add_pass((width, height, first, after), self.spp, self.seed)
+                side.add_pass((width, height, first, after), self.spp, self.seed, self.moving)
             else:
                 side.region = (width, height, 0, 0)
                 side.passes += 1

@@ -266,3 +266,28 @@ def test_two_plugins_of_one_name(mi_rgb, monkeypatch):
     with pytest.warns(RuntimeWarning, match=r'"disney" \(theirs.disney\) is left out: .* mi_diffind.plugins.disney'):
         plugins.register(variant)
     assert plugins.declared()["disney"].factory.__module__ == "mi_diffind.plugins.disney"
+
+
+FILES = {
+    "neural_texture": {"filename": "tiles_filtered.npz", "channels": "albedo"},
+    "neural_material": {"filename": "tiles_filtered.npz"},
+    "mipmap": {"filename": "tiles_albedo.png"},
+    "neural_sdf": {"filename": "knot.npz"},
+}
+
+
+def test_choices_are_the_words_that_plugins_allow(mi_rgb):
+    """As they list them themselves when they refuse another one."""
+    assets = Path(__file__).resolve().parents[2] / "scenes" / "assets"
+    choices = [
+        (name, key, words) for name, plugin in plugins.declared().items() for key, words in plugin.choices.items()
+    ]
+    assert len(choices) > 8
+    for name, key, words in choices:
+        given = dict(FILES.get(name, {}))
+        if "filename" in given:
+            given["filename"] = str(assets / given["filename"])
+        with pytest.raises(RuntimeError, match=f'{key}.*"x"') as refused:
+            mi_rgb.load_dict({"type": name, **given, key: "x"})
+        listed = str(refused.value).split("allowed are ")[-1].split("\n")[0]
+        assert {word.strip(' "') for word in listed.split(",")} == set(words), (name, key, listed)
