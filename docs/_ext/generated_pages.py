@@ -82,10 +82,10 @@ def toctree(names) -> list[str]:
 
 
 def gallery(entries) -> list[str]:
-    """Return a grid of cards, each with a picture: triples of page, text and picture (path from ``docs``)."""
+    """Return a grid of cards: page, heading, text and picture of each."""
     lines = [".. grid:: 1 2 3 3", "   :gutter: 3", ""]
-    for page, text, picture in entries:
-        lines += [f"   .. grid-item-card:: {page}", f"      :link: {page}", "      :link-type: doc"]
+    for page, heading, text, picture in entries:
+        lines += [f"   .. grid-item-card:: {heading}", f"      :link: {page}", "      :link-type: doc"]
         lines += [f"      :img-top: {picture}" if picture else "", "", f"      {text}", ""]
     return lines
 
@@ -114,7 +114,7 @@ def plugin_pages(pages: Pages) -> dict[str, str]:
     for kind, heading in HEADINGS.items():
         named = sorted(name for name, plugin in declared.items() if plugin.object_type == kind)
         if named:
-            cards = [(name, _title(pages.content[f"plugins/{name}.rst"]), _picture(name)) for name in named]
+            cards = [(name, name, _title(pages.content[f"plugins/{name}.rst"]), _picture(name)) for name in named]
             index += [*titled(heading, "-"), *gallery(cards), *toctree(named)]
     pages.add("plugins/index.rst", "\n".join(index), "plugins")
     return {name: f"manual/plugins/{name}" for name in declared}
@@ -243,7 +243,7 @@ def notebook_pages(pages: Pages) -> None:
         pages.add(f"notebooks/{path.stem}.md", text, f"notebooks/{path.name}")
         pages.sources[f"manual/notebooks/{path.stem}"] = f"notebooks/{path.name}"
         title = re.search(r"^# (.+)$", text, re.MULTILINE)[1]
-        cards.append((path.stem, title, next(iter(pictures), "")))
+        cards.append((path.stem, title, f"``{path.name}``", next(iter(pictures), "")))
     index = [
         *titled("Notebooks"),
         "The files lie in the folder ``notebooks``; their results are those of the last run.",
