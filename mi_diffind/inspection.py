@@ -119,12 +119,13 @@ def paths_of(scene) -> dict[str, object]:
 
     The scene's own path is "". Mitsuba names objects without an id ``object_…``, by their address.
     """
-    paths, visited = {"": scene}, {scene}
 
     class Paths(mi.TraversalCallback):
-        def __init__(self, prefix: str):
+        """Callback that holds what it visits: a class that did would keep the scene until garbage is collected."""
+
+        def __init__(self, prefix: str, paths: dict, visited: set):
             super().__init__()
-            self.prefix = prefix
+            self.prefix, self.paths, self.visited = prefix, paths, visited
 
         def put(self, name, value, flags, cpptype=None):
             if isinstance(value, mi.Object):
@@ -134,16 +135,17 @@ def paths_of(scene) -> dict[str, object]:
             pass
 
         def put_object(self, name, value, flags):
-            if value is None or value in visited:
+            if value is None or value in self.visited:
                 return
-            visited.add(value)
+            self.visited.add(value)
             path = f"{self.prefix}{name}"
             numbered = (f"{path}_{i}" for i in itertools.count(1))
-            path = next(p for p in itertools.chain([path], numbered) if p not in paths)
-            paths[path] = value
-            value.traverse(Paths(f"{path}."))
+            path = next(p for p in itertools.chain([path], numbered) if p not in self.paths)
+            self.paths[path] = value
+            value.traverse(Paths(f"{path}.", self.paths, self.visited))
 
-    scene.traverse(Paths(""))
+    paths = {"": scene}
+    scene.traverse(Paths("", paths, {scene}))
     return paths
 
 

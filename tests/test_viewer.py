@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import mi_diffind
-from mi_diffind import scenes, srgb
+from mi_diffind import compat, scenes, srgb
 from mi_diffind.cli import main
 from mi_diffind.errors import UsageError
 from mi_diffind.viewer import passes
@@ -273,6 +273,20 @@ def test_table_files_are_shown(mi_rgb, file, mean):
     assert shown.figures["table_bytes"] > 500
     assert picture.astype(float).std(axis=(0, 1)).max() > 8
     assert shown.exact is not None or "exist" in shown.refusal or "source" in shown.refusal
+
+
+def test_scenes_end_with_their_session(mi_rgb, no_garbage_collection):
+    """Without the collector, which would free a scene within another one's render: Mitsuba crashes."""
+    shown = session(mi_rgb)
+    shown.refine()
+    first = [shown.learned.scene, shown.exact.scene]
+    shown.choose("preset", "paper")
+    shown.refine()
+    second = [shown.learned.scene, shown.exact.scene]
+    del shown
+    for kept in (first, second):
+        while kept:
+            assert not compat.is_shared([kept.pop()])
 
 
 def test_a_scene_without_learned_plugins_has_one_side(mi_rgb):
