@@ -16,6 +16,7 @@ import numpy as np
 
 from ... import units
 from ...errors import UsageError
+from ...files import check_distinct
 from ...fitting import FitResult, FittingError, cores
 from ...interrupt import interruptible
 from ...splat_files import is_splats
@@ -109,6 +110,10 @@ def check(request: FitRequest) -> None:
                 units.check_size(f"--{name}", value, MAX_BYTES)
     nodes = options["resolution"] or RESOLUTIONS[0]
     units.check_memory("--resolution", nodes, VOXEL * nodes**3)
+    if request.checkpoint is not None:
+        parts = ["grid.npz", *(f"stage{n}" for n in range(len(STAGES))), *(f"size{n}" for n in range(len(LADDER)))]
+        kept = [f"{os.fspath(request.checkpoint)}.{part}" for part in parts]
+        check_distinct({"-o": request.output, "--grid": options["grid"]}, {"a file beside --checkpoint": kept})
 
 
 def fit(request: FitRequest) -> Fitted:

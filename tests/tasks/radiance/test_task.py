@@ -16,6 +16,7 @@ from PIL import Image
 from mi_diffind import fitting, metrics
 from mi_diffind.cli import main
 from mi_diffind.deadline import Deadline
+from mi_diffind.errors import UsageError
 from mi_diffind.fitting import FitSettings
 from mi_diffind.fitting import fit as train
 from mi_diffind.runtime import array_module
@@ -305,6 +306,13 @@ def test_options_that_do_not_go_together(folder, tmp_path, capsys, more, message
         code = e.code
     assert code == 2 and message in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["state.grid.npz", "state.stage0", "state.size7"])
+def test_files_beside_a_checkpoint_are_not_replaced(folder, tmp_path, name):
+    given = {"grid": str(tmp_path / name)} if name != "state.grid.npz" else {"output": tmp_path / name}
+    with pytest.raises(UsageError, match=f'{name}", the same file as a file beside --checkpoint'):
+        fit("field", str(folder), checkpoint=tmp_path / "state", progress=False, **given)
 
 
 def test_a_grid_of_other_views_is_refused(folder, tmp_path, capsys):
