@@ -252,6 +252,8 @@ recipe("arrays of which one is of floats, nothing inside", "sdf_paper", ["conver
        ["set_record", "end", 0, 4, 4, 65536])  # fmt: skip
 recipe("a primary array of floats", "sdf_paper", ["convert", "primary", "float32"],
        ["set_record", "local", 2, 6, 1, 2], outcomes=("refused", "loaded"))  # fmt: skip
+recipe("random probabilities, no nodes", "field_coded", ["random_entries", "probabilities", 18])
+recipe("no nodes", "field_grid", ["set_entries", "cells", "all", 0, 0])
 recipe("no crossed cell", "sdf_sparse", ["set_entries", "region_masks", "all", 0, 0])
 recipe("control characters in a setting", "ggx_small", ["set_value", ["settings", "inputs"], "\x1b[31mred"])
 recipe("control characters in the task", "ggx_small", ["set_value", ["task"], "\x1b]0;title\x07"])

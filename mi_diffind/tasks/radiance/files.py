@@ -330,9 +330,11 @@ def cells_of_file(table: Table) -> np.ndarray:
 
 
 def nodes_of(table: Table, types, packed: bool = False) -> Nodes:
-    """Return the nodes of a checked table."""
+    """Return the nodes of a checked table. Raises :class:`TableError` if there are none."""
     settings = table.settings
     stored = cells_of_file(table) if packed else stored_of(table)
+    if not stored.any():
+        raise TableError(f"{table.path or 'the field'}: holds no nodes")
     place = types, settings["lower"], settings["spacing"], settings["shape"], stored, packed
     return ContractedNodes(*place, inner=settings["inner"]) if "inner" in settings else Nodes(*place)
 
