@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -208,9 +209,10 @@ def load(path) -> Table:
         bits, colours = table.settings.get("density_bits"), len(table.arrays["palette"].entries)
         if bits not in range(1, MOST_DENSITY_BITS + 1) or colours > 2**MOST_BITS:
             raise TableError(f"{path}: is damaged: found {bits!r} bits of a density and {colours:,} colours")
-        check_palette(table)
+        check_bytes(table, table.arrays)
         sparse(table)
         return table
+    check_bytes(table, ["cells"])
     if len(table.arrays["cells"].entries) != -(-math.prod(shape) // 8):
         raise TableError(f'{path}: is damaged: the array "cells" is not that of a grid of {shape}')
     if layout == "pairs":
@@ -225,7 +227,7 @@ def load(path) -> Table:
         if stored != entries:
             raise TableError(f'{path}: is damaged: the array "{name}" has {stored} entries, expected {entries}')
     if layout == "sparse":
-        check_palette(table)
+        check_bytes(table, table.arrays)
         bits = table.settings.get("index_bits")
         if bits not in INDEX_BITS:
             raise TableError(f"{path}: is damaged: found indices of {bits!r} bits, allowed are {INDEX_BITS}")
@@ -250,9 +252,9 @@ def check_place(table: Table) -> None:
         )
 
 
-def check_palette(table: Table) -> None:
-    """Raise :class:`TableError` unless the arrays of a field with a palette are bytes."""
-    for name in table.arrays:
+def check_bytes(table: Table, names: Iterable[str]) -> None:
+    """Raise :class:`TableError` unless the arrays of these names are bytes."""
+    for name in names:
         if table.arrays[name].storage != "uint8":
             kept = table.arrays[name].storage
             raise TableError(f'{table.path}: is damaged: its array "{name}" is stored as {kept}, allowed is uint8')
