@@ -20,6 +20,9 @@ from .limits import Allowance, json_bytes
 #: Methods of compression that are read. Members in bz2 or lzma, which NumPy never writes, grow faster than deflate.
 METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
+#: Most digits of a whole number of JSON: larger ones are no floats.
+LONGEST_NUMBER = 308
+
 #: Bytes that are decompressed at a time.
 PIECE = 2**20
 
@@ -113,9 +116,16 @@ class Archive:
         text = array.tobytes()
         self.allowance.take(json_bytes(text), content)
         try:
-            return json.loads(text)
+            return json.loads(text, parse_int=_whole)
         except RecursionError:
             raise ValueError("too many lists within lists") from None
+
+
+def _whole(digits: str) -> int:
+    """Return a whole number of JSON. Raises ``ValueError`` for one of more digits than a float may have."""
+    if len(digits) > LONGEST_NUMBER:
+        raise ValueError(f"a whole number of {len(digits)} digits, at most {LONGEST_NUMBER} are read")
+    return int(digits)
 
 
 def read_arrays(path: str | os.PathLike) -> dict[str, np.ndarray]:

@@ -804,7 +804,7 @@ def test_damaged_affine_map(tmp_path, key, value):
     path = tmp_path / "t.npz"
     save_table(path, example("uint8"))
     change_meta(path, lambda meta: meta["arrays"]["cascaded"].update({key: value}))
-    refused(path, "cascaded")
+    refused(path, "a whole number of 401 digits" if value == [10**400] * 7 else "cascaded")
     change_meta(path, lambda meta: meta["arrays"]["cascaded"].pop(key) and None)
     refused(path, "cascaded")
 

@@ -254,6 +254,7 @@ recipe("a primary array of floats", "sdf_paper", ["convert", "primary", "float32
        ["set_record", "local", 2, 6, 1, 2], outcomes=("refused", "loaded"))  # fmt: skip
 recipe("random probabilities, no nodes", "field_coded", ["random_entries", "probabilities", 18])
 recipe("flags of floats", "field_pairs", ["convert", "cells", "float16"])
+recipe("a figure of 400 digits", "texture_pages", ["set_value", ["measured", "psnr_base_color_db"], 10**400])
 recipe("no nodes", "field_grid", ["set_entries", "cells", "all", 0, 0])
 recipe("no crossed cell", "sdf_sparse", ["set_entries", "region_masks", "all", 0, 0])
 recipe("control characters in a setting", "ggx_small", ["set_value", ["settings", "inputs"], "\x1b[31mred"])
