@@ -373,9 +373,9 @@ def damaged(data: bytes, recipe: list) -> tuple[bytes, list[str] | None]:
         archive = Archive.read(io.BytesIO(data))
         names = set(archive.arrays)
         for name, *arguments in structured:
-            if name in ("set_entries", "random_entries", "resize", "convert"):
-                if not getattr(archive.arrays.get(arguments[0]), "ndim", 0):  # numbers of a checkpoint have no entries
-                    continue
+            of_entries = name in ("set_entries", "random_entries", "resize", "convert")
+            if of_entries and not np.ndim(archive.arrays.get(arguments[0], 0)):  # numbers of a checkpoint have none
+                continue
             STEPS[name](archive, *arguments)
         data = archive.write()
         if any(step[0] not in ("duplicate", "method") for step in structured):
