@@ -58,14 +58,16 @@ class Campaign:
         return {"target": self.target, "mutants": self.outcomes.total(), **counted, "faults": self.faults}
 
 
-def run(child: LimitedChild, target: Target, recipes, examples: int, spare=lambda: True, share: int = 1) -> Campaign:
+def run(
+    child: LimitedChild, target: Target, recipes, examples: int, spare=lambda: True, share: int = 1, seed: int = 0
+) -> Campaign:
     """Send ``examples`` mutants through the child, as long as ``spare()`` says that there is time.
 
     Of the table files that load, one in ``share`` is decoded and rendered.
     """
     campaign = Campaign(target.name)
 
-    @strategies.hostile(examples)
+    @strategies.hostile(examples, seed)
     @given(recipe=recipes)
     def each(recipe):
         if spare():

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from hostile_files import SIDES, VALUES, Archive
 from hypothesis import HealthCheck, Phase, settings
+from hypothesis import seed as seeded
 from hypothesis import strategies as st
 from hypothesis.configuration import set_hypothesis_home_dir
 
@@ -19,12 +20,13 @@ set_hypothesis_home_dir(Path(tempfile.gettempdir()) / "hypothesis")
 MUTANTS = int(os.environ.get("MI_DIFFIND_MUTANTS", "2000"))
 
 
-def hostile(examples: int):
-    """Settings of hypothesis: always the same examples, no limit of time, nothing is written."""
-    return settings(
-        max_examples=examples, derandomize=True, deadline=None, database=None,
+def hostile(examples: int, seed: int = 0):
+    """Return a decorator: always the same examples, or others by ``seed``, no limit of time, nothing is written."""
+    decorator = settings(
+        max_examples=examples, derandomize=not seed, deadline=None, database=None,
         suppress_health_check=list(HealthCheck), phases=(Phase.generate, Phase.shrink),
     )  # fmt: skip
+    return (lambda test: seeded(seed)(decorator(test))) if seed else decorator
 
 
 def paths_of(content, before: tuple = ()) -> list[tuple]:

@@ -1,7 +1,8 @@
 """Attack all readers with damaged files: ``python tests/trust/run.py --mutants N --raw M``.
 
 Prints a table of figures a file (refused, loaded, and every sort of fault) and writes it as JSON, with the shortest
-recipe of each fault. ``--seeds`` writes the small valid files of all tasks anew instead.
+recipe of each fault. ``--add EARLIER.json --seed N`` adds other mutants to those of an earlier report.
+``--seeds`` writes the small valid files of all tasks anew instead.
 """
 
 from __future__ import annotations
@@ -35,6 +36,27 @@ def make_seeds(only: list[str]) -> None:
                 print(f"{path}: {path.stat().st_size:,} bytes")
 
 
+def report(results: list[dict], arguments) -> dict:
+    """Return the report of some campaigns, with those of an earlier report added."""
+    columns = ("mutants", *GOOD, *FAULTS)
+    earlier = json.loads(arguments.add.read_text(encoding="utf-8")) if arguments.add else {"results": [], "seeds": []}
+    rows = {(r["recipes"], r["target"]): dict(r) for r in earlier["results"]}
+    for result in results:
+        row = rows.setdefault((result["recipes"], result["target"]), {**result, **dict.fromkeys(columns, 0)})
+        row.update({column: row[column] + result[column] for column in columns})
+        row["faults"] = {**row.get("faults", {}), **result["faults"]}
+    totals = {
+        form: {c: sum(r[c] for r in rows.values() if r["recipes"] == form) for c in columns}
+        for form in ("structured", "raw")
+    }
+    return {
+        "version": __version__, "machine": platform.processor() or platform.machine(),
+        "date": time.strftime("%Y-%m-%d"), "seeds": [*earlier.get("seeds", [0]), arguments.seed], "totals": totals,
+        "faults": sum(t[fault] for t in totals.values() for fault in FAULTS),
+        "results": [rows[key] for key in sorted(rows)],
+    }  # fmt: skip
+
+
 def main() -> int:
     """Run the campaigns; return 1 if there was a fault."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -42,6 +64,8 @@ def main() -> int:
     parser.add_argument("--raw", type=int, default=1000, help="mutants by bytes of each file (default: 1000)")
     parser.add_argument("--share", type=int, default=1, help="one in so many tables that load is rendered (default: 1)")
     parser.add_argument("--seconds", type=float, default=float("inf"), help="limit of the time of all together")
+    parser.add_argument("--seed", type=int, default=0, help="other mutants for each number (default: 0)")
+    parser.add_argument("--add", type=Path, metavar="EARLIER", help="report of another seed, whose figures are added")
     parser.add_argument("--json", type=Path, default=Path("trust_files.json"), help="report to write")
     parser.add_argument("--seeds", action="store_true", help="write the valid files of all tasks anew, and end")
     parser.add_argument("only", nargs="*", help="names of files (default: all)")
@@ -66,16 +90,18 @@ def main() -> int:
                 if count < 1:
                     continue
                 campaign = campaigns.run(
-                    child, target, recipes, count, lambda end=end: time.monotonic() < end, arguments.share
+                    child,
+                    target,
+                    recipes,
+                    count,
+                    lambda end=end: time.monotonic() < end,
+                    arguments.share,
+                    arguments.seed,
                 )
                 figures = {"recipes": form, **campaign.figures()}
                 results.append(figures)
                 print(f"{name:24} {form:10} " + " ".join(f"{figures[c]:13,}" for c in columns), flush=True)
-        report = {
-            "version": __version__, "machine": platform.processor() or platform.machine(),
-            "date": time.strftime("%Y-%m-%d"), "seconds": round(time.monotonic() - began), "results": results,
-        }  # fmt: skip
-        arguments.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+        arguments.json.write_text(json.dumps(report(results, arguments), indent=1) + "\n", encoding="utf-8")
     total = {c: sum(r[c] for r in results) for c in columns}
     print(f"{'all':35} " + " ".join(f"{total[c]:13,}" for c in columns))
     for result in results:
