@@ -249,7 +249,8 @@ class NeuralGGX(mi.BSDF):
         if self._reflects_all() and not mi.is_polarized:
             return mi.Spectrum(1)
         cos = 0.5 * dr.sqrt(h2)  # of the angle between wi and the half vector
-        eta = mi.UnpolarizedSpectrum(self.eta.eval(si, active))
+        # At normal incidence, the reflectance of eta = k = 0 is 0 / 0
+        eta = dr.maximum(mi.UnpolarizedSpectrum(self.eta.eval(si, active)), 1e-6)
         k = mi.UnpolarizedSpectrum(self.k.eval(si, active))
         if mi.is_polarized:
             return _polarised(ctx, eta, k, h * dr.rsqrt(h2), cos, wi, wo)
