@@ -13,8 +13,9 @@ run in turn; ratios are medians over the rounds of the ratio to the first conten
 contender has a process of its own, because Dr.Jit compiles the materials of all scenes that a process holds into each
 kernel. Bytes are those of all maps of a file, in memory in the storage form that a plugin reads by default, and on
 disk. Distance fields have 1 MiB and are trained by the whole recipe, because the steps of rays depend on their entries.
-The paper's recipe for images and textures is trained for half a minute, and fields of a small capture briefly: their
-times depend on the arrays alone.
+The grid of ``sdfgrid`` has the exact distances of the mesh; its error is the mean angle of its normals where rays meet
+it. The paper's recipe for images and textures is trained for minutes, which its bytes on disk depend on. Materials of
+4096² texels (``large``) and fields of a small capture are trained briefly: their times depend on the arrays alone.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from bench_large_material import material
 
 import mi_diffind
 from mi_diffind import compat
@@ -43,8 +45,8 @@ VARIANT = "llvm_ad_rgb"
 #: Pass → side of the film; samples a pixel.
 SIDES, SPP = {"render": 160, "step": 96}, 4
 
-#: Seconds of a training by the paper's recipe.
-SECONDS = 30
+#: Seconds of a training by the paper's recipe, and of one of a material of 4096² texels.
+SECONDS, LARGE_SECONDS = 240, 30
 
 #: First rounds, which compile kernels.
 WARM = 2
@@ -106,6 +108,11 @@ def field(name: str, storage: str, folder: Path) -> dict:
     return {"integrator": {"type": "neural_field", "filename": str(folder / f"field_{name}.npz"), "storage": storage}}
 
 
+def learned_image(filename, storage: str) -> dict:
+    """Return the albedo of a file of the task ``image``."""
+    return repeated({"type": "neural_image", "filename": str(filename), "channels": "albedo", "storage": storage})
+
+
 #: Task → name of a contender → parts of its scene, of ``storage`` and ``folder`` (the files of :func:`prepare`). The
 #: first contender is what a user would take instead. ``keys``: parameters of the step, a pattern.
 CONTENDERS = {
@@ -128,13 +135,13 @@ CONTENDERS = {
     },
     "image": {
         "bitmap": lambda storage, **_: on_plane(bitmap("tiles_albedo.png", storage)),
-        "ours": lambda storage, **_: on_plane(
-            repeated({"type": "neural_image", "filename": asset("tiles.npz"), "channels": "albedo", "storage": storage})
-        ),
-        "paper": lambda storage, folder: on_plane(
-            repeated({"type": "neural_image", "filename": str(folder / "image_paper.npz"), "channels": "albedo",
-                      "storage": storage})
-        ),
+        "ours": lambda storage, **_: on_plane(learned_image(asset("tiles.npz"), storage)),
+        "paper": lambda storage, folder: on_plane(learned_image(folder / "image_paper.npz", storage)),
+    },
+    "large": {
+        "bitmap": lambda storage, folder: on_plane(bitmap(str(folder / "large" / "albedo.png"), storage)),
+        "ours": lambda storage, folder: on_plane(learned_image(folder / "large_ours.npz", storage)),
+        "paper": lambda storage, folder: on_plane(learned_image(folder / "large_paper.npz", storage)),
     },
     "texture": {
         "bitmap": lambda storage, **_: on_plane(bitmap("tiles_albedo.png", storage)),
@@ -185,8 +192,10 @@ CONTENDERS = {
 KEYS = {
     "ggx": r"shape\.bsdf\.(alpha|eta|k)\b.*", "disney": r"shape\.bsdf\.(?!tables).*",
     "bsdf": r"shape\.bsdf\.(?!tables).*",
-    "image": r"shape\.bsdf\..*(data|tables\..*)", "texture": r"shape\.bsdf\..*(data|levels.*|tables\..*)",
-    "shading": r"shape\.bsdf\..*(data|tables\..*)", "sdf": r"shape\.(grid|vertex_positions|tables\..*)",
+    **dict.fromkeys(("image", "large"), r"shape\.bsdf\..*(data|tables\..*)"),
+    "texture": r"shape\.bsdf\..*(data|levels.*|tables\..*)",
+    "shading": r"shape\.bsdf\..*(data|tables\..*)",
+    "sdf": r"shape\.(grid|vertex_positions|tables\..*)",
     "field": r"integrator\..*tables\..*",
 }  # fmt: skip
 
@@ -207,6 +216,44 @@ def grid_of(path: Path) -> dict:
     lower, size = stored["lower"], stored["upper"] - stored["lower"]
     to_world = mi.ScalarTransform4f().translate(lower.tolist()).scale(size.tolist())
     return {"grid": mi.TensorXf(stored["values"]), "to_world": to_world}
+
+
+def write_grid(path: Path) -> None:
+    """Write the exact distances of Suzanne for ``sdfgrid``, and the place of the grid."""
+    from mi_diffind.plugins.support.distance_shapes import crop_grid
+    from mi_diffind.tasks.sdf.distances import Distances
+    from mi_diffind.tasks.sdf.mesh import load_mesh
+
+    mesh = load_mesh(asset("suzanne.ply"))
+    spacing = float((mesh.upper - mesh.lower).max()) / CELLS
+    lower = mesh.lower - 3 * spacing
+    counts = np.ceil((mesh.upper - lower) / spacing).astype(int) + 4
+    z, y, x = np.meshgrid(*(np.arange(n) for n in counts[::-1]), indexing="ij")
+    points = lower + spacing * np.stack([x, y, z], -1).reshape(-1, 3)
+    values = Distances(mesh).signed(points).reshape(x.shape)
+    values, lower, upper = crop_grid(values, lower, spacing)
+    lower, upper = (np.array(mesh.centre) + mesh.scale * corner for corner in (lower, upper))
+    values = values[..., None] * mesh.scale
+    np.savez(path, values=values.astype(np.float32), lower=lower, upper=upper)
+
+
+def grid_error(path: Path, normal: str = "smooth", count: int = 2**18) -> float:
+    """Return the mean angle, in degrees, of the normals of ``sdfgrid`` from the mesh's, where rays meet both."""
+    from mi_diffind.tasks.sdf.distances import Distances
+    from mi_diffind.tasks.sdf.mesh import load_mesh
+    from mi_diffind.tasks.sdf.sampling import sample_surface
+
+    mesh = load_mesh(asset("suzanne.ply"))
+    points, normals = sample_surface(Distances(mesh).surface, count, 1)
+    shape = {"type": "sdfgrid", "normals": normal, **grid_of(path)}
+    scene = mi.load_dict({"type": "scene", "shape": shape})
+    points = points * mesh.scale + np.array(mesh.centre) + 0.01 * mesh.scale * normals
+    vectors = [mi.Vector3f(*(np.ascontiguousarray(v, np.float32) for v in a.T)) for a in (points, -normals)]
+    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(vectors[0]), vectors[1]))
+    met = np.array(si.is_valid()) & (np.array(si.t) < 0.02 * mesh.scale)
+    cosine = np.sum(np.array(si.sh_frame.n).T * normals, axis=1)[met]
+    print(f"sdfgrid: {met.mean():.1%} of the rays meet it", flush=True)
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean())
 
 
 def file_sizes(path: Path, storage: str = "uint8") -> dict[str, int]:
@@ -250,6 +297,7 @@ def sizes(folder: Path, tasks: list[str]) -> dict[str, dict]:
             measured=dict.fromkeys(("memory", "disk"), (folder / "copper.bsdf").stat().st_size),
         ),
         "image": lambda: files(ASSETS / "tiles.npz", "image_paper.npz", bitmap=bitmaps(tiles)),
+        "large": dict,
         "texture": lambda: files(ASSETS / "tiles_filtered.npz", "texture_paper.npz", bitmap=bitmaps(tiles)),
         "shading": lambda: files(
             ASSETS / "rust_shaded.npz", "shading_paper.npz", **{name: bitmaps(maps[name]) for name in maps}
@@ -275,22 +323,19 @@ def prepare(folder: Path, tasks: list[str]) -> None:
         fitted("bsdf", {"type": "roughconductor", "distribution": "ggx", **METAL}, "bsdf_paper", preset="paper")
     if "image" in tasks:
         fitted("image", asset("tiles.json"), "image_paper", preset="paper", seconds=SECONDS)
+    if "large" in tasks:
+        manifest = material(folder / "large", "lacquer", 4096)
+        for preset in ("ours", "paper"):
+            options = {"preset": preset, "seconds": LARGE_SECONDS, "compression": 12}
+            fitted("image", str(manifest), f"large_{preset}", **options)
     if "texture" in tasks:
         fitted("texture", asset("tiles.json"), "texture_paper", preset="paper", seconds=SECONDS)
     if "shading" in tasks:
         fitted("texture", asset("rust.json"), "shading_paper", preset="paper", seconds=SECONDS)
     if "sdf" in tasks:
-        from mi_diffind.plugins.support.distance_shapes import crop_grid
-        from mi_diffind.tasks.sdf import grids
-
         for preset, name in (("sparse", "sdf_ours"), ("paper", "sdf_paper")):
             fitted("sdf", asset("suzanne.ply"), name, preset=preset, bytes="1m")
-        model = mi_diffind.open(folder / "sdf_ours.npz")
-        values, lower, upper = grids.grid(model.field, CELLS)
-        values, lower, upper = crop_grid(values, lower, (upper[0] - lower[0]) / (values.shape[2] - 1))
-        lower, upper = (np.array(model.centre) + model.scale * corner for corner in (lower, upper))
-        values = values[..., None] * model.scale
-        np.savez(folder / "sdf_grid.npz", values=values.astype(np.float32), lower=lower, upper=upper)
+        write_grid(folder / "sdf_grid.npz")
     if "field" in tasks:
         views = folder / "views"
         mi_diffind.capture(ROOT / "scenes" / "capture_group.xml", views, views=24, test=4, resolution=64, spp=16)
@@ -406,10 +451,12 @@ def main() -> None:
     names = arguments.tasks or list(CONTENDERS)
     kept = Path(arguments.json) if arguments.json else None
     before = json.loads(kept.read_text(encoding="utf-8")) if kept and kept.is_file() else {}
-    results, counted = before.get("tasks", {}), before.get("bytes", {})
+    results, counted, errors = (before.get(key, {}) for key in ("tasks", "bytes", "errors"))
     with tempfile.TemporaryDirectory() as folder:
         prepare(Path(folder), names)
         counted |= sizes(Path(folder), names)
+        if "sdf" in names:
+            errors["sdfgrid"] = grid_error(Path(folder) / "sdf_grid.npz")
         for task in names:
             results[task] = {}
             for size in SIDES:
@@ -421,7 +468,7 @@ def main() -> None:
             if kept:
                 write_json(kept, {
                     "machine": clock.machine(VARIANT), "rounds": arguments.rounds, "spp": SPP, "sides": SIDES,
-                    "bytes": counted, "tasks": results,
+                    "bytes": counted, "errors": errors, "tasks": results,
                 })  # fmt: skip
 
 
