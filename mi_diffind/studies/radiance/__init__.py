@@ -42,6 +42,10 @@ class RadianceStudy(Study):
         parser.add_argument(
             "--steps", type=int, default=0, metavar="N", help="steps of each training through the images (default: 500)"
         )
+        parser.add_argument(
+            "--seconds", type=float, default=0.0, metavar="S",
+            help="seconds of each training of planes and of the network, whose steps take long (default: 90)",
+        )  # fmt: skip
 
     def check(self, arguments) -> None:
         """Check the options and read the views; raise :class:`~mi_diffind.tasks.radiance.views.ViewsError`."""
@@ -58,6 +62,8 @@ class RadianceStudy(Study):
             value = getattr(arguments, name)
             if value and value < least:
                 raise ValueError(f"--{name}: found {value}, at least {least} is needed")
+        if not 0 <= arguments.seconds < float("inf"):
+            raise ValueError(f"--seconds: found {arguments.seconds:g}, allowed are numbers that are not negative")
         if arguments.source == DEFAULT and not Path(DEFAULT).exists():
             raise ValueError(f'there is no folder "{DEFAULT}": make it by mi-diffind capture {SCENE} -o {DEFAULT}')
         arguments.views = tuple(load_views(arguments.source, split) for split in ("train", "test"))
@@ -76,7 +82,7 @@ class RadianceStudy(Study):
             resolution=arguments.resolution or (24 if quick else 128),
             grid_steps=60 if quick else 0,
             steps=arguments.steps or (40 if quick else 500),
-            seconds=3.0 if quick else 90.0,
+            seconds=arguments.seconds or (3.0 if quick else 90.0),
             film=48 if quick else 200,
         )
         session = FieldSession(array_module(mi.variant()), *arguments.views)
