@@ -99,6 +99,21 @@ def trace(folder: Path, count: int) -> dict:
     return report
 
 
+def write_fields(folder: Path) -> None:
+    """Write small fields, each to a file of ``folder``."""
+    from radiance_fields import ball_table
+    from sdf_fields import dense_table, sparse_table
+
+    from mi_diffind.tables import save_table
+
+    tables = {
+        "sparse": sparse_table(), "sparse_float32": sparse_table(), "dense": dense_table(), "field": ball_table(),
+        "surroundings": ball_table((0, 0, 0, 0.6)),
+    }  # fmt: skip
+    for name, table in tables.items():
+        save_table(folder / f"{name}.npz", table)
+
+
 def opened(mi, path: Path) -> tuple:
     """The box of a field (corners, spacing), and functions that follow rays (origins, directions, lengths), by name.
 

@@ -4,25 +4,13 @@ through everything that is traced: every one ends, and no result is NaN or infin
 """
 
 import pytest
-from hostile_rays import report_of
-from radiance_fields import ball_table
-from sdf_fields import dense_table, sparse_table
-
-from mi_diffind.tables import save_table
+from hostile_rays import report_of, write_fields
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("hostile")
-    tables = {
-        "sparse": sparse_table(),
-        "sparse_float32": sparse_table(),
-        "dense": dense_table(),
-        "field": ball_table(),
-        "surroundings": ball_table((0, 0, 0, 0.6)),
-    }
-    for name, table in tables.items():
-        save_table(path / f"{name}.npz", table)
+    write_fields(path)
     return path
 
 

@@ -1,0 +1,57 @@
+"""Send hostile rays and queries through all plugins: ``python tests/trust/hostile.py --count 10000000``.
+
+Rays go through small fields, alone and in a scene, queries to each material and texture. The report counts what was
+sent, and the answers that are not finite (of densities and values: or negative).
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "helpers"))
+
+import hostile_queries
+import hostile_rays
+import mitsuba as mi
+import plugin_examples
+
+import mi_diffind
+from mi_diffind.files import write_json
+from mi_diffind.measure import clock
+
+VARIANT = "llvm_ad_rgb"
+
+
+def main() -> int:
+    """Send them; return 1 if an answer was not finite."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=10**5, help="rays of each field, queries of each (default: 10⁵)")
+    parser.add_argument("--seconds", type=float, default=7200, help="limit of the time of all rays (default: 7200)")
+    parser.add_argument("--json", type=Path, default=Path("trust_rays.json"), help="report to write")
+    arguments = parser.parse_args()
+    mi.set_variant(VARIANT)
+    with tempfile.TemporaryDirectory() as folder:
+        hostile_rays.write_fields(Path(folder))
+        rays = hostile_rays.report_of(folder, arguments.count, arguments.seconds)
+    print(*(f"{name}: {numbers}" for name, numbers in rays.items()), sep="\n", flush=True)
+    queries, wrong = {}, sum(numbers["not_finite"] for numbers in rays.values())
+    for name in filter(hostile_queries.is_queried, plugin_examples.names()):
+        faults = hostile_queries.faults(mi, name, arguments.count)
+        materials = len(hostile_queries.materials(mi, name))
+        queries[name] = {"queries": materials * arguments.count, "wrong": sum(n for n, *_ in faults.values())}
+        print(f"{name}: {queries[name]} {faults or ''}", flush=True)
+        wrong += queries[name]["wrong"]
+    report = {
+        "version": mi_diffind.__version__, "machine": clock.machine(VARIANT), "date": time.strftime("%Y-%m-%d"),
+        "count": arguments.count, "wrong": wrong, "rays": rays, "queries": queries,
+    }  # fmt: skip
+    write_json(arguments.json, report)
+    return int(wrong > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
