@@ -102,7 +102,7 @@ class NeuralBSDF(mi.BSDF):
        - The entries of the residual's arrays; of a family, also ``tables.mixing`` and ``tables.proxy``.
        - |exposed|, |differentiable|
 
-    Any reflecting BSDF in two kilobytes: an analytic proxy (a diffuse lobe and two microfacet lobes) times
+    Any reflecting BSDF in a file of four kilobytes: an analytic proxy (a diffuse lobe and two microfacet lobes) times
     the fourth power of a residual that is read by *differentiable indirection* (Datta et al., *Efficient Graphics
     Representation with Differentiable Indirection*, SIGGRAPH Asia 2023). ``mi-diffind fit bsdf`` makes the file of a
     material of a scene, of any of Mitsuba's BSDFs, or of measured data.

@@ -66,9 +66,9 @@ class NeuralDisney(Disney):
     densities are analytic, so they stay normalised although tables are approximate. Only the effects in use are traced,
     read and sampled.
 
-    The preset ``paper`` **gains energy** at the horizon, where its masking is inaccurate: at roughness 0.2,
-    ``anisotropic`` 1 and an angle of 89° the mean weight of a sample reaches 2.44, where the exact one stays below 1.
-    ``tables`` does not.
+    **Energy**: the Disney model itself reflects more than it receives at grazing angles, if it is bright, and so does
+    this plugin, as :monosp:`disney` does. The preset ``paper`` gains more, since its masking is inaccurate at the
+    horizon; ``tables`` does not.
 
     {executable}
 

@@ -135,8 +135,8 @@ derivatives with respect to the field include its light and its shadow on surfac
 
 ``to_world`` may change between renders; the field is then that of a new scene. Its derivatives, with any ``storage``,
 include the sides of the box and the surfaces that cut the field. Where occupied cells end before the density is zero,
-the field jumps, and the jump has no derivative: derivatives of pixels were 10% off differences for a trained grid of
-40³ cells, and 0.2% for a ball that fades out.
+the field jumps, and the jump has no derivative: derivatives of pixels with respect to ``to_world`` are then several
+percent off differences.
 
 The base classes of Mitsuba write an alpha of 0 or 1, and they fail with AOVs in the backward pass, since they multiply
 AOVs, which are numbers, by the weight of the ray, which is a spectrum. This integrator has render passes of its

@@ -90,12 +90,12 @@ class NeuralGGX(mi.BSDF):
     With ``tables``, D̂/D lies between 0.9 and 1.1 at any angle and roughness, in every storage form, and the mean weight
     is at most 0.02 (bytes: 0.035) above the exact one: the tail, beyond 8/9 of the projected area of the normals, is
     not read but continued by its analytic form. ``paper`` reads all of D. It underestimates the peak and overestimates
-    the tail: at an angle of 89.999°, where the exact mean weight is 0.92 to 0.94, its mean weight is 1.3 at ``alpha``
-    0.003, 3.5 at 0.001 and 29 at 0.0001, and single weights reach 600, 5,000 and 200,000.
+    the tail: close to the horizon, where the exact mean weight is below 1, its mean weight grows to 29 at ``alpha``
+    0.0001, and single weights reach thousands.
 
     **Derivatives are less accurate than values**, since the slope of a bilinear read is constant between entries:
-    derivatives with respect to ``alpha`` have errors of 4% to 13% on average, and from ``alpha`` 0.95 may have the
-    wrong sign. Fits of ``alpha`` from images still converge.
+    derivatives with respect to ``alpha`` have errors of several percent on average, and close to ``alpha`` 1 may have
+    the wrong sign. Fits of ``alpha`` from images still converge.
 
     Sampling is detached, as in ``disney``: gradients flow through the value of a sample, not through its position or
     density. Like its counterpart, the material reflects on the front side only; nest it in :monosp:`twosided` for both.

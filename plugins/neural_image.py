@@ -68,8 +68,8 @@ class NeuralImage(MapTexture):
     seam, where :monosp:`bitmap` blends over the width of a texel.
 
     **Spectral variants** upsample each colour to a spectrum by Jakob and Hanika's model, from the table of coefficients
-    that :monosp:`bitmap` uses at load time. The spectra agree at texel centres (114 dB), and to 52 dB between the
-    texels of smooth colours (48 × 64 texels, 400 to 700 nm). As in :monosp:`bitmap`, colours are clamped to [0, 1]
+    that :monosp:`bitmap` uses at load time. The spectra agree at texel centres, and closely between the texels
+    of smooth colours. As in :monosp:`bitmap`, colours are clamped to [0, 1]
     before upsampling, also those of emitters; and a map of three channels gives spectra only without ``raw``, and
     numbers only with ``raw``.
 

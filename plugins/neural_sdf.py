@@ -171,15 +171,15 @@ class NeuralSDF(distance_shape(mi.Mesh)):
 
     ``to_world`` may change between renders, with any ``storage``; the shape is then that of a new scene. Its
     derivatives are those of :monosp:`path_sdf`: shading, without the outlines that move. With ``analytic`` normals, a
-    normal jumps from cell to cell of the field, and the jumps have no derivative: on a glossy torus, derivatives of
-    pixels are 1 to 14% off differences, against 0.3 to 5% with ``smooth`` normals, which do not jump.
+    normal jumps from cell to cell of the field, and the jumps have no derivative: on glossy solids,
+    derivatives of pixels are several times as far from differences as with ``smooth`` normals, which do not jump.
 
     **With** ``grid``, the resolution is chosen when the scene is loaded: grids are evaluated at 4096 places on the
     surface, and the coarsest one is taken whose mean distance to the arrays' surface is at most the arrays' mean
-    distance to the mesh when they were fitted. Values beside the surface are corrected for the error of interpolation,
-    which reduces it by a fifth to a third. Mitsuba takes 40 bytes for each cell of the box around the surface, crossed
-    or not: 400 MB for a field of 256 kB, more than 2.5 GB and up to 20 seconds for one of 1 MB; ``resolution`` requests
-    a coarser grid. Where 512 cells or 3.2 GB do not suffice, a warning states the errors; ``mi-diffind inspect`` states
+    distance to the mesh when they were fitted. Values beside the surface are corrected for the error of
+    interpolation. Mitsuba takes 40 bytes for each cell of the box around the surface, crossed or not: hundreds of
+    megabytes for a field of 256 kB, gigabytes for one of 1 MB; ``resolution`` requests a coarser grid.
+    Where 512 cells or 3.2 GB do not suffice, a warning states the errors; ``mi-diffind inspect`` states
     them for any scene. Each shape has its own grid. A rotated grid is an instance; derivatives and parameters are those
     of :monosp:`sdfgrid`.
 

@@ -42,8 +42,8 @@ from the origin looks the same. Seen from :math:`10^3` times its size away, a so
 
 **Glass** needs a large ``max_depth``. The normals of a field are a fraction of a degree off, as those of flat triangles
 are: light that enters a round solid at grazing incidence is then totally reflected within it, often hundreds of times.
-Of a glass ball under a white sky, a field of 1 MB has 102 of 2304 pixels more than 1% too dark with a ``max_depth`` of
-16, a mesh of 20,480 flat triangles 110. With 1000, the field has none, and every path has the weight 1.
+Of a glass ball under a white sky, some pixels are too dark with a ``max_depth`` of 16, as they are of a mesh of flat
+triangles. With 1000, none is, and every path has the weight 1.
 
 **Derivatives** are computed by path replay with respect to materials, textures, emitters, the ``to_world`` of fields
 and, with ``storage`` ``float32``, their arrays: hits move along their rays by the implicit function theorem, and

@@ -78,10 +78,10 @@ PARTS = {
         footprint.
 
         ``anisotropic`` always reads ``max_anisotropy`` places, evenly spaced over the major axis, on a level half a
-        step finer than the width of one place. This is 1.4 to 3.6 dB nearer to the mean over the footprint than a full
-        level is. ``stochastic`` chooses one of these places by a hash of the hit's position and uv. Its expectation is
-        the result of ``anisotropic``, with the noise of one sample; every read on a path makes the same choice, and so
-        do all samples through one point of a pixel.""",
+        step finer than the width of one place, which is nearer to the mean over the footprint than a full level.
+        ``stochastic`` reads one of these places: unbiased with respect to ``anisotropic``, with the noise of one
+        sample. The choice is a hash of the hit's position and uv, so all maps at a hit, and all samples through one
+        point of a pixel, share it.""",
     "executable": """\
         The program ``mitsuba`` of Mitsuba 3.9 loads no plugins written in Python and ends with "Plugin not found". Use
         ``mi-diffind render SCENE.xml``, or ``import mi_diffind`` and :monosp:`mi.render` in Python.""",
