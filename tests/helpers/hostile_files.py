@@ -357,7 +357,7 @@ BYTE_STEPS = {f.__name__: f for f in (set_bytes, cut, repeat, insert, set_record
 def json_steps(content, recipe: list) -> object:
     """Return JSON content after steps of a description, whose paths begin at its root."""
     archive = Archive({}, copy.deepcopy(content))
-    for name, *arguments in copy.deepcopy(recipe):  # later steps may write into a value of an earlier one
+    for name, *arguments in map(copy.deepcopy, recipe):  # steps may write into a value that they share
         STEPS[name](archive, *arguments)
     return archive.meta
 
@@ -367,7 +367,7 @@ def damaged(data: bytes, recipe: list) -> tuple[bytes, list[str] | None]:
 
     ``None`` in place of them: nothing was done to the description, either.
     """
-    structured = [step for step in copy.deepcopy(recipe) if step[0] in STEPS]
+    structured = [copy.deepcopy(step) for step in recipe if step[0] in STEPS]
     untouched = None
     if structured:
         archive = Archive.read(io.BytesIO(data))
