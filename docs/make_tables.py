@@ -861,7 +861,7 @@ for source in ("suzanne", "armadillo", "bunny"):
 TABLES |= {"sdf_parts": lambda: sdf_parts("tradeoff_sdf_parts_armadillo"), "sdf_rays": sdf_rays}
 TABLES |= {
     "field_errors": lambda: field_errors("tradeoff_field"),
-    "field_errors_50": lambda: field_errors("tradeoff_field_50"), "field_times": lambda: field_times("tradeoff_field"),
+    "field_times": lambda: field_times("tradeoff_field"),
     "field_parts": field_parts, "field_captures": field_captures, "field_nerf": field_nerf,
     "field_surroundings": field_surroundings,
 }  # fmt: skip
