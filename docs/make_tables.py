@@ -6,16 +6,21 @@ Write the tables and the figures of the documentation.
 ``tasks.md`` is made from the declarations of tasks. In the other pages, the text between ``<!-- table NAME -->`` and
 ``<!-- end -->`` is made from JSON in ``docs/measured/``, which ``mi-diffind … --json docs/measured/NAME.json`` wrote;
 the pages show the commands. Figures in sentences are inserted from the same files, as ``claims.toml`` says
-(``claims.py``). With ``--check`` nothing is written, and the exit code is 1 if a page would change.
+(``claims.py``). A table that shows some of its rows has all of them in ``docs/measured/NAME.csv``. With ``--check``
+nothing is written, and the exit code is 1 if a page or a CSV file would change.
 """
 
 from __future__ import annotations
 
+import csv
 import importlib
+import io
 import json
 import re
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 from claims import ClaimError, claims, commands, files
 from claims import measured as node
@@ -33,10 +38,35 @@ def measured(name: str) -> dict:
     return json.loads((DOCS / "measured" / f"{name}.json").read_text(encoding="utf-8"))
 
 
-def table(head: list[str], rows: list[list]) -> str:
-    """Return a table in Markdown."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
+class Table(NamedTuple):
+    """Table of a page: its head, its rows, and which of the rows the page shows (all if ``shown`` is ``None``)."""
+
+    head: list[str]
+    rows: list[list]
+    shown: Callable[[list], bool] | None = None
+
+    def __str__(self) -> str:
+        """Return the rows that the page shows, in Markdown."""
+        lines = [self.head, ["---"] * len(self.head), *filter(self.shown or (lambda row: True), self.rows)]
+        return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
+
+    def of_page(self, name: str) -> str:
+        """Return the rows that the page shows and, if these are not all, a link to ``measured/NAME.csv``."""
+        link = f"\n\nAll {len(self.rows)} rows: [{name}.csv](measured/{name}.csv)" if self.shown else ""
+        return f"{self}{link}"
+
+    def csv(self) -> str:
+        """Return all rows as comma-separated values, without marks of Markdown and separators of thousands."""
+        marks = re.compile(r"`|\*\*|(?<=\d),(?=\d{3})")
+        stream = io.StringIO()
+        lines = ([marks.sub("", str(cell)) for cell in line] for line in (self.head, *self.rows))
+        csv.writer(stream, lineterminator="\n").writerows(lines)
+        return stream.getvalue()
+
+
+def table(head: list[str], rows: list[list], shown: Callable[[list], bool] | None = None) -> Table:
+    """Return a table; ``shown`` tells the rows that a page shows where there are more than ten."""
+    return Table(head, rows, shown)
 
 
 def page_of_tasks() -> str:
@@ -53,7 +83,7 @@ def page_of_tasks() -> str:
             [f"`{name}`" + (" (default)" if i == 0 else ""), s.steps, f"{s.batch:,}", f"{s.lr:g}", s.schedule, s.loss]
             for i, (name, s) in enumerate(task.presets.items())
         ]
-        parts.append(table(["preset", "steps", "samples a step", "learning rate", "schedule", "loss"], rows) + "\n")
+        parts.append(f"{table(['preset', 'steps', 'samples a step', 'learning rate', 'schedule', 'loss'], rows)}\n")
         if task.shipped:
             rows = []
             for preset in task.shipped:
@@ -63,7 +93,7 @@ def page_of_tasks() -> str:
                     f"{shipped.measured['psnr_db']:.1f}",
                     f"`mi-diffind fit {task.name} --preset {preset} -o {shipped.path.name}`",
                 ])  # fmt: skip
-            parts.append(table(["file that ships", "preset", "bytes of entries", "PSNR, dB", "made by"], rows) + "\n")
+            parts.append(f"{table(['file that ships', 'preset', 'bytes of entries', 'PSNR, dB', 'made by'], rows)}\n")
         if task.arguments:
             parts.append(
                 "Arguments of its own: " + ", ".join(f"`{a.flags[0]}`" for a in task.arguments) + "; see "
@@ -106,10 +136,10 @@ def page_of_figures(pages: dict[Path, str]) -> str:
         "## Other sentences",
         table(head, rest),
     ]
-    return "\n\n".join(parts) + "\n"
+    return "\n\n".join(map(str, parts)) + "\n"
 
 
-def disney_forms() -> str:
+def disney_forms() -> Table:
     """Return accuracy, bytes and time of each form of the Disney BRDF."""
     study = measured("tradeoff_disney")
     columns = {
@@ -134,7 +164,7 @@ def _decibel(value: float | None) -> str:
     return "all is noise" if value is None else f"{value:.1f}"
 
 
-def comparisons() -> str:
+def comparisons() -> Table:
     """Return errors and time ratios of the scenes by ``compare``, each against its truths."""
     rows = []
     for path in sorted((DOCS / "measured").glob("compare_*.json")):
@@ -151,7 +181,7 @@ def comparisons() -> str:
     return table(columns, rows)
 
 
-def ggx_quality() -> str:
+def ggx_quality() -> Table:
     """Return costs of each family at the quality of an indirection, as multiples of it, beside the paper's."""
     from mi_diffind.studies.ggx.conclusions import equal_quality
 
@@ -164,27 +194,29 @@ def ggx_quality() -> str:
     return table(["", "flops", "bytes read", "bytes stored", "time", "PSNR beside it, dB"], rows)
 
 
-def ggx_candidates() -> str:
+def ggx_candidates() -> Table:
     """Return bytes, PSNR and times of the float32 candidates for both kinds of inputs, without tensor networks."""
     study, rows = measured("tradeoff_ggx"), []
     for case, timings in ((name, case["queries"].get("read", {})) for name, case in study["cases"].items()):
         for name, timing in timings.items():
             c = study["candidates"][name]
-            if name in GGX_CANDIDATES:
-                rows.append([
-                    case, name.removesuffix(", log"), f"{c['bytes']:,}", f"{c['errors']['psnr_db']:.1f}",
-                    f"{timing['time']:.2f}", "yes" if c["converged"] else "no",
-                ])  # fmt: skip
-    return table(["inputs", "", "bytes", "PSNR, dB", "a read, ns", "converged"], rows)
+            psnr = f"{c['errors']['psnr_db']:.1f}" if "psnr_db" in c["errors"] else "exact"
+            rows.append([
+                case, name.removesuffix(", log"), f"{c['bytes']:,}", psnr, f"{timing['time']:.2f}",
+                "–" if psnr == "exact" else "yes" if c["converged"] else "no",
+            ])  # fmt: skip
+    head = ["inputs", "", "bytes", "PSNR, dB", "a read, ns", "converged"]
+    return table(head, rows, lambda row: row[1] in GGX_CANDIDATES[row[0]])
 
 
-#: Rows of the table of GGX; all others are in the JSON file.
-GGX_CANDIDATES = (
-    "16→8", "16→8 u8", "24²", "96²", "192²", "MLP 32x3", "16→8, log", "16→8 u8, log", "24², log", "MLP 32x3, log",
-)  # fmt: skip
+#: Rows of the page's table of GGX, by the inputs.
+GGX_CANDIDATES = {
+    "inputs as in the paper": ("16→8", "16→8 u8", "24²", "96²", "192²", "MLP 32x3"),
+    "logarithmic inputs": ("16→8", "16→8 u8", "24²", "MLP 32x3"),
+}
 
 
-def scenes_bias() -> str:
+def scenes_bias() -> Table:
     """Return bias of the tables, the samples at which noise equals it, and times of scenes, learned over exact."""
     rows = []
     for name, tables in (
@@ -204,7 +236,7 @@ def scenes_bias() -> str:
     return table(["scene", "tables", "bias", "the noise equals it at", "time, learned / exact"], rows)
 
 
-def image_contenders() -> str:
+def image_contenders() -> Table:
     """Return quality of a compressed material beside that of codecs in as many bytes."""
     rows = []
     for name, c in measured("tradeoff_image")["candidates"].items():
@@ -218,7 +250,7 @@ def image_contenders() -> str:
     return table(["", "bytes", "PSNR at texels, dB", "between texels", "FLIP", "as seen, dB"], rows)
 
 
-def image_pages() -> str:
+def image_pages() -> Table:
     """Return PSNR of images and materials as one grid and as pages, in equal bytes and seconds."""
     rows = []
     for source in ("boombox", "tiles", "wood_color", "vase_color", "hammered_normal"):
@@ -229,7 +261,7 @@ def image_pages() -> str:
     return table(["source", "one grid, the better of two", "what auto chooses"], rows)
 
 
-def image_seen() -> str:
+def image_seen() -> Table:
     """Return errors as seen of materials with equal weights, and with those that ``--weights auto`` chooses."""
     rows = []
     for source, weights in (("boombox", ""), ("tiles", ""), ("rust", "auto"), ("brick", "auto")):
@@ -248,7 +280,7 @@ def image_seen() -> str:
     return table([*head, "brightness", "auto: the map that loses most"], rows)
 
 
-def image_bytes() -> str:
+def image_bytes() -> Table:
     """Sizes of the sources: raw, as the PNG files of the repository, and compressed."""
     assets, rows = DOCS.parent / "scenes" / "assets", []
     for source in ("tiles", "wood_color", "vase_color", "hammered_normal"):
@@ -259,7 +291,7 @@ def image_bytes() -> str:
     return table(["source", "raw bytes", "bytes of the PNG files", "bytes at 12x", "of PNG"], rows)
 
 
-#: Rows of the pages' tables of renders; all others are in the JSON files.
+#: Rows of the pages' tables of renders.
 RENDERS = (
     "bitmap, 1 spp", "bitmap, 4 spp", "bitmap, 16 spp", "bitmap, 4 spp, multijittered", "bitmap, 16 spp, multijittered",
     "mipmap, trilinear", "ours 12x, trilinear", "ours 12x, anisotropic, centred", "ASTC 12x, trilinear",
@@ -267,13 +299,13 @@ RENDERS = (
 )  # fmt: skip
 
 
-def texture_renders(study: dict) -> str:
+def texture_renders(study: dict) -> Table:
     """Return errors, flicker and times of renders with filtered textures."""
     stages, base, steady = list(study["details"]["counted"]), "bitmap, 1 spp", "bitmap, 4 spp"
     flicker = study["candidates"][steady]["errors"]["flicker_error"]
     rows = []
     for name, c in study["candidates"].items():
-        if "flicker" not in c["errors"] or name not in RENDERS:
+        if "flicker" not in c["errors"]:
             continue
         e = c["errors"]
         times = [study["cases"][s]["ratios"]["render"].get(f"{name} / {base}", {"median": 1})["median"] for s in stages]
@@ -282,26 +314,27 @@ def texture_renders(study: dict) -> str:
             f"{e['flicker_error'] / flicker:.2f}", " / ".join(f"{t:.2f}" for t in times),
         ])  # fmt: skip
     head = ["", "bytes", *(f"{s}: PSNR, dB / FLIP" for s in stages), "flicker", f"time: {' / '.join(stages)}"]
-    return table(head, rows)
+    return table(head, rows, lambda row: row[0].strip("`") in RENDERS)
 
 
-def texture_factors(study: dict) -> str:
+def texture_factors(study: dict) -> Table:
     """Return how many times as long a bitmap takes for the same error."""
     from mi_diffind.studies.texture.conclusions import speed
 
     stages, rows = [s for s, c in study["cases"].items() if c["in_picture"]], []
     for name, c in study["candidates"].items():
-        if c["representation"].startswith("bitmap") or not c["errors"] or name not in RENDERS:
+        if c["representation"].startswith("bitmap") or not c["errors"]:
             continue
         cells = []
         for stage in stages:
             speeds = [speed(study, stage, name, against) for against in ("bitmap", "bitmap, multijittered")]
             cells.append(" / ".join(f"{'> ' * more}{value:.1f}" for value, more in speeds))
         rows.append([f"`{name}`", *cells])
-    return table(["", *(f"{s}: independent / multijittered" for s in stages)], rows)
+    head = ["", *(f"{s}: independent / multijittered" for s in stages)]
+    return table(head, rows, lambda row: row[0].strip("`") in RENDERS)
 
 
-def texture_levels(study: dict) -> str:
+def texture_levels(study: dict) -> Table:
     """Return PSNR of each level of detail."""
     from mi_diffind.studies.texture.conclusions import levels
 
@@ -314,7 +347,7 @@ def texture_levels(study: dict) -> str:
     return table(["", "ratio", *(f"L{i}" for i in range(count))], rows)
 
 
-def texture_presets() -> str:
+def texture_presets() -> Table:
     """Return PSNR of our preset and of the paper's, trained as long."""
     rows = []
     for source in ("boombox", "boombox_albedo"):
@@ -329,16 +362,18 @@ def texture_presets() -> str:
     return table(head, rows)
 
 
-def texture_footprints() -> str:
+def texture_footprints() -> Table:
     """Return relative errors of footprints, medians and 90th percentiles, of the side and of the major axis."""
     rows = [
         [name, *(f"{100 * median:.2g}, {100 * worst:.2g}%" for median, worst in errors)]
         for name, errors in measured("bench_footprint")["rows"].items()
     ]
-    return table(["", "side", "major axis"], rows)
+    easy = ("plane, field of view 60°", "sphere, field of view 60°", "vase, field of view 90°")
+    easy += ("knot, field of view 60°", "flat mirror")
+    return table(["", "side", "major axis"], rows, lambda row: row[0] not in easy)
 
 
-def texture_equal_samples() -> str:
+def texture_equal_samples() -> Table:
     """Return how many samples of a bitmap have the error of one filtered sample, on the plane of boombox."""
     study, rows = node("tradeoff_texture_boombox"), []
     for name, label in (
@@ -351,7 +386,7 @@ def texture_equal_samples() -> str:
     return table(["filter", "PSNR", "independent samples", "multijittered samples"], rows)
 
 
-def texture_memory() -> str:
+def texture_memory() -> Table:
     """Return the resident memory of a scene with many textures."""
     memory = measured("texture_memory")
     rows = [
@@ -361,7 +396,7 @@ def texture_memory() -> str:
     return table([f"{memory['count']} textures of {memory['side']}²", "MiB", "times less"], rows)
 
 
-def texture_reads() -> str:
+def texture_reads() -> Table:
     """Return the times of filtered reads, as multiples of those of bitmaps, before this version's reads and now."""
     before, now = (measured(name)["reads"] for name in ("bench_texture_before", "bench_texture"))
     head = ["table", "hits", "maps", "`off`", "`trilinear`", "`anisotropic`"]
@@ -388,7 +423,7 @@ def with_spread(values: list[float]) -> str:
     return f"{mean(values):.2f}" + (f" ± {(max(values) - min(values)) / 2:.2f}" if len(values) > 1 else "")
 
 
-def shading_best(*studies: str) -> str:
+def shading_best(*studies: str) -> Table:
     """Return errors of textures trained for shading, beside the best classical filters and the texture before."""
     rows = []
     for name, material in shading_curves(*studies).items():
@@ -407,7 +442,7 @@ def shading_best(*studies: str) -> str:
     return table(head, rows)
 
 
-def shading_shares(*studies: str) -> str:
+def shading_shares(*studies: str) -> Table:
     """Return the paper's figure 2 as a table: quality by λ, with the spread over seeds."""
     from mi_diffind.studies.shading.conclusions import trouble
 
@@ -422,7 +457,7 @@ def shading_shares(*studies: str) -> str:
     return table(["material", "", "", *(f"λ {share:g}" for share in shares), "trouble"], rows)
 
 
-def shading_extras(study: str) -> str:
+def shading_extras(study: str) -> Table:
     """Return errors of textures of the first seed, trained for shading without and with extras."""
     jobs, rows = measured(study)["jobs"], []
     for name, material in shading_curves(study).items():
@@ -435,23 +470,23 @@ def shading_extras(study: str) -> str:
     return table(["material", "extras", "bytes", "C, dB", "FLIP", *(f"L{i}" for i in range(6))], rows)
 
 
-def shading_renders() -> str:
+def shading_renders() -> Table:
     """Return errors and times of whole renders, bytes, and the time of a training step over that of the first row."""
     study = measured("tradeoff_shading_renders")
-    chosen = {name: (1,) for name in study["bytes"] if name != "disney + mip maps"}
-    chosen |= {"principled + bitmaps": (1, 16), "principled + bitmaps, multijittered": (4, 16)}
+    left_out = ("principled + bitmaps, multijittered, 1 spp", "disney + bitmaps, 1 spp", "disney + mip maps, 1 spp")
+    kept = ("principled + bitmaps, multijittered, 4 spp", "principled + bitmaps, multijittered, 16 spp")
     rows = []
     for points in zip(*(scene["points"] for scene in study["scenes"].values()), strict=True):
         name, spp = points[0]["name"], points[0]["spp"]
-        if spp in chosen.get(name, ()):
-            cells = (f"{p['psnr_db']:.1f} / {p['cpu_ms']['median']:.0f}" for p in points)
-            step = study["steps"].get(name)
-            rows.append([f"{name}, {spp} spp", f"{study['bytes'][name]:,}", *cells,
-                         f"{step['ratio']['median']:.2f}" if step and spp == 1 else ""])  # fmt: skip
-    return table(["", "bytes", *study["scenes"], "training step"], rows)
+        cells = (f"{p['psnr_db']:.1f} / {p['cpu_ms']['median']:.0f}" for p in points)
+        step = study["steps"].get(name)
+        rows.append([f"{name}, {spp} spp", f"{study['bytes'][name]:,}", *cells,
+                     f"{step['ratio']['median']:.2f}" if step and spp == 1 else ""])  # fmt: skip
+    head = ["", "bytes", *study["scenes"], "training step"]
+    return table(head, rows, lambda row: row[0] in kept or (row[0].endswith(", 1 spp") and row[0] not in left_out))
 
 
-def material_times() -> str:
+def material_times() -> Table:
     """Return the cost of a pass with each form of a material, as multiples of separate plugins."""
     study = measured("bench_material")
     separate = study["frame"]["normalmap + disney + 4 neural_texture"]["operations"]
@@ -468,7 +503,7 @@ def material_times() -> str:
 BSDF_CONTENDERS = ("ours", "table", "plain", "paper", "network, warped", "network, raw", "measured")
 
 
-def bsdf() -> str:
+def bsdf() -> Table:
     """Return the PSNR of learned BSDFs and of what they are compared with."""
     candidates, rows = measured("tradeoff_bsdf")["candidates"], []
     for material in measured("tradeoff_bsdf")["cases"]:
@@ -479,7 +514,7 @@ def bsdf() -> str:
     return table(["material", "bytes", "proxy alone", *BSDF_CONTENDERS], rows)
 
 
-def bsdf_times() -> str:
+def bsdf_times() -> Table:
     """Return albedo, noise of sampling and times of learned BSDFs."""
     result, rows = measured("tradeoff_bsdf"), []
     for material, case in result["cases"].items():
@@ -502,7 +537,7 @@ def bsdf_times() -> str:
     return table(head, rows)
 
 
-def bsdf_families() -> str:
+def bsdf_families() -> Table:
     """Return the errors of learned families at random members."""
     rows = []
     for name, label in (
@@ -521,7 +556,7 @@ def bsdf_families() -> str:
     return table(["family", "bytes", "PSNR, dB: mean / median / least", "albedo", "moment"], rows)
 
 
-def shading_distances() -> str:
+def shading_distances() -> Table:
     """Return the PSNR of materials before and after training for their shading, as seen from three distances."""
     rows = []
     for name, study in measured("bench_shading_distances").items():
@@ -531,7 +566,7 @@ def shading_distances() -> str:
     return table(["material", "level bias", "fine levels fixed", "near, dB", "middle, dB", "far, dB"], rows)
 
 
-def rust() -> str:
+def rust() -> Table:
     """Return the errors of the scene rust at one sample a pixel, before and after training for its shading."""
     figures, rows = measured("rust"), []
     for name in ("rust_plain.npz", "rust_shaded.npz"):
@@ -541,7 +576,7 @@ def rust() -> str:
     return table(["texture", "bytes", "PSNR, dB", "FLIP", "brightness"], rows)
 
 
-def scene_training() -> str:
+def scene_training() -> Table:
     """Return errors of held-out views and lights after training inside a scene and over the hemisphere."""
     rows = []
     for path in sorted((DOCS / "measured").glob("tradeoff_scene_training_*.json")):
@@ -553,14 +588,22 @@ def scene_training() -> str:
             name += f", {d['spp']} samples a pixel" if d["spp"] != runs[0]["spp"] else ""
             times = [f"{d[key]:.{digits}f}" if key in d else "–" for key, digits in TRAINING_FIGURES.items()]
             rows.append([d["scene"], name, f"{d['psnr_db']:.2f}", f"{d['flip']:.3f}", *times])
-    return table(["scene", "run", "PSNR, dB", "FLIP", "steps", "processor s", "level bias"], rows)
+    head = ["scene", "run", "PSNR, dB", "FLIP", "steps", "processor s", "level bias"]
+    return table(head, rows, lambda row: row[1] in SCENE_RUNS[row[0]])
 
+
+#: Runs of the page's table of trainings inside a scene, by the scene.
+SCENE_RUNS = {
+    "balls": ("scene", "hemisphere", "hemisphere, then scene", "another material, then scene"),
+    "corner": ("scene", "hemisphere", "hemisphere, then scene"),
+    "floor": ("scene", "hemisphere, longer", "hemisphere, then scene"),
+}
 
 #: Figures of a training in the table above, and their digits.
 TRAINING_FIGURES = {"steps": 0, "processor_seconds": 0, "level_bias": 1}
 
 
-def sdf_errors(study: str) -> str:
+def sdf_errors(study: str) -> Table:
     """Return errors of distance fields in equal bytes: IoU, IoU near the surface, normals."""
     from mi_diffind.studies.equal_memory import candidates_by_budget
     from mi_diffind.studies.sdf.conclusions import size_text
@@ -572,10 +615,12 @@ def sdf_errors(study: str) -> str:
             e = c["errors"]
             cell = f"{e['iou']:.4f} / {e['iou_near']:.4f} / {e['normal_deg']:.2f}°"
             rows.setdefault(c["label"], {})[size] = cell
-    return table(["", *map(size_text, sizes)], [[name, *(row.get(s, "") for s in sizes)] for name, row in rows.items()])
+    lines = [[name, *(row.get(s, "") for s in sizes)] for name, row in rows.items()]
+    shown = (lambda row: row[0] != "8³ bricks") if len(lines) > 10 else None
+    return table(["", *map(size_text, sizes)], lines, shown)
 
 
-def sdf_times(study: str) -> str:
+def sdf_times(study: str) -> Table:
     """Return times of distance fields of one size: seconds of the fit, reads, rays, renders."""
     result = measured(study)
     reads, rays = (result["cases"][case] for case in ("reads", "rays"))
@@ -588,10 +633,11 @@ def sdf_times(study: str) -> str:
         seconds = "" if c["is_reference"] else f"{c['training_seconds']:.0f}"
         rows.append([c["label"], f"{c['bytes']:,}", seconds, *("" if t is None else f"{t['time']:.3g}" for t in cells)])
     head = ["", "bytes", "seconds", "a distance, ns", "a gradient, ns", "a primary ray, ns", "a render, ms"]
-    return table(head, rows)
+    trained = ("dense grid", "8³ bricks", "sparse distances")  # their trained or finer forms stay
+    return table(head, rows, lambda row: row[0] not in trained)
 
 
-def sdf_parts(study: str) -> str:
+def sdf_parts(study: str) -> Table:
     """Return errors of distance fields with parts of ours left out or changed, in equal bytes."""
     rows = []
     for c in measured(study)["candidates"].values():
@@ -600,10 +646,11 @@ def sdf_parts(study: str) -> str:
             c["label"], f"{c['bytes']:,}", f"{e['iou']:.4f} / {e['iou_near']:.4f}",
             f"{e['normal_deg']:.2f}° / {e['normal_p95_deg']:.1f}°", f"{e['components']:,}" if "components" in e else "",
         ])  # fmt: skip
-    return table(["", "bytes", "IoU / within 0.01", "normals: mean / 95%", "pieces"], rows)
+    head = ["", "bytes", "IoU / within 0.01", "normals: mean / 95%", "pieces"]
+    return table(head, rows, lambda row: row[0] != "16 bits a node, not trained")
 
 
-def sdf_rays() -> str:
+def sdf_rays() -> Table:
     """Return times of rays through the arrays of distance fields and through ``sdfgrid``, beside Embree."""
     rows = []
     for file in measured("bench_sdf")["files"]:
@@ -618,7 +665,7 @@ def sdf_rays() -> str:
     return table(["mesh", "rays", "Embree, ns", *times, "hits that differ"], rows)
 
 
-def field_errors(study: str) -> str:
+def field_errors(study: str) -> Table:
     """Return PSNR of radiance fields by how many times smaller than a dense grid they are."""
     from mi_diffind.studies.equal_memory import candidates_by_budget
     from mi_diffind.studies.radiance.conclusions import ratio_text, references
@@ -632,10 +679,20 @@ def field_errors(study: str) -> str:
                 c["label"], ratio_text(d["asked"]) if d.get("asked") else "", f"{d['memory_bytes'] / 1e6:.2f}",
                 f"{d['file_bytes'] / 1e6:.2f}", f"{e['psnr_white_db']:.2f}", f"{e['psnr_foreground_db']:.2f}",
             ])  # fmt: skip
-    return table(["", "asked for", "MB in memory", "MB on disk", "dB, white", "dB, foreground"], rows)
+    head = ["", "asked for", "MB in memory", "MB on disk", "dB, white", "dB, foreground"]
+    shown = (lambda row: (row[0], row[1]) in FIELD_CONTENDERS) if len(rows) > 10 else None
+    return table(head, rows, shown)
 
 
-def field_times(study: str) -> str:
+#: Rows of the page's table of radiance fields: those that are as good as ours or better, and the paper's.
+FIELD_CONTENDERS = [("grid", ""), ("paper", "75×")] + [
+    (name, ratio)
+    for name in ("sparse grid, 6-bit colours", "principal components", "codebook", "ours")
+    for ratio in ("75×", "200×")
+]
+
+
+def field_times(study: str) -> Table:
     """Return times of radiance fields of one size: seconds of training, a sample, a picture."""
     result = measured(study)
     reads = result["cases"]["reads"]
@@ -650,7 +707,7 @@ def field_times(study: str) -> str:
     return table(["", "seconds", "a sample, ns", f"{side}², ms"], rows)
 
 
-def field_parts() -> str:
+def field_parts() -> Table:
     """Return errors of radiance fields with parts of the compression left out."""
     rows = [
         [
@@ -662,7 +719,7 @@ def field_parts() -> str:
     return table(["", "MB in memory", "dB, white", "dB, foreground"], rows)
 
 
-def field_captures() -> str:
+def field_captures() -> Table:
     """Return errors and bytes of three captures, as a grid and compressed."""
     rows = []
     for name, content in (
@@ -682,7 +739,7 @@ def field_captures() -> str:
     return table(["", "grid, dB", "compressed, dB", "MB in memory", "MB on disk"], rows)
 
 
-def field_surroundings() -> str:
+def field_surroundings() -> Table:
     """Return figures of a capture without alpha, with and without surroundings."""
     rows = []
     for name, row in measured("bench_surroundings")["rows"].items():
@@ -705,7 +762,7 @@ PUBLISHED_LEGO = (
 )
 
 
-def field_nerf() -> str:
+def field_nerf() -> Table:
     """Return figures of NeRF's synthetic scenes: as measured here, and as published for lego."""
     rows, path = [], DOCS / "measured" / "nerf_scenes.json"
     for row in measured(path.stem)["rows"] if path.is_file() else ():
@@ -719,7 +776,7 @@ def field_nerf() -> str:
     return table(["scene", "method", "dB, white", "SSIM", "MB on disk", "minutes", "peak memory, GB", "machine"], rows)
 
 
-def trust() -> str:
+def trust() -> Table:
     """Return one row a plugin: the worst figure of each property over the variants that were measured."""
     rows = []
     for name, by_variant in measured("trust")["cells"].items():
@@ -743,7 +800,7 @@ def trust() -> str:
     return table(head, rows)
 
 
-def viewer() -> str:
+def viewer() -> Table:
     """Return pictures a second of the viewer."""
     rows = []
     for row in measured("bench_view")["rows"]:
@@ -804,7 +861,7 @@ for source in ("suzanne", "armadillo", "bunny"):
 TABLES |= {"sdf_parts": lambda: sdf_parts("tradeoff_sdf_parts_armadillo"), "sdf_rays": sdf_rays}
 TABLES |= {
     "field_errors": lambda: field_errors("tradeoff_field"),
-    "field_errors_50": lambda: field_errors("tradeoff_field_50"), "field_times": lambda: field_times("tradeoff_field"),
+    "field_times": lambda: field_times("tradeoff_field"),
     "field_parts": field_parts, "field_captures": field_captures, "field_nerf": field_nerf,
     "field_surroundings": field_surroundings,
 }  # fmt: skip
@@ -813,7 +870,7 @@ for source, study in (("", "tradeoff_texture"), ("_boombox", "texture_levels_boo
 TABLES["viewer"] = viewer
 
 
-def film_errors() -> str:
+def film_errors() -> Table:
     """PSNR of the panels of films against their truth."""
     figures = {f"`{name}`": measured(f"film_{name}")["psnr_db"] for name in ("zoom", "orbit", "shading")}
     return table(
@@ -822,7 +879,7 @@ def film_errors() -> str:
     )
 
 
-def film_bytes() -> str:
+def film_bytes() -> Table:
     """Sizes of films in three formats."""
     films = {name: measured(f"film_{name}") for name in ("suite", "zoom", "orbit", "shading")}
     return table(
@@ -841,14 +898,20 @@ TABLES |= importlib.import_module("cost_table").tables(table)
 
 
 def written() -> dict[Path, str]:
-    """Return the text of each page by its path."""
-    pages = {DOCS / "tasks.md": page_of_tasks()}
+    """Return the text of each page, and of each CSV file of a table that a page shortens, by its path."""
+    pages, files = {DOCS / "tasks.md": page_of_tasks()}, {}
+
+    def block(match: re.Match) -> str:
+        begin, name, end = match.groups()
+        content = TABLES[name]()
+        if content.shown:
+            files[DOCS / "measured" / f"{name}.csv"] = content.csv()
+        return f"{begin}{content.of_page(name)}\n{end}"
+
     for path in sorted(DOCS.glob("*.md")):
         text = pages.get(path) or path.read_text(encoding="utf-8")
-        pages[path] = re.sub(
-            r"(<!-- table (\w+) -->\n)(?:\|.*\n)*(<!-- end -->)", lambda m: f"{m[1]}{TABLES[m[2]]()}\n{m[3]}", text
-        )
-    return pages
+        pages[path] = re.sub(r"(<!-- table (\w+) -->\n)(?:(?:\|.*|All \d.*)?\n)*(<!-- end -->)", block, text)
+    return pages | files
 
 
 def figures(pages: dict[Path, str]) -> tuple[dict[Path, str], list[str]]:
@@ -870,6 +933,8 @@ def figures(pages: dict[Path, str]) -> tuple[dict[Path, str], list[str]]:
 def main(check: bool) -> int:
     """Write the pages that differ, or with ``check`` name them; return the exit code."""
     pages, troubles = figures(written())
+    for path in sorted(set((DOCS / "measured").glob("*.csv")) - pages.keys()):
+        troubles.append(f"measured/{path.name}: no page has a shortened table of this name; remove the file")
     differing = [p for p, text in pages.items() if not p.is_file() or p.read_text(encoding="utf-8") != text]
     for trouble in troubles:
         print(trouble, file=sys.stderr)

@@ -21,6 +21,10 @@ import make_tables  # noqa: E402
 
 #: Numbers of a page that no file backs: more are refused, and whoever lowers a count lowers it here. Other pages: none.
 UNBACKED = {}
+#: Numbers of trials without a kept script, by the same rule.
+TRIALS = {"04_sdf_from_images.ipynb": 16, "bsdf.md": 69, "field.md": 18, "shading.md": 16, "texture.md": 10}
+#: Tables of more than ten rows in a page: each task or plugin has a row, or shorter ones would hide what ours loses.
+LONG = {"cost", "cost_losses", "cost_sources", "trust", "shading_best"}
 
 
 def test_pages_are_as_the_files_say():
@@ -134,7 +138,7 @@ def test_ratios_are_medians_in_either_order():
 
 def test_figures_of_shading_are_those_of_its_table():
     """The function that sentences use, against the rows that the table has."""
-    rows = [line.split(" | ") for line in make_tables.shading_best("tradeoff_shading").splitlines()[2:]]
+    rows = [line.split(" | ") for line in str(make_tables.shading_best("tradeoff_shading")).splitlines()[2:]]
     for material in ("hammered", "weave", "lacquer"):
         by_label = {r[1]: r for r in rows if r[0].strip("| ") == material}
         (trained,) = [r for label, r in by_label.items() if label.startswith("trained")]
@@ -180,6 +184,36 @@ def test_numbers_without_a_file_only_become_fewer():
     counts = {page: count["unbacked"] for page, count in list_numbers.counts().items()}
     more = {page: n for page, n in counts.items() if n > UNBACKED.get(page, 0)}
     assert more == {}, "python docs/list_numbers.py lists them"
+
+
+def test_numbers_of_trials_only_become_fewer():
+    counts = {page: count["trial"] for page, count in list_numbers.counts().items() if count["trial"]}
+    assert counts == TRIALS, "more are refused; fewer: lower the count here"
+
+
+def test_long_tables_are_shortened():
+    """A page shows at most ten rows, and links to all of them."""
+    for name, make in make_tables.TABLES.items():
+        table = make()
+        text = table.of_page(name)
+        rows = text.count("\n|") - 1
+        assert rows <= 10 or name in LONG, name
+        assert (f"measured/{name}.csv" in text) == (table.shown is not None), name
+        assert table.csv().count("\n") == len(table.rows) + 1
+        if table.shown:
+            assert 0 < rows < len(table.rows), name
+
+
+def test_a_changed_or_superfluous_csv_is_refused(copy):
+    path = copy / "docs" / "measured" / "field_errors.csv"
+    whole = path.read_text(encoding="utf-8")
+    path.write_text(spoiled(whole, re.search(r"\d", whole).start()), encoding="utf-8")
+    result = check(copy)
+    assert result.returncode == 1 and "field_errors.csv: would change" in result.stdout
+    path.write_text(whole, encoding="utf-8")
+    (path.parent / "nothing.csv").write_text("a\n", encoding="utf-8")
+    result = check(copy)
+    assert result.returncode == 1 and "measured/nothing.csv: no page has" in result.stderr
 
 
 def test_headlines_of_the_readme_are_backed():
