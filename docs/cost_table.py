@@ -31,6 +31,7 @@ COMMANDS = {
     "bench_large_material": "python tests/benchmarks/bench_large_material.py FOLDER",
     "tradeoff_bsdf": "mi-diffind tradeoff bsdf MATERIAL… --workers 2",
     "tradeoff_disney": "mi-diffind tradeoff disney",
+    "tradeoff_disney_network": "mi-diffind tradeoff disney --only network",
     "tradeoff_field": "mi-diffind tradeoff field out/group --compression 75 --compression 200",
     "tradeoff_ggx": "mi-diffind tradeoff ggx",
     "tradeoff_image": "mi-diffind tradeoff image scenes/assets/tiles.json --compression 12 --seconds 60 "
@@ -48,6 +49,7 @@ COMMANDS = {
     "--steps 300 --pretrain-steps 300 --seeds 3 --lambda 0.1 --lambda 0.25 --lambda 0.5 --lambda 1 --frames 8",
     "tradeoff_texture": "mi-diffind tradeoff texture --compression 12x --seconds 40 --footprints --astc thorough "
     "--width 300 --frames 20",
+    "tradeoff_texture_network": "mi-diffind tradeoff texture --compression 12x --width 300 --frames 20 --only network",
 }
 
 
@@ -140,10 +142,14 @@ def disney() -> Row:
     """Return the row of the Disney BRDF."""
     study = measured("tradeoff_disney")["candidates"]
     ours, paper = (study[name]["errors"]["psnr_db_training"] for name in ("tables, uint8", "paper, uint8"))
+    networks = measured("tradeoff_disney_network")["candidates"].values()
+    texts = [f"{size_text(c['bytes'])} has {c['errors']['psnr_db_training']:.1f} dB" for c in networks]
     return Row(
         "`neural_disney`", "disney", "`principled`", "PSNR of BRDF · cosine", "dB",
         benched(ours, "disney", "ours"), benched(EXACT, "disney", "principled"), benched(paper, "disney", "paper"),
-        {"errors": "tradeoff_disney", "all others": "bench_backward"},
+        {"errors": "tradeoff_disney", "all others": "bench_backward", "the networks": "tradeoff_disney_network"},
+        f"A network in {texts[0]}, one in {texts[1]}, in half precision and with the coordinates of the formulas as "
+        "inputs; Mitsuba has no plugin that evaluates it.",
         others={"disney, exact": benched(EXACT, "disney", "disney")},
     )  # fmt: skip
 
@@ -234,11 +240,17 @@ def texture() -> Row:
     others = [name for name, c in study["candidates"].items() if "psnr_plane_db" in c["errors"]]
     fits = [measured(f"fit_texture_boombox_{preset}") for preset in ("ours", "paper")]
     level, seconds = [f["measured"]["psnr_l0_db"] for f in fits], fits[0]["settings"]["seconds"]
+    network = measured("tradeoff_texture_network")["candidates"]["network 12x, trilinear"]
+    same = study["candidates"]["ours 12x, trilinear"]
     named = ("ours 12x, anisotropic", base, "paper 12x, trilinear")
     return Row(
         "`neural_texture`", "texture", "`bitmap`, 4 samples a pixel", "PSNR of a plane", "dB",
         *(contender(name, key) for name, key in zip(named, ("ours", "bitmap", "paper"), strict=True)),
-        {"errors, renders": "tradeoff_texture", "all others": "bench_backward"},
+        {"errors, renders": "tradeoff_texture", "all others": "bench_backward",
+         "the network": "tradeoff_texture_network"},
+        f"A hash grid with a network in {size_text(network['bytes'])} has {network['errors']['psnr_plane_db']:.1f} dB, "
+        f"ours with the same filter, trilinear, {same['errors']['psnr_plane_db']:.1f} dB; Mitsuba has no plugin that "
+        "renders it. "
         f"Both presets had {study['details']['request']['seconds']:.0f} s, too few for the paper's recipe to converge. "
         f"After {seconds:.0f} s of each on boombox, the finest level has {level[0]:.1f} dB by ours and "
         f"{level[1]:.1f} dB by the paper's (`fit_texture_boombox_….json`). {BRIEF}",

@@ -110,7 +110,7 @@ def page_of_figures(pages: dict[Path, str]) -> str:
 
 
 def disney_forms() -> str:
-    """Return accuracy, bytes and time of each form of the Disney BRDF."""
+    """Return accuracy, bytes and time of each form of the Disney BRDF; times of networks are not measured."""
     study = measured("tradeoff_disney")
     columns = {
         "constant, all lobes": ("eval",),
@@ -120,7 +120,7 @@ def disney_forms() -> str:
     cases = study["cases"]
     timings = {f"{q}: {case}": cases[case]["queries"][q] for case, queries in columns.items() for q in queries}
     rows = []
-    for name, candidate in study["candidates"].items():
+    for name, candidate in {**study["candidates"], **measured("tradeoff_disney_network")["candidates"]}.items():
         if candidate["representation"] == "one table":
             continue
         errors = candidate["errors"]
@@ -263,12 +263,18 @@ def image_bytes() -> str:
 RENDERS = (
     "bitmap, 1 spp", "bitmap, 4 spp", "bitmap, 16 spp", "bitmap, 4 spp, multijittered", "bitmap, 16 spp, multijittered",
     "mipmap, trilinear", "ours 12x, trilinear", "ours 12x, anisotropic, centred", "ASTC 12x, trilinear",
-    "ASTC 12x, anisotropic, centred",
+    "ASTC 12x, anisotropic, centred", "network 12x, trilinear",
 )  # fmt: skip
 
 
+def with_network(study: dict) -> dict:
+    """Return the study of filtered tiles with the network, which ``tradeoff_texture_network`` measured without times."""
+    network = measured("tradeoff_texture_network")
+    return {**study, **{key: {**study[key], **network[key]} for key in ("candidates", "jobs")}}
+
+
 def texture_renders(study: dict) -> str:
-    """Return errors, flicker and times of renders with filtered textures."""
+    """Return errors, flicker and times of renders with filtered textures; "–": a time is not measured."""
     stages, base, steady = list(study["details"]["counted"]), "bitmap, 1 spp", "bitmap, 4 spp"
     flicker = study["candidates"][steady]["errors"]["flicker_error"]
     rows = []
@@ -276,10 +282,11 @@ def texture_renders(study: dict) -> str:
         if "flicker" not in c["errors"] or name not in RENDERS:
             continue
         e = c["errors"]
-        times = [study["cases"][s]["ratios"]["render"].get(f"{name} / {base}", {"median": 1})["median"] for s in stages]
+        ratios = [study["cases"][s]["ratios"]["render"].get(f"{name} / {base}", {}).get("median") for s in stages]
+        times = ["1.00" if name == base else "–" if ratio is None else f"{ratio:.2f}" for ratio in ratios]
         rows.append([
             f"`{name}`", f"{c['bytes']:,}", *(f"{e[f'psnr_{s}_db']:.1f} / {e[f'flip_{s}']:.4f}" for s in stages),
-            f"{e['flicker_error'] / flicker:.2f}", " / ".join(f"{t:.2f}" for t in times),
+            f"{e['flicker_error'] / flicker:.2f}", " / ".join(times),
         ])  # fmt: skip
     head = ["", "bytes", *(f"{s}: PSNR, dB / FLIP" for s in stages), "flicker", f"time: {' / '.join(stages)}"]
     return table(head, rows)
@@ -810,6 +817,8 @@ TABLES |= {
 }  # fmt: skip
 for source, study in (("", "tradeoff_texture"), ("_boombox", "texture_levels_boombox")):
     TABLES["texture_levels" + source] = lambda study=study: texture_levels(measured(study))
+TABLES["texture_renders"] = lambda: texture_renders(with_network(measured("tradeoff_texture")))
+TABLES["texture_levels"] = lambda: texture_levels(with_network(measured("tradeoff_texture")))
 TABLES["viewer"] = viewer
 
 

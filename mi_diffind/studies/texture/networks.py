@@ -28,7 +28,7 @@ from ..baselines import image_networks
 from ..baselines.networks import Network
 
 #: Steps of the first training, and of the longest as a multiple.
-STEPS, LONGEST = 1000, 8
+STEPS, LONGEST = 1000, 16
 
 #: Samples of a measurement during training.
 MEASURED = 2**17
