@@ -268,7 +268,7 @@ RENDERS = (
 
 
 def with_network(study: dict) -> dict:
-    """Return the study of filtered tiles with the network, which ``tradeoff_texture_network`` measured without times."""
+    """Return the study of filtered tiles with the network of ``tradeoff_texture_network``, whose times are not used."""
     network = measured("tradeoff_texture_network")
     return {**study, **{key: {**study[key], **network[key]} for key in ("candidates", "jobs")}}
 

@@ -29,7 +29,7 @@ from ..baselines.networks import Network
 INPUTS, OUTPUTS, LAYERS = 10, 4, 2
 
 #: Settings of the shortest training, and steps of the longest.
-SETTINGS, LONGEST = FitSettings(steps=2000, batch=2**12, lr=1e-2, loss="mse", seed=1), 16000
+SETTINGS, LONGEST = FitSettings(steps=2000, batch=2**12, lr=1e-2, loss="mse", seed=1), 64000
 
 #: Steps of the first training of a quick study; the longest takes twice as many.
 QUICK_STEPS = 50
