@@ -41,6 +41,9 @@ repository_root = str(ROOT)
 declared = re.search(r'^Source = "(.+)"$', (ROOT / "pyproject.toml").read_text(encoding="utf-8"), re.MULTILINE)
 repository_url = os.environ.get("MI_DIFFIND_REPOSITORY", declared[1] if declared else "").rstrip("/")
 
+#: Options keep their two dashes.
+smartquotes = False
+
 html_theme = "furo"
 html_title = f"mi_diffind {version}"
 html_static_path = ["_static"]

@@ -8,43 +8,31 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import statistics
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import tomllib
+
 MEASURED = Path(__file__).resolve().parent / "measured"
 
 #: Of which training the bytes on disk of the paper's recipe are.
-TRAINED = "Bytes on disk of the paper's recipe are those after four minutes of training."
+TRAINED = "Bytes on disk of the paper's recipe are those after two minutes of training."
 
 #: Error of a contender that defines the truth of its row.
 EXACT = math.inf
 
 MISSING = "not measured"
 
-#: JSON file → command that writes it.
+#: End of a line within a cell, and the names of the lines.
+LINE = "<br>"
+NAMES = LINE.join(("**ours**", "instead", "paper"))
+
+#: JSON file → command that wrote it, without the file's name.
 COMMANDS = {
-    "bench_backward": "python tests/benchmarks/bench_backward.py --rounds 11",
-    "bench_large_material": "python tests/benchmarks/bench_large_material.py FOLDER",
-    "tradeoff_bsdf": "mi-diffind tradeoff bsdf MATERIAL… --workers 2",
-    "tradeoff_disney": "mi-diffind tradeoff disney",
-    "tradeoff_field": "mi-diffind tradeoff field out/group --compression 75 --compression 200",
-    "tradeoff_ggx": "mi-diffind tradeoff ggx",
-    "tradeoff_image": "mi-diffind tradeoff image scenes/assets/tiles.json --compression 12 --seconds 60 "
-    "--paper-seconds 60 --dims 4 --astc thorough",
-    "tradeoff_image_network": "mi-diffind tradeoff image scenes/assets/tiles.json --compression 12 --seconds 60 "
-    "--paper-seconds 60 --dims 4 --astc thorough",
-    "tradeoff_scene_training_balls": "mi-diffind tradeoff scene-training scenes/training_balls.xml --lambda 0.9 "
-    "--spp 1 --steps 60 --width 64",
-    "tradeoff_scene_training_floor": "mi-diffind tradeoff scene-training scenes/training_floor.xml --lambda 0.9 "
-    "--spp 1 --steps 60 --width 64",
-    "tradeoff_sdf_suzanne": "mi-diffind tradeoff sdf --bytes 1M --bytes 256k",
-    "tradeoff_shading": "mi-diffind tradeoff shading hammered weave lacquer --side 256 --steps 1500 "
-    "--pretrain-steps 300 --seeds 3 --remedies on --lambda 0.9 --frames 8",
-    "tradeoff_shading_paper": "mi-diffind tradeoff shading weave --side 256 --preset paper --remedies clip "
-    "--steps 300 --pretrain-steps 300 --seeds 3 --lambda 0.1 --lambda 0.25 --lambda 0.5 --lambda 1 --frames 8",
-    "tradeoff_texture": "mi-diffind tradeoff texture --compression 12x --seconds 40 --footprints --astc thorough "
-    "--width 300 --frames 20",
+    name: re.sub(r" --json docs/measured/\S+", "", command)
+    for name, command in tomllib.loads((MEASURED / "commands.toml").read_text(encoding="utf-8")).items()
 }
 
 
@@ -74,7 +62,8 @@ class Row:
 
     ``better``: whether a larger ``error`` is better, as for a PSNR. ``others`` are shown in the picture alone.
     ``sources``: figures and the JSON files that they come from. ``note``: why cells are not
-    measured, and what else a reader should know. ``cells``: texts in place of cells.
+    measured, and what else a reader should know. ``cells``: texts in place of cells. ``behind``: where ours loses
+    beyond the figures of the row.
     """
 
     task: str
@@ -90,6 +79,12 @@ class Row:
     better: bool = True
     others: dict[str, Contender] = field(default_factory=dict)
     cells: dict[str, str] = field(default_factory=dict)
+    behind: tuple[str, ...] = ()
+
+    @property
+    def title(self) -> str:
+        """The task beside what a user would take instead."""
+        return f"{self.task} beside {self.instead}"
 
 
 def size_text(nbytes: float) -> str:
@@ -137,10 +132,14 @@ def disney() -> Row:
     """Return the row of the Disney BRDF."""
     study = measured("tradeoff_disney")["candidates"]
     ours, paper = (study[name]["errors"]["psnr_db_training"] for name in ("tables, uint8", "paper, uint8"))
+    networks = measured("tradeoff_disney_network")["candidates"].values()
+    texts = [f"{size_text(c['bytes'])} has {c['errors']['psnr_db_training']:.1f} dB" for c in networks]
     return Row(
         "`neural_disney`", "disney", "`principled`", "PSNR of BRDF · cosine", "dB",
         benched(ours, "disney", "ours"), benched(EXACT, "disney", "principled"), benched(paper, "disney", "paper"),
-        {"errors": "tradeoff_disney", "all others": "bench_backward"},
+        {"errors": "tradeoff_disney", "all others": "bench_backward", "the networks": "tradeoff_disney_network"},
+        f"A network in {texts[0]}, one in {texts[1]}, in half precision and with the coordinates of the formulas as "
+        "inputs; Mitsuba has no plugin that evaluates it.",
         others={"disney, exact": benched(EXACT, "disney", "disney")},
     )  # fmt: skip
 
@@ -218,28 +217,27 @@ def large_material() -> Row:
 
 def texture() -> Row:
     """Return the row of filtered textures, of renders of a plane."""
-    study = measured("tradeoff_texture")
-    base, renders = "bitmap, 4 spp, multijittered", study["cases"]["plane"]["ratios"]["render"]
-    scale = renders[f"{base} / bitmap, 1 spp"]["median"]
+    study, base = measured("tradeoff_texture"), "bitmap, 4 spp, multijittered"
 
-    def contender(name: str, of_bench: str = "") -> Contender:
-        error = study["candidates"][name]["errors"]["psnr_plane_db"]
-        ratio = 1 if name == "bitmap, 1 spp" else renders[f"{name} / bitmap, 1 spp"]["median"]
-        found = benched(error, "texture", of_bench) if of_bench else Contender(error)
-        return Contender(error, ratio / scale, found.step, found.memory, found.disk)
+    def contender(name: str, of_bench: str) -> Contender:
+        return benched(study["candidates"][name]["errors"]["psnr_plane_db"], "texture", of_bench)
 
-    others = [name for name, c in study["candidates"].items() if "psnr_plane_db" in c["errors"]]
     fits = [measured(f"fit_texture_boombox_{preset}") for preset in ("ours", "paper")]
     level, seconds = [f["measured"]["psnr_l0_db"] for f in fits], fits[0]["settings"]["seconds"]
+    network = measured("tradeoff_texture_network")["candidates"]["network 12x, trilinear"]
+    same = study["candidates"]["ours 12x, trilinear"]
     named = ("ours 12x, anisotropic", base, "paper 12x, trilinear")
     return Row(
         "`neural_texture`", "texture", "`bitmap`, 4 samples a pixel", "PSNR of a plane", "dB",
         *(contender(name, key) for name, key in zip(named, ("ours", "bitmap", "paper"), strict=True)),
-        {"errors, renders": "tradeoff_texture", "all others": "bench_backward"},
+        {"errors": "tradeoff_texture", "all others": "bench_backward",
+         "the network": "tradeoff_texture_network"},
+        f"A hash grid with a network in {size_text(network['bytes'])} has {network['errors']['psnr_plane_db']:.1f} dB, "
+        f"ours with the same filter, trilinear, {same['errors']['psnr_plane_db']:.1f} dB; Mitsuba has no plugin that "
+        "renders it. "
         f"Both presets had {study['details']['request']['seconds']:.0f} s, too few for the paper's recipe to converge. "
         f"After {seconds:.0f} s of each on boombox, the finest level has {level[0]:.1f} dB by ours and "
         f"{level[1]:.1f} dB by the paper's (`fit_texture_boombox_….json`). {TRAINED}",
-        others={name: contender(name) for name in others if name not in named},
     )  # fmt: skip
 
 
@@ -255,7 +253,7 @@ def shading() -> Row:
     recipe = max(recipes, key=lambda c: c["errors"]["c_mean_db"])
     names = ("ours", "normalmap + principled + bitmaps", "paper")
     shares = [
-        scene["equal_error"]["neural_material, trained"]["principled + bitmaps, multijittered"]["share"]
+        scene["equal_error"]["neural_material, trained, trilinear"]["principled + bitmaps, multijittered"]["share"]
         for scene in measured("tradeoff_shading_renders")["scenes"].values()
     ]
     best_text = best.replace(", ASTC", " filters in ASTC").replace(", compressed", " filters, compressed")
@@ -269,9 +267,9 @@ def shading() -> Row:
          "all others": "bench_backward"},
         f"Errors are those of {material}; instead of ours, the best classical filter in equal bytes with mip maps, "
         "which Mitsuba does not read. Times and bytes are those of rust and of its bitmaps without a filter. At equal "
-        f"error of whole renders of rust, ours takes {min(shares):.2f} to {max(shares):.2f} of the time of "
-        "multijittered bitmaps (`tradeoff_shading_renders.json`). The paper's recipe had 300 steps, ours 1,500 (the "
-        "commands). " + TRAINED,
+        f"error of whole renders of rust, ours with its default filter takes {min(shares):.2f} to {max(shares):.2f} of "
+        "the time of multijittered bitmaps (`tradeoff_shading_renders.json`). The paper's recipe had 300 steps, ours "
+        "1,500 (the commands). " + TRAINED,
     )  # fmt: skip
 
 
@@ -290,6 +288,7 @@ def scene() -> Row:
         "Times and bytes are those of the row above: the arrays have the same form. The paper's recipe is not "
         "measured: it does not train inside scenes.",
         cells=dict.fromkeys(("render", "step", "memory", "disk"), "as above"),
+        behind=(f"error {other['scene'] - other['hemisphere']:+.1f} dB on the scene of balls",),
     )  # fmt: skip
 
 
@@ -357,13 +356,13 @@ def rows() -> list[Row]:
 
 
 def three(row: Row, text, key: str) -> str:
-    """Return the cell of ours / theirs / the paper's recipe."""
+    """Return the cell of ours, theirs and the paper's recipe, one a line."""
     values = [getattr(c, key) for c in (row.ours, row.theirs, row.paper)]
     if key in row.cells:
         return row.cells[key]
     if all(v is None for v in values):
         return MISSING
-    return " / ".join(MISSING if v is None else text(v) for v in values)
+    return LINE.join("–" if v is None else text(v).replace(" ", "\N{NO-BREAK SPACE}") for v in values)
 
 
 def cost(table) -> str:
@@ -376,10 +375,10 @@ def cost(table) -> str:
 
         lines.append([
             f"[{row.task}]({row.page}.md)", row.instead, f"{row.error}, {row.unit}" if row.unit != "°" else row.error,
-            three(row, error, "error"), *(three(row, lambda v: f"{v:.2f}", key) for key in ("render", "step")),
+            NAMES, three(row, error, "error"), *(three(row, lambda v: f"{v:.2f}", key) for key in ("render", "step")),
             *(three(row, size_text, key) for key in ("memory", "disk")),
         ])  # fmt: skip
-    head = ["task", "instead", "measure", "error", "a render", "a step", "bytes in memory", "bytes on disk"]
+    head = ["task", "instead", "measure", "", "error", "a render", "a step", "in memory", "on disk"]
     return table(head, lines)
 
 
@@ -417,7 +416,8 @@ def cost_losses(table) -> str:
     lines = []
     for row in rows():
         (wins, losses), (_, behind) = (compared(row, other) for other in (row.theirs, row.paper))
-        lines.append([row.task, *("; ".join(texts) or "–" for texts in (wins, losses, behind))])
+        losses.extend(row.behind)
+        lines.append([row.title, *("; ".join(texts) or "–" for texts in (wins, losses, behind))])
     return table(["task", "better", "worse", "worse than the paper's recipe"], lines)
 
 
@@ -426,7 +426,7 @@ def cost_sources(table) -> str:
     lines = []
     for row in rows():
         sources = [f"{figures}: `{COMMANDS[name]}`" for figures, name in row.sources.items()]
-        lines.append([row.task, "; ".join(sources), row.note])
+        lines.append([row.title, "; ".join(sources), row.note])
     return table(["task", "commands", "notes"], lines)
 
 

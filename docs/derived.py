@@ -115,3 +115,9 @@ def shipped(task: str, preset: str) -> float:
 def asset_bytes(name: str) -> int:
     """Return the bytes of a file in ``scenes/assets``."""
     return (Path(__file__).resolve().parents[1] / "scenes" / "assets" / name).stat().st_size
+
+
+def trust_cells(study: Any) -> tuple[int, int]:
+    """Return the numbers of cells of the table of properties that were measured, and of all."""
+    results = [c["result"] for by in study.content["cells"].values() for row in by.values() for c in row.values()]
+    return len(results) - results.count("not run"), len(results)

@@ -30,7 +30,7 @@ WIDTH, HEIGHT, LARGEST = 384, 240, 25_000
 CAPTIONS = {
     "disney": "Lacquer (``clearcoat``), cloth (``sheen``) and brushed metal (``anisotropic``).",
     "mipmap": "One sample a pixel: ``bitmap`` on the left, ``mipmap`` with ``filter`` ``anisotropic`` on the right.",
-    "neural_bsdf": "Three materials (a blend of plastic and gold, bronze, pearl), each from a file of two kilobytes.",
+    "neural_bsdf": "Three materials (a blend of plastic and gold, bronze, pearl), each from a file of four kilobytes.",
     "neural_disney": "The materials of the picture of ``disney``, from 384 bytes of tables.",
     "neural_field": "A captured field of 0.6 MB on a mirror, behind a golden mesh.",
     "neural_ggx": "Gold, copper and aluminium of ``alpha`` 0.05, 0.2 and 0.4.",

@@ -140,7 +140,7 @@ def page_of_figures(pages: dict[Path, str]) -> str:
 
 
 def disney_forms() -> Table:
-    """Return accuracy, bytes and time of each form of the Disney BRDF."""
+    """Return accuracy, bytes and time of each form of the Disney BRDF; times of networks are not measured."""
     study = measured("tradeoff_disney")
     columns = {
         "constant, all lobes": ("eval",),
@@ -150,7 +150,7 @@ def disney_forms() -> Table:
     cases = study["cases"]
     timings = {f"{q}: {case}": cases[case]["queries"][q] for case, queries in columns.items() for q in queries}
     rows = []
-    for name, candidate in study["candidates"].items():
+    for name, candidate in {**study["candidates"], **measured("tradeoff_disney_network")["candidates"]}.items():
         if candidate["representation"] == "one table":
             continue
         errors = candidate["errors"]
@@ -295,12 +295,18 @@ def image_bytes() -> Table:
 RENDERS = (
     "bitmap, 1 spp", "bitmap, 4 spp", "bitmap, 16 spp", "bitmap, 4 spp, multijittered", "bitmap, 16 spp, multijittered",
     "mipmap, trilinear", "ours 12x, trilinear", "ours 12x, anisotropic, centred", "ASTC 12x, trilinear",
-    "ASTC 12x, anisotropic, centred",
+    "ASTC 12x, anisotropic, centred", "network 12x, trilinear",
 )  # fmt: skip
 
 
+def with_network(study: dict) -> dict:
+    """Return the study of filtered tiles with the network of ``tradeoff_texture_network``, whose times are not used."""
+    network = measured("tradeoff_texture_network")
+    return {**study, **{key: {**study[key], **network[key]} for key in ("candidates", "jobs")}}
+
+
 def texture_renders(study: dict) -> Table:
-    """Return errors, flicker and times of renders with filtered textures."""
+    """Return errors, flicker and times of renders with filtered textures; "–": a time is not measured."""
     stages, base, steady = list(study["details"]["counted"]), "bitmap, 1 spp", "bitmap, 4 spp"
     flicker = study["candidates"][steady]["errors"]["flicker_error"]
     rows = []
@@ -308,10 +314,11 @@ def texture_renders(study: dict) -> Table:
         if "flicker" not in c["errors"]:
             continue
         e = c["errors"]
-        times = [study["cases"][s]["ratios"]["render"].get(f"{name} / {base}", {"median": 1})["median"] for s in stages]
+        ratios = [study["cases"][s]["ratios"]["render"].get(f"{name} / {base}", {}).get("median") for s in stages]
+        times = ["1.00" if name == base else "–" if ratio is None else f"{ratio:.2f}" for ratio in ratios]
         rows.append([
             f"`{name}`", f"{c['bytes']:,}", *(f"{e[f'psnr_{s}_db']:.1f} / {e[f'flip_{s}']:.4f}" for s in stages),
-            f"{e['flicker_error'] / flicker:.2f}", " / ".join(f"{t:.2f}" for t in times),
+            f"{e['flicker_error'] / flicker:.2f}", " / ".join(times),
         ])  # fmt: skip
     head = ["", "bytes", *(f"{s}: PSNR, dB / FLIP" for s in stages), "flicker", f"time: {' / '.join(stages)}"]
     return table(head, rows, lambda row: row[0].strip("`") in RENDERS)
@@ -792,11 +799,7 @@ def trust() -> Table:
                 text = "–" if any(c["result"] == "does not apply" for c in cells) else "not run"
             row.append(text if failed or not held else f"{text} ({len(held)})")
         rows.append(row)
-    study = measured("trust")
-    results = [c["result"] for by in study["cells"].values() for row in by.values() for c in row.values()]
-    run = len(results) - results.count("not run")
-    corner = f"{study['date']}{', quick' * study['quick']}: {run} of {len(results)} cells"
-    head = [corner, "albedo, at most", "reciprocity", "χ² rejected", "furnace", "gradients", "gradients, float32"]
+    head = ["plugin", "albedo, at most", "reciprocity", "χ² rejected", "furnace", "gradients", "gradients, float32"]
     return table(head, rows)
 
 
@@ -867,6 +870,8 @@ TABLES |= {
 }  # fmt: skip
 for source, study in (("", "tradeoff_texture"), ("_boombox", "texture_levels_boombox")):
     TABLES["texture_levels" + source] = lambda study=study: texture_levels(measured(study))
+TABLES["texture_renders"] = lambda: texture_renders(with_network(measured("tradeoff_texture")))
+TABLES["texture_levels"] = lambda: texture_levels(with_network(measured("tradeoff_texture")))
 TABLES["viewer"] = viewer
 
 

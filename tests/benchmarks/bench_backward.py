@@ -3,19 +3,20 @@ Time of a render, and of a render with its backward pass, of each task's plugin 
 
     python tests/benchmarks/bench_backward.py [TASK …] [--rounds 15] [--json docs/measured/bench_backward.json]
 
-A *render* has 160 × 160 pixels and 4 samples a pixel, with the storage that files have. A *step* has 96 × 96 pixels and
-4 samples: ``mi.render``, the mean squared error against a grey picture, and ``dr.backward`` with respect to all
-parameters that can be optimised. For BSDFs, these are the parameters of the counterpart; for the other tasks, they are
-the entries of the tables, of the bitmap, of the grid, or the vertices of the mesh. Tables are then in single precision.
+A *render* has 320 × 320 pixels, with the storage that files have, a *step* 160 × 160: ``mi.render``, the mean squared
+error against a grey picture, and ``dr.backward`` with respect to all parameters that can be optimised. For BSDFs, these
+are the parameters of the counterpart; for the other tasks, they are the entries of the tables, of the bitmap, of the
+grid, or the vertices of the mesh. Tables are then in single precision.
 
-Times are those of the processor, on one core, and include the tracing of the kernel by Python. Contenders of a task
+There are 16 samples a pixel; of solids, fields and filtered textures 4, beside a bitmap with 16 multijittered ones.
+Times are those of the processor, on one core, and include the tracing of the kernel by Python, which takes milliseconds. Contenders of a task
 run in turn; ratios are medians over the rounds of the ratio to the first contender in the same round. Each
 contender has a process of its own, because Dr.Jit compiles the materials of all scenes that a process holds into each
 kernel. Bytes are those of all maps of a file, in memory in the storage form that a plugin reads by default, and on
 disk. Distance fields have 1 MiB and are trained by the whole recipe, because the steps of rays depend on their entries.
 The grid of ``sdfgrid`` has the exact distances of the mesh; its error is the mean angle of its normals where rays meet
-it. The paper's recipe for images and textures is trained for minutes, which its bytes on disk depend on. Materials of
-4096² texels (``large``) and fields of a small capture are trained briefly: their times depend on the arrays alone.
+it. The paper's recipe for images and textures is trained for two minutes, which its bytes on disk depend on. Materials
+of 4096² texels (``large``) and fields of a small capture are trained briefly: their times depend on the arrays alone.
 """
 
 from __future__ import annotations
@@ -42,11 +43,11 @@ ROOT = Path(__file__).resolve().parents[2]
 ASSETS = ROOT / "scenes" / "assets"
 VARIANT = "llvm_ad_rgb"
 
-#: Pass → side of the film; samples a pixel.
-SIDES, SPP = {"render": 160, "step": 96}, 4
+#: Pass → side of the film; samples a pixel, and those of tasks whose rays or textures make up for fewer.
+SIDES, SPP, FEWER = {"render": 320, "step": 160}, 16, {"sdf": 4, "field": 4, "texture": 4}
 
 #: Seconds of a training by the paper's recipe, and of one of a material of 4096² texels.
-SECONDS, LARGE_SECONDS = 240, 30
+SECONDS, LARGE_SECONDS = 120, 30
 
 #: First rounds, which compile kernels.
 WARM = 2
@@ -144,11 +145,13 @@ CONTENDERS = {
         "paper": lambda storage, folder: on_plane(learned_image(folder / "large_paper.npz", storage)),
     },
     "texture": {
-        "bitmap": lambda storage, **_: on_plane(bitmap("tiles_albedo.png", storage)),
+        "bitmap": lambda storage, **_: {
+            **on_plane(bitmap("tiles_albedo.png", storage)), "spp": SPP, "sampler": "multijitter",
+        },
         "mipmap": lambda **_: on_plane(repeated({"type": "mipmap", "filename": asset("tiles_albedo.png")})),
         "ours": lambda storage, **_: on_plane(
             repeated({"type": "neural_texture", "filename": asset("tiles_filtered.npz"), "channels": "albedo",
-                      "storage": storage})
+                      "storage": storage, "filter": "anisotropic"})
         ),
         "paper": lambda storage, folder: on_plane(
             repeated({"type": "neural_texture", "filename": str(folder / "texture_paper.npz"), "channels": "albedo",
@@ -349,11 +352,11 @@ def scene(task: str, contender: str, size: str, folder: Path):
     parts = CONTENDERS[task][contender](storage="float32" if size == "step" else "uint8", folder=folder)
     eye, target = VIEWS.get(task, ([0, 2.2, 4.2], [0, 0.5, 0]))
     integrator = {"type": "path_sdf" if parts.pop("traced", False) else "prb", "max_depth": 3}
-    side = SIDES[size]
+    side, spp, sampler = SIDES[size], parts.pop("spp", FEWER.get(task, SPP)), parts.pop("sampler", "independent")
     return mi_diffind.load_dict({
         "type": "scene", "integrator": integrator,
         "sensor": {
-            "type": "perspective", "fov": 40, "sampler": {"type": "independent", "sample_count": SPP},
+            "type": "perspective", "fov": 40, "sampler": {"type": sampler, "sample_count": spp},
             "to_world": mi.ScalarTransform4f().look_at(eye, target, [0, 1, 0]),
             "film": {
                 "type": "hdrfilm", "width": side, "height": side, "pixel_format": "rgb", "rfilter": {"type": "box"},
@@ -378,12 +381,12 @@ def worker(task: str, contender: str, size: str, folder: str, pipe) -> None:
 
         def run(seed):
             if size == "render":
-                return mi.render(loaded, spp=SPP, seed=seed)
+                return mi.render(loaded, seed=seed)
             for key in keys:
                 dr.enable_grad(parameters[key])
                 dr.set_grad(parameters[key], 0)
             parameters.update()
-            image = mi.render(loaded, parameters, spp=SPP, seed=seed, seed_grad=seed + 10_000)
+            image = mi.render(loaded, parameters, seed=seed, seed_grad=seed + 10_000)
             dr.backward(dr.mean(dr.square(image - 0.5), axis=None))
             return [parameters[key].grad for key in keys]
 
@@ -467,8 +470,8 @@ def main() -> None:
                         print(task, size, name, shown, figures["parameters"], "of", figures["exposed"], flush=True)
             if kept:
                 write_json(kept, {
-                    "machine": clock.machine(VARIANT), "rounds": arguments.rounds, "spp": SPP, "sides": SIDES,
-                    "bytes": counted, "errors": errors, "tasks": results,
+                    "machine": clock.machine(VARIANT), "rounds": arguments.rounds, "spp": SPP, "fewer": FEWER,
+                    "sides": SIDES, "bytes": counted, "errors": errors, "tasks": results,
                 })  # fmt: skip
 
 

@@ -26,7 +26,9 @@ def finished(tmp_path_factory):
 
 def test_quick_run_writes_what_it_promises(finished):
     folder, found = finished
-    assert sorted(os.listdir(folder)) == [f"tradeoff_disney.{kind}" for kind in ("csv", "json", "png")]
+    files = {kind: f"tradeoff_disney.{kind}" for kind in ("csv", "json", "png")}
+    files["training"] = "tradeoff_disney_training.png"
+    assert sorted(os.listdir(folder)) == sorted([*files.values(), "tradeoff_disney_models"])
     with open(folder / "tradeoff_disney.csv", encoding="utf-8", newline="") as file:
         table = list(csv.DictReader(file))
     assert list(table[0])[: len(report.COLUMNS)] == list(report.COLUMNS)
@@ -34,14 +36,14 @@ def test_quick_run_writes_what_it_promises(finished):
     names = {row["candidate"] for row in table}
     stored = {f"{q}{s}" for q in ("tables", "paper") for s in ("", ", uint8")}
     single = {f"only {factor} read" for factor in ("alpha", "masking", "coat")}
-    assert names == {"principled", "disney", "formulas", *stored, *single}
+    assert names == {"principled", "disney", "formulas", "network, bytes of tables", *stored, *single}
     assert {row["query"] for row in table} == {"eval", "sample", "pdf", "render", "render, with tracing"}
     assert {row["case"] for row in table} == {"constant, all lobes", "textured, diffuse + specular"}
     for row in table:
         assert float(row["time_with_floor"]) > 0 and int(row["rounds"]) >= 2
         assert (row["psnr_db_training"] == "") == (row["candidate"] in ("principled", "formulas"))
     written = json.loads((folder / "tradeoff_disney.json").read_text(encoding="utf-8"))
-    assert found.pop("files") == {k: str(folder / f"tradeoff_disney.{k}") for k in ("csv", "json", "png")}
+    assert found.pop("files") == {k: str(folder / name) for k, name in files.items()}
     assert written == found and not found["interrupted"]
     assert {"cpu", "cores", "variant", "mitsuba", "drjit", "mi-diffind"} <= set(found["machine"])
     assert (folder / "tradeoff_disney.png").stat().st_size > 50_000
@@ -59,6 +61,12 @@ def test_candidates_are_what_they_are_called(finished):
     bytes_of = {name: c["bytes"] for name, c in found["candidates"].items()}
     for preset in ("tables", "paper"):
         assert bytes_of[preset] == 4 * bytes_of[f"{preset}, uint8"] > 0
+    network = found["candidates"]["network, bytes of tables"]
+    assert bytes_of["tables, uint8"] < network["bytes"] <= network["details"]["equal_to_bytes"] == 832
+    timed = {
+        query for query, times in found["cases"]["constant, all lobes"]["queries"].items() if network["label"] in times
+    }
+    assert timed == {"eval"}
     assert bytes_of["formulas"] == bytes_of["disney"] == bytes_of["principled"] == 0
     constant, textured = found["cases"].values()
     for query in ("eval", "sample"):

@@ -15,7 +15,7 @@ from mi_diffind.measure import benchmark
 from mi_diffind.studies.baselines import node_codes, radiance_factors, radiance_fits
 from mi_diffind.studies.radiance import conclusions
 from mi_diffind.studies.radiance import plan as plans
-from mi_diffind.tasks.radiance import visual_hull
+from mi_diffind.tasks.radiance import march, visual_hull
 from mi_diffind.tasks.radiance.nodes import Nodes, cells_of, corners_of
 from mi_diffind.tasks.radiance.session import FieldSession
 from mi_diffind.tasks.radiance.volume_field import FAINT, NodeField
@@ -195,6 +195,31 @@ def test_derivatives_of_planes_and_networks(grid, kind, rng):
         moved = [values({**net, name: net[name] + s * step * change}).numpy().astype(np.float64) for s in (1, -1)]
         found = np.sum(gradients[name].numpy().astype(np.float64) * change.numpy())
         assert found == pytest.approx(np.sum(moved[0] - moved[1]) / (2 * step), rel=0.01), name
+
+
+def test_all_outputs_of_a_network_are_trained(grid, rng):
+    """Derivatives of rays reach the density and all coefficients of the colours, as finite differences do."""
+    made = radiance_factors.HashVolumeFit(grid, 2**9, 16.0)
+    made.net["weights"] = made.net["weights"] * 1.5  # some density
+    _, _, o, d = rays(rng, 500, grid)
+
+    def total(net):
+        seen = march.differentiable(made.field_of(net).for_training(), o, d, T.Float(0), T.Float(dr.inf))
+        return sum(w * dr.sum(colour) for w, colour in zip((1, 2, 3), seen.colour, strict=True))
+
+    net = {name: T.TensorXf(value) for name, value in made.net.items()}
+    dr.enable_grad(net)
+    dr.backward(total(net))
+    gradient, net = dr.grad(net)["weights"].numpy().astype(np.float64), dr.detach(net)
+    bias = made.network.layers[-1].bias
+    for row in range(13):
+        place, sums = bias.offset + row * bias.stride, []
+        for sign in (1, -1):
+            weights = net["weights"].numpy().copy()
+            weights[place] += sign * 1e-2
+            sums.append(float(total({**net, "weights": T.TensorXf(weights)})[0]))
+        assert gradient[place] == pytest.approx((sums[0] - sums[1]) / 2e-2, rel=0.03, abs=1e-3), row
+    assert np.abs(gradient[bias.offset + bias.stride :: bias.stride][:3]).min() > 0.01
 
 
 def test_planes_are_sums_of_products(grid, rng):

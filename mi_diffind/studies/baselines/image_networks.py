@@ -27,10 +27,18 @@ def network(source: Source, nbytes: float) -> Network:
 
     Raises ``ValueError`` if the bytes are too few for a hash grid and a network.
     """
+    return Network(2, WIDTH, LAYERS, hash_grid(source, nbytes, source.channels), outputs=source.channels)
+
+
+def hash_grid(source: Source, nbytes: float, outputs: int, direct: int = 0) -> dict:
+    """Return the options of the largest hash grid with which a network takes ``nbytes``, as :func:`network` raises.
+
+    The network has ``outputs``, and ``direct`` inputs beside the features of the grid.
+    """
     finest = max(2 * COARSEST, max(source.width, source.height))
     scale = (finest / COARSEST) ** (1 / (LEVELS - 1))
-    units = FEATURES * LEVELS + (LAYERS - 1) * WIDTH + source.channels
-    weights = WIDTH * units + LAYERS * WIDTH + source.channels
+    units = FEATURES * LEVELS + direct + (LAYERS - 1) * WIDTH + outputs
+    weights = WIDTH * units + LAYERS * WIDTH + outputs
     resolutions = [math.ceil(COARSEST * scale**level) for level in range(LEVELS)]
     sizes = [int(2**power) // 16 * 16 for power in np.arange(6, 24, 0.05)]
 
@@ -41,10 +49,9 @@ def network(source: Source, nbytes: float) -> Network:
     largest = largest_fitting(fits, -1, len(sizes))
     if largest < 0:
         raise ValueError(f"{nbytes:,.0f} bytes are too few for a hash grid of {LEVELS} levels")
-    grid = {"n_levels": LEVELS, "n_features_per_level": FEATURES, "hashmap_size": sizes[largest],
+    return {"n_levels": LEVELS, "n_features_per_level": FEATURES, "hashmap_size": sizes[largest],
             "base_resolution": COARSEST, "per_level_scale": scale, "align_corners": True,
             "init_scale": 1e-4}  # fmt: skip
-    return Network(2, WIDTH, LAYERS, grid, outputs=source.channels)
 
 
 class ImageNetworkProblem(Problem):

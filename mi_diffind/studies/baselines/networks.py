@@ -16,10 +16,11 @@ class Network(nn.Module):
     """Multilayer perceptron from ``inputs`` coordinates to one number, or as many as ``outputs``.
 
     There are ``layers`` hidden layers of ``width`` leaky rectified units. With ``grid``, the options of
-    ``nn.HashGridEncoding``, a hash grid encodes the coordinates. With ``table``, a number of entries on a side, the
-    network's outputs point into a square :class:`~mi_diffind.indirection.DifferentiableArray`, as the primary array of
-    an indirection does. A call with a list of coordinates returns a list of arrays. As allocated, the network
-    computes with tensors, the faster form to train; :meth:`cooperative` returns it in cooperative vectors.
+    ``nn.HashGridEncoding``, a hash grid encodes the coordinates; ``direct`` further coordinates bypass it. With
+    ``table``, a number of entries on a side, the network's outputs point into a square
+    :class:`~mi_diffind.indirection.DifferentiableArray`, as the primary array of an indirection does. A call with a
+    list of coordinates returns a list of arrays. As allocated, the network computes with tensors, the faster form to
+    train; :meth:`cooperative` returns it in cooperative vectors.
     """
 
     DRJIT_STRUCT = {"entries": object, "mlp": nn.Module, "table": object}  # noqa: RUF012
@@ -32,9 +33,10 @@ class Network(nn.Module):
         grid: dict | None = None,
         table: int = 0,
         outputs: int = 1,
+        direct: int = 0,
     ):
         self.inputs, self.width, self.layers, self.grid, self.table_size = inputs, width, layers, grid, table
-        self.outputs = 2 if table else outputs
+        self.outputs, self.direct = 2 if table else outputs, direct
         self.entries = self.mlp = self.table = self.encoding = None
         self.is_cooperative = False
 
@@ -44,7 +46,7 @@ class Network(nn.Module):
             Float = module_of(dtype).Float
             result.encoding = nn.HashGridEncoding(Float, self.inputs, rng=rng, **self.grid)
             result.entries = dtype(result.encoding.params)
-            size = self.grid["n_levels"] * self.grid["n_features_per_level"]
+            size = self.grid["n_levels"] * self.grid["n_features_per_level"] + self.direct
         hidden = []
         for _ in range(self.layers):
             hidden += [nn.Linear(-1, self.width), nn.LeakyReLU()]
@@ -58,7 +60,7 @@ class Network(nn.Module):
         n = max(dr.width(v) for v in x)
         if self.encoding is not None:
             self.encoding.data = self.entries.array
-            x = list(self.encoding(list(x)))
+            x = [*self.features(list(x)), *x[self.inputs :]]
         if self.is_cooperative:
             y = list(self.mlp(nn.CoopVec(*x)))
         else:
@@ -67,6 +69,10 @@ class Network(nn.Module):
             y = self.mlp(dr.concat(rows, axis=0))
             y = [y.array] if y.shape[0] == 1 else [y[i, :].array for i in range(y.shape[0])]
         return y if self.table is None else self.table([fold(v) for v in y], active)
+
+    def features(self, x: list) -> list:
+        """Return the features that the hash grid gives to the network at coordinates ``x``."""
+        return list(self.encoding(x[: self.inputs]))
 
     def cooperative(self) -> Network:
         """Return a copy in cooperative vectors, for inference only."""

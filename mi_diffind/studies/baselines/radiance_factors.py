@@ -230,19 +230,31 @@ class HashVolumeField(OccupancyField):
         super().__init__(nodes, arrays, occupancy)
         self.encoding, self.network = encoding, network
 
+    #: The marching of rays differentiates colours by what :meth:`radiance_at` computes, not by ``point_data``.
+    reads_again = False
+
+    def for_training(self):
+        field = super().for_training()
+        field.reads_again = True
+        return field
+
     def density_at(self, p, active=True):
         active = self.occupancy(p, active)
+        raw, *numbers = self._outputs(p, active)
+        return dr.select(active, density_of(raw + BEGIN, self.per_voxel), 0), [] if self.reads_again else numbers
+
+    def _outputs(self, p, active):
+        """Return the outputs of the network: a raw density and twelve coefficients."""
         longest = max(b - a for a, b in zip(self.lower, self.upper, strict=True))
         self.encoding.data = self.arrays["entries"].array
         for layer in self.network.layers:
             if isinstance(layer, nn.Linear):
                 layer.weights.buffer = layer.bias.buffer = self.arrays["weights"].array
         features = self.encoding([(x - a) * (1 / longest) for x, a in zip(p, self.lower, strict=True)], active)
-        raw, *numbers = self.network(nn.CoopVec(*features))
-        return dr.select(active, density_of(raw + BEGIN, self.per_voxel), 0), numbers
+        return list(self.network(nn.CoopVec(*features)))
 
     def radiance_at(self, point_data, p, d, active=True):
-        return colour_of(point_data, d)
+        return colour_of(self._outputs(p, active)[1:] if self.reads_again else point_data, d)
 
 
 class HashVolumeFit:

@@ -1,10 +1,14 @@
 """Plan of the Disney study: ``disney``, ``neural_disney`` and ``principled`` with constant and with textured materials.
 
 ``disney`` evaluates formulas; ``neural_disney`` is measured with each preset, in each storage form, and with one of its
-tables only. Errors are measured against :mod:`~mi_diffind.tasks.disney.model`, formulas that no plugin shares.
+tables only. Networks (:mod:`.networks`) have as many bytes as the tables of each preset take in memory, in ``uint8``.
+Errors are measured against :mod:`~mi_diffind.tasks.disney.model`, formulas that no plugin shares.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -13,14 +17,17 @@ import numpy as np
 from ... import runtime
 from ...lookup import STORAGES
 from ...measure.bsdf import QUERIES, TEXTURE_SIZE, bsdf_queries, directions, noise_texture
-from ...measure.operations import FLOPS
+from ...measure.operations import FLOPS, Operations, count_query
+from ...measure.store import fingerprint
 from ...measure.study import Candidate, Case, Plan
 from ...tasks.disney import TASK
 from ...tasks.disney.decoder import Decoder
 from ...tasks.disney.factored import FactoredDecoder
 from ...tasks.disney.model import PARAMETERS, Material
 from ...tasks.disney.training import measure, shade
+from . import NETWORK
 from .conclusions import PAPER, conclusions
+from .networks import DisneyNetworkTraining
 
 #: Parameters of a material that uses every part of the model, and of one with the two lobes that most materials have.
 ALL_LOBES = {
@@ -39,13 +46,26 @@ PRESETS = ("tables", "paper")
 #: Candidates of a quick study that are rendered, and measured with textured materials.
 QUICK = ("principled", "disney", "tables")
 
+#: Candidates of a quick study that are trained.
+QUICK_PRESETS = ("tables",)
+
 _PRINCIPLED_NOTE = "another model (full Fresnel terms, no flatness without `thin`): no error against this one"
 _FORMULAS_NOTE = "the formulas alone, without a plugin's checks of directions and selection of lobes"
+_NETWORK_NOTE = "in half precision; timed without a plugin's checks of directions and selection of lobes"
 
 
-def plan(quick: bool = False) -> Plan:
-    """Return the plan of the study in the current variant; ``quick``: fewer cases, fewer and smaller renders."""
+def plan(quick: bool = False, only: Sequence[str] = ()) -> Plan:
+    """Return the plan of the study in the current variant.
+
+    ``quick``: fewer cases, fewer and smaller renders, short trainings. ``only``: representations that are measured
+    (default: all).
+    """
     candidates, plugins = _candidates(quick)
+    trainings = _trainings(quick)
+    candidates += [_network_candidate(training) for training in trainings.values()]
+    candidates = [c for c in candidates if not only or c.representation in only]
+    trainings = {name: training for name, training in trainings.items() if name in {c.name for c in candidates}}
+    plugins = {name: build for name, build in plugins.items() if name in {c.name for c in candidates}}
     lobes = {"all lobes": ALL_LOBES, "diffuse + specular": DIFFUSE_SPECULAR}
     combinations = [(m, l) for m in ("constant", "textured") for l in lobes]
     if quick:
@@ -56,19 +76,30 @@ def plan(quick: bool = False) -> Plan:
     cases = []
     for material, name in combinations:
         parameters = lobes[name]
-        names = [*plugins, *([FORMULAS] if material == "constant" and mi.is_rgb else [])]
+        bare = {}
+        if material == "constant" and mi.is_rgb:
+            bare = {FORMULAS: lambda: None, **{n: training.cooperative for n, training in trainings.items()}}
+        names = [*plugins, *(c.name for c in candidates if c.name in bare)]
         if quick and cases:
-            names = list(QUICK)
+            names = [n for n in QUICK if n in plugins]
+        if not names:
+            continue
         timed = {n: plugins[n] for n in names if n in plugins}
+        evaluated = {n: bare[n] for n in names if n in bare}
+        passes = rendered and not (quick and cases)
         cases.append(
             Case(
                 f"{material}, {name}",
-                lambda lanes, t=timed, m=material, p=parameters: _queries(t, m, p, lanes),
-                None if quick and cases else lambda m=material, p=parameters: _passes(rendered, m, p, quick),
+                lambda lanes, t=timed, b=evaluated, m=material, p=parameters: _queries(t, b, m, p, lanes),
+                (lambda m=material, p=parameters: _passes(rendered, m, p, quick)) if passes else None,
                 {"material": material, "lobes": name, "base_color": BASE_COLOR, **parameters},
                 tuple(names),
+                query_names=None if timed else ("eval",),
             )
         )
+    package = Path(__file__).resolve().parents[2]
+    names = ("fitting", "studies/disney/networks", "studies/baselines/networks")
+    training_sources = [*(package / f"{name}.py" for name in names), *(package / "tasks" / "disney").glob("*.py")]
     return Plan(
         study="disney",
         title="Disney BRDF: accuracy against time",
@@ -90,8 +121,46 @@ def plan(quick: bool = False) -> Plan:
             "errors": "PSNR in dB and mean absolute error of BRDF · cosine, clipped to [0, 1], over random directions "
             "and materials with all lobes: distributed as in training, and uniformly",
         },
+        jobs=list(trainings.values()),
+        jobs_fingerprint=fingerprint(training_sources),
         conclusions=conclusions,
     )
+
+
+def _trainings(quick: bool) -> dict[str, DisneyNetworkTraining]:
+    """Return the trainings of networks, in the bytes in memory of each preset's tables in ``uint8``, by name."""
+    types, trainings = runtime.array_module(mi.variant()), {}
+    for preset in QUICK_PRESETS if quick else PRESETS:
+        nbytes = TASK.open(types.TensorXf, preset=preset, storage="uint8").memory_nbytes
+        name = f"network, bytes of {preset}"
+        trainings[name] = DisneyNetworkTraining(name, nbytes, quick)
+    return trainings
+
+
+def _network_candidate(training: DisneyNetworkTraining) -> Candidate:
+    """Return the candidate of a trained network, which is timed in ``eval`` only, with constant materials, in RGB."""
+
+    def counted(query: str) -> Operations:
+        material, albedo, wi, wo = _constants(ALL_LOBES, 64)
+        decoder = training.cooperative()
+        return count_query(lambda: shade(decoder, material, albedo, wi, wo)) + training.net.products()
+
+    return Candidate(
+        training.name, NETWORK, "float16", errors=_errors(lambda: training.decoder), in_passes=False,
+        job=training.name, queries=("eval",), operations=counted, note=_NETWORK_NOTE,
+        details={"equal_to_bytes": training.nbytes},
+    )  # fmt: skip
+
+
+def _errors(decoder: Callable[[], Decoder]) -> Callable[[int], dict[str, float]]:
+    """Return a function that measures the errors of a form of the model with a number of samples."""
+
+    def measure_errors(samples: int) -> dict[str, float]:
+        types, form = runtime.array_module(mi.variant()), decoder()
+        measured = {d: measure(form, types, samples, d) for d in ("training", "uniform")}
+        return {f"{error}_{d}": m[error] for d, m in measured.items() for error in ("psnr_db", "mae")}
+
+    return measure_errors
 
 
 def _candidates(quick: bool) -> tuple[list[Candidate], dict]:
@@ -102,11 +171,7 @@ def _candidates(quick: bool) -> tuple[list[Candidate], dict]:
     types = runtime.array_module(mi.variant())
 
     def errors(decoder):
-        def measure_errors(samples: int) -> dict[str, float]:
-            measured = {d: measure(decoder, types, samples, d) for d in ("training", "uniform")}
-            return {f"{error}_{d}": m[error] for d, m in measured.items() for error in ("psnr_db", "mae")}
-
-        return measure_errors
+        return _errors(lambda: decoder)
 
     def loaded(**plugin):
         return lambda parameters: mi.load_dict({**plugin, **parameters})
@@ -156,15 +221,27 @@ def _material(material: str, parameters: dict) -> dict:
     }
 
 
-def _queries(plugins: dict, material: str, parameters: dict, lanes: int) -> dict:
+def _queries(plugins: dict, bare: dict, material: str, parameters: dict, lanes: int) -> dict:
+    """Return the queries of BSDFs, and ``eval`` of the forms of ``bare``: functions that return a decoder or ``None``.
+
+    ``None`` stands for the published formulas.
+    """
     bsdfs = {name: build(_material(material, parameters)) for name, build in plugins.items()}
-    inputs = directions(lanes)
-    functions = bsdf_queries(bsdfs, inputs, material == "textured")
-    values = {**dict.fromkeys(PARAMETERS, 0.0), **parameters}  # each one number for all lanes, as in a plugin
+    functions = bsdf_queries(bsdfs, directions(lanes), material == "textured")
+    constant, albedo, wi, wo = _constants(parameters, lanes)
+    decoders = {name: decoder() for name, decoder in bare.items()}
+    for name, decoder in decoders.items():
+        functions["eval"][name] = lambda d=decoder: shade(d, constant, albedo, wi, wo)
+    return functions
+
+
+def _constants(parameters: dict, lanes: int) -> tuple:
+    """Return a material, each parameter one number for all lanes as in a plugin, its albedo, ``wi`` and ``wo``."""
+    values = {**dict.fromkeys(PARAMETERS, 0.0), **parameters}
     constants, albedo = {name: dr.opaque(mi.Float, value) for name, value in values.items()}, mi.Color3f(BASE_COLOR)
     dr.make_opaque(albedo)
-    functions["eval"][FORMULAS] = lambda: shade(None, Material(**constants), albedo, inputs[0].wi, inputs[1])
-    return functions
+    si, wo, *_ = directions(lanes)
+    return Material(**constants), albedo, si.wi, wo
 
 
 def _passes(plugins: dict, material: str, parameters: dict, quick: bool) -> dict:

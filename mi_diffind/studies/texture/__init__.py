@@ -1,8 +1,8 @@
 """Study ``tradeoff texture``: error and time of renders with filtered, compressed textures against bitmaps.
 
-A texture that filters itself is compared with supersampled bitmaps, uncompressed mip maps, and ASTC with mip maps in
-equal bytes: by the error against the time of a render, the error of each level of detail, and the flicker of a moving
-camera. :mod:`.plan` describes the contenders.
+A texture that filters itself is compared with supersampled bitmaps, uncompressed mip maps, and ASTC with mip maps and a
+network in equal bytes: by the error against the time of a render, the error of each level of detail, and the flicker of
+a moving camera. :mod:`.plan` describes the contenders.
 """
 
 from __future__ import annotations
@@ -12,6 +12,10 @@ import argparse
 from ...arguments import positive
 from ...measure.study import Plan, Study
 from ..maps import add_astc_option
+
+#: Methods of the candidates.
+METHODS = ("bitmap", "bitmap, multijittered", "mip maps, uncompressed", "ours", "paper's preset", "ASTC with mip maps",
+           "network")  # fmt: skip
 
 
 class TextureStudy(Study):
@@ -42,6 +46,8 @@ class TextureStudy(Study):
         add_astc_option(parser)
         parser.add_argument("--footprints", action="store_true",
                             help="also train with each distribution of footprints and draw both")  # fmt: skip
+        parser.add_argument("--only", action="append", default=[], choices=METHODS, metavar="METHOD",
+                            help=f"measure only one method ({'; '.join(METHODS)}); may be repeated")  # fmt: skip
         parser.add_argument("--frames", type=positive, metavar="N", help="frames of the zoom (default: 60; --quick: 6)")
         parser.add_argument("--width", type=positive, metavar="N",
                             help="width of the stills; the height is 2/3 (default: 480; --quick: 96)")  # fmt: skip
@@ -75,6 +81,8 @@ class TextureStudy(Study):
             64 if quick else 256,
             1 if quick else 4,
             arguments.footprints,
+            **({"network_steps": 30} if quick else {}),
+            only=tuple(arguments.only),
         )
         return plan(arguments.loaded, arguments.source, settings, arguments.tables)
 

@@ -2,9 +2,10 @@
 
 A map of a material covers a surface in a light without noise (:mod:`.test_scenes`). The truth is ``bitmap`` at many
 multijittered samples. The candidates are ``bitmap`` at 1 to 64 samples per pixel, independent or multijittered;
-``mipmap``, the uncompressed pyramid; ``neural_texture`` at several sizes; and all levels encoded with ASTC in the same
-bytes, read by ``mipmap``. Filtered textures take one sample per pixel, at a random position or *centred*. Trilinear
-filtering reads the texture once, anisotropic filtering at most four times.
+``mipmap``, the uncompressed pyramid; ``neural_texture`` at several sizes; all levels encoded with ASTC in the same
+bytes, read by ``mipmap``; and a network in the bytes of the first size (:mod:`.networks`), filtered trilinearly.
+Filtered textures take one sample per pixel, at a random position or *centred*. Trilinear filtering reads the texture
+once, anisotropic filtering at most four times.
 
 *Errors* are those of displayed values in pixels entirely on the surface; a scene counts those that are minified, or
 magnified. *Levels*: the error of each level of detail at its texel centres, of all maps. *Flicker*:
@@ -13,6 +14,7 @@ magnified. *Levels*: the error of each level of detail at its texel centres, of 
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import itertools
 import time
@@ -26,18 +28,20 @@ import mitsuba as mi
 import numpy as np
 
 from ... import task
-from ...maps.compressed import decibel
+from ...maps.compressed import FilteredMaps, decibel
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source
 from ...measure.store import fingerprint
 from ...measure.study import FLOOR, Candidate, Case, Job, Plan
+from ...measure.training import ConvergenceTraining
 from ...plugins.support.image_files import PYRAMIDS
 from ...scenes import footprint
 from ...tables import Table
 from ..baselines import codecs
+from ..baselines.hash_grids import halved
 from ..equal_memory import Contender, PresetContender, StudyContext, load_arrays
 from ..maps import source_details
-from . import levels, pictures, test_scenes
+from . import METHODS, levels, networks, pictures, test_scenes
 from .conclusions import BASE, conclusions, table
 from .test_scenes import TextureReader, TextureScene
 from .zoom import TextureZoom
@@ -54,7 +58,7 @@ FILTERS = {
 }
 
 #: Names of methods in legends.
-OURS, PAPER, ASTC = "ours", "paper's preset", "ASTC with mip maps"
+BITMAP, MULTIJITTERED, MIPMAP, OURS, PAPER, ASTC, NETWORK = METHODS
 
 #: Filters, each with whether samples are centred; and further ones that only our first texture is read with.
 READS = tuple(itertools.product(("trilinear", "anisotropic"), (False, True)))
@@ -82,6 +86,8 @@ class TextureStudySettings:
     and ``astc_choice`` are presets of the ASTC encoder as in the image study. ``film`` and ``zoom_film`` are sizes of
     images (width, height), ``frames`` is the length of the zoom, ``truth_spp`` a square number, ``seeds`` the number of
     renders that errors are averaged over. ``footprints`` adds trainings with other distributions of footprints.
+    ``network_steps`` is the length of the first training of a network. ``only`` are the methods that are measured
+    (default: all).
     """
 
     map: str
@@ -95,6 +101,8 @@ class TextureStudySettings:
     truth_spp: int = 256
     seeds: int = 4
     footprints: bool = False
+    network_steps: int = networks.STEPS
+    only: tuple[str, ...] = ()
 
 
 def colour_map(source: Source, name: str = "") -> str:
@@ -136,6 +144,8 @@ def plan(
     builder.add_truths()
     builder.add_references()
     builder.add_textures(tables)
+    builder.add_network()
+    builder.select(settings.only)
     note = (
         f"{name}, {source.width} × {source.height}, {len(source.maps)} map(s), of which {settings.map} is rendered. "
         "PSNR of displayed values. Bytes are those of all maps, with mip maps but for bitmaps."
@@ -234,8 +244,8 @@ class TextureStudyContext(StudyContext):
             prepare=footprint.attach,
         )
 
-    def mipmap(self, pyramid: Pyramid, filter_name: str, centred: bool) -> TextureReader:
-        """Return ``mipmap`` of a pyramid."""
+    def mipmap(self, pyramid: FilteredMaps, filter_name: str, centred: bool) -> TextureReader:
+        """Return ``mipmap`` of a pyramid, or of other maps that are read as one."""
         name = f"study {id(pyramid)}"
         PYRAMIDS[name] = pyramid
         return self.filtered({"type": "mipmap", "pyramid": name}, filter_name, centred)
@@ -339,6 +349,47 @@ class EncodedTexture(TextureContender):
         return context.mipmap(levels.pyramid_of(self.model, context.pyramid), filter_name, centred)
 
 
+@dataclass
+class NetworkTexture(TextureContender):
+    """Hash grid and network in half precision, trained to convergence (:mod:`.networks`)."""
+
+    def cached_record(self, folder: Path | None, record: dict | None) -> dict | None:
+        return self._completed(self.training.cached_record(folder, None), record)
+
+    def run(self, folder: Path | None, progress: bool) -> dict | None:
+        return self._completed(self.training.run(folder, progress), None)
+
+    @cached_property
+    def training(self) -> ConvergenceTraining:
+        context, steps = self.context, self.context.settings.network_steps
+        pyramid, source = context.pyramid, context.source
+
+        def problem() -> networks.TextureNetworkProblem:
+            net = networks.network(source, pyramid.layout, source.nbytes / self.budget)
+            return networks.TextureNetworkProblem(net, pyramid, source.digest)
+
+        return ConvergenceTraining(self.name, problem, networks.settings(steps), networks.LONGEST * steps, 5)
+
+    def _completed(self, trained: dict | None, record: dict | None) -> dict | None:
+        """Round the parameters, and return the record with the errors of levels unless ``record`` has them."""
+        if trained is None:
+            return None
+        halved(self.training.net)
+        pyramid = self.context.pyramid
+        self.model = networks.NetworkMaps(self.training.net, pyramid.layout, pyramid.types, pyramid.border, True)
+        if record is None:
+            record = self.level_record(
+                2 * trained["entries"], sum(run["seconds"] for run in trained["runs"]),
+                levels.decoded(self.model, pyramid.layout.names, pyramid.levels),
+                steps=trained["steps"], steps_first=self.training.settings.steps, steps_longest=self.training.longest,
+                batch=self.training.settings.batch,
+            )  # fmt: skip
+        return {**trained, **record}
+
+    def reader(self, filter_name: str, centred: bool) -> TextureReader:
+        return self.context.mipmap(self.model, filter_name, centred)
+
+
 class TextureCandidates:
     """Builder of the plan: jobs, candidates, and a function for each candidate that returns its reader."""
 
@@ -380,12 +431,12 @@ class TextureCandidates:
     def add_references(self) -> None:
         """Register bitmaps and the uncompressed pyramid."""
         context, nbytes = self.context, self.context.source.nbytes
-        for sampler, method in (("independent", "bitmap"), ("multijitter", "bitmap, multijittered")):
+        for sampler, method in (("independent", BITMAP), ("multijitter", MULTIJITTERED)):
             for spp in COUNTS if sampler == "independent" else COUNTS[1:]:
-                name = f"bitmap, {spp} spp{method.removeprefix('bitmap')}"
+                name = f"bitmap, {spp} spp{method.removeprefix(BITMAP)}"
                 self.add(name, method, functools.partial(context.bitmap, spp, sampler), bytes=nbytes,
                          setting=f"{spp} spp", queries=None if spp == 1 else ())  # fmt: skip
-        self.add_filtered("mipmap", "mip maps, uncompressed", functools.partial(context.mipmap, context.pyramid),
+        self.add_filtered("mipmap", MIPMAP, functools.partial(context.mipmap, context.pyramid),
                           self.reads, bytes=context.pyramid.nbytes)  # fmt: skip
 
     def add_textures(self, tables: Sequence[Table]) -> None:
@@ -423,6 +474,26 @@ class TextureCandidates:
                 TrainedTexture("footprints", compression, context, f"{preset} {compression:g}x, {samples} footprints",
                                preset="paper" if preset == "paper" else "", footprint_samples=samples)
             )  # fmt: skip
+
+    def add_network(self) -> None:
+        """Register a network in the bytes of our texture at the first ratio, unless they are too few for one."""
+        context = self.context
+        for compression in context.settings.compressions[:1]:
+            with contextlib.suppress(ValueError):
+                networks.network(context.source, context.pyramid.layout, context.source.nbytes / compression)
+                job = NetworkTexture(NETWORK, compression, context, f"network {compression:g}x")
+                self.jobs.append(job)
+                fields = {"job": job.name, "training_seconds": None}
+                self.add_filtered(job.name, job.method, job.reader, self.reads[:1], **fields)
+
+    def select(self, only: Sequence[str]) -> None:
+        """Keep the candidates of the methods ``only``, unless there are none, and the jobs that these need."""
+        if not only:
+            return
+        self.candidates = [c for c in self.candidates if c.representation in only]
+        needed = {c.job for c in self.candidates}
+        needed |= {j.equal_to.name for j in self.jobs if isinstance(j, EncodedTexture) and j.name in needed}
+        self.jobs = [job for job in self.jobs if isinstance(job, TextureTruth) or job.name in needed]
 
 
 def _case(context: TextureStudyContext, scene: TextureScene, candidates: list[Candidate], readers: dict) -> Case:

@@ -55,13 +55,17 @@ class TextureProblem(Problem):
         self.weights = {name: len(channels) / layout.stored for name, channels in self.groups.items()}
         self.sizes = [level.shape[:2] for level in pyramid.values]
         self.starts = np.cumsum([0] + [rows * columns for rows, columns in self.sizes])
-        structure = dataclasses.asdict(net.structure)
         self.identity = {
             "source": digest, **{k: v for k, v in dataclasses.asdict(recipe).items() if k != "settings"},
-            "structure": structure, "border": list(net.border),
+            **self.form(net),
         }  # fmt: skip
         self.jittered = False
         self._stretches = {}  # size of a batch → level, first texel, number of texels, … of each sample
+
+    @staticmethod
+    def form(net) -> dict:
+        """Return what identifies the arrays to train, as JSON."""
+        return {"structure": dataclasses.asdict(net.structure), "border": list(net.border)}
 
     def begin(self, step: int, share: float) -> str:
         """Start a step: decide whether its samples are jittered. Returns a text that names the decision."""
