@@ -9,7 +9,7 @@ import pytest
 
 from mi_diffind.cli import main
 from mi_diffind.measure import report
-from mi_diffind.studies.disney import conclusions
+from mi_diffind.studies.disney import REPRESENTATIONS, conclusions
 
 ERRORS = ["mae_training", "mae_uniform", "psnr_db_training", "psnr_db_uniform"]
 
@@ -35,6 +35,7 @@ def test_quick_run_writes_what_it_promises(finished):
     assert sorted(list(table[0])[len(report.COLUMNS) :]) == ERRORS
     names = {row["candidate"] for row in table}
     stored = {f"{q}{s}" for q in ("tables", "paper") for s in ("", ", uint8")}
+    assert {c["representation"] for c in found["candidates"].values()} == set(REPRESENTATIONS)  # the words of --only
     single = {f"only {factor} read" for factor in ("alpha", "masking", "coat")}
     assert names == {"principled", "disney", "formulas", "network, bytes of tables", *stored, *single}
     assert {row["query"] for row in table} == {"eval", "sample", "pdf", "render", "render, with tracing"}

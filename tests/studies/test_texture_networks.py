@@ -1,11 +1,13 @@
 """Filtered maps as a hash grid and a network."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from mi_diffind.cli import main
 from mi_diffind.runtime import array_module
-from mi_diffind.studies.texture import networks
+from mi_diffind.studies.texture import METHODS, networks
 
 
 def ramps(side=64):
@@ -122,6 +124,8 @@ def test_the_study_compares_with_a_network(mi_rgb):
     for key in job.training.net:
         value = job.training.net[key].numpy()
         np.testing.assert_array_equal(value, value.astype(np.float16).astype(np.float32))
+    everything = plans.plan(ramps(), "ramps", dataclasses.replace(settings, only=()))
+    assert {c.representation for c in everything.candidates} <= set(METHODS)
     assert not plans.plan(ramps(16), "ramps", settings).candidates
 
 

@@ -10,11 +10,8 @@ import argparse
 
 from ...measure.study import Plan, Study
 
-#: Representation of networks.
-NETWORK = "network"
-
 #: Representations of the candidates.
-REPRESENTATIONS = ("Mitsuba", "formulas", "arithmetic", "tables", "paper", "one table", NETWORK)
+REPRESENTATIONS = ("Mitsuba", "formulas", "arithmetic", "tables", "paper", "one table", "network")
 
 
 class DisneyStudy(Study):

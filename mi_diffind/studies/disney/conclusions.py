@@ -6,13 +6,15 @@ import math
 
 from ...measure.formatting import grid
 from ...measure.operations import Operations
-from . import NETWORK
 
 #: The paper's count of operations of one evaluation (supplement, 1.2.1).
 PAPER = {
     "exact, the paper's": Operations(add=92, mul=150, div=17, sqrt=5, log=1),
     "tables, the paper's": Operations(add=11, mul=26, div=2, gathers=5),
 }
+
+#: Representation of networks.
+NETWORK = "network"
 
 #: Required ratios of the times of ``eval`` with a constant material, floor subtracted: lobes, pair, least ratio.
 #: ``disney`` is much faster than ``principled``; the default of ``neural_disney`` is at most 5% (noise) slower.

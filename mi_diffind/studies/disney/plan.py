@@ -25,8 +25,7 @@ from ...tasks.disney.decoder import Decoder
 from ...tasks.disney.factored import FactoredDecoder
 from ...tasks.disney.model import PARAMETERS, Material
 from ...tasks.disney.training import measure, shade
-from . import NETWORK
-from .conclusions import PAPER, conclusions
+from .conclusions import NETWORK, PAPER, conclusions
 from .networks import DisneyNetworkTraining
 
 #: Parameters of a material that uses every part of the model, and of one with the two lobes that most materials have.

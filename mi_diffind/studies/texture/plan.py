@@ -41,7 +41,7 @@ from ..baselines import codecs
 from ..baselines.hash_grids import halved
 from ..equal_memory import Contender, PresetContender, StudyContext, load_arrays
 from ..maps import source_details
-from . import METHODS, levels, networks, pictures, test_scenes
+from . import levels, networks, pictures, test_scenes
 from .conclusions import BASE, conclusions, table
 from .test_scenes import TextureReader, TextureScene
 from .zoom import TextureZoom
@@ -58,7 +58,8 @@ FILTERS = {
 }
 
 #: Names of methods in legends.
-BITMAP, MULTIJITTERED, MIPMAP, OURS, PAPER, ASTC, NETWORK = METHODS
+BITMAP, MULTIJITTERED, MIPMAP = "bitmap", "bitmap, multijittered", "mip maps, uncompressed"
+OURS, PAPER, ASTC, NETWORK = "ours", "paper's preset", "ASTC with mip maps", "network"
 
 #: Filters, each with whether samples are centred; and further ones that only our first texture is read with.
 READS = tuple(itertools.product(("trilinear", "anisotropic"), (False, True)))
