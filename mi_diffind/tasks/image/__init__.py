@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from ...arguments import Argument, checked, positive
+from ...arguments import Argument, between, checked, positive
 from ...maps.arguments import DECODED, SIZES, SOURCE, SOURCES
 from ...task import Task
 from .presets import IMPROVEMENTS, PRESETS, STRUCTURES, parse_weights, without
@@ -51,6 +51,10 @@ class Image(Task):
         Argument("--dims", type=positive, choices=range(1, 5), help="dimensions of the cascaded array"),
         Argument(
             "--cascaded", type=positive, metavar="N", help="entries along each side of the cascaded array"
+        ),
+        Argument(
+            "--ratio", type=between(1, 1024), metavar="N",
+            help="for paper: side of the primary over side of the cascaded array (default: by size and compression)",
         ),
         Argument(
             "--weights", type=checked(parse_weights), metavar="equal|auto|MAP=W,…", default="equal",

@@ -45,7 +45,12 @@ def check(request: FitRequest) -> None:
         raise UsageError("--without: the preset paper has none of our improvements: leave it out")
     if options["source"] is None:
         raise UsageError("source: not given, an image or a manifest of the maps of a material is needed")
-    recipe_of(request.preset, request.settings, options)
+    recipe = recipe_of(request.preset, request.settings, options)
+    if options["ratio"] is not None:
+        if recipe.components or STRUCTURES[recipe.structure][1]:
+            raise UsageError("--ratio: for the preset paper with one primary array; ours takes --cascaded")
+        if options["ratio_search"] or options["psnr"] or options["cascaded"]:
+            raise UsageError("--ratio: chooses the sides of arrays: leave out --ratio-search, --psnr and --cascaded")
 
 
 def fit(request: FitRequest) -> Fitted:
@@ -114,7 +119,7 @@ def _train(request: FitRequest, source: Source, recipe: ImageRecipe) -> tuple[Fi
                 f"dimensions, allowed are {MAX_BYTES:,}"
             )
     else:
-        size = search.default_size(source, requested, recipe)
+        size = search.default_size(source, requested, recipe, options["ratio"])
     if size.paged and size.primaries[0][0] * size.primaries[0][1] > most_entries(2):
         raise UsageError(
             f'--structure "{recipe.structure}": {round(requested):,} bytes are too many, pages hold at most '

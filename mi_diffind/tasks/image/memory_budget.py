@@ -152,14 +152,17 @@ def search(
     width: int,
     dims: int = 4,
     bits: int = 8,
+    ratio: float | None = None,
 ) -> ImageBudget:
-    """Return :func:`paper_search` with the ratio of :func:`resolution_ratio`, corrected if it is more than 5% off.
+    """Return :func:`paper_search` with ``ratio``, corrected if it is more than 5% off.
+
+    The default of ``ratio`` is :func:`resolution_ratio`.
 
     Sides in steps can miss ``compression`` by far (4K RGB at 12x becomes 13.4x at ρ = 80). Then the cascaded array is
     kept, or reduced until it takes at most half of the bytes, and the primary becomes the largest that fits
     (:func:`fit_bytes`): 1×1 for images so small that the smallest cascaded array (``N_c`` = 4) is too large.
     """
-    ratio = resolution_ratio(compression, math.sqrt(height * width))
+    ratio = ratio or resolution_ratio(compression, math.sqrt(height * width))
     size = paper_search(uncompressed_bytes, compression, channels, height, width, ratio, dims, bits)
     budget = uncompressed_bytes / compression
     if abs(size.nbytes / budget - 1) <= TOLERANCE:

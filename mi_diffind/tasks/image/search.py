@@ -50,11 +50,11 @@ class RatioSearch:
     interrupted: bool = False
 
 
-def default_size(source: Source, nbytes: float, recipe: ImageRecipe) -> ImageBudget:
+def default_size(source: Source, nbytes: float, recipe: ImageRecipe, ratio: float | None = None) -> ImageBudget:
     """Return the default budget of a recipe for ``nbytes`` bytes.
 
-    The supplement's search, or, with ``components`` or two primaries, a cascaded array of
-    :func:`.memory_budget.cascaded_side` and the largest primary that fits beside it.
+    The supplement's search, with ``ratio`` in place of its table if given; or, with ``components`` or two primaries, a
+    cascaded array of :func:`.memory_budget.cascaded_side` and the largest primary that fits beside it.
     """
     stored, structure = max(1, layout_of(source, recipe).stored), structure_of(source, recipe, nbytes)
     bits, coarse = STRUCTURES[structure]
@@ -62,7 +62,8 @@ def default_size(source: Source, nbytes: float, recipe: ImageRecipe) -> ImageBud
         dims = dims_of(recipe, structure, stored)
         return sized(source, nbytes, recipe, memory_budget.cascaded_side(nbytes, stored, dims))
     compression = source.nbytes / nbytes
-    return memory_budget.search(source.nbytes, compression, stored, source.height, source.width, recipe.dims, bits)
+    height, width = source.height, source.width
+    return memory_budget.search(source.nbytes, compression, stored, height, width, recipe.dims, bits, ratio)
 
 
 def sized(source: Source, nbytes: float, recipe: ImageRecipe, cascaded: int) -> ImageBudget:

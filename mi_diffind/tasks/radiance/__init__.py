@@ -16,7 +16,7 @@ import dataclasses
 import importlib
 
 from ... import units
-from ...arguments import Argument, checked, decibels, positive
+from ...arguments import Argument, between, checked, decibels, positive
 from ...splat_files import is_splats
 from ...task import Task
 from .presets import BACKGROUNDS, COLOURS, PRESETS
@@ -64,6 +64,14 @@ class RadianceField(Task):
         Argument(
             "--psnr", group="size", type=checked(decibels), metavar="N",
             help="PSNR over white, in dB: the smallest of eight sizes that reaches it (three trainings)",
+        ),
+        *(
+            Argument(
+                f"--{quantity}-ratio", type=between(1, 16), metavar="N",
+                help=f"for paper: side of the primary over side of the cascaded array of the {quantity} (default: by "
+                "the compression)",
+            )
+            for quantity in ("density", "colour")
         ),
         Argument(
             "--resolution", type=resolution, metavar="N",

@@ -87,6 +87,9 @@ def check(request: FitRequest) -> None:
     sized = [name for name in ("bytes", "compression", "psnr", "disk") if options.get(name) is not None]
     if request.preset == "grid" and sized:
         raise UsageError(f"--{sized[0]} is an option of the presets sparse and paper, found the preset grid")
+    for name in ("density_ratio", "colour_ratio"):
+        if request.preset != "paper" and options.get(name) is not None:
+            raise UsageError(f"--{name.replace('_', '-')}: found the preset {request.preset}, allowed is paper")
     if request.preset == "paper":
         for name in ("psnr", "disk", "exposures"):
             if options.get(name):
@@ -517,7 +520,8 @@ class FieldFit:
         extent = np.array(grid.nodes.upper) - np.array(grid.nodes.lower)
         shapes = {}
         for name, channels, share in (("density", 1, DENSITY_SHARE), ("colour", 12, 1 - DENSITY_SHARE)):
-            shapes[name] = paper.sides(share * nbytes, ratio_for(name, ratio), channels, extent)
+            given = request.options.get(f"{name}_ratio") or ratio_for(name, ratio)
+            shapes[name] = paper.sides(share * nbytes, given, channels, extent)
         density, colour, low, high = paper.initial(paper.dense(grid), shapes, types)
         net = paper.PairsNet(density, colour)
         field = paper.PairsField(grid.nodes, density, colour, low, high)

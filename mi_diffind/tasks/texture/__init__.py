@@ -56,6 +56,10 @@ class Texture(Task):
             "--cascaded", type=positive, metavar="N", help="entries along each side of the cascaded array"
         ),
         Argument(
+            "--ratio", type=between(1, 1024), metavar="N",
+            help="for paper: side of the primary over side of the cascaded array (default: by the compression)",
+        ),
+        Argument(
             "--footprint-samples", choices=["levels", "power", "exponential"],
             help="distribution of levels of detail in training (default: levels for ours, power for paper)",
         ),

@@ -36,6 +36,8 @@ def check(request: FitRequest) -> None:
                 raise UsageError(f"--{name}: not for the preset paper, whose arrays follow from the paper's tables")
         if options["footprint_samples"] == "levels":
             raise UsageError("--footprint-samples: found levels, allowed for the preset paper are power, exponential")
+    elif options["ratio"] is not None:
+        raise UsageError(f"--ratio: found the preset {request.preset}, allowed is paper")
     if options["structure"] == "pages" and options["skip"] is not None:
         first = memory_budget.PAGES_SKIP
         raise UsageError(f"--skip: not for the structure pages, whose coarse array starts at level {first}")
@@ -81,7 +83,8 @@ def size_of(source: Source, pyramid: Pyramid, nbytes: float, recipe: TextureReci
 def _size_of(source: Source, pyramid: Pyramid, nbytes: float, recipe: TextureRecipe, options):
     layout = pyramid.layout
     if not recipe.layered:
-        return memory_budget.paper_size(nbytes, source.nbytes, layout.stored, layout.height, layout.width)
+        height, width, ratio = layout.height, layout.width, options["ratio"]
+        return memory_budget.paper_size(nbytes, source.nbytes, layout.stored, height, width, ratio)
     fine, skip, structure = None, options["skip"], options["structure"] or "auto"
     if structure in ("auto", "pages") and skip is None:
         size = memory_budget.paged(layout.height, layout.width, layout.stored, nbytes, options["cascaded"])

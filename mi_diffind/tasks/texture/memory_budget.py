@@ -70,15 +70,17 @@ class PaperBudget:
         return paper_bytes(self.rows * self.columns, self.lods, self.cascaded, self.channels)
 
 
-def paper_size(nbytes: float, source_bytes: int, channels: int, height: int, width: int) -> PaperBudget:
+def paper_size(
+    nbytes: float, source_bytes: int, channels: int, height: int, width: int, rho: float | None = None
+) -> PaperBudget:
     """Return the result of the paper's linear search over the sides ``N_c`` = 4, 8, ….
 
     The search minimises the difference of compression ratios, with ``N_p0 = ρ N_c`` in multiples of 8 and no larger
-    than the image. If the best is more than 5% off, primary 0 is resized to fit beside the same ``N_c``, or beside a
-    smaller one if the cascaded array alone takes more than half of the bytes.
+    than the image; ``rho`` is by default :func:`ratio`. If the best is more than 5% off, primary 0 is resized to fit
+    beside the same ``N_c``, or beside a smaller one if the cascaded array alone takes more than half of the bytes.
     """
     lods, wanted = lods_of(height, width), source_bytes / nbytes
-    rho = ratio(max(wanted, 1e-6), channels)
+    rho = rho or ratio(max(wanted, 1e-6), channels)
     best, distance, cascaded = None, math.inf, 0
     while True:
         cascaded += CASCADED_STEP
