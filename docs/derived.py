@@ -121,3 +121,30 @@ def trust_cells(study: Any) -> tuple[int, int]:
     """Return the numbers of cells of the table of properties that were measured, and of all."""
     results = [c["result"] for by in study.content["cells"].values() for row in by.values() for c in row.values()]
     return len(results) - results.count("not run"), len(results)
+
+
+#: Task of ``bench_ratio`` → figure of its tables; the angles of ``sdf`` are errors.
+RATIO_FIGURES = {
+    "image": "psnr_db", "texture": "psnr_levels_db", "sdf": "normal_deg", "field": "psnr_foreground_db",
+}  # fmt: skip
+
+
+def ratio_rows(study: Any, task: str, budget: float, preset: str = "paper", part: str = "") -> list[dict]:
+    """Return the trainings of a sweep of ρ by the first seed, in the order of ρ from the largest on."""
+    wanted = {"task": task, "budget": budget, "preset": preset, "part": part, "seed": 0}
+    rows = [row for row in study.content["rows"] if all(row[key] == value for key, value in wanted.items())]
+    return sorted(rows, key=lambda row: -row["ratio"])
+
+
+def ratio_best(study: Any, task: str, budget: float, preset: str = "paper", part: str = "") -> dict:
+    """Return the training of the best ρ of a sweep."""
+    sign = 1 if task == "sdf" else -1
+    return min(ratio_rows(study, task, budget, preset, part), key=lambda row: sign * row[RATIO_FIGURES[task]])
+
+
+def ratio_loss(study: Any, task: str, budget: float, preset: str = "paper", part: str = "") -> float:
+    """Return how far the default ρ lies behind the best: in dB, of an angle relative to the best."""
+    rows, figure = ratio_rows(study, task, budget, preset, part), RATIO_FIGURES[task]
+    (default,) = [row for row in rows if row["default"]]
+    best = ratio_best(study, task, budget, preset, part)[figure]
+    return default[figure] / best - 1 if task == "sdf" else best - default[figure]
