@@ -12,11 +12,12 @@ There are 16 samples a pixel; of solids, fields and filtered textures 4, beside 
 Times are those of the processor, on one core, and include the tracing of the kernel by Python, which takes
 milliseconds. Contenders of a task run in turn; ratios are medians over the rounds of the ratio to the first contender
 in the same round. Each contender has a process of its own, because Dr.Jit compiles the materials of all scenes that a
-process holds into each kernel. Bytes are those of all maps of a file, in memory in the storage form that a plugin reads by default, and on
-disk. Distance fields have 1 MiB and are trained by the whole recipe, because the steps of rays depend on their entries.
-The grid of ``sdfgrid`` has the exact distances of the mesh; its error is the mean angle of its normals where rays meet
-it. The paper's recipe for images and textures is trained for two minutes, which its bytes on disk depend on. Materials
-of 4096² texels (``large``) and fields of a small capture are trained briefly: their times depend on the arrays alone.
+process holds into each kernel. Bytes are those of all maps of a file, in memory in the storage form that a plugin reads
+by default, and on disk. Distance fields have 1 MiB and are trained by the whole recipe, because the steps of rays
+depend on their entries. The grid of ``sdfgrid`` has the exact distances of the mesh; its error is the mean angle of its
+normals where rays meet it. The paper's recipe for images and textures is trained for two minutes, which its bytes on
+disk depend on. Materials of 4096² texels (``large``) and fields of a small capture are trained briefly: their times
+depend on the arrays alone.
 """
 
 from __future__ import annotations
