@@ -148,3 +148,12 @@ def ratio_loss(study: Any, task: str, budget: float, preset: str = "paper", part
     (default,) = [row for row in rows if row["default"]]
     best = ratio_best(study, task, budget, preset, part)[figure]
     return default[figure] / best - 1 if task == "sdf" else best - default[figure]
+
+
+def ratio_range(study: Any, task: str) -> float:
+    """Return the largest difference, in dB, of a sweep of ρ."""
+    figure, sweeps = RATIO_FIGURES[task], {}
+    for row in study.content["rows"]:
+        if row["task"] == task:
+            sweeps.setdefault((row["preset"], row["budget"], row["part"]), []).append(row[figure])
+    return max(max(sweep) - min(sweep) for sweep in sweeps.values())

@@ -91,7 +91,7 @@ def test_many_damaged_inputs(child, name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [f"{t.name}/{trial}" for t in tasks().values() for trial in t.trials])
-def test_trials_have_the_arrays_of_the_kept_files(tmp_path, name):
+def test_trials_have_the_arrays_of_the_kept_files(mi_rgb, tmp_path, name):
     """The files in ``corpus/seeds`` are what the declared trials still give."""
     task, trial = name.split("/")
     trained = trial_files.make(tasks()[task], trial, tmp_path, tmp_path / "trial.npz")

@@ -18,12 +18,15 @@ QUICK = tuple(variant for variant in VARIANTS if variant.endswith("_ad_rgb"))
 #: Samples in a pixel.
 SPP = 4
 
-#: Parameters that are not seen in the scenes: levels finer than any footprint, and tints without colours.
-UNSEEN = ("level0", "level1", "level2"), ("spec_tint.value", "sheen_tint.value")
+#: Parameters that are not seen in the scenes: levels finer than any footprint, tints without colours, and levels
+#: coarser than the footprint where no integrator finds it after a bounce.
+UNSEEN = ("level0", "level1", "level2"), ("spec_tint.value", "sheen_tint.value"), ("tables.coarse",)
 
 #: Plugin → largest relative change of an image after a parameter was set back. The levels of ``mipmap`` are computed
-#: by NumPy when a file is read, and on the device in single precision after its texels were assigned.
-RECOMPUTED = {"mipmap": 2e-6}
+#: by NumPy when a file is read, and on the device in single precision after its texels were assigned. In polarised
+#: variants, ``neural_sdf`` is a grid of Mitsuba in an instance, whose inverse transformation is computed anew: a path
+#: of one pixel in a hundred may take another turn.
+RECOMPUTED = {"mipmap": 2e-6, "neural_sdf": 5e-6}
 
 
 #: Variant × plugin × storage form ("": the default form).
@@ -49,10 +52,25 @@ def render(mi, scene, seed=3, **more) -> np.ndarray:
     return np.array(mi.render(scene, spp=SPP, seed=mi.UInt32(seed), **more))
 
 
-def check_back(name: str, image: np.ndarray, fresh: np.ndarray, key: str) -> None:
+def can_freeze(mi) -> bool:
+    """Return whether a scene of Mitsuba's own plugins can be recorded; in spectral variants of 3.9, none can."""
+    scene = mi.load_dict({"type": "scene", "sensor": examples.sensor(mi), "ball": {"type": "sphere"},
+                          "sky": {"type": "constant"}, "integrator": {"type": "path"}})  # fmt: skip
+    try:
+        dr.eval(dr.freeze(lambda scene, seed: mi.render(scene, spp=1, seed=seed))(scene, dr.opaque(mi.UInt32, 1)))
+    except RuntimeError as e:
+        assert "recording" in str(e)
+        return False
+    return True
+
+
+def check_back(mi, name: str, image: np.ndarray, fresh: np.ndarray, key: str) -> None:
     """Compare the image after a parameter was set back with that of a fresh scene."""
-    if name in RECOMPUTED:
+    if name == "mipmap":
         np.testing.assert_allclose(image, fresh, rtol=RECOMPUTED[name], err_msg=key)
+    elif name == "neural_sdf" and mi.is_polarized:
+        wrong = ~np.isclose(image, fresh, rtol=RECOMPUTED[name], atol=0)
+        assert wrong.any(axis=-1).mean() <= 0.01, key
     else:
         np.testing.assert_array_equal(image, fresh, err_msg=key)
 
@@ -74,7 +92,7 @@ def test_all_parameters_set_back(variant, name, storage):
     for key in keys:
         params[key] = before[key]
     params.update()
-    check_back(name, render(mi, scene), fresh, "all")
+    check_back(mi, name, render(mi, scene), fresh, "all")
 
 
 @pytest.mark.slow
@@ -85,7 +103,7 @@ def test_each_parameter_set_back(variant, name, storage):
     fresh = render(mi, examples.load(mi, name, storage))
     scene = examples.load(mi, name, storage)
     params, keys = examples.exposed(mi, scene, name)
-    unseen = UNSEEN[0] + UNSEEN[1] * ("mono" in variant or name == "neural_material")
+    unseen = UNSEEN[0] + UNSEEN[1] * ("mono" in variant or name == "neural_material") + UNSEEN[2] * mi.is_polarized
     for key in keys:
         before = examples.copied(params[key])
         params[key] = examples.another(params[key])
@@ -95,13 +113,16 @@ def test_each_parameter_set_back(variant, name, storage):
         assert key.endswith(unseen) or not np.array_equal(changed, fresh), f"{key} has no effect"
         params[key] = before
         params.update()
-        check_back(name, render(mi, scene), fresh, key)
+        check_back(mi, name, render(mi, scene), fresh, key)
 
 
 @pytest.mark.parametrize("variant, name, storage", CASES)
 def test_frozen_renders(variant, name, storage, no_garbage_collection):
     """A recorded render equals one that is not recorded, for other seeds and after a change of all parameters."""
     mi = loaded(variant, name, storage)
+    if not can_freeze(mi):
+        assert mi.is_spectral
+        pytest.skip("Mitsuba's own scenes cannot be recorded in this variant")
     scene = examples.load(mi, name, storage)
     params, keys = examples.exposed(mi, scene, name)
     dr.eval(mi.render(scene, spp=SPP))
@@ -113,7 +134,11 @@ def test_frozen_renders(variant, name, storage, no_garbage_collection):
             params.update()
         for seed in (1, 2):
             image = np.array(frozen(scene, dr.opaque(mi.UInt32, seed)))
-            np.testing.assert_array_equal(image, render(mi, scene, seed), err_msg=f"changes: {changes}, seed {seed}")
+            again = render(mi, scene, seed)
+            if changes and name == "neural_sdf" and mi.is_polarized:
+                np.testing.assert_allclose(image, again, rtol=RECOMPUTED[name])
+            else:
+                np.testing.assert_array_equal(image, again, err_msg=f"changes: {changes}, seed {seed}")
 
 
 @pytest.mark.parametrize("variant, name, storage", CASES)
