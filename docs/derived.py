@@ -115,3 +115,43 @@ def shipped(task: str, preset: str) -> float:
 def asset_bytes(name: str) -> int:
     """Return the bytes of a file in ``scenes/assets``."""
     return (Path(__file__).resolve().parents[1] / "scenes" / "assets" / name).stat().st_size
+
+
+#: Task of ``bench_ratio`` → figure of its tables; the angles of ``sdf`` are errors.
+RATIO_FIGURES = {
+    "image": "psnr_db", "texture": "psnr_levels_db", "sdf": "normal_deg", "field": "psnr_foreground_db",
+}  # fmt: skip
+
+
+def ratio_rows(study: Any, task: str, budget: float, preset: str = "paper", part: str = "") -> list[dict]:
+    """Return the trainings of a sweep of ρ, from the largest on; figures are means over seeds."""
+    wanted = {"task": task, "budget": budget, "preset": preset, "part": part}
+    rows = [row for row in study.content["rows"] if all(row[key] == value for key, value in wanted.items())]
+    figure, by_ratio = RATIO_FIGURES[task], {}
+    for row in rows:
+        by_ratio.setdefault(row["ratio"], []).append(row)
+    means = [{**same[0], figure: _mean(row[figure] for row in same)} for same in by_ratio.values()]
+    return sorted(means, key=lambda row: -row["ratio"])
+
+
+def ratio_noise(study: Any, task: str) -> float:
+    """Return the largest difference between trainings of the same arrays by different seeds."""
+    figure, values = RATIO_FIGURES[task], {}
+    for row in study.content["rows"]:
+        if row["task"] == task:
+            values.setdefault((row["preset"], row["budget"], row["ratio"]), []).append(row[figure])
+    return max(max(same) - min(same) for same in values.values())
+
+
+def ratio_best(study: Any, task: str, budget: float, preset: str = "paper", part: str = "") -> dict:
+    """Return the training of the best ρ of a sweep."""
+    sign = 1 if task == "sdf" else -1
+    return min(ratio_rows(study, task, budget, preset, part), key=lambda row: sign * row[RATIO_FIGURES[task]])
+
+
+def ratio_loss(study: Any, task: str, budget: float, preset: str = "paper", part: str = "") -> float:
+    """Return how far the default ρ lies behind the best: in dB, of an angle relative to the best."""
+    rows, figure = ratio_rows(study, task, budget, preset, part), RATIO_FIGURES[task]
+    (default,) = [row for row in rows if row["default"]]
+    best = ratio_best(study, task, budget, preset, part)[figure]
+    return default[figure] / best - 1 if task == "sdf" else best - default[figure]

@@ -19,11 +19,15 @@ from pathlib import Path
 
 from claims import ClaimError, claims, commands, files
 from claims import measured as node
-from derived import equal_samples
+from derived import RATIO_FIGURES, equal_samples, ratio_best, ratio_loss, ratio_rows
 from list_numbers import headlines
 
 import mi_diffind
 from mi_diffind.task import tasks
+from mi_diffind.tasks.image import memory_budget as image_budget
+from mi_diffind.tasks.radiance import presets as field_presets
+from mi_diffind.tasks.sdf import paper as sdf_paper
+from mi_diffind.tasks.texture import memory_budget as texture_budget
 
 DOCS = Path(__file__).resolve().parent
 
@@ -719,6 +723,36 @@ def field_nerf() -> str:
     return table(["scene", "method", "dB, white", "SSIM", "MB on disk", "minutes", "peak memory, GB", "machine"], rows)
 
 
+def ratios(task: str) -> str:
+    """Return errors of a sweep of ρ at equal bytes, the best in bold, beside the paper's best ρ."""
+    study, figure, rows = node("bench_ratio"), RATIO_FIGURES[task], []
+    tables = {"image": image_budget.RATIOS, "texture": texture_budget.RATIOS, "sdf": sdf_paper.RATIOS}
+    digits, unit = (2, " °") if task == "sdf" else (1, " dB")
+    of_task = [row for row in study.content["rows"] if row["task"] == task]
+    for preset, budget, part in dict.fromkeys(
+        (row["preset"], row["budget"], row["part"]) for row in of_task if row["default"]
+    ):
+        sweep, best = ratio_rows(study, task, budget, preset, part), ratio_best(study, task, budget, preset, part)
+        cells = [f"{row['ratio']:.3g}: {row[figure]:.{digits}f}" for row in sweep]
+        cells = [f"**{cell}**" if row == best else cell for row, cell in zip(sweep, cells, strict=True)]
+        default = next(row for row in sweep if row["default"])
+        loss = ratio_loss(study, task, budget, preset, part)
+        if preset != "paper":
+            published = "–"
+        elif task == "sdf":
+            published = f"{min(tables[task].items())[1]:g} (6 MB)"
+        else:
+            published = f"{(field_presets.RATIOS[part] if part else tables[task])[budget]:g}"
+        size = f"{budget / 1000:,.0f} kB" if task == "sdf" else f"{budget:g}x"
+        rows.append([
+            f"`{preset}`, {size}" + (f", {part}" if part else ""), ", ".join(cells), f"{default['ratio']:.3g}",
+            f"{100 * loss:.1f}%" if task == "sdf" else f"{loss:.1f} dB", published,
+        ])  # fmt: skip
+    names = {"image": "PSNR at texels", "texture": "mean PSNR of levels", "sdf": "angle", "field": "PSNR of foreground"}
+    head = ["preset, budget", f"ρ: {names[task]},{unit}", "default ρ"]
+    return table([*head, "behind the best by", "paper's best ρ"], rows)
+
+
 def trust() -> str:
     """Return one row a plugin: the worst figure of each property over the variants that were measured."""
     rows = []
@@ -811,6 +845,7 @@ TABLES |= {
 for source, study in (("", "tradeoff_texture"), ("_boombox", "texture_levels_boombox")):
     TABLES["texture_levels" + source] = lambda study=study: texture_levels(measured(study))
 TABLES["viewer"] = viewer
+TABLES |= {f"ratios_{task}": lambda task=task: ratios(task) for task in RATIO_FIGURES}
 
 
 def film_errors() -> str:
