@@ -130,10 +130,23 @@ RATIO_FIGURES = {
 
 
 def ratio_rows(study: Any, task: str, budget: float, preset: str = "paper", part: str = "") -> list[dict]:
-    """Return the trainings of a sweep of ρ by the first seed, in the order of ρ from the largest on."""
-    wanted = {"task": task, "budget": budget, "preset": preset, "part": part, "seed": 0}
+    """Return the trainings of a sweep of ρ, from the largest on; figures are means over seeds."""
+    wanted = {"task": task, "budget": budget, "preset": preset, "part": part}
     rows = [row for row in study.content["rows"] if all(row[key] == value for key, value in wanted.items())]
-    return sorted(rows, key=lambda row: -row["ratio"])
+    figure, by_ratio = RATIO_FIGURES[task], {}
+    for row in rows:
+        by_ratio.setdefault(row["ratio"], []).append(row)
+    means = [{**same[0], figure: _mean(row[figure] for row in same)} for same in by_ratio.values()]
+    return sorted(means, key=lambda row: -row["ratio"])
+
+
+def ratio_noise(study: Any, task: str) -> float:
+    """Return the largest difference between trainings of the same arrays by different seeds."""
+    figure, values = RATIO_FIGURES[task], {}
+    for row in study.content["rows"]:
+        if row["task"] == task:
+            values.setdefault((row["preset"], row["budget"], row["ratio"]), []).append(row[figure])
+    return max(max(same) - min(same) for same in values.values())
 
 
 def ratio_best(study: Any, task: str, budget: float, preset: str = "paper", part: str = "") -> dict:

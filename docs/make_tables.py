@@ -816,28 +816,29 @@ def ratios(task: str) -> Table:
     """Return errors of a sweep of ρ at equal bytes, the best in bold, beside the paper's best ρ."""
     study, figure, rows = node("bench_ratio"), RATIO_FIGURES[task], []
     tables = {"image": image_budget.RATIOS, "texture": texture_budget.RATIOS, "sdf": sdf_paper.RATIOS}
-    digits, unit = (2, "°") if task == "sdf" else (1, " dB")
+    digits, unit = (2, " °") if task == "sdf" else (1, " dB")
     of_task = [row for row in study.content["rows"] if row["task"] == task]
-    for preset, budget, part in dict.fromkeys((row["preset"], row["budget"], row["part"]) for row in of_task):
+    for preset, budget, part in dict.fromkeys(
+        (row["preset"], row["budget"], row["part"]) for row in of_task if row["default"]
+    ):
         sweep, best = ratio_rows(study, task, budget, preset, part), ratio_best(study, task, budget, preset, part)
         cells = [f"{row['ratio']:.3g}: {row[figure]:.{digits}f}" for row in sweep]
-        cells = [f"**{cell}**" if row is best else cell for row, cell in zip(sweep, cells, strict=True)]
-        default = next((row for row in sweep if row["default"]), None)
+        cells = [f"**{cell}**" if row == best else cell for row, cell in zip(sweep, cells, strict=True)]
+        default = next(row for row in sweep if row["default"])
+        loss = ratio_loss(study, task, budget, preset, part)
         if preset != "paper":
             published = "–"
         elif task == "sdf":
             published = f"{min(tables[task].items())[1]:g} (6 MB)"
         else:
             published = f"{(field_presets.RATIOS[part] if part else tables[task])[budget]:g}"
-        loss = ratio_loss(study, task, budget, preset, part) if default else 0
-        behind = f"{100 * loss:.1f}%" if task == "sdf" else f"{loss:.1f} dB"
         size = f"{budget / 1000:,.0f} kB" if task == "sdf" else f"{budget:g}x"
         rows.append([
-            f"`{preset}`, {size}" + (f", {part}" if part else ""), ", ".join(cells),
-            f"{default['ratio']:.3g}" if default else "by search", behind if default else "–", published,
+            f"`{preset}`, {size}" + (f", {part}" if part else ""), ", ".join(cells), f"{default['ratio']:.3g}",
+            f"{100 * loss:.1f}%" if task == "sdf" else f"{loss:.1f} dB", published,
         ])  # fmt: skip
     names = {"image": "PSNR at texels", "texture": "mean PSNR of levels", "sdf": "angle", "field": "PSNR of foreground"}
-    head = ["preset, budget", f"ρ: {names[task]},{unit if task != 'sdf' else ' °'}", "default ρ"]
+    head = ["preset, budget", f"ρ: {names[task]},{unit}", "default ρ"]
     return table([*head, "behind the best by", "paper's best ρ"], rows)
 
 

@@ -31,6 +31,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -244,6 +245,8 @@ def captured(folder: Path):
 
     views, path = folder / "views", folder / "grid.npz"
     if not path.is_file():
+        # On one core, the loading of a scene in parallel waits for itself
+        dr.set_thread_count(max(2, dr.thread_count()))
         scene = ROOT / "scenes" / "capture_group.xml"
         mi_diffind.capture(scene, views, views=VIEWS, test=TEST, resolution=PIXELS, spp=SPP)
         options = {"preset": "grid", "steps": GRID_STEPS, "resolution": RESOLUTION, "colours": "directions"}
