@@ -25,32 +25,39 @@ class RecordedKeys(dict):
     ``len``, copies and ``{**…}`` record none.
     """
 
+    __slots__ = ("read",)
+
     def __init__(self, *content, **entries):
         super().__init__(*content, **entries)
-        self.read: set = set()
+        self.read: set | frozenset = frozenset()  # a set takes 216 bytes, and many objects may be in a file
+
+    def _record(self, keys) -> None:
+        if isinstance(self.read, frozenset):
+            self.read = set()
+        self.read.update(keys)
 
     def __getitem__(self, key):
-        self.read.add(key)
+        self._record((key,))
         return super().__getitem__(key)
 
     def __contains__(self, key) -> bool:
-        self.read.add(key)
+        self._record((key,))
         return super().__contains__(key)
 
     def get(self, key, default=None):
-        self.read.add(key)
+        self._record((key,))
         return super().get(key, default)
 
     def pop(self, key, *default):
-        self.read.add(key)
+        self._record((key,))
         return super().pop(key, *default)
 
     def items(self):
-        self.read.update(self.keys())
+        self._record(self.keys())
         return super().items()
 
     def values(self):
-        self.read.update(self.keys())
+        self._record(self.keys())
         return super().values()
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import reason
-from .image_files import ViewsError
+from .image_files import EXTENSIONS, ViewsError
 from .transforms import EVERY, Frame, FrameList
 
 #: Folders that may hold a model, the first one first.
@@ -75,4 +75,20 @@ def colmap_frames(folder: Path, model: Path, split: str) -> FrameList:
         mask_name = str(mask.relative_to(folder)) if mask.is_file() else None
         frames.append(Frame(f"{IMAGES}/{image.name}", pose, numbers, mask_name))
     points = [p.xyz for p in reconstruction.points3D.values() if p.track.length() >= TRACK]
-    return FrameList(model, folder, frames, points=np.array(points).reshape(-1, 3))
+    return FrameList(model, folder, frames, points=np.array(points).reshape(-1, 3), notes=_notes(folder, model, images))
+
+
+def _notes(folder: Path, model: Path, images: list) -> tuple[str, ...]:
+    """Return notes on further models and on masks that are not used."""
+    notes, masks = [], (path for path in (folder / MASKS).rglob("*.*") if path.suffix.lower() in EXTENSIONS)
+    others = [path.parent for path in model.parent.glob("*/cameras.*") if path.parent != model and model.name == "0"]
+    if others:
+        notes.append(f"{', '.join(sorted({p.name for p in others}))}: further models beside {model}, not used")
+    names = {path.relative_to(folder / MASKS).as_posix() for path in masks} - {f"{image.name}.png" for image in images}
+    unused = [name for name in names if not (folder / IMAGES / name.removesuffix(".png")).is_file()]
+    if unused:
+        notes.append(
+            f"{folder / MASKS}: {len(unused):,} files are masks of no image, such as {min(unused)}: the mask of a.jpg "
+            f"is a.jpg.png"
+        )
+    return tuple(notes)

@@ -149,7 +149,7 @@ class FieldFit:
             warnings.append("there are no test views: the measured error is that of the training views")
         if not session.views.has_alpha and not session.views.surroundings:
             warnings.append("the images have no alpha: their background becomes part of the field")
-        for line in (*session.views.notes, *(f"warning: {warning}" for warning in warnings)):
+        for line in (*session.notes, *(f"warning: {warning}" for warning in warnings)):
             print(line, file=sys.stderr)
         start = time.perf_counter()
         grid, grid_result = self.grid()
@@ -186,6 +186,7 @@ class FieldFit:
         if size:
             lines.append(f"{size:,} bytes in memory, {dense / size:.0f} times less than the dense grid of float32")
         figures = {"grid_seconds": grid_seconds, "dense_bytes": dense, "memory_bytes": size, "warnings": warnings}
+        figures["notes"] = session.notes
         return Fitted(table, result, lines, figures)
 
     @property

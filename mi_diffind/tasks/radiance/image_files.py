@@ -6,6 +6,8 @@ opaque everywhere.
 
 from __future__ import annotations
 
+import functools
+import os
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +22,12 @@ from ...units import memory
 #: Extensions tried in turn for an image name without one.
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".exr")
 
+#: Extensions of one format.
+JPEG = (".jpg", ".jpeg")
+
+#: Bytes up to this one are black in a mask that was written as JPEG, whose black is not exact.
+BLACK_OF_JPEG = 127
+
 #: Byte of sRGB → linear value, and byte of alpha → share.
 LINEAR, SHARE = to_linear(np.arange(256) / 255).astype(np.float32), np.arange(256, dtype=np.float32) / np.float32(255)
 
@@ -31,19 +39,49 @@ class ViewsError(DiffindError, ValueError):
     """Error for unusable images or poses; the message is one sentence that names the file and the fault."""
 
 
+class MissingImageError(ViewsError):
+    """Error for an image that a list of views names and that does not exist."""
+
+
 def image_file(root: Path, name: str, file: Path) -> Path:
-    """Return the path of an image in the folder ``root``, which the ``file`` with a list of views names."""
+    r"""Return the path of an image in the folder ``root``, which the ``file`` with a list of views names.
+
+    The name may lack its extension, have ``\`` between folders, and differ from the file's in upper and lower case, or
+    by ``.jpg`` and ``.jpeg``. Raises :class:`MissingImageError`, and :class:`ViewsError` for a path out of the folder.
+    """
     try:
-        path = path_within(root, name, file)
+        paths = [path_within(root, spelling, file) for spelling in dict.fromkeys((name, name.replace("\\", "/")))]
     except OutsideError as e:
         raise ViewsError(str(e)) from None
-    for candidate in (path, *(path.with_name(path.name + e) for e in EXTENSIONS)):
-        if fault := irregular(candidate, memory() // 4):
-            raise ViewsError(f"{shown(candidate)}: {fault}, {file.name} names it")
-        if candidate.is_file():
-            return candidate
-    more = "" if path.suffix.lower() in EXTENSIONS else f", nor with {', '.join(EXTENSIONS)}"
-    raise ViewsError(f"{shown(path)}: no such image{more}, {file.name} names it")
+    for path in paths:
+        candidates = [path, *(path.with_name(path.name + e) for e in EXTENSIONS)]
+        if path.suffix.lower() in JPEG:
+            candidates += [path.with_suffix(suffix) for suffix in JPEG]
+        for candidate in (*candidates, *filter(None, map(_in_other_case, candidates))):
+            if fault := irregular(candidate, memory() // 4):
+                raise ViewsError(f"{shown(candidate)}: {fault}, {file.name} names it")
+            if candidate.is_file():
+                return candidate
+    more = "" if paths[0].suffix.lower() in EXTENSIONS else f", nor with {', '.join(EXTENSIONS)}"
+    raise MissingImageError(f"{shown(paths[0])}: no such image{more}, {file.name} names it")
+
+
+def _in_other_case(path: Path) -> Path | None:
+    """Return the only path in a folder that differs from ``path`` in upper and lower case at most, or ``None``."""
+    try:
+        names = _names_of(path.parent, path.parent.stat().st_mtime_ns).get(path.name.casefold(), [])
+    except (OSError, ValueError):
+        return None
+    return path.with_name(names[0]) if len(names) == 1 else None
+
+
+@functools.lru_cache(maxsize=4)
+def _names_of(folder: Path, modified: int) -> dict[str, list[str]]:
+    """Return the names in a folder that was ``modified`` at a time, by their form without case."""
+    names: dict[str, list[str]] = {}
+    for name in os.listdir(folder):
+        names.setdefault(name.casefold(), []).append(name)
+    return names
 
 
 def is_linear(path: Path) -> bool:
@@ -121,14 +159,21 @@ def reduced(image: np.ndarray, mask: np.ndarray | None, factor: int) -> tuple[np
     return encoded(mean) if image.dtype == np.uint8 else mean, mask
 
 
-def read_mask(path: Path, image: np.ndarray, image_path: Path) -> np.ndarray:
-    """Return the mask of an image, bool ``(height, width)``: true where the file is not 0.
+def read_mask(path: Path, image: np.ndarray, image_path: Path) -> tuple[np.ndarray, bool]:
+    """Return the mask of an image, bool ``(height, width)``, true where a pixel counts, and whether alpha holds it.
 
-    Raises :class:`ViewsError`, also if the sizes differ.
+    Alpha holds the mask if the file has an alpha that is not 1 everywhere, else the luminance does. A pixel counts
+    where it is not 0 or, in a JPEG, above :data:`BLACK_OF_JPEG`. Raises :class:`ViewsError`, also if the sizes differ.
     """
     try:
-        with _opened(path, 1) as opened:
-            mask = np.array(opened.convert("L")) > 0
+        with _opened(path, 4) as opened:
+            alpha = np.array(opened.convert("RGBA"))[..., 3] if opened.has_transparency_data else None
+            if in_alpha := alpha is not None and bool(alpha.min() < 255):
+                mask = alpha > 0
+            else:
+                single = opened.mode in ("1", "L", "I", "F") or opened.mode.startswith("I;")  # of 16 bits, too
+                values = np.array(opened if single else opened.convert("L"))
+                mask = values > (BLACK_OF_JPEG if opened.format == "JPEG" else 0)
     except LimitError as e:
         raise ViewsError(str(e)) from None
     except Exception as e:
@@ -136,7 +181,7 @@ def read_mask(path: Path, image: np.ndarray, image_path: Path) -> np.ndarray:
     if mask.shape != image.shape[:2]:
         sizes = " × ".join(map(str, mask.shape[::-1])), " × ".join(map(str, image.shape[1::-1]))
         raise ViewsError(f"{path}: has {sizes[0]} pixels, its image {image_path.name} has {sizes[1]}")
-    return mask
+    return mask, in_alpha
 
 
 def _opened(path: Path, channels: int):

@@ -7,6 +7,7 @@ are those of random patches, which share most of what their rays read. Most patc
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -280,6 +281,11 @@ class FieldSession:
         # Of these, one is looked at at a time
         return FieldSession(types, views, held_out.compressed(), has_test_views, pixels, stops)
 
+    @property
+    def notes(self) -> list[str]:
+        """Notes on the training views and the held-out ones, each once."""
+        return list(dict.fromkeys((*self.views.notes, *self.held_out.notes)))
+
     @functools.cached_property
     def images(self) -> ViewImages:
         """Training views as Dr.Jit arrays."""
@@ -314,13 +320,15 @@ class FieldSession:
 def load_held_out(folder, most: int | None = None, **reading) -> tuple[CapturedViews, bool]:
     """Return ``most`` test views of a capture and True or, if there are none, of its training views and False.
 
-    ``reading`` are further arguments of :func:`.views.load_views`.
+    A note of the training views says why there are none. ``reading`` are further arguments of
+    :func:`.views.load_views`.
     """
     try:
         return load_views(folder, "test", most, **reading), True
     except ViewsError as e:
         try:
-            return load_views(folder, "train", most, **reading), False
+            views = load_views(folder, "train", most, **reading)
+            return dataclasses.replace(views, notes=(*views.notes, f"no test views: {e}")), False
         except ViewsError:
             raise e from None
 

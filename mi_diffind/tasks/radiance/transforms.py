@@ -1,24 +1,26 @@
 """Lists of views in JSON: those of NeRF's Blender data, of nerfstudio and of instant-ngp.
 
 Two layouts are read: ``transforms_train.json``, ``transforms_test.json`` and ``transforms_val.json`` of NeRF's Blender
-data (Mildenhall et al. 2020), and the ``transforms.json`` of nerfstudio and instant-ngp. Poses map camera to world; a
-camera looks along −z with y up. Transforms that nerfstudio has already applied to the poses (``applied_transform``,
-``applied_scale``) are not undone.
+data (Mildenhall et al. 2020), and the ``transforms.json`` of nerfstudio and instant-ngp. Cameras are those of
+:mod:`.camera_keys`. Poses map camera to world; a camera looks along −z with y up. Transforms that nerfstudio has
+already applied to the poses (``applied_transform``, ``applied_scale``) are not undone. Keys that are not used are named
+in a note.
 """
 
 from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from ...errors import reason
 from ...files import MOST_TEXT, irregular, shown
 from ...limits import Allowance, LimitError, json_bytes
+from ...unused_keys import RecordedKeys, unused_note
+from .camera_keys import camera_numbers
 from .image_files import ViewsError
-from .lenses import DISTORTION
 
 SPLITS = ("train", "test", "val")
 
@@ -28,19 +30,12 @@ RIGID = 1e-3
 #: Interval of the test views in a list without splits, beginning with the first view (as in LLFF's data).
 EVERY = 8
 
-#: Focal lengths and sizes in pixels are smaller.
-LONGEST = 1e9
-
-#: Camera models that are read; a distortion may be 0.
-CAMERA_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
-
 
 @dataclass(frozen=True)
 class Frame:
     """One view in a list: the name of its image, pose ``(4, 4)``, camera to world, and the ``numbers`` of its camera.
 
-    The numbers have the names of nerfstudio: w, h, fl_x, fl_y, cx, cy, camera_angle_x, camera_angle_y, k1 to k6, p1 and
-    p2. ``mask`` names a mask.
+    The numbers are those of :func:`.camera_keys.camera_numbers`. ``mask`` names a mask.
     """
 
     image: str
@@ -54,7 +49,7 @@ class FrameList:
     """Views of a split: the ``file`` that lists them, the folder of their images, and what else the file says.
 
     ``box`` ``(2, 3)`` holds two corners; ``points`` ``(n, 3)`` lie on surfaces. ``settings`` are those that a fitted
-    field records.
+    field records, ``notes`` sentences for the user.
     """
 
     file: Path
@@ -63,34 +58,40 @@ class FrameList:
     box: np.ndarray | None = None
     points: np.ndarray | None = None
     settings: dict = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
 
 def listed_frames(folder: Path, split: str) -> FrameList:
     """Return the views of a ``split`` that the JSON files in a folder list. Raises :class:`ViewsError`."""
     file, content, frames = _frames(folder, split)
-    names = ("applied_transform", "applied_scale")
-    return FrameList(
-        file, file.parent, [_camera(file, content, frame) for frame in frames], _box(file, content),
-        settings={name: content[name] for name in names if name in content},
-    )  # fmt: skip
+    content["frames"] = frames  # those of other splits are not read
+    cameras, box = [_camera(file, content, frame) for frame in frames], _box(file, content)
+    settings = {name: content[name] for name in ("applied_transform", "applied_scale") if name in content}
+    note = unused_note(file, content)
+    return FrameList(file, file.parent, cameras, box, settings=settings, notes=(note,) if note else ())
 
 
 def _frames(folder: Path, split: str) -> tuple[Path, dict, list[dict]]:
-    """Return the file that lists the views of a split, its content, and the entries of these views."""
+    """Return the file that lists the views of a split, its content, and the entries of these views.
+
+    Views for a validation are the test views of a capture without others.
+    """
     if fault := irregular(folder):
         raise ViewsError(f"{shown(folder)}: {fault}")
     if not folder.is_dir():
         raise ViewsError(f"{folder}: {'is not a folder' if folder.exists() else 'no such folder'}")
-    listed_split, train, single = (folder / f"transforms{s}.json" for s in (f"_{split}", "_train", ""))
+    files = {s: folder / f"transforms_{s}.json" for s in SPLITS}
+    test = "val" if files["val"].is_file() and not files["test"].is_file() else "test"
+    listed_split, single = files[test if split == "test" else split], folder / "transforms.json"
     if listed_split.is_file():
         content, frames = _parse(listed_split)
-        if split == "train" and not (folder / "transforms_test.json").is_file():
+        if split == "train" and not files[test].is_file():
             frames = [f for i, f in enumerate(frames) if i % EVERY or len(frames) == 1]
         return listed_split, content, frames
-    if train.is_file():
+    if files["train"].is_file():
         if split == "test":
-            content, frames = _parse(train)
-            return train, content, frames[::EVERY]
+            content, frames = _parse(files["train"])
+            return files["train"], content, frames[::EVERY]
         raise ViewsError(f"{listed_split}: no such file")
     if not single.is_file():
         raise ViewsError(
@@ -104,15 +105,22 @@ def _frames(folder: Path, split: str) -> tuple[Path, dict, list[dict]]:
             raise ViewsError(f'{single}: has no list "val_filenames"')
         wanted = [f for i, f in enumerate(frames) if (i % EVERY == 0) == (split == "test")]
         return single, content, frames if len(frames) == 1 else wanted
+    if split == "test" and "test" not in lists and "val" in lists:
+        split = "val"
     if split not in lists:
         raise ViewsError(f'{single}: has no list "{split}_filenames", only those of {", ".join(lists)}')
-    listed = {frame["file_path"]: frame for frame in frames}
     if not isinstance(lists[split], list):
         raise ViewsError(f'{single}: "{split}_filenames" is {lists[split]!r:.40}, expected a list')
+    listed = {_plain(frame["file_path"]): frame for frame in frames}
     for name in lists[split]:
-        if name not in listed:
+        if not isinstance(name, str) or _plain(name) not in listed:
             raise ViewsError(f'{single}: "{split}_filenames" names {name!r:.60}, which is not among the frames')
-    return single, content, [listed[name] for name in lists[split]]
+    return single, content, [listed[_plain(name)] for name in lists[split]]
+
+
+def _plain(name: str) -> str:
+    r"""Return the name of an image without ``./`` and ``\``, which two lists may use differently."""
+    return str(PurePosixPath(name.replace("\\", "/")))
 
 
 def _parse(file: Path) -> tuple[dict, list[dict]]:
@@ -121,7 +129,7 @@ def _parse(file: Path) -> tuple[dict, list[dict]]:
     try:
         data = file.read_bytes()
         Allowance(file).check(json_bytes(data), "a list of views")
-        content = json.loads(data.decode("utf-8-sig"))
+        content = json.loads(data.decode("utf-8-sig"), object_hook=RecordedKeys)
     except LimitError as e:
         raise ViewsError(str(e)) from None
     except (ValueError, RecursionError) as e:
@@ -156,36 +164,23 @@ def _box(file: Path, content: dict) -> np.ndarray | None:
 
 def _camera(file: Path, content: dict, frame: dict) -> Frame:
     where = f'{file}: frame "{frame["file_path"]}"'
-    entries = {**{k: v for k, v in content.items() if k != "frames"}, **frame}
-    model = entries.get("camera_model", "PINHOLE")
-    if model not in CAMERA_MODELS or entries.get("is_fisheye"):
-        model = model if model not in CAMERA_MODELS else "fisheye"
-        raise ViewsError(
-            f"{where} has the camera model {model!r:.40}, allowed are {', '.join(CAMERA_MODELS)}: undistort the images "
-            f"first"
-        )
-    numbers = {}
-    for name in ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", *DISTORTION):
-        value = entries.get(name)
-        if value is None:
-            continue
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < float("inf"):
-            raise ViewsError(f'{where} has the "{name}" {value!r:.40}, expected a number')
-        try:
-            numbers[name] = float(value)
-        except OverflowError:  # a whole number of more than 308 digits
-            raise ViewsError(f'{where} has a "{name}" above 1e308, expected a number') from None
-    if not {"fl_x", "camera_angle_x"} & set(numbers):
-        raise ViewsError(f'{where} has no focal length: neither "camera_angle_x" nor "fl_x" is given')
-    for names, limit, allowed in (
-        (("fl_x", "fl_y", "w", "h"), LONGEST, f"a number > 0 and < {LONGEST:g}"),
-        (("camera_angle_x", "camera_angle_y"), np.pi, "radians between 0 and π"),
-    ):
-        for name in names:
-            if name in numbers and not 0 < numbers[name] < limit:
-                raise ViewsError(f'{where} has the "{name}" {numbers[name]:g}, expected {allowed}')
-    pose = _pose(where, frame.get("transform_matrix"))
+    numbers, pose = camera_numbers(where, frame, content), _pose(where, _matrix(where, frame))
+    if content.get("from_mitsuba", "normal_mts_args" in content):  # cameras look along z, with x to the left
+        pose = pose @ np.diag([-1.0, 1.0, -1.0, 1.0])
     return Frame(frame["file_path"], pose, numbers, frame.get("mask_path") or None)
+
+
+def _matrix(where: str, frame: dict):
+    """Return the matrix of a frame: that of the time at which the shutter opens, too, if the camera stands still."""
+    if frame.get("transform_matrix") is not None:
+        return frame["transform_matrix"]
+    begin, end = (frame.get(f"transform_matrix_{time}") for time in ("start", "end"))
+    if end is not None and end != begin:
+        raise ViewsError(
+            f'{where} moves while the shutter is open, from the "transform_matrix_start" to another '
+            f'"transform_matrix_end": a "transform_matrix" is needed'
+        )
+    return begin
 
 
 def _pose(where: str, matrix) -> np.ndarray:

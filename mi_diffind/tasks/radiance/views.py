@@ -20,11 +20,23 @@ from pathlib import Path
 import numpy as np
 
 from ... import units
+from ...errors import printable, shortened
 from ...indirection import aligned
 from ...progress import progress_bar
 from . import background as backgrounds
+from .camera_keys import focal_lengths
 from .colmap import colmap_frames, model_folder
-from .image_files import ViewsError, decoded, half_floats, image_file, is_linear, read_image, read_mask, reduced
+from .image_files import (
+    MissingImageError,
+    ViewsError,
+    decoded,
+    half_floats,
+    image_file,
+    is_linear,
+    read_image,
+    read_mask,
+    reduced,
+)
 from .lenses import DISTORTION, undistorted
 from .transforms import SPLITS, Frame, FrameList, listed_frames
 
@@ -33,6 +45,9 @@ PACKING = 1
 
 #: Longest side in pixels of images that are not reduced.
 LONGEST = 1600
+
+#: Fewest views for training, since one shows no depth, and names of missing images in a note.
+LEAST_VIEWS, NAMED_MISSING = 2, 3
 
 #: Percentiles of points along each axis between which the captured objects lie, and the margin around these, as a share
 #: of the longest side.
@@ -156,8 +171,9 @@ def load_views(
 
     The file is ``transforms_SPLIT.json``, or ``transforms.json`` with the lists ``train_filenames``,
     ``test_filenames`` and ``val_filenames``, or, without these, a model of COLMAP. If no file or list names the test
-    views, every eighth view is one. Of more than ``most`` views, so many are read, evenly spread in the list.
-    ``progress`` shows a bar on stderr.
+    views, they are those for a validation or, without such, every eighth view. Views whose images do not exist are left
+    out, with a note. Of more than ``most`` views, so many are read, evenly spread in the list. ``progress`` shows a bar
+    on stderr.
 
     ``background`` is that of images without alpha: "white", "black", bytes of sRGB, or "scene" or "surroundings" if
     what is around the objects is part of the capture. ``None``: the colour of their borders if it is one, else "scene".
@@ -170,21 +186,19 @@ def load_views(
     if split not in SPLITS:
         raise ValueError(f'split: found "{split}", allowed are {", ".join(SPLITS)}')
     listed = _listed(folder, split)
-    file, frames = listed.file, listed.frames
-    if split == "train" and len(frames) < 2:
-        raise ViewsError(f"{file}: has {len(frames)} view for training, at least 2 are needed: one shows no depth")
-    if not frames:
-        raise ViewsError(f'{file}: has no views for the split "{split}"')
+    frames, paths, missing = _with_images(listed, split)
     if most is not None and most < len(frames):
-        frames = [frames[i * len(frames) // most] for i in range(most)]
-    paths = [image_file(listed.root, frame.image, file) for frame in frames]
+        chosen = [i * len(frames) // most for i in range(most)]
+        frames, paths = ([entries[i] for i in chosen] for entries in (frames, paths))
     images = _Images(len(paths), 2 if any(map(is_linear, paths)) else 1, downscale)
     with progress_bar("views", len(paths), "images", progress) as bar:
         for path, frame in zip(paths, frames, strict=True):
             images.add(path, frame, listed)
             bar.update()
     opaque = images.opaque if images.transparent else list(range(len(paths)))
-    notes = []
+    notes = [*listed.notes, *missing, *images.notes]
+    if images.alpha_masks:
+        notes.append(f"the masks of {images.alpha_masks} images are those of their alpha")
     if images.reduced:
         factors = " or ".join(map(str, sorted(images.reduced)))
         notes.append(f"images are reduced by the factor {factors} along each side: option --downscale")
@@ -242,6 +256,32 @@ def _listed(folder: Path, split: str) -> FrameList:
     return listed_frames(folder, split)
 
 
+def _with_images(listed: FrameList, split: str) -> tuple[list[Frame], list[Path], list[str]]:
+    """Return the views whose images exist, the paths of these images, and notes on the others."""
+    file, least = listed.file, LEAST_VIEWS if split == "train" else 1
+    if split == "train" and len(listed.frames) < least:
+        raise ViewsError(
+            f"{file}: has {len(listed.frames)} view for training, at least {least} are needed: one shows no depth"
+        )
+    if not listed.frames:
+        raise ViewsError(f'{file}: has no views for the split "{split}"')
+    frames, paths, missing = [], [], []
+    for frame in listed.frames:
+        try:
+            paths.append(image_file(listed.root, frame.image, file))
+            frames.append(frame)
+        except MissingImageError as e:
+            missing.append((frame.image, e))
+    if not missing:
+        return frames, paths, []
+    count = f'{len(missing):,} of {len(listed.frames):,} images of the split "{split}" do not exist'
+    if len(frames) < least:
+        raise ViewsError(f"{missing[0][1]}; {count}, at least {least} {'is' if least == 1 else 'are'} needed")
+    names = ", ".join(shortened(printable(name), 60) for name, _ in missing[:NAMED_MISSING])
+    more = f" and {len(missing) - NAMED_MISSING:,} more" if len(missing) > NAMED_MISSING else ""
+    return frames, paths, [f"{file.name}: {count} and are left out: {names}{more}"]
+
+
 def _box(listed: FrameList, has_alpha: bool) -> np.ndarray | None:
     """Return the box of a list of views or, if no alpha shows where the objects are, that of most of its points."""
     if listed.box is not None or has_alpha or listed.points is None or not len(listed.points):
@@ -258,6 +298,7 @@ class _Images:
         self.views, self.pixels, self.count = views, np.empty((0, words), np.uint32), 0
         self.sizes, self.focal, self.centre, self.masks = [], [], [], []
         self.transparent, self.opaque, self.undistorted, self.downscale, self.reduced = False, [], 0, downscale, set()
+        self.alpha_masks, self.notes = 0, {}  # notes in their order, each once
 
     def add(self, path: Path, frame: Frame, listed: FrameList) -> None:
         """Read an image and its mask, reduce and undistort them."""
@@ -269,11 +310,15 @@ class _Images:
                 f"{path}: has {width} × {height} pixels, {listed.file} says {expected[0]:g} × {expected[1]:g}, to "
                 f"which its focal lengths refer"
             )
-        focal = _focal(numbers, width, height)
+        focal, notes = focal_lengths(numbers, width, height)
+        self.notes |= {f"{listed.file.name}: {note}": None for note in notes}
         centre = numbers.get("cx", width / 2), numbers.get("cy", height / 2)
-        mask = None
+        mask, excluded = None, path.with_name(f"dynamic_mask_{path.stem}.png")
         if frame.mask is not None:
-            mask = read_mask(image_file(listed.root, frame.mask, listed.file), image, path)
+            mask, in_alpha = read_mask(image_file(listed.root, frame.mask, listed.file), image, path)
+            self.alpha_masks += in_alpha
+        elif excluded.is_file():  # of instant-ngp, white where a pixel does not count
+            mask = ~read_mask(excluded, image, path)[0]
         factor = self.downscale or -(-max(height, width) // LONGEST)
         if factor > min(height, width):
             raise ViewsError(f"{path}: has {width} × {height} pixels, which cannot be reduced by the factor {factor}")
@@ -320,11 +365,3 @@ class _Images:
             np.ones(h * w, bool) if m is None else m.ravel() for m, (h, w) in zip(self.masks, self.sizes, strict=True)
         )
         return np.concatenate(list(whole))
-
-
-def _focal(numbers: dict[str, float], width: int, height: int) -> tuple[float, float]:
-    """Return the focal lengths along x and y in pixels of an image of this size."""
-    fx = numbers["fl_x"] if "fl_x" in numbers else width / 2 / np.tan(numbers["camera_angle_x"] / 2)
-    if "fl_y" in numbers or "fl_x" in numbers or "camera_angle_y" not in numbers:
-        return fx, numbers.get("fl_y", fx)
-    return fx, height / 2 / np.tan(numbers["camera_angle_y"] / 2)
