@@ -11,6 +11,7 @@ import hashlib
 import io
 import json
 import os
+import re
 import zipfile
 from pathlib import Path, PurePosixPath
 
@@ -19,6 +20,7 @@ import numpy as np
 from .errors import DiffindError, reason
 from .files import irregular, shown
 from .units import memory
+from .unused_keys import RecordedKeys, unused_note
 
 #: Names of properties that every Gaussian of a PLY file has.
 NAMES = (
@@ -36,6 +38,15 @@ FARTHEST = 1e18
 #: Name of the file that describes a SOG folder or archive, and the most bytes that it may have.
 META, META_BYTES = "meta.json", 1 << 20
 
+#: End of a file's name → format of 3D Gaussians that is not read.
+OTHER_FORMATS = {
+    ".spz": "SPZ (Niantic)", ".splat": ".splat (antimatter15)", ".ksplat": ".ksplat (GaussianSplats3D)",
+    ".lcc": "LCC (XGRIDS)", "lod-meta.json": "streamed SOG (PlayCanvas)",
+}  # fmt: skip
+
+#: Advice for files of these formats.
+CONVERTER = 'PlayCanvas\' splat-transform converts it ("splat-transform {} OUTPUT.ply")'
+
 #: Colours in a row of the palette of a SOG file.
 PALETTE_WIDTH = 64
 
@@ -51,20 +62,33 @@ class SplatsError(DiffindError, ValueError):
 
 
 def is_splats(source) -> bool:
-    """Return whether a source is the name of a file of Gaussians: ``*.ply``, ``*.sog`` or ``meta.json``."""
+    """Return whether a source is the name of a file of Gaussians: ``*.ply``, ``*.sog`` or ``meta.json``.
+
+    Names of :data:`OTHER_FORMATS` count, too: :func:`read_gaussians` says what to do with them.
+    """
     if not isinstance(source, (str, os.PathLike)):
         return False
     path = Path(source)
-    return path.suffix.lower() in (".ply", ".sog") or path.name.lower() == META
+    return path.suffix.lower() in (".ply", ".sog") or path.name.lower() == META or bool(_other_format(path))
 
 
-def read_gaussians(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], str]:
-    """Return the Gaussians of a file and the SHA-256 of its content.
+def _other_format(path: Path) -> str:
+    """Return the format of a file of Gaussians that is not read, by its name, else ""."""
+    return next((name for end, name in OTHER_FORMATS.items() if path.name.lower().endswith(end)), "")
+
+
+def read_gaussians(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], str, tuple[str, ...]]:
+    """Return the Gaussians of a file, the SHA-256 of its content, and notes on what is not used of it.
 
     The arrays are those of :class:`.splats.Splats`, float32. Raises :class:`SplatsError`.
     """
     path = Path(path)
-    arrays, digest = (_ply if path.suffix.lower() == ".ply" else _sog)(path)
+    if other := _other_format(path):
+        if not path.is_file():
+            raise SplatsError(f"{shown(path)}: no such file")
+        advice = CONVERTER.format(path.name)
+        raise SplatsError(f"{path}: holds Gaussians in the format {other}, PLY or SOG is needed: {advice}")
+    arrays, digest, note = (_ply if path.suffix.lower() == ".ply" else _sog)(path)
     if not len(arrays["centres"]):
         raise SplatsError(f"{path}: holds no Gaussians")
     lengths = np.linalg.norm(arrays["quaternions"], axis=1, keepdims=True)
@@ -75,26 +99,31 @@ def read_gaussians(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], str]
         arrays["scales"] = np.exp(arrays["scales"])
     if arrays["scales"].max() > FARTHEST or np.abs(arrays["centres"]).max() > FARTHEST:
         raise SplatsError(f"{path}: has places or scales above 1e18, are the scales logarithms?")
-    return {name: array.astype(np.float32) for name, array in arrays.items()}, digest
+    return {name: array.astype(np.float32) for name, array in arrays.items()}, digest, (note,) if note else ()
 
 
-def _ply(path: Path) -> tuple[dict[str, np.ndarray], str]:
-    """Return the arrays of a PLY file, with logarithms of the scales and quaternions of any length."""
+def _ply(path: Path) -> tuple[dict[str, np.ndarray], str, str | None]:
+    """Return the arrays of a PLY file, with logarithms of the scales and quaternions of any length, and a note."""
     from trimesh.exchange.ply import load_ply
 
     if fault := irregular(path, memory() // 4):
         raise SplatsError(f"{shown(path)}: {fault}")
     try:
         content = path.read_bytes()
-        with path.open("rb") as file:
-            vertices = load_ply(file)["metadata"]["_ply_raw"]["vertex"]["data"]
+        if re.search(rb"property\s+\w+\s+packed_position\s", content.partition(b"end_header")[0]):
+            raise SplatsError(
+                f"{path}: holds compressed Gaussians, an uncompressed PLY file or SOG is needed: "
+                f"{CONVERTER.format(path.name)}"
+            )
+        elements = load_ply(io.BytesIO(content))["metadata"]["_ply_raw"]
+        vertices = elements["vertex"]["data"]
         names = vertices.dtype.names if isinstance(vertices, np.ndarray) else tuple(vertices)
+    except SplatsError:
+        raise
     except OSError as e:
         raise SplatsError(f"{path}: cannot be read ({e.strerror or reason(e)})") from None
     except Exception as e:  # the reader has no errors of its own
         raise SplatsError(f"{path}: is not a PLY file with vertices, or is damaged ({reason(e)})") from None
-    if "packed_position" in names:
-        raise SplatsError(f"{path}: holds compressed Gaussians, an uncompressed PLY file or SOG is needed")
     missing = [name for name in NAMES if name not in names]
     if missing:
         raise SplatsError(f"{path}: holds no 3D Gaussians, its vertices lack {', '.join(missing)}")
@@ -106,6 +135,8 @@ def _ply(path: Path) -> tuple[dict[str, np.ndarray], str]:
         return np.stack([np.asarray(vertices[name], np.float64).reshape(-1) for name in chosen], axis=-1)
 
     further = tuple(f"f_rest_{i}" for i in range(rest))
+    if missing := [name for name in further if name not in names]:
+        raise SplatsError(f"{path}: has {rest} properties f_rest_*, but lacks {', '.join(missing)}")
     for name in (*NAMES, *further):
         values = columns(name)
         wrong = np.isnan(values) if name == "opacity" else ~np.isfinite(values)
@@ -124,11 +155,14 @@ def _ply(path: Path) -> tuple[dict[str, np.ndarray], str]:
         "opacities": opacities,
         "colours": colours,
     }
-    return arrays, hashlib.sha256(content).hexdigest()
+    # Normals are 0 in the files of the reference implementation
+    unused = [name for name in names if name not in (*NAMES, *further) and np.any(vertices[name])]
+    note = unused_note(path, [], (*unused, *(name for name in elements if name != "vertex")))
+    return arrays, hashlib.sha256(content).hexdigest(), note
 
 
-def _sog(path: Path) -> tuple[dict[str, np.ndarray], str]:
-    """Return the arrays of a SOG archive or of a folder's ``meta.json``, as :func:`_ply` does."""
+def _sog(path: Path) -> tuple[dict[str, np.ndarray], str, str | None]:
+    """Return the arrays of a SOG archive or of a folder's ``meta.json``, as :func:`_ply` does, and a note."""
     with _SogFiles(path) as files:
         meta = files.meta()
         count = files.number(meta, "count", MOST)
@@ -149,7 +183,7 @@ def _sog(path: Path) -> tuple[dict[str, np.ndarray], str]:
         }
         if "shN" in meta:
             arrays["colours"] = np.concatenate([arrays["colours"], files.further(meta, count)], axis=1)
-        return arrays, files.digest.hexdigest()
+        return arrays, files.digest.hexdigest(), unused_note(path, meta)
 
 
 class _SogFiles:
@@ -198,7 +232,7 @@ class _SogFiles:
         """Return the description."""
         content = self.content(META if self.archive is not None else self.path.name, META_BYTES)
         try:
-            meta = json.loads(content)
+            meta = json.loads(content, object_hook=RecordedKeys)
         except ValueError as e:
             raise SplatsError(f"{self.path}: {META} is no JSON ({reason(e)})") from None
         if not isinstance(meta, dict) or meta.get("version") != 2:

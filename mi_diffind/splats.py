@@ -52,7 +52,7 @@ class Splats:
     ``centres`` ``(N, 3)``; ``scales`` ``(N, 3)``, standard deviations along the axes that the ``quaternions``
     ``(N, 4)`` (x, y, z, w, of length 1) turn; ``opacities`` ``(N,)`` in [0, 1]; ``colours`` ``(N, K, 3)``, coefficients
     of spherical harmonics, whose sum plus 0.5 is the colour as displayed (sRGB). ``digest`` is the SHA-256 of the
-    file.
+    file, ``notes`` are sentences on what is not used of it.
     """
 
     path: Path
@@ -62,6 +62,7 @@ class Splats:
     opacities: np.ndarray
     colours: np.ndarray
     digest: str
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.centres)
@@ -69,8 +70,8 @@ class Splats:
     @staticmethod
     def read(path: str | os.PathLike) -> Splats:
         """Read a PLY file or SOG (:mod:`.splat_files`). Raises :class:`SplatsError`."""
-        arrays, digest = read_gaussians(path)
-        return Splats(Path(path), digest=digest, **arrays)
+        arrays, digest, notes = read_gaussians(path)
+        return Splats(Path(path), digest=digest, notes=notes, **arrays)
 
     def chosen(self, which: np.ndarray) -> Splats:
         """Return some of the Gaussians, by a mask ``(N,)`` or numbers."""
@@ -132,7 +133,7 @@ class SplatSubject:
         if not mi.is_rgb:
             raise SplatsError(f"{path}: the variant {mi.variant()} shows no Gaussians, one with rgb is needed")
         splats = Splats.read(path)
-        self.splats, self.total = splats.cropped(box), len(splats)
+        self.splats, self.total, self.notes = splats.cropped(box), len(splats), splats.notes
         check_memory(f"{path}: Gaussians", len(self.splats), GAUSSIAN * len(self.splats))
 
     def record(self) -> dict:

@@ -15,7 +15,7 @@ from pathlib import Path
 from .errors import printable
 
 #: Names in a note, and characters of a name.
-MOST_NAMES, LONGEST_NAME = 20, 40
+MOST_NAMES, LONGEST_NAME = 50, 40
 
 
 class RecordedKeys(dict):

@@ -71,7 +71,7 @@ class Captured:
 
     ``files`` of images (relative to ``folder``) and their ``total`` once complete; the number ``rendered`` now, in
     ``seconds``; ``radius``, ``centre`` and ``box`` ``(2, 3)`` of the cameras' target; ``opaque``: no rendered pixel has
-    alpha below 1.
+    alpha below 1; ``notes`` on what is not used of a file of 3D Gaussians.
     """
 
     folder: Path
@@ -83,6 +83,7 @@ class Captured:
     centre: np.ndarray
     box: np.ndarray
     opaque: bool
+    notes: tuple[str, ...] = ()
 
     @property
     def interrupted(self) -> bool:
@@ -102,6 +103,7 @@ class Captured:
             "radius": self.radius,
             "centre": self.centre.tolist(),
             "box": self.box.tolist(),
+            "notes": list(self.notes),
         }
 
     @property
@@ -203,7 +205,7 @@ def capture(
                     break
     seconds = time.perf_counter() - start
     files = _write_lists(folder, settings, splits, box)
-    return Captured(folder, files, total, rendered, seconds, radius, centre, box, opaque)
+    return Captured(folder, files, total, rendered, seconds, radius, centre, box, opaque, subject.notes)
 
 
 def views_of_splats(request: FitRequest) -> Path:
@@ -267,6 +269,8 @@ def _subject(scene, defines: Mapping | None, settings: CaptureSettings) -> Scene
 
 class SceneSubject:
     """Scene as the subject of a capture, of which ``objects`` are captured."""
+
+    notes = ()
 
     def __init__(self, scene, defines: Mapping | None, objects: tuple[str, ...]):
         self.parsed, self.objects = scenes.ParsedScene(scene, defines), objects
@@ -566,7 +570,7 @@ def lines(captured: Captured) -> list[str]:
     ]
     if captured.opaque:
         text.append("  alpha is 1 everywhere: surfaces behind the objects became part of the views")
-    return text
+    return [*text, *(f"  {note}" for note in captured.notes)]
 
 
 def _point(p: np.ndarray) -> str:

@@ -111,6 +111,7 @@ def test_views_hold_what_is_displayed(mi_rgb, tmp_path, rng):
     assert np.abs(pixels[some][:, :3] - 255 * np.array([0.8, 0.4, 0.1])).max() <= 3  # not darker at the edge
     views = load_views(tmp_path / "views")
     assert views.has_alpha and (views.box[0] < -0.4).all() and (views.box[1] > 0.4).all()
+    assert views.notes == load_views(tmp_path / "views", "test").notes == ()
     record = json.loads((tmp_path / "views" / "capture.json").read_text())
     assert record["settings"]["spp"] == 4 and record["scene"] == "s.ply"
 
@@ -272,6 +273,10 @@ def without(table, *names):
     [
         (lambda t: {n: t[n] for n in "xyz"}, "holds no 3D Gaussians, its vertices lack f_dc_0, .*opacity, scale_0"),
         (lambda t: without(t, "rot_3"), "holds no 3D Gaussians, its vertices lack rot_3"),
+        (
+            lambda t: {n.replace("t_7", "t_45"): v for n, v in t.items()},
+            r"has 45 properties f_rest_\*, but lacks f_rest_7",
+        ),
         (lambda t: without(t, "f_rest_44"), r"has 44 properties f_rest_\*, allowed are 0, 9, 24, 45"),
         (lambda t: t | {"y": np.full(COUNT, np.nan)}, "has 6 values of y that are NaN or infinite"),
         (lambda t: t | {"f_rest_3": np.full(COUNT, np.inf)}, "has 6 values of f_rest_3 that are NaN or infinite"),
@@ -287,6 +292,50 @@ def test_other_files_are_refused(tmp_path, rng, change, message):
     path = write(tmp_path / "s.ply", change(columns(gaussians(rng))))
     with pytest.raises(SplatsError, match=message):
         Splats.read(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "named"),
+    [
+        ("s.spz", r"in the format SPZ \(Niantic\), PLY or SOG is needed"), ("s.splat", r"in the format \.splat"),
+        ("s.KSPLAT", r"in the format \.ksplat"), ("s.lcc", "in the format LCC"), ("lod-meta.json", "streamed SOG"),
+        ("s.ply", "holds compressed Gaussians, an uncompressed PLY file or SOG is needed"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("command", ["capture", "fit field"])
+def test_other_formats_are_refused_by_name(mi_rgb, tmp_path, capsys, name, named, command):
+    """Compressed PLY is PlayCanvas' header: chunks of bounds before vertices without a property x."""
+    import re
+
+    bounds = "".join(f"property float {end}_{axis}\n" for end in ("min", "max") for axis in "xyz")
+    packed = "".join(f"property uint packed_{part}\n" for part in ("position", "rotation", "scale", "color"))
+    header = f"ply\nformat binary_little_endian 1.0\nelement chunk 1\n{bounds}element vertex 4\n{packed}end_header\n"
+    (tmp_path / name).write_bytes(header.encode() + bytes(24 + 64))
+    assert cli.main([*command.split(), str(tmp_path / name), "-o", str(tmp_path / "o.npz")]) == 2
+    error = capsys.readouterr().err
+    assert re.search(named, error) and f'"splat-transform {name} OUTPUT.ply"' in error and error.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_what_is_not_used_of_a_file_is_named(mi_rgb, tmp_path, rng, capsys):
+    """Not the normals that the reference implementation writes, which are 0."""
+    from mi_diffind.splats import Splats
+
+    table = columns(gaussians(rng)) | {"nx": np.zeros(COUNT), "filter_3D": np.full(COUNT, 0.1)}
+    path = write(tmp_path / "s.ply", table)
+    note = "s.ply: keys that are not used: filter_3D"
+    assert Splats.read(path).notes == (note,)
+    options = ["--views", "2", "--test", "0", "--resolution", "4", "--spp", "1", "--json", str(tmp_path / "s.json")]
+    assert cli.main(["capture", str(path), "-o", str(tmp_path / "v"), *options]) == 0
+    assert f"  {note}\n" in capsys.readouterr().out
+    assert json.loads((tmp_path / "s.json").read_text())["notes"] == [note]
+    content = path.read_bytes().replace(b"end_header\n", b"element intrinsic 1\nproperty float f\nend_header\n")
+    path.write_bytes(content + bytes(4))
+    assert Splats.read(path).notes == (f"{note}, intrinsic",)
+    assert not Splats.read(write(tmp_path / "t.ply", without(table, "filter_3D"))).notes
+    plain = Splats.read(sog(tmp_path, gaussians(rng)))
+    more = sog(tmp_path, gaussians(rng), lambda m, i: (m.update(antialias=True), m["means"].update(unit=1)))
+    assert not plain.notes and Splats.read(more).notes == ("meta.json: keys that are not used: means.unit, antialias",)
 
 
 def test_damaged_files_are_refused(tmp_path, rng):

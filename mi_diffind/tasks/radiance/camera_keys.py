@@ -102,7 +102,7 @@ def _lens(where: str, levels: tuple[dict, dict], model: str) -> dict[str, float]
     """Return the coefficients of the distortion by their names."""
     lens: dict[str, float] = {}
     for level in levels:
-        entries = level.get("distortion_params")
+        entries = level.get("distortion_params") if set(DISTORTION_PARAMS) - lens.keys() else None
         if entries is None:
             given = {name: _number(where, level, name) for name in DISTORTION if name not in lens}
         elif isinstance(entries, list) and len(entries) == len(DISTORTION_PARAMS):

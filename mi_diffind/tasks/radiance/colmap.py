@@ -83,7 +83,9 @@ def _notes(folder: Path, model: Path, images: list) -> tuple[str, ...]:
     notes, masks = [], (path for path in (folder / MASKS).rglob("*.*") if path.suffix.lower() in EXTENSIONS)
     others = [path.parent for path in model.parent.glob("*/cameras.*") if path.parent != model and model.name == "0"]
     if others:
-        notes.append(f"{', '.join(sorted({p.name for p in others}))}: further models beside {model}, not used")
+        notes.append(
+            f"{', '.join(sorted({p.name for p in others}))}: further models beside {model}, which are not used"
+        )
     names = {path.relative_to(folder / MASKS).as_posix() for path in masks} - {f"{image.name}.png" for image in images}
     unused = [name for name in names if not (folder / IMAGES / name.removesuffix(".png")).is_file()]
     if unused:

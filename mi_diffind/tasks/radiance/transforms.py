@@ -60,6 +60,11 @@ class FrameList:
     settings: dict = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
+    @property
+    def name(self) -> str:
+        """Name of the file in its folder."""
+        return self.file.relative_to(self.root).as_posix()
+
 
 def listed_frames(folder: Path, split: str) -> FrameList:
     """Return the views of a ``split`` that the JSON files in a folder list. Raises :class:`ViewsError`."""

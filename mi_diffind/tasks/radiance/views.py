@@ -279,7 +279,7 @@ def _with_images(listed: FrameList, split: str) -> tuple[list[Frame], list[Path]
         raise ViewsError(f"{missing[0][1]}; {count}, at least {least} {'is' if least == 1 else 'are'} needed")
     names = ", ".join(shortened(printable(name), 60) for name, _ in missing[:NAMED_MISSING])
     more = f" and {len(missing) - NAMED_MISSING:,} more" if len(missing) > NAMED_MISSING else ""
-    return frames, paths, [f"{file.name}: {count} and are left out: {names}{more}"]
+    return frames, paths, [f"{listed.name}: {count} and are left out: {names}{more}"]
 
 
 def _box(listed: FrameList, has_alpha: bool) -> np.ndarray | None:
@@ -311,7 +311,7 @@ class _Images:
                 f"which its focal lengths refer"
             )
         focal, notes = focal_lengths(numbers, width, height)
-        self.notes |= {f"{listed.file.name}: {note}": None for note in notes}
+        self.notes |= {f"{listed.name}: {note}": None for note in notes}
         centre = numbers.get("cx", width / 2), numbers.get("cy", height / 2)
         mask, excluded = None, path.with_name(f"dynamic_mask_{path.stem}.png")
         if frame.mask is not None:

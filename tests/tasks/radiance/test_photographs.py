@@ -264,12 +264,24 @@ def test_masked_borders_are_no_background(studio_shots):
         np.testing.assert_array_equal(views.stored(view)[counted][:, 3], images[name][counted][:, 3])
 
 
-def test_a_field_records_its_background(studio_shots, monkeypatch):
+def test_a_field_records_its_background(studio_shots, monkeypatch, capsys):
+    """And the notes on what was read reach the command line and its JSON, those of the test views, too."""
     folder, _ = studio_shots
+    change(folder, aabb_scale=4)
+    change(folder, "transforms_test.json", frame=1, sharpness=3)
+    (folder / "train_4.png").unlink()
     options = ["--preset", "grid", "--steps", "40", "--resolution", "12", "--batch", "256"]
     monkeypatch.setattr(visual_hull, "SEARCH", 24)
     monkeypatch.setattr(grids, "VISIBLE", 0.0)
-    assert main(["fit", "field", str(folder), "-o", str(folder / "x.npz"), *options, "--variant", "llvm_ad_rgb"]) == 0
+    options += ["--variant", "llvm_ad_rgb", "--json", str(folder / "x.json")]
+    assert main(["fit", "field", str(folder), "-o", str(folder / "x.npz"), *options]) == 0
+    notes = [line for line in capsys.readouterr().err.splitlines() if line.startswith("transforms_")]
+    assert notes == [
+        "transforms_train.json: keys that are not used: aabb_scale",
+        'transforms_train.json: 1 of 6 images of the split "train" do not exist and are left out: train_4.png',
+        "transforms_test.json: keys that are not used: frames.sharpness",
+    ]
+    assert set(notes) < set(json.loads((folder / "x.json").read_text())["notes"])
     model = tasks()["field"].open(llvm.TensorXf, folder / "x.npz")
     assert model.table.settings["background"] == [240, 240, 235]
     measured = model.table.measured["psnr_white_db"]
@@ -354,6 +366,30 @@ def test_colmap_text_distortion_and_masks(colmap):
     assert not views.counted(2).any() and views.counted(0).all()
     write_json(folder / "transforms.json", frames=[])
     with pytest.raises(ViewsError, match=r'transforms\.json: has no "frames"'):
+        load_views(folder)
+
+
+def test_colmap_models_and_masks_that_are_not_used_are_named(colmap):
+    folder, _ = colmap
+    assert not load_views(folder).notes
+    (folder / "images" / "left" / "3.png").unlink()
+    shutil.copytree(folder / "sparse" / "0", folder / "sparse" / "1")
+    (folder / "masks" / "left").mkdir(parents=True)
+    for name in ("3.png", "4.png.png"):  # the second one is the mask of an image
+        Image.fromarray(np.full(SIZE, 255, np.uint8)).save(folder / "masks" / "left" / name)
+    models, masks, images = load_views(folder).notes
+    assert models.startswith("1: further models beside ") and models.endswith("sparse/0, which are not used")
+    assert masks.endswith("masks: 1 files are masks of no image, such as left/3.png: the mask of a.jpg is a.jpg.png")
+    assert images == 'sparse/0: 1 of 8 images of the split "train" do not exist and are left out: images/left/3.png'
+
+
+@pytest.mark.parametrize(
+    "camera", ["SIMPLE_RADIAL_FISHEYE 8 6 10 4 3 0", "RADIAL_FISHEYE 8 6 10 4 3 0 0", "FOV 8 6 10 10 4 3 0.1"]
+)
+def test_lenses_of_colmap_that_are_refused(colmap, camera):
+    folder, _ = colmap
+    (folder / "sparse" / "0" / "cameras.txt").write_text(f"1 {camera}\n2 PINHOLE 8 6 9 9 4 3\n")
+    with pytest.raises(ViewsError, match=rf"has the camera model {camera.split()[0]}, allowed are .*: undistort the"):
         load_views(folder)
 
 

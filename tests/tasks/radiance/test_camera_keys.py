@@ -1,0 +1,329 @@
+"""Cameras as NeRF's Blender data, nerfstudio, instant-ngp and BlenderNeRF spell them, and keys that nobody reads."""
+
+import json
+import math
+
+import drjit.llvm.ad as llvm
+import numpy as np
+import pytest
+from captures import SIZE, change, pose, write_image, write_json
+from PIL import Image
+
+from mi_diffind.tasks.radiance.session import FieldSession
+from mi_diffind.tasks.radiance.views import ViewsError, load_views
+
+#: Keys of the focal lengths 10 and 12 of images of 8 × 6 pixels, and of a centre and a lens.
+PIXELS = {"fl_x": 10.0, "fl_y": 12}
+ANGLES = {"camera_angle_x": 2 * math.atan(0.4), "camera_angle_y": 2 * math.atan(0.25)}
+DEGREES = {"x_fov": 2 * math.degrees(math.atan(0.4)), "y_fov": 2 * math.degrees(math.atan(0.25))}
+CENTRE = {"cx": 4.5, "cy": 3.25}
+LENS = {"k1": -0.12, "k2": 0.03, "k3": 0.01, "p1": 0.004, "p2": -0.003}
+LISTED = {"distortion_params": [-0.12, 0.03, 0.01, 0.0, 0.004, -0.003]}
+ZERO = {"distortion_params": [0] * 6}
+WRONG = {"fl_x": 77, "fl_y": 78, "cx": 1, "cy": 2}
+
+
+def studio(folder, of_file, of_frames, views=3):
+    """Views that the list ``train_filenames`` names, with these keys of the file and of each frame."""
+    (folder / "images").mkdir(exist_ok=True)
+    frames = []
+    for i in range(views):
+        write_image(folder / "images" / f"{i}.png", i, channels=3)
+        frames.append({"file_path": f"images/{i}.png", "transform_matrix": pose(i)} | of_frames)
+    names = [frame["file_path"] for frame in frames]
+    write_json(folder / "transforms.json", frames=frames, train_filenames=names, **of_file)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("of_file", "of_frames", "focal", "centre"),
+    [
+        (PIXELS | CENTRE | {"w": 8, "h": 6.0}, {}, (10, 12), (4.5, 3.25)),
+        ({}, PIXELS | CENTRE | {"w": 8.0, "h": 6}, (10, 12), (4.5, 3.25)),
+        (WRONG, PIXELS | CENTRE, (10, 12), (4.5, 3.25)),
+        (CENTRE, PIXELS, (10, 12), (4.5, 3.25)),
+        (ANGLES, {}, (10, 12), (4, 3)),
+        (WRONG, ANGLES | CENTRE, (10, 12), (4.5, 3.25)),
+        (DEGREES, CENTRE, (10, 12), (4.5, 3.25)),
+        (ANGLES | {"camera_angle_x": 0.1}, DEGREES, (10, 12), (4, 3)),
+        (PIXELS | ANGLES | DEGREES, {}, (10, 12), (4, 3)),
+        ({"fl_x": 10}, {}, (10, 10), (4, 3)),
+        ({"fl_x": 10, "camera_angle_y": ANGLES["camera_angle_y"]}, {}, (10, 12), (4, 3)),
+        ({"camera_angle_x": ANGLES["camera_angle_x"]}, {}, (10, 10), (4, 3)),
+        ({"x_fov": DEGREES["x_fov"]}, {"cy": 2}, (10, 10), (4, 2)),
+        (PIXELS | {"cx": None, "k1": None, "is_fisheye": None}, {}, (10, 12), (4, 3)),
+        (PIXELS | ZERO | {"camera_model": "SIMPLE_PINHOLE", "is_fisheye": False}, {}, (10, 12), (4, 3)),
+        (PIXELS | {"camera_model": "OPENCV", "k1": 0, "k2": 0.0, "k3": 0, "k4": 0}, {}, (10, 12), (4, 3)),
+        (PIXELS | {"camera_model": "pinhole"}, {"camera_model": "RADIAL"}, (10, 12), (4, 3)),
+    ],
+)  # fmt: skip
+def test_spellings_of_focal_lengths(tmp_path, of_file, of_frames, focal, centre):
+    views = load_views(studio(tmp_path, of_file, of_frames))
+    np.testing.assert_allclose(views.focal, [focal] * 3)
+    np.testing.assert_allclose(views.centre, [centre] * 3)
+    assert views.mask is None and not any("lens" in note or "field of view" in note for note in views.notes)
+
+
+@pytest.mark.parametrize(
+    ("of_file", "of_frames"),
+    [
+        (LISTED, {}),
+        ({}, LISTED),
+        ({}, LENS),
+        (ZERO, LENS),
+        ({"k1": 0.3, "k2": 0.1}, LISTED),
+        ({"k1": LENS["k1"], "k2": LENS["k2"]}, {"k3": LENS["k3"], "p1": LENS["p1"], "p2": LENS["p2"]}),
+        (LISTED | {"camera_model": "OPENCV", "is_fisheye": False}, {}),
+        (LENS | {"k4": 0.0, "camera_model": "opencv"}, {}),
+    ],
+)  # fmt: skip
+def test_spellings_of_lenses(tmp_path, of_file, of_frames):
+    """The images are those of the same coefficients by their names."""
+    (tmp_path / "names").mkdir()
+    expected = load_views(studio(tmp_path / "names", PIXELS | LENS, {}))
+    views = load_views(studio(tmp_path, PIXELS | of_file, of_frames))
+    assert "all images have a lens distortion and were undistorted" in views.notes
+    assert np.array_equal(views.pixels, expected.pixels) and np.array_equal(views.mask, expected.mask)
+    plain = load_views(studio(tmp_path / "names", PIXELS, {}))
+    assert not np.array_equal(plain.pixels, views.pixels) and not plain.notes
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        *(
+            ({"camera_model": name}, f"has the camera model '{name}', allowed are PINHOLE, .*: undistort the images")
+            for name in ("OPENCV_FISHEYE", "EQUIRECTANGULAR", "FISHEYE624", "ORTHOPHOTO", "VR180_L", "RADIAL_FISHEYE")
+        ),
+        ({"is_fisheye": True, "camera_model": "OPENCV"}, "has the camera model 'fisheye'"),
+        ({"latlong": True}, "has the camera model 'latlong'"),
+        ({"equirectangular": True}, "has the camera model 'equirectangular'"),
+        ({"orthographic": True}, "has the camera model 'orthographic'"),
+        ({"ftheta_p0": 0.1}, "has the camera model 'f-theta'"),
+        ({"distortion_params": [0.1, 0.2, 0, 0]}, r'has the "distortion_params" \[0.1, 0.2, 0, 0\], expected the list'),
+        ({"distortion_params": {"k1": 0.1}}, r"expected the list \[k1, k2, k3, k4, p1, p2\] of nerfstudio"),
+        ({"distortion_params": [0.1, "0.2", 0, 0, 0, 0]}, "has the \"k2\" '0.2', expected a number"),
+        ({"distortion_params": [0, 0, 0, 0.01, 0, 0]}, r"has the distortion k4 = 0.01, which nerfstudio multiplies"),
+        ({"k1": 0.1, "k4": 0.01}, r"has the distortion k4 = 0.01, which nerfstudio multiplies by r⁸"),
+        ({"fl_x": None, "x_fov": 180}, r'has the "x_fov" 180, expected degrees between 0 and 180'),
+        ({"camera_model": ["PINHOLE"]}, r"has the camera model \['PINHOLE'\], allowed are"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("place", ["file", "frame"])
+def test_cameras_that_are_refused(tmp_path, keys, message, place):
+    studio(tmp_path, (PIXELS | keys) if place == "file" else {}, (PIXELS | keys) if place == "frame" else {})
+    with pytest.raises(ViewsError, match=message):
+        load_views(tmp_path)
+
+
+def test_fields_of_view_that_contradict_focal_lengths_are_noted(tmp_path):
+    views = load_views(studio(tmp_path, PIXELS | {"camera_angle_x": ANGLES["camera_angle_x"] * 1.02}, {}))
+    assert views.focal[0].tolist() == [10, 12]
+    (note,) = views.notes
+    assert note.startswith(
+        'transforms.json: the field of view 0.7762 ("camera_angle_x") would be a focal length of 9.7'
+    )
+
+
+# -- poses ------------------------------------------------------------------------------------------------------------
+
+
+def test_spellings_of_poses(tmp_path):
+    turned = np.array(pose(7.0))
+    turned[:3, :3] = np.linalg.qr(np.random.default_rng(2).normal(size=(3, 3)))[0]
+    turned[:3, :3] *= np.sign(np.linalg.det(turned[:3, :3]))
+    studio(tmp_path, PIXELS, {})
+
+    content = json.loads((tmp_path / "transforms.json").read_text())
+
+    def read(**keys):
+        content["frames"][1] = {"file_path": "images/1.png"} | keys
+        write_json(tmp_path / "transforms.json", **content)
+        return load_views(tmp_path)
+
+    whole, start, end = ({f"transform_matrix{time}": turned.tolist()} for time in ("", "_start", "_end"))
+    for keys in (whole, {"transform_matrix": turned[:3].tolist()}, start, start | end):
+        views = read(**keys)
+        np.testing.assert_allclose(views.poses[1], turned)
+        assert not views.notes
+    moved = {"transform_matrix_end": pose()}
+    with pytest.raises(
+        ViewsError, match=r'frame "images/1.png" moves while the shutter is open, from the "transform_m'
+    ):
+        read(**start, **moved)
+    (note,) = read(**whole, **moved).notes
+    assert note.endswith("not used: frames.transform_matrix_end")
+
+
+def test_poses_of_mitsuba(tmp_path):
+    """instant-ngp's ``from_mitsuba``: cameras look along +z, with x to the left, as Mitsuba's ``look_at`` says."""
+    import mitsuba as mi
+
+    mi.set_variant("scalar_rgb")
+    matrix = np.array(mi.ScalarTransform4f().look_at(origin=[3, 1, 2], target=[0, 0.5, 0], up=[0, 1, 0]).matrix)
+    studio(tmp_path, PIXELS | {"from_mitsuba": True}, {"transform_matrix": matrix.tolist()})
+    camera = load_views(tmp_path).poses[0]
+    np.testing.assert_allclose(camera[:3, 3], [3, 1, 2])
+    forward = np.array([-3, -0.5, -2]) / np.linalg.norm([3, 0.5, 2])
+    np.testing.assert_allclose(-camera[:3, 2], forward, atol=1e-6)
+    np.testing.assert_allclose(camera[:3, 0], np.cross(forward, [0, 1, 0]) / np.hypot(*forward[[0, 2]]), atol=1e-6)
+    change(tmp_path, "transforms.json", from_mitsuba=False)
+    np.testing.assert_allclose(load_views(tmp_path).poses[0], matrix, atol=1e-6)
+
+
+# -- names of images and splits ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "file"),
+    [
+        ("./images/a.png", "images/a.png"), ("images/a", "images/a.png"), ("images\\a.png", "images/a.png"),
+        (".\\images\\a", "images/a.png"), ("images/a.png", "images/a.PNG"), ("images/a.JPG", "images/a.jpg"),
+        ("images/a", "images/A.JPG"), ("images/a.jpg", "images/a.jpeg"), ("images/A.JPEG", "images/a.jpg"),
+        ("images/a.b", "images/a.b.png"), ("images/./a.png", "images/a.png"),
+    ],
+)  # fmt: skip
+def test_spellings_of_names(tmp_path, name, file):
+    studio(tmp_path, PIXELS, {})
+    values = np.full((*SIZE, 3), 200, np.uint8)
+    Image.fromarray(values).save(tmp_path / file)
+    change(tmp_path, "transforms.json", frame=1, file_path=name)
+    change(tmp_path, "transforms.json", train_filenames=["images/0.png", name.replace("\\", "/").removeprefix("./")])
+    views = load_views(tmp_path)
+    assert views.names == ("images/0.png", file) and np.abs(views.stored(1)[..., :3].astype(int) - 200).max() <= 2
+
+
+def test_two_files_of_one_name_are_none(tmp_path):
+    studio(tmp_path, PIXELS, {})
+    change(tmp_path, "transforms.json", frame=1, file_path="images/A.png")
+    change(tmp_path, "transforms.json", train_filenames=None)
+    assert (tmp_path / "images" / "a.PNG").write_bytes(b"x") and (tmp_path / "images" / "a.pnG").write_bytes(b"x")
+    (tmp_path / "images" / "3.png").write_bytes((tmp_path / "images" / "0.png").read_bytes())
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    content["frames"].append(content["frames"][0] | {"file_path": "images/3.png"})
+    write_json(tmp_path / "transforms.json", **content)
+    assert load_views(tmp_path).names == ("images/2.png", "images/3.png")
+
+
+def test_views_for_a_validation_are_test_views_where_there_are_no_others(tmp_path):
+    studio(tmp_path, PIXELS, {}, views=5)
+    names = [f"images/{i}.png" for i in range(5)]
+    change(tmp_path, "transforms.json", train_filenames=names[:3], val_filenames=[f"./{n}" for n in names[3:]])
+    assert load_views(tmp_path, "test").names == load_views(tmp_path, "val").names == tuple(names[3:])
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    for split, frames in (("train", content["frames"][:3]), ("val", content["frames"][3:])):
+        write_json(tmp_path / f"transforms_{split}.json", frames=frames, **PIXELS)
+    assert load_views(tmp_path).names == tuple(names[:3])
+    assert load_views(tmp_path, "test").names == load_views(tmp_path, "val").names == tuple(names[3:])
+    (tmp_path / "transforms_val.json").rename(tmp_path / "transforms_test.json")
+    assert load_views(tmp_path, "test").names == tuple(names[3:])
+
+
+# -- missing images ---------------------------------------------------------------------------------------------------
+
+
+def test_views_without_images_are_left_out(tmp_path):
+    studio(tmp_path, PIXELS, {}, views=12)
+    change(tmp_path, "transforms.json", train_filenames=None)
+    for i in (3, 4, 5, 9):
+        (tmp_path / "images" / f"{i}.png").unlink()
+    views = load_views(tmp_path)
+    assert views.names == tuple(f"images/{i}.png" for i in (1, 2, 6, 7, 10, 11))
+    np.testing.assert_array_equal(views.origins[:, 0], [1, 2, 6, 7, 10, 11])
+    assert views.notes == (
+        'transforms.json: 4 of 10 images of the split "train" do not exist and are left out: images/3.png, '
+        "images/4.png, images/5.png and 1 more",
+    )
+    assert load_views(tmp_path, most=3).names == tuple(f"images/{i}.png" for i in (1, 6, 10))
+    for i in (0, 8):
+        (tmp_path / "images" / f"{i}.png").unlink()
+    with pytest.raises(
+        ViewsError, match=r'0\.png: no such image, transforms.json names it; 2 of 2 images of the split "t'
+    ):
+        load_views(tmp_path, "test")
+    session = FieldSession.load(llvm, tmp_path)
+    assert not session.has_test_views and len(session.held_out) == 6
+    assert len(session.notes) == 2 and session.notes[1].startswith("no test views: ")
+    for i in (1, 2, 6, 7, 10):
+        (tmp_path / "images" / f"{i}.png").unlink()
+    with pytest.raises(ViewsError, match=r'9 of 10 images of the split "train" do not exist, at least 2 are needed$'):
+        load_views(tmp_path)
+
+
+# -- masks ------------------------------------------------------------------------------------------------------------
+
+
+def masked(folder, name="mask.png"):
+    """Three views with the same mask."""
+    studio(folder, PIXELS, {"mask_path": name} if name else {})
+    return load_views(folder)
+
+
+@pytest.mark.parametrize("colour", [0, 255, None])
+def test_masks_in_an_alpha_channel(tmp_path, colour):
+    """Whatever the colours are, of a cut-out photograph, too."""
+    counts = np.random.default_rng(0).random(SIZE) < 0.6
+    image = np.random.default_rng(1).integers(0, 256, (*SIZE, 4), np.uint8)
+    if colour is not None:
+        image[..., :3] = colour
+    image[..., 3] = 255 * counts
+    Image.fromarray(image).save(tmp_path / "mask.png")
+    views = masked(tmp_path)
+    np.testing.assert_array_equal(views.counted(1), counts)
+    assert views.notes == ("the masks of 3 images are those of their alpha",)
+    image[..., 3], image[..., :3] = 255, 255 * counts[..., None]  # an alpha of 1 holds nothing
+    Image.fromarray(image).save(tmp_path / "mask.png")
+    views = masked(tmp_path)
+    np.testing.assert_array_equal(views.counted(1), counts)
+    assert not views.notes
+
+
+def test_masks_of_other_formats(tmp_path):
+    counts = np.zeros(SIZE, bool)
+    counts[:, 3:] = True
+    Image.fromarray(np.uint8(255 * counts)).save(tmp_path / "mask.jpg", quality=30)
+    assert np.array(Image.open(tmp_path / "mask.jpg"))[~counts].max() > 0  # black is not exact
+    Image.fromarray(np.uint16(counts)).save(tmp_path / "sixteen.png")
+    Image.fromarray(counts).save(tmp_path / "bits.png")
+    palette = Image.fromarray(np.uint8(counts), "P")
+    palette.putpalette([0, 0, 0, 128, 0, 0])
+    palette.save(tmp_path / "labels.png")
+    for name in ("mask.jpg", "sixteen.png", "bits.png", "labels.png"):
+        np.testing.assert_array_equal(masked(tmp_path, name).counted(0), counts, err_msg=name)
+    Image.fromarray(np.uint8(255 * counts)).save(tmp_path / "images" / "dynamic_mask_1.png")
+    views = masked(tmp_path, "")
+    np.testing.assert_array_equal(views.counted(1), ~counts)  # instant-ngp's are white where nothing counts
+    assert views.counted(0).all()
+
+
+# -- keys that are not used -------------------------------------------------------------------------------------------
+
+#: Keys of nerfstudio, instant-ngp, BlenderNeRF and Blender's data that change nothing here, and others.
+OF_FILES = {
+    "aabb_scale": 16, "scale": 0.33, "offset": [0.5, 0.5, 0.5], "up": [0, 0, 1], "n_frames": 2, "render_aabb": [[0], 1],
+    "white_transparent": True, "enable_depth_loading": True, "integer_depth_scale": 0.001, "fisheye_crop_radius": 3,
+    "orientation_override": "none", "ply_file_path": "sparse_pc.ply", "rolling_shutter": [0, 0, 0], "from_na": False,
+}  # fmt: skip
+OF_FRAMES = {"sharpness": 20.0, "rotation": 0.01, "colmap_im_id": 3, "depth_file_path": "d.png", "depth_path": "e"}
+
+
+def test_keys_that_are_not_used_are_named(tmp_path):
+    for key, value in OF_FILES.items():
+        assert load_views(studio(tmp_path, PIXELS | {key: value}, {})).notes == (
+            f"transforms.json: keys that are not used: {key}",
+        )
+    for key, value in OF_FRAMES.items():
+        assert load_views(studio(tmp_path, PIXELS, {key: value})).notes == (
+            f"transforms.json: keys that are not used: frames.{key}",
+        )
+    (note,) = load_views(studio(tmp_path, PIXELS | OF_FILES | ZERO | {"k1": 0.2}, OF_FRAMES | LISTED)).notes[:1]
+    assert note.split(": ")[-1].split(", ") == [
+        *(f"frames.{key}" for key in OF_FRAMES), *OF_FILES, "distortion_params", "k1"
+    ]  # fmt: skip
+    used = PIXELS | ANGLES | CENTRE | LENS | {"w": 8, "h": 6, "camera_model": "OPENCV", "is_fisheye": False}
+    used |= {"applied_transform": np.eye(4)[:3].tolist(), "applied_scale": 2.0, "aabb": [[0, 0, 0], [1, 1, 1]]}
+    assert load_views(studio(tmp_path, used, {})).notes == ("all images have a lens distortion and were undistorted",)
+    # Of a key that only a frame of another split has, nothing is said
+    change(tmp_path, "transforms.json", frame=1, sharpness=3, **dict.fromkeys(["mask_path"]))
+    change(tmp_path, "transforms.json", train_filenames=["images/0.png", "images/2.png"])
+    assert len(load_views(tmp_path).notes) == 1
