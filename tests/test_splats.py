@@ -253,6 +253,24 @@ def test_other_sog_files_are_refused(tmp_path, rng, change, message):
         Splats.read(sog(tmp_path, gaussians(rng), change, tmp_path / "s.sog"))
 
 
+def test_sog_files_that_lack_something_are_refused(tmp_path, rng):
+    """Whatever key it is; without the key "shN", colours have the degree 0."""
+    from mi_diffind.splats import Splats, SplatsError
+
+    path = sog(tmp_path, gaussians(rng))
+    meta = json.loads(path.read_text())
+    assert sum(len(part) for part in meta.values() if isinstance(part, dict)) == 12
+    for key, part in meta.items():
+        for name in (None, *(part if isinstance(part, dict) else ())):
+            changed = {k: v for k, v in meta.items() if k != key} | ({} if name is None else {key: without(part, name)})
+            path.write_text(json.dumps(changed))
+            if (key, name) == ("shN", None):
+                assert Splats.read(path).colours.shape == (COUNT, 1, 3)
+            else:
+                with pytest.raises(SplatsError, match=name or ("SOG version" if key == "version" else key)):
+                    Splats.read(path)
+
+
 def test_damaged_archives_are_refused(tmp_path, rng):
     from mi_diffind.splats import Splats, SplatsError
 

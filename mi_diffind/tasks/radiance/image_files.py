@@ -67,12 +67,15 @@ def image_file(root: Path, name: str, file: Path) -> Path:
 
 
 def _in_other_case(path: Path) -> Path | None:
-    """Return the only path in a folder that differs from ``path`` in upper and lower case at most, or ``None``."""
+    """Return the only path that differs from ``path`` in upper and lower case at most, or ``None``."""
+    folder = path.parent
+    if not folder.is_dir() and folder.name:
+        folder = _in_other_case(folder)
     try:
-        names = _names_of(path.parent, path.parent.stat().st_mtime_ns).get(path.name.casefold(), [])
+        names = _names_of(folder, folder.stat().st_mtime_ns).get(path.name.casefold(), []) if folder else []
     except (OSError, ValueError):
         return None
-    return path.with_name(names[0]) if len(names) == 1 else None
+    return folder / names[0] if len(names) == 1 else None
 
 
 @functools.lru_cache(maxsize=4)

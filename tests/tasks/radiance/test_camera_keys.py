@@ -181,6 +181,7 @@ def test_poses_of_mitsuba(tmp_path):
         (".\\images\\a", "images/a.png"), ("images/a.png", "images/a.PNG"), ("images/a.JPG", "images/a.jpg"),
         ("images/a", "images/A.JPG"), ("images/a.jpg", "images/a.jpeg"), ("images/A.JPEG", "images/a.jpg"),
         ("images/a.b", "images/a.b.png"), ("images/./a.png", "images/a.png"),
+        ("Images\\A.png", "images/a.png"),
     ],
 )  # fmt: skip
 def test_spellings_of_names(tmp_path, name, file):
