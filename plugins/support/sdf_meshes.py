@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
+from mi_diffind import mitsuba_versions
 from mi_diffind.errors import DiffindError
 from mi_diffind.files import is_within
 from mi_diffind.tables import TableError
@@ -25,6 +26,13 @@ from .stock import Kept
 
 #: Share of open edges up to which a mesh counts as closed: a fit closes holes, but not a surface without an inside.
 OPEN = 0.01
+
+#: Share of triangles that may face inwards: those of a distance field all face outwards.
+INWARDS = 0.01
+
+#: Mean angle between shading normals and triangles up to which a field stands for both, in degrees: that of a ball of
+#: 320 triangles with the normals of a sphere.
+SMOOTH_DEG = 5.2
 
 
 def to_mesh(props: mi.Properties) -> None:
@@ -66,6 +74,47 @@ def closed_mesh_of(path: Path, folder: Path, index: int = 0) -> Path:
     if np.count_nonzero(balance) > OPEN * len(balance):
         raise Kept(f"encloses no solid: {np.count_nonzero(balance):,} of {len(balance):,} edges are open")
     return path
+
+
+def check_normals(props: mi.Properties, source: Path) -> None:
+    """Raise :class:`~.stock.Kept` for a mesh whose normals a distance field does not have, as Mitsuba renders them.
+
+    ``props``: properties of the shape; ``source``: the file of its mesh. The triangles have to face outwards, and the
+    shading normals, of the file or smoothed by Mitsuba, have to be near those of the triangles.
+    """
+    mesh = load_mesh(source)
+    linear = np.array(props.get("to_world", mi.ScalarTransform4f()).matrix)[:3, :3]
+    inwards = mesh.turned / len(mesh.faces)
+    if (np.linalg.det(linear) < 0) != (props.get("flip_normals", False) is True):
+        inwards = 1 - inwards
+    if inwards > INWARDS:
+        raise Kept(f"is wound inside out: {inwards:.0%} of its triangles face inwards, those of fields outwards")
+    if props.get("face_normals", False) is True:
+        return
+    keys = [key for key in ("filename", "shape_index", "face_normals") if key in props]
+    angle = _smoothness(mi.load_dict({"type": props.plugin_name(), **{key: props[key] for key in keys}}))
+    if angle > SMOOTH_DEG:
+        raise Kept(
+            f"has shading normals {angle:.0f}° from those of its triangles, distance fields have the latter: "
+            f"face_normals true renders it without"
+        )
+
+
+def _smoothness(mesh: mi.Mesh) -> float:
+    """Return the mean angle over a mesh's area between its shading normals and those of its triangles, in degrees."""
+    if not mesh.has_vertex_normals():
+        return 0.0
+    vertices, faces = mitsuba_versions.triangles(mesh)
+    normals = mitsuba_versions.vertex_normals(mesh)[faces].astype(np.float64)
+    a, b, c = np.moveaxis(vertices[faces].astype(np.float64), 1, 0)
+    face = np.cross(b - a, c - a)
+    areas = np.linalg.norm(face, axis=1)
+    angles = 0
+    for weights in ((4, 1, 1), (1, 4, 1), (1, 1, 4)):  # exact for quadratic functions on a triangle
+        shading = np.einsum("i,nij->nj", weights, normals)
+        cosines = (shading * face).sum(1) / np.maximum(np.linalg.norm(shading, axis=1) * areas, 1e-300)
+        angles = angles + np.arccos(np.clip(cosines, -1, 1)) / 3
+    return float(np.degrees((angles * areas).sum() / areas.sum()))
 
 
 @functools.lru_cache
