@@ -8,31 +8,34 @@ import numpy as np
 
 from . import compat, scenes
 
-#: Longest side of the pictures in pixels, side of a tile, independent passes of each scene, samples a pixel in a pass.
-SIDE, TILE, PASSES, SAMPLES = 128, 8, 8, 4
+#: Longest side of the pictures in pixels, independent passes of each scene, and samples a pixel in a pass.
+SIDE, PASSES, SAMPLES = 128, 16, 4
 
-#: Share of checks of equal scenes in which a tile seems to differ.
+#: Side of the smallest tiles in pixels. Each next size is four times larger, up to the whole picture.
+TILE = 8
+
+#: Share of checks of equal scenes in which a tile of any size seems to differ.
 FALSE_ALARMS = 0.01
 
-#: Share of the picture's mean brightness below which a tile counts as dark: its difference is relative to that.
+#: Brightness of a tile, relative to the picture's, below which its difference is relative to this.
 DARK = 0.1
 
 
 @dataclass(frozen=True)
 class PictureCheck:
-    """Difference of two pictures in tiles, all relative to the brightness of the tile before.
+    """Difference of two pictures in tiles of all sizes, relative to the brightness of the tile before.
 
-    ``differs``: a tile differs by more than noise explains; ``difference``: root mean square over the tiles without
-    noise; ``noise``: its standard error; ``seen``: the difference that nine of ten checks would see in half of the
-    tiles; ``worst``: ``x, y, width, height`` in pixels of the tile that differs most beyond noise, by ``worst_change``
-    (−0.5: half as bright); ``width``, ``height``, ``spp`` of the pictures; ``not_finite``: pixels that are not finite,
-    before and after.
+    ``differs``: a tile differs by more than noise explains; ``difference``: root mean square over the smallest tiles,
+    without noise; ``noise``: their standard error; ``seen``: differences that nine of ten checks see, in the smallest
+    tiles (half of them) and of the whole picture; ``worst``: ``x, y, width, height`` in pixels of the tile that differs
+    most beyond noise, and ``worst_change`` by how much (−0.5: half as bright); ``width``, ``height``, ``spp`` of the
+    pictures; ``not_finite``: pixels that are not finite, before and after.
     """
 
     differs: bool
     difference: float
     noise: float
-    seen: float
+    seen: tuple[float, float]
     worst: tuple[int, int, int, int]
     worst_change: float
     width: int
@@ -46,43 +49,45 @@ class PictureCheck:
             return f"differs: {self.not_finite[1]} pixels are not finite, {self.not_finite[0]} were before ({picture})"
         if not self.differs:
             return (
-                f"equal within noise ({picture}): tiles vary by {self.noise:.2g} of their brightness, "
-                f"a difference of {self.seen:.2g} would have been seen in half of them"
+                f"equal within noise ({picture}), which would have shown a difference of {self.seen[0]:.1%} "
+                f"in a tile of {TILE} x {TILE}, of {self.seen[1]:.1%} in the whole"
             )
         x, y, width, height = self.worst
         brighter = "brighter" if self.worst_change > 0 else "darker"
         return (
-            f"differs by {self.difference:.2g} of the brightness of a tile, noise is {self.noise:.2g} ({picture}); "
-            f"most in the {width} x {height} pixels at ({x}, {y}): {abs(self.worst_change):.0%} {brighter}"
+            f"differs by {self.difference:.1%} in a tile of {TILE} x {TILE} beside {self.noise:.1%} of noise "
+            f"({picture}); most in the {width} x {height} pixels at ({x}, {y}): {abs(self.worst_change):.1%} {brighter}"
         )
 
 
 def check_picture(before, after) -> PictureCheck:
     """Render two loaded scenes by the first sensor, small and with independent random numbers, and compare them.
 
-    The means of a tile over the passes of each side are compared by Welch's t-test with Bonferroni's correction for the
-    number of tiles; passes are independent, which neighbouring pixels of one pass are not.
+    The means of tiles over the passes of each side are compared by Welch's t-test, with Bonferroni's correction for the
+    number of tiles: passes are independent, which neighbouring pixels of one pass are not.
     """
     from scipy.stats import t as student
 
-    old, new = (_passes(scene, first) for scene, first in ((before, 0), (after, PASSES)))
+    old, new = _passes(before, 0), _passes(after, PASSES)
     bad = [~np.isfinite(side).all(axis=0) for side in (old, new)]
-    width, height = old.shape[2], old.shape[1]
-    a, b = (_tiles(np.where(bad[0] | bad[1], 0, side)) for side in (old, new))
-    brightness = a.mean(axis=0)
-    brightness = np.maximum(brightness, max(DARK * brightness.mean(), 1e-30))
-    change = (b.mean(axis=0) - a.mean(axis=0)) / brightness
-    variance = (a.var(axis=0, ddof=1) + b.var(axis=0, ddof=1)) / PASSES / brightness**2
-    error = np.sqrt(variance + 1e-14)  # rounding alone
-    limit = student.isf(FALSE_ALARMS / 2 / change.size, 2 * PASSES - 2)
-    row, column = np.unravel_index(int(np.argmax(np.abs(change) - limit * error)), change.shape)
-    place = (column * TILE, row * TILE)
+    old, new = (np.where(bad[0] | bad[1], 0, side) for side in (old, new))
+    height, width = bad[0].shape
+    darkest, freedom, sizes = max(DARK * old.mean(), 1e-30), 2 * PASSES - 2, [TILE]
+    while sizes[-1] < max(width, height):
+        sizes.append(4 * sizes[-1])
+    tests = [(size, *_changes(_tiles(old, size), _tiles(new, size), darkest)) for size in sizes]
+    limit = student.isf(FALSE_ALARMS / 2 / sum(change.size for _, change, _ in tests), freedom)
+    margins = [(np.abs(change) - limit * error, size, change) for size, change, error in tests]
+    margin, size, change = max(margins, key=lambda one: one[0].max())
+    row, column = np.unravel_index(int(margin.argmax()), margin.shape)
+    x, y = int(column) * size, int(row) * size
+    (_, first, error), (_, _, whole) = tests[0], tests[-1]
     return PictureCheck(
-        differs=bool((np.abs(change) > limit * error).any()),
-        difference=float(np.sqrt(max(0.0, np.mean(change**2 - variance)))),
-        noise=float(np.sqrt(variance.mean())),
-        seen=float(np.median(error) * (limit + student.isf(0.1, 2 * PASSES - 2))),
-        worst=(*map(int, place), min(TILE, width - int(place[0])), min(TILE, height - int(place[1]))),
+        differs=bool(margin.max() > 0),
+        difference=float(np.sqrt(max(0.0, np.mean(first**2 - error**2)))),
+        noise=float(np.sqrt(np.mean(error**2))),
+        seen=tuple(float(np.median(e) * (limit + student.isf(0.1, freedom))) for e in (error, whole)),
+        worst=(x, y, min(size, width - x), min(size, height - y)),
         worst_change=float(change[row, column]),
         width=width,
         height=height,
@@ -91,8 +96,16 @@ def check_picture(before, after) -> PictureCheck:
     )
 
 
+def _changes(old: np.ndarray, new: np.ndarray, darkest: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the relative change of each tile and its standard error, from tiles ``(passes, rows, columns)``."""
+    brightness = np.maximum(old.mean(axis=0), darkest)
+    variance = (old.var(axis=0, ddof=1) + new.var(axis=0, ddof=1)) / PASSES
+    rounding = 1e-7
+    return (new.mean(axis=0) - old.mean(axis=0)) / brightness, np.sqrt(variance) / brightness + rounding
+
+
 def _passes(scene, first: int) -> np.ndarray:
-    """Return the brightness of each pass ``(passes, height, width)``; ``first`` is the seed of the first pass."""
+    """Return the brightness of each pass, ``(passes, height, width)``; ``first`` is the seed of the first one."""
     width, height = scenes.film_size(scene)
     shrink = min(1.0, SIDE / max(width, height))
     size = (max(1, round(shrink * n)) for n in (width, height))
@@ -101,9 +114,9 @@ def _passes(scene, first: int) -> np.ndarray:
     return np.stack([scenes.colour_channels(image).mean(axis=-1) for image in images])
 
 
-def _tiles(images: np.ndarray) -> np.ndarray:
-    """Return the means of the tiles of images ``(n, height, width)``; those at the edges may be smaller."""
-    rows, columns = (np.arange(0, n, TILE) for n in images.shape[1:])
+def _tiles(images: np.ndarray, size: int) -> np.ndarray:
+    """Return the means of square tiles of images ``(n, height, width)``; those at the edges may be smaller."""
+    rows, columns = (np.arange(0, n, size) for n in images.shape[1:])
     sums = np.add.reduceat(np.add.reduceat(images, rows, axis=1), columns, axis=2)
-    ones = np.add.reduceat(np.add.reduceat(np.ones(images.shape[1:]), rows, axis=0), columns, axis=1)
-    return sums / ones
+    texels = np.add.reduceat(np.add.reduceat(np.ones(images.shape[1:]), rows, axis=0), columns, axis=1)
+    return sums / texels

@@ -124,8 +124,8 @@ class NeuralDisney(Disney):
         super().parameters_changed(keys)
 
 
-#: Least ``specular`` and ``eta`` of a metal. Where the dielectric Fresnel term is 0, ``principled`` leaves out the metal's
-#: reflection, too; of a material that transmits light, it replaces 0 and 1 by these values itself.
+#: Least ``specular`` and ``eta`` of a metal. Where the dielectric Fresnel term is 0, ``principled`` leaves out the
+#: metal's reflection, too; of a material that transmits light, it replaces 0 and 1 by these values itself.
 METALS = {"specular": 1e-3, "eta": 1.001}
 
 
