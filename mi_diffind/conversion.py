@@ -269,12 +269,15 @@ def write_scene(
     content = before.change(lambda b: parsed.change(lambda a: edited_text(b, a, parsed.defines, target)))
     with replacing(path) as temporary:
         temporary.write_bytes(content)
-        written = ParsedScene(temporary)
-        states = parsed.change(with_paths), written.change(with_paths)
-        if fault := parsed.change(lambda _: difference(*states)):
-            raise SceneError(f"{parsed.path}: cannot be written as {path}, which would have {fault}")
-        if check is not None:
-            check(written)
+        try:
+            written = ParsedScene(temporary)
+            states = parsed.change(with_paths), written.change(with_paths)
+            if fault := parsed.change(lambda _: difference(*states)):
+                raise SceneError(f"{parsed.path}: cannot be written as {path}, which would have {fault}")
+            if check is not None:
+                check(written)
+        except SceneError as e:
+            raise SceneError(str(e).replace(temporary.name, Path(path).name)) from e
 
 
 def summary(conversions: Sequence[Conversion | Mapping]) -> list[str]:

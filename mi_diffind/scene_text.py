@@ -197,7 +197,7 @@ class _Editor:
             edits.append(element.edit("type", after.plugin_name()))
         children = {self.value(child, "name"): child for child in element.children}
         for key in dict.fromkeys([*before, *after]):
-            if key in before and key in after and before[key] == after[key]:
+            if key in before and key in after and _is_equal(key, before, after):
                 continue
             written = self.parameter(key, after[key]) if key in after else ""
             if key in before:
@@ -256,6 +256,18 @@ def edited_text(before, after, defines: dict[str, str], target: Path) -> bytes:
     return _Editor(before, after, defines, target).text().encode("latin-1")
 
 
+def _is_equal(key: str, a, b) -> bool:
+    """Return whether two properties are equal. Colours compare by component, and no two transforms as unequal."""
+    pair = mi.Properties(), mi.Properties()
+    for one, props in zip(pair, (a, b), strict=True):
+        one[key] = props[key]
+    return pair[0] == pair[1]
+
+
+def _shown(value) -> str:
+    return " ".join(str(value).split())
+
+
 def with_paths(state):
     """Return a copy of a parsed scene in which the paths of files that exist are absolute."""
     state = compat.copy_parsed(state)[1]
@@ -276,14 +288,14 @@ def difference(before, after) -> str:
     """
     pairs = list(zip(compat.properties_of(before), compat.properties_of(after), strict=False))
     for index, (a, b) in enumerate(pairs):
-        name = f'{b.plugin_name()} "{b.id() or compat.parsed_place(after, index)}"'
+        name = f'{b.plugin_name()} "{b.id() or Path(compat.parsed_place(after, index)).name}"'
         if (a.plugin_name(), a.id()) != (b.plugin_name(), b.id()):
             return f'{name} in place of {a.plugin_name()} "{a.id()}"'
         for key in dict.fromkeys([*a, *b]) if a != b else ():
             if key not in a or key not in b:
                 return f'{name} {"lacks" if key in a else "has"} "{key}"'
-            if a[key] != b[key] and compat.property_kind(a, key) != "object":
-                return f"{name} has {key} {b[key]} in place of {a[key]}"
+            if not _is_equal(key, a, b) and compat.property_kind(a, key) != "object":
+                return f"{name} has {key} {_shown(b[key])} in place of {_shown(a[key])}"
     counts = [len(compat.properties_of(state)) for state in (before, after)]
     if counts[0] != counts[1]:
         return f"{counts[1]} objects in place of {counts[0]}"
