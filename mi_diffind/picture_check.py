@@ -46,7 +46,8 @@ class PictureCheck:
     def __str__(self) -> str:
         picture = f"{self.width} x {self.height} pixels, {self.spp} spp"
         if self.not_finite[0] != self.not_finite[1]:
-            return f"differs: {self.not_finite[1]} pixels are not finite, {self.not_finite[0]} were before ({picture})"
+            before, after = self.not_finite
+            return f"differs: values are not finite in {after} pixels, were not in {before} before ({picture})"
         if not self.differs:
             return (
                 f"equal within noise ({picture}), which would have shown a difference of {self.seen[0]:.1%} "
@@ -61,14 +62,18 @@ class PictureCheck:
 
 
 def check_picture(before, after) -> PictureCheck:
-    """Render two loaded scenes by the first sensor, small and with independent random numbers, and compare them.
+    """Render two loaded scenes by the first sensor, small and with independent random numbers, and compare them."""
+    return compare_passes(_passes(before, 0), _passes(after, PASSES))
+
+
+def compare_passes(old: np.ndarray, new: np.ndarray) -> PictureCheck:
+    """Compare independent passes of two pictures, ``(PASSES, height, width)`` each.
 
     The means of tiles over the passes of each side are compared by Welch's t-test, with Bonferroni's correction for the
     number of tiles: passes are independent, which neighbouring pixels of one pass are not.
     """
     from scipy.stats import t as student
 
-    old, new = _passes(before, 0), _passes(after, PASSES)
     bad = [~np.isfinite(side).all(axis=0) for side in (old, new)]
     old, new = (np.where(bad[0] | bad[1], 0, side) for side in (old, new))
     height, width = bad[0].shape
