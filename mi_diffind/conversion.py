@@ -58,12 +58,19 @@ class Conversion:
 
 
 class Conversions(list):
-    """List of all :class:`Conversion`, and the ``check`` of the pictures before and after, ``None`` without one."""
+    """List of all :class:`Conversion`, and the ``check`` of the pictures before and after, ``None`` without one.
+
+    ``unchecked`` is the reason why there is none although there should be.
+    """
 
     check: PictureCheck | None = None
+    unchecked: str = ""
 
     def __str__(self) -> str:
-        return "\n".join([*summary(self), *([f"check       {self.check}"] if self.check else [])])
+        lines = summary(self) if any(c.learned for c in self) else ["replaced    nothing", *summary(self)]
+        if self.check or self.unchecked:
+            lines.append(f"check       {self.check or self.unchecked}")
+        return "\n".join(lines)
 
 
 def words() -> dict[str, plugins.Plugin]:
@@ -115,22 +122,19 @@ def convert(
         conversions = Conversions(replace_stock(parsed, groups, folder, progress))
 
         def render(written: ParsedScene) -> None:
-            if check and any(c.learned for c in conversions):
-                conversions.check = _check(ParsedScene(scene, parsed.defines), written)
+            if not check or not any(c.learned for c in conversions):
+                return
+            pair = ParsedScene(scene, parsed.defines).load(), written.load()
+            if all(loaded.sensors() and loaded.integrator() for loaded in pair):
+                conversions.check = check_picture(*pair)
+            else:
+                conversions.unchecked = "none: the scene has no sensor or no integrator"
 
         write_scene(parsed, output, render)
     finally:
         with contextlib.suppress(OSError):  # does not exist, or is not empty
             folder.rmdir()
     return conversions
-
-
-def _check(before: ParsedScene, after: ParsedScene) -> PictureCheck | None:
-    """Return the check of two scenes, ``None`` if they have no sensor or no integrator to be rendered with."""
-    scenes = before.load(), after.load()
-    if not all(scene.sensors() and scene.integrator() for scene in scenes):
-        return None
-    return check_picture(*scenes)
 
 
 def replace_stock(

@@ -17,6 +17,9 @@ TILE = 8
 #: Share of checks of equal scenes in which a tile of any size seems to differ.
 FALSE_ALARMS = 0.01
 
+#: Relative difference of a tile that does not count: 8 bits do not show it.
+LEAST = 1e-3
+
 #: Brightness of a tile, relative to the picture's, below which its difference is relative to this.
 DARK = 0.1
 
@@ -82,7 +85,7 @@ def compare_passes(old: np.ndarray, new: np.ndarray) -> PictureCheck:
         sizes.append(4 * sizes[-1])
     tests = [(size, *_changes(_tiles(old, size), _tiles(new, size), darkest)) for size in sizes]
     limit = student.isf(FALSE_ALARMS / 2 / sum(change.size for _, change, _ in tests), freedom)
-    margins = [(np.abs(change) - limit * error, size, change) for size, change, error in tests]
+    margins = [(np.abs(change) - np.maximum(limit * error, LEAST), size, change) for size, change, error in tests]
     margin, size, change = max(margins, key=lambda one: one[0].max())
     row, column = np.unravel_index(int(margin.argmax()), margin.shape)
     x, y = int(column) * size, int(row) * size
@@ -91,7 +94,7 @@ def compare_passes(old: np.ndarray, new: np.ndarray) -> PictureCheck:
         differs=bool(margin.max() > 0),
         difference=float(np.sqrt(max(0.0, np.mean(first**2 - error**2)))),
         noise=float(np.sqrt(np.mean(error**2))),
-        seen=tuple(float(np.median(e) * (limit + student.isf(0.1, freedom))) for e in (error, whole)),
+        seen=tuple(max(LEAST, float(np.median(e) * (limit + student.isf(0.1, freedom)))) for e in (error, whole)),
         worst=(x, y, min(size, width - x), min(size, height - y)),
         worst_change=float(change[row, column]),
         width=width,
@@ -105,8 +108,7 @@ def _changes(old: np.ndarray, new: np.ndarray, darkest: float) -> tuple[np.ndarr
     """Return the relative change of each tile and its standard error, from tiles ``(passes, rows, columns)``."""
     brightness = np.maximum(old.mean(axis=0), darkest)
     variance = (old.var(axis=0, ddof=1) + new.var(axis=0, ddof=1)) / PASSES
-    rounding = 1e-7
-    return (new.mean(axis=0) - old.mean(axis=0)) / brightness, np.sqrt(variance) / brightness + rounding
+    return (new.mean(axis=0) - old.mean(axis=0)) / brightness, np.sqrt(variance) / brightness
 
 
 def _passes(scene, first: int) -> np.ndarray:

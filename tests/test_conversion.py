@@ -181,7 +181,8 @@ def test_by_default_only_textures_are_learned(mi_rgb, folder):
     assert [task for task, _ in fits] == ["texture"] and str(result).splitlines()[-1] == f"check       {result.check}"
     types = scenes.ParsedScene(folder / "new.xml").change(lambda state: [n.props.plugin_name() for n in state.nodes])
     assert {"principled", "ply", "path", "neural_texture"} <= set(types) and "bitmap" not in types
-    assert conversion.convert(folder / "scene.xml", folder / "same.xml", learn=[]).check is None
+    same = conversion.convert(folder / "scene.xml", folder / "same.xml", learn=[])
+    assert same.check is None and str(same) == "replaced    nothing"
     assert (folder / "same.xml").read_bytes() == (folder / "scene.xml").read_bytes()
 
 

@@ -64,6 +64,14 @@ def test_large_pictures_and_numbers_that_are_not_finite(same, monkeypatch):
     assert str(check) == "differs: values are not finite in 1 pixels, were not in 0 before (64 x 48 pixels, 64 spp)"
 
 
+def test_rounding_is_no_difference():
+    """Two pictures without noise that differ by less than 8 bits show; the power is then stated as that."""
+    old = np.ones((picture_check.PASSES, 9, 9))
+    check = picture_check.compare_passes(old, 1.0009 * old)
+    assert not check.differs and check.seen == (picture_check.LEAST, picture_check.LEAST)
+    assert picture_check.compare_passes(old, 1.0011 * old).differs
+
+
 def test_false_alarms():
     """Of 300 pairs of passes with the noise of lamps (lognormal, correlated neighbours), few seem to differ."""
     rng, alarms = np.random.default_rng(2), 0
