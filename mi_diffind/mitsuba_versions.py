@@ -113,9 +113,3 @@ def triangles(mesh) -> tuple:
     names = before if hasattr(mesh, before[0]) else ("positions", "faces")
     positions, faces = (getattr(mesh, name)().numpy().reshape(-1, 3) for name in names)
     return positions, faces
-
-
-def vertex_normals(mesh):
-    """Return the shading normals at the vertices of a ``mi.Mesh``, ``(n, 3)``; the mesh must have them."""
-    name = "vertex_normals_buffer" if hasattr(mesh, "vertex_normals_buffer") else "normals"
-    return getattr(mesh, name)().numpy().reshape(-1, 3)

@@ -9,6 +9,7 @@ import shutil
 import tempfile
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import trimesh
@@ -102,19 +103,16 @@ def check_normals(props: mi.Properties, source: Path) -> None:
 
 def _smoothness(mesh: mi.Mesh) -> float:
     """Return the mean angle over a mesh's area between its shading normals and those of its triangles, in degrees."""
-    if not mesh.has_vertex_normals():
-        return 0.0
     vertices, faces = mitsuba_versions.triangles(mesh)
-    normals = mitsuba_versions.vertex_normals(mesh)[faces].astype(np.float64)
     a, b, c = np.moveaxis(vertices[faces].astype(np.float64), 1, 0)
-    face = np.cross(b - a, c - a)
-    areas = np.linalg.norm(face, axis=1)
-    angles = 0
-    for weights in ((4, 1, 1), (1, 4, 1), (1, 1, 4)):  # exact for quadratic functions on a triangle
-        shading = np.einsum("i,nij->nj", weights, normals)
-        cosines = (shading * face).sum(1) / np.maximum(np.linalg.norm(shading, axis=1) * areas, 1e-300)
-        angles = angles + np.arccos(np.clip(cosines, -1, 1)) / 3
-    return float(np.degrees((angles * areas).sum() / areas.sum()))
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    index, angles = dr.arange(mi.UInt32, len(faces)), 0
+    for place in ((1 / 6, 1 / 6), (2 / 3, 1 / 6), (1 / 6, 2 / 3)):  # exact for quadratic functions on a triangle
+        pi = dr.zeros(mi.PreliminaryIntersection3f, len(faces))
+        pi.t, pi.prim_index, pi.prim_uv = 1, index, mi.Point2f(*place)
+        si = mesh.compute_surface_interaction(dr.zeros(mi.Ray3f, len(faces)), pi)
+        angles = angles + np.degrees(dr.safe_acos(dr.dot(si.n, si.sh_frame.n)).numpy()) / 3
+    return float((angles * areas).sum() / areas.sum())
 
 
 @functools.lru_cache
