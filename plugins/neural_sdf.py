@@ -316,7 +316,7 @@ def _from_mesh(node: StockNode) -> str:
     except RuntimeError as e:
         raise Kept(f"cannot be placed: {e}") from None
     source = closed_mesh_of(node.file(), node.folder, props.get("shape_index", 0))
-    check_normals(props, source)
+    smooth = check_normals(props, source)
     table = node.fit(TASK.name, source, bytes=BYTES)
     quality = f"IoU {table.measured['iou']:.4f}, normals off by {table.measured['normal_deg']:.1f}°"
     if table.measured["iou"] < LEAST_IOU or table.measured["normal_deg"] > LARGEST_ANGLE:
@@ -326,7 +326,8 @@ def _from_mesh(node: StockNode) -> str:
     for name in ("shape_index", "face_normals", "flip_normals", "flip_tex_coords"):
         if name in props:
             del props[name]
-    return f"{table.path.name}, {quality}"
+    lost = f", those of smooth shading, {smooth:.1f}° from the triangles, are lost" if smooth >= 0.05 else ""
+    return f"{table.path.name}, {quality}{lost}"
 
 
 PLUGIN = Plugin(

@@ -257,7 +257,8 @@ def test_shading_normals(mi_rgb, tmp_path):
             with pytest.raises(Kept, match=f"has shading normals {angle}° from those of its triangles"):
                 sdf_meshes.check_normals(props, tmp_path / name)
             props["face_normals"] = True
-        sdf_meshes.check_normals(props, tmp_path / name)
+        lost = sdf_meshes.check_normals(props, tmp_path / name)
+        assert lost == pytest.approx(2.54 if name == "fine.ply" else 0, abs=0.02)
 
 
 def test_unknown_groups_are_refused(mi_rgb, folder):

@@ -31,9 +31,9 @@ OPEN = 0.01
 #: Share of triangles that may face inwards: those of a distance field all face outwards.
 INWARDS = 0.01
 
-#: Mean angle between shading normals and triangles up to which a field stands for both, in degrees: that of a ball of
-#: 320 triangles with the normals of a sphere.
-SMOOTH_DEG = 5.2
+#: Mean angle between shading normals and triangles up to which a field stands for both, in degrees. A ball of polished
+#: metal under the sun is 24% darker with triangles of 5.1°, and equal within 0.1% with those of 2.5° (4% in blocks).
+SMOOTH_DEG = 3.0
 
 
 def to_mesh(props: mi.Properties) -> None:
@@ -77,10 +77,11 @@ def closed_mesh_of(path: Path, folder: Path, index: int = 0) -> Path:
     return path
 
 
-def check_normals(props: mi.Properties, source: Path) -> None:
-    """Raise :class:`~.stock.Kept` for a mesh whose normals a distance field does not have, as Mitsuba renders them.
+def check_normals(props: mi.Properties, source: Path) -> float:
+    """Return the mean angle between the shading normals of a mesh and those of its triangles, in degrees.
 
-    ``props``: properties of the shape; ``source``: the file of its mesh. The triangles have to face outwards, and the
+    ``props``: properties of the shape; ``source``: the file of its mesh. Raises :class:`~.stock.Kept` for a mesh whose
+    normals, as Mitsuba renders them, a distance field does not have: the triangles have to face outwards, and the
     shading normals, of the file or smoothed by Mitsuba, have to be near those of the triangles.
     """
     mesh = load_mesh(source)
@@ -91,7 +92,7 @@ def check_normals(props: mi.Properties, source: Path) -> None:
     if inwards > INWARDS:
         raise Kept(f"is wound inside out: {inwards:.0%} of its triangles face inwards, those of fields outwards")
     if props.get("face_normals", False) is True:
-        return
+        return 0.0
     keys = [key for key in ("filename", "shape_index", "face_normals") if key in props]
     angle = _smoothness(mi.load_dict({"type": props.plugin_name(), **{key: props[key] for key in keys}}))
     if angle > SMOOTH_DEG:
@@ -99,6 +100,7 @@ def check_normals(props: mi.Properties, source: Path) -> None:
             f"has shading normals {angle:.0f}° from those of its triangles, distance fields have the latter: "
             f"face_normals true renders it without"
         )
+    return angle
 
 
 def _smoothness(mesh: mi.Mesh) -> float:
