@@ -153,9 +153,11 @@ class _Editor:
                     continue
             if element.tag in ("include", "spectrum"):
                 attribute = "filename"
-            elif element.tag != "path" and not (element.tag == "string" and _may_be_file(name, element)):
+            elif element.tag not in ("path", "string"):
                 continue
             value = self.value(element, attribute)
+            if element.tag == "string" and not _may_be_file(name, value):
+                continue
             beside = element.tag in ("include", "path") and (folder / value).exists()
             if moved := self.moved(value, folder if beside else self.origin):
                 edits.append(element.edit(attribute, moved))
@@ -167,9 +169,11 @@ class _Editor:
         name, number = self.value(element, "filename"), self.next_file
         places = (folder / name, self.origin / name, Path(str(mi.file_resolver().resolve(name))))
         file = next((place for place in places if place.is_file()), places[0]).resolve()
-        if number == len(self.files) or self.files[number] != file:
-            return None  # holds no objects, and Mitsuba does not count it
         text, root = _read(file)
+        if number == len(self.files) or self.files[number] != file:  # without objects, and Mitsuba does not count it
+            for default in (one for one in root.walk() if one.tag == "default"):
+                self.parameters.setdefault(self.value(default, "name"), self.value(default, "value"))
+            return None
         edits, needed = self.edits(root, file.parent)
         if not needed:
             return None
@@ -223,10 +227,9 @@ def _is_modern(root: _Element) -> bool:
     return not root.attributes["version"][0].strip().startswith(("0", "1"))
 
 
-def _may_be_file(name: str, element: _Element) -> bool:
+def _may_be_file(name: str, value: str) -> bool:
     """Return whether a parameter may be the name of a file, by its own name or by its value's extension."""
-    value = element.attributes["value"][0]
-    return "file" in name or "$" in value or bool(Path(value).suffix)
+    return "file" in name or bool(Path(value).suffix)
 
 
 def _applied(text: str, edits: list[_Edit], start: int, end: int) -> str:
@@ -273,7 +276,7 @@ def with_paths(state):
     state = compat.copy_parsed(state)[1]
     for props in compat.properties_of(state):
         for key in props:
-            if compat.property_kind(props, key) == "text" and props[key]:
+            if compat.property_kind(props, key) == "text" and props[key] and _may_be_file(key, props[key]):
                 file = Path(str(mi.file_resolver().resolve(props[key])))
                 if file.is_file():
                     props[key] = str(file.resolve())

@@ -34,8 +34,11 @@ def folders(tmp_path):
     (tmp_path / "a/parts/lone.xml").write_text(
         f'<bsdf version="3.0.0" type="principled" name="x" id="lone">{leaf}</bsdf>'
     )
-    (tmp_path / "a/parts/values.xml").write_text(f'{HEAD}<default name="m" value="0.25"/></scene>')
+    (tmp_path / "a/parts/values.xml").write_text(
+        f'{HEAD}<default name="m" value="0.25"/><default name="p" value="leaf"/></scene>'
+    )
     (tmp_path / "a/parts/old.xml").write_text('<scene version="0.6.0"><bsdf type="principled" id="old"/></scene>')
+    (tmp_path / "b/leaf").write_text("no texture")
     (tmp_path / "a/lamp.spd").write_text("400 1\n500 2\n700 0.3\n")
     return tmp_path / "a", tmp_path / "b"
 
@@ -102,6 +105,9 @@ def test_ids_aliases_references_and_both_sides(mi_rgb, tmp_path):
         ('<include filename="parts/values.xml"/><bsdf type="principled"><float name="metallic" value="$m"/></bsdf>',
          '<include filename="UPparts/values.xml"/><bsdf type="neural_disney"><float name="metallic" value="$m"/>'
          "</bsdf>"),
+        ('<include filename="parts/values.xml"/><texture type="bitmap"><string name="filename" value="$p.png"/></texture>',
+         '<include filename="UPparts/values.xml"/><texture type="bitmap"><string name="filename" value="DOLLAR"/>'
+         "</texture>"),
         ('<default name="n" value="leaf"/><default name="f" value="$n.png"/><texture type="bitmap">\n'
          '<string name="filename" value="$f"/></texture>',
          '<default name="n" value="leaf"/><default name="f" value="$n.png"/><texture type="bitmap">\n'
@@ -112,18 +118,20 @@ def test_ids_aliases_references_and_both_sides(mi_rgb, tmp_path):
          '<path value="UPparts"/><texture type="bitmap"><string name="filename" value="UPparts/leaf.png"/></texture>'),
         ('<emitter type="constant"><spectrum name="radiance" filename="lamp.spd"/></emitter>',
          '<emitter type="constant"><spectrum name="radiance" filename="UPlamp.spd"/></emitter>'),
-        ('<emitter type="constant"><string name="word" value="leaf.xyz"/></emitter>',
-         '<emitter type="constant"><string name="word" value="leaf.xyz"/></emitter>'),
+        ('<emitter type="constant"><string name="word" value="leaf"/><string name="file" value="none.png"/></emitter>',
+         '<emitter type="constant"><string name="word" value="leaf"/><string name="file" value="none.png"/></emitter>'),
     ],
 )  # fmt: skip
 def test_files_includes_and_parameters(mi_rgb, folders, body, expected, folder):
     """Files are found from the new folder; an included file that changes takes the place of its include."""
     a, _ = folders
     new = written(a / "scene.xml", f"{HEAD}{body}</scene>", a.parent / folder / "new.xml")
-    up, file, quoted = "", "$f", '"ä &amp; &quot;b&quot;.png"'
+    up, file, dollar, quoted = "", "$f", "$p.png", '"ä &amp; &quot;b&quot;.png"'
     if folder == "b":
-        up, file, quoted = "../a/", "../a/leaf.png", "'../a/ä &amp; \"b\".png'"
-    assert new == f"{HEAD}{expected.replace('UP', up).replace('FILE', file).replace('QUOTED', quoted)}</scene>"
+        up, file, dollar, quoted = "../a/", *2 * ["../a/leaf.png"], "'../a/ä &amp; \"b\".png'"
+    for placeholder, value in (("UP", up), ("FILE", file), ("DOLLAR", dollar), ("QUOTED", quoted)):
+        expected = expected.replace(placeholder, value)
+    assert new == f"{HEAD}{expected}</scene>"
 
 
 def test_values_of_defines_become_defaults(mi_rgb, folders):
