@@ -105,7 +105,8 @@ def test_ids_aliases_references_and_both_sides(mi_rgb, tmp_path):
         ('<include filename="parts/values.xml"/><bsdf type="principled"><float name="metallic" value="$m"/></bsdf>',
          '<include filename="UPparts/values.xml"/><bsdf type="neural_disney"><float name="metallic" value="$m"/>'
          "</bsdf>"),
-        ('<include filename="parts/values.xml"/><texture type="bitmap"><string name="filename" value="$p.png"/></texture>',
+        ('<include filename="parts/values.xml"/><texture type="bitmap"><string name="filename" value="$p.png"/>'
+         "</texture>",
          '<include filename="UPparts/values.xml"/><texture type="bitmap"><string name="filename" value="DOLLAR"/>'
          "</texture>"),
         ('<default name="n" value="leaf"/><default name="f" value="$n.png"/><texture type="bitmap">\n'
