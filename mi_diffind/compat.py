@@ -510,13 +510,17 @@ def parsed_types(state) -> list:
 def parsed_references(state) -> list[list[int]]:
     """Return for each object of a parsed scene, in the order of :func:`properties_of`, those it nests or refers to.
 
-    They are indices in that order. References are resolved only when a scene is built.
+    They are indices in that order. References are resolved only when a scene is built. Raises ``RuntimeError`` for an
+    id that does not exist.
     """
     import mitsuba as mi
 
     types, result = mi.Properties.Type, []
     for props in properties_of(state):
         values = [props[key] for key in props if props.type(key) in (types.Reference, types.ResolvedReference)]
+        for value in values:
+            if not hasattr(value, "index") and value.id() not in state.id_to_index:
+                raise RuntimeError(f'refers to the id "{value.id()}", which no object has')
         result.append([v.index() if hasattr(v, "index") else state.id_to_index[v.id()] for v in values])
     return result
 
@@ -528,11 +532,9 @@ def parsed_place(state, index: int) -> str:
     return mi.parser.file_location(state, state.nodes[index])
 
 
-def scene_xml(state) -> str:
-    """Return a parsed scene as XML, without comments. Mitsuba's writer is new in 3.8."""
-    import mitsuba as mi
-
-    return '<?xml version="1.0" encoding="utf-8"?>\n' + mi.parser.write_string(state)
+def parsed_offsets(state) -> list[tuple[int, int]]:
+    """Return for each object of a parsed scene the number of its file, and the byte of UTF-8 behind its "<"."""
+    return [(node.file_index, node.offset) for node in state.nodes]
 
 
 def parsed_files(state) -> list[str]:

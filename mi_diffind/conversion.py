@@ -6,12 +6,13 @@ a name that contains a digest of the source, its place and the options, and is n
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import json
 import os
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,10 +21,12 @@ import mitsuba as mi
 from . import compat, mitsuba_versions, plugins
 from .errors import DiffindError, UsageError
 from .files import relative_path, replacing, writable_file, writable_folder
+from .picture_check import PictureCheck, check_picture
 from .plugins.support.stock import Kept, StockNode
 from .runtime import use_variant
-from .scenes import ParsedScene
-from .tables import save_table
+from .scene_text import difference, edited_text, with_paths
+from .scenes import ParsedScene, SceneError
+from .tables import Table, save_table
 from .task import fit, tasks
 
 #: Environment variable with the folder of fits for scenes that are rendered and not written.
@@ -39,7 +42,7 @@ class Conversion:
 
     ``word``: its group (:class:`.plugins.Stock`); ``name``: its id, that of an object around it, or its place in the
     file; ``stock``: its type; ``learned``: the type that replaces it, "" if it is kept; ``reason``: why, or the table
-    file that was fitted to it.
+    file that was fitted to it and its error.
     """
 
     word: str
@@ -52,6 +55,22 @@ class Conversion:
         if not self.learned:
             return f'{self.stock} "{self.name}": {self.reason}'
         return f'{self.stock} "{self.name}" → {self.learned}{f", {self.reason}" if self.reason else ""}'
+
+
+class Conversions(list):
+    """List of all :class:`Conversion`, and the ``check`` of the pictures before and after, ``None`` without one.
+
+    ``unchecked`` is the reason why there is none although there should be.
+    """
+
+    check: PictureCheck | None = None
+    unchecked: str = ""
+
+    def __str__(self) -> str:
+        lines = summary(self) if any(c.learned for c in self) else ["replaced    nothing", *summary(self)]
+        if self.check or self.unchecked:
+            lines.append(f"check       {self.check or self.unchecked}")
+        return "\n".join(lines)
 
 
 def words() -> dict[str, plugins.Plugin]:
@@ -76,16 +95,18 @@ def convert(
     learn: Sequence[str] | None = None,
     tables: str | os.PathLike | None = None,
     defines: Mapping[str, object] | None = None,
+    check: bool = True,
     progress: bool = True,
-) -> list[Conversion]:
+) -> Conversions:
     """Write a scene with learned plugins in place of Mitsuba's: ``mi-diffind convert`` in Python.
 
     - ``scene``: a scene file; ``output``: the scene file to write (:func:`write_scene`).
-    - ``learn``: groups of plugins to replace (:func:`words`; ``None``: all).
+    - ``learn``: groups of plugins to replace (:func:`words`; ``None``: those of which a scene gains, textures).
     - ``tables``: folder of the table files (``None``: ``NEW_tables`` beside ``NEW.xml``).
     - ``defines``: values of the file's ``<default>`` parameters.
+    - ``check``: render small pictures before and after (:mod:`.picture_check`), if anything was replaced.
 
-    Returns what was replaced and what was kept (:func:`replace_stock`, whose errors are raised, too).
+    Returns what was replaced and what was kept (:func:`replace_stock`, whose errors are raised, too), and the check.
     """
     output = Path(output)
     if output.suffix.lower() != ".xml":
@@ -96,10 +117,23 @@ def convert(
     use_variant()
     parsed = ParsedScene(scene, dict(defines or {}))
     folder = Path(tables or output.with_name(f"{output.stem}_tables"))
-    conversions = replace_stock(parsed, list(words()) if learn is None else learn, folder, progress)
-    if folder.is_dir() and not any(folder.iterdir()):
-        folder.rmdir()
-    write_scene(parsed, output)
+    groups = [word for word, plugin in words().items() if plugin.stock.advised] if learn is None else learn
+    try:
+        conversions = Conversions(replace_stock(parsed, groups, folder, progress))
+
+        def render(written: ParsedScene) -> None:
+            if not check or not any(c.learned for c in conversions):
+                return
+            pair = ParsedScene(scene, parsed.defines).load(), written.load()
+            if all(loaded.sensors() and loaded.integrator() for loaded in pair):
+                conversions.check = check_picture(*pair)
+            else:
+                conversions.unchecked = "none: the scene has no sensor or no integrator"
+
+        write_scene(parsed, output, render)
+    finally:
+        with contextlib.suppress(OSError):  # does not exist, or is not empty
+            folder.rmdir()
     return conversions
 
 
@@ -139,23 +173,22 @@ def _convert(state, groups: dict[str, plugins.Plugin], folder: Path, progress: b
         around = list(_around(references, index))
         name = next(filter(None, (nodes[i].id() for i in (index, *around))), "") or compat.parsed_place(state, index)
         parents = [i for i in around if index in references[i]]
-        fits: list[Path] = []
         node = StockNode(
             props, tuple(nodes[i] for i in parents), tuple((types[i], nodes[i]) for i in _below(references, index)),
-            folder, functools.partial(_fitted, folder, progress, fits),
+            folder, functools.partial(_fitted, folder, progress),
         )  # fmt: skip
         try:
-            plugin.stock.convert(node)
+            fitted = plugin.stock.convert(node)
         except Kept as e:
             conversions.append(Conversion(word, name, before, "", str(e)))
         else:
             props.set_plugin_name(plugin.name)
-            conversions.append(Conversion(word, name, before, plugin.name, fits[0].name if fits else ""))
+            conversions.append(Conversion(word, name, before, plugin.name, fitted))
         for key in props:
             props.mark_queried(key, False)  # else Mitsuba takes what was read here for known to the plugin
     for plugin in groups.values():
         if plugin.seen_by and any(c.learned == plugin.name for c in conversions):
-            conversions += _trace_by(plugin.seen_by[0], compat.properties_of(state, mi.ObjectType.Integrator))
+            conversions += _trace_by(plugin.seen_by, compat.properties_of(state, mi.ObjectType.Integrator))
     return conversions
 
 
@@ -178,18 +211,23 @@ def _below(references: list[list[int]], index: int) -> list[int]:
     return sorted(seen)
 
 
-def _trace_by(name: str, integrators: list) -> list[Conversion]:
-    """Replace an integrator :data:`TRACER` by another one that takes its parameters."""
+def _trace_by(seen_by: tuple[str, ...], integrators: list) -> list[Conversion]:
+    """Replace each integrator :data:`TRACER` by the first of ``seen_by``, which takes its parameters."""
     conversions = []
     for props in integrators:
-        if props.plugin_name() == TRACER and all(key in TRACER_PARAMETERS for key in props):
-            props.set_plugin_name(name)
-            conversions.append(Conversion("integrator", props.id() or TRACER, TRACER, name, ""))
+        name = props.plugin_name()
+        if name == TRACER and all(key in TRACER_PARAMETERS for key in props):
+            props.set_plugin_name(seen_by[0])
+            reason = "which follows no footprints: textures filter by the sensor's alone"
+            conversions.append(Conversion("integrator", props.id() or name, name, seen_by[0], reason))
+        elif name not in seen_by:
+            reason = "does not trace distance fields: they are decoded to grids when the scene is loaded"
+            conversions.append(Conversion("integrator", props.id() or name, name, "", reason))
     return conversions
 
 
-def _fitted(folder: Path, progress: bool, fits: list[Path], task: str, source: Path, **options) -> Path:
-    """Return the table file of a fit, of this call or an earlier one, and add it to ``fits``.
+def _fitted(folder: Path, progress: bool, task: str, source: Path, **options) -> Table:
+    """Return the table of a fit, of this call or an earlier one, as its file holds it.
 
     Raises :class:`~.plugins.support.stock.Kept` for a source that the task refuses.
     """
@@ -205,9 +243,7 @@ def _fitted(folder: Path, progress: bool, fits: list[Path], task: str, source: P
         if fitted.result.interrupted:
             raise KeyboardInterrupt
         save_table(path, fitted.table)
-    tasks()[task].load(path)  # raises for a damaged file
-    fits.append(path)
-    return path
+    return tasks()[task].load(path)  # raises for a damaged file
 
 
 def _digest(source: Path, options) -> str:
@@ -222,26 +258,30 @@ def _digest(source: Path, options) -> str:
     return content.hexdigest()[:10]
 
 
-def write_scene(parsed: ParsedScene, path: str | os.PathLike) -> None:
-    """Write a parsed scene as XML. Names of files are changed to those that the new file's folder needs.
+def write_scene(
+    parsed: ParsedScene, path: str | os.PathLike, check: Callable[[ParsedScene], object] | None = None
+) -> None:
+    """Write a parsed and changed scene file: as it was, but for what was changed (:mod:`.scene_text`).
 
-    Values of ``defines`` are written in the place of ``$name``; comments and includes are not kept. Raises
+    What was written is parsed again. The file stays only if it holds the objects of the changed scene, with their ids,
+    plugins, parameters and references, and if ``check(written)`` raises nothing. Raises :class:`.scenes.SceneError` and
     :class:`~mi_diffind.files.OutputError`.
     """
-    target = Path(path).resolve().parent
-
-    def text(state) -> str:
-        for props in compat.properties_of(state):
-            for key in props:
-                if compat.property_kind(props, key) == "text" and key == "filename":
-                    file = Path(str(mi.file_resolver().resolve(props[key])))
-                    if file.is_file():
-                        props[key] = relative_path(file, target)
-        return compat.scene_xml(state)
-
-    content = parsed.change(text)
+    if parsed.description:
+        raise UsageError("scene: found one in memory, a scene file is needed")
+    target, before = Path(path).resolve().parent, ParsedScene(parsed.path, parsed.defines)
+    content = before.change(lambda b: parsed.change(lambda a: edited_text(b, a, parsed.defines, target)))
     with replacing(path) as temporary:
-        temporary.write_text(content, encoding="utf-8")
+        temporary.write_bytes(content)
+        try:
+            written = ParsedScene(temporary)
+            states = parsed.change(with_paths), written.change(with_paths)
+            if fault := parsed.change(lambda _: difference(*states)):
+                raise SceneError(f"{parsed.path}: cannot be written as {path}, which would have {fault}")
+            if check is not None:
+                check(written)
+        except SceneError as e:
+            raise SceneError(str(e).replace(temporary.name, Path(path).name)) from e
 
 
 def summary(conversions: Sequence[Conversion | Mapping]) -> list[str]:
@@ -252,4 +292,9 @@ def summary(conversions: Sequence[Conversion | Mapping]) -> list[str]:
     for stock, learned in dict.fromkeys((c.stock, c.learned) for c in replaced):
         count = sum((c.stock, c.learned) == (stock, learned) for c in replaced)
         lines.append(f"replaced    {count} x {stock} → {learned}")
+        lines += [
+            f'            "{c.name}": {c.reason}'
+            for c in replaced
+            if (c.stock, c.learned, bool(c.reason)) == (stock, learned, True)
+        ]
     return [*lines, *(f"kept        {c}" for c in conversions if not c.learned)]

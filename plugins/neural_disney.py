@@ -124,7 +124,12 @@ class NeuralDisney(Disney):
         super().parameters_changed(keys)
 
 
-def _from_principled(node: StockNode) -> None:
+#: Least ``specular`` and ``eta`` of a metal. Where the dielectric Fresnel term is 0, ``principled`` leaves out the
+#: metal's reflection, too; of a material that transmits light, it replaces 0 and 1 by these values itself.
+METALS = {"specular": 1e-3, "eta": 1.001}
+
+
+def _from_principled(node: StockNode) -> str:
     """Check whether a ``principled`` is within the model, whose parameters have the same names."""
     props = node.props
     if "spec_trans" in props and not (properties.is_number(props, "spec_trans") and float(props["spec_trans"]) == 0):
@@ -134,6 +139,11 @@ def _from_principled(node: StockNode) -> None:
     for name, low, high in (*((name, 0, 1) for name in unit), ("eta", 1, ETA_MAX)):
         if name in props and properties.is_number(props, name) and not low <= float(props[name]) <= high:
             raise Kept(f'has the parameter "{name}" {float(props[name]):g}, the Disney BRDF allows {low} to {high:g}')
+    metal = "metallic" in props and not (properties.is_number(props, "metallic") and float(props["metallic"]) == 0)
+    for name, least in METALS.items():
+        if metal and name in props and properties.is_number(props, name) and float(props[name]) < least:
+            raise Kept(f'is a metal with "{name}" {float(props[name]):g}, whose reflection Mitsuba leaves out')
+    return ""
 
 
 PLUGIN = Plugin(

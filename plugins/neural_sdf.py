@@ -22,7 +22,7 @@ from .support import properties, tables
 from .support.distance_shapes import CELL_BYTES, SEEN_BY, crop_grid, distance_shape, finest, native_grid
 from .support.manual import shared_parts
 from .support.placement import Placement
-from .support.sdf_meshes import closed_mesh_of, to_mesh
+from .support.sdf_meshes import check_normals, closed_mesh_of, to_mesh
 from .support.stock import Kept, StockNode
 
 #: Models whose arrays cannot be optimised, shared by all shapes of a file.
@@ -295,7 +295,11 @@ def factory(props: mi.Properties):
 BYTES = 2**18
 
 
-def _from_mesh(node: StockNode) -> None:
+#: Limits of that fit: the least intersection over union with the solid, and the mean error of the normals, in degrees.
+LEAST_IOU, LARGEST_ANGLE = 0.98, 8.0
+
+
+def _from_mesh(node: StockNode) -> str:
     """Replace a mesh of a file by its distance field."""
     props = node.props
     if any(parent.plugin_name() == "shapegroup" for parent in node.parents):
@@ -306,18 +310,24 @@ def _from_mesh(node: StockNode) -> None:
         raise Kept("borders on a medium, distance fields hold none")
     if textures := node.nested_types(mi.ObjectType.Texture):
         raise Kept(f"has a material with textures ({', '.join(textures)}), distance fields have no texture coordinates")
-    if props.get("flip_normals", False) is True:
-        raise Kept("has flipped normals, those of distance fields point outwards")
     node.allow("filename", "shape_index", "face_normals", "flip_normals", "flip_tex_coords", "to_world", "bsdf")
     try:
         Placement.of(props.get("to_world", mi.ScalarTransform4f()), 1.0, (0, 0, 0))
     except RuntimeError as e:
         raise Kept(f"cannot be placed: {e}") from None
     source = closed_mesh_of(node.file(), node.folder, props.get("shape_index", 0))
-    props["filename"] = str(node.fit(TASK.name, source, bytes=BYTES))
+    smooth = check_normals(props, source)
+    table = node.fit(TASK.name, source, bytes=BYTES)
+    quality = f"IoU {table.measured['iou']:.4f}, normals off by {table.measured['normal_deg']:.1f}°"
+    if table.measured["iou"] < LEAST_IOU or table.measured["normal_deg"] > LARGEST_ANGLE:
+        limits = f"{LEAST_IOU:g} and {LARGEST_ANGLE:g}° are needed"
+        raise Kept(f"{node.file().name} would have {quality}, {limits}: fit it by hand, with more bytes")
+    props["filename"] = str(table.path)
     for name in ("shape_index", "face_normals", "flip_normals", "flip_tex_coords"):
         if name in props:
             del props[name]
+    lost = f", those of smooth shading, {smooth:.1f}° from the triangles, are lost" if smooth >= 0.05 else ""
+    return f"{table.path.name}, {quality}{lost}"
 
 
 PLUGIN = Plugin(

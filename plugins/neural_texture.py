@@ -99,7 +99,11 @@ def _to_bitmap(props: mi.Properties) -> None:
 STEPS = 300
 
 
-def _from_bitmap(node: StockNode) -> None:
+#: Least PSNR of that fit, in dB: an RMS error of 5.6% of the range of values.
+LEAST_DB = 25.0
+
+
+def _from_bitmap(node: StockNode) -> str:
     """Replace the image of a ``bitmap`` by a compressed one."""
     props = node.props
     node.allow("filename", "raw", "to_uv", "wrap_mode", "filter_type", "format", "accel")
@@ -108,10 +112,15 @@ def _from_bitmap(node: StockNode) -> None:
     normal = any(parent.plugin_name() == "normalmap" for parent in node.parents)
     source = manifest_of(node.file(), node.folder, props.get("raw", False) is True, normal)
     border = "repeat" if str(props.get("wrap_mode", "repeat")) == "repeat" else "clamp"
-    props["filename"] = str(node.fit(TASK.name, source, steps=STEPS, border=border))
+    table = node.fit(TASK.name, source, steps=STEPS, border=border)
+    if table.measured["psnr_db"] < LEAST_DB:
+        quality = f"{node.file().name} would have {table.measured['psnr_db']:.1f} dB"
+        raise Kept(f"{quality}, at least {LEAST_DB:g} are needed: fit it by hand, with more bytes")
+    props["filename"] = str(table.path)
     for name in ("filter_type", "format", "accel"):  # a bitmap's "bilinear" would switch filtering off
         if name in props:
             del props[name]
+    return f"{table.path.name}, {table.measured['psnr_db']:.1f} dB"
 
 
 PLUGIN = Plugin(
@@ -123,5 +132,5 @@ PLUGIN = Plugin(
     others=(Counterpart("mipmap", ("storage", "source"), convert=functools.partial(to_mipmap, TASK)),),
     choices={"filter": FILTERS},
     truths=("mipmap", "exact"),
-    stock=Stock("bitmap", ("bitmap",), _from_bitmap),
+    stock=Stock("bitmap", ("bitmap",), _from_bitmap, advised=True),
 )

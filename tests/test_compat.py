@@ -466,8 +466,8 @@ def test_integrators_in_python(mi_rgb):
         assert names == [compat.INTERSECTING, "PRBIntegrator"]
 
 
-def test_parsed_scenes_as_graphs_and_as_xml(mi_rgb, tmp_path):
-    """Which object refers to which, by nesting and by id, where it stands, and the same scene written again."""
+def test_parsed_scenes_as_graphs(mi_rgb, tmp_path):
+    """Which object refers to which, by nesting and by id, and where it stands, by line and by byte of UTF-8."""
     text = (
         '<scene version="3.0.0">\n<bsdf type="twosided" id="a">\n<bsdf type="diffuse"/></bsdf>'
         '<shape type="sphere"><ref id="a"/><float name="radius" value="2"/></shape></scene>'
@@ -479,7 +479,13 @@ def test_parsed_scenes_as_graphs_and_as_xml(mi_rgb, tmp_path):
     assert [str(t).rpartition(".")[2] for t in compat.parsed_types(state)] == ["Scene", "BSDF", "BSDF", "Shape"]
     assert compat.parsed_references(state) == [[1, 3], [2], [], [1]]
     assert compat.parsed_place(state, 2).endswith("a.xml (line 3, col 2)")
-    (tmp_path / "b.xml").write_text(compat.scene_xml(state))
-    _, again = compat.parse_file(tmp_path / "b.xml")
-    assert compat.parsed_references(again) == [[1, 3], [2], [], [1]]
-    assert compat.properties_of(again)[3]["radius"] == 2
+    text = text.replace("\n<bsdf", "<!-- ä -->\n<bsdf", 1)
+    (tmp_path / "b.xml").write_text(f'{text[:-8]}<include filename="a.xml"/></scene>'.replace('id="a"', 'id="b"', 1))
+    _, both = compat.parse_file(tmp_path / "b.xml")
+    for number, byte in compat.parsed_offsets(both):
+        content = (tmp_path / "ba"[number]).with_suffix(".xml").read_bytes()
+        assert content[byte - 1 :].startswith((b"<scene", b"<bsdf", b"<shape"))
+    assert [number for number, _ in compat.parsed_offsets(both)] == [0, 0, 0, 0, 1, 1, 1]
+    (tmp_path / "c.xml").write_text('<scene version="3.0.0"><shape type="sphere"><ref id="none"/></shape></scene>')
+    with pytest.raises(RuntimeError, match='refers to the id "none", which no object has'):
+        compat.parsed_references(compat.parse_file(tmp_path / "c.xml")[1])

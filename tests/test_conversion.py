@@ -1,6 +1,7 @@
 """Conversion of scenes: what replaces Mitsuba's plugins, what stays and why, and fits that are not repeated."""
 
 import json
+import re
 import struct
 import zlib
 
@@ -10,6 +11,8 @@ import trimesh
 
 from mi_diffind import comparison, conversion, scenes
 from mi_diffind.errors import UsageError
+from mi_diffind.plugins.support import sdf_meshes
+from mi_diffind.plugins.support.stock import Kept
 from mi_diffind.tasks.sdf import serialized
 from mi_diffind.tasks.sdf.mesh import MeshError, load_mesh
 
@@ -50,6 +53,12 @@ def folder(tmp_path, monkeypatch):
     return tmp_path, fits
 
 
+def save_image(path, values):
+    import mitsuba as mi
+
+    mi.Bitmap(np.ascontiguousarray(values, np.uint8)).write(str(path))
+
+
 def parsed(folder, objects, name="scene.xml"):
     (folder / name).write_text(SCENE.replace("OBJECTS", objects))
     return scenes.ParsedScene(folder / name)
@@ -62,7 +71,8 @@ def test_a_converted_scene_shows_the_same(mi_rgb, folder):
         <translate y="-1"/></transform><bsdf type="twosided" id="floor"><bsdf type="principled">
         <texture name="base_color" type="bitmap"><string name="filename" value="image.png"/>
         <string name="filter_type" value="bilinear"/></texture></bsdf></bsdf></shape>"""
-    scene = parsed(folder, BALL.replace("MORE", "") + floor)
+    ball = BALL.replace("MORE", '<boolean name="face_normals" value="true"/>')
+    scene = parsed(folder, ball + floor)
     stock = scenes.render(scene.load(), 16)[0]
     conversions = conversion.replace_stock(scene, ["principled", "bitmap", "mesh"], folder / "tables")
     assert [(c.stock, c.learned, c.name) for c in conversions] == [
@@ -71,14 +81,19 @@ def test_a_converted_scene_shows_the_same(mi_rgb, folder):
         ("path", "path_sdf", "path"),
     ]  # fmt: skip
     assert [task for task, _ in fits] == ["sdf", "texture"]
-    assert conversion.summary(conversions)[0] == "replaced    1 x ply → neural_sdf"
+    lines = conversion.summary(conversions)
+    assert lines[0] == "replaced    1 x ply → neural_sdf" and re.fullmatch(
+        r' +"ball": ball_\w+\.npz, IoU 0\.9\d+, normals off by \d\.\d°', lines[1]
+    )
+    assert re.fullmatch(r' +"floor": image_\w+\.npz, \d\d\.\d dB', lines[4])
+    assert lines[6] == " " * 12 + '"path": which follows no footprints: textures filter by the sensor\'s alone'
     (folder / "other").mkdir()
     conversion.write_scene(scene, folder / "other" / "new.xml")
     learned = scenes.render(scenes.load(folder / "other" / "new.xml"), 16)[0]
     assert stock.std() > 0.1 and np.abs(learned - stock).mean() < 0.02
     exact = scenes.load(folder / "other" / "new.xml", exact=True)
     assert "PLYMesh" in [shape.class_name() for shape in exact.shapes()]
-    twice = parsed(folder, BALL.replace("MORE", "") + floor, "again.xml")
+    twice = parsed(folder, ball + floor, "again.xml")
     assert len(conversion.replace_stock(twice, ["mesh", "bitmap"], folder / "tables")) == 3 and len(fits) == 2
 
 
@@ -94,10 +109,19 @@ def test_a_converted_scene_shows_the_same(mi_rgb, folder):
          'bitmap "Sharp"', 'the filter_type "nearest", allowed are bilinear'),
         ("bitmap", '<bsdf type="diffuse" id="Lost"><texture type="bitmap" name="reflectance"><string name="filename" '
          'value="none.png"/></texture></bsdf>', 'bitmap "Lost"', "names no file that exists"),
+        *(
+            ("principled", f'<bsdf type="principled" id="Gold"><float name="metallic" value="{metal}"/>'
+             f'<float name="{name}" value="{value}"/></bsdf>', 'principled "Gold"', f'is a metal with "{name}" {value}')
+            for metal, name, value in ((1, "specular", 0), (0.5, "eta", 1))
+        ),
         ("mesh", BALL.replace("MORE", '<emitter type="area"/>'), 'ply "ball"', "emits light"),
         ("mesh", BALL.replace("MORE", '<transform name="to_world"><scale x="1" y="2" z="1"/></transform>'),
          'ply "ball"', "allowed are rotations, uniform scales"),
         ("mesh", BALL.replace("ball.ply", "bowl.ply").replace("MORE", ""), 'ply "ball"', "encloses no solid"),
+        ("mesh", BALL.replace("MORE", '<boolean name="flip_normals" value="true"/>'), 'ply "ball"',
+         "is wound inside out: 100% of its triangles face inwards"),
+        ("mesh", BALL.replace("ball.ply", "coarse.ply").replace("MORE", ""), 'ply "ball"',
+         "has shading normals 10° from those of its triangles"),
         ("mesh", '<shape type="ply"><string name="filename" value="ball.ply"/><bsdf type="diffuse" id="Worn"><texture '
          'name="reflectance" type="checkerboard"/></bsdf></shape>', "scene.xml", "with textures (checkerboard)"),
     ],
@@ -107,6 +131,7 @@ def test_what_stays_is_named_with_the_reason(mi_rgb, folder, group, objects, nam
     half = trimesh.creation.icosphere(3)
     half.update_faces(half.triangles_center[:, 1] < 0)
     half.export(folder / "bowl.ply")
+    trimesh.creation.icosphere(1).export(folder / "coarse.ply")
     scene = parsed(folder, objects)
     (one,) = conversion.replace_stock(scene, [group], folder / "tables")
     assert one.learned == "" and reason in one.reason and name in str(one) and not fits
@@ -124,22 +149,116 @@ def test_the_command_and_a_comparison_with_the_stock_scene(mi_rgb, tmp_path, cap
     parsed(tmp_path, materials + ball)
     scene, new = str(tmp_path / "scene.xml"), tmp_path / "new.xml"
     arguments = ["-o", str(new), "--json", str(tmp_path / "a.json"), "--variant", mi_rgb.variant()]
-    assert main(["convert", scene, *arguments]) == 0
+    assert main(["convert", scene, *arguments, "--learn", "principled"]) == 0
     printed = capsys.readouterr().out.splitlines()
     assert printed == [
         "replaced    1 x principled → neural_disney",
         'kept        principled "Glass": transmits light (spec_trans), which the Disney BRDF does not',
-        f"scene       {new}",
+        printed[2], f"scene       {new}",
     ]  # fmt: skip
+    assert printed[2].startswith("check       equal within noise (24 x 16 pixels, 64 spp), which would have shown")
     assert [c["learned"] for c in json.loads((tmp_path / "a.json").read_text())["conversions"]] == ["neural_disney", ""]
     assert new.read_text().count("neural_disney") == 1 and not (tmp_path / "new_tables").exists()
     for output, fault in (("scene.xml", "the same file as the scene"), ("new.json", "allowed is .xml")):
         assert main(["convert", scene, "-o", str(tmp_path / output)]) == 2 and fault in capsys.readouterr().err
     result = mi_diffind.compare(scene, 8, learn=["principled"], progress=False)
     assert comparison.truth_label(result.figures) == "stock (principled), 8 spp" and result.further == ()
+    assert main(["convert", scene, "-o", str(new), "--learn", "principled", "--no-check"]) == 0
+    assert "check" not in capsys.readouterr().out
     assert printed[:2] == str(result).splitlines()[3:5] and result.figures["psnr_db"] > 25
     same = mi_diffind.compare(new, 8, against="principled", progress=False)
     np.testing.assert_allclose(same.written, result.written, atol=1e-4)
+
+
+def test_by_default_only_textures_are_learned(mi_rgb, folder):
+    """Formulas stay formulas and meshes stay meshes unless they are asked for."""
+    folder, fits = folder
+    textured = """<shape type="rectangle"><bsdf type="diffuse" id="card"><texture type="bitmap" name="reflectance">
+        <string name="filename" value="image.png"/></texture></bsdf></shape>"""
+    parsed(folder, BALL.replace("MORE", "") + textured)
+    result = conversion.convert(folder / "scene.xml", folder / "new.xml", defines={"rough": 0.4}, progress=False)
+    assert [(c.stock, c.learned, c.name) for c in result] == [("bitmap", "neural_texture", "card")]
+    assert [task for task, _ in fits] == ["texture"] and str(result).splitlines()[-1] == f"check       {result.check}"
+    types = scenes.ParsedScene(folder / "new.xml").change(lambda state: [n.props.plugin_name() for n in state.nodes])
+    assert {"principled", "ply", "path", "neural_texture"} <= set(types) and "bitmap" not in types
+    same = conversion.convert(folder / "scene.xml", folder / "same.xml", learn=[])
+    assert same.check is None and str(same) == "replaced    nothing"
+    assert (folder / "same.xml").read_bytes() == (folder / "scene.xml").read_bytes()
+
+
+def test_small_and_noisy_images_stay(mi_rgb, folder):
+    """Images of less than 4 kB without a fit, and one of noise that the fit would blur, whose PSNR is said."""
+    folder, fits = folder
+    rng = np.random.default_rng(1)
+    sizes = [(1, 1, 3), (4, 1, 3), (1, 64, 4), (7, 3, 1), (32, 32, 3), (36, 37, 3), (63, 64, 1)]
+    for i, size in enumerate(sizes):
+        save_image(folder / f"small{i}.png", rng.integers(0, 256, size))
+    save_image(folder / "noise.png", rng.integers(0, 256, (64, 64, 3)))
+    material = """<bsdf type="diffuse" id="m{0}"><texture type="bitmap" name="reflectance">
+        <string name="filename" value="{0}.png"/></texture></bsdf>"""
+    names = [f"small{i}" for i in range(len(sizes))]
+    scene = parsed(folder, "".join(map(material.format, [*names, "noise"])))
+    *small, noise = conversion.replace_stock(scene, ["bitmap"], folder / "tables", progress=False)
+    for size, name, one in zip(sizes, names, small, strict=True):
+        assert str(one) == f'bitmap "m{name}": {name}.png has {np.prod(size):,} bytes, of which no fit would save any'
+    assert (
+        len(fits) == 1
+        and noise.learned == ""
+        and re.fullmatch(
+            r"noise\.png would have 1\d\.\d dB, at least 25 are needed: fit it by hand, with more bytes", noise.reason
+        )
+    )
+    (again,) = [c for c in conversion.replace_stock(scene, ["bitmap"], folder / "tables") if c.name == "mnoise"]
+    assert again == noise and len(fits) == 1
+
+
+@pytest.mark.parametrize("wound", ["outwards", "inwards", "a tenth inwards"])
+def test_windings_and_mirrorings(mi_rgb, tmp_path, wound):
+    """A mesh is kept if the normals that Mitsuba gives to its hits face inwards; rooms would come out black."""
+    mi, ball = mi_rgb, trimesh.creation.icosphere(3)
+    turned = {"outwards": 0, "inwards": len(ball.faces), "a tenth inwards": len(ball.faces) // 10}[wound]
+    ball.faces[:turned] = ball.faces[:turned, ::-1]
+    ball.export(tmp_path / "ball.ply")
+    transform = mi.ScalarTransform4f
+    for placed in (transform(), transform().rotate([1, 2, 3], 50).scale(3), transform().scale([-1, 1, 1])):
+        for flipped in (False, True):
+            props = mi.Properties("ply")
+            props["filename"], props["to_world"] = str(tmp_path / "ball.ply"), placed
+            props["flip_normals"], props["face_normals"] = flipped, True
+            shape = mi.load_dict({"type": "ply", **{key: props[key] for key in props}})
+            si = mi.load_dict({"type": "scene", "shape": shape}).ray_intersect(
+                mi.Ray3f(
+                    mi.Point3f(0),
+                    mi.warp.square_to_uniform_sphere(mi.Point2f(*np.random.default_rng(0).random((2, 999)))),
+                )
+            )
+            inwards = np.mean(np.sum(np.array(si.n) * np.array(si.p), axis=0) < 0)
+            if inwards < 0.005:
+                sdf_meshes.check_normals(props, tmp_path / "ball.ply")
+                continue
+            with pytest.raises(Kept, match="is wound inside out") as kept:
+                sdf_meshes.check_normals(props, tmp_path / "ball.ply")
+            assert abs(int(re.search(r"(\d+)%", str(kept.value))[1]) / 100 - inwards) < 0.03
+
+
+def test_shading_normals(mi_rgb, tmp_path):
+    """Smooth normals, of the file or Mitsuba's, are far from those of the triangles unless ``face_normals`` is true."""
+    mi = mi_rgb
+    box, ball = trimesh.creation.box(), trimesh.creation.icosphere(1)
+    box.export(tmp_path / "box.ply")
+    ball.export(tmp_path / "ball.obj", include_normals=True)
+    trimesh.creation.icosphere(3).export(tmp_path / "fine.ply")
+    box.unmerge_vertices()
+    box.export(tmp_path / "flat.ply")
+    for name, angle in (("box.ply", 39), ("ball.obj", 10), ("fine.ply", None), ("flat.ply", None)):
+        props = mi.Properties(name[-3:])
+        props["filename"] = str(tmp_path / name)
+        if angle is not None:
+            with pytest.raises(Kept, match=f"has shading normals {angle}° from those of its triangles"):
+                sdf_meshes.check_normals(props, tmp_path / name)
+            props["face_normals"] = True
+        lost = sdf_meshes.check_normals(props, tmp_path / name)
+        assert lost == pytest.approx(2.54 if name == "fine.ply" else 0, abs=0.02)
 
 
 def test_unknown_groups_are_refused(mi_rgb, folder):
@@ -193,8 +312,6 @@ def test_serialized_meshes(mi_rgb, tmp_path, version, double):
 
 def test_shapes_of_a_scene(mi_rgb, tmp_path):
     """One by its id, placed as in the scene, or all; the fitted field finds its mesh again."""
-    from mi_diffind.plugins.support import sdf_meshes
-
     trimesh.creation.icosphere(1).export(tmp_path / "ball.ply")
     path = tmp_path / "scene.xml"
     path.write_text(

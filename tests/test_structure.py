@@ -64,6 +64,8 @@ FLOORS = (
         "reference_files",
         "regression",
         "depth",
+        "picture_check",
+        "scene_text",
         "inspection",
         "measure",
     ),

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from .common import learn_option, print_conversions, require_scene, say, scene_options, set_variant, verb
+from .common import learn_option, require_scene, say, scene_options, set_variant, verb
 
-HELP = "write a scene with learned plugins in place of Mitsuba's, fitted to what they show"
+HELP = "write a scene with learned plugins in place of Mitsuba's, by default its textures, fitted to what they show"
 
 EXAMPLE = "mi-diffind convert scene.xml -o learned.xml"
 
@@ -15,12 +15,18 @@ def add(commands) -> None:
     sub.add_argument("scene", metavar="SCENE.xml")
     sub.add_argument("-o", "--output", required=True, metavar="NEW.xml", help="scene file to write")
     sub.add_argument("--tables", metavar="DIR", help="folder of the table files (default: NEW_tables beside NEW.xml)")
-    learn_option(sub, "all of them")
+    learn_option(sub, "bitmap")
+    sub.add_argument(
+        "--no-check",
+        dest="check",
+        action="store_false",
+        help="do not render the scene before and after: 2 pictures of at most 128 pixels",
+    )
     scene_options(sub, rendering=False)
 
 
 def run(arguments) -> dict:
-    """Convert the scene, write it, and return the ``output`` and the ``conversions``.
+    """Convert the scene, write it, and return the ``output``, the ``conversions`` and the ``check``.
 
     Raises :class:`~mi_diffind.errors.UsageError`, and as :mod:`mi_diffind.conversion` does.
     """
@@ -28,16 +34,15 @@ def run(arguments) -> dict:
     set_variant(arguments.variant)
     from ..conversion import convert
 
-    conversions = [
-        vars(c)
-        for c in convert(
-            arguments.scene,
-            arguments.output,
-            learn=arguments.learn or None,
-            tables=arguments.tables,
-            defines=dict(arguments.defines),
-        )
-    ]
-    print_conversions(conversions)
+    conversions = convert(
+        arguments.scene,
+        arguments.output,
+        learn=arguments.learn or None,
+        tables=arguments.tables,
+        defines=dict(arguments.defines),
+        check=arguments.check,
+    )
+    say(conversions)
     say(f"scene       {arguments.output}")
-    return {"output": arguments.output, "conversions": conversions}
+    check = conversions.check and vars(conversions.check)
+    return {"output": arguments.output, "conversions": [vars(c) for c in conversions], "check": check}

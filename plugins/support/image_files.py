@@ -29,12 +29,17 @@ from mi_diffind.tables import Table, TableError
 from mi_diffind.task import Task, stamp
 
 from . import properties
+from .stock import Kept
 from .tables import copy_entries, exposed
 
 STORAGES = ("uint8", "float32")
 
 #: Kinds of maps that hold data, not colours.
 DATA_ROLES = ("normal", "roughness", "ao", "metallic")
+
+#: Bytes of an image below which a scene's bitmap is kept: a table file takes 1 to 3 kB itself, and the training of so
+#: few texels ends anywhere between 6 and 32 dB.
+LEAST_BYTES = 2**12
 
 #: Name → :class:`~mi_diffind.maps.pyramid.Pyramid`, for textures that name one (no property can hold a pyramid).
 PYRAMIDS: dict[str, Pyramid] = {}
@@ -241,13 +246,16 @@ def layout_of(task: Task, props: mi.Properties) -> Layout:
 def manifest_of(image: Path, folder: Path, raw: bool, normal: bool) -> Path:
     """Write a manifest of an image's colours as ``bitmap`` reads them, and return its path.
 
-    ``raw``: values are left as they are; ``normal``: they are a normal map. Raises ``RuntimeError``.
+    ``raw``: values are left as they are; ``normal``: they are a normal map. Raises ``RuntimeError``, and
+    :class:`~.stock.Kept` for fewer bytes than :data:`LEAST_BYTES`.
     """
     try:
         check_picture(image)
     except LimitError as e:
         raise RuntimeError(str(e)) from None
     bitmap = mi.Bitmap(str(image))
+    if bitmap.buffer_size() < LEAST_BYTES:
+        raise Kept(f"{image.name} has {bitmap.buffer_size():,} bytes, of which no fit would save any")
     formats = mi.Bitmap.PixelFormat
     entry = {
         "file": relative_path(image, folder),

@@ -9,10 +9,12 @@ import shutil
 import tempfile
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import trimesh
 
+from mi_diffind import mitsuba_versions
 from mi_diffind.errors import DiffindError
 from mi_diffind.files import is_within
 from mi_diffind.tables import TableError
@@ -25,6 +27,13 @@ from .stock import Kept
 
 #: Share of open edges up to which a mesh counts as closed: a fit closes holes, but not a surface without an inside.
 OPEN = 0.01
+
+#: Share of triangles that may face inwards: those of a distance field all face outwards.
+INWARDS = 0.01
+
+#: Mean angle between shading normals and triangles up to which a field stands for both, in degrees. A ball of polished
+#: metal under the sun is 24% darker with triangles of 5.1°, and equal within 0.1% with those of 2.5° (4% in blocks).
+SMOOTH_DEG = 3.0
 
 
 def to_mesh(props: mi.Properties) -> None:
@@ -66,6 +75,46 @@ def closed_mesh_of(path: Path, folder: Path, index: int = 0) -> Path:
     if np.count_nonzero(balance) > OPEN * len(balance):
         raise Kept(f"encloses no solid: {np.count_nonzero(balance):,} of {len(balance):,} edges are open")
     return path
+
+
+def check_normals(props: mi.Properties, source: Path) -> float:
+    """Return the mean angle between the shading normals of a mesh and those of its triangles, in degrees.
+
+    ``props``: properties of the shape; ``source``: the file of its mesh. Raises :class:`~.stock.Kept` for a mesh whose
+    normals, as Mitsuba renders them, a distance field does not have: the triangles have to face outwards, and the
+    shading normals, of the file or smoothed by Mitsuba, have to be near those of the triangles.
+    """
+    mesh = load_mesh(source)
+    linear = np.array(props.get("to_world", mi.ScalarTransform4f()).matrix)[:3, :3]
+    inwards = mesh.turned / len(mesh.faces)
+    if (np.linalg.det(linear) < 0) != (props.get("flip_normals", False) is True):
+        inwards = 1 - inwards
+    if inwards > INWARDS:
+        raise Kept(f"is wound inside out: {inwards:.0%} of its triangles face inwards, those of fields outwards")
+    if props.get("face_normals", False) is True:
+        return 0.0
+    keys = [key for key in ("filename", "shape_index", "face_normals") if key in props]
+    angle = _smoothness(mi.load_dict({"type": props.plugin_name(), **{key: props[key] for key in keys}}))
+    if angle > SMOOTH_DEG:
+        raise Kept(
+            f"has shading normals {angle:.0f}° from those of its triangles, distance fields have the latter: "
+            f"face_normals true renders it without"
+        )
+    return angle
+
+
+def _smoothness(mesh: mi.Mesh) -> float:
+    """Return the mean angle over a mesh's area between its shading normals and those of its triangles, in degrees."""
+    vertices, faces = mitsuba_versions.triangles(mesh)
+    a, b, c = np.moveaxis(vertices[faces].astype(np.float64), 1, 0)
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    index, angles = dr.arange(mi.UInt32, len(faces)), 0
+    for place in ((1 / 6, 1 / 6), (2 / 3, 1 / 6), (1 / 6, 2 / 3)):  # exact for quadratic functions on a triangle
+        pi = dr.zeros(mi.PreliminaryIntersection3f, len(faces))
+        pi.t, pi.prim_index, pi.prim_uv = 1, index, mi.Point2f(*place)
+        si = mesh.compute_surface_interaction(dr.zeros(mi.Ray3f, len(faces)), pi)
+        angles = angles + np.degrees(dr.safe_acos(dr.dot(si.n, si.sh_frame.n)).numpy()) / 3
+    return float((angles * areas).sum() / areas.sum())
 
 
 @functools.lru_cache

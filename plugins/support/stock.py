@@ -8,6 +8,8 @@ from pathlib import Path
 
 import mitsuba as mi
 
+from mi_diffind.tables import Table
+
 from . import properties
 
 
@@ -21,15 +23,15 @@ class StockNode:
 
     ``props``: its properties, which a conversion changes; ``parents``: those of the objects that refer to it;
     ``nested``: type and properties of all objects below it; ``folder``: where files may be written.
-    ``fit(task, source, **options)`` returns the path of a table file of the task, fitted to the file ``source`` or
-    fitted before to the same content.
+    ``fit(task, source, **options)`` returns the table of the task, read from its file ``table.path``, that was fitted
+    to the file ``source``, or before to the same content.
     """
 
     props: mi.Properties
     parents: tuple[mi.Properties, ...]
     nested: tuple[tuple[mi.ObjectType, mi.Properties], ...]
     folder: Path
-    fit: Callable[..., Path]
+    fit: Callable[..., Table]
 
     def nested_types(self, object_type: mi.ObjectType) -> list[str]:
         """Return the plugin names of all nested objects of one type, each once."""

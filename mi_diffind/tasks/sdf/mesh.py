@@ -52,7 +52,7 @@ class Mesh:
     Each position occurs once; faces are counter-clockwise from outside. ``watertight``: each edge is used as often in
     one direction as in the other, so the winding number is whole and changes on the surface only. A point of the file
     is ``vertices · scale + centre``. ``digest`` is a SHA-256 over vertices and faces; ``warnings`` has one sentence for
-    each repair or doubt.
+    each repair or doubt, and ``turned`` is the number of triangles that were wound the other way in the file.
     """
 
     vertices: np.ndarray
@@ -63,6 +63,7 @@ class Mesh:
     path: str = ""
     digest: str = ""
     warnings: list[str] = dataclasses.field(default_factory=list)
+    turned: int = 0
 
     @property
     def lower(self) -> np.ndarray:
@@ -174,10 +175,10 @@ def make_mesh(vertices: np.ndarray, faces: np.ndarray, name: str = "mesh") -> Me
     vertices = (vertices - centre) / scale
 
     repairs = []
-    vertices, faces, watertight = _repaired(vertices, faces, name, repairs)
+    vertices, faces, watertight, turned = _repaired(vertices, faces, name, repairs)
     vertices, faces = np.ascontiguousarray(vertices), np.ascontiguousarray(faces, dtype=np.int32)
     digest = hashlib.sha256(vertices.tobytes() + faces.tobytes()).hexdigest()
-    mesh = Mesh(vertices, faces, watertight, scale, tuple(float(c) for c in centre), name, digest, repairs)
+    mesh = Mesh(vertices, faces, watertight, scale, tuple(float(c) for c in centre), name, digest, repairs, turned)
     if mesh.watertight and abs(mesh.volume) < NO_VOLUME:
         raise MeshError(f"{name}: encloses no volume, expected the surface of a solid")
     return mesh
@@ -256,10 +257,10 @@ def _repaired(vertices: np.ndarray, faces: np.ndarray, name: str, repairs: list[
     if not len(faces):
         raise MeshError(f"{name}: has no triangle that has an area, expected the surface of a solid")
 
-    turned = _inconsistent(faces)
-    if turned.any():
-        faces[turned] = faces[turned, ::-1]
-        repairs.append(f"{name}: {turned.sum():,} triangles wound against their neighbours were turned")
+    against = _inconsistent(faces)
+    if against.any():
+        faces[against] = faces[against, ::-1]
+        repairs.append(f"{name}: {against.sum():,} triangles wound against their neighbours were turned")
     turned = _inside_out(vertices, faces)
     if turned.any():
         faces[turned] = faces[turned, ::-1]
@@ -279,7 +280,7 @@ def _repaired(vertices: np.ndarray, faces: np.ndarray, name: str, repairs: list[
     if dropped:
         repairs.append(f"{name}: {dropped:,} triangles without an area were left out")
     used, faces = np.unique(faces[~flat], return_inverse=True)
-    return vertices[used], faces.reshape(-1, 3), not open_edges
+    return vertices[used], faces.reshape(-1, 3), not open_edges, int(np.count_nonzero(against != turned))
 
 
 def _joined(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
