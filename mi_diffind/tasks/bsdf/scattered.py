@@ -254,20 +254,20 @@ def exchanged(truth: ScatteredTruth) -> ScatteredTruth:
 def irreciprocal_share(truth: ScatteredTruth, isotropic: bool, mirror: bool) -> float | None:
     """Return the share of the light that no reciprocal model can reproduce; ``None`` if too few rows have images.
 
-    It is the sum of ``|f(i, o) − f(o, i)| / 2`` over that of ``|f|`` of all rows whose directions exchanged are those of
-    another row, weighted by both solid angles and both cosines. Rows that are their own images, as the mirror direction
-    is, count as they do among all rows. With ``mirror``, images at the plane of incidence count, too.
+    It is the sum of ``|f(i, o) − f(o, i)| / 2`` over that of ``|f|``, weighted by both solid angles and cosines, of
+    all rows whose directions exchanged are those of another row. Rows that are their own images (mirror directions)
+    count as they do among all rows. With ``mirror``, images at the plane of incidence count, too.
     """
     from scipy.spatial import cKDTree
 
     points, images = places(truth, isotropic), places(exchanged(truth), isotropic)
     if isotropic and mirror:
         points[:, 2], images[:, 2] = np.abs(points[:, 2]), np.abs(images[:, 2])
-    own = np.linalg.norm(points - images, axis=1) < EXACT
+    symmetric = np.linalg.norm(points - images, axis=1) < EXACT
     image = cKDTree(points).query(images, distance_upper_bound=EXACT)[1]
-    image[own] = np.flatnonzero(own)
+    image[symmetric] = np.flatnonzero(symmetric)
     paired = image < len(points)
-    others = (paired & ~own).sum()
+    others = (paired & ~symmetric).sum()
     if others < LEAST:
         return None
     rows = np.flatnonzero(paired)
@@ -279,7 +279,7 @@ def irreciprocal_share(truth: ScatteredTruth, isotropic: bool, mirror: bool) -> 
         weight *= cells(np.abs(np.stack(azimuths, axis=1)))
     else:
         weight = truth.solid_angle[rows] * truth.solid_angle[image]
-    weight *= np.where(own[rows], 1, (~own).sum() / others)
+    weight *= np.where(symmetric[rows], 1, (~symmetric).sum() / others)
     weight = (weight * (truth.weight[rows] + truth.weight[image]) * wi[:, 2] * wo[:, 2])[:, None]
     difference = (weight * np.abs(truth.f[rows] - truth.f[image])).sum() / 2
     return float(difference / max((weight * np.abs(truth.f[rows])).sum(), 1e-20))
