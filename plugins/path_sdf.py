@@ -95,6 +95,11 @@ def integrator() -> type:
                 return super().sample(mode, scene, *args, **kwargs)
             return self.sample_shapes(mode, scene, shapes, *args, **kwargs)
 
+        def render_backward(self, scene, params, grad_in, *args, **kwargs):
+            """See ``ADIntegrator.render_backward``. Warns of a shape without derivatives."""
+            super().render_backward(scene, params, grad_in, *args, **kwargs)
+            sdf.check_derivatives(sdf.distance_shapes_in(scene), grad_in)
+
         def intersect(self, scene, shapes, ray, coherent, active, rest):
             """Return the nearest hit, of an ordinary shape or of a distance shape; the other one is not valid."""
             pi = scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
