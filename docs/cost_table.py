@@ -261,11 +261,11 @@ def step_of(contender: str) -> str:
 
 
 def mip_maps() -> Row:
-    """Return the row of uncompressed mip maps."""
+    """Return the row of uncompressed mip maps: floats, of which the study counts 8 bits each."""
     study, png = measured("tradeoff_texture")["candidates"], measured("bench_backward")["bytes"]["texture"]["bitmap"]
     return Row(
         "`mipmap`", "texture", OF_SAMPLES, "PSNR of a plane", "dB",
-        plane("mipmap, trilinear", memory=study["mipmap, trilinear"]["bytes"], disk=png["disk"]),
+        plane("mipmap, trilinear", memory=4 * study["mipmap, trilinear"]["bytes"], disk=png["disk"]),
         plane(SAMPLES, **png), Contender(), {"errors, renders": "tradeoff_texture", "steps, bytes": "bench_backward"},
         step_of("mipmap"),
     )  # fmt: skip
