@@ -6,7 +6,6 @@ Everything here runs in the variant that is set.
 from __future__ import annotations
 
 import contextlib
-import functools
 import os
 import threading
 import time
@@ -420,14 +419,16 @@ def film_size(scene) -> tuple[int, int]:
 
 def samples_taken(scene, spp: int, passes: int = 1) -> list[int]:
     """Return the samples a pixel of each pass of :func:`render`: samplers other than ``independent`` may round up."""
-    sampler = scene.sensors()[0].sampler().clone()
+    counts = [(i + 1) * spp // passes - i * spp // passes for i in range(passes)]
+    taken = {count: rounded(scene.sensors()[0], count) for count in set(counts)}
+    return [taken[count] for count in counts]
 
-    @functools.cache
-    def rounded(count: int) -> int:
-        sampler.set_sample_count(count)
-        return sampler.sample_count()
 
-    return [rounded((i + 1) * spp // passes - i * spp // passes) for i in range(passes)]
+def rounded(sensor, spp: int) -> int:
+    """Return the samples a pixel that the sampler of a sensor takes for ``spp``."""
+    sampler = sensor.sampler().clone()
+    sampler.set_sample_count(spp)
+    return sampler.sample_count()
 
 
 def samples_text(figures: dict) -> str:
