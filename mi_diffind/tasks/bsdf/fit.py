@@ -154,7 +154,10 @@ def symmetry_line(symmetries: dict[str, float | None]) -> str:
     assumed = {
         "isotropy": ("isotropic", "anisotropic ({})"),
         "mirror": ("symmetric about the plane of incidence", "not symmetric about the plane of incidence ({})"),
-        "reciprocity": ("reciprocal", "not reciprocal: {} of the light; no reciprocal model can be nearer than that"),
+        "reciprocity": (
+            "reciprocal",
+            "not reciprocal: {} of the light, weighted by both cosines; no reciprocal model can be nearer than that",
+        ),
     }
     parts = []
     for name, (yes, no) in assumed.items():
