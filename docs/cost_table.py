@@ -361,7 +361,6 @@ def radiance() -> Row:
 
     named = ("ours 75×", base, "paper 75×")
     left_out = (*named, "hash grid + network 75×")  # its colours were not trained in this run
-    small, codes = (study["candidates"][f"{name} 200×"] for name in ("ours", "codebook"))
     steps = [times("field", name)["step"] for name in ("ours", "paper")]
     return Row(
         "`neural_field`", "field", "codebook (VQRF)", "PSNR of the foreground", "dB",
@@ -369,9 +368,7 @@ def radiance() -> Row:
         "The codebook is the best contender of the study in equal bytes of memory. It is no plugin that could take a "
         f"step; a step of ours takes {steps[0]:.2f} (the paper's recipe: {steps[1]:.2f}) of that of a grid in "
         "single precision (`bench_backward.json`). Mitsuba's `volprim_rf_basic` is not measured: it needs 3D "
-        f"Gaussians of the capture. At 200x, ours has {small['errors']['psnr_foreground_db']:.1f} dB in "
-        f"{size_text(small['details']['memory_bytes'])}, the codebook {codes['errors']['psnr_foreground_db']:.1f} dB "
-        f"in {size_text(codes['details']['memory_bytes'])}.",
+        "Gaussians of the capture.",
         others={name: contender(name) for name in study["candidates"] if name not in left_out}, cells={"step": "none"},
     )  # fmt: skip
 
