@@ -23,6 +23,7 @@ from .files import writable_folder
 from .interrupt import interruptible
 from .measure import figure_grid
 from .measure.statistics import spread
+from .plugins.support import footprint
 from .progress import progress_bar
 from .runtime import use_variant
 
@@ -155,6 +156,7 @@ def compare(
             sides[name] = _Side(parsed.load(exact=True, against=names), oversampling)
     written = _Side(parsed.load())
     spp = spp or written.scene.sensors()[0].sampler().sample_count()
+    footprint.check_samples(footprint.textures(written.scene), spp)
     passes, done = max(1, min(max(passes, 2), spp)), 0
     turns = [written, *sides.values()]
     total = passes * sum(side.oversampling for side in turns)

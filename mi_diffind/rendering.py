@@ -18,6 +18,7 @@ from . import depth as depths
 from . import orbit as orbits
 from .errors import UsageError
 from .interrupt import interruptible
+from .plugins.support import footprint
 from .progress import progress_bar
 from .runtime import use_variant
 from .units import check_memory
@@ -147,6 +148,7 @@ def render(
         _check_channels(image_path(output, bool(orbit)), channels_of(loaded))
     ready = time.perf_counter()
     spp = spp or loaded.sensors()[0].sampler().sample_count()
+    footprint.check_samples(footprint.textures(loaded), spp)
     if orbit:
         width, height = scenes.film_size(loaded)
         check_memory("orbit", orbit, 16 * orbit * width * height)

@@ -50,8 +50,9 @@ and, with ``storage`` ``float32``, their arrays: hits move along their rays by t
 normals, cosines and the solid angles between vertices follow. The derivatives are those of *interiors*: where the
 outline of a solid, its shadow or its image in a mirror moves over a pixel, radiance jumps, and this part of the
 derivative is missing. An optimisation from images therefore learns from shading, not from silhouettes; masks, or a loss
-on the field itself, have to compensate. Ordinary shapes are constants, and so are places seen in smooth mirrors and
-through smooth glass. Polarised variants and media are not supported.
+on the field itself, have to compensate. A warning says where all derivatives of a shape are zero. Ordinary shapes are
+constants, and so are places seen in smooth mirrors and through smooth glass. Polarised variants and media are not
+supported.
 
 {executable}
 

@@ -365,7 +365,7 @@ def attach(scene: mi.Scene, sensor: int | mi.Sensor = 0, spp: int | None = None)
 def check_samples(textures, spp: int) -> None:
     """Warn, once a file and number, of textures that ``fit scene`` trained for other samples per pixel than ``spp``."""
     for texture in textures:
-        table, _ = texture.trained()
+        table = texture.trained()[0] if hasattr(texture, "trained") else None
         settings = {} if table is None or table.settings.get("kept_start") else table.settings.get("shading", {})
         trained = settings.get("spp", spp) if isinstance(settings, dict) else spp
         if trained != spp and (key := (table.path, trained, spp)) not in _warned:
