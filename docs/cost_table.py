@@ -215,61 +215,91 @@ def large_material() -> Row:
     )  # fmt: skip
 
 
+def exact_disney() -> Row:
+    """Return the row of the exact Disney BRDF beside Mitsuba's formula."""
+    return Row(
+        "`disney`", "disney", "`principled`", "a formula, as `principled` is", "",
+        benched(None, "disney", "disney"), benched(None, "disney", "principled"), Contender(),
+        {"all": "bench_backward"}, "The paper has no such row: not measured.", cells={"error": "exact"},
+    )  # fmt: skip
+
+
+#: What a user would take instead of a filtered texture, in the study and in words.
+SAMPLES, OF_SAMPLES = "bitmap, 4 spp, multijittered", "`bitmap`, 4 samples beside 1"
+
+
+def plane(name: str, **sizes) -> Contender:
+    """Return a contender of the study of filtered textures, with errors and times of its renders of a plane."""
+    study, first = measured("tradeoff_texture"), "bitmap, 1 spp"
+    ratios = study["cases"]["plane"]["ratios"]["render"]
+    times = [ratios[f"{contender} / {first}"]["median"] for contender in (name, SAMPLES)]
+    return Contender(study["candidates"][name]["errors"]["psnr_plane_db"], times[0] / times[1], **sizes)
+
+
 def texture() -> Row:
     """Return the row of filtered textures, of renders of a plane."""
-    study, base = measured("tradeoff_texture"), "bitmap, 4 spp, multijittered"
-
-    def contender(name: str, of_bench: str) -> Contender:
-        return benched(study["candidates"][name]["errors"]["psnr_plane_db"], "texture", of_bench)
-
-    fits = [measured(f"fit_texture_boombox_{preset}") for preset in ("ours", "paper")]
-    level, seconds = [f["measured"]["psnr_l0_db"] for f in fits], fits[0]["settings"]["seconds"]
+    bench = measured("bench_backward")
     network = measured("tradeoff_texture_network")["candidates"]["network 12x, trilinear"]
-    same = study["candidates"]["ours 12x, trilinear"]
-    named = ("ours 12x, anisotropic", base, "paper 12x, trilinear")
+    same = plane("ours 12x, trilinear").error
     return Row(
-        "`neural_texture`", "texture", "`bitmap`, 4 samples a pixel", "PSNR of a plane", "dB",
-        *(contender(name, key) for name, key in zip(named, ("ours", "bitmap", "paper"), strict=True)),
-        {"errors": "tradeoff_texture", "all others": "bench_backward",
+        "`neural_texture`", "texture", OF_SAMPLES, "PSNR of a plane", "dB",
+        plane("ours 12x, anisotropic, centred", **bench["bytes"]["texture"]["ours"]),
+        plane(SAMPLES, **bench["bytes"]["texture"]["bitmap"]), Contender(),
+        {"errors, renders": "tradeoff_texture", "steps, bytes": "bench_backward",
          "the network": "tradeoff_texture_network"},
         f"A hash grid with a network in {size_text(network['bytes'])} has {network['errors']['psnr_plane_db']:.1f} dB, "
-        f"ours with the same filter, trilinear, {same['errors']['psnr_plane_db']:.1f} dB; Mitsuba has no plugin that "
-        "renders it. Errors are those of 1 sample a pixel beside 4, times those of 4 beside 16. "
-        f"Both presets had {study['details']['request']['seconds']:.0f} s, too few for the paper's recipe to converge. "
-        f"After {seconds:.0f} s of each on boombox, the finest level has {level[0]:.1f} dB by ours and "
-        f"{level[1]:.1f} dB by the paper's (`fit_texture_boombox_….json`). {TRAINED}",
+        f"ours with the same filter, trilinear, {same:.1f} dB; Mitsuba has no plugin that renders it. "
+        f"{step_of('ours')} The paper's recipe had {measured('tradeoff_texture')['details']['request']['seconds']:.0f} "
+        "s there, too few to converge: not measured.",
+    )  # fmt: skip
+
+
+def step_of(contender: str) -> str:
+    """Return a sentence about the training step of a filtered texture, which has other samples than its renders."""
+    ratio = times("texture", contender)["step"]
+    return f"A step is not measured with these samples: 4 beside 16 of the bitmap take {ratio:.2f} of the time."
+
+
+def mip_maps() -> Row:
+    """Return the row of uncompressed mip maps: floats, of which the study counts 8 bits each."""
+    study, png = measured("tradeoff_texture")["candidates"], measured("bench_backward")["bytes"]["texture"]["bitmap"]
+    return Row(
+        "`mipmap`", "texture", OF_SAMPLES, "PSNR of a plane", "dB",
+        plane("mipmap, trilinear", memory=4 * study["mipmap, trilinear"]["bytes"], disk=png["disk"]),
+        plane(SAMPLES, **png), Contender(), {"errors, renders": "tradeoff_texture", "steps, bytes": "bench_backward"},
+        step_of("mipmap"),
     )  # fmt: skip
 
 
 def shading() -> Row:
-    """Return the row of textures trained for shaded values, of the material that the paper's recipe has run on."""
+    """Return the row of textures trained for shaded values, beside the best classical filter in equal bytes."""
     study, material = measured("tradeoff_shading")["candidates"], "weave"
     mine = {name.removeprefix(f"{material}, "): c for name, c in study.items() if name.startswith(f"{material}, ")}
     psnr = {name: c["errors"]["c_mean_db"] for name, c in mine.items()}
-    equal = [name for name in psnr if name.endswith((", ASTC", ", compressed"))]
-    best = max(equal, key=psnr.get)
-    paper = measured("tradeoff_shading_paper")["candidates"]
-    recipes = [c for name, c in paper.items() if name.startswith(f"{material}, lambda")]
-    recipe = max(recipes, key=lambda c: c["errors"]["c_mean_db"])
+    best = max((name for name in psnr if name.endswith((", ASTC", ", compressed"))), key=psnr.get)
+    best_text = best.replace(", ASTC", " filters in ASTC").replace(", compressed", " filters, compressed")
+    return Row(
+        "`fit shading`", "shading", f"classical filters in equal bytes ({best_text})", f"PSNR of shaded {material}",
+        "dB", Contender(psnr["lambda 0.9, clip, schedule"]), Contender(psnr[best]), Contender(),
+        {"errors": "tradeoff_shading"},
+        "No plugin of Mitsuba reads the mip maps of classical filters. The paper's recipe: not measured.",
+        cells={"render": "no plugin", "step": "no plugin", "memory": "equal", "disk": "equal"},
+    )  # fmt: skip
+
+
+def material() -> Row:
+    """Return the row of a material in one plugin, beside bitmaps without a filter."""
     names = ("ours", "normalmap + principled + bitmaps", "paper")
     shares = [
         scene["equal_error"]["neural_material, trained, trilinear"]["principled + bitmaps, multijittered"]["share"]
         for scene in measured("tradeoff_shading_renders")["scenes"].values()
     ]
-    best_text = best.replace(", ASTC", " filters in ASTC").replace(", compressed", " filters, compressed")
-    errors = (psnr["lambda 0.9, clip, schedule"], psnr[best], recipe["errors"]["c_mean_db"])
     return Row(
-        "`neural_material`", "shading", f"`normalmap`, `principled`, 4 maps ({best_text})", "PSNR of shaded values",
-        "dB",
-        *(benched(error, "shading", name) for error, name in zip(errors[:2], names[:2], strict=True)),
-        benched(errors[2], "shading", names[2]),
-        {"errors": "tradeoff_shading", "error of the paper's recipe": "tradeoff_shading_paper",
-         "all others": "bench_backward"},
-        f"Errors are those of {material}; instead of ours, the best classical filter in equal bytes with mip maps, "
-        "which Mitsuba does not read. Times and bytes are those of rust and of its bitmaps without a filter. At equal "
-        f"error of whole renders of rust, ours with its default filter takes {min(shares):.2f} to {max(shares):.2f} of "
-        "the time of multijittered bitmaps (`tradeoff_shading_renders.json`). The paper's recipe had 300 steps, ours "
-        "1,500 (the commands). " + TRAINED,
+        "`neural_material`", "shading", "`normalmap`, `principled`, 4 bitmaps", "maps of rust", "",
+        *(benched(None, "shading", name) for name in names), {"all": "bench_backward"},
+        f"At equal error of whole renders, ours with its default filter takes {min(shares):.2f} to {max(shares):.2f} "
+        f"of the time of multijittered bitmaps (`tradeoff_shading_renders.json`). {TRAINED}",
+        cells={"error": "not compared"},
     )  # fmt: skip
 
 
@@ -285,9 +315,8 @@ def scene() -> Row:
         {"errors": "tradeoff_scene_training_floor", "balls": "tradeoff_scene_training_balls"},
         f"On the scene of balls, training inside the scene alone has {other['scene']:.1f} dB, over the hemisphere "
         f"{other['hemisphere']:.1f} dB, one after the other {other['hemisphere, then scene']:.1f} dB. "
-        "Times and bytes are those of the row above: the arrays have the same form. The paper's recipe is not "
-        "measured: it does not train inside scenes.",
-        cells=dict.fromkeys(("render", "step", "memory", "disk"), "as above"),
+        "The paper's recipe is not measured: it does not train inside scenes.",
+        cells=dict.fromkeys(("render", "step", "memory", "disk"), "equal"),
         behind=(f"error {other['scene'] - other['hemisphere']:+.1f} dB on the scene of balls",),
     )  # fmt: skip
 
@@ -332,7 +361,6 @@ def radiance() -> Row:
 
     named = ("ours 75×", base, "paper 75×")
     left_out = (*named, "hash grid + network 75×")  # its colours were not trained in this run
-    small, codes = (study["candidates"][f"{name} 200×"] for name in ("ours", "codebook"))
     steps = [times("field", name)["step"] for name in ("ours", "paper")]
     return Row(
         "`neural_field`", "field", "codebook (VQRF)", "PSNR of the foreground", "dB",
@@ -340,15 +368,16 @@ def radiance() -> Row:
         "The codebook is the best contender of the study in equal bytes of memory. It is no plugin that could take a "
         f"step; a step of ours takes {steps[0]:.2f} (the paper's recipe: {steps[1]:.2f}) of that of a grid in "
         "single precision (`bench_backward.json`). Mitsuba's `volprim_rf_basic` is not measured: it needs 3D "
-        f"Gaussians of the capture. At 200x, ours has {small['errors']['psnr_foreground_db']:.1f} dB in "
-        f"{size_text(small['details']['memory_bytes'])}, the codebook {codes['errors']['psnr_foreground_db']:.1f} dB "
-        f"in {size_text(codes['details']['memory_bytes'])}.",
+        "Gaussians of the capture.",
         others={name: contender(name) for name in study["candidates"] if name not in left_out}, cells={"step": "none"},
     )  # fmt: skip
 
 
 #: Functions that make the rows, in the order of the table.
-ROWS = (ggx, disney, bsdf, bsdf_source, image, large_material, texture, shading, scene, sdf, sdf_grid, radiance)
+ROWS = (
+    ggx, disney, exact_disney, bsdf, bsdf_source, image, large_material, texture, mip_maps, shading, material, scene,
+    sdf, sdf_grid, radiance,
+)  # fmt: skip
 
 
 def rows() -> list[Row]:
@@ -375,7 +404,7 @@ def cost(table) -> str:
             return "exact" if value == EXACT else f"{value:.2f}°" if row.unit == "°" else f"{value:.1f}"
 
         lines.append([
-            f"[{row.task}]({row.page}.md)", row.instead, f"{row.error}, {row.unit}" if row.unit != "°" else row.error,
+            f"[{row.task}]({row.page}.md)", row.instead, f"{row.error}, {row.unit}" if row.unit == "dB" else row.error,
             NAMES, three(row, error, "error"), *(three(row, lambda v: f"{v:.2f}", key) for key in ("render", "step")),
             *(three(row, size_text, key) for key in ("memory", "disk")),
         ])  # fmt: skip

@@ -76,7 +76,7 @@ def table(head: list[str], rows: list[list], shown: Callable[[list], bool] | Non
 def page_of_tasks() -> str:
     """Return the page of all tasks: their presets, and the files that ship."""
     parts = [
-        "# All tasks\n\nMade from the declarations of the tasks by `python docs/make_tables.py`: "
+        "# All tasks and presets\n\nMade from the declarations of the tasks by `python docs/make_tables.py`: "
         "change those, not this page.\n"
     ]
     for task in tasks().values():
@@ -130,7 +130,8 @@ def page_of_figures(pages: dict[Path, str]) -> str:
     parts = [
         "# Where the figures come from",
         "Each figure of the README and of the pages is inserted from a file in `docs/measured`, which the command "
-        "below wrote.\nThis page is made by `python docs/make_tables.py`; `python docs/list_numbers.py` lists the "
+        "below wrote. Files of version 0.1.0 were measured on the way to 0.2.0.\n"
+        "This page is made by `python docs/make_tables.py`; `python docs/list_numbers.py` lists the "
         "numbers that no file backs.",
         "## Headlines",
         "Tables and lists of the README, and the first paragraph of each page.",
@@ -325,7 +326,8 @@ def texture_renders(study: dict) -> Table:
             f"`{name}`", f"{c['bytes']:,}", *(f"{e[f'psnr_{s}_db']:.1f} / {e[f'flip_{s}']:.4f}" for s in stages),
             f"{e['flicker_error'] / flicker:.2f}", " / ".join(times),
         ])  # fmt: skip
-    head = ["", "bytes", *(f"{s}: PSNR, dB / FLIP" for s in stages), "flicker", f"time: {' / '.join(stages)}"]
+    head = ["", "bytes, 8 bits a number"]
+    head += [*(f"{s}: PSNR, dB / FLIP" for s in stages), "flicker", f"time: {' / '.join(stages)}"]
     return table(head, rows, lambda row: row[0].strip("`") in RENDERS)
 
 

@@ -1,4 +1,4 @@
-"""Learned lookup tables that a renderer trusts: differentiable indirection for Mitsuba 3.
+"""Learned lookup tables for Mitsuba 3, by differentiable indirection.
 
 ``import mi_diffind`` makes the plugins (``neural_disney``, ``disney``, ``neural_ggx``, ``neural_image``, …) known to
 ``mi.load_file``, ``mi.load_string`` and ``mi.load_dict`` in every variant, whichever of ``mitsuba`` and ``mi_diffind``

@@ -23,6 +23,7 @@ from .files import writable_folder
 from .interrupt import interruptible
 from .measure import figure_grid
 from .measure.statistics import spread
+from .plugins.support import footprint
 from .progress import progress_bar
 from .runtime import use_variant
 
@@ -70,6 +71,7 @@ class _Side:
 
     def render(self, spp: int, seed: int, on_pass) -> None:
         """Render one pass of ``spp`` samples, and further ones of as many where the side is oversampled."""
+        spp = scenes.samples_taken(self.scene, spp)[0]
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
             image, seconds = scenes.render(self.scene, spp * self.oversampling, seed, self.oversampling, on_pass)
@@ -154,6 +156,7 @@ def compare(
             sides[name] = _Side(parsed.load(exact=True, against=names), oversampling)
     written = _Side(parsed.load())
     spp = spp or written.scene.sensors()[0].sampler().sample_count()
+    footprint.check_samples(footprint.textures(written.scene), spp)
     passes, done = max(1, min(max(passes, 2), spp)), 0
     turns = [written, *sides.values()]
     total = passes * sum(side.oversampling for side in turns)
@@ -169,7 +172,7 @@ def compare(
     common = {
         "scene": str(parsed.path),
         "variant": mi.variant(),
-        "spp": done,
+        "spp": sum(written.samples),
         "seed": seed,
         "width": written.image.shape[1],
         "height": written.image.shape[0],
@@ -186,7 +189,7 @@ def compare(
             **common,
             "against": name,
             "counterparts": put_in[name],
-            "truth_spp": done * side.oversampling,
+            "truth_spp": sum(side.samples) * side.oversampling,
             **_errors(written, side),
             **_times(written, side, name),
         })
@@ -351,9 +354,8 @@ def _sections(comparison: Comparison) -> list[list[str]]:
     f = comparison.figures
     replaced = "1 plugin" if f["replaced_plugins"] == 1 else f"{f['replaced_plugins']} plugins"
     what = "learned" if f["learned_plugins"] == f["replaced_plugins"] else "replaced"
-    spp = f"{f['spp']} of {f['spp_requested']} spp (interrupted)" if f["interrupted"] else f"{f['spp']} spp"
     head = [
-        f"scene       {Path(f['scene']).name}, {f['width']} x {f['height']}, {spp}",
+        f"scene       {Path(f['scene']).name}, {f['width']} x {f['height']}, {scenes.samples_text(f)}",
         f"variant     {f['variant']}",
         f"{what:12}{replaced}, {f['table_bytes']:,} bytes of tables",
     ]

@@ -41,6 +41,13 @@ def shortened(text: str, most: int = LONGEST_MESSAGE) -> str:
     return f"{text[: most - 3 - end]} … {text[-end:]}"
 
 
+def missing_package(*names: str) -> str:
+    """Return ``names`` of packages on PyPI as the object of a sentence, with the command that installs them."""
+    plural = len(names) > 1
+    listed = f"package{'s' * plural} {', '.join(names)}, which {'are' if plural else 'is'} not installed"
+    return f"the {listed}: pip install {' '.join(names)}"
+
+
 class DiffindError(Exception):
     """Bad input, or a place that cannot be written.
 

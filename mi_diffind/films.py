@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from . import srgb
-from .errors import UsageError
+from .errors import UsageError, missing_package
 from .files import OutputError, replacing, shown
 
 #: Extensions of films.
@@ -28,10 +28,7 @@ INK, PAPER, LABEL = (32, 32, 32), (255, 255, 255), 1.7
 def check_encoder(path: str | os.PathLike) -> None:
     """Refuse a film that cannot be encoded here. Raises :class:`~mi_diffind.errors.UsageError`."""
     if Path(path).suffix.lower() == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
-        raise UsageError(
-            f'output "{shown(path)}": H.264 needs the package imageio-ffmpeg, which is not installed: '
-            f"pip install 'mi-diffind[film]'"
-        )
+        raise UsageError(f'output "{shown(path)}": H.264 needs {missing_package("imageio-ffmpeg")}')
 
 
 def displayed(image: np.ndarray) -> np.ndarray:

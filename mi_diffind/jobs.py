@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 
-from .errors import DiffindError, UsageError, reason
+from .errors import DiffindError, UsageError, missing_package, reason
 from .interrupt import interruptible
 from .progress import progress_bar
 
@@ -245,9 +245,7 @@ def _on_cluster(function, jobs: Mapping[str, object], scheduler: str, stop: thre
     try:
         import distributed
     except ImportError:
-        raise UsageError(
-            "scheduler: needs the package distributed, which is not installed: pip install 'mi-diffind[cluster]'"
-        ) from None
+        raise UsageError(f"scheduler: needs {missing_package('distributed')}") from None
     try:
         client = distributed.Client(scheduler, timeout=TIMEOUT, set_as_default=False)
     except (OSError, ValueError, ImportError) as e:  # a TimeoutError is an OSError

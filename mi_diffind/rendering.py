@@ -18,12 +18,16 @@ from . import depth as depths
 from . import orbit as orbits
 from .errors import UsageError
 from .interrupt import interruptible
+from .plugins.support import footprint
 from .progress import progress_bar
 from .runtime import use_variant
 from .units import check_memory
 
 #: Samples per pixel of a pass, after each of which Ctrl-C may end the rendering.
 PASS = 16
+
+#: Numbers of passes that are tried beside that of :data:`PASS`, for samplers that round up.
+TRIED = 8
 
 
 @dataclass
@@ -144,18 +148,19 @@ def render(
         _check_channels(image_path(output, bool(orbit)), channels_of(loaded))
     ready = time.perf_counter()
     spp = spp or loaded.sensors()[0].sampler().sample_count()
+    footprint.check_samples(footprint.textures(loaded), spp)
     if orbit:
         width, height = scenes.film_size(loaded)
         check_memory("orbit", orbit, 16 * orbit * width * height)
         with interruptible() as stop, progress_bar("orbit", orbit, "frame", progress) as bar:
             frames = orbits.orbit(loaded, orbit, centre, spp=spp, seed=seed, on_frame=bar.update, stop=stop)
-        interrupted, done = len(frames) < orbit, spp
+        interrupted, done = len(frames) < orbit, sum(scenes.samples_taken(loaded, spp))
     else:
-        passes = max(1, spp // PASS)
+        passes = fewest_samples(loaded, spp)
         with interruptible() as stop, progress_bar("render", passes, "pass", progress) as bar:
             image, seconds = scenes.render(loaded, spp, seed, passes, bar.update, stop)
-        frames, done = [image], len(seconds) * spp // passes
-        interrupted = done < spp
+        frames, done = [image], sum(scenes.samples_taken(loaded, spp, passes)[: len(seconds)])
+        interrupted = len(seconds) < passes
     figures = {
         "interrupted": interrupted,
         "scene": str(parsed.path) if parsed else None,
@@ -176,6 +181,13 @@ def render(
         learned = parsed.learned_plugins()
         figures |= {"learned_plugins": learned, "table_bytes": parsed.table_bytes(learned)}
     return Rendering(frames, figures, loaded)
+
+
+def fewest_samples(scene, spp: int) -> int:
+    """Return the number of passes, of about :data:`PASS` samples, of which the sampler rounds up least."""
+    about = max(1, spp // PASS)
+    counts = range(about, min(2 * about, about + TRIED, spp) + 1)
+    return min(counts, key=lambda passes: sum(scenes.samples_taken(scene, spp, passes)))
 
 
 def _chosen_depth(parsed: scenes.ParsedScene, requested, tolerance: float | None, seed: int) -> dict:

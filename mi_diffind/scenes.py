@@ -417,6 +417,28 @@ def film_size(scene) -> tuple[int, int]:
     return int(width), int(height)
 
 
+def samples_taken(scene, spp: int, passes: int = 1) -> list[int]:
+    """Return the samples a pixel of each pass of :func:`render`: samplers other than ``independent`` may round up."""
+    counts = [(i + 1) * spp // passes - i * spp // passes for i in range(passes)]
+    taken = {count: rounded(scene.sensors()[0], count) for count in set(counts)}
+    return [taken[count] for count in counts]
+
+
+def rounded(sensor, spp: int) -> int:
+    """Return the samples a pixel that the sampler of a sensor takes for ``spp``."""
+    sampler = sensor.sampler().clone()
+    sampler.set_sample_count(spp)
+    return sampler.sample_count()
+
+
+def samples_text(figures: dict) -> str:
+    """Return ``spp`` of the figures of a render as text, with the reason if it is not ``spp_requested``."""
+    spp, requested = figures["spp"], figures["spp_requested"]
+    if figures["interrupted"]:
+        return f"interrupted, kept {spp} of {requested} spp"
+    return f"{spp} spp" if spp == requested else f"{spp} spp ({requested} requested, the sampler adds some)"
+
+
 def render(
     scene,
     spp: int | None = None,
@@ -429,9 +451,9 @@ def render(
 
     Returns the linear image ``(height, width, channels)``, float32, and the seconds of each pass (the first includes
     compilation). ``on_pass()`` is called after each pass. Once ``stop`` is set, the running pass is the last, and the
-    image is the average of ``len(seconds) · spp // passes`` samples. The same arguments give the same image if the
-    film's filter is a box (other filters add up samples of neighbouring pixels in any order) and the samples of a pass
-    are a power of two (else the last bit of a few pixels varies).
+    image is the average of ``len(seconds)`` passes, of :func:`samples_taken` each. The same arguments give the same
+    image if the film's filter is a box (other filters add up samples of neighbouring pixels in any order) and the
+    samples of a pass are a power of two (else the last bit of a few pixels varies).
     """
     spp = spp or scene.sensors()[0].sampler().sample_count()
     passes = max(1, min(passes, spp))

@@ -414,17 +414,19 @@ class CaptureCamera:
         self.parameters["to_world"] = type(self.parameters["to_world"])(mi.ScalarTransform4f(matrix))
         self.parameters.update()
         footprint.attach(self.scene, self.sensor, self.settings.spp)
-        total, done = 0.0, 0
+        total, done, passes = 0.0, 0, 0
         most = 1 << (max(1, PASS // self.settings.resolution**2).bit_length() - 1)
         while done < self.settings.spp:
             n = min(most, self.settings.spp - done)
+            if scenes.rounded(self.sensor, n) > n:  # multijitter takes powers of four as they are
+                n = 4 ** ((n.bit_length() - 1) // 2)
             with scenes.scene_errors(None):
                 image = mi.render(
                     self.scene, sensor=self.sensor, integrator=self.integrator, spp=n,
-                    seed=(seed * 4096 + done // most) % 2**32,
+                    seed=(seed * 4096 + passes) % 2**32,
                 ).numpy().astype(np.float64)  # fmt: skip
             total = total + n * np.where(np.isfinite(image), image, 0)
-            done += n
+            done, passes = done + n, passes + 1
         image = total / done
         colours = 1 if mi.is_monochromatic else 3
         alpha = np.clip(image[..., colours : colours + 1], 0, 1)

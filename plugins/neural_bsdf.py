@@ -388,7 +388,8 @@ def _proxy(parameters: dict, form) -> Proxy:
             axes = ("alpha_u",) if form.isotropic else ("alpha_u", "alpha_v")
             alphas = tuple(clamp(parameters[f"{name}.{axis}"], ALPHA_MIN, 1.0) for axis in axes)
             colours = [[limited(c) for c in parameters[f"{name}.{key}"]] for key in ("f0", "f90")]
-            lobes[name] = ProxyLobe(alphas, limited(parameters[f"{name}.gamma"]), *colours)
+            gamma = clamp(parameters[f"{name}.gamma"], 2 * low, 2 * high)  # files hold the logarithm of its half
+            lobes[name] = ProxyLobe(alphas, gamma, *colours)
     if "diffuse" not in form.terms:
         return Proxy.of_parts(None, None, lobes)
     return Proxy.of_parts([limited(c) for c in parameters["diffuse"]], limited(parameters["edge"]), lobes)

@@ -222,8 +222,8 @@ class NeuralSDF(distance_shape(mi.Mesh)):
     def optimisable(self) -> bool:
         return bool(self.entries())
 
-    def optimised(self) -> bool:
-        return super().optimised() or any(compat.has_gradient(values) for values in self.entries().values())
+    def attached(self) -> list:
+        return super().attached() + [values for values in self.entries().values() if compat.has_gradient(values)]
 
     def traverse(self, cb: mi.TraversalCallback) -> None:
         super().traverse(cb)

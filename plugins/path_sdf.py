@@ -50,8 +50,9 @@ and, with ``storage`` ``float32``, their arrays: hits move along their rays by t
 normals, cosines and the solid angles between vertices follow. The derivatives are those of *interiors*: where the
 outline of a solid, its shadow or its image in a mirror moves over a pixel, radiance jumps, and this part of the
 derivative is missing. An optimisation from images therefore learns from shading, not from silhouettes; masks, or a loss
-on the field itself, have to compensate. Ordinary shapes are constants, and so are places seen in smooth mirrors and
-through smooth glass. Polarised variants and media are not supported.
+on the field itself, have to compensate. A warning says where all derivatives of a shape are zero. Ordinary shapes are
+constants, and so are places seen in smooth mirrors and through smooth glass. Polarised variants and media are not
+supported.
 
 {executable}
 
@@ -94,6 +95,11 @@ def integrator() -> type:
             if not shapes:
                 return super().sample(mode, scene, *args, **kwargs)
             return self.sample_shapes(mode, scene, shapes, *args, **kwargs)
+
+        def render_backward(self, scene, params, grad_in, *args, **kwargs):
+            """See ``ADIntegrator.render_backward``. Warns of a shape without derivatives."""
+            super().render_backward(scene, params, grad_in, *args, **kwargs)
+            sdf.check_derivatives(sdf.distance_shapes_in(scene), grad_in)
 
         def intersect(self, scene, shapes, ray, coherent, active, rest):
             """Return the nearest hit, of an ordinary shape or of a distance shape; the other one is not valid."""

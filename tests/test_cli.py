@@ -313,7 +313,7 @@ def test_interrupted_renders_keep_what_they_have(tmp_path):
     assert "interrupted, kept 32 of 96 spp" in text
     assert json.loads(report.read_text())["spp"] == 32
     assert np.array(mi.Bitmap(str(out))).mean() > 0.01
-    assert "4 of 20 spp (interrupted)" in text
+    assert "interrupted, kept 4 of 20 spp" in text
     assert (folder / "comparison.png").exists()
 
 

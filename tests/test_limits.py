@@ -400,7 +400,7 @@ def test_readers_that_are_not_installed(tmp_path, monkeypatch):
             raise error
 
         monkeypatch.setattr(trimesh, "load", missing)
-        with pytest.raises(MeshError, match=rf"\.3mf files need a Python module .*: pip install {package}$"):
+        with pytest.raises(MeshError, match=rf"\.3mf files need the package {package}, .*: pip install {package}$"):
             load_mesh(tmp_path / "a.3mf")
 
 

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from shading_scenes import fitted, material, scene_file
+from variants import warnings_of
 
 import mi_diffind
 from mi_diffind import scenes
@@ -564,7 +565,10 @@ def test_a_scene_is_trained(folder, tmp_path, monkeypatch):
     (truth,) = references.images([view])
     assert references.reused == 1
     Rig(plain, ORBIT).place(view)
-    footprint.attach(plain)
+    warned = warnings_of(mi, monkeypatch)
+    for spp in (4, 1, 4, None):
+        footprint.attach(plain, 0, spp)
+    assert len(warned) == 1 and "trained.npz: was trained for spp=1, found spp=4: fit scene --spp 4" in warned[0]
     images = [np.clip(found.settings["exposure"] * mi.render(plain, spp=1, seed=i).numpy(), 0, 1) for i in range(16)]
     error = np.mean((np.mean(images, axis=0) - np.clip(found.settings["exposure"] * truth, 0, 1)) ** 2)
     assert -10 * np.log10(error) == pytest.approx(result.measured["psnr_db"], abs=0.3)

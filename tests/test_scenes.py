@@ -182,6 +182,33 @@ def test_passes_add_up_to_the_samples(mi_rgb):
     assert abs(image.mean() / converged.mean() - 1) < 0.1
 
 
+def test_samples_that_a_sampler_adds_are_said(mi_rgb, tmp_path, capsys, monkeypatch):
+    """By ``render`` and ``compare``: as many as Mitsuba takes."""
+    from mi_diffind import cli
+
+    text = (Path(__file__).parent / "lamp.xml").read_text().replace('type="independent"', 'type="multijitter"')
+    (tmp_path / "a.xml").write_text(text)
+    render, counts = mi_rgb.render, []
+
+    def counted(scene, *arguments, **options):
+        image = render(scene, *arguments, **options)
+        counts.append(scene.sensors()[0].sampler().sample_count())
+        return image
+
+    monkeypatch.setattr(mi_rgb, "render", counted)
+    scene = [str(tmp_path / "a.xml"), "-D", "width=12", "-D", "height=8", "--spp"]
+    added = " ({} requested, the sampler adds some)".format
+    for words, taken, note in (
+        (["render", *scene, "32", "-o", str(tmp_path / "a.exr")], 32, ""),
+        (["render", *scene, "13", "-o", str(tmp_path / "a.exr")], 14, added(13)),
+        (["compare", *scene, "14", "--passes", "2", "--out", str(tmp_path)], 16, added(14)),
+    ):
+        counts.clear()
+        assert cli.main(words) == 0
+        assert sum(counts) == taken * (2 if words[0] == "compare" else 1)
+        assert f", {taken} spp{note}" in capsys.readouterr().out
+
+
 def test_metrics():
     rng = np.random.default_rng(0)
     a = rng.random((32, 48, 3)).astype(np.float32)

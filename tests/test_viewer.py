@@ -370,7 +370,7 @@ def test_bars_beside_a_picture(rng):
 
 def test_without_viser_a_sentence_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(UsageError, match=r'the package viser is not installed: pip install "mi-diffind\[view\]"'):
+    with pytest.raises(UsageError, match=r"the package viser, which is not installed: pip install viser$"):
         server("127.0.0.1", 0)
 
 

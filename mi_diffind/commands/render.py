@@ -109,12 +109,12 @@ def run(arguments) -> dict:
     if arguments.orbit:
         count, wanted = figures["frames"], figures["frames_requested"]
         kept = f"interrupted, kept {count} of {wanted}" if figures["interrupted"] else count
-        say(f"{output}: {kept} frames of {size}, {figures['spp']} spp, {time}")
+        samples = scenes.samples_text({**figures, "interrupted": False})
+        say(f"{output}: {kept} frames of {size}, {samples}, {time}")
         if output.suffix.lower() == ".mp4" and (figures["width"] % 2 or figures["height"] % 2):
             say("H.264 needs an even width and height: the last column or row is there twice")
     else:
-        kept = f"interrupted, kept {figures['spp']} of {figures['spp_requested']}"
-        say(f"{output}: {size}, {kept if figures['interrupted'] else figures['spp']} spp, {time}")
+        say(f"{output}: {size}, {scenes.samples_text(figures)}, {time}")
     reports = scenes.reports(rendering.scene) if arguments.json is not None and not arguments.orbit else []
     return {**figures, "output": str(output), "reports": reports}
 

@@ -15,7 +15,7 @@ from collections.abc import Callable
 import numpy as np
 
 from .. import srgb
-from ..errors import DiffindError, UsageError
+from ..errors import DiffindError, UsageError, missing_package
 from .passes import no_collection
 from .session import Pose, Session
 
@@ -46,7 +46,7 @@ def server(host: str, port: int):
     try:
         import viser
     except ImportError:
-        raise UsageError('view: the package viser is not installed: pip install "mi-diffind[view]"') from None
+        raise UsageError(f"view: needs {missing_package('viser')}") from None
     if not isinstance(port, int) or not 0 <= port <= 65535:
         raise UsageError(f"port: found {port}, allowed are whole numbers from 0 to 65535")
     try:

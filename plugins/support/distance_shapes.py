@@ -23,6 +23,7 @@ import numpy as np
 from mi_diffind import compat, mitsuba_versions
 from mi_diffind.tasks.sdf import tracing
 
+from .. import warn
 from . import omissions
 from .placement import Placement, PlacementParameter
 from .tables import arrays_of
@@ -58,7 +59,7 @@ def distance_shape(mesh: type) -> type:
 
         def __init__(self, props: mi.Properties, field, placement: Placement, smooth: bool):
             self.field, self.smooth, self.position = field, smooth, PlacementParameter(placement)
-            self.ready = False
+            self.ready, self.differentiated = False, False
             super().__init__(*mitsuba_versions.mesh_arguments(props, CORNERS, CORNERS))
             if self.is_emitter():
                 raise RuntimeError("emitter: found one, signed distance fields emit no light")
@@ -125,9 +126,13 @@ def distance_shape(mesh: type) -> type:
             """Return whether the field's arrays are kept in a form that can be optimised."""
             return False
 
+        def attached(self) -> list:
+            """Return the arrays of the field and the transform whose derivatives are tracked."""
+            return [self.position.transform.matrix] if self.position.moving() else []
+
         def optimised(self) -> bool:
             """Return whether derivatives with respect to the field or its place are enabled."""
-            return self.position.moving()
+            return bool(self.attached())
 
         @property
         def index_bytes(self) -> int:
@@ -232,6 +237,22 @@ def distance_shapes_in(scene: mi.Scene) -> DistanceShapes:
             f'with a "to_world" of their own share its memory, and trace="grid" may be instanced'
         )
     return DistanceShapes(shapes)
+
+
+def check_derivatives(shapes: DistanceShapes, adjoint: mi.TensorXf) -> None:
+    """Warn of shapes that have only zeros from their first backward pass, with a nonzero ``adjoint`` of the image."""
+    if dr.flag(dr.JitFlag.FreezingScope):  # nothing can be evaluated
+        return
+    moving = [shape for shape in shapes if shape.optimised() and not shape.differentiated]
+    if not moving or not np.array(adjoint).any():
+        return
+    for shape in moving:
+        shape.differentiated = True
+    if not any(np.array(dr.grad(values)).any() for shape in moving for values in shape.attached()):
+        warn(
+            f'the derivatives of the shape "{moving[0].id()}" ({omissions.plugin_of(moving[0])}) are all zero: '
+            "they leave out outlines that move; add a loss on the field, such as masks"
+        )
 
 
 def crop_grid(values: np.ndarray, lower, spacing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -22,6 +22,7 @@ import numpy as np
 
 from mi_diffind import compat, mitsuba_versions
 
+from .. import warn
 from . import omissions
 
 #: Limit of the components of a footprint in uv: larger than any texture, and its fourth power is finite.
@@ -356,7 +357,24 @@ def attach(scene: mi.Scene, sensor: int | mi.Sensor = 0, spp: int | None = None)
         texture.set_cone(cone)
         _attached[texture] = (0, "") if cone is None else (id(sensor), sensor.id())
     omissions.recheck()
+    if cone is not None:
+        check_samples(filtering, sensor.sampler().sample_count() if spp is None else spp)
     return len(filtering)
+
+
+def check_samples(textures, spp: int) -> None:
+    """Warn, once a file and number, of textures that ``fit scene`` trained for other samples per pixel than ``spp``."""
+    for texture in textures:
+        table = texture.trained()[0] if hasattr(texture, "trained") else None
+        settings = {} if table is None or table.settings.get("kept_start") else table.settings.get("shading", {})
+        trained = settings.get("spp", spp) if isinstance(settings, dict) else spp
+        if trained != spp and (key := (table.path, trained, spp)) not in _warned:
+            _warned.add(key)
+            warn(f"{table.path}: was trained for spp={trained}, found spp={spp}: fit scene --spp {spp} trains for that")
+
+
+#: Files with the samples that they were trained and rendered with, warned of by :func:`check_samples`.
+_warned: set[tuple] = set()
 
 
 def attached_sensor(texture) -> tuple[int, str]:

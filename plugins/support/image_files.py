@@ -28,6 +28,7 @@ from mi_diffind.picture_sizes import check_picture
 from mi_diffind.tables import Table, TableError
 from mi_diffind.task import Task, stamp
 
+from .. import warn
 from . import properties
 from .stock import Kept
 from .tables import copy_entries, exposed
@@ -103,6 +104,8 @@ def open_file(task: Task, path: str | Path, storage: str) -> SharedMaps:
     def load():
         model = task.model(task.load(path), mi.TensorXf, storage)
         copy_entries(model.arrays)
+        if storage == "float32" and not model.arrays:
+            warn(f'parameter "storage": found "float32", but {path} is of one colour: it has no arrays to optimise')
         return SharedMaps(model.image, model.arrays, model.table)
 
     return shared((task.name, str(path.resolve()), *stamp(path), storage, mi.TensorXf), load)

@@ -184,8 +184,8 @@ def register(mi, fields: dict, name: str = "test_solid") -> None:
         return Held(props, fields[props["field"]], placement, props.get("smooth", False))
 
     class Held(shapes.distance_shape(mi.Mesh)):
-        def optimised(self):
+        def attached(self):
             values = [v for v in vars(self.field).values() if isinstance(v, mi.Float)]
-            return super().optimised() or any(dr.is_diff_v(v) and v.index_ad for v in values)
+            return super().attached() + [v for v in values if dr.is_diff_v(v) and v.index_ad]
 
     mi.register_shape(name, make)

@@ -22,3 +22,11 @@ def set_variant(name):
     mi.set_variant(name)
     mi.set_log_level(mi.LogLevel.Error)
     return mi
+
+
+def warnings_of(mi, monkeypatch):
+    """What Mitsuba is told to warn of from here on."""
+    report = []
+    mi.set_log_level(mi.LogLevel.Warn)  # commands that ran before may have asked for less
+    monkeypatch.setattr(mi, "Log", lambda level, text: report.append(text) if level == mi.LogLevel.Warn else None)
+    return report

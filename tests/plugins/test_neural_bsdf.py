@@ -10,7 +10,7 @@ from learned_bsdfs import formula, handmade
 from variants import VARIANTS, set_variant
 
 import mi_diffind
-from mi_diffind.tables import load_table, save_table
+from mi_diffind.tables import StoredArray, load_table, save_table
 
 LIBRARY = Path(__file__).resolve().parents[2] / "scenes" / "assets" / "library"
 
@@ -23,6 +23,11 @@ def files(tmp_path_factory):
         "anisotropic": {"isotropic": False, "scale": (0.05, 0.3), "terms": ("first", "second")},
     }.items():
         save_table(folder / f"{name}.npz", handmade(**form))
+    table = handmade()
+    proxy = table.arrays["proxy"].entries.copy()
+    proxy[[6, 15]] = 5.0  # the largest exponents that a file may hold
+    table.arrays["proxy"] = StoredArray(proxy)
+    save_table(folder / "beckmann.npz", table)
     return {path.stem: str(path) for path in folder.glob("*.npz")}
 
 
@@ -45,7 +50,7 @@ def uniform(mi, rng, n):
     return u[0], mi.Point2f(u[1], u[2])
 
 
-@pytest.mark.parametrize("name", ["isotropic", "anisotropic"])
+@pytest.mark.parametrize("name", ["isotropic", "anisotropic", "beckmann"])
 def test_values_and_densities(mi_rgb, files, rng, name):
     """``eval`` is the formula times the cosine; ``eval_pdf``, ``pdf`` and ``sample`` agree with it."""
     mi, n, ctx = mi_rgb, 4000, mi_rgb.BSDFContext()

@@ -18,7 +18,7 @@ import pytest
 from arrays import aligned
 from scipy.ndimage import map_coordinates
 from texture_scenes import alive, check_process, refused, scene_xml
-from variants import VARIANTS, set_variant
+from variants import VARIANTS, set_variant, warnings_of
 
 from mi_diffind import comparison, compat, scenes
 from mi_diffind.maps.layout import Layout, MapLayout
@@ -824,9 +824,10 @@ def test_bytes_have_no_parameters_but_the_transformation(mi_rgb, file):
 
 
 @pytest.mark.parametrize("variant", RENDERED)
-def test_no_arrays(variant, tmp_path, rng):
-    """An image of one colour is a few numbers."""
+def test_no_arrays(variant, tmp_path, rng, monkeypatch):
+    """An image of one colour is a few numbers, none of which can be optimised."""
     mi = set_variant(variant)
+    warned = warnings_of(mi, monkeypatch)
     one = MapLayout("image", "albedo", "srgb", 1, (("constant", 0.5), ("constant", 0.2), ("constant", 0.7)))
     path = make(tmp_path / "a.npz", Layout(WIDTH, HEIGHT, (one,), (), ()))
     theirs = mi.load_dict(counterpart(mi, path, "image"))
@@ -840,6 +841,7 @@ def test_no_arrays(variant, tmp_path, rng):
             if a is not None:
                 np.testing.assert_allclose(np.broadcast_to(a, b.shape), b, atol=2e-5)
         assert not texture.is_spatially_varying()
+        assert (storage == "float32") == any("a.npz is of one colour: it has no arrays" in text for text in warned)
         assert float(texture.mean()[0]) == pytest.approx(float(theirs.mean()[0]), abs=1e-5)
         t = plugin(path, "image", storage=storage)
         lit = scene(mi, {"type": "diffuse", "reflectance": t}, {"type": "area", "radiance": t})

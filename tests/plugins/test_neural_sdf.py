@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from arrays import aligned
 from sdf_fields import dense_table, sparse_table, torus
+from variants import warnings_of
 
 from mi_diffind import compat, plugins, scenes
 from mi_diffind.scenes import SceneError
@@ -400,14 +401,6 @@ def test_grids_of_sparse_fields(mi_rgb, upright_files):
         assert np.abs(values - expected).max() < 1e-6
         crossed = grids.crossed_blocks(field, lower, (upper[0] - lower[0]) / (shape[0] - 1), shape)
         assert crossed.any() and (resolution < 100 or crossed.mean() < 0.9)
-
-
-def warnings_of(mi, monkeypatch):
-    """What Mitsuba is told to warn of from here on."""
-    report = []
-    mi.set_log_level(mi.LogLevel.Warn)  # commands that ran before may have asked for less
-    monkeypatch.setattr(mi, "Log", lambda level, text: report.append(text) if level == mi.LogLevel.Warn else None)
-    return report
 
 
 def test_grids_are_no_larger_than_allowed(mi_rgb, upright_files, monkeypatch):

@@ -4,6 +4,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from sdf_fields import Ball, register
+from variants import warnings_of
 
 BSDFS = {
     "diffuse": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.7, 0.5, 0.3]}},
@@ -296,3 +297,23 @@ def test_derivatives_of_the_place_against_differences(mi_rgb, fields, move):
     assert np.abs(differences).mean() > 0.1
     forward = of_place(mi, loaded, integrator, move)
     assert np.abs(forward - differences).mean() < 2e-3 * np.abs(differences).mean()
+
+
+@pytest.mark.parametrize("moved", ["field", "place"])
+def test_derivatives_that_are_zero_are_said(mi_rgb, fields, monkeypatch, moved):
+    """Of a black ball before a sky, whose outline alone shows: once, and not of a ball that is lit."""
+    mi, ball, warned = mi_rgb, fields["ball"], warnings_of(mi_rgb, monkeypatch)
+    integrator = mi.load_dict({"type": "path_sdf", "max_depth": 2})
+    for reflectance, count in ((0.5, 0), (0.0, 1)):
+        bsdf = {"type": "diffuse", "reflectance": reflectance}
+        loaded = scene(mi, {"ball": solid(mi, "ball", bsdf=bsdf)}, (12, 8))
+        for _ in range(2):
+            if moved == "place":
+                of_place(mi, loaded, integrator, "translation", "backward", spp=4)
+            else:
+                ball.r = dr.opaque(mi.Float, 0.4)
+                dr.enable_grad(ball.r)
+                integrator.render_backward(loaded, None, dr.ones(mi.TensorXf, (8, 12, 3)), spp=4)
+                ball.r = dr.opaque(mi.Float, 0.4)
+        assert len(warned) == count
+    assert 'the derivatives of the shape "ball" (' in warned[0] and "are all zero" in warned[0]

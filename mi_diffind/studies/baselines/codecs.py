@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...errors import DiffindError
+from ...errors import DiffindError, missing_package
 from ...units import largest_fitting
 
 #: Block size of ASTC in 2D, width × height, finest first → bits per texel.
@@ -78,9 +78,10 @@ def available() -> tuple[str, ...]:
 
 def install_notes(codecs: Iterable[str] = tuple(_PACKAGES)) -> list[str]:
     """Return a note, in a list, about those of ``codecs`` that are not installed; an empty list if all are."""
-    missing = [TITLES[codec] for codec in codecs if codec not in available()]
-    note = f'Left out, not being installed: {", ".join(missing)}; pip install "mi-diffind[compare]"'
-    return [note] if missing else []
+    missing = [codec for codec in codecs if codec not in available()]
+    packages = dict.fromkeys(package for codec in missing for package, _ in _PACKAGES[codec])
+    titles = ", ".join(TITLES[codec] for codec in missing)
+    return [f"Left out: {titles}; needed: {missing_package(*packages)}"] if missing else []
 
 
 def astc(
@@ -378,7 +379,7 @@ def _modules(codec: str) -> list:
         try:
             modules.append(importlib.import_module(module))
         except ImportError:
-            raise CodecError(f'the codec {codec} needs {package}, which "pip install {package}" installs') from None
+            raise CodecError(f"the codec {codec} needs {missing_package(package)}") from None
     return modules
 
 

@@ -152,9 +152,12 @@ def _fitted(truth: Truth, request: FitRequest, stop: Event) -> FittedBSDF:
 def symmetry_line(symmetries: dict[str, float | None]) -> str:
     """Return the measured symmetries as a line of text."""
     assumed = {
-        "isotropy": ("isotropic", "anisotropic"),
-        "mirror": ("symmetric about the plane of incidence", "not symmetric about the plane of incidence"),
-        "reciprocity": ("reciprocal", "not reciprocal: its symmetric part is fitted"),
+        "isotropy": ("isotropic", "anisotropic ({})"),
+        "mirror": ("symmetric about the plane of incidence", "not symmetric about the plane of incidence ({})"),
+        "reciprocity": (
+            "reciprocal",
+            "not reciprocal: {} of the light, weighted by both cosines; no reciprocal model can be nearer than that",
+        ),
     }
     parts = []
     for name, (yes, no) in assumed.items():
@@ -162,5 +165,6 @@ def symmetry_line(symmetries: dict[str, float | None]) -> str:
         if value is None:
             parts.append(f"{yes} (assumed: no rows to compare)")
         else:
-            parts.append(f"{yes if value <= symmetry.TOLERANCE else no} ({100 * value:.2g}%)")
+            percent = f"{100 * value:.2g}%"
+            parts.append(f"{yes} ({percent})" if value <= symmetry.TOLERANCE else no.format(percent))
     return "measured: " + ", ".join(parts)

@@ -10,6 +10,7 @@ so that noise and outliers move it little.
 
 from __future__ import annotations
 
+import copy
 import csv
 import dataclasses
 import hashlib
@@ -43,8 +44,14 @@ DENSITY, NEIGHBOURS = 8, 16
 #: by more than this.
 OUTLIER, FAR = 6.0, 0.4
 
-#: Number of rows among which symmetries are measured; azimuths that count as equal and as different.
+#: Number of rows whose neighbours measure symmetries; azimuths that count as equal and as different.
 PAIRS, SAME, OTHER = 20_000, math.radians(15), math.radians(30)
+
+#: Factors of :func:`places` of an isotropic material that give the mirror image at the plane of incidence.
+MIRROR = np.array([1, 1, -1, 1])
+
+#: Distance of two rows below which they have the same directions.
+EXACT = 1e-4
 
 #: Quantile of f cos θ_i cos θ_o above which rows count the same where symmetries are measured.
 BRIGHT = 0.9
@@ -191,25 +198,25 @@ def places(truth: ScatteredTruth, isotropic: bool) -> np.ndarray:
 def measured_symmetry(truth: ScatteredTruth, seed: int = 1) -> dict[str, float | None]:
     """Return the relative difference of f that each symmetry would hide (:mod:`.symmetry`), from pairs of rows.
 
-    A row is compared with the row that is nearest to its image. What neighbours without the symmetry differ by,
-    through noise and their distance, is subtracted. ``None``: there are no such pairs.
+    Reciprocity is measured by :func:`irreciprocal_share` where rows have exact images. Else a row is compared with the
+    row that is nearest to its image, and what neighbours without the symmetry differ by, through noise and their
+    distance, is subtracted. ``None``: there are no such pairs.
     """
     from scipy.spatial import cKDTree
 
-    rows = np.random.default_rng(seed).permutation(len(truth.f))[:PAIRS]
-    points, f = places(truth, True)[rows], truth.f[rows].mean(axis=1)
-    light = np.maximum(f * truth.wi[rows, 2] * truth.wo[rows, 2], 1e-12)
+    points, f = places(truth, True), truth.f.mean(axis=1)
+    rows = np.random.default_rng(seed).permutation(len(f))[:PAIRS]
+    light = np.maximum(f * truth.wi[:, 2] * truth.wo[:, 2], 1e-12)
     bright = np.quantile(light, BRIGHT)
-    scale = np.array([1, 1, -1, 1])
-    tree, azimuth = cKDTree(points), np.arctan2(truth.wi[rows, 1], truth.wi[rows, 0])
-    near, neighbours = (a[:, 1:] for a in tree.query(points, NEIGHBOURS + 1))
-    angle = np.abs((azimuth[:, None] - azimuth[neighbours] + math.pi / 2) % math.pi - math.pi / 2)
+    tree, azimuth = cKDTree(points), np.arctan2(truth.wi[:, 1], truth.wi[:, 0])
+    near, neighbours = (a[:, 1:] for a in tree.query(points[rows], NEIGHBOURS + 1))
+    angle = np.abs((azimuth[rows, None] - azimuth[neighbours] + math.pi / 2) % math.pi - math.pi / 2)
 
     def difference(others: np.ndarray, chosen: np.ndarray) -> float | None:
         """Return the mean of relative differences of f; ``None`` if too few rows are chosen."""
         if chosen.sum() < LEAST:
             return None
-        a, b = light[chosen], light[others[chosen]]
+        a, b = light[rows[chosen]], light[others[chosen]]
         weight = np.minimum(np.maximum(a, b), bright)  # bright rows count more, outliers little
         return float((weight * np.abs(a - b) / (a + b)).sum() / weight.sum())
 
@@ -217,22 +224,72 @@ def measured_symmetry(truth: ScatteredTruth, seed: int = 1) -> dict[str, float |
         """Return the nearest neighbour that meets a condition, and whether there is one."""
         return neighbours[np.arange(len(rows)), condition.argmax(axis=1)], condition.any(axis=1)
 
+    def excess(images: np.ndarray, informative: np.ndarray | bool = True) -> float | None:
+        """Return the difference from the rows nearest to images, no further than neighbours are."""
+        distance, nearest = tree.query(images[rows])
+        close = (distance <= 1.5 * near[:, 0]) & (nearest != rows) & informative
+        return _excess(difference(nearest, close), difference(neighbours[:, 0], close))
+
     result: dict[str, float | None] = {}
     same, other = first(angle < SAME), first(angle > OTHER)
     both = same[1] & other[1]
     result["isotropy"] = _excess(difference(other[0], both), difference(same[0], both))
-    # Images under the other symmetries: rows at their places, no further than neighbours are
-    swapped = ScatteredTruth.__new__(ScatteredTruth)
-    swapped.wi, swapped.wo = truth.wo[rows], truth.wi[rows]
-    for name, images in (("mirror", points * scale), ("reciprocity", places(swapped, True))):
-        distance, nearest = tree.query(images)
-        close = (distance <= 1.5 * near[:, 0]) & (nearest != np.arange(len(rows)))
-        if name == "mirror":  # rows in the plane of incidence say nothing
-            close &= np.abs(points[:, 2]) > 0.02
-        result[name] = _excess(difference(nearest, close), difference(neighbours[:, 0], close))
-    if (result["isotropy"] or 0) > TOLERANCE:  # the plane of incidence of a row then means another material each time
+    # Rows in the plane of incidence say nothing about the mirror image
+    result["mirror"] = excess(points * MIRROR, np.abs(points[rows, 2]) > 0.02)
+    isotropic = (result["isotropy"] or 0) <= TOLERANCE
+    if not isotropic:  # the plane of incidence of a row then means another material each time
         result["mirror"] = result["isotropy"]
+    share = irreciprocal_share(truth, isotropic, (result["mirror"] or 0) <= TOLERANCE)
+    result["reciprocity"] = excess(places(exchanged(truth), True)) if share is None else share
     return result
+
+
+def exchanged(truth: ScatteredTruth) -> ScatteredTruth:
+    """Return the rows with their directions exchanged."""
+    result = copy.copy(truth)
+    result.wi, result.wo = truth.wo, truth.wi
+    return result
+
+
+def irreciprocal_share(truth: ScatteredTruth, isotropic: bool, mirror: bool) -> float | None:
+    """Return the share of the light that no reciprocal model can reproduce; ``None`` if too few rows have images.
+
+    It is the sum of ``|f(i, o) − f(o, i)| / 2`` over that of ``|f|``, weighted by both solid angles and cosines, of
+    all rows whose directions exchanged are those of another row. Rows that are their own images (mirror directions)
+    count as they do among all rows. With ``mirror``, images at the plane of incidence count, too.
+    """
+    from scipy.spatial import cKDTree
+
+    points, images = places(truth, isotropic), places(exchanged(truth), isotropic)
+    if isotropic and mirror:
+        points[:, 2], images[:, 2] = np.abs(points[:, 2]), np.abs(images[:, 2])
+    symmetric = np.linalg.norm(points - images, axis=1) < EXACT
+    image = cKDTree(points).query(images, distance_upper_bound=EXACT)[1]
+    image[symmetric] = np.flatnonzero(symmetric)
+    paired = image < len(points)
+    others = (paired & ~symmetric).sum()
+    if others < LEAST:
+        return None
+    rows = np.flatnonzero(paired)
+    image, wi, wo = image[rows], truth.wi[rows], truth.wo[rows]
+    if truth.solid_angle is None:
+        weight = cells(np.arccos(np.stack([wi[:, 2], wo[:, 2]], axis=1)))
+        weight *= np.prod(np.hypot(*np.stack([wi, wo])[:, :, :2].T), axis=1)
+        azimuths = [np.arctan2(w[:, 1], w[:, 0]) for w in ([along_x(truth)[rows]] if isotropic else [wi, wo])]
+        weight *= cells(np.abs(np.stack(azimuths, axis=1)))
+    else:
+        weight = truth.solid_angle[rows] * truth.solid_angle[image]
+    weight *= np.where(symmetric[rows], 1, (~symmetric).sum() / others)
+    weight = (weight * (truth.weight[rows] + truth.weight[image]) * wi[:, 2] * wo[:, 2])[:, None]
+    difference = (weight * np.abs(truth.f[rows] - truth.f[image])).sum() / 2
+    return float(difference / max((weight * np.abs(truth.f[rows])).sum(), 1e-20))
+
+
+def cells(angles: np.ndarray) -> np.ndarray:
+    """Return products of the widths for which angles ``(n, k)`` stand on the axis that their ``k`` columns share."""
+    values, index = np.unique(np.round(angles, 5), return_inverse=True)
+    widths = np.gradient(values) if len(values) > 1 else np.ones(1)
+    return widths[index.reshape(angles.shape)].prod(axis=1)
 
 
 def _excess(difference: float | None, usual: float | None) -> float | None:

@@ -53,8 +53,9 @@ def measured_symmetry(truth, types, size: int = 2**16, seed: int = 1) -> dict[st
     """Return the relative difference of f that each symmetry would hide.
 
     ``isotropy``: rotation about the normal; ``mirror``: reflection at the plane of incidence; ``reciprocity``: exchange
-    of the directions. Each is a mean of absolute differences over the mean value, weighted by both cosines. At angles
-    up to 85°; 0 for what the format implies.
+    of the directions. Each is a mean of absolute differences over the mean value, weighted by both cosines; that of
+    reciprocity is halved, which no reciprocal model can be nearer than. At angles up to 85°; 0 for what the format
+    implies.
     """
     rng = dr.rng(seed=dr.opaque(types.UInt64, seed))
     samples = outgoing(rng, types, incident(rng, types, size, isotropic=False), truth)
@@ -81,6 +82,7 @@ def measured_symmetry(truth, types, size: int = 2**16, seed: int = 1) -> dict[st
     for name, other in others.items():
         difference = sum(dr.sum(weight * wi.z * dr.abs(a - b)) for a, b in zip(value, other, strict=True))
         result[name] = float((difference / dr.maximum(total, 1e-20))[0])
+    result["reciprocity"] /= 2
     if truth.isotropic:
         result["isotropy"] = 0.0
     return result

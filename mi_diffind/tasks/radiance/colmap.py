@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import reason
+from ...errors import missing_package, reason
 from .image_files import EXTENSIONS, ViewsError
 from .transforms import EVERY, Frame, FrameList
 
@@ -47,9 +47,7 @@ def colmap_frames(folder: Path, model: Path, split: str) -> FrameList:
     try:
         import pycolmap
     except ImportError:
-        raise ViewsError(
-            f'{model}: is a COLMAP model, the Python module pycolmap is needed: pip install "mi-diffind[colmap]"'
-        ) from None
+        raise ViewsError(f"{model}: is a COLMAP model, which needs {missing_package('pycolmap')}") from None
     try:
         reconstruction = pycolmap.Reconstruction(str(model))
     except Exception as e:

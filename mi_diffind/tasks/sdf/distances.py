@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import DiffindError, reason
+from ...errors import DiffindError, missing_package, reason
 from . import boundary
 from .mesh import NO_VOLUME, Mesh
 
@@ -238,9 +238,7 @@ class Distances:
 
     def _start(self) -> None:
         if importlib.util.find_spec("igl") is None:
-            raise DistancesError(
-                f"{self.mesh.path}: distances need libigl, which is not installed (pip install libigl)"
-            )
+            raise DistancesError(f"{self.mesh.path}: distances need {missing_package('libigl')}")
         self._owner = os.getpid()
         script = Path(__file__).with_name("distances_child.py")
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115

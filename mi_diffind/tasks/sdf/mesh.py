@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from ... import mitsuba_versions
-from ...errors import DiffindError, reason
+from ...errors import DiffindError, missing_package, reason
 from ...files import irregular, shown
 from ...units import memory
 from . import scene_meshes, serialized
@@ -222,9 +222,7 @@ def _read(path: Path, part: str = "") -> tuple[np.ndarray, np.ndarray]:
         module = e.name or (quoted and (quoted[1] or quoted[2])) or "trimesh[easy]"
         if module == "charset_normalizer":  # what trimesh would guess the encoding with
             raise MeshError(f"{path}: cannot be read as a mesh, its text is not UTF-8") from None
-        raise MeshError(
-            f"{path}: {path.suffix} files need a Python module that is not installed: pip install {module}"
-        ) from None
+        raise MeshError(f"{path}: {path.suffix} files need {missing_package(module)}") from None
     except Exception as e:  # readers of a dozen formats raise whatever they like
         fault = f"{type(e).__name__}: {reason(e)}"
         raise MeshError(f"{path}: cannot be read as a mesh, it is damaged or of an unknown format ({fault})") from None

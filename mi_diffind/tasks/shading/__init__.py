@@ -35,7 +35,7 @@ class Shading(Task):
         *(size for size in SIZES if size.name != "psnr"),
         Argument(
             "--start", file="read", metavar="FILE.npz",
-            help="arrays to start from, as written by fit texture (default: trained first, with half of --seconds)",
+            help="arrays to start from, as written by fit texture (default: trained in two fifths of --seconds)",
         ),
         Argument(
             "--lambda", dest="share", type=fraction, metavar="L",

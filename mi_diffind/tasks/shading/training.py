@@ -85,6 +85,8 @@ class ShadingProblem(textures.TextureProblem):
         self.beta_2 = recipe.beta_2 if recipe.share > 0 else self.beta_2
         #: Picture that is written at each measurement, and the images that it shows a part of
         self.preview: tuple[Path, ShadedEvaluation] | None = None
+        #: Gain of each level over ``base`` in the last measurement, dB
+        self.level_gains = np.zeros(0)
         self.effects, _ = effects_of(pyramid.layout)
         self.decoder = frozen_decoder(self.types)
         recorded = {k: v for k, v in dataclasses.asdict(recipe).items() if k != "settings"}
@@ -140,17 +142,18 @@ class ShadingProblem(textures.TextureProblem):
         if self.preview is not None:
             write_preview(*self.preview, read)
         errors = self.evaluation.measure(read, False)
-        gain = {"gain_db": gain_of(errors["C"]["psnr_db"], self.base)} if self.base else {}
+        if self.base:
+            self.level_gains = np.subtract(errors["C"]["psnr_db"], self.base)
+        gain = {"gain_db": mean_gain(self.level_gains)} if self.base else {}
         shading = {f"shaded_{TRUTHS[k]}_db": f["mean_db"] for k, f in errors.items()}
         return {**gain, **shading, **{f"texture_{name}": value for name, value in texture.items()}}
 
 
-def gain_of(levels: Sequence[float], base: Sequence[float]) -> float:
-    """Return the mean gain of ``levels`` over ``base``, in dB, if no level loses, else the largest loss, negative.
+def mean_gain(gains: np.ndarray) -> float:
+    """Return the mean gain of levels, in dB, if no level loses, else the largest loss, negative.
 
     Losses up to :data:`ROUNDING` are those of sums in another order.
     """
-    gains = np.subtract(levels, base)
     return float(gains.mean() if gains.min() >= -ROUNDING else gains.min())
 
 
@@ -220,7 +223,9 @@ def fit_shading(
         problem.preview = None if preview is None or evaluation is None else (preview, evaluation)
         result = request.train(problem, "shading")
     kept = bool(base) and result.measured["gain_db"] <= 0
-    if not kept:
+    if kept:
+        result = dataclasses.replace(result, step=0, measured={"gain_db": 0.0})
+    else:
         texture = CompressedTexture(pyramid.layout, textures.stored_form(problem.net), problem.level_bias)
     identity = {k: v for k, v in problem.identity.items() if k not in ("structure", "border")}
     settings = {**request.recorded(result), **identity, "level_bias": texture.level_bias}
@@ -241,18 +246,23 @@ def choose(
     """Return the best :class:`Trial` after a short training with each, the gains, and ``None``.
 
     The best has the largest mean of levels among those that lose at no level, or among all if each loses somewhere. If
-    each of ``biases`` does, :data:`FIXED_BIASES` follow, with fixed fine levels; a recipe with a bias has its own. With
+    each of ``biases`` does, :data:`FIXED_BIASES` follow, with fixed fine levels; a recipe with a bias has its own. One
+    of these with a level whose loss the short training leaves as it is comes last. With
     extras in the ``recipe``, the best so far is trained with them, too. The gains are ``gain_db`` by the name of a
     choice. If Ctrl-C ends a training, its problem and record are returned in place of ``None``. If the time is too
     short (:data:`SHORTEST`), the untrained arrays are compared.
     """
-    measured, steps = {}, max(1, round(TRIAL * request.settings.steps))
+    measured, constant, steps = {}, set(), max(1, round(TRIAL * request.settings.steps))
     settings = dataclasses.replace(request.settings, steps=steps, measure_every=steps)
     seconds = None if request.seconds is None else TRIAL * request.seconds
     short = None
 
     def best() -> Trial:
-        return max(measured, key=lambda c: (measured[c]["gain_db"] >= 0, measured[c]["shaded_converged_db"]))
+        def rank(choice: Trial) -> tuple:
+            figures = measured[choice]
+            return figures["gain_db"] >= 0, choice not in constant, figures["shaded_converged_db"]
+
+        return max(measured, key=rank)
 
     def choices() -> Iterator[Trial]:
         yield from map(Trial, biases)
@@ -265,6 +275,7 @@ def choose(
     for choice in choices():
         problem = problem_of(choice)
         measured[choice], measurement = duration(lambda problem=problem: problem.measure(problem.net))
+        untrained = problem.level_gains
         trial = dataclasses.replace(
             request.part(TRIAL), settings=settings, seconds=seconds, checkpoint=None, resume=False
         )
@@ -274,6 +285,8 @@ def choose(
             result = trial.train(problem, f"level bias {choice.name}")
             if result.interrupted:
                 return choice, {}, (problem, result)
+            if choice.fixed and np.any((untrained < -ROUNDING) & (abs(problem.level_gains - untrained) < ROUNDING)):
+                constant.add(choice)
             measured[choice] = result.measured
     return best(), {c.name: float(f"{m['gain_db']:.4g}") for c, m in measured.items()}, None
 

@@ -308,9 +308,7 @@ def test_normals_without_z_where_that_is_better():
 def test_missing_package(monkeypatch, codec, module, package):
     monkeypatch.setitem(sys.modules, module, None)
     assert codec not in codecs.available()
-    with pytest.raises(
-        CodecError, match=rf'^the codec {codec} needs {package}, which "pip install {package}" installs$'
-    ):
+    with pytest.raises(CodecError, match=rf"needs the package {package}, .*: pip install {package}$"):
         encode(codec, picture(8, 8))
     if codec == "astc":
         assert {"jpeg", "webp", "bicubic"} <= set(codecs.available())

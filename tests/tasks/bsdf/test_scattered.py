@@ -109,6 +109,25 @@ def test_symmetries_are_measured_from_neighbours(tmp_path, rng, changes, broken)
         assert (excess > 0.02) if name in broken else (excess < 0.01), (name, excess)
 
 
+@pytest.mark.parametrize("every", [1, 3])
+def test_reciprocity_is_measured_from_exact_pairs(tmp_path, every):
+    """Of a grid of angles up to 180°: the light that no reciprocal model reproduces, by quadrature; also of a part."""
+    theta, phi = (np.arange(30) + 0.5) * np.pi / 60, (np.arange(40) + 0.5) * np.pi / 40
+    i, o, k = np.meshgrid(theta, theta, phi, indexing="ij")
+    rng = np.random.default_rng(2)
+    symmetric, skew = np.exp(-3 * (i - o) ** 2 - (k - np.pi) ** 2), 0.4 * rng.normal(size=(30, 30, 1))
+    f = symmetric * (1 + skew - skew.transpose(1, 0, 2))
+    measure = np.sin(i) * np.cos(i) * np.sin(o) * np.cos(o)
+    expected = (measure * np.abs(f - f.transpose(1, 0, 2))).sum() / 2 / (measure * np.abs(f)).sum()
+    a = np.stack([i, 0 * i, o, k], axis=-1).reshape(-1, 4)
+    chosen = rng.random(len(a)) < 1 / every
+    truth = scattered.ScatteredTruth(write(tmp_path / "rows.csv", rows_of(a[chosen], f.ravel()[chosen])))
+    share = scattered.measured_symmetry(truth)["reciprocity"]
+    assert expected > 0.2 and share == pytest.approx(expected, rel=1e-3 if every == 1 else 0.05)
+    truth.f = np.repeat(symmetric.ravel()[chosen, None], 3, axis=1)
+    assert scattered.measured_symmetry(truth)["reciprocity"] < 1e-6
+
+
 def test_symmetries_without_pairs_are_assumed(tmp_path, rng):
     a = angles(rng, 2000, azimuth=False)
     truth = scattered.ScatteredTruth(

@@ -405,5 +405,5 @@ def test_colmap_models_that_are_refused(colmap, monkeypatch):
     with pytest.raises(ViewsError, match=r"sparse/0: cannot be read as a COLMAP model \("):
         load_views(folder)
     monkeypatch.setitem(sys.modules, "pycolmap", None)
-    with pytest.raises(ViewsError, match=r'sparse/0: is a COLMAP model, .* pip install "mi-diffind\[colmap\]"$'):
+    with pytest.raises(ViewsError, match=r"sparse/0: is a COLMAP model, .*: pip install pycolmap$"):
         load_views(folder)

@@ -495,7 +495,7 @@ def test_without_libigl(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with Distances(make_mesh(*solids.box(), "box.ply")) as d, pytest.raises(DistancesError) as error:
         d.signed(np.zeros((1, 3)))
-    assert "box.ply: distances need libigl" in sentence(error) and "pip install libigl" in str(error.value)
+    assert "box.ply: distances need the package libigl" in sentence(error) and "pip install libigl" in str(error.value)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
