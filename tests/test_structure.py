@@ -37,6 +37,7 @@ FLOORS = (
         "rays",
         "splat_files",
         "srgb",
+        "unused_keys",
     ),
     ("lookup",),
     ("indirection", "pages"),
