@@ -248,15 +248,32 @@ def is_within(folder: str | os.PathLike, name: str | os.PathLike) -> bool:
 def path_within(folder: str | os.PathLike, name: str, file: str | os.PathLike) -> Path:
     """Return the path of the file ``name`` in a folder, as the content of a ``file`` names it.
 
-    Raises :class:`OutsideError` for a path that leads out of the folder, unless :data:`PATHS` allows any. Symbolic
-    links are not resolved: whoever unpacks a folder has put them there.
+    Names written on other systems count: where there is no such file, backslashes are slashes, and a name that differs
+    in upper and lower case alone is taken if it is the only one. Raises :class:`OutsideError` for a path that leads out
+    of the folder, unless :data:`PATHS` allows any. Symbolic links are not resolved: whoever unpacks a folder has put
+    them there.
     """
+    if "\\" in name and not os.path.lexists(os.path.join(folder, name)):
+        name = name.replace("\\", "/")
     if os.environ.get(PATHS) != "any" and not is_within(folder, name):
         raise OutsideError(
             f"{file}: names {name!r:.80}, which lies outside of its folder: the environment variable {PATHS}=any "
             f"allows it"
         )
-    return Path(folder) / name
+    path = Path(folder) / name
+    return path if os.path.lexists(path) or not is_within(folder, name) else _in_other_case(Path(folder), path)
+
+
+def _in_other_case(folder: Path, path: Path) -> Path:
+    """Return the only path in a folder that differs from ``path`` in upper and lower case, else ``path`` itself."""
+    present = folder
+    for part in path.relative_to(folder).parts:
+        if not os.path.lexists(present / part):
+            with contextlib.suppress(OSError):
+                alike = [entry for entry in os.listdir(present) if entry.casefold() == part.casefold()]
+                part = alike[0] if len(alike) == 1 else part
+        present = present / part
+    return present if os.path.lexists(present) else path
 
 
 def relative_path(file: str | os.PathLike, folder: str | os.PathLike) -> str:

@@ -28,6 +28,7 @@ from mi_diffind.picture_sizes import check_picture
 from mi_diffind.tables import Table, TableError
 from mi_diffind.task import Task, stamp
 
+from .. import warn
 from . import properties
 from .tables import copy_entries, exposed
 
@@ -148,7 +149,10 @@ def open_uncompressed(props: mi.Properties, wrap_mode: str) -> tuple[SharedMaps,
         return shared(("pyramid", id(pyramid)), lambda: SharedMaps(pyramid, {})), ""
 
     def load() -> SharedMaps:
-        source = load_source(path, nonfinite="clean") if path else _source_of(props["bitmap"])
+        # A single image without "raw" is colours, whatever its name, as for Mitsuba's "bitmap"
+        source = load_source(path, nonfinite="clean", named=raw) if path else _source_of(props["bitmap"])
+        for note in source.notes:
+            warn(note)
         if raw:
             maps = tuple(dataclasses.replace(m, color_space="linear") for m in source.maps)
             source = dataclasses.replace(source, maps=maps)
