@@ -15,7 +15,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from . import compat, plugins
+from . import compat, metrics, plugins, units
 from .errors import DiffindError, UsageError
 from .files import MOST_TEXT, irregular, replacing, shown
 from .measure.operations import bsdf_operations
@@ -28,6 +28,14 @@ MAX_DEPTHS = {
     **dict.fromkeys(("path", "volpath", "volpathmis", "ptracer", "path_footprint", "path_sdf", "neural_field"), -1),
     **dict.fromkeys(("prb", "prb_basic", "prb_projective", "prbvolpath"), 6),
 }
+
+
+#: What a scene needs to be rendered, beside objects and lights.
+NEEDS = ("integrator", "sensor")
+
+#: Bytes of memory of a channel of a pixel while a pass is rendered: of the film, the developed image, its copy in
+#: single precision, and sums in double precision.
+PIXEL_BYTES = 3 * 4 + 2 * 8
 
 
 class SceneError(DiffindError, RuntimeError):
@@ -87,6 +95,7 @@ class ParsedScene:
         change: Callable[[object], object] | None = None,
         merge: bool = True,
         parallel: bool = True,
+        needs: tuple[str, ...] = NEEDS,
     ):
         """Return a loaded scene, as :func:`load_file` does.
 
@@ -95,7 +104,8 @@ class ParsedScene:
         ``longest_path`` replaces the ``max_depth`` of the scene's integrator (1: emitted light, 2: direct light, …; -1:
         infinite). ``change(state)`` may change the parsed scene (``mi.parser.ParserState``) before anything else does.
         Without ``merge``, Mitsuba joins no meshes, and each keeps its id. Objects that are not loaded in ``parallel``
-        have the same order in each run, so that the kernels of an earlier run are found again.
+        have the same order in each run, so that the kernels of an earlier run are found again. A scene without what it
+        ``needs`` to be rendered is an error (:func:`check_renderable`).
 
         Shapes whose stored arrays the scene's integrator cannot trace are decoded, with a warning that states the
         memory, unless the scene forbids decoding; then this is an error.
@@ -116,6 +126,7 @@ class ParsedScene:
             loaded = _build(config, state, integrators, _refuse)
             if not isinstance(loaded, mi.Scene):
                 raise RuntimeError(f"{self.path}: holds a {type(loaded).__name__}, a scene is expected")
+            check_renderable(loaded, self.path, needs)
             return loaded
 
     def change(self, change: Callable[[object], object]):
@@ -197,6 +208,38 @@ class LoadedScene(ParsedScene):
         return []
 
 
+def check_renderable(scene, path: str | os.PathLike = "scene", needs: tuple[str, ...] = NEEDS) -> None:
+    """Raise :class:`SceneError` if a loaded scene lacks what it ``needs`` to be rendered."""
+    for name in needs:
+        if not (scene.integrator() if name == "integrator" else scene.sensors()):
+            example = {"integrator": "path", "sensor": "perspective"}[name]
+            raise SceneError(f'{path}: has no {name}, one is needed, such as <{name} type="{example}">')
+
+
+def check_size(scene, spp: int, size: tuple[int, int] | None = None) -> None:
+    """Refuse a picture that takes more memory than this machine has, or too many samples per pixel.
+
+    ``size`` is its width and height, by default that of the first sensor's film. Raises
+    :class:`~mi_diffind.errors.UsageError`.
+    """
+    width, height = size or film_size(scene)
+    channels = scene.sensors()[0].film().base_channels_count()
+    units.check_memory("film", f"{width:,} x {height:,} pixels", width * height * channels * PIXEL_BYTES)
+    units.check_samples(spp)
+
+
+def warn_of_black(scene, path: str | os.PathLike, images) -> None:
+    """Warn if all ``images`` of a loaded scene are black."""
+    if not any(image[..., :3].any() for image in images):
+        plugins.warn(f"{path}: the picture is black{'' if scene.emitters() else ', the scene has no emitter'}")
+
+
+def check_finite(image: np.ndarray, name: str) -> None:
+    """Raise :class:`SceneError` if pixels of the image ``name`` are NaN or infinite."""
+    if count := metrics.nonfinite_pixels(image):
+        raise SceneError(f"{name}: {count:,} of {image.shape[0] * image.shape[1]:,} pixels are not finite")
+
+
 def _unique() -> str:
     """Return a text that no other call returns."""
     return os.urandom(16).hex()
@@ -217,8 +260,8 @@ def _is_scene(value) -> bool:
 
 
 def load(path: str | os.PathLike, defines: dict[str, str] | None = None, **options):
-    """Return the loaded scene of a file; ``options`` are those of :meth:`ParsedScene.load`."""
-    return ParsedScene(path, defines).load(**options)
+    """Return the loaded scene of a file; ``options`` are those of :meth:`ParsedScene.load`. It ``needs`` nothing."""
+    return ParsedScene(path, defines).load(**{"needs": (), **options})
 
 
 def load_file(path: str | os.PathLike, parallel: bool = True, optimize: bool = True, **defines):
@@ -451,6 +494,7 @@ def render(
 
 def render_pass(scene, spp: int, seed: int) -> np.ndarray:
     """Render one pass, ``(height, width, channels)``, float64; ``seed`` is Mitsuba's own, modulo 2³²."""
+    check_size(scene, spp)
     with scene_errors(None):
         return mi.render(scene, spp=spp, seed=seed % 2**32).numpy().astype(np.float64)
 
