@@ -133,7 +133,7 @@ def test_capture_and_viewer_count_what_is_not_finite(tmp_path, capsys):
     from mi_diffind.viewer.session import Session
 
     path = scene_file(tmp_path, more=NAN)
-    views = ["--views", "2", "--test", "0", "--resolution", "8", "--spp", "1"]
+    views = ["--views", "2", "--test", "0", "--resolution", "8", "--spp", "16"]
     assert main(["capture", str(path), "-o", str(tmp_path / "views"), *views]) == 0
     assert "of 64 pixels of a view have NaN or infinite samples" in capsys.readouterr().err
     session = Session(path, width=16, spp=1)
