@@ -22,6 +22,7 @@ from .measure.operations import bsdf_operations
 from .plugins.support import footprint, omissions
 from .runtime import use_variant
 from .task import tasks
+from .tasks.bsdf import tensor_file
 
 #: Integrators that follow paths to a ``max_depth``, and the depth of each where the scene gives none (-1: infinite).
 MAX_DEPTHS = {
@@ -316,6 +317,7 @@ def attach(scene, sensor=0, spp: int | None = None):
 
 def _build(config, state, integrators: list[str], report: Callable[[str], None]):
     """Instantiate a parsed scene; ``report`` is called with a sentence about a shape that no integrator traces."""
+    _check_measured(state)
     decoded = _decode_unseen(state, integrators) if integrators else []
     loaded = compat.instantiate(config, state)
     if isinstance(loaded, mi.Scene):
@@ -326,6 +328,15 @@ def _build(config, state, integrators: list[str], report: Callable[[str], None])
         _warn_of_decoded(loaded, decoded, integrators)
         footprint.attach(loaded)
     return loaded
+
+
+def _check_measured(state) -> None:
+    """Refuse damaged files of measured materials that a parsed scene names. Raises UsageError."""
+    for props in compat.properties_of(state):
+        if props.plugin_name() in ("measured", "measured_polarized") and "filename" in props:
+            path = Path(str(mi.file_resolver().resolve(str(props["filename"]))))
+            if path.is_file():
+                tensor_file.check(path, tensor_file.read(path))
 
 
 def _refuse(sentence: str):

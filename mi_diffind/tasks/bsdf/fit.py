@@ -90,6 +90,7 @@ def _fitted(truth: Truth, request: FitRequest, stop: Event) -> FittedBSDF:
     if truth.function:
         samples = training.draw(truth, types, training.SAMPLES, settings.seed + 1, isotropic)
         validation = training.draw(truth, types, training.VALIDATION, settings.seed + 2, isotropic)
+        lines += truth.remarks(validation)
         view, smooth = SphereView(truth, types), validation
     else:
         samples, validation, smooth = scattered.split(truth, types, isotropic, training.LIMIT, settings.seed)
