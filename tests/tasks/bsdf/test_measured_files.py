@@ -116,20 +116,22 @@ def changed(array, damage):
 
 
 DAMAGED = {
-    "theta_i": {"missing": 'no field "theta_i"', "flat": "1 dimensions are needed", "short": "is needed", "empty": "has the shape",
-                "nan": "8 values that are not finite", "falling": "does not increase"},
-    "ndf": {"missing": 'no field "ndf"', "flat": "2 dimensions are needed", "nan": "not finite", "dark": "or none above 0"},
+    "theta_i": {"missing": 'no field "theta_i"', "flat": "1 dimensions are needed", "short": "is needed",
+                "empty": "has the shape", "nan": "8 values that are not finite", "falling": "does not increase"},
+    "ndf": {"missing": 'no field "ndf"', "flat": "2 dimensions are needed", "nan": "not finite",
+            "dark": "or none above 0"},
     "vndf": {"nan": "not finite", "empty": "has the shape"},
     "luminance": {"short": "is needed"},
     "rgb": {"missing": 'no field "rgb"', "short": "is needed", "nan": "not finite"},
-    "phi_d": {"missing": 'no field "phi_d"', "falling": "does not increase", "empty": "has the shape", "nan": "not finite"},
+    "phi_d": {"missing": 'no field "phi_d"', "falling": "does not increase", "empty": "has the shape",
+              "nan": "not finite"},
     "M": {"short": "is needed", "nan": "not finite"},
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name, damage", [(name, damage) for name, damages in DAMAGED.items() for damage in damages])
 def test_files_with_a_damaged_field(mi_rgb, tmp_path, monkeypatch, name, damage):
-    """The sentence names file and field, of a source and of a scene; Mitsuba reads some of these files without a word."""
+    """The sentence names file and field, of a source and of a scene; Mitsuba reads some of the files as they are."""
     polarised = name in ("phi_d", "M")
     fields = fields_of(tmp_path, monkeypatch, polarised)
     array = changed(fields.pop(name), damage)

@@ -330,7 +330,7 @@ def test_a_plastic_is_fitted(types, short, tmp_path):
     assert again.read_bytes() == (tmp_path / "a.npz").read_bytes()
 
 
-@pytest.mark.parametrize("colour", [(0, 0, 0), (1e-6, 1e-6, 1e-6), (0.5, 0, 0.1)], ids=["black", "nearly", "channel"])
+@pytest.mark.parametrize("colour", [(0, 0, 0), (0.5, 0, 0.1)], ids=["black", "channel"])
 def test_black_materials_are_fitted(mi_rgb, types, short, tmp_path, colour):
     """Their albedo in Mitsuba is that of the source, in each channel, and no training is said to diverge."""
     source = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(colour)}}
