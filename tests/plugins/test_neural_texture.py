@@ -75,6 +75,18 @@ def expected(mi, image, name, uv, level):
 # -- what is read ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("channels", ["albedo", "normal", "roughness"])
+@pytest.mark.parametrize("preset", ["ours", "paper"])
+def test_the_maximum_is_an_upper_bound(mi_rgb, files, rng, preset, channels):
+    """At any place, between texels, too, and at any level of detail; of 1 at most."""
+    mi = mi_rgb
+    uv, (ddx, ddy) = rng.random((2, 200_000)), texture_scenes.footprints(rng, 200_000, SIZE)
+    for name in ("off", "trilinear"):
+        texture = mi.load_dict(plugin(files[preset], name, channels))
+        values = texture.eval(texture_scenes.hits(mi, uv, ddx, ddy)).numpy()
+        assert values.max() <= texture.max() + 1e-6 and texture.max() <= 1
+
+
 @pytest.mark.parametrize("preset", ["ours", "paper"])
 def test_off_is_level_0_and_costs_no_footprint(mi_rgb, files, rng, preset):
     """The arrays of coarser levels and of the footprint are not read."""
