@@ -15,14 +15,13 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from . import compat, metrics, plugins, units
+from . import compat, metrics, plugins, tensor_files, units
 from .errors import DiffindError, UsageError
 from .files import MOST_TEXT, irregular, replacing, shown
 from .measure.operations import bsdf_operations
 from .plugins.support import footprint, omissions
 from .runtime import use_variant
 from .task import tasks
-from .tasks.bsdf import tensor_file
 
 #: Integrators that follow paths to a ``max_depth``, and the depth of each where the scene gives none (-1: infinite).
 MAX_DEPTHS = {
@@ -81,6 +80,7 @@ class ParsedScene:
             if self.path.suffix.lower() == ".npz":
                 raise RuntimeError(f"{path}: found a table file, a scene is needed: mi_diffind.inspect shows its use")
             _, self._state = compat.parse_file(path, self.defines)
+            _use_slashes(self._state)
 
     @contextlib.contextmanager
     def _errors(self):
@@ -280,6 +280,7 @@ def load_file(path: str | os.PathLike, parallel: bool = True, optimize: bool = T
         return mi.load_file(str(path))
     with _resolving(path):
         config, state = compat.parse_file(path, defines)
+        _use_slashes(state)
         compat.build_as(config, parallel, optimize)
         return _build(config, state, _integrators(state), plugins.warn)
 
@@ -330,13 +331,30 @@ def _build(config, state, integrators: list[str], report: Callable[[str], None])
     return loaded
 
 
+def _use_slashes(state) -> None:
+    """Write names of files in a parsed scene with slashes where they have backslashes, and only that is a file."""
+    copies = compat.properties_of(compat.copy_parsed(state)[1])  # a parameter that was read counts as known
+    for props, copy in zip(compat.properties_of(state), copies, strict=True):
+        for key in copy:
+            text = str(copy[key]) if compat.property_kind(copy, key) == "text" else ""
+            if "\\" in text and not _is_file(text) and _is_file(text.replace("\\", "/")):
+                props[key] = text.replace("\\", "/")
+
+
+def _is_file(name: str) -> bool:
+    """Return whether a name is that of a file, as Mitsuba resolves it."""
+    with contextlib.suppress(OSError, ValueError):
+        return Path(str(mi.file_resolver().resolve(name))).is_file()
+    return False
+
+
 def _check_measured(state) -> None:
     """Refuse damaged files of measured materials that a parsed scene names. Raises UsageError."""
     for props in compat.properties_of(state):
         if props.plugin_name() in ("measured", "measured_polarized") and "filename" in props:
             path = Path(str(mi.file_resolver().resolve(str(props["filename"]))))
             if path.is_file():
-                tensor_file.check(path, tensor_file.read(path))
+                tensor_files.check(path, tensor_files.read(path))
 
 
 def _refuse(sentence: str):

@@ -37,6 +37,7 @@ FLOORS = (
         "rays",
         "splat_files",
         "srgb",
+        "tensor_files",
         "unused_keys",
     ),
     ("lookup",),

@@ -16,9 +16,9 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 
+from ... import tensor_files
 from ...errors import UsageError
 from ...lookup import clamp
-from . import tensor_file
 from .source import Truth
 
 #: Illuminants, the first is the default.
@@ -59,14 +59,14 @@ def measured_bsdf(path: Path, illuminant: str):
     """
     import mitsuba as mi
 
-    fields = tensor_file.read(path)
-    tensor_file.check(path, fields)
+    fields = tensor_files.read(path)
+    tensor_files.check(path, fields)
     if "wavelengths" not in fields or mi.is_spectral:
         return mi.load_dict({"type": "measured", "filename": str(path)}), ""
     fields = in_colours(fields, illuminant)
     with tempfile.TemporaryDirectory() as folder:
         converted = os.path.join(folder, path.name)
-        tensor_file.write(converted, fields)
+        tensor_files.write(converted, fields)
         return mi.load_dict({"type": "measured", "filename": converted}), _remark(illuminant)
 
 
@@ -86,10 +86,10 @@ class PolarisedTruth(Truth):
     def __init__(self, path: Path, illuminant: str):
         import mitsuba as mi
 
-        fields = tensor_file.read(path)
+        fields = tensor_files.read(path)
         if "M" not in fields:
             raise UsageError(f'{path}: is no file of measured Mueller matrices: has no field "M"')
-        tensor_file.check(path, fields)
+        tensor_files.check(path, fields)
         nodes = fields["M"].shape
         weights = colour_weights(np.asarray(fields["wvls"], np.float64), illuminant)
         colours = np.asarray(fields["M"][..., 0, 0], np.float32) @ weights.astype(np.float32)
