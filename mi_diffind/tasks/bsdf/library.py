@@ -104,7 +104,7 @@ class FittedLibrary(Fitted):
         lines = [f"{path}: {len(self.materials)} materials: {', '.join(counts)}; {self.seconds:.0f} s"]
         lines += [f"  {line}" for line in table_lines(self.materials)]
         lines += [f"  {name}: {m['failure']}" for name, m in self.materials.items() if m["failure"]]
-        lines += [f"  {name}: {remark}" for name, m in self.materials.items() for remark in m["remarks"]]
+        lines += [f"  {name}: {remark}" for name, m in self.materials.items() for remark in m.get("remarks", ())]
         return lines
 
 
@@ -266,7 +266,6 @@ def fit_material(material: LibraryMaterial) -> float:
 
 def _record(material: LibraryMaterial | None, folder: Path, status: str, failure: str = "", seconds=None) -> dict:
     record = {"status": status, "failure": failure, "source": "", "material": "", "file": "", "bytes": 0}
-    record["remarks"] = []
     if material is not None:
         record |= {"source": relative_path(material.source, folder), "material": material.material}
         if status in ("fitted", "kept"):
