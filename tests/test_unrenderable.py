@@ -169,3 +169,12 @@ def test_no_error_of_what_is_not_finite(value, error):
         with pytest.raises(metrics.NotFiniteError, match="2 of 144 pixels are not finite"):
             error(*pair)
     assert metrics.nonfinite_pixels(other) == 2 and metrics.nonfinite_pixels(image) == 0
+
+
+def test_inspect_refuses_measurements_that_are_no_numbers(monkeypatch, capsys):
+    from mi_diffind.task import tasks
+
+    ggx = tasks()["ggx"]
+    monkeypatch.setattr(ggx.model_class(), "measure", lambda self: {"mae": 0.1, "worst": np.nan, "psnr_db": np.inf})
+    sentence = refused(capsys, "inspect", str(ggx.file()), "--measure")
+    assert "ggx_tables.npz: as " in sentence and "worst is no number" in sentence

@@ -17,18 +17,18 @@ ALBEDO = (
     *("albedo", "basecolor", "basecolour", "base", "basemap", "diff", "diffuse", "diffusecolor", "diffusecolour"),
     *("color", "colour", "col", "maintex", "albedotransparency"),
 )
-NORMAL = ("normal", "normals", "nrm", "nor", "norm")
+NORMAL = ("normal", "normals", "normalmap", "nrm", "nor", "norm")
 ROUGHNESS = ("roughness", "rough", "specularroughness")
 AO = ("ao", "occlusion", "ambientocclusion", "mixedao")
 METALLIC = ("metallic", "metalness", "metal", "basemetalness")
 COLOURS = ("emissive", "emission", "emit", "translucency", "speccolor", "specularcolor")
 DATA = (
     *("data", "alpha", "opacity", "mask", "height", "disp", "displacement", "bump", "cavity", "curvature", "thickness"),
-    *("spec", "specular", "gloss", "glossiness", "smoothness", "anisotropy", "transmission"),
+    *("spec", "specular", "gloss", "glossiness", "smoothness", "anisotropy", "transmission", "parallax", "refl"),
 )
 PACKED = (
     *("arm", "orm", "rma", "mra", "mro", "metallicroughness", "metalrough", "occlusionroughnessmetallic"),
-    *("metallicsmoothness", "maskmap"),
+    *("metallicsmoothness", "metallicgloss", "maskmap"),
 )
 
 #: Ends of the names of normal maps → whether y points down in the image's green channel, as DirectX has it.

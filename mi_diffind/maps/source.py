@@ -502,13 +502,13 @@ def _notes_on(m: _RawMap) -> list[str]:
         return [f'map "{m.name}": normals of DirectX, y is inverted to that of OpenGL, which Mitsuba expects']
     if m.content.packed and m.values.shape[2] > 1:
         return [f'map "{m.name}": holds several maps, which are kept as one: "channels" gives each a map of its own']
+    if m.content.role == "other" and not m.content.colours and _share_of_normals(m.values) > _LOOKS:
+        return [f'map "{m.name}": looks like a normal map, but is taken for other data: call it "normal"']
     if m.content is not _UNKNOWN:
         return [] if content_of(m.name) else [f'map "{m.name}": has the role {m.content.role} by the name of its file']
     colours = m.color_space is None and m.values.dtype.name in _ENCODED and m.values.shape[2] == 3
     if not colours or _equal(m.values):
         return []
-    if _share_of_normals(m.values) > _LOOKS:
-        return [f'map "{m.name}": looks like a normal map, but is taken for other data: call it "normal"']
     return [f'map "{m.name}": an unknown name, taken for data, linear: give it "color_space": "srgb" if it is a colour']
 
 

@@ -183,7 +183,8 @@ def test_roles_of_images_and_of_maps(tmp_path, name, expected):
      # Quixel, Substance, Unity, Poliigon
      ("vhlmdg_4K_Albedo", "albedo"), ("vhlmdg_4K_Normal_LOD0", "normal"), ("Wall_Base_Color.1001", "albedo"),
      ("Wall_Normal_OpenGL", "normal"), ("Wall_Mixed_AO", "ao"), ("Wall_BaseMap", "albedo"), ("Wall_MaskMap", "other"),
-     ("MainTex", "albedo"), ("MetallicSmoothness", "other"), ("Planks_COL_VAR1_3K", "albedo"),
+     ("MainTex", "albedo"), ("MetallicSmoothness", "other"), ("Wall_NormalMap_GL", "normal"),
+     ("Planks_COL_VAR1_3K", "albedo"),
      ("Planks_NRM_3K", "normal"),
      # Further lobes of glTF, MaterialX and OpenPBR
      ("clearcoat_normal", "other"), ("coat_roughness", "other"), ("specular_roughness", "roughness"),
@@ -264,6 +265,7 @@ def test_normals_of_directx(tmp_path, dtype):
      ({"paint": {"file": "c.png", "color_space": "linear"}}, []),
      ({"paint": "grey.png"}, []),
      ({"paint": "n.png"}, ['map "paint": looks like a normal map']),
+     ({"BumpMap": "n.png"}, ['map "BumpMap": looks like a normal map']),
      ({"paint": "Wood_Color.png"}, ['map "paint": has the role albedo by the name of its file']),
      ({"paint": {"file": "Wood_Color.png", "channels": "r"}}, []),
      ({"arm": "c.png"}, ['map "arm": holds several maps']),
