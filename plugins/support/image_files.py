@@ -218,6 +218,12 @@ def to_bitmap(task: Task, props: mi.Properties) -> None:
 def to_mipmap(task: Task, props: mi.Properties) -> None:
     """Add the properties that a ``mipmap`` needs to show the original of the map."""
     original, layout = original_of(task, props)
+    if original.suffix.lower() != ".json" and layout.role == "other":  # linear by the name of its file
+        to_bitmap(task, props)
+        for name in ("filename", "channels"):
+            if name in props:
+                del props[name]
+        return
     props["filename"] = str(original)
     if original.suffix.lower() == ".json":
         props["channels"] = layout.name
