@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import compat, conversion, metrics, plugins, scenes
+from . import compat, conversion, metrics, plugins, scene_checks, scenes
 from .errors import UsageError
 from .files import writable_folder
 from .interrupt import interruptible
@@ -77,7 +77,7 @@ class _Side:
             dr.kernel_history_clear()
             image, seconds = scenes.render(self.scene, spp * self.oversampling, seed, self.oversampling, on_pass)
             self.compiled.append(compat.was_compiled(dr.kernel_history()))
-        scenes.check_finite(image, self.name)
+        scene_checks.check_finite(image, self.name)
         image = image[..., :3].astype(np.float64)
         half = len(self.seconds) % 2
         self.halves[half] = self.halves[half] + spp * np.repeat(image, 3 // image.shape[-1], -1)
@@ -159,7 +159,7 @@ def compare(
         sides[name] = _Side(loaded, oversampling, f"{parsed.path} with {', '.join(put_in[name])}")
     written = _Side(parsed.load(), name=f"{parsed.path}, as written")
     spp = spp or written.scene.sensors()[0].sampler().sample_count()
-    scenes.check_size(written.scene, spp)
+    scene_checks.check_size(written.scene, spp)
     passes, done = max(1, min(max(passes, 2), spp)), 0
     turns = [written, *sides.values()]
     total = passes * sum(side.oversampling for side in turns)
@@ -172,7 +172,7 @@ def compare(
             if stop.is_set():
                 break
 
-    scenes.warn_of_black(written.scene, parsed.path, [written.image, *(side.image for side in sides.values())])
+    scene_checks.warn_of_black(written.scene, parsed.path, [written.image, *(side.image for side in sides.values())])
     common = {
         "scene": str(parsed.path),
         "variant": mi.variant(),

@@ -13,7 +13,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from . import conversion, films, metrics, plugins, scenes
+from . import conversion, films, metrics, plugins, scene_checks, scenes
 from . import depth as depths
 from . import orbit as orbits
 from .errors import UsageError
@@ -139,12 +139,12 @@ def render(
         if not isinstance(loaded, mi.Scene):
             raise UsageError(f"scene: found a {type(loaded).__name__}, expected a scene, its file or its dictionary")
     name = str(parsed.path) if parsed else "scene"
-    scenes.check_renderable(loaded, name)
+    scene_checks.check_renderable(loaded, name)
     if output is not None:
         _check_channels(image_path(output, bool(orbit)), channels_of(loaded))
     ready = time.perf_counter()
     spp = spp or loaded.sensors()[0].sampler().sample_count()
-    scenes.check_size(loaded, spp)
+    scene_checks.check_size(loaded, spp)
     if orbit:
         width, height = scenes.film_size(loaded)
         check_memory("orbit", orbit, 16 * orbit * width * height)
@@ -161,7 +161,7 @@ def render(
     if bad:
         total = len(frames) * frames[0].shape[0] * frames[0].shape[1]
         plugins.warn(f"{name}: {bad:,} of {total:,} rendered pixels are not finite (NaN or infinite)")
-    scenes.warn_of_black(loaded, name, frames)
+    scene_checks.warn_of_black(loaded, name, frames)
     figures = {
         "interrupted": interrupted,
         "nonfinite_pixels": bad,

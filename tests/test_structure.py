@@ -54,6 +54,7 @@ FLOORS = (
         "poses",
         "saving",
         "rendering",
+        "scene_checks",
         "scenes",
         "view_capture",
         "capture_settings",

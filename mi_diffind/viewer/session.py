@@ -12,7 +12,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from .. import compat, metrics, plugins, scenes, srgb
+from .. import compat, metrics, plugins, scene_checks, scenes, srgb
 from ..errors import DiffindError, UsageError
 from ..orbit import middle
 from ..runtime import use_variant
@@ -110,7 +110,7 @@ class Session:
         self.spp = spp or sensor.sampler().sample_count()
         if not isinstance(self.spp, int) or not 1 <= self.spp <= 2**16:
             raise UsageError(f"spp: found {self.spp}, allowed are whole numbers from 1 to {2**16}")
-        scenes.check_size(self.learned.scene, self.spp, self.full)
+        scene_checks.check_size(self.learned.scene, self.spp, self.full)
         self.start = Pose.of(written)
         self._pose, self._residue = self.start, np.linalg.inv(self.start.matrix) @ written
         self.view = VIEWS[0] if self.exact else VIEWS[1]
