@@ -152,7 +152,7 @@ def _content_of_image(path: Path, values: np.ndarray) -> tuple[Content, list[str
     if content.colours:
         looks = f'{path.name}: looks like a normal map, but is taken for colours: a manifest may call it "normal"'
         return _COLOURS, [looks] if share > _LOOKS else []
-    described = "data" if content.role == "other" else f"a {content.role} map"
+    described = {"other": "data", "ao": "an AO map"}.get(content.role, f"a {content.role} map")
     fits = share > _NAMED if content.role == "normal" else content.packed or values.shape[2] == 1 or _equal(values)
     if not fits:
         return _COLOURS, [f"{path.name}: has the name of {described}, but the values of colours, which it is taken for"]

@@ -151,7 +151,7 @@ def open_uncompressed(props: mi.Properties, wrap_mode: str) -> tuple[SharedMaps,
     def load() -> SharedMaps:
         # A single image without "raw" is colours, whatever its name, as for Mitsuba's "bitmap"
         source = load_source(path, nonfinite="clean", named=raw) if path else _source_of(props["bitmap"])
-        for note in source.notes:
+        for note in source.notes if path.lower().endswith(".json") else ():
             warn(note)
         if raw:
             maps = tuple(dataclasses.replace(m, color_space="linear") for m in source.maps)
