@@ -248,26 +248,29 @@ def is_within(folder: str | os.PathLike, name: str | os.PathLike) -> bool:
 def path_within(folder: str | os.PathLike, name: str, file: str | os.PathLike) -> Path:
     """Return the path of the file ``name`` in a folder, as the content of a ``file`` names it.
 
-    Names written on other systems count: where there is no such file, backslashes are slashes, and a name that differs
-    in upper and lower case alone is taken if it is the only one. Raises :class:`OutsideError` for a path that leads out
-    of the folder, unless :data:`PATHS` allows any. Symbolic links are not resolved: whoever unpacks a folder has put
-    them there.
+    Raises :class:`OutsideError` for a path that leads out of the folder, unless :data:`PATHS` allows any. Symbolic
+    links are not resolved: whoever unpacks a folder has put them there.
     """
-    if "\\" in name and not os.path.lexists(os.path.join(folder, name)):
-        name = name.replace("\\", "/")
     if os.environ.get(PATHS) != "any" and not is_within(folder, name):
         raise OutsideError(
             f"{file}: names {name!r:.80}, which lies outside of its folder: the environment variable {PATHS}=any "
             f"allows it"
         )
-    path = Path(folder) / name
-    return path if os.path.lexists(path) or not is_within(folder, name) else _in_other_case(Path(folder), path)
+    return Path(folder) / name
 
 
-def _in_other_case(folder: Path, path: Path) -> Path:
-    """Return the only path in a folder that differs from ``path`` in upper and lower case, else ``path`` itself."""
-    present = folder
-    for part in path.relative_to(folder).parts:
+def path_by_name(folder: str | os.PathLike, name: str, file: str | os.PathLike) -> Path:
+    """Return :func:`path_within` of a ``name`` that may have been written on another system.
+
+    Where there is no such file, backslashes are slashes, and a name that differs in upper and lower case alone is taken
+    if it is the only one. Raises :class:`OutsideError`.
+    """
+    for spelling in (name, name.replace("\\", "/")):
+        path = path_within(folder, spelling, file)
+        if os.path.lexists(path):
+            return path
+    present = Path(folder)
+    for part in () if os.path.isabs(spelling) else Path(spelling).parts:
         if not os.path.lexists(present / part):
             with contextlib.suppress(OSError):
                 alike = [entry for entry in os.listdir(present) if entry.casefold() == part.casefold()]

@@ -27,7 +27,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import DiffindError, reason
-from ..files import MOST_TEXT, OutsideError, irregular, path_within, shown
+from ..files import MOST_TEXT, OutsideError, irregular, path_by_name, shown
 from ..limits import Allowance, LimitError, json_bytes
 from ..picture_sizes import check_picture
 from ..units import memory
@@ -228,7 +228,7 @@ def _load_manifest(path: Path, nonfinite: str) -> Source:
                 f'{path}: map "{name}" has the color space {color_space!r:.40}, allowed are {COLOR_SPACES}'
             )
         try:
-            file = path_within(path.parent, file, path)
+            file = path_by_name(path.parent, file, path)
         except OutsideError as e:
             raise SourceError(str(e)) from None
         if file not in images:
