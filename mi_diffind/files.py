@@ -269,8 +269,10 @@ def path_by_name(folder: str | os.PathLike, name: str, file: str | os.PathLike) 
         path = path_within(folder, spelling, file)
         if os.path.lexists(path):
             return path
+    if os.path.isabs(spelling):
+        return path
     present = Path(folder)
-    for part in () if os.path.isabs(spelling) else Path(spelling).parts:
+    for part in Path(spelling).parts:
         if not os.path.lexists(present / part):
             with contextlib.suppress(OSError):
                 alike = [entry for entry in os.listdir(present) if entry.casefold() == part.casefold()]
