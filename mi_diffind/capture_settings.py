@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .poses import orbit_directions, sphere_directions
-from .units import check_memory
+from .units import check_memory, check_samples
 
 #: Bytes of memory for a sample of a pass and for the camera of a view, roughly.
 SAMPLE, VIEW = 512, 1024
@@ -57,6 +57,7 @@ class CaptureSettings:
         for name, least in (("views", 1), ("test", 0), ("resolution", 1), ("spp", 1)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name}: found {getattr(self, name)}, allowed are whole numbers ≥ {least}")
+        check_samples(self.spp)
         check_memory("resolution", self.resolution, SAMPLE * self.resolution**2)
         check_memory("views", self.views + self.test, VIEW * (self.views + self.test))
         if not 0 < self.fov < 170:

@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import compat, conversion, metrics, plugins, scenes
+from . import compat, conversion, metrics, plugins, scene_checks, scenes
 from .errors import UsageError
 from .files import writable_folder
 from .interrupt import interruptible
@@ -61,10 +61,13 @@ class Comparison:
 
 
 class _Side:
-    """Scene, its passes so far and their times: ``oversampling`` times the samples of the scene as written."""
+    """Scene, its passes so far and their times: ``oversampling`` times the samples of the scene as written.
 
-    def __init__(self, scene, oversampling: int = 1):
-        self.scene, self.oversampling = scene, oversampling
+    ``name`` is that of the picture in a sentence.
+    """
+
+    def __init__(self, scene, oversampling: int = 1, name: str = "the picture"):
+        self.scene, self.name, self.oversampling = scene, name, oversampling
         self.halves, self.samples = [0.0, 0.0], [0, 0]
         self.seconds: list[float] = []
         self.compiled: list[bool] = []
@@ -76,6 +79,7 @@ class _Side:
             dr.kernel_history_clear()
             image, seconds = scenes.render(self.scene, spp * self.oversampling, seed, self.oversampling, on_pass)
             self.compiled.append(compat.was_compiled(dr.kernel_history()))
+        scene_checks.check_finite(image, self.name)
         image = image[..., :3].astype(np.float64)
         half = len(self.seconds) % 2
         self.halves[half] = self.halves[half] + spp * np.repeat(image, 3 // image.shape[-1], -1)
@@ -151,12 +155,14 @@ def compare(
         oversampling = max(c.oversampling for c in counterparts[name])
         if learn and not against and name == "exact":
             name, put_in["stock"] = "stock", list(dict.fromkeys(c.stock for c in conversions if c.learned))
-            sides[name] = _Side(scenes.load(scene, defines), oversampling)
+            loaded = scenes.load(scene, defines)
         else:
-            sides[name] = _Side(parsed.load(exact=True, against=names), oversampling)
-    written = _Side(parsed.load())
+            loaded = parsed.load(exact=True, against=names)
+        sides[name] = _Side(loaded, oversampling, f"{parsed.path} with {', '.join(put_in[name])}")
+    written = _Side(parsed.load(), name=f"{parsed.path}, as written")
     spp = spp or written.scene.sensors()[0].sampler().sample_count()
     footprint.check_samples(footprint.textures(written.scene), spp)
+    scene_checks.check_size(written.scene, spp)
     passes, done = max(1, min(max(passes, 2), spp)), 0
     turns = [written, *sides.values()]
     total = passes * sum(side.oversampling for side in turns)
@@ -169,6 +175,7 @@ def compare(
             if stop.is_set():
                 break
 
+    scene_checks.warn_of_black(written.scene, parsed.path, [written.image, *(side.image for side in sides.values())])
     common = {
         "scene": str(parsed.path),
         "variant": mi.variant(),

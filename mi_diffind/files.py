@@ -259,6 +259,28 @@ def path_within(folder: str | os.PathLike, name: str, file: str | os.PathLike) -
     return Path(folder) / name
 
 
+def path_by_name(folder: str | os.PathLike, name: str, file: str | os.PathLike) -> Path:
+    """Return :func:`path_within` of a ``name`` that may have been written on another system.
+
+    Where there is no such file, backslashes are slashes, and a name that differs in upper and lower case alone is taken
+    if it is the only one. Raises :class:`OutsideError`.
+    """
+    for spelling in (name, name.replace("\\", "/")):
+        path = path_within(folder, spelling, file)
+        if os.path.lexists(path):
+            return path
+    if os.path.isabs(spelling):
+        return path
+    present = Path(folder)
+    for part in Path(spelling).parts:
+        if not os.path.lexists(present / part):
+            with contextlib.suppress(OSError):
+                alike = [entry for entry in os.listdir(present) if entry.casefold() == part.casefold()]
+                part = alike[0] if len(alike) == 1 else part
+        present = present / part
+    return present if os.path.lexists(present) else path
+
+
 def relative_path(file: str | os.PathLike, folder: str | os.PathLike) -> str:
     """Return the path of a file from a folder, or an absolute one if the two share no more than the root."""
     file, folder = os.path.abspath(file), os.path.abspath(folder)

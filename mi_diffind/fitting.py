@@ -89,6 +89,10 @@ class Problem:
     #: (:class:`.sparse_adam.SparseAdam`). ``net`` is a dictionary then.
     sparse: bool = False
 
+    #: Loss that is no explosion, however small the losses before: a training that starts next to its optimum first
+    #: moves away from it, as far as its learning rate goes.
+    harmless: float = 1e-6
+
     #: What the settings do not say about the problem, as JSON; a checkpoint of another one is refused.
     identity: Mapping = {}
 
@@ -267,7 +271,7 @@ def fit(
             if not (due or last or reference is None):
                 continue
             value = float(loss[0])
-            if _diverged(value, reference) or not trainer.finite():
+            if _diverged(value, reference, problem.harmless) or not trainer.finite():
                 restarts += 1
                 trainer.restarts = restarts
                 if restarts > 8:
@@ -378,8 +382,8 @@ class _Bar:
         self.shown.set_postfix(self.text, refresh=not self.lines)
 
 
-def _diverged(value: float, reference: float | None) -> bool:
-    return not math.isfinite(value) or (reference is not None and value > 10 * reference + 1e-6)
+def _diverged(value: float, reference: float | None, harmless: float) -> bool:
+    return not math.isfinite(value) or (reference is not None and value > 10 * reference + harmless)
 
 
 class _Plateau:

@@ -15,7 +15,7 @@ import mitsuba as mi
 from . import plugins, scenes
 from .errors import UsageError, printable
 from .runtime import array_module, use_variant
-from .tables import gathers_of, load_table
+from .tables import TableError, gathers_of, load_table
 from .task import task_of
 from .units import labelled
 
@@ -90,7 +90,7 @@ def _inspect_scene_file(path, defines: dict) -> Inspection:
     parsed = scenes.ParsedScene(path, defines)
     learned = parsed.learned_plugins()
     tables = {key: table.nbytes for key, table in parsed.tables(learned).items()}
-    return _scene_inspection(str(path), _reports(parsed.load()), learned, tables)
+    return _scene_inspection(str(path), _reports(parsed.load(needs=())), learned, tables)
 
 
 def _scene_inspection(file: str | None, reports: list[dict], learned: list[dict], tables: dict) -> Inspection:
@@ -193,6 +193,9 @@ def _inspect_table(file, measure: bool) -> Inspection:
         model = task.model(table, dtype, form)
         size = {"bytes": model.nbytes, "memory_bytes": model.memory_nbytes}
         measured[model.storage] = {**size, **model.measure()}
+        bad = [name for name, value in measured[model.storage].items() if value != value]
+        if bad:
+            raise TableError(f"{file}: as {model.storage}, {', '.join(bad)} is no number: values are not finite")
     return Inspection(
         {
             "file": str(file),

@@ -6,20 +6,43 @@ import math
 
 import numpy as np
 
+from .errors import DiffindError
 from .srgb import for_display
 
 #: Side of the window of :func:`ssim_published`, pixels.
 WINDOW = 11
 
 
+class NotFiniteError(DiffindError, ValueError):
+    """An image has no error, since pixels of it are NaN or infinite; the message is one sentence."""
+
+
+def nonfinite_pixels(image: np.ndarray) -> int:
+    """Return the number of pixels with a channel that is NaN or infinite."""
+    return int((~np.isfinite(image)).any(axis=-1).sum())
+
+
+def check_finite(*images: np.ndarray) -> None:
+    """Raise :class:`NotFiniteError` if pixels of an image are NaN or infinite."""
+    for image in images:
+        if count := nonfinite_pixels(image):
+            pixels = image.size // image.shape[-1]
+            raise NotFiniteError(f"{count:,} of {pixels:,} pixels are not finite, so that the image has no error")
+
+
 def psnr(reference: np.ndarray, image: np.ndarray) -> float:
-    """Return the peak signal-to-noise ratio in dB of linear values clipped to [0, 1]; infinite for equal images."""
+    """Return the peak signal-to-noise ratio in dB of linear values clipped to [0, 1]; infinite for equal images.
+
+    Raises :class:`NotFiniteError`, as :func:`mae` and :func:`flip` do.
+    """
+    check_finite(reference, image)
     mse = float(np.mean((np.clip(reference, 0, 1) - np.clip(image, 0, 1)) ** 2, dtype=np.float64))
     return math.inf if mse == 0 else -10 * math.log10(mse)
 
 
 def mae(reference: np.ndarray, image: np.ndarray) -> float:
     """Return the mean absolute error of linear values, not clipped."""
+    check_finite(reference, image)
     return float(np.mean(np.abs(reference - image), dtype=np.float64))
 
 
@@ -28,6 +51,7 @@ def flip(reference: np.ndarray, image: np.ndarray) -> float:
 
     They are encoded by :func:`.srgb.for_display`; the viewing distance is the default one, 67 pixels per degree.
     """
+    check_finite(reference, image)
     return flip_shown(for_display(reference), for_display(image))
 
 

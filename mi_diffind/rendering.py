@@ -13,7 +13,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from . import conversion, films, scenes
+from . import conversion, films, metrics, plugins, scene_checks, scenes
 from . import depth as depths
 from . import orbit as orbits
 from .errors import UsageError
@@ -142,13 +142,14 @@ def render(
         chosen, conversions, loaded = None, [], scenes.load_dict(scene) if isinstance(scene, dict) else scene
         if not isinstance(loaded, mi.Scene):
             raise UsageError(f"scene: found a {type(loaded).__name__}, expected a scene, its file or its dictionary")
-    if not loaded.sensors():
-        raise scenes.SceneError(f"{parsed.path if parsed else 'scene'}: has no sensor")
+    name = str(parsed.path) if parsed else "scene"
+    scene_checks.check_renderable(loaded, name)
     if output is not None:
         _check_channels(image_path(output, bool(orbit)), channels_of(loaded))
     ready = time.perf_counter()
     spp = spp or loaded.sensors()[0].sampler().sample_count()
     footprint.check_samples(footprint.textures(loaded), spp)
+    scene_checks.check_size(loaded, spp)
     if orbit:
         width, height = scenes.film_size(loaded)
         check_memory("orbit", orbit, 16 * orbit * width * height)
@@ -161,8 +162,14 @@ def render(
             image, seconds = scenes.render(loaded, spp, seed, passes, bar.update, stop)
         frames, done = [image], sum(scenes.samples_taken(loaded, spp, passes)[: len(seconds)])
         interrupted = len(seconds) < passes
+    bad = sum(map(metrics.nonfinite_pixels, frames))
+    if bad:
+        total = len(frames) * frames[0].shape[0] * frames[0].shape[1]
+        plugins.warn(f"{name}: {bad:,} of {total:,} rendered pixels are not finite (NaN or infinite)")
+    scene_checks.warn_of_black(loaded, name, frames)
     figures = {
         "interrupted": interrupted,
+        "nonfinite_pixels": bad,
         "scene": str(parsed.path) if parsed else None,
         "variant": mi.variant(),
         "width": frames[0].shape[1],

@@ -16,11 +16,12 @@ import mitsuba as mi
 import numpy as np
 
 from . import compat, plugins
-from .errors import DiffindError, UsageError
+from .errors import UsageError
 from .files import MOST_TEXT, irregular, replacing, shown
 from .measure.operations import bsdf_operations
 from .plugins.support import footprint, omissions
 from .runtime import use_variant
+from .scene_checks import NEEDS, SceneError, check_measured, check_renderable, check_size, use_slashes
 from .task import tasks
 
 #: Integrators that follow paths to a ``max_depth``, and the depth of each where the scene gives none (-1: infinite).
@@ -28,10 +29,6 @@ MAX_DEPTHS = {
     **dict.fromkeys(("path", "volpath", "volpathmis", "ptracer", "path_footprint", "path_sdf", "neural_field"), -1),
     **dict.fromkeys(("prb", "prb_basic", "prb_projective", "prbvolpath"), 6),
 }
-
-
-class SceneError(DiffindError, RuntimeError):
-    """A scene cannot be loaded or rendered; the message is one sentence that names the file and the fault."""
 
 
 class ParsedScene:
@@ -72,6 +69,7 @@ class ParsedScene:
             if self.path.suffix.lower() == ".npz":
                 raise RuntimeError(f"{path}: found a table file, a scene is needed: mi_diffind.inspect shows its use")
             _, self._state = compat.parse_file(path, self.defines)
+            use_slashes(self._state)
 
     @contextlib.contextmanager
     def _errors(self):
@@ -87,6 +85,7 @@ class ParsedScene:
         change: Callable[[object], object] | None = None,
         merge: bool = True,
         parallel: bool = True,
+        needs: tuple[str, ...] = NEEDS,
     ):
         """Return a loaded scene, as :func:`load_file` does.
 
@@ -95,7 +94,8 @@ class ParsedScene:
         ``longest_path`` replaces the ``max_depth`` of the scene's integrator (1: emitted light, 2: direct light, …; -1:
         infinite). ``change(state)`` may change the parsed scene (``mi.parser.ParserState``) before anything else does.
         Without ``merge``, Mitsuba joins no meshes, and each keeps its id. Objects that are not loaded in ``parallel``
-        have the same order in each run, so that the kernels of an earlier run are found again.
+        have the same order in each run, so that the kernels of an earlier run are found again. A scene without what it
+        ``needs`` to be rendered is an error (:func:`check_renderable`).
 
         Shapes whose stored arrays the scene's integrator cannot trace are decoded, with a warning that states the
         memory, unless the scene forbids decoding; then this is an error.
@@ -116,6 +116,7 @@ class ParsedScene:
             loaded = _build(config, state, integrators, _refuse)
             if not isinstance(loaded, mi.Scene):
                 raise RuntimeError(f"{self.path}: holds a {type(loaded).__name__}, a scene is expected")
+            check_renderable(loaded, self.path, needs)
             return loaded
 
     def change(self, change: Callable[[object], object]):
@@ -217,8 +218,8 @@ def _is_scene(value) -> bool:
 
 
 def load(path: str | os.PathLike, defines: dict[str, str] | None = None, **options):
-    """Return the loaded scene of a file; ``options`` are those of :meth:`ParsedScene.load`."""
-    return ParsedScene(path, defines).load(**options)
+    """Return the loaded scene of a file; ``options`` are those of :meth:`ParsedScene.load`. It ``needs`` nothing."""
+    return ParsedScene(path, defines).load(**{"needs": (), **options})
 
 
 def load_file(path: str | os.PathLike, parallel: bool = True, optimize: bool = True, **defines):
@@ -236,6 +237,7 @@ def load_file(path: str | os.PathLike, parallel: bool = True, optimize: bool = T
         return mi.load_file(str(path))
     with _resolving(path):
         config, state = compat.parse_file(path, defines)
+        use_slashes(state)
         compat.build_as(config, parallel, optimize)
         return _build(config, state, _integrators(state), plugins.warn)
 
@@ -273,6 +275,7 @@ def attach(scene, sensor=0, spp: int | None = None):
 
 def _build(config, state, integrators: list[str], report: Callable[[str], None]):
     """Instantiate a parsed scene; ``report`` is called with a sentence about a shape that no integrator traces."""
+    check_measured(state)
     decoded = _decode_unseen(state, integrators) if integrators else []
     loaded = compat.instantiate(config, state)
     if isinstance(loaded, mi.Scene):
@@ -473,6 +476,7 @@ def render(
 
 def render_pass(scene, spp: int, seed: int) -> np.ndarray:
     """Render one pass, ``(height, width, channels)``, float64; ``seed`` is Mitsuba's own, modulo 2³²."""
+    check_size(scene, spp)
     with scene_errors(None):
         return mi.render(scene, spp=spp, seed=seed % 2**32).numpy().astype(np.float64)
 

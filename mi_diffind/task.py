@@ -130,7 +130,7 @@ class FitRequest:
         Arrays, meshes and other objects in memory are left out.
         """
         files = {name: file for name, file in sources.items() if isinstance(file, (str, os.PathLike))}
-        return {name: os.path.relpath(Path(file).resolve(), self.folder) for name, file in files.items()}
+        return {k: Path(os.path.relpath(Path(file).resolve(), self.folder)).as_posix() for k, file in files.items()}
 
 
 @dataclass(repr=False)

@@ -19,6 +19,9 @@ _WORDS = {
     "converged": "converged truth",
     "prefiltered": "prefiltered truth",
 }  # fmt: skip
+#: Most samples per pixel of a picture: up to there, each pass of 16 has random numbers of its own.
+MOST_SAMPLES = 2**20
+
 _UNITS = {"": 1, "k": 1024, "m": 1024**2, "g": 1024**3}
 
 
@@ -56,14 +59,21 @@ def memory() -> int:
         return 2**36
 
 
-def check_memory(name: str, value: float, nbytes: float) -> None:
-    """Refuse a ``value`` of an option that takes about ``nbytes`` bytes of memory.
+def check_memory(name: str, value: float | str, nbytes: float) -> None:
+    """Refuse a ``value`` of an option, a number or a text, that takes about ``nbytes`` bytes of memory.
 
     Raises :class:`~mi_diffind.errors.UsageError` if the machine has less.
     """
     if nbytes > memory():
         needed, there = (f"{n / 2**30:,.0f} GiB" for n in (nbytes, memory()))
-        raise UsageError(f"{name}: found {value:,}, which takes about {needed} of memory, this machine has {there}")
+        value = value if isinstance(value, str) else f"{value:,}"
+        raise UsageError(f"{name}: found {value}, which takes about {needed} of memory, this machine has {there}")
+
+
+def check_samples(spp: int) -> None:
+    """Refuse a number of samples per pixel beyond :data:`MOST_SAMPLES`. Raises UsageError."""
+    if not 1 <= spp <= MOST_SAMPLES:
+        raise UsageError(f"spp: found {spp:,} samples per pixel, allowed are 1 to {MOST_SAMPLES:,}")
 
 
 def check_size(name: str, value: float, most: float) -> None:

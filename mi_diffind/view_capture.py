@@ -26,7 +26,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import __version__, compat, scenes, splats, srgb
+from . import __version__, compat, plugins, scenes, splats, srgb
 from .capture_settings import CaptureSettings
 from .errors import DiffindError, UsageError, reason
 from .files import replacing, writable_folder, write_json
@@ -383,7 +383,7 @@ def _load(parsed: scenes.ParsedScene):
             if not scenes.nests_another(props):  # the nested one follows the paths
                 props["hide_emitters"] = True
 
-    return parsed.load(change=hide, merge=False)
+    return parsed.load(change=hide, merge=False, needs=())
 
 
 class CaptureCamera:
@@ -415,6 +415,7 @@ class CaptureCamera:
         self.parameters.update()
         footprint.attach(self.scene, self.sensor, self.settings.spp)
         total, done, passes = 0.0, 0, 0
+        bad = np.zeros((self.settings.resolution,) * 2, bool)
         most = 1 << (max(1, PASS // self.settings.resolution**2).bit_length() - 1)
         while done < self.settings.spp:
             n = min(most, self.settings.spp - done)
@@ -425,8 +426,13 @@ class CaptureCamera:
                     self.scene, sensor=self.sensor, integrator=self.integrator, spp=n,
                     seed=(seed * 4096 + passes) % 2**32,
                 ).numpy().astype(np.float64)  # fmt: skip
+            bad |= ~np.isfinite(image).all(axis=-1)
             total = total + n * np.where(np.isfinite(image), image, 0)
             done, passes = done + n, passes + 1
+        if bad.any():
+            plugins.warn(
+                f"{int(bad.sum()):,} of {bad.size:,} pixels of a view have NaN or infinite samples, which count 0"
+            )
         image = total / done
         colours = 1 if mi.is_monochromatic else 3
         alpha = np.clip(image[..., colours : colours + 1], 0, 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations  # Delayed parsing of type annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import drjit as dr
@@ -262,22 +263,29 @@ class MapTexture(base_class("Texture")):
     def max(self):
         self._check_cache()
         if self._max is None:
-            self._max = float(self._decoded().max())
+            bounds = self._elsewhere(lambda: self.image.bounds(self.map.name))
+            self._max = float(self._decoded().max() if bounds is None else self._linear(np.array(bounds)).max())
         return self._max
 
     def _decoded(self) -> np.ndarray:
-        """Return the converted image, float32, ``(height, width, channels)``.
+        """Return the converted image, float32, ``(height, width, channels)``."""
+        name = self.map.name
+        return self._linear(self._elsewhere(lambda: self.image.decode([name], *self._decoded_size())[name]))
 
-        It is decoded in another thread: this one may be recording a loop or a call, where nothing can be evaluated.
-        """
+    def _linear(self, values: np.ndarray) -> np.ndarray:
+        """Return values of the map as they are read: converted, if they are encoded."""
+        return srgb.to_linear(values) if self._is_encoded() else values
 
-        def decode():
+    @staticmethod
+    def _elsewhere(compute: Callable):
+        """Return ``compute()`` of another thread: this one may be recording a loop, where nothing can be evaluated."""
+
+        def computed():
             with dr.suspend_grad():
-                return self.image.decode([self.map.name], *self._decoded_size())[self.map.name]
+                return compute()
 
         with ThreadPoolExecutor(1) as pool:
-            values = pool.submit(decode).result()
-        return srgb.to_linear(values) if self._is_encoded() else values
+            return pool.submit(computed).result()
 
     def _sampled(self) -> PositionDistribution:
         self._check_cache()

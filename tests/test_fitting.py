@@ -392,6 +392,15 @@ def test_losses_of_different_kinds_are_not_compared(ad, tmp_path):
     assert result.restarts == 1 and messages[0].startswith("step 41: ")
 
 
+@pytest.mark.parametrize("harmless, restarts", [(1e-6, 1), (10.0, 0)])
+def test_losses_that_do_no_harm_are_no_explosions(ad, harmless, restarts):
+    """A training that starts next to its optimum moves away from it at first, by a loss that its problem knows."""
+    problem = Curve(ad, {35: lambda y: y + 2})
+    problem.harmless = harmless
+    result, messages = run(problem, settings())
+    assert (result.restarts, len(messages), result.steps) == (restarts, restarts, 60)
+
+
 def test_explosion_is_noticed(ad):
     """A loss that jumps by more than an order of magnitude counts as divergence as well."""
     problem = Curve(ad, {35: lambda y: y + 1e6})

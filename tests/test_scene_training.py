@@ -445,7 +445,8 @@ def test_a_scene_may_be_a_dictionary(folder, trained):
     file = (folder / "material.npz").resolve()
     texture = {"type": "neural_texture", "filename": str(file), "channels": "albedo"}
     floor = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": texture}}
-    parsed = scenes.ParsedScene({"type": "scene", "sensor": {"type": "perspective"}, "floor": floor})
+    scene = {"type": "scene", "integrator": {"type": "path"}, "sensor": {"type": "perspective"}, "floor": floor}
+    parsed = scenes.ParsedScene(scene)
     assert texture_file(parsed) == (file, "")
     assert TrainedScene(parsed, {file: load(file)}, ViewDistribution(), 1).keys.keys() == trained[0].keys.keys()
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from .. import lookup
 from ..indirection import aligned_copy
-from .layout import Layout
+from .layout import FROM_NORMAL, Layout
 from .source import Source
 
 #: Texels decoded at a time.
@@ -71,6 +71,20 @@ class CompressedMaps:
                 for c, value in enumerate(channels):
                     images[name][start : start + count, c] = value if isinstance(value, float) else value.numpy()
         return {name: image.reshape(height, width, -1) for name, image in images.items()}
+
+    def bounds(self, name: str) -> list[float] | None:
+        """Return upper bounds of the channels of a map, in its color space, at any place and level of detail.
+
+        A read interpolates entries of the array ``cascaded``, so that none of its values is above the largest entry.
+        ``None`` if the maps have no such array: they interpolate texels.
+        """
+        net = getattr(self, "net", None)
+        if net is None:
+            return None
+        entries = net.cascaded.numpy()
+        largest = self.layout.decode(name, entries.reshape(-1, entries.shape[-1]).max(axis=0).tolist())
+        channels = zip(self.layout[name].where, largest, strict=True)
+        return [1.0 if where == FROM_NORMAL else float(value) for where, value in channels]
 
     def measure(self, source: Source) -> dict[str, float]:
         """Return the errors at texel centres against ``source``.

@@ -13,7 +13,8 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from .source import ROLES, Map, Source
+from .names import ROLES
+from .source import Map, Source
 
 #: Least PSNR, in dB, of the third component of a normal that is derived from the other two.
 NORMAL_FLOOR_DB = 45.0

@@ -78,10 +78,11 @@ class MapsModel(Model):
         for m in layout.maps:
             psnr = table.measured.get(map_figure(m.name))
             stored = [w if isinstance(w, int) else "from x and y" if w == "z" else f"is {w[1]:.4g}" for w in m.where]
-            maps[m.name] = {"channels": m.channels, "color_space": m.color_space, "stored_as": stored, "psnr_db": psnr}
+            content = {"role": m.role, "channels": m.channels, "color_space": m.color_space}
+            maps[m.name] = {**content, "stored_as": stored, "psnr_db": psnr}
             error = f", {psnr:.2f} dB" if psnr is not None else ""
             kept = ", ".join(map(str, stored))
-            lines.append(f"  {m.name:20} {m.channels} channel(s), {m.color_space}, stored as {kept}{error}")
+            lines.append(f"  {m.name:20} {m.role}, {m.channels} channel(s), {m.color_space}, stored as {kept}{error}")
         figures = {"width": layout.width, "height": layout.height, "source_bytes": layout.source_nbytes}
         return {**figures, "memory_bytes": self.memory_nbytes, "compression": ratio, "maps": maps}, lines
 

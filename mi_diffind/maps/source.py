@@ -10,6 +10,9 @@ A manifest gives the name and the file of each map, relative to the manifest's f
 or is the content of ``"maps"`` alone. ``channels`` are letters among ``r``, ``g``, ``b`` and ``a``, or a list of
 indices (needed for a multi-channel EXR). Images are read by ``mitsuba.Bitmap``: PNG, JPEG, EXR, HDR, PFM, BMP, TGA. No
 variant of Mitsuba has to be set.
+
+The name of a map, or if it is unknown that of its file, tells its role and color space (:mod:`.names`). What had to be
+guessed is in the notes of a :class:`Source`.
 """
 
 from __future__ import annotations
@@ -24,25 +27,26 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import DiffindError, reason
-from ..files import MOST_TEXT, OutsideError, irregular, path_within, shown
+from ..files import MOST_TEXT, OutsideError, irregular, path_by_name, shown
 from ..limits import Allowance, LimitError, json_bytes
 from ..picture_sizes import check_picture
 from ..units import memory
+from ..unused_keys import RecordedKeys, unused_note
+from .names import Content, content_of
 
 #: Largest number of channels of all maps together.
 MAX_CHANNELS = 16
 
 COLOR_SPACES = ("srgb", "linear")
-ROLES = ("albedo", "normal", "roughness", "ao", "metallic", "other")
 NONFINITE = ("error", "clean")
 
-_SYNONYMS = {
-    "albedo": ("albedo", "basecolor", "diffuse", "diffusecolor", "color", "colour"),
-    "normal": ("normal", "normals", "nrm"),
-    "roughness": ("roughness", "rough"),
-    "ao": ("ao", "occlusion", "ambientocclusion"),
-    "metallic": ("metallic", "metalness", "metal"),
-}
+#: Largest distance of a normal's length from 1, and least share of such texels in an image that looks like normals, or
+#: that has the name of normals.
+_LENGTH, _LOOKS, _NAMED = 0.15, 0.95, 0.5
+
+#: Content of images without a name, and of maps with an unknown one.
+_COLOURS, _UNKNOWN = Content("albedo", colours=True), Content("other")
+
 _DEPTHS = {"uint8": 1, "uint16": 2, "uint32": 4, "float16": 2, "float32": 4, "float64": 4}
 _ENCODED = ("uint8", "uint16")  # types whose full range means 0 … 1
 
@@ -78,7 +82,7 @@ class Source:
     """The ``maps`` of an image or material, all of ``height`` × ``width`` texels, with at most 16 channels together.
 
     ``digest`` is a SHA-256 over their names, layout and values; ``cleaned`` counts the NaN and infinite values that
-    were replaced.
+    were replaced. ``notes`` are sentences about what was guessed, changed or not used, for people.
     """
 
     maps: tuple[Map, ...]
@@ -86,6 +90,7 @@ class Source:
     width: int
     digest: str
     cleaned: int = 0
+    notes: tuple[str, ...] = ()
 
     @property
     def channels(self) -> int:
@@ -102,16 +107,18 @@ class Source:
         return self.texels * sum(m.channels * m.depth for m in self.maps)
 
 
-def load_source(source, nonfinite: str = "error") -> Source:
+def load_source(source, nonfinite: str = "error", named: bool = True) -> Source:
     """Read an image or a manifest (``.json``), or take the maps that ``source`` holds in memory.
 
     In memory, ``source`` is a :class:`Source`, an image (an array ``(height, width, channels)`` or a ``mi.Bitmap``), or
     a dictionary of such images and of image files by the name of the map (:func:`from_arrays`).
 
     An image is a map called ``"image"`` and, if it has an alpha channel, a map ``"alpha"``. It is sRGB if it is grey or
-    RGB of 8 or 16 bits, else linear. A map of a manifest is by default sRGB if it is an albedo of 8 or 16 bits and 1 or
-    3 channels. Its alpha channel is left out if it is 1 everywhere, else ``channels`` is needed. A roughness, AO or
-    metallic map with three equal channels keeps one.
+    RGB of 8 or 16 bits, unless the name of its file is that of data, such as normals (``named``: names of images count,
+    else they are colours). A map of a manifest is by default sRGB if its name is that of colours and it has 8 or 16
+    bits and 1 or 3 channels. Its alpha channel is left out if it is 1 everywhere, else ``channels`` is needed. A
+    roughness, AO or metallic map with three equal channels keeps one. Normals of DirectX in a manifest become those of
+    OpenGL.
 
     NaN and infinite values are an error. With ``nonfinite="clean"`` NaN becomes 0 and infinity the largest (negative:
     the smallest) finite value of the channel, 0 if there is none. Raises :class:`SourceError`.
@@ -127,11 +134,30 @@ def load_source(source, nonfinite: str = "error") -> Source:
         return _load_manifest(path, nonfinite)
     else:
         image, where = _read(path), path
-    role, file = "albedo" if image.named else "other", str(where) if where is not None else ""
-    maps = [_RawMap("image", image.values[:, :, : image.colors], role, file, image.color_space)]
+    values, content, notes = image.values[:, :, : image.colors], _COLOURS if image.named else _UNKNOWN, []
+    if named and image.named and isinstance(where, Path):
+        content, notes = _content_of_image(where, values)
+    maps = [_RawMap("image", _one_of_equal(values, content.role), content, str(where), image.color_space)]
     if image.has_alpha:
-        maps.append(_RawMap("alpha", image.values[:, :, image.colors :], "other", file))
-    return _assemble(maps, where, nonfinite)
+        maps.append(_RawMap("alpha", image.values[:, :, image.colors :], _UNKNOWN, str(where)))
+    return _assemble(maps, where, nonfinite, notes)
+
+
+def _content_of_image(path: Path, values: np.ndarray) -> tuple[Content, list[str]]:
+    """Return the content of a single image by the name of its file, and what has to be said about it.
+
+    A name of data counts only where the values can be that: three equal channels, or unit normals.
+    """
+    content, share = content_of(path.stem) or _COLOURS, _share_of_normals(values)
+    if content.colours:
+        looks = f'{path.name}: looks like a normal map, but is taken for colours: a manifest may call it "normal"'
+        return _COLOURS, [looks] if share > _LOOKS else []
+    described = {"other": "data", "ao": "an AO map"}.get(content.role, f"a {content.role} map")
+    fits = share > _NAMED if content.role == "normal" else content.packed or values.shape[2] == 1 or _equal(values)
+    if not fits:
+        return _COLOURS, [f"{path.name}: has the name of {described}, but the values of colours, which it is taken for"]
+    down = "; y points down (DirectX), Mitsuba expects OpenGL" if content.y_down else ""
+    return content, [f"{path.name}: taken for {described} by its name, linear{down}"]
 
 
 def from_arrays(arrays: dict, color_spaces: dict[str, str] | None = None, nonfinite: str = "error") -> Source:
@@ -150,22 +176,17 @@ def from_arrays(arrays: dict, color_spaces: dict[str, str] | None = None, nonfin
         _check_name("arrays", name)
         image = _read(Path(array)) if isinstance(array, (str, os.PathLike)) else _in_memory(array, where)
         values = image.opaque(where)
-        role = role_of(name)
+        content = content_of(name)
         if name == "image" and values.shape[2] in (1, 3):
-            role = "albedo"
+            content = _COLOURS
         color_space = color_spaces.pop(name, image.color_space)
         if color_space is not None and color_space not in COLOR_SPACES:
             raise SourceError(f'{where}: has the color space "{color_space}", allowed are {COLOR_SPACES}')
-        maps.append(_RawMap(name, _one_of_equal(values, role), role, "", color_space))
+        content = content or _UNKNOWN
+        maps.append(_RawMap(name, _one_of_equal(values, content.role), content, "", color_space))
     if color_spaces:
         raise SourceError(f'arrays: a color space is given for "{next(iter(color_spaces))}", which is not among them')
     return _assemble(maps, "arrays", nonfinite)
-
-
-def role_of(name: str) -> str:
-    """Return the role (:data:`ROLES`) of a map by its name, such as ``"albedo"`` for ``"base_color"``."""
-    plain = name.lower().replace("_", "").removesuffix("texture").removesuffix("map")
-    return next((role for role, names in _SYNONYMS.items() if plain in names), "other")
 
 
 def _load_manifest(path: Path, nonfinite: str) -> Source:
@@ -180,12 +201,7 @@ def _load_manifest(path: Path, nonfinite: str) -> Source:
         if isinstance(e, SourceError):
             raise
         raise SourceError(f"{path}: is not valid JSON ({reason(e)})") from None
-    entries = content
-    if isinstance(content, dict) and "maps" in content:
-        entries = content["maps"]
-        for key in content:
-            if key != "maps":
-                raise SourceError(f'{path}: has the key "{key}" beside "maps", which allows no other')
+    entries = content["maps"] if isinstance(content, dict) and "maps" in content else content
     if not isinstance(entries, dict) or not entries:
         raise SourceError(f"{path}: has no maps, expected an object that gives each map's name a file")
 
@@ -212,27 +228,29 @@ def _load_manifest(path: Path, nonfinite: str) -> Source:
                 f'{path}: map "{name}" has the color space {color_space!r:.40}, allowed are {COLOR_SPACES}'
             )
         try:
-            file = path_within(path.parent, file, path)
+            file = path_by_name(path.parent, file, path)
         except OutsideError as e:
             raise SourceError(str(e)) from None
         if file not in images:
             images[file] = _read(file)
-        role = role_of(name)
+        content_of_map = content_of(name)
         if "channels" in entry:
             values = images[file].select(entry["channels"], f'{path}: map "{name}"')
         else:
-            values = _one_of_equal(images[file].opaque(f'{path}: map "{name}"'), role)
-        maps.append(_RawMap(name, values, role, str(file), color_space))
-    return _assemble(maps, path, nonfinite)
+            values = images[file].opaque(f'{path}: map "{name}"')
+            content_of_map = content_of_map or content_of(file.stem)
+            values = _one_of_equal(values, content_of_map.role if content_of_map else "")
+        maps.append(_RawMap(name, values, content_of_map or _UNKNOWN, str(file), color_space))
+    note = unused_note(path, content)
+    return _assemble(maps, path, nonfinite, [note] if note else [])
 
 
 def _unique(pairs: list) -> dict:
     """Return an object of a JSON file. Raises ``ValueError`` if a key comes twice."""
-    result = {}
-    for key, value in pairs:
-        if key in result:
-            raise ValueError(f'the key "{key}" comes twice')
-        result[key] = value
+    result = RecordedKeys(pairs)
+    if len(result) < len(pairs):
+        keys = [key for key, _ in pairs]
+        raise ValueError(f'the key "{next(key for key in keys if keys.count(key) > 1)}" comes twice')
     return result
 
 
@@ -391,21 +409,45 @@ class _RawMap:
 
     name: str
     values: np.ndarray
-    role: str
+    content: Content
     file: str
     color_space: str | None = None
 
 
 def _one_of_equal(values: np.ndarray, role: str) -> np.ndarray:
     """Return ``values``, or one of three equal channels where the role has one channel."""
-    if role not in ("roughness", "ao", "metallic") or values.shape[2] != 3:
-        return values
+    return values[:, :, :1] if role in ("roughness", "ao", "metallic") and _equal(values) else values
+
+
+def _equal(values: np.ndarray) -> bool:
+    """Return whether ``values`` have three equal channels."""
     nan = values.dtype.kind == "f"
-    equal = all(np.array_equal(values[:, :, 0], values[:, :, i], equal_nan=nan) for i in (1, 2))
-    return values[:, :, :1] if equal else values
+    return values.shape[2] == 3 and all(np.array_equal(values[:, :, 0], values[:, :, i], equal_nan=nan) for i in (1, 2))
 
 
-def _assemble(raw: list[_RawMap], where, nonfinite: str) -> Source:
+def _share_of_normals(values: np.ndarray) -> float:
+    """Return the share of texels that are unit normals, pointing away from a surface."""
+    if values.shape[2] != 3:
+        return 0.0
+    rows, columns = (slice(None, None, -(-n // 256)) for n in values.shape[:2])  # some texels suffice
+    normals = values[rows, columns].astype(np.float32)
+    if values.dtype.kind == "u":
+        normals /= np.iinfo(values.dtype).max
+    normals = normals if (normals < 0).any() else 2 * normals - 1  # signed, or stored as (n + 1)/2
+    with np.errstate(over="ignore", invalid="ignore"):
+        unit = np.abs(np.linalg.norm(normals, axis=2) - 1) < _LENGTH
+    return float((unit & (normals[..., 2] > 0)).mean())
+
+
+def _inverted(values: np.ndarray) -> np.ndarray:
+    """Return normals with their second component inverted, in integers or floats, signed or stored as (n + 1)/2."""
+    values = values.copy()
+    one = np.iinfo(values.dtype).max if values.dtype.kind == "u" else 0 if (values < 0).any() else 1
+    values[..., 1] = one - values[..., 1]
+    return values
+
+
+def _assemble(raw: list[_RawMap], where, nonfinite: str, notes: list[str] = ()) -> Source:
     """Return the source of some maps. Raises :class:`SourceError` if they do not go together."""
     if not raw:
         raise SourceError(f"{where}: has no maps")
@@ -421,32 +463,53 @@ def _assemble(raw: list[_RawMap], where, nonfinite: str) -> Source:
     if channels > MAX_CHANNELS:
         raise SourceError(f"{where}: has {channels} channels in all, at most {MAX_CHANNELS} are supported")
 
-    maps, cleaned = [], 0
+    maps, notes, cleaned = [], list(notes), 0
     digest = hashlib.sha256()
     for m in raw:
-        if m.role == "normal" and m.values.shape[2] == 1:
+        role = m.content.role
+        if role == "normal" and m.values.shape[2] == 1:
             raise SourceError(
                 f'{m.file or where}: the normal map "{m.name}" has 1 channel, 3 are needed (x, y, z), or x and y alone'
             )
         number_type = m.values.dtype.name
         color_space = m.color_space
         if color_space is None:
-            srgb = m.role == "albedo" and number_type in _ENCODED and m.values.shape[2] in (1, 3)
+            srgb = m.content.colours and number_type in _ENCODED and m.values.shape[2] in (1, 3)
             color_space = "srgb" if srgb else "linear"
+        notes += _notes_on(m)
+        values = _inverted(m.values) if m.content.y_down and m.name != "image" else m.values
         with np.errstate(over="ignore"):  # float64 beyond float32 becomes infinite and is reported below
-            values = m.values.astype("<f4", order="C")
+            values = values.astype("<f4", order="C")
         if number_type in _ENCODED:
             values /= np.iinfo(m.values.dtype).max
         else:
             cleaned += _check_finite(values, f'{m.file or where}: map "{m.name}"', nonfinite)
         values.flags.writeable = False
         depth = _DEPTHS[number_type]
-        maps.append(Map(m.name, values, color_space, m.role, depth, m.file))
-        layout = [m.name, color_space, m.role, depth, *values.shape]
+        maps.append(Map(m.name, values, color_space, role, depth, m.file))
+        layout = [m.name, color_space, role, depth, *values.shape]
         digest.update(json.dumps(layout).encode() + b"\n")
         digest.update(values)
     height, width = first.values.shape[:2]
-    return Source(tuple(maps), height, width, digest.hexdigest(), cleaned)
+    return Source(tuple(maps), height, width, digest.hexdigest(), cleaned, tuple(notes))
+
+
+def _notes_on(m: _RawMap) -> list[str]:
+    """Return what has to be said about a map of a manifest or of a dictionary."""
+    if m.name == "image":
+        return []
+    if m.content.y_down:
+        return [f'map "{m.name}": normals of DirectX, y is inverted to that of OpenGL, which Mitsuba expects']
+    if m.content.packed and m.values.shape[2] > 1:
+        return [f'map "{m.name}": holds several maps, which are kept as one: "channels" gives each a map of its own']
+    if m.content.role == "other" and not m.content.colours and _share_of_normals(m.values) > _LOOKS:
+        return [f'map "{m.name}": looks like a normal map, but is taken for other data: call it "normal"']
+    if m.content is not _UNKNOWN:
+        return [] if content_of(m.name) else [f'map "{m.name}": has the role {m.content.role} by the name of its file']
+    colours = m.color_space is None and m.values.dtype.name in _ENCODED and m.values.shape[2] == 3
+    if not colours or _equal(m.values):
+        return []
+    return [f'map "{m.name}": an unknown name, taken for data, linear: give it "color_space": "srgb" if it is a colour']
 
 
 def _check_finite(values: np.ndarray, where: str, nonfinite: str) -> int:

@@ -308,5 +308,7 @@ def status_lines(session: Session, message: str = "") -> list[str]:
     else:
         name = session.against if session.against != "exact" else "exact plugins"
         lines.append(f"**error** {f['psnr_db']:.1f} dB against {name}, noise included")
+    if f["nonfinite_pixels"]:
+        lines.append(f"**not finite** {f['nonfinite_pixels']:,} pixels")
     lines.append(f"**bytes** {f['table_bytes']:,} in tables")
     return [*lines, *([f"**refused** {message}"] if message else [])]

@@ -12,7 +12,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from .. import compat, metrics, plugins, scenes, srgb
+from .. import compat, metrics, plugins, scene_checks, scenes, srgb
 from ..errors import DiffindError, UsageError
 from ..orbit import middle
 from ..runtime import use_variant
@@ -110,6 +110,7 @@ class Session:
         self.spp = spp or sensor.sampler().sample_count()
         if not isinstance(self.spp, int) or not 1 <= self.spp <= 2**16:
             raise UsageError(f"spp: found {self.spp}, allowed are whole numbers from 1 to {2**16}")
+        scene_checks.check_size(self.learned.scene, self.spp, self.full)
         self.start = Pose.of(written)
         self._pose, self._residue = self.start, np.linalg.inv(self.start.matrix) @ written
         self.view = VIEWS[0] if self.exact else VIEWS[1]
@@ -128,8 +129,6 @@ class Session:
 
         with no_collection():
             learned = self._parsed.load(change=change)
-        if not learned.sensors():
-            raise scenes.SceneError(f"{self._parsed.path}: has no sensor")
         names = tuple(dict.fromkeys((self.against, "exact")))
         replaced = self._parsed.learned_plugins(names)
         if not replaced:
@@ -386,11 +385,12 @@ class Session:
         """Figures of the picture.
 
         ``seconds`` of the last pass of each visible side, ``psnr_db`` between the sides as they are now, noise
-        included (``None`` unless both are rendered as a whole), ``table_bytes`` of the learned plugins, ``samples``,
-        ``spp``, ``width`` and ``height``.
+        included (``None`` unless both are rendered as a whole, and finite), ``nonfinite_pixels`` of the visible sides,
+        ``table_bytes`` of the learned plugins, ``samples``, ``spp``, ``width`` and ``height``.
         """
         sides, names = self._visible(), {id(self.learned): "learned", id(self.exact): "exact"}
-        both = len(sides) == 2 and self.passes and not (self.moving and self.view == VIEWS[0])
+        bad = sum(metrics.nonfinite_pixels(side.image) for side in sides) if self.passes else 0
+        both = not bad and len(sides) == 2 and self.passes and not (self.moving and self.view == VIEWS[0])
         return {
             "scene": self.name,
             "variant": mi.variant(),
@@ -403,6 +403,7 @@ class Session:
             "pictures": self.pictures,
             "seconds": {names[id(side)]: side.seconds for side in sides if side.seconds > 0},
             "psnr_db": metrics.psnr(self.exact.image, self.learned.image) if both else None,
+            "nonfinite_pixels": bad,
             "table_bytes": self.table_bytes,
             "choices": self.chosen,
             "values": {k: list(v) if isinstance(v, tuple) else v for k, v in self._values.items()},

@@ -156,7 +156,10 @@ def open_uncompressed(props: mi.Properties, wrap_mode: str) -> tuple[SharedMaps,
         return shared(("pyramid", id(pyramid)), lambda: SharedMaps(pyramid, {})), ""
 
     def load() -> SharedMaps:
-        source = load_source(path, nonfinite="clean") if path else _source_of(props["bitmap"])
+        # A single image without "raw" is colours, whatever its name, as for Mitsuba's "bitmap"
+        source = load_source(path, nonfinite="clean", named=raw) if path else _source_of(props["bitmap"])
+        for note in source.notes if path.lower().endswith(".json") else ():
+            warn(note)
         if raw:
             maps = tuple(dataclasses.replace(m, color_space="linear") for m in source.maps)
             source = dataclasses.replace(source, maps=maps)
@@ -222,6 +225,12 @@ def to_bitmap(task: Task, props: mi.Properties) -> None:
 def to_mipmap(task: Task, props: mi.Properties) -> None:
     """Add the properties that a ``mipmap`` needs to show the original of the map."""
     original, layout = original_of(task, props)
+    if original.suffix.lower() != ".json" and layout.role == "other":  # linear by the name of its file
+        to_bitmap(task, props)
+        for name in ("filename", "channels"):
+            if name in props:
+                del props[name]
+        return
     props["filename"] = str(original)
     if original.suffix.lower() == ".json":
         props["channels"] = layout.name

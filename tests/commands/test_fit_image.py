@@ -184,6 +184,24 @@ def test_manifests(folder, capsys):
 # -- sizes ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("task", ["image", "texture"])
+def test_names_of_images_are_said(folder, capsys, task):
+    """An image with the name of a normal map, and maps whose names had to be guessed; ``inspect`` shows the roles."""
+    y, x = np.mgrid[-0.5:0.5:8j, -0.5:0.5:8j]
+    normals = np.rint(127.5 * (np.stack([x, y, np.sqrt(1 - x * x - y * y)], axis=-1) + 1)).astype(np.uint8)
+    write("x_normal.png", normals)
+    short = SHORT if task == "image" else SHORT[:-2]
+    assert main(["fit", task, "x_normal.png", "-o", "a.npz", *short]) == 0
+    assert "x_normal.png: taken for a normal map by its name, linear" in capsys.readouterr().out
+    assert main(["inspect", "a.npz"]) == 0
+    assert re.search(r"image +normal, 3 channel\(s\), linear", capsys.readouterr().out)
+    write("c.png", noise(8, 8, 3))
+    (folder / "m.json").write_text('{"maps": {"paint": "c.png"}, "licence": "CC0"}')
+    assert main(["fit", task, "m.json", "-o", "b.npz", *short]) == 0
+    out = capsys.readouterr().out
+    assert 'map "paint": an unknown name' in out and "m.json: keys that are not used: licence" in out
+
+
 def test_a_size_in_each_unit(folder):
     """Bits of a texel are those of all its channels together; without a word it is 12x."""
     write("a.png", noise(32, 32, 3) // 2 + waves(32, 32) // 4)

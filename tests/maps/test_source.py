@@ -10,7 +10,8 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from mi_diffind.maps.source import SourceError, from_arrays, load_source, role_of
+from mi_diffind.maps.names import content_of
+from mi_diffind.maps.source import SourceError, from_arrays, load_source
 
 
 def pattern(height, width, channels, dtype=np.uint8, seed=0):
@@ -171,10 +172,128 @@ def test_roles_of_images_and_of_maps(tmp_path, name, expected):
     "name, role",
     [("albedo", "albedo"), ("baseColor", "albedo"), ("base_color_map", "albedo"), ("diffuse", "albedo"),
      ("Color", "albedo"), ("normalTexture", "normal"), ("occlusion", "ao"), ("AO", "ao"), ("metalness", "metallic"),
-     ("roughness", "roughness"), ("alpha", "other"), ("height", "other"), ("map", "other")],
+     ("roughness", "roughness"), ("alpha", "other"), ("height", "other"),
+     # Poly Haven
+     ("diff", "albedo"), ("nor_gl", "normal"), ("nor_dx", "normal"), ("rough", "roughness"), ("arm", "other"),
+     ("metal", "metallic"), ("ao", "ao"), ("disp", "other"), ("spec", "other"), ("rough_wood_diff_1k", "albedo"),
+     # ambientCG
+     ("NormalGL", "normal"), ("NormalDX", "normal"), ("AmbientOcclusion", "ao"), ("Displacement", "other"),
+     ("Wood051_1K-JPG_Color", "albedo"), ("Wood051_1K-JPG_NormalGL", "normal"),
+     ("Metal003_2K-PNG_Metalness", "metallic"),
+     # Quixel, Substance, Unity, Poliigon
+     ("vhlmdg_4K_Albedo", "albedo"), ("vhlmdg_4K_Normal_LOD0", "normal"), ("Wall_Base_Color.1001", "albedo"),
+     ("Wall_Normal_OpenGL", "normal"), ("Wall_Mixed_AO", "ao"), ("Wall_BaseMap", "albedo"), ("Wall_MaskMap", "other"),
+     ("MainTex", "albedo"), ("MetallicSmoothness", "other"), ("Wall_NormalMap_GL", "normal"),
+     ("Planks_COL_VAR1_3K", "albedo"),
+     ("Planks_NRM_3K", "normal"),
+     # Further lobes of glTF, MaterialX and OpenPBR
+     ("clearcoat_normal", "other"), ("coat_roughness", "other"), ("specular_roughness", "roughness"),
+     ("sheenColorTexture", "other")],
 )  # fmt: skip
 def test_roles(name, role):
-    assert role_of(name) == role
+    assert content_of(name).role == role
+
+
+@pytest.mark.parametrize("name", ["map", "rough_wood", "photo", "normal_day", "x1", "_", "2k"])
+def test_names_without_a_role(name):
+    assert content_of(name) is None
+
+
+@pytest.mark.parametrize(
+    "name, colours, packed, y_down",
+    [("Wood_Color", True, False, False), ("emissive", True, False, False), ("sheen_color", True, False, False),
+     ("spec", False, False, False), ("arm", False, True, False), ("metallicRoughnessTexture", False, True, False),
+     ("nor_gl", False, False, False), ("brick_nor_dx_2k", False, False, True),
+     ("Wall_Normal_DirectX", False, False, True)],
+)  # fmt: skip
+def test_contents(name, colours, packed, y_down):
+    content = content_of(name)
+    assert (content.colours, content.packed, content.y_down) == (colours, packed, y_down)
+
+
+def normal_map(height=8, width=8, seed=0):
+    """Return an 8-bit map of unit normals, y up."""
+    rng = np.random.default_rng(seed)
+    n = np.concatenate([rng.uniform(-0.5, 0.5, (height, width, 2)), np.ones((height, width, 1))], axis=2)
+    n /= np.linalg.norm(n, axis=2, keepdims=True)
+    return np.rint(127.5 * (n + 1)).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    "stem, kind, expected, said",
+    [("photo", "colours", ("albedo", "srgb", 3), ""),
+     ("x_normal", "normals", ("normal", "linear", 3), "taken for a normal map by its name"),
+     ("Wood051_1K-JPG_NormalDX", "normals", ("normal", "linear", 3), "y points down"),
+     ("x_normal", "colours", ("albedo", "srgb", 3), "but the values of colours"),
+     ("bumps", "normals", ("albedo", "srgb", 3), "looks like a normal map"),
+     ("Wood_Roughness", "grey", ("roughness", "linear", 1), "taken for a roughness map"),
+     ("metal", "colours", ("albedo", "srgb", 3), "but the values of colours"),
+     ("Wood_Displacement", "grey", ("other", "linear", 3), "taken for data"),
+     ("wood_arm_2k", "colours", ("other", "linear", 3), "taken for data"),
+     ("photo", "grey", ("albedo", "srgb", 3), "")],
+)  # fmt: skip
+def test_names_of_single_images(tmp_path, stem, kind, expected, said):
+    arrays = {"colours": pattern(8, 8, 3), "normals": normal_map(), "grey": np.repeat(pattern(8, 8, 1), 3, 2)}
+    source = load_source(write(tmp_path / f"{stem}.png", arrays[kind]))
+    (m,) = source.maps
+    assert (m.role, m.color_space, m.channels) == expected and m.name == "image"
+    assert (len(source.notes) == 1 and said in source.notes[0]) if said else source.notes == ()
+    assert np.array_equal(np.rint(m.values * 255), arrays[kind][..., : m.channels])  # no note changes values
+    assert load_source(tmp_path / f"{stem}.png", named=False).maps[0].color_space == "srgb"
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32, "signed"])
+def test_normals_of_directx(tmp_path, dtype):
+    array = normal_map()
+    array = array * np.uint16(257) if dtype == np.uint16 else array
+    if dtype in (np.float32, "signed"):
+        array = array.astype(np.float32) / 255
+        array = 2 * array - 1 if dtype == "signed" else array
+    name = "n.png" if np.dtype(array.dtype).kind == "u" else "n.exr"
+    write(tmp_path / name, array)
+    source = load_source(manifest(tmp_path, {"nor_gl": name, "nor_dx": name}))
+    up, down = (m.values if dtype == "signed" else 2 * m.values - 1 for m in source.maps)
+    np.testing.assert_allclose(down, up * [1, -1, 1], atol=1e-6)
+    assert [m.role for m in source.maps] == ["normal"] * 2
+    assert len(source.notes) == 1 and 'map "nor_dx": normals of DirectX' in source.notes[0]
+
+
+@pytest.mark.parametrize(
+    "maps, said",
+    [({"albedo": "c.png", "normal": "n.png", "height": "c.png", "Wood_Color": "c.png"}, []),
+     ({"paint": "c.png"}, ['map "paint": an unknown name, taken for data, linear']),
+     ({"paint": {"file": "c.png", "color_space": "linear"}}, []),
+     ({"paint": "grey.png"}, []),
+     ({"paint": "n.png"}, ['map "paint": looks like a normal map']),
+     ({"BumpMap": "n.png"}, ['map "BumpMap": looks like a normal map']),
+     ({"paint": "Wood_Color.png"}, ['map "paint": has the role albedo by the name of its file']),
+     ({"paint": {"file": "Wood_Color.png", "channels": "r"}}, []),
+     ({"arm": "c.png"}, ['map "arm": holds several maps']),
+     ({"maps": {"albedo": "c.png"}, "licence": "CC0", "more": {"a": 1}}, ["keys that are not used: licence, more"])],
+)  # fmt: skip
+def test_notes_of_manifests(tmp_path, maps, said):
+    images = {"c": pattern(8, 8, 3), "Wood_Color": pattern(8, 8, 3), "n": normal_map()}
+    for name, array in {**images, "grey": np.repeat(pattern(8, 8, 1), 3, 2)}.items():
+        write(tmp_path / f"{name}.png", array)
+    notes = load_source(manifest(tmp_path, maps)).notes
+    assert len(notes) == len(said) and all(part in note for part, note in zip(said, notes, strict=True)), notes
+
+
+@pytest.mark.parametrize(
+    "name", ["maps/A.JPG", "./maps/A.JPG", r"maps\A.JPG", r".\maps\A.JPG", "maps/a.jpg", r"Maps\a.JPG"]
+)
+def test_names_of_files_as_other_systems_write_them(tmp_path, name):
+    (tmp_path / "maps").mkdir()
+    write(tmp_path / "a.jpg", np.full((4, 4, 3), 99, np.uint8)).rename(tmp_path / "maps" / "A.JPG")
+    assert load_source(manifest(tmp_path, {"albedo": name})).maps[0].values.shape == (4, 4, 3)
+
+
+@pytest.mark.parametrize("name", [r"..\secret.png", "../secret.png"])
+def test_names_of_files_outside(tmp_path, name):
+    (tmp_path / "inside").mkdir()
+    write(tmp_path / "secret.png", pattern(4, 4, 3))
+    with pytest.raises(SourceError, match="lies outside of its folder"):
+        load_source(manifest(tmp_path / "inside", {"albedo": name}))
 
 
 def test_no_variant_is_set_or_changed(tmp_path, mi_rgb):
@@ -434,7 +553,6 @@ def test_sizes_have_to_agree(tmp_path):
         ({}, "has no maps"),
         ({"maps": {}}, "has no maps"),
         ({"maps": "a.png"}, "has no maps"),
-        ({"maps": {"a": "a.png"}, "size": 3}, 'has the key "size" beside "maps"'),
         ({"a": 3}, 'map "a" is 3, expected'),
         ({"a": {"path": "a.png"}}, 'map "a" has the key "path", allowed are'),
         ({"a": {"channels": "r"}}, 'map "a" has the file None'),

@@ -415,6 +415,29 @@ def test_slope_of_a_filtered_texture(mi_rgb, rng):
     np.testing.assert_allclose(found.ravel(), [2 * 0.5, -0.3], atol=1e-3)
 
 
+def test_notes_on_a_manifest_are_warnings(mi_rgb, tmp_path, rng, capfd):
+    """Those of a fit, which its counterpart would repeat in silence."""
+    mi_rgb.Bitmap(rng.integers(0, 255, (8, 8, 3), np.uint8)).write(str(tmp_path / "c.png"))
+    (tmp_path / "m.json").write_text('{"paint": "c.png"}')
+    mi_rgb.load_dict({"type": "mipmap", "filename": str(tmp_path / "m.json"), "channels": "paint"})
+    printed = capfd.readouterr()
+    assert 'map "paint": an unknown name, taken for data' in printed.out + printed.err
+
+
+@pytest.mark.parametrize("raw", [False, True])
+@pytest.mark.parametrize("name", ["x_normal", "x_nor_dx", "x_Roughness", "x_arm"])
+def test_names_of_images_change_no_values(mi_rgb, tmp_path, rng, name, raw):
+    """A single image is what ``bitmap`` shows, whatever its name; a manifest is read by names."""
+    path = str(tmp_path / f"{name}.png")
+    image = rng.integers(0, 255, (8, 8, 1 if name == "x_Roughness" else 3), np.uint8)
+    mi_rgb.Bitmap(image.repeat(3, 2) if image.shape[2] == 1 else image).write(path)
+    given = {"filename": path, "raw": raw}
+    si = texture_scenes.hits(mi_rgb, rng.random((2, 200)))
+    ours = mi_rgb.load_dict({"type": "mipmap", "filter": "off", **given}).eval(si).numpy()
+    theirs = mi_rgb.load_dict({"type": "bitmap", **given}).eval(si).numpy()
+    np.testing.assert_allclose(np.broadcast_to(ours, theirs.shape), theirs, atol=1e-3)
+
+
 # -- sensors -----------------------------------------------------------------------------------------------------------
 
 

@@ -20,7 +20,7 @@ from mi_diffind import scenes
 from mi_diffind.compat import module_of
 from mi_diffind.maps.layout import Layout
 from mi_diffind.maps.pyramid import Pyramid
-from mi_diffind.maps.source import from_arrays
+from mi_diffind.maps.source import from_arrays, load_source
 from mi_diffind.measure.operations import bsdf_operations, count
 from mi_diffind.tables import load_table, save_table
 from mi_diffind.tasks.texture import TASK
@@ -73,6 +73,39 @@ def expected(mi, image, name, uv, level):
 
 
 # -- what is read ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["x_diff", "x_normal", "x_disp", "x_arm"])
+def test_counterparts_of_images_with_names(mi_rgb, tmp_path, rng, name):
+    """Both counterparts show a single image as its file is read: linear if its name is that of data."""
+    mi, path = mi_rgb, tmp_path / f"{name}.png"
+    image = material()["normal" if name == "x_normal" else "albedo"][..., : 1 if name == "x_disp" else 3]
+    mi.Bitmap(np.ascontiguousarray(image)).write(str(path))
+    texture = plugin(make(tmp_path / "a.npz", load_source(path)), "off", "image", source=str(path))
+    bsdf = {"type": "diffuse", "reflectance": texture}
+    parsed, uv = (
+        scenes.ParsedScene({"type": "scene", "shape": {"type": "rectangle", "bsdf": bsdf}}),
+        rng.random((2, 500)),
+    )
+    values = []
+    for against in ("exact", "mipmap"):
+        (shape,) = parsed.load(exact=True, against=against, needs=()).shapes()
+        values.append(shape.bsdf().eval_diffuse_reflectance(texture_scenes.hits(mi, uv)).numpy())
+    np.testing.assert_allclose(*values, atol=5e-3)  # "mipmap" derives z of a normal from x and y
+    expected = linear(image / 255) if name == "x_diff" else image / 255
+    assert values[0].mean() == pytest.approx(expected.mean(), abs=0.02)
+
+
+@pytest.mark.parametrize("channels", ["albedo", "normal", "roughness"])
+@pytest.mark.parametrize("preset", ["ours", "paper"])
+def test_the_maximum_is_an_upper_bound(mi_rgb, files, rng, preset, channels):
+    """At any place, between texels, too, and at any level of detail; of 1 at most."""
+    mi = mi_rgb
+    uv, (ddx, ddy) = rng.random((2, 200_000)), texture_scenes.footprints(rng, 200_000, SIZE)
+    for name in ("off", "trilinear"):
+        texture = mi.load_dict(plugin(files[preset], name, channels))
+        values = texture.eval(texture_scenes.hits(mi, uv, ddx, ddy)).numpy()
+        assert values.max() <= texture.max() + 1e-6 and texture.max() <= 1
 
 
 @pytest.mark.parametrize("preset", ["ours", "paper"])

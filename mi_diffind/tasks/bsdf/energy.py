@@ -10,6 +10,9 @@ from .pool import outgoing
 #: Albedo that a learned BSDF may have, relative to the source's; less than 1.001 at the nodes and between them.
 ALLOWED = 1.0005
 
+#: Albedo of a channel, relative to that of the brightest one, which is allowed in any case.
+DARK = 1e-3
+
 #: Entries of the scale, angles at which albedos are computed for each, and samples of an angle.
 NODES, ANGLES, SAMPLES = 32, 4, 8192
 
@@ -56,14 +59,17 @@ def fitted_scale(value, truth, types, azimuths: tuple[float, ...] = (0.0,)) -> n
     """Return s(θ) ≤ 1 at :data:`NODES` cosines, so that s(θ_i) s(θ_o) f has at most the source's albedo + 0.1%.
 
     ``value`` is f cos θ_o of the learned BSDF. s starts at 1; where the albedo is too high in a channel, the nodes next
-    to the angle are lowered, until no angle is left.
+    to the angle are lowered, until no angle is left. A black channel may reach :data:`DARK` of the brightest one: no
+    factor lowers it without the others.
     """
     fine = np.maximum(np.linspace(0, 1, (NODES - 1) * ANGLES + 1) ** 2, 2e-3)
     position, nodes = np.sqrt(fine), np.linspace(0, 1, NODES)
     parts = []
     for azimuth in azimuths:
         cos, (source, learned) = contributions([truth.value, value], truth, types, fine, azimuth)
-        parts.append((np.sqrt(np.clip(cos, 0, 1)), ALLOWED * source.mean(axis=1, dtype=np.float64), learned))
+        albedo = source.mean(axis=1, dtype=np.float64)
+        allowed = np.maximum(ALLOWED * albedo, DARK * albedo.max(axis=1, keepdims=True))
+        parts.append((np.sqrt(np.clip(cos, 0, 1)), allowed, learned))
     scale = np.ones(NODES)
     for k in range(CORRECTIONS):
         ratio = np.ones(len(fine))

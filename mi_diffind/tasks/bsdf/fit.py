@@ -90,10 +90,13 @@ def _fitted(truth: Truth, request: FitRequest, stop: Event) -> FittedBSDF:
     if truth.function:
         samples = training.draw(truth, types, training.SAMPLES, settings.seed + 1, isotropic)
         validation = training.draw(truth, types, training.VALIDATION, settings.seed + 2, isotropic)
+        lines += (remarks := truth.remarks(validation))
         view, smooth = SphereView(truth, types), validation
     else:
         samples, validation, smooth = scattered.split(truth, types, isotropic, training.LIMIT, settings.seed)
-        view = None
+        view, remarks = None, []
+        if not any(dr.any(v > 0) for v in samples.value):
+            raise UsageError(f"{truth.name}: all of its values are 0, which measures no material")
     angle = 0.0 if isotropic else symmetry.axes_angle(samples, truth)
     if angle:
         lines.append(f"axes at {math.degrees(angle):.1f} degrees")
@@ -130,6 +133,7 @@ def _fitted(truth: Truth, request: FitRequest, stop: Event) -> FittedBSDF:
         model = BSDFModel(table, allocate(table, types.TensorXf), types.TensorXf)
         figures = measure_samples(model, validation) if view is None else measure(model, truth, view)
         table.measured = {k: float(f"{v:.5g}") for k, v in figures.items()}
+        table.settings |= {"remarks": remarks} if remarks else {}
         return table, scale, raw
 
     result = training.train_last(problem, request, stored, stop)

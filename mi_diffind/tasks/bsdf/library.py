@@ -104,6 +104,7 @@ class FittedLibrary(Fitted):
         lines = [f"{path}: {len(self.materials)} materials: {', '.join(counts)}; {self.seconds:.0f} s"]
         lines += [f"  {line}" for line in table_lines(self.materials)]
         lines += [f"  {name}: {m['failure']}" for name, m in self.materials.items() if m["failure"]]
+        lines += [f"  {name}: {remark}" for name, m in self.materials.items() for remark in m.get("remarks", ())]
         return lines
 
 
@@ -270,6 +271,7 @@ def _record(material: LibraryMaterial | None, folder: Path, status: str, failure
         if status in ("fitted", "kept"):
             table = load_table(material.path)
             record |= {"file": Path(material.path).name, "bytes": table.nbytes, **table.measured, "seconds": seconds}
+            record["remarks"] = table.settings.get("remarks", [])
     return record
 
 

@@ -16,16 +16,13 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 
+from ... import tensor_files
 from ...errors import UsageError
 from ...lookup import clamp
-from . import tensor_file
 from .source import Truth
 
 #: Illuminants, the first is the default.
 ILLUMINANTS = ("D65", "E")
-
-#: Shapes of the fields of a polarised file: number of dimensions.
-POLARISED = {"theta_h": 2, "theta_d": 2, "phi_d": 2, "wvls": 1, "M": 6}
 
 
 def colour_weights(wavelengths: np.ndarray, illuminant: str) -> np.ndarray:
@@ -50,8 +47,6 @@ def in_colours(fields: dict, illuminant: str) -> dict:
     """Return the fields of a spectral file of ``measured`` as those of an RGB one."""
     weights = colour_weights(np.asarray(fields["wavelengths"], np.float64), illuminant)
     spectra = np.asarray(fields["spectra"])
-    if spectra.ndim != 5 or spectra.shape[2] != len(weights):
-        raise ValueError(f"spectra of the shape {spectra.shape} and {len(weights)} wavelengths")
     rgb = np.einsum("ptwyx,wc->ptcyx", spectra, weights.astype(np.float32))
     kept = {name: np.asarray(value) for name, value in fields.items() if name not in ("spectra", "wavelengths")}
     return {**kept, "rgb": np.ascontiguousarray(rgb, np.float32)}
@@ -64,16 +59,14 @@ def measured_bsdf(path: Path, illuminant: str):
     """
     import mitsuba as mi
 
-    fields = tensor_file.read(path)
+    fields = tensor_files.read(path)
+    tensor_files.check(path, fields)
     if "wavelengths" not in fields or mi.is_spectral:
         return mi.load_dict({"type": "measured", "filename": str(path)}), ""
-    try:
-        fields = in_colours(fields, illuminant)
-    except (KeyError, ValueError) as e:
-        raise UsageError(f"{path}: is no file of measured spectra ({e})") from None
+    fields = in_colours(fields, illuminant)
     with tempfile.TemporaryDirectory() as folder:
         converted = os.path.join(folder, path.name)
-        tensor_file.write(converted, fields)
+        tensor_files.write(converted, fields)
         return mi.load_dict({"type": "measured", "filename": converted}), _remark(illuminant)
 
 
@@ -93,11 +86,11 @@ class PolarisedTruth(Truth):
     def __init__(self, path: Path, illuminant: str):
         import mitsuba as mi
 
-        fields = tensor_file.read(path)
-        shapes = {name: np.shape(fields.get(name)) for name in POLARISED}
-        nodes = tuple(shapes[name][-1] if shapes[name] else 0 for name in ("phi_d", "theta_d", "theta_h", "wvls"))
-        if any(len(shapes[name]) != n for name, n in POLARISED.items()) or shapes["M"] != (*nodes, 4, 4):
-            raise UsageError(f"{path}: is no file of measured Mueller matrices, its arrays are {shapes}")
+        fields = tensor_files.read(path)
+        if "M" not in fields:
+            raise UsageError(f'{path}: is no file of measured Mueller matrices: has no field "M"')
+        tensor_files.check(path, fields)
+        nodes = fields["M"].shape
         weights = colour_weights(np.asarray(fields["wvls"], np.float64), illuminant)
         colours = np.asarray(fields["M"][..., 0, 0], np.float32) @ weights.astype(np.float32)
         grid = np.zeros((*nodes[:3], 2, 2), np.float32)  # Mitsuba interpolates pictures, here of 2 x 2 numbers

@@ -107,8 +107,8 @@ def candidate_densities(truth, types, isotropic: bool, lobes: list, size: int, s
         dr.eval(columns)
     weight, mean, *densities = (c.numpy().reshape(NODES, size) for c in columns)
     square = weight * mean**2
-    square /= np.maximum(square.mean(axis=1, keepdims=True), 1e-30)
-    return np.stack(densities), square
+    means = square.mean(axis=1, keepdims=True)
+    return np.stack(densities), np.where(means > 0, square / np.where(means > 0, means, 1), 1)  # 1 if black
 
 
 def optimal_weights(densities: np.ndarray, square: np.ndarray, iterations: int = ITERATIONS) -> tuple:
@@ -177,7 +177,10 @@ class TurnedMixture:
 
 
 def second_moment(truth_value, mixture: Mixture, truth, types, cos: float, size: int = 2**16, seed: int = 11) -> float:
-    """Return E[w²] / E[w]² of the weights w = f cos θ_o / p of samples at a cosine of ``wi``; f: the mean channel."""
+    """Return E[w²] / E[w]² of the weights w = f cos θ_o / p of samples at a cosine of ``wi``; f: the mean channel.
+
+    It is 1 where f is black.
+    """
     rng = dr.rng(seed=dr.opaque(types.UInt64, seed))
     wi = types.Array3f(dr.full(types.Float, (1 - cos**2) ** 0.5, size), 0, cos)
     s = outgoing(rng, types, wi, truth)
@@ -186,4 +189,4 @@ def second_moment(truth_value, mixture: Mixture, truth, types, cos: float, size:
         density = mixture.density(s.wi, s.wo)
         square = dr.select(density > 0, s.weight * dr.square(mean) * dr.rcp(density), 0)
         first, second = dr.mean(s.weight * mean), dr.mean(square)
-    return float((second / dr.square(first))[0])
+    return float((second / dr.square(first))[0]) if first[0] > 0 else 1.0

@@ -8,6 +8,7 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 
+from ... import tensor_files
 from ...errors import UsageError
 from ...files import replacing
 from . import tensor_file
@@ -57,7 +58,7 @@ def write(model, output: Path, source, rows: int | None = None, seed: int | None
     if suffix == ".bsdf":
         fields = tensor_file.fields(model.bsdf, model.types, f"{model.table.settings.get('name', '')} (learned)")
         with replacing(output) as temporary:
-            tensor_file.write(temporary, fields)
+            tensor_files.write(temporary, fields)
         shape = fields["rgb"].shape
         return [(output, f"{output.stat().st_size:,} bytes, {shape[1]} x {shape[0]} directions, for measured in RGB")]
     image, line = picture(model, source)

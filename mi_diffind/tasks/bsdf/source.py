@@ -26,6 +26,10 @@ class Truth:
         """Return f cos θ_o in linear sRGB, three arrays, for unit directions above the surface."""
         raise NotImplementedError
 
+    def remarks(self, samples) -> list[str]:
+        """Return sentences about what a fit to the values of ``samples`` leaves out. Raises ``UsageError``."""
+        return []
+
     def sample(self, wi, w, u, v):
         """Return directions ``wo`` from three uniform numbers each."""
         raise NotImplementedError

@@ -41,7 +41,7 @@ def starts(samples: Samples, types, count: int) -> list[np.ndarray]:
     basis = np.stack([c.numpy() for c in columns], axis=-1) * weight[:, None]
     target = np.stack([v.numpy() for v in s.value], axis=-1) * weight[:, None]
     # Squares of contributions count bright ones most: rows are scaled towards their roots
-    rows = 1 / np.sqrt(np.maximum(target.mean(axis=1, keepdims=True), 1e-2 * target.mean()))
+    rows = 1 / np.sqrt(np.maximum(target.mean(axis=1, keepdims=True), max(1e-2 * target.mean(), 1e-20)))
     gram, right = (rows * basis).T @ (rows * basis), (rows * basis).T @ (rows * target)
     ranked = []
     for i, j in itertools.combinations(range(len(shapes)), 2):

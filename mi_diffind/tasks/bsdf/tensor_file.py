@@ -8,15 +8,9 @@ f cos θ_o · 4σ/D on a grid of the square, and ``luminance`` draws samples.
 
 from __future__ import annotations
 
-import contextlib
-import io
-import struct
-from pathlib import Path
-
 import drjit as dr
 import numpy as np
 
-from ...errors import UsageError, reason
 from .model import LearnedBSDF
 
 #: Nodes of a file: angles θ_i; azimuths φ_i of a quarter turn, of anisotropic files; sides of the warped square and of
@@ -29,40 +23,8 @@ LEAST = 1e-3
 #: Smallest cosine of a normal at which the light that returns is read, and below which D falls with its square.
 HORIZON = 0.02, 0.05
 
-#: Types of numbers in a tensor file, by their code, and most fields of a file.
-TYPES, MOST = ("", "u1", "i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f2", "<f4", "<f8"), 256
-
 #: Weights of linear sRGB in the luminance.
 LUMINANCE = (0.212671, 0.715160, 0.072169)
-
-
-def read(path: Path) -> dict[str, np.ndarray]:
-    """Return the fields of a tensor file by name, arrays that are read when used. Raises :class:`UsageError`."""
-    fields = {}
-    try:
-        with open(path, "rb") as stream:
-
-            def unpack(form: str) -> tuple:
-                return struct.unpack("<" + form, stream.read(struct.calcsize("<" + form)))
-
-            magic, version, _, count = unpack("12sBBI")
-            if magic != b"tensor_file\0" or version != 1 or count > MOST:
-                raise ValueError("another format")
-            for _ in range(count):
-                name = stream.read(*unpack("H")).decode()
-                dims, dtype, offset = unpack("HBQ")
-                fields[name] = np.memmap(path, TYPES[dtype], "r", offset, unpack("Q" * dims))
-    except Exception as e:  # struct and NumPy have their own
-        raise UsageError(f"{path}: is no tensor file of a measured material ({reason(e)})") from None
-    return fields
-
-
-def write(path: Path, fields: dict) -> None:
-    """Write the fields of a tensor file."""
-    from mitsuba.python import tensor_io
-
-    with contextlib.redirect_stdout(io.StringIO()):
-        tensor_io.write(str(path), **fields)
 
 
 def fields(bsdf: LearnedBSDF, types, description: str) -> dict:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import os
 from collections.abc import Callable
@@ -16,7 +17,19 @@ from ...indirection import DifferentiableArray
 from ...interrupt import interruptible
 from ...settings import FitSettings
 from ...task import FitRequest
-from .model import BLACK, DIFFUSE, LOBE, PARAMETERS, TERMS, BSDFArrays, Form, LearnedBSDF, ResidualSizes, fourth_roots
+from .model import (
+    BLACK,
+    DIFFUSE,
+    LOBE,
+    LOGARITHMS,
+    PARAMETERS,
+    TERMS,
+    BSDFArrays,
+    Form,
+    LearnedBSDF,
+    ResidualSizes,
+    fourth_roots,
+)
 from .pool import Samples, incident, outgoing
 from .starts import starts
 from .view import SphereView
@@ -41,6 +54,9 @@ QUANTILE, MARGIN = 0.998, 0.25
 
 #: Least residual range, and the value relative to the mean below which a source counts as black.
 LEAST, DARK = 0.01, 1e-3
+
+#: Least value of f relative to the largest where there is no proxy and a channel is black.
+BLACK_CHANNEL = 1e-4
 
 #: Share of the training after which entries are rounded to bytes in each step.
 ROUNDED = 0.5
@@ -74,6 +90,13 @@ class BSDFProblem(Problem):
     def __init__(self, net: BSDFArrays, form: Form, samples: Samples, measure: Callable, identity: dict | None = None):
         self.net, self.form, self.samples, self._measure = net, form, samples, measure
         self.identity, self._share = identity or {}, 0.0
+
+    @functools.cached_property
+    def harmless(self) -> float:
+        """A tenth of the light of the samples: a loss that is no explosion."""
+        with dr.suspend_grad():
+            light = sum(dr.mean(self.samples.weight * v) for v in self.samples.value)
+        return 0.1 / 3 * float(light[0])
 
     def begin(self, step: int, share: float) -> str:
         self._share = share
@@ -114,7 +137,7 @@ def proxy_loss(samples: Samples) -> Callable:
         value = bsdf.value(samples.wi, samples.wo)
         pairs = zip(value, samples.value, strict=True)
         error = sum(dr.mean(samples.weight * dr.abs(v * samples.wo.z - t)) for v, t in pairs)
-        total = sum(dr.mean(samples.weight * t) for t in samples.value)
+        total = dr.maximum(sum(dr.mean(samples.weight * t) for t in samples.value), 1e-20)  # of a black source
         return {"error_db": -20 * math.log10(max(float((error / total)[0]), 1e-9))}
 
     return measure
@@ -182,18 +205,23 @@ def form_of(logarithms: np.ndarray, samples: Samples, isotropic: bool, azimuth: 
             terms.append(name)
             scales.append([float(np.clip(values[a + i], 1e-3, 1)) for i in (0, 0 if isotropic else 1)])
     scale = min(scales, key=min) if scales else [1.0, 1.0]
+    terms = terms or ["diffuse"]  # black, or nearly so
     form = Form(tuple(terms), isotropic, azimuth, tuple(scale), angle=angle)
     return dataclasses.replace(form, range=residual_range(form, logarithms, samples))
 
 
 def residual_range(form: Form, logarithms: np.ndarray, samples: Samples) -> tuple[float, float]:
-    """Return the range of log(f / proxy) over samples, from quantiles."""
+    """Return the range of log(f / proxy) over samples, from quantiles; without a proxy, black channels count, too."""
     types = module_types(samples)
-    value = [1.0, 1.0, 1.0]
     if form.terms:
         net = BSDFArrays(None, proxy_array(logarithms, 1.0)).alloc(types.TensorXf)
-        value = LearnedBSDF.of(form, net).value(samples.wi, samples.wo)
-    return range_above(value, samples)
+        return range_above(LearnedBSDF.of(form, net).value(samples.wi, samples.wo), samples)
+    low, high = range_above([1.0, 1.0, 1.0], samples)
+    with dr.suspend_grad():
+        light = [float(dr.mean(samples.weight * t)[0]) for t in samples.value]
+    if not any(light):
+        return LOGARITHMS[0] - LEAST, LOGARITHMS[0] + LEAST
+    return (min(low, high + math.log(BLACK_CHANNEL)) if min(light) < DARK * max(light) else low), high
 
 
 def range_above(value: list, samples: Samples) -> tuple[float, float]:

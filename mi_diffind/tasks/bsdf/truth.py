@@ -10,6 +10,7 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 
+from ...compat import one_sentence
 from ...errors import UsageError, reason
 from ...files import irregular, shown
 from ...lookup import clamp
@@ -21,6 +22,9 @@ from .source import Truth
 
 #: Extensions of files that are sources.
 SUFFIXES = (".xml", ".bsdf", ".pbsdf", ".binary", ".csv")
+
+#: Share of the values of a source that may be NaN or infinite: a few are at the horizon.
+MOST_NONFINITE = 0.01
 
 #: Largest value f cos θ that counts; a plugin may exceed it next to the horizon.
 LARGEST = 1e8
@@ -54,9 +58,33 @@ class MitsubaTruth(Truth):
         return si
 
     def value(self, wi, wo):
+        return [clamp(channel, 0, LARGEST) for channel in self._colour(wi, wo)]
+
+    def _colour(self, wi, wo):
+        """Return the BSDF's values as they are: also negative, infinite or NaN."""
         spectrum = self.bsdf.eval(self.context, self._interaction(wi), self.mi.Vector3f(wo))
-        colour = self.mi.unpolarized_spectrum(spectrum)
-        return [clamp(channel, 0, LARGEST) for channel in colour]
+        return self.mi.unpolarized_spectrum(spectrum)
+
+    def remarks(self, samples) -> list[str]:
+        wi, wo = samples.wi, samples.wo
+        with dr.suspend_grad():
+            below = [type(w)(w.x, w.y, -w.z) for w in (wi, wo)]
+            sides = [list(self._colour(*pair)) for pair in ((wi, wo), below)]
+            dr.eval(sides)
+        front, back = (np.stack([channel.numpy() for channel in side]) for side in sides)
+        bad, remarks = float((~np.isfinite(front)).any(axis=0).mean()), []
+        if bad > MOST_NONFINITE:
+            raise UsageError(f"{self.name}: {bad:.1%} of its values are not finite, nothing can be fitted to them")
+        if bad:
+            remarks.append(f"{bad:.2g} of its values are not finite and count as 0")
+        front, back = np.nan_to_num(front), np.nan_to_num(back)
+        if np.abs(back).max() > 0:
+            other = np.abs(back - front).mean() > 1e-3 * np.abs(front).mean()
+            remarks.append(
+                "its back is another material, which is left out: fit that one by itself" if other else
+                "it reflects on both sides: neural_bsdf does so with two_sided"
+            )  # fmt: skip
+        return remarks
 
     def sample(self, wi, w, u, v):
         bs, _ = self.bsdf.sample(self.context, self._interaction(wi), w, self.mi.Point2f(u, v))
@@ -210,7 +238,7 @@ def _built(name, load):
     except UsageError:
         raise
     except Exception as e:  # Mitsuba raises several types
-        raise UsageError(f"{name}: cannot be loaded ({reason(e)})") from None
+        raise UsageError(f"{name}: cannot be loaded ({reason(RuntimeError(one_sentence(e)))})") from None
 
 
 def _chosen(loaded, name, material: str):

@@ -70,7 +70,7 @@ def fit(request: FitRequest) -> Fitted:
     fitted.table.measured |= {name: float(f"{value:.5g}") for name, value in seen.items()}
     fitted.table.settings |= request.paths(source_path=options["source"])
     figures, line = size_figures(source, fitted.table, requested)
-    fitted.lines.append(line)
+    fitted.lines += [line, *source.notes]
     fitted.figures = {**figures, **fitted.figures}
     return fitted
 

@@ -91,6 +91,8 @@ class ImageProblem(Problem):
     stored channels, ``(height, width, stored)``; ``border`` is that of the image along v and u.
     """
 
+    harmless = 1e-2  # of values in [0, 1]
+
     def __init__(
         self, net, bits, layout: Layout, values: np.ndarray, border, recipe: ImageRecipe, types, digest: str = ""
     ):

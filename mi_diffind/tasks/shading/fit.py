@@ -105,7 +105,11 @@ def fit(request: FitRequest) -> Fitted:
         )
     if first is not None and first.unfinished and not first.interrupted:
         lines.append(f"the training as a texture: {first.outcome}")
-    lines += [f"{source.nbytes / table.nbytes:.2f}x", f"effects that are shaded: {', '.join(effects.names)}"]
+    lines += [
+        f"{source.nbytes / table.nbytes:.2f}x",
+        *source.notes,
+        f"effects that are shaded: {', '.join(effects.names)}",
+    ]
     if table.settings.get("level_bias"):
         lines.append(f"read {-table.settings['level_bias']:g} levels finer than the footprint")
     if table.settings.get("shading", {}).get("fixed") and not table.settings.get("kept_start"):

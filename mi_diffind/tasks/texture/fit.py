@@ -66,7 +66,7 @@ def fit(request: FitRequest) -> Fitted:
     table.measured |= {name: float(f"{value:.5g}") for name, value in seen.items()}
     table.settings |= request.paths(source_path=options["source"])
     figures, line = size_figures(source, table, requested)
-    lines = [line]
+    lines = [line, *source.notes]
     if size is not None and abs(size.nbytes / requested - 1) > memory_budget.TOLERANCE:
         lines.append(f"{requested:,} bytes were requested, but {size.nbytes:,} are the nearest that the arrays allow")
     return Fitted(table, result, lines, figures)

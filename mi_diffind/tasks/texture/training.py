@@ -47,6 +47,7 @@ class TextureProblem(Problem):
     """Training problem of a texture: ``net`` (:mod:`.nets`) against the reference ``pyramid``."""
 
     tolerance = 0.02
+    harmless = 1e-2  # of values in [0, 1]
 
     def __init__(self, net, pyramid: Pyramid, recipe: TextureRecipe, digest: str = ""):
         self.net, self.pyramid, self.recipe, self.types = net, pyramid, recipe, pyramid.types

@@ -7,6 +7,7 @@ from learned_bsdfs import handmade
 from variants import set_variant
 
 import mi_diffind
+from mi_diffind import tensor_files
 from mi_diffind.errors import UsageError
 from mi_diffind.runtime import array_module
 from mi_diffind.tables import save_table
@@ -32,7 +33,7 @@ def spectral_file(mi, path, folder, monkeypatch):
     rgb = fields.pop("rgb")
     shares = np.random.default_rng(2).random((3, len(WAVELENGTHS))).astype(np.float32)
     spectra = np.einsum("ptcyx,cw->ptwyx", rgb, shares)
-    tensor_file.write(path, {**fields, "spectra": spectra, "wavelengths": WAVELENGTHS.astype(np.float32)})
+    tensor_files.write(path, {**fields, "spectra": spectra, "wavelengths": WAVELENGTHS.astype(np.float32)})
 
 
 def polarised_file(path):
@@ -43,7 +44,7 @@ def polarised_file(path):
     m[4, 2, 3] = np.nan
     angles = {"phi_d": phi_d, "theta_d": theta_d, "theta_h": theta_h}
     fields = {name: a[None].astype(np.float32) for name, a in angles.items()}
-    tensor_file.write(path, {**fields, "wvls": WAVELENGTHS.astype(np.uint16), "M": m.astype(np.float32)})
+    tensor_files.write(path, {**fields, "wvls": WAVELENGTHS.astype(np.uint16), "M": m.astype(np.float32)})
 
 
 def spectrum(mi, plugin, path, wi, wo, wavelengths):
@@ -91,6 +92,68 @@ def test_colours_are_those_of_spectral_variants(tmp_path, rng, monkeypatch, plug
     np.testing.assert_allclose(white, 1 if illuminant == "D65" else [1.205, 0.948, 0.909], atol=2e-3)
 
 
+def fields_of(folder, monkeypatch, polarised=False):
+    """Fields of a small file, of colours or of matrices, as arrays."""
+    path = folder / "whole.pbsdf"
+    if polarised:
+        polarised_file(path)
+        return {name: np.array(array) for name, array in tensor_files.read(path).items()}
+    monkeypatch.setattr(tensor_file, "THETAS", 8)
+    monkeypatch.setattr(tensor_file, "SIDE", 8)
+    save_table(folder / "learned.npz", handmade())
+    return mi_diffind.open(folder / "learned.npz").decode()
+
+
+def changed(array, damage):
+    return {
+        "missing": None,
+        "flat": array[None],
+        "short": np.ascontiguousarray(array[..., : array.shape[-1] // 2]),
+        "empty": array[:0],
+        "nan": np.full_like(array, np.nan) if array.dtype.kind == "f" else None,
+        "falling": array[..., ::-1].copy(),
+        "dark": 0 * array,
+    }[damage]
+
+
+DAMAGED = {
+    "theta_i": {"missing": 'no field "theta_i"', "flat": "1 dimensions are needed", "short": "is needed",
+                "empty": "has the shape", "nan": "8 values that are not finite", "falling": "does not increase"},
+    "ndf": {"missing": 'no field "ndf"', "flat": "2 dimensions are needed", "nan": "not finite",
+            "dark": "or none above 0"},
+    "vndf": {"nan": "not finite", "empty": "has the shape"},
+    "luminance": {"short": "is needed"},
+    "rgb": {"missing": 'no field "rgb"', "short": "is needed", "nan": "not finite"},
+    "phi_d": {"missing": 'no field "phi_d"', "falling": "does not increase", "empty": "has the shape",
+              "nan": "not finite"},
+    "M": {"short": "is needed", "nan": "not finite"},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name, damage", [(name, damage) for name, damages in DAMAGED.items() for damage in damages])
+def test_files_with_a_damaged_field(mi_rgb, tmp_path, monkeypatch, name, damage):
+    """The sentence names file and field, of a source and of a scene; Mitsuba reads some of the files as they are."""
+    polarised = name in ("phi_d", "M")
+    fields = fields_of(tmp_path, monkeypatch, polarised)
+    array = changed(fields.pop(name), damage)
+    path = tmp_path / ("a.pbsdf" if polarised else "a.bsdf")
+    tensor_files.write(path, {**fields, **({} if array is None else {name: array})})
+    sentence = rf"a\.p?bsdf: is no file of measured (colours|Mueller matrices): .*{DAMAGED[name][damage]}"
+    with pytest.raises(UsageError, match=sentence):
+        truth_of(path, array_module())
+    if array is not None or not polarised:
+        plugin = "measured_polarized" if polarised else "measured"
+        with pytest.raises(UsageError, match=sentence):
+            mi_diffind.load_dict(
+                {"type": "scene", "shape": {"type": "sphere", "b": {"type": plugin, "filename": str(path)}}}
+            )
+
+
+def test_a_file_with_an_empty_description(mi_rgb, tmp_path, monkeypatch):
+    tensor_files.write(tmp_path / "a.bsdf", {**fields_of(tmp_path, monkeypatch), "description": ""})
+    assert truth_of(tmp_path / "a.bsdf", array_module()).name == "a.bsdf"
+
+
 def test_damaged_files(mi_rgb, tmp_path):
     path = tmp_path / "a.pbsdf"
     polarised_file(path)
@@ -100,9 +163,11 @@ def test_damaged_files(mi_rgb, tmp_path):
         path.write_bytes(damaged)
         with pytest.raises(UsageError, match=message):
             truth_of(path, array_module())
-    tensor_file.write(path, {"M": np.zeros((2, 2, 2, 2, 4, 3), np.float32)})
+    tensor_files.write(path, {"M": np.zeros((2, 2, 2, 2, 4, 3), np.float32)})
     with pytest.raises(UsageError, match="is no file of measured Mueller matrices"):
         truth_of(path, array_module())
-    tensor_file.write(tmp_path / "a.bsdf", {"wavelengths": np.zeros(3, np.float32), "spectra": np.zeros(4, np.float32)})
+    tensor_files.write(
+        tmp_path / "a.bsdf", {"wavelengths": np.zeros(3, np.float32), "spectra": np.zeros(4, np.float32)}
+    )
     with pytest.raises(UsageError, match=r"a.bsdf: is no file of measured spectra"):
         truth_of(tmp_path / "a.bsdf", array_module())

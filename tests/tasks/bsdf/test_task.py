@@ -330,6 +330,70 @@ def test_a_plastic_is_fitted(types, short, tmp_path):
     assert again.read_bytes() == (tmp_path / "a.npz").read_bytes()
 
 
+@pytest.mark.parametrize("colour", [(0, 0, 0), (0.5, 0, 0.1)], ids=["black", "channel"])
+def test_black_materials_are_fitted(mi_rgb, types, short, tmp_path, colour):
+    """Their albedo in Mitsuba is that of the source, in each channel, and no training is said to diverge."""
+    source = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(colour)}}
+    fitted = mi_diffind.fit("bsdf", source, steps=20, batch=2**11, measure_every=20, progress=False)
+    assert fitted.result.restarts == 0 and all(map(math.isfinite, fitted.table.measured.values()))
+    fitted.save(tmp_path / "a.npz")
+    bsdf = mi_rgb.load_dict({"type": "neural_bsdf", "filename": str(tmp_path / "a.npz")})
+    si = dr.zeros(mi_rgb.SurfaceInteraction3f, 4096)
+    si.wi = mi_rgb.Vector3f(0.6, 0, 0.8)
+    u = mi_rgb.PCG32(4096)
+    places = [u.next_float32() for _ in range(3)]
+    _, weight = bsdf.sample(mi_rgb.BSDFContext(), si, places[0], mi_rgb.Point2f(places[1:]))
+    np.testing.assert_allclose(numpy_of(weight).mean(axis=0), colour, rtol=0.05, atol=1e-4 * max(colour))
+
+
+def test_a_black_channel_does_not_darken_the_others(types):
+    """The limit of the albedo: no factor could make the black channel darker without the others."""
+
+    class Red(FormulaTruth):
+        share = 1
+
+        def value(self, wi, wo):
+            red, *_ = super().value(wi, wo)
+            return [self.share * red, 0 * red, 0 * red]
+
+    def learned(wi, wo):
+        red, *_ = FormulaTruth().value(wi, wo)
+        return [1.01 * red, 1e-4 * red, 1e-6 * red]
+
+    scale = energy.fitted_scale(learned, Red(), types)
+    assert (scale > 0.985).all() and (scale < 0.998).all()
+    Red.share = 0
+    assert (energy.fitted_scale(learned, Red(), types) == 0).all()
+
+
+def test_ranges_without_a_proxy_reach_to_black(types):
+    samples = training.draw(FormulaTruth(), types, 2**13, 1, True)
+    low, high = training.residual_range(Form(()), np.zeros(22), samples)
+    samples.value[1] = 0 * samples.value[1]
+    assert training.residual_range(Form(()), np.zeros(22), samples)[0] == pytest.approx(high + math.log(1e-4), abs=0.2)
+    samples.value = [0 * v for v in samples.value]
+    assert training.residual_range(Form(()), np.zeros(22), samples)[1] < -13 and low > -8
+
+
+@pytest.mark.parametrize(
+    "front, back, said",
+    [(0.5, None, []), (0.5, 0.5, ["it reflects on both sides"]), (0.5, 0.2, ["its back is another material"]),
+     (math.nan, None, "100.0% of its values are not finite")],
+)  # fmt: skip
+def test_what_a_fit_leaves_out_is_said(types, front, back, said):
+    """A back of its own, and values that are no numbers."""
+    sides = [{"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.1, x, 0.3]}} for x in (front, back) if x]
+    source = sides[0] if back is None else {"type": "twosided", "front": sides[0], "back": sides[1]}
+    truth = truth_of(source, types)
+    samples = training.draw(truth, types, 2**10, 1, True)
+    if isinstance(said, str):
+        with pytest.raises(UsageError, match=said):
+            truth.remarks(samples)
+    else:
+        remarks = truth.remarks(samples)
+        assert len(remarks) == len(said) and all(part in text for part, text in zip(said, remarks, strict=True))
+
+
 def test_the_range_holds_the_residual(types):
     """Without a proxy, the range is that of log f, from quantiles."""
     samples = training.draw(FormulaTruth(), types, 2**13, 1, True)

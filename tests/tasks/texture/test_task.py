@@ -56,6 +56,14 @@ def material(height=32, width=24, seed=0):
     return {name: np.rint(255 * values).astype(np.uint8) for name, values in maps.items()}
 
 
+def test_a_start_next_to_the_optimum_has_not_diverged(ad):
+    """The components of a ramp are exact: the first steps of a short training are worse, and no explosion."""
+    ramp = np.linspace(0, 65535, 256 * 256).reshape(256, 256, 1).astype(np.uint16)
+    fitted = fit("texture", {"image": ramp}, steps=3, progress=False)
+    assert fitted.result.restarts == 0 and fitted.table.measured["psnr_db"] > 30
+    assert fitted.history[1]["loss"] > 10 * fitted.history[0]["loss"]
+
+
 def quick(recipe=OURS, **settings):
     given = {"steps": 4, "batch": 2048, "measure_every": 4, **settings}
     return dataclasses.replace(recipe, settings=dataclasses.replace(recipe.settings, **given))

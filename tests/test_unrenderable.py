@@ -1,0 +1,180 @@
+"""Scenes that cannot be rendered, and pictures that are no numbers: one sentence each, in every command."""
+
+import numpy as np
+import pytest
+from commands import refused
+
+from mi_diffind import metrics, scenes, units
+from mi_diffind.cli import main
+from mi_diffind.errors import UsageError
+
+PARTS = {
+    "integrator": '<integrator type="path"><integer name="max_depth" value="2"/></integrator>',
+    "sensor": '<sensor type="perspective"><transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/>'
+    '</transform><film type="hdrfilm"><rfilter type="box"/><integer name="width" value="WIDTH"/><integer name="height" '
+    'value="12"/></film></sensor>',
+    "emitter": '<emitter type="constant"/>',
+    "shape": '<shape type="sphere"><bsdf type="neural_disney"/></shape>',
+}
+
+#: Light that is NaN in half of the picture's pixels at most: where the sphere is.
+NAN = '<emitter type="point"><rgb name="intensity" value="nan"/><point name="position" x="0" y="0" z="3"/></emitter>'
+
+
+def scene_file(tmp_path, *without, more="", width=16):
+    path = tmp_path / "scene.xml"
+    parts = "".join(text for name, text in PARTS.items() if name not in without).replace("WIDTH", str(width))
+    path.write_text(f'<scene version="3.0.0">{parts}{more}</scene>')
+    return path
+
+
+def commands(path, folder):
+    """Return the commands that render the scene ``path``, by name."""
+    return {
+        "render": ["render", path, "-o", folder / "a.exr", "--spp", "2"],
+        "orbit": ["render", path, "-o", folder / "a.png", "--spp", "1", "--orbit", "2"],
+        "compare": ["compare", path, "--spp", "2", "--out", folder / "out"],
+        "view": ["view", path, "--port", "0", "--seconds", "1", "--width", "64"],
+        "regress": ["regress", path, "--update", "--references", folder / "references"],
+        "tradeoff": ["tradeoff", "scene", path, "--quick", "--spp", "1", "--out", folder / "out"],
+    }
+
+
+@pytest.mark.parametrize("name", ["render", "orbit", "compare", "view", "regress", "tradeoff"])
+@pytest.mark.parametrize("missing", ["integrator", "sensor"])
+def test_scenes_without_a_part(tmp_path, capsys, name, missing):
+    path = scene_file(tmp_path, missing)
+    sentence = refused(capsys, *map(str, commands(path, tmp_path)[name]))
+    assert f"scene.xml: has no {missing}, one is needed" in sentence
+    assert sorted(f.name for f in tmp_path.rglob("*") if f.is_file()) == ["scene.xml"]
+
+
+@pytest.mark.parametrize("missing", ["integrator", "sensor", "emitter"])
+def test_what_is_not_rendered_from_the_sensor_needs_none(tmp_path, capsys, missing):
+    """``capture`` has cameras of its own, and a path integrator if the scene has none; ``inspect`` renders nothing."""
+    path = str(scene_file(tmp_path, missing))
+    assert main(["inspect", path]) == 0
+    views = ["--views", "1", "--test", "0", "--resolution", "8", "--spp", "1"]
+    assert main(["capture", path, "-o", str(tmp_path / "views"), *views]) == 0
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize("missing", ["emitter", "shape"])
+def test_scenes_without_lights_or_shapes(tmp_path, capsys, missing):
+    path = str(scene_file(tmp_path, missing))
+    assert main(["render", path, "-o", str(tmp_path / "a.exr"), "--spp", "2"]) == 0
+    warned = capsys.readouterr().err
+    assert ("the picture is black, the scene has no emitter" in warned) == (missing == "emitter")
+
+
+@pytest.mark.parametrize("plugin", ["bitmap", "mipmap"])
+def test_backslashes_in_names_of_files(tmp_path, mi_rgb, plugin):
+    """As Windows writes them; a misspelt parameter beside them is still an error, and so is a file that is missing."""
+    (tmp_path / "maps").mkdir()
+    mi_rgb.Bitmap(np.full((2, 2, 3), 99, np.uint8)).write(str(tmp_path / "maps" / "a.png"))
+    texture = rf'<texture name="reflectance" type="{plugin}"><string name="filename" value="maps\a.png"/></texture>'
+    path = scene_file(tmp_path, more=f'<shape type="sphere"><bsdf type="diffuse">{texture}</bsdf></shape>')
+    assert scenes.load_file(path).shapes() and scenes.ParsedScene(path).load().shapes()
+    assert (tmp_path / "maps" / "a.png").resolve() in scenes.ParsedScene(path).files()
+    text, more = path.read_text(), 'type="diffuse"><float name="x" value="1"/>'
+    for wrong, match in ((text.replace("maps", "map"), "a.png"), (text.replace('type="diffuse">', more), '"x"')):
+        path.write_text(wrong)
+        with pytest.raises(scenes.SceneError, match=match):
+            scenes.ParsedScene(path).load()
+
+
+def test_scenes_in_memory(mi_rgb):
+    from mi_diffind.rendering import render
+
+    scene = {"type": "scene", "sensor": {"type": "perspective"}, "shape": {"type": "sphere"}}
+    with pytest.raises(scenes.SceneError, match="scene: has no integrator"):
+        render(scene, 1)
+    with pytest.raises(scenes.SceneError, match="scene: has no integrator"):
+        render(mi_rgb.load_dict(scene), 1)
+
+
+@pytest.mark.parametrize("name", ["render", "orbit", "compare", "view", "regress", "tradeoff"])
+def test_films_beyond_the_memory(tmp_path, capsys, monkeypatch, name):
+    """On a machine of 32 kB; the film of the viewer has the width that it is asked for."""
+    monkeypatch.setattr(units, "memory", lambda: 2**15)
+    sentence = refused(capsys, *map(str, commands(scene_file(tmp_path, width=64), tmp_path)[name]))
+    assert "film: found 64 x 12 pixels, which takes about 0 GiB of memory" in sentence
+
+
+def test_films_of_any_size(tmp_path, capsys):
+    """A film of 200,000 x 12 pixels fits, one of 2,000,000,000 x 12 does not, before anything is allocated."""
+    path = scene_file(tmp_path, width=2_000_000_000)
+    sentence = refused(capsys, "render", str(path), "-o", str(tmp_path / "a.exr"))
+    assert "film: found 2,000,000,000 x 12 pixels" in sentence
+
+
+@pytest.mark.parametrize("name", ["render", "orbit", "compare"])
+def test_absurd_samples(tmp_path, capsys, name):
+    arguments = [*map(str, commands(scene_file(tmp_path), tmp_path)[name]), "--spp", "1000000000"]
+    assert "spp: found 1,000,000,000 samples per pixel, allowed are 1 to 1,048,576" in refused(capsys, *arguments)
+    with pytest.raises(UsageError, match="spp: found 0"):
+        units.check_samples(0)
+
+
+# -- NaN --------------------------------------------------------------------------------------------------------------
+
+
+def nan_pixels(path, spp, seed=0):
+    """Return how many pixels of a picture are NaN, rendered by Mitsuba itself."""
+    import mitsuba as mi
+
+    image = np.array(mi.render(mi.load_file(str(path)), spp=spp, seed=seed << 16))
+    return int(np.isnan(image).any(axis=2).sum())
+
+
+def test_render_counts_what_is_not_finite(tmp_path, capsys):
+    path = scene_file(tmp_path, more=NAN)
+    from mi_diffind.rendering import render
+
+    assert main(["render", str(path), "-o", str(tmp_path / "a.exr"), "--spp", "2"]) == 0
+    count = nan_pixels(path, 2)
+    assert 0 < count < 192
+    assert f"scene.xml: {count} of 192 rendered pixels are not finite" in capsys.readouterr().err
+    assert render(path, 2, progress=False).figures["nonfinite_pixels"] == count
+    assert render(scene_file(tmp_path), 2, progress=False).figures["nonfinite_pixels"] == 0
+
+
+def test_compare_refuses_what_is_not_finite(tmp_path, capsys):
+    sentence = refused(capsys, "compare", str(scene_file(tmp_path, more=NAN)), "--spp", "2", "--out", str(tmp_path))
+    assert "pixels are not finite" in sentence and "of 192" in sentence
+
+
+def test_capture_and_viewer_count_what_is_not_finite(tmp_path, capsys):
+    from mi_diffind.viewer.page import status_lines
+    from mi_diffind.viewer.session import Session
+
+    path = scene_file(tmp_path, more=NAN)
+    views = ["--views", "2", "--test", "0", "--resolution", "8", "--spp", "16"]
+    assert main(["capture", str(path), "-o", str(tmp_path / "views"), *views]) == 0
+    assert "of 64 pixels of a view have NaN or infinite samples" in capsys.readouterr().err
+    session = Session(path, width=16, spp=1)
+    session.refine()
+    figures = session.figures
+    assert figures["psnr_db"] is None and figures["nonfinite_pixels"] > 0
+    assert f"**not finite** {figures['nonfinite_pixels']} pixels" in status_lines(session)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("error", [metrics.psnr, metrics.mae, metrics.flip, metrics.compare])
+def test_no_error_of_what_is_not_finite(value, error):
+    image = np.full((12, 12, 3), 0.5, np.float32)
+    other = image.copy()
+    other[3, 4, 1] = other[3, 4, 2] = other[0, 0, 0] = value
+    for pair in ((image, other), (other, image)):
+        with pytest.raises(metrics.NotFiniteError, match="2 of 144 pixels are not finite"):
+            error(*pair)
+    assert metrics.nonfinite_pixels(other) == 2 and metrics.nonfinite_pixels(image) == 0
+
+
+def test_inspect_refuses_measurements_that_are_no_numbers(monkeypatch, capsys):
+    from mi_diffind.task import tasks
+
+    ggx = tasks()["ggx"]
+    monkeypatch.setattr(ggx.model_class(), "measure", lambda self: {"mae": 0.1, "worst": np.nan, "psnr_db": np.inf})
+    sentence = refused(capsys, "inspect", str(ggx.file()), "--measure")
+    assert "ggx_tables.npz: as " in sentence and "worst is no number" in sentence
