@@ -6,14 +6,12 @@ opaque everywhere.
 
 from __future__ import annotations
 
-import functools
-import os
 from pathlib import Path
 
 import numpy as np
 
 from ...errors import DiffindError, reason
-from ...files import OutsideError, irregular, path_within, shown
+from ...files import OutsideError, irregular, path_by_name, shown
 from ...limits import Allowance, LimitError
 from ...picture_sizes import check_picture
 from ...srgb import from_linear, to_linear
@@ -49,42 +47,20 @@ def image_file(root: Path, name: str, file: Path) -> Path:
     The name may lack its extension, have ``\`` between folders, and differ from the file's in upper and lower case, or
     by ``.jpg`` and ``.jpeg``. Raises :class:`MissingImageError`, and :class:`ViewsError` for a path out of the folder.
     """
-    try:
-        paths = [path_within(root, spelling, file) for spelling in dict.fromkeys((name, name.replace("\\", "/")))]
-    except OutsideError as e:
-        raise ViewsError(str(e)) from None
-    for path in paths:
-        candidates = [path, *(path.with_name(path.name + e) for e in EXTENSIONS)]
-        if path.suffix.lower() in JPEG:
-            candidates += [path.with_suffix(suffix) for suffix in JPEG]
-        for candidate in (*candidates, *filter(None, map(_in_other_case, candidates))):
-            if fault := irregular(candidate, memory() // 4):
-                raise ViewsError(f"{shown(candidate)}: {fault}, {file.name} names it")
-            if candidate.is_file():
-                return candidate
-    more = "" if paths[0].suffix.lower() in EXTENSIONS else f", nor with {', '.join(EXTENSIONS)}"
-    raise MissingImageError(f"{shown(paths[0])}: no such image{more}, {file.name} names it")
-
-
-def _in_other_case(path: Path) -> Path | None:
-    """Return the only path that differs from ``path`` in upper and lower case at most, or ``None``."""
-    folder = path.parent
-    if not folder.is_dir() and folder.name:
-        folder = _in_other_case(folder)
-    try:
-        names = _names_of(folder, folder.stat().st_mtime_ns).get(path.name.casefold(), []) if folder else []
-    except (OSError, ValueError):
-        return None
-    return folder / names[0] if len(names) == 1 else None
-
-
-@functools.lru_cache(maxsize=4)
-def _names_of(folder: Path, modified: int) -> dict[str, list[str]]:
-    """Return the names in a folder that was ``modified`` at a time, by their form without case."""
-    names: dict[str, list[str]] = {}
-    for name in os.listdir(folder):
-        names.setdefault(name.casefold(), []).append(name)
-    return names
+    names = [name, *(name + extension for extension in EXTENSIONS)]
+    if Path(name).suffix.lower() in JPEG:
+        names += [str(Path(name).with_suffix(suffix)) for suffix in JPEG]
+    for spelling in names:
+        try:
+            path = path_by_name(root, spelling, file)
+        except OutsideError as e:
+            raise ViewsError(str(e)) from None
+        if fault := irregular(path, memory() // 4):
+            raise ViewsError(f"{shown(path)}: {fault}, {file.name} names it")
+        if path.is_file():
+            return path
+    more = "" if Path(name).suffix.lower() in EXTENSIONS else f", nor with {', '.join(EXTENSIONS)}"
+    raise MissingImageError(f"{shown(Path(root) / name)}: no such image{more}, {file.name} names it")
 
 
 def is_linear(path: Path) -> bool:
