@@ -21,15 +21,13 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 
+from .compat import LEAST_THREADS, use_threads
 from .errors import DiffindError, UsageError, reason
 from .interrupt import interruptible
 from .progress import progress_bar
 
 #: Processes that may be lost with a job, one after the other, before the job has failed.
 ATTEMPTS = 3
-
-#: Least number of threads of a process: with a single one, Mitsuba waits forever for the content of an EXR file.
-THREADS = 2
 
 #: Option of Linux's ``prctl``.
 PR_SET_PDEATHSIG = 1
@@ -170,8 +168,6 @@ def serve(descriptor: int, threads: int, idle: float | None) -> None:
         except queue.Empty:
             os._exit(0)
         if threads:
-            from .compat import use_threads
-
             use_threads(threads)
         outcome = _attempt(name, function, value)
         try:
@@ -182,7 +178,7 @@ def serve(descriptor: int, threads: int, idle: float | None) -> None:
 
 
 def _in_processes(function, jobs: Mapping[str, object], workers: int, stop: threading.Event) -> Iterator[Outcome]:
-    threads = max(THREADS, (os.cpu_count() or 1) // workers)
+    threads = max(LEAST_THREADS, (os.cpu_count() or 1) // workers)
     left = collections.deque((name, 1) for name in jobs)
     idle: list[WorkerProcess] = []
     running: dict[Connection, tuple[WorkerProcess, str, int]] = {}
@@ -228,7 +224,7 @@ def _beside(name: str, function, value, slots: Mapping[str, int]) -> Outcome:
     import distributed
 
     host = distributed.get_worker().address.rpartition(":")[0]
-    threads = max(THREADS, (os.cpu_count() or 1) // slots.get(host, 1))
+    threads = max(LEAST_THREADS, (os.cpu_count() or 1) // slots.get(host, 1))
     for _ in range(ATTEMPTS):
         process = getattr(_spare, "process", None)
         if process is None or process.process.poll() is not None:
@@ -248,10 +244,16 @@ def _on_cluster(function, jobs: Mapping[str, object], scheduler: str, stop: thre
         raise UsageError(
             "scheduler: needs the package distributed, which is not installed: pip install 'mi-diffind[cluster]'"
         ) from None
+    client = distributed.Client.__new__(distributed.Client)
     try:
-        client = distributed.Client(scheduler, timeout=TIMEOUT, set_as_default=False)
-    except (OSError, ValueError, ImportError) as e:  # a TimeoutError is an OSError
-        raise UsageError(f'scheduler: "{scheduler}" cannot be reached ({reason(e)})') from None
+        client.__init__(scheduler, timeout=TIMEOUT, set_as_default=False)
+    except BaseException as e:
+        # Left to the garbage collector, it might be closed while the next one starts, and both want one lock
+        with contextlib.suppress(Exception):  # it takes too long
+            client.__del__()
+        if isinstance(e, (OSError, ValueError, TypeError, ImportError)):  # a TimeoutError is an OSError
+            raise UsageError(f'scheduler: "{scheduler}" cannot be reached ({reason(e)})') from None
+        raise
     with client, client.as_current():
         slots = collections.Counter()
         for address, worker in client.scheduler_info(n_workers=-1)["workers"].items():

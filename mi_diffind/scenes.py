@@ -274,7 +274,8 @@ def attach(scene, sensor=0, spp: int | None = None):
 def _build(config, state, integrators: list[str], report: Callable[[str], None]):
     """Instantiate a parsed scene; ``report`` is called with a sentence about a shape that no integrator traces."""
     decoded = _decode_unseen(state, integrators) if integrators else []
-    loaded = compat.instantiate(config, state)
+    with compat.threads_for_files():
+        loaded = compat.instantiate(config, state)
     if isinstance(loaded, mi.Scene):
         unseen = _unseen(loaded, integrators)
         if unseen:
@@ -463,7 +464,7 @@ def colour_channels(image):
 
 def write_image(path: str | os.PathLike, image: np.ndarray) -> None:
     """Write a linear image: ``.exr`` as 32-bit floats, ``.png`` or ``.jpg`` as displayed."""
-    with replacing(path) as temporary:
+    with replacing(path) as temporary, compat.threads_for_files():
         bitmap = mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32))
         if Path(path).suffix.lower() == ".exr":
             bitmap.write(str(temporary))

@@ -116,7 +116,8 @@ class Captured:
     @property
     def images(self) -> list[np.ndarray]:
         """Images of all ``files``, ``(height, width, 4)``, read when asked for: uint8, or of EXR linear floats."""
-        return [np.array(mi.Bitmap(str(self.folder / name))) for name in self.files]
+        with compat.threads_for_files():
+            return [np.array(mi.Bitmap(str(self.folder / name))) for name in self.files]
 
     def __str__(self) -> str:
         return "\n".join(lines(self))
@@ -129,7 +130,8 @@ class Captured:
         columns, side = min(8, max(1, len(chosen))), 128
         sheet = Image.new("RGB", (columns * side, max(1, -(-len(chosen) // columns)) * side), "white")
         for i, number in enumerate(chosen):
-            image = np.array(mi.Bitmap(str(self.folder / self.files[number])))
+            with compat.threads_for_files():
+                image = np.array(mi.Bitmap(str(self.folder / self.files[number])))
             if image.dtype != np.uint8:  # linear, multiplied by alpha
                 straight = image[..., :3] / np.maximum(image[..., 3:], 1e-6)
                 shown = np.concatenate([srgb.for_display(straight), np.clip(image[..., 3:], 0, 1)], axis=-1)

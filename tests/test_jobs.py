@@ -1,5 +1,6 @@
 """Jobs in this process, in others, and on a Dask cluster: outcomes, lost processes, Ctrl-C."""
 
+import gc
 import os
 import signal
 import subprocess
@@ -109,15 +110,18 @@ def test_on_a_cluster(tmp_path):
         assert (tmp_path / "mark").exists() and killed["a"].value and not killed["a"].failure
 
 
-def test_clusters_out_of_reach(monkeypatch):
+def test_clusters_out_of_reach(monkeypatch, no_garbage_collection):
     with pytest.raises(UsageError, match="workers: given together with a scheduler"):
         run(worker_jobs.square, VALUES, 2, scheduler="tcp://127.0.0.1:1")
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "distributed", None)
         with pytest.raises(UsageError, match="distributed, which is not installed: pip install"):
             run(worker_jobs.square, VALUES, scheduler="tcp://127.0.0.1:1")
-    pytest.importorskip("distributed", reason="distributed is not installed: pip install '.[cluster]'")
-    monkeypatch.setattr(jobs, "TIMEOUT", 0.3)
-    for address in ("tcp://127.0.0.1:1", "nonsense", "http://nonsense:80"):
+    distributed = pytest.importorskip("distributed", reason="distributed is not installed: pip install '.[cluster]'")
+    monkeypatch.setattr(jobs, "TIMEOUT", 1)
+    for address in ("tcp://127.0.0.1:1", "nonsense", "http://nonsense:80", "tls://127.0.0.1:1"):
         with pytest.raises(UsageError, match=f'scheduler: "{address}" cannot be reached'):
             run(worker_jobs.square, VALUES, scheduler=address)
+    # A client that the garbage collector would close stops the process for ever if another one starts just then
+    clients = [found for found in gc.get_objects() if isinstance(found, distributed.Client)]
+    assert {client.status for client in clients} <= {"closed"}

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .. import srgb
+from .. import compat, srgb
 from ..errors import UsageError
 from ..files import replacing
 from ..indirection import DifferentiableArray
@@ -148,7 +148,7 @@ def _write(path: Path, values: np.ndarray, color_space: str) -> None:
     """Write a map as PNG or EXR."""
     import mitsuba as mi
 
-    with replacing(path) as temporary:
+    with replacing(path) as temporary, compat.threads_for_files():
         if path.suffix.lower() == ".png":
             mi.Bitmap(np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)).write(str(temporary))
             return

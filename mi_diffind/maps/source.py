@@ -23,6 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .. import compat
 from ..errors import DiffindError, reason
 from ..files import MOST_TEXT, OutsideError, irregular, path_within, shown
 from ..limits import Allowance, LimitError, json_bytes
@@ -292,7 +293,8 @@ def _read(path: Path) -> _ImageFile:
     # A TGA file has no signature
     file_format = mi.Bitmap.FileFormat.TGA if path.suffix.lower() == ".tga" else mi.Bitmap.FileFormat.Auto
     try:
-        bitmap = mi.Bitmap(str(path), file_format)
+        with compat.threads_for_files():
+            bitmap = mi.Bitmap(str(path), file_format)
         values = np.array(bitmap)
         pixels = bitmap.pixel_format()
     except (RuntimeError, MemoryError, ValueError) as e:

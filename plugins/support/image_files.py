@@ -247,7 +247,8 @@ def manifest_of(image: Path, folder: Path, raw: bool, normal: bool) -> Path:
         check_picture(image)
     except LimitError as e:
         raise RuntimeError(str(e)) from None
-    bitmap = mi.Bitmap(str(image))
+    with compat.threads_for_files():
+        bitmap = mi.Bitmap(str(image))
     formats = mi.Bitmap.PixelFormat
     entry = {
         "file": relative_path(image, folder),
