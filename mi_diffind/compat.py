@@ -46,7 +46,7 @@ class JitCore:
     """C++ functions of Dr.Jit's library by their mangled names (Itanium ABI), which change with their signatures.
 
     These are ``jit_shutdown(int)``, ``jit_init(uint32_t)``, ``jit_launch_stats(size_t *, size_t *, size_t *)``,
-    ``jit_registry_id_bound(const char *, const char *)``, ``jit_set_log_level_stderr(LogLevel)`` and
+    ``jit_registry_id_bound(const char *, const char *)`` and
     ``jit_llvm_set_target(const char *, const char *, uint32_t)``. Raises ``OSError`` or ``AttributeError`` where one
     is missing.
     """
@@ -62,7 +62,6 @@ class JitCore:
         self._shutdown, self._init = core["_Z12jit_shutdowni"], core["_Z8jit_initj"]
         self._launch_stats, self._id_bound = core["_Z16jit_launch_statsPmS_S_"], core["_Z21jit_registry_id_boundPKcS0_"]
         self._id_bound.argtypes, self._id_bound.restype = [ctypes.c_char_p] * 2, ctypes.c_uint32
-        self._set_log_level = core["_Z24jit_set_log_level_stderr8LogLevel"]
         self._set_target = core["_Z19jit_llvm_set_targetPKcS0_j"]
         self._set_target.argtypes, self._set_target.restype = [ctypes.c_char_p] * 2 + [ctypes.c_uint32], None
 
@@ -83,10 +82,6 @@ class JitCore:
     def init(self, backend: int) -> None:
         """Start a backend: :attr:`LLVM` or :attr:`CUDA`."""
         self._init(backend)
-
-    def log_to_stderr(self, level: int) -> None:
-        """Write messages up to a level, a number of ``dr.LogLevel``, to the process's standard error."""
-        self._set_log_level(level)
 
     def set_target(self, cpu: str, features: str, lanes: int) -> None:
         """Generate LLVM code for this processor and these features, in vectors of so many single-precision lanes."""
@@ -169,11 +164,6 @@ def room_for_sums(entries: int):
         dr.set_expand_threshold(before)
 
 
-#: Least number of threads of a process: with a single one, Mitsuba waits for ever for the content of an EXR file, which
-#: its library reads and writes on Dr.Jit's threads beside the calling one.
-LEAST_THREADS = 2
-
-
 def use_threads(count: int) -> None:
     """Compute on ``count`` cores, after waiting for all computations.
 
@@ -185,34 +175,6 @@ def use_threads(count: int) -> None:
         dr.eval()
         dr.sync_thread()
         dr.set_thread_count(count)
-
-
-@contextlib.contextmanager
-def threads_for_files():
-    """Have at least :data:`LEAST_THREADS` in this context, which reads or writes pictures or loads a scene."""
-    import drjit as dr
-
-    before = dr.thread_count()
-    use_threads(max(before, LEAST_THREADS))
-    try:
-        yield
-    finally:
-        use_threads(before)
-
-
-def log_beside_python() -> None:
-    """Have Dr.Jit write its messages to the process's standard error itself, and no longer through Python.
-
-    It logs with its lock held, for instance that a kernel cannot be stored on a full disk. A thread that has to wait
-    for Python meanwhile, as those that load a scene, stops for ever if the thread that runs Python waits for the lock.
-    Dr.Jit has no Python function for this; where its library lacks it, messages stay as they are.
-    """
-    import drjit as dr
-
-    level = dr.log_level()
-    with contextlib.suppress(OSError, AttributeError):
-        JitCore().log_to_stderr(level.value)
-        dr.set_log_level(dr.LogLevel.Disable)
 
 
 def module_of(array):

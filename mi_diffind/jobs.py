@@ -21,10 +21,11 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 
-from .compat import LEAST_THREADS, use_threads
+from .compat import use_threads
 from .errors import DiffindError, UsageError, reason
 from .interrupt import interruptible
 from .progress import progress_bar
+from .threads import LEAST_THREADS
 
 #: Processes that may be lost with a job, one after the other, before the job has failed.
 ATTEMPTS = 3

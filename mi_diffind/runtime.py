@@ -28,13 +28,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from . import compat
+from . import compat, threads
 from .errors import UsageError
 
 ENV = "DRJIT_LIBLLVM_PATH"
-
-#: Environment variable that keeps the processes that this one begins from saying again that there is one core.
-SAID = "MI_DIFFIND_ONE_CORE"
 
 #: The oldest LLVM whose code generator knows every instruction that Dr.Jit 1.5 emits.
 MIN_LLVM = 19
@@ -160,7 +157,7 @@ def install(register_plugins: Callable[[], None]) -> None:
     hooks = {}
     if "drjit" in sys.modules:
         correct_llvm()
-        _settle()
+        threads.settle()
     else:
         hooks["drjit"] = _starting_drjit
     if "mitsuba" in sys.modules:
@@ -218,25 +215,8 @@ def _starting_drjit():
     if _problem is None and 0 <= running[0] < MIN_LLVM:  # only where the search was left to Dr.Jit
         _problem = f"Dr.Jit found LLVM {running[0]}, with which it aborts: {_ADVICE}."
         _restart_llvm(None)
-    _settle()
+    threads.settle()
     _warn()
-
-
-def _settle() -> None:
-    """Keep Dr.Jit, once it is imported, from waiting for ever: for a second thread, or for Python while it logs."""
-    import drjit as dr
-
-    compat.log_beside_python()
-    if dr.thread_count() >= compat.LEAST_THREADS:
-        return
-    compat.use_threads(compat.LEAST_THREADS)
-    if not os.environ.get(SAID):
-        os.environ[SAID] = "1"
-        print(
-            "mi_diffind: this process has one core; Dr.Jit uses two threads, since with one, Mitsuba would wait for "
-            "ever for EXR files",
-            file=sys.stderr,
-        )
 
 
 def correct_llvm() -> Choice:

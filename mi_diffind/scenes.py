@@ -22,6 +22,7 @@ from .measure.operations import bsdf_operations
 from .plugins.support import footprint, omissions
 from .runtime import use_variant
 from .task import tasks
+from .threads import threads_for_files
 
 #: Integrators that follow paths to a ``max_depth``, and the depth of each where the scene gives none (-1: infinite).
 MAX_DEPTHS = {
@@ -274,7 +275,7 @@ def attach(scene, sensor=0, spp: int | None = None):
 def _build(config, state, integrators: list[str], report: Callable[[str], None]):
     """Instantiate a parsed scene; ``report`` is called with a sentence about a shape that no integrator traces."""
     decoded = _decode_unseen(state, integrators) if integrators else []
-    with compat.threads_for_files():
+    with threads_for_files():
         loaded = compat.instantiate(config, state)
     if isinstance(loaded, mi.Scene):
         unseen = _unseen(loaded, integrators)
@@ -464,7 +465,7 @@ def colour_channels(image):
 
 def write_image(path: str | os.PathLike, image: np.ndarray) -> None:
     """Write a linear image: ``.exr`` as 32-bit floats, ``.png`` or ``.jpg`` as displayed."""
-    with replacing(path) as temporary, compat.threads_for_files():
+    with replacing(path) as temporary, threads_for_files():
         bitmap = mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32))
         if Path(path).suffix.lower() == ".exr":
             bitmap.write(str(temporary))

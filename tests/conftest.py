@@ -83,7 +83,7 @@ def few_samples(monkeypatch):
 
 @pytest.fixture
 def no_garbage_collection():
-    """For frozen functions, as Dr.Jit aborts if the collector frees its arrays while it records one; or to see it all."""
+    """For frozen functions: Dr.Jit aborts if the collector frees its arrays while it records one."""
     gc.collect()
     gc.disable()
     yield

@@ -14,7 +14,7 @@ from pathlib import Path
 import drjit as dr
 import pytest
 
-from mi_diffind import runtime
+from mi_diffind import runtime, threads
 from mi_diffind.errors import DiffindError, UsageError
 from mi_diffind.runtime import ENV, MIN_LLVM, choose_llvm, library_version, system_libraries
 
@@ -219,7 +219,7 @@ assert cli.main(["render", scene, "-D", "width=8", "-D", "height=8", "--spp", "1
 assert cli.main(["decode", table, "-o", "decoded.exr", "--map", "roughness"]) == 0
 """
 
-#: Kernels are compiled in threads that load a scene, and cannot be stored: files have at most 16 bytes, as on a full disk.
+#: Kernels of threads that load a scene cannot be stored: files have at most 16 bytes, as on a full disk.
 FULL_DISK = """
 import faulthandler, resource, sys
 faulthandler.dump_traceback_later(60, exit=True)
@@ -515,7 +515,7 @@ def test_plugins_register_for_variants_set_later():
 def test_one_core(tmp_path):
     """Mitsuba waits for ever for the content of an EXR file if there is no second thread."""
     tables = ROOT / "scenes" / "assets" / "tiles_filtered.npz"
-    done = succeeds(ONE_CORE, arguments=[ROOT / "tests" / "lamp.xml", tables, tmp_path], **{runtime.SAID: ""})
+    done = succeeds(ONE_CORE, arguments=[ROOT / "tests" / "lamp.xml", tables, tmp_path], **{threads.ONE_CORE: ""})
     assert done.stderr.count("this process has one core") == 1
 
 

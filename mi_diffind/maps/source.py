@@ -23,11 +23,11 @@ from pathlib import Path
 
 import numpy as np
 
-from .. import compat
 from ..errors import DiffindError, reason
 from ..files import MOST_TEXT, OutsideError, irregular, path_within, shown
 from ..limits import Allowance, LimitError, json_bytes
 from ..picture_sizes import check_picture
+from ..threads import threads_for_files
 from ..units import memory
 
 #: Largest number of channels of all maps together.
@@ -293,7 +293,7 @@ def _read(path: Path) -> _ImageFile:
     # A TGA file has no signature
     file_format = mi.Bitmap.FileFormat.TGA if path.suffix.lower() == ".tga" else mi.Bitmap.FileFormat.Auto
     try:
-        with compat.threads_for_files():
+        with threads_for_files():
             bitmap = mi.Bitmap(str(path), file_format)
         values = np.array(bitmap)
         pixels = bitmap.pixel_format()
