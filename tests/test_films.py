@@ -165,6 +165,20 @@ def test_films_that_begin_again(tmp_path):
             assert np.abs(np.array(film.convert("RGB")).astype(float) - frames[4]).mean() < 8
 
 
+@pytest.mark.parametrize("name", ["film.webp", "film.gif"])
+def test_nothing_stays_of_the_frame_before(tmp_path, name):
+    """A square without a corner that moves in front of nothing: each frame is clear but for its own square."""
+    frames = np.zeros((3, 16, 48, 4), np.uint8)
+    for i, frame in enumerate(frames):
+        frame[4:12, 16 * i + 4 : 16 * i + 12] = 200, 60, 20, 255
+        frame[4, 16 * i + 4] = 0
+    films.write(tmp_path / name, frames)
+    with Image.open(tmp_path / name) as film:
+        for i, frame in enumerate(frames):
+            film.seek(i)
+            np.testing.assert_array_equal(np.array(film.convert("RGBA"))[..., 3], frame[..., 3])
+
+
 @needs_ffmpeg
 @pytest.mark.long
 def test_the_films_of_the_pages_are_rendered(tmp_path):
