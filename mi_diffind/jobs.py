@@ -21,7 +21,6 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 
-from .compat import use_threads
 from .errors import DiffindError, UsageError, reason
 from .interrupt import interruptible
 from .progress import progress_bar
@@ -169,6 +168,8 @@ def serve(descriptor: int, threads: int, idle: float | None) -> None:
         except queue.Empty:
             os._exit(0)
         if threads:
+            from .compat import use_threads
+
             use_threads(threads)
         outcome = _attempt(name, function, value)
         try:

@@ -10,7 +10,6 @@ import trimesh
 
 from mi_diffind import comparison, conversion, scenes
 from mi_diffind.errors import UsageError
-from mi_diffind.files import OutputError
 from mi_diffind.tasks.sdf import serialized
 from mi_diffind.tasks.sdf.mesh import MeshError, load_mesh
 
@@ -146,14 +145,6 @@ def test_the_command_and_a_comparison_with_the_stock_scene(mi_rgb, tmp_path, cap
 def test_unknown_groups_are_refused(mi_rgb, folder):
     with pytest.raises(UsageError, match='found "glass", allowed are principled, mesh, bitmap'):
         conversion.replace_stock(parsed(folder[0], ""), ["glass"], folder[0])
-
-
-def test_fits_that_cannot_be_kept_name_the_variable(tmp_path, monkeypatch):
-    (tmp_path / "file").write_text("")
-    for name, fault in (("file/a/cache", "cannot be made: Not a directory"), ("file", "is not a folder")):
-        monkeypatch.setenv(conversion.FOLDER, str(tmp_path / name))
-        with pytest.raises(OutputError, match=f"{fault}; the environment variable MI_DIFFIND_CACHE names another"):
-            conversion.cache_folder()
 
 
 def test_misspelt_parameters_stay_errors(mi_rgb, folder):

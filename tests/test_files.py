@@ -120,6 +120,16 @@ def test_a_link_is_written_through(tmp_path):
             raise AssertionError("reached")
 
 
+def test_a_cache_that_cannot_be_made_names_its_variable(tmp_path, monkeypatch):
+    from mi_diffind import conversion
+
+    (tmp_path / "file").write_text("")
+    for name, fault in (("file/a/cache", "cannot be made: Not a directory"), ("file", "is not a folder")):
+        monkeypatch.setenv(conversion.FOLDER, str(tmp_path / name))
+        with pytest.raises(OutputError, match=f"{fault}; the environment variable MI_DIFFIND_CACHE names another"):
+            conversion.cache_folder()
+
+
 def test_names_that_are_too_long(tmp_path):
     writable_file(tmp_path / ("a" * LONGEST_NAME))
     for name in ("a" * (LONGEST_NAME + 1), "ä" * 128):

@@ -27,7 +27,6 @@ from mi_diffind.maps.source import Source, SourceError, from_arrays, load_source
 from mi_diffind.picture_sizes import check_picture
 from mi_diffind.tables import Table, TableError
 from mi_diffind.task import Task, stamp
-from mi_diffind.threads import threads_for_files
 
 from . import properties
 from .tables import copy_entries, exposed
@@ -248,8 +247,7 @@ def manifest_of(image: Path, folder: Path, raw: bool, normal: bool) -> Path:
         check_picture(image)
     except LimitError as e:
         raise RuntimeError(str(e)) from None
-    with threads_for_files():
-        bitmap = mi.Bitmap(str(image))
+    bitmap = mi.Bitmap(str(image))
     formats = mi.Bitmap.PixelFormat
     entry = {
         "file": relative_path(image, folder),
