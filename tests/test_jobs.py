@@ -16,6 +16,8 @@ from mi_diffind import jobs
 from mi_diffind.errors import UsageError
 from mi_diffind.jobs import run_jobs
 
+linux = pytest.mark.skipif(sys.platform != "linux", reason="the kernel ends such a process on Linux only")
+
 #: A number, a word that is refused, and what raises another error.
 VALUES = {"three": 3, "word": "abc", "none": None, "four": 4}
 
@@ -51,7 +53,9 @@ def test_in_processes(tmp_path):
 
 
 def test_interrupted_here():
+    """What is done stays; what fails for the Ctrl-C has not failed."""
     assert list(run(worker_jobs.interrupt, {"a": 1, "b": 2, "c": 3})) == ["a", "b"]
+    assert list(run(worker_jobs.interrupt, {"a": 1, "b": "word", "c": 3})) == ["a"]
 
 
 def test_processes_are_interrupted(tmp_path):
@@ -69,11 +73,12 @@ def test_processes_are_interrupted(tmp_path):
     assert not exists(int(file.read_text()))
 
 
-def test_processes_end_with_the_one_that_began_them(tmp_path):
+@pytest.mark.parametrize("job", ["write_process_and_sleep", pytest.param("write_process_and_hold_python", marks=linux)])
+def test_processes_end_with_the_one_that_began_them(tmp_path, job):
     file = tmp_path / "process"
     code = (
         f"import sys; sys.path[:] = {sys.path}; import worker_jobs; from mi_diffind.jobs import run_jobs\n"
-        f"list(run_jobs(worker_jobs.write_process_and_sleep, {{'a': {str(file)!r}}}, 1))"
+        f"list(run_jobs(worker_jobs.{job}, {{'a': {str(file)!r}}}, 1))"
     )
     parent = subprocess.Popen([sys.executable, "-c", code])
     wait_for(lambda: file.is_file() and file.read_text())
