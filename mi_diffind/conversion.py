@@ -20,7 +20,7 @@ import mitsuba as mi
 
 from . import compat, mitsuba_versions, plugins
 from .errors import DiffindError, UsageError
-from .files import relative_path, replacing, writable_file, writable_folder
+from .files import OutputError, relative_path, replacing, shown, writable_file, writable_folder
 from .picture_check import PictureCheck, check_picture
 from .plugins.support.stock import Kept, StockNode
 from .runtime import use_variant
@@ -84,8 +84,12 @@ def cache_folder() -> Path:
     Raises :class:`~mi_diffind.files.OutputError`.
     """
     folder = Path(os.environ.get(FOLDER) or Path.home() / ".cache" / "mi_diffind")
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    return writable_folder(folder, create=True)
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        return writable_folder(folder, create=True)
+    except OSError as e:
+        fault = str(e) if isinstance(e, OutputError) else f'folder "{shown(folder)}" cannot be made: {e.strerror}'
+        raise OutputError(f"{fault}; the environment variable {FOLDER} names another folder") from None
 
 
 def convert(

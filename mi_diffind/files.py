@@ -98,14 +98,19 @@ def writable_folder(path: str | os.PathLike, create: bool = False) -> Path:
     return path
 
 
+def _target(path: Path) -> Path:
+    """Return the file to write: that to which a symbolic link leads, which need not exist."""
+    return Path(os.path.realpath(path)) if os.path.islink(path) else path
+
+
 def writable_file(path: str | os.PathLike) -> Path:
-    """Return the file ``path``, new or to be replaced.
+    """Return the file ``path``, new or to be replaced; it may be a symbolic link to such a file.
 
     Raises :class:`OutputError` if its folder cannot be written, its name is too long, or something else than a regular
     file has the name, such as a folder or a device.
     """
     path = Path(path)
-    writable_folder(path.parent)
+    writable_folder(_target(path).parent)
     if (length := len(os.fsencode(path.name))) > LONGEST_NAME:
         raise OutputError(
             f'output file "{shown(path)}" has a name of {length} bytes, at most {LONGEST_NAME} are allowed'
@@ -154,19 +159,22 @@ def _paths(named: Mapping[str, object]) -> list[tuple[str, str | os.PathLike]]:
 def replacing(path: str | os.PathLike):
     """Yield the path of a temporary file beside ``path``; rename it to ``path`` on success, remove it on failure.
 
-    The temporary file has the same extension. Those of earlier processes that were killed are removed. Raises
-    :class:`OutputError` if the folder or the file cannot be written, as on a full disk.
+    Of a symbolic link, the file to which it leads is replaced. The temporary file has the same extension. Those of
+    earlier processes that were killed are removed. Raises :class:`OutputError` if the folder or the file cannot be
+    written, as on a full disk.
     """
     path = writable_file(path)
+    target = _target(path)
+    beside = target.with_name(path.name)
     temporary = handle = None
     try:
-        _remove_abandoned(path)
-        handle, temporary = _locked(path)
+        _remove_abandoned(beside)
+        handle, temporary = _locked(beside)
         yield temporary
         umask = os.umask(0)
         os.umask(umask)
         os.chmod(temporary, 0o666 & ~umask)
-        os.replace(temporary, path)
+        os.replace(temporary, target)
     except BaseException as e:
         if temporary is not None:
             with contextlib.suppress(OSError):

@@ -24,12 +24,10 @@ from multiprocessing.connection import Connection, wait
 from .errors import DiffindError, UsageError, missing_package, reason
 from .interrupt import interruptible
 from .progress import progress_bar
+from .threads import LEAST_THREADS
 
 #: Processes that may be lost with a job, one after the other, before the job has failed.
 ATTEMPTS = 3
-
-#: Least number of threads of a process: with a single one, Mitsuba waits forever for the content of an EXR file.
-THREADS = 2
 
 #: Option of Linux's ``prctl``.
 PR_SET_PDEATHSIG = 1
@@ -182,7 +180,7 @@ def serve(descriptor: int, threads: int, idle: float | None) -> None:
 
 
 def _in_processes(function, jobs: Mapping[str, object], workers: int, stop: threading.Event) -> Iterator[Outcome]:
-    threads = max(THREADS, (os.cpu_count() or 1) // workers)
+    threads = max(LEAST_THREADS, (os.cpu_count() or 1) // workers)
     left = collections.deque((name, 1) for name in jobs)
     idle: list[WorkerProcess] = []
     running: dict[Connection, tuple[WorkerProcess, str, int]] = {}
@@ -228,7 +226,7 @@ def _beside(name: str, function, value, slots: Mapping[str, int]) -> Outcome:
     import distributed
 
     host = distributed.get_worker().address.rpartition(":")[0]
-    threads = max(THREADS, (os.cpu_count() or 1) // slots.get(host, 1))
+    threads = max(LEAST_THREADS, (os.cpu_count() or 1) // slots.get(host, 1))
     for _ in range(ATTEMPTS):
         process = getattr(_spare, "process", None)
         if process is None or process.process.poll() is not None:
@@ -246,10 +244,16 @@ def _on_cluster(function, jobs: Mapping[str, object], scheduler: str, stop: thre
         import distributed
     except ImportError:
         raise UsageError(f"scheduler: needs {missing_package('distributed')}") from None
+    client = distributed.Client.__new__(distributed.Client)
     try:
-        client = distributed.Client(scheduler, timeout=TIMEOUT, set_as_default=False)
-    except (OSError, ValueError, ImportError) as e:  # a TimeoutError is an OSError
-        raise UsageError(f'scheduler: "{scheduler}" cannot be reached ({reason(e)})') from None
+        client.__init__(scheduler, timeout=TIMEOUT, set_as_default=False)
+    except BaseException as e:
+        # Left to the garbage collector, it might be closed while the next one starts, and both want one lock
+        with contextlib.suppress(Exception):  # it takes too long
+            client.__del__()
+        if isinstance(e, (OSError, ValueError, TypeError, ImportError)):  # a TimeoutError is an OSError
+            raise UsageError(f'scheduler: "{scheduler}" cannot be reached ({reason(e)})') from None
+        raise
     with client, client.as_current():
         slots = collections.Counter()
         for address, worker in client.scheduler_info(n_workers=-1)["workers"].items():

@@ -28,7 +28,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from . import compat
+from . import compat, threads
 from .errors import UsageError
 
 ENV = "DRJIT_LIBLLVM_PATH"
@@ -157,6 +157,7 @@ def install(register_plugins: Callable[[], None]) -> None:
     hooks = {}
     if "drjit" in sys.modules:
         correct_llvm()
+        threads.settle()
     else:
         hooks["drjit"] = _starting_drjit
     if "mitsuba" in sys.modules:
@@ -214,6 +215,7 @@ def _starting_drjit():
     if _problem is None and 0 <= running[0] < MIN_LLVM:  # only where the search was left to Dr.Jit
         _problem = f"Dr.Jit found LLVM {running[0]}, with which it aborts: {_ADVICE}."
         _restart_llvm(None)
+    threads.settle()
     _warn()
 
 

@@ -23,6 +23,7 @@ from .plugins.support import footprint, omissions
 from .runtime import use_variant
 from .scene_checks import NEEDS, SceneError, check_measured, check_renderable, check_size, use_slashes
 from .task import tasks
+from .threads import threads_for_files
 
 #: Integrators that follow paths to a ``max_depth``, and the depth of each where the scene gives none (-1: infinite).
 MAX_DEPTHS = {
@@ -277,7 +278,8 @@ def _build(config, state, integrators: list[str], report: Callable[[str], None])
     """Instantiate a parsed scene; ``report`` is called with a sentence about a shape that no integrator traces."""
     check_measured(state)
     decoded = _decode_unseen(state, integrators) if integrators else []
-    loaded = compat.instantiate(config, state)
+    with threads_for_files():
+        loaded = compat.instantiate(config, state)
     if isinstance(loaded, mi.Scene):
         unseen = _unseen(loaded, integrators)
         if unseen:
@@ -489,7 +491,7 @@ def colour_channels(image):
 
 def write_image(path: str | os.PathLike, image: np.ndarray) -> None:
     """Write a linear image: ``.exr`` as 32-bit floats, ``.png`` or ``.jpg`` as displayed."""
-    with replacing(path) as temporary:
+    with replacing(path) as temporary, threads_for_files():
         bitmap = mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32))
         if Path(path).suffix.lower() == ".exr":
             bitmap.write(str(temporary))

@@ -38,6 +38,7 @@ from .progress import progress_bar
 from .runtime import use_variant
 from .splat_files import is_splats
 from .task import FitRequest
+from .threads import threads_for_files
 
 #: Samples of the whole image in one pass.
 PASS = 1 << 23
@@ -118,7 +119,8 @@ class Captured:
     @property
     def images(self) -> list[np.ndarray]:
         """Images of all ``files``, ``(height, width, 4)``, read when asked for: uint8, or of EXR linear floats."""
-        return [np.array(mi.Bitmap(str(self.folder / name))) for name in self.files]
+        with threads_for_files():
+            return [np.array(mi.Bitmap(str(self.folder / name))) for name in self.files]
 
     def __str__(self) -> str:
         return "\n".join(lines(self))
@@ -131,7 +133,8 @@ class Captured:
         columns, side = min(8, max(1, len(chosen))), 128
         sheet = Image.new("RGB", (columns * side, max(1, -(-len(chosen) // columns)) * side), "white")
         for i, number in enumerate(chosen):
-            image = np.array(mi.Bitmap(str(self.folder / self.files[number])))
+            with threads_for_files():
+                image = np.array(mi.Bitmap(str(self.folder / self.files[number])))
             if image.dtype != np.uint8:  # linear, multiplied by alpha
                 straight = image[..., :3] / np.maximum(image[..., 3:], 1e-6)
                 shown = np.concatenate([srgb.for_display(straight), np.clip(image[..., 3:], 0, 1)], axis=-1)

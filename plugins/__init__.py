@@ -168,7 +168,9 @@ def with_counterpart(against: str = "exact") -> tuple[str, ...]:
 
 
 def _on_variant_change(old: str | None, new: str) -> None:
-    register(new)
+    # After a purge of sys.modules, those imported anew register their own classes
+    if getattr(sys.modules.get(__name__), "_declared", None) is _declared:
+        register(new)
 
 
 def register(variant: str) -> None:

@@ -1,10 +1,12 @@
 """Fixtures shared by all tests: Mitsuba variants and seeded generators."""
 
+import faulthandler
 import gc
 import os
 
 import numpy as np
 import pytest
+from _pytest.faulthandler import fault_handler_stderr_fd_key
 from variants import BACKENDS, VARIANTS, set_variant
 
 from mi_diffind import compat
@@ -12,6 +14,14 @@ from mi_diffind import compat
 #: Run all tests with code for another processor, such as ``haswell:+avx2,+fma:8`` (most laptops).
 if TARGET := os.environ.get("MI_DIFFIND_LLVM_TARGET"):
     compat.limit_code_generation(TARGET)
+
+#: Seconds that a test marked ``slow`` or ``long`` may take; others have ``faulthandler_timeout`` of ``pyproject.toml``.
+LONG_LIMIT = 3600
+
+
+def pytest_runtest_setup(item):
+    if any(item.get_closest_marker(name) for name in ("slow", "long")):
+        faulthandler.dump_traceback_later(LONG_LIMIT, exit=True, file=item.config.stash[fault_handler_stderr_fd_key])
 
 
 def pytest_collection_modifyitems(items):

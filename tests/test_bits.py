@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mi_diffind.bits import as_words, mask_flags, mask_words, pack_bits, unpack_bits
+from mi_diffind.bits import PART, as_words, mask_flags, mask_words, pack_bits, unpack_bits
 
 
 @pytest.mark.parametrize("bits", range(1, 9))
@@ -20,6 +20,16 @@ def test_bits_survive_packing(bits, count):
     np.testing.assert_array_equal(unpacked, codes)
     wider = codes | np.uint8(0xFF << bits & 0xFF)  # what lies above is left out
     np.testing.assert_array_equal(pack_bits(wider, bits), packed)
+
+
+@pytest.mark.parametrize("bits", [3, 5, 8])
+def test_more_numbers_than_are_packed_at_a_time(rng, bits):
+    """The parts join without a gap, also where a number's bits do not fill bytes."""
+    codes = rng.integers(0, 2**bits, 2 * PART + 9).astype(np.uint8)
+    number = int("".join(f"{code:0{bits}b}" for code in codes[::-1]), 2)
+    packed = pack_bits(codes, bits)
+    assert packed.tobytes() == number.to_bytes(-(-len(codes) * bits // 8), "little")
+    np.testing.assert_array_equal(unpack_bits(packed, len(codes), bits), codes)
 
 
 def test_numbers_of_more_than_a_byte():

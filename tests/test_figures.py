@@ -8,16 +8,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import claims
+import derived
+import list_numbers
+import make_tables
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
-sys.path.insert(0, str(DOCS))
-
-import claims  # noqa: E402
-import derived  # noqa: E402
-import list_numbers  # noqa: E402
-import make_tables  # noqa: E402
 
 #: Numbers of a page that no file backs: more are refused, and whoever lowers a count lowers it here. Other pages: none.
 UNBACKED = {}

@@ -99,6 +99,37 @@ def test_only_regular_files_are_replaced(tmp_path):
     assert os.stat(pipe).st_mode == os.lstat(pipe).st_mode and len(os.listdir(tmp_path)) == 3
 
 
+def test_a_link_is_written_through(tmp_path):
+    """The link stays; its target, which may be missing, is replaced in its folder, in the format of the link's name."""
+    target, link = tmp_path / "there" / "data.bin", tmp_path / "a.npz"
+    target.parent.mkdir()
+    (tmp_path / "between").symlink_to(target)
+    link.symlink_to("between")
+    for content in (b"first", b"second"):
+        with replacing(link) as temporary:
+            assert temporary.parent == target.parent and temporary.suffix == ".npz"
+            temporary.write_bytes(content)
+        assert link.is_symlink() and target.read_bytes() == content and not target.is_symlink()
+    with pytest.raises(ZeroDivisionError), replacing(link):
+        raise ZeroDivisionError
+    assert os.listdir(target.parent) == ["data.bin"] and target.read_bytes() == b"second"
+    (tmp_path / "loop").symlink_to("loop")
+    (tmp_path / "lost").symlink_to(tmp_path / "no" / "a")
+    for name, fault in (("loop", "too many levels"), ("lost", 'no" does not exist')):
+        with pytest.raises(OutputError, match=fault), replacing(tmp_path / name):
+            raise AssertionError("reached")
+
+
+def test_a_cache_that_cannot_be_made_names_its_variable(tmp_path, monkeypatch):
+    from mi_diffind import conversion
+
+    (tmp_path / "file").write_text("")
+    for name, fault in (("file/a/cache", "cannot be made: Not a directory"), ("file", "is not a folder")):
+        monkeypatch.setenv(conversion.FOLDER, str(tmp_path / name))
+        with pytest.raises(OutputError, match=f"{fault}; the environment variable MI_DIFFIND_CACHE names another"):
+            conversion.cache_folder()
+
+
 def test_names_that_are_too_long(tmp_path):
     writable_file(tmp_path / ("a" * LONGEST_NAME))
     for name in ("a" * (LONGEST_NAME + 1), "ä" * 128):

@@ -24,6 +24,29 @@ def smooth_frames(count, height, width):
     return [np.round(127 + 100 * np.stack(wave, axis=-1)).astype(np.uint8) for wave in waves]
 
 
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+def test_linear_images_as_displayed(channels):
+    """Bytes of sRGB, rounded; colours multiplied by alpha are divided by it, or stand in front of black."""
+    alpha = np.array([0, 0.02, 0.25, 1])[None, :, None]
+    colours = np.array([0.001, 0.2, 0.7, 3])[:, None, None] * np.array([1, 0.6, 0.3])[: 1 if channels < 3 else 3]
+
+    def encoded(values):
+        values = np.clip(values, 0, 1)
+        return 255 * np.where(values <= 0.0031308, 12.92 * values, 1.055 * values ** (1 / 2.4) - 0.055)
+
+    if channels % 2:
+        image = np.repeat(colours, 4, axis=1)
+        straight, black = encoded(image), encoded(image)
+    else:
+        image = np.concatenate([colours * alpha, np.repeat(alpha, 4, axis=0)], axis=-1)
+        straight, black = encoded(np.where(alpha > 0, colours, 0)), encoded(colours * alpha)
+    shown, in_front = films.displayed(image), films.over_black(image)
+    assert shown.dtype == np.uint8 and shown.shape[2] == (3 if channels % 2 else 4) and in_front.shape[2] == 3
+    assert np.abs(shown[..., :3] - straight).max() < 0.51 and np.abs(in_front - black).max() < 0.51
+    if channels % 2 == 0:
+        assert np.abs(shown[..., 3] - 255 * image[..., -1]).max() < 0.51
+
+
 @needs_ffmpeg
 @pytest.mark.parametrize("size", [(48, 64), (47, 63)])
 def test_h264_is_read_back(tmp_path, size):
@@ -138,6 +161,20 @@ def test_films_that_begin_again(tmp_path):
             film.load()
             assert film.info["duration"] == 200
             assert np.abs(np.array(film.convert("RGB")).astype(float) - frames[4]).mean() < 8
+
+
+@pytest.mark.parametrize("name", ["film.webp", "film.gif"])
+def test_nothing_stays_of_the_frame_before(tmp_path, name):
+    """A square without a corner that moves in front of nothing: each frame is clear but for its own square."""
+    frames = np.zeros((3, 16, 48, 4), np.uint8)
+    for i, frame in enumerate(frames):
+        frame[4:12, 16 * i + 4 : 16 * i + 12] = 200, 60, 20, 255
+        frame[4, 16 * i + 4] = 0
+    films.write(tmp_path / name, frames)
+    with Image.open(tmp_path / name) as film:
+        for i, frame in enumerate(frames):
+            film.seek(i)
+            np.testing.assert_array_equal(np.array(film.convert("RGBA"))[..., 3], frame[..., 3])
 
 
 @needs_ffmpeg

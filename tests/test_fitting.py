@@ -849,6 +849,7 @@ def test_training_through_a_render(tmp_path):
         ({"lr": math.inf}, "lr: found inf"), ({"schedule": "step"}, '"step", allowed are'),
         ({"loss": "huber"}, '"huber", allowed are'), ({"seed": -1}, "seed: found -1"),
         ({"measure_every": 0}, "measure_every"), ({"check_every": 0}, "check_every"),
+        ({"steps": True}, "steps: found True, a whole number"), ({"batch": 2.0}, "batch: found 2.0, a whole number"),
     ],
 )  # fmt: skip
 def test_bad_settings(change, match):

@@ -1,5 +1,6 @@
 """Jobs in this process, in others, and on a Dask cluster: outcomes, lost processes, Ctrl-C."""
 
+import gc
 import os
 import signal
 import subprocess
@@ -14,6 +15,8 @@ import worker_jobs
 from mi_diffind import jobs
 from mi_diffind.errors import UsageError
 from mi_diffind.jobs import run_jobs
+
+linux = pytest.mark.skipif(sys.platform != "linux", reason="the kernel ends such a process on Linux only")
 
 #: A number, a word that is refused, and what raises another error.
 VALUES = {"three": 3, "word": "abc", "none": None, "four": 4}
@@ -50,7 +53,9 @@ def test_in_processes(tmp_path):
 
 
 def test_interrupted_here():
+    """What is done stays; what fails for the Ctrl-C has not failed."""
     assert list(run(worker_jobs.interrupt, {"a": 1, "b": 2, "c": 3})) == ["a", "b"]
+    assert list(run(worker_jobs.interrupt, {"a": 1, "b": "word", "c": 3})) == ["a"]
 
 
 def test_processes_are_interrupted(tmp_path):
@@ -68,11 +73,12 @@ def test_processes_are_interrupted(tmp_path):
     assert not exists(int(file.read_text()))
 
 
-def test_processes_end_with_the_one_that_began_them(tmp_path):
+@pytest.mark.parametrize("job", ["write_process_and_sleep", pytest.param("write_process_and_hold_python", marks=linux)])
+def test_processes_end_with_the_one_that_began_them(tmp_path, job):
     file = tmp_path / "process"
     code = (
         f"import sys; sys.path[:] = {sys.path}; import worker_jobs; from mi_diffind.jobs import run_jobs\n"
-        f"list(run_jobs(worker_jobs.write_process_and_sleep, {{'a': {str(file)!r}}}, 1))"
+        f"list(run_jobs(worker_jobs.{job}, {{'a': {str(file)!r}}}, 1))"
     )
     parent = subprocess.Popen([sys.executable, "-c", code])
     wait_for(lambda: file.is_file() and file.read_text())
@@ -109,15 +115,18 @@ def test_on_a_cluster(tmp_path):
         assert (tmp_path / "mark").exists() and killed["a"].value and not killed["a"].failure
 
 
-def test_clusters_out_of_reach(monkeypatch):
+def test_clusters_out_of_reach(monkeypatch, no_garbage_collection):
     with pytest.raises(UsageError, match="workers: given together with a scheduler"):
         run(worker_jobs.square, VALUES, 2, scheduler="tcp://127.0.0.1:1")
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "distributed", None)
         with pytest.raises(UsageError, match="distributed, which is not installed: pip install"):
             run(worker_jobs.square, VALUES, scheduler="tcp://127.0.0.1:1")
-    pytest.importorskip("distributed", reason="distributed is not installed: pip install '.[cluster]'")
-    monkeypatch.setattr(jobs, "TIMEOUT", 0.3)
-    for address in ("tcp://127.0.0.1:1", "nonsense", "http://nonsense:80"):
+    distributed = pytest.importorskip("distributed", reason="distributed is not installed: pip install '.[cluster]'")
+    monkeypatch.setattr(jobs, "TIMEOUT", 1)
+    for address in ("tcp://127.0.0.1:1", "nonsense", "http://nonsense:80", "tls://127.0.0.1:1"):
         with pytest.raises(UsageError, match=f'scheduler: "{address}" cannot be reached'):
             run(worker_jobs.square, VALUES, scheduler=address)
+    # A client that the garbage collector would close stops the process for ever if another one starts just then
+    clients = [found for found in gc.get_objects() if isinstance(found, distributed.Client)]
+    assert {client.status for client in clients} <= {"closed"}

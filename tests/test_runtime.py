@@ -9,13 +9,16 @@ import importlib
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import drjit as dr
 import pytest
 
-from mi_diffind import runtime
+from mi_diffind import runtime, threads
 from mi_diffind.errors import DiffindError, UsageError
 from mi_diffind.runtime import ENV, MIN_LLVM, choose_llvm, library_version, system_libraries
+
+ROOT = Path(__file__).resolve().parents[1]
 
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="LLVM is searched for on Linux only")
 
@@ -157,18 +160,19 @@ def test_array_module():
 # -- in fresh processes ------------------------------------------------------------------------------------------------
 
 
-def python(code, setting=None, **extra):
+def python(code, setting=None, arguments=(), **extra):
     """Run ``code``; never accept that the process was killed by a signal."""
     environ = {k: v for k, v in os.environ.items() if k != ENV} | extra
     if setting is not None:
         environ[ENV] = setting
-    done = subprocess.run([sys.executable, "-c", code], env=environ, capture_output=True, text=True, timeout=300)
+    command = [sys.executable, "-c", code, *arguments]
+    done = subprocess.run(command, env=environ, capture_output=True, text=True, timeout=300)
     assert done.returncode >= 0, f"killed by signal {-done.returncode}:\n{done.stderr}"
     return done
 
 
-def succeeds(code, setting=None, **extra):
-    done = python(code, setting, **extra)
+def succeeds(code, setting=None, arguments=(), **extra):
+    done = python(code, setting, arguments, **extra)
     assert done.returncode == 0, done.stderr
     return done
 
@@ -188,6 +192,43 @@ def aborting():
     """An old LLVM that Dr.Jit loads all the same, and with which it would abort."""
     return old_library(15, 16, 17, 18)
 
+
+#: EXR files in a process of one core: by Mitsuba alone, where only one thread computes, and by commands.
+ONE_CORE = """
+import faulthandler, os, sys
+faulthandler.dump_traceback_later(120, exit=True)
+os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
+import mi_diffind, drjit as dr, mitsuba as mi, numpy as np
+from mi_diffind import cli, fitting, scenes
+from mi_diffind.maps.source import load_source
+assert dr.thread_count() == 2
+scene, table, folder = sys.argv[1:]
+os.chdir(folder)
+values = np.random.default_rng(1).random((40, 3, 3), np.float32)
+mi.Bitmap(values).write("stock.exr")
+assert np.array_equal(np.array(mi.Bitmap("stock.exr")), values)
+mi.set_variant("llvm_ad_rgb")
+with fitting.cores(True):
+    scenes.write_image("ours.exr", values)
+    assert np.array_equal(next(iter(load_source("ours.exr").maps)).values, values)
+    bitmap = {"type": "bitmap", "filename": "ours.exr", "raw": True}
+    assert scenes.load_dict({"type": "diffuse", "reflectance": bitmap}, parallel=False) is not None
+    assert dr.thread_count() == 1
+assert dr.thread_count() == 2
+assert cli.main(["render", scene, "-D", "width=8", "-D", "height=8", "--spp", "1", "-o", "render.exr"]) == 0
+assert cli.main(["decode", table, "-o", "decoded.exr", "--map", "roughness"]) == 0
+"""
+
+#: Kernels of threads that load a scene cannot be stored: files have at most 16 bytes, as on a full disk.
+FULL_DISK = """
+import faulthandler, resource, sys
+faulthandler.dump_traceback_later(60, exit=True)
+resource.setrlimit(resource.RLIMIT_FSIZE, (16, resource.RLIM_INFINITY))
+import mi_diffind, mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+mi.load_file(sys.argv[1])
+print("loaded")
+"""
 
 LIGHT = """
 import sys
@@ -465,3 +506,21 @@ def test_plugins_register_for_variants_set_later():
     succeeds(
         f"import mi_diffind, mitsuba as mi\nmi.set_variant('scalar_rgb')\nmi.set_variant('llvm_ad_mono')\n{RENDER}"
     )
+
+
+# -- little of a machine -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores of a process can be limited on Linux only")
+def test_one_core(tmp_path):
+    """Mitsuba waits for ever for the content of an EXR file if there is no second thread."""
+    tables = ROOT / "scenes" / "assets" / "tiles_filtered.npz"
+    done = succeeds(ONE_CORE, arguments=[ROOT / "tests" / "lamp.xml", tables, tmp_path], **{threads.ONE_CORE: ""})
+    assert done.stderr.count("this process has one core") == 1
+
+
+@linux
+def test_kernels_that_cannot_be_stored(tmp_path):
+    """Dr.Jit's warning waits neither for Python nor for a thread that holds it."""
+    done = succeeds(FULL_DISK, arguments=[ROOT / "scenes" / "rust.xml"], DRJIT_CACHE_DIR=str(tmp_path))
+    assert done.stdout.split() == ["loaded"] and "I/O error while writing" in done.stderr

@@ -218,6 +218,19 @@ def test_metrics():
     assert metrics.psnr(a, np.where(a > 0.5, a + 7, a)) < 40  # clipped, yet seen
     assert metrics.psnr(np.full_like(a, 3), np.full_like(a, 9)) == np.inf  # both white
     assert 0.01 < metrics.flip(a, b) < 1
+    signed = np.where(a > 0.5, 4, -0.2).astype(np.float32)
+    assert metrics.mae(a, a + signed) == pytest.approx(np.abs(signed).mean(), rel=1e-5)  # above 1 and below 0, too
+    assert metrics.compare(a, b) == {
+        "psnr_db": metrics.psnr(a, b),
+        "flip": metrics.flip(a, b),
+        "mae": metrics.mae(a, b),
+    }
+    # Normals of any length, 30 degrees from each other
+    n = rng.normal(size=(8, 8, 3))
+    aside = np.cross(n, rng.normal(size=(8, 8, 3)))
+    turned = np.sqrt(3) / 2 * n / np.linalg.norm(n, axis=-1, keepdims=True)
+    turned += 0.5 * aside / np.linalg.norm(aside, axis=-1, keepdims=True)
+    assert metrics.angle(n / 2 + 0.5, 3 * turned / 2 + 0.5) == pytest.approx(30, abs=1e-6)
 
 
 def test_folders_of_a_scene_are_searched(mi_rgb, tmp_path):

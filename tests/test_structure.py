@@ -17,6 +17,7 @@ FLOORS = (
         "interrupt",
         "files",
         "compat",
+        "threads",
         "mitsuba_versions",
         "runtime",
         "deadline",

@@ -6,6 +6,7 @@ import math
 import pytest
 
 from mi_diffind import units
+from mi_diffind.errors import UsageError
 from mi_diffind.tasks.image import memory_budget
 from mi_diffind.tasks.image.memory_budget import ImageBudget, explain, fit_bytes, paper_search, search
 from mi_diffind.units import parse_size
@@ -196,6 +197,18 @@ def test_explanations():
 def test_sizes_refuse_nonsense():
     with pytest.raises(ValueError, match="rows: found 0"):
         ImageBudget(0, 1, 4, 3)
+
+
+def test_more_than_fits_is_refused(monkeypatch):
+    """What fits exactly is allowed, one byte more is not."""
+    assert 2**28 < units.memory() < 2**45
+    monkeypatch.setattr(units, "memory", lambda: 3 * 2**30)
+    units.check_memory("batch", 10, 3 * 2**30)
+    with pytest.raises(UsageError, match="batch: found 1,000, which takes about 3 GiB of memory, this machine has 3"):
+        units.check_memory("batch", 1000, 3 * 2**30 + 1)
+    units.check_size("bytes", 2**20, 2**20)
+    with pytest.raises(UsageError, match="bytes: found 1,048,577 bytes, a table file holds at most 1,048,576"):
+        units.check_size("bytes", 2**20 + 1, 2**20)
 
 
 @pytest.mark.parametrize("threshold", [-3, 0, 1, 7, 99, 100, 250])

@@ -15,6 +15,7 @@ from ..indirection import DifferentiableArray
 from ..pages import SIDE_BITS, page_counts, page_shift
 from ..tables import PAGES, Table, TableError, allocate_pages, page_sides
 from ..task import Model
+from ..threads import threads_for_files
 from . import as_seen
 from .compressed import CompressedMaps, map_figure
 from .source import load_source
@@ -149,7 +150,7 @@ def _write(path: Path, values: np.ndarray, color_space: str) -> None:
     """Write a map as PNG or EXR."""
     import mitsuba as mi
 
-    with replacing(path) as temporary:
+    with replacing(path) as temporary, threads_for_files():
         if path.suffix.lower() == ".png":
             mi.Bitmap(np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)).write(str(temporary))
             return

@@ -30,6 +30,7 @@ from ..errors import DiffindError, reason
 from ..files import MOST_TEXT, OutsideError, irregular, path_by_name, shown
 from ..limits import Allowance, LimitError, json_bytes
 from ..picture_sizes import check_picture
+from ..threads import threads_for_files
 from ..units import memory
 from ..unused_keys import RecordedKeys, unused_note
 from .names import Content, content_of
@@ -310,7 +311,8 @@ def _read(path: Path) -> _ImageFile:
     # A TGA file has no signature
     file_format = mi.Bitmap.FileFormat.TGA if path.suffix.lower() == ".tga" else mi.Bitmap.FileFormat.Auto
     try:
-        bitmap = mi.Bitmap(str(path), file_format)
+        with threads_for_files():
+            bitmap = mi.Bitmap(str(path), file_format)
         values = np.array(bitmap)
         pixels = bitmap.pixel_format()
     except (RuntimeError, MemoryError, ValueError) as e:

@@ -1,5 +1,6 @@
 """Jobs for other processes, which know functions by their modules."""
 
+import ctypes
 import dataclasses
 import os
 import signal
@@ -44,16 +45,22 @@ def kill_parent_once(mark):
 
 
 def interrupt(x):
-    """Send this process a Ctrl-C if ``x`` is 2, and return it."""
-    if x == 2:
+    """Send this process a Ctrl-C if ``x`` is 2, and return it; a word fails after the Ctrl-C."""
+    if x == 2 or isinstance(x, str):
         signal.raise_signal(signal.SIGINT)
-    return x
+    return x * 1.0
 
 
 def write_process_and_sleep(path):
     """Write the number of this process to a file, and sleep."""
     Path(path).write_text(str(os.getpid()))
     time.sleep(60)
+
+
+def write_process_and_hold_python(path):
+    """Write the number of this process to a file, and sleep in C, where no other thread of Python runs."""
+    Path(path).write_text(str(os.getpid()))
+    ctypes.PyDLL(None).sleep(60)
 
 
 def fit_quickly(material):

@@ -173,6 +173,20 @@ def test_colours_are_averaged_linearly(ad, rng):
     np.testing.assert_allclose(found[3:], values[0, 1:3, :2].mean(axis=0), atol=1e-5)
 
 
+@pytest.mark.parametrize("first", ["albedo", "data"])
+def test_channels_of_two_maps_are_linear_if_both_are_colours(ad, rng, first):
+    """A channel that an sRGB map shares with data is interpolated as the first map of the two has it."""
+    codes = rng.integers(0, 256, (8, 8, 3), dtype=np.uint8)
+    source = from_arrays({first: codes, **{name: codes for name in ("albedo", "data") if name != first}})
+    pyramid = Pyramid.of(source, Layout.of(source), ad)
+    assert pyramid.layout.stored == 3
+    assert pyramid.is_linear("albedo") is (first == "albedo") and not pyramid.is_linear("data")
+    u, v = (ad.Float(aligned(x)) for x in centres(8, 8))
+    found = numpy_of(pyramid.interpolated(u, v, ad.Float(0))).reshape(8, 8, 3)
+    expected = to_linear(codes / 255) if pyramid.is_linear("albedo") else codes / 255
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
 def test_high_dynamic_range_is_averaged_as_it_is(ad, rng):
     values = (10 ** (4 * noise(rng, 8, 8, 3) - 1)).astype(np.float32)
     source = from_arrays({"image": values})

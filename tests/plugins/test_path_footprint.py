@@ -118,6 +118,23 @@ def test_rough_bounces_widen_and_samples_share(mi_rgb):
     assert side(MIRROR, 256) == pytest.approx(smooth / 8, rel=0.02)
 
 
+def test_cones_of_rough_bounces_add_up(mi_rgb):
+    """The variances of the angles add up over several bounces, each of the solid angle of its sample."""
+    from mi_diffind.plugins.support.differentials import Differentials
+
+    mi = mi_rgb
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.n, si.sh_frame = mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Normal3f(0, 0, 1))
+    ray, still = mi.Ray3f(mi.Point3f(0), mi.Vector3f(0, 0, -1)), mi.Vector3f(0)
+    cone = Differentials(still, still, still, still, mi.Float(0), mi.Float(0))
+    edges = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
+    spreads = []
+    for pdf, delta in ((400, False), (100, False), (1, True), (400, False)):
+        cone = cone.bounced(ray, si, mi.Vector3f(0, 0, 1), mi.Float(1), mi.Float(pdf), mi.Bool(delta), 0.5, edges)
+        spreads.append(cone.spread[0])
+    assert spreads == pytest.approx(0.025 * np.sqrt([1, 1 + 4, 1 + 4, 1 + 4 + 1]))
+
+
 def lit(mi, bsdf: dict, **more) -> dict:
     floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1]) @ scaled(mi, 3)}
     light = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 4]) @ scaled(mi, 1, 1, -1)}

@@ -127,6 +127,42 @@ def test_where_the_camera_is(mi_rgb, fields, place):
     same_light(mi, {**actual, **panes}, {**expected, **panes}, view)
 
 
+def test_far_from_the_origin(mi_rgb, fields):
+    """A ball under a sky does not shadow itself, where single precision is coarser than the offset of its rays."""
+    mi, images = mi_rgb, []
+    for place in (0, 0, 0), (60000, -20000, 10000):
+        at = mi.ScalarTransform4f().translate(list(place))
+        view = at @ mi.ScalarTransform4f().look_at([0, -5, 2.5], [0, 0, 0], [0, 0, 1])
+        film = {"type": "hdrfilm", "width": 24, "height": 24, "rfilter": {"type": "box"}}
+        loaded = mi.load_dict({
+            "type": "scene", "sky": {"type": "constant"}, "ball": {**solid(mi, "ball"), "to_world": at.scale(2.5)},
+            "sensor": {"type": "perspective", "fov": 20, "to_world": view, "film": film},
+        })  # fmt: skip
+        images.append(render(mi, loaded, spp=16, max_depth=2)[..., 0])
+    assert np.abs(images[0] - images[1]).mean() < 0.01 and images[0].std() > 0.1
+
+
+def test_shadows_of_a_sky_far_from_the_origin(mi_rgb, fields):
+    """From the lowest place of a small ball on a larger one: a place on the sky is rounded, its direction counts."""
+    from mi_diffind.plugins.support import distance_shapes
+
+    mi, count, far = mi_rgb, 4000, 1e7
+    at = mi.ScalarTransform4f().translate
+    small = {**solid(mi, "ball"), "to_world": at([far, 3, 0])}
+    large = {**solid(mi, "ball"), "to_world": at([far, 0, 0]).scale(2.5)}
+    loaded = mi.load_dict({"type": "scene", "sky": {"type": "constant"}, "small": small, "large": large})
+    shapes = distance_shapes.distance_shapes_in(loaded)
+    number = 1 + [shape.id() for shape in shapes].index("small")
+    hit = distance_shapes.ShapeHit(mi.UInt32(number), mi.Float(1), mi.Point3f(0, -0.4, 0))
+    si = dr.zeros(mi.SurfaceInteraction3f, count)
+    si.p, si.n = mi.Point3f(far, 2.6, 0), mi.Normal3f(0, -1, 0)
+    ds, _ = loaded.emitters()[0].sample_direction(si, mi.Point2f(np.random.default_rng(1).random((2, count))))
+    found, d = np.array(distance_shapes.occluded_from(shapes, hit, si, ds)), np.array(ds.d, np.float64).T
+    below = d[:, 1] < -0.05
+    expected = 2.6**2 * (1 - d[:, 1] ** 2) < 1
+    assert 0.05 < expected[below].mean() < 0.2 and (found != expected)[below].sum() <= 2
+
+
 @pytest.mark.parametrize("options", [{"max_depth": 1}, {"max_depth": 2, "hide_emitters": True}, {"rr_depth": 1}])
 def test_depths_and_hidden_emitters(mi_rgb, fields, options):
     mi, view = mi_rgb, ((0, -5, 8.0), (0, 0, 1))

@@ -193,6 +193,20 @@ def test_each_variant_has_classes_of_its_own():
     assert found[0] is not found[1] and found[0].__init__.__globals__ is not found[1].__init__.__globals__
 
 
+def test_after_a_purge_of_modules():
+    """Variants may be set before and after the package is imported anew, which registers its plugins."""
+    code = (
+        "import sys, mi_diffind, mitsuba as mi; mi.set_variant('llvm_ad_rgb')\n"
+        "def purge():\n"
+        "    for name in [n for n in sys.modules if n.split('.')[0] == 'mi_diffind']: del sys.modules[name]\n"
+        "purge(); mi.set_variant('llvm_ad_spectral'); import mi_diffind\n"
+        "print(type(mi_diffind.load_dict({'type': 'disney'})).__name__)\n"
+        "mi.set_variant('llvm_ad_rgb'); print(type(mi.load_dict({'type': 'neural_disney'})).__name__)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.split() == ["Disney", "NeuralDisney"], done.stderr
+
+
 def test_plugins_of_other_packages(mi_toys, tmp_path):
     """Shapes whose factories return native objects are found, compared and inspected; also by scalar variants."""
     mi = mi_toys

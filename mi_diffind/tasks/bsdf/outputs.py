@@ -11,6 +11,7 @@ import numpy as np
 from ... import tensor_files
 from ...errors import UsageError
 from ...files import replacing
+from ...threads import threads_for_files
 from . import tensor_file
 from .measurement import cosine
 from .pool import incident, outgoing
@@ -62,7 +63,7 @@ def write(model, output: Path, source, rows: int | None = None, seed: int | None
         shape = fields["rgb"].shape
         return [(output, f"{output.stat().st_size:,} bytes, {shape[1]} x {shape[0]} directions, for measured in RGB")]
     image, line = picture(model, source)
-    with replacing(output) as temporary:
+    with replacing(output) as temporary, threads_for_files():
         _bitmap(image).write(str(temporary))
     return [(output, line)]
 

@@ -1,5 +1,6 @@
 """Footprints of pixels: against finite differences of rays, and where there is nothing to measure."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import drjit as dr
@@ -162,6 +163,27 @@ def looking_along_z(mi, **given):
 
 def columns(found) -> np.ndarray:
     return np.array([[float(v.x[0]), float(v.y[0])] for v in found]).T
+
+
+def test_places_that_a_lens_sees_from_its_rim(mi_rgb):
+    """Directly seen, as from the middle of the lens; a pinhole there does not see the place along this line."""
+    mi = mi_rgb
+    pinhole = looking_along_z(mi)
+    lens = replace(pinhole, projection="thinlens", lens=dr.opaque(mi.Float, 0.3))
+    si = hit(mi)
+    si.wi = si.sh_frame.to_local(dr.normalize(mi.Vector3f(0.25, 0, -2)))
+    np.testing.assert_allclose(columns(footprint.footprint(si, lens)), np.diag([-0.04, -0.04]), atol=1e-6)
+    assert footprint.area(*footprint.footprint(si, pinhole))[0] < 0.04**2 / 2
+
+
+@pytest.mark.parametrize(("t", "cosine"), [(1.5, 0.3), (1, 0.3), (1.9, 0.9), (3, 0.9)])
+def test_the_larger_estimate_of_what_is_not_seen_directly(mi_rgb, t, cosine):
+    """Along the last segment onto a surface oblique to it, or from the sensor, 2 away, onto one that faces it."""
+    mi, cone = mi_rgb, looking_along_z(mi_rgb)
+    si = hit(mi, wi=mi.Vector3f(float(np.sqrt(1 - cosine**2)), 0, cosine), t=t)
+    corner = 0.02 * 3**-0.75  # a pixel at the film's corner, at 90° of view
+    expected = corner**2 * max(t**2 / cosine, 2**2)
+    assert footprint.area(*footprint.footprint(si, cone))[0] == pytest.approx(expected, rel=1e-4)
 
 
 def test_sources_hand_over_to_the_next_one(mi_rgb):
