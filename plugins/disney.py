@@ -12,7 +12,7 @@ from mi_diffind.tasks.disney.effects import Effects, find_effects
 from mi_diffind.tasks.disney.model import LOBES
 
 from . import Counterpart, Plugin
-from .support import properties, tables
+from .support import frozen, properties, tables
 from .support.manual import shared_parts
 from .support.tracked_parameter import tracked, when_outermost
 
@@ -271,6 +271,12 @@ class Disney(mi.BSDF):
         textures = {"base_color": self.base_color, **self.scalars, self.reflectance_name: self.reflectance}
         return {name: texture for name, texture in textures.items() if isinstance(texture, base_class("Texture"))}
 
+    def _numbers(self) -> dict:
+        """Return the parameters that are numbers, by name."""
+        rates = {name: self.rates[lobe] for lobe, name in self.RATES.items()}
+        is_number = isinstance(self.reflectance, dr.ArrayBase)
+        return {**rates, self.reflectance_name: self.reflectance} if is_number else rates
+
     def traverse(self, cb: mi.TraversalCallback):
         given = {"base_color": self.base_color, **self.scalars, self.reflectance_name: self.reflectance}
         for name, texture in given.items():
@@ -280,10 +286,7 @@ class Disney(mi.BSDF):
             cb.put(name, self.rates[lobe], mi.ParamFlags.NonDifferentiable)
 
     def parameters_changed(self, keys: list[str] = ()):
-        # A number assigned from Python is a literal, which would become part of the kernel and recompile it
-        if not isinstance(self.reflectance, base_class("Texture")):
-            dr.make_opaque(self.reflectance)
-        dr.make_opaque(self.rates)
+        frozen.make_opaque(self._numbers())
         self._prepare_constants()
 
     def _find_effects(self) -> tuple[Effects, dict[str, str]]:
@@ -318,11 +321,13 @@ class Disney(mi.BSDF):
                 for group in groups
                 if self._is_constant(group)
             }
-        known = {name: mi.Float(0) for name in effects.names}
-        dr.make_opaque(constant, known)
+        dr.make_opaque(constant)
         self._constant, self._constant_for = constant, effects
-        # What frozen functions traverse; they are recorded anew when they see other arrays here
-        self.held = [known, tables.arrays_of([constant, self._arrays()])]
+        self.held = [frozen.key(*self._settings()), tables.arrays_of([constant, self._arrays()])]
+
+    def _settings(self) -> tuple:
+        """Return what decides how the material is evaluated, besides arrays, for :func:`.frozen.key`."""
+        return self._constant_for.names, sorted(self._constant)
 
     def _arrays(self) -> dict:
         """Return the tables that are read, by name."""

@@ -29,7 +29,7 @@ from mi_diffind.tasks.bsdf.model import (
 from mi_diffind.tasks.bsdf.truth import MitsubaTruth
 
 from . import Counterpart, Plugin
-from .support import properties, tables, upsampling
+from .support import frozen, properties, tables, upsampling
 from .support.manual import shared_parts
 from .support.tracked_parameter import TrackedParameter, when_outermost
 
@@ -175,7 +175,7 @@ class NeuralBSDF(mi.BSDF):
         self.proxy = _parameters(self.model) if self.model.form.terms and not self.textures else {}
         self._tracked = [TrackedParameter(texture) for texture in self.textures.values()]
         self.known, self.member = [], None
-        tables.copy_entries(self._arrays())
+        self._entries = tables.Entries(tables.exposed(self._arrays()))
         self._compute_constants()
         if self.textures:
             when_outermost(self._compute_member)
@@ -208,7 +208,8 @@ class NeuralBSDF(mi.BSDF):
         tables.traverse(cb, tables.exposed(self._arrays()))
 
     def parameters_changed(self, keys: list[str] = ()):
-        tables.check_shapes(tables.exposed(self._arrays()))
+        self._entries.accept()
+        frozen.make_opaque({"scale": self.scale, **self.proxy})
         self._compute_constants()
         if self.textures:
             when_outermost(self._compute_member)
@@ -216,7 +217,8 @@ class NeuralBSDF(mi.BSDF):
 
     def _hold(self) -> None:
         """Keep all arrays that are read as an attribute, for frozen functions."""
-        self.held = tables.arrays_of([self.model, self.member, getattr(self, "constants", None)])
+        arrays = tables.arrays_of([self.model, self.member, getattr(self, "constants", None)])
+        self.held = [frozen.key(self.known, self._entries.shapes()), arrays]
 
     def _at(self, si, active):
         """Return the BSDF with its present parameters, and the mixture that samples it."""

@@ -29,7 +29,7 @@ from mi_diffind.tables import Table, TableError
 from mi_diffind.task import Task, stamp
 
 from . import properties
-from .tables import copy_entries, exposed
+from .tables import Entries, exposed
 
 STORAGES = ("uint8", "float32")
 
@@ -52,6 +52,7 @@ class SharedMaps:
 
     def __init__(self, image: CompressedMaps, arrays: dict, table: Table | None = None):
         self.image, self.arrays, self.table = image, arrays, table
+        self.entries = Entries(exposed(arrays))
         self._loaded = self.state()
         self._transforms = {}
 
@@ -97,7 +98,6 @@ def open_file(task: Task, path: str | Path, storage: str) -> SharedMaps:
 
     def load():
         model = task.model(task.load(path), mi.TensorXf, storage)
-        copy_entries(model.arrays)
         return SharedMaps(model.image, model.arrays, model.table)
 
     return shared((task.name, str(path.resolve()), *stamp(path), storage, mi.TensorXf), load)
