@@ -94,7 +94,10 @@ class MapTexture(base_class("Texture")):
     def parameters_changed(self, keys: list[str] = ()):
         self._shared.entries.accept()
         self._update_transformation()
+        emits = self._positions is not None
         self._clear_cache()
+        if emits:  # now, since a frozen function could not compute it
+            self._sampled()
 
     def _update_transformation(self) -> None:
         m = self.to_uv.matrix
@@ -292,6 +295,11 @@ class MapTexture(base_class("Texture")):
     def _sampled(self) -> PositionDistribution:
         self._check_cache()
         if self._positions is None:
+            if dr.flag(dr.JitFlag.FreezingScope):
+                raise RuntimeError(
+                    f'the texture "{self.id()}": a frozen function (dr.freeze) cannot compute the distribution of its '
+                    f"light, render the scene once before"
+                )
             self._positions = PositionDistribution.of(self._decoded(), self.wrap_mode)
         return self._positions
 

@@ -5,7 +5,7 @@ from __future__ import annotations  # Delayed parsing of type annotations
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind import compat, srgb
+from mi_diffind import memory, srgb
 from mi_diffind.maps.pyramid import TexelPyramid
 
 from . import Plugin
@@ -140,7 +140,7 @@ class MipMap(FilteredTexture):
             data, channels = self._data.tensor, self.map.channels
             if data.ndim != 3 or data.shape[2] != channels or 0 in data.shape:
                 shape = tuple(data.shape)
-                compat.assign(data, self._data.accepted)
+                memory.assign(data, self._data.accepted)
                 raise RuntimeError(f'parameter "data": has the shape {shape}, expected (height, width, {channels})')
             self._data.accepted = dr.detach(data)
             self._shared = SharedMaps(TexelPyramid(self._entry, data, self.image.border), {})

@@ -2,6 +2,8 @@
 
 from __future__ import annotations  # Delayed parsing of type annotations
 
+import copy
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -234,6 +236,7 @@ class NeuralBSDF(mi.BSDF):
         bsdf = self.model.bsdf
         if self.proxy:
             attached = dr.grad_enabled(list(self.proxy.values()))
+            bsdf = copy.copy(bsdf)  # what is traced here must not outlive the trace
             bsdf.proxy = _proxy(self.proxy, self.model.form) if attached else self.constants
         return bsdf, self.model.mixture
 

@@ -18,6 +18,7 @@ FLOORS = (
         "files",
         "compat",
         "mitsuba_versions",
+        "memory",
         "runtime",
         "deadline",
         "progress",

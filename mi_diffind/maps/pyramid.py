@@ -19,7 +19,7 @@ from types import ModuleType
 import drjit as dr
 import numpy as np
 
-from .. import compat, lookup, srgb
+from .. import compat, lookup, memory, srgb
 from ..indirection import aligned
 from . import components
 from .compressed import FilteredMaps
@@ -81,7 +81,7 @@ class Pyramid(FilteredMaps):
     def _hold(self, texels, offsets: np.ndarray) -> None:
         """Keep the texels and the levels' offsets in memory of Dr.Jit: frozen functions take NumPy's for constants."""
         offsets = self.types.UInt32(offsets.astype(np.uint32))
-        self._texels, self._offsets = compat.owned(texels), compat.owned(offsets)
+        self._texels, self._offsets = memory.owned(texels), memory.owned(offsets)
         dr.eval(self._texels)
 
     @staticmethod

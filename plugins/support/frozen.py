@@ -13,7 +13,7 @@ import hashlib
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind import compat
+from mi_diffind import compat, memory
 
 #: Types of Dr.Jit's literals that stand for the digits of a key.
 _DIGITS = ("Int8", "UInt8", "Int32", "UInt32", "Int64", "UInt64", "Float16", "Float64")
@@ -37,12 +37,12 @@ def make_opaque(numbers: dict) -> None:
     """Make parameters (name → number or colour, Dr.Jit arrays) inputs of kernels, after an assignment.
 
     A number of Python that was assigned would be part of the kernel, which would be compiled anew for the next one.
-    Raises ``RuntimeError`` for several numbers where one is allowed; the first of them is kept.
+    Raises ``RuntimeError`` for several numbers where one is allowed; the first of them, or 0, is kept.
     """
     for name, value in numbers.items():
         width = dr.width(value)
         if width != 1:
-            compat.assign(value, dr.gather(type(value), dr.detach(value), 0) if width else dr.zeros(type(value)))
+            memory.assign(value, dr.gather(type(value), dr.detach(value), 0) if width else dr.zeros(type(value)))
         dr.make_opaque(value)
         if width != 1:
             raise RuntimeError(f'parameter "{name}": found {width} values, allowed is one')

@@ -7,7 +7,7 @@ from types import ModuleType
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind import compat
+from mi_diffind import compat, memory
 from mi_diffind.task import Model, Task
 
 from . import properties
@@ -53,7 +53,7 @@ class Entries:
         self.accept()
 
     def accept(self) -> None:
-        """Take assigned entries over, into memory of Dr.Jit (:func:`.compat.owned`).
+        """Take assigned entries over, into memory of Dr.Jit (:func:`.memory.owned`).
 
         Raises ``RuntimeError`` for those of another shape, after the entries before are put back: a read would go
         beyond the end.
@@ -63,9 +63,9 @@ class Entries:
             tensor, accepted = _tensor(entries), self._accepted.get(name)
             if fault := self._fault(name, entries):
                 refused.append(f'parameter "tables.{name}": {fault}')
-                compat.assign(tensor, accepted)
+                memory.assign(tensor, accepted)
             elif accepted is None or compat.identity(accepted) != compat.identity(tensor):
-                compat.assign(tensor, type(tensor)(compat.owned(tensor.array), tensor.shape))
+                memory.assign(tensor, type(tensor)(memory.owned(tensor.array), tensor.shape))
             self._accepted[name] = dr.detach(tensor)  # a reference keeps the variable's index from being used again
         if refused:
             raise RuntimeError(refused[0])
