@@ -13,6 +13,7 @@ from mi_diffind.tasks.disney.model import LOBES
 
 from . import Counterpart, Plugin
 from .support import frozen, properties, tables
+from .support.directions import are_directions
 from .support.manual import shared_parts
 from .support.tracked_parameter import tracked, when_outermost
 
@@ -394,15 +395,14 @@ class Disney(mi.BSDF):
         Directions are safe to compute with in every lane.
         """
         inside, above = point.enter(wo)
-        active = active & point.above & above
+        active = active & point.above & above & are_directions(point.wi, inside)
         up = mi.Vector3f(0, 0, 1)
-        wi, inside = dr.select(active, point.wi, up), dr.select(active, inside, up)
-        return wi, inside, active & _are_directions(wi, inside)
+        return dr.select(active, point.wi, up), dr.select(active, inside, up), active
 
     def _value(self, point, coefficients, effects, lobes, wo, directions):
         wi, inside, active = directions
         value = self.decoder.value(coefficients, effects, lobes, point.parameters, wi, inside)
-        value = mi.UnpolarizedSpectrum(value) * point.factor(wo)
+        value = mi.UnpolarizedSpectrum(value) * point.factor(wo, active)
         return mi.depolarizer(mi.Spectrum(dr.select(active, value, 0)))
 
     def _density(self, point, coefficients, effects, rates, directions):
@@ -506,11 +506,6 @@ def _visible_normal(alpha: tuple, wi: mi.Vector3f, sample: mi.Point2f) -> mi.Nor
     return dr.normalize(mi.Normal3f(xx * half.x, dr.fma(yx, half.x, yy * half.y), half.z))
 
 
-def _are_directions(wi, wo):
-    """Return the lanes in which neither direction is NaN or much longer than 1."""
-    return model.geometry(wi, wo).h2 < 100
-
-
 class ShadedPoint:
     """Surface point as the lobes see it: parameters, and the direction ``wi`` in the frame that they reflect in.
 
@@ -531,8 +526,8 @@ class ShadedPoint:
         """Return a direction of this frame in that of the surface."""
         return wo
 
-    def factor(self, wo: mi.Vector3f) -> mi.Float | float:
-        """Return a factor on the values towards a direction of the surface's frame."""
+    def factor(self, wo: mi.Vector3f, active: mi.Bool) -> mi.Float | float:
+        """Return a factor on the values towards a direction of the surface's frame, in active lanes."""
         return 1.0
 
 

@@ -11,6 +11,7 @@ from mi_diffind.tasks.ggx.model import Roughness
 
 from . import Counterpart, Plugin
 from .support import frozen, properties, tables
+from .support.directions import are_directions
 from .support.manual import shared_parts
 from .support.tracked_parameter import TrackedParameter, when_outermost
 
@@ -222,8 +223,7 @@ class NeuralGGX(mi.BSDF):
 
     def _prepare(self, ctx, si, wo, active):
         """Return directions that are safe to compute with in every lane, and the mask of lanes whose result counts."""
-        # Directions have length 1; the comparison is false for NaN and infinities
-        active = active & (si.wi.z > 0) & (wo.z > 0) & (dr.squared_norm(si.wi) + dr.squared_norm(wo) < 100)
+        active = active & (si.wi.z > 0) & (wo.z > 0) & are_directions(si.wi, wo)
         if not ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0):
             active = mi.Bool(False)
         up = mi.Vector3f(0, 0, 1)

@@ -294,10 +294,11 @@ class MapPoint(ShadedPoint):
             wo = s * wo.x + t * wo.y + n * wo.z
         return self._flipped(wo)
 
-    def factor(self, wo):
+    def factor(self, wo, active):
         factor = 1.0
         if self._frame is not None:
-            factor = shadowing(self._frame[2], self._flipped(wo))
+            # The derivative with respect to the normal is 0 in other lanes, times a number
+            factor = shadowing(self._frame[2], dr.select(active, self._flipped(wo), mi.Vector3f(0, 0, 1)))
         return factor if self.opacity is None else factor * self.opacity
 
 
