@@ -340,9 +340,9 @@ def srgb_coefficients() -> tuple:
 def normal_edges(pi, si, ray, active) -> tuple:
     """Return two vectors in space along which the shading normal changes by ``si.dn_du`` and ``si.dn_dv``.
 
-    They are ``mi.Vector3f``; ``si`` is of ``pi.compute_surface_interaction(ray)`` with ``RayFlags.dNSdUV``. The vectors
-    are ``dp_du`` and ``dp_dv``, but edges of the triangle for meshes, where Mitsuba 3.9 gives derivatives in
-    barycentric coordinates.
+    They are ``mi.Vector3f``; ``si`` is that of ``pi`` with derivatives of normals (:func:`.ray_flags`). The vectors are
+    ``dp_du`` and ``dp_dv``, but edges of the triangle for meshes, where Mitsuba 3.9 gives derivatives in barycentric
+    coordinates.
     """
     import drjit as dr
     import mitsuba as mi

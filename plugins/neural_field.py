@@ -8,7 +8,7 @@ from functools import cache
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind import compat
+from mi_diffind import compat, mitsuba_versions
 from mi_diffind.tables import TableError
 from mi_diffind.tasks.radiance.march import OPAQUE
 
@@ -615,7 +615,7 @@ def integrator() -> type:
 
             # Across a smooth surface
             arrived = active & (through > 0) & ~solid
-            flags = mi.RayFlags.All | mi.RayFlags.dNSdUV if carried else mi.RayFlags.All
+            flags = mitsuba_versions.ray_flags(curvature=carried)
             si = pi.compute_surface_interaction(ray, ray_flags=flags, active=arrived)
             bsdf = si.bsdf(ray)
             going = arrived & si.is_valid() & (path.count < self.smooth_depth)

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_diffind import compat
-from mi_diffind.mitsuba_versions import base_class
+from mi_diffind.mitsuba_versions import base_class, normal_mapped
 from mi_diffind.tasks.disney import TASK as DISNEY
 from mi_diffind.tasks.disney.model import clamp
 from mi_diffind.tasks.shading.material import frame, shadowing
@@ -177,6 +177,8 @@ class NeuralMaterial(Disney):
             )
         self._is_anisotropic |= extras or "anisotropic" in self.maps.maps
         sides = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide if self.two_sided else mi.BSDFFlags.FrontSide
+        if "normal" in self.maps.maps:
+            sides = sides | normal_mapped()
         self._set_flags(self.maps.is_spatially_varying(), self._is_anisotropic, sides)
         if "opacity" in self.maps.maps:
             self.m_components = [*self.m_components, mi.BSDFFlags.Null | mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide]

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from mi_diffind import compat, runtime
+from mi_diffind.mitsuba_versions import ray_flags
 
 SCENE = Path(__file__).resolve().parent / "lamp.xml"
 
@@ -393,7 +394,7 @@ def test_edges_of_shading_normals(mi_rgb):
             o = mi_rgb.Point3f(middle.tolist()) + mi_rgb.Vector3f(x + step * float(radius), 0.3 * x, 0)
             ray = mi_rgb.Ray3f(o + mi_rgb.Vector3f(0, 0, 3 * float(radius)), mi_rgb.Vector3f(0, 0, -1))
             pi = scene.ray_intersect_preliminary(ray)
-            found.append((pi, pi.compute_surface_interaction(ray, mi_rgb.RayFlags.All | mi_rgb.RayFlags.dNSdUV), ray))
+            found.append((pi, pi.compute_surface_interaction(ray, ray_flags(curvature=True)), ray))
         (pi, si, ray), (other, moved, _) = found
         edges = compat.normal_edges(pi, si, ray, mi_rgb.Bool(True))
         basis = np.stack([np.array(v).T for v in edges], axis=-1)
