@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import functools
 import os
 import re
 import struct
@@ -242,26 +241,6 @@ def on_variant_change(callback) -> None:
     import mitsuba as mi
 
     mi.detail.add_variant_callback(callback)
-
-
-def before_render(callback) -> None:
-    """Have ``mi.render`` call ``callback(scene, integrator, sensor)`` first, with the arguments given to it.
-
-    Mitsuba tells plugins nothing of renders: scenes, sensors and shapes have no method in Python that one calls. The
-    function is the same in all variants, under two names. It stays as it is for everything else: its arguments, errors,
-    documentation and signature.
-    """
-    import mitsuba as mi
-    from mitsuba.python import util
-
-    render = util.render
-
-    @functools.wraps(render)
-    def checked_render(scene, params=None, sensor=0, integrator=None, *args, **kwargs):
-        callback(scene, integrator, sensor)
-        return render(scene, params, sensor, integrator, *args, **kwargs)
-
-    util.render = mi.render = checked_render
 
 
 def is_recording() -> bool:

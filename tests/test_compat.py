@@ -10,7 +10,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from mi_diffind import compat, runtime
+from mi_diffind import compat, runtime, turns
 from mi_diffind.mitsuba_versions import ray_flags
 
 SCENE = Path(__file__).resolve().parent / "lamp.xml"
@@ -203,7 +203,7 @@ def test_callback_of_renders(mi_rgb, monkeypatch):
     monkeypatch.setattr(mi.util, "render", mi.util.render)
     monkeypatch.setattr(mi, "render", mi.render)
     with hook("mi.render, mitsuba.python.util.render"):
-        compat.before_render(lambda *arguments: calls.append(arguments))
+        turns.before_render(lambda *arguments: calls.append(arguments))
         scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective"}})
         tracer = mi.load_dict({"type": "depth"})
         for arguments, more in (((scene, None, 0, tracer, 3), {}), ((), {"integrator": tracer, "scene": scene})):

@@ -19,6 +19,7 @@ FLOORS = (
         "compat",
         "mitsuba_versions",
         "memory",
+        "turns",
         "runtime",
         "deadline",
         "progress",
