@@ -1,8 +1,5 @@
 """Python threads that load and render wait for one another."""
 
-import inspect
-import subprocess
-import sys
 import threading
 
 import mi_diffind as md
@@ -16,31 +13,6 @@ def scene() -> dict:
         "type": "scene", "integrator": {"type": "path"}, "sky": {"type": "constant"},
         "sensor": {"type": "perspective", "film": film}, "ball": ball,
     }  # fmt: skip
-
-
-THREADS = f"""
-import threading
-import mi_diffind as md, mitsuba as mi, numpy as np
-{inspect.getsource(scene)}
-mi.set_variant("llvm_ad_rgb")
-
-def picture():
-    return np.array(mi.render(md.load_dict(scene()), spp=2, seed=1))
-
-expected, found = picture(), []
-threads = [threading.Thread(target=lambda: [found.append(picture()) for _ in range(4)]) for _ in range(3)]
-for thread in threads:
-    thread.start()
-for thread in threads:
-    thread.join()
-assert len(found) == 12 and all((image == expected).all() for image in found), len(found)
-"""
-
-
-def test_threads_with_scenes_of_their_own():
-    """Without turns, this process ends by a signal, or images are missing."""
-    result = subprocess.run([sys.executable, "-c", THREADS], capture_output=True, text=True, timeout=120)
-    assert result.returncode == 0, result.stderr[-1500:]
 
 
 def test_loads_and_renders_wait(mi_rgb):
@@ -57,7 +29,7 @@ def test_loads_and_renders_wait(mi_rgb):
 
 
 def test_scenes_of_threads_end_in_a_turn(mi_rgb):
-    """A scene of a thread is kept until the next load or render if nothing refers to it, one of the main thread is not."""
+    """A scene of a thread that nothing refers to ends at the next load or render; one of the main thread at once."""
     kept = []
     with turns.turn():
         pass
