@@ -8,11 +8,13 @@ not frozen.
 from itertools import pairwise
 
 import drjit as dr
+import learned_bsdfs
 import numpy as np
 import plugin_examples as examples
 import pytest
 
 from mi_diffind import compat
+from mi_diffind.tables import save_table
 
 #: Seed of all pictures that are compared.
 SEED = 3
@@ -265,3 +267,35 @@ def test_textures_attached_to_another_sensor(mi_rgb):
         np.testing.assert_allclose(render(scene), picture(mi, scene), atol=1e-6)
         seen.append(render(scene))
     assert np.abs(seen[1] - seen[0]).max() > 1e-3
+
+
+def test_families(mi_rgb, tmp_path):
+    """Members are computed anew with each change of a number or a table; numbers compile no kernels."""
+    mi = mi_rgb
+    save_table(tmp_path / "family.npz", learned_bsdfs.handmade_family())
+    parts = examples.scene_parts(mi, "neural_bsdf", "float32")
+    file = str(tmp_path / "family.npz")
+    parts["shape"]["bsdf"] = {"type": "neural_bsdf", "filename": file, "storage": "float32"}
+    scene = mi.load_dict({**parts, "sensor": examples.sensor(mi)}, parallel=False)
+    params, keys = examples.exposed(mi, scene, "neural_bsdf")
+    keys = [key for key in keys if isinstance(params[key], dr.ArrayBase)]
+    assert len(keys) == 8
+    render, _ = frozen(mi)
+    picture(mi, scene)
+    render(scene)
+    for key in keys:
+        start = params[key].numpy().copy()
+        for factor in (0.9, 0.5):
+            params[key] = type(params[key])(np.array(np.float32(factor) * start))
+            params.update()
+            np.testing.assert_allclose(render(scene), picture(mi, scene), atol=1e-6, err_msg=f"{key} {factor}")
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        for turn in range(3):
+            for key in keys:
+                if not dr.is_tensor_v(params[key]):
+                    params[key] = 0.3 + 0.1 * turn
+            params.update()
+            picture(mi, scene)
+            kernels = dr.kernel_history()
+            dr.kernel_history_clear()
+            assert turn == 0 or not compat.was_compiled(kernels)
