@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import functools
 import os
 import re
 import struct
@@ -244,26 +243,6 @@ def on_variant_change(callback) -> None:
     mi.detail.add_variant_callback(callback)
 
 
-def before_render(callback) -> None:
-    """Have ``mi.render`` call ``callback(scene, integrator, sensor)`` first, with the arguments given to it.
-
-    Mitsuba tells plugins nothing of renders: scenes, sensors and shapes have no method in Python that one calls. The
-    function is the same in all variants, under two names. It stays as it is for everything else: its arguments, errors,
-    documentation and signature.
-    """
-    import mitsuba as mi
-    from mitsuba.python import util
-
-    render = util.render
-
-    @functools.wraps(render)
-    def checked_render(scene, params=None, sensor=0, integrator=None, *args, **kwargs):
-        callback(scene, integrator, sensor)
-        return render(scene, params, sensor, integrator, *args, **kwargs)
-
-    util.render = mi.render = checked_render
-
-
 def is_recording() -> bool:
     """Return whether Dr.Jit records a loop or a call symbolically, as integrators do while they trace a scene."""
     import drjit as dr
@@ -340,9 +319,9 @@ def srgb_coefficients() -> tuple:
 def normal_edges(pi, si, ray, active) -> tuple:
     """Return two vectors in space along which the shading normal changes by ``si.dn_du`` and ``si.dn_dv``.
 
-    They are ``mi.Vector3f``; ``si`` is of ``pi.compute_surface_interaction(ray)`` with ``RayFlags.dNSdUV``. The vectors
-    are ``dp_du`` and ``dp_dv``, but edges of the triangle for meshes, where Mitsuba 3.9 gives derivatives in
-    barycentric coordinates.
+    They are ``mi.Vector3f``; ``si`` is that of ``pi`` with derivatives of normals (:func:`.ray_flags`). The vectors are
+    ``dp_du`` and ``dp_dv``, but edges of the triangle for meshes, where Mitsuba 3.9 gives derivatives in barycentric
+    coordinates.
     """
     import drjit as dr
     import mitsuba as mi

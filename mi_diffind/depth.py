@@ -34,6 +34,7 @@ import numpy as np
 
 from . import compat, scenes
 from .interrupt import interruptible
+from .mitsuba_versions import ray_flags
 from .plugins.support import distance_shapes as sdf
 from .progress import progress_bar
 
@@ -150,7 +151,7 @@ def _follow(scene, shapes, sampler, ray, β, light, path, paths, deepest, limit)
         if dr.hint(bool(shapes), mode="scalar"):
             hit = sdf.intersect(shapes, ray.o, ray.d, dr.minimum(pi.t, ray.maxt), active, rest)
             pi.t = dr.select(hit.number > 0, dr.inf, pi.t)
-        si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+        si = pi.compute_surface_interaction(ray, ray_flags(), active)
         if dr.hint(bool(shapes), mode="scalar"):
             si = sdf.interaction(shapes, hit, ray, si, active)
         bsdf = si.bsdf(ray)

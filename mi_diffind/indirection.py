@@ -19,6 +19,7 @@ from drjit import nn
 from . import lookup
 from .bits import as_words, pack_bits, unpack_bits
 from .compat import module_of
+from .memory import owned
 from .runtime import llvm_problem
 
 __all__ = ["DifferentiableArray", "Indirection", "fold"]
@@ -248,9 +249,7 @@ class DifferentiableArray(nn.Module):
                 packed = as_words(pack_bits(padded, bits), spare=2)
             else:
                 packed = lookup.pack(codes, result.border)
-            words = aligned(packed.shape, np.uint32)
-            words[...] = packed
-            result.data = UInt32(words)
+            result.data = owned(device_array(UInt32, packed))
         else:
             tensor = module_of(dtype).TensorXf16 if storage == "float16" else module_of(dtype).TensorXf
             result.data = padded_tensor(tensor, values, result.resolution, result.channels)
@@ -551,7 +550,7 @@ def padded_tensor(dtype, values: np.ndarray, resolution, channels: int):
     stored = aligned(shape, np.float16 if half else np.float32)
     stored[..., :channels] = values
     stored[..., channels:] = 0
-    return dtype(stored)
+    return dtype(owned(dtype(stored).array), shape)
 
 
 def aligned(shape, dtype) -> np.ndarray:

@@ -29,6 +29,31 @@ def footprint_of(si) -> tuple | None:
     return mi.Vector2f(matrix[0, 0], matrix[1, 0]), mi.Vector2f(matrix[0, 1], matrix[1, 1])
 
 
+def ray_flags(curvature: bool = False) -> int:
+    """Return the ``mi.RayFlags`` for all of an interaction, the footprint included, and with ``curvature`` ``dn_du``.
+
+    In Mitsuba 3.10, ``Default`` is all but the derivatives of normals, ``NormalPartials``; ``All`` is the shading frame
+    alone. There ``dNSdUV`` is gone.
+    """
+    import mitsuba as mi
+
+    flags = mi.RayFlags
+    if hasattr(flags, "NormalPartials"):
+        return flags.Default | flags.NormalPartials if curvature else flags.Default
+    return flags.All | flags.dNSdUV if curvature else flags.All
+
+
+def normal_mapped() -> int:
+    """Return the ``mi.BSDFFlags`` of a BSDF whose normals are those of a map, 0 in Mitsuba 3.9, which has none.
+
+    In Mitsuba 3.10, meshes align the shading frame with uv for such BSDFs; where uv are mirrored, the frame is
+    left-handed (``si.frame_flipped``), so that directions and normals in it need no change.
+    """
+    import mitsuba as mi
+
+    return getattr(mi.BSDFFlags, "NormalMapped", 0)
+
+
 def shapes_in_python() -> bool:
     """Return whether ``mi.Shape`` can be derived from in Python (Mitsuba 3.10, #1967), not only ``mi.Mesh``.
 

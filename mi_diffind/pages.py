@@ -21,7 +21,8 @@ from drjit import nn
 from . import lookup
 from .bits import as_words, pack_bits, unpack_bits
 from .compat import module_of
-from .indirection import DifferentiableArray, aligned, coordinates_of, fold, padded_tensor, require_backend
+from .indirection import DifferentiableArray, coordinates_of, device_array, fold, padded_tensor, require_backend
+from .memory import owned
 
 __all__ = [
     "PagedArray",
@@ -118,9 +119,7 @@ class PagedArray(DifferentiableArray):
         index = np.cumsum(flat.prod(axis=1)) - flat.prod(axis=1)
         for axis in range(self.dims):
             index = index << bits | (flat[:, axis] - 1)
-        words = aligned(index.shape, np.uint32)
-        words[...] = index
-        return module_of(dtype).UInt32(words)
+        return owned(device_array(module_of(dtype).UInt32, index))
 
     def _form(self) -> dict:
         return {"sizes": self.sizes, "shift": self.shift}
@@ -164,9 +163,7 @@ class PagedArray(DifferentiableArray):
         result.scale, result.offset = (tuple(map(float, numbers)) for numbers in affine)
         result.bits = bits
         packed = as_words(pack_bits(codes, bits), spare=2)
-        words = aligned(packed.shape, np.uint32)
-        words[...] = packed
-        result.data = module.UInt32(words)
+        result.data = owned(device_array(module.UInt32, packed))
         return result
 
     def codes(self) -> np.ndarray:

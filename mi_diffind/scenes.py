@@ -24,6 +24,7 @@ from .runtime import use_variant
 from .scene_checks import NEEDS, SceneError, check_measured, check_renderable, check_size, use_slashes
 from .task import tasks
 from .threads import threads_for_files
+from .turns import in_turn
 
 #: Integrators that follow paths to a ``max_depth``, and the depth of each where the scene gives none (-1: infinite).
 MAX_DEPTHS = {
@@ -218,11 +219,13 @@ def _is_scene(value) -> bool:
     return isinstance(value, mi.Scene)
 
 
+@in_turn
 def load(path: str | os.PathLike, defines: dict[str, str] | None = None, **options):
     """Return the loaded scene of a file; ``options`` are those of :meth:`ParsedScene.load`. It ``needs`` nothing."""
     return ParsedScene(path, defines).load(**{"needs": (), **options})
 
 
+@in_turn
 def load_file(path: str | os.PathLike, parallel: bool = True, optimize: bool = True, **defines):
     """Load a scene file as ``mi.load_file`` does, prepared for filtering textures and for stored shapes.
 
@@ -243,6 +246,7 @@ def load_file(path: str | os.PathLike, parallel: bool = True, optimize: bool = T
         return _build(config, state, _integrators(state), plugins.warn)
 
 
+@in_turn
 def load_dict(scene: dict, parallel: bool = True, optimize: bool = True):
     """Load a scene or an object from a dictionary as ``mi.load_dict`` does, prepared as by :func:`load_file`."""
     use_variant()
@@ -251,6 +255,7 @@ def load_dict(scene: dict, parallel: bool = True, optimize: bool = True):
     return _build(config, state, _integrators(state), plugins.warn)
 
 
+@in_turn
 def load_string(text: str, parallel: bool = True, optimize: bool = True, **defines):
     """Load a scene from a text of XML as ``mi.load_string`` does, prepared as by :func:`load_file`."""
     use_variant()

@@ -12,7 +12,8 @@ from mi_diffind.tasks.disney.effects import Effects, find_effects
 from mi_diffind.tasks.disney.model import LOBES
 
 from . import Counterpart, Plugin
-from .support import properties, tables
+from .support import frozen, properties, tables
+from .support.directions import are_directions
 from .support.manual import shared_parts
 from .support.tracked_parameter import tracked, when_outermost
 
@@ -271,6 +272,12 @@ class Disney(mi.BSDF):
         textures = {"base_color": self.base_color, **self.scalars, self.reflectance_name: self.reflectance}
         return {name: texture for name, texture in textures.items() if isinstance(texture, base_class("Texture"))}
 
+    def _numbers(self) -> dict:
+        """Return the parameters that are numbers, by name."""
+        rates = {name: self.rates[lobe] for lobe, name in self.RATES.items()}
+        is_number = isinstance(self.reflectance, dr.ArrayBase)
+        return {**rates, self.reflectance_name: self.reflectance} if is_number else rates
+
     def traverse(self, cb: mi.TraversalCallback):
         given = {"base_color": self.base_color, **self.scalars, self.reflectance_name: self.reflectance}
         for name, texture in given.items():
@@ -280,10 +287,7 @@ class Disney(mi.BSDF):
             cb.put(name, self.rates[lobe], mi.ParamFlags.NonDifferentiable)
 
     def parameters_changed(self, keys: list[str] = ()):
-        # A number assigned from Python is a literal, which would become part of the kernel and recompile it
-        if not isinstance(self.reflectance, base_class("Texture")):
-            dr.make_opaque(self.reflectance)
-        dr.make_opaque(self.rates)
+        frozen.make_opaque(self._numbers())
         self._prepare_constants()
 
     def _find_effects(self) -> tuple[Effects, dict[str, str]]:
@@ -318,11 +322,13 @@ class Disney(mi.BSDF):
                 for group in groups
                 if self._is_constant(group)
             }
-        known = {name: mi.Float(0) for name in effects.names}
-        dr.make_opaque(constant, known)
+        dr.make_opaque(constant)
         self._constant, self._constant_for = constant, effects
-        # What frozen functions traverse; they are recorded anew when they see other arrays here
-        self.held = [known, tables.arrays_of([constant, self._arrays()])]
+        self.held = [frozen.key(*self._settings()), tables.arrays_of([constant, self._arrays()])]
+
+    def _settings(self) -> tuple:
+        """Return what decides how the material is evaluated, besides arrays, for :func:`.frozen.key`."""
+        return self._constant_for.names, sorted(self._constant)
 
     def _arrays(self) -> dict:
         """Return the tables that are read, by name."""
@@ -389,15 +395,14 @@ class Disney(mi.BSDF):
         Directions are safe to compute with in every lane.
         """
         inside, above = point.enter(wo)
-        active = active & point.above & above
+        active = active & point.above & above & are_directions(point.wi, inside)
         up = mi.Vector3f(0, 0, 1)
-        wi, inside = dr.select(active, point.wi, up), dr.select(active, inside, up)
-        return wi, inside, active & _are_directions(wi, inside)
+        return dr.select(active, point.wi, up), dr.select(active, inside, up), active
 
     def _value(self, point, coefficients, effects, lobes, wo, directions):
         wi, inside, active = directions
         value = self.decoder.value(coefficients, effects, lobes, point.parameters, wi, inside)
-        value = mi.UnpolarizedSpectrum(value) * point.factor(wo)
+        value = mi.UnpolarizedSpectrum(value) * point.factor(wo, active)
         return mi.depolarizer(mi.Spectrum(dr.select(active, value, 0)))
 
     def _density(self, point, coefficients, effects, rates, directions):
@@ -501,11 +506,6 @@ def _visible_normal(alpha: tuple, wi: mi.Vector3f, sample: mi.Point2f) -> mi.Nor
     return dr.normalize(mi.Normal3f(xx * half.x, dr.fma(yx, half.x, yy * half.y), half.z))
 
 
-def _are_directions(wi, wo):
-    """Return the lanes in which neither direction is NaN or much longer than 1."""
-    return model.geometry(wi, wo).h2 < 100
-
-
 class ShadedPoint:
     """Surface point as the lobes see it: parameters, and the direction ``wi`` in the frame that they reflect in.
 
@@ -526,8 +526,8 @@ class ShadedPoint:
         """Return a direction of this frame in that of the surface."""
         return wo
 
-    def factor(self, wo: mi.Vector3f) -> mi.Float | float:
-        """Return a factor on the values towards a direction of the surface's frame."""
+    def factor(self, wo: mi.Vector3f, active: mi.Bool) -> mi.Float | float:
+        """Return a factor on the values towards a direction of the surface's frame, in active lanes."""
         return 1.0
 
 

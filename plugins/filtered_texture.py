@@ -35,6 +35,11 @@ class FilteredTexture(MapTexture):
     def set_cone(self, cone: Cone | None) -> None:
         """Set the sensor that sees the texture; ``None``: the one that the parameters describe, if any."""
         self.cone = cone or self._cone_of_parameters
+        self._update_key()
+
+    def _settings(self):
+        cone = None if self.cone is None else (self.cone.projection, self.cone.corner is None)
+        return *super()._settings(), self.filter, cone
 
     def omitted(self, integrators: list, sensor) -> str:
         """Return a sentence if no footprints reach the texture, or those of another sensor; see :mod:`.omissions`.

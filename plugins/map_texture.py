@@ -15,7 +15,7 @@ from mi_diffind.lookup import clamp
 from mi_diffind.maps.layout import MapLayout
 from mi_diffind.mitsuba_versions import base_class
 
-from .support import properties, tables, textures, upsampling
+from .support import frozen, properties, tables, textures, upsampling
 from .support.image_files import SharedMaps, is_data, map_of
 from .support.textures import WRAP_MODES, PositionDistribution, luminance
 
@@ -93,9 +93,12 @@ class MapTexture(base_class("Texture")):
         return self._shared.table, self._shared.tables
 
     def parameters_changed(self, keys: list[str] = ()):
-        tables.check_shapes(self._shared.tables)
+        self._shared.entries.accept()
         self._update_transformation()
+        emits = self._positions is not None
         self._clear_cache()
+        if emits:  # now, since a frozen function could not compute it
+            self._sampled()
 
     def _update_transformation(self) -> None:
         m = self.to_uv.matrix
@@ -103,6 +106,16 @@ class MapTexture(base_class("Texture")):
         identity = matrix == [[float(i == j) for j in range(3)] for i in range(3)]
         self._transform = None if identity else self._shared.transform(matrix)
         self._permutes = textures.permutes_corners(matrix)
+        self._update_key()
+
+    def _update_key(self) -> None:
+        """Tell frozen functions what decides how the texture is read, besides its arrays."""
+        self.key = frozen.key(*self._settings())
+
+    def _settings(self) -> tuple:
+        """Return the settings of :func:`.frozen.key`."""
+        identity = self._transform is None
+        return self._size, self.map, self.raw, self.wrap_mode, identity, self._permutes, self._shared.entries.shapes()
 
     def _clear_cache(self) -> None:
         """Discard the mean, the maximum and the distribution of positions."""
@@ -290,6 +303,11 @@ class MapTexture(base_class("Texture")):
     def _sampled(self) -> PositionDistribution:
         self._check_cache()
         if self._positions is None:
+            if dr.flag(dr.JitFlag.FreezingScope):
+                raise RuntimeError(
+                    f'the texture "{self.id()}": a frozen function (dr.freeze) cannot compute the distribution of its '
+                    f"light, render the scene once before"
+                )
             self._positions = PositionDistribution.of(self._decoded(), self.wrap_mode)
         return self._positions
 

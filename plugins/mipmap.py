@@ -5,7 +5,7 @@ from __future__ import annotations  # Delayed parsing of type annotations
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind import srgb
+from mi_diffind import memory, srgb
 from mi_diffind.maps.pyramid import TexelPyramid
 
 from . import Plugin
@@ -16,10 +16,13 @@ from .support.manual import shared_parts
 
 
 class Texels:
-    """Holder of the parameter ``data``, which frozen functions (``dr.freeze``) do not read and must not look for."""
+    """Holder of the parameter ``data``, which frozen functions (``dr.freeze``) do not read and must not look for.
+
+    ``accepted`` is its last value of an allowed shape.
+    """
 
     def __init__(self, tensor: mi.TensorXf):
-        self.tensor = tensor
+        self.tensor, self.accepted = tensor, dr.detach(tensor)
 
 
 @shared_parts
@@ -136,9 +139,10 @@ class MipMap(FilteredTexture):
         if "data" in keys:
             data, channels = self._data.tensor, self.map.channels
             if data.ndim != 3 or data.shape[2] != channels or 0 in data.shape:
-                raise RuntimeError(
-                    f'parameter "data": has the shape {tuple(data.shape)}, expected (height, width, {channels})'
-                )
+                shape = tuple(data.shape)
+                memory.assign(data, self._data.accepted)
+                raise RuntimeError(f'parameter "data": has the shape {shape}, expected (height, width, {channels})')
+            self._data.accepted = dr.detach(data)
             self._shared = SharedMaps(TexelPyramid(self._entry, data, self.image.border), {})
             self.image, self.texels = self._shared.image, self._shared.image.arrays
             self.map = self.image.layout.maps[0]

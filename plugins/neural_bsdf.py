@@ -2,6 +2,8 @@
 
 from __future__ import annotations  # Delayed parsing of type annotations
 
+import copy
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -29,7 +31,8 @@ from mi_diffind.tasks.bsdf.model import (
 from mi_diffind.tasks.bsdf.truth import MitsubaTruth
 
 from . import Counterpart, Plugin
-from .support import properties, tables, upsampling
+from .support import frozen, properties, tables, upsampling
+from .support.directions import are_directions
 from .support.manual import shared_parts
 from .support.tracked_parameter import TrackedParameter, when_outermost
 
@@ -175,7 +178,7 @@ class NeuralBSDF(mi.BSDF):
         self.proxy = _parameters(self.model) if self.model.form.terms and not self.textures else {}
         self._tracked = [TrackedParameter(texture) for texture in self.textures.values()]
         self.known, self.member = [], None
-        tables.copy_entries(self._arrays())
+        self._entries = tables.Entries(tables.exposed(self._arrays()))
         self._compute_constants()
         if self.textures:
             when_outermost(self._compute_member)
@@ -208,7 +211,8 @@ class NeuralBSDF(mi.BSDF):
         tables.traverse(cb, tables.exposed(self._arrays()))
 
     def parameters_changed(self, keys: list[str] = ()):
-        tables.check_shapes(tables.exposed(self._arrays()))
+        self._entries.accept()
+        frozen.make_opaque({"scale": self.scale, **self.proxy})
         self._compute_constants()
         if self.textures:
             when_outermost(self._compute_member)
@@ -216,7 +220,8 @@ class NeuralBSDF(mi.BSDF):
 
     def _hold(self) -> None:
         """Keep all arrays that are read as an attribute, for frozen functions."""
-        self.held = tables.arrays_of([self.model, self.member, getattr(self, "constants", None)])
+        arrays = tables.arrays_of([self.model, self.member, getattr(self, "constants", None)])
+        self.held = [frozen.key(self.known, self._entries.shapes()), arrays]
 
     def _at(self, si, active):
         """Return the BSDF with its present parameters, and the mixture that samples it."""
@@ -232,6 +237,7 @@ class NeuralBSDF(mi.BSDF):
         bsdf = self.model.bsdf
         if self.proxy:
             attached = dr.grad_enabled(list(self.proxy.values()))
+            bsdf = copy.copy(bsdf)  # what is traced here must not outlive the trace
             bsdf.proxy = _proxy(self.proxy, self.model.form) if attached else self.constants
         return bsdf, self.model.mixture
 
@@ -265,8 +271,7 @@ class NeuralBSDF(mi.BSDF):
         """Return both directions on the front side, and the mask of lanes whose result counts."""
         if self.two_sided:
             wi, wo = mi.Vector3f(wi.x, wi.y, dr.abs(wi.z)), mi.Vector3f(wo.x, wo.y, dr.mulsign(wo.z, wi.z))
-        # Directions have length 1; the comparison is false for NaN and infinities
-        active = active & (wi.z > 0) & (wo.z > 0) & (dr.squared_norm(wi) + dr.squared_norm(wo) < 100)
+        active = active & (wi.z > 0) & (wo.z > 0) & are_directions(wi, wo)
         if not ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0):
             active = mi.Bool(False)
         up = mi.Vector3f(0, 0, 1)

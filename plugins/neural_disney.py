@@ -98,7 +98,7 @@ class NeuralDisney(Disney):
     def _set_up(self, props):
         opened = tables.open_tables(props, TASK, STORAGE)
         self.decoder, self.preset, self._table = opened.decoder, opened.table.preset, opened.table
-        tables.copy_entries(self._arrays())
+        self._entries = tables.Entries(self._tables())
 
     def _arrays(self) -> dict:
         return {name: getattr(self.decoder.arrays, name) for name in self.decoder.arrays.SHAPES}
@@ -111,6 +111,9 @@ class NeuralDisney(Disney):
         """Return the table of the file, and the arrays that can be optimised, by name."""
         return self._table, self._tables()
 
+    def _settings(self):
+        return *super()._settings(), self._entries.shapes()
+
     def _is_constant(self, group):
         reads_tables = group not in GROUPS
         return super()._is_constant(group) and not (reads_tables and tables.optimised(self._tables()))
@@ -120,7 +123,7 @@ class NeuralDisney(Disney):
         tables.traverse(cb, self._tables())
 
     def parameters_changed(self, keys: list[str] = ()):
-        tables.check_shapes(self._tables())
+        self._entries.accept()
         super().parameters_changed(keys)
 
 

@@ -8,7 +8,7 @@ from functools import cache
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind import compat
+from mi_diffind import compat, mitsuba_versions
 from mi_diffind.tables import TableError
 from mi_diffind.tasks.radiance.march import OPAQUE
 
@@ -16,7 +16,7 @@ from . import Counterpart, Plugin, warn
 from .path_footprint import integrator as path_footprint
 from .path_footprint import relative
 from .support import distance_shapes as sdf
-from .support import omissions, properties
+from .support import omissions, properties, tables
 from .support.differentials import Differentials
 from .support.field_light import FieldLight, in_order
 from .support.joined_fields import grouped
@@ -257,6 +257,7 @@ def integrator() -> type:
             if field.unbounded and not shown:
                 field = field.without_surroundings()
             self.placed = PlacedField(field, props.get("to_world", mi.ScalarTransform4f()))
+            self._entries = tables.Entries(self.placed.exposed)
             self.light = VariantLight()
             self.fields = [self.placed]
             if isinstance(self.nested, NeuralField):
@@ -270,7 +271,6 @@ def integrator() -> type:
             self._group()
             self._warned = False
             omissions.watch(self)
-            self._shapes = {name: tuple(values.shape) for name, values in self.placed.exposed.items()}
 
         def _group(self) -> None:
             """Join fields whose boxes overlap, and show them to the integrator of surfaces if they light it.
@@ -343,10 +343,7 @@ def integrator() -> type:
             return (self.model.table if self.model else None), self.placed.exposed
 
         def parameters_changed(self, keys=()) -> None:
-            for name, values in self.placed.exposed.items():
-                shape, expected = tuple(values.shape), self._shapes[name]
-                if shape != expected:
-                    raise RuntimeError(f'parameter "tables.{name}": has the shape {shape}, expected {expected}')
+            self._entries.accept()
             if not keys or "to_world" in keys:
                 self.placed.update()
             # Mitsuba gives the last part of a name
@@ -618,7 +615,7 @@ def integrator() -> type:
 
             # Across a smooth surface
             arrived = active & (through > 0) & ~solid
-            flags = mi.RayFlags.All | mi.RayFlags.dNSdUV if carried else mi.RayFlags.All
+            flags = mitsuba_versions.ray_flags(curvature=carried)
             si = pi.compute_surface_interaction(ray, ray_flags=flags, active=arrived)
             bsdf = si.bsdf(ray)
             going = arrived & si.is_valid() & (path.count < self.smooth_depth)

@@ -10,7 +10,8 @@ from mi_diffind.tasks.ggx import TASK
 from mi_diffind.tasks.ggx.model import Roughness
 
 from . import Counterpart, Plugin
-from .support import properties, tables
+from .support import frozen, properties, tables
+from .support.directions import are_directions
 from .support.manual import shared_parts
 from .support.tracked_parameter import TrackedParameter, when_outermost
 
@@ -142,7 +143,7 @@ class NeuralGGX(mi.BSDF):
 
         opened = tables.open_tables(props, TASK)
         self.distribution, self.preset, self._table = opened.distribution, opened.table.preset, opened.table
-        tables.copy_entries(self._arrays())
+        self._entries = tables.Entries(self._tables())
 
         self._tracked_alpha = TrackedParameter(self.alpha)
         self._tracked_ior = [TrackedParameter(self.eta, colour=True), TrackedParameter(self.k, colour=True)]
@@ -183,7 +184,7 @@ class NeuralGGX(mi.BSDF):
         tables.traverse(cb, self._tables())
 
     def parameters_changed(self, keys: list[str] = ()):
-        tables.check_shapes(self._tables())
+        self._entries.accept()
         self._prepare_constants()
 
     def _parameters(self) -> list[TrackedParameter]:
@@ -199,10 +200,8 @@ class NeuralGGX(mi.BSDF):
                 constant = self.distribution.constant_roughness(alpha)
             dr.make_opaque(constant)
             self._constant = constant
-        # What frozen functions traverse; they are recorded anew when they see other arrays here
-        known = {name: mi.Float(0) for name, holds in (("mirror", self._reflects_all()),) if holds}
-        dr.make_opaque(known)
-        self.held = [known, tables.arrays_of([self.distribution, self._constant])]
+        known = self._constant is None, self._reflects_all(), self._has_factor(), self._entries.shapes()
+        self.held = [frozen.key(*known), tables.arrays_of([self.distribution, self._constant])]
 
     def _is_constant(self) -> bool:
         """Return whether the roughness is constant, and neither changed nor, like the tables, being optimised."""
@@ -224,8 +223,7 @@ class NeuralGGX(mi.BSDF):
 
     def _prepare(self, ctx, si, wo, active):
         """Return directions that are safe to compute with in every lane, and the mask of lanes whose result counts."""
-        # Directions have length 1; the comparison is false for NaN and infinities
-        active = active & (si.wi.z > 0) & (wo.z > 0) & (dr.squared_norm(si.wi) + dr.squared_norm(wo) < 100)
+        active = active & (si.wi.z > 0) & (wo.z > 0) & are_directions(si.wi, wo)
         if not ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0):
             active = mi.Bool(False)
         up = mi.Vector3f(0, 0, 1)

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_diffind import compat
-from mi_diffind.mitsuba_versions import base_class
+from mi_diffind.mitsuba_versions import base_class, normal_mapped
 from mi_diffind.tasks.disney import TASK as DISNEY
 from mi_diffind.tasks.disney.model import clamp
 from mi_diffind.tasks.shading.material import frame, shadowing
@@ -177,6 +177,8 @@ class NeuralMaterial(Disney):
             )
         self._is_anisotropic |= extras or "anisotropic" in self.maps.maps
         sides = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide if self.two_sided else mi.BSDFFlags.FrontSide
+        if "normal" in self.maps.maps:
+            sides = sides | normal_mapped()
         self._set_flags(self.maps.is_spatially_varying(), self._is_anisotropic, sides)
         if "opacity" in self.maps.maps:
             self.m_components = [*self.m_components, mi.BSDFFlags.Null | mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide]
@@ -294,10 +296,11 @@ class MapPoint(ShadedPoint):
             wo = s * wo.x + t * wo.y + n * wo.z
         return self._flipped(wo)
 
-    def factor(self, wo):
+    def factor(self, wo, active):
         factor = 1.0
         if self._frame is not None:
-            factor = shadowing(self._frame[2], self._flipped(wo))
+            # The derivative with respect to the normal is 0 in other lanes, times a number
+            factor = shadowing(self._frame[2], dr.select(active, self._flipped(wo), mi.Vector3f(0, 0, 1)))
         return factor if self.opacity is None else factor * self.opacity
 
 

@@ -209,6 +209,7 @@ class NeuralSDF(distance_shape(mi.Mesh)):
             raise RuntimeError('parameter "resolution": has no effect with trace="arrays"')
         props.get("resolution", 0)  # for a grid, if the scene's integrator needs one
         to_world = props.get("to_world", mi.ScalarTransform4f())
+        self._entries = tables.Entries(self.model.entries())
         super().__init__(props, self.model.field, Placement.of(to_world, self.model.scale, self.model.centre), smooth)
 
     def entries(self) -> dict:
@@ -235,13 +236,7 @@ class NeuralSDF(distance_shape(mi.Mesh)):
         super().parameters_changed(keys)
         if not self.ready:
             return
-        nodes = getattr(self.model.field, "nodes", None)
-        if nodes is not None and tuple(nodes.shape) != (self.model.field.structure.nodes, 4):
-            raise RuntimeError(
-                f'parameter "tables.nodes": has the shape {tuple(nodes.shape)}, expected '
-                f"{(self.model.field.structure.nodes, 4)}"
-            )
-        tables.check_shapes(tables.exposed(self.model.arrays))
+        self._entries.accept()
         if not keys or any(key.startswith("tables.") for key in keys):
             self.model.field.changed()
             self._hold()

@@ -7,6 +7,8 @@ from functools import cache
 import drjit as dr
 import mitsuba as mi
 
+from mi_diffind.mitsuba_versions import ray_flags
+
 from . import Plugin, path_footprint
 from .path_footprint import power_heuristic, relative
 from .support import distance_shapes as sdf
@@ -114,7 +116,7 @@ def integrator() -> type:
         def interaction(self, shapes, ray, pi, hit, active):
             """Return the surface interaction at the hit; ordinary shapes are not differentiated."""
             with dr.suspend_grad():
-                si = pi.compute_surface_interaction(ray, ray_flags=mi.RayFlags.All, active=active)
+                si = pi.compute_surface_interaction(ray, ray_flags=ray_flags(), active=active)
             return sdf.interaction(shapes, hit, ray, si, active)
 
         @dr.syntax

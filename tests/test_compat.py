@@ -10,7 +10,8 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from mi_diffind import compat, runtime
+from mi_diffind import compat, runtime, turns
+from mi_diffind.mitsuba_versions import ray_flags
 
 SCENE = Path(__file__).resolve().parent / "lamp.xml"
 
@@ -202,7 +203,7 @@ def test_callback_of_renders(mi_rgb, monkeypatch):
     monkeypatch.setattr(mi.util, "render", mi.util.render)
     monkeypatch.setattr(mi, "render", mi.render)
     with hook("mi.render, mitsuba.python.util.render"):
-        compat.before_render(lambda *arguments: calls.append(arguments))
+        turns.before_render(lambda *arguments: calls.append(arguments))
         scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective"}})
         tracer = mi.load_dict({"type": "depth"})
         for arguments, more in (((scene, None, 0, tracer, 3), {}), ((), {"integrator": tracer, "scene": scene})):
@@ -393,7 +394,7 @@ def test_edges_of_shading_normals(mi_rgb):
             o = mi_rgb.Point3f(middle.tolist()) + mi_rgb.Vector3f(x + step * float(radius), 0.3 * x, 0)
             ray = mi_rgb.Ray3f(o + mi_rgb.Vector3f(0, 0, 3 * float(radius)), mi_rgb.Vector3f(0, 0, -1))
             pi = scene.ray_intersect_preliminary(ray)
-            found.append((pi, pi.compute_surface_interaction(ray, mi_rgb.RayFlags.All | mi_rgb.RayFlags.dNSdUV), ray))
+            found.append((pi, pi.compute_surface_interaction(ray, ray_flags(curvature=True)), ray))
         (pi, si, ray), (other, moved, _) = found
         edges = compat.normal_edges(pi, si, ray, mi_rgb.Bool(True))
         basis = np.stack([np.array(v).T for v in edges], axis=-1)

@@ -3,8 +3,10 @@
 What is simulated is described in ``docs/next_mitsuba.md``. Nothing here shows that Mitsuba 3.10 itself works.
 """
 
+import enum
 import importlib.metadata
 import json
+import re
 import subprocess
 import sys
 import types
@@ -122,6 +124,55 @@ def test_textures_ask_for_footprints(mi_rgb, given, expected):
     content = {"type": "mipmap", "bitmap": mi_rgb.Bitmap(pixels), "raw": True}
     content |= {k: v for k, v in given.items() if k != "constant"}
     assert mi_rgb.load_dict(content).filtered() is expected
+
+
+def test_ray_flags(mi_rgb, monkeypatch):
+    """All of an interaction, and derivatives of normals on demand: those of 3.9 in a scene, those of 3.10 by name."""
+    scene = mi_rgb.load_dict({"type": "scene", "ball": {"type": "sphere"}})
+    ray = mi_rgb.Ray3f([0.3, 0.2, -3], [0, 0, 1])
+    for curvature in (False, True):
+        si = scene.ray_intersect(ray, mitsuba_versions.ray_flags(curvature), True)
+        assert dr.allclose(dr.norm(si.sh_frame.n), 1) and dr.norm(si.dp_du)[0] > 0.1
+        assert (dr.norm(si.dn_du)[0] > 0.1) is curvature
+
+    class RayFlags(enum.IntFlag):
+        """Flags of Mitsuba's main branch: ``All`` lacks the footprint, ``dNSdUV`` is gone."""
+
+        Shading, NormalPartials, Footprint = 1, 2, 16
+        All, Default = 1, 17
+
+    monkeypatch.setitem(sys.modules, "mitsuba", types.SimpleNamespace(RayFlags=RayFlags))
+    assert mitsuba_versions.ray_flags() == RayFlags.Shading | RayFlags.Footprint
+    assert mitsuba_versions.ray_flags(curvature=True) == mitsuba_versions.ray_flags() | RayFlags.NormalPartials
+
+
+def test_no_other_file_chooses_ray_flags():
+    """Other files name ``Minimal`` alone, the same in both versions."""
+    files = [*(ROOT / "mi_diffind").rglob("*.py"), *(ROOT / "plugins").rglob("*.py")]
+    named = {f.name: set(re.findall(r"RayFlags\.(\w+)", f.read_text(encoding="utf-8"))) for f in files}
+    assert len(files) > 100
+    assert {name: flags for name, flags in named.items() if flags - {"Minimal"}} == {}
+
+
+def test_normal_maps(mi_rgb, monkeypatch):
+    """A material with a normal map asks meshes for frames along uv; directions and normals in them stay as they are."""
+    from mi_diffind.plugins import neural_material
+
+    path = str(ROOT / "scenes" / "assets" / "rust_shaded.npz")
+    flag = 0x40000
+    assert mitsuba_versions.normal_mapped() == 0
+
+    def has_flag(**more) -> bool:
+        bsdf = mi_rgb.load_dict({"type": "neural_material", "filename": path, **more})
+        assert bool(bsdf.flags(1) & flag) == bool(bsdf.flags() & flag)
+        return bool(bsdf.flags() & flag)
+
+    assert not has_flag()
+    monkeypatch.setattr(neural_material, "normal_mapped", lambda: flag)
+    assert has_flag() and not has_flag(ignore="normal")
+    newer = types.SimpleNamespace(BSDFFlags=types.SimpleNamespace(NormalMapped=flag))
+    monkeypatch.setitem(sys.modules, "mitsuba", newer)
+    assert mitsuba_versions.normal_mapped() == flag
 
 
 def test_shapes_in_python(mi_rgb, monkeypatch):

@@ -21,6 +21,7 @@ WRITTEN = {
     "Recover maps from pictures": ("base_color.exr", "roughness.exr"),
     "Deform a distance field and save it": ("ball.npz", "deformed.npz"),
     "Capture, fit and place a radiance field": ("field.npz", "placed.png"),
+    "Freeze the steps of an optimisation": ("wall.exr",),
 }
 
 
@@ -37,6 +38,9 @@ def test_scripts_run(mi_rgb, tmp_path, monkeypatch, capsys, title, script):
         errors = [list(map(float, re.findall(r"([0-9.]+) dB", line))) for line in capsys.readouterr().out.splitlines()]
         assert len(errors) == 3  # 35 and 31 dB; the grey start has 11 and 15
         assert all(colour > 28 and roughness > 24 for colour, roughness in errors)
+    if title.startswith("Freeze"):
+        before, after = map(float, re.findall(r"loss ([0-9.]+)", capsys.readouterr().out))
+        assert after < 0.2 * before
     if title.startswith("Deform"):
         before, after = map(float, re.search(r"loss ([0-9.]+) → ([0-9.]+)", capsys.readouterr().out).groups())
         assert after < 0.8 * before

@@ -19,6 +19,8 @@ FLOORS = (
         "compat",
         "threads",
         "mitsuba_versions",
+        "memory",
+        "turns",
         "runtime",
         "deadline",
         "progress",

@@ -19,7 +19,7 @@ from types import ModuleType
 import drjit as dr
 import numpy as np
 
-from .. import compat, lookup, srgb
+from .. import compat, lookup, memory, srgb
 from ..indirection import aligned
 from . import components
 from .compressed import FilteredMaps
@@ -76,7 +76,13 @@ class Pyramid(FilteredMaps):
             for channel, owner in enumerate(self._owners):
                 padded[start:end, channel] = _interpolated(flat[:, channel], owner)
         self._padded = padded.shape[-1]
-        self._texels, self._offsets = types.TensorXf(padded).array, types.UInt32(offsets[:-1].astype(np.uint32))
+        self._hold(types.TensorXf(padded).array, offsets[:-1])
+
+    def _hold(self, texels, offsets: np.ndarray) -> None:
+        """Keep the texels and the levels' offsets in memory of Dr.Jit: frozen functions take NumPy's for constants."""
+        offsets = self.types.UInt32(offsets.astype(np.uint32))
+        self._texels, self._offsets = memory.owned(texels), memory.owned(offsets)
+        dr.eval(self._texels)
 
     @staticmethod
     def of(source: Source, layout: Layout | None = None, types: ModuleType | None = None, border=None) -> Pyramid:
@@ -241,8 +247,7 @@ class TexelPyramid(Pyramid):
         for c in range(count):
             channel = dr.concat([level[c] for level in levels])
             dr.scatter(self._texels, channel, dr.fma(index, self._padded, c), mode=dr.ReduceMode.NoConflicts)
-        self._offsets = UInt32(offsets[:-1].astype(np.uint32))
-        dr.eval(self._texels)
+        self._hold(self._texels, offsets[:-1])
 
 
 def _halved_channels(types: ModuleType, channels: list, rows: int, columns: int) -> list:

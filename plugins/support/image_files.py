@@ -31,7 +31,7 @@ from mi_diffind.task import Task, stamp
 from .. import warn
 from . import properties
 from .stock import Kept
-from .tables import copy_entries, exposed
+from .tables import Entries, exposed
 
 STORAGES = ("uint8", "float32")
 
@@ -58,6 +58,7 @@ class SharedMaps:
 
     def __init__(self, image: CompressedMaps, arrays: dict, table: Table | None = None):
         self.image, self.arrays, self.table = image, arrays, table
+        self.entries = Entries(exposed(arrays))
         self._loaded = self.state()
         self._transforms = {}
 
@@ -103,7 +104,6 @@ def open_file(task: Task, path: str | Path, storage: str) -> SharedMaps:
 
     def load():
         model = task.model(task.load(path), mi.TensorXf, storage)
-        copy_entries(model.arrays)
         if storage == "float32" and not model.arrays:
             warn(f'parameter "storage": found "float32", but {path} is of one colour: it has no arrays to optimise')
         return SharedMaps(model.image, model.arrays, model.table)

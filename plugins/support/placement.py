@@ -69,7 +69,9 @@ class PlacementParameter:
     def update(self) -> None:
         """Follow a change of ``transform``. Raises ``RuntimeError`` for anything but one similarity."""
         m, before = self.transform.matrix, self.placement
-        values = np.array(dr.detach(m))
+        numbers = dr.detach(m)
+        dr.make_opaque(numbers)  # NumPy asks for a kernel, which other numbers share
+        values = np.array(numbers)
         if values.shape[2:] not in ((), (1,)):
             raise RuntimeError(f'parameter "to_world": found {values.shape[2]} transforms, allowed is one')
         self._set(Placement.of(values.reshape(4, 4), before.scale, before.centre))

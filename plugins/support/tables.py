@@ -7,7 +7,7 @@ from types import ModuleType
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind import compat
+from mi_diffind import compat, memory
 from mi_diffind.task import Model, Task
 
 from . import properties
@@ -34,32 +34,59 @@ def exposed(arrays: dict) -> dict:
     return {name: array for name, array in arrays.items() if array.storage == "float32"}
 
 
-def copy_entries(arrays: dict) -> None:
-    """Copy the entries of arrays that can be optimised from NumPy's memory to that of Dr.Jit.
-
-    Frozen functions (``dr.freeze``) of Dr.Jit 1.5 take entries in foreign memory for constants: a change would not be
-    seen.
-    """
-    for array in exposed(arrays).values():
-        entries, shape = array.data.array, array.data.shape
-        one, zero = (dr.opaque(type(entries), number) for number in (1.0, -0.0))
-        array.data = type(array.data)(dr.fma(entries, one, zero), shape)  # no number changes, not even −0 and NaN
-        dr.eval(array.data)
-
-
 def traverse(cb: mi.TraversalCallback, arrays: dict) -> None:
     """Expose the entries of arrays as parameters ``tables.NAME``."""
     for name, array in arrays.items():
         cb.put(f"tables.{name}", array.data, mi.ParamFlags.Differentiable)
 
 
-def check_shapes(arrays: dict) -> None:
-    """Raise ``RuntimeError`` if a changed parameter has another shape."""
-    for name, array in arrays.items():
+class Entries:
+    """Entries that are exposed as parameters, which are of their shape and in memory of Dr.Jit.
+
+    ``exposed``, by name, are tensors, or arrays (``DifferentiableArray``), which check their shape.
+    """
+
+    def __init__(self, exposed: dict):
+        self._exposed = exposed
+        self._shapes = {name: tuple(_tensor(entries).shape) for name, entries in exposed.items()}
+        self._accepted = {}
+        self.accept()
+
+    def accept(self) -> None:
+        """Take assigned entries over, into memory of Dr.Jit (:func:`.memory.owned`).
+
+        Raises ``RuntimeError`` for those of another shape, after the entries before are put back: a read would go
+        beyond the end.
+        """
+        refused = []
+        for name, entries in self._exposed.items():
+            tensor, accepted = _tensor(entries), self._accepted.get(name)
+            if fault := self._fault(name, entries):
+                refused.append(f'parameter "tables.{name}": {fault}')
+                memory.assign(tensor, accepted)
+            elif accepted is None or compat.identity(accepted) != compat.identity(tensor):
+                memory.assign(tensor, type(tensor)(memory.owned(tensor.array), tensor.shape))
+            self._accepted[name] = dr.detach(tensor)  # a reference keeps the variable's index from being used again
+        if refused:
+            raise RuntimeError(refused[0])
+
+    def _fault(self, name: str, entries) -> str:
+        if dr.is_tensor_v(entries):
+            shape, expected = tuple(entries.shape), self._shapes[name]
+            return "" if shape == expected else f"has the shape {shape}, expected {expected}"
         try:
-            array.check_shape()
+            entries.check_shape()
         except ValueError as e:
-            raise RuntimeError(f'parameter "tables.{name}": {e}') from None
+            return str(e)
+        return ""
+
+    def shapes(self) -> list[tuple]:
+        """Return the present shapes, which decide what is traced: the last axis may be padded or not."""
+        return [tuple(_tensor(entries).shape) for entries in self._exposed.values()]
+
+
+def _tensor(entries):
+    return entries if dr.is_tensor_v(entries) else entries.data
 
 
 def arrays_of(value, visited: set | None = None) -> list:

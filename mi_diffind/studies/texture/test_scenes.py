@@ -17,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from ... import srgb
+from ...mitsuba_versions import ray_flags
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ class TextureScene:
         sensor = scene.sensors()[0]
         place = mi.Point2f(mi.Float(np.asarray(x, np.float32)), mi.Float(np.asarray(y, np.float32)))
         ray, _ = sensor.sample_ray_differential(0.0, 0.5, place, mi.Point2f(0.5, 0.5))
-        si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
+        si = scene.ray_intersect(ray, ray_flags(), coherent=True)
         dr.eval(si)  # while the scene exists
         return si
 

@@ -211,12 +211,15 @@ class FamilyMember(LearnedBSDF):
     def __init__(self, form: Form, residual, proxy: Proxy, energy, scale: tuple):
         super().__init__(form, residual, proxy, energy)
         self.scale = scale
+        x, y = (dr.rcp(dr.square(a)) for a in (scale[0], scale[-1]))
+        #: Terms of u that the scale determines.
+        self.terms = x, y, dr.rcp(dr.log2(1 + dr.maximum(x, y)))
 
     def coordinates(self, g: DirectionPair) -> list:
         _, v, w = super().coordinates(g)
-        x, y = (dr.rcp(dr.square(a)) for a in (self.scale[0], self.scale[-1]))
+        x, y, inverse = self.terms
         t = dr.fma(g.hx2, x, g.hy2 * y)
-        return [dr.minimum(dr.log2(1 + t) * dr.rcp(dr.log2(1 + dr.maximum(x, y))), 1), v, w]
+        return [dr.minimum(dr.log2(1 + t) * inverse, 1), v, w]
 
 
 def member(form: Form, table, residual, mixing, energy, coordinates: list, active=True) -> FamilyMember:

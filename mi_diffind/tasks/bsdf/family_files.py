@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import os
 
@@ -13,7 +12,7 @@ from ...errors import UsageError, reason
 from ...indirection import DifferentiableArray, Indirection
 from ...tables import StoredArray, Table, TableError, byte_array, check_ranges, load_table
 from . import family_measurement
-from .family import CHANNELS, MOST, FamilyArrays, Parameter, member, proxy_of, widths
+from .family import CHANNELS, MOST, FamilyArrays, FamilyMember, Parameter, member, proxy_of, widths
 from .family_truth import FamilyTruth
 from .files import RESIDUAL, BSDFModel, check_arrays, form_of
 from .mixture import Mixture, SampledLobe
@@ -136,9 +135,8 @@ class FamilyModel(BSDFModel):
             proxy, scale = proxy_of(numbers, self.form)
             factors = self.table.settings["factors"]
             lobes = tuple(f * w for f, w in zip(factors, widths(proxy, scale), strict=True))
-            dr.make_opaque(proxy, lobes)
-        form = dataclasses.replace(self.form, scale=tuple(float(scale[k][0]) for k in (0, -1)))
-        low, step = fourth_roots(form.range)
+            dr.make_opaque(proxy, lobes, scale)
+        low, step = fourth_roots(self.form.range)
         start, cascaded = (1 - low) / step, self.arrays["cascaded"].numpy().astype(np.float64)
         terms = cascaded.reshape(*cascaded.shape[:3], -1, 3) - start
         combined = np.clip(start + np.einsum("r,uvwrc->uvwc", 2 * at["mixing"] - 1, terms), 0, 1)
@@ -146,7 +144,10 @@ class FamilyModel(BSDFModel):
         residual = Indirection(parts, self._array(combined, self.arrays["cascaded"].border), [(0, 1), (1, 2)])
         energy = self._array(at["energy"]) if "energy" in at else None
         mixture = Mixture(self._array(at["weights"]), tuple(SampledLobe(a, a) for a in lobes))
-        return LearnedBSDF(form, residual, proxy, energy), mixture
+        with dr.suspend_grad():
+            bsdf = FamilyMember(self.form, residual, proxy, energy, scale)
+            dr.make_opaque(bsdf.terms)  # not numbers of Python, which would be part of kernels
+        return bsdf, mixture
 
     def reduced(self, values: list[float | None]) -> FamilyModel:
         """Return the family of the parameters whose value is ``None``, for ``values`` of the others."""
