@@ -18,7 +18,9 @@ def owned(array):
 
     if array.state != dr.VarState.Evaluated:
         return array
-    zero = dr.opaque(type(array), -0.0 if dr.is_float_v(array) else 0)  # no number changes, not even −0
+    zero = dr.opaque(
+        type(array), -0.0 if dr.is_float_v(array) else 0
+    )  # no number changes, not even −0; denormal ones may become 0
     copy = dr.detach(array) + zero
     dr.eval(copy)
     return dr.replace_grad(copy, array) if has_gradient(array) else copy

@@ -223,10 +223,10 @@ def _checked(plugin: Plugin):
         for key in unknown:
             props.mark_queried(key, False)
         part = _parts.pop(id(instance), instance)
+        _forget_dead()  # a dead ``roughplastic`` of Mitsuba's would keep functions from being frozen
         if hasattr(part, "__dict__"):
             part._origin = _Origin(description)
         else:
-            _forget_dead()
             _native.setdefault(id(part), [part, description, None])[1] = description
         return instance
 
@@ -271,7 +271,7 @@ def _forget_dead() -> None:
     """Drop the native objects that nothing else refers to."""
     for key, entry in list(_native.items()):
         if not compat.is_shared(entry):
-            del _native[key]
+            _native.pop(key, None)
 
 
 def origin(instance) -> dict | None:

@@ -220,7 +220,8 @@ class NeuralBSDF(mi.BSDF):
 
     def _hold(self) -> None:
         """Keep all arrays that are read as an attribute, for frozen functions."""
-        arrays = tables.arrays_of([self.model, self.member, getattr(self, "constants", None)])
+        parts = [self.model, self.member, getattr(self, "constants", None), getattr(self, "source", None)]
+        arrays = tables.arrays_of(parts)
         self.held = [frozen.key(self.known, self._entries.shapes()), arrays]
 
     def _at(self, si, active):
@@ -437,8 +438,8 @@ class SourceBSDF(NeuralBSDF):
     """
 
     def __init__(self, props: mi.Properties, truth):
-        super().__init__(props)
         self.source = _Values(truth)
+        super().__init__(props)
 
     def _at(self, si, active):
         return self.source, super()._at(si, active)[1]
