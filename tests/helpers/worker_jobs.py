@@ -60,7 +60,7 @@ def write_process_and_sleep(path):
 def write_process_and_hold_python(path):
     """Write the number of this process to a file, and sleep in C, where no other thread of Python runs."""
     Path(path).write_text(str(os.getpid()))
-    ctypes.PyDLL(None).sleep(60)
+    ctypes.PyDLL(None).sleep(200)
 
 
 def fit_quickly(material):
