@@ -28,12 +28,13 @@ DARK = 0.05
 ROUNDING = 1e-4
 #: Side of the tile of :meth:`BlockReference.visible_change`, in pixels, and the chance that its change is found.
 TILE, POWER = 16, 0.9
+#: Places of the tile that are tried in each unchanged check.
+TILES = 24
 
 #: Value of t of blocks that are wholly black in the reference, and no longer.
 _LARGEST = 1e9
+#: Degrees of freedom of t.
 _FREEDOM = CHECK_PASSES + REFERENCE_PASSES - 2
-#: Standard deviation of a difference of means, in units of that of a pass.
-_SCATTER = math.sqrt(1 / CHECK_PASSES + 1 / REFERENCE_PASSES)
 
 
 def block_means(image: np.ndarray) -> np.ndarray:
@@ -204,21 +205,13 @@ class BlockReference:
         over the picture and cancel out. Values that are not finite take part in no test.
         """
         levels, worst, largest = [], None, -1.0
-        both = np.concatenate([self.passes, check])
-        windows = list(_levels(both, self.height, self.width))
-        for side, means in windows:
-            reference, check_means = means[:REFERENCE_PASSES], means[REFERENCE_PASSES:]
-            mean = reference.mean(axis=0)
-            difference = check_means.mean(axis=0) - mean
-            squares = ((reference - mean) ** 2).sum(axis=0) + ((check_means - difference - mean) ** 2).sum(axis=0)
-            t = difference / self._deviation(squares / _FREEDOM, mean)
-            t = np.nan_to_num(t, nan=0.0, posinf=_LARGEST, neginf=-_LARGEST)
-            stride, change = side if side == BLOCK else side // 2, difference / np.abs(mean)
-            level = Level(side, stride, t, change, _threshold(t.size, len(windows)))
+        for side, mean, difference, deviation, threshold in self._differences(check):
+            t = np.nan_to_num(difference / deviation, nan=0.0, posinf=_LARGEST, neginf=-_LARGEST)
+            level = Level(side, side if side == BLOCK else side // 2, t, difference / np.abs(mean), threshold)
             levels.append(level)
             i = np.unravel_index(np.abs(t).argmax(), t.shape)
-            if abs(t[i]) / level.threshold > largest:
-                largest, worst = abs(t[i]) / level.threshold, self._block(level, *(int(n) for n in i))
+            if abs(t[i]) / threshold > largest:
+                largest, worst = abs(t[i]) / threshold, self._block(level, *(int(n) for n in i))
         # the same groups in a t-test of one more value; two processors differ by their rounding at most
         scatter = max(float(self.stops.std(ddof=1)), ROUNDING) * math.sqrt(1 + 1 / len(self.stops))
         quantile = -special.stdtrit(len(self.stops) - 1, STOPS_SIGNIFICANCE)
@@ -226,9 +219,17 @@ class BlockReference:
         stops = mean_stops(np.where(np.isfinite(mean), mean, self.mean), self.mean, self.dark)
         return BlockTest(levels, worst, stops, float(self.stops.mean() + quantile * scatter), not_finite)
 
-    def _deviation(self, variance: np.ndarray, mean: np.ndarray) -> np.ndarray:
-        """Return the standard deviation of the difference of check and reference, of the variance of a pass."""
-        return np.sqrt(np.maximum(variance, (ROUNDING * (np.abs(mean) + self.dark)) ** 2)) * _SCATTER
+    def _differences(self, check: np.ndarray) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray, float]]:
+        """Yield the side of the windows, the reference, the difference, its deviation, and the threshold of t."""
+        windows = list(_levels(np.concatenate([self.passes, check]), self.height, self.width))
+        for side, means in windows:
+            reference, others = means[:REFERENCE_PASSES], means[REFERENCE_PASSES:]
+            mean, mean_of_check = reference.mean(axis=0), others.mean(axis=0)
+            squares = ((reference - mean) ** 2).sum(axis=0) + ((others - mean_of_check) ** 2).sum(axis=0)
+            floor = (ROUNDING * (np.abs(mean) + self.dark)) ** 2
+            deviation = np.sqrt(np.maximum(squares / _FREEDOM, floor) * (1 / CHECK_PASSES + 1 / REFERENCE_PASSES))
+            chance = -math.expm1(math.log1p(-BLOCK_SIGNIFICANCE / len(windows)) / mean.size)
+            yield side, mean, mean_of_check - mean, deviation, float(-special.stdtrit(_FREEDOM, chance / 2))
 
     def _block(self, level: Level, row: int, column: int, channel: int) -> Block:
         x, y = column * level.stride, row * level.stride
@@ -238,39 +239,38 @@ class BlockReference:
         change = float(level.change[i]) if np.isfinite(level.change[i]) else None
         return Block(x, y, *size, level.side, name, change, float(level.t[i]), level.threshold)
 
-    def visible_change(self) -> float:
+    def visible_change(self, image: np.ndarray, checks: np.ndarray) -> float:
         """Return the relative change of brightness of a tile that :meth:`test` finds nine times of ten.
 
-        The tile, of 16 × 16 pixels or the whole of a smaller picture, lies anywhere in the picture but where the
-        reference is dark: the chance is the mean over its places. It is that of the window that covers most of the tile
-        and of its channel with the least noise, by a normal approximation of the noncentral t distribution. Returns
-        infinity where not even a tile of a hundred times the brightness is found so often.
+        The tile, of 16 × 16 pixels or as many as there are, lies at a random place of the ``image``, ``(height, width,
+        channels)``, that is not dark. ``checks``, ``(count, 8, rows, columns, channels)``, are unchanged. In each of
+        them, a tile that is brighter adds the light of its part in a window to the difference of that window: so the
+        smallest change is known that raises one t beyond its threshold. Returns infinity if too many tiles have none.
         """
-        windows = list(_levels(self.passes, self.height, self.width))
-        level = min(TILE // BLOCK // 2, len(windows) - 1)
-        means = windows[level][1]
-        mean = means.mean(axis=0)
-        t = _threshold(mean.size, len(windows))
-        signal = np.abs(mean) / np.maximum(self._deviation(means.var(axis=0, ddof=1), mean), 1e-30)
-        signal = signal.max(axis=-1)[mean.max(axis=-1) >= self.dark]
-        for windows_of_axis in mean.shape[:2]:  # the nearest of overlapping windows is at most a quarter away
-            overlap = 1 - (np.arange(8) + 0.5) / 32 if windows_of_axis > 1 else np.ones(1)
-            signal = np.multiply.outer(signal, overlap)
-        quantile, deviation = t * (1 - 1 / (4 * _FREEDOM)), math.sqrt(1 + t**2 / (2 * _FREEDOM))
-        low, high = 1e-6, 100.0
-        while high / low > 1.001:
-            middle = math.sqrt(low * high)
-            if signal.size and special.ndtr((middle * signal - quantile) / deviation).mean() >= POWER:
-                high = middle
-            else:
-                low = middle
-        return high if high < 100 else math.inf
+        rng, smallest = np.random.default_rng(0), []
+        size = np.minimum((self.height, self.width), TILE)
+        for check in checks:
+            noise = [(difference, deviation * t) for _, _, difference, deviation, t in self._differences(check)]
+            for start in rng.integers((self.height, self.width) - size + 1, size=(TILES, 2)):
+                window = tuple(slice(*pair) for pair in zip(start, start + size, strict=True))
+                if image[window].mean() < self.dark:
+                    continue
+                smallest.append(min(
+                    ((limit - difference)[part > 0] / part[part > 0]).min(initial=math.inf)
+                    for (_, part), (difference, limit) in zip(self._light(image, window), noise, strict=True)
+                ))  # fmt: skip
+        return float(np.quantile(smallest, POWER, method="higher")) if smallest else math.inf
 
-
-def _threshold(values: int, levels: int) -> float:
-    """Return the value of t beyond which one of so many ``values`` of a level fails."""
-    chance = -math.expm1(math.log1p(-BLOCK_SIGNIFICANCE / levels) / values)
-    return float(-special.stdtrit(_FREEDOM, chance / 2))
+    def _light(self, image: np.ndarray, window: tuple[slice, slice]) -> Iterator[tuple[int, np.ndarray]]:
+        """Return the levels of an image that is black but for a window."""
+        blocks = tuple(slice(w.start // BLOCK, -(-w.stop // BLOCK)) for w in window)
+        pixels = tuple(slice(b.start * BLOCK, b.stop * BLOCK) for b in blocks)
+        black = np.ones(image.shape[:2], bool)
+        black[window] = False
+        tile = np.where(black[pixels][..., None], 0, image[pixels])
+        light = np.zeros(self.mean.shape)
+        light[blocks] = block_means(tile)
+        return _levels(light, self.height, self.width)
 
 
 def _mean_brightness(blocks: np.ndarray, height: int, width: int) -> float:

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import mitsuba as mi
@@ -39,7 +40,8 @@ class Reference:
     Values are linear, of 3 channels (red, green, blue) or 1 (mono variants); the image is for pictures, rounded to half
     floats. ``about`` holds ``scene`` (file name without its extension), ``variant``, ``defines`` (texts for the scene's
     ``<default>`` values), ``budget`` (samples per pixel of a check), ``spp`` (samples per pixel of the reference),
-    ``seed``, and the ``versions`` of mi_diffind and Mitsuba that rendered it.
+    ``seed``, ``visible_change`` (of :meth:`.block_test.BlockReference.visible_change`, ``None`` for infinity), and the
+    ``versions`` of mi_diffind and Mitsuba that rendered it.
     """
 
     image: np.ndarray
@@ -149,7 +151,12 @@ def _reference(path: Path, about: dict, image: dict, means: dict) -> Reference:
         ).astype(np.float64)
         mean = np.stack([means[f"mean.{name}"] for name in names], axis=-1).astype(np.float64)
         stops = np.array(about.pop("stops"), np.float64)
-        good = stops.shape == (GROUPS,) and mean.shape == passes[0].shape == block_means(pixels).shape
+        change = about["visible_change"]
+        good = (
+            stops.shape == (GROUPS,)
+            and (change is None or isinstance(change, float))
+            and mean.shape == passes[0].shape == block_means(pixels).shape
+        )
     except (KeyError, TypeError, ValueError):
         good = False
     if not (good and all(np.isfinite(values).all() for values in (pixels, passes, mean, stops))):
@@ -159,49 +166,37 @@ def _reference(path: Path, about: dict, image: dict, means: dict) -> Reference:
 
 @dataclass
 class PassSums:
-    """Passes of a reference that is being rendered, ``done`` of them so far.
-
-    ``image``: sum of the images; ``singles``, ``(16, rows, columns, channels)``: block means of the first passes;
-    ``groups``, of the same shape: sums of block means of 8 passes each.
-    """
+    """Passes of a reference that is being rendered: the sum of the images, and the ``blocks`` of each pass."""
 
     image: np.ndarray | float = 0.0
-    singles: np.ndarray | None = None
-    groups: np.ndarray | None = None
-    done: int = 0
+    blocks: list[np.ndarray] = field(default_factory=list)
 
     def add(self, image: np.ndarray) -> None:
         """Add the next pass."""
-        means = block_means(image)
-        if self.groups is None:
-            self.singles, self.groups = (np.zeros((n, *means.shape)) for n in (REFERENCE_PASSES, GROUPS))
-        if self.done < REFERENCE_PASSES:
-            self.singles[self.done] = means
-        self.groups[self.done // CHECK_PASSES] += means
         self.image = self.image + image
-        self.done += 1
+        self.blocks.append(block_means(image).astype(np.float32))
 
     def reference(self, about: dict) -> Reference:
-        """Return the reference of all passes."""
-        # as it will be read: the passes of a check meet the same numbers before and after
-        singles, groups = (v.astype(np.float32).astype(np.float64) for v in (self.singles, self.groups / CHECK_PASSES))
-        image = np.float32(self.image / self.done)
-        return Reference(image, BlockReference.from_groups(singles, groups, *image.shape[:2]), about)
+        """Return the reference of all passes, with its ``visible_change``, ``None`` for infinity, in ``about``."""
+        image = np.float32(self.image / len(self.blocks))
+        passes = np.stack(self.blocks).astype(np.float64)
+        groups = passes.reshape(-1, CHECK_PASSES, *passes.shape[1:])
+        blocks = BlockReference.from_groups(passes[:REFERENCE_PASSES], groups.mean(axis=1), *image.shape[:2])
+        change = blocks.visible_change(image, groups[REFERENCE_PASSES // CHECK_PASSES :])
+        return Reference(image, blocks, {**about, "visible_change": change if math.isfinite(change) else None})
 
 
 def write_partial(path: Path, sums: PassSums, key: dict) -> None:
     """Keep the passes of an unfinished reference, with a ``key`` (JSON) of all that the render depends on."""
-    about = np.frombuffer(json.dumps({**key, "done": sums.done}).encode(), np.uint8)
+    about = np.frombuffer(json.dumps(key).encode(), np.uint8)
     with replacing(path) as temporary, open(temporary, "wb") as stream:
-        np.savez(stream, image=sums.image, singles=sums.singles, groups=sums.groups, about=about)
+        np.savez(stream, image=sums.image, blocks=np.stack(sums.blocks), about=about)
 
 
 def read_partial(path: Path, key: dict) -> PassSums:
     """Return the kept passes of the render with the same ``key``; none if missing or damaged."""
     with contextlib.suppress(Exception), Archive(path) as archive:
-        about = archive.json("about")
-        arrays = [archive.array(name).copy() for name in ("image", "singles", "groups")]
-        sums = PassSums(*arrays, about.pop("done"))
-        if about == key and all(np.isfinite(values).all() for values in arrays):
-            return sums
+        image, blocks = archive.array("image").copy(), archive.array("blocks")
+        if archive.json("about") == key and np.isfinite(image).all() and np.isfinite(blocks).all():
+            return PassSums(image, list(blocks))
     return PassSums()

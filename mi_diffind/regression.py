@@ -170,16 +170,18 @@ def update_reference(
     sums, start = read_partial(partial, key), time.perf_counter()
     result = {
         **_facts(path, str(output), width, height, seed, parsed.defines), "budget": size.check_spp, "asked_spp": asked,
-        "spp": size.check_spp * GROUPS, "reused_passes": sums.done, "partial": None,
+        "spp": size.check_spp * GROUPS, "reused_passes": len(sums.blocks), "partial": None,
     }  # fmt: skip
     with interruptible() as stop:
-        with progress_bar(f"{stem}: reference", PASSES, initial=sums.done, progress=progress) as bar:
-            for image in _passes(scene, size, seed, range(PASSES + sums.done, 2 * PASSES), bar, stop):
+        with progress_bar(f"{stem}: reference", PASSES, initial=len(sums.blocks), progress=progress) as bar:
+            for image in _passes(scene, size, seed, range(PASSES + len(sums.blocks), 2 * PASSES), bar, stop):
                 sums.add(image)
         bad = int((~np.isfinite(sums.image)).any(axis=-1).sum())
         if bad:
             raise scenes.SceneError(f"{path}: {bad} pixel(s) are not finite, so this cannot be a reference")
-        reference, passed = sums.reference(about), False
+        passed = False
+        if not stop.is_set():
+            reference = sums.reference(about)
         for seed_of_check in () if stop.is_set() else _OWN_CHECKS:
             check = _render_check(scene, size, seed_of_check, f"{stem}: check", progress, stop)
             passed = check is not None and reference.blocks.test(check.blocks, check.not_finite).passed
@@ -188,22 +190,18 @@ def update_reference(
     result |= {"seconds": time.perf_counter() - start, "interrupted": stop.is_set()}
     if stop.is_set():
         write_partial(partial, sums, key)
-        return {**result, "spp": sums.done * size.renders * size.samples, "partial": str(partial)}
+        return {**result, "spp": len(sums.blocks) * size.renders * size.samples, "partial": str(partial)}
     if not passed:
         raise scenes.SceneError(
             f"{path}: fails two checks at {size.check_spp} samples a pixel although nothing has changed: bright paths "
             "are too rare, or passes of different seeds are not independent; give more samples (--spp) or a lower "
             "max_depth, or another sampler"
         )
-    versions = {"mi_diffind": __version__, "mitsuba": mi.__version__}
-    write_reference(output, dataclasses.replace(reference, about={**about, "spp": result["spp"], "versions": versions}))
+    about = {**reference.about, "spp": result["spp"]}
+    about["versions"] = {"mi_diffind": __version__, "mitsuba": mi.__version__}
+    write_reference(output, dataclasses.replace(reference, about=about))
     partial.unlink(missing_ok=True)
-    return {**result, **_power(reference), "bytes": output.stat().st_size}
-
-
-def _power(reference: Reference) -> dict:
-    change = reference.blocks.visible_change()
-    return {"tile": TILE, "visible_change": change if math.isfinite(change) else None}
+    return {**result, "tile": TILE, "visible_change": about["visible_change"], "bytes": output.stat().st_size}
 
 
 def _parsed(scene, defines: dict) -> scenes.ParsedScene:
@@ -276,7 +274,8 @@ def regress(
     figures = {
         **_facts(path, f"{about['scene']}.{about['variant']}.exr", width, height, seed_of_check, parsed.defines),
         "spp": about["budget"], "reference_spp": about["spp"], "seconds": time.perf_counter() - start,
-        "interrupted": stop.is_set(), "passed": None, "files": {}, **_power(reference),
+        "interrupted": stop.is_set(), "passed": None, "files": {}, "tile": TILE,
+        "visible_change": about["visible_change"],
     }  # fmt: skip
     if check is None:
         return Regression(figures)

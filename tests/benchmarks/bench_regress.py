@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 import mi_diffind  # noqa: F401
-from mi_diffind import block_test, scenes
+from mi_diffind import block_test, regression, scenes
 
 WIDTH, HEIGHT = 96, 64
 PASSES, GROUP = block_test.CHECK_PASSES * block_test.GROUPS, block_test.CHECK_PASSES
@@ -101,92 +101,107 @@ SCENES = {"box": box, "glossy": glossy, "environment": environment}
 
 
 class Passes:
-    """Independent passes of a scene: each call renders further ones."""
+    """Block means of independent passes of a scene, in the order of their seeds, kept in a folder if there is one."""
 
-    def __init__(self, description: dict, spp: int, first_seed: int):
-        self.scene, self.spp, self.seed = mi.load_dict(description), spp, first_seed
+    def __init__(self, arguments, name: str, change: str):
+        settings = (name, change or "unchanged", mi.variant(), arguments.sampler, arguments.spp)
+        self.file = arguments.passes and Path(arguments.passes) / f"{'_'.join(map(str, settings))}.npy"
+        self.kept = list(np.load(self.file)) if self.file and self.file.exists() else []
+        self.scene, self.taken = mi.load_dict(SCENES[name](change, arguments.sampler)), 0
+        self.size = regression.PassSize.of_check(self.scene, arguments.spp)
+        self.first_seed = (CHANGES.index(change) + 1 if change else 0) << 24
 
-    def images(self, count: int) -> np.ndarray:
-        images = []
-        for _ in range(count):
-            images.append(scenes.colour_channels(scenes.render_pass(self.scene, self.spp // GROUP, self.seed)))
-            self.seed += 1
-        return np.stack(images)
+    def take(self, count: int) -> np.ndarray:
+        """Return passes that nobody has taken before, ``(count, rows, columns, channels)``."""
+        for seed in range(len(self.kept), self.taken + count):
+            image = scenes.render_pass(self.scene, self.size.samples, self.first_seed + seed)
+            self.kept.append(block_test.block_means(scenes.colour_channels(image)).astype(np.float32))
+        self.taken += count
+        return np.float64(self.kept[self.taken - count : self.taken])
 
-    def blocks(self, count: int) -> np.ndarray:
-        return np.stack([block_test.block_means(image) for image in self.images(count)])
+    def keep(self):
+        if self.file:
+            self.file.parent.mkdir(parents=True, exist_ok=True)
+            np.save(self.file, self.kept)
 
 
-def measure(name: str, spp: int, sampler: str, references: int, unchanged: int, changed: int) -> dict:
+def reference_of(passes: np.ndarray) -> tuple[block_test.BlockReference, float]:
+    """Return the reference of 128 passes and the change that it promises to see."""
+    groups = passes.reshape(-1, GROUP, *passes.shape[1:])
+    reference = block_test.BlockReference.from_groups(passes[: 2 * GROUP], groups.mean(axis=1), HEIGHT, WIDTH)
+    image = reference.mean.repeat(block_test.BLOCK, axis=0).repeat(block_test.BLOCK, axis=1)
+    return reference, reference.visible_change(image, groups[2:])
+
+
+def with_brighter_tile(check: np.ndarray, reference: block_test.BlockReference, change: float, rng) -> np.ndarray:
+    """Return a check with a brighter tile at a random place that is not dark, of blocks whose pixels are alike."""
+    while True:
+        y, x = rng.integers((HEIGHT - block_test.TILE + 1, WIDTH - block_test.TILE + 1))
+        inside = np.zeros((HEIGHT, WIDTH, 1))
+        inside[y : y + block_test.TILE, x : x + block_test.TILE] = 1
+        part = block_test.block_means(inside)
+        if (part * reference.mean).sum() >= part.sum() * reference.mean.shape[-1] * reference.dark:
+            return check * (1 + change * part)
+
+
+def measure(arguments, name: str) -> dict:
     """Return the alarms of checks of one scene, and the power."""
-    make, rng, start = SCENES[name], np.random.default_rng(1), time.perf_counter()
-    same = Passes(make("", sampler), spp, 0)
-    tests, predicted, seen, tiles = [], [], 0, 0
+    rng, start = np.random.default_rng(1), time.perf_counter()
+    same, per_reference = Passes(arguments, name, ""), arguments.unchanged // arguments.references
+    changed = arguments.changed // arguments.references
+    references = [reference_of(same.take(PASSES)) for _ in range(arguments.references)]
     alarms = dict.fromkeys(("unchanged", "unchanged, blocks", "unchanged, stops", *LAMPS), 0)
-    for _ in range(references):
-        passes = same.blocks(PASSES)
-        groups = passes.reshape(-1, GROUP, *passes.shape[1:]).mean(axis=1)
-        reference = block_test.BlockReference.from_groups(passes[: block_test.REFERENCE_PASSES], groups, HEIGHT, WIDTH)
-        tests.append(reference)
-        predicted.append(reference.visible_change())
-        for i in range(unchanged // references):
-            images = same.images(GROUP)
-            check = np.stack([block_test.block_means(image) for image in images])
+    seen, tiles = 0, 0
+    for reference, change in references:
+        for i in range(per_reference):
+            check = same.take(GROUP)
             result = reference.test(check)
             alarms["unchanged"] += not result.passed
             alarms["unchanged, blocks"] += result.failing_blocks > 0
             alarms["unchanged, stops"] += result.stops > result.stops_threshold
-            if i < changed // references:
+            if i < changed:
                 for lamp, factor in LAMPS.items():
                     alarms[lamp] += not reference.test(factor * check).passed
+            if change < 100:
                 for _ in range(4):
-                    y, x = tile(reference, rng)
-                    images_of_tile = images.copy()
-                    images_of_tile[:, y : y + block_test.TILE, x : x + block_test.TILE] *= 1 + predicted[-1]
-                    check = np.stack([block_test.block_means(image) for image in images_of_tile])
-                    seen, tiles = seen + (not reference.test(check).passed), tiles + 1
+                    brighter = with_brighter_tile(check, reference, change, rng)
+                    seen, tiles = seen + (not reference.test(brighter).passed), tiles + 1
+    same.keep()
     for change in CHANGES:
-        other, alarms[change] = Passes(make(change, sampler), spp, 1 << 24), 0
-        for reference in tests:
-            for _ in range(changed // references):
-                alarms[change] += not reference.test(other.blocks(GROUP)).passed
-    checks = {key: unchanged // references * references for key in alarms if key.startswith("unchanged")}
-    checks |= {key: changed // references * references for key in alarms if key not in checks}
-    row = {"scene": name, "variant": mi.variant(), "sampler": sampler, "spp": spp, "references": references,
-           "checks": checks, "alarms": alarms,
-           "percent": {key: 100 * alarms[key] / checks[key] for key in alarms},
-           "power": {"predicted_change": float(np.median(predicted)), "predicted_percent": 100 * block_test.POWER,
-                     "measured_percent": 100 * seen / tiles, "tiles": tiles},
-           "seconds": time.perf_counter() - start}  # fmt: skip
-    print(json.dumps({k: row[k] for k in ("scene", "variant", "sampler", "spp", "percent", "power", "seconds")}), flush=True)
+        other = Passes(arguments, name, change)
+        alarms[change] = sum(not r.test(other.take(GROUP)).passed for r, _ in references for _ in range(changed))
+        other.keep()
+    checks = {key: (per_reference if "unchanged" in key else changed) * len(references) for key in alarms}
+    row = {
+        "scene": name, "variant": mi.variant(), "sampler": arguments.sampler, "spp": same.size.check_spp,
+        "references": len(references), "checks": checks, "alarms": alarms,
+        "percent": {key: round(100 * alarms[key] / checks[key], 2) for key in alarms},
+        "power": {"predicted_change": float(np.median([change for _, change in references])),
+                  "predicted_percent": 100 * block_test.POWER,
+                  "measured_percent": round(100 * seen / tiles, 2) if tiles else None, "tiles": tiles},
+        "seconds": round(time.perf_counter() - start, 1),
+    }  # fmt: skip
+    print(json.dumps({k: row[k] for k in (*SETTINGS, "percent", "power", "seconds")}, ensure_ascii=False), flush=True)
     return row
-
-
-def tile(reference: block_test.BlockReference, rng) -> tuple[int, int]:
-    """Return a random place of a tile that is not dark."""
-    while True:
-        y, x = rng.integers(HEIGHT - block_test.TILE + 1), rng.integers(WIDTH - block_test.TILE + 1)
-        i, n = (round(y / block_test.BLOCK), round(x / block_test.BLOCK)), block_test.TILE // block_test.BLOCK
-        if reference.mean[i[0] : i[0] + n, i[1] : i[1] + n].mean(axis=(0, 1)).max() >= reference.dark:
-            return y, x
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", metavar="FILE", help="where to write the alarms; rows of other settings are kept")
+    parser.add_argument("--passes", metavar="DIR", help="folder in which rendered passes are kept for a further run")
     parser.add_argument("--variant", default="llvm_ad_rgb")
     parser.add_argument("--sampler", default="independent")
     parser.add_argument("--spp", type=int, default=128)
     parser.add_argument("--scenes", nargs="+", default=list(SCENES))
-    parser.add_argument("--references", type=int, default=10)
-    parser.add_argument("--unchanged", type=int, default=340, help="unchanged checks of a scene")
+    parser.add_argument("--references", type=int, default=5)
+    parser.add_argument("--unchanged", type=int, default=335, help="unchanged checks of a scene")
     parser.add_argument("--changed", type=int, default=100, help="checks of each change")
     arguments = parser.parse_args()
     mi.set_variant(arguments.variant)
     path = arguments.json and Path(arguments.json)
     rows = json.loads(path.read_text(encoding="utf-8"))["rows"] if path and path.exists() else []
     for name in arguments.scenes:
-        row = measure(name, arguments.spp, arguments.sampler, arguments.references, arguments.unchanged, arguments.changed)
+        row = measure(arguments, name)
         rows = [other for other in rows if any(other[key] != row[key] for key in SETTINGS)] + [row]
         if path:
             path.write_text(json.dumps({"rows": rows}, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
