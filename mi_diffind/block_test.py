@@ -239,38 +239,28 @@ class BlockReference:
         change = float(level.change[i]) if np.isfinite(level.change[i]) else None
         return Block(x, y, *size, level.side, name, change, float(level.t[i]), level.threshold)
 
-    def visible_change(self, image: np.ndarray, checks: np.ndarray) -> float:
+    def visible_change(self, checks: np.ndarray) -> float:
         """Return the relative change of brightness of a tile that :meth:`test` finds nine times of ten.
 
-        The tile, of 16 × 16 pixels or as many as there are, lies at a random place of the ``image``, ``(height, width,
-        channels)``, that is not dark. ``checks``, ``(count, 8, rows, columns, channels)``, are unchanged. In each of
-        them, a tile that is brighter adds the light of its part in a window to the difference of that window: so the
-        smallest change is known that raises one t beyond its threshold. Returns infinity if too many tiles have none.
+        The tile, of 16 × 16 pixels or as many as there are, lies at a random place that is not dark. ``checks``,
+        ``(count, 8, rows, columns, channels)``, are unchanged. In each of them, a tile that is brighter adds the light
+        of its part in a window to the difference of that window: so the smallest change is known that raises one t
+        beyond its threshold. Returns infinity if too many tiles have none.
         """
         rng, smallest = np.random.default_rng(0), []
-        size = np.minimum((self.height, self.width), TILE)
+        places = np.maximum(np.array([self.height, self.width]) - TILE, 0) + 1
         for check in checks:
             noise = [(difference, deviation * t) for _, _, difference, deviation, t in self._differences(check)]
-            for start in rng.integers((self.height, self.width) - size + 1, size=(TILES, 2)):
-                window = tuple(slice(*pair) for pair in zip(start, start + size, strict=True))
-                if image[window].mean() < self.dark:
+            for y, x in rng.integers(places, size=(TILES, 2)):
+                tile = np.zeros((self.height, self.width, 1))
+                tile[y : y + TILE, x : x + TILE] = 1
+                part = block_means(tile)
+                light = part * np.maximum(self.mean, 0)
+                if light.mean() < part.mean() * self.dark:
                     continue
-                smallest.append(min(
-                    ((limit - difference)[part > 0] / part[part > 0]).min(initial=math.inf)
-                    for (_, part), (difference, limit) in zip(self._light(image, window), noise, strict=True)
-                ))  # fmt: skip
+                levels = zip(_levels(light, self.height, self.width), noise, strict=True)
+                smallest.append(min(((t - d)[v > 0] / v[v > 0]).min(initial=math.inf) for (_, v), (d, t) in levels))
         return float(np.quantile(smallest, POWER, method="higher")) if smallest else math.inf
-
-    def _light(self, image: np.ndarray, window: tuple[slice, slice]) -> Iterator[tuple[int, np.ndarray]]:
-        """Return the levels of an image that is black but for a window."""
-        blocks = tuple(slice(w.start // BLOCK, -(-w.stop // BLOCK)) for w in window)
-        pixels = tuple(slice(b.start * BLOCK, b.stop * BLOCK) for b in blocks)
-        black = np.ones(image.shape[:2], bool)
-        black[window] = False
-        tile = np.where(black[pixels][..., None], 0, image[pixels])
-        light = np.zeros(self.mean.shape)
-        light[blocks] = block_means(tile)
-        return _levels(light, self.height, self.width)
 
 
 def _mean_brightness(blocks: np.ndarray, height: int, width: int) -> float:

@@ -182,7 +182,7 @@ class PassSums:
         passes = np.stack(self.blocks).astype(np.float64)
         groups = passes.reshape(-1, CHECK_PASSES, *passes.shape[1:])
         blocks = BlockReference.from_groups(passes[:REFERENCE_PASSES], groups.mean(axis=1), *image.shape[:2])
-        change = blocks.visible_change(image, groups[REFERENCE_PASSES // CHECK_PASSES :])
+        change = blocks.visible_change(groups[REFERENCE_PASSES // CHECK_PASSES :])
         return Reference(image, blocks, {**about, "visible_change": change if math.isfinite(change) else None})
 
 

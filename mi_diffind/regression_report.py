@@ -108,15 +108,15 @@ def block_sentence(worst: dict) -> str:
 
 def reasons(figures: dict) -> list[str]:
     """Return the reasons for which a check failed, as parts of a sentence."""
-    found = []
+    parts = []
     if figures["not_finite"]:
-        found.append(f"{figures['not_finite']} pixel(s) are not finite")
+        parts.append(f"{figures['not_finite']} pixel(s) are not finite")
     if figures["failing_blocks"]:
-        found.append(block_sentence(figures["worst"]))
+        parts.append(block_sentence(figures["worst"]))
     if figures["stops"] > figures["stops_threshold"]:
         measured, threshold = figures["stops"], figures["stops_threshold"]
-        found.append(f"off by {measured:.3g} stops on average, noise by {threshold:.3g} at most")
-    return found
+        parts.append(f"off by {measured:.3g} stops on average, noise by {threshold:.3g} at most")
+    return parts
 
 
 def summary(results: list[dict]) -> list[str]:

@@ -129,8 +129,7 @@ def reference_of(passes: np.ndarray) -> tuple[block_test.BlockReference, float]:
     """Return the reference of 128 passes and the change that it promises to see."""
     groups = passes.reshape(-1, GROUP, *passes.shape[1:])
     reference = block_test.BlockReference.from_groups(passes[: 2 * GROUP], groups.mean(axis=1), HEIGHT, WIDTH)
-    image = reference.mean.repeat(block_test.BLOCK, axis=0).repeat(block_test.BLOCK, axis=1)
-    return reference, reference.visible_change(image, groups[2:])
+    return reference, reference.visible_change(groups[2:])
 
 
 def with_brighter_tile(check: np.ndarray, reference: block_test.BlockReference, change: float, rng) -> np.ndarray:
