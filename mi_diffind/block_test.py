@@ -264,4 +264,4 @@ class BlockReference:
 
 
 def _mean_brightness(blocks: np.ndarray, height: int, width: int) -> float:
-    return float((blocks * _pixels(height, width)).sum() / (height * width * blocks.shape[-1]))
+    return float((np.abs(blocks) * _pixels(height, width)).sum() / (height * width * blocks.shape[-1]))

@@ -557,28 +557,6 @@ def property_kind(props, key: str) -> str:
     return words.get(parameter, "other")
 
 
-@contextlib.contextmanager
-def film_size(sensor, width: int, height: int):
-    """Give the film of a loaded sensor another size (pixels) while the context is open; yield whether that is possible.
-
-    The parameter ``film.size`` is not in the manual, and a film with a crop window keeps its size.
-    """
-    import mitsuba as mi
-
-    film, params = sensor.film(), mi.traverse(sensor)
-    before = [int(n) for n in film.size()]
-    if "film.size" not in params or before != [int(n) for n in film.crop_size()]:
-        yield False
-        return
-    try:
-        params["film.size"] = mi.ScalarVector2u(width, height)
-        params.update()
-        yield True
-    finally:
-        params["film.size"] = mi.ScalarVector2u(*before)
-        params.update()
-
-
 def one_sentence(error: BaseException) -> str:
     """Return the message of an error without the layers around it, whose form is not promised.
 

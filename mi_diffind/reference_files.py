@@ -69,7 +69,7 @@ def read_reference(path: str | os.PathLike, references: str | os.PathLike | None
     parts = _parts(stored)
     about = _about(stored, Path(path).stem, parts)
     if len(parts) != 2:
-        raise BadReference(f"{stored}: is a reference of an earlier version, which no check can use; add --update")
+        raise BadReference(f"{stored}: is a reference of an earlier version, render it again with --update")
     return _reference(stored, about, *(channels for _, channels in parts))
 
 
@@ -87,25 +87,26 @@ def write_reference(path: Path, reference: Reference) -> None:
     """Write a reference in one piece. Raises :class:`~mi_diffind.files.OutputError`."""
     import OpenEXR
 
-    blocks = reference.blocks
-    names = _channels(blocks.mean.shape[-1])
-    about = json.dumps({**reference.about, "stops": blocks.stops.tolist()}, sort_keys=True)
-    image = np.clip(reference.image, -_LARGEST, _LARGEST).astype(np.float16)
-    means = {f"pass{i:02}": values for i, values in enumerate(blocks.passes)} | {"mean": blocks.mean}
-    parts = []
-    window = (np.zeros(2, np.int32), np.array(image.shape[1::-1], np.int32) - 1)
-    for title, planes in (("image", {"": image}), ("blocks", means)):
-        channels = {}
-        for plane, values in planes.items():
-            for i, name in enumerate(names):
-                full = f"{plane}.{name}" if plane else name
-                channels[full] = np.ascontiguousarray(values[..., i], values.dtype if title == "image" else np.float32)
-        size = np.array(values.shape[1::-1], np.int32) - 1
-        header = {
-            "type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION, "displayWindow": window,
-            "dataWindow": (np.zeros(2, np.int32), size), **({_ATTRIBUTE: about} if title == "image" else {}),
+    def part(title: str, values: dict[str, np.ndarray], dtype: type, **attributes) -> OpenEXR.Part:
+        height, width, count = next(iter(values.values())).shape
+        channels = {
+            prefix + name: np.ascontiguousarray(value[..., i], dtype)
+            for prefix, value in values.items() for i, name in enumerate(_channels(count))
         }  # fmt: skip
-        parts.append(OpenEXR.Part(header, channels, title))
+        windows = {"displayWindow": window(*reference.image.shape[:2]), "dataWindow": window(height, width)}
+        form = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+        return OpenEXR.Part({**form, **windows, **attributes}, channels, title)
+
+    def window(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros(2, np.int32), np.array([width - 1, height - 1], np.int32)
+
+    blocks, about = reference.blocks, {**reference.about, "stops": reference.blocks.stops.tolist()}
+    means = {f"pass{i:02}.": values for i, values in enumerate(blocks.passes)} | {"mean.": blocks.mean}
+    image = {"": np.clip(reference.image, -_LARGEST, _LARGEST)}
+    parts = [
+        part("image", image, np.float16, **{_ATTRIBUTE: json.dumps(about, sort_keys=True)}),
+        part("blocks", means, np.float32),
+    ]
     with replacing(path) as temporary:
         try:
             with OpenEXR.File(parts) as file:

@@ -306,16 +306,6 @@ def test_parsed_scenes(mi_rgb):
         film["height"] = 10
         scene = compat.instantiate(config, state)
         assert isinstance(scene, mi_rgb.Scene) and tuple(scene.sensors()[0].film().size()) == (20, 10)
-    with hook("the size of a film as a parameter"):
-        sensor = scene.sensors()[0]
-        before = mi_rgb.render(scene, spp=1, seed=1).numpy()
-        with compat.film_size(sensor, 10, 5) as possible:
-            assert possible and mi_rgb.render(scene, spp=1).shape[:2] == (5, 10)
-        assert np.array_equal(mi_rgb.render(scene, spp=1, seed=1).numpy(), before)
-    with hook("film with a crop window"):
-        cropped = {"type": "hdrfilm", "width": 8, "height": 8, "crop_width": 4, "crop_height": 4}
-        with compat.film_size(mi_rgb.load_dict({"type": "perspective", "film": cropped}), 2, 2) as possible:
-            assert not possible
 
 
 def test_meshes_that_are_kept_apart(mi_rgb, tmp_path):

@@ -431,7 +431,7 @@ def test_references_of_earlier_versions(regress, tmp_path, capsys):
     with OpenEXR.File({"type": OpenEXR.scanlineimage, "mi_diffind": json.dumps(about)}, channels) as old:
         old.write(str(file))
     message = refused(capsys, "regress", path)
-    assert f"{file}: is a reference of an earlier version, which no check can use; add --update" in message
+    assert f"{file}: is a reference of an earlier version, render it again with --update" in message
     assert main(["regress", path, "--update"]) == 0
     new = regress.read_reference(path)
     assert {**new.about, **about} == new.about and new.image.shape == (12, 10, 3)
