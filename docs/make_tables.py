@@ -242,7 +242,7 @@ def scenes_bias() -> Table:
 
 
 def regress_power() -> Table:
-    """Return alarms of regression checks of changed and of unchanged scenes, and how often a promised change is found."""
+    """Return alarms of regression checks of changed and unchanged scenes, and how often a promised change is found."""
     changes = ("unchanged", "colour −3%", "roughness +10%", "moved by 0.2%", "lamp −1%", "lamp −2%")
     rows = []
     for row in measured("regress_power")["rows"]:
