@@ -144,7 +144,7 @@ def update_summary(figures: dict) -> list[str]:
 
 
 def _wrapped(title: str, text: str) -> list[str]:
-    return textwrap.wrap(f"{title:11} {text}", 62, subsequent_indent=" " * 12)
+    return textwrap.wrap(f"{title:11} {text}", 58, subsequent_indent=" " * 12)
 
 
 def _write_figure(path: str, result: Regression) -> None:
