@@ -242,6 +242,20 @@ def scenes_bias() -> Table:
     return table(["scene", "tables", "bias", "the noise equals it at", "time, learned / exact"], rows)
 
 
+def regress_power() -> Table:
+    """Return alarms of regression checks of changed and unchanged scenes, and how often a promised change is found."""
+    changes = ("unchanged", "colour −3%", "roughness +10%", "moved by 0.2%", "lamp −1%", "lamp −2%")
+    rows = []
+    for row in measured("regress_power")["rows"]:
+        power, mode = row["power"], row["variant"].removeprefix("llvm_ad_")
+        rows.append([
+            f"{row['scene']}, {mode}, `{row['sampler']}`, {row['spp']}",
+            *(f"{row['percent'][c]:.3g}% of {row['checks'][c]}" for c in changes),
+            f"{100 * power['predicted_change']:.2g}%: {power['measured_percent']:.0f}%",
+        ])  # fmt: skip
+    return table(["scene, variant, sampler, spp", *changes, "tile: found"], rows)
+
+
 def image_contenders() -> Table:
     """Return quality of a compressed material beside that of codecs in as many bytes."""
     rows = []
@@ -890,6 +904,7 @@ TABLES = {
         ggx_candidates,
         ggx_quality,
         scenes_bias,
+        regress_power,
         image_contenders,
         image_bytes,
         image_pages,

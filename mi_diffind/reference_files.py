@@ -1,15 +1,17 @@
 """Stored renderings of scenes: the EXR files that :mod:`.regression` checks against, and partial renders of them.
 
-A reference is kept beside its scene, as ``references/SCENE.VARIANT.exr``: the image (``R``, ``G``, ``B``, or ``Y`` in
-mono variants), the variance of one sample (``variance.R``, …), and a header attribute with the settings of the render.
+A reference is kept beside its scene, as ``references/SCENE.VARIANT.exr``, an EXR file of two parts. The first is the
+image in half floats (``R``, ``G``, ``B``, or ``Y`` in mono variants), with the settings of the render in its header.
+The second has the means of blocks of 4 × 4 pixels: of 16 single passes (``pass00.R``, …) and of all 128 (``mean.R``).
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import mitsuba as mi
@@ -17,12 +19,14 @@ import numpy as np
 
 from . import scenes
 from .archives import Archive
+from .block_test import CHECK_PASSES, GROUPS, REFERENCE_PASSES, BlockReference, block_means
 from .files import OutputError, replacing
-from .z_test import PassMoments
 
 _ATTRIBUTE = "mi_diffind"
 _REMEDY = "remove it and make it again with --update"
 _ABOUT = {"scene": str, "variant": str, "defines": dict, "budget": int, "spp": int, "seed": int}
+#: Largest half float.
+_LARGEST = 65504.0
 
 
 class BadReference(scenes.SceneError):
@@ -31,16 +35,17 @@ class BadReference(scenes.SceneError):
 
 @dataclass(frozen=True)
 class Reference:
-    """A stored rendering: ``image`` and the ``variance`` of one sample, both ``(height, width, channels)``, float32.
+    """A stored rendering: its ``image``, ``(height, width, channels)``, and its ``blocks``, for the test of a check.
 
-    Values are linear, of 3 channels (red, green, blue) or 1 (mono variants). ``about`` holds ``scene`` (file name
-    without its extension), ``variant``, ``defines`` (texts for the scene's ``<default>`` values), ``budget`` (samples
-    per pixel of a check), ``spp`` (samples per pixel of the reference), ``seed``, and the ``versions`` of mi_diffind
-    and Mitsuba that rendered it.
+    Values are linear, of 3 channels (red, green, blue) or 1 (mono variants); the image is for pictures, rounded to half
+    floats. ``about`` holds ``scene`` (file name without its extension), ``variant``, ``defines`` (texts for the scene's
+    ``<default>`` values), ``budget`` (samples per pixel of a check), ``spp`` (samples per pixel of the reference),
+    ``seed``, ``visible_change`` (of :meth:`.block_test.BlockReference.visible_change`, ``None`` for infinity), and the
+    ``versions`` of mi_diffind and Mitsuba that rendered it.
     """
 
     image: np.ndarray
-    variance: np.ndarray
+    blocks: BlockReference
     about: dict
 
 
@@ -61,11 +66,17 @@ def read_reference(path: str | os.PathLike, references: str | os.PathLike | None
     stored = next((file for file in (wanted, *twins) if file.is_file()), None)
     if stored is None:
         raise BadReference(f'{path}: has no reference "{wanted}"; run the same command with --update to make it')
-    reference = _read(stored)
-    about = reference.about
-    if (about["scene"], f"{about['scene']}.{about['variant']}.exr") != (Path(path).stem, stored.name):
-        raise BadReference(f'{stored}: is the reference of the scene "{about["scene"]}" in {about["variant"]}')
-    return reference
+    parts = _parts(stored)
+    about = _about(stored, Path(path).stem, parts)
+    if len(parts) != 2:
+        raise BadReference(f"{stored}: is a reference of an earlier version, render it again with --update")
+    return _reference(stored, about, *(channels for _, channels in parts))
+
+
+def read_settings(path: str | os.PathLike, references: str | os.PathLike | None = None) -> dict:
+    """Return ``about`` of a scene's reference in this variant, also of earlier versions; nothing if there is none."""
+    stored = reference_path(path, references)
+    return _about(stored, Path(path).stem, _parts(stored)) if stored.is_file() else {}
 
 
 def _channels(count: int) -> str:
@@ -76,61 +87,117 @@ def write_reference(path: Path, reference: Reference) -> None:
     """Write a reference in one piece. Raises :class:`~mi_diffind.files.OutputError`."""
     import OpenEXR
 
-    header = {
-        "type": OpenEXR.scanlineimage,
-        "compression": OpenEXR.ZIP_COMPRESSION,
-        _ATTRIBUTE: json.dumps(reference.about, sort_keys=True),
-    }
-    channels = {}
-    for i, name in enumerate(_channels(reference.image.shape[-1])):
-        channels[name] = np.ascontiguousarray(reference.image[..., i])
-        channels[f"variance.{name}"] = np.ascontiguousarray(reference.variance[..., i])
+    def part(title: str, values: dict[str, np.ndarray], dtype: type, **attributes) -> OpenEXR.Part:
+        height, width, count = next(iter(values.values())).shape
+        channels = {
+            prefix + name: np.ascontiguousarray(value[..., i], dtype)
+            for prefix, value in values.items() for i, name in enumerate(_channels(count))
+        }  # fmt: skip
+        windows = {"displayWindow": window(*reference.image.shape[:2]), "dataWindow": window(height, width)}
+        form = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+        return OpenEXR.Part({**form, **windows, **attributes}, channels, title)
+
+    def window(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros(2, np.int32), np.array([width - 1, height - 1], np.int32)
+
+    blocks, about = reference.blocks, {**reference.about, "stops": reference.blocks.stops.tolist()}
+    means = {f"pass{i:02}.": values for i, values in enumerate(blocks.passes)} | {"mean.": blocks.mean}
+    image = {"": np.clip(reference.image, -_LARGEST, _LARGEST)}
+    parts = [
+        part("image", image, np.float16, **{_ATTRIBUTE: json.dumps(about, sort_keys=True)}),
+        part("blocks", means, np.float32),
+    ]
     with replacing(path) as temporary:
         try:
-            with OpenEXR.File(header, channels) as file:
+            with OpenEXR.File(parts) as file:
                 file.write(str(temporary))
         except RuntimeError as e:
             raise OutputError(f'reference "{path}" cannot be written: {e}') from None
 
 
-def _read(path: Path) -> Reference:
+def _parts(path: Path) -> list[tuple[dict, dict]]:
+    """Return the header and the channels of each part of an EXR file."""
     import OpenEXR
 
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             # copies: closing the file empties its dictionaries
-            header, channels = dict(file.header()), {k: v.pixels.copy() for k, v in file.channels().items()}
+            return [
+                (dict(part.header), {k: v.pixels.astype(np.float32) for k, v in part.channels.items()})
+                for part in file.parts
+            ]
     except (RuntimeError, ValueError) as e:
         raise BadReference(f"{path}: cannot be read as an EXR image; {_REMEDY}") from e
+
+
+def _about(path: Path, stem: str, parts: list[tuple[dict, dict]]) -> dict:
     try:
-        about = json.loads(header[_ATTRIBUTE])
+        about = json.loads(parts[0][0][_ATTRIBUTE])
         good = all(isinstance(about[key], expected) for key, expected in _ABOUT.items())
-        image, variance = (
-            np.stack([channels[prefix + name] for name in _channels(3 if "R" in channels else 1)], -1).astype(
-                np.float32
-            )
-            for prefix in ("", "variance.")
-        )
     except (KeyError, TypeError, ValueError) as e:
         raise BadReference(f"{path}: is an EXR image, but no reference; {_REMEDY}") from e
-    if not (good and about["budget"] > 0 and about["spp"] > 0 and np.isfinite(image + variance).all()):
+    if not (good and about["budget"] > 0 and about["spp"] > 0):
         raise BadReference(f"{path}: is a damaged reference; {_REMEDY}")
-    return Reference(image, variance, about)
+    if (about["scene"], f"{about['scene']}.{about['variant']}.exr") != (stem, path.name):
+        raise BadReference(f'{path}: is the reference of the scene "{about["scene"]}" in {about["variant"]}')
+    return about
 
 
-def write_partial(path: Path, moments: PassMoments, key: dict) -> None:
+def _reference(path: Path, about: dict, image: dict, means: dict) -> Reference:
+    try:
+        names = _channels(3 if "R" in image else 1)
+        pixels = np.stack([image[name] for name in names], axis=-1)
+        passes = np.stack(
+            [np.stack([means[f"pass{i:02}.{name}"] for name in names], -1) for i in range(REFERENCE_PASSES)]
+        ).astype(np.float64)
+        mean = np.stack([means[f"mean.{name}"] for name in names], axis=-1).astype(np.float64)
+        stops = np.array(about.pop("stops"), np.float64)
+        change = about["visible_change"]
+        good = (
+            stops.shape == (GROUPS,)
+            and (change is None or isinstance(change, float))
+            and mean.shape == passes[0].shape == block_means(pixels).shape
+        )
+    except (KeyError, TypeError, ValueError):
+        good = False
+    if not (good and all(np.isfinite(values).all() for values in (pixels, passes, mean, stops))):
+        raise BadReference(f"{path}: is a damaged reference; {_REMEDY}")
+    return Reference(pixels, BlockReference(passes, mean, stops, *pixels.shape[:2]), about)
+
+
+@dataclass
+class PassSums:
+    """Passes of a reference that is being rendered: the sum of the images, and the ``blocks`` of each pass."""
+
+    image: np.ndarray | float = 0.0
+    blocks: list[np.ndarray] = field(default_factory=list)
+
+    def add(self, image: np.ndarray) -> None:
+        """Add the next pass."""
+        self.image = self.image + image
+        self.blocks.append(block_means(image).astype(np.float32))
+
+    def reference(self, about: dict) -> Reference:
+        """Return the reference of all passes, with its ``visible_change``, ``None`` for infinity, in ``about``."""
+        image = np.float32(self.image / len(self.blocks))
+        passes = np.stack(self.blocks).astype(np.float64)
+        groups = passes.reshape(-1, CHECK_PASSES, *passes.shape[1:])
+        blocks = BlockReference.from_groups(passes[:REFERENCE_PASSES], groups.mean(axis=1), *image.shape[:2])
+        change = blocks.visible_change(groups[REFERENCE_PASSES // CHECK_PASSES :])
+        return Reference(image, blocks, {**about, "visible_change": change if math.isfinite(change) else None})
+
+
+def write_partial(path: Path, sums: PassSums, key: dict) -> None:
     """Keep the passes of an unfinished reference, with a ``key`` (JSON) of all that the render depends on."""
-    about = json.dumps({**key, "samples": moments.samples, "passes": moments.passes}).encode()
+    about = np.frombuffer(json.dumps(key).encode(), np.uint8)
     with replacing(path) as temporary, open(temporary, "wb") as stream:
-        np.savez(stream, mean=moments.mean, squares=moments.squares, about=np.frombuffer(about, np.uint8))
+        np.savez(stream, image=sums.image, blocks=np.stack(sums.blocks), about=about)
 
 
-def read_partial(path: Path, key: dict) -> PassMoments:
+def read_partial(path: Path, key: dict) -> PassSums:
     """Return the kept passes of the render with the same ``key``; none if missing or damaged."""
     with contextlib.suppress(Exception), Archive(path) as archive:
-        about = archive.json("about")
-        sums = archive.array("mean"), archive.array("squares")
-        moments = PassMoments(*sums, about.pop("samples"), about.pop("passes"))
-        if about == key and np.isfinite(moments.mean + moments.squares).all():
-            return moments
-    return PassMoments()
+        image, blocks = archive.array("image").copy(), archive.array("blocks")
+        if archive.json("about") == key and np.isfinite(image).all() and np.isfinite(blocks).all():
+            return PassSums(image, list(blocks))
+    return PassSums()

@@ -1,8 +1,8 @@
 """Checks against stored references: the statistics, what they let pass and catch, the files, and the command."""
 
+import dataclasses
 import json
 import os
-import re
 import signal
 from pathlib import Path
 
@@ -13,8 +13,8 @@ import pytest
 from commands import refused
 from variants import set_variant
 
+from mi_diffind import reference_files
 from mi_diffind.cli import main
-from mi_diffind.reference_files import write_reference
 
 TESTS = Path(__file__).resolve().parent
 SCENES = TESTS.parent / "scenes"
@@ -39,7 +39,8 @@ def scene_file(tmp_path, name="scene", reflectance=0.5):
     path = tmp_path / f"{name}.xml"
     path.write_text(
         '<scene version="3.0.0"><integrator type="direct"/><emitter type="constant"/><default name="width" value="16"/>'
-        '<sensor type="perspective"><film type="hdrfilm"><integer name="width" value="$width"/>'
+        '<default name="sampler" value="independent"/><sensor type="perspective"><sampler type="$sampler"/>'
+        '<film type="hdrfilm"><integer name="width" value="$width"/>'
         '<integer name="height" value="12"/><rfilter type="box"/><string name="pixel_format" value="rgb"/></film>'
         '</sensor><shape type="sphere"><transform name="to_world"><translate z="4"/></transform>'
         f'<bsdf type="diffuse"><spectrum name="reflectance" value="{reflectance}"/></bsdf></shape></scene>'
@@ -47,40 +48,46 @@ def scene_file(tmp_path, name="scene", reflectance=0.5):
     return str(path)
 
 
-def noise(rng, variance, spp):
-    """What ``spp`` samples of zero mean average to, if they are normally distributed."""
-    return rng.standard_normal(variance.shape) * np.sqrt(variance / spp)
-
-
 # -- passes ------------------------------------------------------------------------------------------------------------
 
 
-def test_mean_and_variance_of_passes(regress, rng, monkeypatch):
-    """Of noise with a known variance of a sample, whatever the number of samples in a pass; alpha is left out."""
-    truth, variance = rng.random((40, 50, 4)), 10 ** rng.uniform(-3, 1, (40, 50, 4))
+def test_passes_share_no_samples(regress, monkeypatch, tmp_path):
+    """Neither with each other nor with those of the other side, also where a pass takes several renders."""
     taken = []
 
     def render_pass(scene, spp, seed):
         taken.append((spp, seed))
-        return truth + noise(rng, variance, spp)
+        return np.full((12, 16, 3), 0.5)
 
     monkeypatch.setattr(regress.scenes, "render_pass", render_pass)
-    for spp, in_a_pass in ((1, 1), (128, 1), (129, 2), (3808, 32), (6800, 64)):  # powers of two: see below
+    path = scene_file(tmp_path)
+    for limit, renders in ((1 << 22, 1), (192, 4)):
+        monkeypatch.setattr(regress, "_RENDER", limit)
+        for seed in (0, 3):
+            regress.regress(path, update=True, spp=32, seed=seed, progress=False)
+            assert regress.regress(path, seed=seed, progress=False).figures["spp"] == 32
+        assert len(taken) == 2 * (128 + 8 + 8) * renders and {spp for spp, _ in taken} == {4 // renders}
+        assert len({seed % 2**32 for _, seed in taken}) == len(taken) - 8 * renders  # both updates end in one check
         taken.clear()
-        mean, found, done = regress.render_with_variance(None, spp, seed=3)
-        assert {n for n, _ in taken} == {in_a_pass} and done == 128 * in_a_pass >= spp
-        assert mean.shape == found.shape == (40, 50, 3)
-        ratio = found / variance[..., :3]
-        assert abs(ratio.mean() - 1) < 0.02 and ratio.std() == pytest.approx(np.sqrt(2 / 127), rel=0.1)
-        z = (mean - truth[..., :3]) / np.sqrt(variance[..., :3] / done)
-        assert abs(z.mean()) < 0.1 and z.std() == pytest.approx(1, rel=0.05)
-        seeds = {seed for _, seed in taken}
-        assert len(seeds) == 128 and seeds == {(3 << 16) + (1 << 15) + i for i in range(128)}
-    taken.clear()
-    regress.scenes.render(None, 4000, seed=3, passes=100)
-    assert seeds.isdisjoint(seed for _, seed in taken)  # a check never sees the samples of its reference
-    with pytest.raises(ValueError, match="at least 2"):
-        regress.render_with_variance(None, 16, passes=1)
+
+
+def test_samplers_that_round(regress, tmp_path, capsys):
+    """What is rendered is said; a check has the samples of its reference, or is refused."""
+    path, report = scene_file(tmp_path), tmp_path / "report.json"
+    rounded = {"independent": 24, "stratified": 32, "multijitter": 24, "orthogonal": 32, "ldsampler": 32}
+    for sampler, spp in rounded.items():
+        scene = regress.scenes.load(path, {"sampler": sampler})
+        assert regress.PassSize.of_check(scene, 20).check_spp == spp
+    assert main(["regress", path, "--update", "--json", str(report), "-D", "sampler=stratified", "--spp", "20"]) == 0
+    assert "a check has 32 spp (asked for 20) and would see" in capsys.readouterr().out
+    stored = json.loads(report.read_text())["scenes"][0]
+    assert (stored["asked_spp"], stored["budget"], stored["spp"]) == (20, 32, 512)
+    assert main(["regress", path, "--json", str(report)]) == 0
+    assert json.loads(report.read_text())["scenes"][0]["spp"] == 32
+    for wrong in (["--spp", "100"], ["--spp", "128", "-D", "sampler=independent"]):
+        message = refused(capsys, "regress", path, *wrong)
+        assert "samples a pixel, its reference is for 32: keep --spp and the sampler, or render it again" in message
+        assert "--update --spp 128" in message
 
 
 # -- the repository's scenes -------------------------------------------------------------------------------------------
@@ -128,7 +135,7 @@ def test_scene_renders_as_its_reference(path, variant):
 
     result = regress.regress(path, progress=False).figures
     assert result["passed"], result
-    assert result["reference_spp"] >= 16 * result["spp"] and result["spp"] > 200
+    assert result["reference_spp"] == 16 * result["spp"] and result["spp"] >= 128
 
 
 def test_references_are_small():
@@ -184,13 +191,13 @@ def test_a_broken_table_entry_is_caught(regress, tmp_path, capsys, monkeypatch):
     found = json.loads(report.read_text())
     result = found["scenes"][0]
     assert found["failed"] == 1 and result["passed"] is False
-    assert result["fraction"] == pytest.approx(1 - result["failing_pixels"] / (result["width"] * result["height"]))
     assert len(result["files"]) == 5 and {Path(f).name for f in result["files"].values()} == set(os.listdir(out))
-    image, reference, error, p = (
-        np.array(mi.Bitmap(result["files"][k])) for k in ("image", "reference", "error", "p_value")
-    )
+    image, reference, error, t = (np.array(mi.Bitmap(result["files"][k])) for k in ("image", "reference", "error", "t"))
     assert np.array_equal(np.abs(image - reference), error)
-    assert (p <= result["alpha"]).any(axis=-1).sum() == result["failing_pixels"] > 0.0025 * p[..., 0].size
+    worst = result["worst"]
+    inside = t[worst["y"] : worst["y"] + worst["height"], worst["x"] : worst["x"] + worst["width"]]
+    assert np.abs(t).max() == pytest.approx(abs(worst["t"])) and abs(worst["t"]) > worst["threshold"]
+    assert (np.abs(inside) == np.abs(t).max()).any(axis=-1).all() and result["failing_blocks"] > 0
     assert np.array(mi.Bitmap(result["files"]["figure"])).std() > 20  # not blank
 
 
@@ -203,19 +210,23 @@ def test_update_stores_what_a_check_needs(tmp_path, capsys):
     path, report = scene_file(tmp_path), tmp_path / "report.json"
     update = ["regress", path, "--update", "--json", str(report)]
     assert main([*update, "--spp", "20", "--seed", "7", "-D", "width=10"]) == 0
-    assert "10 x 12, 512 spp" in capsys.readouterr().out  # 128 passes of 4, more than 16 · 20
+    assert "10 x 12, 384 spp" in capsys.readouterr().out  # 128 passes of 3
     folder = tmp_path / "references"
     assert os.listdir(folder) == ["scene.llvm_ad_rgb.exr"]
     with OpenEXR.File(str(folder / "scene.llvm_ad_rgb.exr"), separate_channels=True) as file:
         about = json.loads(file.header()["mi_diffind"])
-        channels = {k: v.pixels.copy() for k, v in file.channels().items()}
-    assert sorted(channels) == ["B", "G", "R", "variance.B", "variance.G", "variance.R"]
-    assert all(c.shape == (12, 10) and c.dtype == np.float32 for c in channels.values())
-    versions = about.pop("versions")
-    assert set(versions) == {"mi_diffind", "mitsuba"}
-    expected = {"scene": "scene", "variant": "llvm_ad_rgb", "defines": {"width": "10"}, "budget": 20, "spp": 512}
-    assert about == {**expected, "seed": 7}
+        image, blocks = ({k: v.pixels.copy() for k, v in part.channels.items()} for part in file.parts)
+    assert sorted(image) == ["B", "G", "R"]
+    assert sorted(blocks) == sorted(f"{n}.{c}" for c in "RGB" for n in ("mean", *(f"pass{i:02}" for i in range(16))))
+    assert all(c.shape == (12, 10) and c.dtype == np.float16 for c in image.values())
+    assert all(c.shape == (3, 3) and c.dtype == np.float32 for c in blocks.values())
+    assert blocks["mean.G"][2, 1] == pytest.approx(image["G"][8:12, 4:8].mean(), rel=1e-3)
+    assert set(about.pop("versions")) == {"mi_diffind", "mitsuba"} and len(about.pop("stops")) == 16
+    assert 0 < about.pop("visible_change") < 0.5
+    expected = {"scene": "scene", "variant": "llvm_ad_rgb", "budget": 24, "spp": 384, "seed": 7}
+    assert about == {**expected, "defines": {"width": "10"}}
 
+    assert main([*update, "--spp", "16"]) == 0
     first = (folder / "scene.llvm_ad_rgb.exr").read_bytes()
     assert main(update) == 0  # the same size, samples and seed again
     assert (folder / "scene.llvm_ad_rgb.exr").read_bytes() == first
@@ -223,10 +234,9 @@ def test_update_stores_what_a_check_needs(tmp_path, capsys):
     assert (folder / "scene.llvm_ad_rgb.exr").read_bytes() != first
     assert main(["regress", path, "--json", str(report)]) == 0
     result = json.loads(report.read_text())["scenes"][0]
-    assert (result["width"], result["height"], result["spp"], result["reference_spp"]) == (10, 12, 20, 512)
-    assert main(["regress", path, "--spp", "30", "--seed", "5", "--json", str(report)]) == 0
-    result = json.loads(report.read_text())["scenes"][0]
-    assert result["spp"] == 30 and result["seed"] == 5
+    assert (result["width"], result["height"], result["spp"], result["reference_spp"]) == (10, 12, 16, 256)
+    assert main(["regress", path, "--spp", "16", "--seed", "5", "--json", str(report)]) == 0
+    assert json.loads(report.read_text())["scenes"][0]["seed"] == 5
 
 
 def test_every_scene_is_checked(tmp_path, capsys):
@@ -239,7 +249,7 @@ def test_every_scene_is_checked(tmp_path, capsys):
     capsys.readouterr()
     assert main(["regress", *paths, *options]) == 1
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[:2] for line in lines if "pixels" in line] == [
+    assert [line.split()[:2] for line in lines if "spp" in line] == [
         ["passed", "first"],
         ["FAILED", "second"],
         ["passed", "third"],
@@ -278,124 +288,58 @@ def test_an_update_that_does_not_end_changes_nothing(regress, tmp_path, capsys, 
     report = tmp_path / "report.json"
     assert main(["regress", path, "--update", "--seed", "1", "--json", str(report)]) == 130
     assert json.loads(report.read_text())["interrupted"]
-    assert file.read_bytes() == before and os.listdir(file.parent) == [file.name]
+    assert file.read_bytes() == before and sorted(os.listdir(file.parent))[0] == file.name
     capsys.readouterr()
     assert main(["regress", path, "--json", str(report)]) == 130
     assert "interrupted" in capsys.readouterr().out
     assert json.loads(report.read_text())["scenes"][0]["passed"] is None
 
 
-def rare_bright_paths(tmp_path):
-    """A rough metal ball throws the light of a small lamp onto the floor, on paths that are found by chance."""
-    path = tmp_path / "rare.xml"
-    path.write_text("""<scene version="3.0.0">
-        <integrator type="path"><integer name="max_depth" value="4"/></integrator>
-        <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="48"/>
-                <integer name="height" value="36"/><rfilter type="box"/><string name="pixel_format" value="rgb"/></film>
-            <transform name="to_world"><lookat origin="0,3,6" target="0,0,0" up="0,1,0"/></transform></sensor>
-        <shape type="rectangle"><transform name="to_world"><scale value="4"/><rotate x="1" angle="-90"/></transform>
-            <bsdf type="diffuse"/></shape>
-        <shape type="sphere"><point name="center" x="0" y="1" z="0"/>
-            <bsdf type="roughconductor"><float name="alpha" value="0.4"/></bsdf></shape>
-        <shape type="sphere"><point name="center" x="-2" y="3" z="1"/><float name="radius" value="0.02"/>
-            <emitter type="area"><rgb name="radiance" value="2500"/></emitter></shape></scene>""")
-    return str(path)
-
-
-def test_a_probe_foretells_the_check(regress, tmp_path, monkeypatch):
-    """The failing part of checks against references of 16 times their samples, within a factor of two."""
-    scene = regress.scenes.load(rare_bright_paths(tmp_path))
-    params = mi.traverse(scene.sensors()[0])
-    monkeypatch.setattr(regress, "PROBE_PIXELS", (256, 2048))
-    for spp, width in ((32, 40), (8, 96)):  # the second has more pixels than a probe
-        params["film.size"] = mi.ScalarVector2u(width, width * 3 // 4)
-        params.update()
-        before = regress.scenes.render_pass(scene, 1, 0)
-        foretold = regress.probe(scene, spp, samples=1 << 19)
-        assert np.array_equal(regress.scenes.render_pass(scene, 1, 0), before)  # the size is as it was
-        image, variance, done = regress.render_with_variance(scene, 16 * spp)
-        checks = [regress.scenes.render(scene, spp, seed)[0] for seed in range(3)]
-        found = [1 - regress.z_test(c, image, variance, spp, done).fraction for c in checks]
-        assert np.mean(found) / 2 - 1e-3 < foretold < 2 * np.mean(found) + 1e-3, (spp, found)
-        assert foretold > 5e-4
-
-
-def rare_bright_samples(tmp_path):
-    """A black screen before a sky: every pixel is black in 96 of 100 samples, and bright in the others."""
-    path = tmp_path / "rare.xml"
-    path.write_text("""<scene version="3.0.0"><integrator type="direct"/>
-        <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="48"/>
-            <integer name="height" value="36"/><rfilter type="box"/><string name="pixel_format" value="rgb"/></film>
-        </sensor><emitter type="constant"><rgb name="radiance" value="10"/></emitter>
-        <shape type="rectangle"><transform name="to_world"><scale value="9"/><translate z="4"/></transform>
-            <bsdf type="mask"><float name="opacity" value="0.96"/>
-                <bsdf type="diffuse"><rgb name="reflectance" value="0"/></bsdf></bsdf></shape></scene>""")
-    return str(path)
-
-
-def test_too_few_samples_are_refused_early(regress, tmp_path, monkeypatch):
-    """Before the reference is rendered, with the number of samples that suffices."""
-    path, rendered, original = rare_bright_samples(tmp_path), [], regress.scenes.render_pass
-    monkeypatch.setattr(regress.scenes, "render_pass", lambda *a: rendered.append(a[1]) or original(*a))
-    options = {"progress": False, "probe_samples": 1 << 19}
-    with pytest.raises(regress.scenes.SceneError) as caught:
-        regress.update_reference(path, spp=4, **options)
-    message = str(caught.value)
-    assert "would fail the check at 4 samples a pixel although nothing has changed (about " in message
-    assert "0.25% may" in message and "a lower max_depth" in message
-    assert not list((tmp_path / "references").iterdir())
-    factor = len(rendered) // regress.PROBE_PASSES  # of the samples that do; 2 to 16
-    wanted = int(re.search(r"--spp (\d+) should do", message)[1])
-    assert len(rendered) % regress.PROBE_PASSES == 0 and wanted == 4 * 2 ** (factor - 1) > 4
-    assert regress.update_reference(path, spp=wanted, **options)["expected_fraction"] >= 0.9975
-    monkeypatch.setattr(regress, "probe", lambda *_: 0.02)
-    with pytest.raises(regress.scenes.SceneError, match="not even 16 times the samples would do: give a lower"):
-        regress.update_reference(path, **options)
-
-
 def test_a_reference_that_would_fail_unchanged_is_refused(regress, rng, tmp_path, capsys, monkeypatch):
-    """Rare bright paths that no probe saw; what was rendered is not lost."""
+    """One of two checks has to pass: one of a hundred fails by chance."""
+    path, fails = scene_file(tmp_path), 2
 
-    def fireflies(scene, spp, seed):
-        return 0.5 + 100 * (rng.random((12, 16, 3)) < 1e-5 * spp)
+    def brighter_checks(scene, spp, seed):
+        number = 65535 - (seed >> 16)
+        return rng.normal(1.5 if number < fails else 1, 0.1, (12, 16, 3))
 
-    path, report = scene_file(tmp_path), tmp_path / "report.json"
-    update, partial = ["regress", path, "--update"], tmp_path / "references" / "scene.llvm_ad_rgb.partial.npz"
-    with monkeypatch.context() as patch:
-        patch.setattr(regress.scenes, "render_pass", fireflies)
-        assert "although nothing has changed (about " in refused(capsys, *update, "--spp", "1000")
-        assert not list(partial.parent.iterdir())
-        patch.setattr(regress, "probe", lambda scene, spp, *_: 0.01 if 1000 < spp < 4000 else 0.0)
-        message = refused(capsys, *update, "--spp", "1000")
-        assert "fails the check at 1000 samples a pixel although nothing has changed (" in message
-        assert "--spp 4000 should do, or a lower max_depth" in message
-        assert f"the same command continues from {partial.name} beside the reference" in message
-    monkeypatch.setattr(regress.scenes, "render_pass", lambda *_: np.full((12, 16, 3), 0.5))
-    assert [f.name for f in partial.parent.iterdir()] == [partial.name]
-    kept = partial.read_bytes()
-    assert main([*update, "--spp", "4000", "--json", str(report)]) == 0
-    found = json.loads(report.read_text())["scenes"][0]
-    assert found["reused_spp"] == 16384 and found["spp"] == 65536  # 96 more passes of 512
-    assert not partial.exists()
-    for content, seed in ((kept, "1"), (kept[:500], "0"), (b"", "0")):  # of other samples, or damaged
-        partial.write_bytes(content)
-        assert main([*update, "--spp", "40", "--seed", seed, "--json", str(report)]) == 0
-        assert json.loads(report.read_text())["scenes"][0]["reused_spp"] == 0
-    monkeypatch.setattr(regress.scenes, "render_pass", lambda *_: np.full((12, 16, 3), np.nan))
-    assert "192 pixel(s) are not finite" in refused(capsys, *update, "--spp", "10")
-    assert not partial.exists()
+    monkeypatch.setattr(regress.scenes, "render_pass", brighter_checks)
+    message = refused(capsys, "regress", path, "--update", "--spp", "16")
+    assert "fails two checks at 16 samples a pixel although nothing has changed: bright paths are too rare" in message
+    assert os.listdir(tmp_path / "references") == []
+    fails = 1
+    assert main(["regress", path, "--update", "--spp", "16"]) == 0
+
+
+def test_pixels_that_are_not_finite(regress, tmp_path, capsys, monkeypatch):
+    """A reference with such pixels is refused, a check fails and counts them."""
+    path, original, out = scene_file(tmp_path), regress.scenes.render_pass, tmp_path / "out"
+
+    def spoiled(scene, spp, seed):
+        image = original(scene, spp, seed)
+        image[3, 4:6, 1] = np.nan, np.inf
+        return image
+
+    assert main(["regress", path, "--update", "--spp", "16"]) == 0
+    monkeypatch.setattr(regress.scenes, "render_pass", spoiled)
+    capsys.readouterr()
+    assert main(["regress", path, "--out", str(out)]) == 1
+    assert "16 spp: 2 pixel(s) are not finite\n" in capsys.readouterr().out
+    assert np.isnan(np.array(mi.Bitmap(str(out / "scene.llvm_ad_rgb.image.exr")))[3, 4, 1])
+    message = refused(capsys, "regress", path, "--update")
+    assert "2 pixel(s) are not finite, so this cannot be a reference" in message
 
 
 def test_an_interrupted_update_goes_on(regress, tmp_path, capsys, monkeypatch):
     """From where it was: the bytes of the reference are those of one that was never interrupted."""
     path, report = scene_file(tmp_path), tmp_path / "report.json"
-    update = ["regress", path, "--update", "--spp", "20", "--json", str(report), "--references"]
+    update = ["regress", path, "--update", "--spp", "16", "--json", str(report), "--references"]
     assert main([*update, str(tmp_path / "undisturbed")]) == 0
     original, taken = regress.scenes.render_pass, []
 
     def interrupting(*arguments):
         taken.append(1)
-        if len(taken) == regress.PROBE_PASSES + 50:
+        if len(taken) == 50:
             os.kill(os.getpid(), signal.SIGINT)
         return original(*arguments)
 
@@ -404,12 +348,12 @@ def test_an_interrupted_update_goes_on(regress, tmp_path, capsys, monkeypatch):
     capsys.readouterr()
     assert main([*update, str(folder)]) == 130
     partial = folder / "scene.llvm_ad_rgb.partial.npz"
-    assert f"{partial}: 200 samples a pixel are kept, the same command goes on" in capsys.readouterr().out
+    assert f"{partial}: 100 samples a pixel are kept, the same command goes on" in capsys.readouterr().out
     assert os.listdir(folder) == [partial.name]
     before = len(taken)
     assert main([*update, str(folder)]) == 0
-    assert len(taken) - before == regress.PROBE_PASSES + 128 - 50 + 1  # and the check
-    assert json.loads(report.read_text())["scenes"][0]["reused_spp"] == 200
+    assert len(taken) - before == 128 - 50 + 8  # and the check
+    assert json.loads(report.read_text())["scenes"][0]["reused_passes"] == 50
     name = "scene.llvm_ad_rgb.exr"
     assert (folder / name).read_bytes() == (tmp_path / "undisturbed" / name).read_bytes()
     assert os.listdir(folder) == [name]
@@ -418,7 +362,9 @@ def test_an_interrupted_update_goes_on(regress, tmp_path, capsys, monkeypatch):
     assert main([*update, str(folder)]) == 130
     scene_file(tmp_path, reflectance=0.3)  # another scene: nothing of it is used
     assert main([*update, str(folder)]) == 0
-    assert json.loads(report.read_text())["scenes"][0]["reused_spp"] == 0
+    assert json.loads(report.read_text())["scenes"][0]["reused_passes"] == 0
+    partial.write_bytes(b"damaged")
+    assert main([*update, str(folder)]) == 0
 
 
 def test_references_serve_both_backends(regress, tmp_path, monkeypatch):
@@ -456,12 +402,39 @@ def test_bad_references(regress, tmp_path, capsys):
         assert "remove it" in refused(capsys, "regress", path, "--update")
     regress.scenes.write_image(file, np.zeros((12, 16, 3)))
     assert "is an EXR image, but no reference" in refused(capsys, "regress", path, *out)
-    about = {"scene": "scene", "variant": "llvm_ad_rgb", "defines": {}, "budget": 8, "spp": 128, "seed": 0}
-    picture = np.zeros((12, 16, 3), np.float32)
-    for image, wrong in ((picture, {"budget": 0}), (picture, {"spp": "many"}), (picture + np.nan, {})):
-        write_reference(file, regress.Reference(image, picture, {**about, **wrong}))
+    file.write_bytes(content)
+    stored = regress.read_reference(path)
+    for wrong in ({"budget": 0}, {"spp": "many"}, {"image": stored.image + np.nan}, {"image": stored.image[:8]}):
+        image = wrong.pop("image", stored.image)
+        reference_files.write_reference(file, dataclasses.replace(stored, image=image, about={**stored.about, **wrong}))
         assert "is a damaged reference" in refused(capsys, "regress", path, *out)
     assert not (tmp_path / "out").exists()
+
+
+def test_references_of_earlier_versions(regress, tmp_path, capsys):
+    """They are refused, and give their settings to an update."""
+    import OpenEXR
+
+    path = scene_file(tmp_path)
+    about = {
+        "scene": "scene",
+        "variant": "llvm_ad_rgb",
+        "defines": {"width": "10"},
+        "budget": 16,
+        "spp": 256,
+        "seed": 3,
+    }
+    picture = np.zeros((12, 10), np.float32)
+    channels = {f"{prefix}{c}": picture for c in "RGB" for prefix in ("", "variance.")}
+    file = tmp_path / "references" / "scene.llvm_ad_rgb.exr"
+    file.parent.mkdir()
+    with OpenEXR.File({"type": OpenEXR.scanlineimage, "mi_diffind": json.dumps(about)}, channels) as old:
+        old.write(str(file))
+    message = refused(capsys, "regress", path)
+    assert f"{file}: is a reference of an earlier version, render it again with --update" in message
+    assert main(["regress", path, "--update"]) == 0
+    new = regress.read_reference(path)
+    assert {**new.about, **about} == new.about and new.image.shape == (12, 10, 3)
 
 
 def test_bad_options(tmp_path, capsys):

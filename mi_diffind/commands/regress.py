@@ -23,7 +23,7 @@ def add(commands) -> None:
     sub.add_argument(
         "--out", default="out", metavar="DIR", help="folder for the pictures of failed checks (default: out)"
     )
-    sub.add_argument("--spp", type=positive, help="samples per pixel of a check (default: the reference's)")
+    sub.add_argument("--spp", type=positive, help="samples per pixel of a check, with --update")
     sub.add_argument("--seed", type=natural, help="seed of the random numbers (default: 0; --update: the reference's)")
     scene_options(sub, rendering=False)
 
@@ -41,7 +41,7 @@ def run(arguments) -> dict:
         if stems.count(stem) > 1:
             raise UsageError(f'{len(stems)} scenes, and more than one is called "{stem}": check them one at a time')
     set_variant(arguments.variant)
-    from .. import regression
+    from .. import reference_files, regression, regression_report
 
     results, options = [], {"spp": arguments.spp, "seed": arguments.seed, "defines": dict(arguments.defines)}
     if not arguments.update:
@@ -49,7 +49,7 @@ def run(arguments) -> dict:
         writable_folder(out if out.exists() else out.parent)
         options["out"] = out
         for path in arguments.scenes:  # before the first is rendered
-            regression.read_reference(path, arguments.references)
+            reference_files.read_reference(path, arguments.references)
     try:
         for path in arguments.scenes:
             result = regression.regress(path, update=arguments.update, references=arguments.references, **options)
@@ -60,7 +60,7 @@ def run(arguments) -> dict:
                 break
     finally:
         if results and not arguments.update:
-            say("\n".join(regression.summary(results)))
+            say("\n".join(regression_report.summary(results)))
     return {
         "interrupted": results[-1]["interrupted"],
         "failed": sum(r.get("passed") is False for r in results),
