@@ -212,7 +212,9 @@ def load_views(
         notes.append(f"{count} images have a lens distortion and were undistorted")
     mask = images.mask()
     if mask is not None and not mask.any():
-        raise ViewsError(f"{listed.file}: no pixel counts: masks or lens distortions exclude all of {len(paths)} images")
+        raise ViewsError(
+            f"{listed.file}: no pixel counts: masks or lens distortions exclude all of {len(paths)} images"
+        )
     views = CapturedViews(
         pixels=images.pixels[: images.count],
         offsets=np.cumsum([0, *(height * width for height, width in images.sizes)])[:-1],

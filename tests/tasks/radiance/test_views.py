@@ -277,7 +277,10 @@ def test_cameras_of_single_frames(studio):
         ({"camera_angle_x": 1e-320}, 'has the "camera_angle_x" .*, expected radians between 1e-06 and π'),
         ({"cx": 1e308}, 'has the "cx" 1e\\+308, expected a number between -1e\\+09 and 1e\\+09'),
         ({"k2": -1e300}, 'has the "k2" -1e\\+300, expected a number between'),
-        ({"k1": -1e6, "cx": -900.0}, r"transforms\.json: no pixel counts: masks or lens distortions exclude all of 8 i"),
+        (
+            {"k1": -1e6, "cx": -900.0},
+            r"transforms\.json: no pixel counts: masks or lens distortions exclude all of 8 i",
+        ),
         ({"w": 16}, "has 8 × 6 pixels, .*json says 16 × 6"),
         ({"frames": []}, 'has no "frames"'),
         ({"frames": [{"transform_matrix": 1}]}, 'frame 0 has no "file_path"'),
