@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import glob
 import hashlib
 import json
 import os
@@ -238,11 +239,16 @@ def _fitted(folder: Path, progress: bool, task: str, source: Path, **options) ->
             print(f"fit {task} to {source.name}: {path}", file=sys.stderr, flush=True)
         try:
             fitted = fit(task, variant=mi.variant(), output=path, progress=progress, source=str(source), **options)
+            if fitted.result.interrupted:
+                raise KeyboardInterrupt
+            save_table(path, fitted.table)
         except DiffindError as e:
             raise Kept(f"cannot be fitted: {e}") from None
-        if fitted.result.interrupted:
-            raise KeyboardInterrupt
-        save_table(path, fitted.table)
+        finally:
+            if source.suffix == ".json" and not any(folder.glob(f"{glob.escape(source.stem)}_*.npz")):
+                for file in folder.glob(f"{glob.escape(source.stem)}.*"):
+                    if file == source or file.is_symlink():  # the manifest, and its link to the image
+                        file.unlink()
     return tasks()[task].load(path)  # raises for a damaged file
 
 

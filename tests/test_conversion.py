@@ -1,5 +1,6 @@
 """Conversion of scenes: what replaces Mitsuba's plugins, what stays and why, and fits that are not repeated."""
 
+import contextlib
 import json
 import re
 import struct
@@ -144,6 +145,32 @@ def test_what_stays_is_named_with_the_reason(mi_rgb, folder, group, objects, nam
     assert conversion.summary([one]) == [f"kept        {one}"]
     stays = scene.change(lambda state: [node.props.plugin_name() for node in state.nodes])
     assert one.stock in stays and "path" in stays
+
+
+@pytest.mark.parametrize("fault", [KeyboardInterrupt(), UsageError("no")])
+def test_a_fit_that_ends_early_leaves_no_files(mi_rgb, folder, monkeypatch, fault):
+    """An interrupted conversion leaves nothing; one whose fit is refused keeps the image, and writes no table."""
+
+    def failing(*_, **__):
+        raise fault
+
+    monkeypatch.setattr(conversion, "fit", failing)
+    image = '<texture type="bitmap" name="reflectance"><string name="filename" value="image.png"/></texture>'
+    parsed(folder[0], f'<shape type="sphere"><bsdf type="diffuse">{image}</bsdf></shape>')
+    before = sorted(folder[0].iterdir())
+    (folder[0] / "new").mkdir()
+    with pytest.raises(KeyboardInterrupt) if isinstance(fault, KeyboardInterrupt) else contextlib.nullcontext():
+        conversion.convert(folder[0] / "scene.xml", folder[0] / "new" / "new.xml", check=False)
+    assert sorted(folder[0].iterdir()) == sorted([*before, folder[0] / "new"])
+    assert [file.name for file in (folder[0] / "new").iterdir()] == ["new.xml"] * isinstance(fault, UsageError)
+
+
+def test_an_image_that_cannot_be_read_stays(mi_rgb, folder):
+    (folder[0] / "leaf.webp").write_bytes(b"RIFF\0\0\0\0WEBP" + bytes(64))
+    image = '<texture type="bitmap" name="reflectance"><string name="filename" value="leaf.webp"/></texture>'
+    scene = parsed(folder[0], f'<bsdf type="diffuse">{image}</bsdf>')
+    (one,) = conversion.replace_stock(scene, ["bitmap"], folder[0] / "tables")
+    assert not one.learned and one.reason.startswith("leaf.webp cannot be read: ") and "\n" not in one.reason
 
 
 @pytest.mark.parametrize("metal, specular, most", [(0, 0.1, 0.2), (0, 0.5, 0.03), (1, 0.05, 0.03)])
