@@ -213,17 +213,19 @@ def _below(references: list[list[int]], index: int) -> list[int]:
 
 
 def _trace_by(seen_by: tuple[str, ...], integrators: list) -> list[Conversion]:
-    """Replace each integrator :data:`TRACER` by the first of ``seen_by``, which takes its parameters."""
-    conversions = []
+    """Replace each integrator :data:`TRACER` by the first of ``seen_by``, unless another one needs decoded fields."""
+    conversions, tracers = [], []
     for props in integrators:
         name = props.plugin_name()
         if name == TRACER and all(key in TRACER_PARAMETERS for key in props):
-            props.set_plugin_name(seen_by[0])
-            reason = "which follows no footprints: textures filter by the sensor's alone"
-            conversions.append(Conversion("integrator", props.id() or name, name, seen_by[0], reason))
+            tracers.append(props)
         elif name not in seen_by:
             reason = "does not trace distance fields: they are decoded to grids when the scene is loaded"
             conversions.append(Conversion("integrator", props.id() or name, name, "", reason))
+    for props in tracers if not conversions else ():
+        props.set_plugin_name(seen_by[0])
+        reason = "which follows no footprints: textures filter by the sensor's alone"
+        conversions.append(Conversion("integrator", props.id() or TRACER, TRACER, seen_by[0], reason))
     return conversions
 
 

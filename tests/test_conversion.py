@@ -165,6 +165,15 @@ def test_a_fit_that_ends_early_leaves_no_files(mi_rgb, folder, monkeypatch, faul
     assert [file.name for file in (folder[0] / "new").iterdir()] == ["new.xml"] * isinstance(fault, UsageError)
 
 
+@pytest.mark.parametrize("names, after", [(["path"], ["path_sdf"]), (["aov", "path"], ["aov", "path"])])
+def test_a_path_stays_where_another_integrator_needs_decoded_fields(mi_rgb, names, after):
+    """``path_sdf`` follows no footprints: nothing is gained where the fields are decoded to grids in any case."""
+    integrators = [mi_rgb.Properties(name) for name in names]
+    conversions = conversion._trace_by(("path_sdf",), integrators)
+    assert [props.plugin_name() for props in integrators] == after
+    assert [c.learned for c in conversions] == ["path_sdf" if len(names) == 1 else ""]
+
+
 def test_an_image_that_cannot_be_read_stays(mi_rgb, folder):
     (folder[0] / "leaf.webp").write_bytes(b"RIFF\0\0\0\0WEBP" + bytes(64))
     image = '<texture type="bitmap" name="reflectance"><string name="filename" value="leaf.webp"/></texture>'
