@@ -165,6 +165,12 @@ def test_a_fit_that_ends_early_leaves_no_files(mi_rgb, folder, monkeypatch, faul
     assert [file.name for file in (folder[0] / "new").iterdir()] == ["new.xml"] * isinstance(fault, UsageError)
 
 
+def test_a_comparison_of_nothing_says_what_was_kept(mi_rgb, folder):
+    parsed(folder[0], '<bsdf type="principled" id="Glass"><float name="spec_trans" value="1"/></bsdf>')
+    with pytest.raises(scenes.SceneError, match='nothing to compare; kept is principled "Glass": transmits light'):
+        comparison.compare(folder[0] / "scene.xml", learn=["principled"], progress=False)
+
+
 @pytest.mark.parametrize("names, after", [(["path"], ["path_sdf"]), (["aov", "path"], ["aov", "path"])])
 def test_a_path_stays_where_another_integrator_needs_decoded_fields(mi_rgb, names, after):
     """``path_sdf`` follows no footprints: nothing is gained where the fields are decoded to grids in any case."""
