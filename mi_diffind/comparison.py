@@ -146,7 +146,8 @@ def compare(
     if not replaced:
         what = f'plugin that "{against}" can stand for' if against not in (None, "exact") else "learned plugin"
         names = ", ".join(plugins.with_counterpart(against or "exact"))
-        raise scenes.SceneError(f"{parsed.path}: names no {what} ({names}), so there is nothing to compare")
+        kept = "".join(f"; kept is {c}" for c in conversions if not c.learned)
+        raise scenes.SceneError(f"{parsed.path}: names no {what} ({names}), so there is nothing to compare{kept}")
     learned = [entry for entry in replaced if entry["plugin"] in plugins.with_counterpart()]
     truths, sides = {against: (against,)} if against else _default_truths(replaced), {}
     counterparts = {name: _counterparts(replaced, names) for name, names in truths.items()}

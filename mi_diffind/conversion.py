@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import glob
 import hashlib
 import json
 import os
@@ -216,17 +217,19 @@ def _below(references: list[list[int]], index: int) -> list[int]:
 
 
 def _trace_by(seen_by: tuple[str, ...], integrators: list) -> list[Conversion]:
-    """Replace each integrator :data:`TRACER` by the first of ``seen_by``, which takes its parameters."""
-    conversions = []
+    """Replace each integrator :data:`TRACER` by the first of ``seen_by``, unless another one needs decoded fields."""
+    conversions, tracers = [], []
     for props in integrators:
         name = props.plugin_name()
         if name == TRACER and all(key in TRACER_PARAMETERS for key in props):
-            props.set_plugin_name(seen_by[0])
-            reason = "which follows no footprints: textures filter by the sensor's alone"
-            conversions.append(Conversion("integrator", props.id() or name, name, seen_by[0], reason))
+            tracers.append(props)
         elif name not in seen_by:
             reason = "does not trace distance fields: they are decoded to grids when the scene is loaded"
             conversions.append(Conversion("integrator", props.id() or name, name, "", reason))
+    for props in tracers if not conversions else ():
+        props.set_plugin_name(seen_by[0])
+        reason = "which follows no footprints: textures filter by the sensor's alone"
+        conversions.append(Conversion("integrator", props.id() or TRACER, TRACER, seen_by[0], reason))
     return conversions
 
 
@@ -242,11 +245,16 @@ def _fitted(folder: Path, progress: bool, task: str, source: Path, **options) ->
             print(f"fit {task} to {source.name}: {path}", file=sys.stderr, flush=True)
         try:
             fitted = fit(task, variant=mi.variant(), output=path, progress=progress, source=str(source), **options)
+            if fitted.result.interrupted:
+                raise KeyboardInterrupt
+            save_table(path, fitted.table)
         except DiffindError as e:
             raise Kept(f"cannot be fitted: {e}") from None
-        if fitted.result.interrupted:
-            raise KeyboardInterrupt
-        save_table(path, fitted.table)
+        finally:
+            if source.suffix == ".json" and not any(folder.glob(f"{glob.escape(source.stem)}_*.npz")):
+                for file in folder.glob(f"{glob.escape(source.stem)}.*"):
+                    if file == source or file.is_symlink():  # the manifest, and its link to the image
+                        file.unlink()
     return tasks()[task].load(path)  # raises for a damaged file
 
 

@@ -28,6 +28,9 @@ _ATTRIBUTE = re.compile(r"""([^\s=]+)\s*=\s*(?:"([^"]*)"|'([^']*)')""")
 
 _ENTITIES = {"&quot;": '"', "&apos;": "'"}
 
+#: Character by its number, decimal or hexadecimal.
+_NUMBERED = re.compile(r"&#(?:x([0-9a-fA-F]+)|([0-9]+));")
+
 #: Element for a parameter by the type of its value.
 _PARAMETERS = {bool: "boolean", int: "integer", float: "float", str: "string"}
 
@@ -85,6 +88,12 @@ def _read(path: Path) -> tuple[str, _Element]:
     return text, top.children[0]
 
 
+def _character(match: re.Match) -> str:
+    """Return the character of a :data:`_NUMBERED`, escaped if it begins another entity."""
+    character = chr(int(match[1], 16) if match[1] else int(match[2]))
+    return "&amp;" if character == "&" else character
+
+
 def _quoted(text: str) -> str:
     """Return text as the value of an attribute, quoted, one character a byte of UTF-8."""
     return quoteattr(text.replace("$", r"\$")).encode().decode("latin-1")
@@ -119,7 +128,8 @@ class _Editor:
     def value(self, element: _Element, name: str) -> str:
         """Return an attribute as Mitsuba takes it: with the values of parameters in the place of ``$name``."""
         raw = element.attributes.get(name, ("", 0, 0))[0]
-        value = unescape(raw.encode("latin-1").decode("utf-8", "replace"), _ENTITIES)
+        text = _NUMBERED.sub(_character, raw.encode("latin-1").decode("utf-8", "replace"))
+        value = unescape(text, _ENTITIES)
         for key in sorted(self.parameters, key=len, reverse=True) if "$" in value else ():
             value = re.sub(rf"(?<!\\)\${re.escape(key)}", lambda _, key=key: self.parameters[key], value)
         return value.replace(r"\$", "$")

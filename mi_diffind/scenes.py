@@ -67,7 +67,9 @@ class ParsedScene:
             if fault := irregular(path, MOST_TEXT):
                 raise RuntimeError(f"{shown(path)}: {fault}")
             if not self.path.is_file():
-                raise RuntimeError(f"{path}: no such scene file")
+                raise RuntimeError(
+                    f"{path}: {'is a folder, a scene file is needed' if path.is_dir() else 'no such scene file'}"
+                )
             if self.path.suffix.lower() == ".npz":
                 raise RuntimeError(f"{path}: found a table file, a scene is needed: mi_diffind.inspect shows its use")
             _, self._state = compat.parse_file(path, self.defines)

@@ -131,6 +131,11 @@ class NeuralDisney(Disney):
 #: metal's reflection, too; of a material that transmits light, it replaces 0 and 1 by these values itself.
 METALS = {"specular": 1e-3, "eta": 1.001}
 
+#: The same of all else. Schlick's term of the Disney BRDF is 1 at grazing angles, the dielectric one is smaller the
+#: nearer the index of refraction is to 1: a floor of roughness 0.1 seen at 11° is 76% brighter with ``specular`` 0, 15%
+#: with 0.1 and 2% with 0.5.
+DIELECTRICS = {"specular": 0.1, "eta": 1.2}
+
 
 def _from_principled(node: StockNode) -> str:
     """Check whether a ``principled`` is within the model, whose parameters have the same names."""
@@ -142,10 +147,14 @@ def _from_principled(node: StockNode) -> str:
     for name, low, high in (*((name, 0, 1) for name in unit), ("eta", 1, ETA_MAX)):
         if name in props and properties.is_number(props, name) and not low <= float(props[name]) <= high:
             raise Kept(f'has the parameter "{name}" {float(props[name]):g}, the Disney BRDF allows {low} to {high:g}')
-    metal = "metallic" in props and not (properties.is_number(props, "metallic") and float(props["metallic"]) == 0)
-    for name, least in METALS.items():
-        if metal and name in props and properties.is_number(props, name) and float(props[name]) < least:
-            raise Kept(f'is a metal with "{name}" {float(props[name]):g}, whose reflection Mitsuba leaves out')
+    textured = "metallic" in props and not properties.is_number(props, "metallic")
+    share = 0.5 if textured else float(props.get("metallic", 0))
+    for name, least in (METALS if share == 1 else DIELECTRICS).items():
+        if name in props and properties.is_number(props, name) and float(props[name]) < least:
+            value = f'"{name}" {float(props[name]):g}'
+            if share and float(props[name]) < METALS[name]:
+                raise Kept(f"is a metal with {value}, whose reflection Mitsuba leaves out")
+            raise Kept(f"has the {value}, below {least:g} the Disney BRDF reflects more at grazing angles")
     return ""
 
 

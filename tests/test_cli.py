@@ -567,7 +567,7 @@ def test_variant_without_its_device(tmp_path, capsys):
 
 
 def test_not_a_scene(tmp_path, capsys):
-    assert "no such scene file" in refused(capsys, "render", ".")
+    assert ".: is a folder, a scene file is needed" in refused(capsys, "render", ".")
     path = tmp_path / "bsdf.xml"
     path.write_text('<bsdf version="3.0.0" type="neural_disney"/>')
     assert "a scene is expected" in refused(capsys, "render", str(path), "-o", str(tmp_path / "image.exr"))

@@ -1,10 +1,12 @@
 """Conversion of scenes: what replaces Mitsuba's plugins, what stays and why, and fits that are not repeated."""
 
+import contextlib
 import json
 import re
 import struct
 import zlib
 
+import drjit as dr
 import numpy as np
 import pytest
 import trimesh
@@ -114,6 +116,11 @@ def test_a_converted_scene_shows_the_same(mi_rgb, folder):
              f'<float name="{name}" value="{value}"/></bsdf>', 'principled "Gold"', f'is a metal with "{name}" {value}')
             for metal, name, value in ((1, "specular", 0), (0.5, "eta", 1))
         ),
+        *(
+            ("principled", f'<bsdf type="principled" id="Floor"><float name="{name}" value="{value}"/></bsdf>',
+             'principled "Floor"', f'has the "{name}" {value}, below {least} the Disney BRDF reflects more at grazing')
+            for name, value, least in (("specular", 0, 0.1), ("specular", 0.09, 0.1), ("eta", 1.1, 1.2))
+        ),
         ("mesh", BALL.replace("MORE", '<emitter type="area"/>'), 'ply "ball"', "emits light"),
         ("mesh", BALL.replace("MORE", '<transform name="to_world"><scale x="1" y="2" z="1"/></transform>'),
          'ply "ball"', "allowed are rotations, uniform scales"),
@@ -138,6 +145,67 @@ def test_what_stays_is_named_with_the_reason(mi_rgb, folder, group, objects, nam
     assert conversion.summary([one]) == [f"kept        {one}"]
     stays = scene.change(lambda state: [node.props.plugin_name() for node in state.nodes])
     assert one.stock in stays and "path" in stays
+
+
+@pytest.mark.parametrize("fault", [KeyboardInterrupt(), UsageError("no")])
+def test_a_fit_that_ends_early_leaves_no_files(mi_rgb, folder, monkeypatch, fault):
+    """An interrupted conversion leaves nothing; one whose fit is refused keeps the image, and writes no table."""
+
+    def failing(*_, **__):
+        raise fault
+
+    monkeypatch.setattr(conversion, "fit", failing)
+    image = '<texture type="bitmap" name="reflectance"><string name="filename" value="image.png"/></texture>'
+    parsed(folder[0], f'<shape type="sphere"><bsdf type="diffuse">{image}</bsdf></shape>')
+    before = sorted(folder[0].iterdir())
+    (folder[0] / "new").mkdir()
+    with pytest.raises(KeyboardInterrupt) if isinstance(fault, KeyboardInterrupt) else contextlib.nullcontext():
+        conversion.convert(folder[0] / "scene.xml", folder[0] / "new" / "new.xml", check=False)
+    assert sorted(folder[0].iterdir()) == sorted([*before, folder[0] / "new"])
+    assert [file.name for file in (folder[0] / "new").iterdir()] == ["new.xml"] * isinstance(fault, UsageError)
+
+
+def test_a_comparison_of_nothing_says_what_was_kept(mi_rgb, folder):
+    parsed(folder[0], '<bsdf type="principled" id="Glass"><float name="spec_trans" value="1"/></bsdf>')
+    with pytest.raises(scenes.SceneError, match='nothing to compare; kept is principled "Glass": transmits light'):
+        comparison.compare(folder[0] / "scene.xml", learn=["principled"], progress=False)
+
+
+@pytest.mark.parametrize("names, after", [(["path"], ["path_sdf"]), (["aov", "path"], ["aov", "path"])])
+def test_a_path_stays_where_another_integrator_needs_decoded_fields(mi_rgb, names, after):
+    """``path_sdf`` follows no footprints: nothing is gained where the fields are decoded to grids in any case."""
+    integrators = [mi_rgb.Properties(name) for name in names]
+    conversions = conversion._trace_by(("path_sdf",), integrators)
+    assert [props.plugin_name() for props in integrators] == after
+    assert [c.learned for c in conversions] == ["path_sdf" if len(names) == 1 else ""]
+
+
+def test_an_image_that_cannot_be_read_stays(mi_rgb, folder):
+    (folder[0] / "leaf.webp").write_bytes(b"RIFF\0\0\0\0WEBP" + bytes(64))
+    image = '<texture type="bitmap" name="reflectance"><string name="filename" value="leaf.webp"/></texture>'
+    scene = parsed(folder[0], f'<bsdf type="diffuse">{image}</bsdf>')
+    (one,) = conversion.replace_stock(scene, ["bitmap"], folder[0] / "tables")
+    assert not one.learned and one.reason.startswith("leaf.webp cannot be read: ") and "\n" not in one.reason
+
+
+@pytest.mark.parametrize("metal, specular, most", [(0, 0.1, 0.2), (0, 0.5, 0.03), (1, 0.05, 0.03)])
+def test_albedos_at_grazing_angles_of_what_is_replaced(mi_rgb, folder, metal, specular, most):
+    """A polished floor seen at 11° is up to 15% brighter at the limit of ``specular``, and 3% by default."""
+    mi, n = mi_rgb, 1 << 16
+    numbers = {"roughness": 0.1, "metallic": float(metal), "specular": specular}
+    listed = "".join(f'<float name="{name}" value="{value}"/>' for name, value in numbers.items())
+    scene = parsed(folder[0], f'<bsdf type="principled" id="Floor">{listed}</bsdf>')
+    (one,) = conversion.replace_stock(scene, ["principled"], folder[0] / "tables")
+    albedo = []
+    for plugin in (one.stock, one.learned):
+        bsdf = mi.load_dict({"type": plugin, **numbers})
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(1, n)
+        si = dr.zeros(mi.SurfaceInteraction3f, n)
+        si.wi = mi.Vector3f(0.96**0.5, 0, 0.2)
+        weight = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d())[1]
+        albedo.append(float(dr.mean(weight.x)[0]))
+    assert abs(albedo[1] / albedo[0] - 1) < most
 
 
 def test_the_command_and_a_comparison_with_the_stock_scene(mi_rgb, tmp_path, capsys):

@@ -115,6 +115,8 @@ def test_ids_aliases_references_and_both_sides(mi_rgb, tmp_path):
          '<string name="filename" value="FILE"/></texture>'),
         ('<texture type="bitmap"><string name="filename" value="ä &amp; &quot;b&quot;.png"/></texture>',
          '<texture type="bitmap"><string name="filename" value=QUOTED/></texture>'),
+        ('<texture type="bitmap"><string name="filename" value="l&#101;a&#x66;.png"/></texture>',
+         '<texture type="bitmap"><string name="filename" value="NUMBERED"/></texture>'),
         ('<path value="parts"/><texture type="bitmap"><string name="filename" value="parts/leaf.png"/></texture>',
          '<path value="UPparts"/><texture type="bitmap"><string name="filename" value="UPparts/leaf.png"/></texture>'),
         ('<emitter type="constant"><spectrum name="radiance" filename="lamp.spd"/></emitter>',
@@ -128,9 +130,16 @@ def test_files_includes_and_parameters(mi_rgb, folders, body, expected, folder):
     a, _ = folders
     new = written(a / "scene.xml", f"{HEAD}{body}</scene>", a.parent / folder / "new.xml")
     up, file, dollar, quoted = "", "$f", "$p.png", '"ä &amp; &quot;b&quot;.png"'
+    numbered = "l&#101;a&#x66;.png" if folder != "b" else "../a/leaf.png"
     if folder == "b":
         up, file, dollar, quoted = "../a/", *2 * ["../a/leaf.png"], "'../a/ä &amp; \"b\".png'"
-    for placeholder, value in (("UP", up), ("FILE", file), ("DOLLAR", dollar), ("QUOTED", quoted)):
+    for placeholder, value in (
+        ("NUMBERED", numbered),
+        ("UP", up),
+        ("FILE", file),
+        ("DOLLAR", dollar),
+        ("QUOTED", quoted),
+    ):
         expected = expected.replace(placeholder, value)
     assert new == f"{HEAD}{expected}</scene>"
 

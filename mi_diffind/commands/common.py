@@ -119,7 +119,8 @@ def require_scene(path: str) -> None:
     if fault := irregular(path):
         raise UsageError(f"{shown(path)}: {fault}")
     if not os.path.isfile(path):
-        raise UsageError(f"{shown(path)}: no such scene file")
+        fault = "is a folder, a scene file is needed" if os.path.isdir(path) else "no such scene file"
+        raise UsageError(f"{shown(path)}: {fault}")
     if Path(path).suffix.lower() == ".npz":
         raise UsageError(
             f'{path}: found a table file, a scene (.xml) is needed; "mi-diffind inspect {path}" prints the lines by '

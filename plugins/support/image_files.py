@@ -265,7 +265,10 @@ def manifest_of(image: Path, folder: Path, raw: bool, normal: bool) -> Path:
         check_picture(image)
     except LimitError as e:
         raise RuntimeError(str(e)) from None
-    bitmap = mi.Bitmap(str(image))
+    try:
+        bitmap = mi.Bitmap(str(image))
+    except RuntimeError as e:
+        raise Kept(f"{image.name} cannot be read: {compat.one_sentence(e)}") from None
     if bitmap.buffer_size() < LEAST_BYTES:
         raise Kept(f"{image.name} has {bitmap.buffer_size():,} bytes, of which no fit would save any")
     formats = mi.Bitmap.PixelFormat

@@ -33,8 +33,11 @@ PROJECTIONS = {
     "ftheta_p0": "f-theta",
 }  # fmt: skip
 
-#: Focal lengths and sizes in pixels are smaller.
+#: Focal lengths, sizes and places in pixels and the coefficients of lenses are smaller.
 LONGEST = 1e9
+
+#: Fields of view in radians are larger: those of telescopes.
+SMALLEST_ANGLE = 1e-6
 
 #: Largest ratio of the focal length that a field of view gives to that in pixels, minus 1, without a note.
 AGREEMENT = 5e-3
@@ -60,12 +63,13 @@ def camera_numbers(where: str, frame: dict, file: dict) -> dict[str, float]:
     if numbers["fl_x"] is None and numbers["camera_angle_x"] is None:
         raise ViewsError(f'{where} has no focal length: neither "camera_angle_x" nor "fl_x" is given')
     numbers = {name: value for name, value in numbers.items() if value is not None} | _lens(where, levels, model)
-    for names, limit, allowed in (
-        (("fl_x", "fl_y", "w", "h"), LONGEST, f"a number > 0 and < {LONGEST:g}"),
-        (("camera_angle_x", "camera_angle_y"), np.pi, "radians between 0 and π"),
+    for names, least, limit, allowed in (
+        (("fl_x", "fl_y", "w", "h"), 0, LONGEST, f"a number > 0 and < {LONGEST:g}"),
+        (("camera_angle_x", "camera_angle_y"), SMALLEST_ANGLE, np.pi, f"radians between {SMALLEST_ANGLE:g} and π"),
+        (("cx", "cy", *DISTORTION), -LONGEST, LONGEST, f"a number between -{LONGEST:g} and {LONGEST:g}"),
     ):
         for name in names:
-            if name in numbers and not 0 < numbers[name] < limit:
+            if name in numbers and not least < numbers[name] < limit:
                 raise ViewsError(f'{where} has the "{name}" {numbers[name]:g}, expected {allowed}')
     return numbers
 

@@ -209,7 +209,7 @@ def _pose(where: str, matrix) -> np.ndarray:
     if np.abs(lengths - 1).max() > RIGID:
         text = ", ".join(f"{x:.4g}" for x in lengths)
         raise ViewsError(f"{where} has a transform_matrix that scales (columns of length {text}), a rotation is needed")
-    if np.abs(rotation.T @ rotation - np.eye(3)).max() > RIGID:
+    if np.abs((rotation / lengths).T @ (rotation / lengths) - np.eye(3)).max() > RIGID:
         raise ViewsError(f"{where} has a transform_matrix that shears, a rotation is needed")
     if np.linalg.det(rotation) < 0:
         raise ViewsError(f"{where} has a transform_matrix that mirrors, a rotation is needed")

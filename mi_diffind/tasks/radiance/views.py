@@ -49,6 +49,9 @@ LONGEST = 1600
 #: Fewest views for training, since one shows no depth, and names of missing images in a note.
 LEAST_VIEWS, NAMED_MISSING = 2, 3
 
+#: Largest distance of a principal point from the middle of its image, as a share of the side, without a note.
+OFF_MIDDLE = 0.25
+
 #: Percentiles of points along each axis between which the captured objects lie, and the margin around these, as a share
 #: of the longest side.
 OUTLIERS, POINTS_MARGIN = (1, 99), 0.05
@@ -202,9 +205,16 @@ def load_views(
     if images.reduced:
         factors = " or ".join(map(str, sorted(images.reduced)))
         notes.append(f"images are reduced by the factor {factors} along each side: option --downscale")
+    if images.off_middle:
+        notes.append(f'{listed.name}: "cx" and "cy" in pixels are expected, {images.off_middle}')
     if images.undistorted:
         count = "all" if images.undistorted == len(paths) else f"{images.undistorted} of {len(paths)}"
         notes.append(f"{count} images have a lens distortion and were undistorted")
+    mask = images.mask()
+    if mask is not None and not mask.any():
+        raise ViewsError(
+            f"{listed.file}: no pixel counts: masks or lens distortions exclude all of {len(paths)} images"
+        )
     views = CapturedViews(
         pixels=images.pixels[: images.count],
         offsets=np.cumsum([0, *(height * width for height, width in images.sizes)])[:-1],
@@ -216,7 +226,7 @@ def load_views(
         path=folder,
         has_alpha=not opaque,
         split=split,
-        mask=images.mask(),
+        mask=mask,
         notes=tuple(notes),
         settings=listed.settings,
     )
@@ -299,6 +309,7 @@ class _Images:
         self.sizes, self.focal, self.centre, self.masks = [], [], [], []
         self.transparent, self.opaque, self.undistorted, self.downscale, self.reduced = False, [], 0, downscale, set()
         self.alpha_masks, self.notes = 0, {}  # notes in their order, each once
+        self.off_middle = ""
 
     def add(self, path: Path, frame: Frame, listed: FrameList) -> None:
         """Read an image and its mask, reduce and undistort them."""
@@ -313,6 +324,11 @@ class _Images:
         focal, notes = focal_lengths(numbers, width, height)
         self.notes |= {f"{listed.name}: {note}": None for note in notes}
         centre = numbers.get("cx", width / 2), numbers.get("cy", height / 2)
+        if any(abs(x / side - 0.5) > OFF_MIDDLE for x, side in zip(centre, (width, height), strict=True)):
+            self.off_middle = self.off_middle or (
+                f"the principal point ({centre[0]:g}, {centre[1]:g}) of {path.name} is far from the middle of its "
+                f"{width} × {height} pixels"
+            )
         mask, excluded = None, path.with_name(f"dynamic_mask_{path.stem}.png")
         if frame.mask is not None:
             mask, in_alpha = read_mask(image_file(listed.root, frame.mask, listed.file), image, path)

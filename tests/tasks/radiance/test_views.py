@@ -274,6 +274,13 @@ def test_cameras_of_single_frames(studio):
         ({"fl_x": 0}, 'has the "fl_x" 0, expected a number > 0'),
         ({"fl_x": "10"}, "has the \"fl_x\" '10', expected a number"),
         ({"camera_angle_x": 4.0}, 'has the "camera_angle_x" 4, expected radians'),
+        ({"camera_angle_x": 1e-320}, 'has the "camera_angle_x" .*, expected radians between 1e-06 and π'),
+        ({"cx": 1e308}, 'has the "cx" 1e\\+308, expected a number between -1e\\+09 and 1e\\+09'),
+        ({"k2": -1e300}, 'has the "k2" -1e\\+300, expected a number between'),
+        (
+            {"k1": -1e6, "cx": -900.0},
+            r"transforms\.json: no pixel counts: masks or lens distortions exclude all of 8 i",
+        ),
         ({"w": 16}, "has 8 × 6 pixels, .*json says 16 × 6"),
         ({"frames": []}, 'has no "frames"'),
         ({"frames": [{"transform_matrix": 1}]}, 'frame 0 has no "file_path"'),
@@ -315,6 +322,19 @@ def test_poses_that_are_refused(blender, matrix, message):
     with pytest.raises(ViewsError, match=message) as e:
         load_views(blender)
     assert 'transforms_train.json: frame "./train/r_2" has' in str(e.value)
+
+
+def test_a_principal_point_in_shares_of_the_image_is_named(studio):
+    change(studio, "transforms.json", cx=0.56, cy=0.54)
+    (note,) = [note for note in load_views(studio).notes if "principal point" in note]
+    assert '"cx" and "cy" in pixels are expected' in note and "(0.56, 0.54) of frame_00001.png" in note
+    change(studio, "transforms.json", cx=5.5, cy=2.0)
+    assert not any("principal point" in note for note in load_views(studio).notes)
+
+
+def test_rotations_within_the_tolerance_of_lengths_do_not_shear(blender):
+    change(blender, frame=2, transform_matrix=pose(2, 1.0008))
+    assert np.array_equal(load_views(blender).poses[2], pose(2, 1.0008))
 
 
 def test_a_pose_of_three_rows_is_taken(blender):
