@@ -7,7 +7,7 @@ per cent hides in the noise of each pixel, but not in the mean of a block that i
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,7 +26,7 @@ BLOCK_SIGNIFICANCE, STOPS_SIGNIFICANCE = 0.008, 0.002
 DARK = 0.05
 #: Relative deviation that two processors may have where there is no noise.
 ROUNDING = 1e-4
-#: Side of the tile of :func:`visible_change`, in pixels, and the chance that its change is found.
+#: Side of the tile of :meth:`BlockReference.visible_change`, in pixels, and the chance that its change is found.
 TILE, POWER = 16, 0.9
 #: Places of the tile that are tried in each unchanged check.
 TILES = 24
@@ -135,76 +135,6 @@ class Block:
         return f"{place}: {float(f'{100 * abs(self.change):.2g}'):g}% {'darker' if self.t < 0 else 'brighter'}"
 
 
-@np.errstate(divide="ignore", invalid="ignore")
-def compare(reference: np.ndarray, check: np.ndarray, size: tuple, dark: float, least: float = 0.0) -> list[Level]:
-    """Return the t-tests of two stacks of passes, block means ``(passes, rows, columns, channels)``.
-
-    With R passes of the reference, C of the check, and SS the sum of squared deviations from the mean,
-
-        t = (mean_C − mean_R) / √(max(s², floor) (1/R + 1/C)),    s² = (SS_R + SS_C) / (R + C − 2),
-
-    for windows of 4 × 4, 8 × 8, … pixels up to the whole picture, each channel on its own. The variance is that of
-    both sides: a rare bright path of the check raises it, too. The floor, of the square of 1e-4 of the brightness,
-    lets processors round differently. Each level has an equal part of the significance of 0.8%, and each value of a
-    level the part 1 − (1 − α)^(1/values) of it, by Student's t distribution of R + C − 2 degrees of freedom.
-
-    ``size``: height and width in pixels; ``dark``: brightness, linear, that is added to that of a window; ``least``:
-    relative difference that does not count, however small the noise is.
-    """
-    count, freedom = len(reference), len(reference) + len(check) - 2
-    windows, levels = list(_levels(np.concatenate([reference, check]), *size)), []
-    for side, passes in windows:
-        mean, mean_of_check = passes[:count].mean(axis=0), passes[count:].mean(axis=0)
-        difference, brightness = mean_of_check - mean, np.abs(mean) + dark
-        squares = ((passes[:count] - mean) ** 2).sum(axis=0) + ((passes[count:] - mean_of_check) ** 2).sum(axis=0)
-        chance = -math.expm1(math.log1p(-BLOCK_SIGNIFICANCE / len(windows)) / mean.size)
-        threshold = float(-special.stdtrit(freedom, chance / 2))
-        variance = np.maximum(squares / freedom, (ROUNDING * brightness) ** 2) * (1 / len(check) + 1 / count)
-        deviation = np.maximum(np.sqrt(variance), least * brightness / threshold)
-        t = np.nan_to_num(difference / deviation, nan=0.0, posinf=_LARGEST, neginf=-_LARGEST)
-        levels.append(Level(side, max(BLOCK, side // 2), mean, difference, deviation, t, threshold))
-    return levels
-
-
-@np.errstate(divide="ignore", invalid="ignore")
-def worst_block(levels: list[Level], size: tuple) -> Block:
-    """Return the window whose t exceeds its threshold most, of a picture of the ``size``."""
-    level = max(levels, key=lambda level: np.abs(level.t).max() / level.threshold)
-    i = row, column, channel = np.unravel_index(np.abs(level.t).argmax(), level.t.shape)
-    x, y = int(column) * level.stride, int(row) * level.stride
-    height, width = min(level.side, size[0] - y), min(level.side, size[1] - x)
-    name = ("red", "green", "blue")[channel] if level.t.shape[2] == 3 else "brightness"
-    change = float(level.difference[i] / np.abs(level.mean[i]))
-    change = change if math.isfinite(change) else None
-    return Block(x, y, width, height, level.side, name, change, float(level.t[i]), level.threshold)
-
-
-def visible_change(tests: Iterable, mean: np.ndarray, size: tuple, dark: float, side: int = TILE) -> float:
-    """Return the relative change of brightness of a tile that :func:`compare` finds nine times of ten.
-
-    The tile, of ``side`` pixels or as many as there are, lies at a random place that is not dark. The ``tests`` are of
-    unchanged checks. In each of them, a tile that is brighter adds the light of its part in a window, of the picture's
-    ``mean``, to the difference of that window: so the smallest change is known that raises one t beyond its threshold.
-    Returns infinity if too many tiles have none.
-    """
-    rng, smallest = np.random.default_rng(0), []
-    places = np.maximum(np.array(size) - side, 0) + 1
-    for levels in tests:
-        tiles = np.zeros((TILES, *size, 1), bool)
-        for tile, (y, x) in zip(tiles, rng.integers(places, size=(TILES, 2)), strict=True):
-            tile[y : y + side, x : x + side] = True
-        parts = block_means(tiles)
-        light = parts * np.maximum(mean, 0)
-        light = light[light.mean(axis=(1, 2, 3)) >= dark * parts.mean(axis=(1, 2, 3))]
-        change = np.full(len(light), math.inf)
-        for (_, gain), level in zip(_levels(light, *size), levels, strict=True):
-            missing = level.threshold * level.deviation - level.difference
-            needed = np.divide(missing, gain, out=np.full_like(gain, math.inf), where=gain > 0)
-            change = np.minimum(change, needed.min(axis=(1, 2, 3)))
-        smallest.extend(change)
-    return float(np.quantile(smallest, POWER, method="higher")) if smallest else math.inf
-
-
 @dataclass(frozen=True)
 class BlockTest:
     """Result of :meth:`BlockReference.test`.
@@ -237,11 +167,11 @@ class BlockTest:
 
 @dataclass(frozen=True)
 class BlockReference:
-    """A reference as the test needs it.
+    """A reference as the test needs it; that of a regression check has 16 groups of 8 passes.
 
-    ``passes``, ``(16, rows, columns, channels)``: block means of single passes; ``mean``, ``(rows, columns,
-    channels)``: of all 128 passes; ``stops``, ``(16,)``: mean difference in stops of each group of 8 passes from the
-    mean of all others; ``height`` and ``width`` in pixels.
+    ``passes``, ``(count, rows, columns, channels)``: block means of single passes; ``mean``, ``(rows, columns,
+    channels)``: of all passes; ``stops``, ``(groups,)``: mean difference in stops of each group of passes from the mean
+    of all others; ``height`` and ``width`` in pixels; ``least``: relative difference that does not count.
     """
 
     passes: np.ndarray
@@ -249,12 +179,13 @@ class BlockReference:
     stops: np.ndarray
     height: int
     width: int
+    least: float = 0.0
 
     @classmethod
     def from_groups(cls, passes: np.ndarray, groups: np.ndarray, height: int, width: int) -> BlockReference:
-        """Return the reference of 16 single ``passes`` and of the means of 16 ``groups`` of passes."""
+        """Return the reference of single ``passes`` and of the means of ``groups`` of passes."""
         mean = groups.mean(axis=0)
-        dark = dark_brightness(mean, height, width)
+        dark = _dark(mean, height, width)
         others = (len(groups) * mean - groups) / (len(groups) - 1)
         stops = np.array([mean_stops(*pair, dark) for pair in zip(groups, others, strict=True)])
         return cls(passes, mean, stops, height, width)
@@ -262,32 +193,89 @@ class BlockReference:
     @property
     def dark(self) -> float:
         """Darkest brightness that counts, linear."""
-        return dark_brightness(self.mean, self.height, self.width)
+        return _dark(self.mean, self.height, self.width)
 
     def test(self, check: np.ndarray, not_finite: int = 0) -> BlockTest:
         """Test whether a check, block means ``(8, rows, columns, channels)``, shows the scene of the reference.
 
-        *Blocks*: :func:`compare`. *Stops*: the mean over blocks of |log₂((C + e) / (R + e))|, e = 5% of the mean
+        *Blocks*: :meth:`compare`. *Stops*: the mean over blocks of |log₂((C + e) / (R + e))|, e = 5% of the mean
         brightness, is compared with those of the groups of the reference by a t-test with a significance of 0.2%: it
         finds changes that are spread over the picture and cancel out. Values that are not finite take part in no test.
         """
-        levels = self._compare(check)
+        levels = self.compare(check)
         # the same groups in a t-test of one more value; two processors differ by their rounding at most
         scatter = max(float(self.stops.std(ddof=1)), ROUNDING) * math.sqrt(1 + 1 / len(self.stops))
         quantile = -special.stdtrit(len(self.stops) - 1, STOPS_SIGNIFICANCE)
         mean = check.mean(axis=0)
         stops = mean_stops(np.where(np.isfinite(mean), mean, self.mean), self.mean, self.dark)
         threshold = float(self.stops.mean() + quantile * scatter)
-        return BlockTest(levels, worst_block(levels, (self.height, self.width)), stops, threshold, not_finite)
+        return BlockTest(levels, self.worst_block(levels), stops, threshold, not_finite)
 
-    def visible_change(self, checks: np.ndarray) -> float:
-        """Return :func:`visible_change` of unchanged ``checks``, ``(count, 8, rows, columns, channels)``."""
-        return visible_change(map(self._compare, checks), self.mean, (self.height, self.width), self.dark)
+    @np.errstate(divide="ignore", invalid="ignore")
+    def compare(self, check: np.ndarray) -> list[Level]:
+        """Return the t-tests of a check, block means ``(count, rows, columns, channels)``.
 
-    def _compare(self, check: np.ndarray) -> list[Level]:
-        return compare(self.passes, check, (self.height, self.width), self.dark)
+        With R passes of the reference, C of the check, and SS the sum of squared deviations from the mean,
+
+            t = (mean_C − mean_R) / √(max(s², floor) (1/R + 1/C)),    s² = (SS_R + SS_C) / (R + C − 2),
+
+        for windows of 4 × 4, 8 × 8, … pixels up to the whole picture, each channel on its own. The variance is that of
+        both sides: a rare bright path of the check raises it, too. The floor, of the square of 1e-4 of the brightness,
+        lets processors round differently. Each level has an equal part of the significance of 0.8%, and each value of a
+        level the part 1 − (1 − α)^(1/values) of it, by Student's t distribution of R + C − 2 degrees of freedom.
+        """
+        count, freedom = len(self.passes), len(self.passes) + len(check) - 2
+        windows, levels = list(_levels(np.concatenate([self.passes, check]), self.height, self.width)), []
+        for side, passes in windows:
+            mean, mean_of_check = passes[:count].mean(axis=0), passes[count:].mean(axis=0)
+            difference, brightness = mean_of_check - mean, np.abs(mean) + self.dark
+            squares = ((passes[:count] - mean) ** 2).sum(axis=0) + ((passes[count:] - mean_of_check) ** 2).sum(axis=0)
+            chance = -math.expm1(math.log1p(-BLOCK_SIGNIFICANCE / len(windows)) / mean.size)
+            threshold = float(-special.stdtrit(freedom, chance / 2))
+            variance = np.maximum(squares / freedom, (ROUNDING * brightness) ** 2) * (1 / len(check) + 1 / count)
+            deviation = np.maximum(np.sqrt(variance), self.least * brightness / threshold)
+            t = np.nan_to_num(difference / deviation, nan=0.0, posinf=_LARGEST, neginf=-_LARGEST)
+            levels.append(Level(side, max(BLOCK, side // 2), mean, difference, deviation, t, threshold))
+        return levels
+
+    @np.errstate(divide="ignore", invalid="ignore")
+    def worst_block(self, levels: list[Level]) -> Block:
+        """Return the window of :meth:`compare` whose t exceeds its threshold most."""
+        level = max(levels, key=lambda level: np.abs(level.t).max() / level.threshold)
+        i = row, column, channel = np.unravel_index(np.abs(level.t).argmax(), level.t.shape)
+        x, y = int(column) * level.stride, int(row) * level.stride
+        height, width = min(level.side, self.height - y), min(level.side, self.width - x)
+        name = ("red", "green", "blue")[channel] if level.t.shape[2] == 3 else "brightness"
+        change = float(level.difference[i] / np.abs(level.mean[i]))
+        change = change if math.isfinite(change) else None
+        return Block(x, y, width, height, level.side, name, change, float(level.t[i]), level.threshold)
+
+    def visible_change(self, checks: np.ndarray, side: int = TILE) -> float:
+        """Return the relative change of brightness of a tile that :meth:`compare` finds nine times of ten.
+
+        The tile, of ``side`` pixels or as many as there are, lies at a random place that is not dark. ``checks``,
+        ``(count, passes, rows, columns, channels)``, are unchanged. In each of them, a tile that is brighter adds the
+        light of its part in a window to the difference of that window: so the smallest change is known that raises one
+        t beyond its threshold. Returns infinity if too many tiles have none.
+        """
+        rng, smallest = np.random.default_rng(0), []
+        size = self.height, self.width
+        places = np.maximum(np.array(size) - side, 0) + 1
+        for check in checks:
+            tiles = np.zeros((TILES, *size, 1), bool)
+            for tile, (y, x) in zip(tiles, rng.integers(places, size=(TILES, 2)), strict=True):
+                tile[y : y + side, x : x + side] = True
+            parts = block_means(tiles)
+            light = parts * np.maximum(self.mean, 0)
+            light = light[light.mean(axis=(1, 2, 3)) >= self.dark * parts.mean(axis=(1, 2, 3))]
+            change = np.full(len(light), math.inf)
+            for (_, gain), level in zip(_levels(light, *size), self.compare(check), strict=True):
+                missing = level.threshold * level.deviation - level.difference
+                needed = np.divide(missing, gain, out=np.full_like(gain, math.inf), where=gain > 0)
+                change = np.minimum(change, needed.min(axis=(1, 2, 3)))
+            smallest.extend(change)
+        return float(np.quantile(smallest, POWER, method="higher")) if smallest else math.inf
 
 
-def dark_brightness(blocks: np.ndarray, height: int, width: int) -> float:
-    """Return the darkest brightness that counts, of a picture's block means."""
+def _dark(blocks: np.ndarray, height: int, width: int) -> float:
     return DARK * float((np.abs(blocks) * _pixels(height, width)).sum() / (height * width * blocks.shape[-1]))
