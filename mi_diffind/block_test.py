@@ -1,4 +1,4 @@
-"""Test of a render against a reference that is noisy, too: t-tests of blocks of all sizes, and a mean of stops.
+"""Test of a render against another that is noisy, too: t-tests of blocks of all sizes, and a mean of stops.
 
 Both sides consist of independent *passes* of equal samples, kept as means of blocks of 4 × 4 pixels. A change of a few
 per cent hides in the noise of each pixel, but not in the mean of a block that is as large as the change.
@@ -33,15 +33,13 @@ TILES = 24
 
 #: Value of t of blocks that are wholly black in the reference, and no longer.
 _LARGEST = 1e9
-#: Degrees of freedom of t.
-_FREEDOM = CHECK_PASSES + REFERENCE_PASSES - 2
 
 
 def block_means(image: np.ndarray) -> np.ndarray:
-    """Return the means of blocks of 4 × 4 pixels, ``(rows, columns, channels)``; those at the edges may be smaller."""
-    height, width = image.shape[:2]
+    """Return the means of blocks of 4 × 4 pixels, ``(…, rows, columns, channels)``; at the edges, of fewer."""
+    height, width = image.shape[-3:-1]
     rows, columns = np.arange(0, height, BLOCK), np.arange(0, width, BLOCK)
-    sums = np.add.reduceat(np.add.reduceat(image, rows, axis=0, dtype=np.float64), columns, axis=1)
+    sums = np.add.reduceat(np.add.reduceat(image, rows, axis=-3, dtype=np.float64), columns, axis=-2)
     return sums / _pixels(height, width)
 
 
@@ -91,15 +89,18 @@ def mean_stops(image: np.ndarray, other: np.ndarray, dark: float) -> float:
 
 @dataclass(frozen=True)
 class Level:
-    """Windows of one size: the ``side`` and the ``stride`` in pixels, and the values of the t-tests.
+    """Windows of one size: the ``side`` and the ``stride`` in pixels, and their t-tests.
 
-    ``t`` and the relative ``change`` are ``(rows, columns, channels)``; values of t beyond ``threshold`` fail.
+    ``mean`` (of the reference), the ``difference`` from it, the standard ``deviation`` of that, and ``t`` are ``(rows,
+    columns, channels)``; values of t beyond ``threshold`` fail, and are 0 where something is not finite.
     """
 
     side: int
     stride: int
+    mean: np.ndarray
+    difference: np.ndarray
+    deviation: np.ndarray
     t: np.ndarray
-    change: np.ndarray
     threshold: float
 
     @property
@@ -126,6 +127,12 @@ class Block:
     change: float | None
     t: float
     threshold: float
+
+    def __str__(self) -> str:
+        place = f"{self.width} x {self.height} pixels at ({self.x}, {self.y})"
+        if self.change is None:
+            return f"{place}: no longer black"
+        return f"{place}: {float(f'{100 * abs(self.change):.2g}'):g}% {'darker' if self.t < 0 else 'brighter'}"
 
 
 @dataclass(frozen=True)
@@ -160,11 +167,11 @@ class BlockTest:
 
 @dataclass(frozen=True)
 class BlockReference:
-    """A reference as the test needs it.
+    """A reference as the test needs it; that of a regression check has 16 groups of 8 passes.
 
-    ``passes``, ``(16, rows, columns, channels)``: block means of single passes; ``mean``, ``(rows, columns,
-    channels)``: of all 128 passes; ``stops``, ``(16,)``: mean difference in stops of each group of 8 passes from the
-    mean of all others; ``height`` and ``width`` in pixels.
+    ``passes``, ``(count, rows, columns, channels)``: block means of single passes; ``mean``, ``(rows, columns,
+    channels)``: of all passes; ``stops``, ``(groups,)``: mean difference in stops of each group of passes from the mean
+    of all others; ``height`` and ``width`` in pixels; ``least``: relative difference that does not count.
     """
 
     passes: np.ndarray
@@ -172,12 +179,13 @@ class BlockReference:
     stops: np.ndarray
     height: int
     width: int
+    least: float = 0.0
 
     @classmethod
     def from_groups(cls, passes: np.ndarray, groups: np.ndarray, height: int, width: int) -> BlockReference:
-        """Return the reference of 16 single ``passes`` and of the means of 16 ``groups`` of passes."""
+        """Return the reference of single ``passes`` and of the means of ``groups`` of passes."""
         mean = groups.mean(axis=0)
-        dark = DARK * _mean_brightness(mean, height, width)
+        dark = _dark(mean, height, width)
         others = (len(groups) * mean - groups) / (len(groups) - 1)
         stops = np.array([mean_stops(*pair, dark) for pair in zip(groups, others, strict=True)])
         return cls(passes, mean, stops, height, width)
@@ -185,13 +193,29 @@ class BlockReference:
     @property
     def dark(self) -> float:
         """Darkest brightness that counts, linear."""
-        return DARK * _mean_brightness(self.mean, self.height, self.width)
+        return _dark(self.mean, self.height, self.width)
 
-    @np.errstate(divide="ignore", invalid="ignore")
     def test(self, check: np.ndarray, not_finite: int = 0) -> BlockTest:
         """Test whether a check, block means ``(8, rows, columns, channels)``, shows the scene of the reference.
 
-        *Blocks.* With R passes of the reference, C of the check, and SS the sum of squared deviations from the mean,
+        *Blocks*: :meth:`compare`. *Stops*: the mean over blocks of |log₂((C + e) / (R + e))|, e = 5% of the mean
+        brightness, is compared with those of the groups of the reference by a t-test with a significance of 0.2%: it
+        finds changes that are spread over the picture and cancel out. Values that are not finite take part in no test.
+        """
+        levels = self.compare(check)
+        # the same groups in a t-test of one more value; two processors differ by their rounding at most
+        scatter = max(float(self.stops.std(ddof=1)), ROUNDING) * math.sqrt(1 + 1 / len(self.stops))
+        quantile = -special.stdtrit(len(self.stops) - 1, STOPS_SIGNIFICANCE)
+        mean = check.mean(axis=0)
+        stops = mean_stops(np.where(np.isfinite(mean), mean, self.mean), self.mean, self.dark)
+        threshold = float(self.stops.mean() + quantile * scatter)
+        return BlockTest(levels, self.worst_block(levels), stops, threshold, not_finite)
+
+    @np.errstate(divide="ignore", invalid="ignore")
+    def compare(self, check: np.ndarray) -> list[Level]:
+        """Return the t-tests of a check, block means ``(count, rows, columns, channels)``.
+
+        With R passes of the reference, C of the check, and SS the sum of squared deviations from the mean,
 
             t = (mean_C − mean_R) / √(max(s², floor) (1/R + 1/C)),    s² = (SS_R + SS_C) / (R + C − 2),
 
@@ -199,69 +223,59 @@ class BlockReference:
         both sides: a rare bright path of the check raises it, too. The floor, of the square of 1e-4 of the brightness,
         lets processors round differently. Each level has an equal part of the significance of 0.8%, and each value of a
         level the part 1 − (1 − α)^(1/values) of it, by Student's t distribution of R + C − 2 degrees of freedom.
-
-        *Stops.* The mean over blocks of |log₂((C + e) / (R + e))|, e = 5% of the mean brightness, is compared with
-        those of the groups of the reference by a t-test with a significance of 0.2%: it finds changes that are spread
-        over the picture and cancel out. Values that are not finite take part in no test.
         """
-        levels, worst, largest = [], None, -1.0
-        for side, mean, difference, deviation, threshold in self._differences(check):
-            t = np.nan_to_num(difference / deviation, nan=0.0, posinf=_LARGEST, neginf=-_LARGEST)
-            level = Level(side, side if side == BLOCK else side // 2, t, difference / np.abs(mean), threshold)
-            levels.append(level)
-            i = np.unravel_index(np.abs(t).argmax(), t.shape)
-            if abs(t[i]) / threshold > largest:
-                largest, worst = abs(t[i]) / threshold, self._block(level, *(int(n) for n in i))
-        # the same groups in a t-test of one more value; two processors differ by their rounding at most
-        scatter = max(float(self.stops.std(ddof=1)), ROUNDING) * math.sqrt(1 + 1 / len(self.stops))
-        quantile = -special.stdtrit(len(self.stops) - 1, STOPS_SIGNIFICANCE)
-        mean = check.mean(axis=0)
-        stops = mean_stops(np.where(np.isfinite(mean), mean, self.mean), self.mean, self.dark)
-        return BlockTest(levels, worst, stops, float(self.stops.mean() + quantile * scatter), not_finite)
-
-    def _differences(self, check: np.ndarray) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray, float]]:
-        """Yield the side of the windows, the reference, the difference, its deviation, and the threshold of t."""
-        windows = list(_levels(np.concatenate([self.passes, check]), self.height, self.width))
-        for side, means in windows:
-            reference, others = means[:REFERENCE_PASSES], means[REFERENCE_PASSES:]
-            mean, mean_of_check = reference.mean(axis=0), others.mean(axis=0)
-            squares = ((reference - mean) ** 2).sum(axis=0) + ((others - mean_of_check) ** 2).sum(axis=0)
-            floor = (ROUNDING * (np.abs(mean) + self.dark)) ** 2
-            deviation = np.sqrt(np.maximum(squares / _FREEDOM, floor) * (1 / CHECK_PASSES + 1 / REFERENCE_PASSES))
+        count, freedom = len(self.passes), len(self.passes) + len(check) - 2
+        windows, levels = list(_levels(np.concatenate([self.passes, check]), self.height, self.width)), []
+        for side, passes in windows:
+            mean, mean_of_check = passes[:count].mean(axis=0), passes[count:].mean(axis=0)
+            difference, brightness = mean_of_check - mean, np.abs(mean) + self.dark
+            squares = ((passes[:count] - mean) ** 2).sum(axis=0) + ((passes[count:] - mean_of_check) ** 2).sum(axis=0)
             chance = -math.expm1(math.log1p(-BLOCK_SIGNIFICANCE / len(windows)) / mean.size)
-            yield side, mean, mean_of_check - mean, deviation, float(-special.stdtrit(_FREEDOM, chance / 2))
+            threshold = float(-special.stdtrit(freedom, chance / 2))
+            variance = np.maximum(squares / freedom, (ROUNDING * brightness) ** 2) * (1 / len(check) + 1 / count)
+            deviation = np.maximum(np.sqrt(variance), self.least * brightness / threshold)
+            t = np.nan_to_num(difference / deviation, nan=0.0, posinf=_LARGEST, neginf=-_LARGEST)
+            levels.append(Level(side, max(BLOCK, side // 2), mean, difference, deviation, t, threshold))
+        return levels
 
-    def _block(self, level: Level, row: int, column: int, channel: int) -> Block:
-        x, y = column * level.stride, row * level.stride
-        size = min(level.side, self.width - x), min(level.side, self.height - y)
-        i = row, column, channel
+    @np.errstate(divide="ignore", invalid="ignore")
+    def worst_block(self, levels: list[Level]) -> Block:
+        """Return the window of :meth:`compare` whose t exceeds its threshold most."""
+        level = max(levels, key=lambda level: np.abs(level.t).max() / level.threshold)
+        i = row, column, channel = np.unravel_index(np.abs(level.t).argmax(), level.t.shape)
+        x, y = int(column) * level.stride, int(row) * level.stride
+        height, width = min(level.side, self.height - y), min(level.side, self.width - x)
         name = ("red", "green", "blue")[channel] if level.t.shape[2] == 3 else "brightness"
-        change = float(level.change[i]) if np.isfinite(level.change[i]) else None
-        return Block(x, y, *size, level.side, name, change, float(level.t[i]), level.threshold)
+        change = float(level.difference[i] / np.abs(level.mean[i]))
+        change = change if math.isfinite(change) else None
+        return Block(x, y, width, height, level.side, name, change, float(level.t[i]), level.threshold)
 
-    def visible_change(self, checks: np.ndarray) -> float:
-        """Return the relative change of brightness of a tile that :meth:`test` finds nine times of ten.
+    def visible_change(self, checks: np.ndarray, side: int = TILE) -> float:
+        """Return the relative change of brightness of a tile that :meth:`compare` finds nine times of ten.
 
-        The tile, of 16 × 16 pixels or as many as there are, lies at a random place that is not dark. ``checks``,
-        ``(count, 8, rows, columns, channels)``, are unchanged. In each of them, a tile that is brighter adds the light
-        of its part in a window to the difference of that window: so the smallest change is known that raises one t
-        beyond its threshold. Returns infinity if too many tiles have none.
+        The tile, of ``side`` pixels or as many as there are, lies at a random place that is not dark. ``checks``,
+        ``(count, passes, rows, columns, channels)``, are unchanged. In each of them, a tile that is brighter adds the
+        light of its part in a window to the difference of that window: so the smallest change is known that raises one
+        t beyond its threshold. Returns infinity if too many tiles have none.
         """
         rng, smallest = np.random.default_rng(0), []
-        places = np.maximum(np.array([self.height, self.width]) - TILE, 0) + 1
+        size = self.height, self.width
+        places = np.maximum(np.array(size) - side, 0) + 1
         for check in checks:
-            noise = [(difference, deviation * t) for _, _, difference, deviation, t in self._differences(check)]
-            for y, x in rng.integers(places, size=(TILES, 2)):
-                tile = np.zeros((self.height, self.width, 1))
-                tile[y : y + TILE, x : x + TILE] = 1
-                part = block_means(tile)
-                light = part * np.maximum(self.mean, 0)
-                if light.mean() < part.mean() * self.dark:
-                    continue
-                levels = zip(_levels(light, self.height, self.width), noise, strict=True)
-                smallest.append(min(((t - d)[v > 0] / v[v > 0]).min(initial=math.inf) for (_, v), (d, t) in levels))
+            tiles = np.zeros((TILES, *size, 1), bool)
+            for tile, (y, x) in zip(tiles, rng.integers(places, size=(TILES, 2)), strict=True):
+                tile[y : y + side, x : x + side] = True
+            parts = block_means(tiles)
+            light = parts * np.maximum(self.mean, 0)
+            light = light[light.mean(axis=(1, 2, 3)) >= self.dark * parts.mean(axis=(1, 2, 3))]
+            change = np.full(len(light), math.inf)
+            for (_, gain), level in zip(_levels(light, *size), self.compare(check), strict=True):
+                missing = level.threshold * level.deviation - level.difference
+                needed = np.divide(missing, gain, out=np.full_like(gain, math.inf), where=gain > 0)
+                change = np.minimum(change, needed.min(axis=(1, 2, 3)))
+            smallest.extend(change)
         return float(np.quantile(smallest, POWER, method="higher")) if smallest else math.inf
 
 
-def _mean_brightness(blocks: np.ndarray, height: int, width: int) -> float:
-    return float((np.abs(blocks) * _pixels(height, width)).sum() / (height * width * blocks.shape[-1]))
+def _dark(blocks: np.ndarray, height: int, width: int) -> float:
+    return DARK * float((np.abs(blocks) * _pixels(height, width)).sum() / (height * width * blocks.shape[-1]))

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from . import scenes
-from .block_test import CHECK_PASSES, BlockTest, Level
+from .block_test import CHECK_PASSES, Block, BlockTest, Level
 from .files import writable_folder
 from .measure import figure_grid
 
@@ -99,11 +99,7 @@ def power(figures: dict) -> str:
 
 def block_sentence(worst: dict) -> str:
     """Return the place and the change of a :class:`.block_test.Block`."""
-    change = "no longer black"
-    if worst["change"] is not None:
-        change = f"{100 * abs(worst['change']):.2g}% {'darker' if worst['t'] < 0 else 'brighter'}"
-    size = f"{worst['width']} x {worst['height']} pixels at ({worst['x']}, {worst['y']})"
-    return f"block of {size}: {change}, t = {worst['t']:.1f}, {worst['channel']}"
+    return f"block of {Block(**worst)}, t = {worst['t']:.1f}, {worst['channel']}"
 
 
 def reasons(figures: dict) -> list[str]:

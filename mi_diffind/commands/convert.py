@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 from .common import learn_option, require_scene, say, scene_options, set_variant, verb
 
 HELP = "write a scene with learned plugins in place of Mitsuba's, by default its textures, fitted to what they show"
@@ -44,5 +46,5 @@ def run(arguments) -> dict:
     )
     say(conversions)
     say(f"scene       {arguments.output}")
-    check = conversions.check and vars(conversions.check)
+    check = conversions.check and dataclasses.asdict(conversions.check)
     return {"output": arguments.output, "conversions": [vars(c) for c in conversions], "check": check}
