@@ -17,6 +17,7 @@ import os
 import re
 import struct
 import sys
+import threading
 from pathlib import Path
 
 
@@ -196,6 +197,22 @@ def has_gradient(value) -> bool:
     if dr.depth_v(value) > 1:
         return any(has_gradient(v) for v in value)
     return dr.is_diff_v(value) and value.index_ad != 0
+
+
+#: Held while ``dr.syntax`` transforms a function.
+_TRANSFORMING = threading.RLock()
+
+
+def syntax(function):
+    """Apply ``dr.syntax`` to a function while no other thread does.
+
+    Mitsuba loads plugins in several threads. CPython 3.11 keeps one depth of syntax trees for all of them, and may end
+    a transformation by "SystemError: AST constructor recursion depth mismatch" where two meet.
+    """
+    import drjit as dr
+
+    with _TRANSFORMING:
+        return dr.syntax(function)
 
 
 def identity(value) -> tuple:

@@ -134,7 +134,7 @@ def _pass(scene, sensor, width: int, height: int, spp: int, seed: int, max_depth
     return dr.block_sum(light, spp)
 
 
-@dr.syntax
+@compat.syntax
 def _follow(scene, shapes, sampler, ray, β, light, path, paths, deepest, limit):
     """Follow paths as ``mi.ad.integrators.prb`` does; add luminance of depth ``k + 1`` to ``light[k·paths + path]``.
 

@@ -18,6 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from . import compat
 from .splat_files import SplatsError, read_gaussians
 from .srgb import to_linear
 from .units import check_memory
@@ -199,7 +200,7 @@ class SplatCamera:
         return np.concatenate([colour.numpy().T, 1 - transmittance.numpy()[:, None]], axis=1)
 
 
-@dr.syntax
+@compat.syntax
 def composite(scene, integrator, p, d):
     """Return the colour (sRGB) of the Gaussians along rays, and the transmittance behind them.
 

@@ -173,7 +173,7 @@ def integrator() -> type:
                 setattr(ray, f"o_{x}", ray.o + (getattr(ray, f"o_{x}") - ray.o) * scale + start * turn)
                 setattr(ray, f"d_{x}", ray.d + turn)
 
-        @dr.syntax
+        @compat.syntax
         def sample(self, mode, scene, sampler, ray, δL=None, state_in=None, active=True, **kwargs):
             """Trace paths; see ``ADIntegrator.sample``.
 

@@ -7,6 +7,7 @@ from functools import cache
 import drjit as dr
 import mitsuba as mi
 
+from mi_diffind import compat
 from mi_diffind.mitsuba_versions import ray_flags
 
 from . import Plugin, path_footprint
@@ -119,7 +120,7 @@ def integrator() -> type:
                 si = pi.compute_surface_interaction(ray, ray_flags=ray_flags(), active=active)
             return sdf.interaction(shapes, hit, ray, si, active)
 
-        @dr.syntax
+        @compat.syntax
         def sample_shapes(self, mode, scene, shapes, sampler, ray, δL=None, state_in=None, active=True, **kwargs):
             """Implement ``sample`` for a scene with distance shapes; see ``path_footprint``."""
             primal = mode == dr.ADMode.Primal

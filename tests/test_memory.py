@@ -13,6 +13,7 @@ def test_copies_are_not_numpys_memory(mi_rgb, name):
     values = np.array([0, -0.0, 1, 7] if name == "Float" else [0, 1, 2**32 - 1], "f4" if name == "Float" else "u4")
     array, kept = dtype(values), values.copy()
     copy = memory.owned(array)
+    dr.sync_thread()  # copies are made in the background
     assert copy.index != array.index
     if mi_rgb.variant().startswith("llvm"):
         values[:] = 3

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_diffind import compat
 from mi_diffind.tasks.radiance import march as marching
 
 from .placed_fields import VariantLight
@@ -96,7 +97,7 @@ class FieldLight:
         width = dr.select(share < 1, share / (1 + dr.sqrt(dr.maximum(1 - share, 0))), 2)
         return to, radius, width, dr.gather(mi.Float, self.radiances, i, active) * width
 
-    @dr.syntax
+    @compat.syntax
     def sample(self, p, number, place, active=True):
         """Return directions from the points ``p`` towards the light, and their density by solid angle.
 
@@ -123,7 +124,7 @@ class FieldLight:
             d = dr.normalize(mi.Frame3f(axis).to_world(local))
             return d, self.density(p, d, active & (total > 0))
 
-    @dr.syntax
+    @compat.syntax
     def density(self, p, d, active=True):
         """Return the density by solid angle with which :meth:`sample` returns the directions ``d`` at ``p``."""
         with dr.suspend_grad():

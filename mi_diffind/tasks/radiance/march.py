@@ -16,6 +16,7 @@ from dataclasses import asdict, dataclass
 
 import drjit as dr
 
+from ... import compat
 from ...rays import box_interval, is_direction
 from .volume_field import VolumeField
 
@@ -62,7 +63,7 @@ def box(field, o, d, near, far, active):
     return entry, near, dr.minimum(far - near, longest), active
 
 
-@dr.syntax
+@compat.syntax
 def march(field, o, d, near, far, active=True, offset=0.5) -> Marched:
     """March the rays ``o + t d`` through a field, for t from ``near`` to ``far``.
 
@@ -96,7 +97,7 @@ def march(field, o, d, near, far, active=True, offset=0.5) -> Marched:
     return Marched(seen, through, depth)
 
 
-@dr.syntax
+@compat.syntax
 def _next(field, o, d, t, far, step, offset, active, steps):
     """Return the start of the next step, from ``t`` on, that may not be empty, and whether there is one."""
     types = field.types
@@ -134,7 +135,7 @@ def tangent(field, o, d, near, far, active, offset, marched: Marched, moving=Fal
     return _follow(field, o, d, near, far, active, offset, marched, None, moving)
 
 
-@dr.syntax
+@compat.syntax
 def _follow(field, o, d, near, far, active, offset, marched, adjoint, moving):
     types = field.types
     with dr.suspend_grad():
@@ -256,7 +257,7 @@ def _attached(field, o, d, near, far, active) -> tuple:
     return dr.select(active, entry, 0), d, dr.select(active, length, 0), dr.select(active, near, 0)
 
 
-@dr.syntax
+@compat.syntax
 def visibility(field, o, d, near, far, active, target) -> None:
     """Raise ``target`` to the largest weight that each cell of ``field.nodes`` has in one of these rays.
 

@@ -19,6 +19,7 @@ import drjit as dr
 import numpy as np
 from scipy.ndimage import distance_transform_cdt
 
+from ... import compat
 from ...bits import mask_flags, mask_words
 from ...indirection import device_array
 from . import codes
@@ -408,7 +409,7 @@ class GridRay:
         return dr.minimum(dr.minimum(sides[0], sides[1]), sides[2])
 
 
-@dr.syntax
+@compat.syntax
 def march(marcher, o, d, length, fresh, active):
     """Find the first change of sign before ``length`` along rays ``o + t·d`` in the grid: ``(hit, t, leaving)``.
 

@@ -16,6 +16,7 @@ from typing import Any
 
 import drjit as dr
 
+from ... import compat
 from ...rays import box_interval, is_direction
 from . import marching
 
@@ -87,7 +88,7 @@ def intersect(field, o, d, maxt, active=True, exact: bool = True) -> Hit:
         return Hit(hit, dr.select(hit, near + t, dr.inf), dr.fma(d, t, start), leaving)
 
 
-@dr.syntax
+@compat.syntax
 def sphere_trace(field, start, d, length, fresh, active, exact: bool = True):
     """Find the first change of sign along rays from ``start``, a place in the box, up to ``length``.
 
