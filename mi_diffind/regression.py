@@ -45,7 +45,7 @@ PASSES = CHECK_PASSES * GROUPS
 
 #: Samples of the whole image in one render, a bound of its memory; a pass of more is several renders.
 _RENDER = 1 << 22
-#: Of Mitsuba's seeds ``(seed << 16) + i``, those with ``i`` below are for checks, those from here on for references.
+#: First ``i`` of Mitsuba's seeds ``(seed << 16) + i`` that references use; checks use smaller ones.
 _REFERENCE_SEEDS = 1 << 15
 #: Seeds of one pass, and so the largest number of its renders.
 _SEEDS = 1 << 8

@@ -12,7 +12,7 @@ import numpy as np
 from . import compat, metrics, plugins, tensor_files, units
 from .errors import DiffindError
 
-#: What a scene needs to be rendered, beside objects and lights.
+#: Parts that a scene needs to be rendered, beside objects and lights.
 NEEDS = ("integrator", "sensor")
 
 #: Bytes of memory of a channel of a pixel while a pass is rendered: of the film, the developed image, its copy in

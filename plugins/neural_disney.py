@@ -131,9 +131,9 @@ class NeuralDisney(Disney):
 #: metal's reflection, too; of a material that transmits light, it replaces 0 and 1 by these values itself.
 METALS = {"specular": 1e-3, "eta": 1.001}
 
-#: The same of all else. Schlick's term of the Disney BRDF is 1 at grazing angles, the dielectric one is smaller the
-#: nearer the index of refraction is to 1: a floor of roughness 0.1 seen at 11° is 76% brighter with ``specular`` 0, 15%
-#: with 0.1 and 2% with 0.5.
+#: Least values for dielectrics. Schlick's term of the Disney BRDF is 1 at grazing angles; the dielectric one is less,
+#: the nearer the index of refraction is to 1. A floor of roughness 0.1 seen at 11° is 76% brighter with ``specular`` 0,
+#: 15% with 0.1 and 2% with 0.5.
 DIELECTRICS = {"specular": 0.1, "eta": 1.2}
 
 
