@@ -14,20 +14,20 @@ ROOT = Path(__file__).resolve().parent
 
 
 class BuildWithScenes(build_py):
-    """Copies the scenes, too: those files that ``mi-diffind examples`` writes (:mod:`mi_diffind.example_files`)."""
+    """Copies the scenes, too: those files that ``mi-diffind examples`` writes (:mod:`mi_diffind.scenes.examples`)."""
 
     def run(self):
         super().run()
         if self.editable_mode:  # a checkout has them
             return
         sys.path.insert(0, str(ROOT))
-        from mi_diffind import example_files
+        from mi_diffind.scenes import examples
 
         target = Path(self.build_lib) / "mi_diffind" / "example_scenes"
         shutil.rmtree(target, ignore_errors=True)  # those of an earlier build
-        for name in example_files.files():
+        for name in examples.files():
             (target / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(example_files.source() / name, target / name)
+            shutil.copyfile(examples.source() / name, target / name)
 
 
 plugins = ["mi_diffind.plugins", *(f"mi_diffind.plugins.{name}" for name in find_packages("plugins"))]

@@ -106,7 +106,7 @@ def rendered(study: Any, scene: str, name: str, spp: int = 1) -> float:
 
 def shipped(task: str, preset: str) -> float:
     """Return the PSNR in dB that is stored in the file that ships for a preset of a task."""
-    from mi_diffind.task import tasks
+    from mi_diffind.fitting.task import tasks
 
     task = tasks()[task]
     return task.load(task.file(preset=preset)).measured["psnr_db"]

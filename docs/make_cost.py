@@ -15,7 +15,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 import cost_table
 
-from mi_diffind.files import replacing
+from mi_diffind.core.files import replacing
 
 #: Role → label, colour, marker and size of its point. Shapes differ for prints without colour.
 ROLES = {

@@ -23,9 +23,10 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from mi_diffind import films, orbit, poses, scenes
-from mi_diffind.files import write_json
-from mi_diffind.progress import progress_bar
+from mi_diffind.core.files import write_json
+from mi_diffind.core.progress import progress_bar
+from mi_diffind.images import films
+from mi_diffind.scenes import loading, orbit, poses
 from mi_diffind.studies.texture import test_scenes
 from mi_diffind.studies.texture.zoom import TextureZoom
 
@@ -97,7 +98,7 @@ def rendered(
     """
     defines |= {"spp": spp, "width": size[0] // scale, "height": size[1] // scale}
     options = {"exact": True, "against": against} if against else {}
-    scene = scenes.load(SCENES / f"{name}.xml", defines, **options)
+    scene = loading.load(SCENES / f"{name}.xml", defines, **options)
     with progress_bar(" ".join(filter(None, (name, against))), len(motions), "frame", True) as bar:
         images = orbit.along(scene, motions, new_seeds=True, on_frame=bar.update)
     return [films.displayed(image).repeat(scale, axis=0).repeat(scale, axis=1) for image in images]
@@ -169,7 +170,7 @@ def zoom(frames: int) -> Film:
             lambda repeats, texture=texture: {**texture, "to_uv": test_scenes.to_uv(repeats)},
             spp=TRUTH if truth else 1,
             sampler="multijitter" if truth else "independent",
-            prepare=scenes.attach,
+            prepare=loading.attach,
         )
         panels[label] = [np.round(255 * image).astype(np.uint8) for image in view.render(reader)]
     return Film(panels, 2, ["tiles_filtered.npz"])

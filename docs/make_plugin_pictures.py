@@ -17,7 +17,7 @@ import numpy as np
 from PIL import Image
 
 import mi_diffind as md
-from mi_diffind.files import replacing
+from mi_diffind.core.files import replacing
 
 ROOT = Path(__file__).resolve().parents[1]
 ASSETS = ROOT / "scenes" / "assets"

@@ -28,7 +28,7 @@ from derived import RATIO_FIGURES, equal_samples, ratio_best, ratio_loss, ratio_
 from list_numbers import headlines
 
 import mi_diffind
-from mi_diffind.task import tasks
+from mi_diffind.fitting.task import tasks
 from mi_diffind.tasks.image import memory_budget as image_budget
 from mi_diffind.tasks.radiance import presets as field_presets
 from mi_diffind.tasks.sdf import paper as sdf_paper

@@ -29,7 +29,17 @@ def main() -> None:
     parser.add_argument("--spp", default="256")
     parser.add_argument("-o", "--output", default=str(ROOT / "docs" / "viewer.jpg"))
     arguments = parser.parse_args()
-    command = [sys.executable, "-m", "mi_diffind.cli", "view", arguments.scene, "--port", "0", "--width", "640"]
+    command = [
+        sys.executable,
+        "-m",
+        "mi_diffind.commands.cli",
+        "view",
+        arguments.scene,
+        "--port",
+        "0",
+        "--width",
+        "640",
+    ]
     server = subprocess.Popen([*command, "--spp", arguments.spp], stdout=subprocess.PIPE, text=True)
     try:
         url = re.search(r"http://\S+", server.stdout.readline())[0]

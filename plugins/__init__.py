@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from mi_diffind import compat, discovery, mitsuba_versions
+from mi_diffind.core import compat, discovery, mitsuba_versions
 
 #: Modules of this package that are no plugins.
 IGNORED = ("support",)
@@ -78,7 +78,7 @@ class Plugin:
     - ``seen_by``: for a shape that only some integrators see, these; ``otherwise``: the parameter and the value with
       which all others see it, too.
 
-    Instances with a method ``report()`` describe what they do (:func:`mi_diffind.scenes.reports`); for an object of one
+    Instances with a method ``report()`` describe what they do (:func:`.reports`); for an object of one
     of Mitsuba's own classes, the factory calls :func:`reports_as`.
     """
 

@@ -5,8 +5,8 @@ from __future__ import annotations  # Delayed parsing of type annotations
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind import compat, mitsuba_versions
-from mi_diffind.lookup import clamp
+from mi_diffind.arrays.lookup import clamp
+from mi_diffind.core import compat, mitsuba_versions
 
 from .map_texture import MapTexture
 from .support import footprint, omissions

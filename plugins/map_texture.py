@@ -9,11 +9,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_diffind import srgb
-from mi_diffind.bounds import ValueBounds
-from mi_diffind.lookup import clamp
+from mi_diffind.arrays.bounds import ValueBounds
+from mi_diffind.arrays.lookup import clamp
+from mi_diffind.core.mitsuba_versions import base_class
+from mi_diffind.images import srgb
 from mi_diffind.maps.layout import MapLayout
-from mi_diffind.mitsuba_versions import base_class
 
 from .support import frozen, properties, tables, textures, upsampling
 from .support.image_files import SharedMaps, is_data, map_of

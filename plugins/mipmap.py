@@ -5,7 +5,8 @@ from __future__ import annotations  # Delayed parsing of type annotations
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind import memory, srgb
+from mi_diffind.core import memory
+from mi_diffind.images import srgb
 from mi_diffind.maps.pyramid import TexelPyramid
 
 from . import Plugin

@@ -8,26 +8,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_diffind import compat
-from mi_diffind.errors import UsageError
-from mi_diffind.indirection import DifferentiableArray
-from mi_diffind.lookup import clamp
-from mi_diffind.mitsuba_versions import base_class
-from mi_diffind.tables import TableError
+from mi_diffind.arrays.indirection import DifferentiableArray
+from mi_diffind.arrays.lookup import clamp
+from mi_diffind.arrays.tables import TableError
+from mi_diffind.core import compat
+from mi_diffind.core.errors import UsageError
+from mi_diffind.core.mitsuba_versions import base_class
 from mi_diffind.tasks.bsdf import TASK
 from mi_diffind.tasks.bsdf.family_files import ARRAYS
 from mi_diffind.tasks.bsdf.files import RESIDUAL
-from mi_diffind.tasks.bsdf.model import (
-    ALPHA_MIN,
-    DIFFUSE,
-    EDGE,
-    LOBE,
-    LOGARITHMS,
-    PARAMETERS,
-    TERMS,
-    Proxy,
-    ProxyLobe,
-)
+from mi_diffind.tasks.bsdf.model import ALPHA_MIN, DIFFUSE, EDGE, LOBE, LOGARITHMS, PARAMETERS, TERMS, Proxy, ProxyLobe
 from mi_diffind.tasks.bsdf.truth import MitsubaTruth
 
 from . import Counterpart, Plugin

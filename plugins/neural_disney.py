@@ -4,7 +4,7 @@ from __future__ import annotations  # Delayed parsing of type annotations
 
 import mitsuba as mi
 
-from mi_diffind.task import STORAGES
+from mi_diffind.fitting.task import STORAGES
 from mi_diffind.tasks.disney import TASK
 from mi_diffind.tasks.disney.decoder import GROUPS
 

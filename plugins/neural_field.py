@@ -8,8 +8,8 @@ from functools import cache
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind import compat, mitsuba_versions
-from mi_diffind.tables import TableError
+from mi_diffind.arrays.tables import TableError
+from mi_diffind.core import compat, mitsuba_versions
 from mi_diffind.tasks.radiance.march import OPAQUE
 
 from . import Counterpart, Plugin, warn

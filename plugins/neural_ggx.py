@@ -5,7 +5,7 @@ from __future__ import annotations  # Delayed parsing of type annotations
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind.task import STORAGES
+from mi_diffind.fitting.task import STORAGES
 from mi_diffind.tasks.ggx import TASK
 from mi_diffind.tasks.ggx.model import Roughness
 

@@ -12,9 +12,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_diffind import compat
-from mi_diffind.tables import TableError
-from mi_diffind.task import stamp
+from mi_diffind.arrays.tables import TableError
+from mi_diffind.core import compat
+from mi_diffind.fitting.task import stamp
 from mi_diffind.tasks.sdf import TASK
 
 from . import Counterpart, Plugin, Stock, reports_as, shown_as, warn

@@ -7,7 +7,7 @@ from functools import cache
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind import compat, mitsuba_versions
+from mi_diffind.core import compat, mitsuba_versions
 
 from . import Plugin
 from .support import footprint, omissions

@@ -15,7 +15,8 @@ import numpy as np
 from scene_xml import element, head, lying, plugin, transform, write
 
 import mi_diffind as md
-from mi_diffind import metrics, scenes
+from mi_diffind.images import metrics
+from mi_diffind.scenes import loading
 
 ABOUT = """Hammered metal with rust, minified: what a texture that is trained for its shading is for. Written by
 make_rust.py: change that file.
@@ -56,7 +57,7 @@ def picture(json_file: str | None) -> None:
 
     def rendered(file: str, spp: int, exact: bool = False) -> np.ndarray:
         defines = {**PICTURE, "spp": spp, "metal": file}  # the scene's samples scale the footprints
-        return scenes.render(scenes.load(FOLDER / "rust.xml", defines, exact=exact), passes=max(1, spp // 16))[0]
+        return loading.render(loading.load(FOLDER / "rust.xml", defines, exact=exact), passes=max(1, spp // 16))[0]
 
     files = ("rust_plain.npz", "rust_shaded.npz")
     images, truth = {file: rendered(file, 1) for file in files}, rendered(files[0], 256, exact=True)

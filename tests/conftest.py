@@ -9,7 +9,7 @@ import pytest
 from _pytest.faulthandler import fault_handler_stderr_fd_key
 from variants import BACKENDS, VARIANTS, set_variant
 
-from mi_diffind import compat
+from mi_diffind.core import compat
 
 #: Run all tests with code for another processor, such as ``haswell:+avx2,+fma:8`` (most laptops).
 if TARGET := os.environ.get("MI_DIFFIND_LLVM_TARGET"):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mi_diffind import block_test
-from mi_diffind.block_test import BlockReference, block_means
+from mi_diffind.scenes import block_test
+from mi_diffind.scenes.block_test import BlockReference, block_means
 
 HEIGHT, WIDTH = 46, 70  # no multiples of 4
 

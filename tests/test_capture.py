@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mi_diffind import cli
+from mi_diffind.commands import cli
 
 SCENES = Path(__file__).resolve().parents[1] / "scenes"
 
@@ -142,10 +142,10 @@ def test_other_settings_are_refused(mi_rgb, scene, tmp_path, capsys):
 
 
 def test_an_interrupted_capture_is_gone_on_with(mi_rgb, scene, tmp_path, monkeypatch, capsys):
-    from mi_diffind import view_capture
+    from mi_diffind.scenes import capture
     from mi_diffind.tasks.radiance.views import load_views
 
-    stop, render = threading.Event(), view_capture.CaptureCamera.render
+    stop, render = threading.Event(), capture.CaptureCamera.render
 
     def third(self, *arguments):
         third.calls += 1
@@ -155,17 +155,17 @@ def test_an_interrupted_capture_is_gone_on_with(mi_rgb, scene, tmp_path, monkeyp
 
     third.calls = 0
     with monkeypatch.context() as patch:
-        patch.setattr(view_capture, "interruptible", lambda: contextlib.nullcontext(stop))
-        patch.setattr(view_capture.CaptureCamera, "render", third)
+        patch.setattr(capture, "interruptible", lambda: contextlib.nullcontext(stop))
+        patch.setattr(capture.CaptureCamera, "render", third)
         assert run(scene, tmp_path / "views") == 130
     assert "3 of 6 views, 3 rendered now" in capsys.readouterr().out
     assert len(load_views(tmp_path / "views")) == 3  # what there is can be used
     with monkeypatch.context() as patch:  # and a failure on the way leaves no half image
 
         def failing(path, image):
-            raise view_capture.CaptureError("disk")
+            raise capture.CaptureError("disk")
 
-        patch.setattr(view_capture, "_write", failing)
+        patch.setattr(capture, "_write", failing)
         assert run(scene, tmp_path / "views") == 2
     assert run(scene, tmp_path / "views") == 0 and "3 rendered now" in capsys.readouterr().out
     assert run(scene, tmp_path / "whole") == 0
@@ -175,8 +175,8 @@ def test_an_interrupted_capture_is_gone_on_with(mi_rgb, scene, tmp_path, monkeyp
 
 def test_views_of_other_processes(mi_rgb, scene, tmp_path, monkeypatch, capsys):
     """The same bytes, also of the lists; a view that fails ends the capture."""
-    from mi_diffind import view_capture
-    from mi_diffind.jobs import Outcome
+    from mi_diffind.core.jobs import Outcome
+    from mi_diffind.scenes import capture
 
     assert run(scene, tmp_path / "one", "-D", "red=0.5") == run(
         scene, tmp_path / "two", "-D", "red=0.5", "--workers", "1"
@@ -186,7 +186,7 @@ def test_views_of_other_processes(mi_rgb, scene, tmp_path, monkeypatch, capsys):
     for file in files:
         assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes(), file
     (tmp_path / "two" / "train" / "r_000.png").unlink()
-    monkeypatch.setattr(view_capture, "run_jobs", lambda *_: [Outcome("train/r_000.png", failure="disk full")])
+    monkeypatch.setattr(capture, "run_jobs", lambda *_: [Outcome("train/r_000.png", failure="disk full")])
     assert run(scene, tmp_path / "two", "-D", "red=0.5", "--workers", "1") == 2
     assert "train/r_000.png: disk full" in capsys.readouterr().err
 
@@ -225,17 +225,17 @@ def test_objects_alone_are_seen(mi_rgb, scene, tmp_path, capsys, integrator):
 
 def test_meshes_of_one_material_keep_their_ids(mi_rgb, tmp_path):
     """Mitsuba makes one mesh of them, where it may."""
-    from mi_diffind import scenes, view_capture
+    from mi_diffind.scenes import capture, loading
 
     path, cube = tmp_path / "cubes.xml", '<shape type="cube" id="{}"><ref id="grey"/><transform name="to_world">{}'
     cubes = [cube.format(name, f'<translate x="{x}"/></transform></shape>') for name, x in (("a", -2), ("b", 3))]
     path.write_text(f'<scene version="3.0.0"><bsdf type="diffuse" id="grey"/>{"".join(cubes)}</scene>')
-    assert len(scenes.load(path).shapes()) == 1
-    loaded = view_capture._load(scenes.ParsedScene(path))
-    assert view_capture.bounds(loaded).tolist() == [[-3, -1, -1], [4, 1, 1]]
-    assert view_capture.bounds(loaded, ("b",)).tolist() == [[2, -1, -1], [4, 1, 1]]
+    assert len(loading.load(path).shapes()) == 1
+    loaded = capture._load(loading.ParsedScene(path))
+    assert capture.bounds(loaded).tolist() == [[-3, -1, -1], [4, 1, 1]]
+    assert capture.bounds(loaded, ("b",)).tolist() == [[2, -1, -1], [4, 1, 1]]
     # As far as their vertices, which is nearer than the corners of a box around both
-    assert view_capture._reach(loaded, ("b",), np.array([3.0, 0, 0])) == pytest.approx(np.sqrt(3))
+    assert capture._reach(loaded, ("b",), np.array([3.0, 0, 0])) == pytest.approx(np.sqrt(3))
 
 
 def test_integrators_that_nest_another_leave_lights_to_it(mi_rgb, scene, tmp_path):
@@ -331,7 +331,7 @@ def angles(a, b):
 
 
 def test_views_on_a_sphere_are_even_and_test_views_between_them(mi_rgb):
-    from mi_diffind.view_capture import CaptureSettings
+    from mi_diffind.scenes.capture import CaptureSettings
 
     train, test = CaptureSettings(seed=1).directions()
     assert train.shape == (60, 3) and test.shape == (20, 3)
@@ -348,7 +348,7 @@ def test_views_on_a_sphere_are_even_and_test_views_between_them(mi_rgb):
 
 
 def test_an_orbit_closes_and_swings(mi_rgb):
-    from mi_diffind.view_capture import CaptureSettings
+    from mi_diffind.scenes.capture import CaptureSettings
 
     train, test = CaptureSettings(path="orbit", views=12, test=6, elevation=(0.0, 60.0)).directions()
     azimuth = np.degrees(np.arctan2(train[:, 1], train[:, 0])) % 360
@@ -362,7 +362,7 @@ def test_an_orbit_closes_and_swings(mi_rgb):
 
 @pytest.mark.parametrize("up", [(0, 1, 0), (0, 0, 2), (1, 1, -1)])
 def test_poses_are_rigid_and_upright(mi_rgb, up):
-    from mi_diffind.poses import frame_of, pose
+    from mi_diffind.scenes.poses import frame_of, pose
 
     frame = frame_of(up)
     axis = np.array(up) / np.linalg.norm(up)

@@ -12,9 +12,9 @@ import pytest
 from commands import refused
 from variants import BACKENDS
 
-from mi_diffind.cli import VERBS, main
-from mi_diffind.tables import load_table
-from mi_diffind.task import tasks
+from mi_diffind.arrays.tables import load_table
+from mi_diffind.commands.cli import VERBS, main
+from mi_diffind.fitting.task import tasks
 
 SCENES = Path(__file__).resolve().parents[1] / "scenes"
 #: Two materials, exact and from tables, under one lamp.
@@ -189,7 +189,7 @@ def test_fit_ggx(tmp_path, capsys, few_samples):
 
 def test_fit_for_some_seconds(tmp_path, capsys, few_samples, monkeypatch):
     """By a clock of its own: as many steps as there is time for; the file says how many, and how long."""
-    from mi_diffind import fitting
+    from mi_diffind.fitting import loop
 
     now = [0.0]
 
@@ -197,7 +197,7 @@ def test_fit_for_some_seconds(tmp_path, capsys, few_samples, monkeypatch):
         now[0] += 1 / 16
         return now[0]
 
-    monkeypatch.setattr(fitting.time, "perf_counter", tick)
+    monkeypatch.setattr(loop.time, "perf_counter", tick)
     out = tmp_path / "own.npz"
     arguments = ["fit", "ggx", "--batch", "512", "--variant", "llvm_ad_rgb", "-o", str(out), "--json"]
     assert main([*arguments, str(tmp_path / "r.json"), "--seconds", "2"]) == 0

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mi_diffind import comparison, metrics
+from mi_diffind.images import metrics
+from mi_diffind.scenes import comparison
 
 ASSETS = Path(__file__).resolve().parents[1] / "scenes" / "assets"
 
@@ -74,7 +75,7 @@ TEXTURED = """
 def test_a_filtered_texture_has_two_truths(mi_rgb, tmp_path):
     """The mip map at equal samples and the bitmap at eight times as many; other learned plugins are exact in both."""
     import mi_diffind
-    from mi_diffind import scenes
+    from mi_diffind.scenes import loading
 
     path = tmp_path / "scene.xml"
     path.write_text(TEXTURED.replace("FILE", str(ASSETS / "tiles_filtered.npz")))
@@ -83,8 +84,8 @@ def test_a_filtered_texture_has_two_truths(mi_rgb, tmp_path):
     assert [comparison.truth_label(one.figures) for one in (first, second)] == [
         "mipmap (disney, mipmap), 8 spp", "exact (disney, bitmap), 64 spp",
     ]  # fmt: skip
-    exact = scenes.load(path, exact=True)
-    np.testing.assert_allclose(second.reference, scenes.render(exact, 2048)[0], atol=0.15)
+    exact = loading.load(path, exact=True)
+    np.testing.assert_allclose(second.reference, loading.render(exact, 2048)[0], atol=0.15)
     assert second.figures["noise_db"] < first.figures["noise_db"]  # other random numbers: all of the noise is there
     text = comparison.summary(first)
     assert "against     mipmap (disney, mipmap), 8 spp" in text

@@ -12,8 +12,8 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from mi_diffind import compat, runtime, turns
-from mi_diffind.mitsuba_versions import ray_flags
+from mi_diffind.core import compat, runtime, turns
+from mi_diffind.core.mitsuba_versions import ray_flags
 
 SCENE = Path(__file__).resolve().parent / "lamp.xml"
 

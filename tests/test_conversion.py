@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from mi_diffind import comparison, conversion, scenes
-from mi_diffind.errors import UsageError
+from mi_diffind.core.errors import UsageError
 from mi_diffind.plugins.support import sdf_meshes
 from mi_diffind.plugins.support.stock import Kept
+from mi_diffind.scenes import comparison, conversion, loading
 from mi_diffind.tasks.sdf import serialized
 from mi_diffind.tasks.sdf.mesh import MeshError, load_mesh
 
@@ -63,7 +63,7 @@ def save_image(path, values):
 
 def parsed(folder, objects, name="scene.xml"):
     (folder / name).write_text(SCENE.replace("OBJECTS", objects))
-    return scenes.ParsedScene(folder / name)
+    return loading.ParsedScene(folder / name)
 
 
 def test_a_converted_scene_shows_the_same(mi_rgb, folder):
@@ -75,7 +75,7 @@ def test_a_converted_scene_shows_the_same(mi_rgb, folder):
         <string name="filter_type" value="bilinear"/></texture></bsdf></bsdf></shape>"""
     ball = BALL.replace("MORE", '<boolean name="face_normals" value="true"/>')
     scene = parsed(folder, ball + floor)
-    stock = scenes.render(scene.load(), 16)[0]
+    stock = loading.render(scene.load(), 16)[0]
     conversions = conversion.replace_stock(scene, ["principled", "bitmap", "mesh"], folder / "tables")
     assert [(c.stock, c.learned, c.name) for c in conversions] == [
         ("ply", "neural_sdf", "ball"), ("principled", "neural_disney", "ball"),
@@ -91,9 +91,9 @@ def test_a_converted_scene_shows_the_same(mi_rgb, folder):
     assert lines[6] == " " * 12 + '"path": which follows no footprints: textures filter by the sensor\'s alone'
     (folder / "other").mkdir()
     conversion.write_scene(scene, folder / "other" / "new.xml")
-    learned = scenes.render(scenes.load(folder / "other" / "new.xml"), 16)[0]
+    learned = loading.render(loading.load(folder / "other" / "new.xml"), 16)[0]
     assert stock.std() > 0.1 and np.abs(learned - stock).mean() < 0.02
-    exact = scenes.load(folder / "other" / "new.xml", exact=True)
+    exact = loading.load(folder / "other" / "new.xml", exact=True)
     assert "PLYMesh" in [shape.class_name() for shape in exact.shapes()]
     twice = parsed(folder, ball + floor, "again.xml")
     assert len(conversion.replace_stock(twice, ["mesh", "bitmap"], folder / "tables")) == 3 and len(fits) == 2
@@ -167,7 +167,7 @@ def test_a_fit_that_ends_early_leaves_no_files(mi_rgb, folder, monkeypatch, faul
 
 def test_a_comparison_of_nothing_says_what_was_kept(mi_rgb, folder):
     parsed(folder[0], '<bsdf type="principled" id="Glass"><float name="spec_trans" value="1"/></bsdf>')
-    with pytest.raises(scenes.SceneError, match='nothing to compare; kept is principled "Glass": transmits light'):
+    with pytest.raises(loading.SceneError, match='nothing to compare; kept is principled "Glass": transmits light'):
         comparison.compare(folder[0] / "scene.xml", learn=["principled"], progress=False)
 
 
@@ -210,7 +210,7 @@ def test_albedos_at_grazing_angles_of_what_is_replaced(mi_rgb, folder, metal, sp
 
 def test_the_command_and_a_comparison_with_the_stock_scene(mi_rgb, tmp_path, capsys):
     import mi_diffind
-    from mi_diffind.cli import main
+    from mi_diffind.commands.cli import main
 
     materials = '<bsdf type="principled" id="Clay"/><bsdf type="principled" id="Glass"><float name="spec_trans" '
     ball = 'value="1"/></bsdf><shape type="sphere"><ref id="Clay"/></shape>'
@@ -247,7 +247,7 @@ def test_by_default_only_textures_are_learned(mi_rgb, folder):
     result = conversion.convert(folder / "scene.xml", folder / "new.xml", defines={"rough": 0.4}, progress=False)
     assert [(c.stock, c.learned, c.name) for c in result] == [("bitmap", "neural_texture", "card")]
     assert [task for task, _ in fits] == ["texture"] and str(result).splitlines()[-1] == f"check       {result.check}"
-    types = scenes.ParsedScene(folder / "new.xml").change(lambda state: [n.props.plugin_name() for n in state.nodes])
+    types = loading.ParsedScene(folder / "new.xml").change(lambda state: [n.props.plugin_name() for n in state.nodes])
     assert {"principled", "ply", "path", "neural_texture"} <= set(types) and "bitmap" not in types
     same = conversion.convert(folder / "scene.xml", folder / "same.xml", learn=[])
     assert same.check is None and str(same) == "replaced    nothing"
@@ -340,7 +340,7 @@ def test_misspelt_parameters_stay_errors(mi_rgb, folder):
                    '<shape type="sphere"><ref id="a"/></shape>')  # fmt: skip
     (one,) = conversion.replace_stock(scene, ["principled"], folder[0])
     assert one.reason == 'has the parameter "rougness", which the learned plugin lacks'
-    with pytest.raises(scenes.SceneError, match="rougness"):
+    with pytest.raises(loading.SceneError, match="rougness"):
         scene.load()
 
 

@@ -7,13 +7,14 @@ import drjit.llvm.ad as types
 import numpy as np
 import pytest
 
-from mi_diffind import fitting, progress
-from mi_diffind.deadline import Deadline
-from mi_diffind.errors import UsageError
-from mi_diffind.fitting import FitSettings, Problem, fit
+from mi_diffind.core import progress
+from mi_diffind.core.deadline import Deadline
+from mi_diffind.core.errors import UsageError
+from mi_diffind.fitting import loop
+from mi_diffind.fitting.loop import FitSettings, Problem, fit
+from mi_diffind.fitting.task import FitRequest, tasks
 from mi_diffind.maps.arguments import requested_bytes
 from mi_diffind.maps.source import from_arrays
-from mi_diffind.task import FitRequest, tasks
 
 
 class Clock:
@@ -28,9 +29,9 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch):
     clock = Clock()
-    monkeypatch.setattr(fitting.time, "perf_counter", lambda: clock.now)
+    monkeypatch.setattr(loop.time, "perf_counter", lambda: clock.now)
     monkeypatch.setattr("tqdm.std.time", lambda: clock.now)
-    monkeypatch.setattr("mi_diffind.compat.compile_seconds", lambda history: 0.0)
+    monkeypatch.setattr("mi_diffind.core.compat.compile_seconds", lambda history: 0.0)
     return clock
 
 
@@ -149,7 +150,7 @@ def started(task, **options):
 
 
 def capture(**options):
-    from mi_diffind.view_capture import CaptureSettings
+    from mi_diffind.scenes.capture import CaptureSettings
 
     CaptureSettings(**options).check()
 
@@ -161,7 +162,7 @@ def image(nbytes):
 
 @pytest.mark.parametrize("name", TOO_MUCH)
 def test_what_takes_too_much_is_refused(name, monkeypatch):
-    monkeypatch.setattr("mi_diffind.units.memory", lambda: 2**34)
+    monkeypatch.setattr("mi_diffind.core.units.memory", lambda: 2**34)
     action, sentence = TOO_MUCH[name]
     with pytest.raises((UsageError, ValueError)) as error:
         action()

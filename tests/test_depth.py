@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from commands import refused
 
-from mi_diffind.cli import main
+from mi_diffind.commands.cli import main
 
 SCENES = Path(__file__).resolve().parents[1] / "scenes"
 SMALL = {"width": 96, "height": 56}
@@ -75,9 +75,9 @@ def test_furnace(mi_rgb, tmp_path, albedo, max_depth, expected):
     For ρ = 0.5 it falls below 0.5% after eight bounces (0.39%), for 0.8 after 24 (0.47%), for 0.1 after 3 (0.1%). With
     ρ = 0.5 and D = 8, depth 7 would leave out 0.79%: the scene's own depth stays.
     """
-    from mi_diffind import depth, scenes
+    from mi_diffind.scenes import depth, loading
 
-    scene = scenes.load(scene_file(tmp_path, FURNACE, depth=max_depth, albedo=albedo))
+    scene = loading.load(scene_file(tmp_path, FURNACE, depth=max_depth, albedo=albedo))
     light = depth.probe(scene, max_depth)
     found = depth.bounces(light)
     assert len(found) == (depth.MAX_BINS if max_depth < 0 else max_depth)
@@ -96,11 +96,11 @@ def test_furnace(mi_rgb, tmp_path, albedo, max_depth, expected):
 @pytest.mark.parametrize("name", ["volpath", "path_footprint", "path_sdf", "neural_field"])
 def test_other_integrators(mi_rgb, tmp_path, name):
     """The furnace is the same for all that follow paths; without a medium, there is no light through media."""
-    from mi_diffind import depth, scenes
+    from mi_diffind.scenes import depth, loading
 
     file = "" if name != "neural_field" else f'<string name="filename" value="{SCENES / "assets/group.npz"}"/>'
     integrator = f'<integrator type="{name}"><integer name="max_depth" value="$depth"/>{file}</integrator>'
-    parsed = scenes.ParsedScene(scene_file(tmp_path, FURNACE, integrator, depth=8))
+    parsed = loading.ParsedScene(scene_file(tmp_path, FURNACE, integrator, depth=8))
     found = depth.auto_depth(parsed, 0.05, progress=False)
     assert (found["chosen"], found["scene"]) == (6, 8)
     assert found["left_out"] == pytest.approx((0.5**5 - 0.5**7) / (1 - 0.5**7), rel=0.02)
@@ -108,7 +108,7 @@ def test_other_integrators(mi_rgb, tmp_path, name):
 
 def test_distance_fields_are_met(mi_rgb, tmp_path):
     """Each depth is that of a render by ``path_sdf``: light that bounces between a solid and the floor, and shadows."""
-    from mi_diffind import depth, scenes
+    from mi_diffind.scenes import depth, loading
 
     solid = f"""
     <emitter type="constant"/>
@@ -119,18 +119,18 @@ def test_distance_fields_are_met(mi_rgb, tmp_path):
     <shape type="rectangle"><transform name="to_world"><scale value="10"/><rotate x="1" angle="-90"/>
         <translate y="-1"/></transform><bsdf type="diffuse"><spectrum name="reflectance" value="0.7"/></bsdf></shape>"""
     file = scene_file(tmp_path, solid, PATH.replace('"path"', '"path_sdf"'), depth=3)
-    probed = depth.probe(scenes.load(file), 3, spp=32).mean((1, 2))
-    renders = [scenes.render(scenes.load(file, longest_path=d), 128)[0] for d in (1, 2, 3)]
+    probed = depth.probe(loading.load(file), 3, spp=32).mean((1, 2))
+    renders = [loading.render(loading.load(file, longest_path=d), 128)[0] for d in (1, 2, 3)]
     path = np.diff([luminance(image) for image in renders], prepend=0)
     assert np.allclose(probed, path, rtol=0.03), (probed, path)
 
 
 def test_deeper_than_the_bins(mi_rgb, tmp_path):
     """What arrives deeper than the bins reach is booked under the last, and such a scene keeps its own depth."""
-    from mi_diffind import depth, scenes
+    from mi_diffind.scenes import depth, loading
 
     albedo = 0.95
-    scene = scenes.load(scene_file(tmp_path, FURNACE, albedo=albedo))
+    scene = loading.load(scene_file(tmp_path, FURNACE, albedo=albedo))
     light = depth.probe(scene, -1, spp=8)
     means = light.mean((1, 2))
     assert means.sum() == pytest.approx(1 / (1 - albedo), rel=0.02)
@@ -141,47 +141,47 @@ def test_deeper_than_the_bins(mi_rgb, tmp_path):
 
 
 def test_one_bounce_alone(mi_rgb, tmp_path):
-    from mi_diffind import depth, scenes
+    from mi_diffind.scenes import depth, loading
 
-    found = depth.auto_depth(scenes.ParsedScene(scene_file(tmp_path, CONVEX)), progress=False)
+    found = depth.auto_depth(loading.ParsedScene(scene_file(tmp_path, CONVEX)), progress=False)
     assert found["chosen"] == 2 and found["scene"] == -1 and found["left_out"] == 0
     assert [s["share"] for s in found["shares"][:3]] == [0, 1, 0]
-    assert depth.auto_depth(scenes.ParsedScene(scene_file(tmp_path, CONVEX, depth=1)), progress=False)["chosen"] == 1
-    assert depth.auto_depth(scenes.ParsedScene(scene_file(tmp_path, CONVEX, depth=0)), progress=False)["chosen"] == 0
+    assert depth.auto_depth(loading.ParsedScene(scene_file(tmp_path, CONVEX, depth=1)), progress=False)["chosen"] == 1
+    assert depth.auto_depth(loading.ParsedScene(scene_file(tmp_path, CONVEX, depth=0)), progress=False)["chosen"] == 0
 
 
 def test_without_scattered_light(mi_rgb, tmp_path):
-    from mi_diffind import depth, scenes
+    from mi_diffind.scenes import depth, loading
 
-    found = depth.auto_depth(scenes.ParsedScene(scene_file(tmp_path, '<emitter type="constant"/>')), progress=False)
+    found = depth.auto_depth(loading.ParsedScene(scene_file(tmp_path, '<emitter type="constant"/>')), progress=False)
     assert found["chosen"] == 1 and found["left_out"] == 0
 
 
 def test_each_depth_is_that_of_path(mi_rgb, tmp_path):
     """Against Mitsuba's own path tracer, image by image."""
-    from mi_diffind import depth, scenes
+    from mi_diffind.scenes import depth, loading
 
     file, depths = scene_file(tmp_path, MIXED), 5
-    probed = depth.probe(scenes.load(file), depths, spp=64).mean((1, 2))
-    renders = [scenes.render(scenes.load(file, longest_path=d), 256)[0] for d in range(1, depths + 1)]
+    probed = depth.probe(loading.load(file), depths, spp=64).mean((1, 2))
+    renders = [loading.render(loading.load(file, longest_path=d), 256)[0] for d in range(1, depths + 1)]
     path = np.diff([luminance(image) for image in renders], prepend=0)
     assert np.allclose(probed, path, rtol=0.02), (probed, path)
 
 
 def test_in_each_variant(mi_any, tmp_path):
     """Spectra are sampled and polarisation is left out; what glass polarises is below the bound."""
-    from mi_diffind import depth, scenes
+    from mi_diffind.scenes import depth, loading
 
     file = scene_file(tmp_path, MIXED)
-    probed = depth.probe(scenes.load(file), 4, spp=32).mean((1, 2))
-    direct, full = (luminance(scenes.render(scenes.load(file, longest_path=d), 128)[0]) for d in (2, 4))
+    probed = depth.probe(loading.load(file), 4, spp=32).mean((1, 2))
+    direct, full = (luminance(loading.render(loading.load(file, longest_path=d), 128)[0]) for d in (2, 4))
     assert probed[2:].sum() / probed.sum() == pytest.approx(1 - direct / full, rel=0.03)
 
 
 def test_same_seed_same_numbers(mi_rgb):
-    from mi_diffind import depth, scenes
+    from mi_diffind.scenes import depth, loading
 
-    scene = scenes.load(SCENES / "still_life.xml")
+    scene = loading.load(SCENES / "still_life.xml")
     first, again, other = (depth.probe(scene, 5, spp=4, passes=2, seed=s) for s in (1, 1, 2))
     assert np.array_equal(first, again) and not np.array_equal(first, other)
     assert first.shape == (5, 80, 128)  # 960 x 580 in tiles of 8 pixels
@@ -192,13 +192,13 @@ def test_same_seed_same_numbers(mi_rgb):
 )
 def test_left_out_is_what_a_render_lacks(mi_rgb, name):
     """The repository's scenes at 5%: the image to the chosen depth lacks what was announced, and less than allowed."""
-    from mi_diffind import depth, scenes
+    from mi_diffind.scenes import depth, loading
 
     file = SCENES / f"{name}.xml"
-    found = depth.auto_depth(scenes.ParsedScene(file), 0.05, progress=False)
+    found = depth.auto_depth(loading.ParsedScene(file), 0.05, progress=False)
     assert 2 < found["chosen"] < found["scene"] == 5
     emitted, chosen, full = (
-        luminance(scenes.render(scenes.load(file, longest_path=d, defines=SMALL), 64)[0])
+        luminance(loading.render(loading.load(file, longest_path=d, defines=SMALL), 64)[0])
         for d in (1, found["chosen"], 5)
     )
     lacks = (full - chosen) / (full - emitted)
@@ -215,7 +215,7 @@ def images(*levels):
 
 
 def test_bright_lamps_and_highlights_hide_nothing():
-    from mi_diffind import depth
+    from mi_diffind.scenes import depth
 
     plain = images(0, 90, 10)
     rest = depth.bounces(plain)[1].rest
@@ -232,7 +232,7 @@ def test_bright_lamps_and_highlights_hide_nothing():
 
 def test_a_corner_counts():
     """1 of 128 tiles would lose a third: 0.26% of the image, yet more than ten times the tolerance there."""
-    from mi_diffind import depth
+    from mi_diffind.scenes import depth
 
     light = images(0, 1, 0)
     light[2, :8, :8] = 0.5
@@ -246,7 +246,7 @@ def test_a_corner_counts():
 
 
 def test_tolerance():
-    from mi_diffind import depth
+    from mi_diffind.scenes import depth
 
     found = depth.bounces(images(5, 90, 9, 0.9, 0.1))
     assert [round(b.rest, 4) for b in found] == [1, 0.1, 0.01, 0.001, 0]

@@ -5,7 +5,7 @@ from importlib import metadata
 
 import pytest
 
-from mi_diffind import discovery
+from mi_diffind.core import discovery
 
 
 @pytest.fixture

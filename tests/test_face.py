@@ -9,8 +9,8 @@ import trimesh
 from PIL import Image
 
 import mi_diffind
-from mi_diffind.cli import VERBS, main
-from mi_diffind.errors import UsageError
+from mi_diffind.commands.cli import VERBS, main
+from mi_diffind.core.errors import UsageError
 
 ASSETS = Path(__file__).resolve().parents[1] / "scenes" / "assets"
 TILES = ASSETS / "tiles_filtered.npz"
@@ -332,7 +332,7 @@ BALL = """<scene version="3.0.0"><default name="light" value="1"/><integrator ty
 
 def test_captured_views(mi_rgb, tmp_path):
     """Images and poses are those of the folder; what is there is kept; words of the command are keywords."""
-    from mi_diffind.view_capture import CaptureError
+    from mi_diffind.scenes.capture import CaptureError
 
     (tmp_path / "ball.xml").write_text(BALL)
     settings = {"views": 4, "test": 1, "resolution": 12, "spp": 4, "path": "orbit"}
@@ -378,7 +378,7 @@ def test_scenes_in_memory_that_hold_existing_objects_are_known_once(mi_rgb):
     """The content of a bitmap is in no description; two dictionaries of plain values have equal ones."""
     import mitsuba as mi
 
-    from mi_diffind.scenes import ParsedScene
+    from mi_diffind.scenes.loading import ParsedScene
 
     assert ParsedScene(ball()).description == ParsedScene(ball()).description != ParsedScene(ball(2)).description
     scene = ball() | {"other": mi.load_dict({"type": "sphere"})}
@@ -412,8 +412,8 @@ def test_a_reference_and_its_checks(mi_rgb, tmp_path):
 
 def test_keywords_of_a_study(monkeypatch, tmp_path, mi_rgb):
     """They become the arguments of the command, checked by its parser; the result shows its picture."""
-    from mi_diffind import tradeoffs
-    from mi_diffind.measure.report import Tradeoff
+    from mi_diffind.measure.study import Tradeoff
+    from mi_diffind.studies import tradeoffs
 
     asked = []
 
@@ -447,7 +447,7 @@ def test_keywords_of_a_study(monkeypatch, tmp_path, mi_rgb):
 def test_an_image_that_a_file_cannot_hold_is_not_rendered(mi_rgb, tmp_path, monkeypatch):
     """The channels that are predicted are those of the render, for each format of the film."""
     mi = mi_rgb
-    from mi_diffind import rendering
+    from mi_diffind.scenes import rendering
 
     integrators = {
         "path": {"type": "path"},

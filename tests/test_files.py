@@ -12,8 +12,8 @@ import pytest
 from commands import refused
 from PIL import Image
 
-from mi_diffind.errors import UsageError
-from mi_diffind.files import (
+from mi_diffind.core.errors import UsageError
+from mi_diffind.core.files import (
     LONGEST_NAME,
     OutputError,
     check_distinct,
@@ -121,7 +121,7 @@ def test_a_link_is_written_through(tmp_path):
 
 
 def test_a_cache_that_cannot_be_made_names_its_variable(tmp_path, monkeypatch):
-    from mi_diffind import conversion
+    from mi_diffind.scenes import conversion
 
     (tmp_path / "file").write_text("")
     for name, fault in (("file/a/cache", "cannot be made: Not a directory"), ("file", "is not a folder")):

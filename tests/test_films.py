@@ -10,9 +10,9 @@ import pytest
 from film_files import decoded, needs_ffmpeg
 from PIL import Image
 
-from mi_diffind import films
-from mi_diffind.errors import UsageError
-from mi_diffind.files import OutputError
+from mi_diffind.core.errors import UsageError
+from mi_diffind.core.files import OutputError
+from mi_diffind.images import films
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -14,11 +14,12 @@ import pytest
 from drjit import nn
 from variants import BACKENDS
 
-from mi_diffind import DifferentiableArray, DiffindError, Indirection, fitting
-from mi_diffind.files import OutputError
-from mi_diffind.fitting import FitResult, FitSettings, FittingError, Problem, fit
-from mi_diffind.indirection import unfolded
-from mi_diffind.runtime import array_module
+from mi_diffind import DifferentiableArray, DiffindError, Indirection
+from mi_diffind.arrays.indirection import unfolded
+from mi_diffind.core.files import OutputError
+from mi_diffind.core.runtime import array_module
+from mi_diffind.fitting import loop
+from mi_diffind.fitting.loop import FitResult, FitSettings, FittingError, Problem, fit
 
 
 @pytest.fixture(params=BACKENDS)
@@ -98,7 +99,7 @@ def interrupt(y):
 # -- results ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("loss", fitting.LOSSES)
+@pytest.mark.parametrize("loss", loop.LOSSES)
 def test_converges(ad, loss):
     problem = Curve(ad)
     before = problem.measure(problem.net)["psnr_db"]
@@ -185,7 +186,7 @@ def test_the_number_of_threads_is_restored(ad):
     assert dr.thread_count() == before
 
 
-@pytest.mark.parametrize("schedule", fitting.SCHEDULES)
+@pytest.mark.parametrize("schedule", loop.SCHEDULES)
 def test_resumed_equals_uninterrupted(ad, tmp_path, schedule):
     """Stopped by Ctrl-C between two checkpoints, or by a crash: the continued run is the same, bit by bit."""
     if ad.Float is not array_module("llvm").Float:
@@ -344,7 +345,7 @@ def test_nan_in_the_last_step_is_noticed(ad):
 
 def test_entries_lost_in_a_step_whose_loss_was_fine(ad, monkeypatch):
     """The loss is that of the state before the step: what the last step did shows in the entries only."""
-    original, spoiled = fitting._Trainer.take_step, []
+    original, spoiled = loop._Trainer.take_step, []
 
     def take_step(self, plateau=1.0):
         loss = original(self, plateau)
@@ -353,7 +354,7 @@ def test_entries_lost_in_a_step_whose_loss_was_fine(ad, monkeypatch):
             self.optimizer["cascaded.data"] = self.optimizer["cascaded.data"] * math.nan
         return loss
 
-    monkeypatch.setattr(fitting._Trainer, "take_step", take_step)
+    monkeypatch.setattr(loop._Trainer, "take_step", take_step)
     problem = Curve(ad)
     result, messages = run(problem, settings())
     assert spoiled and result.restarts == 1 and messages[0].startswith("step 60: ")
@@ -462,7 +463,7 @@ def clock(monkeypatch):
         now[0] += 1 / 32
         return now[0]
 
-    monkeypatch.setattr(fitting.time, "perf_counter", tick)
+    monkeypatch.setattr(loop.time, "perf_counter", tick)
     monkeypatch.setattr("tqdm.std.time", tick)
     return now
 
@@ -484,11 +485,11 @@ class Terminal(io.StringIO):
 @pytest.fixture
 def terminal(monkeypatch):
     """A terminal on which the progress bar is drawn as often as it changes, as on a slow machine."""
-    original, terminal = fitting.tqdm.__init__, Terminal()
+    original, terminal = loop.tqdm.__init__, Terminal()
     for module in ("fitting", "progress"):
         monkeypatch.setattr(f"mi_diffind.{module}.in_terminal", lambda: True)
     always = {"file": terminal, "mininterval": 0, "miniters": 0, "ncols": 200}
-    monkeypatch.setattr(fitting.tqdm, "__init__", lambda self, *a, **k: original(self, *a, **{**k, **always}))
+    monkeypatch.setattr(loop.tqdm, "__init__", lambda self, *a, **k: original(self, *a, **{**k, **always}))
     return terminal
 
 
@@ -585,7 +586,7 @@ def test_plateau_leaves_an_improving_loss_alone(ad):
 # -- cost -------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("schedule", fitting.SCHEDULES)
+@pytest.mark.parametrize("schedule", loop.SCHEDULES)
 def test_no_compilation_after_the_first_steps(ad, schedule):
     """
     A step that changes a literal would compile a new kernel each time. The cache on disk could hide that, so distinct
@@ -633,7 +634,7 @@ class Several(Curve):
 @pytest.mark.parametrize("problem", [Curve, Several])
 def test_a_step_is_one_kernel(ad, problem):
     """Reads, losses and the sums of all gradients: what else there is has the sizes of the arrays."""
-    trainer = fitting._Trainer(problem(ad), settings(batch=1000))
+    trainer = loop._Trainer(problem(ad), settings(batch=1000))
     trainer.take_step()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         for _ in range(2):
@@ -659,7 +660,7 @@ def test_the_loss_and_its_gradient(ad):
 
     problem = Linear(ad)
     problem.settings = settings(batch=1000, loss="mse")
-    trainer = fitting._Trainer(problem, problem.settings)
+    trainer = loop._Trainer(problem, problem.settings)
     entries = problem.net.numpy().astype(np.float64)
     seed = dr.opaque(ad.UInt64, 0)
     x = np.array(problem.batch(dr.rng(seed=seed), 1000)[0][0]).astype(np.float64)
@@ -767,7 +768,7 @@ def test_gradients_may_be_shaped_on_their_way(ad):
             def measure(self, net):
                 return {"q": 1.0}
 
-        trainer = fitting._Trainer(Clipped(limit), settings(batch=64))
+        trainer = loop._Trainer(Clipped(limit), settings(batch=64))
         assert float(trainer.take_step()[0]) == pytest.approx(9)
         moments[limit] = np.array(trainer.optimizer.state["data"][3][1]) / 0.1
     x = np.arange(64) / 63

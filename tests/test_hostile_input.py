@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from commands import refused
 
-from mi_diffind.cli import main
-from mi_diffind.errors import DiffindError, UsageError
-from mi_diffind.settings import FitSettings, within_memory
+from mi_diffind.commands.cli import main
+from mi_diffind.core.errors import DiffindError, UsageError
+from mi_diffind.fitting.settings import FitSettings, within_memory
 
 PATHS = ("a" * 300, "a/" * 2500, "a" * 5000)
 
@@ -30,7 +30,7 @@ def test_numbers_beyond_32_bits(tmp_path, capsys, option, value):
 
 def test_a_batch_beyond_memory(tmp_path, capsys, monkeypatch):
     """Dr.Jit ends the process with a segmentation fault where memory cannot be allocated."""
-    monkeypatch.setattr("mi_diffind.units.memory", lambda: 2**34)
+    monkeypatch.setattr("mi_diffind.core.units.memory", lambda: 2**34)
     for task in (["ggx"], ["sdf", "no.ply"]):
         message = refused(capsys, "fit", *task, "-o", str(tmp_path / "a.npz"), "--batch", str(2**31 - 1))
         assert "batch: found 2,147,483,647, which takes about 128 GiB of memory, this machine has 16 GiB" in message
@@ -96,7 +96,11 @@ def test_pipes_and_devices_are_not_read(tmp_path, command, target):
         os.mkfifo(tmp_path / name) if target == "pipe" else os.symlink("/dev/zero", tmp_path / name)
     (tmp_path / "m.json").write_text(json.dumps({"albedo": "PATH.png"}))
     done = subprocess.run(
-        [sys.executable, "-m", "mi_diffind.cli", *words], cwd=tmp_path, capture_output=True, text=True, timeout=100
+        [sys.executable, "-m", "mi_diffind.commands.cli", *words],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=100,
     )
     last = done.stderr.strip().splitlines()[-1]
     assert done.returncode == 2 and last.startswith("mi-diffind: error: ") and "Traceback" not in done.stderr

@@ -9,9 +9,10 @@ from drjit.opt import Adam
 from scipy.ndimage import map_coordinates
 from variants import BACKENDS
 
-from mi_diffind import DifferentiableArray, Indirection, fold, lookup
-from mi_diffind.indirection import ramp, unfolded
-from mi_diffind.runtime import array_module
+from mi_diffind import DifferentiableArray, Indirection, fold
+from mi_diffind.arrays import lookup
+from mi_diffind.arrays.indirection import ramp, unfolded
+from mi_diffind.core.runtime import array_module
 
 BELOW_ONE = np.float32(1) - np.float32(2**-23)
 

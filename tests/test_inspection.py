@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 import mi_diffind
-from mi_diffind.cli import main
-from mi_diffind.errors import UsageError
-from mi_diffind.units import labelled
+from mi_diffind.commands.cli import main
+from mi_diffind.core.errors import UsageError
+from mi_diffind.core.units import labelled
 
 ASSETS = Path(__file__).resolve().parents[1] / "scenes" / "assets"
 SENSOR = {"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8}}

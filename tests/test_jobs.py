@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 import worker_jobs
 
-from mi_diffind import jobs
-from mi_diffind.errors import UsageError
-from mi_diffind.jobs import run_jobs
+from mi_diffind.core import jobs
+from mi_diffind.core.errors import UsageError
+from mi_diffind.core.jobs import run_jobs
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="the kernel ends such a process on Linux only")
 
@@ -77,7 +77,7 @@ def test_processes_are_interrupted(tmp_path):
 def test_processes_end_with_the_one_that_began_them(tmp_path, job):
     file = tmp_path / "process"
     code = (
-        f"import sys; sys.path[:] = {sys.path}; import worker_jobs; from mi_diffind.jobs import run_jobs\n"
+        f"import sys; sys.path[:] = {sys.path}; import worker_jobs; from mi_diffind.core.jobs import run_jobs\n"
         f"list(run_jobs(worker_jobs.{job}, {{'a': {str(file)!r}}}, 1))"
     )
     parent = subprocess.Popen([sys.executable, "-c", code])

@@ -16,20 +16,20 @@ import numpy as np
 import pytest
 
 from mi_diffind import DiffindError, TableError, load_table, save_table
-from mi_diffind.archives import ArchiveError, read_arrays
-from mi_diffind.errors import LONGEST_MESSAGE, UsageError
-from mi_diffind.files import PATHS, OutputError
-from mi_diffind.fitting import checkpoint_settings
-from mi_diffind.inspection import Inspection
-from mi_diffind.limits import FACTOR, FREE, VARIABLE, Allowance, LimitError, allowed, json_bytes
+from mi_diffind.arrays.tables import StoredArray, Table, byte_array
+from mi_diffind.core.archives import ArchiveError, read_arrays
+from mi_diffind.core.errors import LONGEST_MESSAGE, UsageError
+from mi_diffind.core.files import PATHS, OutputError
+from mi_diffind.core.limits import FACTOR, FREE, VARIABLE, Allowance, LimitError, allowed, json_bytes
+from mi_diffind.core.units import labelled
+from mi_diffind.fitting.loop import checkpoint_settings
+from mi_diffind.images.headers import picture_size
 from mi_diffind.maps.compressed import map_figure
 from mi_diffind.maps.source import SourceError, from_arrays, load_source
-from mi_diffind.picture_sizes import picture_size
-from mi_diffind.tables import StoredArray, Table, byte_array
+from mi_diffind.scenes.inspection import Inspection
 from mi_diffind.tasks.radiance import ans, files, node_codes
 from mi_diffind.tasks.radiance.image_files import ViewsError, image_file, read_image
 from mi_diffind.tasks.sdf.mesh import MeshError, load_mesh, make_mesh
-from mi_diffind.units import labelled
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -12,8 +12,9 @@ from arrays import aligned
 from scipy.interpolate import RegularGridInterpolator
 from variants import BACKENDS
 
-from mi_diffind import DifferentiableArray, lookup
-from mi_diffind.runtime import array_module
+from mi_diffind import DifferentiableArray
+from mi_diffind.arrays import lookup
+from mi_diffind.core.runtime import array_module
 
 CHANNELS = (1, 2, 3, 4, 7, 12)
 RESOLUTION = (5, 4, 6, 3)
@@ -400,7 +401,7 @@ def test_gathers():
 
 def test_gathers_that_the_kernel_makes():
     """
-    The kernel really contains as many gathers as :func:`mi_diffind.lookup.gathers` says for bytes: a word each.
+    The kernel really contains as many gathers as :func:`mi_diffind.arrays.lookup.gathers` says for bytes: a word each.
     """
     ad = array_module("llvm")
     large = (600, 600)
@@ -511,7 +512,7 @@ def test_few_bits_take_that_memory(ad, bits):
 
 
 def test_gathers_of_few_bits_that_the_kernel_makes():
-    """Those of two pairs of neighbours, no more than of single entries, as :func:`mi_diffind.lookup.gathers` says."""
+    """Those of two pairs of neighbours, no more than of single entries, as :func:`.gathers` says."""
     ad = array_module("llvm")
     for bits, channels, words, pair in (
         (4, 4, 1, 2),

@@ -4,7 +4,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from mi_diffind import memory
+from mi_diffind.core import memory
 
 
 @pytest.mark.parametrize("name", ["Float", "UInt32"])

@@ -16,7 +16,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from mi_diffind import mitsuba_versions
+from mi_diffind.core import mitsuba_versions
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -46,7 +46,7 @@ def load_entry_points():
     for name in kinds:
         setattr(mi, name, functions[name])
     # Functions that register differ from variant to variant; from now on, count where all are called
-    versions = sys.modules["mi_diffind.mitsuba_versions"]
+    versions = sys.modules["mi_diffind.core.mitsuba_versions"]
     versions.register = counted(versions.register)
 
 for variant in sys.argv[2:] * 2:
@@ -69,17 +69,17 @@ print(json.dumps({"before": before, "results": results, "classes": len(classes),
 def test_declared_entry_point():
     """The one that Mitsuba finds in an installation; a checkout that is not installed has ``pyproject.toml`` only."""
     text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
-    assert '[project.entry-points.mitsuba]\nmi_diffind = "mi_diffind.mitsuba_entry"\n' in text
+    assert '[project.entry-points.mitsuba]\nmi_diffind = "mi_diffind.plugins.mitsuba_entry"\n' in text
     for entry in importlib.metadata.entry_points(group="mitsuba"):
         if entry.name == "mi_diffind":
-            assert entry.value == "mi_diffind.mitsuba_entry"
+            assert entry.value == "mi_diffind.plugins.mitsuba_entry"
 
 
 def test_entry_point_in_three_variants():
     """Imported once, loaded anew after each change, six changes: every plugin is registered once in each variant."""
     variants = ["llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono"]
     done = subprocess.run(
-        [sys.executable, "-W", "error::UserWarning", "-c", LOADER, "mi_diffind.mitsuba_entry", *variants],
+        [sys.executable, "-W", "error::UserWarning", "-c", LOADER, "mi_diffind.plugins.mitsuba_entry", *variants],
         capture_output=True, text=True, cwd=ROOT,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

@@ -10,7 +10,7 @@ import pytest
 from film_files import decoded, needs_ffmpeg
 from PIL import Image
 
-from mi_diffind import cli
+from mi_diffind.commands import cli
 
 SCENE = """
 <scene version="3.0.0">
@@ -44,9 +44,9 @@ def place_of(image, channel):
 
 def test_the_camera_goes_around(mi_rgb, path):
     """Two spheres about the axis: after half a turn, the far one is the near one; a quarter shows both."""
-    from mi_diffind import orbit, scenes
+    from mi_diffind.scenes import loading, orbit
 
-    scene = scenes.load(path)
+    scene = loading.load(path)
     assert orbit.middle(scene) == pytest.approx([1, 0, 2])  # the light is none of it
     frames = orbit.orbit(scene, 4)
     assert len(frames) == 4 and frames[0].shape == (24, 32, 4)
@@ -57,24 +57,24 @@ def test_the_camera_goes_around(mi_rgb, path):
     assert place_of(frames[3], 0)[0] > 3 and place_of(frames[3], 2)[0] < -3
     # The colours change places, nothing else does
     assert np.abs(frames[0][..., 3] - frames[2][..., 3]).mean() < 0.02
-    again = scenes.render(scene, 8)[0]
+    again = loading.render(scene, 8)[0]
     assert np.abs(again - frames[0]).max() < 1e-6  # the camera is where it was
 
 
 def test_random_numbers_of_frames(mi_rgb, path):
     """Frames of one view have the same noise, or that of the seeds that follow each other."""
-    from mi_diffind import orbit, scenes
+    from mi_diffind.scenes import loading, orbit
 
-    scene, still = scenes.load(path), [np.eye(4)] * 2
+    scene, still = loading.load(path), [np.eye(4)] * 2
     same, new = (orbit.along(scene, still, 4, 7, new_seeds=new_seeds) for new_seeds in (False, True))
     assert np.array_equal(same[0], same[1]) and np.array_equal(same[0], new[0])
-    assert np.array_equal(new[1], scenes.render(scene, 4, 8)[0]) and not np.array_equal(new[0], new[1])
+    assert np.array_equal(new[1], loading.render(scene, 4, 8)[0]) and not np.array_equal(new[0], new[1])
 
 
 @pytest.mark.parametrize(("views", "test"), [(8, 3), (5, 5), (4, 1)])
 def test_views_that_are_held_out_lie_between_the_others(views, test):
     """Halfway in azimuth between two neighbours, and as many steps of the orbit from each other, to one."""
-    from mi_diffind.poses import orbit_directions
+    from mi_diffind.scenes.poses import orbit_directions
 
     trained, held_out = orbit_directions(views, test, 0.1, 0.7)
     steps = np.degrees(np.arctan2(held_out[:, 1], held_out[:, 0])) % 360 / (360 / views)
@@ -89,7 +89,7 @@ def test_views_that_are_held_out_lie_between_the_others(views, test):
 @pytest.mark.parametrize("aside", [0, 3e-7, 1e-3])
 def test_cameras_that_look_straight_down(aside):
     """The pose is a rotation and looks at its target, also where the way up is next to the line of sight."""
-    from mi_diffind.poses import pose
+    from mi_diffind.scenes.poses import pose
 
     origin = np.array([aside, 0, 2])
     turn = pose(origin, np.zeros(3), (0, 0, 1))[:3, :3]
@@ -119,7 +119,8 @@ def test_films_and_strips(mi_rgb, path, tmp_path, capsys):
 @needs_ffmpeg
 def test_an_orbit_as_h264(mi_rgb, path, tmp_path, capsys):
     """The frames of the decoded film are those of the orbit, in front of black, and each is nearest to its own."""
-    from mi_diffind import films, orbit, scenes
+    from mi_diffind.images import films
+    from mi_diffind.scenes import loading, orbit
 
     film = tmp_path / "film.mp4"
     options = ("--orbit", "4", "--spp", "64", "-o", str(film))
@@ -129,7 +130,7 @@ def test_an_orbit_as_h264(mi_rgb, path, tmp_path, capsys):
     assert "film.mp4: 4 frames of 31 x 24, 64 spp" in out and "even width and height" in out
     frames = decoded(film)
     assert frames.shape == (4, 24, 32, 3)
-    expected = orbit.orbit(scenes.load(path), 4, spp=64)
+    expected = orbit.orbit(loading.load(path), 4, spp=64)
     shown = np.stack([films.displayed(frame[..., :3]) for frame in expected])
     errors = np.square(frames[:, None, :, :31].astype(float) - shown[None]).mean(axis=(2, 3, 4))
     assert (10 * np.log10(255**2 / np.diag(errors)) > 30).all()
@@ -142,7 +143,7 @@ def test_an_orbit_as_h264(mi_rgb, path, tmp_path, capsys):
 
 
 def test_an_interrupted_orbit_keeps_its_frames(mi_rgb, path, tmp_path, monkeypatch, capsys):
-    from mi_diffind import rendering
+    from mi_diffind.scenes import rendering
 
     stop = threading.Event()
     stop.set()
@@ -165,7 +166,7 @@ def test_what_is_refused(mi_rgb, path, tmp_path, capsys):
 
 
 def test_h264_is_refused_before_frames_are_rendered(mi_rgb, path, tmp_path, monkeypatch, capsys):
-    from mi_diffind import orbit
+    from mi_diffind.scenes import orbit
 
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)  # as if it were not installed
     monkeypatch.setattr(orbit, "along", lambda *_, **__: pytest.fail("rendered"))
@@ -175,7 +176,7 @@ def test_h264_is_refused_before_frames_are_rendered(mi_rgb, path, tmp_path, monk
 
 
 def test_a_rotation_leaves_its_axis_in_place():
-    from mi_diffind.poses import rotation
+    from mi_diffind.scenes.poses import rotation
 
     matrix = rotation((0, 1, 0), 90, (1, 2, 3))
     assert matrix @ [1, 7, 3, 1] == pytest.approx([1, 7, 3, 1])

@@ -10,12 +10,20 @@ from arrays import aligned
 from scipy.ndimage import map_coordinates
 from variants import BACKENDS
 
-from mi_diffind.indirection import DifferentiableArray, Indirection, unfolded
+from mi_diffind.arrays.indirection import DifferentiableArray, Indirection, unfolded
+from mi_diffind.arrays.pages import (
+    PagedArray,
+    page_counts,
+    page_entries,
+    page_gain,
+    page_positions,
+    page_shift,
+    page_sizes,
+)
+from mi_diffind.arrays.tables import PAGES, TableError, gathers_of, load_table, save_table
+from mi_diffind.core.runtime import array_module
+from mi_diffind.fitting.task import FitRequest
 from mi_diffind.maps.source import from_arrays
-from mi_diffind.pages import PagedArray, page_counts, page_entries, page_gain, page_positions, page_shift, page_sizes
-from mi_diffind.runtime import array_module
-from mi_diffind.tables import PAGES, TableError, gathers_of, load_table, save_table
-from mi_diffind.task import FitRequest
 from mi_diffind.tasks.image import TASK, presets, search, training
 from mi_diffind.tasks.image.compressed import CompressedImage
 

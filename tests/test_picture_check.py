@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mi_diffind import picture_check, scenes
+from mi_diffind.scenes import loading, picture_check
 
 SCENE = """<scene version="3.0.0"><integrator type="direct"/>
     <sensor type="perspective"><float name="fov" value="60"/><transform name="to_world">
@@ -16,7 +16,7 @@ SCENE = """<scene version="3.0.0"><integrator type="direct"/>
 
 
 def load(width=64, light=1.0, patch=0.5):
-    return scenes.load_string(
+    return loading.load_string(
         SCENE.replace("WIDTH", f"{width}").replace("LIGHT", f"{light}").replace("PATCH", f"{patch}")
     )
 
@@ -52,7 +52,7 @@ def test_large_pictures_and_numbers_that_are_not_finite(same, monkeypatch):
     """Films are rendered with at most 128 pixels a side, and keep their size; a pixel that became NaN is said."""
     large = load(width=640)
     check = picture_check.check_picture(large, large)
-    assert (check.width, check.height) == (128, 10) and scenes.film_size(large) == (640, 48)
+    assert (check.width, check.height) == (128, 10) and loading.film_size(large) == (640, 48)
     passes = picture_check._passes
 
     def broken(scene, first):

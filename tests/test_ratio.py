@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from mi_diffind.errors import UsageError
-from mi_diffind.settings import FitSettings
-from mi_diffind.task import FitRequest, tasks
+from mi_diffind.core.errors import UsageError
+from mi_diffind.fitting.settings import FitSettings
+from mi_diffind.fitting.task import FitRequest, tasks
 from mi_diffind.tasks.image import memory_budget as image_budget
 from mi_diffind.tasks.radiance import fit as field_fit
 from mi_diffind.tasks.radiance.presets import dense_bytes

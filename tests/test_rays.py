@@ -3,8 +3,8 @@
 import drjit as dr
 import numpy as np
 
-from mi_diffind.rays import box_interval, is_direction
-from mi_diffind.runtime import array_module
+from mi_diffind.arrays.boxes import box_interval, is_direction
+from mi_diffind.core.runtime import array_module
 
 
 def test_box_interval(rng):

@@ -13,8 +13,8 @@ import pytest
 from commands import refused
 from variants import set_variant
 
-from mi_diffind import reference_files
-from mi_diffind.cli import main
+from mi_diffind.commands.cli import main
+from mi_diffind.scenes import reference_files
 
 TESTS = Path(__file__).resolve().parent
 SCENES = TESTS.parent / "scenes"
@@ -29,7 +29,7 @@ STORED = [
 
 @pytest.fixture
 def regress(mi_rgb):
-    from mi_diffind import regression as regress
+    from mi_diffind.scenes import regression as regress
 
     return regress
 
@@ -131,7 +131,7 @@ SLOW = {
 def test_scene_renders_as_its_reference(path, variant):
     """If a change is meant, render the references again: scenes/README.md says how."""
     set_variant(variant)
-    from mi_diffind import regression as regress
+    from mi_diffind.scenes import regression as regress
 
     result = regress.regress(path, progress=False).figures
     assert result["passed"], result

@@ -18,9 +18,9 @@ import pytest
 from commands import refused
 
 import mi_diffind
-from mi_diffind import downloads
-from mi_diffind.cli import main
-from mi_diffind.errors import UsageError
+from mi_diffind.commands.cli import main
+from mi_diffind.core.errors import UsageError
+from mi_diffind.scenes import downloads
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -232,7 +232,9 @@ def test_wheel(tmp_path):
     zipfile.ZipFile(wheel).extractall(installed)
     empty = tmp_path / "empty"
     empty.mkdir()
-    code = "import sys; sys.path.insert(0, sys.argv.pop(1)); import mi_diffind; from mi_diffind.cli import main\n"
+    code = (
+        "import sys; sys.path.insert(0, sys.argv.pop(1)); import mi_diffind; from mi_diffind.commands.cli import main\n"
+    )
     code += "print(mi_diffind.__file__); sys.exit(main())"
 
     def run(*arguments):
@@ -248,4 +250,4 @@ def test_wheel(tmp_path):
     run("compare", "scenes/materials.xml", "--passes", "2", *small)
     assert (empty / "out" / "comparison.png").stat().st_size > 1000
     points = (installed / f"mi_diffind-{mi_diffind.__version__}.dist-info" / "entry_points.txt").read_text()
-    assert "[mitsuba]\nmi_diffind = mi_diffind.mitsuba_entry" in points
+    assert "[mitsuba]\nmi_diffind = mi_diffind.plugins.mitsuba_entry" in points

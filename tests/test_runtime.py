@@ -14,9 +14,9 @@ from pathlib import Path
 import drjit as dr
 import pytest
 
-from mi_diffind import runtime, threads
-from mi_diffind.errors import DiffindError, UsageError
-from mi_diffind.runtime import ENV, MIN_LLVM, choose_llvm, library_version, system_libraries
+from mi_diffind.core import runtime, threads
+from mi_diffind.core.errors import DiffindError, UsageError
+from mi_diffind.core.runtime import ENV, MIN_LLVM, choose_llvm, library_version, system_libraries
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -236,7 +236,7 @@ before = set(sys.meta_path)
 import mi_diffind
 assert not {"drjit", "mitsuba", "numpy"} & set(sys.modules), sorted(sys.modules)
 assert len(set(sys.meta_path) - before) == 1
-assert mi_diffind.runtime.llvm_problem() is None
+assert mi_diffind.core.runtime.llvm_problem() is None
 """
 
 
@@ -250,8 +250,8 @@ def test_each_import_is_met_once():
     code = f"""{LIGHT}
 import importlib.util
 chosen = []
-original = mi_diffind.runtime.choose_llvm
-mi_diffind.runtime.choose_llvm = lambda *a: chosen.append(a) or original(*a)
+original = mi_diffind.core.runtime.choose_llvm
+mi_diffind.core.runtime.choose_llvm = lambda *a: chosen.append(a) or original(*a)
 registered = []
 sys.modules["mi_diffind.plugins"] = plugins = type(sys)("mi_diffind.plugins")
 plugins.install = lambda: registered.append(1)
@@ -364,7 +364,7 @@ def test_an_unusable_explicit_library_never_aborts(which, first, tmp_path, reque
     code = f"""
 {first}import mi_diffind, mitsuba as mi, os, numpy, drjit.llvm.ad
 assert os.environ["{ENV}"] == {path!r}
-assert "karellen" in mi_diffind.runtime.llvm_problem()
+assert "karellen" in mi_diffind.core.runtime.llvm_problem()
 mi.set_variant("scalar_rgb")
 print("went on")
 try:
@@ -374,7 +374,7 @@ except Exception as e:
 else:
     print("computed")
 for name, use in {{
-    "array_module": lambda: mi_diffind.runtime.array_module("llvm"),
+    "array_module": lambda: mi_diffind.core.runtime.array_module("llvm"),
     "alloc": lambda: mi_diffind.DifferentiableArray((4, 4), 3).alloc(drjit.llvm.ad.TensorXf),
     "from_numpy": lambda: mi_diffind.DifferentiableArray.from_numpy(
         numpy.zeros((4, 1)), drjit.llvm.ad.TensorXf, storage="uint8"),

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mi_diffind import conversion, scene_text, scenes
+from mi_diffind.scenes import conversion, loading, scene_text
 
 HEAD = '<scene version="3.0.0">'
 
@@ -58,7 +58,7 @@ def test_transforms_of_all_sizes(mi_rgb, tmp_path):
         uv = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.diag([scale, 2, 1])
         matrices += [world, uv]
     written(tmp_path / "scene.xml", f"{HEAD}{''.join(objects)}</scene>", tmp_path / "new.xml")
-    parsed = scenes.ParsedScene(tmp_path / "new.xml")
+    parsed = loading.ParsedScene(tmp_path / "new.xml")
     found = parsed.change(lambda s: [n.props[k] for n in s.nodes for k in ("to_world", "to_uv") if k in n.props])
     assert len(found) == len(matrices) == 72
     for transform, matrix in zip(found, matrices, strict=True):
@@ -84,7 +84,7 @@ def test_ids_aliases_references_and_both_sides(mi_rgb, tmp_path):
 </scene>"""
     new = written(tmp_path / "scene.xml", text, tmp_path / "new.xml")
     assert new == text.replace('<bsdf type="principled" id="back"', '<bsdf type="neural_disney" id="back"')
-    a, b = (scenes.load_file(tmp_path / f, optimize=False) for f in ("scene.xml", "new.xml"))
+    a, b = (loading.load_file(tmp_path / f, optimize=False) for f in ("scene.xml", "new.xml"))
     assert [shape.id() for shape in a.shapes()] == [shape.id() for shape in b.shapes()]
     assert [str(shape.bsdf()) for shape in a.shapes()[:2]] == [str(shape.bsdf()) for shape in b.shapes()[:2]]
     keys, back = [set(mi_rgb.traverse(scene).keys()) for scene in (a, b)], "sheet.bsdf.brdf_1"
@@ -151,7 +151,7 @@ def test_values_of_defines_become_defaults(mi_rgb, folders):
     body += '<float name="metallic" value="$m"/></bsdf>'
     new = written(a / "scene.xml", f"{HEAD}{body}</scene>", b / "new.xml", rough=0.1, m="0.25")
     assert re.findall(r'<default name="(\w+)" value="([\d.]+)"/>', new) == [("m", "0.25"), ("rough", "0.1")]
-    read = scenes.ParsedScene(b / "new.xml", {"rough": 0.7}).change(lambda s: s.nodes[1].props)
+    read = loading.ParsedScene(b / "new.xml", {"rough": 0.7}).change(lambda s: s.nodes[1].props)
     assert (read.plugin_name(), read["roughness"], read["metallic"]) == ("neural_disney", 0.7, 0.25)
 
 
@@ -163,7 +163,7 @@ def test_encodings(mi_rgb, tmp_path, encoding):
     source, new = tmp_path / "scene.xml", tmp_path / "new.xml"
     source.write_bytes(("\ufeff" * (encoding == "utf-16-le") + head + text).encode(encoding))
     if encoding == "latin-1":
-        with pytest.raises(scenes.SceneError, match=r"scene\.xml: found text in another encoding, needed is UTF-8"):
+        with pytest.raises(loading.SceneError, match=r"scene\.xml: found text in another encoding, needed is UTF-8"):
             conversion.convert(source, new, learn=["principled"], check=False)
         assert not new.exists()
         return
@@ -202,7 +202,7 @@ def test_a_text_that_reads_differently_is_not_written(mi_rgb, folders, monkeypat
         return content.replace(*damage)
 
     monkeypatch.setattr(conversion, "edited_text", wrong)
-    with pytest.raises(scenes.SceneError, match=fault):
+    with pytest.raises(loading.SceneError, match=fault):
         conversion.convert(a / "scene.xml", a / "new.xml", learn=["principled"], check=False)
     assert set(a.iterdir()) == before
 
@@ -216,7 +216,7 @@ def test_a_text_that_reads_differently_is_not_written(mi_rgb, folders, monkeypat
 )
 def test_scenes_that_cannot_be_written(mi_rgb, folders, body, fault):
     a, _ = folders
-    with pytest.raises(scenes.SceneError, match=fault):
+    with pytest.raises(loading.SceneError, match=fault):
         written(a / "scene.xml", f"{HEAD}{body}</scene>", a / "new.xml")
     assert not (a / "new.xml").exists()
 
@@ -225,6 +225,6 @@ def test_the_example_scenes(mi_rgb, tmp_path):
     """Each of them, with nothing learned, in another folder: the same objects in Mitsuba's words, but for paths."""
     for source in sorted((Path(__file__).parents[1] / "scenes").glob("*.xml")):
         conversion.convert(source, tmp_path / source.name, learn=[])
-        states = [scenes.ParsedScene(path).change(scene_text.with_paths) for path in (source, tmp_path / source.name)]
+        states = [loading.ParsedScene(path).change(scene_text.with_paths) for path in (source, tmp_path / source.name)]
         lines = [re.sub(r"object_\d+", "", "\n".join(str(node.props) for node in state.nodes)) for state in states]
         assert lines[0] == lines[1] and lines[0].count("\n") > 20

@@ -13,24 +13,27 @@ from shading_scenes import fitted, material, scene_file
 from variants import warnings_of
 
 import mi_diffind
-from mi_diffind import scenes
-from mi_diffind.arguments import add_arguments
-from mi_diffind.compat import use_threads, was_compiled
-from mi_diffind.deadline import Deadline
-from mi_diffind.errors import UsageError
-from mi_diffind.files import OutputError
+from mi_diffind.arrays.tables import TableError, load_table, save_table
+from mi_diffind.core.arguments import add_arguments
+from mi_diffind.core.compat import use_threads, was_compiled
+from mi_diffind.core.deadline import Deadline
+from mi_diffind.core.errors import UsageError
+from mi_diffind.core.files import OutputError
+from mi_diffind.core.runtime import array_module
+from mi_diffind.fitting.settings import FitSettings
+from mi_diffind.fitting.task import FitRequest
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import load_source
 from mi_diffind.plugins.support import footprint
-from mi_diffind.runtime import array_module
-from mi_diffind.scene_training import recipe as scene_recipe
-from mi_diffind.scene_training import reference_renders
-from mi_diffind.scene_training.fit import fit_scene, joined, limit
-from mi_diffind.scene_training.problem import SceneProblem, exposure_of
-from mi_diffind.scene_training.recipe import SCENE_ARGUMENTS, SceneRecipe
-from mi_diffind.scene_training.reference_renders import ReferenceRenders
-from mi_diffind.scene_training.rig import Rig
-from mi_diffind.scene_training.stored_texture import (
+from mi_diffind.scenes import loading
+from mi_diffind.scenes.training import recipe as scene_recipe
+from mi_diffind.scenes.training import reference_renders
+from mi_diffind.scenes.training.fit import fit_scene, joined, limit
+from mi_diffind.scenes.training.problem import SceneProblem, exposure_of
+from mi_diffind.scenes.training.recipe import SCENE_ARGUMENTS, SceneRecipe
+from mi_diffind.scenes.training.reference_renders import ReferenceRenders
+from mi_diffind.scenes.training.rig import Rig
+from mi_diffind.scenes.training.stored_texture import (
     budget_of,
     recipe_of,
     stored_textures,
@@ -38,11 +41,8 @@ from mi_diffind.scene_training.stored_texture import (
     texture_files,
     texture_problem,
 )
-from mi_diffind.scene_training.trained_scene import TrainedScene
-from mi_diffind.scene_training.views import View, ViewDistribution, views_of
-from mi_diffind.settings import FitSettings
-from mi_diffind.tables import TableError, load_table, save_table
-from mi_diffind.task import FitRequest
+from mi_diffind.scenes.training.trained_scene import TrainedScene
+from mi_diffind.scenes.training.views import View, ViewDistribution, views_of
 from mi_diffind.tasks.texture.compressed import CompressedTexture, load, to_table
 from mi_diffind.tasks.texture.memory_budget import PaperBudget, TextureBudget, parse_structure
 from mi_diffind.tasks.texture.presets import PRESETS
@@ -81,7 +81,7 @@ def path(folder):
 @pytest.fixture(scope="module")
 def trained(folder, path):
     """The scene with its arrays as parameters, and the problem of the texture."""
-    parsed = scenes.ParsedScene(path)
+    parsed = loading.ParsedScene(path)
     file, _ = texture_file(parsed)
     table = load(file)
     problem = texture_problem(table, load_source(folder / "material.json"))
@@ -318,14 +318,14 @@ def test_a_camera_in_a_box_looks_at_the_target():
 
 def test_rigs_that_cannot_be():
     turn = ViewDistribution(light_azimuth=(0, 90))
-    with pytest.raises(scenes.SceneError, match=r"light_azimuth: no light .* \(ConstantBackgroundEmitter\)"):
+    with pytest.raises(loading.SceneError, match=r"light_azimuth: no light .* \(ConstantBackgroundEmitter\)"):
         Rig(lit("ambient"), turn)
     raised = dataclasses.replace(turn, light_elevation=(0, 9))
     for name in ("sky", "noon"):
-        with pytest.raises(scenes.SceneError, match="light_elevation: no light"):
+        with pytest.raises(loading.SceneError, match="light_elevation: no light"):
             Rig(lit(name), raised)
     Rig(lit("sky"), turn)
-    with pytest.raises(scenes.SceneError, match="target: not given, and the middle"):
+    with pytest.raises(loading.SceneError, match="target: not given, and the middle"):
         Rig(lit("sky"), ViewDistribution(azimuth=(0, 9)))
 
 
@@ -337,13 +337,13 @@ FOUR = 4 * 24 * 24
 
 def references_of(path, *arguments, **options):
     """References of a scene file, without a progress bar."""
-    return ReferenceRenders(scenes.ParsedScene(path), *arguments, progress=False, **options)
+    return ReferenceRenders(loading.ParsedScene(path), *arguments, progress=False, **options)
 
 
 @pytest.fixture
 def passes(monkeypatch):
     """Seeds of the rendered passes, of which one can be made to fail."""
-    render, seeds = scenes.render_pass, []
+    render, seeds = loading.render_pass, []
 
     def counted(scene, spp, seed):
         seeds.append(seed)
@@ -352,7 +352,7 @@ def passes(monkeypatch):
         return render(scene, spp, seed)
 
     counted.stop, counted.seeds = 0, seeds
-    monkeypatch.setattr(scenes, "render_pass", counted)
+    monkeypatch.setattr(loading, "render_pass", counted)
     return counted
 
 
@@ -420,7 +420,7 @@ def test_references_go_on_after_an_interruption(path, tmp_path, passes):
 def test_references_are_the_exact_scene(path, passes):
     """Against the scene rendered as it is written, in the view that it has."""
     image = references_of(path, ViewDistribution(), 64).images([View()])[0]
-    expected = mi.render(scenes.load(path, exact=True), spp=64, seed=9).numpy()
+    expected = mi.render(loading.load(path, exact=True), spp=64, seed=9).numpy()
     assert np.abs(image - expected).mean() < 0.05 * expected.mean() and not np.array_equal(image, expected)
 
 
@@ -431,8 +431,8 @@ def test_only_colours_count(path):
     image, expected = (references_of(p, ViewDistribution(), 16).images([View()])[0] for p in (with_alpha, path))
     assert image.shape == (24, 24, 3)
     assert np.abs(image - expected).mean() < 0.1 * expected.mean()
-    assert scenes.colour_channels(mi.TensorXf(np.zeros((2, 2, 4)))).shape == (2, 2, 3)
-    assert scenes.colour_channels(np.zeros((2, 2, 2))).shape == (2, 2, 1)
+    assert loading.colour_channels(mi.TensorXf(np.zeros((2, 2, 4)))).shape == (2, 2, 3)
+    assert loading.colour_channels(np.zeros((2, 2, 2))).shape == (2, 2, 1)
 
 
 def test_a_folder_for_references_that_cannot_be(path, tmp_path):
@@ -446,7 +446,7 @@ def test_a_scene_may_be_a_dictionary(folder, trained):
     texture = {"type": "neural_texture", "filename": str(file), "channels": "albedo"}
     floor = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": texture}}
     scene = {"type": "scene", "integrator": {"type": "path"}, "sensor": {"type": "perspective"}, "floor": floor}
-    parsed = scenes.ParsedScene(scene)
+    parsed = loading.ParsedScene(scene)
     assert texture_file(parsed) == (file, "")
     assert TrainedScene(parsed, {file: load(file)}, ViewDistribution(), 1).keys.keys() == trained[0].keys.keys()
 
@@ -482,7 +482,7 @@ def test_renders_that_fit_into_a_limited_time(monkeypatch, seconds, compiling, k
         start = clock.now
         return work(), clock.now - start, [{}, {"backend_time": 1e3 * compiling, "operation_count": 20_000}]
 
-    monkeypatch.setattr("mi_diffind.scene_training.fit.profiled", profiled)
+    monkeypatch.setattr("mi_diffind.scenes.training.fit.profiled", profiled)
     problem = Timed(clock)
     request = FitRequest("ours", problem.recipe.settings, None, deadline=Deadline(seconds))
     sentence, figures = limit(problem, request, known)
@@ -508,7 +508,7 @@ def test_a_scene_is_trained(folder, tmp_path, monkeypatch):
     table.arrays["cascaded"] = dataclasses.replace(entries, entries=255 - entries.entries)
     save_table(tmp_path / "material.npz", table)
     scene = scene_file(tmp_path / "material.npz", NAMES)
-    parsed = scenes.ParsedScene(scene)
+    parsed = loading.ParsedScene(scene)
     recipe = SceneRecipe(share=1.0, reference_spp=16, samples=1)
     changed = {"steps": 12, "measure_every": 6, "batch": 2048, "lr": 0.1, "schedule": "constant"}
     recipe = dataclasses.replace(recipe, settings=dataclasses.replace(recipe.settings, **changed))
@@ -560,7 +560,7 @@ def test_a_scene_is_trained(folder, tmp_path, monkeypatch):
     }
     # The scene that names it looks as was measured
     (tmp_path / "after.xml").write_text(scene.read_text().replace("material.npz", "trained.npz"))
-    plain, view = scenes.load(tmp_path / "after.xml"), ORBIT.measured()[0]
+    plain, view = loading.load(tmp_path / "after.xml"), ORBIT.measured()[0]
     own = {"without": (tmp_path / "material.npz",), "inputs": (found.settings["source"],)}
     references = references_of(scene, ORBIT, 16, tmp_path / "kept", **own)
     (truth,) = references.images([view])
@@ -586,7 +586,7 @@ def test_the_scene_reads_what_it_is_given(path, trained):
     """Against the scene as it is written, which reads bytes; also from another view, with its footprints."""
     scene, problem = trained
     scene.hold(rounded(problem.net))
-    plain = scenes.load(path)
+    plain = loading.load(path)
     rig = Rig(plain, ORBIT)
     for view in (View(), ORBIT.trained()[1]):
         scene.place(view)
@@ -607,8 +607,8 @@ def test_the_scene_reads_what_it_is_given(path, trained):
 
 def test_no_other_scene_reads_the_same_arrays(path, trained):
     scene, problem = trained
-    other = scenes.load(path, change=lambda state: [
-        props.__setitem__("storage", "float32") for props in scenes.compat.properties_of(state)
+    other = loading.load(path, change=lambda state: [
+        props.__setitem__("storage", "float32") for props in loading.compat.properties_of(state)
         if props.plugin_name() == "neural_texture"
     ])  # fmt: skip
     key = next(key for key in mi.traverse(other).keys() if key.endswith("tables.coarse"))
@@ -656,7 +656,7 @@ def test_small_films_are_rendered_with_more_samples(trained, monkeypatch):
 def test_values_and_derivatives_have_their_own_samples(trained, weights):
     scene, problem = trained
     scene.place(View())
-    (bsdf,) = (made for made in scenes.instances(scene.scene) if hasattr(made, "decoder"))
+    (bsdf,) = (made for made in loading.instances(scene.scene) if hasattr(made, "decoder"))
     tables = {name: array.codes() for name, array in bsdf._arrays().items()}
     (a, da), (b, db), (c, dc) = (
         rendered(scene, inside(problem.net), weights, *seeds) for seeds in ((1, 2), (1, 3), (5, 2))
@@ -679,7 +679,7 @@ def test_a_material_is_trained_as_its_maps_are(folder, path, trained, weights):
         'name="lobes" value="tables"/></bsdf>', path.read_text(encoding="utf-8"),
     )  # fmt: skip
     (folder / "whole.xml").write_text(text)
-    parsed = scenes.ParsedScene(folder / "whole.xml")
+    parsed = loading.ParsedScene(folder / "whole.xml")
     file, _ = texture_file(parsed)
     whole, (scene, problem) = TrainedScene(parsed, {file: load(file)}, ORBIT, 1), trained
     whole.place(View())
@@ -720,7 +720,7 @@ def test_gradients_against_differences(trained, weights):
 
 
 def test_which_textures(path, folder):
-    parsed = scenes.ParsedScene(path)
+    parsed = loading.ParsedScene(path)
     assert texture_files(parsed) == texture_files(parsed, [folder / "material.npz"]) == {folder / "material.npz": ""}
     with pytest.raises(
         UsageError, match=r"no neural_texture or neural_material reads .*other\.npz, the files are material\.npz"
@@ -729,7 +729,7 @@ def test_which_textures(path, folder):
     plain = folder / "plain.xml"
     plain.write_text('<scene version="3.0.0"><shape type="sphere"/></scene>')
     with pytest.raises(UsageError, match="names no file of neural_texture or neural_material"):
-        texture_files(scenes.ParsedScene(plain))
+        texture_files(loading.ParsedScene(plain))
 
 
 # -- several textures -------------------------------------------------------------------------------------------------
@@ -760,7 +760,7 @@ def test_gradients_of_several_files(pair, weights):
     """Together they are the gradients of one file that both surfaces show."""
     images, gradients = {}, {}
     for b in ("a.npz", "b.npz"):
-        parsed = scenes.ParsedScene(pair, {"b": b})
+        parsed = loading.ParsedScene(pair, {"b": b})
         textures = stored_textures(parsed)
         problem = joined({t.file.name: t.problem for t in textures})
         scene = TrainedScene(parsed, {t.file: t.table for t in textures}, ViewDistribution(), 1)
@@ -888,7 +888,7 @@ def test_a_training_that_gains_nothing_keeps_its_start(folder, path):
     settings = FitSettings(steps=4, batch=64, lr=5.0, measure_every=4, deterministic=True)
     recipe, before = SceneRecipe(reference_spp=4, settings=settings), load(folder / "material.npz")
     request = FitRequest("ours", settings, array_module("llvm"), progress=False)
-    parsed, views = scenes.ParsedScene(path, {"film": 4}), ViewDistribution(1, 1)
+    parsed, views = loading.ParsedScene(path, {"film": 4}), ViewDistribution(1, 1)
     tables, result = fit_scene(parsed, views, recipe, request)
     table = tables["material.npz"]
     assert table.settings["kept_start"] and result.step == 0

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mi_diffind import metrics
+from mi_diffind.images import metrics
 
 SCENES = Path(__file__).resolve().parents[1] / "scenes"
 SMALL = {"width": 96, "height": 56}
@@ -16,7 +16,7 @@ SMALL = {"width": 96, "height": 56}
 @pytest.mark.parametrize("name", [pytest.param("materials", marks=pytest.mark.slow), "still_life"])
 def test_scene_as_written_and_exact(mi_rgb, name):
     """The bound on the approximation: 77.8 and 77.2 dB are reached, FLIP of 0.0010 and 0.0014."""
-    from mi_diffind import comparison
+    from mi_diffind.scenes import comparison
 
     result = comparison.compare(SCENES / f"{name}.xml", spp=32, passes=1, progress=False, defines=SMALL)
     assert np.isfinite(result.written).all() and result.written.min() >= 0
@@ -46,11 +46,11 @@ UNNAMED = """
 
 
 def test_reports_have_the_parameters_of_their_own_node(mi_rgb, tmp_path):
-    from mi_diffind import scenes
+    from mi_diffind.scenes import loading
 
     path = tmp_path / "scene.xml"
     path.write_text(UNNAMED.replace("TILES", str(SCENES / "assets" / "tiles.npz")))
-    found = scenes.reports(scenes.load(path))
+    found = loading.reports(loading.load(path))
     expected = {
         "neural_disney tables": {"roughness": 0.2},
         "neural_disney paper": {"roughness": 0.7, "base_color": "texture"},
@@ -59,7 +59,7 @@ def test_reports_have_the_parameters_of_their_own_node(mi_rgb, tmp_path):
         "neural_ggx tables copper": {"material": "Cu"},
     }
     assert {f"{r['plugin']} {r['preset']} {r['id']}".strip(): r["parameters"] for r in found} == expected
-    assert sorted(map(str, (r["parameters"] for r in scenes.ParsedScene(path).learned_plugins()))) == sorted(
+    assert sorted(map(str, (r["parameters"] for r in loading.ParsedScene(path).learned_plugins()))) == sorted(
         map(str, expected.values())
     )
     (image,) = [r for r in found if r["kind"] == "texture"]
@@ -84,7 +84,7 @@ PAIR = """
 @pytest.mark.parametrize("name", ["disney", "neural_disney"])
 def test_compare_against_principled(mi_rgb, tmp_path, name):
     """Another Fresnel term: a little darker than Mitsuba's model, in every parameter else the same."""
-    from mi_diffind import comparison
+    from mi_diffind.scenes import comparison
 
     path, given = tmp_path / "scene.xml", {"subsurface": 0.8, "clearcoat": 0.5, "eta": 1.4}
     parameters = "".join(f'<float name="{k}" value="{v}"/>' for k, v in given.items())
@@ -121,30 +121,30 @@ def test_compare_against_principled(mi_rgb, tmp_path, name):
     ],
 )
 def test_what_cannot_be_compared(mi_rgb, tmp_path, plugin, parameters, against, sentence):
-    from mi_diffind import comparison, scenes
+    from mi_diffind.scenes import comparison, loading
 
     path = tmp_path / "scene.xml"
     path.write_text(PAIR.replace("PLUGIN", plugin).replace("PARAMETERS", parameters))
-    with pytest.raises(scenes.SceneError) as caught:
+    with pytest.raises(loading.SceneError) as caught:
         comparison.compare(path, spp=1, passes=1, progress=False, against=against)
     assert sentence in str(caught.value)
 
 
 @pytest.mark.parametrize("name", ["materials", "still_life"])
 def test_exact_scene_names_no_learned_plugin(mi_rgb, name):
-    from mi_diffind import scenes
+    from mi_diffind.scenes import loading
 
-    exact = scenes.load(SCENES / f"{name}.xml", exact=True, defines=SMALL)
+    exact = loading.load(SCENES / f"{name}.xml", exact=True, defines=SMALL)
     assert "NeuralDisney" not in str(exact) and "Disney[" in str(exact)
-    written = scenes.load(SCENES / f"{name}.xml", defines=SMALL)
+    written = loading.load(SCENES / f"{name}.xml", defines=SMALL)
     assert "NeuralDisney" in str(written)
 
 
 def test_materials_cover_the_ten_parameters(mi_rgb):
-    from mi_diffind import scenes
+    from mi_diffind.scenes import loading
     from mi_diffind.tasks.disney.model import PARAMETERS
 
-    learned = scenes.ParsedScene(SCENES / "materials.xml").learned_plugins()
+    learned = loading.ParsedScene(SCENES / "materials.xml").learned_plugins()
     for name in PARAMETERS:
         row = [e["parameters"][name] for e in learned if e["id"].rpartition("_")[0] == name]
         assert np.allclose(sorted(row), np.linspace(0, 1, 6), atol=1e-3), name
@@ -163,28 +163,28 @@ def test_scenes_are_what_their_scripts_write(tmp_path, name):
 
 
 def test_same_arguments_same_image(mi_rgb):
-    from mi_diffind import scenes
+    from mi_diffind.scenes import loading
 
-    scene = scenes.load(SCENES / "still_life.xml", defines=SMALL)
-    first, second = (scenes.render(scene, 4, seed=5, passes=2)[0] for _ in range(2))
+    scene = loading.load(SCENES / "still_life.xml", defines=SMALL)
+    first, second = (loading.render(scene, 4, seed=5, passes=2)[0] for _ in range(2))
     assert np.array_equal(first, second)
-    assert not np.array_equal(first, scenes.render(scene, 4, seed=6, passes=2)[0])
+    assert not np.array_equal(first, loading.render(scene, 4, seed=6, passes=2)[0])
 
 
 def test_passes_add_up_to_the_samples(mi_rgb):
     """An average of passes of unequal size is the average of the samples."""
-    from mi_diffind import scenes
+    from mi_diffind.scenes import loading
 
-    scene = scenes.load(SCENES / "still_life.xml", defines=SMALL)
-    image, seconds = scenes.render(scene, 7, passes=3)
+    scene = loading.load(SCENES / "still_life.xml", defines=SMALL)
+    image, seconds = loading.render(scene, 7, passes=3)
     assert len(seconds) == 3
-    converged, _ = scenes.render(scene, 64)
+    converged, _ = loading.render(scene, 64)
     assert abs(image.mean() / converged.mean() - 1) < 0.1
 
 
 def test_samples_that_a_sampler_adds_are_said(mi_rgb, tmp_path, capsys, monkeypatch):
     """By ``render`` and ``compare``: as many as Mitsuba takes."""
-    from mi_diffind import cli
+    from mi_diffind.commands import cli
 
     text = (Path(__file__).parent / "lamp.xml").read_text().replace('type="independent"', 'type="multijitter"')
     (tmp_path / "a.xml").write_text(text)
@@ -235,7 +235,7 @@ def test_metrics():
 
 def test_folders_of_a_scene_are_searched(mi_rgb, tmp_path):
     """``<path>`` counts when the scene is built, not only while it is parsed."""
-    from mi_diffind import scenes
+    from mi_diffind.scenes import loading
 
     (tmp_path / "common" / "textures").mkdir(parents=True)
     mi_rgb.Bitmap(np.full((2, 2, 3), 0.5, np.float32)).write(str(tmp_path / "common" / "textures" / "grey.exr"))
@@ -245,5 +245,5 @@ def test_folders_of_a_scene_are_searched(mi_rgb, tmp_path):
         '<scene version="3.0.0"><path value="../common"/><emitter type="envmap">'
         '<string name="filename" value="textures/grey.exr"/></emitter></scene>'
     )
-    assert len(scenes.load(path).emitters()) == 1
-    assert len(scenes.load_file(path).emitters()) == 1
+    assert len(loading.load(path).emitters()) == 1
+    assert len(loading.load_file(path).emitters()) == 1

@@ -14,7 +14,8 @@ from PIL import Image
 from plugin_examples import names
 
 import mi_diffind
-from mi_diffind import cli, plugins
+from mi_diffind import plugins
+from mi_diffind.commands import cli
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"

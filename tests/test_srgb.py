@@ -4,8 +4,8 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from mi_diffind import srgb
-from mi_diffind.runtime import array_module
+from mi_diffind.core.runtime import array_module
+from mi_diffind.images import srgb
 
 
 def test_numpy():

@@ -12,20 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mi_diffind import (
-    DifferentiableArray,
-    DiffindError,
-    Indirection,
-    StoredArray,
-    TableError,
-    load_table,
-    lookup,
-    save_table,
-    tables,
-)
-from mi_diffind.files import OutputError
-from mi_diffind.runtime import array_module
-from mi_diffind.tables import Table
+from mi_diffind import DifferentiableArray, DiffindError, Indirection, StoredArray, TableError, load_table, save_table
+from mi_diffind.arrays import lookup, tables
+from mi_diffind.arrays.tables import Table
+from mi_diffind.core.files import OutputError
+from mi_diffind.core.runtime import array_module
 
 SHAPES = {"primary.0.data": (4, 5, 2), "cascaded": (3, 3, 7)}
 

@@ -14,14 +14,14 @@ import pytest
 
 import mi_diffind
 from mi_diffind import DifferentiableArray, DiffindError, StoredArray, TableError, load_model, save_table
-from mi_diffind import task as task_module
-from mi_diffind.arguments import Argument
-from mi_diffind.errors import UsageError, reason
-from mi_diffind.fitting import FitSettings, Problem
-from mi_diffind.lookup import STORAGES
-from mi_diffind.runtime import array_module
-from mi_diffind.tables import Table
-from mi_diffind.task import Model, Task, fit, task_of, tasks
+from mi_diffind.arrays.lookup import STORAGES
+from mi_diffind.arrays.tables import Table
+from mi_diffind.core.arguments import Argument
+from mi_diffind.core.errors import UsageError, reason
+from mi_diffind.core.runtime import array_module
+from mi_diffind.fitting import task as task_module
+from mi_diffind.fitting.loop import FitSettings, Problem
+from mi_diffind.fitting.task import Model, Task, fit, task_of, tasks
 
 ROOT = Path(__file__).resolve().parents[1]
 BUILT_IN = ("bsdf", "disney", "field", "ggx", "image", "scene", "sdf", "shading", "texture")

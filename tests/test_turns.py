@@ -3,7 +3,7 @@
 import threading
 
 import mi_diffind as md
-from mi_diffind import turns
+from mi_diffind.core import turns
 
 
 def scene() -> dict:

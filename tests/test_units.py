@@ -5,11 +5,11 @@ import math
 
 import pytest
 
-from mi_diffind import units
-from mi_diffind.errors import UsageError
+from mi_diffind.core import units
+from mi_diffind.core.errors import UsageError
+from mi_diffind.core.units import parse_size
 from mi_diffind.tasks.image import memory_budget
 from mi_diffind.tasks.image.memory_budget import ImageBudget, explain, fit_bytes, paper_search, search
-from mi_diffind.units import parse_size
 
 IMAGES = [(1, 1), (1, 4096), (4096, 1), (7, 5), (64, 64), (100, 100), (333, 1000), (1024, 1024), (4096, 4096)]
 

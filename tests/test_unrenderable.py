@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 from commands import refused
 
-from mi_diffind import metrics, scenes, units
-from mi_diffind.cli import main
-from mi_diffind.errors import UsageError
+from mi_diffind.commands.cli import main
+from mi_diffind.core import units
+from mi_diffind.core.errors import UsageError
+from mi_diffind.images import metrics
+from mi_diffind.scenes import loading
 
 PARTS = {
     "integrator": '<integrator type="path"><integer name="max_depth" value="2"/></integrator>',
@@ -74,22 +76,22 @@ def test_backslashes_in_names_of_files(tmp_path, mi_rgb, plugin):
     mi_rgb.Bitmap(np.full((2, 2, 3), 99, np.uint8)).write(str(tmp_path / "maps" / "a.png"))
     texture = rf'<texture name="reflectance" type="{plugin}"><string name="filename" value="maps\a.png"/></texture>'
     path = scene_file(tmp_path, more=f'<shape type="sphere"><bsdf type="diffuse">{texture}</bsdf></shape>')
-    assert scenes.load_file(path).shapes() and scenes.ParsedScene(path).load().shapes()
-    assert (tmp_path / "maps" / "a.png").resolve() in scenes.ParsedScene(path).files()
+    assert loading.load_file(path).shapes() and loading.ParsedScene(path).load().shapes()
+    assert (tmp_path / "maps" / "a.png").resolve() in loading.ParsedScene(path).files()
     text, more = path.read_text(), 'type="diffuse"><float name="x" value="1"/>'
     for wrong, match in ((text.replace("maps", "map"), "a.png"), (text.replace('type="diffuse">', more), '"x"')):
         path.write_text(wrong)
-        with pytest.raises(scenes.SceneError, match=match):
-            scenes.ParsedScene(path).load()
+        with pytest.raises(loading.SceneError, match=match):
+            loading.ParsedScene(path).load()
 
 
 def test_scenes_in_memory(mi_rgb):
-    from mi_diffind.rendering import render
+    from mi_diffind.scenes.rendering import render
 
     scene = {"type": "scene", "sensor": {"type": "perspective"}, "shape": {"type": "sphere"}}
-    with pytest.raises(scenes.SceneError, match="scene: has no integrator"):
+    with pytest.raises(loading.SceneError, match="scene: has no integrator"):
         render(scene, 1)
-    with pytest.raises(scenes.SceneError, match="scene: has no integrator"):
+    with pytest.raises(loading.SceneError, match="scene: has no integrator"):
         render(mi_rgb.load_dict(scene), 1)
 
 
@@ -129,7 +131,7 @@ def nan_pixels(path, spp, seed=0):
 
 def test_render_counts_what_is_not_finite(tmp_path, capsys):
     path = scene_file(tmp_path, more=NAN)
-    from mi_diffind.rendering import render
+    from mi_diffind.scenes.rendering import render
 
     assert main(["render", str(path), "-o", str(tmp_path / "a.exr"), "--spp", "2"]) == 0
     count = nan_pixels(path, 2)
@@ -145,8 +147,8 @@ def test_compare_refuses_what_is_not_finite(tmp_path, capsys):
 
 
 def test_capture_and_viewer_count_what_is_not_finite(tmp_path, capsys):
-    from mi_diffind.viewer.page import status_lines
-    from mi_diffind.viewer.session import Session
+    from mi_diffind.scenes.viewer.page import status_lines
+    from mi_diffind.scenes.viewer.session import Session
 
     path = scene_file(tmp_path, more=NAN)
     views = ["--views", "2", "--test", "0", "--resolution", "8", "--spp", "16"]
@@ -172,7 +174,7 @@ def test_no_error_of_what_is_not_finite(value, error):
 
 
 def test_inspect_refuses_measurements_that_are_no_numbers(monkeypatch, capsys):
-    from mi_diffind.task import tasks
+    from mi_diffind.fitting.task import tasks
 
     ggx = tasks()["ggx"]
     monkeypatch.setattr(ggx.model_class(), "measure", lambda self: {"mae": 0.1, "worst": np.nan, "psnr_db": np.inf})

@@ -11,12 +11,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import mi_diffind
-from mi_diffind import compat, scenes, srgb
-from mi_diffind.cli import main
-from mi_diffind.errors import UsageError
-from mi_diffind.viewer import passes
-from mi_diffind.viewer.page import Page, padded, pose, server, status_lines
-from mi_diffind.viewer.session import Pose, Session, combined
+from mi_diffind.commands.cli import main
+from mi_diffind.core import compat
+from mi_diffind.core.errors import UsageError
+from mi_diffind.images import srgb
+from mi_diffind.scenes import loading
+from mi_diffind.scenes.viewer import passes
+from mi_diffind.scenes.viewer.page import Page, padded, pose, server, status_lines
+from mi_diffind.scenes.viewer.session import Pose, Session, combined
 
 ROOT = Path(__file__).resolve().parents[1]
 ASSETS = ROOT / "scenes" / "assets"
@@ -48,7 +50,7 @@ def session(mi, **options):
 
 def reference(mi, passes=3, **options):
     """The same passes by ``mi.render``."""
-    return scenes.render(scenes.load_dict(content(mi, **options)), passes, 3, passes)[0]
+    return loading.render(loading.load_dict(content(mi, **options)), passes, 3, passes)[0]
 
 
 @pytest.mark.parametrize("integrator", ["path", "path_sdf", "path_footprint", "prb"])
@@ -71,7 +73,7 @@ def test_every_variant_shows_a_picture(mi_any):
     for _ in range(2):
         picture = shown.refine()
     assert picture.shape == (HEIGHT, WIDTH, 3) and 20 < picture.mean() < 250
-    expected = scenes.colour_channels(reference(mi_any, 2))
+    expected = loading.colour_channels(reference(mi_any, 2))
     np.testing.assert_allclose(shown.learned.image, np.broadcast_to(expected, (HEIGHT, WIDTH, 3)), atol=1e-4)
     assert shown.learned.by_pixels == (not mi_any.is_spectral and not mi_any.is_polarized)
 
@@ -228,7 +230,7 @@ def test_a_scene_that_cannot_be_rendered_is_one_sentence(mi_rgb, monkeypatch):
     shown = session(mi_rgb)
     with monkeypatch.context() as patched:
         patched.setattr(passes, "_sample_pixels", fail)
-        with pytest.raises(scenes.SceneError, match=r"^no light$"):
+        with pytest.raises(loading.SceneError, match=r"^no light$"):
             shown.refine()
     shown.refine()  # nothing stays behind
     assert shown.figures["samples"] == 1 and shown.learned.frozen
@@ -309,13 +311,13 @@ def test_refused_input(mi_rgb, tmp_path):
         with pytest.raises(UsageError, match=sentence):
             Session(scene, **options)
     with pytest.raises(UsageError, match="found a loaded scene, which cannot be changed any more"):
-        Session(scenes.load_dict(scene))
+        Session(loading.load_dict(scene))
     with pytest.raises(UsageError, match=r"tiles\.npz: found a table file with defines"):
         Session(ASSETS / "tiles.npz", defines={"a": 1})
-    with pytest.raises(scenes.SceneError, match="has no sensor"):
+    with pytest.raises(loading.SceneError, match="has no sensor"):
         Session({key: value for key, value in scene.items() if key != "sensor"})
     still = {"type": "irradiancemeter", "film": scene["sensor"]["film"]}
-    with pytest.raises(scenes.SceneError, match="the sensor IrradianceMeter cannot be moved"):
+    with pytest.raises(loading.SceneError, match="the sensor IrradianceMeter cannot be moved"):
         Session({**scene, "sensor": {"type": "rectangle", "meter": still}})
     with pytest.raises(mi_diffind.TableError):
         (tmp_path / "broken.npz").write_bytes(b"PK")
@@ -348,7 +350,7 @@ def test_a_mirrored_sensor_stays_mirrored(mi_rgb):
     flipped["lamp"] = {"type": "point", "position": [3, 0, 3], "intensity": 30.0}
     shown = Session(flipped, WIDTH, seed=3)
     shown.refine()
-    expected = scenes.render(scenes.load_dict(flipped), 1, 3, 1)[0]
+    expected = loading.render(loading.load_dict(flipped), 1, 3, 1)[0]
     np.testing.assert_allclose(shown.learned.image, expected, atol=1e-4)
 
 

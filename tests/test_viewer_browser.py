@@ -59,7 +59,17 @@ def served(tmp_path):
     """The command and the address that it prints."""
     pytest.importorskip("viser", reason="the optional package viser is not installed")
     (tmp_path / "scene.xml").write_text(SCENE)
-    command = [sys.executable, "-m", "mi_diffind.cli", "view", "scene.xml", "--port", "0", "--variant", "llvm_ad_rgb"]
+    command = [
+        sys.executable,
+        "-m",
+        "mi_diffind.commands.cli",
+        "view",
+        "scene.xml",
+        "--port",
+        "0",
+        "--variant",
+        "llvm_ad_rgb",
+    ]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     process = subprocess.Popen(
         command, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True

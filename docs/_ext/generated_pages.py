@@ -165,7 +165,7 @@ def _with_picture(page: str, plugin) -> str:
 
 def command_pages(pages: Pages) -> None:
     """Add a page for each verb of the command line, from its parser."""
-    from mi_diffind.cli import VERBS
+    from mi_diffind.commands.cli import VERBS
 
     index = [*titled("Command line")]
     index += ["Exit codes: 0 done, 1 a check failed, 2 bad usage or bad input, 130 interrupted.", ""]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..arguments import WORKER_ARGUMENTS, add_arguments
-from ..files import writable_folder
+from ..core.arguments import WORKER_ARGUMENTS, add_arguments
+from ..core.files import writable_folder
 from .common import natural, positive, require_scene, say, scene_options, set_variant, verb
 
 HELP = "render views of a scene, or of 3D Gaussians, from all sides, with their poses"
@@ -65,12 +65,12 @@ def run(arguments) -> dict:
     """Render the views that are missing and return what is printed.
 
     After Ctrl-C, the result lists the views that exist. Raises :class:`UsageError`, and as
-    :mod:`mi_diffind.view_capture` does.
+    :mod:`mi_diffind.scenes.capture` does.
     """
     require_scene(arguments.scene)
     writable_folder(Path(arguments.output).parent)
     set_variant(arguments.variant)
-    from ..view_capture import capture
+    from ..scenes.capture import capture
 
     names = ("views", "test", "resolution", "spp", "fov", "radius", "path", "seed", "format", "workers", "scheduler")
     given = {name: getattr(arguments, name) for name in (*names, "centre", "elevation", "up", "objects", "box")}

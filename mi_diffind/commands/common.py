@@ -6,10 +6,10 @@ import argparse
 import os
 from pathlib import Path
 
-from .. import runtime
-from ..arguments import define, natural, positive
-from ..errors import UsageError, printable
-from ..files import check_distinct, irregular, shown
+from ..core import runtime
+from ..core.arguments import define, natural, positive
+from ..core.errors import UsageError, printable
+from ..core.files import check_distinct, irregular, shown
 
 
 def verb(
@@ -96,7 +96,7 @@ def say(text) -> None:
 
 def print_conversions(conversions: list[dict]) -> None:
     """Print what was replaced and what was kept."""
-    from .. import conversion
+    from ..scenes import conversion
 
     for line in conversion.summary(conversions):
         say(line)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..files import writable_folder
+from ..core.files import writable_folder
 from .common import learn_option, positive, require_scene, say, scene_options, set_variant, verb
 
 HELP = "render a scene as written and with exact plugins, and show the difference"
@@ -33,12 +33,12 @@ def run(arguments) -> dict:
 
     ``further`` are the figures against further truths.
 
-    Raises :class:`~mi_diffind.errors.UsageError`, and as :mod:`mi_diffind.comparison` does.
+    Raises :class:`.UsageError`, and as :mod:`mi_diffind.scenes.comparison` does.
     """
     require_scene(arguments.scene)
     writable_folder(arguments.out, create=True)
     set_variant(arguments.variant)
-    from .. import comparison
+    from ..scenes import comparison
 
     result = comparison.compare(
         arguments.scene,

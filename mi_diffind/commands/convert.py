@@ -30,11 +30,11 @@ def add(commands) -> None:
 def run(arguments) -> dict:
     """Convert the scene, write it, and return the ``output``, the ``conversions`` and the ``check``.
 
-    Raises :class:`~mi_diffind.errors.UsageError`, and as :mod:`mi_diffind.conversion` does.
+    Raises :class:`.UsageError`, and as :mod:`mi_diffind.scenes.conversion` does.
     """
     require_scene(arguments.scene)
     set_variant(arguments.variant)
-    from ..conversion import convert
+    from ..scenes.conversion import convert
 
     conversions = convert(
         arguments.scene,

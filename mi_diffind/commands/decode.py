@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..arguments import add_arguments
-from ..errors import UsageError
-from ..files import writable_file
-from ..task import load_model, task_of, tasks
+from ..core.arguments import add_arguments
+from ..core.errors import UsageError
+from ..core.files import writable_file
+from ..fitting.task import load_model, task_of, tasks
 from .common import say, set_variant, variant_option, verb
 
 HELP = "turn a table file back into ordinary files, as images"
@@ -29,11 +29,11 @@ def add(commands) -> None:
 def run(arguments) -> dict:
     """Write the files and return their names as ``files``.
 
-    Raises :class:`UsageError`, :class:`~mi_diffind.tables.TableError` and :class:`~mi_diffind.files.OutputError`.
+    Raises :class:`UsageError`, :class:`.TableError` and :class:`.OutputError`.
     """
     output = writable_file(arguments.output)
-    from ..runtime import array_module
-    from ..tables import load_table
+    from ..arrays.tables import load_table
+    from ..core.runtime import array_module
 
     accepted = {argument.name for argument in task_of(load_table(arguments.file)).decode_arguments}
     given = {a.name: getattr(arguments, a.name) for task in tasks().values() for a in task.decode_arguments}

@@ -18,9 +18,9 @@ def add(commands) -> None:
 def run(arguments) -> dict:
     """Copy the scenes and return what is printed.
 
-    Raises :class:`~mi_diffind.errors.UsageError` and :class:`~mi_diffind.files.OutputError`.
+    Raises :class:`.UsageError` and :class:`.OutputError`.
     """
-    from ..example_files import examples
+    from ..scenes.examples import examples
 
     written = examples(arguments.folder)
     say(written)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from ..arguments import add_arguments, natural, positive
-from ..deadline import Deadline
-from ..files import writable_file, writable_folder
-from ..settings import LOSSES, SCHEDULES, FittingError
-from ..task import Task, fit, tasks
+from ..core.arguments import add_arguments, natural, positive
+from ..core.deadline import Deadline
+from ..core.files import writable_file, writable_folder
+from ..fitting.settings import LOSSES, SCHEDULES, FittingError
+from ..fitting.task import Task, fit, tasks
 from .common import alternative, alternatives, say, set_variant, variant_option, verb
 
 #: Settings of a training that every task has: what they are, and the options of their parsers.
@@ -68,8 +68,8 @@ def _default(task: Task, name: str) -> str:
 def run(arguments) -> dict:
     """Train, write the table file, and return its size, its accuracy and the history of the training.
 
-    After Ctrl-C, these are of the best state so far. Raises :class:`~mi_diffind.errors.UsageError`,
-    :class:`~mi_diffind.files.OutputError`, :class:`FittingError` and what the task's own input raises.
+    After Ctrl-C, these are of the best state so far. Raises :class:`.UsageError`,
+    :class:`.OutputError`, :class:`FittingError` and what the task's own input raises.
     """
     deadline = None if arguments.seconds is None else Deadline(arguments.seconds)
     task = tasks()[arguments.task]

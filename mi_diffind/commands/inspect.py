@@ -23,11 +23,11 @@ def add(commands) -> None:
 
 
 def run(arguments) -> dict:
-    """Print the description of the file and return its figures (:func:`mi_diffind.inspection.inspect`)."""
+    """Print the description of the file and return its figures (:func:`mi_diffind.scenes.inspection.inspect`)."""
     if Path(arguments.file).suffix.lower() == ".xml":
         require_scene(arguments.file)
     set_variant(arguments.variant)
-    from ..inspection import inspect
+    from ..scenes.inspection import inspect
 
     inspection = inspect(arguments.file, arguments.measure, defines=dict(arguments.defines))
     say("\n".join(inspection.lines(arguments.verbose)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..files import writable_folder
+from ..core.files import writable_folder
 from .common import UsageError, natural, positive, require_scene, say, scene_options, set_variant, verb
 
 HELP = "check that scenes render as their stored references do"
@@ -32,7 +32,7 @@ def run(arguments) -> dict:
     """Check each scene, or store its reference again.
 
     Returns the result of each in ``scenes`` and the number that ``failed``. Raises :class:`UsageError`, and as
-    :mod:`mi_diffind.regression` does.
+    :mod:`mi_diffind.scenes.regression` does.
     """
     for path in arguments.scenes:
         require_scene(path)
@@ -41,7 +41,7 @@ def run(arguments) -> dict:
         if stems.count(stem) > 1:
             raise UsageError(f'{len(stems)} scenes, and more than one is called "{stem}": check them one at a time')
     set_variant(arguments.variant)
-    from .. import reference_files, regression, regression_report
+    from ..scenes import reference_files, regression, regression_report
 
     results, options = [], {"spp": arguments.spp, "seed": arguments.seed, "defines": dict(arguments.defines)}
     if not arguments.update:

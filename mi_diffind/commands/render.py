@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ..arguments import proper_fraction
-from ..files import writable_file
+from ..core.arguments import proper_fraction
+from ..core.files import writable_file
 from .common import (
     UsageError,
     learn_option,
@@ -19,7 +19,7 @@ from .common import (
     verb,
 )
 
-#: Extensions of films (:data:`mi_diffind.films.FILMS`, without importing NumPy).
+#: Extensions of films (:data:`mi_diffind.images.films.FILMS`, without importing NumPy).
 FILMS = (".mp4", ".webp", ".gif")
 
 HELP = "render a scene that names learned plugins"
@@ -64,9 +64,9 @@ def add(commands) -> None:
 
 
 def run(arguments) -> dict:
-    """Render the scene, write the image, and return the figures of :func:`mi_diffind.rendering.render`.
+    """Render the scene, write the image, and return the figures of :func:`mi_diffind.scenes.rendering.render`.
 
-    Raises :class:`~mi_diffind.errors.UsageError`, and as :mod:`mi_diffind.scenes` does.
+    Raises :class:`.UsageError`, and as :mod:`mi_diffind.scenes.loading` does.
     """
     require_scene(arguments.scene)
     if arguments.centre is not None and not arguments.orbit:
@@ -80,12 +80,12 @@ def run(arguments) -> dict:
         raise UsageError(f'output "{output}": found the extension "{output.suffix}", allowed are {allowed}')
     writable_file(output)
     if arguments.orbit:
-        from ..films import check_encoder
+        from ..images.films import check_encoder
 
         check_encoder(output)
     set_variant(arguments.variant)
-    from .. import depth, scenes
-    from ..rendering import render
+    from ..scenes import depth, loading
+    from ..scenes.rendering import render
 
     rendering = render(
         arguments.scene,
@@ -109,13 +109,13 @@ def run(arguments) -> dict:
     if arguments.orbit:
         count, wanted = figures["frames"], figures["frames_requested"]
         kept = f"interrupted, kept {count} of {wanted}" if figures["interrupted"] else count
-        samples = scenes.samples_text({**figures, "interrupted": False})
+        samples = loading.samples_text({**figures, "interrupted": False})
         say(f"{output}: {kept} frames of {size}, {samples}, {time}")
         if output.suffix.lower() == ".mp4" and (figures["width"] % 2 or figures["height"] % 2):
             say("H.264 needs an even width and height: the last column or row is there twice")
     else:
-        say(f"{output}: {size}, {scenes.samples_text(figures)}, {time}")
-    reports = scenes.reports(rendering.scene) if arguments.json is not None and not arguments.orbit else []
+        say(f"{output}: {size}, {loading.samples_text(figures)}, {time}")
+    reports = loading.reports(rendering.scene) if arguments.json is not None and not arguments.orbit else []
     return {**figures, "output": str(output), "reports": reports}
 
 

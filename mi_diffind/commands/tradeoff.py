@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from .. import tradeoffs
-from ..arguments import WORKER_ARGUMENTS, add_arguments
-from ..studies import studies
+from ..core.arguments import WORKER_ARGUMENTS, add_arguments
+from ..studies import studies, tradeoffs
 from .common import alternative, alternatives, require_scene, say, scene_options, set_variant, variant_option, verb
 
 HELP = "measure time against accuracy, of all forms of a task or of a scene"

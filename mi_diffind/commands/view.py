@@ -27,12 +27,12 @@ def add(commands) -> None:
 def run(arguments) -> dict:
     """Show the page until Ctrl-C, and return the figures of :func:`mi_diffind.view`.
 
-    Raises :class:`~mi_diffind.errors.UsageError`, and as :mod:`mi_diffind.viewer` does.
+    Raises :class:`.UsageError`, and as :mod:`mi_diffind.scenes.viewer` does.
     """
     if Path(arguments.file).suffix.lower() != ".npz":
         require_scene(arguments.file)
     set_variant(arguments.variant)
-    from ..viewer import view
+    from ..scenes.viewer import view
 
     return view(
         arguments.file,

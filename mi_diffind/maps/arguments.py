@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .. import units
-from ..arguments import Argument, between, checked, decibels, positive
-from ..errors import UsageError
+from ..core import units
+from ..core.arguments import Argument, between, checked, decibels, positive
+from ..core.errors import UsageError
 from .source import NONFINITE, Source
 
 _SIZES = (
@@ -71,7 +71,7 @@ DECODED = (
 
 def requested_bytes(options, source: Source) -> int:
     """Return the bytes of the options :data:`SIZES`, by default a twelfth of the source's. Raises UsageError."""
-    from ..tables import MAX_BYTES
+    from ..arrays.tables import MAX_BYTES
 
     given = {k: options[k] for k in ("compression", "bpp")} | {"nbytes": options["bytes"]}
     if not any(given.values()):

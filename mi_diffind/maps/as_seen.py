@@ -14,7 +14,7 @@ from types import ModuleType
 
 import numpy as np
 
-from .. import metrics, srgb
+from ..images import metrics, srgb
 from .compressed import CompressedMaps, decibel
 from .source import Map, Source
 

@@ -10,8 +10,8 @@ from types import ModuleType
 import drjit as dr
 import numpy as np
 
-from .. import lookup
-from ..indirection import aligned_copy
+from ..arrays import lookup
+from ..arrays.indirection import aligned_copy
 from .layout import FROM_NORMAL, Layout
 from .source import Source
 

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from .. import srgb
-from ..errors import UsageError
-from ..files import replacing
-from ..indirection import DifferentiableArray
-from ..pages import SIDE_BITS, page_counts, page_shift
-from ..tables import PAGES, Table, TableError, allocate_pages, page_sides
-from ..task import Model
-from ..threads import threads_for_files
+from ..arrays.indirection import DifferentiableArray
+from ..arrays.pages import SIDE_BITS, page_counts, page_shift
+from ..arrays.tables import PAGES, Table, TableError, allocate_pages, page_sides
+from ..core.errors import UsageError
+from ..core.files import replacing
+from ..core.threads import threads_for_files
+from ..fitting.task import Model
+from ..images import srgb
 from . import as_seen
 from .compressed import CompressedMaps, map_figure
 from .source import load_source

@@ -19,8 +19,10 @@ from types import ModuleType
 import drjit as dr
 import numpy as np
 
-from .. import compat, lookup, memory, srgb
-from ..indirection import aligned
+from ..arrays import lookup
+from ..arrays.indirection import aligned
+from ..core import compat, memory
+from ..images import srgb
 from . import components
 from .compressed import FilteredMaps
 from .layout import Layout, MapLayout

@@ -26,13 +26,13 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import DiffindError, reason
-from ..files import MOST_TEXT, OutsideError, irregular, path_by_name, shown
-from ..limits import Allowance, LimitError, json_bytes
-from ..picture_sizes import check_picture
-from ..threads import threads_for_files
-from ..units import memory
-from ..unused_keys import RecordedKeys, unused_note
+from ..core.errors import DiffindError, reason
+from ..core.files import MOST_TEXT, OutsideError, irregular, path_by_name, shown
+from ..core.limits import Allowance, LimitError, json_bytes
+from ..core.threads import threads_for_files
+from ..core.units import memory
+from ..core.unused_keys import RecordedKeys, unused_note
+from ..images.headers import check_picture
 from .names import Content, content_of
 
 #: Largest number of channels of all maps together.
@@ -299,7 +299,7 @@ def _read(path: Path) -> _ImageFile:
     """Read an image file.
 
     Raises :class:`SourceError` if ``mitsuba.Bitmap`` cannot read it, it is cut short, or it takes more memory than a
-    file of its size may (:mod:`~mi_diffind.limits`).
+    file of its size may (:mod:`~mi_diffind.core.limits`).
     """
     import mitsuba as mi
 

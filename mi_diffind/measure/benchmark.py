@@ -23,17 +23,14 @@ from pathlib import Path
 import drjit as dr
 from tqdm import tqdm
 
-from ..interrupt import interruptible
-from ..jobs import run_jobs
-from ..runtime import use_variant
+from ..core.interrupt import interruptible
+from ..core.jobs import run_jobs
+from ..core.runtime import use_variant
 from .clock import machine, timed, total
 from .operations import count_query
 from .statistics import pareto, ratio, spread, timing
 from .store import Store, fingerprint, models_folder, sources
-from .study import FLOOR, Case, Plan
-
-#: Names of a whole pass among the queries: time of its kernels, and time from beginning to end.
-PASS, PASS_WALL = "render", "render, with tracing"
+from .study import FLOOR, PASS, PASS_WALL, Case, Plan, in_competition
 
 #: Times that differ by a smaller factor count as equal on the Pareto front.
 SAME_TIME = 1.05
@@ -108,7 +105,7 @@ def measure(
     ms; ``ratios``: query → ``"a / b"`` → ``median``, ``q1``, ``q3``, ``with_floor``, ``hidden``; ``jobs``: their
     records. After Ctrl-C the result is incomplete.
 
-    Raises :class:`~mi_diffind.files.OutputError` if the folder cannot be written.
+    Raises :class:`.OutputError` if the folder cannot be written.
     """
     key = {
         "settings": asdict(settings),
@@ -344,11 +341,6 @@ def _mark_front(timings: dict, candidates: dict, accuracy: str) -> None:
     front = dict(zip(competing, pareto(list(competing.values()), (math.log(SAME_TIME), 0)), strict=True))
     for name in timings:
         timings[name]["on_front"] = front.get(name)
-
-
-def in_competition(candidate: dict) -> bool:
-    """Return whether a candidate of a result may be on the Pareto front."""
-    return candidate["competes"] and not (candidate["is_reference"] or candidate["is_truth"])
 
 
 def _ratios(pairs: list[tuple[str, str]], values: dict[str, list[float]], floor: float) -> dict:

@@ -10,7 +10,7 @@ where ``m`` is the brightness around the pixel, a mean over 5 × 5 pixels of an 
 else. The denominator depends on none of the compared images, and nothing is clipped, so squares add up exactly:
 E[mse] = bias² + noise², and for independent samples noise² = σ² / spp. (A denominator made of the truth itself would
 be large where the noise of the truth is positive, and hide a part of the noise.) The PSNR of
-:mod:`mi_diffind.metrics` clips to [0, 1]; a clipped noisy image has another mean, so PSNR does not add up. It is given
+:mod:`.metrics` clips to [0, 1]; a clipped noisy image has another mean, so PSNR does not add up. It is given
 as well; the PSNR of the bias uses values of the truth up to 1, where clipping changes nothing. A dark pixel that one
 rare bright path hits may outweigh all others: errors are those of several images with different seeds, given as median
 and quartiles. The median of few samples therefore tends to be below the noise σ² / spp, which is a mean.

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import drjit as dr
 
-from .. import compat
+from ..core import compat
 
 #: Function to measure: its result, any tree of arrays, is evaluated.
 Query = Callable[[], object]

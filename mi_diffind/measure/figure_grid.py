@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from .. import srgb
+from ..images import srgb
 from . import plot
 
 #: Function that draws one cell, of a Matplotlib figure and of the cell's axes.
@@ -61,7 +61,7 @@ def text(lines: Sequence[str]) -> Cell:
 def write(path: str | os.PathLike, cells: Sequence[Cell], columns: int, shape: Sequence[int]) -> None:
     """Draw ``cells`` row by row, each seven inches wide, and write ``path`` (``.png``).
 
-    ``shape`` is that of the pictures, (height, width, …). Raises :class:`~mi_diffind.files.OutputError`.
+    ``shape`` is that of the pictures, (height, width, …). Raises :class:`.OutputError`.
     """
     from matplotlib.figure import Figure
 

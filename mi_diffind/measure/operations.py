@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass, fields
 
 import drjit as dr
 
-from ..compat import is_ptx, kernel_code
+from ..core.compat import is_ptx, kernel_code
 from .clock import Query, total
 
 #: Flops of an operation in the paper's accounting.

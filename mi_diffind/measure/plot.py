@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..files import replacing
+from ..core.files import replacing
 
 #: Colour and marker of each representation, in order of appearance; markers differ for prints without colour.
 STYLES = (
@@ -102,7 +102,7 @@ def fix_layout(figure) -> None:
 
 
 def save(figure, path: str | os.PathLike) -> None:
-    """Write a figure to ``path`` (``.png``). Raises :class:`~mi_diffind.files.OutputError`."""
+    """Write a figure to ``path`` (``.png``). Raises :class:`.OutputError`."""
     with replacing(path) as temporary:
         figure.savefig(temporary, format=Path(path).suffix[1:])
 

@@ -7,16 +7,13 @@ import io
 import math
 import os
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from pathlib import Path
 
-from ..files import replacing, writable_folder, write_json
+from ..core.files import replacing, writable_folder, write_json
 from . import plot
-from .benchmark import PASS, in_competition
 from .formatting import grid, machine_line, ratio_cell, state, time_cell
 from .statistics import finite, pareto
 from .store import Store
-from .study import Plan
+from .study import PASS, Plan, Tradeoff, in_competition
 
 #: Columns of the table before those of errors and of the candidates' details.
 COLUMNS = (
@@ -42,7 +39,7 @@ def write_files(
 
     ``pictures`` maps ``"png"`` (``tradeoff_NAME.png``) or another word (``tradeoff_NAME_WORD.png``) to a function that
     draws a Matplotlib figure. Partial results of a complete run are removed from ``folder``. Raises
-    :class:`~mi_diffind.files.OutputError`.
+    :class:`.OutputError`.
     """
     folder = writable_folder(folder, create=True)
     start = str(folder / f"tradeoff_{name}")
@@ -60,28 +57,6 @@ def write_files(
     if not result["interrupted"]:
         Store.remove(folder, name)
     return paths
-
-
-@dataclass
-class Tradeoff:
-    """Result of a study: its ``figures`` as JSON holds them, ``lines`` of text, and the paths of the ``files``."""
-
-    figures: dict
-    lines: list[str]
-    files: dict[str, str]
-
-    @property
-    def pictures(self) -> dict[str, str]:
-        """Paths of the pictures by name; ``"png"`` is accuracy against time and bytes."""
-        return {name: path for name, path in self.files.items() if path.endswith(".png")}
-
-    def __str__(self) -> str:
-        return "\n".join([*self.lines, "", "written     " + ", ".join(self.files.values())])
-
-    def _repr_png_(self) -> bytes | None:
-        pictures = self.pictures
-        path = pictures.get("png") or next(iter(pictures.values()), None)
-        return None if path is None else Path(path).read_bytes()
 
 
 def publish(result: dict, paths: dict[str, str], lines: list[str]) -> Tradeoff:

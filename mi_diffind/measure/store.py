@@ -7,6 +7,7 @@ Partial results stay until the result is written. A run is continued only if its
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 import json
 import os
 import shutil
@@ -17,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..files import replacing, writable_folder, write_json
+from ..core.files import replacing, writable_folder, write_json
 from .statistics import finite
 
 
@@ -29,7 +30,7 @@ class Store:
 
     Partial results in the folder are read if their key is the same (``resumed``), else removed. With ``progress``, a
     line on stderr tells which, and which parts of the key differ or that a file is damaged. Raises
-    :class:`~mi_diffind.files.OutputError` if the folder cannot be written.
+    :class:`.OutputError` if the folder cannot be written.
     """
 
     def __init__(
@@ -124,8 +125,7 @@ def fingerprint(paths: Iterable[str | os.PathLike]) -> str:
 
 def sources() -> set[Path]:
     """Return the files that a measurement may depend on: modules, plugins (elsewhere in a checkout), tables."""
-    from .. import plugins
-
     package = Path(__file__).resolve().parents[1]
-    modules = {*package.rglob("*.py"), *Path(plugins.__file__).resolve().parent.rglob("*.py")}
+    plugins = importlib.util.find_spec("mi_diffind.plugins").submodule_search_locations
+    modules = {path for folder in (package, *map(Path, plugins)) for path in folder.rglob("*.py")}
     return modules | set((package / "data").glob("*.npz"))

@@ -12,13 +12,37 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from .report import Tradeoff
 
 #: Name of the floor among the queries of a case.
 FLOOR = "floor"
+
+#: Name of a whole pass among the queries: time of its kernels.
+PASS = "render"
+
+#: Name of a whole pass among the queries: time from beginning to end.
+PASS_WALL = "render, with tracing"
+
+
+@dataclass
+class Tradeoff:
+    """Result of a study: its ``figures`` as JSON holds them, ``lines`` of text, and the paths of the ``files``."""
+
+    figures: dict
+    lines: list[str]
+    files: dict[str, str]
+
+    @property
+    def pictures(self) -> dict[str, str]:
+        """Paths of the pictures by name; ``"png"`` is accuracy against time and bytes."""
+        return {name: path for name, path in self.files.items() if path.endswith(".png")}
+
+    def __str__(self) -> str:
+        return "\n".join([*self.lines, "", "written     " + ", ".join(self.files.values())])
+
+    def _repr_png_(self) -> bytes | None:
+        pictures = self.pictures
+        path = pictures.get("png") or next(iter(pictures.values()), None)
+        return None if path is None else Path(path).read_bytes()
 
 
 class Study:
@@ -180,3 +204,8 @@ class Plan:
         """Return the names of the candidates that take part in a query of a :meth:`resolved` case."""
         in_case = [c for c in self.candidates if c.name in case.candidates]
         return [c.name for c in in_case if c.queries is None or query in c.queries]
+
+
+def in_competition(candidate: dict) -> bool:
+    """Return whether a candidate of a result may be on the Pareto front."""
+    return candidate["competes"] and not (candidate["is_reference"] or candidate["is_truth"])

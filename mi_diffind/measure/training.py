@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..files import replacing
-from ..fitting import FitSettings, Problem, fit
+from ..core.files import replacing
+from ..fitting.loop import FitSettings, Problem, fit
 from .store import file_name
 from .study import Job
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 
-from .. import discovery
+from ..core import discovery
 from ..measure.study import Study
 
 

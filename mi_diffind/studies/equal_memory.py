@@ -15,10 +15,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from .. import task
-from ..files import replacing
+from ..core.files import replacing
+from ..core.runtime import array_module
+from ..fitting import task
 from ..measure.study import Candidate, Job
-from ..runtime import array_module
 
 
 def add_without_option(parser: argparse.ArgumentParser) -> None:
@@ -135,7 +135,7 @@ class PresetContender(Contender):
     preset: str = ""
 
     def arguments(self) -> dict:
-        """Return the training settings and the task's own arguments, those of :func:`mi_diffind.task.fit`."""
+        """Return the training settings and the task's own arguments, those of :func:`mi_diffind.fitting.task.fit`."""
         raise NotImplementedError
 
     def fit(self, progress: bool) -> task.Fitted:
@@ -148,7 +148,7 @@ class PresetContender(Contender):
         )  # fmt: skip
 
     def run(self, folder: Path | None, progress: bool) -> dict | None:
-        from ..tables import save_table
+        from ..arrays.tables import save_table
 
         if not self.file:
             raise ValueError("presets are measured from their files: give a folder for them")

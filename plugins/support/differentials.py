@@ -84,7 +84,7 @@ class Differentials:
 
         The bounce is treated as that of a mirror, or of a smooth boundary, with the normal that maps one direction to
         the other: a shading normal, a mapped normal or the normal of a microfacet. Its curvature is that of the
-        surface: ``dn_du`` and ``dn_dv`` belong to the ``edges`` (:func:`mi_diffind.compat.normal_edges`). Without
+        surface: ``dn_du`` and ``dn_dv`` belong to the ``edges`` (:func:`mi_diffind.core.compat.normal_edges`). Without
         ``delta``, the ``spread`` s of the cone grows to √(s² + a²) with a² = scale² / pdf, the solid angle of one
         sample's share of the lobe; a is at most :data:`WIDEST`.
         """

@@ -20,7 +20,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_diffind import compat, mitsuba_versions
+from mi_diffind.core import compat, mitsuba_versions
 from mi_diffind.tasks.sdf import tracing
 
 from .. import warn

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_diffind import compat
+from mi_diffind.core import compat
 from mi_diffind.tasks.radiance import march as marching
 
 from .placed_fields import VariantLight

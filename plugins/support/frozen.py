@@ -13,7 +13,7 @@ import hashlib
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind import compat, memory
+from mi_diffind.core import compat, memory
 
 #: Types of Dr.Jit's literals that stand for the digits of a key.
 _DIGITS = ("Int8", "UInt8", "Int32", "UInt32", "Int64", "UInt64", "Float16", "Float64")

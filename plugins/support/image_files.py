@@ -15,18 +15,18 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_diffind import compat
-from mi_diffind.compat import module_of
-from mi_diffind.errors import DiffindError
-from mi_diffind.files import OutsideError, is_within, path_within, relative_path, write_json
-from mi_diffind.limits import LimitError
+from mi_diffind.arrays.tables import Table, TableError
+from mi_diffind.core import compat
+from mi_diffind.core.compat import module_of
+from mi_diffind.core.errors import DiffindError
+from mi_diffind.core.files import OutsideError, is_within, path_within, relative_path, write_json
+from mi_diffind.core.limits import LimitError
+from mi_diffind.fitting.task import Task, stamp
+from mi_diffind.images.headers import check_picture
 from mi_diffind.maps.compressed import CompressedMaps
 from mi_diffind.maps.layout import Layout, MapLayout
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import Source, SourceError, from_arrays, load_source
-from mi_diffind.picture_sizes import check_picture
-from mi_diffind.tables import Table, TableError
-from mi_diffind.task import Task, stamp
 
 from .. import warn
 from . import properties

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_diffind.rays import box_interval
+from mi_diffind.arrays.boxes import box_interval
 from mi_diffind.tasks.radiance.volume_field import VolumeField
 
 from .placed_fields import PlacedField, corners

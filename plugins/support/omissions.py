@@ -1,7 +1,7 @@
 """Warnings of what a render would do wrong in silence: leave out a shape that no integrator sees, or filter no texture.
 
 Scenes that ``mi_diffind`` loads are prepared, or refused. Those of ``mi.load_file``, ``mi.load_dict`` and
-``mi.load_string`` are checked when they are rendered: by ``mi.render`` (:func:`mi_diffind.turns.before_render`), by
+``mi.load_string`` are checked when they are rendered: by ``mi.render`` (:func:`.before_render`), by
 ``render`` of integrators of this package, and by textures while an integrator reads them (:func:`reading`). Each scene
 is warned of once.
 """
@@ -12,7 +12,7 @@ import weakref
 
 import mitsuba as mi
 
-from mi_diffind import compat, turns
+from mi_diffind.core import compat, turns
 
 from .. import origin, warn
 

@@ -9,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_diffind import compat
-from mi_diffind.tables import TableError
+from mi_diffind.arrays.tables import TableError
+from mi_diffind.core import compat
 from mi_diffind.tasks.radiance import march as marching
 from mi_diffind.tasks.radiance.files import load
 

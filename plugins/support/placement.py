@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_diffind import compat
+from mi_diffind.core import compat
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,11 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
-from mi_diffind import mitsuba_versions
-from mi_diffind.errors import DiffindError
-from mi_diffind.files import is_within
-from mi_diffind.tables import TableError
-from mi_diffind.task import stamp
+from mi_diffind.arrays.tables import TableError
+from mi_diffind.core import mitsuba_versions
+from mi_diffind.core.errors import DiffindError
+from mi_diffind.core.files import is_within
+from mi_diffind.fitting.task import stamp
 from mi_diffind.tasks.sdf import TASK, serialized
 from mi_diffind.tasks.sdf.mesh import directed_edges, load_mesh, split_part
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from mi_diffind.tables import Table
+from mi_diffind.arrays.tables import Table
 
 from . import properties
 

@@ -7,8 +7,8 @@ from types import ModuleType
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind import compat, memory
-from mi_diffind.task import Model, Task
+from mi_diffind.core import compat, memory
+from mi_diffind.fitting.task import Model, Task
 
 from . import properties
 

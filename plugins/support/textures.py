@@ -9,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_diffind.indirection import fold
-from mi_diffind.lookup import clamp
+from mi_diffind.arrays.indirection import fold
+from mi_diffind.arrays.lookup import clamp
 
 from . import upsampling
 

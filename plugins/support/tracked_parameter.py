@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind import compat
-from mi_diffind.bounds import ValueBounds
+from mi_diffind.arrays.bounds import ValueBounds
+from mi_diffind.core import compat
 
 _waiting = threading.local()
 

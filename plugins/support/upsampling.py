@@ -13,9 +13,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_diffind import compat
-from mi_diffind.indirection import DifferentiableArray
-from mi_diffind.lookup import clamp
+from mi_diffind.arrays.indirection import DifferentiableArray
+from mi_diffind.arrays.lookup import clamp
+from mi_diffind.core import compat
 
 _models: dict = {}
 _lock = threading.RLock()

@@ -13,9 +13,9 @@ import mitsuba as mi
 import numpy as np
 
 import mi_diffind  # noqa: F401  (registers the plugins)
-from mi_diffind.files import write_json
+from mi_diffind.core.files import write_json
+from mi_diffind.core.runtime import array_module
 from mi_diffind.measure.clock import machine
-from mi_diffind.runtime import array_module
 from mi_diffind.tasks.bsdf import TASK, energy
 from mi_diffind.tasks.bsdf.truth import MitsubaTruth
 

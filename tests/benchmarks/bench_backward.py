@@ -36,8 +36,8 @@ import numpy as np
 from bench_large_material import material
 
 import mi_diffind
-from mi_diffind import compat
-from mi_diffind.files import write_json
+from mi_diffind.core import compat
+from mi_diffind.core.files import write_json
 from mi_diffind.measure import clock
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -8,7 +8,7 @@ The same as ``mi-diffind tradeoff disney``.
 
 import sys
 
-from mi_diffind.cli import main
+from mi_diffind.commands.cli import main
 
 if __name__ == "__main__":
     sys.exit(main(["tradeoff", "disney", *sys.argv[1:]]))

@@ -12,9 +12,9 @@ import os
 import sys
 import time
 
-from mi_diffind.files import write_json
-from mi_diffind.runtime import array_module
-from mi_diffind.task import FitRequest, tasks
+from mi_diffind.core.files import write_json
+from mi_diffind.core.runtime import array_module
+from mi_diffind.fitting.task import FitRequest, tasks
 from mi_diffind.tasks.radiance import compression, files, fit, rate_distortion
 from mi_diffind.tasks.radiance.presets import PRESETS, dense_bytes
 from mi_diffind.tasks.radiance.session import FieldSession

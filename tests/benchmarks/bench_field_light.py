@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 import mi_diffind
-from mi_diffind.files import write_json
+from mi_diffind.core.files import write_json
 
 KNOT = str(Path(__file__).parents[2] / "scenes/assets/knot.ply")
 

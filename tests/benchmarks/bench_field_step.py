@@ -29,8 +29,9 @@ def child(arguments) -> dict:
 
     import drjit as dr
 
-    from mi_diffind import compat, fitting
-    from mi_diffind.runtime import array_module
+    from mi_diffind.core import compat
+    from mi_diffind.core.runtime import array_module
+    from mi_diffind.fitting import loop
     from mi_diffind.tasks.radiance import files, grid
     from mi_diffind.tasks.radiance.presets import PRESETS
 
@@ -44,12 +45,12 @@ def child(arguments) -> dict:
     views = session.FieldSession.load(types, arguments.source)
     reader = files if hasattr(files, "grid_of") else importlib.import_module("mi_diffind.tasks.radiance.fit")
     begin = reader.grid_of(files.load(arguments.grid), types)
-    with fitting.cores(True), compat.room_for_sums(fitting.LARGEST_SUMS):
+    with loop.cores(True), compat.room_for_sums(loop.LARGEST_SUMS):
         side = () if arguments.old else (1,)
         problem = grid.GridProblem(begin, views, *side)
         settings = dataclasses.replace(PRESETS["grid"].settings, batch=arguments.rays, steps=100000)
         problem.settings = settings
-        trainer = fitting._Trainer(problem, settings)
+        trainer = loop._Trainer(problem, settings)
         steps, forwards = [], []
         for number in range(WARM + arguments.steps):
             start = time.perf_counter()
@@ -108,7 +109,7 @@ def main() -> None:
         rows[0]["step_ratios"] = [min(ratios), max(ratios)]
     print(json.dumps(rows, indent=1))
     if arguments.json:
-        from mi_diffind.files import write_json
+        from mi_diffind.core.files import write_json
 
         write_json(arguments.json, {"rays": arguments.rays, "nodes": records["this version"][0]["nodes"], "rows": rows})
 

@@ -18,9 +18,9 @@ import drjit as dr
 import numpy as np
 
 import mi_diffind  # noqa: F401
-from mi_diffind.fitting import FitSettings, _Trainer
+from mi_diffind.core.runtime import array_module
+from mi_diffind.fitting.loop import FitSettings, _Trainer
 from mi_diffind.maps import source
-from mi_diffind.runtime import array_module
 from mi_diffind.tasks.image import training
 from mi_diffind.tasks.image.memory_budget import ImageBudget
 from mi_diffind.tasks.image.presets import PRESETS, replaced

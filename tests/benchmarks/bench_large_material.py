@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 import mi_diffind
-from mi_diffind.files import write_json
+from mi_diffind.core.files import write_json
 from mi_diffind.maps.source import load_source
 from mi_diffind.measure import clock
 from mi_diffind.studies.baselines import codecs

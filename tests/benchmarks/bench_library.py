@@ -75,7 +75,7 @@ def main() -> None:
     arguments.folder.mkdir(exist_ok=True)
     sources, output = arguments.folder / "materials", arguments.folder / "learned"
     write_materials(sources, arguments.materials)
-    command = [sys.executable, "-m", "mi_diffind.cli", "fit", "bsdf", "--steps", str(arguments.steps)]
+    command = [sys.executable, "-m", "mi_diffind.commands.cli", "fit", "bsdf", "--steps", str(arguments.steps)]
     library = [*command, str(sources), "-o", str(output), "--workers", str(arguments.workers)]
 
     def fitted() -> int:

@@ -21,9 +21,10 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 
-from mi_diffind import DifferentiableArray, compat
-from mi_diffind.lookup import STORAGES
-from mi_diffind.runtime import array_module
+from mi_diffind import DifferentiableArray
+from mi_diffind.arrays.lookup import STORAGES
+from mi_diffind.core import compat
+from mi_diffind.core.runtime import array_module
 
 CASES = {
     "2D, 4 channels, 256²": ((256, 256), 4),

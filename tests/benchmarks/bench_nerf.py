@@ -18,9 +18,9 @@ import tempfile
 import time
 from pathlib import Path
 
-from mi_diffind.files import write_json
+from mi_diffind.arrays.tables import load_table
+from mi_diffind.core.files import write_json
 from mi_diffind.measure.clock import machine
-from mi_diffind.tables import load_table
 from mi_diffind.tasks.radiance.views import load_views
 
 
@@ -28,7 +28,7 @@ def timed(command: list[str]) -> dict:
     """Run a command; return minutes of the clock and of the processor, and peak memory. Raises ``SystemExit``."""
     print(" ".join(command), flush=True)
     start = time.perf_counter()
-    process = subprocess.Popen([sys.executable, "-m", "mi_diffind.cli", *command])
+    process = subprocess.Popen([sys.executable, "-m", "mi_diffind.commands.cli", *command])
     _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:

@@ -36,11 +36,11 @@ import mitsuba as mi
 import numpy as np
 
 import mi_diffind
-from mi_diffind.files import write_json
+from mi_diffind.core.files import write_json
+from mi_diffind.core.runtime import array_module
+from mi_diffind.fitting.task import FitRequest, tasks
 from mi_diffind.maps.source import load_source
 from mi_diffind.measure import clock
-from mi_diffind.runtime import array_module
-from mi_diffind.task import FitRequest, tasks
 from mi_diffind.tasks.image import memory_budget as image_budget
 from mi_diffind.tasks.image.presets import PRESETS
 from mi_diffind.tasks.image.search import default_size

@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 import mi_diffind  # noqa: F401
-from mi_diffind import block_test, regression, scenes
+from mi_diffind.scenes import block_test, loading, regression
 
 WIDTH, HEIGHT = 96, 64
 PASSES, GROUP = block_test.CHECK_PASSES * block_test.GROUPS, block_test.CHECK_PASSES
@@ -114,8 +114,8 @@ class Passes:
     def take(self, count: int) -> np.ndarray:
         """Return passes that nobody has taken before, ``(count, rows, columns, channels)``."""
         for seed in range(len(self.kept), self.taken + count):
-            image = scenes.render_pass(self.scene, self.size.samples, self.first_seed + seed)
-            self.kept.append(block_test.block_means(scenes.colour_channels(image)).astype(np.float32))
+            image = loading.render_pass(self.scene, self.size.samples, self.first_seed + seed)
+            self.kept.append(block_test.block_means(loading.colour_channels(image)).astype(np.float32))
         self.taken += count
         return np.float64(self.kept[self.taken - count : self.taken])
 

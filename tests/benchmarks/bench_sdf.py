@@ -24,7 +24,7 @@ import mitsuba as mi
 import numpy as np
 
 import mi_diffind  # noqa: F401
-from mi_diffind.files import write_json
+from mi_diffind.core.files import write_json
 from mi_diffind.measure.clock import machine, timed
 from mi_diffind.tasks.sdf import TASK, grids, tracing
 from mi_diffind.tasks.sdf.mesh import load_mesh

@@ -15,10 +15,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_diffind import compat, fitting, scenes
+from mi_diffind.core import compat
+from mi_diffind.core.runtime import array_module
+from mi_diffind.fitting import loop
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import load_source
-from mi_diffind.runtime import array_module
+from mi_diffind.scenes import loading
 from mi_diffind.tasks.shading import training
 from mi_diffind.tasks.shading.presets import PRESETS
 from mi_diffind.tasks.texture import TASK
@@ -42,7 +44,7 @@ def long_training(steps: int) -> list[dict]:
     settings = dataclasses.replace(recipe.settings, steps=steps, batch=2**14)
     problem = training.ShadingProblem(training.start_of(table, pyramid), pyramid, recipe, source.digest)
     problem.settings = settings
-    trainer, found = fitting._Trainer(problem, settings), []
+    trainer, found = loop._Trainer(problem, settings), []
     compat.use_threads(1)
     trainer.take_step()  # compiles
     for part in range(10):
@@ -64,14 +66,14 @@ def render_ratio(rounds: int = 15) -> dict:
     """Time of a render with ``rust_shaded.npz``, as a multiple of that with ``rust_plain.npz``: median, quartiles."""
     mi.set_variant("llvm_ad_rgb")
     defines = {"width": "320", "height": "180", "max_depth": "2"}
-    loaded = [scenes.load(SCENES / "rust.xml", defines={**defines, "metal": f"rust_{name}.npz"})
+    loaded = [loading.load(SCENES / "rust.xml", defines={**defines, "metal": f"rust_{name}.npz"})
               for name in ("plain", "shaded")]  # fmt: skip
     times = []
     for i in range(rounds + 1):
         own = []
         for scene in loaded:
             start = time.perf_counter()
-            scenes.render_pass(scene, 4, i)
+            loading.render_pass(scene, 4, i)
             own.append(time.perf_counter() - start)
         times.append(own)
     ratios = [b / a for a, b in times[1:]]  # the first compiles

@@ -24,20 +24,20 @@ import mitsuba as mi
 import numpy as np
 
 import mi_diffind
-from mi_diffind.compat import use_threads
-from mi_diffind.fitting import fit
-from mi_diffind.indirection import unfolded
+from mi_diffind.arrays.indirection import unfolded
+from mi_diffind.arrays.tables import save_table
+from mi_diffind.core.compat import use_threads
+from mi_diffind.fitting.loop import fit
+from mi_diffind.fitting.task import FitRequest
 from mi_diffind.maps.source import load_source
-from mi_diffind.scene_training.fit import fit_scene
-from mi_diffind.scene_training.problem import SceneProblem
-from mi_diffind.scene_training.recipe import SceneRecipe
-from mi_diffind.scene_training.reference_renders import ReferenceRenders
-from mi_diffind.scene_training.stored_texture import texture_problem
-from mi_diffind.scene_training.trained_scene import TrainedScene
-from mi_diffind.scene_training.views import View, ViewDistribution
-from mi_diffind.scenes import ParsedScene
-from mi_diffind.tables import save_table
-from mi_diffind.task import FitRequest
+from mi_diffind.scenes.loading import ParsedScene
+from mi_diffind.scenes.training.fit import fit_scene
+from mi_diffind.scenes.training.problem import SceneProblem
+from mi_diffind.scenes.training.recipe import SceneRecipe
+from mi_diffind.scenes.training.reference_renders import ReferenceRenders
+from mi_diffind.scenes.training.stored_texture import texture_problem
+from mi_diffind.scenes.training.trained_scene import TrainedScene
+from mi_diffind.scenes.training.views import View, ViewDistribution
 from mi_diffind.tasks.texture.compressed import load
 from mi_diffind.tasks.texture.training import rounded
 
@@ -361,7 +361,7 @@ def several(folder: Path, count=60) -> dict:
     sun = {"type": "directional", "direction": [0.3, 0.5, -1], "irradiance": {"type": "rgb", "value": 2.5}}
     result = {}
 
-    def train(name: str, files: list, **more) -> mi_diffind.task.Fitted:
+    def train(name: str, files: list, **more) -> mi_diffind.fitting.task.Fitted:
         plates = {f"plate{i}": plate(file, 2 * i - 1) for i, file in enumerate(files)}
         integrator = {"type": "path", "max_depth": 2}
         scene = {"type": "scene", "integrator": integrator, "sensor": sensor, "sun": sun, **plates}

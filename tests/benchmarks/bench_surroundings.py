@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from bench_nerf import training
 
-from mi_diffind.files import write_json
+from mi_diffind.core.files import write_json
 from mi_diffind.measure.clock import machine
 from mi_diffind.tasks.radiance.surroundings import inner_cube
 from mi_diffind.tasks.radiance.views import load_views

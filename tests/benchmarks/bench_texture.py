@@ -24,7 +24,7 @@ import mitsuba as mi
 import numpy as np
 
 import mi_diffind
-from mi_diffind.compat import use_threads
+from mi_diffind.core.compat import use_threads
 from mi_diffind.measure.bsdf import bsdf_queries, directions, noise_texture
 from mi_diffind.measure.clock import machine, timed, total
 from mi_diffind.measure.operations import count_query

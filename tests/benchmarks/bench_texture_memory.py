@@ -45,7 +45,7 @@ def child(kind: str, folder: Path) -> None:
     import mi_diffind  # noqa: F401
 
     mi.set_variant("llvm_ad_rgb")
-    from mi_diffind.scenes import footprint
+    from mi_diffind.scenes.loading import footprint
 
     quads = {}
     for i in range(COUNT):

@@ -23,12 +23,12 @@ import mitsuba as mi
 import numpy as np
 from PIL import Image
 
-from mi_diffind import scenes
-from mi_diffind.files import write_json
-from mi_diffind.poses import rotation
-from mi_diffind.runtime import use_variant
-from mi_diffind.viewer import session as viewer
-from mi_diffind.viewer.page import QUALITY
+from mi_diffind.core.files import write_json
+from mi_diffind.core.runtime import use_variant
+from mi_diffind.scenes import loading
+from mi_diffind.scenes.poses import rotation
+from mi_diffind.scenes.viewer import session as viewer
+from mi_diffind.scenes.viewer.page import QUALITY
 
 ROOT = Path(__file__).resolve().parents[2]
 SCENES = ("materials", "solids", "field")
@@ -56,7 +56,7 @@ def by_mitsuba(session, pose, seed) -> float:
     start = time.perf_counter()
     session.move_camera(pose)
     session._place()
-    images = [scenes.render_pass(side.scene, 1, seed) for side in (session.learned, session.exact) if side]
+    images = [loading.render_pass(side.scene, 1, seed) for side in (session.learned, session.exact) if side]
     for image in images:
         viewer.displayed(image.astype(np.float32))
     return time.perf_counter() - start

@@ -23,10 +23,10 @@ import time
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
-from mi_diffind.errors import DiffindError
-from mi_diffind.files import OutputError, write_json
+from mi_diffind.core.errors import DiffindError
+from mi_diffind.core.files import OutputError, write_json
+from mi_diffind.core.runtime import use_variant
 from mi_diffind.measure.clock import machine
-from mi_diffind.runtime import use_variant
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -135,7 +135,16 @@ def run_times(report: dict, save, quick: bool, variant: str) -> None:
             print(f"tradeoff {study}, {chosen} …", flush=True)
             with tempfile.TemporaryDirectory() as folder:
                 output = Path(folder) / "study.json"
-                command = [sys.executable, "-m", "mi_diffind.cli", "tradeoff", study, "--quick", "--variant", chosen]
+                command = [
+                    sys.executable,
+                    "-m",
+                    "mi_diffind.commands.cli",
+                    "tradeoff",
+                    study,
+                    "--quick",
+                    "--variant",
+                    chosen,
+                ]
                 code, text = run([*command, "--out", folder, "--json", output], "times", chosen.partition("_")[0])
                 if code == 0 and output.is_file():
                     entry["ns"][chosen] = medians(json.loads(output.read_text(encoding="utf-8")))

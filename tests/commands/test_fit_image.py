@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from mi_diffind import StoredArray, load_model
-from mi_diffind.cli import main
+from mi_diffind.arrays.tables import Table, load_table, save_table
+from mi_diffind.commands.cli import main
+from mi_diffind.core.runtime import array_module
+from mi_diffind.fitting.task import tasks
 from mi_diffind.maps.layout import Layout, MapLayout
-from mi_diffind.runtime import array_module
-from mi_diffind.tables import Table, load_table, save_table
-from mi_diffind.task import tasks
 from mi_diffind.tasks.image import presets, search, training
 from mi_diffind.tasks.image.presets import STRUCTURES
 

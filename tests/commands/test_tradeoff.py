@@ -12,7 +12,7 @@ import pytest
 from small_study import KERNELS, SETTINGS, Log, small_plan
 from variants import BACKENDS
 
-from mi_diffind.cli import main
+from mi_diffind.commands.cli import main
 from mi_diffind.measure.benchmark import BenchmarkSettings
 from mi_diffind.measure.study import Study
 from mi_diffind.studies import studies

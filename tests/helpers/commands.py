@@ -1,6 +1,6 @@
 """Commands that must fail, with one sentence."""
 
-from mi_diffind.cli import main
+from mi_diffind.commands.cli import main
 
 
 def refused(capsys, *arguments):

@@ -20,9 +20,9 @@ import numpy as np
 from limited_child import Growth, fault_of_sentence
 
 import mi_diffind
-from mi_diffind import compat
-from mi_diffind.errors import DiffindError
-from mi_diffind.runtime import array_module
+from mi_diffind.core import compat
+from mi_diffind.core.errors import DiffindError
+from mi_diffind.core.runtime import array_module
 
 #: Memory that reading a file may take: bytes, and multiples of the file's size.
 MEMORY, TIMES = 64 << 20, 20
@@ -82,8 +82,8 @@ def content(path: str):
 
 def load(path: str):
     """Return the checked table of a file of any task."""
-    from mi_diffind.tables import load_table
-    from mi_diffind.task import task_of
+    from mi_diffind.arrays.tables import load_table
+    from mi_diffind.fitting.task import task_of
 
     return task_of(load_table(path)).load(path)
 
@@ -111,7 +111,7 @@ def changed_array(path: str, original: str, untouched: list[str] | None) -> str:
 
 def table(path: str, original: str, untouched: list[str] | None, evaluate: bool = True) -> dict | None:
     """Read a table file, compare it with the original, describe it, decode it and render the plugin that reads it."""
-    from mi_diffind.task import task_of
+    from mi_diffind.fitting.task import task_of
 
     try:
         with Growth() as growth:
@@ -153,7 +153,7 @@ def refuse(error: RuntimeError, path: str) -> None:
 
 def decoded(model) -> object:
     """Return the content of a model in an ordinary format, ``None`` if there is no such format."""
-    from mi_diffind.task import Model, task_of
+    from mi_diffind.fitting.task import Model, task_of
 
     if type(model).decode is Model.decode:
         return None
@@ -170,7 +170,7 @@ def decoded(model) -> object:
 
 def rendered(task, loaded, path: str) -> str:
     """Render the plugin of a task; returns what is wrong with the picture, "" if nothing is."""
-    from mi_diffind import scenes
+    from mi_diffind.scenes import loading
 
     tag, name = task.plugin
     plugin = {"type": name, "filename": path}
@@ -187,7 +187,7 @@ def rendered(task, loaded, path: str) -> str:
     else:
         scene = scene_with({"type": "rectangle", "bsdf": plugin})
     try:
-        scene = scenes.load_dict(scene)
+        scene = loading.load_dict(scene)
     except RuntimeError as e:
         refuse(e, path)
         raise
@@ -251,7 +251,7 @@ def mesh(path: str) -> dict | None:
 
 def splats(path: str) -> dict | None:
     """Read Gaussians, and crop them."""
-    from mi_diffind.splats import Splats
+    from mi_diffind.scenes.splats import Splats
 
     loaded = bounded(lambda: Splats.read(path), path)
     names = ("centres", "scales", "quaternions", "opacities", "colours")
@@ -263,8 +263,8 @@ def splats(path: str) -> dict | None:
 
 def checkpoint(path: str, write: bool = False) -> dict | None:
     """Go on with a short training from a checkpoint; ``write``: make the checkpoint instead."""
-    from mi_diffind.fitting import FitSettings, fit
-    from mi_diffind.task import FitRequest
+    from mi_diffind.fitting.loop import FitSettings, fit
+    from mi_diffind.fitting.task import FitRequest
     from mi_diffind.tasks.ggx import TASK
 
     types = array_module("llvm")
@@ -280,7 +280,7 @@ def checkpoint(path: str, write: bool = False) -> dict | None:
 
 def command(arguments: list[str]) -> dict | None:
     """Run a command line; it has to end with an exit code and, if it is refused, in one sentence."""
-    from mi_diffind import cli
+    from mi_diffind.commands import cli
 
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):

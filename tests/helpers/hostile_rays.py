@@ -104,7 +104,7 @@ def write_fields(folder: Path) -> None:
     from radiance_fields import ball_table
     from sdf_fields import dense_table, sparse_table
 
-    from mi_diffind.tables import save_table
+    from mi_diffind.arrays.tables import save_table
 
     tables = {
         "sparse": sparse_table(), "sparse_float32": sparse_table(), "dense": dense_table(), "field": ball_table(),
@@ -121,7 +121,7 @@ def opened(mi, path: Path) -> tuple:
     """
     import drjit as dr
 
-    from mi_diffind.tables import load_table
+    from mi_diffind.arrays.tables import load_table
     from mi_diffind.tasks.radiance import TASK as RADIANCE
     from mi_diffind.tasks.radiance import march
     from mi_diffind.tasks.sdf import TASK as SDF

@@ -46,7 +46,7 @@ def main(request: dict) -> None:
     """Run one command in this process."""
     import importlib
 
-    from mi_diffind import cli
+    from mi_diffind.commands import cli
 
     if request["prepare"]:
         module, _, function = request["prepare"].partition(":")
@@ -97,11 +97,11 @@ def killed_plan():
     import drjit as dr
     import numpy as np
 
-    from mi_diffind.fitting import FitSettings, Problem
-    from mi_diffind.indirection import DifferentiableArray
+    from mi_diffind.arrays.indirection import DifferentiableArray
+    from mi_diffind.core.runtime import array_module
+    from mi_diffind.fitting.loop import FitSettings, Problem
     from mi_diffind.measure.study import FLOOR, Candidate, Case, Plan
     from mi_diffind.measure.training import ConvergenceTraining
-    from mi_diffind.runtime import array_module
 
     types = array_module("llvm")
 

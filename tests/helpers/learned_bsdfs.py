@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from mi_diffind.tables import StoredArray, Table, byte_array
+from mi_diffind.arrays.tables import StoredArray, Table, byte_array
 from mi_diffind.tasks.bsdf.model import PARAMETERS, Form
 
 SIZES = {"primary_uv": (7, 5, 2), "primary_vw": (4, 3, 1), "cascaded": (6, 5, 4, 3)}

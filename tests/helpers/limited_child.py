@@ -171,7 +171,7 @@ def fault_of_sentence(message: str) -> str:
 
 def answer_to(function, arguments: dict, log) -> dict:
     """Return the answer to one request."""
-    from mi_diffind.errors import DiffindError
+    from mi_diffind.core.errors import DiffindError
 
     log.seek(0)
     log.truncate()

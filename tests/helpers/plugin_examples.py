@@ -10,7 +10,8 @@ import drjit as dr
 import numpy as np
 from arrays import aligned
 
-from mi_diffind import compat, discovery, plugins
+from mi_diffind import plugins
+from mi_diffind.core import compat, discovery
 
 ASSETS = Path(__file__).resolve().parents[2] / "scenes" / "assets"
 

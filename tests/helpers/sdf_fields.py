@@ -3,8 +3,8 @@
 import drjit as dr
 import numpy as np
 
-from mi_diffind.compat import module_of
-from mi_diffind.lookup import clamp
+from mi_diffind.arrays.lookup import clamp
+from mi_diffind.core.compat import module_of
 from mi_diffind.tasks.sdf.field import DistanceField
 from mi_diffind.tasks.sdf.paper import edge_steps
 
@@ -117,7 +117,7 @@ def torus(p):
 
 def sparse_table(shape=torus, spacing=1 / 40, entries=256, scale=2.0, centre=(0.5, -1.0, 0.25)):
     """The table of a formula's sparse field, as ``fit sdf`` would write it; pointers have 8 bits."""
-    from mi_diffind.tables import Table
+    from mi_diffind.arrays.tables import Table
     from mi_diffind.tasks.sdf import codes, encoding, model, nodes, structure
 
     lower = np.array([-0.5, -0.5, -0.5]) - 1.5 * spacing
@@ -156,8 +156,8 @@ def sparse_table(shape=torus, spacing=1 / 40, entries=256, scale=2.0, centre=(0.
 
 def dense_table(shape=torus, half=(0.6, 0.6, 0.25), resolution=(48, 48, 20), scale=2.0, centre=(0.5, -1.0, 0.25)):
     """The table of a formula's field in two dense arrays, as ``fit sdf --preset dense`` starts."""
-    from mi_diffind.runtime import array_module
-    from mi_diffind.tables import StoredArray, Table
+    from mi_diffind.arrays.tables import StoredArray, Table
+    from mi_diffind.core.runtime import array_module
     from mi_diffind.tasks.sdf import paper
 
     upper, band = np.array(half), 0.1

@@ -7,11 +7,11 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
+from mi_diffind.arrays.tables import save_table
+from mi_diffind.core.runtime import array_module
+from mi_diffind.fitting.task import FitRequest
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import load_source
-from mi_diffind.runtime import array_module
-from mi_diffind.tables import save_table
-from mi_diffind.task import FitRequest
 from mi_diffind.tasks.texture import training
 from mi_diffind.tasks.texture.memory_budget import TextureBudget, parse_structure
 from mi_diffind.tasks.texture.presets import PRESETS

@@ -6,9 +6,9 @@ import signal
 import drjit as dr
 from variants import BACKENDS
 
+from mi_diffind.core.runtime import array_module
 from mi_diffind.measure.benchmark import BenchmarkSettings
 from mi_diffind.measure.study import FLOOR, Candidate, Case, Job, Plan
-from mi_diffind.runtime import array_module
 
 SETTINGS = BenchmarkSettings(lanes=1024, rounds=4, passes=3, samples=100)
 

@@ -3,9 +3,9 @@
 import numpy as np
 from arrays import aligned
 
+from mi_diffind.arrays.tables import save_table
+from mi_diffind.core.runtime import array_module
 from mi_diffind.maps.pyramid import Pyramid
-from mi_diffind.runtime import array_module
-from mi_diffind.tables import save_table
 from mi_diffind.tasks.texture import memory_budget, training
 from mi_diffind.tasks.texture.compressed import CompressedTexture, to_table
 from mi_diffind.tasks.texture.nets import neutral_extras

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from arrays import aligned
 
-from mi_diffind import compat
+from mi_diffind.core import compat
 
 #: Components of a footprint that no render should produce, and some that are merely extreme.
 WRONG = (0.0, 1.0, -1.0, 1e-20, -0.0, 1e20, 3e38, -3e38, math.nan, math.inf, -math.inf)

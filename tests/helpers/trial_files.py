@@ -1,4 +1,4 @@
-"""Small valid files of every task, from the fits that each task declares (:attr:`mi_diffind.task.Task.trials`).
+"""Small valid files of every task, from the fits that each task declares (:attr:`mi_diffind.fitting.task.Task.trials`).
 
 Some of these fits take minutes: their files are kept in ``tests/trust/corpus/seeds``, which ``python
 tests/trust/run.py --seeds`` writes anew.
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_diffind.task import DATA, Task, tasks
+from mi_diffind.fitting.task import DATA, Task, tasks
 
 SEEDS = Path(__file__).resolve().parents[1] / "trust" / "corpus" / "seeds"
 

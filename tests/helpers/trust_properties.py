@@ -230,7 +230,7 @@ def field_furnace(mi, parts: dict, effort: Effort) -> Cell:
     """Return the cell of a fog of radiance 1 around a white ball."""
     import radiance_fields
 
-    from mi_diffind import compat
+    from mi_diffind.core import compat
 
     fog = radiance_fields.Fog(compat.module_of(mi.Float), 0.8, (1.0, 1.0, 1.0))
     radiance_fields.register(mi, {"white": fog}, "furnace_field")

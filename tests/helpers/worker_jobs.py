@@ -7,7 +7,7 @@ import signal
 import time
 from pathlib import Path
 
-from mi_diffind.errors import UsageError
+from mi_diffind.core.errors import UsageError
 from mi_diffind.tasks.bsdf import contact_sheet, energy, library, mixture, starts, training
 
 _fit_material = library.fit_material

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from mi_diffind.core.runtime import array_module
 from mi_diffind.maps import as_seen
 from mi_diffind.maps.source import from_arrays
-from mi_diffind.runtime import array_module
 
 LLVM = array_module("llvm")
 

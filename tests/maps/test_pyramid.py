@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from arrays import aligned, numpy_of
 
+from mi_diffind.core.runtime import array_module
 from mi_diffind.maps.layout import Layout
 from mi_diffind.maps.pyramid import Pyramid, halved, level_sizes
 from mi_diffind.maps.source import from_arrays
-from mi_diffind.runtime import array_module
 
 
 @pytest.fixture(scope="module")

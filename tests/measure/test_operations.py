@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from variants import BACKENDS
 
+from mi_diffind.core.runtime import array_module
 from mi_diffind.measure.operations import FLOPS, Operations, bsdf_operations, count, count_ir
-from mi_diffind.runtime import array_module
 
 LANES = 64
 

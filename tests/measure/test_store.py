@@ -6,7 +6,7 @@ import os
 import numpy as np
 import pytest
 
-from mi_diffind.files import OutputError
+from mi_diffind.core.files import OutputError
 from mi_diffind.measure.store import Store, fingerprint, models_folder, sources
 
 KEY = {"settings": {"rounds": 3, "sides": (1, 2)}, "machine": "here", "limit": float("nan")}

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from variants import BACKENDS
 
-from mi_diffind.fitting import FitSettings, Problem
-from mi_diffind.indirection import DifferentiableArray
+from mi_diffind.arrays.indirection import DifferentiableArray
+from mi_diffind.core.runtime import array_module
+from mi_diffind.fitting.loop import FitSettings, Problem
 from mi_diffind.measure.training import GAIN, ConvergenceTraining
-from mi_diffind.runtime import array_module
 
 SETTINGS = FitSettings(steps=10, batch=64, lr=1e-2, schedule="constant", seed=3, deterministic=False)
 

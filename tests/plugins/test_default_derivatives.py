@@ -12,8 +12,8 @@ from learned_bsdfs import handmade
 from radiance_fields import ball_table
 from sdf_fields import sparse_table
 
+from mi_diffind.arrays.tables import save_table
 from mi_diffind.maps.source import from_arrays
-from mi_diffind.tables import save_table
 
 COUNT = 20_000
 

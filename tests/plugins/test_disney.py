@@ -12,7 +12,7 @@ from gradients import gradients_enabled
 from variants import set_variant
 
 from mi_diffind import StoredArray
-from mi_diffind.tables import save_table
+from mi_diffind.arrays.tables import save_table
 from mi_diffind.tasks.disney import TASK
 
 #: Every version of the model in Mitsuba.

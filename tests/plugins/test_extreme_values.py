@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import texture_files
 
-from mi_diffind import compat
+from mi_diffind.arrays.tables import load_table, save_table
+from mi_diffind.core import compat
 from mi_diffind.maps.source import from_arrays
-from mi_diffind.tables import load_table, save_table
 
 ALLOWED = "allowed in a scene are -1e+09 to 1e+09"
 
@@ -27,8 +27,8 @@ def file(tmp_path_factory):
 @pytest.fixture(scope="module")
 def image_file(tmp_path_factory):
     """An image of which all channels are constant, of the task ``image``."""
+    from mi_diffind.arrays.tables import Table
     from mi_diffind.maps.layout import Layout, MapLayout
-    from mi_diffind.tables import Table
 
     where = (("constant", 0.5),) * 3
     layout = Layout(8, 8, (MapLayout("albedo", "albedo", "srgb", 1, where),), (), ())

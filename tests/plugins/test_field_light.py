@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from radiance_fields import Fog, register
 
-from mi_diffind import compat, plugins
+from mi_diffind import plugins
+from mi_diffind.core import compat
 
 #: Half of the sides of boxes that are opaque within a hundredth of them.
 HALF = (0.3, 0.5, 0.2)

@@ -13,8 +13,8 @@ import numpy as np
 import plugin_examples as examples
 import pytest
 
-from mi_diffind import compat
-from mi_diffind.tables import save_table
+from mi_diffind.arrays.tables import save_table
+from mi_diffind.core import compat
 
 #: Seed of all pictures that are compared.
 SEED = 3

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from sdf_fields import sparse_table
 
-from mi_diffind.tables import save_table
+from mi_diffind.arrays.tables import save_table
 
 SIZE, FAR = 48, 1e4
 

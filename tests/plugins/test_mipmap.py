@@ -13,11 +13,11 @@ from arrays import aligned, numpy_of
 from texture_scenes import WRONG, linear
 from variants import set_variant
 
-from mi_diffind import scenes
-from mi_diffind.compat import module_of
+from mi_diffind.core.compat import module_of
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.measure.operations import count
+from mi_diffind.scenes import loading
 
 SIZE = WIDTH, HEIGHT = 24, 16
 
@@ -629,7 +629,7 @@ def test_report(mi_rgb, file):
     assert off["footprint"] == [] and off["effects_left_out"]["footprint"] == "the filter is off"
     text = str(mi.load_dict(plugin(file, "stochastic", max_anisotropy=8, **SENSOR(mi))))
     assert "MipMap[" in text and "filter = stochastic, at most 8 taps, a perspective sensor" in text
-    assert scenes.learned_instances(texture_scenes.plane(mi, plugin(file))) == []
+    assert loading.learned_instances(texture_scenes.plane(mi, plugin(file))) == []
 
 
 def test_words_of_bitmap(mi_rgb, file):

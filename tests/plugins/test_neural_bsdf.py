@@ -10,7 +10,7 @@ from learned_bsdfs import formula, handmade
 from variants import VARIANTS, set_variant
 
 import mi_diffind
-from mi_diffind.tables import StoredArray, load_table, save_table
+from mi_diffind.arrays.tables import StoredArray, load_table, save_table
 
 LIBRARY = Path(__file__).resolve().parents[2] / "scenes" / "assets" / "library"
 

@@ -8,7 +8,7 @@ from learned_bsdfs import formula, handmade_family, member
 from variants import VARIANTS, set_variant
 
 import mi_diffind
-from mi_diffind.tables import load_table, save_table
+from mi_diffind.arrays.tables import load_table, save_table
 
 
 @pytest.fixture(scope="module")

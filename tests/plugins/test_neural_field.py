@@ -6,7 +6,8 @@ import pytest
 from radiance_fields import Bumps, Fog, ball_table, register
 from scipy.ndimage import gaussian_filter
 
-from mi_diffind import compat, plugins
+from mi_diffind import plugins
+from mi_diffind.core import compat
 
 #: Density and radiance of the fog.
 DENSITY, HUE = 0.8, np.array([0.2, 0.5, 0.8])
@@ -690,7 +691,7 @@ def test_what_is_refused(mi_rgb, fields, more, message):
 @pytest.fixture(scope="module")
 def file(tmp_path_factory):
     """A small field: a ball that is red to the left and blue to the right, in half precision."""
-    from mi_diffind.tables import save_table
+    from mi_diffind.arrays.tables import save_table
 
     path = tmp_path_factory.mktemp("field") / "ball.npz"
     save_table(path, ball_table())
@@ -699,7 +700,7 @@ def file(tmp_path_factory):
 
 def test_a_file_in_a_scene(mi_rgb, file, tmp_path):
     """As the field that it holds; depths and what is nested are known to the commands."""
-    from mi_diffind import scenes
+    from mi_diffind.scenes import loading
     from mi_diffind.tasks.radiance import TASK
 
     mi = mi_rgb
@@ -717,16 +718,16 @@ def test_a_file_in_a_scene(mi_rgb, file, tmp_path):
     inner = """<integrator type="neural_field"><string name="filename" value="ball.npz"/>
         <transform name="to_world"><translate y="4"/></transform></integrator>"""
     (tmp_path / "two.xml").write_text(text.replace("INNER", inner))
-    assert scenes.ParsedScene(tmp_path / "two.xml").path_integrator() == ("neural_field", -1)
-    assert len(scenes.load(tmp_path / "two.xml", longest_path=3).integrator().fields) == 2
-    assert scenes.ParsedScene(tmp_path / "scene.xml").path_integrator() == ("neural_field", -1)
-    assert scenes.ParsedScene(tmp_path / "nested.xml").path_integrator() == ("prb", 3)
-    loaded = scenes.load(tmp_path / "scene.xml", longest_path=2)
+    assert loading.ParsedScene(tmp_path / "two.xml").path_integrator() == ("neural_field", -1)
+    assert len(loading.load(tmp_path / "two.xml", longest_path=3).integrator().fields) == 2
+    assert loading.ParsedScene(tmp_path / "scene.xml").path_integrator() == ("neural_field", -1)
+    assert loading.ParsedScene(tmp_path / "nested.xml").path_integrator() == ("prb", 3)
+    loaded = loading.load(tmp_path / "scene.xml", longest_path=2)
     assert loaded.integrator().surfaces.max_depth == 2
     image = render(mi, loaded, 4)
     assert image[8, 8, 3] > 0.99 and image[0, 0, 3] == 0
     assert image[8, 5, 0] > 2 * image[8, 5, 2] > 0 and image[8, 10, 2] > 2 * image[8, 10, 0] > 0
-    assert np.abs(render(mi, scenes.load(tmp_path / "nested.xml"), 4) - image).max() < 1e-5
+    assert np.abs(render(mi, loading.load(tmp_path / "nested.xml"), 4) - image).max() < 1e-5
     report = plugins.report(loaded.integrator())
     assert report["table_bytes"] > 0 and report["surfaces"] == "PathFootprint"
     register(mi, {"file": TASK.open(mi.TensorXf, file).field})
@@ -754,7 +755,7 @@ def test_arrays_of_a_file_can_be_optimised(mi_rgb, fields, file):
 
 def test_reflections_of_a_file(mi_rgb, fields, file, tmp_path):
     """They change with the environment, and derivatives reach it, the normals, and the place of the field."""
-    from mi_diffind.tables import save_table
+    from mi_diffind.arrays.tables import save_table
     from mi_diffind.tasks.radiance import TASK, files, reflection
 
     mi = mi_rgb

@@ -23,10 +23,11 @@ from half_vectors import HalfVectorSampling
 from spheres import key_of, sphere_scene
 from variants import VARIANTS, set_variant
 
-from mi_diffind import comparison, compat, scenes
-from mi_diffind.bounds import ValueBounds
+from mi_diffind.arrays.bounds import ValueBounds
+from mi_diffind.arrays.tables import StoredArray, save_table
+from mi_diffind.core import compat
 from mi_diffind.measure.operations import bsdf_operations
-from mi_diffind.tables import StoredArray, save_table
+from mi_diffind.scenes import comparison, loading
 from mi_diffind.tasks.disney import TASK as DISNEY
 from mi_diffind.tasks.ggx import TASK
 from mi_diffind.tasks.ggx.files import encoding_of
@@ -1277,7 +1278,7 @@ def test_many_materials(mi_rgb, rng, count):
         bsdfs.append({**forms[kind % 5], **m})
     size = 4 * columns
     scene = sphere_scene(mi, bsdfs, "direct", size, columns)
-    assert len(scenes.learned_instances(scene)) == count
+    assert len(loading.learned_instances(scene)) == count
     image = mi.render(scene, spp=4).numpy()
     assert np.isfinite(image).all() and image.min() >= 0
     assert np.array_equal(image, mi.render(scene, spp=4).numpy())
@@ -1491,12 +1492,12 @@ def scene_file(tmp_path):
 def test_a_scene_and_its_exact_counterpart(mi_rgb, scene_file):
     """``scenes.load(exact=True)`` swaps the plugin, drops what only it takes and names the distribution."""
     mi = mi_rgb
-    exact = scenes.load(scene_file, exact=True)
+    exact = loading.load(scene_file, exact=True)
     text, distribution = str(exact), '<string name="distribution" value="ggx"/>'
     assert "NeuralGGX" not in text  # a twosided one has two sides
     assert text.count("RoughConductor[") == text.count("distribution = ggx") == 4
-    assert not scenes.learned_instances(exact)
-    written = scenes.load(scene_file)
+    assert not loading.learned_instances(exact)
+    written = loading.load(scene_file)
     assert str(written).count("NeuralGGX[") == 4 and "RoughConductor" not in str(written)
     by_hand = re.sub('<string name="(storage|preset)" value="[a-z0-9]*"/>', "", SCENE)
     by_hand = re.sub('type="neural_ggx" (id="[a-z]*")>', r'type="roughconductor" \1>' + distribution, by_hand)
@@ -1515,18 +1516,18 @@ def test_comparison(mi_rgb, scene_file):
 
 
 def test_what_is_known_of_a_scene(mi_rgb, scene_file):
-    learned = scenes.ParsedScene(scene_file).learned_plugins()
+    learned = loading.ParsedScene(scene_file).learned_plugins()
     assert [entry["id"] for entry in learned] == ["copper", "gold", "checked"]
     assert learned[0]["parameters"] == {"material": "Cu", "alpha": pytest.approx(0.15)}
     assert learned[0]["storage"] == "uint8" and learned[2]["parameters"]["alpha"] == "texture"
-    reports = {report["id"]: report for report in scenes.reports(scenes.load(scene_file))}
+    reports = {report["id"]: report for report in loading.reports(loading.load(scene_file))}
     assert reports["copper"]["effects_left_out"] == {"specular_reflectance": "is not given"}
     assert reports["checked"]["evaluated_once"] == [] and reports["gold"]["evaluated_once"] == ["roughness"]
     assert reports["copper"]["operations"]["eval"]["flops"] > 0
 
 
 def test_same_scene_same_image(mi_rgb, scene_file):
-    first, second = (scenes.render(scenes.load(scene_file), 4, seed=3, passes=2)[0] for _ in range(2))
+    first, second = (loading.render(loading.load(scene_file), 4, seed=3, passes=2)[0] for _ in range(2))
     assert np.array_equal(first, second)
 
 
@@ -1585,8 +1586,8 @@ def test_bad_files_are_refused(mi_rgb, tmp_path):
 
 def test_a_mistake_in_a_scene_names_the_file(mi_rgb, scene_file):
     scene_file.write_text(SCENE.replace('"0.4"', '"1.4"'))
-    with pytest.raises(scenes.SceneError, match=r'metals\.xml.*parameter "alpha": found 1.4, allowed is \[0, 1\]'):
-        scenes.load(scene_file)
+    with pytest.raises(loading.SceneError, match=r'metals\.xml.*parameter "alpha": found 1.4, allowed is \[0, 1\]'):
+        loading.load(scene_file)
 
 
 def test_scalar_variants_are_refused():

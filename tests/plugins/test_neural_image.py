@@ -20,11 +20,12 @@ from scipy.ndimage import map_coordinates
 from texture_scenes import alive, check_process, refused, scene_xml
 from variants import VARIANTS, set_variant, warnings_of
 
-from mi_diffind import comparison, compat, scenes
+from mi_diffind.arrays.tables import StoredArray, Table, load_table, save_table
+from mi_diffind.core import compat
 from mi_diffind.maps.layout import Layout, MapLayout
 from mi_diffind.maps.source import load_source
 from mi_diffind.measure.operations import bsdf_operations, count
-from mi_diffind.tables import StoredArray, Table, load_table, save_table
+from mi_diffind.scenes import comparison, loading
 from mi_diffind.tasks.ggx import TASK as GGX
 from mi_diffind.tasks.image import TASK
 from mi_diffind.tasks.image.compressed import CompressedImage
@@ -970,7 +971,7 @@ def test_exact_counterpart(variant, material):
     """The same scene as with the images themselves, where there is a file for each; and it can be compared."""
     mi = set_variant(variant)
     folder, _, orm = material
-    exact = scenes.load(folder / "scene.xml", exact=True)
+    exact = loading.load(folder / "scene.xml", exact=True)
     mi.Bitmap(np.ascontiguousarray(orm[..., 1:2])).write(str(folder / "roughness.png"))
     textures = (
         '<texture type="bitmap" name="base_color"><string name="filename" value="albedo.png"/></texture>'
@@ -978,7 +979,7 @@ def test_exact_counterpart(variant, material):
         '<boolean name="raw" value="true"/><string name="wrap_mode" value="mirror"/></texture>'
     )
     (folder / "stock.xml").write_text(wall_xml("principled", textures))
-    stock = scenes.load(folder / "stock.xml")
+    stock = loading.load(folder / "stock.xml")
     np.testing.assert_array_equal(mi.render(exact, spp=8).numpy(), mi.render(stock, spp=8).numpy())
     if not mi.is_rgb:
         return
@@ -996,7 +997,7 @@ def test_exact_counterpart_of_a_given_source(mi_rgb, material, rng):
     for source, raw in (("albedo.png", ""), ("wall.json", ""), ("albedo.png", '<boolean name="raw" value="true"/>')):
         xml = texture_xml("reflectance", "wall.npz", raw, channels="albedo", source=source)
         (folder / "b.xml").write_text(wall_xml("diffuse", xml))
-        exact = scenes.load(folder / "b.xml", exact=True).shapes()[0].bsdf()
+        exact = loading.load(folder / "b.xml", exact=True).shapes()[0].bsdf()
         bitmap = mi.load_dict({"type": "bitmap", "bitmap": mi.Bitmap(albedo), "raw": bool(raw)})
         si = interactions(mi, *rng.random((2, 100)))
         np.testing.assert_array_equal(exact.eval_diffuse_reflectance(si).numpy(), bitmap.eval(si).numpy())
@@ -1019,9 +1020,9 @@ def test_exact_counterpart_without_a_source(mi_rgb, material, tmp_path):
         more = {} if given is None else {"source": given}
         xml = texture_xml("alpha", "wall.npz", channels="roughness", **more)
         (tmp_path / "s.xml").write_text(wall_xml("roughconductor", xml))
-        scenes.load(tmp_path / "s.xml")  # as written it needs none
-        with pytest.raises(scenes.SceneError) as e:
-            scenes.load(tmp_path / "s.xml", exact=True)
+        loading.load(tmp_path / "s.xml")  # as written it needs none
+        with pytest.raises(loading.SceneError) as e:
+            loading.load(tmp_path / "s.xml", exact=True)
         cases.append((expected, sentence(e.value)))
     for expected, found in cases:
         assert expected in found
@@ -1038,13 +1039,13 @@ def test_exact_counterpart_elsewhere(mi_rgb, material, tmp_path):
         table.settings["source"] = recorded
         save_table(tmp_path / "elsewhere.npz", table)
         if recorded == digest:
-            exact = scenes.load(tmp_path / "s.xml", exact=True).shapes()[0].bsdf()
+            exact = loading.load(tmp_path / "s.xml", exact=True).shapes()[0].bsdf()
             bitmap = mi_rgb.load_dict({"type": "bitmap", "bitmap": mi_rgb.Bitmap(albedo)})
             si = interactions(mi_rgb, np.float32([0.2, 0.7]), np.float32([0.4, 0.1]))
             np.testing.assert_array_equal(exact.eval_diffuse_reflectance(si).numpy(), bitmap.eval(si).numpy())
         else:
-            with pytest.raises(scenes.SceneError, match="has changed since"):
-                scenes.load(tmp_path / "s.xml", exact=True)
+            with pytest.raises(loading.SceneError, match="has changed since"):
+                loading.load(tmp_path / "s.xml", exact=True)
 
 
 # -- what scenes do to a texture ---------------------------------------------------------------------------------------

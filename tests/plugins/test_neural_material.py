@@ -14,10 +14,11 @@ from arrays import aligned
 from texture_files import make
 
 import mi_diffind
-from mi_diffind import plugins, scenes
+from mi_diffind import plugins
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.measure.operations import bsdf_operations
 from mi_diffind.plugins.support import footprint
+from mi_diffind.scenes import loading
 
 WIDTH, HEIGHT = 32, 16
 
@@ -460,10 +461,10 @@ def test_counterparts(mi_rgb, rng, tmp_path):
         name="height" value="4"/></film></sensor><shape type="rectangle"><bsdf type="neural_material"><string
         name="filename" value="paint.npz"/><boolean name="two_sided" value="true"/><float name="clearcoat"
         value="0.5"/><float name="clearcoat_sampling_rate" value="2"/></bsdf></shape></scene>""")
-    written = mi.render(scenes.load(tmp_path / "scene.xml"), spp=64).numpy()
+    written = mi.render(loading.load(tmp_path / "scene.xml"), spp=64).numpy()
     for against in ("exact", "mipmap", "principled"):
-        scene = scenes.load(tmp_path / "scene.xml", exact=True, against=against)
-        assert not [r for r in scenes.reports(scene) if r["plugin"].startswith("neural")]
+        scene = loading.load(tmp_path / "scene.xml", exact=True, against=against)
+        assert not [r for r in loading.reports(scene) if r["plugin"].startswith("neural")]
         image = mi.render(scene, spp=64).numpy()
         np.testing.assert_allclose(image, written, rtol=0.05 if against == "principled" else 2e-3)
     assert plugins.declared()["neural_material"].counterpart().oversampling == 8

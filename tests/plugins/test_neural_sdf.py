@@ -14,9 +14,11 @@ from arrays import aligned
 from sdf_fields import dense_table, sparse_table, torus
 from variants import warnings_of
 
-from mi_diffind import compat, plugins, scenes
-from mi_diffind.scenes import SceneError
-from mi_diffind.tables import load_table, save_table
+from mi_diffind import plugins
+from mi_diffind.arrays.tables import load_table, save_table
+from mi_diffind.core import compat
+from mi_diffind.scenes import loading
+from mi_diffind.scenes.loading import SceneError
 from mi_diffind.tasks.sdf.mesh import load_mesh
 
 SCALE, CENTRE = 2.0, (0.5, -1.0, 0.25)
@@ -170,7 +172,7 @@ def test_reports(mi_rgb, folder):
         "b": shape(folder, id="b", trace="grid", resolution=24),
         "c": shape(folder, id="c", trace="grid", resolution=24, to_world=turned),
     })  # fmt: skip
-    result = {entry["trace"] + str("to_world" in entry["parameters"]): entry for entry in scenes.reports(loaded)}
+    result = {entry["trace"] + str("to_world" in entry["parameters"]): entry for entry in loading.reports(loaded)}
     assert set(result) == {"arraysFalse", "gridFalse", "gridTrue"}
     assert result["arraysFalse"]["table_bytes"] < 100_000 and result["arraysFalse"]["index_bytes"] > 0
     turned = result["gridTrue"]
@@ -335,7 +337,7 @@ def grid_of(mi, file, **more):
     loaded = as_grid(mi, file, **more)
     values = np.array(mi.traverse(loaded)["a.grid"])[..., 0]
     box = loaded.bbox()
-    (report,) = scenes.reports(loaded)
+    (report,) = loading.reports(loaded)
     return report, values, np.array(box.min), np.array(box.max)
 
 
@@ -432,7 +434,7 @@ def test_images_of_grids_are_those_of_arrays(mi_rgb, folder):
     for trace in ("arrays", "grid"):
         loaded = scene(mi_rgb, {"torus": shape(folder, trace=trace)})
         images.append(np.array(mi_rgb.render(loaded, spp=64, seed=1)))
-    assert scenes.reports(loaded)[0]["resolution"] < 80
+    assert loading.reports(loaded)[0]["resolution"] < 80
     assert np.abs(images[0] - images[1]).mean() < 1e-3 < np.abs(images[0] - images[0].mean()).mean() / 20
 
 
@@ -535,9 +537,9 @@ def test_other_integrators_see_a_grid(mi_rgb, folder, tmp_path, monkeypatch, xml
     """If the scene says nothing; one line tells what that takes."""
     warned = warnings_of(mi_rgb, monkeypatch)
     path = written(folder, tmp_path, '<integer name="resolution" value="40"/>', xml)
-    for load in (scenes.load, scenes.load_file):
+    for load in (loading.load, loading.load_file):
         loaded = load(path)
-        (report,) = scenes.reports(loaded)
+        (report,) = loading.reports(loaded)
         assert report["trace"] == "grid" and warned.pop().endswith(report["decoded"]) and not warned
         ray = mi_rgb.Ray3f(mi_rgb.Point3f(CENTRE[0] + 0.76, CENTRE[1], 5), mi_rgb.Vector3f(0, 0, -1))
         assert dr.all(loaded.ray_test(ray))
@@ -547,14 +549,14 @@ def test_other_integrators_see_a_grid(mi_rgb, folder, tmp_path, monkeypatch, xml
 def test_our_integrator_sees_arrays(mi_rgb, folder, tmp_path, monkeypatch, xml):
     """Also within another one."""
     warned = warnings_of(mi_rgb, monkeypatch)
-    for load in (scenes.load, scenes.load_file):
-        (report,) = scenes.reports(load(written(folder, tmp_path, "", xml)))
+    for load in (loading.load, loading.load_file):
+        (report,) = loading.reports(load(written(folder, tmp_path, "", xml)))
         assert report["trace"] == "arrays" and not warned
 
 
 def test_commands_tell_what_a_grid_takes(mi_rgb, folder, tmp_path, capsys):
     """Once, on stderr, where they keep Mitsuba's log quiet."""
-    from mi_diffind.cli import main
+    from mi_diffind.commands.cli import main
 
     path = written(folder, tmp_path, '<integer name="resolution" value="40"/>', STOCK[0])
     assert main(["render", str(path), "-o", str(tmp_path / "a.exr"), "--spp", "1", "--variant", mi_rgb.variant()]) == 0
@@ -566,8 +568,8 @@ def test_scenes_without_an_integrator(mi_rgb, folder, tmp_path, monkeypatch):
     """Commands that need none take ``path``; in Python, another one may be meant."""
     warned = warnings_of(mi_rgb, monkeypatch)
     path = written(folder, tmp_path)
-    assert scenes.reports(scenes.load(path))[0]["trace"] == "grid" and len(warned) == 1
-    assert scenes.reports(scenes.load_file(path))[0]["trace"] == "arrays"
+    assert loading.reports(loading.load(path))[0]["trace"] == "grid" and len(warned) == 1
+    assert loading.reports(loading.load_file(path))[0]["trace"] == "arrays"
     assert 'is seen by the integrator "path_sdf" alone, found none' in warned[1]
 
 
@@ -578,11 +580,11 @@ def test_arrays_that_other_integrators_do_not_see(mi_rgb, folder, tmp_path, monk
     warned = warnings_of(mi_rgb, monkeypatch)
     path = written(folder, tmp_path, more, xml)
     with pytest.raises(SceneError, match=r'"ring".*"path_sdf".*found.*"path"'):
-        scenes.load(path)
-    assert scenes.reports(scenes.load_file(path))[0]["trace"] == "arrays" and len(warned) == 1
-    loaded = scenes.load(written(folder, tmp_path, more, TRACED))
+        loading.load(path)
+    assert loading.reports(loading.load_file(path))[0]["trace"] == "arrays" and len(warned) == 1
+    loaded = loading.load(written(folder, tmp_path, more, TRACED))
     assert len(loaded.shapes()) == 1
-    mesh = scenes.load(path, exact=True).shapes()[0]
+    mesh = loading.load(path, exact=True).shapes()[0]
     assert mesh.face_count() == 96 * 48 * 2 and type(mesh) is mi_rgb.Mesh
 
 
@@ -595,10 +597,10 @@ def test_mesh_elsewhere(mi_rgb, folder, tmp_path):
         save_table(tmp_path / "torus.npz", table)
         path = written(tmp_path, tmp_path)
         if recorded == digest:
-            assert scenes.load(path, exact=True).shapes()[0].face_count() == 96 * 48 * 2
+            assert loading.load(path, exact=True).shapes()[0].face_count() == 96 * 48 * 2
         else:
             with pytest.raises(SceneError, match="has changed since"):
-                scenes.load(path, exact=True)
+                loading.load(path, exact=True)
 
 
 def test_load_file_takes_what_mitsuba_takes(mi_rgb, folder, tmp_path):
@@ -609,12 +611,12 @@ def test_load_file_takes_what_mitsuba_takes(mi_rgb, folder, tmp_path):
         '<default name="n" value="3"/>' + integrator("path_sdf", '<integer name="max_depth" value="$n"/>'),
     )
     for parallel in (True, False):
-        loaded = scenes.load_file(path, parallel=parallel, optimize=False, n=7)
+        loaded = loading.load_file(path, parallel=parallel, optimize=False, n=7)
         assert loaded.integrator().max_depth == 7
     with pytest.raises(RuntimeError, match=r"none\.xml"):
-        scenes.load_file(tmp_path / "none.xml")
+        loading.load_file(tmp_path / "none.xml")
     with pytest.raises(RuntimeError, match="unused"):
-        scenes.load_file(path, unused=1)
+        loading.load_file(path, unused=1)
 
 
 def test_plugin_is_declared(mi_rgb):

@@ -16,13 +16,13 @@ from arrays import aligned, numpy_of
 from texture_files import make
 from texture_scenes import WRONG, linear
 
-from mi_diffind import scenes
-from mi_diffind.compat import module_of
+from mi_diffind.arrays.tables import load_table, save_table
+from mi_diffind.core.compat import module_of
 from mi_diffind.maps.layout import Layout
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays, load_source
 from mi_diffind.measure.operations import bsdf_operations, count
-from mi_diffind.tables import load_table, save_table
+from mi_diffind.scenes import loading
 from mi_diffind.tasks.texture import TASK
 from mi_diffind.tasks.texture.compressed import CompressedTexture, to_table
 
@@ -84,7 +84,7 @@ def test_counterparts_of_images_with_names(mi_rgb, tmp_path, rng, name):
     texture = plugin(make(tmp_path / "a.npz", load_source(path)), "off", "image", source=str(path))
     bsdf = {"type": "diffuse", "reflectance": texture}
     parsed, uv = (
-        scenes.ParsedScene({"type": "scene", "shape": {"type": "rectangle", "bsdf": bsdf}}),
+        loading.ParsedScene({"type": "scene", "shape": {"type": "rectangle", "bsdf": bsdf}}),
         rng.random((2, 500)),
     )
     values = []
@@ -509,19 +509,19 @@ def test_counterparts(mi_rgb, tmp_path):
         (tmp_path / "scene.xml").write_text(scene)
         bitmap = {"type": "bitmap", "filename": str(tmp_path / f"{name}.png"), "raw": name == "roughness"}
         image = {**bitmap, "to_uv": mi.ScalarTransform4f().scale([3, 3, 1])}
-        exact = scenes.load(tmp_path / "scene.xml", exact=True)
+        exact = loading.load(tmp_path / "scene.xml", exact=True)
         stock = texture_scenes.plane(mi, image, shape=None, size=8)
         si = texture_scenes.hits(mi, np.random.default_rng(1).random((2, 50)), (0.05, 0), (0, 0.05))
         a, b = (s.emitters()[0] for s in (exact, stock))
         np.testing.assert_allclose(a.eval(si).numpy(), b.eval(si).numpy(), atol=1e-6)
-        levels = scenes.load(tmp_path / "scene.xml", exact=True, against="mipmap")
+        levels = loading.load(tmp_path / "scene.xml", exact=True, against="mipmap")
         (found,) = footprint.textures(levels)
         assert type(found).__name__ == "MipMap" and found.map.name in (name, "image")
-        ours = scenes.load(tmp_path / "scene.xml")
+        ours = loading.load(tmp_path / "scene.xml")
         np.testing.assert_allclose(
             ours.emitters()[0].eval(si).numpy(), levels.emitters()[0].eval(si).numpy(), atol=0.03
         )
-        (report,) = scenes.reports(ours)
+        (report,) = loading.reports(ours)
         assert (
             report["plugin"] == "neural_texture" and report["table_bytes"] == load_table(tmp_path / "wall.npz").nbytes
         )

@@ -41,9 +41,9 @@ def render(mi, loaded, integrator="path_sdf", spp=16, seed=0, **options):
 @pytest.fixture
 def fields(mi_rgb):
     """The fields that a ``test_solid`` may name."""
-    import mi_diffind.compat
+    import mi_diffind.core.compat
 
-    types = mi_diffind.compat.module_of(mi_rgb.Float)
+    types = mi_diffind.core.compat.module_of(mi_rgb.Float)
     by_name = {"ball": Ball(types), "aside": Ball(types, 0.3, (0.15, 0.1, -0.05))}
     register(mi_rgb, by_name)
     return by_name
@@ -189,7 +189,7 @@ def test_solids_in_groups_are_refused(mi_rgb, fields):
     loaded = scene(mi, {"group": group, "one": {"type": "instance", "group": {"type": "ref", "id": "group"}}})
     with pytest.raises(RuntimeError) as raised:
         render(mi, loaded)
-    from mi_diffind import compat
+    from mi_diffind.core import compat
 
     assert "is in a shapegroup" in compat.one_sentence(raised.value)
 

@@ -10,7 +10,8 @@ from pathlib import Path
 import drjit as dr
 import pytest
 
-from mi_diffind import plugins, scenes
+from mi_diffind import plugins
+from mi_diffind.scenes import loading
 
 #: A learned shape whose factory returns a native object, another of Mitsuba's, a volume, and factories that fail.
 MODULES = {
@@ -212,19 +213,19 @@ def test_plugins_of_other_packages(mi_toys, tmp_path):
     mi = mi_toys
     assert {"toy_ball", "toy_field", "toy_fog", "neural_disney"} <= set(plugins.declared())
     (tmp_path / "scene.xml").write_text(SCENE)
-    found = scenes.ParsedScene(tmp_path / "scene.xml").learned_plugins()
+    found = loading.ParsedScene(tmp_path / "scene.xml").learned_plugins()
     assert [(e["plugin"], e["id"], e.get("preset"), e.get("size")) for e in found] == [
         ("toy_ball", "ball", "paper", None), ("toy_ball", "", None, "0.25"), ("toy_field", "", None, None)
     ]  # fmt: skip
-    exact = scenes.load(tmp_path / "scene.xml", exact=True)
+    exact = loading.load(tmp_path / "scene.xml", exact=True)
     assert [shape.class_name() for shape in exact.shapes()] == ["Sphere", "Sphere", "Cube"]
-    assert scenes.instances(exact) == []
+    assert loading.instances(exact) == []
     if not plugins.supported(mi.variant()):
-        with pytest.raises(scenes.SceneError, match='"toy_ball" does not run in the variant "scalar_rgb"'):
-            scenes.load(tmp_path / "scene.xml")
+        with pytest.raises(loading.SceneError, match='"toy_ball" does not run in the variant "scalar_rgb"'):
+            loading.load(tmp_path / "scene.xml")
         return
-    scene = scenes.load(tmp_path / "scene.xml")
-    reports = scenes.reports(scene)
+    scene = loading.load(tmp_path / "scene.xml")
+    reports = loading.reports(scene)
     assert [(r["plugin"], r["id"], r.get("preset")) for r in reports[:2]] == [
         ("toy_ball", "ball", "paper"), ("toy_ball", "", "tables")
     ]  # fmt: skip
@@ -257,9 +258,9 @@ def test_volumes(mi_toys):
             mi.load_dict(scene)
         return
     loaded = mi.load_dict(scene)
-    (report,) = scenes.reports(loaded)
+    (report,) = loading.reports(loaded)
     assert (report["plugin"], report["kind"], report["preset"]) == ("toy_fog", "volume", "tables")
-    volume = scenes.instances(loaded)[0]
+    volume = loading.instances(loaded)[0]
     assert dr.allclose(volume.eval_1(dr.zeros(mi.Interaction3f)), 0.7)
 
 

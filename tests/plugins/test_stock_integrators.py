@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from radiance_fields import Fog, register
 
-from mi_diffind import compat
+from mi_diffind.core import compat
 
 ASSETS = Path(__file__).resolve().parents[2] / "scenes" / "assets"
 

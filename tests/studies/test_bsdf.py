@@ -5,9 +5,9 @@ import os
 
 import pytest
 
-from mi_diffind.cli import main
-from mi_diffind.errors import UsageError
-from mi_diffind.tradeoffs import tradeoff
+from mi_diffind.commands.cli import main
+from mi_diffind.core.errors import UsageError
+from mi_diffind.studies.tradeoffs import tradeoff
 
 
 @pytest.fixture(scope="module")

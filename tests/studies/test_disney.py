@@ -7,7 +7,7 @@ import os
 import numpy as np
 import pytest
 
-from mi_diffind.cli import main
+from mi_diffind.commands.cli import main
 from mi_diffind.measure import report
 from mi_diffind.studies.disney import REPRESENTATIONS, conclusions
 

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from mi_diffind.cli import main
-from mi_diffind.runtime import array_module
+from mi_diffind.commands.cli import main
+from mi_diffind.core.runtime import array_module
 from mi_diffind.studies.disney import networks
 
 #: Steps of a training.

@@ -10,8 +10,8 @@ import pytest
 from study_runs import quick_result
 from variants import BACKENDS, VARIANTS
 
-from mi_diffind.fitting import FitSettings, fit
-from mi_diffind.runtime import array_module
+from mi_diffind.core.runtime import array_module
+from mi_diffind.fitting.loop import FitSettings, fit
 from mi_diffind.studies.baselines.networks import Network
 from mi_diffind.studies.ggx import conclusions
 from mi_diffind.studies.ggx import plan as plans

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from mi_diffind import fitting, metrics
-from mi_diffind.cli import main
+from mi_diffind.commands.cli import main
+from mi_diffind.fitting import loop
+from mi_diffind.images import metrics
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.studies.baselines import codecs
 from mi_diffind.tasks.image import training
@@ -192,7 +193,7 @@ def test_a_run_goes_on(material, tmp_path, capfd, monkeypatch):
     """After Ctrl-C in the second training, the first is not trained again if its file exists."""
     import signal
 
-    step, seen = fitting._Trainer.take_step, []
+    step, seen = loop._Trainer.take_step, []
 
     def interrupted(self, *args):
         seen.append(self.problem.recipe)
@@ -204,7 +205,7 @@ def test_a_run_goes_on(material, tmp_path, capfd, monkeypatch):
     command += ["--out", str(tmp_path)]
     monkeypatch.setattr(codecs, "available", lambda: ())
     with monkeypatch.context() as m:
-        m.setattr(fitting._Trainer, "take_step", interrupted)
+        m.setattr(loop._Trainer, "take_step", interrupted)
         assert main(command) == 130
     assert (tmp_path / "tradeoff_image.partial.json").is_file()
     result = json.loads((tmp_path / "tradeoff_image.json").read_text())

@@ -10,7 +10,7 @@ import drjit.llvm.ad as T
 import numpy as np
 import pytest
 
-from mi_diffind.cli import main
+from mi_diffind.commands.cli import main
 from mi_diffind.measure import benchmark
 from mi_diffind.studies.baselines import node_codes, radiance_factors, radiance_fits
 from mi_diffind.studies.radiance import conclusions

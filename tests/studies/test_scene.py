@@ -12,11 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mi_diffind import metrics, scenes
-from mi_diffind.files import OutputError
+from mi_diffind.core.files import OutputError
+from mi_diffind.images import metrics
 from mi_diffind.measure import bias
 from mi_diffind.measure.statistics import finite
-from mi_diffind.scenes import SceneError
+from mi_diffind.scenes import loading
+from mi_diffind.scenes.loading import SceneError
 from mi_diffind.studies.scene import picture, report
 from mi_diffind.studies.scene import renders as study
 from mi_diffind.studies.scene.renders import VERSIONS, SceneStudySettings
@@ -89,7 +90,7 @@ class Renders(list):
     """Records the sample counts and seeds of passes; the ``stop_at``-th presses Ctrl-C."""
 
     def __init__(self, monkeypatch, stop_at=None):
-        original = scenes.render_pass
+        original = loading.render_pass
 
         def render_pass(loaded, spp, seed):
             self.append((spp, seed))
@@ -97,7 +98,7 @@ class Renders(list):
                 os.kill(os.getpid(), signal.SIGINT)
             return original(loaded, spp, seed)
 
-        monkeypatch.setattr(scenes, "render_pass", render_pass)
+        monkeypatch.setattr(loading, "render_pass", render_pass)
 
 
 def errors_of(result):
@@ -150,7 +151,7 @@ def test_a_run_from_scene_to_picture(scene, tmp_path, monkeypatch):
 def test_bias_is_that_of_converged_images(scene, whole, mi_rgb):
     """The bias, known with few samples, against the difference of two converged renders."""
     found = whole["bias"]
-    written, exact = (scenes.load(scene, exact=e) for e in (False, True))
+    written, exact = (loading.load(scene, exact=e) for e in (False, True))
     images = [mi_rgb.render(s, spp=4096, seed=77).numpy().astype(np.float64) for s in (written, exact)]
     weights = bias.weights_of(images[1])
     rmse = math.sqrt(np.mean(weights * (images[0] - images[1]) ** 2))
@@ -217,14 +218,14 @@ def test_large_images_are_rendered_in_several_launches(scene, monkeypatch):
 
 
 def test_values_that_are_not_finite_are_counted(scene, monkeypatch):
-    original = scenes.render_pass
+    original = loading.render_pass
 
     def render_pass(*arguments):
         image = original(*arguments)
         image[0, 0, 0] = math.nan
         return image
 
-    monkeypatch.setattr(scenes, "render_pass", render_pass)
+    monkeypatch.setattr(loading, "render_pass", render_pass)
     result = study.measure(scene, QUICK, progress=False)
     assert result["not_finite"] == 2 * (QUICK.passes + 2 * QUICK.rounds)
     assert math.isfinite(result["points"][0]["mse"])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import mi_diffind
-from mi_diffind.errors import UsageError
+from mi_diffind.core.errors import UsageError
 from mi_diffind.studies.scene_training import conclusions
 
 

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 import solid_meshes as solids
 
-from mi_diffind import fitting, task
-from mi_diffind.cli import main
+from mi_diffind.commands.cli import main
+from mi_diffind.fitting import loop, task
 from mi_diffind.measure import benchmark
 from mi_diffind.studies.baselines import bricks, byte_grids, direct_nodes, hash_grids, volumes
 from mi_diffind.studies.sdf import conclusions, contenders, parts
@@ -280,7 +280,7 @@ def test_hash_grid(rng):
     field = problem.field
     assert 0.8 * 40000 < field.nbytes <= 40000
     start = problem.measure(problem.net)["psnr_db"]
-    from mi_diffind.fitting import FitSettings, fit
+    from mi_diffind.fitting.loop import FitSettings, fit
 
     entries = problem.net.entries.numpy()
     fit(problem, FitSettings(seed=1, steps=80, batch=2**11, lr=1e-2, loss="mae", measure_every=80), progress=False)
@@ -392,7 +392,7 @@ def test_fields_and_meshes_are_in_one_place(finished):
 
 def test_trained_in_other_ways():
     """Nodes move in the usual training, and stay as sampled without one."""
-    settings, moved = fitting.FitSettings(steps=10, batch=2**10, lr=1e-2, measure_every=10), []
+    settings, moved = loop.FitSettings(steps=10, batch=2**10, lr=1e-2, measure_every=10), []
     for request in (task.FitRequest, parts.UntrainedRequest):
         sampled = encoding.sample(Ball(), 1 / 12)
         field = nodes.SparseNodes(T, sampled.structure, 1.0)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import mi_diffind
-from mi_diffind import fitting
-from mi_diffind.cli import main
-from mi_diffind.errors import UsageError
+from mi_diffind.commands.cli import main
+from mi_diffind.core.errors import UsageError
+from mi_diffind.fitting import loop
 from mi_diffind.studies.shading import conclusions, materials
 
 
@@ -126,8 +126,8 @@ def test_sentences_of_what_there_is(result):
 
 def test_the_zoom_is_what_the_camera_sees(mi_rgb):
     """Pixels of a frame, against a ray of a pinhole camera above the plane; points stay where they are."""
+    from mi_diffind.core.runtime import array_module
     from mi_diffind.maps.pyramid import Pyramid
-    from mi_diffind.runtime import array_module
     from mi_diffind.studies.shading import zoom
     from mi_diffind.tasks.shading.material import effects_of
 
@@ -199,7 +199,7 @@ def test_what_is_written(tmp_path, monkeypatch, capsys):
     """A whole run, interrupted in the last training and continued: finished trainings are not repeated."""
     out = tmp_path / "out"
     command = ["tradeoff", "shading", "lacquer", *COMMAND, "--out", str(out), "--json", str(tmp_path / "r.json")]
-    trained, take_step = [], fitting._Trainer.take_step
+    trained, take_step = [], loop._Trainer.take_step
 
     def counted(self, *args):
         trained.append(type(self.problem).__name__)
@@ -208,7 +208,7 @@ def test_what_is_written(tmp_path, monkeypatch, capsys):
         return take_step(self, *args)
 
     with monkeypatch.context() as m:
-        m.setattr(fitting._Trainer, "take_step", counted)
+        m.setattr(loop._Trainer, "take_step", counted)
         assert main(command) == 130
     assert (out / "tradeoff_shading.partial.json").is_file() and set(trained) == {"TextureProblem", "ShadingProblem"}
     trained.clear()
@@ -217,7 +217,7 @@ def test_what_is_written(tmp_path, monkeypatch, capsys):
         trained.append((type(self.problem).__name__, getattr(self.problem, "shading", None)))
         return take_step(self, *args)
 
-    monkeypatch.setattr(fitting._Trainer, "take_step", again)
+    monkeypatch.setattr(loop._Trainer, "take_step", again)
     assert main(command) == 0
     assert {(name, shading.share) for name, shading in trained} == {("ShadingProblem", 1.0)}
     result = json.loads((tmp_path / "r.json").read_text())

@@ -10,7 +10,7 @@ import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 from study_runs import quick_result
 
-from mi_diffind.cli import main
+from mi_diffind.commands.cli import main
 from mi_diffind.measure.report import panels
 from mi_diffind.studies.baselines import codecs
 
@@ -157,9 +157,9 @@ def test_astc_with_mip_maps():
 
 def test_levels(mi_rgb):
     """Errors of each level, and that what was decoded comes back in a pyramid of the same layout."""
+    from mi_diffind.core.runtime import array_module
     from mi_diffind.maps.pyramid import Pyramid
     from mi_diffind.maps.source import from_arrays
-    from mi_diffind.runtime import array_module
     from mi_diffind.studies.texture import levels
 
     source = from_arrays({"albedo": smooth(8, 16, 3), "ao": smooth(8, 16, 1, 1)})
@@ -227,7 +227,7 @@ def small(tmp_path, monkeypatch):
     import mitsuba as mi
 
     import mi_diffind.commands.fit  # noqa: F401  (or it would import the replacement, and keep it)
-    from mi_diffind import task
+    from mi_diffind.fitting import task
 
     mi.set_variant("llvm_ad_rgb")
     maps = {"albedo": smooth(32, 32, 3, 1), "roughness": smooth(32, 32, 1, 2)}

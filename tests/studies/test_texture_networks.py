@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from mi_diffind.cli import main
-from mi_diffind.runtime import array_module
+from mi_diffind.commands.cli import main
+from mi_diffind.core.runtime import array_module
 from mi_diffind.studies.texture import METHODS, networks
 
 
@@ -37,8 +37,8 @@ def test_a_network_takes_no_more_than_its_bytes(mi_rgb, nbytes):
 
 def test_a_network_learns_all_levels(mi_rgb):
     """After a short training, levels are those of the pyramid, in their sizes."""
-    from mi_diffind.fitting import fit
-    from mi_diffind.settings import FitSettings
+    from mi_diffind.fitting.loop import fit
+    from mi_diffind.fitting.settings import FitSettings
     from mi_diffind.studies.texture import levels
 
     problem = problem_of(12000, mi_rgb)

@@ -20,7 +20,7 @@ import mitsuba as mi
 import plugin_examples
 
 import mi_diffind
-from mi_diffind.files import write_json
+from mi_diffind.core.files import write_json
 from mi_diffind.measure import clock
 
 VARIANT = "llvm_ad_rgb"

@@ -25,8 +25,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "helpers"))
 import trust_properties as trust
 from variants import VARIANTS, set_variant
 
-from mi_diffind import compat, plugins
-from mi_diffind.files import write_json
+from mi_diffind import plugins
+from mi_diffind.core import compat
+from mi_diffind.core.files import write_json
 from mi_diffind.measure.clock import machine
 
 

@@ -22,7 +22,7 @@ import trial_files
 from limited_child import FAULTS, GOOD, LimitedChild
 
 from mi_diffind import __version__
-from mi_diffind.task import tasks
+from mi_diffind.fitting.task import tasks
 
 
 def make_seeds(only: list[str]) -> None:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from limited_child import GOOD, LimitedChild
 from trial_files import all_seeds
 
-from mi_diffind import cli
+from mi_diffind.commands import cli
 
 SCENE = """
 <scene version="3.0.0">

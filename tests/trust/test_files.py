@@ -15,7 +15,7 @@ from hostile_corpus import tiny_files
 from hostile_strategies import MUTANTS
 from limited_child import FAULTS, LimitedChild
 
-from mi_diffind.task import tasks
+from mi_diffind.fitting.task import tasks
 
 TABLES = campaigns.tables()
 
@@ -51,7 +51,7 @@ def check(child, target, structured, raw, share=1):
 def test_every_task_declares_small_files(name):
     task = tasks()[name]
     files = trial_files.seeds(task)
-    assert files, f"the task {name} declares no file to damage: give it trials (mi_diffind.task.Task.trials)"
+    assert files, f"the task {name} declares no file to damage: give it trials (mi_diffind.fitting.task.Task.trials)"
     for file in files.values():
         assert file.is_file(), f"{file} is missing: python tests/trust/run.py --seeds {file.stem}"
         assert task.load(file).arrays, f"{file} is out of date: python tests/trust/run.py --seeds {file.stem}"

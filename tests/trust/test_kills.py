@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import trial_files
 
-from mi_diffind.task import tasks
+from mi_diffind.fitting.task import tasks
 
 SCENE = """
 <scene version="3.0.0">

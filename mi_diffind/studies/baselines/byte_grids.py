@@ -12,12 +12,12 @@ import math
 import drjit as dr
 import numpy as np
 
-from ...lookup import clamp
+from ...arrays.lookup import clamp
+from ...core.units import largest_fitting
 from ...tasks.sdf.distances import Distances
 from ...tasks.sdf.field import DistanceField
 from ...tasks.sdf.mesh import Mesh
 from ...tasks.sdf.sampling import CORNERS, surface_cells
-from ...units import largest_fitting
 
 #: Largest distance, in cells, between the surface and a corner of a cell that the surface crosses.
 NEAREST = 1.75

@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...errors import DiffindError, missing_package
-from ...units import largest_fitting
+from ...core.errors import DiffindError, missing_package
+from ...core.units import largest_fitting
 
 #: Block size of ASTC in 2D, width × height, finest first → bits per texel.
 ASTC_BLOCKS = {

@@ -10,12 +10,12 @@ import math
 import drjit as dr
 import numpy as np
 
-from ...fitting import Problem
+from ...core.units import largest_fitting
+from ...fitting.loop import Problem
 from ...tasks.sdf.distances import Distances
 from ...tasks.sdf.field import DistanceField
 from ...tasks.sdf.mesh import Mesh
 from ...tasks.sdf.sampling import sample_box, sample_near
-from ...units import largest_fitting
 from .networks import Network
 
 #: Largest distance that is learned.

@@ -10,9 +10,9 @@ import math
 import drjit as dr
 import numpy as np
 
-from ...fitting import Problem
+from ...core.units import largest_fitting
+from ...fitting.loop import Problem
 from ...maps.source import Source
-from ...units import largest_fitting
 from .networks import Network
 
 #: Width and hidden layers of the network, levels of the grid, features of a level, its coarsest resolution.

@@ -7,8 +7,8 @@ import copy
 import drjit as dr
 from drjit import nn
 
-from ...compat import module_of
-from ...indirection import DifferentiableArray, fold
+from ...arrays.indirection import DifferentiableArray, fold
+from ...core.compat import module_of
 from ...measure.operations import Operations
 
 
@@ -18,7 +18,7 @@ class Network(nn.Module):
     There are ``layers`` hidden layers of ``width`` leaky rectified units. With ``grid``, the options of
     ``nn.HashGridEncoding``, a hash grid encodes the coordinates; ``direct`` further coordinates bypass it. With
     ``table``, a number of entries on a side, the network's outputs point into a square
-    :class:`~mi_diffind.indirection.DifferentiableArray`, as the primary array of an indirection does. A call with a
+    :class:`.DifferentiableArray`, as the primary array of an indirection does. A call with a
     list of coordinates returns a list of arrays. As allocated, the network computes with tensors, the faster form to
     train; :meth:`cooperative` returns it in cooperative vectors.
     """

@@ -24,8 +24,8 @@ from dataclasses import replace
 import drjit as dr
 import numpy as np
 
-from ...indirection import aligned_copy
-from ...lookup import clamp
+from ...arrays.indirection import aligned_copy
+from ...arrays.lookup import clamp
 from ...maps.layout import FROM_NORMAL, Layout, MapLayout
 from ...maps.pyramid import Pyramid, halved, level_sizes
 from ...maps.source import Source

@@ -9,7 +9,7 @@ from __future__ import annotations
 import drjit as dr
 import numpy as np
 
-from ...indirection import device_array
+from ...arrays.indirection import device_array
 from ...tasks.radiance.nodes import Nodes
 from ...tasks.radiance.volume_field import NodeField, NodeVolume, colour_of
 from .node_codes import QuantisationSteps

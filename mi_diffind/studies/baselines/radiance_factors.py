@@ -13,7 +13,7 @@ import drjit as dr
 import numpy as np
 from drjit import nn
 
-from ...indirection import device_array, device_tensor
+from ...arrays.indirection import device_array, device_tensor
 from ...tasks.radiance.nodes import COARSE, FARTHEST, Nodes, cells_of, chessboard_distances, corners_of
 from ...tasks.radiance.volume_field import VolumeField, colour_of, density_of
 from .node_codes import QuantisationSteps, deflated, mask_bytes

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...files import replacing
+from ...core.files import replacing
 from ...tasks.sdf import codes
 from ...tasks.sdf.distances import Distances
 from ...tasks.sdf.encoding import sample

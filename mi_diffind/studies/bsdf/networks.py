@@ -13,10 +13,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...lookup import clamp
+from ...arrays.lookup import clamp
+from ...core.runtime import array_module
+from ...fitting.settings import FitSettings
 from ...measure.training import ConvergenceTraining
-from ...runtime import array_module
-from ...settings import FitSettings
 from ...tasks.bsdf import training
 from ...tasks.bsdf.model import DirectionPair, Form, coordinate_u, coordinate_w
 from ...tasks.bsdf.training import BSDFProblem

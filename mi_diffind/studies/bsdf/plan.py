@@ -7,11 +7,11 @@ from pathlib import Path
 
 import mitsuba as mi
 
+from ...fitting.task import fit, load_model
 from ...measure.bsdf import bsdf_queries, directions
 from ...measure.formatting import grid
 from ...measure.store import file_name, fingerprint
 from ...measure.study import Candidate, Case, Job, Plan
-from ...task import fit, load_model
 from ...tasks.bsdf import fit as fitting
 from ...tasks.bsdf import mixture
 from ...tasks.bsdf.model import LearnedBSDF
@@ -132,7 +132,7 @@ def plan(materials: tuple[str, ...] = (), quick: bool = False) -> Plan:
         ratios += [(name, reference) for name in learned for reference in references]
         ratios += [(f"{material}: ours", f"{material}: measured")]
     package = Path(__file__).resolve().parents[2]
-    code = [package / f"{name}.py" for name in ("lookup", "indirection", "fitting")]
+    code = [package / f"{name}.py" for name in ("arrays/lookup", "arrays/indirection", "fitting/loop")]
     code += [*(package / "tasks" / "bsdf").glob("*.py"), Path(__file__).with_name("materials.py")]
     return Plan(
         study="bsdf",

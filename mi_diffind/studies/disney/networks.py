@@ -12,16 +12,16 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 
-from ...fitting import Problem
-from ...lookup import clamp
+from ...arrays.lookup import clamp
+from ...core.runtime import array_module
+from ...core.units import largest_fitting
+from ...fitting.loop import Problem
+from ...fitting.settings import FitSettings
 from ...measure.training import ConvergenceTraining
-from ...runtime import array_module
-from ...settings import FitSettings
 from ...tasks.disney import model
 from ...tasks.disney.decoder import Decoder
 from ...tasks.disney.model import TINY, Factors, compose, geometry
 from ...tasks.disney.training import measure, random_directions, random_materials, shade
-from ...units import largest_fitting
 from ..baselines.hash_grids import halved
 from ..baselines.networks import Network
 

@@ -14,8 +14,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ... import runtime
-from ...lookup import STORAGES
+from ...arrays.lookup import STORAGES
+from ...core import runtime
 from ...measure.bsdf import QUERIES, TEXTURE_SIZE, bsdf_queries, directions, noise_texture
 from ...measure.operations import FLOPS, Operations, count_query
 from ...measure.store import fingerprint
@@ -97,7 +97,7 @@ def plan(quick: bool = False, only: Sequence[str] = ()) -> Plan:
             )
         )
     package = Path(__file__).resolve().parents[2]
-    names = ("fitting", "studies/disney/networks", "studies/baselines/networks")
+    names = ("fitting/loop", "studies/disney/networks", "studies/baselines/networks")
     training_sources = [*(package / f"{name}.py" for name in names), *(package / "tasks" / "disney").glob("*.py")]
     return Plan(
         study="disney",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from ...lookup import STORAGES
+from ...arrays.lookup import STORAGES
 from ...measure.formatting import grid
 
 #: Sides of the primary and the cascaded array of the equal-quality reference: the paper's sizes.

@@ -19,10 +19,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ... import runtime
-from ...fitting import FitSettings
-from ...indirection import DifferentiableArray
-from ...lookup import STORAGES
+from ...arrays.indirection import DifferentiableArray
+from ...arrays.lookup import STORAGES
+from ...core import runtime
+from ...fitting.loop import FitSettings
 from ...measure.bsdf import QUERIES, bsdf_queries, directions, noise_texture
 from ...measure.operations import FLOPS, Operations, count_query
 from ...measure.store import fingerprint
@@ -96,7 +96,7 @@ def plan(quick: bool = False, quick_steps: int = QUICK_STEPS) -> Plan:
         *builder.conductors(),
     ]
     package = Path(__file__).resolve().parents[2]
-    training_sources = [package / f"{name}.py" for name in ("lookup", "indirection", "fitting")]
+    training_sources = [package / f"{name}.py" for name in ("arrays/lookup", "arrays/indirection", "fitting/loop")]
     training_sources += [*(package / "tasks").glob("*.py"), *(package / "tasks" / "ggx").glob("*.py")]
     training_sources += [package / "studies" / "baselines" / "networks.py"]
     return Plan(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 
-from ...arguments import positive
+from ...core.arguments import positive
 from ...measure.study import Plan, Study
 from ..maps import add_astc_option
 
@@ -37,8 +37,8 @@ class ImageStudy(Study):
 
     def check(self, arguments) -> None:
         """Check the options and load the source; raise as :func:`.load_source` does."""
+        from ...core.units import parse_compression
         from ...maps.source import load_source
-        from ...units import parse_compression
 
         arguments.compressions = tuple(map(parse_compression, arguments.compression)) or (12.0,)
         arguments.loaded = load_source(arguments.source)

@@ -24,13 +24,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ... import metrics
-from ...fitting import FitSettings, fit
+from ...core.runtime import array_module
+from ...fitting.loop import FitSettings, fit
+from ...images import metrics
 from ...maps import as_seen
 from ...maps.compressed import decibel
 from ...maps.source import Source
 from ...measure.study import FLOOR, Candidate, Case, Plan
-from ...runtime import array_module
 from ...tasks.image.presets import IMPROVEMENTS
 from ..baselines import codecs, image_networks
 from ..baselines.hash_grids import halved

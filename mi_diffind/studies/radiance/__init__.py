@@ -51,8 +51,8 @@ class RadianceStudy(Study):
         """Check the options and read the views; raise :class:`~mi_diffind.tasks.radiance.views.ViewsError`."""
         from pathlib import Path
 
+        from ...core.units import parse_compression
         from ...tasks.radiance.views import load_views
-        from ...units import parse_compression
         from .plan import KINDS
 
         default = ("75",) if arguments.quick else map(str, RATIOS)
@@ -71,7 +71,7 @@ class RadianceStudy(Study):
     def plan(self, arguments) -> Plan:
         import mitsuba as mi
 
-        from ...runtime import array_module
+        from ...core.runtime import array_module
         from ...tasks.radiance.session import FieldSession
         from .plan import RadianceStudySettings, plan
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from ...measure.benchmark import PASS
 from ...measure.formatting import duration, enumeration, grid
+from ...measure.study import PASS
 from ..equal_memory import candidates_by_budget, name_of_ours, ours_and_others, ratio_phrases
 
 #: The two figures that are always given together.

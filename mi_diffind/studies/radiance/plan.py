@@ -27,7 +27,7 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 
-from ...fitting import FitSettings, fit
+from ...fitting.loop import FitSettings, fit
 from ...measure.store import fingerprint
 from ...measure.study import FLOOR, Candidate, Case, Plan
 from ...tasks.radiance import grid as grids
@@ -187,7 +187,7 @@ def plan(session: FieldSession, source: str, settings: RadianceStudySettings) ->
              query_names=("density", "both")),
     ]  # fmt: skip
     package = Path(__file__).resolve().parents[2]
-    sources = [*(package / "tasks" / "radiance").glob("*.py"), package / "fitting.py", Path(__file__)]
+    sources = [*(package / "tasks" / "radiance").glob("*.py"), package / "fitting" / "loop.py", Path(__file__)]
     sources += (package / "studies" / "baselines").glob("radiance*.py")
     sources.append(package / "studies" / "baselines" / "node_codes.py")
     return Plan(

@@ -9,11 +9,11 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from ...arguments import natural, positive
+from ...core.arguments import natural, positive
 from ...measure.study import Study
 
 if TYPE_CHECKING:
-    from ...measure.report import Tradeoff
+    from ...measure.study import Tradeoff
 
 
 class SceneStudy(Study):

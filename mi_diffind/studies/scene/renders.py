@@ -18,13 +18,15 @@ import mitsuba as mi
 import numpy as np
 from tqdm import tqdm
 
-from ... import metrics, plugins, scenes
-from ...interrupt import interruptible
+from ... import plugins
+from ...core.interrupt import interruptible
+from ...images import metrics
 from ...measure.benchmark import Stopped
 from ...measure.bias import LEAST, crossover, describe, error, estimate, root, weights_of
 from ...measure.clock import machine, timed
 from ...measure.statistics import finite, flat_spread, spread
 from ...measure.store import Store, fingerprint, sources
+from ...scenes import loading
 from .picture import VERSIONS
 from .report import verdict
 
@@ -101,14 +103,14 @@ def measure(
     - ``bias``: :func:`~mi_diffind.measure.bias.describe`; ``crossover``: :func:`~mi_diffind.measure.bias.crossover`.
 
     After Ctrl-C the result covers the renders up to then: ``points`` may be empty, and values derived from them
-    ``None``. Raises :class:`~mi_diffind.scenes.SceneError`, also if the scene names no learned plugin, and
-    :class:`~mi_diffind.files.OutputError` if the folder cannot be written.
+    ``None``. Raises :class:`.SceneError`, also if the scene names no learned plugin, and
+    :class:`.OutputError` if the folder cannot be written.
     """
-    parsed = scenes.ParsedScene(scene_path, defines)
+    parsed = loading.ParsedScene(scene_path, defines)
     learned = parsed.learned_plugins()
     if not learned:
         names = ", ".join(plugins.with_counterpart())
-        raise scenes.SceneError(f"{scene_path}: names no learned plugin ({names}), so there is nothing to compare")
+        raise loading.SceneError(f"{scene_path}: names no learned plugin ({names}), so there is nothing to compare")
     loaded = {name: parsed.load(exact=name == "exact") for name in VERSIONS}
     sensor = loaded["learned"].sensors()[0]
     width, height = (int(v) for v in sensor.film().crop_size())
@@ -214,7 +216,7 @@ class SceneRun:
     def _render(self, name: str, spp: int, number: int) -> tuple[np.ndarray, dict]:
         """Return an image, float32, with ``seconds``, ``seconds_wall`` (``None`` if it compiled) and ``not_finite``."""
         launches = 1 << ((spp * self.pixels - 1) // self.launch_samples).bit_length()
-        render = timed(lambda: scenes.render(self.loaded[name], spp, (self.seed << 8) + number, launches)[0])
+        render = timed(lambda: loading.render(self.loaded[name], spp, (self.seed << 8) + number, launches)[0])
         image = render.value[..., : 3 if render.value.shape[-1] >= 3 else 1]
         bad = ~np.isfinite(image)
         return np.where(bad, np.float32(0), image), {

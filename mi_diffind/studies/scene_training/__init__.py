@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 
-from ...arguments import fraction, positive
+from ...core.arguments import fraction, positive
 from ...measure.study import Plan, Study
 from ..equal_memory import add_without_option, check_without
 from .conclusions import WAYS

@@ -28,20 +28,22 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ... import metrics, scenes, task
-from ...files import writable_folder, write_json
+from ...arrays.tables import Table
+from ...core.files import writable_folder, write_json
+from ...fitting import task
+from ...images import metrics
+from ...images.srgb import for_display
 from ...maps.source import load_source
 from ...measure import plot
 from ...measure.formatting import figure_caption
 from ...measure.study import Candidate, Plan
-from ...scene_training.problem import exposure_of
-from ...scene_training.recipe import SceneRecipe
-from ...scene_training.reference_renders import ReferenceRenders
-from ...scene_training.stored_texture import original_of, texture_file
-from ...scene_training.trained_scene import TrainedScene
-from ...scene_training.views import View, ViewDistribution
-from ...srgb import for_display
-from ...tables import Table
+from ...scenes import loading
+from ...scenes.training.problem import exposure_of
+from ...scenes.training.recipe import SceneRecipe
+from ...scenes.training.reference_renders import ReferenceRenders
+from ...scenes.training.stored_texture import original_of, texture_file
+from ...scenes.training.trained_scene import TrainedScene
+from ...scenes.training.views import View, ViewDistribution
 from ...tasks.texture.compressed import load
 from ..equal_memory import Contender, StudyContext
 from .conclusions import AFTER, FEW, LONGER, MENDED, OTHER, conclusions, table
@@ -119,7 +121,7 @@ class SceneTrainingContext(StudyContext):
     def __init__(self, path: Path, settings: SceneTrainingSettings):
         self.path, self.name, self.settings = path, path.stem.removeprefix("training_"), settings
         self.ranges = RANGES.get(path.stem, RANGES["training_balls"])
-        self.parsed = scenes.ParsedScene(path, settings.defines)
+        self.parsed = loading.ParsedScene(path, settings.defines)
         self.file, given = texture_file(self.parsed)
         self.start = load(self.file)
         self.source = original_of(self.start, self.file, given)

@@ -46,8 +46,8 @@ class SdfStudy(Study):
 
     def check(self, arguments) -> None:
         """Check the arguments and read the mesh; raises :class:`~mi_diffind.tasks.sdf.mesh.MeshError`."""
+        from ...core.units import parse_bytes
         from ...tasks.sdf.mesh import load_mesh
-        from ...units import parse_bytes
         from .contenders import METHODS, PARTS
 
         every = (FIRST,) if arguments.ablation else (FIRST, *(s for s in SIZES if s != FIRST))

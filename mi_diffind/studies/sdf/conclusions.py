@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from ...measure.benchmark import PASS
 from ...measure.formatting import enumeration, grid
+from ...measure.study import PASS
 from ..equal_memory import candidates_by_budget, name_of_ours, ours_and_others, ratio_phrases
 
 #: Measures of the sentences: label, error, format, and whether more is better.

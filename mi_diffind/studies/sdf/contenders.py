@@ -12,7 +12,7 @@ import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from ...fitting import FitSettings
+from ...fitting.loop import FitSettings
 from ...measure.study import Candidate
 from ...measure.training import ConvergenceTraining
 from ...tasks.sdf.distances import Distances

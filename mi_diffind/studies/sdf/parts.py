@@ -9,8 +9,8 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from ... import task
-from ...fitting import FitResult, FitSettings, fit
+from ...fitting import task
+from ...fitting.loop import FitResult, FitSettings, fit
 from ...tasks.sdf.encoding import sample
 from ...tasks.sdf.evaluation import HeldOut
 from ...tasks.sdf.fit import NodeProblem

@@ -26,9 +26,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...core.runtime import array_module
 from ...measure.store import fingerprint
 from ...measure.study import FLOOR, Candidate, Case, Plan
-from ...runtime import array_module
 from ...tasks.sdf.field import DistanceField
 from ...tasks.sdf.mesh import Mesh
 from .. import equal_memory
@@ -133,7 +133,7 @@ def _model_sources() -> list[Path]:
     studies = package / "studies"
     return [
         *(path for path in (package / "tasks" / "sdf").glob("*.py") if path.stem not in TRACING_MODULES),
-        *(package / f"{name}.py" for name in ("fitting", "indirection")),
+        *(package / f"{name}.py" for name in ("fitting/loop", "arrays/indirection")),
         *(studies / "sdf" / f"{name}.py" for name in ("contenders", "parts")),
         *(studies / "baselines" / f"{name}.py"
           for name in ("byte_grids", "bricks", "volumes", "direct_nodes", "hash_grids", "networks")),

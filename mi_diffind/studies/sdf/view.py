@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ... import mitsuba_versions
+from ...core import mitsuba_versions
 from ...tasks.sdf import grids, tracing
 from ...tasks.sdf.field import DistanceField
 from ...tasks.sdf.mesh import Mesh

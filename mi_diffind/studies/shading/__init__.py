@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 
-from ...arguments import fraction, positive
+from ...core.arguments import fraction, positive
 from ...measure.study import Plan, Study
 
 #: Weights λ of the paper's figure 2.
@@ -63,7 +63,7 @@ class ShadingStudy(Study):
 
     def check(self, arguments) -> None:
         """Check the options and load the materials; raise as :func:`.load_source` does."""
-        from ...units import parse_compression
+        from ...core.units import parse_compression
         from .plan import materials_of
 
         if (arguments.steps is None) != (arguments.pretrain_steps is None):

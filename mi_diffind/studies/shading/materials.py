@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ...errors import UsageError
+from ...core.errors import UsageError
 from ...maps.source import Source, from_arrays
 
 #: Texels along each side.
@@ -102,9 +102,9 @@ def example_maps(name: str = "hammered", side: int = SIDE) -> dict[str, np.ndarr
     """Return the maps of one of :data:`MATERIALS`: name → ``(side, side, channels)`` or ``(side, side)``, bytes.
 
     Albedos are sRGB-encoded, normals are (n + 1)/2. Maps repeat. The same arguments give the same bytes. Raises
-    :class:`~mi_diffind.errors.UsageError` for another name.
+    :class:`.UsageError` for another name.
     """
-    from ...srgb import for_display
+    from ...images.srgb import for_display
 
     if name not in MATERIALS:
         raise UsageError(f'name: found the material "{name}", allowed are {", ".join(MATERIALS)}')

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ... import srgb
+from ...images import srgb
 from ...maps.compressed import decibel
 from ...measure import plot
 from ...measure.curves import finish

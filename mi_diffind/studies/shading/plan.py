@@ -32,15 +32,15 @@ from pathlib import Path
 
 import numpy as np
 
-from ... import task
-from ...files import replacing
-from ...fitting import FitResult
+from ...arrays.tables import Table, save_table
+from ...core.files import replacing
+from ...fitting import task
+from ...fitting.loop import FitResult
+from ...fitting.settings import FitSettings, FittingError
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source, SourceError, load_source
 from ...measure.store import file_name
 from ...measure.study import Candidate, Plan
-from ...settings import FitSettings, FittingError
-from ...tables import Table, save_table
 from ...tasks.shading import fit as shading_fit
 from ...tasks.shading import presets
 from ...tasks.shading.evaluation import ShadedEvaluation, ShadedReader, reader

@@ -26,19 +26,21 @@ import mitsuba as mi
 import numpy as np
 from tqdm import tqdm
 
-from ... import scenes, task
-from ...compat import use_threads
+from ...arrays.tables import Table
+from ...core.compat import use_threads
+from ...core.runtime import array_module
+from ...fitting import task
 from ...maps.compressed import decibel
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source
 from ...measure import clock, plot
 from ...measure.curves import finish
 from ...measure.formatting import figure_caption
-from ...measure.report import Tradeoff, publish, write_files
+from ...measure.report import publish, write_files
 from ...measure.statistics import spread
+from ...measure.study import Tradeoff
 from ...plugins.support.image_files import PYRAMIDS
-from ...runtime import array_module
-from ...tables import Table
+from ...scenes import loading
 from ..baselines import codecs, normals
 from ..texture import levels
 from ..texture.test_scenes import TextureScene, still_scenes, to_uv, zoom_scene
@@ -113,7 +115,7 @@ class RenderedMaterial:
         if sky:
             described |= {"sky": {"type": "constant", "radiance": sky}}
             described["integrator"]["max_depth"] = 3
-        return scenes.load_dict(described)
+        return loading.load_dict(described)
 
     def plugin(self, repeats: tuple[float, float], trains: bool) -> dict:
         """Return the BSDF."""

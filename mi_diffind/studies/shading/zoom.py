@@ -12,8 +12,8 @@ from functools import cached_property
 import drjit as dr
 import numpy as np
 
-from ... import srgb
-from ...indirection import aligned_copy
+from ...arrays.indirection import aligned_copy
+from ...images import srgb
 from ...maps.pyramid import Pyramid
 from ...measure.flicker import POINTS, MovingView
 from ...tasks.disney.effects import Effects

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 
-from ...arguments import positive
+from ...core.arguments import positive
 from ...measure.study import Plan, Study
 from ..maps import add_astc_option
 
@@ -54,8 +54,8 @@ class TextureStudy(Study):
 
     def check(self, arguments) -> None:
         """Check the options and load the source and tables; raise as :func:`.load_source` does."""
+        from ...core.units import parse_compression
         from ...maps.source import load_source
-        from ...units import parse_compression
         from .plan import colour_map, tables_of
 
         default = () if arguments.table else (12.0,) if arguments.quick else (12.0, 3.0, 6.0, 24.0)

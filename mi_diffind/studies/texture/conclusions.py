@@ -5,8 +5,8 @@ from __future__ import annotations
 import itertools
 import math
 
-from ...measure.benchmark import PASS
 from ...measure.formatting import grid
+from ...measure.study import PASS
 from ..maps import source_line
 
 #: The bitmaps that gains in PSNR and ratios of flicker refer to.

@@ -16,12 +16,12 @@ from types import ModuleType
 
 import drjit as dr
 
-from ...lookup import clamp
+from ...arrays.lookup import clamp
+from ...fitting.settings import FitSettings
 from ...maps.compressed import FilteredMaps, decibel
 from ...maps.layout import Layout
 from ...maps.pyramid import Pyramid, level_sizes
 from ...maps.source import Source
-from ...settings import FitSettings
 from ...tasks.texture.presets import PRESETS
 from ...tasks.texture.training import TextureProblem
 from ..baselines import image_networks

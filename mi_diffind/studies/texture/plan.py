@@ -27,7 +27,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ... import task
+from ...arrays.tables import Table
+from ...fitting import task
 from ...maps.compressed import FilteredMaps, decibel
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source
@@ -35,8 +36,7 @@ from ...measure.store import fingerprint
 from ...measure.study import FLOOR, Candidate, Case, Job, Plan
 from ...measure.training import ConvergenceTraining
 from ...plugins.support.image_files import PYRAMIDS
-from ...scenes import footprint
-from ...tables import Table
+from ...scenes.loading import footprint
 from ..baselines import codecs
 from ..baselines.hash_grids import halved
 from ..equal_memory import Contender, PresetContender, StudyContext, load_arrays
@@ -118,7 +118,7 @@ def colour_map(source: Source, name: str = "") -> str:
 
 
 def tables_of(paths: Sequence[str], source: Source) -> list[Table]:
-    """Return trained tables. Raises :class:`~mi_diffind.tables.TableError`, ``ValueError`` for another source."""
+    """Return trained tables. Raises :class:`.TableError`, ``ValueError`` for another source."""
     tables = [task.tasks()["texture"].load(path) for path in paths]
     for trained in tables:
         if trained.settings.get("source") != source.digest:

@@ -16,8 +16,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ... import srgb
-from ...mitsuba_versions import ray_flags
+from ...core.mitsuba_versions import ray_flags
+from ...images import srgb
 
 
 @dataclass(frozen=True)

@@ -20,10 +20,10 @@ import argparse
 import os
 from pathlib import Path
 
-from ...arguments import WORKER_ARGUMENTS, Argument, checked, natural, positive
-from ...settings import FitSettings
-from ...task import FitRequest, Fitted, Task, table_path
-from ...units import parse_bytes
+from ...core.arguments import WORKER_ARGUMENTS, Argument, checked, natural, positive
+from ...core.units import parse_bytes
+from ...fitting.settings import FitSettings
+from ...fitting.task import FitRequest, Fitted, Task, table_path
 
 
 def _coordinate(text: str) -> float:
@@ -131,7 +131,7 @@ class BSDFTask(Task):
         return lines
 
     def load(self, path):
-        from ...tables import load_table
+        from ...arrays.tables import load_table
 
         if "family" not in load_table(path, self.name).settings:
             return super().load(path)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ...files import replacing
-from ...srgb import for_display
+from ...core.files import replacing
+from ...images.srgb import for_display
 from .files import BSDFModel
 from .fit import cosine
 from .source import FunctionTruth, Truth

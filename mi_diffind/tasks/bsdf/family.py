@@ -22,8 +22,8 @@ import drjit as dr
 import numpy as np
 from drjit import nn
 
-from ...indirection import DifferentiableArray, Indirection, device_array, rounded, unfolded
-from ...lookup import clamp
+from ...arrays.indirection import DifferentiableArray, Indirection, device_array, rounded, unfolded
+from ...arrays.lookup import clamp
 from .model import (
     ALPHA_MIN,
     LOBE,

@@ -8,9 +8,9 @@ import os
 import drjit as dr
 import numpy as np
 
-from ...errors import UsageError, reason
-from ...indirection import DifferentiableArray, Indirection
-from ...tables import StoredArray, Table, TableError, byte_array, check_ranges, load_table
+from ...arrays.indirection import DifferentiableArray, Indirection
+from ...arrays.tables import StoredArray, Table, TableError, byte_array, check_ranges, load_table
+from ...core.errors import UsageError, reason
 from . import family_measurement
 from .family import CHANNELS, MOST, FamilyArrays, FamilyMember, Parameter, member, proxy_of, widths
 from .family_truth import FamilyTruth

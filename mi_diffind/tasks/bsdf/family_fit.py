@@ -9,24 +9,15 @@ from threading import Event
 import drjit as dr
 import numpy as np
 
-from ...errors import UsageError
-from ...fitting import FitResult
-from ...indirection import DifferentiableArray
-from ...interrupt import interruptible
-from ...settings import FitSettings
-from ...task import FitRequest, Fitted
-from ...units import parse_bytes
+from ...arrays.indirection import DifferentiableArray
+from ...core.errors import UsageError
+from ...core.interrupt import interruptible
+from ...core.units import parse_bytes
+from ...fitting.loop import FitResult
+from ...fitting.settings import FitSettings
+from ...fitting.task import FitRequest, Fitted
 from . import family_measurement, symmetry, training
-from .family import (
-    CHANNELS,
-    PROXY_NODES,
-    SCALE,
-    SIZES,
-    FamilyArrays,
-    FamilySizes,
-    nodes_of,
-    sizes_of,
-)  # fmt: skip
+from .family import CHANNELS, PROXY_NODES, SCALE, SIZES, FamilyArrays, FamilySizes, nodes_of, sizes_of  # fmt: skip
 from .family_files import FamilyModel, allocate, to_table
 from .family_sampling import fitted_mixture, fitted_scale
 from .family_truth import MEMBERS, FamilySamples, FamilyTruth, constants, draw, parameters_of, points

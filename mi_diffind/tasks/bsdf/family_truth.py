@@ -7,8 +7,8 @@ import math
 import drjit as dr
 import numpy as np
 
-from ...errors import UsageError
-from ...indirection import device_array
+from ...arrays.indirection import device_array
+from ...core.errors import UsageError
 from . import symmetry, training
 from .family import MOST, Parameter
 from .pool import Samples

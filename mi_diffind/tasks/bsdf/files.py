@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ...indirection import DifferentiableArray, Indirection
-from ...tables import StoredArray, Table, TableError, byte_array, check_ranges, load_table
-from ...task import Model
+from ...arrays.indirection import DifferentiableArray, Indirection
+from ...arrays.tables import StoredArray, Table, TableError, byte_array, check_ranges, load_table
+from ...fitting.task import Model
 from . import measurement, outputs, scattered, tensor_file
 from .mixture import Mixture, SampledLobe, TurnedMixture
 from .model import AZIMUTHS, PARAMETERS, TERMS, BSDFArrays, Form, LearnedBSDF, Proxy
@@ -186,7 +186,7 @@ class BSDFModel(Model):
         """Write a ``.bsdf``, ``.csv`` or ``.exr`` file (:mod:`.outputs`); without an ``output``, return its fields.
 
         ``rows`` and ``seed``: number of rows of a ``.csv`` file, and seed of its random directions. Raises
-        :class:`~mi_diffind.errors.UsageError`.
+        :class:`.UsageError`.
         """
         if output is None:
             return tensor_file.fields(self.bsdf, self.types, str(self.table.settings.get("name", "")))

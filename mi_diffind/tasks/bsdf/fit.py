@@ -8,11 +8,11 @@ from threading import Event
 
 import drjit as dr
 
-from ...errors import UsageError
-from ...fitting import FitResult
-from ...interrupt import interruptible
-from ...task import FitRequest, Fitted
-from ...units import parse_bytes
+from ...core.errors import UsageError
+from ...core.interrupt import interruptible
+from ...core.units import parse_bytes
+from ...fitting.loop import FitResult
+from ...fitting.task import FitRequest, Fitted
 from . import energy, mixture, scattered, symmetry, training
 from .files import BSDFModel, allocate, to_table
 from .measurement import cosine, measure, measure_samples

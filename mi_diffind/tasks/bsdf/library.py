@@ -11,13 +11,14 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ... import __version__, compat
-from ...errors import DiffindError, UsageError
-from ...files import relative_path, replacing, writable_folder, write_json
-from ...jobs import run_jobs
-from ...runtime import use_variant
-from ...tables import load_table
-from ...task import FitRequest, Fitted, Model, fit, load_model
+from ... import __version__
+from ...arrays.tables import load_table
+from ...core import compat
+from ...core.errors import DiffindError, UsageError
+from ...core.files import relative_path, replacing, writable_folder, write_json
+from ...core.jobs import run_jobs
+from ...core.runtime import use_variant
+from ...fitting.task import FitRequest, Fitted, Model, fit, load_model
 from .contact_sheet import PICTURES, accuracy, save_pair, write_sheet
 from .files import load
 from .fit import use_rgb_variant
@@ -37,7 +38,7 @@ REPORT, PAGE, SHEET = "report.json", "report.md", "contact_sheet.png"
 class LibraryMaterial:
     """Material of a library: its source, and how it is to be fitted.
 
-    ``options`` are those of :func:`mi_diffind.task.fit`; ``identity`` stands for the content of the source and all
+    ``options`` are those of :func:`.task.fit`; ``identity`` stands for the content of the source and all
     options, "" if the source cannot be read.
     """
 
@@ -140,7 +141,7 @@ _INSTEAD = {"checkpoint": "the same command continues without one", "seconds": "
 def fit_library(request: FitRequest) -> FittedLibrary:
     """Fit all materials of a library that its folder does not hold yet, and write its report.
 
-    Raises :class:`UsageError` and :class:`~mi_diffind.files.OutputError`.
+    Raises :class:`UsageError` and :class:`.OutputError`.
     """
     use_rgb_variant(request)
     start, options = time.perf_counter(), request.options

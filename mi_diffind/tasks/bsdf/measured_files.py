@@ -16,9 +16,9 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 
-from ... import tensor_files
-from ...errors import UsageError
-from ...lookup import clamp
+from ...arrays.lookup import clamp
+from ...core import tensor_files
+from ...core.errors import UsageError
 from .source import Truth
 
 #: Illuminants, the first is the default.

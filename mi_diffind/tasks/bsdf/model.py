@@ -34,8 +34,8 @@ import drjit as dr
 import numpy as np
 from drjit import nn
 
-from ...indirection import DifferentiableArray, Indirection, rounded, unfolded
-from ...lookup import clamp
+from ...arrays.indirection import DifferentiableArray, Indirection, rounded, unfolded
+from ...arrays.lookup import clamp
 
 #: Smallest roughness of a lobe, and smallest scale of the coordinate u.
 ALPHA_MIN = 1e-3
@@ -212,7 +212,7 @@ class Proxy:
 class BSDFArrays(nn.Module):
     """Arrays of a learned BSDF.
 
-    ``residual`` is an :class:`~mi_diffind.indirection.Indirection` of three coordinates, or one array that is read at
+    ``residual`` is an :class:`.Indirection` of three coordinates, or one array that is read at
     them; ``proxy`` holds the logarithms of the proxy's parameters, divided by ``rate``, as an array ``(22, 1)``
     (``None``: no proxy).
     """

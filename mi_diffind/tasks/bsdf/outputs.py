@@ -8,10 +8,10 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 
-from ... import tensor_files
-from ...errors import UsageError
-from ...files import replacing
-from ...threads import threads_for_files
+from ...core import tensor_files
+from ...core.errors import UsageError
+from ...core.files import replacing
+from ...core.threads import threads_for_files
 from . import tensor_file
 from .measurement import cosine
 from .pool import incident, outgoing
@@ -44,7 +44,7 @@ def write(model, output: Path, source, rows: int | None = None, seed: int | None
     """Write a model as a ``.bsdf``, ``.csv`` or ``.exr`` file, and return the file with a line about it.
 
     ``source()`` returns the source (:class:`.truth.Truth`), or raises a ``TableError``. ``rows`` and ``seed`` are those
-    of a ``.csv`` file. Raises :class:`~mi_diffind.errors.UsageError` for another extension.
+    of a ``.csv`` file. Raises :class:`.UsageError` for another extension.
     """
     suffix = output.suffix.lower()
     if suffix not in EXTENSIONS:
@@ -95,7 +95,7 @@ def _angles(w) -> tuple:
 
 def picture(model, source) -> tuple[np.ndarray, str]:
     """Return a lit sphere of a model, beside it that of its source and the difference, and a line about them."""
-    from ...tables import TableError
+    from ...arrays.tables import TableError
 
     try:
         truth, alone = source(), ""

@@ -21,7 +21,7 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 
-from ...errors import UsageError, reason
+from ...core.errors import UsageError, reason
 from .model import BSDFArrays, DirectionPair, Form, LearnedBSDF, turned
 from .pool import Samples
 from .source import Truth

@@ -12,11 +12,11 @@ from threading import Event
 import drjit as dr
 import numpy as np
 
-from ...fitting import FitResult, Problem
-from ...indirection import DifferentiableArray
-from ...interrupt import interruptible
-from ...settings import FitSettings
-from ...task import FitRequest
+from ...arrays.indirection import DifferentiableArray
+from ...core.interrupt import interruptible
+from ...fitting.loop import FitResult, Problem
+from ...fitting.settings import FitSettings
+from ...fitting.task import FitRequest
 from .model import (
     BLACK,
     DIFFUSE,
@@ -245,7 +245,7 @@ def range_above(value: list, samples: Samples) -> tuple[float, float]:
 
 def module_types(samples: Samples):
     """Return the module of the Dr.Jit types of samples."""
-    from ...compat import module_of
+    from ...core.compat import module_of
 
     return module_of(samples.weight)
 

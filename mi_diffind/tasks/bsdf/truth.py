@@ -10,12 +10,12 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 
-from ...compat import one_sentence
-from ...errors import UsageError, reason
-from ...files import irregular, shown
-from ...lookup import clamp
-from ...tables import Table, TableError
-from ...units import memory
+from ...arrays.lookup import clamp
+from ...arrays.tables import Table, TableError
+from ...core.compat import one_sentence
+from ...core.errors import UsageError, reason
+from ...core.files import irregular, shown
+from ...core.units import memory
 from .measured_files import ILLUMINANTS, PolarisedTruth, measured_bsdf
 from .scattered import ScatteredTruth
 from .source import Truth
@@ -156,7 +156,7 @@ def truth_of(
     a measured file (``.bsdf``, ``.pbsdf``, ``.binary``), or a table of measurements (``.csv``), whose ``angles`` are
     degrees or radians ("": as :mod:`.scattered` decides). ``material`` is the id of a BSDF of a scene. Spectra of
     measured files have colours under an ``illuminant`` (:mod:`.measured_files`; "": D65). Raises
-    :class:`~mi_diffind.errors.UsageError`.
+    :class:`.UsageError`.
     """
     import mitsuba as mi
 
@@ -270,7 +270,7 @@ def _bsdfs(scene) -> list:
 def material_ids(path) -> list[str]:
     """Return the ids of the materials of a scene file, sorted, or ``[""]`` for a file of one BSDF.
 
-    Raises :class:`~mi_diffind.errors.UsageError`.
+    Raises :class:`.UsageError`.
     """
     import mitsuba as mi
 

@@ -11,8 +11,8 @@
 
 from __future__ import annotations
 
-from ...settings import FitSettings
-from ...task import FitRequest, Task
+from ...fitting.settings import FitSettings
+from ...fitting.task import FitRequest, Task
 
 
 class DisneyTask(Task):

@@ -1,7 +1,7 @@
 """Base class of the tables of the Disney BRDF.
 
 A layout (:class:`.paper.PaperArrays`, :class:`.factored.FactoredArrays`) is a ``drjit.nn`` module of named
-:class:`~mi_diffind.indirection.DifferentiableArray` s. It declares their sizes and the range of their entries, and
+:class:`.DifferentiableArray` s. It declares their sizes and the range of their entries, and
 defines their training: initial values, targets and predictions. Its decoder reads it.
 """
 
@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 from drjit import nn
 
-from ...indirection import DifferentiableArray
-from ...lookup import clamp
-from ...tables import StoredArray, Table
+from ...arrays.indirection import DifferentiableArray
+from ...arrays.lookup import clamp
+from ...arrays.tables import StoredArray, Table
 from .decoder import warp_roughness
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
-from ...bounds import ValueBounds
+from ...arrays.bounds import ValueBounds
 from .model import PARAMETERS
 
 

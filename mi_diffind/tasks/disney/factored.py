@@ -29,8 +29,8 @@ from __future__ import annotations
 import drjit as dr
 import numpy as np
 
-from ...lookup import clamp, quantize
-from ...tables import StoredArray, Table
+from ...arrays.lookup import clamp, quantize
+from ...arrays.tables import StoredArray, Table
 from . import decoder, model
 from .arrays import DisneyArrays
 from .model import ALPHA_MIN, TINY

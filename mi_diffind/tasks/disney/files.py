@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 
-from ...lookup import STORAGES
-from ...tables import Table, TableError, check_ranges, load_table
-from ...task import Model
+from ...arrays.lookup import STORAGES
+from ...arrays.tables import Table, TableError, check_ranges, load_table
+from ...fitting.task import Model
 from . import training
 from .arrays import DisneyArrays
 from .decoder import Decoder

@@ -21,7 +21,7 @@ from typing import Any
 
 import drjit as dr
 
-from ...lookup import clamp
+from ...arrays.lookup import clamp
 
 #: Smallest GGX roughness α, as in Mitsuba's ``principled``.
 ALPHA_MIN = 1e-3

@@ -24,7 +24,7 @@ from __future__ import annotations
 import drjit as dr
 import numpy as np
 
-from ...lookup import clamp
+from ...arrays.lookup import clamp
 from . import decoder, model
 from .arrays import DisneyArrays
 from .model import ALPHA_MIN, COAT_F0, TINY, Factors, compose, diffuse_factors, geometry, positive

@@ -13,7 +13,7 @@ from typing import Any
 
 import drjit as dr
 
-from ...fitting import Problem, exponential_like
+from ...fitting.loop import Problem, exponential_like
 from . import model
 from .arrays import DisneyArrays
 from .decoder import Decoder, Lobe

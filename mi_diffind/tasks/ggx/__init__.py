@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 
-from ...errors import UsageError
-from ...settings import FitSettings
-from ...task import Argument, FitRequest, Task
+from ...core.errors import UsageError
+from ...fitting.settings import FitSettings
+from ...fitting.task import Argument, FitRequest, Task
 
 
 def _side(text: str) -> int:
@@ -53,7 +53,7 @@ class GGX(Task):
     def table(self, problem, request: FitRequest):
         from dataclasses import asdict
 
-        from ...tables import StoredArray, Table
+        from ...arrays.tables import StoredArray, Table
 
         net = problem.net
         arrays = {"primary": StoredArray.of(net.primary[0]), "cascaded": StoredArray.of(net.cascaded)}

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 
-from ...indirection import Indirection
-from ...lookup import STORAGES
-from ...tables import Table, TableError, check_ranges, load_table
-from ...task import Model
+from ...arrays.indirection import Indirection
+from ...arrays.lookup import STORAGES
+from ...arrays.tables import Table, TableError, check_ranges, load_table
+from ...fitting.task import Model
 from . import training
 from .model import Encoding, LearnedGGX
 

@@ -37,8 +37,8 @@ from typing import Any
 
 import drjit as dr
 
-from ...indirection import DifferentiableArray, Indirection
-from ...lookup import clamp
+from ...arrays.indirection import DifferentiableArray, Indirection
+from ...arrays.lookup import clamp
 
 #: Smallest roughness that is learned. A smaller one is read here, at an angle that is scaled accordingly.
 ALPHA_MIN = 1e-3
@@ -145,7 +145,7 @@ class Roughness:
 class LearnedGGX:
     """Distribution read from ``net``, any function from a list of two coordinates in [0, 1] to a list of one array.
 
-    ``net`` may be an :class:`~mi_diffind.indirection.Indirection`, a single array or a network. Without ``tail``, all
+    ``net`` may be an :class:`.Indirection`, a single array or a network. Without ``tail``, all
     of the distribution is read, as in training.
     """
 

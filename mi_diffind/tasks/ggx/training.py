@@ -9,7 +9,7 @@ from dataclasses import asdict
 import drjit as dr
 import numpy as np
 
-from ...fitting import Problem, exponential_like
+from ...fitting.loop import Problem, exponential_like
 from .model import ALPHA_MIN, ENCODINGS, Encoding, LearnedGGX, ggx
 
 #: Ranges of roughness for which errors are reported.

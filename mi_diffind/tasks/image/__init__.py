@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import dataclasses
 
-from ...arguments import Argument, between, checked, positive
+from ...core.arguments import Argument, between, checked, positive
+from ...fitting.task import Task
 from ...maps.arguments import DECODED, SIZES, SOURCE, SOURCES
-from ...task import Task
 from .presets import IMPROVEMENTS, PRESETS, STRUCTURES, parse_weights, without
 
 

@@ -13,10 +13,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ...indirection import DifferentiableArray, Indirection, ramp
+from ...arrays.indirection import DifferentiableArray, Indirection, ramp
+from ...arrays.pages import PagedArray, page_counts, page_entries, page_gain, page_positions, page_shift, page_sizes
 from ...maps import components
 from ...maps.layout import Layout
-from ...pages import PagedArray, page_counts, page_entries, page_gain, page_positions, page_shift, page_sizes
 from .memory_budget import ImageBudget
 
 #: Room between the components' range and the ends of [0, 1]; share of texels beyond the range at either end.
@@ -94,7 +94,7 @@ def from_components(values: np.ndarray, size: ImageBudget, border: tuple[str, st
 
 
 def gain_of_pages(values: np.ndarray, size: ImageBudget, border: tuple[str, str]) -> tuple[float, float]:
-    """Return :func:`~mi_diffind.pages.page_gain` of the components of an image, for one primary."""
+    """Return :func:`~mi_diffind.arrays.pages.page_gain` of the components of an image, for one primary."""
     k = values.shape[-1]
     mean = values.reshape(-1, k).mean(axis=0, dtype=np.float64)
     covariance = components.covariance(values, mean)

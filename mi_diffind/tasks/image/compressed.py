@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 
-from ...compat import module_of
-from ...indirection import DifferentiableArray, Indirection
+from ...arrays.indirection import DifferentiableArray, Indirection
+from ...arrays.pages import page_counts
+from ...arrays.tables import PAGES, Table, TableError, load_table, stored_arrays
+from ...core.compat import module_of
 from ...maps.compressed import CompressedMaps
 from ...maps.layout import Layout
 from ...maps.model import MapsModel, allocate_maps, page_entries
-from ...pages import page_counts
-from ...tables import PAGES, Table, TableError, load_table, stored_arrays
 from .arrays import joined
 
 #: Names of the primary arrays: the second, of lower resolution, is optional. The first may consist of pages.
@@ -63,7 +63,7 @@ def to_table(image: CompressedImage, settings: dict) -> Table:
 
 
 def load(path: str | os.PathLike) -> Table:
-    """Read and check a table file of this task. Raises :class:`~mi_diffind.tables.TableError`."""
+    """Read and check a table file of this task. Raises :class:`.TableError`."""
     table = load_table(path, "image")
     try:
         layout = Layout.from_json(table.settings["layout"])

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 
-from ...errors import UsageError
+from ...arrays.pages import most_entries
+from ...arrays.tables import MAX_BYTES
+from ...core.errors import UsageError
+from ...fitting.settings import FittingError
+from ...fitting.task import FitRequest, Fitted
 from ...maps import as_seen
 from ...maps.arguments import requested_border, requested_bytes, size_figures
 from ...maps.source import Source, load_source
-from ...pages import most_entries
-from ...settings import FittingError
-from ...tables import MAX_BYTES
-from ...task import FitRequest, Fitted
 from . import memory_budget, search, training, weights
 from .compressed import CompressedImage
 from .presets import PAGED, PRESETS, STRUCTURES, ImageRecipe, parse_weights, without
@@ -57,7 +57,7 @@ def fit(request: FitRequest) -> Fitted:
     """Choose sizes, train, and measure.
 
     Raises :class:`UsageError`, :class:`~mi_diffind.maps.source.SourceError` and
-    :class:`~mi_diffind.fitting.FittingError`.
+    :class:`.FittingError`.
     """
     options = request.options
     source = load_source(options["source"], nonfinite=options["nonfinite"])

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ...units import largest_fitting
+from ...core.units import largest_fitting
 
 #: Best resolution ratio for compression ratios of RGB textures at 4K (the supplement's table 2).
 RATIOS = {3: 128, 6: 128, 12: 80, 24: 72}

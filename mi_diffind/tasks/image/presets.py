@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from ...settings import FitSettings
+from ...fitting.settings import FitSettings
 from .memory_budget import CoarsePrimary
 
 #: Structures of the primary: bits of an entry, and a second primary or ``None``. Fewer bits: more entries.
@@ -20,7 +20,7 @@ STRUCTURES: dict[str, tuple[int, CoarsePrimary | None]] = {
     "pages of 2 + 6 bits": (2, CoarsePrimary(2, 6, 0.35)),
 }
 
-#: Structures whose first primary consists of pages, whose resolution follows the image (:mod:`mi_diffind.pages`).
+#: Structures whose first primary consists of pages, whose resolution follows the image (:mod:`.pages`).
 PAGED = ("pages of 5 bits", "pages of 6 bits", "pages of 2 + 6 bits")
 
 

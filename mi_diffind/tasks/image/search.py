@@ -7,10 +7,10 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from ...fitting import FitResult
+from ...arrays.tables import Table
+from ...fitting.loop import FitResult
+from ...fitting.task import FitRequest
 from ...maps.source import Source
-from ...tables import Table
-from ...task import FitRequest
 from . import memory_budget
 from .memory_budget import CoarsePrimary, ImageBudget
 from .presets import PAGED, STRUCTURES, ImageRecipe, replaced

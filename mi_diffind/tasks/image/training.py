@@ -13,17 +13,17 @@ import math
 import drjit as dr
 import numpy as np
 
-from ... import lookup
-from ...fitting import FitResult, Problem
-from ...indirection import aligned, aligned_copy, rounded, stored_form
+from ...arrays import lookup
+from ...arrays.indirection import aligned, aligned_copy, rounded, stored_form
+from ...arrays.pages import most_entries, page_counts
+from ...arrays.tables import Table
+from ...fitting.loop import FitResult, Problem
+from ...fitting.task import FitRequest
 from ...maps import components
 from ...maps.compressed import decibel
 from ...maps.layout import Layout
 from ...maps.pyramid import padded_texels, weighted_sum
 from ...maps.source import Source
-from ...pages import most_entries, page_counts
-from ...tables import Table
-from ...task import FitRequest
 from . import arrays, memory_budget
 from .compressed import CompressedImage, to_table
 from .memory_budget import ImageBudget

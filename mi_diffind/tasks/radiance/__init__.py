@@ -12,13 +12,9 @@
 
 from __future__ import annotations
 
-import dataclasses
-import importlib
-
-from ... import units
-from ...arguments import Argument, between, checked, decibels, positive
-from ...splat_files import is_splats
-from ...task import Task
+from ...core import units
+from ...core.arguments import Argument, between, checked, decibels, positive
+from ...fitting.task import Task
 from .presets import BACKGROUNDS, COLOURS, PRESETS
 
 
@@ -100,24 +96,12 @@ class RadianceField(Task):
         Argument(
             "--grid", file="written", metavar="FILE", help="grid to compress; if the file does not exist, it is made"
         ),
-        Argument(
-            "--box", type=float, nargs=6, metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
-            help="of 3D Gaussians, those inside, lower corner first (default: all but strays)",
-        ),
     )  # fmt: skip
     decode_arguments = (
         Argument(
             "--resolution", type=positive, metavar="N", help="nodes along the longest side (default: the field's)"
         ),
     )
-
-    def fit(self, request):
-        source = request.options["source"]
-        if is_splats(source):
-            # Captures stand above tasks: asked for by name, as plugins are
-            views = importlib.import_module("mi_diffind.view_capture").views_of_splats(request)
-            request = dataclasses.replace(request, options={**request.options, "source": views})
-        return super().fit(request)
 
     def allocate(self, table, dtype, storage=""):
         return {}

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import missing_package, reason
+from ...core.errors import missing_package, reason
 from .image_files import EXTENSIONS, ViewsError
 from .transforms import EVERY, Frame, FrameList
 

@@ -13,8 +13,8 @@ import drjit as dr
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ...deadline import Deadline
-from ...indirection import device_array, device_tensor, fold
+from ...arrays.indirection import device_array, device_tensor, fold
+from ...core.deadline import Deadline
 from . import grid as grids
 from . import node_codes
 from .grid import NodeGrid

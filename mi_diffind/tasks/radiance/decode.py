@@ -13,8 +13,8 @@ import drjit as dr
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from ...errors import UsageError
-from ...files import replacing
+from ...core.errors import UsageError
+from ...core.files import replacing
 from .volume_field import DenseVolumeField, VolumeField, raw_of
 
 #: Points at which a field is evaluated at once.
@@ -47,7 +47,7 @@ def grid(field: VolumeField, resolution: int | None = None) -> dict[str, np.ndar
     If the radiance of a field is not such an exponential, the mean of the logarithms of opposite directions is kept
     along the axes. Empty nodes get the colour of the nearest node that is not empty. A sparse field ends at the faces
     of its occupied cells, a dense grid fades out over the next cell: a grid twice as fine is closer to the field.
-    Raises :class:`~mi_diffind.errors.UsageError` for a resolution outside of 2 … 512.
+    Raises :class:`.UsageError` for a resolution outside of 2 … 512.
     """
     lower, extent = np.array(field.lower), np.array(field.upper) - np.array(field.lower)
     if resolution is None:
@@ -127,7 +127,7 @@ def decode(field: VolumeField, output: Path, resolution: int | None = None) -> l
     """Write a field as a dense grid and return the file with a line about its content.
 
     A ``.npz`` file holds the arrays of :func:`grid`; a ``.vdb`` file holds grids ``density`` and ``color``, the mean
-    radiance over all directions. Raises :class:`~mi_diffind.errors.UsageError` for another extension, a bad resolution,
+    radiance over all directions. Raises :class:`.UsageError` for another extension, a bad resolution,
     or if OpenVDB is not installed.
     """
     suffix = output.suffix.lower()

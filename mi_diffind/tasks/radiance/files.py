@@ -10,9 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ...indirection import Indirection, device_array, device_tensor
-from ...limits import allowed
-from ...tables import (
+from ...arrays.indirection import Indirection, device_array, device_tensor
+from ...arrays.tables import (
     StoredArray,
     Table,
     TableError,
@@ -22,6 +21,7 @@ from ...tables import (
     load_layout,
     restored,
 )
+from ...core.limits import allowed
 from . import node_codes
 from .compression import INDEX_BITS, MOST_BITS, as_bytes
 from .grid import NodeGrid
@@ -92,7 +92,7 @@ def coded(stored: np.ndarray, levels: np.ndarray, index: np.ndarray, palette: St
 def sparse(table: Table) -> Table:
     """Return a table of the layout "coded" in the layout "sparse", any other table as it is.
 
-    Raises :class:`~mi_diffind.tables.TableError` if it is damaged.
+    Raises :class:`.TableError` if it is damaged.
     """
     if table.settings["layout"] != "coded":
         return table
@@ -181,7 +181,7 @@ def pairs_table(nodes: Nodes, arrays: dict, low, high) -> Table:
 
 
 def load(path) -> Table:
-    """Read and check a table file of a radiance field. Raises :class:`~mi_diffind.tables.TableError`."""
+    """Read and check a table file of a radiance field. Raises :class:`.TableError`."""
     table = load_layout(path, "field", LAYOUTS)
     layout = table.settings["layout"]
     if "curve" in table.arrays:

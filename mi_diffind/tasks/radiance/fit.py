@@ -14,14 +14,13 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 
-from ... import units
-from ...errors import UsageError
-from ...files import check_distinct
-from ...fitting import FitResult, FittingError, cores
-from ...interrupt import interruptible
-from ...splat_files import is_splats
-from ...tables import MAX_BYTES, StoredArray, Table, save_table
-from ...task import FitRequest, Fitted
+from ...arrays.tables import MAX_BYTES, StoredArray, Table, save_table
+from ...core import units
+from ...core.errors import UsageError
+from ...core.files import check_distinct
+from ...core.interrupt import interruptible
+from ...fitting.loop import FitResult, FittingError, cores
+from ...fitting.task import FitRequest, Fitted
 from . import compression, files, paper
 from . import grid as grids
 from .grid import NodeGrid
@@ -77,13 +76,21 @@ TRIAL = 600
 PIXELS = 40_000
 
 
+#: Ends of the names of files of 3D Gaussians.
+SPLATS = (".ply", ".sog", ".spz", ".splat", ".ksplat", ".lcc")
+
+
 def check(request: FitRequest) -> None:
     """Raise :class:`UsageError` for options that do not go together."""
     options = request.options
     if options["source"] is None:
         raise UsageError("source: not given, a folder of views is needed")
-    if options["box"] is not None and not is_splats(options["source"]):
-        raise UsageError(f"--box: given with {options['source']}, allowed are files of 3D Gaussians")
+    if Path(options["source"]).suffix.lower() in SPLATS:
+        path = Path(options["source"])
+        raise UsageError(
+            f"source: {path} is a file of 3D Gaussians, a folder of views is needed: "
+            f"mi-diffind capture {path.name} -o {path.stem}_views --views 80 --resolution 200"
+        )
     sized = [name for name in ("bytes", "compression", "psnr", "disk") if options.get(name) is not None]
     if request.preset == "grid" and sized:
         raise UsageError(f"--{sized[0]} is an option of the presets sparse and paper, found the preset grid")
@@ -122,8 +129,8 @@ def check(request: FitRequest) -> None:
 def fit(request: FitRequest) -> Fitted:
     """Fit a field to the views in a folder.
 
-    Raises :class:`UsageError`, :class:`.views.ViewsError`, :class:`~mi_diffind.tables.TableError` and
-    :class:`~mi_diffind.fitting.FittingError`.
+    Raises :class:`UsageError`, :class:`.views.ViewsError`, :class:`.TableError` and
+    :class:`.FittingError`.
     """
     pixels = None if request.deadline is None else PIXELS * request.deadline.seconds
     options = request.options

@@ -13,7 +13,7 @@ import drjit as dr
 import numpy as np
 from scipy.ndimage import binary_dilation, gaussian_filter, map_coordinates
 
-from ...indirection import device_array, device_tensor
+from ...arrays.indirection import device_array, device_tensor
 from . import reflection, surroundings
 from .march import visibility
 from .nodes import Nodes, cells_of, corners_of

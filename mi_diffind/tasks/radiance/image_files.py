@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import DiffindError, reason
-from ...files import OutsideError, irregular, path_by_name, shown
-from ...limits import Allowance, LimitError
-from ...picture_sizes import check_picture
-from ...srgb import from_linear, to_linear
-from ...units import memory
+from ...core.errors import DiffindError, reason
+from ...core.files import OutsideError, irregular, path_by_name, shown
+from ...core.limits import Allowance, LimitError
+from ...core.units import memory
+from ...images.headers import check_picture
+from ...images.srgb import from_linear, to_linear
 
 #: Extensions tried in turn for an image name without one.
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".exr")
@@ -166,7 +166,7 @@ def read_mask(path: Path, image: np.ndarray, image_path: Path) -> tuple[np.ndarr
 def _opened(path: Path, channels: int):
     """Return an open image file of Pillow, not yet decoded, that may have so many ``channels`` of a byte.
 
-    Raises :class:`~mi_diffind.limits.LimitError` for one that takes more memory than a file of its size may.
+    Raises :class:`.LimitError` for one that takes more memory than a file of its size may.
     """
     from PIL import Image
 

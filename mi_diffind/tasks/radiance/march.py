@@ -16,8 +16,8 @@ from dataclasses import asdict, dataclass
 
 import drjit as dr
 
-from ... import compat
-from ...rays import box_interval, is_direction
+from ...arrays.boxes import box_interval, is_direction
+from ...core import compat
 from .volume_field import VolumeField
 
 #: Transmittance at which a ray ends.

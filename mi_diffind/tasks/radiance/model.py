@@ -8,8 +8,8 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 
-from ...indirection import device_array
-from ...task import Model
+from ...arrays.indirection import device_array
+from ...fitting.task import Model
 from .files import field_of
 from .presets import dense_bytes
 
@@ -115,7 +115,7 @@ class RadianceFieldModel(Model):
         return [images.render(self.field, i) for i in range(min(count or len(images.views), len(images.views)))]
 
     def _test_views(self, capture):
-        """Return the test views of a capture. Raises :class:`~mi_diffind.tables.TableError` if it is not there."""
+        """Return the test views of a capture. Raises :class:`.TableError` if it is not there."""
         from .session import ViewImages, load_held_out
 
         folder = (self.table.path or Path("x")).resolve().parent

@@ -11,8 +11,8 @@ import numpy as np
 from drjit import nn
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
-from ...fitting import Problem
-from ...indirection import DifferentiableArray, Indirection, ramp, rounded
+from ...arrays.indirection import DifferentiableArray, Indirection, ramp, rounded
+from ...fitting.loop import Problem
 from .grid import NodeGrid
 from .nodes import Nodes
 from .session import FieldSession

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from math import log, prod
 
-from ...settings import FitSettings
+from ...fitting.settings import FitSettings
 
 #: Voxels per pixel of the views at the distance of the box, and the range of the resolution that follows from them:
 #: nodes along each side of a cube with the volume of the box.

@@ -13,8 +13,8 @@ import drjit as dr
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ... import srgb
-from ...deadline import Deadline
+from ...core.deadline import Deadline
+from ...images import srgb
 from . import node_codes
 from .grid import NodeGrid
 from .march import differentiable

@@ -17,8 +17,8 @@ import drjit as dr
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from ... import metrics, srgb
-from ...indirection import device_array
+from ...arrays.indirection import device_array
+from ...images import metrics, srgb
 from .image_files import LINEAR
 from .march import march
 from .views import CapturedViews, ViewsError, load_views

@@ -7,9 +7,9 @@ from collections.abc import Callable
 import drjit as dr
 import numpy as np
 
-from ... import srgb
-from ...fitting import Problem
-from ...indirection import device_tensor
+from ...arrays.indirection import device_tensor
+from ...fitting.loop import Problem
+from ...images import srgb
 from .march import differentiable
 from .session import PATCH, SIDE, FieldSession
 from .volume_field import VolumeField

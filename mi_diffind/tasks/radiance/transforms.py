@@ -15,10 +15,10 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from ...errors import reason
-from ...files import MOST_TEXT, irregular, shown
-from ...limits import Allowance, LimitError, json_bytes
-from ...unused_keys import RecordedKeys, unused_note
+from ...core.errors import reason
+from ...core.files import MOST_TEXT, irregular, shown
+from ...core.limits import Allowance, LimitError, json_bytes
+from ...core.unused_keys import RecordedKeys, unused_note
 from .camera_keys import camera_numbers
 from .image_files import ViewsError
 

@@ -19,10 +19,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ... import units
-from ...errors import printable, shortened
-from ...indirection import aligned
-from ...progress import progress_bar
+from ...arrays.indirection import aligned
+from ...core import units
+from ...core.errors import printable, shortened
+from ...core.progress import progress_bar
 from . import background as backgrounds
 from .camera_keys import focal_lengths
 from .colmap import colmap_frames, model_folder

@@ -11,8 +11,8 @@ import copy
 import drjit as dr
 import numpy as np
 
-from ...bits import as_words, pack_bits
-from ...indirection import device_array, device_tensor
+from ...arrays.bits import as_words, pack_bits
+from ...arrays.indirection import device_array, device_tensor
 from . import reflection
 from .nodes import Nodes
 from .reflection import BRIGHTEST

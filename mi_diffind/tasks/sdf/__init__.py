@@ -10,10 +10,10 @@
 
 from __future__ import annotations
 
-from ... import units
-from ...arguments import Argument, between, checked, positive
-from ...settings import FitSettings
-from ...task import Task
+from ...core import units
+from ...core.arguments import Argument, between, checked, positive
+from ...fitting.settings import FitSettings
+from ...fitting.task import Task
 
 #: Bits of a pointer that divide words evenly (:data:`.codes.POINTERS`, without importing Dr.Jit).
 BITS = (4, 5, 6, 8, 10, 16)

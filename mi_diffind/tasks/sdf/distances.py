@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import DiffindError, missing_package, reason
+from ...core.errors import DiffindError, missing_package, reason
 from . import boundary
 from .mesh import NO_VOLUME, Mesh
 

@@ -11,7 +11,7 @@ import math
 import drjit as dr
 import numpy as np
 
-from ...indirection import device_array
+from ...arrays.indirection import device_array
 from .distances import Distances
 from .extraction import OFF_NODE, components, march, trimesh_of
 from .field import DistanceField

@@ -18,7 +18,7 @@ def extract(field: DistanceField, resolution: int, scale: float = 1.0, centre=(0
     Vertices are in units and place of the file: ``vertices · scale + centre``. ``resolution`` is the number of cells
     along the longest side; choose cells finer than the field's where the result is to be measured. Values are kept of
     32 layers of cells at a time, and computed near the nodes of a sparse field only. Raises
-    :class:`~mi_diffind.errors.UsageError` for a resolution outside of 4 … 1024.
+    :class:`.UsageError` for a resolution outside of 4 … 1024.
     """
     spacing = spacing_for(field, resolution)
     # One more cell on either side, all outside, closes what the box cuts

@@ -10,13 +10,13 @@ import drjit as dr
 import numpy as np
 from drjit import nn
 
-from ... import units
-from ...errors import UsageError
-from ...fitting import Problem
-from ...indirection import device_array, device_tensor
-from ...settings import FittingError
-from ...tables import MAX_BYTES, Table
-from ...task import FitRequest, Fitted
+from ...arrays.indirection import device_array, device_tensor
+from ...arrays.tables import MAX_BYTES, Table
+from ...core import units
+from ...core.errors import UsageError
+from ...fitting.loop import Problem
+from ...fitting.settings import FittingError
+from ...fitting.task import FitRequest, Fitted
 from . import codes, encoding
 from .distances import Distances
 from .evaluation import HELD_OUT, HeldOut, SurfaceEvaluation, lost_pieces
@@ -159,7 +159,7 @@ def fit(request: FitRequest, measured: int = MEASURED, samples: int = SAMPLES, h
 
     ``measured`` and ``held_out`` are the numbers of points at which the result and states on the way are measured,
     ``samples`` the number of training samples of dense arrays. Raises :class:`UsageError`, :class:`.mesh.MeshError`,
-    :class:`.distances.DistancesError` and :class:`~mi_diffind.fitting.FittingError`.
+    :class:`.distances.DistancesError` and :class:`.FittingError`.
     """
     mesh = load_mesh(request.options["source"])
     nbytes = requested_bytes(request.options)

@@ -10,8 +10,8 @@ import math
 import drjit as dr
 import numpy as np
 
-from ...errors import UsageError
-from ...indirection import device_array
+from ...arrays.indirection import device_array
+from ...core.errors import UsageError
 from .field import DistanceField
 from .sampling import CORNERS
 from .structure import BLOCK as NODES
@@ -27,7 +27,7 @@ MAX_RESOLUTION = 1024
 
 
 def spacing_for(field: DistanceField, resolution: int) -> float:
-    """Return the side of a grid's cells. Raises :class:`~mi_diffind.errors.UsageError` for a bad resolution."""
+    """Return the side of a grid's cells. Raises :class:`.UsageError` for a bad resolution."""
     if isinstance(resolution, bool) or not isinstance(resolution, (int, np.integer)) or not (
         4 <= resolution <= MAX_RESOLUTION
     ):  # fmt: skip

@@ -19,9 +19,9 @@ import drjit as dr
 import numpy as np
 from scipy.ndimage import distance_transform_cdt
 
-from ... import compat
-from ...bits import mask_flags, mask_words
-from ...indirection import device_array
+from ...arrays.bits import mask_flags, mask_words
+from ...arrays.indirection import device_array
+from ...core import compat
 from . import codes
 from .nodes import CORNERS, MIDDLE, bernstein
 from .structure import ACTIVE, BLOCK, first_ranks, place_of

@@ -18,10 +18,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ... import mitsuba_versions
-from ...errors import DiffindError, missing_package, reason
-from ...files import irregular, shown
-from ...units import memory
+from ...core import mitsuba_versions
+from ...core.errors import DiffindError, missing_package, reason
+from ...core.files import irregular, shown
+from ...core.units import memory
 from . import scene_meshes, serialized
 
 #: Extent along an axis, relative to the longest side, below which a mesh is flat: float32 resolves no volume in it.

@@ -9,11 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ...compat import module_of
-from ...errors import UsageError
-from ...files import replacing
-from ...indirection import Indirection, device_tensor
-from ...tables import (
+from ...arrays.indirection import Indirection, device_tensor
+from ...arrays.tables import (  # fmt: skip
     StoredArray,
     Table,
     TableError,
@@ -22,9 +19,12 @@ from ...tables import (
     check_numbers,
     load_layout,
     restored,
-)  # fmt: skip
-from ...task import Model
-from ...units import check_memory
+)
+from ...core.compat import module_of
+from ...core.errors import UsageError
+from ...core.files import replacing
+from ...core.units import check_memory
+from ...fitting.task import Model
 from . import codes
 from .field import DistanceField
 from .nodes import SparseNodes, coded_field, decoded_nodes, slope_bound
@@ -69,7 +69,7 @@ def sparse_arrays(structure: Structure, frames, pointers, entries) -> dict[str, 
 
 
 def load(path) -> Table:
-    """Read and check a file. Raises :class:`~mi_diffind.tables.TableError`."""
+    """Read and check a file. Raises :class:`.TableError`."""
     table = load_layout(path, "sdf", LAYOUTS)
     sparse = table.settings["layout"] == "sparse"
     for name in ("lower", "centre", *(() if sparse else ("upper",))):
@@ -88,7 +88,7 @@ def load(path) -> Table:
 
 
 def check_pair(table: Table) -> None:
-    """Raise :class:`~mi_diffind.tables.TableError` unless the box of two arrays has a volume, and cells."""
+    """Raise :class:`.TableError` unless the box of two arrays has a volume, and cells."""
     sides = table.arrays["primary"].shape[:-1]
     if min(sides) < 2:
         raise TableError(
@@ -109,7 +109,7 @@ def _words(table: Table, name: str, part=slice(None)) -> np.ndarray:
 
 
 def structure_of(table: Table) -> Structure:
-    """Return the structure of a sparse field. Raises :class:`~mi_diffind.tables.TableError` if it is damaged."""
+    """Return the structure of a sparse field. Raises :class:`.TableError` if it is damaged."""
     settings = table.settings
     bits, nodes = settings["bits"], settings["nodes"]
     regions = table.arrays["regions"].entries[..., 0]

@@ -13,12 +13,12 @@ import drjit as dr
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ...errors import UsageError
-from ...fitting import Problem
-from ...indirection import DifferentiableArray, Indirection, device_array, ramp, rounded, stored_form
-from ...tables import StoredArray, Table
-from ...task import FitRequest
-from ...units import largest_fitting
+from ...arrays.indirection import DifferentiableArray, Indirection, device_array, ramp, rounded, stored_form
+from ...arrays.tables import StoredArray, Table
+from ...core.errors import UsageError
+from ...core.units import largest_fitting
+from ...fitting.loop import Problem
+from ...fitting.task import FitRequest
 from .distances import Distances
 from .evaluation import HELD_OUT, HeldOut
 from .field import DistanceField
@@ -219,7 +219,7 @@ def fit_pair(
 
     ``samples`` and ``held_out`` are the numbers of training samples and of points measured on the way;
     ``measure`` is the measurement that will follow, for which a limit of time leaves room. Raises
-    :class:`~mi_diffind.errors.UsageError` if even the smallest arrays are larger.
+    :class:`.UsageError` if even the smallest arrays are larger.
     """
     mesh, options = distances.mesh, request.options
     extent = mesh.upper - mesh.lower

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ... import mitsuba_versions
-from ...runtime import use_variant
+from ...core import mitsuba_versions
+from ...core.runtime import use_variant
 
 
 def read(path: Path, name: str = "") -> list[tuple[np.ndarray, np.ndarray]]:

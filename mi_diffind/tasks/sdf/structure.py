@@ -17,8 +17,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...bits import mask_flags, mask_words
-from ...errors import DiffindError
+from ...arrays.bits import mask_flags, mask_words
+from ...core.errors import DiffindError
 
 #: Nodes along a side of a block and of a region.
 BLOCK, REGION = 4, 16

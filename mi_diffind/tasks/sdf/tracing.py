@@ -16,8 +16,8 @@ from typing import Any
 
 import drjit as dr
 
-from ... import compat
-from ...rays import box_interval, is_direction
+from ...arrays.boxes import box_interval, is_direction
+from ...core import compat
 from . import marching
 
 #: Shortest step, relative to the longest side; a ray may miss a solid that it crosses in less.

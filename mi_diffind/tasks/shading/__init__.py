@@ -7,14 +7,14 @@ task 4, shaded by frozen tables of task 2; the result is a file of the task ``te
 - :mod:`.evaluation`: images under views and lights that no training draws; :mod:`.preview`: a picture of the progress;
 - :mod:`.presets`, :mod:`.training`, :mod:`.fit`: recipes, the problem, and ``fit shading``.
 
-Training through renders of a scene is :mod:`mi_diffind.scene_training`.
+Training through renders of a scene is :mod:`mi_diffind.scenes.training`.
 """
 
 from __future__ import annotations
 
-from ...arguments import Argument, fraction, positive_or_none
+from ...core.arguments import Argument, fraction, positive_or_none
+from ...fitting.task import Task
 from ...maps.arguments import LEVEL_BIAS, PREVIEW, SIZES, SOURCES
-from ...task import Task
 from .presets import PRESETS, REFERENCES
 
 

@@ -9,8 +9,8 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from ... import metrics
-from ...indirection import aligned_copy
+from ...arrays.indirection import aligned_copy
+from ...images import metrics
 from ...maps.compressed import FilteredMaps, decibel
 from ...maps.pyramid import Pyramid
 from ..disney.decoder import Decoder

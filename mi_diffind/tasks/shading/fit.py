@@ -6,13 +6,13 @@ import dataclasses
 import math
 import os
 
-from ...errors import UsageError
+from ...arrays.tables import Table
+from ...core.errors import UsageError
+from ...core.units import labelled
+from ...fitting.task import FitRequest, Fitted
 from ...maps.arguments import preview_path, requested_border, requested_bytes
 from ...maps.pyramid import Pyramid
 from ...maps.source import load_source
-from ...tables import Table
-from ...task import FitRequest, Fitted
-from ...units import labelled
 from ..texture import TASK as TEXTURE
 from ..texture import fit as texture_fit
 from ..texture import training as textures
@@ -62,8 +62,8 @@ def fit(request: FitRequest) -> Fitted:
     """Train as a texture, unless a trained one is given, then for shading, and measure the result.
 
     If time is limited, the first training takes :data:`PRETRAINING` of what is left. Raises :class:`UsageError`,
-    :class:`~mi_diffind.maps.source.SourceError`, :class:`~mi_diffind.tables.TableError` and
-    :class:`~mi_diffind.fitting.FittingError`.
+    :class:`~mi_diffind.maps.source.SourceError`, :class:`.TableError` and
+    :class:`.FittingError`.
     """
     options = request.options
     source = load_source(options["source"], nonfinite=options["nonfinite"])

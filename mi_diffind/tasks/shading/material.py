@@ -16,10 +16,10 @@ from typing import Any
 
 import drjit as dr
 
-from ... import srgb
-from ...bounds import ValueBounds
-from ...compat import module_of
-from ...errors import UsageError
+from ...arrays.bounds import ValueBounds
+from ...core.compat import module_of
+from ...core.errors import UsageError
+from ...images import srgb
 from ...maps.compressed import FilteredMaps
 from ...maps.layout import Layout, MapLayout
 from ..disney import TASK as DISNEY

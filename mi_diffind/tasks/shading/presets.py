@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 
-from ...settings import FitSettings
+from ...fitting.settings import FitSettings
 
 #: Sample patterns of the reference (:data:`.reference.SAMPLES_PER_SIDE`).
 REFERENCES = ("jittered", "prefiltered", "converged")

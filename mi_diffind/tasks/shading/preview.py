@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ... import srgb
-from ...files import replacing
+from ...core.files import replacing
+from ...images import srgb
 from .evaluation import ShadedEvaluation, ShadedReader
 
 #: Levels of the preview, and the factor by which differences are amplified.

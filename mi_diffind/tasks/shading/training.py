@@ -16,14 +16,14 @@ from typing import NamedTuple
 import drjit as dr
 import numpy as np
 
-from ... import lookup
-from ...deadline import duration
-from ...fitting import FitResult, checkpoint_settings, sample_losses
-from ...indirection import unfolded
+from ...arrays import lookup
+from ...arrays.indirection import unfolded
+from ...arrays.tables import Table
+from ...core.deadline import duration
+from ...fitting.loop import FitResult, checkpoint_settings, sample_losses
+from ...fitting.task import FitRequest
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source
-from ...tables import Table
-from ...task import FitRequest
 from ..disney.training import random_directions
 from ..texture import training as textures
 from ..texture.compressed import CompressedTexture, to_table

@@ -10,9 +10,9 @@ Sources, stored channels and the reference, a mip pyramid, are in :mod:`mi_diffi
 
 from __future__ import annotations
 
-from ...arguments import Argument, between, checked, natural, positive
+from ...core.arguments import Argument, between, checked, natural, positive
+from ...fitting.task import Task
 from ...maps.arguments import BIAS_RANGE, DECODED, SIZES, SOURCE, SOURCES
-from ...task import Task
 from .presets import PRESETS
 
 

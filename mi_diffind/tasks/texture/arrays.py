@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...indirection import DifferentiableArray
+from ...arrays.indirection import DifferentiableArray
+from ...arrays.pages import PagedArray, page_entries, page_gain, page_positions, page_shift, page_sizes_of
 from ...maps import components
 from ...maps.compressed import taps
 from ...maps.layout import Layout
-from ...pages import PagedArray, page_entries, page_gain, page_positions, page_shift, page_sizes_of
 from .memory_budget import PaperBudget, TextureBudget
 from .nets import FineLayer, LayeredNet, LayeredStructure, PaperNet, PaperStructure
 
@@ -163,7 +163,7 @@ def _pages(pointers: list, basis: PrincipalComponents, size: TextureBudget, bord
 
 
 def gain_of_pages(values: Sequence[np.ndarray], size: TextureBudget, border: tuple[str, str]) -> float:
-    """Return the gain of pages over one grid of equal bytes at level 0, in dB (:func:`~mi_diffind.pages.page_gain`)."""
+    """Return the gain of pages over one grid of equal bytes at level 0, in dB (:func:`.page_gain`)."""
     basis = PrincipalComponents.of(values[0], size.dims)
     flat = values[0].reshape(-1, values[0].shape[-1]) - basis.mean
     exact = flat @ basis.directions.T

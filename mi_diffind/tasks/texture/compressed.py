@@ -9,17 +9,17 @@ from dataclasses import asdict
 import drjit as dr
 import numpy as np
 
-from ...compat import module_of
-from ...errors import UsageError
-from ...indirection import DifferentiableArray, aligned_copy
-from ...lookup import BORDERS
+from ...arrays.indirection import DifferentiableArray, aligned_copy
+from ...arrays.lookup import BORDERS
+from ...arrays.tables import PAGES, Table, TableError, load_table, stored_arrays
+from ...core.compat import module_of
+from ...core.errors import UsageError
 from ...maps.arguments import BIAS_RANGE
 from ...maps.compressed import FilteredMaps, decibel, map_figure
 from ...maps.layout import Layout
 from ...maps.model import MapsModel, allocate_maps, page_entries
 from ...maps.pyramid import Pyramid, level_sizes
 from ...maps.source import Source
-from ...tables import PAGES, Table, TableError, load_table, stored_arrays
 from .nets import NEUTRAL, FineLayer, LayeredNet, LayeredStructure, PaperNet, PaperStructure
 
 #: Names of the paper's arrays.
@@ -203,7 +203,7 @@ def structure_of(settings: dict, layout: Layout):
 
 
 def load(path: str | os.PathLike) -> Table:
-    """Read and check a table file of this task. Raises :class:`~mi_diffind.tables.TableError`."""
+    """Read and check a table file of this task. Raises :class:`.TableError`."""
     table = load_table(path, "texture")
     structure = border = None
     try:

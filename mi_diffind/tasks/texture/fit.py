@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 
-from ...errors import UsageError
+from ...arrays.tables import MAX_BYTES
+from ...core.errors import UsageError
+from ...fitting.task import FitRequest, Fitted
 from ...maps import as_seen, components
 from ...maps.arguments import requested_border, requested_bytes, size_figures
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source, load_source
-from ...tables import MAX_BYTES
-from ...task import FitRequest, Fitted
 from . import arrays, memory_budget, training
 from .compressed import CompressedTexture
 from .presets import PRESETS, TextureRecipe
@@ -50,7 +50,7 @@ def fit(request: FitRequest) -> Fitted:
     """Choose sizes, train, and measure.
 
     Raises :class:`UsageError`, :class:`~mi_diffind.maps.source.SourceError` and
-    :class:`~mi_diffind.fitting.FittingError`.
+    :class:`.FittingError`.
     """
     options = request.options
     source = load_source(options["source"], nonfinite=options["nonfinite"])

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ...arrays.pages import SIDE_BITS, most_entries, page_counts
 from ...maps.pyramid import level_sizes
-from ...pages import SIDE_BITS, most_entries, page_counts
 
 #: Best resolution ratio for compression ratios of textures at 4K (the supplement's table 4): RGB, and materials.
 RATIOS = {3: 80, 6: 64, 12: 64, 24: 48}

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import drjit as dr
 from drjit import nn
 
-from ... import lookup
-from ...indirection import DifferentiableArray
+from ...arrays import lookup
+from ...arrays.indirection import DifferentiableArray
+from ...arrays.pages import PagedArray
 from ...maps.pyramid import around, level_sizes
-from ...pages import PagedArray
 from .sampling import footprint_of
 
 

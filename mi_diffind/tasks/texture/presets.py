@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 
-from ...settings import FitSettings
+from ...fitting.settings import FitSettings
 
 
 @dataclass(frozen=True)

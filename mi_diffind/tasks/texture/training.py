@@ -12,15 +12,15 @@ import dataclasses
 import drjit as dr
 import numpy as np
 
-from ... import lookup
-from ...fitting import FitResult, Problem
-from ...indirection import aligned_copy, unfolded
+from ...arrays import lookup
+from ...arrays.indirection import aligned_copy, unfolded
+from ...arrays.tables import Table
+from ...fitting.loop import FitResult, Problem
+from ...fitting.task import FitRequest
 from ...maps.compressed import decibel
 from ...maps.layout import Layout
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source
-from ...tables import Table
-from ...task import FitRequest
 from . import arrays
 from .compressed import CompressedTexture, to_table
 from .memory_budget import PaperBudget, TextureBudget

@@ -325,12 +325,12 @@ def test_scenes_tell_their_textures(mi_rgb, tmp_path):
     fp.register_probe()
     path = tmp_path / "scene.xml"
     path.write_text(SCENE)
-    from mi_diffind import scenes
+    from mi_diffind.scenes import loading
 
     probe = footprint.textures(mi.load_file(str(path)))[0]
     assert probe.cone is None
     for scene, fov in (
-        (mi_diffind.load_file(path), 60), (mi_diffind.load_file(path, fov=30), 30), (scenes.load(path), 60)
+        (mi_diffind.load_file(path), 60), (mi_diffind.load_file(path, fov=30), 30), (loading.load(path), 60)
     ):  # fmt: skip
         cone = footprint.textures(scene)[0].cone
         assert cone.scale[0] == 0.25 and cone.spread[0] == pytest.approx(2 * np.tan(np.radians(fov) / 2) / 8, rel=1e-4)

@@ -10,7 +10,7 @@ from radiance_fields import Fog
 from radiance_fields import register as register_field
 
 import mi_diffind
-from mi_diffind import compat
+from mi_diffind.core import compat
 from mi_diffind.plugins.support import footprint
 
 SOLID = str(Path(__file__).resolve().parents[3] / "scenes" / "assets" / "suzanne.npz")

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from mi_diffind.metrics import psnr
+from mi_diffind.images.metrics import psnr
 from mi_diffind.studies.baselines import codecs
 from mi_diffind.studies.baselines.codecs import ASTC_BLOCKS, CodecError, Encoded
 

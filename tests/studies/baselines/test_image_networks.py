@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from mi_diffind.fitting import fit
+from mi_diffind.core.runtime import array_module
+from mi_diffind.fitting.loop import fit
+from mi_diffind.fitting.settings import FitSettings
 from mi_diffind.maps.source import from_arrays
-from mi_diffind.runtime import array_module
-from mi_diffind.settings import FitSettings
 from mi_diffind.studies.baselines import image_networks
 
 

@@ -19,7 +19,7 @@ WI, WO = np.array([0.3, 0.1, 0.95]), np.array([-0.2, 0.35, 0.9])
 
 @pytest.fixture
 def types(mi_rgb):
-    from mi_diffind.runtime import array_module
+    from mi_diffind.core.runtime import array_module
 
     return array_module(mi_rgb.variant())
 

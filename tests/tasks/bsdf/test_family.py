@@ -9,9 +9,9 @@ from arrays import aligned, numpy_of
 from learned_bsdfs import formula, handmade_family, member
 
 import mi_diffind
-from mi_diffind.errors import UsageError
-from mi_diffind.runtime import array_module
-from mi_diffind.tables import StoredArray, TableError, load_table, save_table
+from mi_diffind.arrays.tables import StoredArray, TableError, load_table, save_table
+from mi_diffind.core.errors import UsageError
+from mi_diffind.core.runtime import array_module
 from mi_diffind.tasks.bsdf import TASK, family_fit, family_measurement, family_sampling, family_truth, training
 from mi_diffind.tasks.bsdf.family import Parameter, sizes_of
 
@@ -88,7 +88,7 @@ def test_parameters_that_are_refused(mi_rgb, case):
 
 
 def test_the_command_line_names_ranges(capsys):
-    from mi_diffind import cli
+    from mi_diffind.commands import cli
 
     with pytest.raises(SystemExit):
         cli.main(["fit", "bsdf", "a.xml", "--over", "roughness=1", "-o", "a.npz"])

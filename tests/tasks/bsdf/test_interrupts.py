@@ -7,8 +7,8 @@ import signal
 import pytest
 
 import mi_diffind
-from mi_diffind.fitting import FittingError
-from mi_diffind.tables import load_table
+from mi_diffind.arrays.tables import load_table
+from mi_diffind.fitting.loop import FittingError
 from mi_diffind.tasks.bsdf import TASK, mixture, training, view
 
 SOURCE = {"type": "roughplastic", "alpha": 0.2}

@@ -7,9 +7,9 @@ import worker_jobs
 from PIL import Image
 
 import mi_diffind
-from mi_diffind.cli import main
-from mi_diffind.errors import UsageError
-from mi_diffind.tables import load_table
+from mi_diffind.arrays.tables import load_table
+from mi_diffind.commands.cli import main
+from mi_diffind.core.errors import UsageError
 from mi_diffind.tasks.bsdf import library
 
 BSDF = '<bsdf version="3.0.0" type="{}"><float name="alpha" value="{}"/></bsdf>'

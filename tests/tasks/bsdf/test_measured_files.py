@@ -7,10 +7,10 @@ from learned_bsdfs import handmade
 from variants import set_variant
 
 import mi_diffind
-from mi_diffind import tensor_files
-from mi_diffind.errors import UsageError
-from mi_diffind.runtime import array_module
-from mi_diffind.tables import save_table
+from mi_diffind.arrays.tables import save_table
+from mi_diffind.core import tensor_files
+from mi_diffind.core.errors import UsageError
+from mi_diffind.core.runtime import array_module
 from mi_diffind.tasks.bsdf import measured_files, tensor_file
 from mi_diffind.tasks.bsdf.truth import truth_of
 

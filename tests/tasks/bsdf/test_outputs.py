@@ -9,9 +9,9 @@ import pytest
 from learned_bsdfs import formula, handmade
 
 import mi_diffind
-from mi_diffind.errors import UsageError
-from mi_diffind.runtime import array_module
-from mi_diffind.tables import TableError, load_table, save_table
+from mi_diffind.arrays.tables import TableError, load_table, save_table
+from mi_diffind.core.errors import UsageError
+from mi_diffind.core.runtime import array_module
 from mi_diffind.tasks.bsdf import outputs, tensor_file
 from mi_diffind.tasks.bsdf.truth import MitsubaTruth, recorded_source
 from mi_diffind.tasks.bsdf.view import SphereView

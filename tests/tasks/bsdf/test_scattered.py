@@ -10,9 +10,9 @@ import pytest
 from arrays import aligned, numpy_of
 
 import mi_diffind
-from mi_diffind.errors import UsageError
-from mi_diffind.inspection import inspect
-from mi_diffind.runtime import array_module
+from mi_diffind.core.errors import UsageError
+from mi_diffind.core.runtime import array_module
+from mi_diffind.scenes.inspection import inspect
 from mi_diffind.tasks.bsdf import outputs, scattered, training
 from mi_diffind.tasks.bsdf.truth import truth_of
 from mi_diffind.tasks.bsdf.view import SphereView

@@ -10,9 +10,9 @@ from arrays import aligned, numpy_of
 from learned_bsdfs import about_normal, formula, handmade
 
 import mi_diffind
-from mi_diffind.errors import UsageError
-from mi_diffind.runtime import array_module
-from mi_diffind.tables import StoredArray, TableError, load_table, save_table
+from mi_diffind.arrays.tables import StoredArray, TableError, load_table, save_table
+from mi_diffind.core.errors import UsageError
+from mi_diffind.core.runtime import array_module
 from mi_diffind.tasks.bsdf import TASK, energy, mixture, pool, symmetry, training, view
 from mi_diffind.tasks.bsdf.files import BSDFModel, allocate
 from mi_diffind.tasks.bsdf.model import TERMS, Form, structure_of

@@ -28,7 +28,7 @@ from disney_materials import (
 )
 from spheres import sphere_scene
 
-from mi_diffind.fitting import EXPONENTIAL_RATE
+from mi_diffind.fitting.loop import EXPONENTIAL_RATE
 from mi_diffind.tasks.disney import TASK, training
 from mi_diffind.tasks.disney.decoder import Decoder
 from mi_diffind.tasks.disney.model import Material

@@ -11,9 +11,9 @@ from arrays import aligned
 
 from mi_diffind import StoredArray, load_model
 from mi_diffind import fit as fit_task
-from mi_diffind.fitting import EXPONENTIAL_RATE, exponential_like
-from mi_diffind.runtime import array_module
-from mi_diffind.tables import Table, TableError, save_table
+from mi_diffind.arrays.tables import Table, TableError, save_table
+from mi_diffind.core.runtime import array_module
+from mi_diffind.fitting.loop import EXPONENTIAL_RATE, exponential_like
 from mi_diffind.tasks.disney import TASK
 from mi_diffind.tasks.disney.decoder import Decoder
 from mi_diffind.tasks.disney.effects import Effects, ValueBounds, find_effects

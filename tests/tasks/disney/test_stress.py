@@ -31,8 +31,8 @@ from half_vectors import HalfVectorSampling
 from spheres import key_of, sphere_scene
 
 from mi_diffind import StoredArray
-from mi_diffind.bounds import ValueBounds
-from mi_diffind.tables import save_table
+from mi_diffind.arrays.bounds import ValueBounds
+from mi_diffind.arrays.tables import save_table
 from mi_diffind.tasks.disney import TASK
 from mi_diffind.tasks.disney.effects import find_effects
 

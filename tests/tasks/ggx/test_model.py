@@ -11,13 +11,14 @@ import pytest
 from arrays import aligned
 from variants import BACKENDS
 
-from mi_diffind import DifferentiableArray, StoredArray, load_model, lookup
+from mi_diffind import DifferentiableArray, StoredArray, load_model
 from mi_diffind import fit as fit_task
-from mi_diffind.errors import UsageError
-from mi_diffind.fitting import EXPONENTIAL_RATE, fit
-from mi_diffind.runtime import array_module
-from mi_diffind.tables import TableError, save_table
-from mi_diffind.task import FitRequest
+from mi_diffind.arrays import lookup
+from mi_diffind.arrays.tables import TableError, save_table
+from mi_diffind.core.errors import UsageError
+from mi_diffind.core.runtime import array_module
+from mi_diffind.fitting.loop import EXPONENTIAL_RATE, fit
+from mi_diffind.fitting.task import FitRequest
 from mi_diffind.tasks.ggx import TASK
 from mi_diffind.tasks.ggx.files import encoding_of
 from mi_diffind.tasks.ggx.model import ALPHA_FLOOR, ALPHA_MIN, ENCODINGS, PEAKS, Encoding, LearnedGGX, ggx, indirection

@@ -7,10 +7,10 @@ import types as python_types
 import numpy as np
 import pytest
 
-from mi_diffind.fitting import FitResult
+from mi_diffind.core.runtime import array_module
+from mi_diffind.fitting.loop import FitResult
+from mi_diffind.fitting.task import FitRequest
 from mi_diffind.maps.source import from_arrays
-from mi_diffind.runtime import array_module
-from mi_diffind.task import FitRequest
 from mi_diffind.tasks.image import memory_budget, presets, search, training
 from mi_diffind.tasks.image.compressed import CompressedImage
 from mi_diffind.tasks.image.memory_budget import ImageBudget

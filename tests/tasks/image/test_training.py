@@ -10,13 +10,14 @@ from arrays import aligned, numpy_of
 from scipy.ndimage import map_coordinates
 from variants import BACKENDS
 
-from mi_diffind import DifferentiableArray, Indirection, fitting, save_table
-from mi_diffind.fitting import fit
+from mi_diffind import DifferentiableArray, Indirection, save_table
+from mi_diffind.core.runtime import array_module
+from mi_diffind.fitting import loop
+from mi_diffind.fitting.loop import fit
+from mi_diffind.fitting.task import FitRequest
 from mi_diffind.maps import components
 from mi_diffind.maps.layout import Layout
 from mi_diffind.maps.source import from_arrays
-from mi_diffind.runtime import array_module
-from mi_diffind.task import FitRequest
 from mi_diffind.tasks.image import TASK, arrays, presets, search, training
 from mi_diffind.tasks.image.compressed import CompressedImage
 from mi_diffind.tasks.image.memory_budget import CoarsePrimary, ImageBudget
@@ -376,7 +377,7 @@ def test_a_step_is_one_kernel(ad, recipe, structure):
     recipe = replaced(dataclasses.replace(PRESETS[recipe], structure=structure), batch=3000)
     source = from_arrays({"albedo": image})
     problem = training.problem_of(source, search.default_size(source, 4000, recipe), recipe, ad)
-    trainer = fitting._Trainer(problem, recipe.settings)
+    trainer = loop._Trainer(problem, recipe.settings)
     trainer.share = 0.9
     for _ in range(4):
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
@@ -674,14 +675,14 @@ def test_training_for_a_time(ad, monkeypatch):
         clock[0] += 1 / 40
         return clock[0]
 
-    rate = fitting._Trainer.learning_rate
+    rate = loop._Trainer.learning_rate
 
     def watched(self, plateau):
         rates.append(rate(self, plateau))
         return rates[-1]
 
-    monkeypatch.setattr(fitting.time, "perf_counter", tick)
-    monkeypatch.setattr(fitting._Trainer, "learning_rate", watched)
+    monkeypatch.setattr(loop.time, "perf_counter", tick)
+    monkeypatch.setattr(loop._Trainer, "learning_rate", watched)
     table, result = trained(
         from_arrays({"image": waves(8, 8)}), ImageBudget(4, 4, 4, 3, 4, 6), short(lr=3e-2), seconds=1
     )

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import mi_diffind as md
-from mi_diffind.errors import UsageError
+from mi_diffind.core.errors import UsageError
+from mi_diffind.core.runtime import array_module
 from mi_diffind.maps import as_seen
 from mi_diffind.maps.source import from_arrays
-from mi_diffind.runtime import array_module
 from mi_diffind.tasks.image import presets, search, training, weights
 from mi_diffind.tasks.image.compressed import CompressedImage
 

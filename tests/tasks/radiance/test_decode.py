@@ -6,7 +6,7 @@ import types
 import numpy as np
 import pytest
 
-from mi_diffind.errors import UsageError
+from mi_diffind.core.errors import UsageError
 from mi_diffind.tasks.radiance import decode
 from mi_diffind.tasks.radiance.nodes import Nodes, cells_of
 from mi_diffind.tasks.radiance.volume_field import DenseVolumeField, NodeField, VolumeField

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from radiance_fields import Bumps, Fog
 
-from mi_diffind import compat
+from mi_diffind.core import compat
 from mi_diffind.tasks.radiance import march as marching
 
 

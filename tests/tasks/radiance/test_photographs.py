@@ -15,8 +15,8 @@ from PIL import Image
 from scipy.ndimage import binary_erosion
 from scipy.spatial.transform import Rotation
 
-from mi_diffind.cli import main
-from mi_diffind.task import tasks
+from mi_diffind.commands.cli import main
+from mi_diffind.fitting.task import tasks
 from mi_diffind.tasks.radiance import grid as grids
 from mi_diffind.tasks.radiance import views as view_files
 from mi_diffind.tasks.radiance import visual_hull

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mi_diffind.cli import main
-from mi_diffind.runtime import array_module
-from mi_diffind.tables import StoredArray, TableError, load_table, save_table
+from mi_diffind.arrays.tables import StoredArray, TableError, load_table, save_table
+from mi_diffind.commands.cli import main
+from mi_diffind.core.runtime import array_module
 from mi_diffind.tasks.radiance import compression, files, fit, presets, reflection
 from mi_diffind.tasks.radiance.grid import NodeGrid
 from mi_diffind.tasks.radiance.march import differentiable, march

@@ -9,11 +9,11 @@ import pytest
 from PIL import Image
 from scipy.ndimage import map_coordinates
 
-from mi_diffind import compat
-from mi_diffind.cli import main
-from mi_diffind.fitting import FitSettings
-from mi_diffind.runtime import array_module
-from mi_diffind.tables import TableError, load_table, save_table
+from mi_diffind.arrays.tables import TableError, load_table, save_table
+from mi_diffind.commands.cli import main
+from mi_diffind.core import compat
+from mi_diffind.core.runtime import array_module
+from mi_diffind.fitting.loop import FitSettings
 from mi_diffind.tasks.radiance import files, march, nodes, surroundings
 from mi_diffind.tasks.radiance import fit as field_fit
 from mi_diffind.tasks.radiance import grid as grids

@@ -13,15 +13,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mi_diffind import fitting, metrics
-from mi_diffind.cli import main
-from mi_diffind.deadline import Deadline
-from mi_diffind.errors import UsageError
-from mi_diffind.fitting import FitSettings
-from mi_diffind.fitting import fit as train
-from mi_diffind.runtime import array_module
-from mi_diffind.tables import StoredArray, TableError, load_table, save_table
-from mi_diffind.task import FitRequest, fit, tasks
+from mi_diffind.arrays.tables import StoredArray, TableError, load_table, save_table
+from mi_diffind.commands.cli import main
+from mi_diffind.core.deadline import Deadline
+from mi_diffind.core.errors import UsageError
+from mi_diffind.core.runtime import array_module
+from mi_diffind.fitting import loop
+from mi_diffind.fitting.loop import FitSettings
+from mi_diffind.fitting.loop import fit as train
+from mi_diffind.fitting.task import FitRequest, fit, tasks
+from mi_diffind.images import metrics
 from mi_diffind.tasks.radiance import compression, files, nodes, rate_distortion, visual_hull
 from mi_diffind.tasks.radiance import fit as field_fit
 from mi_diffind.tasks.radiance import grid as grids
@@ -219,8 +220,8 @@ def test_same_command_same_file(folder, tmp_path):
 def test_numbers_limit_the_resolution(folder, monkeypatch, capsys):
     """All stages stay below the limit; a resolution that is given is kept."""
     trained = []
-    train_all = fitting.fit
-    monkeypatch.setattr(fitting, "fit", lambda p, *a, **k: trained.append(p.nodes) or train_all(p, *a, **k))
+    train_all = loop.fit
+    monkeypatch.setattr(loop, "fit", lambda p, *a, **k: trained.append(p.nodes) or train_all(p, *a, **k))
     options = {"source": str(folder), "batch": 256, "steps": 40, "variant": "llvm_ad_rgb", "colours": "directions"}
     sizes = {}
     for limit in (10**9, 100_000):
@@ -248,7 +249,7 @@ def test_a_stopped_training_goes_on(folder, tmp_path, monkeypatch):
             raise KeyboardInterrupt
         return train(problem, settings, *args, **kwargs)
 
-    monkeypatch.setattr(fitting, "fit", stopping)
+    monkeypatch.setattr(loop, "fit", stopping)
     checkpoint = tmp_path / "state"
     with pytest.raises(KeyboardInterrupt):
         fit("field", preset="grid", progress=False, checkpoint=checkpoint, **options)
@@ -273,7 +274,7 @@ def test_ctrl_c_keeps_what_there_is(folder, tmp_path, monkeypatch, late):
     checkpoint = tmp_path / "state"
     options = {"source": str(folder), "resolution": 24, "batch": 512, "steps": 4, "variant": "llvm_ad_rgb"}
     with monkeypatch.context() as patch:
-        patch.setattr(fitting, "fit", stopping)
+        patch.setattr(loop, "fit", stopping)
         kept = tmp_path / "grid.npz"
         found = fit("field", progress=False, checkpoint=checkpoint, grid=str(kept), **options)
     assert not kept.exists()

@@ -13,7 +13,7 @@ import pytest
 from captures import SIZE, Fog, change, pose, write_blender, write_image, write_json
 from PIL import Image
 
-from mi_diffind import srgb
+from mi_diffind.images import srgb
 from mi_diffind.tasks.radiance import session
 from mi_diffind.tasks.radiance.session import TILE, FieldSession, ViewImages
 from mi_diffind.tasks.radiance.training import ImagesProblem

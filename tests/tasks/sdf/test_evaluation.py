@@ -10,7 +10,7 @@ import solid_meshes as solids
 from scipy.ndimage import map_coordinates
 from sdf_fields import TrilinearField
 
-from mi_diffind.errors import DiffindError
+from mi_diffind.core.errors import DiffindError
 from mi_diffind.tasks.sdf import evaluation, extraction, grids
 from mi_diffind.tasks.sdf.distances import Distances
 from mi_diffind.tasks.sdf.evaluation import BAND, PADDING, SurfaceEvaluation

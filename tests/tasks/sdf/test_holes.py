@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import solid_meshes as solids
 
-from mi_diffind.runtime import array_module
+from mi_diffind.core.runtime import array_module
 from mi_diffind.tasks.sdf import codes, encoding, extraction, grids, nodes
 from mi_diffind.tasks.sdf.distances import Distances
 from mi_diffind.tasks.sdf.field import DistanceField

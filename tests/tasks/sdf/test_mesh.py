@@ -15,7 +15,7 @@ import pytest
 import solid_meshes as solids
 import trimesh
 
-from mi_diffind.errors import DiffindError
+from mi_diffind.core.errors import DiffindError
 from mi_diffind.tasks.sdf.distances import Distances, DistancesError
 from mi_diffind.tasks.sdf.mesh import Mesh, MeshError, load_mesh, make_mesh
 from mi_diffind.tasks.sdf.sampling import (

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from solid_meshes import box, sphere, together
 
-from mi_diffind.runtime import array_module
+from mi_diffind.core.runtime import array_module
 from mi_diffind.tasks.sdf import codes, encoding, extraction, nodes, structure
 from mi_diffind.tasks.sdf.distances import Distances
 from mi_diffind.tasks.sdf.mesh import make_mesh

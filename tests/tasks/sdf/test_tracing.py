@@ -11,7 +11,7 @@ import pytest
 from arrays import aligned
 from sdf_fields import Ball, Slab, Steps, TrilinearField, sparse_table, torus
 
-import mi_diffind.runtime
+import mi_diffind.core.runtime
 from mi_diffind.tasks.sdf import codes, grids, marching, model, tracing
 from mi_diffind.tasks.sdf.nodes import MIDDLE
 
@@ -20,9 +20,9 @@ COUNT = 4096
 
 @pytest.fixture
 def types(mi_rgb):
-    import mi_diffind.compat
+    import mi_diffind.core.compat
 
-    return mi_diffind.compat.module_of(mi_rgb.Float)
+    return mi_diffind.core.compat.module_of(mi_rgb.Float)
 
 
 def unit(v):
@@ -148,7 +148,7 @@ print("ended")
 
 
 def test_directions_without_a_length_end(types):
-    script = ENDLESS.replace("VARIANT", mi_diffind.runtime.use_variant())
+    script = ENDLESS.replace("VARIANT", mi_diffind.core.runtime.use_variant())
     env = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     done = subprocess.run([sys.executable, "-c", script], env=env, capture_output=True, text=True, timeout=100)
     assert done.stdout.strip() == "ended", done.stderr

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from arrays import numpy_of
 
-from mi_diffind.cli import main
-from mi_diffind.deadline import Deadline
-from mi_diffind.errors import UsageError
-from mi_diffind.fitting import FitResult
+from mi_diffind.arrays.tables import TableError, load_table, save_table
+from mi_diffind.commands.cli import main
+from mi_diffind.core.deadline import Deadline
+from mi_diffind.core.errors import UsageError
+from mi_diffind.core.runtime import array_module
+from mi_diffind.fitting.loop import FitResult
+from mi_diffind.fitting.task import FitRequest
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
-from mi_diffind.runtime import array_module
-from mi_diffind.tables import TableError, load_table, save_table
-from mi_diffind.task import FitRequest
 from mi_diffind.tasks.disney import TASK as DISNEY
 from mi_diffind.tasks.disney.decoder import Decoder
 from mi_diffind.tasks.disney.effects import Effects
@@ -480,7 +480,7 @@ def test_share_zero_is_the_texture_alone(start, ad):
     recipe = quick(share=0.0, steps=5)
     found, _ = trained(start, ad, recipe, measured=False)  # else the start might be kept
     problem = textures.TextureProblem(training.start_of(table, pyramid), pyramid, TEXTURES["ours"], source.digest)
-    from mi_diffind.fitting import fit
+    from mi_diffind.fitting.loop import fit
 
     fit(problem, recipe.settings, progress=False)
     # Settings say "mse" in both, and the samples are those of the same seed

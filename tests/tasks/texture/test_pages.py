@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from arrays import aligned, numpy_of
 
+from mi_diffind.arrays.tables import StoredArray, TableError, load_table, save_table
+from mi_diffind.core.runtime import array_module
+from mi_diffind.fitting.task import FitRequest
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
-from mi_diffind.runtime import array_module
-from mi_diffind.tables import StoredArray, TableError, load_table, save_table
-from mi_diffind.task import FitRequest
 from mi_diffind.tasks.texture import TASK, arrays, memory_budget, training
 from mi_diffind.tasks.texture.compressed import CompressedTexture
 from mi_diffind.tasks.texture.presets import PRESETS

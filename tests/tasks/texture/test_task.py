@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from arrays import aligned, numpy_of
 
-from mi_diffind.cli import main
-from mi_diffind.errors import UsageError
+from mi_diffind.arrays.tables import StoredArray, TableError, load_table, save_table
+from mi_diffind.commands.cli import main
+from mi_diffind.core.errors import UsageError
+from mi_diffind.core.runtime import array_module
+from mi_diffind.fitting.task import FitRequest, fit
 from mi_diffind.maps.layout import Layout
 from mi_diffind.maps.pyramid import Pyramid, level_sizes
 from mi_diffind.maps.source import from_arrays
-from mi_diffind.runtime import array_module
-from mi_diffind.tables import StoredArray, TableError, load_table, save_table
-from mi_diffind.task import FitRequest, fit
 from mi_diffind.tasks.texture import TASK, memory_budget, sampling, training
 from mi_diffind.tasks.texture.compressed import CompressedTexture
 from mi_diffind.tasks.texture.memory_budget import (
@@ -465,25 +465,25 @@ def test_the_same_seed_gives_the_same_file(tmp_path):
 
 def test_a_resumed_training_is_the_same(tmp_path, monkeypatch):
     """Stopped after its first measurement and gone on with, to the last byte."""
-    from mi_diffind import fitting
+    from mi_diffind.fitting import loop
 
     source, checkpoint = from_arrays(material()), tmp_path / "c.npz"
     recipe = quick(steps=8)
     whole = file_bytes(trained(source, sized(source), recipe)[0], tmp_path / "a.npz")
-    step = fitting._Trainer.take_step
+    step = loop._Trainer.take_step
 
     def stopped(self, *arguments):
         if self.step == 6:
             raise InterruptedError
         return step(self, *arguments)
 
-    monkeypatch.setattr(fitting._Trainer, "take_step", stopped)
+    monkeypatch.setattr(loop._Trainer, "take_step", stopped)
     with pytest.raises(InterruptedError):
         trained(source, sized(source), recipe, checkpoint=checkpoint)
-    monkeypatch.setattr(fitting._Trainer, "take_step", step)
+    monkeypatch.setattr(loop._Trainer, "take_step", step)
     table, result = trained(source, sized(source), recipe, checkpoint=checkpoint, resume=True)
     assert result.steps == 8 and file_bytes(table, tmp_path / "b.npz") == whole
-    with pytest.raises(fitting.FittingError, match=r"other settings|other table sizes"):
+    with pytest.raises(loop.FittingError, match=r"other settings|other table sizes"):
         trained(source, sized(source, fine="0:1:3,1:2:4"), recipe, checkpoint=checkpoint, resume=True)
 
 

@@ -8,12 +8,12 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind.indirection import DifferentiableArray
-from mi_diffind.lookup import STORAGES
+from mi_diffind.arrays.indirection import DifferentiableArray
+from mi_diffind.arrays.lookup import STORAGES
+from mi_diffind.core.runtime import array_module
 from mi_diffind.measure.store import fingerprint
 from mi_diffind.measure.study import FLOOR, Candidate, Case, Plan
 from mi_diffind.measure.training import ConvergenceTraining
-from mi_diffind.runtime import array_module
 
 from . import measurement
 from .task import SIZES, TASK

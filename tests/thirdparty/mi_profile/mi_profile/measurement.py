@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_diffind.errors import DiffindError
+from mi_diffind.core.errors import DiffindError
 
 
 class ProfileError(DiffindError):
@@ -68,8 +68,8 @@ def read(path: str | os.PathLike) -> Measurement:
 
 
 def write(path: str | os.PathLike, angles: np.ndarray, intensity: np.ndarray) -> None:
-    """Write such a file, in one piece. Raises :class:`~mi_diffind.files.OutputError`."""
-    from mi_diffind.files import replacing
+    """Write such a file, in one piece. Raises :class:`.OutputError`."""
+    from mi_diffind.core.files import replacing
 
     rows = [f"{a:g},{i:.6g}" for a, i in zip(angles, intensity, strict=True)]
     with replacing(path) as temporary:

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from mi_diffind import Indirection
-from mi_diffind.errors import UsageError
-from mi_diffind.lookup import STORAGES
-from mi_diffind.tables import TableError
-from mi_diffind.task import Model
+from mi_diffind.arrays.lookup import STORAGES
+from mi_diffind.arrays.tables import TableError
+from mi_diffind.core.errors import UsageError
+from mi_diffind.fitting.task import Model
 
 from . import measurement
 from .training import errors

@@ -4,8 +4,8 @@ from __future__ import annotations  # Delayed parsing of type annotations
 
 import mitsuba as mi
 
+from mi_diffind.arrays.tables import TableError
 from mi_diffind.plugins import Counterpart, Plugin
-from mi_diffind.tables import TableError
 
 from .profile import Profile
 from .task import TASK

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mi_diffind.errors import UsageError
+from mi_diffind.core.errors import UsageError
 from mi_diffind.measure.study import Plan, Study
 
 DOWNLIGHT = Path(__file__).resolve().parent / "data" / "downlight.csv"

@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from mi_diffind.arguments import Argument, positive
-from mi_diffind.errors import UsageError
-from mi_diffind.settings import FitSettings
-from mi_diffind.task import FitRequest, Task
+from mi_diffind.core.arguments import Argument, positive
+from mi_diffind.core.errors import UsageError
+from mi_diffind.fitting.settings import FitSettings
+from mi_diffind.fitting.task import FitRequest, Task
 
 _FIT = FitSettings(steps=600, batch=4096, lr=3e-2, loss="mse", seed=1)
 
@@ -39,7 +39,7 @@ class Profile(Task):
         return ProfileProblem(arrays(*SIZES[request.preset]).alloc(request.types.TensorXf), truth, request.types)
 
     def table(self, problem, request: FitRequest):
-        from mi_diffind.tables import StoredArray, Table
+        from mi_diffind.arrays.tables import StoredArray, Table
 
         folder = (request.output or Path("x")).resolve().parent
         about = {
@@ -52,7 +52,7 @@ class Profile(Task):
         return Table(self.name, stored, settings=about, path=folder / (request.output or Path("x")).name)
 
     def load(self, path):
-        from mi_diffind.tables import TableError, check_ranges, load_table
+        from mi_diffind.arrays.tables import TableError, check_ranges, load_table
 
         table = load_table(path, self.name, {"primary": (None, 1), "cascaded": (None, 1)})
         check_ranges(table, {"primary": (0.0, 1.0)})

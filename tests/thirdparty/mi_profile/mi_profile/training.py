@@ -8,7 +8,7 @@ import drjit as dr
 import numpy as np
 
 from mi_diffind import DifferentiableArray, Indirection
-from mi_diffind.fitting import Problem
+from mi_diffind.fitting.loop import Problem
 
 from .measurement import Measurement
 

@@ -1,0 +1,1 @@
+"""Differentiable arrays, the indirection, and table files."""

@@ -1,0 +1,1 @@
+"""Errors, files, arguments, progress, and uses of private interfaces of Mitsuba and Dr.Jit."""

@@ -1,0 +1,134 @@
+"""Reading of ``.npz`` archives whose content nobody has checked.
+
+Sizes in the headers of a ZIP archive are claims. Members are therefore decompressed piece by piece, up to the size that
+the array's header states and the :class:`.Allowance` of the file permits, and never beyond.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from .errors import DiffindError, reason
+from .limits import Allowance, json_bytes
+
+#: Methods of compression that are read. Members in bz2 or lzma, which NumPy never writes, grow faster than deflate.
+METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+
+#: Most digits of a whole number of JSON: larger ones are no floats.
+LONGEST_NUMBER = 308
+
+#: Bytes that are decompressed at a time.
+PIECE = 2**20
+
+
+class ArchiveError(DiffindError, ValueError):
+    """An archive is damaged, or holds more than arrays; the message is one sentence that names the file."""
+
+
+class Archive:
+    """Arrays of a ``.npz`` archive, read one after the other within the ``allowance`` of the file.
+
+    A context manager. Raises ``OSError`` and ``zipfile.BadZipFile`` as ``zipfile`` does, and :class:`ArchiveError` for
+    members that are no arrays, of the same name, or compressed otherwise than by :data:`METHODS`.
+    """
+
+    def __init__(self, path: str | os.PathLike):
+        self.path = Path(path)
+        self.allowance = Allowance(self.path)
+        self._zip = zipfile.ZipFile(self.path)
+        try:
+            self.members = self._members()
+        except BaseException:
+            self._zip.close()
+            raise
+
+    def __enter__(self) -> Archive:
+        return self
+
+    def __exit__(self, *exception) -> None:
+        self._zip.close()
+
+    def _members(self) -> dict[str, zipfile.ZipInfo]:
+        members = {}
+        for info in self._zip.infolist():
+            if not info.filename.endswith(".npy") or not info.filename.isprintable():
+                raise ArchiveError(f"{self.path}: contains {info.filename!r:.80}, which is not an array")
+            name = info.filename[:-4]
+            if name in members:
+                raise ArchiveError(f'{self.path}: contains the array "{name:.80}" twice')
+            if info.compress_type not in METHODS:
+                method = zipfile.compressor_names.get(info.compress_type, info.compress_type)
+                raise ArchiveError(
+                    f'{self.path}: the array "{name:.80}" is compressed by {method}, allowed are deflate and none'
+                )
+            members[name] = info
+        return members
+
+    def array(self, name: str, dtype: np.dtype | None = None, shape: tuple | None = None) -> np.ndarray:
+        """Return an array, of a given type and shape unless these are ``None``; it cannot be written.
+
+        Its header is checked before memory is allocated. Raises :class:`ArchiveError` and
+        :class:`.LimitError`.
+        """
+        where = f'{self.path}: array "{name:.80}"'
+        with self._zip.open(self.members[name]) as stream:
+            try:
+                if np.lib.format.read_magic(stream) != (1, 0):
+                    raise ValueError("of a version other than 1.0")  # whose headers have no bounded size
+                stored_shape, fortran, stored_dtype = np.lib.format.read_array_header_1_0(stream)
+            except ValueError as e:
+                raise ArchiveError(f"{where} has a damaged header ({reason(e)})") from None
+            if dtype is not None and stored_dtype != dtype:
+                raise ArchiveError(f"{where} has the type {stored_dtype}, expected {dtype}")
+            if stored_dtype.kind not in "biuf" or min(stored_shape, default=0) < 0:
+                raise ArchiveError(f"{where} has the type {stored_dtype!s:.80}, allowed are numbers")
+            if fortran or (shape is not None and stored_shape != shape):
+                raise ArchiveError(f"{where} has the shape {stored_shape}, expected {shape or 'rows'}")
+            nbytes = math.prod(stored_shape) * stored_dtype.itemsize
+            claimed = self.members[name].file_size
+            if nbytes > claimed:
+                raise ArchiveError(f"{where} claims {nbytes:,} bytes but the file holds {claimed:,}")
+            self.allowance.take(nbytes, f'the array "{name:.80}"')
+            data = np.empty(nbytes, np.uint8)
+            count = 0
+            while piece := stream.read(min(PIECE, nbytes - count)) if count < nbytes else b"":
+                data[count : count + len(piece)] = np.frombuffer(piece, np.uint8)
+                count += len(piece)
+            rest = stream.read(1)  # at the end, the checksum is compared
+        if count < nbytes or rest:
+            raise ArchiveError(f"{where} holds {'more' if rest else f'{count:,} bytes'}, expected {nbytes:,} bytes")
+        data.flags.writeable = False
+        return data.view(stored_dtype).reshape(stored_shape)
+
+    def json(self, name: str):
+        """Return the content of an array of UTF-8 bytes that hold JSON.
+
+        Raises ``ValueError`` for text that is no JSON, and the errors of :meth:`array`.
+        """
+        array, content = self.array(name, np.dtype("u1")), f'the array "{name:.80}"'
+        self.allowance.take(array.size, content)
+        text = array.tobytes()
+        self.allowance.take(json_bytes(text), content)
+        try:
+            return json.loads(text, parse_int=_whole)
+        except RecursionError:
+            raise ValueError("too many lists within lists") from None
+
+
+def _whole(digits: str) -> int:
+    """Return a whole number of JSON. Raises ``ValueError`` for one of more digits than a float may have."""
+    if len(digits) > LONGEST_NUMBER:
+        raise ValueError(f"a whole number of {len(digits)} digits, at most {LONGEST_NUMBER} are read")
+    return int(digits)
+
+
+def read_arrays(path: str | os.PathLike) -> dict[str, np.ndarray]:
+    """Return all arrays of an archive. Raises as :class:`Archive` does, ``zlib.error`` and ``EOFError``."""
+    with Archive(path) as archive:
+        return {name: archive.array(name) for name in archive.members}

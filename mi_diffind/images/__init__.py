@@ -1,0 +1,1 @@
+"""Colours, errors between images, films and headers of image files."""

@@ -1,0 +1,163 @@
+"""Sizes of pictures, from the headers of their files, before anything is decoded.
+
+The formats are those that ``mitsuba.Bitmap`` reads: PNG, JPEG, OpenEXR, Radiance HDR, PFM, PPM, BMP and TGA.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+from ..core.limits import Allowance
+
+#: PNG: type of colour → channels, after the expansion of a palette, which may have transparency.
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 4, 4: 2, 6: 4}
+
+#: Markers of JPEG that begin a frame with its size.
+_JPEG_FRAMES = {0xC0, 0xC1, 0xC2, 0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF}
+
+#: OpenEXR: pixel type → bytes; flag of files with several parts.
+_EXR_BYTES, _EXR_PARTS = {0: 4, 1: 2, 2: 4}, 0x1000
+
+#: Bytes of the longest text header, and of the longest name or attribute of an OpenEXR header that is kept.
+_HEADER = 2**16
+
+
+@dataclass(frozen=True)
+class PictureSize:
+    """Size of a picture: ``width`` and ``height`` in pixels, and the bytes of a decoded pixel of all channels."""
+
+    width: int
+    height: int
+    pixel_bytes: int
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all pixels."""
+        return self.width * self.height * self.pixel_bytes
+
+
+def check_picture(path: str | os.PathLike) -> None:
+    """Raise :class:`.LimitError` for a picture that takes more memory than its file may.
+
+    Files of other formats, and headers that are cut short, are left to their decoders. Raises ``OSError``.
+    """
+    path = Path(path)
+    size = picture_size(path)
+    if size is not None:
+        Allowance(path).check(size.nbytes, f"a picture of {size.width:,} x {size.height:,} pixels")
+
+
+def picture_size(path: Path) -> PictureSize | None:
+    """Return the size of a picture; ``None`` for other formats, and for headers that are cut short."""
+    with open(path, "rb") as file:
+        start = file.read(8)
+        file.seek(0)
+        try:
+            if start == b"\x89PNG\r\n\x1a\n":
+                return _png(file)
+            if start.startswith(b"\xff\xd8"):
+                return _jpeg(file)
+            if start.startswith(b"\x76\x2f\x31\x01"):
+                return _exr(file)
+            if start.startswith(b"#?"):
+                return _radiance(file)
+            if start[:2] in (b"PF", b"Pf", b"P6", b"P5"):
+                return _portable(file)
+            return _bmp(file) if start.startswith(b"BM") else _tga(file, path)
+        except (struct.error, ValueError, KeyError):
+            return None
+
+
+def _png(file: BinaryIO) -> PictureSize:
+    width, height, depth, colour = struct.unpack(">IIBB", file.read(26)[16:])
+    return PictureSize(width, height, _PNG_CHANNELS[colour] * (2 if depth == 16 else 1))
+
+
+def _jpeg(file: BinaryIO) -> PictureSize | None:
+    file.seek(2)
+    while True:
+        byte = file.read(1)
+        if not byte:
+            return None
+        if byte != b"\xff":
+            continue
+        while byte == b"\xff":
+            byte = file.read(1)
+        if not byte or byte[0] in (0xD9, 0xDA):
+            return None
+        if byte[0] == 0x00 or byte[0] == 0x01 or 0xD0 <= byte[0] <= 0xD8:  # without a length
+            continue
+        (length,) = struct.unpack(">H", file.read(2))
+        if byte[0] in _JPEG_FRAMES:
+            _, height, width, channels = struct.unpack(">BHHB", file.read(6))
+            return PictureSize(width, height, channels)
+        file.seek(max(0, length - 2), os.SEEK_CUR)
+
+
+def _exr(file: BinaryIO) -> PictureSize:
+    """Return the size of all parts together: the width and height are those of the largest."""
+    (version,) = struct.unpack("<I", file.read(8)[4:])
+    sizes = []
+    while True:
+        attributes = {}
+        while name := _text(file):
+            _text(file)  # the type
+            (length,) = struct.unpack("<i", file.read(4))
+            if name in (b"channels", b"dataWindow"):
+                attributes[name] = file.read(min(max(0, length), _HEADER))
+                length -= len(attributes[name])
+            file.seek(max(0, length), os.SEEK_CUR)
+        if attributes:
+            left, top, right, bottom = struct.unpack("<4i", attributes[b"dataWindow"])
+            channels = re.findall(rb"[^\0]+\0(.)\0\0\0.{12}", attributes[b"channels"], re.DOTALL)
+            bytes_of_pixel = sum(_EXR_BYTES.get(channel[0], 4) for channel in channels)
+            sizes.append(PictureSize(right - left + 1, bottom - top + 1, bytes_of_pixel))
+        if not attributes or not version & _EXR_PARTS:
+            break
+    largest = max(sizes, key=lambda size: size.nbytes)
+    total = sum(size.nbytes for size in sizes)
+    return PictureSize(largest.width, largest.height, -(-total // max(1, largest.width * largest.height)))
+
+
+def _text(file: BinaryIO) -> bytes:
+    """Return the bytes up to the next zero. Raises ``ValueError`` at the end of the file."""
+    text = bytearray()
+    while (byte := file.read(1)) != b"\0":
+        if not byte or len(text) > _HEADER:
+            raise ValueError("cut short")
+        text += byte
+    return bytes(text)
+
+
+def _radiance(file: BinaryIO) -> PictureSize | None:
+    lines = re.search(rb"^[-+][YX] +(\d+) +[-+][YX] +(\d+)", file.read(_HEADER), re.MULTILINE)
+    return None if lines is None else PictureSize(int(lines[2]), int(lines[1]), 12)
+
+
+def _portable(file: BinaryIO) -> PictureSize | None:
+    head = re.match(rb"P([Ff56])(?:\s|#[^\n]*\n)+(\d+)(?:\s|#[^\n]*\n)+(\d+)", file.read(_HEADER))
+    if head is None:
+        return None
+    pixel = {b"F": 12, b"f": 4, b"6": 6, b"5": 2}[head[1]]
+    return PictureSize(int(head[2]), int(head[3]), pixel)
+
+
+def _bmp(file: BinaryIO) -> PictureSize:
+    head = file.read(30)
+    width, height, _, bits = struct.unpack("<iiHH", head[18:30])
+    return PictureSize(abs(width), abs(height), max(3, -(-bits // 8)))
+
+
+def _tga(file: BinaryIO, path: Path) -> PictureSize | None:
+    """Return the size in a TGA file, which only its extension or its last bytes show to be one."""
+    head = file.read(18)
+    file.seek(max(0, path.stat().st_size - 18))
+    if path.suffix.lower() != ".tga" and not file.read(18).startswith(b"TRUEVISION-XFILE"):
+        return None
+    width, height, bits = struct.unpack("<HHB", head[12:17])
+    return PictureSize(width, height, -(-bits // 8))

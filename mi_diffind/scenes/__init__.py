@@ -1,0 +1,1 @@
+"""Load, render, compare, convert, check and inspect scenes."""

@@ -1,0 +1,313 @@
+"""Conversion of scenes: stock plugins are replaced by learned ones, which are fitted where they need a table file.
+
+Plugins declare which plugins of Mitsuba they can stand for (:class:`.plugins.Stock`). A fit is kept in a folder under
+a name that contains a digest of the source, its place and the options, and is not repeated.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import glob
+import hashlib
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import mitsuba as mi
+
+from .. import plugins
+from ..arrays.tables import Table, save_table
+from ..core import compat, mitsuba_versions
+from ..core.errors import DiffindError, UsageError
+from ..core.files import OutputError, relative_path, replacing, shown, writable_file, writable_folder
+from ..core.runtime import use_variant
+from ..fitting.task import fit, tasks
+from ..plugins.support.stock import Kept, StockNode
+from .loading import ParsedScene, SceneError
+from .picture_check import PictureCheck, check_picture
+from .scene_text import difference, edited_text, with_paths
+
+#: Environment variable with the folder of fits for scenes that are rendered and not written.
+FOLDER = "MI_DIFFIND_CACHE"
+
+#: Integrator whose estimator those of ``Plugin.seen_by`` share, and the parameters that they take from it.
+TRACER, TRACER_PARAMETERS = "path", ("max_depth", "rr_depth", "hide_emitters")
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """Stock plugin of a scene and what became of it.
+
+    ``word``: its group (:class:`.plugins.Stock`); ``name``: its id, that of an object around it, or its place in the
+    file; ``stock``: its type; ``learned``: the type that replaces it, "" if it is kept; ``reason``: why, or the table
+    file that was fitted to it and its error.
+    """
+
+    word: str
+    name: str
+    stock: str
+    learned: str
+    reason: str
+
+    def __str__(self) -> str:
+        if not self.learned:
+            return f'{self.stock} "{self.name}": {self.reason}'
+        return f'{self.stock} "{self.name}" → {self.learned}{f", {self.reason}" if self.reason else ""}'
+
+
+class Conversions(list):
+    """List of all :class:`Conversion`, and the ``check`` of the pictures before and after, ``None`` without one.
+
+    ``unchecked`` is the reason why there is none although there should be.
+    """
+
+    check: PictureCheck | None = None
+    unchecked: str = ""
+
+    def __str__(self) -> str:
+        lines = summary(self) if any(c.learned for c in self) else ["replaced    nothing", *summary(self)]
+        if self.check or self.unchecked:
+            lines.append(f"check       {self.check or self.unchecked}")
+        return "\n".join(lines)
+
+
+def words() -> dict[str, plugins.Plugin]:
+    """Return the groups of stock plugins that learned ones can stand for, and the learned plugin of each."""
+    return {plugin.stock.word: plugin for plugin in plugins.declared().values() if plugin.stock}
+
+
+def cache_folder() -> Path:
+    """Return the folder of fits of this user, which is created: ``$MI_DIFFIND_CACHE``, or in ``~/.cache``.
+
+    Raises :class:`.OutputError`.
+    """
+    folder = Path(os.environ.get(FOLDER) or Path.home() / ".cache" / "mi_diffind")
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        return writable_folder(folder, create=True)
+    except OSError as e:
+        fault = str(e) if isinstance(e, OutputError) else f'folder "{shown(folder)}" cannot be made: {e.strerror}'
+        raise OutputError(f"{fault}; the environment variable {FOLDER} names another folder") from None
+
+
+def convert(
+    scene: str | os.PathLike,
+    output: str | os.PathLike,
+    *,
+    learn: Sequence[str] | None = None,
+    tables: str | os.PathLike | None = None,
+    defines: Mapping[str, object] | None = None,
+    check: bool = True,
+    progress: bool = True,
+) -> Conversions:
+    """Write a scene with learned plugins in place of Mitsuba's: ``mi-diffind convert`` in Python.
+
+    - ``scene``: a scene file; ``output``: the scene file to write (:func:`write_scene`).
+    - ``learn``: groups of plugins to replace (:func:`words`; ``None``: those of which a scene gains, textures).
+    - ``tables``: folder of the table files (``None``: ``NEW_tables`` beside ``NEW.xml``).
+    - ``defines``: values of the file's ``<default>`` parameters.
+    - ``check``: render small pictures before and after (:mod:`.picture_check`), if anything was replaced.
+
+    Returns what was replaced and what was kept (:func:`replace_stock`, whose errors are raised, too), and the check.
+    """
+    output = Path(output)
+    if output.suffix.lower() != ".xml":
+        raise UsageError(f'output "{output}": found the extension "{output.suffix}", allowed is .xml')
+    if output.resolve() == Path(scene).resolve():
+        raise UsageError(f'output "{output}": is the scene itself')
+    writable_file(output)
+    use_variant()
+    parsed = ParsedScene(scene, dict(defines or {}))
+    folder = Path(tables or output.with_name(f"{output.stem}_tables"))
+    groups = [word for word, plugin in words().items() if plugin.stock.advised] if learn is None else learn
+    try:
+        conversions = Conversions(replace_stock(parsed, groups, folder, progress))
+
+        def render(written: ParsedScene) -> None:
+            if not check or not any(c.learned for c in conversions):
+                return
+            pair = ParsedScene(scene, parsed.defines).load(), written.load()
+            if all(loaded.sensors() and loaded.integrator() for loaded in pair):
+                conversions.check = check_picture(*pair)
+            else:
+                conversions.unchecked = "none: the scene has no sensor or no integrator"
+
+        write_scene(parsed, output, render)
+    finally:
+        with contextlib.suppress(OSError):  # does not exist, or is not empty
+            folder.rmdir()
+    return conversions
+
+
+def replace_stock(
+    parsed: ParsedScene, learn: Sequence[str], folder: str | os.PathLike | None = None, progress: bool = True
+) -> list[Conversion]:
+    """Replace the stock plugins of the groups ``learn`` (:func:`words`) in a parsed scene, and return what was done.
+
+    A plugin that no learned one can stand for stays as it is, with the reason. Fits go into ``folder``, by default
+    :func:`cache_folder`. Where shapes were replaced that only one integrator traces as they are stored, that integrator
+    replaces a ``path`` of the scene.
+
+    Raises :class:`.UsageError` for an unknown group, :class:`.SceneError`,
+    :class:`.OutputError`, and :class:`.FittingError` if a training fails.
+    """
+    groups = words()
+    for word in learn:
+        if word not in groups:
+            raise UsageError(f'learn: found "{word}", allowed are {", ".join(groups)}')
+    if not learn:
+        return []
+    folder = cache_folder() if folder is None else writable_folder(folder, create=True)
+    return parsed.change(lambda state: _convert(state, {w: groups[w] for w in learn}, folder.resolve(), progress))
+
+
+def _convert(state, groups: dict[str, plugins.Plugin], folder: Path, progress: bool) -> list[Conversion]:
+    nodes, types = compat.properties_of(state), compat.parsed_types(state)
+    references = compat.parsed_references(state)
+    stock = {name: (word, plugin) for word, plugin in groups.items() for name in plugin.stock.names}
+    conversions = []
+    for index, props in enumerate(nodes):
+        if (before := props.plugin_name()) not in stock:
+            continue
+        word, plugin = stock[before]
+        if mitsuba_versions.object_type(plugins.OBJECT_TYPES[plugin.object_type]) != types[index]:
+            continue
+        around = list(_around(references, index))
+        name = next(filter(None, (nodes[i].id() for i in (index, *around))), "") or compat.parsed_place(state, index)
+        parents = [i for i in around if index in references[i]]
+        node = StockNode(
+            props, tuple(nodes[i] for i in parents), tuple((types[i], nodes[i]) for i in _below(references, index)),
+            folder, functools.partial(_fitted, folder, progress),
+        )  # fmt: skip
+        try:
+            fitted = plugin.stock.convert(node)
+        except Kept as e:
+            conversions.append(Conversion(word, name, before, "", str(e)))
+        else:
+            props.set_plugin_name(plugin.name)
+            conversions.append(Conversion(word, name, before, plugin.name, fitted))
+        for key in props:
+            props.mark_queried(key, False)  # else Mitsuba takes what was read here for known to the plugin
+    for plugin in groups.values():
+        if plugin.seen_by and any(c.learned == plugin.name for c in conversions):
+            conversions += _trace_by(plugin.seen_by, compat.properties_of(state, mi.ObjectType.Integrator))
+    return conversions
+
+
+def _around(references: list[list[int]], index: int) -> Iterator[int]:
+    """Yield the objects that refer to one, then those that refer to these, …; the scene has index 0 and is left out."""
+    level = [index]
+    while level:
+        level = [i for i, others in enumerate(references) if i and set(others) & set(level)]
+        yield from level
+
+
+def _below(references: list[list[int]], index: int) -> list[int]:
+    """Return all objects that one nests or refers to, directly or not."""
+    seen, todo = set(), list(references[index])
+    while todo:
+        other = todo.pop()
+        if other not in seen:
+            seen.add(other)
+            todo += references[other]
+    return sorted(seen)
+
+
+def _trace_by(seen_by: tuple[str, ...], integrators: list) -> list[Conversion]:
+    """Replace each integrator :data:`TRACER` by the first of ``seen_by``, unless another one needs decoded fields."""
+    conversions, tracers = [], []
+    for props in integrators:
+        name = props.plugin_name()
+        if name == TRACER and all(key in TRACER_PARAMETERS for key in props):
+            tracers.append(props)
+        elif name not in seen_by:
+            reason = "does not trace distance fields: they are decoded to grids when the scene is loaded"
+            conversions.append(Conversion("integrator", props.id() or name, name, "", reason))
+    for props in tracers if not conversions else ():
+        props.set_plugin_name(seen_by[0])
+        reason = "which follows no footprints: textures filter by the sensor's alone"
+        conversions.append(Conversion("integrator", props.id() or TRACER, TRACER, seen_by[0], reason))
+    return conversions
+
+
+def _fitted(folder: Path, progress: bool, task: str, source: Path, **options) -> Table:
+    """Return the table of a fit, of this call or an earlier one, as its file holds it.
+
+    Raises :class:`~.plugins.support.stock.Kept` for a source that the task refuses.
+    """
+    key = [task, sorted(options.items()), relative_path(source, folder)]  # the file records its source by that path
+    path = folder / f"{source.stem}_{_digest(source, key)}.npz"
+    if not path.is_file():
+        if progress:
+            print(f"fit {task} to {source.name}: {path}", file=sys.stderr, flush=True)
+        try:
+            fitted = fit(task, variant=mi.variant(), output=path, progress=progress, source=str(source), **options)
+            if fitted.result.interrupted:
+                raise KeyboardInterrupt
+            save_table(path, fitted.table)
+        except DiffindError as e:
+            raise Kept(f"cannot be fitted: {e}") from None
+        finally:
+            if source.suffix == ".json" and not any(folder.glob(f"{glob.escape(source.stem)}_*.npz")):
+                for file in folder.glob(f"{glob.escape(source.stem)}.*"):
+                    if file == source or file.is_symlink():  # the manifest, and its link to the image
+                        file.unlink()
+    return tasks()[task].load(path)  # raises for a damaged file
+
+
+def _digest(source: Path, options) -> str:
+    """Return a digest of a file, of the files that it names if it is JSON, and of options; ten hexadecimal digits."""
+    files = [source]
+    if source.suffix == ".json":
+        maps = json.loads(source.read_text(encoding="utf-8"))["maps"]
+        files += [source.parent / entry["file"] for entry in maps.values()]
+    content = hashlib.sha256(json.dumps(options).encode())
+    for file in files:
+        content.update(hashlib.sha256(file.read_bytes()).digest())
+    return content.hexdigest()[:10]
+
+
+def write_scene(
+    parsed: ParsedScene, path: str | os.PathLike, check: Callable[[ParsedScene], object] | None = None
+) -> None:
+    """Write a parsed and changed scene file: as it was, but for what was changed (:mod:`.scene_text`).
+
+    What was written is parsed again. The file stays only if it holds the objects of the changed scene, with their ids,
+    plugins, parameters and references, and if ``check(written)`` raises nothing. Raises :class:`.scenes.SceneError` and
+    :class:`.OutputError`.
+    """
+    if parsed.description:
+        raise UsageError("scene: found one in memory, a scene file is needed")
+    target, before = Path(path).resolve().parent, ParsedScene(parsed.path, parsed.defines)
+    content = before.change(lambda b: parsed.change(lambda a: edited_text(b, a, parsed.defines, target)))
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
+        try:
+            written = ParsedScene(temporary)
+            states = parsed.change(with_paths), written.change(with_paths)
+            if fault := parsed.change(lambda _: difference(*states)):
+                raise SceneError(f"{parsed.path}: cannot be written as {path}, which would have {fault}")
+            if check is not None:
+                check(written)
+        except SceneError as e:
+            raise SceneError(str(e).replace(temporary.name, Path(path).name)) from e
+
+
+def summary(conversions: Sequence[Conversion | Mapping]) -> list[str]:
+    """Return what was replaced and what was kept, by name, as lines of text; mappings hold the fields."""
+    conversions = [Conversion(**c) if isinstance(c, Mapping) else c for c in conversions]
+    replaced = [c for c in conversions if c.learned]
+    lines = []
+    for stock, learned in dict.fromkeys((c.stock, c.learned) for c in replaced):
+        count = sum((c.stock, c.learned) == (stock, learned) for c in replaced)
+        lines.append(f"replaced    {count} x {stock} → {learned}")
+        lines += [
+            f'            "{c.name}": {c.reason}'
+            for c in replaced
+            if (c.stock, c.learned, bool(c.reason)) == (stock, learned, True)
+        ]
+    return [*lines, *(f"kept        {c}" for c in conversions if not c.learned)]

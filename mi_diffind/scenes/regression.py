@@ -1,0 +1,306 @@
+"""Regression checks of scenes against stored renderings: changes that sampling noise does not explain.
+
+A reference shows the scene as written, learned plugins included. A check finds changes; the distance of an
+approximation from the truth is measured by :mod:`.comparison`. Statistics: :mod:`.block_test`; files:
+:mod:`.reference_files`; sentences and pictures: :mod:`.regression_report`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from .. import __version__
+from ..core.errors import UsageError
+from ..core.files import writable_file, writable_folder
+from ..core.interrupt import interruptible
+from ..core.progress import progress_bar
+from ..core.runtime import use_variant
+from ..measure.store import fingerprint, sources
+from . import loading
+from .block_test import CHECK_PASSES, GROUPS, TILE, block_means
+from .reference_files import (
+    BadReference,
+    Reference,
+    read_partial,
+    read_reference,
+    read_settings,
+    reference_path,
+    write_partial,
+    write_reference,
+)
+from .regression_report import Regression, write_failure
+
+#: Samples of the whole image in a check, by default at most, but at least one a pixel in each pass.
+BUDGET = 2_000_000
+#: Passes that a reference is rendered from.
+PASSES = CHECK_PASSES * GROUPS
+
+#: Samples of the whole image in one render, a bound of its memory; a pass of more is several renders.
+_RENDER = 1 << 22
+#: First ``i`` of Mitsuba's seeds ``(seed << 16) + i`` that references use; checks use smaller ones.
+_REFERENCE_SEEDS = 1 << 15
+#: Seeds of one pass, and so the largest number of its renders.
+_SEEDS = 1 << 8
+#: Seeds of the check that a new reference has to pass, and of a second one, since one of a hundred fails by chance.
+_OWN_CHECKS = ((1 << 16) - 1, (1 << 16) - 2)
+
+
+@dataclasses.dataclass(frozen=True)
+class PassSize:
+    """Samples of a pass: ``renders`` of ``samples`` a pixel each, a number that the scene's sampler takes."""
+
+    renders: int
+    samples: int
+
+    @classmethod
+    def of_check(cls, scene, spp: int) -> PassSize:
+        """Return the size of one of the eight passes of a check of at least ``spp`` samples a pixel.
+
+        Samplers such as ``stratified`` and ``multijitter`` round the samples of each render up.
+        """
+        samples, sampler = -(-spp // CHECK_PASSES), scene.sensors()[0].sampler()
+        renders = min(-(-samples * math.prod(loading.film_size(scene)) // _RENDER), samples, _SEEDS)
+        sampler.set_sample_count(-(-samples // renders))
+        return cls(renders, sampler.sample_count())
+
+    @property
+    def check_spp(self) -> int:
+        """Samples per pixel of a check."""
+        return CHECK_PASSES * self.renders * self.samples
+
+
+def _passes(scene, size: PassSize, seed: int, numbers: range, bar, stop: threading.Event) -> Iterator[np.ndarray]:
+    """Render passes of independent samples, ``(height, width, 3 or 1)``, until ``stop`` is set.
+
+    The same arguments give the same bits if the film's filter is a box and the samples of a render are a power of two:
+    then no pixel is shared by two threads, which would add up its samples in any order.
+    """
+    for number in numbers:
+        first = (seed << 16) + number * _SEEDS
+        yield (
+            sum(
+                loading.colour_channels(loading.render_pass(scene, size.samples, first + i))
+                for i in range(size.renders)
+            )
+            / size.renders
+        )
+        bar.update()
+        if stop.is_set():
+            return
+
+
+@dataclasses.dataclass(frozen=True)
+class Check:
+    """Passes of a check: their mean ``image``, and ``blocks``, ``(8, rows, columns, channels)``.
+
+    ``not_finite``: number of pixels that are not finite in a pass; the blocks that hold them are not finite either.
+    """
+
+    image: np.ndarray
+    blocks: np.ndarray
+    not_finite: int
+
+
+def _render_check(scene, size: PassSize, seed: int, title: str, progress: bool, stop: threading.Event) -> Check | None:
+    """Render the passes of a check; ``None`` after Ctrl-C."""
+    image, blocks = 0, []
+    with progress_bar(title, CHECK_PASSES, progress=progress) as bar, np.errstate(invalid="ignore", over="ignore"):
+        for one in _passes(scene, size, seed, range(CHECK_PASSES), bar, stop):
+            image = image + one / CHECK_PASSES
+            blocks.append(block_means(one))
+        image = np.float32(image)
+    if stop.is_set():
+        return None
+    return Check(image, np.stack(blocks), int((~np.isfinite(image)).any(axis=-1).sum()))
+
+
+def _default_spp(width: int, height: int) -> int:
+    samples = max(1, BUDGET // (width * height * CHECK_PASSES))
+    return CHECK_PASSES << (samples.bit_length() - 1)
+
+
+def update_reference(
+    path: str | os.PathLike,
+    references: str | os.PathLike | None = None,
+    spp: int | None = None,
+    seed: int | None = None,
+    progress: bool = True,
+    defines: dict[str, str] | None = None,
+    source: str | os.PathLike | dict | mi.Scene | None = None,
+) -> dict:
+    """Render a reference of the scene file ``path`` in the current variant and store it (:func:`reference_path`).
+
+    Of a scene in memory, ``source``, the path is a name.
+
+    ``spp`` are the samples per pixel of a check, which has eight passes; the reference has 128 passes of the same
+    samples. Settings that are not given are those of the reference that is replaced: ``spp`` (else about two million
+    samples of the image, a power of two per pixel), ``seed`` (else 0) and each of ``defines``, which replace the
+    scene's ``<default>`` values. If the scene's filter is a box, and the samples are a power of two, the same arguments
+    give the same bytes on the same machine, interrupted or not.
+
+    The reference is checked against another render: one that fails twice although nothing has changed is not stored.
+    Rendered passes are kept in a file ``SCENE.VARIANT.partial.npz`` beside the reference after Ctrl-C: the same command
+    continues from there, unless the scene, its files, or this package have changed.
+
+    Returns ``scene``, ``reference`` (the file), ``variant``, ``width``, ``height``, ``budget`` (samples per pixel of a
+    check, which a sampler may have rounded up from ``spp``), ``asked_spp``, ``spp`` (of the reference), ``seed``,
+    ``defines``, ``seconds``, ``bytes``, ``visible_change`` (:meth:`.block_test.BlockReference.visible_change`, ``None``
+    for infinity) of a ``tile``, ``reused_passes`` (that had been kept), and ``interrupted``: after Ctrl-C no reference
+    has been written, and ``partial`` is the file of kept passes (else ``None``). Raises
+    :class:`.SceneError` and :class:`.OutputError`.
+    """
+    output, stem = reference_path(path, references), Path(path).stem
+    before = read_settings(path, references)
+    parsed = _parsed(path if source is None else source, {**before.get("defines", {}), **(defines or {})})
+    scene = parsed.load()
+    writable_folder(output.parent, create=True)
+    writable_file(output)
+    width, height = loading.film_size(scene)
+    asked = spp or before.get("budget") or _default_spp(width, height)
+    size = PassSize.of_check(scene, asked)
+    seed = before.get("seed", 0) if seed is None else seed
+    partial = output.with_suffix(".partial.npz")
+    about = {"scene": stem, "variant": mi.variant(), "defines": parsed.defines, "seed": seed, "budget": size.check_spp}
+    key = about | {"sources": fingerprint(sources() | set(parsed.files())) + mi.__version__ + parsed.description}
+    sums, start = read_partial(partial, key), time.perf_counter()
+    result = {
+        **_facts(path, str(output), width, height, seed, parsed.defines), "budget": size.check_spp, "asked_spp": asked,
+        "spp": size.check_spp * GROUPS, "reused_passes": len(sums.blocks), "partial": None,
+    }  # fmt: skip
+    with interruptible() as stop:
+        with progress_bar(f"{stem}: reference", PASSES, initial=len(sums.blocks), progress=progress) as bar:
+            for image in _passes(scene, size, seed, range(PASSES + len(sums.blocks), 2 * PASSES), bar, stop):
+                sums.add(image)
+        bad = int((~np.isfinite(sums.image)).any(axis=-1).sum())
+        if bad:
+            raise loading.SceneError(f"{path}: {bad} pixel(s) are not finite, so this cannot be a reference")
+        passed = False
+        if not stop.is_set():
+            reference = sums.reference(about)
+        for seed_of_check in () if stop.is_set() else _OWN_CHECKS:
+            check = _render_check(scene, size, seed_of_check, f"{stem}: check", progress, stop)
+            passed = check is not None and reference.blocks.test(check.blocks, check.not_finite).passed
+            if passed or stop.is_set():
+                break
+    result |= {"seconds": time.perf_counter() - start, "interrupted": stop.is_set()}
+    if stop.is_set():
+        write_partial(partial, sums, key)
+        return {**result, "spp": len(sums.blocks) * size.renders * size.samples, "partial": str(partial)}
+    if not passed:
+        raise loading.SceneError(
+            f"{path}: fails two checks at {size.check_spp} samples a pixel although nothing has changed: bright paths "
+            "are too rare, or passes of different seeds are not independent; give more samples (--spp) or a lower "
+            "max_depth, or another sampler"
+        )
+    about = {**reference.about, "spp": result["spp"]}
+    about["versions"] = {"mi_diffind": __version__, "mitsuba": mi.__version__}
+    write_reference(output, dataclasses.replace(reference, about=about))
+    partial.unlink(missing_ok=True)
+    return {**result, "tile": TILE, "visible_change": about["visible_change"], "bytes": output.stat().st_size}
+
+
+def _parsed(scene, defines: dict) -> loading.ParsedScene:
+    """Return a scene file or a dictionary parsed, or a loaded scene in their place."""
+    if not isinstance(scene, mi.Scene):
+        return loading.ParsedScene(scene, defines)
+    if defines:
+        raise UsageError("defines: given with a scene in memory, allowed are scene files")
+    return loading.LoadedScene(scene)
+
+
+def _facts(path, reference: str, width: int, height: int, seed: int, defines: dict) -> dict:
+    """Return the entries that the results of a check and of an update share."""
+    return {
+        "scene": str(path), "reference": reference, "variant": mi.variant(), "width": width, "height": height,
+        "seed": seed, "defines": defines,
+    }  # fmt: skip
+
+
+def regress(
+    scene: str | os.PathLike | dict | mi.Scene,
+    *,
+    name: str | None = None,
+    update: bool = False,
+    references: str | os.PathLike | None = None,
+    out: str | os.PathLike | None = None,
+    spp: int | None = None,
+    seed: int | None = None,
+    defines: Mapping[str, object] | None = None,
+    progress: bool = True,
+) -> Regression:
+    """Render the ``scene`` in the variant that is set and test it against its reference (:mod:`.block_test`).
+
+    The scene is a file, a dictionary as of ``mi.load_dict``, or a loaded ``mi.Scene``. A scene in memory needs a
+    ``name`` for its reference, ``references/NAME.VARIANT.exr`` in the current folder, and has no ``defines``.
+    ``defines`` are the reference's unless given, ``seed`` is 0; every seed is independent of the reference. ``spp`` are
+    the reference's; others are refused, since the noise of both sides must be equal. If the check fails and ``out``
+    names a folder, the images are written there (:func:`.regression_report.write_failure`). With ``update``, the
+    reference is rendered again instead and stored (:func:`update_reference`).
+
+    The figures are ``scene``, ``reference`` (the file's name), ``variant``, ``width``, ``height``, ``spp``,
+    ``reference_spp``, ``seed``, ``defines``, ``seconds``, ``interrupted``, ``passed``, ``blocks`` (number of them that
+    were tested), ``failing_blocks``, ``worst`` (:class:`.block_test.Block`), ``stops``, ``stops_threshold``,
+    ``not_finite`` (pixels), ``visible_change`` of a ``tile``, and ``files`` (written paths). After Ctrl-C there is no
+    verdict, and ``passed`` is ``None``. Raises :class:`.SceneError`, among them
+    :class:`BadReference`, :class:`.UsageError` and :class:`.OutputError`.
+    """
+    use_variant()
+    seed_of_check, path = seed or 0, scene
+    if not isinstance(scene, (str, os.PathLike)):
+        if not name:
+            raise UsageError("name: not given, a scene in memory needs one, after which its reference is called")
+        path = f"{name}.xml"
+    if update:
+        return Regression(update_reference(path, references, spp, seed, progress, dict(defines or {}), source=scene))
+    reference = read_reference(path, references)
+    about = reference.about
+    parsed = _parsed(scene, {**about["defines"], **(defines or {})})
+    loaded = parsed.load()
+    width, height = loading.film_size(loaded)
+    _check_size(path, reference, height, width)
+    size, start = PassSize.of_check(loaded, spp or about["budget"]), time.perf_counter()
+    if size.check_spp != about["budget"]:
+        raise BadReference(
+            f"{path}: a check would have {size.check_spp} samples a pixel, its reference is for {about['budget']}: "
+            f"keep --spp and the sampler, or render it again with --update --spp {size.check_spp}"
+        )
+    with interruptible() as stop:
+        check = _render_check(loaded, size, seed_of_check, Path(path).stem, progress, stop)
+    figures = {
+        **_facts(path, f"{about['scene']}.{about['variant']}.exr", width, height, seed_of_check, parsed.defines),
+        "spp": about["budget"], "reference_spp": about["spp"], "seconds": time.perf_counter() - start,
+        "interrupted": stop.is_set(), "passed": None, "files": {}, "tile": TILE,
+        "visible_change": about["visible_change"],
+    }  # fmt: skip
+    if check is None:
+        return Regression(figures)
+    _check_size(path, reference, *check.image.shape)
+    test = reference.blocks.test(check.blocks, check.not_finite)
+    figures |= {
+        "passed": test.passed, "blocks": sum(level.failing.size for level in test.levels),
+        "failing_blocks": test.failing_blocks, "worst": dataclasses.asdict(test.worst), "stops": test.stops,
+        "stops_threshold": test.stops_threshold, "not_finite": test.not_finite,
+    }  # fmt: skip
+    result = Regression(figures, check.image, reference.image, test)
+    if not test.passed and out is not None:
+        figures["files"] = write_failure(out, result)
+    return result
+
+
+def _check_size(path, reference: Reference, height: int, width: int, channels: int | None = None) -> None:
+    expected = reference.image.shape
+    if (height, width, expected[2] if channels is None else channels) != expected:
+        rendered = f"{width} x {height} pixels" + ("" if channels is None else f" of {channels} channel(s)")
+        raise BadReference(
+            f"{path}: renders {rendered}, its reference has {expected[1]} x {expected[0]} of {expected[2]} channel(s); "
+            "leave the size to the reference, or render it again with --update"
+        )

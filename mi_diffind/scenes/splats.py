@@ -1,0 +1,221 @@
+"""3D Gaussians of "3D Gaussian Splatting" (Kerbl et al. 2023), and views of them for a field.
+
+Mitsuba traces the Gaussians: the shape ``ellipsoidsmesh`` orders them along a ray, and the integrator
+``volprim_rf_basic`` gives the transmittance and the colour of each. Two things are added to that integrator. It has an
+alpha of 1 everywhere, here rays keep their transmittance. And its rays go on 1e-4 behind each hit, whatever the scene's
+size, which skips Gaussians of a small scene; here all scenes are traced at one size.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core import compat
+from ..core.units import check_memory
+from ..images.srgb import to_linear
+from .splat_files import SplatsError, read_gaussians
+
+#: Opacity below which a Gaussian is left out: it changes no 8-bit value.
+FAINT = 1 / 255
+
+#: Contribution to a ray at which a Gaussian ends, for boxes.
+EDGE = 0.05
+
+#: Shares of opacity below and above the box of most Gaussians along an axis, and the part of that box's sides by which
+#: it is widened. Gaussians outside count as strays.
+STRAY, WIDER = 0.01, 0.25
+
+#: Half diagonal of the box of all Gaussians while they are traced, and the step behind a hit.
+SIZE, STEP = 100.0, 1e-4
+
+#: Transmittance at which a ray ends, and counts as stopped.
+OPAQUE = 0.01
+
+#: Samples of one pass, and bytes of memory for a Gaussian, roughly: a shell of 20 triangles.
+PASS, GAUSSIAN = 1 << 21, 4096
+
+#: Default number of samples a pixel.
+SPP = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Splats:
+    """Gaussians of a file, as arrays of float32.
+
+    ``centres`` ``(N, 3)``; ``scales`` ``(N, 3)``, standard deviations along the axes that the ``quaternions``
+    ``(N, 4)`` (x, y, z, w, of length 1) turn; ``opacities`` ``(N,)`` in [0, 1]; ``colours`` ``(N, K, 3)``, coefficients
+    of spherical harmonics, whose sum plus 0.5 is the colour as displayed (sRGB). ``digest`` is the SHA-256 of the
+    file, ``notes`` are sentences on what is not used of it.
+    """
+
+    path: Path
+    centres: np.ndarray
+    scales: np.ndarray
+    quaternions: np.ndarray
+    opacities: np.ndarray
+    colours: np.ndarray
+    digest: str
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.centres)
+
+    @staticmethod
+    def read(path: str | os.PathLike) -> Splats:
+        """Read a PLY file or SOG (:mod:`.splat_files`). Raises :class:`SplatsError`."""
+        arrays, digest, notes = read_gaussians(path)
+        return Splats(Path(path), digest=digest, notes=notes, **arrays)
+
+    def chosen(self, which: np.ndarray) -> Splats:
+        """Return some of the Gaussians, by a mask ``(N,)`` or numbers."""
+        names = ("centres", "scales", "quaternions", "opacities", "colours")
+        return dataclasses.replace(self, **{name: getattr(self, name)[which] for name in names})
+
+    def cropped(self, box=None) -> Splats:
+        """Return the visible Gaussians whose centres lie in a ``box``: lower corner, upper corner.
+
+        The default box holds 98% of the opacity along each axis, and a quarter more on both sides. Raises
+        :class:`SplatsError` if none is left.
+        """
+        visible = self.chosen(self.opacities >= FAINT)
+        if not len(visible):
+            raise SplatsError(f"{self.path}: has {len(self):,} Gaussians, none with an opacity of 1/255 or more")
+        box = visible.most() if box is None else np.array(box, np.float64).reshape(2, 3)
+        inside = ((visible.centres >= box[0]) & (visible.centres <= box[1])).all(axis=1)
+        if not inside.any():
+            text = " to ".join("(" + ", ".join(f"{x:.4g}" for x in corner) + ")" for corner in visible.most())
+            raise SplatsError(f"box: holds none of the {len(self):,} Gaussians of {self.path}, most lie in {text}")
+        return visible.chosen(inside)
+
+    def most(self) -> np.ndarray:
+        """Return the box ``(2, 3)`` outside of which Gaussians count as strays."""
+        box = np.empty((2, 3))
+        for axis, values in enumerate(self.centres.T.astype(np.float64)):
+            order = np.argsort(values)
+            weight = np.cumsum(self.opacities[order], dtype=np.float64)
+            ends = np.searchsorted(weight, weight[-1] * np.array([STRAY, 1 - STRAY]))
+            box[:, axis] = values[order[np.minimum(ends, len(values) - 1)]]
+        return box + np.array([[-WIDER], [WIDER]]) * (box[1] - box[0])
+
+    def extents(self) -> np.ndarray:
+        """Return half the sides ``(N, 3)`` of the box around each Gaussian, where it adds more than 5% to a ray."""
+        x, y, z, w = self.quaternions.T.astype(np.float64)
+        rows = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+        reach = np.sqrt(2 * np.log(np.maximum(self.opacities / EDGE, 1), dtype=np.float64))
+        return reach[:, None] * np.sqrt(np.einsum("ijn,nj->ni", np.square(rows), np.square(self.scales)))
+
+    def box(self) -> np.ndarray:
+        """Return the corners ``(2, 3)`` of the box around all Gaussians."""
+        extents = self.extents()
+        return np.stack([(self.centres - extents).min(axis=0), (self.centres + extents).max(axis=0)])
+
+
+class SplatSubject:
+    """Gaussians of a file as the subject of a capture, cropped to a ``box`` (default: :meth:`Splats.cropped`).
+
+    Raises :class:`SplatsError`, also in a variant without RGB, and :class:`.UsageError` if the
+    Gaussians need more memory than there is.
+    """
+
+    def __init__(self, path: str | os.PathLike, box=None):
+        self.path = Path(path)
+        if not mi.is_rgb:
+            raise SplatsError(f"{path}: the variant {mi.variant()} shows no Gaussians, one with rgb is needed")
+        splats = Splats.read(path)
+        self.splats, self.total, self.notes = splats.cropped(box), len(splats), splats.notes
+        check_memory(f"{path}: Gaussians", len(self.splats), GAUSSIAN * len(self.splats))
+
+    def record(self) -> dict:
+        """Return what the images depend on beside the settings."""
+        return {"scene": self.path.name, "defines": {}, "digest": self.splats.digest}
+
+    def bounds(self) -> np.ndarray:
+        """Return the corners ``(2, 3)`` of the Gaussians' box."""
+        return self.splats.box()
+
+    def reach(self, centre: np.ndarray) -> float:
+        """Return the radius of a sphere around a point that holds the Gaussians' box."""
+        corners = np.array(list(itertools.product(*self.bounds().T)))
+        return float(np.linalg.norm(corners - centre, axis=1).max())
+
+    def camera(self, settings) -> SplatCamera:
+        """Return the camera of a capture with these settings."""
+        return SplatCamera(self.splats, settings)
+
+
+class SplatCamera:
+    """Camera that sees Gaussians, ``settings`` (:class:`.capture_settings.CaptureSettings`) as for a scene."""
+
+    def __init__(self, splats: Splats, settings):
+        self.settings = settings
+        box = splats.box()
+        self.centre, self.scale = box.mean(axis=0), SIZE / max(np.linalg.norm(box[1] - box[0]) / 2, 1e-30)
+        centres = (splats.centres - self.centre) * self.scale
+        data = np.concatenate([centres, splats.scales * self.scale, splats.quaternions], axis=1)
+        arrays = {
+            "data": data, "opacities": splats.opacities[:, None], "sh_coeffs": splats.colours.reshape(len(splats), -1),
+        }  # fmt: skip
+        tensors = {name: mi.TensorXf(np.ascontiguousarray(array, np.float32)) for name, array in arrays.items()}
+        self.scene = mi.load_dict({"type": "scene", "splats": {"type": "ellipsoidsmesh", **tensors}})
+        self.integrator = mi.load_dict({"type": "volprim_rf_basic", "srgb_primitives": False})
+
+    def render(self, pose: np.ndarray, seed: int) -> np.ndarray:
+        """Render a view, ``(height, width, 4)``, float32: linear colours, multiplied by alpha, and alpha."""
+        side, spp = self.settings.resolution, self.settings.spp
+        rng = np.random.default_rng(seed)
+        shift, total = rng.random((2, side * side)), np.zeros((side * side, 4))
+        y, x = np.divmod(np.arange(side * side), side)
+        slope = 2 * np.tan(np.radians(self.settings.fov) / 2) / side
+        at_once = max(1, PASS // side**2)
+        for first in range(0, spp, at_once):
+            # Points of the sequence R2 (Roberts 2018), moved by a random offset in each pixel
+            numbers = np.arange(first, min(spp, first + at_once))[:, None]
+            u, v = ((numbers * step + s) % 1 for step, s in zip((0.7548776662, 0.5698402910), shift, strict=True))
+            d = np.stack([(x + u - side / 2) * slope, (side / 2 - y - v) * slope, -np.ones_like(u)], axis=-1)
+            d = (d / np.linalg.norm(d, axis=-1, keepdims=True)).reshape(-1, 3) @ pose[:3, :3].T
+            total += self.trace((pose[:3, 3] - self.centre) * self.scale, d).reshape(len(numbers), -1, 4).sum(axis=0)
+        image = (total / spp).reshape(side, side, 4)
+        alpha = image[..., 3:]
+        straight = np.clip(image[..., :3] / np.maximum(alpha, 1e-6), 0, 1)
+        return np.concatenate([to_linear(straight) * alpha, alpha], axis=-1).astype(np.float32)
+
+    def trace(self, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Return sRGB multiplied by alpha, and alpha, ``(N, 4)``, along rays from one point, at the traced size."""
+        ahead = np.maximum(0, -(directions @ origin) - 2 * SIZE)  # far origins are not exact enough
+        points = origin + ahead[:, None] * directions
+        p, d = (np.ascontiguousarray(v.T, np.float32) for v in (points, directions))
+        colour, transmittance = composite(self.scene, self.integrator, mi.Point3f(p), mi.Vector3f(d))
+        return np.concatenate([colour.numpy().T, 1 - transmittance.numpy()[:, None]], axis=1)
+
+
+@compat.syntax
+def composite(scene, integrator, p, d):
+    """Return the colour (sRGB) of the Gaussians along rays, and the transmittance behind them.
+
+    Where the transmittance falls below :data:`OPAQUE`, the ray ends, and the colour is divided by the opacity.
+    """
+    ray, p = mi.Ray3f(p, d), mi.Point3f(p)
+    colour, transmittance, active = mi.Color3f(0), mi.Float(1), mi.Bool(True)
+    while active:
+        si = scene.ray_intersect(mi.Ray3f(p, d), mi.RayFlags.Minimal, False, active)
+        active &= si.is_valid()
+        passed = integrator.eval_transmission(si, ray, active)
+        emitted = integrator.eval_sh_emission(si, ray, active)
+        colour[active] = colour + transmittance * (1 - passed) * emitted
+        transmittance[active] = transmittance * passed
+        p[active] = p + (si.t + STEP) * d
+        active &= transmittance > OPAQUE
+    stopped = transmittance <= OPAQUE
+    return colour * dr.select(stopped, dr.rcp(1 - transmittance), 1), dr.select(stopped, 0, transmittance)

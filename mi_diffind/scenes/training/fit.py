@@ -1,0 +1,219 @@
+"""``fit scene SCENE.xml``: training of textures by differentiating renders of a scene that shows them."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from ...arrays.tables import Table
+from ...core import compat
+from ...core.deadline import profiled
+from ...core.errors import UsageError
+from ...core.files import writable_folder
+from ...fitting.loop import FitResult, cores
+from ...fitting.task import FitRequest, Fitted, table_path
+from ...maps.arguments import preview_path
+from ...tasks.texture.training import TextureProblem
+from .. import loading
+from ..conversion import cache_folder
+from .fitted_files import FittedFiles
+from .joint_problem import JointProblem
+from .problem import SceneProblem
+from .recipe import SceneRecipe, recipe_of
+from .reference_renders import ReferenceRenders
+from .stored_texture import SceneTexture, stored_textures
+from .trained_scene import TrainedScene
+from .views import ViewDistribution, views_of
+
+#: Shares of a limited time: that of the references, and that of a measurement of renders.
+REFERENCES, MEASURING = 0.25, 0.1
+
+#: Duration of a step in renders of one sample a pixel, and of the compilation of its kernels in that of a render's: a
+#: step renders three times, once with derivatives, whose kernel is four times as long.
+STEP_RENDERS, STEP_KERNELS = 20, 8
+
+#: Seconds that LLVM takes to compile one operation of a render's kernel.
+OPERATION = 3e-4
+
+
+def fit(request: FitRequest) -> Fitted:
+    """Train textures of a scene as requested on the command line, in the active variant.
+
+    The result of several is a :class:`.fitted_files.FittedFiles`.
+    """
+    options = request.options
+    views, recipe = views_of(options, request.settings.seed), recipe_of(options, request.settings)
+    parsed = loading.ParsedScene(options["source"], dict(options["defines"] or ()))
+    tables, result = fit_scene(
+        parsed, views, recipe, request, listed(options["texture"]), options["references"], preview_path(request),
+        listed(options["start"]),
+    )  # fmt: skip
+    table = next(iter(tables.values()))
+    count = len(views.trained())
+    lines = [
+        f"{count} view{'s' if count != 1 else ''}, {recipe.spp} sample{'s' if recipe.spp != 1 else ''} a pixel",
+        *filter(None, [table.settings.get("remark")]),
+    ]
+    if table.settings.get("kept_start"):
+        lines.append("training inside the scene gained nothing: these are the arrays that it started from")
+    if (samples := table.settings.get("reference_samples", recipe.reference_spp)) < recipe.reference_spp:
+        lines.append(f"the time allowed references of {samples} samples a pixel in place of {recipe.reference_spp}")
+    if len(tables) > 1:
+        return FittedFiles(table, result, lines, {"views": dataclasses.asdict(views)}, tables=tables)
+    figures = {
+        "arrays": {name: list(a.shape) for name, a in table.arrays.items()},
+        "bits": {name: a.bits for name, a in table.arrays.items()},
+        "views": dataclasses.asdict(views),
+    }
+    return Fitted(table, result, lines, figures)
+
+
+def listed(files) -> list:
+    """Return the files of an option that may be repeated; from Python, also a single one."""
+    return [files] if isinstance(files, (str, os.PathLike)) else list(files or ())
+
+
+def fit_scene(
+    parsed: loading.ParsedScene,
+    views: ViewDistribution,
+    recipe: SceneRecipe,
+    request: FitRequest,
+    files: Sequence[str | os.PathLike] = (),
+    references: str | os.PathLike | None = None,
+    preview: Path | None = None,
+    starts: Sequence[str | os.PathLike] = (),
+) -> tuple[dict[str, Table], FitResult]:
+    """Train the arrays of textures of a scene for the ``views``.
+
+    Returns the stored tables, by the names of their files, and the run's record. ``files`` are those of the textures,
+    by default all that the scene reads and that hold arrays. They are trained together, through the same renders.
+    ``request`` gives duration and checkpoint; its settings are those of the ``recipe``. ``references`` is a folder that
+    keeps the reference images; ``preview`` a picture that is written at each measurement; ``starts`` files whose arrays
+    and level bias the training starts from, in place of the textures'. If no state renders the held-out views better
+    than the start, the tables hold the start (setting ``kept_start``). Runs in the variant that is set.
+
+    Raises :class:`.SceneError`, :class:`.UsageError`,
+    :class:`.TableError`, :class:`~mi_diffind.maps.source.SourceError`,
+    :class:`.FittingError` and :class:`.OutputError`.
+    """
+    request = dataclasses.replace(request, settings=recipe.settings)
+    textures = stored_textures(parsed, files, starts, recipe.start == "file")
+    check_output(request.output, [texture.file for texture in textures])
+    rendered = ReferenceRenders(
+        parsed, views, recipe.reference_spp, references, recipe.against,
+        without=[texture.file for texture in textures], inputs=[texture.source.digest for texture in textures],
+        progress=request.progress, deadline=request.part(REFERENCES).deadline,
+        workers=request.options.get("workers"), scheduler=request.options.get("scheduler", ""),
+    )  # fmt: skip
+    trained, measured = views.trained(), views.measured()
+    images = rendered.images([*trained, *measured])
+    scene = TrainedScene(parsed, {texture.file: texture.table for texture in textures}, views, recipe.spp)
+    problem = SceneProblem(
+        joined({texture.file.name: texture.problem for texture in textures}), scene,
+        [*zip(trained, images, strict=False)], [*zip(measured, images[len(trained) :], strict=True)],
+        recipe, rendered.digest, preview,
+    )  # fmt: skip
+    problem.common |= {"views": dataclasses.asdict(views)}
+    problem.identity |= problem.common
+
+    def stored(texture: SceneTexture, recorded: Mapping, more: Mapping) -> tuple[Table, dict[str, float]]:
+        table = texture.stored({**recorded, **texture.identity, **problem.common, **more})
+        return table, texture.measure(table)
+
+    remark, before = "", None
+    if request.deadline is not None:
+        compiled = compiled_file(f"{rendered.digest} {recipe.spp}")
+        remark, before = limit(problem, request, compiled is not None and compiled.is_file())
+    elif recipe.start == "file":
+        before = problem.measure(problem.net)
+    arrays = {name: array.data for name, array in problem.net.arrays.items()}
+    result = request.train(problem, finish=lambda: [stored(texture, {}, {}) for texture in textures])
+    kept = recipe.start == "file" and before["psnr_db"] > result.measured["psnr_db"]
+    if kept:
+        for name, data in arrays.items():
+            problem.net.arrays[name].data = data
+        result.measured, result.step = before, 0
+    if request.deadline is not None and compiled is not None and problem.recipe.share > 0:
+        compiled.touch()
+    result.unfinished = result.unfinished or bool(remark)
+    more = request.paths(scene_path=None if parsed.description else parsed.path)
+    more |= {"kept_start": True} if kept else {}
+    more |= {"remark": remark} if remark else {}
+    more |= {"reference_samples": rendered.samples} if rendered.samples < recipe.reference_spp else {}
+    more |= {"trained_with": [t.file.name for t in textures]} if len(textures) > 1 else {}
+    tables = {}
+    for texture in textures:
+        table, errors = stored(texture, request.recorded(result), more)
+        table.settings |= request.paths(source_path=texture.source_path)
+        table.preset, table.seed = request.preset, recipe.settings.seed
+        errors["psnr_scene_db"] = result.measured["psnr_db"]
+        table.measured = {k: float(f"{v:.5g}") for k, v in errors.items()}
+        tables[texture.file.name] = table
+    return tables, result
+
+
+def joined(problems: Mapping[str, TextureProblem]) -> TextureProblem | JointProblem:
+    """Return the problem of all textures, by name: that of a single one as it is."""
+    return JointProblem(problems) if len(problems) > 1 else next(iter(problems.values()))
+
+
+def check_output(output: Path | None, files: Sequence[Path]) -> None:
+    """Raise :class:`UsageError` unless the ``output`` suits the number of trained ``files``: one is a file."""
+    if output is None:
+        return
+    if len(files) == 1:
+        table_path(output)
+        return
+    names = ", ".join(file.name for file in files)
+    if output.suffix.lower() == ".npz":
+        raise UsageError(
+            f'output "{output}": found a file, but {len(files)} textures are trained ({names}): give a '
+            f"folder, as in -o trained/, or choose one by --texture"
+        )
+    if any(output.resolve() == file.parent for file in files):
+        raise UsageError(f'output "{output}": found the folder of the trained textures ({names}): give another one')
+
+
+def compiled_file(key: str) -> Path | None:
+    """Return the file that is there once a training has compiled the kernels of a scene; ``None`` if it cannot be."""
+    try:
+        folder = writable_folder(cache_folder() / "compiled", create=True)
+    except OSError:
+        return None
+    return folder / hashlib.sha256(key.encode()).hexdigest()[:16]
+
+
+def limit(problem: SceneProblem, request: FitRequest, compiled: bool) -> tuple[str, dict[str, float]]:
+    """Fit a problem into a limited time.
+
+    Returns a sentence if only the texture alone can be trained, else "", and the figures before the training.
+
+    A measurement of one render a view is rehearsed. Measurements then have so many samples as fit, and where a step
+    would take longer than what is left, renders have no share in the loss. Its kernels are expected to be compiled
+    unless an earlier training of the scene has ``compiled`` them.
+    """
+    deadline, spp, most = request.deadline, problem.scene.spp, problem.samples
+    problem.samples = spp
+    with cores(request.settings.deterministic):
+        figures, seconds, history = profiled(lambda: problem.measure(problem.net))
+    compiling = compat.compile_seconds(history)
+    if not compiled:
+        compiling = max(compiling, OPERATION * max((entry.get("operation_count", 0) for entry in history), default=0))
+    render = seconds / (2 * len(problem.measured) * spp)
+    problem.samples = max(spp, min(most, int(MEASURING * deadline.seconds * spp / seconds)))
+    deadline.reserve += seconds * problem.samples / spp
+    step = STEP_RENDERS * spp * render + STEP_KERNELS * compiling
+    if problem.recipe.share == 0 or step < deadline.left():
+        return "", figures
+    problem.recipe = dataclasses.replace(problem.recipe, share=0.0)
+    problem.identity["shading"]["share"] = 0.0
+    kernels = f", {STEP_KERNELS * compiling:.0f} s of it to compile its kernels" if compiling > 1 else ""
+    enough = deadline.seconds + 2 * step
+    sentence = (
+        f"no step through renders: one takes about {step:.0f} s{kernels}; the texture was trained alone; give "
+        f"--seconds {enough:.0f} or more, or a smaller film"
+    )
+    return sentence, figures

@@ -1,0 +1,208 @@
+"""Rig of a loaded scene: its camera and lights, moved to the places of a view."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..loading import SceneError
+from ..poses import rotation
+from .views import View, ViewDistribution
+
+#: Sine of the angle between two directions below which they count as parallel.
+PARALLEL = 1e-4
+
+#: Bit of a parameter that cannot be set.
+READ_ONLY = mi.ParamFlags.ReadOnly.value
+
+
+class Rig:
+    """First sensor and lights of a loaded scene, moved through scene parameters: nothing is loaded or compiled again.
+
+    Raises :class:`.SceneError` if the scene has nothing that could be moved, or looked at.
+    """
+
+    def __init__(self, scene: mi.Scene, views: ViewDistribution):
+        self.scene, self.views = scene, views
+        if not scene.sensors():
+            raise SceneError("the scene has no sensor, views need one")
+        self.up = np.array(views.up, np.float64) / np.linalg.norm(views.up)
+        self.sensor = _Movable(scene.sensors()[0])
+        if views.moves_camera and not self.sensor.matrix:
+            raise SceneError(f"the sensor {scene.sensors()[0].class_name()} cannot be moved")
+        self.lights = _lights(scene) if views.moves_light else []
+        raised = [light for light in self.lights if not light.environment or light.sun is not None]
+        if views.moves_light and not (self.lights if views.light_elevation is None else raised):
+            names = ", ".join(sorted({e.class_name() for e in scene.emitters()})) or "none"
+            what = "light_azimuth" if views.light_elevation is None else "light_elevation"
+            raise SceneError(
+                f"{what}: no light of the scene can be moved so ({names}); directional, point, spot and area lights "
+                f"can, the sun of a sunsky by its sun_direction, and environments about the vertical"
+            )
+        self.target = np.zeros(3)
+        if views.moves_camera or any(not light.at_infinity for light in self.lights):
+            self.target = self._target()
+
+    def _target(self) -> np.ndarray:
+        """Return the target of the views: the given one, or the surface in the middle of the scene's image."""
+        if self.views.target is not None:
+            return np.array(self.views.target, np.float64)
+        sensor = self.scene.sensors()[0]
+        middle = mi.Point2f(0.5)
+        hit = self.scene.ray_intersect(sensor.sample_ray(sensor.shutter_open(), 0.5, middle, middle)[0])
+        if not hit.is_valid()[0]:
+            raise SceneError("target: not given, and the middle of the scene's image shows no surface")
+        return np.array(hit.p, np.float64).ravel()
+
+    def place(self, view: View) -> None:
+        """Move camera and lights to a view."""
+        if self.views.moves_camera:
+            self.sensor.move(self._camera(view))
+        for light in self.lights:
+            turn = self._turn(light, view)
+            sun = {} if light.sun is None else {"sun": self._sun(light, turn, view)}
+            light.move(turn @ light.before, **sun)
+
+    def _camera(self, view: View) -> np.ndarray:
+        before = self.sensor.before
+        origin = before[:3, 3]
+        if view.origin is not None:
+            to = np.array(view.origin)
+        else:
+            to = self.target + self._turned(origin - self.target, view.azimuth, view.elevation, view.distance)
+        # Roll, scale and the angle to the target of the scene's own camera are preserved
+        return self._looking(to) @ np.linalg.inv(self._looking(origin)) @ before
+
+    def _turn(self, light: _Movable | _AreaLight, view: View) -> np.ndarray:
+        """Return the 4×4 matrix that moves a light from its place in the scene to that of a view."""
+        centre = self.target
+        if light.environment:
+            return rotation(self.up, view.light_azimuth or 0.0, centre)
+        towards = -light.before[:3, 2] if light.at_infinity else light.centre - centre
+        turned = self._turned(towards, view.light_azimuth, view.light_elevation, None)
+        turn = _between(towards, turned, self.up, view.light_azimuth or 0.0)
+        turn[:3, 3] = centre - turn[:3, :3] @ centre
+        return turn
+
+    def _sun(self, light: _Movable, turn: np.ndarray, view: View) -> np.ndarray:
+        """Return the direction of the sun of a sky that was turned, in the sky's coordinates."""
+        if view.light_elevation is None:
+            return light.sun
+        sky = light.before[:3, :3]
+        towards = self._turned(sky @ light.sun, view.light_azimuth, view.light_elevation, None)
+        return np.linalg.solve(turn[:3, :3] @ sky, towards)
+
+    def _turned(self, offset: np.ndarray, azimuth, elevation, distance) -> np.ndarray:
+        """Return an offset from the target after a turn about ``up``, at an elevation and a distance."""
+        length = np.linalg.norm(offset)
+        if length == 0:
+            raise SceneError("target: found the place of the camera or of a light, another point is needed")
+        height = offset @ self.up
+        flat = offset - height * self.up
+        if np.linalg.norm(flat) < PARALLEL * length:
+            flat = np.eye(3)[np.argmin(np.abs(self.up))]
+            flat = flat - (flat @ self.up) * self.up
+        flat = rotation(self.up, azimuth or 0.0)[:3, :3] @ (flat / np.linalg.norm(flat))
+        angle = np.arcsin(np.clip(height / length, -1, 1)) if elevation is None else np.radians(elevation)
+        return (distance or length) * (np.cos(angle) * flat + np.sin(angle) * self.up)
+
+    def _looking(self, origin: np.ndarray) -> np.ndarray:
+        """Return the ``look_at`` matrix from ``origin`` to the target."""
+        axis = self.target - origin
+        if np.linalg.norm(axis) == 0:
+            raise SceneError("target: found the place of the camera, another point is needed")
+        axis = axis / np.linalg.norm(axis)
+        left = np.cross(self.up, axis)
+        if np.linalg.norm(left) < PARALLEL:
+            left = np.cross(np.eye(3)[np.argmin(np.abs(axis))], axis)
+        left = left / np.linalg.norm(left)
+        matrix = np.eye(4)
+        matrix[:3] = np.stack([left, np.cross(axis, left), axis, origin], axis=1)
+        return matrix
+
+
+def _lights(scene: mi.Scene) -> list[_Movable | _AreaLight]:
+    """Return the lights that can be moved: emitters with a place or a direction, and shapes that emit."""
+    emitting = [_AreaLight(scene, shape) for shape in scene.shapes() if shape.is_emitter()]
+    lights = [_Movable(emitter) for emitter in scene.emitters()]
+    return [light for light in (*lights, *emitting) if light.parameter]
+
+
+class _Movable:
+    """A sensor or light; ``before``: its 4×4 matrix in the scene; ``parameter``: key of its place ("": fixed).
+
+    ``sun``: direction of the sun in the coordinates of a sky, ``None`` if there is none or its date gives it.
+    """
+
+    def __init__(self, node):
+        self.parameters = mi.traverse(node)
+        self.parameter = next((k for k in ("to_world", "position") if k in self.parameters), "")
+        self.matrix = self.parameter == "to_world"
+        emitter = isinstance(node, mi.Emitter)
+        self.environment = emitter and bool(node.is_environment())
+        self.at_infinity = self.environment or (emitter and mi.has_flag(node.flags(), mi.EmitterFlags.Infinite))
+        self.before = np.eye(4)
+        if self.matrix:
+            self.before = np.array(self.parameters[self.parameter].matrix, np.float64).reshape(4, 4)
+        elif self.parameter:
+            self.before[:3, 3] = np.array(self.parameters[self.parameter], np.float64).ravel()
+        self.centre, self.sun = self.before[:3, 3], None
+        if "sun_direction" in self.parameters and not self.parameters.flags("sun_direction") & READ_ONLY:
+            self.sun = np.array(self.parameters["sun_direction"], np.float64).ravel()
+
+    def move(self, matrix: np.ndarray, sun: np.ndarray | None = None) -> None:
+        """Move to a 4×4 matrix; ``sun``: the new direction of the sun, in the coordinates of the sky."""
+        value = _transform(self.parameters[self.parameter], matrix) if self.matrix else matrix[:3, 3].tolist()
+        self.parameters[self.parameter] = type(self.parameters[self.parameter])(value)
+        if sun is not None:
+            self.parameters["sun_direction"] = dr.opaque(mi.Vector3f, sun.tolist())
+        self.parameters.update()
+
+
+class _AreaLight:
+    """An area light, moved with its shape: by the shape's ``to_world``, or of a mesh by its vertices.
+
+    ``before`` is the matrix of a ``to_world``, the identity for a mesh; ``centre`` is that of the shape's bounds.
+    """
+
+    environment = at_infinity = False
+    sun = None
+
+    def __init__(self, scene: mi.Scene, shape: mi.Shape):
+        self.scene, self.parameters = scene, mi.traverse(shape)
+        self.centre, self.before = np.array(shape.bbox().center(), np.float64).ravel(), np.eye(4)
+        self.parameter = next((k for k in ("to_world", "vertex_positions") if k in self.parameters), "")
+        if self.parameter == "to_world":
+            self.before = np.array(self.parameters["to_world"].matrix, np.float64).reshape(4, 4)
+        elif self.parameter:
+            keys = [k for k in ("vertex_positions", "vertex_normals") if k in self.parameters]
+            self.vertices = {k: np.array(self.parameters[k]).reshape(-1, 3) for k in keys}
+
+    def move(self, matrix: np.ndarray) -> None:
+        if self.parameter == "to_world":
+            self.parameters["to_world"] = _transform(self.parameters["to_world"], matrix)
+        else:
+            for key, values in self.vertices.items():
+                shift = matrix[:3, 3] if key == "vertex_positions" else 0
+                self.parameters[key] = (values @ matrix[:3, :3].T + shift).ravel().astype(np.float32)
+        self.parameters.update()
+        self.scene.parameters_changed()  # rays are to find the shape at its place
+
+
+def _transform(before, matrix: np.ndarray):
+    """Return a 4×4 matrix as a transformation of the type of ``before``, opaque: no part of a kernel depends on it."""
+    value = type(before)(mi.ScalarTransform4f(matrix))
+    dr.make_opaque(value)
+    return value
+
+
+def _between(before: np.ndarray, after: np.ndarray, up: np.ndarray, degrees: float) -> np.ndarray:
+    """Return the rotation by ``degrees`` about ``up``, then the shortest one that aligns ``before`` with ``after``."""
+    turn = rotation(up, degrees)
+    a, b = turn[:3, :3] @ before, after
+    axis = np.cross(a, b)
+    sine = np.linalg.norm(axis)
+    if sine < 1e-12 * np.linalg.norm(a) * np.linalg.norm(b):
+        return turn
+    return rotation(axis, np.degrees(np.arctan2(sine, a @ b))) @ turn
