@@ -189,7 +189,7 @@ def comparisons() -> Table:
 
 def ggx_quality() -> Table:
     """Return costs of each family at the quality of an indirection, as multiples of it, beside the paper's."""
-    from mi_diffind.studies.ggx.conclusions import equal_quality
+    from mi_diffind.studies.ggx import equal_quality
 
     study, reference = measured("tradeoff_ggx"), "16→8"
     goal, rows = study["candidates"][reference]["errors"]["psnr_db"], []
@@ -347,7 +347,7 @@ def texture_renders(study: dict) -> Table:
 
 def texture_factors(study: dict) -> Table:
     """Return how many times as long a bitmap takes for the same error."""
-    from mi_diffind.studies.texture.conclusions import speed
+    from mi_diffind.studies.texture import speed
 
     stages, rows = [s for s, c in study["cases"].items() if c["in_picture"]], []
     for name, c in study["candidates"].items():
@@ -364,7 +364,7 @@ def texture_factors(study: dict) -> Table:
 
 def texture_levels(study: dict) -> Table:
     """Return PSNR of each level of detail."""
-    from mi_diffind.studies.texture.conclusions import levels
+    from mi_diffind.studies.texture import levels
 
     by_name = levels(study)
     count = max(len(v["all"]) for v in by_name.values())
@@ -441,7 +441,7 @@ def texture_reads() -> Table:
 
 def shading_curves(*studies: str) -> dict:
     """Return the results of the study of shading by material."""
-    from mi_diffind.studies.shading.conclusions import curves
+    from mi_diffind.studies.shading import curves
 
     return {name: material for study in studies for name, material in curves(measured(study)).items()}
 
@@ -472,7 +472,7 @@ def shading_best(*studies: str) -> Table:
 
 def shading_shares(*studies: str) -> Table:
     """Return the paper's figure 2 as a table: quality by λ, with the spread over seeds."""
-    from mi_diffind.studies.shading.conclusions import trouble
+    from mi_diffind.studies.shading import trouble
 
     rows, materials = [], shading_curves(*studies)
     shares = sorted({share for material in materials.values() for _, share in material.runs})
@@ -633,8 +633,8 @@ TRAINING_FIGURES = {"steps": 0, "processor_seconds": 0, "level_bias": 1}
 
 def sdf_errors(study: str) -> Table:
     """Return errors of distance fields in equal bytes: IoU, IoU near the surface, normals."""
-    from mi_diffind.studies.equal_memory import candidates_by_budget
-    from mi_diffind.studies.sdf.conclusions import size_text
+    from mi_diffind.measure.report import candidates_by_budget
+    from mi_diffind.studies.sdf import size_text
 
     sizes = candidates_by_budget(measured(study))
     rows: dict[str, dict[int, str]] = {}
@@ -717,8 +717,8 @@ def field_longer() -> Table:
 
 def field_errors(study: str) -> Table:
     """Return PSNR of radiance fields by how many times smaller than a dense grid they are."""
-    from mi_diffind.studies.equal_memory import candidates_by_budget
-    from mi_diffind.studies.radiance.conclusions import ratio_text, references
+    from mi_diffind.measure.report import candidates_by_budget
+    from mi_diffind.studies.field import ratio_text, references
 
     result = measured(study)
     rows = []

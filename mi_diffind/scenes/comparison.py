@@ -25,7 +25,7 @@ from ..core.interrupt import interruptible
 from ..core.progress import progress_bar
 from ..core.runtime import use_variant
 from ..images import metrics
-from ..measure import figure_grid
+from ..measure import plot as figure_grid
 from ..measure.statistics import spread
 from ..plugins.support import footprint
 from . import conversion, loading, scene_checks

@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 import mi_diffind
-from mi_diffind.measure import clock, operations
+from mi_diffind.measure import clock
 
 ASSETS = Path(__file__).resolve().parents[2] / "scenes" / "assets"
 FILE = str(ASSETS / "rust_plain.npz")
@@ -112,7 +112,7 @@ def worker(name: str, size: str, pipe) -> None:
         dr.backward(dr.mean(mi.render(loaded, parameters, spp=1, seed=seed, seed_grad=seed + 10_000), axis=None))
         return [parameters[key].grad for key in parameters.keys()]
 
-    counted = operations.count(lambda: run(dr.opaque(mi.UInt32, 0)))
+    counted = clock.count(lambda: run(dr.opaque(mi.UInt32, 0)))
     pipe.send(counted.asdict())
     while (i := pipe.recv()) is not None:
         seed = dr.opaque(mi.UInt32, i)

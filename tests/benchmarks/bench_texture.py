@@ -25,9 +25,8 @@ import numpy as np
 
 import mi_diffind
 from mi_diffind.core.compat import use_threads
-from mi_diffind.measure.bsdf import bsdf_queries, directions, noise_texture
-from mi_diffind.measure.clock import machine, timed, total
-from mi_diffind.measure.operations import count_query
+from mi_diffind.measure.clock import count_query, machine, timed, total
+from mi_diffind.measure.renders import bsdf_queries, directions, noise_texture
 from mi_diffind.measure.study import FLOOR
 
 TILES = Path(__file__).parents[2] / "scenes/assets/tiles_filtered.npz"

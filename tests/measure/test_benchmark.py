@@ -15,8 +15,7 @@ from small_study import CALLS, KERNELS, SETTINGS, Log, separable_plan, small_pla
 
 from mi_diffind.measure import benchmark, plot, report
 from mi_diffind.measure.benchmark import measure
-from mi_diffind.measure.clock import Timed
-from mi_diffind.measure.operations import Operations
+from mi_diffind.measure.clock import Operations, Timed
 from mi_diffind.measure.statistics import finite, pareto, spread
 from mi_diffind.measure.study import FLOOR, Job
 

@@ -6,7 +6,7 @@ import pytest
 from variants import BACKENDS
 
 from mi_diffind.core.runtime import array_module
-from mi_diffind.measure.operations import FLOPS, Operations, bsdf_operations, count, count_ir
+from mi_diffind.measure.clock import FLOPS, Operations, bsdf_operations, count
 
 LANES = 64
 
@@ -126,51 +126,6 @@ def test_calls_are_counted(ad):
     dr.make_opaque(index)
     found = count(lambda: dr.switch(index, [lambda v: dr.sqrt(v) * v, lambda v: v / (v + 1)], x))
     assert (found.add, found.mul, found.div, found.sqrt) == (1, 1, 1, 1)
-
-
-def test_ptx():
-    """What Dr.Jit's CUDA backend writes; counted without a GPU."""
-    found = count_ir("""
-.version 8.0
-.target sm_70
-.address_size 64
-
-.entry drjit_0123456789abcdef0123456789abcdef(.param .align 8 .b8 params[40]) {
-    .reg.b8  %b <20>; .reg.b16  %w<20>; .reg.b32 %r<20>;
-
-    mov.u32 %r0, %ctaid.x;
-    mad.lo.u32 %r0, %r0, %r1, %r2;
-    setp.ge.u32 %p0, %r0, %r2;
-    @%p0 ret;
-
-body: // sm_90
-    ld.param.u64 %rd0, [params+8];
-    mad.wide.u32 %rd0, %r0, 4, %rd0;
-    ld.global.cs.b32 %f4, [%rd0];
-    mov.b32 %f5, 0x40400000;
-    add.ftz.f32 %f6, %f4, %f5;
-    sub.ftz.f32 %f7, %f4, %f6;
-    fma.rn.ftz.f32 %f8, %f4, %f6, %f7;
-    mul.ftz.f32 %f9, %f8, %f8;
-    div.approx.ftz.f32 %f10, %f9, %f4;
-    rcp.approx.ftz.f32 %f11, %f10;
-    sqrt.approx.ftz.f32 %f12, %f11;
-    lg2.approx.ftz.f32 %f13, %f12;
-    add.u32 %r14, %r0, %r1;
-    mad.wide.u32 %rd3, %r14, 4, %rd2;
-    mov.b32 %f15, 0;
-    @%p3 ld.global.nc.b32 %f15, [%rd3];
-    mad.wide.u32 %rd3, %r14, 16, %rd2;
-    .reg.f32 %f16_out_<4>;
-    ld.global.nc.v4.b32 {%f16_out_0, %f16_out_1, %f16_out_2, %f16_out_3}, [%rd3+0];
-    setp.lt.f32 %p17, %f15, %f4;
-    selp.b32 %f18, %f15, %f4, %p17;
-    st.global.cs.b32 [%rd0], %f18;
-    ret;
-}
-""")
-    assert found == Operations(3, 2, 2, 1, 1, gathers=2, bytes_gathered=20, instructions=13)
-    assert found.flops == 3 + 2 + 2 * 2 + 4 + 4
 
 
 def test_sums_and_names():

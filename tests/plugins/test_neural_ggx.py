@@ -26,7 +26,7 @@ from variants import VARIANTS, set_variant
 from mi_diffind.arrays.bounds import ValueBounds
 from mi_diffind.arrays.tables import StoredArray, save_table
 from mi_diffind.core import compat
-from mi_diffind.measure.operations import bsdf_operations
+from mi_diffind.measure.clock import bsdf_operations
 from mi_diffind.scenes import comparison, loading
 from mi_diffind.tasks.disney import TASK as DISNEY
 from mi_diffind.tasks.ggx import TASK
