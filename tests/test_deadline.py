@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from mi_diffind.core import progress
-from mi_diffind.core.deadline import Deadline
 from mi_diffind.core.errors import UsageError
+from mi_diffind.core.progress import Deadline
 from mi_diffind.fitting import loop
 from mi_diffind.fitting.loop import FitSettings, Problem, fit
 from mi_diffind.fitting.task import FitRequest, tasks

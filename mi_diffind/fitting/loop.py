@@ -22,13 +22,10 @@ from tqdm import tqdm
 
 from ..arrays.indirection import aligned_copy, unfolded
 from ..core import compat
-from ..core.archives import Archive, ArchiveError
-from ..core.deadline import duration
+from ..core.archives import Archive, ArchiveError, LimitError
 from ..core.errors import reason
 from ..core.files import irregular, replacing, shown, writable_file
-from ..core.interrupt import interruptible
-from ..core.limits import LimitError
-from ..core.progress import in_terminal, progress_bar
+from ..core.progress import duration, in_terminal, interruptible, progress_bar
 from .settings import LOSSES, SCHEDULES, FitSettings, FittingError
 from .sparse_adam import SparseAdam
 

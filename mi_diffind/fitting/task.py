@@ -33,8 +33,8 @@ from typing import TYPE_CHECKING, Any
 from ..core import discovery
 from ..core.arguments import Argument, check_files
 from ..core.compat import module_of
-from ..core.deadline import Deadline
 from ..core.errors import UsageError
+from ..core.progress import Deadline
 from ..core.units import labelled
 from .settings import FitSettings, within_memory
 

@@ -18,7 +18,7 @@ from ...arrays.tables import MAX_BYTES, StoredArray, Table, save_table
 from ...core import units
 from ...core.errors import UsageError
 from ...core.files import check_distinct
-from ...core.interrupt import interruptible
+from ...core.progress import interruptible
 from ...fitting.loop import FitResult, FittingError, cores
 from ...fitting.task import FitRequest, Fitted
 from . import compression, files, paper

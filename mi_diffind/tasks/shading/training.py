@@ -19,7 +19,7 @@ import numpy as np
 from ...arrays import lookup
 from ...arrays.indirection import unfolded
 from ...arrays.tables import Table
-from ...core.deadline import duration
+from ...core.progress import duration
 from ...fitting.loop import FitResult, checkpoint_settings, sample_losses
 from ...fitting.task import FitRequest
 from ...maps.pyramid import Pyramid
