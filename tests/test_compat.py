@@ -80,7 +80,7 @@ def test_functions_of_the_library(mi_rgb):
 def test_limited_code_generation():
     """The width of vectors and the processor of kernels, and the result; in a process of its own."""
     code = (
-        "import sys, mi_diffind, drjit as dr; from mi_diffind import compat; from drjit.llvm.ad import Float\n"
+        "import sys, mi_diffind, drjit as dr; from mi_diffind.core import compat; from drjit.llvm.ad import Float\n"
         "compat.limit_code_generation(sys.argv[1]); dr.set_flag(dr.JitFlag.KernelHistory, True)\n"
         "y = dr.square(dr.opaque(Float, 3, 1000)) + 1; dr.eval(y); dr.sync_thread()\n"
         "print(y[999], *compat.llvm_target(compat.kernel_code(dr.kernel_history([dr.KernelType.JIT])[0])))"

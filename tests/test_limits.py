@@ -49,10 +49,10 @@ CHILD = """
 import resource, sys
 from pathlib import Path
 import numpy, PIL.Image, OpenEXR, mitsuba, scipy.ndimage
-from mi_diffind.errors import DiffindError
-from mi_diffind.fitting import checkpoint_settings
+from mi_diffind.core.errors import DiffindError
+from mi_diffind.fitting.loop import checkpoint_settings
 from mi_diffind.maps.source import load_source
-from mi_diffind.tables import load_table
+from mi_diffind.arrays.tables import load_table
 from mi_diffind.tasks.radiance import files
 from mi_diffind.tasks.radiance.image_files import read_image
 from mi_diffind.tasks.sdf import model

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import json
 import os
@@ -245,6 +246,32 @@ def write_json(path: str | os.PathLike, content) -> None:
     """Write ``content`` as indented JSON, in one piece."""
     with replacing(path) as temporary:
         temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
+
+def stamp(path: str | os.PathLike) -> tuple:
+    """Return numbers that change when a file does: its time and size."""
+    try:
+        status = os.stat(path)
+    except OSError:
+        return ()
+    return status.st_mtime_ns, status.st_size
+
+
+def read_once(read, path: str | os.PathLike, *form):
+    """Return ``read(path, *form)``, and the same object again while the file does not change.
+
+    The last :data:`REMEMBERED` results are kept. ``form`` are hashable values that say how the file is read.
+    """
+    return _read(read, Path(path), stamp(path), form)
+
+
+#: Results of :func:`read_once` that are kept.
+REMEMBERED = 64
+
+
+@functools.lru_cache(maxsize=REMEMBERED)
+def _read(read, path: Path, stamp: tuple, form: tuple):
+    return read(path, *form)
 
 
 def is_within(folder: str | os.PathLike, name: str | os.PathLike) -> bool:

@@ -17,8 +17,7 @@ import trimesh
 from mi_diffind.arrays.tables import TableError
 from mi_diffind.core import compat
 from mi_diffind.core.errors import DiffindError
-from mi_diffind.core.files import is_within
-from mi_diffind.fitting.task import stamp
+from mi_diffind.core.files import is_within, stamp
 from mi_diffind.tasks.sdf import TASK, serialized
 from mi_diffind.tasks.sdf.mesh import directed_edges, load_mesh, split_part
 
