@@ -575,7 +575,7 @@ def integrator() -> type:
 
             A ``mode`` of ``None`` is the primal phase. Without smooth surfaces, a single piece is enough.
             """
-            solids = sdf.distance_shapes_in(scene) if hasattr(self.surfaces, "sample_shapes") else ()
+            solids = sdf.distance_shapes_in(scene) if getattr(self.surfaces, "traces_solids", False) else ()
             if self.smooth_depth == 0 or not has_smooth(scene):
                 return sampler, self._piece(mode, scene, sampler, path, solids, surfaces, False, False)
 
