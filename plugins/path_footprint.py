@@ -100,18 +100,6 @@ class Centred:
         return getattr(self._sampler, name)
 
 
-def mis_weight(a, b):
-    """Return the weight of a sample of density ``a``, where another technique has the density ``b``."""
-    return dr.select(a > 0, dr.rcp(1 + dr.square(b / a)), 0)
-
-
-def relative(value):
-    """Return 1 with the derivative of the logarithm of ``value``; 0 where ``value`` is 0."""
-    detached = dr.detach(value)
-    nonzero = detached != 0
-    return dr.select(nonzero, value / dr.select(nonzero, detached, 1), 0)
-
-
 @cache
 def integrator() -> type:
     """Return the class for the variant that is set; its base class exists only after Mitsuba loaded this file."""
@@ -220,7 +208,7 @@ def integrator() -> type:
             carried = bool(getattr(ray, "has_differentials", False)) and not solids
             flags = mitsuba_versions.ray_flags(curvature=carried)
             scale = dr.opaque(mi.Float, footprint.scale_of(sampler.sample_count()))
-            bsdf_ctx = mi.BSDFContext()
+            bsdf_ctx, mis_weight = mi.BSDFContext(), mi.ad.integrators.common.mis_weight
 
             differentials = Differentials.of(ray)
             ray = mi.Ray3f(dr.detach(ray))
@@ -351,7 +339,7 @@ def integrator() -> type:
                     with dr.resume_grad():
                         # A smooth mirror cannot be evaluated: its weight is differentiated instead
                         rough = bsdf.eval(bsdf_ctx, moving_si, wo, active_next & ~bsdf_delta)
-                        factor = dr.select(bsdf_delta, relative(bsdf_weight), relative(rough) * J)
+                        factor = dr.select(bsdf_delta, dr.relative_grad(bsdf_weight), dr.relative_grad(rough) * J)
                         Lo = Le + Lr_dir + dr.select(active_next, L * factor, 0)
                         if dr.hint(mode == dr.ADMode.Backward, mode="scalar"):
                             dr.backward_from(δL * Lo, unattached)

@@ -11,7 +11,6 @@ import mitsuba as mi
 from mi_diffind.core.mitsuba_versions import ray_flags
 
 from . import Plugin, path_footprint
-from .path_footprint import relative
 from .support import distance_shapes as sdf
 from .support.manual import shared_parts
 
@@ -74,13 +73,6 @@ supported.
 """
 
 
-def solid_angle(origin, place, normal):
-    """Return the solid angle of a unit of area at ``place``, seen from ``origin``."""
-    to = place - origin
-    squared = dr.squared_norm(to)
-    return dr.abs(dr.dot(to, normal)) * dr.rcp(squared * dr.sqrt(squared))
-
-
 @dataclass  # a type that loops of Dr.Jit accept as state
 class SolidHit:
     """Hit of Mitsuba's shapes ``pi`` or of a distance shape ``solid``; one of them is not valid.
@@ -98,6 +90,7 @@ class SolidHit:
 @cache
 def integrator() -> type:
     """Return the integrator's class in the current variant."""
+    jacobian = mi.ad.integrators.common.solid_angle_to_area_jacobian
 
     @shared_parts
     class PathSDF(path_footprint.integrator()):
@@ -155,7 +148,7 @@ def integrator() -> type:
             ds.d = dr.replace_grad(ds.d, dr.select(finite, (ds.p - si.p) / distance, ds.d))
             ds.dist = dr.replace_grad(ds.dist, dr.select(finite, distance, ds.dist))
             surface = mi.has_flag(flags, mi.EmitterFlags.Surface)
-            return dr.select(surface, relative(solid_angle(si.p, ds.p, ds.n)), 1)
+            return dr.select(surface, dr.relative_grad(jacobian(si.p, ds.p, ds.n)), 1)
 
         def attach_direction(self, solids, si, bs, ray, hit, active):
             # The next vertex stays fixed, or the direction if there is none
@@ -164,7 +157,7 @@ def integrator() -> type:
             with dr.resume_grad():
                 d = dr.select(active, dr.normalize(target.p - si.p), ray.d)
                 wo = dr.replace_grad(bs.wo, si.to_local(d))
-                return wo, dr.select(active, relative(solid_angle(si.p, target.p, target.n)), 1)
+                return wo, dr.select(active, dr.relative_grad(jacobian(si.p, target.p, target.n)), 1)
 
     return PathSDF
 
