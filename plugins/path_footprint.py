@@ -7,7 +7,7 @@ from functools import cache
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind.core import compat, mitsuba_versions
+from mi_diffind.core import compat
 
 from . import Plugin
 from .support import footprint, omissions
@@ -206,7 +206,7 @@ def integrator() -> type:
             fields_move = not primal and fields is not None and fields.optimised()
             unattached = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad  # a field may be all that is optimised
             carried = bool(getattr(ray, "has_differentials", False)) and not solids
-            flags = mitsuba_versions.ray_flags(curvature=carried)
+            flags = compat.ray_flags(curvature=carried)
             scale = dr.opaque(mi.Float, footprint.scale_of(sampler.sample_count()))
             bsdf_ctx, mis_weight = mi.BSDFContext(), mi.ad.integrators.common.mis_weight
 

@@ -8,7 +8,7 @@ from functools import cache
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind.core.mitsuba_versions import ray_flags
+from mi_diffind.core.compat import ray_flags
 
 from . import Plugin, path_footprint
 from .support import distance_shapes as sdf

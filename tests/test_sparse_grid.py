@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mi_diffind.arrays import sparse_grid
-from mi_diffind.arrays.bits import mask_words
+from mi_diffind.arrays.lookup import mask_words
 from mi_diffind.arrays.sparse_grid import CORNERS, GridIndex, SparseGrid
 from mi_diffind.core.runtime import array_module
 

@@ -14,8 +14,8 @@ import numpy as np
 from scipy.ndimage import distance_transform_cdt
 
 from ..core.errors import DiffindError
-from .bits import mask_flags, mask_words
 from .indirection import device_array
+from .lookup import mask_flags, mask_words
 
 #: Corners of a cell, z fastest, ``(8, 3)``.
 CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)

@@ -8,7 +8,7 @@ import math
 import drjit as dr
 import numpy as np
 
-from ...arrays.bits import mask_words
+from ...arrays.lookup import mask_words
 from ...arrays.sparse_grid import CORNERS
 from ...tasks.sdf.distances import Distances
 from ...tasks.sdf.sampling import surface_cells

@@ -18,8 +18,8 @@ import threading
 import drjit as dr
 import numpy as np
 
-from ...arrays.bits import mask_flags, mask_words
 from ...arrays.indirection import device_array
+from ...arrays.lookup import mask_flags, mask_words
 from ...arrays.sparse_grid import ACTIVE, BLOCK, CORNERS, empty_distances, mask_ranks, place_of_bit
 from ...core import compat
 from . import codes
