@@ -125,7 +125,7 @@ def opened(mi, path: Path) -> tuple:
     from mi_diffind.tasks.radiance import TASK as RADIANCE
     from mi_diffind.tasks.radiance import march
     from mi_diffind.tasks.sdf import TASK as SDF
-    from mi_diffind.tasks.sdf import tracing
+    from mi_diffind.tasks.sdf import marching
 
     def through(scene):
         """Follow rays in a scene, in which the unit frame is the world."""
@@ -147,8 +147,8 @@ def opened(mi, path: Path) -> tuple:
         field = model.field
 
         def follow(o, d, length):
-            hit = tracing.intersect(field, o, d, length)
-            blocked = tracing.occluded(field, o, d, length)
+            hit = marching.intersect(field, o, d, length)
+            blocked = marching.occluded(field, o, d, length)
             value, slope = field.gradient(hit.p, hit.hit)
             return hit.hit | blocked, [dr.select(hit.hit, v, 0) for v in (hit.t, *hit.p, value, *slope)]
 
