@@ -18,10 +18,8 @@ from .path_footprint import relative
 from .support import distance_shapes as sdf
 from .support import omissions, properties, tables
 from .support.differentials import Differentials
-from .support.field_light import FieldLight, in_order
-from .support.joined_fields import grouped
 from .support.manual import shared_parts
-from .support.placed_fields import PlacedField, VariantLight, to_grid
+from .support.placed_fields import FieldLight, PlacedField, VariantLight, grouped, in_order, to_grid
 
 #: Properties that the default integrator of surfaces takes.
 INNER = ("max_depth", "rr_depth", "hide_emitters", "jitter")

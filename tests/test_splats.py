@@ -385,9 +385,9 @@ def test_options_of_scenes_are_refused(mi_rgb, tmp_path, rng, capsys):
 def test_a_field_of_gaussians(mi_rgb, tmp_path, rng, monkeypatch, capsys):
     """Views of the Gaussians, and the field of the views; the file itself is refused with the command that captures."""
     from mi_diffind.arrays.tables import load_table
-    from mi_diffind.tasks.radiance import visual_hull
+    from mi_diffind.tasks.radiance import views as view_files
 
-    monkeypatch.setattr(visual_hull, "SEARCH", 16)
+    monkeypatch.setattr(view_files, "SEARCH", 16)
     g = gaussians(rng)
     g["centres"] *= 0.1
     g["scales"][:], g["opacities"][:] = 0.3, 0.99

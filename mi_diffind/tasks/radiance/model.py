@@ -10,8 +10,8 @@ import numpy as np
 
 from ...arrays.indirection import device_array
 from ...fitting.task import Model
+from . import dense_bytes
 from .files import field_of
-from .presets import dense_bytes
 
 #: Rays along each side of the box in counts of steps.
 PIXELS = 96

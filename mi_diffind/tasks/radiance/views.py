@@ -1,9 +1,9 @@
-"""Captured views: images of a scene with the poses of their cameras, read from a folder.
+"""Captured views: images of a scene with the poses of their cameras, and the space that the objects may occupy.
 
-``mi-diffind capture``, Blender, nerfstudio and instant-ngp list views in JSON (:mod:`.transforms`); models of COLMAP
-are read, too (:mod:`.colmap`). Pixels stay as their files have them (:mod:`.image_files`), 4 bytes each, or 8 bytes if
-there is an EXR among the files; photographs with a distortion become images of pinholes (:mod:`.lenses`). An image
-without alpha is opaque everywhere, so that its background becomes part of the field.
+Lists of views and image files are read by :mod:`.captures`. Pixels stay as their files have them, 4 bytes each, or 8
+bytes if there is an EXR among the files; photographs with a distortion become images of pinholes. An image without
+alpha is opaque everywhere, so that its background becomes part of the field, unless it has one colour: then pixels of
+this colour that are connected with the border of their image become empty.
 """
 
 from __future__ import annotations
@@ -14,31 +14,38 @@ import hashlib
 import json
 import os
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import binary_propagation, maximum_filter
 
 from ...arrays.indirection import aligned
 from ...core import units
 from ...core.errors import printable, shortened
 from ...core.progress import progress_bar
-from . import background as backgrounds
-from .camera_keys import focal_lengths
-from .colmap import colmap_frames, model_folder
-from .image_files import (
+from .captures import (
+    DISTORTION,
+    SPLITS,
+    Frame,
+    FrameList,
     MissingImageError,
     ViewsError,
+    colmap_frames,
     decoded,
+    encoded,
+    focal_lengths,
     half_floats,
     image_file,
     is_linear,
+    listed_frames,
+    model_folder,
     read_image,
     read_mask,
     reduced,
+    undistorted,
 )
-from .lenses import DISTORTION, undistorted
-from .transforms import SPLITS, Frame, FrameList, listed_frames
 
 #: Level of zlib for images that are kept compressed: the fastest.
 PACKING = 1
@@ -77,7 +84,7 @@ class CapturedViews:
     recorded in the file of a fitted field.
 
     ``background`` holds bytes of sRGB if images without alpha show one colour around the objects
-    (:mod:`.background`); its pixels have alpha 0 then. ``None``: images with alpha, or surroundings that are captured.
+    (:mod:`.views`); its pixels have alpha 0 then. ``None``: images with alpha, or surroundings that are captured.
     """
 
     pixels: np.ndarray
@@ -110,6 +117,10 @@ class CapturedViews:
             focal=self.focal[numbers], centre=self.centre[numbers], names=tuple(self.names[i] for i in numbers),
             packed=None if self.packed is None else tuple(self.packed[i] for i in numbers),
         )  # fmt: skip
+
+    def spread(self, count: int) -> CapturedViews:
+        """Return ``count`` of the views, evenly spread in the list."""
+        return self.chosen(np.arange(count) * len(self) // count)
 
     def compressed(self) -> CapturedViews:
         """Return the same views with compressed images, which are decoded one at a time."""
@@ -243,12 +254,12 @@ def _in_front_of(views: CapturedViews, opaque: list[int], background) -> Capture
         )
         surroundings = bool(opaque) and background == "surroundings"
         return dataclasses.replace(views, notes=(*views.notes, *unused), surroundings=surroundings)
-    chosen = backgrounds.NAMED[background] if isinstance(background, str) else background
-    colour = chosen or backgrounds.border_colour(opaque, views.stored, views.counted)
+    chosen = NAMED[background] if isinstance(background, str) else background
+    colour = chosen or border_colour(opaque, views.stored, views.counted)
     if colour is None:
         return views
     for view in opaque:
-        backgrounds.clear(views.stored(view), views.counted(view), colour)
+        clear(views.stored(view), views.counted(view), colour)
     notes = views.notes
     if not chosen:
         text = ", ".join(map(str, colour))
@@ -381,3 +392,138 @@ class _Images:
             np.ones(h * w, bool) if m is None else m.ravel() for m, (h, w) in zip(self.masks, self.sizes, strict=True)
         )
         return np.concatenate(list(whole))
+
+
+#: Name → bytes of sRGB.
+NAMED = {"white": (255, 255, 255), "black": (0, 0, 0)}
+
+#: Largest difference from the background in a byte of its pixels.
+TOLERANCE = 4
+
+#: Least share of the pixels at borders that have one colour if it is the background.
+SHARE_OF_BORDER = 0.9
+
+
+def _shown(image: np.ndarray) -> np.ndarray:
+    """Return the bytes of sRGB of an image of bytes or halves, ``(…, 3)``."""
+    return (image if image.dtype == np.uint8 else encoded(image.astype(np.float32)))[..., :3]
+
+
+def _near(shown: np.ndarray, colour) -> np.ndarray:
+    return np.abs(shown.astype(np.int16) - np.int16(colour)).max(axis=-1) <= TOLERANCE
+
+
+def border_colour(views: range | list[int], image: Callable, counted: Callable) -> tuple[int, int, int] | None:
+    """Return the colour that most pixels at the borders of some views have, bytes of sRGB, or ``None``.
+
+    ``image(view)`` and ``counted(view)`` are those of :class:`CapturedViews`, the image as it is stored.
+    """
+    pixels = []
+    for view in views:
+        shown, counts = image(view), counted(view)
+        for side in ((0, slice(None)), (-1, slice(None)), (slice(None), 0), (slice(None), -1)):
+            pixels.append(_shown(shown[side])[counts[side]])
+    pixels = np.concatenate(pixels)
+    if not len(pixels):
+        return None
+    colour = np.median(pixels, axis=0).astype(int)
+    return tuple(colour.tolist()) if _near(pixels, colour).mean() >= SHARE_OF_BORDER else None
+
+
+def clear(image: np.ndarray, counted: np.ndarray, colour) -> None:
+    """Set the pixels of the background in a stored image to 0."""
+    free = _near(_shown(image), colour) | ~counted
+    border = np.ones_like(free)
+    border[1:-1, 1:-1] = False
+    image[binary_propagation(border & free, mask=free) & counted] = 0
+
+
+#: Nodes along the longest side of the grid in which the box is searched.
+SEARCH = 64
+
+#: Share of the views that must have a node in sight, so that space out of sight does not count as occupied.
+SIGHTED = 0.34
+
+#: Voxels by which the box is larger than the visual hull.
+MARGIN = 2
+
+
+def box_of(views: CapturedViews) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lower and upper corner of the box of the captured objects.
+
+    The box is the ``aabb`` of the capture, cut to the visual hull if the images have alpha. Without an ``aabb``, the
+    search covers a cube around the point that the cameras look at, up to the nearest camera. Raises
+    :class:`.ViewsError` if the visual hull is empty.
+    """
+    if views.box is not None:
+        lower, upper = np.asarray(views.box, np.float64)
+    else:
+        middle, reach = focus(views)
+        lower, upper = middle - reach, middle + reach
+    if not views.has_alpha:
+        return lower, upper
+    for _ in range(2):  # the second time, in a finer grid
+        spacing = float((upper - lower).max()) / (SEARCH - 1)
+        shape = np.ceil((upper - lower) / spacing).astype(int) + 1
+        inside = hull(views, lower, spacing, shape)
+        if not inside.any():
+            raise ViewsError(f"{views.path}: the views show nothing: no point has an alpha above 0 in all of them")
+        occupied = np.argwhere(inside)
+        first, last = occupied.min(axis=0) - MARGIN, occupied.max(axis=0) + MARGIN
+        lower, upper = np.maximum(lower, lower + first * spacing), np.minimum(upper, lower + last * spacing)
+    return lower, upper
+
+
+def pixel_width(views: CapturedViews, point) -> float:
+    """Return the width of a pixel at the distance of a point: the median over the views."""
+    distances = np.linalg.norm(views.origins - np.asarray(point), axis=1)
+    return float(np.median(distances / views.focal.mean(axis=1)))
+
+
+def focus(views: CapturedViews) -> tuple[np.ndarray, float]:
+    """Return the point nearest to the optical axes of all cameras and its distance to the nearest camera."""
+    axes = -views.poses[:, :3, 2]
+    # Σ (I − a aᵀ) (x − o) = 0; a little weight on the cameras' mean if all look the same way
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    ahead = views.origins + axes * np.linalg.norm(views.origins - views.origins.mean(axis=0), axis=1).max()
+    matrix = across.sum(axis=0) + 1e-3 * len(axes) * np.eye(3)
+    point = np.linalg.solve(
+        matrix, np.einsum("nij,nj->i", across, views.origins) + 1e-3 * len(axes) * ahead.mean(axis=0)
+    )
+    reach = np.linalg.norm(views.origins - point, axis=1).min()
+    return point, float(max(reach, 1e-3))
+
+
+def hull(views: CapturedViews, lower, spacing: float, shape) -> np.ndarray:
+    """Return the nodes ``lower + spacing · (i, j, k)`` of the visual hull: bool of this ``shape``.
+
+    A node belongs to it if a share :data:`SIGHTED` of the views have it in sight and none of these shows it empty: a
+    pixel within a voxel of its projection has an alpha above 0, or does not count.
+    """
+    lower = np.asarray(lower, np.float64)
+    axes = [a + spacing * np.arange(n) for a, n in zip(lower, shape, strict=True)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    numbers, sights = np.arange(len(points)), np.zeros(len(points), np.int32)
+    needed = max(1, int(SIGHTED * len(views)))
+    for v in range(len(views)):
+        local = (points - views.origins[v]) @ views.poses[v, :3, :3]
+        ahead = -local[:, 2]
+        front = ahead > 1e-6
+        scale = views.focal[v] / np.where(front, ahead, 1)[:, None]
+        x = views.centre[v, 0] + scale[:, 0] * local[:, 0] - 0.5
+        y = views.centre[v, 1] - scale[:, 1] * local[:, 1] - 0.5
+        # The filter is as wide as a voxel appears. Nodes so near that it would cover the image are left to other views
+        near = 0.5 * np.median(ahead[front]) if front.any() else np.inf
+        front &= ahead >= near
+        reach = int(np.ceil(0.87 * spacing * views.focal[v].max() / near))
+        covered = maximum_filter((views.stored(v)[..., 3] > 0) | ~views.counted(v), size=2 * reach + 1)
+        height, width = covered.shape
+        i, j = np.rint(x).astype(np.int64), np.rint(y).astype(np.int64)
+        sighted = front & (i >= 0) & (i < width) & (j >= 0) & (j < height)
+        sights += sighted
+        kept = sights + (len(views) - 1 - v) >= needed
+        kept[sighted] &= covered[j[sighted], i[sighted]]
+        points, numbers, sights = points[kept], numbers[kept], sights[kept]
+    inside = np.zeros(tuple(shape), bool)
+    inside.reshape(-1)[numbers] = True
+    return inside

@@ -17,8 +17,7 @@ from mi_diffind.fitting.loop import FitSettings
 from mi_diffind.tasks.radiance import files, march, nodes, surroundings
 from mi_diffind.tasks.radiance import fit as field_fit
 from mi_diffind.tasks.radiance import grid as grids
-from mi_diffind.tasks.radiance.session import FieldSession
-from mi_diffind.tasks.radiance.training import ImagesProblem
+from mi_diffind.tasks.radiance.session import FieldSession, ImagesProblem
 from mi_diffind.tasks.radiance.views import load_views
 from mi_diffind.tasks.radiance.volume_field import NodeField
 

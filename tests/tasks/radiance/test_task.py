@@ -23,9 +23,10 @@ from mi_diffind.fitting.loop import FitSettings
 from mi_diffind.fitting.loop import fit as train
 from mi_diffind.fitting.task import FitRequest, fit, tasks
 from mi_diffind.images import metrics
-from mi_diffind.tasks.radiance import compression, files, nodes, rate_distortion, visual_hull
+from mi_diffind.tasks.radiance import compression, files, nodes
 from mi_diffind.tasks.radiance import fit as field_fit
 from mi_diffind.tasks.radiance import grid as grids
+from mi_diffind.tasks.radiance import views as view_files
 from mi_diffind.tasks.radiance.session import FieldSession, ViewImages, displayed, scores
 from mi_diffind.tasks.radiance.views import load_views
 
@@ -45,7 +46,7 @@ def short_grids():
     short = type(grid)(grid.layout, FitSettings(**{**vars(grid.settings), "steps": 60, "batch": 1024}))
     patch.setitem(field_fit.PRESETS, "grid", short)
     patch.setattr(field_fit, "VALUE_STEPS", 20)
-    patch.setattr(visual_hull, "SEARCH", 32)
+    patch.setattr(view_files, "SEARCH", 32)
     yield
     patch.undo()
 
@@ -158,7 +159,7 @@ def test_a_trial_with_a_part_of_the_nodes_can_be_coded(folder, ad, monkeypatch):
     monkeypatch.setattr(compression, "COLUMN", 3)
     grid = files.grid_of(files.load(folder / "grid.npz"), ad)
     rows = np.arange(1.0, grid.nodes.count + 1)
-    part, weights = compression.trial_part(grid, rate_distortion.Importance(rows, rows, np.ones(12), 1.0))
+    part, weights = compression.trial_part(grid, compression.Importance(rows, rows, np.ones(12), 1.0))
     assert 0 < part.nodes.count < 0.7 * grid.nodes.count
     assert len(part.density) == part.nodes.entries == len(weights.density) + 1 == len(weights.colour) + 1
     np.testing.assert_array_equal(part.density[1:], grid.density[1:][weights.density.astype(int) - 1])
@@ -370,14 +371,14 @@ def test_files_with_a_density_curve_are_refused(folder, tmp_path):
 
 
 def test_hull_and_box(folder, monkeypatch):
-    monkeypatch.setattr(visual_hull, "SEARCH", 64)
+    monkeypatch.setattr(view_files, "SEARCH", 64)
     views = load_views(folder, "train")
-    lower, upper = visual_hull.box_of(views)
+    lower, upper = view_files.box_of(views)
     assert np.all(lower < [-0.3, -0.5, -0.5]) and np.all(upper > [0.7, 0.5, 0.5])
     assert np.all(upper - lower < 1.8)
     spacing = 0.05
     shape = np.ceil((upper - lower) / spacing).astype(int) + 1
-    inside = visual_hull.hull(views, lower, spacing, shape)
+    inside = view_files.hull(views, lower, spacing, shape)
     at = np.stack(np.meshgrid(*[a + spacing * np.arange(n) for a, n in zip(lower, shape, strict=True)], indexing="ij"))
     distance = np.linalg.norm(at - np.array([0.2, 0, 0])[:, None, None, None], axis=0)
     assert inside[distance < 0.5].all() and inside[distance > 0.75].mean() < 0.01
@@ -419,7 +420,7 @@ def test_importance_is_what_a_change_costs(folder, ad, rng):
     """Against differences: changes of important and of other nodes change the images as their importance says."""
     grid = files.grid_of(files.load(folder / "grid.npz"), ad)
     session = FieldSession.load(ad, folder)
-    weights, images = rate_distortion.importance(grid, session, 0), session.images
+    weights, images = compression.importance(grid, session, 0), session.images
     order, ratios = np.argsort(weights.colour), []
     before = [displayed(images.render(grid.field(), v)) for v in range(len(images.views))]
     for nodes_of in (order[-40:], order[len(order) // 2 :][:40]):
@@ -508,7 +509,7 @@ def test_views_without_alpha(tmp_path, capsys):
 def test_sizes(folder, ad):
     grid = files.grid_of(files.load(folder / "grid.npz"), ad)
     session = FieldSession.load(ad, folder)
-    weights = rate_distortion.importance(grid, session, 0)
+    weights = compression.importance(grid, session, 0)
     for bits in (6, 8):
         problem = compression.PaletteProblem(compression.palette_coding(grid, weights, bits, 0, 0.0), session)
         table = files.palette_table(grid.nodes, problem.stored())
@@ -558,5 +559,5 @@ def test_a_view_that_sees_nothing(folder):
         poses=np.concatenate([views.poses, away[None]]), focal=np.concatenate([views.focal, views.focal[:1]]),
         centre=np.concatenate([views.centre, views.centre[:1]]), names=(*views.names, "away.png"),
     )  # fmt: skip
-    made = [visual_hull.hull(v, (-0.5, -0.7, -0.7), 0.07, (18, 20, 20)) for v in (views, more)]
+    made = [view_files.hull(v, (-0.5, -0.7, -0.7), 0.07, (18, 20, 20)) for v in (views, more)]
     assert made[0].sum() > 500 and (made[0] & ~made[1]).sum() < 0.02 * made[0].sum()

@@ -15,10 +15,8 @@ from PIL import Image
 
 from mi_diffind.images import srgb
 from mi_diffind.tasks.radiance import session
-from mi_diffind.tasks.radiance.session import TILE, FieldSession, ViewImages
-from mi_diffind.tasks.radiance.training import ImagesProblem
-from mi_diffind.tasks.radiance.views import ViewsError, load_views
-from mi_diffind.tasks.radiance.visual_hull import hull
+from mi_diffind.tasks.radiance.session import TILE, FieldSession, ImagesProblem, ViewImages
+from mi_diffind.tasks.radiance.views import ViewsError, hull, load_views
 
 
 def test_few_views_of_many_are_evenly_spread(blender):
