@@ -324,7 +324,9 @@ def camera_numbers(where: str, frame: dict, file: dict) -> dict[str, float]:
     """
     levels = frame, file
     model = _check_model(where, levels)
-    numbers = {name: _first(where, levels, name) for name in ("w", "h", "cx", "cy")}
+    numbers = {}
+    for name in ("w", "h", "cx", "cy"):
+        numbers[name] = next((v for level in levels if (v := _number(where, level, name)) is not None), None)
     for names in FOCAL.values():
         level = next((level for level in levels if any(level.get(name) is not None for name in names)), file)
         pixels, degrees, radians = (_number(where, level, name) for name in names)
@@ -399,15 +401,6 @@ def _lens(where: str, levels: tuple[dict, dict], model: str) -> dict[str, float]
     return lens
 
 
-def _first(where: str, levels: tuple[dict, dict], name: str) -> float | None:
-    """Return a number of the first level that has it."""
-    for level in levels:
-        value = _number(where, level, name)
-        if value is not None:
-            return value
-    return None
-
-
 def _number(where: str, entries: dict, name: str) -> float | None:
     value = entries.get(name)
     if value is None:
@@ -433,7 +426,7 @@ EVERY = 8
 class Frame:
     """One view in a list: the name of its image, pose ``(4, 4)``, camera to world, and the ``numbers`` of its camera.
 
-    The numbers are those of :func:`.camera_keys.camera_numbers`. ``mask`` names a mask.
+    The numbers are those of :func:`camera_numbers`. ``mask`` names a mask.
     """
 
     image: str
@@ -464,14 +457,25 @@ class FrameList:
         return self.file.relative_to(self.root).as_posix()
 
 
-def listed_frames(folder: Path, split: str) -> FrameList:
-    """Return the views of a ``split`` that the JSON files in a folder list. Raises :class:`ViewsError`."""
+def list_frames(folder: Path, split: str) -> FrameList:
+    """Return the views of a ``split`` that JSON files in a folder or, without such, a model of COLMAP list.
+
+    Raises :class:`ViewsError`.
+    """
+    model = None if any(folder.glob("transforms*.json")) else model_folder(folder)
+    if model is not None:
+        return colmap_frames(folder, model, split)
     file, content, frames = _frames(folder, split)
     content["frames"] = frames  # those of other splits are not read
     cameras, box = [_camera(file, content, frame) for frame in frames], _box(file, content)
     settings = {name: content[name] for name in ("applied_transform", "applied_scale") if name in content}
     note = unused_note(file, content)
     return FrameList(file, file.parent, cameras, box, settings=settings, notes=(note,) if note else ())
+
+
+def _part(entries: list, split: str) -> list:
+    """Return the entries of a split of a list without splits: every eighth one is a test view."""
+    return entries if len(entries) == 1 else [e for i, e in enumerate(entries) if (i % EVERY == 0) == (split == "test")]
 
 
 def _frames(folder: Path, split: str) -> tuple[Path, dict, list[dict]]:
@@ -483,19 +487,16 @@ def _frames(folder: Path, split: str) -> tuple[Path, dict, list[dict]]:
         raise ViewsError(f"{shown(folder)}: {fault}")
     if not folder.is_dir():
         raise ViewsError(f"{folder}: {'is not a folder' if folder.exists() else 'no such folder'}")
-    files = {s: folder / f"transforms_{s}.json" for s in SPLITS}
+    files, single = {s: folder / f"transforms_{s}.json" for s in SPLITS}, folder / "transforms.json"
     test = "val" if files["val"].is_file() and not files["test"].is_file() else "test"
-    listed_split, single = files[test if split == "test" else split], folder / "transforms.json"
-    if listed_split.is_file():
-        content, frames = _parse(listed_split)
-        if split == "train" and not files[test].is_file():
-            frames = [f for i, f in enumerate(frames) if i % EVERY or len(frames) == 1]
-        return listed_split, content, frames
-    if files["train"].is_file():
-        if split == "test":
-            content, frames = _parse(files["train"])
-            return files["train"], content, frames[::EVERY]
-        raise ViewsError(f"{listed_split}: no such file")
+    file = files[test if split == "test" else split]
+    if file.is_file() or files["train"].is_file():
+        whole = split != "val" and not files[test].is_file()  # the list of all views
+        file = files["train"] if whole else file
+        if not file.is_file():
+            raise ViewsError(f"{file}: no such file")
+        content, frames = _parse(file)
+        return file, content, _part(frames, split) if whole else frames
     if not single.is_file():
         raise ViewsError(
             f"{folder}: holds no views: neither transforms_train.json nor transforms.json, nor a COLMAP model in "
@@ -506,8 +507,7 @@ def _frames(folder: Path, split: str) -> tuple[Path, dict, list[dict]]:
     if not lists:
         if split == "val":
             raise ViewsError(f'{single}: has no list "val_filenames"')
-        wanted = [f for i, f in enumerate(frames) if (i % EVERY == 0) == (split == "test")]
-        return single, content, frames if len(frames) == 1 else wanted
+        return single, content, _part(frames, split)
     if split == "test" and "test" not in lists and "val" in lists:
         split = "val"
     if split not in lists:
@@ -636,10 +636,8 @@ TRACK = 3
 
 def model_folder(folder: Path) -> Path | None:
     """Return the folder of the COLMAP model of a capture, or ``None``."""
-    for path in (folder / name for name in FOLDERS):
-        if any((path / f"cameras.{suffix}").is_file() for suffix in ("bin", "txt")):
-            return path
-    return None
+    files = (folder / name / f"cameras.{suffix}" for name in FOLDERS for suffix in ("bin", "txt"))
+    return next((file.parent for file in files if file.is_file()), None)
 
 
 def colmap_frames(folder: Path, model: Path, split: str) -> FrameList:
@@ -660,9 +658,7 @@ def colmap_frames(folder: Path, model: Path, split: str) -> FrameList:
         raise ViewsError(f'{model}: has no views for the split "val"')
     images = sorted((reconstruction.images[i] for i in reconstruction.reg_image_ids()), key=lambda image: image.name)
     frames = []
-    for i, image in enumerate(images):
-        if len(images) > 1 and (i % EVERY == 0) != (split == "test"):
-            continue
+    for image in _part(images, split):
         camera, mask = reconstruction.cameras[image.camera_id], folder / MASKS / f"{image.name}.png"
         if camera.model.name not in PARAMETERS:
             raise ViewsError(

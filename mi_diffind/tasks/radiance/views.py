@@ -14,7 +14,6 @@ import hashlib
 import json
 import os
 import zlib
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,15 +31,13 @@ from .captures import (
     FrameList,
     MissingImageError,
     ViewsError,
-    colmap_frames,
     decoded,
     encoded,
     focal_lengths,
     half_floats,
     image_file,
     is_linear,
-    listed_frames,
-    model_folder,
+    list_frames,
     read_image,
     read_mask,
     reduced,
@@ -64,7 +61,7 @@ OFF_MIDDLE = 0.25
 OUTLIERS, POINTS_MARGIN = (1, 99), 0.05
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class CapturedViews:
     """Images of one ``split`` of a capture, with their cameras.
 
@@ -83,8 +80,8 @@ class CapturedViews:
     undistorted photograph does not show. ``None``: all count. ``notes`` are sentences for the user; ``settings`` are
     recorded in the file of a fitted field.
 
-    ``background`` holds bytes of sRGB if images without alpha show one colour around the objects
-    (:mod:`.views`); its pixels have alpha 0 then. ``None``: images with alpha, or surroundings that are captured.
+    ``background`` holds bytes of sRGB if images without alpha show one colour around the objects,
+    and its pixels have alpha 0 then. ``None``: images with alpha, or surroundings that are captured.
     """
 
     pixels: np.ndarray
@@ -199,28 +196,17 @@ def load_views(
     folder = Path(folder)
     if split not in SPLITS:
         raise ValueError(f'split: found "{split}", allowed are {", ".join(SPLITS)}')
-    listed = _listed(folder, split)
+    listed = list_frames(folder, split)
     frames, paths, missing = _with_images(listed, split)
     if most is not None and most < len(frames):
         chosen = [i * len(frames) // most for i in range(most)]
         frames, paths = ([entries[i] for i in chosen] for entries in (frames, paths))
-    images = _Images(len(paths), 2 if any(map(is_linear, paths)) else 1, downscale)
+    images = _Images(listed, len(paths), 2 if any(map(is_linear, paths)) else 1, downscale)
     with progress_bar("views", len(paths), "images", progress) as bar:
         for path, frame in zip(paths, frames, strict=True):
-            images.add(path, frame, listed)
+            images.add(path, frame)
             bar.update()
     opaque = images.opaque if images.transparent else list(range(len(paths)))
-    notes = [*listed.notes, *missing, *images.notes]
-    if images.alpha_masks:
-        notes.append(f"the masks of {images.alpha_masks} images are those of their alpha")
-    if images.reduced:
-        factors = " or ".join(map(str, sorted(images.reduced)))
-        notes.append(f"images are reduced by the factor {factors} along each side: option --downscale")
-    if images.off_middle:
-        notes.append(f'{listed.name}: "cx" and "cy" in pixels are expected, {images.off_middle}')
-    if images.undistorted:
-        count = "all" if images.undistorted == len(paths) else f"{images.undistorted} of {len(paths)}"
-        notes.append(f"{count} images have a lens distortion and were undistorted")
     mask = images.mask()
     if mask is not None and not mask.any():
         raise ViewsError(
@@ -238,43 +224,33 @@ def load_views(
         has_alpha=not opaque,
         split=split,
         mask=mask,
-        notes=tuple(notes),
+        notes=(*listed.notes, *missing, *images.all_notes()),
         settings=listed.settings,
     )
-    views = _in_front_of(views, opaque, background)
+    _set_background(views, opaque, background)
     # Points of a model lie in the surroundings, too
-    return dataclasses.replace(views, box=_box(listed, views.has_alpha or views.surroundings))
+    views.box = _box(listed, views.has_alpha or views.surroundings)
+    return views
 
 
-def _in_front_of(views: CapturedViews, opaque: list[int], background) -> CapturedViews:
-    """Return views whose ``opaque`` images are in front of a background."""
+def _set_background(views: CapturedViews, opaque: list[int], background) -> None:
+    """Let the ``opaque`` images of views be in front of a background."""
     if not opaque or background in ("scene", "surroundings"):
-        unused = (
-            [] if opaque or background in (None, "scene") else ["all images have alpha: the background is not used"]
-        )
-        surroundings = bool(opaque) and background == "surroundings"
-        return dataclasses.replace(views, notes=(*views.notes, *unused), surroundings=surroundings)
+        views.surroundings = bool(opaque) and background == "surroundings"
+        if not opaque and background not in (None, "scene"):
+            views.notes += ("all images have alpha: the background is not used",)
+        return
     chosen = NAMED[background] if isinstance(background, str) else background
-    colour = chosen or border_colour(opaque, views.stored, views.counted)
+    colour = chosen or border_colour(views, opaque)
     if colour is None:
-        return views
+        return
     for view in opaque:
         clear(views.stored(view), views.counted(view), colour)
-    notes = views.notes
     if not chosen:
         text = ", ".join(map(str, colour))
-        notes += (f"images without alpha: the colour of their borders (sRGB {text}) is taken for the background",)
-    settings = views.settings | {"background": list(colour)}
-    return dataclasses.replace(views, has_alpha=True, background=tuple(colour), notes=notes, settings=settings)
-
-
-def _listed(folder: Path, split: str) -> FrameList:
-    """Return the list of the views of a split: in JSON if there is such a file, else in a COLMAP model."""
-    if not any(folder.glob("transforms*.json")):
-        model = model_folder(folder)
-        if model is not None:
-            return colmap_frames(folder, model, split)
-    return listed_frames(folder, split)
+        views.notes += (f"images without alpha: the colour of their borders (sRGB {text}) is taken for the background",)
+    views.has_alpha, views.background = True, tuple(colour)
+    views.settings = views.settings | {"background": list(colour)}
 
 
 def _with_images(listed: FrameList, split: str) -> tuple[list[Frame], list[Path], list[str]]:
@@ -315,16 +291,16 @@ def _box(listed: FrameList, has_alpha: bool) -> np.ndarray | None:
 class _Images:
     """Images of a capture while they are read: arrays and lists of :class:`CapturedViews`."""
 
-    def __init__(self, views: int, words: int, downscale: int | None):
-        self.views, self.pixels, self.count = views, np.empty((0, words), np.uint32), 0
+    def __init__(self, listed: FrameList, views: int, words: int, downscale: int | None):
+        self.listed, self.views, self.downscale = listed, views, downscale
+        self.pixels, self.count = np.empty((0, words), np.uint32), 0
         self.sizes, self.focal, self.centre, self.masks = [], [], [], []
-        self.transparent, self.opaque, self.undistorted, self.downscale, self.reduced = False, [], 0, downscale, set()
-        self.alpha_masks, self.notes = 0, {}  # notes in their order, each once
-        self.off_middle = ""
+        self.transparent, self.opaque, self.undistorted, self.reduced = False, [], 0, set()
+        self.alpha_masks, self.notes, self.off_middle = 0, {}, ""  # notes in their order, each once
 
-    def add(self, path: Path, frame: Frame, listed: FrameList) -> None:
+    def add(self, path: Path, frame: Frame) -> None:
         """Read an image and its mask, reduce and undistort them."""
-        numbers, (image, has_alpha) = frame.numbers, read_image(path)
+        numbers, listed, (image, has_alpha) = frame.numbers, self.listed, read_image(path)
         height, width = image.shape[:2]
         expected = numbers.get("w", width), numbers.get("h", height)
         if expected != (width, height):
@@ -351,21 +327,36 @@ class _Images:
             raise ViewsError(f"{path}: has {width} × {height} pixels, which cannot be reduced by the factor {factor}")
         if factor > 1:
             image, mask = reduced(image, mask, factor)
-            (height, width), self.reduced = image.shape[:2], self.reduced | {factor}
+            self.reduced.add(factor)
             focal, centre = ((x / factor, y / factor) for x, y in (focal, centre))
         lens = tuple(numbers.get(name, 0.0) for name in DISTORTION)
         if any(lens):
             image, mask = undistorted(image, mask, focal, centre, lens)
             self.undistorted += 1
-        self.sizes.append((height, width))
+        if not has_alpha:
+            self.opaque.append(len(self.sizes))
+        elif not self.transparent:
+            self.transparent = bool(image[..., 3].min() < (255 if image.dtype == np.uint8 else 1))
+        self.sizes.append(image.shape[:2])
         self.focal.append(focal)
         self.centre.append(centre)
         self.masks.append(None if mask is None or mask.all() else mask)
-        if not has_alpha:
-            self.opaque.append(len(self.sizes) - 1)
-        elif not self.transparent:
-            self.transparent = bool(image[..., 3].min() < (255 if image.dtype == np.uint8 else 1))
         self._store(image)
+
+    def all_notes(self) -> list[str]:
+        """Return sentences on the images that were read."""
+        notes = list(self.notes)
+        if self.alpha_masks:
+            notes.append(f"the masks of {self.alpha_masks} images are those of their alpha")
+        if self.reduced:
+            factors = " or ".join(map(str, sorted(self.reduced)))
+            notes.append(f"images are reduced by the factor {factors} along each side: option --downscale")
+        if self.off_middle:
+            notes.append(f'{self.listed.name}: "cx" and "cy" in pixels are expected, {self.off_middle}')
+        if self.undistorted:
+            count = "all" if self.undistorted == len(self.sizes) else f"{self.undistorted} of {len(self.sizes)}"
+            notes.append(f"{count} images have a lens distortion and were undistorted")
+        return notes
 
     def _store(self, image: np.ndarray) -> None:
         words, size = self.pixels.shape[1], image.shape[0] * image.shape[1]
@@ -413,14 +404,11 @@ def _near(shown: np.ndarray, colour) -> np.ndarray:
     return np.abs(shown.astype(np.int16) - np.int16(colour)).max(axis=-1) <= TOLERANCE
 
 
-def border_colour(views: range | list[int], image: Callable, counted: Callable) -> tuple[int, int, int] | None:
-    """Return the colour that most pixels at the borders of some views have, bytes of sRGB, or ``None``.
-
-    ``image(view)`` and ``counted(view)`` are those of :class:`CapturedViews`, the image as it is stored.
-    """
+def border_colour(views: CapturedViews, chosen: list[int]) -> tuple[int, int, int] | None:
+    """Return the colour that most pixels at the borders of some views have, bytes of sRGB, or ``None``."""
     pixels = []
-    for view in views:
-        shown, counts = image(view), counted(view)
+    for view in chosen:
+        shown, counts = views.stored(view), views.counted(view)
         for side in ((0, slice(None)), (-1, slice(None)), (slice(None), 0), (slice(None), -1)):
             pixels.append(_shown(shown[side])[counts[side]])
     pixels = np.concatenate(pixels)
