@@ -29,9 +29,8 @@ import numpy as np
 
 from ..core import compat
 from ..core.errors import DiffindError, reason
-from ..core.files import irregular, shown
+from ..core.files import RecordedKeys, irregular, shown, unused_note
 from ..core.units import check_memory, memory
-from ..core.unused_keys import RecordedKeys, unused_note
 from ..images.srgb import to_linear
 
 #: Names of properties that every Gaussian of a PLY file has.

@@ -23,7 +23,7 @@ from half_vectors import HalfVectorSampling
 from spheres import key_of, sphere_scene
 from variants import VARIANTS, set_variant
 
-from mi_diffind.arrays.bounds import ValueBounds
+from mi_diffind.arrays.boxes import ValueBounds
 from mi_diffind.arrays.tables import StoredArray, save_table
 from mi_diffind.core import compat
 from mi_diffind.measure.operations import bsdf_operations

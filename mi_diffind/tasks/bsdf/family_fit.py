@@ -11,7 +11,7 @@ import numpy as np
 
 from ...arrays.indirection import DifferentiableArray
 from ...core.errors import UsageError
-from ...core.interrupt import interruptible
+from ...core.progress import interruptible
 from ...core.units import parse_bytes
 from ...fitting.loop import FitResult
 from ...fitting.settings import FitSettings

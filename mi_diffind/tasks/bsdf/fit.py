@@ -9,7 +9,7 @@ from threading import Event
 import drjit as dr
 
 from ...core.errors import UsageError
-from ...core.interrupt import interruptible
+from ...core.progress import interruptible
 from ...core.units import parse_bytes
 from ...fitting.loop import FitResult
 from ...fitting.task import FitRequest, Fitted

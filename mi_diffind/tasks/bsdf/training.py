@@ -13,7 +13,7 @@ import drjit as dr
 import numpy as np
 
 from ...arrays.indirection import DifferentiableArray
-from ...core.interrupt import interruptible
+from ...core.progress import interruptible
 from ...fitting.loop import FitResult, Problem
 from ...fitting.settings import FitSettings
 from ...fitting.task import FitRequest

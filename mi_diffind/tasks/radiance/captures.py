@@ -34,11 +34,10 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from scipy.ndimage import map_coordinates
 
+from ...core.archives import Allowance, LimitError, json_bytes
 from ...core.errors import DiffindError, missing_package, reason
-from ...core.files import MOST_TEXT, OutsideError, irregular, path_by_name, shown
-from ...core.limits import Allowance, LimitError, json_bytes
+from ...core.files import MOST_TEXT, OutsideError, RecordedKeys, irregular, path_by_name, shown, unused_note
 from ...core.units import memory
-from ...core.unused_keys import RecordedKeys, unused_note
 from ...images.headers import check_picture
 from ...images.srgb import from_linear, to_linear
 

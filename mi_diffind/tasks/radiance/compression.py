@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from ...arrays.indirection import device_array, device_tensor, fold
 from ...arrays.tables import StoredArray
-from ...core.deadline import Deadline
+from ...core.progress import Deadline
 from . import grid as grids
 from .coding import LOW_BITS, NAMED, NAMED_CONTEXTS, PARTS, Pass, encode, fresh_context, naming, passes_of
 from .grid import NodeGrid

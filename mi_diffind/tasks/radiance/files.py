@@ -20,7 +20,7 @@ from ...arrays.tables import (
     load_layout,
     restored,
 )
-from ...core.limits import allowed
+from ...core.archives import allowed
 from . import COLOURS
 from .coding import MOST_STORED, TooManyNodes, decode, encode
 from .compression import INDEX_BITS, MOST_BITS, to_bytes

@@ -17,9 +17,9 @@ from ...arrays.tables import MAX_BYTES, StoredArray, Table, save_table
 from ...core import units
 from ...core.errors import UsageError
 from ...core.files import check_distinct
-from ...core.interrupt import interruptible
+from ...core.progress import interruptible
 from ...fitting.loop import FitResult, FittingError, cores
-from ...fitting.task import FitRequest, Fitted
+from ...fitting.task import FitRequest, Fitted, Stage
 from . import (
     COLOURS,
     COMPRESSION,
@@ -224,11 +224,11 @@ class FieldFit:
         ``CHECKPOINT.grid.npz``.
         """
         request, views, recipe = self.request, self.session.views, PRESETS["grid"]
-        settings, limited = request.settings, request
+        settings = request.settings
         if request.preset != "grid":
             same = {name: getattr(settings, name) for name in ("seed", "deterministic")}
             settings = recipe.scaled(dataclasses.replace(recipe.settings, **same), views)
-            limited = request.part(GRID_TIME)
+            request = request.part(GRID_TIME)
         nodes = request.options["resolution"] or grids.resolution_of(views)
         grid, finished, reached, result = self.kept_grid(nodes)
         for number, (share, part) in enumerate(STAGES[finished:], finished):
@@ -243,27 +243,25 @@ class FieldFit:
             steps = max(1, round(settings.steps * part))
             schedule, every = "cosine" if last else "constant", max(1, steps // 2)
             stage = dataclasses.replace(settings, steps=steps, schedule=schedule, measure_every=every)
-            of_stage = limited.part(part / sum(later for _, later in STAGES[number:]))
+            limited = request.part(part / sum(later for _, later in STAGES[number:]))
             if share == REFLECTING and self.colours != "directions":
                 tried = dataclasses.replace(stage, steps=min(steps, TRIAL))
-                grid, chosen = self.with_colours(grid, dataclasses.replace(of_stage, settings=tried))
+                grid, chosen = self.with_colours(grid, dataclasses.replace(limited, settings=tried))
                 if chosen is not None:
                     result = chosen
-                    over = chosen.interrupted or chosen.asked_to_stop or limited.deadline is not None
+                    over = chosen.interrupted or chosen.asked_to_stop or request.deadline is not None
                     steps = 0 if over else steps - chosen.steps
             if steps:
                 problem, grid = grids.GridProblem(grid, self.session, SIDE if last else 1), None
                 if number:
                     problem.draw_by_errors()
-                checkpoint = f"{request.checkpoint}.stage{number}" if request.checkpoint else None
-                resume = request.resume and checkpoint is not None and os.path.exists(checkpoint)
-                stage = dataclasses.replace(stage, steps=steps)
-                of_stage = dataclasses.replace(of_stage, settings=stage, checkpoint=checkpoint, resume=resume)
                 finish = functools.partial(self.finish_grid, problem) if last and request.preset == "grid" else None
-                title = f"grid, {round(nodes * reached)}³"
-                result = of_stage.train(problem, title, finish, self.times, 1 if number else FIRST_STEPS)
+                stage, title = dataclasses.replace(stage, steps=steps), f"grid, {round(nodes * reached)}³"
+                least = 1 if number else FIRST_STEPS
+                stages = [Stage(f"stage{number}", problem, 1.0, stage, title, finish, self.times, least)]
+                (result,) = limited.run(stages)
                 grid = problem.grid()
-                del problem, finish
+                del problem, finish, stages
             if result.interrupted or (result.asked_to_stop and not last):
                 return grid, dataclasses.replace(result, interrupted=True)
             if request.checkpoint is not None:
@@ -335,10 +333,8 @@ class FieldFit:
         settings = dataclasses.replace(trial.settings, measure_every=trial.settings.steps)
         trained, reached = [], []
         for number, start in enumerate((grid, grid.with_reflections())):
-            problem = grids.GridProblem(start, session, 1)
-            request = trial.part(1 / (2 - number))
-            request = dataclasses.replace(request, settings=settings, checkpoint=None, resume=False)
-            result = request.train(problem, f"trial of colours: {COLOURS[1 - number]}")
+            problem, title = grids.GridProblem(start, session, 1), f"trial of colours: {COLOURS[1 - number]}"
+            (result,) = trial.run([Stage("", problem, 1 / (2 - number), settings, title, resumable=False)])
             trained.append((problem.grid(), result))
             reached.append(session.held_out_images.evaluate(trained[-1][0].field())["psnr_foreground_db"])
             if result.interrupted:
@@ -393,8 +389,8 @@ class FieldFit:
             # The interrupted part may have been the grid
             before = [f"{request.checkpoint}.{name}" for name in ("stage0", "grid.npz")]
             request = dataclasses.replace(request, resume=not any(map(os.path.exists, before)))
-        result = request.train(problem, "through the images", measured, self.times)
-        return table(), result
+        stage = Stage("", problem, title="through the images", finish=measured, times=self.times)
+        return table(), *request.run([stage])
 
     def sparse(self, grid: NodeGrid, stopped: bool) -> tuple[Table, FitResult]:
         """Compress a grid to density levels and a palette, in the bytes that the options ask for."""
@@ -466,8 +462,7 @@ class FieldFit:
             values = paper.ValuesProblem(net, paper.PairsField(grid.nodes, density, colour, low, high), grid)
             settings = {"steps": steps, "batch": VALUE_BATCH, "lr": VALUE_RATE, "measure_every": steps}
             settings = dataclasses.replace(request.settings, **settings)
-            limited = dataclasses.replace(request.part(VALUE_TIME), settings=settings, checkpoint=None, resume=False)
-            limited.train(values, "the numbers of the grid")
+            request.run([Stage("", values, VALUE_TIME, settings, "the numbers of the grid", resumable=False)])
         return paper.PairsProblem(net, grid.nodes, low, high, self.session)
 
 

@@ -23,8 +23,8 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
-from ...arrays.bits import as_words, pack_bits
 from ...arrays.indirection import device_array, device_tensor
+from ...arrays.lookup import as_words, pack_bits
 from ...arrays.tables import StoredArray
 from .nodes import Nodes
 

@@ -31,7 +31,7 @@ from half_vectors import HalfVectorSampling
 from spheres import key_of, sphere_scene
 
 from mi_diffind import StoredArray
-from mi_diffind.arrays.bounds import ValueBounds
+from mi_diffind.arrays.boxes import ValueBounds
 from mi_diffind.arrays.tables import save_table
 from mi_diffind.tasks.disney import TASK
 from mi_diffind.tasks.disney.effects import find_effects
