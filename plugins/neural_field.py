@@ -10,7 +10,6 @@ import mitsuba as mi
 
 from mi_diffind.arrays.tables import TableError
 from mi_diffind.core import compat
-from mi_diffind.tasks.radiance.march import OPAQUE
 
 from . import Counterpart, Plugin, warn
 from .path_footprint import integrator as path_footprint
@@ -333,7 +332,7 @@ def integrator() -> type:
             for name, values in self.placed.exposed.items():
                 cb.put(f"tables.{name}", values, mi.ParamFlags.Differentiable)
             flags = mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous
-            cb.put("to_world", self.placed.position.transform, flags)
+            cb.put("to_world", self.placed.transform, flags)
             cb.put("surfaces", self.nested, mi.ParamFlags.Differentiable)
 
         def trained(self) -> tuple:
@@ -483,9 +482,9 @@ def integrator() -> type:
             return any(compat.identity(v) not in field_arrays for v in attached)
 
         def _check_moving(self) -> None:
-            if any(placed.position.moving() and placed not in self.groups for placed in self.fields):
+            if any(placed.moving() and placed not in self.groups for placed in self.fields):
                 raise RuntimeError('parameter "to_world": has no derivatives for a field that overlaps another one')
-            if any(placed.position.moving() and placed.field.unbounded for placed in self.fields):
+            if any(placed.moving() and placed.field.unbounded for placed in self.fields):
                 raise RuntimeError('parameter "to_world": has no derivatives for a field with surroundings')
 
         def sample(self, mode, scene, sampler, ray, δL=None, δaovs=None, state_in=None, active=True, **kwargs):
@@ -676,8 +675,7 @@ def integrator() -> type:
 
         def _see(self, mode, path, placed, ray, far, crossed, first, before):
             """Add the light of a field behind a transmittance ``before``; return the transmittance behind the field."""
-            marched = placed.march(ray, far, crossed)
-            through = dr.select(marched.transmittance > OPAQUE, marched.transmittance, 0)
+            marched, through = placed.march(ray, far, crossed)
             light = dr.select(crossed, path.throughput * self.light.of(marched.colour, ray.wavelengths, crossed), 0)
             depth = dr.select(first, before * marched.depth * placed.size, 0)
             if mode is None:

@@ -24,7 +24,7 @@ from .tables import arrays_of
 LUMINANCE = (0.212671, 0.715160, 0.072169)
 
 
-class PlacedField:
+class PlacedField(PlacementParameter):
     """Radiance field (:class:`mi_diffind.tasks.radiance.volume_field.VolumeField`) in a scene, placed by ``to_world``.
 
     The transform is a similarity. Densities are per unit of length in the field's frame, so that a scaled field keeps
@@ -32,22 +32,8 @@ class PlacedField:
     """
 
     def __init__(self, field, to_world):
-        self.field, self.position = field, PlacementParameter(Placement.of(to_world, 1.0, (0, 0, 0)))
-        self._turn = None
-        self._place()
-
-    def _place(self) -> None:
-        self.axes, self.origin, self.size = self.position.axes, self.position.origin, self.position.size
-
-    def update(self) -> None:
-        """Follow a change of the parameter ``to_world``. Raises ``RuntimeError`` unless it is a similarity."""
-        self.position.update()
-        self._place()
-
-    @property
-    def placement(self) -> Placement:
-        """Placement of the field's frame in the world."""
-        return self.position.placement
+        super().__init__(Placement.of(to_world, 1.0, (0, 0, 0)))
+        self.field, self._turn = field, None
 
     def held(self) -> list:
         """Return all arrays that rays read.
@@ -64,7 +50,7 @@ class PlacedField:
 
     def optimised(self) -> bool:
         """Return whether a derivative with respect to the field's arrays or its place is requested."""
-        return self.position.moving() or any(compat.has_gradient(values) for values in self.exposed.values())
+        return self.moving() or any(compat.has_gradient(values) for values in self.exposed.values())
 
     def _local(self, ray, far, active) -> tuple:
         """Return the arguments of the functions of :mod:`.march` after the field."""
@@ -97,9 +83,13 @@ class PlacedField:
                 return False
         return True
 
-    def march(self, ray, far, active=True) -> marching.Marched:
-        """March rays up to the distance ``far``; the resulting ``depth`` is in units of the field's frame."""
-        return marching.march(self.field, *self._local(ray, far, active))
+    def march(self, ray, far, active=True) -> tuple:
+        """March rays up to the distance ``far``; return the result and the transmittance, 0 where a ray is opaque.
+
+        The ``depth`` of the result is in units of the field's frame.
+        """
+        marched = marching.march(self.field, *self._local(ray, far, active))
+        return marched, dr.select(marched.transmittance > marching.OPAQUE, marched.transmittance, 0)
 
     def count(self, ray, far, active=True) -> marching.RayCounts:
         """Return the counts of the reads of :meth:`march`."""
@@ -107,7 +97,7 @@ class PlacedField:
 
     def replay(self, ray, far, active, marched, d_colour, d_transmittance, d_depth) -> None:
         """Call :func:`.march.replay`; ``depth`` is in units of the world."""
-        moving = self.position.moving()
+        moving = self.moving()
         with dr.resume_grad(when=moving):
             if moving:
                 # Gathered, so that the kernel of the rays sums the gradients: sums of a width of 1 are kernels each
@@ -126,7 +116,7 @@ class PlacedField:
     def start_forward(self) -> None:
         """Determine the tangents of the placement, once before :meth:`tangent`."""
         self._turn = None
-        if self.position.moving():
+        if self.moving():
             with dr.resume_grad():
                 self._turn = dr.forward_to(*self._numbers(), flags=marching.ANY)
 
@@ -353,10 +343,10 @@ class FieldLight:
         """Return the light of the fields on rays up to the distance ``far``, and the transmittance of the fields."""
         light, through = mi.Spectrum(0), mi.Float(1)
         for placed, crossed in in_order(self.fields, [f.enters(ray, far, active) for f in self.fields]):
-            marched = placed.march(ray, far, crossed)
+            marched, passed = placed.march(ray, far, crossed)
             seen = self.light.of(marched.colour, ray.wavelengths, crossed)
             light += dr.select(crossed, through * seen, 0)
-            through *= dr.select(marched.transmittance > marching.OPAQUE, marched.transmittance, 0)
+            through *= passed
         return light, through
 
     def optimised(self) -> bool:
@@ -371,8 +361,7 @@ class FieldLight:
         """
         change, before, beyond = mi.Spectrum(0), mi.Float(1), mi.Spectrum(total)
         for placed, crossed in in_order(self.fields, [f.enters(ray, far, active) for f in self.fields]):
-            marched = placed.march(ray, far, crossed)
-            through = dr.select(marched.transmittance > marching.OPAQUE, marched.transmittance, 0)
+            marched, through = placed.march(ray, far, crossed)
             share = mi.Spectrum(factor) * before
             beyond -= dr.select(crossed, share * self.light.of(marched.colour, ray.wavelengths, crossed), 0)
             if placed.optimised():
@@ -392,8 +381,7 @@ class FieldLight:
         """Return the transmittance of the fields on rays up to the distance ``far``."""
         through = mi.Float(1)
         for placed in self.fields:
-            one = placed.march(ray, far, active).transmittance
-            through *= dr.select(one > marching.OPAQUE, one, 0)
+            through *= placed.march(ray, far, active)[1]
         return through
 
     def _sphere(self, i, p, active) -> tuple:
@@ -455,17 +443,16 @@ def in_order(fields: list, entered: list) -> list:
     """
     if len(fields) == 1:
         return [(fields[0], entered[0][1])]
-    ranks = []
+    ranks = [mi.UInt32(0) for _ in fields]
     for i, (near, _) in enumerate(entered):
-        rank = mi.UInt32(0)
         for j, (other, crossed) in enumerate(entered):
             if j != i:
-                rank += dr.select(crossed & ((other < near) | ((other == near) & (j < i))), mi.UInt32(1), 0)
-        ranks.append(rank)
-    pairs = []
-    for place in range(len(fields)):
-        pairs += [(field, entered[i][1] & (ranks[i] == place)) for i, field in enumerate(fields)]
-    return pairs
+                ranks[i] += dr.select(crossed & ((other < near) | ((other == near) & (j < i))), mi.UInt32(1), 0)
+    return [
+        (field, crossed & (rank == place))
+        for place in range(len(fields))
+        for field, (_, crossed), rank in zip(fields, entered, ranks, strict=True)
+    ]
 
 
 def bright_spheres(field, count: int) -> np.ndarray:

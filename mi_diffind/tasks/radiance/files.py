@@ -264,12 +264,12 @@ def _check_colours(table: Table) -> None:
     if colours not in allowed:
         raise _damaged(table, f"found the colours {colours!r}, allowed are {', '.join(allowed)}")
     numbers = table.arrays.get("colour", table.arrays.get("palette"))
-    found = environment and environment.shape, numbers and numbers.shape[-1]
+    present = environment and environment.shape, numbers and numbers.shape[-1]
     expected = ((ENTRIES, 3), COLUMNS) if colours == "reflections" else (None, DIRECTIONS)
-    if not pairs and found != expected:
+    if not pairs and present != expected:
         raise _damaged(
             table,
-            f"found an environment of the shape {found[0]} and {found[1]} numbers of a colour, the colours "
+            f"found an environment of the shape {present[0]} and {present[1]} numbers of a colour, the colours "
             f'"{colours}" have {expected[0]} and {expected[1]}',
         )
 
