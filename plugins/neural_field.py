@@ -383,7 +383,7 @@ def integrator() -> type:
             with dr.suspend_grad():
                 _, _, _, ray, _, _ = self._begin(scene, sensor, 0, 1)
                 pi = scene.ray_intersect_preliminary(ray, coherent=True, active=True)
-                return self.placed.count(ray, dr.minimum(pi.t, ray.maxt)).asdict()
+                return vars(self.placed.count(ray, dr.minimum(pi.t, ray.maxt)))
 
         def sample_rays(self, scene, sensor, sampler):
             """Sample camera rays as the inner integrator does."""

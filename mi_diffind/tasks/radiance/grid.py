@@ -15,7 +15,7 @@ from scipy.ndimage import binary_dilation, gaussian_filter, map_coordinates
 
 from ...arrays.indirection import device_array, device_tensor
 from . import RESOLUTIONS, VOXELS_PER_PIXEL, surroundings
-from .march import visibility
+from .march import march
 from .nodes import Nodes, cells_of, corners_of
 from .session import SIDE, FieldSession, ImagesProblem, ViewImages
 from .views import CapturedViews, box_of, hull, pixel_width
@@ -197,7 +197,7 @@ def weights(field: NodeVolume, images: ViewImages) -> np.ndarray:
         lane, width = dr.arange(types.UInt32, height * width), dr.opaque(types.UInt32, width)
         column, row = (n * dr.opaque(types.UInt32, every) for n in (lane % width, lane // width))
         place = dr.opaque(types.UInt32, view), column, row
-        visibility(field, *images.rays(*place), images.near, dr.inf, images.counted(*place), largest)
+        march(field, *images.rays(*place), images.near, dr.inf, images.counted(*place), visibility=largest)
         dr.eval(largest)
     return largest.numpy()
 

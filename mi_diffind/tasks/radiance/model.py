@@ -96,7 +96,7 @@ class RadianceFieldModel(Model):
             self.types.Array3f(*(device_array(self.types.Float, x) for x in np.concatenate(v).T))
             for v in (origins, directions)
         )
-        return count(self.field, o, d, 0, np.inf).asdict()
+        return vars(count(self.field, o, d, 0, np.inf))
 
     def measure(self, capture=None):
         """Return PSNR and SSIM of the test views of a capture.
