@@ -145,7 +145,7 @@ def coded_table(path, shape, claimed) -> Path:
     count = int(np.prod(shape))
     palette = table.arrays["palette"]
     numbers = np.zeros(count, int), np.zeros(count, int)
-    coded = coding.encoded(np.ones(shape, bool), *numbers, 64, len(palette.entries))
+    coded = coding.encode(np.ones(shape, bool), *numbers, 64, len(palette.entries))
     arrays = dict(zip(("probabilities", "nodes"), (byte_array(c[:, None]) for c in coded), strict=True))
     settings = {**table.settings, "layout": "coded", "shape": list(claimed), "density_bits": 6, "density_scale": 1.0}
     others = {n: a for n, a in table.arrays.items() if n in ("palette", "environment")}
@@ -285,11 +285,11 @@ def test_coded_nodes_are_those_of_a_dense_grid(tmp_path, rng):
     stored = corners_of(rng.random(tuple(n - 1 for n in shape)) < 0.02)
     count = int(stored.sum())
     numbers = rng.integers(0, 16, count), rng.integers(0, 300, count)
-    places, *again = coding.decoded_places(*coding.encoded(stored, *numbers, 16, 300), shape, 16, 300)
+    places, *again = coding.decode(*coding.encode(stored, *numbers, 16, 300), shape, 16, 300)
     np.testing.assert_array_equal(places, np.flatnonzero(stored))
     assert all(np.array_equal(a, b) for a, b in zip(again, numbers, strict=True))
     with pytest.raises(coding.TooManyNodes, match="at most 100 are accepted"):
-        coding.decoded(*coding.encoded(stored, *numbers, 16, 300), shape, 16, 300, 100)
+        coding.decode(*coding.encode(stored, *numbers, 16, 300), shape, 16, 300, 100)
     assert np.array_equal(files._packed(places, stored.size), np.packbits(stored.reshape(-1)))
     for mask in (stored, np.packbits(stored.reshape(-1))):
         np.testing.assert_array_equal(np.concatenate([*layers(mask, shape)]), stored)

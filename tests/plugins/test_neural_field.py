@@ -760,7 +760,7 @@ def test_reflections_of_a_file(mi_rgb, fields, file, tmp_path):
 
     mi = mi_rgb
     rng = np.random.default_rng(8)
-    grid = files.grid_of(files.load(file), compat.module_of(mi.Float)).reflecting()
+    grid = files.grid_of(files.load(file), compat.module_of(mi.Float)).with_reflections()
     place = grid.nodes.positions() - (np.array(grid.nodes.shape) - 1) / 2
     grid.colour[1:, volume_field.NORMAL] = place / np.maximum(np.linalg.norm(place, axis=1, keepdims=True), 1)
     grid.colour[:, volume_field.TINT] = -0.5

@@ -46,9 +46,9 @@ def test_nodes_come_back(shell, rng):
     for mask, colours in ((stored, 300), (corners_of(rng.random((9, 7, 32)) < 0.2), 70)):
         count = mask.sum()
         numbers = (levels, index) if mask is stored else (rng.integers(0, 16, count), rng.integers(0, colours, count))
-        coded = coding.encoded(mask, *numbers, 16, colours)
-        again = coding.decoded(*coded, mask.shape, 16, colours)
-        for a, b in zip(again, (mask, *numbers), strict=True):
+        coded = coding.encode(mask, *numbers, 16, colours)
+        again = coding.decode(*coded, mask.shape, 16, colours)
+        for a, b in zip(again, (np.flatnonzero(mask), *numbers), strict=True):
             np.testing.assert_array_equal(a, b)
     # Each node is in one pass, and its context has been coded before
     passes = coding.passes_of(stored)
@@ -63,7 +63,7 @@ def test_nodes_come_back(shell, rng):
 def test_smooth_nodes_take_few_bytes(shell):
     stored, levels, index = shell
     plain = (entropy(levels, 0 * levels) + entropy(index, 0 * index)) / 8
-    assert len(coding.encoded(stored, levels, index, 16, 300)[1]) < 0.4 * plain
+    assert len(coding.encode(stored, levels, index, 16, 300)[1]) < 0.4 * plain
     mask = coding.SymbolEncoder()
     coding._cells(mask, tuple(n - 1 for n in stored.shape), cells_of(stored))
     assert len(mask.finish()[1]) < 0.2 * stored.size / 8
@@ -71,14 +71,14 @@ def test_smooth_nodes_take_few_bytes(shell):
 
 def test_damaged_nodes_are_refused(shell):
     stored, levels, index = shell
-    probabilities, data = coding.encoded(stored, levels, index, 16, 300)
+    probabilities, data = coding.encode(stored, levels, index, 16, 300)
     cases = (
         (probabilities, data[:-100]), (probabilities, data[:3]), (probabilities[:40], data),
         (np.full_like(probabilities, 255), data), (probabilities, np.full_like(data, 255)),
     )  # fmt: skip
     for case in cases:
         with pytest.raises(ValueError, match="found"):
-            coding.decoded(*case, stored.shape, 16, 300)
+            coding.decode(*case, stored.shape, 16, 300)
 
 
 def test_rate_and_distortion(shell, rng):
@@ -91,9 +91,9 @@ def test_rate_and_distortion(shell, rng):
     points = colours[index] + rng.normal(0, 0.3, (len(index), 3))
     sizes, errors = [], []
     for rate in (1e-5, 0.02):
-        chosen = compression.chosen_levels(passes, exact, weight, rate, 16)
-        centres, named = compression.chosen_index(passes, points, weight, colours, rate)
-        sizes.append([len(coding.encoded(stored, *pair, 16, 300)[1]) for pair in ((chosen, index), (levels, named))])
+        chosen = compression.choose_levels(passes, exact, weight, rate, 16)
+        centres, named = compression.choose_index(passes, points, weight, colours, rate)
+        sizes.append([len(coding.encode(stored, *pair, 16, 300)[1]) for pair in ((chosen, index), (levels, named))])
         errors.append([np.square(chosen - exact), np.square(points - centres[named]).sum(axis=1)])
     sizes = np.array(sizes)
     assert (sizes[1] < 0.85 * sizes[0]).all()

@@ -132,15 +132,11 @@ def test_files_keep_reflections(ad, rng, environment, tmp_path):
     table = files.load(tmp_path / "grid.npz")
     assert np.abs(pictures(files.field_of(table, ad), ad, rng) / expected - 1).max() < 0.01
 
-    palette, scale, offset = compression.as_bytes(grid.colour[1:])
-    environment_bytes, *ranges = compression.as_bytes(environment[:, :3])
     levels = np.clip(np.rint((grid.density - compression.EMPTIEST) / compression.LEVEL_STEP), 0, 15).astype(np.uint8)
-    stored = {
-        "levels": levels, "density_range": (compression.EMPTIEST, compression.LEVEL_STEP), "density_bits": 4,
-        "index": np.append(0, np.arange(125)).astype(np.uint32), "palette": palette, "scale": scale, "offset": offset,
-        "environment": environment_bytes, "environment_range": ranges,
-    }  # fmt: skip
-    save_table(tmp_path / "palette.npz", files.palette_table(nodes, stored))
+    shared = [compression.to_bytes(values) for values in (grid.colour[1:], environment[:, :3])]
+    index, range_ = np.append(0, np.arange(125)).astype(np.uint32), (compression.EMPTIEST, compression.LEVEL_STEP)
+    numbers = volume_field.PaletteArrays(levels, 4, range_, index, *shared)
+    save_table(tmp_path / "palette.npz", files.palette_table(nodes, numbers))
     table = files.load(tmp_path / "palette.npz")
     assert table.settings["layout"] == "coded" and table.settings["colours"] == "reflections"
     packed, floats = (pictures(files.field_of(table, ad, storage), ad, rng) for storage in ("", "float32"))
