@@ -498,7 +498,8 @@ def test_views_without_alpha(tmp_path, capsys):
     assert "no alpha" in capsys.readouterr().err
 
 
-def test_sizes(folder, ad):
+def test_sizes(folder, ad, monkeypatch):
+    monkeypatch.setattr(compression, "SLOPE", 0.0)  # so that all colours are used
     grid = files.grid_of(files.load(folder / "grid.npz"), ad)
     session = FieldSession.load(ad, folder)
     weights = compression.importance(grid, session, 0)
