@@ -13,7 +13,6 @@ from mi_diffind.core import compat
 
 from . import Counterpart, Plugin, warn
 from .path_footprint import integrator as path_footprint
-from .path_footprint import relative
 from .support import distance_shapes as sdf
 from .support import omissions, properties, tables
 from .support.differentials import Differentials
@@ -555,7 +554,7 @@ def integrator() -> type:
 
             A ``mode`` of ``None`` is the primal phase. Without smooth surfaces, a single piece is enough.
             """
-            solids = sdf.distance_shapes_in(scene) if hasattr(self.surfaces, "sample_shapes") else ()
+            solids = sdf.distance_shapes_in(scene) if getattr(self.surfaces, "traces_solids", False) else ()
             if self.smooth_depth == 0 or not has_smooth(scene):
                 return sampler, self._piece(mode, scene, sampler, path, solids, surfaces, False, False)
 
@@ -617,7 +616,7 @@ def integrator() -> type:
             path.light = light + emitted_now if mode is None else light - emitted_now
             if mode is not None and surfaces:
                 with dr.resume_grad():
-                    both = dr.select(shining, emitted, 0) + dr.select(going, path.light * relative(weight), 0)
+                    both = dr.select(shining, emitted, 0) + dr.select(going, path.light * dr.relative_grad(weight), 0)
                     if mode == dr.ADMode.Backward:
                         dr.backward_from(path.change * both, dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
                     else:

@@ -109,7 +109,7 @@ def distance_shape(mesh: type) -> type:
         def omitted(self, integrators: list, sensor) -> str:
             """Return a sentence if these integrators do not trace the shape; see :mod:`.omissions`."""
             names = [compat.integrator_name(integrator) for integrator in integrators]
-            if any(hasattr(i, "sample_shapes") for i in integrators) and compat.INTERSECTING not in names:
+            if any(getattr(i, "traces_solids", False) for i in integrators) and compat.INTERSECTING not in names:
                 return ""
             name = compat.INTERSECTING if compat.INTERSECTING in names else names[-1]
             decoded = (

@@ -8,9 +8,9 @@ from __future__ import annotations
 import drjit as dr
 import numpy as np
 
+from ...arrays.sparse_grid import SparseGrid
 from ...tasks.sdf import codes, encoding
 from ...tasks.sdf.nodes import SparseNodes, slope_bound
-from ...tasks.sdf.structure import Structure
 from .byte_grids import NEAREST
 from .volumes import structure_arrays
 
@@ -52,7 +52,7 @@ def _normals(numbers: np.ndarray) -> np.ndarray:
 class DirectNodes(SparseNodes):
     """Field of a sparse ``structure`` whose nodes are ``numbers`` (n,), uint16, in its order."""
 
-    def __init__(self, types, structure: Structure, numbers: np.ndarray, slope: float):
+    def __init__(self, types, structure: SparseGrid, numbers: np.ndarray, slope: float):
         words = codes.pointer_words(numbers, 16)
         super().__init__(types, structure, slope, pointers=words, bits=16)
         self.state = {"numbers": numbers, "slope": slope, **structure_arrays(structure)}

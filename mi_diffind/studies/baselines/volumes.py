@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
+from ...arrays.sparse_grid import SparseGrid
 from ...core.files import replacing
 from ...tasks.sdf import codes
 from ...tasks.sdf.distances import Distances
 from ...tasks.sdf.encoding import sample
 from ...tasks.sdf.field import DistanceField
 from ...tasks.sdf.nodes import SparseNodes, middles
-from ...tasks.sdf.structure import Structure
 from .bricks import Bricks
 from .byte_grids import NEAREST, ByteGrid, dequantised, least_squares, quantised, slope_bound
 
@@ -27,7 +27,7 @@ FIRST, FINEST, COARSEST = 1 / 64, 1 / 2048, 1 / 12
 class DistanceNodes(SparseNodes):
     """Distances of ``bits`` each at the nodes of a sparse ``structure``: our layout without normals and indirection."""
 
-    def __init__(self, types, structure: Structure, numbers: np.ndarray, band: float, bits: int, slope: float):
+    def __init__(self, types, structure: SparseGrid, numbers: np.ndarray, band: float, bits: int, slope: float):
         words = codes.pointer_words(numbers, bits)
         super().__init__(types, structure, slope, pointers=words, bits=bits)
         self.state = {"numbers": numbers, "band": band, "bits": bits, "slope": slope, **structure_arrays(structure)}
@@ -82,7 +82,7 @@ def distance_nodes(types, distances: Distances, spacing: float, train: bool = Fa
     return DistanceNodes(types, structure, numbers, band, bits, slope)
 
 
-def structure_arrays(structure: Structure) -> dict:
+def structure_arrays(structure: SparseGrid) -> dict:
     """Return the fields of a structure for the ``state`` of a field, each name with ``structure_`` before it."""
     return {f"structure_{f.name}": getattr(structure, f.name) for f in dataclasses.fields(structure)}
 
@@ -108,7 +108,7 @@ def load(path: Path | str, types, *more: type[DistanceField]) -> DistanceField:
     parts = {name: state.pop(name) for name in list(state) if name.startswith("structure_")}
     if parts:
         parts = {name.removeprefix("structure_"): v for name, v in parts.items()}
-        state["structure"] = Structure(**{**parts, "lower": tuple(parts["lower"].tolist())})
+        state["structure"] = SparseGrid(**{**parts, "lower": tuple(parts["lower"].tolist())})
     return field_class(types, **state)
 
 

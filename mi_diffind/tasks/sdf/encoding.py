@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ...arrays.sparse_grid import SparseGrid
 from . import codes
 from .distances import Distances
 from .nodes import decoded_nodes, middles
 from .sampling import near_nodes, surface_cells
-from .structure import Structure, build
 
 #: Weights of an entry's coordinates when entries are chosen: a distance (in spacings) counts 5 times a normal.
 WEIGHTS = np.array([5.0, 1, 1])
@@ -32,7 +32,7 @@ class SampledNodes:
     the ``corners`` of the grid's cells (K, 8), z fastest.
     """
 
-    structure: Structure
+    structure: SparseGrid
     positions: np.ndarray
     block: np.ndarray
     distances: np.ndarray
@@ -53,27 +53,28 @@ def sample(distances: Distances, spacing: float) -> SampledNodes:
     d, normals = distances.signed_normals(lower + spacing * nodes)
     crossed = (d < 0)[corners]
     keep = crossed.any(axis=1) & ~crossed.all(axis=1)
-    used, corners = np.unique(corners[keep], return_inverse=True)
-    corners = corners.reshape(-1, 8)
+    used = np.unique(corners[keep])
     nodes, d, normals = nodes[used], d[used], normals[used]
-    structure = build(nodes, d < 0, shape + 1, lower, spacing, distances.inside)
-    # In the order of the structure
+    structure = SparseGrid.from_nodes(nodes, d < 0, shape + 1, lower, spacing, distances.inside)
+    # In the order of the grid
     positions, block = structure.node_positions()
-
-    def key(p):
-        return np.ravel_multi_index(np.asarray(p, np.int64).T, structure.shape)
-
-    order = np.argsort(key(nodes))
-    place = order[np.searchsorted(key(nodes), key(positions), sorter=order)]
-    back = np.empty_like(place)
-    back[place] = np.arange(len(place))
+    order = np.ravel_multi_index(nodes.T, structure.shape)  # ascending
+    place = np.searchsorted(order, np.ravel_multi_index(positions.T, structure.shape))
+    missed = 1 - np.count_nonzero(keep) / max(1, len(cells))
     return SampledNodes(
         structure, positions, block, d[place].astype(np.float64) / spacing, normals[place].astype(np.float64),
-        back[corners], len(cells), 1 - len(corners) / max(1, len(cells)),
+        crossed_cells(structure, d[place] < 0), len(cells), missed,
     )  # fmt: skip
 
 
-def encoded(structure: Structure, before: np.ndarray, values: np.ndarray, bits: int, seed: int = 0):
+def crossed_cells(structure: SparseGrid, inside: np.ndarray) -> np.ndarray:
+    """Return the corners ``(K, 8)`` of the cells in which the signs of stored nodes differ, given ``inside`` (n,)."""
+    corners = structure.cells()
+    crossed = inside[corners]
+    return corners[crossed.any(axis=1) & ~crossed.all(axis=1)]
+
+
+def encoded(structure: SparseGrid, before: np.ndarray, values: np.ndarray, bits: int, seed: int = 0):
     """Encode the nodes of a field again, with new ``values`` (n, 4): distances in spacings and unit normals.
 
     ``before`` are the decoded nodes of the file (n, 4), whose signs state the side of each node. Returns the
@@ -81,15 +82,7 @@ def encoded(structure: Structure, before: np.ndarray, values: np.ndarray, bits: 
     """
     positions, block = structure.node_positions()
     side = np.where(before[:, 0] < 0, -1.0, 1.0)
-    shape = np.array(structure.shape) + 1
-    keys = np.ravel_multi_index(np.asarray(positions, np.int64).T, shape)
-    order = np.argsort(keys)
-    steps = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(-1, 3)
-    wanted = keys[:, None] + steps @ np.array([shape[1] * shape[2], shape[2], 1])
-    place = order[np.minimum(np.searchsorted(keys, wanted, sorter=order), len(order) - 1)]
-    inside = side[place] < 0
-    cells = (keys[place] == wanted).all(axis=1) & inside.any(axis=1) & ~inside.all(axis=1)
-    corners = place[cells]
+    corners = crossed_cells(structure, side < 0)
     distances = side * np.maximum(np.abs(before[:, 0]), LEAST)
     nodes = SampledNodes(structure, positions, block, distances, before[:, 1:], corners, len(corners), 0.0)
     coding = NodeCoding(nodes, bits, seed)

@@ -11,10 +11,10 @@ import drjit as dr
 import numpy as np
 
 from ...arrays.indirection import device_array
+from ...arrays.sparse_grid import BLOCK as NODES
+from ...arrays.sparse_grid import CORNERS
 from ...core.errors import UsageError
 from .field import DistanceField
-from .sampling import CORNERS
-from .structure import BLOCK as NODES
 
 #: Cells along each side of the blocks in which grids are computed if the surface passes through them.
 BLOCK = 32

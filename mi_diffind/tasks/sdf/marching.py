@@ -17,14 +17,13 @@ import threading
 
 import drjit as dr
 import numpy as np
-from scipy.ndimage import distance_transform_cdt
 
 from ...arrays.indirection import device_array
 from ...arrays.lookup import mask_flags, mask_words
+from ...arrays.sparse_grid import ACTIVE, BLOCK, CORNERS, empty_distances, mask_ranks, place_of_bit
 from ...core import compat
 from . import codes
-from .nodes import CORNERS, MIDDLE, bernstein
-from .structure import ACTIVE, BLOCK, first_ranks, place_of
+from .nodes import MIDDLE, bernstein
 
 #: Places along the ray at which the field is evaluated in a cell, and steps by false position from there.
 SAMPLES, ROOTS = 3, 3
@@ -62,7 +61,7 @@ class GridCells:
     """
 
     def __init__(self, structure):
-        self._structure, self._first = structure, first_ranks(structure.block_masks).astype(np.int32)
+        self._structure, self._first = structure, mask_ranks(structure.block_masks).astype(np.int32)
         place = structure.block_positions() // BLOCK
         self._neighbours = _neighbours(place, [n // BLOCK + 1 for n in structure.shape])
         # Signs of blocks without nodes; beyond the grid outside
@@ -136,12 +135,11 @@ def slab_words(cells: GridCells, nodes, frames) -> np.ndarray:
     normals = np.stack([nx, ny, nz], axis=1)
     lower, upper = np.full((2, len(frames)), np.inf)
     upper *= -1
-    corners = np.array(CORNERS)
     half = np.abs(normals).sum(axis=1) / 2
     for part in cells.parts():
         node, distance, normal = cells.nodes(part), distances[part], normals[part]
         block, bit = np.nonzero(cells.crossed[part])
-        at = place_of(bit)[:, None] + corners
+        at = place_of_bit(bit)[:, None] + CORNERS
         residual = nodes[node[block[:, None], at[..., 0], at[..., 1], at[..., 2]]].astype(np.float64)
         residual[..., 0] -= distance[block, None] + np.einsum("mki,mi->mk", at - MIDDLE, normal[block])
         residual[..., 1:] -= normal[block, None]
@@ -150,7 +148,7 @@ def slab_words(cells: GridCells, nodes, frames) -> np.ndarray:
         np.maximum.at(upper[part], block, -coefficients.min(axis=1))
         block, bit = np.nonzero(~cells.crossed[part])
         within = cells.inside[part][block, bit]
-        planes = distance[block] + np.einsum("mi,mi->m", place_of(bit) - MIDDLE + 0.5, normal[block])
+        planes = distance[block] + np.einsum("mi,mi->m", place_of_bit(bit) - MIDDLE + 0.5, normal[block])
         np.maximum.at(upper[part], block[within], (planes + half[part][block])[within])
         np.minimum.at(lower[part], block[~within], (planes - half[part][block])[~within])
     scale = STEPS / (2 * SLAB)
@@ -197,8 +195,8 @@ def _by_region(values: np.ndarray) -> np.ndarray:
 
 def _empty_words(full: np.ndarray, sign: np.ndarray) -> np.ndarray:
     """Return the flags of the elements of a grid and their distances to the nearest one that is ``full``, uint32."""
-    far = distance_transform_cdt(~full, "chessboard") if full.any() else np.full(full.shape, max(full.shape), np.int32)
-    return np.uint32(EMPTY) | np.where(sign, np.uint32(INSIDE), np.uint32(0)) | far.astype(np.uint32)
+    signs = np.where(sign, np.uint32(INSIDE), np.uint32(0))
+    return np.uint32(EMPTY) | signs | empty_distances(full).astype(np.uint32)
 
 
 class Marcher:
@@ -238,9 +236,7 @@ class Marcher:
         i, j, k = cell = ray.cell(t)
         types = self.field.types
         UInt32, Int32 = types.UInt32, types.Int32
-        _, ny, nz = self.field.region_sides
-        number = (UInt32(i >> 4) * ny + UInt32(j >> 4)) * nz + UInt32(k >> 4)
-        region = dr.gather(UInt32, self.regions, number, active)
+        region = dr.gather(UInt32, self.regions, self.field.index.region(i, j, k), active)
         wide = region >= EMPTY
         place = UInt32((i >> 2 & 3) * 16 + (j >> 2 & 3) * 4 + (k >> 2 & 3))
         word = dr.gather(UInt32, self.words, region * 64 + place, active & ~wide)
@@ -309,10 +305,10 @@ class Marcher:
             last = (v & 3) == 3
             owners = [dr.select(last, w, owners[n - m]) if n & m else w for n, w in enumerate(owners)]
         corners = []
-        for owner, corner in zip(owners, CORNERS, strict=True):
+        for owner, corner in zip(owners, CORNERS.tolist(), strict=True):
             at = [v + e for v, e in zip(cell, corner, strict=True)]
-            record = field._record(owner, active)
-            _, node, _ = field._in_block(record, *at)
+            record = field.index.record(owner, active)
+            _, node, _ = field.index.node(record, *at)
             corners.append(field._node(node, record, *at, active))
         return corners
 
@@ -332,7 +328,7 @@ def along(corners, start, d):
     y and x.
     """
     lines = []
-    for corner, (distance, g) in zip(CORNERS, corners, strict=True):
+    for corner, (distance, g) in zip(CORNERS.tolist(), corners, strict=True):
         offset = [x - e for x, e in zip(start, corner, strict=True)]
         there = dr.fma(g[0], offset[0], dr.fma(g[1], offset[1], g[2] * offset[2]))
         change = dr.fma(g[0], d[0], dr.fma(g[1], d[1], g[2] * d[2]))
@@ -387,7 +383,7 @@ class GridRay:
     """Ray ``o + t·d`` in a grid, with the reciprocals of its direction."""
 
     def __init__(self, field, o, d):
-        self.types, self.last = field.types, field.last_cell
+        self.types, self.last = field.types, field.index.last_cell
         self.o, self.d = list(o), list(d)
         still = [dr.abs(v) < TINY for v in d]
         self.inverse = [dr.rcp(dr.select(s, TINY, v)) for s, v in zip(still, d, strict=True)]

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ...arrays.indirection import Indirection, device_tensor
+from ...arrays.sparse_grid import ACTIVE, SparseGrid, SparseGridError
 from ...arrays.tables import (  # fmt: skip
     StoredArray,
     Table,
@@ -29,7 +30,6 @@ from . import codes
 from .field import DistanceField
 from .nodes import SparseNodes, coded_field, decoded_nodes, slope_bound
 from .paper import PairField
-from .structure import ACTIVE, Structure, StructureError
 
 #: Arrays of each layout: name → number of dimensions, and channels (bytes in the sparse layout, except for entries).
 LAYOUTS = {
@@ -55,7 +55,7 @@ def _word_bytes(words: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(words, "<u4").view(np.uint8).reshape(len(words), -1)
 
 
-def sparse_arrays(structure: Structure, frames, pointers, entries) -> dict[str, StoredArray]:
+def sparse_arrays(structure: SparseGrid, frames, pointers, entries) -> dict[str, StoredArray]:
     """Return the arrays of a sparse field: words of frames (B,) and pointers, and the entries (K, 3), float32."""
     blocks = [_word_bytes(structure.block_masks), structure.block_signs[:, None], _word_bytes(frames[:, None])]
     masks = np.concatenate([structure.region_masks, structure.region_signs], axis=1)
@@ -108,7 +108,7 @@ def _words(table: Table, name: str, part=slice(None)) -> np.ndarray:
     return np.ascontiguousarray(table.arrays[name].entries[:, part]).view("<u4")
 
 
-def structure_of(table: Table) -> Structure:
+def structure_of(table: Table) -> SparseGrid:
     """Return the structure of a sparse field. Raises :class:`.TableError` if it is damaged."""
     settings = table.settings
     bits, nodes = settings["bits"], settings["nodes"]
@@ -117,12 +117,12 @@ def structure_of(table: Table) -> Structure:
     some = slice(None) if (regions == ACTIVE).any() else slice(0)
     masks, blocks = _words(table, "region_masks")[some], _words(table, "blocks", slice(8))[some]
     signs = table.arrays["blocks"].entries[some, 8]
-    structure = Structure(
+    structure = SparseGrid(
         tuple(settings["lower"]), float(settings["spacing"]), regions, masks[:, :2], masks[:, 2:], blocks, signs
     )
     try:
         structure.check()
-    except StructureError as e:
+    except SparseGridError as e:
         raise TableError(f"{table.path}: is damaged: {e}") from None
     if bits not in codes.POINTERS or structure.nodes != nodes:
         raise TableError(f"{table.path}: is damaged: its masks have {structure.nodes} nodes, its settings {nodes}")

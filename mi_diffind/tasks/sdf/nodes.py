@@ -15,17 +15,15 @@ import numpy as np
 
 from ...arrays.indirection import device_array
 from ...arrays.lookup import mask_flags
+from ...arrays.sparse_grid import BLOCK, CORNERS, GridIndex, SparseGrid, place_of_bit
 from . import codes
 from .field import DistanceField
-from .structure import ACTIVE, BLOCK, Structure, first_ranks, place_of
 
 #: Largest distance that a field returns, in spacings.
 BAND = 2.0
 
 #: Blocks whose nodes are decoded at a time.
 PART = 2**10
-
-CORNERS = [(a, b, c) for a in (0, 1) for b in (0, 1) for c in (0, 1)]
 
 #: Middle of a block, relative to its first node.
 MIDDLE = (BLOCK - 1) / 2
@@ -41,70 +39,29 @@ class SparseNodes(DistanceField):
 
     marched = True
 
-    def __init__(self, types, structure: Structure, slope: float, *, nodes=None, frames=None, pointers=None, bits=0,
+    def __init__(self, types, structure: SparseGrid, slope: float, *, nodes=None, frames=None, pointers=None, bits=0,
                  entries=None, offset=None, step=None):  # fmt: skip
         h = structure.spacing
         super().__init__(types, structure.lower, structure.upper, h, BAND * h)
         self.structure, self.slope = structure, float(slope)
-        UInt32 = types.UInt32
-        regions = structure.regions.reshape(-1).astype(np.uint32)
-        active = regions == ACTIVE
-        # A region with nodes: its number. Any other: the highest bit, and its sign in the lowest
-        regions[~active] |= np.uint32(1 << 31)
-        regions[active] = np.arange(active.sum(), dtype=np.uint32)
-        self._regions = device_array(UInt32, regions)
-        masks = np.concatenate([structure.region_masks, structure.region_signs], axis=1)
-        self._region_masks = device_array(UInt32, masks)
-        self._first_blocks = device_array(UInt32, first_ranks(structure.region_masks))
-        words = structure.block_signs.astype(np.uint32) << np.uint32(24) | first_ranks(structure.block_masks)
-        frame_words = np.zeros(structure.blocks, np.uint32) if frames is None else frames
-        blocks = np.stack([*structure.block_masks.T, words, frame_words], axis=1)
-        self._blocks = device_array(UInt32, blocks)
+        self.index = GridIndex(types, structure, frames)
         self.nodes = nodes
         self.bits = bits
-        self._pointers = None if pointers is None else device_array(UInt32, pointers)
-        self._entries = None if entries is None else device_array(UInt32, entries)
+        self._pointers = None if pointers is None else device_array(types.UInt32, pointers)
+        self._entries = None if entries is None else device_array(types.UInt32, entries)
         self._affine = None if offset is None else (tuple(map(float, offset)), tuple(map(float, step)))
         self._scale = self._affine and [dr.opaque(types.Array3f, v) for v in self._affine]
-        # Opaque, like those of the base class: numbers of regions along the axes, and the last cell
-        self.region_sides = dr.opaque(types.Array3u, structure.regions.shape)
-        self.last_cell = dr.opaque(types.Array3i, [n - 2 for n in structure.shape])
 
     def _grid(self, p):
         """Return the cell of points, as whole numbers of its lowest corner, and the place within it."""
         Int32 = self.types.Int32
         cell, place = [], []
-        for x, a, last in zip(p, self.box[0], self.last_cell, strict=True):
+        for x, a, last in zip(p, self.box[0], self.index.last_cell, strict=True):
             t = (x - a) * self.cells_per_unit
             i = dr.clip(Int32(dr.floor(dr.detach(t))), 0, last)
             cell.append(i)
             place.append(t - self.types.Float(i))
         return cell, place
-
-    def _block(self, i, j, k, active):
-        """Return the number of the block of node (i, j, k), whether it has nodes, and its sign if it has none."""
-        UInt32 = self.types.UInt32
-        _, ny, nz = self.region_sides
-        word = dr.gather(UInt32, self._regions, (UInt32(i >> 4) * ny + UInt32(j >> 4)) * nz + UInt32(k >> 4), active)
-        has = active & (word < 2**31)
-        masks = dr.gather(dr.uint32_array_t(self.types.Array4f), self._region_masks, word, has)
-        bit = UInt32((i >> 2 & 3) * 16 + (j >> 2 & 3) * 4 + (k >> 2 & 3))
-        in_mask, rank = _bit_and_rank(masks[0], masks[1], bit)
-        inside = dr.select(has, _bit_and_rank(masks[2], masks[3], bit)[0], (word & 1) == 1)
-        has_nodes = has & in_mask
-        number = dr.gather(UInt32, self._first_blocks, word, has_nodes) + rank
-        return number, has_nodes, inside
-
-    def _record(self, number, active):
-        return dr.gather(dr.uint32_array_t(self.types.Array4f), self._blocks, number, active)
-
-    def _in_block(self, record, i, j, k):
-        """Return whether node (i, j, k) of a block is stored, its number, and whether it is inside if not stored."""
-        UInt32 = self.types.UInt32
-        x, y, z = UInt32(i & 3), UInt32(j & 3), UInt32(k & 3)
-        stored, rank = _bit_and_rank(record[0], record[1], x * 16 + y * 4 + z)
-        group = (x >> 1) * 4 + (y >> 1) * 2 + (z >> 1)
-        return stored, (record[2] & 0xFFFFFF) + rank, (record[2] >> (24 + group) & 1) == 1
 
     def _node(self, number, record, i, j, k, active):
         """Return the distance, in spacings, and the gradient of a node."""
@@ -118,29 +75,6 @@ class SparseNodes(DistanceField):
         offset = [Float(v & 3) - MIDDLE for v in (i, j, k)]
         return codes.decode_nodes(entry, n, d, scale, offset)
 
-    def _corners(self, cell, active):
-        """Return, for each corner of a cell: ``(stored, number, record, position, inside)``.
-
-        ``inside`` is the sign of a corner that is not stored.
-        """
-        i, j, k = cell
-        first = self._block(i, j, k, active)
-        first_record = self._record(first[0], first[1])
-        corners = []
-        for a, b, c in CORNERS:
-            at = i + a, j + b, k + c
-            (_, has, inside), record = first, first_record
-            if a or b or c:
-                # Mostly in the block of the first corner
-                other = active & (((at[0] ^ i) | (at[1] ^ j) | (at[2] ^ k)) >> 2 != 0)
-                number_, has_, inside_ = self._block(*at, other)
-                record_ = self._record(number_, has_)
-                has, inside = dr.select(other, has_, has), dr.select(other, inside_, inside)
-                record = [dr.select(other, p, q) for p, q in zip(record_, record, strict=True)]
-            stored, number, sign = self._in_block(record, *at)
-            corners.append((has & stored, number, record, at, dr.select(has, sign, inside)))
-        return corners
-
     def _blend(self, p, active, derivatives: bool):
         """Blend the corners of a cell: ``(value, gradient, smooth normal, complete, some, inside)``.
 
@@ -149,7 +83,7 @@ class SparseNodes(DistanceField):
         """
         Float = self.types.Float
         cell, place = self._grid(p)
-        corners = self._corners(cell, active)
+        corners = self.index.corners(cell, active)
         # Where a corner is not stored, the signs of all are the same, and its sign is known exactly: signs of nodes may
         # have been lost in training or by rounding
         complete, inside = active, dr.mask_t(Float)(False)
@@ -157,7 +91,7 @@ class SparseNodes(DistanceField):
             complete, inside = complete & stored, inside | (sign & ~stored)
         value, weight_sum = Float(0), Float(0)
         slope, mean, weighted = [Float(0)] * 3, [Float(0)] * 3, []
-        for (a, b, c), (stored, number, record, at, _) in zip(CORNERS, corners, strict=True):
+        for (a, b, c), (stored, number, record, at, _) in zip(CORNERS.tolist(), corners, strict=True):
             d, g = self._node(number, record, *at, active & stored)
             ends = [(t if e else 1 - t) for e, t in zip((a, b, c), place, strict=True)]
             offset = [t - e for e, t in zip((a, b, c), place, strict=True)]
@@ -225,7 +159,7 @@ class SparseNodes(DistanceField):
 
     def frames(self) -> np.ndarray:
         """Return the words of the blocks' frames, ``(B,)``."""
-        return np.array(self._blocks).reshape(-1, 4)[:, 3]
+        return self.index.block_words
 
     def decoded(self) -> np.ndarray | None:
         """Return distances in spacings and gradients of coded nodes, ``(n, 4)``; ``None`` for decoded ones."""
@@ -244,21 +178,13 @@ class SparseNodes(DistanceField):
         return total + 4 * (self.structure.blocks + dr.width(self._pointers) + dr.width(self._entries))
 
 
-def coded_field(types, structure: Structure, slope: float, frames, pointers, bits: int, entries) -> SparseNodes:
+def coded_field(types, structure: SparseGrid, slope: float, frames, pointers, bits: int, entries) -> SparseNodes:
     """Return a field whose nodes are ``pointers`` (words) into ``entries`` (K, 3), float32."""
     offset, step = codes.entry_scale(entries)
     return SparseNodes(
         types, structure, slope, frames=frames, pointers=pointers, bits=bits,
         entries=codes.entry_words(entries, offset, step), offset=offset, step=step,
     )  # fmt: skip
-
-
-def _bit_and_rank(low, high, bit):
-    """Return whether a bit of a 64-bit mask, given as two words, is set, and how many bits below it are."""
-    upper = bit >= 32
-    word = dr.select(upper, high, low)
-    rank = dr.popcnt(word & ((type(low)(1) << (bit & 31)) - 1)) + dr.select(upper, dr.popcnt(low), 0)
-    return (word >> (bit & 31) & 1) == 1, rank
 
 
 def slope_bound(values: np.ndarray, gradients: np.ndarray, corners: np.ndarray, part: int = 2**17) -> float:
@@ -307,7 +233,7 @@ def middles(positions: np.ndarray) -> np.ndarray:
 
 
 def decoded_nodes(
-    structure: Structure, frames: np.ndarray, entries: np.ndarray, pointers: np.ndarray | None = None
+    structure: SparseGrid, frames: np.ndarray, entries: np.ndarray, pointers: np.ndarray | None = None
 ) -> np.ndarray:
     """Decode nodes: distances in spacings and normals, (n, 4) float32, from the frames (B,) of their blocks.
 
@@ -322,7 +248,7 @@ def decoded_nodes(
             for value in codes.frames(frames[part : part + PART])
         )
         entry = entries[rows] if pointers is None else entries[pointers[rows]]
-        distance, normal = codes.decode_nodes(entry.astype(np.float64).T, n, d, scale, middles(place_of(bit)).T)
+        distance, normal = codes.decode_nodes(entry.astype(np.float64).T, n, d, scale, middles(place_of_bit(bit)).T)
         result[rows] = np.stack([distance, *normal], axis=1)
         first = rows.stop
     return result

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import solid_meshes as solids
 
+from mi_diffind.arrays.sparse_grid import CORNERS
 from mi_diffind.core.runtime import array_module
 from mi_diffind.tasks.sdf import codes, encoding, extraction, grids, nodes
 from mi_diffind.tasks.sdf.distances import Distances
@@ -71,7 +72,7 @@ def test_wrong_nodes_make_no_floaters(types, sampled):
     points = sample_box(field.lower, field.upper, 40000, 5)
     cell = np.floor((points - field.lower) / field.spacing).astype(int)
     stored = set(map(tuple, s.structure.node_positions()[0].tolist()))
-    corners = (cell[:, None] + np.array(nodes.CORNERS)).tolist()
+    corners = (cell[:, None] + CORNERS).tolist()
     count = np.array([sum(tuple(c) in stored for c in eight) for eight in corners])
     inside = distances.inside(points)
     wrong = (field.value(vectors(types, points)).numpy() < 0) != inside

@@ -1,14 +1,12 @@
 """The sparse layout of signed distance fields: masks, codes, what cells say."""
 
-import dataclasses
-
 import drjit as dr
 import numpy as np
 import pytest
 from solid_meshes import box, sphere, together
 
 from mi_diffind.core.runtime import array_module
-from mi_diffind.tasks.sdf import codes, encoding, extraction, nodes, structure
+from mi_diffind.tasks.sdf import codes, encoding, extraction, nodes
 from mi_diffind.tasks.sdf.distances import Distances
 from mi_diffind.tasks.sdf.mesh import make_mesh
 
@@ -60,31 +58,6 @@ def test_every_node_of_the_grid_has_its_sign(ad, solid):
     sure = np.abs(distances.unsigned(places)) > 1e-3 * s.spacing
     assert 0.02 < inside.mean() < 0.5
     assert np.array_equal((result < 0)[sure], inside[sure])
-
-
-def test_positions_follow_from_masks(solid):
-    _, _, sampled = solid
-    s = sampled.structure
-    positions, block = s.node_positions()
-    assert len(positions) == s.nodes == len(np.unique(positions, axis=0))
-    assert np.array_equal(positions // 4 * 4, s.block_positions()[block])
-    # The corners of a cell, z fastest
-    corner = positions[sampled.corners]
-    assert np.array_equal(corner - corner[:, :1], np.broadcast_to(nodes.CORNERS, corner.shape))
-    signs = (sampled.distances < 0)[sampled.corners]
-    assert np.all(signs.any(axis=1) & ~signs.all(axis=1))
-
-
-@pytest.mark.parametrize(
-    ("changes", "says"),
-    [
-        ({"block_masks": np.zeros((1, 2), np.uint32)}, "blocks have nodes, found masks for 1"),
-        ({"region_masks": np.zeros((0, 2), np.uint32)}, "regions have nodes, found masks for 0"),
-    ],
-)
-def test_masks_that_do_not_go_together(solid, changes, says):
-    with pytest.raises(structure.StructureError, match=says):
-        dataclasses.replace(solid[2].structure, **changes).check()
 
 
 # -- codes -------------------------------------------------------------------------------------------------------------
