@@ -36,8 +36,8 @@ from mi_diffind.images.headers import picture_size
 from mi_diffind.maps.compressed import map_figure
 from mi_diffind.maps.source import SourceError, from_arrays, load_source
 from mi_diffind.scenes.inspection import Inspection
-from mi_diffind.tasks.radiance import ans, files, node_codes
-from mi_diffind.tasks.radiance.image_files import ViewsError, image_file, read_image
+from mi_diffind.tasks.radiance import coding, files
+from mi_diffind.tasks.radiance.captures import ViewsError, image_file, read_image
 from mi_diffind.tasks.sdf.mesh import MeshError, load_mesh, make_mesh
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -54,7 +54,7 @@ from mi_diffind.fitting.loop import checkpoint_settings
 from mi_diffind.maps.source import load_source
 from mi_diffind.arrays.tables import load_table
 from mi_diffind.tasks.radiance import files
-from mi_diffind.tasks.radiance.image_files import read_image
+from mi_diffind.tasks.radiance.captures import read_image
 from mi_diffind.tasks.sdf import model
 READERS = {"table": load_table, "sdf": model.load, "field": files.load, "source": load_source, "image": read_image,
            "checkpoint": checkpoint_settings}
@@ -145,8 +145,8 @@ def coded_table(path, shape, claimed) -> Path:
     count = int(np.prod(shape))
     palette = table.arrays["palette"]
     numbers = np.zeros(count, int), np.zeros(count, int)
-    coding = node_codes.encoded(np.ones(shape, bool), *numbers, 64, len(palette.entries))
-    arrays = dict(zip(("probabilities", "nodes"), (byte_array(c[:, None]) for c in coding), strict=True))
+    coded = coding.encode(np.ones(shape, bool), *numbers, 64, len(palette.entries))
+    arrays = dict(zip(("probabilities", "nodes"), (byte_array(c[:, None]) for c in coded), strict=True))
     settings = {**table.settings, "layout": "coded", "shape": list(claimed), "density_bits": 6, "density_scale": 1.0}
     others = {n: a for n, a in table.arrays.items() if n in ("palette", "environment")}
     save_table(path, replace(table, arrays=arrays | others, settings={**settings, "density_offset": 0.0}))
@@ -269,10 +269,10 @@ def test_archives_hold_plain_numbers(tmp_path):
 
 def test_few_lanes_hold_few_symbols():
     """A lane decodes one symbol after the other: many symbols in one lane would take hours."""
-    coder = ans.SymbolEncoder()
+    coder = coding.SymbolEncoder()
     context = np.zeros(100, int)
     coder.code("x", 1, 2, context, context)
-    decoder = ans.SymbolDecoder(*coder.finish())
+    decoder = coding.SymbolDecoder(*coder.finish())
     with pytest.raises(ValueError, match="more symbols than its lanes"):
         decoder.code("x", 1, 2, np.zeros(10**6, int))
 
@@ -285,18 +285,18 @@ def test_coded_nodes_are_those_of_a_dense_grid(tmp_path, rng):
     stored = corners_of(rng.random(tuple(n - 1 for n in shape)) < 0.02)
     count = int(stored.sum())
     numbers = rng.integers(0, 16, count), rng.integers(0, 300, count)
-    places, *again = node_codes.decoded_places(*node_codes.encoded(stored, *numbers, 16, 300), shape, 16, 300)
+    places, *again = coding.decode(*coding.encode(stored, *numbers, 16, 300), shape, 16, 300)
     np.testing.assert_array_equal(places, np.flatnonzero(stored))
     assert all(np.array_equal(a, b) for a, b in zip(again, numbers, strict=True))
-    with pytest.raises(node_codes.TooManyNodes, match="at most 100 are accepted"):
-        node_codes.decoded(*node_codes.encoded(stored, *numbers, 16, 300), shape, 16, 300, 100)
+    with pytest.raises(coding.TooManyNodes, match="at most 100 are accepted"):
+        coding.decode(*coding.encode(stored, *numbers, 16, 300), shape, 16, 300, 100)
     assert np.array_equal(files._packed(places, stored.size), np.packbits(stored.reshape(-1)))
     for mask in (stored, np.packbits(stored.reshape(-1))):
         np.testing.assert_array_equal(np.concatenate([*layers(mask, shape)]), stored)
     number = np.full(np.array(shape) + 8, -1)
     number[4:-4, 4:-4, 4:-4][stored] = np.arange(count)
     place = np.argwhere(stored) + 4
-    for part in node_codes.passes_of(stored):
+    for part in coding.passes_of(stored):
         around = {int(number[tuple(place[part.rows[0]] + np.array(o) - 2)]) for o in np.ndindex(5, 5, 5)}
         assert set(part.near[0].tolist()) <= around | {-1}
 

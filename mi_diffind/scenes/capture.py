@@ -38,7 +38,7 @@ from ..plugins.support import footprint
 from . import loading, splats
 from .capture_settings import CaptureSettings
 from .poses import frame_of, pose
-from .splat_files import is_splats
+from .splats import is_splats
 
 #: Samples of the whole image in one pass.
 PASS = 1 << 23
@@ -156,7 +156,7 @@ def capture(
     """Render the views of a ``scene`` into ``folder``, in the variant that is set.
 
     The scene is a file or a dictionary as of ``mi.load_dict``; of a loaded scene, lights could not be hidden. It may
-    also be a file of 3D Gaussians (:mod:`.splat_files`), of which ``box`` crops a part.
+    also be a file of 3D Gaussians (:mod:`.splats`), of which ``box`` crops a part.
     ``given`` are fields of :class:`CaptureSettings`, the options of ``mi-diffind capture`` as keywords: ``views=60``,
     ``resolution=160``, ``path="orbit"``, …; ``defines`` replace the file's ``<default>`` parameters; ``workers``
     processes share the views, or those of the Dask cluster ``scheduler``. The folder is created if its parent exists.
