@@ -15,7 +15,6 @@ from mi_diffind.core import compat
 from mi_diffind.core.errors import UsageError
 from mi_diffind.core.mitsuba_versions import base_class
 from mi_diffind.tasks.bsdf import TASK
-from mi_diffind.tasks.bsdf.family_files import ARRAYS
 from mi_diffind.tasks.bsdf.files import RESIDUAL
 from mi_diffind.tasks.bsdf.model import ALPHA_MIN, DIFFUSE, EDGE, LOBE, LOGARITHMS, PARAMETERS, TERMS, Proxy, ProxyLobe
 from mi_diffind.tasks.bsdf.truth import MitsubaTruth
@@ -162,7 +161,7 @@ class NeuralBSDF(mi.BSDF):
             self.model.arrays.pop("energy", None)
             self.model.refresh()
         self.textures = {}
-        for parameter in getattr(self.model, "parameters", ()):
+        for parameter in self.model.parameters:
             properties.check_range(props, parameter.name, parameter.low, parameter.high)
             self.textures[parameter.name] = props.get_unbounded_texture(parameter.name, parameter.middle)
         self.proxy = _parameters(self.model) if self.model.form.terms and not self.textures else {}
@@ -184,7 +183,7 @@ class NeuralBSDF(mi.BSDF):
         self.m_flags = flags
 
     def _arrays(self) -> dict:
-        names = (*ARRAYS, "proxy") if self.textures else RESIDUAL
+        names = (*RESIDUAL, "proxy") if self.textures else RESIDUAL
         return {name: self.model.arrays[name] for name in names if name in self.model.arrays}
 
     def trained(self) -> tuple:
@@ -424,7 +423,7 @@ def _spectrum(rgb: list, wavelengths):
 class SourceBSDF(NeuralBSDF):
     """Source of a table file in its place: at one point of its textures, or not a plugin of Mitsuba. The file samples.
 
-    ``truth`` is a :class:`mi_diffind.tasks.bsdf.source.Truth`.
+    ``truth`` is a :class:`mi_diffind.tasks.bsdf.measured.Truth`.
     """
 
     def __init__(self, props: mi.Properties, truth):

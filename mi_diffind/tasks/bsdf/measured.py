@@ -1,11 +1,16 @@
-"""Sources that are rows of measured values: scattered, noisy, and weighted.
+"""Sources of learned BSDFs as they were measured: their symmetries, spectra as colours, and rows of values.
 
-A ``.csv`` file has a header of names (:data:`NAMES`, in any order) and one row for each measurement: two directions by
-their angles, and f without the cosine in linear sRGB. Lines that start with # are comments.
-
-Nothing is known between the rows: proxy and residual are trained on nine tenths of them and measured on the rest, and
-sampling and the limit of the albedo follow from the fitted BSDF. The loss is a weighted mean of absolute differences,
-so that noise and outliers move it little.
+- Symmetries are measured before they are assumed.
+- Tensor files of Mitsuba's ``measured`` (Dupuy and Jakob 2018) and ``measured_polarized`` (Baek et al., *Image-Based
+  Acquisition and Modeling of Polarimetric Reflectance*, SIGGRAPH 2020) hold spectra. These are integrated with the CIE
+  1931 observer and the spectrum of the illuminant, and scaled so that a perfect reflector has the luminance 1. Under
+  ``D65`` it is white: this is what spectral variants of Mitsuba show in the light of RGB emitters. ``E`` is the light
+  of equal energy.
+- A ``.csv`` file has a header of names (in any order) and one row for each measurement: two directions by angles, and
+  f without the cosine in linear sRGB. Lines that start with # are comments. Nothing is known between the rows: proxy
+  and residual are trained on nine tenths of them and measured on the rest, and sampling and the limit of the albedo
+  follow from the fitted BSDF. The loss is a weighted mean of absolute differences, so that noise and outliers move it
+  little.
 """
 
 from __future__ import annotations
@@ -15,37 +20,78 @@ import csv
 import dataclasses
 import hashlib
 import math
+import os
+import tempfile
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import drjit as dr
 import numpy as np
 
+from ...arrays.lookup import clamp
+from ...core import tensor_files
 from ...core.errors import UsageError, reason
+from .directions import Samples, incident, outgoing
 from .model import BSDFArrays, DirectionPair, Form, LearnedBSDF, turned
-from .pool import Samples
-from .source import Truth
-from .symmetry import TOLERANCE
 from .training import module_types, proxy_array, residual_range
 
-#: Columns of angles and values that a file needs, and columns that it may have.
-ANGLES, VALUES, OPTIONAL = ("theta_i", "phi_i", "theta_o", "phi_o"), ("r", "g", "b"), ("solid_angle", "weight")
+#: Relative difference up to which a symmetry is assumed.
+TOLERANCE = 0.01
 
-#: Smallest number of rows, and the share of rows that measure the result.
-LEAST, VALIDATION = 200, 0.1
+#: Azimuth of the axes of a source below which they count as those of the surface, radians.
+TURN = math.radians(0.5)
+
+#: Quantile above which contributions of measured rows count the same in the azimuth of the axes.
+BRIGHT_AXES = 0.999
+
+#: Difference of the azimuths from two halves of the samples beyond which neither counts, radians.
+APART = math.radians(4)
+
+#: Samples that determine the azimuth of the axes.
+AXES_SAMPLES = 2**18
+
+#: Illuminants, the first is the default.
+ILLUMINANTS = ("D65", "E")
+
+#: Columns of angles that a file needs.
+ANGLES = ("theta_i", "phi_i", "theta_o", "phi_o")
+
+#: Columns of values that a file needs.
+VALUES = ("r", "g", "b")
+
+#: Columns that a file may have.
+OPTIONAL = ("solid_angle", "weight")
+
+#: Smallest number of rows.
+LEAST_ROWS = 200
+
+#: Share of the rows that measure the result.
+VALIDATION = 0.1
 
 #: Smallest cosine of a direction that counts.
 HORIZON = 1e-3
 
-#: Neighbours that determine the density of rows, and those that a row is compared with.
-DENSITY, NEIGHBOURS = 8, 16
+#: Neighbours that determine the density of rows.
+DENSITY = 8
 
-#: A row is an outlier if its logarithm differs from its neighbours' median by this many times the usual difference, and
-#: by more than this.
-OUTLIER, FAR = 6.0, 0.4
+#: Neighbours that a row is compared with.
+NEIGHBOURS = 16
 
-#: Number of rows whose neighbours measure symmetries; azimuths that count as equal and as different.
-PAIRS, SAME, OTHER = 20_000, math.radians(15), math.radians(30)
+#: A row is an outlier if its logarithm differs from its neighbours' median by this many times the usual difference …
+OUTLIER = 6.0
+
+#: … and by more than this.
+FAR = 0.4
+
+#: Number of rows whose neighbours measure symmetries.
+PAIRS = 20_000
+
+#: Difference of azimuths that count as equal, radians.
+SAME = math.radians(15)
+
+#: Difference of azimuths that count as different, radians.
+OTHER = math.radians(30)
 
 #: Factors of :func:`places` of an isotropic material that give the mirror image at the plane of incidence.
 MIRROR = np.array([1, 1, -1, 1])
@@ -58,6 +104,229 @@ BRIGHT = 0.9
 
 #: Difference under a symmetry that neighbours have, too, relative to that of neighbours without it.
 USUAL = 1.5
+
+
+class Truth:
+    """Base class of sources.
+
+    ``name`` describes the source; ``digest`` changes when its content does; ``samples``: it samples directions itself;
+    ``isotropic``: it is isotropic by its format (``None``: it has to be measured). ``function``: its values are known
+    for all directions. ``remark``: line about how it was read, for people.
+    """
+
+    name: str
+    digest: str
+    samples, function, remark = False, True, ""
+    isotropic: bool | None = None
+
+    def value(self, wi, wo) -> list:
+        """Return f cos θ_o in linear sRGB, three arrays, for unit directions above the surface."""
+        raise NotImplementedError
+
+    def remarks(self, samples) -> list[str]:
+        """Return sentences about what a fit to the values of ``samples`` leaves out. Raises ``UsageError``."""
+        return []
+
+    def sample(self, wi, w, u, v):
+        """Return directions ``wo`` from three uniform numbers each."""
+        raise NotImplementedError
+
+    def density(self, wi, wo):
+        """Return the density of :meth:`sample` per solid angle."""
+        raise NotImplementedError
+
+
+class FunctionTruth(Truth):
+    """Source whose values f cos θ_o are those of a function ``value(wi, wo)``."""
+
+    def __init__(self, name: str, value: Callable):
+        self.name, self.digest, self.value = name, "", value
+
+
+class TurnedTruth(Truth):
+    """Source that is turned about the normal by ``angle``, radians."""
+
+    def __init__(self, truth: Truth, angle: float):
+        self.truth, self.angle, self.name, self.digest = truth, angle, truth.name, truth.digest
+        self.samples, self.remark = truth.samples, truth.remark
+
+    def value(self, wi, wo) -> list:
+        return self.truth.value(turned(wi, -self.angle), turned(wo, -self.angle))
+
+    def sample(self, wi, w, u, v):
+        return turned(self.truth.sample(turned(wi, -self.angle), w, u, v), self.angle)
+
+    def density(self, wi, wo):
+        return self.truth.density(turned(wi, -self.angle), turned(wo, -self.angle))
+
+
+#: Diffuse source of albedo 1.
+WHITE = FunctionTruth("white", lambda wi, wo: [wo.z * dr.inv_pi] * 3)
+
+
+# -- symmetries --------------------------------------------------------------------------------------------------------
+
+
+def axes_angle(samples: Samples, truth: Truth) -> float:
+    """Return the azimuth of the axes of an anisotropic source, radians from −π/4 to π/4.
+
+    They are the principal axes of the half vectors, weighted by the squares of contributions, most of which lie in the
+    peak. Of a function, four turned values of each sample are used, so that what is isotropic cancels. The result is 0
+    if it is below :data:`TURN`, or if halves of the samples disagree.
+    """
+    index = dr.arange(dr.uint32_array_t(type(samples.weight)), min(AXES_SAMPLES, dr.width(samples.weight)))
+    samples, moments = samples.at(index), 0
+    half = samples.wi + samples.wo
+    half = half * dr.rsqrt(dr.maximum(dr.squared_norm(half), 1e-20))
+    for k in range(4 if truth.function else 1):
+        angle = k * math.pi / 4
+        value = truth.value(turned(samples.wi, angle), turned(samples.wo, angle)) if k else samples.value
+        light, h = samples.weight * dr.square(value[0] + value[1] + value[2]), turned(half, angle)
+        if not truth.function:  # rows may be outliers
+            light = dr.minimum(light, float(np.quantile(light.numpy(), BRIGHT_AXES)))
+        columns = [light * (dr.square(h.x) - dr.square(h.y)), 2 * light * h.x * h.y]
+        moments = moments + np.stack([dr.detach(c).numpy() for c in columns]).astype(np.float64)
+    angles = [0.5 * math.atan2(*part.sum(axis=1)[::-1]) for part in (moments, moments[:, ::2], moments[:, 1::2])]
+    apart = (angles[1] - angles[2] + math.pi / 2) % math.pi - math.pi / 2
+    angle = angles[0] - round(angles[0] / (math.pi / 2)) * (math.pi / 2)
+    return angle if abs(angle) > TURN and abs(apart) < APART else 0.0
+
+
+def measure_symmetry(truth, types, size: int = 2**16, seed: int = 1) -> dict[str, float]:
+    """Return the relative difference of f that each symmetry would hide.
+
+    ``isotropy``: rotation about the normal; ``mirror``: reflection at the plane of incidence; ``reciprocity``: exchange
+    of the directions. Each is a mean of absolute differences over the mean value, weighted by both cosines; that of
+    reciprocity is halved, which no reciprocal model can be nearer than. At angles up to 85°; 0 for what the format
+    implies.
+    """
+    rng = dr.rng(seed=dr.opaque(types.UInt64, seed))
+    samples = outgoing(rng, types, incident(rng, types, size, isotropic=False), truth)
+    wi, wo = samples.wi, samples.wo
+    weight = dr.select(dr.minimum(wi.z, wo.z) > 0.087, samples.weight, 0)
+    sin, cos = dr.sincos(2 * dr.pi * rng.random(types.Float, size))
+
+    def rotated(w):
+        return types.Array3f(dr.fma(cos, w.x, -sin * w.y), dr.fma(sin, w.x, cos * w.y), w.z)
+
+    def mirrored(w):  # at the plane of wi and the normal
+        r2 = dr.maximum(dr.square(wi.x) + dr.square(wi.y), 1e-12)
+        along, across = (w.x * wi.x + w.y * wi.y) / r2, (w.y * wi.x - w.x * wi.y) / r2
+        return types.Array3f(along * wi.x + across * wi.y, along * wi.y - across * wi.x, w.z)
+
+    value = truth.value(wi, wo)
+    others = {
+        "isotropy": truth.value(rotated(wi), rotated(wo)),
+        "mirror": truth.value(wi, mirrored(wo)),
+        "reciprocity": [v * wo.z / wi.z for v in truth.value(wo, wi)],
+    }
+    total = sum(dr.sum(weight * wi.z * v) for v in value)
+    result = {}
+    for name, other in others.items():
+        difference = sum(dr.sum(weight * wi.z * dr.abs(a - b)) for a, b in zip(value, other, strict=True))
+        result[name] = float((difference / dr.maximum(total, 1e-20))[0])
+    result["reciprocity"] /= 2
+    if truth.isotropic:
+        result["isotropy"] = 0.0
+    return result
+
+
+# -- spectra -----------------------------------------------------------------------------------------------------------
+
+
+def colour_weights(wavelengths: np.ndarray, illuminant: str) -> np.ndarray:
+    """Return the weights ``(n, 3)`` of values at ``n`` wavelengths (nm) in a colour of linear sRGB.
+
+    Values are interpolated linearly between wavelengths, and constant beyond the first and last one.
+    """
+    import mitsuba as mi
+
+    grid = np.arange(mi.MI_CIE_MIN, mi.MI_CIE_MAX + 0.5)
+    nodes = mi.Float(grid.astype(np.float32))
+    observer = mi.cie1931_xyz(nodes)
+    colours = np.stack([c.numpy() for c in mi.xyz_to_srgb(observer)], axis=1).astype(np.float64)
+    light = mi.cie_d65(nodes).numpy().astype(np.float64) if illuminant == "D65" else np.ones(len(grid))
+    density = light[:, None] * colours / (light @ observer.y.numpy().astype(np.float64))
+    order = np.argsort(wavelengths)
+    hats = np.stack([np.interp(grid, wavelengths[order], row) for row in np.eye(len(wavelengths))[:, order]])
+    return hats @ density
+
+
+def rgb_fields(fields: dict, illuminant: str) -> dict:
+    """Return the fields of a spectral file of ``measured`` as those of an RGB one."""
+    weights = colour_weights(np.asarray(fields["wavelengths"], np.float64), illuminant)
+    spectra = np.asarray(fields["spectra"])
+    rgb = np.einsum("ptwyx,wc->ptcyx", spectra, weights.astype(np.float32))
+    kept = {name: np.asarray(value) for name, value in fields.items() if name not in ("spectra", "wavelengths")}
+    return {**kept, "rgb": np.ascontiguousarray(rgb, np.float32)}
+
+
+def measured_bsdf(path: Path, illuminant: str):
+    """Return Mitsuba's ``measured`` of a file in an RGB variant, and a remark about colours ("" for an RGB file).
+
+    Raises :class:`UsageError`, and as Mitsuba does.
+    """
+    import mitsuba as mi
+
+    fields = tensor_files.read(path)
+    tensor_files.check(path, fields)
+    if "wavelengths" not in fields or mi.is_spectral:
+        return mi.load_dict({"type": "measured", "filename": str(path)}), ""
+    fields = rgb_fields(fields, illuminant)
+    with tempfile.TemporaryDirectory() as folder:
+        converted = os.path.join(folder, path.name)
+        tensor_files.write(converted, fields)
+        return mi.load_dict({"type": "measured", "filename": converted}), _remark(illuminant)
+
+
+def _remark(illuminant: str) -> str:
+    return f"spectra as linear sRGB under the illuminant {illuminant}"
+
+
+class PolarisedTruth(Truth):
+    """Isotropic measurement of Mueller matrices, as of unpolarised light: their first entry.
+
+    Angles are φ_d, θ_d and θ_h; values are interpolated linearly, and 0 beside invalid ones (NaN). Raises
+    :class:`UsageError`.
+    """
+
+    isotropic = True
+
+    def __init__(self, path: Path, illuminant: str):
+        import mitsuba as mi
+
+        fields = tensor_files.read(path)
+        if "M" not in fields:
+            raise UsageError(f'{path}: is no file of measured Mueller matrices: has no field "M"')
+        tensor_files.check(path, fields)
+        nodes = fields["M"].shape
+        weights = colour_weights(np.asarray(fields["wvls"], np.float64), illuminant)
+        colours = np.asarray(fields["M"][..., 0, 0], np.float32) @ weights.astype(np.float32)
+        grid = np.zeros((*nodes[:3], 2, 2), np.float32)  # Mitsuba interpolates pictures, here of 2 x 2 numbers
+        grid.reshape(*nodes[:3], 4)[..., :3] = colours
+        angles = [np.ravel(fields[name]).astype(float).tolist() for name in ("phi_d", "theta_d", "theta_h")]
+        self.mi, self.grid = mi, mi.MarginalContinuous2D3(grid, angles, False, False)
+        self.name, self.remark = path.name, _remark(illuminant)
+        digest = hashlib.sha256(illuminant.encode())
+        with open(path, "rb") as stream:
+            while block := stream.read(2**24):
+                digest.update(block)
+        self.digest = digest.hexdigest()
+
+    def value(self, wi, wo):
+        half = wi + wo
+        half = half * dr.rsqrt(dr.maximum(dr.squared_norm(half), 1e-20))
+        sin = dr.sqrt(dr.maximum(dr.square(half.x) + dr.square(half.y), 1e-20))
+        cos_d = dr.clip(dr.dot(wo, half), 0, 1)
+        # Components of wo along the tangents of h: towards the normal, and perpendicular to both
+        along, across = (half.z * cos_d - wo.z) / sin, (half.x * wo.y - half.y * wo.x) / sin
+        angles = [dr.atan2(across, along), dr.acos(cos_d), dr.atan2(sin, half.z)]
+        corners = ((0, 0), (1, 0), (0, 1))
+        values = [self.grid.eval(self.mi.Point2f(x, y), angles) for x, y in corners]
+        return [wo.z * dr.select(dr.isnan(v), 0, clamp(v, 0, 1e8)) for v in values]
+
+
+# -- rows of values ----------------------------------------------------------------------------------------------------
 
 
 class ScatteredTruth(Truth):
@@ -90,8 +359,8 @@ class ScatteredTruth(Truth):
             if len(wrong):
                 raise UsageError(f"{path}:{_line(path, wrong[0])}: {name} is negative, allowed are numbers ≥ 0")
         counts = (self.wi[:, 2] > HORIZON) & (self.wo[:, 2] > HORIZON) & (self.weight > 0)
-        if counts.sum() < LEAST:
-            raise UsageError(f"{path}: has {counts.sum()} rows above the horizon, at least {LEAST} are needed")
+        if counts.sum() < LEAST_ROWS:
+            raise UsageError(f"{path}: has {counts.sum()} rows above the horizon, at least {LEAST_ROWS} are needed")
         self.left_out = int((~counts).sum())
         self.wi, self.wo, self.f, self.weight = (a[counts] for a in (self.wi, self.wo, self.f, self.weight))
         self.solid_angle = None if self.solid_angle is None else self.solid_angle[counts]
@@ -192,11 +461,8 @@ def places(truth: ScatteredTruth, isotropic: bool) -> np.ndarray:
     return np.concatenate([np.arccos(np.clip(truth.wi[:, 2:], -1, 1)), along_x(truth)], axis=1)
 
 
-# -- symmetries --------------------------------------------------------------------------------------------------------
-
-
-def measured_symmetry(truth: ScatteredTruth, seed: int = 1) -> dict[str, float | None]:
-    """Return the relative difference of f that each symmetry would hide (:mod:`.symmetry`), from pairs of rows.
+def measure_row_symmetry(truth: ScatteredTruth, seed: int = 1) -> dict[str, float | None]:
+    """Return the relative difference of f that each symmetry would hide (:func:`measure_symmetry`), from pairs of rows.
 
     Reciprocity is measured by :func:`irreciprocal_share` where rows have exact images. Else a row is compared with the
     row that is nearest to its image, and what neighbours without the symmetry differ by, through noise and their
@@ -214,7 +480,7 @@ def measured_symmetry(truth: ScatteredTruth, seed: int = 1) -> dict[str, float |
 
     def difference(others: np.ndarray, chosen: np.ndarray) -> float | None:
         """Return the mean of relative differences of f; ``None`` if too few rows are chosen."""
-        if chosen.sum() < LEAST:
+        if chosen.sum() < LEAST_ROWS:
             return None
         a, b = light[rows[chosen]], light[others[chosen]]
         weight = np.minimum(np.maximum(a, b), bright)  # bright rows count more, outliers little
@@ -268,7 +534,7 @@ def irreciprocal_share(truth: ScatteredTruth, isotropic: bool, mirror: bool) -> 
     image[symmetric] = np.flatnonzero(symmetric)
     paired = image < len(points)
     others = (paired & ~symmetric).sum()
-    if others < LEAST:
+    if others < LEAST_ROWS:
         return None
     rows = np.flatnonzero(paired)
     image, wi, wo = image[rows], truth.wi[rows], truth.wo[rows]
@@ -294,9 +560,6 @@ def cells(angles: np.ndarray) -> np.ndarray:
 
 def _excess(difference: float | None, usual: float | None) -> float | None:
     return None if difference is None or usual is None else max(0.0, difference - USUAL * usual)
-
-
-# -- samples -----------------------------------------------------------------------------------------------------------
 
 
 def solid_angles(truth: ScatteredTruth, isotropic: bool) -> np.ndarray:
@@ -384,7 +647,7 @@ def cleaned(
     """Return samples without outliers from a fitted proxy, the form with the range of the first, and a line of text."""
     types = module_types(parts[0])
     net = BSDFArrays(None, proxy_array(logarithms, 1.0) if form.terms else None).alloc(types.TensorXf)
-    parts, outliers = zip(*(without_outliers(s, form, LearnedBSDF.of(form, net)) for s in parts), strict=True)
+    parts, outliers = zip(*(without_outliers(s, form, net.at(form)) for s in parts), strict=True)
     form = dataclasses.replace(form, range=residual_range(form, logarithms, parts[0]))
     left_out = f", {truth.left_out:,} at the horizon or of no weight" if truth.left_out else ""
     line = f"{len(truth.f):,} rows; left out: {sum(outliers):,} unlike their neighbours{left_out}"
