@@ -5,7 +5,7 @@ from __future__ import annotations  # Delayed parsing of type annotations
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind.core.mitsuba_versions import base_class, lobe_rates
+from mi_diffind.core.compat import base_class, lobe_rates
 from mi_diffind.tasks.disney import model, sampling
 from mi_diffind.tasks.disney.decoder import Decoder, Lobe
 from mi_diffind.tasks.disney.effects import Effects, find_effects

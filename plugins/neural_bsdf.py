@@ -12,8 +12,8 @@ from mi_diffind.arrays.indirection import DifferentiableArray
 from mi_diffind.arrays.lookup import clamp
 from mi_diffind.arrays.tables import TableError
 from mi_diffind.core import compat
+from mi_diffind.core.compat import base_class
 from mi_diffind.core.errors import UsageError
-from mi_diffind.core.mitsuba_versions import base_class
 from mi_diffind.tasks.bsdf import TASK
 from mi_diffind.tasks.bsdf.files import RESIDUAL
 from mi_diffind.tasks.bsdf.model import ALPHA_MIN, DIFFUSE, EDGE, LOBE, LOGARITHMS, PARAMETERS, TERMS, Proxy, ProxyLobe

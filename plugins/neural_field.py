@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_diffind.arrays.tables import TableError
-from mi_diffind.core import compat, mitsuba_versions
+from mi_diffind.core import compat
 from mi_diffind.tasks.radiance.march import OPAQUE
 
 from . import Counterpart, Plugin, warn
@@ -615,7 +615,7 @@ def integrator() -> type:
 
             # Across a smooth surface
             arrived = active & (through > 0) & ~solid
-            flags = mitsuba_versions.ray_flags(curvature=carried)
+            flags = compat.ray_flags(curvature=carried)
             si = pi.compute_surface_interaction(ray, ray_flags=flags, active=arrived)
             bsdf = si.bsdf(ray)
             going = arrived & si.is_valid() & (path.count < self.smooth_depth)

@@ -7,7 +7,7 @@ from functools import cache
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind.core import compat, mitsuba_versions
+from mi_diffind.core import compat
 
 from . import Plugin
 from .support import footprint, omissions
@@ -185,7 +185,7 @@ def integrator() -> type:
             unattached = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad  # a field may be all that is optimised
             carried = bool(getattr(ray, "has_differentials", False))
             environment = scene.environment() is not None and not self.hide_emitters
-            flags = mitsuba_versions.ray_flags(curvature=carried)
+            flags = compat.ray_flags(curvature=carried)
             context = mi.BSDFContext()
             scale = dr.opaque(mi.Float, footprint.scale_of(sampler.sample_count()))
 

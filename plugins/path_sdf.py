@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_diffind.core import compat
-from mi_diffind.core.mitsuba_versions import ray_flags
+from mi_diffind.core.compat import ray_flags
 
 from . import Plugin, path_footprint
 from .path_footprint import power_heuristic, relative

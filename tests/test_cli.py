@@ -252,7 +252,7 @@ def batch(self, rng, size):
         time.sleep(0.1)
     return original(self, rng, size)
 training.GGXProblem.batch = batch
-from mi_diffind.cli import main
+from mi_diffind.commands.cli import main
 sys.exit(main())
 """
 
@@ -278,7 +278,7 @@ def interrupted(*commands) -> tuple[list[int], str]:
 
 SIGINT_IN_THE_SECOND_PASS = """
 import json, os, signal, sys, mi_diffind.scenes as scenes
-from mi_diffind.cli import main
+from mi_diffind.commands.cli import main
 count = [0]
 original = scenes.mi.render
 def render(*args, **kwargs):
@@ -325,7 +325,7 @@ def verbs_with_tasks():
 
 HELP = """
 import contextlib, io, json, sys
-from mi_diffind.cli import main
+from mi_diffind.commands.cli import main
 
 texts = []
 for arguments in json.loads(sys.argv[1]):

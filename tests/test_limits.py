@@ -17,10 +17,19 @@ import pytest
 
 from mi_diffind import DiffindError, TableError, load_table, save_table
 from mi_diffind.arrays.tables import StoredArray, Table, byte_array
-from mi_diffind.core.archives import ArchiveError, read_arrays
+from mi_diffind.core.archives import (
+    FACTOR,
+    FREE,
+    VARIABLE,
+    Allowance,
+    ArchiveError,
+    LimitError,
+    allowed,
+    json_bytes,
+    read_arrays,
+)
 from mi_diffind.core.errors import LONGEST_MESSAGE, UsageError
 from mi_diffind.core.files import PATHS, OutputError
-from mi_diffind.core.limits import FACTOR, FREE, VARIABLE, Allowance, LimitError, allowed, json_bytes
 from mi_diffind.core.units import labelled
 from mi_diffind.fitting.loop import checkpoint_settings
 from mi_diffind.images.headers import picture_size
@@ -40,10 +49,10 @@ CHILD = """
 import resource, sys
 from pathlib import Path
 import numpy, PIL.Image, OpenEXR, mitsuba, scipy.ndimage
-from mi_diffind.errors import DiffindError
-from mi_diffind.fitting import checkpoint_settings
+from mi_diffind.core.errors import DiffindError
+from mi_diffind.fitting.loop import checkpoint_settings
 from mi_diffind.maps.source import load_source
-from mi_diffind.tables import load_table
+from mi_diffind.arrays.tables import load_table
 from mi_diffind.tasks.radiance import files
 from mi_diffind.tasks.radiance.image_files import read_image
 from mi_diffind.tasks.sdf import model

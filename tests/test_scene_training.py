@@ -16,9 +16,9 @@ import mi_diffind
 from mi_diffind.arrays.tables import TableError, load_table, save_table
 from mi_diffind.core.arguments import add_arguments
 from mi_diffind.core.compat import use_threads, was_compiled
-from mi_diffind.core.deadline import Deadline
 from mi_diffind.core.errors import UsageError
 from mi_diffind.core.files import OutputError
+from mi_diffind.core.progress import Deadline
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting.settings import FitSettings
 from mi_diffind.fitting.task import FitRequest

@@ -16,11 +16,10 @@ import drjit as dr
 import numpy as np
 from drjit import nn
 
-from ..core.compat import module_of
-from ..core.memory import owned
+from ..core.compat import module_of, owned
 from ..core.runtime import llvm_problem
 from . import lookup
-from .bits import as_words, pack_bits, unpack_bits
+from .lookup import as_words, pack_bits, unpack_bits
 
 __all__ = ["DifferentiableArray", "Indirection", "fold"]
 

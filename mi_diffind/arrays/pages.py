@@ -18,11 +18,10 @@ import drjit as dr
 import numpy as np
 from drjit import nn
 
-from ..core.compat import module_of
-from ..core.memory import owned
+from ..core.compat import module_of, owned
 from . import lookup
-from .bits import as_words, pack_bits, unpack_bits
 from .indirection import DifferentiableArray, coordinates_of, device_array, fold, padded_tensor, require_backend
+from .lookup import as_words, pack_bits, unpack_bits
 
 __all__ = [
     "PagedArray",

@@ -1,7 +1,7 @@
 """The table file: a ``.npz`` archive of one trained result (readable by ``numpy.load``, never pickled).
 
 It contains one array for each table, ``float32``, ``float16`` or ``uint8`` entries of shape ``(N_1, …, N_d, c)``;
-entries with fewer than 8 bits are packed one after the other (:func:`.bits.pack_bits`). An array ``meta`` of UTF-8
+entries with fewer than 8 bits are packed one after the other (:func:`.lookup.pack_bits`). An array ``meta`` of UTF-8
 bytes holds JSON with the format version, the task and its preset, for each array its shape, borders, storage form, and
 (of bytes) affine map and bits, the training settings, the seed and the measurements. The same content gives the same
 bytes.
@@ -19,19 +19,17 @@ from pathlib import Path
 
 import numpy as np
 
-from ..core.archives import Archive, ArchiveError
+from ..core.archives import Allowance, Archive, ArchiveError, LimitError
 from ..core.errors import DiffindError, printable, reason
 from ..core.files import irregular, replacing, shown
-from ..core.limits import Allowance, LimitError
-from .bits import pack_bits, unpack_bits
 from .indirection import DifferentiableArray
-from .lookup import BORDERS, STORAGES, gathers, pair_words, quantize
+from .lookup import BORDERS, STORAGES, gathers, pack_bits, pair_words, quantize, unpack_bits
 from .pages import SIDE_BITS, PagedArray
 
 #: Version of the format that is written. A file with another version is refused.
 FORMAT_VERSION = 2
 
-#: Largest file content that is written or accepted, in bytes. Small files may hold less: :mod:`.limits`.
+#: Largest file content that is written or accepted, in bytes. Small files may hold less: :mod:`.archives`.
 MAX_BYTES = 2**30
 
 #: Longest path of a file in the settings, in characters.
@@ -290,7 +288,7 @@ def load_table(path: str | os.PathLike, task: str | None = None, shapes: dict[st
     ``task`` and ``shapes`` (array name → shape, ``None`` in place of a free dimension) say what is expected. Raises
     :class:`TableError` with one sentence on anything else: a file that is missing, truncated or no archive, an
     unknown version, a missing, additional, misshapen or mistyped array, NaN or infinity, sizes beyond
-    :data:`MAX_BYTES` or beyond what a file of this size may hold (:mod:`.limits`).
+    :data:`MAX_BYTES` or beyond what a file of this size may hold (:mod:`.archives`).
     """
     path = Path(path)
     if fault := irregular(path, 2 * MAX_BYTES):
@@ -348,7 +346,7 @@ def check_numbers(table: Table, name: str, count: int, positive: bool = False, w
 def check_allowance(table: Table, nbytes: int, content: str) -> None:
     """Raise :class:`TableError` if a file's arrays and ``nbytes`` for its ``content`` are more than it may take.
 
-    The rule is that of :mod:`.limits`. Tables in memory have no limit.
+    The rule is that of :mod:`.archives`. Tables in memory have no limit.
     """
     if table.path is None:
         return

@@ -22,8 +22,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 
 from .errors import DiffindError, UsageError, missing_package, reason
-from .interrupt import interruptible
-from .progress import progress_bar
+from .progress import interruptible, progress_bar
 from .threads import LEAST_THREADS
 
 #: Processes that may be lost with a job, one after the other, before the job has failed.

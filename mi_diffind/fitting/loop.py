@@ -22,13 +22,10 @@ from tqdm import tqdm
 
 from ..arrays.indirection import aligned_copy, unfolded
 from ..core import compat
-from ..core.archives import Archive, ArchiveError
-from ..core.deadline import duration
+from ..core.archives import Archive, ArchiveError, LimitError
 from ..core.errors import reason
 from ..core.files import irregular, replacing, shown, writable_file
-from ..core.interrupt import interruptible
-from ..core.limits import LimitError
-from ..core.progress import in_terminal, progress_bar
+from ..core.progress import Deadline, duration, in_terminal, interruptible, progress_bar
 from .settings import LOSSES, SCHEDULES, FitSettings, FittingError
 from .sparse_adam import SparseAdam
 
@@ -189,15 +186,15 @@ def fit(
     progress=True,
     log=None,
     title=None,
-    seconds: float | None = None,
+    deadline: Deadline | None = None,
     least: int = 1,
 ) -> FitResult:
     """Train ``problem.net`` in place and leave the best state of the training in it.
 
     ``checkpoint`` is a file that keeps the state of the training, written at every measurement; with ``resume`` it is
-    read first (it must belong to the same settings). ``title`` stands before the progress bar. With ``seconds``, the
-    training and its last measurement end after that time, though not before ``least`` steps, and its schedules follow
-    the clock in place of the steps. It is measured as often as the settings say, at most ten times, and less often if
+    read first (it must belong to the same settings). ``title`` stands before the progress bar. With a ``deadline``, the
+    training and its last measurement end in time, though not before ``least`` steps, and its schedules follow the clock
+    in place of the steps. It is measured as often as the settings say, at most ten times, and less often if
     measurements take long. Ctrl-C ends the training after the current step, which is measured, too, and keeps the best
     state so far. If the loss or a parameter becomes NaN, or the loss explodes, the last good state is restored and the
     learning rate halved; ``log`` (default: print to stderr) gets one sentence about it.
@@ -224,7 +221,7 @@ def fit(
         plateau.restore(extra["plateau"])
 
     start = time.perf_counter() - spent
-    clock = None if seconds is None else _Clock(start, seconds)
+    clock = None if deadline is None else _Clock(start, deadline.left())
 
     def share() -> float:
         """Return the share of the training that is over."""
@@ -234,7 +231,7 @@ def fit(
 
     trainer.share = share()
     good = trainer.earlier()
-    bar = _Bar(settings.steps, seconds, title, progress)
+    bar = _Bar(settings.steps, clock and clock.seconds, title, progress)
     planned = min(MEASUREMENTS, max(1, settings.steps // settings.measure_every))  # with a limit of time
     bar.show(trainer)
     log = log or (lambda message: tqdm.write(message, file=sys.stderr))
@@ -257,14 +254,14 @@ def fit(
             kept = not problem.sparse or (trainer.step + 1) % settings.check_every == 0
             before, share_before = trainer.earlier() if kept else good, trainer.share
             loss = trainer.take_step(plateau.factor)
-            if seconds is not None:
+            if clock is not None:
                 dr.eval(loss)
                 dr.sync_thread()
             trainer.share = share()
             bar.show(trainer)
             last = trainer.share >= 1
             measured = trainer.step % settings.measure_every == 0
-            if seconds is not None:
+            if clock is not None:
                 measured = int(planned * trainer.share) > int(planned * share_before) and not clock.slow
             due = trainer.step % settings.check_every == 0 or measured
             reference = references.get(trainer.phase)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from ..core.limits import Allowance
+from ..core.archives import Allowance
 
 #: PNG: type of colour → channels, after the expansion of a palette, which may have transparency.
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 4, 4: 2, 6: 4}

@@ -21,7 +21,7 @@ import numpy as np
 
 from ..arrays import lookup
 from ..arrays.indirection import aligned
-from ..core import compat, memory
+from ..core import compat
 from ..images import srgb
 from . import components
 from .compressed import FilteredMaps
@@ -83,7 +83,7 @@ class Pyramid(FilteredMaps):
     def _hold(self, texels, offsets: np.ndarray) -> None:
         """Keep the texels and the levels' offsets in memory of Dr.Jit: frozen functions take NumPy's for constants."""
         offsets = self.types.UInt32(offsets.astype(np.uint32))
-        self._texels, self._offsets = memory.owned(texels), memory.owned(offsets)
+        self._texels, self._offsets = compat.owned(texels), compat.owned(offsets)
         dr.eval(self._texels)
 
     @staticmethod

@@ -26,12 +26,11 @@ from pathlib import Path
 
 import numpy as np
 
+from ..core.archives import Allowance, LimitError, json_bytes
 from ..core.errors import DiffindError, reason
-from ..core.files import MOST_TEXT, OutsideError, irregular, path_by_name, shown
-from ..core.limits import Allowance, LimitError, json_bytes
+from ..core.files import MOST_TEXT, OutsideError, RecordedKeys, irregular, path_by_name, shown, unused_note
 from ..core.threads import threads_for_files
 from ..core.units import memory
-from ..core.unused_keys import RecordedKeys, unused_note
 from ..images.headers import check_picture
 from .names import Content, content_of
 
@@ -299,7 +298,7 @@ def _read(path: Path) -> _ImageFile:
     """Read an image file.
 
     Raises :class:`SourceError` if ``mitsuba.Bitmap`` cannot read it, it is cut short, or it takes more memory than a
-    file of its size may (:mod:`~mi_diffind.core.limits`).
+    file of its size may (:mod:`~mi_diffind.core.archives`).
     """
     import mitsuba as mi
 

@@ -29,9 +29,8 @@ from .. import __version__, plugins
 from ..core import compat
 from ..core.errors import DiffindError, UsageError, reason
 from ..core.files import replacing, writable_folder, write_json
-from ..core.interrupt import interruptible
 from ..core.jobs import run_jobs
-from ..core.progress import progress_bar
+from ..core.progress import interruptible, progress_bar
 from ..core.runtime import use_variant
 from ..core.threads import threads_for_files
 from ..images import srgb

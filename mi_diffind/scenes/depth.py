@@ -33,9 +33,8 @@ import mitsuba as mi
 import numpy as np
 
 from ..core import compat
-from ..core.interrupt import interruptible
-from ..core.mitsuba_versions import ray_flags
-from ..core.progress import progress_bar
+from ..core.compat import ray_flags
+from ..core.progress import interruptible, progress_bar
 from ..plugins.support import distance_shapes as sdf
 from . import loading
 

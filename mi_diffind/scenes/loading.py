@@ -20,8 +20,7 @@ from ..core import compat
 from ..core.errors import UsageError
 from ..core.files import MOST_TEXT, irregular, replacing, shown
 from ..core.runtime import use_variant
-from ..core.threads import threads_for_files
-from ..core.turns import in_turn
+from ..core.threads import in_turn, threads_for_files
 from ..fitting.task import tasks
 from ..measure.operations import bsdf_operations
 from ..plugins.support import footprint, omissions

@@ -18,9 +18,8 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from ..core.errors import DiffindError, reason
-from ..core.files import irregular, shown
+from ..core.files import RecordedKeys, irregular, shown, unused_note
 from ..core.units import memory
-from ..core.unused_keys import RecordedKeys, unused_note
 
 #: Names of properties that every Gaussian of a PLY file has.
 NAMES = (

@@ -20,7 +20,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_diffind.core import compat, mitsuba_versions
+from mi_diffind.core import compat
 from mi_diffind.tasks.sdf import tracing
 
 from .. import warn
@@ -60,7 +60,7 @@ def distance_shape(mesh: type) -> type:
         def __init__(self, props: mi.Properties, field, placement: Placement, smooth: bool):
             self.field, self.smooth, self.position = field, smooth, PlacementParameter(placement)
             self.ready, self.differentiated = False, False
-            super().__init__(*mitsuba_versions.mesh_arguments(props, CORNERS, CORNERS))
+            super().__init__(*compat.mesh_arguments(props, CORNERS, CORNERS))
             if self.is_emitter():
                 raise RuntimeError("emitter: found one, signed distance fields emit no light")
             if self.is_medium_transition():
@@ -83,7 +83,7 @@ def distance_shape(mesh: type) -> type:
             corners = np.stack(np.meshgrid(*box.T, indexing="ij"), -1).reshape(-1, 3)
             self.ready = False
             buffers = mi.traverse(self)
-            mitsuba_versions.set_triangles(buffers, self.placement.world(corners), np.repeat(np.arange(CORNERS), 3))
+            compat.set_triangles(buffers, self.placement.world(corners), np.repeat(np.arange(CORNERS), 3))
             buffers.update()
             self.ready = True
 

@@ -446,7 +446,7 @@ def test_no_space_left(folder, capsys, monkeypatch, what):
 
 FULL = """
 import os, resource, signal, sys
-from mi_diffind.cli import main
+from mi_diffind.commands.cli import main
 
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 limit, arguments = int(sys.argv[1]), sys.argv[2:]

@@ -37,9 +37,9 @@ def requested_seconds():
     seconds, fit_image = [], training.fit_image
 
     def stepwise(source, size, recipe, request, *options):
-        seconds.append(request.seconds)
+        seconds.append(request.deadline.total)
         recipe = replaced(recipe, steps=STEPS, batch=2**12)
-        return fit_image(source, size, recipe, dataclasses.replace(request, seconds=None, deadline=None), *options)
+        return fit_image(source, size, recipe, dataclasses.replace(request, deadline=None), *options)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training, "fit_image", stepwise)

@@ -28,7 +28,7 @@ from mi_diffind.fitting.task import tasks
 def make_seeds(only: list[str]) -> None:
     """Carry out the trials of all tasks, or those whose names are given, and keep their files."""
     for task in tasks().values():
-        for name in task.trials if trial_files.has_files(task) else ():
+        for name in trial_files.TRIALS.get(task.name, ()):
             path = trial_files.SEEDS / f"{task.name}_{name}.npz"
             if not only or path.stem in only:
                 with tempfile.TemporaryDirectory() as folder:

@@ -3,7 +3,7 @@ Damaged files of every task and every reader: each is refused in one sentence, o
 was done to are unchanged and everything that is computed from it is finite. No read leaves an array, no mutant takes
 more memory or time than its size allows.
 
-A task gets its part of this suite by its declaration: ``Task.trials``, fits of seconds whose files are damaged.
+A task gets its part of this suite by fits of seconds, whose files are damaged (``trial_files.TRIALS``).
 """
 
 import json
@@ -51,7 +51,7 @@ def check(child, target, structured, raw, share=1):
 def test_every_task_declares_small_files(name):
     task = tasks()[name]
     files = trial_files.seeds(task)
-    assert files, f"the task {name} declares no file to damage: give it trials (mi_diffind.fitting.task.Task.trials)"
+    assert files, f"the task {name} has no file to damage: give it trials (trial_files.TRIALS)"
     for file in files.values():
         assert file.is_file(), f"{file} is missing: python tests/trust/run.py --seeds {file.stem}"
         assert task.load(file).arrays, f"{file} is out of date: python tests/trust/run.py --seeds {file.stem}"
@@ -90,9 +90,9 @@ def test_many_damaged_inputs(child, name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [f"{t.name}/{trial}" for t in tasks().values() for trial in t.trials])
+@pytest.mark.parametrize("name", trial_files.NAMES)
 def test_trials_have_the_arrays_of_the_kept_files(mi_rgb, tmp_path, name):
-    """The files in ``corpus/seeds`` are what the declared trials still give."""
+    """The files in ``corpus/seeds`` are what the trials still give."""
     task, trial = name.split("/")
     trained = trial_files.make(tasks()[task], trial, tmp_path, tmp_path / "trial.npz")
     kept = tasks()[task].load(trial_files.SEEDS / f"{task}_{trial}.npz")

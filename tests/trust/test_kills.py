@@ -134,11 +134,11 @@ def words_of(options):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("trial", [f"{t.name}/{name}" for t in tasks().values() for name in t.trials])
+@pytest.mark.parametrize("trial", trial_files.NAMES)
 def test_every_task(tmp_path, trial):
     """Five kills of each declared fit."""
     name, _, which = trial.partition("/")
-    options = {**tasks()[name].trials[which], "steps": 30}
+    options = {**trial_files.TRIALS[name][which], "steps": 30}
     source = options.pop("source", None)
     command = ["fit", name, *([f"../{write_source(source, tmp_path)}"] if source else []), "-o", "own.npz",
                "--checkpoint", "state.npz", "--variant", "llvm_ad_rgb", *words_of(options)]  # fmt: skip

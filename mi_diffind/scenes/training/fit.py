@@ -10,9 +10,9 @@ from pathlib import Path
 
 from ...arrays.tables import Table
 from ...core import compat
-from ...core.deadline import profiled
 from ...core.errors import UsageError
 from ...core.files import writable_folder
+from ...core.progress import profiled
 from ...fitting.loop import FitResult, cores
 from ...fitting.task import FitRequest, Fitted, table_path
 from ...maps.arguments import preview_path

@@ -24,6 +24,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...core.progress import Deadline
 from ...core.runtime import array_module
 from ...fitting.loop import FitSettings, fit
 from ...images import metrics
@@ -198,7 +199,7 @@ class NetworkImage(ImageContender):
         net = image_networks.network(source, source.nbytes / self.budget)
         problem = image_networks.ImageNetworkProblem(net, self.context.types, source)
         title = f"train {self.name}" if progress else None
-        result = fit(problem, NETWORK_SETTINGS, progress=progress, title=title, seconds=self.seconds)
+        result = fit(problem, NETWORK_SETTINGS, progress=progress, title=title, deadline=Deadline(self.seconds))
         if result.interrupted:
             return None
         halved(problem.net)

@@ -27,6 +27,7 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 
+from ...core.progress import Deadline
 from ...fitting.loop import FitSettings, fit
 from ...measure.store import fingerprint
 from ...measure.study import FLOOR, Candidate, Case, Plan
@@ -152,7 +153,7 @@ class RadianceStudyContext:
         """Train a fit in place, at the learning rate of a name in :data:`RATES`, and return the result."""
         problem = UnmeasuredProblem(self.session, trained_fit.net, trained_fit.field_of)
         settings = replace(SETTINGS, lr=RATES.get(rate, SETTINGS.lr), steps=steps, measure_every=steps)
-        result = fit(problem, settings, progress=progress, title=title, seconds=seconds)
+        result = fit(problem, settings, progress=progress, title=title, deadline=seconds and Deadline(seconds))
         trained_fit.net = problem.net
         return result
 

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...core import mitsuba_versions
+from ...core import compat
 from ...tasks.sdf import grids, tracing
 from ...tasks.sdf.field import DistanceField
 from ...tasks.sdf.mesh import Mesh
@@ -58,9 +58,9 @@ class MeshView:
     def mesh_scene(self, lit: bool = False):
         """Return a scene of the mesh, alone or ``lit`` on a floor."""
         counts = len(self.mesh.vertices), len(self.mesh.faces)
-        shape = mi.Mesh(*mitsuba_versions.mesh_arguments(_material(), *counts))
+        shape = mi.Mesh(*compat.mesh_arguments(_material(), *counts))
         buffers = mi.traverse(shape)
-        mitsuba_versions.set_triangles(buffers, self.mesh.vertices, self.mesh.faces)
+        compat.set_triangles(buffers, self.mesh.vertices, self.mesh.faces)
         buffers.update()
         return self._scene(shape, "path", lit)
 

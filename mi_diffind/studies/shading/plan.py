@@ -34,6 +34,7 @@ import numpy as np
 
 from ...arrays.tables import Table, save_table
 from ...core.files import replacing
+from ...core.progress import Deadline
 from ...fitting import task
 from ...fitting.loop import FitResult
 from ...fitting.settings import FitSettings, FittingError
@@ -180,7 +181,8 @@ class ShadingStudyContext(StudyContext):
         options = {argument.name: argument.default for argument in task.tasks()["texture"].arguments}
         options["compression"] = self.settings.compression
         preset = self.settings.preset
-        return task.FitRequest(preset, settings, self.types, seconds=seconds, progress=progress, options=options)
+        return task.FitRequest(preset, settings, self.types, deadline=seconds and Deadline(seconds), progress=progress,
+                               options=options)  # fmt: skip
 
     def fit_texture(
         self, pyramid: Pyramid, length: float, seed: int, progress: bool, extras: bool = False

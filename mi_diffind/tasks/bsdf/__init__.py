@@ -51,10 +51,6 @@ class BSDFTask(Task):
         for name in ("ours", "table", "paper", "plain")
     }
     storages = ()
-    trials = {  # noqa: RUF012
-        "single": {"source": "bsdf", "steps": 2, "batch": 256, "bytes": "1k"},
-        "family": {"source": "bsdf", "steps": 2, "batch": 256, "over": [("alpha", (0.1, 0.5))]},
-    }
     arguments = (
         Argument(
             "source", file="read", metavar="SOURCE",

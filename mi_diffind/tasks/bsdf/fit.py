@@ -11,7 +11,7 @@ import numpy as np
 
 from ...arrays.tables import Table
 from ...core.errors import UsageError
-from ...core.interrupt import interruptible
+from ...core.progress import interruptible
 from ...core.units import parse_bytes
 from ...fitting.loop import FitResult
 from ...fitting.task import FitRequest, Fitted
@@ -184,7 +184,7 @@ def _assumed(symmetries: dict[str, float | None]) -> tuple[bool, str]:
 def _sizes(request: FitRequest, parameters=(), plain: bool = False) -> ResidualSizes:
     try:
         return sizes_within(parse_bytes(request.options["bytes"] or BYTES[len(parameters)]), parameters, plain)
-    except ValueError as e:
+    except ValueError as e:  # of the bytes, or of the budget
         raise UsageError(f"--bytes: {e}") from None
 
 

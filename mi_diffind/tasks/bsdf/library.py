@@ -141,12 +141,10 @@ def check(request: FitRequest) -> None:
         raise UsageError(f"output: found {request.output or 'none'}, a library is written to a folder")
     if request.options["over"]:
         raise UsageError("over: given for a library, a family is fitted to a single BSDF")
-    for name in ("checkpoint", "seconds"):
-        if getattr(request, name) is not None:
-            raise UsageError(f"{name}: given for a library, which {_INSTEAD[name]}")
-
-
-_INSTEAD = {"checkpoint": "the same command continues without one", "seconds": "is limited by steps alone"}
+    if request.checkpoint is not None:
+        raise UsageError("checkpoint: given for a library, which the same command continues without one")
+    if request.deadline is not None:
+        raise UsageError("seconds: given for a library, which is limited by steps alone")
 
 
 def fit_library(request: FitRequest) -> FittedLibrary:

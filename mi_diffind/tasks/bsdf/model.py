@@ -45,6 +45,7 @@ import drjit as dr
 import numpy as np
 from drjit import nn
 
+from ...arrays.budget import Budget
 from ...arrays.indirection import DifferentiableArray, Indirection, device_array, rounded, unfolded
 from ...arrays.lookup import clamp
 
@@ -570,7 +571,7 @@ class ResidualSizes:
 
 
 def sizes_within(nbytes: int, parameters: Sequence[Parameter] = (), plain: bool = False) -> ResidualSizes:
-    """Return the largest arrays of the default's proportions within ``nbytes``. Raises ``ValueError``.
+    """Return the largest arrays of the default's proportions within ``nbytes``. Raises :class:`.BudgetError`.
 
     ``parameters`` are those of a family; ``plain``: a single array, without primaries.
     """
@@ -584,10 +585,4 @@ def sizes_within(nbytes: int, parameters: Sequence[Parameter] = (), plain: bool 
         first, second = (tuple(max(2, round(n * scale**power)) for n in pair) for pair in ((14, 9), (8, 6)))
         return ResidualSizes(*(None, None) if plain else (first, second), cascaded, mixing, rank)
 
-    fitting = [step for step in range(0 if parameters else 1, 400) if sizes(step).nbytes <= nbytes]
-    if not fitting:
-        least = sizes(0).nbytes if parameters else ResidualSizes((2, 2), (2, 2), (2, 2, 2)).nbytes
-        raise ValueError(
-            f"found {nbytes} bytes, the smallest arrays{' of this family' * bool(parameters)} need {least}"
-        )
-    return sizes(fitting[-1])
+    return sizes(Budget(nbytes).largest(sizes, range(400)))

@@ -14,10 +14,10 @@ import drjit as dr
 import numpy as np
 
 from ...arrays.indirection import DifferentiableArray, device_array
-from ...core.interrupt import interruptible
+from ...core.progress import interruptible
 from ...fitting.loop import FitResult, Problem
 from ...fitting.settings import FitSettings
-from ...fitting.task import FitRequest
+from ...fitting.task import FitRequest, Stage
 from .directions import Samples, SphereView, incident, outgoing
 from .model import (
     ALPHA_MIN,
@@ -266,12 +266,9 @@ def view_psnr(views: list[tuple[Sequence, SphereView]]) -> Callable:
 
 
 def train_stage(problem: Problem, settings: FitSettings, request: FitRequest, name: str, title: str) -> FitResult:
-    """Train a stage before the last one, with its checkpoint beside that of the request: ``FILE.name``."""
-    checkpoint = f"{request.checkpoint}.{name}" if request.checkpoint else None
+    """Train a stage before the last one, which may take all of the time of the ``request``."""
     settings = dataclasses.replace(settings, deterministic=request.settings.deterministic)
-    resume = request.resume and os.path.exists(checkpoint or "")
-    stage = dataclasses.replace(request, settings=settings, checkpoint=checkpoint, resume=resume)
-    return stage.train(problem, title)
+    return request.run([Stage(name, problem, settings=settings, title=title)])[0]
 
 
 def train_last(problem: Problem, request: FitRequest, finish: Callable, stop: Event) -> FitResult:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
-from ...arrays.bounds import ValueBounds
+from ...arrays.boxes import ValueBounds
 from .model import PARAMETERS
 
 

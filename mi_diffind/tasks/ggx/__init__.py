@@ -31,7 +31,6 @@ class GGX(Task):
         "paper": FitSettings(steps=3000, batch=65536, lr=1e-3, schedule="constant", seed=1),
     }
     shipped = {"tables": "ggx_tables.npz", "paper": "ggx_paper.npz"}  # noqa: RUF012
-    trials = {"small": {"steps": 2, "batch": 256, "primary": 4, "cascaded": 3}}  # noqa: RUF012
     arguments = tuple(
         Argument(
             f"--{name}", type=_side, default=side, metavar="N",

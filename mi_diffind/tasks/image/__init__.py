@@ -29,10 +29,6 @@ class Image(Task):
     plugin = ("texture", "neural_image")
     presets = {name: recipe.settings for name, recipe in PRESETS.items()}  # noqa: RUF012
     storages = ()
-    trials = {  # noqa: RUF012
-        "indices": {"source": "maps", "steps": 2, "batch": 256, "compression": 2},
-        "pages": {"source": "maps", "steps": 2, "batch": 256, "compression": 2, "structure": "pages of 5 bits"},
-    }
     arguments = (
         SOURCE,
         *SIZES,

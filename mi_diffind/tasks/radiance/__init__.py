@@ -33,11 +33,6 @@ class RadianceField(Task):
     plugin = ("integrator", "neural_field")
     presets = {name: recipe.settings for name, recipe in PRESETS.items()}  # noqa: RUF012
     storages = ()
-    trials = {  # noqa: RUF012
-        "coded": {"source": "views", "steps": 2, "batch": 256, "resolution": 10},
-        "grid": {"source": "views", "steps": 2, "batch": 256, "resolution": 10, "preset": "grid"},
-        "pairs": {"source": "views", "steps": 2, "batch": 256, "resolution": 10, "preset": "paper"},
-    }
     measurements = 2
     arguments = (
         Argument(

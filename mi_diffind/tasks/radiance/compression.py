@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ...arrays.indirection import device_array, device_tensor, fold
-from ...core.deadline import Deadline
+from ...core.progress import Deadline
 from . import grid as grids
 from . import node_codes
 from .grid import NodeGrid

@@ -21,7 +21,7 @@ from ...arrays.tables import (
     load_layout,
     restored,
 )
-from ...core.limits import allowed
+from ...core.archives import allowed
 from . import node_codes
 from .compression import INDEX_BITS, MOST_BITS, as_bytes
 from .grid import NodeGrid

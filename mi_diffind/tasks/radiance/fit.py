@@ -18,7 +18,7 @@ from ...arrays.tables import MAX_BYTES, StoredArray, Table, save_table
 from ...core import units
 from ...core.errors import UsageError
 from ...core.files import check_distinct
-from ...core.interrupt import interruptible
+from ...core.progress import interruptible
 from ...fitting.loop import FitResult, FittingError, cores
 from ...fitting.task import FitRequest, Fitted
 from . import compression, files, paper
@@ -223,7 +223,7 @@ class FieldFit:
         for number, start in enumerate((grid, grid.reflecting())):
             problem = grids.GridProblem(start, session, 1)
             request = dataclasses.replace(trial.part(1 / (2 - number)), settings=settings, checkpoint=None)
-            request = dataclasses.replace(request, resume=False, seconds=None)
+            request = dataclasses.replace(request, resume=False)
             result = request.train(problem, f"trial of colours: {COLOURS[1 - number]}")
             trained.append((problem.trained(), result))
             reached.append(session.held_out_images.evaluate(trained[-1][0].field())["psnr_foreground_db"])
@@ -350,7 +350,6 @@ class FieldFit:
                     settings=dataclasses.replace(stage, steps=rest),
                     checkpoint=checkpoint,
                     resume=request.resume and checkpoint is not None and os.path.exists(checkpoint),
-                    seconds=None,
                 )
                 finish = functools.partial(self.finish_grid, problem) if last and request.preset == "grid" else None
                 result = stage_request.train(
@@ -539,7 +538,7 @@ class FieldFit:
             )
             values = paper.ValuesProblem(net, field, grid)
             limited = dataclasses.replace(request.part(VALUE_TIME), settings=settings, checkpoint=None, resume=False)
-            dataclasses.replace(limited, seconds=None).train(values, "the numbers of the grid")
+            limited.train(values, "the numbers of the grid")
         return paper.PairsProblem(net, grid.nodes, low, high, self.session)
 
 

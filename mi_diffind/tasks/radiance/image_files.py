@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ...core.archives import Allowance, LimitError
 from ...core.errors import DiffindError, reason
 from ...core.files import OutsideError, irregular, path_by_name, shown
-from ...core.limits import Allowance, LimitError
 from ...core.units import memory
 from ...images.headers import check_picture
 from ...images.srgb import from_linear, to_linear

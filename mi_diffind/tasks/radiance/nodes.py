@@ -11,8 +11,8 @@ import drjit as dr
 import numpy as np
 from scipy.ndimage import distance_transform_cdt
 
-from ...arrays.bits import mask_words
 from ...arrays.indirection import device_array
+from ...arrays.lookup import mask_words
 
 #: Cells along a side of a cell of the coarser grid of distances.
 COARSE = 2

@@ -13,7 +13,7 @@ import drjit as dr
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ...core.deadline import Deadline
+from ...core.progress import Deadline
 from ...images import srgb
 from . import node_codes
 from .grid import NodeGrid

@@ -15,10 +15,9 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from ...core.archives import Allowance, LimitError, json_bytes
 from ...core.errors import reason
-from ...core.files import MOST_TEXT, irregular, shown
-from ...core.limits import Allowance, LimitError, json_bytes
-from ...core.unused_keys import RecordedKeys, unused_note
+from ...core.files import MOST_TEXT, RecordedKeys, irregular, shown, unused_note
 from .camera_keys import camera_numbers
 from .image_files import ViewsError
 

@@ -11,8 +11,8 @@ import copy
 import drjit as dr
 import numpy as np
 
-from ...arrays.bits import as_words, pack_bits
 from ...arrays.indirection import device_array, device_tensor
+from ...arrays.lookup import as_words, pack_bits
 from . import reflection
 from .nodes import Nodes
 from .reflection import BRIGHTEST

@@ -19,8 +19,8 @@ import drjit as dr
 import numpy as np
 from scipy.ndimage import distance_transform_cdt
 
-from ...arrays.bits import mask_flags, mask_words
 from ...arrays.indirection import device_array
+from ...arrays.lookup import mask_flags, mask_words
 from ...core import compat
 from . import codes
 from .nodes import CORNERS, MIDDLE, bernstein

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...core import mitsuba_versions
+from ...core import compat
 from ...core.errors import DiffindError, missing_package, reason
 from ...core.files import irregular, shown
 from ...core.units import memory
@@ -140,7 +140,7 @@ def load_mesh(mesh) -> Mesh:
 def _in_memory(mesh) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices and faces of a mesh in memory. Raises :class:`MeshError` for an object that is none."""
     if hasattr(mesh, "vertex_positions_buffer") or hasattr(mesh, "from_fields"):  # mi.Mesh
-        return mitsuba_versions.triangles(mesh)
+        return compat.triangles(mesh)
     if hasattr(mesh, "to_geometry"):  # trimesh.Scene
         mesh = mesh.to_geometry()
     if hasattr(mesh, "vertices") and hasattr(mesh, "faces"):

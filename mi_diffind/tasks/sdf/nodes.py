@@ -13,8 +13,8 @@ from __future__ import annotations
 import drjit as dr
 import numpy as np
 
-from ...arrays.bits import mask_flags
 from ...arrays.indirection import device_array
+from ...arrays.lookup import mask_flags
 from . import codes
 from .field import DistanceField
 from .structure import ACTIVE, BLOCK, Structure, first_ranks, place_of

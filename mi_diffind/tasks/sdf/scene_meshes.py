@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...core import mitsuba_versions
+from ...core import compat
 from ...core.runtime import use_variant
 
 
@@ -24,4 +24,4 @@ def read(path: Path, name: str = "") -> list[tuple[np.ndarray, np.ndarray]]:
     if not chosen:
         names = ", ".join(f'"{shape.id()}"' for shape in shapes) or "none"
         raise ValueError(f'holds no mesh "{name}", found {names}')
-    return [mitsuba_versions.triangles(shape) for shape in chosen]
+    return [compat.triangles(shape) for shape in chosen]

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...arrays.bits import mask_flags, mask_words
+from ...arrays.lookup import mask_flags, mask_words
 from ...core.errors import DiffindError
 
 #: Nodes along a side of a block and of a region.

@@ -16,7 +16,7 @@ from typing import Any
 
 import drjit as dr
 
-from ...arrays.bounds import ValueBounds
+from ...arrays.boxes import ValueBounds
 from ...core.compat import module_of
 from ...core.errors import UsageError
 from ...images import srgb

@@ -35,11 +35,6 @@ class Texture(Task):
     plugin = ("texture", "neural_texture")
     presets = {name: recipe.settings for name, recipe in PRESETS.items()}  # noqa: RUF012
     storages = ()
-    trials = {  # noqa: RUF012
-        "layers": {"source": "maps", "steps": 2, "batch": 256, "compression": 2},
-        "pages": {"source": "maps", "steps": 2, "batch": 256, "compression": 2, "structure": "pages"},
-        "paper": {"source": "maps", "steps": 2, "batch": 256, "compression": 2, "preset": "paper"},
-    }
     measurements = 10
     arguments = (
         SOURCE,

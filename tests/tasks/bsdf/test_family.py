@@ -68,7 +68,7 @@ def test_sizes_follow_the_bytes():
     parameters = [Parameter("a", 0.01, 1.0), Parameter("b", 0.0, 1.0), Parameter("c", 0.0, 1.0)]
     for count, nbytes in ((1, 4000), (2, 9000), (3, 12000)):
         assert 0.75 * nbytes < sizes_within(nbytes, parameters[:count]).nbytes <= nbytes
-    with pytest.raises(ValueError, match="found 10 bytes, the smallest arrays of this family need"):
+    with pytest.raises(ValueError, match="found 10 bytes, the smallest arrays need"):
         sizes_within(10, parameters)
 
 

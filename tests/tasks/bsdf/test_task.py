@@ -99,7 +99,7 @@ def test_extremes(types, model, form):
 def test_sizes_follow_the_bytes():
     assert sizes_within(2048).nbytes <= 2048 and sizes_within(2048).nbytes > 1700
     assert sizes_within(8192, plain=True).first is None and sizes_within(8192, plain=True).nbytes > 7000
-    with pytest.raises(ValueError, match="found 10 bytes, the smallest arrays need 36"):
+    with pytest.raises(ValueError, match="found 10 bytes, the smallest arrays need 64"):
         sizes_within(10)
 
 

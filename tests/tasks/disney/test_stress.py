@@ -14,7 +14,7 @@ from bsdf_queries import close, equal_images, interactions, random_directions, t
 from disney_materials import FORMS, MATERIALS, PLAIN, PRESETS, RICH, SCALARS, plugin, textured
 from spheres import key_of, sphere_scene
 
-from mi_diffind.arrays.bounds import ValueBounds
+from mi_diffind.arrays.boxes import ValueBounds
 from mi_diffind.fitting.loop import EXPONENTIAL_RATE
 from mi_diffind.tasks.disney import TASK, training
 from mi_diffind.tasks.disney.decoder import Decoder

@@ -15,8 +15,8 @@ from PIL import Image
 
 from mi_diffind.arrays.tables import StoredArray, TableError, load_table, save_table
 from mi_diffind.commands.cli import main
-from mi_diffind.core.deadline import Deadline
 from mi_diffind.core.errors import UsageError
+from mi_diffind.core.progress import Deadline
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting import loop
 from mi_diffind.fitting.loop import FitSettings

@@ -14,8 +14,8 @@ from arrays import numpy_of
 
 from mi_diffind.arrays.tables import TableError, load_table, save_table
 from mi_diffind.commands.cli import main
-from mi_diffind.core.deadline import Deadline
 from mi_diffind.core.errors import UsageError
+from mi_diffind.core.progress import Deadline
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting.loop import FitResult
 from mi_diffind.fitting.task import FitRequest
