@@ -8,8 +8,7 @@ import mitsuba as mi
 from mi_diffind.core.compat import base_class, lobe_rates
 from mi_diffind.tasks.disney import model, sampling
 from mi_diffind.tasks.disney.decoder import Decoder, Lobe
-from mi_diffind.tasks.disney.effects import Effects, find_effects
-from mi_diffind.tasks.disney.model import LOBES
+from mi_diffind.tasks.disney.model import LOBES, Effects, find_effects
 
 from . import Counterpart, Plugin
 from .support import frozen, properties, tables

@@ -30,8 +30,8 @@ from mi_diffind.arrays.boxes import ValueBounds
 from mi_diffind.measure.operations import bsdf_operations
 from mi_diffind.scenes import comparison, loading
 from mi_diffind.tasks.ggx import TASK
-from mi_diffind.tasks.ggx.files import encoding_of
 from mi_diffind.tasks.ggx.model import ALPHA_FLOOR
+from mi_diffind.tasks.ggx.training import table_encoding
 
 EXACT = {"type": "roughconductor", "distribution": "ggx"}
 
@@ -92,7 +92,7 @@ def roughness_of(material):
 def normals(form):
     """What the tables of a form say, read by NumPy and SciPy."""
     table = shipped(FORMS[form].get("preset", "tables"))
-    encoding = encoding_of(table)
+    encoding = table_encoding(table)
     return ggx_formulas.learned(table.to(FORMS[form].get("storage", table.storage)), encoding.inputs, encoding.output)
 
 
@@ -260,7 +260,7 @@ def shifted_table(preset, name, index, step):
     table = shipped(preset)
     entries = {k: array.values.astype(np.float64) for k, array in table.arrays.items()}
     entries[name][index] += step
-    encoding, arrays = encoding_of(table), {k: SimpleNamespace(values=v) for k, v in entries.items()}
+    encoding, arrays = table_encoding(table), {k: SimpleNamespace(values=v) for k, v in entries.items()}
     return ggx_formulas.learned(SimpleNamespace(arrays=arrays), encoding.inputs, encoding.output)
 
 

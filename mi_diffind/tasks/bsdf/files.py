@@ -42,6 +42,9 @@ RESIDUAL = ("primary_uv", "primary_vw", "cascaded", "mixing")
 #: Tables over the parameters of a family.
 PARAMETER_TABLES = ("proxy", "mixing", "weights", "energy")
 
+#: Largest entry that counts in an interpolation: assigned ones may be infinite.
+LARGEST_ENTRY = 1e6
+
 #: Limit of the range of residuals, natural logarithms.
 WIDEST = 40.0
 
@@ -273,7 +276,8 @@ class BSDFModel(Model):
 
     def _interpolated(self, name: str, values: list[float | None]) -> np.ndarray:
         """Return a table without the axes of parameters that have a value."""
-        array, first = self.arrays[name].numpy().astype(np.float64), name in ("weights", "energy")
+        first = name in ("weights", "energy")
+        array = np.clip(np.nan_to_num(self.arrays[name].numpy().astype(np.float64)), -LARGEST_ENTRY, LARGEST_ENTRY)
         for k, value in reversed(list(enumerate(values))):
             if value is not None:
                 axis = first + k

@@ -16,13 +16,11 @@
 from __future__ import annotations
 
 import copy
-import csv
 import dataclasses
 import hashlib
 import math
 import os
 import tempfile
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -339,25 +337,28 @@ class ScatteredTruth(Truth):
     function = False
 
     def __init__(self, path: Path, angles: str = ""):
-        names, rows = read_rows(path)
+        names, rows, lines = read_rows(path)
         columns = dict(zip(names, rows.T, strict=True))
+
+        def refuse(wrong: np.ndarray, fault: str) -> None:
+            if wrong.any():
+                row = int(np.argmax(wrong))
+                raise UsageError(f"{path}:{lines[row]}: {fault.format(*rows[row])}")
+
+        refuse(~np.isfinite(rows).all(axis=1), "holds a number that is not finite")
         unit = angles or _unit(path, [columns[name] for name in ANGLES])
         if unit == "degrees":
             columns |= {name: np.radians(columns[name]) for name in ANGLES}
+        limit = "90 degrees" if unit == "degrees" else "π/2"
         for name in ("theta_i", "theta_o"):
-            wrong = np.flatnonzero((columns[name] < 0) | (columns[name] > math.pi / 2 * (1 + 1e-6)))
-            if len(wrong):
-                value = rows[wrong[0], names.index(name)]
-                limit = "90 degrees" if unit == "degrees" else "π/2"
-                raise UsageError(f"{path}:{_line(path, wrong[0])}: {name} is {value:g}, allowed is 0 to {limit}")
+            wrong = (columns[name] < 0) | (columns[name] > math.pi / 2 * (1 + 1e-6))
+            refuse(wrong, f"{name} is {{{names.index(name)}:g}}, allowed is 0 to {limit}")
+        for name in OPTIONAL:
+            refuse(columns.get(name, np.zeros(1)) < 0, f"{name} is negative, allowed are numbers ≥ 0")
         self.wi, self.wo = (_direction(columns[f"theta_{k}"], columns[f"phi_{k}"]) for k in "io")
         self.f = np.stack([columns[name] for name in VALUES], axis=1)
         self.weight = columns.get("weight", np.ones(len(rows)))
         self.solid_angle = columns.get("solid_angle")
-        for name in OPTIONAL:
-            wrong = np.flatnonzero(columns.get(name, np.zeros(1)) < 0)
-            if len(wrong):
-                raise UsageError(f"{path}:{_line(path, wrong[0])}: {name} is negative, allowed are numbers ≥ 0")
         counts = (self.wi[:, 2] > HORIZON) & (self.wo[:, 2] > HORIZON) & (self.weight > 0)
         if counts.sum() < LEAST_ROWS:
             raise UsageError(f"{path}: has {counts.sum()} rows above the horizon, at least {LEAST_ROWS} are needed")
@@ -367,69 +368,39 @@ class ScatteredTruth(Truth):
         self.name, self.digest = path.name, hashlib.sha256(path.read_bytes() + unit.encode()).hexdigest()
 
 
-def read_rows(path: Path) -> tuple[list[str], np.ndarray]:
-    """Return the names and the numbers of a file, ``(rows, names)``. Raises :class:`UsageError`, with file and line."""
+def read_rows(path: Path) -> tuple[list[str], np.ndarray, list[int]]:
+    """Return the names, the numbers, ``(rows, names)``, and the lines of the rows of a file.
+
+    Raises :class:`UsageError`, with file and line.
+    """
     try:
-        with open(path, newline="", encoding="utf-8-sig") as stream:
-            header = next((line for line in stream if line.strip() and not line.startswith("#")), "")
-            names = [name.strip().lower() for name in next(csv.reader([header]), [])]
-            _check_names(path, names)
-            try:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore")  # of no rows
-                    rows = np.loadtxt(stream, delimiter=",", comments="#", ndmin=2)
-            except ValueError:
-                rows = None
+        texts = enumerate(path.read_text(encoding="utf-8-sig").splitlines(), 1)
     except (OSError, UnicodeDecodeError) as e:
         raise UsageError(f"{path}: cannot be read ({reason(e)})") from None
-    if rows is None or (rows.size and rows.shape[1] != len(names)):
-        _refuse_line(path, len(names))
-    if not rows.size:
-        raise UsageError(f"{path}: has no rows below its header")
-    wrong = np.flatnonzero(~np.isfinite(rows).all(axis=1))
-    if len(wrong):
-        raise UsageError(f"{path}:{_line(path, wrong[0])}: holds a number that is not finite")
-    return names, rows
-
-
-def _check_names(path: Path, names: list[str]) -> None:
-    needed, known = (*ANGLES, *VALUES), (*ANGLES, *VALUES, *OPTIONAL)
-    for name in names:
+    (_, header), *body = [(k, t) for k, t in texts if t.strip() and not t.lstrip().startswith("#")] or [(0, "")]
+    names = [name.strip().lower() for name in header.split(",")]
+    known = (*ANGLES, *VALUES, *OPTIONAL)
+    for name in names if header else ():
         if name not in known or names.count(name) > 1:
-            fault = "twice" if name in known else f", allowed are {', '.join(known)}"
-            raise UsageError(f'{path}: its header has the column "{name}"{" " * (fault == "twice")}{fault}')
+            fault = " twice" if name in known else f", allowed are {', '.join(known)}"
+            raise UsageError(f'{path}: its header has the column "{name}"{fault}')
+    needed = (*ANGLES, *VALUES)
     missing = [name for name in needed if name not in names]
     if missing:
         raise UsageError(f"{path}: its header has no {', '.join(missing)}, needed are {', '.join(needed)}")
-
-
-def _rows_of_text(path: Path):
-    """Yield the line number and the text of each row below the header."""
-    header = False
-    with open(path, encoding="utf-8-sig") as stream:
-        for number, line in enumerate(stream, 1):
-            if line.strip() and not line.lstrip().startswith("#"):
-                if header:
-                    yield number, line
-                header = True
-
-
-def _line(path: Path, row: int) -> int:
-    """Return the line of a row."""
-    return next(number for k, (number, _) in enumerate(_rows_of_text(path)) if k == row)
-
-
-def _refuse_line(path: Path, count: int):
-    for number, line in _rows_of_text(path):
-        cells = line.partition("#")[0].split(",")
-        if len(cells) != count:
-            raise UsageError(f"{path}:{number}: has {len(cells)} columns, its header has {count}")
-        for cell in cells:
-            try:
-                float(cell)
-            except ValueError:
-                raise UsageError(f'{path}:{number}: found "{cell.strip()[:40]}", a number is needed') from None
-    raise UsageError(f"{path}: is no table of numbers separated by commas")
+    rows = []
+    for number, text in body:
+        cells = text.partition("#")[0].split(",")
+        if len(cells) != len(names):
+            raise UsageError(f"{path}:{number}: has {len(cells)} columns, its header has {len(names)}")
+        try:
+            rows.append(list(map(float, cells)))
+        except ValueError as e:
+            cell = str(e).partition(": ")[2].strip("'\" ")[:40]
+            raise UsageError(f'{path}:{number}: found "{cell}", a number is needed') from None
+    if not rows:
+        raise UsageError(f"{path}: has no rows below its header")
+    return names, np.array(rows), [number for number, _ in body]
 
 
 def _unit(path: Path, angles: list[np.ndarray]) -> str:

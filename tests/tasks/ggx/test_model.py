@@ -18,9 +18,8 @@ from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting.loop import EXPONENTIAL_RATE, fit
 from mi_diffind.fitting.task import FitRequest
 from mi_diffind.tasks.ggx import TASK
-from mi_diffind.tasks.ggx.files import encoding_of
 from mi_diffind.tasks.ggx.model import ALPHA_FLOOR, ALPHA_MIN, ENCODINGS, Encoding, LearnedGGX, ggx, indirection
-from mi_diffind.tasks.ggx.training import BANDS, GGXProblem, draw, measure
+from mi_diffind.tasks.ggx.training import BANDS, GGXProblem, draw, measure, table_encoding
 
 PRESETS = tuple(TASK.presets)
 
@@ -34,7 +33,7 @@ def ad(request):
 def shipped():
     """Preset → (table, encoding)."""
     tables = {preset: TASK.load(TASK.file(preset=preset)) for preset in PRESETS}
-    return {preset: (table, encoding_of(table)) for preset, table in tables.items()}
+    return {preset: (table, table_encoding(table)) for preset, table in tables.items()}
 
 
 def stored(ad, shipped, preset, storage="float32"):
@@ -104,18 +103,6 @@ def test_projected_area_is_one(ad, shipped, name, alpha):
 
 
 # -- encodings ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("preset", PRESETS)
-def test_what_is_encoded_is_decoded(ad, rng, preset):
-    encoding = ENCODINGS[preset]
-    sin2, alpha = random_case(rng, 10_000)
-    d, alpha = ad.Float(aligned(ggx_formulas.distribution(sin2, alpha))), ad.Float(alpha)
-    y = encoding.encode(d, alpha)
-    if preset == "tables":
-        assert y.numpy().min() > 0 and y.numpy().max() <= 1 + 1e-6
-        np.testing.assert_allclose(y.numpy()[sin2 == 0], 1, atol=1e-6)
-    np.testing.assert_allclose(encoding.decode(y, dr.rcp(encoding.peak_inverse(alpha))).numpy(), d.numpy(), rtol=1e-5)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -213,12 +200,6 @@ def test_training_distributions(ad):
         assert abs(np.mean(q <= t) - (0.125 + 0.375 * of_the_peak + 0.5 * of_the_rest)) < 0.005
 
 
-def test_measure_of_the_truth(ad):
-    found = measure(exact, ad, 10_000)
-    assert found.pop("psnr_db") == 200 and found.pop("mae") == 0
-    assert len(found) == 2 * len(BANDS) and max(found.values()) < 2e-6
-
-
 def test_measure_recognises_known_errors(ad):
     def scaled(cos, sin2, alpha):
         return 1.1 * ggx(sin2, alpha)
@@ -278,20 +259,6 @@ def test_shipped_tables_are_what_their_files_say(ad, shipped, preset):
 #: What is promised for each storage form, a little less than what is reached: PSNR in dB, largest error at the peak
 #: and in the lobe.
 PROMISED = {"float32": (57, 0.001, 0.03), "float16": (56.5, 0.002, 0.03), "uint8": (50, 0.01, 0.035)}
-
-
-@pytest.mark.parametrize("storage", lookup.STORAGES)
-def test_shipped_tables_keep_their_promises(ad, shipped, storage):
-    found = measure(stored(ad, shipped, "tables", storage), ad)
-    psnr, peak, lobe = PROMISED[storage]
-    print(storage, {name: float(f"{v:.3g}") for name, v in found.items()})
-    assert found["psnr_db"] >= psnr
-    for name, value in found.items():
-        if name.startswith("peak"):
-            assert value <= peak, name
-        elif name.startswith("lobe"):
-            assert value <= lobe, name
-    assert measure(stored(ad, shipped, "paper", storage), ad)["psnr_db"] >= 33
 
 
 @pytest.mark.parametrize("storage", lookup.STORAGES)
@@ -382,7 +349,7 @@ def test_fit_improves_and_is_repeatable(tmp_path, preset):
         assert fitted.table.measured["psnr_db"] > start + 1
     assert files[0] == files[1] != files[2]
     read = TASK.load(tmp_path / "first")
-    assert encoding_of(read) == ENCODINGS[preset] and read.preset == preset
+    assert table_encoding(read) == ENCODINGS[preset] and read.preset == preset
     settings = dataclasses.asdict(dataclasses.replace(TASK.presets[preset], seed=1, lr=1e-2, **SHORT))
     assert read.settings == {**settings, **dataclasses.asdict(ENCODINGS[preset])}
 
