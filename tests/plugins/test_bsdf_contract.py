@@ -32,7 +32,7 @@ from bsdf_queries import (
     tile,
     uniform,
     vectors,
-)  # fmt: skip
+)
 from gradients import gradients_enabled
 from half_vectors import HalfVectorSampling
 from spheres import key_of, sphere_scene
@@ -215,6 +215,17 @@ def test_chi2(mi_rgb, case, angle, in_folder):
     messages, valid = lobe_sampling(mi_rgb, case, angle).faults(CHI2_COUNT)
     assert not messages, messages
     assert valid > 1e5, "hardly a sample is valid, the test says nothing"
+
+
+@pytest.mark.parametrize("component", range(3))
+def test_chi2_of_one_lobe(mi_rgb, component, in_folder):
+    """``sample`` draws from ``pdf`` in a context of one of several components, too."""
+    ctx = mi_rgb.BSDFContext()
+    ctx.component = component
+    alpha = disney_materials.smallest_alpha(disney_materials.RICH)
+    bsdf = mi_rgb.load_dict(disney_materials.plugin(mi_rgb, "disney", disney_materials.RICH))
+    messages, _ = HalfVectorSampling(mi_rgb, bsdf, 60, alpha, ctx).faults(3)
+    assert not messages, messages
 
 
 @pytest.mark.parametrize("name", PLUGINS)
@@ -465,6 +476,49 @@ def test_updated_parameters_show(mi_rgb, rng, name, kind):
             params[key] = mi.TensorXf(aligned(new)) if kind == "bitmap" else mi.Float(ends[end])
             params.update()
             np.testing.assert_allclose(value(changed), fresh[end], rtol=1e-3, atol=1e-5, err_msg=f"{parameter} {end}")
+
+
+@pytest.mark.parametrize("name, parameter, values", [("disney", "clearcoat", (0.0, 0.0, 0.5, 0.0, 1.0)),
+                                                     ("neural_ggx", "alpha", (0.3, 0.3, 0.5, 0.05, 1.0))])  # fmt: skip
+def test_parameters_updated_inside_a_frozen_function(mi_rgb, no_garbage_collection, name, parameter, values):
+    """Each image is that of a scene loaded so, also after an update outside of it again."""
+    mi, seed = mi_rgb, mi_rgb.UInt32(0)
+
+    def load_scene(value):
+        return sphere_scene(mi, described(name, **{parameter: value}), "direct", size=8)
+
+    expected = {value: mi.render(load_scene(value), spp=4, seed=seed).numpy() for value in {*values, 0.7}}
+    scene = load_scene(values[0])
+    params = mi.traverse(scene)
+    key = key_of(params, f"{parameter}.value")
+
+    @dr.freeze
+    def frozen(scene, params, value, seed):
+        params[key] = value
+        params.update()
+        return mi.render(scene, params, spp=4, seed=seed)
+
+    for value in values:
+        assert equal_images(frozen(scene, params, dr.opaque(mi.Float, value), seed).numpy(), expected[value]), value
+    params[key] = mi.Float(0.7)
+    params.update()
+    assert equal_images(mi.render(scene, params, spp=4, seed=seed).numpy(), expected[0.7])
+
+
+@pytest.mark.parametrize("name, parameter", [("disney", "clearcoat"), ("neural_ggx", "alpha")])
+def test_textures_that_vary_without_saying_so(mi_rgb, name, parameter):
+    """Mitsuba's ``mesh_attribute`` calls itself constant: its value at no mesh at all is not that of the material."""
+    mi, images = mi_rgb, []
+    for value in ({"type": "mesh_attribute", "name": "vertex_value"}, 0.5):
+        mesh = mi.Mesh("quad", 4, 2)
+        params = mi.traverse(mesh)
+        params["vertex_positions"] = mi.Float([-1, -1, 0, 1, -1, 0, 1, 1, 0, -1, 1, 0])
+        params["faces"] = mi.UInt32([0, 1, 2, 0, 2, 3])
+        params.update()
+        mesh.add_attribute("vertex_value", 1, [0.5] * 4)
+        mesh.set_bsdf(load(mi, name, **{parameter: value}))
+        images.append(mi.render(sphere_scene(mi, [], "direct", columns=1, mesh=mesh), spp=4).numpy())
+    assert images[0].max() > 0.1 and equal_images(*images)
 
 
 #: BSDF → parameters at the values at which they are left out, with their effects.

@@ -343,16 +343,13 @@ def choose_form(logarithms: np.ndarray, samples: Samples, isotropic: bool, azimu
     It has the terms that are not black, the scale of u of a single proxy, and the range of the residuals of
     ``samples``.
     """
-    terms = ["diffuse"] if logarithms[..., DIFFUSE].max() > BLACK else []
-    scales = []
-    for k, name in enumerate(TERMS[1:]):
-        a = 4 + k * LOBE
-        if logarithms[..., a + 3 : a + 9].max() > BLACK:
-            terms.append(name)
-            scales += [tuple(float(np.clip(np.exp(logarithms[a + i]), 1e-3, 1)) for i in (0, 0 if isotropic else 1))
-                       ] * (logarithms.ndim == 1)  # fmt: skip
-    form = Form(tuple(terms or ["diffuse"]), isotropic, azimuth, angle=angle)  # black, or nearly so
+    lobes = {name: 4 + k * LOBE for k, name in enumerate(TERMS[1:])}
+    lobes = {name: a for name, a in lobes.items() if logarithms[..., a + 3 : a + 9].max() > BLACK}
+    terms = (*(["diffuse"] if logarithms[..., DIFFUSE].max() > BLACK else []), *lobes)
+    form = Form(terms or ("diffuse",), isotropic, azimuth, angle=angle)  # black, or nearly so
     if logarithms.ndim == 1:
+        axes = (0, 0 if isotropic else 1)
+        scales = [tuple(float(np.clip(np.exp(logarithms[a + k]), 1e-3, 1)) for k in axes) for a in lobes.values()]
         form = dataclasses.replace(form, scale=min(scales, key=min) if scales else (1.0, 1.0))
     return dataclasses.replace(form, range=residual_range(form, logarithms, samples))
 
