@@ -72,7 +72,7 @@ def main(request: dict) -> None:
 def measure_little() -> None:
     """Measure results at few places."""
     from mi_diffind.tasks.disney.files import DisneyModel
-    from mi_diffind.tasks.ggx.files import GGXModel
+    from mi_diffind.tasks.ggx.training import GGXModel
 
     GGXModel.measure.__defaults__ = (2**12,)
     DisneyModel.measure.__defaults__ = (2**12,)

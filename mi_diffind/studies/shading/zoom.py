@@ -16,7 +16,7 @@ from ...arrays.indirection import aligned_copy
 from ...images import srgb
 from ...maps.pyramid import Pyramid
 from ...measure.flicker import POINTS, MovingView
-from ...tasks.disney.effects import Effects
+from ...tasks.disney.model import Effects
 from ...tasks.shading.evaluation import ShadedReader
 from ...tasks.shading.reference import reference
 

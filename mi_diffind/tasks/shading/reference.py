@@ -17,7 +17,7 @@ import drjit as dr
 
 from ...maps.pyramid import Pyramid
 from ..disney.decoder import Decoder
-from ..disney.effects import Effects
+from ..disney.model import Effects
 from .material import shaded, surface_of
 
 #: Number of samples along each side of the footprint, by pattern.

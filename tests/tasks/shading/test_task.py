@@ -23,7 +23,7 @@ from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.tasks.disney import TASK as DISNEY
 from mi_diffind.tasks.disney.decoder import Decoder
-from mi_diffind.tasks.disney.effects import Effects
+from mi_diffind.tasks.disney.model import Effects
 from mi_diffind.tasks.disney.training import uniform_hemisphere
 from mi_diffind.tasks.shading import TASK, material, training
 from mi_diffind.tasks.shading.evaluation import ShadedEvaluation, reader
