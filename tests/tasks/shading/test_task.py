@@ -25,14 +25,12 @@ from mi_diffind.tasks.disney import TASK as DISNEY
 from mi_diffind.tasks.disney.decoder import Decoder
 from mi_diffind.tasks.disney.effects import Effects
 from mi_diffind.tasks.disney.training import uniform_hemisphere
-from mi_diffind.tasks.shading import TASK, material, training
-from mi_diffind.tasks.shading.evaluation import ShadedEvaluation, reader
-from mi_diffind.tasks.shading.presets import PRESETS
-from mi_diffind.tasks.shading.reference import reference
+from mi_diffind.tasks.shading import PRESETS, TASK, material, training
+from mi_diffind.tasks.shading.evaluation import ShadedEvaluation, reader, reference
+from mi_diffind.tasks.texture import PRESETS as TEXTURES
 from mi_diffind.tasks.texture import TASK as TEXTURE
 from mi_diffind.tasks.texture import training as textures
 from mi_diffind.tasks.texture.compressed import CompressedTexture
-from mi_diffind.tasks.texture.presets import PRESETS as TEXTURES
 
 OURS = PRESETS["ours"]
 

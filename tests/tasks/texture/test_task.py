@@ -19,17 +19,9 @@ from mi_diffind.fitting.task import FitRequest, fit
 from mi_diffind.maps.layout import Layout
 from mi_diffind.maps.pyramid import Pyramid, level_sizes
 from mi_diffind.maps.source import from_arrays
-from mi_diffind.tasks.texture import TASK, memory_budget, sampling, training
+from mi_diffind.tasks.texture import PRESETS, TASK, arrays, nets, training
+from mi_diffind.tasks.texture.arrays import FineArray, TextureBudget, choose, paper_bytes, paper_size, parse_structure
 from mi_diffind.tasks.texture.compressed import CompressedTexture
-from mi_diffind.tasks.texture.memory_budget import (
-    FineArray,
-    TextureBudget,
-    choose,
-    paper_bytes,
-    paper_size,
-    parse_structure,
-)
-from mi_diffind.tasks.texture.presets import PRESETS
 
 OURS, PAPER = PRESETS["ours"], PRESETS["paper"]
 
@@ -101,53 +93,53 @@ def read(texture, u, v, level) -> np.ndarray:
 @pytest.mark.parametrize("base, n", [(1024, 10), (2048, 11), (4096, 12)])
 def test_powers_of_uniform_numbers(ad, rng, base, n):
     """Equations 3 to 6: half of the samples below a texel's side, and the whole distribution."""
-    t = sampling.threshold(base)
-    assert t == 1 / base and sampling.exponent(t) == pytest.approx(n)
-    assert sampling.share_below(t, "power", base) == pytest.approx(0.5)
+    t = nets.threshold(base)
+    assert t == 1 / base and nets.exponent(t) == pytest.approx(n)
+    assert nets.share_below(t, "power", base) == pytest.approx(0.5)
     u = rng.random(200_000)
-    x = np.sort(sampling.footprints(ad.Float(u), "power", base).numpy())
+    x = np.sort(nets.footprints(ad.Float(u), "power", base).numpy())
     np.testing.assert_allclose(x, np.sort(u) ** n, rtol=2e-4, atol=1e-7)
     for fraction in (0.1, 0.25, 0.5, 0.9):
-        assert sampling.share_below(x[int(fraction * len(x))], "power", base) == pytest.approx(fraction, abs=0.01)
+        assert nets.share_below(x[int(fraction * len(x))], "power", base) == pytest.approx(fraction, abs=0.01)
     assert x.max() < 1
 
 
 def test_exponential_samples(ad, rng):
     """Equations 7 to 9."""
     t = 1 / 1024
-    rate = sampling.exponential_rate(t)
+    rate = nets.exponential_rate(t)
     assert rate == pytest.approx(1024 * math.log(2))
-    assert sampling.share_below(t, "exponential", 1024) == pytest.approx(0.5)
+    assert nets.share_below(t, "exponential", 1024) == pytest.approx(0.5)
     u = 1 - rng.random(200_000)
     u[0] = 0
-    x = sampling.footprints(ad.Float(u), "exponential", 1024).numpy()
+    x = nets.footprints(ad.Float(u), "exponential", 1024).numpy()
     np.testing.assert_allclose(x[1:], np.minimum(-np.log(u[1:]) / rate, 1), rtol=2e-3, atol=1e-7)
     for below in (0.5 * t, t, 3 * t):
-        share = sampling.share_below(below, "exponential", 1024)
+        share = nets.share_below(below, "exponential", 1024)
         assert share == pytest.approx(1 - math.exp(-rate * below)) == pytest.approx(np.mean(x < below), abs=0.01)
     assert np.isfinite(x).all() and x.max() <= 1
     with pytest.raises(ValueError, match='footprint samples: found "uniform", allowed are'):
-        sampling.footprints(ad.Float(u), "uniform", 512)
+        nets.footprints(ad.Float(u), "uniform", 512)
 
 
 def test_levels_of_footprints(ad):
     """A side of 1 is the coarsest level; half the side is one level less; what is below a texel is level 0."""
     x = ad.Float([1e-9, 2**-9, 2**-4, 0.5, 1])
-    np.testing.assert_allclose(sampling.level_of(x, 10).numpy(), [0, 0, 5, 8, 9], atol=1e-4)
+    np.testing.assert_allclose(nets.level_of(x, 10).numpy(), [0, 0, 5, 8, 9], atol=1e-4)
     levels = np.float32([0, 0.5, 3, 9])
-    back = sampling.footprint_of(ad.Float(levels), 10)
-    np.testing.assert_allclose(sampling.level_of(back, 10).numpy(), levels, atol=1e-4)
-    assert back.numpy()[-1] == pytest.approx(1) and sampling.footprint_of(0.0, 10) == pytest.approx(2**-9)
+    back = nets.footprint_of(ad.Float(levels), 10)
+    np.testing.assert_allclose(nets.level_of(back, 10).numpy(), levels, atol=1e-4)
+    assert back.numpy()[-1] == pytest.approx(1) and nets.footprint_of(0.0, 10) == pytest.approx(2**-9)
 
 
 def test_which_levels_the_footprints_are_on(rng):
     """The supplement rejects the exponential distribution since coarse levels get too few samples."""
-    power, exponential = (sampling.footprint_histogram(name, 11) for name in sampling.FOOTPRINTS)
+    power, exponential = (nets.footprint_histogram(name, 11) for name in nets.FOOTPRINTS)
     assert power.sum() == pytest.approx(1) and exponential.sum() == pytest.approx(1)
     # Level of u^10 is 10 + 10 log2 u: below ½ with probability 2^-0.95, each further level has 2^(0.1 · level) more
     np.testing.assert_allclose(power, np.diff([0, *2 ** ((np.arange(10) + 0.5 - 10) / 10), 1]), atol=1e-6)
     assert power[0] > 0.5 and power[5:].sum() > 0.2 and exponential[5:].sum() < 1e-3
-    drawn = np.log2(np.minimum(-np.log(1 - rng.random(200_000)) / sampling.exponential_rate(2**-10), 1)) + 10
+    drawn = np.log2(np.minimum(-np.log(1 - rng.random(200_000)) / nets.exponential_rate(2**-10), 1)) + 10
     counted = np.bincount(np.clip(np.floor(drawn + 0.5).astype(int), 0, 10), minlength=11) / 200_000
     np.testing.assert_allclose(exponential, counted, atol=0.005)
 
@@ -157,9 +149,9 @@ def test_which_levels_the_footprints_are_on(rng):
 
 def test_bytes_are_equation_2():
     assert paper_bytes(640**2, 8, 8, 3) == 3 * 640**2 + 32 + 3 * 8**3 * 8
-    assert [memory_budget.lods_of(n, n) for n in (1, 8, 256, 1024, 2048, 4096)] == [2, 3, 8, 8, 12, 12]
+    assert [arrays.lods_of(n, n) for n in (1, 8, 256, 1024, 2048, 4096)] == [2, 3, 8, 8, 12, 12]
     for x, rgb, rest in ((3, 80, 128), (6, 64, 96), (12, 64, 96), (24, 48, 72)):
-        assert memory_budget.ratio(x, 3) == rgb and memory_budget.ratio(x, 7) == rest
+        assert arrays.ratio(x, 3) == rgb and arrays.ratio(x, 7) == rest
 
 
 @pytest.mark.parametrize("height, width", [(4096, 4096), (1024, 1024), (300, 1000), (64, 64)])
@@ -394,7 +386,7 @@ def test_better_than_the_paper():
     assert ours.measured["psnr_worst_db"] > theirs.measured["psnr_worst_db"] + 10
 
 
-@pytest.mark.parametrize("samples", sampling.FOOTPRINTS)
+@pytest.mark.parametrize("samples", nets.FOOTPRINTS)
 def test_the_papers_arrays(samples, tmp_path, ad, rng):
     source = from_arrays(material(64, 48))
     size = paper_size(source.nbytes / 4, source.nbytes, 5, 64, 48)
