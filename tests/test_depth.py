@@ -355,13 +355,13 @@ def test_bad_options(tmp_path, capsys):
 def test_interrupted_probe(tmp_path):
     """Ctrl-C while the probe runs: nothing to keep, exit code 130."""
     code = """
-import os, signal, sys, mi_diffind.depth as depth
+import os, signal, sys, mi_diffind.scenes.depth as depth
 original = depth._pass
 def one_pass(*args):
     os.kill(os.getpid(), signal.SIGINT)
     return original(*args)
 depth._pass = one_pass
-from mi_diffind.cli import main
+from mi_diffind.commands.cli import main
 sys.exit(main())"""
     out = tmp_path / "image.exr"
     arguments = ["render", scene_file(tmp_path, CONVEX), "-o", str(out), "--depth", "auto"]

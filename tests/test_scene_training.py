@@ -43,9 +43,9 @@ from mi_diffind.scenes.training.stored_texture import (
 )
 from mi_diffind.scenes.training.trained_scene import TrainedScene
 from mi_diffind.scenes.training.views import View, ViewDistribution, views_of
+from mi_diffind.tasks.texture import PRESETS
+from mi_diffind.tasks.texture.arrays import PaperBudget, TextureBudget, parse_structure
 from mi_diffind.tasks.texture.compressed import CompressedTexture, load, to_table
-from mi_diffind.tasks.texture.memory_budget import PaperBudget, TextureBudget, parse_structure
-from mi_diffind.tasks.texture.presets import PRESETS
 from mi_diffind.tasks.texture.training import layout_of, problem_of, rounded, stored_form
 
 NAMES = ("albedo", "roughness")

@@ -16,7 +16,7 @@ def crashed(): os.kill(os.getpid(), signal.SIGSEGV)
 def slept(): time.sleep(600)
 def failed(): raise KeyError("x")
 def refusing(text):
-    from mi_diffind.errors import UsageError
+    from mi_diffind.core.errors import UsageError
     raise UsageError(text)
 def gathered():
     import drjit as dr

@@ -129,7 +129,7 @@ def test_what_is_no_ray_ends(types):
 ENDLESS = """
 import drjit as dr, mitsuba as mi, numpy as np
 mi.set_variant("VARIANT")
-from mi_diffind.compat import module_of
+from mi_diffind.core.compat import module_of
 from mi_diffind.tasks.sdf import model, tracing
 from sdf_fields import Ball, sparse_table
 types = module_of(mi.Float)
