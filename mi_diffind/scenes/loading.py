@@ -143,6 +143,13 @@ class ParsedScene:
             name = props.plugin_name()
             return name, int(props.get("max_depth", MAX_DEPTHS[name]))
 
+    def load_integrator(self, longest_path: int):
+        """Return the integrator of :meth:`path_integrator` alone, with another ``max_depth``."""
+        with self._errors():
+            props = mi.Properties(_path_integrator(self._copy()))
+            props["max_depth"] = longest_path
+            return mi.PluginManager.instance().create_object(props)
+
     def learned_plugins(self, against: str | tuple[str, ...] = "exact") -> list[dict]:
         """Return the descriptions (:meth:`.plugins.Plugin.described`) of the learned plugins, in the file's order.
 

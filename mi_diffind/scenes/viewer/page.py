@@ -91,7 +91,7 @@ class Page:
         gui.main_panel.dock_right()
         gui.set_panel_label(f"mi-diffind view: {session.name}")
         self.server.scene.set_up_direction(tuple(session.up()))
-        self._look(self.server.initial_camera)
+        self._begin_at(self.server.initial_camera)
         self.server.initial_camera.up = tuple(session.up())
         self._status = gui.add_markdown("Compiling the scene …")
         self._view = gui.add_dropdown("view", session.views, initial_value=session.view)
@@ -121,7 +121,7 @@ class Page:
         self._view.options = self.session.views
         self._view.value = self.session.view
 
-    def _look(self, camera) -> None:
+    def _begin_at(self, camera) -> None:
         """Give a camera of viser the place and the target of the first view."""
         camera.position, camera.look_at = tuple(self.session.start[:3, 3]), tuple(self.session.target())
 
@@ -180,7 +180,7 @@ class Page:
         for client in self.server.get_clients().values():
             with client.atomic():
                 client.camera.up_direction = tuple(self.session.up())
-                self._look(client.camera)
+                self._begin_at(client.camera)
         self._move(self.session.start)
 
     # -- events of viser, in its threads ------------------------------------------------------------------------------
