@@ -33,7 +33,7 @@ _NAMES = {
     "regress": "scenes.regression",
     "render": "scenes.rendering",
     "examples": "scenes.examples",
-    "fetch": "scenes.downloads",
+    "fetch": "scenes.examples",
     "view": "scenes.viewer",
     # Measurements
     "tradeoff": "studies.tradeoffs",
