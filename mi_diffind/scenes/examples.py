@@ -242,5 +242,5 @@ def _load(address: str, sha256: str, path: Path) -> None:
         pooch.HTTPDownloader(timeout=TIMEOUT)(address, str(path), None)
     except (OSError, ValueError) as e:  # of requests
         raise DownloadError(f"{shown(address)}: cannot be fetched: {reason(e)}") from None
-    if (found := pooch.file_hash(str(path))) != sha256:
-        raise DownloadError(f"{shown(address)}: found the SHA-256 {found[:16]}…, {sha256[:16]}… is expected")
+    if (digest := pooch.file_hash(str(path))) != sha256:
+        raise DownloadError(f"{shown(address)}: found the SHA-256 {digest[:16]}…, {sha256[:16]}… is expected")
