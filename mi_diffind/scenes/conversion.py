@@ -27,8 +27,8 @@ from ..core.files import OutputError, relative_path, replacing, shown, writable_
 from ..core.runtime import use_variant
 from ..fitting.task import fit, tasks
 from ..plugins.support.stock import Kept, StockNode
+from .block_test import PictureCheck, check_picture
 from .loading import ParsedScene, SceneError
-from .picture_check import PictureCheck, check_picture
 from .scene_text import difference, edited_text, with_paths
 
 #: Environment variable with the folder of fits for scenes that are rendered and not written.
@@ -110,7 +110,7 @@ def convert(
     - ``learn``: groups of plugins to replace (:func:`words`; ``None``: those of which a scene gains, textures).
     - ``tables``: folder of the table files (``None``: ``NEW_tables`` beside ``NEW.xml``).
     - ``defines``: values of the file's ``<default>`` parameters.
-    - ``check``: render small pictures before and after (:mod:`.picture_check`), if anything was replaced.
+    - ``check``: render small pictures before and after (:func:`.block_test.check_picture`), if anything was replaced.
 
     Returns what was replaced and what was kept (:func:`replace_stock`, whose errors are raised, too), and the check.
     """
