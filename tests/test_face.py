@@ -457,7 +457,7 @@ def test_an_image_that_a_file_cannot_hold_is_not_rendered(mi_rgb, tmp_path, monk
                 "type": "hdrfilm", "width": 4, "height": 4, "pixel_format": pixel_format}}  # fmt: skip
             loaded = mi.load_dict(content)
             if mi.is_rgb:
-                assert rendering.channels_of(loaded) == mi.render(loaded, spp=1).shape[2], (name, pixel_format)
+                assert rendering.channel_count(loaded) == mi.render(loaded, spp=1).shape[2], (name, pixel_format)
     monkeypatch.setattr(rendering.scenes, "render", None)  # not reached
     with pytest.raises(UsageError, match=r"the image has 7 channels, PNG holds 4: use .exr"):
         mi_diffind.render(loaded, spp=1, output="a.png", progress=False)

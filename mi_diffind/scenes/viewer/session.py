@@ -20,7 +20,7 @@ from ...fitting.task import task_of
 from ...images import metrics
 from ...images.films import displayed
 from .. import loading, scene_checks
-from ..orbit import middle
+from ..rendering import middle
 from .passes import NamedParameter, RenderedSide, no_collection
 
 #: Contents of the picture.
