@@ -18,7 +18,7 @@ _NAMES = {
     # Training, table files
     "fit": "fitting.task",
     "open": "fitting.task:open_model",
-    "save": "scenes.saving",
+    "save": "scenes.conversion",
     "from_arrays": "maps.source",
     "example_maps": "studies.shading.materials",
     # Scenes

@@ -458,7 +458,7 @@ def test_an_image_that_a_file_cannot_hold_is_not_rendered(mi_rgb, tmp_path, monk
             loaded = mi.load_dict(content)
             if mi.is_rgb:
                 assert rendering.channel_count(loaded) == mi.render(loaded, spp=1).shape[2], (name, pixel_format)
-    monkeypatch.setattr(rendering.scenes, "render", None)  # not reached
+    monkeypatch.setattr(rendering.loading, "render", None)  # not reached
     with pytest.raises(UsageError, match=r"the image has 7 channels, PNG holds 4: use .exr"):
         mi_diffind.render(loaded, spp=1, output="a.png", progress=False)
 

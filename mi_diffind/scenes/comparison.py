@@ -28,7 +28,7 @@ from ..images import metrics
 from ..measure import figure_grid
 from ..measure.statistics import spread
 from ..plugins.support import footprint
-from . import conversion, loading, scene_checks
+from . import conversion, loading
 
 #: Pairs of passes that a ratio of times needs.
 PAIRS = 3
@@ -146,7 +146,7 @@ class _Side:
             dr.kernel_history_clear()
             image, seconds = loading.render(self.scene, spp * self.oversampling, seed, self.oversampling, on_pass)
             self.compiled.append(compat.was_compiled(dr.kernel_history()))
-        scene_checks.check_finite(image, self.name)
+        loading.check_finite(image, self.name)
         image = image[..., :3].astype(np.float64)
         half = len(self.seconds) % 2
         self.halves[half] = self.halves[half] + spp * np.repeat(image, 3 // image.shape[-1], -1)
@@ -231,7 +231,7 @@ def compare(
     written = _Side(parsed.load(), name=f"{parsed.path}, as written")
     spp = spp or written.scene.sensors()[0].sampler().sample_count()
     footprint.check_samples(footprint.textures(written.scene), spp)
-    scene_checks.check_size(written.scene, spp)
+    loading.check_size(written.scene, spp)
     passes, done = max(1, min(max(passes, 2), spp)), 0
     turns = [written, *sides.values()]
     total = passes * sum(side.oversampling for side in turns)
@@ -244,7 +244,7 @@ def compare(
             if stop.is_set():
                 break
 
-    scene_checks.warn_of_black(written.scene, parsed.path, [written.image, *(side.image for side in sides.values())])
+    loading.warn_of_black(written.scene, parsed.path, [written.image, *(side.image for side in sides.values())])
     common = {
         "scene": str(parsed.path),
         "variant": mi.variant(),

@@ -317,24 +317,12 @@ def read_partial(path: Path, key: dict) -> PassSums:
 def _update_reference(
     scene, path, references, spp: int | None, seed: int | None, progress: bool, defines: dict
 ) -> dict:
-    """Render a reference of a scene in the current variant and store it (:func:`reference_path`).
+    """Render a reference of a scene in the current variant, store it (:func:`reference_path`), and return the figures.
 
-    ``spp`` are the samples per pixel of a check, which has eight passes; the reference has 128 passes of the same
-    samples. Settings that are not given are those of the reference that is replaced: ``spp`` (else about two million
-    samples of the image, a power of two per pixel), ``seed`` (else 0) and each of ``defines``, which replace the
-    scene's ``<default>`` values. If the scene's filter is a box, and the samples are a power of two, the same arguments
-    give the same bytes on the same machine, interrupted or not.
-
-    The reference is checked against another render: one that fails twice although nothing has changed is not stored.
-    Rendered passes are kept in a file ``SCENE.VARIANT.partial.npz`` beside the reference after Ctrl-C: the same command
-    continues from there, unless the scene, its files, or this package have changed.
-
-    Returns ``scene``, ``reference`` (the file), ``variant``, ``width``, ``height``, ``budget`` (samples per pixel of a
-    check, which a sampler may have rounded up from ``spp``), ``asked_spp``, ``spp`` (of the reference), ``seed``,
-    ``defines``, ``seconds``, ``bytes``, ``visible_change`` (:meth:`.block_test.BlockReference.visible_change`, ``None``
-    for infinity) of a ``tile``, ``reused_passes`` (that had been kept), and ``interrupted``: after Ctrl-C no reference
-    has been written, and ``partial`` is the file of kept passes (else ``None``). Raises
-    :class:`.SceneError` and :class:`.OutputError`.
+    The reference has 128 passes of the samples of those of a check. It is checked against another render: one that
+    fails twice although nothing has changed is not stored. Passes that were rendered when Ctrl-C came are kept in
+    ``SCENE.VARIANT.partial.npz`` beside the reference: the same command continues from there, unless the scene, its
+    files, or this package have changed.
     """
     output, stem = reference_path(path, references), Path(path).stem
     before = read_settings(path, references)
@@ -422,15 +410,21 @@ def regress(
     ``name`` for its reference, ``references/NAME.VARIANT.exr`` in the current folder, and has no ``defines``.
     ``defines`` are the reference's unless given, ``seed`` is 0; every seed is independent of the reference. ``spp`` are
     the reference's; others are refused, since the noise of both sides must be equal. If the check fails and ``out``
-    names a folder, the images are written there (:func:`.regression_report.write_failure`). With ``update``, the
-    reference is rendered again instead and stored (:func:`_update_reference`).
+    names a folder, the images are written there (:func:`.regression_report.write_failure`).
 
-    The figures are ``scene``, ``reference`` (the file's name), ``variant``, ``width``, ``height``, ``spp``,
-    ``reference_spp``, ``seed``, ``defines``, ``seconds``, ``interrupted``, ``passed``, ``blocks`` (number of them that
-    were tested), ``failing_blocks``, ``worst`` (:class:`.block_test.Block`), ``stops``, ``stops_threshold``,
-    ``not_finite`` (pixels), ``visible_change`` of a ``tile``, and ``files`` (written paths). After Ctrl-C there is no
-    verdict, and ``passed`` is ``None``. Raises :class:`.SceneError`, among them
-    :class:`BadReference`, :class:`.UsageError` and :class:`.OutputError`.
+    With ``update``, the reference is rendered again instead and stored. Settings that are not given are then those of
+    the reference that is replaced: ``spp`` of a check (else about two million samples of the image, a power of two per
+    pixel), ``seed`` (else 0) and each of ``defines``. If the scene's filter is a box, and the samples are a power of
+    two, the same arguments give the same bytes on the same machine, interrupted or not.
+
+    Figures of both: ``scene``, ``reference`` (the file), ``variant``, ``width``, ``height``, ``seed``, ``defines``,
+    ``seconds``, ``interrupted`` (no verdict, ``passed`` is ``None``), ``spp``, and ``visible_change``
+    (:meth:`.block_test.BlockReference.visible_change`, ``None`` for infinity) of a ``tile``. Of a check:
+    ``reference_spp``, ``passed``, ``blocks`` (number of them that were tested), ``failing_blocks``, ``worst``
+    (:class:`.block_test.Block`), ``stops``, ``stops_threshold``, ``not_finite`` (pixels), and ``files`` (written
+    paths). Of an update: ``budget`` (samples per pixel of a check, which a sampler may have rounded up from
+    ``asked_spp``), ``bytes``, ``reused_passes``, and ``partial``, the file of kept passes after Ctrl-C. Raises
+    :class:`.SceneError`, among them :class:`BadReference`, :class:`.UsageError` and :class:`.OutputError`.
     """
     use_variant()
     seed_of_check, path = seed or 0, scene

@@ -23,7 +23,7 @@ from ..core.runtime import use_variant
 from ..core.units import check_memory
 from ..images import films, metrics
 from ..plugins.support import footprint
-from . import conversion, loading, scene_checks
+from . import conversion, loading
 from . import depth as depths
 from .poses import rotation
 
@@ -158,13 +158,13 @@ def render(
         if not isinstance(loaded, mi.Scene):
             raise UsageError(f"scene: found a {type(loaded).__name__}, expected a scene, its file or its dictionary")
     name = str(parsed.path) if parsed else "scene"
-    scene_checks.check_renderable(loaded, name)
+    loading.check_renderable(loaded, name)
     if output is not None:
         _check_channels(image_path(output, bool(orbit)), channel_count(loaded))
     ready = time.perf_counter()
     spp = spp or loaded.sensors()[0].sampler().sample_count()
     footprint.check_samples(footprint.textures(loaded), spp)
-    scene_checks.check_size(loaded, spp)
+    loading.check_size(loaded, spp)
     if orbit:
         width, height = loading.film_size(loaded)
         check_memory("orbit", orbit, 16 * orbit * width * height)
@@ -183,7 +183,7 @@ def render(
     if bad:
         total = len(frames) * frames[0].shape[0] * frames[0].shape[1]
         plugins.warn(f"{name}: {bad:,} of {total:,} rendered pixels are not finite (NaN or infinite)")
-    scene_checks.warn_of_black(loaded, name, frames)
+    loading.warn_of_black(loaded, name, frames)
     figures = {
         "interrupted": interrupted,
         "nonfinite_pixels": bad,

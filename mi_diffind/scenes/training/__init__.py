@@ -7,7 +7,7 @@ shaded values without a scene.
 - :mod:`.options`: recipe, views and the arguments of ``fit scene``; :mod:`.fit`: the training and its result;
 - :mod:`.trained_scene`: textures that are trained, and their arrays as parameters of the scene;
 - :mod:`.rig`: camera and lights of a view; :mod:`.references`: renders with exact plugins;
-- :mod:`.problem`: the loss; :mod:`.joint_problem`: that of several textures at once.
+- :mod:`.problem`: the loss.
 """
 
 from __future__ import annotations

@@ -22,11 +22,10 @@ from ...maps.arguments import preview_path
 from ...tasks.texture.training import TextureProblem
 from .. import loading
 from ..conversion import cache_folder
-from .joint_problem import JointProblem
 from .options import SceneRecipe, ViewDistribution, recipe_from, views_from
 from .problem import SceneProblem
 from .references import ReferenceRenders
-from .trained_scene import SceneTexture, TrainedScene, stored_textures
+from .trained_scene import JointProblem, SceneTexture, TrainedScene, stored_textures
 
 #: Shares of a limited time: that of the references, and that of a measurement of renders.
 REFERENCES, MEASURING = 0.25, 0.1

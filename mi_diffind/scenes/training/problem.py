@@ -26,10 +26,9 @@ from ...fitting.loop import Problem
 from ...images import srgb
 from ...tasks.shading.preview import titled
 from ...tasks.texture.training import TextureProblem, rounded
-from .joint_problem import JointProblem
 from .options import SceneRecipe, View
 from .references import SEEDS
-from .trained_scene import TrainedScene
+from .trained_scene import JointProblem, TrainedScene
 
 #: Share of the references' pixels that may be brighter than white.
 BRIGHTER = 0.05

@@ -19,7 +19,7 @@ from ...core.runtime import array_module, use_variant
 from ...fitting.task import task_of
 from ...images import metrics
 from ...images.films import displayed
-from .. import loading, scene_checks
+from .. import loading
 from ..rendering import middle
 from .passes import NamedParameter, RenderedSide, no_collection
 
@@ -105,7 +105,7 @@ class Session:
         film = loading.film_size(self.learned.scene)
         self.full = (width, max(1, round(width * film[1] / film[0]))) if self.learned.by_pixels else film
         self.spp = _checked_samples(spp or sensor.sampler().sample_count())
-        scene_checks.check_size(self.learned.scene, self.spp, self.full)
+        loading.check_size(self.learned.scene, self.spp, self.full)
         written = np.array(self.learned.placement["to_world"].matrix, np.float64).reshape(4, 4)
         self.pose = self.start = rigid(written)
         self._residue = np.linalg.inv(self.start) @ written
