@@ -2,8 +2,7 @@
 
 Each material is fitted with a proxy times an indirection (``ours``), a proxy times one array (``table``), an
 indirection alone (``paper``), one array alone (``plain``), and networks of 675 weights, for raw and for warped inputs
-(:class:`.NetworkBSDF`). Timed beside them are the material itself, ``principled``, and ``measured`` with a file of the
-first.
+(:class:`.NetworkBSDF`). Timed beside them are the material itself and ``principled``.
 """
 
 from __future__ import annotations
@@ -20,11 +19,10 @@ from ..measure.renders import bsdf_queries, directions
 from ..measure.store import file_name, fingerprint, package_files
 from ..measure.study import Candidate, Case, Job, Measure, Plan, Study
 from ..measure.training import ConvergenceTraining, halve
-from ..tasks.bsdf import fit as fitting
 from ..tasks.bsdf import mixture
+from ..tasks.bsdf.directions import SphereView
 from ..tasks.bsdf.model import LearnedBSDF
 from ..tasks.bsdf.truth import truth_of
-from ..tasks.bsdf.view import SphereView
 from .baselines import networks
 
 
@@ -154,7 +152,7 @@ class BSDFTraining(Job):
         errors = dict(model.table.measured)
         if model.bsdf.proxy is not None:
             proxy = LearnedBSDF(model.form, None, model.bsdf.proxy)
-            errors["psnr_proxy_db"] = SphereView(truth, model.types).psnr(fitting.cosine(proxy))
+            errors["psnr_proxy_db"] = SphereView(truth, model.types).psnr(proxy.cosine_value)
         for name, sampled in (("learned", model.mixture), ("native", truth)):
             moments = [mixture.second_moment(truth.value, sampled, truth, model.types, cos) for cos in COSINES]
             errors[f"moment_{name}"] = sum(moments) / len(moments)
@@ -172,31 +170,6 @@ class BSDFTraining(Job):
     def scale(self) -> tuple[float, float]:
         """Return the scale of the coordinate u of the fitted file."""
         return load_model(self.path, mi.TensorXf).form.scale
-
-
-class TensorFile(Job):
-    """Tensor file for ``measured``, written from the file of a learned BSDF."""
-
-    def __init__(self, training: BSDFTraining):
-        self.training, self.name = training, f"{training.material}, measured"
-        self.path: Path | None = None
-
-    def cached_record(self, folder: Path | None, record: dict | None) -> dict | None:
-        self.path = Path(folder or ".") / f"{file_name(self.name)}.bsdf"
-        return record if self.path.is_file() else None
-
-    def run(self, folder: Path | None, progress: bool) -> dict | None:
-        model = load_model(self.training.path, mi.TensorXf)
-        start = time.perf_counter()
-        model.decode(self.path)
-        seconds = time.perf_counter() - start
-        view = SphereView(truth_of(MATERIALS[self.training.material][0], model.types), model.types)
-        errors = {"psnr_db": view.psnr(truth_of(self.path, model.types).value)}
-        return {"seconds": seconds, "bytes": self.path.stat().st_size, "errors": errors}
-
-    def load(self):
-        """Return the plugin that reads the file."""
-        return mi.load_dict({"type": "measured", "filename": str(self.path)})
 
 
 def network_training(material: str, inputs: str, scale) -> ConvergenceTraining:
@@ -234,7 +207,6 @@ def plan(materials: tuple[str, ...] = (), quick: bool = False) -> Plan:
         references = [c.name for c in its_candidates if c.is_truth or c.is_reference]
         learned = [c.name for c in its_candidates if c.name not in references]
         ratios += [(name, reference) for name in learned for reference in references]
-        ratios += [(f"{material}: ours", f"{material}: measured")]
     code = package_files("arrays/lookup.py", "arrays/indirection.py", "fitting/loop.py", "tasks/bsdf/*.py",
                          "studies/bsdf.py")  # fmt: skip
     return Plan(
@@ -264,7 +236,7 @@ def _material(material: str, quick: bool) -> tuple[Case, list[Candidate], list[J
     """Return the case of a material, its candidates and their jobs."""
     source, nbytes = MATERIALS[material]
     trainings = [BSDFTraining(material, preset, quick) for preset in (PRESETS[:1] if quick else PRESETS)]
-    files, nets = [TensorFile(trainings[0])], []
+    nets = []
     if not quick and nbytes == "2k":
         nets = [network_training(material, inputs, trainings[0].scale) for inputs in INPUTS]
 
@@ -280,7 +252,6 @@ def _material(material: str, quick: bool) -> tuple[Case, list[Candidate], list[J
             note="another material",
         ),
         *(learned(job, job.preset, "learned") for job in trainings),
-        *(learned(job, "measured", "tensor file") for job in files),
         *(
             learned(job, f"network, {inputs}", "network", queries=("eval",))
             for job, inputs in zip(nets, INPUTS, strict=False)
@@ -290,7 +261,6 @@ def _material(material: str, quick: bool) -> tuple[Case, list[Candidate], list[J
     def queries(lanes: int) -> dict:
         bsdfs = {f"{material}: source": mi.load_dict(source), f"{material}: principled": mi.load_dict(PEER)}
         bsdfs |= {f"{material}: {job.preset}": job.load() for job in trainings}
-        bsdfs |= {f"{material}: measured": job.load() for job in files}
         bsdfs |= {
             f"{material}: network, {i}": job.problem().bsdf(job.net.cooperative())
             for job, i in zip(nets, INPUTS, strict=False)
@@ -301,5 +271,5 @@ def _material(material: str, quick: bool) -> tuple[Case, list[Candidate], list[J
     return (
         Case(material, queries, None, {"material": source}, members, QUERIES),
         candidates,
-        [*trainings, *files, *nets],
+        [*trainings, *nets],
     )

@@ -27,6 +27,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.progress import Deadline
 from ..core.runtime import array_module
 from ..core.units import parse_compression
 from ..fitting.loop import FitSettings, fit
@@ -34,12 +35,11 @@ from ..measure import plot
 from ..measure.report import figure_caption
 from ..measure.store import fingerprint, package_files
 from ..measure.study import FLOOR, Candidate, Case, Measure, Plan, Study
+from ..tasks.radiance import dense_bytes
 from ..tasks.radiance import grid as grids
 from ..tasks.radiance.files import grid_of, load
 from ..tasks.radiance.march import march
-from ..tasks.radiance.presets import dense_bytes
-from ..tasks.radiance.session import FieldSession, displayed
-from ..tasks.radiance.training import ImagesProblem
+from ..tasks.radiance.session import FieldSession, ImagesProblem, displayed
 from ..tasks.radiance.views import load_views
 from ..tasks.radiance.volume_field import NodeField, VolumeField
 from . import equal_memory
@@ -237,7 +237,7 @@ class RadianceStudyContext:
         problem = ImagesProblem(self.session, trained_fit.net, trained_fit.field_of)
         problem.measure = lambda net: {"step": 0.0}
         settings = replace(SETTINGS, lr=rate, steps=steps, measure_every=steps)
-        result = fit(problem, settings, progress=progress, title=title, seconds=seconds)
+        result = fit(problem, settings, progress=progress, title=title, deadline=seconds and Deadline(seconds))
         trained_fit.net = problem.net
         return result
 

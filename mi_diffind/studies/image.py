@@ -25,6 +25,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arguments import positive
+from ..core.progress import Deadline
 from ..core.runtime import array_module
 from ..core.units import parse_compression
 from ..fitting.loop import FitSettings, fit
@@ -34,7 +35,7 @@ from ..maps.compressed import decibel
 from ..maps.source import Source, load_source
 from ..measure.study import FLOOR, Candidate, Case, Measure, Plan, Study
 from ..measure.training import halve
-from ..tasks.image.presets import IMPROVEMENTS
+from ..tasks.image import IMPROVEMENTS
 from . import equal_memory
 from .baselines import codecs, networks
 from .equal_memory import Contender
@@ -196,7 +197,7 @@ class ImageStudyContext:
             net = networks.image_network(self.source, self.source.nbytes / compression)
             problem = networks.ImageNetworkProblem(net, array_module(mi.variant()), self.source)
             title = f"train {name}" if progress else None
-            result = fit(problem, NETWORK_SETTINGS, progress=progress, title=title, seconds=seconds)
+            result = fit(problem, NETWORK_SETTINGS, progress=progress, title=title, deadline=Deadline(seconds))
             if result.interrupted:
                 return None
             halve(problem.net)

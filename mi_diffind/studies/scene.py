@@ -23,7 +23,7 @@ from tqdm import tqdm
 
 from .. import plugins
 from ..core.arguments import natural, positive
-from ..core.interrupt import interruptible
+from ..core.progress import interruptible
 from ..images import metrics
 from ..measure import plot, report
 from ..measure.benchmark import Stopped

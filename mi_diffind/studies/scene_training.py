@@ -40,12 +40,10 @@ from ..measure import plot
 from ..measure.report import figure_caption
 from ..measure.study import Candidate, Measure, Plan, Study
 from ..scenes import loading
+from ..scenes.training.options import SceneRecipe, View, ViewDistribution
 from ..scenes.training.problem import exposure_of
-from ..scenes.training.recipe import SceneRecipe
-from ..scenes.training.reference_renders import ReferenceRenders
-from ..scenes.training.stored_texture import original_of, texture_file
-from ..scenes.training.trained_scene import TrainedScene
-from ..scenes.training.views import View, ViewDistribution
+from ..scenes.training.references import ReferenceRenders
+from ..scenes.training.trained_scene import TrainedScene, original_of, texture_file
 from ..tasks.texture.compressed import load
 from .equal_memory import Contender, add_without_option, check_without
 

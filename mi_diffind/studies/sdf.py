@@ -27,7 +27,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core import mitsuba_versions
+from ..core import compat
 from ..core.runtime import array_module
 from ..core.units import parse_bytes
 from ..fitting.loop import FitSettings
@@ -37,10 +37,9 @@ from ..measure.store import fingerprint, package_files
 from ..measure.study import FLOOR, Candidate, Case, Measure, Plan, Study
 from ..plugins.support.distance_shapes import crop_grid, distance_shape
 from ..plugins.support.placement import Placement
-from ..tasks.sdf import grids, tracing
+from ..tasks.sdf import grids, marching
 from ..tasks.sdf.distances import Distances
 from ..tasks.sdf.evaluation import SurfaceEvaluation
-from ..tasks.sdf.extraction import extract
 from ..tasks.sdf.field import DistanceField
 from ..tasks.sdf.mesh import Mesh, load_mesh
 from . import equal_memory
@@ -238,7 +237,7 @@ class DistanceStudyContext:
         resolution = math.ceil(FINER / model.spacing)
         if resolution <= self.settings.decoded:
             resolution = max(resolution, self.settings.decoded // 3)
-            surface = extract(model, resolution, self.mesh.scale, self.mesh.centre)
+            surface = grids.extract(model, resolution, self.mesh.scale, self.mesh.centre)
             errors |= self.evaluation.chamfer(surface, max(2**10, self.settings.points // 4))
         return errors
 
@@ -456,9 +455,9 @@ class MeshView:
     def mesh_scene(self, lit: bool = False):
         """Return a scene of the mesh, alone or ``lit`` on a floor."""
         counts = len(self.mesh.vertices), len(self.mesh.faces)
-        shape = mi.Mesh(*mitsuba_versions.mesh_arguments(_material(), *counts))
+        shape = mi.Mesh(*compat.mesh_arguments(_material(), *counts))
         buffers = mi.traverse(shape)
-        mitsuba_versions.set_triangles(buffers, self.mesh.vertices, self.mesh.faces)
+        compat.set_triangles(buffers, self.mesh.vertices, self.mesh.faces)
         buffers.update()
         return self._scene(shape, "path", lit)
 
@@ -508,7 +507,7 @@ def _material() -> mi.Properties:
 
 def traced_distance(field: DistanceField, o, d):
     """Return the length of rays until they meet a field, infinite if they miss it."""
-    return tracing.trace(field, o, d, FAR)[0]
+    return marching.trace(field, o, d, FAR)[0]
 
 
 def scene_distance(scene, o, d):

@@ -38,6 +38,7 @@ import numpy as np
 from ..arrays.indirection import aligned_copy
 from ..arrays.tables import Table, save_table
 from ..core.arguments import fraction, positive
+from ..core.progress import Deadline
 from ..core.runtime import array_module
 from ..core.units import parse_compression
 from ..fitting import task
@@ -51,14 +52,13 @@ from ..measure import plot
 from ..measure.renders import POINTS, MovingView
 from ..measure.report import figure_caption
 from ..measure.study import Candidate, Measure, Plan, Study
-from ..tasks.disney.effects import Effects
+from ..tasks import shading as shading_task
+from ..tasks import texture as texture_task
+from ..tasks.disney.model import Effects
 from ..tasks.shading import fit as shading_fit
-from ..tasks.shading import presets
-from ..tasks.shading.evaluation import ShadedEvaluation, ShadedReader, reader
+from ..tasks.shading.evaluation import ShadedEvaluation, ShadedReader, reader, reference
 from ..tasks.shading.material import effects_of, frozen_decoder
-from ..tasks.shading.reference import reference
 from ..tasks.shading.training import ShadingProblem, fit_shading, start_of
-from ..tasks.texture import presets as texture_presets
 from ..tasks.texture import training as textures
 from ..tasks.texture.compressed import CompressedTexture
 from ..tasks.texture.fit import size_of
@@ -121,8 +121,8 @@ class ShadingStudySettings:
     extras: bool = False
 
     @property
-    def recipe(self) -> presets.ShadingRecipe:
-        return presets.PRESETS[self.preset]
+    def recipe(self) -> shading_task.ShadingRecipe:
+        return shading_task.PRESETS[self.preset]
 
 
 #: Options with a positive number → help.
@@ -323,7 +323,7 @@ class ShadingStudyContext:
 
     @cached_property
     def recipe(self):
-        return texture_presets.PRESETS[self.settings.recipe.texture]
+        return texture_task.PRESETS[self.settings.recipe.texture]
 
     @cached_property
     def pyramid(self) -> Pyramid:
@@ -404,7 +404,8 @@ class ShadingStudyContext:
         options = {argument.name: argument.default for argument in task.tasks()["texture"].arguments}
         options["compression"] = self.settings.compression
         preset = self.settings.preset
-        return task.FitRequest(preset, settings, self.types, seconds=seconds, progress=progress, options=options)
+        return task.FitRequest(preset, settings, self.types, deadline=seconds and Deadline(seconds),
+                               progress=progress, options=options)  # fmt: skip
 
     def fit_texture(
         self, pyramid: Pyramid, length: float, seed: int, progress: bool, extras: bool = False
@@ -413,7 +414,7 @@ class ShadingStudyContext:
 
         With ``extras``, the arrays leave room for them.
         """
-        request = self.request(texture_presets.PRESETS["ours"].settings, length, seed, progress)
+        request = self.request(texture_task.PRESETS["ours"].settings, length, seed, progress)
         recipe = dataclasses.replace(self.recipe, settings=request.settings)
         nbytes = self.source.nbytes / self.settings.compression
         nbytes = shading_fit.bytes_beside_extras(nbytes, pyramid) if extras else nbytes

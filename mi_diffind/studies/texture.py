@@ -45,7 +45,7 @@ from ..measure.store import fingerprint
 from ..measure.study import FLOOR, PASS, Candidate, Case, Job, Measure, Plan, Study
 from ..plugins.support.image_files import PYRAMIDS
 from ..scenes.loading import footprint
-from ..tasks.texture import sampling, training
+from ..tasks.texture import nets, training
 from . import equal_memory
 from .baselines import codecs, networks
 from .equal_memory import Contender, NetworkContender
@@ -734,7 +734,7 @@ def draw_levels(context: TextureStudyContext, result: dict):
     count, panels = context.pyramid.levels, {}
     if context.settings.footprints:
         shares = {"by level (ours)": training.shares(count)}
-        shares |= {name: sampling.footprint_histogram(name, count) for name in sampling.FOOTPRINTS}
+        shares |= {name: nets.footprint_histogram(name, count) for name in nets.FOOTPRINTS}
         panels["% of the samples of a training"] = [
             plot.Curve(name, range(count), 100 * np.asarray(share)) for name, share in shares.items()
         ]

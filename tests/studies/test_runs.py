@@ -19,7 +19,7 @@ from mi_diffind.maps.source import from_arrays, load_source
 from mi_diffind.measure import benchmark
 from mi_diffind.studies import image, scene_training, studies
 from mi_diffind.studies.baselines import codecs
-from mi_diffind.tasks.image.presets import IMPROVEMENTS
+from mi_diffind.tasks.image import IMPROVEMENTS
 
 ROOT = Path(__file__).resolve().parents[2]
 TRAINED = ["--steps", "2", "--pretrain-steps", "2"]

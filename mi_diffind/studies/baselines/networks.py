@@ -32,15 +32,15 @@ from ...maps.pyramid import Pyramid, level_sizes
 from ...maps.source import Source
 from ...measure.clock import Operations
 from ...tasks.bsdf import training as bsdf_training
+from ...tasks.bsdf.directions import SphereView
 from ...tasks.bsdf.model import DirectionPair, Form, coordinate_u, coordinate_w
 from ...tasks.bsdf.training import BSDFProblem
 from ...tasks.bsdf.truth import truth_of
-from ...tasks.bsdf.view import SphereView
 from ...tasks.disney import model
 from ...tasks.disney.decoder import Decoder
 from ...tasks.disney.model import TINY, Factors, compose, geometry
 from ...tasks.disney.training import measure, random_directions, random_materials, shade
-from ...tasks.texture.presets import PRESETS
+from ...tasks.texture import PRESETS
 from ...tasks.texture.training import TextureProblem
 
 #: Hidden units of a layer, and hidden layers, of networks after a hash grid.
@@ -500,7 +500,7 @@ class BSDFNetworkProblem(BSDFProblem):
         truth = truth_of(source, types)
         samples = bsdf_training.draw(truth, types, bsdf_training.SAMPLES, 2, True)
         network = bsdf_network().alloc(mi.TensorXf, rng=dr.rng(seed=dr.opaque(mi.UInt64, 1)))
-        super().__init__(network, Form(scale=scale), samples, bsdf_training.view_psnr(SphereView(truth, types)))
+        super().__init__(network, Form(scale=scale), samples, bsdf_training.view_psnr([((), SphereView(truth, types))]))
         self.inputs, self.mean = inputs, mean_logarithm(samples)
         self.identity = {"source": truth.digest, "inputs": inputs, "scale": list(scale)}
 
@@ -523,7 +523,7 @@ class BSDFNetworkProblem(BSDFProblem):
 
     def measure(self, net) -> dict[str, float]:
         with dr.suspend_grad():
-            return self._measure(self.bsdf(net))
+            return self._measure(lambda coordinates: self.bsdf(net))
 
 
 def mean_logarithm(samples) -> float:

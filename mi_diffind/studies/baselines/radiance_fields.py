@@ -22,8 +22,8 @@ from drjit import nn
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
-from ...arrays.bits import pack_bits
 from ...arrays.indirection import device_array, device_tensor
+from ...arrays.lookup import pack_bits
 from ...core.units import largest_fitting
 from ...tasks.radiance.grid import DENSITY_SCALE
 from ...tasks.radiance.march import march, replay
