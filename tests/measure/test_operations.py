@@ -1,12 +1,11 @@
 """Counts of operations: against expressions counted by hand, and whether effects that are left out fall out."""
 
 import drjit as dr
-import numpy as np
 import pytest
 from variants import BACKENDS
 
 from mi_diffind.core.runtime import array_module
-from mi_diffind.measure.clock import FLOPS, Operations, bsdf_operations, count
+from mi_diffind.measure.clock import Operations, bsdf_operations, count
 
 LANES = 64
 
@@ -53,13 +52,6 @@ def test_against_expressions_counted_by_hand(ad, name):
     assert found.flops == expected[0] + expected[1] + 2 * expected[2] + 4 * expected[3]
 
 
-def test_instructions_are_those_that_compute(ad):
-    x, y, z = floats(ad, 3)
-    assert count(lambda: dr.fma(x, y, z)).instructions == 1
-    assert count(lambda: dr.select(x < y, x * y, z)).instructions == 3
-    assert count(lambda: [x + 0, y]).instructions == 0
-
-
 def test_inputs_and_outputs_are_not_counted(ad):
     x, y, _ = floats(ad, 3)
     scalar = ad.Float(3)
@@ -101,24 +93,6 @@ def test_transcendental_functions_count_as_what_they_are(ad):
         assert found.log == 1
 
 
-def test_cached_kernels_are_counted_again(ad):
-    x, y, z = floats(ad, 3)
-    first = count(lambda: dr.fma(x, y, z) / x)
-    assert count(lambda: dr.fma(x, y, z) / x) == first == Operations(add=1, mul=1, div=1, instructions=2)
-
-
-def test_everything_that_is_evaluated_is_counted(ad):
-    """Also what the function evaluates on the way, in a kernel of its own."""
-    x, y, _ = floats(ad, 3)
-
-    def function():
-        product = x * y
-        dr.eval(product)
-        return product + x
-
-    assert count(function) == Operations(add=1, mul=1, instructions=2)
-
-
 def test_calls_are_counted(ad):
     """The functions of a dispatch, all of them; not the helpers that Dr.Jit adds to a kernel."""
     x, _, _ = floats(ad, 3)
@@ -126,12 +100,6 @@ def test_calls_are_counted(ad):
     dr.make_opaque(index)
     found = count(lambda: dr.switch(index, [lambda v: dr.sqrt(v) * v, lambda v: v / (v + 1)], x))
     assert (found.add, found.mul, found.div, found.sqrt) == (1, 1, 1, 1)
-
-
-def test_sums_and_names():
-    a, b = Operations(add=1, mul=2, gathers=3), Operations(add=10, sqrt=1, instructions=7)
-    assert a + b == Operations(add=11, mul=2, sqrt=1, gathers=3, instructions=7)
-    assert (a + b).asdict()["flops"] == 11 + 2 + 4 and set(FLOPS) < set(a.asdict())
 
 
 # -- materials --------------------------------------------------------------------------------------------------------
@@ -163,31 +131,6 @@ def test_reads_of_tables(mi_rgb, preset):
         small = bsdf_operations(load(mi_rgb, type="neural_disney", preset=preset, storage="uint8"), methods=("eval",))
         assert list(small) == ["eval"]
         assert small["eval"].bytes_gathered < found["eval"].bytes_gathered
-
-
-def test_textures_are_part_of_it(mi_rgb):
-    data = np.random.default_rng(1).uniform(0.1, 0.9, (8, 8, 1)).astype(np.float32)
-    texture = {"type": "bitmap", "raw": True, "data": mi_rgb.TensorXf(data)}
-    constant, textured = (bsdf_operations(load(mi_rgb, roughness=r)) for r in (0.4, texture))
-    for method in ("eval", "pdf", "sample"):
-        assert constant[method].gathers == 0
-        assert (textured[method].gathers, textured[method].bytes_gathered) == (4, 16)  # bilinear
-        assert constant[method].flops < textured[method].flops
-
-
-def test_positions_are_inputs(mi_rgb):
-    """Which square of a checkerboard is hit is not known before."""
-    bsdfs = [{"type": "diffuse"}, {"type": "diffuse", "reflectance": {"type": "checkerboard"}}]
-    constant, textured = (bsdf_operations(mi_rgb.load_dict(b), ("eval",))["eval"] for b in bsdfs)
-    assert textured.instructions - constant.instructions > 5
-
-
-def test_any_bsdf(mi_any):
-    for name in ("principled", "disney", "diffuse", "roughconductor"):
-        found = bsdf_operations(mi_any.load_dict({"type": name}))
-        assert set(found) == {"eval", "pdf", "sample"}
-        assert found["sample"].flops > found["pdf"].flops > 0
-        assert found["eval"].instructions > 0
 
 
 def test_bad_method(mi_rgb):

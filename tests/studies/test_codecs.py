@@ -1,4 +1,4 @@
-"""Codecs that learned textures are compared with: sane round trips, exact bytes, budgets kept, sentences for errors."""
+"""Codecs: order of channels, exact bytes, memory budgets that are kept, sentences for errors."""
 
 import importlib.util
 import itertools
@@ -7,17 +7,13 @@ import sys
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from mi_diffind.images.metrics import psnr
 from mi_diffind.studies.baselines import codecs
-from mi_diffind.studies.baselines.codecs import ASTC_BLOCKS, CodecError, Encoded
+from mi_diffind.studies.baselines.codecs import ASTC_BLOCKS, CodecError
 
-MODULES = {
-    "astc": ("astc_encoder",),
-    "bc7": ("ispc_texcomp", "texture2ddecoder"),
-    **dict.fromkeys(("jpeg", "webp"), ()),
-}
-SIZES = [(1, 1), (7, 5), (1, 4096), (33, 70)]
+MODULES = {"astc": ("astc_encoder",), "bc7": ("ispc_texcomp", "texture2ddecoder")}
 QUICK = {"quality": "fastest"}
 
 
@@ -31,6 +27,8 @@ def every(*names):
 
 
 every_codec = every("astc", "bc7", "jpeg", "webp", "bicubic")
+
+
 astc_only = needs("astc")
 
 
@@ -57,49 +55,15 @@ def encode(codec, image, nbytes=None):
     return codecs.bc7(image) if codec == "bc7" else getattr(codecs, codec)(image, 95)
 
 
-def check(image, coded):
-    assert isinstance(coded, Encoded)
-    assert coded.image.shape == image.shape and coded.image.dtype == np.float32
-    assert coded.image.min() >= 0 and coded.image.max() <= 1
-    assert coded.nbytes > 0
-
-
 @every_codec
 @pytest.mark.parametrize("channels", [1, 2, 3, 4])
 def test_channels(codec, channels):
     image = picture(96, 80, channels)
     coded = encode(codec, image)
-    check(image, coded)
+    assert coded.image.shape == image.shape and coded.image.min() >= 0 and coded.image.max() <= 1 and coded.nbytes > 0
     assert psnr(image, coded.image) > (27 if codec == "webp" else 31)
     for c in range(channels):
         assert psnr(image[..., c], coded.image[..., c]) > 25  # the channels are in their order
-
-
-@every_codec
-@pytest.mark.parametrize("size", SIZES)
-def test_sizes(codec, size):
-    image = picture(*size)
-    coded = encode(codec, image)
-    check(image, coded)
-    assert psnr(image, coded.image) > 22
-
-
-@every_codec
-@pytest.mark.parametrize("channels", [1, 2, 3, 4])
-def test_constant(codec, channels):
-    image = np.broadcast_to(np.float32([0.2, 0.5, 0.8, 0.4][:channels]), (13, 22, channels))
-    coded = encode(codec, image, 1)
-    limit = {"jpeg": 3, "webp": 4}.get(codec, 1) if channels > 2 else {"webp": 2}.get(codec, 1)
-    assert np.abs(coded.image - image).max() <= (limit + 1e-3) / 255
-
-
-@every_codec
-def test_repeatable_and_input_untouched(codec):
-    image = picture(20, 31)
-    before = image.copy()
-    first, second = encode(codec, image), encode(codec, image)
-    assert np.array_equal(image, before)
-    assert first.nbytes == second.nbytes and np.array_equal(first.image, second.image)
 
 
 @every_codec
@@ -120,22 +84,8 @@ def test_refused(codec, image, match):
 
 
 @astc_only
-def test_astc_blocks():
-    image = picture(120, 120)
-    assert len(ASTC_BLOCKS) == 14 and ASTC_BLOCKS["4x4"] == 8 and ASTC_BLOCKS["10x5"] == 2.56
-    found = [codecs.astc(image, block, "fast") for block in ASTC_BLOCKS]
-    for (block, bits), coded in zip(ASTC_BLOCKS.items(), found, strict=True):
-        assert coded.codec == f"ASTC {block}" and coded.nbytes == 120 * 120 * bits / 8
-        assert coded.nbytes == codecs.astc_bytes(image.shape, block)
-    errors = [psnr(image, coded.image) for coded in found]
-    assert errors[0] > 35 and errors[-1] > 20
-    assert all(b < a + 0.3 for a, b in itertools.pairwise(errors)) and errors[-1] < errors[0] - 8
-
-
-@astc_only
-@pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("block", ["4x4", "10x5", "12x12"])
-@pytest.mark.parametrize("reduce", [1, 2])
+@pytest.mark.parametrize("size", [(1, 1), (7, 5), (33, 70)])
+@pytest.mark.parametrize("block, reduce", [("4x4", 1), ("10x5", 2)])
 def test_astc_bytes(size, block, reduce):
     w, h = map(int, block.split("x"))
     height, width = (math.ceil(n / reduce) for n in size)
@@ -146,55 +96,15 @@ def test_astc_bytes(size, block, reduce):
 
 
 @astc_only
-def test_astc_quality():
-    image = picture(96, 96)
-    errors = [psnr(image, codecs.astc(image, "6x6", q).image) for q in ("fastest", "medium", "thorough")]
-    assert errors[0] < errors[1] < errors[2]
-
-
-@astc_only
-def test_astc_two_channels_weigh_the_same():
-    image = picture(96, 96, 2)
-    one, other = (codecs.astc(i, "8x8", "medium").image for i in (image, image[..., ::-1]))
-    assert abs(psnr(image, one) - psnr(image[..., ::-1], other)) < 0.5
-
-
-@astc_only
 @pytest.mark.parametrize("reduce", [1, 2])
 def test_astc_normal(reduce):
     image = normal_map(90, 70)
     coded = codecs.astc(image, "5x5", "fast", normal=True, reduce=reduce)
-    check(image, coded)
     assert " xy" in coded.codec and psnr(image, coded.image) > 25
     length = np.linalg.norm(2 * coded.image - 1, axis=-1)
     assert np.abs(length - 1).max() < 1e-5
     flat = np.broadcast_to(np.float32([0.5, 0.5, 1]), (9, 9, 3))
     assert np.abs(codecs.astc(flat, "8x8", normal=True, **QUICK).image - flat).max() <= 1 / 255
-
-
-@every("bc7")
-@pytest.mark.parametrize("size", SIZES)
-def test_bc7_bytes(codec, size):
-    assert codecs.bc7(picture(*size)).nbytes == 16 * math.ceil(size[0] / 4) * math.ceil(size[1] / 4)
-
-
-@every("jpeg", "webp")
-def test_files(codec):
-    image = picture(120, 90)
-    found = [getattr(codecs, codec)(image, q) for q in (5, 30, 60, 90)]
-    for a, b in itertools.pairwise(found):
-        assert a.nbytes < b.nbytes and psnr(image, a.image) < psnr(image, b.image)
-    assert found[-1].codec == {"jpeg": "JPEG 90", "webp": "WebP 90"}[codec]
-    pair = picture(40, 40, 2)
-    single = [getattr(codecs, codec)(pair[..., c : c + 1], 50) for c in range(2)]
-    both = getattr(codecs, codec)(pair, 50)
-    assert both.nbytes == sum(e.nbytes for e in single)
-    assert np.array_equal(both.image, np.concatenate([e.image for e in single], -1))
-
-
-def test_too_long_for_webp():
-    with pytest.raises(CodecError, match=r"^WebP cannot store 16384x1 texels, at most 16383 a side$"):
-        codecs.webp(np.zeros((1, 16384, 1), np.float32), 50)
 
 
 def test_bicubic():
@@ -223,51 +133,8 @@ def test_at_bytes_files(codec, channels):
     assert highest.codec.split()[1] == "100"
 
 
-def test_at_bytes_bicubic():
-    assert codecs.at_bytes("bicubic", picture(40, 40), 1200).codec == "bicubic 20x20"
-
-
-@every("bc7")
-def test_at_bytes_bc7(codec):
-    assert codecs.at_bytes(codec, picture(16, 16), 1).nbytes == 256
-
-
-def material():
-    return {
-        "base": np.repeat(picture(60, 72, 1), 3, -1),
-        "normal": normal_map(60, 72),
-        "rough": np.full((60, 72, 1), 0.5, np.float32),
-    }
-
-
 def squared(maps, coded):
     return sum(float(np.sum((maps[k] - e.image) ** 2, dtype=np.float64)) for k, e in coded.items())
-
-
-@astc_only
-def test_material():
-    maps, cache = material(), {}
-    options = {"quality": "fast", "choose": "fast", "reduces": (1, 2), "cache": cache}
-    errors = []
-    for n in (60 * 72 // 4, 60 * 72 // 2):
-        best, total = codecs.astc_material(maps, n, **options)
-        even, even_total = codecs.astc_material(maps, n, uniform=True, **options)
-        assert total == sum(e.nbytes for e in best.values()) <= n and even_total <= n
-        assert list(best) == list(even) == list(maps)
-        for name, e in best.items():
-            check(maps[name], e)
-            assert e.codec.startswith("ASTC ")
-        assert np.array_equal(best["base"].image[..., 0], best["base"].image[..., 2])
-        settings = {e.codec.replace(" xy", "") for e in even.values()}
-        assert len(settings) == 1
-        errors.append(squared(maps, best))
-        assert errors[-1] < squared(maps, even)
-    assert errors[1] < errors[0]
-    known = len(cache)
-    again, _ = codecs.astc_material(maps, 60 * 72 // 2, **options)
-    assert len(cache) == known and {k: e.codec for k, e in again.items()} == {k: e.codec for k, e in best.items()}
-    with pytest.raises(CodecError, match=r"^ASTC cannot store base, normal, rough in 10 bytes$"):
-        codecs.astc_material(maps, 10, **options)
 
 
 @astc_only
@@ -282,17 +149,6 @@ def test_material_is_optimal():
     rounded = {k: np.rint(image * 255) / 255 for k, image in maps.items()}
     least = min(squared(rounded, dict(zip(maps, p, strict=True))) for p in fitting)
     assert total <= n and squared(rounded, found) == pytest.approx(least, rel=1e-4)
-
-
-@astc_only
-def test_normals_without_z_where_that_is_better():
-    normal = {"normal": normal_map(48, 48)}
-    options = {"quality": "fast", "choose": "fast", "reduces": (1, 4)}
-    errors = [
-        squared(normal, codecs.astc_material(normal, 48 * 48 // 4, normals=names, **options)[0])
-        for names in ((), ("normal",))
-    ]
-    assert errors[1] <= errors[0]
 
 
 @pytest.mark.parametrize(
@@ -313,9 +169,36 @@ def test_missing_package(monkeypatch, codec, module, package):
     if codec == "astc":
         assert {"jpeg", "webp", "bicubic"} <= set(codecs.available())
         with pytest.raises(CodecError, match="astc-encoder-py"):
-            codecs.astc_material(material(), 1000)
+            codecs.astc_material({"base": picture(8, 8)}, 1000)
 
 
-@every_codec
-def test_available(codec):
-    assert codec in codecs.available()
+def smooth(height, width, channels, seed=0):
+    random = np.random.default_rng(seed).random((height, width, channels))
+    values = gaussian_filter(random, (2, 2, 0), mode="wrap")
+    values = (values - values.min()) / (values.max() - values.min())
+    return np.rint(255 * values).astype(np.uint8)
+
+
+@astc_only
+def test_astc_with_mip_maps():
+    maps = {"albedo": [], "ao": []}
+    for i in range(6):
+        maps["albedo"].append(smooth(32 >> i, 32 >> i, 3).astype(np.float32) / 255 if i < 5 else np.ones((1, 1, 3)))
+        maps["ao"].append(smooth(32 >> i, 32 >> i, 1, 1).astype(np.float32) / 255 if i < 5 else np.ones((1, 1, 1)))
+    options = {"quality": "fast", "choose": "fast", "cache": {}}
+    errors = []
+    for nbytes in (3000, 1200, 400):
+        found, taken = codecs.astc_levels(maps, nbytes, **options)
+        assert taken == sum(e.nbytes for e in found.values()) <= nbytes
+        for name, e in found.items():
+            block = e.codec.split()[1]
+            drop = int(e.codec.split("level ")[1].split()[0]) if "level" in e.codec else 0
+            assert e.nbytes == sum(codecs.astc_bytes(level.shape, block) for level in maps[name][drop:])
+            assert [level.shape for level in e.levels] == [level.shape for level in maps[name]]
+            alone = codecs.astc(maps[name][drop + 1], block, "fast")
+            np.testing.assert_array_equal(e.levels[drop + 1], alone.image)
+        errors.append(sum(float(((e.levels[0] - maps[n][0]) ** 2).sum()) for n, e in found.items()))
+    assert errors == sorted(errors) and errors[0] < errors[-1]
+    assert "level" in "".join(e.codec for e in found.values())  # so little takes less than all levels
+    with pytest.raises(codecs.CodecError, match="100 bytes"):
+        codecs.astc_levels(maps, 100, **options)

@@ -186,26 +186,6 @@ def test_interruption_and_the_same_errors_in_the_end(scene, whole, tmp_path, mon
     assert sorted(os.listdir(out)) == FILES
 
 
-@pytest.mark.parametrize("change", ["scene", "settings", "seed"])
-def test_a_run_of_something_else_is_not_gone_on_with(scene, tmp_path, monkeypatch, capsys, change):
-    out, settings, seed = tmp_path / "out", QUICK, 0
-    with monkeypatch.context() as patch:
-        Renders(patch, 4)
-        assert study.measure(scene, settings, out, seed, progress=False)["interrupted"]
-    if change == "scene":
-        scene.write_text(scene.read_text(encoding="utf-8").replace("0.3, 0.2", "0.3, 0.1"), encoding="utf-8")
-    elif change == "settings":
-        settings = replace(QUICK, rounds=1)
-    else:
-        seed = 1
-    with monkeypatch.context() as patch:
-        Renders(patch, 1)
-        result = study.measure(scene, settings, out, seed)
-    assert not result["resumed"]
-    names = {"scene": "sources", "settings": "settings", "seed": "seed"}
-    assert f"is of a run with other {names[change]}: starting anew" in capsys.readouterr().err
-
-
 def test_large_images_are_rendered_in_several_launches(scene, monkeypatch):
     renders = Renders(monkeypatch)
     result = study.measure(scene, replace(QUICK, rounds=1), progress=False, launch_samples=16 * 12 * 2)
