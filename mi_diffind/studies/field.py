@@ -291,7 +291,7 @@ def longer_reference(context: RadianceStudyContext) -> Contender:
         settings = replace(SETTINGS, steps=steps, measure_every=steps)
         if fit(problem, settings, progress=progress, title=job.name).interrupted:
             return None
-        grid = problem.trained()
+        grid = problem.grid()
         job.save_arrays(density=grid.density, colour=grid.colour)
         job.model = grid.field()
         nbytes = 52 * grid.nodes.count
