@@ -128,11 +128,8 @@ class ShadingStudySettings:
 #: Options with a positive number → help.
 _NUMBERS = {
     "--seeds": "number of seeds of each training (default: 3; --quick: 1)",
-    "--seconds": "seconds of training for shading (default: 15; --quick: 1)",
-    "--pretrain-seconds": "seconds of training as a texture before (default: 20; --quick: 1)",
-    "--steps": "steps of training for shading in place of seconds, independent of the machine's speed; needs "
-    "--pretrain-steps",
-    "--pretrain-steps": "steps of training as a texture",
+    "--steps": "steps of training for shading (default: 15 seconds; --quick: 1 second); needs --pretrain-steps",
+    "--pretrain-steps": "steps of training as a texture before (default: 20 seconds; --quick: 1 second)",
     "--side": "texels on a side of generated materials (default: 512; --quick: 64)",
     "--frames": "frames of the zoom (default: 60; --quick: 4)",
 }
@@ -174,8 +171,6 @@ class ShadingStudy(Study):
         """Check the options and load the materials; raise as :func:`.load_source` does."""
         if (arguments.steps is None) != (arguments.pretrain_steps is None):
             raise ValueError("--steps and --pretrain-steps: found one of them, both or none are allowed")
-        if arguments.steps and (arguments.seconds or arguments.pretrain_seconds):
-            raise ValueError("--steps: found beside seconds, only one of them is allowed")
         if arguments.extras and arguments.preset == "paper":
             raise ValueError("--extras: the arrays of the preset paper have none")
         arguments.ratio = parse_compression(arguments.compression)
@@ -203,8 +198,8 @@ class ShadingStudy(Study):
             tuple(sorted({0.0, *(arguments.lambdas or ((0.9,) if quick else LAMBDAS))})),
             ways[:: len(ways) - 1] if quick and len(ways) > 1 else ways,
             arguments.seeds or (1 if quick else 3),
-            float(arguments.steps or arguments.seconds or (1 if quick else 15)),
-            float(arguments.pretrain_steps or arguments.pretrain_seconds or (1 if quick else 20)),
+            float(arguments.steps or (1 if quick else 15)),
+            float(arguments.pretrain_steps or (1 if quick else 20)),
             arguments.ratio,
             arguments.frames or (4 if quick else 60),
             quick,
