@@ -421,11 +421,14 @@ class ShadingStudyContext:
         trained.preset, trained.seed = self.settings.preset, seed
         return trained, result
 
-    def trained(self, method: str, label: str, train: Callable[[bool], tuple[Table, FitResult, dict]]) -> Contender:
+    def trained(
+        self, method: str, label: str, train: Callable[[bool], tuple[Table, FitResult, dict]],
+        finish: Callable[[dict], None] = lambda record: None,
+    ) -> Contender:  # fmt: skip
         """Return the contender of a texture that ``train(progress)`` trains; its table stays in the folder of models.
 
-        ``train`` returns the table, the record of the training, and further details. The model has the attribute
-        ``table``.
+        ``train`` returns the table, the record of the training, and further details; ``finish`` completes the record.
+        The model has the attribute ``table``.
         """
 
         def fit(job: Contender, progress: bool) -> dict | None:
@@ -437,7 +440,9 @@ class ShadingStudyContext:
             job.model = TrainedReader(table, self)
             training = {"steps": result.steps, "kept_step": result.step, "restarts": result.restarts,
                         "history": result.history, "training_seconds": result.seconds}  # fmt: skip
-            return self.measure(job, table.nbytes, **training, **details)
+            record = self.measure(job, table.nbytes, **training, **details)
+            finish(record)
+            return record
 
         def read(job: Contender) -> TrainedReader:
             return TrainedReader(task.tasks()["texture"].load(job.file), self)
@@ -496,18 +501,13 @@ class ShadingStudyContext:
                 details["has_extras"] = table.settings.get("shading", {}).get("extras", False)
             return table, result, details
 
+        def finish(record: dict) -> None:
+            before = base.record["details"] if base is not None and base.record else None
+            record["details"]["trouble"] = troubles(record["details"], before)
+
         name = f"extras, seed {seed}" if extras else f"lambda {share:g}, {way.name}, seed {seed}"
-        job = self.trained("extras" if extras else "run", name, train)
-        fit = job.fit
-
-        def fit_with_troubles(job: Contender, progress: bool) -> dict | None:
-            record = fit(job, progress)
-            if record is not None:
-                before = base.record["details"] if base is not None and base.record else None
-                record["details"]["trouble"] = troubles(record["details"], before)
-            return record
-
-        job.fit, job.details = fit_with_troubles, {"share": share, "way": way, "base": base, "start": start}
+        job = self.trained("extras" if extras else "run", name, train, finish)
+        job.details = {"share": share, "way": way, "base": base, "start": start}
         return job
 
 
