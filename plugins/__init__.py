@@ -16,7 +16,7 @@ from typing import Any
 from mi_diffind.core import compat, discovery
 
 #: Modules of this package that are no plugins.
-IGNORED = ("support",)
+IGNORED = ("support", "mitsuba_entry")
 
 #: Type of a plugin → the class in ``mitsuba`` whose instances its factory returns.
 OBJECT_TYPES = {"bsdf": "BSDF", "texture": "Texture", "shape": "Shape", "volume": "Volume", "integrator": "Integrator"}

@@ -11,7 +11,7 @@ from variants import BACKENDS
 
 from mi_diffind import DifferentiableArray, Indirection, fold
 from mi_diffind.arrays import lookup
-from mi_diffind.arrays.indirection import ramp, unfolded
+from mi_diffind.arrays.indirection import unfolded
 from mi_diffind.core.runtime import array_module
 
 BELOW_ONE = np.float32(1) - np.float32(2**-23)
@@ -69,13 +69,6 @@ def test_fold_values(ad):
     np.testing.assert_array_equal(fold(ad.Float(inside)).numpy(), inside)
 
 
-def test_fold_is_periodic_and_even(ad):
-    x = np.random.default_rng(2).uniform(-1, 1, 1000).astype(np.float32)
-    for period in (2, -2, 4, -6, 100):
-        np.testing.assert_allclose(fold(ad.Float(x) + period).numpy(), fold(ad.Float(x)).numpy(), atol=1e-5)
-    np.testing.assert_allclose(fold(-ad.Float(x)).numpy(), fold(ad.Float(x)).numpy(), atol=2e-7)
-
-
 def test_fold_never_reaches_one(ad):
     """Around every odd number, and for any finite bit pattern: at least 0 (up to a flushed denormal) and below 1."""
     odd = np.arange(-99, 100, 2).astype(np.float32)
@@ -112,18 +105,6 @@ def test_ramp(ad, resolution, border):
         x = uniform(0, 100, dims)
         for k, n in enumerate(resolution):
             np.testing.assert_allclose(read(array, ad, x)[:, k], x[:, k] if n > 1 else 0, atol=2e-7)
-
-
-def test_constant(ad):
-    assert (DifferentiableArray((3, 4), 3).alloc(ad.TensorXf).numpy() == 0.5).all()
-    array = DifferentiableArray((3, 4), 3, "constant", (0.5, 0.5, 1)).alloc(ad.TensorXf)
-    np.testing.assert_array_equal(array.numpy(), np.broadcast_to(np.float32([0.5, 0.5, 1]), (3, 4, 3)))
-
-
-def test_given_entries(ad):
-    entries = np.random.default_rng(4).normal(size=(3, 4, 5)).astype(np.float32)
-    for given in (entries, ad.TensorXf(entries), entries.astype(np.float64)):
-        np.testing.assert_array_equal(DifferentiableArray((3, 4), 5, given).alloc(ad.TensorXf).numpy(), entries)
 
 
 def test_random_is_seeded(ad):
@@ -191,14 +172,6 @@ def test_values(ad, storage):
     np.testing.assert_allclose(np.stack([v.numpy() for v in net.pointer([ad.Float(v) for v in x.T.copy()])], 1),
                                interpolate(p, x), rtol=1e-5, atol=1e-6 if atol == 0 else 1 / 255 / 64)  # fmt: skip
     np.testing.assert_allclose(read(net, ad, x), interpolate(c, interpolate(p, x)), rtol=1e-5, atol=atol)
-
-
-def test_storage_can_differ(ad):
-    net = pair(ad).to("uint8", "float16")
-    assert net.primary[0].storage == "uint8" and net.cascaded.storage == "float16"
-    back = net.to("float32")
-    x = uniform(2, 100, 2)
-    np.testing.assert_allclose(read(back, ad, x), read(net, ad, x), rtol=1e-5, atol=5e-4)
 
 
 def test_gradients_equal_central_differences(ad):
@@ -310,13 +283,6 @@ def test_unfolded(ad, storage):
     assert [a.folded for a in arrays] == [storage == "float32"] * 2 + [False]  # the net is as it was
 
 
-def test_what_has_no_float_entries_stays(ad):
-    packed = DifferentiableArray(4, 2, "ramp").alloc(ad.TensorXf).to("uint8")
-    layer = nn.Linear(3, 4)
-    assert unfolded(packed) is packed and unfolded(5) == 5
-    assert type(unfolded((packed, layer))) is tuple and type(unfolded(layer)) is nn.Linear
-
-
 @pytest.mark.parametrize("storage", lookup.STORAGES)
 def test_several_primaries(ad, storage):
     """Outputs are concatenated in the order of the primaries; ``inputs`` says who reads what."""
@@ -335,12 +301,6 @@ def test_several_primaries(ad, storage):
     pointers = [interpolate(p.numpy(), x[:, list(g)]) for p, g in zip(net.primary, groups, strict=True)]
     expected = interpolate(net.cascaded.numpy(), np.concatenate(pointers, axis=1))
     np.testing.assert_allclose(read(net, ad, x), expected, rtol=1e-5, atol=5e-4 if storage == "uint8" else 0)
-
-
-def test_inputs_default_to_consecutive_ones():
-    arrays = [DifferentiableArray((4, 4), 3), DifferentiableArray(4, 1)]
-    assert Indirection(arrays, DifferentiableArray((2,) * 4)).inputs == ((0, 1), (2,))
-    assert Indirection(arrays[1], DifferentiableArray(4)).inputs == ((0,),)
 
 
 @pytest.mark.parametrize("storage", lookup.STORAGES)
@@ -382,25 +342,6 @@ def test_what_remains_where_a_coordinate_is_known(ad, dims, channels, storage, b
         if border == "clamp":
             position = np.nan_to_num(everywhere)
             np.testing.assert_allclose(values, interpolate(array.numpy(), position), atol=tolerance)
-
-
-@pytest.mark.parametrize("storage", lookup.STORAGES)
-def test_what_remains_of_mixed_borders(ad, storage):
-    """Each axis keeps its own."""
-    rng = np.random.default_rng(1)
-    table, border = rng.uniform(0.5, 1.5, (4, 3, 5, 2)), ("repeat", "clamp", "repeat")
-    array = DifferentiableArray.from_numpy(table, ad.TensorXf, border)
-    array = array if storage == "float32" else array.to(storage)
-    rest = uniform(5, 100, 2) * 3 - 1
-    row = array.at(ad.Float(1.7))
-    assert row.border == ("repeat", "clamp")
-    expected = read(array, ad, np.column_stack([rest, np.full(100, 1.7, np.float32)]))
-    np.testing.assert_allclose(read(row, ad, rest), expected, atol=5e-4 if storage == "uint8" else 2e-6)
-
-
-def test_a_coordinate_may_be_a_number(ad):
-    array = known(ad, 2, 3, "float32")
-    np.testing.assert_array_equal(array.at(0.3).numpy(), array.at(ad.Float(0.3)).numpy())
 
 
 def test_what_remains_is_folded(ad):
@@ -451,16 +392,6 @@ def test_gradients_of_what_remains(ad, dims, border):
         assert gradient[index] == pytest.approx(expected, rel=1e-3, abs=1e-4)
     expected = (number(table, x + 1e-2) - number(table, x - 1e-2)) / 2e-2  # linear within a cell
     assert coordinate.grad.numpy()[0] == pytest.approx(expected, rel=1e-3, abs=1e-3)
-
-
-@pytest.mark.parametrize("storage", lookup.STORAGES)
-def test_a_row_of_an_indirection(ad, storage):
-    net = pair(ad, primary=(5, 6))
-    net = net if storage == "float32" else net.to(storage)
-    x = uniform(2, 100, 1)
-    row = Indirection(net.primary[0].at(ad.Float(0.6)), net.cascaded)
-    expected = read(net, ad, np.column_stack([x, np.full(100, 0.6, np.float32)]))
-    np.testing.assert_allclose(read(row, ad, x), expected, atol=2e-3 if storage == "uint8" else 2e-5)
 
 
 def test_an_array_of_one_dimension_has_nothing_that_remains(ad):
@@ -703,12 +634,6 @@ def test_impossible_settings(name):
     assert "\n" not in str(caught.value)
 
 
-def test_numpy_integers_are_integers():
-    array = DifferentiableArray(np.int64(4), np.int32(2))
-    assert array.resolution == (4,) and array.channels == 2
-    assert DifferentiableArray(np.array([4, 5])).resolution == (4, 5)
-
-
 def test_mistakes_when_reading(ad):
     net = pair(ad)
     x = ad.Float(0.5)
@@ -731,8 +656,3 @@ def test_mistakes_when_reading(ad):
         net.cascaded.codes()
     with pytest.raises(ValueError, match="2 input"):
         net.alloc(ad.TensorXf, 3)
-
-
-def test_ramp_function():
-    np.testing.assert_array_equal(ramp((3,), 1, ("clamp",))[:, 0], [0, 0.5, 1])
-    np.testing.assert_array_equal(ramp((4,), 1, ("repeat",))[:, 0], [0, 0.25, 0.5, 0.75])

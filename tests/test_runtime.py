@@ -135,15 +135,6 @@ def test_version_of_a_library(tmp_path):
     assert library_version("libc.so.6") is None  # a library, but another one
 
 
-@linux
-def test_version_of_the_library_in_use():
-    usable = [p for p in [*runtime.pip_libraries(), *system_libraries()] if (library_version(p) or 0) >= MIN_LLVM]
-    if not usable:
-        pytest.skip("no LLVM to look at")
-    assert runtime._named_version(os.path.basename(usable[0])) in (0, library_version(usable[0]))
-    assert dr.detail.llvm_version()[0] >= MIN_LLVM
-
-
 def test_array_module():
     for name in ("metal", "scalar_rgb"):
         with pytest.raises(UsageError, match=f'the variant "{name}" is not vectorised'):
@@ -238,11 +229,6 @@ assert not {"drjit", "mitsuba", "numpy"} & set(sys.modules), sorted(sys.modules)
 assert len(set(sys.meta_path) - before) == 1
 assert mi_diffind.core.runtime.llvm_problem() is None
 """
-
-
-def test_importing_imports_nothing():
-    """Neither Dr.Jit nor Mitsuba: they are met when they come."""
-    succeeds(LIGHT)
 
 
 def test_each_import_is_met_once():
@@ -416,11 +402,6 @@ except Exception as e:
 """
     done = succeeds(code, aborting)
     assert done.stdout.split() == ["refused"] * 4 and done.stderr.count("RuntimeWarning") == 1
-
-
-def test_rendering_with_an_unusable_library_is_an_exception(tmp_path):
-    done = python(f"import mi_diffind\n{RENDER}", str(tmp_path / "none.so"))
-    assert done.returncode == 1 and "karellen-llvm-core" in done.stderr
 
 
 @pytest.mark.parametrize("imported", ["drjit", "mitsuba"])

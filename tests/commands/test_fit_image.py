@@ -5,8 +5,6 @@ import json
 import os
 import re
 import signal
-import subprocess
-import sys
 import zipfile
 
 import numpy as np
@@ -18,8 +16,7 @@ from mi_diffind.commands.cli import main
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting.task import tasks
 from mi_diffind.maps.layout import Layout, MapLayout
-from mi_diffind.tasks.image import presets, search, training
-from mi_diffind.tasks.image.presets import STRUCTURES
+from mi_diffind.tasks.image import training
 
 SHORT = ["--steps", "4", "--batch", "256", "--variant", "llvm_ad_rgb", "--dims", "2"]
 
@@ -124,82 +121,7 @@ def test_sources_of_every_kind(folder, capsys, name):
     assert found["measured"] == table.measured and found["settings"]["source_path"] == file
 
 
-@pytest.mark.parametrize("array", [noise(1, 1, 3), noise(7, 5, 3), np.full((6, 6, 3), 77, np.uint8)])
-def test_the_papers_recipe_on_the_smallest_sources(folder, array):
-    write("a.png", array)
-    assert fit("a.png", "--preset", "paper", "--dims", "4") == 0
-    maps, layout, table = decoded()
-    assert layout.stored == 3 and table.arrays["primary"].shape == (1, 1, 4)
-    assert maps["image"].shape == array.shape and np.isfinite(maps["image"]).all()
-
-
-def test_values_that_are_not_finite(folder, capsys):
-    values = noise(6, 6, 3, dtype=np.float32)
-    values[2, 3, 1], values[4, 4, 0] = np.nan, np.inf
-    write("a.exr", values)
-    assert 'a.exr: map "image" has 2 values that are NaN or infinite' in refused(
-        capsys, "fit", "image", "a.exr", "-o", "out.npz", *SHORT
-    )
-    assert os.listdir(folder) == ["a.exr"]
-    assert fit("a.exr", "--nonfinite", "clean") == 0
-    assert np.isfinite(decoded()[0]["image"]).all()
-
-
-@pytest.mark.parametrize("extension", ["png", "exr"])
-def test_damaged_sources(folder, capsys, extension):
-    write(f"a.{extension}", noise(9, 8, 3) if extension == "png" else noise(9, 8, 3, dtype=np.float32))
-    content = (folder / f"a.{extension}").read_bytes()
-    for damaged in (b"", b"hello", content[: len(content) // 2], content[:-20]):
-        (folder / f"a.{extension}").write_bytes(damaged)
-        assert f"a.{extension}: " in refused(capsys, "fit", "image", f"a.{extension}", "-o", "out.npz", *SHORT)
-    assert "gone.png: no such file" in refused(capsys, "fit", "image", "gone.png", "-o", "out.npz", *SHORT)
-    assert os.listdir(folder) == [f"a.{extension}"]
-
-
-def test_manifests(folder, capsys):
-    albedo, orm, normal = noise(6, 7, 3), noise(6, 7, 3, seed=1), np.full((6, 7, 3), (128, 128, 255), np.uint8)
-    (folder / "maps").mkdir()
-    for name, array in (("albedo", albedo), ("orm", orm), ("normal", normal)):
-        write(folder / "maps" / f"{name}.png", array)
-    maps = {
-        "albedo": "albedo.png",
-        "roughness": {"file": "orm.png", "channels": "g"},
-        "ao": {"file": "orm.png", "channels": "r"},
-        "normal": "normal.png",
-    }
-    (folder / "maps" / "material.json").write_text(json.dumps({"maps": maps}))
-    assert fit("maps/material.json") == 0
-    found, layout, table = decoded()
-    assert layout.names == tuple(maps) and layout.stored == 5  # the normal is constant
-    assert [layout[n].color_space for n in maps] == ["srgb", "linear", "linear", "linear"]
-    np.testing.assert_array_equal(np.rint(255 * found["normal"]), normal)
-    assert table.settings["source_path"] == "maps/material.json"
-    assert {k for k in table.measured if k.startswith("psnr_")} == {
-        "psnr_db", "psnr_mean_db", "psnr_between_db", *(f"psnr_{n}_db" for n in maps),
-    }  # fmt: skip
-    (folder / "maps" / "material.json").write_text('{"maps": {"albedo": "gone.png"}}')
-    assert "gone.png: no such file" in refused(capsys, "fit", "image", "maps/material.json", "-o", "o.npz", *SHORT)
-
-
 # -- sizes ------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("task", ["image", "texture"])
-def test_names_of_images_are_said(folder, capsys, task):
-    """An image with the name of a normal map, and maps whose names had to be guessed; ``inspect`` shows the roles."""
-    y, x = np.mgrid[-0.5:0.5:8j, -0.5:0.5:8j]
-    normals = np.rint(127.5 * (np.stack([x, y, np.sqrt(1 - x * x - y * y)], axis=-1) + 1)).astype(np.uint8)
-    write("x_normal.png", normals)
-    short = SHORT if task == "image" else SHORT[:-2]
-    assert main(["fit", task, "x_normal.png", "-o", "a.npz", *short]) == 0
-    assert "x_normal.png: taken for a normal map by its name, linear" in capsys.readouterr().out
-    assert main(["inspect", "a.npz"]) == 0
-    assert re.search(r"image +normal, 3 channel\(s\), linear", capsys.readouterr().out)
-    write("c.png", noise(8, 8, 3))
-    (folder / "m.json").write_text('{"maps": {"paint": "c.png"}, "licence": "CC0"}')
-    assert main(["fit", task, "m.json", "-o", "b.npz", *short]) == 0
-    out = capsys.readouterr().out
-    assert 'map "paint": an unknown name' in out and "m.json: keys that are not used: licence" in out
 
 
 def test_a_size_in_each_unit(folder):
@@ -278,52 +200,6 @@ def test_what_does_not_go_together(folder, capsys, options, sentence):
     assert os.listdir(folder) == ["a.png"]
 
 
-def test_resuming_after_seconds(folder, capsys):
-    """A number of steps that was measured is another one the next time."""
-    write("a.png", noise(16, 16, 3))
-    arguments = ["fit", "image", "a.png", "-o", "out.npz", "--checkpoint", "c.npz", "--resume", "--seconds", "3"]
-    assert "needs the --steps of the run" in refused(capsys, *arguments)
-
-
-def test_searches(folder, capsys, monkeypatch):
-    """The file is of the best training that was tried, whichever that is; qualities are made up, but for the arrays."""
-    write("a.png", waves())
-    fit_image, trained = training.fit_image, []
-
-    def ranked(source, size, recipe, request, border=None, title=None):
-        table, result = fit_image(source, size, presets.replaced(recipe, steps=2), request, border, title)
-        if title is not None:  # a candidate
-            decibels = 20.0 + 3 * (size.dims == 3) + len(trained) / 10
-            table.measured |= {"psnr_db": decibels, "psnr_between_db": decibels}
-            trained.append((size, recipe.structure))
-        return table, result
-
-    monkeypatch.setattr(search, "fit_image", ranked)
-    assert fit("a.png", "--ratio-search", "--bytes", "1200", "--steps", "20", "--json", "r.json") == 0
-    text, report = capsys.readouterr().out, json.loads((folder / "r.json").read_text())
-    assert len(report["tried"]) == len(trained) == text.count("  tried ") >= 2
-    best = max(report["tried"], key=lambda t: t["psnr_db"] + t["psnr_between_db"])
-    assert report["settings"]["structure"] == best["structure"] and report["settings"]["dims"] == best["dims"]
-    assert report["arrays"]["cascaded"][0] == best["cascaded"]
-    assert report["bytes"] == best["bytes"] <= 1260 and report["settings"]["steps"] == 20
-    # So few bytes that nothing can be tried
-    assert fit("a.png", "--ratio-search", "--bytes", "20", "--json", "r.json") == 0
-    assert json.loads((folder / "r.json").read_text())["tried"] == []
-
-
-def test_the_smallest_of_a_quality(folder, capsys):
-    write("a.png", waves())
-    options = ["--psnr", "15", "--steps", "10", "--dims", "3", "--lr", "0.01"]
-    assert fit("a.png", *options, "--json", "r.json") == 0
-    report = json.loads((folder / "r.json").read_text())
-    assert report["measured"]["psnr_db"] >= 15 and report["compression_asked"] is None
-    assert report["bytes"] == min(t["bytes"] for t in report["tried"] if t["psnr_db"] >= 15)
-    (folder / "out.npz").unlink()
-    message = refused(capsys, "fit", "image", "a.png", "-o", "out.npz", *SHORT, "--psnr", "110")
-    assert "a.png: 110 dB were not reached; the best of" in message and "give more --steps" in message
-    assert not (folder / "out.npz").exists()
-
-
 # -- interruptions ----------------------------------------------------------------------------------------------------
 
 
@@ -344,33 +220,6 @@ def ctrl_c(monkeypatch, when):
 RUN = ["--steps", "20", "--json", "r.json"]
 
 
-def test_ctrl_c_keeps_the_best(folder, capsys, monkeypatch):
-    write("a.png", waves())
-    with monkeypatch.context() as patch:
-        calls = ctrl_c(patch, 11)
-        assert fit("a.png", *RUN) == 130
-    assert len(calls) == 11 and "interrupted at step 11" in capsys.readouterr().out
-    report, (maps, _, table) = json.loads((folder / "r.json").read_text()), decoded()
-    assert report["interrupted"] and report["step"] <= 11 and report["measured"] == table.measured
-    mse = np.mean((maps["image"] - waves() / 255) ** 2)
-    assert table.measured["psnr_db"] == pytest.approx(-10 * np.log10(mse), abs=0.01)
-    assert sorted(os.listdir(folder)) == ["a.png", "out.npz", "r.json"]
-
-
-def test_resuming_is_as_if_nothing_had_happened(folder, capsys, monkeypatch):
-    write("a.png", waves())
-    assert fit("a.png", *RUN, output="whole.npz") == 0
-    with monkeypatch.context() as patch:
-        ctrl_c(patch, 13)
-        assert fit("a.png", *RUN, "--checkpoint", "c.npz") == 130
-    early = (folder / "out.npz").read_bytes()
-    with monkeypatch.context() as patch:
-        calls = ctrl_c(patch, 1000)
-        assert fit("a.png", *RUN, "--checkpoint", "c.npz", "--resume") == 0
-    assert 7 <= len(calls) < 20  # not from the start
-    assert (folder / "out.npz").read_bytes() == (folder / "whole.npz").read_bytes() != early
-
-
 @pytest.mark.parametrize("changed", ["a texel", "the size", "the channels", "a name"])
 def test_resuming_with_another_source(folder, capsys, changed):
     image = waves()
@@ -387,15 +236,6 @@ def test_resuming_with_another_source(folder, capsys, changed):
     message = refused(capsys, "fit", "image", *arguments, "--resume")
     assert 'the checkpoint "c.npz" is of another source, or the source has changed since' in message
     assert [(folder / name).read_bytes() for name in ("c.npz", "out.npz")] == before
-
-
-def test_resuming_with_other_settings(folder, capsys):
-    write("a.png", waves())
-    assert fit("a.png", *RUN, "--checkpoint", "c.npz") == 0
-    arguments = ["a.png", "-o", "out.npz", *SHORT, *RUN, "--checkpoint", "c.npz", "--resume"]
-    for option, found in ((["--seed", "5"], "seed"), (["--without", "jitter"], "jitter"), (["--loss", "mae"], "loss")):
-        assert f"was made with other settings ({found})" in refused(capsys, "fit", "image", *arguments, *option)
-    assert "holds other table sizes" in refused(capsys, "fit", "image", *arguments, "--bytes", "2000")
 
 
 def test_ctrl_c_in_a_search(folder, capsys, monkeypatch):
@@ -442,36 +282,6 @@ def test_no_space_left(folder, capsys, monkeypatch, what):
     message = refused(capsys, "fit", "image", "a.png", "-o", "out.npz", *SHORT, *options)
     assert f'output file "{file}" cannot be written: No space left on device' in message
     assert sorted(os.listdir(folder)) == names
-
-
-FULL = """
-import os, resource, signal, sys
-from mi_diffind.commands.cli import main
-
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-limit, arguments = int(sys.argv[1]), sys.argv[2:]
-resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
-sys.exit(main(arguments))
-"""
-
-
-@pytest.mark.parametrize("verb", ["fit", "decode.png", "decode.exr"])
-def test_a_full_disk(folder, verb):
-    """As the kernel has it: whoever writes, no more than so many bytes go into a file."""
-    write("a.png", noise(64, 64, 3))
-    arguments = ["fit", "image", "a.png", "-o", "new.npz", *SHORT]
-    if verb != "fit":
-        make_file(folder / "t.npz", 64, 64)
-        arguments = ["decode", "t.npz", "--map", "albedo", "-o", verb.replace("decode", "new")]
-    before = sorted(os.listdir(folder))
-    command = [sys.executable, "-c", FULL, "200", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 2, done.stderr
-    lines = [line for line in done.stderr.splitlines() if "mi-diffind: error" in line or "Traceback" in line]
-    reason = "I/O error" if verb != "fit" else "File too large"
-    output = arguments[arguments.index("-o") + 1]
-    assert len(lines) == 1 and f'output file "{output}" cannot be written: ' in lines[0] and reason in lines[0], lines
-    assert sorted(os.listdir(folder)) == before
 
 
 # -- decode -----------------------------------------------------------------------------------------------------------
@@ -569,81 +379,6 @@ def test_what_decode_refuses(folder, capsys):
     assert main(["decode", "many.npz", "-o", "b.exr"]) == 0 and read("b.exr").shape == (5, 7, 6)
 
 
-def _settings(change):
-    def damage(table):
-        change(table.settings["layout"])
-
-    return damage
-
-
-def _grow(name, shape):
-    def damage(table):
-        table.arrays[name] = in_bytes(np.zeros(shape, np.uint8))
-
-    return damage
-
-
-def _affine(name, scale, offset):
-    def damage(table):
-        table.arrays[name] = in_bytes(table.arrays[name].entries, scale, offset)
-
-    return damage
-
-
-DAMAGE = {
-    "no layout": lambda table: table.settings.clear(),
-    "another layout": lambda table: table.settings.update(layout=[1, 2]),
-    "an endless width": _settings(lambda layout: layout.update(width=10**400)),
-    "a folder as name": _settings(lambda layout: layout["maps"][0].update(name="../a")),
-    "no cascaded array": lambda table: table.arrays.pop("cascaded"),
-    "one array more": _grow("third", (3, 3, 1)),
-    "other dimensions": _grow("primary", (6, 5, 3)),
-    "a primary of 1D": _grow("primary", (30, 2)),
-    "other channels": _grow("cascaded", (4, 4, 3)),
-    "beyond 1": _affine("primary", 0.005, 0.0),
-    "below 0": _affine("cascaded", 1 / 255, -0.1),
-    "falling": _affine("cascaded", -1 / 255, 1.0),
-}
-
-
-@pytest.mark.parametrize("name", DAMAGE)
-def test_files_that_stand_for_no_image(folder, capsys, name):
-    table = load_table(make_file("t.npz"))
-    DAMAGE[name](table)
-    save_table("t.npz", table)
-    message = refused(capsys, "decode", "t.npz", "-o", "b.png")
-    assert message.startswith("mi-diffind: error: t.npz: ") and len(message) < 300, message
-    assert os.listdir(folder) == ["t.npz"]
-
-
-def test_decoding_ends_of_a_file_that_tiles(folder):
-    """A source that repeats is found to, and reads the same at both ends."""
-    write("a.png", waves())
-    assert fit("a.png", "--bytes", "1200") == 0
-    types = array_module("llvm")
-    model = load_model("out.npz", types.TensorXf)
-    assert model.table.arrays["primary"].border == ("repeat", "repeat")
-    image = model.image
-    t, zero = np.linspace(0, 1, 33, dtype=np.float32), np.zeros(33, np.float32)
-    for a, b in (((zero, t), (zero + 1, t)), ((t, zero), (t, zero + 1))):
-        first, second = (
-            np.stack([c.numpy() for c in image.read(*(types.Float(x) for x in place))["image"]]) for place in (a, b)
-        )
-        assert np.isfinite(first).all() and np.ptp(first) > 0.05
-        np.testing.assert_allclose(first, second, atol=1e-6)
-    assert fit("a.png", "--bytes", "1200", "--border", "clamp") == 0
-    assert load_table("out.npz").arrays["primary"].border == ("clamp", "clamp")
-
-
-def test_the_same_command_gives_the_same_file(folder):
-    write("a.png", waves())
-    for name in ("one.npz", "two.npz"):
-        assert fit("a.png", "--seed", "3", output=name) == 0
-    assert (folder / "one.npz").read_bytes() == (folder / "two.npz").read_bytes()
-    assert fit("a.png", "--seed", "4", output="two.npz") == 0
-    assert (folder / "one.npz").read_bytes() != (folder / "two.npz").read_bytes()
-
-
 @pytest.mark.parametrize("name", ["plain", "one colour", "cleaned"])
 def test_inspect_measures_against_the_source(folder, capsys, name):
     """What was measured after the training; from another folder, too; not against anything else."""
@@ -667,12 +402,3 @@ def test_inspect_measures_against_the_source(folder, capsys, name):
         assert "has changed since" in refused(capsys, "inspect", "files/out.npz", "--measure")
     os.unlink(source)
     assert f"{source}: no such file" in refused(capsys, "inspect", "files/out.npz", "--measure")
-
-
-def test_inspect_measures_nothing_without_a_source(folder, capsys):
-    make_file("t.npz")
-    assert "t.npz: no source file is recorded" in refused(capsys, "inspect", "t.npz", "--measure")
-
-
-def test_candidates_of_a_search_are_structures_that_exist():
-    assert set(search.TRIED) <= set(STRUCTURES)
