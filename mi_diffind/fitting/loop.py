@@ -51,10 +51,10 @@ def exponential_like(u, rate: float = EXPONENTIAL_RATE):
 
 
 def sample_losses(outputs: Mapping, targets: Mapping, weights: Mapping[str, float], size: int, loss: str) -> list:
-    """Return the weighted absolute or squared differences (``loss``) between outputs and targets, to be summed.
+    """Return the weighted absolute or squared differences (``loss``) between outputs and targets, one array a target.
 
-    ``outputs`` and ``targets`` map names to lists of arrays with ``size`` entries; a missing weight counts 1. There is
-    one array of ``size`` numbers for each target in the result; the sum of all entries is the weighted mean.
+    ``outputs`` and ``targets`` map names to lists of arrays with ``size`` entries; a missing weight counts 1. The sum
+    of all entries of the result is the weighted mean.
     """
     losses = []
     for name, target in targets.items():
@@ -119,10 +119,8 @@ class Problem:
     def loss(self, net, rng, size: int):
         """Return the loss of a step that may draw ``size`` samples from ``rng``.
 
-        It is differentiable with respect to ``net``, an array or a list of arrays, whose entries are summed. By default
-        it is the weighted mean of the differences between :meth:`predict` and the targets of :meth:`batch`, absolute or
-        squared (``settings.loss``), as one array of ``size`` numbers for each target. They are not summed here, so that
-        one kernel can write them and sum the gradients of all entries.
+        It is an array or a list of arrays, whose entries are summed later, so that one kernel writes them and sums all
+        gradients. By default: :func:`sample_losses` of :meth:`predict` and the targets of :meth:`batch`.
         """
         inputs, targets = self.batch(rng, size)
         return sample_losses(self.predict(unfolded(net), inputs), targets, self.weights, size, self.settings.loss)
@@ -168,9 +166,8 @@ class FitResult:
 
 @dataclass
 class _State:
-    """State of a training: parameters and, for each, Adam's step count and moments.
+    """State of a training: parameters and, for each, Adam's step count and moments, as Dr.Jit or NumPy arrays.
 
-    They are Dr.Jit arrays (not written in place, so a snapshot costs nothing) or, from a checkpoint, NumPy arrays.
     Without ``moments``, Adam begins anew.
     """
 
