@@ -190,7 +190,9 @@ import faulthandler, os, sys
 faulthandler.dump_traceback_later(120, exit=True)
 os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
 import mi_diffind, drjit as dr, mitsuba as mi, numpy as np
-from mi_diffind import cli, fitting, scenes
+from mi_diffind.commands import cli
+from mi_diffind.fitting import loop as fitting
+from mi_diffind.scenes import loading as scenes
 from mi_diffind.maps.source import load_source
 assert dr.thread_count() == 2
 scene, table, folder = sys.argv[1:]
