@@ -92,7 +92,7 @@ class Problem:
     #: moves away from it, as far as its learning rate goes.
     harmless: float = 1e-6
 
-    #: What the settings do not say about the problem, as JSON; a checkpoint of another one is refused.
+    #: Content of a checkpoint beside the settings, as JSON; a checkpoint of another problem is refused.
     identity: Mapping = {}
 
     #: The settings of the training; set by :func:`fit`.
@@ -250,7 +250,7 @@ def fit(
     interrupted = False
 
     def measure(loss: float | None):
-        figures = problem.measure(net) if clock is None else clock.measured(lambda: problem.measure(net))
+        figures = problem.measure(net) if clock is None else clock.time_measurement(lambda: problem.measure(net))
         measured = {k: float(v) for k, v in figures.items()}
         name, value = next(iter(measured.items()))
         record.history.append({"step": trainer.step, "loss": loss, **measured})
@@ -258,7 +258,7 @@ def fit(
         if record.best is None or value >= top - problem.tolerance:
             record.best = trainer.snapshot(all_moments=False).parameters
             record.best_measured, record.best_step = measured, trainer.step
-        bar.measured(name, value)
+        bar.show_figure(name, value)
 
     with interruptible() as stop, cores(settings.deterministic), compat.room_for_sums(LARGEST_SUMS), bar.shown:
         while trainer.share < 1 and not stop.is_set():
@@ -280,7 +280,7 @@ def fit(
             if not (due or last or reference is None):
                 continue
             value = float(loss[0])
-            if _diverged(value, reference, problem.harmless) or not trainer.finite():
+            if _has_diverged(value, reference, problem.harmless) or not trainer.finite():
                 trainer.restarts = record.restarts = record.restarts + 1
                 if record.restarts > 8:
                     raise FittingError(
@@ -298,7 +298,7 @@ def fit(
                 continue
             record.references[trainer.phase] = value if reference is None else 0.5 * (reference + value)
             plateau.update(trainer.step, value)
-            bar.loss(value)
+            bar.show_loss(value)
             good = before  # not the state after this step: nobody has seen its loss yet
             if measured or last:
                 measure(value)
@@ -349,7 +349,7 @@ class _Clock:
         """True if measurements take too much of the time, so that only the last one is still carried out."""
         return self.measuring > MEASURING * (self.before - self.start)
 
-    def measured(self, measure):
+    def time_measurement(self, measure):
         """Return the result of a measurement, whose duration counts."""
         start = time.perf_counter()
         figures, self.measurement = duration(measure)
@@ -379,16 +379,16 @@ class _Bar:
             self.shown.bar_format = self.title + self._form(trainer.step, trainer.share)
         self.shown.update((trainer.step if self.seconds is None else trainer.share) - self.shown.n)
 
-    def loss(self, loss: float) -> None:
+    def show_loss(self, loss: float) -> None:
         self.text["loss"] = f"{loss:.3g}"
         self.shown.set_postfix(self.text, refresh=False)
 
-    def measured(self, name: str, value: float) -> None:
+    def show_figure(self, name: str, value: float) -> None:
         self.text[name] = f"{value:.2f}"
         self.shown.set_postfix(self.text, refresh=not self.lines)
 
 
-def _diverged(value: float, reference: float | None, harmless: float) -> bool:
+def _has_diverged(value: float, reference: float | None, harmless: float) -> bool:
     return not math.isfinite(value) or (reference is not None and value > 10 * reference + harmless)
 
 
