@@ -125,7 +125,8 @@ class FitRequest:
                 if problem is not None:
                     request = self._stage_request(stage)
                     title = stage.title or stage.name or None
-                    results.append(request.train(problem, title, stage.finish, stage.times, stage.least))
+                    limits = {"times": stage.times, "least": stage.least}
+                    results.append(request.train(problem, title, stage.finish, **limits))
         return results
 
     def _stage_request(self, stage: Stage) -> FitRequest:
