@@ -446,20 +446,6 @@ def test_an_old_library_that_drjit_found_is_replaced(aborting, first):
     assert int(lines[1]) < MIN_LLVM <= int(lines[-1])
 
 
-def test_variables_survive_the_replacement(aborting):
-    """Arrays made (not computed) on the old LLVM keep their values."""
-    code = f"""
-import drjit as dr, drjit.llvm as ll, os
-a = ll.Float([1, 2, 3])
-assert dr.detail.llvm_version()[0] < {MIN_LLVM}
-del os.environ["{ENV}"]
-import mi_diffind
-assert dr.detail.llvm_version()[0] >= {MIN_LLVM}
-assert dr.minimum(a, 2).numpy().tolist() == [1, 2, 2]
-"""
-    succeeds(code, aborting)
-
-
 @pytest.mark.parametrize("first", ["", "import drjit", "import mitsuba"])
 def test_a_machine_without_any_usable_library(aborting, first):
     """No setting, nothing from pip, an old one in the system: a warning, no abort, other variants work."""
@@ -485,12 +471,6 @@ except RuntimeError as e:
     done = succeeds(code)
     assert done.stdout.split() == ["refused"]
     assert done.stderr.count("RuntimeWarning") == 1 and "pip install karellen-llvm-core" in done.stderr
-
-
-def test_plugins_register_for_variants_set_later():
-    succeeds(
-        f"import mi_diffind, mitsuba as mi\nmi.set_variant('scalar_rgb')\nmi.set_variant('llvm_ad_mono')\n{RENDER}"
-    )
 
 
 # -- little of a machine -----------------------------------------------------------------------------------------------
