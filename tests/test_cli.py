@@ -114,21 +114,6 @@ def test_inspect_measures(tmp_path, capsys, few_samples):
     assert measured["float32"]["psnr_db"] > 86
 
 
-def test_inspect_scene(tmp_path, capsys):
-    report = tmp_path / "report.json"
-    assert main(["inspect", str(SCENES / "still_life.xml"), "--json", str(report)]) == 0
-    text = capsys.readouterr().out
-    assert f"9 learned plugins, {entries('disney')} bytes" in text
-    wood = text[text.index("wood: neural_disney, effects used, base_color texture, roughness texture") :]
-    assert "in use    diffuse, dielectric, clearcoat" in wood
-    assert "sheen (sheen is 0)" in wood and "anisotropic (anisotropic is 0)" in wood
-    materials = {m["id"]: m for m in json.loads(report.read_text())["reports"]}
-    assert len(materials) == 9  # wrapped ones are found, too
-    assert materials["copper"]["effects_in_use"] == ["metal"]
-    assert materials["copper"]["effects_left_out"]["diffuse"] == "metallic is 1"
-    assert materials["copper"]["operations"]["eval"]["gathers"] > 0
-
-
 #: Enough steps to see that it trains.
 FIT = ["--steps", "10", "--batch", "2048", "--variant", "llvm_ad_rgb"]
 

@@ -614,47 +614,6 @@ def test_the_base_class_says_what_is_missing(ad):
         run(Empty(), settings(steps=1))
 
 
-class Shaped(dr.CustomOp):
-    """The identity, whose gradient is clipped to ± ``limit`` on its way back."""
-
-    def eval(self, value, limit):
-        self.limit = limit
-        return dr.detach(value)
-
-    def forward(self):
-        self.set_grad_out(self.grad_in("value"))
-
-    def backward(self):
-        self.set_grad_in("value", dr.clip(self.grad_out(), -self.limit, self.limit))
-
-
-def test_gradients_may_be_shaped_on_their_way(ad):
-    """By a custom operation inside of the loss: each sample's share is clipped, the value stays as it is."""
-    moments = {}
-    for limit in (None, 1e-4):
-
-        class Clipped(Problem):
-            def __init__(self, limit):
-                self.net, self.limit = DifferentiableArray(2, 1, value=0.0).alloc(ad.TensorXf), limit
-
-            def loss(self, net, rng, size):
-                y = net([dr.arange(ad.Float, size) / (size - 1)])[0]
-                if self.limit is not None:
-                    y = dr.custom(Shaped, y, self.limit)
-                return dr.square(y - 3) / size
-
-            def measure(self, net):
-                return {"q": 1.0}
-
-        trainer = loop._Trainer(Clipped(limit), settings(batch=64))
-        assert float(trainer.take_step()[0]) == pytest.approx(9)
-        moments[limit] = np.array(trainer.optimizer.state["data"][3][1]) / 0.1
-    x = np.arange(64) / 63
-    weights = np.stack([1 - x, x])
-    np.testing.assert_allclose(moments[None], weights.sum(axis=1) * -6 / 64, rtol=1e-4)
-    np.testing.assert_allclose(moments[1e-4], weights.sum(axis=1) * -1e-4, rtol=1e-4)
-
-
 RENDERED = """
 import sys
 import threading

@@ -210,28 +210,6 @@ def test_gradients_equal_central_differences(ad):
             assert v.grad.numpy()[sample] == pytest.approx(expected, rel=1e-3, abs=2e-4)
 
 
-@pytest.mark.parametrize("bits", range(1, 8))
-def test_values_of_few_bits(ad, bits):
-    """A primary of few bits points into a cascaded array of bytes, as the reference does with the same codes."""
-    rng = np.random.default_rng(bits)
-    steps = 2**bits - 1
-    codes = rng.integers(0, steps, (5, 6, 3), np.uint8, endpoint=True)
-    colors = rng.integers(0, 255, (4, 4, 4, 2), np.uint8, endpoint=True)
-    primary = DifferentiableArray.from_numpy(
-        codes, ad.TensorXf, storage="uint8", quantization=((1 / steps,) * 3, (0.0,) * 3), bits=bits
-    )
-    cascaded = DifferentiableArray.from_numpy(
-        colors, ad.TensorXf, storage="uint8", quantization=((1 / 255,) * 2, (0.0,) * 2)
-    )
-    net, x = Indirection(primary, cascaded), uniform(bits, 200, 2)
-    expected = interpolate(colors / 255, np.clip(interpolate(codes / steps, x), 0, 1))
-    np.testing.assert_allclose(read(net, ad, x), expected, atol=3e-5)
-    assert primary.is_pointer and net.nbytes == -(-5 * 6 * 3 * bits // 8) + 4**3 * 2
-    assert not DifferentiableArray.from_numpy(
-        codes, ad.TensorXf, storage="uint8", quantization=((1.01 / steps,) * 3, (0.0,) * 3), bits=bits
-    ).is_pointer
-
-
 def test_copies_keep_few_bits(ad):
     """Of an array with 5 bits an entry: in its own form, as a PyTree, and what any other form makes of it."""
     codes = np.random.default_rng(5).integers(0, 32, (5, 6, 3)).astype(np.uint8)

@@ -345,6 +345,17 @@ def test_quantising_a_constant_and_refusing_nan(ad):
             DifferentiableArray.from_numpy(constant, ad.TensorXf, storage="uint8")
 
 
+def kernel_gathers(ad, array) -> int:
+    """Return the number of gathers in the kernel of a read."""
+    x = [dr.linspace(ad.Float, 0, 1, 123) for _ in array.resolution]
+    dr.eval(x)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        dr.eval(array(x))
+        code = "".join(k["ir"].getvalue() for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT)
+    return sum("call" in line and "gather" in line for line in code.splitlines())
+
+
 def test_gathers_that_the_kernel_makes():
     """
     The kernel really contains as many gathers as :func:`mi_diffind.arrays.lookup.gathers` says for bytes: a word each.
@@ -359,14 +370,7 @@ def test_gathers_that_the_kernel_makes():
     ):
         table = entries(np.random.default_rng(0), resolution, channels)
         array = DifferentiableArray.from_numpy(table, ad.TensorXf, storage="uint8")
-        x = [dr.linspace(ad.Float, 0, 1, 123) for _ in resolution]
-        dr.eval(x)
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-            dr.kernel_history_clear()
-            dr.eval(array(x))
-            code = "".join(k["ir"].getvalue() for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT)
-        calls = [line for line in code.splitlines() if "call" in line and "gather" in line]
-        assert len(calls) == lookup.gathers(resolution, channels, "uint8"), (resolution, channels)
+        assert kernel_gathers(ad, array) == lookup.gathers(resolution, channels, "uint8"), (resolution, channels)
 
 
 # -- fewer than 8 bits an entry ----------------------------------------------------------------------------------------
@@ -474,14 +478,10 @@ def test_gathers_of_few_bits_that_the_kernel_makes():
     ):
         assert lookup.channels_words(channels, bits) == words, (bits, channels)
         array, *_ = few_bits(ad, np.random.default_rng(0), (5, 7), channels, bits, "clamp")
-        x = [dr.linspace(ad.Float, 0, 1, 123) for _ in range(2)]
-        dr.eval(x)
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-            dr.kernel_history_clear()
-            dr.eval(array(x))
-            code = "".join(k["ir"].getvalue() for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT)
-        calls = [line for line in code.splitlines() if "call" in line and "gather" in line]
-        assert len(calls) == 2 * pair == lookup.gathers((5, 7), channels, "uint8", bits), (bits, channels)
+        assert kernel_gathers(ad, array) == 2 * pair == lookup.gathers((5, 7), channels, "uint8", bits), (
+            bits,
+            channels,
+        )
 
 
 def test_no_entry_needs_more_words_than_are_read():
