@@ -69,11 +69,12 @@ class Stage:
 
     Example: a proxy in 30% of the time, then a residual on top of it::
 
-        problems = []
-        first, last = request.run([
-            Stage("proxy", lambda: problems.append(ProxyProblem(samples)) or problems[0], 0.3, PROXY_SETTINGS),
-            Stage("", lambda: ResidualProblem(samples, problems[0].net), finish=stored),
-        ])
+        def stages():
+            proxy = ProxyProblem(samples)
+            yield Stage("proxy", proxy, share=0.3, settings=PROXY_SETTINGS)
+            yield Stage("", ResidualProblem(samples, proxy.net), finish=stored)
+
+        first, last = request.run(stages())
     """
 
     name: str
@@ -118,15 +119,17 @@ class FitRequest:
         results: list[FitResult] = []
         with interruptible() as stop:
             for stage in stages:
-                if results and (results[-1].interrupted or stop.is_set()):
+                if results and stop.is_set():
                     results[-1] = dataclasses.replace(results[-1], interrupted=True)
                     break
                 problem = stage.problem() if callable(stage.problem) else stage.problem
-                if problem is not None:
-                    request = self._stage_request(stage)
-                    title = stage.title or stage.name or None
-                    limits = {"times": stage.times, "least": stage.least}
-                    results.append(request.train(problem, title, stage.finish, **limits))
+                if problem is None:
+                    continue
+                request, title = self._stage_request(stage), stage.title or stage.name or None
+                limits = {"times": stage.times, "least": stage.least}
+                results.append(request.train(problem, title, stage.finish, **limits))
+                if results[-1].interrupted:
+                    break
         return results
 
     def _stage_request(self, stage: Stage) -> FitRequest:
