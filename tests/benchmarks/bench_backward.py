@@ -22,27 +22,19 @@ depend on the arrays alone.
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
-import multiprocessing
 import tempfile
-import time
 from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from bench_large_material import material
+from frame import ASSETS, ROOT, VARIANT, answer_passes, earlier, in_processes, parser, spread, write
 
 import mi_diffind
 from mi_diffind.core import compat
-from mi_diffind.core.files import write_json
 from mi_diffind.measure import clock
-
-ROOT = Path(__file__).resolve().parents[2]
-ASSETS = ROOT / "scenes" / "assets"
-VARIANT = "llvm_ad_rgb"
 
 #: Pass → side of the film; samples a pixel, and those of tasks whose rays or textures make up for fewer.
 SIDES, SPP, FEWER = {"render": 320, "step": 160}, 16, {"sdf": 4, "field": 4, "texture": 4}
@@ -369,8 +361,8 @@ def scene(task: str, contender: str, size: str, folder: Path):
     })  # fmt: skip
 
 
-def worker(task: str, contender: str, size: str, folder: str, pipe) -> None:
-    """Process of one scene: send its parameters, then the seconds of a pass for each seed received."""
+def worker(contender: str, task: str, size: str, folder: str, pipe) -> None:
+    """Process of one scene: send its parameters, then the times of passes."""
     mi.set_variant(VARIANT)
     mi.set_log_level(mi.LogLevel.Error)
     compat.use_threads(1)
@@ -399,63 +391,36 @@ def worker(task: str, contender: str, size: str, folder: str, pipe) -> None:
     except Exception as error:  # the reason is reported, and the task goes on without this contender
         pipe.send({"error": compat.one_sentence(error) if isinstance(error, RuntimeError) else repr(error)})
         return
-    while (i := pipe.recv()) is not None:
-        seed = dr.opaque(mi.UInt32, i)
-        dr.sync_thread()
-        start, start_cpu = time.perf_counter(), time.process_time()
-        dr.eval(run(seed))
-        dr.sync_thread()
-        pipe.send((1e3 * (time.perf_counter() - start), 1e3 * (time.process_time() - start_cpu)))
-
-
-def spread(values) -> dict:
-    """Return the median and the quartiles."""
-    low, median, high = np.quantile(values, (0.25, 0.5, 0.75))
-    return {"median": float(median), "q1": float(low), "q3": float(high)}
+    answer_passes(pipe, run)
 
 
 def measured(task: str, size: str, folder: Path, rounds: int) -> dict[str, dict]:
     """Return the milliseconds of a pass of each contender, and ratios to the first, by turns."""
-    context, pipes, results, times = multiprocessing.get_context("spawn"), {}, {}, {}
-    for name in CONTENDERS[task]:
-        pipe, other = context.Pipe()
-        context.Process(target=worker, args=(task, name, size, str(folder), other), daemon=True).start()
-        results[name] = pipe.recv()
-        if "error" in results[name]:
-            print(task, size, name, results[name], flush=True)
-        else:
-            pipes[name], times[name] = pipe, []
-    for i in range(rounds):
-        for name in pipes if i % 2 == 0 else reversed(pipes):
-            pipes[name].send(WARM + i)
-            times[name].append(pipes[name].recv())
-    for pipe in pipes.values():
-        pipe.send(None)
-    cpu = {name: np.array(both)[:, 1] for name, both in times.items()}
-    first = next(iter(CONTENDERS[task]))
-    for name, both in times.items():
-        results[name] |= {"ms": spread(np.array(both)[:, 0]), "cpu_ms": spread(cpu[name])}
-        if first in cpu:
-            results[name]["ratio"] = spread(cpu[name] / cpu[first])
+    results = in_processes(worker, list(CONTENDERS[task]), rounds, task, size, str(folder), warm=0)
+    first = next(iter(results.values())).get("cpu_ms")
+    for name, figures in results.items():
+        if "error" in figures:
+            print(task, size, name, figures, flush=True)
+            continue
+        cpu = figures["cpu_ms"]
+        figures |= {"ms": spread(figures["ms"]), "cpu_ms": spread(cpu)}
+        if first is not None:
+            figures["ratio"] = spread(cpu / first)
     return results
 
 
 def main() -> None:
     """Measure the tasks that are named, or all of them."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("tasks", nargs="*", metavar="TASK", help=", ".join(CONTENDERS))
-    parser.add_argument("--rounds", type=int, default=15)
-    parser.add_argument("--json", help="file to write; tasks that it holds already and that are not named stay")
-    arguments = parser.parse_args()
-    unknown = set(arguments.tasks) - set(CONTENDERS)
-    if unknown:
-        parser.error(f"unknown task {', '.join(sorted(unknown))}: allowed are {', '.join(CONTENDERS)}")
+    command = parser(__doc__, rounds=15)
+    command.add_argument("tasks", nargs="*", metavar="TASK", help=", ".join(CONTENDERS))
+    arguments = command.parse_args()
+    if unknown := set(arguments.tasks) - set(CONTENDERS):
+        command.error(f"unknown task {', '.join(sorted(unknown))}: allowed are {', '.join(CONTENDERS)}")
     mi.set_variant(VARIANT)
     mi.set_log_level(mi.LogLevel.Error)
     names = arguments.tasks or list(CONTENDERS)
-    kept = Path(arguments.json) if arguments.json else None
-    before = json.loads(kept.read_text(encoding="utf-8")) if kept and kept.is_file() else {}
-    results, counted, errors = (before.get(key, {}) for key in ("tasks", "bytes", "errors"))
+    before = earlier(arguments.json, tasks={}, bytes={}, errors={})
+    results, counted, errors = (before[key] for key in ("tasks", "bytes", "errors"))
     with tempfile.TemporaryDirectory() as folder:
         prepare(Path(folder), names)
         counted |= sizes(Path(folder), names)
@@ -469,11 +434,10 @@ def main() -> None:
                     if "ratio" in figures:
                         shown = {key: round(figures[key]["median"], 2) for key in ("ms", "cpu_ms", "ratio")}
                         print(task, size, name, shown, figures["parameters"], "of", figures["exposed"], flush=True)
-            if kept:
-                write_json(kept, {
-                    "machine": clock.machine(VARIANT), "rounds": arguments.rounds, "spp": SPP, "fewer": FEWER,
-                    "sides": SIDES, "bytes": counted, "errors": errors, "tasks": results,
-                })  # fmt: skip
+            write(arguments.json, {
+                "machine": clock.machine(VARIANT), "rounds": arguments.rounds, "spp": SPP, "fewer": FEWER,
+                "sides": SIDES, "bytes": counted, "errors": errors, "tasks": results,
+            })  # fmt: skip
 
 
 if __name__ == "__main__":

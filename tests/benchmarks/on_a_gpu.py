@@ -135,16 +135,8 @@ def run_times(report: dict, save, quick: bool, variant: str) -> None:
             print(f"tradeoff {study}, {chosen} …", flush=True)
             with tempfile.TemporaryDirectory() as folder:
                 output = Path(folder) / "study.json"
-                command = [
-                    sys.executable,
-                    "-m",
-                    "mi_diffind.commands.cli",
-                    "tradeoff",
-                    study,
-                    "--quick",
-                    "--variant",
-                    chosen,
-                ]
+                command = [sys.executable, "-m", "mi_diffind.commands.cli", "tradeoff", study, "--quick"]
+                command += ["--variant", chosen]
                 code, text = run([*command, "--out", folder, "--json", output], "times", chosen.partition("_")[0])
                 if code == 0 and output.is_file():
                     entry["ns"][chosen] = medians(json.loads(output.read_text(encoding="utf-8")))
