@@ -6,16 +6,12 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import statistics
 from dataclasses import dataclass, field
-from pathlib import Path
 
-import tomllib
-
-MEASURED = Path(__file__).resolve().parent / "measured"
+from figures import commands, measured
 
 #: Of which training the bytes on disk of the paper's recipe are.
 TRAINED = "Bytes on disk of the paper's recipe are those after two minutes of training."
@@ -30,15 +26,7 @@ LINE = "<br>"
 NAMES = LINE.join(("**ours**", "instead", "paper"))
 
 #: JSON file → command that wrote it, without the file's name.
-COMMANDS = {
-    name: re.sub(r" --json docs/measured/\S+", "", command)
-    for name, command in tomllib.loads((MEASURED / "commands.toml").read_text(encoding="utf-8")).items()
-}
-
-
-def measured(name: str) -> dict:
-    """Return the JSON that a command wrote."""
-    return json.loads((MEASURED / f"{name}.json").read_text(encoding="utf-8"))
+COMMANDS = {name: re.sub(r" --json docs/measured/\S+", "", command) for name, command in commands().items()}
 
 
 @dataclass(frozen=True)
