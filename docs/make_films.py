@@ -28,7 +28,7 @@ from mi_diffind.core.errors import UsageError
 from mi_diffind.core.files import write_json
 from mi_diffind.core.progress import progress_bar
 from mi_diffind.images import films
-from mi_diffind.scenes import loading, orbit, poses
+from mi_diffind.scenes import loading, poses, rendering
 from mi_diffind.studies.texture import test_scenes
 from mi_diffind.studies.texture.zoom import TextureZoom
 
@@ -111,7 +111,7 @@ def rendered(
     options = {"exact": True, "against": against} if against else {}
     scene = loading.load(SCENES / f"{name}.xml", defines, **options)
     with progress_bar(" ".join(filter(None, (name, against))), len(motions), "frame", True) as bar:
-        images = orbit.along(scene, motions, new_seeds=True, on_frame=bar.update)
+        images = rendering.along(scene, motions, new_seeds=True, on_frame=bar.update)
     return [films.displayed(image).repeat(scale, axis=0).repeat(scale, axis=1) for image in images]
 
 

@@ -40,10 +40,10 @@ from figures import (
 
 import mi_diffind
 from mi_diffind.fitting.task import tasks
-from mi_diffind.tasks.image import memory_budget as image_budget
-from mi_diffind.tasks.radiance import presets as field_presets
+from mi_diffind.tasks import radiance as field_presets
+from mi_diffind.tasks.image import arrays as image_budget
 from mi_diffind.tasks.sdf import paper as sdf_paper
-from mi_diffind.tasks.texture import memory_budget as texture_budget
+from mi_diffind.tasks.texture import arrays as texture_budget
 
 
 class Table(NamedTuple):
@@ -783,7 +783,6 @@ def field_surroundings(study: Entries) -> Table:
     return filled(named(study.rows), {
         "": "{name}", "dB": "{psnr_white_db:.2f}", "SSIM": "{ssim_white:.3f}",
         "MB on disk": lambda row: f"{row.file_bytes / 1e6:.1f}", "minutes of a core": "{cpu_minutes:.1f}",
-        "error of exposures, stops": "{exposure_error_stops:.3f}",
     })  # fmt: skip
 
 

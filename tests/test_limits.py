@@ -35,8 +35,8 @@ from mi_diffind.images.headers import picture_size
 from mi_diffind.maps.compressed import map_figure
 from mi_diffind.maps.source import SourceError, from_arrays, load_source
 from mi_diffind.scenes.inspection import Inspection
-from mi_diffind.tasks.radiance import ans, files, node_codes
-from mi_diffind.tasks.radiance.image_files import ViewsError, image_file, read_image
+from mi_diffind.tasks.radiance import coding, files
+from mi_diffind.tasks.radiance.captures import ViewsError, image_file, read_image
 from mi_diffind.tasks.sdf.mesh import MeshError, load_mesh, make_mesh
 
 
@@ -133,12 +133,12 @@ def test_archives_hold_plain_numbers(tmp_path):
 
 def test_few_lanes_hold_few_symbols():
     """A lane decodes one symbol after the other: many symbols in one lane would take hours."""
-    coder = ans.SymbolEncoder()
+    coder = coding.SymbolEncoder()
     context = np.zeros(100, int)
-    coder.code("x", 1, 2, context, context)
-    decoder = ans.SymbolDecoder(*coder.finish())
+    coder.code("x", 1, 2, context, lambda: context)
+    decoder = coding.SymbolDecoder(*coder.finish())
     with pytest.raises(ValueError, match="more symbols than its lanes"):
-        decoder.code("x", 1, 2, np.zeros(10**6, int))
+        decoder.code("x", 1, 2, np.zeros(10**6, int), None)
 
 
 def test_coded_nodes_are_those_of_a_dense_grid(tmp_path, rng):
@@ -149,18 +149,18 @@ def test_coded_nodes_are_those_of_a_dense_grid(tmp_path, rng):
     stored = corners_of(rng.random(tuple(n - 1 for n in shape)) < 0.02)
     count = int(stored.sum())
     numbers = rng.integers(0, 16, count), rng.integers(0, 300, count)
-    places, *again = node_codes.decoded_places(*node_codes.encoded(stored, *numbers, 16, 300), shape, 16, 300)
+    places, *again = coding.decode(*coding.encode(stored, *numbers, 16, 300), shape, 16, 300)
     np.testing.assert_array_equal(places, np.flatnonzero(stored))
     assert all(np.array_equal(a, b) for a, b in zip(again, numbers, strict=True))
-    with pytest.raises(node_codes.TooManyNodes, match="at most 100 are accepted"):
-        node_codes.decoded(*node_codes.encoded(stored, *numbers, 16, 300), shape, 16, 300, 100)
+    with pytest.raises(coding.TooManyNodes, match="at most 100 are accepted"):
+        coding.decode(*coding.encode(stored, *numbers, 16, 300), shape, 16, 300, 100)
     assert np.array_equal(files._packed(places, stored.size), np.packbits(stored.reshape(-1)))
     for mask in (stored, np.packbits(stored.reshape(-1))):
         np.testing.assert_array_equal(np.concatenate([*layers(mask, shape)]), stored)
     number = np.full(np.array(shape) + 8, -1)
     number[4:-4, 4:-4, 4:-4][stored] = np.arange(count)
     place = np.argwhere(stored) + 4
-    for part in node_codes.passes_of(stored):
+    for part in coding.passes_of(stored):
         around = {int(number[tuple(place[part.rows[0]] + np.array(o) - 2)]) for o in np.ndindex(5, 5, 5)}
         assert set(part.near[0].tolist()) <= around | {-1}
 

@@ -14,10 +14,10 @@ import trimesh
 from mi_diffind.core.errors import UsageError
 from mi_diffind.fitting.settings import FitSettings
 from mi_diffind.fitting.task import FitRequest, tasks
-from mi_diffind.tasks.image import memory_budget as image_budget
+from mi_diffind.tasks.image import arrays as image_budget
+from mi_diffind.tasks.radiance import dense_bytes
 from mi_diffind.tasks.radiance import fit as field_fit
-from mi_diffind.tasks.radiance.presets import dense_bytes
-from mi_diffind.tasks.texture import memory_budget as texture_budget
+from mi_diffind.tasks.texture import arrays as texture_budget
 
 PATH = Path(__file__).resolve().parent / "benchmarks" / "bench_ratio.py"
 
@@ -25,6 +25,7 @@ PATH = Path(__file__).resolve().parent / "benchmarks" / "bench_ratio.py"
 @pytest.fixture(scope="module")
 def bench():
     """The benchmark as a module."""
+    sys.path.insert(0, str(PATH.parent))
     spec = importlib.util.spec_from_file_location("bench_ratio", PATH)
     module = importlib.util.module_from_spec(spec)
     sys.modules["bench_ratio"] = module  # dataclasses look their module up

@@ -26,9 +26,8 @@ from mi_diffind.arrays.indirection import unfolded
 from mi_diffind.core.compat import use_threads
 from mi_diffind.maps.source import load_source
 from mi_diffind.scenes.loading import ParsedScene
-from mi_diffind.scenes.training.stored_texture import texture_problem
-from mi_diffind.scenes.training.trained_scene import TrainedScene
-from mi_diffind.scenes.training.views import View, ViewDistribution
+from mi_diffind.scenes.training.options import View, ViewDistribution
+from mi_diffind.scenes.training.trained_scene import TrainedScene, texture_problem
 from mi_diffind.tasks.texture.compressed import load
 from mi_diffind.tasks.texture.training import rounded
 

@@ -13,7 +13,6 @@ import shutil
 import tempfile
 from pathlib import Path
 
-import numpy as np
 from bench_nerf import training
 from frame import VARIANT, earlier, parser, short_machine, write
 
@@ -25,7 +24,6 @@ ROWS = {
     "scene": ["--background", "scene"],
     "scene, larger box": ["--background", "scene"],
     "surroundings": ["--background", "surroundings"],
-    "surroundings, exposures": ["--background", "surroundings", "--exposures"],
 }
 
 #: Side of the larger box as a multiple of that of the inner cube.
@@ -53,7 +51,6 @@ def main() -> None:
     arguments = command.parse_args()
     output, folder = arguments.json, Path(arguments.folder)
     result = earlier(output, rows={}) | {"machine": short_machine()}
-    stops = np.array(json.loads((folder / "capture.json").read_text(encoding="utf-8"))["stops"])
     with tempfile.TemporaryDirectory() as work:
         for name in arguments.rows:
             source = with_box(folder, Path(work) / "boxed") if "box" in name else folder
@@ -61,9 +58,6 @@ def main() -> None:
             options += ["--downscale", arguments.downscale, "--steps", arguments.steps]
             report = Path(work) / "x.npz"
             row = training(str(source), report, options)
-            settings = json.loads(report.with_suffix(".json").read_text(encoding="utf-8"))["settings"]
-            if "exposures" in settings:
-                row["exposure_error_stops"] = float(np.sqrt(np.mean((settings["exposures"] - stops) ** 2)))
             result["rows"][name] = row
             write(output, result)
 

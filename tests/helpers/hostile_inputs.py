@@ -127,15 +127,15 @@ def distance_field(path: Path) -> tuple:
 
     A function returns whether rays meet the field, and numbers that have to be finite.
     """
-    from mi_diffind.tasks.sdf import TASK, tracing
+    from mi_diffind.tasks.sdf import TASK, marching
 
     storage = "float32" if "float32" in path.stem else "uint8"
     model = TASK.open(mi.TensorXf, path, storage=storage)
     field = model.field
 
     def follow(o, d, length):
-        hit = tracing.intersect(field, o, d, length)
-        blocked = tracing.occluded(field, o, d, length)
+        hit = marching.intersect(field, o, d, length)
+        blocked = marching.occluded(field, o, d, length)
         value, slope = field.gradient(hit.p, hit.hit)
         return hit.hit | blocked, [dr.select(hit.hit, v, 0) for v in (hit.t, *hit.p, value, *slope)]
 

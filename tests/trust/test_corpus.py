@@ -16,7 +16,7 @@ from damage import Archive, header, png
 from limited_child import LimitedChild
 from trial_files import all_seeds
 
-from mi_diffind.tasks.radiance import node_codes
+from mi_diffind.tasks.radiance import coding
 
 #: Name → function that writes the files to a folder and returns the probe and its arguments, the right outcomes, and
 #: an expression that the sentence has to match.
@@ -132,10 +132,10 @@ def _(folder):
 def _(folder):
     archive, shape = Archive(all_seeds()["field_coded"][1].read_bytes()), (60, 60, 60)
     numbers, colours = np.zeros(np.prod(shape), int), len(archive.arrays["palette"])
-    coding = node_codes.encoded(np.ones(shape, bool), numbers, numbers, 2 ** archive.meta["settings"]["density_bits"],
+    codes = coding.encode(np.ones(shape, bool), numbers, numbers, 2 ** archive.meta["settings"]["density_bits"],
                                 colours)  # fmt: skip
     archive.meta["settings"]["shape"] = [600] * 3
-    for name, array in zip(("probabilities", "nodes"), coding, strict=True):
+    for name, array in zip(("probabilities", "nodes"), codes, strict=True):
         archive.arrays[name], archive.meta["arrays"][name]["shape"] = array[:, None], [len(array), 1]
     return mutant(folder, "field_coded", archive.write())
 
