@@ -66,9 +66,9 @@ def by_turns(functions: dict[str, Callable], rounds: int, warm: int = 1) -> dict
     return results
 
 
-def resident() -> float:
-    """Return the memory of this process in MiB."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 2**20
+def resident(process: int | str = "self") -> float:
+    """Return the memory of a process in MiB."""
+    return int(Path(f"/proc/{process}/statm").read_text().split()[1]) * 4096 / 2**20
 
 
 def timed_pass(run: Callable, seed: int, processor=time.process_time) -> tuple[float, float]:
