@@ -8,8 +8,7 @@ a pixel. The hits are ``random`` (any place, any footprint up to the whole image
 horizon, pixel by pixel. The bitmaps hold the decoded maps and do not read the derivatives. Times are those of the
 kernels, one of each texture before the next of any; ratios are medians of the rounds.
 
-Then whole renders of the plane in a constant light, ``path_footprint`` against ``path``, and the methods of ``disney``
-with textures against those of ``principled``.
+Then whole renders of the plane in a constant light, ``path_footprint`` against ``path``.
 """
 
 from __future__ import annotations
@@ -23,10 +22,8 @@ from frame import ASSETS, VARIANT, by_turns, parser, spread, write
 
 import mi_diffind
 from mi_diffind.core.compat import use_threads
-from mi_diffind.measure.bsdf import bsdf_queries, directions, noise_texture
 from mi_diffind.measure.clock import machine, timed, total
 from mi_diffind.measure.operations import count_query
-from mi_diffind.measure.study import FLOOR
 
 TILES = ASSETS / "tiles_filtered.npz"
 WIDTH, HEIGHT = 128, 128
@@ -126,52 +123,27 @@ def renders(path: Path, number: int) -> dict[str, dict]:
     return against(rounds(functions, number), "path", 192 * 128)
 
 
-def materials(number: int) -> dict[str, dict]:
-    """Return method → the costs of ``disney`` and ``principled`` with four textures."""
-    rng = np.random.default_rng(0)
-    values = {"base_color": [0.6, 0.3, 0.2], "roughness": [0.4], "metallic": [0.5], "anisotropic": [0.3]}
-    maps = {name: mi.load_dict(noise_texture(v, rng)) for name, v in values.items()}
-    bsdfs = {name: mi.load_dict({"type": name, **maps}) for name in ("principled", "disney")}
-    lanes = 2**14
-    inputs, context = directions(lanes), mi.BSDFContext()
-    queries = bsdf_queries(bsdfs, inputs, True)
-
-    def together(bsdf):
-        value, pdf, bs, weight = bsdf.eval_pdf_sample(context, *inputs)
-        return [value, pdf, bs.wo, bs.pdf, weight]
-
-    queries["eval_pdf_sample"] = {name: lambda b=bsdf: together(b) for name, bsdf in bsdfs.items()}
-    result = {}
-    for query, functions in queries.items():
-        costs = against(rounds({n: f for n, f in functions.items() if n != FLOOR}, number), "principled", lanes)
-        for name in costs:
-            operations = count_query(functions[name])
-            costs[name] |= {"instructions": operations.instructions, "gathers": operations.gathers}
-        result[query] = costs
-    return result
-
-
 def main() -> None:
     command = parser(__doc__, rounds=101)
     command.add_argument("--table", action="append", type=Path, metavar="FILE", help="texture (default: tiles)")
     command.add_argument("--variant", default=VARIANT)
-    command.add_argument("--only", choices=("reads", "renders", "materials"))
+    command.add_argument("--only", choices=("reads", "renders"))
     options = command.parse_args()
     mi.set_variant(options.variant)
     use_threads(1)
     result = {"machine": machine(options.variant), "rounds": options.rounds}
     parts = {
         "reads": lambda: [row for path in options.table or [TILES] for row in reads(path, options.rounds)],
-        "renders": lambda: renders(TILES, options.rounds), "materials": lambda: materials(options.rounds),
-    }  # fmt: skip
+        "renders": lambda: renders(TILES, options.rounds),
+    }
     with dr.suspend_grad():
         result |= {name: part() for name, part in parts.items() if options.only in (None, name)}
     for row in result.get("reads", []):
         print(f"{row['table']}, {row['hits']}, {row['maps']} map(s)")
         show(row["textures"])
-    for name, costs in {"renders": result.get("renders", {}), **result.get("materials", {})}.items():
-        print(name)
-        show(costs)
+    if "renders" in result:
+        print("renders")
+        show(result["renders"])
     write(options.json, result)
 
 
