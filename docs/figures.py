@@ -142,7 +142,7 @@ def _runs(study: Entries, material: str, which: str) -> list[dict]:
     ``which`` is the name of a filter, ``uncompressed`` or ``equal bytes`` for the best of either, ``trained`` for the
     weight λ = 0.9, or another weight as ``λ 0.5``; ``, no schedule`` after it names that way of a study with several.
     """
-    from mi_diffind.studies.shading.conclusions import curves
+    from mi_diffind.studies.shading import curves
 
     curve = curves(study)[material]
     filters = {**curve.classical, **curve.compressed}

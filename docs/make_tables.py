@@ -138,7 +138,7 @@ def disney_forms(study: Entries, network: Entries) -> Table:
 @table_of(("", "tradeoff_ggx"))
 def ggx_quality(study: Entries) -> Table:
     """Return costs of each family at the quality of an indirection, as multiples of it, beside the paper's."""
-    from mi_diffind.studies.ggx.conclusions import equal_quality
+    from mi_diffind.studies.ggx import equal_quality
 
     reference = "16→8"
     goal, rows = study.candidates[reference].errors.psnr_db, []
@@ -418,7 +418,7 @@ def texture_renders(*studies: Entries) -> Table:
 @table_of(("", "tradeoff_texture"), ("_boombox", "tradeoff_texture_boombox"))
 def texture_factors(study: Entries) -> Table:
     """Return how many times as long a bitmap takes for the same error."""
-    from mi_diffind.studies.texture.conclusions import speed
+    from mi_diffind.studies.texture import speed
 
     def cell(name, stage):
         speeds = [speed(study, stage, name, against) for against in ("bitmap", "bitmap, multijittered")]
@@ -435,7 +435,7 @@ def texture_factors(study: Entries) -> Table:
 @table_of(("", "tradeoff_texture", "tradeoff_texture_network"), ("_boombox", "texture_levels_boombox"))
 def texture_levels(*studies: Entries) -> Table:
     """Return PSNR of each level of detail."""
-    from mi_diffind.studies.texture.conclusions import levels
+    from mi_diffind.studies.texture import levels
 
     study = with_network(*studies)
     by_name = {name: values["all"] for name, values in levels(study).items()}
@@ -516,7 +516,7 @@ def texture_reads(before: Entries, now: Entries) -> Table:
 
 def shading_curves(*studies: Entries) -> dict:
     """Return the results of the study of shading by material."""
-    from mi_diffind.studies.shading.conclusions import curves
+    from mi_diffind.studies.shading import curves
 
     return {name: material for study in studies for name, material in curves(study).items()}
 
@@ -543,7 +543,7 @@ def shading_best(*studies: Entries) -> Table:
 @table_of(("", "tradeoff_shading_lambda"), ("_paper", "tradeoff_shading_paper"))
 def shading_shares(study: Entries) -> Table:
     """Return the paper's figure 2 as a table: quality by λ, with the spread over seeds."""
-    from mi_diffind.studies.shading.conclusions import trouble
+    from mi_diffind.studies.shading import trouble
 
     rows, materials = [], shading_curves(study)
     shares = sorted({share for material in materials.values() for _, share in material.runs})
@@ -631,8 +631,8 @@ SOLIDS = [(f"_{name}", f"tradeoff_sdf_{name}") for name in ("suzanne", "armadill
 @table_of(*SOLIDS)
 def sdf_errors(study: Entries) -> Table:
     """Return errors of distance fields in equal bytes: IoU, IoU near the surface, normals."""
-    from mi_diffind.studies.equal_memory import candidates_by_budget
-    from mi_diffind.studies.sdf.conclusions import size_text
+    from mi_diffind.measure.report import candidates_by_budget
+    from mi_diffind.studies.sdf import size_text
 
     sizes, rows = candidates_by_budget(study), {}
     for size, candidates in sizes.items():
@@ -725,8 +725,8 @@ def field_longer(study: Entries) -> Table:
 @table_of(("", "tradeoff_field"))
 def field_errors(study: Entries) -> Table:
     """Return PSNR of radiance fields by how many times smaller than a dense grid they are."""
-    from mi_diffind.studies.equal_memory import candidates_by_budget
-    from mi_diffind.studies.radiance.conclusions import ratio_text, references
+    from mi_diffind.measure.report import candidates_by_budget
+    from mi_diffind.studies.field import ratio_text, references
 
     study = {**study, "candidates": {c.name: c for c in trained(study)}}
     rows = [c for each in (references(study), *candidates_by_budget(study).values()) for c in each.values()]

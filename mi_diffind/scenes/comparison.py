@@ -24,7 +24,7 @@ from ..core.files import writable_folder
 from ..core.progress import interruptible, progress_bar
 from ..core.runtime import use_variant
 from ..images import metrics
-from ..measure import figure_grid
+from ..measure import plot as figure_grid
 from ..measure.statistics import spread
 from ..plugins.support import footprint
 from . import conversion, loading

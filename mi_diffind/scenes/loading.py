@@ -23,7 +23,7 @@ from ..core.runtime import use_variant
 from ..core.threads import in_turn, threads_for_files
 from ..fitting.task import tasks
 from ..images import metrics
-from ..measure.operations import bsdf_operations
+from ..measure.clock import bsdf_operations
 from ..plugins.support import footprint, omissions
 
 #: Parts that a scene needs to be rendered, beside objects and lights.
@@ -481,7 +481,7 @@ def reports(scene) -> list[dict]:
     It has the description of :meth:`ParsedScene.learned_plugins`; the plugin's own report, ``preset``,
     ``effects_in_use``, ``effects_left_out`` (effect → reason), ``evaluated_once``, ``storage``, ``table_bytes`` and
     more; for a BSDF the ``operations`` of ``eval``, ``pdf`` and ``sample``
-    (:class:`~mi_diffind.measure.operations.Operations`, by name); for the integrator of a radiance field, how many
+    (:class:`~mi_diffind.measure.clock.Operations`, by name); for the integrator of a radiance field, how many
     steps of ``rays`` are taken, skipped, … (:class:`~mi_diffind.tasks.radiance.march.RayCounts`).
     """
     return [report_of(instance, scene) for instance in learned_instances(scene)]

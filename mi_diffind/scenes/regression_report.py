@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..core.files import writable_folder
-from ..measure import figure_grid
+from ..measure import plot as figure_grid
 from . import loading
 from .block_test import CHECK_PASSES, Block, BlockTest, Level
 

@@ -16,7 +16,7 @@ import mitsuba as mi
 from frame import ASSETS, VARIANT, answer_passes, in_processes, parser, spread, write
 
 import mi_diffind
-from mi_diffind.measure import clock, operations
+from mi_diffind.measure import clock
 
 FILE = str(ASSETS / "rust_plain.npz")
 
@@ -102,7 +102,7 @@ def worker(name: str, size: str, pipe) -> None:
         dr.backward(dr.mean(mi.render(loaded, parameters, spp=1, seed=seed, seed_grad=seed + 10_000), axis=None))
         return [parameters[key].grad for key in parameters.keys()]
 
-    pipe.send({"operations": operations.count(lambda: run(dr.opaque(mi.UInt32, 0))).asdict()})
+    pipe.send({"operations": clock.count(lambda: run(dr.opaque(mi.UInt32, 0))).asdict()})
     answer_passes(pipe, run, seconds)
 
 

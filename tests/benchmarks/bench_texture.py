@@ -22,8 +22,7 @@ from frame import ASSETS, VARIANT, by_turns, parser, spread, write
 
 import mi_diffind
 from mi_diffind.core.compat import use_threads
-from mi_diffind.measure.clock import machine, timed, total
-from mi_diffind.measure.operations import count_query
+from mi_diffind.measure.clock import count_query, machine, timed, total
 
 TILES = ASSETS / "tiles_filtered.npz"
 WIDTH, HEIGHT = 128, 128

@@ -11,4 +11,4 @@ def quick_result(plan, folder):
     result = measure(plan, BenchmarkSettings.choose(plan.variant, quick=True), folder, progress=False)
     report.write(result, folder, plan)
     written = json.loads((folder / f"tradeoff_{plan.study}.json").read_text(encoding="utf-8"))
-    return written, "\n".join(report.summary(result, plan))
+    return written, "\n".join(report.summary(result))

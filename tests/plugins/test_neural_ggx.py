@@ -27,7 +27,7 @@ from spheres import key_of, sphere_scene
 from variants import VARIANTS, set_variant
 
 from mi_diffind.arrays.boxes import ValueBounds
-from mi_diffind.measure.operations import bsdf_operations
+from mi_diffind.measure.clock import bsdf_operations
 from mi_diffind.scenes import comparison, loading
 from mi_diffind.tasks.ggx import TASK
 from mi_diffind.tasks.ggx.model import ALPHA_FLOOR

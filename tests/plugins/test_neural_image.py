@@ -24,7 +24,7 @@ from mi_diffind.arrays.tables import StoredArray, Table, load_table, save_table
 from mi_diffind.core import compat
 from mi_diffind.maps.layout import Layout, MapLayout
 from mi_diffind.maps.source import load_source
-from mi_diffind.measure.operations import bsdf_operations, count
+from mi_diffind.measure.clock import bsdf_operations, count
 from mi_diffind.scenes import comparison, loading
 from mi_diffind.tasks.ggx import TASK as GGX
 from mi_diffind.tasks.image import TASK

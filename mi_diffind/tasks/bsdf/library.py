@@ -19,7 +19,7 @@ from ...core.files import relative_path, writable_folder, write_json
 from ...core.jobs import run_jobs
 from ...core.runtime import use_variant
 from ...fitting.task import FitRequest, Fitted, Model, fit, load_model
-from ...measure.formatting import grid
+from ...measure.report import grid
 from .files import load
 from .fit import use_rgb_variant
 from .truth import SUFFIXES, material_ids
