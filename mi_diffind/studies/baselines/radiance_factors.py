@@ -14,7 +14,8 @@ import numpy as np
 from drjit import nn
 
 from ...arrays.indirection import device_array, device_tensor
-from ...tasks.radiance.nodes import COARSE, FARTHEST, Nodes, cells_of, chessboard_distances, corners_of
+from ...arrays.sparse_grid import cell_corners, complete_cells
+from ...tasks.radiance.nodes import COARSE, FARTHEST, Nodes, chessboard_distances
 from ...tasks.radiance.volume_field import VolumeField, colour_of, density_of
 from .node_codes import QuantisationSteps, deflated, mask_bytes
 from .radiance import transformed
@@ -29,7 +30,7 @@ WIDER = 2
 
 def wide_cells(stored: np.ndarray | None, shape) -> np.ndarray:
     """Return the wide cells, bool, that hold occupied cells of a grid of this shape with ``stored`` nodes."""
-    cells = cells_of(stored) if stored is not None else np.ones([n - 1 for n in shape], bool)
+    cells = complete_cells(stored) if stored is not None else np.ones([n - 1 for n in shape], bool)
     padded = np.pad(cells, [(0, -n % WIDER) for n in cells.shape])
     x, y, z = (n // WIDER for n in padded.shape)
     return padded.reshape(x, WIDER, y, WIDER, z, WIDER).any(axis=(1, 3, 5))
@@ -39,7 +40,7 @@ class Occupancy:
     """Occupied cells and empty distances of a grid whose nodes are :data:`WIDER` times as far apart."""
 
     def __init__(self, nodes: Nodes):
-        stored = corners_of(wide_cells(nodes.stored, nodes.shape))
+        stored = cell_corners(wide_cells(nodes.stored, nodes.shape))
         self.nodes = Nodes(nodes.types, nodes.lower, WIDER * nodes.spacing, stored.shape, stored)
         self.nodes.index = None
         self.types, self.nbytes = nodes.types, self.nodes.nbytes
@@ -68,7 +69,7 @@ class OccupancyField(VolumeField):
 
 def occupied_bytes(state: dict) -> int:
     """Return the bytes on disk of the occupancy of the nodes of a state."""
-    cells = cells_of(corners_of(wide_cells(state.get("stored"), state["shape"])))
+    cells = complete_cells(cell_corners(wide_cells(state.get("stored"), state["shape"])))
     return len(mask_bytes(chessboard_distances(cells) == 0))
 
 

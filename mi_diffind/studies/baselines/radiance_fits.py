@@ -14,9 +14,10 @@ from scipy.spatial import cKDTree
 
 from ...arrays.indirection import device_array, device_tensor
 from ...arrays.lookup import pack_bits
+from ...arrays.sparse_grid import cell_corners, complete_cells
 from ...tasks.radiance.grid import DENSITY_SCALE
 from ...tasks.radiance.march import march, replay
-from ...tasks.radiance.nodes import Nodes, cells_of, corners_of
+from ...tasks.radiance.nodes import Nodes
 from ...tasks.radiance.volume_field import NodeField
 from .node_codes import QuantisationSteps, coded_bytes, deflated
 from .radiance import RAW, ByteField, CoefficientField
@@ -58,14 +59,14 @@ class WeightedGrid:
 
     def kept(self, cells: np.ndarray) -> WeightedGrid:
         """Return the grid reduced to those of its cells that are in ``cells`` (bool)."""
-        stored = corners_of(cells & self.cells())
+        stored = cell_corners(cells & self.cells())
         nodes = Nodes(self.nodes.types, self.nodes.lower, self.nodes.spacing, self.nodes.shape, stored)
         inside = stored[self.stored]
         return WeightedGrid(nodes, self.density[inside], self.colour[inside], self.seen[inside])
 
     def cells(self) -> np.ndarray:
         """Return the occupied cells, bool ``(X − 1, Y − 1, Z − 1)``."""
-        return cells_of(self.stored)
+        return complete_cells(self.stored)
 
     def coarser(self, scale: float) -> np.ndarray:
         """Return the mask of nodes ``scale`` times as far apart, whose cells cover the occupied cells of this grid."""
@@ -75,7 +76,7 @@ class WeightedGrid:
         for corner in np.ndindex(2, 2, 2):
             new = ((old + np.array(corner) * (1 - 1e-6)) / scale).astype(int)
             cells[tuple(np.minimum(new, last).T)] = True
-        return corners_of(cells)
+        return cell_corners(cells)
 
     def resampled(self, scale: float, sparse: bool = True) -> WeightedGrid:
         """Return the grid on nodes ``scale`` times as far apart: those of :meth:`coarser` if ``sparse``, otherwise all.

@@ -15,7 +15,8 @@ from operator import getitem
 
 import numpy as np
 
-from .nodes import cells_of, coarser
+from ...arrays.sparse_grid import complete_cells
+from .nodes import coarser
 
 #: Bits of a probability.
 PRECISION = 12
@@ -326,7 +327,7 @@ def encode(stored: np.ndarray, levels: np.ndarray, index: np.ndarray, level_coun
     node is a corner of an occupied cell.
     """
     coder = SymbolEncoder()
-    _cells(coder, tuple(n - 1 for n in stored.shape), cells_of(stored))
+    _cells(coder, tuple(n - 1 for n in stored.shape), complete_cells(stored))
     _numbers(coder, passes_of(stored), level_count, colours, levels, index)
     return coder.finish()
 

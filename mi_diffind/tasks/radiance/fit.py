@@ -390,7 +390,8 @@ class FieldFit:
             before = [f"{request.checkpoint}.{name}" for name in ("stage0", "grid.npz")]
             request = dataclasses.replace(request, resume=not any(map(os.path.exists, before)))
         stage = Stage("", problem, title="through the images", finish=measured, times=self.times)
-        return table(), *request.run([stage])
+        (result,) = request.run([stage])
+        return table(), result
 
     def sparse(self, grid: NodeGrid, stopped: bool) -> tuple[Table, FitResult]:
         """Compress a grid to density levels and a palette, in the bytes that the options ask for."""

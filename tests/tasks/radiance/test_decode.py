@@ -6,9 +6,10 @@ import types
 import numpy as np
 import pytest
 
+from mi_diffind.arrays.sparse_grid import complete_cells
 from mi_diffind.core.errors import UsageError
 from mi_diffind.tasks.radiance import decode
-from mi_diffind.tasks.radiance.nodes import Nodes, cells_of
+from mi_diffind.tasks.radiance.nodes import Nodes
 from mi_diffind.tasks.radiance.volume_field import DenseVolumeField, NodeField, VolumeField
 
 
@@ -83,7 +84,7 @@ def test_nodes_at_the_rim_of_what_is_stored_count(t, rng):
     raw = np.abs(raw)
     field = NodeField(nodes, t.TensorXf(raw), t.TensorXf(colour))
     found = decode.grid(field)
-    assert cells_of(stored).sum() == 4 and np.array_equal(found["density"] > 0, stored)
+    assert complete_cells(stored).sum() == 4 and np.array_equal(found["density"] > 0, stored)
     assert found["density"][stored] == pytest.approx(softplus(raw[1:]) / VOXEL, rel=0.02)
     assert found["colour"][stored] == pytest.approx(colour[1:], abs=0.02)
 

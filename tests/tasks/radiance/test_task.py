@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from mi_diffind.arrays import sparse_grid
 from mi_diffind.arrays.tables import StoredArray, TableError, load_table, save_table
 from mi_diffind.commands.cli import main
 from mi_diffind.core.errors import UsageError
@@ -162,7 +163,7 @@ def test_a_trial_with_a_part_of_the_nodes_can_be_coded(folder, ad, monkeypatch):
     assert 0 < part.nodes.count < 0.7 * grid.nodes.count
     assert len(part.density) == part.nodes.entries == len(weights.density) + 1 == len(weights.colour) + 1
     np.testing.assert_array_equal(part.density[1:], grid.density[1:][weights.density.astype(int) - 1])
-    assert (nodes.corners_of(nodes.cells_of(part.nodes.stored)) == part.nodes.stored).all()
+    assert (sparse_grid.cell_corners(sparse_grid.complete_cells(part.nodes.stored)) == part.nodes.stored).all()
 
 
 def test_paper_preset(folder, tmp_path, ad):
@@ -378,7 +379,7 @@ def test_hull_and_box(folder, monkeypatch):
 
 def test_index_by_masks_is_the_index(ad, rng):
     for shape in ((9, 7, 33), (6, 8, 32), (4, 5, 70), (12, 9, 2)):
-        stored = nodes.corners_of(rng.random(tuple(n - 1 for n in shape)) < 0.1)
+        stored = sparse_grid.cell_corners(rng.random(tuple(n - 1 for n in shape)) < 0.1)
         made = [nodes.Nodes(ad, (0, 0, 0), 0.1, shape, stored, packed=packed) for packed in (False, True)]
         p = ad.Array3f((rng.random((3, 4096)) * (np.array(shape)[:, None] - 1) * 0.1).astype(np.float32))
         (first, seen), (second, again) = (n.corners(p) for n in made)
@@ -464,7 +465,7 @@ def test_refined_grids_are_what_they_were(folder, ad, rng):
     grid = files.grid_of(files.load(folder / "grid.npz"), ad)
     images = ViewImages(ad, load_views(folder, "train"))
     finer = grids.refine(grid, grids.dilate(grids.visible(grid, images)), 2)
-    cells = nodes.cells_of(finer.nodes.stored)
+    cells = sparse_grid.complete_cells(finer.nodes.stored)
     places = np.argwhere(cells)[rng.choice(cells.sum(), 500)] + 0.5
     p = ad.Array3f((np.array(finer.nodes.lower) + finer.nodes.spacing * places).T.astype(np.float32))
     weights = np.array([c[0].numpy() for c in finer.nodes.corners(p)[0]])
