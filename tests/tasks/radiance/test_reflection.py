@@ -69,7 +69,7 @@ def test_the_environment_in_the_mirrored_direction(ad, rng, environment, sharpne
     def entry(number, active):
         return list(dr.gather(ad.Array4f, table, number, active))[:3]
 
-    found = volume_field.reflected(ad, numbers, ad.Array3f(*np.float32(d.T)), entry)
+    found = volume_field.reflection(ad, numbers, ad.Array3f(*np.float32(d.T)), entry)
     mirrored = d - 2 * (d * n).sum(axis=1, keepdims=True) * n
     assert np.abs(np.log(np.array(found).T) - s - light(mirrored)).max() < tolerance
 
@@ -84,7 +84,7 @@ def test_hard_numbers_are_finite(ad, environment):
             d = ad.Array3f(*axes.T)
             numbers = [ad.Float(v) for v in values]
             dr.enable_grad(numbers, d)
-            found = volume_field.reflected(ad, numbers, d, lambda i, a: list(dr.gather(ad.Array4f, table, i, a))[:3])
+            found = volume_field.reflection(ad, numbers, d, lambda i, a: list(dr.gather(ad.Array4f, table, i, a))[:3])
             dr.backward(sum(found))
             assert np.isfinite(np.array(found)).all()
             assert all(np.isfinite(dr.grad(v).numpy()).all() for v in [*numbers, *d])
