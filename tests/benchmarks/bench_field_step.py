@@ -25,25 +25,19 @@ WARM = 5
 def child(arguments) -> dict:
     """Return the median milliseconds of a step and of its forward part."""
     import dataclasses
-    import importlib
 
     import drjit as dr
 
     from mi_diffind.core import compat
     from mi_diffind.core.runtime import array_module
     from mi_diffind.fitting import loop
-    from mi_diffind.tasks.radiance import PRESETS, files, grid
+    from mi_diffind.tasks.radiance import PRESETS, files, grid, session
 
-    try:
-        session = importlib.import_module("mi_diffind.tasks.radiance.session")
-    except ImportError:
-        session = importlib.import_module("mi_diffind.tasks.radiance.session")
     if arguments.anywhere:
         session.ANYWHERE = 1.0
     types = array_module("llvm")
     views = session.FieldSession.load(types, arguments.source)
-    reader = files if hasattr(files, "grid_of") else importlib.import_module("mi_diffind.tasks.radiance.fit")
-    begin = reader.grid_of(files.load(arguments.grid), types)
+    begin = files.grid_of(files.load(arguments.grid), types)
     with loop.cores(True), compat.room_for_sums(loop.LARGEST_SUMS):
         side = () if arguments.old else (1,)
         problem = grid.GridProblem(begin, views, *side)

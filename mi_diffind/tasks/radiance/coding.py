@@ -116,7 +116,7 @@ class SymbolDecoder:
         # A lane decodes one symbol after the other: few lanes for many symbols would take hours
         self.left = np.inf if lanes == MOST_LANES else LANE_SYMBOLS * (lanes + 1)
 
-    def code(self, group: str, contexts: int, symbols: int, context: np.ndarray, given: Callable) -> np.ndarray:
+    def code(self, group: str, contexts: int, symbols: int, context: np.ndarray, given=None) -> np.ndarray:
         """Return the symbol in each ``context``, for the same arguments as :meth:`SymbolEncoder.code` but ``given``."""
         if group not in self.tables:
             codes, self.probabilities = np.split(self.probabilities, [contexts * symbols])

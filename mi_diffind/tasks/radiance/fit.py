@@ -87,24 +87,21 @@ def check(request: FitRequest) -> None:
             f"source: {path} is a file of 3D Gaussians, a folder of views is needed: "
             f"mi-diffind capture {path.name} -o {path.stem}_views --views 80 --resolution 200"
         )
-    sized = [name for name in ("bytes", "compression", "disk") if options.get(name) is not None]
-    if preset == "grid" and sized:
-        raise UsageError(f"--{sized[0]} is an option of the presets sparse and paper, found the preset grid")
-    for name in ("density_ratio", "colour_ratio"):
-        if preset != "paper" and options.get(name) is not None:
-            raise UsageError(f"--{name.replace('_', '-')}: found the preset {preset}, allowed is paper")
+    sized = next((name for name in ("bytes", "compression", "disk") if options.get(name) is not None), "")
     reflections, surroundings = options.get("colours") == "reflections", options.get("background") == "surroundings"
-    if preset == "paper":
-        if options.get("disk"):
-            raise UsageError("--disk is an option of the preset sparse, found the preset paper")
-        if surroundings:
-            raise UsageError("--background: found surroundings with the preset paper, whose box is not contracted")
-        if reflections:
-            raise UsageError(
-                "--colours: found reflections with the preset paper, whose numbers are those of directions"
-            )
-    if reflections and surroundings:
-        raise UsageError("--colours: found reflections with --background surroundings, allowed is directions")
+    is_paper, given = preset == "paper", f"the preset {preset}"
+    for wrong, message in (
+        (preset == "grid" and sized, f"--{sized} is an option of the presets sparse and paper, found {given}"),
+        (not is_paper and options.get("density_ratio"), f"--density-ratio: found {given}, allowed is paper"),
+        (not is_paper and options.get("colour_ratio"), f"--colour-ratio: found {given}, allowed is paper"),
+        (is_paper and options.get("disk"), f"--disk is an option of the preset sparse, found {given}"),
+        (is_paper and surroundings, f"--background: found surroundings with {given}, whose box has an end"),
+        (is_paper and reflections, f"--colours: found reflections with {given}, allowed is directions"),
+        (surroundings and reflections, "--colours: found reflections with --background surroundings, allowed is "
+         "directions"),
+    ):  # fmt: skip
+        if wrong:
+            raise UsageError(message)
     for name in ("bytes", "disk"):
         if options.get(name) is not None:
             units.check_size(f"--{name}", _parsed(options, name), MAX_BYTES)
