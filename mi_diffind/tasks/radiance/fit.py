@@ -13,7 +13,7 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 
-from ...arrays.tables import MAX_BYTES, StoredArray, Table, save_table
+from ...arrays.tables import MAX_BYTES, Table, save_table
 from ...core import units
 from ...core.errors import UsageError
 from ...core.files import check_distinct
@@ -434,16 +434,9 @@ class FieldFit:
         nbytes = self.wanted_bytes(grid) or dense_bytes(grid.nodes.shape) / COMPRESSION
         grid = self.visible(grid)
         problem = self.pairs_problem(grid, nbytes, 0 if stopped else VALUE_STEPS)
-
-        def table() -> Table:
-            arrays = {}
-            for name in ("density", "colour"):
-                pair = getattr(problem.net, name)
-                arrays[f"{name}_primary"] = StoredArray.of(pair.primary[0].quantised(8))
-                arrays[f"{name}_cascaded"] = StoredArray.of(pair.cascaded.quantised(8))
-            return files.pairs_table(grid.nodes, arrays, problem.low, problem.high)
-
-        return self.train(problem, table, stopped)
+        return self.train(
+            problem, lambda: files.pairs_table(grid.nodes, problem.table_arrays(), problem.low, problem.high), stopped
+        )
 
     def pairs_problem(self, grid: NodeGrid, nbytes: float, steps: int) -> paper.PairsProblem:
         """Return the arrays of the supplement in ``nbytes``, trained on the numbers of the grid for ``steps``."""

@@ -12,6 +12,7 @@ from drjit import nn
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from ...arrays.indirection import DifferentiableArray, Indirection, ramp, rounded
+from ...arrays.tables import StoredArray
 from ...fitting.loop import Problem
 from .grid import NodeGrid
 from .nodes import Nodes
@@ -127,6 +128,23 @@ class PairsNet(nn.Module):
         self.density, self.colour = density, colour
 
 
+class PairsProblem(ImagesProblem):
+    """Training of the pairs through the images of a session."""
+
+    def __init__(self, net: PairsNet, nodes: Nodes, low, high, session: FieldSession):
+        self.nodes, self.low, self.high = nodes, low, high
+        super().__init__(session, net, self.field_of)
+
+    def field_of(self, net) -> PairsField:
+        """Return the field of the trained arrays, rounded as they are stored."""
+        return PairsField(self.nodes, rounded(net.density), rounded(net.colour), self.low, self.high)
+
+    def table_arrays(self) -> dict[str, StoredArray]:
+        """Return the trained arrays as a file stores them, by name."""
+        field = PairsField(self.nodes, self.net.density, self.net.colour, self.low, self.high)
+        return {name: StoredArray.of(module.quantised(8)) for name, module in field.modules.items()}
+
+
 class ValuesProblem(Problem):
     """Training of the pairs by the mean absolute error of the grid's numbers, at random points of occupied cells."""
 
@@ -159,15 +177,3 @@ class ValuesProblem(Problem):
 
     def measure(self, net):
         return {"step": 0.0}
-
-
-class PairsProblem(ImagesProblem):
-    """Training of the pairs through the images of a session."""
-
-    def __init__(self, net: PairsNet, nodes: Nodes, low, high, session: FieldSession):
-        self.nodes, self.low, self.high = nodes, low, high
-        super().__init__(session, net, self.field_of)
-
-    def field_of(self, net) -> PairsField:
-        """Return the field of the trained arrays, rounded as they are stored."""
-        return PairsField(self.nodes, rounded(net.density), rounded(net.colour), self.low, self.high)

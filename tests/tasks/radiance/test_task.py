@@ -30,7 +30,7 @@ from mi_diffind.tasks.radiance import views as view_files
 from mi_diffind.tasks.radiance.session import FieldSession, ViewImages, displayed, scores
 from mi_diffind.tasks.radiance.views import load_views
 
-SIZE, FOV = 40, 0.9
+SIZE = 40
 SHORT = ["--resolution", "24", "--batch", "1024", "--variant", "llvm_ad_rgb", "--colours", "directions"]
 
 
@@ -51,52 +51,10 @@ def short_grids():
     patch.undo()
 
 
-def look_at(o):
-    """Camera to world, from ``o`` to the origin, as Blender has it."""
-    back = np.asarray(o) / np.linalg.norm(o)
-    right = np.cross([0, 0, 1.0], back)
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
-    pose[:3, 3] = o
-    return pose
-
-
-def picture(pose):
-    """Of a ball of radius 0.5 around (0.2, 0, 0), whose colour follows its normal: straight sRGB with alpha."""
-    focal = SIZE / 2 / np.tan(FOV / 2)
-    x, y = np.meshgrid(np.arange(SIZE), np.arange(SIZE))
-    d = np.stack([(x + 0.5 - SIZE / 2) / focal, -(y + 0.5 - SIZE / 2) / focal, -np.ones_like(x)], axis=-1)
-    d = d / np.linalg.norm(d, axis=-1, keepdims=True) @ pose[:3, :3].T
-    o = pose[:3, 3] - [0.2, 0, 0]
-    b = d @ o
-    under = b**2 - o @ o + 0.25
-    normal = (o + (-b - np.sqrt(np.maximum(under, 0)))[..., None] * d) / 0.5
-    linear = np.clip(0.5 + 0.4 * normal, 0, 1)
-    srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    return np.rint(255 * np.concatenate([srgb, (under > 0)[..., None]], axis=-1)).astype(np.uint8)
-
-
-def write_views(folder, split, count, turn=0.0, alpha=True):
-    k = np.arange(count) + 0.5
-    z = 1 - 2 * k / count
-    angle = np.pi * (1 + 5**0.5) * k + turn
-    frames = []
-    for i, v in enumerate(np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], 1)):
-        pose, name = look_at(2.0 * v), f"{split}_{i}.png"
-        pixels = picture(pose)
-        Image.fromarray(pixels if alpha else pixels[..., :3]).save(folder / name)
-        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
-    content = {"camera_angle_x": FOV, "frames": frames}
-    (folder / f"transforms_{split}.json").write_text(json.dumps(content))
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A capture, its grid ``grid.npz``, and ``ball.npz``."""
-    path = tmp_path_factory.mktemp("field")
-    write_views(path, "train", 16)
-    write_views(path, "test", 3, turn=0.7)
+    path = captures.write(tmp_path_factory.mktemp("field"), 16, 3, SIZE)
     assert main(["fit", "field", str(path), "-o", str(path / "ball.npz"), "--grid", str(path / "grid.npz"),
                  "--json", str(path / "fit.json"), "--steps", "60", *SHORT]) == 0  # fmt: skip
     return path
@@ -299,7 +257,7 @@ def test_files_beside_a_checkpoint_are_not_replaced(folder, tmp_path, name):
 
 
 def test_a_grid_of_other_views_is_refused(folder, tmp_path, capsys):
-    write_views(tmp_path, "train", 4)
+    captures.write(tmp_path, 4, 2, SIZE)
     assert main(["fit", "field", str(tmp_path), "-o", str(tmp_path / "x.npz"), "--grid", str(folder / "grid.npz"),
                  *SHORT]) == 2  # fmt: skip
     assert "was fitted to other views" in capsys.readouterr().err
@@ -364,17 +322,17 @@ def test_files_with_a_density_curve_are_refused(folder, tmp_path):
 
 
 def test_hull_and_box(folder, monkeypatch):
+    """Of two balls."""
     monkeypatch.setattr(view_files, "SEARCH", 64)
     views = load_views(folder, "train")
     lower, upper = view_files.box_of(views)
-    assert np.all(lower < [-0.3, -0.5, -0.5]) and np.all(upper > [0.7, 0.5, 0.5])
-    assert np.all(upper - lower < 1.8)
-    spacing = 0.05
-    shape = np.ceil((upper - lower) / spacing).astype(int) + 1
-    inside = view_files.hull(views, lower, spacing, shape)
-    at = np.stack(np.meshgrid(*[a + spacing * np.arange(n) for a, n in zip(lower, shape, strict=True)], indexing="ij"))
-    distance = np.linalg.norm(at - np.array([0.2, 0, 0])[:, None, None, None], axis=0)
-    assert inside[distance < 0.5].all() and inside[distance > 0.75].mean() < 0.01
+    assert np.all(lower < [-0.55, -0.3, -0.3]) and np.all(upper > [0.5, 0.3, 0.4]) and np.all(upper - lower < 1.8)
+    shape = np.ceil((upper - lower) / 0.05).astype(int) + 1
+    inside = view_files.hull(views, lower, 0.05, shape)
+    at = lower + 0.05 * np.argwhere(np.ones(shape, bool)).reshape(*shape, 3)
+    balls = (([-0.25, 0, 0.1], 0.35), ([0.3, 0.1, -0.1], 0.25))
+    beyond = np.min([np.linalg.norm(at - centre, axis=-1) - radius for centre, radius in balls], axis=0)
+    assert inside[beyond < 0].all() and inside[beyond > 0.25].mean() < 0.02
 
 
 def test_index_by_masks_is_the_index(ad, rng):
@@ -482,7 +440,7 @@ def test_refined_grids_are_what_they_were(folder, ad, rng):
 
 
 def test_nothing_in_view_is_said(tmp_path, capsys):
-    write_views(tmp_path, "train", 4)
+    captures.write(tmp_path, 4, 2, SIZE)
     for image in tmp_path.glob("*.png"):
         Image.fromarray(np.zeros((SIZE, SIZE, 4), np.uint8)).save(image)
     assert main(["fit", "field", str(tmp_path), "-o", str(tmp_path / "x.npz"), *SHORT]) == 2
@@ -491,10 +449,10 @@ def test_nothing_in_view_is_said(tmp_path, capsys):
 
 def test_views_without_alpha(tmp_path, capsys):
     """They are trained in the whole box, and what cannot be known is said."""
-    write_views(tmp_path, "train", 3, alpha=False)
-    file = tmp_path / "transforms_train.json"
-    content = json.loads(file.read_text()) | {"aabb": [[-0.6, -0.8, -0.8], [1, 0.8, 0.8]]}
-    file.write_text(json.dumps(content))
+    captures.write(tmp_path, 3, 2, SIZE)
+    for path in tmp_path.glob("*.png"):
+        Image.open(path).convert("RGB").save(path)
+    captures.change(tmp_path, aabb=[[-0.8, -0.6, -0.6], [0.8, 0.6, 0.6]])
     assert main(["fit", "field", str(tmp_path), "-o", str(tmp_path / "x.npz"), "--steps", "5", *SHORT]) == 0
     assert "no alpha" in capsys.readouterr().err
 
@@ -544,7 +502,7 @@ def test_ten_thousand_steps_take_no_more_memory(folder, ad):
 def test_a_view_that_sees_nothing(folder):
     """An empty view that looks elsewhere takes nothing from the hull."""
     views = load_views(folder, "train")
-    away = look_at([0, 2.0, 0.1])
+    away = captures.look_at(np.array([0, 0.1, 2.0]))
     away[:3, :3] = away[:3, :3] @ np.diag([-1, 1, -1])
     more = dataclasses.replace(
         views, pixels=np.concatenate([views.pixels, np.zeros((SIZE**2, 1), np.uint32)]),
