@@ -50,8 +50,11 @@ PACKING = 1
 #: Longest side in pixels of images that are not reduced.
 LONGEST = 1600
 
-#: Fewest views for training, since one shows no depth, and names of missing images in a note.
-LEAST_VIEWS, NAMED_MISSING = 2, 3
+#: Fewest views for training, since one shows no depth.
+LEAST_VIEWS = 2
+
+#: Names of missing images in a note.
+NAMED_MISSING = 3
 
 #: Largest distance of a principal point from the middle of its image, as a share of the side, without a note.
 OFF_MIDDLE = 0.25

@@ -51,10 +51,24 @@ def short_grids():
     patch.undo()
 
 
+def ball(pose, side):
+    """sRGB and alpha, uint8, of a ball of radius 0.5 around (0.2, 0, 0), whose colour follows its normal."""
+    x, y = np.meshgrid(*[np.arange(side) + 0.5 - side / 2] * 2)
+    d = np.stack([x, -y, np.full_like(x, -side / 2 / np.tan(captures.ANGLE / 2))], axis=-1)
+    d = d / np.linalg.norm(d, axis=-1, keepdims=True) @ pose[:3, :3].T
+    o = pose[:3, 3] - [0.2, 0, 0]
+    b = d @ o
+    under = b**2 - o @ o + 0.25
+    normal = (o + (-b - np.sqrt(np.maximum(under, 0)))[..., None] * d) / 0.5
+    linear = np.clip(0.5 + 0.4 * normal, 0, 1)
+    srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return np.rint(255 * np.concatenate([srgb, (under > 0)[..., None]], axis=-1)).astype(np.uint8)
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A capture, its grid ``grid.npz``, and ``ball.npz``."""
-    path = captures.write(tmp_path_factory.mktemp("field"), 16, 3, SIZE)
+    path = captures.write(tmp_path_factory.mktemp("field"), 16, 3, SIZE, ball)
     assert main(["fit", "field", str(path), "-o", str(path / "ball.npz"), "--grid", str(path / "grid.npz"),
                  "--json", str(path / "fit.json"), "--steps", "60", *SHORT]) == 0  # fmt: skip
     return path
@@ -257,7 +271,7 @@ def test_files_beside_a_checkpoint_are_not_replaced(folder, tmp_path, name):
 
 
 def test_a_grid_of_other_views_is_refused(folder, tmp_path, capsys):
-    captures.write(tmp_path, 4, 2, SIZE)
+    captures.write(tmp_path, 4, 2, SIZE, ball)
     assert main(["fit", "field", str(tmp_path), "-o", str(tmp_path / "x.npz"), "--grid", str(folder / "grid.npz"),
                  *SHORT]) == 2  # fmt: skip
     assert "was fitted to other views" in capsys.readouterr().err
@@ -322,17 +336,15 @@ def test_files_with_a_density_curve_are_refused(folder, tmp_path):
 
 
 def test_hull_and_box(folder, monkeypatch):
-    """Of two balls."""
     monkeypatch.setattr(view_files, "SEARCH", 64)
     views = load_views(folder, "train")
     lower, upper = view_files.box_of(views)
-    assert np.all(lower < [-0.55, -0.3, -0.3]) and np.all(upper > [0.5, 0.3, 0.4]) and np.all(upper - lower < 1.8)
+    assert np.all(lower < [-0.3, -0.5, -0.5]) and np.all(upper > [0.7, 0.5, 0.5])
+    assert np.all(upper - lower < 1.8)
     shape = np.ceil((upper - lower) / 0.05).astype(int) + 1
     inside = view_files.hull(views, lower, 0.05, shape)
-    at = lower + 0.05 * np.argwhere(np.ones(shape, bool)).reshape(*shape, 3)
-    balls = (([-0.25, 0, 0.1], 0.35), ([0.3, 0.1, -0.1], 0.25))
-    beyond = np.min([np.linalg.norm(at - centre, axis=-1) - radius for centre, radius in balls], axis=0)
-    assert inside[beyond < 0].all() and inside[beyond > 0.25].mean() < 0.02
+    distance = np.linalg.norm(lower + 0.05 * np.argwhere(np.ones(shape, bool)) - [0.2, 0, 0], axis=1).reshape(shape)
+    assert inside[distance < 0.5].all() and inside[distance > 0.75].mean() < 0.01
 
 
 def test_index_by_masks_is_the_index(ad, rng):
@@ -440,7 +452,7 @@ def test_refined_grids_are_what_they_were(folder, ad, rng):
 
 
 def test_nothing_in_view_is_said(tmp_path, capsys):
-    captures.write(tmp_path, 4, 2, SIZE)
+    captures.write(tmp_path, 4, 2, SIZE, ball)
     for image in tmp_path.glob("*.png"):
         Image.fromarray(np.zeros((SIZE, SIZE, 4), np.uint8)).save(image)
     assert main(["fit", "field", str(tmp_path), "-o", str(tmp_path / "x.npz"), *SHORT]) == 2
@@ -449,10 +461,10 @@ def test_nothing_in_view_is_said(tmp_path, capsys):
 
 def test_views_without_alpha(tmp_path, capsys):
     """They are trained in the whole box, and what cannot be known is said."""
-    captures.write(tmp_path, 3, 2, SIZE)
+    captures.write(tmp_path, 3, 2, SIZE, ball)
     for path in tmp_path.glob("*.png"):
         Image.open(path).convert("RGB").save(path)
-    captures.change(tmp_path, aabb=[[-0.8, -0.6, -0.6], [0.8, 0.6, 0.6]])
+    captures.change(tmp_path, aabb=[[-0.6, -0.8, -0.8], [1, 0.8, 0.8]])
     assert main(["fit", "field", str(tmp_path), "-o", str(tmp_path / "x.npz"), "--steps", "5", *SHORT]) == 0
     assert "no alpha" in capsys.readouterr().err
 
