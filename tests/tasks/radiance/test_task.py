@@ -340,7 +340,7 @@ def test_hull_and_box(folder, monkeypatch):
     views = load_views(folder, "train")
     lower, upper = view_files.box_of(views)
     assert np.all(lower < [-0.3, -0.5, -0.5]) and np.all(upper > [0.7, 0.5, 0.5])
-    assert np.all(upper - lower < 1.8)
+    assert np.all(upper - lower < 2.0)
     shape = np.ceil((upper - lower) / 0.05).astype(int) + 1
     inside = view_files.hull(views, lower, 0.05, shape)
     distance = np.linalg.norm(lower + 0.05 * np.argwhere(np.ones(shape, bool)) - [0.2, 0, 0], axis=1).reshape(shape)
