@@ -30,9 +30,9 @@ from list_numbers import headlines
 import mi_diffind
 from mi_diffind.fitting.task import tasks
 from mi_diffind.tasks import radiance as field_presets
-from mi_diffind.tasks.image import memory_budget as image_budget
+from mi_diffind.tasks.image import arrays as image_budget
 from mi_diffind.tasks.sdf import paper as sdf_paper
-from mi_diffind.tasks.texture import memory_budget as texture_budget
+from mi_diffind.tasks.texture import arrays as texture_budget
 
 DOCS = Path(__file__).resolve().parent
 

@@ -89,7 +89,7 @@ def composited(g, o, d):
 @pytest.mark.parametrize("size", [1e-4, 1, 1e4])
 def test_rays_agree_with_numpy_at_every_size(mi_rgb, tmp_path, rng, size):
     """Gaussians of a scene of 1e-4 are all nearer to one another than the steps of Mitsuba's integrator."""
-    from mi_diffind.scenes.capture_settings import CaptureSettings
+    from mi_diffind.scenes.capture import CaptureSettings
     from mi_diffind.scenes.splats import SplatSubject
 
     g = gaussians(rng, size)

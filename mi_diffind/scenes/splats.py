@@ -374,7 +374,7 @@ class SplatSubject:
 
 
 class SplatCamera:
-    """Camera that sees Gaussians, ``settings`` (:class:`.capture_settings.CaptureSettings`) as for a scene."""
+    """Camera that sees Gaussians, ``settings`` (:class:`.capture.CaptureSettings`) as for a scene."""
 
     def __init__(self, splats: Splats, settings):
         self.settings = settings

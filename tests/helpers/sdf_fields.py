@@ -119,7 +119,7 @@ def sparse_table(shape=torus, spacing=1 / 40, entries=256, scale=2.0, centre=(0.
     """The table of a formula's sparse field, as ``fit sdf`` would write it; pointers have 8 bits."""
     from mi_diffind.arrays.sparse_grid import SparseGrid, cell_corners
     from mi_diffind.arrays.tables import Table
-    from mi_diffind.tasks.sdf import codes, encoding, model, nodes
+    from mi_diffind.tasks.sdf import encoding, model, nodes
 
     lower = np.array([-0.5, -0.5, -0.5]) - 1.5 * spacing
     n = int(np.ceil((1 + 3 * spacing) / spacing)) + 1
@@ -140,7 +140,7 @@ def sparse_table(shape=torus, spacing=1 / 40, entries=256, scale=2.0, centre=(0.
     wanted = encoding.exact_entries(sampled, frames)
     bits, entries = 8, encoding.cluster(wanted, entries)
     pointers = encoding.assign(wanted, entries)
-    table = Table("sdf", model.sparse_arrays(grid, frames, codes.pointer_words(pointers, bits), entries))
+    table = Table("sdf", model.sparse_arrays(grid, frames, nodes.pointer_words(pointers, bits), entries))
     table.preset = "sparse"
     slope = nodes.slope_bound(d / spacing, g, corners)
     table.settings = {"layout": "sparse", "lower": list(grid.lower), "spacing": spacing, "bits": bits,

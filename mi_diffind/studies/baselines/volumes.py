@@ -12,7 +12,7 @@ import numpy as np
 
 from ...arrays.sparse_grid import SparseGrid
 from ...core.files import replacing
-from ...tasks.sdf import codes
+from ...tasks.sdf import nodes
 from ...tasks.sdf.distances import Distances
 from ...tasks.sdf.encoding import sample
 from ...tasks.sdf.field import DistanceField
@@ -28,13 +28,13 @@ class DistanceNodes(SparseNodes):
     """Distances of ``bits`` each at the nodes of a sparse ``structure``: our layout without normals and indirection."""
 
     def __init__(self, types, structure: SparseGrid, numbers: np.ndarray, band: float, bits: int, slope: float):
-        words = codes.pointer_words(numbers, bits)
+        words = nodes.pointer_words(numbers, bits)
         super().__init__(types, structure, slope, pointers=words, bits=bits)
         self.state = {"numbers": numbers, "band": band, "bits": bits, "slope": slope, **structure_arrays(structure)}
         self.band_spacings, self.number_bytes = band / self.spacing, 4 * len(words)
 
     def _node(self, number, record, i, j, k, active):
-        value = self.types.Float(codes.pointer_at(self._pointers, number, self.bits, active))
+        value = self.types.Float(nodes.pointer_at(self._pointers, number, self.bits, active))
         half = 2 ** (self.bits - 1)
         zero = self.types.Float(0)
         return (value + (0.5 - half)) * (self.band_spacings / half), (zero, zero, zero)
@@ -56,7 +56,7 @@ class DistanceNodes(SparseNodes):
         planes = np.linalg.solve(sums[..., :4] + 1e-3 * np.eye(4), sums[..., 4:])[..., 0]
         length = np.linalg.norm(planes[:, 1:], axis=1, keepdims=True)
         normals = np.where(length > 0, planes[:, 1:] / np.maximum(length, 1e-9), [0.0, 0.0, 1.0])
-        return codes.frame_words(normals, planes[:, 0], np.ones(len(planes)))
+        return nodes.frame_words(normals, planes[:, 0], np.ones(len(planes)))
 
     @property
     def nbytes(self) -> int:
