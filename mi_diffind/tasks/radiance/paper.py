@@ -6,11 +6,14 @@ empty, as in all fields here; the supplement keeps them.
 
 from __future__ import annotations
 
+import math
+
 import drjit as dr
 import numpy as np
 from drjit import nn
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
+from ...arrays.budget import Budget, proportional_shape
 from ...arrays.indirection import DifferentiableArray, Indirection, ramp, rounded
 from ...arrays.tables import StoredArray
 from ...fitting.loop import Problem
@@ -75,14 +78,14 @@ def sides(nbytes: float, ratio: float, channels: int, extent) -> tuple[tuple[int
     """
     shape = np.asarray(extent, np.float64) / np.max(extent)
 
-    def of(n: float):
-        return [np.maximum(2, np.round(m * shape).astype(int)) for m in (n, n / ratio)]
+    def arrays(n: float) -> list[tuple]:
+        sides = ((n, 3), (n / ratio, channels))
+        return [((*proportional_shape(side, extent), count), 8) for side, count in sides]
 
-    n = 4 + (nbytes / (3 + channels * ratio**-3) / np.prod(shape)) ** (1 / 3)
-    while n > 3 and 3 * of(n)[0].prod() + channels * of(n)[1].prod() > nbytes:
-        n -= 0.5
-    primary, cascaded = of(n)
-    return tuple(primary.tolist()), tuple(cascaded.tolist())
+    most = 4 + (nbytes / (3 + channels * ratio**-3) / np.prod(shape)) ** (1 / 3)
+    steps = range(max(0, math.ceil(2 * (most - 3))), -1, -1)
+    n = Budget(nbytes).largest(arrays, [most - step / 2 for step in steps], strict=False)
+    return tuple(shape[:3] for shape, _ in arrays(n))
 
 
 def dense(grid: NodeGrid) -> np.ndarray:
