@@ -144,9 +144,10 @@ def test_few_lanes_hold_few_symbols():
 def test_coded_nodes_are_those_of_a_dense_grid(tmp_path, rng):
     """Places, neighbours and packed flags, against masks of the whole grid."""
     shape = (37, 18, 45)
-    from mi_diffind.tasks.radiance.nodes import corners_of, layers
+    from mi_diffind.arrays.sparse_grid import cell_corners
+    from mi_diffind.tasks.radiance.nodes import layers
 
-    stored = corners_of(rng.random(tuple(n - 1 for n in shape)) < 0.02)
+    stored = cell_corners(rng.random(tuple(n - 1 for n in shape)) < 0.02)
     count = int(stored.sum())
     numbers = rng.integers(0, 16, count), rng.integers(0, 300, count)
     places, *again = coding.decode(*coding.encode(stored, *numbers, 16, 300), shape, 16, 300)

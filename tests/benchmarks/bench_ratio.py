@@ -42,7 +42,7 @@ from mi_diffind.measure import clock
 from mi_diffind.tasks.image import PRESETS
 from mi_diffind.tasks.image import arrays as image_budget
 from mi_diffind.tasks.image.fit import default_size
-from mi_diffind.tasks.radiance import dense_bytes, ratio_for
+from mi_diffind.tasks.radiance import dense_bytes, files, ratio_for
 from mi_diffind.tasks.radiance import fit as field_fit
 from mi_diffind.tasks.radiance import paper as field_paper
 from mi_diffind.tasks.sdf import paper as sdf_paper
@@ -225,8 +225,8 @@ def field_training(session, grid) -> Training:
     def train(layout: Layout, seed: int) -> dict:
         options = {"compression": layout.budget, f"{layout.part}_ratio": layout.ratio}
         request = request_of("field", "paper", seed, **options)
-        table, _, field = field_fit.FieldFit(request, session).pairs(grid, False)
-        errors = session.held_out_images.evaluate(field)
+        table, _ = field_fit.FieldFit(request, session).pairs(grid, False)
+        errors = session.held_out_images.evaluate(files.field_of(table, session.types))
         arrays = sum(array.nbytes for name, array in table.arrays.items() if name.startswith(("density_", "colour_")))
         return {"bytes": arrays, **errors}
 
@@ -235,7 +235,6 @@ def field_training(session, grid) -> Training:
 
 def captured(folder: Path):
     """Return the session of a small capture in ``folder``, and its grid."""
-    from mi_diffind.tasks.radiance import files
     from mi_diffind.tasks.radiance.session import FieldSession
 
     views, path = folder / "views", folder / "grid.npz"
