@@ -16,7 +16,7 @@ from typing import Any
 from mi_diffind.core import compat, discovery
 
 #: Modules of this package that are no plugins.
-IGNORED = ("support",)
+IGNORED = ("support", "mitsuba_entry")
 
 #: Type of a plugin → the class in ``mitsuba`` whose instances its factory returns.
 OBJECT_TYPES = {"bsdf": "BSDF", "texture": "Texture", "shape": "Shape", "volume": "Volume", "integrator": "Integrator"}
@@ -181,9 +181,9 @@ def register(variant: str) -> None:
     for plugin in _load():
         declarations[plugin.name] = plugin
         if supported(variant):
-            factory = _checked(plugin)
+            factory = _checking_factory(plugin)
         elif plugin.object_type != "volume":  # in scalar variants, Mitsuba needs the type of every object it loads
-            factory = _refusal(plugin.name, variant)
+            factory = _refusing_factory(plugin.name, variant)
         else:
             continue
         compat.register(plugin.object_type, plugin.name, factory)
@@ -196,7 +196,7 @@ def _load() -> list[Plugin]:
     return list(discovery.load(__name__, "PLUGIN", IGNORED, expected=Plugin).values())
 
 
-def _refusal(name: str, variant: str):
+def _refusing_factory(name: str, variant: str):
     def make(props):
         import mitsuba as mi
 
@@ -207,7 +207,7 @@ def _refusal(name: str, variant: str):
     return make
 
 
-def _checked(plugin: Plugin):
+def _checking_factory(plugin: Plugin):
     """Return the factory to register: it checks the type of the instance and records the properties it came from."""
 
     def make(props):

@@ -13,8 +13,7 @@ import pytest
 from commands import refused
 
 import mi_diffind
-from mi_diffind import DiffindError, TableError, load_table, save_table
-from mi_diffind.arrays.tables import StoredArray, Table
+from mi_diffind import DiffindError, TableError, load_table
 from mi_diffind.core.archives import (
     FACTOR,
     FREE,
@@ -234,14 +233,6 @@ def test_inspection_cannot_steer_a_terminal(tmp_path):
     for verbose in (False, True):
         lines = Inspection(figures, ["remark \x1b"], ["usage \x1b"]).lines(verbose)
         assert lines and all(line.isprintable() for line in lines)
-
-
-def test_measurements_of_a_file_are_numbers(tmp_path):
-    path = archive(tmp_path / "t.npz", {"meta": damage.npy(meta_of({}, measured={"psnr_db": "\x1b[31m"}))})
-    with pytest.raises(TableError, match="measurements have to be numbers"):
-        load_table(path)
-    save_table(path, Table("a task", {"a": StoredArray(np.zeros((2, 1), np.float32))}, measured={"psnr_db": 1.5}))
-    assert load_table(path).measured == {"psnr_db": 1.5}
 
 
 def test_files_name_others_in_their_folder(tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""``mi-diffind tradeoff``: time against accuracy of all forms of a task, or of a scene."""
+"""``mi-diffind tradeoff``: time against accuracy of the contenders of a task, or of a scene."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from ..studies import run as run_study
 from ..studies import studies
 from .common import alternative, alternatives, require_scene, say, scene_options, set_variant, variant_option, verb
 
-HELP = "measure time against accuracy, of all forms of a task or of a scene"
+HELP = "measure time against accuracy of the contenders of a task, or of a scene"
 
 #: Arguments of studies that are files, as far as a study has them.
 READS = ("source", "scene", "scenes", "materials", "table", "renders", "errors_of")

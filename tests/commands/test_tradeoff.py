@@ -18,6 +18,9 @@ from mi_diffind.studies import studies
 
 ROOT = Path(__file__).resolve().parents[2]
 
+#: Studies that ship.
+STUDIES = ["bsdf", "disney", "field", "ggx", "image", "scene", "scene-training", "sdf", "shading", "texture"]
+
 
 class SmallStudy(Study):
     """One of another package: its plan is that of the frame's tests."""
@@ -63,35 +66,12 @@ def small(tmp_path, monkeypatch):
 
 
 def test_studies_are_found():
-    assert list(studies()) == [
-        "bsdf",
-        "disney",
-        "field",
-        "ggx",
-        "image",
-        "scene",
-        "scene-training",
-        "sdf",
-        "shading",
-        "texture",
-    ]
+    assert list(studies()) == STUDIES
 
 
 def test_studies_of_others_are_found(small):
     with pytest.warns(RuntimeWarning) as warned:
-        assert list(studies()) == [
-            "bsdf",
-            "disney",
-            "field",
-            "ggx",
-            "image",
-            "scene",
-            "scene-training",
-            "sdf",
-            "shading",
-            "texture",
-            "small",
-        ]
+        assert list(studies()) == [*STUDIES, "small"]
     texts = sorted(str(w.message) for w in warned)
     assert len(texts) == 2 and "No module named 'no_such_module_at_all'" in texts[0]
     assert texts[1].startswith('"ggx" (its_module) is left out: mi_diffind.studies has ')
