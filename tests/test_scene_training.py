@@ -699,7 +699,7 @@ def test_gradients_against_differences(trained, weights):
     """
     Of a weighted sum of all pixels with respect to entries of each array, seven of those with the largest gradients and
     three others, by central differences at equal samples. The sun's direction is no random number, so nothing is
-    sampled that would depend on the entries. More of them, with normals: ``benchmarks/bench_shading_scene.py``.
+    sampled that would depend on the entries.
     """
     scene, problem = trained
     scene.place(View())

@@ -7,9 +7,10 @@ import drjit.llvm.ad as T
 import numpy as np
 import pytest
 
+from mi_diffind.arrays.sparse_grid import cell_corners, complete_cells
 from mi_diffind.studies.baselines import radiance_fields as rivals
 from mi_diffind.tasks.radiance import march
-from mi_diffind.tasks.radiance.nodes import Nodes, cells_of, corners_of
+from mi_diffind.tasks.radiance.nodes import Nodes
 from mi_diffind.tasks.radiance.volume_field import FAINT, NodeField
 
 LOWER, SPACING, SHAPE = (-0.5, -0.3, 0.1), 0.05, (11, 9, 14)
@@ -17,7 +18,7 @@ LOWER, SPACING, SHAPE = (-0.5, -0.3, 0.1), 0.05, (11, 9, 14)
 
 @pytest.fixture
 def grid(rng):
-    stored = corners_of(rng.random([n - 1 for n in SHAPE]) < 0.25)
+    stored = cell_corners(rng.random([n - 1 for n in SHAPE]) < 0.25)
     count = np.count_nonzero(stored)
     density, colour = 3 * rng.normal(size=count), 0.7 * rng.normal(size=(count, 12))
     nodes = Nodes(T, LOWER, SPACING, SHAPE, stored)
@@ -48,7 +49,7 @@ def interpolated(grid, numbers, points):
     for corner in np.ndindex(2, 2, 2):
         weight = np.prod(np.where(corner, place - cell, 1 - (place - cell)), axis=1)
         found = found + weight[:, None] * dense[tuple((cell + corner).T)]
-    return found, cells_of(grid.nodes.stored)[tuple(cell.T)]
+    return found, complete_cells(grid.nodes.stored)[tuple(cell.T)]
 
 
 def numbers_of(state):
@@ -139,7 +140,7 @@ def test_coarser_grids_are_read_from_finer_ones():
     """Numbers that are linear in the place are met where nodes are inside; there is nothing outside."""
     cells = np.zeros((15, 15, 15), bool)
     cells[3:12, 3:12, 3:12] = True
-    nodes = Nodes(T, LOWER, SPACING, (16, 16, 16), corners_of(cells))
+    nodes = Nodes(T, LOWER, SPACING, (16, 16, 16), cell_corners(cells))
     place = nodes.positions()
     colour = np.stack([place @ [k, 1, 2] for k in range(12)], axis=1)
     grid = rivals.WeightedGrid(nodes, 0.3 * place[:, 0] - 0.1 * place[:, 2], colour, np.ones(len(place)))

@@ -24,10 +24,11 @@ from scipy.spatial import cKDTree
 
 from ...arrays.indirection import device_array, device_tensor
 from ...arrays.lookup import pack_bits
+from ...arrays.sparse_grid import cell_corners, complete_cells
 from ...core.units import largest_fitting
 from ...tasks.radiance.grid import DENSITY_SCALE
 from ...tasks.radiance.march import march, replay
-from ...tasks.radiance.nodes import COARSE, FARTHEST, Nodes, cells_of, chessboard_distances, corners_of
+from ...tasks.radiance.nodes import COARSE, FARTHEST, Nodes, chessboard_distances
 from ...tasks.radiance.volume_field import NodeField, NodeVolume, VolumeField, colour_of, density_of
 
 #: Strategies of zlib that are tried: repetitions and frequencies, mostly frequencies, or frequencies alone.
@@ -246,14 +247,14 @@ class WeightedGrid:
 
     def kept(self, cells: np.ndarray) -> WeightedGrid:
         """Return the grid reduced to those of its cells that are in ``cells`` (bool)."""
-        stored = corners_of(cells & self.cells())
+        stored = cell_corners(cells & self.cells())
         nodes = Nodes(self.nodes.types, self.nodes.lower, self.nodes.spacing, self.nodes.shape, stored)
         inside = stored[self.nodes.stored]
         return WeightedGrid(nodes, self.density[inside], self.colour[inside], self.seen[inside])
 
     def cells(self) -> np.ndarray:
         """Return the occupied cells, bool ``(X − 1, Y − 1, Z − 1)``."""
-        return cells_of(self.nodes.stored)
+        return complete_cells(self.nodes.stored)
 
     def coarser(self, scale: float) -> np.ndarray:
         """Return the mask of nodes ``scale`` times as far apart, whose cells cover the occupied cells of this grid."""
@@ -263,7 +264,7 @@ class WeightedGrid:
         for corner in np.ndindex(2, 2, 2):
             new = ((old + np.array(corner) * (1 - 1e-6)) / scale).astype(int)
             cells[tuple(np.minimum(new, last).T)] = True
-        return corners_of(cells)
+        return cell_corners(cells)
 
     def resampled(self, scale: float) -> WeightedGrid:
         """Return the grid on the nodes of :meth:`coarser`.
@@ -423,7 +424,7 @@ def k_means(points: np.ndarray, weights: np.ndarray, count: int):
 
 def wide_cells(stored: np.ndarray) -> np.ndarray:
     """Return the wide cells, bool, that hold occupied cells of a grid with ``stored`` nodes."""
-    cells = cells_of(stored)
+    cells = complete_cells(stored)
     padded = np.pad(cells, [(0, -n % WIDER) for n in cells.shape])
     x, y, z = (n // WIDER for n in padded.shape)
     return padded.reshape(x, WIDER, y, WIDER, z, WIDER).any(axis=(1, 3, 5))
@@ -433,7 +434,7 @@ class Occupancy:
     """Occupied cells and empty distances of a grid whose nodes are :data:`WIDER` times as far apart."""
 
     def __init__(self, nodes: Nodes):
-        stored = corners_of(wide_cells(nodes.stored))
+        stored = cell_corners(wide_cells(nodes.stored))
         self.nodes = Nodes(nodes.types, nodes.lower, WIDER * nodes.spacing, stored.shape, stored)
         self.nodes.index = None
         self.types, self.nbytes = nodes.types, self.nodes.nbytes
@@ -451,7 +452,7 @@ class Occupancy:
 
 def occupied_bytes(state: dict) -> int:
     """Return the bytes on disk of the occupancy of the nodes of a state."""
-    cells = cells_of(corners_of(wide_cells(state["stored"])))
+    cells = complete_cells(cell_corners(wide_cells(state["stored"])))
     return len(mask_bytes(chessboard_distances(cells) == 0))
 
 
