@@ -48,6 +48,7 @@ from mi_diffind.tasks.radiance import fit as field_fit
 from mi_diffind.tasks.radiance import paper as field_paper
 from mi_diffind.tasks.radiance.presets import dense_bytes, ratio_for
 from mi_diffind.tasks.sdf import paper as sdf_paper
+from mi_diffind.tasks.sdf.model import field_of
 from mi_diffind.tasks.texture import memory_budget as texture_budget
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -217,8 +218,13 @@ def sdf_training(distances) -> Training:
 
     def train(layout: Layout, seed: int) -> dict:
         request = request_of("sdf", "paper", seed, ratio=layout.ratio)
-        table, _, field = sdf_paper.fit_pair(distances, int(layout.budget), request, SAMPLES, HELD_OUT)
-        errors = evaluation.measure(field)
+        extent = distances.mesh.upper - distances.mesh.lower
+        shapes = sdf_paper.resolutions(int(layout.budget), layout.ratio, extent)
+        problem = sdf_paper.PairProblem(distances, shapes, "ramp", request.types, seed, SAMPLES, HELD_OUT)
+        request.train(problem)
+        table = problem.table(seed)
+        arrays = tasks()["sdf"].allocate(table, request.types.TensorXf)
+        errors = evaluation.measure(field_of(table, arrays, request.types))
         return {"bytes": table.nbytes, **{name: float(f"{value:.6g}") for name, value in errors.items()}}
 
     return train

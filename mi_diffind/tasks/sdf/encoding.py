@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from ...arrays.sparse_grid import SparseGrid
 from .distances import Distances
 from .nodes import (  # fmt: skip
+    POINTERS,
     bernstein,
     decoded_nodes,
     entry_scale,
@@ -60,9 +61,22 @@ class SampledNodes:
     #: Number of cells that the surface passes through or close by, and the share of them in which no sign changes.
     cells: int
     missed: float
+    #: Bits of the pointers that will code the nodes.
+    bits: int = 10
+
+    @property
+    def entries(self) -> int:
+        """Entries of the cascaded array: as many as pointers can name, and at most one for each node."""
+        return max(1, min(2**self.bits, self.structure.nodes))
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes in memory of the coded nodes: the grid, frames, pointers and entries."""
+        pointers = -(-self.structure.nodes // POINTERS[self.bits])
+        return self.structure.nbytes + 4 * (self.structure.blocks + pointers + self.entries)
 
 
-def sample(distances: Distances, spacing: float) -> SampledNodes:
+def sample(distances: Distances, spacing: float, bits: int = 10) -> SampledNodes:
     """Sample the nodes of a grid of this ``spacing`` (of the longest side) around the mesh of ``distances``."""
     mesh = distances.mesh
     lower = mesh.lower - 1.5 * spacing
@@ -82,7 +96,7 @@ def sample(distances: Distances, spacing: float) -> SampledNodes:
     missed = 1 - np.count_nonzero(keep) / max(1, len(cells))
     return SampledNodes(
         structure, positions, block, d[place].astype(np.float64) / spacing, normals[place].astype(np.float64),
-        crossed_cells(structure, d[place] < 0), len(cells), missed,
+        crossed_cells(structure, d[place] < 0), len(cells), missed, bits,
     )  # fmt: skip
 
 

@@ -230,11 +230,11 @@ def test_resumed_equals_uninterrupted(folder, tmp_path, monkeypatch):
     ("arguments", "says"),
     [
         (["none.ply"], "none.ply: there is no such file"),
-        (["solids.ply", "--bytes", "200"], "--bytes: found 200, the coarsest grid of this mesh needs"),
+        (["solids.ply", "--bytes", "200"], "--bytes: found 200 bytes, the smallest of"),
         (["solids.ply", "--bytes", "lots"], "is not a number of bytes"),
         (["solids.ply", "--ratio", "2"], "--ratio: found the preset sparse, allowed are dense and paper"),
         (["solids.ply", "--constant"], "--constant: found the preset sparse, allowed is paper"),
-        (["solids.ply", "--preset", "paper", "--bytes", "20"], "--bytes: found 20, the smallest arrays need"),
+        (["solids.ply", "--preset", "paper", "--bytes", "20"], "--bytes: found 20 bytes, the smallest arrays need"),
         (["solids.ply", "--bits", "7"], "invalid choice"),
     ],
 )
