@@ -70,7 +70,7 @@ def decoded(model, resolution: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndar
         most = min(FINEST, finest(np.subtract(field.upper, field.lower), LARGEST))
         resolution, error = grids.resolution_for(field, wanted, most)
     values, lower, upper = grids.grid(field, resolution)
-    grids.sharpen(values, field.band)
+    values[1:-1, 1:-1, 1:-1] = grids.sharpen(values, field.band)
     values, lower, upper = crop_grid(values, lower, (upper[0] - lower[0]) / (values.shape[2] - 1))
     report = {
         "preset": model.table.preset,

@@ -14,7 +14,7 @@ import numpy as np
 from ...arrays.indirection import device_array
 from .distances import Distances
 from .field import DistanceField
-from .grids import OFF_NODE, components, march, point_array, point_values, trimesh_of
+from .grids import OFF_NODE, components, march, point_array, point_values, to_trimesh
 from .mesh import Mesh
 from .sampling import node_distances, sample_box, sample_near, sample_surface, surface_cells
 
@@ -177,8 +177,8 @@ class SurfaceEvaluation:
         lower = self.mesh.lower - 1.5 * spacing
         cells = np.ceil((self.mesh.upper - lower) / spacing + 1.5).astype(int)
         values = node_distances(self.distances, lower, spacing, cells + 1, 2 * spacing)
-        vertices, faces = march(lambda a, b: values[a : b + 1], cells, OFF_NODE * spacing)
-        return trimesh_of(self.mesh.to_file_frame(lower + spacing * vertices), faces)
+        vertices, faces = march(lambda a, b: values[a:b], cells, OFF_NODE * spacing)
+        return to_trimesh(self.mesh.to_file_frame(lower + spacing * vertices), faces)
 
 
 def lost_pieces(field: DistanceField, distances: Distances, count: int = 32, seed: int = 2) -> int:
