@@ -16,8 +16,8 @@ from . import Counterpart, Plugin, warn
 from .path_footprint import integrator as path_footprint
 from .support import distance_shapes as sdf
 from .support import omissions, properties, tables
-from .support.differentials import Differentials
 from .support.field_light import FieldLight, in_order
+from .support.footprint import Differentials
 from .support.joined_fields import grouped
 from .support.manual import shared_parts
 from .support.placed_fields import PlacedField, VariantLight, to_grid

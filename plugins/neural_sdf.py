@@ -19,10 +19,19 @@ from mi_diffind.tasks.sdf import TASK
 
 from . import Counterpart, Plugin, Stock, reports_as, shown_as, warn
 from .support import properties, tables
-from .support.distance_shapes import CELL_BYTES, SEEN_BY, crop_grid, distance_shape, finest, native_grid
+from .support.distance_shapes import (
+    CELL_BYTES,
+    SEEN_BY,
+    check_normals,
+    closed_mesh_of,
+    crop_grid,
+    distance_shape,
+    finest,
+    native_grid,
+    to_mesh,
+)
 from .support.manual import shared_parts
 from .support.placement import Placement
-from .support.sdf_meshes import check_normals, closed_mesh_of, to_mesh
 from .support.stock import Kept, StockNode
 
 #: Models whose arrays cannot be optimised, shared by all shapes of a file.

@@ -11,7 +11,7 @@ from mi_diffind.core import compat
 
 from . import Plugin
 from .support import footprint, omissions
-from .support.differentials import Differentials
+from .support.footprint import Differentials
 from .support.manual import shared_parts
 
 #: ``max_depth`` where there is no limit.

@@ -120,7 +120,7 @@ def test_rough_bounces_widen_and_samples_share(mi_rgb):
 
 def test_cones_of_rough_bounces_add_up(mi_rgb):
     """The variances of the angles add up over several bounces, each of the solid angle of its sample."""
-    from mi_diffind.plugins.support.differentials import Differentials
+    from mi_diffind.plugins.support.footprint import Differentials
 
     mi = mi_rgb
     si = dr.zeros(mi.SurfaceInteraction3f)
