@@ -23,7 +23,7 @@ from .support.distance_shapes import (
     CELL_BYTES,
     SEEN_BY,
     check_normals,
-    closed_mesh_of,
+    closed_mesh_file,
     crop_grid,
     distance_shape,
     finest,
@@ -319,7 +319,7 @@ def _from_mesh(node: StockNode) -> str:
         Placement.of(props.get("to_world", mi.ScalarTransform4f()), 1.0, (0, 0, 0))
     except RuntimeError as e:
         raise Kept(f"cannot be placed: {e}") from None
-    source = closed_mesh_of(node.file(), node.folder, props.get("shape_index", 0))
+    source = closed_mesh_file(node.file(), node.folder, props.get("shape_index", 0))
     smooth = check_normals(props, source)
     table = node.fit(TASK.name, source, bytes=BYTES)
     quality = f"IoU {table.measured['iou']:.4f}, normals off by {table.measured['normal_deg']:.1f}°"

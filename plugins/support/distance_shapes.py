@@ -439,7 +439,7 @@ def to_mesh(props: mi.Properties) -> None:
     props["filename"] = str(mesh) if mesh.suffix.lower() == ".ply" else _as_ply(mesh, stamp(file))
 
 
-def closed_mesh_of(path: Path, folder: Path, index: int = 0) -> Path:
+def closed_mesh_file(path: Path, folder: Path, index: int = 0) -> Path:
     """Return the file of a mesh to fit: ``path``, or the PLY file of one shape of a ``.serialized`` in ``folder``.
 
     Raises :class:`~.stock.Kept` for a mesh that encloses no solid.

@@ -48,7 +48,7 @@ from mi_diffind.tasks.radiance import fit as field_fit
 from mi_diffind.tasks.radiance import paper as field_paper
 from mi_diffind.tasks.radiance.presets import dense_bytes, ratio_for
 from mi_diffind.tasks.sdf import paper as sdf_paper
-from mi_diffind.tasks.sdf.model import field_of
+from mi_diffind.tasks.sdf.model import build_field
 from mi_diffind.tasks.texture import memory_budget as texture_budget
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -224,7 +224,7 @@ def sdf_training(distances) -> Training:
         request.train(problem)
         table = problem.table(seed)
         arrays = tasks()["sdf"].allocate(table, request.types.TensorXf)
-        errors = evaluation.measure(field_of(table, arrays, request.types))
+        errors = evaluation.measure(build_field(table, arrays, request.types))
         return {"bytes": table.nbytes, **{name: float(f"{value:.6g}") for name, value in errors.items()}}
 
     return train

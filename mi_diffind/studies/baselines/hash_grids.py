@@ -12,10 +12,9 @@ import numpy as np
 
 from ...core.units import largest_fitting
 from ...fitting.loop import Problem
-from ...tasks.sdf.distances import Distances
+from ...tasks.sdf.distances import Distances, sample_box, sample_near
 from ...tasks.sdf.field import DistanceField
 from ...tasks.sdf.mesh import Mesh
-from ...tasks.sdf.sampling import sample_box, sample_near
 from .networks import Network
 
 #: Largest distance that is learned.

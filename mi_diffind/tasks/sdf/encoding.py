@@ -9,11 +9,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ...arrays.sparse_grid import SparseGrid
-from .distances import Distances
+from .distances import Distances, near_nodes, surface_cells
 from .nodes import (  # fmt: skip
     POINTERS,
     bernstein,
-    decoded_nodes,
+    decode_to_array,
     entry_scale,
     entry_words,
     frame_words,
@@ -23,7 +23,6 @@ from .nodes import (  # fmt: skip
     unpack_entries,
     unpack_frames,
 )
-from .sampling import near_nodes, surface_cells
 
 #: Weights of an entry's coordinates when entries are chosen: a distance (in spacings) counts 5 times a normal.
 WEIGHTS = np.array([5.0, 1, 1])
@@ -287,4 +286,4 @@ class NodeCoding:
 
     def values(self) -> np.ndarray:
         """Return the coded nodes, decoded, (n, 4) float32."""
-        return decoded_nodes(self.sampled.structure, self.frames, self.entries[self.pointers])
+        return decode_to_array(self.sampled.structure, self.frames, self.entries[self.pointers])

@@ -12,11 +12,10 @@ import drjit as dr
 import numpy as np
 
 from ...arrays.indirection import device_array
-from .distances import Distances
+from .distances import Distances, node_distances, sample_box, sample_near, sample_surface, surface_cells
 from .field import DistanceField
 from .grids import OFF_NODE, components, march, point_array, point_values, to_trimesh
 from .mesh import Mesh
-from .sampling import node_distances, sample_box, sample_near, sample_surface, surface_cells
 
 #: Distance from the surface within which points count as near.
 BAND = 0.01

@@ -21,7 +21,7 @@ from . import TASK, encoding
 from .distances import Distances
 from .evaluation import HELD_OUT, HeldOut, SurfaceEvaluation, lost_pieces
 from .mesh import Mesh, load_mesh
-from .model import coded_arrays, field_of
+from .model import build_field, coded_arrays
 from .nodes import POINTERS, SparseNodes
 from .paper import SAMPLES, STARTS, PairProblem, ratio_for, resolutions
 
@@ -190,7 +190,7 @@ def fit(request: FitRequest, measured: int = MEASURED, samples: int = SAMPLES, h
 
         def measure() -> tuple[Table, dict[str, float], int]:
             table = problem.table(seed)
-            field = field_of(table, TASK.allocate(table, request.types.TensorXf), request.types)
+            field = build_field(table, TASK.allocate(table, request.types.TensorXf), request.types)
             return table, evaluation.measure(field), lost_pieces(field, distances)
 
         result = request.train(problem, finish=measure)

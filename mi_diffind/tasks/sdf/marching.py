@@ -292,7 +292,7 @@ class Marcher:
         return corners
 
 
-def marcher_of(field) -> Marcher:
+def get_marcher(field) -> Marcher:
     """Return the field's cached marcher, the same one to all threads."""
     with _lock:
         if "_marcher" not in vars(field):
@@ -494,7 +494,7 @@ def intersect(field, o, d, maxt, active=True, exact: bool = True) -> Hit:
         if field.marched:
             scale = field.cells_per_unit
             origin = [(x - a) * scale for x, a in zip(start, field.box[0], strict=True)]
-            hit, t, leaving = march(marcher_of(field), origin, d, length * scale, near == 0, active)
+            hit, t, leaving = march(get_marcher(field), origin, d, length * scale, near == 0, active)
             t = t * field.cell
         else:
             hit, t, leaving = sphere_trace(field, start, d, length, near == 0, active, exact)
@@ -567,4 +567,4 @@ def occluded(field, o, d, maxt, active=True):
 
 def index_bytes(field) -> int:
     """Return the bytes of the field's ray-marching index; 0 if it is sphere-traced."""
-    return marcher_of(field).nbytes if field.marched else 0
+    return get_marcher(field).nbytes if field.marched else 0

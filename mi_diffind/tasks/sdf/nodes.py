@@ -328,7 +328,7 @@ class SparseNodes(DistanceField):
             return None
         pointers = unpack_pointers(np.array(self._pointers), self.bits, self.structure.nodes)
         entries = np.stack(unpack_entries(np.array(self._entries), *self._affine), axis=1)
-        return decoded_nodes(self.structure, self.frames(), entries, pointers)
+        return decode_to_array(self.structure, self.frames(), entries, pointers)
 
     @property
     def nbytes(self) -> int:
@@ -393,7 +393,7 @@ def middles(positions: np.ndarray) -> np.ndarray:
     return positions % BLOCK - MIDDLE
 
 
-def decoded_nodes(
+def decode_to_array(
     structure: SparseGrid, frames: np.ndarray, entries: np.ndarray, pointers: np.ndarray | None = None
 ) -> np.ndarray:
     """Decode nodes: distances in spacings and normals, (n, 4) float32, from the frames (B,) of their blocks.

@@ -16,10 +16,9 @@ from ...arrays.indirection import DifferentiableArray, Indirection, device_array
 from ...arrays.tables import StoredArray, Table
 from ...core.errors import UsageError
 from ...fitting.loop import Problem
-from .distances import Distances
+from .distances import Distances, sample_box, sample_near
 from .evaluation import HELD_OUT, HeldOut
 from .field import DistanceField
-from .sampling import sample_box, sample_near
 
 #: Table 5 of the supplement: sides of the primary over sides of the cascaded array, by megabytes of both. Its text says
 #: 1.5 to 2.5; the table's values are taken.
@@ -57,7 +56,7 @@ class PairField(DistanceField):
         return self._bound
 
     def changed(self):
-        self.slope = slope_of(self.net, self.lower, self.upper, self.band)
+        self.slope = slope_bound(self.net, self.lower, self.upper, self.band)
         self._bound = dr.opaque(self.types.Float, self.slope)
 
     def value(self, p, active=True):
@@ -120,7 +119,7 @@ def initial(start: str, primary, cascaded, grid_distance, samples, distances, ba
     )
 
 
-def slope_of(net: Indirection, lower, upper, band: float) -> float:
+def slope_bound(net: Indirection, lower, upper, band: float) -> float:
     """Return a bound Λ of the field's slope.
 
     For each cell of the primary array: how fast its pointers change, times the steepest slope of the cascaded array
@@ -231,7 +230,8 @@ class PairProblem(Problem):
         stored, field = stored_form(self.net), self.field
         settings = {
             "layout": "pair", "lower": list(field.lower), "upper": list(field.upper), "band": field.band,
-            "slope": slope_of(stored, field.lower, field.upper, field.band), "ratio": self.ratio, "start": self.start,
+            "slope": slope_bound(stored, field.lower, field.upper, field.band), "ratio": self.ratio,
+            "start": self.start,
         }  # fmt: skip
         arrays = {"primary": StoredArray.of(stored.primary[0]), "cascaded": StoredArray.of(stored.cascaded)}
         return Table("sdf", arrays, settings=settings)

@@ -11,10 +11,9 @@ import solid_meshes as solids
 from mi_diffind.arrays.sparse_grid import CORNERS
 from mi_diffind.core.runtime import array_module
 from mi_diffind.tasks.sdf import encoding, grids, nodes
-from mi_diffind.tasks.sdf.distances import Distances
+from mi_diffind.tasks.sdf.distances import Distances, sample_box
 from mi_diffind.tasks.sdf.field import DistanceField
 from mi_diffind.tasks.sdf.mesh import load_mesh, make_mesh
-from mi_diffind.tasks.sdf.sampling import sample_box
 
 ARMADILLO = Path(__file__).resolve().parents[4] / "shared/data/meshes/armadillo.off"
 
@@ -47,7 +46,7 @@ def coded(types, sampled, bits=8):
     wanted = encoding.exact_entries(sampled, frames)
     entries = encoding.cluster(wanted, min(2**bits, len(wanted)))
     pointers = encoding.assign(wanted, entries)
-    values = nodes.decoded_nodes(sampled.structure, frames, entries[pointers]).astype(np.float64)
+    values = nodes.decode_to_array(sampled.structure, frames, entries[pointers]).astype(np.float64)
     slope = nodes.slope_bound(values[:, 0], values[:, 1:], sampled.corners)
     words = nodes.pointer_words(pointers, bits)
     return nodes.coded_field(types, sampled.structure, slope, frames, words, bits, entries)

@@ -176,7 +176,7 @@ def test_coded_nodes_are_the_decoded_ones(ad, solid):
     """Read from pointers, entries and frames in the kernel, and decoded by NumPy: one field."""
     _, _, sampled = solid
     field, frames, entries = coded(ad, sampled)
-    values = nodes.decoded_nodes(sampled.structure, frames, entries)
+    values = nodes.decode_to_array(sampled.structure, frames, entries)
     other = nodes.SparseNodes(ad, sampled.structure, 3.0, nodes=ad.TensorXf(values))
     rng = np.random.default_rng(3)
     p = points(ad, rng.uniform(field.lower, field.upper, (20000, 3)))
