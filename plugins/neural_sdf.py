@@ -38,8 +38,11 @@ from .support.stock import Kept, StockNode
 _shared: WeakValueDictionary = WeakValueDictionary()
 _lock = threading.RLock()  # Mitsuba loads shapes in parallel; a thread that waits for a kernel may load another shape
 
-#: Limits of a grid whose resolution is chosen automatically: cells along the longest side, and bytes in Mitsuba.
-FINEST, LARGEST = 512, 3 * 2**30
+#: Cells along the longest side of the finest grid that is chosen automatically.
+FINEST = 512
+
+#: Bytes in Mitsuba of the largest such grid.
+LARGEST = 3 * 2**30
 
 #: Error, in cells of the field, assumed for a file without measurements; sparse fields have 0.002 to 0.007.
 TYPICAL_ERROR = 0.005
@@ -299,8 +302,11 @@ def factory(props: mi.Properties):
 BYTES = 2**18
 
 
-#: Limits of that fit: the least intersection over union with the solid, and the mean error of the normals, in degrees.
-LEAST_IOU, LARGEST_ANGLE = 0.98, 8.0
+#: Least intersection over union of that fit with the solid.
+LEAST_IOU = 0.98
+
+#: Largest mean error of the normals of that fit, in degrees.
+LARGEST_ANGLE = 8.0
 
 
 def _from_mesh(node: StockNode) -> str:

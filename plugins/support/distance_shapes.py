@@ -52,8 +52,11 @@ CELL_BYTES = 40
 #: Integrators that trace distance shapes.
 SEEN_BY = ("path_sdf",)
 
-#: Number of triangles without area, and an attribute that keeps Mitsuba from merging them with other meshes.
-CORNERS, UNMERGED = 8, "face_solid"
+#: Number of triangles without area.
+CORNERS = 8
+
+#: Attribute that keeps Mitsuba from merging such triangles with other meshes.
+UNMERGED = "face_solid"
 
 
 @cache

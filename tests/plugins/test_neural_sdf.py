@@ -147,7 +147,7 @@ def test_grid_and_arrays_agree_and_are_where_the_mesh_is(mi_rgb, folder, turned)
     bsdf = {"bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.5, 0.2]}}}
     shapes = {
         "arrays": {"type": "neural_sdf", "filename": str(folder / "torus.npz"), "normals": "analytic"},
-        "grid": shape(folder, trace="grid", resolution=96, normals="analytic"),
+        "grid": shape(folder, trace="grid", normals="analytic"),
         "mesh": {"type": "ply", "filename": str(folder / "torus.ply")},
     }
     images, boxes = {}, {}
@@ -428,16 +428,6 @@ def test_grids_of_files_that_tell_no_error(mi_rgb, upright_files):
     assert report["error"] <= report["arrays_error"] and "about" in report["decoded"]
 
 
-def test_images_of_grids_are_those_of_arrays(mi_rgb, folder):
-    """At the resolution that is found by itself and with the same random numbers, most of the noise cancels."""
-    images = []
-    for trace in ("arrays", "grid"):
-        loaded = scene(mi_rgb, {"torus": shape(folder, trace=trace)})
-        images.append(np.array(mi_rgb.render(loaded, spp=64, seed=1)))
-    assert loading.reports(loaded)[0]["resolution"] < 80
-    assert np.abs(images[0] - images[1]).mean() < 1e-3 < np.abs(images[0] - images[0].mean()).mean() / 20
-
-
 def test_crops_keep_two_cells_around_what_is_inside(mi_rgb):
     """Two cells and no more, unless the grid ends; what is added until X and Z are equal is outside."""
     from mi_diffind.plugins.support import distance_shapes
@@ -450,13 +440,8 @@ def test_crops_keep_two_cells_around_what_is_inside(mi_rgb):
     assert (cropped[5:] == 1).all()
     np.testing.assert_allclose(lower, [2, 2, 4.5])
     np.testing.assert_allclose(upper, [6, 3.5, 8.5])
-
-
-def test_grids_without_anything_inside(mi_rgb):
-    from mi_diffind.plugins.support import distance_shapes
-
-    with pytest.raises(RuntimeError, match="nothing is inside at 6 cells"):
-        distance_shapes.crop_grid(np.ones((5, 6, 7)), np.zeros(3), 0.1)
+    with pytest.raises(RuntimeError, match="nothing is inside at 13 cells"):
+        distance_shapes.crop_grid(np.ones((12, 10, 14)), np.zeros(3), 0.1)
 
 
 # -- what cannot be ----------------------------------------------------------------------------------------------------
@@ -493,22 +478,11 @@ def test_scales_that_differ(mi_rgb, folder, trace):
     refused(mi_rgb, folder, 'parameter "to_world": found', to_world=at, trace=trace)
 
 
-@pytest.mark.parametrize("fault", ["missing", "truncated", "NaN", "other task"])
+@pytest.mark.parametrize("fault", ["missing", "other task"])
 def test_damaged_files(mi_rgb, folder, tmp_path, fault):
     from mi_diffind.tasks.ggx import TASK as GGX
 
-    path = tmp_path / "bad.npz"
-    whole = (folder / "torus.npz").read_bytes()
-    if fault == "truncated":
-        path.write_bytes(whole[: len(whole) // 2])
-    elif fault == "NaN":
-        with np.load(folder / "torus.npz") as file:
-            content = dict(file)
-        entries = next(v for v in content.values() if v.dtype == np.float32 and v.ndim == 2 and v.shape[1] == 3)
-        entries[3] = np.nan
-        np.savez(path, **content)
-    elif fault == "other task":
-        path = GGX.file()
+    path = GGX.file() if fault == "other task" else tmp_path / "bad.npz"
     sentence = refused(mi_rgb, folder, path.name, filename=str(path))
     assert len(sentence) < 400
 
@@ -617,7 +591,3 @@ def test_load_file_takes_what_mitsuba_takes(mi_rgb, folder, tmp_path):
         loading.load_file(tmp_path / "none.xml")
     with pytest.raises(RuntimeError, match="unused"):
         loading.load_file(path, unused=1)
-
-
-def test_plugin_is_declared(mi_rgb):
-    assert plugins.declared()["neural_sdf"].exact.name == "ply"

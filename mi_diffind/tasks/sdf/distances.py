@@ -39,9 +39,11 @@ TOUCHING = 1e-9
 #: Deviation of a winding number from a whole number beyond which the inside is ambiguous.
 AMBIGUOUS = 0.1
 
-#: Points at which the winding number of an open mesh is evaluated, and the share of the certain ones among them that
-#: may differ between the mesh and the closed mesh.
-AMBIGUITY_POINTS, DISAGREEMENT = 2**16, 0.01
+#: Points at which the winding number of an open mesh is evaluated.
+AMBIGUITY_POINTS = 2**16
+
+#: Largest share of the certain ones among these points that may differ between the mesh and the closed mesh.
+DISAGREEMENT = 0.01
 
 #: Cells along the longest side of the coarse grid with which far points are recognised.
 COARSE = 40

@@ -29,28 +29,43 @@ from .paper import SAMPLES, STARTS, PairProblem, ratio_for, resolutions
 BYTES = 2**20
 
 #: Bytes of samples of the nodes during the training for each byte of the field, roughly.
-SAMPLED = 64
+SAMPLE_BYTES = 64
 
-#: First, finest and coarsest spacing in the search for a grid's size, relative to the longest side.
-FIRST, FINEST, COARSEST = 1 / 64, 1 / 2048, 1 / 8
+#: First spacing in the search for a grid's size, relative to the longest side.
+FIRST_SPACING = 1 / 64
+
+#: Smallest spacing in that search.
+FINEST_SPACING = 1 / 2048
+
+#: Largest spacing in that search.
+COARSEST_SPACING = 1 / 8
 
 #: Share by which a sparse field may be smaller than requested.
 TOLERANCE = 0.02
 
-#: Least bytes for a cell that the surface passes through: of masks and frames, and of pointers with a word each.
-BYTES_PER_CELL, WORDS_PER_CELL = 1, 6
+#: Least bytes of masks and frames for a cell that the surface passes through.
+BYTES_PER_CELL = 1
+
+#: Least bytes of pointers for such a cell, times the pointers in a word.
+WORDS_PER_CELL = 6
 
 #: Held-out points of the final measurement.
 MEASURED = 2**18
 
 #: Share of the surface's cells without a change of sign above which a warning is printed.
-THIN = 0.3
+MISSED_CELLS = 0.3
 
-#: Weights in the loss: the distance (in spacings), the field's gradient and the blended normals of nodes.
-DISTANCE, GRADIENT, SMOOTH = 0.3, 0.05, 0.02
+#: Weight of the distance, in spacings, in the loss.
+DISTANCE_WEIGHT = 0.3
+
+#: Weight of the field's gradient in the loss.
+GRADIENT_WEIGHT = 0.05
+
+#: Weight of the blended normals of nodes in the loss.
+SMOOTH_WEIGHT = 0.02
 
 #: Distance, in spacings, below which errors are weighted by their squares.
-ROUND = 0.01
+ROUNDED_DISTANCE = 0.01
 
 
 class SurfaceSampler:
@@ -117,8 +132,12 @@ class NodeProblem(Problem):
         value, slope, smooth, complete = self.field.blend(p)
         Array3f = self.types.Array3f
         square = dr.square(value)
-        error = DISTANCE * (dr.sqrt(square + ROUND**2) if self.settings.loss == "mae" else 10 * square)
-        error += GRADIENT * dr.squared_norm(Array3f(*slope) - n) + SMOOTH * dr.squared_norm(Array3f(*smooth) - n)
+        error = DISTANCE_WEIGHT * (
+            dr.sqrt(square + ROUNDED_DISTANCE**2) if self.settings.loss == "mae" else 10 * square
+        )
+        error += GRADIENT_WEIGHT * dr.squared_norm(Array3f(*slope) - n) + SMOOTH_WEIGHT * dr.squared_norm(
+            Array3f(*smooth) - n
+        )
         return dr.select(complete, error, 0) / size
 
     def measure(self, net):
@@ -153,7 +172,7 @@ def requested_bytes(options) -> int:
     except ValueError as e:
         raise UsageError(f"--bytes: {e}") from None
     units.check_size("--bytes", nbytes, MAX_BYTES)
-    units.check_memory("--bytes", nbytes, SAMPLED * nbytes)
+    units.check_memory("--bytes", nbytes, SAMPLE_BYTES * nbytes)
     return nbytes
 
 
@@ -175,7 +194,7 @@ def fit(request: FitRequest, measured: int = MEASURED, samples: int = SAMPLES, h
         if request.preset == "sparse":
             sampled = search_grid(distances, nbytes, options["bits"])
             spacing = sampled.structure.spacing
-            if sampled.missed > THIN:
+            if sampled.missed > MISSED_CELLS:
                 lines.append(
                     f"{100 * sampled.missed:.0f}% of the cells that the surface comes through or near to show no "
                     f"change of sign: parts may be thinner than a cell, 1/{1 / spacing:.0f} of the longest side: more "
@@ -231,10 +250,12 @@ def search_grid(distances: Distances, nbytes: int, bits: int) -> encoding.Sample
         least = BYTES_PER_CELL + WORDS_PER_CELL / POINTERS[bits]
         expected = max(sampled.nbytes - fixed, least * sampled.cells)
         aim = spacing * np.sqrt(expected / max((1 - TOLERANCE / 2) * nbytes - fixed, 1))
-        return float(np.clip(aim, FINEST, COARSEST))
+        return float(np.clip(aim, FINEST_SPACING, COARSEST_SPACING))
 
     try:
-        best = budget.approach(lambda spacing: encoding.sample(distances, spacing, bits), FIRST, following, attempts=6)
+        best = budget.approach(
+            lambda spacing: encoding.sample(distances, spacing, bits), FIRST_SPACING, following, attempts=6
+        )
     except BudgetError as e:
         raise UsageError(f"--bytes: {e}") from None
     if best.structure.nodes == 0:

@@ -149,8 +149,17 @@ def sharpen(values: np.ndarray, band: float) -> np.ndarray:
 #: Cells along the longest side of the coarsest grid that is considered.
 COARSEST = 8
 
-#: Sampling of surface points: points drawn at once, largest number of draws, Newton steps, and largest error in cells.
-DRAWN, DRAWS, NEWTON, ON_SURFACE = 2**15, 64, 6, 1e-3
+#: Surface points that are drawn at once.
+POINTS_PER_DRAW = 2**15
+
+#: Largest number of draws of surface points.
+MOST_DRAWS = 64
+
+#: Newton steps that move a point onto the surface.
+NEWTON_STEPS = 6
+
+#: Largest distance of a surface point from the surface, in cells.
+ON_SURFACE = 1e-3
 
 #: Parts along the longest side of a box; points are drawn in those that the surface may pass through.
 PARTS = 16
@@ -202,11 +211,11 @@ def surface_points(field: DistanceField, count: int, seed: int = 0) -> np.ndarra
     blocks = np.ceil((np.array(field.upper) - np.array(field.lower)) / side - 1e-6).astype(int)
     parts = np.argwhere(crossed_blocks(field, np.array(field.lower), side / BLOCK, BLOCK * blocks))
     points, have = [np.zeros((0, 3))], 0
-    for _ in range(DRAWS if len(parts) else 0):
-        p = parts[rng.integers(len(parts), size=DRAWN)] + rng.random((DRAWN, 3))
+    for _ in range(MOST_DRAWS if len(parts) else 0):
+        p = parts[rng.integers(len(parts), size=POINTS_PER_DRAW)] + rng.random((POINTS_PER_DRAW, 3))
         p = np.array(field.lower) + side * p
         p = p[np.abs(point_values(field, p)) < 0.9 * field.band][:count]
-        for _ in range(NEWTON if len(p) else 0):
+        for _ in range(NEWTON_STEPS if len(p) else 0):
             with dr.suspend_grad():
                 value, slope = (np.asarray(v.numpy(), np.float64) for v in field.gradient(point_array(field, p)))
             p = p - np.where((slope**2).sum(0) > 0.01, value / np.maximum((slope**2).sum(0), 0.01) * slope, 0).T

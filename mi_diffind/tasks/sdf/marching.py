@@ -27,8 +27,11 @@ from ...arrays.sparse_grid import BLOCK, CORNERS, empty_distances, place_of_bit
 from ...core import compat
 from .nodes import MIDDLE, bernstein, unpack_frames
 
-#: Places along the ray at which the field is evaluated in a cell, and steps by false position from there.
-SAMPLES, ROOTS = 3, 3
+#: Places along the ray at which the field is evaluated in a cell.
+SAMPLES = 3
+
+#: Steps by false position from the places between which the sign changes.
+FALSE_POSITION_STEPS = 3
 
 #: Distance by which a ray is advanced beyond the side of a cell, so that it is in the next one.
 EPSILON = 1e-3
@@ -38,14 +41,23 @@ TINY = 1e-12
 
 #: Smallest rise of a ray above a plane, per spacing. With less, distances would exceed the range of whole numbers; with
 #: more, the error would exceed a slab's margin in the longest grid.
-LEVEL = 1e-7
+LEAST_SLOPE = 1e-7
 
-#: Flags in the word of a block without crossed cells, above the distance to the next crossed one in blocks: the word is
-#: no number of a block; the block is inside.
-EMPTY, INSIDE = 1 << 31, 1 << 30
+#: Flag in the word of a block without crossed cells, above the distance to the next crossed one in blocks: the word is
+#: no number of a block.
+EMPTY = 1 << 31
 
-#: Largest height of a slab's bounds above or below a block's plane, number of steps in 16 bits, and safety margin.
-SLAB, STEPS, MARGIN = 10.0, 65535, 1e-3
+#: Flag in such a word: the block is inside.
+INSIDE = 1 << 30
+
+#: Largest height of a slab's bounds above or below the plane of its block, in spacings.
+SLAB = 10.0
+
+#: Number of steps of that height, in 16 bits.
+STEPS = 65535
+
+#: Safety margin of a slab, in spacings.
+MARGIN = 1e-3
 
 _lock = threading.RLock()  # a thread that waits for the copy of an array may load another shape
 
@@ -269,7 +281,7 @@ class Marcher:
         at, slope = d, Float(0)
         for v, x, o, e in zip(n, cell, ray.o, ray.d, strict=True):
             at, slope = dr.fma(v, o - Float(x & ~3) - MIDDLE, at), dr.fma(v, e, slope)
-        slope = dr.select(dr.abs(slope) < LEVEL, LEVEL, slope)
+        slope = dr.select(dr.abs(slope) < LEAST_SLOPE, LEAST_SLOPE, slope)
         inverse = dr.rcp(slope)
         one, other = (low - at) * inverse, (high - at) * inverse
         first, last = dr.minimum(one, other), dr.maximum(one, other)
@@ -344,7 +356,7 @@ def cross(marcher, ray, low, end, number, leaving, fresh):
         high, b = dr.select(other & ~hit, t, high), dr.select(other & ~hit, v, b)
         hit |= other
         low, a = dr.select(hit, low, t), dr.select(hit, a, v)
-    for _ in range(ROOTS):
+    for _ in range(FALSE_POSITION_STEPS):
         t = dr.fma(high - low, _share(a, b), low)
         v = value(t)
         other = (v < 0) != leaving
@@ -440,8 +452,11 @@ def march(marcher, o, d, length, fresh, active):
 #: Shortest step, relative to the longest side; a ray may miss a solid that it crosses in less.
 SHORTEST_STEP = 1e-4
 
-#: Largest error of a hit along the ray, and the value at which a place counts as on the surface.
-TOLERANCE, ZERO = 1e-5, 1e-6
+#: Largest error of a hit along a sphere-traced ray, relative to the longest side.
+TOLERANCE = 1e-5
+
+#: Value at which a place counts as on the surface.
+ZERO = 1e-6
 
 #: Distance, in cells, by which a ray may exceed the safe step where the surface is expected.
 RELAXATION = 1.0

@@ -30,8 +30,17 @@ from ...core.units import memory
 #: First number of a file and of each mesh in it.
 MAGIC = 0x041C
 
-#: Flags of a mesh: optional arrays before the triangles, and their precision.
-NORMALS, TEXTURE_COORDINATES, COLOURS, DOUBLE = 0x1, 0x2, 0x8, 0x2000
+#: Flag of a serialized mesh: normals follow its vertices.
+NORMALS = 0x1
+
+#: Flag of a serialized mesh: texture coordinates follow its vertices.
+TEXTURE_COORDINATES = 0x2
+
+#: Flag of a serialized mesh: colours follow its vertices.
+COLOURS = 0x8
+
+#: Flag of a serialized mesh: numbers have double precision.
+DOUBLE = 0x2000
 
 
 def read_serialized(path: str | os.PathLike, number: str = "") -> list[tuple[np.ndarray, np.ndarray]]:
@@ -445,9 +454,11 @@ def _windings(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray, place
 #: Distance from a triangle at which either side is tested: resolved by float32, and thinner than thin sheets.
 STEP = 2e-6
 
-#: Edge length above which a triangle is tested in parts, and the length down to which parts are halved while some of a
-#: part bounds the solid and some does not.
-COARSE, FINE = 1 / 32, 1 / 256
+#: Edge length above which a triangle is tested in parts.
+COARSE = 1 / 32
+
+#: Edge length down to which parts are halved while some of a part bounds the solid and some does not.
+FINE = 1 / 256
 
 #: Barycentric coordinates at which a triangle is tested: the middle and near the corners.
 PLACES = np.array([[1 / 3, 1 / 3, 1 / 3], [0.9, 0.05, 0.05], [0.05, 0.9, 0.05], [0.05, 0.05, 0.9]])

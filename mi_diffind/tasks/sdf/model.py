@@ -40,8 +40,14 @@ LAYOUTS = {
 #: Bytes of memory for each cell of a side's square while a surface is extracted, roughly.
 TRIANGLES = 128
 
-#: Bytes of memory for each region, block and node while a sparse field and its index for rays are built, measured.
-REGION_BYTES, BLOCK_BYTES, NODE_BYTES = 300, 400, 28
+#: Bytes of memory for each region while a sparse field and its index for rays are built, measured.
+REGION_BYTES = 300
+
+#: Bytes of memory for each block meanwhile.
+BLOCK_BYTES = 400
+
+#: Bytes of memory for each node meanwhile.
+NODE_BYTES = 28
 
 #: Coordinates of a box are smaller.
 LARGEST = 1e9

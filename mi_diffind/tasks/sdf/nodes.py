@@ -21,8 +21,14 @@ from ...arrays.lookup import mask_flags
 from ...arrays.sparse_grid import BLOCK, CORNERS, GridIndex, SparseGrid, place_of_bit
 from .field import DistanceField
 
-#: Bits of a frame: each coordinate of the normal, the distance of the middle, the scale.
-NORMAL_BITS, DISTANCE_BITS, SCALE_BITS = 10, 8, 4
+#: Bits of each coordinate of a frame's normal.
+NORMAL_BITS = 10
+
+#: Bits of the distance of a block's middle in a frame.
+DISTANCE_BITS = 8
+
+#: Bits of a frame's scale.
+SCALE_BITS = 4
 
 #: Largest distance of a block's middle, in spacings.
 REACH = 4.5

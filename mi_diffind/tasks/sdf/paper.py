@@ -24,14 +24,20 @@ from .field import DistanceField
 #: 1.5 to 2.5; the table's values are taken.
 RATIOS = {6: 2.0, 12: 2.56, 16: 2.81, 24: 2.08, 48: 2.71, 96: 2.56}
 
-#: Largest distance that is stored, in spacings of the primary array, and its minimum, relative to the longest side.
-BAND, LEAST_BAND = 2.5, 0.02
+#: Largest distance that is stored, in spacings of the primary array.
+BAND = 2.5
+
+#: Least value of that distance, relative to the longest side.
+LEAST_BAND = 0.02
 
 #: Number of cells of the cascaded array along an axis, beyond the first, up to which the bound of the slope is local.
 NARROW = 3
 
-#: Training samples, and the share of them that is uniform in the box.
-SAMPLES, UNIFORM = 2**20, 0.2
+#: Training samples.
+SAMPLES = 2**20
+
+#: Share of the training samples that is uniform in the box.
+UNIFORM = 0.2
 
 #: Starts of the arrays by preset; see :func:`initial`.
 STARTS = {"dense": "distance", "paper": "ramp"}

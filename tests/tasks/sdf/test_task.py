@@ -288,21 +288,6 @@ def test_damaged_files(folder, tmp_path, name, change, says, ad):
         pytest.fail("it was read")
 
 
-def test_truncated_file(folder, tmp_path, ad):
-    path = tmp_path / "cut.npz"
-    path.write_bytes((folder / "solids.npz").read_bytes()[:-2000])
-    with pytest.raises(TableError, match=r"cut\.npz: not a table file .*truncated"):
-        opened(path, ad)
-
-
-def test_missing_array(folder, tmp_path, ad):
-    table = load_table(folder / "solids.npz")
-    del table.arrays["regions"]
-    save_table(tmp_path / "less.npz", table)
-    with pytest.raises(TableError, match='the array "regions" is missing'):
-        opened(tmp_path / "less.npz", ad)
-
-
 # -- hard cases --------------------------------------------------------------------------------------------------------
 
 
