@@ -340,33 +340,3 @@ def near_nodes(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     keys = np.ravel_multi_index(cells.T, shape)[:, None] + np.ravel_multi_index(CORNERS.T, shape)
     keys, corners = np.unique(keys, return_inverse=True)
     return np.stack(np.unravel_index(keys, shape), axis=-1).astype(np.int32), corners.reshape(-1, 8)
-
-
-def node_distances(distances: Distances, lower, spacing: float, shape, limit: float) -> np.ndarray:
-    """Return the signed distance at all nodes ``lower + spacing · (i, j, k)`` of a grid, truncated to ± ``limit``.
-
-    The result is float32 of the ``shape`` (nodes along x, y and z). Distances are computed near the surface only; of
-    the other nodes, neighbours share a sign, which is computed once.
-    """
-    from scipy.ndimage import label
-
-    shape = tuple(int(n) for n in shape)
-    lower = np.asarray(lower, dtype=np.float64)
-    cells = surface_cells(distances, lower, spacing, np.array(shape) - 1, max(0.0, limit - 0.8 * spacing))
-    nodes, _ = near_nodes(cells)
-    near = np.zeros(shape, dtype=bool)
-    near[tuple(nodes.T)] = True
-    values = np.empty(shape, np.float32)
-    if distances.solid.watertight:
-        pieces, count = label(~near)
-        first = np.zeros(count + 1, dtype=np.int64)
-        flat = pieces.reshape(-1)
-        first[flat[::-1]] = np.arange(len(flat))[::-1]
-        places = np.stack(np.unravel_index(first, shape), axis=-1)
-        signs = np.where(distances.inside(lower + spacing * places), -1, 1).astype(np.float32)
-        values[...] = limit * signs[pieces]
-    else:
-        far = np.argwhere(~near)
-        values[tuple(far.T)] = np.where(distances.inside(lower + spacing * far), -limit, limit)
-    values[tuple(nodes.T)] = distances.signed(lower + spacing * nodes).clip(-limit, limit)
-    return values

@@ -20,7 +20,6 @@ from mi_diffind.tasks.sdf.distances import (
     Distances,
     DistancesError,
     near_nodes,
-    node_distances,
     sample_box,
     sample_near,
     sample_surface,
@@ -419,20 +418,6 @@ def test_surface_cells_miss_nothing():
     assert np.array_equal(nodes[corners], cells[:, None] + CORNERS) and len(np.unique(nodes, axis=0)) == len(nodes)
     assert np.array_equal(nodes, nodes[np.lexsort(nodes.T[::-1])])
     assert near_nodes(cells[:0])[0].shape == (0, 3) and near_nodes(cells[:0])[1].shape == (0, 8)
-
-
-def test_grid_of_distances():
-    """Far nodes take their sign from neighbours: the same as one by one, with a cavity and two pieces."""
-    mesh = make_mesh(*solids.together(solids.sphere(10), solids.turned(solids.sphere(8, 0.6)),
-                                      solids.sphere(6, 0.3, (1.5, 0, 0))))  # fmt: skip
-    lower, spacing = mesh.lower - 0.1, 0.03
-    shape = np.ceil((mesh.upper + 0.1 - lower) / spacing).astype(int) + 1
-    with Distances(mesh) as d:
-        values = node_distances(d, lower, spacing, shape, 0.05)
-        nodes = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1)
-        truth = d.signed((lower + spacing * nodes).reshape(-1, 3)).reshape(values.shape)
-    assert values.dtype == np.float32 and np.abs(values - truth.clip(-0.05, 0.05)).max() < 1e-6
-    assert (values == -np.float32(0.05)).any() and (values == np.float32(0.05)).any()
 
 
 def test_samples():
