@@ -200,7 +200,7 @@ class SparseNodes(DistanceField):
     """Field of the nodes of a ``structure``, in one of two forms.
 
     Decoded nodes can be trained: ``nodes`` is a tensor (n, 4) of distances in spacings and gradients. Coded nodes are
-    ``pointers`` (words, with ``bits`` bits each) into ``entries`` (words, with the :func:`.codes.entry_scale`
+    ``pointers`` (words, with ``bits`` bits each) into ``entries`` (words, with the :func:`entry_scale`
     ``offset`` and ``step``), relative to the ``frames`` of their blocks (words).
     """
 
