@@ -111,7 +111,7 @@ def integrator() -> type:
         #: Rays carry differentials, from which textures get footprints (:mod:`.filtered_texture`).
         gives_footprints = True
 
-        #: Radiance fields between the surfaces (:class:`.field_light.FieldLight`), or ``None``.
+        #: Radiance fields between the surfaces (:class:`.placed_fields.FieldLight`), or ``None``.
         between = None
 
         def __init__(self, props: mi.Properties):

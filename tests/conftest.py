@@ -63,8 +63,8 @@ def collect_garbage():
 def few_samples(monkeypatch):
     """What a training measures of its result in the end is measured at fewer places than for a user."""
     from mi_diffind.tasks.disney.files import DisneyModel
-    from mi_diffind.tasks.ggx.files import GGXModel
-    from mi_diffind.tasks.image.compressed import CompressedImage
+    from mi_diffind.tasks.ggx.training import GGXModel
+    from mi_diffind.tasks.image.arrays import CompressedImage
 
     for function, samples in (
         (CompressedImage._between, 2**13),

@@ -229,7 +229,7 @@ def test_the_command_and_a_comparison_with_the_stock_scene(mi_rgb, tmp_path, cap
     for output, fault in (("scene.xml", "the same file as the scene"), ("new.json", "allowed is .xml")):
         assert main(["convert", scene, "-o", str(tmp_path / output)]) == 2 and fault in capsys.readouterr().err
     result = mi_diffind.compare(scene, 8, learn=["principled"], progress=False)
-    assert comparison.truth_label(result.figures) == "stock (principled), 8 spp" and result.further == ()
+    assert result.truth == "stock (principled), 8 spp" and result.further == ()
     assert main(["convert", scene, "-o", str(new), "--learn", "principled", "--no-check"]) == 0
     assert "check" not in capsys.readouterr().out
     assert printed[:2] == str(result).splitlines()[3:5] and result.figures["psnr_db"] > 25
