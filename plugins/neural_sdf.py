@@ -64,7 +64,7 @@ def open_model(props: mi.Properties):
         raise RuntimeError(str(e)) from None
 
 
-def decoded(model, resolution: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict]:
+def decode_grid(model, resolution: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict]:
     """Return a grid of a model's field for ``sdfgrid``, its corners in the unit frame, and its report.
 
     ``resolution`` is the number of cells along the longest side; 0 chooses the coarsest grid with an error below that
@@ -250,7 +250,7 @@ class NeuralSDF(distance_shape(mi.Mesh)):
             return
         self._entries.accept()
         if not keys or any(key.startswith("tables.") for key in keys):
-            self.model.field.changed()
+            self.model.field.update_bound()
             self._hold()
 
     def report(self) -> dict:
@@ -281,7 +281,7 @@ def factory(props: mi.Properties):
     Placement.of(to_world, model.scale, model.centre)  # raises for an invalid transform
     normals = properties.one_of(props, "normals", ("smooth", "analytic"))
     try:
-        values, lower, upper, report = decoded(model, resolution)
+        values, lower, upper, report = decode_grid(model, resolution)
     except RuntimeError as e:
         raise RuntimeError(f"{model.table.path}: {e}") from None
     to_unit = mi.ScalarTransform4f().translate(list(model.centre)).scale(model.scale)

@@ -178,7 +178,7 @@ def distance_shape(mesh: type) -> type:
             part = total - a
             return mi.Point3f(total), (a - (total - part)) + (b - part)
 
-        def moved(self, p, d, active=True) -> tuple:
+        def move_along(self, p, d, active=True) -> tuple:
             """Return the hit ``p`` (unit frame) of a ray with the direction ``d`` (world), and its place in the world.
 
             If derivatives are enabled and not suspended, both are attached to the field's entries and to its placement:
@@ -205,9 +205,9 @@ def distance_shape(mesh: type) -> type:
         def surface(self, p, d, active=True):
             """Return place, geometric and shading normal, in the world, of the hit ``p`` (unit frame) of a ray.
 
-            The ray has the direction ``d`` (world); the place is attached as in :meth:`moved`.
+            The ray has the direction ``d`` (world); the place is attached as in :meth:`move_along`.
             """
-            p, place = self.moved(p, d, active)
+            p, place = self.move_along(p, d, active)
             if not self.smooth:
                 shading = normal = self._unit(self.field.gradient(p, active)[1], d)
             else:
@@ -380,7 +380,7 @@ def shift(shapes: DistanceShapes, hit: ShapeHit, d, active=True):
     change = mi.Vector3f(0)
     for i, shape in enumerate(shapes):
         here = (hit.number == i + 1) & active
-        _, place = shape.moved(hit.p, d, here)
+        _, place = shape.move_along(hit.p, d, here)
         change = dr.select(here, place - dr.detach(place), change)
     return change
 

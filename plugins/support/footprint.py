@@ -46,7 +46,7 @@ class Cone:
     - ``origin``: the centre of projection, or of the lens; ``axis``: the unit vector of the viewing direction;
     - ``dx``, ``dy``: the shift of the visible place for a step of one pixel to the right, or down, at depth 1 along the
       axis (for an orthographic sensor, at any depth);
-    - ``scale``: the width of a sample's footprint relative to a pixel's (:func:`scale_of`);
+    - ``scale``: the width of a sample's footprint relative to a pixel's (:func:`sample_scale`);
     - ``reach``: the least √(cos³) of the angle between a pixel and the axis, 1 if orthographic;
     - ``lens``: the radius of the lens, 0 without one;
     - ``corner``: the visible place at the film's corner, relative to ``origin`` and at the depth of ``dx``; ``None``
@@ -147,7 +147,7 @@ class Cone:
     @classmethod
     def _opaque(cls, projection, origin, axis, dx, dy, spp, reach, lens) -> Cone:
         vectors = (dr.opaque(mi.Vector3f, [float(x) for x in v]) for v in (axis, dx, dy))
-        numbers = (dr.opaque(mi.Float, float(x)) for x in (scale_of(spp), reach, lens))
+        numbers = (dr.opaque(mi.Float, float(x)) for x in (sample_scale(spp), reach, lens))
         return cls(projection, dr.opaque(mi.Point3f, [float(x) for x in origin]), *vectors, *numbers)
 
     @property
@@ -156,7 +156,7 @@ class Cone:
         return dr.norm(self.dx)
 
 
-def scale_of(spp: float) -> float:
+def sample_scale(spp: float) -> float:
     """Return the width of a sample's footprint relative to the pixel's: max(1/8, 1/√spp), as in pbrt-v4."""
     return float(max(1 / 8, 1 / np.sqrt(max(spp, 1))))
 
@@ -277,7 +277,7 @@ def _finite(v: mi.Vector2f) -> mi.Vector2f:
     return dr.select(dr.isnan(v), 0, dr.clip(v, -LARGEST, LARGEST))
 
 
-def transformed(ddx: mi.Vector2f, ddy: mi.Vector2f, matrix) -> tuple[mi.Vector2f, mi.Vector2f]:
+def transform(ddx: mi.Vector2f, ddy: mi.Vector2f, matrix) -> tuple[mi.Vector2f, mi.Vector2f]:
     """Apply ``to_uv`` to a footprint in uv; ``matrix``, 3 × 3, is a list of its rows."""
     (a, b), (c, d) = (tuple(row)[:2] for row in tuple(matrix)[:2])
     return tuple(mi.Vector2f(dr.fma(a, v.x, b * v.y), dr.fma(c, v.x, d * v.y)) for v in (ddx, ddy))
@@ -299,7 +299,7 @@ def axes(ddx: mi.Vector2f, ddy: mi.Vector2f) -> tuple[mi.Float, mi.Float, mi.Vec
     return major, dr.select(major > 0, dr.minimum(area(ddx, ddy) / major, major), 0), direction
 
 
-def joined(ddx: mi.Vector2f, ddy: mi.Vector2f, s: mi.Vector2f, t: mi.Vector2f) -> tuple[mi.Vector2f, mi.Vector2f]:
+def add_moments(ddx: mi.Vector2f, ddy: mi.Vector2f, s: mi.Vector2f, t: mi.Vector2f) -> tuple[mi.Vector2f, mi.Vector2f]:
     """Return the axes, major first, of two footprints blurred by each other: the second moments are added."""
     ddx, ddy, s, t = (_finite(v) for v in (ddx, ddy, s, t))
     p, q, r = (a + b for a, b in zip(_moments(ddx, ddy), _moments(s, t), strict=True))
@@ -414,7 +414,7 @@ class Differentials:
     spread: mi.Float
 
     @classmethod
-    def of(cls, ray) -> Differentials:
+    def from_ray(cls, ray) -> Differentials:
         """Return those of a sensor's rays (``mi.RayDifferential3f``, scaled for samples); zero for other rays."""
         if not (hasattr(ray, "d_x") and ray.has_differentials):
             return cls(*(mi.Vector3f(0) for _ in range(4)), mi.Float(0), mi.Float(0))
@@ -448,11 +448,11 @@ class Differentials:
         ddx, ddy = in_uv(self.ox, self.oy, ray.d, du, dv)
         frame = mi.Frame3f(ray.d)
         s, t = in_uv(self.width * frame.s, self.width * frame.t, ray.d, du, dv)
-        both = joined(ddx, ddy, s, t)
+        both = add_moments(ddx, ddy, s, t)
         wide = self.width > 0
         return dr.select(wide, both[0], ddx), dr.select(wide, both[1], ddy)
 
-    def bounced(self, ray, si, wo, eta, pdf, delta, scale, edges) -> Differentials:
+    def bounce(self, ray, si, wo, eta, pdf, delta, scale, edges) -> Differentials:
         """Return the differentials after a bounce at a hit (:meth:`at`) into the direction ``wo`` (world space).
 
         ``pdf`` is the density of the direction per solid angle, unless it is the only one (``delta``); ``eta`` is the

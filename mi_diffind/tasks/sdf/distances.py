@@ -167,13 +167,13 @@ class Distances:
         With a small limit, many points all over space are several times as fast, since far ones are recognised by a
         coarse grid.
         """
-        points = _checked(points)
+        points = _check_points(points)
         if limit < math.inf and len(points) > COARSE**3:
-            return self._truncated(points, limit)
+            return self._signed_near(points, limit)
         sign = np.where(self.inside(points), -1, 1).astype(np.float32)
         return sign * np.minimum(self.unsigned(points), limit).astype(np.float32)
 
-    def _truncated(self, points: np.ndarray, limit: float) -> np.ndarray:
+    def _signed_near(self, points: np.ndarray, limit: float) -> np.ndarray:
         """Compute :meth:`signed` with a coarse grid: the distance of a cell's centre bounds those of its points."""
         lower, upper = points.min(axis=0), points.max(axis=0)
         side = max(float((upper - lower).max()) / COARSE, 1e-9)
@@ -196,7 +196,7 @@ class Distances:
 
         The gradient points away from the nearest point; on the surface it is the normal of the triangle.
         """
-        points = _checked(points)
+        points = _check_points(points)
         d, face, closest = self.nearest(points)
         sign = np.where(self.inside(points), -1.0, 1.0)
         near = d < TOUCHING
@@ -206,7 +206,7 @@ class Distances:
 
     def _ask(self, question: str, points, name: str, mesh: Mesh) -> tuple[np.ndarray, ...]:
         """Return the answers for all points, chunk by chunk; the mesh is sent once, under its ``name``."""
-        points = _checked(points)
+        points = _check_points(points)
         if not len(points):
             return tuple(array[:0] for array in self._ask(question, np.zeros((1, 3)), name, mesh))
         if self._owner != os.getpid():
@@ -226,7 +226,7 @@ class Distances:
             self._child.stdin.flush()
             error, arrays = pickle.load(self._child.stdout)
         except (OSError, EOFError, pickle.UnpicklingError):
-            self._died()
+            self._raise_ended()
         except BaseException:  # after Ctrl-C the rest of an answer would be read as the next one
             self.close()
             raise
@@ -247,7 +247,7 @@ class Distances:
             env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, map(os.path.abspath, sys.path)))},
         )  # fmt: skip
 
-    def _died(self) -> None:
+    def _raise_ended(self) -> None:
         """Raise :class:`DistancesError` with the reason why the child process ended."""
         code = self._child.wait()
         cause = f"exit code {code}"
@@ -261,7 +261,7 @@ class Distances:
         )
 
 
-def _checked(points) -> np.ndarray:
+def _check_points(points) -> np.ndarray:
     points = np.ascontiguousarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"points: found the shape {points.shape}, expected (N, 3)")

@@ -290,10 +290,10 @@ def march(layers, cells, smallest: float, crossed=None) -> tuple[np.ndarray, np.
                 count += len(v)
     if not vertices:
         return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
-    return _joined(np.concatenate(vertices), np.concatenate(faces))
+    return _merge_vertices(np.concatenate(vertices), np.concatenate(faces))
 
 
-def _joined(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Merge the equal vertices of adjacent blocks.
 
     A vertex on a grid's edge is the same wherever it comes from. No vertex lies on a node, so the edge is identified by

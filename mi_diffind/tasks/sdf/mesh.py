@@ -231,7 +231,7 @@ def make_mesh(vertices: np.ndarray, faces: np.ndarray, name: str = "mesh") -> Me
     if len(faces) == 0:
         raise MeshError(f"{name}: has no triangles, expected a surface that encloses a solid")
     _check_indices(name, faces, len(vertices))
-    vertices, faces = _joined(vertices, faces)
+    vertices, faces = _merge_vertices(vertices, faces)
     if not np.all(np.isfinite(vertices)):
         raise MeshError(f"{name}: has vertices that are NaN or infinite, allowed are finite ones")
 
@@ -248,7 +248,7 @@ def make_mesh(vertices: np.ndarray, faces: np.ndarray, name: str = "mesh") -> Me
     vertices = (vertices - centre) / scale
 
     repairs = []
-    vertices, faces, watertight, turned = _repaired(vertices, faces, name, repairs)
+    vertices, faces, watertight, turned = _repair(vertices, faces, name, repairs)
     vertices, faces = np.ascontiguousarray(vertices), np.ascontiguousarray(faces, dtype=np.int32)
     digest = hashlib.sha256(vertices.tobytes() + faces.tobytes()).hexdigest()
     mesh = Mesh(vertices, faces, watertight, scale, tuple(float(c) for c in centre), name, digest, repairs, turned)
@@ -321,7 +321,7 @@ def _read(path: Path, part: str = "") -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(vertices), np.concatenate(faces)
 
 
-def _repaired(vertices: np.ndarray, faces: np.ndarray, name: str, repairs: list[str]):
+def _repair(vertices: np.ndarray, faces: np.ndarray, name: str, repairs: list[str]):
     """Drop degenerate triangles and turn wrongly wound ones; sentences are added to ``repairs``."""
     twice = (faces[:, 0] == faces[:, 1]) | (faces[:, 1] == faces[:, 2]) | (faces[:, 2] == faces[:, 0])
     faces = faces[~twice]
@@ -354,7 +354,7 @@ def _repaired(vertices: np.ndarray, faces: np.ndarray, name: str, repairs: list[
     return vertices[used], faces.reshape(-1, 3), not open_edges, int(np.count_nonzero(against != turned))
 
 
-def _joined(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Merge equal vertices and drop unused ones: vertices in lexicographic order, and faces that index them."""
     used = np.zeros(len(vertices), dtype=bool)
     used[faces] = True

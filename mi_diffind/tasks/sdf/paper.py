@@ -61,7 +61,7 @@ class PairField(DistanceField):
     def bound(self):
         return self._bound
 
-    def changed(self):
+    def update_bound(self):
         self.slope = slope_bound(self.net, self.lower, self.upper, self.band)
         self._bound = dr.opaque(self.types.Float, self.slope)
 

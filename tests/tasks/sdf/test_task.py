@@ -155,7 +155,7 @@ def test_the_bound_of_the_slope_follows_entries(ad, rng):
     bounds = []
     for factor in (1, 3):
         net.cascaded.data = net.cascaded.data * factor
-        field.changed()
+        field.update_bound()
         steps = dr.abs(field.value(p + d) - field.value(p - d)) / 2e-4
         steepest = dr.max(dr.select(field.inside(p + d) & field.inside(p - d), steps, 0))[0]
         bounds.append(field.slope)
