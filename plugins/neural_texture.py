@@ -9,12 +9,12 @@ import mitsuba as mi
 from mi_diffind.tasks.texture import TASK
 
 from . import Counterpart, Plugin, Stock
-from .filtered_texture import FilteredTexture
-from .support.filtering import FILTERS, TYPES
-from .support.filtering import PROPERTIES as FILTERING
 from .support.image_files import SharedMaps, manifest_of, open_compressed, to_bitmap, to_mipmap
 from .support.manual import shared_parts
+from .support.map_textures import FilteredTexture
 from .support.stock import Kept, StockNode
+from .support.textures import FILTERS, TYPES
+from .support.textures import PROPERTIES as FILTERING
 
 
 @shared_parts

@@ -154,18 +154,18 @@ def test_stochastic_is_unbiased(mi_rgb, file, rng, taps):
 def test_random_numbers(mi_rgb, rng):
     """Uniform, and independent of each other and of where the hits are, for places on a line or in a small patch."""
     mi = mi_rgb
-    from mi_diffind.plugins.support import filtering
+    from mi_diffind.plugins.support import textures
 
     n = 2**16
     line = np.linspace(0, 1, n)
     patch = np.mgrid[0:256, 0:256].reshape(2, -1) * 1e-3
     for uv, p in ((np.stack([line, 0 * line]), np.stack([line, line, 0 * line])), (patch, np.zeros((3, n)))):
-        a, b = (x.numpy() for x in filtering.random(texture_scenes.hits(mi, uv, p=p)))
+        a, b = (x.numpy() for x in textures.hit_numbers(texture_scenes.hits(mi, uv, p=p)))
         assert min(a.min(), b.min()) >= 0 and max(a.max(), b.max()) < 1
         for x, y in ((a, b), (a[:-1], a[1:]), (b[:-1], b[1:]), (a[:-256], a[256:])):
             counts = np.histogram2d(x, y, bins=16, range=[[0, 1]] * 2)[0]
             assert ((counts - len(x) / 256) ** 2 / (len(x) / 256)).sum() < 255 + 5 * math.sqrt(2 * 255)
-        again = filtering.random(texture_scenes.hits(mi, uv, p=p))[0].numpy()
+        again = textures.hit_numbers(texture_scenes.hits(mi, uv, p=p))[0].numpy()
         np.testing.assert_array_equal(again, a)
 
 

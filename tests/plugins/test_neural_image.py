@@ -499,7 +499,7 @@ def test_upsampling_is_mitsubas(rng):
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_spectral")
-    from mi_diffind.plugins.support import upsampling
+    from mi_diffind.plugins.support import textures
 
     n = 300
     colours = rng.random((3, n)) ** rng.choice([0.3, 1, 6], n)
@@ -509,7 +509,7 @@ def test_upsampling_is_mitsubas(rng):
     wavelengths = np.float32([380, 470, 560, 700])
     rgb = [mi.Float(aligned(c)) for c in colours]
     dr.enable_grad(rgb)
-    found = upsampling.spectrum(rgb, mi.UnpolarizedSpectrum(*[float(w) for w in wavelengths]))
+    found = textures.spectrum(rgb, mi.UnpolarizedSpectrum(*[float(w) for w in wavelengths]))
     expected = []
     for c in colours.T:
         c0, c1, c2 = np.array(mi.srgb_model_fetch([float(v) for v in c]), np.float64)
@@ -525,7 +525,7 @@ def test_upsampling_is_mitsubas(rng):
         step, values = 1e-3, []
         for sign in (-1, 1):
             moved = [mi.Float(aligned(c + (sign * step if i == k else 0))) for i, c in enumerate(colours)]
-            values.append(sum(upsampling.spectrum(moved, mi.UnpolarizedSpectrum(*wavelengths.tolist())).numpy()))
+            values.append(sum(textures.spectrum(moved, mi.UnpolarizedSpectrum(*wavelengths.tolist())).numpy()))
         difference = (values[1] - values[0]) / (2 * step)
         inside = (colours[:, :n].min(axis=0) > 0.1) & (colours[:, :n].max(axis=0) < 0.95)
         error = np.abs(gradient - difference)[:n][inside]
