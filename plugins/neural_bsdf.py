@@ -418,7 +418,7 @@ def _spectrum(rgb: list, wavelengths):
     if not mi.is_spectral:
         return mi.UnpolarizedSpectrum(*rgb)
     largest = dr.maximum(dr.maximum(dr.maximum(rgb[0], rgb[1]), rgb[2]), 1e-20)
-    return largest * textures.spectrum([v / largest for v in rgb], wavelengths)
+    return largest * textures.upsampled_spectrum([v / largest for v in rgb], wavelengths)
 
 
 class SourceBSDF(NeuralBSDF):

@@ -175,7 +175,7 @@ class VariantLight:
         scale = 2 * dr.maximum(dr.max(mi.Array3f(*colour)), 1e-20)
         at = dr.zeros(mi.SurfaceInteraction3f)
         at.wavelengths = wavelengths
-        spectrum = textures.spectrum([c / scale for c in colour], wavelengths)
+        spectrum = textures.upsampled_spectrum([c / scale for c in colour], wavelengths)
         return mi.Spectrum(spectrum * scale * self.illuminant.eval(at, active))
 
     def adjoint(self, colour, wavelengths, weight, active=True):

@@ -509,7 +509,7 @@ def test_upsampling_is_mitsubas(rng):
     wavelengths = np.float32([380, 470, 560, 700])
     rgb = [mi.Float(aligned(c)) for c in colours]
     dr.enable_grad(rgb)
-    found = textures.spectrum(rgb, mi.UnpolarizedSpectrum(*[float(w) for w in wavelengths]))
+    found = textures.upsampled_spectrum(rgb, mi.UnpolarizedSpectrum(*[float(w) for w in wavelengths]))
     expected = []
     for c in colours.T:
         c0, c1, c2 = np.array(mi.srgb_model_fetch([float(v) for v in c]), np.float64)
@@ -525,7 +525,7 @@ def test_upsampling_is_mitsubas(rng):
         step, values = 1e-3, []
         for sign in (-1, 1):
             moved = [mi.Float(aligned(c + (sign * step if i == k else 0))) for i, c in enumerate(colours)]
-            values.append(sum(textures.spectrum(moved, mi.UnpolarizedSpectrum(*wavelengths.tolist())).numpy()))
+            values.append(sum(textures.upsampled_spectrum(moved, mi.UnpolarizedSpectrum(*wavelengths.tolist())).numpy()))
         difference = (values[1] - values[0]) / (2 * step)
         inside = (colours[:, :n].min(axis=0) > 0.1) & (colours[:, :n].max(axis=0) < 0.95)
         error = np.abs(gradient - difference)[:n][inside]
