@@ -525,7 +525,9 @@ def test_upsampling_is_mitsubas(rng):
         step, values = 1e-3, []
         for sign in (-1, 1):
             moved = [mi.Float(aligned(c + (sign * step if i == k else 0))) for i, c in enumerate(colours)]
-            values.append(sum(textures.upsampled_spectrum(moved, mi.UnpolarizedSpectrum(*wavelengths.tolist())).numpy()))
+            values.append(
+                sum(textures.upsampled_spectrum(moved, mi.UnpolarizedSpectrum(*wavelengths.tolist())).numpy())
+            )
         difference = (values[1] - values[0]) / (2 * step)
         inside = (colours[:, :n].min(axis=0) > 0.1) & (colours[:, :n].max(axis=0) < 0.95)
         error = np.abs(gradient - difference)[:n][inside]
