@@ -241,41 +241,6 @@ def test_extras_shape_and_weigh_the_highlight(mi_rgb, files, rng):
     np.testing.assert_allclose(values, expected, rtol=2e-3, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["metal", "leaf", "shaped"])
-def test_chi2(mi_rgb, files, name, tmp_path, monkeypatch):
-    """Samples follow the density, on both sides and beside the horizon of a turned frame."""
-    from mitsuba.chi2 import BSDFAdapter, ChiSquareTest, SphericalDomain
-
-    monkeypatch.chdir(tmp_path)  # where a failing test leaves its histogram
-    xml = f'<string name="filename" value="{files[name]}"/><boolean name="two_sided" value="true"/>'
-    xml += '<float name="clearcoat" value="0.8"/>' + (
-        '<string name="ignore" value="opacity"/>' if name == "leaf" else ""
-    )
-    for angle in (20, 100):
-        theta = np.radians(angle)
-        wi = dr.opaque(mi_rgb.Vector3f, [np.sin(theta), 0, np.cos(theta)])  # one kernel for all
-        sample, pdf = BSDFAdapter("neural_material", xml, wi=wi)
-        test = ChiSquareTest(SphericalDomain(), sample, pdf, sample_dim=3, sample_count=500_000, res=61, ires=32)
-        assert test.run(test_count=2, quiet=True), test.messages
-
-
-def test_energy_and_reciprocity(mi_rgb, files, rng):
-    """No weight exceeds the light on average; without a normal map, both directions may be exchanged."""
-    mi, ctx, n = mi_rgb, mi_rgb.BSDFContext(), 2**16
-    for name, more in (("metal", {}), ("steep", {"ignore": "albedo"}), ("leaf", {}), ("shaped", {})):
-        bsdf = mi.load_dict({"type": "neural_material", "filename": files[name], **more})
-        for z in (0.1, 0.6, 1.0):
-            si = hits(mi, rng, n)
-            si.wi = mi.Vector3f((1 - z * z) ** 0.5, 0, z)
-            _, weight = bsdf.sample(ctx, si, *samples(mi, rng, n))
-            assert 0 < weight.numpy().mean(axis=1).max() < 1.01
-    bsdf = mi.load_dict({"type": "neural_material", "filename": files["shaped"], "ignore": "normal", "clearcoat": 0.5})
-    si, wo = hits(mi, rng, n), directions(mi, rng, n)
-    forth = bsdf.eval(ctx, si, wo).numpy() * si.wi.z.numpy()
-    wi, si.wi = mi.Vector3f(si.wi), wo
-    np.testing.assert_allclose(bsdf.eval(ctx, si, wi).numpy() * wo.z.numpy(), forth, rtol=1e-3, atol=1e-6)
-
-
 @pytest.mark.parametrize("name", ["steep", "smooth"])
 def test_extremes_are_finite(mi_rgb, files, rng, name):
     """Roughness 0, black, steep normals, directions at both horizons and none at all: values and derivatives."""
