@@ -17,6 +17,7 @@ from ...fitting.settings import FittingError
 from ...fitting.task import FitRequest, Fitted
 from ...maps import as_seen
 from ...maps.arguments import requested_border, requested_bytes, size_figures
+from ...maps.model import significant
 from ...maps.source import Source, load_source
 from . import PAGED, PRESETS, STRUCTURES, CoarsePrimary, ImageRecipe, parse_weights, replaced, without
 from .arrays import CompressedImage, ImageBudget, cascaded_side, fit_bytes, search
@@ -109,7 +110,7 @@ def fit(request: FitRequest) -> Fitted:
         request.deadline.rehearse(lambda: as_seen.reference(source, request.types))
     fitted, requested = _train(request, source, recipe)
     seen = as_seen.measure(source, CompressedImage.of(fitted.table, request.types.TensorXf))
-    fitted.table.measured |= {name: float(f"{value:.5g}") for name, value in seen.items()}
+    fitted.table.measured |= significant(seen)
     fitted.table.settings |= request.paths(source_path=options["source"])
     figures, lines = size_figures(source, fitted.table, requested)
     fitted.lines += [*lines, *source.notes]

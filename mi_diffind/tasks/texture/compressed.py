@@ -147,7 +147,8 @@ def to_table(texture: CompressedTexture, settings: dict) -> Table:
     stored = {}
     for name, array in texture.arrays.items():
         stored |= stored_arrays(name, array)
-    settings = {**settings, "layout": texture.layout.to_json()}
+    settings = {k: v for k, v in settings.items() if k not in ("structure", "border")}  # in "arrays" below
+    settings["layout"] = texture.layout.to_json()
     if texture.level_bias:
         settings["level_bias"] = texture.level_bias
     if texture.net is not None:
