@@ -44,9 +44,9 @@ from mi_diffind.measure import clock
 from mi_diffind.tasks.image import PRESETS
 from mi_diffind.tasks.image import arrays as image_budget
 from mi_diffind.tasks.image.fit import default_size
+from mi_diffind.tasks.radiance import dense_bytes, ratio_for
 from mi_diffind.tasks.radiance import fit as field_fit
 from mi_diffind.tasks.radiance import paper as field_paper
-from mi_diffind.tasks.radiance.presets import dense_bytes, ratio_for
 from mi_diffind.tasks.sdf import paper as sdf_paper
 from mi_diffind.tasks.texture import arrays as texture_budget
 

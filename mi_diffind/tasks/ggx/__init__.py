@@ -1,4 +1,4 @@
-"""Task 1: the isotropic GGX distribution of normals (:mod:`.model`, :mod:`.training`, :mod:`.files`)."""
+"""Task 1: the isotropic GGX distribution of normals (:mod:`.model`, :mod:`.training`)."""
 
 from __future__ import annotations
 
@@ -30,6 +30,7 @@ class GGX(Task):
         "tables": FitSettings(steps=4000, batch=65536, lr=1e-2, schedule="cosine", seed=1),
         "paper": FitSettings(steps=3000, batch=65536, lr=1e-3, schedule="constant", seed=1),
     }
+    files = "training"
     shipped = {"tables": "ggx_tables.npz", "paper": "ggx_paper.npz"}  # noqa: RUF012
     arguments = tuple(
         Argument(

@@ -26,7 +26,7 @@ from ...images import metrics, srgb
 from ...maps.compressed import FilteredMaps, decibel
 from ...maps.pyramid import Pyramid
 from ..disney.decoder import Decoder
-from ..disney.effects import Effects
+from ..disney.model import Effects
 from ..disney.training import uniform_hemisphere
 from .material import shaded, surface_of
 

@@ -23,7 +23,7 @@ from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.tasks.disney import TASK as DISNEY
 from mi_diffind.tasks.disney.decoder import Decoder
-from mi_diffind.tasks.disney.effects import Effects
+from mi_diffind.tasks.disney.model import Effects
 from mi_diffind.tasks.disney.training import uniform_hemisphere
 from mi_diffind.tasks.shading import PRESETS, material, training
 from mi_diffind.tasks.shading.evaluation import ShadedEvaluation, reader, reference
@@ -590,7 +590,7 @@ def test_command_trains_both_and_the_plugin_reads_it(mi_rgb, start, manifest, tm
     "changed, message",
     [
         (["--lambda", "1.5"], "argument --lambda: found '1.5', allowed are numbers from 0 to 1"),
-        (["--clip", "-1"], "argument --clip: found '-1', expected a positive number or none"),
+        (["--clip", "-1"], "argument --clip: found '-1', allowed are numbers above 0 and none"),
         (["--start", "x.npz", "--compression", "3x"], "--start: the arrays have their size"),
         (["--extras", "auto", "--preset", "paper"], "--extras: found auto, the arrays of the preset paper have none"),
         (["--level-bias", "0.5"], "argument --level-bias: found '0.5', allowed are numbers from -4 to 0"),
