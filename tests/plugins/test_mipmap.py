@@ -90,18 +90,6 @@ def test_off_ignores_footprints(mi_rgb, file, rng):
     assert a.gathers == 4 and c.gathers == 8 + 2 and c.instructions > a.instructions + 100
 
 
-def test_reads_by_filter(mi_rgb, file, rng):
-    """As many as the filter says; one place for all taps of the stochastic one, and one level."""
-    mi = mi_rgb
-    si = texture_scenes.hits(mi, rng.random((2, 100)), *texture_scenes.footprints(rng, 100, SIZE))
-    found = {}
-    for name, taps in (("anisotropic", 1), ("anisotropic", 4), ("anisotropic", 7), ("stochastic", 4)):
-        texture = mi.load_dict(plugin(file, name, max_anisotropy=taps))
-        found[name, taps] = count(lambda t=texture: t.eval(si)).gathers
-        assert texture.report()["taps"] == (taps if name == "anisotropic" else 1)
-    assert list(found.values()) == [8 + 2, 4 * 8 + 2, 7 * 8 + 2, 4 + 1]
-
-
 @pytest.mark.parametrize("wrap_mode", ["repeat", "clamp"])
 def test_trilinear_is_the_pyramid_at_the_level_of_the_area(mi_any, file, image, rng, wrap_mode):
     mi = mi_any
@@ -188,16 +176,6 @@ def test_seams(mi_rgb, file, rng, name):
 
 
 # -- gradients ---------------------------------------------------------------------------------------------------------
-
-
-def test_gradients_of_wrong_footprints_are_finite(mi_rgb, file):
-    mi = mi_rgb
-    parts = np.stack(np.meshgrid(*[(0, 1, 1e20, math.nan, math.inf, -math.inf)] * 4)).reshape(4, -1)
-    for name in ("trilinear", "anisotropic"):
-        si = texture_scenes.hits(mi, [[0.3], [0.7]], parts[:2], parts[2:])
-        dr.enable_grad(si.uv, si.duv_dx)
-        dr.backward(dr.sum(mi.load_dict(plugin(file, name)).eval_1(si)))
-        assert np.isfinite(dr.grad(si.uv).numpy()).all() and np.isfinite(dr.grad(si.duv_dx).numpy()).all()
 
 
 def changed(mi, texture, values):
@@ -334,15 +312,6 @@ def test_slope_of_a_filtered_texture(mi_rgb, rng):
     np.testing.assert_allclose(found.ravel(), [2 * 0.5, -0.3], atol=1e-3)
 
 
-def test_notes_on_a_manifest_are_warnings(mi_rgb, tmp_path, rng, capfd):
-    """Those of a fit, which its counterpart would repeat in silence."""
-    mi_rgb.Bitmap(rng.integers(0, 255, (8, 8, 3), np.uint8)).write(str(tmp_path / "c.png"))
-    (tmp_path / "m.json").write_text('{"paint": "c.png"}')
-    mi_rgb.load_dict({"type": "mipmap", "filename": str(tmp_path / "m.json"), "channels": "paint"})
-    printed = capfd.readouterr()
-    assert 'map "paint": an unknown name, taken for data' in printed.out + printed.err
-
-
 @pytest.mark.parametrize("raw", [False, True])
 @pytest.mark.parametrize("name", ["x_normal", "x_nor_dx", "x_Roughness", "x_arm"])
 def test_names_of_images_change_no_values(mi_rgb, tmp_path, rng, name, raw):
@@ -454,19 +423,6 @@ def test_frozen_renders(mi_rgb, file, no_garbage_collection):
             images.append(frozen(loaded, mi.UInt32(seed)).numpy())
             np.testing.assert_allclose(images[-1], mi.render(loaded, spp=1, seed=seed).numpy(), atol=1e-5)
     assert np.abs(images[0] - images[5]).max() > 0.05
-
-
-def test_textures_of_one_file_are_read_once(mi_rgb, file, rng):
-    """One pyramid, and one read of it, of the same footprint: also with parameters that say the same sensor."""
-    mi = mi_rgb
-    a, b = (mi.load_dict(plugin(file, "anisotropic", **SENSOR(mi))) for _ in range(2))
-    assert a.image is b.image
-    si = texture_scenes.seen(mi, 100)
-    alone = count(lambda: a.eval(si)).gathers
-    assert np.abs(a.eval(si).numpy() - mi.load_dict(plugin(file, "off")).eval(si).numpy()).max() > 0.1
-    assert count(lambda: (a.eval(si), b.eval_1(si))).gathers == alone
-    other = mi.load_dict(plugin(file, "anisotropic", wrap_mode="clamp", **SENSOR(mi)))
-    assert other.image is not a.image
 
 
 def test_sources(mi_rgb, tmp_path, image, rng):

@@ -3,7 +3,6 @@
 import functools
 import itertools
 import json
-import math
 import os
 from dataclasses import replace
 
@@ -75,12 +74,6 @@ def make(path, layout=LAYOUT, border=("repeat", "clamp"), seed=1, shape=(8, 9), 
     return str(path)
 
 
-def single(kind, color_space="linear", channels=3):
-    """A layout of one map."""
-    one = MapLayout("image", kind, color_space, 1, tuple(range(channels)))
-    return Layout(WIDTH, HEIGHT, (one,), (0.5,) * channels, ("image",) * channels)
-
-
 def tabulated(path, layout, values, **settings):
     """A file whose primary is uv, and whose cascaded array has the channels ``values(y, x)`` of places in [0, 1]."""
     y, x = np.mgrid[0:129, 0:129] / 128
@@ -100,19 +93,6 @@ def layout_of(file):
 @pytest.fixture(scope="module")
 def file(tmp_path_factory):
     return make(tmp_path_factory.mktemp("images") / "material.npz")
-
-
-@pytest.fixture(scope="module")
-def smooth(tmp_path_factory):
-    """Three smooth colours, and the image with 8 bits that they stand for."""
-    path = tmp_path_factory.mktemp("smooth") / "smooth.npz"
-
-    def waves(y, x):
-        return np.stack([0.5 + 0.3 * np.sin(2 * np.pi * (x + k * y / 2) + k) for k in range(3)], axis=-1)
-
-    y, x = np.mgrid[0:48, 0:64]
-    layout = replace(single("albedo", "srgb"), width=64, height=48)
-    return tabulated(path, layout, waves), np.rint(255 * waves((y + 0.5) / 48, (x + 0.5) / 64)).astype(np.uint8)
 
 
 def plugin(file, channels="albedo", **more):
@@ -302,24 +282,6 @@ def test_gradient_of_the_image(mi_rgb, file, rng):
 # -- spectra -----------------------------------------------------------------------------------------------------------
 
 
-def test_spectra_between_texels(smooth):
-    """Of smooth colours, against ``bitmap`` with what the file decodes to (51 dB) and with the original (48 dB)."""
-    import mitsuba as mi
-
-    mi.set_variant("llvm_ad_spectral")
-    mi.set_log_level(mi.LogLevel.Error)
-    path, image = smooth
-    rng = np.random.default_rng(2)
-    si = interactions(mi, *rng.random((2, 20000)))
-    si.wavelengths = type(si.wavelengths)(*[mi.Float(aligned(w)) for w in rng.uniform(400, 700, (4, 20000))])
-    more = {"wrap_mode": "clamp"}
-    ours = mi.load_dict(plugin(path, "image", **more)).eval(si).numpy()
-    for bitmap, floor in ((mi.load_dict(counterpart(mi, path, "image", **more)), 48), (None, 45)):
-        theirs = bitmap or mi.load_dict({"type": "bitmap", "bitmap": mi.Bitmap(image), **more})
-        mse = np.mean((ours - theirs.eval(si).numpy()) ** 2, dtype=np.float64)
-        assert -10 * math.log10(mse) > floor
-
-
 def test_upsampling_is_mitsubas(rng):
     """The same spectra as from Mitsuba's coefficients, for all colours, with gradients that are their differences."""
     import mitsuba as mi
@@ -361,16 +323,6 @@ def test_upsampling_is_mitsubas(rng):
 
 
 # -- positions ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("variant", RENDERED)
-def test_particle_tracer(variant, file):
-    """Asks for a wavelength and a ray from the emitter."""
-    mi = set_variant(variant)
-    emitter = {"type": "area", "radiance": plugin(file)}
-    image = mi.render(scene(mi, emitter=emitter, size=4, type="ptracer", max_depth=3), spp=2**13).numpy()
-    expected = mi.render(scene(mi, emitter=emitter, size=4), spp=2**10).numpy()
-    assert image.mean() == pytest.approx(expected.mean(), rel=0.05)
 
 
 # -- in materials ------------------------------------------------------------------------------------------------------
@@ -499,14 +451,6 @@ def test_no_arrays(variant, tmp_path, rng, monkeypatch):
         assert mi.render(lit, spp=4).numpy().mean() > 0
 
 
-def test_the_only_map_need_not_be_named(mi_rgb, file, tmp_path, rng):
-    mi = mi_rgb
-    si = interactions(mi, *rng.random((2, 20)))
-    for path, name in ((file, "albedo"), (make(tmp_path / "a.npz", single("other")), "image")):
-        found = mi.load_dict({"type": "neural_image", "filename": path})
-        np.testing.assert_array_equal(found.eval(si).numpy(), mi.load_dict(plugin(path, name)).eval(si).numpy())
-
-
 def test_a_file_that_was_written_anew_is_read_anew(mi_rgb, tmp_path, rng):
     mi = mi_rgb
     si = interactions(mi, *rng.random((2, 20)))
@@ -609,19 +553,6 @@ def test_exact_counterpart(variant, material):
     assert result.figures["psnr_db"] > 40
     assert result.figures["learned_plugins"] == 2
     assert result.figures["table_bytes"] == load_table(folder / "wall.npz").nbytes
-
-
-def test_exact_counterpart_of_a_given_source(mi_rgb, material, rng):
-    """``source`` names an image or a manifest; the values' own transfer function and ``raw`` are kept."""
-    mi = mi_rgb
-    folder, albedo, _ = material
-    for source, raw in (("albedo.png", ""), ("wall.json", ""), ("albedo.png", '<boolean name="raw" value="true"/>')):
-        xml = texture_xml("reflectance", "wall.npz", raw, channels="albedo", source=source)
-        (folder / "b.xml").write_text(wall_xml("diffuse", xml))
-        exact = loading.load(folder / "b.xml", exact=True).shapes()[0].bsdf()
-        bitmap = mi.load_dict({"type": "bitmap", "bitmap": mi.Bitmap(albedo), "raw": bool(raw)})
-        si = interactions(mi, *rng.random((2, 100)))
-        np.testing.assert_array_equal(exact.eval_diffuse_reflectance(si).numpy(), bitmap.eval(si).numpy())
 
 
 def test_exact_counterpart_without_a_source(mi_rgb, material, tmp_path):

@@ -241,34 +241,6 @@ def test_extras_shape_and_weigh_the_highlight(mi_rgb, files, rng):
     np.testing.assert_allclose(values, expected, rtol=2e-3, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["steep", "smooth"])
-def test_extremes_are_finite(mi_rgb, files, rng, name):
-    """Roughness 0, black, steep normals, directions at both horizons and none at all: values and derivatives."""
-    mi, n = mi_rgb, 50_000
-    bsdf = mi.load_dict({"type": "neural_material", "filename": files[name], "storage": "float32", "clearcoat": 1.0})
-    z = rng.choice([0, 1e-38, 1e-20, 1e-8, 1e-4, 0.5, 1, -0.5, -1e-8], (2, n))
-    phi = rng.choice([0, 1.0, np.pi, 2.0], (2, n))
-    r = np.sqrt(1 - z * z)
-    wi, wo = (mi.Vector3f(aligned([r[i] * np.cos(phi[i]), r[i] * np.sin(phi[i]), z[i]])) for i in (0, 1))
-    si = hits(mi, rng, n)
-    si.wi = dr.select(mi.Bool(rng.random(n) < 0.01), mi.Vector3f(0), wi)
-    params = mi.traverse(bsdf)
-    keys = [key for key in params.keys() if key.startswith("maps.tables.")]
-    for key in keys:
-        dr.enable_grad(params[key])
-    params.update()
-    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, wo)
-    bs, weight = bsdf.sample(mi.BSDFContext(), si, *samples(mi, rng, n))
-    dr.backward(dr.sum(value.x + weight.x))
-    gradients = [params[key].grad for key in keys]
-    dr.eval(value, pdf, bs, weight, gradients)
-    for v in (value, pdf, bs.pdf, weight, bs.wo, *gradients):
-        assert np.isfinite(v.numpy()).all()
-    assert min(v.numpy().min() for v in (value, pdf, bs.pdf, weight)) >= 0
-    outside = (wi.z.numpy() <= 0) | (wo.z.numpy() <= 0)
-    assert (value.numpy()[:, outside] == 0).all() and (pdf.numpy()[outside] == 0).all()
-
-
 # -- parameters --------------------------------------------------------------------------------------------------------
 
 

@@ -148,8 +148,8 @@ def bytes_beside_extras(nbytes: float, pyramid: Pyramid) -> float:
 def pretrained(source, pyramid: Pyramid, size, recipe: ShadingRecipe, request: FitRequest) -> tuple:
     """Train as a texture alone, with a separate checkpoint; return the table and the run's record."""
     texture = TEXTURES[recipe.texture]
-    own = {"seed": recipe.settings.seed, "deterministic": recipe.settings.deterministic}
-    texture = dataclasses.replace(texture, settings=dataclasses.replace(texture.settings, **own))
+    seeded = {"seed": recipe.settings.seed, "deterministic": recipe.settings.deterministic}
+    texture = dataclasses.replace(texture, settings=dataclasses.replace(texture.settings, **seeded))
     checkpoint = None if request.checkpoint is None else f"{request.checkpoint}.texture"
     first = dataclasses.replace(
         request.part(PRETRAINING), preset=recipe.texture, checkpoint=checkpoint,
