@@ -53,7 +53,7 @@ def structure_of(source: Source, recipe: ImageRecipe, nbytes: float | None = Non
     return _structures[key]
 
 
-def dims_of(recipe: ImageRecipe, structure: str, stored: int) -> int:
+def pointer_dims(recipe: ImageRecipe, structure: str, stored: int) -> int:
     """Return the dimensions of the cascaded array for ``stored`` channels.
 
     A single primary of pages has at most ``stored`` (at least 2): more entries gain more than more coordinates.
@@ -69,7 +69,7 @@ def _suitable(values: np.ndarray, recipe: ImageRecipe, nbytes: float) -> str:
     if recipe.components and k:
         # More channels than dimensions need more precise pointers
         pages = "pages of 6 bits" if k > recipe.dims else "pages of 5 bits"
-        dims = dims_of(recipe, pages, k)
+        dims = pointer_dims(recipe, pages, k)
         side = arrays.cascaded_side(nbytes, k, dims)
         size = arrays.fit_bytes(nbytes, k, height, width, side, dims, STRUCTURES[pages][0])
         fewest = ENTRIES * math.prod(page_counts((height, width)))

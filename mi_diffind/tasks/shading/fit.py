@@ -73,14 +73,14 @@ def fit(request: FitRequest) -> Fitted:
     effects, reasons = material.effects_of(layout)
     if not layout.stored:
         raise UsageError(f"{options['source']}: all of its maps are constant, there is nothing to learn")
-    start = None if options["start"] is None else started(options["start"], source, request)
+    start = None if options["start"] is None else load_start(options["start"], source, request)
     size = size_of(source, pyramid, recipe, options) if start is None else None
     # Before any training, which gets a share of the time that is left
     evaluation = ShadedEvaluation(pyramid, effects, pairs=PAIRS, side=SIDE)
     evaluation.another()
     first = result = None
     if start is None:
-        start, first = pretrained(source, pyramid, size, recipe, request)
+        start, first = pretrain(source, pyramid, size, recipe, request)
     if first is not None and first.interrupted:
         table, result = start, first
     else:
@@ -120,7 +120,7 @@ def fit(request: FitRequest) -> Fitted:
     return Fitted(table, result, [line for applies, line in remarks if applies], figures)
 
 
-def started(path, source, request: FitRequest) -> Table:
+def load_start(path, source, request: FitRequest) -> Table:
     """Return the texture to start from. Raises :class:`UsageError` for a texture of another source."""
     table = TEXTURE.load(path)
     if table.settings.get("source", source.digest) != source.digest:
@@ -145,7 +145,7 @@ def bytes_beside_extras(nbytes: float, pyramid: Pyramid) -> float:
     return nbytes - needed
 
 
-def pretrained(source, pyramid: Pyramid, size, recipe: ShadingRecipe, request: FitRequest) -> tuple:
+def pretrain(source, pyramid: Pyramid, size, recipe: ShadingRecipe, request: FitRequest) -> tuple:
     """Train as a texture alone, with a separate checkpoint; return the table and the run's record."""
     texture = TEXTURES[recipe.texture]
     seeded = {"seed": recipe.settings.seed, "deterministic": recipe.settings.deterministic}

@@ -332,7 +332,7 @@ def random_net(ad, dims=3, primaries=1, channels=3, low=-1.5, high=2.5):
         p = rng.uniform(low, high, (15 - 4 * k, 6, d)).astype(np.float32)
         made.append(DifferentiableArray(p.shape[:2], d, p, fold=True, border=("clamp", "repeat")))
     c = rng.uniform(low, high, (4,) * dims + (channels,)).astype(np.float32)
-    return arrays.joined(made, DifferentiableArray((4,) * dims, channels, c, fold=True)).alloc(ad.TensorXf)
+    return arrays.join_primaries(made, DifferentiableArray((4,) * dims, channels, c, fold=True)).alloc(ad.TensorXf)
 
 
 def random_places(ad, count=300):

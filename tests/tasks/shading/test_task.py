@@ -571,10 +571,10 @@ def test_sources_that_cannot_be_shaded_are_refused(ad, start, tmp_path):
     wide = {"albedo": np.zeros((4, 4, 2), np.uint8)}
     with pytest.raises(UsageError, match='map "albedo": found 2 channels, allowed for albedo are 1 or 3'):
         material.effects_of(pyramid_of(wide, ad)[1].layout)
-    from mi_diffind.tasks.shading.fit import started
+    from mi_diffind.tasks.shading.fit import load_start
 
     with pytest.raises(UsageError, match=r"was made from another source than other\.json"):
-        started(
+        load_start(
             start[4],
             from_arrays(bumpy(seed=9)),
             FitRequest("ours", OURS.settings, ad, options={"source": "other.json"}),
