@@ -108,7 +108,7 @@ def integrator() -> type:
     class PathFootprint(compat.replay_integrator()):
         __doc__ = MANUAL
 
-        #: Rays carry differentials, from which textures get footprints (:mod:`.filtered_texture`).
+        #: Rays carry differentials, from which textures get footprints (:mod:`.map_textures`).
         gives_footprints = True
 
         #: Radiance fields between the surfaces (:class:`.placed_fields.FieldLight`), or ``None``.
