@@ -191,7 +191,8 @@ def register(variant: str) -> None:
 
 def _load() -> list[Plugin]:
     """Execute the modules of plugins afresh and return their declarations."""
-    for name in discovery.modules(__name__, IGNORED).values():  # all of them first, since modules import each other
+    # All of them first, since modules import each other; the classes of the last one derive from ``mi.Texture``
+    for name in (*discovery.modules(__name__, IGNORED).values(), f"{__name__}.support.map_textures"):
         sys.modules.pop(name, None)
     return list(discovery.load(__name__, "PLUGIN", IGNORED, expected=Plugin).values())
 

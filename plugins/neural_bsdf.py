@@ -20,7 +20,7 @@ from mi_diffind.tasks.bsdf.model import ALPHA_MIN, DIFFUSE, EDGE, LOBE, LOGARITH
 from mi_diffind.tasks.bsdf.truth import MitsubaTruth
 
 from . import Counterpart, Plugin
-from .support import frozen, properties, tables, upsampling
+from .support import frozen, properties, tables, textures
 from .support.directions import are_directions
 from .support.manual import shared_parts
 from .support.tracked_parameter import TrackedParameter, when_outermost
@@ -404,7 +404,7 @@ def _spectrum(rgb: list, wavelengths):
     if not mi.is_spectral:
         return mi.UnpolarizedSpectrum(*rgb)
     largest = dr.maximum(dr.maximum(dr.maximum(rgb[0], rgb[1]), rgb[2]), 1e-20)
-    return largest * upsampling.spectrum([v / largest for v in rgb], wavelengths)
+    return largest * textures.upsampled_spectrum([v / largest for v in rgb], wavelengths)
 
 
 class SourceBSDF(NeuralBSDF):
