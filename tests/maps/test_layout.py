@@ -82,19 +82,6 @@ def test_constant_channels_are_numbers():
     assert Layout.of(source, once=False).stored == 5
 
 
-def test_initial_values_are_the_supplements():
-    names = {"albedo": 3, "normal": 3, "roughness": 1, "ao": 1, "metallic": 1, "height": 1}
-    source = from_arrays({name: noise(5, 4, c, seed=i) for i, (name, c) in enumerate(names.items())})
-    initial = dict.fromkeys(names, ())
-    layout = Layout.of(source, once=False, two_channel_normals=False)
-    for group, value in zip(layout.groups, layout.initial, strict=True):
-        initial[group] += (value,)
-    assert initial == {
-        "albedo": (0.5, 0.5, 0.5), "normal": (0.5, 0.5, 1.0), "roughness": (0.5,), "ao": (1.0,), "metallic": (0.0,),
-        "height": (0.0,),
-    }  # fmt: skip
-
-
 # -- normals ----------------------------------------------------------------------------------------------------------
 
 

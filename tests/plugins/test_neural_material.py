@@ -244,44 +244,6 @@ def test_extras_shape_and_weigh_the_highlight(mi_rgb, files, rng):
 # -- parameters --------------------------------------------------------------------------------------------------------
 
 
-def test_gradients_are_those_of_differences(mi_rgb, files, rng):
-    """With respect to entries of the arrays, along a random direction, and to a constant."""
-    mi, ctx, n = mi_rgb, mi_rgb.BSDFContext(), 20_000
-    more = {"storage": "float32", "clearcoat": 0.5}
-    bsdf = mi.load_dict({"type": "neural_material", "filename": files["shaped"], **more})
-    params, si, wo = mi.traverse(bsdf), hits(mi, rng, n), directions(mi, rng, n, lowest=0.6)
-    si.wi = directions(mi, rng, n, lowest=0.6)  # off the horizons, across which values jump
-    key = "maps.tables.cascaded"
-    extras = "maps.tables.extras"
-    steps = {
-        key: (mi.TensorXf(aligned(rng.random(params[key].shape))), 1e-3),
-        extras: (mi.TensorXf(aligned(rng.random(params[extras].shape))), 1e-3),
-        "clearcoat.value": (mi.Float(1), 1e-2),
-    }
-
-    def total():
-        value = bsdf.eval(ctx, si, wo)
-        return dr.mean(dr.minimum(value.x + value.y + value.z, 4.0))
-
-    for name, (direction, step) in steps.items():
-        before = params[name] + 0
-        if name in (key, extras):
-            before = 0.1 + 0.8 * before  # away from the ends of [0, 1], where entries are folded
-        params[name] = before
-        dr.enable_grad(params[name])
-        params.update()
-        dr.backward(total())
-        gradient = dr.sum(params[name].grad * direction, axis=None).numpy().item()
-        sums = []
-        for sign in (1, -1):
-            params[name] = dr.detach(before) + sign * step * direction
-            params.update()
-            sums.append(total().numpy().item())
-        assert gradient == pytest.approx((sums[0] - sums[1]) / (2 * step), rel=0.03) and abs(gradient) > 1e-4
-        params[name] = dr.detach(before)
-        params.update()
-
-
 def test_what_the_file_rules_out_is_not_traced(mi_rgb, files):
     """Lobes that a constant map rules out are not traced, here and in ``disney`` with textures of the same file."""
     mi, file = mi_rgb, files["plain"]

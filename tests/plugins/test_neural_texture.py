@@ -243,24 +243,6 @@ def test_maps_of_one_file_are_read_once(mi_rgb, file, name):
     assert found[0] <= found[1] == found[2] - tables < 2 * found[0]
 
 
-def test_one_sample_a_pixel_on_a_plane(mi_rgb, tmp_path):
-    """Against many of its own level 0: anisotropic before trilinear before neither."""
-    mi = mi_rgb
-    from mi_diffind.plugins.support import footprint
-
-    rng = np.random.default_rng(3)
-    total = sum(np.kron(rng.random((2**i, 2**i, 3)), np.ones((64 >> i, 64 >> i, 1))) for i in range(2, 7))
-    path = make(tmp_path / "a.npz", from_arrays({"albedo": np.rint(255 * total / total.max()).astype(np.uint8)}))
-    more = {"to_uv": mi.ScalarTransform4f().scale([8, 8, 1])}
-    truth = mi.render(texture_scenes.plane(mi, plugin(path, "off", **more), 256, "multijitter", 32)).numpy()
-    quality = {}
-    for name in ("off", "trilinear", "anisotropic"):
-        loaded = texture_scenes.plane(mi, plugin(path, name, **more), size=32)
-        assert footprint.attach(loaded) == 1
-        quality[name] = texture_scenes.psnr(mi.render(loaded).numpy(), truth)
-    assert quality["off"] + 4 < quality["trilinear"] < quality["anisotropic"] - 2, quality
-
-
 # -- counterparts and words --------------------------------------------------------------------------------------------
 
 LAMP = """<shape type="rectangle"><emitter type="area"><texture name="radiance" type="neural_texture">

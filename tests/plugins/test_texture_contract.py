@@ -449,6 +449,14 @@ def test_emitters(mi_rgb, files, name):
     assert means[0] == pytest.approx(means[1], rel=0.03) and means[0] == pytest.approx(means[2], rel=0.03)
 
 
+@pytest.mark.parametrize("variant", RENDERED)
+def test_particle_tracer(variant, files):
+    """A particle tracer asks for a wavelength and a ray from the emitter."""
+    mi, texture = set_variant(variant), plugin(files, "neural_image")
+    image = mi.render(lamp(mi, texture, type="ptracer", max_depth=3), spp=2**13).numpy()
+    assert image.mean() == pytest.approx(mi.render(lamp(mi, texture), spp=2**10).numpy().mean(), rel=0.05)
+
+
 # ---------------------- Scenes ----------------------
 
 
