@@ -22,8 +22,8 @@ from .support import properties, tables
 from .support.distance_shapes import CELL_BYTES, SEEN_BY, crop_grid, distance_shape, finest, native_grid
 from .support.manual import shared_parts
 from .support.placement import Placement
+from .support.properties import Kept, StockNode
 from .support.sdf_meshes import check_normals, closed_mesh_of, to_mesh
-from .support.stock import Kept, StockNode
 
 #: Models whose arrays cannot be optimised, shared by all shapes of a file.
 _shared: WeakValueDictionary = WeakValueDictionary()

@@ -14,7 +14,7 @@ from .support.filtering import FILTERS, TYPES
 from .support.filtering import PROPERTIES as FILTERING
 from .support.image_files import SharedMaps, manifest_of, open_compressed, to_bitmap, to_mipmap
 from .support.manual import shared_parts
-from .support.stock import Kept, StockNode
+from .support.properties import Kept, StockNode
 
 
 @shared_parts

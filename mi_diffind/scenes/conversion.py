@@ -26,7 +26,7 @@ from ..core.errors import DiffindError, UsageError
 from ..core.files import OutputError, relative_path, replacing, shown, writable_file, writable_folder
 from ..core.runtime import use_variant
 from ..fitting.task import fit, tasks
-from ..plugins.support.stock import Kept, StockNode
+from ..plugins.support.properties import Kept, StockNode
 from .loading import ParsedScene, SceneError
 from .picture_check import PictureCheck, check_picture
 from .scene_text import difference, edited_text, with_paths

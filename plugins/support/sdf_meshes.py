@@ -22,7 +22,7 @@ from mi_diffind.tasks.sdf import TASK, serialized
 from mi_diffind.tasks.sdf.mesh import directed_edges, load_mesh, split_part
 
 from . import properties
-from .stock import Kept
+from .properties import Kept
 
 #: Share of open edges up to which a mesh counts as closed: a fit closes holes, but not a surface without an inside.
 OPEN = 0.01

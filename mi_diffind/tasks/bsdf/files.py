@@ -210,7 +210,7 @@ class BSDFModel(Model):
             self.bsdf, self.mixture = self.at([self.types.Float(p.middle) for p in self.parameters])
             return
         proxy = self.arrays.get("proxy")
-        proxy = None if proxy is None else Proxy.of(BSDFArrays(None, proxy).logarithms(), self.form)
+        proxy = None if proxy is None else Proxy.from_logarithms(BSDFArrays(None, proxy).logarithms(), self.form)
         self.bsdf = LearnedBSDF(self.form, self._residual(), proxy, self.arrays.get("energy"))
         lobes = tuple(SampledLobe(*map(float, lobe)) for lobe in self.table.settings["lobes"])
         self.mixture = Mixture(self.arrays["weights"], lobes)
@@ -237,7 +237,7 @@ class BSDFModel(Model):
         alphas = [f * w for f, w in zip(factors, widths(bsdf.proxy, bsdf.scale), strict=True)]
         return bsdf, Mixture(weights, tuple(SampledLobe(a, a) for a in alphas))
 
-    def fixed(self, values: list[float]) -> tuple[LearnedBSDF, Mixture]:
+    def member(self, values: list[float]) -> tuple[LearnedBSDF, Mixture]:
         """Return the BSDF and the mixture of one member, a single material, without derivatives.
 
         The tables are interpolated once, so that it takes no more time than a single learned BSDF.
@@ -262,7 +262,7 @@ class BSDFModel(Model):
             dr.make_opaque(bsdf.terms)  # not numbers of Python, which would be part of kernels
         return bsdf, mixture
 
-    def reduced(self, values: list[float | None]) -> BSDFModel:
+    def restrict(self, values: list[float | None]) -> BSDFModel:
         """Return the family of the parameters whose value is ``None``, for ``values`` of the others."""
         result = self.copy()
         for name in PARAMETER_TABLES:

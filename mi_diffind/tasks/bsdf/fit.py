@@ -93,7 +93,7 @@ def _fit_single(truth: Truth, request: FitRequest, stop: Event) -> Fitted:
         form = dataclasses.replace(form, terms=())
         form = dataclasses.replace(form, range=training.residual_range(form, logarithms, validation))
     if rows:
-        (samples, validation), form, line = measured.cleaned(truth, [samples, validation], form, logarithms)
+        (samples, validation), form, line = measured.remove_outliers(truth, [samples, validation], form, logarithms)
         lines.append(line)
     identity = {"source": truth.digest, "structure": sizes.to_json(), "form": form.to_json()}
     judge = judge or training.proxy_loss(validation)
