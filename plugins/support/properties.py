@@ -1,4 +1,4 @@
-"""Checks of a plugin's properties: one of a few words, a number in a range, a file."""
+"""Properties of plugins: checks, and those of stock plugins on their way to learned ones."""
 
 from __future__ import annotations
 
