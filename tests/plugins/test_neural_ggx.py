@@ -209,7 +209,7 @@ def test_parameters_may_be_textures(mi_any, rng):
     for name in ("alpha", "specular_reflectance", "eta", "k"):
         values = rng.uniform(0.2, 0.9, (2, 3, 3)).astype(np.float32)
         grey = name == "alpha" or mi.is_spectral  # where a colour would have to become a spectrum
-        m = {"alpha": 0.4, "eta": 0.5, "k": 0.7, name: bitmap(mi, values[..., :1] if grey else values)}
+        m = {"alpha": 0.4, "eta": 0.5, "k": 0.7, name: mi.load_dict(bitmap(mi, values[..., :1] if grey else values))}
         results[name] = [
             mi.load_dict({**form, **m}).eval(mi.BSDFContext(), si, wo) for form in (FORMS["tables"], EXACT)
         ]
