@@ -18,7 +18,7 @@ _NAMES = {
     # Training, table files
     "fit": "fitting.task",
     "open": "fitting.task:open_model",
-    "save": "scenes.saving",
+    "save": "scenes.conversion",
     "from_arrays": "maps.source",
     "example_maps": "studies.shading.materials",
     # Scenes
@@ -33,7 +33,7 @@ _NAMES = {
     "regress": "scenes.regression",
     "render": "scenes.rendering",
     "examples": "scenes.examples",
-    "fetch": "scenes.downloads",
+    "fetch": "scenes.examples",
     "view": "scenes.viewer",
     # Measurements
     "tradeoff": "studies.tradeoffs",

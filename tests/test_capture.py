@@ -231,11 +231,11 @@ def test_meshes_of_one_material_keep_their_ids(mi_rgb, tmp_path):
     cubes = [cube.format(name, f'<translate x="{x}"/></transform></shape>') for name, x in (("a", -2), ("b", 3))]
     path.write_text(f'<scene version="3.0.0"><bsdf type="diffuse" id="grey"/>{"".join(cubes)}</scene>')
     assert len(loading.load(path).shapes()) == 1
-    loaded = capture._load(loading.ParsedScene(path))
-    assert capture.bounds(loaded).tolist() == [[-3, -1, -1], [4, 1, 1]]
-    assert capture.bounds(loaded, ("b",)).tolist() == [[2, -1, -1], [4, 1, 1]]
+    assert capture.SceneSubject(path, None).bounds().tolist() == [[-3, -1, -1], [4, 1, 1]]
+    subject = capture.SceneSubject(path, None, ("b",))
+    assert subject.bounds().tolist() == [[2, -1, -1], [4, 1, 1]]
     # As far as their vertices, which is nearer than the corners of a box around both
-    assert capture._reach(loaded, ("b",), np.array([3.0, 0, 0])) == pytest.approx(np.sqrt(3))
+    assert subject.reach(np.array([3.0, 0, 0])) == pytest.approx(np.sqrt(3))
 
 
 def test_integrators_that_nest_another_leave_lights_to_it(mi_rgb, scene, tmp_path):

@@ -277,7 +277,7 @@ def interrupted(*commands) -> tuple[list[int], str]:
 
 
 SIGINT_IN_THE_SECOND_PASS = """
-import json, os, signal, sys, mi_diffind.scenes as scenes
+import json, os, signal, sys, mi_diffind.scenes.loading as scenes
 from mi_diffind.commands.cli import main
 count = [0]
 original = scenes.mi.render
@@ -359,7 +359,7 @@ def test_help_is_light():
     for command, found in text.items():
         assert found.startswith(" ".join(["usage: mi-diffind", *command]) + " [-h]"), command
     assert all(f"\n    {verb} " in text[()] for verb in VERBS)
-    assert not HEAVY & modules and not [m for m in modules if m.endswith((".training", ".scenes", ".fitting"))]
+    assert not HEAVY & modules and not [m for m in modules if m.endswith((".texture.training", ".loading", ".loop"))]
     assert "--primary" in text["fit", "ggx"] and "--primary" not in text["fit", "disney"]  # those of the task only
     assert "-D NAME" in text["tradeoff", "scene"] and "-D NAME" not in text["tradeoff", "disney"]
 

@@ -15,8 +15,7 @@ from mi_diffind.core.errors import UsageError
 from mi_diffind.plugins.support import sdf_meshes
 from mi_diffind.plugins.support.properties import Kept
 from mi_diffind.scenes import comparison, conversion, loading
-from mi_diffind.tasks.sdf import serialized
-from mi_diffind.tasks.sdf.mesh import MeshError, load_mesh
+from mi_diffind.tasks.sdf.mesh import MeshError, load_mesh, read_serialized
 
 SCENE = """
 <scene version="3.0.0">
@@ -230,7 +229,7 @@ def test_the_command_and_a_comparison_with_the_stock_scene(mi_rgb, tmp_path, cap
     for output, fault in (("scene.xml", "the same file as the scene"), ("new.json", "allowed is .xml")):
         assert main(["convert", scene, "-o", str(tmp_path / output)]) == 2 and fault in capsys.readouterr().err
     result = mi_diffind.compare(scene, 8, learn=["principled"], progress=False)
-    assert comparison.truth_label(result.figures) == "stock (principled), 8 spp" and result.further == ()
+    assert result.truth == "stock (principled), 8 spp" and result.further == ()
     assert main(["convert", scene, "-o", str(new), "--learn", "principled", "--no-check"]) == 0
     assert "check" not in capsys.readouterr().out
     assert printed[:2] == str(result).splitlines()[3:5] and result.figures["psnr_db"] > 25
@@ -363,7 +362,7 @@ def test_serialized_meshes(mi_rgb, tmp_path, version, double):
     mi, path = mi_rgb, tmp_path / "two.serialized"
     meshes = [trimesh.creation.icosphere(1), trimesh.creation.box(bounds=[[2, 0, 0], [3, 1, 2]])]
     write_serialized(path, meshes, version, double)
-    for index, (vertices, faces) in enumerate(serialized.read(path)):
+    for index, (vertices, faces) in enumerate(read_serialized(path)):
         shape = mi.load_dict({"type": "serialized", "filename": str(path), "shape_index": index})
         params = mi.traverse(shape)
         assert np.allclose(params["vertex_positions"].numpy().reshape(-1, 3), vertices, atol=1e-6)

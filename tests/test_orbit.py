@@ -44,11 +44,11 @@ def place_of(image, channel):
 
 def test_the_camera_goes_around(mi_rgb, path):
     """Two spheres about the axis: after half a turn, the far one is the near one; a quarter shows both."""
-    from mi_diffind.scenes import loading, orbit
+    from mi_diffind.scenes import loading, rendering
 
     scene = loading.load(path)
-    assert orbit.middle(scene) == pytest.approx([1, 0, 2])  # the light is none of it
-    frames = orbit.orbit(scene, 4)
+    assert rendering.middle(scene) == pytest.approx([1, 0, 2])  # the light is none of it
+    frames = rendering.render(scene, orbit=4, progress=False).frames
     assert len(frames) == 4 and frames[0].shape == (24, 32, 4)
     (x0, near), (x2, far) = place_of(frames[0], 0), place_of(frames[2], 0)
     assert abs(x0) < 0.5 and near > 1.3 * far and abs(x2) < 0.5
@@ -63,10 +63,10 @@ def test_the_camera_goes_around(mi_rgb, path):
 
 def test_random_numbers_of_frames(mi_rgb, path):
     """Frames of one view have the same noise, or that of the seeds that follow each other."""
-    from mi_diffind.scenes import loading, orbit
+    from mi_diffind.scenes import loading, rendering
 
     scene, still = loading.load(path), [np.eye(4)] * 2
-    same, new = (orbit.along(scene, still, 4, 7, new_seeds=new_seeds) for new_seeds in (False, True))
+    same, new = (rendering.along(scene, still, 4, 7, new_seeds=new_seeds) for new_seeds in (False, True))
     assert np.array_equal(same[0], same[1]) and np.array_equal(same[0], new[0])
     assert np.array_equal(new[1], loading.render(scene, 4, 8)[0]) and not np.array_equal(new[0], new[1])
 
@@ -120,7 +120,7 @@ def test_films_and_strips(mi_rgb, path, tmp_path, capsys):
 def test_an_orbit_as_h264(mi_rgb, path, tmp_path, capsys):
     """The frames of the decoded film are those of the orbit, in front of black, and each is nearest to its own."""
     from mi_diffind.images import films
-    from mi_diffind.scenes import loading, orbit
+    from mi_diffind.scenes import rendering
 
     film = tmp_path / "film.mp4"
     options = ("--orbit", "4", "--spp", "64", "-o", str(film))
@@ -130,7 +130,7 @@ def test_an_orbit_as_h264(mi_rgb, path, tmp_path, capsys):
     assert "film.mp4: 4 frames of 31 x 24, 64 spp" in out and "even width and height" in out
     frames = decoded(film)
     assert frames.shape == (4, 24, 32, 3)
-    expected = orbit.orbit(loading.load(path), 4, spp=64)
+    expected = rendering.render(path, 64, orbit=4, progress=False).frames
     shown = np.stack([films.displayed(frame[..., :3]) for frame in expected])
     errors = np.square(frames[:, None, :, :31].astype(float) - shown[None]).mean(axis=(2, 3, 4))
     assert (10 * np.log10(255**2 / np.diag(errors)) > 30).all()
@@ -166,10 +166,10 @@ def test_what_is_refused(mi_rgb, path, tmp_path, capsys):
 
 
 def test_h264_is_refused_before_frames_are_rendered(mi_rgb, path, tmp_path, monkeypatch, capsys):
-    from mi_diffind.scenes import orbit
+    from mi_diffind.scenes import rendering
 
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)  # as if it were not installed
-    monkeypatch.setattr(orbit, "along", lambda *_, **__: pytest.fail("rendered"))
+    monkeypatch.setattr(rendering, "along", lambda *_, **__: pytest.fail("rendered"))
     assert cli.main(["render", str(path), "--orbit", "3", "-o", str(tmp_path / "film.mp4")]) == 2
     assert 'film.mp4": H.264 needs the package imageio-ffmpeg, which is not installed' in capsys.readouterr().err
     assert [file.name for file in tmp_path.iterdir()] == ["scene.xml"]

@@ -14,7 +14,6 @@ from commands import refused
 from variants import set_variant
 
 from mi_diffind.commands.cli import main
-from mi_diffind.scenes import reference_files
 
 TESTS = Path(__file__).resolve().parent
 SCENES = TESTS.parent / "scenes"
@@ -59,7 +58,7 @@ def test_passes_share_no_samples(regress, monkeypatch, tmp_path):
         taken.append((spp, seed))
         return np.full((12, 16, 3), 0.5)
 
-    monkeypatch.setattr(regress.scenes, "render_pass", render_pass)
+    monkeypatch.setattr(regress.loading, "render_pass", render_pass)
     path = scene_file(tmp_path)
     for limit, renders in ((1 << 22, 1), (192, 4)):
         monkeypatch.setattr(regress, "_RENDER", limit)
@@ -76,8 +75,8 @@ def test_samplers_that_round(regress, tmp_path, capsys):
     path, report = scene_file(tmp_path), tmp_path / "report.json"
     rounded = {"independent": 24, "stratified": 32, "multijitter": 24, "orthogonal": 32, "ldsampler": 32}
     for sampler, spp in rounded.items():
-        scene = regress.scenes.load(path, {"sampler": sampler})
-        assert regress.PassSize.of_check(scene, 20).check_spp == spp
+        scene = regress.loading.load(path, {"sampler": sampler})
+        assert regress.PassSize.for_check(scene, 20).check_spp == spp
     assert main(["regress", path, "--update", "--json", str(report), "-D", "sampler=stratified", "--spp", "20"]) == 0
     assert "a check has 32 spp (asked for 20) and would see" in capsys.readouterr().out
     stored = json.loads(report.read_text())["scenes"][0]
@@ -95,9 +94,9 @@ def test_samplers_that_round(regress, tmp_path, capsys):
 
 def test_passes_of_references_repeat_to_the_last_bit(regress):
     """Passes of 30 or 54 samples do not on several cores: threads share pixels, and add up in any order."""
-    scene = regress.scenes.load(TESTS / "lamp.xml")
+    scene = regress.loading.load(TESTS / "lamp.xml")
     for spp in (32, 64):
-        assert len({regress.scenes.render_pass(scene, spp, 7).tobytes() for _ in range(6)}) == 1
+        assert len({regress.loading.render_pass(scene, spp, 7).tobytes() for _ in range(6)}) == 1
 
 
 #: What other variants of the same scenes show already, and what takes longest.
@@ -153,7 +152,7 @@ def seen_from_the_camera(scene):
 
 def test_a_broken_table_entry_is_caught(regress, tmp_path, capsys, monkeypatch):
     """Of a table of the paper's layout, the entry that matters most for the image is changed by 10%; no other."""
-    original = regress.scenes.ParsedScene.load
+    original = regress.loading.ParsedScene.load
 
     def broken(parsed):
         scene = original(parsed)
@@ -184,7 +183,7 @@ def test_a_broken_table_entry_is_caught(regress, tmp_path, capsys, monkeypatch):
     arguments = ["regress", str(TESTS / "lamp.xml"), "--out", str(out), "--json", str(report)]
     assert main(arguments) == 0 and not out.exists()
     assert "passed" in capsys.readouterr().out
-    monkeypatch.setattr(regress.scenes.ParsedScene, "load", broken)
+    monkeypatch.setattr(regress.loading.ParsedScene, "load", broken)
     assert main(arguments) == 1
     text = capsys.readouterr().out
     assert "FAILED" in text and str(out / "lamp.llvm_ad_rgb.png") in text
@@ -278,13 +277,13 @@ def test_an_update_that_does_not_end_changes_nothing(regress, tmp_path, capsys, 
         assert "cannot be written: disk full" in refused(capsys, "regress", path, "--update", "--seed", "1")
     assert file.read_bytes() == before and os.listdir(file.parent) == [file.name]
 
-    original = regress.scenes.render_pass
+    original = regress.loading.render_pass
 
     def interrupting(scene, spp, seed):
         os.kill(os.getpid(), signal.SIGINT)
         return original(scene, spp, seed)
 
-    monkeypatch.setattr(regress.scenes, "render_pass", interrupting)
+    monkeypatch.setattr(regress.loading, "render_pass", interrupting)
     report = tmp_path / "report.json"
     assert main(["regress", path, "--update", "--seed", "1", "--json", str(report)]) == 130
     assert json.loads(report.read_text())["interrupted"]
@@ -303,7 +302,7 @@ def test_a_reference_that_would_fail_unchanged_is_refused(regress, rng, tmp_path
         number = 65535 - (seed >> 16)
         return rng.normal(1.5 if number < fails else 1, 0.1, (12, 16, 3))
 
-    monkeypatch.setattr(regress.scenes, "render_pass", brighter_checks)
+    monkeypatch.setattr(regress.loading, "render_pass", brighter_checks)
     message = refused(capsys, "regress", path, "--update", "--spp", "16")
     assert "fails two checks at 16 samples a pixel although nothing has changed: bright paths are too rare" in message
     assert os.listdir(tmp_path / "references") == []
@@ -313,7 +312,7 @@ def test_a_reference_that_would_fail_unchanged_is_refused(regress, rng, tmp_path
 
 def test_pixels_that_are_not_finite(regress, tmp_path, capsys, monkeypatch):
     """A reference with such pixels is refused, a check fails and counts them."""
-    path, original, out = scene_file(tmp_path), regress.scenes.render_pass, tmp_path / "out"
+    path, original, out = scene_file(tmp_path), regress.loading.render_pass, tmp_path / "out"
 
     def spoiled(scene, spp, seed):
         image = original(scene, spp, seed)
@@ -321,7 +320,7 @@ def test_pixels_that_are_not_finite(regress, tmp_path, capsys, monkeypatch):
         return image
 
     assert main(["regress", path, "--update", "--spp", "16"]) == 0
-    monkeypatch.setattr(regress.scenes, "render_pass", spoiled)
+    monkeypatch.setattr(regress.loading, "render_pass", spoiled)
     capsys.readouterr()
     assert main(["regress", path, "--out", str(out)]) == 1
     assert "16 spp: 2 pixel(s) are not finite\n" in capsys.readouterr().out
@@ -335,7 +334,7 @@ def test_an_interrupted_update_goes_on(regress, tmp_path, capsys, monkeypatch):
     path, report = scene_file(tmp_path), tmp_path / "report.json"
     update = ["regress", path, "--update", "--spp", "16", "--json", str(report), "--references"]
     assert main([*update, str(tmp_path / "undisturbed")]) == 0
-    original, taken = regress.scenes.render_pass, []
+    original, taken = regress.loading.render_pass, []
 
     def interrupting(*arguments):
         taken.append(1)
@@ -343,7 +342,7 @@ def test_an_interrupted_update_goes_on(regress, tmp_path, capsys, monkeypatch):
             os.kill(os.getpid(), signal.SIGINT)
         return original(*arguments)
 
-    monkeypatch.setattr(regress.scenes, "render_pass", interrupting)
+    monkeypatch.setattr(regress.loading, "render_pass", interrupting)
     folder = tmp_path / "own"
     capsys.readouterr()
     assert main([*update, str(folder)]) == 130
@@ -369,7 +368,7 @@ def test_an_interrupted_update_goes_on(regress, tmp_path, capsys, monkeypatch):
 
 def test_references_serve_both_backends(regress, tmp_path, monkeypatch):
     path = scene_file(tmp_path)
-    regress.update_reference(path, spp=8, progress=False)
+    regress.regress(path, update=True, spp=8, progress=False)
     stored = regress.read_reference(path)
     monkeypatch.setattr(mi, "variant", lambda: "cuda_ad_rgb")
     assert np.array_equal(regress.read_reference(path).image, stored.image)
@@ -400,13 +399,13 @@ def test_bad_references(regress, tmp_path, capsys):
         file.write_bytes(damaged)
         assert "cannot be read as an EXR image" in refused(capsys, "regress", path, *out)
         assert "remove it" in refused(capsys, "regress", path, "--update")
-    regress.scenes.write_image(file, np.zeros((12, 16, 3)))
+    regress.loading.write_image(file, np.zeros((12, 16, 3)))
     assert "is an EXR image, but no reference" in refused(capsys, "regress", path, *out)
     file.write_bytes(content)
     stored = regress.read_reference(path)
     for wrong in ({"budget": 0}, {"spp": "many"}, {"image": stored.image + np.nan}, {"image": stored.image[:8]}):
         image = wrong.pop("image", stored.image)
-        reference_files.write_reference(file, dataclasses.replace(stored, image=image, about={**stored.about, **wrong}))
+        regress.write_reference(file, dataclasses.replace(stored, image=image, about={**stored.about, **wrong}))
         assert "is a damaged reference" in refused(capsys, "regress", path, *out)
     assert not (tmp_path / "out").exists()
 

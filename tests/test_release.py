@@ -20,7 +20,7 @@ from commands import refused
 import mi_diffind
 from mi_diffind.commands.cli import main
 from mi_diffind.core.errors import UsageError
-from mi_diffind.scenes import downloads
+from mi_diffind.scenes import examples
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -114,14 +114,14 @@ def server(tmp_path, monkeypatch):
     (served / "thing").mkdir(parents=True)
     for name, content in CONTENT.items():
         (served / "thing" / name).write_bytes(content)
-    files = tuple(downloads.File(n, len(c), hashlib.sha256(c).hexdigest()) for n, c in CONTENT.items())
+    files = {name: (len(c), hashlib.sha256(c).hexdigest()) for name, c in CONTENT.items()}
     monkeypatch.setattr(Handler, "asked", [])
     monkeypatch.setenv("no_proxy", "*")
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Handler, directory=served)) as found:
         threading.Thread(target=found.serve_forever, daemon=True).start()
         address = f"http://127.0.0.1:{found.server_port}"
-        known = {"thing": downloads.Download("a thing", "CC0", f"{address}/thing", files, {"albedo": "one.bin"})}
-        monkeypatch.setattr(downloads, "DOWNLOADS", known)
+        known = {"thing": examples.Download("a thing", "CC0", f"{address}/thing", files, {"albedo": "one.bin"})}
+        monkeypatch.setattr(examples, "DOWNLOADS", known)
         yield address
         found.shutdown()
 
@@ -143,9 +143,8 @@ def test_fetch(server, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda served: (served / "one.bin").unlink(), "cannot be fetched: HTTP 404"),
-        (lambda served: (served / "one.bin").write_bytes(CONTENT["one.bin"][:-1]), "found 179,199 bytes, 179,200 are"),
-        (lambda served: (served / "one.bin").write_bytes(CONTENT["one.bin"] + b"x"), "found more than 179,200 bytes"),
+        (lambda served: (served / "one.bin").unlink(), "cannot be fetched: 404"),
+        (lambda served: (served / "one.bin").write_bytes(CONTENT["one.bin"][:-1]), "found the SHA-256"),
         (lambda served: (served / "one.bin").write_bytes(CONTENT["one.bin"][::-1]), "found the SHA-256"),
     ],
 )
@@ -159,7 +158,7 @@ def test_fetch_of_other_content(server, tmp_path, capsys, change, message):
 
 def test_fetch_that_fails(server, tmp_path, capsys):
     folder = tmp_path / "data"
-    for word, message in (("moved", "cannot be fetched: HTTP 302"), ("broken", "")):
+    for word, message in (("moved", "cannot be fetched: "), ("broken", "")):
         found = refused(capsys, "fetch", "thing", "-o", str(folder), "--from", f"{server}/{word}")
         assert f"error: {server}/{word}/thing/one.bin: " in found and message in found
         assert below(folder) == {}
@@ -184,14 +183,14 @@ def test_what_can_be_fetched(capsys):
     """The list shows the licence of each; addresses name a commit or a version, so that they keep their content."""
     assert main(["fetch"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines] == list(downloads.DOWNLOADS)
-    for line, each in zip(lines, downloads.DOWNLOADS.values(), strict=True):
+    assert [line.split()[0] for line in lines] == list(examples.DOWNLOADS)
+    for line, each in zip(lines, examples.DOWNLOADS.values(), strict=True):
         assert each.licence in line and each.base.startswith("https://")
         assert re.search(r"/[0-9a-f]{40}/|/v\d+\.\d+\.\d+/", each.base)
-        for file in each.files:
-            assert re.fullmatch(r"[0-9a-f]{64}", file.sha256) and 0 < file.size < 2**24
+        for size, sha256 in each.files.values():
+            assert re.fullmatch(r"[0-9a-f]{64}", sha256) and 0 < size < 2**24
         mapped = {m if isinstance(m, str) else m["file"] for m in (each.maps or {}).values()}
-        assert mapped <= {file.name for file in each.files}
+        assert mapped <= each.files.keys()
 
 
 # -- The release -------------------------------------------------------------------------------------------------------

@@ -26,14 +26,21 @@ from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import load_source
 from mi_diffind.plugins.support import footprint
 from mi_diffind.scenes import loading
-from mi_diffind.scenes.training import recipe as scene_recipe
-from mi_diffind.scenes.training import reference_renders
+from mi_diffind.scenes.training import references
 from mi_diffind.scenes.training.fit import fit_scene, joined, limit
+from mi_diffind.scenes.training.options import (
+    SCENE_ARGUMENTS,
+    SceneRecipe,
+    View,
+    ViewDistribution,
+    recipe_from,
+    views_from,
+)
 from mi_diffind.scenes.training.problem import SceneProblem, exposure_of
-from mi_diffind.scenes.training.recipe import SCENE_ARGUMENTS, SceneRecipe
-from mi_diffind.scenes.training.reference_renders import ReferenceRenders
+from mi_diffind.scenes.training.references import ReferenceRenders
 from mi_diffind.scenes.training.rig import Rig
-from mi_diffind.scenes.training.stored_texture import (
+from mi_diffind.scenes.training.trained_scene import (
+    TrainedScene,
     budget_of,
     recipe_of,
     stored_textures,
@@ -41,11 +48,9 @@ from mi_diffind.scenes.training.stored_texture import (
     texture_files,
     texture_problem,
 )
-from mi_diffind.scenes.training.trained_scene import TrainedScene
-from mi_diffind.scenes.training.views import View, ViewDistribution, views_of
+from mi_diffind.tasks.texture import PRESETS
+from mi_diffind.tasks.texture.arrays import PaperBudget, TextureBudget, parse_structure
 from mi_diffind.tasks.texture.compressed import CompressedTexture, load, to_table
-from mi_diffind.tasks.texture.memory_budget import PaperBudget, TextureBudget, parse_structure
-from mi_diffind.tasks.texture.presets import PRESETS
 from mi_diffind.tasks.texture.training import layout_of, problem_of, rounded, stored_form
 
 NAMES = ("albedo", "roughness")
@@ -148,7 +153,7 @@ def parsed(*words):
 
 
 def test_arguments():
-    assert views_of(parsed()) == ViewDistribution() and scene_recipe.recipe_of(parsed(), FitSettings()).bound == 1
+    assert views_from(parsed()) == ViewDistribution() and recipe_from(parsed(), FitSettings()).bound == 1
     found = parsed(
         "--views", "3", "--azimuth=-30:30", "--elevation", "40", "--target=-1,0,2.5", "--light-elevation", "10:80",
         "--bound", "none", "--spp", "4", "--begin", "untrained",
@@ -156,10 +161,10 @@ def test_arguments():
     expected = ViewDistribution(
         3, azimuth=(-30, 30), elevation=(40, 40), target=(-1, 0, 2.5), light_elevation=(10, 80), seed=7
     )
-    assert views_of(found, 7) == expected
-    recipe = scene_recipe.recipe_of({**found, "share": 0.5}, FitSettings(steps=9))
+    assert views_from(found, 7) == expected
+    recipe = recipe_from({**found, "share": 0.5}, FitSettings(steps=9))
     assert recipe == SceneRecipe(0.5, 4, None, start="untrained", settings=FitSettings(steps=9))
-    assert views_of(parsed("--origins", "0,0,0:1,1,1")).origins == ((0, 0, 0), (1, 1, 1))
+    assert views_from(parsed("--origins", "0,0,0:1,1,1")).origins == ((0, 0, 0), (1, 1, 1))
 
 
 @pytest.mark.parametrize(
@@ -357,32 +362,32 @@ def passes(monkeypatch):
 
 
 def test_references_are_rendered_once(path, tmp_path, passes):
-    def references(spp=10, **more):
+    def rendered(spp=10, **more):
         return references_of(path, ORBIT, spp, tmp_path / "kept", pass_samples=FOUR, **more)
 
     views = ORBIT.trained()[:2]
-    first = references()
+    first = rendered()
     images = first.images(views)
     assert first.rendered == 6 and first.reused == 0 and len(set(passes.seeds)) == 6
-    assert min(passes.seeds) >= reference_renders.SEEDS
+    assert min(passes.seeds) >= references.SEEDS
     files = sorted((tmp_path / "kept").iterdir())
     assert [file.suffix for file in files] == [".npz"] * 2
-    again = references()
+    again = rendered()
     np.testing.assert_array_equal(images, again.images(views))
     assert again.rendered == 0 and again.reused == 2
     # Other samples, a scene that is written otherwise: other images; not for what is trained
-    unchanged = references(without=(path.with_name("material.npz"),))
-    assert not {references(11).path(v) for v in views} & set(files)
-    assert not {references(inputs=("x",)).path(v) for v in views} & set(files)
+    unchanged = rendered(without=(path.with_name("material.npz"),))
+    assert not {rendered(11).path(v) for v in views} & set(files)
+    assert not {rendered(inputs=("x",)).path(v) for v in views} & set(files)
     for file, kept in ((path, False), (path.with_name("material.npz"), True)):
         before = file.read_bytes()
         file.write_bytes(before + b"<!-- changed -->")
         own = {"without": (path.with_name("material.npz"),)}
-        assert ({references(**own).path(v) for v in views} == {unchanged.path(v) for v in views}) == kept
+        assert ({rendered(**own).path(v) for v in views} == {unchanged.path(v) for v in views}) == kept
         file.write_bytes(before)
     # A damaged file is rendered anew
     files[0].write_bytes(files[0].read_bytes()[:100])
-    np.testing.assert_array_equal(images, references().images(views))
+    np.testing.assert_array_equal(images, rendered().images(views))
 
 
 def test_references_of_other_processes(path, tmp_path, passes):

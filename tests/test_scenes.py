@@ -96,7 +96,7 @@ def test_compare_against_principled(mi_rgb, tmp_path, name):
     assert (result.figures["learned_plugins"], result.figures["table_bytes"]) == (
         (0, 0) if name == "disney" else (1, 384)
     )
-    paths = comparison.write(result, tmp_path)
+    paths = result.save(tmp_path)
     assert paths["principled"].endswith("principled.exr") and Path(paths["figure"]).is_file()
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..scenes.downloads import DOWNLOADS
+from ..scenes.examples import DOWNLOADS
 from .common import say, verb
 
 HELP = "fetch data of the documentation that do not ship: materials and meshes"
@@ -21,9 +21,9 @@ def add(commands) -> None:
 def run(arguments) -> dict:
     """Fetch the files, or list what there is, and return what is printed.
 
-    Raises :class:`.UsageError` and as :mod:`mi_diffind.scenes.downloads` does.
+    Raises :class:`.UsageError` and as :mod:`mi_diffind.scenes.examples` does.
     """
-    from ..scenes.downloads import fetch
+    from ..scenes.examples import fetch
 
     if not arguments.names:
         for name, each in DOWNLOADS.items():

@@ -41,7 +41,7 @@ def run(arguments) -> dict:
         if stems.count(stem) > 1:
             raise UsageError(f'{len(stems)} scenes, and more than one is called "{stem}": check them one at a time')
     set_variant(arguments.variant)
-    from ..scenes import reference_files, regression, regression_report
+    from ..scenes import regression, regression_report
 
     results, options = [], {"spp": arguments.spp, "seed": arguments.seed, "defines": dict(arguments.defines)}
     if not arguments.update:
@@ -49,7 +49,7 @@ def run(arguments) -> dict:
         writable_folder(out if out.exists() else out.parent)
         options["out"] = out
         for path in arguments.scenes:  # before the first is rendered
-            reference_files.read_reference(path, arguments.references)
+            regression.read_reference(path, arguments.references)
     try:
         for path in arguments.scenes:
             result = regression.regress(path, update=arguments.update, references=arguments.references, **options)

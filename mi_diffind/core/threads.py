@@ -1,6 +1,7 @@
-"""Threads of Dr.Jit: as many as Mitsuba needs for files, and messages for which no thread waits.
+"""Threads: as many of Dr.Jit's as Mitsuba needs for files, and turns of Python's: one loads or renders at a time.
 
-Importing this imports neither Dr.Jit nor Mitsuba.
+In Mitsuba 3.9, two threads that render plugins written in Python end the process or raise errors of Dr.Jit, and so does
+a thread that drops a scene while another one renders. Importing this imports neither Dr.Jit nor Mitsuba.
 """
 
 from __future__ import annotations
@@ -59,9 +60,8 @@ def settle() -> None:
 def log_beside_python() -> None:
     """Have Dr.Jit write its messages to the standard error of the process by itself, and no longer through Python.
 
-    It logs with its lock held, for instance that a kernel cannot be stored on a full disk. In a thread that loads a
-    scene it would then wait for Python, while the thread that runs Python waits for the lock. Dr.Jit has no Python
-    function for this; where its library lacks ``jit_set_log_level_stderr(LogLevel)``, messages stay as they are.
+    Dr.Jit logs with its lock held. In a thread that loads a scene it would then wait for Python, while the thread that
+    runs Python waits for the lock. Without ``jit_set_log_level_stderr(LogLevel)``, messages stay as they are.
     """
     import drjit as dr
 
@@ -107,11 +107,10 @@ def in_turn(load):
 
 
 def before_render(callback) -> None:
-    """Have ``mi.render`` wait for its turn and call ``callback(scene, integrator, sensor)`` first, as it was called.
+    """Have ``mi.render`` wait for its turn and call ``callback(scene, integrator, sensor)`` first.
 
-    Mitsuba tells plugins nothing of renders: scenes, sensors and shapes have no method in Python that one calls. The
-    function is the same in all variants, under two names. It stays as it is for everything else: its arguments, errors,
-    documentation and signature.
+    Mitsuba tells plugins nothing of renders. The function is the same in all variants, under two names; its arguments,
+    errors, documentation and signature stay.
     """
     import mitsuba as mi
     from mitsuba.python import util

@@ -23,9 +23,8 @@ from ..arrays import lookup
 from ..arrays.indirection import aligned
 from ..core import compat
 from ..images import srgb
-from . import components
 from .compressed import FilteredMaps
-from .layout import Layout, MapLayout
+from .layout import Layout, MapLayout, choose_borders
 from .source import Source
 
 
@@ -92,7 +91,7 @@ class Pyramid(FilteredMaps):
 
         ``layout`` is any layout of this source (default: ``Layout.of(source, filtered=True)``); a stored channel of
         several maps is averaged as in the first of them. ``border`` along v and u is by default
-        :func:`.components.borders`.
+        :func:`.layout.choose_borders`.
         """
         layout = layout or Layout.of(source, filtered=True)
         sizes = level_sizes(source.height, source.width)
@@ -121,7 +120,7 @@ class Pyramid(FilteredMaps):
                     mean = srgb.from_linear(level) if m.color_space == "srgb" else level
                 for c, where in channels:
                     stored[..., where] = entry.encode(mean[..., c])
-        border = border or components.borders(values[0])
+        border = border or choose_borders(values[0])
         return Pyramid(layout, values, types, border)
 
     @property

@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
-import io
 import itertools
 import json
 import math
@@ -33,12 +32,12 @@ from ..core.jobs import run_jobs
 from ..core.progress import interruptible, progress_bar
 from ..core.runtime import use_variant
 from ..core.threads import threads_for_files
+from ..core.units import check_memory, check_samples
 from ..images import srgb
 from ..plugins.support import footprint
 from . import loading, splats
-from .capture_settings import CaptureSettings
-from .poses import frame_of, pose
-from .splat_files import is_splats
+from .poses import frame_of, orbit_directions, pose, sphere_directions
+from .splats import is_splats
 
 #: Samples of the whole image in one pass.
 PASS = 1 << 23
@@ -52,8 +51,17 @@ THROUGH = 8
 #: Largest number of a half float, the type of the colours of an EXR.
 LARGEST = 65504.0
 
-#: Number of views of a contact sheet.
-SHOWN = 24
+#: Bytes of memory for a sample of a pass, roughly.
+SAMPLE_BYTES = 512
+
+#: Bytes of memory for the camera of a view, roughly.
+VIEW_BYTES = 1024
+
+#: Shapes of the camera path.
+PATHS = ("sphere", "orbit")
+
+#: Formats of the images.
+FORMATS = ("png", "exr")
 
 #: File that records the settings of a folder.
 RECORD = "capture.json"
@@ -61,6 +69,76 @@ RECORD = "capture.json"
 
 class CaptureError(DiffindError, RuntimeError):
     """A scene cannot be captured with these settings, or not in this folder; the message is one sentence."""
+
+
+@dataclass(frozen=True)
+class CaptureSettings:
+    """Settings of a capture: number and size of the views, samples, camera path.
+
+    ``views`` are for training, ``test`` further ones for tests: square images of ``resolution`` pixels with a field of
+    view ``fov`` (degrees) and ``spp`` samples a pixel. ``objects`` are the ids of the captured shapes (none: all
+    surfaces that do not shine); all other shapes only cast light and shadow on them. Cameras look at ``centre``
+    (default: the centre of the objects' box) from the distance ``radius`` (default: a sphere around the objects fills
+    the image). ``path``: "sphere", all over it, or "orbit", once around the axis ``up``. ``elevation``: the lowest and
+    the highest, degrees above the plane normal to ``up``; an orbit swings between them (default: −90, 90 for a sphere,
+    20, 20 for an orbit). ``format``: "png", as displayed, 8 bits, or "exr", linear half floats. ``box``: of 3D
+    Gaussians, the lower and the upper corner of what is captured (default: :meth:`.splats.Splats.cropped`).
+    """
+
+    views: int = 60
+    test: int = 20
+    resolution: int = 160
+    spp: int = 256
+    fov: float = 40.0
+    centre: tuple[float, float, float] | None = None
+    radius: float | None = None
+    path: str = "sphere"
+    elevation: tuple[float, float] | None = None
+    up: tuple[float, float, float] = (0.0, 1.0, 0.0)
+    objects: tuple[str, ...] = ()
+    seed: int = 0
+    format: str = "png"
+    box: tuple[float, ...] | None = None
+
+    def check(self) -> None:
+        """Raise ``ValueError`` for values that are not allowed."""
+        if self.path not in PATHS:
+            raise ValueError(f'path: found "{self.path}", allowed are {", ".join(PATHS)}')
+        if self.format not in FORMATS:
+            raise ValueError(f'format: found "{self.format}", allowed are {", ".join(FORMATS)}')
+        for name, least in (("views", 1), ("test", 0), ("resolution", 1), ("spp", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name}: found {getattr(self, name)}, allowed are whole numbers ≥ {least}")
+        check_samples(self.spp)
+        check_memory("resolution", self.resolution, SAMPLE_BYTES * self.resolution**2)
+        check_memory("views", self.views + self.test, VIEW_BYTES * (self.views + self.test))
+        if not 0 < self.fov < 170:
+            raise ValueError(f"fov: found {self.fov:g}, allowed are degrees between 0 and 170")
+        if self.radius is not None and not 0 < self.radius < math.inf:
+            raise ValueError(f"radius: found {self.radius:g}, allowed are numbers > 0")
+        if self.centre is not None and not np.isfinite(self.centre).all():
+            raise ValueError("centre: found NaN or infinity, allowed are numbers")
+        if not np.isfinite(self.up).all() or not np.any(self.up):
+            raise ValueError("up: found no direction, allowed are three numbers that are not all 0")
+        if self.box is not None and not (len(self.box) == 6 and np.less(self.box[:3], self.box[3:]).all()):
+            raise ValueError("box: found no box, allowed are six numbers, those of the lower corner first")
+        low, high = self.elevations
+        if not -90 <= low <= high <= 90:
+            raise ValueError(
+                f"elevation: found {low:g} to {high:g}, allowed are degrees from −90 to 90, the lower first"
+            )
+
+    @property
+    def elevations(self) -> tuple[float, float]:
+        """Lowest and highest elevation, degrees: ``elevation`` or its default."""
+        return self.elevation or ((20.0, 20.0) if self.path == "orbit" else (-90.0, 90.0))
+
+    def directions(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return unit vectors from the centre to the cameras, ``(views, 3)`` and ``(test, 3)``; z is up."""
+        low, high = np.radians(self.elevations)
+        if self.path == "orbit":
+            return orbit_directions(self.views, self.test, low, high)
+        return sphere_directions(self.views, self.test, low, high, self.seed)
 
 
 @dataclass
@@ -91,26 +169,18 @@ class Captured:
     @property
     def figures(self) -> dict:
         """Figures of ``mi-diffind capture --json``."""
+        names = ("interrupted", "files", "rendered", "seconds", "radius")
         return {
-            "interrupted": self.interrupted,
-            "output": str(self.folder),
-            "files": self.files,
-            "views": self.total,
-            "rendered": self.rendered,
-            "seconds": self.seconds,
-            "radius": self.radius,
-            "centre": self.centre.tolist(),
-            "box": self.box.tolist(),
-            "notes": list(self.notes),
-        }
+            **{name: getattr(self, name) for name in names}, "output": str(self.folder), "views": self.total,
+            "centre": self.centre.tolist(), "box": self.box.tolist(), "notes": list(self.notes),
+        }  # fmt: skip
 
     @property
     def poses(self) -> np.ndarray:
         """Camera-to-world matrices ``(views, 4, 4)`` of all ``files``, in this order; cameras look along −z."""
-        matrices = {}
-        for path in self.folder.glob("transforms_*.json"):
-            for frame in json.loads(path.read_text(encoding="utf-8"))["frames"]:
-                matrices[frame["file_path"].removeprefix("./")] = frame["transform_matrix"]
+        lists = [json.loads(path.read_text(encoding="utf-8")) for path in self.folder.glob("transforms_*.json")]
+        frames = [frame for one in lists for frame in one["frames"]]
+        matrices = {frame["file_path"].removeprefix("./"): frame["transform_matrix"] for frame in frames}
         return np.array([matrices[name] for name in self.files], np.float64).reshape(-1, 4, 4)
 
     @property
@@ -120,27 +190,15 @@ class Captured:
             return [np.array(mi.Bitmap(str(self.folder / name))) for name in self.files]
 
     def __str__(self) -> str:
-        return "\n".join(lines(self))
-
-    def _repr_png_(self) -> bytes:
-        """Return a contact sheet of at most :data:`SHOWN` views on white, evenly chosen."""
-        from PIL import Image
-
-        chosen = np.unique(np.linspace(0, len(self.files) - 1, min(SHOWN, len(self.files))).round().astype(int))
-        columns, side = min(8, max(1, len(chosen))), 128
-        sheet = Image.new("RGB", (columns * side, max(1, -(-len(chosen) // columns)) * side), "white")
-        for i, number in enumerate(chosen):
-            with threads_for_files():
-                image = np.array(mi.Bitmap(str(self.folder / self.files[number])))
-            if image.dtype != np.uint8:  # linear, multiplied by alpha
-                straight = image[..., :3] / np.maximum(image[..., 3:], 1e-6)
-                shown = np.concatenate([srgb.for_display(straight), np.clip(image[..., 3:], 0, 1)], axis=-1)
-                image = np.rint(255 * shown).astype(np.uint8)
-            thumbnail = Image.fromarray(image).resize((side, side))
-            sheet.paste(thumbnail, (i % columns * side, i // columns * side), thumbnail)
-        stream = io.BytesIO()
-        sheet.save(stream, "PNG")
-        return stream.getvalue()
+        lines = [
+            f"{self.folder}: {len(self.files)} of {self.total} views, {self.rendered} rendered now, "
+            f"{self.seconds:.1f} s",
+            f"  from a distance of {self.radius:.4g} around {_point(self.centre)}, "
+            f"box {' to '.join(map(_point, self.box))}",
+        ]
+        if self.opaque:
+            lines.append("  alpha is 1 everywhere: surfaces behind the objects became part of the views")
+        return "\n".join([*lines, *(f"  {note}" for note in self.notes)])
 
 
 def capture(
@@ -156,7 +214,7 @@ def capture(
     """Render the views of a ``scene`` into ``folder``, in the variant that is set.
 
     The scene is a file or a dictionary as of ``mi.load_dict``; of a loaded scene, lights could not be hidden. It may
-    also be a file of 3D Gaussians (:mod:`.splat_files`), of which ``box`` crops a part.
+    also be a file of 3D Gaussians (:mod:`.splats`), of which ``box`` crops a part.
     ``given`` are fields of :class:`CaptureSettings`, the options of ``mi-diffind capture`` as keywords: ``views=60``,
     ``resolution=160``, ``path="orbit"``, …; ``defines`` replace the file's ``<default>`` parameters; ``workers``
     processes share the views, or those of the Dask cluster ``scheduler``. The folder is created if its parent exists.
@@ -169,7 +227,12 @@ def capture(
     settings = _settings(scene, given)
     subject = _subject(scene, defines, settings)
     folder = writable_folder(folder, create=True)
-    record = _record(subject, settings)
+    record = {
+        "settings": json.loads(json.dumps(dataclasses.asdict(settings))),
+        "variant": mi.variant(),
+        "versions": {"mitsuba": mi.__version__, "mi_diffind": __version__},
+        **subject.record(),
+    }
     _check_record(folder, record)
     box = subject.bounds()
     centre = box.mean(axis=0) if settings.centre is None else np.array(settings.centre, np.float64)
@@ -253,18 +316,37 @@ def _subject(scene, defines: Mapping | None, settings: CaptureSettings) -> Scene
 
 
 class SceneSubject:
-    """Scene as the subject of a capture, of which ``objects`` are captured."""
+    """Scene as the subject of a capture, of which the shapes with the ids ``objects`` are captured."""
 
     notes = ()
 
-    def __init__(self, scene, defines: Mapping | None, objects: tuple[str, ...]):
+    def __init__(self, scene, defines: Mapping | None, objects: tuple[str, ...] = ()):
         self.parsed, self.objects = loading.ParsedScene(scene, defines), objects
         self.path = self.parsed.path
 
     @functools.cached_property
     def scene(self):
-        """Scene whose integrators hide its lights."""
-        return _load(self.parsed)
+        """Scene whose integrators hide its lights, and whose meshes keep their ids."""
+
+        def hide(state) -> None:
+            for props in loading.integrator_properties(state):
+                if not loading.nests_another(props):  # the nested one follows the paths
+                    props["hide_emitters"] = True
+
+        return self.parsed.load(change=hide, merge=False, needs=())
+
+    def shapes(self) -> list:
+        """Return the captured shapes, without ``objects`` all that are no lights. Raises :class:`CaptureError`."""
+        shapes = self.scene.shapes()
+        ids = {s.id() for s in shapes}
+        for name in self.objects:
+            if name not in ids:
+                named = ", ".join(sorted(n for n in ids if n and not n.startswith("_"))) or "none has one"
+                raise CaptureError(f'objects: found "{name}", the ids of the scene\'s shapes are: {named}')
+        shapes = [s for s in shapes if (s.id() in self.objects if self.objects else not s.is_emitter())]
+        if not shapes:
+            raise CaptureError("the scene has no surfaces but lights, there is nothing to capture")
+        return shapes
 
     def record(self) -> dict:
         """Return what the images depend on beside the settings."""
@@ -278,16 +360,32 @@ class SceneSubject:
         }
 
     def bounds(self) -> np.ndarray:
-        """Return the corners ``(2, 3)`` of the captured objects' box."""
-        return bounds(self.scene, self.objects)
+        """Return the corners ``(2, 3)`` of the captured objects' box. Raises :class:`CaptureError`."""
+        boxes = np.array([_box(s) for s in self.shapes()])
+        box = np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
+        if not np.isfinite(box).all():
+            raise CaptureError("the box around the captured objects is not finite: name the objects")
+        return box
 
     def reach(self, centre: np.ndarray) -> float:
-        """Return the radius of a sphere around a point that holds the captured objects."""
-        return _reach(self.scene, self.objects, centre)
+        """Return the largest distance of objects from a point: of vertices of meshes, of corners of other boxes."""
+        reach, vertices = 0.0, "vertex_positions"
+        for shape in self.shapes():
+            parameters = mi.traverse(shape) if isinstance(shape, mi.Mesh) and shape.vertex_count() else {}
+            if vertices in parameters:
+                points = np.array(parameters[vertices], np.float64).reshape(-1, 3)
+            else:
+                points = np.array(list(itertools.product(*_box(shape).T)))
+            reach = max(reach, float(np.linalg.norm(points - centre, axis=1).max()))
+        return reach
 
     def camera(self, settings: CaptureSettings) -> CaptureCamera:
         """Return the camera of a capture with these settings."""
-        return CaptureCamera(self.scene, settings)
+        return CaptureCamera(self, settings)
+
+
+def _box(shape) -> np.ndarray:
+    return np.array([shape.bbox().min, shape.bbox().max], np.float64).reshape(2, 3)
 
 
 def _settings(scene, given: dict) -> CaptureSettings:
@@ -308,48 +406,6 @@ def _settings(scene, given: dict) -> CaptureSettings:
     return settings
 
 
-def shapes_of(scene, objects: tuple[str, ...] = ()) -> list:
-    """Return the shapes with the ids ``objects`` (none: all that are no lights). Raises :class:`CaptureError`."""
-    shapes = [s for s in scene.shapes() if not s.is_emitter()]
-    if objects:
-        ids = {s.id() for s in scene.shapes()}
-        for name in objects:
-            if name not in ids:
-                named = ", ".join(sorted(n for n in ids if n and not n.startswith("_"))) or "none has one"
-                raise CaptureError(f'objects: found "{name}", the ids of the scene\'s shapes are: {named}')
-        shapes = [s for s in scene.shapes() if s.id() in objects]
-    if not shapes:
-        raise CaptureError("the scene has no surfaces but lights, there is nothing to capture")
-    return shapes
-
-
-def bounds(scene, objects: tuple[str, ...] = ()) -> np.ndarray:
-    """Return the corners ``(2, 3)`` of the box of :func:`shapes_of`. Raises :class:`CaptureError`."""
-    boxes = [_box(s) for s in shapes_of(scene, objects)]
-    box = np.stack([np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)])
-    if not np.isfinite(box).all():
-        raise CaptureError("the box around the captured objects is not finite: name the objects")
-    return box
-
-
-def _box(shape) -> np.ndarray:
-    return np.array([shape.bbox().min, shape.bbox().max], np.float64).reshape(2, 3)
-
-
-def _reach(scene, objects: tuple[str, ...], centre: np.ndarray) -> float:
-    """Return the largest distance of shapes from a point: of the vertices of meshes, of the corners of other boxes."""
-    reach = 0.0
-    for shape in shapes_of(scene, objects):
-        vertices = "vertex_positions"
-        parameters = mi.traverse(shape) if isinstance(shape, mi.Mesh) and shape.vertex_count() else {}
-        if vertices in parameters:
-            points = np.array(parameters[vertices], np.float64).reshape(-1, 3)
-        else:
-            points = np.array(list(itertools.product(*_box(shape).T)))
-        reach = max(reach, float(np.linalg.norm(points - centre, axis=1).max()))
-    return reach
-
-
 def _plan(settings: CaptureSettings, centre: np.ndarray, radius: float) -> dict[str, list[np.ndarray]]:
     """Return the poses of each split, ``"train"`` and ``"test"``."""
     frame = frame_of(settings.up)
@@ -360,22 +416,11 @@ def _plan(settings: CaptureSettings, centre: np.ndarray, radius: float) -> dict[
     }
 
 
-def _load(parsed: loading.ParsedScene):
-    """Load a scene so that its integrators hide its lights, and its meshes keep their ids."""
-
-    def hide(state) -> None:
-        for props in loading.integrator_properties(state):
-            if not loading.nests_another(props):  # the nested one follows the paths
-                props["hide_emitters"] = True
-
-    return parsed.load(change=hide, merge=False, needs=())
-
-
 class CaptureCamera:
     """Camera of a capture, beside the sensors of the loaded scene."""
 
-    def __init__(self, scene, settings: CaptureSettings):
-        self.scene, self.settings = scene, settings
+    def __init__(self, subject: SceneSubject, settings: CaptureSettings):
+        self.scene, self.settings = subject.scene, settings
         side = settings.resolution
         mono = mi.is_monochromatic
         self.sensor = mi.load_dict({
@@ -387,11 +432,11 @@ class CaptureCamera:
             "sampler": {"type": "multijitter", "sample_count": settings.spp},
         })  # fmt: skip
         self.parameters = mi.traverse(self.sensor)
-        self.integrator = scene.integrator()
+        self.integrator = self.scene.integrator()
         if self.integrator is None:
             self.integrator = mi.load_dict({"type": "path", "hide_emitters": True})
         if settings.objects:
-            self.integrator = _only(self.integrator, shapes_of(scene, settings.objects))
+            self.integrator = _only(self.integrator, subject.shapes())
 
     def render(self, pose: np.ndarray, seed: int) -> np.ndarray:
         """Render a view, ``(height, width, 4)``, float32: linear colours, multiplied by alpha, and alpha."""
@@ -469,16 +514,6 @@ def _only(inner, shapes: list):
     return ObjectsOnly(mi.Properties("only"))
 
 
-def _record(subject: SceneSubject | splats.SplatSubject, settings: CaptureSettings) -> dict:
-    """Return the record of a folder: the settings, and everything else that its images depend on."""
-    return {
-        "settings": json.loads(json.dumps(dataclasses.asdict(settings))),
-        "variant": mi.variant(),
-        "versions": {"mitsuba": mi.__version__, "mi_diffind": __version__},
-        **subject.record(),
-    }
-
-
 def _check_record(folder: Path, record: dict) -> None:
     """Raise :class:`CaptureError` if a folder holds a capture with other settings, or views of another program."""
     path = folder / RECORD
@@ -487,29 +522,26 @@ def _check_record(folder: Path, record: dict) -> None:
             raise CaptureError(f"{folder}: holds views that were not captured here, a folder of its own is needed")
         return
     try:
-        before = json.loads(path.read_text(encoding="utf-8"))
-        changed = _changed(before, record)
+        before, now = _flat(json.loads(path.read_text(encoding="utf-8"))), _flat(record)
     except (ValueError, OSError, AttributeError) as e:
         raise CaptureError(f"{path}: cannot be read ({reason(e)})") from None
-    if changed:
+    keys = [key for key in dict.fromkeys([*now, *before]) if before.get(key) != now.get(key)]
+    if keys:
+        changes = [
+            "the scene's files have changed"
+            if key[0] == "digest"
+            else f"{key[-1]}: {before.get(key)}, now {now.get(key)}"
+            for key in keys
+        ]
         raise CaptureError(
-            f"{folder}: holds a capture with other settings ({'; '.join(changed)}): take those, or another folder"
+            f"{folder}: holds a capture with other settings ({'; '.join(changes)}): take those, or another folder"
         )
 
 
-def _changed(before: dict, now: dict) -> list[str]:
-    changes = []
-    for key, value in now.items():
-        was = before.get(key)
-        if key == "digest" and was != value:
-            changes.append("the scene's files have changed")
-        elif isinstance(value, dict):
-            was = was or {}
-            keys = dict.fromkeys([*value, *was])
-            changes += [f"{k}: {was.get(k)}, now {value.get(k)}" for k in keys if was.get(k) != value.get(k)]
-        elif was != value:
-            changes.append(f"{key}: {was}, now {value}")
-    return changes
+def _flat(record: dict) -> dict[tuple, object]:
+    """Return the values of a record by their path in it."""
+    parts = [(k, v if isinstance(v, dict) else {None: v}) for k, v in record.items()]
+    return {tuple(filter(None, (k, inner))): value for k, part in parts for inner, value in part.items()}
 
 
 def _name(split: str, i: int, settings: CaptureSettings) -> str:
@@ -551,19 +583,6 @@ def _write(path: Path, image: np.ndarray) -> None:
             header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
             with OpenEXR.File(header, channels) as file:
                 file.write(str(temporary))
-
-
-def lines(captured: Captured) -> list[str]:
-    """Return a summary as lines of text."""
-    box = " to ".join(map(_point, captured.box))
-    count = f"{len(captured.files)} of {captured.total} views"
-    text = [
-        f"{captured.folder}: {count}, {captured.rendered} rendered now, {captured.seconds:.1f} s",
-        f"  from a distance of {captured.radius:.4g} around {_point(captured.centre)}, box {box}",
-    ]
-    if captured.opaque:
-        text.append("  alpha is 1 everywhere: surfaces behind the objects became part of the views")
-    return [*text, *(f"  {note}" for note in captured.notes)]
 
 
 def _point(p: np.ndarray) -> str:

@@ -27,13 +27,19 @@ from ..images import metrics
 from ..measure import figure_grid
 from ..measure.statistics import spread
 from ..plugins.support import footprint
-from . import conversion, loading, scene_checks
+from . import conversion, loading
 
-#: Pairs of passes that a ratio of times needs, and the largest ratio of its quartiles: beyond, none is given.
-PAIRS, WIDEST = 3, 1.5
+#: Pairs of passes that a ratio of times needs.
+PAIRS = 3
 
-#: Side of the zoomed window over the side of the picture, and its smallest width or height in pixels.
-ZOOM, SMALLEST = 1 / 8, 8
+#: Largest ratio of the quartiles of the ratios of times: beyond, none is given.
+WIDEST = 1.5
+
+#: Side of the zoomed window over the side of the picture.
+ZOOM = 1 / 8
+
+#: Smallest width or height of the zoomed window in pixels.
+SMALLEST = 8
 
 
 @dataclass
@@ -48,17 +54,75 @@ class Comparison:
     figures: dict
     further: tuple[Comparison, ...] = ()
 
+    @property
+    def truth(self) -> str:
+        """Name of the truth, the plugins that it is rendered with, and its samples: ``exact (disney), 32 spp``."""
+        name, put_in = self.figures["against"], ", ".join(self.figures["counterparts"])
+        return f"{name}{'' if put_in == name else f' ({put_in})'}, {self.figures['truth_spp']} spp"
+
     def save(self, folder: str | os.PathLike) -> dict[str, str]:
-        """Write the pictures into a folder (:func:`write`), and return their paths."""
-        return write(self, folder)
+        """Write ``comparison.png`` and EXR images into ``folder``, made if its parent exists, and return the paths.
+
+        The EXR images are ``written.exr``, ``exact.exr`` (or by the name of the other counterpart) and ``error.exr``
+        (absolute difference; with several truths ``error_NAME.exr``). Raises :class:`.OutputError`.
+        """
+        folder = writable_folder(folder, create=True)
+        images = {"written": self.written}
+        for one in (self, *self.further):
+            name = one.figures["against"]
+            images[name] = one.reference
+            images[f"error_{name}" if self.further else "error"] = np.abs(one.written - one.reference)
+        paths = {name: str(folder / f"{name}.exr") for name in images}
+        for name, image in images.items():
+            loading.write_image(paths[name], image)
+        paths["figure"] = str(folder / "comparison.png")
+        self._write_figure(paths["figure"])
+        return paths
+
+    def _write_figure(self, path: str | os.PathLike) -> None:
+        """Write one picture.
+
+        Two rows for each truth, the scene as written, the truth and their difference, above as a whole and below its
+        worst place, and a row with the figures.
+        """
+        learned = " (learned tables)" if self.figures["learned_plugins"] else ""
+        written, cells = "learned plugins" if self.figures["conversions"] else f"as written{learned}", []
+        for one in (self, *self.further):
+            x, y, width, height = frame = tuple(one.figures["worst"][key] for key in ("x", "y", "width", "height"))
+            inside, place = np.s_[y : y + height, x : x + width], f"{width} x {height} pixels from ({x}, {y})"
+            zoomed = one.written[inside], one.reference[inside]
+            cells += [
+                figure_grid.picture(f"{written}, {one.figures['spp']} spp", one.written, frame),
+                figure_grid.picture(one.truth, one.reference, frame),
+                figure_grid.error_map(np.abs(one.written - one.reference).mean(axis=-1)),
+                figure_grid.picture(f"{written}, worst place: {place}", zoomed[0]),
+                figure_grid.picture(f"{one.truth}, worst place", zoomed[1]),
+                figure_grid.error_map(_clipped_error(*zoomed), "worst place, difference clipped to [0, 1]"),
+            ]
+        cells += [figure_grid.text(lines) for lines in self._sections()]
+        figure_grid.write(path, cells, 3, self.written.shape)
+
+    def _sections(self) -> list[list[str]]:
+        """Return the lines about the scene, and those about each truth."""
+        f = self.figures
+        replaced = "1 plugin" if f["replaced_plugins"] == 1 else f"{f['replaced_plugins']} plugins"
+        what = "learned" if f["learned_plugins"] == f["replaced_plugins"] else "replaced"
+        head = [
+            f"scene       {Path(f['scene']).name}, {f['width']} x {f['height']}, {loading.samples_text(f)}",
+            f"variant     {f['variant']}",
+            f"{what:12}{replaced}, {f['table_bytes']:,} bytes of tables",
+        ]
+        return [head, *([f"against     {one.truth}", *_lines(one.figures)] for one in (self, *self.further))]
 
     def __str__(self) -> str:
-        return "\n".join(summary(self))
+        head, *blocks = self._sections()
+        head += conversion.summary(self.figures["conversions"])
+        return "\n".join([*head, *(line for lines in blocks for line in ("", *lines))])
 
     def _repr_png_(self) -> bytes:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "comparison.png"
-            _write_figure(self, path)
+            self._write_figure(path)
             return path.read_bytes()
 
 
@@ -81,7 +145,7 @@ class _Side:
             dr.kernel_history_clear()
             image, seconds = loading.render(self.scene, spp * self.oversampling, seed, self.oversampling, on_pass)
             self.compiled.append(compat.was_compiled(dr.kernel_history()))
-        scene_checks.check_finite(image, self.name)
+        loading.check_finite(image, self.name)
         image = image[..., :3].astype(np.float64)
         half = len(self.seconds) % 2
         self.halves[half] = self.halves[half] + spp * np.repeat(image, 3 // image.shape[-1], -1)
@@ -151,21 +215,22 @@ def compare(
         kept = "".join(f"; kept is {c}" for c in conversions if not c.learned)
         raise loading.SceneError(f"{parsed.path}: names no {what} ({names}), so there is nothing to compare{kept}")
     learned = [entry for entry in replaced if entry["plugin"] in plugins.with_counterpart()]
-    truths, sides = {against: (against,)} if against else _default_truths(replaced), {}
-    counterparts = {name: _counterparts(replaced, names) for name, names in truths.items()}
-    put_in = {name: list(dict.fromkeys(c.name for c in each)) for name, each in counterparts.items()}
-    for name, names in truths.items():  # before the scene as written, since a counterpart may refuse
-        oversampling = max(c.oversampling for c in counterparts[name])
+    declared, sides, put_in = plugins.declared(), {}, {}
+    for name, names in ({against: (against,)} if against else _default_truths(replaced)).items():
+        counterparts = [declared[entry["plugin"]].counterpart(names) for entry in replaced]
+        plugins_put_in = [c.name for c in counterparts]
         if learn and not against and name == "exact":
-            name, put_in["stock"] = "stock", list(dict.fromkeys(c.stock for c in conversions if c.learned))
+            name, plugins_put_in = "stock", [c.stock for c in conversions if c.learned]
             loaded = loading.load(scene, defines)
-        else:
+        else:  # before the scene as written, since a counterpart may refuse
             loaded = parsed.load(exact=True, against=names)
+        put_in[name] = list(dict.fromkeys(plugins_put_in))
+        oversampling = max(c.oversampling for c in counterparts)
         sides[name] = _Side(loaded, oversampling, f"{parsed.path} with {', '.join(put_in[name])}")
     written = _Side(parsed.load(), name=f"{parsed.path}, as written")
     spp = spp or written.scene.sensors()[0].sampler().sample_count()
     footprint.check_samples(footprint.textures(written.scene), spp)
-    scene_checks.check_size(written.scene, spp)
+    loading.check_size(written.scene, spp)
     passes, done = max(1, min(max(passes, 2), spp)), 0
     turns = [written, *sides.values()]
     total = passes * sum(side.oversampling for side in turns)
@@ -178,7 +243,7 @@ def compare(
             if stop.is_set():
                 break
 
-    scene_checks.warn_of_black(written.scene, parsed.path, [written.image, *(side.image for side in sides.values())])
+    loading.warn_of_black(written.scene, parsed.path, [written.image, *(side.image for side in sides.values())])
     common = {
         "scene": str(parsed.path),
         "variant": mi.variant(),
@@ -213,10 +278,6 @@ def _default_truths(learned: list[dict]) -> dict[str, tuple[str, ...]]:
     """Return, by name, the counterparts that learned plugins are replaced by without a choice, ``exact`` last."""
     names = dict.fromkeys(name for entry in learned for name in plugins.declared()[entry["plugin"]].truths)
     return {name: tuple(dict.fromkeys((name, "exact"))) for name in sorted(names, key="exact".__eq__)}
-
-
-def _counterparts(replaced: list[dict], names: tuple[str, ...]) -> list:
-    return [plugins.declared()[entry["plugin"]].counterpart(names) for entry in replaced]
 
 
 def _errors(written: _Side, truth: _Side) -> dict:
@@ -301,80 +362,9 @@ def _times(written: _Side, truth: _Side, name: str) -> dict:
     }
 
 
-def write(comparison: Comparison, folder: str | os.PathLike) -> dict[str, str]:
-    """Write ``comparison.png`` and EXR images into ``folder``, which is created if its parent exists; return the paths.
-
-    The EXR images are ``written.exr``, ``exact.exr`` (or by the name of the other counterpart) and ``error.exr``
-    (absolute difference; with several truths ``error_NAME.exr``). Raises :class:`.OutputError`.
-    """
-    folder = writable_folder(folder, create=True)
-    images, everything = {"written": comparison.written}, (comparison, *comparison.further)
-    for one in everything:
-        name = one.figures["against"]
-        images[name] = one.reference
-        images["error" if len(everything) == 1 else f"error_{name}"] = np.abs(one.written - one.reference)
-    paths = {name: str(folder / f"{name}.exr") for name in images}
-    for name, image in images.items():
-        loading.write_image(paths[name], image)
-    paths["figure"] = str(folder / "comparison.png")
-    _write_figure(comparison, paths["figure"])
-    return paths
-
-
-def _write_figure(comparison: Comparison, path: str | os.PathLike) -> None:
-    """Write one picture.
-
-    Two rows for each truth, the scene as written, the truth and their difference, above as a whole and below its worst
-    place, and a row with the figures.
-    """
-    learned = " (learned tables)" if comparison.figures["learned_plugins"] else ""
-    written = "learned plugins" if comparison.figures["conversions"] else f"as written{learned}"
-    cells, everything = [], (comparison, *comparison.further)
-    for one in everything:
-        x, y, width, height = frame = tuple(one.figures["worst"][key] for key in ("x", "y", "width", "height"))
-        inside, place = np.s_[y : y + height, x : x + width], f"{width} x {height} pixels from ({x}, {y})"
-        label, zoomed = truth_label(one.figures), (one.written[inside], one.reference[inside])
-        cells += [
-            figure_grid.picture(f"{written}, {one.figures['spp']} spp", one.written, frame),
-            figure_grid.picture(label, one.reference, frame),
-            figure_grid.error_map(np.abs(one.written - one.reference).mean(axis=-1)),
-            figure_grid.picture(f"{written}, worst place: {place}", zoomed[0]),
-            figure_grid.picture(f"{label}, worst place", zoomed[1]),
-            figure_grid.error_map(_clipped_error(*zoomed), "worst place, difference clipped to [0, 1]"),
-        ]
-    head, *blocks = (figure_grid.text(lines) for lines in _sections(comparison))
-    figure_grid.write(path, [*cells, head, *blocks], 3, comparison.written.shape)
-
-
-def truth_label(figures: dict) -> str:
-    """Return the name of a truth, the plugins that it is rendered with, and its samples: ``exact (disney), 32 spp``."""
-    name, put_in = figures["against"], ", ".join(figures["counterparts"])
-    return f"{name}{'' if put_in == name else f' ({put_in})'}, {figures['truth_spp']} spp"
-
-
-def summary(comparison: Comparison) -> list[str]:
-    """Return the figures as lines of text."""
-    head, *blocks = _sections(comparison)
-    head += conversion.summary(comparison.figures["conversions"])
-    return [*head, *(line for lines in blocks for line in ("", *lines))]
-
-
-def _sections(comparison: Comparison) -> list[list[str]]:
-    """Return the lines about the scene, and those about each truth."""
-    f = comparison.figures
-    replaced = "1 plugin" if f["replaced_plugins"] == 1 else f"{f['replaced_plugins']} plugins"
-    what = "learned" if f["learned_plugins"] == f["replaced_plugins"] else "replaced"
-    head = [
-        f"scene       {Path(f['scene']).name}, {f['width']} x {f['height']}, {loading.samples_text(f)}",
-        f"variant     {f['variant']}",
-        f"{what:12}{replaced}, {f['table_bytes']:,} bytes of tables",
-    ]
-    return [head, *(_truth_lines(one.figures) for one in (comparison, *comparison.further))]
-
-
-def _truth_lines(f: dict) -> list[str]:
+def _lines(f: dict) -> list[str]:
+    """Return the errors and times against one truth as lines of text."""
     return [
-        f"against     {truth_label(f)}",
         f"PSNR        {f['psnr_db']:.2f} dB   (linear, clipped to [0, 1])",
         f"noise       {_noise_text(f)}",
         f"FLIP        {f['flip']:.4f}     (0 = equal to the eye)",
@@ -389,11 +379,9 @@ def _noise_text(f: dict) -> str:
         return "not measured: it needs two samples a pixel"
     if math.isinf(f["noise_db"]):
         return "none: both halves of the samples differ alike"
-    without = f["psnr_without_noise_db"]
-    rest = (
-        ": all of the error, as far as the samples tell" if without is None else f" of it, {without:.2f} dB without it"
-    )
-    return f"{f['noise_db']:.2f} dB{rest}"
+    if f["psnr_without_noise_db"] is None:
+        return f"{f['noise_db']:.2f} dB: all of the error, as far as the samples tell"
+    return f"{f['noise_db']:.2f} dB of it, {f['psnr_without_noise_db']:.2f} dB without it"
 
 
 def _time_lines(f: dict) -> list[str]:

@@ -1,4 +1,4 @@
-"""Conversion of scenes: stock plugins are replaced by learned ones, which are fitted where they need a table file.
+"""Conversion of scenes: learned plugins in place of stock ones, fitted where they need a table file; saved tables.
 
 Plugins declare which plugins of Mitsuba they can stand for (:class:`.plugins.Stock`). A fit is kept in a folder under
 a name that contains a digest of the source, its place and the options, and is not repeated.
@@ -18,17 +18,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import mitsuba as mi
+import numpy as np
 
 from .. import plugins
-from ..arrays.tables import Table, save_table
+from ..arrays.tables import Table, moved_paths, save_table
 from ..core import compat
 from ..core.errors import DiffindError, UsageError
 from ..core.files import OutputError, relative_path, replacing, shown, writable_file, writable_folder
 from ..core.runtime import use_variant
-from ..fitting.task import fit, tasks
+from ..fitting.task import STORAGES, fit, table_path, task_of, tasks
 from ..plugins.support.properties import Kept, StockNode
+from .block_test import PictureCheck, check_picture
 from .loading import ParsedScene, SceneError
-from .picture_check import PictureCheck, check_picture
 from .scene_text import difference, edited_text, with_paths
 
 #: Environment variable with the folder of fits for scenes that are rendered and not written.
@@ -110,7 +111,7 @@ def convert(
     - ``learn``: groups of plugins to replace (:func:`words`; ``None``: those of which a scene gains, textures).
     - ``tables``: folder of the table files (``None``: ``NEW_tables`` beside ``NEW.xml``).
     - ``defines``: values of the file's ``<default>`` parameters.
-    - ``check``: render small pictures before and after (:mod:`.picture_check`), if anything was replaced.
+    - ``check``: render small pictures before and after (:func:`.block_test.check_picture`), if anything was replaced.
 
     Returns what was replaced and what was kept (:func:`replace_stock`, whose errors are raised, too), and the check.
     """
@@ -237,7 +238,7 @@ def _trace_by(seen_by: tuple[str, ...], integrators: list) -> list[Conversion]:
 def _fitted(folder: Path, progress: bool, task: str, source: Path, **options) -> Table:
     """Return the table of a fit, of this call or an earlier one, as its file holds it.
 
-    Raises :class:`~.plugins.support.stock.Kept` for a source that the task refuses.
+    Raises :class:`~.plugins.support.properties.Kept` for a source that the task refuses.
     """
     key = [task, sorted(options.items()), relative_path(source, folder)]  # the file records its source by that path
     path = folder / f"{source.stem}_{_digest(source, key)}.npz"
@@ -311,3 +312,82 @@ def summary(conversions: Sequence[Conversion | Mapping]) -> list[str]:
             if (c.stock, c.learned, bool(c.reason)) == (stock, learned, True)
         ]
     return [*lines, *(f"kept        {c}" for c in conversions if not c.learned)]
+
+
+# -- tables that were optimised inside of a scene ---------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Saved:
+    """Saved table file: its ``path``, ``nbytes`` and ``storage`` form.
+
+    ``rms`` is the root mean square error of each array that was optimised, against its values in single precision.
+    """
+
+    path: Path
+    nbytes: int
+    storage: str
+    rms: dict[str, float]
+
+    def __str__(self) -> str:
+        errors = ", ".join(f"{name} {value:.2g}" for name, value in self.rms.items())
+        return f"{self.path}: {self.nbytes:,} bytes as {self.storage}; RMS error against float32: {errors}"
+
+
+def save(source, path: str | os.PathLike, storage: str = "", file: str | os.PathLike = "") -> Saved:
+    """Write tables that were optimised through renders into a table file.
+
+    - ``source``: a plugin (``neural_texture``, ``neural_material``, ``neural_image``, ``neural_disney``,
+      ``neural_ggx``, ``neural_sdf``, ``neural_field``), a scene, or ``mi.traverse(…)`` of one of them. The plugin has
+      the storage form ``"float32"``.
+    - ``path``: table file (``.npz``) to write.
+    - ``storage``: storage form of the entries (``"uint8"``, ``"float16"``, ``"float32"``); "": that of the file that
+      the plugin read, with its bits per entry.
+    - ``file``: if a scene optimises the tables of several files, the name of the one to save.
+
+    The new file keeps the settings of the old one, without its measurements. Raises
+    :class:`.UsageError` and :class:`.OutputError`.
+    """
+    path = table_path(path)
+    if storage and storage not in STORAGES:
+        raise UsageError(f'storage: found "{storage}", allowed are {", ".join(STORAGES)}')
+    table, entries = _optimised_table(source, str(file))
+    try:
+        stored = task_of(table).stored(table, entries, storage)
+    except ValueError as e:
+        raise UsageError(f"{path}: {e}") from None
+    stored.settings = moved_paths(stored.settings, Path(table.path or "x").resolve().parent, path.resolve().parent)
+    save_table(path, stored)
+    return Saved(path, stored.nbytes, stored.storage, _rms_errors(stored, entries))
+
+
+def _optimised_table(source, file: str) -> tuple[Table, dict]:
+    """Return the one table of an object whose entries can be optimised, and these entries."""
+    if isinstance(source, mi.SceneParameters):
+        nodes = compat.nodes_of(source)
+    else:
+        nodes = [source] if hasattr(source, "trained") else compat.objects_of(source)
+    trained = {}
+    for node in nodes:
+        if hasattr(node, "trained") and plugins.origin(node) is not None:
+            table, entries = node.trained()
+            if table is not None and entries:
+                trained.setdefault(tuple(id(v) for v in entries.values()), (table, entries))
+    if file:
+        trained = {key: value for key, value in trained.items() if Path(value[0].path).name == Path(file).name}
+    if not trained:
+        raise UsageError(
+            'save: found no tables that can be optimised; give the plugin storage="float32"'
+            + (f", or another name than {file}" if file else "")
+        )
+    if len(trained) > 1:
+        names = ", ".join(str(table.path) for table, _ in trained.values())
+        raise UsageError(f"save: found the tables of several files ({names}): name one of them by file")
+    return next(iter(trained.values()))
+
+
+def _rms_errors(stored: Table, entries: dict) -> dict[str, float]:
+    """Return the root mean square errors of stored entries."""
+    read = task_of(stored).model(stored, mi.TensorXf, "float32").entries()
+    pairs = {name: (array.numpy().reshape(-1), read[name].numpy().reshape(-1)) for name, array in entries.items()}
+    return {name: float(np.sqrt(np.mean(np.square(a - b, dtype=np.float64)))) for name, (a, b) in pairs.items()}

@@ -1,59 +1,214 @@
 """Regression checks of scenes against stored renderings: changes that sampling noise does not explain.
 
 A reference shows the scene as written, learned plugins included. A check finds changes; the distance of an
-approximation from the truth is measured by :mod:`.comparison`. Statistics: :mod:`.block_test`; files:
-:mod:`.reference_files`; sentences and pictures: :mod:`.regression_report`.
+approximation from the truth is measured by :mod:`.comparison`. Statistics: :mod:`.block_test`; sentences and pictures:
+:mod:`.regression_report`.
+
+A reference is kept beside its scene, as ``references/SCENE.VARIANT.exr``, an EXR file of two parts. The first is the
+image in half floats (``R``, ``G``, ``B``, or ``Y`` in mono variants), with the settings of the render in its header.
+The second has the means of blocks of 4 × 4 pixels: of 16 single passes (``pass00.R``, …) and of all 128 (``mean.R``).
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import json
 import math
 import os
 import threading
 import time
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 
 from .. import __version__
+from ..core.archives import Archive
 from ..core.errors import UsageError
-from ..core.files import writable_file, writable_folder
+from ..core.files import OutputError, replacing, writable_file, writable_folder
 from ..core.progress import interruptible, progress_bar
 from ..core.runtime import use_variant
 from ..measure.store import fingerprint, sources
 from . import loading
-from .block_test import CHECK_PASSES, GROUPS, TILE, block_means
-from .reference_files import (
-    BadReference,
-    Reference,
-    read_partial,
-    read_reference,
-    read_settings,
-    reference_path,
-    write_partial,
-    write_reference,
-)
+from .block_test import CHECK_PASSES, GROUPS, REFERENCE_PASSES, TILE, BlockReference, block_means
 from .regression_report import Regression, write_failure
 
 #: Samples of the whole image in a check, by default at most, but at least one a pixel in each pass.
 BUDGET = 2_000_000
+
 #: Passes that a reference is rendered from.
 PASSES = CHECK_PASSES * GROUPS
 
 #: Samples of the whole image in one render, a bound of its memory; a pass of more is several renders.
 _RENDER = 1 << 22
-#: First ``i`` of Mitsuba's seeds ``(seed << 16) + i`` that references use; checks use smaller ones.
-_REFERENCE_SEEDS = 1 << 15
-#: Seeds of one pass, and so the largest number of its renders.
+
+#: Seeds of one pass, and so the largest number of its renders. Of Mitsuba's seeds ``(seed << 16) + i``, the passes of
+#: checks use those with ``i`` below :data:`PASSES` times this number, references those from there on.
 _SEEDS = 1 << 8
+
 #: Seeds of the check that a new reference has to pass, and of a second one, since one of a hundred fails by chance.
 _OWN_CHECKS = ((1 << 16) - 1, (1 << 16) - 2)
 
+#: Attribute of an EXR file that holds the settings of a reference, as JSON.
+_ATTRIBUTE = "mi_diffind"
 
-@dataclasses.dataclass(frozen=True)
+#: Settings of a reference, and their types.
+_ABOUT = {"scene": str, "variant": str, "defines": dict, "budget": int, "spp": int, "seed": int}
+
+#: Largest half float.
+_LARGEST = 65504.0
+
+_REMEDY = "remove it and make it again with --update"
+
+
+# -- files ------------------------------------------------------------------------------------------------------------
+
+
+class BadReference(loading.SceneError):
+    """A stored reference is missing, damaged, or of another size; the message is one sentence that names it."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A stored rendering: its ``image``, ``(height, width, channels)``, and its ``blocks``, for the test of a check.
+
+    Values are linear, of 3 channels (red, green, blue) or 1 (mono variants); the image is for pictures, rounded to half
+    floats. ``about`` holds ``scene`` (file name without its extension), ``variant``, ``defines`` (texts for the scene's
+    ``<default>`` values), ``budget`` (samples per pixel of a check), ``spp`` (samples per pixel of the reference),
+    ``seed``, ``visible_change`` (of :meth:`.block_test.BlockReference.visible_change`, ``None`` for infinity), and the
+    ``versions`` of mi_diffind and Mitsuba that rendered it.
+    """
+
+    image: np.ndarray
+    blocks: BlockReference
+    about: dict
+
+
+def reference_path(path: str | os.PathLike, references: str | os.PathLike | None = None) -> Path:
+    """Return the file of a scene's reference in this variant: ``references/SCENE.VARIANT.exr`` beside the scene."""
+    folder = Path(path).parent / "references" if references is None else Path(references)
+    return folder / f"{Path(path).stem}.{mi.variant()}.exr"
+
+
+def read_reference(path: str | os.PathLike, references: str | os.PathLike | None = None) -> Reference:
+    """Return the stored reference of a scene file in the current variant, or in its twin for the other backend.
+
+    ``llvm_…`` and ``cuda_…`` variants render the same. Raises :class:`BadReference`.
+    """
+    wanted = reference_path(path, references)
+    backend, _, mode = mi.variant().partition("_")
+    twins = [wanted.with_name(f"{Path(path).stem}.{b}_{mode}.exr") for b in ("llvm", "cuda") if b != backend]
+    stored = next((file for file in (wanted, *twins) if file.is_file()), None)
+    if stored is None:
+        raise BadReference(f'{path}: has no reference "{wanted}"; run the same command with --update to make it')
+    parts = _parts(stored)
+    about = _about(stored, Path(path).stem, parts)
+    if len(parts) != 2:
+        raise BadReference(f"{stored}: is a reference of an earlier version, render it again with --update")
+    return _reference(stored, about, *(channels for _, channels in parts))
+
+
+def read_settings(path: str | os.PathLike, references: str | os.PathLike | None = None) -> dict:
+    """Return ``about`` of a scene's reference in this variant, also of earlier versions; nothing if there is none."""
+    stored = reference_path(path, references)
+    return _about(stored, Path(path).stem, _parts(stored)) if stored.is_file() else {}
+
+
+def _names(channels: int) -> str:
+    return "RGB" if channels == 3 else "Y"
+
+
+def write_reference(path: Path, reference: Reference) -> None:
+    """Write a reference in one piece. Raises :class:`.OutputError`."""
+    import OpenEXR
+
+    def part(title: str, values: dict[str, np.ndarray], dtype: type, **attributes) -> OpenEXR.Part:
+        height, width, count = next(iter(values.values())).shape
+        channels = {
+            prefix + name: np.ascontiguousarray(value[..., i], dtype)
+            for prefix, value in values.items() for i, name in enumerate(_names(count))
+        }  # fmt: skip
+        windows = {"displayWindow": window(*reference.image.shape[:2]), "dataWindow": window(height, width)}
+        form = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+        return OpenEXR.Part({**form, **windows, **attributes}, channels, title)
+
+    def window(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros(2, np.int32), np.array([width - 1, height - 1], np.int32)
+
+    blocks, about = reference.blocks, {**reference.about, "stops": reference.blocks.stops.tolist()}
+    means = {f"pass{i:02}.": values for i, values in enumerate(blocks.passes)} | {"mean.": blocks.mean}
+    image = {"": np.clip(reference.image, -_LARGEST, _LARGEST)}
+    parts = [
+        part("image", image, np.float16, **{_ATTRIBUTE: json.dumps(about, sort_keys=True)}),
+        part("blocks", means, np.float32),
+    ]
+    with replacing(path) as temporary:
+        try:
+            with OpenEXR.File(parts) as file:
+                file.write(str(temporary))
+        except RuntimeError as e:
+            raise OutputError(f'reference "{path}" cannot be written: {e}') from None
+
+
+def _parts(path: Path) -> list[tuple[dict, dict]]:
+    """Return the header and the channels of each part of an EXR file."""
+    import OpenEXR
+
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            # copies: closing the file empties its dictionaries
+            return [
+                (dict(part.header), {k: v.pixels.astype(np.float32) for k, v in part.channels.items()})
+                for part in file.parts
+            ]
+    except (RuntimeError, ValueError) as e:
+        raise BadReference(f"{path}: cannot be read as an EXR image; {_REMEDY}") from e
+
+
+def _about(path: Path, stem: str, parts: list[tuple[dict, dict]]) -> dict:
+    try:
+        about = json.loads(parts[0][0][_ATTRIBUTE])
+        good = all(isinstance(about[key], expected) for key, expected in _ABOUT.items())
+    except (KeyError, TypeError, ValueError) as e:
+        raise BadReference(f"{path}: is an EXR image, but no reference; {_REMEDY}") from e
+    if not (good and about["budget"] > 0 and about["spp"] > 0):
+        raise BadReference(f"{path}: is a damaged reference; {_REMEDY}")
+    if (about["scene"], f"{about['scene']}.{about['variant']}.exr") != (stem, path.name):
+        raise BadReference(f'{path}: is the reference of the scene "{about["scene"]}" in {about["variant"]}')
+    return about
+
+
+def _reference(path: Path, about: dict, image: dict, means: dict) -> Reference:
+    """Return the reference of a file from its two parts, which are checked."""
+    names = _names(3 if "R" in image else 1)
+
+    def stacked(channels: dict, prefix: str = "") -> np.ndarray:
+        return np.stack([channels[prefix + name] for name in names], axis=-1)
+
+    try:
+        pixels, mean = stacked(image), np.float64(stacked(means, "mean."))
+        passes = np.float64([stacked(means, f"pass{i:02}.") for i in range(REFERENCE_PASSES)])
+        stops, change = np.array(about.pop("stops"), np.float64), about["visible_change"]
+        good = (
+            stops.shape == (GROUPS,)
+            and (change is None or isinstance(change, float))
+            and mean.shape == passes[0].shape == block_means(pixels).shape
+            and all(np.isfinite(values).all() for values in (pixels, passes, mean, stops))
+        )
+    except (KeyError, TypeError, ValueError):
+        good = False
+    if not good:
+        raise BadReference(f"{path}: is a damaged reference; {_REMEDY}")
+    return Reference(pixels, BlockReference(passes, mean, stops, *pixels.shape[:2]), about)
+
+
+# -- passes -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
 class PassSize:
     """Samples of a pass: ``renders`` of ``samples`` a pixel each, a number that the scene's sampler takes."""
 
@@ -61,7 +216,7 @@ class PassSize:
     samples: int
 
     @classmethod
-    def of_check(cls, scene, spp: int) -> PassSize:
+    def for_check(cls, scene, spp: int) -> PassSize:
         """Return the size of one of the eight passes of a check of at least ``spp`` samples a pixel.
 
         Samplers such as ``stratified`` and ``multijitter`` round the samples of each render up.
@@ -85,19 +240,14 @@ def _passes(scene, size: PassSize, seed: int, numbers: range, bar, stop: threadi
     """
     for number in numbers:
         first = (seed << 16) + number * _SEEDS
-        yield (
-            sum(
-                loading.colour_channels(loading.render_pass(scene, size.samples, first + i))
-                for i in range(size.renders)
-            )
-            / size.renders
-        )
+        images = (loading.render_pass(scene, size.samples, first + i) for i in range(size.renders))
+        yield sum(map(loading.colour_channels, images)) / size.renders
         bar.update()
         if stop.is_set():
             return
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Check:
     """Passes of a check: their mean ``image``, and ``blocks``, ``(8, rows, columns, channels)``.
 
@@ -122,50 +272,67 @@ def _render_check(scene, size: PassSize, seed: int, title: str, progress: bool, 
     return Check(image, np.stack(blocks), int((~np.isfinite(image)).any(axis=-1).sum()))
 
 
-def _default_spp(width: int, height: int) -> int:
-    samples = max(1, BUDGET // (width * height * CHECK_PASSES))
-    return CHECK_PASSES << (samples.bit_length() - 1)
+@dataclass
+class PassSums:
+    """Passes of a reference that is being rendered: the sum of the images, and the ``blocks`` of each pass."""
+
+    image: np.ndarray | float = 0.0
+    blocks: list[np.ndarray] = field(default_factory=list)
+
+    def add(self, image: np.ndarray) -> None:
+        """Add the next pass."""
+        self.image = self.image + image
+        self.blocks.append(block_means(image).astype(np.float32))
+
+    def reference(self, about: dict) -> Reference:
+        """Return the reference of all passes, with its ``visible_change``, ``None`` for infinity, in ``about``."""
+        image = np.float32(self.image / len(self.blocks))
+        passes = np.stack(self.blocks).astype(np.float64)
+        groups = passes.reshape(-1, CHECK_PASSES, *passes.shape[1:])
+        blocks = BlockReference.from_groups(passes[:REFERENCE_PASSES], groups.mean(axis=1), *image.shape[:2])
+        change = blocks.visible_change(groups[REFERENCE_PASSES // CHECK_PASSES :])
+        return Reference(image, blocks, {**about, "visible_change": change if math.isfinite(change) else None})
 
 
-def update_reference(
-    path: str | os.PathLike,
-    references: str | os.PathLike | None = None,
-    spp: int | None = None,
-    seed: int | None = None,
-    progress: bool = True,
-    defines: dict[str, str] | None = None,
-    source: str | os.PathLike | dict | mi.Scene | None = None,
+def write_partial(path: Path, sums: PassSums, key: dict) -> None:
+    """Keep the passes of an unfinished reference, with a ``key`` (JSON) of all that the render depends on."""
+    about = np.frombuffer(json.dumps(key).encode(), np.uint8)
+    with replacing(path) as temporary, open(temporary, "wb") as stream:
+        np.savez(stream, image=sums.image, blocks=np.stack(sums.blocks), about=about)
+
+
+def read_partial(path: Path, key: dict) -> PassSums:
+    """Return the kept passes of the render with the same ``key``; none if missing or damaged."""
+    with contextlib.suppress(Exception), Archive(path) as archive:
+        image, blocks = archive.array("image").copy(), archive.array("blocks")
+        if archive.json("about") == key and np.isfinite(image).all() and np.isfinite(blocks).all():
+            return PassSums(image, list(blocks))
+    return PassSums()
+
+
+# -- checks and updates -----------------------------------------------------------------------------------------------
+
+
+def _update_reference(
+    scene, path, references, spp: int | None, seed: int | None, progress: bool, defines: dict
 ) -> dict:
-    """Render a reference of the scene file ``path`` in the current variant and store it (:func:`reference_path`).
+    """Render a reference of a scene in the current variant, store it (:func:`reference_path`), and return the figures.
 
-    Of a scene in memory, ``source``, the path is a name.
-
-    ``spp`` are the samples per pixel of a check, which has eight passes; the reference has 128 passes of the same
-    samples. Settings that are not given are those of the reference that is replaced: ``spp`` (else about two million
-    samples of the image, a power of two per pixel), ``seed`` (else 0) and each of ``defines``, which replace the
-    scene's ``<default>`` values. If the scene's filter is a box, and the samples are a power of two, the same arguments
-    give the same bytes on the same machine, interrupted or not.
-
-    The reference is checked against another render: one that fails twice although nothing has changed is not stored.
-    Rendered passes are kept in a file ``SCENE.VARIANT.partial.npz`` beside the reference after Ctrl-C: the same command
-    continues from there, unless the scene, its files, or this package have changed.
-
-    Returns ``scene``, ``reference`` (the file), ``variant``, ``width``, ``height``, ``budget`` (samples per pixel of a
-    check, which a sampler may have rounded up from ``spp``), ``asked_spp``, ``spp`` (of the reference), ``seed``,
-    ``defines``, ``seconds``, ``bytes``, ``visible_change`` (:meth:`.block_test.BlockReference.visible_change`, ``None``
-    for infinity) of a ``tile``, ``reused_passes`` (that had been kept), and ``interrupted``: after Ctrl-C no reference
-    has been written, and ``partial`` is the file of kept passes (else ``None``). Raises
-    :class:`.SceneError` and :class:`.OutputError`.
+    The reference has 128 passes of the samples of those of a check. It is checked against another render: one that
+    fails twice although nothing has changed is not stored. Passes that were rendered when Ctrl-C came are kept in
+    ``SCENE.VARIANT.partial.npz`` beside the reference: the same command continues from there, unless the scene, its
+    files, or this package have changed.
     """
     output, stem = reference_path(path, references), Path(path).stem
     before = read_settings(path, references)
-    parsed = _parsed(path if source is None else source, {**before.get("defines", {}), **(defines or {})})
+    parsed = _parsed(scene, {**before.get("defines", {}), **defines})
     scene = parsed.load()
     writable_folder(output.parent, create=True)
     writable_file(output)
     width, height = loading.film_size(scene)
-    asked = spp or before.get("budget") or _default_spp(width, height)
-    size = PassSize.of_check(scene, asked)
+    a_pass = max(1, BUDGET // (width * height * CHECK_PASSES))
+    asked = spp or before.get("budget") or CHECK_PASSES << (a_pass.bit_length() - 1)
+    size = PassSize.for_check(scene, asked)
     seed = before.get("seed", 0) if seed is None else seed
     partial = output.with_suffix(".partial.npz")
     about = {"scene": stem, "variant": mi.variant(), "defines": parsed.defines, "seed": seed, "budget": size.check_spp}
@@ -242,15 +409,21 @@ def regress(
     ``name`` for its reference, ``references/NAME.VARIANT.exr`` in the current folder, and has no ``defines``.
     ``defines`` are the reference's unless given, ``seed`` is 0; every seed is independent of the reference. ``spp`` are
     the reference's; others are refused, since the noise of both sides must be equal. If the check fails and ``out``
-    names a folder, the images are written there (:func:`.regression_report.write_failure`). With ``update``, the
-    reference is rendered again instead and stored (:func:`update_reference`).
+    names a folder, the images are written there (:func:`.regression_report.write_failure`).
 
-    The figures are ``scene``, ``reference`` (the file's name), ``variant``, ``width``, ``height``, ``spp``,
-    ``reference_spp``, ``seed``, ``defines``, ``seconds``, ``interrupted``, ``passed``, ``blocks`` (number of them that
-    were tested), ``failing_blocks``, ``worst`` (:class:`.block_test.Block`), ``stops``, ``stops_threshold``,
-    ``not_finite`` (pixels), ``visible_change`` of a ``tile``, and ``files`` (written paths). After Ctrl-C there is no
-    verdict, and ``passed`` is ``None``. Raises :class:`.SceneError`, among them
-    :class:`BadReference`, :class:`.UsageError` and :class:`.OutputError`.
+    With ``update``, the reference is rendered again instead and stored. Settings that are not given are then those of
+    the reference that is replaced: ``spp`` of a check (else about two million samples of the image, a power of two per
+    pixel), ``seed`` (else 0) and each of ``defines``. If the scene's filter is a box, and the samples are a power of
+    two, the same arguments give the same bytes on the same machine, interrupted or not.
+
+    Figures of both: ``scene``, ``reference`` (the file), ``variant``, ``width``, ``height``, ``seed``, ``defines``,
+    ``seconds``, ``interrupted`` (no verdict, ``passed`` is ``None``), ``spp``, and ``visible_change``
+    (:meth:`.block_test.BlockReference.visible_change`, ``None`` for infinity) of a ``tile``. Of a check:
+    ``reference_spp``, ``passed``, ``blocks`` (number of them that were tested), ``failing_blocks``, ``worst``
+    (:class:`.block_test.Block`), ``stops``, ``stops_threshold``, ``not_finite`` (pixels), and ``files`` (written
+    paths). Of an update: ``budget`` (samples per pixel of a check, which a sampler may have rounded up from
+    ``asked_spp``), ``bytes``, ``reused_passes``, and ``partial``, the file of kept passes after Ctrl-C. Raises
+    :class:`.SceneError`, among them :class:`BadReference`, :class:`.UsageError` and :class:`.OutputError`.
     """
     use_variant()
     seed_of_check, path = seed or 0, scene
@@ -259,14 +432,14 @@ def regress(
             raise UsageError("name: not given, a scene in memory needs one, after which its reference is called")
         path = f"{name}.xml"
     if update:
-        return Regression(update_reference(path, references, spp, seed, progress, dict(defines or {}), source=scene))
+        return Regression(_update_reference(scene, path, references, spp, seed, progress, dict(defines or {})))
     reference = read_reference(path, references)
     about = reference.about
     parsed = _parsed(scene, {**about["defines"], **(defines or {})})
     loaded = parsed.load()
     width, height = loading.film_size(loaded)
     _check_size(path, reference, height, width)
-    size, start = PassSize.of_check(loaded, spp or about["budget"]), time.perf_counter()
+    size, start = PassSize.for_check(loaded, spp or about["budget"]), time.perf_counter()
     if size.check_spp != about["budget"]:
         raise BadReference(
             f"{path}: a check would have {size.check_spp} samples a pixel, its reference is for {about['budget']}: "

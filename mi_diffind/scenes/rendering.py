@@ -1,12 +1,13 @@
-"""Rendering of a scene or of an orbit around it: ``mi_diffind.render``, with the path depth that the scene needs."""
+"""Rendering of a scene or of cameras that move through it: ``mi_diffind.render``, to the path depth that is needed."""
 
 from __future__ import annotations
 
 import contextlib
 import io
 import os
+import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,20 +16,27 @@ import numpy as np
 
 from .. import plugins
 from ..core.errors import UsageError
+from ..core.files import replacing
 from ..core.progress import interruptible, progress_bar
 from ..core.runtime import use_variant
 from ..core.units import check_memory
 from ..images import films, metrics
 from ..plugins.support import footprint
-from . import conversion, loading, scene_checks
+from . import conversion, loading
 from . import depth as depths
-from . import orbit as orbits
+from .poses import rotation
 
 #: Samples per pixel of a pass, after each of which Ctrl-C may end the rendering.
 PASS = 16
 
 #: Numbers of passes that are tried beside that of :data:`PASS`, for samplers that round up.
 TRIED = 8
+
+#: Axis of an orbit.
+UP = (0.0, 1.0, 0.0)
+
+#: Largest number of frames in a row of a film strip.
+COLUMNS = 6
 
 
 @dataclass
@@ -45,8 +53,8 @@ class Rendering:
 
     @property
     def image(self) -> np.ndarray:
-        """The image, or all frames side by side."""
-        return self.frames[0] if len(self.frames) == 1 else orbits.strip(self.frames)
+        """The image, or all frames side by side (:func:`strip`)."""
+        return self.frames[0] if len(self.frames) == 1 else strip(self.frames)
 
     def save(self, path: str | os.PathLike) -> Path:
         """Write the image (``.exr``, ``.png``) or a film (``.mp4``, ``.webp``, ``.gif``), and return the path.
@@ -55,10 +63,15 @@ class Rendering:
         """
         path = image_path(path, len(self.frames) > 1)
         _check_channels(path, self.image.shape[2])
-        if len(self.frames) > 1:
-            orbits.write(path, self.frames)
+        extension = path.suffix.lower()
+        if extension in films.FILMS and len(self.frames) > 1:
+            displayed = films.over_black if extension == ".mp4" else films.displayed
+            films.write(path, [displayed(frame) for frame in self.frames])
+        elif extension == ".png" and len(self.frames) > 1:
+            with replacing(path) as temporary:
+                temporary.write_bytes(self._repr_png_())
         else:
-            loading.write_image(path, self.frames[0])
+            loading.write_image(path, self.image)
         return path
 
     def _repr_png_(self) -> bytes:
@@ -75,7 +88,7 @@ def _check_channels(path: Path, channels: int) -> None:
         raise UsageError(f'output "{path}": the image has {channels} channels, {form} holds 4: use .exr')
 
 
-def channels_of(scene) -> int:
+def channel_count(scene) -> int:
     """Return the number of channels of the images of a scene: those of its film, and further ones of its integrator."""
     names = scene.integrator().aov_names() if scene.integrator() else []
     images = {name.removesuffix(".A") for name in names if name.endswith(".A")}  # nested in aov, in the film's format
@@ -144,21 +157,23 @@ def render(
         if not isinstance(loaded, mi.Scene):
             raise UsageError(f"scene: found a {type(loaded).__name__}, expected a scene, its file or its dictionary")
     name = str(parsed.path) if parsed else "scene"
-    scene_checks.check_renderable(loaded, name)
+    loading.check_renderable(loaded, name)
     if output is not None:
-        _check_channels(image_path(output, bool(orbit)), channels_of(loaded))
+        _check_channels(image_path(output, bool(orbit)), channel_count(loaded))
     ready = time.perf_counter()
     spp = spp or loaded.sensors()[0].sampler().sample_count()
     footprint.check_samples(footprint.textures(loaded), spp)
-    scene_checks.check_size(loaded, spp)
+    loading.check_size(loaded, spp)
     if orbit:
         width, height = loading.film_size(loaded)
         check_memory("orbit", orbit, 16 * orbit * width * height)
         with interruptible() as stop, progress_bar("orbit", orbit, "frame", progress) as bar:
-            frames = orbits.orbit(loaded, orbit, centre, spp=spp, seed=seed, on_frame=bar.update, stop=stop)
+            centre = middle(loaded) if centre is None else np.array(centre, np.float64)
+            turns = [rotation(UP, 360 * i / orbit, centre) for i in range(orbit)]
+            frames = along(loaded, turns, spp, seed, on_frame=bar.update, stop=stop)
         interrupted, done = len(frames) < orbit, sum(loading.samples_taken(loaded, spp))
     else:
-        passes = fewest_samples(loaded, spp)
+        passes = pass_count(loaded, spp)
         with interruptible() as stop, progress_bar("render", passes, "pass", progress) as bar:
             image, seconds = loading.render(loaded, spp, seed, passes, bar.update, stop)
         frames, done = [image], sum(loading.samples_taken(loaded, spp, passes)[: len(seconds)])
@@ -167,7 +182,7 @@ def render(
     if bad:
         total = len(frames) * frames[0].shape[0] * frames[0].shape[1]
         plugins.warn(f"{name}: {bad:,} of {total:,} rendered pixels are not finite (NaN or infinite)")
-    scene_checks.warn_of_black(loaded, name, frames)
+    loading.warn_of_black(loaded, name, frames)
     figures = {
         "interrupted": interrupted,
         "nonfinite_pixels": bad,
@@ -191,7 +206,7 @@ def render(
     return Rendering(frames, figures, loaded)
 
 
-def fewest_samples(scene, spp: int) -> int:
+def pass_count(scene, spp: int) -> int:
     """Return the number of passes, of about :data:`PASS` samples, of which the sampler rounds up least."""
     about = max(1, spp // PASS)
     counts = range(about, min(2 * about, about + TRIED, spp) + 1)
@@ -208,3 +223,70 @@ def _chosen_depth(parsed: loading.ParsedScene, requested, tolerance: float | Non
     chosen = scene_depth if requested == "scene" else requested
     unknown = ("tolerance", "shares", "left_out", "left_out_in_a_tile", "probe_seconds")
     return {"requested": requested, "chosen": chosen, "scene": scene_depth, **dict.fromkeys(unknown)}
+
+
+# -- cameras that move ------------------------------------------------------------------------------------------------
+
+
+def along(
+    scene,
+    motions: Sequence[np.ndarray],
+    spp: int | None = None,
+    seed: int = 0,
+    new_seeds: bool = False,
+    on_frame: Callable[[], object] | None = None,
+    stop: threading.Event | None = None,
+) -> list[np.ndarray]:
+    """Render a loaded scene once for each of ``motions`` of its first camera, which then returns to its place.
+
+    A motion is a matrix ``(4, 4)`` in world space that moves the camera from its place in the scene. All frames have
+    the random numbers of ``seed``; with ``new_seeds``, frame ``i`` has those of ``seed + i``.
+
+    Returns the linear images; once ``stop`` is set, the frames that are done. Raises :class:`.SceneError` if there is
+    no camera that can be moved.
+    """
+    if not scene.sensors():
+        raise loading.SceneError("orbit: the scene has no sensor")
+    sensor = scene.sensors()[0]
+    parameters = mi.traverse(sensor)
+    if "to_world" not in parameters:
+        raise loading.SceneError(f"orbit: the sensor {sensor.class_name()} cannot be moved")
+    transform, before = type(parameters["to_world"]), np.array(parameters["to_world"].matrix, np.float64).reshape(4, 4)
+
+    def move(matrix: np.ndarray) -> None:
+        parameters["to_world"] = transform(mi.ScalarTransform4f(matrix))
+        parameters.update()
+        footprint.attach(scene, 0, spp)
+
+    images = []
+    try:
+        for i, motion in enumerate(motions):
+            move(motion @ before)
+            images.append(loading.render(scene, spp, seed + i * new_seeds)[0])
+            if on_frame is not None:
+                on_frame()
+            if stop is not None and stop.is_set():
+                break
+    finally:
+        move(before)
+    return images
+
+
+def middle(scene) -> np.ndarray:
+    """Return the middle of the box of all shapes that are no lights, ``(3,)``; the origin without such shapes."""
+    boxes = [s.bbox() for s in scene.shapes() if not s.is_emitter()]
+    corners = np.array([[b.min, b.max] for b in boxes], np.float64).reshape(-1, 2, 3)
+    if not len(corners) or not np.isfinite(corners).all():
+        return np.zeros(3)
+    return (corners[:, 0].min(axis=0) + corners[:, 1].max(axis=0)) / 2
+
+
+def strip(frames: Sequence[np.ndarray], columns: int = COLUMNS) -> np.ndarray:
+    """Return one image of all frames, at most ``columns`` in a row; missing cells are 0."""
+    columns = min(columns, len(frames))
+    rows = -(-len(frames) // columns)
+    height, width, channels = frames[0].shape
+    grid = np.zeros((rows, height, columns, width, channels), np.float32)
+    for i, frame in enumerate(frames):
+        grid[i // columns, :, i % columns] = frame
+    return grid.reshape(rows * height, columns * width, channels)

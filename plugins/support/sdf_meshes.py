@@ -18,8 +18,8 @@ from mi_diffind.arrays.tables import TableError
 from mi_diffind.core import compat
 from mi_diffind.core.errors import DiffindError
 from mi_diffind.core.files import is_within, stamp
-from mi_diffind.tasks.sdf import TASK, serialized
-from mi_diffind.tasks.sdf.mesh import directed_edges, load_mesh, split_part
+from mi_diffind.tasks.sdf import TASK
+from mi_diffind.tasks.sdf.mesh import directed_edges, load_mesh, read_serialized, split_part
 
 from . import properties
 from .properties import Kept
@@ -61,7 +61,7 @@ def closed_mesh_of(path: Path, folder: Path, index: int = 0) -> Path:
     """
     try:
         if path.suffix.lower() == ".serialized":
-            vertices, faces = serialized.read(path)[index]
+            vertices, faces = read_serialized(path)[index]
             path = folder / f"{path.stem}_{index}_{hashlib.sha256(vertices.tobytes()).hexdigest()[:12]}.ply"
             trimesh.Trimesh(vertices, faces, process=False).export(path)
         faces = load_mesh(path).faces

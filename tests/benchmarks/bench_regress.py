@@ -108,7 +108,7 @@ class Passes:
         self.file = arguments.passes and Path(arguments.passes) / f"{'_'.join(map(str, settings))}.npy"
         self.kept = list(np.load(self.file)) if self.file and self.file.exists() else []
         self.scene, self.taken = mi.load_dict(SCENES[name](change, arguments.sampler)), 0
-        self.size = regression.PassSize.of_check(self.scene, arguments.spp)
+        self.size = regression.PassSize.for_check(self.scene, arguments.spp)
         self.first_seed = (CHANGES.index(change) + 1 if change else 0) << 24
 
     def take(self, count: int) -> np.ndarray:

@@ -32,12 +32,10 @@ from mi_diffind.fitting.task import FitRequest
 from mi_diffind.maps.source import load_source
 from mi_diffind.scenes.loading import ParsedScene
 from mi_diffind.scenes.training.fit import fit_scene
+from mi_diffind.scenes.training.options import SceneRecipe, View, ViewDistribution
 from mi_diffind.scenes.training.problem import SceneProblem
-from mi_diffind.scenes.training.recipe import SceneRecipe
-from mi_diffind.scenes.training.reference_renders import ReferenceRenders
-from mi_diffind.scenes.training.stored_texture import texture_problem
-from mi_diffind.scenes.training.trained_scene import TrainedScene
-from mi_diffind.scenes.training.views import View, ViewDistribution
+from mi_diffind.scenes.training.references import ReferenceRenders
+from mi_diffind.scenes.training.trained_scene import TrainedScene, texture_problem
 from mi_diffind.tasks.texture.compressed import load
 from mi_diffind.tasks.texture.training import rounded
 

@@ -14,7 +14,6 @@ import json
 import os
 import statistics
 import time
-from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 
@@ -28,18 +27,14 @@ from mi_diffind.core.runtime import use_variant
 from mi_diffind.scenes import loading
 from mi_diffind.scenes.poses import rotation
 from mi_diffind.scenes.viewer import session as viewer
-from mi_diffind.scenes.viewer.page import QUALITY
+from mi_diffind.scenes.viewer.page import MOVING_QUALITY
 
 ROOT = Path(__file__).resolve().parents[2]
 SCENES = ("materials", "solids", "field")
 
 
 def turned(pose, centre, up, degrees):
-    matrix = rotation(up, degrees, centre)
-    turn = matrix[:3, :3]
-    position = (matrix @ np.append(pose.position, 1))[:3]
-    axes = {name: turn @ getattr(pose, name) for name in ("right", "up", "forward")}
-    return replace(pose, position=position, **axes)
+    return rotation(up, degrees, centre) @ pose
 
 
 def shown(session, pose) -> tuple[float, tuple[int, int]]:
@@ -47,7 +42,7 @@ def shown(session, pose) -> tuple[float, tuple[int, int]]:
     start = time.perf_counter()
     session.move_camera(pose)
     picture = session.moving_picture()
-    Image.fromarray(picture).save(BytesIO(), "JPEG", quality=QUALITY[0])
+    Image.fromarray(picture).save(BytesIO(), "JPEG", quality=MOVING_QUALITY)
     return time.perf_counter() - start, picture.shape[1::-1]
 
 

@@ -16,9 +16,8 @@ from mi_diffind.fitting import loop
 from mi_diffind.images import metrics
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.studies.baselines import codecs
-from mi_diffind.tasks.image import training
-from mi_diffind.tasks.image.compressed import CompressedImage
-from mi_diffind.tasks.image.presets import IMPROVEMENTS, replaced
+from mi_diffind.tasks.image import IMPROVEMENTS, replaced, training
+from mi_diffind.tasks.image.arrays import CompressedImage
 
 #: Steps of a training.
 STEPS = 8

@@ -4,10 +4,10 @@ References are renders of the same scene with exact plugins and many samples. Th
 ``texture``. This package stands above plugins and scenes, which it renders; :mod:`mi_diffind.tasks.shading` trains for
 shaded values without a scene.
 
-- :mod:`.recipe`, :mod:`.views`: settings, views and the arguments of ``fit scene``; :mod:`.fit`: the training;
-- :mod:`.stored_texture`: a texture that is trained; :mod:`.trained_scene`: its arrays as parameters of the scene;
-- :mod:`.rig`: camera and lights of a view; :mod:`.reference_renders`: renders with exact plugins;
-- :mod:`.problem`: the loss; :mod:`.joint_problem`, :mod:`.fitted_files`: several textures at once, and their result.
+- :mod:`.options`: recipe, views and the arguments of ``fit scene``; :mod:`.fit`: the training and its result;
+- :mod:`.trained_scene`: textures that are trained, and their arrays as parameters of the scene;
+- :mod:`.rig`: camera and lights of a view; :mod:`.references`: renders with exact plugins;
+- :mod:`.problem`: the loss.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 from ...core.arguments import WORKER_ARGUMENTS, Argument, fraction
 from ...core.errors import UsageError
 from ...fitting.task import FitRequest, Fitted, Task, table_path
-from .recipe import SCENE_ARGUMENTS, SceneRecipe
+from .options import SCENE_ARGUMENTS, SceneRecipe
 
 
 class SceneTraining(Task):

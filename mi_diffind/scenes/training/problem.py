@@ -24,13 +24,11 @@ from ...arrays.indirection import unfolded
 from ...core.files import replacing
 from ...fitting.loop import Problem
 from ...images import srgb
-from ...tasks.shading.preview import titled
+from ...tasks.shading.evaluation import titled
 from ...tasks.texture.training import TextureProblem, rounded
-from .joint_problem import JointProblem
-from .recipe import SceneRecipe
-from .reference_renders import SEEDS
-from .trained_scene import TrainedScene
-from .views import View
+from .options import SceneRecipe, View
+from .references import SEEDS
+from .trained_scene import JointProblem, TrainedScene
 
 #: Share of the references' pixels that may be brighter than white.
 BRIGHTER = 0.05

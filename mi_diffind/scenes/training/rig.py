@@ -8,7 +8,7 @@ import numpy as np
 
 from ..loading import SceneError
 from ..poses import rotation
-from .views import View, ViewDistribution
+from .options import View, ViewDistribution
 
 #: Sine of the angle between two directions below which they count as parallel.
 PARALLEL = 1e-4
@@ -28,10 +28,12 @@ class Rig:
         if not scene.sensors():
             raise SceneError("the scene has no sensor, views need one")
         self.up = np.array(views.up, np.float64) / np.linalg.norm(views.up)
-        self.sensor = _Movable(scene.sensors()[0])
-        if views.moves_camera and not self.sensor.matrix:
+        self.sensor = _Movable(scene.sensors()[0], scene)
+        if views.moves_camera and self.sensor.parameter != "to_world":
             raise SceneError(f"the sensor {scene.sensors()[0].class_name()} cannot be moved")
-        self.lights = _lights(scene) if views.moves_light else []
+        nodes = [*scene.emitters(), *(shape for shape in scene.shapes() if shape.is_emitter())]
+        lights = [_Movable(node, scene) for node in nodes] if views.moves_light else []
+        self.lights = [light for light in lights if light.parameter]
         raised = [light for light in self.lights if not light.environment or light.sun is not None]
         if views.moves_light and not (self.lights if views.light_elevation is None else raised):
             names = ", ".join(sorted({e.class_name() for e in scene.emitters()})) or "none"
@@ -61,8 +63,7 @@ class Rig:
             self.sensor.move(self._camera(view))
         for light in self.lights:
             turn = self._turn(light, view)
-            sun = {} if light.sun is None else {"sun": self._sun(light, turn, view)}
-            light.move(turn @ light.before, **sun)
+            light.move(turn @ light.before, None if light.sun is None else self._sun(light, turn, view))
 
     def _camera(self, view: View) -> np.ndarray:
         before = self.sensor.before
@@ -74,7 +75,7 @@ class Rig:
         # Roll, scale and the angle to the target of the scene's own camera are preserved
         return self._looking(to) @ np.linalg.inv(self._looking(origin)) @ before
 
-    def _turn(self, light: _Movable | _AreaLight, view: View) -> np.ndarray:
+    def _turn(self, light: _Movable, view: View) -> np.ndarray:
         """Return the 4×4 matrix that moves a light from its place in the scene to that of a view."""
         centre = self.target
         if light.environment:
@@ -122,79 +123,50 @@ class Rig:
         return matrix
 
 
-def _lights(scene: mi.Scene) -> list[_Movable | _AreaLight]:
-    """Return the lights that can be moved: emitters with a place or a direction, and shapes that emit."""
-    emitting = [_AreaLight(scene, shape) for shape in scene.shapes() if shape.is_emitter()]
-    lights = [_Movable(emitter) for emitter in scene.emitters()]
-    return [light for light in (*lights, *emitting) if light.parameter]
-
-
 class _Movable:
-    """A sensor or light; ``before``: its 4×4 matrix in the scene; ``parameter``: key of its place ("": fixed).
+    """Sensor, light or shape that emits, moved by its ``to_world``, its ``position`` or the vertices of a mesh.
 
-    ``sun``: direction of the sun in the coordinates of a sky, ``None`` if there is none or its date gives it.
+    ``parameter``: the key of that ("": fixed); ``before``: the 4×4 matrix in the scene, the identity for a mesh;
+    ``centre``: its place, of a shape the centre of its bounds; ``sun``: direction of the sun in the coordinates of a
+    sky, ``None`` if there is none or its date gives it.
     """
 
-    def __init__(self, node):
+    def __init__(self, node, scene: mi.Scene):
         self.parameters = mi.traverse(node)
-        self.parameter = next((k for k in ("to_world", "position") if k in self.parameters), "")
-        self.matrix = self.parameter == "to_world"
+        keys = ("to_world", "position", "vertex_positions")
+        self.parameter = next((key for key in keys if key in self.parameters), "")
         emitter = isinstance(node, mi.Emitter)
         self.environment = emitter and bool(node.is_environment())
         self.at_infinity = self.environment or (emitter and mi.has_flag(node.flags(), mi.EmitterFlags.Infinite))
-        self.before = np.eye(4)
-        if self.matrix:
-            self.before = np.array(self.parameters[self.parameter].matrix, np.float64).reshape(4, 4)
+        self.before, self.vertices, self.sun = np.eye(4), {}, None
+        if self.parameter == "to_world":
+            self.before = np.array(self.parameters["to_world"].matrix, np.float64).reshape(4, 4)
+        elif self.parameter == "position":
+            self.before[:3, 3] = np.array(self.parameters["position"], np.float64).ravel()
         elif self.parameter:
-            self.before[:3, 3] = np.array(self.parameters[self.parameter], np.float64).ravel()
-        self.centre, self.sun = self.before[:3, 3], None
+            keys = [key for key in ("vertex_positions", "vertex_normals") if key in self.parameters]
+            self.vertices = {key: np.array(self.parameters[key]).reshape(-1, 3) for key in keys}
+        self.scene = scene if isinstance(node, mi.Shape) else None
+        self.centre = np.array(node.bbox().center(), np.float64).ravel() if self.scene else self.before[:3, 3]
         if "sun_direction" in self.parameters and not self.parameters.flags("sun_direction") & READ_ONLY:
             self.sun = np.array(self.parameters["sun_direction"], np.float64).ravel()
 
     def move(self, matrix: np.ndarray, sun: np.ndarray | None = None) -> None:
         """Move to a 4×4 matrix; ``sun``: the new direction of the sun, in the coordinates of the sky."""
-        value = _transform(self.parameters[self.parameter], matrix) if self.matrix else matrix[:3, 3].tolist()
-        self.parameters[self.parameter] = type(self.parameters[self.parameter])(value)
+        if self.parameter == "to_world":
+            transform = type(self.parameters["to_world"])(mi.ScalarTransform4f(matrix))
+            dr.make_opaque(transform)  # no part of a kernel depends on it
+            self.parameters["to_world"] = transform
+        elif self.parameter == "position":
+            self.parameters["position"] = type(self.parameters["position"])(matrix[:3, 3].tolist())
+        for key, values in self.vertices.items():
+            shift = matrix[:3, 3] if key == "vertex_positions" else 0
+            self.parameters[key] = (values @ matrix[:3, :3].T + shift).ravel().astype(np.float32)
         if sun is not None:
             self.parameters["sun_direction"] = dr.opaque(mi.Vector3f, sun.tolist())
         self.parameters.update()
-
-
-class _AreaLight:
-    """An area light, moved with its shape: by the shape's ``to_world``, or of a mesh by its vertices.
-
-    ``before`` is the matrix of a ``to_world``, the identity for a mesh; ``centre`` is that of the shape's bounds.
-    """
-
-    environment = at_infinity = False
-    sun = None
-
-    def __init__(self, scene: mi.Scene, shape: mi.Shape):
-        self.scene, self.parameters = scene, mi.traverse(shape)
-        self.centre, self.before = np.array(shape.bbox().center(), np.float64).ravel(), np.eye(4)
-        self.parameter = next((k for k in ("to_world", "vertex_positions") if k in self.parameters), "")
-        if self.parameter == "to_world":
-            self.before = np.array(self.parameters["to_world"].matrix, np.float64).reshape(4, 4)
-        elif self.parameter:
-            keys = [k for k in ("vertex_positions", "vertex_normals") if k in self.parameters]
-            self.vertices = {k: np.array(self.parameters[k]).reshape(-1, 3) for k in keys}
-
-    def move(self, matrix: np.ndarray) -> None:
-        if self.parameter == "to_world":
-            self.parameters["to_world"] = _transform(self.parameters["to_world"], matrix)
-        else:
-            for key, values in self.vertices.items():
-                shift = matrix[:3, 3] if key == "vertex_positions" else 0
-                self.parameters[key] = (values @ matrix[:3, :3].T + shift).ravel().astype(np.float32)
-        self.parameters.update()
-        self.scene.parameters_changed()  # rays are to find the shape at its place
-
-
-def _transform(before, matrix: np.ndarray):
-    """Return a 4×4 matrix as a transformation of the type of ``before``, opaque: no part of a kernel depends on it."""
-    value = type(before)(mi.ScalarTransform4f(matrix))
-    dr.make_opaque(value)
-    return value
+        if self.scene:
+            self.scene.parameters_changed()  # rays are to find the shape at its place
 
 
 def _between(before: np.ndarray, after: np.ndarray, up: np.ndarray, degrees: float) -> np.ndarray:

@@ -1,31 +1,257 @@
-"""Scene whose textures are trained: arrays as parameters of the scene, and renders that are differentiable by them."""
+"""Scene whose textures are trained: their files and problems, and their arrays as parameters of its renders."""
 
 from __future__ import annotations
 
+import dataclasses
+import os
 import re
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import mitsuba as mi
+from drjit import nn
 
 from ... import plugins
-from ...arrays.tables import Table, save_table
+from ...arrays.indirection import DifferentiableArray
+from ...arrays.tables import PAGES, Table, TableError, save_table
 from ...core import compat
 from ...core.errors import UsageError
+from ...fitting.loop import Problem
+from ...maps.layout import Layout
+from ...maps.pyramid import Pyramid
+from ...maps.source import Source, load_source
 from ...plugins.support import footprint
+from ...tasks.texture import PRESETS, TextureRecipe
+from ...tasks.texture.arrays import FineArray, PaperBudget, TextureBudget
+from ...tasks.texture.compressed import CompressedTexture, bias_of, load, structure_of, to_table
+from ...tasks.texture.nets import PaperStructure
+from ...tasks.texture.training import TextureProblem, problem_of, stored_form
 from .. import loading
-from .joint_problem import array_name
+from .options import View, ViewDistribution
 from .rig import Rig
-from .stored_texture import PLUGINS
-from .views import View, ViewDistribution
+
+
+def array_name(texture: str, array: str) -> str:
+    """Return the name of an array of one of several textures."""
+    return f"{texture}/{array}"
+
+
+class JointNet(nn.Module):
+    """Arrays of several textures; ``names`` are those of the textures, ``nets`` read their arrays."""
+
+    DRJIT_STRUCT = {"nets": tuple, "names": object}  # noqa: RUF012
+
+    def __init__(self, nets=(), names: tuple[str, ...] = ()):
+        self.nets, self.names = tuple(nets), names
+
+    @property
+    def arrays(self) -> dict[str, DifferentiableArray]:
+        """The arrays by name (:func:`array_name`)."""
+        pairs = zip(self.names, self.nets, strict=True)
+        return {array_name(name, key): array for name, net in pairs for key, array in net.arrays.items()}
+
+    def changed(self, change) -> JointNet:
+        """Return a copy with ``change(array, bits)`` in place of each array."""
+        return JointNet([net.changed(change) for net in self.nets], self.names)
+
+
+class JointProblem(Problem):
+    """Training problem of several textures, by name: the sum of their losses.
+
+    As the maps of one file, each texture has a share of the loss and of the samples: that of its stored channels.
+    """
+
+    def __init__(self, problems: Mapping[str, TextureProblem]):
+        self.problems = list(problems.values())
+        self.net = JointNet([problem.net for problem in self.problems], tuple(problems))
+        channels = [problem.pyramid.layout.stored for problem in self.problems]
+        self.shares = [count / sum(channels) for count in channels]
+        identities = {name: problem.identity for name, problem in problems.items()}
+        self.identity = {"source": [i["source"] for i in identities.values()], "textures": identities}
+
+    def begin(self, step: int, share: float) -> str:
+        """Start a step of each texture."""
+        return ", ".join(problem.begin(step, share) for problem in self.problems)
+
+    def loss(self, net: JointNet, rng, size: int) -> list:
+        """Return the losses of all textures, each with its share of ``size`` samples."""
+        parts = zip(self.problems, self.shares, net.nets, strict=True)
+        return [
+            share * values
+            for problem, share, part in parts
+            for values in problem.loss(part, rng, max(1, round(share * size)))
+        ]
+
+    def seen(self, net: JointNet) -> JointNet:
+        """Return the folded arrays as training reads them (:meth:`.TextureProblem.seen`)."""
+        pairs = zip(self.problems, net.nets, strict=True)
+        return JointNet([problem.seen(part) for problem, part in pairs], net.names)
+
+    def measure(self, net: JointNet) -> dict[str, float]:
+        """Return the figures of each texture (:meth:`.TextureProblem.measure`), their names behind its own."""
+        parts = zip(net.names, self.problems, net.nets, strict=True)
+        return {f"{name}_{key}": v for name, problem, part in parts for key, v in problem.measure(part).items()}
+
+
+#: Plugins whose arrays are trained.
+PLUGINS = ("neural_texture", "neural_material")
+
+
+def texture_files(parsed: loading.ParsedScene, files: Sequence[str | os.PathLike] = ()) -> dict[Path, str]:
+    """Return the files of trained textures, each with the ``source`` that the scene gives for it ("": none).
+
+    They are the ``files``, by default all that textures of the scene read. Raises
+    :class:`.UsageError` and :class:`.SceneError`.
+    """
+    folder, sources = parsed.path.resolve().parent, {}
+    for entry in parsed.learned_plugins():
+        if entry["plugin"] in PLUGINS and entry.get("filename"):
+            source = entry.get("source", "")
+            sources.setdefault((folder / entry["filename"]).resolve(), str(folder / source) if source else "")
+    names, readers = ", ".join(f.name for f in sources) or "none", " or ".join(PLUGINS)
+    if not sources:
+        raise UsageError(f"{parsed.path}: names no file of {readers}, whose arrays could be trained")
+    for file in files:
+        if Path(file).resolve() not in sources:
+            raise UsageError(f"{parsed.path}: no {readers} reads {file}, the files are {names}")
+    wanted = {Path(file).resolve(): sources[Path(file).resolve()] for file in files} or sources
+    if len({file.name for file in wanted}) < len(wanted):
+        raise UsageError(f"{parsed.path}: two of its textures have the same name ({names}): train one by --texture")
+    return wanted
+
+
+def texture_file(parsed: loading.ParsedScene) -> tuple[Path, str]:
+    """Return the only file of :func:`texture_files`, and its source. Raises as it does, also if there are several."""
+    files = texture_files(parsed)
+    if len(files) > 1:
+        raise UsageError(
+            f"{parsed.path}: names {len(files)} textures ({', '.join(f.name for f in files)}), one is needed"
+        )
+    return next(iter(files.items()))
+
+
+def original_of(table: Table, file: Path, given: str = "") -> Path:
+    """Return the image or manifest of a texture, recorded or ``given``. Raises :class:`TableError`."""
+    recorded = str(table.settings.get("source_path", ""))
+    if not given and not recorded:
+        raise TableError(f'{file}: does not record its source; the parameter "source" of the texture may name it')
+    original = Path(given) if given else file.parent / recorded
+    if not original.is_file():
+        raise TableError(f"{original}: no such file, {file.name} was made from it")
+    return original.resolve()
+
+
+def texture_problem(table: Table, source: Source) -> TextureProblem:
+    """Return the training problem of a texture alone, by the recipe and from the arrays of its file."""
+    layout = Layout.from_json(table.settings["layout"])
+    if not layout.stored:
+        raise UsageError(f"{table.path}: holds a texture of one colour, without arrays to train")
+    texture = CompressedTexture.of(table, mi.TensorXf, "float32")
+    pyramid = Pyramid.of(source, layout, compat.module_of(mi.TensorXf), texture.border)
+    problem = TextureProblem(texture.net, pyramid, recipe_of(table), source.digest)
+    problem.settings = problem.recipe.settings
+    return problem
+
+
+class SceneTexture:
+    """Texture of a scene: its ``file``, the ``table`` that the training starts from, its source, and its ``problem``.
+
+    ``given``: source that the scene gives for it, if any. ``start``: another table of the same maps to start from.
+    Without a ``trained`` start, the arrays are those of an untrained texture.
+    """
+
+    def __init__(self, file: Path, table: Table, given: str = "", start: Table | None = None, trained: bool = True):
+        self.file, self.table = file, start or table
+        self.source_path = original_of(table, file, given)
+        self.source = load_source(self.source_path, nonfinite="clean")
+        self.problem = texture_problem(self.table, self.source)
+        self.level_bias = bias_of(self.table.settings)
+        if not trained:
+            recipe, pyramid = self.problem.recipe, self.problem.pyramid
+            self.problem = problem_of(self.source, budget_of(self.table), recipe, pyramid)
+            self.problem.settings = recipe.settings
+            self.table = self.stored({})
+
+    def stored(self, settings: Mapping) -> Table:
+        """Return the table of the arrays in their state, with ``settings``."""
+        texture = CompressedTexture(self.problem.pyramid.layout, stored_form(self.problem.net), self.level_bias)
+        return to_table(texture, dict(settings))
+
+    def measure(self, table: Table) -> dict[str, float]:
+        """Return the errors of a table against the source (:meth:`.CompressedTexture.measure`)."""
+        return CompressedTexture.of(table, mi.TensorXf).measure(self.source)
+
+    @property
+    def identity(self) -> dict:
+        """Settings of the texture's own training, as a table file keeps them."""
+        return {k: v for k, v in self.problem.identity.items() if k not in ("structure", "border")}
+
+
+def stored_textures(
+    parsed: loading.ParsedScene,
+    files: Sequence[str | os.PathLike] = (),
+    starts: Sequence[str | os.PathLike] = (),
+    trained: bool = True,
+) -> list[SceneTexture]:
+    """Return the textures of a scene that are trained: of the ``files``, by default of all that hold arrays.
+
+    ``starts`` are files to start from; each belongs to the texture that has its maps and its source. Raises
+    :class:`.UsageError`, :class:`.TableError` and
+    :class:`~mi_diffind.maps.source.SourceError`.
+    """
+    given = texture_files(parsed, files)
+    tables = {file: load(file) for file in given}
+    if not files:
+        tables = {file: table for file, table in tables.items() if table.arrays} or tables
+    begin = {}
+    for start in starts:
+        other = load(start)
+        same = [
+            file for file, table in tables.items()
+            if all(other.settings.get(key) == table.settings.get(key) for key in ("layout", "source"))
+        ]  # fmt: skip
+        if not same:
+            names = " or ".join(file.name for file in tables)
+            raise UsageError(f"--start: {start} holds other maps, or is of another source, than {names}")
+        if len(same) > 1 or same[0] in begin:
+            raise UsageError(f"--start: {start} is not the only one for {same[0].name}, or belongs to several textures")
+        begin[same[0]] = other
+    return [SceneTexture(file, table, given[file], begin.get(file), trained) for file, table in tables.items()]
+
+
+def recipe_of(table: Table) -> TextureRecipe:
+    """Return the recipe by which the arrays of a file were trained as a texture."""
+    preset = PRESETS["ours" if table.settings.get("layered", True) else "paper"]
+    names = [f.name for f in dataclasses.fields(TextureRecipe) if f.name != "settings"]
+    return dataclasses.replace(preset, **{n: table.settings[n] for n in names if n in table.settings})
+
+
+def budget_of(table: Table) -> TextureBudget | PaperBudget:
+    """Return the memory budget that the arrays of a texture were made for."""
+    layout = Layout.from_json(table.settings["layout"])
+    structure, _ = structure_of(table.settings, layout)
+    shapes = {name: array.shape for name, array in table.arrays.items()}
+    if isinstance(structure, PaperStructure):
+        rows, columns, _ = shapes["primary0"]
+        return PaperBudget(rows, columns, shapes["cascaded"][0], shapes["cascaded"][1], layout.stored)
+    paged = [layer for layer in structure.layers if layer.paged]
+    fine = tuple(FineArray(x.level, x.channels, x.bits) for x in structure.layers if not x.paged)
+    dims, axes = shapes["coarse"][-1], len(shapes["cascaded"]) - 1
+    names = [f"level{x.level}" for x in paged]
+    nbytes = sum(table.arrays[name].nbytes + table.arrays[name + PAGES].nbytes for name in names)
+    return TextureBudget(
+        layout.height, layout.width, layout.stored, fine, structure.skip, dims, shapes["cascaded"][-2],
+        structure.skip + 1 if axes > dims else 1, structure.bits, tuple(x.level for x in paged), nbytes,
+        paged[0].bits if paged else 5,
+    )  # fmt: skip
 
 
 class TrainedScene:
     """Loaded scene in which textures of the files in ``tables`` read the arrays of these, which can be replaced.
 
     All maps of a file read the same arrays. Each array has one parameter for each map; setting one of them sets the
-    array for all maps. Arrays of several files are called by :func:`.joint_problem.array_name`. Renders use the
+    array for all maps. Arrays of several files are called by :func:`array_name`. Renders use the
     integrator ``prb`` in place of ``path``, the same estimator: paths are sampled *detached*, without derivatives of
     the sampling decisions, and the values along them are differentiated. The gradient is right on average, since
     neither visible surfaces nor the places of samples depend on a texture's values; the choice of a lobe does, but the

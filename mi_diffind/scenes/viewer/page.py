@@ -13,11 +13,12 @@ import time
 from collections.abc import Callable
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ...core.errors import DiffindError, UsageError, missing_package
 from ...images import srgb
 from .passes import no_collection
-from .session import Pose, Session
+from .session import Session
 
 #: Seconds without a movement after which the picture is refined.
 QUIET = 0.3
@@ -28,8 +29,11 @@ MOST_SLIDERS = 60
 #: Steps of a slider.
 STEPS = 200
 
-#: Quality of pictures as JPEG, while the camera moves and else.
-QUALITY = (75, 92)
+#: Quality of pictures as JPEG while the camera moves.
+MOVING_QUALITY = 75
+
+#: Quality of pictures as JPEG at rest.
+QUALITY = 92
 
 #: Seconds between two collections of garbage.
 COLLECTED = 20.0
@@ -87,35 +91,39 @@ class Page:
         gui.main_panel.dock_right()
         gui.set_panel_label(f"mi-diffind view: {session.name}")
         self.server.scene.set_up_direction(tuple(session.up()))
-        camera = self.server.initial_camera
-        camera.position, camera.look_at = tuple(session.start.position), tuple(session.target())
-        camera.up = tuple(session.up())
+        self._begin_at(self.server.initial_camera)
+        self.server.initial_camera.up = tuple(session.up())
         self._status = gui.add_markdown("Compiling the scene …")
         self._view = gui.add_dropdown("view", session.views, initial_value=session.view)
-        self._divider = gui.add_slider("divider", 0.0, 1.0, 0.01, session.divider)
-        self._gain = gui.add_slider("gain", 1.0, 100.0, 1.0, session.gain, hint="factor of the difference")
-        self._spp = gui.add_number("samples", session.spp, min=1, max=2**16, step=1, hint="samples per pixel")
-        self._view.on_update(lambda event: self._ask(lambda: session.show(view=self._view.value)))
-        self._divider.on_update(lambda event: self._ask(lambda: session.show(divider=self._divider.value)))
-        self._gain.on_update(lambda event: self._ask(lambda: session.show(gain=self._gain.value)))
-        self._spp.on_update(lambda event: self._ask(lambda: session.samples(int(self._spp.value))))
-        for name, options in session.choices.items():
-            self._choice(name, options)
+        divider = gui.add_slider("divider", 0.0, 1.0, 0.01, session.divider)
+        gain = gui.add_slider("gain", 1.0, 100.0, 1.0, session.gain, hint="factor of the difference")
+        spp = gui.add_number("samples", session.spp, min=1, max=2**16, step=1, hint="samples per pixel")
+        self._on_update(self._view, lambda view: session.show(view=view))
+        self._on_update(divider, lambda divider: session.show(divider=divider))
+        self._on_update(gain, lambda gain: session.show(gain=gain))
+        self._on_update(spp, lambda spp: session.samples(int(spp)))
+        for name, words in session.choices.items():
+            menu = gui.add_dropdown(name, words, initial_value=words[0], hint="loads the scene again")
+            self._on_update(menu, lambda word, name=name: self._choose(name, word))
         gui.add_button("first view").on_click(lambda event: self._ask(self._first_view))
         self._search = gui.add_text("find", "", hint="part of the names of the parameters to show")
-        self._search.on_update(lambda event: self._ask(self._list_parameters))
+        self._on_update(self._search, lambda text: self._list_parameters())
         self._folders: list = []
         self._list_parameters()
 
-    def _choice(self, name: str, options: tuple[str, ...]) -> None:
-        chosen = self.server.gui.add_dropdown(name, options, initial_value=options[0], hint="loads the scene again")
-        chosen.on_update(lambda event: self._ask(lambda: self._choose(name, chosen.value)))
+    def _on_update(self, control, change: Callable[[object], object]) -> None:
+        """Call ``change`` with the value of a control whenever that changes, in the loop."""
+        control.on_update(lambda event: self._ask(lambda: change(control.value)))
 
     def _choose(self, name: str, word: str) -> None:
         self._status.content = "Loading the scene …"
         self.session.choose(name, word)
         self._view.options = self.session.views
         self._view.value = self.session.view
+
+    def _begin_at(self, camera) -> None:
+        """Give a camera of viser the place and the target of the first view."""
+        camera.position, camera.look_at = tuple(self.session.start[:3, 3]), tuple(self.session.target())
 
     def _list_parameters(self) -> None:
         """Show the sliders of the parameters whose names contain the text of the search, a folder for each object."""
@@ -138,27 +146,22 @@ class Page:
             self._folders.append(self.server.gui.add_markdown(f"{hidden} more parameters: find them by their names"))
 
     def _slider(self, parameter) -> None:
-        gui, path = self.server.gui, parameter.path
+        """Show the control of a parameter: a slider, a colour picker, or numbers for a colour beyond [0, 1]."""
+        gui, path, decoded = self.server.gui, parameter.path, lambda value: value
         value = self.session.learned.parameters.value(path)
         hint = path if self.session.on_both(path) else f"{path}: of the learned side only"
         if not parameter.is_colour:
             low, high = min(parameter.low, value), max(parameter.high, value)
-            step = (high - low) / STEPS
-            control = gui.add_slider(parameter.name, low, high, step, value, hint=hint)
+            control = gui.add_slider(parameter.name, low, high, (high - low) / STEPS, value, hint=hint)
         elif min(value) >= 0 and max(value) <= 1 and parameter.high == 1:
             shown = tuple(int(x) for x in np.round(255 * srgb.from_linear(np.array(value))))
             control = gui.add_rgb(parameter.name, shown, hint=hint)
+
+            def decoded(value):
+                return tuple(float(x) for x in srgb.to_linear(np.array(value) / 255))
         else:
             control = gui.add_vector3(parameter.name, value, step=parameter.high / STEPS, hint=hint)
-        picked = parameter.is_colour and isinstance(control.value[0], int)
-
-        def changed(event) -> None:
-            new = control.value
-            if picked:
-                new = tuple(float(x) for x in srgb.to_linear(np.array(new) / 255))
-            self._change(path, new)
-
-        control.on_update(changed)
+        control.on_update(lambda event: self._change(path, decoded(control.value)))
 
     def _change(self, path: str, value) -> None:
         """Ask for another value of a parameter; of several that wait, the newest counts."""
@@ -174,13 +177,11 @@ class Page:
         self.session.set(values)
 
     def _first_view(self) -> None:
-        session = self.session
         for client in self.server.get_clients().values():
             with client.atomic():
-                client.camera.up_direction = tuple(session.up())
-                client.camera.position = tuple(session.start.position)
-                client.camera.look_at = tuple(session.target())
-        self._move(session.start)
+                client.camera.up_direction = tuple(self.session.up())
+                self._begin_at(client.camera)
+        self._move(self.session.start)
 
     # -- events of viser, in its threads ------------------------------------------------------------------------------
 
@@ -240,7 +241,7 @@ class Page:
             self._show(self.session.picture() if self._picture is not None and self.session.passes else None)
         with self._lock:
             camera, self._camera = self._camera, None
-        if camera is not None and self._move(pose(*camera)):
+        if camera is not None and self._move(to_world(*camera)):
             self._halted = False
             self._show(self.session.moving_picture())
             return True
@@ -253,8 +254,8 @@ class Page:
             return True
         return worked
 
-    def _move(self, place: Pose) -> bool:
-        moved = self.session.move_camera(place)
+    def _move(self, pose: np.ndarray) -> bool:
+        moved = self.session.move_camera(pose)
         if moved:
             self._moved = time.monotonic()
         return moved
@@ -269,16 +270,16 @@ class Page:
     def _send(self, client) -> None:
         if self._picture is not None:
             image = padded(self._picture, client.camera.aspect)
-            quality = QUALITY[0 if self.session.moving else 1]
+            quality = MOVING_QUALITY if self.session.moving else QUALITY
             client.scene.set_background_image(image, format="jpeg", jpeg_quality=quality)
 
 
-def pose(wxyz: np.ndarray, position: np.ndarray) -> Pose:
-    """Return the pose of viser's camera: its axes point to the right, down and forward."""
-    w, x, y, z = wxyz / np.linalg.norm(wxyz)
-    right = np.array([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)])
-    down = np.array([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)])
-    return Pose(position, right, -down, np.cross(right, down))
+def to_world(wxyz: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Return the pose of viser's camera, ``(4, 4)``: its axes point to the right, down and forward."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_quat(np.roll(wxyz, -1)).as_matrix() * [-1, -1, 1]
+    matrix[:3, 3] = position
+    return matrix
 
 
 def padded(picture: np.ndarray, aspect: float) -> np.ndarray:

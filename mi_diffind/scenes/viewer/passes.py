@@ -1,54 +1,67 @@
-"""Passes of one sample per pixel over a scene or a part of its picture, recorded once and then repeated."""
+"""Side of the viewer: a loaded scene, its numbers and colours, and passes that are recorded once and then repeated."""
 
 from __future__ import annotations
 
+import collections
 import contextlib
 import gc
 import math
+import re
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ... import plugins
 from ...core import compat
+from ...core.errors import UsageError
 from ...plugins.support import footprint
 from .. import loading
-from .parameters import NamedParameters
+from ..inspection import owners_of, paths_of
 
-#: Passes of a size, the first ones, whose times include compilation and recording.
+#: Passes of a region, the first ones, whose times include compilation and recording.
 SETTLED = 3
 
-#: Sizes and parts of pictures whose renders are kept as recordings.
+#: Regions whose renders are kept as recordings.
 RECORDED = 12
+
+#: Parameters of a sensor that are listed, with their ranges; its position is the mouse's.
+SENSOR_RANGES = {"x_fov": (1.0, 170.0)}
+
+#: Largest exponent of two of a slider's range.
+LARGEST_EXPONENT = 100
 
 
 class RenderedSide:
-    """Scene, the sum of its passes, and renders that repeat without tracing.
+    """Loaded scene, the sum of its passes of one sample per pixel, and its :class:`NamedParameters`.
 
+    A ``region`` of the picture is its width and height, its first rendered column and the one after the last.
     ``oversampling``: passes for each pass of the scene as written.
     """
 
     def __init__(self, scene, oversampling: int):
         self.scene, self.oversampling = scene, oversampling
-        self.sensor = scene.sensors()[0]
-        self.placement = mi.traverse(self.sensor)
+        self.placement = mi.traverse(scene.sensors()[0])
         self.parameters = NamedParameters(scene)
-        self.by_pixels = samples_pixels(scene)
-        self.region: tuple[int, int, int, int] = (0, 0, 0, 0)
-        self.grids: dict[tuple[int, int, int, int], tuple] = {}
-        self.frozen: dict[tuple[int, int, int, int], object] | None = {}
-        self.counts: dict[tuple[int, int, int, int], int] = {}
+        #: Whether single pixels can be sampled: others are rendered as whole films by ``mi.render``.
+        self.by_pixels = (
+            isinstance(scene.integrator(), mi.SamplingIntegrator) and not mi.is_spectral and not mi.is_polarized
+        )
+        self.recordable, self.region = True, (0, 0, 0, 0)
+        self.renders: dict[tuple[int, int, int, int], tuple] = {}
+        self.counts = collections.Counter()
         self.restart()
 
     def restart(self) -> None:
+        """Forget all passes."""
         self.total, self.samples, self.passes, self.seconds = 0.0, 0, 0, math.nan
 
     def place(self, matrix: np.ndarray, spp: int) -> None:
         """Move the camera, and give textures the footprint of ``spp`` samples per pixel."""
-        transform = type(self.placement["to_world"])
-        self.placement["to_world"] = transform(mi.ScalarTransform4f(matrix))
+        self.placement["to_world"] = type(self.placement["to_world"])(mi.ScalarTransform4f(matrix))
         self.placement.update()
         footprint.attach(self.scene, 0, spp)
         self.restart()
@@ -56,15 +69,16 @@ class RenderedSide:
     def change(self, values: Mapping[str, object]) -> None:
         """Change parameters. Plugins may then compute something else, so that recorded renders are of no use."""
         self.parameters.set(values)
-        self.counts = {}
-        if self.frozen is not None:
-            self.frozen = {}
+        self._forget()
         self.restart()
 
-    def add_pass(self, region: tuple[int, int, int, int], spp: int, seed: int, moving: bool = False) -> None:
-        """Render one sample of the pixels of a ``region``, or unless ``moving`` as many as oversampled, and add them.
+    def _forget(self) -> None:
+        self.renders = {}
+        self.counts.clear()
 
-        The region is the ``width`` and ``height`` of the picture, its first column and the one after its last.
+    def add_pass(self, region: tuple[int, int, int, int], spp: int, seed: int, moving: bool = False) -> None:
+        """Add one sample of the pixels of a ``region``, or unless ``moving`` as many as oversampled.
+
         Filtering textures get the footprint of ``spp`` samples per pixel.
         """
         start = time.perf_counter()
@@ -80,7 +94,7 @@ class RenderedSide:
     @property
     def settled(self) -> bool:
         """Whether the last pass compiled and recorded nothing."""
-        return self.counts.get(self.region, 0) > SETTLED
+        return self.counts[self.region] > SETTLED
 
     @property
     def image(self) -> np.ndarray:
@@ -94,37 +108,28 @@ class RenderedSide:
     def _render(self, spp: int, seed: int) -> np.ndarray:
         """Return a pass ``(height, columns, 3)``, float64."""
         _, height, first, after = self.region
-        if self.region not in self.grids:
-            if len(self.grids) >= RECORDED:
-                self.grids, self.frozen, self.counts = {}, None if self.frozen is None else {}, {}
-            self.grids[self.region] = _pixels(*self.region)
-        self.counts[self.region] = self.counts.get(self.region, 0) + 1
-        arguments = (*self.grids[self.region], dr.opaque(mi.UInt32, seed), spp)
         render = _sample_pixels if self.by_pixels else _render_film
+        if self.region not in self.renders:
+            if len(self.renders) >= RECORDED:
+                self._forget()
+            self.renders[self.region] = dr.freeze(render), _pixels(*self.region)
+        self.counts[self.region] += 1
+        recorded, pixels = self.renders[self.region]
+        arguments = (self.scene, *pixels, dr.opaque(mi.UInt32, seed), spp)
         with loading.scene_errors(None), dr.suspend_grad(), no_collection():
             values = None
-            if self.frozen is not None:
-                if self.region not in self.frozen:
-                    self.frozen[self.region] = dr.freeze(render)
+            if self.recordable:
                 with contextlib.suppress(RuntimeError):  # of the scene, or of a plugin that computes outside Dr.Jit
-                    values = np.array(self.frozen[self.region](self.scene, *arguments))
+                    values = np.array(recorded(*arguments))
             if values is None:
-                self.frozen = {}
-                values = np.array(render(self.scene, *arguments))
-                self.frozen = None  # it renders, and cannot be recorded
+                self._forget()
+                values = np.array(render(*arguments))
+                self.recordable = False
         if self.by_pixels:
             image = values.astype(np.float64).T.reshape(height, after - first, -1)
         else:
             image = loading.colour_channels(values.astype(np.float64))[:, first:after]
         return image.repeat(3, axis=2) if image.shape[2] == 1 else image
-
-
-def samples_pixels(scene) -> bool:
-    """Return whether single pixels of a scene can be sampled: its integrator follows rays of a camera, without spectra.
-
-    Others are rendered as whole films by ``mi.render``.
-    """
-    return isinstance(scene.integrator(), mi.SamplingIntegrator) and not mi.is_spectral and not mi.is_polarized
 
 
 def _pixels(width: int, height: int, first: int, after: int) -> tuple:
@@ -186,3 +191,130 @@ def no_collection():
     finally:
         if enabled:
             gc.enable()
+
+
+# -- numbers and colours ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class NamedParameter:
+    """A number or a colour of a scene.
+
+    ``owner`` is the name of the object that groups it, ``name`` its name within. ``value`` is a number or the three
+    components of a linear colour when the scene was loaded; ``low`` and ``high`` limit a slider.
+    """
+
+    owner: str
+    name: str
+    value: float | tuple[float, float, float]
+    low: float
+    high: float
+
+    @property
+    def path(self) -> str:
+        """Unique name in a scene: ``owner.name``."""
+        return f"{self.owner}.{self.name}"
+
+    @property
+    def is_colour(self) -> bool:
+        """Whether the value has three components."""
+        return isinstance(self.value, tuple)
+
+
+class NamedParameters:
+    """Scalars and colours of a loaded scene, by :attr:`NamedParameter.path`; this package's plugins come first.
+
+    A parameter of ``mi.traverse`` is listed if it is one number or one colour, and finite. Tables, transformations,
+    switches and whole numbers are not.
+    """
+
+    def __init__(self, scene):
+        self._params, self._keys = mi.traverse(scene), {}
+        objects = paths_of(scene)
+        owners, first, rest = owners_of(objects), {}, {}
+        for key in self._params.keys():
+            path = next(p for p in _parents(key) if p in owners)
+            value, node = _plain(self._params[key]), objects[path]
+            hidden = isinstance(node, mi.Sensor) and key.rpartition(".")[2] not in SENSOR_RANGES
+            if value is None or hidden or isinstance(node, (mi.Film, mi.Sampler)):
+                continue
+            owner, inner = re.match(r"(\([^)]*\)|[^.]*)\.?(.*)", owners[path]).groups()  # "(Sphere 2).bsdf"
+            name = ".".join(filter(None, (inner, key[len(path) :].strip("."))))
+            limits = SENSOR_RANGES.get(name) or _limits(value)
+            parameter = NamedParameter(owner, name.removesuffix(".value") or "value", value, *limits)
+            if parameter.path not in self._keys:
+                self._keys[parameter.path] = key
+                ours = any(plugins.origin(objects[p]) for p in (path, *_parents(path)) if p in objects)
+                (first if ours else rest)[parameter.path] = parameter
+        self.listed = {**first, **rest}
+
+    def __contains__(self, path: str) -> bool:
+        return path in self.listed
+
+    def value(self, path: str) -> float | tuple[float, float, float]:
+        """Return the value that a parameter has now."""
+        return _plain(self._params[self._keys[path]])
+
+    def set(self, values: Mapping[str, float | tuple[float, float, float]]) -> None:
+        """Give parameters other values, as of :meth:`checked`, and update the scene."""
+        for path, value in values.items():
+            value_type = type(self._params[self._keys[path]])
+            # Opaque: another value needs no other kernel
+            self._params[self._keys[path]] = value if value_type is float else dr.opaque(value_type, value)
+        self._params.update()
+
+    def checked(self, path: str, value) -> float | tuple[float, float, float]:
+        """Return a value as the parameter holds it.
+
+        Raises :class:`.UsageError` for a parameter that is not listed, and a value that is no finite number or colour.
+        """
+        if path not in self.listed:
+            raise UsageError(f'parameter "{path}": not one of the {len(self.listed)} numbers and colours of the scene')
+        colour = self.listed[path].is_colour
+        try:
+            numbers = tuple(float(x) for x in (value if colour else (value,)))
+        except (TypeError, ValueError):
+            numbers = ()
+        if len(numbers) != (3 if colour else 1) or not all(map(math.isfinite, numbers)):
+            expected = "three finite numbers" if colour else "a finite number"
+            raise UsageError(f'parameter "{path}": found {str(value)[:40]}, expected {expected}')
+        return numbers if colour else numbers[0]
+
+    def named(self, path: str) -> str:
+        """Return the path of the parameter here that the learned scene calls ``path``, "" if there is none.
+
+        Objects without an id are named by their plugin: ``(neural_disney 2)`` is ``(disney 2)`` in the exact scene.
+        """
+        names = {name: plugin.exact.name for name, plugin in plugins.declared().items() if plugin.exact}
+        path = re.sub(r"^\((\w+)", lambda match: f"({names.get(match[1], match[1])}", path)
+        return path if path in self.listed else ""
+
+
+def _parents(key: str) -> Iterator[str]:
+    """Yield the dotted prefixes of a key, the longest first, down to the empty one of the scene."""
+    while key:
+        key = key.rpartition(".")[0]
+        yield key
+
+
+def _plain(value) -> float | tuple[float, float, float] | None:
+    """Return a parameter as a number or a colour, ``None`` if it is neither, or not finite."""
+    if isinstance(value, float):
+        numbers = (value,)
+    elif isinstance(value, mi.Float) and len(value) == 1:
+        numbers = (float(value[0]),)
+    elif mi.is_rgb and isinstance(value, mi.Color3f) and dr.width(value) == 1:
+        numbers = tuple(float(x[0]) for x in value)
+    else:
+        return None
+    if not all(map(math.isfinite, numbers)):
+        return None
+    return numbers if len(numbers) == 3 else numbers[0]
+
+
+def _limits(value: float | tuple[float, ...]) -> tuple[float, float]:
+    """Return the range of a slider: [0, 1], or up to the power of two above twice the value; negative likewise."""
+    values = value if isinstance(value, tuple) else (value,)
+    largest = max(map(abs, values))
+    high = 1.0 if largest <= 1 else 2.0 ** min(math.ceil(math.log2(2 * largest)), LARGEST_EXPONENT)
+    return (-high if min(values) < 0 else 0.0), high

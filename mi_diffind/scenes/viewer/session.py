@@ -5,32 +5,41 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 
 from ... import plugins
+from ...arrays.tables import load_table
 from ...core import compat
 from ...core.errors import DiffindError, UsageError
-from ...core.runtime import use_variant
-from ...images import metrics, srgb
-from .. import loading, scene_checks
-from ..orbit import middle
-from .parameters import NamedParameter, counterparts
-from .passes import RenderedSide, no_collection
-from .table_scene import table_scene
+from ...core.runtime import array_module, use_variant
+from ...fitting.task import task_of
+from ...images import metrics
+from ...images.films import displayed
+from .. import loading
+from ..rendering import middle
+from .passes import NamedParameter, RenderedSide, no_collection
 
 #: Contents of the picture.
 VIEWS = ("side by side", "learned", "exact", "difference")
 
-#: Width of the picture in pixels by default, and limits.
-WIDTH, NARROWEST, WIDEST = 320, 16, 4096
+#: Width of the picture in pixels by default.
+WIDTH = 320
 
-#: Seconds of a picture while the camera moves above which the next is smaller, and below which it is larger again.
-SLOW, FAST = 0.18, 0.04
+#: Smallest width of the picture in pixels.
+NARROWEST = 16
+
+#: Largest width of the picture in pixels.
+WIDEST = 4096
+
+#: Seconds of a picture while the camera moves above which the next is smaller.
+SLOW = 0.18
+
+#: Seconds of a picture while the camera moves below which the next is larger again.
+FAST = 0.04
 
 #: Factors by which the sides of a picture are smaller while the camera moves.
 REDUCTIONS = (1, 2, 4)
@@ -38,45 +47,31 @@ REDUCTIONS = (1, 2, 4)
 #: Option of a choice that leaves the file's own value.
 AS_WRITTEN = "as written"
 
+#: Maps that a texture's table file shows, the first that the file has; else its first map.
+SHOWN_MAPS = ("base_color", "albedo", "image")
 
-@dataclass(frozen=True)
-class Pose:
-    """Camera in world space: ``position``, and unit vectors to the ``right``, ``up`` and ``forward``, all ``(3,)``."""
+#: Direction from the middle of what a table file shows to the camera.
+CAMERA = (0.5, 0.35, 1.0)
 
-    position: np.ndarray
-    right: np.ndarray
-    up: np.ndarray
-    forward: np.ndarray
-
-    @classmethod
-    def of(cls, to_world: np.ndarray) -> Pose:
-        """Return the pose of a sensor's matrix ``(4, 4)``; Mitsuba's x axis points to the left."""
-        up, forward = (to_world[:3, i] / np.linalg.norm(to_world[:3, i]) for i in (1, 2))
-        return cls(to_world[:3, 3].copy(), np.cross(forward, up), up, forward)  # also of a mirrored sensor
-
-    @property
-    def matrix(self) -> np.ndarray:
-        """Matrix of a sensor in this pose, ``(4, 4)``."""
-        matrix = np.eye(4)
-        matrix[:3] = np.stack([-self.right, self.up, self.forward, self.position], axis=1)
-        return matrix
+#: Direction from the middle of what a table file shows to the lamp.
+LAMP = (-0.6, 1.0, 0.7)
 
 
 class Session:
     """Scene that is looked at: what is shown, from where, with which values, and the picture so far.
 
-    - ``source``: a scene file, a table file (:func:`.table_scene.table_scene`) or a dictionary as of ``mi.load_dict``;
+    - ``source``: a scene file, a table file (:func:`table_scene`) or a dictionary as of ``mi.load_dict``;
     - ``width``: of the picture, pixels; the height follows the scene's film;
     - ``spp``: samples per pixel of a finished picture (``None``: the scene's); ``seed``: seed of the random numbers;
     - ``against``: the counterpart that replaces learned plugins on the other side, as of :func:`mi_diffind.compare`;
     - ``defines``: values of a scene file's ``<default>`` parameters.
 
     A picture is the mean of passes of one sample, ``passes`` so far; :meth:`refine` adds one. A change of anything
-    restarts it. ``refusal`` is the sentence that says why there is no exact side, "" if there is one. Computations run
-    in the thread that calls, and only one thread may.
+    restarts it. ``refusal`` is the sentence that says why there is no exact side, "" if there is one. Poses are
+    matrices ``(4, 4)`` of a sensor that only rotate and move; ``start`` is that of the scene. Computations run in the
+    thread that calls, and only one thread may.
 
-    Raises :class:`.SceneError`, :class:`.TableError` and
-    :class:`.UsageError`.
+    Raises :class:`.SceneError`, :class:`.TableError` and :class:`.UsageError`.
     """
 
     def __init__(
@@ -107,43 +102,40 @@ class Session:
         sensor = self.learned.scene.sensors()[0]
         if "to_world" not in self.learned.placement:
             raise loading.SceneError(f"{self._parsed.path}: the sensor {sensor.class_name()} cannot be moved")
-        written = np.array(self.learned.placement["to_world"].matrix, np.float64).reshape(4, 4)
         film = loading.film_size(self.learned.scene)
         self.full = (width, max(1, round(width * film[1] / film[0]))) if self.learned.by_pixels else film
-        self.spp = spp or sensor.sampler().sample_count()
-        if not isinstance(self.spp, int) or not 1 <= self.spp <= 2**16:
-            raise UsageError(f"spp: found {self.spp}, allowed are whole numbers from 1 to {2**16}")
-        scene_checks.check_size(self.learned.scene, self.spp, self.full)
-        self.start = Pose.of(written)
-        self._pose, self._residue = self.start, np.linalg.inv(self.start.matrix) @ written
-        self.view = VIEWS[0] if self.exact else VIEWS[1]
+        self.spp = _checked_samples(spp or sensor.sampler().sample_count())
+        loading.check_size(self.learned.scene, self.spp, self.full)
+        written = np.array(self.learned.placement["to_world"].matrix, np.float64).reshape(4, 4)
+        self.pose = self.start = rigid(written)
+        self._residue = np.linalg.inv(self.start) @ written
+        self.view = self.views[0]
         self.divider, self.gain = 0.5, 10.0
         self.table_bytes = self._bytes({})
         self.moving, self.reduction, self.pictures = False, REDUCTIONS[0], 0
         self._place()
 
     def _load(self, chosen: Mapping[str, str]) -> tuple[RenderedSide, RenderedSide | None, str]:
+        """Load both sides with the ``chosen`` words, and return them; without an exact side, the reason."""
+
         def change(state):
             _resize(state, self._width)
-            for props, plugin in _of_plugins(state):
-                for name, word in chosen.items():
-                    if _has_choice(props, plugin, name) and word in plugin.choices[name]:
-                        props[name] = word
+            for props, name, words in _choices(state):
+                if chosen.get(name) in words:
+                    props[name] = chosen[name]
 
-        with no_collection():
-            learned = self._parsed.load(change=change)
         names = tuple(dict.fromkeys((self.against, "exact")))
-        replaced = self._parsed.learned_plugins(names)
-        if not replaced:
-            return RenderedSide(learned, 1), None, "the scene names no learned plugin, so there is nothing to compare"
-        declared = plugins.declared()
-        oversampling = max(declared[entry["plugin"]].counterpart(names).oversampling for entry in replaced)
-        try:
-            with no_collection():
+        with no_collection():
+            learned = RenderedSide(self._parsed.load(change=change), 1)
+            replaced = self._parsed.learned_plugins(names)
+            if not replaced:
+                return learned, None, "the scene names no learned plugin, so there is nothing to compare"
+            counterparts = [plugins.declared()[entry["plugin"]].counterpart(names) for entry in replaced]
+            try:
                 exact = self._parsed.load(exact=True, against=names, change=change)
-        except DiffindError as e:
-            return RenderedSide(learned, 1), None, str(e)
-        return RenderedSide(learned, 1), RenderedSide(exact, oversampling), ""
+            except DiffindError as e:
+                return learned, None, str(e)
+            return learned, RenderedSide(exact, max(c.oversampling for c in counterparts)), ""
 
     def _bytes(self, chosen: Mapping[str, str]) -> int:
         """Return the bytes of all tables, with another preset or storage form if it was chosen."""
@@ -165,8 +157,7 @@ class Session:
     def show(self, view: str | None = None, divider: float | None = None, gain: float | None = None) -> None:
         """Choose one of :attr:`views`, the place of the divider, 0 to 1, or the factor of the difference.
 
-        The samples so far are kept, unless another side becomes visible. Raises
-        :class:`.UsageError`.
+        The samples so far are kept, unless another side becomes visible. Raises :class:`.UsageError`.
         """
         if view is not None and view not in self.views:
             because = f" ({self.refusal})" if self.refusal else ""
@@ -176,50 +167,45 @@ class Session:
                 raise UsageError(f"{name}: found {value}, allowed are numbers from 0 to {high:g}")
         self.divider = self.divider if divider is None else float(divider)
         self.gain = self.gain if gain is None else float(gain)
-        if view is not None and view != self.view:
-            self.view = view
-            if len({side.passes for side in self._visible()}) > 1 or self.passes == 0:
-                self._restart()
+        self.view = view or self.view
+        if view and (len({side.passes for side in self._visible()}) > 1 or self.passes == 0):
+            self._restart()
 
     def _visible(self) -> list[RenderedSide]:
         if self.exact is None or self.view == "learned":
             return [self.learned]
         return [self.exact] if self.view == "exact" else [self.learned, self.exact]
 
+    def _sides(self) -> list[RenderedSide]:
+        return [self.learned, self.exact] if self.exact else [self.learned]
+
     # -- camera -------------------------------------------------------------------------------------------------------
 
-    @property
-    def pose(self) -> Pose:
-        """Camera."""
-        return self._pose
-
-    def move_camera(self, pose: Pose) -> bool:
+    def move_camera(self, pose: np.ndarray) -> bool:
         """Move the camera, and return whether it moved; the next :meth:`moving_picture` shows it."""
-        if not np.isfinite(pose.matrix).all():
+        if not np.isfinite(pose).all():
             raise UsageError("camera: found a position or a direction that is not finite")
-        if np.allclose(pose.matrix, self._pose.matrix, rtol=1e-6, atol=1e-6 * (1 + np.abs(pose.position).max())):
+        if np.allclose(pose, self.pose, rtol=1e-6, atol=1e-6 * (1 + np.abs(pose[:3, 3]).max())):
             return False
-        self._pose = pose
+        self.pose = pose
         self._restart()
         return True
 
     def target(self) -> np.ndarray:
         """Return the point on the first view's axis that the camera turns about: the nearest to the scene's middle."""
-        centre = middle(self.learned.scene)
-        distance = float((centre - self.start.position) @ self.start.forward)
+        position, forward = self.start[:3, 3], self.start[:3, 2]
+        distance = float((middle(self.learned.scene) - position) @ forward)
         if distance <= 1e-6:
             box = self.learned.scene.bbox()
             distance = float(np.linalg.norm(np.array(box.max) - np.array(box.min))) / 4 if box.valid() else 1.0
             distance = distance if math.isfinite(distance) and distance > 0 else 1.0
-        return self.start.position + distance * self.start.forward
+        return position + distance * forward
 
     def up(self) -> np.ndarray:
         """Return the upward direction of the world: the axis nearest to the camera's, which a level camera shares."""
-        axis = np.zeros(3)
-        place = int(np.abs(self.start.up).argmax())
-        axis[place] = np.sign(self.start.up[place])
-        level = abs(float(axis @ self.start.right)) < 1e-3
-        return axis if level else self.start.up
+        left, up = self.start[:3, 0], self.start[:3, 1]
+        axis = np.where(np.arange(3) == np.abs(up).argmax(), np.sign(up), 0.0)
+        return axis if abs(float(axis @ left)) < 1e-3 else up
 
     # -- passes -------------------------------------------------------------------------------------------------------
 
@@ -244,11 +230,10 @@ class Session:
         start = time.perf_counter()
         self._place()
         self._add_pass()
-        seconds, sides = time.perf_counter() - start, self._visible()
-        if self.learned.by_pixels and all(side.settled for side in sides if side.seconds > 0):
-            step = 1 if seconds > SLOW else -1 if seconds < FAST else 0
-            index = min(max(REDUCTIONS.index(self.reduction) + step, 0), len(REDUCTIONS) - 1)
-            self.reduction = REDUCTIONS[index]
+        seconds = time.perf_counter() - start
+        if self.learned.by_pixels and all(side.settled for side in self._visible() if side.seconds > 0):
+            index = REDUCTIONS.index(self.reduction) + (seconds > SLOW) - (seconds < FAST)
+            self.reduction = REDUCTIONS[min(max(index, 0), len(REDUCTIONS) - 1)]
         return self.picture()
 
     def refine(self) -> np.ndarray:
@@ -263,23 +248,17 @@ class Session:
         return self.picture()
 
     def _place(self) -> None:
-        matrix = self._pose.matrix @ self._residue
-        for side in filter(None, (self.learned, self.exact)):
-            side.place(matrix, self.spp)
-
-    def _size(self) -> tuple[int, int]:
-        """Return the size of the picture: reduced while the camera moves."""
-        if self.moving and self.learned.by_pixels:
-            return tuple(max(1, round(n / self.reduction)) for n in self.full)
-        return self.full
+        for side in self._sides():
+            side.place(self.pose @ self._residue, self.spp)
 
     def _add_pass(self) -> None:
-        width, height = self._size()
-        sides = self._visible()
-        for side in sides:
+        """Render the sides that are visible; while the camera moves, each only where it is visible."""
+        reduction = self.reduction if self.moving and self.learned.by_pixels else 1
+        width, height = (max(1, round(n / reduction)) for n in self.full)
+        for side in self._visible():
             first, after = 0, width
-            if self.moving and self.view == VIEWS[0]:  # each side only where it is visible
-                column = min(max(round(self.divider * width), 0), width)
+            if self.moving and self.view == VIEWS[0]:
+                column = round(self.divider * width)
                 first, after = (0, column) if side is self.learned else (column, width)
             if first < after:
                 side.add_pass((width, height, first, after), self.spp, self.seed, self.moving)
@@ -289,21 +268,20 @@ class Session:
         self.pictures += 1
 
     def _restart(self) -> None:
-        for side in filter(None, (self.learned, self.exact)):
+        for side in self._sides():
             side.restart()
 
     # -- values -------------------------------------------------------------------------------------------------------
 
     @property
     def parameters(self) -> dict[str, NamedParameter]:
-        """Numbers and colours of the scene by their paths (:class:`.parameters.NamedParameters`)."""
+        """Numbers and colours of the scene by their paths (:class:`.passes.NamedParameters`)."""
         return self.learned.parameters.listed
 
     def set(self, values: Mapping[str, object]) -> None:
         """Give parameters other values on both sides, as far as both have them.
 
-        If the scene refuses them, it keeps the old ones. Raises :class:`.UsageError` and
-        :class:`.SceneError`.
+        If the scene refuses them, it keeps the old ones. Raises :class:`.UsageError` and :class:`.SceneError`.
         """
         checked = {path: self.learned.parameters.checked(path, value) for path, value in values.items()}
         before = {path: self.learned.parameters.value(path) for path in checked}
@@ -318,45 +296,36 @@ class Session:
 
     def _set(self, values: Mapping[str, object]) -> None:
         self.learned.change(values)
-        if self.exact is not None:
-            pairs = counterparts(values, self.exact.parameters)
-            if pairs:
-                self.exact.change({pairs[path]: values[path] for path in pairs})
+        if self.exact:
+            named = {self.exact.parameters.named(path): value for path, value in values.items()}
+            self.exact.change({path: value for path, value in named.items() if path})
 
     def on_both(self, path: str) -> bool:
         """Return whether a parameter changes the exact side, too."""
-        return self.exact is None or bool(counterparts([path], self.exact.parameters))
+        return self.exact is None or bool(self.exact.parameters.named(path))
 
     @property
     def choices(self) -> dict[str, tuple[str, ...]]:
         """Parameters of the scene's plugins that are one of a few words (:attr:`.plugins.Plugin.choices`)."""
-        words: dict[str, tuple[str, ...]] = {}
-        self._parsed.change(lambda state: words.update(_choices(state)))
-        return {name: (AS_WRITTEN, *options) for name, options in words.items()}
-
-    @property
-    def chosen(self) -> dict[str, str]:
-        """Choices that were made, by name."""
-        return dict(self._chosen)
+        choices: dict[str, tuple[str, ...]] = {}
+        for _, name, words in self._parsed.change(lambda state: list(_choices(state))):
+            choices[name] = tuple(dict.fromkeys((*choices.get(name, (AS_WRITTEN,)), *words)))
+        return choices
 
     def choose(self, name: str, word: str) -> None:
         """Give all plugins that have the choice ``name`` this value, and load the scene again with it.
 
-        If the scene refuses it, it stays as it is. Raises :class:`.UsageError` and
-        :class:`.SceneError`.
+        If the scene refuses it, it stays as it is. Raises :class:`.UsageError` and :class:`.SceneError`.
         """
         options = self.choices
         if name not in options or word not in options[name]:
             allowed = ", ".join(options.get(name, options)) or "none"
             raise UsageError(f'{name}: found "{word}", allowed are {allowed}')
-        chosen = {**self._chosen, name: word}
-        if word == AS_WRITTEN:
-            del chosen[name]
+        chosen = {k: v for k, v in {**self._chosen, name: word}.items() if v != AS_WRITTEN}
         sides, table_bytes = self._load(chosen), self._bytes(chosen)
         self.learned, self.exact, self.refusal = sides
         self._chosen, self.table_bytes = chosen, table_bytes
-        if self.view not in self.views:
-            self.view = self.views[0]
+        self.view = self.view if self.view in self.views else self.views[0]
         kept = {path: value for path, value in self._values.items() if path in self.learned.parameters}
         if kept:
             self._set(kept)
@@ -364,23 +333,20 @@ class Session:
 
     def samples(self, spp: int) -> None:
         """Choose the samples per pixel of a finished picture. Raises :class:`.UsageError`."""
-        if not isinstance(spp, int) or not 1 <= spp <= 2**16:
-            raise UsageError(f"spp: found {spp}, allowed are whole numbers from 1 to {2**16}")
-        self.spp = spp
+        self.spp = _checked_samples(spp)
         self._restart()  # the footprint of a sample depends on their number
 
     # -- picture and figures ------------------------------------------------------------------------------------------
 
     def picture(self) -> np.ndarray:
-        """Return what is shown, as bytes for a screen ``(height, width, 3)``.
+        """Return the picture, as bytes for a screen ``(height, width, 3)``.
 
         Side by side, the learned scene is left of a white line at ``divider``, the exact one right of it. The
         difference is the absolute one of values clipped to [0, 1], times ``gain``, grey where colours agree in it.
         """
-        if self.exact is None or self.view == "learned":
-            return displayed(self.learned.image)
-        if self.view == "exact":
-            return displayed(self.exact.image)
+        sides = self._visible()
+        if len(sides) == 1:
+            return displayed(sides[0].image)
         return combined(self.learned.image, self.exact.image, self.view, self.divider, self.gain)
 
     @property
@@ -408,15 +374,24 @@ class Session:
             "psnr_db": metrics.psnr(self.exact.image, self.learned.image) if both else None,
             "nonfinite_pixels": bad,
             "table_bytes": self.table_bytes,
-            "choices": self.chosen,
+            "choices": dict(self._chosen),
             "values": {k: list(v) if isinstance(v, tuple) else v for k, v in self._values.items()},
-            "to_world": (self._pose.matrix @ self._residue).tolist(),
+            "to_world": (self.pose @ self._residue).tolist(),
         }
 
 
-def displayed(image: np.ndarray) -> np.ndarray:
-    """Return a linear image as bytes for a screen."""
-    return np.round(255 * srgb.for_display(image)).astype(np.uint8)
+def _checked_samples(spp) -> int:
+    if not isinstance(spp, int) or not 1 <= spp <= 2**16:
+        raise UsageError(f"spp: found {spp}, allowed are whole numbers from 1 to {2**16}")
+    return spp
+
+
+def rigid(to_world: np.ndarray) -> np.ndarray:
+    """Return the pose of a sensor's matrix ``(4, 4)``: without scale, and turned back where it mirrors."""
+    up, forward = (to_world[:3, i] / np.linalg.norm(to_world[:3, i]) for i in (1, 2))
+    matrix = np.eye(4)
+    matrix[:3] = np.stack([np.cross(up, forward), up, forward, to_world[:3, 3]], axis=1)
+    return matrix
 
 
 def combined(learned: np.ndarray, exact: np.ndarray, view: str, divider: float, gain: float) -> np.ndarray:
@@ -442,22 +417,76 @@ def _resize(state, width: int) -> None:
             props["width"] = width
 
 
-def _of_plugins(state) -> list[tuple]:
-    """Return ``(properties, plugin)`` of all nodes of a parsed scene that are plugins of this package."""
-    declared = plugins.declared()
-    nodes = ((props, declared.get(props.plugin_name())) for props in compat.properties_of(state))
-    return [(props, plugin) for props, plugin in nodes if plugin is not None]
+def _choices(state) -> Iterator[tuple]:
+    """Yield ``(properties, name, words)`` for each parameter of a parsed scene's plugins that is one of a few words.
+
+    A preset names a table that ships: there is no such choice beside a file.
+    """
+    for props in compat.properties_of(state):
+        plugin = plugins.declared().get(props.plugin_name())
+        for name, words in plugin.choices.items() if plugin else ():
+            if not (name == "preset" and "filename" in props):
+                yield props, name, words
 
 
-def _has_choice(props, plugin, name: str) -> bool:
-    """Return whether a node has a choice; a preset names a table that ships, in place of a file."""
-    return name in plugin.choices and not (name == "preset" and "filename" in props)
+# -- table files ------------------------------------------------------------------------------------------------------
 
 
-def _choices(state) -> dict[str, tuple[str, ...]]:
-    words: dict[str, tuple[str, ...]] = {}
-    for props, plugin in _of_plugins(state):
-        for name, options in plugin.choices.items():
-            if _has_choice(props, plugin, name):
-                words[name] = tuple(dict.fromkeys((*words.get(name, ()), *options)))
-    return words
+def table_scene(file: str | os.PathLike) -> dict:
+    """Return a scene, as a dictionary for ``mi.load_dict``, in which the plugin of a file's task reads the file.
+
+    A texture lies on a square, a BSDF on a ball; a shape and a radiance field stand alone. The light is a white
+    surrounding and, but for textures and fields, a lamp. Raises :class:`.TableError`, and :class:`.UsageError` for a
+    task whose tables no plugin reads.
+    """
+    path = Path(file).resolve()
+    task = task_of(load_table(file))
+    table = task.load(file)
+    if task.plugin is None:
+        raise UsageError(f'{file}: holds tables for the task "{task.name}", which no plugin shows')
+    object_type, name = task.plugin
+    plugin = {"type": name, "filename": str(path)}
+    layout = table.settings.get("layout")
+    maps = [entry["name"] for entry in layout["maps"]] if isinstance(layout, dict) else []
+    if len(maps) > 1:
+        plugin["channels"] = next((shown for shown in SHOWN_MAPS if shown in maps), maps[0])
+    lower, upper, integrator, shape = [-1] * 3, [1] * 3, "path", {"type": "sphere", "bsdf": plugin}
+    if object_type == "texture":
+        lower, integrator = [-1, -1, 0], "path_footprint"
+        shape = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": plugin}}
+        upper = [1, 1, 0]
+    elif object_type == "shape":
+        with loading.scene_errors(path):
+            box = mi.load_dict(plugin).bbox()
+        lower, upper, integrator = list(box.min), list(box.max), "path_sdf"
+        shape = {**plugin, "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.6}}}
+    elif object_type != "bsdf":
+        lower, upper = task.model(table, array_module().TensorXf).describe()[0].get("box", (lower, upper))
+        integrator = shape = None
+    lit, lower, upper = object_type in ("bsdf", "shape"), np.array(lower, float), np.array(upper, float)
+    middle, radius = (lower + upper) / 2, max(float(np.linalg.norm(upper - lower)) / 2, 1e-6)
+    towards = np.array((0, 0, 1) if object_type == "texture" else CAMERA, float)
+    origin = middle + 2.3 * radius * towards / np.linalg.norm(towards)
+    look_at = mi.ScalarTransform4f().look_at
+    scene = {
+        "type": "scene",
+        "sensor": {
+            "type": "perspective", "fov": 40, "fov_axis": "y",
+            "to_world": look_at(origin.tolist(), middle.tolist(), [0, 1, 0]),
+            "film": {
+                "type": "hdrfilm", "width": 320, "height": 180, "pixel_format": "rgb", "rfilter": {"type": "box"},
+            },
+            "sampler": {"type": "independent", "sample_count": 64},
+        },
+        "integrator": {"type": integrator, "max_depth": 4} if integrator else plugin,
+    }  # fmt: skip
+    if shape:
+        scene["shown"] = shape
+        scene["light"] = {"type": "constant", "radiance": {"type": "rgb", "value": 0.4 if lit else 1.0}}
+    if lit:
+        place = middle + 4 * radius * np.array(LAMP)
+        scene["lamp"] = {
+            "type": "rectangle", "to_world": look_at(place.tolist(), middle.tolist(), [0, 1, 0.1]).scale(radius),
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 12.0}},
+        }  # fmt: skip
+    return scene

@@ -32,7 +32,7 @@ from ...maps import as_seen
 from ...maps.compressed import decibel
 from ...maps.source import Source
 from ...measure.study import FLOOR, Candidate, Case, Plan
-from ...tasks.image.presets import IMPROVEMENTS
+from ...tasks.image import IMPROVEMENTS
 from ..baselines import codecs, image_networks
 from ..baselines.hash_grids import halved
 from ..equal_memory import Contender, PresetContender, StudyContext

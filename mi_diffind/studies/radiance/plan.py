@@ -31,12 +31,11 @@ from ...core.progress import Deadline
 from ...fitting.loop import FitSettings, fit
 from ...measure.store import fingerprint
 from ...measure.study import FLOOR, Candidate, Case, Plan
+from ...tasks.radiance import dense_bytes
 from ...tasks.radiance import grid as grids
 from ...tasks.radiance.files import grid_of, load
 from ...tasks.radiance.march import march
-from ...tasks.radiance.presets import dense_bytes
-from ...tasks.radiance.session import FieldSession
-from ...tasks.radiance.training import ImagesProblem
+from ...tasks.radiance.session import FieldSession, ImagesProblem
 from ...tasks.radiance.volume_field import NodeField, VolumeField
 from .. import equal_memory
 from ..baselines import radiance_factors as factors

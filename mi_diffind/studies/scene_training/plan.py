@@ -38,12 +38,10 @@ from ...measure import plot
 from ...measure.formatting import figure_caption
 from ...measure.study import Candidate, Plan
 from ...scenes import loading
+from ...scenes.training.options import SceneRecipe, View, ViewDistribution
 from ...scenes.training.problem import exposure_of
-from ...scenes.training.recipe import SceneRecipe
-from ...scenes.training.reference_renders import ReferenceRenders
-from ...scenes.training.stored_texture import original_of, texture_file
-from ...scenes.training.trained_scene import TrainedScene
-from ...scenes.training.views import View, ViewDistribution
+from ...scenes.training.references import ReferenceRenders
+from ...scenes.training.trained_scene import TrainedScene, original_of, texture_file
 from ...tasks.texture.compressed import load
 from ..equal_memory import Contender, StudyContext
 from .conclusions import AFTER, FEW, LONGER, MENDED, OTHER, conclusions, table

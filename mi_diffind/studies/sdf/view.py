@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...core import compat
-from ...tasks.sdf import grids, tracing
+from ...tasks.sdf import grids, marching
 from ...tasks.sdf.field import DistanceField
 from ...tasks.sdf.mesh import Mesh
 
@@ -115,7 +115,7 @@ def _material() -> mi.Properties:
 
 def traced_distance(field: DistanceField, o, d):
     """Return the length of rays until they meet a field, infinite if they miss it."""
-    return tracing.trace(field, o, d, FAR)[0]
+    return marching.trace(field, o, d, FAR)[0]
 
 
 def scene_distance(scene, o, d):

@@ -42,12 +42,12 @@ from ...maps.pyramid import Pyramid
 from ...maps.source import Source, SourceError, load_source
 from ...measure.store import file_name
 from ...measure.study import Candidate, Plan
+from ...tasks import shading
+from ...tasks import texture as texture_presets
 from ...tasks.shading import fit as shading_fit
-from ...tasks.shading import presets
 from ...tasks.shading.evaluation import ShadedEvaluation, ShadedReader, reader
 from ...tasks.shading.material import effects_of, frozen_decoder
 from ...tasks.shading.training import ShadingProblem, fit_shading, start_of
-from ...tasks.texture import presets as texture_presets
 from ...tasks.texture import training as textures
 from ...tasks.texture.compressed import CompressedTexture
 from ...tasks.texture.fit import size_of
@@ -111,8 +111,8 @@ class ShadingStudySettings:
     extras: bool = False
 
     @property
-    def recipe(self) -> presets.ShadingRecipe:
-        return presets.PRESETS[self.preset]
+    def recipe(self) -> shading.ShadingRecipe:
+        return shading.PRESETS[self.preset]
 
 
 def materials_of(names: Sequence[str], side: int, quick: bool = False) -> dict[str, Source]:

@@ -25,15 +25,13 @@ from ...fitting.task import FitRequest
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source
 from ..disney.training import random_directions
+from ..texture import PRESETS as TEXTURES
 from ..texture import training as textures
 from ..texture.compressed import CompressedTexture, to_table
 from ..texture.nets import neutral_extras
-from ..texture.presets import PRESETS as TEXTURES
-from .evaluation import TRUTHS, ShadedEvaluation, reader
+from . import ShadingRecipe
+from .evaluation import TRUTHS, ShadedEvaluation, reader, reference, write_preview
 from .material import effects_of, frozen_decoder, shaded, surface_of
-from .presets import ShadingRecipe
-from .preview import write_preview
-from .reference import reference
 
 #: Factor of the number of shaded samples from one level to the next coarser one, and the last level that it counts for.
 FALL, TOP = 0.7, 9

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import gc
 import hashlib
@@ -26,8 +27,8 @@ from ...measure.store import fingerprint
 from ...plugins.support import footprint
 from ...tasks import disney
 from .. import loading
+from .options import View, ViewDistribution
 from .rig import Rig
-from .views import View, ViewDistribution
 
 #: Samples of the whole image in one pass; an interruption loses one pass at most.
 PASS = 1 << 23
@@ -107,7 +108,7 @@ class ReferenceRenders:
         The exact scene is dropped afterwards: Dr.Jit compiles the materials of all loaded scenes into every kernel.
         """
         if (self.workers or self.scheduler) and self.deadline is None and not self.scene.description:
-            return self._shared(views)
+            return self._images_by_workers(views)
         bar = progress_bar("references", len(views) * self.spp, "spp", self.progress)
         try:
             with bar:
@@ -116,17 +117,15 @@ class ReferenceRenders:
             self._loaded = None
             gc.collect()
 
-    def _shared(self, views: Sequence[View]) -> list[np.ndarray]:
+    def _images_by_workers(self, views: Sequence[View]) -> list[np.ndarray]:
         """Return the images, rendered by other processes. Raises :class:`.errors.DiffindError` if one fails."""
         given = {name: getattr(self, name) for name in SHARED}
-        if self.folder is not None:
-            given["folder"] = self.folder.resolve()
+        given["folder"] = self.folder and self.folder.resolve()
         content = pickle.dumps((str(self.scene.path.resolve()), self.scene.defines, mi.variant(), given))
         jobs = {self._key(view): (content, view) for view in views}
         images = {}
-        for outcome in run_jobs(
-            render_separately, jobs, self.workers, self.scheduler, self.progress, "references", "view"
-        ):
+        options = (self.workers, self.scheduler, self.progress, "references", "view")
+        for outcome in run_jobs(render_separately, jobs, *options):
             if outcome.failure:
                 raise DiffindError(f"references: {outcome.failure}")
             images[outcome.name], rendered, reused = outcome.value
@@ -165,14 +164,12 @@ class ReferenceRenders:
 
     def _kept(self, path: Path | None) -> tuple:
         """Return the sum of the kept samples of a view, and their number; a damaged file counts as none."""
-        if path is None or not path.is_file():
-            return 0.0, 0
-        try:
-            with Archive(path) as archive:
+        if path is not None and path.is_file():
+            with contextlib.suppress(Exception), Archive(path) as archive:  # zipfile and numpy each have their own
                 total, done = archive.array("total"), int(archive.array("done"))
-        except Exception:  # zipfile and numpy each have their own for a damaged file
-            return 0.0, 0
-        return (total, done) if total.ndim == 3 and 0 < done <= self.spp else (0.0, 0)
+                if total.ndim == 3 and 0 < done <= self.spp:
+                    return total, done
+        return 0.0, 0
 
     def _scene(self) -> tuple:
         """Return the exact scene, loaded on the first call, its rig, and the samples per pixel of one pass."""

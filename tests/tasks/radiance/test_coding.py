@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mi_diffind.tasks.radiance import ans, node_codes, rate_distortion
+from mi_diffind.tasks.radiance import coding, compression
 from mi_diffind.tasks.radiance.nodes import cells_of, corners_of
 
 
@@ -29,13 +29,13 @@ def entropy(symbols, contexts) -> float:
 def test_symbols_take_the_bytes_of_their_entropy(rng):
     contexts = rng.integers(0, 3, 60_000)
     symbols = np.minimum(rng.geometric(np.array([0.9, 0.4, 0.05])[contexts]) - 1, 99)
-    coder = ans.SymbolEncoder()
+    coder = coding.SymbolEncoder()
     for part in (slice(0, 7), slice(7, 60_000)):
         coder.code("x", 3, 100, contexts[part], symbols[part])
     coder.code("flags", 1, 2, np.zeros(3, int), np.array([1, 0, 1]))
     probabilities, data = coder.finish()
     assert 8 * len(data) < 1.02 * entropy(symbols, contexts) + 32 * 17
-    decoder = ans.SymbolDecoder(probabilities, data)
+    decoder = coding.SymbolDecoder(probabilities, data)
     read = [decoder.code("x", 3, 100, contexts[part]) for part in (slice(0, 7), slice(7, 60_000))]
     np.testing.assert_array_equal(np.concatenate(read), symbols)
     np.testing.assert_array_equal(decoder.code("flags", 1, 2, np.zeros(3, int)), [1, 0, 1])
@@ -46,12 +46,12 @@ def test_nodes_come_back(shell, rng):
     for mask, colours in ((stored, 300), (corners_of(rng.random((9, 7, 32)) < 0.2), 70)):
         count = mask.sum()
         numbers = (levels, index) if mask is stored else (rng.integers(0, 16, count), rng.integers(0, colours, count))
-        coding = node_codes.encoded(mask, *numbers, 16, colours)
-        again = node_codes.decoded(*coding, mask.shape, 16, colours)
-        for a, b in zip(again, (mask, *numbers), strict=True):
+        coded = coding.encode(mask, *numbers, 16, colours)
+        again = coding.decode(*coded, mask.shape, 16, colours)
+        for a, b in zip(again, (np.flatnonzero(mask), *numbers), strict=True):
             np.testing.assert_array_equal(a, b)
     # Each node is in one pass, and its context has been coded before
-    passes = node_codes.passes_of(stored)
+    passes = coding.passes_of(stored)
     order = np.empty(stored.sum(), int)
     for number, part in enumerate(passes):
         order[part.rows] = number
@@ -63,39 +63,37 @@ def test_nodes_come_back(shell, rng):
 def test_smooth_nodes_take_few_bytes(shell):
     stored, levels, index = shell
     plain = (entropy(levels, 0 * levels) + entropy(index, 0 * index)) / 8
-    assert len(node_codes.encoded(stored, levels, index, 16, 300)[1]) < 0.4 * plain
-    mask = ans.SymbolEncoder()
-    node_codes._cells(mask, tuple(n - 1 for n in stored.shape), cells_of(stored))
+    assert len(coding.encode(stored, levels, index, 16, 300)[1]) < 0.4 * plain
+    mask = coding.SymbolEncoder()
+    coding._cells(mask, tuple(n - 1 for n in stored.shape), cells_of(stored))
     assert len(mask.finish()[1]) < 0.2 * stored.size / 8
 
 
 def test_damaged_nodes_are_refused(shell):
     stored, levels, index = shell
-    probabilities, data = node_codes.encoded(stored, levels, index, 16, 300)
+    probabilities, data = coding.encode(stored, levels, index, 16, 300)
     cases = (
         (probabilities, data[:-100]), (probabilities, data[:3]), (probabilities[:40], data),
         (np.full_like(probabilities, 255), data), (probabilities, np.full_like(data, 255)),
     )  # fmt: skip
     for case in cases:
         with pytest.raises(ValueError, match="found"):
-            node_codes.decoded(*case, stored.shape, 16, 300)
+            coding.decode(*case, stored.shape, 16, 300)
 
 
 def test_rate_and_distortion(shell, rng):
     """A higher rate takes fewer bytes and a larger error; nodes that matter keep theirs."""
     stored, levels, index = shell
-    passes = node_codes.passes_of(stored)
+    passes = coding.passes_of(stored)
     exact = np.clip(levels + rng.normal(0, 1, len(levels)), 0, 15)
     weight = np.where(rng.random(len(levels)) < 0.3, 1.0, 1e-3)
     colours = rng.normal(size=(300, 3))
     points = colours[index] + rng.normal(0, 0.3, (len(index), 3))
     sizes, errors = [], []
     for rate in (1e-5, 0.02):
-        chosen = rate_distortion.chosen_levels(passes, exact, weight, rate, 16)
-        centres, named = rate_distortion.chosen_index(passes, points, weight, colours, rate)
-        sizes.append(
-            [len(node_codes.encoded(stored, *pair, 16, 300)[1]) for pair in ((chosen, index), (levels, named))]
-        )
+        chosen = compression.choose_levels(passes, exact, weight, rate, 16)
+        centres, named = compression.choose_index(passes, points, weight, colours, rate)
+        sizes.append([len(coding.encode(stored, *pair, 16, 300)[1]) for pair in ((chosen, index), (levels, named))])
         errors.append([np.square(chosen - exact), np.square(points - centres[named]).sum(axis=1)])
     sizes = np.array(sizes)
     assert (sizes[1] < 0.85 * sizes[0]).all()

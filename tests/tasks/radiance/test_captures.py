@@ -1,12 +1,13 @@
-"""Cameras as NeRF's Blender data, nerfstudio, instant-ngp and BlenderNeRF spell them, and keys that nobody reads."""
+"""Lists of views of NeRF's Blender data, nerfstudio, instant-ngp and BlenderNeRF: spellings, masks, and refusals."""
 
 import json
 import math
 
 import drjit.llvm.ad as llvm
 import numpy as np
+import OpenEXR
 import pytest
-from captures import SIZE, change, pose, write_image, write_json
+from captures import SIZE, change, pose, write_blender, write_image, write_json
 from PIL import Image
 
 from mi_diffind.tasks.radiance.session import FieldSession
@@ -88,32 +89,127 @@ def test_spellings_of_lenses(tmp_path, of_file, of_frames):
     assert not np.array_equal(plain.pixels, views.pixels) and not plain.notes
 
 
+def shear():
+    matrix = np.array(pose())
+    matrix[0, 1] = 0.04
+    matrix[:, 1] /= np.linalg.norm(matrix[:3, 1])
+    return matrix.tolist()
+
+
+#: Keys of a file or of a frame → what is said.
+REFUSED_CAMERAS = [
+    *(
+        ({"camera_model": name}, f"has the camera model '{name}', allowed are PINHOLE, .*: undistort the images")
+        for name in ("OPENCV_FISHEYE", "EQUIRECTANGULAR", "FISHEYE624", "ORTHOPHOTO", "VR180_L", "RADIAL_FISHEYE")
+    ),
+    ({"is_fisheye": True, "camera_model": "OPENCV"}, "has the camera model 'fisheye'"),
+    ({"latlong": True}, "has the camera model 'latlong'"),
+    ({"equirectangular": True}, "has the camera model 'equirectangular'"),
+    ({"orthographic": True}, "has the camera model 'orthographic'"),
+    ({"ftheta_p0": 0.1}, "has the camera model 'f-theta'"),
+    ({"distortion_params": [0.1, 0.2, 0, 0]}, r'has the "distortion_params" \[0.1, 0.2, 0, 0\], expected the list'),
+    ({"distortion_params": {"k1": 0.1}}, r"expected the list \[k1, k2, k3, k4, p1, p2\] of nerfstudio"),
+    ({"distortion_params": [0.1, "0.2", 0, 0, 0, 0]}, "has the \"k2\" '0.2', expected a number"),
+    ({"distortion_params": [0, 0, 0, 0.01, 0, 0]}, r"has the distortion k4 = 0.01, which nerfstudio multiplies"),
+    ({"k1": 0.1, "k4": 0.01}, r"has the distortion k4 = 0.01, which nerfstudio multiplies by r⁸"),
+    ({"fl_x": None, "x_fov": 180}, r'has the "x_fov" 180, expected degrees between 0 and 180'),
+    ({"camera_model": ["PINHOLE"]}, r"has the camera model \['PINHOLE'\], allowed are"),
+    ({"k1": "0.02"}, "has the \"k1\" '0.02', expected a number"),
+    ({"fl_x": None}, "has no focal length"),
+    ({"fl_x": 0}, 'has the "fl_x" 0, expected a number > 0'),
+    ({"camera_angle_x": 4.0}, 'has the "camera_angle_x" 4, expected radians'),
+    ({"camera_angle_x": 1e-320}, 'has the "camera_angle_x" .*, expected radians between 1e-06 and π'),
+    ({"cx": 1e308}, 'has the "cx" 1e\\+308, expected a number between -1e\\+09 and 1e\\+09'),
+    ({"k2": -1e300}, 'has the "k2" -1e\\+300, expected a number between'),
+    ({"k1": -1e6, "cx": -900.0}, r"transforms\.json: no pixel counts: masks or lens distortions exclude all of 3 i"),
+    ({"w": 16}, "has 8 × 6 pixels, .*json says 16 × 6"),
+]  # fmt: skip
+
+#: Keys of all frames → what is said.
+REFUSED_FRAMES = [
+    ({"file_path": ""}, 'frame 0 has no "file_path"'),
+    ({"mask_path": 3}, 'frame 0 has a "mask_path" that is no name of a file$'),
+    ({"mask_path": "mask.png"}, r"mask\.png: no such image"),
+    ({"mask_path": "small.png"}, r"small\.png: has 3 × 3 pixels, its image 0\.png has 8 × 6$"),
+    ({"mask_path": "broken.png"}, r"broken\.png: cannot be read as a mask"),
+    ({"transform_matrix": None}, 'frame "images/0.png" has no "transform_matrix"'),
+    ({"transform_matrix": pose(np.nan)}, "with NaN or infinite numbers"),
+    ({"transform_matrix": pose(0, 0.5)}, r"that scales \(columns of length 0.5, 0.5, 0.5\)"),
+    ({"transform_matrix": shear()}, "that shears"),
+    ({"transform_matrix": (np.array(pose()) * [1, 1, -1, 1]).tolist()}, "that mirrors"),
+    ({"transform_matrix": np.eye(3).tolist()}, r"of the shape \(3, 3\), expected \(4, 4\)"),
+    ({"transform_matrix": [[1, 2], [3]]}, "that is not a matrix of numbers"),
+    ({"transform_matrix": np.ones((4, 4)).tolist()}, "whose last row is not 0, 0, 0, 1"),
+]
+
+#: Keys of a file → what is said.
+REFUSED_FILES = [
+    *(({"aabb": box}, r'transforms\.json: has the "aabb" .*, expected two corners')
+      for box in ([[0, 0, 0], [1, 1, 0]], [0, 1], [[0, 0, 0], [1, "a", 1]])),
+    ({"frames": []}, 'has no "frames"'),
+]  # fmt: skip
+
+
 @pytest.mark.parametrize(
-    ("keys", "message"),
+    ("of_file", "of_frames", "message"),
     [
-        *(
-            ({"camera_model": name}, f"has the camera model '{name}', allowed are PINHOLE, .*: undistort the images")
-            for name in ("OPENCV_FISHEYE", "EQUIRECTANGULAR", "FISHEYE624", "ORTHOPHOTO", "VR180_L", "RADIAL_FISHEYE")
-        ),
-        ({"is_fisheye": True, "camera_model": "OPENCV"}, "has the camera model 'fisheye'"),
-        ({"latlong": True}, "has the camera model 'latlong'"),
-        ({"equirectangular": True}, "has the camera model 'equirectangular'"),
-        ({"orthographic": True}, "has the camera model 'orthographic'"),
-        ({"ftheta_p0": 0.1}, "has the camera model 'f-theta'"),
-        ({"distortion_params": [0.1, 0.2, 0, 0]}, r'has the "distortion_params" \[0.1, 0.2, 0, 0\], expected the list'),
-        ({"distortion_params": {"k1": 0.1}}, r"expected the list \[k1, k2, k3, k4, p1, p2\] of nerfstudio"),
-        ({"distortion_params": [0.1, "0.2", 0, 0, 0, 0]}, "has the \"k2\" '0.2', expected a number"),
-        ({"distortion_params": [0, 0, 0, 0.01, 0, 0]}, r"has the distortion k4 = 0.01, which nerfstudio multiplies"),
-        ({"k1": 0.1, "k4": 0.01}, r"has the distortion k4 = 0.01, which nerfstudio multiplies by r⁸"),
-        ({"fl_x": None, "x_fov": 180}, r'has the "x_fov" 180, expected degrees between 0 and 180'),
-        ({"camera_model": ["PINHOLE"]}, r"has the camera model \['PINHOLE'\], allowed are"),
+        *((keys, {}, message) for keys, message in REFUSED_CAMERAS + REFUSED_FILES),
+        *(({}, keys, message) for keys, message in REFUSED_CAMERAS + REFUSED_FRAMES),
     ],
-)  # fmt: skip
-@pytest.mark.parametrize("place", ["file", "frame"])
-def test_cameras_that_are_refused(tmp_path, keys, message, place):
-    studio(tmp_path, (PIXELS | keys) if place == "file" else {}, (PIXELS | keys) if place == "frame" else {})
-    with pytest.raises(ViewsError, match=message):
+)
+def test_lists_that_are_refused(tmp_path, of_file, of_frames, message):
+    studio(tmp_path, {} if of_frames else PIXELS, PIXELS | of_frames if of_frames else {})
+    change(tmp_path, "transforms.json", **of_file)
+    Image.fromarray(np.zeros((3, 3), np.uint8)).save(tmp_path / "small.png")
+    (tmp_path / "broken.png").write_bytes(b"no")
+    with pytest.raises(ViewsError, match=message) as e:
         load_views(tmp_path)
+    assert "\n" not in str(e.value) and str(tmp_path) in str(e.value)
+
+
+def test_files_that_are_refused(tmp_path):
+    """Images, lists that are no JSON, and folders."""
+    path = studio(tmp_path, PIXELS, {}) / "images" / "1.png"
+    data = path.read_bytes()
+    for broken in (data[: len(data) // 2], b"", b"not an image", data[:40] + b"\0" * 40 + data[80:]):
+        path.write_bytes(broken)
+        with pytest.raises(ViewsError, match=r"1\.png: cannot be read as an image"):
+            load_views(tmp_path)
+    Image.fromarray(np.zeros(SIZE, np.uint16)).save(path)
+    with pytest.raises(ViewsError, match=r"1\.png: has pixels of the mode I"):
+        load_views(tmp_path)
+    path.unlink()
+    path = path.with_suffix(".exr")
+    path.write_bytes(b"no")
+    change(tmp_path, "transforms.json", frame=1, file_path="images/1")
+    change(tmp_path, "transforms.json", train_filenames=None)
+    with pytest.raises(ViewsError, match=r"1\.exr: cannot be read as an image"):
+        load_views(tmp_path)
+    with OpenEXR.File({"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage},
+                      {"Z": np.zeros(SIZE, np.float32)}) as file:  # fmt: skip
+        file.write(str(path))
+    with pytest.raises(ViewsError, match=r"has the channels Z, expected R, G, B or Y, and A"):
+        load_views(tmp_path)
+    for broken in ("{", "[1, 2]", "{}"):
+        (tmp_path / "transforms.json").write_text(broken)
+        with pytest.raises(ViewsError, match=r"transforms\.json: (is not valid JSON|has no \"frames\")"):
+            load_views(tmp_path)
+    with pytest.raises(ViewsError, match=r"missing: no such folder$"):
+        load_views(tmp_path / "missing")
+    with pytest.raises(ViewsError, match=r"json: is not a folder$"):
+        load_views(tmp_path / "transforms.json")
+    with pytest.raises(ViewsError, match=r"holds no views: neither transforms_train\.json nor transforms\.json"):
+        load_views(tmp_path / "images")
+    with pytest.raises(ViewsError, match=r"has 1 view for training, at least 2 are needed"):
+        load_views(studio(tmp_path, PIXELS, {}, 1))
+    with pytest.raises(ValueError, match=r'split: found "all", allowed are train, test, val'):
+        load_views(tmp_path, "all")
+
+
+def test_a_principal_point_in_shares_of_the_image_is_named(tmp_path):
+    (note,) = load_views(studio(tmp_path, PIXELS | {"cx": 0.56, "cy": 0.54}, {})).notes
+    assert '"cx" and "cy" in pixels are expected' in note and "(0.56, 0.54) of 0.png" in note
+    assert not load_views(studio(tmp_path, PIXELS | {"cx": 5.5, "cy": 2.0}, {})).notes
 
 
 def test_fields_of_view_that_contradict_focal_lengths_are_noted(tmp_path):
@@ -146,6 +242,8 @@ def test_spellings_of_poses(tmp_path):
         views = read(**keys)
         np.testing.assert_allclose(views.poses[1], turned)
         assert not views.notes
+    near = pose(2, 1.0008)  # within the tolerance of lengths, and no shear
+    assert np.array_equal(read(transform_matrix=near).poses[1], near)
     moved = {"transform_matrix_end": pose()}
     with pytest.raises(
         ViewsError, match=r'frame "images/1.png" moves while the shutter is open, from the "transform_m'
@@ -169,6 +267,43 @@ def test_poses_of_mitsuba(tmp_path):
     np.testing.assert_allclose(camera[:3, 0], np.cross(forward, [0, 1, 0]) / np.hypot(*forward[[0, 2]]), atol=1e-6)
     change(tmp_path, "transforms.json", from_mitsuba=False)
     np.testing.assert_allclose(load_views(tmp_path).poses[0], matrix, atol=1e-6)
+
+
+def test_nerfstudio_layout(tmp_path):
+    studio(tmp_path, PIXELS | CENTRE | {"w": 8, "h": 6, "k1": 0.0, "applied_transform": np.eye(4)[:3].tolist()}, {}, 10)
+    change(tmp_path, "transforms.json", train_filenames=None)
+    train, test = load_views(tmp_path), load_views(tmp_path, "test")
+    assert test.names == ("images/0.png", "images/8.png") and len(train) == 8 and not train.has_alpha
+    assert np.array_equal(train.poses[0], pose(1))
+    assert train.settings == {"applied_transform": np.eye(4)[:3].tolist()}
+    listed = [f"images/{i}.png" for i in range(10)]
+    change(tmp_path, "transforms.json", applied_transform=None, train_filenames=listed[3:], test_filenames=listed[:2])
+    assert load_views(tmp_path, "test").names == tuple(listed[:2])
+    again = load_views(tmp_path)
+    assert len(again) == 7 and again.settings == {} and np.array_equal(again.poses[0], pose(3))
+    with pytest.raises(ViewsError, match=r'has no list "val_filenames"'):
+        load_views(tmp_path, "val")
+    change(tmp_path, "transforms.json", test_filenames=["images/other.png"])
+    with pytest.raises(ViewsError, match=r"test_filenames\" names 'images/other.png', which is not among the frames$"):
+        load_views(tmp_path, "test")
+
+
+def test_blender_layout(tmp_path):
+    blender = write_blender(tmp_path)
+    views = load_views(blender)
+    assert len(views) == 4 and np.array_equal(views.sizes, [SIZE] * 4) and views.pixels.nbytes == 4 * 4 * 6 * 8
+    assert views.names == tuple(f"train/r_{i}.png" for i in range(4)) and views.has_alpha and views.box is None
+    assert np.array_equal(views.poses, [pose(i) for i in range(4)]) and np.array_equal(views.origins[:, 0], range(4))
+    assert np.allclose(views.focal, 4 / np.tan(0.35)) and np.array_equal(views.centre[0], [4, 3])
+    assert len(load_views(blender, "test")) == 2
+    with pytest.raises(ViewsError, match=r"transforms_val\.json: no such file$"):
+        load_views(blender, "val")
+    assert load_views(blender).digest == views.digest != load_views(blender, "test").digest
+    change(blender, aabb=[[-1, 0, -1], [1, 2, 1]])
+    assert np.array_equal(load_views(blender).box, [[-1, 0, -1], [1, 2, 1]])
+    (blender / "transforms_test.json").unlink()
+    assert load_views(blender).names == tuple(f"train/r_{i}.png" for i in (1, 2, 3))
+    assert load_views(blender, "test").names == ("train/r_0.png",)
 
 
 # -- names of images and splits ---------------------------------------------------------------------------------------
