@@ -54,7 +54,7 @@ BSDFS = {
     "neural_ggx uint8": ("neural_ggx", {"storage": "uint8"}),
     "neural_bsdf": ("neural_bsdf", {"storage": "float32"}),
     "neural_bsdf anisotropic": ("neural_bsdf", {"filename": "anisotropic.npz", "two_sided": True}),
-    "neural_bsdf family": ("neural_bsdf", {"filename": "family.npz", "storage": "float32", "scale": 1.0}),
+    "neural_bsdf family": ("neural_bsdf", {"filename": "family.npz", "storage": "float32"}),
     "neural_material": ("neural_material", {"storage": "float32"}),
 }
 
@@ -597,6 +597,23 @@ def test_assigned_tables_are_those_of_one_instance(mi_rgb, rng, name):
     params.update()
     assert not np.allclose(intensities(mi, first.eval(mi.BSDFContext(), si, wo)), before, rtol=1e-2)
     np.testing.assert_array_equal(intensities(mi, second.eval(mi.BSDFContext(), si, wo)), before)
+
+
+@pytest.mark.parametrize("is_textured", [False, True])
+@pytest.mark.parametrize("name", ["neural_bsdf anisotropic", "neural_bsdf family", "neural_ggx paper"])
+def test_gradients_against_differences(mi_rgb, rng, name, is_textured):
+    """By all parameters, numbers or texels, and tables. (Default forms are measured for ``docs/trust.md``.)"""
+    mi, n = mi_rgb, 2**13
+    ends = TEXTURED.get(name, {})
+    if is_textured and not ends:
+        pytest.skip("none of its parameters may be a texture")
+    given = {p: texels(mi, np.linspace(*pair, 4)) if is_textured else pair[1] for p, pair in ends.items()}
+    bsdf = load(mi, name, **given)
+    wi, wo = random_directions(rng, n, 0.3), random_directions(rng, n, 0.3)
+    params, si, towards = mi.traverse(bsdf), interactions(mi, wi, np.arange(n) % 4, 4), vectors(mi, wo)
+    keys = [key for key in params.keys() if dr.is_diff_v(params[key])]
+    worst, names = trust.compared(lambda: total(bsdf.eval(mi.BSDFContext(), si, towards)), params, keys, rng)
+    assert worst <= 0.03 and len(names) >= 4
 
 
 @pytest.mark.parametrize("integrator", ["prb", "path"])
