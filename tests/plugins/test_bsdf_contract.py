@@ -168,7 +168,9 @@ def test_eval_pdf_and_sample_agree_in_every_context(variant, rng, name):
         assert not value[below].any() and not pdf[below].any()
         valid, weight = sampled_pdf > 0, intensities(mi, weight)
         assert not weight[~valid].any() and valid.any() == bool(components)
-        for found, expected, rtol in bool(components) * (
+        if not components:
+            continue
+        for found, expected, rtol in (
             (sampled_pdf[valid], again_pdf[valid], 1e-3),
             ((weight[valid].T * sampled_pdf[valid]).T, intensities(mi, again[0])[valid], 2e-3),
         ):
@@ -183,7 +185,7 @@ def test_eval_pdf_and_sample_agree_in_every_context(variant, rng, name):
     assert close(sum(components), parts["all"], 1e-4).all()
 
 
-#: BSDFs with their narrowest lobe: plugin, parameters, roughness.
+#: Case → BSDF, parameters, and the roughness of its narrowest lobe (``None``: by the formula of ``disney``).
 LOBES = {
     **{f"disney {m}": ("disney", disney_materials.MATERIALS[m], None)
        for m in ("rich", "coat_only", "glossy_coat", "sheen_only", "smoothest", "brushed_mirror", "everything")},
@@ -197,7 +199,7 @@ LOBES = {
 }  # fmt: skip
 
 
-def lobe_sampling(mi, case, angle, **more):
+def lobe_sampling(mi, case, angle):
     name, parameters, alpha = LOBES[case]
     alpha = alpha or disney_materials.smallest_alpha(parameters)
     bsdf = mi.load_dict(disney_materials.plugin(mi, described(name), {**disney_materials.PLAIN, **parameters})

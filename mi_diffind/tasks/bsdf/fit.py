@@ -69,7 +69,7 @@ def _fit_single(truth: Truth, request: FitRequest, stop: Event) -> Fitted:
     with dr.suspend_grad():
         rows = not truth.function
         symmetries = measured.measure_row_symmetry(truth) if rows else measured.measure_symmetry(truth, types)
-    isotropic, azimuth = _assumed(symmetries)
+    isotropic, azimuth = _assumed_symmetry(symmetries)
     lines = [*filter(None, [truth.remark]), symmetry_line(symmetries)]
     sizes = _sizes(request, plain=request.preset in ("table", "plain"))
     if rows:
@@ -135,7 +135,7 @@ def _fit_family(truth: FamilyTruth, request: FitRequest, stop: Event) -> Fitted:
     with dr.suspend_grad():
         truth.check_effects(types)
         symmetries = truth.symmetries(types)
-    isotropic, azimuth = _assumed(symmetries)
+    isotropic, azimuth = _assumed_symmetry(symmetries)
     members, count = training.MEMBERS, training.SAMPLES
     samples = training.draw_members(truth, types, count, members, settings.seed + 1, isotropic)
     validation = training.draw_members(truth, types, training.VALIDATION, members // 4, settings.seed + 2, isotropic)
@@ -175,7 +175,7 @@ def _fit_family(truth: FamilyTruth, request: FitRequest, stop: Event) -> Fitted:
     return Fitted(table, result, lines, {**_figures(table, symmetries), "family": described})
 
 
-def _assumed(symmetries: dict[str, float | None]) -> tuple[bool, str]:
+def _assumed_symmetry(symmetries: dict[str, float | None]) -> tuple[bool, str]:
     """Return whether a source counts as isotropic, and what its residual assumes of the azimuth."""
     isotropic, mirror = ((symmetries[name] or 0) <= measured.TOLERANCE for name in ("isotropy", "mirror"))
     return isotropic, "mirror" if mirror else "half"
