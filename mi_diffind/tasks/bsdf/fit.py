@@ -18,7 +18,7 @@ from ...fitting.task import FitRequest, Fitted
 from . import energy, evaluation, measured, mixture, training
 from .directions import SphereView
 from .files import BSDFModel, allocate, to_table
-from .measured import WHITE, FunctionTruth, Truth, TurnedTruth
+from .measured import WHITE, FunctionTruth, Truth
 from .model import BYTES, TERMS, ResidualSizes, points, sizes_within
 from .truth import FamilyTruth, parameter_ranges, recorded_source, truth_of
 
@@ -104,7 +104,7 @@ def _fit_single(truth: Truth, request: FitRequest, stop: Event) -> Fitted:
         """Return the table of the arrays as they are, its limit of the albedo, and the PSNR without."""
         value = problem.net.at(form).cosine_value
         sampled = FunctionTruth(truth.name, value) if rows else truth
-        sampled = TurnedTruth(sampled, -angle) if angle else sampled
+        sampled = measured.rotate_truth(sampled, -angle) if angle else sampled
         lobes, weights = mixture.fit_mixture(sampled, types, isotropic, form.scale[1] / form.scale[0])
         raw, scale = None if rows else view.psnr(value), None
         if options["energy"] == "source":

@@ -31,6 +31,7 @@ from ...arrays.lookup import clamp
 from ...core import tensor_files
 from ...core.errors import UsageError, reason
 from .directions import Samples, incident, outgoing
+from .mixture import TurnedMixture
 from .model import BSDFArrays, DirectionPair, Form, LearnedBSDF, rotate
 from .training import module_types, proxy_array, residual_range
 
@@ -135,27 +136,21 @@ class Truth:
 
 
 class FunctionTruth(Truth):
-    """Source whose values f cos θ_o are those of a function ``value(wi, wo)``."""
+    """Source whose values f cos θ_o are those of a function ``value(wi, wo)``, sampled by a mixture, if any."""
 
-    def __init__(self, name: str, value: Callable):
+    def __init__(self, name: str, value: Callable, mixture=None):
         self.name, self.digest, self.value = name, "", value
+        if mixture is not None:
+            self.samples, self.sample, self.density = True, mixture.sample, mixture.density
 
 
-class TurnedTruth(Truth):
-    """Source that is turned about the normal by ``angle``, radians."""
+def rotate_truth(truth: Truth, angle: float) -> Truth:
+    """Return a source after a rotation about the normal by ``angle``, radians."""
 
-    def __init__(self, truth: Truth, angle: float):
-        self.truth, self.angle, self.name, self.digest = truth, angle, truth.name, truth.digest
-        self.samples, self.remark = truth.samples, truth.remark
+    def value(wi, wo) -> list:
+        return truth.value(rotate(wi, -angle), rotate(wo, -angle))
 
-    def value(self, wi, wo) -> list:
-        return self.truth.value(rotate(wi, -self.angle), rotate(wo, -self.angle))
-
-    def sample(self, wi, w, u, v):
-        return rotate(self.truth.sample(rotate(wi, -self.angle), w, u, v), self.angle)
-
-    def density(self, wi, wo):
-        return self.truth.density(rotate(wi, -self.angle), rotate(wo, -self.angle))
+    return FunctionTruth(truth.name, value, TurnedMixture(truth, angle) if truth.samples else None)
 
 
 #: Diffuse source of albedo 1.

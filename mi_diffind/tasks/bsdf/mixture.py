@@ -204,18 +204,18 @@ class Mixture:
 
 
 class TurnedMixture:
-    """Mixture that is turned about the normal by ``angle``, radians."""
+    """Mixture, or source that samples itself, that is turned about the normal by ``angle``, radians."""
 
-    def __init__(self, mixture: Mixture, angle: float):
+    def __init__(self, mixture, angle: float):
         self.mixture, self.angle = mixture, angle
 
-    def sample(self, wi, w, u, v, active=True):
+    def sample(self, wi, w, u, v):
         """Return directions ``wo`` from three uniform numbers each; some lie below the surface."""
-        return rotate(self.mixture.sample(rotate(wi, -self.angle), w, u, v, active), self.angle)
+        return rotate(self.mixture.sample(rotate(wi, -self.angle), w, u, v), self.angle)
 
-    def density(self, wi, wo, active=True):
+    def density(self, wi, wo):
         """Return the density of :meth:`sample` per solid angle, for directions above the surface."""
-        return self.mixture.density(rotate(wi, -self.angle), rotate(wo, -self.angle), active)
+        return self.mixture.density(rotate(wi, -self.angle), rotate(wo, -self.angle))
 
 
 def second_moment(truth_value, mixture: Mixture, truth, types, cos: float, size: int = 2**16, seed: int = 11) -> float:
