@@ -314,12 +314,14 @@ class BSDFModel(Model):
             return evaluation.measure_samples(self, measured.without_outliers(rows, self.form, self.bsdf)[0])
         return evaluation.measure(self, truth, SphereView(truth, self.types))
 
-    def decode(self, output: str | os.PathLike, rows: int | None = None, seed: int | None = None):
-        """Write a ``.csv`` or ``.exr`` file (:func:`.evaluation.write`).
+    def decode(self, output: str | os.PathLike | None = None, rows: int | None = None, seed: int | None = None):
+        """Write a ``.csv`` or ``.exr`` file (:func:`.evaluation.write`); without an ``output``, return the rows.
 
         ``rows`` and ``seed``: number of rows of a ``.csv`` file, and seed of its random directions. Raises
         :class:`.UsageError`.
         """
+        if output is None:
+            return evaluation.sample_rows(self, rows or evaluation.ROWS, seed or 0)
         return evaluation.write(self, Path(output), self.source, rows, seed)
 
 
