@@ -77,10 +77,10 @@ DENSITY = 8
 #: Neighbours that a row is compared with.
 NEIGHBOURS = 16
 
-#: A row is an outlier if its logarithm differs from its neighbours' median by this many times the usual difference …
+#: Multiple of the usual difference from the neighbours' median, of logarithms, above which a row is an outlier.
 OUTLIER = 6.0
 
-#: … and by more than this.
+#: Least difference of logarithms of an outlier.
 FAR = 0.4
 
 #: Number of rows whose neighbours measure symmetries.
