@@ -53,9 +53,8 @@ class Stock:
     """Plugins of Mitsuba that a learned plugin can stand for, fitted to what they show if need be.
 
     ``word``: the name of all of them for users; ``names``: their types in a scene. ``convert(node)`` changes the
-    properties of a :class:`~mi_diffind.plugins.support.stock.StockNode`, without the type, and returns what was fitted
-    and how well, or "", or raises :class:`~mi_diffind.plugins.support.stock.Kept`. ``advised``: a scene gains from the
-    learned plugin, so that it is put in without being asked for.
+    properties of a :class:`.StockNode`, without the type, and returns what was fitted and how well, or "", or raises
+    :class:`.Kept`. ``advised``: a scene gains from the learned plugin, so that it is put in without being asked for.
     """
 
     word: str

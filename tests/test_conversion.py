@@ -13,7 +13,7 @@ import trimesh
 
 from mi_diffind.core.errors import UsageError
 from mi_diffind.plugins.support import distance_shapes
-from mi_diffind.plugins.support.stock import Kept
+from mi_diffind.plugins.support.properties import Kept
 from mi_diffind.scenes import comparison, conversion, loading
 from mi_diffind.tasks.sdf.mesh import MeshError, load_mesh, read_serialized
 

@@ -27,7 +27,7 @@ from ..core.errors import DiffindError, UsageError
 from ..core.files import OutputError, relative_path, replacing, shown, writable_file, writable_folder
 from ..core.runtime import use_variant
 from ..fitting.task import STORAGES, fit, table_path, task_of, tasks
-from ..plugins.support.stock import Kept, StockNode
+from ..plugins.support.properties import Kept, StockNode
 from .block_test import PictureCheck, check_picture
 from .loading import ParsedScene, SceneError
 from .scene_text import difference, edited_text, with_paths
@@ -238,7 +238,7 @@ def _trace_by(seen_by: tuple[str, ...], integrators: list) -> list[Conversion]:
 def _fitted(folder: Path, progress: bool, task: str, source: Path, **options) -> Table:
     """Return the table of a fit, of this call or an earlier one, as its file holds it.
 
-    Raises :class:`~.plugins.support.stock.Kept` for a source that the task refuses.
+    Raises :class:`~.plugins.support.properties.Kept` for a source that the task refuses.
     """
     key = [task, sorted(options.items()), relative_path(source, folder)]  # the file records its source by that path
     path = folder / f"{source.stem}_{_digest(source, key)}.npz"
