@@ -33,7 +33,6 @@ from .support.distance_shapes import (
 from .support.manual import shared_parts
 from .support.placement import Placement
 from .support.properties import Kept, StockNode
-from .support.sdf_meshes import check_normals, to_mesh
 
 #: Models whose arrays cannot be optimised, shared by all shapes of a file.
 _shared: WeakValueDictionary = WeakValueDictionary()

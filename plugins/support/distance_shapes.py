@@ -37,7 +37,7 @@ from mi_diffind.tasks.sdf.mesh import directed_edges, load_mesh, read_serialized
 from .. import warn
 from . import omissions, properties
 from .placement import Placement, PlacementParameter
-from .stock import Kept
+from .properties import Kept
 from .tables import arrays_of
 
 #: Distance of secondary rays' origins from the surface: three shortest steps of a ray.
