@@ -118,13 +118,10 @@ class ParsedScene:
 
     def __init__(self, source: str | os.PathLike | dict, defines: dict[str, str] | None = None, name: str = "scene"):
         in_memory = isinstance(source, dict)
-        if not in_memory and not isinstance(source, (str, os.PathLike)):
-            source_type = (
-                "loaded scene, which cannot be changed any more" if _is_scene(source) else type(source).__name__
-            )
-            raise UsageError(
-                f"scene: found a {source_type}; a scene file is needed, or a dictionary as of mi.load_dict"
-            )
+        if not isinstance(source, (dict, str, os.PathLike)):
+            loaded = "loaded scene, which cannot be changed any more"
+            kind = loaded if isinstance(source, mi.Scene) else type(source).__name__
+            raise UsageError(f"scene: found a {kind}; a scene file is needed, or a dictionary as of mi.load_dict")
         if in_memory and defines:
             raise UsageError("defines: given with a scene in memory, allowed are scene files")
         self.path = path = Path.cwd() / name if in_memory else Path(source)
@@ -137,11 +134,10 @@ class ParsedScene:
                 return
             if fault := irregular(path, MOST_TEXT):
                 raise RuntimeError(f"{shown(path)}: {fault}")
-            if not self.path.is_file():
-                raise RuntimeError(
-                    f"{path}: {'is a folder, a scene file is needed' if path.is_dir() else 'no such scene file'}"
-                )
-            if self.path.suffix.lower() == ".npz":
+            if not path.is_file():
+                fault = "is a folder, a scene file is needed" if path.is_dir() else "no such scene file"
+                raise RuntimeError(f"{path}: {fault}")
+            if path.suffix.lower() == ".npz":
                 raise RuntimeError(f"{path}: found a table file, a scene is needed: mi_diffind.inspect shows its use")
             _, self._state = compat.parse_file(path, self.defines)
             use_slashes(self._state)
@@ -236,14 +232,13 @@ class ParsedScene:
         tables = {}
         for entry in learned:
             plugin = plugins.declared()[entry["plugin"]]
-            if not plugin.task:
-                continue
-            name, storage = entry.get("filename", ""), entry.get("storage", "") or plugin.storage
-            task = tasks()[plugin.task]
-            file = task.file(name and self.path.resolve().parent / name, entry.get("preset", ""))
-            if (str(file), storage) not in tables:
-                table = task.load(file)
-                tables[str(file), storage] = table.to(storage) if storage else table
+            if plugin.task:
+                name, storage = entry.get("filename", ""), entry.get("storage", "") or plugin.storage
+                task = tasks()[plugin.task]
+                file = task.file(name and self.path.resolve().parent / name, entry.get("preset", ""))
+                if (str(file), storage) not in tables:
+                    table = task.load(file)
+                    tables[str(file), storage] = table.to(storage) if storage else table
         return tables
 
     def table_bytes(self, learned: list[dict]) -> int:
@@ -269,7 +264,7 @@ class LoadedScene(ParsedScene):
 
     def __init__(self, scene: mi.Scene, name: str = "scene"):
         self.scene, self.path, self.defines = scene, Path.cwd() / name, {}
-        self.description = _unique()
+        self.description = os.urandom(16).hex()
 
     def load(self):
         """Return the scene."""
@@ -280,11 +275,6 @@ class LoadedScene(ParsedScene):
         return []
 
 
-def _unique() -> str:
-    """Return a text that no other call returns."""
-    return os.urandom(16).hex()
-
-
 def _description(state) -> str:
     """Return a parsed scene as text: equal texts stand for equal scenes, without the content of files.
 
@@ -292,11 +282,7 @@ def _description(state) -> str:
     """
     nodes = compat.properties_of(state)
     existing = any(compat.property_kind(props, key) == "existing" for props in nodes for key in props)
-    return "\n".join([_unique() if existing else "", *map(str, nodes)])
-
-
-def _is_scene(value) -> bool:
-    return isinstance(value, mi.Scene)
+    return "\n".join([os.urandom(16).hex() if existing else "", *map(str, nodes)])
 
 
 @in_turn
@@ -322,24 +308,25 @@ def load_file(path: str | os.PathLike, parallel: bool = True, optimize: bool = T
     with _resolving(path):
         config, state = compat.parse_file(path, defines)
         use_slashes(state)
-        compat.build_as(config, parallel, optimize)
-        return _build(config, state, _integrators(state), plugins.warn)
+        return _build_as(config, state, parallel, optimize)
 
 
 @in_turn
 def load_dict(scene: dict, parallel: bool = True, optimize: bool = True):
     """Load a scene or an object from a dictionary as ``mi.load_dict`` does, prepared as by :func:`load_file`."""
     use_variant()
-    config, state = compat.parse(scene)
-    compat.build_as(config, parallel, optimize)
-    return _build(config, state, _integrators(state), plugins.warn)
+    return _build_as(*compat.parse(scene), parallel, optimize)
 
 
 @in_turn
 def load_string(text: str, parallel: bool = True, optimize: bool = True, **defines):
     """Load a scene from a text of XML as ``mi.load_string`` does, prepared as by :func:`load_file`."""
     use_variant()
-    config, state = compat.parse(text, defines)
+    return _build_as(*compat.parse(text, defines), parallel, optimize)
+
+
+def _build_as(config, state, parallel: bool, optimize: bool):
+    """Instantiate a parsed scene with Mitsuba's own arguments; what no integrator traces is a warning."""
     compat.build_as(config, parallel, optimize)
     return _build(config, state, _integrators(state), plugins.warn)
 
