@@ -20,7 +20,7 @@ from ...core import compat
 from ...core.errors import UsageError
 from ...plugins.support import footprint
 from .. import loading
-from ..inspection import owners_of, paths_of
+from ..inspection import object_paths, owner_names
 
 #: Passes of a region, the first ones, whose times include compilation and recording.
 SETTLED = 3
@@ -230,8 +230,8 @@ class NamedParameters:
 
     def __init__(self, scene):
         self._params, self._keys = mi.traverse(scene), {}
-        objects = paths_of(scene)
-        owners, first, rest = owners_of(objects), {}, {}
+        objects = object_paths(scene)
+        owners, first, rest = owner_names(objects), {}, {}
         for key in self._params.keys():
             path = next(p for p in _parents(key) if p in owners)
             value, node = _plain(self._params[key]), objects[path]
