@@ -119,9 +119,9 @@ class ParsedScene:
     def __init__(self, source: str | os.PathLike | dict, defines: dict[str, str] | None = None, name: str = "scene"):
         in_memory = isinstance(source, dict)
         if not isinstance(source, (dict, str, os.PathLike)):
-            loaded = "loaded scene, which cannot be changed any more"
-            kind = loaded if isinstance(source, mi.Scene) else type(source).__name__
-            raise UsageError(f"scene: found a {kind}; a scene file is needed, or a dictionary as of mi.load_dict")
+            loaded = isinstance(source, mi.Scene)
+            found_type = "loaded scene, which cannot be changed any more" if loaded else type(source).__name__
+            raise UsageError(f"scene: found a {found_type}; a scene file is needed, or a dictionary as of mi.load_dict")
         if in_memory and defines:
             raise UsageError("defines: given with a scene in memory, allowed are scene files")
         self.path = path = Path.cwd() / name if in_memory else Path(source)
