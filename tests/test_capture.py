@@ -14,7 +14,7 @@ from mi_diffind.commands import cli
 from mi_diffind.core.jobs import Outcome
 from mi_diffind.scenes import capture, loading
 from mi_diffind.scenes.capture import CaptureSettings
-from mi_diffind.scenes.poses import frame_of, pose
+from mi_diffind.scenes.poses import pose, upright_frame
 from mi_diffind.tasks.radiance.views import load_views
 
 SCENES = Path(__file__).resolve().parents[1] / "scenes"
@@ -343,7 +343,7 @@ def test_an_orbit_closes_and_swings(mi_rgb):
 
 @pytest.mark.parametrize("up", [(0, 1, 0), (0, 0, 2), (1, 1, -1)])
 def test_poses_are_rigid_and_upright(mi_rgb, up):
-    frame = frame_of(up)
+    frame = upright_frame(up)
     axis = np.array(up) / np.linalg.norm(up)
     assert np.allclose(frame.T @ frame, np.eye(3)) and np.allclose(frame[:, 2], axis)
     target = np.array([0.2, -1, 3])

@@ -27,7 +27,7 @@ from mi_diffind.maps.source import load_source
 from mi_diffind.plugins.support import footprint
 from mi_diffind.scenes import loading
 from mi_diffind.scenes.training import references
-from mi_diffind.scenes.training.fit import fit_scene, joined, limit
+from mi_diffind.scenes.training.fit import fit_scene, joint_problem, limit
 from mi_diffind.scenes.training.options import (
     SCENE_ARGUMENTS,
     SceneRecipe,
@@ -41,12 +41,12 @@ from mi_diffind.scenes.training.references import ReferenceRenders
 from mi_diffind.scenes.training.rig import Rig
 from mi_diffind.scenes.training.trained_scene import (
     TrainedScene,
-    budget_of,
-    recipe_of,
-    stored_textures,
+    load_textures,
+    texture_budget,
     texture_file,
     texture_files,
     texture_problem,
+    texture_recipe,
 )
 from mi_diffind.tasks.texture.compressed import CompressedTexture, load, to_table
 from mi_diffind.tasks.texture.memory_budget import PaperBudget, TextureBudget, parse_structure
@@ -535,7 +535,7 @@ def test_a_scene_is_trained(folder, tmp_path, monkeypatch):
     save_table(tmp_path / "trained.npz", found)
     assert found.settings["source_path"] == "material.json" and found.task == "texture"
     assert found.measured["psnr_scene_db"] == pytest.approx(result.measured["psnr_db"], rel=1e-4)
-    assert recipe_of(load(tmp_path / "trained.npz")) == PRESETS["ours"]
+    assert texture_recipe(load(tmp_path / "trained.npz")) == PRESETS["ours"]
     shapes, given = ({k: (a.shape, a.bits) for k, a in t.arrays.items()} for t in (found, table))
     assert shapes == given
     # The scene that names it looks as was measured
@@ -741,8 +741,8 @@ def test_gradients_of_several_files(pair, weights):
     images, gradients = {}, {}
     for b in ("a.npz", "b.npz"):
         parsed = loading.ParsedScene(pair, {"b": b})
-        textures = stored_textures(parsed)
-        problem = joined({t.file.name: t.problem for t in textures})
+        textures = load_textures(parsed)
+        problem = joint_problem({t.file.name: t.problem for t in textures})
         scene = TrainedScene(parsed, {t.file: t.table for t in textures}, ViewDistribution(), 1)
         images[b], gradients[b] = rendered(scene, inside(problem.net), weights, 1, 2)
     np.testing.assert_allclose(images["a.npz"], images["b.npz"], atol=1e-5)
@@ -859,8 +859,8 @@ def test_arrays_of_the_same_size(folder, preset, tmp_path):
     table = to_table(CompressedTexture(layout, stored_form(net)), {**own, "loss": "mae"})  # a render's
     save_table(tmp_path / "x.npz", table)
     table = load(tmp_path / "x.npz")
-    assert budget_of(table) == wanted
-    assert recipe_of(table) == recipe
+    assert texture_budget(table) == wanted
+    assert texture_recipe(table) == recipe
 
 
 def test_a_training_that_gains_nothing_keeps_its_start(folder, path):

@@ -37,7 +37,7 @@ from ..core.units import check_memory, check_samples
 from ..images import srgb
 from ..plugins.support import footprint
 from . import loading, splats
-from .poses import frame_of, orbit_directions, pose, sphere_directions
+from .poses import orbit_directions, pose, sphere_directions, upright_frame
 from .splat_files import is_splats
 
 #: Samples of the whole image in one pass.
@@ -249,7 +249,7 @@ def capture(
     total, start, rendered, opaque = sum(map(len, splits.values())), time.perf_counter(), 0, bool(left)
     _write_lists(folder, settings, splits, box)
     if left and (workers or scheduler):
-        views = _shared(scene, subject, (settings, centre, radius), folder, left)
+        views = _view_jobs(scene, subject, (settings, centre, radius), folder, left)
         outcomes = run_jobs(
             render_separately, views, workers, scheduler, progress, "capture", "view", total - len(left)
         )
@@ -280,7 +280,7 @@ def _render(camera: CaptureCamera, splits: dict, folder: Path, split: str, i: in
     return bool((image[..., 3] > 0.999).all())
 
 
-def _shared(scene, subject: SceneSubject, given: tuple, folder: Path, left: list) -> dict[str, tuple]:
+def _view_jobs(scene, subject: SceneSubject, given: tuple, folder: Path, left: list) -> dict[str, tuple]:
     """Return the jobs of :func:`render_separately`. Raises :class:`.UsageError`."""
     source = scene if isinstance(scene, dict) else str(subject.path.resolve())
     try:
@@ -293,12 +293,12 @@ def _shared(scene, subject: SceneSubject, given: tuple, folder: Path, left: list
 def render_separately(view: tuple[bytes, str, str, int]) -> bool:
     """Render a view in this process, which loads the scene once, and write it; return whether it is opaque."""
     content, folder, split, i = view
-    camera, splits = _camera_of(content)
+    camera, splits = _cached_camera(content)
     return _render(camera, splits, Path(folder), split, i)
 
 
 @functools.lru_cache(maxsize=1)
-def _camera_of(content: bytes) -> tuple[CaptureCamera, dict]:
+def _cached_camera(content: bytes) -> tuple[CaptureCamera, dict]:
     scene, defines, settings, centre, radius, variant = pickle.loads(content)
     use_variant(variant)
     return _subject(scene, defines, settings).camera(settings), _plan(settings, centre, radius)
@@ -409,7 +409,7 @@ def _settings(scene, given: dict) -> CaptureSettings:
 
 def _plan(settings: CaptureSettings, centre: np.ndarray, radius: float) -> dict[str, list[np.ndarray]]:
     """Return the poses of each split, ``"train"`` and ``"test"``."""
-    frame = frame_of(settings.up)
+    frame = upright_frame(settings.up)
     places = (d @ frame.T * radius + centre for d in settings.directions())
     return {
         split: [pose(origin, centre, settings.up) for origin in origins]
@@ -450,7 +450,7 @@ class CaptureCamera:
         most = 1 << (max(1, PASS // self.settings.resolution**2).bit_length() - 1)
         while done < self.settings.spp:
             n = min(most, self.settings.spp - done)
-            if loading.rounded(self.sensor, n) > n:  # multijitter takes powers of four as they are
+            if loading.sampler_count(self.sensor, n) > n:  # multijitter takes powers of four as they are
                 n = 4 ** ((n.bit_length() - 1) // 2)
             with loading.scene_errors(None):
                 image = mi.render(

@@ -141,7 +141,7 @@ class _Side:
 
     def render(self, spp: int, seed: int, on_pass) -> None:
         """Render one pass of ``spp`` samples, and further ones of as many where the side is oversampled."""
-        spp = loading.samples_taken(self.scene, spp)[0]
+        spp = loading.sample_counts(self.scene, spp)[0]
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
             image, seconds = loading.render(self.scene, spp * self.oversampling, seed, self.oversampling, on_pass)
@@ -244,7 +244,7 @@ def compare(
             if stop.is_set():
                 break
 
-    loading.warn_of_black(written.scene, parsed.path, [written.image, *(side.image for side in sides.values())])
+    loading.warn_if_black(written.scene, parsed.path, [written.image, *(side.image for side in sides.values())])
     common = {
         "scene": str(parsed.path),
         "variant": mi.variant(),

@@ -106,7 +106,7 @@ def _reports(scene) -> list[dict]:
     owners, reports = owner_names(paths), []
     for path, node in paths.items():
         if plugins.origin(node) is not None:
-            report = loading.report_of(node, scene)
+            report = loading.instance_report(node, scene)
             reports.append({"owner": owners[path], "learned": report["plugin"] in learned, **report})
     return reports
 

@@ -59,7 +59,7 @@ def check_size(scene, spp: int, size: tuple[int, int] | None = None) -> None:
     units.check_samples(spp)
 
 
-def warn_of_black(scene, path: str | os.PathLike, images) -> None:
+def warn_if_black(scene, path: str | os.PathLike, images) -> None:
     """Warn if all ``images`` of a loaded scene are black."""
     if not any(image[..., :3].any() for image in images):
         plugins.warn(f"{path}: the picture is black{'' if scene.emitters() else ', the scene has no emitter'}")
@@ -357,7 +357,7 @@ def _build(config, state, integrators: list[str], report: Callable[[str], None])
         if unseen:
             report(unseen)
             omissions.settle(instance for instance in instances(loaded) if hasattr(instance, "seen_by"))
-        _warn_of_decoded(loaded, decoded, integrators)
+        _warn_decoded(loaded, decoded, integrators)
         footprint.attach(loaded)
     return loaded
 
@@ -425,7 +425,7 @@ def _sees(integrators: list[str], seen_by: tuple[str, ...]) -> bool:
     return bool(set(seen_by) & set(integrators)) and "aov" not in integrators
 
 
-def _warn_of_decoded(scene, ids: list[str], integrators: list[str]) -> None:
+def _warn_decoded(scene, ids: list[str], integrators: list[str]) -> None:
     """Warn of each shape that was decoded because the ``integrators`` cannot trace its arrays."""
     names = ", ".join(f'"{name}"' for name in integrators)
     for instance in instances(scene) if ids else ():
@@ -472,10 +472,10 @@ def reports(scene) -> list[dict]:
     (:class:`~mi_diffind.measure.operations.Operations`, by name); for the integrator of a radiance field, how many
     steps of ``rays`` are taken, skipped, … (:class:`~mi_diffind.tasks.radiance.march.RayCounts`).
     """
-    return [report_of(instance, scene) for instance in learned_instances(scene)]
+    return [instance_report(instance, scene) for instance in learned_instances(scene)]
 
 
-def report_of(instance, scene) -> dict:
+def instance_report(instance, scene) -> dict:
     """Return the report (:func:`reports`) on one of the :func:`instances` of a loaded scene, or of another object."""
     counts = bsdf_operations(instance) if isinstance(instance, mi.BSDF) else {}
     counted = hasattr(instance, "counts") and isinstance(scene, mi.Scene) and scene.sensors()
@@ -494,14 +494,14 @@ def film_size(scene) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def samples_taken(scene, spp: int, passes: int = 1) -> list[int]:
+def sample_counts(scene, spp: int, passes: int = 1) -> list[int]:
     """Return the samples a pixel of each pass of :func:`render`: samplers other than ``independent`` may round up."""
     counts = [(i + 1) * spp // passes - i * spp // passes for i in range(passes)]
-    taken = {count: rounded(scene.sensors()[0], count) for count in set(counts)}
+    taken = {count: sampler_count(scene.sensors()[0], count) for count in set(counts)}
     return [taken[count] for count in counts]
 
 
-def rounded(sensor, spp: int) -> int:
+def sampler_count(sensor, spp: int) -> int:
     """Return the samples a pixel that the sampler of a sensor takes for ``spp``."""
     sampler = sensor.sampler().clone()
     sampler.set_sample_count(spp)
@@ -528,7 +528,7 @@ def render(
 
     Returns the linear image ``(height, width, channels)``, float32, and the seconds of each pass (the first includes
     compilation). ``on_pass()`` is called after each pass. Once ``stop`` is set, the running pass is the last, and the
-    image is the average of ``len(seconds)`` passes, of :func:`samples_taken` each. The same arguments give the same
+    image is the average of ``len(seconds)`` passes, of :func:`sample_counts` each. The same arguments give the same
     image if the film's filter is a box (other filters add up samples of neighbouring pixels in any order) and the
     samples of a pass are a power of two (else the last bit of a few pixels varies).
     """

@@ -13,8 +13,11 @@ from ...core.interrupt import interruptible
 from .page import Page, server
 from .session import WIDTH, Session
 
-#: Address at which the page is served by default.
-HOST, PORT = "127.0.0.1", 8080
+#: Host at which the page is served by default: only this machine can open it.
+HOST = "127.0.0.1"
+
+#: Port at which the page is served by default.
+PORT = 8080
 
 
 def view(

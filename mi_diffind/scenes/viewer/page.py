@@ -269,7 +269,7 @@ class Page:
 
     def _send(self, client) -> None:
         if self._picture is not None:
-            image = padded(self._picture, client.camera.aspect)
+            image = pad(self._picture, client.camera.aspect)
             quality = MOVING_QUALITY if self.session.moving else QUALITY
             client.scene.set_background_image(image, format="jpeg", jpeg_quality=quality)
 
@@ -282,7 +282,7 @@ def to_world(wxyz: np.ndarray, position: np.ndarray) -> np.ndarray:
     return matrix
 
 
-def padded(picture: np.ndarray, aspect: float) -> np.ndarray:
+def pad(picture: np.ndarray, aspect: float) -> np.ndarray:
     """Return a picture ``(height, width, 3)`` between black bars, so that width over height is ``aspect``."""
     height, width = picture.shape[:2]
     if not math.isfinite(aspect) or not 0.05 < aspect < 20:
