@@ -215,14 +215,13 @@ def capture(
     """Render the views of a ``scene`` into ``folder``, in the variant that is set.
 
     The scene is a file or a dictionary as of ``mi.load_dict``; of a loaded scene, lights could not be hidden. It may
-    also be a file of 3D Gaussians (:mod:`.splat_files`), of which ``box`` crops a part.
-    ``given`` are fields of :class:`CaptureSettings`, the options of ``mi-diffind capture`` as keywords: ``views=60``,
-    ``resolution=160``, ``path="orbit"``, …; ``defines`` replace the file's ``<default>`` parameters; ``workers``
-    processes share the views, or those of the Dask cluster ``scheduler``. The folder is created if its parent exists.
-    Views of an earlier capture with the same settings of the same scene are kept, unless a dictionary holds objects
-    that exist already; after Ctrl-C the current view is the last. Raises :class:`.UsageError` for bad
-    settings, :class:`CaptureError`, also for a folder with other settings, :class:`.SceneError`,
-    :class:`.SplatsError` and :class:`.OutputError`.
+    also be a file of 3D Gaussians (:mod:`.splat_files`), of which ``box`` crops a part. ``given`` are fields of
+    :class:`CaptureSettings`, the options of ``mi-diffind capture`` as keywords: ``views=60``, ``resolution=160``,
+    ``path="orbit"``, …; ``defines`` replace the file's ``<default>`` parameters; ``workers`` processes share the views,
+    or those of the Dask cluster ``scheduler``. The folder is created if its parent exists. Views of an earlier capture
+    with the same settings of the same scene are kept, unless a dictionary holds objects that exist already; after
+    Ctrl-C the current view is the last. Raises :class:`.UsageError` for bad settings, :class:`CaptureError`, also for a
+    folder with other settings, :class:`.SceneError`, :class:`.SplatsError` and :class:`.OutputError`.
     """
     use_variant()
     settings = _settings(scene, given)

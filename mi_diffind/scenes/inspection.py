@@ -62,8 +62,7 @@ def inspect(file_or_scene, measure: bool = False, *, defines: Mapping[str, objec
     - ``measure``: measure the accuracy of a table file in each storage form, against the truth that it was fitted to.
     - ``defines``: values of a scene file's ``<default>`` parameters.
 
-    Raises :class:`.UsageError`, :class:`.TableError` and
-    :class:`.SceneError`.
+    Raises :class:`.UsageError`, :class:`.TableError` and :class:`.SceneError`.
     """
     use_variant()
     is_file = isinstance(file_or_scene, (str, os.PathLike))

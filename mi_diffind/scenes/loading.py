@@ -50,8 +50,7 @@ def check_renderable(scene, path: str | os.PathLike = "scene", needs: tuple[str,
 def check_size(scene, spp: int, size: tuple[int, int] | None = None) -> None:
     """Refuse a picture that takes more memory than this machine has, or too many samples per pixel.
 
-    ``size`` is its width and height, by default that of the first sensor's film. Raises
-    :class:`.UsageError`.
+    ``size`` is its width and height, by default that of the first sensor's film. Raises :class:`.UsageError`.
     """
     width, height = size or map(int, scene.sensors()[0].film().crop_size())
     channels = scene.sensors()[0].film().base_channels_count()

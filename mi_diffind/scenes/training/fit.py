@@ -100,9 +100,8 @@ def fit_scene(
     and level bias the training starts from, in place of the textures'. If no state renders the held-out views better
     than the start, the tables hold the start (setting ``kept_start``). Runs in the variant that is set.
 
-    Raises :class:`.SceneError`, :class:`.UsageError`,
-    :class:`.TableError`, :class:`~mi_diffind.maps.source.SourceError`,
-    :class:`.FittingError` and :class:`.OutputError`.
+    Raises :class:`.SceneError`, :class:`.UsageError`, :class:`.TableError`,
+    :class:`~mi_diffind.maps.source.SourceError`, :class:`.FittingError` and :class:`.OutputError`.
     """
     request = dataclasses.replace(request, settings=recipe.settings)
     textures = load_textures(parsed, files, starts, recipe.start == "file")

@@ -51,10 +51,9 @@ class SceneProblem(Problem):
     """Training problem (:mod:`mi_diffind.fitting.loop`) of a texture in a scene.
 
     ``texture`` is the problem of the same arrays without a scene, of one texture or several, whose ``net`` is trained;
-    ``scene`` reads the arrays.
-    ``trained`` and ``measured`` are pairs of a view and its reference, ``(height, width, channels)``. ``preview`` is a
-    picture of the first measured view, written at each measurement: reference | render | :data:`SHOWN` times their
-    difference.
+    ``scene`` reads the arrays. ``trained`` and ``measured`` are pairs of a view and its reference, ``(height, width,
+    channels)``. ``preview`` is a picture of the first measured view, written at each measurement: reference | render |
+    :data:`SHOWN` times their difference.
     """
 
     #: Tolerance of the PSNR of renders, dB.

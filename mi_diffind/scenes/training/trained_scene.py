@@ -197,8 +197,7 @@ def load_textures(
     """Return the textures of a scene that are trained: of the ``files``, by default of all that hold arrays.
 
     ``starts`` are files to start from; each belongs to the texture that has its maps and its source. Raises
-    :class:`.UsageError`, :class:`.TableError` and
-    :class:`~mi_diffind.maps.source.SourceError`.
+    :class:`.UsageError`, :class:`.TableError` and :class:`~mi_diffind.maps.source.SourceError`.
     """
     given = texture_files(parsed, files)
     tables = {file: load(file) for file in given}

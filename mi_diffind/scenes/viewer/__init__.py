@@ -44,8 +44,7 @@ def view(
     - ``announce``: called with a sentence that names the page.
 
     Returns the figures of the last picture (:attr:`.session.Session.figures`) with the ``url`` and ``seconds_shown``.
-    Raises :class:`.UsageError`, also if viser is not installed, and as
-    :class:`.session.Session` does.
+    Raises :class:`.UsageError`, also if viser is not installed, and as :class:`.session.Session` does.
     """
     start = time.perf_counter()
     session = Session(source, width, spp, seed, against=against, defines=defines)
