@@ -57,9 +57,7 @@ def sphere(row: int, column: int):
     name, color, changes = ROWS[row]
     x, z = place(row, column)
     placed = transform(
-        scale={"value": 0.5},
-        rotate=turn("x", -90),
-        translate={"x": round(x, 3), "y": 0.5, "z": round(z, 3)},
+        scale={"value": 0.5}, rotate=turn("x", -90), translate={"x": round(x, 3), "y": 0.5, "z": round(z, 3)}
     )
     learned = {PRESET: f"${PRESET}", "storage": "$storage", "effects": "$effects"}
     values = {**DEFAULTS, **changes, name: column / (COLUMNS - 1)}

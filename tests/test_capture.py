@@ -268,10 +268,7 @@ def test_what_hides_nothing_is_said(mi_rgb, scene, tmp_path, capsys):
         (("--radius", "0"), "radius: found 0, allowed are numbers > 0"),
         (("--radius", "nan"), "radius: found nan, allowed are numbers > 0"),
         (("--fov", "180"), "fov: found 180, allowed are degrees between 0 and 170"),
-        (
-            ("--elevation", "30", "20"),
-            "elevation: found 30 to 20, allowed are degrees from −90 to 90, the lower first",
-        ),
+        (("--elevation", "30", "20"), "elevation: found 30 to 20, allowed are degrees from −90 to 90, the lower first"),
         (("--up", "0", "0", "0"), "up: found no direction"),
         (("--centre", "0", "inf", "0"), "centre: found NaN or infinity"),
     ],
