@@ -88,9 +88,9 @@ def test_other_integrators_and_variants(mi_any, tmp_path):
     for name in ("path", *(("volpath", "path_footprint", "path_sdf", "neural_field") if rgb else ())):
         file = "" if name != "neural_field" else f'<string name="filename" value="{SCENES / "assets/group.npz"}"/>'
         integrator = f'<integrator type="{name}"><integer name="max_depth" value="$depth"/>{file}</integrator>'
-        found = auto_depth(scene_file(tmp_path, FURNACE, integrator, depth=8), 0.05)
-        assert (found["chosen"], found["scene"]) == (6, 8), name
-        assert found["left_out"] == pytest.approx((0.5**5 - 0.5**7) / (1 - 0.5**7), abs=1.5e-3)
+        found = auto_depth(scene_file(tmp_path, FURNACE, integrator, depth=6), 0.2)
+        assert (found["chosen"], found["scene"]) == (4, 6), name
+        assert found["left_out"] == pytest.approx((0.5**3 - 0.5**5) / (1 - 0.5**5), abs=1.5e-3)
     if rgb:
         fog = scene_file(tmp_path, FOG, '<integrator type="volpath"/>')
         assert auto_depth(fog, 0.5)["shares"][1]["share"] > 0
@@ -119,8 +119,6 @@ def test_left_out_is_what_a_render_lacks(mi_rgb):
     file = SCENES / "tiles.xml"
     found = auto_depth(file, 0.05)
     assert 2 < found["chosen"] < found["scene"] == 5
-    other = auto_depth(file, 0.05, seed=1)
-    assert {**found, "probe_seconds": 0} != {**other, "probe_seconds": 0}
     emitted, chosen, full = (
         luminance(loading.render(loading.load(file, longest_path=d, defines=SMALL), 64)[0])
         for d in (1, found["chosen"], 5)
