@@ -15,14 +15,16 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 
+from mi_diffind.core.errors import UsageError
 from mi_diffind.core.files import write_json
 from mi_diffind.core.progress import progress_bar
 from mi_diffind.images import films
@@ -36,6 +38,15 @@ ASSETS = SCENES / "assets"
 
 #: Frames a second; samples a pixel of the floor, whose light has noise, and of the truth.
 RATE, SAMPLES, TRUTH = 12, 4, 64
+
+#: Colour of a label.
+INK = (32, 32, 32)
+
+#: Colour of the space around panels.
+PAPER = (255, 255, 255)
+
+#: Height of a label over that of its text.
+LABEL = 1.7
 
 #: Settings of panels of the scenes, without "spp".
 FLOOR = {"max_depth": 3}
@@ -189,10 +200,52 @@ def psnr(panels: Panels) -> dict[str, float]:
     return {label: float(-10 * np.log10(error)) for label, error in errors.items() if not label.startswith("truth")}
 
 
+def beside(
+    panels: Mapping[str, Sequence[np.ndarray]], columns: int, text_height: int = 13, gap: int = 4
+) -> list[np.ndarray]:
+    """Return the frames of several films of one size and length as one film, ``columns`` panels in a row.
+
+    ``panels``: label → frames of bytes, ``(height, width, 3)``. The label stands above its panel, in text of
+    ``text_height`` pixels; ``gap`` pixels separate columns.
+
+    Raises :class:`.UsageError` for panels of different lengths or sizes.
+    """
+    from PIL import Image, ImageDraw, ImageFont
+
+    if len({len(frames) for frames in panels.values()}) != 1:
+        counts = ", ".join(f"{len(frames)} of {label!r}" for label, frames in panels.items()) or "no panel"
+        raise UsageError(f"panels: found {counts}, allowed are one or more panels of equally many frames")
+    films.check_frames([frame for frames in panels.values() for frame in frames], (3,))
+    height, width, _ = next(iter(panels.values()))[0].shape
+    columns, band = min(columns, len(panels)), round(LABEL * text_height)
+    rows = -(-len(panels) // columns)
+    size = (columns * (width + gap) - gap, rows * (height + band))
+    sheet, font = Image.new("RGB", size, PAPER), ImageFont.truetype(_font(), text_height)
+    corners, draw = [], ImageDraw.Draw(sheet)
+    for i, label in enumerate(panels):
+        x, y = i % columns * (width + gap), i // columns * (height + band)
+        draw.text((x + width / 2, y + band / 2), label, fill=INK, font=font, anchor="mm")
+        corners.append((x, y + band))
+    empty, frames = np.array(sheet), []
+    for together in zip(*panels.values(), strict=True):
+        frame = empty.copy()
+        for (x, y), image in zip(corners, together, strict=True):
+            frame[y : y + height, x : x + width] = image
+        frames.append(frame)
+    return frames
+
+
+def _font() -> str:
+    """Return the path of DejaVu Sans, which Matplotlib brings."""
+    import matplotlib
+
+    return os.path.join(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf")
+
+
 def make(name: str, frames: int, out: Path, json_folder: Path | None, quality: float) -> None:
     """Render a film and write it."""
     film = FILMS[name](frames)
-    shown = films.beside(film.panels, film.columns)
+    shown = beside(film.panels, film.columns)
     rendered_frames = len(shown)
     if film.returns:
         shown += shown[-2:0:-1]

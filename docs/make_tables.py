@@ -29,10 +29,10 @@ from list_numbers import headlines
 
 import mi_diffind
 from mi_diffind.fitting.task import tasks
-from mi_diffind.tasks.image import memory_budget as image_budget
-from mi_diffind.tasks.radiance import presets as field_presets
+from mi_diffind.tasks import radiance as field_presets
+from mi_diffind.tasks.image import arrays as image_budget
 from mi_diffind.tasks.sdf import paper as sdf_paper
-from mi_diffind.tasks.texture import memory_budget as texture_budget
+from mi_diffind.tasks.texture import arrays as texture_budget
 
 DOCS = Path(__file__).resolve().parent
 
@@ -795,12 +795,11 @@ def field_surroundings() -> Table:
     """Return figures of a capture without alpha, with and without surroundings."""
     rows = []
     for name, row in measured("bench_surroundings")["rows"].items():
-        error = row.get("exposure_error_stops")
         rows.append([
             name, f"{row['psnr_white_db']:.2f}", f"{row['ssim_white']:.3f}", f"{row['file_bytes'] / 1e6:.1f}",
-            f"{row['cpu_minutes']:.1f}", "" if error is None else f"{error:.3f}",
+            f"{row['cpu_minutes']:.1f}",
         ])  # fmt: skip
-    return table(["", "dB", "SSIM", "MB on disk", "minutes of a core", "error of exposures, stops"], rows)
+    return table(["", "dB", "SSIM", "MB on disk", "minutes of a core"], rows)
 
 
 #: Figures for NeRF's synthetic scene lego at 800²: method, paper, dB before white, MB on disk as far as it is stated.

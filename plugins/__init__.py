@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from mi_diffind.core import compat, discovery, mitsuba_versions
+from mi_diffind.core import compat, discovery
 
 #: Modules of this package that are no plugins.
 IGNORED = ("support",)
@@ -186,7 +186,7 @@ def register(variant: str) -> None:
             factory = _refusal(plugin.name, variant)
         else:
             continue
-        mitsuba_versions.register(plugin.object_type, plugin.name, factory)
+        compat.register(plugin.object_type, plugin.name, factory)
 
 
 def _load() -> list[Plugin]:
@@ -212,7 +212,7 @@ def _checked(plugin: Plugin):
 
     def make(props):
         instance = plugin.factory(props)
-        needed = mitsuba_versions.base_class(OBJECT_TYPES[plugin.object_type])
+        needed = compat.base_class(OBJECT_TYPES[plugin.object_type])
         if not isinstance(instance, needed):  # Mitsuba would crash
             returned = "nothing" if instance is None else f"a {type(instance).__name__}"
             raise RuntimeError(

@@ -5,11 +5,10 @@ from __future__ import annotations  # Delayed parsing of type annotations
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind.core.mitsuba_versions import base_class, lobe_rates
+from mi_diffind.core.compat import base_class, lobe_rates
 from mi_diffind.tasks.disney import model, sampling
 from mi_diffind.tasks.disney.decoder import Decoder, Lobe
-from mi_diffind.tasks.disney.effects import Effects, find_effects
-from mi_diffind.tasks.disney.model import LOBES
+from mi_diffind.tasks.disney.model import LOBES, Effects, find_effects
 
 from . import Counterpart, Plugin
 from .support import frozen, properties, tables
@@ -174,16 +173,9 @@ class Disney(mi.BSDF):
 
     #: Parameter → default, in the order of the manual page.
     DEFAULTS = {  # noqa: RUF012
-        "roughness": 0.5,
-        "anisotropic": 0.0,
-        "metallic": 0.0,
-        "spec_tint": 0.0,
-        "sheen": 0.0,
-        "sheen_tint": 0.0,
-        "flatness": 0.0,
-        "clearcoat": 0.0,
-        "clearcoat_gloss": 0.0,
-    }
+        "roughness": 0.5, "anisotropic": 0.0, "metallic": 0.0, "spec_tint": 0.0, "sheen": 0.0, "sheen_tint": 0.0,
+        "flatness": 0.0, "clearcoat": 0.0, "clearcoat_gloss": 0.0,
+    }  # fmt: skip
 
     RATES = {  # noqa: RUF012
         "diffuse": "diffuse_reflectance_sampling_rate",
@@ -194,13 +186,9 @@ class Disney(mi.BSDF):
     def __init__(self, props: mi.Properties):
         super().__init__(props)
 
-        if "subsurface" in props:
-            if "flatness" in props:
-                raise RuntimeError('parameter "subsurface": is another name of "flatness", give only one of the two')
-            aliases = {"flatness": "subsurface"}
-        else:
-            aliases = {}
-
+        if "subsurface" in props and "flatness" in props:
+            raise RuntimeError('parameter "subsurface": is another name of "flatness", give only one of the two')
+        aliases = {"flatness": "subsurface"} if "subsurface" in props else {}
         self.base_color = props.get_texture("base_color", 0.5)
         properties.check_range(props, "base_color", 0, 1)
         self.scalars = {}

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_diffind.arrays.lookup import clamp
-from mi_diffind.core import compat, mitsuba_versions
+from mi_diffind.core import compat
 
 from .map_texture import MapTexture
 from .support import footprint, omissions
@@ -163,7 +163,7 @@ class FilteredTexture(MapTexture):
         if self.filter.name == "off" or not self.is_spatially_varying():
             left_out["footprint"] = "the filter is off" if self.filter.name == "off" else "the map is constant"
         else:
-            sources = [*(["interaction"] if mitsuba_versions.has_footprints() else []), "uv partials"]
+            sources = [*(["interaction"] if compat.has_footprints() else []), "uv partials"]
             if self.cone is not None:
                 sources.append("sensor" if self.cone is not self._cone_of_parameters else "parameters")
             else:

@@ -9,9 +9,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_diffind.arrays.bounds import ValueBounds
+from mi_diffind.arrays.boxes import ValueBounds
 from mi_diffind.arrays.lookup import clamp
-from mi_diffind.core.mitsuba_versions import base_class
+from mi_diffind.core.compat import base_class
 from mi_diffind.images import srgb
 from mi_diffind.maps.layout import MapLayout
 

@@ -5,7 +5,7 @@ from __future__ import annotations  # Delayed parsing of type annotations
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind.core import memory
+from mi_diffind.core import compat
 from mi_diffind.images import srgb
 from mi_diffind.maps.pyramid import TexelPyramid
 
@@ -141,7 +141,7 @@ class MipMap(FilteredTexture):
             data, channels = self._data.tensor, self.map.channels
             if data.ndim != 3 or data.shape[2] != channels or 0 in data.shape:
                 shape = tuple(data.shape)
-                memory.assign(data, self._data.accepted)
+                compat.assign(data, self._data.accepted)
                 raise RuntimeError(f'parameter "data": has the shape {shape}, expected (height, width, {channels})')
             self._data.accepted = dr.detach(data)
             self._shared = SharedMaps(TexelPyramid(self._entry, data, self.image.border), {})

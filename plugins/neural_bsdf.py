@@ -12,10 +12,9 @@ from mi_diffind.arrays.indirection import DifferentiableArray
 from mi_diffind.arrays.lookup import clamp
 from mi_diffind.arrays.tables import TableError
 from mi_diffind.core import compat
+from mi_diffind.core.compat import base_class
 from mi_diffind.core.errors import UsageError
-from mi_diffind.core.mitsuba_versions import base_class
 from mi_diffind.tasks.bsdf import TASK
-from mi_diffind.tasks.bsdf.family_files import ARRAYS
 from mi_diffind.tasks.bsdf.files import RESIDUAL
 from mi_diffind.tasks.bsdf.model import ALPHA_MIN, DIFFUSE, EDGE, LOBE, LOGARITHMS, PARAMETERS, TERMS, Proxy, ProxyLobe
 from mi_diffind.tasks.bsdf.truth import MitsubaTruth
@@ -162,7 +161,7 @@ class NeuralBSDF(mi.BSDF):
             self.model.arrays.pop("energy", None)
             self.model.refresh()
         self.textures = {}
-        for parameter in getattr(self.model, "parameters", ()):
+        for parameter in self.model.parameters:
             properties.check_range(props, parameter.name, parameter.low, parameter.high)
             self.textures[parameter.name] = props.get_unbounded_texture(parameter.name, parameter.middle)
         self.proxy = _parameters(self.model) if self.model.form.terms and not self.textures else {}
@@ -184,14 +183,14 @@ class NeuralBSDF(mi.BSDF):
         self.m_flags = flags
 
     def _arrays(self) -> dict:
-        names = (*ARRAYS, "proxy") if self.textures else RESIDUAL
+        names = (*RESIDUAL, "proxy") if self.textures else RESIDUAL
         return {name: self.model.arrays[name] for name in names if name in self.model.arrays}
 
     def trained(self) -> tuple:
         """Return the table of the file, and the arrays that can be optimised, by name."""
         arrays = tables.exposed(self._arrays())
         if self.proxy:
-            arrays = {**arrays, "proxy": _stored(self.proxy)}
+            arrays = {**arrays, "proxy": _proxy_array(self.proxy, self.model.form)}
         return self.model.table, arrays
 
     def traverse(self, cb: mi.TraversalCallback):
@@ -344,30 +343,25 @@ class NeuralBSDF(mi.BSDF):
         return f"NeuralBSDF[\n  {(',' + chr(10) + '  ').join(lines)}\n]"
 
 
+def _names(form) -> dict[str, tuple[slice, float]]:
+    """Return name of a parameter of the proxy → its place in a file, and the factor on what the file holds there."""
+    names = {"diffuse": (DIFFUSE, 1), "edge": (slice(EDGE, EDGE + 1), 1)} if "diffuse" in form.terms else {}
+    axes = {"alpha_u": (0, 1, 1)} | ({} if form.isotropic else {"alpha_v": (1, 2, 1)})
+    parts = {**axes, "gamma": (2, 3, 2), "f0": (3, 6, 1), "f90": (6, 9, 1)}
+    for k, term in enumerate(TERMS[1:]):
+        a = 4 + k * LOBE
+        if term in form.terms:
+            names |= {f"{term}.{n}": (slice(a + i, a + j), factor) for n, (i, j, factor) in parts.items()}
+    return names
+
+
 def _parameters(model) -> dict:
     """Return the proxy's parameters by name, in linear units."""
-    logarithms = np.clip(model.arrays["proxy"].numpy().ravel().astype(np.float64), *LOGARITHMS)
-    values, form, result = np.exp(logarithms), model.form, {}
-
-    def number(value):
-        return dr.opaque(mi.Float, float(value))
-
-    def colour(values):
-        return mi.Color3f(*map(number, values))
-
-    if "diffuse" in form.terms:
-        result |= {"diffuse": colour(values[DIFFUSE]), "edge": number(values[EDGE])}
-    for k, name in enumerate(TERMS[1:]):
-        a = 4 + k * LOBE
-        if name in form.terms:
-            v = values[a : a + LOBE]
-            result |= {
-                f"{name}.alpha_u": number(v[0]),
-                **({} if form.isotropic else {f"{name}.alpha_v": number(v[1])}),
-                f"{name}.gamma": number(2 * v[2]),
-                f"{name}.f0": colour(v[3:6]),
-                f"{name}.f90": colour(v[6:9]),
-            }
+    values = np.exp(np.clip(model.arrays["proxy"].numpy().ravel().astype(np.float64), *LOGARITHMS))
+    result = {}
+    for name, (place, factor) in _names(model.form).items():
+        numbers = [dr.opaque(mi.Float, float(factor * v)) for v in values[place]]
+        result[name] = mi.Color3f(*numbers) if len(numbers) == 3 else numbers[0]
     return result
 
 
@@ -391,22 +385,14 @@ def _proxy(parameters: dict, form) -> Proxy:
     return Proxy.of_parts([limited(c) for c in parameters["diffuse"]], limited(parameters["edge"]), lobes)
 
 
-def _stored(parameters: dict) -> DifferentiableArray:
+def _proxy_array(parameters: dict, form) -> DifferentiableArray:
     """Return the logarithms of parameters as the array ``proxy`` of a file."""
     values = np.full(PARAMETERS, np.exp(LOGARITHMS[0]))
-
-    def numbers(name):
-        value = parameters[name]
-        return [float(dr.detach(c).numpy()[0]) for c in (value if dr.depth_v(value) > 1 else [value])]
-
-    if "diffuse" in parameters:
-        values[DIFFUSE], values[EDGE] = numbers("diffuse"), numbers("edge")[0]
-    for k, name in enumerate(TERMS[1:]):
-        if f"{name}.alpha_u" in parameters:
-            a = 4 + k * LOBE
-            alpha_v = f"{name}.alpha_v" if f"{name}.alpha_v" in parameters else f"{name}.alpha_u"
-            values[a : a + 3] = *numbers(f"{name}.alpha_u"), *numbers(alpha_v), numbers(f"{name}.gamma")[0] / 2
-            values[a + 3 : a + 6], values[a + 6 : a + 9] = numbers(f"{name}.f0"), numbers(f"{name}.f90")
+    for name, (place, factor) in _names(form).items():
+        value = dr.detach(parameters[name])
+        values[place] = np.ravel(value.numpy())[: place.stop - place.start] / factor
+        if name.endswith("alpha_u"):  # of isotropic files, both
+            values[place.start + 1] = values[place.start]
     logarithms = np.log(np.maximum(values, np.exp(LOGARITHMS[0]))).astype(np.float32)[:, None]
     return DifferentiableArray((PARAMETERS,), 1, logarithms).alloc(mi.TensorXf)
 
@@ -424,7 +410,7 @@ def _spectrum(rgb: list, wavelengths):
 class SourceBSDF(NeuralBSDF):
     """Source of a table file in its place: at one point of its textures, or not a plugin of Mitsuba. The file samples.
 
-    ``truth`` is a :class:`mi_diffind.tasks.bsdf.source.Truth`.
+    ``truth`` is a :class:`mi_diffind.tasks.bsdf.measured.Truth`.
     """
 
     def __init__(self, props: mi.Properties, truth):
@@ -436,11 +422,12 @@ class SourceBSDF(NeuralBSDF):
 
 
 class _Values:
+    """Values f, without the cosine, of a source."""
+
     def __init__(self, truth):
         self.truth = truth
 
     def value(self, wi, wo) -> list:
-        """Return f without the cosine."""
         return [v / wo.z for v in self.truth.value(wi, wo)]
 
 
@@ -477,13 +464,12 @@ def _source(learned: NeuralBSDF, props: mi.Properties):
         if not truth.function:
             raise UsageError(f"{name}: its source, {truth.name}, is rows of measured values, which show no picture")
         return truth
-    numbers = [p.name for p in model.parameters if p.name in props and not properties.is_number(props, p.name)]
-    if numbers:
-        raise UsageError(f'parameter "{numbers[0]}": found a texture, the source of {name} is compared at numbers')
-    values = [float(props.get(p.name, p.middle)) for p in model.parameters]
-    return model.family().at(
-        [float(p.coordinate(mi.Float(v))[0]) for p, v in zip(model.parameters, values, strict=True)]
-    )
+    coordinates = []
+    for p in model.parameters:
+        if p.name in props and not properties.is_number(props, p.name):
+            raise UsageError(f'parameter "{p.name}": found a texture, the source of {name} is compared at numbers')
+        coordinates.append(float(p.coordinate(mi.Float(props.get(p.name, p.middle)))[0]))
+    return model.family().at(coordinates)
 
 
 def _to_source(props: mi.Properties) -> str:

@@ -9,19 +9,15 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_diffind.arrays.tables import TableError
-from mi_diffind.core import compat, mitsuba_versions
-from mi_diffind.tasks.radiance.march import OPAQUE
+from mi_diffind.core import compat
 
 from . import Counterpart, Plugin, warn
 from .path_footprint import integrator as path_footprint
-from .path_footprint import relative
 from .support import distance_shapes as sdf
 from .support import omissions, properties, tables
 from .support.differentials import Differentials
-from .support.field_light import FieldLight, in_order
-from .support.joined_fields import grouped
 from .support.manual import shared_parts
-from .support.placed_fields import PlacedField, VariantLight, to_grid
+from .support.placed_fields import FieldLight, PlacedField, VariantLight, grouped, in_order, to_grid
 
 #: Properties that the default integrator of surfaces takes.
 INNER = ("max_depth", "rr_depth", "hide_emitters", "jitter")
@@ -95,25 +91,23 @@ Radiance field among surfaces (:monosp:`neural_field`)
    - |exposed|, |differentiable|
 
 A captured radiance field (Datta et al., *Efficient Graphics Representation with Differentiable Indirection*, SIGGRAPH
-Asia 2023, task 7) among ordinary surfaces. Each camera ray is marched through the field up to the first surface. The
-emission of the field is summed from front to back; the radiance of the inner integrator is added, times the remaining
-transmittance. A ray that becomes opaque in the field (a transmittance below :math:`10^{-4}`) sees no surface. A ray
-that misses the box of the field shows the inner integrator alone. Where there is no surface behind the field, alpha on
-the film is one minus the transmittance.
+Asia 2023, task 7) among ordinary surfaces. Each camera ray is marched through the field up to the first surface; the
+radiance of the inner integrator is added, times the remaining transmittance. A ray that becomes opaque in the field (a
+transmittance below :math:`10^{-4}`) sees no surface. Where there is no surface behind the field, alpha on the film is
+one minus the transmittance.
 
 **Mirrors and glass.** Rays are followed across surfaces that are smooth throughout (:monosp:`conductor`,
-:monosp:`dielectric`, :monosp:`thindielectric`, :monosp:`null`, no medium inside), and marched through the field between
-them. All other surfaces, including those with a smooth lobe and another lobe (:monosp:`plastic`, :monosp:`mask`), are
-rendered by the inner integrator. Paths of a limited ``max_depth`` may be longer by the smooth surfaces before.
-Participating media count as being behind the field. Rays keep their footprints across mirrors.
+:monosp:`dielectric`, :monosp:`thindielectric`, :monosp:`null`, no medium inside), with their footprints, and marched
+through the field between them. All other surfaces, including those with a smooth lobe and another lobe
+(:monosp:`plastic`, :monosp:`mask`), are rendered by the inner integrator. Paths of a limited ``max_depth`` may be
+longer by the smooth surfaces before. Participating media count as being behind the field.
 
 **Light and shadow.** With ``lit``, every segment of a path is marched through the field: surfaces are lit and shadowed
 by the field, and it is visible in rough mirrors, in the coat of :monosp:`plastic` and through the holes of a
 :monosp:`mask`. The estimator is unbiased for light that surfaces scatter any number of times. Directions towards the
 field are sampled from cones around its bright parts; they and the samples of BSDFs are weighted by the power heuristic.
 The field itself is not lit: it keeps the light of its capture. Participating media are not rendered, which a warning
-says. Without ``lit``, the inner integrator does not see the field: the field casts no light and no shadow, and is not
-visible in rough mirrors, in :monosp:`plastic` or through a :monosp:`mask`.
+says. Without ``lit``, the inner integrator does not see the field.
 
 **Spectral variants** treat the radiance as that of an emitter of this colour: upsampled, times D65. ``mono`` variants
 take the luminance. Polarised variants are not supported.
@@ -123,9 +117,8 @@ take the luminance. Polarised variants are not supported.
 steps of half the smallest voxel there, and ``to_world`` of such fields has no derivatives.
 
 **Surroundings.** A field of ``fit field --background surroundings`` fills all space: a cube around its objects, and
-what is beyond, coarser with the distance. Rays that meet no surface end in the surroundings, so that alpha is 1 where
-these are opaque. Such a field cannot be nested with others, and its ``to_world`` has no derivatives, unless
-``surroundings`` is false.
+what is beyond, coarser with the distance. Alpha is 1 where the surroundings are opaque. Such a field cannot be nested
+with others, and its ``to_world`` has no derivatives, unless ``surroundings`` is false.
 
 **Derivatives** with respect to the field's arrays and its ``to_world`` replay the rays (Vicini et al., *Path Replay
 Backpropagation*, SIGGRAPH 2021). They cover the radiance, alpha and the channels of ``aovs``. If the inner integrator
@@ -133,14 +126,11 @@ replays paths, too (:monosp:`path_footprint`, :monosp:`path_sdf`, :monosp:`prb`,
 materials, textures and emitters; any other inner integrator is constant, and so is the geometry. With ``lit``, the
 derivatives with respect to the field include its light and its shadow on surfaces; alpha behind holes is constant.
 
-``to_world`` may change between renders; the field is then that of a new scene. Its derivatives, with any ``storage``,
-include the sides of the box and the surfaces that cut the field. Where occupied cells end before the density is zero,
-the field jumps, and the jump has no derivative: derivatives of pixels with respect to ``to_world`` are then several
-percent off differences.
+``to_world`` may change between renders. Its derivatives, with any ``storage``, include the sides of the box and the
+surfaces that cut the field. Where occupied cells end before the density is zero, the field jumps, and the jump has no
+derivative: derivatives of pixels with respect to ``to_world`` are then several percent off differences.
 
-The base classes of Mitsuba write an alpha of 0 or 1, and they fail with AOVs in the backward pass, since they multiply
-AOVs, which are numbers, by the weight of the ray, which is a spectrum. This integrator has render passes of its
-own. Inside another integrator, such as :monosp:`aov`, alpha is 0 or 1. If :monosp:`mi.render` is given an integrator
+Inside another integrator, such as :monosp:`aov`, alpha is 0 or 1. If :monosp:`mi.render` is given an integrator
 without a field for a scene with one, it warns once.
 
 {executable}
@@ -206,25 +196,18 @@ def is_smooth(bsdf):
 
 def has_smooth(scene: mi.Scene) -> bool:
     """Return whether the scene has a smooth surface that rays are followed across; an instance counts as one."""
-    for shape in scene.shapes():
-        bsdf = shape.bsdf()
-        if compat.is_instance(shape):
-            return True
-        if bsdf is not None and is_smooth(bsdf) and not shape.is_medium_transition():
-            return True
-    return False
+    return any(
+        compat.is_instance(shape)
+        or (shape.bsdf() is not None and is_smooth(shape.bsdf()) and not shape.is_medium_transition())
+        for shape in scene.shapes()
+    )
 
 
 def with_holes(scene: mi.Scene) -> list[str]:
     """Return the names of shapes whose material has holes, such as a ``mask``."""
-    names = []
-    for shape in scene.shapes():
-        bsdf = shape.bsdf()
-        if bsdf is not None:
-            flags = bsdf.flags()
-            if mi.has_flag(flags, mi.BSDFFlags.Null) and mi.has_flag(flags, mi.BSDFFlags.Smooth):
-                names.append(shape.id())
-    return names
+    flags = {shape.id(): shape.bsdf().flags() for shape in scene.shapes() if shape.bsdf() is not None}
+    both = mi.BSDFFlags.Null, mi.BSDFFlags.Smooth
+    return [name for name, of_shape in flags.items() if all(mi.has_flag(of_shape, flag) for flag in both)]
 
 
 @cache
@@ -335,7 +318,7 @@ def integrator() -> type:
             for name, values in self.placed.exposed.items():
                 cb.put(f"tables.{name}", values, mi.ParamFlags.Differentiable)
             flags = mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous
-            cb.put("to_world", self.placed.position.transform, flags)
+            cb.put("to_world", self.placed.transform, flags)
             cb.put("surfaces", self.nested, mi.ParamFlags.Differentiable)
 
         def trained(self) -> tuple:
@@ -358,19 +341,11 @@ def integrator() -> type:
             return list(self.aovs)
 
         def report(self) -> dict:
-            field = self.placed.field
-            report = {
-                "voxel": field.voxel * self.placed.placement.size,
-                "surfaces": compat.integrator_name(self.surfaces),
-            }
-            if self.model is None:
+            voxel = self.placed.field.voxel * self.placed.placement.size
+            report = {"voxel": voxel, "surfaces": compat.integrator_name(self.surfaces)}
+            if (model := self.model) is None:
                 return report
-            return {
-                "preset": self.model.table.preset,
-                "storage": self.model.storage,
-                "table_bytes": self.model.nbytes,
-                **report,
-            }
+            return {"preset": model.table.preset, "storage": model.storage, "table_bytes": model.nbytes, **report}
 
         def to_string(self) -> str:
             path = self.model.table.path if self.model is not None else ""
@@ -386,7 +361,7 @@ def integrator() -> type:
             with dr.suspend_grad():
                 _, _, _, ray, _, _ = self._begin(scene, sensor, 0, 1)
                 pi = scene.ray_intersect_preliminary(ray, coherent=True, active=True)
-                return self.placed.count(ray, dr.minimum(pi.t, ray.maxt)).asdict()
+                return vars(self.placed.count(ray, dr.minimum(pi.t, ray.maxt)))
 
         def sample_rays(self, scene, sensor, sampler):
             """Sample camera rays as the inner integrator does."""
@@ -415,7 +390,11 @@ def integrator() -> type:
 
         @staticmethod
         def _developed(film, spp, place, light, alpha, aovs, wavelengths):
-            """Return the image of samples. The weight of a ray applies to its light, not to its AOVs."""
+            """Return the image of samples.
+
+            Mitsuba's base classes write an alpha of 0 or 1, and multiply AOVs by the weight of a ray, which fails in
+            the backward pass. Here, the weight applies to the light alone.
+            """
             block = film.create_block()
             block.set_coalesce(block.coalesce() and spp >= 4)
             compat.splat(block, film, place, light, alpha, aovs, wavelengths)
@@ -485,9 +464,9 @@ def integrator() -> type:
             return any(compat.identity(v) not in field_arrays for v in attached)
 
         def _check_moving(self) -> None:
-            if any(placed.position.moving() and placed not in self.groups for placed in self.fields):
+            if any(placed.moving() and placed not in self.groups for placed in self.fields):
                 raise RuntimeError('parameter "to_world": has no derivatives for a field that overlaps another one')
-            if any(placed.position.moving() and placed.field.unbounded for placed in self.fields):
+            if any(placed.moving() and placed.field.unbounded for placed in self.fields):
                 raise RuntimeError('parameter "to_world": has no derivatives for a field with surroundings')
 
         def sample(self, mode, scene, sampler, ray, δL=None, δaovs=None, state_in=None, active=True, **kwargs):
@@ -575,7 +554,7 @@ def integrator() -> type:
 
             A ``mode`` of ``None`` is the primal phase. Without smooth surfaces, a single piece is enough.
             """
-            solids = sdf.distance_shapes_in(scene) if hasattr(self.surfaces, "sample_shapes") else ()
+            solids = sdf.distance_shapes_in(scene) if getattr(self.surfaces, "traces_solids", False) else ()
             if self.smooth_depth == 0 or not has_smooth(scene):
                 return sampler, self._piece(mode, scene, sampler, path, solids, surfaces, False, False)
 
@@ -615,7 +594,7 @@ def integrator() -> type:
 
             # Across a smooth surface
             arrived = active & (through > 0) & ~solid
-            flags = mitsuba_versions.ray_flags(curvature=carried)
+            flags = compat.ray_flags(curvature=carried)
             si = pi.compute_surface_interaction(ray, ray_flags=flags, active=arrived)
             bsdf = si.bsdf(ray)
             going = arrived & si.is_valid() & (path.count < self.smooth_depth)
@@ -637,7 +616,7 @@ def integrator() -> type:
             path.light = light + emitted_now if mode is None else light - emitted_now
             if mode is not None and surfaces:
                 with dr.resume_grad():
-                    both = dr.select(shining, emitted, 0) + dr.select(going, path.light * relative(weight), 0)
+                    both = dr.select(shining, emitted, 0) + dr.select(going, path.light * dr.relative_grad(weight), 0)
                     if mode == dr.ADMode.Backward:
                         dr.backward_from(path.change * both, dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
                     else:
@@ -678,8 +657,7 @@ def integrator() -> type:
 
         def _see(self, mode, path, placed, ray, far, crossed, first, before):
             """Add the light of a field behind a transmittance ``before``; return the transmittance behind the field."""
-            marched = placed.march(ray, far, crossed)
-            through = dr.select(marched.transmittance > OPAQUE, marched.transmittance, 0)
+            marched, through = placed.march(ray, far, crossed)
             light = dr.select(crossed, path.throughput * self.light.of(marched.colour, ray.wavelengths, crossed), 0)
             depth = dr.select(first, before * marched.depth * placed.size, 0)
             if mode is None:

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_diffind.core import compat
-from mi_diffind.core.mitsuba_versions import base_class, normal_mapped
+from mi_diffind.core.compat import base_class, normal_mapped
 from mi_diffind.tasks.disney import TASK as DISNEY
 from mi_diffind.tasks.disney.model import clamp
 from mi_diffind.tasks.shading.material import frame, shadowing

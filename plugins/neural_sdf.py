@@ -14,7 +14,7 @@ import numpy as np
 
 from mi_diffind.arrays.tables import TableError
 from mi_diffind.core import compat
-from mi_diffind.fitting.task import stamp
+from mi_diffind.core.files import stamp
 from mi_diffind.tasks.sdf import TASK
 
 from . import Counterpart, Plugin, Stock, reports_as, shown_as, warn

@@ -7,7 +7,7 @@ from functools import cache
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind.core import compat, mitsuba_versions
+from mi_diffind.core import compat
 
 from . import Plugin
 from .support import footprint, omissions
@@ -100,18 +100,6 @@ class Centred:
         return getattr(self._sampler, name)
 
 
-def power_heuristic(a, b):
-    """Return the weight of a sample of density ``a``, where another technique has the density ``b``."""
-    return dr.select(a > 0, dr.rcp(1 + dr.square(b / a)), 0)
-
-
-def relative(value):
-    """Return 1 with the derivative of the logarithm of ``value``; 0 where ``value`` is 0."""
-    detached = dr.detach(value)
-    nonzero = detached != 0
-    return dr.select(nonzero, value / dr.select(nonzero, detached, 1), 0)
-
-
 @cache
 def integrator() -> type:
     """Return the class for the variant that is set; its base class exists only after Mitsuba loaded this file."""
@@ -123,7 +111,7 @@ def integrator() -> type:
         #: Rays carry differentials, from which textures get footprints (:mod:`.filtered_texture`).
         gives_footprints = True
 
-        #: Radiance fields between the surfaces (:class:`.field_light.FieldLight`), or ``None``.
+        #: Radiance fields between the surfaces (:class:`.placed_fields.FieldLight`), or ``None``.
         between = None
 
         def __init__(self, props: mi.Properties):
@@ -173,6 +161,39 @@ def integrator() -> type:
                 setattr(ray, f"o_{x}", ray.o + (getattr(ray, f"o_{x}") - ray.o) * scale + start * turn)
                 setattr(ray, f"d_{x}", ray.d + turn)
 
+        # ---------------- What a path meets (path_sdf adds its shapes) ----------------
+
+        def solids(self, scene):
+            """Return the shapes of a scene that rays are traced through, and Mitsuba does not see: none."""
+            return ()
+
+        def nearest(self, solids, ray, pi, active, rest=0, before=None):
+            """Return the hit of a ray: ``pi``, or that of a nearer solid. ``before`` is the hit of the vertex before.
+
+            ``rest`` is what :meth:`spawn` returned with the ray.
+            """
+            return pi
+
+        def interaction(self, solids, ray, hit, flags, active, moving=False):
+            """Return the surface interaction at a hit, attached to solids and to the vertex before if ``moving``."""
+            return hit.compute_surface_interaction(ray, ray_flags=flags, active=active)
+
+        def occluded(self, solids, hit, si, ds, active):
+            """Return whether a solid lies between a vertex and the sample of an emitter."""
+            return mi.Bool(False)
+
+        def spawn(self, solids, hit, si, d) -> tuple:
+            """Return the ray from a vertex in the direction ``d``, and the rest of its origin."""
+            return si.spawn_ray(d), 0
+
+        def attach_emitter(self, si, ds):
+            """Attach the sample of an emitter to a vertex that moves; return a factor of 1 with the derivative."""
+            return mi.Float(1)
+
+        def attach_direction(self, solids, si, bs, ray, hit, active) -> tuple:
+            """Return the sampled direction, attached to a vertex that moves, and a factor of 1 with the derivative."""
+            return bs.wo, mi.Float(1)
+
         @compat.syntax
         def sample(self, mode, scene, sampler, ray, δL=None, state_in=None, active=True, **kwargs):
             """Trace paths; see ``ADIntegrator.sample``.
@@ -180,145 +201,169 @@ def integrator() -> type:
             In the differential phases, ``L`` is the radiance that is still to come at the current vertex; it starts as
             the radiance of the whole path (``state_in``).
             """
-            primal, between = mode == dr.ADMode.Primal, self.between
-            moving = not primal and between is not None and between.optimised()
+            primal, solids, fields = mode == dr.ADMode.Primal, self.solids(scene), self.between
+            solids_move = not primal and any(solid.optimised() for solid in solids)
+            fields_move = not primal and fields is not None and fields.optimised()
             unattached = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad  # a field may be all that is optimised
-            carried = bool(getattr(ray, "has_differentials", False))
-            environment = scene.environment() is not None and not self.hide_emitters
-            flags = mitsuba_versions.ray_flags(curvature=carried)
-            context = mi.BSDFContext()
+            carried = bool(getattr(ray, "has_differentials", False)) and not solids
+            flags = compat.ray_flags(curvature=carried)
             scale = dr.opaque(mi.Float, footprint.scale_of(sampler.sample_count()))
+            bsdf_ctx, mis_weight = mi.BSDFContext(), mi.ad.integrators.common.mis_weight
 
             differentials = Differentials.of(ray)
             ray = mi.Ray3f(dr.detach(ray))
             active = mi.Bool(active)
-            valid = mi.Bool(environment)
+            valid_ray = mi.Bool(scene.environment() is not None and not self.hide_emitters)
             depth = mi.UInt32(0)
             L = mi.Spectrum(0 if primal else state_in)
             δL = mi.Spectrum(0 if δL is None else δL)
-            throughput = mi.Spectrum(1)
-            eta = mi.Float(1)
-            before = dr.zeros(mi.SurfaceInteraction3f)
-            density = mi.Float(1)
-            delta = mi.Bool(True)
+            β = mi.Spectrum(1)
+            η = mi.Float(1)
+            prev_si = dr.zeros(mi.SurfaceInteraction3f)
+            prev_bsdf_pdf = mi.Float(1)
+            prev_bsdf_delta = mi.Bool(True)
             clear = mi.Float(1)  # transmittance of fields before the first surface that changes a ray
+
+            # ---------------------- Hide area emitters ----------------------
 
             pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
             if dr.hint(self.hide_emitters, mode="scalar"):
                 hidden = active & pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711  (lane by lane)
                 at = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, hidden)
-                pi[hidden] = self.skip_area_emitters(scene, at.spawn_ray(ray.d), True, hidden)
+                behind = self.skip_area_emitters(scene, at.spawn_ray(ray.d), True, hidden)
+                behind.t += at.t
+                pi[hidden] = behind
+            hit = self.nearest(solids, ray, pi, active)
 
-            while dr.hint(active, max_iterations=self.max_depth, label=f"path_footprint ({mode.name})"):
-                si = pi.compute_surface_interaction(ray, ray_flags=flags, active=active)
+            while dr.hint(active, max_iterations=self.max_depth, label=f"{type(self).__name__} ({mode.name})"):
+                with dr.resume_grad(when=solids_move):
+                    moving_si = self.interaction(solids, ray, hit, flags, active, solids_move)
                 if dr.hint(carried, mode="scalar"):
-                    differentials = differentials.at(ray, si)
-                    si.duv_dx, si.duv_dy = differentials.footprint(ray, si)
+                    differentials = differentials.at(ray, moving_si)
+                    moving_si.duv_dx, moving_si.duv_dy = differentials.footprint(ray, moving_si)
+                si = dr.detach(moving_si)
                 bsdf = si.bsdf(ray)
 
-                # Emission, weighted against having sampled the emitter at the vertex before
+                # ---------------------- Direct emission ----------------------
+
+                # Weighted against having sampled the emitter at the previous vertex
                 shown = active
                 if dr.hint(self.hide_emitters, mode="scalar"):
                     # Fields are visible where the environment is not
-                    shown &= (valid if between is not None else depth > 0) | si.is_valid()
-                ds = mi.DirectionSample3f(scene, si, before)
-                weight = power_heuristic(density, scene.pdf_emitter_direction(before, ds, shown & ~delta))
+                    shown &= (valid_ray if fields is not None else depth > 0) | si.is_valid()
+                ds = mi.DirectionSample3f(scene, si, prev_si)
+                em_pdf = scene.pdf_emitter_direction(prev_si, ds, shown & ~prev_bsdf_delta)
                 with dr.resume_grad(when=not primal):
-                    emitted = throughput * weight * ds.emitter.eval(si, shown)
+                    Le = β * mis_weight(prev_bsdf_pdf, em_pdf) * ds.emitter.eval(si, shown)
 
-                # Light from an emitter, and the next direction
-                going = active & si.is_valid() & (depth + 1 < self.max_depth)
-                smooth = going & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-                lit = mi.Bool(smooth)
-                ds, emitter_weight = scene.sample_emitter_direction(si, sampler.next_2d(), True, lit)
-                lit &= ds.pdf != 0
-                wo = si.to_local(ds.d)
-                shadow, beam = mi.Float(1), mi.Ray3f(ray)
-                if dr.hint(between is not None, mode="scalar"):
-                    beam = si.spawn_ray_to(ds.p)
-                    shadow = between.transmittance(beam, beam.maxt, lit)
+                # ------------- Emitter sampling, and the next direction -------------
+
+                active_next = active & si.is_valid() & (depth + 1 < self.max_depth)
+                active_field = active_next & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+                active_em = mi.Bool(active_field)
+                ds, em_weight = scene.sample_emitter_direction(si, sampler.next_2d(), True, active_em)
+                active_em &= ds.pdf != 0
+                active_em &= ~self.occluded(solids, hit, si, ds, active_em)
+                through, ray_em = mi.Float(1), mi.Ray3f(ray)
+                if dr.hint(fields is not None, mode="scalar"):
+                    ray_em = si.spawn_ray_to(ds.p)
+                    through = fields.transmittance(ray_em, ray_em.maxt, active_em)
                 with dr.resume_grad(when=not primal):
+                    J = mi.Float(1)
+                    if dr.hint(solids_move, mode="scalar"):
+                        J = self.attach_emitter(moving_si, ds)
                     if dr.hint(not primal, mode="scalar"):
-                        value = scene.eval_emitter_direction(si, ds, lit) * dr.select(lit, dr.rcp(ds.pdf), 0)
-                        emitter_weight = dr.replace_grad(emitter_weight, value)
+                        em_value = scene.eval_emitter_direction(moving_si, ds, active_em)
+                        em_weight = dr.replace_grad(em_weight, em_value * dr.select(active_em, dr.rcp(ds.pdf), 0)) * J
                     # Together with the next direction: the textures of a material are read once
                     bsdf_value, bsdf_pdf, bs, bsdf_weight = bsdf.eval_pdf_sample(
-                        context, si, wo, sampler.next_1d(), sampler.next_2d(), going
-                    )
-                    weight = dr.select(ds.delta, 1, power_heuristic(ds.pdf, dr.detach(bsdf_pdf)))
-                    direct = dr.select(lit, throughput * weight * shadow * bsdf_value * emitter_weight, 0)
-                if dr.hint(moving, mode="scalar"):
-                    δL += between.derive(mode, beam, beam.maxt, lit, δL, mi.Spectrum(0), dr.detach(direct))
-                if dr.hint(between is not None, mode="scalar"):
-                    # Light from a field
-                    toward, chance = between.sample(si.p, sampler.next_1d(), sampler.next_2d(), smooth)
-                    smooth &= chance > 0
-                    with dr.resume_grad(when=not primal):
-                        bsdf_value, bsdf_pdf = bsdf.eval_pdf(context, si, si.to_local(toward), smooth)
-                    smooth &= dr.max(dr.detach(bsdf_value)) > 0
-                    beam = si.spawn_ray(toward)
-                    far = scene.ray_intersect_preliminary(beam, coherent=False, active=smooth).t
-                    shine, _ = between.cross(beam, far, smooth)
-                    weight = power_heuristic(chance, dr.detach(bsdf_pdf)) * dr.rcp(chance)
-                    weight = dr.select(smooth, throughput * weight, 0)
-                    with dr.resume_grad(when=not primal):
-                        direct += dr.select(smooth, weight * bsdf_value * shine, 0)
-                    if dr.hint(moving, mode="scalar"):
-                        weight = weight * dr.detach(bsdf_value)
-                        δL += between.derive(mode, beam, far, smooth, δL, weight, weight * shine)
+                        bsdf_ctx, moving_si, moving_si.to_local(ds.d), sampler.next_1d(), sampler.next_2d(),
+                        active_next,
+                    )  # fmt: skip
+                    mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, dr.detach(bsdf_pdf)))
+                    Lr_dir = dr.select(active_em, β * mis * through * bsdf_value * em_weight, 0)
                 bs = dr.detach(bs)
-                delta_next = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-                L = L + emitted + direct if primal else L - dr.detach(emitted + direct)
+                bsdf_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
 
-                if dr.hint(not primal, mode="scalar"):
-                    with dr.resume_grad():
-                        # A smooth mirror cannot be evaluated: there, the weight itself is differentiated
-                        rough = bsdf.eval(context, si, bs.wo, going & ~delta_next)
-                        reflected = L * dr.select(delta_next, relative(bsdf_weight), relative(rough))
-                        contribution = emitted + direct + dr.select(going, reflected, 0)
-                        if dr.hint(mode == dr.ADMode.Backward, mode="scalar"):
-                            dr.backward_from(δL * contribution, unattached)
-                        else:
-                            δL += dr.forward_to(contribution, flags=unattached)
+                # ---------------------- Light from a field ----------------------
 
-                out = si.to_world(bs.wo)
+                if dr.hint(fields_move, mode="scalar"):
+                    δL += fields.derive(mode, ray_em, ray_em.maxt, active_em, δL, mi.Spectrum(0), dr.detach(Lr_dir))
+                if dr.hint(fields is not None, mode="scalar"):
+                    d, field_pdf = fields.sample(si.p, sampler.next_1d(), sampler.next_2d(), active_field)
+                    active_field &= field_pdf > 0
+                    with dr.resume_grad(when=not primal):
+                        bsdf_value, bsdf_pdf = bsdf.eval_pdf(bsdf_ctx, si, si.to_local(d), active_field)
+                    active_field &= dr.max(dr.detach(bsdf_value)) > 0
+                    ray_em = si.spawn_ray(d)
+                    far = scene.ray_intersect_preliminary(ray_em, coherent=False, active=active_field).t
+                    Le_field, _ = fields.cross(ray_em, far, active_field)
+                    weight = mis_weight(field_pdf, dr.detach(bsdf_pdf)) * dr.rcp(field_pdf)
+                    weight = dr.select(active_field, β * weight, 0)
+                    with dr.resume_grad(when=not primal):
+                        Lr_dir += dr.select(active_field, weight * bsdf_value * Le_field, 0)
+                    if dr.hint(fields_move, mode="scalar"):
+                        weight = weight * dr.detach(bsdf_value)
+                        δL += fields.derive(mode, ray_em, far, active_field, δL, weight, weight * Le_field)
+                L = L + Le + Lr_dir if primal else L - dr.detach(Le + Lr_dir)
+
+                # ---------------------- Next vertex ----------------------
+
+                wo = si.to_world(bs.wo)
                 if dr.hint(carried, mode="scalar"):
-                    edges = compat.normal_edges(pi, si, ray, going)
-                    differentials = differentials.bounced(ray, si, out, bs.eta, bs.pdf, delta_next, scale, edges)
-                valid |= active & si.is_valid() & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
-                ray = si.spawn_ray(out)
-                before = dr.detach(si)
-                throughput *= dr.detach(bsdf_weight)
-                eta *= bs.eta
-                density = bs.pdf
-                delta = delta_next
+                    edges = compat.normal_edges(hit, si, ray, active_next)
+                    differentials = differentials.bounced(ray, si, wo, bs.eta, bs.pdf, bsdf_delta, scale, edges)
+                valid_ray |= active & si.is_valid() & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+                ray, rest = self.spawn(solids, hit, si, wo)
+                β *= dr.detach(bsdf_weight)
+                η *= bs.eta
 
                 # Russian roulette, without the factor η² of radiance at boundaries
-                largest = dr.max(throughput)
-                survival = dr.minimum(largest * dr.square(eta), 0.95)
-                roulette = depth >= self.rr_depth
-                survives = sampler.next_1d() < survival
-                throughput[roulette] *= dr.rcp(survival)
-                active = going & (largest != 0) & (~roulette | survives)
-                depth[going] += 1
-                pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+                β_max = dr.max(β)
+                rr_prob = dr.minimum(β_max * dr.square(η), 0.95)
+                rr_active = depth >= self.rr_depth
+                rr_continue = sampler.next_1d() < rr_prob
+                β[rr_active] *= dr.rcp(rr_prob)
+                active = active_next & (β_max != 0) & (~rr_active | rr_continue)
+                depth[active_next] += 1
+                hit = self.nearest(
+                    solids, ray, scene.ray_intersect_preliminary(ray, coherent=False, active=active), active, rest, hit
+                )
 
-                if dr.hint(between is not None, mode="scalar"):
-                    # Fields up to the next surface, weighted against having sampled this direction towards them
-                    shine, passed = between.cross(ray, pi.t, active)
-                    weight = power_heuristic(density, between.density(before.p, ray.d, active & ~delta))
-                    weight = dr.select(active, throughput * weight, 0)
-                    if dr.hint(moving, mode="scalar"):
-                        δL += between.derive(mode, ray, pi.t, active, δL, weight, L)
-                    shine = dr.select(active, weight * shine, 0)
-                    L = L + shine if primal else L - shine
-                    clear = dr.select(active & ~valid, clear * passed, clear)
-                    throughput *= dr.select(active, passed, 1)
-                    active &= passed > 0
+                # ---------------------- Differential phases ----------------------
 
-            visible = L if between is not None else dr.select(valid, L, 0)
-            result = visible if primal else δL
-            return result, valid, [clear] if between is not None else [], L
+                if dr.hint(not primal, mode="scalar"):
+                    wo, J = bs.wo, mi.Float(1)
+                    if dr.hint(solids_move, mode="scalar"):
+                        wo, J = self.attach_direction(solids, moving_si, bs, ray, hit, active)
+                    with dr.resume_grad():
+                        # A smooth mirror cannot be evaluated: its weight is differentiated instead
+                        rough = bsdf.eval(bsdf_ctx, moving_si, wo, active_next & ~bsdf_delta)
+                        factor = dr.select(bsdf_delta, dr.relative_grad(bsdf_weight), dr.relative_grad(rough) * J)
+                        Lo = Le + Lr_dir + dr.select(active_next, L * factor, 0)
+                        if dr.hint(mode == dr.ADMode.Backward, mode="scalar"):
+                            dr.backward_from(δL * Lo, unattached)
+                        else:
+                            δL += dr.forward_to(Lo, flags=unattached)
+
+                # ---------------------- Fields up to the next vertex ----------------------
+
+                prev_si, prev_bsdf_pdf, prev_bsdf_delta = si, bs.pdf, bsdf_delta
+                if dr.hint(fields is not None, mode="scalar"):
+                    # Weighted against having sampled this direction towards them
+                    Le_field, through = fields.cross(ray, hit.t, active)
+                    field_pdf = fields.density(prev_si.p, ray.d, active & ~prev_bsdf_delta)
+                    weight = dr.select(active, β * mis_weight(prev_bsdf_pdf, field_pdf), 0)
+                    if dr.hint(fields_move, mode="scalar"):
+                        δL += fields.derive(mode, ray, hit.t, active, δL, weight, L)
+                    Le_field = dr.select(active, weight * Le_field, 0)
+                    L = L + Le_field if primal else L - Le_field
+                    clear = dr.select(active & ~valid_ray, clear * through, clear)
+                    β *= dr.select(active, through, 1)
+                    active &= through > 0
+
+            visible = L if fields is not None else dr.select(valid_ray, L, 0)
+            return visible if primal else δL, valid_ray, [] if fields is None else [clear], L
 
     return PathFootprint
 

@@ -2,16 +2,15 @@
 
 from __future__ import annotations  # Delayed parsing of type annotations
 
+from dataclasses import dataclass
 from functools import cache
 
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind.core import compat
-from mi_diffind.core.mitsuba_versions import ray_flags
+from mi_diffind.core.compat import ray_flags
 
 from . import Plugin, path_footprint
-from .path_footprint import power_heuristic, relative
 from .support import distance_shapes as sdf
 from .support.manual import shared_parts
 
@@ -74,178 +73,91 @@ supported.
 """
 
 
-def solid_angle(origin, place, normal):
-    """Return the solid angle of a unit of area at ``place``, seen from ``origin``."""
-    to = place - origin
-    squared = dr.squared_norm(to)
-    return dr.abs(dr.dot(to, normal)) * dr.rcp(squared * dr.sqrt(squared))
+@dataclass  # a type that loops of Dr.Jit accept as state
+class SolidHit:
+    """Hit of Mitsuba's shapes ``pi`` or of a distance shape ``solid``; one of them is not valid.
+
+    ``d`` is the direction of the ray; ``previous`` and ``previous_d`` are ``solid`` and ``d`` of the vertex before.
+    """
+
+    pi: mi.PreliminaryIntersection3f
+    solid: sdf.ShapeHit
+    d: mi.Vector3f
+    previous: sdf.ShapeHit
+    previous_d: mi.Vector3f
 
 
 @cache
 def integrator() -> type:
     """Return the integrator's class in the current variant."""
+    jacobian = mi.ad.integrators.common.solid_angle_to_area_jacobian
 
     @shared_parts
     class PathSDF(path_footprint.integrator()):
         __doc__ = MANUAL
 
+        #: Rays are traced through distance shapes (:mod:`.distance_shapes`).
+        traces_solids = True
+
         def to_string(self) -> str:
             return super().to_string().replace("PathFootprint", "PathSDF", 1)
-
-        def sample(self, mode, scene, *args, **kwargs):
-            """See ``ADIntegrator.sample``. A scene without distance shapes is rendered by ``path_footprint``."""
-            shapes = sdf.distance_shapes_in(scene)
-            if not shapes:
-                return super().sample(mode, scene, *args, **kwargs)
-            return self.sample_shapes(mode, scene, shapes, *args, **kwargs)
 
         def render_backward(self, scene, params, grad_in, *args, **kwargs):
             """See ``ADIntegrator.render_backward``. Warns of a shape without derivatives."""
             super().render_backward(scene, params, grad_in, *args, **kwargs)
-            sdf.check_derivatives(sdf.distance_shapes_in(scene), grad_in)
+            sdf.check_derivatives(self.solids(scene), grad_in)
 
-        def intersect(self, scene, shapes, ray, coherent, active, rest):
-            """Return the nearest hit, of an ordinary shape or of a distance shape; the other one is not valid."""
-            pi = scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
-            return self.nearer(shapes, ray, pi, active, rest)
+        def solids(self, scene):
+            return sdf.distance_shapes_in(scene)
 
-        def nearer(self, shapes, ray, pi, active, rest=0):
-            hit = sdf.intersect(shapes, ray.o, ray.d, dr.minimum(pi.t, ray.maxt), active, rest)
-            pi.t = dr.select(hit.number > 0, dr.inf, pi.t)
-            return pi, hit
+        def nearest(self, solids, ray, pi, active, rest=0, before=None):
+            if not solids:
+                return pi
+            solid = sdf.intersect(solids, ray.o, ray.d, dr.minimum(pi.t, ray.maxt), active, rest)
+            pi.t = dr.select(solid.number > 0, dr.inf, pi.t)
+            previous = (dr.zeros(sdf.ShapeHit), mi.Vector3f(ray.d)) if before is None else (before.solid, before.d)
+            return SolidHit(pi, solid, mi.Vector3f(ray.d), *previous)
 
-        def interaction(self, shapes, ray, pi, hit, active):
-            """Return the surface interaction at the hit; ordinary shapes are not differentiated."""
-            with dr.suspend_grad():
-                si = pi.compute_surface_interaction(ray, ray_flags=ray_flags(), active=active)
-            return sdf.interaction(shapes, hit, ray, si, active)
+        def interaction(self, solids, ray, hit, flags, active, moving=False):
+            if not solids:
+                return super().interaction(solids, ray, hit, flags, active)
+            with dr.suspend_grad():  # ordinary shapes are constants
+                si = hit.pi.compute_surface_interaction(ray, ray_flags=flags, active=active)
+            si = sdf.interaction(solids, hit.solid, ray, si, active)
+            if moving:
+                # Seen from the vertex before, which also moves
+                aside = sdf.shift(solids, hit.previous, hit.previous_d, active & si.is_valid())
+                turn = aside - ray.d * dr.dot(aside, ray.d)
+                si.wi += dr.detach(si.sh_frame).to_local(turn) * dr.rcp(dr.select(si.is_valid(), si.t, 1))
+            return si
 
-        @compat.syntax
-        def sample_shapes(self, mode, scene, shapes, sampler, ray, δL=None, state_in=None, active=True, **kwargs):
-            """Implement ``sample`` for a scene with distance shapes; see ``path_footprint``."""
-            primal = mode == dr.ADMode.Primal
-            moving = not primal and any(shape.optimised() for shape in shapes)
-            environment = scene.environment() is not None and not self.hide_emitters
-            context = mi.BSDFContext()
+        def occluded(self, solids, hit, si, ds, active):
+            return sdf.occluded_from(solids, hit.solid, si, ds, active) if solids else mi.Bool(False)
 
-            ray = mi.Ray3f(dr.detach(ray))
-            active = mi.Bool(active)
-            valid = mi.Bool(environment)
-            depth = mi.UInt32(0)
-            L = mi.Spectrum(0 if primal else state_in)
-            δL = mi.Spectrum(0 if δL is None else δL)
-            throughput = mi.Spectrum(1)
-            eta = mi.Float(1)
-            before = dr.zeros(mi.SurfaceInteraction3f)
-            density = mi.Float(1)
-            delta = mi.Bool(True)
+        def spawn(self, solids, hit, si, d):
+            ray, rest = super().spawn(solids, hit, si, d)
+            if solids:
+                ray.o, rest = sdf.spawn(solids, hit.solid, si, d)
+            return ray, rest
 
-            pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-            if dr.hint(self.hide_emitters, mode="scalar"):
-                hidden = active & pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711  (lane by lane)
-                at = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, hidden)
-                after = self.skip_area_emitters(scene, at.spawn_ray(ray.d), True, hidden)
-                after.t += at.t
-                pi[hidden] = after
-            pi, hit = self.nearer(shapes, ray, pi, active)
-            before_ray, before_hit = mi.Ray3f(ray), dr.zeros(sdf.ShapeHit)  # of the vertex before
+        def attach_emitter(self, si, ds):
+            # Points of emitters stay fixed, and so do directions to infinite ones
+            flags = ds.emitter.flags()
+            finite = ~mi.has_flag(flags, mi.EmitterFlags.Infinite)
+            distance = dr.norm(ds.p - si.p)
+            ds.d = dr.replace_grad(ds.d, dr.select(finite, (ds.p - si.p) / distance, ds.d))
+            ds.dist = dr.replace_grad(ds.dist, dr.select(finite, distance, ds.dist))
+            surface = mi.has_flag(flags, mi.EmitterFlags.Surface)
+            return dr.select(surface, dr.relative_grad(jacobian(si.p, ds.p, ds.n)), 1)
 
-            while dr.hint(active, max_iterations=self.max_depth, label=f"path_sdf ({mode.name})"):
-                with dr.resume_grad(when=moving):
-                    si = self.interaction(shapes, ray, pi, hit, active)
-                    if dr.hint(moving, mode="scalar"):
-                        # Seen from the vertex before, which also moves
-                        aside = sdf.shift(shapes, before_hit, before_ray.d, active & si.is_valid())
-                        turn = aside - ray.d * dr.dot(aside, ray.d)
-                        si.wi += dr.detach(si.sh_frame).to_local(turn) * dr.rcp(dr.select(si.is_valid(), si.t, 1))
-                fixed = dr.detach(si)
-                bsdf = si.bsdf(ray)
-
-                # Emission, weighted against having sampled the emitter at the vertex before
-                shown = active
-                if dr.hint(self.hide_emitters, mode="scalar"):
-                    shown &= (depth > 0) | si.is_valid()
-                ds = mi.DirectionSample3f(scene, fixed, before)
-                weight = power_heuristic(density, scene.pdf_emitter_direction(before, ds, shown & ~delta))
-                with dr.resume_grad(when=not primal):
-                    emitted = throughput * weight * ds.emitter.eval(fixed, shown)
-
-                # Light from an emitter, and the next direction
-                going = active & si.is_valid() & (depth + 1 < self.max_depth)
-                lit = going & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-                ds, emitter_weight = scene.sample_emitter_direction(fixed, sampler.next_2d(), True, lit)
-                lit &= ds.pdf != 0
-                lit &= ~sdf.occluded_from(shapes, hit, fixed, ds, lit)
-                with dr.resume_grad(when=not primal):
-                    factor = mi.Float(1)
-                    if dr.hint(moving, mode="scalar"):
-                        # Points of emitters stay fixed, and so do directions to infinite ones
-                        flags = ds.emitter.flags()
-                        finite = ~mi.has_flag(flags, mi.EmitterFlags.Infinite)
-                        away = dr.norm(ds.p - si.p)
-                        toward = dr.select(finite, (ds.p - si.p) / away, ds.d)
-                        ds.d = dr.replace_grad(ds.d, toward)
-                        ds.dist = dr.replace_grad(ds.dist, dr.select(finite, away, ds.dist))
-                        if mi.has_flag(flags, mi.EmitterFlags.Surface):
-                            factor = relative(solid_angle(si.p, ds.p, ds.n))
-                    if dr.hint(not primal, mode="scalar"):
-                        value = scene.eval_emitter_direction(si, ds, lit) * dr.select(lit, dr.rcp(ds.pdf), 0)
-                        emitter_weight = dr.replace_grad(emitter_weight, value) * factor
-                    # Together with the next direction: the textures of a material are read once
-                    bsdf_value, bsdf_pdf, bs, bsdf_weight = bsdf.eval_pdf_sample(
-                        context, si, si.to_local(ds.d), sampler.next_1d(), sampler.next_2d(), going
-                    )
-                    weight = dr.select(ds.delta, 1, power_heuristic(ds.pdf, dr.detach(bsdf_pdf)))
-                    direct = dr.select(lit, throughput * weight * bsdf_value * emitter_weight, 0)
-                bs = dr.detach(bs)
-                delta_next = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-                L = L + emitted + direct if primal else L - dr.detach(emitted + direct)
-                out = fixed.to_world(bs.wo)
-                following = fixed.spawn_ray(out)
-                following.o, rest = sdf.spawn(shapes, hit, fixed, out)
-                valid |= active & si.is_valid() & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
-
-                # Russian roulette: undo the change of radiance by η² at a boundary
-                passed = throughput * dr.detach(bsdf_weight)
-                eta *= bs.eta
-                largest = dr.max(passed)
-                survival = dr.minimum(largest * dr.square(eta), 0.95)
-                roulette = depth >= self.rr_depth
-                survives = sampler.next_1d() < survival
-                passed[roulette] *= dr.rcp(survival)
-                further = going & (largest != 0) & (~roulette | survives)
-                pi_next, hit_next = self.intersect(scene, shapes, following, False, further, rest)
-
-                if dr.hint(not primal, mode="scalar"):
-                    factor, wo = mi.Float(1), bs.wo
-                    if dr.hint(moving, mode="scalar"):
-                        # The next vertex stays fixed, or the direction if there is none
-                        target = self.interaction(shapes, following, pi_next, hit_next, further)
-                        bound = further & target.is_valid()
-                        with dr.resume_grad():
-                            toward = dr.select(bound, dr.normalize(target.p - si.p), out)
-                            wo = dr.replace_grad(bs.wo, si.to_local(toward))
-                            factor = dr.select(bound, relative(solid_angle(si.p, target.p, target.n)), 1)
-                    with dr.resume_grad():
-                        # A smooth mirror cannot be evaluated: its weight is differentiated instead
-                        smooth = bsdf.eval(context, si, wo, going & ~delta_next)
-                        reflected = L * dr.select(delta_next, relative(bsdf_weight), relative(smooth) * factor)
-                        contribution = emitted + direct + dr.select(going, reflected, 0)
-                        if dr.hint(mode == dr.ADMode.Backward, mode="scalar"):
-                            dr.backward_from(δL * contribution)
-                        else:
-                            δL += dr.forward_to(contribution)
-
-                before = fixed
-                throughput = passed
-                density = bs.pdf
-                delta = delta_next
-                depth[going] += 1
-                before_ray, before_hit = ray, hit
-                ray, pi, hit, active = following, pi_next, hit_next, further
-
-            shown = dr.select(valid, L, 0) if primal else δL
-            return shown, valid, [], L
+        def attach_direction(self, solids, si, bs, ray, hit, active):
+            # The next vertex stays fixed, or the direction if there is none
+            target = self.interaction(solids, ray, hit, ray_flags(), active)
+            active = active & target.is_valid()
+            with dr.resume_grad():
+                d = dr.select(active, dr.normalize(target.p - si.p), ray.d)
+                wo = dr.replace_grad(bs.wo, si.to_local(d))
+                return wo, dr.select(active, dr.relative_grad(jacobian(si.p, target.p, target.n)), 1)
 
     return PathSDF
 

@@ -2,18 +2,11 @@
 
 import faulthandler
 import gc
-import os
 
 import numpy as np
 import pytest
 from _pytest.faulthandler import fault_handler_stderr_fd_key
 from variants import BACKENDS, VARIANTS, set_variant
-
-from mi_diffind.core import compat
-
-#: Run all tests with code for another processor, such as ``haswell:+avx2,+fma:8`` (most laptops).
-if TARGET := os.environ.get("MI_DIFFIND_LLVM_TARGET"):
-    compat.limit_code_generation(TARGET)
 
 #: Seconds that a test marked ``slow`` or ``long`` may take; others have ``faulthandler_timeout`` of ``pyproject.toml``.
 LONG_LIMIT = 3600
@@ -70,8 +63,8 @@ def collect_garbage():
 def few_samples(monkeypatch):
     """What a training measures of its result in the end is measured at fewer places than for a user."""
     from mi_diffind.tasks.disney.files import DisneyModel
-    from mi_diffind.tasks.ggx.files import GGXModel
-    from mi_diffind.tasks.image.compressed import CompressedImage
+    from mi_diffind.tasks.ggx.training import GGXModel
+    from mi_diffind.tasks.image.arrays import CompressedImage
 
     for function, samples in (
         (CompressedImage._between, 2**13),

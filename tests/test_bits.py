@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mi_diffind.arrays.bits import PART, as_words, mask_flags, mask_words, pack_bits, unpack_bits
+from mi_diffind.arrays.lookup import PART, as_words, mask_flags, mask_words, pack_bits, unpack_bits
 
 
 @pytest.mark.parametrize("bits", range(1, 9))

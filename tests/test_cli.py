@@ -252,7 +252,7 @@ def batch(self, rng, size):
         time.sleep(0.1)
     return original(self, rng, size)
 training.GGXProblem.batch = batch
-from mi_diffind.cli import main
+from mi_diffind.commands.cli import main
 sys.exit(main())
 """
 
@@ -277,8 +277,8 @@ def interrupted(*commands) -> tuple[list[int], str]:
 
 
 SIGINT_IN_THE_SECOND_PASS = """
-import json, os, signal, sys, mi_diffind.scenes as scenes
-from mi_diffind.cli import main
+import json, os, signal, sys, mi_diffind.scenes.loading as scenes
+from mi_diffind.commands.cli import main
 count = [0]
 original = scenes.mi.render
 def render(*args, **kwargs):
@@ -325,7 +325,7 @@ def verbs_with_tasks():
 
 HELP = """
 import contextlib, io, json, sys
-from mi_diffind.cli import main
+from mi_diffind.commands.cli import main
 
 texts = []
 for arguments in json.loads(sys.argv[1]):
@@ -359,7 +359,7 @@ def test_help_is_light():
     for command, found in text.items():
         assert found.startswith(" ".join(["usage: mi-diffind", *command]) + " [-h]"), command
     assert all(f"\n    {verb} " in text[()] for verb in VERBS)
-    assert not HEAVY & modules and not [m for m in modules if m.endswith((".training", ".scenes", ".fitting"))]
+    assert not HEAVY & modules and not [m for m in modules if m.endswith((".texture.training", ".loading", ".loop"))]
     assert "--primary" in text["fit", "ggx"] and "--primary" not in text["fit", "disney"]  # those of the task only
     assert "-D NAME" in text["tradeoff", "scene"] and "-D NAME" not in text["tradeoff", "disney"]
 

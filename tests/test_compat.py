@@ -12,8 +12,8 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from mi_diffind.core import compat, runtime, turns
-from mi_diffind.core.mitsuba_versions import ray_flags
+from mi_diffind.core import compat, runtime, threads
+from mi_diffind.core.compat import ray_flags
 
 SCENE = Path(__file__).resolve().parent / "lamp.xml"
 
@@ -80,7 +80,7 @@ def test_functions_of_the_library(mi_rgb):
 def test_limited_code_generation():
     """The width of vectors and the processor of kernels, and the result; in a process of its own."""
     code = (
-        "import sys, mi_diffind, drjit as dr; from mi_diffind import compat; from drjit.llvm.ad import Float\n"
+        "import sys, mi_diffind, drjit as dr; from mi_diffind.core import compat; from drjit.llvm.ad import Float\n"
         "compat.limit_code_generation(sys.argv[1]); dr.set_flag(dr.JitFlag.KernelHistory, True)\n"
         "y = dr.square(dr.opaque(Float, 3, 1000)) + 1; dr.eval(y); dr.sync_thread()\n"
         "print(y[999], *compat.llvm_target(compat.kernel_code(dr.kernel_history([dr.KernelType.JIT])[0])))"
@@ -205,7 +205,7 @@ def test_callback_of_renders(mi_rgb, monkeypatch):
     monkeypatch.setattr(mi.util, "render", mi.util.render)
     monkeypatch.setattr(mi, "render", mi.render)
     with hook("mi.render, mitsuba.python.util.render"):
-        turns.before_render(lambda *arguments: calls.append(arguments))
+        threads.before_render(lambda *arguments: calls.append(arguments))
         scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective"}})
         tracer = mi.load_dict({"type": "depth"})
         for arguments, more in (((scene, None, 0, tracer, 3), {}), ((), {"integrator": tracer, "scene": scene})):
@@ -505,9 +505,9 @@ def test_functions_are_transformed_one_at_a_time(monkeypatch):
         return function
 
     monkeypatch.setattr("drjit.syntax", transform)
-    threads = [threading.Thread(target=compat.syntax, args=(i,)) for i in range(8)]
-    for thread in threads:
+    workers = [threading.Thread(target=compat.syntax, args=(i,)) for i in range(8)]
+    for thread in workers:
         thread.start()
-    for thread in threads:
+    for thread in workers:
         thread.join()
     assert most == [1] * 8

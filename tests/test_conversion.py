@@ -17,8 +17,7 @@ from mi_diffind.core.errors import UsageError
 from mi_diffind.plugins.support import sdf_meshes
 from mi_diffind.plugins.support.stock import Kept
 from mi_diffind.scenes import comparison, conversion, loading
-from mi_diffind.tasks.sdf import serialized
-from mi_diffind.tasks.sdf.mesh import MeshError, load_mesh
+from mi_diffind.tasks.sdf.mesh import MeshError, load_mesh, read_serialized
 
 SCENE = """
 <scene version="3.0.0">
@@ -362,7 +361,7 @@ def test_serialized_meshes(mi_rgb, tmp_path, version, double):
     mi, path = mi_rgb, tmp_path / "two.serialized"
     meshes = [trimesh.creation.icosphere(1), trimesh.creation.box(bounds=[[2, 0, 0], [3, 1, 2]])]
     write_serialized(path, meshes, version, double)
-    for index, (vertices, faces) in enumerate(serialized.read(path)):
+    for index, (vertices, faces) in enumerate(read_serialized(path)):
         shape = mi.load_dict({"type": "serialized", "filename": str(path), "shape_index": index})
         params = mi.traverse(shape)
         assert np.allclose(params["vertex_positions"].numpy().reshape(-1, 3), vertices, atol=1e-6)

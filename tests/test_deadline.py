@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from mi_diffind.core import progress
-from mi_diffind.core.deadline import Deadline
 from mi_diffind.core.errors import UsageError
+from mi_diffind.core.progress import Deadline
 from mi_diffind.fitting import loop
 from mi_diffind.fitting.loop import FitSettings, Problem, fit
 from mi_diffind.fitting.task import FitRequest, tasks
@@ -56,7 +56,7 @@ def settings(steps=1000):
 
 
 def request(seconds, **options):
-    return FitRequest("", settings(), types, progress=False, deadline=Deadline(seconds), seconds=seconds, **options)
+    return FitRequest("", settings(), types, progress=False, deadline=Deadline(seconds), **options)
 
 
 def test_parts_and_what_follows_share_the_time(clock):
@@ -83,7 +83,7 @@ def test_a_limit_bounds_reading_training_and_measuring(clock, step, measurement,
 
 
 def test_measurements_that_take_long_are_fewer(clock):
-    result = fit(Slow(clock, 0.1, 4), settings(), progress=False, seconds=40)
+    result = fit(Slow(clock, 0.1, 4), settings(), progress=False, deadline=Deadline(40))
     assert len(result.history) == 3 and result.history[-1]["step"] == result.steps
 
 
@@ -93,7 +93,7 @@ def test_too_few_steps_are_unfinished(clock):
     result = limited.train(Slow(clock, 2, 1))
     assert result.steps == 1 and result.outcome == "1 step: unfinished, best step 1"
     assert limited.train(Slow(clock, 2, 1), least=7).steps == 7
-    assert fit(Slow(clock, 1, 1), settings(20), progress=False, seconds=20).outcome.startswith("best step")
+    assert fit(Slow(clock, 1, 1), settings(20), progress=False, deadline=Deadline(20)).outcome.startswith("best step")
 
 
 @pytest.fixture
@@ -114,7 +114,7 @@ def test_lines_of_a_training_in_a_log(clock, log):
 
 
 def test_lines_of_a_limited_training_in_a_log(clock, log):
-    fit(Slow(clock, 0.5, 0), settings(), title="timed", seconds=40)
+    fit(Slow(clock, 0.5, 0), settings(), title="timed", deadline=Deadline(40))
     lines = log.getvalue().splitlines()
     assert 3 <= len(lines) <= 5 and all(line.startswith("timed: step ") and " left" in line for line in lines)
 

@@ -260,7 +260,7 @@ def test_bad_options(tmp_path, capsys):
     for value in ("0", "1", "-0.1", "nan", "inf", "small"):
         with pytest.raises(SystemExit) as caught:
             main(["render", file, "--depth", "auto", f"--depth-tolerance={value}"])
-        assert caught.value.code == 2 and "allowed is more than 0 and less than 1" in capsys.readouterr().err
+        assert caught.value.code == 2 and "allowed are numbers above 0 and below 1" in capsys.readouterr().err
 
 
 def test_interrupted_probe(tmp_path, monkeypatch, capsys):

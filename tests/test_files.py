@@ -27,7 +27,7 @@ from mi_diffind.core.files import (
 #: Process that begins to write a file, says so, and waits to be killed.
 WRITER = """
 import sys, time
-from mi_diffind.files import replacing
+from mi_diffind.core.files import replacing
 with replacing(sys.argv[1]) as temporary:
     temporary.write_bytes(b"half of it")
     print(temporary, flush=True)

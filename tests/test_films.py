@@ -118,12 +118,6 @@ def test_refused_frames(tmp_path):
     ):
         with pytest.raises(UsageError, match=message):
             films.write(tmp_path / "film.webp", frames)
-    with pytest.raises(UsageError, match="panels: found 1 of 'a', 2 of 'b', allowed are"):
-        films.beside({"a": [frame], "b": [frame, frame]}, columns=2)
-    with pytest.raises(UsageError, match=r"frames: found uint8 \(4, 8, 3\) as number 1"):
-        films.beside({"a": [frame], "b": [frame[:4]]}, columns=2)
-    with pytest.raises(UsageError, match="panels: found no panel"):
-        films.beside({}, columns=2)
     assert not os.listdir(tmp_path)
 
 
@@ -135,12 +129,12 @@ def test_h264_has_no_alpha(tmp_path):
         films.write(tmp_path / "film.mp4", [np.zeros((8, 8, 4), np.uint8)])
 
 
-def test_panels_stand_beside_one_another():
+def test_panels_stand_beside_one_another(mi_rgb):
+    from make_films import beside
+
     red, blue = (np.full((3, 20, 40, 3), colour, np.uint8) for colour in ((200, 0, 0), (0, 0, 200)))
     blue[2] = 90
-    frames = films.beside(
-        {"left": list(red), "right": list(blue), "below": list(red)}, columns=2, text_height=10, gap=4
-    )
+    frames = beside({"left": list(red), "right": list(blue), "below": list(red)}, columns=2, text_height=10, gap=4)
     assert len(frames) == 3 and all(frame.shape == (2 * (20 + 17), 84, 3) for frame in frames)
     first = frames[0]
     assert (first[17:37, :40] == red[0]).all() and (first[17:37, 44:] == blue[0]).all()

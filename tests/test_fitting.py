@@ -17,6 +17,7 @@ from variants import BACKENDS
 from mi_diffind import DifferentiableArray, DiffindError, Indirection
 from mi_diffind.arrays.indirection import unfolded
 from mi_diffind.core.files import OutputError
+from mi_diffind.core.progress import Deadline
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting import loop
 from mi_diffind.fitting.loop import FitResult, FitSettings, FittingError, Problem, fit
@@ -486,7 +487,7 @@ class Terminal(io.StringIO):
 def terminal(monkeypatch):
     """A terminal on which the progress bar is drawn as often as it changes, as on a slow machine."""
     original, terminal = loop.tqdm.__init__, Terminal()
-    for module in ("fitting", "progress"):
+    for module in ("fitting.loop", "core.progress"):
         monkeypatch.setattr(f"mi_diffind.{module}.in_terminal", lambda: True)
     always = {"file": terminal, "mininterval": 0, "miniters": 0, "ncols": 200}
     monkeypatch.setattr(loop.tqdm, "__init__", lambda self, *a, **k: original(self, *a, **{**k, **always}))
@@ -505,14 +506,14 @@ def test_the_bar_of_a_run_in_steps(ad, terminal):
 
 def test_the_bar_of_a_limited_run_shows_the_time_left(ad, clock, terminal):
     """Its schedule and its end are those of the clock; how long it will take is known from the start."""
-    result = fit(Curve(ad), settings(steps=10**6, lr=1e-2), seconds=40, title="timed")
+    result = fit(Curve(ad), settings(steps=10**6, lr=1e-2), deadline=Deadline(40), title="timed")
     assert result.steps < 2000 and not result.interrupted and 8 <= len(result.history) <= 11
     states = terminal.states
     assert all(line.startswith("timed") for line in states) and "step" not in "".join(states)
     assert len(states) > 50 and not any("?" in line for line in states)
     left = [line.split("<")[1].split(",")[0].strip() for line in states]
     seconds = [60 * int(minutes) + int(rest) for minutes, rest in (text.split(":") for text in left)]
-    assert seconds[0] == 40 and seconds[-1] == 0 and set(np.diff(seconds)) == {0, -1}
+    assert seconds[0] == 39 and seconds[-1] == 0 and set(np.diff(seconds)) == {0, -1}
     assert "100%" in states[-1]
 
 
@@ -782,7 +783,7 @@ import sys
 import drjit as dr, mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
 import numpy as np
-from mi_diffind.fitting import FitSettings, Problem, fit
+from mi_diffind.fitting.loop import FitSettings, Problem, fit
 
 scene = mi.load_dict({
     "type": "scene", "integrator": {"type": "direct"},

@@ -16,7 +16,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from mi_diffind.core import mitsuba_versions
+from mi_diffind.core import compat
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -46,7 +46,7 @@ def load_entry_points():
     for name in kinds:
         setattr(mi, name, functions[name])
     # Functions that register differ from variant to variant; from now on, count where all are called
-    versions = sys.modules["mi_diffind.core.mitsuba_versions"]
+    versions = sys.modules["mi_diffind.core.compat"]
     versions.register = counted(versions.register)
 
 for variant in sys.argv[2:] * 2:
@@ -102,14 +102,14 @@ def test_footprints(mi_rgb, monkeypatch):
 
     si = dr.zeros(mi_rgb.SurfaceInteraction3f, 3)
     si.duv_dx, si.duv_dy = mi_rgb.Vector2f(0.5, 0), mi_rgb.Vector2f(0, 0.25)
-    assert not mitsuba_versions.has_footprints() and mitsuba_versions.footprint_of(si) is None
+    assert not compat.has_footprints() and compat.footprint_of(si) is None
     ddx, ddy = (v.numpy() for v in footprint.footprint(si))
     np.testing.assert_allclose(ddx[0], 0.5)
 
     # The third lane has none, as after a bounce
     matrix = mi_rgb.Matrix2f([[mi_rgb.Float([1, 0.1, 0]), 3], [2, 4]]) * mi_rgb.Float(1, 1, 0)
     monkeypatch.setattr(mi_rgb.SurfaceInteraction3f, "footprint", matrix, raising=False)
-    assert mitsuba_versions.has_footprints()
+    assert compat.has_footprints()
     ddx, ddy = (v.numpy() for v in footprint.footprint(si))
     np.testing.assert_allclose(ddx, [[1, 0.1, 0.5], [2, 2, 0]])
     np.testing.assert_allclose(ddy, [[3, 3, 0], [4, 4, 0.25]])
@@ -131,7 +131,7 @@ def test_ray_flags(mi_rgb, monkeypatch):
     scene = mi_rgb.load_dict({"type": "scene", "ball": {"type": "sphere"}})
     ray = mi_rgb.Ray3f([0.3, 0.2, -3], [0, 0, 1])
     for curvature in (False, True):
-        si = scene.ray_intersect(ray, mitsuba_versions.ray_flags(curvature), True)
+        si = scene.ray_intersect(ray, compat.ray_flags(curvature), True)
         assert dr.allclose(dr.norm(si.sh_frame.n), 1) and dr.norm(si.dp_du)[0] > 0.1
         assert (dr.norm(si.dn_du)[0] > 0.1) is curvature
 
@@ -142,8 +142,8 @@ def test_ray_flags(mi_rgb, monkeypatch):
         All, Default = 1, 17
 
     monkeypatch.setitem(sys.modules, "mitsuba", types.SimpleNamespace(RayFlags=RayFlags))
-    assert mitsuba_versions.ray_flags() == RayFlags.Shading | RayFlags.Footprint
-    assert mitsuba_versions.ray_flags(curvature=True) == mitsuba_versions.ray_flags() | RayFlags.NormalPartials
+    assert compat.ray_flags() == RayFlags.Shading | RayFlags.Footprint
+    assert compat.ray_flags(curvature=True) == compat.ray_flags() | RayFlags.NormalPartials
 
 
 def test_no_other_file_chooses_ray_flags():
@@ -158,7 +158,7 @@ def test_normal_maps(mi_rgb, monkeypatch):
     """A material with a normal map asks meshes for frames along uv; directions and normals in them stay as they are."""
     path = str(ROOT / "scenes" / "assets" / "rust_shaded.npz")
     flag = 0x40000
-    assert mitsuba_versions.normal_mapped() == 0
+    assert compat.normal_mapped() == 0
 
     def load(**more):
         return mi_rgb.load_dict({"type": "neural_material", "filename": path, **more})
@@ -176,16 +176,16 @@ def test_normal_maps(mi_rgb, monkeypatch):
     assert has_flag() and not has_flag(ignore="normal")
     newer = types.SimpleNamespace(BSDFFlags=types.SimpleNamespace(NormalMapped=flag))
     monkeypatch.setitem(sys.modules, "mitsuba", newer)
-    assert mitsuba_versions.normal_mapped() == flag
+    assert compat.normal_mapped() == flag
 
 
 def test_shapes_in_python(mi_rgb, monkeypatch):
-    assert not mitsuba_versions.shapes_in_python()
+    assert not compat.shapes_in_python()
     with pytest.raises(RuntimeError, match="no constructor"):  # what the answer is about
         mi_rgb.register_shape("unsupported", type("Unsupported", (mi_rgb.Shape,), {}))
         mi_rgb.load_dict({"type": "unsupported"})
     monkeypatch.setattr(mi_rgb, "Shape", type("Shape", (), {"__init__": mi_rgb.Mesh.__init__}))
-    assert mitsuba_versions.shapes_in_python()
+    assert compat.shapes_in_python()
 
 
 def test_lobe_rates(mi_rgb, monkeypatch):
@@ -193,7 +193,7 @@ def test_lobe_rates(mi_rgb, monkeypatch):
     from mi_diffind.plugins.disney import to_principled
 
     rates = ("clearcoat_sampling_rate", "diffuse_reflectance_sampling_rate", "main_specular_sampling_rate")
-    assert mitsuba_versions.lobe_rates() == rates
+    assert compat.lobe_rates() == rates
 
     def converted():
         props = mi_rgb.Properties("disney")
@@ -207,7 +207,7 @@ def test_lobe_rates(mi_rgb, monkeypatch):
     stock = mi_rgb.traverse
     fewer = {"roughness.value": 0.5}
     monkeypatch.setattr(mi_rgb, "traverse", lambda node: fewer if "Principled" in node.class_name() else stock(node))
-    assert mitsuba_versions.lobe_rates() == () and converted() == {"roughness"}
+    assert compat.lobe_rates() == () and converted() == {"roughness"}
 
 
 class Fields(types.SimpleNamespace):
@@ -220,9 +220,9 @@ class Fields(types.SimpleNamespace):
 
 
 def test_fields(mi_rgb, monkeypatch):
-    assert mitsuba_versions.base_class("Texture") is mi_rgb.Texture
-    assert mitsuba_versions.base_class("Volume") is mi_rgb.Volume
-    assert mitsuba_versions.object_type("Texture") == mi_rgb.ObjectType.Texture
+    assert compat.base_class("Texture") is mi_rgb.Texture
+    assert compat.base_class("Volume") is mi_rgb.Volume
+    assert compat.object_type("Texture") == mi_rgb.ObjectType.Texture
 
     registered = []
     fields = Fields(
@@ -231,11 +231,11 @@ def test_fields(mi_rgb, monkeypatch):
         register_field=lambda *given: registered.append(("field", *given)),
     )
     monkeypatch.setitem(sys.modules, "mitsuba", fields)
-    assert mitsuba_versions.base_class("Texture") is mitsuba_versions.base_class("Volume") is Fields.Field
-    assert mitsuba_versions.base_class("BSDF") is mi_rgb.BSDF
-    assert mitsuba_versions.object_type("Volume") == "a field" and mitsuba_versions.object_type("BSDF") == "a BSDF"
+    assert compat.base_class("Texture") is compat.base_class("Volume") is Fields.Field
+    assert compat.base_class("BSDF") is mi_rgb.BSDF
+    assert compat.object_type("Volume") == "a field" and compat.object_type("BSDF") == "a BSDF"
     for kind in ("texture", "volume", "bsdf"):
-        mitsuba_versions.register(kind, f"some {kind}", int)
+        compat.register(kind, f"some {kind}", int)
     assert registered == [("field", "some texture", int), ("field", "some volume", int), ("bsdf", "some bsdf", int)]
 
 
@@ -244,21 +244,21 @@ def test_meshes(mi_rgb, monkeypatch):
     positions = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float64)
     faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
     props = mi_rgb.Properties("tetrahedron")
-    mesh = mi_rgb.Mesh(*mitsuba_versions.mesh_arguments(props, len(positions), len(faces)))
+    mesh = mi_rgb.Mesh(*compat.mesh_arguments(props, len(positions), len(faces)))
     params = mi_rgb.traverse(mesh)
-    mitsuba_versions.set_triangles(params, positions, faces)
+    compat.set_triangles(params, positions, faces)
     params.update()
-    for found, given in zip(mitsuba_versions.triangles(mesh), (positions, faces), strict=True):
+    for found, given in zip(compat.triangles(mesh), (positions, faces), strict=True):
         np.testing.assert_array_equal(found, given)
     scene = mi_rgb.load_dict({"type": "scene", "mesh": mesh})
     hit = scene.ray_intersect(mi_rgb.Ray3f([0.25, 0.25, -1], [0, 0, 1]))
     assert dr.allclose(hit.t, 1)
 
     newer = {"positions": None, "faces": None}
-    mitsuba_versions.set_triangles(newer, positions, faces)
+    compat.set_triangles(newer, positions, faces)
     assert newer["positions"].shape == (4, 3) and newer["faces"].shape == (4, 3)
     stand_in = types.SimpleNamespace(**{name: lambda name=name: newer[name] for name in newer})
-    for found, given in zip(mitsuba_versions.triangles(stand_in), (positions, faces), strict=True):
+    for found, given in zip(compat.triangles(stand_in), (positions, faces), strict=True):
         np.testing.assert_array_equal(found, given)
     monkeypatch.setattr(mi_rgb.Mesh, "from_fields", None, raising=False)
-    assert mitsuba_versions.mesh_arguments(props, 4, 4) == (props,)
+    assert compat.mesh_arguments(props, 4, 4) == (props,)

@@ -24,8 +24,8 @@ from mi_diffind.arrays.tables import PAGES, TableError, gathers_of, load_table, 
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting.task import FitRequest
 from mi_diffind.maps.source import from_arrays
-from mi_diffind.tasks.image import TASK, presets, search, training
-from mi_diffind.tasks.image.compressed import CompressedImage
+from mi_diffind.tasks.image import PAGED, PRESETS, STRUCTURES, TASK, fit, replaced, training
+from mi_diffind.tasks.image.arrays import CompressedImage
 
 SHAPES = {1: (7,), 2: (5, 3), 3: (2, 3, 2)}
 
@@ -288,13 +288,13 @@ def test_positions_of_entries():
 
 
 def short(structure, steps=30, **changes):
-    recipe = presets.replaced(presets.PRESETS["ours"], steps=steps, batch=4096, measure_every=steps)
+    recipe = replaced(PRESETS["ours"], steps=steps, batch=4096, measure_every=steps)
     return dataclasses.replace(recipe, structure=structure, **changes)
 
 
 def trained(ad, recipe, nbytes=1500):
     source = from_arrays({"albedo": np.rint(255 * half_empty()).astype(np.uint8)})
-    size = search.default_size(source, nbytes, recipe)
+    size = fit.default_size(source, nbytes, recipe)
     asked = FitRequest("ours", recipe.settings, ad, progress=False)
     return training.fit_image(source, size, recipe, asked)[0]
 
@@ -302,22 +302,22 @@ def trained(ad, recipe, nbytes=1500):
 def test_pages_are_chosen_and_win(ad):
     """An image with an empty part, in as many bytes and steps; a homogeneous one gets none."""
     paged, dense = trained(ad, short("auto")), trained(ad, short("6 bits"))
-    assert paged.settings["structure"] in presets.PAGED and dense.settings["structure"] == "6 bits"
+    assert paged.settings["structure"] in PAGED and dense.settings["structure"] == "6 bits"
     assert paged.nbytes <= 1.01 * dense.nbytes
     assert paged.measured["psnr_db"] > dense.measured["psnr_db"] + 2
     noise = from_arrays({"albedo": np.random.default_rng(0).integers(0, 255, (64, 64, 3)).astype(np.uint8)})
-    assert training.structure_of(noise, short("auto"), 1500) not in presets.PAGED
-    assert training.structure_of(noise, short("auto", components=False), 1500) not in presets.PAGED
+    assert training.structure_of(noise, short("auto"), 1500) not in PAGED
+    assert training.structure_of(noise, short("auto", components=False), 1500) not in PAGED
 
 
-@pytest.mark.parametrize("structure", presets.PAGED)
+@pytest.mark.parametrize("structure", PAGED)
 def test_a_file_reads_as_it_was_trained(ad, tmp_path, structure):
     recipe = short(structure, steps=4)
     table = trained(ad, recipe)
     save_table(tmp_path / "t.npz", table)
     loaded = TASK.load(tmp_path / "t.npz")
     assert loaded.nbytes == table.nbytes <= 1500
-    fine, coarse = presets.STRUCTURES[structure]
+    fine, coarse = STRUCTURES[structure]
     width = fine * (3 if coarse is None else recipe.dims - coarse.dims)
     assert gathers_of(loaded, "primary") == 2 * (2 if width <= 16 else 3 if width < 32 else 4)
     assert gathers_of(loaded, "primary" + PAGES) == 1

@@ -14,10 +14,10 @@ import trimesh
 from mi_diffind.core.errors import UsageError
 from mi_diffind.fitting.settings import FitSettings
 from mi_diffind.fitting.task import FitRequest, tasks
-from mi_diffind.tasks.image import memory_budget as image_budget
+from mi_diffind.tasks.image import arrays as image_budget
+from mi_diffind.tasks.radiance import dense_bytes
 from mi_diffind.tasks.radiance import fit as field_fit
-from mi_diffind.tasks.radiance.presets import dense_bytes
-from mi_diffind.tasks.texture import memory_budget as texture_budget
+from mi_diffind.tasks.texture import arrays as texture_budget
 
 PATH = Path(__file__).resolve().parent / "benchmarks" / "bench_ratio.py"
 

@@ -485,7 +485,7 @@ import sys, types
 package = types.ModuleType("mi_diffind")
 package.__path__ = [{os.path.dirname(runtime.__file__)!r}]
 sys.modules["mi_diffind"] = package
-import mi_diffind.runtime as runtime
+import mi_diffind.core.runtime as runtime
 runtime.choose_llvm.__defaults__ = ({{}}, lambda: [], lambda: [{aborting!r}], runtime.library_version)
 del sys.modules["mi_diffind"]
 

@@ -16,9 +16,9 @@ import mi_diffind
 from mi_diffind.arrays.tables import TableError, load_table, save_table
 from mi_diffind.core.arguments import add_arguments
 from mi_diffind.core.compat import use_threads, was_compiled
-from mi_diffind.core.deadline import Deadline
 from mi_diffind.core.errors import UsageError
 from mi_diffind.core.files import OutputError
+from mi_diffind.core.progress import Deadline
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting.settings import FitSettings
 from mi_diffind.fitting.task import FitRequest
@@ -48,9 +48,9 @@ from mi_diffind.scenes.training.trained_scene import (
     texture_problem,
     texture_recipe,
 )
+from mi_diffind.tasks.texture import PRESETS
+from mi_diffind.tasks.texture.arrays import PaperBudget, TextureBudget, parse_structure
 from mi_diffind.tasks.texture.compressed import CompressedTexture, load, to_table
-from mi_diffind.tasks.texture.memory_budget import PaperBudget, TextureBudget, parse_structure
-from mi_diffind.tasks.texture.presets import PRESETS
 from mi_diffind.tasks.texture.training import layout_of, problem_of, rounded, stored_form
 
 NAMES = ("albedo", "roughness")

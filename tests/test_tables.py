@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import mi_diffind
 from mi_diffind import DifferentiableArray, DiffindError, Indirection, StoredArray, TableError, load_table, save_table
 from mi_diffind.arrays import lookup, tables
 from mi_diffind.arrays.tables import Table
@@ -819,7 +820,7 @@ def test_ranges(tmp_path, low):
 
 
 def test_shipped_tables_load():
-    folder = os.path.join(os.path.dirname(tables.__file__), "data")
+    folder = os.path.join(os.path.dirname(mi_diffind.__file__), "data")
     shipped = [name for name in os.listdir(folder) if name.endswith(".npz")]
     assert shipped
     for name in shipped:

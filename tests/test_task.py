@@ -4,6 +4,8 @@ import ast
 import dataclasses
 import importlib.util
 import json
+import os
+import signal
 import subprocess
 import sys
 import warnings
@@ -18,10 +20,11 @@ from mi_diffind.arrays.lookup import STORAGES
 from mi_diffind.arrays.tables import Table
 from mi_diffind.core.arguments import Argument
 from mi_diffind.core.errors import UsageError, reason
+from mi_diffind.core.progress import Deadline
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting import task as task_module
 from mi_diffind.fitting.loop import FitSettings, Problem
-from mi_diffind.fitting.task import Model, Task, fit, task_of, tasks
+from mi_diffind.fitting.task import FitRequest, Model, Stage, Task, fit, task_of, tasks
 
 ROOT = Path(__file__).resolve().parents[1]
 BUILT_IN = ("bsdf", "disney", "field", "ggx", "image", "scene", "sdf", "shading", "texture")
@@ -30,8 +33,8 @@ BUILT_IN = ("bsdf", "disney", "field", "ggx", "image", "scene", "sdf", "shading"
 # -- what is found ----------------------------------------------------------------------------------------------------
 
 LINE = """
-from mi_diffind.settings import FitSettings
-from mi_diffind.task import Task
+from mi_diffind.fitting.settings import FitSettings
+from mi_diffind.fitting.task import Task
 
 class Line(Task):
     name, title = "line", "a straight line"
@@ -71,7 +74,7 @@ def install(tmp_path, monkeypatch):
 
 def test_what_ships_is_found():
     """Each folder of the package is one, and nothing else; nowhere is there a list of them."""
-    folders = {p.parent.name for p in Path(task_module.__file__).parent.glob("tasks/*/__init__.py")}
+    folders = {p.parent.name for p in (ROOT / "mi_diffind" / "tasks").glob("*/__init__.py")}
     names = {"field" if folder == "radiance" else folder for folder in folders} | {"scene"}
     assert names == set(BUILT_IN) and tuple(tasks())[: len(BUILT_IN)] == BUILT_IN
     assert {name: task.name for name, task in tasks().items()} == {name: name for name in tasks()}
@@ -144,7 +147,7 @@ def test_the_same_entry_point_twice_is_no_conflict(install):
 
 LIGHT = """
 import json, sys
-import mi_diffind.task as task
+import mi_diffind.fitting.task as task
 found = {name: [t.title, list(t.presets), [a.flags for a in t.arguments]] for name, t in task.tasks().items()}
 print(json.dumps(sorted(sys.modules)))
 """
@@ -156,7 +159,8 @@ def test_declarations_are_light():
     assert done.returncode == 0, done.stderr
     modules = set(json.loads(done.stdout))
     assert not {"drjit", "mitsuba", "matplotlib", "tqdm", "scipy"} & modules
-    assert not [m for m in modules if m.startswith("mi_diffind.") and m.endswith((".training", ".model", ".fitting"))]
+    heavy = (".fit", ".fitting.loop", ".model", "texture.training")
+    assert not [m for m in modules if m.startswith("mi_diffind.") and m.endswith(heavy)]
 
 
 @pytest.mark.parametrize("name", BUILT_IN)
@@ -260,6 +264,42 @@ def test_fit(line, tmp_path):
     assert table.measured == {"score": float(f"{score:.5g}")} and score > -0.1
     assert run(preset="short").table.settings["steps"] == 5 and run(steep=True) and line.request.options["steep"]
     assert run().table.storage == "float32"
+
+
+def test_stages(line, tmp_path):
+    """A fit in stages: each has its settings, its checkpoint, and what the ones before have trained."""
+    types, trained = array_module("llvm"), []
+    request = FitRequest("", LineTask.presets["short"], types, progress=False, checkpoint=tmp_path / "line.ckpt")
+
+    def second():
+        assert trained[0].net.numpy().max() > 0
+        trained.append(LineProblem(types))
+        return trained[-1]
+
+    trained.append(LineProblem(types))
+    long = LineTask.presets["default"]
+    stages = [Stage("first", trained[0], 0.5, long), Stage("none", lambda: None), Stage("", second)]
+    assert [result.steps for result in request.run(stages)] == [60, 5]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["line.ckpt", "line.ckpt.first"]
+    again = dataclasses.replace(request, resume=True)
+    trained[:] = [LineProblem(types)]
+    stages[0] = dataclasses.replace(stages[0], problem=trained[0])
+    assert [result.steps for result in again.run(stages)] == [60, 5]
+    limited = dataclasses.replace(request, checkpoint=None, deadline=Deadline(8))
+    part = limited._stage_request(stages[0])
+    assert part.settings is long and part.deadline.seconds < 4 and part.recorded()["seconds"] == 8
+
+
+def test_no_stage_begins_after_an_interrupt(line):
+    class Interrupted(LineProblem):
+        def measure(self, net):
+            os.kill(os.getpid(), signal.SIGINT)
+            return super().measure(net)
+
+    types = array_module("llvm")
+    request = FitRequest("", LineTask.presets["short"], types, progress=False)
+    results = request.run([Stage("a", Interrupted(types)), Stage("b", LineProblem(types))])
+    assert len(results) == 1 and results[0].interrupted
 
 
 def test_models_of_any_task(line, tmp_path):

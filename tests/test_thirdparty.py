@@ -24,7 +24,7 @@ DATA = PACKAGE / "mi_profile" / "data" / "downlight.csv"
 #: Runs commands, and Python code, as they come: in one process, in which the package is installed.
 COMMANDS = """
 import contextlib, io, json, os, sys, traceback
-from mi_diffind.cli import main
+from mi_diffind.commands.cli import main
 
 def python(code, *arguments):
     sys.argv = ["-c", *arguments]

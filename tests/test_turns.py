@@ -3,7 +3,7 @@
 import threading
 
 import mi_diffind as md
-from mi_diffind.core import turns
+from mi_diffind.core import threads
 
 
 def scene() -> dict:
@@ -20,7 +20,7 @@ def test_loads_and_renders_wait(mi_rgb):
     for work in (lambda: mi_rgb.render(loaded, spp=1), lambda: md.load_dict(scene())):
         done = threading.Event()
         thread = threading.Thread(target=lambda work=work, done=done: (work(), done.set()))
-        with turns.LOCK:
+        with threads.LOCK:
             thread.start()
             assert not done.wait(0.3)
             mi_rgb.render(loaded, spp=1)  # the thread that holds the lock goes on
@@ -31,22 +31,22 @@ def test_loads_and_renders_wait(mi_rgb):
 def test_scenes_of_threads_end_in_a_turn(mi_rgb):
     """A scene of a thread that nothing refers to ends at the next load or render; one of the main thread at once."""
     kept = []
-    with turns.turn():
+    with threads.turn():
         pass
-    before = len(turns._scenes)
+    before = len(threads._scenes)
 
     def load():
         kept.append(md.load_dict(scene()))
         mi_rgb.render(kept[-1], spp=1)
 
     load()
-    assert len(turns._scenes) == before
+    assert len(threads._scenes) == before
     thread = threading.Thread(target=load)
     thread.start()
     thread.join()
-    with turns.turn():
-        assert len(turns._scenes) == before + 1
+    with threads.turn():
+        assert len(threads._scenes) == before + 1
     kept.clear()
-    assert len(turns._scenes) == before + 1
-    with turns.turn():
-        assert len(turns._scenes) == before
+    assert len(threads._scenes) == before + 1
+    with threads.turn():
+        assert len(threads._scenes) == before

@@ -8,8 +8,8 @@ import pytest
 from mi_diffind.core import units
 from mi_diffind.core.errors import UsageError
 from mi_diffind.core.units import parse_size
-from mi_diffind.tasks.image import memory_budget
-from mi_diffind.tasks.image.memory_budget import ImageBudget, explain, fit_bytes, paper_search, search
+from mi_diffind.tasks.image import arrays
+from mi_diffind.tasks.image.arrays import ImageBudget, fit_bytes, paper_search, search
 
 IMAGES = [(1, 1), (1, 4096), (4096, 1), (7, 5), (64, 64), (100, 100), (333, 1000), (1024, 1024), (4096, 4096)]
 
@@ -26,24 +26,24 @@ def test_bytes_of_other_dimensions_and_bits():
 
 
 def test_ratio_is_table_2_at_4k():
-    assert [memory_budget.resolution_ratio(e, 4096) for e in (3, 6, 12, 24)] == [128, 128, 80, 72]
-    assert memory_budget.resolution_ratio(math.sqrt(12 * 24), 4096) == pytest.approx(76)  # half-way in log2
-    assert memory_budget.resolution_ratio(1, 4096) == memory_budget.resolution_ratio(0.1, 8192) == 128
-    assert memory_budget.resolution_ratio(1000, 4096) == 72
+    assert [arrays.resolution_ratio(e, 4096) for e in (3, 6, 12, 24)] == [128, 128, 80, 72]
+    assert arrays.resolution_ratio(math.sqrt(12 * 24), 4096) == pytest.approx(76)  # half-way in log2
+    assert arrays.resolution_ratio(1, 4096) == arrays.resolution_ratio(0.1, 8192) == 128
+    assert arrays.resolution_ratio(1000, 4096) == 72
 
 
 def test_ratio_falls_with_resolution_within_the_useful_range():
     assert (
-        memory_budget.resolution_ratio(3, 1024)
-        == memory_budget.resolution_ratio(3, 2048)
-        == memory_budget.resolution_ratio(3, 1)
+        arrays.resolution_ratio(3, 1024)
+        == arrays.resolution_ratio(3, 2048)
+        == arrays.resolution_ratio(3, 1)
         == pytest.approx(128 * 64 / 80)
     )
-    assert memory_budget.resolution_ratio(3, 2048 * math.sqrt(2)) == pytest.approx(128 * 0.9)
+    assert arrays.resolution_ratio(3, 2048 * math.sqrt(2)) == pytest.approx(128 * 0.9)
     assert (
-        memory_budget.resolution_ratio(12, 1024) == memory_budget.resolution_ratio(12, 2048) == pytest.approx(64)
+        arrays.resolution_ratio(12, 1024) == arrays.resolution_ratio(12, 2048) == pytest.approx(64)
     )  # the safe default
-    values = [memory_budget.resolution_ratio(e, n) for e in (0.01, 1, 5, 12, 100, 1e6) for n in (1, 500, 3000, 1e5)]
+    values = [arrays.resolution_ratio(e, n) for e in (0.01, 1, 5, 12, 100, 1e6) for n in (1, 500, 3000, 1e5)]
     assert min(values) >= 40 and max(values) <= 128
 
 
@@ -62,7 +62,7 @@ def test_search_is_the_papers(side, channels, compression, ratio):
     size = paper_search(uncompressed, compression, channels, side, side, ratio)
     assert size == ImageBudget(primary, primary, cascaded, channels)
     assert size.nbytes == nbytes
-    if ratio == memory_budget.resolution_ratio(compression, side):
+    if ratio == arrays.resolution_ratio(compression, side):
         corrected = search(uncompressed, compression, channels, side, side)
         assert corrected.cascaded == cascaded
         assert uncompressed / corrected.nbytes == pytest.approx(compression, rel=0.05)
@@ -79,10 +79,10 @@ def test_search_at_4k():
 
 
 def test_side_of_the_cascaded_array():
-    assert memory_budget.cascaded_side(2**20, 4, 4, 1) == 16 and memory_budget.cascaded_side(2**20, 4, 4, 0.05) == 8
-    assert memory_budget.cascaded_side(1, 16) == 4 and memory_budget.cascaded_side(1e12, 1) == 16
-    assert memory_budget.cascaded_side(1e12, 1, 2) == 64
-    with_share = memory_budget.cascaded_side(10**6, 5, 4, 0.1)
+    assert arrays.cascaded_side(2**20, 4, 4, 1) == 16 and arrays.cascaded_side(2**20, 4, 4, 0.05) == 8
+    assert arrays.cascaded_side(1, 16) == 4 and arrays.cascaded_side(1e12, 1) == 16
+    assert arrays.cascaded_side(1e12, 1, 2) == 64
+    with_share = arrays.cascaded_side(10**6, 5, 4, 0.1)
     assert 5 * with_share**4 <= 10**5 < 5 * (with_share + 4) ** 4
 
 
@@ -180,23 +180,6 @@ def test_a_size_is_asked_for_in_one_way():
         parse_size(3, 1, compression=12, bpp=2)
     with pytest.raises(ValueError, match="out of range"):
         parse_size(3, 1, compression="1e-320")
-
-
-def test_explanations():
-    near = fit_bytes(100_000, 3, 1024, 1024, 8)
-    assert explain(near, 3 * 1024**2, 100_000) is None
-    least = search(35 * 3, 12, 3, 7, 5)
-    assert "smallest table with a cascaded side of 4 has 772 bytes (0.136x)" in explain(least, 35 * 3, 9)
-    assert "as large as the image" in explain(fit_bytes(10**6, 3, 64, 64, 4), 64**2 * 3, 10**6)
-    coarse = paper_search(4096**2 * 3, 12, 3, 4096, 4096, 80)
-    assert "nearest with whole sides and a cascaded side of 12" in explain(coarse, 4096**2 * 3, 4096**2 * 3 / 12)
-    wide = paper_search(256**2 * 3, 12, 3, 256, 256, 64)
-    assert "nearest with whole sides and a cascaded side of 4" in explain(wide, 256**2 * 3, 256**2 / 4)
-
-
-def test_sizes_refuse_nonsense():
-    with pytest.raises(ValueError, match="rows: found 0"):
-        ImageBudget(0, 1, 4, 3)
 
 
 def test_more_than_fits_is_refused(monkeypatch):

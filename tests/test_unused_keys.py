@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from mi_diffind.core.unused_keys import MOST_NAMES, RecordedKeys, unused_keys, unused_note
+from mi_diffind.core.files import MOST_NAMES, RecordedKeys, unused_keys, unused_note
 
 TEXT = '{"a": 1, "b": {"c": 2, "d": 3}, "e": [{"f": 4, "g": 5}, {"f": 6, "g": 7, "h": {"i": 8}}], "j": null}'
 

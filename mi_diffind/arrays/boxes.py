@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 
 #: Magnitude below which a component of a direction counts as zero: its reciprocal fits single precision.
@@ -32,3 +34,21 @@ def box_interval(o, d, lower, upper, near, far, active) -> tuple:
         near = dr.select(parallel, near, dr.maximum(near, dr.minimum(first, second)))
         far = dr.select(parallel, far, dr.minimum(far, dr.maximum(first, second)))
     return near, far, active
+
+
+@dataclass(frozen=True)
+class ValueBounds:
+    """Bounds of a parameter: its values lie in ``[low, high]``.
+
+    ``optimised``: a derivative with respect to it is tracked, and it may take any value. ``grey``: its channels are
+    equal, if it is a colour.
+    """
+
+    low: float = 0.0
+    high: float = 1.0
+    optimised: bool = False
+    grey: bool = False
+
+    def is_always(self, value: float) -> bool:
+        """Return whether the parameter is this constant and stays so."""
+        return self.low == self.high == value and not self.optimised

@@ -8,7 +8,6 @@ Datta et al., *Efficient Graphics Representation with Differentiable Indirection
 from __future__ import annotations
 
 import copy
-import functools
 import math
 from collections.abc import Sequence
 
@@ -16,11 +15,10 @@ import drjit as dr
 import numpy as np
 from drjit import nn
 
-from ..core.compat import module_of
-from ..core.memory import owned
+from ..core.compat import module_of, owned
 from ..core.runtime import llvm_problem
 from . import lookup
-from .bits import as_words, pack_bits, unpack_bits
+from .lookup import as_words, pack_bits, unpack_bits
 
 __all__ = ["DifferentiableArray", "Indirection", "fold"]
 
@@ -100,22 +98,15 @@ class DifferentiableArray(nn.Module):
                 raise ValueError(f'init: found "{init}", allowed are {INITIALISATIONS} or an array of entries')
         elif tuple(np.shape(init)) != (*resolution, channels):
             raise ValueError(f"init: found shape {tuple(np.shape(init))}, expected {(*resolution, channels)}")
-        self.resolution = resolution
-        self.channels = int(channels)
-        self.border = border
-        self.folded = bool(fold)
-        self.storage = "float32"
-        self.bits = 8
-        self.scale = ()
-        self.offset = ()
-        self.init = init
+        self.resolution, self.channels, self.border, self.folded = resolution, int(channels), border, bool(fold)
+        self.storage, self.bits, self.scale, self.offset = "float32", 8, (), ()
+        self.init, self.data = init, None
         random = isinstance(init, str) and init == "random"
         self.value = value if value is not None else (0.0, 1.0) if random else 0.5
         if random and np.shape(self.value) != (2,):
             raise ValueError(f'value: found {value}, init="random" needs a pair (low, high)')
         if isinstance(init, str) and init == "constant" and np.shape(self.value) not in ((), (1,), (self.channels,)):
             raise ValueError(f"value: found {value}, one number or {self.channels} are needed, one a channel")
-        self.data = None
 
     def _alloc(self, dtype, size=-1, rng=None):
         if size not in (-1, self.dims):
@@ -132,28 +123,23 @@ class DifferentiableArray(nn.Module):
             low, high = self.value
             drawn = rng.random(module_of(dtype).Float, int(np.prod(shape)))
             values = low + (high - low) * drawn.numpy().reshape(shape)
-        result = self._like()
-        result.storage = "float16" if dr.is_half_v(dtype) else "float32"
-        result.data = padded_tensor(dtype, values, self.resolution, self.channels)
-        return result, self.channels
+        return self._replace()._hold(values, dtype, "float16" if dr.is_half_v(dtype) else "float32"), self.channels
 
     def _require_entries(self) -> None:
         if self.data is None:
             raise RuntimeError("this DifferentiableArray has no entries yet: call .alloc(tensor type) first")
 
-    def _like(self) -> DifferentiableArray:
-        """Return a copy that shares everything but the cache of parameter names."""
+    def _replace(self, **changes) -> DifferentiableArray:
+        """Return a copy with other attributes, which shares everything else but the cache of parameter names."""
         result = type(self)()
         for name in self.DRJIT_STRUCT:
-            setattr(result, name, getattr(self, name))
+            setattr(result, name, changes[name] if name in changes else getattr(self, name))
         return result
 
     def copy(self) -> DifferentiableArray:
         """Return a copy that shares the entries; assigning to one does not change the other."""
         self._require_entries()
-        result = self._like()
-        result.data = type(self.data)(self.data)
-        return result
+        return self._replace(data=type(self.data)(self.data))
 
     def unfolded(self, change=None) -> DifferentiableArray:
         """Return a copy that holds its entries folded already, after ``change`` (a function of a flat array) if given.
@@ -161,23 +147,20 @@ class DifferentiableArray(nn.Module):
         It is differentiable with respect to the entries of this array. For floats.
         """
         self._require_entries()
-        result, entries = self._like(), self.data.array
-        entries = fold(entries) if self.folded else entries
-        result.data = type(self.data)(entries if change is None else change(entries), self.data.shape)
-        result.folded = False
-        return result
+        entries = fold(self.data.array) if self.folded else self.data.array
+        entries = entries if change is None else change(entries)
+        return self._replace(data=type(self.data)(entries, self.data.shape), folded=False)
 
     def fixed(self, count: int | None = None) -> DifferentiableArray:
         """Return a copy without gradients of the first ``count`` entries along the first axis (``None``: of all)."""
         self._require_entries()
-        result, entries = self._like(), self.data.array
+        entries = self.data.array
         constant = dr.detach(entries)
         if count is not None:
             first = count * (len(entries) // self.resolution[0])
             index = dr.arange(dr.uint32_array_t(type(entries)), len(entries))
             constant = dr.select(index < first, constant, entries)
-        result.data = type(self.data)(constant, self.data.shape)
-        return result
+        return self._replace(data=type(self.data)(constant, self.data.shape))
 
     def rounded(self, bits: int) -> DifferentiableArray:
         """Return a copy whose entries in [0, 1], after the fold, are rounded as :meth:`quantised` stores them.
@@ -202,7 +185,7 @@ class DifferentiableArray(nn.Module):
         steps = 2**bits - 1
         codes = np.rint(self.numpy().astype(np.float64) * steps).astype(np.uint8)
         affine = ((1 / steps,) * self.channels, (0.0,) * self.channels)
-        return self.from_numpy(codes, type(self.data), self.border, "uint8", False, affine, bits, **self._form())
+        return self._replace(folded=False)._hold(codes, type(self.data), "uint8", affine, bits)
 
     def to(self, storage: str) -> DifferentiableArray:
         """Return a copy in another storage form.
@@ -210,15 +193,10 @@ class DifferentiableArray(nn.Module):
         Leaving ``"float32"`` applies the fold for good: quantised entries are ``fold(entry)``, and inference needs no
         non-linearity. ``"uint8"`` is for reading only.
         """
-        if storage not in lookup.STORAGES:
-            raise ValueError(f'storage: found "{storage}", allowed are {lookup.STORAGES}')
+        check_storage(storage)
         if storage == self.storage:
-            return self._like()
-        return self.from_numpy(self.numpy(), module_of(self.data).TensorXf, self.border, storage, **self._form())
-
-    def _form(self) -> dict:
-        """Return further arguments of :meth:`from_numpy` that make an array of the same form."""
-        return {}
+            return self._replace()
+        return self._replace(folded=False)._hold(self.numpy(), type(self.data), storage)
 
     @classmethod
     def from_numpy(cls, values, dtype, border="clamp", storage="float32", fold=False, quantization=None, bits=8):
@@ -228,32 +206,33 @@ class DifferentiableArray(nn.Module):
         ``bits`` < 8 that they need only so many bits each in memory.
         """
         values = np.asarray(values)
-        if storage not in lookup.STORAGES:
-            raise ValueError(f'storage: found "{storage}", allowed are {lookup.STORAGES}')
+        check_storage(storage)
         if values.ndim < 2:
             raise ValueError(f"values: found shape {values.shape}, the last axis has to be the channels")
         result = cls(values.shape[:-1], values.shape[-1], "constant", None, fold, border)
-        result.storage = storage
-        if storage == "uint8":
-            if quantization is None:
-                codes, scale, offset = lookup.quantize(values, result.channels)
-            else:
-                codes, (scale, offset) = values, quantization
-            result.scale, result.offset = tuple(map(float, scale)), tuple(map(float, offset))
-            require_backend(dtype)
-            UInt32 = module_of(dtype).UInt32
-            result.bits = bits
-            if bits < 8:
-                more = lookup.guarded(result.resolution, result.border)[-1] - codes.shape[-2]
-                padded = np.concatenate([codes, codes[..., :more, :]], axis=-2)
-                packed = as_words(pack_bits(padded, bits), spare=2)
-            else:
-                packed = lookup.pack(codes, result.border)
-            result.data = owned(device_array(UInt32, packed))
-        else:
-            tensor = module_of(dtype).TensorXf16 if storage == "float16" else module_of(dtype).TensorXf
-            result.data = padded_tensor(tensor, values, result.resolution, result.channels)
-        return result
+        return result._hold(values, dtype, storage, quantization, bits)
+
+    def _hold(self, values, dtype, storage: str, quantization=None, bits: int = 8) -> DifferentiableArray:
+        """Take ``values`` as entries, as :meth:`from_numpy` does, and return the array itself."""
+        require_backend(dtype)
+        self.storage, self.scale, self.offset, self.bits = storage, (), (), 8
+        if storage != "uint8":
+            self.data = padded_tensor(_tensor_type(dtype, storage), values, self._shape, self.channels)
+            return self
+        codes, affine = values, quantization
+        if quantization is None:
+            codes, *affine = lookup.quantize(values, self.channels)
+        self.scale, self.offset = (tuple(map(float, numbers)) for numbers in affine)
+        self.bits = bits
+        self.data = owned(device_array(module_of(dtype).UInt32, self._packed(codes, bits)))
+        return self
+
+    def _packed(self, codes: np.ndarray, bits: int) -> np.ndarray:
+        """Return the words that hold the numbers ``codes``, ``(*shape, channels)``, of ``bits`` bits."""
+        if bits == 8:
+            return lookup.pack(codes, self.border)
+        more = lookup.guarded(self.resolution, self.border)[-1] - codes.shape[-2]
+        return as_words(pack_bits(np.concatenate([codes, codes[..., :more, :]], axis=-2), bits), spare=2)
 
     def numpy(self) -> np.ndarray:
         """Return the entries as they are interpolated (folded, dequantised), float32, ``(N_1, …, N_d, channels)``."""
@@ -269,11 +248,15 @@ class DifferentiableArray(nn.Module):
         """Return the bytes of an array in ``"uint8"`` storage, shape ``(N_1, …, N_d, channels)``."""
         if self.storage != "uint8":
             raise ValueError(f'only "uint8" storage has codes, this array is stored as "{self.storage}"')
-        if self.bits < 8:
-            shape = (*lookup.guarded(self.resolution, self.border), self.channels)
-            codes = unpack_bits(self.data.numpy().view(np.uint8), math.prod(shape), self.bits)
-            return codes.reshape(shape)[..., : self.resolution[-1], :]
-        return lookup.unpack(self.data.numpy(), self.resolution, self.channels)
+        return self._unpacked(self.data.numpy())
+
+    def _unpacked(self, words: np.ndarray) -> np.ndarray:
+        """Return the numbers of :meth:`_packed` words."""
+        if self.bits == 8:
+            return lookup.unpack(words, self.resolution, self.channels)
+        shape = (*lookup.guarded(self.resolution, self.border), self.channels)
+        codes = unpack_bits(words.view(np.uint8), math.prod(shape), self.bits)
+        return codes.reshape(shape)[..., : self.resolution[-1], :]
 
     def at(self, x) -> DifferentiableArray:
         """Fix the *last* coordinate at ``x``, an array of size 1, and return the array of one dimension less.
@@ -300,8 +283,7 @@ class DifferentiableArray(nn.Module):
         for k, value in enumerate(values):
             dr.scatter(flat, value, index + k)
         result = DifferentiableArray(resolution, self.channels, border=self.border[:-1])
-        result.data = module.TensorXf(flat, (*resolution, stored))
-        return result
+        return result._replace(data=module.TensorXf(flat, (*resolution, stored)))
 
     def blend(self, corners, active=True) -> list:
         """Return the channels of a weighted sum of entries, folded, without interpolation.
@@ -310,17 +292,21 @@ class DifferentiableArray(nn.Module):
         to 1. Differentiable with respect to the weights and to the entries of float storage.
         """
         self._require_entries()
-        if self.storage == "uint8":
-            return lookup.blend_packed(
-                self.data, self.scale, self.offset, self.resolution, self.channels, corners, active, self.bits
-            )
+        if self.storage != "uint8":
+            return self._read_floats(lambda: corners, active)
+        words, runs = (self.data, self.scale, self.offset), [(index, (weight,)) for index, weight in corners]
+        packed = self.resolution if self.bits == 8 else None
+        return lookup.read_words(*words, self.channels, runs, active, self.bits, packed)
+
+    def _read_floats(self, corners, active) -> list:
+        """Return the weighted sum of the entries that the function ``corners`` returns."""
         self.check_shape()
+        # Folding the whole table once is cheaper, but a loop or call that is being recorded can only gather from (and
+        # send gradients to) what exists already.
         entries, transform = self.data.array, fold if self.folded else None
         if self.folded and not dr.flag(dr.JitFlag.SymbolicScope):
             entries, transform = fold(entries), None
-        Float, stored = module_of(self.data).Float, self.data.shape[-1]
-        fetch = functools.partial(lookup.fetch_float, entries, self.channels, stored, active, transform, Float)
-        return lookup.weighted_sum((weight, fetch(index)) for index, weight in corners)
+        return lookup.read_floats(entries, self.channels, self.data.shape[-1], corners(), active, transform)
 
     @property
     def is_pointer(self) -> bool:
@@ -330,11 +316,16 @@ class DifferentiableArray(nn.Module):
         pairs = list(zip(self.scale, self.offset, strict=True))
         return all(offset >= 0 and scale >= 0 and offset + (2**self.bits - 1) * scale <= 1 for scale, offset in pairs)
 
+    @property
+    def _shape(self) -> tuple[int, ...]:
+        """Shape of the entries, without the channels."""
+        return self.resolution
+
     def check_shape(self) -> None:
         """Raise ``ValueError`` if ``data`` is a tensor of any shape but the two that can be read."""
-        expected = (*self.resolution, self.channels)
-        if self.data.shape not in (expected, (*self.resolution, lookup.padded_channels(self.channels))):
-            raise ValueError(f'"data" has the shape {self.data.shape}, expected {expected}')
+        allowed = [(*self._shape, n) for n in (self.channels, lookup.padded_channels(self.channels))]
+        if self.data.shape not in allowed:
+            raise ValueError(f'"data" has the shape {self.data.shape}, expected {allowed[0]}')
 
     @property
     def dims(self) -> int:
@@ -345,15 +336,11 @@ class DifferentiableArray(nn.Module):
     def nbytes(self) -> int:
         """Bytes of the entries in their storage form, without padding: what a file has to hold."""
         bits = {"float32": 32, "float16": 16, "uint8": self.bits}[self.storage]
-        return (math.prod(self.resolution) * self.channels * bits + 7) // 8
+        return (math.prod(self._shape) * self.channels * bits + 7) // 8
 
     @property
     def memory_nbytes(self) -> int:
-        """Bytes in memory, with padded channels and repeated entries.
-
-        Packed tables repeat entries so that one gather brings several corners
-        (:func:`mi_diffind.arrays.lookup.packed_layout`).
-        """
+        """Bytes in memory, with padded channels, and entries that packed tables repeat (:func:`.packed_layout`)."""
         self._require_entries()
         return dr.width(self.data) * (2 if self.storage == "float16" else 4)
 
@@ -371,39 +358,17 @@ class DifferentiableArray(nn.Module):
         coordinates, is_coopvec = coordinates_of(x, module_of(self.data).Float)
         if len(coordinates) != self.dims:
             raise ValueError(f"an array of {self.dims} dimension(s) was read at {len(coordinates)} coordinate(s)")
-        if self.storage == "uint8":
-            read = lookup.read_packed if self.bits == 8 else functools.partial(lookup.read_bits, bits=self.bits)
-            values = read(
-                self.data,
-                self.scale,
-                self.offset,
-                self.resolution,
-                self.channels,
-                coordinates,
-                self.border,
-                active,
-                inside,
-            )
-        else:
-            self.check_shape()
-            # Folding the whole table once is cheaper, but a loop or call that is being recorded can only gather from
-            # (and send gradients to) what exists already.
-            entries, transform = self.data.array, None
-            if self.folded and dr.flag(dr.JitFlag.SymbolicScope):
-                transform = fold
-            elif self.folded:
-                entries = fold(entries)
-            values = lookup.read_float(
-                entries,
-                self.resolution,
-                self.channels,
-                coordinates,
-                self.border,
-                active,
-                transform,
-                self.data.shape[-1],
-            )
+        values = self._read(coordinates, active, inside)
         return nn.CoopVec(*values) if is_coopvec else values
+
+    def _read(self, x: list, active, inside: bool) -> list:
+        if self.storage != "uint8":
+            return self._read_floats(lambda: lookup.corners(x, self.resolution, self.border), active)
+        words = self.data, self.scale, self.offset
+        if self.bits == 8:
+            return lookup.read_packed(*words, self.resolution, self.channels, x, self.border, active, inside)
+        runs = lookup.neighbour_pairs(x, self.resolution, self.border, inside)
+        return lookup.read_words(*words, self.channels, runs, active, self.bits)
 
 
 class Indirection(nn.Module):
@@ -511,14 +476,18 @@ def rounded(net: Indirection, bits: Sequence[int] | None = None) -> Indirection:
 
     Entries of each primary are rounded to its ``bits`` (default: 8), the cascaded array's to 8.
     """
-    widths = zip(net.primary, bits or [8] * len(net.primary), strict=True)
-    return Indirection([array.rounded(width) for array, width in widths], net.cascaded.rounded(8), net.inputs)
+    return _changed(net, bits, DifferentiableArray.rounded)
 
 
 def stored_form(net: Indirection, bits: Sequence[int] | None = None) -> Indirection:
     """Return the arrays of ``net`` as they are stored, as bytes; :func:`rounded` predicts their values."""
-    widths = zip(net.primary, bits or [8] * len(net.primary), strict=True)
-    return Indirection([array.quantised(width) for array, width in widths], net.cascaded.quantised(8), net.inputs)
+    return _changed(net, bits, DifferentiableArray.quantised)
+
+
+def _changed(net: Indirection, bits: Sequence[int] | None, change) -> Indirection:
+    widths = bits or [8] * len(net.primary)
+    primary = [change(array, width) for array, width in zip(net.primary, widths, strict=True)]
+    return Indirection(primary, change(net.cascaded, 8), net.inputs)
 
 
 def ramp(resolution: Sequence[int], channels: int, border: Sequence[str]) -> np.ndarray:
@@ -536,6 +505,17 @@ def ramp(resolution: Sequence[int], channels: int, border: Sequence[str]) -> np.
     return np.stack([grids[k % len(grids)] for k in range(channels)], axis=-1)
 
 
+def check_storage(storage: str) -> None:
+    """Raise ``ValueError`` for a word that is no storage form."""
+    if storage not in lookup.STORAGES:
+        raise ValueError(f'storage: found "{storage}", allowed are {lookup.STORAGES}')
+
+
+def _tensor_type(dtype, storage: str):
+    """Return the tensor type of a float storage form: never double, also in such variants."""
+    return module_of(dtype).TensorXf16 if storage == "float16" else module_of(dtype).TensorXf
+
+
 def require_backend(dtype) -> None:
     # Without LLVM, Dr.Jit takes the whole process down when it makes an array from NumPy's (SIGFPE).
     if not dr.has_backend(dr.backend_v(dtype)):
@@ -543,9 +523,10 @@ def require_backend(dtype) -> None:
 
 
 def padded_tensor(dtype, values: np.ndarray, resolution, channels: int):
+    """Return ``values``, ``(*resolution, channels)``, as a tensor with padded channels, which are 0."""
     require_backend(dtype)
     half = dr.is_half_v(dtype)
-    dtype = module_of(dtype).TensorXf16 if half else module_of(dtype).TensorXf  # never double, also in such variants
+    dtype = _tensor_type(dtype, "float16" if half else "float32")
     shape = (*resolution, lookup.padded_channels(channels))
     stored = aligned(shape, np.float16 if half else np.float32)
     stored[..., :channels] = values

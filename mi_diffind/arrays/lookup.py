@@ -17,11 +17,11 @@ Everything works on any JIT backend of Dr.Jit; nothing here knows Mitsuba.
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Sequence
 
 import drjit as dr
+import numpy as np
 
 from ..core.compat import module_of
 
@@ -137,45 +137,34 @@ def weighted_sum(terms):
     return total
 
 
-def read_float(
-    data,
-    resolution: Sequence[int],
-    channels: int,
-    x: Sequence,
-    border: Sequence[str],
-    active=True,
-    transform=None,
-    stored: int | None = None,
-):
-    """Read a table of 16- or 32-bit floats.
+def corners(x: Sequence, resolution: Sequence[int], border: Sequence[str]) -> list:
+    """Return the ``2^d`` pairs (index of an entry, weight) of a multilinear read at the ``d`` coordinates ``x``."""
+    return _corners([_axis(v, n, b) for v, n, b in zip(x, resolution, border, strict=True)], resolution)
 
-    ``data`` is the flat array of shape ``(N_1·…·N_d·stored,)``, where ``stored`` is ``padded_channels(channels)``
-    unless given, ``x`` the ``d`` coordinates. Returns a list of ``channels`` arrays of the coordinates' (single
-    precision) type. Differentiable with respect to ``data`` and ``x``. ``transform`` is applied to each entry that was
+
+def read_floats(data, channels: int, stored: int, corners, active=True, transform=None) -> list:
+    """Return the sum of entries of a table of 16- or 32-bit floats, as single-precision arrays, one a channel.
+
+    ``data`` is the flat array of entries of ``stored`` numbers each; ``corners`` are pairs (index of an entry, weight).
+    Differentiable with respect to the entries and the weights. ``transform`` is applied to each number that was
     fetched.
     """
-    Float, stored = type(x[0]), stored or padded_channels(channels)
-    fetch = functools.partial(fetch_float, data, channels, stored, active, transform, Float)
-    axes = [_axis(v, n, b) for v, n, b in zip(x, resolution, border, strict=True)]
-    return weighted_sum((weight, fetch(index)) for index, weight in _corners(axes, resolution))
-
-
-def fetch_float(data, channels: int, stored: int, active, transform, Float, index) -> list:
-    """Return the channels of an entry of a flat array of floats as ``Float``.
-
-    The array holds ``stored`` numbers an entry.
-    """
+    Float = dr.float32_array_t(type(data))
     packet = _packet(stored)
     groups = stored // packet
     suffix = "f16" if dr.is_half_v(type(data)) else "f"
     Packet = None if packet == 1 else getattr(module_of(Float), f"Array{packet}{suffix}")
-    values = []
-    for group in range(groups):
-        where = index if groups == 1 else dr.fma(index, groups, group)
-        packet_values = dr.gather(Packet or type(data), data, where, active)
-        values += [Float(v) for v in (packet_values if Packet else [packet_values])]
-    values = values[:channels]
-    return values if transform is None else [transform(v) for v in values]
+
+    def fetch(index) -> list:
+        values = []
+        for group in range(groups):
+            where = index if groups == 1 else dr.fma(index, groups, group)
+            packet_values = dr.gather(Packet or type(data), data, where, active)
+            values += [Float(v) for v in (packet_values if Packet else [packet_values])]
+        values = values[:channels]
+        return values if transform is None else [transform(v) for v in values]
+
+    return weighted_sum((weight, fetch(index)) for index, weight in corners)
 
 
 def read_packed(
@@ -279,21 +268,10 @@ def guarded(resolution: Sequence[int], border: Sequence[str]) -> tuple[int, ...]
     return (*outer, n + (border[-1] == "repeat" and n > 1))
 
 
-def read_bits(
-    words,
-    scale,
-    offset,
-    resolution: Sequence[int],
-    channels: int,
-    x: Sequence,
-    border: Sequence[str],
-    active=True,
-    inside: bool = False,
-    bits: int = 4,
-):
-    """Read a table of fewer than 8 ``bits`` a channel (:func:`.bits.pack_bits`, in 32-bit words and two words more).
+def neighbour_pairs(x: Sequence, resolution: Sequence[int], border: Sequence[str], inside: bool = False) -> list:
+    """Return the entries that a multilinear read of a table of fewer than 8 bits a channel blends.
 
-    The table takes no more memory than these bits and those of :func:`guarded`. Otherwise like :func:`read_packed`.
+    They are pairs: the index of an entry, and the weights of it and of the next one along the last axis.
     """
     axes = [_axis(v, n, b, inside) for v, n, b in zip(x, resolution, border, strict=True)]
     stored, (lower, _, w) = guarded(resolution, border), axes[-1]
@@ -301,25 +279,44 @@ def read_bits(
     for index, weight in _corners(axes[:-1], stored[:-1]):
         index = lower if index is None else dr.fma(index, stored[-1], lower)
         pairs.append((index, ends if weight is None else [weight * end for end in ends]))
-    return blend_bits(words, scale, offset, channels, pairs, active, bits)
+    return pairs
 
 
-def blend_bits(words, scale, offset, channels: int, pairs, active, bits: int) -> list:
-    """Return the sum of pairs of neighbouring entries of fewer than 8 ``bits``, by weights that sum to 1.
+def read_words(
+    words, scale, offset, channels: int, runs, active=True, bits: int = 4, resolution: Sequence[int] | None = None
+) -> list:
+    """Return the sum of entries of a table of words, by weights that sum to 1, for each channel.
 
-    ``pairs`` hold the index of the first entry of each, and both weights. Scale and offset are applied to the sum.
+    ``runs`` are pairs: the index of an entry, and the weights of it and of those that follow it. Entries have ``bits``
+    bits a channel, one entry after the other (:func:`pack_bits`, and one word to spare for each entry of a run). With a
+    ``resolution``, they are the bytes of :func:`pack`, and a run has one entry. Scale and offset are applied once, to
+    the sum. Differentiable with respect to the weights.
     """
-    Float = dr.float32_array_t(type(words))
-    terms = []
-    for index, weights in pairs:
-        terms += zip(weights, fetch_bits(words, channels, bits, active, Float, index, 2), strict=True)
-    sums, steps = weighted_sum(terms), bit_steps(channels, bits)
-    values = [dr.fma(s, scale[k] * steps[k], offset[k]) for k, s in enumerate(sums)]
+    Float, terms = dr.float32_array_t(type(words)), []
+    steps = bit_steps(channels, bits) if resolution is None else [2.0**-15, 2.0**-7] * channels
+    per_texel = 0 if resolution is None else packed_layout(resolution, channels)[2]
+    for index, weights in runs:
+        if per_texel:
+            entries = [_fetch_bytes(words, channels, per_texel, active, Float, index)]
+        else:
+            entries = fetch_bits(words, channels, bits, active, Float, index, len(weights))
+        terms += zip(weights, entries, strict=True)
+    values = [dr.fma(v, scale[k] * steps[k], offset[k]) for k, v in enumerate(weighted_sum(terms))]
     return values if active is True else [dr.select(active, v, 0) for v in values]
 
 
+def _fetch_bytes(words, channels: int, per_texel: int, active, Float, index) -> list:
+    """Return the bytes of an entry of a packed table as ``Float``, still to be multiplied by 2⁻¹⁵ and 2⁻⁷ in turn."""
+    UInt32, Int32, codes = type(words), dr.int32_array_t(type(words)), []
+    for word in range((channels + 3) // 4):
+        value = dr.gather(UInt32, words, index if per_texel == 1 else index * per_texel + word, active)
+        for rotated in (value, (value << 16) | (value >> 16)):
+            codes += [Float(Int32(rotated & mask)) for mask in (0x7F8000, 0x7F80)]
+    return codes[:channels]
+
+
 def fetch_bits(words, channels: int, bits: int, active, Float, index, entries: int = 1) -> list[list]:
-    """Return the numbers that :func:`.bits.pack_bits` packed for one entry, or for it and the next one, for each.
+    """Return the numbers that :func:`pack_bits` packed for one entry, or for it and the next one, for each.
 
     They are ``Float``, still to be multiplied by :func:`bit_steps`: bits stay where they are in a word, which saves a
     shift for each number. A table has one word to spare for each of the ``entries``.
@@ -370,44 +367,12 @@ def bit_steps(channels: int, bits: int) -> list[float]:
     return [2.0**-at if at + bits < 32 else 1.0 for at in places]
 
 
-def blend_packed(
-    words, scale, offset, resolution: Sequence[int], channels: int, corners, active=True, bits: int = 8
-) -> list:
-    """Return the sum of entries of a table of bytes (:func:`pack`) or of fewer ``bits``, by weights that sum to 1.
-
-    ``corners`` are pairs (index of an entry, weight). Scale and offset are applied once, to the sum.
-    """
-    UInt32, Int32 = type(words), dr.int32_array_t(type(words))
-    Float = dr.float32_array_t(UInt32)
-    if bits < 8:
-        steps = bit_steps(channels, bits)
-
-        def fetch(index):
-            return fetch_bits(words, channels, bits, active, Float, index)[0]
-    else:
-        steps, (_, _, per_texel) = [2.0**-15, 2.0**-7] * channels, packed_layout(resolution, channels)
-
-        def fetch(index):
-            codes = []
-            for word in range((channels + 3) // 4):
-                word_values = dr.gather(UInt32, words, index if per_texel == 1 else index * per_texel + word, active)
-                for rotated in (word_values, (word_values << 16) | (word_values >> 16)):
-                    codes += [Float(Int32(rotated & mask)) for mask in (0x7F8000, 0x7F80)]
-            return codes[:channels]
-
-    sums = weighted_sum((weight, fetch(index)) for index, weight in corners)
-    values = [dr.fma(s, scale[k] * steps[k], offset[k]) for k, s in enumerate(sums)]
-    return values if active is True else [dr.select(active, v, 0) for v in values]
-
-
 def quantize(values, channels: int):
     """Quantise a NumPy array of shape ``(…, channels)`` to bytes, with one affine map a channel.
 
     Returns ``(codes, scale, offset)`` with ``values ≈ offset + scale · codes``, at most half a ``scale`` off; the
     smallest and the largest value of each channel are hit exactly.
     """
-    import numpy as np
-
     flat = np.asarray(values, dtype=np.float64).reshape(-1, channels)
     if not np.isfinite(flat).all():
         raise ValueError("entries that are NaN or infinite cannot be stored as bytes")
@@ -423,8 +388,6 @@ def pack(codes, border: Sequence[str]):
     Returns a flat ``uint32`` array in the layout of :func:`packed_layout`, the last axis fastest. See :func:`unpack`
     for the bits.
     """
-    import numpy as np
-
     codes = np.asarray(codes, dtype=np.uint8)
     *resolution, channels = codes.shape
     inner, stride, words = packed_layout(resolution, channels)
@@ -447,9 +410,51 @@ def unpack(words, resolution: Sequence[int], channels: int):
     Byte 0 of a word lies in bits 15 to 22, byte 1 in bits 7 to 14, and bytes 2 and 3 there once the word is rotated by
     16.
     """
-    import numpy as np
-
     words = np.asarray(words, dtype=np.uint32)
     rotated = words << 16 | words >> 16
     codes = np.stack([words >> 15, words >> 7, rotated >> 15, rotated >> 7], axis=-1) & 0xFF
     return codes.astype(np.uint8).reshape(*resolution, -1)[..., :channels].copy()
+
+
+#: Numbers that are packed or unpacked at a time, a multiple of 8.
+PART = 2**16
+
+
+def pack_bits(numbers: np.ndarray, bits: int) -> np.ndarray:
+    """Pack the lowest ``bits`` bits of each unsigned number, in the order of the flat array: flat ``uint8``."""
+    numbers = np.ascontiguousarray(numbers).reshape(-1, 1)
+    packed = np.empty(-(-len(numbers) * bits // 8), np.uint8)
+    for first in range(0, len(numbers), PART):  # flags take 8 or 32 bytes a number
+        part = numbers[first : first + PART]
+        if part.dtype != np.uint8:
+            part = part.astype("<u4").view(np.uint8)
+        flags = np.packbits(np.unpackbits(part, axis=1, bitorder="little")[:, :bits], bitorder="little")
+        packed[first * bits // 8 : first * bits // 8 + len(flags)] = flags
+    return packed
+
+
+def unpack_bits(packed: np.ndarray, count: int, bits: int) -> np.ndarray:
+    """Return the first ``count`` numbers of up to 8 bits that :func:`pack_bits` packed: flat ``uint8``."""
+    numbers = np.empty(count, np.uint8)
+    for first in range(0, count, PART):  # flags take 8 bytes a number
+        part = numbers[first : first + PART]
+        begin = first * bits // 8
+        flags = np.unpackbits(packed[begin : begin + PART * bits // 8], count=len(part) * bits, bitorder="little")
+        flags = np.pad(flags.reshape(-1, bits), ((0, 0), (0, 8 - bits)))
+        part[:] = np.packbits(flags, axis=1, bitorder="little").reshape(-1)
+    return numbers
+
+
+def as_words(packed: np.ndarray, spare: int = 0) -> np.ndarray:
+    """Return bytes as 32-bit words, filled up with zeros, and ``spare`` words of zeros after them."""
+    return np.pad(packed, (0, -len(packed) % 4 + 4 * spare)).view("<u4")
+
+
+def mask_words(flags: np.ndarray) -> np.ndarray:
+    """Return each row of ``flags``, shape ``(…, 32 k)``, as ``k`` words: ``uint32`` of shape ``(…, k)``."""
+    return np.packbits(flags, axis=-1, bitorder="little").view("<u4")
+
+
+def mask_flags(masks: np.ndarray) -> np.ndarray:
+    """Return the flags of rows of words, the inverse of :func:`mask_words`: ``bool`` of shape ``(…, 32 k)``."""
+    return np.unpackbits(np.ascontiguousarray(masks, "<u4").view(np.uint8), axis=-1, bitorder="little").astype(bool)

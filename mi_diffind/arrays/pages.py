@@ -10,19 +10,16 @@ first.
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Sequence
 
 import drjit as dr
 import numpy as np
-from drjit import nn
 
-from ..core.compat import module_of
-from ..core.memory import owned
+from ..core.compat import module_of, owned
 from . import lookup
-from .bits import as_words, pack_bits, unpack_bits
-from .indirection import DifferentiableArray, coordinates_of, device_array, fold, padded_tensor, require_backend
+from .indirection import DifferentiableArray, check_storage, device_array, require_backend
+from .lookup import as_words, pack_bits, unpack_bits
 
 __all__ = [
     "PagedArray",
@@ -100,15 +97,15 @@ class PagedArray(DifferentiableArray):
         """Number of entries of all pages together."""
         return int(self.sizes.prod(axis=-1).sum())
 
+    @property
+    def _shape(self) -> tuple[int]:
+        return (self.entries,)
+
     def _alloc(self, dtype, size=-1, rng=None):
         if size not in (-1, self.dims):
             raise ValueError(f"an array of {self.dims} dimension(s) was given {size} input(s)")
         values = np.broadcast_to(self.init, (self.entries, self.channels))
-        result = self._like()
-        result.storage = "float16" if dr.is_half_v(dtype) else "float32"
-        result.data = padded_tensor(dtype, values, (self.entries,), self.channels)
-        result.index = (self._words(dtype),)
-        return result, self.channels
+        return self._replace()._hold(values, dtype, "float16" if dr.is_half_v(dtype) else "float32"), self.channels
 
     def _words(self, dtype):
         """Return the index: for each page, its first entry and, in the lower bits, its sides less one.
@@ -121,65 +118,38 @@ class PagedArray(DifferentiableArray):
             index = index << bits | (flat[:, axis] - 1)
         return owned(device_array(module_of(dtype).UInt32, index))
 
-    def _form(self) -> dict:
-        return {"sizes": self.sizes, "shift": self.shift}
-
     @classmethod
     def from_numpy(
-        cls,
-        values,
-        dtype,
-        border="clamp",
-        storage="float32",
-        fold=False,
-        quantization=None,
-        bits=8,
-        *,
-        sizes=None,
+        cls, values, dtype, border="clamp", storage="float32", fold=False, quantization=None, bits=8, *, sizes=None,
         shift=0.0,
-    ):
+    ):  # fmt: skip
         """Return an allocated array of pages of ``sizes`` that holds ``values``, ``(entries, channels)``.
 
         Other parameters are those of :meth:`.DifferentiableArray.from_numpy`. Bytes are never held several times.
         """
         values = np.asarray(values)
-        if storage not in lookup.STORAGES:
-            raise ValueError(f'storage: found "{storage}", allowed are {lookup.STORAGES}')
+        check_storage(storage)
         if values.ndim != 2:
             raise ValueError(f"values: found shape {values.shape}, expected (entries, channels)")
         result = cls(sizes, values.shape[1], 0.0, shift, fold, border)
         if len(values) != result.entries:
             raise ValueError(f"values: found {len(values)} entries, the pages have {result.entries}")
-        require_backend(dtype)
-        module, result.storage = module_of(dtype), storage
-        result.index = (result._words(dtype),)
-        if storage != "uint8":
-            form = module.TensorXf16 if storage == "float16" else module.TensorXf
-            result.data = padded_tensor(form, values, (result.entries,), result.channels)
-            return result
-        codes, affine = values, quantization
-        if quantization is None:
-            codes, *affine = lookup.quantize(values, result.channels)
-        result.scale, result.offset = (tuple(map(float, numbers)) for numbers in affine)
-        result.bits = bits
-        packed = as_words(pack_bits(codes, bits), spare=2)
-        result.data = owned(device_array(module.UInt32, packed))
-        return result
+        return result._hold(values, dtype, storage, quantization, bits)
 
-    def codes(self) -> np.ndarray:
-        """Return the bytes of an array in ``"uint8"`` storage, ``(entries, channels)``."""
-        if self.storage != "uint8":
-            raise ValueError(f'only "uint8" storage has codes, this array is stored as "{self.storage}"')
-        packed = self.data.numpy().view(np.uint8)
-        return unpack_bits(packed, self.entries * self.channels, self.bits).reshape(-1, self.channels)
+    def _hold(self, values, dtype, storage: str, quantization=None, bits: int = 8) -> PagedArray:
+        require_backend(dtype)
+        self.index = (self._words(dtype),)
+        return super()._hold(values, dtype, storage, quantization, bits)
+
+    def _packed(self, codes: np.ndarray, bits: int) -> np.ndarray:
+        return as_words(pack_bits(codes, bits), spare=2)
+
+    def _unpacked(self, words: np.ndarray) -> np.ndarray:
+        codes = unpack_bits(words.view(np.uint8), self.entries * self.channels, self.bits)
+        return codes.reshape(-1, self.channels)
 
     def at(self, x):
         raise NotImplementedError("an array of pages cannot be reduced by a dimension")
-
-    def check_shape(self) -> None:
-        allowed = [(self.entries, n) for n in (self.channels, lookup.padded_channels(self.channels))]
-        if self.data.shape not in allowed:
-            raise ValueError(f'"data" has the shape {self.data.shape}, expected {allowed[0]}')
 
     @property
     def index_nbytes(self) -> int:
@@ -189,8 +159,7 @@ class PagedArray(DifferentiableArray):
     @property
     def nbytes(self) -> int:
         """Bytes of the entries in their storage form, without padding, and of the index."""
-        bits = {"float32": 32, "float16": 16, "uint8": self.bits}[self.storage]
-        return (self.entries * self.channels * bits + 7) // 8 + self.index_nbytes
+        return super().nbytes + self.index_nbytes
 
     @property
     def memory_nbytes(self) -> int:
@@ -204,27 +173,13 @@ class PagedArray(DifferentiableArray):
             f"fold={self.folded})"
         )
 
-    def __call__(self, x, active=True, inside=False):
-        self._require_entries()
-        x, is_coopvec = coordinates_of(x, module_of(self.data).Float)
-        if len(x) != self.dims:
-            raise ValueError(f"an array of {self.dims} dimension(s) was read at {len(x)} coordinate(s)")
+    def _read(self, x: list, active, inside: bool) -> list:
         corners = self._corners(x, active, inside)
-        if self.storage == "uint8":
-            # The entries of a cell are neighbours along the last axis; a side of one entry reads the next by weight 0
-            pairs = [(i, (v, w)) for (i, v), (_, w) in zip(corners[::2], corners[1::2], strict=True)]
-            values = lookup.blend_bits(self.data, self.scale, self.offset, self.channels, pairs, active, self.bits)
-        else:
-            self.check_shape()
-            entries, transform = self.data.array, None
-            if self.folded and dr.flag(dr.JitFlag.SymbolicScope):  # as in DifferentiableArray
-                transform = fold
-            elif self.folded:
-                entries = fold(entries)
-            stored = self.data.shape[-1]
-            fetch = functools.partial(lookup.fetch_float, entries, self.channels, stored, active, transform, type(x[0]))
-            values = lookup.weighted_sum((weight, fetch(index)) for index, weight in corners)
-        return nn.CoopVec(*values) if is_coopvec else values
+        if self.storage != "uint8":
+            return self._read_floats(lambda: corners, active)
+        # The entries of a cell are neighbours along the last axis; a side of one entry reads the next by weight 0
+        pairs = [(i, (v, w)) for (i, v), (_, w) in zip(corners[::2], corners[1::2], strict=True)]
+        return lookup.read_words(self.data, self.scale, self.offset, self.channels, pairs, active, self.bits)
 
     def _corners(self, x: Sequence, active, inside: bool) -> list:
         """Return the ``2^d`` pairs (entry, weight) of a cell."""

@@ -1,7 +1,7 @@
 """The table file: a ``.npz`` archive of one trained result (readable by ``numpy.load``, never pickled).
 
 It contains one array for each table, ``float32``, ``float16`` or ``uint8`` entries of shape ``(N_1, …, N_d, c)``;
-entries with fewer than 8 bits are packed one after the other (:func:`.bits.pack_bits`). An array ``meta`` of UTF-8
+entries with fewer than 8 bits are packed one after the other (:func:`.lookup.pack_bits`). An array ``meta`` of UTF-8
 bytes holds JSON with the format version, the task and its preset, for each array its shape, borders, storage form, and
 (of bytes) affine map and bits, the training settings, the seed and the measurements. The same content gives the same
 bytes.
@@ -19,19 +19,17 @@ from pathlib import Path
 
 import numpy as np
 
-from ..core.archives import Archive, ArchiveError
+from ..core.archives import Allowance, Archive, ArchiveError, LimitError
 from ..core.errors import DiffindError, printable, reason
 from ..core.files import irregular, replacing, shown
-from ..core.limits import Allowance, LimitError
-from .bits import pack_bits, unpack_bits
 from .indirection import DifferentiableArray
-from .lookup import BORDERS, STORAGES, gathers, pair_words, quantize
+from .lookup import BORDERS, STORAGES, gathers, pack_bits, pair_words, quantize, unpack_bits
 from .pages import SIDE_BITS, PagedArray
 
 #: Version of the format that is written. A file with another version is refused.
 FORMAT_VERSION = 2
 
-#: Largest file content that is written or accepted, in bytes. Small files may hold less: :mod:`.limits`.
+#: Largest file content that is written or accepted, in bytes. Small files may hold less: :mod:`.archives`.
 MAX_BYTES = 2**30
 
 #: Longest path of a file in the settings, in characters.
@@ -43,7 +41,11 @@ _ROWS = 2**16
 #: Bytes of an entry in single precision, in which readers use it.
 _SINGLE = 4
 
+#: Storage form → type of the entries in a file.
 _DTYPES = {"float32": np.dtype("<f4"), "float16": np.dtype("<f2"), "uint8": np.dtype("u1")}
+
+#: End of the name of the array that holds the sizes of pages.
+PAGES = "_pages"
 
 
 class TableError(DiffindError, ValueError):
@@ -82,10 +84,13 @@ class StoredArray:
         ``fold``: float entries pass through the fold, so that an optimiser may leave the range.
         """
         form = self.to(storage or self.storage)
-        affine = (form.scale, form.offset) if form.storage == "uint8" else None
-        return DifferentiableArray.from_numpy(
-            form.entries, dtype, form.border, form.storage, fold and form.storage == "float32", affine, form.bits
-        )
+        return DifferentiableArray.from_numpy(form.entries, dtype, form.border, **form._held(fold))
+
+    def _held(self, fold: bool) -> dict:
+        """Return the arguments of :meth:`.DifferentiableArray.from_numpy` that say how the entries are held."""
+        affine = (self.scale, self.offset) if self.storage == "uint8" else None
+        fold = fold and self.storage == "float32"
+        return {"storage": self.storage, "fold": fold, "quantization": affine, "bits": self.bits}
 
     def to(self, storage: str) -> StoredArray:
         """Return the array in another storage form; precision that bytes or halves have lost does not come back."""
@@ -132,10 +137,6 @@ class StoredArray:
         steps = 2**self.bits - 1
         pairs = zip(self.scale, self.offset, strict=True)
         return all(o >= 0 and s >= 0 and o + steps * s <= 1 + 1e-6 for s, o in pairs)
-
-
-#: What is behind the name of an array of pages in that of the array of their sizes.
-PAGES = "_pages"
 
 
 def stored_arrays(name: str, array: DifferentiableArray) -> dict[str, StoredArray]:
@@ -188,11 +189,8 @@ def allocate_pages(
     Other parameters are those of :meth:`.StoredArray.allocate`. Raises ``ValueError`` if the two arrays do not match.
     """
     form = entries.to(storage or entries.storage)
-    affine = (form.scale, form.offset) if form.storage == "uint8" else None
-    fold = fold and form.storage == "float32"
-    return PagedArray.from_numpy(
-        form.entries, dtype, pages.border, form.storage, fold, affine, form.bits, sizes=page_sides(pages), shift=shift
-    )
+    sides = page_sides(pages)
+    return PagedArray.from_numpy(form.entries, dtype, pages.border, sizes=sides, shift=shift, **form._held(fold))
 
 
 def page_sides(pages: StoredArray) -> np.ndarray:
@@ -290,7 +288,7 @@ def load_table(path: str | os.PathLike, task: str | None = None, shapes: dict[st
     ``task`` and ``shapes`` (array name → shape, ``None`` in place of a free dimension) say what is expected. Raises
     :class:`TableError` with one sentence on anything else: a file that is missing, truncated or no archive, an
     unknown version, a missing, additional, misshapen or mistyped array, NaN or infinity, sizes beyond
-    :data:`MAX_BYTES` or beyond what a file of this size may hold (:mod:`.limits`).
+    :data:`MAX_BYTES` or beyond what a file of this size may hold (:mod:`.archives`).
     """
     path = Path(path)
     if fault := irregular(path, 2 * MAX_BYTES):
@@ -348,7 +346,7 @@ def check_numbers(table: Table, name: str, count: int, positive: bool = False, w
 def check_allowance(table: Table, nbytes: int, content: str) -> None:
     """Raise :class:`TableError` if a file's arrays and ``nbytes`` for its ``content`` are more than it may take.
 
-    The rule is that of :mod:`.limits`. Tables in memory have no limit.
+    The rule is that of :mod:`.archives`. Tables in memory have no limit.
     """
     if table.path is None:
         return
@@ -373,20 +371,33 @@ def _read(archive: Archive, path: Path, task, shapes) -> Table:
     if "meta" not in members:
         raise TableError(f'{path}: has no "meta" array, it was not written by this package')
     members.remove("meta")
+    table, described = _description(archive, path)
+    if task is not None and table.task != task:
+        raise TableError(f'{path}: holds tables for the task "{table.task}", expected "{task}"')
+    expected = set(shapes) if shapes is not None else set(described)
+    for name in sorted(expected - members):
+        raise TableError(f'{path}: the array "{name}" is missing')
+    for name in sorted(members - expected) + sorted(set(described) ^ members):
+        raise TableError(f'{path}: has an unexpected array "{name}"')
+    for name, entry in described.items():
+        table.arrays[name] = _array(archive, path, name, entry, None if shapes is None else shapes[name])
+    return table
 
+
+def _description(archive: Archive, path: Path) -> tuple[Table, dict]:
+    """Return the table of an archive without its arrays, and their descriptions."""
     try:
         meta = archive.json("meta")
         if "lr_scale" in meta:
             raise TableError(
                 f"{path}: is the checkpoint of a training, the table file is what it writes at its end (-o)"
             )
-        version, stored_task = meta["format_version"], meta["task"]
+        version, task = meta["format_version"], meta["task"]
         if version != FORMAT_VERSION:
             raise TableError(
                 f"{path}: has the format version {version}, this package reads version {FORMAT_VERSION}: make it again "
-                f"with mi-diffind fit {stored_task if isinstance(stored_task, str) else 'TASK'}"
+                f"with mi-diffind fit {task if isinstance(task, str) else 'TASK'}"
             )
-        described = {name: entry for name, entry in meta["arrays"].items()}
         preset, settings, seed, measured = (meta[key] for key in ("preset", "settings", "seed", "measured"))
         if not isinstance(settings, dict) or not isinstance(measured, dict):
             raise TypeError("the settings and the measurements have to be objects")
@@ -395,46 +406,36 @@ def _read(archive: Archive, path: Path, task, shapes) -> Table:
         for key, value in settings.items():
             if key.endswith("_path") and not (isinstance(value, str) and 0 < len(value) <= LONGEST_PATH):
                 raise TypeError(f'the setting "{key:.40}" has to be the path of a file')
+        return Table(str(task), {}, str(preset), settings, seed, measured, path), dict(meta["arrays"].items())
     except (ArchiveError, LimitError, TableError):
         raise
     except (ValueError, TypeError, KeyError, AttributeError) as e:
         raise TableError(f'{path}: its "meta" array is damaged ({type(e).__name__}: {e})') from None
-    if task is not None and stored_task != task:
-        raise TableError(f'{path}: holds tables for the task "{stored_task}", expected "{task}"')
 
-    expected = set(shapes) if shapes is not None else set(described)
-    for name in sorted(expected - members):
-        raise TableError(f'{path}: the array "{name}" is missing')
-    for name in sorted(members - expected) + sorted(set(described) ^ members):
-        raise TableError(f'{path}: has an unexpected array "{name}"')
 
-    table = Table(str(stored_task), {}, str(preset), settings, seed, measured, path)
-    for name, entry in described.items():
-        try:
-            shape, border, storage = tuple(int(n) for n in entry["shape"]), tuple(entry["border"]), entry["storage"]
-            scale, offset, bits = (), (), 8
-            if storage == "uint8":
-                scale, offset = (tuple(float(v) for v in entry[k]) for k in ("scale", "offset"))
-                bits = entry["bits"]
-        except (ValueError, TypeError, KeyError, OverflowError) as e:
-            raise TableError(
-                f'{path}: the description of array "{name}" is damaged ({type(e).__name__}: {e})'
-            ) from None
-        if storage not in STORAGES:
-            raise TableError(f'{path}: array "{name}" has the storage form "{storage}", allowed are {STORAGES}')
-        wanted = shapes[name] if shapes is not None else shape
-        if len(shape) != len(wanted) or any(w is not None and s != w for s, w in zip(shape, wanted, strict=True)):
-            raise TableError(f'{path}: array "{name}" has the shape {shape}, expected {tuple(wanted)}')
-        _check_shape(path, name, shape, border)
-        _check_bits(path, name, bits)
-        stored = shape if bits == 8 else (math.ceil(math.prod(shape) * bits / 8),)
-        entries, count = archive.array(name, _DTYPES[storage], stored), math.prod(shape)
-        archive.allowance.take(count * (_SINGLE + (bits < 8)), f'the array "{printable(name):.80}", {count:,} entries,')
-        if bits < 8:
-            entries = unpack_bits(entries, count, bits).reshape(shape)
-        table.arrays[name] = StoredArray(entries, border, scale, offset, bits)
-        _check(path, name, table.arrays[name])
-    return table
+def _array(archive: Archive, path: Path, name: str, entry: dict, expected: tuple | None) -> StoredArray:
+    """Return an array of an archive by its description; its shape is the ``expected`` one, if that is given."""
+    scale, offset, bits = (), (), 8
+    try:
+        shape, border, storage = tuple(int(n) for n in entry["shape"]), tuple(entry["border"]), entry["storage"]
+        if storage == "uint8":
+            scale, offset = (tuple(float(v) for v in entry[k]) for k in ("scale", "offset"))
+            bits = entry["bits"]
+    except (ValueError, TypeError, KeyError, OverflowError) as e:
+        raise TableError(f'{path}: the description of array "{name}" is damaged ({type(e).__name__}: {e})') from None
+    if storage not in STORAGES:
+        raise TableError(f'{path}: array "{name}" has the storage form "{storage}", allowed are {STORAGES}')
+    wanted = shape if expected is None else expected
+    if len(shape) != len(wanted) or any(w is not None and s != w for s, w in zip(shape, wanted, strict=True)):
+        raise TableError(f'{path}: array "{name}" has the shape {shape}, expected {tuple(wanted)}')
+    _check_form(path, name, shape, border, bits)
+    count = math.prod(shape)
+    entries = archive.array(name, _DTYPES[storage], shape if bits == 8 else (math.ceil(count * bits / 8),))
+    archive.allowance.take(count * (_SINGLE + (bits < 8)), f'the array "{printable(name):.80}", {count:,} entries,')
+    entries = entries if bits == 8 else unpack_bits(entries, count, bits).reshape(shape)
+    array = StoredArray(entries, border, scale, offset, bits)
+    _check(path, name, array)
+    return array
 
 
 def check_ranges(table: Table, ranges: dict[str, tuple[float, float]]) -> None:
@@ -450,28 +451,28 @@ def check_ranges(table: Table, ranges: dict[str, tuple[float, float]]) -> None:
 
 def _check(path, name: str, array: StoredArray) -> None:
     """Raise :class:`TableError` unless the array is one that a file may hold."""
-    _check_shape(path, name, array.shape, array.border)
+    _check_form(path, name, array.shape, array.border, array.bits)
+    fault = ""
     if array.storage != "uint8":
         if array.bits != 8 or array.scale or array.offset:
-            raise TableError(f'{path}: array "{name}" is stored as {array.storage}, only bytes have bits and a scale')
-        if not np.isfinite(array.entries).all():
-            raise TableError(f'{path}: array "{name}" contains NaN or infinity')
-        return
-    _check_bits(path, name, array.bits)
-    for values in (array.scale, array.offset):
-        if len(values) != array.shape[-1] or not all(map(math.isfinite, values)):
-            raise TableError(f'{path}: array "{name}" needs a finite scale and offset for each channel')
-    if array.bits < 8 and array.entries.max() >> array.bits:
-        raise TableError(f'{path}: array "{name}" has entries of more than {array.bits} bits')
+            fault = f"is stored as {array.storage}, only bytes have bits and a scale"
+        elif not np.isfinite(array.entries).all():
+            fault = "contains NaN or infinity"
+    elif not all(len(v) == array.shape[-1] and all(map(math.isfinite, v)) for v in (array.scale, array.offset)):
+        fault = "needs a finite scale and offset for each channel"
+    elif array.bits < 8 and array.entries.max() >> array.bits:
+        fault = f"has entries of more than {array.bits} bits"
+    if fault:
+        raise TableError(f'{path}: array "{name}" {fault}')
 
 
-def _check_shape(path, name: str, shape: tuple, border: tuple) -> None:
+def _check_form(path, name: str, shape: tuple, border: tuple, bits) -> None:
+    fault = ""
     if not 2 <= len(shape) <= 5 or min(shape) < 1:
-        raise TableError(f'{path}: array "{name}" has the shape {shape}, expected 1 to 4 dimensions and channels')
-    if len(border) != len(shape) - 1 or any(b not in BORDERS for b in border):
-        raise TableError(f'{path}: array "{name}" has the borders {border}, allowed are {BORDERS} for each axis')
-
-
-def _check_bits(path, name: str, bits) -> None:
-    if type(bits) is not int or not 1 <= bits <= 8:
-        raise TableError(f'{path}: array "{name}" has {bits} bits an entry, allowed are 1 to 8')
+        fault = f"the shape {shape}, expected 1 to 4 dimensions and channels"
+    elif len(border) != len(shape) - 1 or any(b not in BORDERS for b in border):
+        fault = f"the borders {border}, allowed are {BORDERS} for each axis"
+    elif type(bits) is not int or not 1 <= bits <= 8:
+        fault = f"{bits} bits an entry, allowed are 1 to 8"
+    if fault:
+        raise TableError(f'{path}: array "{name}" has {fault}')

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from .errors import DiffindError, reason
-from .limits import Allowance, json_bytes
+from . import units
+from .errors import DiffindError, UsageError, reason
 
 #: Methods of compression that are read. Members in bz2 or lzma, which NumPy never writes, grow faster than deflate.
 METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
@@ -132,3 +132,70 @@ def read_arrays(path: str | os.PathLike) -> dict[str, np.ndarray]:
     """Return all arrays of an archive. Raises as :class:`Archive` does, ``zlib.error`` and ``EOFError``."""
     with Archive(path) as archive:
         return {name: archive.array(name) for name in archive.members}
+
+
+#: Bytes that the content of any file may take, and bytes for each byte of the file beside these.
+FREE, FACTOR = 64 * 2**20, 20
+
+#: Environment variable with another limit, in bytes, such as ``4G``; limits below those of the rule change nothing.
+VARIABLE = "MI_DIFFIND_MEMORY"
+
+#: Characters of JSON → most bytes in memory for what each begins or separates: an object, a list, an entry, half of a
+#: text, a value of an object.
+_JSON_BYTES = {b"{": 240, b"[": 96, b",": 48, b'"': 40, b":": 100}
+
+
+class LimitError(DiffindError, ValueError):
+    """The content of a file would take more memory than it may; the message is one sentence that names the file."""
+
+
+def allowed(file_bytes: int) -> int:
+    """Return the bytes of memory that the content of a file of ``file_bytes`` may take.
+
+    Raises :class:`.UsageError` if :data:`VARIABLE` is no number of bytes.
+    """
+    limit, given = FREE + FACTOR * file_bytes, os.environ.get(VARIABLE, "")
+    if given:
+        try:
+            limit = max(limit, units.parse_bytes(given))
+        except ValueError as e:
+            raise UsageError(f"environment variable {VARIABLE}: {e}") from None
+    return min(limit, units.memory())
+
+
+def json_bytes(text: bytes) -> int:
+    """Return a bound of the bytes of memory that the content of JSON ``text`` takes, without parsing it."""
+    characters = 2 if text.isascii() else 8  # the whole text, and the texts within; Python has 1 to 4 bytes a character
+    return characters * len(text) + sum(count * text.count(mark) for mark, count in _JSON_BYTES.items())
+
+
+class Allowance:
+    """Memory that the content of one file may take, and that part of it which is taken.
+
+    ``path`` is the name of the file for messages, ``file_bytes`` its size (default: that of the file ``path``).
+    """
+
+    def __init__(self, path: str | os.PathLike, file_bytes: int | None = None):
+        self.path = path
+        self.file_bytes = Path(path).stat().st_size if file_bytes is None else file_bytes
+        self.limit, self.taken = allowed(self.file_bytes), 0
+
+    def check(self, nbytes: int, content: str) -> None:
+        """Raise :class:`LimitError` if ``nbytes`` of memory for a ``content`` exceed what is left."""
+        total = self.taken + nbytes
+        if total <= self.limit:
+            return
+        if total > units.memory():
+            advice = f"this machine has {units.memory():,}"
+        else:
+            gigabytes = 2 ** (-(-total // 2**30) - 1).bit_length()
+            advice = f"the environment variable {VARIABLE}={gigabytes}G allows more"
+        raise LimitError(
+            f"{self.path}: {content} would take {total:,} bytes of memory, a file of {self.file_bytes:,} bytes may "
+            f"take {self.limit:,}: {advice}"
+        )
+
+    def take(self, nbytes: int, content: str) -> None:
+        """Take ``nbytes`` of memory for a ``content``. Raises :class:`LimitError` if they exceed what is left."""
+        self.check(nbytes, content)
+        self.taken += nbytes

@@ -9,8 +9,11 @@ from collections.abc import Mapping
 from .errors import UsageError
 from .files import check_distinct
 
-#: Largest size or count, and largest seed: Dr.Jit and Mitsuba hold them in 32 bits.
-MOST, MOST_NATURAL = 2**31 - 1, 2**32 - 1
+#: Largest size or count: Dr.Jit and Mitsuba hold them in 32 bits.
+MOST = 2**31 - 1
+
+#: Largest seed.
+MOST_NATURAL = 2**32 - 1
 
 
 class Argument:
@@ -68,39 +71,44 @@ def check_files(arguments: tuple[Argument, ...], options: Mapping, outputs: Mapp
     check_distinct({**outputs, **files["written"]}, files["read"])
 
 
-def positive(text: str) -> int:
-    """Return a whole number from 1 to :data:`MOST`. Raises ``ArgumentTypeError``."""
-    value = natural(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
-    if value > MOST:
-        raise argparse.ArgumentTypeError(f"found {text:.40}, allowed are whole numbers up to {MOST:,}")
-    return value
-
-
-def natural(text: str) -> int:
-    """Return a whole number from 0 to :data:`MOST_NATURAL`. Raises ``ArgumentTypeError``."""
+def natural(text: str, least: int = 0, most: int = MOST_NATURAL) -> int:
+    """Return a whole number from ``least`` to ``most``. Raises ``ArgumentTypeError``."""
     try:
         value = int(text)
     except ValueError:
         value = -1
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{text:.40} is not a whole number ≥ 0")
-    if value > MOST_NATURAL:
-        raise argparse.ArgumentTypeError(f"found {text:.40}, allowed are whole numbers up to {MOST_NATURAL:,}")
+    if value < least:
+        wanted = "a positive number" if least else "a whole number ≥ 0"
+        raise argparse.ArgumentTypeError(f"{text:.40} is not {wanted}")
+    if value > most:
+        raise argparse.ArgumentTypeError(f"found {text:.40}, allowed are whole numbers up to {most:,}")
     return value
 
 
-def between(low: float, high: float):
-    """Return a parser of numbers from ``low`` to ``high``, which raises ``ArgumentTypeError``."""
+def positive(text: str) -> int:
+    """Return a whole number from 1 to :data:`MOST`. Raises ``ArgumentTypeError``."""
+    return natural(text, 1, MOST)
+
+
+def between(low: float, high: float, exclusive: bool = False, none: bool = False):
+    """Return a parser of numbers from ``low`` to ``high``, which raises ``ArgumentTypeError``.
+
+    ``exclusive``: the two bounds themselves are refused. ``none``: infinity stands for the word "none".
+    """
+    allowed = f"numbers from {low:g} to {high:g}"
+    if exclusive:
+        allowed = f"numbers above {low:g}" + ("" if math.isinf(high) else f" and below {high:g}")
+    allowed += " and none" if none else ""
 
     def parsed(text: str) -> float:
+        if none and text == "none":
+            return math.inf
         try:
             value = float(text)
         except ValueError:
             value = math.nan
-        if not low <= value <= high:
-            raise argparse.ArgumentTypeError(f"found {text!r}, allowed are numbers from {low:g} to {high:g}")
+        if not (low < value < high if exclusive else low <= value <= high):
+            raise argparse.ArgumentTypeError(f"found {text!r}, allowed are {allowed}")
         return value
 
     return parsed
@@ -109,27 +117,14 @@ def between(low: float, high: float):
 #: A number from 0 to 1.
 fraction = between(0, 1)
 
+#: A number above 0 and below 1.
+proper_fraction = between(0, 1, exclusive=True)
 
-def proper_fraction(text: str) -> float:
-    """Return a number greater than 0 and less than 1. Raises ``ArgumentTypeError``."""
-    try:
-        value = fraction(text)
-    except argparse.ArgumentTypeError:
-        value = 0.0
-    if value in (0, 1):
-        raise argparse.ArgumentTypeError(f"found {text}, allowed is more than 0 and less than 1")
-    return value
+#: A positive number, or infinity for "none".
+positive_or_none = between(0, math.inf, exclusive=True, none=True)
 
-
-def positive_or_none(text: str) -> float:
-    """Return a positive number, or infinity for ``none``. Raises ``ArgumentTypeError``."""
-    try:
-        value = math.inf if text == "none" else float(text)
-    except ValueError:
-        value = math.nan
-    if not value > 0 or (math.isinf(value) and text != "none"):
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected a positive number or none")
-    return value
+#: A PSNR in dB.
+decibels = between(0, 120, exclusive=True)
 
 
 def define(text: str) -> tuple[str, str]:
@@ -154,17 +149,6 @@ def checked(parse):
         return text
 
     return parsed
-
-
-def decibels(text: str) -> float:
-    """Return a PSNR in dB. Raises ``ValueError``."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0 < value < 120:
-        raise ValueError(f"{text!r} is no PSNR, allowed are numbers of dB between 0 and 120")
-    return value
 
 
 #: Options of work that falls apart into jobs (:mod:`.jobs`).

@@ -1,12 +1,8 @@
-"""Hooks into what Mitsuba 3.9 and Dr.Jit 1.5 do not promise, one a function or constant.
+"""Uses of private interfaces of Mitsuba 3.9 and Dr.Jit 1.5, and what Mitsuba 3.10 does otherwise: one a function.
 
-Each has a test that names the hook which broke (``tests/test_compat.py``). Where another version differs, this file
-changes and no other.
-
-What Mitsuba 3.10 does in another way is in :mod:`.mitsuba_versions`.
-
-Functions import Mitsuba and Dr.Jit when they are called, so that this module may be imported before LLVM is chosen
-(:mod:`.runtime`).
+Each has a test that names the hook which broke (``tests/test_compat.py``). Functions import Mitsuba and Dr.Jit when
+they are called, so that this module may be imported before LLVM is chosen (:mod:`.runtime`). Where Mitsuba 3.10
+differs, functions ask for the newer name; that half was read in its sources and has not run (``docs/next_mitsuba.md``).
 """
 
 from __future__ import annotations
@@ -22,20 +18,14 @@ from pathlib import Path
 
 
 def llvm_version() -> tuple[int, int, int]:
-    """Return the version of the LLVM that Dr.Jit has loaded, -1 first if none; waits for its start.
-
-    ``dr.detail`` is not part of the interface; a public function would replace this.
-    """
+    """Return the version of the LLVM that Dr.Jit has loaded, -1 first if none; waits for its start."""
     import drjit
 
     return tuple(drjit.detail.llvm_version())
 
 
 def core_library() -> str:
-    """Return the path of Dr.Jit's native library, whose name and place in the package are not promised.
-
-    A public way to choose LLVM again would replace this and :class:`JitCore`.
-    """
+    """Return the path of Dr.Jit's native library."""
     import drjit
 
     name = {"linux": "libdrjit-core.so", "darwin": "libdrjit-core.dylib"}.get(sys.platform, "drjit-core.dll")
@@ -45,14 +35,13 @@ def core_library() -> str:
 class JitCore:
     """C++ functions of Dr.Jit's library by their mangled names (Itanium ABI), which change with their signatures.
 
-    These are ``jit_shutdown(int)``, ``jit_init(uint32_t)``, ``jit_launch_stats(size_t *, size_t *, size_t *)``,
-    ``jit_registry_id_bound(const char *, const char *)`` and
-    ``jit_llvm_set_target(const char *, const char *, uint32_t)``. Raises ``OSError`` or ``AttributeError`` where one
-    is missing.
+    These are ``jit_shutdown(int)``, ``jit_init(uint32_t)``, ``jit_launch_stats(size_t *, size_t *, size_t *)`` and
+    ``jit_registry_id_bound(const char *, const char *)``. Raises ``OSError`` or ``AttributeError`` if one is missing.
     """
 
-    #: ``JitBackend`` as ``jit_init`` takes it: a mask.
-    CUDA, LLVM = 1 << 1, 1 << 2
+    #: Backends as bits of the mask that ``jit_init`` takes.
+    CUDA = 1 << 1
+    LLVM = 1 << 2
 
     #: Classes of scene objects under which Mitsuba registers them with Dr.Jit.
     DOMAINS = ("Texture", "BSDF", "Shape", "Emitter", "Sensor", "Scene", "Sampler", "Film")
@@ -62,8 +51,6 @@ class JitCore:
         self._shutdown, self._init = core["_Z12jit_shutdowni"], core["_Z8jit_initj"]
         self._launch_stats, self._id_bound = core["_Z16jit_launch_statsPmS_S_"], core["_Z21jit_registry_id_boundPKcS0_"]
         self._id_bound.argtypes, self._id_bound.restype = [ctypes.c_char_p] * 2, ctypes.c_uint32
-        self._set_target = core["_Z19jit_llvm_set_targetPKcS0_j"]
-        self._set_target.argtypes, self._set_target.restype = [ctypes.c_char_p] * 2 + [ctypes.c_uint32], None
 
     def launches(self) -> int:
         """Return the number of kernels launched since the start."""
@@ -83,42 +70,16 @@ class JitCore:
         """Start a backend: :attr:`LLVM` or :attr:`CUDA`."""
         self._init(backend)
 
-    def set_target(self, cpu: str, features: str, lanes: int) -> None:
-        """Generate LLVM code for this processor and these features, in vectors of so many single-precision lanes."""
-        self._set_target(cpu.encode(), features.encode(), lanes)
-
-
-def limit_code_generation(target: str) -> None:
-    """Generate LLVM code for the processor ``target``, written as name, features and lanes: ``haswell:+avx2,+fma:8``.
-
-    Names and features are LLVM's; this processor must have all of the features. Lanes of single precision, a power of
-    two. Call it before the first kernel and the first scene. Dr.Jit has no Python function for this. Raises
-    ``ValueError`` for another form and ``RuntimeError`` where Dr.Jit has no LLVM.
-    """
-    match = re.fullmatch(r"([\w.-]+):([\w.,+-]+):(\d+)", target)
-    if match is None:
-        raise ValueError(f'found the target "{target}", expected name:features:lanes like "haswell:+avx2,+fma:8"')
-    if llvm_version()[0] < 0:
-        raise RuntimeError(f'the target "{target}" cannot be set: Dr.Jit has not started its LLVM backend')
-    JitCore().set_target(match[1], match[2], int(match[3]))
-
 
 def new_scope(dtype) -> None:
-    """Start a scope: Dr.Jit merges no later computation of the backend of ``dtype`` with an earlier one.
-
-    ``dr.detail`` is not part of the interface; no public function does this.
-    """
+    """Start a scope: Dr.Jit merges no later computation of the backend of ``dtype`` with an earlier one."""
     import drjit as dr
 
     dr.detail.new_scope(dr.backend_v(dtype))
 
 
 def kernel_code(entry: dict) -> str:
-    """Return the intermediate code of an entry of ``dr.kernel_history()``: LLVM's or PTX.
-
-    Its form is not promised (:func:`is_ptx`, :func:`llvm_target`, :mod:`.operations`). Counters kept by Dr.Jit would
-    replace reading it.
-    """
+    """Return the intermediate code of an entry of ``dr.kernel_history()``: LLVM's or PTX."""
     return entry["ir"].getvalue()
 
 
@@ -134,7 +95,7 @@ def llvm_target(code: str) -> tuple[str, int] | None:
 
 
 def kernel_seconds(history: list[dict]) -> float:
-    """Return the seconds that the kernels of a ``dr.kernel_history()`` took; its unit, ms, is not promised."""
+    """Return the seconds that the kernels of a ``dr.kernel_history()`` took (which has milliseconds)."""
     return sum(entry["execution_time"] for entry in history) / 1e3
 
 
@@ -150,10 +111,7 @@ def was_compiled(history: list[dict]) -> bool:
 
 @contextlib.contextmanager
 def room_for_sums(entries: int):
-    """Let each core sum the gradients of arrays by itself, up to ``entries`` in the copies of all cores together.
-
-    ``dr.set_expand_threshold`` takes the entries of one copy; its meaning has changed between versions.
-    """
+    """Let each core sum the gradients of arrays by itself, up to ``entries`` in the copies of all cores together."""
     import drjit as dr
 
     before = dr.expand_threshold()
@@ -178,18 +136,12 @@ def use_threads(count: int) -> None:
 
 
 def module_of(array):
-    """Return the module with the types of the same backend as an array or type, such as ``drjit.llvm.ad``.
-
-    It is the module of the class, by convention. ``dr.replace_type_t`` and its like, with all types, would replace it.
-    """
+    """Return the module with the types of the same backend as an array or type, such as ``drjit.llvm.ad``."""
     return sys.modules[(array if isinstance(array, type) else type(array)).__module__]
 
 
 def has_gradient(value) -> bool:
-    """Return whether a derivative with respect to this array is tracked, also where derivatives are suspended.
-
-    ``dr.grad_enabled`` says no in the latter case; ``index_ad`` is an internal number.
-    """
+    """Return whether a derivative with respect to this array is tracked, also where derivatives are suspended."""
     import drjit as dr
 
     if dr.is_tensor_v(value):
@@ -216,11 +168,7 @@ def syntax(function):
 
 
 def identity(value) -> tuple:
-    """Return numbers that identify the content of an array as long as the array is kept.
-
-    They are the indices of Dr.Jit's variables (``index``), which are used again once a variable is gone. A counter of
-    changes would replace them.
-    """
+    """Return the indices of Dr.Jit's variables, which identify the content of an array as long as the array is kept."""
     import drjit as dr
 
     if dr.is_tensor_v(value):
@@ -231,11 +179,7 @@ def identity(value) -> tuple:
 
 
 def adam_state(optimizer) -> dict[str, tuple]:
-    """Return the state of an ``Adam``: name → ``(value, t, m, v)``.
-
-    ``value`` is the parameter, ``t`` the number of the step, ``m`` and ``v`` are the moments (flat). The tuples in
-    ``optimizer.state`` are Dr.Jit's own; a public way to save an optimiser would replace this.
-    """
+    """Return the state of an ``Adam``: name → parameter, number of the step, and both moments (flat)."""
     return {key: (value, t, m, v) for key, (value, _, _, (t, m, v, _)) in optimizer.state.items()}
 
 
@@ -251,10 +195,7 @@ def set_adam_state(optimizer, key: str, value, t, m, v) -> None:
 
 
 def on_variant_change(callback) -> None:
-    """Call ``callback(old, new)`` after each ``mi.set_variant``; the same function is registered once.
-
-    ``mi.detail`` is not part of the interface; plugins found by Mitsuba itself would replace it.
-    """
+    """Call ``callback(old, new)`` after each ``mi.set_variant``; the same function is registered once."""
     import mitsuba as mi
 
     mi.detail.add_variant_callback(callback)
@@ -270,8 +211,7 @@ def is_recording() -> bool:
 def is_zero(*values) -> bool:
     """Return whether Dr.Jit knows of each of these arrays, without an evaluation, that it is zero in all lanes.
 
-    Within a recorded call, inputs stay known if the caller computed them outside of the state of a loop; which ones do
-    is not promised.
+    Within a recorded call, inputs stay known if the caller computed them outside of the state of a loop.
     """
     import drjit as dr
 
@@ -284,17 +224,12 @@ CARRYING = ("VolumetricPathIntegrator", "VolpathMisIntegratorImpl", "PRBVolpathI
 #: Mitsuba's class of integrators that intersect rays with the scene beside their nested integrators.
 INTERSECTING = "AOVIntegrator"
 
-
-#: Mitsuba's classes of textures whose values are those of their parameters, wherever they are read. Others may call
-#: themselves constant and not be, as ``mesh_attribute`` does. ``is_spatially_varying`` would do if all told the truth.
+#: Mitsuba's classes of constant textures. ``is_spatially_varying`` is also false for ``mesh_attribute``, which varies.
 CONSTANT_TEXTURES = ("UniformSpectrum", "SRGBReflectanceSpectrum")
 
 
 def texture_class(texture) -> str:
-    """Return Mitsuba's name of a texture's class, ``""`` for a class written in Python, which may have any name.
-
-    Names of classes are not promised; names of plugins are, but a loaded object does not know its own.
-    """
+    """Return Mitsuba's name of a texture's class, ``""`` for a class written in Python, which may have any name."""
     return texture.class_name() if type(texture).__module__.startswith("mitsuba") else ""
 
 
@@ -317,8 +252,7 @@ def srgb_coefficients() -> tuple:
     """Return Mitsuba's table for spectra from colours (Jakob and Hanika 2019).
 
     Returned are its side ``n``, the positions ``(n,)`` along the largest component, and the coefficients ``(3·n³, 3)``,
-    all float32. Neither place nor form of the file is promised; ``mi.srgb_model_fetch`` for arrays would replace it.
-    Raises ``RuntimeError`` in one sentence.
+    all float32. Raises ``RuntimeError`` in one sentence.
     """
     import mitsuba as mi
     import numpy as np
@@ -356,8 +290,7 @@ def normal_edges(pi, si, ray, active) -> tuple:
 def replay_integrator() -> type:
     """Return ``RBIntegrator`` of the active variant, the base class of integrators that replay paths.
 
-    Mitsuba loads it anew *after* it called the function of :func:`on_variant_change`. Its place is not promised;
-    ``sample_rays`` and the interface of ``sample`` are only described in its code.
+    Mitsuba loads it anew *after* it called the function of :func:`on_variant_change`.
     """
     import mitsuba as mi
 
@@ -365,11 +298,7 @@ def replay_integrator() -> type:
 
 
 def written_in_python(integrator) -> bool:
-    """Return whether an integrator is written in Python upon Mitsuba's base classes.
-
-    ``sample`` of such an integrator takes a mode. These classes are loaded anew with a variant, so that ``isinstance``
-    cannot name them; ``CppADIntegrator``, their common base, is an internal class.
-    """
+    """Return whether an integrator is written in Python upon Mitsuba's base classes, whose ``sample`` takes a mode."""
     import mitsuba as mi
 
     return isinstance(integrator, mi.CppADIntegrator)
@@ -395,11 +324,7 @@ def samples_in_python(integrator) -> bool:
 
 
 def splat(block, film, place, light, alpha, aovs: list, wavelengths) -> None:
-    """Put samples into an image block, with further channels ``aovs``.
-
-    Mitsuba's integrators in Python do this in a function of their own, for all variants and films
-    (``ADIntegrator._splat_to_block``).
-    """
+    """Put samples into an image block, with further channels ``aovs``, as Mitsuba's integrators in Python do."""
     import mitsuba as mi
 
     put = mi.ad.integrators.common.ADIntegrator._splat_to_block
@@ -407,10 +332,7 @@ def splat(block, film, place, light, alpha, aovs: list, wavelengths) -> None:
 
 
 def objects_of(scene) -> list:
-    """Return all objects of a loaded scene, each once, wherever they hide (in a ``twosided``, a ``bumpmap``, …).
-
-    They are the keys of ``hierarchy`` of ``mi.traverse``, which is not in the manual and lists some twice.
-    """
+    """Return all objects of a loaded scene, each once, nested ones too (in a ``twosided``, a ``bumpmap``, …)."""
     import mitsuba as mi
 
     return nodes_of(mi.traverse(scene))
@@ -422,7 +344,7 @@ def nodes_of(params) -> list:
 
 
 def is_instance(shape) -> bool:
-    """Return whether a shape is an ``instance`` of a ``shapegroup``, by the name of its class (not promised)."""
+    """Return whether a shape is an ``instance`` of a ``shapegroup``."""
     return shape.class_name() == "Instance"
 
 
@@ -432,17 +354,17 @@ def is_shared(holder: list) -> bool:
     Classes of Mitsuba's objects allow no weak references, but references from C++ count in Python, too. The number that
     ``sys.getrefcount`` adds by itself differs between versions of Python, so it is measured on a new object.
     """
-    return _references(holder) > _references([object()])
 
+    def references(holder: list) -> int:
+        return sys.getrefcount(holder[0])
 
-def _references(holder: list) -> int:
-    return sys.getrefcount(holder[0])
+    return references(holder) > references([object()])
 
 
 def parse_file(path: str | os.PathLike, defines: dict[str, str] | None = None) -> tuple:
     """Return the configuration and the state of a parsed scene file, before anything is built.
 
-    ``defines`` are its ``<default>`` values. ``mi.parser`` is new in 3.8 and still changes.
+    ``defines`` are its ``<default>`` values.
     """
     import mitsuba as mi
 
@@ -559,7 +481,7 @@ def property_kind(props, key: str) -> str:
 def film_size(sensor, width: int, height: int):
     """Give the film of a loaded sensor another size (pixels) while the context is open; yield whether that is possible.
 
-    The parameter ``film.size`` is not in the manual, and a film with a crop window keeps its size.
+    A film with a crop window keeps its size.
     """
     import mitsuba as mi
 
@@ -578,10 +500,10 @@ def film_size(sensor, width: int, height: int):
 
 
 def one_sentence(error: BaseException) -> str:
-    """Return the message of an error without the layers around it, whose form is not promised.
+    """Return the message of an error without the layers that Mitsuba and Dr.Jit put around it.
 
     Mitsuba prefixes source lines (``[file.cpp:12]``), embeds Python tracebacks, and hides the cause of an error at
-    render time behind ``drjit.custom(...) error``. Errors that keep their type would replace this.
+    render time behind ``drjit.custom(...) error``.
     """
     while error.__cause__ is not None:
         error = error.__cause__
@@ -592,3 +514,130 @@ def one_sentence(error: BaseException) -> str:
         location = re.sub(r"failed to instantiate.*", "", head.strip())
         text = location + last.split(": ", 1)[1]
     return " ".join(text.split())
+
+
+def has_footprints() -> bool:
+    """Return whether hits carry the footprint of a pixel, from ray cones: ``si.footprint`` (Mitsuba 3.10, #1964)."""
+    import mitsuba as mi
+
+    return hasattr(mi.SurfaceInteraction3f, "footprint")
+
+
+def footprint_of(si) -> tuple | None:
+    """Return ``si.footprint`` as two conjugate diameters of an ellipse in uv, ``mi.Vector2f`` each; ``None`` in 3.9.
+
+    It is zero where no ray cone arrived: after the first bounce, and in scenes without a ``filtered()`` texture.
+    """
+    import mitsuba as mi
+
+    matrix = getattr(si, "footprint", None)
+    if matrix is None:
+        return None
+    return mi.Vector2f(matrix[0, 0], matrix[1, 0]), mi.Vector2f(matrix[0, 1], matrix[1, 1])
+
+
+def ray_flags(curvature: bool = False) -> int:
+    """Return the ``mi.RayFlags`` for all of an interaction, with the footprint, and with ``curvature`` ``dn_du``."""
+    import mitsuba as mi
+
+    flags = mi.RayFlags
+    if hasattr(flags, "NormalPartials"):
+        return flags.Default | flags.NormalPartials if curvature else flags.Default
+    return flags.All | flags.dNSdUV if curvature else flags.All
+
+
+def normal_mapped() -> int:
+    """Return the ``mi.BSDFFlags`` of a BSDF whose normals are those of a map, 0 in Mitsuba 3.9, which has none."""
+    import mitsuba as mi
+
+    return getattr(mi.BSDFFlags, "NormalMapped", 0)
+
+
+def lobe_rates() -> tuple[str, ...]:
+    """Return the parameters of ``principled`` that say how often lobes are sampled; none in Mitsuba 3.10 (#1951)."""
+    import mitsuba as mi
+
+    names = mi.traverse(mi.load_dict({"type": "principled"})).keys()
+    return tuple(sorted(name for name in names if name.endswith("_sampling_rate")))
+
+
+#: Mitsuba's classes of which ``Field`` shall take the place (#1885, open).
+FIELDS = ("Texture", "Volume")
+
+
+def base_class(name: str) -> type:
+    """Return the class of this name that plugins derive from; ``mi.Field`` where it has taken its place."""
+    import mitsuba as mi
+
+    return getattr(mi, "Field" if name in FIELDS and not hasattr(mi, name) else name)
+
+
+def object_type(name: str):
+    """Return the ``mi.ObjectType`` of a class's name; that of fields where they have taken its place."""
+    import mitsuba as mi
+
+    return getattr(mi.ObjectType, "Field" if name in FIELDS and not hasattr(mi.ObjectType, name) else name)
+
+
+def register(object_type: str, name: str, factory) -> None:
+    """Register a plugin with the variant that is set.
+
+    Mitsuba has no ``register_volume``; in a scene, volumes are looked up among textures, or among fields (#1885).
+    """
+    import mitsuba as mi
+
+    if object_type in ("texture", "volume"):
+        function = getattr(mi, "register_texture", None) or mi.register_field
+    else:
+        function = getattr(mi, f"register_{object_type}")
+    function(name, factory)
+
+
+def mesh_arguments(props, vertices: int, faces: int) -> tuple:
+    """Return the arguments of ``mi.Mesh`` for a mesh of so many vertices and triangles, to be set afterwards."""
+    import mitsuba as mi
+
+    return (props,) if hasattr(mi.Mesh, "from_fields") else (props.plugin_name(), vertices, faces, props)
+
+
+def set_triangles(params, positions, faces) -> None:
+    """Set the places ``(n, 3)`` and the triangles ``(m, 3)`` of a traversed mesh, NumPy arrays, without an update."""
+    import mitsuba as mi
+    import numpy as np
+
+    positions, faces = np.ascontiguousarray(positions, np.float32), np.ascontiguousarray(faces, np.uint32)
+    if "vertex_positions" in params:
+        params["vertex_positions"], params["faces"] = positions.ravel(), faces.ravel()
+    else:
+        params["positions"], params["faces"] = mi.TensorXf(positions), mi.TensorXu(faces)
+
+
+def triangles(mesh) -> tuple:
+    """Return the places ``(n, 3)`` and the triangles ``(m, 3)`` of a ``mi.Mesh`` as NumPy arrays."""
+    before = ("vertex_positions_buffer", "faces_buffer")
+    names = before if hasattr(mesh, before[0]) else ("positions", "faces")
+    positions, faces = (getattr(mesh, name)().numpy().reshape(-1, 3) for name in names)
+    return positions, faces
+
+
+def owned(array):
+    """Return a copy of an evaluated array in memory of Dr.Jit, with the same derivatives; others as they are.
+
+    Where a virtual call reads an array, a frozen function (``dr.freeze`` of Dr.Jit 1.5) takes the address of memory
+    that Dr.Jit did not allocate, such as NumPy's, for a constant. No public function tells or copies such memory.
+    """
+    import drjit as dr
+
+    if array.state != dr.VarState.Evaluated:
+        return array
+    # Adding −0 changes no number, not even −0; denormal ones may become 0
+    copy = dr.detach(array) + dr.opaque(type(array), -0.0 if dr.is_float_v(array) else 0)
+    dr.eval(copy)
+    return dr.replace_grad(copy, array) if has_gradient(array) else copy
+
+
+def assign(target, value) -> None:
+    """Assign to an array in place, so that all who refer to it see the value, as ``mi.SceneParameters`` does."""
+    import mitsuba as mi
+
+    mi.set_property(target, value)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import json
 import os
@@ -13,7 +14,7 @@ import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
-from .errors import DiffindError, UsageError, reason, shortened
+from .errors import DiffindError, UsageError, printable, reason, shortened
 
 try:
     import fcntl
@@ -247,6 +248,32 @@ def write_json(path: str | os.PathLike, content) -> None:
         temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
+def stamp(path: str | os.PathLike) -> tuple:
+    """Return numbers that change when a file does: its time and size."""
+    try:
+        status = os.stat(path)
+    except OSError:
+        return ()
+    return status.st_mtime_ns, status.st_size
+
+
+def read_once(read, path: str | os.PathLike, *form):
+    """Return ``read(path, *form)``, and the same object again while the file does not change.
+
+    The last :data:`REMEMBERED` results are kept. ``form`` are hashable values that say how the file is read.
+    """
+    return _read(read, Path(path), stamp(path), form)
+
+
+#: Results of :func:`read_once` that are kept.
+REMEMBERED = 64
+
+
+@functools.lru_cache(maxsize=REMEMBERED)
+def _read(read, path: Path, stamp: tuple, form: tuple):
+    return read(path, *form)
+
+
 def is_within(folder: str | os.PathLike, name: str | os.PathLike) -> bool:
     """Return whether the path ``name``, from a folder, stays in the folder."""
     path, inside = os.path.abspath(os.path.join(folder, name)), os.path.abspath(folder)
@@ -294,3 +321,87 @@ def relative_path(file: str | os.PathLike, folder: str | os.PathLike) -> str:
     file, folder = os.path.abspath(file), os.path.abspath(folder)
     shared = os.path.commonpath([file, folder])
     return file if shared == os.path.dirname(shared) else os.path.relpath(file, folder)
+
+
+#: Names in a note, and characters of a name.
+MOST_NAMES, LONGEST_KEY = 50, 40
+
+
+class RecordedKeys(dict):
+    """Dictionary that records the keys which are asked for, in the set ``read``.
+
+    ``[]``, ``get``, ``pop`` and ``in`` record their key; ``items`` and ``values`` record all keys. Iteration, ``keys``,
+    ``len``, copies and ``{**…}`` record none.
+    """
+
+    __slots__ = ("read",)
+
+    def __init__(self, *content, **entries):
+        super().__init__(*content, **entries)
+        self.read: set | frozenset = frozenset()  # a set takes 216 bytes, and many objects may be in a file
+
+    def _record(self, keys) -> None:
+        if isinstance(self.read, frozenset):
+            self.read = set()
+        self.read.update(keys)
+
+    def __getitem__(self, key):
+        self._record((key,))
+        return super().__getitem__(key)
+
+    def __contains__(self, key) -> bool:
+        self._record((key,))
+        return super().__contains__(key)
+
+    def get(self, key, default=None):
+        self._record((key,))
+        return super().get(key, default)
+
+    def pop(self, key, *default):
+        self._record((key,))
+        return super().pop(key, *default)
+
+    def items(self):
+        self._record(self.keys())
+        return super().items()
+
+    def values(self):
+        self._record(self.keys())
+        return super().values()
+
+
+def unused_keys(content) -> list[str]:
+    """Return the keys that were not read, each once, in the order of the file.
+
+    ``content`` is a :class:`RecordedKeys`, or lists and dictionaries that contain such. A key of an object inside
+    another has the outer keys before it: ``frames.sharpness``. Objects that are not recorded count as read.
+    """
+    names: dict[str, None] = {}
+
+    def visit(value, prefix: str) -> None:
+        if isinstance(value, list):
+            for entry in value:
+                visit(entry, prefix)
+        elif isinstance(value, dict):
+            recorded = value.read if isinstance(value, RecordedKeys) else value.keys()
+            for key, entry in dict.items(value):
+                if key in recorded:
+                    visit(entry, f"{prefix}{key}.")
+                else:
+                    names.setdefault(f"{prefix}{key}")
+
+    visit(content, "")
+    return list(names)
+
+
+def unused_note(file: Path | str, content, also: tuple[str, ...] = ()) -> str | None:
+    """Return a sentence with the keys of a ``file`` that were not read, see :func:`unused_keys`, or ``None``.
+
+    ``also`` are further names, from places that are not JSON objects.
+    """
+    names = [*unused_keys(content), *also]
+    if not names:
+        return None
+    listed = [printable(name if len(name) <= LONGEST_KEY else f"{name[:LONGEST_KEY]}…") for name in names]
+    more = f" and {len(names) - MOST_NAMES:,} more" if len(names) > MOST_NAMES else ""
+    return f"{Path(file).name}: keys that are not used: {', '.join(listed[:MOST_NAMES])}{more}"

@@ -1,12 +1,13 @@
 """Independent jobs, carried out one by one, by several processes, or by the workers of a Dask cluster.
 
-A job is a function of one argument. Both, and the result, travel between processes: the function lies in a module, and
-argument and result can be pickled. Importing this imports neither Dr.Jit nor Mitsuba.
+A job is a function of one argument. Function, argument and result travel between processes: the function lies in a
+module, the other two can be pickled. Importing this imports neither Dr.Jit nor Mitsuba.
 """
 
 from __future__ import annotations
 
 import collections
+import concurrent.futures
 import contextlib
 import ctypes
 import os
@@ -19,11 +20,10 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import Connection
 
 from .errors import DiffindError, UsageError, missing_package, reason
-from .interrupt import interruptible
-from .progress import progress_bar
+from .progress import interruptible, progress_bar
 from .threads import LEAST_THREADS
 
 #: Processes that may be lost with a job, one after the other, before the job has failed.
@@ -32,11 +32,17 @@ ATTEMPTS = 3
 #: Option of Linux's ``prctl``.
 PR_SET_PDEATHSIG = 1
 
-#: Seconds between two looks at Ctrl-C, and seconds until a Dask scheduler counts as out of reach.
-POLL, TIMEOUT = 0.2, 20
+#: Seconds between two looks at Ctrl-C.
+POLL = 0.2
+
+#: Seconds until a Dask scheduler counts as out of reach.
+TIMEOUT = 20
 
 #: Seconds after which an idle process of a Dask worker ends.
 IDLE = 60.0
+
+#: Process of each thread that waits for one: of a Dask worker, or of a pool of this process.
+_spare = threading.local()
 
 
 @dataclass
@@ -70,8 +76,7 @@ def run_jobs(
     """
     if workers and scheduler:
         raise UsageError("workers: given together with a scheduler, whose cluster has its own workers")
-    bar = progress_bar(title, len(jobs) + finished, unit, progress, initial=finished)
-    with interruptible() as stop, bar:
+    with interruptible() as stop, progress_bar(title, len(jobs) + finished, unit, progress, initial=finished) as bar:
         if scheduler:
             outcomes = _on_cluster(function, jobs, scheduler, stop)
         elif workers:
@@ -105,17 +110,14 @@ def _here(function, jobs: Mapping[str, object], stop: threading.Event) -> Iterat
         yield outcome
 
 
-# -- processes ---------------------------------------------------------------------------------------------------------
-
-
 class WorkerProcess:
-    """New process of Python that carries out one job at a time, with so many ``threads`` of Dr.Jit (0: all).
+    """New process of Python that carries out one job at a time, with so many ``threads`` of Dr.Jit.
 
-    It does not run the main script again, ignores Ctrl-C, and ends with this process, or after ``idle`` seconds
-    without a job.
+    It does not run the main script again, ignores Ctrl-C, and ends with this process, or after ``idle`` seconds without
+    a job (``None``: never).
     """
 
-    def __init__(self, threads: int = 0, idle: float | None = None):
+    def __init__(self, threads: int, idle: float | None = None):
         ours, theirs = socket.socketpair()
         code = f"from {__name__} import serve; serve({theirs.fileno()}, {threads}, {idle})"
         path = os.pathsep.join(p or os.getcwd() for p in sys.path)
@@ -126,12 +128,9 @@ class WorkerProcess:
             )  # fmt: skip
         self.pipe = Connection(ours.detach())
 
-    def send(self, name: str, function: Callable[[object], object], value: object) -> None:
-        """Begin a job. Raises ``OSError`` if the process has ended."""
+    def carry_out(self, name: str, function: Callable[[object], object], value: object) -> Outcome:
+        """Return the outcome of a job. Raises ``OSError`` or ``EOFError`` if the process ends before."""
         self.pipe.send_bytes(pickle.dumps((name, function, value)))
-
-    def receive(self) -> Outcome:
-        """Wait for the outcome of the job. Raises ``OSError`` or ``EOFError`` if the process ends before."""
         return pickle.loads(self.pipe.recv_bytes())
 
     def close(self) -> str:
@@ -167,10 +166,9 @@ def serve(descriptor: int, threads: int, idle: float | None) -> None:
             name, function, value = pickle.loads(jobs.get(timeout=idle))
         except queue.Empty:
             os._exit(0)
-        if threads:
-            from .compat import use_threads
+        from .compat import use_threads
 
-            use_threads(threads)
+        use_threads(threads)
         outcome = _attempt(name, function, value)
         try:
             content = pickle.dumps(outcome)
@@ -179,64 +177,59 @@ def serve(descriptor: int, threads: int, idle: float | None) -> None:
         pipe.send_bytes(content)
 
 
+def _beside(
+    name: str, function, value, threads: int, idle: float | None = None, pool: list[WorkerProcess] | None = None,
+    stop: threading.Event | None = None,
+) -> Outcome:  # fmt: skip
+    """Carry out a job in the process of this thread, which is begun if need be and then listed in the ``pool``."""
+    end = ""
+    for _ in range(ATTEMPTS):
+        process = getattr(_spare, "process", None)
+        if process is None or process.process.poll() is not None:
+            process = _spare.process = WorkerProcess(threads, idle)
+            if pool is not None:
+                pool.append(process)
+        try:
+            return process.carry_out(name, function, value)
+        except (EOFError, OSError):
+            end, _spare.process = process.close(), None
+            if stop is not None and stop.is_set():
+                break
+    return Outcome(name, failure=f"the process of this job ended {ATTEMPTS} times ({end})")
+
+
+def _threads_a_job(jobs_at_a_time: int) -> int:
+    return max(LEAST_THREADS, (os.cpu_count() or 1) // jobs_at_a_time)
+
+
 def _in_processes(function, jobs: Mapping[str, object], workers: int, stop: threading.Event) -> Iterator[Outcome]:
-    threads = max(LEAST_THREADS, (os.cpu_count() or 1) // workers)
-    left = collections.deque((name, 1) for name in jobs)
-    idle: list[WorkerProcess] = []
-    running: dict[Connection, tuple[WorkerProcess, str, int]] = {}
-    try:
-        while (left or running) and not stop.is_set():
-            while left and len(running) < workers:
-                name, attempt = left.popleft()
-                process = idle.pop() if idle else WorkerProcess(threads)
-                running[process.pipe] = process, name, attempt
-                with contextlib.suppress(OSError):  # it has ended, which its pipe reports below
-                    process.send(name, function, jobs[name])
-            for pipe in wait(list(running), POLL):
-                process, name, attempt = running.pop(pipe)
-                try:
-                    outcome = process.receive()
-                except (EOFError, OSError):
-                    end = process.close()
-                    if attempt < ATTEMPTS:
-                        left.appendleft((name, attempt + 1))
-                    else:
-                        yield Outcome(name, failure=_lost(attempt, end))
-                    continue
-                idle.append(process)
-                yield outcome
-    finally:
-        for process in (*idle, *(process for process, *_ in running.values())):
-            process.process.kill()
-            process.close()
+    processes: list[WorkerProcess] = []
+    over = threading.Event()
+    with concurrent.futures.ThreadPoolExecutor(workers) as pool:
+        threads = _threads_a_job(workers)
+        futures = {
+            pool.submit(_beside, name, function, value, threads, None, processes, over) for name, value in jobs.items()
+        }
+        try:
+            while futures and not stop.is_set():
+                done, futures = concurrent.futures.wait(futures, POLL, concurrent.futures.FIRST_COMPLETED)
+                for future in done:
+                    yield future.result()
+        finally:
+            over.set()
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in processes:
+                process.process.kill()
+    for process in processes:
+        process.close()
 
 
-def _lost(attempts: int, end: str) -> str:
-    return f"the process of this job ended {attempts} times ({end})"
-
-
-# -- clusters ----------------------------------------------------------------------------------------------------------
-
-#: Process of each thread of a Dask worker.
-_spare = threading.local()
-
-
-def _beside(name: str, function, value, slots: Mapping[str, int]) -> Outcome:
+def _beside_worker(name: str, function, value, slots: Mapping[str, int]) -> Outcome:
     """Carry out a job in a process beside a Dask worker; ``slots``: jobs at a time of each machine's address."""
     import distributed
 
     host = distributed.get_worker().address.rpartition(":")[0]
-    threads = max(LEAST_THREADS, (os.cpu_count() or 1) // slots.get(host, 1))
-    for _ in range(ATTEMPTS):
-        process = getattr(_spare, "process", None)
-        if process is None or process.process.poll() is not None:
-            process = _spare.process = WorkerProcess(threads, IDLE)
-        try:
-            process.send(name, function, value)
-            return process.receive()
-        except (EOFError, OSError):
-            end, _spare.process = process.close(), None
-    return Outcome(name, failure=_lost(ATTEMPTS, end))
+    return _beside(name, function, value, _threads_a_job(slots.get(host, 1)), IDLE)
 
 
 def _on_cluster(function, jobs: Mapping[str, object], scheduler: str, stop: threading.Event) -> Iterator[Outcome]:
@@ -259,7 +252,7 @@ def _on_cluster(function, jobs: Mapping[str, object], scheduler: str, stop: thre
         for address, worker in client.scheduler_info(n_workers=-1)["workers"].items():
             slots[address.rpartition(":")[0]] += worker["nthreads"]
         left = {
-            client.submit(_beside, name, function, value, dict(slots), pure=False): name
+            client.submit(_beside_worker, name, function, value, dict(slots), pure=False): name
             for name, value in jobs.items()
         }  # fmt: skip
         while left and not stop.is_set():

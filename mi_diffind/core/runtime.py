@@ -110,9 +110,8 @@ def choose_llvm(environ=os.environ, pip=pip_libraries, system=system_libraries, 
 
     The arguments exist for tests: the environment, the two searches and the function that reads a version.
     """
-    explicit = environ.get(ENV)
-    if explicit:
-        major = version(explicit)
+    if explicit := environ.get(ENV):
+        major, problem = version(explicit), None
         if major is None:
             problem = f"{ENV}={explicit} is not a loadable LLVM library: {_CORRECT}."
         elif major < MIN_LLVM:
@@ -120,24 +119,16 @@ def choose_llvm(environ=os.environ, pip=pip_libraries, system=system_libraries, 
                 f"{ENV}={explicit} is LLVM {major if major > 15 else '15 or older'}, with which Dr.Jit aborts: "
                 f"version {MIN_LLVM} or newer is needed: {_CORRECT}."
             )
-        else:
-            problem = None
         return Choice(explicit, ENV, problem)
-
     if not sys.platform.startswith("linux"):
         return Choice(None, "Dr.Jit's own search")
-
-    too_old = []
-    for origin, paths in (("pip", pip()), ("system", system())):
-        for path in paths:
-            major = version(path)
-            if major is not None and major >= MIN_LLVM:
-                return Choice(path, origin)
-            too_old.append(path)
-    seen = f" (found only {too_old[0]}, which is too old)" if too_old else ""
-    return Choice(
-        None, "none", f"Dr.Jit's CPU variants need LLVM {MIN_LLVM} or newer and none was found{seen}: {_ADVICE}."
-    )
+    libraries = [("pip", path) for path in pip()] + [("system", path) for path in system()]
+    for origin, path in libraries:
+        if (version(path) or 0) >= MIN_LLVM:
+            return Choice(path, origin)
+    seen = f" (found only {libraries[0][1]}, which is too old)" if libraries else ""
+    problem = f"Dr.Jit's CPU variants need LLVM {MIN_LLVM} or newer and none was found{seen}: {_ADVICE}."
+    return Choice(None, "none", problem)
 
 
 _problem: str | None = None
@@ -248,15 +239,14 @@ def _warn() -> None:
 @contextlib.contextmanager
 def _hidden_llvm():
     """Make Dr.Jit's search for LLVM fail while the context is open: an inactive backend raises, an old one aborts."""
-    before = os.environ.get(ENV)
+    before = dict(os.environ)
     os.environ[ENV] = "(switched off by mi_diffind: no usable LLVM)"
     try:
         yield
     finally:
-        if before is None:
-            del os.environ[ENV]
-        else:
-            os.environ[ENV] = before
+        os.environ.pop(ENV)
+        if ENV in before:
+            os.environ[ENV] = before[ENV]
 
 
 def _restart_llvm(path: str | None) -> None:
@@ -302,16 +292,16 @@ def use_variant(name: str | None = None) -> str:
     import drjit as dr
     import mitsuba as mi
 
-    has_cuda = dr.has_backend(dr.JitBackend.CUDA)
-    name = name or mi.variant() or ("cuda_ad_rgb" if has_cuda else "llvm_ad_rgb")
+    default = "cuda_ad_rgb" if dr.has_backend(dr.JitBackend.CUDA) else "llvm_ad_rgb"
+    name = name or mi.variant() or default
     if name == mi.variant():
         return name
     if name not in mi.variants():
         raise UsageError(f'the variant "{name}" does not exist; available are {", ".join(mi.variants())}')
     if name.startswith("llvm") and llvm_problem():
         raise UsageError(llvm_problem())
-    if name.startswith("cuda") and not has_cuda:
-        raise UsageError(f'the variant "{name}" needs an NVIDIA GPU and its driver, and none was found')
+    if name.startswith("cuda"):
+        _require_gpu(name)
     try:
         mi.set_variant(name)
     except ImportError as e:
@@ -319,22 +309,27 @@ def use_variant(name: str | None = None) -> str:
     return name
 
 
+def _require_gpu(variant: str) -> None:
+    import drjit as dr
+
+    if not dr.has_backend(dr.JitBackend.CUDA):
+        raise UsageError(f'the variant "{variant}" needs an NVIDIA GPU and its driver, and none was found')
+
+
 def array_module(variant: str | None = None):
     """Return the module of differentiable Dr.Jit types to compute with outside of Mitsuba.
 
     It is ``drjit.llvm.ad`` or ``drjit.cuda.ad``, that of a Mitsuba ``variant``. ``None`` means the variant that is set
-    if it is vectorised, else the GPU if there is one. Raises :class:`.UsageError` if that cannot run
-    here.
+    if it is vectorised, else the GPU if there is one. Raises :class:`.UsageError` if that cannot run here.
     """
     import drjit as dr
 
-    has_cuda = dr.has_backend(dr.JitBackend.CUDA)
     if variant is None:
         active = ("mitsuba" in sys.modules and sys.modules["mitsuba"].variant()) or ""
-        variant = active if active.startswith(("cuda", "llvm")) else "cuda" if has_cuda else "llvm"
+        default = "cuda" if dr.has_backend(dr.JitBackend.CUDA) else "llvm"
+        variant = active if active.startswith(("cuda", "llvm")) else default
     if variant.startswith("cuda"):
-        if not has_cuda:
-            raise UsageError(f'the variant "{variant}" needs an NVIDIA GPU and its driver, and none was found')
+        _require_gpu(variant)
         import drjit.cuda.ad as module
     elif variant.startswith("llvm"):
         if not dr.has_backend(dr.JitBackend.LLVM):

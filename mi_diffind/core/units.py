@@ -27,14 +27,12 @@ _UNITS = {"": 1, "k": 1024, "m": 1024**2, "g": 1024**3}
 
 def parse_compression(text: str | float) -> float:
     """Return a compression ratio, written as ``12x`` or ``12``. Raises ``ValueError``."""
-    match = re.fullmatch(rf"(?P<number>{_NUMBER})\s*[x×]?", str(text).strip(), re.IGNORECASE | re.ASCII)
-    return _positive(match, text, "a compression ratio", "12x or 7.5")
+    return _positive(text, r"\s*[x×]?", "a compression ratio", "12x or 7.5")[0]
 
 
 def parse_bpp(text: str | float) -> float:
     """Return a number of bits per texel of all channels together, such as ``2``. Raises ``ValueError``."""
-    match = re.fullmatch(rf"(?P<number>{_NUMBER})", str(text).strip(), re.IGNORECASE | re.ASCII)
-    return _positive(match, text, "a number of bits per texel", "2 or 0.5")
+    return _positive(text, "", "a number of bits per texel", "2 or 0.5")[0]
 
 
 def parse_bytes(text: str | float) -> int:
@@ -42,10 +40,8 @@ def parse_bytes(text: str | float) -> int:
 
     k = 1024, M = 1024², G = 1024³, in either case, with or without ``B`` or ``iB``. Raises ``ValueError``.
     """
-    pattern = rf"(?P<number>{_NUMBER})\s*(?P<unit>[kmg]?)(i?b)?"
-    match = re.fullmatch(pattern, str(text).strip(), re.IGNORECASE | re.ASCII)
-    unit = _UNITS[match["unit"].lower()] if match else 1
-    value = _positive(match, text, "a number of bytes", "262144, 256k or 1.5M") * unit
+    number, match = _positive(text, r"\s*(?P<unit>[kmg]?)(i?b)?", "a number of bytes", "262144, 256k or 1.5M")
+    value = number * _UNITS[match["unit"].lower()]
     if not 1 <= value < 2**63:
         raise ValueError(f"{text!r} is {value:.3g} bytes, allowed are 1 to 2⁶³")
     return round(value)
@@ -105,11 +101,13 @@ def parse_size(
     return max(1, round(wanted))
 
 
-def _positive(match: re.Match | None, text, what: str, example: str) -> float:
+def _positive(text, ending: str, quantity: str, example: str) -> tuple[float, re.Match]:
+    """Return the number before an ``ending`` (a regular expression), and the match. Raises ``ValueError``."""
+    match = re.fullmatch(rf"(?P<number>{_NUMBER}){ending}", str(text).strip(), re.IGNORECASE | re.ASCII)
     value = float(match["number"]) if match else math.nan
     if not (value > 0 and math.isfinite(value)):
-        raise ValueError(f"{text!r} is not {what}, allowed are finite numbers > 0 such as {example}")
-    return value
+        raise ValueError(f"{text!r} is not {quantity}, allowed are finite numbers > 0 such as {example}")
+    return value, match
 
 
 def largest_fitting(fits: Callable[[float], bool], low: float, high: float, steps: int | None = None) -> float:

@@ -13,7 +13,7 @@ import os
 import sys
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 
 import drjit as dr
 import numpy as np
@@ -22,21 +22,21 @@ from tqdm import tqdm
 
 from ..arrays.indirection import aligned_copy, unfolded
 from ..core import compat
-from ..core.archives import Archive, ArchiveError
-from ..core.deadline import duration
+from ..core.archives import Archive, ArchiveError, LimitError
 from ..core.errors import reason
 from ..core.files import irregular, replacing, shown, writable_file
-from ..core.interrupt import interruptible
-from ..core.limits import LimitError
-from ..core.progress import in_terminal, progress_bar
+from ..core.progress import Deadline, duration, in_terminal, interruptible, progress_bar
 from .settings import LOSSES, SCHEDULES, FitSettings, FittingError
 from .sparse_adam import SparseAdam
 
 __all__ = ["LOSSES", "SCHEDULES", "FitResult", "FitSettings", "FittingError", "Problem", "fit"]
 
 
-#: Most measurements of a training whose time is limited, and the largest share of the time that they take.
-MEASUREMENTS, MEASURING = 10, 0.2
+#: Most measurements of a training whose time is limited.
+MEASUREMENTS = 10
+
+#: Largest share of a limited time that measurements take.
+MEASURING = 0.2
 
 #: Share of the steps of the settings below which a training whose time is limited is unfinished.
 UNFINISHED = 0.05
@@ -68,9 +68,8 @@ class Problem:
     """Base class of problems: the arrays that a task trains, its loss and its measurement.
 
     Most problems draw samples (:meth:`batch`) and evaluate the tables for them (:meth:`predict`). Other problems
-    replace :meth:`loss`, for instance by the loss of a render: ``net`` may then be the parameters of a loaded scene
-    (``mi.SceneParameters``, reduced to the trained ones by ``keep``), a mapping that takes an optimiser's values by
-    ``update`` as a ``drjit.nn.Module`` does. Custom operations (``dr.custom``) can shape gradients on their way.
+    replace :meth:`loss`, for instance by that of a render: ``net`` may then be the parameters of a loaded scene
+    (``mi.SceneParameters``, reduced to the trained ones by ``keep``).
     """
 
     #: The trainable module (``drjit.nn.Module``), allocated, or another mapping of names to arrays with ``update``.
@@ -181,6 +180,23 @@ class _State:
     moments: dict[str, tuple]
 
 
+@dataclass
+class _Record:
+    """Record of a training so far, which a checkpoint keeps beside the state.
+
+    ``references`` are running means of the loss by phase, from its first step on, lest an explosion sets them.
+    """
+
+    best: dict | None = None
+    best_measured: dict | None = None
+    best_step: int = 0
+    history: list = field(default_factory=list)
+    restarts: int = 0
+    seconds: float = 0.0
+    plateau: list = field(default_factory=list)
+    references: dict = field(default_factory=dict)
+
+
 def fit(
     problem: Problem,
     settings: FitSettings,
@@ -189,19 +205,21 @@ def fit(
     progress=True,
     log=None,
     title=None,
-    seconds: float | None = None,
+    deadline: Deadline | None = None,
     least: int = 1,
 ) -> FitResult:
     """Train ``problem.net`` in place and leave the best state of the training in it.
 
-    ``checkpoint`` is a file that keeps the state of the training, written at every measurement; with ``resume`` it is
-    read first (it must belong to the same settings). ``title`` stands before the progress bar. With ``seconds``, the
-    training and its last measurement end after that time, though not before ``least`` steps, and its schedules follow
-    the clock in place of the steps. It is measured as often as the settings say, at most ten times, and less often if
-    measurements take long. Ctrl-C ends the training after the current step, which is measured, too, and keeps the best
-    state so far. If the loss or a parameter becomes NaN, or the loss explodes, the last good state is restored and the
-    learning rate halved; ``log`` (default: print to stderr) gets one sentence about it.
+    - ``checkpoint``: file that keeps the state of the training, written at every measurement; with ``resume`` it is
+      read first and must belong to the same settings.
+    - ``title``: text before the progress bar.
+    - ``log``: function that gets one sentence about each restart (default: print to stderr).
+    - ``deadline``: the training and its last measurement end in time, though not before ``least`` steps; schedules
+      follow the clock in place of the steps. There are at most :data:`MEASUREMENTS` measurements, fewer if they take
+      long.
 
+    Ctrl-C ends the training after the current step, which is measured, too, and keeps the best state so far. If the
+    loss or a parameter becomes NaN, or the loss explodes, the last good state is restored and the learning rate halved.
     Raises :class:`FittingError` if the training diverges again and again, or the checkpoint does not fit.
     """
     net, problem.settings = problem.net, settings
@@ -209,22 +227,16 @@ def fit(
         writable_file(checkpoint)
         if os.path.exists(checkpoint) and not resume and not _is_checkpoint(checkpoint):
             raise FittingError(f'the checkpoint "{checkpoint}" would replace a file that is not one')
-    trainer, plateau = _Trainer(problem, settings), _Plateau(settings)
-    best, best_measured, best_step, history, restarts, spent = None, None, 0, [], 0, 0.0
-    references = {}  # running mean of the loss of each phase, from its first step on, lest an explosion sets it
+    elif resume:
+        raise FittingError("resuming (--resume) needs the checkpoint (--checkpoint FILE) of the run to go on with")
+    trainer, plateau, record = _Trainer(problem, settings), _Plateau(settings), _Record()
     if resume:
-        if checkpoint is None:
-            raise FittingError("resuming (--resume) needs the checkpoint (--checkpoint FILE) of the run to go on with")
-        state, extra = _load_checkpoint(checkpoint, _all_settings(problem, settings), trainer)
+        state, record = _load_checkpoint(checkpoint, _all_settings(problem, settings), trainer)
         trainer.restore(state)
-        best, best_measured, best_step = extra["best"], extra["best_measured"], extra["best_step"]
-        history, restarts, spent = extra["history"], extra["restarts"], extra["seconds"]
-        trainer.restarts = restarts
-        references = extra["references"]
-        plateau.restore(extra["plateau"])
-
-    start = time.perf_counter() - spent
-    clock = None if seconds is None else _Clock(start, seconds)
+        trainer.restarts = record.restarts
+        plateau.restore(record.plateau)
+    start = time.perf_counter() - record.seconds
+    clock = None if deadline is None else _Clock(start, deadline.left())
 
     def share() -> float:
         """Return the share of the training that is over."""
@@ -234,21 +246,21 @@ def fit(
 
     trainer.share = share()
     good = trainer.earlier()
-    bar = _Bar(settings.steps, seconds, title, progress)
+    bar = _Bar(settings.steps, clock and clock.seconds, title, progress)
     planned = min(MEASUREMENTS, max(1, settings.steps // settings.measure_every))  # with a limit of time
     bar.show(trainer)
     log = log or (lambda message: tqdm.write(message, file=sys.stderr))
     interrupted = False
 
     def measure(loss: float | None):
-        nonlocal best, best_measured, best_step
         figures = problem.measure(net) if clock is None else clock.measured(lambda: problem.measure(net))
         measured = {k: float(v) for k, v in figures.items()}
         name, value = next(iter(measured.items()))
-        history.append({"step": trainer.step, "loss": loss, **measured})
-        top = max((h[name] for h in history if math.isfinite(h[name])), default=value)
-        if best is None or value >= top - problem.tolerance:
-            best, best_measured, best_step = trainer.snapshot(all_moments=False).parameters, measured, trainer.step
+        record.history.append({"step": trainer.step, "loss": loss, **measured})
+        top = max((h[name] for h in record.history if math.isfinite(h[name])), default=value)
+        if record.best is None or value >= top - problem.tolerance:
+            record.best = trainer.snapshot(all_moments=False).parameters
+            record.best_measured, record.best_step = measured, trainer.step
         bar.measured(name, value)
 
     with interruptible() as stop, cores(settings.deterministic), compat.room_for_sums(LARGEST_SUMS), bar.shown:
@@ -257,26 +269,25 @@ def fit(
             kept = not problem.sparse or (trainer.step + 1) % settings.check_every == 0
             before, share_before = trainer.earlier() if kept else good, trainer.share
             loss = trainer.take_step(plateau.factor)
-            if seconds is not None:
+            if clock is not None:
                 dr.eval(loss)
                 dr.sync_thread()
             trainer.share = share()
             bar.show(trainer)
             last = trainer.share >= 1
             measured = trainer.step % settings.measure_every == 0
-            if seconds is not None:
+            if clock is not None:
                 measured = int(planned * trainer.share) > int(planned * share_before) and not clock.slow
             due = trainer.step % settings.check_every == 0 or measured
-            reference = references.get(trainer.phase)
+            reference = record.references.get(trainer.phase)
             if not (due or last or reference is None):
                 continue
             value = float(loss[0])
             if _diverged(value, reference, problem.harmless) or not trainer.finite():
-                restarts += 1
-                trainer.restarts = restarts
-                if restarts > 8:
+                trainer.restarts = record.restarts = record.restarts + 1
+                if record.restarts > 8:
                     raise FittingError(
-                        f"the training diverged {restarts} times (last at step {trainer.step}, loss {value:g}): "
+                        f"the training diverged {record.restarts} times (last at step {trainer.step}, loss {value:g}): "
                         f"lower the learning rate, {settings.lr:g}"
                     )
                 log(
@@ -288,32 +299,30 @@ def fit(
                 trainer.share = share()
                 bar.show(trainer)
                 continue
-            references[trainer.phase] = value if reference is None else 0.5 * (reference + value)
+            record.references[trainer.phase] = value if reference is None else 0.5 * (reference + value)
             plateau.update(trainer.step, value)
             bar.loss(value)
             good = before  # not the state after this step: nobody has seen its loss yet
             if measured or last:
                 measure(value)
                 if checkpoint is not None:
-                    extra = {
-                        "best": best, "best_measured": best_measured, "best_step": best_step, "history": history,
-                        "restarts": restarts, "seconds": time.perf_counter() - start, "plateau": plateau.state(),
-                        "references": references,
-                    }  # fmt: skip
-                    _save_checkpoint(checkpoint, _all_settings(problem, settings), trainer.snapshot(), extra)
+                    record.seconds, record.plateau = time.perf_counter() - start, plateau.state()
+                    _save_checkpoint(checkpoint, _all_settings(problem, settings), trainer.snapshot(), record)
         if stop.is_set() and trainer.share < 1:
             interrupted = True
+            history = record.history
             if trainer.step > 0 and (not history or history[-1]["step"] != trainer.step) and trainer.finite():
                 measure(None)
 
-    if best is None:
+    if record.best is None:
         raise FittingError("the training was stopped before its first measurement: there is nothing to keep")
-    trainer.load_parameters(best)
+    trainer.load_parameters(record.best)
     spent = time.perf_counter() - start
     unfinished = clock is not None and not interrupted and trainer.step < UNFINISHED * settings.steps
     return FitResult(
-        best_measured, best_step, trainer.step, spent, interrupted, restarts, history, stop.is_set(), unfinished
-    )
+        record.best_measured, record.best_step, trainer.step, spent, interrupted, record.restarts, record.history,
+        stop.is_set(), unfinished,
+    )  # fmt: skip
 
 
 class _Clock:
@@ -495,34 +504,37 @@ def _all_settings(problem: Problem, settings: FitSettings) -> dict:
     return {**asdict(settings), **json.loads(json.dumps(dict(problem.identity)))}
 
 
-def _save_checkpoint(path, settings: dict, state: _State, extra: dict) -> None:
+def _save_checkpoint(path, settings: dict, state: _State, record: _Record) -> None:
     arrays = {}
     for key, value in state.parameters.items():
         t, m, v = state.moments[key]
         arrays |= {f"value/{key}": value.numpy(), f"m/{key}": m.numpy(), f"v/{key}": v.numpy()}
-        arrays |= {f"t/{key}": np.int64(t[0]), f"best/{key}": np.asarray(extra["best"][key])}
-    meta = {k: v for k, v in extra.items() if k != "best"}
+        arrays |= {f"t/{key}": np.int64(t[0]), f"best/{key}": np.asarray(record.best[key])}
+    meta = {f.name: getattr(record, f.name) for f in fields(record) if f.name != "best"}
     meta |= {"step": state.step, "lr_scale": state.lr_scale, "settings": settings}
     arrays["meta"] = np.frombuffer(json.dumps(meta).encode(), np.uint8)
     with replacing(path) as temporary, open(temporary, "wb") as stream:
         np.savez(stream, **arrays)
 
 
-def checkpoint_settings(path) -> dict:
-    """Return the settings of the training and the identity of the problem in a checkpoint; {} if it holds none."""
+def _checkpoint_meta(path) -> dict:
+    """Return the description of a checkpoint, {} for another kind of file."""
     try:
         with Archive(path) as archive:
-            return dict(archive.json("meta")["settings"])
+            meta = archive.json("meta")
+            return meta if "lr_scale" in meta else {}
     except Exception:  # zipfile, json and numpy each have their own for another kind of file
         return {}
 
 
+def checkpoint_settings(path) -> dict:
+    """Return the settings of the training and the identity of the problem in a checkpoint; {} if it holds none."""
+    settings = _checkpoint_meta(path).get("settings")
+    return dict(settings) if isinstance(settings, dict) else {}
+
+
 def _is_checkpoint(path) -> bool:
-    try:
-        with Archive(path) as archive:
-            return "lr_scale" in archive.json("meta")
-    except Exception:  # zipfile, json and numpy each have their own for another kind of file
-        return False
+    return bool(_checkpoint_meta(path))
 
 
 def _check_meta(meta: dict) -> None:
@@ -545,7 +557,7 @@ def _check_meta(meta: dict) -> None:
         raise TypeError("the measurements are not lists of numbers")
 
 
-def _load_checkpoint(path, settings: dict, trainer: _Trainer) -> tuple[_State, dict]:
+def _load_checkpoint(path, settings: dict, trainer: _Trainer) -> tuple[_State, _Record]:
     if fault := irregular(path):
         raise FittingError(f'the checkpoint "{shown(path)}" {fault}')
     if not os.path.exists(path):
@@ -577,7 +589,7 @@ def _load_checkpoint(path, settings: dict, trainer: _Trainer) -> tuple[_State, d
     if stored_settings != settings:
         changed = [k for k in {**settings, **stored_settings} if stored_settings.get(k) != settings.get(k)]
         raise FittingError(f'the checkpoint "{path}" was made with other settings ({", ".join(changed)})')
-    return state, {**meta, "best": best}
+    return state, _Record(best, **{f.name: meta[f.name] for f in fields(_Record) if f.name != "best"})
 
 
 #: Entries, of all cores together, that the copies of an array may have in which each core sums gradients on its own: 2

@@ -24,7 +24,7 @@ import importlib
 import importlib.util
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import ModuleType
@@ -33,8 +33,9 @@ from typing import TYPE_CHECKING, Any
 from ..core import discovery
 from ..core.arguments import Argument, check_files
 from ..core.compat import module_of
-from ..core.deadline import Deadline
 from ..core.errors import UsageError
+from ..core.files import read_once
+from ..core.progress import Deadline, interruptible
 from ..core.units import labelled
 from .settings import FitSettings, within_memory
 
@@ -53,14 +54,49 @@ OVERRUN = 1.15
 DATA = Path(__file__).resolve().parents[1] / "data"
 
 
+@dataclass(frozen=True)
+class Stage:
+    """One training of a fit. A fit is a list of stages, which :meth:`FitRequest.run` carries out in turn.
+
+    - ``name``: a stage with a ``name`` keeps its checkpoint in the file ``CHECKPOINT.name`` beside that of the request,
+      one without in the request's own. ``title`` stands before the progress bar (default: the name).
+    - ``problem``: what is trained (:class:`.Problem`), or a function that returns it when the stage begins, from what
+      earlier stages have trained. The stage is left out if it returns ``None``.
+    - ``share``: part of the time that is left when the stage begins, from 0 to 1. Without a limit of time it does
+      nothing: the ``settings`` of the stage (default: those of the request) say how many steps there are.
+    - ``finish``: what follows the training, such as the measurement of the table, and takes ``times`` as long. With a
+      limit of time it is carried out once before, so that time is left for it.
+    - ``least``: steps that are taken however little time is left.
+    - ``resumable``: keep a checkpoint, if the request asks for one.
+
+    Example: a proxy in 30% of the time, then a residual on top of it::
+
+        problems = []
+        first, last = request.run([
+            Stage("proxy", lambda: problems.append(ProxyProblem(samples)) or problems[0], 0.3, PROXY_SETTINGS),
+            Stage("", lambda: ResidualProblem(samples, problems[0].net), finish=stored),
+        ])
+    """
+
+    name: str
+    problem: Problem | Callable[[], Problem | None]
+    share: float = 1.0
+    settings: FitSettings | None = None
+    title: str | None = None
+    finish: Callable[[], object] | None = None
+    times: float = 1.0
+    least: int = 1
+    resumable: bool = True
+
+
 @dataclass
 class FitRequest:
-    """Request for one training.
+    """Request for a fit, complete before it is checked, and never changed afterwards.
 
-    ``preset`` and its ``settings`` as they were changed, the module of Dr.Jit ``types`` to train with, the ``storage``
-    form of the result ("": the task's own), and the task's own arguments (``options``, all of them). ``seconds`` limits
-    the time in place of the steps: that of each training, or with a ``deadline`` that of all that is left to do.
-    ``output`` is the file for the result, if it is known, and ``task`` the name of the task.
+    ``preset`` and its ``settings`` as the user changed them, the module of Dr.Jit ``types`` to train with, the
+    ``storage`` form of the result ("": the task's own), and the task's own arguments (``options``, all of them). The
+    ``deadline`` limits the time of all that is left to do, in place of the steps of the settings. ``output`` is the
+    file for the result, if it is known, and ``task`` the name of the task.
     """
 
     preset: str
@@ -68,13 +104,40 @@ class FitRequest:
     types: ModuleType
     storage: str = ""
     options: Mapping[str, Any] = field(default_factory=dict)
-    seconds: float | None = None
     checkpoint: str | os.PathLike | None = None
     resume: bool = False
     progress: bool = True
     output: Path | None = None
     deadline: Deadline | None = None
     task: str = ""
+
+    def run(self, stages: Iterable[Stage]) -> list[FitResult]:
+        """Train the ``stages`` (:class:`Stage`), one after the other, and return the record of each.
+
+        ``stages`` may be a generator, which decides on a stage when the one before has ended. After Ctrl-C no further
+        stage begins, and the last record is ``interrupted``.
+        """
+        results: list[FitResult] = []
+        with interruptible() as stop:
+            for stage in stages:
+                if results and (results[-1].interrupted or stop.is_set()):
+                    results[-1] = dataclasses.replace(results[-1], interrupted=True)
+                    break
+                problem = stage.problem() if callable(stage.problem) else stage.problem
+                if problem is not None:
+                    request = self._stage_request(stage)
+                    title = stage.title or stage.name or None
+                    results.append(request.train(problem, title, stage.finish, stage.times, stage.least))
+        return results
+
+    def _stage_request(self, stage: Stage) -> FitRequest:
+        checkpoint, resume = self.checkpoint if stage.resumable else None, self.resume and stage.resumable
+        if checkpoint is not None and stage.name:
+            checkpoint = f"{checkpoint}.{stage.name}"
+            resume = resume and os.path.exists(checkpoint)
+        request = self.part(stage.share) if stage.share < 1 else self
+        settings = stage.settings or self.settings
+        return dataclasses.replace(request, settings=settings, checkpoint=checkpoint, resume=resume)
 
     def train(
         self,
@@ -84,40 +147,27 @@ class FitRequest:
         times: float = 1.0,
         least: int = 1,
     ) -> FitResult:
-        """Train a problem with the settings of this request.
-
-        With a deadline, ``finish`` is carried out once before, so that room is kept for the measurement that follows,
-        which takes ``times`` as long. At least ``least`` steps are taken.
-        """
+        """Train one ``problem`` with the settings of this request. Other parameters are those of :class:`Stage`."""
         from .loop import fit
 
-        seconds = self.seconds
-        if self.deadline is not None:
-            if finish is not None:
-                self.deadline.rehearse(finish, times)
-            seconds = self.deadline.left()
+        if self.deadline is not None and finish is not None:
+            self.deadline.rehearse(finish, times)
         return fit(
-            problem,
-            self.settings,
-            self.checkpoint,
-            self.resume,
-            self.progress,
-            title=title,
-            seconds=seconds,
+            problem, self.settings, self.checkpoint, self.resume, self.progress, title=title, deadline=self.deadline,
             least=least,
-        )
+        )  # fmt: skip
 
     def part(self, share: float) -> FitRequest:
         """Return the request for a stage that takes a ``share`` of the time that is left, if time is limited."""
-        if self.deadline is None:
-            return self
-        return dataclasses.replace(self, deadline=self.deadline.part(share))
+        return self if self.deadline is None else dataclasses.replace(self, deadline=self.deadline.part(share))
 
     def recorded(self, result: FitResult | None = None) -> dict:
         """Return the settings as a table file keeps them: with a limit of time, the steps are those of the result."""
-        limited = {} if self.seconds is None else {"seconds": self.seconds}
-        steps = {} if self.seconds is None or result is None else {"steps": result.steps}
-        return {**asdict(self.settings), **steps, **limited}
+        settings = asdict(self.settings)
+        if self.deadline is None:
+            return settings
+        steps = {} if result is None else {"steps": result.steps}
+        return {**settings, **steps, "seconds": self.deadline.total}
 
     @property
     def folder(self) -> Path:
@@ -320,8 +370,6 @@ class Task:
     files: str = "files"
     #: Number of measurements during a training; 0: as the settings of the preset say.
     measurements: int = 0
-    #: Name → keywords of :func:`fit` for fits of seconds, one for each layout, whose files the tests of trust damage.
-    trials: Mapping[str, Mapping[str, Any]] = {}
     #: Object type and name of the plugin that reads the tables ("texture", "neural_image"); none: no plugin does.
     plugin: tuple[str, str] | None = None
 
@@ -433,6 +481,10 @@ class Task:
         """Return the model of a checked table. Raises :class:`.TableError`."""
         return self.model_class()(table, self.allocate(table, dtype, storage), dtype, storage)
 
+    def read(self, path: str | os.PathLike, dtype, storage: str = "") -> Model:
+        """Return the model of a file of this task for the tensor type ``dtype``. Raises :class:`.TableError`."""
+        return self.model(self.load(path), dtype, storage)
+
     def file(self, filename: str | os.PathLike = "", preset: str = "") -> Path:
         """Return the path ``filename``, or of the file that ships for ``preset`` ("": the default).
 
@@ -458,26 +510,12 @@ class Task:
         if storage and storage not in STORAGES:
             raise ValueError(f'parameter "storage": found "{storage}", allowed are {", ".join(STORAGES)}')
         path = self.file(filename, preset)
-        original = _open(self, path, stamp(path), dtype, storage)
+        original = read_once(self.read, path, dtype, storage)
         if preset and original.table.preset != preset:
             from ..arrays.tables import TableError
 
             raise TableError(f'{path}: holds tables of the preset "{original.table.preset}", "{preset}" was asked for')
         return original.copy()
-
-
-def stamp(path: Path) -> tuple:
-    """Return numbers that change when a file does: its time and size."""
-    try:
-        stat = path.stat()
-    except OSError:
-        return ()
-    return stat.st_mtime_ns, stat.st_size
-
-
-@functools.lru_cache(maxsize=64)
-def _open(task: Task, path: Path, stamp: tuple, dtype, storage: str) -> Model:
-    return task.model(task.load(path), dtype, storage)
 
 
 @functools.lru_cache
@@ -503,8 +541,7 @@ def load_model(path: str | os.PathLike, dtype, storage: str = "") -> Model:
     """Return the model of a table file of any task. Raises :class:`.TableError`."""
     from ..arrays.tables import load_table
 
-    task = task_of(load_table(path))
-    return task.model(task.load(path), dtype, storage)
+    return task_of(load_table(path)).read(path, dtype, storage)
 
 
 def open_model(path: str | os.PathLike = "", storage: str = "", *, task: str = "", preset: str = "") -> Model:
@@ -573,9 +610,9 @@ def fit(
         raise UsageError(f'{task}: found the storage "{storage}", allowed are {", ".join(chosen.storages) or "none"}')
     if source is not None:
         given["source"] = source
+    deadline = Deadline(seconds) if isinstance(seconds, (int, float)) else seconds
     arguments = {argument.name: argument for argument in chosen.arguments}
     options, fields = {k: a.default for k, a in arguments.items()}, {f.name for f in dataclasses.fields(FitSettings)}
-    deadline = Deadline(seconds) if isinstance(seconds, (int, float)) else seconds
     for key, value in given.items():
         if key == "source" and key not in options:
             raise UsageError(f"{task}: found a source, but this task has none")
@@ -584,15 +621,15 @@ def fit(
             raise UsageError(f'{task}: found the argument "{key}", allowed are {allowed}')
         options |= {key: arguments[key].parsed(value)} if key in options else {}
     settings = within_memory(chosen.settings(preset, {k: v for k, v in given.items() if k in fields}, options))
-    request = FitRequest(preset, settings, None, storage or next(iter(chosen.storages), ""), options)
-    request.deadline, request.seconds = deadline, None if deadline is None else deadline.seconds
-    request.checkpoint, request.resume, request.progress = checkpoint, resume, progress
-    request.output, request.task = None if output is None else chosen.output_path(output), task
-    check_files(chosen.arguments, options, {"-o": request.output, "--checkpoint": checkpoint})
-    if resume and seconds is not None:
+    output = None if output is None else chosen.output_path(output)
+    check_files(chosen.arguments, options, {"-o": output, "--checkpoint": checkpoint})
+    if resume and deadline is not None:
         raise UsageError("--resume needs the --steps of the run that it goes on with: leave out --seconds")
+    storage = storage or next(iter(chosen.storages), "")
+    request = FitRequest(
+        preset, settings, array_module(variant), storage, options, checkpoint, resume, progress, output, deadline, task
+    )
     chosen.check(request)
-    request.types = array_module(variant)
     fitted = chosen.fit(request)
     fitted.request = request
     if deadline is not None and deadline.spent() > OVERRUN * deadline.seconds:

@@ -1,11 +1,11 @@
-"""Films: frames as H.264, WebP or GIF, and panels with labels side by side."""
+"""Films: frames as H.264, WebP or GIF."""
 
 from __future__ import annotations
 
 import importlib.util
 import os
 import subprocess
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 
@@ -18,11 +18,11 @@ from . import srgb
 #: Extensions of films.
 FILMS = (".mp4", ".webp", ".gif")
 
-#: Quality of H.264 (constant rate factor of x264: 0 is lossless, 51 the worst) and of WebP (100 is the best).
-CRF, WEBP_QUALITY = 18, 85
+#: Quality of H.264: constant rate factor of x264, from 0 (lossless) to 51 (worst).
+CRF = 18
 
-#: Colours of a label and of the space around panels, and the height of a label over that of its text.
-INK, PAPER, LABEL = (32, 32, 32), (255, 255, 255), 1.7
+#: Quality of WebP, from 0 to 100 (best).
+WEBP_QUALITY = 85
 
 
 def check_encoder(path: str | os.PathLike) -> None:
@@ -50,10 +50,7 @@ def over_black(image: np.ndarray) -> np.ndarray:
 
 
 def write(
-    path: str | os.PathLike,
-    frames: Sequence[np.ndarray],
-    seconds: float = 4.0,
-    quality: float | None = None,
+    path: str | os.PathLike, frames: Sequence[np.ndarray], seconds: float = 4.0, quality: float | None = None
 ) -> None:
     """Write a film of bytes, each frame ``(height, width, 3)`` or with alpha 4 channels, that lasts ``seconds``.
 
@@ -67,7 +64,7 @@ def write(
     """
     path = Path(path)
     check_encoder(path)
-    _check_frames(frames, (3,) if path.suffix.lower() == ".mp4" else (3, 4))
+    check_frames(frames, (3,) if path.suffix.lower() == ".mp4" else (3, 4))
     with replacing(path) as temporary:
         if path.suffix.lower() == ".mp4":
             _write_h264(path, temporary, frames, seconds, CRF if quality is None else quality)
@@ -75,20 +72,14 @@ def write(
         from PIL import Image
 
         images = [Image.fromarray(frame) for frame in frames]
-        options = {
-            "save_all": True,
-            "append_images": images[1:],
-            "loop": 0,
-            "duration": round(1000 * seconds / len(frames)),
-        }
+        options = {"disposal": 2}
         if path.suffix.lower() == ".webp":
-            options |= {"quality": WEBP_QUALITY if quality is None else quality, "method": 4}
-        else:
-            options |= {"disposal": 2}
-        images[0].save(temporary, **options)
+            options = {"quality": WEBP_QUALITY if quality is None else quality, "method": 4}
+        duration = round(1000 * seconds / len(frames))
+        images[0].save(temporary, save_all=True, append_images=images[1:], loop=0, duration=duration, **options)
 
 
-def _check_frames(frames: Sequence[np.ndarray], channels: tuple[int, ...]) -> None:
+def check_frames(frames: Sequence[np.ndarray], channels: tuple[int, ...]) -> None:
     """Refuse frames that are not bytes of one size, with one of the numbers of ``channels``."""
     if not len(frames):
         raise UsageError("frames: found none, a film needs one or more")
@@ -103,7 +94,9 @@ def _write_h264(path: Path, temporary: Path, frames: Sequence[np.ndarray], secon
     """Encode frames by x264 on one thread, since its bytes depend on the number of threads."""
     from imageio_ffmpeg import get_ffmpeg_exe
 
-    frames = [even(frame) for frame in frames]
+    height, width, _ = frames[0].shape
+    odd = (0, height % 2), (0, width % 2), (0, 0)
+    frames = [np.pad(frame, odd, mode="edge") for frame in frames]  # H.264 needs even sizes
     height, width, _ = frames[0].shape
     rate = Fraction(len(frames)) / Fraction(seconds).limit_denominator(1000)
     command = [
@@ -122,51 +115,3 @@ def _write_h264(path: Path, temporary: Path, frames: Sequence[np.ndarray], secon
         lines = encoder.stderr.decode(errors="replace").strip().splitlines()
         why = lines[-1] if lines else f"ffmpeg ended with {encoder.returncode}"
         raise OutputError(f'output file "{shown(path)}" cannot be written: {why}')
-
-
-def even(frame: np.ndarray) -> np.ndarray:
-    """Return a frame of even width and height: an odd one is extended by a copy of its last column or row."""
-    height, width, _ = frame.shape
-    return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-
-
-def beside(
-    panels: Mapping[str, Sequence[np.ndarray]], columns: int, text_height: int = 13, gap: int = 4
-) -> list[np.ndarray]:
-    """Return the frames of several films of one size and length as one film, ``columns`` panels in a row.
-
-    ``panels``: label → frames of bytes, ``(height, width, 3)``. The label stands above its panel, in text of
-    ``text_height`` pixels; ``gap`` pixels separate columns.
-
-    Raises :class:`.UsageError` for panels of different lengths or sizes.
-    """
-    from PIL import Image, ImageDraw, ImageFont
-
-    if len({len(frames) for frames in panels.values()}) != 1:
-        counts = ", ".join(f"{len(frames)} of {label!r}" for label, frames in panels.items()) or "no panel"
-        raise UsageError(f"panels: found {counts}, allowed are one or more panels of equally many frames")
-    _check_frames([frame for frames in panels.values() for frame in frames], (3,))
-    height, width, _ = next(iter(panels.values()))[0].shape
-    columns, band = min(columns, len(panels)), round(LABEL * text_height)
-    rows = -(-len(panels) // columns)
-    size = (columns * (width + gap) - gap, rows * (height + band))
-    sheet, font = Image.new("RGB", size, PAPER), ImageFont.truetype(_font(), text_height)
-    corners, draw = [], ImageDraw.Draw(sheet)
-    for i, label in enumerate(panels):
-        x, y = i % columns * (width + gap), i // columns * (height + band)
-        draw.text((x + width / 2, y + band / 2), label, fill=INK, font=font, anchor="mm")
-        corners.append((x, y + band))
-    empty, frames = np.array(sheet), []
-    for together in zip(*panels.values(), strict=True):
-        frame = empty.copy()
-        for (x, y), image in zip(corners, together, strict=True):
-            frame[y : y + height, x : x + width] = image
-        frames.append(frame)
-    return frames
-
-
-def _font() -> str:
-    """Return the path of DejaVu Sans, which Matplotlib brings."""
-    import matplotlib
-
-    return os.path.join(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf")

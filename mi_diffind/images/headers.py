@@ -1,6 +1,7 @@
 """Sizes of pictures, from the headers of their files, before anything is decoded.
 
-The formats are those that ``mitsuba.Bitmap`` reads: PNG, JPEG, OpenEXR, Radiance HDR, PFM, PPM, BMP and TGA.
+The formats are those that ``mitsuba.Bitmap`` reads. Pillow reads the headers of PNG and JPEG. Radiance HDR and PFM are
+unknown to it, and OpenEXR's own reader of headers ends the process on damaged ones.
 """
 
 from __future__ import annotations
@@ -12,16 +13,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from ..core.limits import Allowance
+from ..core.archives import Allowance
 
-#: PNG: type of colour → channels, after the expansion of a palette, which may have transparency.
-_PNG_CHANNELS = {0: 1, 2: 3, 3: 4, 4: 2, 6: 4}
+#: Modes of Pillow that are decoded to more or fewer bytes a pixel than they have letters.
+_MODE_BYTES = {"P": 4, "YCbCr": 3, "I;16": 2, "I;16B": 2}
 
-#: Markers of JPEG that begin a frame with its size.
-_JPEG_FRAMES = {0xC0, 0xC1, 0xC2, 0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF}
+#: Pixel type of OpenEXR → bytes.
+_EXR_BYTES = {0: 4, 1: 2, 2: 4}
 
-#: OpenEXR: pixel type → bytes; flag of files with several parts.
-_EXR_BYTES, _EXR_PARTS = {0: 4, 1: 2, 2: 4}, 0x1000
+#: Flag of OpenEXR files with several parts.
+_EXR_PARTS = 0x1000
 
 #: Bytes of the longest text header, and of the longest name or attribute of an OpenEXR header that is kept.
 _HEADER = 2**16
@@ -58,45 +59,26 @@ def picture_size(path: Path) -> PictureSize | None:
         start = file.read(8)
         file.seek(0)
         try:
-            if start == b"\x89PNG\r\n\x1a\n":
-                return _png(file)
-            if start.startswith(b"\xff\xd8"):
-                return _jpeg(file)
             if start.startswith(b"\x76\x2f\x31\x01"):
                 return _exr(file)
             if start.startswith(b"#?"):
                 return _radiance(file)
             if start[:2] in (b"PF", b"Pf", b"P6", b"P5"):
                 return _portable(file)
+            if start == b"\x89PNG\r\n\x1a\n" or start.startswith(b"\xff\xd8"):
+                return _by_pillow(file, "PNG" if start[1:4] == b"PNG" else "JPEG")
             return _bmp(file) if start.startswith(b"BM") else _tga(file, path)
-        except (struct.error, ValueError, KeyError):
+        except Exception:  # struct and Pillow have their own for damaged headers
             return None
 
 
-def _png(file: BinaryIO) -> PictureSize:
-    width, height, depth, colour = struct.unpack(">IIBB", file.read(26)[16:])
-    return PictureSize(width, height, _PNG_CHANNELS[colour] * (2 if depth == 16 else 1))
+def _by_pillow(file: BinaryIO, name: str) -> PictureSize:
+    from PIL import Image
 
-
-def _jpeg(file: BinaryIO) -> PictureSize | None:
-    file.seek(2)
-    while True:
-        byte = file.read(1)
-        if not byte:
-            return None
-        if byte != b"\xff":
-            continue
-        while byte == b"\xff":
-            byte = file.read(1)
-        if not byte or byte[0] in (0xD9, 0xDA):
-            return None
-        if byte[0] == 0x00 or byte[0] == 0x01 or 0xD0 <= byte[0] <= 0xD8:  # without a length
-            continue
-        (length,) = struct.unpack(">H", file.read(2))
-        if byte[0] in _JPEG_FRAMES:
-            _, height, width, channels = struct.unpack(">BHHB", file.read(6))
-            return PictureSize(width, height, channels)
-        file.seek(max(0, length - 2), os.SEEK_CUR)
+    Image.preinit()
+    picture = Image.OPEN[name][0](file, "")  # Image.open would refuse large pictures
+    deep = "16" in str(picture.tile[0][3]) and "16" not in picture.mode
+    return PictureSize(*picture.size, _MODE_BYTES.get(picture.mode, len(picture.mode)) * (2 if deep else 1))
 
 
 def _exr(file: BinaryIO) -> PictureSize:
@@ -148,16 +130,14 @@ def _portable(file: BinaryIO) -> PictureSize | None:
 
 
 def _bmp(file: BinaryIO) -> PictureSize:
-    head = file.read(30)
-    width, height, _, bits = struct.unpack("<iiHH", head[18:30])
+    width, height, _, bits = struct.unpack("<iiHH", file.read(30)[18:])
     return PictureSize(abs(width), abs(height), max(3, -(-bits // 8)))
 
 
 def _tga(file: BinaryIO, path: Path) -> PictureSize | None:
     """Return the size in a TGA file, which only its extension or its last bytes show to be one."""
-    head = file.read(18)
+    width, height, bits = struct.unpack("<HHB", file.read(18)[12:17])
     file.seek(max(0, path.stat().st_size - 18))
     if path.suffix.lower() != ".tga" and not file.read(18).startswith(b"TRUEVISION-XFILE"):
         return None
-    width, height, bits = struct.unpack("<HHB", head[12:17])
     return PictureSize(width, height, -(-bits // 8))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ..arrays.budget import Budget
 from ..core import units
 from ..core.arguments import Argument, between, checked, decibels, positive
 from ..core.errors import UsageError
@@ -90,8 +91,8 @@ def requested_border(options) -> tuple[str, str] | None:
     return None if options["border"] == "auto" else (options["border"],) * 2
 
 
-def size_figures(source: Source, table, requested: float | None) -> tuple[dict, str]:
-    """Return the sizes of a trained table for ``--json``, and a line of text; ``requested`` are the bytes wanted."""
+def size_figures(source: Source, table, requested: float | None) -> tuple[dict, list[str]]:
+    """Return the sizes of a trained table for ``--json``, and lines of text; ``requested`` are the bytes wanted."""
     achieved = source.nbytes / table.nbytes if table.nbytes else None
     figures = {
         "source_bytes": source.nbytes,
@@ -101,7 +102,11 @@ def size_figures(source: Source, table, requested: float | None) -> tuple[dict, 
         "bits": {name: a.bits for name, a in table.arrays.items()},
     }
     wanted = f" ({source.nbytes / requested:.2f}x requested)" if requested else ""
-    return figures, (f"{achieved:.2f}x" if achieved else "of one colour") + wanted
+    lines = [(f"{achieved:.2f}x" if achieved else "of one colour") + wanted]
+    if requested and achieved and not Budget(requested).is_met(table.nbytes):
+        asked, actual = f"{round(requested):,} bytes were requested", f"{table.nbytes:,}"
+        lines.append(f"{asked}, but {actual} are the nearest that the arrays of this image allow")
+    return figures, lines
 
 
 def preview_path(request) -> Path | None:

@@ -41,7 +41,7 @@ def allocate_maps(
     return arrays
 
 
-def page_entries(table: Table, name: str, size: tuple[int, int]) -> int:
+def stored_entries(table: Table, name: str, size: tuple[int, int]) -> int:
     """Return the number of entries of the pages of an array, on an image of ``size``. Raises :class:`TableError`."""
     pages, counts, largest = table.arrays[name + PAGES], page_counts(size), 2 ** SIDE_BITS[1]
     where = f'{table.path}: array "{name}{PAGES}"'

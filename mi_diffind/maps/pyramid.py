@@ -21,11 +21,10 @@ import numpy as np
 
 from ..arrays import lookup
 from ..arrays.indirection import aligned
-from ..core import compat, memory
+from ..core import compat
 from ..images import srgb
-from . import components
 from .compressed import FilteredMaps
-from .layout import Layout, MapLayout
+from .layout import Layout, MapLayout, choose_borders
 from .source import Source
 
 
@@ -83,7 +82,7 @@ class Pyramid(FilteredMaps):
     def _hold(self, texels, offsets: np.ndarray) -> None:
         """Keep the texels and the levels' offsets in memory of Dr.Jit: frozen functions take NumPy's for constants."""
         offsets = self.types.UInt32(offsets.astype(np.uint32))
-        self._texels, self._offsets = memory.owned(texels), memory.owned(offsets)
+        self._texels, self._offsets = compat.owned(texels), compat.owned(offsets)
         dr.eval(self._texels)
 
     @staticmethod
@@ -92,7 +91,7 @@ class Pyramid(FilteredMaps):
 
         ``layout`` is any layout of this source (default: ``Layout.of(source, filtered=True)``); a stored channel of
         several maps is averaged as in the first of them. ``border`` along v and u is by default
-        :func:`.components.borders`.
+        :func:`.layout.choose_borders`.
         """
         layout = layout or Layout.of(source, filtered=True)
         sizes = level_sizes(source.height, source.width)
@@ -121,7 +120,7 @@ class Pyramid(FilteredMaps):
                     mean = srgb.from_linear(level) if m.color_space == "srgb" else level
                 for c, where in channels:
                     stored[..., where] = entry.encode(mean[..., c])
-        border = border or components.borders(values[0])
+        border = border or choose_borders(values[0])
         return Pyramid(layout, values, types, border)
 
     @property

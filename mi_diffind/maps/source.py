@@ -26,14 +26,96 @@ from pathlib import Path
 
 import numpy as np
 
+from ..core.archives import Allowance, LimitError, json_bytes
 from ..core.errors import DiffindError, reason
-from ..core.files import MOST_TEXT, OutsideError, irregular, path_by_name, shown
-from ..core.limits import Allowance, LimitError, json_bytes
+from ..core.files import MOST_TEXT, OutsideError, RecordedKeys, irregular, path_by_name, shown, unused_note
 from ..core.threads import threads_for_files
 from ..core.units import memory
-from ..core.unused_keys import RecordedKeys, unused_note
 from ..images.headers import check_picture
-from .names import Content, content_of
+
+#: Roles of maps.
+ROLES = ("albedo", "normal", "roughness", "ao", "metallic", "other")
+
+#: Role → names. Those of ``"other"`` are colours (sRGB) or data (linear), some of which pack several maps.
+ALBEDO = (
+    *("albedo", "basecolor", "basecolour", "base", "basemap", "diff", "diffuse", "diffusecolor", "diffusecolour"),
+    *("color", "colour", "col", "maintex", "albedotransparency"),
+)
+NORMAL = ("normal", "normals", "normalmap", "nrm", "nor", "norm")
+ROUGHNESS = ("roughness", "rough", "specularroughness")
+AO = ("ao", "occlusion", "ambientocclusion", "mixedao")
+METALLIC = ("metallic", "metalness", "metal", "basemetalness")
+COLOURS = ("emissive", "emission", "emit", "translucency", "speccolor", "specularcolor")
+DATA = (
+    *("data", "alpha", "opacity", "mask", "height", "disp", "displacement", "bump", "cavity", "curvature", "thickness"),
+    *("spec", "specular", "gloss", "glossiness", "smoothness", "anisotropy", "transmission", "parallax", "refl"),
+)
+PACKED = (
+    *("arm", "orm", "rma", "mra", "mro", "metallicroughness", "metalrough", "occlusionroughnessmetallic"),
+    *("metallicsmoothness", "metallicgloss", "maskmap"),
+)
+
+#: Ends of the names of normal maps → whether y points down in the image's green channel, as DirectX has it.
+NORMAL_FORMS = {
+    "": False, "gl": False, "ogl": False, "opengl": False,
+    "dx": True, "directx": True, "d3d": True,
+}  # fmt: skip
+
+#: Words before the others that name a further lobe: its colour is no albedo, its roughness not that of the material.
+LOBES = {
+    *("sheen", "specular", "spec", "coat", "clearcoat", "emission", "emissive", "subsurface", "transmission", "detail"),
+    *("fuzz", "edge", "attenuation", "iridescence", "film", "volume"),
+}
+
+#: Words at the end that say nothing of the content, beside numbers and resolutions.
+IGNORED = {"map", "texture", "tex", "jpg", "jpeg", "png", "exr", "tif", "tiff", "tga", "lod", "var", "udim"}
+
+_WORD = re.compile(r"\d+[kK](?![a-zA-Z])|[dD]3[dD]|[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
+
+
+@dataclass(frozen=True)
+class Content:
+    """Content of a map: its ``role`` (:data:`ROLES`).
+
+    ``colours``: values are colours, sRGB in images of 8 and 16 bits; ``packed``: channels are maps of their own;
+    ``y_down``: normals of DirectX.
+    """
+
+    role: str
+    colours: bool = False
+    packed: bool = False
+    y_down: bool = False
+
+
+_CONTENTS = {
+    **dict.fromkeys(ALBEDO, Content("albedo", colours=True)),
+    **{name + form: Content("normal", y_down=down) for name in NORMAL for form, down in NORMAL_FORMS.items()},
+    **dict.fromkeys(ROUGHNESS, Content("roughness")),
+    **dict.fromkeys(AO, Content("ao")),
+    **dict.fromkeys(METALLIC, Content("metallic")),
+    **dict.fromkeys(COLOURS, Content("other", colours=True)),
+    **dict.fromkeys(DATA, Content("other")),
+    **dict.fromkeys(PACKED, Content("other", packed=True)),
+}
+
+#: Most words of a name of :data:`_CONTENTS`.
+_LONGEST = 3
+
+
+def content_of(name: str) -> Content | None:
+    """Return the content of a map by its name, or by the name of its file without an extension; ``None`` if unknown."""
+    words = [word.lower() for word in _WORD.findall(name)]
+    for ignored in (False, True):  # "maskmap" is a name, the "map" of "normal_map" is not
+        while ignored and words and (words[-1] in IGNORED or words[-1][0].isdigit()):
+            words.pop()
+        for count in range(min(_LONGEST, len(words)), 0, -1):
+            text = "".join(words[-count:])
+            content = _CONTENTS.get(text) or _CONTENTS.get(text.removesuffix("texture").removesuffix("map"))
+            if content is not None:
+                further = LOBES.intersection(words[:-count])
+                return Content("other", content.colours) if further else content
+    return None
+
 
 #: Largest number of channels of all maps together.
 MAX_CHANNELS = 16
@@ -299,7 +381,7 @@ def _read(path: Path) -> _ImageFile:
     """Read an image file.
 
     Raises :class:`SourceError` if ``mitsuba.Bitmap`` cannot read it, it is cut short, or it takes more memory than a
-    file of its size may (:mod:`~mi_diffind.core.limits`).
+    file of its size may (:mod:`~mi_diffind.core.archives`).
     """
     import mitsuba as mi
 

@@ -23,8 +23,8 @@ from pathlib import Path
 import drjit as dr
 from tqdm import tqdm
 
-from ..core.interrupt import interruptible
 from ..core.jobs import run_jobs
+from ..core.progress import interruptible
 from ..core.runtime import use_variant
 from .clock import machine, timed, total
 from .operations import count_query

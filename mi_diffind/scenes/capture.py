@@ -28,9 +28,8 @@ from .. import __version__, plugins
 from ..core import compat
 from ..core.errors import DiffindError, UsageError, reason
 from ..core.files import replacing, writable_folder, write_json
-from ..core.interrupt import interruptible
 from ..core.jobs import run_jobs
-from ..core.progress import progress_bar
+from ..core.progress import interruptible, progress_bar
 from ..core.runtime import use_variant
 from ..core.threads import threads_for_files
 from ..core.units import check_memory, check_samples
@@ -38,7 +37,7 @@ from ..images import srgb
 from ..plugins.support import footprint
 from . import loading, splats
 from .poses import orbit_directions, pose, sphere_directions, upright_frame
-from .splat_files import is_splats
+from .splats import is_splats
 
 #: Samples of the whole image in one pass.
 PASS = 1 << 23
@@ -215,7 +214,7 @@ def capture(
     """Render the views of a ``scene`` into ``folder``, in the variant that is set.
 
     The scene is a file or a dictionary as of ``mi.load_dict``; of a loaded scene, lights could not be hidden. It may
-    also be a file of 3D Gaussians (:mod:`.splat_files`), of which ``box`` crops a part. ``given`` are fields of
+    also be a file of 3D Gaussians (:mod:`.splats`), of which ``box`` crops a part. ``given`` are fields of
     :class:`CaptureSettings`, the options of ``mi-diffind capture`` as keywords: ``views=60``, ``resolution=160``,
     ``path="orbit"``, …; ``defines`` replace the file's ``<default>`` parameters; ``workers`` processes share the views,
     or those of the Dask cluster ``scheduler``. The folder is created if its parent exists. Views of an earlier capture

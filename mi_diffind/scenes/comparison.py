@@ -21,8 +21,7 @@ from .. import plugins
 from ..core import compat
 from ..core.errors import UsageError
 from ..core.files import writable_folder
-from ..core.interrupt import interruptible
-from ..core.progress import progress_bar
+from ..core.progress import interruptible, progress_bar
 from ..core.runtime import use_variant
 from ..images import metrics
 from ..measure import figure_grid

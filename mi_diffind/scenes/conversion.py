@@ -22,7 +22,7 @@ import numpy as np
 
 from .. import plugins
 from ..arrays.tables import Table, moved_paths, save_table
-from ..core import compat, mitsuba_versions
+from ..core import compat
 from ..core.errors import DiffindError, UsageError
 from ..core.files import OutputError, relative_path, replacing, shown, writable_file, writable_folder
 from ..core.runtime import use_variant
@@ -178,7 +178,7 @@ def _replace_nodes(state, groups: dict[str, plugins.Plugin], folder: Path, progr
         if (before := props.plugin_name()) not in stock:
             continue
         word, plugin = stock[before]
-        if mitsuba_versions.object_type(plugins.OBJECT_TYPES[plugin.object_type]) != types[index]:
+        if compat.object_type(plugins.OBJECT_TYPES[plugin.object_type]) != types[index]:
             continue
         around = list(_around(references, index))
         name = next(filter(None, (nodes[i].id() for i in (index, *around))), "") or compat.parsed_place(state, index)

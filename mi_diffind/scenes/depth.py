@@ -28,8 +28,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core import compat
-from ..core.interrupt import interruptible
-from ..core.progress import progress_bar
+from ..core.progress import interruptible, progress_bar
 from . import loading
 
 #: Part of the scattered light that may be left out.

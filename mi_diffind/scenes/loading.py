@@ -20,8 +20,7 @@ from ..core import compat, tensor_files, units
 from ..core.errors import DiffindError, UsageError
 from ..core.files import MOST_TEXT, irregular, replacing, shown
 from ..core.runtime import use_variant
-from ..core.threads import threads_for_files
-from ..core.turns import in_turn
+from ..core.threads import in_turn, threads_for_files
 from ..fitting.task import tasks
 from ..images import metrics
 from ..measure.operations import bsdf_operations

@@ -29,8 +29,7 @@ from .. import __version__
 from ..core.archives import Archive
 from ..core.errors import UsageError
 from ..core.files import OutputError, replacing, writable_file, writable_folder
-from ..core.interrupt import interruptible
-from ..core.progress import progress_bar
+from ..core.progress import interruptible, progress_bar
 from ..core.runtime import use_variant
 from ..measure.store import fingerprint, sources
 from . import loading

@@ -17,8 +17,7 @@ import numpy as np
 from .. import plugins
 from ..core.errors import UsageError
 from ..core.files import replacing
-from ..core.interrupt import interruptible
-from ..core.progress import progress_bar
+from ..core.progress import interruptible, progress_bar
 from ..core.runtime import use_variant
 from ..core.units import check_memory
 from ..images import films, metrics

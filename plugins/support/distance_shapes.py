@@ -20,8 +20,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_diffind.core import compat, mitsuba_versions
-from mi_diffind.tasks.sdf import tracing
+from mi_diffind.core import compat
+from mi_diffind.tasks.sdf import marching
 
 from .. import warn
 from . import omissions
@@ -29,7 +29,7 @@ from .placement import Placement, PlacementParameter
 from .tables import arrays_of
 
 #: Distance of secondary rays' origins from the surface: three shortest steps of a ray.
-OFFSET = 3 * tracing.EPSILON
+OFFSET = 3 * marching.SHORTEST_STEP
 
 #: Cosine between ray and normal below which the derivative of a hit is that at this cosine.
 GRAZING = 1e-2
@@ -60,7 +60,7 @@ def distance_shape(mesh: type) -> type:
         def __init__(self, props: mi.Properties, field, placement: Placement, smooth: bool):
             self.field, self.smooth, self.position = field, smooth, PlacementParameter(placement)
             self.ready, self.differentiated = False, False
-            super().__init__(*mitsuba_versions.mesh_arguments(props, CORNERS, CORNERS))
+            super().__init__(*compat.mesh_arguments(props, CORNERS, CORNERS))
             if self.is_emitter():
                 raise RuntimeError("emitter: found one, signed distance fields emit no light")
             if self.is_medium_transition():
@@ -83,13 +83,13 @@ def distance_shape(mesh: type) -> type:
             corners = np.stack(np.meshgrid(*box.T, indexing="ij"), -1).reshape(-1, 3)
             self.ready = False
             buffers = mi.traverse(self)
-            mitsuba_versions.set_triangles(buffers, self.placement.world(corners), np.repeat(np.arange(CORNERS), 3))
+            compat.set_triangles(buffers, self.placement.world(corners), np.repeat(np.arange(CORNERS), 3))
             buffers.update()
             self.ready = True
 
         def _hold(self) -> None:
             """Keep all arrays that rays read as an attribute, for frozen functions; build the index of the field."""
-            tracing.index_bytes(self.field)
+            marching.index_bytes(self.field)
             self.held = arrays_of(self.field)
 
         def traverse(self, cb: mi.TraversalCallback) -> None:
@@ -109,7 +109,7 @@ def distance_shape(mesh: type) -> type:
         def omitted(self, integrators: list, sensor) -> str:
             """Return a sentence if these integrators do not trace the shape; see :mod:`.omissions`."""
             names = [compat.integrator_name(integrator) for integrator in integrators]
-            if any(hasattr(i, "sample_shapes") for i in integrators) and compat.INTERSECTING not in names:
+            if any(getattr(i, "traces_solids", False) for i in integrators) and compat.INTERSECTING not in names:
                 return ""
             name = compat.INTERSECTING if compat.INTERSECTING in names else names[-1]
             decoded = (
@@ -137,7 +137,7 @@ def distance_shape(mesh: type) -> type:
         @property
         def index_bytes(self) -> int:
             """Bytes of the field's ray-marching index."""
-            return tracing.index_bytes(self.field)
+            return marching.index_bytes(self.field)
 
         def local_ray(self, o, d, rest=0):
             """Return a ray's origin and direction in the unit frame: lengths are those of the world by ``size``."""
@@ -327,7 +327,7 @@ def intersect(shapes: DistanceShapes, o, d, maxt, active=True, rest=0) -> ShapeH
     nearest = ShapeHit(mi.UInt32(0), mi.Float(maxt), mi.Point3f(0))
     for i, shape in enumerate(shapes):
         start, direction = shape.local_ray(o, d, rest)
-        result = tracing.intersect(shape.field, start, direction, nearest.t / shape.size, active)
+        result = marching.intersect(shape.field, start, direction, nearest.t / shape.size, active)
         nearest.number = dr.select(result.hit, i + 1, nearest.number)
         nearest.t = dr.select(result.hit, result.t * shape.size, nearest.t)
         nearest.p = dr.select(result.hit, mi.Point3f(result.p), nearest.p)
@@ -339,7 +339,7 @@ def occluded(shapes: DistanceShapes, o, d, maxt, active=True, rest=0):
     blocked = mi.Bool(False)
     for shape in shapes:
         start, direction = shape.local_ray(o, d, rest)
-        blocked |= tracing.occluded(shape.field, start, direction, maxt / shape.size, active & ~blocked)
+        blocked |= marching.occluded(shape.field, start, direction, maxt / shape.size, active & ~blocked)
     return blocked
 
 

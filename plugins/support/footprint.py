@@ -20,7 +20,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_diffind.core import compat, mitsuba_versions
+from mi_diffind.core import compat
 
 from .. import warn
 from . import omissions
@@ -177,7 +177,7 @@ def footprint(si: mi.SurfaceInteraction3f, cone: Cone | None = None) -> tuple[mi
     or no source at all is 0, the sharpest footprint.
     """
     sources = []
-    if (given := mitsuba_versions.footprint_of(si)) is not None:
+    if (given := compat.footprint_of(si)) is not None:
         sources.append(given)
     sources.append((si.duv_dx, si.duv_dy))
     ddx, ddy = (mi.Vector2f(0), mi.Vector2f(0)) if cone is None else seen_by(cone, si)

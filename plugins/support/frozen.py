@@ -13,7 +13,7 @@ import hashlib
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind.core import compat, memory
+from mi_diffind.core import compat
 
 #: Types of Dr.Jit's literals that stand for the digits of a key.
 _DIGITS = ("Int8", "UInt8", "Int32", "UInt32", "Int64", "UInt64", "Float16", "Float64")
@@ -42,7 +42,7 @@ def make_opaque(numbers: dict) -> None:
     for name, value in numbers.items():
         width = dr.width(value)
         if width != 1:
-            memory.assign(value, dr.gather(type(value), dr.detach(value), 0) if width else dr.zeros(type(value)))
+            compat.assign(value, dr.gather(type(value), dr.detach(value), 0) if width else dr.zeros(type(value)))
         dr.make_opaque(value)
         if width != 1:
             raise RuntimeError(f'parameter "{name}": found {width} values, allowed is one')

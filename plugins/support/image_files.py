@@ -17,11 +17,11 @@ import numpy as np
 
 from mi_diffind.arrays.tables import Table, TableError
 from mi_diffind.core import compat
+from mi_diffind.core.archives import LimitError
 from mi_diffind.core.compat import module_of
 from mi_diffind.core.errors import DiffindError
-from mi_diffind.core.files import OutsideError, is_within, path_within, relative_path, write_json
-from mi_diffind.core.limits import LimitError
-from mi_diffind.fitting.task import Task, stamp
+from mi_diffind.core.files import OutsideError, is_within, path_within, relative_path, stamp, write_json
+from mi_diffind.fitting.task import Task
 from mi_diffind.images.headers import check_picture
 from mi_diffind.maps.compressed import CompressedMaps
 from mi_diffind.maps.layout import Layout, MapLayout

@@ -12,7 +12,7 @@ import weakref
 
 import mitsuba as mi
 
-from mi_diffind.core import compat, turns
+from mi_diffind.core import compat, threads
 
 from .. import origin, warn
 
@@ -97,4 +97,4 @@ def plugin_of(instance) -> str:
 
 
 # Once in a process: plugins are executed anew for each variant, this module is not
-turns.before_render(check)
+threads.before_render(check)

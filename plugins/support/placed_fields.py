@@ -1,4 +1,4 @@
-"""Radiance fields in a scene: their placement, their light in each variant, and the grid of their counterpart."""
+"""Radiance fields in a scene: placed, joined where they overlap, and as light and shadow on segments of paths."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_diffind.arrays.boxes import box_interval
 from mi_diffind.arrays.tables import TableError
 from mi_diffind.core import compat
 from mi_diffind.tasks.radiance import march as marching
 from mi_diffind.tasks.radiance.files import load
+from mi_diffind.tasks.radiance.volume_field import VolumeField
 
 from . import properties, upsampling
 from .placement import Placement, PlacementParameter
@@ -22,7 +24,7 @@ from .tables import arrays_of
 LUMINANCE = (0.212671, 0.715160, 0.072169)
 
 
-class PlacedField:
+class PlacedField(PlacementParameter):
     """Radiance field (:class:`mi_diffind.tasks.radiance.volume_field.VolumeField`) in a scene, placed by ``to_world``.
 
     The transform is a similarity. Densities are per unit of length in the field's frame, so that a scaled field keeps
@@ -30,22 +32,8 @@ class PlacedField:
     """
 
     def __init__(self, field, to_world):
-        self.field, self.position = field, PlacementParameter(Placement.of(to_world, 1.0, (0, 0, 0)))
-        self._turn = None
-        self._place()
-
-    def _place(self) -> None:
-        self.axes, self.origin, self.size = self.position.axes, self.position.origin, self.position.size
-
-    def update(self) -> None:
-        """Follow a change of the parameter ``to_world``. Raises ``RuntimeError`` unless it is a similarity."""
-        self.position.update()
-        self._place()
-
-    @property
-    def placement(self) -> Placement:
-        """Placement of the field's frame in the world."""
-        return self.position.placement
+        super().__init__(Placement.of(to_world, 1.0, (0, 0, 0)))
+        self.field, self._turn = field, None
 
     def held(self) -> list:
         """Return all arrays that rays read.
@@ -62,7 +50,7 @@ class PlacedField:
 
     def optimised(self) -> bool:
         """Return whether a derivative with respect to the field's arrays or its place is requested."""
-        return self.position.moving() or any(compat.has_gradient(values) for values in self.exposed.values())
+        return self.moving() or any(compat.has_gradient(values) for values in self.exposed.values())
 
     def _local(self, ray, far, active) -> tuple:
         """Return the arguments of the functions of :mod:`.march` after the field."""
@@ -95,9 +83,13 @@ class PlacedField:
                 return False
         return True
 
-    def march(self, ray, far, active=True) -> marching.Marched:
-        """March rays up to the distance ``far``; the resulting ``depth`` is in units of the field's frame."""
-        return marching.march(self.field, *self._local(ray, far, active))
+    def march(self, ray, far, active=True) -> tuple:
+        """March rays up to the distance ``far``; return the result and the transmittance, 0 where a ray is opaque.
+
+        The ``depth`` of the result is in units of the field's frame.
+        """
+        marched = marching.march(self.field, *self._local(ray, far, active))
+        return marched, dr.select(marched.transmittance > marching.OPAQUE, marched.transmittance, 0)
 
     def count(self, ray, far, active=True) -> marching.RayCounts:
         """Return the counts of the reads of :meth:`march`."""
@@ -105,7 +97,7 @@ class PlacedField:
 
     def replay(self, ray, far, active, marched, d_colour, d_transmittance, d_depth) -> None:
         """Call :func:`.march.replay`; ``depth`` is in units of the world."""
-        moving = self.position.moving()
+        moving = self.moving()
         with dr.resume_grad(when=moving):
             if moving:
                 # Gathered, so that the kernel of the rays sums the gradients: sums of a width of 1 are kernels each
@@ -124,7 +116,7 @@ class PlacedField:
     def start_forward(self) -> None:
         """Determine the tangents of the placement, once before :meth:`tangent`."""
         self._turn = None
-        if self.position.moving():
+        if self.moving():
             with dr.resume_grad():
                 self._turn = dr.forward_to(*self._numbers(), flags=marching.ANY)
 
@@ -232,3 +224,289 @@ def to_grid(props: mi.Properties) -> None:
     props["filename"] = str(grid)
     if "storage" in props:
         del props["storage"]
+
+
+class JoinedField(VolumeField):
+    """Sum of placed radiance fields, in the frame of the world: densities add up, and so do their emissions.
+
+    ``members`` are the :class:`.PlacedField`. The box holds all of theirs, and steps are half the smallest voxel.
+    Placements are constants to derivatives.
+    """
+
+    def __init__(self, members: list):
+        points = np.concatenate([corners(placed) for placed in members])
+        voxel = min(placed.field.voxel * placed.placement.size for placed in members)
+        super().__init__(members[0].field.types, points.min(axis=0), points.max(axis=0), voxel, {})
+        self.members = members
+
+    @property
+    def arrays(self) -> dict:
+        """Tensors of all members that can be differentiated."""
+        return {f"{i}.{name}": v for i, placed in enumerate(self.members) for name, v in placed.field.arrays.items()}
+
+    @arrays.setter
+    def arrays(self, values: dict) -> None:
+        """Ignore the arrays of the base class: those of the members count."""
+
+    def density_at(self, p, active=True) -> tuple:
+        return sum(density for density, *_ in self._densities(p, active)), []
+
+    def radiance_at(self, point_data, p, d, active=True) -> list:
+        # Densities are read again: derivatives with respect to them reach the shares of the members
+        read = self._densities(p, active)
+        total = sum(density for density, *_ in read)
+        radiance = [self.types.Float(0)] * 3
+        for placed, (density, data, place, inside) in zip(self.members, read, strict=True):
+            _, way = _local(placed, p, d)
+            share = dr.select(total > 0, density / total, 0)
+            colours = placed.field.radiance_at(data, place, way, inside & (density > 0))
+            radiance = [sum_ + dr.select(density > 0, share * c, 0) for sum_, c in zip(radiance, colours, strict=True)]
+        return radiance
+
+    def free_distance(self, p, d, active=True):
+        nearest = self.types.Float(1e6)
+        for placed in self.members:
+            place, way = _local(placed, p, d)
+            near, far, crossing = box_interval(place, way, *placed.field.box, 0, 1e6, self.types.Bool(active))
+            crossing &= near <= far
+            inside = crossing & (near == 0)
+            free = dr.select(inside, placed.field.free_distance(place, way, inside), near)
+            nearest = dr.select(crossing, dr.minimum(nearest, free * dr.detach(placed.size)), nearest)
+        return nearest
+
+    def _densities(self, p, active) -> list:
+        """Return for each member its density in the world, its data, the point in its frame, and whether it is in."""
+        read = []
+        for placed in self.members:
+            place, _ = _local(placed, p, p)
+            inside = self.types.Bool(active)
+            for x, low, high in zip(place, *placed.field.box, strict=True):
+                inside &= (x >= low) & (x <= high)
+            density, data = placed.field.density_at(place, inside)
+            read.append((dr.select(inside, density / dr.detach(placed.size), 0), data, place, inside))
+        return read
+
+
+def _local(placed: PlacedField, p, d) -> tuple:
+    """Return points and directions of the world in a field's frame."""
+    axes, origin, size = (dr.detach(v) for v in (placed.axes, placed.origin, placed.size))
+    return mi.Point3f(axes.to_local(mi.Vector3f(*p) - mi.Vector3f(origin)) / size), axes.to_local(mi.Vector3f(*d))
+
+
+def grouped(fields: list) -> list:
+    """Return placed fields without common volumes; those of ``fields`` whose boxes overlap are joined."""
+    groups = [([placed], placed) for placed in fields]
+    while True:
+        pair = next(
+            ((a, b) for i, a in enumerate(groups) for b in groups[i + 1 :] if a[1].overlaps(b[1])), None
+        )  # fmt: skip
+        if pair is None:
+            return [placed for _, placed in groups]
+        members = pair[0][0] + pair[1][0]
+        joined = PlacedField(JoinedField(members), mi.ScalarTransform4f())
+        # In place of the first, so that the order of the others stays
+        groups = [(members, joined) if group is pair[0] else group for group in groups if group is not pair[1]]
+
+
+#: Spheres around the light of all fields of a scene.
+SPHERES = 16
+
+#: Lines through a field along which its light is searched.
+LINES = 1 << 14
+
+
+class FieldLight:
+    """Radiance fields between surfaces: emitters and occluders on straight segments, and emitters to be sampled.
+
+    ``fields`` are the :class:`.PlacedField` of a scene, without common volumes. Directions are sampled
+    towards :data:`SPHERES` spheres around places that send light: a sphere by its mean radiance times its solid angle,
+    and uniform directions to it. The spheres only guide samples. Light outside of them is left to samples of BSDFs.
+    """
+
+    def __init__(self, fields: list, light: VariantLight):
+        self.fields, self.light = fields, light
+        self.update()
+
+    def update(self) -> None:
+        """Follow a change of the fields."""
+        rows = []
+        for placed in self.fields:
+            bright, placement = bright_spheres(placed.field, SPHERES // len(self.fields)), placed.placement
+            rows.append(np.column_stack([placement.world(bright[:, :3]), bright[:, 3] * placement.size, bright[:, 4]]))
+        rows = np.concatenate([*rows, np.zeros((SPHERES, 5))])[:SPHERES].astype(np.float32)
+        # Always as many, so that a frozen function takes other ones
+        self.spheres = mi.Float(np.ascontiguousarray(rows[:, :4]).reshape(-1))
+        self.radiances = mi.Float(np.ascontiguousarray(rows[:, 4]))
+        dr.eval(self.spheres, self.radiances)
+
+    def cross(self, ray, far, active=True) -> tuple:
+        """Return the light of the fields on rays up to the distance ``far``, and the transmittance of the fields."""
+        light, through = mi.Spectrum(0), mi.Float(1)
+        for placed, crossed in in_order(self.fields, [f.enters(ray, far, active) for f in self.fields]):
+            marched, passed = placed.march(ray, far, crossed)
+            seen = self.light.of(marched.colour, ray.wavelengths, crossed)
+            light += dr.select(crossed, through * seen, 0)
+            through *= passed
+        return light, through
+
+    def optimised(self) -> bool:
+        """Return whether a derivative with respect to a field is requested."""
+        return any(placed.optimised() for placed in self.fields)
+
+    def derive(self, mode, ray, far, active, δL, factor, total):
+        """Propagate the derivatives of the light ``total`` that arrives along rays, up to the distance ``far``.
+
+        ``total`` is ``factor`` times the light of :meth:`cross`, plus the light from beyond. ``Backward`` propagates
+        the adjoint ``δL`` of ``total`` to the fields. ``Forward`` returns the derivative of ``total``.
+        """
+        change, before, beyond = mi.Spectrum(0), mi.Float(1), mi.Spectrum(total)
+        for placed, crossed in in_order(self.fields, [f.enters(ray, far, active) for f in self.fields]):
+            marched, through = placed.march(ray, far, crossed)
+            share = mi.Spectrum(factor) * before
+            beyond -= dr.select(crossed, share * self.light.of(marched.colour, ray.wavelengths, crossed), 0)
+            if placed.optimised():
+                inverse = dr.select(through > 0, dr.rcp(through), 0)
+                if mode == dr.ADMode.Backward:
+                    d_colour = self.light.adjoint(marched.colour, ray.wavelengths, δL * share, crossed)
+                    d_through = dr.sum(δL * beyond) * inverse
+                    placed.replay(ray, far, crossed, marched, d_colour, d_through, mi.Float(0))
+                else:
+                    colour, transmittance, _ = placed.tangent(ray, far, crossed, marched)
+                    seen = self.light.tangent(marched.colour, colour, ray.wavelengths, crossed)
+                    change += dr.select(crossed, share * seen + beyond * transmittance * inverse, 0)
+            before *= through
+        return change
+
+    def transmittance(self, ray, far, active=True):
+        """Return the transmittance of the fields on rays up to the distance ``far``."""
+        through = mi.Float(1)
+        for placed in self.fields:
+            through *= placed.march(ray, far, active)[1]
+        return through
+
+    def _sphere(self, i, p, active) -> tuple:
+        """Return the vector from ``p`` to a sphere's centre, its radius, 1 − cos of its cone, and its weight."""
+        x, y, z, radius = dr.gather(mi.Vector4f, self.spheres, i, active)
+        to = mi.Vector3f(x, y, z) - mi.Vector3f(p)
+        share = dr.square(radius) / dr.squared_norm(to)
+        width = dr.select(share < 1, share / (1 + dr.sqrt(dr.maximum(1 - share, 0))), 2)
+        return to, radius, width, dr.gather(mi.Float, self.radiances, i, active) * width
+
+    @compat.syntax
+    def sample(self, p, number, place, active=True):
+        """Return directions from the points ``p`` towards the light, and their density by solid angle.
+
+        ``number`` and the pair ``place`` are random, in [0, 1). The density is 0 where the fields send no light.
+        """
+        with dr.suspend_grad():
+            p, active = mi.Point3f(p), mi.Bool(active)
+            number, total = mi.Float(number), mi.Float(0)
+            i, chosen = mi.UInt32(0), mi.UInt32(0)
+            while i < SPHERES:
+                _, _, _, weight = self._sphere(i, p, active)
+                total += weight
+                share = dr.select(weight > 0, weight / total, 0)
+                taken = number < share
+                rest = (number - share) / (1 - share)
+                number = dr.select(taken, number / share, dr.select(share < 1, rest, number))
+                chosen = dr.select(taken, i, chosen)
+                i += 1
+            to, _, width, _ = self._sphere(chosen, p, active)
+            height = width * place.x  # 1 − cos of the direction's angle
+            radius, angle = dr.sqrt(dr.maximum(height * (2 - height), 0)), dr.two_pi * place.y
+            local = mi.Vector3f(radius * dr.cos(angle), radius * dr.sin(angle), 1 - height)
+            axis = dr.select(dr.squared_norm(to) > 0, dr.normalize(to), mi.Vector3f(0, 0, 1))
+            d = dr.normalize(mi.Frame3f(axis).to_world(local))
+            return d, self.density(p, d, active & (total > 0))
+
+    @compat.syntax
+    def density(self, p, d, active=True):
+        """Return the density by solid angle with which :meth:`sample` returns the directions ``d`` at ``p``."""
+        with dr.suspend_grad():
+            p, d, active = mi.Point3f(p), mi.Vector3f(d), mi.Bool(active)
+            i, total, sent = mi.UInt32(0), mi.Float(0), mi.Float(0)
+            while i < SPHERES:
+                to, radius, width, weight = self._sphere(i, p, active)
+                along = dr.dot(to, d)
+                beside = dr.squared_norm(to - along * d)
+                met = (width == 2) | ((along > 0) & (beside <= dr.square(radius)))
+                sent += dr.select(met & (width > 0), weight / width, 0)
+                total += weight
+                i += 1
+            return dr.select(active & (total > 0), sent / (dr.two_pi * total), 0)
+
+
+def in_order(fields: list, entered: list) -> list:
+    """Return pairs of a field and the rays that enter it at this place of the order along a ray.
+
+    ``entered`` holds, for each of ``fields``, the distance at which rays enter it and whether they do.
+    """
+    if len(fields) == 1:
+        return [(fields[0], entered[0][1])]
+    ranks = [mi.UInt32(0) for _ in fields]
+    for i, (near, _) in enumerate(entered):
+        for j, (other, crossed) in enumerate(entered):
+            if j != i:
+                ranks[i] += dr.select(crossed & ((other < near) | ((other == near) & (j < i))), mi.UInt32(1), 0)
+    return [
+        (field, crossed & (rank == place))
+        for place in range(len(fields))
+        for field, (_, crossed), rank in zip(fields, entered, ranks, strict=True)
+    ]
+
+
+def bright_spheres(field, count: int) -> np.ndarray:
+    """Return spheres around the places of a field that send light, ``(n ≤ count, 5)``, in the field's frame.
+
+    Columns are centre, radius and mean radiance. The light is searched along random lines; the lines of a second pass
+    cross the sphere around all light of the first.
+    """
+    lower, upper = np.array(field.lower), np.array(field.upper)
+    centre, radius = (lower + upper) / 2, np.linalg.norm(upper - lower) / 2
+    for _ in range(2):
+        places, light = _lit_places(field, centre, radius)
+        if not len(places):
+            return np.zeros((0, 5))
+        whole, (centre, radius) = radius, _around(places, field.voxel)
+    light *= whole**2 / LINES
+    groups = [np.arange(len(places))]
+    while len(groups) < count:
+        sizes = [np.ptp(places[group], axis=0).max() for group in groups]
+        # The group that wastes most directions
+        largest = max(range(len(groups)), key=lambda i: light[groups[i]].sum() * sizes[i])
+        if sizes[largest] < field.voxel:
+            break
+        group = groups.pop(largest)
+        along = places[group][:, np.ptp(places[group], axis=0).argmax()]
+        below = along < (along.min() + along.max()) / 2
+        groups += [group[below], group[~below]]
+    spheres = []
+    for group in groups:
+        middle, size = _around(places[group], field.voxel)
+        spheres.append([*middle, size, light[group].sum() / size**2])
+    return np.array(spheres)
+
+
+def _around(places: np.ndarray, margin: float) -> tuple:
+    """Return centre and radius of a sphere around points, with a margin."""
+    centre = (places.min(axis=0) + places.max(axis=0)) / 2
+    return centre, np.linalg.norm(places - centre, axis=1).max() + margin
+
+
+def _lit_places(field, centre, radius: float) -> tuple:
+    """Return points ``(n, 3)`` where random lines through a sphere see light, and how much, ``(n,)``."""
+    types, rng = field.types, np.random.default_rng(1)
+    d = rng.normal(size=(LINES, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    # Uniform on the disc perpendicular to the line
+    across = np.cross(d, rng.normal(size=(LINES, 3)))
+    across *= (radius * np.sqrt(rng.random(LINES)) / np.linalg.norm(across, axis=1))[:, None]
+    o = centre + across
+    extent = 2 * float(np.linalg.norm(np.subtract(field.upper, field.lower)))
+    rays = [types.Array3f(np.ascontiguousarray(v.T, np.float32)) for v in (o, d)]
+    marched = marching.march(field, *rays, -extent, extent)
+    dr.eval(marched.colour, marched.transmittance, marched.depth)
+    light, opacity = np.array(marched.colour).mean(axis=0), 1 - np.array(marched.transmittance)
+    seen = (light > 0) & (opacity > 1e-3)
+    distance = np.array(marched.depth)[seen] / opacity[seen]
+    return o[seen] + d[seen] * distance[:, None], light[seen].astype(np.float64)

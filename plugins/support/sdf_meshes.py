@@ -15,12 +15,11 @@ import numpy as np
 import trimesh
 
 from mi_diffind.arrays.tables import TableError
-from mi_diffind.core import mitsuba_versions
+from mi_diffind.core import compat
 from mi_diffind.core.errors import DiffindError
-from mi_diffind.core.files import is_within
-from mi_diffind.fitting.task import stamp
-from mi_diffind.tasks.sdf import TASK, serialized
-from mi_diffind.tasks.sdf.mesh import directed_edges, load_mesh, split_part
+from mi_diffind.core.files import is_within, stamp
+from mi_diffind.tasks.sdf import TASK
+from mi_diffind.tasks.sdf.mesh import directed_edges, load_mesh, read_serialized, split_part
 
 from . import properties
 from .stock import Kept
@@ -62,7 +61,7 @@ def closed_mesh_of(path: Path, folder: Path, index: int = 0) -> Path:
     """
     try:
         if path.suffix.lower() == ".serialized":
-            vertices, faces = serialized.read(path)[index]
+            vertices, faces = read_serialized(path)[index]
             path = folder / f"{path.stem}_{index}_{hashlib.sha256(vertices.tobytes()).hexdigest()[:12]}.ply"
             trimesh.Trimesh(vertices, faces, process=False).export(path)
         faces = load_mesh(path).faces
@@ -105,7 +104,7 @@ def check_normals(props: mi.Properties, source: Path) -> float:
 
 def _smoothness(mesh: mi.Mesh) -> float:
     """Return the mean angle over a mesh's area between its shading normals and those of its triangles, in degrees."""
-    vertices, faces = mitsuba_versions.triangles(mesh)
+    vertices, faces = compat.triangles(mesh)
     a, b, c = np.moveaxis(vertices[faces].astype(np.float64), 1, 0)
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     index, angles = dr.arange(mi.UInt32, len(faces)), 0

@@ -7,7 +7,7 @@ from types import ModuleType
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind.core import compat, memory
+from mi_diffind.core import compat
 from mi_diffind.fitting.task import Model, Task
 
 from . import properties
@@ -63,9 +63,9 @@ class Entries:
             tensor, accepted = _tensor(entries), self._accepted.get(name)
             if fault := self._fault(name, entries):
                 refused.append(f'parameter "tables.{name}": {fault}')
-                memory.assign(tensor, accepted)
+                compat.assign(tensor, accepted)
             elif accepted is None or compat.identity(accepted) != compat.identity(tensor):
-                memory.assign(tensor, type(tensor)(memory.owned(tensor.array), tensor.shape))
+                compat.assign(tensor, type(tensor)(compat.owned(tensor.array), tensor.shape))
             self._accepted[name] = dr.detach(tensor)  # a reference keeps the variable's index from being used again
         if refused:
             raise RuntimeError(refused[0])

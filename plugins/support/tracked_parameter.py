@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind.arrays.bounds import ValueBounds
+from mi_diffind.arrays.boxes import ValueBounds
 from mi_diffind.core import compat
 
 _waiting = threading.local()

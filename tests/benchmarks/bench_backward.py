@@ -130,7 +130,6 @@ CONTENDERS = {
         "paper": lambda **_: on_ball({"type": "neural_disney", "preset": "paper", **DISNEY}),
     },
     "bsdf": {
-        "measured": lambda folder, **_: on_ball({"type": "measured", "filename": str(folder / "copper.bsdf")}),
         "roughconductor": lambda **_: on_ball({"type": "roughconductor", "distribution": "ggx", **METAL}),
         "ours": lambda **_: on_ball({"type": "neural_bsdf", "filename": asset("library/copper.npz")}),
         "paper": lambda folder, **_: on_ball({"type": "neural_bsdf", "filename": str(folder / "bsdf_paper.npz")}),
@@ -296,10 +295,7 @@ def sizes(folder: Path, tasks: list[str]) -> dict[str, dict]:
             "ours": shipped("disney_tables", "uint8"),
             "paper": shipped("disney_paper", "uint8"),
         },
-        "bsdf": lambda: files(
-            ASSETS / "library" / "copper.npz", "bsdf_paper.npz",
-            measured=dict.fromkeys(("memory", "disk"), (folder / "copper.bsdf").stat().st_size),
-        ),
+        "bsdf": lambda: files(ASSETS / "library" / "copper.npz", "bsdf_paper.npz"),
         "image": lambda: files(ASSETS / "tiles.npz", "image_paper.npz", bitmap=bitmaps(tiles)),
         "large": dict,
         "texture": lambda: files(ASSETS / "tiles_filtered.npz", "texture_paper.npz", bitmap=bitmaps(tiles)),
@@ -323,7 +319,6 @@ def prepare(folder: Path, tasks: list[str]) -> None:
         return mi_diffind.fit(task, source, progress=False, **options).save(folder / f"{name}.npz")
 
     if "bsdf" in tasks:
-        mi_diffind.open(asset("library/copper.npz")).decode(folder / "copper.bsdf")
         fitted("bsdf", {"type": "roughconductor", "distribution": "ggx", **METAL}, "bsdf_paper", preset="paper")
     if "image" in tasks:
         fitted("image", asset("tiles.json"), "image_paper", preset="paper", seconds=SECONDS)

@@ -15,8 +15,7 @@ import time
 from mi_diffind.core.files import write_json
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting.task import FitRequest, tasks
-from mi_diffind.tasks.radiance import compression, files, fit, rate_distortion
-from mi_diffind.tasks.radiance.presets import PRESETS, dense_bytes
+from mi_diffind.tasks.radiance import PRESETS, compression, dense_bytes, files, fit
 from mi_diffind.tasks.radiance.session import FieldSession
 
 #: Name of a row → what is changed.
@@ -58,7 +57,7 @@ def main() -> None:
         if paper:
             problem = field_fit.pairs_problem(visible, dense / 50, fit.VALUE_STEPS)
         else:
-            weights = rate_distortion.importance(visible, session, 0)
+            weights = compression.importance(visible, session, 0)
             problem = compression.PaletteProblem(compression.palette_coding(visible, weights, bits, 0), session)
         if steps:
             request.train(problem)

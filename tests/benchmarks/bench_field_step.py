@@ -32,13 +32,12 @@ def child(arguments) -> dict:
     from mi_diffind.core import compat
     from mi_diffind.core.runtime import array_module
     from mi_diffind.fitting import loop
-    from mi_diffind.tasks.radiance import files, grid
-    from mi_diffind.tasks.radiance.presets import PRESETS
+    from mi_diffind.tasks.radiance import PRESETS, files, grid
 
     try:
         session = importlib.import_module("mi_diffind.tasks.radiance.session")
     except ImportError:
-        session = importlib.import_module("mi_diffind.tasks.radiance.training")
+        session = importlib.import_module("mi_diffind.tasks.radiance.session")
     if arguments.anywhere:
         session.ANYWHERE = 1.0
     types = array_module("llvm")

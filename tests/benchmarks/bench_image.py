@@ -21,9 +21,8 @@ import mi_diffind  # noqa: F401
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting.loop import FitSettings, _Trainer
 from mi_diffind.maps import source
-from mi_diffind.tasks.image import training
-from mi_diffind.tasks.image.memory_budget import ImageBudget
-from mi_diffind.tasks.image.presets import PRESETS, replaced
+from mi_diffind.tasks.image import PRESETS, replaced, training
+from mi_diffind.tasks.image.arrays import ImageBudget
 
 PRIMARY, CASCADED, SAMPLES, SIDE = 496, 12, 2**20, 1024
 

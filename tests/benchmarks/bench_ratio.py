@@ -41,14 +41,14 @@ from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting.task import FitRequest, tasks
 from mi_diffind.maps.source import load_source
 from mi_diffind.measure import clock
-from mi_diffind.tasks.image import memory_budget as image_budget
-from mi_diffind.tasks.image.presets import PRESETS
-from mi_diffind.tasks.image.search import default_size
+from mi_diffind.tasks.image import PRESETS
+from mi_diffind.tasks.image import arrays as image_budget
+from mi_diffind.tasks.image.fit import default_size
+from mi_diffind.tasks.radiance import dense_bytes, ratio_for
 from mi_diffind.tasks.radiance import fit as field_fit
 from mi_diffind.tasks.radiance import paper as field_paper
-from mi_diffind.tasks.radiance.presets import dense_bytes, ratio_for
 from mi_diffind.tasks.sdf import paper as sdf_paper
-from mi_diffind.tasks.texture import memory_budget as texture_budget
+from mi_diffind.tasks.texture import arrays as texture_budget
 
 ROOT = Path(__file__).resolve().parents[2]
 VARIANT = "llvm_ad_rgb"
@@ -110,7 +110,7 @@ def planar_bytes(task: str, primary: int, cascaded: int) -> int:
     """Return the bytes of the paper's arrays of an image or a texture."""
     if task == "image":
         return image_budget.ImageBudget(primary, primary, cascaded, CHANNELS).nbytes
-    return texture_budget.paper_bytes(primary**2, texture_budget.lods_of(SIDE, SIDE), cascaded, CHANNELS)
+    return texture_budget.PaperBudget(primary, primary, texture_budget.lod_count(SIDE, SIDE), cascaded, CHANNELS).nbytes
 
 
 def planar_layouts(task: str, budget: float) -> list[Layout]:

@@ -26,7 +26,7 @@ import numpy as np
 import mi_diffind  # noqa: F401
 from mi_diffind.core.files import write_json
 from mi_diffind.measure.clock import machine, timed
-from mi_diffind.tasks.sdf import TASK, grids, tracing
+from mi_diffind.tasks.sdf import TASK, grids, marching
 from mi_diffind.tasks.sdf.mesh import load_mesh
 
 SIDE = 512
@@ -94,7 +94,7 @@ def measured(file: Path, resolution: int, rounds: int) -> dict:
         return run
 
     runs = {name: native(scene) for name, scene in scenes.items()}
-    runs[ARRAYS] = lambda o, d, coherent: tracing.trace(model.field, o, d, dr.inf)
+    runs[ARRAYS] = lambda o, d, coherent: marching.trace(model.field, o, d, dr.inf)
     rows = []
     for ray_set in ("primary", "random"):
         o, d = rays(ray_set)
@@ -115,7 +115,7 @@ def measured(file: Path, resolution: int, rounds: int) -> dict:
             print(json.dumps(rows[-1]), flush=True)
     return {
         "name": Path(model.table.settings["mesh_path"]).stem, "triangles": len(mesh.faces), "bytes": model.nbytes,
-        "index_bytes": tracing.index_bytes(model.field), "rows": rows,
+        "index_bytes": marching.index_bytes(model.field), "rows": rows,
     }  # fmt: skip
 
 

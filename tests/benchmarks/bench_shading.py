@@ -21,11 +21,10 @@ from mi_diffind.fitting import loop
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import load_source
 from mi_diffind.scenes import loading
-from mi_diffind.tasks.shading import training
-from mi_diffind.tasks.shading.presets import PRESETS
+from mi_diffind.tasks.shading import PRESETS, training
+from mi_diffind.tasks.texture import PRESETS as TEXTURES
 from mi_diffind.tasks.texture import TASK
 from mi_diffind.tasks.texture import training as textures
-from mi_diffind.tasks.texture.presets import PRESETS as TEXTURES
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
 

@@ -14,7 +14,6 @@ import shutil
 import tempfile
 from pathlib import Path
 
-import numpy as np
 from bench_nerf import training
 
 from mi_diffind.core.files import write_json
@@ -27,7 +26,6 @@ ROWS = {
     "scene": ["--background", "scene"],
     "scene, larger box": ["--background", "scene"],
     "surroundings": ["--background", "surroundings"],
-    "surroundings, exposures": ["--background", "surroundings", "--exposures"],
 }
 
 #: Side of the larger box as a multiple of that of the inner cube.
@@ -58,7 +56,6 @@ def main() -> None:
     result = json.loads(output.read_text(encoding="utf-8")) if output.is_file() else {"rows": {}}
     described = machine("llvm_ad_rgb")
     result["machine"] = {name: described[name] for name in ("cpu", "cores", "system", "mi-diffind")}
-    stops = np.array(json.loads((folder / "capture.json").read_text(encoding="utf-8"))["stops"])
     with tempfile.TemporaryDirectory() as work:
         for name in arguments.rows:
             source = with_box(folder, Path(work) / "boxed") if "box" in name else folder
@@ -67,9 +64,6 @@ def main() -> None:
             options += ["--preset", "grid", "--steps", arguments.steps]
             report = Path(work) / "x.npz"
             row = training(str(source), report, options)
-            settings = json.loads(report.with_suffix(".json").read_text(encoding="utf-8"))["settings"]
-            if "exposures" in settings:
-                row["exposure_error_stops"] = float(np.sqrt(np.mean((settings["exposures"] - stops) ** 2)))
             result["rows"][name] = row
             write_json(output, result)
 

@@ -1,12 +1,10 @@
-"""``fit image``, ``decode`` and ``inspect`` on images: hard cases, interruptions, full disks, and how they refuse."""
+"""``fit image``, ``decode`` and ``inspect`` on images: sources, sizes, searches, interruptions, refusals."""
 
 import errno
 import json
 import os
 import re
 import signal
-import subprocess
-import sys
 import zipfile
 
 import numpy as np
@@ -18,8 +16,8 @@ from mi_diffind.commands.cli import main
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting.task import tasks
 from mi_diffind.maps.layout import Layout, MapLayout
-from mi_diffind.tasks.image import presets, search, training
-from mi_diffind.tasks.image.presets import STRUCTURES
+from mi_diffind.tasks.image import fit as image_fit
+from mi_diffind.tasks.image import replaced, training
 
 SHORT = ["--steps", "4", "--batch", "256", "--variant", "llvm_ad_rgb", "--dims", "2"]
 
@@ -53,7 +51,7 @@ def noise(*shape, seed=0, dtype=np.uint8):
 
 
 def waves(height=16, width=16):
-    """A smooth image that repeats along both axes."""
+    """Return a smooth image that repeats along both axes."""
     y, x = np.mgrid[0:height, 0:width]
     y, x = 2 * np.pi * (y + 0.5) / height, 2 * np.pi * (x + 0.5) / width
     return np.rint(127.5 + 100 * np.stack([np.sin(x), np.cos(y), np.sin(x + y)], axis=-1)).astype(np.uint8)
@@ -64,7 +62,7 @@ def fit(source, *options, output="out.npz"):
 
 
 def refused(capsys, *arguments):
-    """Run a command that must fail with exit code 2 and one sentence; returns it."""
+    """Run a command that must fail with exit code 2 and one sentence, and return the sentence."""
     capsys.readouterr()
     assert main(list(map(str, arguments))) == 2
     lines = [line for line in capsys.readouterr().err.strip().splitlines() if "error" in line or "Traceback" in line]
@@ -72,22 +70,24 @@ def refused(capsys, *arguments):
     return lines[0]
 
 
+def report():
+    with open("r.json") as file:
+        return json.load(file)
+
+
 def decoded(path="out.npz"):
     model = load_model(path, array_module("llvm").TensorXf)
     return model.image.decode(), model.image.layout, model.table
 
 
-# -- sources of every kind --------------------------------------------------------------------------------------------
+# ---------------------- Sources ----------------------
 
 SOURCES = {
     "one texel": ("a.png", noise(1, 1, 3)),
-    "7 x 5": ("a.png", noise(7, 5, 3)),
-    "a row": ("a.png", noise(1, 4096, 3)),
     "a column": ("a.png", noise(300, 1, 1)),
     "one colour": ("a.png", np.full((6, 6, 3), 77, np.uint8)),
-    "grey": ("a.png", noise(8, 8, 1)),
     "transparent": ("a.png", noise(8, 8, 4)),
-    "16 bits": ("a.png", noise(8, 8, 3).astype(np.uint16) * 257),
+    "16 bits": ("a.png", noise(7, 5, 3).astype(np.uint16) * 257),
     "16 channels": ("a.exr", noise(8, 8, 16, dtype=np.float32)),
     "signed": ("a.exr", 2 * noise(8, 8, 3, dtype=np.float32) - 1),
     "bright": ("a.exr", 1e6 * noise(8, 8, 3, dtype=np.float32) ** 8),
@@ -95,236 +95,159 @@ SOURCES = {
 
 
 @pytest.mark.parametrize("name", SOURCES)
-def test_sources_of_every_kind(folder, capsys, name):
-    """What is fitted can be inspected and decoded, and is what the report says."""
+def test_sources_are_fitted_decoded_and_inspected(folder, capsys, name):
     file, array = SOURCES[name]
     write(file, array)
-    assert fit(file, "--json", "report.json") == 0
-    report, (maps, layout, table) = json.loads((folder / "report.json").read_text()), decoded()
-    size = (folder / "out.npz").stat().st_size
-    assert report["bytes"] == table.nbytes <= size and report["measured"] == table.measured
-    assert (layout.height, layout.width) == array.shape[:2] and report["source_bytes"] == array.nbytes
+    assert fit(file, "--json", "r.json") == 0
+    (maps, layout, table), size = decoded(), (folder / "out.npz").stat().st_size
+    assert report()["bytes"] == table.nbytes <= size and report()["measured"] == table.measured
+    assert (layout.height, layout.width) == array.shape[:2] and report()["source_bytes"] == array.nbytes
     assert sum(v.shape[2] for v in maps.values()) == array.shape[2]
     assert all(np.isfinite(v).all() for v in maps.values()) and set(maps) == set(layout.names)
     if name in ("one texel", "one colour"):
-        assert table.arrays == {} and report["bytes"] == 0 and report["compression"] is None
+        assert table.arrays == {} and report()["bytes"] == 0 and report()["compression"] is None
         np.testing.assert_array_equal(np.rint(255 * maps["image"]), array)
     else:
-        assert report["compression"] == pytest.approx(array.nbytes / table.nbytes)
+        assert report()["compression"] == pytest.approx(array.nbytes / table.nbytes)
     assert main(["decode", "out.npz", "-o", "back.exr"]) == 0
     names = ["back.exr"] if len(maps) == 1 else [f"back_{m}.exr" for m in maps]
-    assert sorted(os.listdir(folder)) == sorted([file, "out.npz", "report.json", *names])
-    for path, values in zip(names, maps.values(), strict=True):
-        assert read(path).shape == values.shape and np.isfinite(read(path)).all()
+    assert sorted(os.listdir(folder)) == sorted([file, "out.npz", "r.json", *names])
     capsys.readouterr()
-    assert main(["inspect", "out.npz", "--json", "inspect.json"]) == 0
-    text, found = capsys.readouterr().out, json.loads((folder / "inspect.json").read_text())
-    assert 'tables for the task "image"' in text and found["bytes"] == table.nbytes
-    assert {n: a["bytes"] for n, a in found["arrays"].items()} == {n: array.nbytes for n, array in table.arrays.items()}
-    assert found["measured"] == table.measured and found["settings"]["source_path"] == file
-
-
-@pytest.mark.parametrize("array", [noise(1, 1, 3), noise(7, 5, 3), np.full((6, 6, 3), 77, np.uint8)])
-def test_the_papers_recipe_on_the_smallest_sources(folder, array):
-    write("a.png", array)
-    assert fit("a.png", "--preset", "paper", "--dims", "4") == 0
-    maps, layout, table = decoded()
-    assert layout.stored == 3 and table.arrays["primary"].shape == (1, 1, 4)
-    assert maps["image"].shape == array.shape and np.isfinite(maps["image"]).all()
+    assert main(["inspect", "out.npz", "--json", "r.json"]) == 0
+    assert 'tables for the task "image"' in capsys.readouterr().out and report()["bytes"] == table.nbytes
+    assert {n: a["bytes"] for n, a in report()["arrays"].items()} == {n: a.nbytes for n, a in table.arrays.items()}
+    assert report()["measured"] == table.measured and report()["settings"]["source_path"] == file
 
 
 def test_values_that_are_not_finite(folder, capsys):
     values = noise(6, 6, 3, dtype=np.float32)
     values[2, 3, 1], values[4, 4, 0] = np.nan, np.inf
     write("a.exr", values)
-    assert 'a.exr: map "image" has 2 values that are NaN or infinite' in refused(
-        capsys, "fit", "image", "a.exr", "-o", "out.npz", *SHORT
-    )
-    assert os.listdir(folder) == ["a.exr"]
-    assert fit("a.exr", "--nonfinite", "clean") == 0
+    message = refused(capsys, "fit", "image", "a.exr", "-o", "out.npz", *SHORT)
+    assert 'a.exr: map "image" has 2 values that are NaN or infinite' in message and os.listdir(folder) == ["a.exr"]
+    assert fit("a.exr", "--nonfinite", "clean", "--preset", "paper", "--dims", "4") == 0
     assert np.isfinite(decoded()[0]["image"]).all()
 
 
-@pytest.mark.parametrize("extension", ["png", "exr"])
-def test_damaged_sources(folder, capsys, extension):
-    write(f"a.{extension}", noise(9, 8, 3) if extension == "png" else noise(9, 8, 3, dtype=np.float32))
-    content = (folder / f"a.{extension}").read_bytes()
-    for damaged in (b"", b"hello", content[: len(content) // 2], content[:-20]):
-        (folder / f"a.{extension}").write_bytes(damaged)
-        assert f"a.{extension}: " in refused(capsys, "fit", "image", f"a.{extension}", "-o", "out.npz", *SHORT)
-    assert "gone.png: no such file" in refused(capsys, "fit", "image", "gone.png", "-o", "out.npz", *SHORT)
-    assert os.listdir(folder) == [f"a.{extension}"]
-
-
 def test_manifests(folder, capsys):
-    albedo, orm, normal = noise(6, 7, 3), noise(6, 7, 3, seed=1), np.full((6, 7, 3), (128, 128, 255), np.uint8)
     (folder / "maps").mkdir()
-    for name, array in (("albedo", albedo), ("orm", orm), ("normal", normal)):
+    normal = np.full((6, 7, 3), (128, 128, 255), np.uint8)
+    for name, array in (("paint", noise(6, 7, 3)), ("orm", noise(6, 7, 3, seed=1)), ("normal", normal)):
         write(folder / "maps" / f"{name}.png", array)
     maps = {
-        "albedo": "albedo.png",
+        "paint": "paint.png",
         "roughness": {"file": "orm.png", "channels": "g"},
         "ao": {"file": "orm.png", "channels": "r"},
         "normal": "normal.png",
     }
-    (folder / "maps" / "material.json").write_text(json.dumps({"maps": maps}))
+    (folder / "maps" / "material.json").write_text(json.dumps({"maps": maps, "licence": "CC0"}))
     assert fit("maps/material.json") == 0
-    found, layout, table = decoded()
+    out = capsys.readouterr().out
+    assert 'map "paint": an unknown name' in out and "material.json: keys that are not used: licence" in out
+    values, layout, table = decoded()
     assert layout.names == tuple(maps) and layout.stored == 5  # the normal is constant
-    assert [layout[n].color_space for n in maps] == ["srgb", "linear", "linear", "linear"]
-    np.testing.assert_array_equal(np.rint(255 * found["normal"]), normal)
+    np.testing.assert_array_equal(np.rint(255 * values["normal"]), normal)
     assert table.settings["source_path"] == "maps/material.json"
-    assert {k for k in table.measured if k.startswith("psnr_")} == {
-        "psnr_db", "psnr_mean_db", "psnr_between_db", *(f"psnr_{n}_db" for n in maps),
-    }  # fmt: skip
+    figures = {"psnr_db", "psnr_mean_db", "psnr_between_db", *(f"psnr_{n}_db" for n in maps)}
+    assert {k for k in table.measured if k.startswith("psnr_")} == figures
     (folder / "maps" / "material.json").write_text('{"maps": {"albedo": "gone.png"}}')
     assert "gone.png: no such file" in refused(capsys, "fit", "image", "maps/material.json", "-o", "o.npz", *SHORT)
 
 
-# -- sizes ------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("task", ["image", "texture"])
-def test_names_of_images_are_said(folder, capsys, task):
-    """An image with the name of a normal map, and maps whose names had to be guessed; ``inspect`` shows the roles."""
-    y, x = np.mgrid[-0.5:0.5:8j, -0.5:0.5:8j]
-    normals = np.rint(127.5 * (np.stack([x, y, np.sqrt(1 - x * x - y * y)], axis=-1) + 1)).astype(np.uint8)
-    write("x_normal.png", normals)
-    short = SHORT if task == "image" else SHORT[:-2]
-    assert main(["fit", task, "x_normal.png", "-o", "a.npz", *short]) == 0
-    assert "x_normal.png: taken for a normal map by its name, linear" in capsys.readouterr().out
-    assert main(["inspect", "a.npz"]) == 0
-    assert re.search(r"image +normal, 3 channel\(s\), linear", capsys.readouterr().out)
-    write("c.png", noise(8, 8, 3))
-    (folder / "m.json").write_text('{"maps": {"paint": "c.png"}, "licence": "CC0"}')
-    assert main(["fit", task, "m.json", "-o", "b.npz", *short]) == 0
-    out = capsys.readouterr().out
-    assert 'map "paint": an unknown name' in out and "m.json: keys that are not used: licence" in out
+# ---------------------- Sizes and options ----------------------
 
 
 def test_a_size_in_each_unit(folder):
-    """Bits of a texel are those of all its channels together; without a word it is 12x."""
+    """Bits of a texel are those of all its channels together; the default is 12x."""
     write("a.png", noise(32, 32, 3) // 2 + waves(32, 32) // 4)
     files = []
     for option in (("--compression", "3x"), ("--bytes", "1k"), ("--bpp", "8"), ()):
         assert fit("a.png", *option, "--json", "r.json", "--structure", "6 bits") == 0
-        report, asked = json.loads((folder / "r.json").read_text()), 1024 if option else 256
-        assert report["compression_asked"] == pytest.approx(3072 / asked)
-        assert 0.85 * asked <= report["bytes"] <= asked
+        requested = 1024 if option else 256
+        assert report()["compression_asked"] == pytest.approx(3072 / requested)
+        assert 0.85 * requested <= report()["bytes"] <= requested
         files.append((folder / "out.npz").read_bytes())
     assert files[0] == files[1] == files[2] != files[3]
 
 
-def test_one_size_only(folder, capsys):
-    write("a.png", noise(4, 4, 3))
-    options = [("--compression", "12"), ("--bytes", "1k"), ("--bpp", "2"), ("--psnr", "30")]
-    for i, first in enumerate(options):
-        for second in options[i + 1 :]:
-            with pytest.raises(SystemExit) as caught:
-                fit("a.png", *first, *second)
-            assert caught.value.code == 2
-            assert f"argument {second[0]}: not allowed with argument {first[0]}" in capsys.readouterr().err
-    assert os.listdir(folder) == ["a.png"]
-
-
-@pytest.mark.parametrize(
-    "option, value",
-    [
-        *(("--compression", v) for v in ("0", "-1", "x", "nan", "inf", "")),
-        *(("--bytes", v) for v in ("0", "-5", "0.1", "1q", "1e30")),
-        *(("--bpp", v) for v in ("0", "-2", "inf", "2x")),
-        *(("--psnr", v) for v in ("0", "-3", "nan", "120", "inf", "good")),
-        *(("--structure", v) for v in ("9 bits", "0", "")),
-        *(("--dims", v) for v in ("0", "5", "x")),
-        *(("--cascaded", v) for v in ("0", "-4", "4.5")),
-        *(("--steps", v) for v in ("0", "many")),
-        ("--seconds", "0"), ("--border", "mirror"), ("--preset", "theirs"), ("--without", "speed"),
-        ("--nonfinite", "ignore"),
-    ],
-)  # fmt: skip
-def test_bad_values(folder, capsys, option, value):
-    write("a.png", noise(4, 4, 3))
-    with pytest.raises(SystemExit) as caught:
-        main(["fit", "image", "a.png", "-o", "out.npz", f"{option}={value}"])
-    assert caught.value.code == 2
-    assert f"mi-diffind fit image: error: argument {option}: " in capsys.readouterr().err.splitlines()[-1]
-    assert os.listdir(folder) == ["a.png"]
+def test_sizes_that_cannot_be_met_are_explained(folder, capsys):
+    write("a.png", noise(8, 8, 3))
+    assert fit("a.png", "--bytes", "20") == 0
+    assert re.search(r"20 bytes were requested, but [\d,]+ are the nearest that the arrays", capsys.readouterr().out)
 
 
 @pytest.mark.parametrize(
     "options, sentence",
     [
+        (["--compression", "nan"], "argument --compression"),
+        (["--bytes", "0.1"], "argument --bytes"),
+        (["--bpp", "2x"], "argument --bpp"),
+        (["--psnr", "120"], "argument --psnr"),
+        (["--compression", "12", "--psnr", "30"], "argument --psnr: not allowed with argument --compression"),
+        (["--structure", "9 bits"], "argument --structure"),
+        (["--dims", "5"], "argument --dims"),
+        (["--cascaded", "4.5"], "argument --cascaded"),
+        (["--without", "speed"], "argument --without"),
         (["--bpp", "1e308"], "bpp 1e308 is out of range"),
         (["--cascaded", "1000", "--dims", "4"], r"--cascaded: found 1000.*bytes.*allowed are"),
         (["--lr", "-1"], "lr: found -1.0"),
-        (["--lr", "nan"], "lr: found nan"),
         (["--resume"], "--checkpoint FILE"),
         (["--resume", "--checkpoint", "c.npz"], "there is nothing to resume"),
         (["--checkpoint", "out.npz"], "the same file as -o"),
-        (["--checkpoint", "a.png"], "the same file as source"),
         (["--checkpoint", "c.npz", "--psnr", "30"], "--checkpoint: for one training"),
         (["--checkpoint", "c.npz", "--ratio-search"], "--checkpoint: for one training"),
         (["--ratio-search", "--cascaded", "8"], "leave out --psnr and --cascaded"),
-        (["--ratio-search", "--psnr", "30"], "leave out --psnr and --cascaded"),
         (["--psnr", "30", "--cascaded", "8"], "leave out --cascaded"),
+        (["--ratio", "8"], "--ratio: for the preset paper"),
         (["--preset", "paper", "--without", "jitter"], "leave it out"),
         (["-o", "out.png"], "allowed is .npz"),
-        (["-o", "gone/out.npz"], 'output folder "gone" does not exist'),
     ],
 )
-def test_what_does_not_go_together(folder, capsys, options, sentence):
+def test_options_that_are_refused(folder, capsys, options, sentence):
     write("a.png", noise(16, 16, 3))
-    assert re.search(sentence, refused(capsys, "fit", "image", "a.png", "-o", "out.npz", *SHORT, *options))
+    try:
+        code = fit("a.png", *options)
+    except SystemExit as e:  # by argparse
+        code = e.code
+    assert code == 2 and re.search(sentence, capsys.readouterr().err.splitlines()[-1])
     assert os.listdir(folder) == ["a.png"]
 
 
-def test_resuming_after_seconds(folder, capsys):
-    """A number of steps that was measured is another one the next time."""
-    write("a.png", noise(16, 16, 3))
-    arguments = ["fit", "image", "a.png", "-o", "out.npz", "--checkpoint", "c.npz", "--resume", "--seconds", "3"]
-    assert "needs the --steps of the run" in refused(capsys, *arguments)
-
-
-def test_searches(folder, capsys, monkeypatch):
-    """The file is of the best training that was tried, whichever that is; qualities are made up, but for the arrays."""
+def test_ratio_search(folder, capsys, monkeypatch):
+    """The file is of the best training that was tried; qualities are made up, but for the arrays."""
     write("a.png", waves())
     fit_image, trained = training.fit_image, []
 
     def ranked(source, size, recipe, request, border=None, title=None):
-        table, result = fit_image(source, size, presets.replaced(recipe, steps=2), request, border, title)
+        recipe = recipe if title is None else replaced(recipe, steps=2)
+        table, result = fit_image(source, size, recipe, request, border, title)
         if title is not None:  # a candidate
             decibels = 20.0 + 3 * (size.dims == 3) + len(trained) / 10
             table.measured |= {"psnr_db": decibels, "psnr_between_db": decibels}
             trained.append((size, recipe.structure))
         return table, result
 
-    monkeypatch.setattr(search, "fit_image", ranked)
+    monkeypatch.setattr(image_fit, "fit_image", ranked)
     assert fit("a.png", "--ratio-search", "--bytes", "1200", "--steps", "20", "--json", "r.json") == 0
-    text, report = capsys.readouterr().out, json.loads((folder / "r.json").read_text())
-    assert len(report["tried"]) == len(trained) == text.count("  tried ") >= 2
-    best = max(report["tried"], key=lambda t: t["psnr_db"] + t["psnr_between_db"])
-    assert report["settings"]["structure"] == best["structure"] and report["settings"]["dims"] == best["dims"]
-    assert report["arrays"]["cascaded"][0] == best["cascaded"]
-    assert report["bytes"] == best["bytes"] <= 1260 and report["settings"]["steps"] == 20
-    # So few bytes that nothing can be tried
-    assert fit("a.png", "--ratio-search", "--bytes", "20", "--json", "r.json") == 0
-    assert json.loads((folder / "r.json").read_text())["tried"] == []
+    assert len(report()["tried"]) == len(trained) == capsys.readouterr().out.count("  tried ") >= 2
+    best = max(report()["tried"], key=lambda t: t["psnr_db"] + t["psnr_between_db"])
+    assert report()["settings"]["structure"] == best["structure"] and report()["settings"]["dims"] == best["dims"]
+    assert report()["arrays"]["cascaded"][0] == best["cascaded"]
+    assert report()["bytes"] == best["bytes"] <= 1260 and report()["settings"]["steps"] == 20
 
 
 def test_the_smallest_of_a_quality(folder, capsys):
     write("a.png", waves())
     options = ["--psnr", "15", "--steps", "10", "--dims", "3", "--lr", "0.01"]
     assert fit("a.png", *options, "--json", "r.json") == 0
-    report = json.loads((folder / "r.json").read_text())
-    assert report["measured"]["psnr_db"] >= 15 and report["compression_asked"] is None
-    assert report["bytes"] == min(t["bytes"] for t in report["tried"] if t["psnr_db"] >= 15)
+    assert report()["measured"]["psnr_db"] >= 15 and report()["compression_asked"] is None
+    assert report()["bytes"] == min(t["bytes"] for t in report()["tried"] if t["psnr_db"] >= 15)
     (folder / "out.npz").unlink()
     message = refused(capsys, "fit", "image", "a.png", "-o", "out.npz", *SHORT, "--psnr", "110")
-    assert "a.png: 110 dB were not reached; the best of" in message and "give more --steps" in message
-    assert not (folder / "out.npz").exists()
+    assert "a.png: 110 dB were not reached; the best of" in message and not (folder / "out.npz").exists()
 
 
-# -- interruptions ----------------------------------------------------------------------------------------------------
+# ---------------------- Interruptions and full disks ----------------------
 
 
 def ctrl_c(monkeypatch, when):
@@ -341,140 +264,58 @@ def ctrl_c(monkeypatch, when):
     return calls
 
 
-RUN = ["--steps", "20", "--json", "r.json"]
-
-
 def test_ctrl_c_keeps_the_best(folder, capsys, monkeypatch):
     write("a.png", waves())
-    with monkeypatch.context() as patch:
-        calls = ctrl_c(patch, 11)
-        assert fit("a.png", *RUN) == 130
+    calls = ctrl_c(monkeypatch, 11)
+    assert fit("a.png", "--steps", "20", "--json", "r.json") == 130
     assert len(calls) == 11 and "interrupted at step 11" in capsys.readouterr().out
-    report, (maps, _, table) = json.loads((folder / "r.json").read_text()), decoded()
-    assert report["interrupted"] and report["step"] <= 11 and report["measured"] == table.measured
+    maps, _, table = decoded()
+    assert report()["interrupted"] and report()["step"] <= 11 and report()["measured"] == table.measured
     mse = np.mean((maps["image"] - waves() / 255) ** 2)
     assert table.measured["psnr_db"] == pytest.approx(-10 * np.log10(mse), abs=0.01)
-    assert sorted(os.listdir(folder)) == ["a.png", "out.npz", "r.json"]
 
 
-def test_resuming_is_as_if_nothing_had_happened(folder, capsys, monkeypatch):
-    write("a.png", waves())
-    assert fit("a.png", *RUN, output="whole.npz") == 0
-    with monkeypatch.context() as patch:
-        ctrl_c(patch, 13)
-        assert fit("a.png", *RUN, "--checkpoint", "c.npz") == 130
-    early = (folder / "out.npz").read_bytes()
-    with monkeypatch.context() as patch:
-        calls = ctrl_c(patch, 1000)
-        assert fit("a.png", *RUN, "--checkpoint", "c.npz", "--resume") == 0
-    assert 7 <= len(calls) < 20  # not from the start
-    assert (folder / "out.npz").read_bytes() == (folder / "whole.npz").read_bytes() != early
-
-
-@pytest.mark.parametrize("changed", ["a texel", "the size", "the channels", "a name"])
-def test_resuming_with_another_source(folder, capsys, changed):
+@pytest.mark.parametrize("changed", ["a texel", "the size", "a name", "the settings", "the sizes"])
+def test_resuming_something_else(folder, capsys, changed):
     image = waves()
     write("a.png", image)
-    assert fit("a.png", *RUN, "--checkpoint", "c.npz", "--cascaded", "16", "--bytes", "2000") == 0
+    run = ["--checkpoint", "c.npz", "--cascaded", "16", "--bytes", "2000"]
+    assert fit("a.png", *run) == 0
     before = [(folder / name).read_bytes() for name in ("c.npz", "out.npz")]
-    image[3, 4, 1] ^= 1
-    source = write("a.png", {"the size": image[:12], "the channels": image[..., 0]}.get(changed, image))
-    if changed == "a name":  # the same values as a map of another one
-        write("a.png", waves())
+    source, options = "a.png", []
+    sentence = 'the checkpoint "c.npz" is of another source, or the source has changed since'
+    if changed in ("a texel", "the size"):
+        image[3, 4, 1] ^= 1
+        write("a.png", image if changed == "a texel" else image[:12])
+    elif changed == "a name":  # the same values as a map of another one
         (folder / "m.json").write_text('{"maps": {"stain": {"file": "a.png", "color_space": "srgb"}}}')
         source = "m.json"
-    arguments = [source, "-o", "out.npz", *SHORT, *RUN, "--checkpoint", "c.npz", "--cascaded", "16", "--bytes", "2000"]
-    message = refused(capsys, "fit", "image", *arguments, "--resume")
-    assert 'the checkpoint "c.npz" is of another source, or the source has changed since' in message
+    elif changed == "the settings":
+        options, sentence = ["--without", "jitter"], "was made with other settings (jitter)"
+    else:
+        options, sentence = ["--bytes", "1000"], "holds other table sizes"
+    arguments = [source, "-o", "out.npz", *SHORT, *run, "--resume", *options]
+    assert sentence in refused(capsys, "fit", "image", *arguments)
     assert [(folder / name).read_bytes() for name in ("c.npz", "out.npz")] == before
 
 
-def test_resuming_with_other_settings(folder, capsys):
+@pytest.mark.parametrize("file", ["out.npz", "c.npz", "r.json"])
+def test_no_space_left(folder, capsys, monkeypatch, file):
     write("a.png", waves())
-    assert fit("a.png", *RUN, "--checkpoint", "c.npz") == 0
-    arguments = ["a.png", "-o", "out.npz", *SHORT, *RUN, "--checkpoint", "c.npz", "--resume"]
-    for option, found in ((["--seed", "5"], "seed"), (["--without", "jitter"], "jitter"), (["--loss", "mae"], "loss")):
-        assert f"was made with other settings ({found})" in refused(capsys, "fit", "image", *arguments, *option)
-    assert "holds other table sizes" in refused(capsys, "fit", "image", *arguments, "--bytes", "2000")
-
-
-def test_ctrl_c_in_a_search(folder, capsys, monkeypatch):
-    write("a.png", waves())
-    with monkeypatch.context() as patch:
-        calls = ctrl_c(patch, 25)  # in the second training of 20 steps
-        assert fit("a.png", "--ratio-search", "--bytes", "1200", "--steps", "160", "--json", "r.json") == 130
-    report = json.loads((folder / "r.json").read_text())
-    assert len(calls) == 25 and len(report["tried"]) == 2 and report["interrupted"]
-    assert report["measured"]["psnr_db"] == max(t["psnr_db"] for t in report["tried"])
-    (folder / "out.npz").unlink()
-    with monkeypatch.context() as patch:
-        ctrl_c(patch, 3)
-        assert fit("a.png", "--psnr", "100") == 130
-    assert not (folder / "out.npz").exists() and capsys.readouterr().err.endswith("mi-diffind: interrupted\n")
-    with monkeypatch.context() as patch:
-        ctrl_c(patch, 6)  # the first training reached it, the second one looks for less
-        assert fit("a.png", "--psnr", "1", "--json", "r.json") == 130
-    assert json.loads((folder / "r.json").read_text())["measured"] == decoded()[2].measured
-
-
-# -- full disks -------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("what", ["the file", "the checkpoint", "the report"])
-def test_no_space_left(folder, capsys, monkeypatch, what):
-    write("a.png", waves())
-    names = ["a.png"]
+    options = {"out.npz": [], "c.npz": ["--checkpoint", "c.npz"], "r.json": ["--json", "r.json"]}[file]
 
     def full(*arguments, **options):
         assert [name for name in os.listdir(folder) if name.startswith(".")]  # the temporary file is there
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    options = []
-    if what == "the file":
-        monkeypatch.setattr(zipfile.ZipFile, "writestr", full)
-    elif what == "the checkpoint":
-        monkeypatch.setattr(np, "savez", full)
-        options = ["--checkpoint", "c.npz"]
-    else:
-        monkeypatch.setattr("pathlib.Path.write_text", full)
-        options, names = ["--json", "r.json"], ["a.png", "out.npz"]  # which was complete by then
-    file = {"the file": "out.npz", "the checkpoint": "c.npz", "the report": "r.json"}[what]
+    target = {"out.npz": (zipfile.ZipFile, "writestr"), "c.npz": (np, "savez")}.get(file)
+    monkeypatch.setattr(*target, full) if target else monkeypatch.setattr("pathlib.Path.write_text", full)
     message = refused(capsys, "fit", "image", "a.png", "-o", "out.npz", *SHORT, *options)
     assert f'output file "{file}" cannot be written: No space left on device' in message
-    assert sorted(os.listdir(folder)) == names
+    assert sorted(os.listdir(folder)) == ["a.png", *(["out.npz"] if file == "r.json" else [])]
 
 
-FULL = """
-import os, resource, signal, sys
-from mi_diffind.cli import main
-
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-limit, arguments = int(sys.argv[1]), sys.argv[2:]
-resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
-sys.exit(main(arguments))
-"""
-
-
-@pytest.mark.parametrize("verb", ["fit", "decode.png", "decode.exr"])
-def test_a_full_disk(folder, verb):
-    """As the kernel has it: whoever writes, no more than so many bytes go into a file."""
-    write("a.png", noise(64, 64, 3))
-    arguments = ["fit", "image", "a.png", "-o", "new.npz", *SHORT]
-    if verb != "fit":
-        make_file(folder / "t.npz", 64, 64)
-        arguments = ["decode", "t.npz", "--map", "albedo", "-o", verb.replace("decode", "new")]
-    before = sorted(os.listdir(folder))
-    command = [sys.executable, "-c", FULL, "200", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 2, done.stderr
-    lines = [line for line in done.stderr.splitlines() if "mi-diffind: error" in line or "Traceback" in line]
-    reason = "I/O error" if verb != "fit" else "File too large"
-    output = arguments[arguments.index("-o") + 1]
-    assert len(lines) == 1 and f'output file "{output}" cannot be written: ' in lines[0] and reason in lines[0], lines
-    assert sorted(os.listdir(folder)) == before
-
-
-# -- decode -----------------------------------------------------------------------------------------------------------
+# ---------------------- decode and inspect ----------------------
 
 MAPS = (
     MapLayout("albedo", "albedo", "srgb", 1, (0, 1, 2)),
@@ -491,9 +332,9 @@ def in_bytes(entries, scale=1 / 255, offset=0.0):
     return StoredArray(entries, (), (scale,) * channels, (offset,) * channels)
 
 
-def make_file(path, height=5, width=7, maps=MAPS, seed=0):
-    """A file of random arrays."""
-    rng = np.random.default_rng(seed)
+def make_file(path, height=5, width=7, maps=MAPS):
+    """Write a file of random arrays."""
+    rng = np.random.default_rng(0)
     stored = 1 + max(w for m in maps for w in m.where if isinstance(w, int))
     layout = Layout(width, height, tuple(maps), (0.5,) * stored, (maps[0].name,) * stored)
     table = Table("image", {}, settings={"layout": layout.to_json()})
@@ -503,89 +344,58 @@ def make_file(path, height=5, width=7, maps=MAPS, seed=0):
     return str(path)
 
 
-def test_decode_to_png(folder, capsys):
+def test_decode_to_files(folder, capsys):
+    """PNG: bytes, sRGB. EXR: linear, half precision, single where that overflows."""
     make_file("t.npz")
-    assert main(["decode", "t.npz", "-o", "b.png", "--json", "r.json"]) == 0
     maps, layout, _ = decoded("t.npz")
-    assert json.loads((folder / "r.json").read_text())["files"] == [f"b_{name}.png" for name in layout.names]
-    text = capsys.readouterr().out
-    for name, values in maps.items():
-        found = read(f"b_{name}.png")
-        assert found.dtype == np.uint8 and f"b_{name}.png: 7 x 5, {values.shape[2]} channel(s)" in text
-        np.testing.assert_array_equal(found, np.rint(255 * np.clip(values.astype(np.float64), 0, 1)).astype(np.uint8))
-
-
-def test_decode_to_exr(folder):
-    """Linear: sRGB is decoded. Half precision, single where that overflows."""
-    make_file("t.npz")
-    assert main(["decode", "t.npz", "-o", "b.exr"]) == 0
-    maps, *_ = decoded("t.npz")
     assert maps["glow"].max() > 65504 > 1 > maps["signed"].min() and maps["signed"].min() < 0
-    for name, values in maps.items():
-        found, expected = read(f"b_{name}.exr"), values.astype(np.float64)
-        if name == "albedo":
-            expected = np.where(expected <= 0.04045, expected / 12.92, ((expected + 0.055) / 1.055) ** 2.4)
-        assert found.dtype == (np.float32 if name == "glow" else np.float16)
-        np.testing.assert_allclose(found.astype(np.float64), expected, rtol=1e-3, atol=1e-6)
-
-
-def test_decode_some_maps_at_other_sizes(folder):
-    make_file("t.npz")
-    assert main(["decode", "t.npz", "-o", "one.png", "--map", "ao", "--width", "21", "--height", "3"]) == 0
-    assert read("one.png").shape == (3, 21, 1)
+    for kind in ("png", "exr"):
+        assert main(["decode", "t.npz", "-o", f"b.{kind}", "--json", "r.json"]) == 0
+        assert report()["files"] == [f"b_{name}.{kind}" for name in layout.names]
+        text = capsys.readouterr().out
+        for name, values in maps.items():
+            written, expected = read(f"b_{name}.{kind}"), values.astype(np.float64)
+            assert f"b_{name}.{kind}: 7 x 5, {values.shape[2]} channel(s)" in text
+            if kind == "png":
+                np.testing.assert_array_equal(written, np.rint(255 * np.clip(expected, 0, 1)).astype(np.uint8))
+                continue
+            if name == "albedo":
+                expected = np.where(expected <= 0.04045, expected / 12.92, ((expected + 0.055) / 1.055) ** 2.4)
+            assert written.dtype == (np.float32 if name == "glow" else np.float16)
+            np.testing.assert_allclose(written.astype(np.float64), expected, rtol=1e-3, atol=1e-6)
     assert main(["decode", "t.npz", "-o", "two.png", "--map", "ao", "--map", "normal", "--width", "2"]) == 0
     assert read("two_ao.png").shape == (5, 2, 1) and read("two_normal.png").shape == (5, 2, 3)
-    assert sorted(os.listdir(folder)) == ["one.png", "t.npz", "two_ao.png", "two_normal.png"]
 
 
 def test_what_decode_refuses(folder, capsys):
     make_file("t.npz")
-    many = [MapLayout("many", "other", "linear", 1, tuple(range(6)))]
-    make_file("many.npz", maps=many)
+    make_file("many.npz", maps=[MapLayout("many", "other", "linear", 1, tuple(range(6)))])
     save_table("unknown.npz", Table("cloth", {"a": StoredArray(np.zeros((2, 1), np.float32))}))
     save_table("other.npz", load_table(tasks()["ggx"].file()))
     before = sorted(os.listdir(folder))
     for arguments, sentence in (
         (["t.npz", "-o", "b.jpg"], 'output "b.jpg": found the extension ".jpg", allowed are .png and .exr'),
-        (["t.npz", "-o", "b"], 'found the extension ""'),
         (["t.npz", "-o", "gone/b.png"], 'output folder "gone" does not exist'),
         (["t.npz", "-o", "b.png", "--map", "colour"], 'found "colour", the file holds albedo, normal, ao'),
         (["gone.npz", "-o", "b.png"], "gone.npz: no such file"),
-        (
-            ["other.npz", "-o", "b.png"],
-            'other.npz: holds tables for the task "ggx", which stand for nothing that could be decoded',
-        ),
+        (["other.npz", "-o", "b.png"], 'the task "ggx", which stand for nothing that could be decoded'),
         (["other.npz", "-o", "b.png", "--map", "a"], "other.npz: --map does not apply to this file"),
         (["unknown.npz", "-o", "b.png"], 'unknown.npz: holds tables for the task "cloth", installed are bsdf, disney'),
         (["many.npz", "-o", "b.png"], 'many.npz: "many" has 6 channels, PNG holds 4: use .exr'),
+        (["t.npz", "-o", "b.png", "--width", "100000", "--height", "100000"], "are more than fit into memory"),
     ):
         assert sentence in refused(capsys, "decode", *arguments)
     assert sorted(os.listdir(folder)) == before
-    message = refused(capsys, "decode", "t.npz", "-o", "b.png", "--width", "100000", "--height", "100000")
-    assert "texels are more than fit into memory" in message
-    for option in (["--width", "0"], ["--height", "-3"], ["--width", "9" * 30]):
-        with pytest.raises(SystemExit):
-            main(["decode", "t.npz", "-o", "b.png", *option])
-    assert main(["decode", "many.npz", "-o", "b.exr"]) == 0 and read("b.exr").shape == (5, 7, 6)
 
 
-def _settings(change):
+def _in_layout(**changed):
+    return lambda table: table.settings["layout"].update(changed)
+
+
+def _with_array(name, shape=None, **affine):
     def damage(table):
-        change(table.settings["layout"])
-
-    return damage
-
-
-def _grow(name, shape):
-    def damage(table):
-        table.arrays[name] = in_bytes(np.zeros(shape, np.uint8))
-
-    return damage
-
-
-def _affine(name, scale, offset):
-    def damage(table):
-        table.arrays[name] = in_bytes(table.arrays[name].entries, scale, offset)
+        entries = table.arrays[name].entries if shape is None else np.zeros(shape, np.uint8)
+        table.arrays[name] = in_bytes(entries, **affine)
 
     return damage
 
@@ -593,21 +403,21 @@ def _affine(name, scale, offset):
 DAMAGE = {
     "no layout": lambda table: table.settings.clear(),
     "another layout": lambda table: table.settings.update(layout=[1, 2]),
-    "an endless width": _settings(lambda layout: layout.update(width=10**400)),
-    "a folder as name": _settings(lambda layout: layout["maps"][0].update(name="../a")),
+    "an endless width": _in_layout(width=10**400),
+    "a folder as name": lambda table: table.settings["layout"]["maps"][0].update(name="../a"),
     "no cascaded array": lambda table: table.arrays.pop("cascaded"),
-    "one array more": _grow("third", (3, 3, 1)),
-    "other dimensions": _grow("primary", (6, 5, 3)),
-    "a primary of 1D": _grow("primary", (30, 2)),
-    "other channels": _grow("cascaded", (4, 4, 3)),
-    "beyond 1": _affine("primary", 0.005, 0.0),
-    "below 0": _affine("cascaded", 1 / 255, -0.1),
-    "falling": _affine("cascaded", -1 / 255, 1.0),
+    "one array more": _with_array("third", (3, 3, 1)),
+    "other dimensions": _with_array("primary", (6, 5, 3)),
+    "a primary of 1D": _with_array("primary", (30, 2)),
+    "other channels": _with_array("cascaded", (4, 4, 3)),
+    "beyond 1": _with_array("primary", scale=0.005),
+    "below 0": _with_array("cascaded", offset=-0.1),
+    "falling": _with_array("cascaded", scale=-1 / 255, offset=1.0),
 }
 
 
 @pytest.mark.parametrize("name", DAMAGE)
-def test_files_that_stand_for_no_image(folder, capsys, name):
+def test_files_that_are_no_image(folder, capsys, name):
     table = load_table(make_file("t.npz"))
     DAMAGE[name](table)
     save_table("t.npz", table)
@@ -616,63 +426,25 @@ def test_files_that_stand_for_no_image(folder, capsys, name):
     assert os.listdir(folder) == ["t.npz"]
 
 
-def test_decoding_ends_of_a_file_that_tiles(folder):
-    """A source that repeats is found to, and reads the same at both ends."""
-    write("a.png", waves())
-    assert fit("a.png", "--bytes", "1200") == 0
-    types = array_module("llvm")
-    model = load_model("out.npz", types.TensorXf)
-    assert model.table.arrays["primary"].border == ("repeat", "repeat")
-    image = model.image
-    t, zero = np.linspace(0, 1, 33, dtype=np.float32), np.zeros(33, np.float32)
-    for a, b in (((zero, t), (zero + 1, t)), ((t, zero), (t, zero + 1))):
-        first, second = (
-            np.stack([c.numpy() for c in image.read(*(types.Float(x) for x in place))["image"]]) for place in (a, b)
-        )
-        assert np.isfinite(first).all() and np.ptp(first) > 0.05
-        np.testing.assert_allclose(first, second, atol=1e-6)
-    assert fit("a.png", "--bytes", "1200", "--border", "clamp") == 0
-    assert load_table("out.npz").arrays["primary"].border == ("clamp", "clamp")
-
-
-def test_the_same_command_gives_the_same_file(folder):
-    write("a.png", waves())
-    for name in ("one.npz", "two.npz"):
-        assert fit("a.png", "--seed", "3", output=name) == 0
-    assert (folder / "one.npz").read_bytes() == (folder / "two.npz").read_bytes()
-    assert fit("a.png", "--seed", "4", output="two.npz") == 0
-    assert (folder / "one.npz").read_bytes() != (folder / "two.npz").read_bytes()
-
-
 @pytest.mark.parametrize("name", ["plain", "one colour", "cleaned"])
 def test_inspect_measures_against_the_source(folder, capsys, name):
-    """What was measured after the training; from another folder, too; not against anything else."""
-    values = {"plain": waves(), "one colour": np.full((6, 6, 3), 77, np.uint8), "cleaned": waves() / np.float32(255)}[
-        name
-    ]
+    """From another folder, too; not against anything but the source."""
+    values = np.full((6, 6, 3), 77, np.uint8) if name == "one colour" else waves()
     if name == "cleaned":
+        values = values / np.float32(255)
         values[3, 4, 1] = np.nan
     (folder / "files").mkdir()
     source = write("a.exr" if name == "cleaned" else "a.png", values)
     assert fit(source, "--nonfinite", "clean", output="files/out.npz") == 0
     assert main(["inspect", "files/out.npz", "--measure", "--json", "r.json"]) == 0
-    ((form, measured),) = json.loads((folder / "r.json").read_text())["measured_in_each_form"].items()
+    ((storage, measured),) = report()["measured_in_each_form"].items()
     model = load_model("files/out.npz", array_module("llvm").TensorXf)
-    assert form == model.storage and measured.pop("bytes") == model.nbytes
+    assert storage == model.storage and measured.pop("bytes") == model.nbytes
     assert measured.pop("memory_bytes") == model.memory_nbytes
     assert measured == pytest.approx(load_table("files/out.npz").measured, rel=1e-4)
-    changed = np.nan_to_num(values)
-    for other in (changed[:5], changed // 2 if name != "cleaned" else changed / 2, changed[..., :1]):
-        write(source, other)
-        assert "has changed since" in refused(capsys, "inspect", "files/out.npz", "--measure")
+    write(source, np.nan_to_num(values)[:5])
+    assert "has changed since" in refused(capsys, "inspect", "files/out.npz", "--measure")
     os.unlink(source)
     assert f"{source}: no such file" in refused(capsys, "inspect", "files/out.npz", "--measure")
-
-
-def test_inspect_measures_nothing_without_a_source(folder, capsys):
     make_file("t.npz")
     assert "t.npz: no source file is recorded" in refused(capsys, "inspect", "t.npz", "--measure")
-
-
-def test_candidates_of_a_search_are_structures_that_exist():
-    assert set(search.TRIED) <= set(STRUCTURES)

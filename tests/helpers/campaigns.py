@@ -7,211 +7,149 @@ import shutil
 import zlib
 from collections import Counter
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import captures
-import hostile_files
-import hostile_strategies as strategies
+import damage
 import numpy as np
 import solid_meshes
 from hypothesis import given
+from hypothesis.strategies import SearchStrategy
 from limited_child import FAULTS, GOOD, LimitedChild
+from PIL import Image
 from trial_files import all_seeds
 
 
-@dataclass
+@dataclass(frozen=True)
 class Target:
-    """A sort of file: how a recipe damages it, what recipes there are, and the probe that reads it.
+    """A sort of file: valid ``files`` by name, the probe that reads ``path`` among them, and how they are damaged.
 
-    ``write(folder, recipe)`` writes the damaged file and returns the arguments of the ``probe``.
+    ``mutants``: form ("structured" or "raw") → name of the damaged file, and the strategy of its
+    :class:`damage.Mutant`. ``arguments``: further ones of the probe.
     """
 
-    name: str
     probe: str
-    structured: object
-    raw: object
-    write: object
+    files: dict[str, bytes]
+    path: str
+    mutants: dict[str, tuple[str, SearchStrategy]]
+    arguments: dict = field(default_factory=dict)
+
+    def write(self, folder: Path, file: str, mutant: damage.Mutant) -> dict:
+        """Write the files, one of them damaged, to ``folder``, and return the arguments of the probe."""
+        shutil.rmtree(folder / "mutant", ignore_errors=True)
+        for name, data in {**self.files, file: mutant.data}.items():
+            path = folder / "mutant" / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(data)
+        untouched = {"untouched": mutant.untouched} if self.probe == "table" else {}
+        return {"path": f"mutant/{self.path}", **self.arguments, **untouched}
 
 
-@dataclass
-class Campaign:
-    """Outcomes of the mutants of one target."""
+def run(child, name: str, target: Target, form: str, examples: int, spare=lambda: True, share=1, seed=0) -> dict:
+    """Send ``examples`` mutants through the child, as long as ``spare()`` says that there is time; return the figures.
 
-    target: str
-    outcomes: Counter = field(default_factory=Counter)
-    faults: dict[str, list] = field(default_factory=dict)
+    Of the table files that load, one in ``share`` is decoded and rendered. The figures are numbers of outcomes and, by
+    exception and line, the message and the lies of each fault, of the shortest file.
+    """
+    outcomes, faults, shortest = Counter(), {}, {}
+    file, strategy = target.mutants[form]
 
-    def add(self, answer: dict, recipe: list) -> None:
-        """Count an answer; of each fault, the shortest recipe is kept."""
+    @damage.hostile(examples, seed)
+    @given(mutant=strategy)
+    def each(mutant):
+        if not spare():
+            return
+        request = target.write(child.folder, file, mutant)
+        if target.probe == "table":
+            request["evaluate"] = zlib.crc32(mutant.data) % share == 0
+        answer = child.check(target.probe, **request)
         outcome, message = answer["outcome"], answer["message"]
-        self.outcomes[outcome] += 1
+        outcomes[outcome] += 1
         if outcome in FAULTS:
-            # One entry a place: exception and line, without the numbers of this mutant
             end = message.rpartition(" (")[2] if outcome == "traceback" else ""
             key = f"{outcome} {message.partition(':')[0][:40]} {end}".strip()
-            if key not in self.faults or len(json.dumps(recipe)) < len(json.dumps(self.faults[key][1])):
-                self.faults[key] = [message, recipe]
-
-    def figures(self) -> dict:
-        """Return the figures for JSON."""
-        counted = {name: self.outcomes[name] for name in (*GOOD, *FAULTS)}
-        return {"target": self.target, "mutants": self.outcomes.total(), **counted, "faults": self.faults}
-
-
-def run(
-    child: LimitedChild, target: Target, recipes, examples: int, spare=lambda: True, share: int = 1, seed: int = 0
-) -> Campaign:
-    """Send ``examples`` mutants through the child, as long as ``spare()`` says that there is time.
-
-    Of the table files that load, one in ``share`` is decoded and rendered.
-    """
-    campaign = Campaign(target.name)
-
-    @strategies.hostile(examples, seed)
-    @given(recipe=recipes)
-    def each(recipe):
-        if spare():
-            request = target.write(child.folder, recipe)
-            if target.probe == "table":
-                request["evaluate"] = zlib.crc32(json.dumps(recipe).encode()) % share == 0
-            campaign.add(child.check(target.probe, **request), recipe)
+            if len(mutant.data) < shortest.get(key, np.inf):
+                shortest[key], faults[key] = len(mutant.data), [message, mutant.lies]
 
     each()
-    return campaign
+    counted = {outcome: outcomes[outcome] for outcome in (*GOOD, *FAULTS)}
+    return {"recipes": form, "target": name, "mutants": outcomes.total(), **counted, "faults": faults}
 
 
-# -- table files -------------------------------------------------------------------------------------------------------
+def single(probe: str, name: str, data: bytes, structured: SearchStrategy, **arguments) -> Target:
+    """Return a target of one file."""
+    mutants = {"structured": (name, structured), "raw": (name, damage.mutants(data))}
+    return Target(probe, {name: data}, name, mutants, arguments)
+
+
+def folder(probe: str, files: dict[str, bytes], path: str, description: str, picture: str) -> Target:
+    """Return a target of a folder, of which a JSON file and a picture are damaged."""
+    content = damage.json_mutants(json.loads(files[description]))
+    mutants = {"structured": (description, content), "raw": (picture, damage.mutants(files[picture]))}
+    return Target(probe, files, path, mutants)
 
 
 def tables() -> dict[str, Target]:
     """Return the small table files of all tasks as targets."""
-
-    def target(name: str, path: Path) -> Target:
-        data = path.read_bytes()
-
-        def write(folder: Path, recipe: list) -> dict:
-            changed, untouched = hostile_files.damaged(data, recipe)
-            (folder / "mutant.npz").write_bytes(changed)
-            return {"path": "mutant.npz", "original": str(path), "untouched": untouched}
-
-        structured = strategies.archive_recipes(hostile_files.Archive.read(path))
-        return Target(name, "table", structured, strategies.byte_recipes(), write)
-
-    return {name: target(name, path) for name, (_, path) in all_seeds().items()}
+    return {
+        name: single("table", "table.npz", path.read_bytes(), damage.archive_mutants(path.read_bytes()),
+                     original=str(path))
+        for name, (_, path) in all_seeds().items()
+    }  # fmt: skip
 
 
-# -- other files -------------------------------------------------------------------------------------------------------
-
-
-def views(folder: Path) -> Target:
-    """Return a capture of 4 × 8 × 6 pixels as a target: its list of views, or one of its images, is damaged."""
-    source = folder / "valid_views"
-    if not source.is_dir():
-        captures.write(source, 4, 1, 8)
-    path = source / "transforms_train.json"
-    content = json.loads(path.read_text())
+def views(child: LimitedChild) -> Target:
+    """Return a capture of 4 pictures of 8 × 8 pixels as a target."""
+    source = captures.write(child.folder / "valid_views", 4, 1, 8)
+    files = {path.name: path.read_bytes() for path in source.iterdir()}
+    content = json.loads(files["transforms_train.json"])
     content |= {"aabb": [[-1, -1, -1], [1, 1, 1]], "fl_x": 12.0, "fl_y": 12.0, "cx": 4.0, "cy": 4.0, "w": 8, "h": 8}
-    image = (source / "train_0.png").read_bytes()
-
-    def write(folder: Path, recipe: list) -> dict:
-        copied = folder / "views"
-        shutil.rmtree(copied, ignore_errors=True)
-        shutil.copytree(source, copied)
-        in_json = [step for step in recipe if step[0] in hostile_files.STEPS]
-        in_bytes = [step for step in recipe if step[0] in hostile_files.BYTE_STEPS]
-        _write_json(copied / path.name, hostile_files.json_steps(content, in_json))
-        (copied / "train_0.png").write_bytes(hostile_files.damaged_bytes(image, in_bytes))
-        return {"path": "views"}
-
-    return Target("capture", "capture", strategies.json_recipes(content), strategies.byte_recipes(), write)
+    files["transforms_train.json"] = damage.dump(content)
+    return folder("capture", files, "", "transforms_train.json", "train_0.png")
 
 
-def manifests(folder: Path) -> Target:
-    """Return the manifest of two maps as a target: the manifest, or one of its images, is damaged."""
-    from PIL import Image
-
-    source = folder / "valid_maps"
-    source.mkdir(exist_ok=True)
-    pixels = np.random.default_rng(3).integers(0, 256, (6, 8, 3), dtype=np.uint8)
-    for name in ("colour", "normal"):
-        Image.fromarray(pixels).save(source / f"{name}.png")
-    content = {
-        "maps": {
-            "base_color": {"file": "colour.png", "color_space": "srgb"},
-            "normal": "normal.png",
-            "roughness": {"file": "colour.png", "channels": [0]},
-        }
-    }
-    image = (source / "colour.png").read_bytes()
-
-    def write(folder: Path, recipe: list) -> dict:
-        copied = folder / "maps"
-        shutil.rmtree(copied, ignore_errors=True)
-        shutil.copytree(source, copied)
-        in_json = [step for step in recipe if step[0] in hostile_files.STEPS]
-        in_bytes = [step for step in recipe if step[0] in hostile_files.BYTE_STEPS]
-        _write_json(copied / "maps.json", hostile_files.json_steps(content, in_json))
-        (copied / "colour.png").write_bytes(hostile_files.damaged_bytes(image, in_bytes))
-        return {"path": "maps/maps.json"}
-
-    return Target("manifest", "manifest", strategies.json_recipes(content), strategies.byte_recipes(), write)
+def manifest(child: LimitedChild) -> Target:
+    """Return the manifest of three maps as a target."""
+    path = child.folder / "colour.png"
+    Image.fromarray(np.random.default_rng(3).integers(0, 256, (6, 8, 3), dtype=np.uint8)).save(path)
+    colour = {"file": "colour.png", "color_space": "srgb"}
+    maps = {"base_color": colour, "normal": "normal.png", "roughness": {"file": "colour.png", "channels": [0]}}
+    files = {"maps.json": damage.dump({"maps": maps}), **dict.fromkeys(("colour.png", "normal.png"), path.read_bytes())}
+    return folder("manifest", files, "maps.json", "maps.json", "colour.png")
 
 
-def _write_json(path: Path, content) -> None:
-    text = content if isinstance(content, bytes) else json.dumps(content).encode("utf-8", "replace")
-    path.write_bytes(text)
+def mesh(child: LimitedChild, suffix: str) -> Target:
+    """Return a ball in a format as a target."""
+    data = solid_meshes.write(child.folder / f"valid{suffix}", solid_meshes.sphere(4, 0.8)).read_bytes()
+    return single("mesh", f"mutant{suffix}", data, damage.mutants(data, (damage.other_word,)))
 
 
-def meshes(folder: Path, suffix: str) -> Target:
-    """Return a ball in a format as a target: words of a text format, bytes of others."""
-    source = solid_meshes.write(folder / f"valid{suffix}", solid_meshes.sphere(4, 0.8))
-    return _bytes_target(f"mesh {suffix}", "mesh", source, suffix)
-
-
-def gaussians(folder: Path) -> Target:
+def gaussians(_) -> Target:
     """Return 8 Gaussians in a PLY file as a target."""
-    source = folder / "valid_splats.ply"
-    names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2"]
-    names += ["rot_0", "rot_1", "rot_2", "rot_3"]
+    names = [*"xyz", *(f"f_dc_{i}" for i in range(3)), "opacity", *(f"scale_{i}" for i in range(3))]
+    names += [f"rot_{i}" for i in range(4)]
     lines = ["ply", "format binary_little_endian 1.0", "element vertex 8", *(f"property float {n}" for n in names)]
     values = np.random.default_rng(1).normal(0, 0.5, (8, len(names))).astype("<f4")
-    source.write_bytes("\n".join([*lines, "end_header\n"]).encode() + values.tobytes())
-    return _bytes_target("splats", "splats", source, ".ply")
+    data = "\n".join([*lines, "end_header\n"]).encode() + values.tobytes()
+    return single("splats", "mutant.ply", data, damage.mutants(data, (damage.other_word,)))
 
 
-def _bytes_target(name: str, probe: str, source: Path, suffix: str) -> Target:
-    data = source.read_bytes()
-
-    def write(folder: Path, recipe: list) -> dict:
-        (folder / f"mutant{suffix}").write_bytes(hostile_files.damaged_bytes(data, recipe))
-        return {"path": f"mutant{suffix}"}
-
-    return Target(name, probe, strategies.text_recipes(), strategies.byte_recipes(), write)
-
-
-def checkpoints(child: LimitedChild) -> Target:
+def checkpoint(child: LimitedChild) -> Target:
     """Return the checkpoint of a short training as a target."""
     child.check("checkpoint", path="valid_checkpoint.npz", write=True)
-    source = child.folder / "valid_checkpoint.npz"
-    data = source.read_bytes()
-
-    def write(folder: Path, recipe: list) -> dict:
-        changed, _ = hostile_files.damaged(data, recipe)
-        (folder / "mutant.npz").write_bytes(changed)
-        return {"path": "mutant.npz"}
-
-    structured = strategies.archive_recipes(hostile_files.Archive.read(source))
-    return Target("checkpoint", "checkpoint", structured, strategies.byte_recipes(), write)
+    data = (child.folder / "valid_checkpoint.npz").read_bytes()
+    return single("checkpoint", "mutant.npz", data, damage.archive_mutants(data))
 
 
 #: Targets beside table files: name → function of the child.
 OTHERS = {
-    "capture": lambda child: views(child.folder),
-    "manifest": lambda child: manifests(child.folder),
-    "mesh .obj": lambda child: meshes(child.folder, ".obj"),
-    "mesh .ply": lambda child: meshes(child.folder, ".ply"),
-    "mesh .off": lambda child: meshes(child.folder, ".off"),
-    "mesh .stl": lambda child: meshes(child.folder, ".stl"),
-    "splats": lambda child: gaussians(child.folder),
-    "checkpoint": checkpoints,
-}
+    "capture": views, "manifest": manifest,
+    **{f"mesh {suffix}": partial(mesh, suffix=suffix) for suffix in (".obj", ".ply", ".off", ".stl")},
+    "splats": gaussians, "checkpoint": checkpoint,
+}  # fmt: skip
+
+
+def target(name: str, child: LimitedChild) -> Target:
+    """Return a target by its name."""
+    return OTHERS[name](child) if name in OTHERS else tables()[name]

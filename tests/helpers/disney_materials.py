@@ -1,9 +1,7 @@
 """Materials of the Disney BRDF, and how to evaluate the plugins with them."""
 
 import disney_formulas
-import drjit as dr
-import numpy as np
-from arrays import aligned
+from bsdf_queries import bitmap
 
 PRESETS = ("tables", "paper")
 
@@ -56,70 +54,16 @@ def plugin(mi, form, material, **more):
     return {**(FORMS[form] if isinstance(form, str) else form), **described, **more}
 
 
-def bitmap(mi, values, **more):
-    """A texture of ``values``, (height, width[, channels]), read as they are."""
-    values = np.asarray(values, np.float32)
-    data = mi.TensorXf(aligned(values.reshape(*values.shape[:2], -1)))
-    return {"type": "bitmap", "data": data, "raw": True, "filter_type": "nearest", "format": "variant", **more}
-
-
 def textured(mi, form, materials, **more):
-    """One BSDF with a texel for each material, read at ``uv`` by :func:`interactions`: nothing about it is constant."""
+    """One BSDF with a texel for each material, at the ``uv`` of :func:`.interactions`: nothing is constant."""
     full = [{**PLAIN, **m} for m in materials]
     # Mitsuba wants two rows of texels
     textures = {name: bitmap(mi, [[m[name] for m in full]] * 2) for name in ("base_color", *SCALARS)}
     return mi.load_dict(plugin(mi, form, textures, **more))
 
 
-def interactions(mi, wi, material=None, count=1):
-    """Interactions that see ``wi``, at the texels of :func:`textured` with the numbers ``material`` (of ``count``)."""
-    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(wi))
-    si.wi = wi
-    if material is not None:
-        si.uv = mi.Point2f(mi.Float(aligned((np.asarray(material) + 0.5) / count)), 0.5)
-    if mi.is_spectral:
-        si.wavelengths = mi.UnpolarizedSpectrum(450, 520, 580, 650)
-    return si
-
-
-def random_directions(rng, n, low=0.0, high=1.0):
-    """(n, 3), uniform over the part of the hemisphere with cosines in [low, high]."""
-    z = low + (high - low) * rng.random(n)
-    phi, r = 2 * np.pi * rng.random(n), np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1).astype(np.float32)
-
-
-def vectors(mi, w):
-    return mi.Vector3f(aligned(w.T))
-
-
-def uniform(mi, rng, n):
-    u = [mi.Float(aligned(rng.random(n))) for _ in range(3)]
-    return u[0], mi.Point2f(u[1], u[2])
-
-
-def contexts(mi):
-    """Name → a context, and the components that it turns on."""
-    found = {"all": (mi.BSDFContext(), (0, 1, 2))}
-    for component in range(3):
-        ctx = mi.BSDFContext()
-        ctx.component = component
-        found[f"component {component}"] = ctx, (component,)
-    for flag, components in (("DiffuseReflection", (0,)), ("GlossyReflection", (1, 2)), ("DeltaReflection", ())):
-        ctx = mi.BSDFContext()
-        ctx.type_mask = getattr(mi.BSDFFlags, flag)
-        found[flag] = ctx, components
-    return found
-
-
-def close(a, b, rtol=1e-5, scale=1e-5):
-    """Equal up to rounding, relative to the value and to the largest value in its row."""
-    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
-    return np.abs(a - b) <= rtol * np.maximum(np.abs(a), np.abs(b)) + rtol * scale * np.abs(b).max(initial=1e-3)
-
-
-def with_cosines(rng, cosines):
-    """Directions with given cosines, (n, 3) in float32, as exactly unit vectors as that allows."""
-    phi = 2 * np.pi * rng.random(len(cosines))
-    r = np.sqrt(1 - np.square(cosines))
-    return np.stack([r * np.cos(phi), r * np.sin(phi), cosines], axis=1).astype(np.float32)
+def smallest_alpha(material):
+    """Roughness of the narrowest lobe of a material."""
+    m = {**PLAIN, **material}
+    coat = 0.1 - 0.099 * m["clearcoat_gloss"] if m["clearcoat"] > 0 else 1.0
+    return min(max(m["roughness"] ** 2, 1e-3), coat)

@@ -42,13 +42,23 @@ class HalfVectorSampling:
         return points, weights
 
     def pdf(self, p):
+        return self.mapped(p, lambda si, wo: self.bsdf.pdf(self.ctx, si, wo))
+
+    def integral(self, function, side=256):
+        """Integral over directions of ``function(si, wo)``, an array, on a grid of half vectors."""
+        mi = self.mi
+        x = (dr.arange(mi.Float, side) + 0.5) / side
+        return float(dr.mean(self.mapped(mi.Point2f(*dr.meshgrid(x, x)), function))[0])
+
+    def mapped(self, p, function):
+        """Return ``function(si, wo)``, per solid angle, as a density of the coordinates."""
         q = self.a2 * (dr.exp(p.y * self.log) - 1)
         sin, cos = 2 * dr.sqrt(q) / (1 + q), (1 - q) / (1 + q)
         sin_phi, cos_phi = dr.sincos(2 * dr.pi * (p.x - 0.5))
         h = self.mi.Vector3f(sin * cos_phi, sin * sin_phi, cos)
         wi_h = dr.dot(self.wi, h)
         wo = dr.fma(2 * wi_h, h, -self.wi)
-        pdf = self.bsdf.pdf(self.ctx, self.interactions(dr.width(p)), wo)
+        pdf = function(self.interactions(dr.width(p)), wo)
         # d(azimuth) dv → solid angle of h → of wo
         jacobian = 2 * dr.pi * self.log * (self.a2 + q) * 2 / dr.square(1 + q) * 4 * wi_h
         return dr.select((wi_h > 0) & (wo.z > 0), pdf * jacobian, 0)

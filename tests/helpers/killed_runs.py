@@ -13,28 +13,21 @@ import subprocess
 import sys
 from pathlib import Path
 
-HELPERS = Path(__file__).resolve().parent
-
 
 def run(arguments: list[str], folder: Path, moment: str = "", prepare: str = "") -> int | None:
     """Run a command in another process; return its number of calls, ``None`` if it was killed.
 
-    ``prepare`` names a function, ``module:function``, that is called first. Raises ``RuntimeError`` if the command
-    fails.
+    ``prepare`` names a function of this module that is called first. Raises ``RuntimeError`` if the command fails.
     """
-    report = folder / "calls.json"
-    report.unlink(missing_ok=True)
-    request = {"arguments": arguments, "moment": moment, "prepare": prepare, "report": str(report)}
+    request = json.dumps({"arguments": arguments, "moment": moment, "prepare": prepare})
     done = subprocess.run(
-        [sys.executable, __file__, json.dumps(request)], cwd=folder, capture_output=True, text=True, errors="replace"
+        [sys.executable, __file__, request], cwd=folder, capture_output=True, text=True, errors="replace"
     )
     if done.returncode == -signal.SIGKILL and moment:
         return None
     if done.returncode:
         raise RuntimeError(f"exit code {done.returncode}: {done.stderr[-2000:]}")
-    calls = json.loads(report.read_text())
-    report.unlink()
-    return calls
+    return int(done.stdout.splitlines()[-1])
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -42,66 +35,48 @@ def files(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
-def main(request: dict) -> None:
+def main(arguments: list[str], moment: str, prepare: str) -> None:
     """Run one command in this process."""
-    import importlib
-
     from mi_diffind.commands import cli
 
-    if request["prepare"]:
-        module, _, function = request["prepare"].partition(":")
-        getattr(importlib.import_module(module), function)()
-    words, calls, replaced = request["moment"].split(), 0, 0
-    last_call = int(words[0]) if len(words) == 1 else 0
-    last_replace = int(words[1]) if len(words) == 2 else 0
+    if prepare:
+        globals()[prepare]()
+    *replace, number = moment.split() or ["0"]
+    last, calls, replaced = int(number), 0, 0
 
     def count(frame, event, argument):
         nonlocal calls, replaced
         calls += event in ("call", "c_call")
         replaced += event == "c_call" and argument is os.replace
-        if calls == last_call or (last_replace and replaced == last_replace):
+        if last and (replaced if replace else calls) == last:
             os.kill(os.getpid(), signal.SIGKILL)
 
     sys.setprofile(count)
-    code = cli.main(request["arguments"])
+    code = cli.main(arguments)
     sys.setprofile(None)
-    Path(request["report"]).write_text(json.dumps({"calls": calls, "replaced": replaced}))
+    print(calls)
     sys.exit(code)
 
 
 def measure_little() -> None:
     """Measure results at few places."""
     from mi_diffind.tasks.disney.files import DisneyModel
-    from mi_diffind.tasks.ggx.files import GGXModel
+    from mi_diffind.tasks.ggx.training import GGXModel
 
-    GGXModel.measure.__defaults__ = (2**12,)
-    DisneyModel.measure.__defaults__ = (2**12,)
+    GGXModel.measure.__defaults__ = DisneyModel.measure.__defaults__ = (2**12,)
 
 
 def small_study() -> None:
     """Add a study ``killed``: one training to convergence, and one case."""
-    from mi_diffind.measure.study import Study
-    from mi_diffind.studies import studies
-
-    class Killed(Study):
-        name, title = "killed", "a small study"
-
-        def plan(self, arguments):
-            return killed_plan()
-
-    studies()["killed"] = Killed()
-
-
-def killed_plan():
-    """Return the plan of the study ``killed``."""
     import drjit as dr
     import numpy as np
 
     from mi_diffind.arrays.indirection import DifferentiableArray
     from mi_diffind.core.runtime import array_module
     from mi_diffind.fitting.loop import FitSettings, Problem
-    from mi_diffind.measure.study import FLOOR, Candidate, Case, Plan
+    from mi_diffind.measure.study import FLOOR, Candidate, Case, Plan, Study
     from mi_diffind.measure.training import ConvergenceTraining
+    from mi_diffind.studies import studies
 
     types = array_module("llvm")
 
@@ -119,18 +94,23 @@ def killed_plan():
         def measure(self, net):
             return {"psnr_db": -20 * float(np.log10(max(np.abs(net.numpy() - 1).mean(), 0.01)))}
 
-    settings = FitSettings(steps=5, batch=64, lr=1e-1, schedule="constant", seed=3)
-    x = dr.arange(types.Float, 1024) + 1
-    dr.make_opaque(x)
-    functions = {FLOOR: lambda: x, "ramp": lambda: x * 2, "exact": lambda: x * 3}
-    return Plan(
-        study="killed", title="A small study", queries=("eval",), accuracy="psnr_db", accuracy_label="PSNR, dB",
-        candidates=[Candidate("ramp", "a", job="training"), Candidate("exact", "b", is_truth=True)],
-        cases=[Case("one", lambda lanes: {"eval": dict(functions)})],
-        jobs=[ConvergenceTraining("training", Ramp, settings, 40)],
-    )  # fmt: skip
+    class Killed(Study):
+        name, title = "killed", "a small study"
+
+        def plan(self, arguments):
+            settings = FitSettings(steps=5, batch=64, lr=1e-1, schedule="constant", seed=3)
+            x = dr.arange(types.Float, 1024) + 1
+            dr.make_opaque(x)
+            functions = {FLOOR: lambda: x, "ramp": lambda: x * 2, "exact": lambda: x * 3}
+            return Plan(
+                study="killed", title="A small study", queries=("eval",), accuracy="psnr_db",
+                accuracy_label="PSNR, dB", cases=[Case("one", lambda lanes: {"eval": dict(functions)})],
+                candidates=[Candidate("ramp", "a", job="training"), Candidate("exact", "b", is_truth=True)],
+                jobs=[ConvergenceTraining("training", Ramp, settings, 40)],
+            )  # fmt: skip
+
+    studies()["killed"] = Killed()
 
 
 if __name__ == "__main__":
-    sys.path.insert(0, str(HELPERS))
-    main(json.loads(sys.argv[1]))
+    main(**json.loads(sys.argv[1]))

@@ -117,36 +117,30 @@ def torus(p):
 
 def sparse_table(shape=torus, spacing=1 / 40, entries=256, scale=2.0, centre=(0.5, -1.0, 0.25)):
     """The table of a formula's sparse field, as ``fit sdf`` would write it; pointers have 8 bits."""
+    from mi_diffind.arrays.sparse_grid import SparseGrid, cell_corners
     from mi_diffind.arrays.tables import Table
-    from mi_diffind.tasks.sdf import codes, encoding, model, nodes, structure
+    from mi_diffind.tasks.sdf import encoding, model, nodes
 
     lower = np.array([-0.5, -0.5, -0.5]) - 1.5 * spacing
     n = int(np.ceil((1 + 3 * spacing) / spacing)) + 1
     index = np.stack(np.meshgrid(*[np.arange(n)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     inside = (shape(lower + spacing * index)[0] < 0).reshape(n, n, n)
-    corner = np.stack([inside[a : n - 1 + a, b : n - 1 + b, c : n - 1 + c] for a, b, c in nodes.CORNERS], axis=-1)
-    cells = np.argwhere(corner.any(-1) & ~corner.all(-1))
-    around = cells[:, None] + np.array(nodes.CORNERS)
-    used = np.unique(around.reshape(-1, 3), axis=0)
+    corner = np.lib.stride_tricks.sliding_window_view(inside, (2, 2, 2)).reshape(n - 1, n - 1, n - 1, 8)
+    used = np.argwhere(cell_corners(corner.any(-1) & ~corner.all(-1)))
 
     def sign(p):
         return shape(np.asarray(p))[0] < 0
 
-    grid = structure.build(used, sign(lower + spacing * used), (n, n, n), lower, spacing, sign)
+    grid = SparseGrid.from_nodes(used, sign(lower + spacing * used), (n, n, n), lower, spacing, sign)
     positions, block = grid.node_positions()
     d, g = shape(np.array(grid.lower) + spacing * positions)
-
-    def key(p):
-        return np.ravel_multi_index(p.T, grid.shape)
-
-    order = np.argsort(key(positions))
-    corners = order[np.searchsorted(key(positions), key(around.reshape(-1, 3)), sorter=order)].reshape(-1, 8)
-    sampled = encoding.SampledNodes(grid, positions, block, d / spacing, g, corners, len(cells), 0.0)
+    corners = encoding.crossed_cells(grid, d < 0)
+    sampled = encoding.SampledNodes(grid, positions, block, d / spacing, g, corners, len(corners), 0.0)
     frames = encoding.fit_frames(sampled)
     wanted = encoding.exact_entries(sampled, frames)
     bits, entries = 8, encoding.cluster(wanted, entries)
     pointers = encoding.assign(wanted, entries)
-    table = Table("sdf", model.sparse_arrays(grid, frames, codes.pointer_words(pointers, bits), entries))
+    table = Table("sdf", model.sparse_arrays(grid, frames, nodes.pointer_words(pointers, bits), entries))
     table.preset = "sparse"
     slope = nodes.slope_bound(d / spacing, g, corners)
     table.settings = {"layout": "sparse", "lower": list(grid.lower), "spacing": spacing, "bits": bits,

@@ -12,9 +12,8 @@ from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting.task import FitRequest
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import load_source
-from mi_diffind.tasks.texture import training
-from mi_diffind.tasks.texture.memory_budget import TextureBudget, parse_structure
-from mi_diffind.tasks.texture.presets import PRESETS
+from mi_diffind.tasks.texture import PRESETS, training
+from mi_diffind.tasks.texture.arrays import TextureBudget, parse_structure
 
 #: Maps of a material, and the parameters of the BSDF that read them.
 PARAMETERS = {"albedo": "base_color", "roughness": "roughness", "metallic": "metallic"}

@@ -6,10 +6,9 @@ from arrays import aligned
 from mi_diffind.arrays.tables import save_table
 from mi_diffind.core.runtime import array_module
 from mi_diffind.maps.pyramid import Pyramid
-from mi_diffind.tasks.texture import memory_budget, training
+from mi_diffind.tasks.texture import PRESETS, arrays, training
 from mi_diffind.tasks.texture.compressed import CompressedTexture, to_table
 from mi_diffind.tasks.texture.nets import neutral_extras
-from mi_diffind.tasks.texture.presets import PRESETS
 
 
 def make(path, source, preset="ours", border="repeat", extras=None, **settings):
@@ -21,12 +20,10 @@ def make(path, source, preset="ours", border="repeat", extras=None, **settings):
     pyramid = Pyramid.of(source, training.layout_of(source, recipe), types, (border, border))
     stored = pyramid.layout.stored
     if preset == "paper":
-        size = memory_budget.PaperBudget(9, 12, 4, 4, stored)
+        size = arrays.PaperBudget(9, 12, 4, 4, stored)
     else:
         dims = min(3, stored)
-        size = memory_budget.TextureBudget(
-            source.height, source.width, stored, (memory_budget.FineArray(0, dims, 8),), 1, dims, 12
-        )
+        size = arrays.TextureBudget(source.height, source.width, stored, (arrays.FineArray(0, dims, 8),), 1, dims, 12)
     net, rng = training.problem_of(source, size, recipe, pyramid).net, np.random.default_rng(7)
     if preset == "paper":
         for array in net.arrays.values():

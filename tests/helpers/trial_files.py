@@ -1,4 +1,4 @@
-"""Small valid files of every task, from the fits that each task declares (:attr:`mi_diffind.fitting.task.Task.trials`).
+"""Small valid files of every task, from fits of seconds (:data:`TRIALS`).
 
 Some of these fits take minutes: their files are kept in ``tests/trust/corpus/seeds``, which ``python
 tests/trust/run.py --seeds`` writes anew.
@@ -15,6 +15,36 @@ from mi_diffind.fitting.task import DATA, Task, tasks
 
 SEEDS = Path(__file__).resolve().parents[1] / "trust" / "corpus" / "seeds"
 
+#: Task → name → keywords of :func:`mi_diffind.fit` for a fit of seconds, one for each layout of its files.
+TRIALS = {
+    "bsdf": {
+        "single": {"source": "bsdf", "steps": 2, "batch": 256, "bytes": "1k"},
+        "family": {"source": "bsdf", "steps": 2, "batch": 256, "over": [("alpha", (0.1, 0.5))]},
+    },
+    "field": {
+        "coded": {"source": "views", "steps": 2, "batch": 256, "resolution": 10},
+        "grid": {"source": "views", "steps": 2, "batch": 256, "resolution": 10, "preset": "grid"},
+        "pairs": {"source": "views", "steps": 2, "batch": 256, "resolution": 10, "preset": "paper"},
+    },
+    "ggx": {"small": {"steps": 2, "batch": 256, "primary": 4, "cascaded": 3}},
+    "image": {
+        "indices": {"source": "maps", "steps": 2, "batch": 256, "compression": 2},
+        "pages": {"source": "maps", "steps": 2, "batch": 256, "compression": 2, "structure": "pages of 5 bits"},
+    },
+    "sdf": {
+        "sparse": {"source": "mesh", "steps": 2, "batch": 256, "bytes": "12k"},
+        "paper": {"source": "mesh", "steps": 2, "batch": 256, "bytes": "4k", "preset": "paper"},
+    },
+    "texture": {
+        "layers": {"source": "maps", "steps": 2, "batch": 256, "compression": 2},
+        "pages": {"source": "maps", "steps": 2, "batch": 256, "compression": 2, "structure": "pages"},
+        "paper": {"source": "maps", "steps": 2, "batch": 256, "compression": 2, "preset": "paper"},
+    },
+}
+
+#: Names of all trials, as "ggx/small".
+NAMES = [f"{task}/{name}" for task, trials in TRIALS.items() for name in trials]
+
 
 def has_files(task: Task) -> bool:
     """Return whether a task has table files of its own: it reads them, or a plugin does."""
@@ -23,7 +53,7 @@ def has_files(task: Task) -> bool:
 
 def seeds(task: Task) -> dict[str, Path]:
     """Return the small files of a task by name: those of its trials, and those that ship."""
-    trials = {f"{task.name}_{name}": SEEDS / f"{task.name}_{name}.npz" for name in task.trials}
+    trials = {f"{task.name}_{name}": SEEDS / f"{task.name}_{name}.npz" for name in TRIALS.get(task.name, ())}
     return {**trials, **{f"{task.name}_shipped_{name}": DATA / file for name, file in task.shipped.items()}}
 
 
@@ -52,7 +82,7 @@ def make(task: Task, name: str, folder: Path, output: Path) -> Path:
     """Carry out a trial of a task and write its file."""
     import mi_diffind
 
-    options = dict(task.trials[name])
+    options = dict(TRIALS[task.name][name])
     source = options.pop("source", None)
     source = sources(folder)[source]() if source else None
     with contextlib.redirect_stdout(None):

@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 from mi_diffind.core.errors import UsageError
-from mi_diffind.tasks.bsdf import contact_sheet, energy, library, mixture, starts, training
+from mi_diffind.tasks.bsdf import energy, library, mixture, training
 
 _fit_material = library.fit_material
 
@@ -16,10 +16,9 @@ _fit_material = library.fit_material
 QUICK = {
     (training, "PROXY"): dataclasses.replace(training.PROXY, steps=10, measure_every=10),
     (training, "SAMPLES"): 2**16,
-    (starts, "ALPHAS"): (0.1, 0.4),
+    (training, "START_ALPHAS"): (0.1, 0.4),
     (mixture, "ALPHAS"): (0.05, 0.3),
     (energy, "CORRECTIONS"): 2,
-    (contact_sheet, "VIEWS"): 1,
 }
 
 

@@ -10,8 +10,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from mi_diffind.maps.names import content_of
-from mi_diffind.maps.source import SourceError, from_arrays, load_source
+from mi_diffind.maps.source import SourceError, content_of, from_arrays, load_source
 
 
 def pattern(height, width, channels, dtype=np.uint8, seed=0):

@@ -80,7 +80,7 @@ def refused(mi, dictionary) -> str:
     return sentence
 
 
-@pytest.mark.parametrize("value", [1e30, -1e30, 1e300, -1e300, 2e9])
+@pytest.mark.parametrize("value", [1e30, -1e300, 2e9])
 @pytest.mark.parametrize("name", ["neural_image", "neural_texture", "neural_material"])
 def test_constants_in_files(mi_rgb, file, image_file, tmp_path, name, value):
     path = changed(image_file if name == "neural_image" else file, tmp_path, constant(value), "albedo")
@@ -135,37 +135,8 @@ def test_bitmaps(mi_rgb, raw):
     assert np.isfinite(image(mi, {"type": "diffuse", "reflectance": texture})).all()
 
 
-def test_image_files(mi_rgb, tmp_path):
-    values = np.random.default_rng(0).random((8, 8, 3)).astype(np.float32)
-    values[3, 4, 1] = 1e12
-    path = str(tmp_path / "bright.exr")
-    mi_rgb.Bitmap(values).write(path)
-    sentence = refused(mi_rgb, {"type": "mipmap", "filename": path})
-    assert f'parameter "filename": {path}: found values up to 1e+12 in the map "image"' in sentence
-
-
-@pytest.mark.parametrize("value", [1e30, 1e300, -1e30, math.nan])
-def test_properties(mi_rgb, image_file, value):
-    mi = mi_rgb
-    for name in ("base_color", "roughness", "metallic", "specular", "eta", "clearcoat", "sheen", "anisotropic"):
-        assert f'parameter "{name}": found {value:g}, allowed is [' in refused(mi, {"type": "disney", name: value})
-    stretched = {"type": "neural_image", "filename": image_file}
-    matrix = mi.ScalarTransform4f([[value, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-    sentence = refused(mi, {**stretched, "to_uv": matrix})
-    assert 'parameter "to_uv": found an entry of ' in sentence and "allowed are up to 1e+18" in sentence
-
-
-@pytest.mark.parametrize("value", [1e31, 1e300, math.nan, -1.0])
-def test_sampling_rates(mi_rgb, value):
-    name = "main_specular_sampling_rate"
-    found = refused(mi_rgb, {"type": "disney", name: value})
-    assert f'parameter "{name}": found {value:g}, allowed is [0, 1e+30]' in found
-    assert np.isfinite(image(mi_rgb, {"type": "disney", name: 1e30})).all()
-
-
-@pytest.mark.parametrize("value", [1e30, -1e30])
-def test_textures_of_a_parameter_are_clamped(mi_rgb, value):
-    """As the parameters of ``disney`` are in any texture: also in one of Mitsuba's own, which is not checked."""
-    texture = {"type": "bitmap", "bitmap": mi_rgb.Bitmap(np.full((4, 4, 3), value, np.float32)), "raw": True}
-    for name in ("base_color", "roughness", "metallic", "specular", "clearcoat", "sheen", "anisotropic"):
-        assert np.isfinite(image(mi_rgb, {"type": "disney", name: texture})).all()
+def test_transformations_of_coordinates(mi_rgb, image_file):
+    for value in (1e30, 1e300, math.nan):
+        matrix = mi_rgb.ScalarTransform4f([[value, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+        sentence = refused(mi_rgb, {"type": "neural_image", "filename": image_file, "to_uv": matrix})
+        assert 'parameter "to_uv": found an entry of ' in sentence and "allowed are up to 1e+18" in sentence

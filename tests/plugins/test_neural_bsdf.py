@@ -5,7 +5,8 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 import pytest
-from arrays import aligned, numpy_of
+from arrays import numpy_of
+from bsdf_queries import interactions, random_directions, uniform, vectors
 from learned_bsdfs import formula, handmade
 from variants import VARIANTS, set_variant
 
@@ -31,32 +32,13 @@ def files(tmp_path_factory):
     return {path.stem: str(path) for path in folder.glob("*.npz")}
 
 
-def directions(rng, n, low=0.02):
-    z, phi = low + (1 - low) * rng.random(n), 2 * np.pi * rng.random(n)
-    r = np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1).astype(np.float32)
-
-
-def hits(mi, wi):
-    si = dr.zeros(mi.SurfaceInteraction3f, len(wi))
-    si.wi = mi.Vector3f(aligned(wi.T))
-    if mi.is_spectral:
-        si.wavelengths = mi.UnpolarizedSpectrum(450, 520, 580, 650)
-    return si
-
-
-def uniform(mi, rng, n):
-    u = [mi.Float(aligned(rng.random(n))) for _ in range(3)]
-    return u[0], mi.Point2f(u[1], u[2])
-
-
 @pytest.mark.parametrize("name", ["isotropic", "anisotropic", "beckmann"])
 def test_values_and_densities(mi_rgb, files, rng, name):
     """``eval`` is the formula times the cosine; ``eval_pdf``, ``pdf`` and ``sample`` agree with it."""
     mi, n, ctx = mi_rgb, 4000, mi_rgb.BSDFContext()
     bsdf = mi.load_dict({"type": "neural_bsdf", "filename": files[name], "scale": 0.5})
-    wi, wo = directions(rng, n), directions(rng, n)
-    si, towards = hits(mi, wi), mi.Vector3f(aligned(wo.T))
+    wi, wo = random_directions(rng, n, 0.05), random_directions(rng, n, 0.05)
+    si, towards = interactions(mi, wi), vectors(mi, wo)
     value, pdf = bsdf.eval_pdf(ctx, si, towards)
     expected = 0.5 * wo[:, 2:] * formula(load_table(files[name]), wi.astype(float), wo.astype(float))
     bs, weight = bsdf.sample(ctx, si, *uniform(mi, rng, n))
@@ -70,20 +52,6 @@ def test_values_and_densities(mi_rgb, files, rng, name):
     assert 0.8 < valid.mean() <= 1
     np.testing.assert_allclose(results[valid, 8], results[valid, 9], rtol=1e-4)
     np.testing.assert_allclose(results[valid, 10:13] * results[valid, 8:9], results[valid, 13:16], rtol=1e-3, atol=1e-6)
-
-
-def test_chi2(mi_rgb, files, tmp_path, monkeypatch):
-    """Samples follow the density, at 20° and 80°, seen from the back, too."""
-    from mitsuba.chi2 import BSDFAdapter, ChiSquareTest, SphericalDomain
-
-    monkeypatch.chdir(tmp_path)  # where a failing test leaves its histogram
-    xml = f'<string name="filename" value="{files["isotropic"]}"/><boolean name="two_sided" value="true"/>'
-    for angle in (20, 80, 150):
-        theta = np.radians(angle)
-        wi = dr.opaque(mi_rgb.Vector3f, [np.sin(theta), 0, np.cos(theta)])  # one kernel for all
-        sample, pdf = BSDFAdapter("neural_bsdf", xml, wi=wi)
-        test = ChiSquareTest(SphericalDomain(), sample, pdf, sample_dim=3, sample_count=500_000, res=61, ires=32)
-        assert test.run(test_count=3, quiet=True), test.messages
 
 
 @pytest.mark.slow
@@ -105,7 +73,7 @@ def test_chi2_of_the_library(mi_rgb, path, tmp_path, monkeypatch):
 def test_sides(mi_rgb, files, rng):
     """The back is black, or with ``two_sided`` looks like the front; no light passes."""
     mi, ctx = mi_rgb, mi_rgb.BSDFContext()
-    wi, wo = directions(rng, 500), directions(rng, 500)
+    wi, wo = random_directions(rng, 500, 0.05), random_directions(rng, 500, 0.05)
     one, two = (
         mi.load_dict({"type": "neural_bsdf", "filename": files["isotropic"], "two_sided": t}) for t in (False, True)
     )
@@ -114,45 +82,13 @@ def test_sides(mi_rgb, files, rng):
     for bsdf in (one, two):
         for a, b in signs:
             flip = np.float32([1, 1, a]), np.float32([1, 1, b])
-            columns += list(bsdf.eval(ctx, hits(mi, wi * flip[0]), mi.Vector3f(aligned((wo * flip[1]).T))))
+            columns += list(bsdf.eval(ctx, interactions(mi, wi * flip[0]), vectors(mi, wo * flip[1])))
     values = numpy_of(columns).reshape(500, 2, 4, 3)
     front = values[:, 0, 0]
     assert front.min() > 0
     np.testing.assert_array_equal(values[:, 0, 1:], 0)
     np.testing.assert_array_equal(values[:, 1, :2], np.stack([front, front], axis=1))
     np.testing.assert_array_equal(values[:, 1, 2:], 0)
-
-
-def test_derivatives(mi_rgb, files, rng):
-    """Derivatives by parameters of the proxy and entries agree with finite differences."""
-    mi, ctx = mi_rgb, mi_rgb.BSDFContext()
-    bsdf = mi.load_dict({"type": "neural_bsdf", "filename": files["isotropic"], "storage": "float32"})
-    params = mi.traverse(bsdf)
-    wi, wo = directions(rng, 256, 0.2), directions(rng, 256, 0.2)
-    si, towards = hits(mi, wi), mi.Vector3f(aligned(wo.T))
-
-    def total():
-        return dr.sum(sum(bsdf.eval(ctx, si, towards)))
-
-    for key, step in (("first.alpha_u", 1e-3), ("second.gamma", 1e-2), ("edge", 1e-2), ("scale", 1e-2)):
-        before = mi.Float(params[key]) - (0.5 if key == "scale" else 0)
-        ends = []
-        for sign in (1, -1):
-            params[key] = before + sign * step
-            params.update()
-            ends.append(float(total()[0]))
-        params[key] = before
-        dr.enable_grad(params[key])
-        params.update()
-        dr.backward(total())
-        slope = float(dr.grad(params[key])[0])
-        params[key] = dr.detach(before)
-        params.update()
-        assert slope == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=0.02, abs=1e-3), key
-    dr.enable_grad(params["tables.cascaded"])
-    params.update()
-    dr.backward(total())
-    assert np.abs(dr.grad(params["tables.cascaded"]).numpy()).max() > 1e-3
 
 
 def test_changed_parameters_are_saved(mi_rgb, files, tmp_path):
@@ -184,9 +120,9 @@ def test_reports(mi_rgb, files):
 def test_other_variants(variant, files, rng):
     """Greys are the same in all variants; a polarised one depolarises."""
     mi = set_variant(variant)
-    wi, wo = directions(rng, 64), directions(rng, 64)
+    wi, wo = random_directions(rng, 64, 0.05), random_directions(rng, 64, 0.05)
     bsdf = mi.load_dict({"type": "neural_bsdf", "filename": files["isotropic"]})
-    value = bsdf.eval(mi.BSDFContext(), hits(mi, wi), mi.Vector3f(aligned(wo.T)))
+    value = bsdf.eval(mi.BSDFContext(), interactions(mi, wi), vectors(mi, wo))
     if mi.is_polarized:
         assert float(dr.max(dr.abs(value[1, 1][0]))[0]) == 0
         value = value[0, 0]
@@ -198,23 +134,6 @@ def test_other_variants(variant, files, rng):
         np.testing.assert_allclose(value[:, 0], luminance, rtol=5e-3)
     else:
         assert (value.max(axis=1) < 1.02 * rgb.max(axis=1)).all() and (value.max(axis=1) > 0.8 * rgb.max(axis=1)).all()
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"filename": ""}, "filename"),
-        ({"scale": 1.5}, r'parameter "scale": found 1.5, allowed is \[0, 1\]'),
-        ({"energy": "low"}, 'parameter "energy": found "low", allowed are source, raw'),
-        ({"two_sided": 3}, 'parameter "two_sided": found 3, allowed are true and false'),
-    ],
-)
-def test_bad_parameters(mi_rgb, files, changes, message):
-    given = {"type": "neural_bsdf", "filename": files["isotropic"], **changes}
-    if not given["filename"]:
-        del given["filename"]
-    with pytest.raises(RuntimeError, match=message):
-        mi_rgb.load_dict(given)
 
 
 def recorded(folder, source, **settings):
@@ -231,22 +150,22 @@ CHECKER = {"type": "checkerboard", "color0": {"type": "rgb", "value": 0.1}, "col
 def test_sources_in_the_place_of_files(mi_rgb, tmp_path, rng):
     """``evaluate="source"`` is the source: Mitsuba's own object, or of textures the point that was fitted."""
     mi, ctx = mi_rgb, mi_rgb.BSDFContext()
-    wi, wo = directions(rng, 64), directions(rng, 64)
+    wi, wo = random_directions(rng, 64, 0.05), random_directions(rng, 64, 0.05)
     plastic = {"type": "roughplastic", "alpha": 0.2}
     given = recorded(tmp_path, plastic)
     expected = mi.load_dict(plastic)
     for changes, sign in (({}, 1), ({"two_sided": True}, -1)):
         source = mi.load_dict({**given, **changes})
         side = np.float32([1, 1, sign])
-        shown = [b.eval(ctx, hits(mi, w), mi.Vector3f(aligned(v.T)))
+        shown = [b.eval(ctx, interactions(mi, w), vectors(mi, v))
                  for b, w, v in ((source, wi * side, wo * side), (expected, wi, wo))]  # fmt: skip
         np.testing.assert_array_equal(numpy_of(shown[0]), numpy_of(shown[1]))
         assert type(source).__name__ != "NeuralBSDF"
     checked = {"type": "diffuse", "reflectance": CHECKER}
     textured = mi.load_dict(recorded(tmp_path, checked, uv=[0.25, 0.75]))
-    si, towards = hits(mi, wi), mi.Vector3f(aligned(wo.T))
+    si, towards = interactions(mi, wi), vectors(mi, wo)
     value, pdf = textured.eval_pdf(ctx, si, towards)
-    elsewhere, there = hits(mi, wi), hits(mi, wi)
+    elsewhere, there = interactions(mi, wi), interactions(mi, wi)
     there.uv = mi.Point2f(0.25, 0.75)
     expected, other = (numpy_of(mi.load_dict(checked).eval(ctx, at, towards)) for at in (there, elsewhere))
     np.testing.assert_allclose(numpy_of(value), expected, rtol=1e-5)

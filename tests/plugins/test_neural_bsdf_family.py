@@ -3,9 +3,9 @@
 import drjit as dr
 import numpy as np
 import pytest
-from arrays import aligned, numpy_of
+from arrays import numpy_of
+from bsdf_queries import interactions, random_directions, uniform, vectors
 from learned_bsdfs import formula, handmade_family, member
-from variants import VARIANTS, set_variant
 
 import mi_diffind
 from mi_diffind.arrays.tables import load_table, save_table
@@ -18,24 +18,8 @@ def file(tmp_path_factory):
     return str(path)
 
 
-def directions(rng, n, low=0.05):
-    z, phi = low + (1 - low) * rng.random(n), 2 * np.pi * rng.random(n)
-    r = np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1).astype(np.float32)
-
-
-def hits(mi, wi, u=None):
-    si = dr.zeros(mi.SurfaceInteraction3f, len(wi))
-    si.wi = mi.Vector3f(aligned(wi.T))
-    if u is not None:
-        si.uv = mi.Point2f(mi.Float(aligned(u)), 0.5)
-    if mi.is_spectral:
-        si.wavelengths = mi.UnpolarizedSpectrum(450, 520, 580, 650)
-    return si
-
-
-def bitmap(mi, values):
-    """A row of texels, read without interpolation."""
+def row(mi, values):
+    """A texture of a row of texels."""
     image = mi.Bitmap(np.float32(values).reshape(1, -1, 1))
     return {"type": "bitmap", "bitmap": image, "raw": True, "filter_type": "nearest"}
 
@@ -43,10 +27,10 @@ def bitmap(mi, values):
 def test_numbers(mi_rgb, file, rng):
     """``eval`` is the formula of the member times the cosine; the default is the middle of the range."""
     mi, ctx = mi_rgb, mi_rgb.BSDFContext()
-    wi, wo = directions(rng, 500), directions(rng, 500)
+    wi, wo = random_directions(rng, 500, 0.05), random_directions(rng, 500, 0.05)
     for given, expected in (({"roughness": 0.1, "metallic": 0.25}, (0.1, 0.25)), ({}, (0.2, 0.5))):
         bsdf = mi.load_dict({"type": "neural_bsdf", "filename": file, **given})
-        value = numpy_of(bsdf.eval(ctx, hits(mi, wi), mi.Vector3f(aligned(wo.T))))
+        value = numpy_of(bsdf.eval(ctx, interactions(mi, wi), vectors(mi, wo)))
         truth = wo[:, 2:] * formula(member(load_table(file), *expected), wi.astype(float), wo.astype(float))
         np.testing.assert_allclose(value, truth, rtol=5e-3)
 
@@ -57,24 +41,25 @@ def test_textures(mi_rgb, file, rng, is_textured):
     ``sample`` agree with ``eval``."""  # fmt: skip
     mi, n, ctx = mi_rgb, 2000, mi_rgb.BSDFContext()
     texels, meant = [0.1, 0.6, -3.0, 7.0, np.nan, np.inf], [0.1, 0.6, 0.05, 0.8, 0.05, 0.8]
-    wi, wo = directions(rng, n), directions(rng, n)
+    wi, wo = random_directions(rng, n, 0.05), random_directions(rng, n, 0.05)
     lane = np.arange(n) % len(texels)
     load = {"type": "neural_bsdf", "filename": file, "metallic": 0.3}
-    more = {"metallic": bitmap(mi, [0.3] * 6)} if is_textured else {}
-    bsdf = mi.load_dict({**load, **more, "roughness": bitmap(mi, texels)})
+    more = {"metallic": row(mi, [0.3] * 6)} if is_textured else {}
+    bsdf = mi.load_dict({**load, **more, "roughness": row(mi, texels)})
     assert bsdf.known == [False, not is_textured]
     assert mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy)
-    si, towards = hits(mi, wi, (lane + 0.5) / len(texels)), mi.Vector3f(aligned(wo.T))
+    si, towards = interactions(mi, wi, lane, len(texels)), vectors(mi, wo)
     value, pdf = bsdf.eval_pdf(ctx, si, towards)
     value, pdf = numpy_of(value), pdf.numpy()
     for k, roughness in enumerate(meant):
         lanes = lane == k
         one = mi.load_dict({**load, "roughness": roughness})
-        expected = numpy_of([*one.eval(ctx, hits(mi, wi), towards), one.pdf(ctx, hits(mi, wi), towards)])
+        expected = numpy_of(
+            [*one.eval(ctx, interactions(mi, wi), towards), one.pdf(ctx, interactions(mi, wi), towards)]
+        )
         np.testing.assert_allclose(value[lanes], expected[lanes, :3], rtol=2e-4)
         np.testing.assert_allclose(pdf[lanes], expected[lanes, 3], rtol=2e-4)
-    u = [mi.Float(aligned(rng.random(n))) for _ in range(3)]
-    bs, weight = bsdf.sample(ctx, si, u[0], mi.Point2f(u[1], u[2]))
+    bs, weight = bsdf.sample(ctx, si, *uniform(mi, rng, n))
     results = numpy_of([bs.pdf, bsdf.pdf(ctx, si, bs.wo), *weight, *bsdf.eval(ctx, si, bs.wo)])
     valid = results[:, 0] > 0
     assert 0.7 < valid.mean() <= 1 and np.isfinite(results).all()
@@ -82,31 +67,15 @@ def test_textures(mi_rgb, file, rng, is_textured):
     np.testing.assert_allclose(results[valid, 2:5] * results[valid, :1], results[valid, 5:], rtol=1e-3, atol=1e-6)
 
 
-def test_chi2(mi_rgb, file, tmp_path, monkeypatch):
-    """Samples follow the density at three angles, of a sharp and of a rough member."""
-    from mitsuba.chi2 import BSDFAdapter, ChiSquareTest, SphericalDomain
-
-    monkeypatch.chdir(tmp_path)  # where a failing test leaves its histogram
-    for roughness, metallic in ((0.3, 0.1), (0.75, 0.9)):
-        xml = f'<string name="filename" value="{file}"/><float name="roughness" value="{roughness}"/>'
-        xml += f'<float name="metallic" value="{metallic}"/>'
-        for angle in (5, 50, 80):
-            theta = np.radians(angle)
-            wi = dr.opaque(mi_rgb.Vector3f, [np.sin(theta), 0, np.cos(theta)])  # one kernel for all
-            sample, pdf = BSDFAdapter("neural_bsdf", xml, wi=wi)
-            test = ChiSquareTest(SphericalDomain(), sample, pdf, sample_dim=3, sample_count=300_000, res=61, ires=32)
-            assert test.run(test_count=6, quiet=True), test.messages
-
-
 def test_derivatives(mi_rgb, file, rng):
     """Derivatives by a texel and by a number agree with finite differences; tables can be optimised."""
     mi, ctx = mi_rgb, mi_rgb.BSDFContext()
-    texture = bitmap(mi, [0.1, 0.3, 0.6, 0.0])
+    texture = row(mi, [0.1, 0.3, 0.6, 0.0])
     bsdf = mi.load_dict({"type": "neural_bsdf", "filename": file, "storage": "float32", "metallic": 0.3,
                          "roughness": texture})  # fmt: skip
     params = mi.traverse(bsdf)
-    wi, wo = directions(rng, 300, 0.2), directions(rng, 300, 0.2)
-    si, towards = hits(mi, wi, (np.arange(300) % 4 + 0.5) / 4), mi.Vector3f(aligned(wo.T))
+    wi, wo = random_directions(rng, 300, 0.2), random_directions(rng, 300, 0.2)
+    si, towards = interactions(mi, wi, np.arange(300) % 4, 4), vectors(mi, wo)
 
     def total():
         return dr.sum(sum(bsdf.eval(ctx, si, towards)))
@@ -140,8 +109,8 @@ def test_a_constant_member_is_computed_once(mi_rgb, file, rng):
     """A member of constant parameters has the values of the tables, follows changes, and is differentiable."""
     mi, ctx = mi_rgb, mi_rgb.BSDFContext()
     bsdf = mi.load_dict({"type": "neural_bsdf", "filename": file, "roughness": 0.2, "metallic": 0.3})
-    wi, wo = directions(rng, 200, 0.2), directions(rng, 200, 0.2)
-    si, towards = hits(mi, wi), mi.Vector3f(aligned(wo.T))
+    wi, wo = random_directions(rng, 200, 0.2), random_directions(rng, 200, 0.2)
+    si, towards = interactions(mi, wi), vectors(mi, wo)
     params, ends = mi.traverse(bsdf), []
 
     def value():
@@ -173,22 +142,3 @@ def test_changed_tables_are_saved(mi_rgb, file, tmp_path):
     mi_diffind.save(bsdf, tmp_path / "saved.npz")
     before, after = (load_table(path).arrays["proxy"].values for path in (file, tmp_path / "saved.npz"))
     np.testing.assert_allclose(after, before - 0.05, atol=5e-3)
-
-
-@pytest.mark.parametrize("variant", [name for name in VARIANTS if not name.endswith("_rgb")])
-def test_other_variants(variant, file, rng):
-    mi = set_variant(variant)
-    wi, wo = directions(rng, 64), directions(rng, 64)
-    bsdf = mi.load_dict({"type": "neural_bsdf", "filename": file, "roughness": bitmap(mi, [0.2, 0.4])})
-    value = numpy_of([bsdf.eval_pdf(mi.BSDFContext(), hits(mi, wi), mi.Vector3f(aligned(wo.T)))[1]])
-    assert (value > 0).all() and np.isfinite(value).all()
-
-
-def test_bad_parameters(mi_rgb, file):
-    load = {"type": "neural_bsdf", "filename": file}
-    with pytest.raises(RuntimeError, match=r'parameter "roughness": found 0.01, allowed is \[0.05, 0.8\]'):
-        mi_rgb.load_dict({**load, "roughness": 0.01})
-    with pytest.raises(RuntimeError, match="alpha"):
-        mi_rgb.load_dict({**load, "alpha": 0.1})
-    report = mi_rgb.load_dict({**load, "metallic": 0.5}).report()
-    assert report["effects_in_use"] == ["residual", "diffuse", "first", "second", "energy"]

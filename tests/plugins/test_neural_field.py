@@ -756,15 +756,15 @@ def test_arrays_of_a_file_can_be_optimised(mi_rgb, fields, file):
 def test_reflections_of_a_file(mi_rgb, fields, file, tmp_path):
     """They change with the environment, and derivatives reach it, the normals, and the place of the field."""
     from mi_diffind.arrays.tables import save_table
-    from mi_diffind.tasks.radiance import TASK, files, reflection
+    from mi_diffind.tasks.radiance import TASK, files, volume_field
 
     mi = mi_rgb
     rng = np.random.default_rng(8)
-    grid = files.grid_of(files.load(file), compat.module_of(mi.Float)).reflecting()
+    grid = files.grid_of(files.load(file), compat.module_of(mi.Float)).with_reflections()
     place = grid.nodes.positions() - (np.array(grid.nodes.shape) - 1) / 2
-    grid.colour[1:, reflection.NORMAL] = place / np.maximum(np.linalg.norm(place, axis=1, keepdims=True), 1)
-    grid.colour[:, reflection.TINT] = -0.5
-    for part in np.split(grid.environment, [reflection.SIDES[0] ** 2]):
+    grid.colour[1:, volume_field.NORMAL] = place / np.maximum(np.linalg.norm(place, axis=1, keepdims=True), 1)
+    grid.colour[:, volume_field.TINT] = -0.5
+    for part in np.split(grid.environment, [volume_field.SIDES[0] ** 2]):
         side = int(len(part) ** 0.5)
         smooth = gaussian_filter(rng.normal(0, 1, (side, side, 4)), (side / 8, side / 8, 0))
         part += (smooth / smooth.std()).reshape(-1, 4)

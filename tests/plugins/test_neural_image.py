@@ -28,7 +28,7 @@ from mi_diffind.measure.operations import bsdf_operations, count
 from mi_diffind.scenes import comparison, loading
 from mi_diffind.tasks.ggx import TASK as GGX
 from mi_diffind.tasks.image import TASK
-from mi_diffind.tasks.image.compressed import CompressedImage
+from mi_diffind.tasks.image.arrays import CompressedImage
 
 WIDTH, HEIGHT = 12, 10
 

@@ -85,7 +85,7 @@ def analytic(o, d):
 
 def test_sparse_grids_are_traced_where_their_surface_is(mi_rgb, folder, rng):
     """From cell to cell, hits are those of sphere tracing through the same field, and near the torus itself."""
-    from mi_diffind.tasks.sdf import TASK, grids, tracing
+    from mi_diffind.tasks.sdf import TASK, grids, marching
 
     mi = mi_rgb
     field = TASK.open(mi.TensorXf, folder / "torus.npz").field
@@ -94,12 +94,12 @@ def test_sparse_grids_are_traced_where_their_surface_is(mi_rgb, folder, rng):
     angle = rng.uniform(0, 2 * np.pi, len(o))
     o[within] = np.stack([0.38 * np.cos(angle), 0.38 * np.sin(angle), 0.05 * np.sin(9 * angle)], 1)[within]
     p, v = (mi.Vector3f(*(mi.Float(aligned(x)) for x in values.T)) for values in (o, d))
-    hit = tracing.intersect(field, p, v, dr.inf)
+    hit = marching.intersect(field, p, v, dr.inf)
     dr.eval(hit)  # at once: each result of its own would be another kernel
     t, result = np.array(hit.t), np.array(hit.hit)
-    near, far, active = tracing.enter(field, p, v, mi.Float(dr.inf))
+    near, far, active = marching.enter(field, p, v, mi.Float(dr.inf))
     start = dr.clip(dr.fma(v, near, p), mi.Vector3f(*field.lower), mi.Vector3f(*field.upper))
-    other, slow, _ = tracing.sphere_trace(field, start, v, far - near, near == 0, active)
+    other, slow, _ = marching.sphere_trace(field, start, v, far - near, near == 0, active)
     slow = np.array(dr.select(other, near + slow, dr.inf))
     assert (np.array(hit.leaving) == within).all() and result[within].all()
     assert np.isclose(t, slow, rtol=0, atol=2e-4).mean() > 0.995
@@ -113,7 +113,7 @@ def test_sparse_grids_are_traced_where_their_surface_is(mi_rgb, folder, rng):
 
 def test_axis_aligned_rays_through_cells(mi_rgb, folder):
     """Also those that run exactly in the sides of cells, and those from far away."""
-    from mi_diffind.tasks.sdf import TASK, tracing
+    from mi_diffind.tasks.sdf import TASK, marching
 
     mi = mi_rgb
     field = TASK.open(mi.TensorXf, folder / "torus.npz").field
@@ -131,7 +131,7 @@ def test_axis_aligned_rays_through_cells(mi_rgb, folder):
                         side = np.hypot(*[0.5, 0]) if offset else 0.38 + np.sqrt(0.12**2 - at[2] ** 2)
                     o.append(origin), d.append(direction), expected.append(distance - side)
     o, d = (mi.Vector3f(*(mi.Float(aligned(x)) for x in np.transpose(values))) for values in (o, d))
-    hit = tracing.intersect(field, o, d, dr.inf)
+    hit = marching.intersect(field, o, d, dr.inf)
     dr.eval(hit)
     assert np.array(hit.hit).all()
     assert np.abs(np.array(hit.t) - expected).max() < 3e-3

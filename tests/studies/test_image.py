@@ -16,9 +16,8 @@ from mi_diffind.fitting import loop
 from mi_diffind.images import metrics
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.studies.baselines import codecs
-from mi_diffind.tasks.image import training
-from mi_diffind.tasks.image.compressed import CompressedImage
-from mi_diffind.tasks.image.presets import IMPROVEMENTS, replaced
+from mi_diffind.tasks.image import IMPROVEMENTS, replaced, training
+from mi_diffind.tasks.image.arrays import CompressedImage
 
 #: Steps of a training.
 STEPS = 8
@@ -37,9 +36,9 @@ def requested_seconds():
     seconds, fit_image = [], training.fit_image
 
     def stepwise(source, size, recipe, request, *options):
-        seconds.append(request.seconds)
+        seconds.append(request.deadline.total)
         recipe = replaced(recipe, steps=STEPS, batch=2**12)
-        return fit_image(source, size, recipe, dataclasses.replace(request, seconds=None, deadline=None), *options)
+        return fit_image(source, size, recipe, dataclasses.replace(request, deadline=None), *options)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training, "fit_image", stepwise)

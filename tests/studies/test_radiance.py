@@ -15,7 +15,8 @@ from mi_diffind.measure import benchmark
 from mi_diffind.studies.baselines import node_codes, radiance_factors, radiance_fits
 from mi_diffind.studies.radiance import conclusions
 from mi_diffind.studies.radiance import plan as plans
-from mi_diffind.tasks.radiance import march, visual_hull
+from mi_diffind.tasks.radiance import march
+from mi_diffind.tasks.radiance import views as view_files
 from mi_diffind.tasks.radiance.nodes import Nodes, cells_of, corners_of
 from mi_diffind.tasks.radiance.session import FieldSession
 from mi_diffind.tasks.radiance.volume_field import FAINT, NodeField
@@ -286,7 +287,7 @@ def finished(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         small = benchmark.BenchmarkSettings(2**10, 2, 1, 2**10, True)
         patch.setattr(benchmark.BenchmarkSettings, "choose", classmethod(lambda cls, variant, quick=False: small))
-        patch.setattr(visual_hull, "SEARCH", 32)
+        patch.setattr(view_files, "SEARCH", 32)
         assert main([*command(folder), "--json", str(folder / "r.json")]) == 0
     return folder
 

@@ -22,7 +22,7 @@ from mi_diffind.studies.sdf import conclusions, contenders, parts
 from mi_diffind.studies.sdf.contenders import DistanceStudySettings
 from mi_diffind.studies.sdf.plan import plan as plan_of
 from mi_diffind.studies.sdf.view import MeshView, scene_distance, traced_distance
-from mi_diffind.tasks.sdf import encoding, nodes, tracing
+from mi_diffind.tasks.sdf import encoding, marching, nodes
 from mi_diffind.tasks.sdf.fit import NodeProblem
 from mi_diffind.tasks.sdf.mesh import make_mesh
 
@@ -263,7 +263,7 @@ def test_nodes_without_indirection(rng, tmp_path):
     assert np.abs(found - h * expected.clip(-2, 2)).max() < 1e-5
     away = rng.normal(size=(3000, 3))
     away /= np.linalg.norm(away, axis=1, keepdims=True)
-    t, hit = tracing.trace(field, arrays(0.9 * away), arrays(-away), math.inf)
+    t, hit = marching.trace(field, arrays(0.9 * away), arrays(-away), math.inf)
     met = (0.9 - t.numpy()[:, None]) * away
     assert hit.numpy().all() and np.abs(np.linalg.norm(met, axis=1) - 0.5).max() < 1.5 * h
     assert np.abs(field.value(arrays(met)).numpy()).max() < 1e-4

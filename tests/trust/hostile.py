@@ -14,10 +14,10 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "helpers"))
 
-import hostile_queries
-import hostile_rays
+import hostile_inputs
 import mitsuba as mi
 import plugin_examples
+from limited_child import LimitedChild
 
 import mi_diffind
 from mi_diffind.core.files import write_json
@@ -30,21 +30,24 @@ def main() -> int:
     """Send them; return 1 if an answer was not finite."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=10**5, help="rays of each field, queries of each (default: 10⁵)")
-    parser.add_argument("--seconds", type=float, default=7200, help="limit of the time of all rays (default: 7200)")
+    parser.add_argument("--seconds", type=int, default=7200, help="limit of the time of all rays (default: 7200)")
     parser.add_argument("--json", type=Path, default=Path("trust_rays.json"), help="report to write")
     arguments = parser.parse_args()
     mi.set_variant(VARIANT)
     with tempfile.TemporaryDirectory() as folder:
-        hostile_rays.write_fields(Path(folder))
-        rays = hostile_rays.report_of(folder, arguments.count, arguments.seconds)
+        hostile_inputs.write_fields(Path(folder))
+        with LimitedChild(Path(folder), arguments.seconds, arguments.seconds) as child:
+            answer = child.check("rays", folder=folder, count=arguments.count)
+    if answer["outcome"] != "loaded":
+        raise SystemExit(answer["message"])
+    rays, queries = answer["fields"], {}
     print(*(f"{name}: {numbers}" for name, numbers in rays.items()), sep="\n", flush=True)
-    queries, wrong = {}, sum(numbers["not_finite"] for numbers in rays.values())
-    for name in filter(hostile_queries.is_queried, plugin_examples.names()):
-        faults = hostile_queries.faults(mi, name, arguments.count)
-        materials = len(hostile_queries.materials(mi, name))
-        queries[name] = {"queries": materials * arguments.count, "wrong": sum(n for n, *_ in faults.values())}
+    for name in filter(hostile_inputs.is_queried, plugin_examples.names()):
+        faults = hostile_inputs.faults(name, arguments.count)
+        sent = len(hostile_inputs.materials(name)) * arguments.count
+        queries[name] = {"queries": sent, "wrong": sum(number for number, *_ in faults.values())}
         print(f"{name}: {queries[name]} {faults or ''}", flush=True)
-        wrong += queries[name]["wrong"]
+    wrong = sum(row["not_finite"] for row in rays.values()) + sum(row["wrong"] for row in queries.values())
     report = {
         "version": mi_diffind.__version__, "machine": clock.machine(VARIANT), "date": time.strftime("%Y-%m-%d"),
         "count": arguments.count, "wrong": wrong, "rays": rays, "queries": queries,

@@ -1,7 +1,7 @@
 """Attack all readers with damaged files: ``python tests/trust/run.py --mutants N --raw M``.
 
-Prints a table of figures a file (refused, loaded, and every sort of fault) and writes it as JSON, with the shortest
-recipe of each fault. ``--add EARLIER.json --seed N`` adds other mutants to those of an earlier report.
+Prints a table of figures a file (refused, loaded, and every sort of fault) and writes it as JSON, with the lies of the
+shortest file of each fault. ``--add EARLIER.json --seed N`` adds other mutants to those of an earlier report.
 ``--seeds`` writes the small valid files of all tasks anew instead.
 """
 
@@ -24,29 +24,30 @@ from limited_child import FAULTS, GOOD, LimitedChild
 from mi_diffind import __version__
 from mi_diffind.fitting.task import tasks
 
+COLUMNS = ("mutants", *GOOD, *FAULTS)
+
 
 def make_seeds(only: list[str]) -> None:
     """Carry out the trials of all tasks, or those whose names are given, and keep their files."""
-    for task in tasks().values():
-        for name in task.trials if trial_files.has_files(task) else ():
-            path = trial_files.SEEDS / f"{task.name}_{name}.npz"
-            if not only or path.stem in only:
-                with tempfile.TemporaryDirectory() as folder:
-                    trial_files.make(task, name, Path(folder), path)
-                print(f"{path}: {path.stat().st_size:,} bytes")
+    for trial in trial_files.NAMES:
+        task, name = trial.split("/")
+        path = trial_files.SEEDS / f"{task}_{name}.npz"
+        if not only or path.stem in only:
+            with tempfile.TemporaryDirectory() as folder:
+                trial_files.make(tasks()[task], name, Path(folder), path)
+            print(f"{path}: {path.stat().st_size:,} bytes")
 
 
 def report(results: list[dict], arguments) -> dict:
     """Return the report of some campaigns, with those of an earlier report added."""
-    columns = ("mutants", *GOOD, *FAULTS)
     earlier = json.loads(arguments.add.read_text(encoding="utf-8")) if arguments.add else {"results": [], "seeds": []}
     rows = {(r["recipes"], r["target"]): dict(r) for r in earlier["results"]}
     for result in results:
-        row = rows.setdefault((result["recipes"], result["target"]), {**result, **dict.fromkeys(columns, 0)})
-        row.update({column: row[column] + result[column] for column in columns})
+        row = rows.setdefault((result["recipes"], result["target"]), {**result, **dict.fromkeys(COLUMNS, 0)})
+        row |= {column: row[column] + result[column] for column in COLUMNS}
         row["faults"] = {**row.get("faults", {}), **result["faults"]}
     totals = {
-        form: {c: sum(r[c] for r in rows.values() if r["recipes"] == form) for c in columns}
+        form: {c: sum(r[c] for r in rows.values() if r["recipes"] == form) for c in COLUMNS}
         for form in ("structured", "raw")
     }
     return {
@@ -73,40 +74,28 @@ def main() -> int:
     if arguments.seeds:
         make_seeds(arguments.only)
         return 0
-    names = arguments.only or [*campaigns.tables(), *campaigns.OTHERS]
-    began, tables, results = time.monotonic(), campaigns.tables(), []
-    columns = ("mutants", *GOOD, *FAULTS)
-    print(f"{'file':24} {'recipes':10} " + " ".join(f"{c:>13}" for c in columns))
+    names, began, results = arguments.only or [*campaigns.tables(), *campaigns.OTHERS], time.monotonic(), []
+    print(f"{'file':24} {'recipes':10} " + " ".join(f"{c:>13}" for c in COLUMNS))
     for number, name in enumerate(names):
         # Each file has an equal share of the time that is left
         share = (arguments.seconds - (time.monotonic() - began)) / (len(names) - number)
         with tempfile.TemporaryDirectory() as folder, LimitedChild(Path(folder)) as child:
-            target = tables[name] if name in tables else campaigns.OTHERS[name](child)
-            for form, recipes, count in (
-                ("structured", target.structured, arguments.mutants),
-                ("raw", target.raw, arguments.raw),
-            ):
-                end = time.monotonic() + share * count / max(1, arguments.mutants + arguments.raw)
+            target = campaigns.target(name, child)
+            for form, count in {"structured": arguments.mutants, "raw": arguments.raw}.items():
                 if count < 1:
                     continue
-                campaign = campaigns.run(
-                    child,
-                    target,
-                    recipes,
-                    count,
-                    lambda end=end: time.monotonic() < end,
-                    arguments.share,
-                    arguments.seed,
-                )
-                figures = {"recipes": form, **campaign.figures()}
+                end = time.monotonic() + share * count / (arguments.mutants + arguments.raw)
+                spare = lambda end=end: time.monotonic() < end  # noqa: E731
+                figures = campaigns.run(child, name, target, form, count, spare, arguments.share, arguments.seed)
                 results.append(figures)
-                print(f"{name:24} {form:10} " + " ".join(f"{figures[c]:13,}" for c in columns), flush=True)
-        arguments.json.write_text(json.dumps(report(results, arguments), indent=1) + "\n", encoding="utf-8")
-    total = {c: sum(r[c] for r in results) for c in columns}
-    print(f"{'all':35} " + " ".join(f"{total[c]:13,}" for c in columns))
+                print(f"{name:24} {form:10} " + " ".join(f"{figures[c]:13,}" for c in COLUMNS), flush=True)
+        text = json.dumps(report(results, arguments), indent=1, default=repr)
+        arguments.json.write_text(text + "\n", encoding="utf-8")
+    total = {c: sum(r[c] for r in results) for c in COLUMNS}
+    print(f"{'all':35} " + " ".join(f"{total[c]:13,}" for c in COLUMNS))
     for result in results:
-        for key, (message, recipe) in result["faults"].items():
-            print(f"\n{result['target']}: {key}\n  {message[:300]!r}\n  {json.dumps(recipe)[:300]}")
+        for key, (message, lies) in result["faults"].items():
+            print(f"\n{result['target']}: {key}\n  {message[:300]!r}\n  {lies!r:.300}")
     return int(any(total[fault] for fault in FAULTS))
 
 

@@ -8,7 +8,7 @@ import json
 import shutil
 
 import pytest
-from hostile_strategies import MUTANTS, hostile
+from damage import MUTANTS, hostile
 from hypothesis import given
 from hypothesis import strategies as st
 from limited_child import GOOD, LimitedChild
@@ -96,9 +96,15 @@ def child(tmp_path_factory):
         yield limited
 
 
-def check(child, name, examples):
-    parser, failures = PARSERS[name], []
-    short = SHORT.get(name)
+@pytest.mark.parametrize(
+    "name, examples",
+    [
+        *((name, 4) for name in sorted(SHORT)),
+        *(pytest.param(name, MUTANTS // 10, marks=pytest.mark.slow) for name in sorted(PARSERS)),
+    ],
+)
+def test_extreme_options(child, name, examples):
+    parser, failures, short = PARSERS[name], [], SHORT.get(name)
     if short is None:  # its source is missing, which ends the command once the options are read
         sources = ["missing.xml" for a in parser._actions if not a.option_strings and a.nargs != "*"]
         short = [*sources, *(["-o", "out.npz"] if "output" in {a.dest for a in parser._actions} else [])]
@@ -113,15 +119,3 @@ def check(child, name, examples):
 
     each()
     assert not failures, json.dumps(failures[:10], indent=1)
-
-
-@pytest.mark.parametrize("name", sorted(SHORT))
-def test_extreme_options(child, name):
-    assert name in PARSERS
-    check(child, name, 4)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(PARSERS))
-def test_many_extreme_options(child, name):
-    check(child, name, MUTANTS // 10)

@@ -11,6 +11,7 @@ import killed_runs
 import numpy as np
 import pytest
 import trial_files
+from PIL import Image
 
 from mi_diffind.fitting.task import tasks
 
@@ -19,60 +20,62 @@ SCENE = """
     <integrator type="direct"/>
     <emitter type="constant"/>
     <shape type="sphere"><float name="radius" value="0.5"/></shape>
+    <bsdf type="roughplastic" id="paint"><float name="alpha" value="0.2"/></bsdf>
 </scene>
 """
-
 
 #: Name of all checkpoints here.
 STATE = "state.npz"
 
+#: Words of a fit with a checkpoint.
+FIT = ["-o", "own.npz", "--checkpoint", STATE, "--variant", "llvm_ad_rgb"]
 
-def kill_and_go_on(command, folder, whole, kills, prepare="", resume=(), seed=1):
-    """Kill a command ``kills`` times at drawn moments, each time going on; then let it end."""
-    rng, killed = random.Random(seed), 0
-    for _ in range(kills):
-        calls = rng.randrange(whole["calls"] // 3, whole["calls"])
-        again = [*command, *resume] if (folder / STATE).exists() else command
-        killed += killed_runs.run(again, folder, str(calls), prepare) is None
-    assert killed >= 1, "the moments lie after the end of the run"
-    # A run that was killed before its first checkpoint has none to go on from
-    return killed_runs.run([*command, *(resume if (folder / STATE).exists() else ())], folder, prepare=prepare)
+
+def kill_and_go_on(command, folder, kills=1, prepare="", resume=()):
+    """Run a command in ``folder / "whole"``; in ``folder / "killed"``, kill it at drawn moments, each time going on.
+
+    Returns the files of both folders.
+    """
+    whole, killed = (folder / name for name in ("whole", "killed"))
+    for each in (whole, killed):
+        each.mkdir()
+    calls, rng = killed_runs.run(command, whole, prepare=prepare), random.Random(1)
+
+    def again():  # a run that was killed before its first checkpoint has none to go on from
+        return [*command, *(resume if (killed / STATE).exists() else ())]
+
+    moments = [str(rng.randrange(calls // 3, calls)) for _ in range(kills)]
+    ended = [killed_runs.run(again(), killed, moment, prepare) for moment in moments]
+    assert None in ended, "the moments lie after the end of the run"
+    killed_runs.run(again(), killed, prepare=prepare)
+    return killed_runs.files(whole), killed_runs.files(killed)
+
+
+def assert_same(first, second, differing=()):
+    """Assert that two folders hold the same files, with the same bytes but for those that hold times."""
+    assert list(first) == list(second)
+    assert [name for name, content in first.items() if content != second[name] and name not in differing] == []
 
 
 def test_a_training(tmp_path):
-    command = ["fit", "ggx", "-o", "own.npz", "--checkpoint", "state.npz", "--steps", "401", "--batch", "64",
-               "--primary", "4", "--cascaded", "3", "--variant", "llvm_ad_rgb"]  # fmt: skip
-    for name in ("whole", "killed"):
-        (tmp_path / name).mkdir()
-    prepare = "killed_runs:measure_little"
-    whole = killed_runs.run(command, tmp_path / "whole", prepare=prepare)
-    kill_and_go_on(command, tmp_path / "killed", whole, 1, prepare, ["--resume"])
-    assert_same(tmp_path / "whole", tmp_path / "killed", differing={"state.npz"})
+    command = ["fit", "ggx", *FIT, "--steps", "401", "--batch", "64", "--primary", "4", "--cascaded", "3"]
+    files = kill_and_go_on(command, tmp_path, 1, "measure_little", ["--resume"])
+    assert_same(*files, differing={STATE})
 
 
 def test_a_capture(tmp_path):
     (tmp_path / "scene.xml").write_text(SCENE)
     command = ["capture", "../scene.xml", "-o", "views", "--views", "3", "--test", "1", "--resolution", "8",
                "--spp", "2", "--variant", "llvm_ad_rgb"]  # fmt: skip
-    for name in ("whole", "killed"):
-        (tmp_path / name).mkdir()
-    whole = killed_runs.run(command, tmp_path / "whole")
-    kill_and_go_on(command, tmp_path / "killed", whole, 1)
-    assert_same(tmp_path / "whole", tmp_path / "killed")
+    assert_same(*kill_and_go_on(command, tmp_path))
 
 
 def test_a_study(tmp_path):
     """Times differ from run to run, trained parameters and their errors do not."""
     command = ["tradeoff", "killed", "--quick", "--out", "out", "--variant", "llvm_ad_rgb"]
-    for name in ("whole", "killed"):
-        (tmp_path / name).mkdir()
-    prepare = "killed_runs:small_study"
-    whole = killed_runs.run(command, tmp_path / "whole", prepare=prepare)
-    kill_and_go_on(command, tmp_path / "killed", whole, 1, prepare)
-    first, second = (killed_runs.files(tmp_path / name) for name in ("whole", "killed"))
+    first, second = kill_and_go_on(command, tmp_path, prepare="small_study")
     assert list(first) == list(second)
-    results = [json.loads(files["out/tradeoff_killed.json"]) for files in (first, second)]
-    records = [result["jobs"]["training"] for result in results]
+    records = [json.loads(files["out/tradeoff_killed.json"])["jobs"]["training"] for files in (first, second)]
     for key in ("steps", "psnr_db", "gain_db", "converged", "entries"):
         assert records[0][key] == records[1][key]
     models = [next(p for p in (tmp_path / n).rglob("training.npz")) for n in ("whole", "killed")]
@@ -90,64 +93,33 @@ def test_no_temporary_file_outlives_the_next_run(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
 
 
-def assert_same(first: Path, second: Path, differing=frozenset()):
-    """Assert that two folders hold the same files, with the same bytes but for those that hold times."""
-    first, second = killed_runs.files(first), killed_runs.files(second)
-    assert list(first) == list(second)
-    for name, content in first.items():
-        assert content == second[name] or name in differing, name
-
-
-# -- all tasks ---------------------------------------------------------------------------------------------------------
-
-#: Tasks whose command line needs a source, as a file.
+#: Sources of trials, as files.
 SOURCES = {"maps": "maps.json", "mesh": "ball.ply", "bsdf": "scene.xml", "views": "views"}
-
-BSDF = """
-<scene version="3.0.0"><bsdf type="roughplastic" id="paint"><float name="alpha" value="0.2"/></bsdf></scene>
-"""
 
 
 def write_source(name, folder):
     """Write the small source of a trial as a file; returns its name."""
     source = trial_files.sources(folder)[name]()
     if name == "bsdf":
-        (folder / "scene.xml").write_text(BSDF)
+        (folder / "scene.xml").write_text(SCENE)
     if name == "maps":
-        from PIL import Image
-
         for map_name, values in source.items():
             Image.fromarray(np.uint8(255 * values)).save(folder / f"{map_name}.png")
         (folder / "maps.json").write_text(json.dumps({map_name: f"{map_name}.png" for map_name in source}))
     return SOURCES[name]
 
 
-def words_of(options):
-    """Return options of Python as words of the command line."""
-    words = []
-    for key, value in options.items():
-        if key == "over":
-            words += ["--over", *(f"{name}={low}:{high}" for name, (low, high) in value)]
-        else:
-            words += [f"--{key.replace('_', '-')}", str(value)]
-    return words
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("trial", [f"{t.name}/{name}" for t in tasks().values() for name in t.trials])
+@pytest.mark.parametrize("trial", trial_files.NAMES)
 def test_every_task(tmp_path, trial):
     """Five kills of each declared fit."""
     name, _, which = trial.partition("/")
-    options = {**tasks()[name].trials[which], "steps": 30}
-    source = options.pop("source", None)
-    command = ["fit", name, *([f"../{write_source(source, tmp_path)}"] if source else []), "-o", "own.npz",
-               "--checkpoint", "state.npz", "--variant", "llvm_ad_rgb", *words_of(options)]  # fmt: skip
-    for folder in ("whole", "killed"):
-        (tmp_path / folder).mkdir()
-    prepare = "killed_runs:measure_little"
-    whole = killed_runs.run(command, tmp_path / "whole", prepare=prepare)
-    kill_and_go_on(command, tmp_path / "killed", whole, 5, prepare, ["--resume"])
-    first, second = (killed_runs.files(tmp_path / n) for n in ("whole", "killed"))
+    options, words = {**trial_files.TRIALS[name][which], "steps": 30}, []
+    if source := options.pop("source", None):
+        words = [f"../{write_source(source, tmp_path)}"]
+    for key, low, high in ((key, *ends) for key, ends in options.pop("over", ())):
+        words += ["--over", f"{key}={low}:{high}"]
+    words += [word for key, value in options.items() for word in (f"--{key.replace('_', '-')}", str(value))]
+    first, second = kill_and_go_on(["fit", name, *words, *FIT], tmp_path, 5, "measure_little", ["--resume"])
     assert first["own.npz"] == second["own.npz"]
-    hidden = [path for path in second if Path(path).name.startswith(".")]
-    assert not hidden, "temporary files of killed runs"
+    assert not [path for path in second if Path(path).name.startswith(".")], "temporary files of killed runs"

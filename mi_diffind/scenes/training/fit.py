@@ -12,9 +12,9 @@ from pathlib import Path
 
 from ...arrays.tables import Table, moved_paths, save_table
 from ...core import compat
-from ...core.deadline import profiled
 from ...core.errors import UsageError
 from ...core.files import replacing, writable_folder
+from ...core.progress import profiled
 from ...core.units import labelled
 from ...fitting.loop import FitResult, cores
 from ...fitting.task import FitRequest, Fitted, Model, table_path, task_of, tasks

@@ -24,7 +24,7 @@ from ...arrays.indirection import unfolded
 from ...core.files import replacing
 from ...fitting.loop import Problem
 from ...images import srgb
-from ...tasks.shading.preview import titled
+from ...tasks.shading.evaluation import titled
 from ...tasks.texture.training import TextureProblem, rounded
 from .options import SceneRecipe, View
 from .references import SEEDS

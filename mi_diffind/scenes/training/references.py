@@ -18,11 +18,10 @@ import numpy as np
 
 from ... import __version__, plugins
 from ...core.archives import Archive
-from ...core.deadline import Deadline
 from ...core.errors import DiffindError
 from ...core.files import replacing, writable_folder
 from ...core.jobs import run_jobs
-from ...core.progress import progress_bar
+from ...core.progress import Deadline, progress_bar
 from ...core.runtime import use_variant
 from ...measure.store import fingerprint
 from ...plugins.support import footprint

@@ -22,10 +22,10 @@ from ...maps.layout import Layout
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source, load_source
 from ...plugins.support import footprint
+from ...tasks.texture import PRESETS, TextureRecipe
+from ...tasks.texture.arrays import FineArray, PaperBudget, TextureBudget
 from ...tasks.texture.compressed import CompressedTexture, bias_of, load, structure_of, to_table
-from ...tasks.texture.memory_budget import FineArray, PaperBudget, TextureBudget
 from ...tasks.texture.nets import PaperStructure
-from ...tasks.texture.presets import PRESETS, TextureRecipe
 from ...tasks.texture.training import TextureProblem, problem_of, stored_form
 from .. import loading
 from .options import View, ViewDistribution

@@ -9,7 +9,7 @@ import os
 import time
 from collections.abc import Mapping
 
-from ...core.interrupt import interruptible
+from ...core.progress import interruptible
 from .page import Page, server
 from .session import WIDTH, Session
 

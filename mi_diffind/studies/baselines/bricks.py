@@ -8,9 +8,10 @@ import math
 import drjit as dr
 import numpy as np
 
-from ...arrays.bits import mask_words
+from ...arrays.lookup import mask_words
+from ...arrays.sparse_grid import CORNERS
 from ...tasks.sdf.distances import Distances
-from ...tasks.sdf.sampling import CORNERS, surface_cells
+from ...tasks.sdf.sampling import surface_cells
 from .byte_grids import NEAREST, ByteCells, dequantised, places, quantised, slope_bound
 
 #: Components of a direction below this count as zero.

@@ -13,11 +13,12 @@ import drjit as dr
 import numpy as np
 
 from ...arrays.lookup import clamp
+from ...arrays.sparse_grid import CORNERS
 from ...core.units import largest_fitting
 from ...tasks.sdf.distances import Distances
 from ...tasks.sdf.field import DistanceField
 from ...tasks.sdf.mesh import Mesh
-from ...tasks.sdf.sampling import CORNERS, surface_cells
+from ...tasks.sdf.sampling import surface_cells
 
 #: Largest distance, in cells, between the surface and a corner of a cell that the surface crosses.
 NEAREST = 1.75

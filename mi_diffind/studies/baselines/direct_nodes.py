@@ -8,9 +8,9 @@ from __future__ import annotations
 import drjit as dr
 import numpy as np
 
-from ...tasks.sdf import codes, encoding
+from ...arrays.sparse_grid import SparseGrid
+from ...tasks.sdf import encoding, nodes
 from ...tasks.sdf.nodes import SparseNodes, slope_bound
-from ...tasks.sdf.structure import Structure
 from .byte_grids import NEAREST
 from .volumes import structure_arrays
 
@@ -52,14 +52,14 @@ def _normals(numbers: np.ndarray) -> np.ndarray:
 class DirectNodes(SparseNodes):
     """Field of a sparse ``structure`` whose nodes are ``numbers`` (n,), uint16, in its order."""
 
-    def __init__(self, types, structure: Structure, numbers: np.ndarray, slope: float):
-        words = codes.pointer_words(numbers, 16)
+    def __init__(self, types, structure: SparseGrid, numbers: np.ndarray, slope: float):
+        words = nodes.pointer_words(numbers, 16)
         super().__init__(types, structure, slope, pointers=words, bits=16)
         self.state = {"numbers": numbers, "slope": slope, **structure_arrays(structure)}
         self.number_bytes = 4 * len(words)
 
     def _node(self, number, record, i, j, k, active):
-        Float, number = self.types.Float, codes.pointer_at(self._pointers, number, 16, active)
+        Float, number = self.types.Float, nodes.pointer_at(self._pointers, number, 16, active)
         normal = number // LEVELS
         distance = (Float(number - normal * LEVELS) + 0.5 * (1 - LEVELS)) * (2 * NEAREST / LEVELS)
         y = normal // SIDE

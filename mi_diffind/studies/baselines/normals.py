@@ -30,12 +30,10 @@ from ...maps.layout import FROM_NORMAL, Layout, MapLayout
 from ...maps.pyramid import Pyramid, halved, level_sizes
 from ...maps.source import Source
 from ...tasks.disney.decoder import Decoder, ggx_coefficients
-from ...tasks.disney.effects import Effects
-from ...tasks.disney.model import ALPHA_MIN, PARAMETERS, Material, sanitize
+from ...tasks.disney.model import ALPHA_MIN, PARAMETERS, Effects, Material, sanitize
 from ...tasks.disney.training import Shaded, shade, uniform_hemisphere
-from ...tasks.shading.evaluation import ShadedReader, reader
+from ...tasks.shading.evaluation import ShadedReader, reader, reference
 from ...tasks.shading.material import DEFAULTS, SurfaceParameters, frame, maps_of, shaded, shadowing, surface_of
-from ...tasks.shading.reference import reference
 
 #: Least third component in the slope of a normal: a slope of 10.
 STEEPEST = 0.1

@@ -12,8 +12,8 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
-from ...arrays.bits import pack_bits
 from ...arrays.indirection import device_array, device_tensor
+from ...arrays.lookup import pack_bits
 from ...tasks.radiance.grid import DENSITY_SCALE
 from ...tasks.radiance.march import march, replay
 from ...tasks.radiance.nodes import Nodes, cells_of, corners_of

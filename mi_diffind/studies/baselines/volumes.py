@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
+from ...arrays.sparse_grid import SparseGrid
 from ...core.files import replacing
-from ...tasks.sdf import codes
+from ...tasks.sdf import nodes
 from ...tasks.sdf.distances import Distances
 from ...tasks.sdf.encoding import sample
 from ...tasks.sdf.field import DistanceField
 from ...tasks.sdf.nodes import SparseNodes, middles
-from ...tasks.sdf.structure import Structure
 from .bricks import Bricks
 from .byte_grids import NEAREST, ByteGrid, dequantised, least_squares, quantised, slope_bound
 
@@ -27,14 +27,14 @@ FIRST, FINEST, COARSEST = 1 / 64, 1 / 2048, 1 / 12
 class DistanceNodes(SparseNodes):
     """Distances of ``bits`` each at the nodes of a sparse ``structure``: our layout without normals and indirection."""
 
-    def __init__(self, types, structure: Structure, numbers: np.ndarray, band: float, bits: int, slope: float):
-        words = codes.pointer_words(numbers, bits)
+    def __init__(self, types, structure: SparseGrid, numbers: np.ndarray, band: float, bits: int, slope: float):
+        words = nodes.pointer_words(numbers, bits)
         super().__init__(types, structure, slope, pointers=words, bits=bits)
         self.state = {"numbers": numbers, "band": band, "bits": bits, "slope": slope, **structure_arrays(structure)}
         self.band_spacings, self.number_bytes = band / self.spacing, 4 * len(words)
 
     def _node(self, number, record, i, j, k, active):
-        value = self.types.Float(codes.pointer_at(self._pointers, number, self.bits, active))
+        value = self.types.Float(nodes.pointer_at(self._pointers, number, self.bits, active))
         half = 2 ** (self.bits - 1)
         zero = self.types.Float(0)
         return (value + (0.5 - half)) * (self.band_spacings / half), (zero, zero, zero)
@@ -56,7 +56,7 @@ class DistanceNodes(SparseNodes):
         planes = np.linalg.solve(sums[..., :4] + 1e-3 * np.eye(4), sums[..., 4:])[..., 0]
         length = np.linalg.norm(planes[:, 1:], axis=1, keepdims=True)
         normals = np.where(length > 0, planes[:, 1:] / np.maximum(length, 1e-9), [0.0, 0.0, 1.0])
-        return codes.frame_words(normals, planes[:, 0], np.ones(len(planes)))
+        return nodes.frame_words(normals, planes[:, 0], np.ones(len(planes)))
 
     @property
     def nbytes(self) -> int:
@@ -82,7 +82,7 @@ def distance_nodes(types, distances: Distances, spacing: float, train: bool = Fa
     return DistanceNodes(types, structure, numbers, band, bits, slope)
 
 
-def structure_arrays(structure: Structure) -> dict:
+def structure_arrays(structure: SparseGrid) -> dict:
     """Return the fields of a structure for the ``state`` of a field, each name with ``structure_`` before it."""
     return {f"structure_{f.name}": getattr(structure, f.name) for f in dataclasses.fields(structure)}
 
@@ -108,7 +108,7 @@ def load(path: Path | str, types, *more: type[DistanceField]) -> DistanceField:
     parts = {name: state.pop(name) for name in list(state) if name.startswith("structure_")}
     if parts:
         parts = {name.removeprefix("structure_"): v for name, v in parts.items()}
-        state["structure"] = Structure(**{**parts, "lower": tuple(parts["lower"].tolist())})
+        state["structure"] = SparseGrid(**{**parts, "lower": tuple(parts["lower"].tolist())})
     return field_class(types, **state)
 
 

@@ -18,10 +18,10 @@ from ...core.runtime import array_module
 from ...fitting.settings import FitSettings
 from ...measure.training import ConvergenceTraining
 from ...tasks.bsdf import training
+from ...tasks.bsdf.directions import SphereView
 from ...tasks.bsdf.model import DirectionPair, Form, coordinate_u, coordinate_w
 from ...tasks.bsdf.training import BSDFProblem
 from ...tasks.bsdf.truth import truth_of
-from ...tasks.bsdf.view import SphereView
 from ..baselines.networks import Network
 
 #: Hidden units of both layers; the weights and biases of 6 inputs and 3 outputs are 675.
@@ -87,7 +87,7 @@ class NetworkProblem(BSDFProblem):
         network = Network(6, WIDTH, 2, outputs=3).alloc(
             mi.TensorXf, rng=dr.rng(seed=dr.opaque(mi.UInt64, SETTINGS.seed))
         )
-        super().__init__(network, Form(scale=scale), samples, training.view_psnr(SphereView(truth, types)))
+        super().__init__(network, Form(scale=scale), samples, training.view_psnr([((), SphereView(truth, types))]))
         self.inputs, self.mean = inputs, mean_logarithm(samples)
         self.identity = {"source": truth.digest, "inputs": inputs, "scale": list(scale)}
 
@@ -110,7 +110,7 @@ class NetworkProblem(BSDFProblem):
 
     def measure(self, net) -> dict[str, float]:
         with dr.suspend_grad():
-            return self._measure(self.bsdf(net))
+            return self._measure(lambda coordinates: self.bsdf(net))
 
 
 def mean_logarithm(samples) -> float:

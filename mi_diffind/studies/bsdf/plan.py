@@ -12,11 +12,10 @@ from ...measure.bsdf import bsdf_queries, directions
 from ...measure.formatting import grid
 from ...measure.store import file_name, fingerprint
 from ...measure.study import Candidate, Case, Job, Plan
-from ...tasks.bsdf import fit as fitting
 from ...tasks.bsdf import mixture
+from ...tasks.bsdf.directions import SphereView
 from ...tasks.bsdf.model import LearnedBSDF
 from ...tasks.bsdf.truth import truth_of
-from ...tasks.bsdf.view import SphereView
 from .materials import MATERIALS, QUICK
 from .networks import INPUTS, NetworkTraining
 
@@ -73,7 +72,7 @@ class BSDFTraining(Job):
         errors = dict(model.table.measured)
         if model.bsdf.proxy is not None:
             proxy = LearnedBSDF(model.form, None, model.bsdf.proxy)
-            errors["psnr_proxy_db"] = SphereView(truth, model.types).psnr(fitting.cosine(proxy))
+            errors["psnr_proxy_db"] = SphereView(truth, model.types).psnr(proxy.cosine_value)
         for name, sampled in (("learned", model.mixture), ("native", truth)):
             moments = [mixture.second_moment(truth.value, sampled, truth, model.types, cos) for cos in COSINES]
             errors[f"moment_{name}"] = sum(moments) / len(moments)
@@ -93,31 +92,6 @@ class BSDFTraining(Job):
         return load_model(self.path, mi.TensorXf).form.scale
 
 
-class TensorFile(Job):
-    """Tensor file for ``measured``, written from the file of a learned BSDF."""
-
-    def __init__(self, training: BSDFTraining):
-        self.training, self.name = training, f"{training.material}, measured"
-        self.path: Path | None = None
-
-    def cached_record(self, folder: Path | None, record: dict | None) -> dict | None:
-        self.path = Path(folder or ".") / f"{file_name(self.name)}.bsdf"
-        return record if self.path.is_file() else None
-
-    def run(self, folder: Path | None, progress: bool) -> dict | None:
-        model = load_model(self.training.path, mi.TensorXf)
-        start = time.perf_counter()
-        model.decode(self.path)
-        seconds = time.perf_counter() - start
-        view = SphereView(truth_of(MATERIALS[self.training.material][0], model.types), model.types)
-        errors = {"psnr_db": view.psnr(truth_of(self.path, model.types).value)}
-        return {"seconds": seconds, "bytes": self.path.stat().st_size, "errors": errors}
-
-    def load(self):
-        """Return the plugin that reads the file."""
-        return mi.load_dict({"type": "measured", "filename": str(self.path)})
-
-
 def plan(materials: tuple[str, ...] = (), quick: bool = False) -> Plan:
     """Return the plan for some materials (default: all), in the current variant."""
     names = materials or (QUICK if quick else tuple(MATERIALS))
@@ -130,7 +104,6 @@ def plan(materials: tuple[str, ...] = (), quick: bool = False) -> Plan:
         references = [c.name for c in its_candidates if c.is_truth or c.is_reference]
         learned = [c.name for c in its_candidates if c.name not in references]
         ratios += [(name, reference) for name in learned for reference in references]
-        ratios += [(f"{material}: ours", f"{material}: measured")]
     package = Path(__file__).resolve().parents[2]
     code = [package / f"{name}.py" for name in ("arrays/lookup", "arrays/indirection", "fitting/loop")]
     code += [*(package / "tasks" / "bsdf").glob("*.py"), Path(__file__).with_name("materials.py")]
@@ -155,7 +128,7 @@ def _material(material: str, quick: bool) -> tuple[Case, list[Candidate], list[J
     """Return the case of a material, its candidates and their jobs."""
     source, nbytes = MATERIALS[material]
     trainings = [BSDFTraining(material, preset, quick) for preset in (PRESETS[:1] if quick else PRESETS)]
-    files, networks = [TensorFile(trainings[0])], []
+    networks = []
     if not quick and nbytes == "2k":
         networks = [NetworkTraining(material, source, inputs, trainings[0].scale) for inputs in INPUTS]
 
@@ -171,7 +144,6 @@ def _material(material: str, quick: bool) -> tuple[Case, list[Candidate], list[J
             note="another material",
         ),
         *(learned(job, job.preset, "learned") for job in trainings),
-        *(learned(job, "measured", "tensor file") for job in files),
         *(
             learned(job, f"network, {inputs}", "network", queries=("eval",))
             for job, inputs in zip(networks, INPUTS, strict=False)
@@ -181,7 +153,6 @@ def _material(material: str, quick: bool) -> tuple[Case, list[Candidate], list[J
     def queries(lanes: int) -> dict:
         bsdfs = {f"{material}: source": mi.load_dict(source), f"{material}: principled": mi.load_dict(PEER)}
         bsdfs |= {f"{material}: {job.preset}": job.load() for job in trainings}
-        bsdfs |= {f"{material}: measured": job.load() for job in files}
         bsdfs |= {f"{material}: network, {i}": job.bsdf() for job, i in zip(networks, INPUTS, strict=False)}
         return bsdf_queries(bsdfs, directions(lanes), False)
 
@@ -189,7 +160,7 @@ def _material(material: str, quick: bool) -> tuple[Case, list[Candidate], list[J
     return (
         Case(material, queries, None, {"material": source}, members, QUERIES),
         candidates,
-        [*trainings, *files, *networks],
+        [*trainings, *networks],
     )
 
 

@@ -24,6 +24,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...core.progress import Deadline
 from ...core.runtime import array_module
 from ...fitting.loop import FitSettings, fit
 from ...images import metrics
@@ -31,7 +32,7 @@ from ...maps import as_seen
 from ...maps.compressed import decibel
 from ...maps.source import Source
 from ...measure.study import FLOOR, Candidate, Case, Plan
-from ...tasks.image.presets import IMPROVEMENTS
+from ...tasks.image import IMPROVEMENTS
 from ..baselines import codecs, image_networks
 from ..baselines.hash_grids import halved
 from ..equal_memory import Contender, PresetContender, StudyContext
@@ -198,7 +199,7 @@ class NetworkImage(ImageContender):
         net = image_networks.network(source, source.nbytes / self.budget)
         problem = image_networks.ImageNetworkProblem(net, self.context.types, source)
         title = f"train {self.name}" if progress else None
-        result = fit(problem, NETWORK_SETTINGS, progress=progress, title=title, seconds=self.seconds)
+        result = fit(problem, NETWORK_SETTINGS, progress=progress, title=title, deadline=Deadline(self.seconds))
         if result.interrupted:
             return None
         halved(problem.net)

@@ -27,15 +27,15 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 
+from ...core.progress import Deadline
 from ...fitting.loop import FitSettings, fit
 from ...measure.store import fingerprint
 from ...measure.study import FLOOR, Candidate, Case, Plan
+from ...tasks.radiance import dense_bytes
 from ...tasks.radiance import grid as grids
 from ...tasks.radiance.files import grid_of, load
 from ...tasks.radiance.march import march
-from ...tasks.radiance.presets import dense_bytes
-from ...tasks.radiance.session import FieldSession
-from ...tasks.radiance.training import ImagesProblem
+from ...tasks.radiance.session import FieldSession, ImagesProblem
 from ...tasks.radiance.volume_field import NodeField, VolumeField
 from .. import equal_memory
 from ..baselines import radiance_factors as factors
@@ -152,7 +152,7 @@ class RadianceStudyContext:
         """Train a fit in place, at the learning rate of a name in :data:`RATES`, and return the result."""
         problem = UnmeasuredProblem(self.session, trained_fit.net, trained_fit.field_of)
         settings = replace(SETTINGS, lr=RATES.get(rate, SETTINGS.lr), steps=steps, measure_every=steps)
-        result = fit(problem, settings, progress=progress, title=title, seconds=seconds)
+        result = fit(problem, settings, progress=progress, title=title, deadline=seconds and Deadline(seconds))
         trained_fit.net = problem.net
         return result
 

@@ -19,7 +19,7 @@ import numpy as np
 from tqdm import tqdm
 
 from ... import plugins
-from ...core.interrupt import interruptible
+from ...core.progress import interruptible
 from ...images import metrics
 from ...measure.benchmark import Stopped
 from ...measure.bias import LEAST, crossover, describe, error, estimate, root, weights_of

@@ -17,8 +17,8 @@ from ...measure.study import Candidate
 from ...measure.training import ConvergenceTraining
 from ...tasks.sdf.distances import Distances
 from ...tasks.sdf.evaluation import SurfaceEvaluation
-from ...tasks.sdf.extraction import extract
 from ...tasks.sdf.field import DistanceField
+from ...tasks.sdf.grids import extract
 from ...tasks.sdf.mesh import Mesh
 from .. import equal_memory
 from ..baselines import bricks, byte_grids, hash_grids, volumes

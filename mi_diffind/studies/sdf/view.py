@@ -8,8 +8,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...core import mitsuba_versions
-from ...tasks.sdf import grids, tracing
+from ...core import compat
+from ...tasks.sdf import grids, marching
 from ...tasks.sdf.field import DistanceField
 from ...tasks.sdf.mesh import Mesh
 
@@ -58,9 +58,9 @@ class MeshView:
     def mesh_scene(self, lit: bool = False):
         """Return a scene of the mesh, alone or ``lit`` on a floor."""
         counts = len(self.mesh.vertices), len(self.mesh.faces)
-        shape = mi.Mesh(*mitsuba_versions.mesh_arguments(_material(), *counts))
+        shape = mi.Mesh(*compat.mesh_arguments(_material(), *counts))
         buffers = mi.traverse(shape)
-        mitsuba_versions.set_triangles(buffers, self.mesh.vertices, self.mesh.faces)
+        compat.set_triangles(buffers, self.mesh.vertices, self.mesh.faces)
         buffers.update()
         return self._scene(shape, "path", lit)
 
@@ -115,7 +115,7 @@ def _material() -> mi.Properties:
 
 def traced_distance(field: DistanceField, o, d):
     """Return the length of rays until they meet a field, infinite if they miss it."""
-    return tracing.trace(field, o, d, FAR)[0]
+    return marching.trace(field, o, d, FAR)[0]
 
 
 def scene_distance(scene, o, d):

@@ -34,6 +34,7 @@ import numpy as np
 
 from ...arrays.tables import Table, save_table
 from ...core.files import replacing
+from ...core.progress import Deadline
 from ...fitting import task
 from ...fitting.loop import FitResult
 from ...fitting.settings import FitSettings, FittingError
@@ -41,12 +42,12 @@ from ...maps.pyramid import Pyramid
 from ...maps.source import Source, SourceError, load_source
 from ...measure.store import file_name
 from ...measure.study import Candidate, Plan
+from ...tasks import shading
+from ...tasks import texture as texture_presets
 from ...tasks.shading import fit as shading_fit
-from ...tasks.shading import presets
 from ...tasks.shading.evaluation import ShadedEvaluation, ShadedReader, reader
 from ...tasks.shading.material import effects_of, frozen_decoder
 from ...tasks.shading.training import ShadingProblem, fit_shading, start_of
-from ...tasks.texture import presets as texture_presets
 from ...tasks.texture import training as textures
 from ...tasks.texture.compressed import CompressedTexture
 from ...tasks.texture.fit import size_of
@@ -110,8 +111,8 @@ class ShadingStudySettings:
     extras: bool = False
 
     @property
-    def recipe(self) -> presets.ShadingRecipe:
-        return presets.PRESETS[self.preset]
+    def recipe(self) -> shading.ShadingRecipe:
+        return shading.PRESETS[self.preset]
 
 
 def materials_of(names: Sequence[str], side: int, quick: bool = False) -> dict[str, Source]:
@@ -180,7 +181,8 @@ class ShadingStudyContext(StudyContext):
         options = {argument.name: argument.default for argument in task.tasks()["texture"].arguments}
         options["compression"] = self.settings.compression
         preset = self.settings.preset
-        return task.FitRequest(preset, settings, self.types, seconds=seconds, progress=progress, options=options)
+        return task.FitRequest(preset, settings, self.types, deadline=seconds and Deadline(seconds), progress=progress,
+                               options=options)  # fmt: skip
 
     def fit_texture(
         self, pyramid: Pyramid, length: float, seed: int, progress: bool, extras: bool = False

@@ -16,9 +16,8 @@ from ...arrays.indirection import aligned_copy
 from ...images import srgb
 from ...maps.pyramid import Pyramid
 from ...measure.flicker import POINTS, MovingView
-from ...tasks.disney.effects import Effects
-from ...tasks.shading.evaluation import ShadedReader
-from ...tasks.shading.reference import reference
+from ...tasks.disney.model import Effects
+from ...tasks.shading.evaluation import ShadedReader, reference
 
 #: Texels along a pixel in the first and in the last frame.
 FAR, NEAR = 12.0, 3.0

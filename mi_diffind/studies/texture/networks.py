@@ -22,7 +22,7 @@ from ...maps.compressed import FilteredMaps, decibel
 from ...maps.layout import Layout
 from ...maps.pyramid import Pyramid, level_sizes
 from ...maps.source import Source
-from ...tasks.texture.presets import PRESETS
+from ...tasks.texture import PRESETS
 from ...tasks.texture.training import TextureProblem
 from ..baselines import image_networks
 from ..baselines.networks import Network

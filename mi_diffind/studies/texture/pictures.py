@@ -80,10 +80,10 @@ def levels(context, readers: dict, result: dict):
 
 def histograms(count: int) -> dict[str, np.ndarray]:
     """Return, for each distribution of footprints, the share of samples nearest to each of ``count`` levels."""
-    from ...tasks.texture import sampling, training
+    from ...tasks.texture import nets, training
 
     ours = {"by level (ours)": training.shares(count)}
-    return ours | {name: sampling.footprint_histogram(name, count) for name in sampling.FOOTPRINTS}
+    return ours | {name: nets.footprint_histogram(name, count) for name in nets.FOOTPRINTS}
 
 
 def _busiest(image: np.ndarray, side: int) -> tuple[int, int]:

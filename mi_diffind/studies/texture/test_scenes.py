@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...core.mitsuba_versions import ray_flags
+from ...core.compat import ray_flags
 from ...images import srgb
 
 

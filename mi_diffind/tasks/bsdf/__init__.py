@@ -1,17 +1,11 @@
 """Learned BSDFs: any reflecting BSDF as an analytic proxy times a learned residual.
 
-- :mod:`.model`: the form of a learned BSDF, its proxy and coordinates;
-- :mod:`.truth`: sources: plugins of Mitsuba, scenes, measured files; :mod:`.scattered`: rows of measured values;
-- :mod:`.measured_files`: measured spectra;
-- :mod:`.source`: their base class; :mod:`.symmetry`: symmetries, measured;
-- :mod:`.pool`: directions at which a source is sampled; :mod:`.view`: the picture that measures;
-- :mod:`.training`: samples, proxy and residual; :mod:`.fit`: ``fit bsdf``;
-- :mod:`.measurement`: errors against a source; :mod:`.outputs`, :mod:`.tensor_file`: other formats;
-- :mod:`.mixture`: importance sampling; :mod:`.energy`: the limit of the albedo; :mod:`.files`: table files;
-- :mod:`.library`: many materials at once; :mod:`.contact_sheet`: their pictures;
-- :mod:`.family`: BSDFs that depend on parameters, :mod:`.family_truth`, :mod:`.family_fit`,
-  :mod:`.family_sampling`, :mod:`.family_measurement` and :mod:`.family_files`: their sources, training, sampling,
-  errors and files.
+- :mod:`.model`: the form of a learned BSDF, and of a family that depends on parameters;
+- :mod:`.truth`: sources: plugins of Mitsuba, scenes, measured files; :mod:`.measured`: symmetries, spectra, rows;
+- :mod:`.directions`: directions at which a source is sampled, and the picture that measures;
+- :mod:`.training`: samples, proxy and residual; :mod:`.fit`: ``fit bsdf``; :mod:`.library`: many sources at once;
+- :mod:`.mixture`: importance sampling; :mod:`.energy`: the limit of the albedo;
+- :mod:`.files`: table files; :mod:`.evaluation`: errors against a source, and other formats.
 """
 
 from __future__ import annotations
@@ -57,10 +51,6 @@ class BSDFTask(Task):
         for name in ("ours", "table", "paper", "plain")
     }
     storages = ()
-    trials = {  # noqa: RUF012
-        "single": {"source": "bsdf", "steps": 2, "batch": 256, "bytes": "1k"},
-        "family": {"source": "bsdf", "steps": 2, "batch": 256, "over": [("alpha", (0.1, 0.5))]},
-    }
     arguments = (
         Argument(
             "source", file="read", metavar="SOURCE",
@@ -114,13 +104,7 @@ class BSDFTask(Task):
         """Fit a BSDF, a family, or all BSDFs of a library."""
         from .library import fit_library, is_library
 
-        if is_library(request):
-            return fit_library(request)
-        if not request.options["over"]:
-            return super().fit(request)
-        from .family_fit import fit_family
-
-        return fit_family(request)
+        return fit_library(request) if is_library(request) else super().fit(request)
 
     def usage(self, table, file):
         lines = super().usage(table, file)
@@ -129,22 +113,6 @@ class BSDFTask(Task):
             comment = f"<!-- or a texture, {low:g} to {high:g} -->"
             lines.insert(-1, f'    <float name="{parameter["name"]}" value="{low:g}"/>  {comment}')
         return lines
-
-    def load(self, path):
-        from ...arrays.tables import load_table
-
-        if "family" not in load_table(path, self.name).settings:
-            return super().load(path)
-        from .family_files import load
-
-        return load(path)
-
-    def model(self, table, dtype, storage=""):
-        if "family" not in table.settings:
-            return super().model(table, dtype, storage)
-        from .family_files import FamilyModel, allocate
-
-        return FamilyModel(table, allocate(table, dtype, storage), dtype, storage)
 
 
 TASK = BSDFTask()

@@ -1,4 +1,4 @@
-"""``fit bsdf SOURCE``: any reflecting BSDF as a proxy, a residual, and a mixture that samples it."""
+"""``fit bsdf SOURCE``: a reflecting BSDF, or a family, as a proxy, a residual, and a mixture that samples it."""
 
 from __future__ import annotations
 
@@ -7,55 +7,53 @@ import math
 from threading import Event
 
 import drjit as dr
+import numpy as np
 
+from ...arrays.tables import Table
 from ...core.errors import UsageError
-from ...core.interrupt import interruptible
+from ...core.progress import interruptible
 from ...core.units import parse_bytes
 from ...fitting.loop import FitResult
 from ...fitting.task import FitRequest, Fitted
-from . import energy, mixture, scattered, symmetry, training
+from . import energy, evaluation, measured, mixture, training
+from .directions import SphereView
 from .files import BSDFModel, allocate, to_table
-from .measurement import cosine, measure, measure_samples
-from .model import LearnedBSDF, structure_of
-from .source import WHITE, FunctionTruth, Truth, TurnedTruth
-from .truth import recorded_source, truth_of
-from .view import SphereView
+from .measured import WHITE, FunctionTruth, Truth, TurnedTruth
+from .model import BYTES, TERMS, ResidualSizes, points, sizes_within
+from .truth import FamilyTruth, parameter_ranges, recorded_source, truth_of
 
-#: Share of a limited time in which the proxy is fitted.
-PRETRAINING = 0.3
-
-
-@dataclasses.dataclass(repr=False)
-class FittedBSDF(Fitted):
-    """Result of a fit, with its source."""
-
-    truth: Truth | None = None
+#: Members of a family whose pictures are compared during the training.
+VIEWS = 8
 
 
 def check(request: FitRequest) -> None:
     """Raise :class:`UsageError` for options that exclude each other."""
     if request.options["source"] is None:
         raise UsageError("source: not given, a BSDF is needed: a scene, a .xml of one BSDF, or a measured file")
+    if request.options["over"] and request.preset != "ours":
+        raise UsageError(f'over: found the preset "{request.preset}", families have the preset "ours" alone')
 
 
 def fit(request: FitRequest) -> Fitted:
-    """Fit a BSDF as requested on the command line, in the active variant. Raises :class:`UsageError`."""
-    return fit_truth(requested_truth(request), request)
+    """Fit a BSDF or a family as requested, in the active variant. Raises :class:`UsageError`.
 
-
-def requested_truth(request: FitRequest) -> Truth:
-    """Return the source of a request. Raises :class:`UsageError`."""
+    Ctrl-C while the proxy is trained leaves the residual out: the file then holds the best proxy so far.
+    """
     use_rgb_variant(request)
     options = request.options
-    u, v = options["uv"]
-    return truth_of(
-        options["source"],
-        request.types,
-        options["material"],
-        (float(u), float(v)),
-        options["angles"],
-        options["illuminant"],
-    )
+    over = parameter_ranges(options["over"]) if options["over"] else {}
+    uv = tuple(map(float, options["uv"]))
+    source, types = options["source"], request.types
+    truth = truth_of(source, types, options["material"], uv, options["angles"], options["illuminant"])
+    if not over:
+        with interruptible() as stop:
+            return _fit_single(truth, request, stop)
+    family = FamilyTruth(truth, over)
+    try:
+        with interruptible() as stop:
+            return _fit_family(family, request, stop)
+    finally:
+        family.restore()
 
 
 def use_rgb_variant(request: FitRequest) -> None:
@@ -66,91 +64,148 @@ def use_rgb_variant(request: FitRequest) -> None:
         mi.set_variant("cuda_ad_rgb" if ".cuda." in request.types.__name__ else "llvm_ad_rgb")
 
 
-def fit_truth(truth: Truth, request: FitRequest) -> FittedBSDF:
-    """Fit a learned BSDF to a source, measure it, and return its table and the record of its training.
-
-    Ctrl-C while the proxy is trained leaves the residual out: the file then holds the best proxy so far.
-    """
-    with interruptible() as stop:
-        return _fitted(truth, request, stop)
-
-
-def _fitted(truth: Truth, request: FitRequest, stop: Event) -> FittedBSDF:
+def _fit_single(truth: Truth, request: FitRequest, stop: Event) -> Fitted:
     types, options, settings = request.types, request.options, request.settings
     with dr.suspend_grad():
-        symmetries = symmetry.measured_symmetry(truth, types) if truth.function else scattered.measured_symmetry(truth)
-    isotropic = (symmetries["isotropy"] or 0) <= symmetry.TOLERANCE
-    azimuth = "mirror" if (symmetries["mirror"] or 0) <= symmetry.TOLERANCE else "half"
+        rows = not truth.function
+        symmetries = measured.measure_row_symmetry(truth) if rows else measured.measure_symmetry(truth, types)
+    isotropic, azimuth = _assumed(symmetries)
     lines = [*filter(None, [truth.remark]), symmetry_line(symmetries)]
-    plain = request.preset in ("table", "plain")
-    try:
-        structure = structure_of(parse_bytes(options["bytes"] or "2k"), plain)
-    except ValueError as e:
-        raise UsageError(f"--bytes: {e}") from None
-    if truth.function:
+    sizes = _sizes(request, plain=request.preset in ("table", "plain"))
+    if rows:
+        samples, validation, smooth = measured.split(truth, types, isotropic, training.LIMIT, settings.seed)
+        view, remarks = None, []
+        if not any(dr.any(v > 0) for v in samples.value):
+            raise UsageError(f"{truth.name}: all of its values are 0, which measures no material")
+    else:
         samples = training.draw(truth, types, training.SAMPLES, settings.seed + 1, isotropic)
         validation = training.draw(truth, types, training.VALIDATION, settings.seed + 2, isotropic)
         lines += (remarks := truth.remarks(validation))
         view, smooth = SphereView(truth, types), validation
-    else:
-        samples, validation, smooth = scattered.split(truth, types, isotropic, training.LIMIT, settings.seed)
-        view, remarks = None, []
-        if not any(dr.any(v > 0) for v in samples.value):
-            raise UsageError(f"{truth.name}: all of its values are 0, which measures no material")
-    angle = 0.0 if isotropic else symmetry.axes_angle(samples, truth)
+    angle = 0.0 if isotropic else measured.axes_angle(samples, truth)
     if angle:
         lines.append(f"axes at {math.degrees(angle):.1f} degrees")
-    first, identity = request.part(PRETRAINING), {"source": truth.digest}
-    judge = None if view is None else training.view_psnr(view)
+    first, identity = request.part(training.PRETRAINING), {"source": truth.digest}
+    judge = None if rows else training.view_psnr([((), view)])
     logarithms = training.fit_proxy(samples, validation, types, isotropic, first, identity, smooth, angle, judge)
-    form = training.form_of(logarithms, validation, isotropic, azimuth, angle)
+    form = training.choose_form(logarithms, validation, isotropic, azimuth, angle)
     if request.preset in ("paper", "plain"):  # the proxy gives the scale of u alone
         form = dataclasses.replace(form, terms=())
         form = dataclasses.replace(form, range=training.residual_range(form, logarithms, validation))
-    if not truth.function:
-        (samples, validation), form, line = scattered.cleaned(truth, [samples, validation], form, logarithms)
+    if rows:
+        (samples, validation), form, line = measured.cleaned(truth, [samples, validation], form, logarithms)
         lines.append(line)
-    identity = {"source": truth.digest, "structure": dataclasses.asdict(structure), "form": form.to_json()}
+    identity = {"source": truth.digest, "structure": sizes.to_json(), "form": form.to_json()}
     judge = judge or training.proxy_loss(validation)
-    problem = training.residual_problem(logarithms, form, structure, samples, judge, identity)
+    problem = training.residual_problem(logarithms, form, sizes, samples, judge, identity)
     azimuths = (0.0,) if isotropic else tuple(math.pi * k / 8 for k in range(8))
 
-    def stored(result: FitResult | None = None) -> tuple:
+    def finish(result: FitResult | None = None) -> tuple[Table, np.ndarray | None, float | None]:
         """Return the table of the arrays as they are, its limit of the albedo, and the PSNR without."""
-        bsdf = LearnedBSDF.of(form, problem.net.rounded())
-        sampled = truth if truth.function else FunctionTruth(truth.name, cosine(bsdf))
+        value = problem.net.at(form).cosine_value
+        sampled = FunctionTruth(truth.name, value) if rows else truth
         sampled = TurnedTruth(sampled, -angle) if angle else sampled
-        lobes, weights = mixture.fitted_mixture(sampled, types, isotropic, form.scale[1] / form.scale[0])
-        scale, raw = None, None if view is None else view.psnr(cosine(bsdf))
+        lobes, weights = mixture.fit_mixture(sampled, types, isotropic, form.scale[1] / form.scale[0])
+        raw, scale = None if rows else view.psnr(value), None
         if options["energy"] == "source":
-            scale = energy.fitted_scale(cosine(bsdf), truth if truth.function else WHITE, types, azimuths)
-        table = to_table(problem.net, form, lobes, weights, scale, {
-            **request.recorded(result), "source": truth.digest, "name": truth.name, "symmetry": symmetries,
-            "structure": dataclasses.asdict(structure),
-        })  # fmt: skip
-        table.preset, table.seed = request.preset, settings.seed
-        table.settings |= request.paths(source_path=options["source"]) | recorded_source(options)
-        model = BSDFModel(table, allocate(table, types.TensorXf), types.TensorXf)
-        figures = measure_samples(model, validation) if view is None else measure(model, truth, view)
-        table.measured = {k: float(f"{v:.5g}") for k, v in figures.items()}
+            scale = energy.fit_scale(value, WHITE if rows else truth, types, azimuths)
+        sampling = {"lobes": [list(dataclasses.astuple(lobe)) for lobe in lobes]}
+        recorded = _settings(request, result, truth, symmetries, sizes)
+        table = to_table(problem.net, form, sampling, weights, scale, recorded)
+        model = _complete(table, request)
+        figures = evaluation.measure_samples(model, validation) if rows else evaluation.measure(model, truth, view)
+        table.measured = {name: float(f"{figure:.5g}") for name, figure in figures.items()}
         table.settings |= {"remarks": remarks} if remarks else {}
         return table, scale, raw
 
-    result = training.train_last(problem, request, stored, stop)
-    table, scale, raw = stored(result)
+    result = training.train_last(problem, request, finish, stop)
+    table, scale, raw = finish(result)
     if scale is not None:
-        limit = "1" if raw is None else "the source's"
-        without = "" if raw is None else f"; {raw:.2f} dB without"
+        limit, without = ("1", "") if raw is None else ("the source's", f"; {raw:.2f} dB without")
         lines.append(f"albedo limited to {limit}: factors down to {scale.min():.4f}{without}")
-    left_out = [name for name in ("diffuse", "first", "second") if name not in form.terms]
+    left_out = [name for name in TERMS if name not in form.terms]
     if left_out and form.terms:
         lines.append(f"the proxy has no {' and no '.join(left_out)} lobe: the source does not need it")
-    figures = {
-        "symmetry": symmetries,
-        "form": form.to_json(),
-        "arrays": {n: list(a.shape) for n, a in table.arrays.items()},
-    }
-    return FittedBSDF(table, result, lines, figures, truth=truth)
+    return Fitted(table, result, lines, _figures(table, symmetries))
+
+
+def _fit_family(truth: FamilyTruth, request: FitRequest, stop: Event) -> Fitted:
+    types, options, settings, parameters = request.types, request.options, request.settings, truth.parameters
+    sizes = _sizes(request, parameters)
+    with dr.suspend_grad():
+        truth.check_effects(types)
+        symmetries = truth.symmetries(types)
+    isotropic, azimuth = _assumed(symmetries)
+    members, count = training.MEMBERS, training.SAMPLES
+    samples = training.draw_members(truth, types, count, members, settings.seed + 1, isotropic)
+    validation = training.draw_members(truth, types, training.VALIDATION, members // 4, settings.seed + 2, isotropic)
+    proxy = training.fit_family_proxy(truth, samples, validation, types, isotropic, request, stop)
+    form = training.choose_form(proxy, validation, isotropic, azimuth)
+    views = [(x, SphereView(truth.at(x), types, side=48, samples=32)) for x in points(VIEWS, len(parameters), seed=5)]
+    described = [p.to_json() for p in parameters]
+    identity = {
+        "source": truth.truth.digest, "over": described, "form": form.to_json(),
+        "structure": sizes.to_json(),
+    }  # fmt: skip
+    problem = training.residual_problem(proxy, form, sizes, samples, training.view_psnr(views), identity)
+    azimuths = (0.0,) if isotropic else tuple(math.pi * k / 4 for k in range(4))
+
+    def at(coordinates):
+        with dr.suspend_grad():
+            return problem.net.at(form, coordinates)
+
+    def finish(result: FitResult | None = None) -> tuple[Table, np.ndarray | None]:
+        """Return the table of the arrays as they are, and its limit of the albedo."""
+        factors, weights = mixture.fit_family_mixture(truth, at, types, isotropic)
+        scale = energy.fit_family_scale(truth, at, types, azimuths) if options["energy"] == "source" else None
+        recorded = _settings(request, result, truth.truth, symmetries, sizes)
+        recorded["over"] = {key: [p.low, p.high] for key, p in zip(truth.keys, parameters, strict=True)}
+        sampling = {"family": described, "factors": list(factors)}
+        table = to_table(problem.net, form, sampling, weights, scale, recorded)
+        figures = evaluation.measure_family(_complete(table, request), truth)
+        table.measured = {name: float(f"{figure:.5g}") for name, figure in figures.items()}
+        return table, scale
+
+    result = training.train_last(problem, request, finish, stop)
+    table, scale = finish(result)
+    lines = [symmetry_line(symmetries)]
+    lines += [f"over {p.name} from {p.low:g} to {p.high:g}, by default {p.middle:.3g}" for p in parameters]
+    if scale is not None:
+        lines.append(f"albedo limited to the source's: factors down to {scale.min():.4f}")
+    return Fitted(table, result, lines, {**_figures(table, symmetries), "family": described})
+
+
+def _assumed(symmetries: dict[str, float | None]) -> tuple[bool, str]:
+    """Return whether a source counts as isotropic, and what its residual assumes of the azimuth."""
+    isotropic, mirror = ((symmetries[name] or 0) <= measured.TOLERANCE for name in ("isotropy", "mirror"))
+    return isotropic, "mirror" if mirror else "half"
+
+
+def _sizes(request: FitRequest, parameters=(), plain: bool = False) -> ResidualSizes:
+    try:
+        return sizes_within(parse_bytes(request.options["bytes"] or BYTES[len(parameters)]), parameters, plain)
+    except ValueError as e:  # of the bytes, or of the budget
+        raise UsageError(f"--bytes: {e}") from None
+
+
+def _settings(request: FitRequest, result: FitResult | None, truth: Truth, symmetries: dict, sizes) -> dict:
+    """Return what a table file records of a fit."""
+    return {
+        **request.recorded(result), "source": truth.digest, "name": truth.name, "symmetry": symmetries,
+        "structure": sizes.to_json(),
+    }  # fmt: skip
+
+
+def _complete(table: Table, request: FitRequest) -> BSDFModel:
+    """Add preset, seed and source to a table, and return its model."""
+    table.preset, table.seed = request.preset, request.settings.seed
+    table.settings |= request.paths(source_path=request.options["source"]) | recorded_source(request.options)
+    return BSDFModel(table, allocate(table, request.types.TensorXf), request.types.TensorXf)
+
+
+def _figures(table: Table, symmetries: dict) -> dict:
+    arrays = {name: list(array.shape) for name, array in table.arrays.items()}
+    return {"symmetry": symmetries, "form": table.settings["form"], "arrays": arrays}
 
 
 def symmetry_line(symmetries: dict[str, float | None]) -> str:
@@ -170,5 +225,5 @@ def symmetry_line(symmetries: dict[str, float | None]) -> str:
             parts.append(f"{yes} (assumed: no rows to compare)")
         else:
             percent = f"{100 * value:.2g}%"
-            parts.append(f"{yes} ({percent})" if value <= symmetry.TOLERANCE else no.format(percent))
+            parts.append(f"{yes} ({percent})" if value <= measured.TOLERANCE else no.format(percent))
     return "measured: " + ", ".join(parts)

@@ -15,11 +15,11 @@ from ... import __version__
 from ...arrays.tables import load_table
 from ...core import compat
 from ...core.errors import DiffindError, UsageError
-from ...core.files import relative_path, replacing, writable_folder, write_json
+from ...core.files import relative_path, writable_folder, write_json
 from ...core.jobs import run_jobs
 from ...core.runtime import use_variant
 from ...fitting.task import FitRequest, Fitted, Model, fit, load_model
-from .contact_sheet import PICTURES, accuracy, save_pair, write_sheet
+from ...measure.formatting import grid
 from .files import load
 from .fit import use_rgb_variant
 from .truth import SUFFIXES, material_ids
@@ -30,8 +30,17 @@ ALL = "all"
 #: Options of ``fit bsdf`` that say where and how a library is fitted, and not what.
 ELSEWHERE = ("source", "material", "workers", "scheduler")
 
-#: Files of a library's report, beside its tables.
-REPORT, PAGE, SHEET = "report.json", "report.md", "contact_sheet.png"
+#: File of a library's report, beside its tables.
+REPORT = "report.json"
+
+#: Columns of the printed table: heading → text of a material's record.
+COLUMNS = {
+    "bytes": lambda m: f"{m['bytes']:,}",
+    "accuracy": lambda m: f"{m['psnr_db']:.1f} dB" if "psnr_db" in m else f"error {100 * m['relative_error']:.2g}%",
+    "albedo": lambda m: f"{100 * m['albedo_excess']:+.2f}%" if "albedo_excess" in m else "–",
+    "moment": lambda m: f"{m['sample_weight_moment']:.2f}",
+    "seconds": lambda m: "" if m["seconds"] is None else f"{m['seconds']:.0f}",
+}
 
 
 @dataclass(frozen=True)
@@ -103,7 +112,9 @@ class FittedLibrary(Fitted):
         counts = [f"{report['fitted']} fitted", f"{report['kept']} kept from before", f"{report['failed']} failed"]
         counts += [f"{left} left: the same command continues"] if left else []
         lines = [f"{path}: {len(self.materials)} materials: {', '.join(counts)}; {self.seconds:.0f} s"]
-        lines += [f"  {line}" for line in table_lines(self.materials)]
+        cells = [[text(m) if m["file"] else "–" for text in COLUMNS.values()] for m in self.materials.values()]
+        rows = [[name, m["status"], *row] for (name, m), row in zip(self.materials.items(), cells, strict=True)]
+        lines += grid([["material", "status", *COLUMNS], *rows])
         lines += [f"  {name}: {m['failure']}" for name, m in self.materials.items() if m["failure"]]
         lines += [f"  {name}: {remark}" for name, m in self.materials.items() for remark in m.get("remarks", ())]
         return lines
@@ -130,12 +141,10 @@ def check(request: FitRequest) -> None:
         raise UsageError(f"output: found {request.output or 'none'}, a library is written to a folder")
     if request.options["over"]:
         raise UsageError("over: given for a library, a family is fitted to a single BSDF")
-    for name in ("checkpoint", "seconds"):
-        if getattr(request, name) is not None:
-            raise UsageError(f"{name}: given for a library, which {_INSTEAD[name]}")
-
-
-_INSTEAD = {"checkpoint": "the same command continues without one", "seconds": "is limited by steps alone"}
+    if request.checkpoint is not None:
+        raise UsageError("checkpoint: given for a library, which the same command continues without one")
+    if request.deadline is not None:
+        raise UsageError("seconds: given for a library, which is limited by steps alone")
 
 
 def fit_library(request: FitRequest) -> FittedLibrary:
@@ -146,8 +155,7 @@ def fit_library(request: FitRequest) -> FittedLibrary:
     use_rgb_variant(request)
     start, options = time.perf_counter(), request.options
     folder = writable_folder(request.output, create=True)
-    writable_folder(folder / PICTURES, create=True)
-    materials, broken = materials_of(request, folder)
+    materials, broken = find_materials(request, folder)
     records = {name: _record(m, folder, "left") for name, m in materials.items()}
     records |= {name: _record(None, folder, "failed", failure) for name, failure in broken.items()}
     for name, material in materials.items():
@@ -164,11 +172,11 @@ def fit_library(request: FitRequest) -> FittedLibrary:
     interrupted = any(r["status"] == "left" for r in records.values())
     library = FittedLibrary(None, None, request=request, folder=folder, materials=records, interrupted=interrupted)
     library.seconds = time.perf_counter() - start
-    write_report(library)
+    write_json(folder / REPORT, library.report)
     return library
 
 
-def materials_of(request: FitRequest, folder: Path) -> tuple[dict[str, LibraryMaterial], dict[str, str]]:
+def find_materials(request: FitRequest, folder: Path) -> tuple[dict[str, LibraryMaterial], dict[str, str]]:
     """Return the materials of a library by name, and the sentences of sources without any.
 
     Names are those of the files, of the ids of a scene's materials, or of both, in letters that all file systems take.
@@ -245,7 +253,7 @@ def _is_fitted(material: LibraryMaterial) -> bool:
 
 
 def fit_material(material: LibraryMaterial) -> float:
-    """Fit a material and write its pictures, then its file, in the variant that it names.
+    """Fit a material and write its file, in the variant that it names.
 
     Returns the duration in seconds. Raises ``KeyboardInterrupt`` if Ctrl-C interrupted the training.
     """
@@ -257,7 +265,6 @@ def fit_material(material: LibraryMaterial) -> float:
     )  # fmt: skip
     if fitted.result.asked_to_stop:
         raise KeyboardInterrupt
-    save_pair(path, fitted.truth, fitted.model)
     fitted.table.settings["identity"] = material.identity
     fitted.save(path)
     del fitted
@@ -274,48 +281,3 @@ def _record(material: LibraryMaterial | None, folder: Path, status: str, failure
             record |= {"file": Path(material.path).name, "bytes": table.nbytes, **table.measured, "seconds": seconds}
             record["remarks"] = table.settings.get("remarks", [])
     return record
-
-
-# -- report ------------------------------------------------------------------------------------------------------------
-
-#: Columns of the table: heading → text of a material's record.
-COLUMNS = {
-    "bytes": lambda m: f"{m['bytes']:,}",
-    "accuracy": accuracy,
-    "albedo": lambda m: f"{100 * m['albedo_excess']:+.2f}%" if "albedo_excess" in m else "–",
-    "moment": lambda m: f"{m['sample_weight_moment']:.2f}",
-    "seconds": lambda m: "" if m["seconds"] is None else f"{m['seconds']:.0f}",
-}
-
-
-def rows_of(materials: dict[str, dict]) -> list[list[str]]:
-    """Return the rows of a table: its heading, then the name, the status and the figures of each material."""
-    rows = [["material", "status", *COLUMNS]]
-    for name, m in materials.items():
-        rows.append([name, m["status"], *((text(m) if m["file"] else "–") for text in COLUMNS.values())])
-    return rows
-
-
-def table_lines(materials: dict[str, dict]) -> list[str]:
-    """Return the table of materials as lines of text."""
-    rows = rows_of(materials)
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [
-        "  ".join(t.ljust(w) if k < 2 else t.rjust(w) for k, (t, w) in enumerate(zip(row, widths, strict=True)))
-        for row in rows
-    ]
-
-
-def write_report(library: FittedLibrary) -> None:
-    """Write ``report.json``, ``report.md`` and the contact sheet of a library into its folder."""
-    folder, materials = library.folder, library.materials
-    rows = rows_of(materials)
-    lines = [f"| {' | '.join(row)} |" for row in rows]
-    lines.insert(1, f"|{' --- |' * len(rows[0])}")
-    head = library.summary(folder.name)[0]
-    failures = [f"- {name}: {m['failure']}" for name, m in materials.items() if m["failure"]]
-    page = [f"# {head}", "", f"![Source and learned BSDF of each material]({SHEET})", "", *lines, "", *failures]
-    write_json(folder / REPORT, library.report)
-    with replacing(folder / PAGE) as temporary:
-        temporary.write_text("\n".join(page).rstrip() + "\n", encoding="utf-8")
-    write_sheet(folder / SHEET, folder, materials)

@@ -1,25 +1,42 @@
-"""Importance sampling of a learned BSDF: a mixture of a cosine and two lobes of visible GGX normals."""
+"""Importance sampling of a learned BSDF, or of a family: a mixture of a cosine and two lobes of visible GGX normals."""
 
 from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
 import numpy as np
 
-from .model import turned
-from .pool import density_ggx, incident, outgoing, sample_ggx, shortened
+from .directions import density_ggx, incident, outgoing, sample_ggx, shortened
+from .model import SAMPLING_NODES, grid, opaque_numbers, table_nodes, turned, widths
 
-#: Directions of incidence for which weights are stored, and samples of each that determine them.
-NODES, SAMPLES = 16, 4096
+#: Directions of incidence for which weights are stored.
+NODES = 16
 
-#: Roughness and exponent of the lobes that are tried.
-ALPHAS, EXPONENTS = tuple(float(a) for a in np.geomspace(0.002, 1.0, 16)), (2.0, 5.0, 20.0)
+#: Samples of each of these directions that determine the weights; of a member of a family.
+SAMPLES = 4096
+MEMBER_SAMPLES = 1024
 
-#: Iterations of the weights of a mixture; samples of a node and iterations that rank pairs of lobes, and pairs kept.
-ITERATIONS, RANKING, KEPT = 30, (256, 8), 6
+#: Roughnesses of the lobes that are tried.
+ALPHAS = tuple(float(a) for a in np.geomspace(0.002, 1.0, 16))
+
+#: Exponents of the lobes that are tried.
+EXPONENTS = (2.0, 5.0, 20.0)
+
+#: Factors of the widths of the proxy's lobes that are tried for a family.
+FACTORS = (0.5, 0.7, 1.0, 1.4, 2.0, 3.0)
+
+#: Iterations of the weights of a mixture.
+ITERATIONS = 30
+
+#: Samples of a direction, and iterations, that rank pairs of lobes.
+RANKING = (256, 8)
+
+#: Pairs of lobes that are tried with all samples.
+PAIRS = 6
 
 #: Least weight of the cosine: every direction can be drawn.
 FLOOR = 0.02
@@ -58,7 +75,7 @@ class SampledLobe:
         return density_ggx(wi, wo, Float(self.alpha_u), Float(self.alpha_v), gamma)
 
 
-def fitted_mixture(
+def fit_mixture(
     truth, types, isotropic: bool, stretch: float = 1.0, seed: int = 3
 ) -> tuple[tuple[SampledLobe, SampledLobe], np.ndarray]:
     """Return both lobes, and the weights of cosine and lobes, ``(NODES, 3)``.
@@ -79,12 +96,37 @@ def fitted_mixture(
         _, cost = optimal_weights(densities[[0, 1 + i, 1 + j], :, some], square[:, some], RANKING[1])
         ranked.append((float(np.log(cost).mean()), i, j))
     best = None
-    for _, i, j in sorted(ranked)[:KEPT]:
+    for _, i, j in sorted(ranked)[:PAIRS]:
         weights, cost = optimal_weights(densities[[0, 1 + i, 1 + j]].astype(np.float64), square)
         total = float(np.mean(np.log(cost)))
         if best is None or total < best[0]:
             best = total, (lobes[i], lobes[j]), weights
     return best[1:]
+
+
+def fit_family_mixture(truth, member_at: Callable, types, isotropic: bool) -> tuple[tuple, np.ndarray]:
+    """Return the factors of the widths of both lobes, and weights, ``(NODES, nodes of the parameters…, 3)``.
+
+    ``member_at`` returns the member of the family at coordinates.
+    """
+    nodes = table_nodes(truth.parameters, SAMPLING_NODES)
+    pairs = list(itertools.product(range(len(FACTORS)), repeat=2))
+    costs, weights = np.zeros(len(pairs)), []
+    for coordinates in grid(nodes):
+        source, fitted = truth.at(coordinates), member_at(opaque_numbers(types, coordinates))
+        lobes = widths(fitted.proxy, fitted.scale)
+        alphas = [dr.clip(types.Float(factor * w), 1e-3, 1) for w in lobes for factor in FACTORS]
+        dr.eval(alphas)
+        lobes_tried = [SampledLobe(a, a) for a in alphas]
+        densities, square = candidate_densities(source, types, isotropic, lobes_tried, MEMBER_SAMPLES, 3)
+        tried = [
+            optimal_weights(densities[[0, 1 + i, 1 + len(FACTORS) + j]], square) for i, j in pairs
+        ]  # fmt: skip
+        costs += [np.log(cost).mean() for _, cost in tried]
+        weights.append([w for w, _ in tried])
+    best = int(np.argmin(costs))
+    table = np.stack([w[best] for w in weights], axis=1)
+    return tuple(FACTORS[k] for k in pairs[best]), table.reshape(NODES, *nodes, 3)
 
 
 def candidate_densities(truth, types, isotropic: bool, lobes: list, size: int, seed: int) -> tuple:

@@ -23,18 +23,30 @@ The *residual* is an indirection (two primary arrays, one cascaded array) in thr
 None of them changes when ``wi`` and ``wo`` are exchanged: f is reciprocal, bit for bit but for rounding. Exchanging
 them also maps φ_d to φ_d + π, so that w assumes in addition that f is symmetric about the plane of incidence
 (``azimuth="mirror"``). With ``azimuth="half"``, w = φ_d/π mod 1 assumes reciprocity alone.
+
+A *family* depends on up to three parameters p, such as roughness and metallic, each in its coordinate in [0, 1]:
+
+    f(wi, wo; p) = proxy(wi, wo; p) · (a + b Σ_r m_r(p) C_r[P₁(u, v), P₂(v, w)])⁴.
+
+The proxy has a table over the parameters: colours, and logarithms of roughnesses, exponents and edges, are interpolated
+linearly. So are the logarithms of the roughnesses a by which u is scaled: entries of the residual are dense in the peak
+of each member. The residual is a sum of R terms: the cascaded array holds all of them, 3R channels, and a table over
+the parameters their factors m ∈ [-1, 1]. At fixed parameters, a family is a :class:`LearnedBSDF` whose numbers may
+differ from lane to lane. A single BSDF is a family of no parameters.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import drjit as dr
 import numpy as np
 from drjit import nn
 
-from ...arrays.indirection import DifferentiableArray, Indirection, rounded, unfolded
+from ...arrays.budget import Budget
+from ...arrays.indirection import DifferentiableArray, Indirection, device_array, rounded, unfolded
 from ...arrays.lookup import clamp
 
 #: Smallest roughness of a lobe, and smallest scale of the coordinate u.
@@ -55,7 +67,35 @@ BLACK = -9.0
 #: Logarithms of the proxy's parameters are limited to this range.
 LOGARITHMS = (-14.0, 5.0)
 
+#: Names of the assumptions on f when the directions are exchanged.
 AZIMUTHS = ("mirror", "half")
+
+#: Most parameters of a family.
+MOST_PARAMETERS = 3
+
+#: Ratio of the ends of a parameter's range from which on its coordinate is logarithmic.
+LOGARITHMIC_RATIO = 4.0
+
+#: Nodes of a coordinate (linear, logarithmic) in the table of a family's proxy, for one, two and three parameters.
+PROXY_NODES = ((9, 9), (5, 9), (3, 8))
+
+#: Nodes of a coordinate in a family's tables of sampling and energy.
+SAMPLING_NODES = ((5, 9), (3, 7), (3, 5))
+
+#: Number of terms R of a family's residual, for one, two and three parameters.
+RANKS = (4, 4, 5)
+
+#: Default size of the residual's arrays, for no, one, two and three parameters.
+BYTES = ("2k", "4k", "9k", "12k")
+
+#: First of the channels of a family's proxy table that hold the logarithms of (a_x, a_y); those before are the proxy's.
+SCALE = PARAMETERS
+
+#: Channels of a family's proxy table.
+CHANNELS = PARAMETERS + 2
+
+#: Channels of a family's proxy table that are interpolated as logarithms.
+LOGARITHMIC_CHANNELS = (3, *(4 + k * LOBE + i for k in range(2) for i in range(3)), SCALE, SCALE + 1)
 
 
 @dataclass(frozen=True)
@@ -209,38 +249,133 @@ class Proxy:
         return result
 
 
-class BSDFArrays(nn.Module):
-    """Arrays of a learned BSDF.
+@dataclass(frozen=True)
+class Parameter:
+    """Parameter of a family: its ``name`` as a property of the plugin, and its range.
 
-    ``residual`` is an :class:`.Indirection` of three coordinates, or one array that is read at
-    them; ``proxy`` holds the logarithms of the proxy's parameters, divided by ``rate``, as an array ``(22, 1)``
-    (``None``: no proxy).
+    Its coordinate in [0, 1] is logarithmic if the ends of the range have a ratio of at least 4, else linear.
     """
 
-    DRJIT_STRUCT = {"residual": nn.Module, "proxy": DifferentiableArray, "rate": float}  # noqa: RUF012
+    name: str
+    low: float
+    high: float
 
-    def __init__(self, residual=None, proxy=None, rate: float = 1.0):
-        self.residual, self.proxy, self.rate = residual, proxy, rate
+    @property
+    def is_logarithmic(self) -> bool:
+        """Whether the coordinate is logarithmic."""
+        return self.low > 0 and self.high / self.low >= LOGARITHMIC_RATIO
+
+    @property
+    def middle(self) -> float:
+        """Value whose coordinate is 0.5."""
+        return self.value(0.5)
+
+    def value(self, coordinate: float) -> float:
+        """Return the value of a coordinate."""
+        if self.is_logarithmic:
+            return self.low * (self.high / self.low) ** coordinate
+        return self.low + (self.high - self.low) * coordinate
+
+    def coordinate(self, value):
+        """Return the coordinate of an array of values; values outside the range count as its ends, NaN as the lower."""
+        if self.is_logarithmic:
+            position = dr.log2(value * (1 / self.low)) * (1 / math.log2(self.high / self.low))
+        else:
+            position = (value - self.low) * (1 / (self.high - self.low))
+        return clamp(position, 0.0, 1.0)
+
+    def to_json(self) -> dict:
+        """Return the parameter as JSON."""
+        return {"name": self.name, "low": self.low, "high": self.high}
+
+
+def table_nodes(parameters: Sequence[Parameter], nodes: tuple) -> tuple[int, ...]:
+    """Return the nodes of a table over parameters, of :data:`PROXY_NODES` or :data:`SAMPLING_NODES`."""
+    linear, logarithmic = nodes[len(parameters) - 1]
+    return tuple(logarithmic if p.is_logarithmic else linear for p in parameters)
+
+
+def grid(nodes: tuple[int, ...]) -> np.ndarray:
+    """Return the coordinates of all nodes, ``(N, d)``, the last axis fastest."""
+    axes = np.meshgrid(*(np.linspace(0, 1, n) for n in nodes), indexing="ij")
+    return np.stack([a.ravel() for a in axes], axis=-1)
+
+
+def interpolation(coordinates, nodes: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the indices of the nodes around coordinates, the last axis fastest, and their weights above 0."""
+    index, weight = np.zeros(1, int), np.ones(1)
+    for x, n in zip(coordinates, nodes, strict=True):
+        position = float(x) * (n - 1)
+        lower = min(int(position), n - 2)
+        ends = np.array([1 - (position - lower), position - lower])
+        index = (index[:, None] * n + lower + np.arange(2)).ravel()
+        weight = (weight[:, None] * ends).ravel()
+    return index[weight > 0], weight[weight > 0]
+
+
+def points(count: int, dims: int, seed: int) -> np.ndarray:
+    """Return well-distributed coordinates in [0, 1], ``(count, dims)``; some lie on the ends."""
+    root = (1.6180339887, 1.3247179572, 1.2207440846)[dims - 1]  # the R sequence (Roberts 2018)
+    steps = root ** -np.arange(1.0, dims + 1)
+    x = (np.random.default_rng(seed).random(dims) + np.arange(1, count + 1)[:, None] * steps) % 1
+    return np.clip(1.08 * x - 0.04, 0, 1)
+
+
+def opaque_numbers(types, numbers) -> list:
+    """Return numbers, as of the parameters of one member, as arrays that no kernel contains."""
+    return [dr.opaque(types.Float, float(x)) for x in numbers]
+
+
+class BSDFArrays(nn.Module):
+    """Arrays of a learned BSDF, for training.
+
+    ``residual`` is an :class:`.Indirection` of three coordinates, or one array that is read at them (``None``: the
+    proxy alone); ``proxy`` holds the logarithms of the proxy's parameters, divided by ``rate``, as an array ``(22, 1)``
+    (``None``: no proxy). Of a family, ``proxy`` is a table over the parameters with :data:`CHANNELS` logarithms, and
+    ``mixing`` that of the factors of the residual's terms.
+    """
+
+    DRJIT_STRUCT = {  # noqa: RUF012
+        "residual": nn.Module, "proxy": DifferentiableArray, "mixing": DifferentiableArray, "rate": float,
+    }  # fmt: skip
+
+    def __init__(self, residual=None, proxy=None, mixing=None, rate: float = 1.0):
+        self.residual, self.proxy, self.mixing, self.rate = residual, proxy, mixing, rate
 
     def _alloc(self, dtype, size=-1, rng=None):
-        parts = [None if part is None else part._alloc(dtype)[0] for part in (self.residual, self.proxy)]
+        parts = [None if p is None else p._alloc(dtype)[0] for p in (self.residual, self.proxy, self.mixing)]
         return BSDFArrays(*parts, self.rate), 3
 
     def logarithms(self) -> list:
-        """Return the logarithms of the proxy's parameters as arrays of one number each."""
+        """Return the logarithms of the parameters of a single proxy, as arrays of one number each."""
         entries = self.proxy.data.array
         index = dr.uint32_array_t(type(entries))
         return [self.rate * dr.gather(type(entries), entries, index(i)) for i in range(PARAMETERS)]
 
-    def rounded(self) -> BSDFArrays:
-        """Return a copy whose residual rounds its entries to bytes, for training."""
-        residual = self.residual
-        residual = rounded(residual) if isinstance(residual, Indirection) else residual.rounded(8)
-        return BSDFArrays(residual, self.proxy, self.rate)
+    def proxy_table(self) -> DifferentiableArray:
+        """Return the table of a family's proxy as it is interpolated: colours, and logarithms of all else."""
+        entries, stored = self.proxy.data.array * self.rate, self.proxy.data.shape[-1]
+        flags = np.resize([channel in LOGARITHMIC_CHANNELS for channel in range(stored)], len(entries))
+        logarithmic = device_array(dr.uint32_array_t(type(entries)), flags) > 0
+        result = self.proxy.copy()
+        values = dr.select(logarithmic, entries, dr.exp(clamp(entries, *LOGARITHMS)))
+        result.data = type(self.proxy.data)(values, self.proxy.data.shape)
+        return result
 
-    def unfolded(self) -> BSDFArrays:
-        """Return a copy whose entries are folded already."""
-        return BSDFArrays(unfolded(self.residual), self.proxy, self.rate)
+    def at(self, form: Form, coordinates: Sequence = (), is_rounded: bool = True) -> LearnedBSDF:
+        """Return the BSDF, or the members of the family at ``coordinates``.
+
+        Entries of the residual are rounded to bytes, or only folded.
+        """
+        residual, mixing = self.residual, self.mixing
+        if residual is not None and not is_rounded:
+            residual, mixing = unfolded(residual), unfolded(mixing)
+        elif residual is not None:
+            residual = rounded(residual) if isinstance(residual, Indirection) else residual.rounded(8)
+            mixing = None if mixing is None else mixing.rounded(8)
+        if len(coordinates):
+            return member(form, self.proxy_table(), residual, mixing, None, coordinates)
+        return LearnedBSDF(form, residual, None if self.proxy is None else Proxy.of(self.logarithms(), form))
 
 
 class LearnedBSDF:
@@ -248,20 +383,30 @@ class LearnedBSDF:
 
     ``residual`` is any function of a list of three coordinates, or ``None``; ``proxy`` may be ``None``, too. ``energy``
     is an array of s(θ) ≤ 1, read at √cos θ: f is multiplied by s(θ_i) s(θ_o), which limits the albedo and keeps
-    reciprocity (``None``: 1).
+    reciprocity (``None``: 1). Of a family's members, ``scale`` has the roughnesses that scale u, (a_x, a_y) or one for
+    both, arrays (``None``: those of the form).
     """
 
-    def __init__(self, form: Form, residual, proxy: Proxy | None, energy=None):
-        self.form, self.residual, self.proxy, self.energy = form, residual, proxy, energy
-
-    @classmethod
-    def of(cls, form: Form, arrays: BSDFArrays) -> LearnedBSDF:
-        proxy = None if arrays.proxy is None else Proxy.of(arrays.logarithms(), form)
-        return cls(form, arrays.residual, proxy)
+    def __init__(self, form: Form, residual, proxy: Proxy | None, energy=None, scale: tuple | None = None):
+        self.form, self.residual, self.proxy, self.energy, self.scale = form, residual, proxy, energy, scale
+        #: Terms of u that the scale of a member determines.
+        self.terms = None
+        if scale is not None:
+            x, y = (dr.rcp(dr.square(a)) for a in (scale[0], scale[-1]))
+            self.terms = x, y, dr.rcp(dr.log2(1 + dr.maximum(x, y)))
 
     def coordinates(self, g: DirectionPair) -> list:
         """Return u, v and w."""
-        return [coordinate_u(g, self.form.scale), dr.sqrt(1 - g.cos_d), coordinate_w(g, self.form)]
+        if self.terms is None:
+            u = coordinate_u(g, self.form.scale)
+        else:
+            x, y, inverse = self.terms
+            u = dr.minimum(dr.log2(1 + dr.fma(g.hx2, x, g.hy2 * y)) * inverse, 1)
+        return [u, dr.sqrt(1 - g.cos_d), coordinate_w(g, self.form)]
+
+    def cosine_value(self, wi, wo) -> list:
+        """Return f cos θ_o, three arrays, for unit directions above the surface."""
+        return [v * wo.z for v in self.value(wi, wo)]
 
     def value(self, wi, wo, active=True) -> list:
         """Return f without the cosine, three arrays, for unit directions above the surface."""
@@ -280,6 +425,63 @@ class LearnedBSDF:
             low, step = fourth_roots(self.form.range)
             factors = [dr.square(dr.square(dr.fma(x, step, low))) for x in numbers]
         return [a * b for a, b in zip(result, factors, strict=True)]
+
+
+def member(form: Form, table, residual, mixing, energy, coordinates: list, active=True) -> LearnedBSDF:
+    """Return the members of a family at ``coordinates``, arrays.
+
+    ``table`` is that of the proxy, ``mixing`` the factors of the residual's terms, and ``energy`` an array of the
+    scale of energy over the cosine's coordinate and those of the parameters (``None``: 1).
+    """
+    numbers = table(coordinates, active)
+    proxy, scale = member_proxy(numbers, form)
+
+    def combined(x, active=True):
+        low, step = fourth_roots(form.range)
+        start = (1 - low) / step
+        factors = [2 * m - 1 for m in mixing(coordinates, active)]
+        values, result = residual(x, active), []
+        for k in range(3):
+            terms = zip(factors, values[k::3], strict=True)
+            result.append(clamp(sum((m * (value - start) for m, value in terms), start), 0, 1))
+        return result
+
+    def limit(x, active=True):
+        return energy([*x, *coordinates], active)
+
+    read = None if residual is None else combined
+    return LearnedBSDF(form, read, proxy, None if energy is None else limit, scale)
+
+
+def member_proxy(numbers: list, form: Form) -> tuple[Proxy, tuple]:
+    """Return the proxy and the scale (a_x, a_y) of :data:`CHANNELS` numbers of a proxy's table, limited to finite."""
+    low, high = (math.exp(x) for x in LOGARITHMS)
+
+    def roughness(channel):
+        channels = (channel,) if form.isotropic else (channel, channel + 1)
+        return tuple(dr.exp(clamp(numbers[c], math.log(ALPHA_MIN), 0.0)) for c in channels)
+
+    def shape(channel):
+        return dr.exp(clamp(numbers[channel], *LOGARITHMS))
+
+    lobes = {}
+    for k, name in enumerate(TERMS[1:]):
+        a = 4 + k * LOBE
+        if name in form.terms:
+            colours = [[clamp(c, low, high) for c in numbers[i : i + 3]] for i in (a + 3, a + 6)]
+            lobes[name] = ProxyLobe(roughness(a), 2 * shape(a + 2), *colours)
+    diffuse = [clamp(c, low, high) for c in numbers[:3]] if "diffuse" in form.terms else None
+    return Proxy.of_parts(diffuse, shape(3), lobes), roughness(SCALE)
+
+
+def widths(proxy: Proxy, scale: tuple) -> list:
+    """Return the roughness of GGX lobes about as wide as both lobes of a proxy; a missing one: 4 times ``scale``."""
+    result = []
+    for name in TERMS[1:]:
+        lobe = proxy.lobes.get(name)
+        wide = dr.minimum(4 * scale[0], 1) if lobe is None else dr.sqrt(lobe.squares[0])
+        result.append(dr.detach(clamp(wide, ALPHA_MIN, 1.0)))
+    return result
 
 
 def turned(w, angle: float):
@@ -318,23 +520,46 @@ def coordinate_w(g: DirectionPair, form: Form):
 
 @dataclass(frozen=True)
 class ResidualSizes:
-    """Sizes of the arrays: entries of P₁ (u, v), P₂ (v, w) and C; without primaries, of C (u, v, w) alone."""
+    """Sizes of the arrays: entries of P₁ (u, v), P₂ (v, w) and C; without primaries, of C (u, v, w) alone.
+
+    Of a family, C has ``rank`` terms, and ``mixing`` has the nodes of the table of their factors.
+    """
 
     first: tuple[int, int] | None = (14, 9)
     second: tuple[int, int] | None = (8, 6)
     cascaded: tuple[int, int, int] = (14, 8, 5)
+    mixing: tuple[int, ...] = ()
+    rank: int = 1
 
     @property
     def nbytes(self) -> int:
         """Bytes of all entries."""
-        total = 3 * math.prod(self.cascaded)
+        factors = math.prod(self.mixing) if self.mixing else 0
+        total = self.rank * (3 * math.prod(self.cascaded) + factors)
         return total if self.first is None else total + 2 * math.prod(self.first) + math.prod(self.second)
 
-    def residual(self, start: float, azimuth: str = "mirror"):
-        """Return the arrays, not yet allocated: the identity, then ``start`` (in [0, 1]) everywhere."""
-        border = ("clamp", "clamp", "repeat" if azimuth == "half" else "clamp")
+    def to_json(self) -> dict:
+        """Return the sizes as JSON."""
+        sizes = {"first": self.first, "second": self.second, "cascaded": self.cascaded}
+        return {"sizes": sizes, "mixing": self.mixing, "rank": self.rank} if self.mixing else sizes
+
+    def arrays(self, start: float, azimuth: str = "mirror"):
+        """Return the residual and the factors of its terms, not yet allocated.
+
+        The primary arrays start as the identity, the cascaded one at ``start`` (in [0, 1]); of a family, nearly so.
+        """
+        border, cascaded, mixing = ("clamp", "clamp", "repeat" if azimuth == "half" else "clamp"), start, None
+        if self.mixing:
+            rng = np.random.default_rng(0)
+            cascaded = start + rng.uniform(-0.05, 0.05, (*self.cascaded, 3 * self.rank))
+            factors = 0.5 + 0.15 * rng.standard_normal((*self.mixing, self.rank))
+            factors[..., 0] = 0.9
+            factors = np.clip(factors, 0.05, 0.95).astype(np.float32)
+            mixing = DifferentiableArray(self.mixing, self.rank, factors, fold=True)
+        values = ("constant", start) if mixing is None else (cascaded.astype(np.float32),)
+        cascaded = DifferentiableArray(self.cascaded, 3 * self.rank, *values, fold=True, border=border)
         if self.first is None:
-            return DifferentiableArray(self.cascaded, 3, "constant", start, fold=True, border=border)
+            return cascaded, mixing
         second = np.broadcast_to(np.linspace(0, 1, self.second[1])[None, :, None], (*self.second, 1))
         if azimuth == "half":  # w wraps around: its primary stays below the end of the cascaded array's period
             second = second * (1 - 1 / self.second[1])
@@ -342,25 +567,22 @@ class ResidualSizes:
             DifferentiableArray(self.first, 2, "ramp", fold=True),
             DifferentiableArray(self.second, 1, second.astype(np.float32), fold=True, border=(border[0], border[2])),
         ]
-        cascaded = DifferentiableArray(self.cascaded, 3, "constant", start, fold=True, border=border)
-        return Indirection(primary, cascaded, [(0, 1), (1, 2)])
+        return Indirection(primary, cascaded, [(0, 1), (1, 2)]), mixing
 
 
-def structure_of(nbytes: int, plain: bool = False) -> ResidualSizes:
-    """Return the largest structure of the default's proportions within ``nbytes``. Raises ``ValueError``.
+def sizes_within(nbytes: int, parameters: Sequence[Parameter] = (), plain: bool = False) -> ResidualSizes:
+    """Return the largest arrays of the default's proportions within ``nbytes``. Raises :class:`.BudgetError`.
 
-    ``plain``: a single array, without primaries.
+    ``parameters`` are those of a family; ``plain``: a single array, without primaries.
     """
-    best = None
-    for step in range(1, 400):
-        scale = 0.2 * 1.02**step
-        cascaded = tuple(max(2, round(n * scale)) for n in (14, 9 if plain else 8, 5))
-        first, second = (tuple(max(2, round(n * scale**0.75)) for n in pair) for pair in ((14, 9), (8, 6)))
-        structure = ResidualSizes(None, None, cascaded) if plain else ResidualSizes(first, second, cascaded)
-        if structure.nbytes <= nbytes:
-            best = structure
-    if best is None:
-        raise ValueError(
-            f"found {nbytes} bytes, the smallest arrays need {ResidualSizes((2, 2), (2, 2), (2, 2, 2)).nbytes}"
-        )
-    return best
+    mixing = table_nodes(parameters, PROXY_NODES) if parameters else ()
+    rank = RANKS[len(parameters) - 1] if parameters else 1
+    first_scale, power, proportions = (0.15, 0.5, (14, 8, 6)) if parameters else (0.2, 0.75, (14, 9 if plain else 8, 5))
+
+    def sizes(step: int) -> ResidualSizes:
+        scale = first_scale * 1.02**step
+        cascaded = tuple(max(2, round(n * scale)) for n in proportions)
+        first, second = (tuple(max(2, round(n * scale**power)) for n in pair) for pair in ((14, 9), (8, 6)))
+        return ResidualSizes(*(None, None) if plain else (first, second), cascaded, mixing, rank)
+
+    return sizes(Budget(nbytes).largest(sizes, range(400)))

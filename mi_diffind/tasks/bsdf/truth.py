@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 from pathlib import Path
 
@@ -16,12 +17,15 @@ from ...core.compat import one_sentence
 from ...core.errors import UsageError, reason
 from ...core.files import irregular, shown
 from ...core.units import memory
-from .measured_files import ILLUMINANTS, PolarisedTruth, measured_bsdf
-from .scattered import ScatteredTruth
-from .source import Truth
+from .directions import incident, outgoing
+from .measured import ILLUMINANTS, PolarisedTruth, ScatteredTruth, Truth, measure_symmetry, measured_bsdf
+from .model import MOST_PARAMETERS, Parameter, points
 
 #: Extensions of files that are sources.
 SUFFIXES = (".xml", ".bsdf", ".pbsdf", ".binary", ".csv")
+
+#: Relative difference of f below which a parameter of a family has no effect.
+EFFECT = 1e-5
 
 #: Share of the values of a source that may be NaN or infinite: a few are at the horizon.
 MOST_NONFINITE = 0.01
@@ -147,6 +151,89 @@ class MERLTruth(Truth):
         return result
 
 
+def parameter_ranges(over) -> dict[str, tuple[float, float]]:
+    """Return the ranges of parameters by name, from a dictionary or pairs. Raises :class:`UsageError`."""
+    ranges = dict(over)
+    if not 1 <= len(ranges) <= MOST_PARAMETERS:
+        raise UsageError(f"over: found {len(ranges)} parameters, allowed are 1 to {MOST_PARAMETERS}")
+    for name, ends in ranges.items():
+        try:
+            low, high = map(float, ends)
+        except (TypeError, ValueError):
+            low = high = math.nan
+        if not (low < high and math.isfinite(low) and math.isfinite(high)):
+            raise UsageError(f"over: found {name} = {ends!r}, a pair of finite numbers (low, high) is needed")
+        ranges[name] = (low, high)
+    return ranges
+
+
+class FamilyTruth:
+    """BSDF of Mitsuba whose ``parameters`` are set. Raises :class:`UsageError`.
+
+    ``over`` maps names to ranges; a name is the key of ``mi.traverse``, with or without a last ``.value``, or its end.
+    """
+
+    def __init__(self, truth: Truth, over: dict[str, tuple[float, float]]):
+        if not isinstance(truth, MitsubaTruth):
+            raise UsageError(f"over: {truth.name} has no parameters, a BSDF of Mitsuba is needed")
+        import mitsuba as mi
+
+        self.truth, self.scene = truth, mi.traverse(truth.bsdf)
+        scalars = [key for key in self.scene.keys() if type(self.scene[key]) is mi.Float]
+        self.scalars = {key.removesuffix(".value"): key for key in scalars}
+        self.keys, self.parameters = [], []
+        for name, (low, high) in over.items():
+            key = self._key(name)
+            self.keys.append(self.scalars[key])
+            self.parameters.append(Parameter(name.removesuffix(".value").replace(".", "_"), low, high))
+        if len(set(self.keys)) < len(self.keys):
+            raise UsageError(f"over: found {', '.join(over)}, which name a parameter twice")
+        self.before = [mi.Float(self.scene[key]) for key in self.keys]
+
+    def _key(self, name: str) -> str:
+        name = name.removesuffix(".value")
+        matching = [name] if name in self.scalars else [key for key in self.scalars if key.endswith("." + name)]
+        if len(matching) != 1:
+            allowed = ", ".join(matching or self.scalars) or "none"
+            raise UsageError(f'over: found "{name}", the parameters of {self.truth.name} are {allowed}')
+        return matching[0]
+
+    def at(self, coordinates) -> MitsubaTruth:
+        """Return the source at coordinates in [0, 1], one for each parameter. It is the same object for all."""
+        self._set([p.value(float(x)) for p, x in zip(self.parameters, coordinates, strict=True)])
+        return self.truth
+
+    def _set(self, values: list) -> None:
+        for key, value in zip(self.keys, values, strict=True):
+            self.scene[key] = type(self.scene[key])(value)
+        self.scene.update()
+
+    def restore(self) -> None:
+        """Give the source the parameters that it had."""
+        self._set(self.before)
+
+    def check_effects(self, types) -> None:
+        """Raise :class:`UsageError` if a parameter changes nothing."""
+        rng = dr.rng(seed=dr.opaque(types.UInt64, 1))
+        samples = outgoing(rng, types, incident(rng, types, 2**10, False))
+        for k, parameter in enumerate(self.parameters):
+            ends = []
+            for end in (0.0, 1.0):
+                coordinates = [0.5] * len(self.parameters)
+                coordinates[k] = end
+                value = self.at(coordinates).value(samples.wi, samples.wo)
+                ends.append(np.stack([(samples.weight * v).numpy() for v in value]))
+            if np.abs(ends[1] - ends[0]).sum() <= EFFECT * np.abs(ends[0]).sum():
+                raise UsageError(
+                    f"over: {parameter.name} changes nothing of {self.truth.name}, which may need it in the source, too"
+                )
+
+    def symmetries(self, types) -> dict[str, float]:
+        """Return the largest relative differences of some members (:func:`.measured.measure_symmetry`)."""
+        measured = [measure_symmetry(self.at(x), types, 2**14) for x in points(6, len(self.parameters), seed=9)]
+        return {name: max(m[name] for m in measured) for name in measured[0]}
+
+
 def truth_of(
     source, types, material: str = "", uv: tuple[float, float] = (0.5, 0.5), angles: str = "", illuminant: str = ""
 ) -> Truth:
@@ -154,8 +241,8 @@ def truth_of(
 
     ``source`` is a scene or a single BSDF as a file (``.xml``) or as a dictionary of ``mi.load_dict``, a ``mi.BSDF``,
     a measured file (``.bsdf``, ``.pbsdf``, ``.binary``), or a table of measurements (``.csv``), whose ``angles`` are
-    degrees or radians ("": as :mod:`.scattered` decides). ``material`` is the id of a BSDF of a scene. Spectra of
-    measured files have colours under an ``illuminant`` (:mod:`.measured_files`; "": D65). Raises
+    degrees or radians ("": as its angles say). ``material`` is the id of a BSDF of a scene. Spectra of
+    measured files have colours under an ``illuminant`` (:mod:`.measured`; "": D65). Raises
     :class:`.UsageError`.
     """
     import mitsuba as mi

@@ -1,9 +1,8 @@
 """Task 2: the Disney BRDF (Burley 2012), exact and as tables.
 
-- :mod:`.model`: the reference model, and parameters, factors and colours that all forms share;
-- :mod:`.effects`: the parts of the model that a material uses;
+- :mod:`.model`: the reference model, parameters, factors and colours, and the parts that a material uses;
 - :mod:`.decoder`: the model in two steps, per material and per direction, with methods that tables can replace;
-- :mod:`.arrays`, :mod:`.factored`, :mod:`.paper`: the tables, their base class and both layouts;
+- :mod:`.arrays`, :mod:`.factored`, :mod:`.paper_variants`: the tables, their base class and both layouts;
 - :mod:`.files`: table files;
 - :mod:`.sampling`: importance sampling and its density;
 - :mod:`.training`: training distributions and errors.

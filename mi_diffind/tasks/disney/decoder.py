@@ -1,7 +1,7 @@
 """The Disney BRDF in two steps: coefficients of the material, then values for pairs of directions.
 
 :class:`Decoder` is the model of :mod:`.model` rearranged for speed, with the same values up to rounding. Only the parts
-in use (:class:`.effects.Effects`) are computed. Coefficients come in groups (:data:`GROUPS`), each of which depends on
+in use (:class:`.model.Effects`) are computed. Coefficients come in groups (:data:`GROUPS`), each of which depends on
 a few parameters: where these are constant, a caller evaluates the group once and not for each sample.
 
 Learned forms replace some of its methods by reads (:class:`.factored.FactoredDecoder`) or all of it
@@ -17,8 +17,7 @@ from typing import Any
 import drjit as dr
 
 from . import model
-from .effects import Effects
-from .model import COAT_F0, COAT_STRENGTH, SPECULAR_SCALE, TINY, diffuse_factors, geometry, schlick
+from .model import COAT_F0, COAT_STRENGTH, SPECULAR_SCALE, TINY, Effects, diffuse_factors, geometry, schlick
 
 #: Group of coefficients → the parameters from which it is computed.
 GROUPS = {

@@ -11,7 +11,7 @@ from . import training
 from .arrays import DisneyArrays
 from .decoder import Decoder
 from .factored import FactoredArrays, FactoredDecoder
-from .paper import PaperArrays, PaperDecoder
+from .paper_variants import PaperArrays, PaperDecoder
 
 #: Preset → the layout of its tables, and the decoder that reads them.
 LAYOUTS: dict[str, tuple[type[DisneyArrays], type[Decoder]]] = {

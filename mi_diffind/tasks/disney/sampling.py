@@ -14,8 +14,7 @@ from __future__ import annotations
 import drjit as dr
 
 from .decoder import coat_quadric, masking, quadric
-from .effects import Effects
-from .model import COAT_F0, TINY, geometry, schlick
+from .model import COAT_F0, TINY, Effects, geometry, schlick
 
 #: Group of coefficients → whether densities need it with the effects ``e``.
 REQUIRED = {"ggx": lambda e: True, "coat": lambda e: e.clearcoat, "shares": lambda e: len(e.lobes) > 1}

@@ -17,8 +17,7 @@ from ...fitting.loop import Problem, exponential_like
 from . import model
 from .arrays import DisneyArrays
 from .decoder import Decoder, Lobe
-from .effects import Effects
-from .model import PARAMETERS, Material, compose, exact_factors
+from .model import PARAMETERS, Effects, Material, compose, exact_factors
 
 #: Luminance weights of linear sRGB, as ``mi.luminance``.
 LUMINANCE = (0.212671, 0.715160, 0.072169)

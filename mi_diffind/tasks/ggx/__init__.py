@@ -1,4 +1,4 @@
-"""Task 1: the isotropic GGX distribution of normals (:mod:`.model`, :mod:`.training`, :mod:`.files`)."""
+"""Task 1: the isotropic GGX distribution of normals (:mod:`.model`, :mod:`.training`)."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class GGX(Task):
         "tables": FitSettings(steps=4000, batch=65536, lr=1e-2, schedule="cosine", seed=1),
         "paper": FitSettings(steps=3000, batch=65536, lr=1e-3, schedule="constant", seed=1),
     }
+    files = "training"
     shipped = {"tables": "ggx_tables.npz", "paper": "ggx_paper.npz"}  # noqa: RUF012
-    trials = {"small": {"steps": 2, "batch": 256, "primary": 4, "cascaded": 3}}  # noqa: RUF012
     arguments = tuple(
         Argument(
             f"--{name}", type=_side, default=side, metavar="N",

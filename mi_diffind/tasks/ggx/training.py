@@ -1,15 +1,20 @@
-"""Training of task 1: samples, errors and the training problem."""
+"""Training of task 1: samples, errors, the training problem, and table files."""
 
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from dataclasses import asdict
 
 import drjit as dr
 import numpy as np
 
+from ...arrays.indirection import Indirection
+from ...arrays.lookup import STORAGES
+from ...arrays.tables import Table, TableError, check_ranges, load_table
 from ...fitting.loop import Problem, exponential_like
+from ...fitting.task import Model
 from .model import ALPHA_MIN, ENCODINGS, Encoding, LearnedGGX, ggx
 
 #: Ranges of roughness for which errors are reported.
@@ -88,3 +93,36 @@ class GGXProblem(Problem):
 
     def measure(self, net) -> dict[str, float]:
         return measure(LearnedGGX(net, self.encoding, tail=False), self.types, 2**18)
+
+
+class GGXModel(Model):
+    """A table file as a ``distribution`` (:class:`.model.LearnedGGX`)."""
+
+    forms = STORAGES
+
+    def build(self):
+        net = Indirection(self.arrays["primary"], self.arrays["cascaded"])
+        self.distribution = LearnedGGX(net, table_encoding(self.table))
+
+    def measure(self, samples: int = 10**6) -> dict[str, float]:
+        """Measure errors (:func:`measure`)."""
+        return measure(self.distribution, self.types, samples)
+
+
+def table_encoding(table: Table) -> Encoding:
+    """Return the encoding that a table's settings name. Raises :class:`TableError`."""
+    try:
+        return Encoding(table.settings["inputs"], table.settings["output"])
+    except (KeyError, TypeError, ValueError) as e:
+        raise TableError(f"{table.path}: the settings name no known encoding ({e})") from None
+
+
+def load(path: str | os.PathLike) -> Table:
+    """Read and check a table file of this task. Raises :class:`TableError`."""
+    table = load_table(path, "ggx", {"primary": (None, None, 2), "cascaded": (None, None, 1)})
+    bounded = table_encoding(table).output == "root"
+    check_ranges(table, {"primary": (0.0, 1.0), **({"cascaded": (-0.5, 1.5)} if bounded else {})})
+    return table
+
+
+MODEL = GGXModel

@@ -1,38 +1,152 @@
-"""Task 3: images and materials as a primary array that points into a cascaded one.
+"""Images and materials as a primary array that points into a cascaded one (task 3), and recipes of their fits.
 
-Sources and stored channels are in :mod:`mi_diffind.maps`.
-
-- :mod:`.arrays`: initial arrays; :mod:`.memory_budget`, :mod:`.search`: resolutions.
-- :mod:`.weights`: weights of maps in the training.
-- :mod:`.presets`, :mod:`.training`, :mod:`.fit`: recipes, the training problem, the command ``fit image``.
-- :mod:`.compressed`: the result as an image, as a table file and as a model.
+Sources and stored channels are in :mod:`mi_diffind.maps`. :mod:`.arrays`: resolutions, initial arrays and files;
+:mod:`.training`: the training problem; :mod:`.fit`: the command ``fit image``.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 from ...core.arguments import Argument, between, checked, positive
+from ...fitting.settings import FitSettings
 from ...fitting.task import Task
 from ...maps.arguments import DECODED, SIZES, SOURCE, SOURCES
-from .presets import IMPROVEMENTS, PRESETS, STRUCTURES, parse_weights, without
+
+
+@dataclass(frozen=True)
+class CoarsePrimary:
+    """A second primary array, of lower resolution.
+
+    It holds ``dims`` coordinates of the pointer in ``bits`` bits; ``scale`` is its side as a multiple of the first's.
+    """
+
+    dims: int = 2
+    bits: int = 6
+    scale: float = 0.35
+
+
+#: Structures of the primary: bits of an entry, and a second primary or ``None``. Fewer bits: more entries.
+STRUCTURES: dict[str, tuple[int, CoarsePrimary | None]] = {
+    **{f"{bits} bits": (bits, None) for bits in (8, 7, 6, 5, 4, 3)},
+    "4 + 8 bits": (4, CoarsePrimary(2, 8, 0.5)),
+    "3 + 6 bits": (3, CoarsePrimary(2, 6, 0.4)),
+    "2 + 6 bits": (2, CoarsePrimary(2, 6, 0.35)),
+    "pages of 5 bits": (5, None),
+    "pages of 6 bits": (6, None),
+    "pages of 2 + 6 bits": (2, CoarsePrimary(2, 6, 0.35)),
+}
+
+#: Structures whose first primary consists of pages, whose resolution follows the image (:mod:`~.arrays.pages`).
+PAGED = ("pages of 5 bits", "pages of 6 bits", "pages of 2 + 6 bits")
+
+
+@dataclass(frozen=True)
+class ImageRecipe:
+    """Storage and training of an image.
+
+    - ``once``: store equal channels once, and constant channels as numbers (:meth:`.Layout.of`).
+    - ``normals``: leave out the third component of normals where it follows from the others.
+    - ``components``: start from principal components, not from the ramp.
+    - ``jitter``: share of the steps whose samples are jittered.
+    - ``rounded``: share of the steps, the last ones, that read entries rounded to their stored values.
+    - ``structure``: one of :data:`STRUCTURES`, or ``"auto"``; ``dims``: coordinates of a pointer.
+    - ``settings``: steps, batch, rate and loss.
+    - ``weights``: name of a map → factor of its differences, wherever errors are compared; 1 for other maps.
+    """
+
+    once: bool = True
+    normals: bool = True
+    components: bool = True
+    jitter: float = 0.5
+    rounded: float = 1.0
+    structure: str = "auto"
+    dims: int = 4
+    settings: FitSettings = dataclasses.field(default_factory=FitSettings)
+    weights: Mapping[str, float] = dataclasses.field(default_factory=dict)
+
+
+#: Steps of 262,144 samples of a training without a time limit.
+STEPS = 1500
+
+_OURS = FitSettings(steps=STEPS, batch=2**18, lr=3e-2, schedule="cosine", loss="mse", measure_every=STEPS // 10)
+_PAPER = dataclasses.replace(_OURS, batch=2**20, steps=STEPS // 4, lr=1e-3, schedule="constant", loss="mae")
+
+#: Recipes by name; the first is the default.
+PRESETS = {
+    "ours": ImageRecipe(settings=_OURS),
+    "paper": ImageRecipe(False, False, False, 1.0, 0.0, "8 bits", 4, _PAPER),
+}
+
+#: Largest weight of a map.
+MOST_WEIGHT = 100
+
+#: Improvements over the supplement's recipe that can be switched off.
+IMPROVEMENTS = {
+    "once": "equal and constant channels are stored once",
+    "normals": "normals as two channels where the third follows",
+    "components": "arrays start from principal components",
+    "jitter": "half of the samples at texel centres",
+    "rounded": "training sees rounded entries",
+    "structure": "pages, fewer bits an entry of the primary array, a second one for noisy images",
+    "loss": "squared errors",
+    "rate": "a higher rate that falls to zero",
+    "batch": "steps of 262,144 samples",
+}
+
+
+def parse_weights(text: str) -> str | dict[str, float]:
+    """Return ``"auto"``, ``"equal"``, or the numbers of ``MAP=W,…`` by the name of the map. Raises ``ValueError``."""
+    if text in ("auto", "equal"):
+        return text
+    weights, allowed = {}, f"auto, equal, or maps with numbers from 0 to {MOST_WEIGHT} such as normal=2"
+    for part in text.split(","):
+        name, _, number = part.partition("=")
+        try:
+            weights[name.strip()] = float(number)
+        except ValueError:
+            weights[name.strip()] = 0.0
+        if not 0 < weights[name.strip()] <= MOST_WEIGHT:
+            raise ValueError(f'found "{part}", allowed are {allowed}')
+    return weights
+
+
+def without(recipe: ImageRecipe, names) -> ImageRecipe:
+    """Return ``recipe`` with some of :data:`IMPROVEMENTS` switched off. Raises ``ValueError`` for an unknown name."""
+    paper = PRESETS["paper"]
+    for name in names:
+        if name not in IMPROVEMENTS:
+            raise ValueError(f'found the improvement "{name}", allowed are {", ".join(IMPROVEMENTS)}')
+        if name == "loss":
+            recipe = replaced(recipe, loss=paper.settings.loss)
+        elif name == "rate":
+            recipe = replaced(recipe, lr=paper.settings.lr, schedule=paper.settings.schedule)
+        elif name == "batch":
+            batches = paper.settings.batch // recipe.settings.batch
+            recipe = replaced(recipe, batch=paper.settings.batch, steps=max(1, recipe.settings.steps // batches))
+        else:
+            recipe = dataclasses.replace(recipe, **{name: getattr(paper, name)})
+    return recipe
+
+
+def replaced(recipe: ImageRecipe, **settings) -> ImageRecipe:
+    """Return ``recipe`` with other settings of the training."""
+    return dataclasses.replace(recipe, settings=dataclasses.replace(recipe.settings, **settings))
 
 
 class Image(Task):
-    """Task of images; presets are the recipes of :mod:`.presets`, entries have 8 bits or fewer."""
+    """Task of images; presets are :data:`PRESETS`, entries have 8 bits or fewer."""
 
     name = "image"
     title = "an image or the maps of a material"
-    files = "compressed"
+    files = "arrays"
     section = "supplemental 1.3"
     example = "material.json --compression 12x"
     plugin = ("texture", "neural_image")
     presets = {name: recipe.settings for name, recipe in PRESETS.items()}  # noqa: RUF012
     storages = ()
-    trials = {  # noqa: RUF012
-        "indices": {"source": "maps", "steps": 2, "batch": 256, "compression": 2},
-        "pages": {"source": "maps", "steps": 2, "batch": 256, "compression": 2, "structure": "pages of 5 bits"},
-    }
     arguments = (
         SOURCE,
         *SIZES,

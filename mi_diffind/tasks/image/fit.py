@@ -1,20 +1,62 @@
-"""``fit image``: checks of options, the choice of a memory budget, searches and trainings."""
+"""``fit image``: checks of options, weights of maps, the choice of sizes by rule or by trainings, and the fit."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
+from collections.abc import Callable, Iterator, Mapping
+from types import ModuleType
+from typing import NamedTuple
 
+from ...arrays.budget import Budget
 from ...arrays.pages import most_entries
-from ...arrays.tables import MAX_BYTES
+from ...arrays.tables import MAX_BYTES, Table
 from ...core.errors import UsageError
+from ...fitting.loop import FitResult
 from ...fitting.settings import FittingError
 from ...fitting.task import FitRequest, Fitted
 from ...maps import as_seen
 from ...maps.arguments import requested_border, requested_bytes, size_figures
 from ...maps.source import Source, load_source
-from . import memory_budget, search, training, weights
-from .compressed import CompressedImage
-from .presets import PAGED, PRESETS, STRUCTURES, ImageRecipe, parse_weights, without
+from . import PAGED, PRESETS, STRUCTURES, CoarsePrimary, ImageRecipe, parse_weights, replaced, without
+from .arrays import CompressedImage, ImageBudget, cascaded_side, fit_bytes, search
+from .training import dims_of, fit_image, layout_of, problem_of, structure_of
+
+#: Share of the steps that a candidate of a search is trained for.
+SHORT = 1 / 8
+
+#: Share of a limited time for such a search; the best candidate is trained in the rest.
+SEARCHED = 2 / 3
+
+#: Number of candidates that share a limited time.
+CANDIDATES = 16
+
+#: Most trainings of a search by quality, and most if its time is limited.
+TRAININGS = 8
+LIMITED_TRAININGS = 4
+
+#: Sides of the cascaded array that a search tries, by its dimensions.
+SIDES = {1: (64, 256), 2: (16, 32, 64), 3: (8, 16, 32), 4: (4, 8, 12, 16)}
+
+#: Structures of the primary that a search tries.
+TRIED = ("8 bits", "6 bits", "4 bits", "4 + 8 bits", "3 + 6 bits", "2 + 6 bits", *PAGED)
+
+#: Largest ratio of the smallest sufficient and the largest insufficient file at which a search by quality ends.
+NEAR = 1.06
+
+#: Gain by twice the bytes that a search by quality expects at first, in dB.
+OCTAVE_DB = 2.5
+
+#: Least weights of maps that pictures show, and of others such as ambient occlusion, in dB.
+SHOWN_DB = -1.0
+OTHER_DB = -2.0
+
+#: Least gain of weights in the pictures of initial arrays, in dB.
+GAIN_DB = 0.5
+
+#: Side of the sample of a material for which initial arrays are compared, in texels, and of its patches.
+SAMPLE_SIDE = 512
+SAMPLE_PATCH = 64
 
 
 def recipe_of(preset: str, settings, options) -> ImageRecipe:
@@ -49,7 +91,7 @@ def check(request: FitRequest) -> None:
     if options["ratio"] is not None:
         if recipe.components or STRUCTURES[recipe.structure][1]:
             raise UsageError("--ratio: for the preset paper with one primary array; ours takes --cascaded")
-        if options["ratio_search"] or options["psnr"] or options["cascaded"]:
+        if several or options["cascaded"]:
             raise UsageError("--ratio: chooses the sides of arrays: leave out --ratio-search, --psnr and --cascaded")
 
 
@@ -69,10 +111,220 @@ def fit(request: FitRequest) -> Fitted:
     seen = as_seen.measure(source, CompressedImage.of(fitted.table, request.types.TensorXf))
     fitted.table.measured |= {name: float(f"{value:.5g}") for name, value in seen.items()}
     fitted.table.settings |= request.paths(source_path=options["source"])
-    figures, line = size_figures(source, fitted.table, requested)
-    fitted.lines += [line, *source.notes]
+    figures, lines = size_figures(source, fitted.table, requested)
+    fitted.lines += [*lines, *source.notes]
     fitted.figures = {**figures, **fitted.figures}
     return fitted
+
+
+def _train(request: FitRequest, source: Source, recipe: ImageRecipe) -> tuple[Fitted, float | None]:
+    """Return the result of the training or search, and the requested bytes."""
+    options = request.options
+    border = requested_border(options)
+    if not layout_of(source, recipe).stored:  # all channels are constant
+        return Fitted(*fit_image(source, None, recipe, request, border), figures={"tried": []}), None
+    if options["psnr"] is not None:
+        return _for_psnr(request, source, recipe, border), None
+    requested = requested_bytes(options, source)
+    tried, lines = [], []
+    if options["ratio_search"]:
+        short = dataclasses.replace(request, checkpoint=None)
+        searched = ratio_search(source, requested, recipe, short, request.preset != "paper", border)
+        tried, recipe, size = searched.tried, searched.recipe, searched.size
+        lines += [
+            f"tried {t['columns']} x {t['rows']} x {t['dims']} of {t['structure']} → {t['cascaded']}: "
+            f"{t['psnr_db']:.2f} dB at texels, {t['psnr_between_db']:.2f} between"
+            for t in tried
+        ]
+        if searched.best and searched.best[1].interrupted:
+            return Fitted(*searched.best, lines, {"tried": tried}), requested
+    elif options["cascaded"]:
+        size = sized(source, requested, recipe, options["cascaded"])
+        if size.nbytes > MAX_BYTES:
+            raise UsageError(
+                f"--cascaded: found {options['cascaded']}, which is {size.nbytes:,} bytes in {size.dims} "
+                f"dimensions, allowed are {MAX_BYTES:,}"
+            )
+    else:
+        size = default_size(source, requested, recipe, options["ratio"])
+    if size.paged and size.primaries[0][0] * size.primaries[0][1] > most_entries(2):
+        raise UsageError(
+            f'--structure "{recipe.structure}": {round(requested):,} bytes are too many, pages hold at most '
+            f"{most_entries(2):,} entries: request fewer bytes or another structure"
+        )
+    return Fitted(*fit_image(source, size, recipe, request, border), lines, {"tried": tried}), requested
+
+
+def _for_psnr(request: FitRequest, source: Source, recipe: ImageRecipe, border) -> Fitted:
+    """Return the smallest file of a wanted quality. Raises :class:`FittingError`."""
+    goal = float(request.options["psnr"])
+    table, result, tried = psnr_search(source, goal, recipe, request, border)
+    if table is None:
+        best = max(tried, key=lambda t: t["psnr_db"])
+        raise FittingError(
+            f"{request.options['source']}: {goal:g} dB were not reached; the best of {len(tried)} sizes had "
+            f"{best['psnr_db']:.2f} dB in {best['bytes']:,} bytes: give more --steps or a lower --psnr"
+        )
+    return Fitted(table, result, figures={"tried": tried})
+
+
+# ---------------------- Sizes ----------------------
+
+
+def default_size(source: Source, nbytes: float, recipe: ImageRecipe, ratio: float | None = None) -> ImageBudget:
+    """Return the default budget of a recipe for ``nbytes`` bytes.
+
+    The supplement's search, with ``ratio`` in place of its table if given; or, with ``components`` or two primaries, a
+    cascaded array of :func:`.cascaded_side` and the largest primary that fits beside it.
+    """
+    stored, structure = max(1, layout_of(source, recipe).stored), structure_of(source, recipe, nbytes)
+    bits, coarse = STRUCTURES[structure]
+    if recipe.components or coarse:
+        return sized(source, nbytes, recipe, cascaded_side(nbytes, stored, dims_of(recipe, structure, stored)))
+    size = (source.height, source.width)
+    return search(source.nbytes, source.nbytes / nbytes, stored, *size, recipe.dims, bits, ratio)
+
+
+def sized(source: Source, nbytes: float, recipe: ImageRecipe, cascaded: int) -> ImageBudget:
+    """Return the budget for ``nbytes`` bytes with a cascaded array of a given side; its dims are :func:`.dims_of`."""
+    stored, structure = max(1, layout_of(source, recipe).stored), structure_of(source, recipe, nbytes)
+    (bits, coarse), dims = STRUCTURES[structure], dims_of(recipe, structure, stored)
+    size = fit_bytes(nbytes, stored, source.height, source.width, cascaded, dims, bits, coarse)
+    return dataclasses.replace(size, paged=structure in PAGED)
+
+
+class RatioSearch(NamedTuple):
+    """Result of :func:`ratio_search`.
+
+    ``tried`` has one dictionary a training (sizes, ``bytes``, ``psnr_db``). ``best`` is the table and the record of the
+    best short training, ``interrupted`` if Ctrl-C ended the search; ``None`` if nothing was tried.
+    """
+
+    size: ImageBudget
+    recipe: ImageRecipe
+    tried: list[dict]
+    best: tuple[Table, FitResult] | None = None
+
+
+def ratio_search(
+    source: Source, nbytes: float, recipe: ImageRecipe, request: FitRequest, free: bool = True, border=None
+) -> RatioSearch:
+    """Return the best of several budgets of ``nbytes`` bytes, each trained for :data:`SHORT` of the steps.
+
+    The side of the cascaded array (and so the ratio ρ) is varied first; with ``free`` then the structure of the primary
+    and the dimensions. The best mean of the qualities at texels and between them is kept after each. ``request`` and
+    ``border`` are those of :func:`.fit_image`.
+    """
+    steps, limit = max(20, round(recipe.settings.steps * SHORT)), request.part(SEARCHED).deadline
+    tried, best = {}, None
+
+    def quality(key: tuple) -> float:
+        return 0.5 * (tried[key]["psnr_db"] + tried[key]["psnr_between_db"])
+
+    def leader() -> tuple | None:
+        """Return structure, dims and side of the best training."""
+        return max(tried, key=quality, default=None)
+
+    start = default_size(source, nbytes, recipe)
+    recipe = dataclasses.replace(recipe, structure=structure_of(source, recipe, nbytes), dims=start.dims)
+    for candidate, side in _candidates(recipe, start.cascaded, free, leader):
+        size = sized(source, nbytes, candidate, side)
+        key = candidate.structure, size.dims, side
+        if key in tried or size.nbytes > nbytes * (1 + Budget(nbytes).tolerance):
+            continue
+        if tried and limit is not None and limit.left() < limit.seconds / CANDIDATES:
+            continue
+        share = 1.0 if limit is None else limit.seconds / CANDIDATES / limit.left()
+        shortened = replaced(dataclasses.replace(candidate, dims=size.dims), steps=steps, measure_every=steps)
+        title = f"try {size.columns}×{size.rows}×{size.dims} of {candidate.structure} → {size.cascaded}"
+        limited = request if limit is None else dataclasses.replace(request, deadline=limit.part(share))
+        table, result = fit_image(source, size, shortened, limited, border, title)
+        tried[key] = {
+            "dims": size.dims, "structure": candidate.structure, "cascaded": side, "rows": size.rows,
+            "columns": size.columns, "ratio": size.ratio, "bytes": table.nbytes, "psnr_db": table.measured["psnr_db"],
+            "psnr_between_db": table.measured["psnr_between_db"],
+        }  # fmt: skip
+        if leader() == key:
+            best = table, result
+        if result.interrupted:
+            best[1].interrupted = True
+            break
+    if best is None:  # not even the smallest cascaded array fits
+        return RatioSearch(start, recipe, [])
+    structure, dims, side = leader()
+    recipe = dataclasses.replace(recipe, structure=structure, dims=dims)
+    return RatioSearch(sized(source, nbytes, recipe, side), recipe, list(tried.values()), best)
+
+
+def _candidates(recipe: ImageRecipe, side: int, free: bool, leader: Callable) -> Iterator[tuple[ImageRecipe, int]]:
+    """Yield recipes with sides of the cascaded array to try; later ones depend on the ``leader`` of those before."""
+    yield from ((recipe, s) for s in sorted(SIDES[recipe.dims], key=lambda s: abs(math.log(s / side))))
+    if not free or leader() is None:
+        return
+    _, _, side = leader()
+    for structure in (s for s in STRUCTURES if s in TRIED and s != recipe.structure):
+        if recipe.dims > CoarsePrimary().dims or not STRUCTURES[structure][1]:
+            yield dataclasses.replace(recipe, structure=structure), side
+    structure, dims, side = leader()
+    recipe = dataclasses.replace(recipe, structure=structure, dims=dims)
+    yield from ((recipe, s) for s in SIDES[dims] if abs(math.log2(s / side)) <= 1)
+    structure, dims, _ = leader()
+    if STRUCTURES[structure][1] is None:
+        recipe = dataclasses.replace(recipe, structure=structure)
+        yield from ((dataclasses.replace(recipe, dims=d), SIDES[d][1]) for d in (2, 3, 4) if d != recipe.dims)
+        recipe = dataclasses.replace(recipe, dims=leader()[1])
+        yield from ((recipe, s) for s in SIDES[recipe.dims])
+
+
+def psnr_search(
+    source: Source, goal: float, recipe: ImageRecipe, request: FitRequest, border=None, most: int = TRAININGS
+) -> tuple[Table | None, FitResult | None, list[dict]]:
+    """Search the smallest file whose ``psnr_db`` is at least ``goal``, by trainings of full length.
+
+    Sizes follow the secant of quality over the logarithm of bytes. The search ends when a sufficient size is within
+    :data:`NEAR` of an insufficient one, or after ``most`` trainings. Returns the table (``None`` if not even the
+    largest primary reaches the goal), the record of its training, and the list of trainings; a line is printed for
+    each. After Ctrl-C the record is marked ``interrupted``; ``KeyboardInterrupt`` is raised if no training had reached
+    the goal.
+    """
+    tried, best = [], (None, None)
+    most = most if request.deadline is None else min(most, LIMITED_TRAININGS)
+    nbytes = middle = source.nbytes / 12
+    while len(tried) < most:
+        sizes = [default_size(source, n, recipe) for n in (nbytes, middle)]
+        size = next((s for s in sizes if all(t["bytes"] != s.nbytes for t in tried)), None)
+        if size is None:
+            break
+        limited = request.part(1 / (most - len(tried)))
+        table, result = fit_image(source, size, recipe, limited, border, f"try {size.nbytes:,} bytes")
+        psnr = table.measured["psnr_db"]
+        tried.append({"bytes": size.nbytes, "psnr_db": psnr, "rows": size.rows, "cascaded": size.cascaded})
+        print(f"{size.nbytes:,} bytes: {psnr:.2f} dB")
+        if psnr >= goal and (best[0] is None or table.nbytes < best[0].nbytes):
+            best = table, result
+        if result.interrupted:
+            if best[0] is None:
+                raise KeyboardInterrupt
+            best[1].interrupted = True
+            break
+        enough = min((t for t in tried if t["psnr_db"] >= goal), key=lambda t: t["bytes"], default=None)
+        short = max((t for t in tried if t["psnr_db"] < goal), key=lambda t: t["bytes"], default=None)
+        if enough and short:
+            if enough["bytes"] <= NEAR * short["bytes"]:
+                break
+            share = (goal - short["psnr_db"]) / max(enough["psnr_db"] - short["psnr_db"], 1e-6)
+            nbytes = short["bytes"] * (enough["bytes"] / short["bytes"]) ** min(max(share, 0.15), 0.85)
+            middle = math.sqrt(enough["bytes"] * short["bytes"])  # the secant may lead to a size that was tried
+            continue
+        if short and size.full:
+            break
+        octaves = (goal - psnr) / OCTAVE_DB
+        octaves = math.copysign(min(max(abs(octaves) * 1.2, 0.25), 3), octaves)
+        nbytes = middle = size.nbytes * 2**octaves
+    return *best, tried
+
+
+# ---------------------- Weights of maps ----------------------
 
 
 def _weights(request: FitRequest, source: Source, recipe: ImageRecipe) -> dict[str, float]:
@@ -83,63 +335,54 @@ def _weights(request: FitRequest, source: Source, recipe: ImageRecipe) -> dict[s
         return {}
     if given == "auto":
         nbytes = source.nbytes / 12 if request.options["psnr"] else requested_bytes(request.options, source)
-        return weights.measured(source, recipe, nbytes, request.types)
+        return weights_as_seen(source, recipe, nbytes, request.types)
     for name in given:
         if name not in (names := [m.name for m in source.maps]):
             raise UsageError(f'--weights: found the map "{name}", allowed are {", ".join(names)}')
     return given
 
 
-def _train(request: FitRequest, source: Source, recipe: ImageRecipe) -> tuple[Fitted, float | None]:
-    """Return the result of the training or search, and the requested bytes."""
-    options = request.options
-    border = requested_border(options)
-    if not training.layout_of(source, recipe).stored:  # all channels are constant
-        return Fitted(*training.fit_image(source, None, recipe, request, border), figures={"tried": []}), None
-    if options["psnr"] is not None:
-        return _for_psnr(request, source, recipe, border), None
-    requested = requested_bytes(options, source)
-    tried, lines = [], []
-    if options["ratio_search"]:
-        short = dataclasses.replace(request, checkpoint=None)
-        ratio = search.ratio_search(source, requested, recipe, short, request.preset != "paper", border)
-        tried, recipe, size = ratio.tried, ratio.recipe, ratio.size
-        lines += [
-            f"tried {t['columns']} x {t['rows']} x {t['dims']} of {t['structure']} → {t['cascaded']}: "
-            f"{t['psnr_db']:.2f} dB at texels, {t['psnr_between_db']:.2f} between"
-            for t in tried
-        ]
-        if ratio.interrupted:
-            return Fitted(*ratio.best, lines, {"tried": tried}), requested
-    elif options["cascaded"]:
-        size = search.sized(source, requested, recipe, options["cascaded"])
-        if size.nbytes > MAX_BYTES:
-            raise UsageError(
-                f"--cascaded: found {options['cascaded']}, which is {size.nbytes:,} bytes in {size.dims} "
-                f"dimensions, allowed are {MAX_BYTES:,}"
-            )
-    else:
-        size = search.default_size(source, requested, recipe, options["ratio"])
-    if size.paged and size.primaries[0][0] * size.primaries[0][1] > most_entries(2):
-        raise UsageError(
-            f'--structure "{recipe.structure}": {round(requested):,} bytes are too many, pages hold at most '
-            f"{most_entries(2):,} entries: request fewer bytes or another structure"
-        )
-    table, result = training.fit_image(source, size, recipe, request, border)
-    sentence = memory_budget.explain(size, source.nbytes, requested)
-    if sentence is None and size.paged and table.nbytes < (1 - memory_budget.TOLERANCE) * requested:
-        sentence = f"{round(requested):,} bytes were requested, at {table.nbytes:,} the pages are as fine as the image"
-    return Fitted(table, result, [*lines, *([sentence] if sentence else [])], {"tried": tried}), requested
+def weights_as_seen(source: Source, recipe: ImageRecipe, nbytes: float, types: ModuleType) -> dict[str, float]:
+    """Return weights of maps by what an error of each does to a shaded picture (:func:`balanced`).
+
+    Returns {} (equal weights) if initial arrays of ``nbytes`` gain less than :data:`GAIN_DB` by them in pictures, if
+    pictures do not show the ``source``, or if the recipe does not start from components.
+    """
+    if not (as_seen.shows(source) and recipe.components and layout_of(source, recipe).stored):
+        return {}
+    share = nbytes / source.nbytes
+    maps = [dataclasses.replace(m, values=as_seen.patchwork(m.values, SAMPLE_SIDE, SAMPLE_PATCH)) for m in source.maps]
+    sample = Source(tuple(maps), *maps[0].values.shape[:2], f"{source.digest} sample")
+    channels = {name: len(indices) for name, indices in layout_of(sample, recipe).channels_by_map().items()}
+    squares = as_seen.sensitivities(sample, types)
+    weights = balanced({name: squares[name] for name in channels}, channels)
+
+    def start_db(weights: dict) -> float:
+        """Return the PSNR as seen from near of initial arrays."""
+        weighted = dataclasses.replace(recipe, weights=weights)
+        problem = problem_of(sample, default_size(sample, share * sample.nbytes, weighted), weighted, types)
+        return as_seen.measure(sample, CompressedImage(problem.layout, problem.net), as_seen.NEAR)["seen_db"]
+
+    before, after = start_db({}), start_db(weights)
+    return weights if after >= before + GAIN_DB else {}
 
 
-def _for_psnr(request: FitRequest, source: Source, recipe: ImageRecipe, border) -> Fitted:
-    """Return the smallest file of a wanted quality. Raises :class:`FittingError`."""
-    goal = float(request.options["psnr"])
-    table, result, tried = search.psnr_search(source, goal, recipe, request, border)
-    if table is None:
-        best = max(tried, key=lambda t: t["psnr_db"])
-        raise FittingError(
-            f"{request.options['source']}: {goal:g} dB were not reached; the best of {len(tried)} sizes had "
-            f"{best['psnr_db']:.2f} dB in {best['bytes']:,} bytes: give more --steps or a lower --psnr"
-        )
-    return Fitted(table, result, figures={"tried": tried})
+def balanced(squares: Mapping[str, float], channels: Mapping[str, int]) -> dict[str, float]:
+    """Return weights whose squares are proportional to ``squares``, where they are not below the least weights.
+
+    Their geometric mean over all ``channels`` of a map is 1: about so many decibels as its weight has does a map gain.
+    """
+    least = {name: SHOWN_DB if square > 0 else OTHER_DB for name, square in squares.items()}
+    wanted = {name: 10 * math.log10(square) if square > 0 else -math.inf for name, square in squares.items()}
+    if not any(squares.values()):
+        return {}
+
+    def decibels(shift: float) -> dict[str, float]:
+        return {name: max(least[name], wanted[name] + shift) for name in squares}
+
+    low, high = -200.0, 200.0
+    for _ in range(60):
+        shift = 0.5 * (low + high)
+        total = sum(channels[name] * db for name, db in decibels(shift).items())
+        low, high = (shift, high) if total < 0 else (low, shift)
+    return {name: float(f"{10 ** (db / 20):.3g}") for name, db in decibels(low).items()}

@@ -1,4 +1,4 @@
-"""Training of task 3: samples, targets and the stored result.
+"""Training of images: samples, targets and the stored result.
 
 A step draws a texel of the source for each sample, stratified. The target is the texel at its centre, or the bilinear
 value at a jittered place within it. The supplement's recipe jitters all samples, which trains a bilinearly smoothed
@@ -19,21 +19,21 @@ from ...arrays.pages import most_entries, page_counts
 from ...arrays.tables import Table
 from ...fitting.loop import FitResult, Problem
 from ...fitting.task import FitRequest
-from ...maps import components
 from ...maps.compressed import decibel
-from ...maps.layout import Layout
+from ...maps.layout import Layout, choose_borders, smoothness
 from ...maps.pyramid import padded_texels, weighted_sum
 from ...maps.source import Source
-from . import arrays, memory_budget
-from .compressed import CompressedImage, to_table
-from .memory_budget import ImageBudget
-from .presets import PAGED, STRUCTURES, ImageRecipe
+from . import PAGED, STRUCTURES, ImageRecipe, arrays
+from .arrays import CompressedImage, ImageBudget, to_table
 
-#: Least smoothness, in dB, of an image for one primary (:func:`~mi_diffind.maps.components.smoothness`).
+#: Least smoothness, in dB, of an image for one primary (:func:`~mi_diffind.maps.layout.smoothness`).
 SMOOTH_DB = 28.0
 
-#: Least gain of pages, and least PSNR of one primary of pages for a rough image, both in dB before training.
-GAIN_DB, FINE_DB = 0.5, 29.0
+#: Least gain of pages, in dB before training.
+GAIN_DB = 0.5
+
+#: Least PSNR of one primary of pages for a rough image, in dB before training.
+FINE_DB = 29.0
 
 #: Least entries a page.
 ENTRIES = 3
@@ -64,16 +64,16 @@ def dims_of(recipe: ImageRecipe, structure: str, stored: int) -> int:
 def _suitable(values: np.ndarray, recipe: ImageRecipe, nbytes: float) -> str:
     """Return the structure for an image, ``(height, width, k)``, in ``nbytes`` bytes."""
     height, width, k = values.shape
-    smooth = recipe.dims < 3 or components.smoothness(values) >= SMOOTH_DB
+    smooth = recipe.dims < 3 or smoothness(values) >= SMOOTH_DB
     if recipe.components and k:
         # More channels than dimensions need more precise pointers
         pages = "pages of 6 bits" if k > recipe.dims else "pages of 5 bits"
         dims = dims_of(recipe, pages, k)
-        side = memory_budget.cascaded_side(nbytes, k, dims)
-        size = memory_budget.fit_bytes(nbytes, k, height, width, side, dims, STRUCTURES[pages][0])
+        side = arrays.cascaded_side(nbytes, k, dims)
+        size = arrays.fit_bytes(nbytes, k, height, width, side, dims, STRUCTURES[pages][0])
         fewest = ENTRIES * math.prod(page_counts((height, width)))
         if fewest <= arrays.page_budget(size, values.shape) <= most_entries(2):
-            gain, psnr = arrays.gain_of_pages(values, size, components.borders(values))
+            gain, psnr = arrays.gain_of_pages(values, size, choose_borders(values))
             if gain >= GAIN_DB:
                 return pages if smooth or psnr >= FINE_DB else "pages of 2 + 6 bits"
     return "6 bits" if smooth else "2 + 6 bits"
@@ -199,7 +199,7 @@ def problem_of(
         raise ValueError("size: found pages, which need a recipe with components")
     layout = layout or layout_of(source, recipe)
     values = layout.encode(source)
-    border = border or components.borders(values)
+    border = border or choose_borders(values)
     if recipe.components:
         weights = [recipe.weights.get(name, 1.0) for name in layout.groups]
         net = arrays.from_components(values, size, border, weights)
@@ -220,7 +220,7 @@ def fit_image(
     """Train the arrays of ``source`` and return the table, with its errors, and the record of the training.
 
     ``size`` is ``None`` for an image of one colour, which needs no arrays. ``border`` along v and u is by default
-    :func:`.components.borders`. ``request`` holds the Dr.Jit types, the time and the checkpoint; its settings are
+    :func:`.layout.choose_borders`. ``request`` holds the Dr.Jit types, the time and the checkpoint; its settings are
     replaced by those of the ``recipe``. Errors are those of :meth:`.CompressedImage.measure`.
     """
     request = dataclasses.replace(request, settings=recipe.settings)
@@ -246,6 +246,6 @@ def fit_image(
 
 
 def _name_of(size: ImageBudget) -> str:
-    """Return the name of the structure of a size, "" for one that is not in :data:`.presets.STRUCTURES`."""
+    """Return the name of the structure of a size, "" for one that is not in :data:`.STRUCTURES`."""
     known = (name for name, s in STRUCTURES.items() if s == (size.bits, size.coarse) and size.paged == (name in PAGED))
     return next(known, "")

@@ -1,7 +1,10 @@
-"""Compression of a grid to density levels and a palette: choice by rate and distortion, training through the images.
+"""Compression of a grid to density levels and a palette of colours, by rate and distortion.
 
 Each node stores a density level, a step on a straight line of raw densities, and an index into a palette of colours
-that all nodes share.
+that all nodes share. Levels and indices are chosen, pass by pass, by what a change costs the images plus a rate times
+the bits of a symbol in its context (:mod:`.coding`). The cost of a change is the diagonal of the Gauss-Newton matrix:
+the sum of squared derivatives of the images' sRGB values, estimated by derivatives of sums with random signs
+(Hutchinson). The palette and the levels are then trained through the images.
 """
 
 from __future__ import annotations
@@ -14,15 +17,33 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ...arrays.indirection import device_array, device_tensor, fold
-from ...core.deadline import Deadline
+from ...arrays.tables import StoredArray
+from ...core.progress import Deadline
 from . import grid as grids
-from . import node_codes
+from .coding import LOW_BITS, NAMED, NAMED_CONTEXTS, PARTS, Pass, encode, fresh_context, naming, passes_of
 from .grid import NodeGrid
+from .march import differentiable
 from .nodes import Nodes, cells_of, corners_of
-from .rate_distortion import Importance, chosen_index, chosen_levels
-from .session import FieldSession, ViewImages
-from .training import ImagesProblem
-from .volume_field import NodeField
+from .session import FieldSession, ImagesProblem, ViewImages, before
+from .volume_field import NodeField, PaletteArrays
+
+#: Rays of an estimate of importance for each pixel of the training views.
+RAYS_PER_PIXEL = 0.2
+
+#: Rays of an estimate that are followed at a time, and the least number of such batches.
+RAYS, LEAST_BATCHES = 2**16, 8
+
+#: Nearest colours that are tried for a node, and the relative error allowed in finding them.
+NEAREST, SLACK = 8, 0.3
+
+#: Counts that a context of levels has before it occurs, shared by all contexts of a variance.
+PRIOR = 20.0
+
+#: Count that a symbol has before it occurs.
+LEAST_COUNT = 0.05
+
+#: Rounds of choosing levels, and indices.
+LEVEL_ROUNDS, INDEX_ROUNDS = 3, 2
 
 #: Raw densities of the first and the last density level: empty, and opaque.
 EMPTIEST, DENSEST = -7.0, 8.0
@@ -35,24 +56,35 @@ LEVEL_STEP = (DENSEST - EMPTIEST) / LAST_LEVEL
 #: Most bits of a palette index, those of sizes in memory, and the default.
 MOST_BITS, INDEX_BITS, DEFAULT_BITS = 14, (6, 8, 10, 12, 14), 12
 
-#: Weight of a bit for each node against the error of the grid's images: 0.007 is 0.7% of the error a bit. A bit of the
-#: levels counts less, since errors of neighbouring densities add up.
-SLOPE, LEVEL_SLOPE = 0.007, 0.1
+#: Weight of a bit for each node against the error of the grid's images: 0.007 is 0.7% of the error a bit.
+SLOPE = 0.007
 
-#: Least and largest slope for a size of the file, trials between them, and nodes of a trial. Where a larger slope is
-#: needed, a coarser grid is better.
-SLOPES, TRIALS, TRIAL_NODES = (1e-3, 0.02), 6, 100_000
+#: Share of the weight that a bit of the levels counts: errors of neighbouring densities add up.
+LEVEL_SLOPE = 0.1
+
+#: Least and largest slope for a size of the file. Where a larger slope is needed, a coarser grid is better.
+SLOPES = (1e-3, 0.02)
+
+#: Trials of a slope for a size of the file, and nodes of a trial.
+TRIALS, TRIAL_NODES = 6, 100_000
 
 #: Side of the columns of nodes that stay together in a trial.
 COLUMN = 24
 
-#: Share of the bytes of a file that its palette may have, that of a file before its training, which adds to it, and
-#: bytes of a file beside its nodes and its palette.
-PALETTE_SHARE, BEFORE_TRAINING, OTHER_BYTES = 0.12, 0.92, 2500
+#: Share of the bytes of a file that its palette may have.
+PALETTE_SHARE = 0.12
 
-#: Factor of the rate of levels, and how often it is applied, until a trained field has the bytes of its file; then the
-#: last interval is halved so often.
-STEEPER, MOST_STEEPER, HALVINGS = 1.5, 12, 3
+#: Share of the bytes of a file that it may have before its training, which adds to it.
+BEFORE_TRAINING = 0.92
+
+#: Bytes of a file beside its nodes and its palette.
+OTHER_BYTES = 2500
+
+#: Factor of the rate of levels, and how often it is applied, until a trained field has the bytes of its file.
+STEEPER, MOST_STEEPER = 1.5, 12
+
+#: Halvings of the last interval of rates.
+HALVINGS = 3
 
 #: Training steps between updates of the range of the palette's bytes.
 RANGE_INTERVAL = 50
@@ -62,6 +94,151 @@ SMALLEST = 0.2
 
 #: Nodes per cluster that clusters are computed from, and rounds of Lloyd's algorithm.
 SAMPLES, ROUNDS = 60, 8
+
+
+@dataclass
+class Importance:
+    """Cost of a change of the numbers of stored nodes: the mean squared error of the images per squared change.
+
+    ``density`` ``(n,)`` is that of raw densities, ``colour`` ``(n,)`` that of colours in units in which ``metric``
+    ``(columns,)`` is the weight of each column. ``loss`` is the mean squared error of the grid itself.
+    """
+
+    density: np.ndarray
+    colour: np.ndarray
+    metric: np.ndarray
+    loss: float
+
+
+def importance(grid: NodeGrid, session: FieldSession, seed: int, deadline: Deadline | None = None) -> Importance:
+    """Return the importance of the nodes of a grid in the training views; at the deadline, from fewer rays."""
+    types, images, views = session.types, session.images, session.views
+    net = grid.tensors()
+    environment = net.pop("environment", None)
+    squares = [dr.zeros(types.Float, v.size) for v in (grid.density, grid.colour)]
+    batches = max(LEAST_BATCHES, round(RAYS_PER_PIXEL * len(views) * views.mean_pixels / RAYS))
+    loss, count = 0.0, 0
+    for batch in range(batches):
+        if deadline is not None and deadline.passed and count:
+            break
+        rng = dr.rng((seed << 32) + batch)
+        view, x, y = images.random_pixels(rng, RAYS)
+        rays = dr.width(view)
+        offset, behind = rng.random(types.TensorXf, (rays,)).array, images.behind(rng, rays)
+        arrays = {name: type(tensor)(tensor) for name, tensor in net.items()}
+        dr.enable_grad(arrays)
+        field = NodeField(grid.nodes, **arrays, environment=environment).for_training()
+        seen = differentiable(field, *images.rays(view, x, y), 0, dr.inf, True, offset)
+        total, error = types.Float(0), types.Float(0)
+        for shown, reference in before(seen, images.colours(view, x, y), behind):
+            error += dr.square(dr.detach(shown) - reference)
+            total += dr.select(rng.random(types.TensorXf, (rays,)).array < 0.5, shown, -shown)
+        counted = images.counted(view, x, y)
+        dr.backward(dr.select(counted, total, 0))
+        squares = [dr.fma(g, g, s) for g, s in zip((dr.grad(a).array for a in arrays.values()), squares, strict=True)]
+        error = dr.sum(dr.select(counted, error, 0))
+        dr.eval(squares, error)
+        loss, count = loss + float(error[0]), count + rays
+    density, colour = (s.numpy().astype(np.float64) / (3 * count) for s in squares)
+    colour = colour.reshape(grid.colour.shape)[1:]
+    metric = np.maximum(colour.mean(axis=0), 1e-30)
+    return Importance(density[1:], (colour / metric).mean(axis=1), metric, loss / (3 * count))
+
+
+def costs(counts: np.ndarray) -> np.ndarray:
+    """Return the bits of symbols by their counts ``(contexts, symbols)``."""
+    counts = counts + LEAST_COUNT
+    return -np.log2(counts / counts.sum(axis=1, keepdims=True))
+
+
+def level_costs(levels: np.ndarray, context: np.ndarray, count: int) -> np.ndarray:
+    """Return the bits of each level in each context of :meth:`.coding.Pass.level_context`.
+
+    Rare contexts resemble others of the same variance: the level relative to the mean counts.
+    """
+    contexts = 7 * count + 1
+    counts = np.bincount(context * count + levels, minlength=contexts * count).reshape(contexts, count).astype(float)
+    mean, spread = np.arange(contexts) // 7, np.arange(contexts) % 7
+    relative = np.full((7, 2 * count), LEAST_COUNT)
+    known = context < 7 * count
+    np.add.at(relative, (context[known] % 7, levels[known] - context[known] // 7 + count), 1.0)
+    prior = relative[spread[:, None], np.arange(count) - np.minimum(mean, count - 1)[:, None] + count]
+    return costs(counts + PRIOR * prior / prior.sum(axis=1, keepdims=True))
+
+
+def choose_levels(passes: list[Pass], exact: np.ndarray, weight: np.ndarray, rate: float, count: int) -> np.ndarray:
+    """Return the levels of nodes, below ``count``, given ``exact`` ones.
+
+    A squared difference counts ``weight`` ``(n,)`` and a bit of the file ``rate``.
+    """
+    levels = np.clip(np.rint(exact), 0, count - 1).astype(np.int64)
+    every = np.arange(count)
+    for turn in range(LEVEL_ROUNDS):
+        tables = [level_costs(levels[p.rows], p.level_context(levels, count), count) for p in passes]
+        for part, table in zip(passes, tables, strict=True):
+            rows = part.rows
+            difference = weight[rows, None] * np.square(exact[rows, None] - every)
+            share = rate * (turn + 1) / LEVEL_ROUNDS
+            levels[rows] = np.argmin(difference + share * table[part.level_context(levels, count)], axis=1)
+    return levels
+
+
+def index_costs(passes: list[Pass], index: np.ndarray, colours: int) -> tuple[list[np.ndarray], np.ndarray]:
+    """Return the bits of symbols that name an index of a neighbour, for each pass by context and symbol.
+
+    The second array holds the bits of an index that no neighbour has, by context and index. Both are estimated from the
+    counts of a whole ``index``.
+    """
+    upper = ((colours - 1) >> LOW_BITS) + 1
+    named, fresh, context = [], [], []
+    for part in passes:
+        names, place = part.named(index)
+        symbol = naming(names, index, part.rows)
+        counts = np.bincount(place * (NAMED + 1) + symbol, minlength=NAMED_CONTEXTS * (NAMED + 1))
+        named.append(costs(counts.reshape(-1, NAMED + 1)))
+        new = symbol == NAMED
+        fresh.append(index[part.rows][new])
+        context.append(fresh_context(names[new], colours))
+    fresh, context = np.concatenate(fresh), np.concatenate(context)
+    high = np.bincount(context * upper + (fresh >> LOW_BITS), minlength=(PARTS + 1) * upper)
+    low = np.bincount(fresh, minlength=upper << LOW_BITS).reshape(upper, -1)
+    return named, costs(high.reshape(PARTS + 1, upper)).repeat(1 << LOW_BITS, axis=1) + costs(low).reshape(-1)
+
+
+def choose_index(
+    passes: list[Pass], points: np.ndarray, weight: np.ndarray, centres: np.ndarray, rate: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ``centres`` ``(P, c)``, moved, and the index of a centre for each of the ``points`` ``(n, c)``.
+
+    A squared difference counts ``weight`` ``(n,)`` and a bit of the file ``rate``. The search begins with the nearest
+    centres.
+    """
+    colours, near, index = len(centres), min(NEAREST, len(centres)), None
+    for _ in range(INDEX_ROUNDS):
+        nearest = cKDTree(centres).query(points, k=near, eps=SLACK)[1].reshape(len(points), near)
+        index = nearest[:, 0].astype(np.int64) if index is None else index
+        bits, fresh_bits = index_costs(passes, index, colours)
+        for part, named in zip(passes, bits, strict=True):
+            names, context = part.named(index)
+            fresh = fresh_bits[fresh_context(names, colours)[:, None], nearest[part.rows]]
+            tried = np.concatenate([names, nearest[part.rows]], axis=1)
+            price = np.concatenate([named[context, :NAMED], named[context, NAMED, None] + fresh], axis=1)
+            best, pick = np.full(len(tried), np.inf), np.zeros(len(tried), np.int64)
+            for column, bit in zip(tried.T, price.T, strict=True):
+                away = np.square(points[part.rows] - centres[np.maximum(column, 0)]).sum(axis=1)
+                cost = np.where(column >= 0, weight[part.rows] * away + rate * bit, np.inf)
+                better = cost < best
+                best[better], pick[better] = cost[better], column[better]
+            index[part.rows] = pick
+        centres = weighted_means(points, weight, index, centres)
+    return centres, index
+
+
+def weighted_means(points: np.ndarray, weight: np.ndarray, index: np.ndarray, empty: np.ndarray) -> np.ndarray:
+    """Return the weighted mean of the points of each cluster, or its row of ``empty`` where a cluster has none."""
+    total = np.bincount(index, weight, len(empty))
+    sums = np.stack([np.bincount(index, weight * column, len(empty)) for column in points.T], axis=1)
+    return np.where(total[:, None] > 0, sums / np.maximum(total, 1e-300)[:, None], empty)
 
 
 @dataclass
@@ -78,18 +255,18 @@ class PaletteCoding:
     levels: np.ndarray
     index: np.ndarray
     palette: np.ndarray
-    passes: list[node_codes.Pass]
+    passes: list[Pass]
     weight: np.ndarray
     rate: float
-    file_bytes: float | None = None
     environment: np.ndarray | None = None
+    file_bytes: float | None = None
 
-    def chosen(self, levels: np.ndarray) -> np.ndarray:
+    def whole_levels(self, levels: np.ndarray) -> np.ndarray:
         """Return whole levels for levels ``(n,)`` in [0, 1], of fewer bits until the file is small enough."""
         exact = levels[1:].astype(np.float64) * LAST_LEVEL
 
         def at(rate: float) -> tuple[np.ndarray, bool]:
-            whole = chosen_levels(self.passes, exact, self.weight, rate, LAST_LEVEL + 1)
+            whole = choose_levels(self.passes, exact, self.weight, rate, LAST_LEVEL + 1)
             return whole, self.file_bytes is None or self.estimated_bytes(whole) <= self.file_bytes
 
         low = high = self.rate
@@ -107,26 +284,20 @@ class PaletteCoding:
 
     def estimated_bytes(self, levels: np.ndarray, share: float = 1.0) -> float:
         """Return about the bytes of a file with these whole levels of stored nodes, which are a ``share`` of all."""
-        colours = len(self.palette)
-        probabilities, data = node_codes.encoded(self.nodes.stored, levels, self.index[1:], LAST_LEVEL + 1, colours)
+        probabilities, data = encode(self.nodes.stored, levels, self.index[1:], LAST_LEVEL + 1, len(self.palette))
         shared = self.palette.size + (0 if self.environment is None else 3 * len(self.environment))
         return len(data) / share + len(zlib.compress(probabilities, 9)) + shared + OTHER_BYTES
 
 
 def palette_coding(
-    grid: NodeGrid,
-    importance: Importance,
-    index_bits: int,
-    seed: int,
-    slope: float = SLOPE,
-    deadline: Deadline | None = None,
+    grid: NodeGrid, importance: Importance, index_bits: int, seed: int, deadline: Deadline | None = None
 ) -> PaletteCoding:
     """Return the initial coding of a grid of visible nodes, with fewer rounds of :func:`clusters` at the deadline.
 
-    A bit for each node is worth the share ``slope`` of the error of the grid's images.
+    A bit for each node is worth the share :data:`SLOPE` of the error of the grid's images.
     """
     palette = sorted_clusters(grid, importance, 2**index_bits, seed, deadline)
-    return coded_by(grid, importance, palette, slope * importance.loss / grid.nodes.count)
+    return coded_by(grid, importance, palette, SLOPE * importance.loss / grid.nodes.count)
 
 
 def sorted_clusters(
@@ -142,9 +313,8 @@ def sorted_clusters(
 def coded_by(grid: NodeGrid, importance: Importance, palette: np.ndarray, rate: float) -> PaletteCoding:
     """Return the coding of a grid by a palette of :func:`sorted_clusters`; a bit of the file counts ``rate``."""
     metric = np.sqrt(importance.metric)
-    points = grid.colour[1:] * metric
-    passes = node_codes.passes_of(grid.nodes.stored)
-    palette, index = chosen_index(passes, points, importance.colour, palette, rate)
+    passes = passes_of(grid.nodes.stored)
+    palette, index = choose_index(passes, grid.colour[1:] * metric, importance.colour, palette, rate)
     used, index = np.unique(index, return_inverse=True)
     levels = np.clip((grid.density - EMPTIEST) / (DENSEST - EMPTIEST), 0, 1).astype(np.float32)
     coding = PaletteCoding(
@@ -155,9 +325,9 @@ def coded_by(grid: NodeGrid, importance: Importance, palette: np.ndarray, rate: 
         passes,
         importance.density * LEVEL_STEP**2,
         LEVEL_SLOPE * rate,
-        environment=grid.environment,
+        grid.environment,
     )
-    coding.levels = (coding.chosen(levels) / LAST_LEVEL).astype(np.float32)
+    coding.levels = (coding.whole_levels(levels) / LAST_LEVEL).astype(np.float32)
     return coding
 
 
@@ -174,17 +344,17 @@ def coding_in(
     part, weights = trial_part(grid, importance)
     share = part.nodes.count / grid.nodes.count
 
-    def size(slope: float) -> float:
+    def fits(slope: float) -> bool:
         coding = coded_by(part, weights, palette, slope * per_node)
-        return coding.estimated_bytes(np.rint(coding.levels[1:] * LAST_LEVEL).astype(int), share)
+        levels = np.rint(coding.levels[1:] * LAST_LEVEL).astype(int)
+        return coding.estimated_bytes(levels, share) <= BEFORE_TRAINING * nbytes
 
     low, high = np.log(SLOPES)
-    if size(np.exp(high)) > BEFORE_TRAINING * nbytes:
+    if not fits(np.exp(high)):
         return None
     for _ in range(TRIALS):
         middle = (low + high) / 2
-        fits = size(np.exp(middle)) <= BEFORE_TRAINING * nbytes
-        low, high = (low, middle) if fits else (middle, high)
+        low, high = (low, middle) if fits(np.exp(middle)) else (middle, high)
     coding = coded_by(grid, importance, palette, np.exp(high) * per_node)
     coding.file_bytes = nbytes
     return coding
@@ -204,10 +374,8 @@ def trial_part(grid: NodeGrid, importance: Importance) -> tuple[NodeGrid, Import
     # Nodes of cells that other columns cut are left out: a file holds corners of whole cells
     stored = corners_of(cells_of(nodes.stored & chosen[column][..., None]))
     here = stored[nodes.stored]
-    part = nodes.like(nodes.spacing, nodes.shape, stored)
-    entries = np.concatenate([[True], here])
     weights = Importance(importance.density[here], importance.colour[here], importance.metric, importance.loss)
-    return NodeGrid(part, grid.density[entries], grid.colour[entries], grid.environment), weights
+    return grid.part(stored), weights
 
 
 def clusters(
@@ -229,11 +397,8 @@ def clusters(
         if deadline is not None and deadline.passed:
             break
         nearest = cKDTree(centres).query(points[sample])[1]
-        total = np.bincount(nearest, share, count)
-        sums = np.stack([np.bincount(nearest, share * column, count) for column in points[sample].T], axis=1)
         # A centre without points restarts at a random one
-        spare = points[rng.choice(sample, count)]
-        centres = np.where(total[:, None] > 0, sums / np.maximum(total, 1e-300)[:, None], spare)
+        centres = weighted_means(points[sample], share, nearest, points[rng.choice(sample, count)])
     return centres
 
 
@@ -247,10 +412,8 @@ class PaletteProblem(ImagesProblem):
     def __init__(self, coding: PaletteCoding, session: FieldSession):
         types = coding.nodes.types
         self.coding, self.index = coding, device_array(types.UInt32, coding.index)
-        net = {"density": coding.levels, "palette": coding.palette}
-        if coding.environment is not None:
-            net["environment"] = coding.environment
-        net = {name: device_tensor(types.TensorXf, values) for name, values in net.items()}
+        net = {"density": coding.levels, "palette": coding.palette, "environment": coding.environment}
+        net = {name: device_tensor(types.TensorXf, values) for name, values in net.items() if values is not None}
         super().__init__(session, net, self.field_of)
         self._set_ranges()
 
@@ -283,28 +446,12 @@ class PaletteProblem(ImagesProblem):
         names, Float = [name for name in ("palette", "environment") if name in self.net], self.session.types.Float
         self.ranges = {n: [device_array(Float, v) for v in byte_range(self.net[n].numpy())] for n in names}
 
-    def stored(self) -> dict[str, np.ndarray]:
-        """Return what is stored: ``levels``, ``index``, ``palette`` (bytes), its ``scale`` and ``offset``.
-
-        ``density_range`` holds the raw density of level 0 and the step from one level to the next, ``density_bits`` the
-        bits of a level. ``environment`` (bytes, ``(e, 3)``) and its ``environment_range``, steps and offsets, are there
-        if the colours have reflections.
-        """
-        palette, scale, offset = as_bytes(self.net["palette"].numpy())
-        shared = {}
-        if "environment" in self.net:
-            environment, *ranges = as_bytes(self.net["environment"].numpy()[:, :3])
-            shared = {"environment": environment, "environment_range": ranges}
-        return {
-            "levels": self.coding.chosen(fold(self.net["density"].array).numpy()).astype(np.uint8),
-            "density_range": (EMPTIEST, LEVEL_STEP),
-            "density_bits": DENSITY_BITS,
-            "index": self.coding.index,
-            "palette": palette,
-            "scale": scale,
-            "offset": offset,
-            **shared,
-        }
+    def numbers(self) -> PaletteArrays:
+        """Return the trained numbers as a file stores them."""
+        environment = to_bytes(self.net["environment"].numpy()[:, :3]) if "environment" in self.net else None
+        levels = self.coding.whole_levels(fold(self.net["density"].array).numpy()).astype(np.uint8)
+        palette = to_bytes(self.net["palette"].numpy())
+        return PaletteArrays(levels, DENSITY_BITS, (EMPTIEST, LEVEL_STEP), self.coding.index, palette, environment)
 
 
 def byte_range(palette: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -313,33 +460,31 @@ def byte_range(palette: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.maximum((high - low) / 255, 1e-6), low
 
 
-def as_bytes(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the bytes of numbers ``(n, c)``, and the step and the minimum of each column (:func:`byte_range`)."""
+def to_bytes(values: np.ndarray) -> StoredArray:
+    """Return numbers ``(n, c)`` as bytes between the minimum and the maximum of each column (:func:`byte_range`)."""
     scale, offset = byte_range(values)
-    return np.clip(np.rint((values - offset) / scale), 0, 255).astype(np.uint8), scale, offset
+    codes = np.clip(np.rint((values - offset) / scale), 0, 255).astype(np.uint8)
+    return StoredArray(codes, (), tuple(scale.tolist()), tuple(offset.tolist()))
 
 
 def packed_bytes(grid: NodeGrid, index_bits: int) -> int:
     """Return the bytes in memory of the packed field of a grid."""
     nodes = grid.nodes
     index = nodes.like(nodes.spacing, nodes.shape, nodes.stored, packed=True).nbytes
-    index += 0 if grid.environment is None else 4 * len(grid.environment)
-    return (
-        index
-        + nodes.entries * (DENSITY_BITS + index_bits) // 8
-        + 8
-        + 16 * -(-grid.colour.shape[1] // 16) * min(2**index_bits, nodes.count)
-    )
+    environment = 0 if grid.environment is None else 4 * len(grid.environment)
+    entries = nodes.entries * (DENSITY_BITS + index_bits) // 8 + 8
+    palette = 16 * -(-grid.colour.shape[1] // 16) * min(2**index_bits, nodes.count)
+    return index + environment + entries + palette
 
 
-def sized(grid: NodeGrid, images: ViewImages, nbytes: int | None) -> tuple[NodeGrid, int]:
+def in_memory(grid: NodeGrid, images: ViewImages, nbytes: int | None) -> tuple[NodeGrid, int]:
     """Return the visible part of a grid at the highest resolution that fits in ``nbytes``, and its bits of an index.
 
     At the full resolution, an index has as many bits as fit; at a lower one, 10, or 8 if these do not fit. With
     ``None``, the resolution and the bits are the default. Raises ``ValueError`` if no grid fits.
     """
     cells = grids.visible(grid, images)
-    whole = grids.divided(grid, cells)
+    whole = grids.refine(grid, cells)
     if nbytes is None:
         return whole, DEFAULT_BITS
     for bits in sorted(INDEX_BITS, reverse=True):
@@ -348,13 +493,13 @@ def sized(grid: NodeGrid, images: ViewImages, nbytes: int | None) -> tuple[NodeG
     low, high, largest = SMALLEST, 1.0, None
     for _ in range(7):
         middle = (low + high) / 2
-        smaller = grids.divided(grid, cells, middle)
+        smaller = grids.refine(grid, cells, middle)
         bits = 10 if packed_bytes(smaller, 10) <= nbytes else 8
         if packed_bytes(smaller, bits) <= nbytes:
             low, largest = middle, (smaller, bits)
         else:
             high = middle
     if largest is None:
-        smallest = packed_bytes(grids.divided(grid, cells, SMALLEST), 6)
+        smallest = packed_bytes(grids.refine(grid, cells, SMALLEST), 6)
         raise ValueError(f"{nbytes:,} bytes are fewer than the smallest field needs, about {smallest:,}")
     return largest

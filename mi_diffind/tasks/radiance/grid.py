@@ -14,15 +14,12 @@ import numpy as np
 from scipy.ndimage import binary_dilation, gaussian_filter, map_coordinates
 
 from ...arrays.indirection import device_array, device_tensor
-from . import reflection, surroundings
-from .march import visibility
+from . import RESOLUTIONS, VOXELS_PER_PIXEL, surroundings
+from .march import march
 from .nodes import Nodes, cells_of, corners_of
-from .presets import RESOLUTIONS, VOXELS_PER_PIXEL
-from .session import SIDE, FieldSession, ViewImages
-from .training import ImagesProblem
-from .views import CapturedViews
-from .visual_hull import box_of, hull, pixel_width
-from .volume_field import NodeField, NodeVolume
+from .session import SIDE, FieldSession, ImagesProblem, ViewImages
+from .views import CapturedViews, box_of, hull, pixel_width
+from .volume_field import ENTRIES, NodeField, NodeVolume, add_reflections
 
 #: Raw density per unit of the trained parameter, so that one learning rate suits density and colour.
 DENSITY_SCALE = 10.0
@@ -30,11 +27,14 @@ DENSITY_SCALE = 10.0
 #: Initial raw density and logarithm of the radiance: nearly empty, and dark.
 BEGIN_DENSITY, BEGIN_COLOUR = -4.0, -1.5
 
-#: Total variation of raw densities: its weight, the square that rounds its kink at 0, and nodes a step.
-SMOOTH, ROUND, VARIED = 5e-5, 1e-2, 2**13
+#: Weight of the total variation of raw densities, and the square that rounds its kink at 0.
+SMOOTH, ROUND = 5e-5, 1e-2
 
-#: The same of the slopes of colours by direction.
+#: Weight of the smoothness of direction coefficients, and the square that rounds its kink at 0.
 SMOOTH_DIRECTIONS, ROUND_DIRECTIONS = 5e-5, 1e-3
+
+#: Nodes of a training step whose variation counts.
+VARIED = 2**13
 
 #: Sums of the gradients of few entries: atomic ones, since copies of a whole table would cost more.
 FEW = dr.ReduceMode.Direct
@@ -45,7 +45,7 @@ EMPTY, NORMAL_BLUR = -6.0, 1.5
 #: Largest weight in a ray below which a cell is removed.
 VISIBLE = 0.02
 
-#: Least factor by which a grid is divided, unless it asks for less, and factors that are tried.
+#: Least factor by which a grid is refined, unless it asks for less, and factors that are tried.
 LEAST_FACTOR, FACTORS = 1.1, 65
 
 #: Arrays of a grid.
@@ -77,17 +77,20 @@ class NodeGrid:
         """Return density, colour and environment, if there is one, by name."""
         return {name: values for name in NAMES if (values := getattr(self, name)) is not None}
 
-    def reflecting(self) -> NodeGrid:
-        """Return a grid whose colours are those of :mod:`.reflection`, to be trained.
+    def part(self, stored: np.ndarray) -> NodeGrid:
+        """Return the grid with those of its nodes alone that a mask marks as ``stored``."""
+        entries = np.concatenate([[True], stored[self.nodes.stored]])
+        nodes = self.nodes.like(self.nodes.spacing, self.nodes.shape, stored)
+        return NodeGrid(nodes, self.density[entries], self.colour[entries], self.environment)
 
-        Normals point from dense to empty space.
-        """
+    def with_reflections(self) -> NodeGrid:
+        """Return a grid whose colours have reflections, to be trained; normals point from dense to empty space."""
         dense = np.full(self.nodes.shape, EMPTY, np.float32)
         dense[self.nodes.stored] = np.clip(self.density[1:], EMPTY, -EMPTY)
         slopes = np.stack(np.gradient(gaussian_filter(dense, NORMAL_BLUR)), axis=-1)[self.nodes.stored]
         normals = np.concatenate([[[0, 0, 1]], -slopes / (np.linalg.norm(slopes, axis=1, keepdims=True) + 1e-6)])
-        environment = np.zeros((reflection.ENTRIES, 4), np.float32)
-        return dataclasses.replace(self, colour=reflection.begun(self.colour, normals), environment=environment)
+        environment = np.zeros((ENTRIES, 4), np.float32)
+        return dataclasses.replace(self, colour=add_reflections(self.colour, normals), environment=environment)
 
 
 class GridProblem(ImagesProblem):
@@ -139,7 +142,7 @@ class GridProblem(ImagesProblem):
         fours = (dr.gather(Array4f, colour, dr.fma(number, packets, k), mode=FEW) for k in range(3))
         return [value for four in fours for value in list(four)[1:]]
 
-    def trained(self) -> NodeGrid:
+    def grid(self) -> NodeGrid:
         """Return the grid with the trained numbers."""
         net = {name: self.net[name].numpy() for name in NAMES if name in self.net}
         net["density"] *= DENSITY_SCALE
@@ -157,7 +160,7 @@ def neighbours(nodes: Nodes) -> np.ndarray:
 def resolution_of(views: CapturedViews) -> int:
     """Return the resolution at which a pixel, seen at the middle of the box, is :data:`VOXELS_PER_PIXEL` voxels wide.
 
-    It is that of :func:`begin`.
+    It is that of :func:`initial_grid`.
     """
     if views.surroundings:
         nodes = surroundings.resolution_of(views)
@@ -167,25 +170,20 @@ def resolution_of(views: CapturedViews) -> int:
     return int(np.clip(round(nodes * VOXELS_PER_PIXEL), *RESOLUTIONS))
 
 
-def begin(types, views: CapturedViews, nodes: int) -> NodeGrid:
+def initial_grid(types, views: CapturedViews, nodes: int) -> NodeGrid:
     """Return an empty grid of the visual hull, as fine as a cube of ``nodes``³ nodes with the volume of its box."""
     if views.surroundings:
-        return _nearly_empty(surroundings.whole_space(types, views, nodes), surroundings.BEGIN_DENSITY)
-    lower, upper = box_of(views)
-    spacing = float((np.prod(upper - lower) / nodes**3) ** (1 / 3))
-    shape = np.maximum(2, np.ceil((upper - lower) / spacing - 1e-6).astype(int) + 1)
-    inside = hull(views, lower, spacing, shape) if views.has_alpha else np.ones(shape, bool)
-    # Occupied: all cells that have a corner in the hull
-    near = np.zeros(tuple(shape - 1), bool)
-    for corner in np.ndindex(2, 2, 2):
-        near |= inside[tuple(slice(c, n - 1 + c) for c, n in zip(corner, shape, strict=True))]
-    return _nearly_empty(Nodes(types, lower, spacing, shape, corners_of(near)))
-
-
-def _nearly_empty(nodes: Nodes, density: float = BEGIN_DENSITY) -> NodeGrid:
-    """Return a grid of these nodes before its training."""
-    colour = np.tile(np.float32([BEGIN_COLOUR, 0, 0, 0] * 3), (nodes.entries, 1))
-    return NodeGrid(nodes, np.full(nodes.entries, density, np.float32), colour)
+        places, density = surroundings.whole_space(types, views, nodes), surroundings.BEGIN_DENSITY
+    else:
+        lower, upper = box_of(views)
+        spacing, density = float((np.prod(upper - lower) / nodes**3) ** (1 / 3)), BEGIN_DENSITY
+        shape = np.maximum(2, np.ceil((upper - lower) / spacing - 1e-6).astype(int) + 1)
+        inside = hull(views, lower, spacing, shape) if views.has_alpha else np.ones(shape, bool)
+        # Occupied: all cells that have a corner in the hull
+        near = ~cells_of(~inside)
+        places = Nodes(types, lower, spacing, shape, corners_of(near))
+    colour = np.tile(np.float32([BEGIN_COLOUR, 0, 0, 0] * 3), (places.entries, 1))
+    return NodeGrid(places, np.full(places.entries, density, np.float32), colour)
 
 
 def weights(field: NodeVolume, images: ViewImages) -> np.ndarray:
@@ -199,7 +197,7 @@ def weights(field: NodeVolume, images: ViewImages) -> np.ndarray:
         lane, width = dr.arange(types.UInt32, height * width), dr.opaque(types.UInt32, width)
         column, row = (n * dr.opaque(types.UInt32, every) for n in (lane % width, lane // width))
         place = dr.opaque(types.UInt32, view), column, row
-        visibility(field, *images.rays(*place), images.near, dr.inf, images.counted(*place), largest)
+        march(field, *images.rays(*place), images.near, dr.inf, images.counted(*place), visibility=largest)
         dr.eval(largest)
     return largest.numpy()
 
@@ -207,24 +205,24 @@ def weights(field: NodeVolume, images: ViewImages) -> np.ndarray:
 def visible(grid: NodeGrid, images: ViewImages) -> np.ndarray:
     """Return the cells that some ray of the views sees, bool ``(X − 1, Y − 1, Z − 1)``.
 
-    In a field that is nearly empty, since its training has just begun, they are those that are seen best.
+    In a field that is nearly empty, since its training has just add_reflections, they are those that are seen best.
     """
     largest = weights(grid.field(), images)
     least = VISIBLE if grid.nodes.contraction is None else surroundings.VISIBLE
     return grid.nodes.cells_where((largest > 0) & (largest >= min(least, 0.5 * float(largest.max()))))
 
 
-def widened(cells: np.ndarray) -> np.ndarray:
+def dilate(cells: np.ndarray) -> np.ndarray:
     """Return ``cells`` and those beside them."""
     return binary_dilation(cells, np.ones((3, 3, 3), bool))
 
 
-def divided(grid: NodeGrid, cells: np.ndarray, factor: float = 1.0) -> NodeGrid:
+def refine(grid: NodeGrid, cells: np.ndarray, factor: float = 1.0) -> NodeGrid:
     """Return the grid reduced to ``cells`` (:func:`visible`), at ``factor`` times as many nodes along each side."""
-    if factor == 1:
-        return kept(grid, cells)
     nodes = grid.nodes
     cells = cells & cells_of(nodes.stored)
+    if factor == 1:
+        return grid.part(corners_of(cells))
     spacing = nodes.spacing / factor
     shape = np.maximum(2, np.ceil((np.asarray(nodes.shape) - 1) * factor - 1e-6).astype(int) + 1)
     # A finer cell is kept if its middle lies in one that is
@@ -235,20 +233,18 @@ def divided(grid: NodeGrid, cells: np.ndarray, factor: float = 1.0) -> NodeGrid:
     fine = nodes.like(spacing, shape, corners_of(cells[np.ix_(*middle)]))
     at = fine.positions().T / factor
 
-    begin = np.float32([BEGIN_COLOUR if c in (0, 4, 8) else 0 for c in range(grid.colour.shape[1])])
-    colour, density = np.empty((fine.entries, len(begin)), np.float32), np.empty(fine.entries, np.float32)
-    for values, column, empty in zip(
-        (density, *colour.T), (grid.density, *grid.colour.T), (BEGIN_DENSITY, *begin), strict=True
-    ):
+    def resampled(column: np.ndarray, empty: float) -> np.ndarray:
         dense = np.full(nodes.shape, empty, np.float32)
         dense[nodes.stored] = column[1:]
-        values[0] = empty
-        values[1:] = map_coordinates(dense, at, order=1, mode="nearest", prefilter=False)
-    return NodeGrid(fine, density, colour, grid.environment)
+        return np.append(np.float32(empty), map_coordinates(dense, at, order=1, mode="nearest", prefilter=False))
+
+    colours = [resampled(v, BEGIN_COLOUR if c in (0, 4, 8) else 0) for c, v in enumerate(grid.colour.T)]
+    density = resampled(grid.density, BEGIN_DENSITY)
+    return NodeGrid(fine, density, np.stack(colours, axis=1), grid.environment)
 
 
 def largest_factor(grid: NodeGrid, cells: np.ndarray, factor: float, numbers: float) -> float:
-    """Return the largest factor up to ``factor`` by which :func:`divided` ``cells`` have at most so many ``numbers``.
+    """Return the largest factor up to ``factor`` at which :func:`refine` has at most so many ``numbers``.
 
     A factor near 1 is 1.
     """
@@ -259,11 +255,3 @@ def largest_factor(grid: NodeGrid, cells: np.ndarray, factor: float, numbers: fl
     counts = (inside * tried**3 + beside * tried**2) * (1 + grid.colour.shape[1])
     fits = tried[counts <= numbers]
     return float(fits[0]) if len(fits) and fits[0] >= min(factor, LEAST_FACTOR) else 1.0
-
-
-def kept(grid: NodeGrid, cells: np.ndarray) -> NodeGrid:
-    """Return the grid reduced to those of its ``cells`` that are marked."""
-    stored = corners_of(cells & cells_of(grid.nodes.stored))
-    entries = np.concatenate([[True], stored[grid.nodes.stored]])
-    nodes = grid.nodes.like(grid.nodes.spacing, grid.nodes.shape, stored)
-    return NodeGrid(nodes, grid.density[entries], grid.colour[entries], grid.environment)

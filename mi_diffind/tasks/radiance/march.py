@@ -12,7 +12,7 @@ from a step on and the transmittance T behind the step, ∂L/∂σ = δ (T c −
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import drjit as dr
 
@@ -64,10 +64,14 @@ def box(field, o, d, near, far, active):
 
 
 @compat.syntax
-def march(field, o, d, near, far, active=True, offset=0.5) -> Marched:
+def march(field, o, d, near, far, active=True, offset=0.5, visibility=None) -> Marched:
     """March the rays ``o + t d`` through a field, for t from ``near`` to ``far``.
 
     ``d`` has unit length; ``offset`` in [0, 1) is the position within a step at which the field is read.
+
+    With ``visibility``, a float array with the entries of ``field.nodes``, no colours are read, and its entries are
+    raised to the largest weight of each cell in a ray: its transmittance times the opacity of a step. That of a cell is
+    the one of its first corner.
     """
     types = field.types
     with dr.suspend_grad():
@@ -85,11 +89,14 @@ def march(field, o, d, near, far, active=True, offset=0.5) -> Marched:
             density, point_data = field.density_at(p, here)
             passed = through * dr.exp(-density * (steps.of_steps(end) - steps.of_steps(t)))
             weight = dr.select(here, through - passed, 0)
-            shown = here & (weight > field.least_weight)
-            colour = types.Array3f(0)
-            if shown:
-                colour = types.Array3f(*field.radiance_at(point_data, p, d, shown))
-            seen += dr.select(shown, weight * colour, 0)
+            if dr.hint(visibility is not None, mode="scalar"):
+                dr.scatter_reduce(dr.ReduceOp.Max, visibility, weight, field.nodes.cell(p, here), here)
+            else:
+                shown = here & (weight > field.least_weight)
+                colour = types.Array3f(0)
+                if shown:
+                    colour = types.Array3f(*field.radiance_at(point_data, p, d, shown))
+                seen += dr.select(shown, weight * colour, 0)
             depth += weight * (near + at)
             through = dr.select(here, passed, through)
             t += step
@@ -257,32 +264,6 @@ def _attached(field, o, d, near, far, active) -> tuple:
     return dr.select(active, entry, 0), d, dr.select(active, length, 0), dr.select(active, near, 0)
 
 
-@compat.syntax
-def visibility(field, o, d, near, far, active, target) -> None:
-    """Raise ``target`` to the largest weight that each cell of ``field.nodes`` has in one of these rays.
-
-    The weight of a step is its transmittance times its opacity. ``target`` has the entries of the nodes; that of a cell
-    is the one of its first corner.
-    """
-    types = field.types
-    with dr.suspend_grad():
-        o, near, far, active = box(field, o, d, near, far, active)
-        t, step = types.Float(0), dr.opaque(types.Float, field.step)
-        steps = field.along(o, d)
-        far = steps.in_steps(far)
-        through = types.Float(1)
-        while active:
-            t, here = _next(field, o, d, t, far, step, types.Float(0.5), active, steps)
-            end = dr.minimum(t + step, far)
-            p = dr.fma(d, steps.of_steps(dr.fma(0.5, end - t, t)), o)
-            density, _ = field.density_at(p, here)
-            passed = through * dr.exp(-density * (steps.of_steps(end) - steps.of_steps(t)))
-            dr.scatter_reduce(dr.ReduceOp.Max, target, through - passed, field.nodes.cell(p, here), here)
-            through = dr.select(here, passed, through)
-            t += step
-            active &= here & (t < far) & (through > OPAQUE)
-
-
 class _March(dr.CustomOp):
     def eval(self, arrays, field, o, d, near, far, active, offset):
         self.field, self.arguments = field, (o, d, near, far, active, offset)
@@ -328,9 +309,6 @@ class RayCounts:
     looks: int
     colours: int
 
-    def asdict(self) -> dict:
-        return asdict(self)
-
 
 class CountingField(VolumeField):
     """Field that counts the reads of density and radiance of another ``field``.
@@ -340,7 +318,7 @@ class CountingField(VolumeField):
 
     def __init__(self, field: VolumeField, reads_all: bool = False):
         super().__init__(field.types, field.lower, field.upper, field.voxel, field.arrays)
-        self.field, self.reads_all, self.box = field, reads_all, field.box
+        self.field, self.reads_all, self.box, self.along = field, reads_all, field.box, field.along
         self.counts = dr.zeros(field.types.UInt32, 2)
 
     def _count(self, which: int, active) -> None:
@@ -357,9 +335,6 @@ class CountingField(VolumeField):
 
     def free_distance(self, p, d, active=True):
         return self.types.Float(0) if self.reads_all else self.field.free_distance(p, d, active)
-
-    def along(self, o, d):
-        return self.field.along(o, d)
 
 
 def count(field: VolumeField, o, d, near, far, active=True) -> RayCounts:

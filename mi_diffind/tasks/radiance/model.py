@@ -10,8 +10,8 @@ import numpy as np
 
 from ...arrays.indirection import device_array
 from ...fitting.task import Model
+from . import dense_bytes
 from .files import field_of
-from .presets import dense_bytes
 
 #: Rays along each side of the box in counts of steps.
 PIXELS = 96
@@ -96,7 +96,7 @@ class RadianceFieldModel(Model):
             self.types.Array3f(*(device_array(self.types.Float, x) for x in np.concatenate(v).T))
             for v in (origins, directions)
         )
-        return count(self.field, o, d, 0, np.inf).asdict()
+        return vars(count(self.field, o, d, 0, np.inf))
 
     def measure(self, capture=None):
         """Return PSNR and SSIM of the test views of a capture.

@@ -11,8 +11,8 @@ import drjit as dr
 import numpy as np
 from scipy.ndimage import distance_transform_cdt
 
-from ...arrays.bits import mask_words
 from ...arrays.indirection import device_array
+from ...arrays.lookup import mask_words
 
 #: Cells along a side of a cell of the coarser grid of distances.
 COARSE = 2
@@ -207,11 +207,11 @@ def layers(stored: np.ndarray, shape, more: int = 0):
 
 def _occupied(stored: np.ndarray, shape) -> np.ndarray:
     """Return the cells of the coarser grid that hold an occupied cell, of a mask or its packed flags."""
-    parts = [_coarser(cells_of(part)) for part in layers(stored, shape, 1) if len(part) > 1]
+    parts = [coarser(cells_of(part)) for part in layers(stored, shape, 1) if len(part) > 1]
     return np.concatenate(parts)
 
 
-def _coarser(cells: np.ndarray) -> np.ndarray:
+def coarser(cells: np.ndarray) -> np.ndarray:
     """Return which cells of the coarser grid hold one of the ``cells``."""
     padded = np.pad(cells, [(0, -n % COARSE) for n in cells.shape])
     x, y, z = (n // COARSE for n in padded.shape)
@@ -239,7 +239,7 @@ def chessboard_distances(cells: np.ndarray) -> np.ndarray:
 
     Distances are in cells of the coarser grid, in the maximum norm, at most :data:`FARTHEST`; uint8.
     """
-    return _farthest(_coarser(cells))
+    return _farthest(coarser(cells))
 
 
 def _farthest(occupied: np.ndarray) -> np.ndarray:

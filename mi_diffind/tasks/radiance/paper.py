@@ -15,8 +15,7 @@ from ...arrays.indirection import DifferentiableArray, Indirection, ramp, rounde
 from ...fitting.loop import Problem
 from .grid import NodeGrid
 from .nodes import Nodes
-from .session import FieldSession
-from .training import ImagesProblem
+from .session import FieldSession, ImagesProblem
 from .volume_field import NodeVolume, blended, colour_of, density_of
 
 #: Range of raw densities: empty space has the smallest, the largest is opaque.

@@ -1,15 +1,16 @@
-"""Session of a training: captured views as Dr.Jit arrays, the rays of their pixels, and the figures of held-out views.
+"""Training of radiance fields through images: captured views as Dr.Jit arrays, the rays of their pixels, and figures.
 
 A pixel is the mean over its square, as a camera records it: the mean of :data:`RAYS` rays, in training and in
 measurements. One ray through its centre cannot be that mean at silhouettes, where 29% of the error was. Training pixels
-are those of random patches, which share most of what their rays read. Most patches lie where the views show something.
+are those of random patches, which share most of what their rays read, in front of random greys. Most patches lie where
+the views show something.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from types import ModuleType
 
@@ -18,24 +19,33 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from ...arrays.indirection import device_array
+from ...fitting.loop import Problem
 from ...images import metrics, srgb
-from .image_files import LINEAR
-from .march import march
-from .views import CapturedViews, ViewsError, load_views
-from .visual_hull import focus
+from .captures import LINEAR
+from .march import Marched, differentiable, march
+from .views import CapturedViews, ViewsError, focus, load_views
 from .volume_field import VolumeField
 
-#: Rays along a side of a pixel, and in all, each through the middle of a part of it.
-SIDE, RAYS = 2, 4
+#: Rays along a side of a pixel, each through the middle of a part of it.
+SIDE = 2
+
+#: Rays of a pixel.
+RAYS = SIDE**2
 
 #: Pixels along a side of a patch, whose rays are computed together.
 PATCH = 2
 
-#: Pixels along a side of a tile, and the share of patches that are drawn from all tiles, with something in them or not.
-TILE, ANYWHERE = 8, 0.05
+#: Pixels along a side of a tile.
+TILE = 8
 
-#: Share of the patches in tiles that are drawn by the errors of tiles, and the share of the mean that is added to each.
-BY_ERRORS, LEAST_ERROR = 0.75, 0.25
+#: Share of patches that are drawn from all tiles, with something in them or not.
+ANYWHERE = 0.05
+
+#: Share of the patches in tiles that are drawn by the errors of tiles.
+BY_ERRORS = 0.75
+
+#: Share of the mean error that is added to the error of each tile.
+LEAST_ERROR = 0.25
 
 #: Pixels of a tile whose error is measured: columns and rows.
 SAMPLED = np.array([(2 * i + j % 2, 2 * j + i % 2) for j in range(TILE // 2) for i in range(TILE // 2)]).T
@@ -47,11 +57,14 @@ GREY = 0.2
 #: the cameras look at to the nearest one.
 NEAR = 0.4
 
-#: Most held-out views of measurements during a training.
-MOST_WATCHED = 20
+#: Most held-out views of measurements during a training, and the same if time is limited.
+MOST_WATCHED, MOST_WATCHED_LIMITED = 20, 8
 
-#: The same if time is limited, their share of the held-out views that are read, and the least views for visible cells.
-WATCHED, WATCHED_SHARE, SEEING = 8, 0.2, 8
+#: Share of the held-out views that are measured during a training if time is limited.
+WATCHED_SHARE = 0.2
+
+#: Least training views in which visible cells are sought if time is limited.
+LEAST_SEEING = 8
 
 
 class ViewImages:
@@ -69,13 +82,10 @@ class ViewImages:
 
         They share the memory of the views on the CPU.
         """
-        views, types = self.views, self.types
-        if views.packed is not None:
-            raise ValueError("the pixels of compressed views are not on the device")
-        pixels = views.pixels
+        pixels = self.views.pixels
         if pixels.shape[1] == 1:
-            return types.UInt32(pixels.reshape(-1))
-        return types.Float16(pixels.view(np.float16).reshape(-1))
+            return self.types.UInt32(pixels.reshape(-1))
+        return self.types.Float16(pixels.view(np.float16).reshape(-1))
 
     @functools.cached_property
     def linear(self):
@@ -263,23 +273,19 @@ class FieldSession:
     has_test_views: bool = True
     #: Most pixels of the views in which the visible cells of a field are sought (``None``: all).
     pixels: float | None = None
-    #: Exposure of each training view in stops, float32, if exposures are trained.
-    exposures: np.ndarray | None = None
 
     @staticmethod
-    def load(types: ModuleType, folder, pixels: float | None = None, exposures=False, **reading) -> FieldSession:
+    def load(types: ModuleType, folder, pixels: float | None = None, **reading) -> FieldSession:
         """Read the capture in a folder, of the held-out views so many that they have at most ``pixels``.
 
-        ``exposures`` are to be trained. ``reading`` are further arguments of :func:`.views.load_views`. Raises
-        :class:`.views.ViewsError`.
+        ``reading`` are further arguments of :func:`.views.load_views`. Raises :class:`.views.ViewsError`.
         """
         views = load_views(folder, "train", **reading)
         most = None if pixels is None else max(2, round(pixels / views.mean_pixels))
         reading["background"] = views.background or "scene"
-        stops = np.zeros(len(views), np.float32) if exposures else None
         held_out, has_test_views = load_held_out(folder, most, **reading)
         # Of these, one is looked at at a time
-        return FieldSession(types, views, held_out.compressed(), has_test_views, pixels, stops)
+        return FieldSession(types, views, held_out.compressed(), has_test_views, pixels)
 
     @property
     def notes(self) -> list[str]:
@@ -295,10 +301,8 @@ class FieldSession:
     def seeing_images(self) -> ViewImages:
         """Training views in which visible cells are sought, evenly spread in the list."""
         views = self.views
-        most = len(views) if self.pixels is None else max(SEEING, round(self.pixels / views.mean_pixels))
-        if most >= len(views):
-            return self.images
-        return ViewImages(self.types, views.chosen(np.arange(most) * len(views) // most))
+        most = len(views) if self.pixels is None else max(LEAST_SEEING, round(self.pixels / views.mean_pixels))
+        return self.images if most >= len(views) else ViewImages(self.types, views.spread(most))
 
     @functools.cached_property
     def held_out_images(self) -> ViewImages:
@@ -308,13 +312,13 @@ class FieldSession:
     @functools.cached_property
     def watched_images(self) -> ViewImages:
         """Held-out views for measurements during a training, evenly spread in the list; fewer if time is limited."""
-        count = len(self.held_out)
-        watched = min(count, MOST_WATCHED)
+        watched = min(len(self.held_out), MOST_WATCHED)
         if self.pixels is not None:
-            watched = min(watched, max(1, min(WATCHED, round(WATCHED_SHARE * count))))
-        if watched == count:
+            share = max(1, min(MOST_WATCHED_LIMITED, round(WATCHED_SHARE * len(self.held_out))))
+            watched = min(watched, share)
+        if watched == len(self.held_out):
             return self.held_out_images
-        return ViewImages(self.types, self.held_out.chosen(np.arange(watched) * count // watched))
+        return ViewImages(self.types, self.held_out.spread(watched))
 
 
 def load_held_out(folder, most: int | None = None, **reading) -> tuple[CapturedViews, bool]:
@@ -359,3 +363,60 @@ def scores(pictures: Iterable[np.ndarray], views: CapturedViews, ssim: bool = Fa
         "psnr_white_db": psnr[1],
         **({"ssim_white": float(np.mean(similar))} if similar else {}),
     }
+
+
+class ImagesProblem(Problem):
+    """Training of a field through the images of a session.
+
+    ``net`` maps names to tensors (a dictionary or a module); ``field_of`` makes a :class:`.VolumeField` of them,
+    differentiably. The loss is the mean squared difference of sRGB values in front of random greys, which trains the
+    opacity, too, or in front of the background of views that have one.
+
+    A pixel is the mean of ``side``² rays; a step has as many rays whatever that is.
+    """
+
+    side = SIDE
+
+    #: Chances of tiles by the errors of the field at the beginning (:meth:`ViewImages.cumulative_errors`), if rays are
+    #: drawn by them.
+    cumulative = None
+
+    def __init__(self, session: FieldSession, net, field_of: Callable[..., VolumeField]):
+        self.session, self.net, self.field_of = session, net, field_of
+        self.identity = {"source": session.views.digest}
+
+    def loss(self, net, rng, size: int):
+        types, images = self.session.types, self.session.images
+        rays = self.side**2
+        view, x, y = images.random_pixels(rng, size // rays, PATCH * SIDE // self.side, self.cumulative)
+        count = dr.width(view)
+        o, d = images.pixel_rays(view, x, y, self.side)
+        offset = rng.random(types.TensorXf, (dr.width(o),)).array
+        behind = images.behind(rng, count)
+        truth = images.colours(view, x, y)
+        seen = differentiable(self.field_of(net).for_training(), o, d, images.near, dr.inf, True, offset)
+        dr.schedule(seen.colour, seen.transmittance)  # at once: each sum evaluates what it adds up
+        *colour, transmittance = (dr.block_sum(v, rays) / rays for v in (*seen.colour, seen.transmittance))
+        pairs = before(Marched(colour, transmittance), truth, behind)
+        total = sum((dr.square(shown - reference) for shown, reference in pairs), types.Float(0))
+        return dr.select(images.counted(view, x, y), total, 0) * (1 / (3 * count))
+
+    def draw_by_errors(self) -> None:
+        """Draw rays by the errors of the present state from now on."""
+        self.cumulative = self.session.images.cumulative_errors(self.field_of(self.net))
+
+    def measure(self, net):
+        return self.session.watched_images.evaluate(self.field_of(net))
+
+
+def before(seen: Marched, truth, background: list) -> list[tuple]:
+    """Return pairs of a seen and a true sRGB value in front of a ``background``, for red, green and blue.
+
+    ``truth`` holds linear colours multiplied by alpha, and alpha. Seen values are not clamped at white: their
+    derivatives lead back into the range.
+    """
+    pairs = []
+    for c, behind in enumerate(background):
+        reference = srgb.from_linear(dr.clip(truth[c] + (1 - truth[3]) * behind, 0, 1), fused=False)
+        pairs.append((srgb.from_linear(seen.colour[c] + seen.transmittance * behind, fused=False), reference))
+    return pairs

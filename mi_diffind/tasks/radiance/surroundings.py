@@ -12,8 +12,7 @@ import drjit as dr
 import numpy as np
 
 from .nodes import Nodes
-from .views import CapturedViews
-from .visual_hull import focus, pixel_width
+from .views import CapturedViews, focus, pixel_width
 from .volume_field import EqualSteps
 
 #: Half side of the inner cube as a share of the distance from the point that the cameras look at to the nearest one.

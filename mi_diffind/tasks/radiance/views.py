@@ -1,9 +1,9 @@
-"""Captured views: images of a scene with the poses of their cameras, read from a folder.
+"""Captured views: images of a scene with the poses of their cameras, and the space that the objects may occupy.
 
-``mi-diffind capture``, Blender, nerfstudio and instant-ngp list views in JSON (:mod:`.transforms`); models of COLMAP
-are read, too (:mod:`.colmap`). Pixels stay as their files have them (:mod:`.image_files`), 4 bytes each, or 8 bytes if
-there is an EXR among the files; photographs with a distortion become images of pinholes (:mod:`.lenses`). An image
-without alpha is opaque everywhere, so that its background becomes part of the field.
+Lists of views and image files are read by :mod:`.captures`. Pixels stay as their files have them, 4 bytes each, or 8
+bytes if there is an EXR among the files; photographs with a distortion become images of pinholes. An image without
+alpha is opaque everywhere, so that its background becomes part of the field, unless it has one colour: then pixels of
+this colour that are connected with the border of their image become empty.
 """
 
 from __future__ import annotations
@@ -18,27 +18,31 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import binary_propagation, maximum_filter
 
 from ...arrays.indirection import aligned
 from ...core import units
 from ...core.errors import printable, shortened
 from ...core.progress import progress_bar
-from . import background as backgrounds
-from .camera_keys import focal_lengths
-from .colmap import colmap_frames, model_folder
-from .image_files import (
+from .captures import (
+    DISTORTION,
+    SPLITS,
+    Frame,
+    FrameList,
     MissingImageError,
     ViewsError,
     decoded,
+    encoded,
+    focal_lengths,
     half_floats,
     image_file,
     is_linear,
+    list_frames,
     read_image,
     read_mask,
     reduced,
+    undistorted,
 )
-from .lenses import DISTORTION, undistorted
-from .transforms import SPLITS, Frame, FrameList, listed_frames
 
 #: Level of zlib for images that are kept compressed: the fastest.
 PACKING = 1
@@ -57,7 +61,7 @@ OFF_MIDDLE = 0.25
 OUTLIERS, POINTS_MARGIN = (1, 99), 0.05
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class CapturedViews:
     """Images of one ``split`` of a capture, with their cameras.
 
@@ -76,8 +80,8 @@ class CapturedViews:
     undistorted photograph does not show. ``None``: all count. ``notes`` are sentences for the user; ``settings`` are
     recorded in the file of a fitted field.
 
-    ``background`` holds bytes of sRGB if images without alpha show one colour around the objects
-    (:mod:`.background`); its pixels have alpha 0 then. ``None``: images with alpha, or surroundings that are captured.
+    ``background`` holds bytes of sRGB if images without alpha show one colour around the objects,
+    and its pixels have alpha 0 then. ``None``: images with alpha, or surroundings that are captured.
     """
 
     pixels: np.ndarray
@@ -110,6 +114,10 @@ class CapturedViews:
             focal=self.focal[numbers], centre=self.centre[numbers], names=tuple(self.names[i] for i in numbers),
             packed=None if self.packed is None else tuple(self.packed[i] for i in numbers),
         )  # fmt: skip
+
+    def spread(self, count: int) -> CapturedViews:
+        """Return ``count`` of the views, evenly spread in the list."""
+        return self.chosen(np.arange(count) * len(self) // count)
 
     def compressed(self) -> CapturedViews:
         """Return the same views with compressed images, which are decoded one at a time."""
@@ -188,28 +196,17 @@ def load_views(
     folder = Path(folder)
     if split not in SPLITS:
         raise ValueError(f'split: found "{split}", allowed are {", ".join(SPLITS)}')
-    listed = _listed(folder, split)
+    listed = list_frames(folder, split)
     frames, paths, missing = _with_images(listed, split)
     if most is not None and most < len(frames):
         chosen = [i * len(frames) // most for i in range(most)]
         frames, paths = ([entries[i] for i in chosen] for entries in (frames, paths))
-    images = _Images(len(paths), 2 if any(map(is_linear, paths)) else 1, downscale)
+    images = _Images(listed, len(paths), 2 if any(map(is_linear, paths)) else 1, downscale)
     with progress_bar("views", len(paths), "images", progress) as bar:
         for path, frame in zip(paths, frames, strict=True):
-            images.add(path, frame, listed)
+            images.add(path, frame)
             bar.update()
     opaque = images.opaque if images.transparent else list(range(len(paths)))
-    notes = [*listed.notes, *missing, *images.notes]
-    if images.alpha_masks:
-        notes.append(f"the masks of {images.alpha_masks} images are those of their alpha")
-    if images.reduced:
-        factors = " or ".join(map(str, sorted(images.reduced)))
-        notes.append(f"images are reduced by the factor {factors} along each side: option --downscale")
-    if images.off_middle:
-        notes.append(f'{listed.name}: "cx" and "cy" in pixels are expected, {images.off_middle}')
-    if images.undistorted:
-        count = "all" if images.undistorted == len(paths) else f"{images.undistorted} of {len(paths)}"
-        notes.append(f"{count} images have a lens distortion and were undistorted")
     mask = images.mask()
     if mask is not None and not mask.any():
         raise ViewsError(
@@ -227,43 +224,33 @@ def load_views(
         has_alpha=not opaque,
         split=split,
         mask=mask,
-        notes=tuple(notes),
+        notes=(*listed.notes, *missing, *images.all_notes()),
         settings=listed.settings,
     )
-    views = _in_front_of(views, opaque, background)
+    _set_background(views, opaque, background)
     # Points of a model lie in the surroundings, too
-    return dataclasses.replace(views, box=_box(listed, views.has_alpha or views.surroundings))
+    views.box = _box(listed, views.has_alpha or views.surroundings)
+    return views
 
 
-def _in_front_of(views: CapturedViews, opaque: list[int], background) -> CapturedViews:
-    """Return views whose ``opaque`` images are in front of a background."""
+def _set_background(views: CapturedViews, opaque: list[int], background) -> None:
+    """Let the ``opaque`` images of views be in front of a background."""
     if not opaque or background in ("scene", "surroundings"):
-        unused = (
-            [] if opaque or background in (None, "scene") else ["all images have alpha: the background is not used"]
-        )
-        surroundings = bool(opaque) and background == "surroundings"
-        return dataclasses.replace(views, notes=(*views.notes, *unused), surroundings=surroundings)
-    chosen = backgrounds.NAMED[background] if isinstance(background, str) else background
-    colour = chosen or backgrounds.border_colour(opaque, views.stored, views.counted)
+        views.surroundings = bool(opaque) and background == "surroundings"
+        if not opaque and background not in (None, "scene"):
+            views.notes += ("all images have alpha: the background is not used",)
+        return
+    chosen = NAMED[background] if isinstance(background, str) else background
+    colour = chosen or border_colour(views, opaque)
     if colour is None:
-        return views
+        return
     for view in opaque:
-        backgrounds.clear(views.stored(view), views.counted(view), colour)
-    notes = views.notes
+        clear(views.stored(view), views.counted(view), colour)
     if not chosen:
         text = ", ".join(map(str, colour))
-        notes += (f"images without alpha: the colour of their borders (sRGB {text}) is taken for the background",)
-    settings = views.settings | {"background": list(colour)}
-    return dataclasses.replace(views, has_alpha=True, background=tuple(colour), notes=notes, settings=settings)
-
-
-def _listed(folder: Path, split: str) -> FrameList:
-    """Return the list of the views of a split: in JSON if there is such a file, else in a COLMAP model."""
-    if not any(folder.glob("transforms*.json")):
-        model = model_folder(folder)
-        if model is not None:
-            return colmap_frames(folder, model, split)
-    return listed_frames(folder, split)
+        views.notes += (f"images without alpha: the colour of their borders (sRGB {text}) is taken for the background",)
+    views.has_alpha, views.background = True, tuple(colour)
+    views.settings = views.settings | {"background": list(colour)}
 
 
 def _with_images(listed: FrameList, split: str) -> tuple[list[Frame], list[Path], list[str]]:
@@ -304,16 +291,16 @@ def _box(listed: FrameList, has_alpha: bool) -> np.ndarray | None:
 class _Images:
     """Images of a capture while they are read: arrays and lists of :class:`CapturedViews`."""
 
-    def __init__(self, views: int, words: int, downscale: int | None):
-        self.views, self.pixels, self.count = views, np.empty((0, words), np.uint32), 0
+    def __init__(self, listed: FrameList, views: int, words: int, downscale: int | None):
+        self.listed, self.views, self.downscale = listed, views, downscale
+        self.pixels, self.count = np.empty((0, words), np.uint32), 0
         self.sizes, self.focal, self.centre, self.masks = [], [], [], []
-        self.transparent, self.opaque, self.undistorted, self.downscale, self.reduced = False, [], 0, downscale, set()
-        self.alpha_masks, self.notes = 0, {}  # notes in their order, each once
-        self.off_middle = ""
+        self.transparent, self.opaque, self.undistorted, self.reduced = False, [], 0, set()
+        self.alpha_masks, self.notes, self.off_middle = 0, {}, ""  # notes in their order, each once
 
-    def add(self, path: Path, frame: Frame, listed: FrameList) -> None:
+    def add(self, path: Path, frame: Frame) -> None:
         """Read an image and its mask, reduce and undistort them."""
-        numbers, (image, has_alpha) = frame.numbers, read_image(path)
+        numbers, listed, (image, has_alpha) = frame.numbers, self.listed, read_image(path)
         height, width = image.shape[:2]
         expected = numbers.get("w", width), numbers.get("h", height)
         if expected != (width, height):
@@ -340,21 +327,36 @@ class _Images:
             raise ViewsError(f"{path}: has {width} × {height} pixels, which cannot be reduced by the factor {factor}")
         if factor > 1:
             image, mask = reduced(image, mask, factor)
-            (height, width), self.reduced = image.shape[:2], self.reduced | {factor}
+            self.reduced.add(factor)
             focal, centre = ((x / factor, y / factor) for x, y in (focal, centre))
         lens = tuple(numbers.get(name, 0.0) for name in DISTORTION)
         if any(lens):
             image, mask = undistorted(image, mask, focal, centre, lens)
             self.undistorted += 1
-        self.sizes.append((height, width))
+        if not has_alpha:
+            self.opaque.append(len(self.sizes))
+        elif not self.transparent:
+            self.transparent = bool(image[..., 3].min() < (255 if image.dtype == np.uint8 else 1))
+        self.sizes.append(image.shape[:2])
         self.focal.append(focal)
         self.centre.append(centre)
         self.masks.append(None if mask is None or mask.all() else mask)
-        if not has_alpha:
-            self.opaque.append(len(self.sizes) - 1)
-        elif not self.transparent:
-            self.transparent = bool(image[..., 3].min() < (255 if image.dtype == np.uint8 else 1))
         self._store(image)
+
+    def all_notes(self) -> list[str]:
+        """Return sentences on the images that were read."""
+        notes = list(self.notes)
+        if self.alpha_masks:
+            notes.append(f"the masks of {self.alpha_masks} images are those of their alpha")
+        if self.reduced:
+            factors = " or ".join(map(str, sorted(self.reduced)))
+            notes.append(f"images are reduced by the factor {factors} along each side: option --downscale")
+        if self.off_middle:
+            notes.append(f'{self.listed.name}: "cx" and "cy" in pixels are expected, {self.off_middle}')
+        if self.undistorted:
+            count = "all" if self.undistorted == len(self.sizes) else f"{self.undistorted} of {len(self.sizes)}"
+            notes.append(f"{count} images have a lens distortion and were undistorted")
+        return notes
 
     def _store(self, image: np.ndarray) -> None:
         words, size = self.pixels.shape[1], image.shape[0] * image.shape[1]
@@ -381,3 +383,135 @@ class _Images:
             np.ones(h * w, bool) if m is None else m.ravel() for m, (h, w) in zip(self.masks, self.sizes, strict=True)
         )
         return np.concatenate(list(whole))
+
+
+#: Name → bytes of sRGB.
+NAMED = {"white": (255, 255, 255), "black": (0, 0, 0)}
+
+#: Largest difference from the background in a byte of its pixels.
+TOLERANCE = 4
+
+#: Least share of the pixels at borders that have one colour if it is the background.
+SHARE_OF_BORDER = 0.9
+
+
+def _shown(image: np.ndarray) -> np.ndarray:
+    """Return the bytes of sRGB of an image of bytes or halves, ``(…, 3)``."""
+    return (image if image.dtype == np.uint8 else encoded(image.astype(np.float32)))[..., :3]
+
+
+def _near(shown: np.ndarray, colour) -> np.ndarray:
+    return np.abs(shown.astype(np.int16) - np.int16(colour)).max(axis=-1) <= TOLERANCE
+
+
+def border_colour(views: CapturedViews, chosen: list[int]) -> tuple[int, int, int] | None:
+    """Return the colour that most pixels at the borders of some views have, bytes of sRGB, or ``None``."""
+    pixels = []
+    for view in chosen:
+        shown, counts = views.stored(view), views.counted(view)
+        for side in ((0, slice(None)), (-1, slice(None)), (slice(None), 0), (slice(None), -1)):
+            pixels.append(_shown(shown[side])[counts[side]])
+    pixels = np.concatenate(pixels)
+    if not len(pixels):
+        return None
+    colour = np.median(pixels, axis=0).astype(int)
+    return tuple(colour.tolist()) if _near(pixels, colour).mean() >= SHARE_OF_BORDER else None
+
+
+def clear(image: np.ndarray, counted: np.ndarray, colour) -> None:
+    """Set the pixels of the background in a stored image to 0."""
+    free = _near(_shown(image), colour) | ~counted
+    border = np.ones_like(free)
+    border[1:-1, 1:-1] = False
+    image[binary_propagation(border & free, mask=free) & counted] = 0
+
+
+#: Nodes along the longest side of the grid in which the box is searched.
+SEARCH = 64
+
+#: Share of the views that must have a node in sight, so that space out of sight does not count as occupied.
+SIGHTED = 0.34
+
+#: Voxels by which the box is larger than the visual hull.
+MARGIN = 2
+
+
+def box_of(views: CapturedViews) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lower and upper corner of the box of the captured objects.
+
+    The box is the ``aabb`` of the capture, cut to the visual hull if the images have alpha. Without an ``aabb``, the
+    search covers a cube around the point that the cameras look at, up to the nearest camera. Raises
+    :class:`.ViewsError` if the visual hull is empty.
+    """
+    if views.box is not None:
+        lower, upper = np.asarray(views.box, np.float64)
+    else:
+        middle, reach = focus(views)
+        lower, upper = middle - reach, middle + reach
+    if not views.has_alpha:
+        return lower, upper
+    for _ in range(2):  # the second time, in a finer grid
+        spacing = float((upper - lower).max()) / (SEARCH - 1)
+        shape = np.ceil((upper - lower) / spacing).astype(int) + 1
+        inside = hull(views, lower, spacing, shape)
+        if not inside.any():
+            raise ViewsError(f"{views.path}: the views show nothing: no point has an alpha above 0 in all of them")
+        occupied = np.argwhere(inside)
+        first, last = occupied.min(axis=0) - MARGIN, occupied.max(axis=0) + MARGIN
+        lower, upper = np.maximum(lower, lower + first * spacing), np.minimum(upper, lower + last * spacing)
+    return lower, upper
+
+
+def pixel_width(views: CapturedViews, point) -> float:
+    """Return the width of a pixel at the distance of a point: the median over the views."""
+    distances = np.linalg.norm(views.origins - np.asarray(point), axis=1)
+    return float(np.median(distances / views.focal.mean(axis=1)))
+
+
+def focus(views: CapturedViews) -> tuple[np.ndarray, float]:
+    """Return the point nearest to the optical axes of all cameras and its distance to the nearest camera."""
+    axes = -views.poses[:, :3, 2]
+    # Σ (I − a aᵀ) (x − o) = 0; a little weight on the cameras' mean if all look the same way
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    ahead = views.origins + axes * np.linalg.norm(views.origins - views.origins.mean(axis=0), axis=1).max()
+    matrix = across.sum(axis=0) + 1e-3 * len(axes) * np.eye(3)
+    point = np.linalg.solve(
+        matrix, np.einsum("nij,nj->i", across, views.origins) + 1e-3 * len(axes) * ahead.mean(axis=0)
+    )
+    reach = np.linalg.norm(views.origins - point, axis=1).min()
+    return point, float(max(reach, 1e-3))
+
+
+def hull(views: CapturedViews, lower, spacing: float, shape) -> np.ndarray:
+    """Return the nodes ``lower + spacing · (i, j, k)`` of the visual hull: bool of this ``shape``.
+
+    A node belongs to it if a share :data:`SIGHTED` of the views have it in sight and none of these shows it empty: a
+    pixel within a voxel of its projection has an alpha above 0, or does not count.
+    """
+    lower = np.asarray(lower, np.float64)
+    axes = [a + spacing * np.arange(n) for a, n in zip(lower, shape, strict=True)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    numbers, sights = np.arange(len(points)), np.zeros(len(points), np.int32)
+    needed = max(1, int(SIGHTED * len(views)))
+    for v in range(len(views)):
+        local = (points - views.origins[v]) @ views.poses[v, :3, :3]
+        ahead = -local[:, 2]
+        front = ahead > 1e-6
+        scale = views.focal[v] / np.where(front, ahead, 1)[:, None]
+        x = views.centre[v, 0] + scale[:, 0] * local[:, 0] - 0.5
+        y = views.centre[v, 1] - scale[:, 1] * local[:, 1] - 0.5
+        # The filter is as wide as a voxel appears. Nodes so near that it would cover the image are left to other views
+        near = 0.5 * np.median(ahead[front]) if front.any() else np.inf
+        front &= ahead >= near
+        reach = int(np.ceil(0.87 * spacing * views.focal[v].max() / near))
+        covered = maximum_filter((views.stored(v)[..., 3] > 0) | ~views.counted(v), size=2 * reach + 1)
+        height, width = covered.shape
+        i, j = np.rint(x).astype(np.int64), np.rint(y).astype(np.int64)
+        sighted = front & (i >= 0) & (i < width) & (j >= 0) & (j < height)
+        sights += sighted
+        kept = sights + (len(views) - 1 - v) >= needed
+        kept[sighted] &= covered[j[sighted], i[sighted]]
+        points, numbers, sights = points[kept], numbers[kept], sights[kept]
+    inside = np.zeros(tuple(shape), bool)
+    inside.reshape(-1)[numbers] = True
+    return inside

@@ -2,20 +2,104 @@
 
 A field fills a box. Each point has a density σ per unit of length and, in each direction, a radiance (linear RGB, never
 negative), so that a ray sees ``Σ T_i (1 − exp(−σ_i δ_i)) c_i`` (:mod:`.march`).
+
+Colours with reflections have numbers of directions and an environment in the mirrored direction. The reflection of a
+distant environment depends on the mirrored direction alone. So all nodes share one table of the environment, and each
+has a normal, by which it finds its place there: an indirection of directions. With the interpolated numbers of a point,
+the radiance in direction d is
+
+    exp(a + b·d) + exp(s + E(d − 2 (d·n) n)).
+
+Here a and b are those of :func:`colour_of` and s is the tint of the reflection (logarithms, for red, green and blue); n
+is the unit normal. E is the logarithm of the environment, interpolated between a fine and a coarse table by the
+sharpness of the point.
 """
 
 from __future__ import annotations
 
 import copy
+from dataclasses import dataclass
 
 import drjit as dr
 import numpy as np
 
-from ...arrays.bits import as_words, pack_bits
 from ...arrays.indirection import device_array, device_tensor
-from . import reflection
+from ...arrays.lookup import as_words, pack_bits
+from ...arrays.tables import StoredArray
 from .nodes import Nodes
-from .reflection import BRIGHTEST
+
+#: Sides of the squares of the fine and the coarse table; each holds all directions, by an octahedron that is unfolded.
+SIDES = (64, 16)
+
+#: Entries of both tables.
+ENTRIES = sum(side**2 for side in SIDES)
+
+#: Columns of the numbers of a node: normal, tint and sharpness follow those of directions; the last is unused.
+DIRECTIONS, NORMAL, TINT, SHARPNESS, COLUMNS = 12, slice(12, 15), slice(15, 18), 18, 20
+
+#: Logarithm of the tint before the training.
+BEGIN_TINT = -3.0
+
+#: Upper limit of the logarithm of a radiance.
+BRIGHTEST = 12.0
+
+
+def unfolded(d) -> tuple:
+    """Return the place of the directions ``d`` on the unfolded octahedron: two coordinates in [−1, 1]."""
+    inverse = dr.rcp(dr.abs(d.x) + dr.abs(d.y) + dr.abs(d.z))
+    u, v = d.x * inverse, d.y * inverse
+    below = d.z < 0
+    return dr.select(below, dr.mulsign(1 - dr.abs(v), u), u), dr.select(below, dr.mulsign(1 - dr.abs(u), v), v)
+
+
+def environment_at(types, entry, d, sharpness, active=True) -> list:
+    """Return the logarithms of red, green and blue of the environment in the directions ``d``.
+
+    ``entry(number, active)`` returns three numbers of an entry of the tables. ``sharpness`` in [0, 1] is the share of
+    the fine one.
+    """
+    place, seen, first = unfolded(d), [types.Float(0)] * 3, 0
+    for side, share in zip(SIDES, (sharpness, 1 - sharpness), strict=True):
+        x, y = (dr.clip(dr.fma(0.5 * side, t, 0.5 * side - 0.5), -0.5, side - 0.5) for t in place)
+        column, row = (types.Int32(dr.floor(dr.detach(t))) for t in (x, y))
+        x, y = x - types.Float(column), y - types.Float(row)
+        for j in (0, 1):
+            for i in (0, 1):
+                number = first + _number(column + i, row + j, side)
+                weight = share * (x if i else 1 - x) * (y if j else 1 - y)
+                seen = [dr.fma(weight, value, s) for value, s in zip(entry(number, active), seen, strict=True)]
+        first += side**2
+    return seen
+
+
+def _number(column, row, side: int):
+    """Return the number of an entry of a square; those beyond a border are the mirrored ones along the same border."""
+    inner = [dr.clip(t, 0, side - 1) for t in (column, row)]
+    column, row = (
+        dr.select(other == kept, t, side - 1 - t)
+        for t, other, kept in ((inner[0], row, inner[1]), (inner[1], column, inner[0]))
+    )
+    return dr.fma(row, side, column)
+
+
+def reflected(types, numbers: list, d, entry, active=True) -> list:
+    """Return the reflection [r, g, b] in direction ``d``, from the ``numbers`` of a point and the tables' ``entry``."""
+    n = types.Array3f(*numbers[NORMAL])
+    n *= dr.rsqrt(dr.squared_norm(n) + 1e-6)
+    mirrored = dr.fma(-2 * dr.dot(d, n), n, d)
+    sharpness = dr.rcp(1 + dr.exp(-dr.clip(numbers[SHARPNESS], -30, 30)))
+    seen = environment_at(types, entry, mirrored, sharpness, active)
+    return [dr.exp(dr.minimum(s + light, BRIGHTEST)) for s, light in zip(numbers[TINT], seen, strict=True)]
+
+
+def add_reflections(colour: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Return the numbers of nodes, ``(n, 20)``, before reflections are trained, from those of directions."""
+    numbers = np.zeros((len(colour), COLUMNS), np.float32)
+    numbers[:, :DIRECTIONS] = colour
+    numbers[:, NORMAL] = normals
+    numbers[:, TINT] = BEGIN_TINT
+    return numbers
+
 
 #: Optical depth of a voxel below which its density counts as zero.
 FAINT = 2e-3
@@ -176,7 +260,7 @@ class NodeField(NodeVolume):
     corners of a cell and blended there.
 
     With an ``environment`` ``(e, 4)``, of which the last column is unused, ``colour`` ``(m, 20)`` holds the numbers of
-    :mod:`.reflection`.
+    :mod:`.volume_field`.
     """
 
     def __init__(self, nodes: Nodes, density, colour, palette_index=None, environment=None):
@@ -198,7 +282,7 @@ class NodeField(NodeVolume):
         def entry(number, seen):
             return list(dr.gather(Array4f, environment, number, seen))[:3]
 
-        mirrored = reflection.reflected(self.types, numbers, d, entry, active)
+        mirrored = reflected(self.types, numbers, d, entry, active)
         return [a + b for a, b in zip(radiance, mirrored, strict=True)]
 
     def coefficients(self, point_data, active) -> list:
@@ -236,32 +320,54 @@ class DenseVolumeField(NodeField):
         super().__init__(nodes, *(device_tensor(tensor, v) for v in values))
 
 
-class PackedPaletteField(NodeVolume):
-    """Compressed field in its form for rendering: a word of ``density_bits`` + ``index_bits`` bits at each node.
+@dataclass
+class PaletteArrays:
+    """Numbers of the nodes of a compressed field; the first entry of ``levels`` and ``index`` stands for no node.
 
-    ``stored`` is that of :meth:`.compression.PaletteProblem.stored`. The low bits of a node are a density level, which
-    stands for the raw density ``density_range[0]`` + level · ``density_range[1]``. The high bits are an index into
-    ``palette`` ``(P, columns)``, uint8, whose bytes stand for ``offset`` + ``scale`` · byte. ``levels`` and ``index``
-    are NumPy arrays ``(n,)``. Entries of the palette take a multiple of 16 bytes in memory, those of ``environment``,
-    with its ``environment_range`` (steps and offsets), four.
+    ``levels`` ``(n,)``, uint8, have ``density_bits`` bits; a level ℓ stands for the raw density ``density_range[0]`` +
+    ``density_range[1]`` · ℓ. ``index`` ``(n,)`` names a row of ``palette`` ``(P, columns)``, bytes. Colours with
+    reflections have an ``environment`` ``(e, 3)``, bytes.
     """
 
-    def __init__(self, nodes: Nodes, stored: dict, density_bits: int, index_bits: int):
+    levels: np.ndarray
+    density_bits: int
+    density_range: tuple[float, float]
+    index: np.ndarray
+    palette: StoredArray
+    environment: StoredArray | None = None
+
+    @property
+    def index_bits(self) -> int:
+        """Bits of an index."""
+        return max(1, (len(self.palette.entries) - 1).bit_length())
+
+
+class PackedPaletteField(NodeVolume):
+    """Compressed field in its form for rendering: the bits of density level and palette index at each node.
+
+    Entries of the palette take a multiple of 16 bytes in memory, those of the environment four.
+    """
+
+    def __init__(self, nodes: Nodes, numbers: PaletteArrays):
         super().__init__(nodes, {})
         types = nodes.types
-        self.density_bits, self.index_bits, self.density_range = density_bits, index_bits, stored["density_range"]
+        self.density_bits, self.index_bits = numbers.density_bits, numbers.index_bits
+        self.density_range = numbers.density_range
         # Level and index of each node without gaps, and one more word
-        joined = stored["levels"].astype(np.uint32) | (stored["index"].astype(np.uint32) << density_bits)
-        self.words = device_array(types.UInt32, as_words(pack_bits(joined, density_bits + index_bits), spare=1))
-        entries = np.pad(stored["palette"], ((0, 0), (0, -stored["palette"].shape[1] % 16)))
+        joined = numbers.levels.astype(np.uint32) | (numbers.index.astype(np.uint32) << self.density_bits)
+        self.words = device_array(
+            types.UInt32, as_words(pack_bits(joined, self.density_bits + self.index_bits), spare=1)
+        )
+        entries = numbers.palette.entries
+        entries = np.pad(entries, ((0, 0), (0, -entries.shape[1] % 16)))
         self.packets = entries.shape[1] // 16
         self.palette = device_array(types.UInt32, entries.view("<u4"))
-        self.scale, self.offset = ([float(v) for v in stored[name]] for name in ("scale", "offset"))
+        self.scale, self.offset = numbers.palette.scale, numbers.palette.offset
         self.environment = None
-        if "environment" in stored:
-            words = np.pad(stored["environment"], ((0, 0), (0, 1))).view("<u4")
+        if (environment := numbers.environment) is not None:
+            words = np.pad(environment.entries, ((0, 0), (0, 1))).view("<u4")
             self.environment = device_array(types.UInt32, words)
-            self.environment_range = [[float(v) for v in values] for values in stored["environment_range"]]
+            self.environment_range = environment.scale, environment.offset
 
     @property
     def nbytes(self) -> int:
@@ -307,5 +413,5 @@ class PackedPaletteField(NodeVolume):
             scale, offset = self.environment_range
             return [dr.fma(types.Float((word >> 8 * c) & 255), scale[c], offset[c]) for c in range(3)]
 
-        mirrored = reflection.reflected(types, numbers, d, entry, active)
+        mirrored = reflected(types, numbers, d, entry, active)
         return [a + b for a, b in zip(radiance, mirrored, strict=True)]

@@ -42,10 +42,6 @@ class Sdf(Task):
         "paper": PAIR_SETTINGS,
     }
     storages = ()
-    trials = {  # noqa: RUF012
-        "sparse": {"source": "mesh", "steps": 2, "batch": 256, "bytes": "12k"},
-        "paper": {"source": "mesh", "steps": 2, "batch": 256, "bytes": "4k", "preset": "paper"},
-    }
     measurements = 4
     files = "model"
     arguments = (

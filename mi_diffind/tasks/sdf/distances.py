@@ -2,7 +2,7 @@
 
 The magnitude |d| comes from a bounding-volume tree, the sign from the winding number: a point is inside where the
 winding number is at least 1/2. That of a watertight mesh is a whole number. An open mesh is closed hole by hole first
-(:func:`.boundary.close_holes`) if the closed mesh agrees with its winding number; :attr:`Distances.ambiguity` is the
+(:func:`.mesh.close_holes`) if the closed mesh agrees with its winding number; :attr:`Distances.ambiguity` is the
 share of space that is in doubt. Triangles inside of the solid, where pieces overlap, have no part in distances: with
 them, the distance would be zero where no surface is visible.
 """
@@ -24,8 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from ...core.errors import DiffindError, missing_package, reason
-from . import boundary
-from .mesh import NO_VOLUME, Mesh
+from .mesh import NO_VOLUME, Mesh, close_holes, outer_surface
 
 #: Points per request: less than a second of work, so that Ctrl-C is noticed.
 CHUNK = 2**17
@@ -97,7 +96,7 @@ class Distances:
         winding = self.winding(points)
         unclear = np.abs(winding - np.round(winding)) > AMBIGUOUS
         self._doubt = float(unclear.mean()), float((np.abs(winding - 0.5) < 0.25).mean())
-        closed = boundary.close_holes(self.mesh)
+        closed = close_holes(self.mesh)
         inside = winding >= 0.5
         differ = self._ask("inside", points, "closed", closed)[0] != inside
         agrees = np.sum(differ & ~unclear) <= DISAGREEMENT * np.sum(inside & ~unclear)
@@ -109,7 +108,7 @@ class Distances:
 
         Raises :class:`DistancesError` if no volume is enclosed.
         """
-        outer = boundary.outer_surface(self.solid, self.inside)
+        outer = outer_surface(self.solid, self.inside)
         if not len(outer.faces) or (outer.watertight and abs(outer.volume) < NO_VOLUME):
             raise DistancesError(f"{self.mesh.path}: encloses no volume, expected the surface of a solid")
         return outer

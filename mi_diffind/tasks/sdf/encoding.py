@@ -8,11 +8,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from . import codes
+from ...arrays.sparse_grid import SparseGrid
 from .distances import Distances
-from .nodes import decoded_nodes, middles
+from .nodes import (  # fmt: skip
+    bernstein,
+    decoded_nodes,
+    entry_scale,
+    entry_words,
+    frame_words,
+    middles,
+    residuals,
+    slope_bound,
+    unpack_entries,
+    unpack_frames,
+)
 from .sampling import near_nodes, surface_cells
-from .structure import Structure, build
 
 #: Weights of an entry's coordinates when entries are chosen: a distance (in spacings) counts 5 times a normal.
 WEIGHTS = np.array([5.0, 1, 1])
@@ -20,8 +30,17 @@ WEIGHTS = np.array([5.0, 1, 1])
 #: Smallest distance of a node from zero, in spacings.
 LEAST = 0.01
 
-#: Largest number of rounds in which nodes are moved to keep the surface within the stored cells.
+#: Rounds in which nodes are moved to keep the surface within the stored cells.
 REPAIRS = 12
+
+#: Corners of a cell, and its Bernstein coefficients, on each of its six sides: −x, +x, −y, …; (6, 4) and (6, 9).
+FACE_CORNERS, FACE_COEFFICIENTS = (
+    np.stack([np.arange(n**3).reshape(n, n, n).take(end, axis).ravel() for axis in range(3) for end in (0, n - 1)])
+    for n in (2, 3)
+)
+
+#: Values of the Bernstein polynomials of a side at 9 × 9 places of it, (9, 81).
+FACE_BASIS = np.kron(*[np.stack([(1 - u) ** 2, 2 * u * (1 - u), u**2]) for u in [np.linspace(0, 1, 9)] * 2])
 
 
 @dataclass
@@ -32,7 +51,7 @@ class SampledNodes:
     the ``corners`` of the grid's cells (K, 8), z fastest.
     """
 
-    structure: Structure
+    structure: SparseGrid
     positions: np.ndarray
     block: np.ndarray
     distances: np.ndarray
@@ -53,53 +72,45 @@ def sample(distances: Distances, spacing: float) -> SampledNodes:
     d, normals = distances.signed_normals(lower + spacing * nodes)
     crossed = (d < 0)[corners]
     keep = crossed.any(axis=1) & ~crossed.all(axis=1)
-    used, corners = np.unique(corners[keep], return_inverse=True)
-    corners = corners.reshape(-1, 8)
+    used = np.unique(corners[keep])
     nodes, d, normals = nodes[used], d[used], normals[used]
-    structure = build(nodes, d < 0, shape + 1, lower, spacing, distances.inside)
-    # In the order of the structure
+    structure = SparseGrid.from_nodes(nodes, d < 0, shape + 1, lower, spacing, distances.inside)
+    # In the order of the grid
     positions, block = structure.node_positions()
-
-    def key(p):
-        return np.ravel_multi_index(np.asarray(p, np.int64).T, structure.shape)
-
-    order = np.argsort(key(nodes))
-    place = order[np.searchsorted(key(nodes), key(positions), sorter=order)]
-    back = np.empty_like(place)
-    back[place] = np.arange(len(place))
+    order = np.ravel_multi_index(nodes.T, structure.shape)  # ascending
+    place = np.searchsorted(order, np.ravel_multi_index(positions.T, structure.shape))
+    missed = 1 - np.count_nonzero(keep) / max(1, len(cells))
     return SampledNodes(
         structure, positions, block, d[place].astype(np.float64) / spacing, normals[place].astype(np.float64),
-        back[corners], len(cells), 1 - len(corners) / max(1, len(cells)),
+        crossed_cells(structure, d[place] < 0), len(cells), missed,
     )  # fmt: skip
 
 
-def encoded(structure: Structure, before: np.ndarray, values: np.ndarray, bits: int, seed: int = 0):
+def crossed_cells(structure: SparseGrid, inside: np.ndarray) -> np.ndarray:
+    """Return the corners ``(K, 8)`` of the cells in which the signs of stored nodes differ, given ``inside`` (n,)."""
+    corners = structure.cells()
+    crossed = inside[corners]
+    return corners[crossed.any(axis=1) & ~crossed.all(axis=1)]
+
+
+def encode_again(structure: SparseGrid, before: np.ndarray, values: np.ndarray, bits: int, seed: int = 0) -> NodeCoding:
     """Encode the nodes of a field again, with new ``values`` (n, 4): distances in spacings and unit normals.
 
-    ``before`` are the decoded nodes of the file (n, 4), whose signs state the side of each node. Returns the
-    :class:`NodeCoding` and the corners (K, 8) of the cells that are stored.
+    ``before`` are the decoded nodes of the file (n, 4), whose signs state the side of each node.
     """
     positions, block = structure.node_positions()
     side = np.where(before[:, 0] < 0, -1.0, 1.0)
-    shape = np.array(structure.shape) + 1
-    keys = np.ravel_multi_index(np.asarray(positions, np.int64).T, shape)
-    order = np.argsort(keys)
-    steps = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(-1, 3)
-    wanted = keys[:, None] + steps @ np.array([shape[1] * shape[2], shape[2], 1])
-    place = order[np.minimum(np.searchsorted(keys, wanted, sorter=order), len(order) - 1)]
-    inside = side[place] < 0
-    cells = (keys[place] == wanted).all(axis=1) & inside.any(axis=1) & ~inside.all(axis=1)
-    corners = place[cells]
+    corners = crossed_cells(structure, side < 0)
     distances = side * np.maximum(np.abs(before[:, 0]), LEAST)
-    nodes = SampledNodes(structure, positions, block, distances, before[:, 1:], corners, len(corners), 0.0)
-    coding = NodeCoding(nodes, bits, seed)
+    sampled = SampledNodes(structure, positions, block, distances, before[:, 1:], corners, len(corners), 0.0)
+    coding = NodeCoding(sampled, bits, seed)
     coding.encode(values)
-    return coding, corners
+    return coding
 
 
 def node_frames(words: np.ndarray, block: np.ndarray):
     """Return the frames of nodes in the blocks ``block`` (n,): normal (three arrays), distance and scale."""
-    n, d, scale = codes.frames(words)
+    n, d, scale = unpack_frames(words)
     return [v[block] for v in n], d[block], scale[block]
 
 
@@ -116,18 +127,18 @@ def fit_frames(s: SampledNodes) -> np.ndarray:
     length = np.linalg.norm(n, axis=1, keepdims=True)
     n = np.where(length > 1e-3, n / np.maximum(length, 1e-9), [0.0, 0.0, 1.0])
     ones = np.ones(len(n))
-    n = np.stack(codes.frames(codes.frame_words(n, 0 * ones, ones))[0], axis=1)
+    n = np.stack(unpack_frames(frame_words(n, 0 * ones, ones))[0], axis=1)
     offsets = middles(s.positions)
-    words = codes.frame_words(n, mean(s.distances - np.sum(offsets * n[s.block], axis=1)), ones)
+    words = frame_words(n, mean(s.distances - np.sum(offsets * n[s.block], axis=1)), ones)
     normals, d, _ = node_frames(words, s.block)
-    rest = codes.residuals(s.distances, s.normals, offsets, normals, d, np.ones(len(offsets)))
+    rest = residuals(s.distances, s.normals, offsets, normals, d, np.ones(len(offsets)))
     size = np.sqrt(mean(np.sum((rest * WEIGHTS) ** 2, axis=1)))
-    return codes.frame_words(n, codes.frames(words)[1], size)
+    return frame_words(n, unpack_frames(words)[1], size)
 
 
 def exact_entries(s: SampledNodes, words: np.ndarray) -> np.ndarray:
     """Return the entries (n, 3) that would reproduce nodes exactly, given the frames of blocks."""
-    return codes.residuals(s.distances, s.normals, middles(s.positions), *node_frames(words, s.block))
+    return residuals(s.distances, s.normals, middles(s.positions), *node_frames(words, s.block))
 
 
 def cluster(values: np.ndarray, count: int, seed: int = 0, rounds: int = 12, most: int = 2**16) -> np.ndarray:
@@ -175,11 +186,10 @@ class NodeCoding:
         self.entries = self._choose_entries(wanted)
         self.pointers = assign(wanted, self.entries)
         self._keep_sides(wanted, np.arange(len(wanted)))
-        before = lowest = None
+        before = None
         for _ in range(REPAIRS):
-            lowest = self._lowest_values(lowest, before)
-            moved = self._hold_borders(lowest)
-            if before is not None and np.array_equal(moved, before):  # as far as their blocks let them
+            moved = self._hold_borders()
+            if np.array_equal(moved, before):  # as far as their blocks let them
                 break
             self._keep_sides(wanted, moved)
             before = moved
@@ -197,8 +207,8 @@ class NodeCoding:
             entries[index, 0] = reach.reduce(needed, initial=entries[index, 0])
         # As words hold them, so that rounding them again changes nothing
         entries = entries.astype(np.float32)
-        offset, step = codes.entry_scale(entries)
-        rounded = codes.entries(codes.entry_words(entries, offset, step), offset, step)
+        offset, step = entry_scale(entries)
+        rounded = unpack_entries(entry_words(entries, offset, step), offset, step)
         return np.stack(rounded, axis=1).astype(np.float32)
 
     @functools.cached_property
@@ -233,65 +243,33 @@ class NodeCoding:
 
     @functools.cached_property
     def _borders(self) -> tuple[np.ndarray, np.ndarray]:
-        """Faces of stored cells that border on cells that are not stored.
+        """Faces of stored cells that border on cells that are not stored: numbers of cells and of sides (0 to 5)."""
+        sampled = self.sampled
+        shape = np.array(sampled.structure.shape) + 2
+        cells = np.ravel_multi_index((sampled.positions[sampled.corners[:, 0]] + 1).T, shape)
+        steps = np.array([shape[1] * shape[2], shape[2], 1])
+        return np.nonzero(~np.isin(cells[:, None] + np.stack([-steps, steps], axis=1).ravel(), cells))
 
-        Each is given by its cell's nodes (m, 2, 2, 2), turned so that the first coordinate is 0 on the face, and by the
-        axis across the face (m,).
-        """
-        corners, positions = self.sampled.corners.reshape(-1, 2, 2, 2), self.sampled.positions
-        cell = positions[corners[:, 0, 0, 0]].astype(np.int64)
-        shape = np.array(self.sampled.structure.shape) + 2
-        order = np.sort(np.ravel_multi_index((cell + 1).T, shape))
-        cells, axes = [], []
-        for axis in range(3):
-            for end in (0, 1):
-                beside = cell + 1
-                beside[:, axis] += 2 * end - 1
-                other = np.ravel_multi_index(beside.T, shape)
-                place = np.minimum(np.searchsorted(order, other), len(order) - 1)
-                alone = np.flatnonzero(order[place] != other)
-                turned = np.moveaxis(corners[alone], 1 + axis, 1)
-                cells.append(turned[:, ::-1] if end else turned)
-                axes.append(np.full(len(alone), axis))
-        return np.concatenate(cells), np.concatenate(axes)
+    def _hold_borders(self) -> np.ndarray:
+        """Raise the smallest distances of nodes at border faces on which the sign changes; return these nodes."""
+        cells, sides = self._borders
+        values, moved = self.values().astype(np.float64), [np.zeros(0, int)]
+        for part in np.array_split(np.arange(len(cells)), max(1, len(cells) // 2**14)):
+            corners = self.sampled.corners[cells[part]]
+            face = np.take_along_axis(corners, FACE_CORNERS[sides[part]], axis=1)
+            coefficients = np.take_along_axis(bernstein(values[corners]), FACE_COEFFICIENTS[sides[part]], axis=1)
+            lowest = (self.side[face[:, :1]] * (coefficients @ FACE_BASIS)).min(axis=1)
+            broken = lowest < 0.5 * LEAST
+            nodes, short = face[broken].ravel(), np.repeat(LEAST - lowest[broken], 4)
+            np.maximum.at(self.least, nodes, self._distances(nodes, self.pointers[nodes, None])[:, 0] + short)
+            moved.append(nodes)
+        return np.unique(np.concatenate(moved))
 
-    def _lowest_values(self, known: np.ndarray | None, moved: np.ndarray | None) -> np.ndarray:
-        """Return the lowest value of each face of :attr:`_borders`, positive on the side of the face, ``(m,)``.
-
-        With the values that were ``known`` before nodes ``moved``, only those of faces with such a node are computed.
-        """
-        cells, axes = self._borders
-        lowest, changed = np.empty(len(cells)), np.arange(len(cells))
-        if known is not None:
-            lowest, some = known.copy(), np.zeros(len(self.side), bool)
-            some[moved] = True
-            changed = np.flatnonzero(some[cells[:, 0]].any(axis=(1, 2)))
+    @property
+    def slope(self) -> float:
+        """Bound of the slope of the coded field."""
         values = self.values().astype(np.float64)
-        u = np.linspace(0, 1, 9)
-        lines = np.stack([1 - u, u])
-        for part in np.array_split(changed, max(1, len(changed) // 2**14)):
-            face = cells[part][:, 0]  # (m, 2, 2)
-            d, g = values[face, 0], values[face, 1:]
-            others = np.array([[1, 2], [0, 2], [0, 1]])[axes[part]]
-            along = [np.take_along_axis(g, others[:, None, None, k : k + 1], axis=3)[..., 0] for k in (0, 1)]
-            total = 0.0
-            for a in (0, 1):
-                for b in (0, 1):
-                    offset = 0.5 * (
-                        along[0][:, a, b, None, None] * (u - a)[:, None] + along[1][:, a, b, None, None] * (u - b)
-                    )
-                    total = total + lines[a][:, None] * lines[b] * (d[:, a, b, None, None] + offset)
-            lowest[part] = (self.side[face[:, 0, 0], None, None] * total).min(axis=(1, 2))
-        return lowest
-
-    def _hold_borders(self, lowest: np.ndarray) -> np.ndarray:
-        """Raise the smallest distances of nodes at faces whose ``lowest`` value is too low; return these nodes."""
-        cells, _ = self._borders
-        broken = lowest < 0.5 * LEAST
-        nodes = cells[broken][:, 0].reshape(-1)
-        short = np.repeat(LEAST - lowest[broken], 4)
-        np.maximum.at(self.least, nodes, self._distances(nodes, self.pointers[nodes, None])[:, 0] + short)
-        return np.unique(nodes)
+        return slope_bound(values[:, 0], values[:, 1:], self.sampled.corners)
 
     def values(self) -> np.ndarray:
         """Return the coded nodes, decoded, (n, 4) float32."""

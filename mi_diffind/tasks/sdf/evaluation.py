@@ -13,9 +13,8 @@ import numpy as np
 
 from ...arrays.indirection import device_array
 from .distances import Distances
-from .extraction import OFF_NODE, components, march, trimesh_of
 from .field import DistanceField
-from .grids import point_array, point_values
+from .grids import OFF_NODE, components, march, point_array, point_values, trimesh_of
 from .mesh import Mesh
 from .sampling import node_distances, sample_box, sample_near, sample_surface, surface_cells
 

@@ -17,12 +17,12 @@ from ...core.errors import UsageError
 from ...fitting.loop import Problem
 from ...fitting.settings import FittingError
 from ...fitting.task import FitRequest, Fitted
-from . import codes, encoding
+from . import encoding
 from .distances import Distances
 from .evaluation import HELD_OUT, HeldOut, SurfaceEvaluation, lost_pieces
 from .mesh import Mesh, load_mesh
-from .model import sparse_arrays
-from .nodes import SparseNodes, coded_field, slope_bound
+from .model import coded_arrays, field_of
+from .nodes import POINTERS, SparseNodes
 from .paper import SAMPLES, fit_pair
 
 #: Default size in memory, in bytes.
@@ -225,7 +225,7 @@ def search_grid(distances: Distances, nbytes: int, bits: int) -> encoding.Sample
         # Nodes, blocks and their words grow with the square. Where a solid is thinner than cells, so do the cells that
         # its surface passes through
         fixed = 4 * entries_for(sampled, bits)
-        least = BYTES_PER_CELL + WORDS_PER_CELL / codes.POINTERS[bits]
+        least = BYTES_PER_CELL + WORDS_PER_CELL / POINTERS[bits]
         expected = max(size - fixed, least * sampled.cells)
         aim = spacing * np.sqrt(expected / max((1 - TOLERANCE / 2) * nbytes - fixed, 1))
         following = float(np.clip(aim, FINEST, COARSEST))
@@ -245,7 +245,7 @@ def search_grid(distances: Distances, nbytes: int, bits: int) -> encoding.Sample
 def coded_bytes(sampled: encoding.SampledNodes, bits: int) -> int:
     """Return the bytes in memory of a sampled grid whose nodes are pointers of ``bits`` bits."""
     structure = sampled.structure
-    pointers = -(-structure.nodes // codes.POINTERS[bits])
+    pointers = -(-structure.nodes // POINTERS[bits])
     return structure.nbytes + 4 * (structure.blocks + pointers + entries_for(sampled, bits))
 
 
@@ -272,15 +272,9 @@ def fit_sparse(
     def stored() -> tuple[Table, SparseNodes]:
         coding = encoding.NodeCoding(sampled, bits, request.settings.seed)
         coding.encode(problem.values())
-        words = codes.pointer_words(coding.pointers, bits)
-        nodes = coding.values().astype(np.float64)
-        slope = slope_bound(nodes[:, 0], nodes[:, 1:], sampled.corners)
-        settings = {
-            "layout": "sparse", "lower": list(structure.lower), "spacing": structure.spacing, "bits": bits,
-            "nodes": structure.nodes, "slope": slope,
-        }  # fmt: skip
-        table = Table("sdf", sparse_arrays(structure, coding.frames, words, coding.entries), settings=settings)
-        return table, coded_field(types, structure, slope, coding.frames, words, bits, coding.entries)
+        arrays, settings = coded_arrays(coding)
+        table = Table("sdf", arrays, settings=settings)
+        return table, field_of(table, {}, types)
 
     result = request.train(problem, finish=lambda: measure(stored()[1]))
     table, field = stored()

@@ -14,17 +14,18 @@ as in the structure.
 from __future__ import annotations
 
 import threading
+from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import numpy as np
-from scipy.ndimage import distance_transform_cdt
 
-from ...arrays.bits import mask_flags, mask_words
+from ...arrays.boxes import box_interval, is_direction
 from ...arrays.indirection import device_array
+from ...arrays.lookup import mask_flags, mask_words
+from ...arrays.sparse_grid import ACTIVE, BLOCK, CORNERS, empty_distances, mask_ranks, place_of_bit
 from ...core import compat
-from . import codes
-from .nodes import CORNERS, MIDDLE, bernstein
-from .structure import ACTIVE, BLOCK, first_ranks, place_of
+from .nodes import MIDDLE, bernstein, unpack_frames
 
 #: Places along the ray at which the field is evaluated in a cell, and steps by false position from there.
 SAMPLES, ROOTS = 3, 3
@@ -62,7 +63,7 @@ class GridCells:
     """
 
     def __init__(self, structure):
-        self._structure, self._first = structure, first_ranks(structure.block_masks).astype(np.int32)
+        self._structure, self._first = structure, mask_ranks(structure.block_masks).astype(np.int32)
         place = structure.block_positions() // BLOCK
         self._neighbours = _neighbours(place, [n // BLOCK + 1 for n in structure.shape])
         # Signs of blocks without nodes; beyond the grid outside
@@ -132,16 +133,15 @@ def slab_words(cells: GridCells, nodes, frames) -> np.ndarray:
     where P is above the upper bound. In a crossed cell f − P, a polynomial of degree 2 along each axis, lies between
     its Bernstein coefficients; where f is 0, P lies between their negatives. The signs of all other cells are kept.
     """
-    (nx, ny, nz), distances, _ = codes.frames(frames)
+    (nx, ny, nz), distances, _ = unpack_frames(frames)
     normals = np.stack([nx, ny, nz], axis=1)
     lower, upper = np.full((2, len(frames)), np.inf)
     upper *= -1
-    corners = np.array(CORNERS)
     half = np.abs(normals).sum(axis=1) / 2
     for part in cells.parts():
         node, distance, normal = cells.nodes(part), distances[part], normals[part]
         block, bit = np.nonzero(cells.crossed[part])
-        at = place_of(bit)[:, None] + corners
+        at = place_of_bit(bit)[:, None] + CORNERS
         residual = nodes[node[block[:, None], at[..., 0], at[..., 1], at[..., 2]]].astype(np.float64)
         residual[..., 0] -= distance[block, None] + np.einsum("mki,mi->mk", at - MIDDLE, normal[block])
         residual[..., 1:] -= normal[block, None]
@@ -150,7 +150,7 @@ def slab_words(cells: GridCells, nodes, frames) -> np.ndarray:
         np.maximum.at(upper[part], block, -coefficients.min(axis=1))
         block, bit = np.nonzero(~cells.crossed[part])
         within = cells.inside[part][block, bit]
-        planes = distance[block] + np.einsum("mi,mi->m", place_of(bit) - MIDDLE + 0.5, normal[block])
+        planes = distance[block] + np.einsum("mi,mi->m", place_of_bit(bit) - MIDDLE + 0.5, normal[block])
         np.maximum.at(upper[part], block[within], (planes + half[part][block])[within])
         np.minimum.at(lower[part], block[~within], (planes - half[part][block])[~within])
     scale = STEPS / (2 * SLAB)
@@ -197,8 +197,8 @@ def _by_region(values: np.ndarray) -> np.ndarray:
 
 def _empty_words(full: np.ndarray, sign: np.ndarray) -> np.ndarray:
     """Return the flags of the elements of a grid and their distances to the nearest one that is ``full``, uint32."""
-    far = distance_transform_cdt(~full, "chessboard") if full.any() else np.full(full.shape, max(full.shape), np.int32)
-    return np.uint32(EMPTY) | np.where(sign, np.uint32(INSIDE), np.uint32(0)) | far.astype(np.uint32)
+    signs = np.where(sign, np.uint32(INSIDE), np.uint32(0))
+    return np.uint32(EMPTY) | signs | empty_distances(full).astype(np.uint32)
 
 
 class Marcher:
@@ -238,9 +238,7 @@ class Marcher:
         i, j, k = cell = ray.cell(t)
         types = self.field.types
         UInt32, Int32 = types.UInt32, types.Int32
-        _, ny, nz = self.field.region_sides
-        number = (UInt32(i >> 4) * ny + UInt32(j >> 4)) * nz + UInt32(k >> 4)
-        region = dr.gather(UInt32, self.regions, number, active)
+        region = dr.gather(UInt32, self.regions, self.field.index.region(i, j, k), active)
         wide = region >= EMPTY
         place = UInt32((i >> 2 & 3) * 16 + (j >> 2 & 3) * 4 + (k >> 2 & 3))
         word = dr.gather(UInt32, self.words, region * 64 + place, active & ~wide)
@@ -288,7 +286,7 @@ class Marcher:
         """
         Float = self.field.types.Float
         frame, word = dr.gather(self.field.types.Array2u, self.slabs, number, active)
-        n, d, _ = codes.frames(frame, Float)
+        n, d, _ = unpack_frames(frame, Float)
         low, high = (dr.fma(Float(v), 2 * SLAB / STEPS, -SLAB) for v in (word & 0xFFFF, word >> 16))
         # The height above the plane is at + slope t
         at, slope = d, Float(0)
@@ -309,10 +307,10 @@ class Marcher:
             last = (v & 3) == 3
             owners = [dr.select(last, w, owners[n - m]) if n & m else w for n, w in enumerate(owners)]
         corners = []
-        for owner, corner in zip(owners, CORNERS, strict=True):
+        for owner, corner in zip(owners, CORNERS.tolist(), strict=True):
             at = [v + e for v, e in zip(cell, corner, strict=True)]
-            record = field._record(owner, active)
-            _, node, _ = field._in_block(record, *at)
+            record = field.index.record(owner, active)
+            _, node, _ = field.index.node(record, *at)
             corners.append(field._node(node, record, *at, active))
         return corners
 
@@ -332,7 +330,7 @@ def along(corners, start, d):
     y and x.
     """
     lines = []
-    for corner, (distance, g) in zip(CORNERS, corners, strict=True):
+    for corner, (distance, g) in zip(CORNERS.tolist(), corners, strict=True):
         offset = [x - e for x, e in zip(start, corner, strict=True)]
         there = dr.fma(g[0], offset[0], dr.fma(g[1], offset[1], g[2] * offset[2]))
         change = dr.fma(g[0], d[0], dr.fma(g[1], d[1], g[2] * d[2]))
@@ -387,7 +385,7 @@ class GridRay:
     """Ray ``o + t·d`` in a grid, with the reciprocals of its direction."""
 
     def __init__(self, field, o, d):
-        self.types, self.last = field.types, field.last_cell
+        self.types, self.last = field.types, field.index.last_cell
         self.o, self.d = list(o), list(d)
         still = [dr.abs(v) < TINY for v in d]
         self.inverse = [dr.rcp(dr.select(s, TINY, v)) for s, v in zip(still, d, strict=True)]
@@ -460,3 +458,136 @@ def march(marcher, o, d, length, fresh, active):
         t = dr.select(struck, place, dr.select(active, end + EPSILON, t))
         active &= ~struck & (t < length)
     return hit & (t <= length), t, leaving
+
+
+#: Shortest step, relative to the longest side; a ray may miss a solid that it crosses in less.
+SHORTEST_STEP = 1e-4
+
+#: Largest error of a hit along the ray, and the value at which a place counts as on the surface.
+TOLERANCE, ZERO = 1e-5, 1e-6
+
+#: Distance, in cells, by which a ray may exceed the safe step where the surface is expected.
+RELAXATION = 1.0
+
+#: Steps by false position before bisection takes over.
+FALSE_POSITIONS = 5
+
+
+@dataclass
+class Hit:
+    """Intersection of rays with a surface.
+
+    ``hit``: whether the surface was hit; ``t``: the distance along the ray, infinite without a hit; ``p``: the place,
+    more precise than ``o + t·d`` for a ray from afar; ``leaving``: whether the ray came from within the solid.
+    """
+
+    hit: Any
+    t: Any
+    p: Any
+    leaving: Any
+
+
+def enter(field, o, d, maxt, active=True):
+    """Return the distances at which rays enter and leave the field's box: ``(near, far, active)``.
+
+    A ray that starts in the box enters at 0. Components of ``d`` may be zero. A ray is not active if it misses the
+    box, if it has no direction (:func:`.rays.is_direction`), or if anything is NaN.
+    """
+    Float = field.types.Float
+    active = field.types.Bool(active) & is_direction(d)
+    near, far, active = box_interval(o, d, *field.box, Float(0), Float(maxt), active)
+    active &= (near <= far) & (far < dr.inf)  # false for NaN
+    return near, far, active
+
+
+def intersect(field, o, d, maxt, active=True, exact: bool = True) -> Hit:
+    """Intersect rays ``o + t·d``, 0 ≤ t ≤ ``maxt``, ``d`` of length 1, with the surface, from either side.
+
+    A ray that starts in the box starts with the field's sign, any other one outside of the solid. A direction shorter
+    than ½ or longer than 2 hits nothing. If not ``exact``, only ``hit`` and ``leaving`` are valid, which is faster.
+    """
+    Float, Point = field.types.Float, field.types.Array3f
+    with dr.suspend_grad():
+        o, d, maxt = Point(dr.detach(o)), Point(dr.detach(d)), Float(dr.detach(maxt))
+        near, far, active = enter(field, o, d, maxt, active)
+        # From here on, numbers are small. Rounding must not leave a ray outside of the box
+        start = Point(dr.clip(dr.fma(d, near, o), *field.box))
+        # The difference of two large distances may be longer than the box: steps beyond it might never end
+        _, length, _ = box_interval(start, d, *field.box, Float(0), far - near, active)
+        if field.marched:
+            scale = field.cells_per_unit
+            origin = [(x - a) * scale for x, a in zip(start, field.box[0], strict=True)]
+            hit, t, leaving = march(marcher_of(field), origin, d, length * scale, near == 0, active)
+            t = t * field.cell
+        else:
+            hit, t, leaving = sphere_trace(field, start, d, length, near == 0, active, exact)
+        # A solid that reaches the side of the box ends there
+        cut = active & (far < maxt) & leaving & ~hit
+        t = dr.select(cut, length, t)
+        hit |= cut
+        return Hit(hit, dr.select(hit, near + t, dr.inf), dr.fma(d, t, start), leaving)
+
+
+@compat.syntax
+def sphere_trace(field, start, d, length, fresh, active, exact: bool = True):
+    """Find the first change of sign along rays from ``start``, a place in the box, up to ``length``.
+
+    Returns ``(hit, t, leaving)``. A ``fresh`` ray starts with the sign at ``start``, any other one outside.
+    """
+    types = field.types
+    Float, Bool = types.Float, types.Bool
+    with dr.suspend_grad():
+        active, hit = Bool(active), Bool(False)
+        leaving = Bool(fresh) & (field.value(start, active) < 0)
+
+        reach = RELAXATION * field.cell
+        t, safe = Float(0), Float(0)
+        low, high = Float(0), Float(dr.inf)  # the last place with the sign at the start, the first one with the other
+        low_value, high_value = Float(0), Float(0)
+        turns = types.UInt32(0)
+        while dr.hint(active, label="sphere tracing"):
+            value, step = field.safe_step(dr.fma(d, t, start), d, active)
+            other = (value < 0) != leaving
+            size = dr.abs(value)
+            # Too far ahead: between the safe steps of both places, the sign may have changed twice
+            back = ~other & ~hit & (t - dr.minimum(step, size / field.bound) > safe)
+            hit |= other
+            # Linear extrapolation to the zero
+            ahead = dr.select(back | hit, 0, size * (t - low) / (dr.abs(low_value) - size))
+            ahead = dr.select(ahead > 0, dr.minimum(dr.fma(ahead, 1.05, 0.1 * SHORTEST_STEP), reach), 0)
+            high = dr.select(other, t, high)
+            high_value = dr.select(other, value, high_value)
+            low = dr.select(other | back, low, t)
+            low_value = dr.select(other | back, low_value, value)
+            safe = dr.select(back | other, safe, t + dr.maximum(step, SHORTEST_STEP))
+            if dr.hint(exact, mode="scalar"):
+                width = high - low
+                done = hit & ((width < TOLERANCE) | ((size < ZERO) & (turns > 0)))
+                share = dr.clip(low_value / (low_value - high_value), 0.03, 0.97)
+                share = dr.select(turns < FALSE_POSITIONS, share, 0.5)
+                turns = dr.select(hit, turns + 1, 0)
+                following = dr.select(
+                    hit, dr.fma(width, share, low), dr.select(back, safe, dr.maximum(safe, t + ahead))
+                )
+                t = dr.select(done, t, following)
+                active &= ~done & (hit | (t <= length))
+            else:
+                t = dr.select(back, safe, dr.maximum(safe, t + ahead))
+                active &= ~hit & (t <= length)
+        return hit, t, leaving
+
+
+def trace(field, o, d, maxt, active=True) -> tuple:
+    """Return the distances at which rays hit the surface, infinite without a hit, and whether they do."""
+    result = intersect(field, o, d, maxt, active)
+    return result.t, result.hit
+
+
+def occluded(field, o, d, maxt, active=True):
+    """Return whether rays hit the surface before ``maxt``."""
+    return intersect(field, o, d, maxt, active, exact=False).hit
+
+
+def index_bytes(field) -> int:
+    """Return the bytes of the field's ray-marching index; 0 if it is sphere-traced."""
+    return marcher_of(field).nbytes if field.marched else 0

@@ -12,17 +12,81 @@ import hashlib
 import logging
 import os
 import re
+import struct
 import warnings
+import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from ...core import mitsuba_versions
+from ...core import compat
 from ...core.errors import DiffindError, missing_package, reason
 from ...core.files import irregular, shown
+from ...core.runtime import use_variant
 from ...core.units import memory
-from . import scene_meshes, serialized
+
+#: First number of a file and of each mesh in it.
+MAGIC = 0x041C
+
+#: Flags of a mesh: optional arrays before the triangles, and their precision.
+NORMALS, TEXTURE_COORDINATES, COLOURS, DOUBLE = 0x1, 0x2, 0x8, 0x2000
+
+
+def read_serialized(path: str | os.PathLike, number: str = "") -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the meshes of a file, or one by its number: vertices ``(V, 3)``, float64, and faces ``(F, 3)``, int64.
+
+    The format is described at Mitsuba's shape ``serialized``; versions 3 and 4 are read. Raises ``ValueError`` for
+    other content, and ``OSError``.
+    """
+    data = Path(path).read_bytes()
+    try:
+        version = struct.unpack_from("<2H", data)[1]
+        count = struct.unpack_from("<I", data, len(data) - 4)[0]
+        width = 8 if version == 4 else 4
+        starts = np.frombuffer(data, f"<u{width}", count, len(data) - 4 - width * count)
+        meshes = [_serialized_mesh(data, int(start), version) for start in starts]
+    except (struct.error, zlib.error, ValueError) as e:
+        raise ValueError(f"is no file of serialized meshes, or cut short: {e}") from None
+    if number and number not in map(str, range(count)):
+        raise ValueError(f'holds no mesh "{number}", allowed are 0 to {count - 1}')
+    return [meshes[int(number)]] if number else meshes
+
+
+def _serialized_mesh(data: bytes, start: int, version: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mesh that begins at the byte ``start``. Raises ``ValueError`` and others for wrong bytes."""
+    magic, each = struct.unpack_from("<2H", data, start)
+    if magic != MAGIC or each not in (3, 4) or each != version:
+        raise ValueError(f"found the numbers {magic:#x} and {each} at byte {start}, expected {MAGIC:#x} and 3 or 4")
+    content = zlib.decompressobj().decompress(data[start + 4 :])
+    flags = struct.unpack_from("<I", content)[0]
+    place = 4 if version == 3 else content.index(b"\0", 4) + 1
+    vertices, faces = struct.unpack_from("<2Q", content, place)
+    place += 16
+    positions = np.frombuffer(content, "<f8" if flags & DOUBLE else "<f4", 3 * vertices, place)
+    numbers = 3 + 3 * bool(flags & NORMALS) + 2 * bool(flags & TEXTURE_COORDINATES) + 3 * bool(flags & COLOURS)
+    place += numbers * vertices * positions.itemsize
+    indices = np.frombuffer(content, "<u8" if vertices > 0xFFFFFFFF else "<u4", 3 * faces, place)
+    return positions.reshape(-1, 3).astype(np.float64), indices.reshape(-1, 3).astype(np.int64)
+
+
+def read_scene(path: Path, name: str = "") -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the meshes of a scene, or the one whose id is ``name``: vertices ``(V, 3)`` and faces ``(F, 3)``.
+
+    The scene is loaded in the variant that is set. Raises ``ValueError`` for another name, and ``RuntimeError`` as
+    Mitsuba does.
+    """
+    use_variant()
+    import mitsuba as mi
+
+    shapes = [shape for shape in mi.load_file(str(path), optimize=False).shapes() if shape.is_mesh()]
+    chosen = [shape for shape in shapes if name in ("", shape.id())]
+    if not chosen:
+        names = ", ".join(f'"{shape.id()}"' for shape in shapes) or "none"
+        raise ValueError(f'holds no mesh "{name}", found {names}')
+    return [compat.triangles(shape) for shape in chosen]
+
 
 #: Extent along an axis, relative to the longest side, below which a mesh is flat: float32 resolves no volume in it.
 FLAT = 1e-6
@@ -38,7 +102,7 @@ MAX_ORIENTED = 200
 
 
 #: Extension of files with several meshes → the function that reads them, or the part that is named.
-PARTS = {".serialized": serialized.read, ".xml": scene_meshes.read}
+PARTS = {".serialized": read_serialized, ".xml": read_scene}
 
 
 class MeshError(DiffindError, ValueError):
@@ -140,7 +204,7 @@ def load_mesh(mesh) -> Mesh:
 def _in_memory(mesh) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices and faces of a mesh in memory. Raises :class:`MeshError` for an object that is none."""
     if hasattr(mesh, "vertex_positions_buffer") or hasattr(mesh, "from_fields"):  # mi.Mesh
-        return mitsuba_versions.triangles(mesh)
+        return compat.triangles(mesh)
     if hasattr(mesh, "to_geometry"):  # trimesh.Scene
         mesh = mesh.to_geometry()
     if hasattr(mesh, "vertices") and hasattr(mesh, "faces"):
@@ -309,15 +373,19 @@ def _balance(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     return np.bincount(edge_of, signs, len(unique)), edge_of.reshape(-1, 3)
 
 
-def component_labels(faces: np.ndarray, count: int) -> np.ndarray:
-    """Return the component number of each triangle, ``(F,)``, given the ``count`` of vertices."""
+def vertex_labels(edges: np.ndarray, count: int) -> np.ndarray:
+    """Return the component number of each of ``count`` vertices, ``(count,)``, given the ``edges`` (n, 2)."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    ends = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
-    graph = coo_array((np.ones(len(ends), np.int8), (ends[:, 0], ends[:, 1])), shape=(count, count))
-    labels = connected_components(graph, directed=False)[1][faces[:, 0]]
-    return np.unique(labels, return_inverse=True)[1]
+    graph = coo_array((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(count, count))
+    return connected_components(graph, directed=False)[1]
+
+
+def component_labels(faces: np.ndarray, count: int) -> np.ndarray:
+    """Return the component number of each triangle, ``(F,)``, given the ``count`` of vertices."""
+    labels = vertex_labels(faces[:, [0, 1, 1, 2]].reshape(-1, 2), count)
+    return np.unique(labels[faces[:, 0]], return_inverse=True)[1]
 
 
 def tetrahedron_volumes(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -327,32 +395,12 @@ def tetrahedron_volumes(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def _inconsistent(faces: np.ndarray) -> np.ndarray:
-    """Return which triangles have to be turned for neighbours to agree, ``(F,)`` bool.
+    """Return which triangles have to be turned for neighbours to agree, ``(F,)`` bool: less than half of each piece."""
+    import igl
 
-    These are the smaller half of each piece that can be oriented at all, none of the others.
-    """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    keys, signs = directed_edges(faces, int(faces.max()) + 1)
-    order = np.argsort(keys, kind="stable")
-    keys, signs, owner = keys[order], signs[order], order // 3
-    starts = np.flatnonzero(np.r_[True, keys[1:] != keys[:-1]])
-    pairs = starts[np.diff(np.r_[starts, len(keys)]) == 2]
-    f, g, same = owner[pairs], owner[pairs + 1], signs[pairs] == signs[pairs + 1]
-    none = np.zeros(len(faces), dtype=bool)
-    if not same.any():
-        return none
-    # Each triangle twice, as it is and turned; neighbours that agree are joined
-    n = len(faces)
-    rows = np.concatenate([f, f + n])
-    columns = np.concatenate([np.where(same, g + n, g), np.where(same, g, g + n)])
-    graph = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(2 * n, 2 * n))
-    kept, turned = connected_components(graph, directed=False)[1].reshape(2, n)
-    piece, state = np.minimum(kept, turned), kept > turned
-    votes, sizes = np.bincount(piece, state, 2 * n), np.bincount(piece, minlength=2 * n)
-    state ^= (votes > sizes / 2)[piece]
-    return np.where(kept == turned, False, state)
+    oriented, piece = igl.bfs_orient(faces)
+    turned = (oriented != faces).any(axis=1)
+    return turned ^ (2 * np.bincount(piece, turned) > np.bincount(piece))[piece]
 
 
 def _inside_out(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -392,3 +440,101 @@ def _windings(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray, place
     for x, y, l in ((a, b, lc), (b, c, la), (c, a, lb)):
         below = below + np.einsum("ij,ij->i", x, y) * l
     return np.bincount(labels, np.arctan2(above, below) / (2 * np.pi))
+
+
+#: Distance from a triangle at which either side is tested: resolved by float32, and thinner than thin sheets.
+STEP = 2e-6
+
+#: Edge length above which a triangle is tested in parts, and the length down to which parts are halved while some of a
+#: part bounds the solid and some does not.
+COARSE, FINE = 1 / 32, 1 / 256
+
+#: Barycentric coordinates at which a triangle is tested: the middle and near the corners.
+PLACES = np.array([[1 / 3, 1 / 3, 1 / 3], [0.9, 0.05, 0.05], [0.05, 0.9, 0.05], [0.05, 0.05, 0.9]])
+
+
+def close_holes(mesh: Mesh) -> Mesh:
+    """Return the mesh with each hole closed by a fan of triangles around the middle of its edge.
+
+    The result is watertight for any holes.
+    """
+    count = len(mesh.vertices)
+    keys, signs = directed_edges(mesh.faces, count)
+    unique, edge = np.unique(keys, return_inverse=True)
+    missing = np.rint(np.bincount(edge, signs, len(unique))).astype(int)
+    ends = np.stack([unique // count, unique % count], axis=-1)
+    # Each surplus direction of an edge, as often as it is in surplus
+    ends[missing < 0] = ends[missing < 0][:, ::-1]
+    ends = np.repeat(ends, np.abs(missing), axis=0)
+    if not len(ends):
+        return mesh
+    hole = np.unique(vertex_labels(ends, count)[ends[:, 0]], return_inverse=True)[1]
+    a, b = mesh.vertices[ends[:, 0]], mesh.vertices[ends[:, 1]]
+    length = np.linalg.norm(b - a, axis=1)
+    middles = np.stack([np.bincount(hole, length * x) for x in ((a + b) / 2).T], axis=-1)
+    middles /= np.bincount(hole, length)[:, None]
+    fans = np.stack([ends[:, 1], ends[:, 0], count + hole], axis=-1)
+    vertices = np.concatenate([mesh.vertices, middles])
+    a, b, c = np.moveaxis(vertices[fans], 1, 0)
+    fans = fans[np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-16]
+    faces = np.concatenate([mesh.faces, fans]).astype(np.int32)
+    return dataclasses.replace(mesh, vertices=vertices, faces=faces, watertight=True)
+
+
+def outer_surface(mesh: Mesh, inside: Callable[[np.ndarray], np.ndarray]) -> Mesh:
+    """Return the triangles of ``mesh``, or parts of them, that have the solid behind them only.
+
+    ``inside`` maps points (N, 3) to bool (N,). The mesh itself is returned if all of its triangles qualify.
+    """
+    middle = mesh.corners.mean(axis=1)
+    before, behind = (inside(middle + side * STEP * mesh.normals) for side in (1, -1))
+    # Sheets without a thickness bound nothing, and need no tests in parts
+    sheet = ~before & ~behind
+    # Where pieces cross there are triangles that bound nothing, or large ones
+    crossed = np.zeros(len(mesh.vertices), dtype=bool)
+    crossed[mesh.faces[before == behind]] = True
+    tested = crossed[mesh.faces].any(axis=1) | (_longest(mesh.corners)[0] > COARSE**2)
+    owner = np.flatnonzero(tested & ~sheet)
+    corners = mesh.corners[owner]
+    parts, dropped = [(corners[:0], owner[:0])], sheet
+    while len(owner):
+        places = np.einsum("pc,ncx->npx", PLACES, corners).reshape(-1, 3)
+        normals = np.repeat(mesh.normals[owner], len(PLACES), axis=0)
+        bounding = _bounds(places, normals, inside, mesh.watertight).reshape(-1, len(PLACES))
+        squared, edge = _longest(corners)
+        mixed = bounding.any(axis=1) & ~bounding.all(axis=1)
+        split = (squared > COARSE**2) | (mixed & (squared > FINE**2))
+        keep = ~split & bounding[:, 0]
+        parts.append((corners[keep], owner[keep]))
+        dropped[owner[~split & ~bounding[:, 0]]] = True
+        corners, owner = _halves(corners[split], edge[split]), np.repeat(owner[split], 2)
+    if not dropped.any():
+        return mesh
+    corners, owner = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    added = corners[dropped[owner]].reshape(-1, 3)
+    faces = np.concatenate([mesh.faces[~dropped], np.arange(len(added)).reshape(-1, 3) + len(mesh.vertices)])
+    vertices = np.concatenate([mesh.vertices, added])
+    return dataclasses.replace(mesh, vertices=vertices, faces=faces.astype(np.int32), watertight=False)
+
+
+def _bounds(points: np.ndarray, normals: np.ndarray, inside, watertight: bool) -> np.ndarray:
+    """Return whether points on triangles have the solid on exactly one side, behind them.
+
+    The winding number of a watertight mesh is larger by one behind a triangle, so only the front is tested then.
+    """
+    before = inside(points + STEP * normals)
+    return ~before if watertight else inside(points - STEP * normals) & ~before
+
+
+def _longest(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the square of the longest edge and the number of the corner at which it begins, ``(N,)`` twice."""
+    squared = np.sum((np.roll(corners, -1, axis=1) - corners) ** 2, axis=-1)
+    return squared.max(axis=1), squared.argmax(axis=1)
+
+
+def _halves(corners: np.ndarray, edge: np.ndarray) -> np.ndarray:
+    """Split each triangle in two through its longest edge: ``(2 N, 3, 3)``."""
+    n = np.arange(len(corners))
+    a, b, c = (corners[n, (edge + i) % 3] for i in range(3))
+    m = (a + b) / 2
+    return np.stack([np.stack([a, m, c], axis=1), np.stack([m, b, c], axis=1)], axis=1).reshape(-1, 3, 3)

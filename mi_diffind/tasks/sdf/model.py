@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ...arrays.indirection import Indirection, device_tensor
+from ...arrays.sparse_grid import ACTIVE, SparseGrid, SparseGridError
 from ...arrays.tables import (  # fmt: skip
     StoredArray,
     Table,
@@ -25,11 +26,10 @@ from ...core.errors import UsageError
 from ...core.files import replacing
 from ...core.units import check_memory
 from ...fitting.task import Model
-from . import codes
+from .encoding import NodeCoding
 from .field import DistanceField
-from .nodes import SparseNodes, coded_field, decoded_nodes, slope_bound
+from .nodes import POINTERS, SparseNodes, coded_field, decoded_nodes, pointer_words, unpack_pointers
 from .paper import PairField
-from .structure import ACTIVE, Structure, StructureError
 
 #: Arrays of each layout: name → number of dimensions, and channels (bytes in the sparse layout, except for entries).
 LAYOUTS = {
@@ -55,7 +55,7 @@ def _word_bytes(words: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(words, "<u4").view(np.uint8).reshape(len(words), -1)
 
 
-def sparse_arrays(structure: Structure, frames, pointers, entries) -> dict[str, StoredArray]:
+def sparse_arrays(structure: SparseGrid, frames, pointers, entries) -> dict[str, StoredArray]:
     """Return the arrays of a sparse field: words of frames (B,) and pointers, and the entries (K, 3), float32."""
     blocks = [_word_bytes(structure.block_masks), structure.block_signs[:, None], _word_bytes(frames[:, None])]
     masks = np.concatenate([structure.region_masks, structure.region_signs], axis=1)
@@ -66,6 +66,17 @@ def sparse_arrays(structure: Structure, frames, pointers, entries) -> dict[str, 
         "pointers": byte_array(_word_bytes(pointers[:, None])),
         "entries": StoredArray(np.ascontiguousarray(entries, np.float32)),
     }
+
+
+def coded_arrays(coding: NodeCoding) -> tuple[dict[str, StoredArray], dict]:
+    """Return the arrays of a file for the codes of a grid's nodes, and the settings that go with them."""
+    structure = coding.sampled.structure
+    arrays = sparse_arrays(structure, coding.frames, pointer_words(coding.pointers, coding.bits), coding.entries)
+    settings = {
+        "layout": "sparse", "lower": list(structure.lower), "spacing": structure.spacing, "bits": coding.bits,
+        "nodes": structure.nodes, "slope": coding.slope,
+    }  # fmt: skip
+    return arrays, settings
 
 
 def load(path) -> Table:
@@ -108,7 +119,7 @@ def _words(table: Table, name: str, part=slice(None)) -> np.ndarray:
     return np.ascontiguousarray(table.arrays[name].entries[:, part]).view("<u4")
 
 
-def structure_of(table: Table) -> Structure:
+def structure_of(table: Table) -> SparseGrid:
     """Return the structure of a sparse field. Raises :class:`.TableError` if it is damaged."""
     settings = table.settings
     bits, nodes = settings["bits"], settings["nodes"]
@@ -117,19 +128,19 @@ def structure_of(table: Table) -> Structure:
     some = slice(None) if (regions == ACTIVE).any() else slice(0)
     masks, blocks = _words(table, "region_masks")[some], _words(table, "blocks", slice(8))[some]
     signs = table.arrays["blocks"].entries[some, 8]
-    structure = Structure(
+    structure = SparseGrid(
         tuple(settings["lower"]), float(settings["spacing"]), regions, masks[:, :2], masks[:, 2:], blocks, signs
     )
     try:
         structure.check()
-    except StructureError as e:
+    except SparseGridError as e:
         raise TableError(f"{table.path}: is damaged: {e}") from None
-    if bits not in codes.POINTERS or structure.nodes != nodes:
+    if bits not in POINTERS or structure.nodes != nodes:
         raise TableError(f"{table.path}: is damaged: its masks have {structure.nodes} nodes, its settings {nodes}")
     words, entries = _words(table, "pointers")[:, 0], len(table.arrays["entries"].entries)
-    if len(words) != max(1, -(-nodes // codes.POINTERS[bits])):
+    if len(words) != max(1, -(-nodes // POINTERS[bits])):
         raise TableError(f"{table.path}: is damaged: {nodes} pointers of {bits} bits do not fit in {len(words)} words")
-    pointers = codes.pointers_of(words, bits, nodes)
+    pointers = unpack_pointers(words, bits, nodes)
     if nodes and pointers.max() >= entries:
         raise TableError(f"{table.path}: is damaged: a pointer names entry {pointers.max()} of {entries}")
     return structure
@@ -149,7 +160,7 @@ def field_of(table: Table, arrays: dict, types, storage: str = "") -> DistanceFi
     frames, words = _words(table, "blocks", slice(9, 13))[: structure.blocks, 0], _words(table, "pointers")[:, 0]
     entries = table.arrays["entries"].values
     if storage == "float32":
-        pointers = codes.pointers_of(words, settings["bits"], structure.nodes)
+        pointers = unpack_pointers(words, settings["bits"], structure.nodes)
         nodes = decoded_nodes(structure, frames, entries, pointers)
         return SparseNodes(types, structure, settings["slope"], nodes=device_tensor(types.TensorXf, nodes))
     return coded_field(types, structure, settings["slope"], frames, words, settings["bits"], entries)
@@ -159,20 +170,17 @@ def stored(table: Table, entries: dict, storage: str = "") -> Table:
     """Return a table with optimised entries: the ``nodes`` (n, 4) of a sparse field, encoded again, or the pair's."""
     if "nodes" not in entries:
         return restored(table, entries, storage)
-    from .encoding import encoded
+    from .encoding import encode_again
 
     if storage not in ("", "uint8"):
         raise ValueError(f'storage: found "{storage}", allowed is uint8: the nodes of a sparse field are coded')
-    values, settings = entries["nodes"].numpy().astype(np.float64), table.settings
+    values = entries["nodes"].numpy().astype(np.float64)
     values[:, 1:] /= np.maximum(np.linalg.norm(values[:, 1:], axis=1, keepdims=True), 1e-9)
-    structure, bits = structure_of(table), settings["bits"]
     before = field_of(table, {}, module_of(entries["nodes"]), "float32").nodes.numpy().astype(np.float64)
-    coding, corners = encoded(structure, before, values, bits, table.seed)
-    decoded = coding.values().astype(np.float64)
-    words = codes.pointer_words(coding.pointers, bits)
-    arrays = sparse_arrays(structure, coding.frames, words, coding.entries)
-    slope = slope_bound(decoded[:, 0], decoded[:, 1:], corners)
-    settings = {**settings, "slope": slope, "optimised": True}
+    arrays, settings = coded_arrays(
+        encode_again(structure_of(table), before, values, table.settings["bits"], table.seed)
+    )
+    settings = {**table.settings, **settings, "optimised": True}
     return replace(table, arrays=arrays, settings=settings, measured={}, path=None)
 
 
@@ -255,8 +263,7 @@ class SdfModel(Model):
 
         ``resolution`` is the number of cells along the longest side, by default finer than the field's cells.
         """
-        from .extraction import extract
-        from .grids import grid
+        from .grids import extract, grid
 
         resolution = resolution or min(1024, round(1.5 / self.field.spacing))
         check_memory("resolution", resolution, TRIANGLES * resolution**2)

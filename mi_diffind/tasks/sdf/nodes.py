@@ -10,22 +10,181 @@ with trilinear weights w, which is exact for quadratic functions. Everywhere els
 
 from __future__ import annotations
 
+import math
+from types import SimpleNamespace
+
 import drjit as dr
 import numpy as np
 
-from ...arrays.bits import mask_flags
 from ...arrays.indirection import device_array
-from . import codes
+from ...arrays.lookup import mask_flags
+from ...arrays.sparse_grid import BLOCK, CORNERS, GridIndex, SparseGrid, place_of_bit
 from .field import DistanceField
-from .structure import ACTIVE, BLOCK, Structure, first_ranks, place_of
+
+#: Bits of a frame: each coordinate of the normal, the distance of the middle, the scale.
+NORMAL_BITS, DISTANCE_BITS, SCALE_BITS = 10, 8, 4
+
+#: Largest distance of a block's middle, in spacings.
+REACH = 4.5
+
+#: The scale is 2^(k/2 − SMALLEST), k from 0 to 15.
+SMALLEST = 7
+
+#: Bits of an entry of the cascaded array: distance, and both coordinates of the normal.
+ENTRY_BITS = (10, 11, 11)
+
+#: Radius slightly below that at which the projection reaches the direction opposite to N.
+EDGE = 1.999
+
+#: Bits of a pointer → pointers in a word of 32 bits.
+POINTERS = {4: 8, 5: 6, 6: 5, 8: 4, 10: 3, 16: 2}
+
+#: The functions of Dr.Jit that codes need, for NumPy arrays.
+NUMPY = SimpleNamespace(
+    abs=np.abs, minimum=np.minimum, maximum=np.maximum, sqrt=np.sqrt, copysign=np.copysign, select=np.where,
+    fma=lambda a, b, c: a * b + c, rcp=lambda x: 1 / x, rsqrt=lambda x: 1 / np.sqrt(np.maximum(x, 1e-300)),
+)  # fmt: skip
+
+
+def _functions(array):
+    """Return the functions for an array: those of Dr.Jit, or :data:`NUMPY`."""
+    return dr if dr.is_array_v(array) else NUMPY
+
+
+def orthonormal(n):
+    """Return two vectors that complete unit vectors ``n`` to a right-handed frame (Duff et al., JCGT 2017)."""
+    x, y, z = n
+    sign = _functions(z).select(z >= 0, 1.0, -1.0)
+    a = -1 / (sign + z)
+    b = x * y * a
+    return (1 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
+
+
+def to_octahedral(normals: np.ndarray) -> np.ndarray:
+    """Return unit vectors (n, 3) as whole numbers (n, 2) of :data:`NORMAL_BITS` bits."""
+    n = normals / np.maximum(np.abs(normals).sum(axis=1, keepdims=True), 1e-30)
+    folded = (1 - np.abs(n[:, 1::-1])) * np.where(n[:, :2] >= 0, 1, -1)
+    xy = np.where(n[:, 2:] < 0, folded, n[:, :2])
+    top = 2**NORMAL_BITS - 1
+    return np.clip(np.round((xy + 1) / 2 * top), 0, top).astype(np.uint32)
+
+
+def frame_words(normals: np.ndarray, distances: np.ndarray, scales: np.ndarray) -> np.ndarray:
+    """Pack frames into words (B,): normals (B, 3), distances in spacings (B,), scales (B,), which are rounded up."""
+    x, y = to_octahedral(normals).T
+    top = 2**DISTANCE_BITS - 1
+    d = np.clip(np.round((distances / REACH + 1) / 2 * top), 0, top).astype(np.uint32)
+    k = np.ceil(2 * (np.log2(np.maximum(scales, 1e-9)) + SMALLEST) - 0.5)
+    k = np.clip(k, 0, 2**SCALE_BITS - 1).astype(np.uint32)
+    return x | y << np.uint32(10) | d << np.uint32(20) | k << np.uint32(28)
+
+
+def unpack_frames(words, Float=np.float64):
+    """Unpack the frames of blocks: the normal (three arrays), the middle's distance in spacings, and the scale.
+
+    ``words`` are ``UInt32`` and ``Float`` the type of the result, of Dr.Jit; or a NumPy array of words.
+    """
+    f, top = _functions(words), 2**NORMAL_BITS - 1
+    x = f.fma(Float(words & top), 2 / top, -1)
+    y = f.fma(Float(words >> 10 & top), 2 / top, -1)
+    z = 1 - f.abs(x) - f.abs(y)
+    t = f.maximum(-z, 0)
+    x, y = x - f.copysign(t, x), y - f.copysign(t, y)
+    inverse = f.rsqrt(f.fma(x, x, f.fma(y, y, z * z)))
+    d = f.fma(Float(words >> 20 & 255), 2 * REACH / 255, -REACH)
+    k = words >> 28
+    if f is NUMPY:
+        power = np.exp2((k >> 1) - float(SMALLEST))
+    else:
+        power = dr.reinterpret_array(Float, ((k >> 1) + (127 - SMALLEST)) << 23)
+    return (x * inverse, y * inverse, z * inverse), d, f.select((k & 1) == 1, power * math.sqrt(2), power)
+
+
+def residuals(distances, normals, offsets, n, d, scales) -> np.ndarray:
+    """Return the exact entries ``(m, 3)`` of nodes: the inverse of :func:`decode_nodes`.
+
+    Nodes have ``distances`` (m,) in spacings, ``normals`` (m, 3) and ``offsets`` from the middle of their block (m, 3);
+    their frames are ``n`` (three arrays), ``d`` (m,) and ``scales`` (m,).
+    """
+    t, b = (np.stack(v, axis=1) for v in orthonormal(n))
+    n = np.stack(n, axis=1)
+    c = np.sum(normals * n, axis=1)
+    stretch = np.sqrt(2 / np.maximum(1 + c, 1e-6))
+    a, b = np.sum(normals * t, axis=1) * stretch, np.sum(normals * b, axis=1) * stretch
+    e = distances - d - np.sum(offsets * n, axis=1)
+    return np.stack([e, a, b], axis=1) / scales[:, None]
+
+
+def decode_nodes(entry, n, d, scale, offset):
+    """Return the distance (in spacings) and the normal (three arrays) of nodes.
+
+    ``entry`` is ``(e, a, b)``; ``n`` (three arrays), ``d`` and ``scale`` are the frame; ``offset`` (three arrays) is
+    the node's position relative to the block's middle.
+    """
+    functions = _functions(n[0])
+    e, a, b = (v * scale for v in entry)
+    square = a * a + b * b
+    # Entries beyond the edge count as on it. Few divisions and roots: rays spend their time here
+    inside, inverse = functions.minimum(square, EDGE**2), -functions.rcp(1 + functions.abs(n[2]))
+    f = functions.sqrt(1 - inside / 4) * functions.select(square > EDGE**2, EDGE * functions.rsqrt(square), 1)
+    # T and B are those of :func:`orthonormal`, their products with N shared
+    x, y, z = n
+    sign = functions.select(z >= 0, 1.0, -1.0)
+    c, p, q = 1 - inside / 2, f * a, sign * f * b
+    m = sign * (x * p + y * q)
+    along = c + sign * inverse * m
+    return d + x * offset[0] + y * offset[1] + z * offset[2] + e, (x * along + p, y * along + q, c * z - m)
+
+
+def entry_scale(entries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return offset and step of each channel, (3,) twice, with which entries (K, 3) round to :data:`ENTRY_BITS`."""
+    low, high = entries.min(axis=0), entries.max(axis=0)
+    steps = np.maximum(high - low, 1e-6) / (2.0 ** np.array(ENTRY_BITS) - 1)
+    return low.astype(np.float32), steps.astype(np.float32)
+
+
+def entry_words(entries: np.ndarray, offset, step) -> np.ndarray:
+    """Pack entries (K, 3) into words (K,)."""
+    top = 2 ** np.array(ENTRY_BITS) - 1
+    e, a, b = np.clip(np.round((entries - offset) / step), 0, top).astype(np.uint32).T
+    return e | a << np.uint32(10) | b << np.uint32(21)
+
+
+def unpack_entries(words, offset, step, Float=np.float64):
+    """Unpack the entries of words: three arrays; types as in :func:`unpack_frames`."""
+    parts = words & 1023, words >> 10 & 2047, words >> 21
+    fma = _functions(words).fma
+    return [fma(Float(p), s, o) for p, s, o in zip(parts, step, offset, strict=True)]
+
+
+def pointer_words(pointers: np.ndarray, bits: int) -> np.ndarray:
+    """Pack pointers (n,) into words (⌈n / k⌉,), k to a word, the first one in the lowest bits."""
+    each = POINTERS[bits]
+    padded = np.zeros(-(-len(pointers) // each) * each, np.uint32)
+    padded[: len(pointers)] = pointers
+    shifts = (np.arange(each) * bits).astype(np.uint32)
+    return np.bitwise_or.reduce(padded.reshape(-1, each) << shifts, axis=1)
+
+
+def unpack_pointers(words: np.ndarray, bits: int, count: int) -> np.ndarray:
+    """Unpack ``count`` pointers from words."""
+    each = POINTERS[bits]
+    shifts = (np.arange(each) * bits).astype(np.uint32)
+    return (words[:, None] >> shifts & np.uint32(2**bits - 1)).reshape(-1)[:count]
+
+
+def pointer_at(source, index, bits: int, active):
+    """Gather the pointers at positions ``index`` from words (Dr.Jit arrays)."""
+    each = POINTERS[bits]
+    word = index // each
+    return dr.gather(type(index), source, word, active) >> ((index - word * each) * bits) & (2**bits - 1)
+
 
 #: Largest distance that a field returns, in spacings.
 BAND = 2.0
 
 #: Blocks whose nodes are decoded at a time.
 PART = 2**10
-
-CORNERS = [(a, b, c) for a in (0, 1) for b in (0, 1) for c in (0, 1)]
 
 #: Middle of a block, relative to its first node.
 MIDDLE = (BLOCK - 1) / 2
@@ -41,70 +200,29 @@ class SparseNodes(DistanceField):
 
     marched = True
 
-    def __init__(self, types, structure: Structure, slope: float, *, nodes=None, frames=None, pointers=None, bits=0,
+    def __init__(self, types, structure: SparseGrid, slope: float, *, nodes=None, frames=None, pointers=None, bits=0,
                  entries=None, offset=None, step=None):  # fmt: skip
         h = structure.spacing
         super().__init__(types, structure.lower, structure.upper, h, BAND * h)
         self.structure, self.slope = structure, float(slope)
-        UInt32 = types.UInt32
-        regions = structure.regions.reshape(-1).astype(np.uint32)
-        active = regions == ACTIVE
-        # A region with nodes: its number. Any other: the highest bit, and its sign in the lowest
-        regions[~active] |= np.uint32(1 << 31)
-        regions[active] = np.arange(active.sum(), dtype=np.uint32)
-        self._regions = device_array(UInt32, regions)
-        masks = np.concatenate([structure.region_masks, structure.region_signs], axis=1)
-        self._region_masks = device_array(UInt32, masks)
-        self._first_blocks = device_array(UInt32, first_ranks(structure.region_masks))
-        words = structure.block_signs.astype(np.uint32) << np.uint32(24) | first_ranks(structure.block_masks)
-        frame_words = np.zeros(structure.blocks, np.uint32) if frames is None else frames
-        blocks = np.stack([*structure.block_masks.T, words, frame_words], axis=1)
-        self._blocks = device_array(UInt32, blocks)
+        self.index = GridIndex(types, structure, frames)
         self.nodes = nodes
         self.bits = bits
-        self._pointers = None if pointers is None else device_array(UInt32, pointers)
-        self._entries = None if entries is None else device_array(UInt32, entries)
+        self._pointers = None if pointers is None else device_array(types.UInt32, pointers)
+        self._entries = None if entries is None else device_array(types.UInt32, entries)
         self._affine = None if offset is None else (tuple(map(float, offset)), tuple(map(float, step)))
         self._scale = self._affine and [dr.opaque(types.Array3f, v) for v in self._affine]
-        # Opaque, like those of the base class: numbers of regions along the axes, and the last cell
-        self.region_sides = dr.opaque(types.Array3u, structure.regions.shape)
-        self.last_cell = dr.opaque(types.Array3i, [n - 2 for n in structure.shape])
 
     def _grid(self, p):
         """Return the cell of points, as whole numbers of its lowest corner, and the place within it."""
         Int32 = self.types.Int32
         cell, place = [], []
-        for x, a, last in zip(p, self.box[0], self.last_cell, strict=True):
+        for x, a, last in zip(p, self.box[0], self.index.last_cell, strict=True):
             t = (x - a) * self.cells_per_unit
             i = dr.clip(Int32(dr.floor(dr.detach(t))), 0, last)
             cell.append(i)
             place.append(t - self.types.Float(i))
         return cell, place
-
-    def _block(self, i, j, k, active):
-        """Return the number of the block of node (i, j, k), whether it has nodes, and its sign if it has none."""
-        UInt32 = self.types.UInt32
-        _, ny, nz = self.region_sides
-        word = dr.gather(UInt32, self._regions, (UInt32(i >> 4) * ny + UInt32(j >> 4)) * nz + UInt32(k >> 4), active)
-        has = active & (word < 2**31)
-        masks = dr.gather(dr.uint32_array_t(self.types.Array4f), self._region_masks, word, has)
-        bit = UInt32((i >> 2 & 3) * 16 + (j >> 2 & 3) * 4 + (k >> 2 & 3))
-        in_mask, rank = _bit_and_rank(masks[0], masks[1], bit)
-        inside = dr.select(has, _bit_and_rank(masks[2], masks[3], bit)[0], (word & 1) == 1)
-        has_nodes = has & in_mask
-        number = dr.gather(UInt32, self._first_blocks, word, has_nodes) + rank
-        return number, has_nodes, inside
-
-    def _record(self, number, active):
-        return dr.gather(dr.uint32_array_t(self.types.Array4f), self._blocks, number, active)
-
-    def _in_block(self, record, i, j, k):
-        """Return whether node (i, j, k) of a block is stored, its number, and whether it is inside if not stored."""
-        UInt32 = self.types.UInt32
-        x, y, z = UInt32(i & 3), UInt32(j & 3), UInt32(k & 3)
-        stored, rank = _bit_and_rank(record[0], record[1], x * 16 + y * 4 + z)
-        group = (x >> 1) * 4 + (y >> 1) * 2 + (z >> 1)
-        return stored, (record[2] & 0xFFFFFF) + rank, (record[2] >> (24 + group) & 1) == 1
 
     def _node(self, number, record, i, j, k, active):
         """Return the distance, in spacings, and the gradient of a node."""
@@ -112,34 +230,11 @@ class SparseNodes(DistanceField):
             distance, *gradient = dr.gather(self.types.Array4f, self.nodes.array, number, active)
             return distance, gradient
         Float = self.types.Float
-        pointer = codes.pointer_at(self._pointers, number, self.bits, active)
-        entry = codes.entries(dr.gather(self.types.UInt32, self._entries, pointer, active), *self._scale, Float)
-        n, d, scale = codes.frames(record[3], Float)
+        pointer = pointer_at(self._pointers, number, self.bits, active)
+        entry = unpack_entries(dr.gather(self.types.UInt32, self._entries, pointer, active), *self._scale, Float)
+        n, d, scale = unpack_frames(record[3], Float)
         offset = [Float(v & 3) - MIDDLE for v in (i, j, k)]
-        return codes.decode_nodes(entry, n, d, scale, offset)
-
-    def _corners(self, cell, active):
-        """Return, for each corner of a cell: ``(stored, number, record, position, inside)``.
-
-        ``inside`` is the sign of a corner that is not stored.
-        """
-        i, j, k = cell
-        first = self._block(i, j, k, active)
-        first_record = self._record(first[0], first[1])
-        corners = []
-        for a, b, c in CORNERS:
-            at = i + a, j + b, k + c
-            (_, has, inside), record = first, first_record
-            if a or b or c:
-                # Mostly in the block of the first corner
-                other = active & (((at[0] ^ i) | (at[1] ^ j) | (at[2] ^ k)) >> 2 != 0)
-                number_, has_, inside_ = self._block(*at, other)
-                record_ = self._record(number_, has_)
-                has, inside = dr.select(other, has_, has), dr.select(other, inside_, inside)
-                record = [dr.select(other, p, q) for p, q in zip(record_, record, strict=True)]
-            stored, number, sign = self._in_block(record, *at)
-            corners.append((has & stored, number, record, at, dr.select(has, sign, inside)))
-        return corners
+        return decode_nodes(entry, n, d, scale, offset)
 
     def _blend(self, p, active, derivatives: bool):
         """Blend the corners of a cell: ``(value, gradient, smooth normal, complete, some, inside)``.
@@ -149,7 +244,7 @@ class SparseNodes(DistanceField):
         """
         Float = self.types.Float
         cell, place = self._grid(p)
-        corners = self._corners(cell, active)
+        corners = self.index.corners(cell, active)
         # Where a corner is not stored, the signs of all are the same, and its sign is known exactly: signs of nodes may
         # have been lost in training or by rounding
         complete, inside = active, dr.mask_t(Float)(False)
@@ -157,7 +252,7 @@ class SparseNodes(DistanceField):
             complete, inside = complete & stored, inside | (sign & ~stored)
         value, weight_sum = Float(0), Float(0)
         slope, mean, weighted = [Float(0)] * 3, [Float(0)] * 3, []
-        for (a, b, c), (stored, number, record, at, _) in zip(CORNERS, corners, strict=True):
+        for (a, b, c), (stored, number, record, at, _) in zip(CORNERS.tolist(), corners, strict=True):
             d, g = self._node(number, record, *at, active & stored)
             ends = [(t if e else 1 - t) for e, t in zip((a, b, c), place, strict=True)]
             offset = [t - e for e, t in zip((a, b, c), place, strict=True)]
@@ -225,14 +320,14 @@ class SparseNodes(DistanceField):
 
     def frames(self) -> np.ndarray:
         """Return the words of the blocks' frames, ``(B,)``."""
-        return np.array(self._blocks).reshape(-1, 4)[:, 3]
+        return self.index.block_words
 
     def decoded(self) -> np.ndarray | None:
         """Return distances in spacings and gradients of coded nodes, ``(n, 4)``; ``None`` for decoded ones."""
         if self._entries is None:
             return None
-        pointers = codes.pointers_of(np.array(self._pointers), self.bits, self.structure.nodes)
-        entries = np.stack(codes.entries(np.array(self._entries), *self._affine), axis=1)
+        pointers = unpack_pointers(np.array(self._pointers), self.bits, self.structure.nodes)
+        entries = np.stack(unpack_entries(np.array(self._entries), *self._affine), axis=1)
         return decoded_nodes(self.structure, self.frames(), entries, pointers)
 
     @property
@@ -244,21 +339,13 @@ class SparseNodes(DistanceField):
         return total + 4 * (self.structure.blocks + dr.width(self._pointers) + dr.width(self._entries))
 
 
-def coded_field(types, structure: Structure, slope: float, frames, pointers, bits: int, entries) -> SparseNodes:
+def coded_field(types, structure: SparseGrid, slope: float, frames, pointers, bits: int, entries) -> SparseNodes:
     """Return a field whose nodes are ``pointers`` (words) into ``entries`` (K, 3), float32."""
-    offset, step = codes.entry_scale(entries)
+    offset, step = entry_scale(entries)
     return SparseNodes(
         types, structure, slope, frames=frames, pointers=pointers, bits=bits,
-        entries=codes.entry_words(entries, offset, step), offset=offset, step=step,
+        entries=entry_words(entries, offset, step), offset=offset, step=step,
     )  # fmt: skip
-
-
-def _bit_and_rank(low, high, bit):
-    """Return whether a bit of a 64-bit mask, given as two words, is set, and how many bits below it are."""
-    upper = bit >= 32
-    word = dr.select(upper, high, low)
-    rank = dr.popcnt(word & ((type(low)(1) << (bit & 31)) - 1)) + dr.select(upper, dr.popcnt(low), 0)
-    return (word >> (bit & 31) & 1) == 1, rank
 
 
 def slope_bound(values: np.ndarray, gradients: np.ndarray, corners: np.ndarray, part: int = 2**17) -> float:
@@ -307,7 +394,7 @@ def middles(positions: np.ndarray) -> np.ndarray:
 
 
 def decoded_nodes(
-    structure: Structure, frames: np.ndarray, entries: np.ndarray, pointers: np.ndarray | None = None
+    structure: SparseGrid, frames: np.ndarray, entries: np.ndarray, pointers: np.ndarray | None = None
 ) -> np.ndarray:
     """Decode nodes: distances in spacings and normals, (n, 4) float32, from the frames (B,) of their blocks.
 
@@ -319,10 +406,10 @@ def decoded_nodes(
         rows = slice(first, first + len(block))
         n, d, scale = (
             [v[block] for v in value] if isinstance(value, tuple) else value[block]
-            for value in codes.frames(frames[part : part + PART])
+            for value in unpack_frames(frames[part : part + PART])
         )
         entry = entries[rows] if pointers is None else entries[pointers[rows]]
-        distance, normal = codes.decode_nodes(entry.astype(np.float64).T, n, d, scale, middles(place_of(bit)).T)
+        distance, normal = decode_nodes(entry.astype(np.float64).T, n, d, scale, middles(place_of_bit(bit)).T)
         result[rows] = np.stack([distance, *normal], axis=1)
         first = rows.stop
     return result

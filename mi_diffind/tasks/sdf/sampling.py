@@ -8,11 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...arrays.sparse_grid import CORNERS
 from .distances import Distances
 from .mesh import Mesh
-
-#: The corners of a cell, z fastest, ``(8, 3)``.
-CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)
 
 #: Largest number of grid nodes for which :func:`near_nodes` keeps a table with one entry per node.
 LARGEST_TABLE = 2**26

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from ...arrays.indirection import aligned_copy
-from ...images import metrics
+from ...core.files import replacing
+from ...images import metrics, srgb
 from ...maps.compressed import FilteredMaps, decibel
 from ...maps.pyramid import Pyramid
 from ..disney.decoder import Decoder
-from ..disney.effects import Effects
+from ..disney.model import Effects
 from ..disney.training import uniform_hemisphere
 from .material import shaded, surface_of
-from .reference import SAMPLES_PER_SIDE, reference
 
 #: Function ``(u, v, level, wi, wo) → Array3f`` of shaded values.
 ShadedReader = Callable[[Any, Any, Any, Any, Any], Any]
@@ -144,3 +145,125 @@ class ShadedEvaluation:
 def _image(value, shape) -> np.ndarray:
     dr.eval(value)  # all three at once: NumPy asks for one after the other, each a kernel
     return np.stack([c.numpy() for c in value], axis=-1).reshape(*shape, 3)
+
+
+#: Number of samples along each side of the footprint, by pattern.
+SAMPLES_PER_SIDE = {"converged": 16, "prefiltered": 4, "jittered": 4}
+
+#: Level of the paper's samples relative to the footprint: so much finer, so that 4 × 4 samples cover it.
+FINER = 2
+
+#: Number of samples that are shaded at a time.
+CHUNK = 2**22
+
+
+def reference(pattern: str, pyramid: Pyramid, u, v, level, wi, wo, effects: Effects, rng=None, side: int = 0):
+    """Return the shaded value (:func:`.material.shaded`) of footprints around (u, v), ``Array3f``, without derivatives.
+
+    ``level`` is the level of detail, a real number; each footprint is seen along ``wi`` and lit along ``wo``. ``rng``
+    jitters the samples (``"jittered"`` needs one; without, samples are the centres of strata); ``side`` replaces the
+    number of samples along a side.
+    """
+    if pattern not in SAMPLES_PER_SIDE:
+        raise ValueError(f'reference: found "{pattern}", allowed are {", ".join(SAMPLES_PER_SIDE)}')
+    if pattern == "jittered" and rng is None:
+        raise ValueError('reference: "jittered" needs random numbers')
+    side, size = side or SAMPLES_PER_SIDE[pattern], dr.width(u)
+    with dr.suspend_grad():
+        if size * side * side <= CHUNK:
+            return _averaged(pattern, pyramid, u, v, level, wi, wo, effects, rng, side)
+        types, step = pyramid.types, max(1, CHUNK // (side * side))
+        total = dr.zeros(types.Array3f, size)
+        for start in range(0, size, step):
+            index = dr.opaque(types.UInt32, start) + dr.arange(types.UInt32, min(step, size - start))
+            parts = [dr.gather(type(x), x, index) for x in (u, v, level, wi, wo)]
+            means = _averaged(pattern, pyramid, *parts, effects, rng, side)
+            dr.scatter(total, means, index)
+            dr.eval(total)
+        return total
+
+
+def _averaged(pattern, pyramid: Pyramid, u, v, level, wi, wo, effects: Effects, rng, side: int):
+    types, layout, samples = pyramid.types, pyramid.layout, side * side
+    Float, UInt32, size = types.Float, types.UInt32, dr.width(u)
+    lane = dr.arange(UInt32, size * samples)
+    # Power of two: shifts and masks in place of divisions. Opaque, so that one kernel serves all numbers of samples
+    shift = round(math.log2(side))
+    if side != 1 << shift:
+        raise ValueError(f"samples along a side: found {side}, allowed are powers of two")
+    shift, mask, count, width = (dr.opaque(UInt32, n) for n in (shift, side - 1, samples - 1, side))
+    place, sample, width = lane >> (2 * shift), lane & count, Float(width)
+    x, y = Float(sample & mask), Float(sample >> shift)
+    x, y = (x + (0.5 if rng is None else rng.random(Float, size * samples)) for x in (x, y))
+    u, v, level, wi, wo = (dr.gather(type(a), a, place) for a in (u, v, level, wi, wo))
+    extent = dr.exp2(level)
+    u = dr.fma((x / width - 0.5) * extent, 1 / layout.width, u)
+    v = dr.fma((y / width - 0.5) * extent, 1 / layout.height, v)
+    u, v = (_inside(x, border) for x, border in zip((u, v), reversed(pyramid.border), strict=True))
+    finer = dr.maximum(level - FINER, 0)
+    stored = pyramid.filtered(u, v, finer) if pattern == "prefiltered" else pyramid.stored(u, v)
+    value = shaded(Decoder(), surface_of(pyramid, stored), wi, wo, effects)
+    dr.eval(value)  # all three at once: a sum over blocks evaluates what it is given
+    return types.Array3f([dr.block_sum(c, samples) / samples for c in value])
+
+
+def _inside(x, border: str):
+    """Return a coordinate in [0, 1]: wrapped in a repeating texture, else clamped to the edge."""
+    return x - dr.floor(x) if border == "repeat" else dr.clip(x, 0, 1)
+
+
+#: Levels of the preview, and the factor by which differences are amplified.
+LEVELS, AMPLIFIED = (0, 2, 4), 4
+
+#: Approximate mean linear value of the image that is chosen.
+BRIGHTNESS = 0.3
+
+#: Smallest number of pixels along the side of each image.
+PANEL = 192
+
+#: Height of a strip of titles, pixels.
+TITLE = 16
+
+
+def write_preview(path: Path, evaluation: ShadedEvaluation, read: ShadedReader) -> None:
+    """Write a picture with a row for each of :data:`LEVELS`, with titles: truth, shaded image, amplified difference.
+
+    View and light are those under which the material is neither dark nor glaring.
+    """
+    import mitsuba as mi
+
+    truths = evaluation.truths[next(iter(evaluation.truths))]
+    pair = int(np.abs(np.clip(truths[0], 0, 1).mean(axis=(1, 2, 3)) - BRIGHTNESS).argmin())
+    rows, side = [], max(PANEL, *(max(size) for size in evaluation.sizes))
+    for level in (i for i in LEVELS if i < evaluation.levels):
+        truth, got = truths[level][pair], evaluation.images(read, level, [pair])[0]
+        row = [srgb.for_display(truth), srgb.for_display(got), np.clip(AMPLIFIED * np.abs(truth - got), 0, 1)]
+        titles = (f"level {level}: reference", "shaded", f"{AMPLIFIED}x difference")
+        rows.append(titled(np.concatenate([_enlarged(image, side) for image in row], axis=1), titles))
+    picture = np.concatenate(rows)
+    with replacing(path) as temporary:
+        mi.Bitmap(np.ascontiguousarray(picture)).write(str(temporary))
+
+
+def titled(picture: np.ndarray, titles: Sequence[str]) -> np.ndarray:
+    """Return a picture ``(height, width, 3)`` of values from 0 to 1 with a strip of ``titles`` above, 8 bits.
+
+    The titles stand above as many parts of equal width.
+    """
+    from PIL import Image, ImageDraw, ImageFont
+
+    width = picture.shape[1]
+    strip = Image.new("RGB", (width, TITLE), "white")
+    font = ImageFont.load_default(size=11)
+    for i, title in enumerate(titles):
+        ImageDraw.Draw(strip).text((i * width // len(titles) + 2, 1), title, "black", font)
+    return np.concatenate([np.asarray(strip), np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8)])
+
+
+def _enlarged(image: np.ndarray, side: int) -> np.ndarray:
+    """Enlarge an image by a whole factor to at most ``side`` × ``side`` pixels; the rest of the square is white."""
+    times = max(1, side // max(image.shape[:2]))
+    image = image.repeat(times, axis=0).repeat(times, axis=1)
+    square = np.ones((side, side, 3))
+    square[: image.shape[0], : image.shape[1]] = image
+    return square

@@ -13,15 +13,14 @@ from ...fitting.task import FitRequest, Fitted
 from ...maps.arguments import preview_path, requested_border, requested_bytes
 from ...maps.pyramid import Pyramid
 from ...maps.source import load_source
+from ..texture import PRESETS as TEXTURES
 from ..texture import TASK as TEXTURE
 from ..texture import fit as texture_fit
 from ..texture import training as textures
 from ..texture.compressed import bias_of
 from ..texture.nets import neutral_extras
-from ..texture.presets import PRESETS as TEXTURES
-from . import material, training
+from . import PRESETS, ShadingRecipe, material, training
 from .evaluation import ShadedEvaluation
-from .presets import PRESETS, ShadingRecipe
 
 
 def recipe_of(preset: str, settings, options) -> ShadingRecipe:

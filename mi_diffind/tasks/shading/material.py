@@ -16,7 +16,7 @@ from typing import Any
 
 import drjit as dr
 
-from ...arrays.bounds import ValueBounds
+from ...arrays.boxes import ValueBounds
 from ...core.compat import module_of
 from ...core.errors import UsageError
 from ...images import srgb
@@ -24,8 +24,7 @@ from ...maps.compressed import FilteredMaps
 from ...maps.layout import Layout, MapLayout
 from ..disney import TASK as DISNEY
 from ..disney.decoder import Decoder, Lobe
-from ..disney.effects import Effects, find_effects
-from ..disney.model import PARAMETERS, Material, sanitize
+from ..disney.model import PARAMETERS, Effects, Material, find_effects, sanitize
 from ..disney.training import shade
 from ..texture.nets import NEUTRAL
 

@@ -19,21 +19,19 @@ import numpy as np
 from ...arrays import lookup
 from ...arrays.indirection import unfolded
 from ...arrays.tables import Table
-from ...core.deadline import duration
+from ...core.progress import duration
 from ...fitting.loop import FitResult, checkpoint_settings, sample_losses
 from ...fitting.task import FitRequest
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source
 from ..disney.training import random_directions
+from ..texture import PRESETS as TEXTURES
 from ..texture import training as textures
 from ..texture.compressed import CompressedTexture, to_table
 from ..texture.nets import neutral_extras
-from ..texture.presets import PRESETS as TEXTURES
-from .evaluation import TRUTHS, ShadedEvaluation, reader
+from . import ShadingRecipe
+from .evaluation import TRUTHS, ShadedEvaluation, reader, reference, write_preview
 from .material import effects_of, frozen_decoder, shaded, surface_of
-from .presets import ShadingRecipe
-from .preview import write_preview
-from .reference import reference
 
 #: Factor of the number of shaded samples from one level to the next coarser one, and the last level that it counts for.
 FALL, TOP = 0.7, 9
@@ -254,7 +252,6 @@ def choose(
     """
     measured, constant, steps = {}, set(), max(1, round(TRIAL * request.settings.steps))
     settings = dataclasses.replace(request.settings, steps=steps, measure_every=steps)
-    seconds = None if request.seconds is None else TRIAL * request.seconds
     short = None
 
     def best() -> Trial:
@@ -276,10 +273,8 @@ def choose(
         problem = problem_of(choice)
         measured[choice], measurement = duration(lambda problem=problem: problem.measure(problem.net))
         untrained = problem.level_gains
-        trial = dataclasses.replace(
-            request.part(TRIAL), settings=settings, seconds=seconds, checkpoint=None, resume=False
-        )
-        limit = seconds if trial.deadline is None else trial.deadline.left()
+        trial = dataclasses.replace(request.part(TRIAL), settings=settings, checkpoint=None, resume=False)
+        limit = None if trial.deadline is None else trial.deadline.left()
         short = limit is not None and limit < SHORTEST * measurement if short is None else short
         if not short:
             result = trial.train(problem, f"level bias {choice.name}")

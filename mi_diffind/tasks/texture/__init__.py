@@ -1,31 +1,88 @@
-"""Task 4: compressed textures and materials that are filtered as they are read, at a place and a level of detail.
+"""Compressed textures and materials that are filtered as they are read (task 4), and recipes of their fits.
 
-Sources, stored channels and the reference, a mip pyramid, are in :mod:`mi_diffind.maps`.
-
-- :mod:`.nets`: reads of the arrays, the paper's structure and ours; :mod:`.arrays`: initial arrays.
-- :mod:`.memory_budget`: resolutions; :mod:`.sampling`: footprints, equations 3 to 9.
-- :mod:`.presets`, :mod:`.training`, :mod:`.fit`: recipes, the training problem, the command ``fit texture``.
-- :mod:`.compressed`: the result as a texture, as a table file and as a model.
+Sources, stored channels and the reference, a mip pyramid, are in :mod:`mi_diffind.maps`. :mod:`.nets`: reads of the
+arrays; :mod:`.arrays`: resolutions and initial entries; :mod:`.compressed`: files and models; :mod:`.training`: the
+training problem; :mod:`.fit`: the command ``fit texture``.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import re
+from dataclasses import dataclass
+from typing import NamedTuple
+
 from ...core.arguments import Argument, between, checked, natural, positive
+from ...fitting.settings import FitSettings
 from ...fitting.task import Task
 from ...maps.arguments import BIAS_RANGE, DECODED, SIZES, SOURCE, SOURCES
-from .presets import PRESETS
 
 
-def _parse_structure(text: str) -> None:
-    """Raise ``ValueError`` for a text that names no structure of arrays."""
-    from .memory_budget import parse_structure
+@dataclass(frozen=True)
+class TextureRecipe:
+    """Storage and training of a texture.
 
-    if text not in ("auto", "pages"):
-        parse_structure(text)
+    - ``layered``: our arrays, on the grids of levels of detail, which start from principal components; else the
+      paper's arrays, which start from ramps.
+    - ``once``: store channels only once that are equal or constant at every level.
+    - ``normals``: leave out the third component of normals where it follows from the others.
+    - ``jitter``: share of the steps whose samples lie between texels and levels; the others lie at texel centres of
+      whole levels.
+    - ``rounded``: train with entries rounded as they will be stored.
+    - ``samples``: distribution of levels of detail, ``"levels"`` (one half on level 0, one quarter on level 1, …) or
+      one of :data:`.nets.FOOTPRINTS`.
+    - ``settings``: steps, batch, rate and loss.
+    """
+
+    layered: bool = True
+    once: bool = True
+    normals: bool = True
+    jitter: float = 0.5
+    rounded: bool = True
+    samples: str = "levels"
+    settings: FitSettings = dataclasses.field(default_factory=FitSettings)
+
+
+#: Steps of 262,144 samples of a training without a time limit.
+STEPS = 1500
+
+_OURS = FitSettings(steps=STEPS, batch=2**18, lr=3e-2, schedule="cosine", loss="mse", measure_every=STEPS // 10)
+_PAPER = dataclasses.replace(_OURS, batch=2**20, steps=STEPS // 4, lr=1e-3, schedule="constant", loss="mae")
+
+#: Recipes by name; the first is the default.
+PRESETS = {
+    "ours": TextureRecipe(settings=_OURS),
+    "paper": TextureRecipe(False, False, False, 1.0, False, "power", _PAPER),
+}
+
+
+class FineArray(NamedTuple):
+    """A fine array on the grid of a ``level`` of detail, with so many ``channels`` of ``bits`` bits."""
+
+    level: int
+    channels: int
+    bits: int
+
+
+def parse_structure(text: str) -> tuple[FineArray, ...]:
+    """Return the fine arrays of a text such as ``0:1:2,1:2:4`` (level, channels, bits), none for auto and pages.
+
+    Raises ``ValueError``.
+    """
+    if text in ("auto", "pages"):
+        return ()
+    if not re.fullmatch(r"\d+:\d+:\d+(,\d+:\d+:\d+)*", text, re.ASCII):
+        raise ValueError(f'structure: found {text!r}, allowed are LEVEL:CHANNELS:BITS,… as in 0:1:2,1:2:4, and "auto"')
+    fine = tuple(FineArray(*map(int, part.split(":"))) for part in text.split(","))
+    if [f.level for f in fine] != sorted({f.level for f in fine}):
+        raise ValueError(f"structure: found {text!r}, levels have to grow from array to array")
+    if not all(1 <= f.channels <= 4 and 1 <= f.bits <= 8 for f in fine):
+        raise ValueError(f"structure: found {text!r}, allowed are 1 to 4 channels and 1 to 8 bits")
+    return fine
 
 
 class Texture(Task):
-    """Task of filtered textures; presets are the recipes of :mod:`.presets`, entries have 8 bits or fewer."""
+    """Task of filtered textures; presets are :data:`PRESETS`, entries have 8 bits or fewer."""
 
     name = "texture"
     title = "a texture or the maps of a material at every level of detail"
@@ -35,17 +92,12 @@ class Texture(Task):
     plugin = ("texture", "neural_texture")
     presets = {name: recipe.settings for name, recipe in PRESETS.items()}  # noqa: RUF012
     storages = ()
-    trials = {  # noqa: RUF012
-        "layers": {"source": "maps", "steps": 2, "batch": 256, "compression": 2},
-        "pages": {"source": "maps", "steps": 2, "batch": 256, "compression": 2, "structure": "pages"},
-        "paper": {"source": "maps", "steps": 2, "batch": 256, "compression": 2, "preset": "paper"},
-    }
     measurements = 10
     arguments = (
         SOURCE,
         *(size for size in SIZES if size.name != "psnr"),
         Argument(
-            "--structure", type=checked(_parse_structure), metavar="L:C:B,…",
+            "--structure", type=checked(parse_structure), metavar="L:C:B,…",
             help="pages, or level, channels and bits of each fine array, as in 0:1:2,1:2:4 (default: auto)",
         ),
         Argument(

@@ -17,7 +17,7 @@ from ...core.errors import UsageError
 from ...maps.arguments import BIAS_RANGE
 from ...maps.compressed import FilteredMaps, decibel, map_figure
 from ...maps.layout import Layout
-from ...maps.model import MapsModel, allocate_maps, page_entries
+from ...maps.model import MapsModel, allocate_maps, stored_entries
 from ...maps.pyramid import Pyramid, level_sizes
 from ...maps.source import Source
 from .nets import NEUTRAL, FineLayer, LayeredNet, LayeredStructure, PaperNet, PaperStructure
@@ -256,7 +256,7 @@ def _layered_shapes(table: Table, layout: Layout, structure: LayeredStructure, l
         if layer.channels > dims or (layer.channels < dims and structure.is_pointer(layer)):
             raise TableError(f'{table.path}: array "{name}" has {layer.channels} channels, its pointers have {dims}')
         size = structure.sizes[layer.level]
-        shapes[name] = (*((page_entries(table, name, size),) if layer.paged else size), layer.channels)
+        shapes[name] = (*((stored_entries(table, name, size),) if layer.paged else size), layer.channels)
     shapes["coarse"] = (sum(map(math.prod, structure.sizes[structure.skip :])), dims)
     shapes["cascaded"] = (structure.skip + 1,) * (axes > dims) + (None,) * dims + (layout.stored,)
     if "extras" in table.arrays:

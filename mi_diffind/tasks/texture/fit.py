@@ -7,22 +7,23 @@ import dataclasses
 from ...arrays.tables import MAX_BYTES
 from ...core.errors import UsageError
 from ...fitting.task import FitRequest, Fitted
-from ...maps import as_seen, components
+from ...maps import as_seen
 from ...maps.arguments import requested_border, requested_bytes, size_figures
+from ...maps.layout import smoothness
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source, load_source
-from . import arrays, memory_budget, training
+from . import PRESETS, TextureRecipe, arrays, parse_structure, training
 from .compressed import CompressedTexture
-from .presets import PRESETS, TextureRecipe
 
-#: Least smoothness of a smooth texture, in dB (:func:`~mi_diffind.maps.components.smoothness`).
+#: Least smoothness of a smooth texture, in dB (:func:`~mi_diffind.maps.layout.smoothness`).
 SMOOTH_DB = 30.0
 
 
 def recipe_of(preset: str, settings, options) -> TextureRecipe:
     """Return the recipe of a preset, changed by the options."""
-    recipe = dataclasses.replace(PRESETS[preset], settings=settings or PRESETS[preset].settings)
-    return dataclasses.replace(recipe, samples=options["footprint_samples"] or recipe.samples)
+    recipe = PRESETS[preset]
+    samples = options["footprint_samples"] or recipe.samples
+    return dataclasses.replace(recipe, settings=settings or recipe.settings, samples=samples)
 
 
 def check(request: FitRequest) -> None:
@@ -39,11 +40,8 @@ def check(request: FitRequest) -> None:
     elif options["ratio"] is not None:
         raise UsageError(f"--ratio: found the preset {request.preset}, allowed is paper")
     if options["structure"] == "pages" and options["skip"] is not None:
-        first = memory_budget.PAGES_SKIP
+        first = arrays.PAGES_SKIP
         raise UsageError(f"--skip: not for the structure pages, whose coarse array starts at level {first}")
-    if options["structure"] not in (None, "auto", "pages") and options["skip"] is None:
-        fine = memory_budget.parse_structure(options["structure"])
-        options["skip"] = fine[-1].level + 1
 
 
 def fit(request: FitRequest) -> Fitted:
@@ -65,46 +63,43 @@ def fit(request: FitRequest) -> Fitted:
     seen = as_seen.measure(source, CompressedTexture.of(table, request.types.TensorXf))
     table.measured |= {name: float(f"{value:.5g}") for name, value in seen.items()}
     table.settings |= request.paths(source_path=options["source"])
-    figures, line = size_figures(source, table, requested)
-    lines = [line, *source.notes]
-    if size is not None and abs(size.nbytes / requested - 1) > memory_budget.TOLERANCE:
-        lines.append(f"{requested:,} bytes were requested, but {size.nbytes:,} are the nearest that the arrays allow")
-    return Fitted(table, result, lines, figures)
+    figures, lines = size_figures(source, table, requested)
+    return Fitted(table, result, [*lines, *source.notes], figures)
 
 
 def size_of(source: Source, pyramid: Pyramid, nbytes: float, recipe: TextureRecipe, options):
     """Return the memory budget of the arrays for ``nbytes`` bytes. Raises :class:`UsageError`."""
-    size = _size_of(source, pyramid, nbytes, recipe, options)
+    layout = pyramid.layout
+    shape = (layout.height, layout.width)
+    if recipe.layered:
+        size = _layered_size(pyramid, nbytes, options["structure"] or "auto", options["skip"], options["cascaded"])
+    else:
+        size = arrays.paper_size(nbytes, source.nbytes, layout.stored, *shape, options["ratio"])
     if size.nbytes > MAX_BYTES:
         raise UsageError(f"size: found {size.nbytes:,} bytes of arrays, allowed are {MAX_BYTES:,}")
     return size
 
 
-def _size_of(source: Source, pyramid: Pyramid, nbytes: float, recipe: TextureRecipe, options):
-    layout = pyramid.layout
-    if not recipe.layered:
-        height, width, ratio = layout.height, layout.width, options["ratio"]
-        return memory_budget.paper_size(nbytes, source.nbytes, layout.stored, height, width, ratio)
-    fine, skip, structure = None, options["skip"], options["structure"] or "auto"
-    if structure in ("auto", "pages") and skip is None:
-        size = memory_budget.paged(layout.height, layout.width, layout.stored, nbytes, options["cascaded"])
+def _layered_size(pyramid: Pyramid, nbytes: float, structure: str, skip: int | None, cascaded: int | None):
+    """Return the budget of pages or fine arrays: those of a ``structure``, or the best for the texture."""
+    layout, fine = pyramid.layout, parse_structure(structure) or None
+    if fine is not None:
+        skip = fine[-1].level + 1 if skip is None else skip
+        if skip <= fine[-1].level:
+            raise UsageError(f"--skip: found {skip}, the structure has a fine array on level {fine[-1].level}")
+    if skip is not None and not 0 <= skip < pyramid.levels:
+        raise UsageError(f"--skip: found {skip}, the texture has levels 0 to {pyramid.levels - 1}")
+    shape = (layout.height, layout.width, layout.stored)
+    if skip is None:
+        size = arrays.paged(*shape, nbytes, cascaded)
         if structure == "pages" and size is None:
             raise UsageError("--structure: found pages, for which the texture or its bytes are too small or too large")
         if structure == "pages":
             return size
         if size and arrays.gain_of_pages(pyramid.values, size, pyramid.border) >= training.GAIN_DB:
             return size
-    if structure not in ("auto", "pages"):
-        fine = memory_budget.parse_structure(structure)
-        lowest = fine[-1].level + 1
-        if skip < lowest:
-            raise UsageError(f"--skip: found {skip}, the structure has a fine array on level {lowest - 1}")
-    if skip is not None and not 0 <= skip < pyramid.levels:
-        raise UsageError(f"--skip: found {skip}, the texture has levels 0 to {pyramid.levels - 1}")
     try:
-        smooth = components.smoothness(pyramid.values[0]) >= SMOOTH_DB
-        return memory_budget.choose(
-            layout.height, layout.width, layout.stored, nbytes, skip, fine, options["cascaded"], smooth
-        )
+        smooth = smoothness(pyramid.values[0]) >= SMOOTH_DB
+        return arrays.choose(*shape, nbytes, skip, fine, cascaded, smooth)
     except ValueError as e:
         raise UsageError(f"--structure: {e}") from None

@@ -21,12 +21,10 @@ from ...maps.compressed import decibel
 from ...maps.layout import Layout
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source
-from . import arrays
+from . import TextureRecipe, arrays
+from .arrays import PaperBudget, TextureBudget
 from .compressed import CompressedTexture, to_table
-from .memory_budget import PaperBudget, TextureBudget
-from .nets import PaperNet
-from .presets import TextureRecipe
-from .sampling import footprints, level_of
+from .nets import PaperNet, footprints, level_of
 
 #: Least gain of pages, in dB before training, over one grid of equal bytes. (0.7 on bricks, where pages lose 0.4.)
 GAIN_DB = 1.0

@@ -12,8 +12,10 @@ import mi_diffind
 from mi_diffind.arrays.tables import StoredArray, TableError, load_table, save_table
 from mi_diffind.core.errors import UsageError
 from mi_diffind.core.runtime import array_module
-from mi_diffind.tasks.bsdf import TASK, family_fit, family_measurement, family_sampling, family_truth, training
-from mi_diffind.tasks.bsdf.family import Parameter, sizes_of
+from mi_diffind.tasks.bsdf import TASK, energy, evaluation, mixture, training
+from mi_diffind.tasks.bsdf import fit as fitting
+from mi_diffind.tasks.bsdf.model import Parameter, points, sizes_within
+from mi_diffind.tasks.bsdf.truth import FamilyTruth, truth_of
 
 MEMBERS = ((0.05, 0.0), (0.8, 1.0), (0.13, 0.4), (0.5, 0.9))
 
@@ -65,9 +67,9 @@ def test_the_formula(types, model, rng):
 def test_sizes_follow_the_bytes():
     parameters = [Parameter("a", 0.01, 1.0), Parameter("b", 0.0, 1.0), Parameter("c", 0.0, 1.0)]
     for count, nbytes in ((1, 4000), (2, 9000), (3, 12000)):
-        assert 0.75 * nbytes < sizes_of(nbytes, parameters[:count]).nbytes <= nbytes
-    with pytest.raises(ValueError, match="found 10 bytes, the smallest arrays of this family need"):
-        sizes_of(10, parameters)
+        assert 0.75 * nbytes < sizes_within(nbytes, parameters[:count]).nbytes <= nbytes
+    with pytest.raises(ValueError, match="found 10 bytes, the smallest arrays need"):
+        sizes_within(10, parameters)
 
 
 REFUSED = {
@@ -121,12 +123,12 @@ def test_damaged_files_are_refused(tmp_path, damage):
 def test_a_family_of_conductors_is_fitted(types, monkeypatch, tmp_path):
     """A file stands for all roughnesses of its range, and the source is left as it was."""
     for module, name, value in (
-        (family_fit, "SAMPLES", 2**15), (family_fit, "VALIDATION", 2**13), (family_fit, "MEMBERS", 16),
-        (family_fit, "VIEWS", 2), (family_measurement, "MEMBERS", 3), (training, "STARTS", 1),
-        (family_sampling, "BETWEEN", 1), (family_sampling, "ENERGY_SAMPLES", 512),
-        (family_sampling, "MIXTURE_SAMPLES", 256), (family_sampling, "FACTORS", (0.7, 1.0)),
+        (training, "SAMPLES", 2**15), (training, "VALIDATION", 2**13), (training, "MEMBERS", 16),
+        (fitting, "VIEWS", 2), (evaluation, "MEMBERS", 3), (training, "STARTS", 1),
+        (energy, "BETWEEN", 1), (energy, "MEMBER_SAMPLES", 512),
+        (mixture, "MEMBER_SAMPLES", 256), (mixture, "FACTORS", (0.7, 1.0)),
         (training, "PROXY", dataclasses.replace(training.PROXY, steps=60, batch=2**11)),
-        (family_fit, "PROXY", dataclasses.replace(family_fit.PROXY, steps=150, batch=2**11)),
+        (training, "FAMILY_PROXY", dataclasses.replace(training.FAMILY_PROXY, steps=150, batch=2**11)),
     ):  # fmt: skip
         monkeypatch.setattr(module, name, value)
     import mitsuba as mi
@@ -147,19 +149,17 @@ def test_a_family_of_conductors_is_fitted(types, monkeypatch, tmp_path):
 
 def test_members_are_sampled_evenly():
     """Coordinates of members fill the square, and reach its ends."""
-    x = family_truth.points(64, 2, 3)
+    x = points(64, 2, 3)
     counts, _, _ = np.histogram2d(*x.T, bins=4)
     assert counts.min() >= 2 and x.min() == 0 and x.max() == 1
 
 
 def test_samples_are_those_of_their_members(types):
     """Each sample has the value of the source at its own parameters."""
-    from mi_diffind.tasks.bsdf.truth import truth_of
-
-    truth = family_truth.FamilyTruth(
+    truth = FamilyTruth(
         truth_of({"type": "roughconductor", "alpha": 0.2}, types), {"alpha": (0.05, 0.8)}
     )  # fmt: skip
-    samples = family_truth.draw(truth, types, 2**10, 4, 2, True)
+    samples = training.draw_members(truth, types, 2**10, 4, 2, True)
     x = samples.coordinates[0].numpy()
     for coordinate in np.unique(x):
         lanes = types.UInt32(np.flatnonzero(x == coordinate).astype(np.uint32))

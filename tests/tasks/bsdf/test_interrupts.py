@@ -1,7 +1,6 @@
 """Ctrl-C in each phase of a fit, and fits that go on from checkpoints."""
 
 import dataclasses
-import importlib
 import signal
 
 import pytest
@@ -9,7 +8,7 @@ import pytest
 import mi_diffind
 from mi_diffind.arrays.tables import load_table
 from mi_diffind.fitting.loop import FittingError
-from mi_diffind.tasks.bsdf import TASK, mixture, training, view
+from mi_diffind.tasks.bsdf import TASK, directions, mixture, training
 
 SOURCE = {"type": "roughplastic", "alpha": 0.2}
 
@@ -20,14 +19,14 @@ PROXY, RESIDUAL = 20, 20
 @pytest.fixture
 def short(monkeypatch, mi_rgb):
     """Trainings of a second."""
-    monkeypatch.setattr(importlib.import_module("mi_diffind.tasks.bsdf.starts"), "ALPHAS", (0.1, 0.3, 0.9))
+    monkeypatch.setattr(training, "START_ALPHAS", (0.1, 0.3, 0.9))
     monkeypatch.setattr(mixture, "ALPHAS", (0.1, 0.3, 0.9))
     monkeypatch.setattr(training, "SAMPLES", 2**13)
     monkeypatch.setattr(training, "VALIDATION", 2**13)
     monkeypatch.setattr(
         training, "PROXY", dataclasses.replace(training.PROXY, steps=PROXY, batch=2**11, measure_every=10)
     )
-    monkeypatch.setattr(view.SphereView.__init__, "__defaults__", (7, 16, 16))
+    monkeypatch.setattr(directions.SphereView.__init__, "__defaults__", (7, 16, 16))
 
 
 @pytest.fixture

@@ -3,15 +3,13 @@
 import numpy as np
 import pytest
 from arrays import aligned, numpy_of
-from learned_bsdfs import handmade
 from variants import set_variant
 
 import mi_diffind
-from mi_diffind.arrays.tables import save_table
 from mi_diffind.core import tensor_files
 from mi_diffind.core.errors import UsageError
 from mi_diffind.core.runtime import array_module
-from mi_diffind.tasks.bsdf import measured_files, tensor_file
+from mi_diffind.tasks.bsdf import measured
 from mi_diffind.tasks.bsdf.truth import truth_of
 
 #: Wavelengths of the files, nm.
@@ -24,16 +22,22 @@ def directions(rng, n=400):
     return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1).astype(np.float32)
 
 
-def spectral_file(mi, path, folder, monkeypatch):
-    """A file of ``measured`` whose colours are another BSDF's, times a spectrum that depends on the half vector."""
-    monkeypatch.setattr(tensor_file, "THETAS", 8)
-    monkeypatch.setattr(tensor_file, "SIDE", 8)
-    save_table(folder / "learned.npz", handmade())
-    fields = mi_diffind.open(folder / "learned.npz").decode()
-    rgb = fields.pop("rgb")
-    shares = np.random.default_rng(2).random((3, len(WAVELENGTHS))).astype(np.float32)
-    spectra = np.einsum("ptcyx,cw->ptwyx", rgb, shares)
-    tensor_files.write(path, {**fields, "spectra": spectra, "wavelengths": WAVELENGTHS.astype(np.float32)})
+def measured_fields(name, channels):
+    """Fields of a file of ``measured`` with random values, whose warp is that of an even distribution of normals."""
+    rng, theta = np.random.default_rng(2), np.linspace(0, 1.57, 8)
+    ones = np.ones((1, len(theta), 8, 8))
+    fields = {
+        "phi_i": np.zeros(1), "theta_i": theta, "ndf": np.ones((8, 8)), "sigma": np.ones((8, 8)), "vndf": ones,
+        "luminance": ones, name: rng.uniform(0.2, 1, (1, len(theta), channels, 8, 8)),
+    }  # fmt: skip
+    fields = {name: np.ascontiguousarray(value, np.float32) for name, value in fields.items()}
+    return {**fields, "jacobian": np.ones(1, np.uint8), "description": "random"}
+
+
+def spectral_file(path):
+    """A file of ``measured`` of random spectra."""
+    fields = measured_fields("spectra", len(WAVELENGTHS))
+    tensor_files.write(path, {**fields, "wavelengths": WAVELENGTHS.astype(np.float32)})
 
 
 def polarised_file(path):
@@ -59,14 +63,14 @@ def spectrum(mi, plugin, path, wi, wo, wavelengths):
     return np.array(rows[: len(wavelengths)])
 
 
-@pytest.mark.parametrize("illuminant", measured_files.ILLUMINANTS)
+@pytest.mark.parametrize("illuminant", measured.ILLUMINANTS)
 @pytest.mark.parametrize("plugin", ["measured", "measured_polarized"])
-def test_colours_are_those_of_spectral_variants(tmp_path, rng, monkeypatch, plugin, illuminant):
+def test_colours_are_those_of_spectral_variants(tmp_path, rng, plugin, illuminant):
     """Colours are integrals of what Mitsuba shows at many wavelengths; white is white under D65."""
     mi = set_variant("llvm_ad_rgb")
     path = tmp_path / ("a.bsdf" if plugin == "measured" else "a.pbsdf")
     if plugin == "measured":
-        spectral_file(mi, path, tmp_path, monkeypatch)
+        spectral_file(path)
     else:
         polarised_file(path)
     wi, wo = directions(rng)
@@ -88,20 +92,17 @@ def test_colours_are_those_of_spectral_variants(tmp_path, rng, monkeypatch, plug
     assert np.median(colours) > 0.01
     np.testing.assert_allclose(colours / scale, np.maximum(expected, 0) / scale, atol=0.01)
     set_variant("llvm_ad_rgb")
-    white = measured_files.colour_weights(WAVELENGTHS, illuminant).sum(axis=0)
+    white = measured.colour_weights(WAVELENGTHS, illuminant).sum(axis=0)
     np.testing.assert_allclose(white, 1 if illuminant == "D65" else [1.205, 0.948, 0.909], atol=2e-3)
 
 
-def fields_of(folder, monkeypatch, polarised=False):
+def fields_of(folder, polarised=False):
     """Fields of a small file, of colours or of matrices, as arrays."""
     path = folder / "whole.pbsdf"
     if polarised:
         polarised_file(path)
         return {name: np.array(array) for name, array in tensor_files.read(path).items()}
-    monkeypatch.setattr(tensor_file, "THETAS", 8)
-    monkeypatch.setattr(tensor_file, "SIDE", 8)
-    save_table(folder / "learned.npz", handmade())
-    return mi_diffind.open(folder / "learned.npz").decode()
+    return measured_fields("rgb", 3)
 
 
 def changed(array, damage):
@@ -131,10 +132,10 @@ DAMAGED = {
 
 
 @pytest.mark.parametrize("name, damage", [(name, damage) for name, damages in DAMAGED.items() for damage in damages])
-def test_files_with_a_damaged_field(mi_rgb, tmp_path, monkeypatch, name, damage):
+def test_files_with_a_damaged_field(mi_rgb, tmp_path, name, damage):
     """The sentence names file and field, of a source and of a scene; Mitsuba reads some of the files as they are."""
     polarised = name in ("phi_d", "M")
-    fields = fields_of(tmp_path, monkeypatch, polarised)
+    fields = fields_of(tmp_path, polarised)
     array = changed(fields.pop(name), damage)
     path = tmp_path / ("a.pbsdf" if polarised else "a.bsdf")
     tensor_files.write(path, {**fields, **({} if array is None else {name: array})})
@@ -149,8 +150,8 @@ def test_files_with_a_damaged_field(mi_rgb, tmp_path, monkeypatch, name, damage)
             )
 
 
-def test_a_file_with_an_empty_description(mi_rgb, tmp_path, monkeypatch):
-    tensor_files.write(tmp_path / "a.bsdf", {**fields_of(tmp_path, monkeypatch), "description": ""})
+def test_a_file_with_an_empty_description(mi_rgb, tmp_path):
+    tensor_files.write(tmp_path / "a.bsdf", {**fields_of(tmp_path), "description": ""})
     assert truth_of(tmp_path / "a.bsdf", array_module()).name == "a.bsdf"
 
 

@@ -13,9 +13,9 @@ import mi_diffind
 from mi_diffind.core.errors import UsageError
 from mi_diffind.core.runtime import array_module
 from mi_diffind.scenes.inspection import inspect
-from mi_diffind.tasks.bsdf import outputs, scattered, training
+from mi_diffind.tasks.bsdf import measured, training
+from mi_diffind.tasks.bsdf.directions import SphereView
 from mi_diffind.tasks.bsdf.truth import truth_of
-from mi_diffind.tasks.bsdf.view import SphereView
 
 HEADER = "theta_i,phi_i,theta_o,phi_o,r,g,b"
 
@@ -77,20 +77,20 @@ def test_faults_are_named(tmp_path, fault):
     path = tmp_path / "rows.csv"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
     with pytest.raises(UsageError, match=message):
-        scattered.ScatteredTruth(path)
+        measured.ScatteredTruth(path)
 
 
 def test_files(tmp_path, rng):
     """Degrees and radians, columns in any order, weights and comments mean the same rows."""
     a, value = angles(rng, 300), rng.random((300, 3))
-    first = scattered.ScatteredTruth(write(tmp_path / "a.csv", np.column_stack([np.degrees(a), value])))
+    first = measured.ScatteredTruth(write(tmp_path / "a.csv", np.column_stack([np.degrees(a), value])))
     np.testing.assert_allclose(first.wi, unit(*a[:, :2].T), atol=1e-5)
     np.testing.assert_allclose(first.wo, unit(*a[:, 2:].T), atol=1e-5)
     np.testing.assert_allclose(first.f, value, rtol=1e-5)
     weight = np.arange(300) % 3.0
     columns = np.column_stack([weight, value[:, ::-1], a])
     header = "# radians\n\nWeight, b,g,r,theta_i,phi_i,theta_o,phi_o"
-    second = scattered.ScatteredTruth(write(tmp_path / "b.csv", columns, header), "radians")
+    second = measured.ScatteredTruth(write(tmp_path / "b.csv", columns, header), "radians")
     assert second.left_out == 100 and second.digest != first.digest
     for name in ("wi", "wo", "f"):
         np.testing.assert_allclose(getattr(second, name), getattr(first, name)[weight > 0], atol=1e-5)
@@ -104,8 +104,8 @@ def test_symmetries_are_measured_from_neighbours(tmp_path, rng, changes, broken)
     """Noise and distance break no symmetry."""
     a = angles(rng, 8000)
     value = lobe(unit(*a[:, :2].T), unit(*a[:, 2:].T), **changes) * (1 + 0.05 * rng.normal(size=len(a)))
-    truth = scattered.ScatteredTruth(write(tmp_path / "rows.csv", rows_of(a, value)))
-    for name, excess in scattered.measured_symmetry(truth).items():
+    truth = measured.ScatteredTruth(write(tmp_path / "rows.csv", rows_of(a, value)))
+    for name, excess in measured.measure_row_symmetry(truth).items():
         assert (excess > 0.02) if name in broken else (excess < 0.01), (name, excess)
 
 
@@ -121,19 +121,19 @@ def test_reciprocity_is_measured_from_exact_pairs(tmp_path, every):
     expected = (measure * np.abs(f - f.transpose(1, 0, 2))).sum() / 2 / (measure * np.abs(f)).sum()
     a = np.stack([i, 0 * i, o, k], axis=-1).reshape(-1, 4)
     chosen = rng.random(len(a)) < 1 / every
-    truth = scattered.ScatteredTruth(write(tmp_path / "rows.csv", rows_of(a[chosen], f.ravel()[chosen])))
-    share = scattered.measured_symmetry(truth)["reciprocity"]
+    truth = measured.ScatteredTruth(write(tmp_path / "rows.csv", rows_of(a[chosen], f.ravel()[chosen])))
+    share = measured.measure_row_symmetry(truth)["reciprocity"]
     assert expected > 0.2 and share == pytest.approx(expected, rel=1e-3 if every == 1 else 0.05)
     truth.f = np.repeat(symmetric.ravel()[chosen, None], 3, axis=1)
-    assert scattered.measured_symmetry(truth)["reciprocity"] < 1e-6
+    assert measured.measure_row_symmetry(truth)["reciprocity"] < 1e-6
 
 
 def test_symmetries_without_pairs_are_assumed(tmp_path, rng):
     a = angles(rng, 2000, azimuth=False)
-    truth = scattered.ScatteredTruth(
+    truth = measured.ScatteredTruth(
         write(tmp_path / "rows.csv", rows_of(a, lobe(unit(*a[:, :2].T), unit(*a[:, 2:].T))))
     )
-    assert scattered.measured_symmetry(truth)["isotropy"] is None
+    assert measured.measure_row_symmetry(truth)["isotropy"] is None
 
 
 def test_solid_angles(tmp_path, rng):
@@ -142,10 +142,10 @@ def test_solid_angles(tmp_path, rng):
     z = rng.random(n)
     theta_o = np.where(np.arange(n) % 2 == 0, np.arccos(z), 0.3 * np.sqrt(z))  # half of them in a cap
     a = np.stack([1.2 * rng.random(n), 0 * z, theta_o, 2 * np.pi * rng.random(n)], axis=1)
-    truth = scattered.ScatteredTruth(write(tmp_path / "rows.csv", rows_of(np.concatenate([a, a[:1000]]), 1.0)))
+    truth = measured.ScatteredTruth(write(tmp_path / "rows.csv", rows_of(np.concatenate([a, a[:1000]]), 1.0)))
     density = 0.5 / (2 * np.pi) + np.where(truth.wo[:, 2] > math.cos(0.3), 0.5 / (math.pi * 0.3**2), 0)
     density[:1000], density[-1000:] = 2 * density[:1000], 2 * density[-1000:]
-    estimated = scattered.solid_angles(truth, True)
+    estimated = measured.solid_angles(truth, True)
     inner = (truth.wi[:, 2] > math.cos(1.1)) & (truth.wi[:, 2] < math.cos(0.1))  # away from the ends of θ_i
     for chosen in (inner & (density > 1), inner & (density < 1)):
         share = (estimated * density)[chosen]
@@ -157,8 +157,8 @@ def test_goniometers(tmp_path, rng):
     """Where there are few directions of incidence, each of them counts the same."""
     parts = [np.stack([np.full(n, t), 0 * np.ones(n), 1.4 * np.sqrt(rng.random(n)), 6.2 * rng.random(n)], axis=1)
              for t, n in ((0.2, 100), (0.6, 800), (1.1, 300))]  # fmt: skip
-    truth = scattered.ScatteredTruth(write(tmp_path / "rows.csv", rows_of(np.concatenate(parts), 1.0)))
-    area = scattered.solid_angles(truth, True)
+    truth = measured.ScatteredTruth(write(tmp_path / "rows.csv", rows_of(np.concatenate(parts), 1.0)))
+    area = measured.solid_angles(truth, True)
     sums = [area[np.abs(truth.wi[:, 2] - math.cos(t)) < 1e-4].sum() for t in (0.2, 0.6, 1.1)]
     np.testing.assert_allclose(sums, np.mean(sums), rtol=0.03)
 
@@ -178,12 +178,12 @@ def test_noisy_rows_are_fitted(types, tmp_path, monkeypatch):
     path = write(tmp_path / "rows.csv", np.column_stack([np.degrees(a), f]))
     fitted = mi_diffind.fit("bsdf", path, steps=80, batch=2**11, measure_every=40, progress=False)
     fitted.save(tmp_path / "a.npz")
-    measured = fitted.table.measured
-    assert 0.03 < measured["relative_error"] < 0.06 and 0.3 < measured["albedo_largest"] < 1.001
-    assert measured["sample_weight_moment"] < 1.3
+    figures = fitted.table.measured
+    assert 0.03 < figures["relative_error"] < 0.06 and 0.3 < figures["albedo_largest"] < 1.001
+    assert figures["sample_weight_moment"] < 1.3
     assert "isotropic (0%), symmetric" in fitted.lines[0] and "6,000 rows; left out: " in fitted.lines[1]
     with dr.suspend_grad():
-        assert SphereView(truth, types, side=32, samples=32).psnr(outputs.cosine(fitted.model.bsdf)) > 45
+        assert SphereView(truth, types, side=32, samples=32).psnr(fitted.model.bsdf.cosine_value) > 45
     again = inspect(tmp_path / "a.npz", measure=True).figures["measured_in_each_form"]
-    assert next(iter(again.values()))["relative_error"] == pytest.approx(measured["relative_error"], rel=0.1)
+    assert next(iter(again.values()))["relative_error"] == pytest.approx(figures["relative_error"], rel=0.1)
     json.dumps(fitted.report)

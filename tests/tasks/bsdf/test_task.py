@@ -13,10 +13,11 @@ import mi_diffind
 from mi_diffind.arrays.tables import StoredArray, TableError, load_table, save_table
 from mi_diffind.core.errors import UsageError
 from mi_diffind.core.runtime import array_module
-from mi_diffind.tasks.bsdf import TASK, energy, mixture, pool, symmetry, training, view
+from mi_diffind.tasks.bsdf import TASK, energy, measured, mixture, training
+from mi_diffind.tasks.bsdf import directions as pool
 from mi_diffind.tasks.bsdf.files import BSDFModel, allocate
-from mi_diffind.tasks.bsdf.model import TERMS, Form, structure_of
-from mi_diffind.tasks.bsdf.source import Truth, TurnedTruth
+from mi_diffind.tasks.bsdf.measured import Truth, TurnedTruth
+from mi_diffind.tasks.bsdf.model import TERMS, Form, sizes_within
 from mi_diffind.tasks.bsdf.truth import MERLTruth, truth_of
 
 FORMS = {
@@ -96,10 +97,10 @@ def test_extremes(types, model, form):
 
 
 def test_sizes_follow_the_bytes():
-    assert structure_of(2048).nbytes <= 2048 and structure_of(2048).nbytes > 1700
-    assert structure_of(8192, plain=True).first is None and structure_of(8192, plain=True).nbytes > 7000
-    with pytest.raises(ValueError, match="found 10 bytes, the smallest arrays need 36"):
-        structure_of(10)
+    assert sizes_within(2048).nbytes <= 2048 and sizes_within(2048).nbytes > 1700
+    assert sizes_within(8192, plain=True).first is None and sizes_within(8192, plain=True).nbytes > 7000
+    with pytest.raises(ValueError, match="found 10 bytes, the smallest arrays need 64"):
+        sizes_within(10)
 
 
 # -- sources -----------------------------------------------------------------------------------------------------------
@@ -127,8 +128,8 @@ class FormulaTruth(Truth):
 )  # fmt: skip
 def test_symmetries_are_measured(types, changes, broken):
     with dr.suspend_grad():
-        measured = symmetry.measured_symmetry(FormulaTruth(**changes), types, 2**14)
-    for name, value in measured.items():
+        found = measured.measure_symmetry(FormulaTruth(**changes), types, 2**14)
+    for name, value in found.items():
         assert (value > 0.02) if name in broken else (value < 1e-3), (name, value)
 
 
@@ -138,7 +139,7 @@ def test_axes_are_measured(types, degrees):
     truth = TurnedTruth(FormulaTruth(anisotropy=8), math.radians(degrees))
     samples = training.draw(truth, types, 2**16, 1, False)
     expected = (degrees + 45) % 90 - 45 if abs(degrees) > 0.5 else 0
-    assert math.degrees(symmetry.axes_angle(samples, truth)) == pytest.approx(expected, abs=0.5 if expected else 0)
+    assert math.degrees(measured.axes_angle(samples, truth)) == pytest.approx(expected, abs=0.5 if expected else 0)
 
 
 def test_mixtures_are_turned(types, rng):
@@ -231,7 +232,7 @@ def test_the_mixture_follows_the_source(types):
             )
             return [p, p, p]
 
-    lobes, weights = mixture.fitted_mixture(Sum(), types, True)
+    lobes, weights = mixture.fit_mixture(Sum(), types, True)
     assert min(abs(math.log(lobe.alpha_u / alpha)) for lobe in lobes) < 0.5
     np.testing.assert_allclose(weights.sum(axis=1), 1)
     array = StoredArray(weights.astype(np.float32)).allocate(types.TensorXf)
@@ -266,7 +267,7 @@ def test_the_albedo_is_limited(types):
         factor = 1 + 0.06 * dr.exp(-dr.square((wi.z - 0.5) / 0.1)) * (1 + wo.z)
         return [factor * v for v in truth.value(wi, wo)]
 
-    scale = energy.fitted_scale(bright, truth, types)
+    scale = energy.fit_scale(bright, truth, types)
     array = StoredArray(scale[:, None].astype(np.float32)).allocate(types.TensorXf)
 
     def scaled(wi, wo):
@@ -312,8 +313,7 @@ def short(monkeypatch):
     monkeypatch.setattr(training, "SAMPLES", 2**14)
     monkeypatch.setattr(training, "STARTS", 1)
     monkeypatch.setattr(training, "PROXY", dataclasses.replace(training.PROXY, steps=60, batch=2**11))
-    monkeypatch.setattr(view, "SIDE", 16)
-    monkeypatch.setattr(view.SphereView.__init__, "__defaults__", (7, 16, 16))
+    monkeypatch.setattr(pool.SphereView.__init__, "__defaults__", (7, 16, 16))
 
 
 def test_a_plastic_is_fitted(types, short, tmp_path):
@@ -360,10 +360,10 @@ def test_a_black_channel_does_not_darken_the_others(types):
         red, *_ = FormulaTruth().value(wi, wo)
         return [1.01 * red, 1e-4 * red, 1e-6 * red]
 
-    scale = energy.fitted_scale(learned, Red(), types)
+    scale = energy.fit_scale(learned, Red(), types)
     assert (scale > 0.985).all() and (scale < 0.998).all()
     Red.share = 0
-    assert (energy.fitted_scale(learned, Red(), types) == 0).all()
+    assert (energy.fit_scale(learned, Red(), types) == 0).all()
 
 
 def test_ranges_without_a_proxy_reach_to_black(types):

@@ -11,15 +11,12 @@ from arrays import aligned
 
 from mi_diffind import StoredArray, load_model
 from mi_diffind import fit as fit_task
-from mi_diffind.arrays.tables import Table, TableError, save_table
-from mi_diffind.core.runtime import array_module
+from mi_diffind.arrays.tables import TableError, save_table
 from mi_diffind.fitting.loop import EXPONENTIAL_RATE, exponential_like
 from mi_diffind.tasks.disney import TASK
 from mi_diffind.tasks.disney.decoder import Decoder
-from mi_diffind.tasks.disney.effects import Effects, ValueBounds, find_effects
 from mi_diffind.tasks.disney.files import LAYOUTS
-from mi_diffind.tasks.disney.model import ALPHA_MIN, PARAMETERS, Material, exact_factors
-from mi_diffind.tasks.disney.paper import PaperArrays
+from mi_diffind.tasks.disney.model import PARAMETERS, Effects, Material, ValueBounds, find_effects
 from mi_diffind.tasks.disney.training import measure, shade, uniform_hemisphere
 
 N = 100_000
@@ -170,35 +167,6 @@ def test_measure_agrees_with_the_independent_reference(rng):
     assert abs(measure(decoder, ad, 2**18, "uniform")["psnr_db"] - independent) < 1
 
 
-@pytest.mark.parametrize("preset", ["formulas", "tables", "paper"])
-def test_values_are_finite_and_non_negative_everywhere(rng, preset):
-    """Also with entries at the ends of their allowed ranges, which a user's own tables or an optimiser may have."""
-    cosines = np.concatenate([[0, 1e-38, 1e-20, 1e-8, 1e-4, 0.5, 1], rng.random(50)])
-    z = np.array(np.meshgrid(cosines, cosines)).reshape(2, -1)
-    phi = 2 * np.pi * rng.random(z.shape)
-    wi, wo = (
-        np.stack([np.sqrt(1 - c * c) * np.cos(p), np.sqrt(1 - c * c) * np.sin(p), c])
-        for c, p in zip(z, phi, strict=True)
-    )
-    values = rng.integers(0, 2, (len(PARAMETERS), z.shape[1])).astype(np.float32)
-    material = Material(**{k: ad.Float(v) for k, v in zip(PARAMETERS, values, strict=True)})
-    wi, wo = ad.Array3f(wi.astype("f4")), ad.Array3f(wo.astype("f4"))
-    layout = LAYOUTS[preset][0] if preset in LAYOUTS else None
-    decoders = [decoder_of(preset)]
-    for end in (0, 1) if layout is not None else ():
-        extreme = {n: np.full(s, layout.RANGES[n][end], np.float32) for n, s in layout.SHAPES.items()}
-        table = Table("disney", {n: StoredArray(entries) for n, entries in extreme.items()}, preset)
-        decoders.append(TASK.model(table, ad.TensorXf).decoder)
-    albedo = ad.Array3f(1, 0, 0.5)
-    for decoder in decoders:
-        value = shade(decoder, material, albedo, wi, wo).numpy()
-        assert np.isfinite(value).all() and value.min() >= 0, (value.min(), value.max())
-    factors = exact_factors(material, wi, wo)
-    for field in dataclasses.fields(factors):
-        v = getattr(factors, field.name).numpy()
-        assert np.isfinite(v).all() and v.min() >= -1e-6, (field.name, v.min(), v.max())
-
-
 def test_training_distributions(rng):
     u = ad.Float(aligned(rng.random(N)))
     x = exponential_like(u).numpy()
@@ -229,14 +197,6 @@ def test_fit_improves_and_is_repeatable(preset, few_samples):
     assert not np.array_equal(first.arrays["masking"].entries, other.arrays["masking"].entries)
 
 
-def test_measurements_of_both_distributions():
-    """Those of the model are those of the function, at fewer samples than a user waits for."""
-    model = TASK.open(ad.TensorXf, "", "paper")
-    found = model.measure(2**14)
-    assert found["psnr_db"] == measure(model.decoder, ad, 2**14)["psnr_db"]
-    assert found["psnr_uniform_db"] == measure(model.decoder, ad, 2**14, "uniform")["psnr_db"] != found["psnr_db"]
-
-
 def test_tables_out_of_range_are_refused(tmp_path):
     table = TASK.load(TASK.file(preset="paper"))
     entries = table.arrays["masking"].entries.copy()
@@ -264,20 +224,6 @@ def test_the_layout_of_a_file_is_that_of_its_preset(tmp_path):
     save_table(path, dataclasses.replace(table, preset="best"))
     with pytest.raises(TableError, match=r'own\.npz: holds tables of the preset "best", allowed are tables, paper'):
         TASK.load(path)
-
-
-def test_copies_of_a_file_are_independent():
-    """They share memory until one is assigned to; a layout's parameters have dotted names."""
-    first, second = (TASK.open(ad.TensorXf, "", "paper") for _ in range(2))
-    assert list(first.layout.keys()) == [f"{name}.data" for name in PaperArrays.SHAPES]
-    before = second.layout.masking.numpy()
-    first.layout.masking.data = first.layout.masking.data * 0
-    np.testing.assert_array_equal(second.layout.masking.numpy(), before)
-    assert array_module("llvm") is first.types
-
-
-def test_masking_floor_matches_the_model():
-    assert PaperArrays.RANGES["masking"][0] < ALPHA_MIN
 
 
 # -- effects in use ----------------------------------------------------------------------------------------------------
@@ -318,26 +264,3 @@ def test_optimised_parameters_keep_their_effect(name):
     effect = {"flatness": "subsurface", "metallic": "metal", "specular": "dielectric"}.get(name, name)
     assert not getattr(find_effects(known)[0], effect)
     assert getattr(find_effects({**known, name: constant(0, optimised=True)})[0], effect)
-
-
-def test_parts_left_out_change_nothing(rng):
-    """Every combination of zeros and ones: the model restricted to the effects in use, against all of it."""
-    switches = ("metallic", "flatness", "sheen", "clearcoat", "anisotropic", "specular", "spec_tint", "sheen_tint")
-    color, m, wi, wo = disney_formulas.random_case(rng, 200)
-    seen = set()
-    for bits in range(2 ** len(switches)):
-        values = {name: bits >> i & 1 for i, name in enumerate(switches)}
-        case = (
-            color,
-            {**m, **{k: np.full(200, v * (1 if k == "metallic" else 0.5)) for k, v in values.items()}},
-            wi,
-            wo,
-        )
-        known = {k: constant(v * (1 if k == "metallic" else 0.5)) for k, v in values.items()}
-        effects, _ = find_effects(known)
-        if effects in seen:
-            continue
-        seen.add(effects)
-        everything, used = shaded(Decoder(), case), shaded(Decoder(), case, effects)
-        assert np.allclose(used, everything, rtol=2e-6, atol=1e-8), effects
-    assert len(seen) > 50

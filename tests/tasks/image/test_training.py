@@ -1,7 +1,6 @@
-"""Training of task 3: initial arrays, samples, targets, rounding, and what a trained file is worth."""
+"""Training of images: initial arrays, samples, targets, rounding, and files."""
 
 import dataclasses
-import itertools
 
 import drjit as dr
 import numpy as np
@@ -10,18 +9,27 @@ from arrays import aligned, numpy_of
 from scipy.ndimage import map_coordinates
 from variants import BACKENDS
 
-from mi_diffind import DifferentiableArray, Indirection, save_table
+from mi_diffind import DifferentiableArray, save_table
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting import loop
-from mi_diffind.fitting.loop import fit
 from mi_diffind.fitting.task import FitRequest
-from mi_diffind.maps import components
-from mi_diffind.maps.layout import Layout
+from mi_diffind.maps.layout import Layout, choose_borders, downscale, smoothness
 from mi_diffind.maps.source import from_arrays
-from mi_diffind.tasks.image import TASK, arrays, presets, search, training
-from mi_diffind.tasks.image.compressed import CompressedImage
-from mi_diffind.tasks.image.memory_budget import CoarsePrimary, ImageBudget
-from mi_diffind.tasks.image.presets import IMPROVEMENTS, PAGED, PRESETS, STRUCTURES, replaced, without
+from mi_diffind.tasks.image import (
+    IMPROVEMENTS,
+    PAGED,
+    PRESETS,
+    STRUCTURES,
+    TASK,
+    CoarsePrimary,
+    ImageRecipe,
+    arrays,
+    fit,
+    replaced,
+    training,
+    without,
+)
+from mi_diffind.tasks.image.arrays import CompressedImage, ImageBudget
 
 OURS = PRESETS["ours"]
 
@@ -43,7 +51,7 @@ def waves(height=24, width=24, channels=3, periods=1):
 
 def short(recipe=OURS, steps=3, batch=256, **settings):
     """A recipe for images of a few texels; keywords that are no settings are the recipe's own."""
-    own = {f.name for f in dataclasses.fields(presets.ImageRecipe)} - {"settings"}
+    own = {f.name for f in dataclasses.fields(ImageRecipe)} - {"settings"}
     recipe = dataclasses.replace(recipe, **{k: settings.pop(k) for k in own & set(settings)})
     settings = {"measure_every": steps, **settings}
     return replaced(recipe, steps=steps, batch=batch, **settings)
@@ -80,19 +88,19 @@ def test_borders_of_what_tiles_and_what_does_not():
     tile = waves()
     y, x = np.mgrid[0:24, 0:24] / 24
     slope = np.stack([x, 0.2 + 0 * x], axis=-1)
-    assert components.borders(tile) == ("repeat", "repeat")
-    assert components.borders(slope) == ("repeat", "clamp")  # constant along v
-    assert components.borders(slope.transpose(1, 0, 2)) == ("clamp", "repeat")
-    assert components.borders(slope + y[..., None]) == ("clamp", "clamp")
-    assert components.borders(tile[:13]) == ("clamp", "repeat")  # half a period
-    assert components.borders(tile[:, :13]) == ("repeat", "clamp")
-    assert components.borders(tile[:1]) == ("repeat", "repeat")
-    assert components.borders(tile[:1, :1]) == ("repeat", "repeat")
-    assert components.borders(np.random.default_rng(0).random((9, 8, 2))) == ("repeat", "repeat")
+    assert choose_borders(tile) == ("repeat", "repeat")
+    assert choose_borders(slope) == ("repeat", "clamp")  # constant along v
+    assert choose_borders(slope.transpose(1, 0, 2)) == ("clamp", "repeat")
+    assert choose_borders(slope + y[..., None]) == ("clamp", "clamp")
+    assert choose_borders(tile[:13]) == ("clamp", "repeat")  # half a period
+    assert choose_borders(tile[:, :13]) == ("repeat", "clamp")
+    assert choose_borders(tile[:1]) == ("repeat", "repeat")
+    assert choose_borders(tile[:1, :1]) == ("repeat", "repeat")
+    assert choose_borders(np.random.default_rng(0).random((9, 8, 2))) == ("repeat", "repeat")
 
 
 @pytest.mark.parametrize("border", [("clamp", "clamp"), ("repeat", "clamp"), ("clamp", "repeat"), ("repeat", "repeat")])
-@pytest.mark.parametrize("rows, columns", [(1, 1), (2, 5), (3, 7), (9, 12), (13, 20)])
+@pytest.mark.parametrize("rows, columns", [(1, 1), (3, 7), (13, 20)])
 def test_downscaling_is_a_tent(rows, columns, border):
     """Summed entry by entry and texel by texel; also onto more entries than there are texels."""
     height, width = 9, 12
@@ -114,7 +122,7 @@ def test_downscaling_is_a_tent(rows, columns, border):
         for j in range(columns):
             w = np.outer(weights(i, rows, height, border[0]), weights(j, columns, width, border[1]))
             expected[i, j] = np.einsum("yx,yxc->c", w, values)
-    found = components.downscale(values, rows, columns, border)
+    found = downscale(values, rows, columns, border)
     assert found.dtype == np.float32 and found.shape == (rows, columns, 2)
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
@@ -198,13 +206,13 @@ def test_detail():
         for j in range(1, 6)
         for c in range(2)
     ]
-    assert components.smoothness(values) == pytest.approx(-10 * np.log10(np.mean(np.square(errors))), abs=1e-3)
-    several = [components.smoothness(v) for v in (values, waves(32, 32, periods=4), waves(32, 32))]
+    assert smoothness(values) == pytest.approx(-10 * np.log10(np.mean(np.square(errors))), abs=1e-3)
+    several = [smoothness(v) for v in (values, waves(32, 32, periods=4), waves(32, 32))]
     assert several[0] < several[1] < several[2]
     y, x = np.mgrid[0:8, 0:8].astype(np.float32)
-    assert components.smoothness((y + 2 * x)[..., None] / 30) == 120  # a plane has none
+    assert smoothness((y + 2 * x)[..., None] / 30) == 120  # a plane has none
     for few in (values[:1], values[:, :2], values[:1, :1]):
-        assert np.isfinite(components.smoothness(few))
+        assert np.isfinite(smoothness(few))
 
 
 def test_the_ramp_is_the_supplements(ad):
@@ -246,7 +254,7 @@ def test_each_texel_is_drawn_once(ad, height, width):
         np.testing.assert_allclose(u * width, index % width + 0.5, atol=1e-5)
 
 
-@pytest.mark.parametrize("size", [1, 2, 10, 34, 36, 50, 64, 1000])
+@pytest.mark.parametrize("size", [1, 10, 34, 36, 1000])
 def test_samples_are_stratified(ad, size):
     """One in each of ``size`` equal stretches of the image, wherever they end."""
     height, width = 7, 5
@@ -264,14 +272,7 @@ def test_samples_are_stratified(ad, size):
         assert np.ptp(seen, axis=0).any()  # drawn anew
 
 
-def test_all_of_a_stretch_may_be_drawn(ad):
-    found = problem(ad, (np.arange(64) / 64).reshape(8, 8, 1))
-    index = np.concatenate([drawn(found, ad, 10, seed=s)[1][:, 0] for s in range(200)])
-    counts = np.bincount(np.rint(index * 64).astype(int), minlength=64)
-    assert counts.min() > 0 and counts.max() < 4 * counts.min() + 20
-
-
-@pytest.mark.parametrize("channels", [1, 2, 3, 4, 5])
+@pytest.mark.parametrize("channels", [1, 3, 5])
 @pytest.mark.parametrize("border", ["repeat", "clamp"])
 def test_targets_are_bilinear(ad, border, channels):
     """SciPy's first-order spline, on which SciPy's own borders are put; at corners, edges, centres, anywhere."""
@@ -355,7 +356,7 @@ def random_places(ad, count=300):
     return [ad.Float(aligned(x)) for x in np.random.default_rng(9).random((2, count), dtype=np.float32)]
 
 
-@pytest.mark.parametrize("bits, dims", [((1,), 3), ((3,), 4), ((6,), 3), ((7,), 4), ((2, 6), 3), ((4, 7), 4)])
+@pytest.mark.parametrize("bits, dims", [((1,), 3), ((6,), 3), ((7,), 4), ((2, 6), 3)])
 def test_rounded_entries_are_the_stored_ones(ad, bits, dims):
     net, x = random_net(ad, dims, len(bits)), random_places(ad)
     stored = training.stored_form(net, bits)
@@ -376,7 +377,7 @@ def test_a_step_is_one_kernel(ad, recipe, structure):
     image = np.random.default_rng(2).integers(0, 255, (64, 80, 3), dtype=np.uint8)
     recipe = replaced(dataclasses.replace(PRESETS[recipe], structure=structure), batch=3000)
     source = from_arrays({"albedo": image})
-    problem = training.problem_of(source, search.default_size(source, 4000, recipe), recipe, ad)
+    problem = training.problem_of(source, fit.default_size(source, 4000, recipe), recipe, ad)
     trainer = loop._Trainer(problem, recipe.settings)
     trainer.share = 0.9
     for _ in range(4):
@@ -413,59 +414,17 @@ def test_the_gradient_passes_through_rounding(ad, bits):
         np.testing.assert_allclose(array.data.grad.numpy()[..., : array.channels], expected, rtol=1e-4, atol=1e-4)
 
 
-def test_rounding_changes_nothing_that_is_round(ad):
-    """Entries that are whole steps already: the value and the gradient are those of the arrays themselves."""
-    rng = np.random.default_rng(0)
-    net = Indirection(
-        DifferentiableArray((5, 6), 3, rng.integers(0, 15, (5, 6, 3)) / 15, fold=True),
-        DifferentiableArray((4,) * 3, 2, rng.integers(0, 255, (4, 4, 4, 2)) / 255, fold=True),
-    ).alloc(ad.TensorXf)
-    x, found = random_places(ad), []
-    for read in (lambda: net(x), lambda: training.rounded(net, [4])(x)):
-        for array in (net.primary[0], net.cascaded):
-            dr.disable_grad(array.data)
-            dr.enable_grad(array.data)
-        values = read()
-        dr.backward(values[0] + 2 * values[1])
-        gradients = [array.data.grad.numpy() for array in (net.primary[0], net.cascaded)]
-        found.append([numpy_of(values), *gradients])
-    for plain, rounded in zip(*found, strict=True):
-        assert np.abs(plain).max() > 0
-        np.testing.assert_allclose(rounded, plain, rtol=1e-4, atol=1e-5)
-
-
-def test_rounding_is_no_divergence(ad):
-    """The loss of a smooth image rises a hundredfold where rounding starts; its training goes on."""
-    source = from_arrays({"image": waves()})
-    recipe = short(steps=60, dims=3, rounded=0.5, jitter=0.5, lr=1e-2, check_every=10, measure_every=10, loss="mse")
-    _, result = trained(source, ImageBudget(24, 24, 4, 3, 3, 1), recipe, ad)
-    losses = [h["loss"] for h in result.history]
-    assert losses[3] > 10 * losses[1] + 1e-6, losses  # what it would have been taken for
-    assert result.restarts == 0 and result.steps == 60
-
-
 def test_training_with_rounding_makes_up_for_it(ad):
     source, found = from_arrays({"image": waves()}), {}
     for rounded in (0, 0.5):
         recipe = short(steps=100, batch=576, dims=3, rounded=rounded, lr=1e-2, loss="mse", schedule="cosine")
         made = training.problem_of(source, ImageBudget(24, 24, 4, 3, 3, 2), recipe, ad)
-        fit(made, recipe.settings, progress=False)
+        loop.fit(made, recipe.settings, progress=False)
         found[rounded] = made.measure(made.net)["psnr_db"]
         x = texel_centres(ad, 24, 24)
         stored = numpy_of(training.stored_form(made.net, [2])(x)).reshape(24, 24, 3)
         assert psnr(stored, source.maps[0].values) == pytest.approx(found[rounded], abs=0.01)
     assert found[0.5] > found[0] + 1
-
-
-def test_eight_bits_cost_little(ad):
-    source = from_arrays({"image": waves(channels=3)})
-    recipe = short(steps=60, batch=576, dims=3, rounded=0.5, lr=1e-2, loss="mse", schedule="cosine")
-    made = training.problem_of(source, ImageBudget(16, 16, 4, 3, 3, 8), recipe, ad)
-    fit(made, recipe.settings, progress=False)
-    x, values = texel_centres(ad, 24, 24), source.maps[0].values
-    full = psnr(numpy_of(made.net(x)).reshape(values.shape), values)
-    stored = psnr(numpy_of(training.stored_form(made.net, [8])(x)).reshape(values.shape), values)
-    assert full > 35 and abs(full - stored) < 1
 
 
 # -- whole trainings --------------------------------------------------------------------------------------------------
@@ -532,7 +491,7 @@ def test_every_structure_makes_a_file(ad, tmp_path, structure):
     """Its arrays have the shapes and bits of the size, and what is read from the file is what was measured."""
     source = from_arrays({"image": np.rint(255 * waves(15, 13)).astype(np.uint8)})
     recipe = short(steps=2, dims=3, structure=structure)
-    size = search.sized(source, 500, recipe, 4)
+    size = fit.sized(source, 500, recipe, 4)
     table, _ = trained(source, size, recipe)
     save_table(tmp_path / "t.npz", table)
     loaded = TASK.load(tmp_path / "t.npz")
@@ -594,7 +553,7 @@ def test_every_improvement_can_be_switched_off(ad):
         assert recipe != small, name
         recipe = replaced(recipe, steps=3, batch=64, measure_every=3)
         stored[name] = training.layout_of(source, recipe).stored
-        size = search.sized(source, 400, recipe, 8)
+        size = fit.sized(source, 400, recipe, 8)
         table, result = trained(source, size, recipe)
         assert result.steps == 3 and result.restarts == 0 and table.measured["psnr_db"] > 5, name
         assert table.arrays["cascaded"].shape[-1] == stored[name]
@@ -613,15 +572,6 @@ def test_without_everything_it_is_the_paper():
         assert getattr(recipe.settings, name) == getattr(paper.settings, name), name
     samples = OURS.settings.steps * OURS.settings.batch
     assert recipe.settings.steps * recipe.settings.batch == pytest.approx(samples, rel=0.01)
-
-
-def test_the_papers_recipe(ad):
-    source = from_arrays({"image": np.rint(255 * waves(9, 11)).astype(np.uint8)})
-    recipe = short(PRESETS["paper"])
-    table, _ = trained(source, ImageBudget(8, 8, 4, 3), recipe)
-    assert table.arrays["primary"].shape == (8, 8, 4) and table.arrays["cascaded"].shape == (4,) * 4 + (3,)
-    assert {a.bits for a in table.arrays.values()} == {8} and table.nbytes == 4 * 64 + 3 * 256
-    assert table.measured["psnr_db"] > 5
 
 
 def test_high_dynamic_range(ad):
@@ -664,33 +614,6 @@ def test_no_seam(ad):
         odd = np.float32([0, 1, -0.0, np.nan, np.inf, -np.inf, 1e30, -1e30])
         for u in odd:
             assert np.isfinite(read(np.full(8, u, np.float32), odd)).all()
-
-
-def test_training_for_a_time(ad, monkeypatch):
-    """With a clock of its own, a fortieth of a second a look: the training ends on time, and its rate with it."""
-
-    clock, rates = [0.0], []
-
-    def tick():
-        clock[0] += 1 / 40
-        return clock[0]
-
-    rate = loop._Trainer.learning_rate
-
-    def watched(self, plateau):
-        rates.append(rate(self, plateau))
-        return rates[-1]
-
-    monkeypatch.setattr(loop.time, "perf_counter", tick)
-    monkeypatch.setattr(loop._Trainer, "learning_rate", watched)
-    table, result = trained(
-        from_arrays({"image": waves(8, 8)}), ImageBudget(4, 4, 4, 3, 4, 6), short(lr=3e-2), seconds=1
-    )
-    assert result.steps == len(rates) == table.settings["steps"] and 30 <= len(rates) <= 40
-    assert table.settings["seconds"] == 1 and not result.interrupted
-    assert 1 <= len(result.history) <= 11
-    assert rates[0] > 0.98 * 3e-2 and rates[-1] < 0.02 * 3e-2
-    assert all(a >= b for a, b in itertools.pairwise(rates))
 
 
 # -- hard cases -------------------------------------------------------------------------------------------------------

@@ -106,7 +106,7 @@ def test_nothing_is_read_that_does_not_count(mi_rgb):
     thick = counted(*across, height=1e4)
     assert thick.opaque == 20 and thick.looks < 0.5 * thick.steps and thick.looks + thick.hidden == thick.steps
     missing = counted([[-3, 2, 0], [5, 0, 0], [0, 0, np.nan]], [[1, 0, 0]] * 3)
-    assert missing.rays == 3 and sum(missing.asdict().values()) == 3
+    assert missing.rays == 3 and sum(vars(missing).values()) == 3
 
 
 def test_hard_rays(mi_rgb):

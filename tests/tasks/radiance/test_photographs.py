@@ -19,12 +19,9 @@ from mi_diffind.commands.cli import main
 from mi_diffind.fitting.task import tasks
 from mi_diffind.tasks.radiance import grid as grids
 from mi_diffind.tasks.radiance import views as view_files
-from mi_diffind.tasks.radiance import visual_hull
-from mi_diffind.tasks.radiance.image_files import LINEAR
-from mi_diffind.tasks.radiance.session import RAYS, FieldSession
-from mi_diffind.tasks.radiance.training import ImagesProblem
-from mi_diffind.tasks.radiance.views import ViewsError, load_views
-from mi_diffind.tasks.radiance.visual_hull import box_of
+from mi_diffind.tasks.radiance.captures import LINEAR
+from mi_diffind.tasks.radiance.session import RAYS, FieldSession, ImagesProblem
+from mi_diffind.tasks.radiance.views import ViewsError, box_of, load_views
 
 LENS = {"k1": -0.12, "k2": 0.03, "p1": 0.004, "p2": -0.003}
 SIDE = 64
@@ -271,7 +268,7 @@ def test_a_field_records_its_background(studio_shots, monkeypatch, capsys):
     change(folder, "transforms_test.json", frame=1, sharpness=3)
     (folder / "train_4.png").unlink()
     options = ["--preset", "grid", "--steps", "40", "--resolution", "12", "--batch", "256"]
-    monkeypatch.setattr(visual_hull, "SEARCH", 24)
+    monkeypatch.setattr(view_files, "SEARCH", 24)
     monkeypatch.setattr(grids, "VISIBLE", 0.0)
     options += ["--variant", "llvm_ad_rgb", "--json", str(folder / "x.json")]
     assert main(["fit", "field", str(folder), "-o", str(folder / "x.npz"), *options]) == 0

@@ -11,7 +11,7 @@ from PIL import Image
 from mi_diffind.arrays.tables import StoredArray, TableError, load_table, save_table
 from mi_diffind.commands.cli import main
 from mi_diffind.core.runtime import array_module
-from mi_diffind.tasks.radiance import compression, files, fit, presets, reflection
+from mi_diffind.tasks.radiance import compression, files, fit, volume_field
 from mi_diffind.tasks.radiance.grid import NodeGrid
 from mi_diffind.tasks.radiance.march import differentiable, march
 from mi_diffind.tasks.radiance.nodes import Nodes
@@ -47,15 +47,15 @@ def light(d):
 
 @pytest.fixture
 def environment():
-    table = np.concatenate([light(texels(side)) for side in reflection.SIDES])
+    table = np.concatenate([light(texels(side)) for side in volume_field.SIDES])
     return np.pad(table, ((0, 0), (0, 1))).astype(np.float32)
 
 
 def grid_of(types, rng, environment, side=5):
     """A cube of random numbers, without empty nodes."""
     nodes = Nodes(types, (-1, -1, -1), 2 / (side - 1), (side,) * 3)
-    colour = rng.normal(0, 0.3, (side**3, reflection.COLUMNS)).astype(np.float32)
-    colour[:, reflection.NORMAL] = rng.normal((0, 0.6, 0.8), 0.1, (side**3, 3))
+    colour = rng.normal(0, 0.3, (side**3, volume_field.COLUMNS)).astype(np.float32)
+    colour[:, volume_field.NORMAL] = rng.normal((0, 0.6, 0.8), 0.1, (side**3, 3))
     return NodeGrid(nodes, rng.uniform(-3, 1, side**3).astype(np.float32), colour, environment)
 
 
@@ -69,7 +69,7 @@ def test_the_environment_in_the_mirrored_direction(ad, rng, environment, sharpne
     def entry(number, active):
         return list(dr.gather(ad.Array4f, table, number, active))[:3]
 
-    found = reflection.reflected(ad, numbers, ad.Array3f(*np.float32(d.T)), entry)
+    found = volume_field.reflected(ad, numbers, ad.Array3f(*np.float32(d.T)), entry)
     mirrored = d - 2 * (d * n).sum(axis=1, keepdims=True) * n
     assert np.abs(np.log(np.array(found).T) - s - light(mirrored)).max() < tolerance
 
@@ -84,7 +84,7 @@ def test_hard_numbers_are_finite(ad, environment):
             d = ad.Array3f(*axes.T)
             numbers = [ad.Float(v) for v in values]
             dr.enable_grad(numbers, d)
-            found = reflection.reflected(ad, numbers, d, lambda i, a: list(dr.gather(ad.Array4f, table, i, a))[:3])
+            found = volume_field.reflected(ad, numbers, d, lambda i, a: list(dr.gather(ad.Array4f, table, i, a))[:3])
             dr.backward(sum(found))
             assert np.isfinite(np.array(found)).all()
             assert all(np.isfinite(dr.grad(v).numpy()).all() for v in [*numbers, *d])
@@ -132,15 +132,11 @@ def test_files_keep_reflections(ad, rng, environment, tmp_path):
     table = files.load(tmp_path / "grid.npz")
     assert np.abs(pictures(files.field_of(table, ad), ad, rng) / expected - 1).max() < 0.01
 
-    palette, scale, offset = compression.as_bytes(grid.colour[1:])
-    environment_bytes, *ranges = compression.as_bytes(environment[:, :3])
     levels = np.clip(np.rint((grid.density - compression.EMPTIEST) / compression.LEVEL_STEP), 0, 15).astype(np.uint8)
-    stored = {
-        "levels": levels, "density_range": (compression.EMPTIEST, compression.LEVEL_STEP), "density_bits": 4,
-        "index": np.append(0, np.arange(125)).astype(np.uint32), "palette": palette, "scale": scale, "offset": offset,
-        "environment": environment_bytes, "environment_range": ranges,
-    }  # fmt: skip
-    save_table(tmp_path / "palette.npz", files.palette_table(nodes, stored))
+    shared = [compression.to_bytes(values) for values in (grid.colour[1:], environment[:, :3])]
+    index, range_ = np.append(0, np.arange(125)).astype(np.uint32), (compression.EMPTIEST, compression.LEVEL_STEP)
+    numbers = volume_field.PaletteArrays(levels, 4, range_, index, *shared)
+    save_table(tmp_path / "palette.npz", files.palette_table(nodes, numbers))
     table = files.load(tmp_path / "palette.npz")
     assert table.settings["layout"] == "coded" and table.settings["colours"] == "reflections"
     packed, floats = (pictures(files.field_of(table, ad, storage), ad, rng) for storage in ("", "float32"))
@@ -200,7 +196,7 @@ def test_a_mirror_is_fitted_by_reflections(tmp_path, capsys):
     write_mirror(tmp_path, "test", 4, 0.7)
     options = ["--resolution", "32", "--batch", "2048", "--variant", "llvm_ad_rgb"]
     reached = {}
-    for name in presets.COLOURS:
+    for name in fit.COLOURS:
         args = ["fit", "field", str(tmp_path), "--preset", "grid", "--steps", "250", "--colours", name, *options]
         assert main([*args, "-o", str(tmp_path / f"{name}.npz")]) == 0
         reached[name] = load_table(tmp_path / f"{name}.npz").measured["psnr_foreground_db"]

@@ -1,4 +1,4 @@
-"""Fields with surroundings: contraction, steps, derivatives, exposures, files and scenes."""
+"""Fields with surroundings: contraction, steps, derivatives, files and scenes."""
 
 import dataclasses
 
@@ -17,8 +17,6 @@ from mi_diffind.fitting.loop import FitSettings
 from mi_diffind.tasks.radiance import files, march, nodes, surroundings
 from mi_diffind.tasks.radiance import fit as field_fit
 from mi_diffind.tasks.radiance import grid as grids
-from mi_diffind.tasks.radiance.session import FieldSession
-from mi_diffind.tasks.radiance.training import ImagesProblem
 from mi_diffind.tasks.radiance.views import load_views
 from mi_diffind.tasks.radiance.volume_field import NodeField
 
@@ -142,7 +140,7 @@ def test_derivatives(field, ad, rng):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Views without alpha, and a short training with surroundings and exposures."""
+    """Views without alpha, and a short training with surroundings."""
     path, patch = tmp_path_factory.mktemp("around"), pytest.MonkeyPatch()
     captures.write(path, 4, 2)
     for image in path.glob("*.png"):
@@ -151,7 +149,7 @@ def folder(tmp_path_factory):
     recipe = field_fit.PRESETS["grid"]
     short = dataclasses.replace(recipe, settings=FitSettings(**{**vars(recipe.settings), "steps": 80, "batch": 1024}))
     patch.setitem(field_fit.PRESETS, "grid", short)
-    options = ["--steps", "5", "--batch", "1024", "--resolution", "20", "--variant", "llvm_ad_rgb", "--exposures"]
+    options = ["--steps", "5", "--batch", "1024", "--resolution", "20", "--variant", "llvm_ad_rgb"]
     assert main(["fit", "field", str(path), "-o", str(path / "x.npz"), "--background", "surroundings",
                  "--grid", str(path / "grid.npz"), *options]) == 0  # fmt: skip
     patch.undo()
@@ -183,32 +181,9 @@ def test_damaged_cubes_are_refused(folder, tmp_path):
 
 
 def test_the_paper_preset_has_no_surroundings(folder, tmp_path, capsys):
-    for option, message in ((["--background", "surroundings"], "found surroundings with the preset paper"),
-                            (["--exposures"], "--exposures is an option of the preset sparse")):  # fmt: skip
-        output = ["-o", str(tmp_path / "x.npz"), "--variant", "llvm_ad_rgb", "--preset", "paper"]
-        assert main(["fit", "field", str(folder), *output, *option]) == 2
-        assert message in capsys.readouterr().err
-
-
-def test_exposures(folder, ad):
-    """They are recorded with a mean of 0, and the derivative of the loss is that of finite differences."""
-    tables = [load_table(folder / name) for name in ("grid.npz", "x.npz")]
-    stops = [np.array(t.settings["exposures"]) for t in tables]
-    assert all(s.shape == (4,) and abs(s.mean()) < 1e-3 and s.std() > 1e-3 for s in stops)
-    session = FieldSession.load(ad, folder, background="surroundings", exposures=True)
-    problem = grids.GridProblem(files.grid_of(files.load(folder / "grid.npz"), ad), session)
-    direction = np.float32([0.5, -1.0, 0.2, 0.9])
-
-    def loss(step, net=None):
-        net = net or {**problem.net, "exposures": ad.TensorXf(step * direction)}
-        return dr.sum(ImagesProblem.loss(problem, net, dr.rng(3), 2048))
-
-    net = {**problem.net, "exposures": ad.TensorXf(0 * direction)}
-    dr.enable_grad(net["exposures"])
-    dr.backward(loss(0, net))
-    gradient = float((dr.grad(net["exposures"]).numpy() * direction).sum())
-    assert gradient == pytest.approx((loss(0.05)[0] - loss(-0.05)[0]) / 0.1, rel=0.01)
-    assert loss(0, {**problem.net, "exposures": ad.TensorXf([1.0] * 4)})[0] == pytest.approx(loss(0)[0], rel=1e-5)
+    output = ["-o", str(tmp_path / "x.npz"), "--variant", "llvm_ad_rgb", "--preset", "paper"]
+    assert main(["fit", "field", str(folder), *output, "--background", "surroundings"]) == 2
+    assert "found surroundings with the preset paper" in capsys.readouterr().err
 
 
 def test_surroundings_in_a_scene(field, tmp_path, mi_rgb):

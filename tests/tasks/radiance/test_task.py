@@ -5,7 +5,6 @@ import gc
 import json
 import resource
 from pathlib import Path
-from types import SimpleNamespace
 
 import captures
 import drjit as dr
@@ -15,17 +14,18 @@ from PIL import Image
 
 from mi_diffind.arrays.tables import StoredArray, TableError, load_table, save_table
 from mi_diffind.commands.cli import main
-from mi_diffind.core.deadline import Deadline
 from mi_diffind.core.errors import UsageError
+from mi_diffind.core.progress import Deadline
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting import loop
 from mi_diffind.fitting.loop import FitSettings
 from mi_diffind.fitting.loop import fit as train
-from mi_diffind.fitting.task import FitRequest, fit, tasks
+from mi_diffind.fitting.task import fit, tasks
 from mi_diffind.images import metrics
-from mi_diffind.tasks.radiance import compression, files, nodes, rate_distortion, visual_hull
+from mi_diffind.tasks.radiance import compression, files, nodes
 from mi_diffind.tasks.radiance import fit as field_fit
 from mi_diffind.tasks.radiance import grid as grids
+from mi_diffind.tasks.radiance import views as view_files
 from mi_diffind.tasks.radiance.session import FieldSession, ViewImages, displayed, scores
 from mi_diffind.tasks.radiance.views import load_views
 
@@ -45,7 +45,7 @@ def short_grids():
     short = type(grid)(grid.layout, FitSettings(**{**vars(grid.settings), "steps": 60, "batch": 1024}))
     patch.setitem(field_fit.PRESETS, "grid", short)
     patch.setattr(field_fit, "VALUE_STEPS", 20)
-    patch.setattr(visual_hull, "SEARCH", 32)
+    patch.setattr(view_files, "SEARCH", 32)
     yield
     patch.undo()
 
@@ -158,30 +158,11 @@ def test_a_trial_with_a_part_of_the_nodes_can_be_coded(folder, ad, monkeypatch):
     monkeypatch.setattr(compression, "COLUMN", 3)
     grid = files.grid_of(files.load(folder / "grid.npz"), ad)
     rows = np.arange(1.0, grid.nodes.count + 1)
-    part, weights = compression.trial_part(grid, rate_distortion.Importance(rows, rows, np.ones(12), 1.0))
+    part, weights = compression.trial_part(grid, compression.Importance(rows, rows, np.ones(12), 1.0))
     assert 0 < part.nodes.count < 0.7 * grid.nodes.count
     assert len(part.density) == part.nodes.entries == len(weights.density) + 1 == len(weights.colour) + 1
     np.testing.assert_array_equal(part.density[1:], grid.density[1:][weights.density.astype(int) - 1])
     assert (nodes.corners_of(nodes.cells_of(part.nodes.stored)) == part.nodes.stored).all()
-
-
-@pytest.mark.parametrize(("psnr", "trained", "kept"), [(30, [2, 1], 2), (20, [2, 1, 0], 0), (50, [2, 3], 3)])
-def test_the_smallest_size_of_a_psnr(folder, ad, monkeypatch, capsys, psnr, trained, kept):
-    """Bisection among four sizes, whose field is their number here."""
-    tried = []
-
-    def compressed(self, grid, bits, stopped, suffix, slope):
-        tried.append(int(suffix[-1]))
-        return SimpleNamespace(arrays={}), SimpleNamespace(interrupted=False), tried[-1]
-
-    monkeypatch.setattr(field_fit, "LADDER", ((0.5, 6, 0.1), (0.7, 6, 0.1), (1.0, 7, 0.02), (1.0, 9, 0.001)))
-    monkeypatch.setattr(field_fit.FieldFit, "compressed", compressed)
-    monkeypatch.setattr(ViewImages, "evaluate", lambda self, field, ssim=False: {"psnr_white_db": 25.0 + 4 * field})
-    request = FitRequest("sparse", FitSettings(), ad, progress=False)
-    grid = files.grid_of(files.load(folder / "grid.npz"), ad)
-    assert field_fit.FieldFit(request, FieldSession.load(ad, folder)).smallest(grid, psnr, False)[2] == kept
-    assert tried == trained
-    assert ("were not reached" in capsys.readouterr().err) == (psnr == 50)
 
 
 def test_paper_preset(folder, tmp_path, ad):
@@ -291,7 +272,7 @@ def test_ctrl_c_keeps_what_there_is(folder, tmp_path, monkeypatch, late):
             ["--preset", "grid", "--bytes", "1M"],
             "--bytes is an option of the presets sparse and paper, found the preset grid",
         ),
-        (["--preset", "paper", "--psnr", "30"], "--psnr is an option of the preset sparse, found the preset paper"),
+        (["--preset", "paper", "--disk", "9k"], "--disk is an option of the preset sparse, found the preset paper"),
         (["--bytes", "100"], "--bytes: 100 bytes are fewer than the smallest field needs"),
         (["--disk", "100"], "--disk: 100 bytes are fewer than a file needs"),
         (["--disk", "9k", "--bytes", "9k"], "not allowed with argument"),
@@ -309,7 +290,7 @@ def test_options_that_do_not_go_together(folder, tmp_path, capsys, more, message
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("name", ["state.grid.npz", "state.stage0", "state.size7"])
+@pytest.mark.parametrize("name", ["state.grid.npz", "state.stage0"])
 def test_files_beside_a_checkpoint_are_not_replaced(folder, tmp_path, name):
     given = {"grid": str(tmp_path / name)} if name != "state.grid.npz" else {"output": tmp_path / name}
     with pytest.raises(UsageError, match=f'{name}", the same file as a file beside --checkpoint'):
@@ -332,7 +313,7 @@ def test_a_grid_of_other_views_is_refused(folder, tmp_path, capsys):
 def test_damaged_files_are_refused(folder, tmp_path, fault):
     table, path = load_table(folder / "ball.npz"), tmp_path / "damaged.npz"
     if fault in ("cells", "index", "bits"):
-        table = files.sparse(table)
+        table = earlier_layout(table)
     arrays = table.arrays
     if fault == "layout":
         table.settings["layout"] = "cube"
@@ -357,6 +338,18 @@ def test_damaged_files_are_refused(folder, tmp_path, fault):
         files.load(path)
 
 
+def earlier_layout(table):
+    """A table in the layout of earlier versions: six bits a level, and indices that are not packed."""
+    flags, numbers = files.palette_arrays(table)
+    index = numbers.index.astype("<u2").view(np.uint8).reshape(-1, 2)
+    arrays = {
+        "cells": files.byte_array(flags[:, None]), "palette": numbers.palette, "index": files.byte_array(index),
+        "density": files.byte_array(4 * numbers.levels[:, None], 0.25, numbers.density_range[0]),
+    }  # fmt: skip
+    settings = {name: value for name, value in table.settings.items() if not name.startswith("density_")}
+    return dataclasses.replace(table, arrays=arrays, settings={**settings, "layout": "sparse", "index_bits": 12})
+
+
 def test_files_with_a_density_curve_are_refused(folder, tmp_path):
     """Files of the version with a learned density curve; the message says how to make them again."""
     table, path = load_table(folder / "ball.npz"), tmp_path / "old.npz"
@@ -370,14 +363,14 @@ def test_files_with_a_density_curve_are_refused(folder, tmp_path):
 
 
 def test_hull_and_box(folder, monkeypatch):
-    monkeypatch.setattr(visual_hull, "SEARCH", 64)
+    monkeypatch.setattr(view_files, "SEARCH", 64)
     views = load_views(folder, "train")
-    lower, upper = visual_hull.box_of(views)
+    lower, upper = view_files.box_of(views)
     assert np.all(lower < [-0.3, -0.5, -0.5]) and np.all(upper > [0.7, 0.5, 0.5])
     assert np.all(upper - lower < 1.8)
     spacing = 0.05
     shape = np.ceil((upper - lower) / spacing).astype(int) + 1
-    inside = visual_hull.hull(views, lower, spacing, shape)
+    inside = view_files.hull(views, lower, spacing, shape)
     at = np.stack(np.meshgrid(*[a + spacing * np.arange(n) for a, n in zip(lower, shape, strict=True)], indexing="ij"))
     distance = np.linalg.norm(at - np.array([0.2, 0, 0])[:, None, None, None], axis=0)
     assert inside[distance < 0.5].all() and inside[distance > 0.75].mean() < 0.01
@@ -419,7 +412,7 @@ def test_importance_is_what_a_change_costs(folder, ad, rng):
     """Against differences: changes of important and of other nodes change the images as their importance says."""
     grid = files.grid_of(files.load(folder / "grid.npz"), ad)
     session = FieldSession.load(ad, folder)
-    weights, images = rate_distortion.importance(grid, session, 0), session.images
+    weights, images = compression.importance(grid, session, 0), session.images
     order, ratios = np.argsort(weights.colour), []
     before = [displayed(images.render(grid.field(), v)) for v in range(len(images.views))]
     for nodes_of in (order[-40:], order[len(order) // 2 :][:40]):
@@ -467,10 +460,10 @@ def test_structural_similarity(rng):
     assert metrics.ssim_published(truth[:10], image[:10]) is None
 
 
-def test_divided_grids_are_what_they_were(folder, ad, rng):
+def test_refined_grids_are_what_they_were(folder, ad, rng):
     grid = files.grid_of(files.load(folder / "grid.npz"), ad)
     images = ViewImages(ad, load_views(folder, "train"))
-    finer = grids.divided(grid, grids.widened(grids.visible(grid, images)), 2)
+    finer = grids.refine(grid, grids.dilate(grids.visible(grid, images)), 2)
     cells = nodes.cells_of(finer.nodes.stored)
     places = np.argwhere(cells)[rng.choice(cells.sum(), 500)] + 0.5
     p = ad.Array3f((np.array(finer.nodes.lower) + finer.nodes.spacing * places).T.astype(np.float32))
@@ -505,30 +498,30 @@ def test_views_without_alpha(tmp_path, capsys):
     assert "no alpha" in capsys.readouterr().err
 
 
-def test_sizes(folder, ad):
+def test_sizes(folder, ad, monkeypatch):
+    monkeypatch.setattr(compression, "SLOPE", 0.0)  # so that all colours are used
     grid = files.grid_of(files.load(folder / "grid.npz"), ad)
     session = FieldSession.load(ad, folder)
-    weights = rate_distortion.importance(grid, session, 0)
+    weights = compression.importance(grid, session, 0)
     for bits in (6, 8):
-        problem = compression.PaletteProblem(compression.palette_coding(grid, weights, bits, 0, 0.0), session)
-        table = files.palette_table(grid.nodes, problem.stored())
+        problem = compression.PaletteProblem(compression.palette_coding(grid, weights, bits, 0), session)
+        table = files.palette_table(grid.nodes, problem.numbers())
         assert files.field_of(table, ad).nbytes == pytest.approx(compression.packed_bytes(grid, bits), rel=0.01)
 
 
 def test_the_layout_of_before(folder, tmp_path, ad):
-    """A file with six bits a level and unpacked indices has the field of the coded one."""
-    coded, path = load_table(folder / "ball.npz"), tmp_path / "sparse.npz"
-    table = files.sparse(coded)
-    levels = table.arrays["density"]
-    assert levels.scale[0] == 1
-    table.arrays["density"] = files.byte_array(levels.entries * 4, 0.25, levels.offset[0])
-    table.settings["index_bits"] = 12
-    del table.settings["density_bits"]
-    save_table(path, table)
-    assert files.load(path).settings["layout"] == "sparse"
+    """A file of the earlier layout has the field of the coded one, and optimised arrays are written as coded ones."""
+    coded, path = folder / "ball.npz", tmp_path / "sparse.npz"
+    save_table(path, earlier_layout(load_table(coded)))
+    table = files.load(path)
+    assert table.settings["layout"] == "sparse" and files.palette_arrays(table)[1].density_range[1] == 0.25
+    optimised, again = files.stored(table, files.field_of(table, ad, "float32").arrays), tmp_path / "again.npz"
+    save_table(again, optimised)
+    assert files.load(again).settings["layout"] == "coded"
     held_out = ViewImages(ad, load_views(folder, "test"))
-    pictures = [held_out.render(tasks()["field"].open(ad.TensorXf, p).field, 0) for p in (folder / "ball.npz", path)]
-    np.testing.assert_allclose(*pictures, atol=1e-6)
+    first, *others = (held_out.render(tasks()["field"].open(ad.TensorXf, p).field, 0) for p in (coded, path, again))
+    for picture in others:
+        np.testing.assert_allclose(picture, first, atol=1e-6)
 
 
 @pytest.mark.slow
@@ -558,5 +551,5 @@ def test_a_view_that_sees_nothing(folder):
         poses=np.concatenate([views.poses, away[None]]), focal=np.concatenate([views.focal, views.focal[:1]]),
         centre=np.concatenate([views.centre, views.centre[:1]]), names=(*views.names, "away.png"),
     )  # fmt: skip
-    made = [visual_hull.hull(v, (-0.5, -0.7, -0.7), 0.07, (18, 20, 20)) for v in (views, more)]
+    made = [view_files.hull(v, (-0.5, -0.7, -0.7), 0.07, (18, 20, 20)) for v in (views, more)]
     assert made[0].sum() > 500 and (made[0] & ~made[1]).sum() < 0.02 * made[0].sum()

@@ -10,15 +10,13 @@ import drjit.llvm.ad as llvm
 import numpy as np
 import OpenEXR
 import pytest
-from captures import SIZE, Fog, change, pose, write_blender, write_image, write_json
+from captures import SIZE, Fog, change, pose, write_blender, write_image
 from PIL import Image
 
 from mi_diffind.images import srgb
 from mi_diffind.tasks.radiance import session
-from mi_diffind.tasks.radiance.session import TILE, FieldSession, ViewImages
-from mi_diffind.tasks.radiance.training import ImagesProblem
-from mi_diffind.tasks.radiance.views import ViewsError, load_views
-from mi_diffind.tasks.radiance.visual_hull import hull
+from mi_diffind.tasks.radiance.session import TILE, FieldSession, ImagesProblem, ViewImages
+from mi_diffind.tasks.radiance.views import ViewsError, hull, load_views
 
 
 def test_few_views_of_many_are_evenly_spread(blender):
@@ -42,8 +40,6 @@ def test_compressed_views_are_the_same(blender, suffix):
     for a, b in zip(packed.chosen(numbers).names, numbers, strict=True):
         assert a == views.names[b]
     np.testing.assert_array_equal(packed.chosen(numbers).image(1), views.image(1))
-    with pytest.raises(ValueError, match="compressed"):
-        _ = ViewImages(llvm, packed).pixels
 
 
 def test_a_limit_of_pixels_leaves_out_held_out_views(blender):
@@ -70,18 +66,6 @@ def linear(byte):
     """IEC 61966-2-1, of one number."""
     c = byte / 255
     return c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4
-
-
-def test_blender_layout(blender):
-    views = load_views(blender)
-    assert len(views) == 4 and np.array_equal(views.sizes, [SIZE] * 4) and views.pixels.nbytes == 4 * 4 * 6 * 8
-    assert views.names == tuple(f"train/r_{i}.png" for i in range(4)) and views.has_alpha and views.box is None
-    assert np.array_equal(views.poses, [pose(i) for i in range(4)]) and np.array_equal(views.origins[:, 0], range(4))
-    assert np.allclose(views.focal, 4 / np.tan(0.35)) and np.array_equal(views.centre[0], [4, 3])
-    assert len(load_views(blender, "test")) == 2
-    with pytest.raises(ViewsError, match=r"transforms_val\.json: no such file$"):
-        load_views(blender, "val")
-    assert load_views(blender).digest == views.digest != load_views(blender, "test").digest
 
 
 def test_pixels_are_linear_and_multiplied_by_alpha(blender):
@@ -227,166 +211,6 @@ def test_a_box_is_read(blender):
 
 
 @pytest.fixture
-def studio(tmp_path):
-    """Ten views as nerfstudio writes them."""
-    (tmp_path / "images").mkdir()
-    frames = []
-    for i in range(10):
-        write_image(tmp_path / "images" / f"frame_{i:05d}.png", i, channels=3)
-        frames.append({"file_path": f"images/frame_{i:05d}.png", "transform_matrix": pose(i), "colmap_im_id": i})
-    write_json(
-        tmp_path / "transforms.json", w=8, h=6, fl_x=10.0, fl_y=11.0, cx=4.5, cy=3.25, k1=0.0, k2=0, p1=0.0, p2=0.0,
-        camera_model="OPENCV", applied_transform=np.eye(4)[:3].tolist(), frames=frames,
-    )  # fmt: skip
-    return tmp_path
-
-
-def test_nerfstudio_layout(studio):
-    train, test = load_views(studio), load_views(studio, "test")
-    assert [name[-6:-4] for name in test.names] == ["00", "08"] and len(train) == 8
-    assert np.array_equal(train.focal, [[10, 11]] * 8) and np.array_equal(train.centre, [[4.5, 3.25]] * 8)
-    assert np.array_equal(train.poses[0], pose(1)) and not train.has_alpha
-    listed = [f"images/frame_{i:05d}.png" for i in range(10)]
-    change(studio, "transforms.json", train_filenames=listed[3:], test_filenames=listed[:2])
-    assert [name[-6:-4] for name in load_views(studio, "test").names] == ["00", "01"]
-    assert len(load_views(studio)) == 7
-    with pytest.raises(ViewsError, match=r'has no list "val_filenames"'):
-        load_views(studio, "val")
-    change(studio, "transforms.json", test_filenames=["images/other.png"])
-    with pytest.raises(ViewsError, match=r"test_filenames\" names 'images/other.png', which is not among the frames$"):
-        load_views(studio, "test")
-
-
-def test_cameras_of_single_frames(studio):
-    change(studio, "transforms.json", frame=3, fl_x=12.0, cx=4.0)
-    views = load_views(studio)
-    assert views.focal[2].tolist() == [12, 11] and views.centre[2].tolist() == [4, 3.25]
-    assert views.focal[1].tolist() == [10, 11]
-
-
-@pytest.mark.parametrize(
-    "changes, message",
-    [
-        ({"camera_model": "OPENCV_FISHEYE"}, "has the camera model 'OPENCV_FISHEYE', allowed are PINHOLE, "),
-        ({"is_fisheye": True}, "has the camera model 'fisheye', allowed are PINHOLE, "),
-        ({"k1": "0.02"}, "has the \"k1\" '0.02', expected a number"),
-        ({"fl_x": None}, "has no focal length"),
-        ({"fl_x": 0}, 'has the "fl_x" 0, expected a number > 0'),
-        ({"fl_x": "10"}, "has the \"fl_x\" '10', expected a number"),
-        ({"camera_angle_x": 4.0}, 'has the "camera_angle_x" 4, expected radians'),
-        ({"camera_angle_x": 1e-320}, 'has the "camera_angle_x" .*, expected radians between 1e-06 and π'),
-        ({"cx": 1e308}, 'has the "cx" 1e\\+308, expected a number between -1e\\+09 and 1e\\+09'),
-        ({"k2": -1e300}, 'has the "k2" -1e\\+300, expected a number between'),
-        (
-            {"k1": -1e6, "cx": -900.0},
-            r"transforms\.json: no pixel counts: masks or lens distortions exclude all of 8 i",
-        ),
-        ({"w": 16}, "has 8 × 6 pixels, .*json says 16 × 6"),
-        ({"frames": []}, 'has no "frames"'),
-        ({"frames": [{"transform_matrix": 1}]}, 'frame 0 has no "file_path"'),
-    ],
-)
-def test_cameras_that_are_refused(studio, changes, message):
-    change(studio, "transforms.json", **changes)
-    with pytest.raises(ViewsError, match=message) as e:
-        load_views(studio)
-    assert "\n" not in str(e.value) and str(studio) in str(e.value)
-
-
-def shear():
-    matrix = np.array(pose())
-    matrix[0, 1] = 0.04
-    matrix[:, 1] /= np.linalg.norm(matrix[:3, 1])
-    return matrix.tolist()
-
-
-def mirror():
-    return (np.array(pose()) * [1, 1, -1, 1]).tolist()
-
-
-@pytest.mark.parametrize(
-    "matrix, message",
-    [
-        (None, 'has no "transform_matrix"'),
-        (pose(np.nan), "with NaN or infinite numbers"),
-        (pose(0, 0.5), r"that scales \(columns of length 0.5, 0.5, 0.5\)"),
-        (shear(), "that shears"),
-        (mirror(), "that mirrors"),
-        (np.eye(3).tolist(), r"of the shape \(3, 3\), expected \(4, 4\)"),
-        ([[1, 2], [3]], "that is not a matrix of numbers"),
-        (np.ones((4, 4)).tolist(), "whose last row is not 0, 0, 0, 1"),
-    ],
-)
-def test_poses_that_are_refused(blender, matrix, message):
-    change(blender, frame=2, transform_matrix=matrix)
-    with pytest.raises(ViewsError, match=message) as e:
-        load_views(blender)
-    assert 'transforms_train.json: frame "./train/r_2" has' in str(e.value)
-
-
-def test_a_principal_point_in_shares_of_the_image_is_named(studio):
-    change(studio, "transforms.json", cx=0.56, cy=0.54)
-    (note,) = [note for note in load_views(studio).notes if "principal point" in note]
-    assert '"cx" and "cy" in pixels are expected' in note and "(0.56, 0.54) of frame_00001.png" in note
-    change(studio, "transforms.json", cx=5.5, cy=2.0)
-    assert not any("principal point" in note for note in load_views(studio).notes)
-
-
-def test_rotations_within_the_tolerance_of_lengths_do_not_shear(blender):
-    change(blender, frame=2, transform_matrix=pose(2, 1.0008))
-    assert np.array_equal(load_views(blender).poses[2], pose(2, 1.0008))
-
-
-def test_a_pose_of_three_rows_is_taken(blender):
-    change(blender, frame=2, transform_matrix=pose(2)[:3])
-    assert np.array_equal(load_views(blender).poses[2], pose(2))
-
-
-def test_images_that_are_refused(blender):
-    path = blender / "train" / "r_1.png"
-    data = path.read_bytes()
-    for broken in (data[: len(data) // 2], b"", b"not an image", data[:40] + b"\0" * 40 + data[80:]):
-        path.write_bytes(broken)
-        with pytest.raises(ViewsError, match=r"r_1\.png: cannot be read as an image"):
-            load_views(blender)
-    Image.fromarray(np.zeros(SIZE, np.uint16)).save(path)
-    with pytest.raises(ViewsError, match=r"r_1\.png: has pixels of the mode I"):
-        load_views(blender)
-    path.unlink()
-    (blender / "train" / "r_1.exr").write_bytes(b"no")
-    with pytest.raises(ViewsError, match=r"r_1\.exr: cannot be read as an image"):
-        load_views(blender)
-    with OpenEXR.File({"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage},
-                      {"Z": np.zeros(SIZE, np.float32)}) as file:  # fmt: skip
-        file.write(str(blender / "train" / "r_1.exr"))
-    with pytest.raises(ViewsError, match=r"has the channels Z, expected R, G, B or Y, and A"):
-        load_views(blender)
-
-
-def test_folders_that_are_refused(blender, tmp_path):
-    with pytest.raises(ViewsError, match=r"missing: no such folder$"):
-        load_views(tmp_path / "missing")
-    with pytest.raises(ViewsError, match=r"json: is not a folder$"):
-        load_views(blender / "transforms_train.json")
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(ViewsError, match=r"holds no views: neither transforms_train\.json nor transforms\.json"):
-        load_views(tmp_path / "empty")
-    content = json.loads((blender / "transforms_train.json").read_text())
-    write_json(blender / "transforms_train.json", **{**content, "frames": content["frames"][:1]})
-    with pytest.raises(ViewsError, match=r"has 1 view for training, at least 2 are needed"):
-        load_views(blender)
-    for broken in ("{", "[1, 2]", "{}"):
-        (blender / "transforms_train.json").write_text(broken)
-        with pytest.raises(ViewsError, match=r"transforms_train\.json: (is not valid JSON|has no \"frames\")"):
-            load_views(blender)
-    with pytest.raises(ValueError, match=r'split: found "all", allowed are train, test, val'):
-        load_views(blender, "all")
-
-
-# -- masks -----------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
 def masked(blender):
     """The third training view and the first test view with masks: a rectangle does not count."""
     mask = np.full(SIZE, 255, np.uint8)
@@ -425,29 +249,6 @@ def test_masked_pixels_carve_nothing(masked):
     change(masked, frame=2, mask_path=None)
     carved = hull(load_views(masked), *box)
     assert (carved <= inside).all() and inside.sum() > 2 * carved.sum() and inside.any()
-
-
-def test_masks_that_are_refused(masked):
-    Image.fromarray(np.zeros((3, 3), np.uint8)).save(masked / "mask.png")
-    with pytest.raises(ViewsError, match=r"mask\.png: has 3 × 3 pixels, its image r_2\.png has 8 × 6$"):
-        load_views(masked)
-    (masked / "mask.png").write_bytes(b"no")
-    with pytest.raises(ViewsError, match=r"mask\.png: cannot be read as a mask"):
-        load_views(masked)
-    (masked / "mask.png").unlink()
-    with pytest.raises(ViewsError, match=r"mask\.png: no such image"):
-        load_views(masked)
-    change(masked, frame=2, mask_path=3)
-    with pytest.raises(ViewsError, match=r'frame 2 has a "mask_path" that is no name of a file$'):
-        load_views(masked)
-
-
-def test_what_nerfstudio_applied_is_kept_and_recorded(studio):
-    views = load_views(studio)
-    assert views.settings == {"applied_transform": np.eye(4)[:3].tolist()}
-    change(studio, "transforms.json", aabb_scale=16, scale=0.33, offset=[0.5, 0.5, 0.5], applied_transform=None)
-    again = load_views(studio)
-    assert again.settings == {} and np.array_equal(again.poses, views.poses) and again.box is None
 
 
 class Clear(Fog):

@@ -11,7 +11,7 @@ from scipy.ndimage import map_coordinates
 from sdf_fields import TrilinearField
 
 from mi_diffind.core.errors import DiffindError
-from mi_diffind.tasks.sdf import evaluation, extraction, grids
+from mi_diffind.tasks.sdf import evaluation, grids
 from mi_diffind.tasks.sdf.distances import Distances
 from mi_diffind.tasks.sdf.evaluation import BAND, PADDING, SurfaceEvaluation
 from mi_diffind.tasks.sdf.field import DistanceField
@@ -194,21 +194,21 @@ def test_buried_surfaces_do_not_count():
 @pytest.mark.parametrize("resolution", [33, 100])
 def test_a_decoded_ball(ball, held_out, resolution):
     """Closed over all blocks, wound outwards, in the frame of the file, and where the ball's surface is."""
-    mesh = extraction.extract(Ball(0.4, (0.05, -0.02, 0.01)), resolution, 4.0, (1, 2, 3))
+    mesh = grids.extract(Ball(0.4, (0.05, -0.02, 0.01)), resolution, 4.0, (1, 2, 3))
     assert mesh.is_watertight and mesh.is_winding_consistent
     radius = np.linalg.norm((mesh.vertices - np.array((1, 2, 3))) / 4 - np.array((0.05, -0.02, 0.01)), axis=1)
     assert np.abs(radius - 0.4).max() < 0.3 * (1.1 / resolution) ** 2 / 0.4 + 2e-5
-    volumes = extraction.components(mesh)
+    volumes = grids.components(mesh)
     assert len(volumes) == 1 and volumes[0] == pytest.approx(
         4**3 * 4 / 3 * math.pi * 0.4**3, rel=10 / resolution**2 + 1e-3
     )
 
 
 def test_what_the_box_cuts_is_closed():
-    mesh = extraction.extract(Ball(0.5, band=1, half=0.4), 40)
-    assert mesh.is_watertight and len(extraction.components(mesh)) == 1
+    mesh = grids.extract(Ball(0.5, band=1, half=0.4), 40)
+    assert mesh.is_watertight and len(grids.components(mesh)) == 1
     assert np.abs(mesh.vertices).max() < 0.4 + 0.8 / 40 and mesh.volume > 0.8 * 0.5
-    full = extraction.extract(Ball(9, band=1, half=0.4), 16)
+    full = grids.extract(Ball(9, band=1, half=0.4), 16)
     assert full.is_watertight and full.volume == pytest.approx(0.8**3, rel=0.15)
 
 
@@ -218,10 +218,10 @@ def test_pieces_and_cavities():
             return dr.maximum(super().value(p, active), 0.1 - dr.norm(p))
 
     field = Union(Shell(0.3), Ball(0.03, (0.45, 0.45, 0.45)), Ball(0.02, (-0.45, 0.4, 0)))
-    volumes = extraction.components(extraction.extract(field, 120)) / (4 / 3 * math.pi)
+    volumes = grids.components(grids.extract(field, 120)) / (4 / 3 * math.pi)
     assert volumes == pytest.approx([0.3**3, -(0.1**3), 0.03**3, 0.02**3], rel=0.15)
-    empty = extraction.extract(Ball(-1.0), 64)
-    assert len(empty.faces) == 0 and len(extraction.components(empty)) == 0
+    empty = grids.extract(Ball(-1.0), 64)
+    assert len(empty.faces) == 0 and len(grids.components(empty)) == 0
 
 
 def test_values_on_nodes_make_no_cracks():
@@ -234,7 +234,7 @@ def test_values_on_nodes_make_no_cracks():
     ):
         n = np.array(values.shape)
         field = TrilinearField(T.TensorXf(values.astype(np.float32)), [0, 0, 0], (n - 1) / 8, 1.0)
-        mesh = extraction.extract(field, int(n.max()) - 1)
+        mesh = grids.extract(field, int(n.max()) - 1)
         count = np.unique(np.sort(mesh.edges, axis=1) @ [len(mesh.vertices), 1], return_counts=True)[1]
         assert np.all(count % 2 == 0) and mesh.is_winding_consistent and mesh.volume > 0
 
@@ -244,13 +244,13 @@ def test_nan_is_outside():
     values[3:6, 3:6, 3:6] = -1
     values[0, 0, 0] = math.nan
     values[5, 5, 5] = math.nan
-    mesh = extraction.extract(TrilinearField(T.TensorXf(values), [-1] * 3, [1] * 3, 1.0), 8)
-    assert np.isfinite(mesh.vertices).all() and mesh.is_watertight and len(extraction.components(mesh)) == 1
+    mesh = grids.extract(TrilinearField(T.TensorXf(values), [-1] * 3, [1] * 3, 1.0), 8)
+    assert np.isfinite(mesh.vertices).all() and mesh.is_watertight and len(grids.components(mesh)) == 1
 
 
 @pytest.mark.parametrize("resolution", [3, 1025, 12.5, True, "64", None])
 def test_resolutions_that_are_none(resolution):
-    for function in (extraction.extract, grids.grid):
+    for function in (grids.extract, grids.grid):
         with pytest.raises(DiffindError, match=r"resolution: found .*, allowed are whole numbers from 4 to 1024"):
             function(Ball(0.5), resolution)
 
@@ -321,7 +321,7 @@ def test_chamfer(ball, held_out):
     """Of concentric spheres, the difference of radii; of a sphere and half of it, only one way."""
     mesh, _ = ball
     for radius in (0.49, 0.5):
-        decoded = extraction.extract(Ball(radius), 150, mesh.scale, mesh.centre)
+        decoded = grids.extract(Ball(radius), 150, mesh.scale, mesh.centre)
         measured = held_out.chamfer(decoded, 2**14)
         assert measured["chamfer"] == pytest.approx(0.5 - radius, abs=2e-4) and measured["components"] == 1
         assert measured["components_mesh"] == 1
@@ -348,7 +348,7 @@ def test_components_of_overlapping_pieces():
         e = SurfaceEvaluation(mesh, d, count=2**8, band=WIDE)
         assert mesh.components == 3 and e.components == 2
         truth = e.truth(64)
-    assert truth.is_watertight and len(extraction.components(truth)) == 2
+    assert truth.is_watertight and len(grids.components(truth)) == 2
     lens = math.pi * 2 * (1 - 1 / 2) ** 2 * (1 - (1 - 1 / 2) / 3)
     volume = 2 * 4 / 3 * math.pi - lens + 4 / 3 * math.pi / 8
     assert truth.volume == pytest.approx(volume, rel=0.05)

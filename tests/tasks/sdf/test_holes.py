@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import solid_meshes as solids
 
+from mi_diffind.arrays.sparse_grid import CORNERS
 from mi_diffind.core.runtime import array_module
-from mi_diffind.tasks.sdf import codes, encoding, extraction, grids, nodes
+from mi_diffind.tasks.sdf import encoding, grids, nodes
 from mi_diffind.tasks.sdf.distances import Distances
 from mi_diffind.tasks.sdf.field import DistanceField
 from mi_diffind.tasks.sdf.mesh import load_mesh, make_mesh
@@ -48,7 +49,7 @@ def coded(types, sampled, bits=8):
     pointers = encoding.assign(wanted, entries)
     values = nodes.decoded_nodes(sampled.structure, frames, entries[pointers]).astype(np.float64)
     slope = nodes.slope_bound(values[:, 0], values[:, 1:], sampled.corners)
-    words = codes.pointer_words(pointers, bits)
+    words = nodes.pointer_words(pointers, bits)
     return nodes.coded_field(types, sampled.structure, slope, frames, words, bits, entries)
 
 
@@ -71,7 +72,7 @@ def test_wrong_nodes_make_no_floaters(types, sampled):
     points = sample_box(field.lower, field.upper, 40000, 5)
     cell = np.floor((points - field.lower) / field.spacing).astype(int)
     stored = set(map(tuple, s.structure.node_positions()[0].tolist()))
-    corners = (cell[:, None] + np.array(nodes.CORNERS)).tolist()
+    corners = (cell[:, None] + CORNERS).tolist()
     count = np.array([sum(tuple(c) in stored for c in eight) for eight in corners])
     inside = distances.inside(points)
     wrong = (field.value(vectors(types, points)).numpy() < 0) != inside
@@ -82,7 +83,7 @@ def test_wrong_nodes_make_no_floaters(types, sampled):
 def test_as_many_pieces_as_the_mesh(types, sampled):
     """Also after coding, decoded finer than the field's cells: two solids, one with a cavity, and nothing else."""
     distances, s = sampled
-    volumes = extraction.components(extraction.extract(coded(types, s), 108)) * distances.mesh.scale**3
+    volumes = grids.components(grids.extract(coded(types, s), 108)) * distances.mesh.scale**3
     assert len(volumes) == 3 and np.sum(volumes < 0) == 1
     assert volumes[1] == pytest.approx(-4 / 3 * math.pi * 0.6**3, rel=0.05)
     assert volumes[2] == pytest.approx(0.5**3, rel=0.05)
@@ -91,13 +92,11 @@ def test_as_many_pieces_as_the_mesh(types, sampled):
 def test_empty_blocks_are_left_out_of_decoding(types, sampled, monkeypatch):
     """The same triangles, whether all of the grid is looked at or what is near stored nodes only."""
     field = coded(types, sampled[1])
-    few = extraction.extract(field, 100)
+    few = grids.extract(field, 100)
     blocks = grids.crossed_blocks(field, np.array(field.lower), 1 / 100, [100] * 3)
     assert blocks.shape == (4, 4, 4) and 0.2 < blocks.mean() < 0.95
-    monkeypatch.setattr(
-        extraction, "crossed_blocks", lambda field, lower, spacing, cells: np.ones(-(-cells // 32), bool)
-    )
-    every = extraction.extract(field, 100)
+    monkeypatch.setattr(grids, "crossed_blocks", lambda field, lower, spacing, cells: np.ones(-(-cells // 32), bool))
+    every = grids.extract(field, 100)
     assert np.array_equal(few.vertices, every.vertices) and np.array_equal(few.faces, every.faces)
 
 
@@ -110,7 +109,7 @@ def shoot(types, distances, field, count, seed):
     each at a place that lies deeper inside than the field's cells are wide: how many go through, how many end elsewhere
     than on the surface.
     """
-    from mi_diffind.tasks.sdf.tracing import trace
+    from mi_diffind.tasks.sdf.marching import trace
 
     rng = np.random.default_rng(seed)
     h = field.spacing

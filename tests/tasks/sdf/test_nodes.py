@@ -1,14 +1,12 @@
 """The sparse layout of signed distance fields: masks, codes, what cells say."""
 
-import dataclasses
-
 import drjit as dr
 import numpy as np
 import pytest
 from solid_meshes import box, sphere, together
 
 from mi_diffind.core.runtime import array_module
-from mi_diffind.tasks.sdf import codes, encoding, extraction, nodes, structure
+from mi_diffind.tasks.sdf import encoding, grids, nodes
 from mi_diffind.tasks.sdf.distances import Distances
 from mi_diffind.tasks.sdf.mesh import make_mesh
 
@@ -41,7 +39,7 @@ def coded(types, sampled, bits=8):
     wanted = encoding.exact_entries(sampled, frames)
     entries = encoding.cluster(wanted, min(2**bits, len(wanted)))
     pointers = encoding.assign(wanted, entries)
-    words = codes.pointer_words(pointers, bits)
+    words = nodes.pointer_words(pointers, bits)
     return nodes.coded_field(types, sampled.structure, 3.0, frames, words, bits, entries), frames, entries[pointers]
 
 
@@ -62,31 +60,6 @@ def test_every_node_of_the_grid_has_its_sign(ad, solid):
     assert np.array_equal((result < 0)[sure], inside[sure])
 
 
-def test_positions_follow_from_masks(solid):
-    _, _, sampled = solid
-    s = sampled.structure
-    positions, block = s.node_positions()
-    assert len(positions) == s.nodes == len(np.unique(positions, axis=0))
-    assert np.array_equal(positions // 4 * 4, s.block_positions()[block])
-    # The corners of a cell, z fastest
-    corner = positions[sampled.corners]
-    assert np.array_equal(corner - corner[:, :1], np.broadcast_to(nodes.CORNERS, corner.shape))
-    signs = (sampled.distances < 0)[sampled.corners]
-    assert np.all(signs.any(axis=1) & ~signs.all(axis=1))
-
-
-@pytest.mark.parametrize(
-    ("changes", "says"),
-    [
-        ({"block_masks": np.zeros((1, 2), np.uint32)}, "blocks have nodes, found masks for 1"),
-        ({"region_masks": np.zeros((0, 2), np.uint32)}, "regions have nodes, found masks for 0"),
-    ],
-)
-def test_masks_that_do_not_go_together(solid, changes, says):
-    with pytest.raises(structure.StructureError, match=says):
-        dataclasses.replace(solid[2].structure, **changes).check()
-
-
 # -- codes -------------------------------------------------------------------------------------------------------------
 
 
@@ -95,13 +68,13 @@ def test_frames_are_the_same_for_both_kinds_of_arrays(ad, rng):
     n /= np.linalg.norm(n, axis=1, keepdims=True)
     n[:6] = [[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [0, 0, -1]]
     d, s = rng.uniform(-4.4, 4.4, 2000), 2.0 ** rng.uniform(-6.9, 0.4, 2000)
-    words = codes.frame_words(n, d, s)
-    axes, distance, scale = codes.frames(words)
+    words = nodes.frame_words(n, d, s)
+    axes, distance, scale = nodes.unpack_frames(words)
     normal = np.stack(axes, axis=1)
     assert np.degrees(np.arccos(np.sum(normal * n, axis=1).clip(-1, 1))).max() < 0.25
     assert np.abs(distance - d).max() <= 4.5 / 255 + 1e-9
     assert np.all(np.abs(np.log2(scale / s)) <= 0.2501)
-    n, e, k = codes.frames(ad.UInt32(words), ad.Float)
+    n, e, k = nodes.unpack_frames(ad.UInt32(words), ad.Float)
     assert np.allclose(np.stack([v.numpy() for v in n], axis=1), normal, atol=2e-6)
     assert np.allclose(e.numpy(), distance, atol=1e-6) and np.allclose(k.numpy(), scale, rtol=1e-6)
 
@@ -113,8 +86,8 @@ def test_residuals_reach_every_direction(rng):
     n, g = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (n, g))
     offsets, d, s = rng.uniform(-1.5, 1.5, (count, 3)), rng.uniform(-2, 2, count), 2.0 ** rng.integers(-4, 1, count)
     distance = rng.uniform(-2, 2, count)
-    entry = codes.residuals(distance, g, offsets, tuple(n.T), d, s)
-    back, normal = codes.decode_nodes(tuple(entry.T), tuple(n.T), d, s, tuple(offsets.T))
+    entry = nodes.residuals(distance, g, offsets, tuple(n.T), d, s)
+    back, normal = nodes.decode_nodes(tuple(entry.T), tuple(n.T), d, s, tuple(offsets.T))
     opposite = np.sum(n * g, axis=1) < -0.99
     assert np.allclose(back, distance, atol=1e-9)
     assert np.allclose(np.stack(normal, axis=1)[~opposite], g[~opposite], atol=1e-6)
@@ -125,17 +98,17 @@ def test_residuals_reach_every_direction(rng):
 def test_entries_beyond_the_projections_edge_stay_unit_vectors():
     n = tuple(np.array([[0.0, 0.6, 0.8]]).T)
     for a in (1.9, 1.9999, 2.5, 100.0):
-        _, normal = codes.decode_nodes((0.0, np.array([a]), np.array([0.0])), n, 0.0, 1.0, (0.0, 0.0, 0.0))
+        _, normal = nodes.decode_nodes((0.0, np.array([a]), np.array([0.0])), n, 0.0, 1.0, (0.0, 0.0, 0.0))
         assert np.isclose(np.linalg.norm(np.array(normal)), 1, atol=1e-6), a
 
 
-@pytest.mark.parametrize("bits", codes.POINTERS)
+@pytest.mark.parametrize("bits", nodes.POINTERS)
 def test_pointers_in_words(ad, bits, rng):
     values = rng.integers(2**bits, size=1001).astype(np.uint32)
-    words = codes.pointer_words(values, bits)
-    assert np.array_equal(codes.pointers_of(words, bits, 1001), values)
+    words = nodes.pointer_words(values, bits)
+    assert np.array_equal(nodes.unpack_pointers(words, bits, 1001), values)
     index = ad.UInt32(rng.permutation(1001).astype(np.uint32))
-    result = codes.pointer_at(ad.UInt32(words), index, bits, ad.Bool(True))
+    result = nodes.pointer_at(ad.UInt32(words), index, bits, ad.Bool(True))
     assert np.array_equal(result.numpy(), values[index.numpy()])
 
 
@@ -264,9 +237,9 @@ def test_the_surface_stays_in_its_cells(ad, solid):
     coding.encode(values)
     distances = coding.values()[:, 0]
     assert np.all((distances < 0) == (sampled.distances < 0)) and np.all(np.abs(distances) > 0.005)
-    words = codes.pointer_words(coding.pointers, 8)
+    words = nodes.pointer_words(coding.pointers, 8)
     field = nodes.coded_field(ad, sampled.structure, 3.0, coding.frames, words, 8, coding.entries)
-    assert len(extraction.components(extraction.extract(field, 200))) == 2
+    assert len(grids.components(grids.extract(field, 200))) == 2
 
     # On the sides of stored cells behind which there is none, the sign is that of their corners
     s = sampled.structure

@@ -21,9 +21,9 @@ from mi_diffind.tasks.sdf import fit as sdf_fit
 from mi_diffind.tasks.sdf import paper
 from mi_diffind.tasks.sdf.distances import Distances
 from mi_diffind.tasks.sdf.evaluation import SurfaceEvaluation
+from mi_diffind.tasks.sdf.marching import trace
 from mi_diffind.tasks.sdf.mesh import load_mesh
 from mi_diffind.tasks.sdf.model import SdfModel
-from mi_diffind.tasks.sdf.tracing import trace
 
 BYTES = 96 * 1024
 SHORT = ["--steps", "60", "--batch", "16384", "--variant", "llvm_ad_rgb"]

@@ -12,7 +12,7 @@ from arrays import aligned
 from sdf_fields import Ball, Slab, Steps, TrilinearField, sparse_table, torus
 
 import mi_diffind.core.runtime
-from mi_diffind.tasks.sdf import codes, grids, marching, model, tracing
+from mi_diffind.tasks.sdf import grids, marching, model, nodes
 from mi_diffind.tasks.sdf.nodes import MIDDLE
 
 COUNT = 4096
@@ -39,7 +39,7 @@ def rays(types, o, d, maxt=np.inf):
 def trace(field, o, d, maxt=np.inf):
     """Distances, hits, places and whether the ray came from within, as NumPy arrays."""
     ray = rays(field.types, o, d, maxt)
-    hit, occluded = tracing.intersect(field, *ray), tracing.occluded(field, *ray)
+    hit, occluded = marching.intersect(field, *ray), marching.occluded(field, *ray)
     dr.eval(hit, occluded)  # at once: each result of its own would be another kernel
     assert (occluded.numpy() == hit.hit.numpy()).all()
     return hit.t.numpy(), hit.hit.numpy(), hit.p.numpy().T, hit.leaving.numpy()
@@ -110,7 +110,7 @@ def test_length_of_rays(types):
     maxt = np.array([1.0, 1.599, 1.601, 9], np.float32)
     t, is_hit, _, _ = trace(Ball(types), o, d, maxt)
     assert is_hit.tolist() == [False, False, True, True]
-    short = tracing.trace(Ball(types), *rays(types, o, d, maxt))
+    short = marching.trace(Ball(types), *rays(types, o, d, maxt))
     dr.eval(short)
     assert np.array_equal(short[0].numpy(), t) and np.array_equal(short[1].numpy(), is_hit)
 
@@ -129,7 +129,7 @@ def test_what_is_no_ray_ends(types):
 ENDLESS = """
 import drjit as dr, mitsuba as mi, numpy as np
 mi.set_variant("VARIANT")
-from mi_diffind.compat import module_of
+from mi_diffind.core.compat import module_of
 from mi_diffind.tasks.sdf import model, tracing
 from sdf_fields import Ball, sparse_table
 types = module_of(mi.Float)
@@ -232,7 +232,7 @@ def test_signs_beyond_slabs(coded, rng):
     words = np.array(marcher.slabs)[1::2]
     full = marching.GridCells(structure).crossed.any(axis=1)
     low, high = (v * (2 * marching.SLAB / marching.STEPS) - marching.SLAB for v in (words & 0xFFFF, words >> 16))
-    axes, middles, _ = codes.frames(coded.frames())
+    axes, middles, _ = nodes.unpack_frames(coded.frames())
     normals = np.stack(axes, axis=1)
     block = rng.choice(np.flatnonzero(full), 50 * COUNT)
     place = rng.uniform(0, 4, (len(block), 3))
@@ -254,7 +254,7 @@ def test_slabs_keep_the_signs_of_other_cells(coded, rng):
     inside[block, cell] = rng.random(len(block)) < 0.5
     words = marching.slab_words(cells, coded.decoded(), coded.frames())[block]
     low, high = (v * (2 * marching.SLAB / marching.STEPS) - marching.SLAB for v in (words & 0xFFFF, words >> 16))
-    axes, middles, _ = codes.frames(coded.frames())
+    axes, middles, _ = nodes.unpack_frames(coded.frames())
     normals, middles = np.stack(axes, axis=1)[block], middles[block]
     place = np.stack([cell // 16, cell // 4 % 4, cell % 4], axis=1) + rng.random((len(block), 3))
     height = middles + np.sum(normals * (place - MIDDLE), axis=1)
@@ -281,7 +281,7 @@ def test_slabs_change_no_hit(types, coded, rng):
 def test_rays_along_the_plane_of_a_block(coded, rng):
     """They enter its slab, if ever, at a distance of which there is a cell."""
     types, marcher, structure = coded.types, marching.marcher_of(coded), coded.structure
-    axes, middles, _ = codes.frames(coded.frames())
+    axes, middles, _ = nodes.unpack_frames(coded.frames())
     normals = np.stack(axes, axis=1)
     block = rng.choice(np.flatnonzero(marching.GridCells(structure).crossed.any(axis=1)), COUNT)
     aside = unit(np.cross(normals[block], rng.normal(size=(COUNT, 3))))

@@ -12,9 +12,8 @@ from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting.task import FitRequest
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
-from mi_diffind.tasks.texture import TASK, arrays, memory_budget, training
+from mi_diffind.tasks.texture import PRESETS, TASK, arrays, training
 from mi_diffind.tasks.texture.compressed import CompressedTexture
-from mi_diffind.tasks.texture.presets import PRESETS
 
 TYPES = array_module("llvm")
 
@@ -41,7 +40,7 @@ def trained(source, size, steps=4):
 
 
 def paged(source, nbytes=3000):
-    return memory_budget.paged(source.height, source.width, 3, nbytes, 4)
+    return arrays.paged(source.height, source.width, 3, nbytes, 4)
 
 
 @pytest.fixture(scope="module")
@@ -155,14 +154,14 @@ def test_which_textures_get_pages():
         pyramid = Pyramid.of(maps, training.layout_of(maps, recipe()), TYPES, ("repeat", "clamp"))
         gain = arrays.gain_of_pages(pyramid.values, paged(maps), pyramid.border)
         assert (gain >= training.GAIN_DB) == more, gain
-    assert memory_budget.paged(8, 8, 3, 100) is None and memory_budget.paged(1024, 1024, 3, 20000) is None
-    assert memory_budget.paged(512, 512, 3, 65536).nbytes <= 65536
+    assert arrays.paged(8, 8, 3, 100) is None and arrays.paged(1024, 1024, 3, 20000) is None
+    assert arrays.paged(512, 512, 3, 65536).nbytes <= 65536
 
 
 def test_pages_gain_what_they_are_for():
     """At equal bytes and steps, on a texture of which a sixteenth has detail; every level, not the first alone."""
     source = sparse()
     with_pages = trained(source, paged(source, 5000), 60).measured
-    without = trained(source, memory_budget.choose(64, 64, 3, 5000), 60).measured
+    without = trained(source, arrays.choose(64, 64, 3, 5000), 60).measured
     assert with_pages["psnr_db"] > without["psnr_db"] + 3
     assert with_pages["psnr_worst_db"] > without["psnr_worst_db"]

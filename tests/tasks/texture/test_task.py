@@ -19,17 +19,9 @@ from mi_diffind.fitting.task import FitRequest, fit
 from mi_diffind.maps.layout import Layout
 from mi_diffind.maps.pyramid import Pyramid, level_sizes
 from mi_diffind.maps.source import from_arrays
-from mi_diffind.tasks.texture import TASK, memory_budget, sampling, training
+from mi_diffind.tasks.texture import PRESETS, TASK, FineArray, arrays, nets, parse_structure, training
+from mi_diffind.tasks.texture.arrays import PaperBudget, TextureBudget, choose, paper_size
 from mi_diffind.tasks.texture.compressed import CompressedTexture
-from mi_diffind.tasks.texture.memory_budget import (
-    FineArray,
-    TextureBudget,
-    choose,
-    paper_bytes,
-    paper_size,
-    parse_structure,
-)
-from mi_diffind.tasks.texture.presets import PRESETS
 
 OURS, PAPER = PRESETS["ours"], PRESETS["paper"]
 
@@ -101,53 +93,51 @@ def read(texture, u, v, level) -> np.ndarray:
 @pytest.mark.parametrize("base, n", [(1024, 10), (2048, 11), (4096, 12)])
 def test_powers_of_uniform_numbers(ad, rng, base, n):
     """Equations 3 to 6: half of the samples below a texel's side, and the whole distribution."""
-    t = sampling.threshold(base)
-    assert t == 1 / base and sampling.exponent(t) == pytest.approx(n)
-    assert sampling.share_below(t, "power", base) == pytest.approx(0.5)
+    t = nets.threshold(base)
+    assert t == 1 / base and nets.exponent(t) == pytest.approx(n)
+    assert nets.share_below(t, "power", base) == pytest.approx(0.5)
     u = rng.random(200_000)
-    x = np.sort(sampling.footprints(ad.Float(u), "power", base).numpy())
+    x = np.sort(nets.footprints(ad.Float(u), "power", base).numpy())
     np.testing.assert_allclose(x, np.sort(u) ** n, rtol=2e-4, atol=1e-7)
     for fraction in (0.1, 0.25, 0.5, 0.9):
-        assert sampling.share_below(x[int(fraction * len(x))], "power", base) == pytest.approx(fraction, abs=0.01)
+        assert nets.share_below(x[int(fraction * len(x))], "power", base) == pytest.approx(fraction, abs=0.01)
     assert x.max() < 1
 
 
 def test_exponential_samples(ad, rng):
     """Equations 7 to 9."""
     t = 1 / 1024
-    rate = sampling.exponential_rate(t)
+    rate = nets.exponential_rate(t)
     assert rate == pytest.approx(1024 * math.log(2))
-    assert sampling.share_below(t, "exponential", 1024) == pytest.approx(0.5)
+    assert nets.share_below(t, "exponential", 1024) == pytest.approx(0.5)
     u = 1 - rng.random(200_000)
     u[0] = 0
-    x = sampling.footprints(ad.Float(u), "exponential", 1024).numpy()
+    x = nets.footprints(ad.Float(u), "exponential", 1024).numpy()
     np.testing.assert_allclose(x[1:], np.minimum(-np.log(u[1:]) / rate, 1), rtol=2e-3, atol=1e-7)
     for below in (0.5 * t, t, 3 * t):
-        share = sampling.share_below(below, "exponential", 1024)
+        share = nets.share_below(below, "exponential", 1024)
         assert share == pytest.approx(1 - math.exp(-rate * below)) == pytest.approx(np.mean(x < below), abs=0.01)
     assert np.isfinite(x).all() and x.max() <= 1
-    with pytest.raises(ValueError, match='footprint samples: found "uniform", allowed are'):
-        sampling.footprints(ad.Float(u), "uniform", 512)
 
 
 def test_levels_of_footprints(ad):
     """A side of 1 is the coarsest level; half the side is one level less; what is below a texel is level 0."""
     x = ad.Float([1e-9, 2**-9, 2**-4, 0.5, 1])
-    np.testing.assert_allclose(sampling.level_of(x, 10).numpy(), [0, 0, 5, 8, 9], atol=1e-4)
+    np.testing.assert_allclose(nets.level_of(x, 10).numpy(), [0, 0, 5, 8, 9], atol=1e-4)
     levels = np.float32([0, 0.5, 3, 9])
-    back = sampling.footprint_of(ad.Float(levels), 10)
-    np.testing.assert_allclose(sampling.level_of(back, 10).numpy(), levels, atol=1e-4)
-    assert back.numpy()[-1] == pytest.approx(1) and sampling.footprint_of(0.0, 10) == pytest.approx(2**-9)
+    back = nets.footprint_of(ad.Float(levels), 10)
+    np.testing.assert_allclose(nets.level_of(back, 10).numpy(), levels, atol=1e-4)
+    assert back.numpy()[-1] == pytest.approx(1) and nets.footprint_of(0.0, 10) == pytest.approx(2**-9)
 
 
 def test_which_levels_the_footprints_are_on(rng):
     """The supplement rejects the exponential distribution since coarse levels get too few samples."""
-    power, exponential = (sampling.footprint_histogram(name, 11) for name in sampling.FOOTPRINTS)
+    power, exponential = (nets.footprint_histogram(name, 11) for name in nets.FOOTPRINTS)
     assert power.sum() == pytest.approx(1) and exponential.sum() == pytest.approx(1)
     # Level of u^10 is 10 + 10 log2 u: below ½ with probability 2^-0.95, each further level has 2^(0.1 · level) more
     np.testing.assert_allclose(power, np.diff([0, *2 ** ((np.arange(10) + 0.5 - 10) / 10), 1]), atol=1e-6)
     assert power[0] > 0.5 and power[5:].sum() > 0.2 and exponential[5:].sum() < 1e-3
-    drawn = np.log2(np.minimum(-np.log(1 - rng.random(200_000)) / sampling.exponential_rate(2**-10), 1)) + 10
+    drawn = np.log2(np.minimum(-np.log(1 - rng.random(200_000)) / nets.exponential_rate(2**-10), 1)) + 10
     counted = np.bincount(np.clip(np.floor(drawn + 0.5).astype(int), 0, 10), minlength=11) / 200_000
     np.testing.assert_allclose(exponential, counted, atol=0.005)
 
@@ -156,10 +146,10 @@ def test_which_levels_the_footprints_are_on(rng):
 
 
 def test_bytes_are_equation_2():
-    assert paper_bytes(640**2, 8, 8, 3) == 3 * 640**2 + 32 + 3 * 8**3 * 8
-    assert [memory_budget.lods_of(n, n) for n in (1, 8, 256, 1024, 2048, 4096)] == [2, 3, 8, 8, 12, 12]
+    assert PaperBudget(640, 640, 8, 8, 3).nbytes == 3 * 640**2 + 32 + 3 * 8**3 * 8
+    assert [arrays.lod_count(n, n) for n in (1, 8, 256, 1024, 2048, 4096)] == [2, 3, 8, 8, 12, 12]
     for x, rgb, rest in ((3, 80, 128), (6, 64, 96), (12, 64, 96), (24, 48, 72)):
-        assert memory_budget.ratio(x, 3) == rgb and memory_budget.ratio(x, 7) == rest
+        assert arrays.resolution_ratio(x, 3) == rgb and arrays.resolution_ratio(x, 7) == rest
 
 
 @pytest.mark.parametrize("height, width", [(4096, 4096), (1024, 1024), (300, 1000), (64, 64)])
@@ -172,7 +162,7 @@ def test_the_papers_sizes_are_near_what_is_asked_for(height, width, compression)
         assert size.nbytes == pytest.approx(source / compression, rel=0.06) or size.cascaded == 4
 
 
-@pytest.mark.parametrize("height, width", [(1024, 1024), (384, 384), (300, 1000), (64, 64), (17, 5), (1, 9), (1, 1)])
+@pytest.mark.parametrize("height, width", [(1024, 1024), (300, 1000), (17, 5), (1, 9), (1, 1)])
 def test_our_sizes_fit(height, width):
     for channels, smooth in ((1, False), (3, False), (8, False), (8, True)):
         before = math.inf
@@ -192,12 +182,10 @@ def test_our_sizes_fit(height, width):
 
 
 def test_structures():
-    assert parse_structure("0:1:2,2:3:8") == (FineArray(0, 1, 2), FineArray(2, 3, 8))
+    assert parse_structure("0:1:2,2:3:8") == (FineArray(0, 1, 2), FineArray(2, 3, 8)) and parse_structure("auto") == ()
     for wrong in ("", "0:1", "1:1:1,0:1:1", "0:5:1", "0:1:9", "a", "0:1:2,"):
-        with pytest.raises(ValueError, match=r"structure|allowed are levels|have to grow"):
+        with pytest.raises(ValueError, match="structure: found"):
             parse_structure(wrong)
-    with pytest.raises(ValueError, match="allowed are different ones below 1"):
-        TextureBudget(8, 8, 3, (FineArray(1, 1, 1),), 1, 3, 4, 2)
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------
@@ -212,7 +200,7 @@ def made():
 
 
 def reference(texture, u, v, level):
-    """The same in NumPy, one place at a time, from the entries: pointers summed, then one read."""
+    """Return a read in NumPy, one place at a time, from the entries: pointers summed, then one read."""
     net, structure = texture.net, texture.net.structure
 
     def bilinear(values, u, v):
@@ -299,17 +287,6 @@ def test_any_level_is_clamped(made, rng):
             np.testing.assert_array_equal(read(t, u2, v2, wrong), read(t, u2, v2, t.levels - 1))
 
 
-def test_borders(made, rng):
-    """The material repeats along v and not along u."""
-    _, texture, *_ = made
-    t = rng.random(50, dtype=np.float32)
-    for level in (0, 0.6, 1, 2.5):
-        np.testing.assert_allclose(read(texture, t, t + 1, level), read(texture, t, t, level), atol=1e-3)
-        before, after = read(texture, t, 1 - 1e-6, level), read(texture, t, 1e-6, level)
-        np.testing.assert_allclose(before, after, atol=2e-3)
-        np.testing.assert_allclose(read(texture, 5, t, level), read(texture, 1, t, level), atol=1e-6)
-
-
 def test_gradients_are_finite(made, rng):
     _, _, texture, _ = made
     types = texture.types
@@ -328,16 +305,6 @@ def test_gradients_are_finite(made, rng):
     slope = (high - low) / (2 * eps)
     assert np.median(np.abs(slope - dr.grad(u).numpy())) < 0.1 * np.median(np.abs(slope))
     dr.disable_grad([a.data for a in texture.arrays.values()])
-
-
-def test_masked_lanes_read_nothing(made):
-    _, texture, single, _ = made
-    for t in (texture, single):
-        types = t.types
-        places = [types.Float([0.2, 0.7]), types.Float([0.1, 0.9]), types.Float([0.5, 2])]
-        all_of_them, some = (numpy_of(t.filtered(*places, active=types.Bool([True, a]))) for a in (True, False))
-        np.testing.assert_array_equal(some[0], all_of_them[0])
-        assert np.isfinite(some).all()
 
 
 # -- what comes out ---------------------------------------------------------------------------------------------------
@@ -372,16 +339,6 @@ def test_reported_qualities(made):
     assert measured["mean_error"] == pytest.approx(max(means), abs=1e-5)
 
 
-def test_training_improves_every_level():
-    source = from_arrays(material())
-    before, after = (
-        trained(source, sized(source), quick(steps=steps, lr=lr))[0].measured for steps, lr in ((1, 1e-9), (60, 3e-2))
-    )
-    for i in range(5):
-        assert after[f"psnr_l{i}_db"] > before[f"psnr_l{i}_db"] + 1, (i, before, after)
-    assert after["mean_error"] < 0.02
-
-
 def test_better_than_the_paper():
     """At no more bytes and samples: level 0 by 5 dB, the worst by 10."""
     source, steps = from_arrays(material(64, 48)), 60
@@ -394,7 +351,7 @@ def test_better_than_the_paper():
     assert ours.measured["psnr_worst_db"] > theirs.measured["psnr_worst_db"] + 10
 
 
-@pytest.mark.parametrize("samples", sampling.FOOTPRINTS)
+@pytest.mark.parametrize("samples", nets.FOOTPRINTS)
 def test_the_papers_arrays(samples, tmp_path, ad, rng):
     source = from_arrays(material(64, 48))
     size = paper_size(source.nbytes / 4, source.nbytes, 5, 64, 48)
@@ -439,52 +396,7 @@ def test_one_colour_needs_no_arrays(tmp_path, ad):
     assert table.measured["psnr_worst_db"] == 120 and table.measured["mean_error"] == 0
 
 
-def test_high_dynamic_range(ad):
-    values = (10 ** (4 * waves(8, 8, 1) - 1)).astype(np.float32)
-    table, _ = trained(
-        from_arrays({"image": values}), sized(from_arrays({"image": values})), quick(steps=30, batch=256)
-    )
-    decoded = CompressedTexture.of(table, ad.TensorXf).decode(level=3)["image"]
-    np.testing.assert_allclose(decoded[0, 0], values.mean(axis=(0, 1)), rtol=0.1)
-
-
 # -- files ------------------------------------------------------------------------------------------------------------
-
-
-def file_bytes(table, path):
-    save_table(path, table)
-    return path.read_bytes()
-
-
-def test_the_same_seed_gives_the_same_file(tmp_path):
-    source = from_arrays(material())
-    made = [trained(source, sized(source), quick(steps=5, seed=seed))[0] for seed in (3, 3, 4)]
-    first, again, other = (file_bytes(table, tmp_path / "t.npz") for table in made)
-    assert first == again != other and made[0].seed == 3
-
-
-def test_a_resumed_training_is_the_same(tmp_path, monkeypatch):
-    """Stopped after its first measurement and gone on with, to the last byte."""
-    from mi_diffind.fitting import loop
-
-    source, checkpoint = from_arrays(material()), tmp_path / "c.npz"
-    recipe = quick(steps=8)
-    whole = file_bytes(trained(source, sized(source), recipe)[0], tmp_path / "a.npz")
-    step = loop._Trainer.take_step
-
-    def stopped(self, *arguments):
-        if self.step == 6:
-            raise InterruptedError
-        return step(self, *arguments)
-
-    monkeypatch.setattr(loop._Trainer, "take_step", stopped)
-    with pytest.raises(InterruptedError):
-        trained(source, sized(source), recipe, checkpoint=checkpoint)
-    monkeypatch.setattr(loop._Trainer, "take_step", step)
-    table, result = trained(source, sized(source), recipe, checkpoint=checkpoint, resume=True)
-    assert result.steps == 8 and file_bytes(table, tmp_path / "b.npz") == whole
-    with pytest.raises(loop.FittingError, match=r"other settings|other table sizes"):
-        trained(source, sized(source, fine="0:1:3,1:2:4"), recipe, checkpoint=checkpoint, resume=True)
 
 
 def test_files_come_back(made, tmp_path, ad, rng):

@@ -1,0 +1,625 @@
+"""Sources of learned BSDFs as they were measured: their symmetries, spectra as colours, and rows of values.
+
+- Symmetries are measured before they are assumed.
+- Tensor files of Mitsuba's ``measured`` (Dupuy and Jakob 2018) and ``measured_polarized`` (Baek et al., *Image-Based
+  Acquisition and Modeling of Polarimetric Reflectance*, SIGGRAPH 2020) hold spectra. These are integrated with the CIE
+  1931 observer and the spectrum of the illuminant, and scaled so that a perfect reflector has the luminance 1. Under
+  ``D65`` it is white: this is what spectral variants of Mitsuba show in the light of RGB emitters. ``E`` is the light
+  of equal energy.
+- A ``.csv`` file has a header of names (in any order) and one row for each measurement: two directions by angles, and
+  f without the cosine in linear sRGB. Lines that start with # are comments. Nothing is known between the rows: proxy
+  and residual are trained on nine tenths of them and measured on the rest, and sampling and the limit of the albedo
+  follow from the fitted BSDF. The loss is a weighted mean of absolute differences, so that noise and outliers move it
+  little.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import hashlib
+import math
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import drjit as dr
+import numpy as np
+
+from ...arrays.lookup import clamp
+from ...core import tensor_files
+from ...core.errors import UsageError, reason
+from .directions import Samples, incident, outgoing
+from .model import BSDFArrays, DirectionPair, Form, LearnedBSDF, turned
+from .training import module_types, proxy_array, residual_range
+
+#: Relative difference up to which a symmetry is assumed.
+TOLERANCE = 0.01
+
+#: Azimuth of the axes of a source below which they count as those of the surface, radians.
+TURN = math.radians(0.5)
+
+#: Quantile above which contributions of measured rows count the same in the azimuth of the axes.
+BRIGHT_AXES = 0.999
+
+#: Difference of the azimuths from two halves of the samples beyond which neither counts, radians.
+APART = math.radians(4)
+
+#: Samples that determine the azimuth of the axes.
+AXES_SAMPLES = 2**18
+
+#: Illuminants, the first is the default.
+ILLUMINANTS = ("D65", "E")
+
+#: Columns of angles that a file needs.
+ANGLES = ("theta_i", "phi_i", "theta_o", "phi_o")
+
+#: Columns of values that a file needs.
+VALUES = ("r", "g", "b")
+
+#: Columns that a file may have.
+OPTIONAL = ("solid_angle", "weight")
+
+#: Smallest number of rows.
+LEAST_ROWS = 200
+
+#: Share of the rows that measure the result.
+VALIDATION = 0.1
+
+#: Smallest cosine of a direction that counts.
+HORIZON = 1e-3
+
+#: Neighbours that determine the density of rows.
+DENSITY = 8
+
+#: Neighbours that a row is compared with.
+NEIGHBOURS = 16
+
+#: A row is an outlier if its logarithm differs from its neighbours' median by this many times the usual difference …
+OUTLIER = 6.0
+
+#: … and by more than this.
+FAR = 0.4
+
+#: Number of rows whose neighbours measure symmetries.
+PAIRS = 20_000
+
+#: Difference of azimuths that count as equal, radians.
+SAME = math.radians(15)
+
+#: Difference of azimuths that count as different, radians.
+OTHER = math.radians(30)
+
+#: Factors of :func:`places` of an isotropic material that give the mirror image at the plane of incidence.
+MIRROR = np.array([1, 1, -1, 1])
+
+#: Distance of two rows below which they have the same directions.
+EXACT = 1e-4
+
+#: Quantile of f cos θ_i cos θ_o above which rows count the same where symmetries are measured.
+BRIGHT = 0.9
+
+#: Difference under a symmetry that neighbours have, too, relative to that of neighbours without it.
+USUAL = 1.5
+
+
+class Truth:
+    """Base class of sources.
+
+    ``name`` describes the source; ``digest`` changes when its content does; ``samples``: it samples directions itself;
+    ``isotropic``: it is isotropic by its format (``None``: it has to be measured). ``function``: its values are known
+    for all directions. ``remark``: line about how it was read, for people.
+    """
+
+    name: str
+    digest: str
+    samples, function, remark = False, True, ""
+    isotropic: bool | None = None
+
+    def value(self, wi, wo) -> list:
+        """Return f cos θ_o in linear sRGB, three arrays, for unit directions above the surface."""
+        raise NotImplementedError
+
+    def remarks(self, samples) -> list[str]:
+        """Return sentences about what a fit to the values of ``samples`` leaves out. Raises ``UsageError``."""
+        return []
+
+    def sample(self, wi, w, u, v):
+        """Return directions ``wo`` from three uniform numbers each."""
+        raise NotImplementedError
+
+    def density(self, wi, wo):
+        """Return the density of :meth:`sample` per solid angle."""
+        raise NotImplementedError
+
+
+class FunctionTruth(Truth):
+    """Source whose values f cos θ_o are those of a function ``value(wi, wo)``."""
+
+    def __init__(self, name: str, value: Callable):
+        self.name, self.digest, self.value = name, "", value
+
+
+class TurnedTruth(Truth):
+    """Source that is turned about the normal by ``angle``, radians."""
+
+    def __init__(self, truth: Truth, angle: float):
+        self.truth, self.angle, self.name, self.digest = truth, angle, truth.name, truth.digest
+        self.samples, self.remark = truth.samples, truth.remark
+
+    def value(self, wi, wo) -> list:
+        return self.truth.value(turned(wi, -self.angle), turned(wo, -self.angle))
+
+    def sample(self, wi, w, u, v):
+        return turned(self.truth.sample(turned(wi, -self.angle), w, u, v), self.angle)
+
+    def density(self, wi, wo):
+        return self.truth.density(turned(wi, -self.angle), turned(wo, -self.angle))
+
+
+#: Diffuse source of albedo 1.
+WHITE = FunctionTruth("white", lambda wi, wo: [wo.z * dr.inv_pi] * 3)
+
+
+# -- symmetries --------------------------------------------------------------------------------------------------------
+
+
+def axes_angle(samples: Samples, truth: Truth) -> float:
+    """Return the azimuth of the axes of an anisotropic source, radians from −π/4 to π/4.
+
+    They are the principal axes of the half vectors, weighted by the squares of contributions, most of which lie in the
+    peak. Of a function, four turned values of each sample are used, so that what is isotropic cancels. The result is 0
+    if it is below :data:`TURN`, or if halves of the samples disagree.
+    """
+    index = dr.arange(dr.uint32_array_t(type(samples.weight)), min(AXES_SAMPLES, dr.width(samples.weight)))
+    samples, moments = samples.at(index), 0
+    half = samples.wi + samples.wo
+    half = half * dr.rsqrt(dr.maximum(dr.squared_norm(half), 1e-20))
+    for k in range(4 if truth.function else 1):
+        angle = k * math.pi / 4
+        value = truth.value(turned(samples.wi, angle), turned(samples.wo, angle)) if k else samples.value
+        light, h = samples.weight * dr.square(value[0] + value[1] + value[2]), turned(half, angle)
+        if not truth.function:  # rows may be outliers
+            light = dr.minimum(light, float(np.quantile(light.numpy(), BRIGHT_AXES)))
+        columns = [light * (dr.square(h.x) - dr.square(h.y)), 2 * light * h.x * h.y]
+        moments = moments + np.stack([dr.detach(c).numpy() for c in columns]).astype(np.float64)
+    angles = [0.5 * math.atan2(*part.sum(axis=1)[::-1]) for part in (moments, moments[:, ::2], moments[:, 1::2])]
+    apart = (angles[1] - angles[2] + math.pi / 2) % math.pi - math.pi / 2
+    angle = angles[0] - round(angles[0] / (math.pi / 2)) * (math.pi / 2)
+    return angle if abs(angle) > TURN and abs(apart) < APART else 0.0
+
+
+def measure_symmetry(truth, types, size: int = 2**16, seed: int = 1) -> dict[str, float]:
+    """Return the relative difference of f that each symmetry would hide.
+
+    ``isotropy``: rotation about the normal; ``mirror``: reflection at the plane of incidence; ``reciprocity``: exchange
+    of the directions. Each is a mean of absolute differences over the mean value, weighted by both cosines; that of
+    reciprocity is halved, which no reciprocal model can be nearer than. At angles up to 85°; 0 for what the format
+    implies.
+    """
+    rng = dr.rng(seed=dr.opaque(types.UInt64, seed))
+    samples = outgoing(rng, types, incident(rng, types, size, isotropic=False), truth)
+    wi, wo = samples.wi, samples.wo
+    weight = dr.select(dr.minimum(wi.z, wo.z) > 0.087, samples.weight, 0)
+    sin, cos = dr.sincos(2 * dr.pi * rng.random(types.Float, size))
+
+    def rotated(w):
+        return types.Array3f(dr.fma(cos, w.x, -sin * w.y), dr.fma(sin, w.x, cos * w.y), w.z)
+
+    def mirrored(w):  # at the plane of wi and the normal
+        r2 = dr.maximum(dr.square(wi.x) + dr.square(wi.y), 1e-12)
+        along, across = (w.x * wi.x + w.y * wi.y) / r2, (w.y * wi.x - w.x * wi.y) / r2
+        return types.Array3f(along * wi.x + across * wi.y, along * wi.y - across * wi.x, w.z)
+
+    value = truth.value(wi, wo)
+    others = {
+        "isotropy": truth.value(rotated(wi), rotated(wo)),
+        "mirror": truth.value(wi, mirrored(wo)),
+        "reciprocity": [v * wo.z / wi.z for v in truth.value(wo, wi)],
+    }
+    total = sum(dr.sum(weight * wi.z * v) for v in value)
+    result = {}
+    for name, other in others.items():
+        difference = sum(dr.sum(weight * wi.z * dr.abs(a - b)) for a, b in zip(value, other, strict=True))
+        result[name] = float((difference / dr.maximum(total, 1e-20))[0])
+    result["reciprocity"] /= 2
+    if truth.isotropic:
+        result["isotropy"] = 0.0
+    return result
+
+
+# -- spectra -----------------------------------------------------------------------------------------------------------
+
+
+def colour_weights(wavelengths: np.ndarray, illuminant: str) -> np.ndarray:
+    """Return the weights ``(n, 3)`` of values at ``n`` wavelengths (nm) in a colour of linear sRGB.
+
+    Values are interpolated linearly between wavelengths, and constant beyond the first and last one.
+    """
+    import mitsuba as mi
+
+    grid = np.arange(mi.MI_CIE_MIN, mi.MI_CIE_MAX + 0.5)
+    nodes = mi.Float(grid.astype(np.float32))
+    observer = mi.cie1931_xyz(nodes)
+    colours = np.stack([c.numpy() for c in mi.xyz_to_srgb(observer)], axis=1).astype(np.float64)
+    light = mi.cie_d65(nodes).numpy().astype(np.float64) if illuminant == "D65" else np.ones(len(grid))
+    density = light[:, None] * colours / (light @ observer.y.numpy().astype(np.float64))
+    order = np.argsort(wavelengths)
+    hats = np.stack([np.interp(grid, wavelengths[order], row) for row in np.eye(len(wavelengths))[:, order]])
+    return hats @ density
+
+
+def rgb_fields(fields: dict, illuminant: str) -> dict:
+    """Return the fields of a spectral file of ``measured`` as those of an RGB one."""
+    weights = colour_weights(np.asarray(fields["wavelengths"], np.float64), illuminant)
+    spectra = np.asarray(fields["spectra"])
+    rgb = np.einsum("ptwyx,wc->ptcyx", spectra, weights.astype(np.float32))
+    kept = {name: np.asarray(value) for name, value in fields.items() if name not in ("spectra", "wavelengths")}
+    return {**kept, "rgb": np.ascontiguousarray(rgb, np.float32)}
+
+
+def measured_bsdf(path: Path, illuminant: str):
+    """Return Mitsuba's ``measured`` of a file in an RGB variant, and a remark about colours ("" for an RGB file).
+
+    Raises :class:`UsageError`, and as Mitsuba does.
+    """
+    import mitsuba as mi
+
+    fields = tensor_files.read(path)
+    tensor_files.check(path, fields)
+    if "wavelengths" not in fields or mi.is_spectral:
+        return mi.load_dict({"type": "measured", "filename": str(path)}), ""
+    fields = rgb_fields(fields, illuminant)
+    with tempfile.TemporaryDirectory() as folder:
+        converted = os.path.join(folder, path.name)
+        tensor_files.write(converted, fields)
+        return mi.load_dict({"type": "measured", "filename": converted}), _remark(illuminant)
+
+
+def _remark(illuminant: str) -> str:
+    return f"spectra as linear sRGB under the illuminant {illuminant}"
+
+
+class PolarisedTruth(Truth):
+    """Isotropic measurement of Mueller matrices, as of unpolarised light: their first entry.
+
+    Angles are φ_d, θ_d and θ_h; values are interpolated linearly, and 0 beside invalid ones (NaN). Raises
+    :class:`UsageError`.
+    """
+
+    isotropic = True
+
+    def __init__(self, path: Path, illuminant: str):
+        import mitsuba as mi
+
+        fields = tensor_files.read(path)
+        if "M" not in fields:
+            raise UsageError(f'{path}: is no file of measured Mueller matrices: has no field "M"')
+        tensor_files.check(path, fields)
+        nodes = fields["M"].shape
+        weights = colour_weights(np.asarray(fields["wvls"], np.float64), illuminant)
+        colours = np.asarray(fields["M"][..., 0, 0], np.float32) @ weights.astype(np.float32)
+        grid = np.zeros((*nodes[:3], 2, 2), np.float32)  # Mitsuba interpolates pictures, here of 2 x 2 numbers
+        grid.reshape(*nodes[:3], 4)[..., :3] = colours
+        angles = [np.ravel(fields[name]).astype(float).tolist() for name in ("phi_d", "theta_d", "theta_h")]
+        self.mi, self.grid = mi, mi.MarginalContinuous2D3(grid, angles, False, False)
+        self.name, self.remark = path.name, _remark(illuminant)
+        digest = hashlib.sha256(illuminant.encode())
+        with open(path, "rb") as stream:
+            while block := stream.read(2**24):
+                digest.update(block)
+        self.digest = digest.hexdigest()
+
+    def value(self, wi, wo):
+        half = wi + wo
+        half = half * dr.rsqrt(dr.maximum(dr.squared_norm(half), 1e-20))
+        sin = dr.sqrt(dr.maximum(dr.square(half.x) + dr.square(half.y), 1e-20))
+        cos_d = dr.clip(dr.dot(wo, half), 0, 1)
+        # Components of wo along the tangents of h: towards the normal, and perpendicular to both
+        along, across = (half.z * cos_d - wo.z) / sin, (half.x * wo.y - half.y * wo.x) / sin
+        angles = [dr.atan2(across, along), dr.acos(cos_d), dr.atan2(sin, half.z)]
+        corners = ((0, 0), (1, 0), (0, 1))
+        values = [self.grid.eval(self.mi.Point2f(x, y), angles) for x, y in corners]
+        return [wo.z * dr.select(dr.isnan(v), 0, clamp(v, 0, 1e8)) for v in values]
+
+
+# -- rows of values ----------------------------------------------------------------------------------------------------
+
+
+class ScatteredTruth(Truth):
+    """Rows of a ``.csv`` file. Raises :class:`UsageError`, with file and line.
+
+    ``wi``, ``wo`` and ``f`` are arrays ``(n, 3)``; ``solid_angle``: that for which each row stands (``None``: not
+    given); ``weight``: factor on it. ``angles``: unit of the angles ("": that of the file).
+    """
+
+    function = False
+
+    def __init__(self, path: Path, angles: str = ""):
+        names, rows, lines = read_rows(path)
+        columns = dict(zip(names, rows.T, strict=True))
+
+        def refuse(wrong: np.ndarray, fault: str) -> None:
+            if wrong.any():
+                row = int(np.argmax(wrong))
+                raise UsageError(f"{path}:{lines[row]}: {fault.format(*rows[row])}")
+
+        refuse(~np.isfinite(rows).all(axis=1), "holds a number that is not finite")
+        unit = angles or _unit(path, [columns[name] for name in ANGLES])
+        if unit == "degrees":
+            columns |= {name: np.radians(columns[name]) for name in ANGLES}
+        limit = "90 degrees" if unit == "degrees" else "π/2"
+        for name in ("theta_i", "theta_o"):
+            wrong = (columns[name] < 0) | (columns[name] > math.pi / 2 * (1 + 1e-6))
+            refuse(wrong, f"{name} is {{{names.index(name)}:g}}, allowed is 0 to {limit}")
+        for name in OPTIONAL:
+            refuse(columns.get(name, np.zeros(1)) < 0, f"{name} is negative, allowed are numbers ≥ 0")
+        self.wi, self.wo = (_direction(columns[f"theta_{k}"], columns[f"phi_{k}"]) for k in "io")
+        self.f = np.stack([columns[name] for name in VALUES], axis=1)
+        self.weight = columns.get("weight", np.ones(len(rows)))
+        self.solid_angle = columns.get("solid_angle")
+        counts = (self.wi[:, 2] > HORIZON) & (self.wo[:, 2] > HORIZON) & (self.weight > 0)
+        if counts.sum() < LEAST_ROWS:
+            raise UsageError(f"{path}: has {counts.sum()} rows above the horizon, at least {LEAST_ROWS} are needed")
+        self.left_out = int((~counts).sum())
+        self.wi, self.wo, self.f, self.weight = (a[counts] for a in (self.wi, self.wo, self.f, self.weight))
+        self.solid_angle = None if self.solid_angle is None else self.solid_angle[counts]
+        self.name, self.digest = path.name, hashlib.sha256(path.read_bytes() + unit.encode()).hexdigest()
+
+
+def read_rows(path: Path) -> tuple[list[str], np.ndarray, list[int]]:
+    """Return the names, the numbers, ``(rows, names)``, and the lines of the rows of a file.
+
+    Raises :class:`UsageError`, with file and line.
+    """
+    try:
+        texts = enumerate(path.read_text(encoding="utf-8-sig").splitlines(), 1)
+    except (OSError, UnicodeDecodeError) as e:
+        raise UsageError(f"{path}: cannot be read ({reason(e)})") from None
+    (_, header), *body = [(k, t) for k, t in texts if t.strip() and not t.lstrip().startswith("#")] or [(0, "")]
+    names = [name.strip().lower() for name in header.split(",")]
+    known = (*ANGLES, *VALUES, *OPTIONAL)
+    for name in names if header else ():
+        if name not in known or names.count(name) > 1:
+            fault = " twice" if name in known else f", allowed are {', '.join(known)}"
+            raise UsageError(f'{path}: its header has the column "{name}"{fault}')
+    needed = (*ANGLES, *VALUES)
+    missing = [name for name in needed if name not in names]
+    if missing:
+        raise UsageError(f"{path}: its header has no {', '.join(missing)}, needed are {', '.join(needed)}")
+    rows = []
+    for number, text in body:
+        cells = text.partition("#")[0].split(",")
+        if len(cells) != len(names):
+            raise UsageError(f"{path}:{number}: has {len(cells)} columns, its header has {len(names)}")
+        try:
+            rows.append(list(map(float, cells)))
+        except ValueError as e:
+            cell = str(e).partition(": ")[2].strip("'\" ")[:40]
+            raise UsageError(f'{path}:{number}: found "{cell}", a number is needed') from None
+    if not rows:
+        raise UsageError(f"{path}: has no rows below its header")
+    return names, np.array(rows), [number for number, _ in body]
+
+
+def _unit(path: Path, angles: list[np.ndarray]) -> str:
+    """Return the unit of angles: degrees, unless all are so small that they may be radians."""
+    if max(np.abs(a).max() for a in angles) <= 2 * math.pi * (1 + 1e-6):
+        raise UsageError(f"{path}: its angles are all below 2π: say whether they are degrees or radians (--angles)")
+    return "degrees"
+
+
+def _direction(theta: np.ndarray, phi: np.ndarray) -> np.ndarray:
+    sin = np.sin(theta)
+    return np.stack([sin * np.cos(phi), sin * np.sin(phi), np.cos(theta)], axis=1)
+
+
+def along_x(truth: ScatteredTruth) -> np.ndarray:
+    """Return ``wo`` after a rotation about the normal that brings ``wi`` to the azimuth 0."""
+    x, y = truth.wi[:, 0], truth.wi[:, 1]
+    r = np.hypot(x, y)
+    cos, sin = np.where(r > 1e-9, x, 1) / np.maximum(r, 1e-9), y / np.maximum(r, 1e-9)
+    cos = np.where(r > 1e-9, cos, 1)
+    wo = truth.wo
+    return np.stack([cos * wo[:, 0] + sin * wo[:, 1], cos * wo[:, 1] - sin * wo[:, 0], wo[:, 2]], axis=1)
+
+
+def places(truth: ScatteredTruth, isotropic: bool) -> np.ndarray:
+    """Return points whose distances are those of rows, ``(n, 4)`` of isotropic and ``(n, 6)`` of other materials."""
+    if not isotropic:
+        return np.concatenate([truth.wi, truth.wo], axis=1)
+    return np.concatenate([np.arccos(np.clip(truth.wi[:, 2:], -1, 1)), along_x(truth)], axis=1)
+
+
+def measure_row_symmetry(truth: ScatteredTruth, seed: int = 1) -> dict[str, float | None]:
+    """Return the relative difference of f that each symmetry would hide (:func:`measure_symmetry`), from pairs of rows.
+
+    Reciprocity is measured by :func:`irreciprocal_share` where rows have exact images. Else a row is compared with the
+    row that is nearest to its image, and what neighbours without the symmetry differ by, through noise and their
+    distance, is subtracted. ``None``: there are no such pairs.
+    """
+    from scipy.spatial import cKDTree
+
+    points, f = places(truth, True), truth.f.mean(axis=1)
+    rows = np.random.default_rng(seed).permutation(len(f))[:PAIRS]
+    light = np.maximum(f * truth.wi[:, 2] * truth.wo[:, 2], 1e-12)
+    bright = np.quantile(light, BRIGHT)
+    tree, azimuth = cKDTree(points), np.arctan2(truth.wi[:, 1], truth.wi[:, 0])
+    near, neighbours = (a[:, 1:] for a in tree.query(points[rows], NEIGHBOURS + 1))
+    angle = np.abs((azimuth[rows, None] - azimuth[neighbours] + math.pi / 2) % math.pi - math.pi / 2)
+
+    def difference(others: np.ndarray, chosen: np.ndarray) -> float | None:
+        """Return the mean of relative differences of f; ``None`` if too few rows are chosen."""
+        if chosen.sum() < LEAST_ROWS:
+            return None
+        a, b = light[rows[chosen]], light[others[chosen]]
+        weight = np.minimum(np.maximum(a, b), bright)  # bright rows count more, outliers little
+        return float((weight * np.abs(a - b) / (a + b)).sum() / weight.sum())
+
+    def first(condition: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the nearest neighbour that meets a condition, and whether there is one."""
+        return neighbours[np.arange(len(rows)), condition.argmax(axis=1)], condition.any(axis=1)
+
+    def excess(images: np.ndarray, informative: np.ndarray | bool = True) -> float | None:
+        """Return the difference from the rows nearest to images, no further than neighbours are."""
+        distance, nearest = tree.query(images[rows])
+        close = (distance <= 1.5 * near[:, 0]) & (nearest != rows) & informative
+        return _excess(difference(nearest, close), difference(neighbours[:, 0], close))
+
+    result: dict[str, float | None] = {}
+    same, other = first(angle < SAME), first(angle > OTHER)
+    both = same[1] & other[1]
+    result["isotropy"] = _excess(difference(other[0], both), difference(same[0], both))
+    # Rows in the plane of incidence say nothing about the mirror image
+    result["mirror"] = excess(points * MIRROR, np.abs(points[rows, 2]) > 0.02)
+    isotropic = (result["isotropy"] or 0) <= TOLERANCE
+    if not isotropic:  # the plane of incidence of a row then means another material each time
+        result["mirror"] = result["isotropy"]
+    share = irreciprocal_share(truth, isotropic, (result["mirror"] or 0) <= TOLERANCE)
+    result["reciprocity"] = excess(places(exchanged(truth), True)) if share is None else share
+    return result
+
+
+def exchanged(truth: ScatteredTruth) -> ScatteredTruth:
+    """Return the rows with their directions exchanged."""
+    result = copy.copy(truth)
+    result.wi, result.wo = truth.wo, truth.wi
+    return result
+
+
+def irreciprocal_share(truth: ScatteredTruth, isotropic: bool, mirror: bool) -> float | None:
+    """Return the share of the light that no reciprocal model can reproduce; ``None`` if too few rows have images.
+
+    It is the sum of ``|f(i, o) − f(o, i)| / 2`` over that of ``|f|``, weighted by both solid angles and cosines, of
+    all rows whose directions exchanged are those of another row. Rows that are their own images (mirror directions)
+    count as they do among all rows. With ``mirror``, images at the plane of incidence count, too.
+    """
+    from scipy.spatial import cKDTree
+
+    points, images = places(truth, isotropic), places(exchanged(truth), isotropic)
+    if isotropic and mirror:
+        points[:, 2], images[:, 2] = np.abs(points[:, 2]), np.abs(images[:, 2])
+    symmetric = np.linalg.norm(points - images, axis=1) < EXACT
+    image = cKDTree(points).query(images, distance_upper_bound=EXACT)[1]
+    image[symmetric] = np.flatnonzero(symmetric)
+    paired = image < len(points)
+    others = (paired & ~symmetric).sum()
+    if others < LEAST_ROWS:
+        return None
+    rows = np.flatnonzero(paired)
+    image, wi, wo = image[rows], truth.wi[rows], truth.wo[rows]
+    if truth.solid_angle is None:
+        weight = cells(np.arccos(np.stack([wi[:, 2], wo[:, 2]], axis=1)))
+        weight *= np.prod(np.hypot(*np.stack([wi, wo])[:, :, :2].T), axis=1)
+        azimuths = [np.arctan2(w[:, 1], w[:, 0]) for w in ([along_x(truth)[rows]] if isotropic else [wi, wo])]
+        weight *= cells(np.abs(np.stack(azimuths, axis=1)))
+    else:
+        weight = truth.solid_angle[rows] * truth.solid_angle[image]
+    weight *= np.where(symmetric[rows], 1, (~symmetric).sum() / others)
+    weight = (weight * (truth.weight[rows] + truth.weight[image]) * wi[:, 2] * wo[:, 2])[:, None]
+    difference = (weight * np.abs(truth.f[rows] - truth.f[image])).sum() / 2
+    return float(difference / max((weight * np.abs(truth.f[rows])).sum(), 1e-20))
+
+
+def cells(angles: np.ndarray) -> np.ndarray:
+    """Return products of the widths for which angles ``(n, k)`` stand on the axis that their ``k`` columns share."""
+    values, index = np.unique(np.round(angles, 5), return_inverse=True)
+    widths = np.gradient(values) if len(values) > 1 else np.ones(1)
+    return widths[index.reshape(angles.shape)].prod(axis=1)
+
+
+def _excess(difference: float | None, usual: float | None) -> float | None:
+    return None if difference is None or usual is None else max(0.0, difference - USUAL * usual)
+
+
+def solid_angles(truth: ScatteredTruth, isotropic: bool) -> np.ndarray:
+    """Return the solid angles for which rows stand, 2π in the mean, from the distances of their neighbours.
+
+    Where ``wi`` has few values, as of goniometers, each of them counts the same.
+    """
+    from scipy.spatial import cKDTree
+
+    points = np.round(places(truth, isotropic), 6)
+    points, index, count = np.unique(points, axis=0, return_inverse=True, return_counts=True)
+    index, split = index.ravel(), 1 if isotropic else 3
+    groups, group, members = np.unique(np.round(points[:, :split], 4), axis=0, return_inverse=True, return_counts=True)
+    group, area = group.ravel(), np.ones(len(points))
+    if len(points) >= 4 * DENSITY * len(groups):
+        for k in np.flatnonzero(members > DENSITY):
+            inside = group == k
+            distance = cKDTree(points[inside, split:]).query(points[inside, split:], DENSITY + 1)[0][:, -1]
+            area[inside] = distance**2 / (distance**2).sum()
+    else:
+        area = cKDTree(points).query(points, min(DENSITY, len(points) - 1) + 1)[0][:, -1] ** (3 if isotropic else 4)
+    area = (area / count)[index]
+    return 2 * math.pi * area / area.mean()
+
+
+def split(truth: ScatteredTruth, types, isotropic: bool, limit: float, seed: int) -> tuple[Samples, Samples, Samples]:
+    """Return the rows for training, those that measure, and smoothed ones for the starts of the proxy.
+
+    Their weights are solid angles, limited so that a row contributes at most ``limit``. Smoothed values are medians of
+    three neighbours: a start is found by least squares, which outliers would rule.
+    """
+    from scipy.spatial import cKDTree
+
+    weight = solid_angles(truth, isotropic) if truth.solid_angle is None else truth.solid_angle
+    weight = weight * truth.weight / truth.weight.mean()
+    value = truth.f * truth.wo[:, 2:]
+    weight = np.minimum(weight, limit / np.maximum(value.max(axis=1), 1e-6))
+    points = places(truth, isotropic)
+    smooth = np.median(value[cKDTree(points).query(points, 3)[1]], axis=1)
+    wi, wo = truth.wi, truth.wo
+    if isotropic:
+        wi = np.stack([np.sqrt(np.maximum(1 - wi[:, 2] ** 2, 0)), 0 * wi[:, 2], wi[:, 2]], axis=1)
+        wo = along_x(truth)
+    order = np.random.default_rng(seed).permutation(len(value))
+    measured = max(1, round(VALIDATION * len(value)))
+
+    def samples(rows: np.ndarray, values: np.ndarray) -> Samples:
+        def columns(a):
+            return [types.Float(np.ascontiguousarray(c, np.float32)) for c in a[rows].T]
+
+        return Samples(
+            types.Array3f(*columns(wi)), types.Array3f(*columns(wo)), columns(weight[:, None])[0], columns(values)
+        )
+
+    return samples(order[measured:], value), samples(order[:measured], value), samples(order, smooth)
+
+
+def without_outliers(samples: Samples, form: Form, proxy: LearnedBSDF) -> tuple[Samples, int]:
+    """Return samples whose outliers weigh nothing, and their number.
+
+    Logarithms of f over the proxy are compared with those of the nearest samples, in the coordinates of the residual.
+    """
+    from scipy.spatial import cKDTree
+
+    with dr.suspend_grad():
+        g = DirectionPair.of(*(turned(w, -form.angle) for w in (samples.wi, samples.wo)))
+        columns = [*proxy.coordinates(g), *(v * samples.wo.z for v in proxy.value(samples.wi, samples.wo))]
+        dr.eval(columns)
+    u, v, w, *expected = (np.asarray(c.numpy(), np.float64) for c in columns)
+    value = np.stack([c.numpy() for c in samples.value], axis=1).mean(axis=1)
+    expected = np.mean(expected, axis=0)
+    floor = 1e-3 * expected.mean()
+    ratio = np.log(np.maximum(value, floor) / np.maximum(expected, floor))
+    points = np.stack([u, v, 0.25 * w], axis=1)
+    median = np.median(ratio[cKDTree(points).query(points, min(NEIGHBOURS, len(points) - 1) + 1)[1][:, 1:]], axis=1)
+    difference = np.abs(ratio - median)
+    outlier = difference > max(FAR, OUTLIER * float(np.median(difference)))
+    kept = type(samples.weight)(np.ascontiguousarray(~outlier, np.float32))
+    return Samples(samples.wi, samples.wo, samples.weight * kept, samples.value), int(outlier.sum())
+
+
+def cleaned(
+    truth: ScatteredTruth, parts: list[Samples], form: Form, logarithms: np.ndarray
+) -> tuple[list[Samples], Form, str]:
+    """Return samples without outliers from a fitted proxy, the form with the range of the first, and a line of text."""
+    types = module_types(parts[0])
+    net = BSDFArrays(None, proxy_array(logarithms, 1.0) if form.terms else None).alloc(types.TensorXf)
+    parts, outliers = zip(*(without_outliers(s, form, net.at(form)) for s in parts), strict=True)
+    form = dataclasses.replace(form, range=residual_range(form, logarithms, parts[0]))
+    left_out = f", {truth.left_out:,} at the horizon or of no weight" if truth.left_out else ""
+    line = f"{len(truth.f):,} rows; left out: {sum(outliers):,} unlike their neighbours{left_out}"
+    return list(parts), form, line
