@@ -82,7 +82,8 @@ class CaptureSettings:
     the image). ``path``: "sphere", all over it, or "orbit", once around the axis ``up``. ``elevation``: the lowest and
     the highest, degrees above the plane normal to ``up``; an orbit swings between them (default: −90, 90 for a sphere,
     20, 20 for an orbit). ``format``: "png", as displayed, 8 bits, or "exr", linear half floats. ``box``: of 3D
-    Gaussians, the lower and the upper corner of what is captured (default: :meth:`.splats.Splats.cropped`).
+    Gaussians, the lower and the upper corner of what is captured (default: :meth:`.splats.Splats.cropped`). Other
+    values raise :class:`.UsageError`.
     """
 
     views: int = 60
@@ -100,31 +101,30 @@ class CaptureSettings:
     format: str = "png"
     box: tuple[float, ...] | None = None
 
-    def check(self) -> None:
-        """Raise ``ValueError`` for values that are not allowed."""
+    def __post_init__(self):
         if self.path not in PATHS:
-            raise ValueError(f'path: found "{self.path}", allowed are {", ".join(PATHS)}')
+            raise UsageError(f'path: found "{self.path}", allowed are {", ".join(PATHS)}')
         if self.format not in FORMATS:
-            raise ValueError(f'format: found "{self.format}", allowed are {", ".join(FORMATS)}')
+            raise UsageError(f'format: found "{self.format}", allowed are {", ".join(FORMATS)}')
         for name, least in (("views", 1), ("test", 0), ("resolution", 1), ("spp", 1)):
             if getattr(self, name) < least:
-                raise ValueError(f"{name}: found {getattr(self, name)}, allowed are whole numbers ≥ {least}")
+                raise UsageError(f"{name}: found {getattr(self, name)}, allowed are whole numbers ≥ {least}")
         check_samples(self.spp)
         check_memory("resolution", self.resolution, SAMPLE_BYTES * self.resolution**2)
         check_memory("views", self.views + self.test, VIEW_BYTES * (self.views + self.test))
         if not 0 < self.fov < 170:
-            raise ValueError(f"fov: found {self.fov:g}, allowed are degrees between 0 and 170")
+            raise UsageError(f"fov: found {self.fov:g}, allowed are degrees between 0 and 170")
         if self.radius is not None and not 0 < self.radius < math.inf:
-            raise ValueError(f"radius: found {self.radius:g}, allowed are numbers > 0")
+            raise UsageError(f"radius: found {self.radius:g}, allowed are numbers > 0")
         if self.centre is not None and not np.isfinite(self.centre).all():
-            raise ValueError("centre: found NaN or infinity, allowed are numbers")
+            raise UsageError("centre: found NaN or infinity, allowed are numbers")
         if not np.isfinite(self.up).all() or not np.any(self.up):
-            raise ValueError("up: found no direction, allowed are three numbers that are not all 0")
+            raise UsageError("up: found no direction, allowed are three numbers that are not all 0")
         if self.box is not None and not (len(self.box) == 6 and np.less(self.box[:3], self.box[3:]).all()):
-            raise ValueError("box: found no box, allowed are six numbers, those of the lower corner first")
+            raise UsageError("box: found no box, allowed are six numbers, those of the lower corner first")
         low, high = self.elevations
         if not -90 <= low <= high <= 90:
-            raise ValueError(
+            raise UsageError(
                 f"elevation: found {low:g} to {high:g}, allowed are degrees from −90 to 90, the lower first"
             )
 
@@ -397,12 +397,7 @@ def _settings(scene, given: dict) -> CaptureSettings:
     tuples = {name: tuple(given[name]) for name in names if given.get(name) is not None}
     if given.get("spp") is None:
         tuples["spp"] = splats.SPP if is_splats(scene) else CaptureSettings.spp
-    settings = CaptureSettings(**{**given, **tuples})
-    try:
-        settings.check()
-    except ValueError as e:
-        raise UsageError(str(e)) from None
-    return settings
+    return CaptureSettings(**{**given, **tuples})
 
 
 def _plan(settings: CaptureSettings, centre: np.ndarray, radius: float) -> dict[str, list[np.ndarray]]:

@@ -257,22 +257,6 @@ class ParsedScene:
             return list(dict.fromkeys(files))
 
 
-class LoadedScene(ParsedScene):
-    """Scene that Mitsuba has loaded, in the place of one that can be loaded: nothing of it can be changed."""
-
-    def __init__(self, scene: mi.Scene, name: str = "scene"):
-        self.scene, self.path, self.defines = scene, Path.cwd() / name, {}
-        self.description = os.urandom(16).hex()
-
-    def load(self):
-        """Return the scene."""
-        return self.scene
-
-    def files(self) -> list[Path]:
-        """Return no files: they are not known."""
-        return []
-
-
 def _description(state) -> str:
     """Return a parsed scene as text: equal texts stand for equal scenes, without the content of files.
 

@@ -21,6 +21,7 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -374,13 +375,13 @@ def _update_reference(
     return {**result, "tile": TILE, "visible_change": about["visible_change"], "bytes": output.stat().st_size}
 
 
-def _parse(scene, defines: dict) -> loading.ParsedScene:
-    """Return a scene file or a dictionary parsed, or a loaded scene in their place."""
+def _parse(scene, defines: dict) -> loading.ParsedScene | SimpleNamespace:
+    """Return a scene file or a dictionary parsed, or a loaded scene in their place, of which no files are known."""
     if not isinstance(scene, mi.Scene):
         return loading.ParsedScene(scene, defines)
     if defines:
         raise UsageError("defines: given with a scene in memory, allowed are scene files")
-    return loading.LoadedScene(scene)
+    return SimpleNamespace(load=lambda: scene, files=list, defines={}, description=os.urandom(16).hex())
 
 
 def _facts(path, reference: str, width: int, height: int, seed: int, defines: dict) -> dict:
