@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 import trimesh
 
+import mi_diffind
+from mi_diffind.commands.cli import main
 from mi_diffind.core.errors import UsageError
 from mi_diffind.plugins.support import distance_shapes
 from mi_diffind.plugins.support.properties import Kept
@@ -208,9 +210,6 @@ def test_albedos_at_grazing_angles_of_what_is_replaced(mi_rgb, folder, metal, sp
 
 
 def test_the_command_and_a_comparison_with_the_stock_scene(mi_rgb, tmp_path, capsys):
-    import mi_diffind
-    from mi_diffind.commands.cli import main
-
     materials = '<bsdf type="principled" id="Clay"/><bsdf type="principled" id="Glass"><float name="spec_trans" '
     ball = 'value="1"/></bsdf><shape type="sphere"><ref id="Clay"/></shape>'
     parsed(tmp_path, materials + ball)
