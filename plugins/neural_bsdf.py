@@ -168,10 +168,7 @@ class NeuralBSDF(mi.BSDF):
         self._tracked = [TrackedParameter(texture) for texture in self.textures.values()]
         self.known, self.member = [], None
         self._entries = tables.Entries(tables.exposed(self._arrays()))
-        self._compute_constants()
-        if self.textures:
-            when_outermost(self._compute_member)
-        self._hold()
+        self.parameters_changed()
 
         side = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide if self.two_sided else mi.BSDFFlags.FrontSide
         flags = mi.BSDFFlags.GlossyReflection | side
@@ -202,7 +199,10 @@ class NeuralBSDF(mi.BSDF):
     def parameters_changed(self, keys: list[str] = ()):
         self._entries.accept()
         frozen.make_opaque({"scale": self.scale, **self.proxy})
-        self._compute_constants()
+        if self.proxy:  # what depends on its parameters alone, once for all lanes
+            with dr.suspend_grad():
+                self.constants = dr.detach(_proxy(self.proxy, self.model.form))
+                dr.make_opaque(self.constants)
         if self.textures:
             when_outermost(self._compute_member)
         self._hold()
@@ -249,13 +249,6 @@ class NeuralBSDF(mi.BSDF):
             if any(self.known):
                 self.member = self.model.member(values) if all(self.known) else self.model.restrict(values)
         self._hold()
-
-    def _compute_constants(self):
-        """Compute what depends on the parameters of the proxy alone, once for all lanes."""
-        if self.proxy:
-            with dr.suspend_grad():
-                self.constants = dr.detach(_proxy(self.proxy, self.model.form))
-                dr.make_opaque(self.constants)
 
     def _prepare(self, ctx, wi, wo, active):
         """Return both directions on the front side, and the mask of lanes whose result counts."""
@@ -379,7 +372,7 @@ def _proxy(parameters: dict, form) -> Proxy:
             alphas = tuple(clamp(parameters[f"{name}.{axis}"], ALPHA_MIN, 1.0) for axis in axes)
             colours = [[limited(c) for c in parameters[f"{name}.{key}"]] for key in ("f0", "f90")]
             gamma = clamp(parameters[f"{name}.gamma"], 2 * low, 2 * high)  # files hold the logarithm of its half
-            lobes[name] = ProxyLobe(alphas, gamma, *colours)
+            lobes[name] = ProxyLobe.from_parameters(alphas, gamma, *colours)
     if "diffuse" not in form.terms:
         return Proxy.from_parts(None, None, lobes)
     return Proxy.from_parts([limited(c) for c in parameters["diffuse"]], limited(parameters["edge"]), lobes)
@@ -414,21 +407,15 @@ class SourceBSDF(NeuralBSDF):
     """
 
     def __init__(self, props: mi.Properties, truth):
-        self.source = _Values(truth)
+        self.source = truth
         super().__init__(props)
 
-    def _at(self, si, active):
-        return self.source, super()._at(si, active)[1]
-
-
-class _Values:
-    """Values f, without the cosine, of a source."""
-
-    def __init__(self, truth):
-        self.truth = truth
-
     def value(self, wi, wo) -> list:
-        return [v / wo.z for v in self.truth.value(wi, wo)]
+        """Return the source's f, without the cosine."""
+        return [v / wo.z for v in self.source.value(wi, wo)]
+
+    def _at(self, si, active):
+        return self, super()._at(si, active)[1]
 
 
 def _learned_or_source(props: mi.Properties):

@@ -602,7 +602,7 @@ def test_assigned_tables_are_those_of_one_instance(mi_rgb, rng, name):
 
 
 @pytest.mark.parametrize("is_textured", [False, True])
-@pytest.mark.parametrize("name", ["neural_bsdf anisotropic", "neural_bsdf family", "neural_ggx paper"])
+@pytest.mark.parametrize("name", ["neural_bsdf anisotropic", "neural_bsdf family", "neural_ggx", "neural_ggx paper"])
 def test_gradients_against_differences(mi_rgb, rng, name, is_textured):
     """By all parameters, numbers or texels, and tables. (Default forms are measured for ``docs/trust.md``.)"""
     mi, n = mi_rgb, 2**13

@@ -81,10 +81,10 @@ def shorten_tail(v, gamma):
     return t * dr.rcp(1 + t)
 
 
-def cosine_hemisphere(types, u, v):
-    """Return a direction of density cos θ / π."""
+def cosine_hemisphere(vector: type, u, v):
+    """Return a direction of density cos θ / π, a ``vector``, from two uniform numbers."""
     r, (sin, cos) = dr.sqrt(u), dr.sincos(2 * dr.pi * v)
-    return types.Array3f(r * cos, r * sin, dr.sqrt(dr.maximum(1 - u, 0)))
+    return vector(r * cos, r * sin, dr.sqrt(dr.maximum(1 - u, 0)))
 
 
 @dataclass
@@ -124,7 +124,7 @@ def outgoing(rng, types, wi, truth=None) -> Samples:
     choice, u, v, w = (rng.random(types.Float, size) for _ in range(4))
     native = NATIVE if truth is not None and truth.samples else 0.0
     share = (1 - COSINE - native) / len(ALPHAS)
-    wo = cosine_hemisphere(types, u, v)
+    wo = cosine_hemisphere(type(wi), u, v)
     for k, alpha in enumerate(ALPHAS):
         chosen = choice > COSINE + k * share
         wo = dr.select(chosen, sample_ggx(wi, types.Float(alpha), types.Float(alpha), u, v), wo)

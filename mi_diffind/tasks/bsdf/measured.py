@@ -29,11 +29,12 @@ import numpy as np
 
 from ...arrays.lookup import clamp
 from ...core import tensor_files
+from ...core.compat import module_of
 from ...core.errors import UsageError, reason
 from .directions import Samples, incident, outgoing
 from .mixture import TurnedMixture
 from .model import BSDFArrays, DirectionPair, Form, LearnedBSDF, rotate
-from .training import module_types, proxy_array, residual_range
+from .training import proxy_array, residual_range
 
 #: Relative difference up to which a symmetry is assumed.
 TOLERANCE = 0.01
@@ -611,8 +612,9 @@ def remove_outliers(
     truth: ScatteredTruth, parts: list[Samples], form: Form, logarithms: np.ndarray
 ) -> tuple[list[Samples], Form, str]:
     """Return samples without outliers from a fitted proxy, the form with the range of the first, and a line of text."""
-    types = module_types(parts[0])
-    net = BSDFArrays(None, proxy_array(logarithms, 1.0) if form.terms else None).alloc(types.TensorXf)
+    net = BSDFArrays(None, proxy_array(logarithms, 1.0) if form.terms else None).alloc(
+        module_of(parts[0].weight).TensorXf
+    )
     parts, outliers = zip(*(without_outliers(s, form, net.at(form)) for s in parts), strict=True)
     form = dataclasses.replace(form, range=residual_range(form, logarithms, parts[0]))
     left_out = f", {truth.left_out:,} at the horizon or of no weight" if truth.left_out else ""

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
-from .directions import density_ggx, incident, outgoing, sample_ggx, shorten_tail
+from .directions import cosine_hemisphere, density_ggx, incident, outgoing, sample_ggx, shorten_tail
 from .model import SAMPLING_NODES, grid, opaque_numbers, rotate, table_nodes, widths
 
 #: Directions of incidence for which weights are stored.
@@ -188,8 +188,7 @@ class Mixture:
         is_first = w < cosine + first
         pairs = zip(*((lobe.alpha_u, lobe.alpha_v, lobe.gamma) for lobe in self.lobes), strict=True)
         alpha_u, alpha_v, gamma = (dr.select(is_first, type(w)(a), type(w)(b)) for a, b in pairs)
-        r, (sin, cos) = dr.sqrt(u), dr.sincos(2 * dr.pi * v)
-        diffuse = type(wi)(r * cos, r * sin, dr.sqrt(dr.maximum(1 - u, 0)))
+        diffuse = cosine_hemisphere(type(wi), u, v)
         if not all(lobe.is_ggx for lobe in self.lobes):
             v = shorten_tail(v, gamma)
         return dr.select(w < cosine, diffuse, sample_ggx(wi, alpha_u, alpha_v, u, v))

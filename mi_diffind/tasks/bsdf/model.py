@@ -158,29 +158,6 @@ def _fifth(x):
 
 @dataclass
 class ProxyLobe:
-    """Microfacet lobe of the proxy: one or two roughnesses, exponent, and colours of three arrays each."""
-
-    alphas: tuple
-    gamma: object
-    f0: list
-    f90: list
-
-    def constants(self) -> LobeConstants:
-        """Return what does not depend on directions."""
-        squares = tuple(map(dr.square, self.alphas))
-        return LobeConstants(
-            squares,
-            tuple(2 * dr.rcp(self.gamma * square) for square in squares),
-            self.gamma,
-            self.gamma - 2,
-            dr.inv_pi * dr.rcp(self.alphas[0] * self.alphas[-1]),
-            self.f0,
-            [edge - normal for normal, edge in zip(self.f0, self.f90, strict=True)],
-        )
-
-
-@dataclass
-class LobeConstants:
     """Constants of a microfacet lobe: α² and 2/(γα²), γ, γ − 2, 1/(π α_u α_v), F₀ and F₉₀ − F₀."""
 
     squares: tuple
@@ -190,6 +167,14 @@ class LobeConstants:
     peak: object
     f0: list
     edge: list
+
+    @classmethod
+    def from_parameters(cls, alphas: tuple, gamma, f0: list, f90: list) -> ProxyLobe:
+        """Return the lobe of one or two roughnesses, an exponent, and colours of three arrays each."""
+        squares, peak = tuple(map(dr.square, alphas)), dr.inv_pi * dr.rcp(alphas[0] * alphas[-1])
+        slopes = tuple(2 * dr.rcp(gamma * square) for square in squares)
+        edge = [grazing - normal for normal, grazing in zip(f0, f90, strict=True)]
+        return cls(squares, slopes, gamma, gamma - 2, peak, f0, edge)
 
     def value(self, g: DirectionPair) -> list:
         """Return D V F, three arrays."""
@@ -217,7 +202,7 @@ class Proxy:
 
     diffuse: list | None
     edge: object
-    lobes: dict[str, LobeConstants]
+    lobes: dict[str, ProxyLobe]
 
     @classmethod
     def from_logarithms(cls, logarithms: list, form: Form) -> Proxy:
@@ -228,7 +213,9 @@ class Proxy:
             a = 4 + k * LOBE
             if name in form.terms:
                 alphas = tuple(dr.clip(x, ALPHA_MIN, 1) for x in values[a : a + (1 if form.isotropic else 2)])
-                lobes[name] = ProxyLobe(alphas, 2 * values[a + 2], values[a + 3 : a + 6], values[a + 6 : a + 9])
+                lobes[name] = ProxyLobe.from_parameters(
+                    alphas, 2 * values[a + 2], values[a + 3 : a + 6], values[a + 6 : a + 9]
+                )
         return cls.from_parts(values[DIFFUSE] if "diffuse" in form.terms else None, values[EDGE], lobes)
 
     @classmethod
@@ -236,7 +223,7 @@ class Proxy:
         """Return the proxy of an albedo (``None``: no diffuse lobe), its factor at the horizon, and lobes."""
         if diffuse is not None:
             diffuse, edge = [dr.inv_pi * c for c in diffuse], edge - 1
-        return cls(diffuse, edge, {name: lobe.constants() for name, lobe in lobes.items()})
+        return cls(diffuse, edge, lobes)
 
     def value(self, g: DirectionPair) -> list:
         """Return the proxy, without the cosine, three arrays."""
@@ -471,7 +458,7 @@ def member_proxy(numbers: list, form: Form) -> tuple[Proxy, tuple]:
         a = 4 + k * LOBE
         if name in form.terms:
             colours = [[clamp(c, low, high) for c in numbers[i : i + 3]] for i in (a + 3, a + 6)]
-            lobes[name] = ProxyLobe(roughness(a), 2 * shape(a + 2), *colours)
+            lobes[name] = ProxyLobe.from_parameters(roughness(a), 2 * shape(a + 2), *colours)
     diffuse = [clamp(c, low, high) for c in numbers[:3]] if "diffuse" in form.terms else None
     return Proxy.from_parts(diffuse, shape(3), lobes), roughness(SCALE)
 

@@ -14,6 +14,7 @@ import drjit as dr
 import numpy as np
 
 from ...arrays.indirection import DifferentiableArray, device_array
+from ...core.compat import module_of
 from ...core.progress import interruptible
 from ...fitting.loop import FitResult, Problem
 from ...fitting.settings import FitSettings
@@ -24,7 +25,6 @@ from .model import (
     BLACK,
     CHANNELS,
     DIFFUSE,
-    EDGE,
     LOBE,
     LOGARITHMS,
     PARAMETERS,
@@ -147,7 +147,7 @@ def proxy_starts(samples: Samples, types, count: int) -> list[np.ndarray]:
     with dr.suspend_grad():
         for alpha, exponent in shapes:
             a, one = types.Float(alpha), [types.Float(1)] * 3
-            value = s.wo.z * ProxyLobe((a,), types.Float(exponent), one, one).constants().value(g)[0]
+            value = s.wo.z * ProxyLobe.from_parameters((a,), types.Float(exponent), one, one).value(g)[0]
             columns += [value * (1 - g.schlick), value * g.schlick]
         dr.eval(columns, s.weight, s.value)
     weight = s.weight.numpy().astype(np.float64)
@@ -180,15 +180,11 @@ def _non_negative(gram: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 def _logarithms(first: tuple[float, float], second: tuple[float, float], colours: np.ndarray) -> np.ndarray:
-    result = np.zeros(PARAMETERS)
-    colours = np.log(np.maximum(colours, LEAST_COLOUR))
-    result[:3], result[EDGE] = colours[0], 0.0
+    """Return the logarithms of a proxy, ``(22,)``: lobes (roughness, exponent), and colours of all terms, ``(5, 3)``."""
+    colours, parts = np.log(np.maximum(colours, LEAST_COLOUR)), []
     for k, (alpha, exponent) in enumerate((first, second)):
-        a = 4 + k * LOBE
-        result[a : a + 2] = np.log(alpha)
-        result[a + 2] = np.log(exponent / 2)
-        result[a + 3 : a + 6], result[a + 6 : a + 9] = colours[1 + 2 * k], colours[2 + 2 * k]
-    return result
+        parts += [np.log([alpha, alpha, exponent / 2]), colours[1 + 2 * k], colours[2 + 2 * k]]
+    return np.concatenate([colours[0], [0.0], *parts])
 
 
 def proxy_array(logarithms: np.ndarray, rate: float) -> DifferentiableArray:
@@ -356,7 +352,7 @@ def choose_form(logarithms: np.ndarray, samples: Samples, isotropic: bool, azimu
 
 def residual_range(form: Form, logarithms: np.ndarray, samples: Samples) -> tuple[float, float]:
     """Return the range of log(f / proxy) over samples, from quantiles; without a proxy, black channels count, too."""
-    types = module_types(samples)
+    types = module_of(samples.weight)
     if form.terms:
         net = BSDFArrays(None, proxy_array(logarithms, 1.0)).alloc(types.TensorXf)
         with dr.suspend_grad():
@@ -389,13 +385,6 @@ def range_above(value: list, samples: Samples) -> tuple[float, float]:
     return float(low - margin), float(high + margin)
 
 
-def module_types(samples: Samples):
-    """Return the module of the Dr.Jit types of samples."""
-    from ...core.compat import module_of
-
-    return module_of(samples.weight)
-
-
 def residual_problem(
     logarithms: np.ndarray, form: Form, sizes: ResidualSizes, samples: Samples, measure: Callable, identity: dict
 ) -> BSDFProblem:
@@ -407,5 +396,5 @@ def residual_problem(
         start = (1 - low) / step
     residual, mixing = sizes.arrays(float(np.clip(start, 0, 1)), form.azimuth)
     proxy = proxy_array(logarithms, RATE) if form.terms else None
-    net = BSDFArrays(residual, proxy, mixing, RATE).alloc(module_types(samples).TensorXf)
+    net = BSDFArrays(residual, proxy, mixing, RATE).alloc(module_of(samples.weight).TensorXf)
     return BSDFProblem(net, form, samples, measure, identity)

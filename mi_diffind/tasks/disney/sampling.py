@@ -16,16 +16,13 @@ import drjit as dr
 from .decoder import coat_quadric, masking, quadric
 from .model import COAT_F0, TINY, Effects, geometry, schlick
 
-#: Group of coefficients → whether densities need it with the effects ``e``.
-REQUIRED = {"ggx": lambda e: True, "coat": lambda e: e.clearcoat, "shares": lambda e: len(e.lobes) > 1}
-
 #: Least share of a lobe, however low its estimated energy: without it, only other lobes would sample its directions.
 FLOOR = 0.02
 
 
 def required(e: Effects) -> tuple[str, ...]:
     """Return the groups of coefficients that densities need when the effects ``e`` are in use."""
-    return tuple(name for name, applies in REQUIRED.items() if applies(e))
+    return ("ggx", *(("coat",) if e.clearcoat else ()), *(("shares",) if len(e.lobes) > 1 else ()))
 
 
 def lobe_probabilities(c: dict, e: Effects, cos_i, rates: dict) -> dict:

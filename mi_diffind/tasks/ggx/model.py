@@ -104,11 +104,7 @@ class Encoding:
 
     def encode(self, d, alpha):
         """Return the value that arrays should hold for the distribution ``d``."""
-        return d if self.output == "raw" else dr.sqrt(dr.sqrt(d * self.peak_inverse(alpha)))
-
-    def peak_inverse(self, alpha):
-        """Return 1/D_peak = π α²."""
-        return dr.pi * dr.square(alpha)
+        return d if self.output == "raw" else dr.sqrt(dr.sqrt(d * (dr.pi * dr.square(alpha))))
 
     def decode(self, y, peak):
         """Return D for the value ``y`` that was read and ``peak`` = 1/(π α²).

@@ -251,7 +251,7 @@ def test_short_tails(types, cos):
     u, v, w = (types.Float(aligned(x)) for x in rng.random((3, n)))
     wi = types.Array3f(dr.full(types.Float, math.sqrt(1 - cos**2), n), 0, dr.full(types.Float, cos, n))
     samples = mixture.Mixture(lambda *_: [types.Float(x) for x in (1e-9, 1, 1)], (lobe, lobe)).sample(wi, w, u, v)
-    uniform = pool.cosine_hemisphere(types, u, v)
+    uniform = pool.cosine_hemisphere(types.Array3f, u, v)
     density = lobe.density(wi, uniform) * dr.pi / uniform.z
     functions = [lambda d: dr.exp(-d.x), lambda d: dr.square(d.y), lambda d: d.z]
     for f in functions:
