@@ -180,7 +180,7 @@ def _non_negative(gram: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 def _logarithms(first: tuple[float, float], second: tuple[float, float], colours: np.ndarray) -> np.ndarray:
-    """Return the logarithms of a proxy, ``(22,)``: lobes (roughness, exponent), and colours of all terms, ``(5, 3)``."""
+    """Return the logarithms of a proxy, ``(22,)``, of lobes (roughness, exponent) and colours of all terms, (5, 3)."""
     colours, parts = np.log(np.maximum(colours, LEAST_COLOUR)), []
     for k, (alpha, exponent) in enumerate((first, second)):
         parts += [np.log([alpha, alpha, exponent / 2]), colours[1 + 2 * k], colours[2 + 2 * k]]
