@@ -56,6 +56,11 @@ def interpolated(array: StoredArray, coordinates) -> np.ndarray:
     return result
 
 
+def unit(theta, phi) -> np.ndarray:
+    """Return directions ``(n, 3)`` of angles."""
+    return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=1)
+
+
 def about_normal(w, angle: float) -> np.ndarray:
     """Return directions ``(n, 3)`` after a rotation about the normal."""
     cos, sin = math.cos(angle), math.sin(angle)

@@ -19,12 +19,25 @@ from mi_diffind.core import compat
 #: Seed of all pictures that are compared.
 SEED = 3
 
-CASES = [(name, storage) for name in examples.names() for storage in ("", "float32")]
+NAMES = [*examples.names(), "family"]
+
+CASES = [(name, storage) for name in NAMES for storage in ("", "float32")]
 
 #: Plugins that expose numbers or a place of their own.
-NUMBERS = [name for name in examples.names() if name not in ("path_footprint", "path_sdf", "neural_texture")]
+NUMBERS = [
+    name for name in (*examples.names(), "family") if name not in ("path_footprint", "path_sdf", "neural_texture")
+]
+
+#: Arguments of an example: a family of ``neural_bsdf`` has a file of its own.
+EXAMPLES = {"family": {"name": "neural_bsdf"}}
 
 pytestmark = pytest.mark.usefixtures("no_garbage_collection")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def family(tmp_path_factory):
+    EXAMPLES["family"]["filename"] = str(tmp_path_factory.mktemp("families") / "family.npz")
+    save_table(EXAMPLES["family"]["filename"], learned_bsdfs.handmade_family())
 
 
 def picture(mi, scene):
@@ -39,14 +52,15 @@ def frozen(mi):
 
 def load(mi, name, storage=""):
     """The scene of an example and its parameters, or a skipped test."""
+    given = EXAMPLES.get(name, {"name": name})
     try:
-        scene = examples.load(mi, name, storage)
+        scene = examples.load(mi, storage=storage, **given)
     except RuntimeError as e:
         sentence = compat.one_sentence(e)
         if "unreferenced property" in sentence or "variant" in sentence:
             pytest.skip(sentence)
         raise
-    return scene, *examples.exposed(mi, scene, name)
+    return scene, *examples.exposed(mi, scene, given["name"])
 
 
 def from_numpy(value, factor):
@@ -75,7 +89,7 @@ def test_frozen_pictures_follow_every_parameter(mi_rgb, name, storage):
     table alone, from NumPy: a function that records anew would hide what it does not see."""
     mi = mi_rgb
     scene, params, keys = load(mi, name, storage)
-    other = examples.exposed(mi, examples.load(mi, name, storage), name)[0]  # as loaded
+    other = load(mi, name, storage)[1]  # as loaded
     first = picture(mi, scene)
     render, function = frozen(mi)
     np.testing.assert_array_equal(render(scene), first)
@@ -118,6 +132,13 @@ def test_other_shapes_are_refused(mi_rgb, name, storage):
             assert tuple(params[key].shape) == shape
     np.testing.assert_allclose(render(scene), before, atol=1e-6)
     np.testing.assert_allclose(picture(mi, scene), before, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", [name for name, storage in CASES if storage])
+def test_tables_of_floats_alone_are_parameters(mi_rgb, name):
+    for storage in ("float32", "uint8"):
+        keys = load(mi_rgb, name, storage)[2]
+        assert any(".tables." in f".{key}" for key in keys) == (storage == "float32"), keys
 
 
 @pytest.mark.parametrize("name", ["disney", "neural_bsdf"])
@@ -267,35 +288,3 @@ def test_textures_attached_to_another_sensor(mi_rgb):
         np.testing.assert_allclose(render(scene), picture(mi, scene), atol=1e-6)
         seen.append(render(scene))
     assert np.abs(seen[1] - seen[0]).max() > 1e-3
-
-
-def test_families(mi_rgb, tmp_path):
-    """Members are computed anew with each change of a number or a table; numbers compile no kernels."""
-    mi = mi_rgb
-    save_table(tmp_path / "family.npz", learned_bsdfs.handmade_family())
-    parts = examples.scene_parts(mi, "neural_bsdf", "float32")
-    file = str(tmp_path / "family.npz")
-    parts["shape"]["bsdf"] = {"type": "neural_bsdf", "filename": file, "storage": "float32"}
-    scene = mi.load_dict({**parts, "sensor": examples.sensor(mi)}, parallel=False)
-    params, keys = examples.exposed(mi, scene, "neural_bsdf")
-    keys = [key for key in keys if isinstance(params[key], dr.ArrayBase)]
-    assert len(keys) == 8
-    render, _ = frozen(mi)
-    picture(mi, scene)
-    render(scene)
-    for key in keys:
-        start = params[key].numpy().copy()
-        for factor in (0.9, 0.5):
-            params[key] = type(params[key])(np.array(np.float32(factor) * start))
-            params.update()
-            np.testing.assert_allclose(render(scene), picture(mi, scene), atol=1e-6, err_msg=f"{key} {factor}")
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        for turn in range(3):
-            for key in keys:
-                if not dr.is_tensor_v(params[key]):
-                    params[key] = 0.3 + 0.1 * turn
-            params.update()
-            picture(mi, scene)
-            kernels = dr.kernel_history()
-            dr.kernel_history_clear()
-            assert turn == 0 or not compat.was_compiled(kernels)

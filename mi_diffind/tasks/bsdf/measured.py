@@ -33,7 +33,7 @@ from ...core.compat import module_of
 from ...core.errors import UsageError, reason
 from .directions import Samples, incident, outgoing
 from .mixture import TurnedMixture
-from .model import BSDFArrays, DirectionPair, Form, LearnedBSDF, rotate
+from .model import BSDFArrays, DirectionPair, Form, LearnedBSDF, rotate, turn
 from .training import proxy_array, residual_range
 
 #: Relative difference up to which a symmetry is assumed.
@@ -200,9 +200,6 @@ def measure_symmetry(truth, types, size: int = 2**16, seed: int = 1) -> dict[str
     weight = dr.select(dr.minimum(wi.z, wo.z) > 0.087, samples.weight, 0)
     sin, cos = dr.sincos(2 * dr.pi * rng.random(types.Float, size))
 
-    def rotated(w):
-        return types.Array3f(dr.fma(cos, w.x, -sin * w.y), dr.fma(sin, w.x, cos * w.y), w.z)
-
     def mirrored(w):  # at the plane of wi and the normal
         r2 = dr.maximum(dr.square(wi.x) + dr.square(wi.y), 1e-12)
         along, across = (w.x * wi.x + w.y * wi.y) / r2, (w.y * wi.x - w.x * wi.y) / r2
@@ -210,7 +207,7 @@ def measure_symmetry(truth, types, size: int = 2**16, seed: int = 1) -> dict[str
 
     value = truth.value(wi, wo)
     others = {
-        "isotropy": truth.value(rotated(wi), rotated(wo)),
+        "isotropy": truth.value(turn(wi, sin, cos), turn(wo, sin, cos)),
         "mirror": truth.value(wi, mirrored(wo)),
         "reciprocity": [v * wo.z / wi.z for v in truth.value(wo, wi)],
     }
@@ -415,9 +412,7 @@ def along_x(truth: ScatteredTruth) -> np.ndarray:
     """Return ``wo`` after a rotation about the normal that brings ``wi`` to the azimuth 0."""
     x, y = truth.wi[:, 0], truth.wi[:, 1]
     r = np.hypot(x, y)
-    cos, sin = np.where(r > 1e-9, x, 1) / np.maximum(r, 1e-9), y / np.maximum(r, 1e-9)
-    cos = np.where(r > 1e-9, cos, 1)
-    wo = truth.wo
+    cos, sin, wo = np.where(r > 1e-9, x / np.maximum(r, 1e-9), 1), y / np.maximum(r, 1e-9), truth.wo
     return np.stack([cos * wo[:, 0] + sin * wo[:, 1], cos * wo[:, 1] - sin * wo[:, 0], wo[:, 2]], axis=1)
 
 
@@ -453,6 +448,9 @@ def measure_row_symmetry(truth: ScatteredTruth, seed: int = 1) -> dict[str, floa
         weight = np.minimum(np.maximum(a, b), bright)  # bright rows count more, outliers little
         return float((weight * np.abs(a - b) / (a + b)).sum() / weight.sum())
 
+    def difference_beyond(usual: float | None, other: float | None) -> float | None:
+        return None if other is None or usual is None else max(0.0, other - USUAL * usual)
+
     def first(condition: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the nearest neighbour that meets a condition, and whether there is one."""
         return neighbours[np.arange(len(rows)), condition.argmax(axis=1)], condition.any(axis=1)
@@ -461,12 +459,12 @@ def measure_row_symmetry(truth: ScatteredTruth, seed: int = 1) -> dict[str, floa
         """Return the difference from the rows nearest to images, no further than neighbours are."""
         distance, nearest = tree.query(images[rows])
         close = (distance <= 1.5 * near[:, 0]) & (nearest != rows) & informative
-        return _excess(difference(nearest, close), difference(neighbours[:, 0], close))
+        return difference_beyond(difference(neighbours[:, 0], close), difference(nearest, close))
 
     result: dict[str, float | None] = {}
     same, other = first(angle < SAME), first(angle > OTHER)
     both = same[1] & other[1]
-    result["isotropy"] = _excess(difference(other[0], both), difference(same[0], both))
+    result["isotropy"] = difference_beyond(difference(same[0], both), difference(other[0], both))
     # Rows in the plane of incidence say nothing about the mirror image
     result["mirror"] = excess(points * MIRROR, np.abs(points[rows, 2]) > 0.02)
     isotropic = (result["isotropy"] or 0) <= TOLERANCE
@@ -479,9 +477,9 @@ def measure_row_symmetry(truth: ScatteredTruth, seed: int = 1) -> dict[str, floa
 
 def exchange(truth: ScatteredTruth) -> ScatteredTruth:
     """Return the rows with their directions exchanged."""
-    result = copy.copy(truth)
-    result.wi, result.wo = truth.wo, truth.wi
-    return result
+    exchanged = copy.copy(truth)
+    exchanged.wi, exchanged.wo = truth.wo, truth.wi
+    return exchanged
 
 
 def irreciprocal_share(truth: ScatteredTruth, isotropic: bool, mirror: bool) -> float | None:
@@ -523,10 +521,6 @@ def cells(angles: np.ndarray) -> np.ndarray:
     values, index = np.unique(np.round(angles, 5), return_inverse=True)
     widths = np.gradient(values) if len(values) > 1 else np.ones(1)
     return widths[index.reshape(angles.shape)].prod(axis=1)
-
-
-def _excess(difference: float | None, usual: float | None) -> float | None:
-    return None if difference is None or usual is None else max(0.0, difference - USUAL * usual)
 
 
 def solid_angles(truth: ScatteredTruth, isotropic: bool) -> np.ndarray:
@@ -612,9 +606,8 @@ def remove_outliers(
     truth: ScatteredTruth, parts: list[Samples], form: Form, logarithms: np.ndarray
 ) -> tuple[list[Samples], Form, str]:
     """Return samples without outliers from a fitted proxy, the form with the range of the first, and a line of text."""
-    net = BSDFArrays(None, proxy_array(logarithms, 1.0) if form.terms else None).alloc(
-        module_of(parts[0].weight).TensorXf
-    )
+    proxy, types = proxy_array(logarithms, 1.0) if form.terms else None, module_of(parts[0].weight)
+    net = BSDFArrays(None, proxy).alloc(types.TensorXf)
     parts, outliers = zip(*(without_outliers(s, form, net.at(form)) for s in parts), strict=True)
     form = dataclasses.replace(form, range=residual_range(form, logarithms, parts[0]))
     left_out = f", {truth.left_out:,} at the horizon or of no weight" if truth.left_out else ""

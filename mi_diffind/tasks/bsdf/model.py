@@ -213,9 +213,8 @@ class Proxy:
             a = 4 + k * LOBE
             if name in form.terms:
                 alphas = tuple(dr.clip(x, ALPHA_MIN, 1) for x in values[a : a + (1 if form.isotropic else 2)])
-                lobes[name] = ProxyLobe.from_parameters(
-                    alphas, 2 * values[a + 2], values[a + 3 : a + 6], values[a + 6 : a + 9]
-                )
+                colours = values[a + 3 : a + 6], values[a + 6 : a + 9]
+                lobes[name] = ProxyLobe.from_parameters(alphas, 2 * values[a + 2], *colours)
         return cls.from_parts(values[DIFFUSE] if "diffuse" in form.terms else None, values[EDGE], lobes)
 
     @classmethod
@@ -477,7 +476,11 @@ def rotate(w, angle: float):
     """Return directions after a rotation about the normal."""
     if not angle:
         return w
-    cos, sin = math.cos(angle), math.sin(angle)
+    return turn(w, math.sin(angle), math.cos(angle))
+
+
+def turn(w, sin, cos):
+    """Return directions after a rotation about the normal by the angle of a sine and a cosine."""
     return type(w)(dr.fma(cos, w.x, -sin * w.y), dr.fma(sin, w.x, cos * w.y), w.z)
 
 

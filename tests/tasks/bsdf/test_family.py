@@ -6,10 +6,11 @@ import drjit as dr
 import numpy as np
 import pytest
 from arrays import aligned, numpy_of
+from bsdf_queries import random_directions
 from learned_bsdfs import formula, handmade_family, member
 
 import mi_diffind
-from mi_diffind.arrays.tables import StoredArray, TableError, load_table, save_table
+from mi_diffind.arrays.tables import TableError, load_table, save_table
 from mi_diffind.core.errors import UsageError
 from mi_diffind.core.runtime import array_module
 from mi_diffind.tasks.bsdf import TASK, energy, evaluation, mixture, training
@@ -31,15 +32,6 @@ def model(types, tmp_path):
     return mi_diffind.open(tmp_path / "family.npz")
 
 
-def directions(rng, n, horizon=0.02):
-    pair = []
-    for _ in range(2):
-        z, phi = horizon + (1 - horizon) * rng.random(n), 2 * np.pi * rng.random(n)
-        r = np.sqrt(1 - z * z)
-        pair.append(np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1))
-    return pair
-
-
 def test_coordinates(types):
     """Wide ranges of positive numbers are logarithmic; numbers outside and NaN count as the ends."""
     values = types.Float(aligned(np.float32([0.05, 0.2, 0.8, 3, -1, np.inf, np.nan])))
@@ -52,7 +44,7 @@ def test_coordinates(types):
 def test_the_formula(types, model, rng):
     """A member is the learned BSDF of the proxy, residual and energy that its parameters give, lane by lane."""
     n = 1200
-    wi, wo = directions(rng, n)
+    wi, wo = (random_directions(rng, n, 0.02) for _ in range(2))
     given = np.repeat(MEMBERS, n // len(MEMBERS), axis=0)
     bsdf, _ = model.at([types.Float(aligned(column)) for column in given.T.astype(np.float32)])
     values = numpy_of(bsdf.value(*(types.Array3f(aligned(w.T)) for w in (wi, wo))))
@@ -95,29 +87,6 @@ def test_the_command_line_names_ranges(capsys):
     with pytest.raises(SystemExit):
         cli.main(["fit", "bsdf", "a.xml", "--over", "roughness=1", "-o", "a.npz"])
     assert "found 'roughness=1', expected NAME=LOW:HIGH" in capsys.readouterr().err
-
-
-DAMAGES = {
-    "name": (lambda t: t.settings.update(family=[{"name": "a b", "low": 0, "high": 1}]), "which are no parameters"),
-    "range": (lambda t: t.settings["family"].__setitem__(0, {"name": "a", "low": 1, "high": 1}), "are no parameters"),
-    "fewer": (lambda t: t.settings["family"].pop(), "expected 1 dimension"),
-    "factors": (lambda t: t.settings.update(factors=[1]), r'its setting "factors" is \[1\]'),
-    "mixing": (lambda t: t.arrays.pop("mixing"), 'the array "mixing" is missing'),
-    "rank": (lambda t: t.arrays.update(mixing=t.arrays["energy"]), 'the array "mixing" has the shape'),
-    "proxy": (lambda t: t.arrays.update(proxy=StoredArray(np.zeros((4, 3, 5), np.float16))), "and 24 channel"),
-    "terms": (lambda t: t.settings["form"].update(terms=[]), "a family needs a proxy"),
-    "other": (lambda t: t.arrays.update(more=t.arrays["energy"]), 'has an unexpected array "more"'),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("damage", DAMAGES)
-def test_damaged_files_are_refused(tmp_path, damage):
-    table = handmade_family()
-    change, message = DAMAGES[damage]
-    change(table)
-    save_table(tmp_path / "damaged.npz", table)
-    with pytest.raises(TableError, match=message):
-        TASK.load(tmp_path / "damaged.npz")
 
 
 def test_a_family_of_conductors_is_fitted(types, monkeypatch, tmp_path):

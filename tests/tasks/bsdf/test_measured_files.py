@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from arrays import aligned, numpy_of
+from bsdf_queries import random_directions
 from variants import set_variant
 
 import mi_diffind
@@ -14,12 +15,6 @@ from mi_diffind.tasks.bsdf.truth import truth_of
 
 #: Wavelengths of the files, nm.
 WAVELENGTHS = np.array([400, 470, 560, 610, 700])
-
-
-def directions(rng, n=400):
-    z, phi = 0.2 + 0.8 * rng.random((2, n)), 2 * np.pi * rng.random((2, n))
-    r = np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1).astype(np.float32)
 
 
 def measured_fields(name, channels):
@@ -73,7 +68,7 @@ def test_colours_are_those_of_spectral_variants(tmp_path, rng, plugin, illuminan
         spectral_file(path)
     else:
         polarised_file(path)
-    wi, wo = directions(rng)
+    wi, wo = random_directions(rng, 400, 0.2), random_directions(rng, 400, 0.2)
     truth = truth_of(path, array_module(), illuminant=illuminant)
     assert truth.remark == f"spectra as linear sRGB under the illuminant {illuminant}"
     types = array_module()

@@ -5,7 +5,7 @@ import json
 
 import numpy as np
 import pytest
-from learned_bsdfs import formula, handmade
+from learned_bsdfs import formula, handmade, unit
 
 import mi_diffind
 from mi_diffind.arrays.tables import TableError, load_table, save_table
@@ -29,10 +29,6 @@ def model(types, tmp_path):
         return mi_diffind.open(tmp_path / "learned.npz")
 
     return opened
-
-
-def unit(theta, phi):
-    return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=1)
 
 
 def test_tables_of_numbers(model, tmp_path):

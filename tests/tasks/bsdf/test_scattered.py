@@ -8,6 +8,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from arrays import aligned, numpy_of
+from learned_bsdfs import unit
 
 import mi_diffind
 from mi_diffind.core.errors import UsageError
@@ -23,10 +24,6 @@ HEADER = "theta_i,phi_i,theta_o,phi_o,r,g,b"
 @pytest.fixture
 def types(mi_rgb):
     return array_module()
-
-
-def unit(theta, phi):
-    return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=1)
 
 
 def angles(rng, n, azimuth=True):

@@ -1,6 +1,6 @@
 """
 The Disney plugins where it is hardest: what is left out because a material does not use it, energy and accuracy at the
-horizon and at the peak, derivatives at the ends of parameters, and a long optimisation.
+horizon and at the peak, and derivatives at the ends of parameters.
 """
 
 import itertools
@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from arrays import aligned
 from bsdf_queries import close, interactions, random_directions, uniform, vectors, with_cosines
-from disney_materials import FORMS, PLAIN, PRESETS, RICH, SCALARS, plugin, textured
-from spheres import key_of, sphere_scene
+from disney_materials import PLAIN, PRESETS, RICH, SCALARS, plugin, textured
 
 from mi_diffind.arrays.boxes import ValueBounds
 from mi_diffind.fitting.loop import EXPONENTIAL_RATE
@@ -252,80 +251,3 @@ def test_gradients_at_the_ends_against_finite_differences(mi_rgb, rng, form, eve
         assert abs(found - expected) <= tolerance * scale + 1e-3, (name, m, found, expected)
         if scale > 1:
             assert found != 0, (name, m)
-
-
-# -- a long optimisation -----------------------------------------------------------------------------------------------
-
-
-WARM_UP = 25
-
-
-def resident_bytes():
-    with open("/proc/self/statm") as f:
-        return int(f.read().split()[1]) * 4096
-
-
-def optimise(mi, form, steps, start, target):
-    """
-    Recover roughness, albedo and clearcoat of ``target`` from its image. Returns what was found, and of each step its
-    kernels, and the process's memory and Dr.Jit's largest, in bytes.
-    """
-    lamps = {
-        f"lamp{i}": {"type": "point", "position": position, "intensity": 15.0}
-        for i, position in enumerate(([-3.0, 1.0, 3.0], [0.0, -3.0, 4.0]))
-    }
-    fixed, lit = {"clearcoat_gloss": 0.3, "metallic": 0.5}, {"size": 24, "depth": 2, "light": 0.02, **lamps}
-    reference = mi.render(sphere_scene(mi, plugin(mi, "disney", {**fixed, **target}), "prb", **lit), spp=512)
-    scene = sphere_scene(mi, plugin(mi, form, {**fixed, **start}), "prb", **lit)
-    params = mi.traverse(scene)
-    keys = {name: key_of(params, f"bsdf.{name}.value") for name in ("roughness", "base_color", "clearcoat")}
-    opt = mi.ad.Adam(lr=0.03)
-    for key in keys.values():
-        opt[key] = params[key]
-    opt.set_learning_rate({keys["clearcoat"]: 0.15})
-    backend = dr.backend_v(mi.Float)
-    history, launched, resident, watermark = [], [], [], []
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.kernel_history_clear()
-        for step in range(steps):
-            dr.detail.malloc_clear_statistics()
-            for key in keys.values():
-                opt[key] = dr.clip(opt[key], 0, 1)
-            params.update(opt)
-            image = mi.render(scene, params, spp=8, seed=step)
-            loss = dr.mean(dr.square(image - reference), axis=None)
-            dr.backward(loss)
-            assert np.isfinite(float(loss.array[0])), step
-            opt.step()
-            dr.eval([opt[key] for key in keys.values()])
-            kernels = [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]
-            launched.append({entry["hash"] for entry in kernels})
-            history.append(np.concatenate([opt[key].numpy().ravel() for key in keys.values()]))
-            resident.append(resident_bytes())
-            watermark.append(dr.detail.malloc_watermark(backend))
-    # The noise of the images makes the parameters wander: their mean
-    roughness, *albedo, coat = np.mean(history[len(history) * 3 // 5 :], axis=0)
-    found = {"roughness": roughness, "base_color": np.array(albedo), "clearcoat": coat}
-    return found, launched, np.array(resident), np.array(watermark)
-
-
-@pytest.mark.parametrize(
-    "form, steps", [("disney", 80), *(pytest.param(f, 500, marks=pytest.mark.slow) for f in FORMS)]
-)
-def test_a_long_optimisation(mi_rgb, form, steps):
-    """
-    500 steps from a coat of exactly 0 recover roughness and albedo within 0.03 and the coat, of which little is seen,
-    within 0.1, and fewer come close, at constant cost: after the warm-up no new kernel appears and memory stays.
-    """
-    start = {"roughness": 0.3, "base_color": (0.5, 0.5, 0.5), "clearcoat": 0.0}
-    target = {"roughness": 0.6, "base_color": (0.7, 0.2, 0.1), "clearcoat": 0.8}
-    found, launched, resident, watermark = optimise(mi_rgb, form, steps, start, target)
-    grown = (resident[-1] - resident[WARM_UP]) / 2**20
-    print(f"{form}: memory {grown:+.2f} MiB, {found}")
-    known = set().union(*launched[:WARM_UP])
-    assert known and all(kernels <= known for kernels in launched[WARM_UP:])
-    assert watermark[WARM_UP:].max() <= watermark[5:WARM_UP].max() * 1.05 + 2**16
-    assert grown < 16
-    for name, expected in target.items():
-        tolerance = (0.03 if steps == 500 else 0.05) if name != "clearcoat" else 0.1 if steps == 500 else 0.25
-        assert np.allclose(found[name], expected, atol=tolerance), (name, found[name])

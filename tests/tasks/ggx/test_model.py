@@ -428,15 +428,6 @@ def test_a_file_is_read_once(tmp_path, shipped, ad, monkeypatch):
     assert TASK.open(ad.TensorXf, path, storage="uint8").storage == "uint8" and len(reads) == 2
 
 
-def test_copies_of_a_file_are_independent(ad):
-    first, second = (TASK.open(ad.TensorXf).distribution for _ in range(2))
-    before = second.net.primary[0].numpy()
-    first.net.primary[0].data = first.net.primary[0].data * 0
-    dr.enable_grad(first.net.cascaded.data)
-    np.testing.assert_array_equal(second.net.primary[0].numpy(), before)
-    assert not dr.grad_enabled(second.net.cascaded.data)
-
-
 def test_entries_an_optimiser_left_out_of_range_are_folded(ad, shipped):
     """In single precision; the triangle wave maps them to pointers."""
     read = stored(ad, shipped, "tables")
