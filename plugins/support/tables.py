@@ -102,14 +102,9 @@ def arrays_of(value, visited: set | None = None) -> list:
     if isinstance(value, dr.ArrayBase):
         value = value.array if dr.is_tensor_v(value) else value
         return [value] if dr.is_jit_v(value) else []
-    if isinstance(value, dict):
-        inside = value.values()
-    elif isinstance(value, (list, tuple)):
-        inside = value
-    else:
-        inside = (
-            vars(value).values() if hasattr(value, "__dict__") and not isinstance(value, (type, ModuleType)) else ()
-        )
+    if hasattr(value, "__dict__") and not isinstance(value, (type, ModuleType)):
+        value = vars(value)
+    inside = value.values() if isinstance(value, dict) else value if isinstance(value, (list, tuple)) else ()
     return [array for one in inside for array in arrays_of(one, visited)]
 
 

@@ -18,11 +18,11 @@ from .measured import FunctionTruth, Truth
 from .model import opaque_numbers
 from .truth import FamilyTruth
 
-#: Angles of incidence at which albedos are compared, degrees.
-ALBEDO_ANGLES = (0, 15, 30, 45, 60, 70, 80, 85, 89)
+#: Cosines of the angles of incidence at which albedos are compared.
+ALBEDO_COSINES = np.cos(np.radians((0, 15, 30, 45, 60, 70, 80, 85, 89)))
 
-#: Angles of incidence at which the weights of samples are measured, degrees.
-WEIGHT_ANGLES = (0, 45, 80)
+#: Cosines of the angles of incidence at which the weights of samples are measured.
+WEIGHT_COSINES = np.cos(np.radians((0, 45, 80)))
 
 #: Members of a family that are measured.
 MEMBERS = 24
@@ -46,21 +46,15 @@ PASSES = 8
 ENLARGED = 8
 
 
-def cosines(degrees) -> np.ndarray:
-    """Return cosines of angles in degrees."""
-    return np.cos(np.radians(degrees))
-
-
 def albedo_excess(truth: Truth, value, types) -> float:
     """Return the largest relative difference by which a directional albedo of f cos θ_o lies above the source's."""
-    source, learned = energy.albedos([truth.value, value], truth, types, cosines(ALBEDO_ANGLES))
+    source, learned = energy.albedos([truth.value, value], truth, types, ALBEDO_COSINES)
     return float(((learned - source) / np.maximum(source, 1e-3)).max())
 
 
 def weight_moments(truth: Truth, sampling, types, size: int = 2**16) -> list[float]:
-    """Return E[w²]/E[w]² of the weights of samples of a source by a mixture, at :data:`WEIGHT_ANGLES`."""
-    cos = map(float, cosines(WEIGHT_ANGLES))
-    return [mixture.second_moment(truth.value, sampling, truth, types, c, size) for c in cos]
+    """Return E[w²]/E[w]² of the weights of samples of a source by a mixture, at :data:`WEIGHT_COSINES`."""
+    return [mixture.second_moment(truth.value, sampling, truth, types, float(c), size) for c in WEIGHT_COSINES]
 
 
 def measure(model, truth: Truth, view: SphereView) -> dict[str, float]:
@@ -91,7 +85,7 @@ def measure_samples(model, samples: Samples) -> dict[str, float]:
     fitted = FunctionTruth("", value)
     return {
         "relative_error": float((error / total)[0]),
-        "albedo_largest": float(energy.albedos([value], fitted, types, cosines(ALBEDO_ANGLES)).max()),
+        "albedo_largest": float(energy.albedos([value], fitted, types, ALBEDO_COSINES).max()),
         "sample_weight_moment": float(np.mean(weight_moments(fitted, model.mixture, types))),
     }
 

@@ -54,6 +54,9 @@ AXES_SAMPLES = 2**18
 #: Illuminants, the first is the default.
 ILLUMINANTS = ("D65", "E")
 
+#: Line about the colours of a spectral file.
+REMARK = "spectra as linear sRGB under the illuminant {}"
+
 #: Columns of angles that a file needs.
 ANGLES = ("theta_i", "phi_i", "theta_o", "phi_o")
 
@@ -267,11 +270,7 @@ def measured_bsdf(path: Path, illuminant: str):
     with tempfile.TemporaryDirectory() as folder:
         converted = os.path.join(folder, path.name)
         tensor_files.write(converted, fields)
-        return mi.load_dict({"type": "measured", "filename": converted}), _remark(illuminant)
-
-
-def _remark(illuminant: str) -> str:
-    return f"spectra as linear sRGB under the illuminant {illuminant}"
+        return mi.load_dict({"type": "measured", "filename": converted}), REMARK.format(illuminant)
 
 
 class PolarisedTruth(Truth):
@@ -297,7 +296,7 @@ class PolarisedTruth(Truth):
         grid.reshape(*nodes[:3], 4)[..., :3] = colours
         angles = [np.ravel(fields[name]).astype(float).tolist() for name in ("phi_d", "theta_d", "theta_h")]
         self.mi, self.grid = mi, mi.MarginalContinuous2D3(grid, angles, False, False)
-        self.name, self.remark = path.name, _remark(illuminant)
+        self.name, self.remark = path.name, REMARK.format(illuminant)
         digest = hashlib.sha256(illuminant.encode())
         with open(path, "rb") as stream:
             while block := stream.read(2**24):
@@ -339,7 +338,9 @@ class ScatteredTruth(Truth):
                 raise UsageError(f"{path}:{lines[row]}: {fault.format(*rows[row])}")
 
         refuse(~np.isfinite(rows).all(axis=1), "holds a number that is not finite")
-        unit = angles or _unit(path, [columns[name] for name in ANGLES])
+        unit = angles or "degrees"
+        if not angles and max(np.abs(columns[name]).max() for name in ANGLES) <= 2 * math.pi * (1 + 1e-6):
+            raise UsageError(f"{path}: its angles are all below 2π: say whether they are degrees or radians (--angles)")
         if unit == "degrees":
             columns |= {name: np.radians(columns[name]) for name in ANGLES}
         limit = "90 degrees" if unit == "degrees" else "π/2"
@@ -372,12 +373,12 @@ def read_rows(path: Path) -> tuple[list[str], np.ndarray, list[int]]:
         raise UsageError(f"{path}: cannot be read ({reason(e)})") from None
     (_, header), *body = [(k, t) for k, t in texts if t.strip() and not t.lstrip().startswith("#")] or [(0, "")]
     names = [name.strip().lower() for name in header.split(",")]
-    known = (*ANGLES, *VALUES, *OPTIONAL)
+    needed = (*ANGLES, *VALUES)
+    known = (*needed, *OPTIONAL)
     for name in names if header else ():
         if name not in known or names.count(name) > 1:
             fault = " twice" if name in known else f", allowed are {', '.join(known)}"
             raise UsageError(f'{path}: its header has the column "{name}"{fault}')
-    needed = (*ANGLES, *VALUES)
     missing = [name for name in needed if name not in names]
     if missing:
         raise UsageError(f"{path}: its header has no {', '.join(missing)}, needed are {', '.join(needed)}")
@@ -394,13 +395,6 @@ def read_rows(path: Path) -> tuple[list[str], np.ndarray, list[int]]:
     if not rows:
         raise UsageError(f"{path}: has no rows below its header")
     return names, np.array(rows), [number for number, _ in body]
-
-
-def _unit(path: Path, angles: list[np.ndarray]) -> str:
-    """Return the unit of angles: degrees, unless all are so small that they may be radians."""
-    if max(np.abs(a).max() for a in angles) <= 2 * math.pi * (1 + 1e-6):
-        raise UsageError(f"{path}: its angles are all below 2π: say whether they are degrees or radians (--angles)")
-    return "degrees"
 
 
 def _direction(theta: np.ndarray, phi: np.ndarray) -> np.ndarray:

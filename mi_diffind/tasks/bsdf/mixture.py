@@ -13,7 +13,7 @@ import numpy as np
 from .directions import cosine_hemisphere, density_ggx, incident, outgoing, sample_ggx, shorten_tail
 from .model import SAMPLING_NODES, grid, opaque_numbers, rotate, table_nodes, widths
 
-#: Directions of incidence for which weights are stored.
+#: Directions of incidence for which weights are stored, evenly spaced in √cos θ_i: dense near the horizon.
 NODES = 16
 
 #: Samples of each of these directions that determine the weights; of a member of a family.
@@ -40,16 +40,6 @@ PAIRS = 6
 
 #: Least weight of the cosine: every direction can be drawn.
 FLOOR = 0.02
-
-
-def coordinate(cos):
-    """Return the coordinate in [0, 1] of the cosine of an angle in tables of directions: dense near the horizon."""
-    return dr.sqrt(dr.clip(cos, 0, 1))
-
-
-def cosines(nodes: int) -> np.ndarray:
-    """Return the cosines of the nodes of a table; the first is slightly above the horizon."""
-    return np.maximum(np.linspace(0, 1, nodes) ** 2, 2e-3)
 
 
 @dataclass(frozen=True)
@@ -136,7 +126,8 @@ def candidate_densities(truth, types, isotropic: bool, lobes: list, size: int, s
     """
     rng = dr.rng(seed=dr.opaque(types.UInt64, seed))
     node = dr.arange(types.UInt32, NODES * size) // size
-    cos = dr.gather(types.Float, types.Float(cosines(NODES).astype(np.float32)), node)
+    cosines = np.maximum(np.linspace(0, 1, NODES) ** 2, 2e-3)  # the first is slightly above the horizon
+    cos = dr.gather(types.Float, types.Float(cosines.astype(np.float32)), node)
     sin = dr.sqrt(1 - dr.square(cos))
     azimuth = incident(rng, types, NODES * size, isotropic)
     r = dr.rsqrt(dr.maximum(dr.square(azimuth.x) + dr.square(azimuth.y), 1e-12))
@@ -170,7 +161,7 @@ def optimal_weights(densities: np.ndarray, square: np.ndarray, iterations: int =
 class Mixture:
     """Mixture of a cosine and two lobes of visible GGX normals.
 
-    ``weights`` is an array of three channels that is read at :func:`coordinate` of cos θ_i.
+    ``weights`` is an array of three channels that is read at √cos θ_i.
     """
 
     def __init__(self, weights, lobes: tuple[SampledLobe, SampledLobe]):
@@ -178,7 +169,7 @@ class Mixture:
 
     def shares(self, wi, active=True) -> list:
         """Return the probabilities of cosine and lobes, which sum to 1."""
-        values = [dr.maximum(v, 1e-3) for v in self.weights([coordinate(wi.z)], active)]
+        values = [dr.maximum(v, 1e-3) for v in self.weights([dr.sqrt(dr.clip(wi.z, 0, 1))], active)]
         inverse = dr.rcp(values[0] + values[1] + values[2])
         return [v * inverse for v in values]
 

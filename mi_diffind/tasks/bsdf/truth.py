@@ -251,9 +251,8 @@ def truth_of(
         return MitsubaTruth(source, source.class_name(), hashlib.sha256(str(source).encode()).hexdigest(), uv)
     if isinstance(source, dict):
         name, content = str(source.get("type", "dictionary")), repr(sorted(source.items(), key=str)).encode()
-        return MitsubaTruth(
-            _chosen(_built(name, lambda: mi.load_dict(source)), name, material), name, _hash(content), uv
-        )
+        bsdf = _chosen(_built(name, lambda: mi.load_dict(source)), name, material)
+        return MitsubaTruth(bsdf, name, _hash(content), uv)
     path = Path(os.fspath(source))
     if fault := irregular(path, memory() // 4):
         raise UsageError(f"{shown(path)}: {fault}")
@@ -281,9 +280,8 @@ def truth_of(
 
 def recorded_source(options) -> dict:
     """Return what a table file keeps of a source beside the path of its file, so that it can be opened again."""
-    recorded = {"material": options["material"], "uv": [float(x) for x in options["uv"]], "angles": options["angles"]}
-    recorded["illuminant"] = options["illuminant"]
-    source = options["source"]
+    source, recorded = options["source"], {name: options[name] for name in ("material", "uv", "angles", "illuminant")}
+    recorded["uv"] = [float(x) for x in recorded["uv"]]
     try:
         if isinstance(source, dict) and json.loads(json.dumps(source)) == source:
             recorded["dictionary"] = source

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import asdict
 
-from ...core.errors import UsageError
 from ...fitting.settings import FitSettings
 from ...fitting.task import Argument, FitRequest, Task
 
@@ -44,15 +44,10 @@ class GGX(Task):
         from .model import indirection
         from .training import GGXProblem
 
-        try:
-            net = indirection(request.options["primary"], request.options["cascaded"])
-        except ValueError as e:
-            raise UsageError(str(e)) from None
+        net = indirection(request.options["primary"], request.options["cascaded"])
         return GGXProblem(net.alloc(request.types.TensorXf), request.types, request.preset)
 
     def table(self, problem, request: FitRequest):
-        from dataclasses import asdict
-
         from ...arrays.tables import StoredArray, Table
 
         net = problem.net
