@@ -154,7 +154,7 @@ class BSDFTraining(Job):
             proxy = LearnedBSDF(model.form, None, model.bsdf.proxy)
             errors["psnr_proxy_db"] = SphereView(truth, model.types).psnr(proxy.cosine_value)
         for name, sampled in (("learned", model.mixture), ("native", truth)):
-            moments = [mixture.second_moment(truth.value, sampled, truth, model.types, cos) for cos in COSINES]
+            moments = [mixture.second_moment(truth, sampled, model.types, cos) for cos in COSINES]
             errors[f"moment_{name}"] = sum(moments) / len(moments)
         settings = model.table.settings
         details = {key: settings[key] for key in ("form", "symmetry", "steps")}

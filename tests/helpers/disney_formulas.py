@@ -68,8 +68,11 @@ def brdf(base_color, m, wi, wo):
     return diffuse + specular + coat[:, None]
 
 
-def random_case(rng, n, low_cosine=0.0):
-    """Random materials (uniform parameters) and directions (uniform over the hemisphere, cosines ≥ low_cosine)."""
+def random_case(rng, n, low_cosine=0.0, rate=0.0):
+    """
+    Random materials and directions (uniform over the hemisphere, cosines ≥ low_cosine). Parameters are uniform, or
+    metallic and roughness of an exponential-like distribution of a ``rate``.
+    """
 
     def directions():
         z = low_cosine + (1 - low_cosine) * rng.random(n)
@@ -77,4 +80,7 @@ def random_case(rng, n, low_cosine=0.0):
         r = np.sqrt(1 - z * z)
         return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1)
 
-    return rng.random((n, 3)), {k: rng.random(n) for k in NAMES}, directions(), directions()
+    color, m = rng.random((n, 3)), {k: rng.random(n) for k in NAMES}
+    for name in ("metallic", "roughness") if rate else ():  # the inverse of its cumulative distribution
+        m[name] = -np.log(1 - m[name] * (1 - np.exp(-rate))) / rate
+    return color, m, directions(), directions()

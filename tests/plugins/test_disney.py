@@ -5,7 +5,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from arrays import aligned
-from bsdf_queries import bitmap, equal_images, interactions, random_directions, vectors
+from bsdf_queries import bitmap, equal_images, interactions, random_directions, texels, vectors
 from disney_materials import FORMS, plugin
 from disney_materials import RICH as COLOURED
 from gradients import gradients_enabled
@@ -24,36 +24,21 @@ def directions(mi, rng, n, low=0.0):
 # -- values ------------------------------------------------------------------------------------------------------------
 
 
-def textured(mi, name, color, m, **more):
-    """A BSDF with one random material a texel, and the interactions that hit each texel's centre."""
-    n = int(np.sqrt(len(color)))
-
-    def texture(values):
-        return bitmap(mi, np.reshape(values, (n, n, -1)))
-
-    return mi.load_dict({**FORMS[name], "base_color": texture(color), **{k: texture(v) for k, v in m.items()}, **more})
-
-
-def texel_interactions(mi, wi):
-    n = int(np.sqrt(len(wi)))
-    si = interactions(mi, mi.Vector3f(aligned(wi.T)))
-    index = np.arange(n * n)
-    si.uv = mi.Point2f(aligned((index % n + 0.5) / n), aligned((index // n + 0.5) / n))
-    return si
-
-
 @pytest.mark.parametrize("name, decibels", [("disney", 120), ("tables", 84), ("paper", 34)])
 def test_values_are_burleys(mi_rgb, rng, name, decibels):
     """Of random texels; densities are those of the exact plugin."""
     mi = mi_rgb
-    color, m, wi, wo = disney_formulas.random_case(rng, 256 * 256, low_cosine=1e-3)
+    n, ctx = 2**14, mi.BSDFContext()
+    color, m, wi, wo = disney_formulas.random_case(rng, n, low_cosine=1e-3)
     color, m = color.astype(np.float32), {k: v.astype(np.float32) for k, v in m.items()}
-    si, towards = texel_interactions(mi, wi), vectors(mi, wo)
-    value, pdf = textured(mi, name, color, m).eval_pdf(mi.BSDFContext(), si, towards)
+    textures = {"base_color": bitmap(mi, [color] * 2), **{k: texels(mi, v) for k, v in m.items()}}
+    exact, bsdf = (mi.load_dict({**FORMS[form], **textures}) for form in ("disney", name))
+    si, towards = interactions(mi, wi, np.arange(n), n), vectors(mi, wo)
+    value, pdf = bsdf.eval_pdf(ctx, si, towards)
     reference = disney_formulas.brdf(color, m, wi.astype("f4"), wo.astype("f4")) * wo[:, 2:3]
     error = np.clip(value.numpy().T, 0, 1) - np.clip(reference, 0, 1)
     assert -10 * np.log10(np.mean(error**2)) >= decibels
-    assert np.array_equal(pdf.numpy(), textured(mi, "disney", color, m).pdf(mi.BSDFContext(), si, towards).numpy())
+    assert np.array_equal(pdf.numpy(), exact.pdf(ctx, si, towards).numpy())
 
 
 def test_gradient_at_a_black_albedo(mi_rgb, rng):

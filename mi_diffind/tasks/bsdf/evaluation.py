@@ -54,7 +54,7 @@ def albedo_excess(truth: Truth, value, types) -> float:
 
 def weight_moments(truth: Truth, sampling, types, size: int = 2**16) -> list[float]:
     """Return E[w²]/E[w]² of the weights of samples of a source by a mixture, at :data:`WEIGHT_COSINES`."""
-    return [mixture.second_moment(truth.value, sampling, truth, types, float(c), size) for c in WEIGHT_COSINES]
+    return [mixture.second_moment(truth, sampling, types, float(c), size) for c in WEIGHT_COSINES]
 
 
 def measure(model, truth: Truth, view: SphereView) -> dict[str, float]:

@@ -88,10 +88,8 @@ def _fit_single(truth: Truth, request: FitRequest, stop: Event) -> Fitted:
     first, identity = request.part(training.PRETRAINING), {"source": truth.digest}
     judge = None if rows else training.view_psnr([((), view)])
     logarithms = training.fit_proxy(samples, validation, types, isotropic, first, identity, smooth, angle, judge)
-    form = training.choose_form(logarithms, validation, isotropic, azimuth, angle)
-    if request.preset in ("paper", "plain"):  # the proxy gives the scale of u alone
-        form = dataclasses.replace(form, terms=())
-        form = dataclasses.replace(form, range=training.residual_range(form, logarithms, validation))
+    has_proxy = request.preset not in ("paper", "plain")  # there it gives the scale of u alone
+    form = training.choose_form(logarithms, validation, isotropic, azimuth, angle, has_proxy)
     if rows:
         (samples, validation), form, line = measured.remove_outliers(truth, [samples, validation], form, logarithms)
         lines.append(line)

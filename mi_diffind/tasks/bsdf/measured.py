@@ -189,7 +189,7 @@ def axes_angle(samples: Samples, truth: Truth) -> float:
     return angle if abs(angle) > TURN and abs(apart) < APART else 0.0
 
 
-def measure_symmetry(truth, types, size: int = 2**16, seed: int = 1) -> dict[str, float]:
+def measure_symmetry(truth, types, size: int = 2**16) -> dict[str, float]:
     """Return the relative difference of f that each symmetry would hide.
 
     ``isotropy``: rotation about the normal; ``mirror``: reflection at the plane of incidence; ``reciprocity``: exchange
@@ -197,7 +197,7 @@ def measure_symmetry(truth, types, size: int = 2**16, seed: int = 1) -> dict[str
     reciprocity is halved, which no reciprocal model can be nearer than. At angles up to 85°; 0 for what the format
     implies.
     """
-    rng = dr.rng(seed=dr.opaque(types.UInt64, seed))
+    rng = dr.rng(seed=dr.opaque(types.UInt64, 1))
     samples = outgoing(rng, types, incident(rng, types, size, isotropic=False), truth)
     wi, wo = samples.wi, samples.wo
     weight = dr.select(dr.minimum(wi.z, wo.z) > 0.087, samples.weight, 0)
@@ -417,7 +417,7 @@ def places(truth: ScatteredTruth, isotropic: bool) -> np.ndarray:
     return np.concatenate([np.arccos(np.clip(truth.wi[:, 2:], -1, 1)), along_x(truth)], axis=1)
 
 
-def measure_row_symmetry(truth: ScatteredTruth, seed: int = 1) -> dict[str, float | None]:
+def measure_row_symmetry(truth: ScatteredTruth) -> dict[str, float | None]:
     """Return the relative difference of f that each symmetry would hide (:func:`measure_symmetry`), from pairs of rows.
 
     Reciprocity is measured by :func:`irreciprocal_share` where rows have exact images. Else a row is compared with the
@@ -427,7 +427,7 @@ def measure_row_symmetry(truth: ScatteredTruth, seed: int = 1) -> dict[str, floa
     from scipy.spatial import cKDTree
 
     points, f = places(truth, True), truth.f.mean(axis=1)
-    rows = np.random.default_rng(seed).permutation(len(f))[:PAIRS]
+    rows = np.random.default_rng(1).permutation(len(f))[:PAIRS]
     light = np.maximum(f * truth.wi[:, 2] * truth.wo[:, 2], 1e-12)
     bright = np.quantile(light, BRIGHT)
     tree, azimuth = cKDTree(points), np.arctan2(truth.wi[:, 1], truth.wi[:, 0])

@@ -65,9 +65,7 @@ class SampledLobe:
         return density_ggx(wi, wo, Float(self.alpha_u), Float(self.alpha_v), gamma)
 
 
-def fit_mixture(
-    truth, types, isotropic: bool, stretch: float = 1.0, seed: int = 3
-) -> tuple[tuple[SampledLobe, SampledLobe], np.ndarray]:
+def fit_mixture(truth, types, isotropic: bool, stretch: float = 1.0) -> tuple[tuple, np.ndarray]:
     """Return both lobes, and the weights of cosine and lobes, ``(NODES, 3)``.
 
     They minimise the mean square of the weights f cos θ / p of a sample, whose lower bound is the squared albedo.
@@ -79,7 +77,7 @@ def fit_mixture(
         for alpha in ALPHAS
         for gamma in EXPONENTS
     ]
-    densities, square = candidate_densities(truth, types, isotropic, lobes, SAMPLES, seed)
+    densities, square = candidate_densities(truth, types, isotropic, lobes, SAMPLES)
     some = slice(0, RANKING[0])
     ranked = []
     for i, j in itertools.combinations(range(len(lobes)), 2):
@@ -108,10 +106,8 @@ def fit_family_mixture(truth, member_at: Callable, types, isotropic: bool) -> tu
         alphas = [dr.clip(types.Float(factor * w), 1e-3, 1) for w in lobes for factor in FACTORS]
         dr.eval(alphas)
         lobes_tried = [SampledLobe(a, a) for a in alphas]
-        densities, square = candidate_densities(source, types, isotropic, lobes_tried, MEMBER_SAMPLES, 3)
-        tried = [
-            optimal_weights(densities[[0, 1 + i, 1 + len(FACTORS) + j]], square) for i, j in pairs
-        ]  # fmt: skip
+        densities, square = candidate_densities(source, types, isotropic, lobes_tried, MEMBER_SAMPLES)
+        tried = [optimal_weights(densities[[0, 1 + i, 1 + len(FACTORS) + j]], square) for i, j in pairs]
         costs += [np.log(cost).mean() for _, cost in tried]
         weights.append([w for w, _ in tried])
     best = int(np.argmin(costs))
@@ -119,12 +115,12 @@ def fit_family_mixture(truth, member_at: Callable, types, isotropic: bool) -> tu
     return tuple(FACTORS[k] for k in pairs[best]), table.reshape(NODES, *nodes, 3)
 
 
-def candidate_densities(truth, types, isotropic: bool, lobes: list, size: int, seed: int) -> tuple:
+def candidate_densities(truth, types, isotropic: bool, lobes: list, size: int) -> tuple:
     """Return densities of the cosine and of ``lobes``, ``(1 + K, NODES, size)``, and f²/density, ``(NODES, size)``.
 
     The squares, of ``size`` samples of a source at each of :data:`NODES` cosines, have a mean of 1 at each.
     """
-    rng = dr.rng(seed=dr.opaque(types.UInt64, seed))
+    rng = dr.rng(seed=dr.opaque(types.UInt64, 3))
     node = dr.arange(types.UInt32, NODES * size) // size
     cosines = np.maximum(np.linspace(0, 1, NODES) ** 2, 2e-3)  # the first is slightly above the horizon
     cos = dr.gather(types.Float, types.Float(cosines.astype(np.float32)), node)
@@ -208,16 +204,16 @@ class TurnedMixture:
         return self.mixture.density(rotate(wi, -self.angle), rotate(wo, -self.angle))
 
 
-def second_moment(truth_value, mixture: Mixture, truth, types, cos: float, size: int = 2**16, seed: int = 11) -> float:
+def second_moment(truth, mixture: Mixture, types, cos: float, size: int = 2**16) -> float:
     """Return E[w²] / E[w]² of the weights w = f cos θ_o / p of samples at a cosine of ``wi``; f: the mean channel.
 
     It is 1 where f is black.
     """
-    rng = dr.rng(seed=dr.opaque(types.UInt64, seed))
+    rng = dr.rng(seed=dr.opaque(types.UInt64, 11))
     wi = types.Array3f(dr.full(types.Float, (1 - cos**2) ** 0.5, size), 0, cos)
     s = outgoing(rng, types, wi, truth)
     with dr.suspend_grad():
-        mean = sum(truth_value(s.wi, s.wo)) / 3
+        mean = sum(truth.value(s.wi, s.wo)) / 3
         density = mixture.density(s.wi, s.wo)
         square = dr.select(density > 0, s.weight * dr.square(mean) * dr.rcp(density), 0)
         first, second = dr.mean(s.weight * mean), dr.mean(square)

@@ -133,8 +133,8 @@ def draw_members(truth, types, size: int, members: int, seed: int, isotropic: bo
     return Samples(wi, wo, arrays[6], arrays[7:10], arrays[10:])
 
 
-def proxy_starts(samples: Samples, types, count: int) -> list[np.ndarray]:
-    """Return the logarithms of the ``count`` best proxies, ``(22,)`` each, by their mean absolute error.
+def proxy_starts(samples: Samples, types) -> list[np.ndarray]:
+    """Return the logarithms of the :data:`STARTS` best proxies, ``(22,)`` each, by their mean absolute error.
 
     The second is the best one with a lobe that is much narrower than those of the first, if there is room for one: a
     sharp coat of little light counts little in the error, but is seen.
@@ -166,7 +166,7 @@ def proxy_starts(samples: Samples, types, count: int) -> list[np.ndarray]:
     narrowest = [min(shapes[i][0], shapes[j][0]) for _, i, j, _ in ranked]
     narrow = next((k for k, alpha in enumerate(narrowest) if alpha < NARROW * narrowest[0]), 1)
     ranked.insert(1, ranked.pop(narrow))
-    return [_logarithms(shapes[i], shapes[j], colours) for _, i, j, colours in ranked[:count]]
+    return [_logarithms(shapes[i], shapes[j], colours) for _, i, j, colours in ranked[:STARTS]]
 
 
 def _non_negative(gram: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -288,7 +288,7 @@ def fit_proxy(
     """
     best, form = None, Form(isotropic=isotropic, angle=angle)
     with interruptible() as stop:
-        for k, start in enumerate(proxy_starts(smooth or validation, types, STARTS)):
+        for k, start in enumerate(proxy_starts(smooth or validation, types)):
             net = BSDFArrays(None, proxy_array(start, 1.0)).alloc(types.TensorXf)
             problem = BSDFProblem(net, form, samples, proxy_loss(validation), {**identity, "start": k})
             settings, limited = dataclasses.replace(PROXY, seed=k), request.part(1 / (STARTS - k))
@@ -333,16 +333,19 @@ def add_scale(table: np.ndarray, isotropic: bool) -> np.ndarray:
     return table
 
 
-def choose_form(logarithms: np.ndarray, samples: Samples, isotropic: bool, azimuth: str, angle: float = 0.0) -> Form:
+def choose_form(
+    logarithms: np.ndarray, samples: Samples, isotropic: bool, azimuth: str, angle: float = 0.0, has_proxy: bool = True
+) -> Form:
     """Return the form of a fitted proxy, or of a table of proxies.
 
-    It has the terms that are not black, the scale of u of a single proxy, and the range of the residuals of
-    ``samples``.
+    It has the terms that are not black (without ``has_proxy``: none), the scale of u of a single proxy, and the range
+    of the residuals of ``samples``.
     """
     lobes = {name: 4 + k * LOBE for k, name in enumerate(TERMS[1:])}
     lobes = {name: a for name, a in lobes.items() if logarithms[..., a + 3 : a + 9].max() > BLACK}
     terms = (*(["diffuse"] if logarithms[..., DIFFUSE].max() > BLACK else []), *lobes)
-    form = Form(terms or ("diffuse",), isotropic, azimuth, angle=angle)  # black, or nearly so
+    terms = (terms or ("diffuse",)) if has_proxy else ()  # all of them black, or nearly so
+    form = Form(terms, isotropic, azimuth, angle=angle)
     if logarithms.ndim == 1:
         axes = (0, 0 if isotropic else 1)
         scales = [tuple(float(np.clip(np.exp(logarithms[a + k]), 1e-3, 1)) for k in axes) for a in lobes.values()]

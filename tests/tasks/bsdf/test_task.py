@@ -223,10 +223,10 @@ def test_the_mixture_follows_the_source(types):
     np.testing.assert_allclose(weights.sum(axis=1), 1)
     array = StoredArray(weights.astype(np.float32)).allocate(types.TensorXf)
     fitted = mixture.Mixture(array, lobes)
-    assert mixture.second_moment(Sum().value, fitted, Sum(), types, 0.7, 2**14) < 1.03
+    assert mixture.second_moment(Sum(), fitted, types, 0.7, 2**14) < 1.03
     wide = (mixture.SampledLobe(0.5, 0.5),) * 2
     one_lobe = mixture.Mixture(StoredArray(np.float32([[1e-3, 1, 1]] * 2)).allocate(types.TensorXf), wide)
-    assert mixture.second_moment(Sum().value, one_lobe, Sum(), types, 0.7, 2**14) > 1.3
+    assert mixture.second_moment(Sum(), one_lobe, types, 0.7, 2**14) > 1.3
 
 
 def test_the_albedo_is_limited(types):

@@ -100,10 +100,8 @@ def million():
     for distribution in ("training", "uniform"):
         parts = []
         for _ in range(4):
-            color, m, wi, wo = disney_formulas.random_case(rng, 250_000)
-            for name in ("metallic", "roughness") if distribution == "training" else ():
-                # Inverse of the exponential-like distribution's CDF
-                m[name] = -np.log(1 - m[name] * (1 - np.exp(-EXPONENTIAL_RATE))) / EXPONENTIAL_RATE
+            rate = EXPONENTIAL_RATE if distribution == "training" else 0.0
+            color, m, wi, wo = disney_formulas.random_case(rng, 250_000, rate=rate)
             wi, wo = (np.where(w[:, 2:3] > 1e-6, w, [0, 0, 1]) for w in (wi, wo))
             parts.append((to_drjit((color, m, wi, wo)), disney_formulas.brdf(color, m, wi, wo), wo[:, 2:3]))
         found[distribution] = parts

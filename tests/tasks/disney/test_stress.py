@@ -104,86 +104,45 @@ def test_what_is_left_out_changes_nothing_in_tables(mi_rgb, rng, form):
 # -- energy and accuracy -----------------------------------------------------------------------------------------------
 
 
-def random_population(rng, n, distribution):
-    """Materials as they are drawn for training, or uniform."""
-    color, m, wi, wo = disney_formulas.random_case(rng, n, low_cosine=1e-5)
-    if distribution == "training":
-        for name in ("metallic", "roughness"):  # inverse of the exponential-like distribution's CDF
-            m[name] = -np.log(1 - m[name] * (1 - np.exp(-EXPONENTIAL_RATE))) / EXPONENTIAL_RATE
-    return color.astype("f4"), {k: v.astype("f4") for k, v in m.items()}, wi.astype("f4"), wo.astype("f4")
-
-
-def shaded(types, decoder, case):
-    color, m, wi, wo = case
-    material = Material(**{name: types.Float(m[name]) for name in SCALARS})
-    vectors = [types.Array3f(aligned(v.T)) for v in (color, wi, wo)]
-    return training.shade(decoder, material, *vectors).numpy().T.astype(np.float64)
-
-
-#: Numbers of samples.
-POPULATION = pytest.mark.parametrize("n", [200_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
-
-
-#: Form and storage → a decibel or two less than is reached.
-REACHED = {("disney", ""): 127, ("tables", "float32"): 87, ("tables", "float16"): 82.5, ("tables", "uint8"): 80.5}
-
-
-def decoder_for(types, form, storage):
-    return Decoder() if form == "disney" else TASK.open(types.TensorXf, "", form, storage).decoder
-
-
-def check_grazing(form, name, found, expected):
-    """99 of 100 within a hundredth, and none much higher than the exact value, where that is not next to nothing."""
-    counts = expected > 1e-3
-    relative = np.abs(found - expected)[counts] / expected[counts]
-    ratio = (found[counts] / expected[counts]).max()
-    print(f"{name}: 99th percentile of the relative error {np.quantile(relative, 0.99):.2g}, largest ratio {ratio:.3f}")
-    assert np.isfinite(found).all() and found.min() >= 0
-    percentile, largest = (5e-5, 1.03) if form == "disney" else (0.008, 1.06)
-    assert np.quantile(relative, 0.99) <= percentile, name
-    assert ratio <= largest, name
-
-
 def near_the_horizon(rng, wi, wo):
     """One of the directions, or both, with a cosine below 0.02."""
-    kind = rng.integers(0, 3, len(wi))
+    either = rng.integers(0, 3, len(wi))
     low = [with_cosines(rng, np.maximum(0.02 * rng.random(len(wi)) ** 2, 1e-6)) for _ in range(2)]
-    return np.where((kind != 1)[:, None], low[0], wi), np.where((kind != 0)[:, None], low[1], wo)
+    return np.where((either != 1)[:, None], low[0], wi), np.where((either != 0)[:, None], low[1], wo)
 
 
-def near_the_peak(rng, wi):
+def near_the_peak(rng, wi, wo):
     """Directions whose half vector is within 10⁻⁴ of the normal."""
     h = with_cosines(rng, 1 - 1e-4 * rng.random(len(wi)) ** 2).astype(np.float64)
     wo = 2 * np.sum(wi * h, axis=1, keepdims=True) * h - wi
     wo[:, 2] = np.maximum(wo[:, 2], 1e-6)
-    return (wo / np.linalg.norm(wo, axis=1, keepdims=True)).astype(np.float32)
+    return wi, (wo / np.linalg.norm(wo, axis=1, keepdims=True)).astype(np.float32)
 
 
-@POPULATION
 @pytest.mark.parametrize("distribution", ["training", "uniform"])
-@pytest.mark.parametrize("where", ["horizon", "peak"])
-def test_accuracy_where_it_is_hardest_to_keep(mi_rgb, rng, distribution, where, n):
+@pytest.mark.parametrize("where", [near_the_horizon, near_the_peak])
+def test_accuracy_where_it_is_hardest_to_keep(mi_rgb, rng, distribution, where):
+    """Where it is not next to nothing, 99 of 100 are within a hundredth, and none is much higher than the exact value.
+    The preset ``paper`` is finite."""  # fmt: skip
     import drjit.llvm.ad as types
 
-    color, m, wi, wo = random_population(rng, n, distribution)
-    if where == "horizon":
-        wi, wo = near_the_horizon(rng, wi, wo)
-    else:
-        wo = near_the_peak(rng, wi)
-    case = color, m, wi, wo
-    expected = disney_formulas.brdf(*case)
-    cosine = wo[:, 2:3].astype(np.float64)
-    for form, storage in REACHED:
-        decoder = decoder_for(types, form, storage)
-        check_grazing(
-            form, f"{where}, {distribution}, {form} {storage}", shaded(types, decoder, case) / cosine, expected
-        )
-    paper = decoder_for(types, "paper", "")
-    found = shaded(types, paper, case) / cosine
-    counts = expected > 1e-3
-    ratio = found[counts] / expected[counts]
-    print(f"{where}, {distribution}, paper: ratios from {ratio.min():.3g} to {ratio.max():.3g}")
-    assert np.isfinite(found).all() and found.min() >= 0
+    rate = EXPONENTIAL_RATE if distribution == "training" else 0.0
+    color, m, wi, wo = disney_formulas.random_case(rng, 200_000, 1e-5, rate)
+    color, wi, wo, m = *(v.astype("f4") for v in (color, wi, wo)), {k: v.astype("f4") for k, v in m.items()}
+    wi, wo = where(rng, wi, wo)
+    expected = disney_formulas.brdf(color, m, wi, wo)
+    material = Material(**{name: types.Float(m[name]) for name in SCALARS})
+    arrays, counts = [types.Array3f(aligned(v.T)) for v in (color, wi, wo)], expected > 1e-3
+    forms = [("disney", ""), *(("tables", storage) for storage in ("float32", "float16", "uint8")), ("paper", "")]
+    for form, storage in forms:
+        decoder = Decoder() if form == "disney" else TASK.open(types.TensorXf, "", form, storage).decoder
+        found = training.shade(decoder, material, *arrays).numpy().T.astype(np.float64) / wo[:, 2:3].astype(np.float64)
+        percentile = np.quantile(np.abs(found - expected)[counts] / expected[counts], 0.99)
+        largest = (found[counts] / expected[counts]).max()
+        print(f"{form} {storage}: 99th percentile of the relative error {percentile:.2g}, largest ratio {largest:.3f}")
+        assert np.isfinite(found).all() and found.min() >= 0
+        limits = {"disney": (5e-5, 1.03), "tables": (0.008, 1.06), "paper": (np.inf, np.inf)}[form]
+        assert percentile <= limits[0] and largest <= limits[1], (form, storage)
 
 
 # -- gradients where an effect is exactly off --------------------------------------------------------------------------
