@@ -21,7 +21,7 @@ from mi_diffind.tasks.bsdf.truth import MitsubaTruth
 
 from . import Counterpart, Plugin
 from .support import frozen, properties, tables, textures
-from .support.directions import are_directions
+from .support.directions import glossy_directions
 from .support.manual import shared_parts
 from .support.tracked_parameter import TrackedParameter, when_outermost
 
@@ -254,11 +254,7 @@ class NeuralBSDF(mi.BSDF):
         """Return both directions on the front side, and the mask of lanes whose result counts."""
         if self.two_sided:
             wi, wo = mi.Vector3f(wi.x, wi.y, dr.abs(wi.z)), mi.Vector3f(wo.x, wo.y, dr.mulsign(wo.z, wi.z))
-        active = active & (wi.z > 0) & (wo.z > 0) & are_directions(wi, wo)
-        if not ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0):
-            active = mi.Bool(False)
-        up = mi.Vector3f(0, 0, 1)
-        return dr.select(active, wi, up), dr.select(active, wo, up), active
+        return glossy_directions(ctx, wi, wo, active)
 
     def _value(self, bsdf, si, wi, wo, active):
         """Return f cos θ_o."""

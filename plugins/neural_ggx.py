@@ -11,7 +11,7 @@ from mi_diffind.tasks.ggx.model import Roughness
 
 from . import Counterpart, Plugin
 from .support import frozen, properties, tables
-from .support.directions import are_directions
+from .support.directions import glossy_directions
 from .support.manual import shared_parts
 from .support.tracked_parameter import TrackedParameter, when_outermost
 
@@ -221,14 +221,6 @@ class NeuralGGX(mi.BSDF):
     def _has_factor(self) -> bool:
         return self._tracked_factor is not None and not self._tracked_factor.bounds().is_always(1)
 
-    def _prepare(self, ctx, si, wo, active):
-        """Return directions that are safe to compute with in every lane, and the mask of lanes whose result counts."""
-        active = active & (si.wi.z > 0) & (wo.z > 0) & are_directions(si.wi, wo)
-        if not ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0):
-            active = mi.Bool(False)
-        up = mi.Vector3f(0, 0, 1)
-        return dr.select(active, si.wi, up), dr.select(active, wo, up), active
-
     def _value(self, ctx, si, r: Roughness, wi, wo, active):
         """Return f · cos = F D̂ (n·o) / (d(n·i) d(n·o)).
 
@@ -264,21 +256,21 @@ class NeuralGGX(mi.BSDF):
             return dr.detach(dr.select(active, pdf, 0))
 
     def eval(self, ctx, si, wo, active=True):
-        wi, wo, active = self._prepare(ctx, si, wo, active)
+        wi, wo, active = glossy_directions(ctx, si.wi, wo, active)
         return self._value(ctx, si, self._roughness(si, active), wi, wo, active)
 
     def pdf(self, ctx, si, wo, active=True):
-        wi, wo, active = self._prepare(ctx, si, wo, active)
+        wi, wo, active = glossy_directions(ctx, si.wi, wo, active)
         return self._density(self._roughness(si, active), wi, wo, active)
 
     def eval_pdf(self, ctx, si, wo, active=True):
-        wi, wo, active = self._prepare(ctx, si, wo, active)
+        wi, wo, active = glossy_directions(ctx, si.wi, wo, active)
         r = self._roughness(si, active)
         return self._value(ctx, si, r, wi, wo, active), self._density(r, wi, wo, active)
 
     def sample(self, ctx, si, sample1, sample2, active=True):
         up = mi.Vector3f(0, 0, 1)
-        wi, _, active = self._prepare(ctx, si, up, active)
+        wi, _, active = glossy_directions(ctx, si.wi, up, active)
         r = self._roughness(si, active)
         with dr.suspend_grad():
             alpha = dr.sqrt(dr.detach(r.alpha2))

@@ -241,16 +241,13 @@ def test_chi2_on_the_sphere(mi_rgb, name, in_folder):
 def test_chi2_has_power(mi_rgb, case, angle, in_folder):
     """Densities that are 3% too high or too low, or seen from 1° beside, are rejected at the same level."""
     right, beside = (lobe_sampling(mi_rgb, case, a) for a in (angle, angle + 1))
-    mutants = {"high": lambda p: 1.03 * right.pdf(p), "low": lambda p: 0.97 * right.pdf(p)}
+    seen = beside.interactions
     for what, pdf in {
-        **mutants,
-        "beside": lambda p: right.mapped(p, lambda si, wo: beside_pdf(beside, si, wo)),
+        "high": lambda p: 1.03 * right.pdf(p),
+        "low": lambda p: 0.97 * right.pdf(p),
+        "beside": lambda p: right.mapped(p, lambda _, wo: beside.bsdf.pdf(beside.ctx, seen(dr.width(wo)), wo)),
     }.items():
         assert right.faults(CHI2_COUNT, pdf)[0], what
-
-
-def beside_pdf(sampling, si, wo):
-    return sampling.bsdf.pdf(sampling.ctx, sampling.interactions(dr.width(wo)), wo)
 
 
 @pytest.mark.parametrize("case", LOBES)
@@ -368,12 +365,8 @@ def test_texels_are_read_as_numbers_in_their_range(mi_rgb, rng, name):
     used = [high, high, low, 0.3, low, low, 0.7]
     names = list(TEXTURED[name])[:1] if "ggx" in name or "family" in name else list(TEXTURED[name])
     textured = load(mi, name, **{p: texels(mi, given) for p in names})
-    lane, wi, wo, u = (
-        np.arange(n) % len(given),
-        random_directions(rng, n),
-        random_directions(rng, n),
-        uniform(mi, rng, n),
-    )
+    lane, u = np.arange(n) % len(given), uniform(mi, rng, n)
+    wi, wo = random_directions(rng, n), random_directions(rng, n)
     found = answers(mi, textured, interactions(mi, wi, lane, len(given)), vectors(mi, wo), u)
     for k, value in enumerate(used):
         expected = answers(mi, load(mi, name, **dict.fromkeys(names, value)), interactions(mi, wi), vectors(mi, wo), u)
@@ -878,12 +871,8 @@ def test_own_tables(mi_rgb, rng, tmp_path, plugin, task):
         assert f"preset = {preset}, {report['table_bytes']} bytes as uint8" in str(own)
         values = [intensities(mi, bsdf.eval(mi.BSDFContext(), si, wo)) for bsdf in (own, shipped)]
         np.testing.assert_array_equal(*values)
-        assert (
-            mi.load_dict({"type": plugin, "filename": str(tmp_path / "own.npz"), "storage": "float32"}).report()[
-                "storage"
-            ]
-            == "float32"
-        )
+        floats = mi.load_dict({"type": plugin, "filename": str(tmp_path / "own.npz"), "storage": "float32"})
+        assert floats.report()["storage"] == "float32"
     with pytest.raises(RuntimeError, match='holds tables of the preset "paper", "tables" was asked for'):
         mi.load_dict({"type": plugin, "filename": str(tmp_path / "own.npz"), "preset": "tables"})
 
@@ -951,7 +940,6 @@ def test_scalar_variants_are_refused():
     bsdfs = [name for name, plugin in plugins.declared().items() if plugin.object_type == "bsdf"]
     assert set(bsdfs) == set(PLUGINS)
     for name in bsdfs:
-        with pytest.raises(
-            RuntimeError, match=f'"{name}" does not run in the variant "scalar_rgb"; use one of llvm_ad'
-        ):
+        refusal = f'"{name}" does not run in the variant "scalar_rgb"; use one of llvm_ad'
+        with pytest.raises(RuntimeError, match=refusal):
             mi.load_dict({"type": name})

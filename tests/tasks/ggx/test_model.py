@@ -105,48 +105,6 @@ def test_projected_area_is_one(ad, shipped, name, alpha):
 # -- encodings ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("preset", PRESETS)
-def test_coordinates_lie_in_the_table(ad, preset):
-    """For every angle and every roughness that there is, in order; 0 and 1 are reached where the domain ends."""
-    encoding = ENCODINGS[preset]
-    alphas = np.array([1e-4, 3e-4, 1e-3, 0.0011, 0.01, 0.1, 0.5, 1], np.float32)
-    sin2 = np.array([0, 1e-38, 1e-12, 1e-8, 1e-6, 1e-4, 0.01, 0.5, 1 - 2**-24, 1], np.float32)
-    s, a = (v.ravel() for v in np.meshgrid(sin2, alphas, indexing="ij"))
-    sin2_, alpha = ad.Float(s), ad.Float(a)
-    u, v = (x.numpy() for x in encoding.coordinates(dr.sqrt(1 - sin2_), sin2_, alpha))
-    for x in (u, v):
-        assert x.min() >= -1e-6 and x.max() <= 1 + 1e-6
-    assert (np.diff(v.reshape(len(sin2), -1), axis=1) >= 0).all()
-    steps = np.diff(u.reshape(-1, len(alphas)), axis=0)
-    assert (steps * (1 if preset == "tables" else -1) >= 0).all()
-    assert v.max() == pytest.approx(1, abs=1e-6) and v.min() == pytest.approx(0, abs=1e-3)
-    start, end = (0, 1) if preset == "tables" else (1, 0)
-    np.testing.assert_allclose(u[s == 0], start, atol=1e-6)
-    np.testing.assert_allclose(u[s == 1], end, atol=1e-6)
-
-
-def test_below_the_learned_roughness_peaks_are_scaled(ad, rng):
-    """A table without error is read as the distribution at any roughness, also where nothing was learned."""
-    encoding, least = ENCODINGS["tables"], ALPHA_MIN**2 / 4
-
-    def perfect(x):
-        """What the table would hold at these coordinates, in double precision."""
-        u, v = (c.numpy().astype(np.float64) for c in x)
-        sin2 = np.maximum((least ** (1 - u) - least) / (1 - least), 0)
-        alpha = ALPHA_MIN ** (1 - v)
-        y = alpha / np.sqrt(sin2 + alpha**2 * (1 - sin2))
-        return [ad.Float(aligned(y))]
-
-    read = LearnedGGX(lambda x, active=True: perfect(x), encoding)
-    sin2, alpha = random_case(rng, 20_000)
-    found, expected = evaluate(ad, read, sin2, alpha), ggx_formulas.distribution(sin2, alpha)
-    in_lobe = sin2 < 100 * alpha.astype(np.float64) ** 2
-    assert (in_lobe & (alpha < ALPHA_MIN)).sum() > 1000
-    # The coordinates have the resolution of single precision on a scale of 15 octaves and more
-    np.testing.assert_allclose(found[in_lobe], expected[in_lobe], rtol=1e-3)
-    np.testing.assert_allclose(found[~in_lobe], expected[~in_lobe], rtol=1e-3)  # the tail, down to 10⁻¹⁶ of the peak
-
-
 @pytest.mark.parametrize("storage", lookup.STORAGES)
 def test_the_tail_falls_as_that_of_the_distribution(ad, shipped, storage):
     """Nowhere more than a tenth above what it should be or below it, down to the horizon and to the least roughness."""
