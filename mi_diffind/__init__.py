@@ -1,9 +1,9 @@
-"""Learned lookup tables for Mitsuba 3, by differentiable indirection.
+"""Differentiable indirection (Datta et al. 2023) as Mitsuba 3 plugins: learned lookup tables.
 
 ``import mi_diffind`` makes the plugins (``neural_disney``, ``disney``, ``neural_ggx``, ``neural_image``, …) known to
 ``mi.load_file``, ``mi.load_string`` and ``mi.load_dict`` in every variant, whichever of ``mitsuba`` and ``mi_diffind``
 is imported first, and makes sure that Dr.Jit runs on an LLVM that does not abort (:mod:`mi_diffind.core.runtime`). It
-imports neither of them itself: what is listed below is imported when it is asked for.
+imports neither of them itself; each name below is imported when it is asked for.
 """
 
 import importlib as _importlib
@@ -20,7 +20,7 @@ _NAMES = {
     "open": "fitting.task:open_model",
     "save": "scenes.conversion",
     "from_arrays": "maps.source",
-    "example_maps": "studies.shading.materials",
+    "example_maps": "studies.example_maps",
     # Scenes
     "load_file": "scenes.loading",
     "load_dict": "scenes.loading",
@@ -36,7 +36,7 @@ _NAMES = {
     "fetch": "scenes.examples",
     "view": "scenes.viewer",
     # Measurements
-    "tradeoff": "studies.tradeoffs",
+    "tradeoff": "studies",
     # Errors between images, and images as displayed
     "metrics": "images.metrics:",
     "srgb": "images.srgb:",

@@ -16,7 +16,7 @@ from typing import Any
 from mi_diffind.core import compat, discovery
 
 #: Modules of this package that are no plugins.
-IGNORED = ("support",)
+IGNORED = ("support", "mitsuba_entry")
 
 #: Type of a plugin → the class in ``mitsuba`` whose instances its factory returns.
 OBJECT_TYPES = {"bsdf": "BSDF", "texture": "Texture", "shape": "Shape", "volume": "Volume", "integrator": "Integrator"}
@@ -53,9 +53,8 @@ class Stock:
     """Plugins of Mitsuba that a learned plugin can stand for, fitted to what they show if need be.
 
     ``word``: the name of all of them for users; ``names``: their types in a scene. ``convert(node)`` changes the
-    properties of a :class:`~mi_diffind.plugins.support.stock.StockNode`, without the type, and returns what was fitted
-    and how well, or "", or raises :class:`~mi_diffind.plugins.support.stock.Kept`. ``advised``: a scene gains from the
-    learned plugin, so that it is put in without being asked for.
+    properties of a :class:`.StockNode`, without the type, and returns what was fitted and how well, or "", or raises
+    :class:`.Kept`. ``advised``: a scene gains from the learned plugin, so that it is put in without being asked for.
     """
 
     word: str
@@ -181,9 +180,9 @@ def register(variant: str) -> None:
     for plugin in _load():
         declarations[plugin.name] = plugin
         if supported(variant):
-            factory = _checked(plugin)
+            factory = _checking_factory(plugin)
         elif plugin.object_type != "volume":  # in scalar variants, Mitsuba needs the type of every object it loads
-            factory = _refusal(plugin.name, variant)
+            factory = _refusing_factory(plugin.name, variant)
         else:
             continue
         compat.register(plugin.object_type, plugin.name, factory)
@@ -197,7 +196,7 @@ def _load() -> list[Plugin]:
     return list(discovery.load(__name__, "PLUGIN", IGNORED, expected=Plugin).values())
 
 
-def _refusal(name: str, variant: str):
+def _refusing_factory(name: str, variant: str):
     def make(props):
         import mitsuba as mi
 
@@ -208,7 +207,7 @@ def _refusal(name: str, variant: str):
     return make
 
 
-def _checked(plugin: Plugin):
+def _checking_factory(plugin: Plugin):
     """Return the factory to register: it checks the type of the instance and records the properties it came from."""
 
     def make(props):

@@ -247,7 +247,7 @@ class NeuralBSDF(mi.BSDF):
             for texture, known in zip(self.textures.values(), self.known, strict=True):
                 values.append(float(mi.Float(texture.eval_1(si))[0]) if known else None)
             if any(self.known):
-                self.member = self.model.fixed(values) if all(self.known) else self.model.reduced(values)
+                self.member = self.model.member(values) if all(self.known) else self.model.restrict(values)
         self._hold()
 
     def _compute_constants(self):
@@ -381,8 +381,8 @@ def _proxy(parameters: dict, form) -> Proxy:
             gamma = clamp(parameters[f"{name}.gamma"], 2 * low, 2 * high)  # files hold the logarithm of its half
             lobes[name] = ProxyLobe(alphas, gamma, *colours)
     if "diffuse" not in form.terms:
-        return Proxy.of_parts(None, None, lobes)
-    return Proxy.of_parts([limited(c) for c in parameters["diffuse"]], limited(parameters["edge"]), lobes)
+        return Proxy.from_parts(None, None, lobes)
+    return Proxy.from_parts([limited(c) for c in parameters["diffuse"]], limited(parameters["edge"]), lobes)
 
 
 def _proxy_array(parameters: dict, form) -> DifferentiableArray:

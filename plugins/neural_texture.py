@@ -12,7 +12,7 @@ from . import Counterpart, Plugin, Stock
 from .support.image_files import SharedMaps, manifest_of, open_compressed, remove, to_bitmap, to_mipmap
 from .support.manual import shared_parts
 from .support.map_textures import FilteredTexture
-from .support.stock import Kept, StockNode
+from .support.properties import Kept, StockNode
 from .support.textures import FILTERS, TYPES
 from .support.textures import PROPERTIES as FILTERING
 

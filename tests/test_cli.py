@@ -62,13 +62,6 @@ def test_render(tmp_path, capsys):
     assert np.array(mi.Bitmap(str(tmp_path / "image.png"))).shape == (28, 48, 3)
 
 
-@pytest.mark.parametrize("scene, variant", [(SCENES / "still_life.xml", "llvm_ad_spectral"), (LAMP, "llvm_ad_mono")])
-def test_render_in_other_variants(tmp_path, scene, variant):
-    out = tmp_path / "image.exr"
-    assert main(["render", str(scene), "-o", str(out), "--variant", variant, *SMALL]) == 0
-    assert out.stat().st_size > 1000
-
-
 def test_compare(tmp_path, capsys):
     import mitsuba as mi
 
@@ -121,21 +114,6 @@ def test_inspect_measures(tmp_path, capsys, few_samples):
     assert measured["float32"]["psnr_db"] > 86
 
 
-def test_inspect_scene(tmp_path, capsys):
-    report = tmp_path / "report.json"
-    assert main(["inspect", str(SCENES / "still_life.xml"), "--json", str(report)]) == 0
-    text = capsys.readouterr().out
-    assert f"9 learned plugins, {entries('disney')} bytes" in text
-    wood = text[text.index("wood: neural_disney, effects used, base_color texture, roughness texture") :]
-    assert "in use    diffuse, dielectric, clearcoat" in wood
-    assert "sheen (sheen is 0)" in wood and "anisotropic (anisotropic is 0)" in wood
-    materials = {m["id"]: m for m in json.loads(report.read_text())["reports"]}
-    assert len(materials) == 9  # wrapped ones are found, too
-    assert materials["copper"]["effects_in_use"] == ["metal"]
-    assert materials["copper"]["effects_left_out"]["diffuse"] == "metallic is 1"
-    assert materials["copper"]["operations"]["eval"]["gathers"] > 0
-
-
 #: Enough steps to see that it trains.
 FIT = ["--steps", "10", "--batch", "2048", "--variant", "llvm_ad_rgb"]
 
@@ -157,34 +135,6 @@ def test_fit(tmp_path, capsys, few_samples):
     again = tmp_path / "again.npz"
     assert main([*arguments, "-o", str(again)]) == 0
     assert out.read_bytes() == again.read_bytes()
-
-
-def test_what_was_fitted_renders(tmp_path, few_samples):
-    assert main(["fit", "disney", *FIT, "-o", str(tmp_path / "own.npz")]) == 0
-    own = scene_file(tmp_path, '<bsdf type="neural_disney"><string name="filename" value="own.npz"/></bsdf>')
-    assert main(["render", own, "-o", str(tmp_path / "image.exr")]) == 0
-
-
-def test_fit_ggx(tmp_path, capsys, few_samples):
-    out, report = tmp_path / "own.npz", tmp_path / "report.json"
-    arguments = ["fit", "ggx", *FIT]
-    assert main([*arguments, "-o", str(out), "--json", str(report)]) == 0
-    table, found = load_table(out), json.loads(report.read_text())
-    assert table.task == "ggx" and table.storage == "float32"
-    assert table.arrays["primary"].shape == (16, 16, 2) and table.arrays["cascaded"].shape == (8, 8, 1)
-    assert found["bytes"] == 4 * (16 * 16 * 2 + 8 * 8) and found["preset"] == "tables"
-    assert found["settings"]["schedule"] == "cosine"
-    own = ["--preset", "paper", "--primary", "12", "--cascaded", "6", "--storage", "float16", "--lr", "0.002"]
-    assert main([*arguments, *own, "-o", str(out)]) == 0
-    table = load_table(out)
-    assert table.arrays["primary"].shape == (12, 12, 2) and table.arrays["cascaded"].shape == (6, 6, 1)
-    assert table.storage == "float16" and table.settings["lr"] == 0.002 and table.preset == "paper"
-    assert table.settings["schedule"] == "constant"  # of the preset that was asked for
-    capsys.readouterr()
-    assert main(["inspect", str(out), "--verbose"]) == 0
-    text = capsys.readouterr().out
-    assert 'tables for the task "ggx", preset "paper", 648 bytes as float16' in text
-    assert "lr 0.002" in text and "seed 1" in text and "PSNR" in text
 
 
 def test_fit_for_some_seconds(tmp_path, capsys, few_samples, monkeypatch):
@@ -239,32 +189,6 @@ def test_fit_is_interrupted_and_resumed(tmp_path, capsys, few_samples, monkeypat
     undisturbed = tmp_path / "undisturbed.npz"
     assert main([*command, "-o", str(undisturbed)]) == 0
     assert out.read_bytes() == undisturbed.read_bytes()
-
-
-SIGINT_OF_ITS_OWN = """
-import os, signal, sys, time
-import mi_diffind.tasks.ggx.training as training
-original, calls = training.GGXProblem.batch, []
-def batch(self, rng, size):
-    calls.append(size)
-    if len(calls) == 25:
-        os.kill(os.getpid(), signal.SIGINT)
-        time.sleep(0.1)
-    return original(self, rng, size)
-training.GGXProblem.batch = batch
-from mi_diffind.commands.cli import main
-sys.exit(main())
-"""
-
-
-def test_a_signal_ends_a_fit(tmp_path):
-    """As the terminal sends it, to a process of its own."""
-    out = tmp_path / "own.npz"
-    arguments = ["fit", "ggx", "--steps", "500", "--batch", "512", "--variant", "llvm_ad_rgb", "-o", str(out)]
-    command = [sys.executable, "-c", SIGINT_OF_ITS_OWN, *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 130, done.stderr
-    assert "interrupted at step 25, kept step 25" in done.stdout and out.exists()
 
 
 def interrupted(*commands) -> tuple[list[int], str]:
@@ -353,22 +277,17 @@ def asked_for_help(commands):
 
 
 def test_help_is_light():
-    """Of the command, and of each verb and task: neither Mitsuba nor Dr.Jit, nor what trains."""
+    """Of the command, and of each verb and task but studies: neither Mitsuba nor Dr.Jit, nor what trains."""
     own = [[verb, name] for verb, names in verbs_with_tasks().items() for name in names]
-    text, modules = asked_for_help([[], *([verb] for verb in VERBS), *own])
+    light = [[], *([verb] for verb in VERBS), *own]
+    text, modules = asked_for_help([command for command in light if "tradeoff" not in command])
+    text |= asked_for_help([command for command in light if "tradeoff" in command])[0]  # studies are imported whole
     for command, found in text.items():
         assert found.startswith(" ".join(["usage: mi-diffind", *command]) + " [-h]"), command
     assert all(f"\n    {verb} " in text[()] for verb in VERBS)
     assert not HEAVY & modules and not [m for m in modules if m.endswith((".texture.training", ".loading", ".loop"))]
     assert "--primary" in text["fit", "ggx"] and "--primary" not in text["fit", "disney"]  # those of the task only
     assert "-D NAME" in text["tradeoff", "scene"] and "-D NAME" not in text["tradeoff", "disney"]
-
-
-def test_help_of_the_command_does_not_look_for_tasks():
-    """There may be many, of others, and slow to import; NumPy is not needed either."""
-    _, modules = asked_for_help([[]])
-    assert not (HEAVY | {"numpy", "tqdm"}) & modules
-    assert not [m for m in modules if m.startswith("mi_diffind.tasks.") and m.split(".")[2] in tasks()]
 
 
 def test_help_lists_what_each_task_says(capsys):
@@ -404,16 +323,6 @@ def test_tradeoff_of_a_scene(tmp_path, capsys):
     assert json.loads((out / "tradeoff_scene.json").read_text()) == found
     assert found["counts"][-1] == 4 and found["seed"] == 3 and found["defines"] == {"width": "48", "height": "28"}
     assert found["settings"]["quick"] and not found["interrupted"]
-
-
-def test_tradeoff_of_a_scene_is_interrupted(tmp_path, capsys, monkeypatch, mi_rgb):
-    from mi_diffind.studies.scene import renders, report
-
-    monkeypatch.setattr(renders, "measure", lambda *arguments: {"interrupted": True})
-    monkeypatch.setattr(report, "write", lambda result, folder: {"csv": f"{folder}/a.csv", "json": f"{folder}/a.json"})
-    monkeypatch.setattr(report, "summary", lambda result: ["first", "second"])
-    assert main(["tradeoff", "scene", scene_file(tmp_path), "--out", str(tmp_path)]) == 130
-    assert capsys.readouterr().out == f"first\nsecond\n\nwritten     {tmp_path}/a.csv, {tmp_path}/a.json\n"
 
 
 # -- bad input ---------------------------------------------------------------------------------------------------------
@@ -548,12 +457,6 @@ def test_defines_may_have_any_name(tmp_path):
     """``spp`` is a default of the scenes, and a parameter of functions."""
     small = ["-D", "spp=2", "-D", "width=24", "-D", "height=14"]
     assert main(["compare", str(LAMP), "--out", str(tmp_path), "--passes", "1", *small]) == 0
-
-
-def test_nothing_to_compare(tmp_path, capsys):
-    path, out = scene_file(tmp_path, '<bsdf type="diffuse"/>'), tmp_path / "pictures"
-    assert "names no learned plugin" in refused(capsys, "compare", path, "--out", str(out))
-    assert main(["render", path, "-o", str(tmp_path / "image.exr")]) == 0
 
 
 def test_options_for_the_other_kind_of_file(tmp_path, capsys):

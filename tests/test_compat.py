@@ -1,11 +1,14 @@
 """Each hook into what Mitsuba and Dr.Jit do not promise: a failure says which one broke."""
 
 import contextlib
-import platform
+import importlib.metadata
+import json
+import re
 import subprocess
 import sys
 import threading
 import time
+import types
 from pathlib import Path
 
 import drjit as dr
@@ -15,10 +18,8 @@ import pytest
 from mi_diffind.core import compat, runtime, threads
 from mi_diffind.core.compat import ray_flags
 
-SCENE = Path(__file__).resolve().parent / "lamp.xml"
-
-#: A processor whose features this one has, with vectors of another width.
-TARGET = {"x86_64": "nehalem:+sse4.2:4", "AMD64": "nehalem:+sse4.2:4"}.get(platform.machine(), "generic:+neon:8")
+ROOT = Path(__file__).resolve().parents[1]
+SCENE = ROOT / "tests" / "lamp.xml"
 
 
 @contextlib.contextmanager
@@ -75,21 +76,6 @@ def test_functions_of_the_library(mi_rgb):
         bsdf = mi_rgb.load_dict({"type": "diffuse"})
         assert bsdf is not None and core.holds_objects(mi_rgb.variant())
         assert not core.holds_objects("llvm_ad_rgb_double")
-
-
-def test_limited_code_generation():
-    """The width of vectors and the processor of kernels, and the result; in a process of its own."""
-    code = (
-        "import sys, mi_diffind, drjit as dr; from mi_diffind.core import compat; from drjit.llvm.ad import Float\n"
-        "compat.limit_code_generation(sys.argv[1]); dr.set_flag(dr.JitFlag.KernelHistory, True)\n"
-        "y = dr.square(dr.opaque(Float, 3, 1000)) + 1; dr.eval(y); dr.sync_thread()\n"
-        "print(y[999], *compat.llvm_target(compat.kernel_code(dr.kernel_history([dr.KernelType.JIT])[0])))"
-    )
-    with hook("mangled name of jit_llvm_set_target"):
-        done = subprocess.run([sys.executable, "-c", code, TARGET], capture_output=True, text=True, check=True)
-        assert done.stdout.split() == ["10.0", *TARGET.split(":")[::2]]
-    with pytest.raises(ValueError, match='found the target "haswell", expected name:features:lanes like "haswell:'):
-        compat.limit_code_generation("haswell")
 
 
 def test_kernels(mi_rgb, history):
@@ -511,3 +497,174 @@ def test_functions_are_transformed_one_at_a_time(monkeypatch):
     for thread in workers:
         thread.join()
     assert most == [1] * 8
+
+
+# -- memory of arrays -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["Float", "UInt32"])
+def test_copies_are_not_numpys_memory(mi_rgb, name):
+    dtype = getattr(mi_rgb, name)
+    values = np.array([0, -0.0, 1, 7] if name == "Float" else [0, 1, 2**32 - 1], "f4" if name == "Float" else "u4")
+    array, kept = dtype(values), values.copy()
+    copy = compat.owned(array)
+    dr.sync_thread()  # copies are made in the background
+    assert copy.index != array.index
+    if mi_rgb.variant().startswith("llvm"):
+        values[:] = 3
+        np.testing.assert_array_equal(array.numpy(), 3)  # what the copy is for
+    np.testing.assert_array_equal(copy.numpy().view("u4"), kept.view("u4"))
+
+
+def test_numbers_that_are_none_stay(mi_rgb):
+    copy = compat.owned(mi_rgb.Float(np.array([np.nan, np.inf, -np.inf, 1e-37], np.float32)))
+    np.testing.assert_array_equal(copy.numpy(), np.float32([np.nan, np.inf, -np.inf, 1e-37]))
+
+
+def test_derivatives_pass_through(mi_rgb):
+    """A copy is the same node: also gradients of an array that is no leaf stay where they were."""
+    array = mi_rgb.Float(np.arange(3, dtype=np.float32))
+    dr.enable_grad(array)
+    copy = compat.owned(array)
+    dr.backward(dr.sum(dr.square(copy)))
+    np.testing.assert_array_equal(dr.grad(array).numpy(), [0, 2, 4])
+    np.testing.assert_array_equal(dr.grad(copy).numpy(), [0, 2, 4])
+
+
+def test_what_is_not_evaluated_is_no_copy(mi_rgb):
+    array = mi_rgb.Float(np.arange(3, dtype=np.float32)) + 1
+    assert compat.owned(array) is array
+
+
+def test_assignments_are_seen_by_all(mi_rgb):
+    tensor = mi_rgb.TensorXf(np.zeros((2, 2), np.float32))
+    same = tensor
+    compat.assign(tensor, mi_rgb.TensorXf(np.ones((1, 3), np.float32)))
+    assert same.shape == (1, 3) and same.array.numpy().tolist() == [1, 1, 1]
+
+
+# -- Mitsuba 3.10 -----------------------------------------------------------------------------------------------------
+
+
+#: What Mitsuba 3.10 does after each change of variant: at first it imports the modules, later it loads them anew.
+LOADER = """
+import collections, importlib, json, sys
+import mitsuba as mi
+
+registered, modules, results, classes = collections.Counter(), [], [], set()
+before = "mi_diffind" in sys.modules
+
+def counted(function):
+    def register(*arguments):
+        registered[mi.variant(), arguments[-2]] += 1
+        return function(*arguments)
+    return register
+
+def load_entry_points():
+    if modules:
+        modules[:] = [importlib.reload(module) for module in modules]
+        return
+    kinds = [name for name in dir(mi) if name.startswith("register_")]
+    functions = {name: getattr(mi, name) for name in kinds}
+    for name in kinds:
+        setattr(mi, name, counted(functions[name]))
+    modules.append(importlib.import_module(sys.argv[1]))
+    for name in kinds:
+        setattr(mi, name, functions[name])
+    # Functions that register differ from variant to variant; from now on, count where all are called
+    versions = sys.modules["mi_diffind.core.compat"]
+    versions.register = counted(versions.register)
+
+for variant in sys.argv[2:] * 2:
+    mi.set_variant(variant)
+    mi.set_log_level(mi.LogLevel.Error)
+    load_entry_points()
+    classes.add((variant, type(mi.load_dict({"type": "disney", "roughness": 0.3}))))
+    image = mi.render(mi.load_dict({
+        "type": "scene", "integrator": {"type": "direct"}, "light": {"type": "constant"},
+        "sensor": {"type": "perspective", "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]),
+                   "film": {"type": "hdrfilm", "width": 8, "height": 8}},
+        "ball": {"type": "sphere", "material": {"type": "neural_disney", "base_color": {"type": "rgb", "value": 0.5}}},
+    }), spp=4)
+    results.append(float(image.numpy().mean()))
+print(json.dumps({"before": before, "results": results, "classes": len(classes),
+                  "registered": [[*key, count] for key, count in registered.items()]}))
+"""
+
+
+def test_declared_entry_point():
+    """The one that Mitsuba finds in an installation; a checkout that is not installed has ``pyproject.toml`` only."""
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    assert '[project.entry-points.mitsuba]\nmi_diffind = "mi_diffind.plugins.mitsuba_entry"\n' in text
+    for entry in importlib.metadata.entry_points(group="mitsuba"):
+        if entry.name == "mi_diffind":
+            assert entry.value == "mi_diffind.plugins.mitsuba_entry"
+
+
+def test_entry_point_in_three_variants():
+    """Imported once, loaded anew after each change, six changes: every plugin is registered once in each variant."""
+    variants = ["llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono"]
+    done = subprocess.run(
+        [sys.executable, "-W", "error::UserWarning", "-c", LOADER, "mi_diffind.plugins.mitsuba_entry", *variants],
+        capture_output=True, text=True, cwd=ROOT,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout[done.stdout.index("{") :])
+    assert not found["before"] and found["classes"] == 3
+    counts = {(variant, name): count for variant, name, count in found["registered"]}
+    assert set(counts.values()) == {1}, counts
+    names = [{name for v, name in counts if v == variant} for variant in variants]
+    assert names[0] == names[1] == names[2] and {"disney", "neural_sdf", "mipmap", "path_sdf"} <= names[0]
+    assert all(0.5 < value < 1 for value in found["results"])
+    assert found["results"][:3] == pytest.approx(found["results"][3:], rel=1e-5)
+
+
+def test_ray_flags(mi_rgb, monkeypatch):
+    """All of an interaction, and derivatives of normals on demand; other files name ``Minimal`` alone."""
+    scene = mi_rgb.load_dict({"type": "scene", "ball": {"type": "sphere"}})
+    ray = mi_rgb.Ray3f([0.3, 0.2, -3], [0, 0, 1])
+    for curvature in (False, True):
+        si = scene.ray_intersect(ray, compat.ray_flags(curvature), True)
+        assert dr.allclose(dr.norm(si.sh_frame.n), 1) and dr.norm(si.dp_du)[0] > 0.1
+        assert (dr.norm(si.dn_du)[0] > 0.1) is curvature
+    newer = types.SimpleNamespace(RayFlags=types.SimpleNamespace(Default=17, NormalPartials=2))
+    monkeypatch.setitem(sys.modules, "mitsuba", newer)
+    assert (compat.ray_flags(), compat.ray_flags(curvature=True)) == (17, 19)
+    files = [*(ROOT / "mi_diffind").rglob("*.py"), *(ROOT / "plugins").rglob("*.py")]
+    named = {f.name: set(re.findall(r"RayFlags\.(\w+)", f.read_text(encoding="utf-8"))) for f in files}
+    assert {name: flags for name, flags in named.items() if flags - {"Minimal"}} == {}
+
+
+def test_footprints(mi_rgb, monkeypatch):
+    """The columns of ``si.footprint`` are the diameters, and count before those of an integrator."""
+    from mi_diffind.plugins.support import footprint
+
+    si = dr.zeros(mi_rgb.SurfaceInteraction3f, 2)
+    si.duv_dx, si.duv_dy = mi_rgb.Vector2f(0.5, 0), mi_rgb.Vector2f(0, 0.25)
+    assert not compat.has_footprints() and compat.footprint_of(si) is None
+    matrix = mi_rgb.Matrix2f([[mi_rgb.Float([1, 0]), 3], [2, 4]]) * mi_rgb.Float(1, 0)  # none, as after a bounce
+    monkeypatch.setattr(mi_rgb.SurfaceInteraction3f, "footprint", matrix, raising=False)
+    ddx, ddy = (v.numpy() for v in footprint.footprint(si))
+    assert compat.has_footprints()
+    np.testing.assert_allclose([ddx, ddy], [[[1, 0.5], [2, 0]], [[3, 0], [4, 0.25]]])
+
+
+def test_names_that_may_change(mi_rgb):
+    assert compat.normal_mapped() == 0 and compat.base_class("Volume") is mi_rgb.Volume
+    assert compat.object_type("Texture") == mi_rgb.ObjectType.Texture
+    rates = ("clearcoat_sampling_rate", "diffuse_reflectance_sampling_rate", "main_specular_sampling_rate")
+    assert compat.lobe_rates() == rates
+
+
+def test_meshes(mi_rgb):
+    """A tetrahedron, set and read."""
+    positions = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float64)
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    mesh = mi_rgb.Mesh(*compat.mesh_arguments(mi_rgb.Properties("tetrahedron"), len(positions), len(faces)))
+    params = mi_rgb.traverse(mesh)
+    compat.set_triangles(params, positions, faces)
+    params.update()
+    for found, given in zip(compat.triangles(mesh), (positions, faces), strict=True):
+        np.testing.assert_array_equal(found, given)
+    scene = mi_rgb.load_dict({"type": "scene", "mesh": mesh})
+    assert dr.allclose(scene.ray_intersect(mi_rgb.Ray3f([0.25, 0.25, -1], [0, 0, 1])).t, 1)

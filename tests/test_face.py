@@ -175,12 +175,6 @@ def test_every_way_to_load_tells_textures_their_sensor(mi_rgb, tmp_path):
         np.testing.assert_allclose(image(mi, loaded), expected, atol=1e-5)
 
 
-def test_objects_load_as_in_mitsuba(mi_rgb):
-    mi = mi_rgb
-    for content in ({"type": "neural_disney"}, {"type": "diffuse"}, {"type": "path_footprint"}):
-        assert type(mi_diffind.load_dict(content)) is type(mi.load_dict(content))
-
-
 def test_a_sensor_that_is_not_there(mi_rgb):
     scene = mi_rgb.load_dict(wall(mi_rgb, texture()))
     with pytest.raises(mi_diffind.DiffindError, match="sensor: found 2, the scene has 1"):
@@ -329,37 +323,6 @@ BALL = """<scene version="3.0.0"><default name="light" value="1"/><integrator ty
     </scene>"""
 
 
-def test_captured_views(mi_rgb, tmp_path):
-    """Images and poses are those of the folder; what is there is kept; words of the command are keywords."""
-    from mi_diffind.scenes.capture import CaptureError
-
-    (tmp_path / "ball.xml").write_text(BALL)
-    settings = {"views": 4, "test": 1, "resolution": 12, "spp": 4, "path": "orbit"}
-    captured = mi_diffind.capture(tmp_path / "ball.xml", tmp_path / "views", progress=False, **settings)
-    assert captured.rendered == captured.total == 5 == len(captured.images) and not captured.interrupted
-    assert captured.images[0].shape == (12, 12, 4) and captured.images[0].dtype == np.uint8
-    assert captured.poses.shape == (5, 4, 4)
-    for pose in captured.poses:  # cameras look along -z at the centre
-        to_centre = captured.centre - pose[:3, 3]
-        np.testing.assert_allclose(-pose[:3, 2], to_centre / captured.radius, atol=1e-6)
-    again = mi_diffind.capture(tmp_path / "ball.xml", tmp_path / "views", progress=False, **settings)
-    assert again.rendered == 0 and again.files == captured.files and "5 of 5 views, 0 rendered now" in str(again)
-    for bad, sentence in (
-        ({"view": 3}, 'found the argument "view", allowed are views'),
-        ({"fov": 200}, "fov: found 200"),
-    ):
-        with pytest.raises(UsageError, match=sentence):
-            mi_diffind.capture(tmp_path / "ball.xml", tmp_path / "views", **bad)
-    # The same scene as a dictionary: the same images, kept until the dictionary changes
-    again = mi_diffind.capture(ball(), tmp_path / "dict", progress=False, **settings)
-    np.testing.assert_array_equal(again.images, captured.images)
-    assert mi_diffind.capture(ball(), tmp_path / "dict", progress=False, **settings).rendered == 0
-    with pytest.raises(CaptureError, match="files have changed"):
-        mi_diffind.capture(ball(2), tmp_path / "dict", progress=False, **settings)
-    with pytest.raises(UsageError, match="found a loaded scene, which cannot be changed any more; a scene file is"):
-        mi_diffind.capture(mi_diffind.load_dict(ball()), tmp_path / "views", **settings)
-
-
 def ball(light=1.0) -> dict:
     """Return the scene :data:`BALL` as a dictionary."""
     film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
@@ -381,46 +344,21 @@ def test_scenes_in_memory_that_hold_existing_objects_are_known_once(mi_rgb):
     assert ParsedScene(scene).description != ParsedScene(scene).description
 
 
-def test_a_reference_and_its_checks(mi_rgb, tmp_path):
-    """A reference is stored; the same scene passes, a brighter one fails, and shows where."""
-    path = tmp_path / "ball.xml"
-    path.write_text(BALL)
-    stored = mi_diffind.regress(path, update=True, spp=16, progress=False)
-    assert Path(stored.figures["reference"]).is_file() and "a check has 16 spp and would see" in str(stored)
-    assert stored.passed is None and stored.images == {} and stored._repr_png_() is None
-    check = mi_diffind.regress(path, seed=1, progress=False)
-    assert check.passed is True and check.figures["passed"] and str(check).startswith("passed")
-    np.testing.assert_allclose(check.images["error"], np.abs(check.images["image"] - check.images["reference"]))
-    brighter = mi_diffind.regress(path, defines={"light": 1.5}, out=tmp_path / "out", progress=False)
-    assert brighter.passed is False and brighter._repr_png_().startswith(b"\x89PNG")
-    assert Path(brighter.figures["files"]["figure"]).is_file()
-    assert brighter.images["image"].mean() == pytest.approx(1.5 * check.images["image"].mean(), rel=0.02)
-    # Scenes in memory, against the same reference by its name
-    known = {"name": "ball", "references": tmp_path / "references", "progress": False}
-    for scene in (ball(), mi_diffind.load_dict(ball())):
-        assert mi_diffind.regress(scene, **known).passed
-    assert mi_diffind.regress(ball(1.5), **known).passed is False
-    with pytest.raises(UsageError, match="name: not given, a scene in memory needs one"):
-        mi_diffind.regress(ball())
-    with pytest.raises(UsageError, match="defines: given with a scene in memory"):
-        mi_diffind.regress(mi_diffind.load_dict(ball()), defines={"light": 2}, **known)
-
-
 def test_keywords_of_a_study(monkeypatch, tmp_path, mi_rgb):
     """They become the arguments of the command, checked by its parser; the result shows its picture."""
+    from mi_diffind import studies
     from mi_diffind.measure.study import Tradeoff
-    from mi_diffind.studies import tradeoffs
 
     asked = []
 
-    class Recorded(tradeoffs.studies()["image"].__class__):
+    class Recorded(studies.studies()["image"].__class__):
         def run(self, arguments):
             asked.append(arguments)
             picture = Path(arguments.out) / "tradeoff_image.png"
             picture.write_bytes(b"\x89PNG")
             return Tradeoff({"quick": arguments.quick}, ["a line"], {"png": str(picture), "csv": "a.csv"})
 
-    monkeypatch.setattr(tradeoffs, "studies", lambda: {"image": Recorded()})
+    monkeypatch.setattr(studies, "studies", lambda: {"image": Recorded()})
     source = tmp_path / "a.png"
     Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(source)
     out = tmp_path / "out"

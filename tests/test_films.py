@@ -85,14 +85,6 @@ def test_a_name_like_an_address_is_a_file(tmp_path, monkeypatch):
 
 
 @needs_ffmpeg
-def test_one_frame_is_a_film(tmp_path):
-    """An interrupted orbit keeps as few."""
-    frame = smooth_frames(1, 32, 32)[0]
-    films.write(tmp_path / "film.mp4", [frame])
-    assert np.abs(decoded(tmp_path / "film.mp4").astype(float) - frame).mean() < 4
-
-
-@needs_ffmpeg
 def test_a_failed_encoder_leaves_nothing(tmp_path):
     """Frames without pixels, which the encoder refuses."""
     with pytest.raises(OutputError, match=r'output file ".*film\.mp4" cannot be written: .+'):

@@ -10,9 +10,10 @@ from pathlib import Path
 import damage
 import numpy as np
 import pytest
+from commands import refused
 
-from mi_diffind import DiffindError, TableError, load_table, save_table
-from mi_diffind.arrays.tables import StoredArray, Table
+import mi_diffind
+from mi_diffind import DiffindError, TableError, load_table
 from mi_diffind.core.archives import (
     FACTOR,
     FREE,
@@ -28,6 +29,7 @@ from mi_diffind.core.errors import LONGEST_MESSAGE, UsageError
 from mi_diffind.core.files import PATHS, OutputError
 from mi_diffind.core.units import labelled
 from mi_diffind.fitting.loop import checkpoint_settings
+from mi_diffind.fitting.settings import FitSettings, within_memory
 from mi_diffind.images.headers import picture_size
 from mi_diffind.maps.compressed import map_figure
 from mi_diffind.maps.source import SourceError, from_arrays, load_source
@@ -132,18 +134,19 @@ def test_few_lanes_hold_few_symbols():
     """A lane decodes one symbol after the other: many symbols in one lane would take hours."""
     coder = coding.SymbolEncoder()
     context = np.zeros(100, int)
-    coder.code("x", 1, 2, context, context)
+    coder.code("x", 1, 2, context, lambda: context)
     decoder = coding.SymbolDecoder(*coder.finish())
     with pytest.raises(ValueError, match="more symbols than its lanes"):
-        decoder.code("x", 1, 2, np.zeros(10**6, int))
+        decoder.code("x", 1, 2, np.zeros(10**6, int), None)
 
 
 def test_coded_nodes_are_those_of_a_dense_grid(tmp_path, rng):
     """Places, neighbours and packed flags, against masks of the whole grid."""
     shape = (37, 18, 45)
-    from mi_diffind.tasks.radiance.nodes import corners_of, layers
+    from mi_diffind.arrays.sparse_grid import cell_corners
+    from mi_diffind.tasks.radiance.nodes import layers
 
-    stored = corners_of(rng.random(tuple(n - 1 for n in shape)) < 0.02)
+    stored = cell_corners(rng.random(tuple(n - 1 for n in shape)) < 0.02)
     count = int(stored.sum())
     numbers = rng.integers(0, 16, count), rng.integers(0, 300, count)
     places, *again = coding.decode(*coding.encode(stored, *numbers, 16, 300), shape, 16, 300)
@@ -196,6 +199,21 @@ def test_a_picture_of_30000_squared_is_refused_by_its_size(tmp_path):
         load_source(path)
 
 
+def test_a_batch_beyond_memory(tmp_path, capsys, monkeypatch):
+    """Dr.Jit ends the process with a segmentation fault where memory cannot be allocated."""
+    monkeypatch.setattr("mi_diffind.core.units.memory", lambda: 2**34)
+    for task in (["ggx"], ["sdf", "no.ply"]):
+        message = refused(capsys, "fit", *task, "-o", str(tmp_path / "a.npz"), "--batch", str(2**31 - 1))
+        assert "batch: found 2,147,483,647, which takes about 128 GiB of memory, this machine has 16 GiB" in message
+    assert within_memory(FitSettings(batch=2**28)).batch == 2**28
+    for given in ({"batch": 2**31}, {"seed": 2**32}, {"batch": "8"}, {"steps": 1.5}, {"lr": "1"}, {"seed": True}):
+        with pytest.raises(DiffindError, match=next(iter(given))):
+            FitSettings(**given)
+    for seconds in (0, -1, 10**400, float("nan"), float("inf")):
+        with pytest.raises(UsageError, match="seconds: found"):
+            mi_diffind.fit("ggx", seconds=seconds)
+
+
 # -- terminals and paths -----------------------------------------------------------------------------------------------
 
 
@@ -215,14 +233,6 @@ def test_inspection_cannot_steer_a_terminal(tmp_path):
     for verbose in (False, True):
         lines = Inspection(figures, ["remark \x1b"], ["usage \x1b"]).lines(verbose)
         assert lines and all(line.isprintable() for line in lines)
-
-
-def test_measurements_of_a_file_are_numbers(tmp_path):
-    path = archive(tmp_path / "t.npz", {"meta": damage.npy(meta_of({}, measured={"psnr_db": "\x1b[31m"}))})
-    with pytest.raises(TableError, match="measurements have to be numbers"):
-        load_table(path)
-    save_table(path, Table("a task", {"a": StoredArray(np.zeros((2, 1), np.float32))}, measured={"psnr_db": 1.5}))
-    assert load_table(path).measured == {"psnr_db": 1.5}
 
 
 def test_files_name_others_in_their_folder(tmp_path, monkeypatch):

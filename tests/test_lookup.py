@@ -14,6 +14,7 @@ from variants import BACKENDS
 
 from mi_diffind import DifferentiableArray
 from mi_diffind.arrays import lookup
+from mi_diffind.arrays.lookup import PART, as_words, mask_flags, mask_words, pack_bits, unpack_bits
 from mi_diffind.core.runtime import array_module
 
 CHANNELS = (1, 2, 3, 4, 7, 12)
@@ -189,18 +190,6 @@ def test_no_bit_pattern_leads_outside_the_table(ad, border, storage):
         assert values.min() >= 2 - 1e-6 and values.max() <= 3 + 1e-6
 
 
-@pytest.mark.parametrize("border", lookup.BORDERS)
-def test_neighbouring_cells_meet(ad, border):
-    """Reading just left and just right of every entry gives that entry: no cell is off by one."""
-    n = 9
-    table = entries(np.random.default_rng(9), (n,), 3)
-    array = DifferentiableArray.from_numpy(table, ad.TensorXf, border)
-    x = (np.arange(n) / (n if border == "repeat" else n - 1)).astype(np.float32)
-    for direction in (-1, 1):
-        around = np.nextafter(x, np.float32(direction * 10))[:, None]
-        np.testing.assert_allclose(read(array, ad, around), table, atol=5e-6)
-
-
 def test_large_tables(ad):
     """The position inside a table of 512 entries a side still has the resolution that single precision allows."""
     rng = np.random.default_rng(11)
@@ -224,17 +213,6 @@ def test_masked_lanes_are_zero(ad, channels, storage):
     everything = read(array, ad, x)
     x[~mask] = np.nan
     np.testing.assert_array_equal(read(array, ad, x, active=ad.Bool(mask)), np.where(mask[:, None], everything, 0))
-
-
-def test_masked_lanes_leave_no_gradient(ad):
-    array = DifferentiableArray.from_numpy(entries(np.random.default_rng(1), (4,), 3), ad.TensorXf)
-    dr.enable_grad(array.data)
-    x = ad.Float([0.1, 0.9])
-    dr.enable_grad(x)
-    dr.backward(sum(array(x, active=ad.Bool([True, False]))))
-    gradient = array.data.grad.numpy()
-    assert gradient[:2, :3].all() and not gradient[2:].any()
-    assert x.grad.numpy()[0] != 0 and x.grad.numpy()[1] == 0
 
 
 # -- gradients ---------------------------------------------------------------------------------------------------------
@@ -271,23 +249,6 @@ def test_gradients_equal_central_differences(ad, dims, channels):
             x64 = x.astype(np.float64)
             slope = (reference(table, x64 + h, border) - reference(table, x64 - h, border)) @ weight / 2e-5
             np.testing.assert_allclose(v.grad.numpy(), slope, rtol=1e-4, atol=1e-5 * np.abs(slope).max())
-
-
-@pytest.mark.parametrize("channels", [1, 2, 3, 4, 7])
-@pytest.mark.parametrize("dims", [1, 2, 3])
-def test_packed_reads_are_differentiable_in_the_coordinate(ad, dims, channels):
-    rng = np.random.default_rng(dims)
-    border = borders(dims)[-1]
-    array = DifferentiableArray.from_numpy(entries(rng, RESOLUTION[:dims], channels), ad.TensorXf, border, "uint8")
-    x = inside(rng, 100, RESOLUTION[:dims], border)
-    point = [ad.Float(aligned(x[:, k])) for k in range(dims)]
-    dr.enable_grad(point)
-    dr.backward(sum(array(point)))
-    for k, v in enumerate(point):
-        h = 1e-5 * np.eye(dims)[k]
-        held = array.numpy()
-        slope = (reference(held, x + h, border) - reference(held, x - h, border)).sum(axis=1) / 2e-5
-        np.testing.assert_allclose(v.grad.numpy(), slope, rtol=1e-3, atol=1e-4 * np.abs(slope).max())
 
 
 @pytest.mark.parametrize("storage", lookup.STORAGES)
@@ -384,19 +345,15 @@ def test_quantising_a_constant_and_refusing_nan(ad):
             DifferentiableArray.from_numpy(constant, ad.TensorXf, storage="uint8")
 
 
-def test_gathers():
-    """The number of memory accesses: the corners of a cell share a texel where that keeps the table small."""
-    assert lookup.gathers((8, 8), 1, "uint8") == 1
-    assert lookup.gathers((8, 8), 4, "uint8") == 4
-    assert lookup.gathers((1000, 1000), 1, "uint8") == 1
-    assert lookup.gathers((1000, 1000), 2, "uint8") == 2
-    assert lookup.gathers((1000, 1000), 4, "uint8") == 4
-    assert lookup.gathers((8,) * 4, 1, "uint8") == 4
-    assert lookup.gathers((8,) * 4, 7, "uint8") == 32
-    assert lookup.gathers((8,) * 4, 12, "uint8") == 48
-    assert lookup.gathers((8, 8), 1, "float32") == 4
-    assert lookup.gathers((8, 8), 4, "float32") == 4
-    assert lookup.gathers((8, 8), 7, "float16") == 8
+def kernel_gathers(ad, array) -> int:
+    """Return the number of gathers in the kernel of a read."""
+    x = [dr.linspace(ad.Float, 0, 1, 123) for _ in array.resolution]
+    dr.eval(x)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        dr.eval(array(x))
+        code = "".join(k["ir"].getvalue() for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT)
+    return sum("call" in line and "gather" in line for line in code.splitlines())
 
 
 def test_gathers_that_the_kernel_makes():
@@ -413,14 +370,7 @@ def test_gathers_that_the_kernel_makes():
     ):
         table = entries(np.random.default_rng(0), resolution, channels)
         array = DifferentiableArray.from_numpy(table, ad.TensorXf, storage="uint8")
-        x = [dr.linspace(ad.Float, 0, 1, 123) for _ in resolution]
-        dr.eval(x)
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-            dr.kernel_history_clear()
-            dr.eval(array(x))
-            code = "".join(k["ir"].getvalue() for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT)
-        calls = [line for line in code.splitlines() if "call" in line and "gather" in line]
-        assert len(calls) == lookup.gathers(resolution, channels, "uint8"), (resolution, channels)
+        assert kernel_gathers(ad, array) == lookup.gathers(resolution, channels, "uint8"), (resolution, channels)
 
 
 # -- fewer than 8 bits an entry ----------------------------------------------------------------------------------------
@@ -467,8 +417,8 @@ def test_few_bits_of_many_channels(ad, bits, channels):
 
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 4])
-@pytest.mark.parametrize("bits", range(1, 8))
-def test_few_bits_are_differentiable_in_the_coordinate(ad, bits, channels):
+@pytest.mark.parametrize("bits", range(1, 9))
+def test_bits_are_differentiable_in_the_coordinate(ad, bits, channels):
     rng = np.random.default_rng(bits)
     dims = 1 + (bits + channels) % 3
     border = (lookup.BORDERS[bits % 2],) * dims
@@ -528,14 +478,10 @@ def test_gathers_of_few_bits_that_the_kernel_makes():
     ):
         assert lookup.channels_words(channels, bits) == words, (bits, channels)
         array, *_ = few_bits(ad, np.random.default_rng(0), (5, 7), channels, bits, "clamp")
-        x = [dr.linspace(ad.Float, 0, 1, 123) for _ in range(2)]
-        dr.eval(x)
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-            dr.kernel_history_clear()
-            dr.eval(array(x))
-            code = "".join(k["ir"].getvalue() for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT)
-        calls = [line for line in code.splitlines() if "call" in line and "gather" in line]
-        assert len(calls) == 2 * pair == lookup.gathers((5, 7), channels, "uint8", bits), (bits, channels)
+        assert kernel_gathers(ad, array) == 2 * pair == lookup.gathers((5, 7), channels, "uint8", bits), (
+            bits,
+            channels,
+        )
 
 
 def test_no_entry_needs_more_words_than_are_read():
@@ -556,3 +502,54 @@ def test_clamp_keeps_the_gradient_at_its_bounds(ad):
     dr.backward(y)
     np.testing.assert_array_equal(y.numpy(), np.float32([0, 1, 0.5, 0, 1, 0]))
     np.testing.assert_array_equal(x.grad.numpy(), [1, 1, 1, 0, 0, 0])
+
+
+@pytest.mark.parametrize("bits", range(1, 9))
+@pytest.mark.parametrize("count", [1, 2, 7, 8, 9, 31, 64, 1001])
+def test_bits_survive_packing(bits, count):
+    """Bit ``i`` of code ``k`` is bit ``k · bits + i`` of the bytes, the lowest first."""
+    codes = np.random.default_rng(count).integers(0, 2**bits, count).astype(np.uint8)
+    packed = pack_bits(codes, bits)
+    assert packed.dtype == np.uint8 and packed.shape == (-(-count * bits // 8),)
+    number = sum(int(code) << (k * bits) for k, code in enumerate(codes))
+    assert packed.tobytes() == number.to_bytes(len(packed), "little")
+    unpacked = unpack_bits(packed, count, bits)
+    assert unpacked.dtype == np.uint8
+    np.testing.assert_array_equal(unpacked, codes)
+    wider = codes | np.uint8(0xFF << bits & 0xFF)  # what lies above is left out
+    np.testing.assert_array_equal(pack_bits(wider, bits), packed)
+
+
+@pytest.mark.parametrize("bits", [3, 5, 8])
+def test_more_numbers_than_are_packed_at_a_time(rng, bits):
+    """The parts join without a gap, also where a number's bits do not fill bytes."""
+    codes = rng.integers(0, 2**bits, 2 * PART + 9).astype(np.uint8)
+    number = int("".join(f"{code:0{bits}b}" for code in codes[::-1]), 2)
+    packed = pack_bits(codes, bits)
+    assert packed.tobytes() == number.to_bytes(-(-len(codes) * bits // 8), "little")
+    np.testing.assert_array_equal(unpack_bits(packed, len(codes), bits), codes)
+
+
+def test_numbers_of_more_than_a_byte():
+    numbers = np.array([1000, 3, 2**17 - 1, 2**20 + 5], np.uint32)
+    number = sum((int(n) % 2**17) << (17 * k) for k, n in enumerate(numbers))
+    assert pack_bits(numbers, 17).tobytes() == number.to_bytes(9, "little")
+    assert pack_bits(numbers.astype(np.int64)[::2], 17).tobytes() == pack_bits(numbers[::2], 17).tobytes()
+
+
+def test_words(rng):
+    for count in (1, 4, 5):
+        packed = rng.integers(0, 256, count).astype(np.uint8)
+        for spare in (0, 1):
+            words = as_words(packed, spare)
+            assert words.dtype == np.uint32 and len(words) == -(-count // 4) + spare
+            assert words.tobytes() == packed.tobytes() + bytes(4 * len(words) - count)
+
+
+def test_masks(rng):
+    flags = rng.integers(0, 2, (5, 64)).astype(bool)
+    words = mask_words(flags)
+    assert words.dtype == np.uint32 and words.shape == (5, 2)
+    number = sum(int(flag) << k for k, flag in enumerate(flags[3]))
+    assert int(words[3, 0]) | int(words[3, 1]) << 32 == number
+    np.testing.assert_array_equal(mask_flags(words), flags)

@@ -4,6 +4,8 @@ import ast
 import functools
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[1]
 
 #: Floors, from the lowest one up. Rooms on the same floor may import one another, without a circle.
@@ -174,6 +176,34 @@ def test_no_circles():
         rooms.setdefault(room(name), set()).update(map(room, others))
     assert circle({name: others - {name} for name, others in rooms.items()}) == ""
     assert circle({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == "b → c → b" and circle({"a": {"b", "c"}, "b": {"c"}}) == ""
+
+
+#: Flow → the modules that it begins with (those that exist), and the most files that it reaches by imports of any kind.
+#: The aim: 30 files to fit a texture, 25 to read one, 40 to fit a field.
+FLOWS = {
+    "fit texture": (("tasks.texture", "tasks.texture.fit", "tasks.texture.model", "tasks.texture.compressed"), 39),
+    "read neural_texture": (("plugins.neural_texture",), 46),
+    "fit field": (("tasks.radiance", "tasks.radiance.fit", "tasks.radiance.model", "tasks.radiance.files"), 49),
+}
+
+
+def closure(roots: tuple[str, ...]) -> set[str]:
+    """The modules that some modules reach by imports, themselves included, without packages that hold no code."""
+    reached, waiting = set(), [f"mi_diffind.{root}" for root in roots if f"mi_diffind.{root}" in modules()]
+    while waiting:
+        name = waiting.pop()
+        if name not in reached:
+            reached.add(name)
+            waiting += graph()[name]
+    return {name for name in reached if len(tree(modules()[name]).body) > 1}
+
+
+@pytest.mark.parametrize("flow", FLOWS)
+def test_flows_pass_through_few_files(flow):
+    """Imports inside of functions, for types and by name count, too."""
+    roots, most = FLOWS[flow]
+    reached = closure(roots)
+    assert len(reached) <= most, "\n".join(sorted(reached))
 
 
 def names_given(syntax: ast.AST) -> list[tuple[str, int]]:

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import warnings
+from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ import mi_diffind
 from mi_diffind import DifferentiableArray, DiffindError, StoredArray, TableError, load_model, save_table
 from mi_diffind.arrays.lookup import STORAGES
 from mi_diffind.arrays.tables import Table
+from mi_diffind.core import discovery
 from mi_diffind.core.arguments import Argument
 from mi_diffind.core.errors import UsageError, reason
 from mi_diffind.core.progress import Deadline
@@ -396,7 +398,7 @@ def test_all_errors_have_one_base_class():
         return name == "DiffindError" or any(derives(base) for base in classes.get(name, []))
 
     # No errors, but how a loop is left, what keeps a plugin as it is, and what a decoder tells the reader that calls it
-    signals = {"Stopped", "Kept", "TooManyNodes"}
+    signals = {"Stopped", "Kept", "TooManyNodes", "BudgetError"}
     assert [name for name in classes if not derives(name) and name not in signals] == []
 
 
@@ -415,3 +417,38 @@ def test_what_can_be_asked_of_the_package():
     assert mi_diffind.fit is fit and mi_diffind.DiffindError is DiffindError
     with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
         mi_diffind.nothing  # noqa: B018
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    """A function that makes a package ``its_package`` of modules (name → text) and of entry points (name → module)."""
+
+    def make(modules, points=()):
+        root = tmp_path / "its_package"
+        root.mkdir()
+        for name, text in {"__init__": "", **modules}.items():
+            (root / f"{name}.py").write_text(text)
+        entries = [metadata.EntryPoint(name, value, "its_package") for name, value in dict(points).items()]
+        monkeypatch.setattr(metadata, "entry_points", lambda group: entries if group == "its_package" else [])
+
+    monkeypatch.syspath_prepend(tmp_path)
+    yield make
+    for name in [n for n in sys.modules if n.split(".")[0] == "its_package"]:
+        del sys.modules[name]
+
+
+def test_modules(package):
+    package({"two": "", "one": "1 / 0", "_own": "", "shared": ""}, {"three": "theirs:THING", "two": "its_package.two"})
+    names = discovery.modules("its_package", ignored=("shared",))
+    assert names == {"one": "its_package.one", "two": "its_package.two", "three": "theirs"}
+    assert list(names) == ["one", "two", "three"] and "its_package.two" not in sys.modules
+
+
+def test_what_of_ours_is_broken_is_an_error(package):
+    """Left out is only what does not claim to be one, or what is not asked for."""
+    package({"one": "THING = 1", "none": "", "broken": "1 / 0"})
+    assert discovery.load("its_package", "THING", only=("one", "none"), expected=int) == {"one": 1}
+    with pytest.raises(ZeroDivisionError):
+        discovery.load("its_package", "THING")
+    with pytest.raises(TypeError, match="its THING is a int, a str is needed"):
+        discovery.load("its_package", "THING", only=("one",), expected=str)

@@ -224,14 +224,14 @@ class DifferentiableArray(nn.Module):
             codes, *affine = lookup.quantize(values, self.channels)
         self.scale, self.offset = (tuple(map(float, numbers)) for numbers in affine)
         self.bits = bits
-        self.data = owned(device_array(module_of(dtype).UInt32, self._packed(codes, bits)))
+        self.data = owned(device_array(module_of(dtype).UInt32, self._pack(codes, bits)))
         return self
 
-    def _packed(self, codes: np.ndarray, bits: int) -> np.ndarray:
+    def _pack(self, codes: np.ndarray, bits: int) -> np.ndarray:
         """Return the words that hold the numbers ``codes``, ``(*shape, channels)``, of ``bits`` bits."""
         if bits == 8:
             return lookup.pack(codes, self.border)
-        more = lookup.guarded(self.resolution, self.border)[-1] - codes.shape[-2]
+        more = lookup.resolution_in_memory(self.resolution, self.border)[-1] - codes.shape[-2]
         return as_words(pack_bits(np.concatenate([codes, codes[..., :more, :]], axis=-2), bits), spare=2)
 
     def numpy(self) -> np.ndarray:
@@ -248,13 +248,13 @@ class DifferentiableArray(nn.Module):
         """Return the bytes of an array in ``"uint8"`` storage, shape ``(N_1, …, N_d, channels)``."""
         if self.storage != "uint8":
             raise ValueError(f'only "uint8" storage has codes, this array is stored as "{self.storage}"')
-        return self._unpacked(self.data.numpy())
+        return self._unpack(self.data.numpy())
 
-    def _unpacked(self, words: np.ndarray) -> np.ndarray:
-        """Return the numbers of :meth:`_packed` words."""
+    def _unpack(self, words: np.ndarray) -> np.ndarray:
+        """Return the numbers of :meth:`_pack` words."""
         if self.bits == 8:
             return lookup.unpack(words, self.resolution, self.channels)
-        shape = (*lookup.guarded(self.resolution, self.border), self.channels)
+        shape = (*lookup.resolution_in_memory(self.resolution, self.border), self.channels)
         codes = unpack_bits(words.view(np.uint8), math.prod(shape), self.bits)
         return codes.reshape(shape)[..., : self.resolution[-1], :]
 
@@ -476,15 +476,15 @@ def rounded(net: Indirection, bits: Sequence[int] | None = None) -> Indirection:
 
     Entries of each primary are rounded to its ``bits`` (default: 8), the cascaded array's to 8.
     """
-    return _changed(net, bits, DifferentiableArray.rounded)
+    return _each_array(net, bits, DifferentiableArray.rounded)
 
 
 def stored_form(net: Indirection, bits: Sequence[int] | None = None) -> Indirection:
     """Return the arrays of ``net`` as they are stored, as bytes; :func:`rounded` predicts their values."""
-    return _changed(net, bits, DifferentiableArray.quantised)
+    return _each_array(net, bits, DifferentiableArray.quantised)
 
 
-def _changed(net: Indirection, bits: Sequence[int] | None, change) -> Indirection:
+def _each_array(net: Indirection, bits: Sequence[int] | None, change) -> Indirection:
     widths = bits or [8] * len(net.primary)
     primary = [change(array, width) for array, width in zip(net.primary, widths, strict=True)]
     return Indirection(primary, change(net.cascaded, 8), net.inputs)

@@ -259,7 +259,7 @@ def pair_words(channels: int, bits: int) -> int:
     return min(2 * channels_words(channels, bits), channels_words(channels, bits, 2))
 
 
-def guarded(resolution: Sequence[int], border: Sequence[str]) -> tuple[int, ...]:
+def resolution_in_memory(resolution: Sequence[int], border: Sequence[str]) -> tuple[int, ...]:
     """Return the resolution in memory of a table of fewer than 8 bits a channel.
 
     If the last axis repeats, its first entry follows the last one, so that the two entries of a cell are neighbours.
@@ -274,7 +274,7 @@ def neighbour_pairs(x: Sequence, resolution: Sequence[int], border: Sequence[str
     They are pairs: the index of an entry, and the weights of it and of the next one along the last axis.
     """
     axes = [_axis(v, n, b, inside) for v, n, b in zip(x, resolution, border, strict=True)]
-    stored, (lower, _, w) = guarded(resolution, border), axes[-1]
+    stored, (lower, _, w) = resolution_in_memory(resolution, border), axes[-1]
     ends, pairs = (1 - w, w), []
     for index, weight in _corners(axes[:-1], stored[:-1]):
         index = lower if index is None else dr.fma(index, stored[-1], lower)
@@ -333,10 +333,10 @@ def fetch_bits(words, channels: int, bits: int, active, Float, index, entries: i
         gathered = [((high << 1) << (shift ^ 31)) | (low >> shift) for low, high in pairs]
     else:
         gathered = [gathered[0] >> shift]
-    return [_numbers(_shifted(gathered, i * width), channels, bits, Float) for i in range(entries)]
+    return [_numbers(_shift_right(gathered, i * width), channels, bits, Float) for i in range(entries)]
 
 
-def _shifted(words: list, by: int) -> list:
+def _shift_right(words: list, by: int) -> list:
     """Return the words of a long number, the lowest first, without its lowest bits."""
     skipped, shift = divmod(by, 32)
     words = words[skipped:]

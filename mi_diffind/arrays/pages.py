@@ -42,8 +42,11 @@ SAMPLES = 16
 SIDES = (1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 13, 15, SAMPLES + 1)
 _OPTIONS = np.array([(rows, columns) for rows in SIDES for columns in SIDES])
 
-#: Pages that are looked at together, and in all for an estimate.
-PART, ESTIMATED = 4096, 1024
+#: Pages whose errors are computed at a time.
+PART = 4096
+
+#: Pages that an estimate looks at.
+ESTIMATED = 1024
 
 
 class PagedArray(DifferentiableArray):
@@ -55,14 +58,14 @@ class PagedArray(DifferentiableArray):
         channels: values per entry.
         init: the entries, ``(entries, channels)``: those of one page after the other, the last axis fastest; or a
             number for all.
-        shift: where the first page begins along each axis, in units of a page, from 0 to 1. Half a texel, if entries
-            are to lie at texel centres. What lies before it belongs, with a ``"repeat"`` border, to the last page,
-            which then ends behind 1; with ``"clamp"`` it reads as the page's border.
+        shift: start of the first page along each axis, in units of a page, from 0 to 1: half a texel, if entries are to
+            lie at texel centres. Coordinates below ``shift`` read the last page (``"repeat"``), which then ends behind
+            1, or clamp to the first one (``"clamp"``).
         fold, border: as for :class:`.DifferentiableArray`.
 
     ``resolution`` are the numbers of pages, ``data`` has the shape ``(entries, padded)``, ``index`` holds the words.
-    Everything else is as there: how it is read, trained and converted. :meth:`at` is not defined. Raises
-    ``ValueError`` for impossible settings.
+    It is read, trained and converted as the base class; :meth:`at` is not defined. Raises ``ValueError`` for impossible
+    settings.
     """
 
     DRJIT_STRUCT = {  # noqa: RUF012
@@ -141,10 +144,10 @@ class PagedArray(DifferentiableArray):
         self.index = (self._words(dtype),)
         return super()._hold(values, dtype, storage, quantization, bits)
 
-    def _packed(self, codes: np.ndarray, bits: int) -> np.ndarray:
+    def _pack(self, codes: np.ndarray, bits: int) -> np.ndarray:
         return as_words(pack_bits(codes, bits), spare=2)
 
-    def _unpacked(self, words: np.ndarray) -> np.ndarray:
+    def _unpack(self, words: np.ndarray) -> np.ndarray:
         codes = unpack_bits(words.view(np.uint8), self.entries * self.channels, self.bits)
         return codes.reshape(-1, self.channels)
 
@@ -241,7 +244,7 @@ def page_sizes_of(images: Sequence[np.ndarray], border: tuple[str, str], entries
     for values in images:
         page_errors = np.concatenate([_errors(part) for part in _parts(_windows(values, border))])
         errors.append(page_errors / math.prod(values.shape[:2]))
-    chosen = _OPTIONS[_allocated(np.concatenate(errors), entries)]
+    chosen = _OPTIONS[_allocate(np.concatenate(errors), entries)]
     parts = np.split(chosen, np.cumsum([len(e) for e in errors])[:-1])
     return [part.reshape(*page_counts(i.shape[:2]), 2) for part, i in zip(parts, images, strict=True)]
 
@@ -257,7 +260,7 @@ def page_gain(values: np.ndarray, border: tuple[str, str], entries: float, rest:
     some = windows[np.random.default_rng(0).permutation(len(windows))[:ESTIMATED]]
     errors, share = _errors(some), len(some) / len(windows)
     texels = len(some) * SAMPLES**2
-    paged = errors[np.arange(len(some)), _allocated(errors, share * entries)].sum() / texels + rest
+    paged = errors[np.arange(len(some)), _allocate(errors, share * entries)].sum() / texels + rest
     # The grid has as many cells a page wherever it is; what a page of its own does better at its border is little
     cells = SAMPLES * math.sqrt(entries / math.prod(values.shape[:2]))
     square = [i for i, (rows, columns) in enumerate(_OPTIONS) if rows == columns > 1]
@@ -267,7 +270,7 @@ def page_gain(values: np.ndarray, border: tuple[str, str], entries: float, rest:
     return 10 / math.log(10) * (float(grid) - paged), -10 / math.log(10) * paged
 
 
-def _allocated(errors: np.ndarray, entries: float) -> np.ndarray:
+def _allocate(errors: np.ndarray, entries: float) -> np.ndarray:
     """Return the option that each page takes, by Lagrange's method.
 
     A page takes the option that minimises ``error + λ · entries``, with the smallest λ that leads to at most

@@ -18,7 +18,7 @@ SETTINGS = (
     ("seed", "seed of the random numbers", {"type": natural}),
 )
 
-HELP = "train tables"
+HELP = "train the tables of a task, and write them to a table file"
 
 EXAMPLE = "mi-diffind fit image photo.png -o photo.npz"
 

@@ -1,7 +1,13 @@
-"""Reading of ``.npz`` archives whose content nobody has checked.
+"""Reading of ``.npz`` archives whose content nobody has checked, and the memory that the content of a file may take.
 
-Sizes in the headers of a ZIP archive are claims. Members are therefore decompressed piece by piece, up to the size that
-the array's header states and the :class:`.Allowance` of the file permits, and never beyond.
+Sizes in the headers of a ZIP archive are claims, and one megabyte of deflate holds a gigabyte of zeros. Members are
+therefore decompressed piece by piece, and readers of any format ask an :class:`Allowance` before they allocate anything
+whose size a file decides. The content of a file may take :data:`FREE` bytes and :data:`FACTOR` times the size of the
+file, and never more than the memory of the machine; the environment variable :data:`VARIABLE` raises the limit.
+
+Counted are the bytes of arrays, decompressed and with the bits of each entry unpacked, and four bytes more for each
+entry of a table; of JSON a bound of what Python's objects take (:func:`json_bytes`); of pictures the bytes that a
+decoder returns; of fields the most memory that decoding and building take at once.
 """
 
 from __future__ import annotations
@@ -73,8 +79,7 @@ class Archive:
     def array(self, name: str, dtype: np.dtype | None = None, shape: tuple | None = None) -> np.ndarray:
         """Return an array, of a given type and shape unless these are ``None``; it cannot be written.
 
-        Its header is checked before memory is allocated. Raises :class:`ArchiveError` and
-        :class:`.LimitError`.
+        Its header is checked before memory is allocated. Raises :class:`ArchiveError` and :class:`LimitError`.
         """
         where = f'{self.path}: array "{name:.80}"'
         with self._zip.open(self.members[name]) as stream:
@@ -134,8 +139,11 @@ def read_arrays(path: str | os.PathLike) -> dict[str, np.ndarray]:
         return {name: archive.array(name) for name in archive.members}
 
 
-#: Bytes that the content of any file may take, and bytes for each byte of the file beside these.
-FREE, FACTOR = 64 * 2**20, 20
+#: Bytes of memory that the content of any file may take.
+FREE = 64 * 2**20
+
+#: Bytes of memory for each byte of the file beside :data:`FREE`.
+FACTOR = 20
 
 #: Environment variable with another limit, in bytes, such as ``4G``; limits below those of the rule change nothing.
 VARIABLE = "MI_DIFFIND_MEMORY"

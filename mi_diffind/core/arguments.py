@@ -100,7 +100,7 @@ def between(low: float, high: float, exclusive: bool = False, none: bool = False
         allowed = f"numbers above {low:g}" + ("" if math.isinf(high) else f" and below {high:g}")
     allowed += " and none" if none else ""
 
-    def parsed(text: str) -> float:
+    def parse(text: str) -> float:
         if none and text == "none":
             return math.inf
         try:
@@ -111,7 +111,7 @@ def between(low: float, high: float, exclusive: bool = False, none: bool = False
             raise argparse.ArgumentTypeError(f"found {text!r}, allowed are {allowed}")
         return value
 
-    return parsed
+    return parse
 
 
 #: A number from 0 to 1.

@@ -1,7 +1,7 @@
 """Uses of private interfaces of Mitsuba 3.9 and Dr.Jit 1.5, and what Mitsuba 3.10 does otherwise: one a function.
 
-Each has a test that names the hook which broke (``tests/test_compat.py``). Functions import Mitsuba and Dr.Jit when
-they are called, so that this module may be imported before LLVM is chosen (:mod:`.runtime`). Where Mitsuba 3.10
+Each has a test that names the hook which broke (``tests/test_compat.py``). Mitsuba and Dr.Jit are imported when a
+function is called, so that this module may be imported before LLVM is chosen (:mod:`.runtime`). Where Mitsuba 3.10
 differs, functions ask for the newer name; that half was read in its sources and has not run (``docs/next_mitsuba.md``).
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import importlib
 import os
 import re
 import struct
@@ -17,19 +18,28 @@ import threading
 from pathlib import Path
 
 
+class _Lazy:
+    """Module that is imported when an attribute is asked for."""
+
+    def __init__(self, name: str):
+        self._name = name
+
+    def __getattr__(self, attribute: str):
+        return getattr(importlib.import_module(self._name), attribute)
+
+
+dr, mi = _Lazy("drjit"), _Lazy("mitsuba")
+
+
 def llvm_version() -> tuple[int, int, int]:
     """Return the version of the LLVM that Dr.Jit has loaded, -1 first if none; waits for its start."""
-    import drjit
-
-    return tuple(drjit.detail.llvm_version())
+    return tuple(dr.detail.llvm_version())
 
 
 def core_library() -> str:
     """Return the path of Dr.Jit's native library."""
-    import drjit
-
     name = {"linux": "libdrjit-core.so", "darwin": "libdrjit-core.dylib"}.get(sys.platform, "drjit-core.dll")
-    return os.path.join(os.path.dirname(drjit.__file__), name)
+    return os.path.join(os.path.dirname(dr.__file__), name)
 
 
 class JitCore:
@@ -73,8 +83,6 @@ class JitCore:
 
 def new_scope(dtype) -> None:
     """Start a scope: Dr.Jit merges no later computation of the backend of ``dtype`` with an earlier one."""
-    import drjit as dr
-
     dr.detail.new_scope(dr.backend_v(dtype))
 
 
@@ -112,8 +120,6 @@ def was_compiled(history: list[dict]) -> bool:
 @contextlib.contextmanager
 def room_for_sums(entries: int):
     """Let each core sum the gradients of arrays by itself, up to ``entries`` in the copies of all cores together."""
-    import drjit as dr
-
     before = dr.expand_threshold()
     dr.set_expand_threshold(max(before, entries // dr.thread_count()))
     try:
@@ -127,8 +133,6 @@ def use_threads(count: int) -> None:
 
     A sum in progress has a place for each thread at its start, and Dr.Jit does not check for one.
     """
-    import drjit as dr
-
     if count != dr.thread_count():
         dr.eval()
         dr.sync_thread()
@@ -142,8 +146,6 @@ def module_of(array):
 
 def has_gradient(value) -> bool:
     """Return whether a derivative with respect to this array is tracked, also where derivatives are suspended."""
-    import drjit as dr
-
     if dr.is_tensor_v(value):
         return value.array.index_ad != 0
     if dr.depth_v(value) > 1:
@@ -161,16 +163,12 @@ def syntax(function):
     Mitsuba loads plugins in several threads. CPython 3.11 keeps one depth of syntax trees for all of them, and may end
     a transformation by "SystemError: AST constructor recursion depth mismatch" where two meet.
     """
-    import drjit as dr
-
     with _TRANSFORMING:
         return dr.syntax(function)
 
 
 def identity(value) -> tuple:
     """Return the indices of Dr.Jit's variables, which identify the content of an array as long as the array is kept."""
-    import drjit as dr
-
     if dr.is_tensor_v(value):
         return identity(value.array)
     if dr.depth_v(value) > 1:
@@ -185,8 +183,6 @@ def adam_state(optimizer) -> dict[str, tuple]:
 
 def set_adam_state(optimizer, key: str, value, t, m, v) -> None:
     """Set the state of the parameter ``key`` of an ``Adam``, from :func:`adam_state` or NumPy arrays and a number."""
-    import drjit as dr
-
     old, promoted, rate, (t_old, m_old, v_old, v_max) = optimizer.state[key]
     new = type(old)(value)
     dr.make_opaque(new)
@@ -196,15 +192,11 @@ def set_adam_state(optimizer, key: str, value, t, m, v) -> None:
 
 def on_variant_change(callback) -> None:
     """Call ``callback(old, new)`` after each ``mi.set_variant``; the same function is registered once."""
-    import mitsuba as mi
-
     mi.detail.add_variant_callback(callback)
 
 
 def is_recording() -> bool:
     """Return whether Dr.Jit records a loop or a call symbolically, as integrators do while they trace a scene."""
-    import drjit as dr
-
     return dr.flag(dr.JitFlag.SymbolicScope)
 
 
@@ -213,8 +205,6 @@ def is_zero(*values) -> bool:
 
     Within a recorded call, inputs stay known if the caller computed them outside of the state of a loop.
     """
-    import drjit as dr
-
     return all(value.state == dr.VarState.Literal and value[0] == 0 for value in values)
 
 
@@ -254,7 +244,6 @@ def srgb_coefficients() -> tuple:
     Returned are its side ``n``, the positions ``(n,)`` along the largest component, and the coefficients ``(3·n³, 3)``,
     all float32. Raises ``RuntimeError`` in one sentence.
     """
-    import mitsuba as mi
     import numpy as np
 
     path = mi.file_resolver().resolve("data/srgb.coeff")
@@ -274,9 +263,6 @@ def normal_edges(pi, si, ray, active) -> tuple:
     ``dp_du`` and ``dp_dv``, but edges of the triangle for meshes, where Mitsuba 3.9 gives derivatives in barycentric
     coordinates.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     mesh = active & si.is_valid() & si.shape.is_mesh()
     edges = []
     for step, otherwise in (((1, 0), si.dp_du), ((0, 1), si.dp_dv)):
@@ -292,15 +278,11 @@ def replay_integrator() -> type:
 
     Mitsuba loads it anew *after* it called the function of :func:`on_variant_change`.
     """
-    import mitsuba as mi
-
     return mi.ad.integrators.common.RBIntegrator
 
 
 def written_in_python(integrator) -> bool:
     """Return whether an integrator is written in Python upon Mitsuba's base classes, whose ``sample`` takes a mode."""
-    import mitsuba as mi
-
     return isinstance(integrator, mi.CppADIntegrator)
 
 
@@ -318,23 +300,17 @@ def replays_paths(integrator) -> bool:
 
 def samples_in_python(integrator) -> bool:
     """Return whether an integrator derives from ``ADIntegrator``; its ``sample`` takes a mode."""
-    import mitsuba as mi
-
     return isinstance(integrator, mi.ad.integrators.common.ADIntegrator)
 
 
 def splat(block, film, place, light, alpha, aovs: list, wavelengths) -> None:
     """Put samples into an image block, with further channels ``aovs``, as Mitsuba's integrators in Python do."""
-    import mitsuba as mi
-
     put = mi.ad.integrators.common.ADIntegrator._splat_to_block
     put(block, film, place, value=light, weight=1.0, alpha=alpha, aovs=aovs, wavelengths=wavelengths)
 
 
 def objects_of(scene) -> list:
     """Return all objects of a loaded scene, each once, nested ones too (in a ``twosided``, a ``bumpmap``, …)."""
-    import mitsuba as mi
-
     return nodes_of(mi.traverse(scene))
 
 
@@ -366,16 +342,12 @@ def parse_file(path: str | os.PathLike, defines: dict[str, str] | None = None) -
 
     ``defines`` are its ``<default>`` values.
     """
-    import mitsuba as mi
-
     config = mi.parser.ParserConfig(mi.variant())
     return config, mi.parser.parse_file(config, str(path), **{k: str(v) for k, v in (defines or {}).items()})
 
 
 def parse(scene: dict | str, defines: dict[str, str] | None = None) -> tuple:
     """Return the configuration and the state of a scene that is a dictionary or a text of XML."""
-    import mitsuba as mi
-
     config = mi.parser.ParserConfig(mi.variant())
     if isinstance(scene, dict):
         return config, mi.parser.parse_dict(config, scene)
@@ -384,15 +356,11 @@ def parse(scene: dict | str, defines: dict[str, str] | None = None) -> tuple:
 
 def copy_parsed(state) -> tuple:
     """Return a configuration and a copy of a parsed scene's state, since :func:`instantiate` changes the state."""
-    import mitsuba as mi
-
     return mi.parser.ParserConfig(mi.variant()), mi.parser.ParserState(state)
 
 
 def instantiate(config, state):
     """Build the parsed scene: transform and merge it, in place, as ``mi.load_file`` does."""
-    import mitsuba as mi
-
     mi.parser.transform_all(config, state)
     return mi.parser.instantiate(config, state)
 
@@ -431,8 +399,6 @@ def parsed_references(state) -> list[list[int]]:
     They are indices in that order. References are resolved only when a scene is built. Raises ``RuntimeError`` for an
     id that does not exist.
     """
-    import mitsuba as mi
-
     types, result = mi.Properties.Type, []
     for props in properties_of(state):
         values = [props[key] for key in props if props.type(key) in (types.Reference, types.ResolvedReference)]
@@ -445,8 +411,6 @@ def parsed_references(state) -> list[list[int]]:
 
 def parsed_place(state, index: int) -> str:
     """Return the file, line and column of an object of a parsed scene."""
-    import mitsuba as mi
-
     return mi.parser.file_location(state, state.nodes[index])
 
 
@@ -466,8 +430,6 @@ def property_kind(props, key: str) -> str:
     It is ``number``, ``colour``, ``text``, ``object`` (nested or referred to), ``existing`` (an object that exists
     already) or ``other``.
     """
-    import mitsuba as mi
-
     types, parameter = mi.Properties.Type, props.type(key)
     if parameter in (types.Float, types.Integer):
         return "number"
@@ -483,8 +445,6 @@ def film_size(sensor, width: int, height: int):
 
     A film with a crop window keeps its size.
     """
-    import mitsuba as mi
-
     film, params = sensor.film(), mi.traverse(sensor)
     before = [int(n) for n in film.size()]
     if "film.size" not in params or before != [int(n) for n in film.crop_size()]:
@@ -518,8 +478,6 @@ def one_sentence(error: BaseException) -> str:
 
 def has_footprints() -> bool:
     """Return whether hits carry the footprint of a pixel, from ray cones: ``si.footprint`` (Mitsuba 3.10, #1964)."""
-    import mitsuba as mi
-
     return hasattr(mi.SurfaceInteraction3f, "footprint")
 
 
@@ -528,8 +486,6 @@ def footprint_of(si) -> tuple | None:
 
     It is zero where no ray cone arrived: after the first bounce, and in scenes without a ``filtered()`` texture.
     """
-    import mitsuba as mi
-
     matrix = getattr(si, "footprint", None)
     if matrix is None:
         return None
@@ -538,8 +494,6 @@ def footprint_of(si) -> tuple | None:
 
 def ray_flags(curvature: bool = False) -> int:
     """Return the ``mi.RayFlags`` for all of an interaction, with the footprint, and with ``curvature`` ``dn_du``."""
-    import mitsuba as mi
-
     flags = mi.RayFlags
     if hasattr(flags, "NormalPartials"):
         return flags.Default | flags.NormalPartials if curvature else flags.Default
@@ -548,15 +502,11 @@ def ray_flags(curvature: bool = False) -> int:
 
 def normal_mapped() -> int:
     """Return the ``mi.BSDFFlags`` of a BSDF whose normals are those of a map, 0 in Mitsuba 3.9, which has none."""
-    import mitsuba as mi
-
     return getattr(mi.BSDFFlags, "NormalMapped", 0)
 
 
 def lobe_rates() -> tuple[str, ...]:
     """Return the parameters of ``principled`` that say how often lobes are sampled; none in Mitsuba 3.10 (#1951)."""
-    import mitsuba as mi
-
     names = mi.traverse(mi.load_dict({"type": "principled"})).keys()
     return tuple(sorted(name for name in names if name.endswith("_sampling_rate")))
 
@@ -567,15 +517,11 @@ FIELDS = ("Texture", "Volume")
 
 def base_class(name: str) -> type:
     """Return the class of this name that plugins derive from; ``mi.Field`` where it has taken its place."""
-    import mitsuba as mi
-
     return getattr(mi, "Field" if name in FIELDS and not hasattr(mi, name) else name)
 
 
 def object_type(name: str):
     """Return the ``mi.ObjectType`` of a class's name; that of fields where they have taken its place."""
-    import mitsuba as mi
-
     return getattr(mi.ObjectType, "Field" if name in FIELDS and not hasattr(mi.ObjectType, name) else name)
 
 
@@ -584,8 +530,6 @@ def register(object_type: str, name: str, factory) -> None:
 
     Mitsuba has no ``register_volume``; in a scene, volumes are looked up among textures, or among fields (#1885).
     """
-    import mitsuba as mi
-
     if object_type in ("texture", "volume"):
         function = getattr(mi, "register_texture", None) or mi.register_field
     else:
@@ -595,14 +539,11 @@ def register(object_type: str, name: str, factory) -> None:
 
 def mesh_arguments(props, vertices: int, faces: int) -> tuple:
     """Return the arguments of ``mi.Mesh`` for a mesh of so many vertices and triangles, to be set afterwards."""
-    import mitsuba as mi
-
     return (props,) if hasattr(mi.Mesh, "from_fields") else (props.plugin_name(), vertices, faces, props)
 
 
 def set_triangles(params, positions, faces) -> None:
     """Set the places ``(n, 3)`` and the triangles ``(m, 3)`` of a traversed mesh, NumPy arrays, without an update."""
-    import mitsuba as mi
     import numpy as np
 
     positions, faces = np.ascontiguousarray(positions, np.float32), np.ascontiguousarray(faces, np.uint32)
@@ -626,8 +567,6 @@ def owned(array):
     Where a virtual call reads an array, a frozen function (``dr.freeze`` of Dr.Jit 1.5) takes the address of memory
     that Dr.Jit did not allocate, such as NumPy's, for a constant. No public function tells or copies such memory.
     """
-    import drjit as dr
-
     if array.state != dr.VarState.Evaluated:
         return array
     # Adding −0 changes no number, not even −0; denormal ones may become 0
@@ -638,6 +577,4 @@ def owned(array):
 
 def assign(target, value) -> None:
     """Assign to an array in place, so that all who refer to it see the value, as ``mi.SceneParameters`` does."""
-    import mitsuba as mi
-
     mi.set_property(target, value)

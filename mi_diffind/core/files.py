@@ -21,8 +21,11 @@ try:
 except ImportError:  # Windows, where temporary files of killed processes stay
     fcntl = None
 
-#: Longest path in a sentence, in characters, and longest name of a file, in bytes, of usual file systems.
-SHOWN, LONGEST_NAME = 120, 255
+#: Longest path in a sentence, in characters.
+SHOWN = 120
+
+#: Longest name of a file of usual file systems, in bytes.
+LONGEST_NAME = 255
 
 #: Word between a file's name and the random part in the name of its temporary file.
 UNFINISHED = "unfinished"
@@ -170,7 +173,7 @@ def replacing(path: str | os.PathLike):
     temporary = handle = None
     try:
         _remove_abandoned(beside)
-        handle, temporary = _locked(beside)
+        handle, temporary = _create_locked(beside)
         yield temporary
         umask = os.umask(0)
         os.umask(umask)
@@ -200,7 +203,7 @@ def _temporary_name(path: Path, random: str) -> str:
     return f".{digest}.{UNFINISHED}-{random}{suffix}"
 
 
-def _locked(path: Path) -> tuple[int, Path]:
+def _create_locked(path: Path) -> tuple[int, Path]:
     """Create a temporary file of ``path``: its handle, whose lock shows that this process lives, and its path."""
     while True:
         temporary = path.with_name(_temporary_name(path, secrets.token_hex(RANDOM // 2)))
@@ -323,8 +326,11 @@ def relative_path(file: str | os.PathLike, folder: str | os.PathLike) -> str:
     return file if shared == os.path.dirname(shared) else os.path.relpath(file, folder)
 
 
-#: Names in a note, and characters of a name.
-MOST_NAMES, LONGEST_KEY = 50, 40
+#: Names in a note.
+MOST_NAMES = 50
+
+#: Characters of a name in a note.
+LONGEST_KEY = 40
 
 
 class RecordedKeys(dict):

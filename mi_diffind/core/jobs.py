@@ -189,6 +189,8 @@ def _beside(
             process = _spare.process = WorkerProcess(threads, idle)
             if pool is not None:
                 pool.append(process)
+            if stop is not None and stop.is_set():  # begun after the others were ended
+                process.process.kill()
         try:
             return process.carry_out(name, function, value)
         except (EOFError, OSError):

@@ -11,15 +11,23 @@ import numpy as np
 
 from .errors import UsageError, reason
 
-#: Types of numbers in a tensor file, by their code, and most fields of a file.
-TYPES, MOST = ("", "u1", "i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f2", "<f4", "<f8"), 256
+#: Types of numbers in a tensor file, by their code.
+TYPES = ("", "u1", "i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f2", "<f4", "<f8")
 
-#: Fields of a file → number of dimensions: of ``measured``, beside its values, and of ``measured_polarized``.
+#: Most fields of a file.
+MOST = 256
+
+#: Field of ``measured``, beside its values → number of dimensions.
 MEASURED = {"phi_i": 1, "theta_i": 1, "ndf": 2, "sigma": 2, "vndf": 4, "luminance": 4}
+
+#: Field of ``measured_polarized`` → number of dimensions.
 POLARISED = {"theta_h": 2, "theta_d": 2, "phi_d": 2, "wvls": 1, "M": 6}
 
-#: Fields that increase, and fields of densities.
-ANGLES, POSITIVE = ("phi_i", "theta_i", "theta_h", "theta_d", "phi_d"), ("ndf", "sigma", "vndf")
+#: Fields that increase.
+ANGLES = ("phi_i", "theta_i", "theta_h", "theta_d", "phi_d")
+
+#: Fields of densities.
+POSITIVE = ("ndf", "sigma", "vndf")
 
 
 def read(path: Path) -> dict[str, np.ndarray]:

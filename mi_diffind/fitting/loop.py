@@ -51,10 +51,10 @@ def exponential_like(u, rate: float = EXPONENTIAL_RATE):
 
 
 def sample_losses(outputs: Mapping, targets: Mapping, weights: Mapping[str, float], size: int, loss: str) -> list:
-    """Return the weighted absolute or squared differences (``loss``) between outputs and targets, to be summed.
+    """Return the weighted absolute or squared differences (``loss``) between outputs and targets, one array a target.
 
-    ``outputs`` and ``targets`` map names to lists of arrays with ``size`` entries; a missing weight counts 1. There is
-    one array of ``size`` numbers for each target in the result; the sum of all entries is the weighted mean.
+    ``outputs`` and ``targets`` map names to lists of arrays with ``size`` entries; a missing weight counts 1. The sum
+    of all entries of the result is the weighted mean.
     """
     losses = []
     for name, target in targets.items():
@@ -92,7 +92,7 @@ class Problem:
     #: moves away from it, as far as its learning rate goes.
     harmless: float = 1e-6
 
-    #: What the settings do not say about the problem, as JSON; a checkpoint of another one is refused.
+    #: Content of a checkpoint beside the settings, as JSON; a checkpoint of another problem is refused.
     identity: Mapping = {}
 
     #: The settings of the training; set by :func:`fit`.
@@ -119,10 +119,8 @@ class Problem:
     def loss(self, net, rng, size: int):
         """Return the loss of a step that may draw ``size`` samples from ``rng``.
 
-        It is differentiable with respect to ``net``, an array or a list of arrays, whose entries are summed. By default
-        it is the weighted mean of the differences between :meth:`predict` and the targets of :meth:`batch`, absolute or
-        squared (``settings.loss``), as one array of ``size`` numbers for each target. They are not summed here, so that
-        one kernel can write them and sum the gradients of all entries.
+        It is an array or a list of arrays, whose entries are summed later, so that one kernel writes them and sums all
+        gradients. By default: :func:`sample_losses` of :meth:`predict` and the targets of :meth:`batch`.
         """
         inputs, targets = self.batch(rng, size)
         return sample_losses(self.predict(unfolded(net), inputs), targets, self.weights, size, self.settings.loss)
@@ -168,9 +166,8 @@ class FitResult:
 
 @dataclass
 class _State:
-    """State of a training: parameters and, for each, Adam's step count and moments.
+    """State of a training: parameters and, for each, Adam's step count and moments, as Dr.Jit or NumPy arrays.
 
-    They are Dr.Jit arrays (not written in place, so a snapshot costs nothing) or, from a checkpoint, NumPy arrays.
     Without ``moments``, Adam begins anew.
     """
 
@@ -253,7 +250,7 @@ def fit(
     interrupted = False
 
     def measure(loss: float | None):
-        figures = problem.measure(net) if clock is None else clock.measured(lambda: problem.measure(net))
+        figures = problem.measure(net) if clock is None else clock.time_measurement(lambda: problem.measure(net))
         measured = {k: float(v) for k, v in figures.items()}
         name, value = next(iter(measured.items()))
         record.history.append({"step": trainer.step, "loss": loss, **measured})
@@ -261,7 +258,7 @@ def fit(
         if record.best is None or value >= top - problem.tolerance:
             record.best = trainer.snapshot(all_moments=False).parameters
             record.best_measured, record.best_step = measured, trainer.step
-        bar.measured(name, value)
+        bar.show_figure(name, value)
 
     with interruptible() as stop, cores(settings.deterministic), compat.room_for_sums(LARGEST_SUMS), bar.shown:
         while trainer.share < 1 and not stop.is_set():
@@ -283,7 +280,7 @@ def fit(
             if not (due or last or reference is None):
                 continue
             value = float(loss[0])
-            if _diverged(value, reference, problem.harmless) or not trainer.finite():
+            if _has_diverged(value, reference, problem.harmless) or not trainer.finite():
                 trainer.restarts = record.restarts = record.restarts + 1
                 if record.restarts > 8:
                     raise FittingError(
@@ -301,7 +298,7 @@ def fit(
                 continue
             record.references[trainer.phase] = value if reference is None else 0.5 * (reference + value)
             plateau.update(trainer.step, value)
-            bar.loss(value)
+            bar.show_loss(value)
             good = before  # not the state after this step: nobody has seen its loss yet
             if measured or last:
                 measure(value)
@@ -352,7 +349,7 @@ class _Clock:
         """True if measurements take too much of the time, so that only the last one is still carried out."""
         return self.measuring > MEASURING * (self.before - self.start)
 
-    def measured(self, measure):
+    def time_measurement(self, measure):
         """Return the result of a measurement, whose duration counts."""
         start = time.perf_counter()
         figures, self.measurement = duration(measure)
@@ -382,16 +379,16 @@ class _Bar:
             self.shown.bar_format = self.title + self._form(trainer.step, trainer.share)
         self.shown.update((trainer.step if self.seconds is None else trainer.share) - self.shown.n)
 
-    def loss(self, loss: float) -> None:
+    def show_loss(self, loss: float) -> None:
         self.text["loss"] = f"{loss:.3g}"
         self.shown.set_postfix(self.text, refresh=False)
 
-    def measured(self, name: str, value: float) -> None:
+    def show_figure(self, name: str, value: float) -> None:
         self.text[name] = f"{value:.2f}"
         self.shown.set_postfix(self.text, refresh=not self.lines)
 
 
-def _diverged(value: float, reference: float | None, harmless: float) -> bool:
+def _has_diverged(value: float, reference: float | None, harmless: float) -> bool:
     return not math.isfinite(value) or (reference is not None and value > 10 * reference + harmless)
 
 

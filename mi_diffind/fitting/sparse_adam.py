@@ -34,7 +34,7 @@ class SparseAdam(Adam):
             del value
             packets = shape[1] // PACKET if len(shape) == 2 and shape[1] % PACKET == 0 else 0
             gradient = gradients.pop(key)
-            changed = _changed(gradient, packets, changed_rows.get(shape[0]))
+            changed = _changed_entries(gradient, packets, changed_rows.get(shape[0]))
             if len(shape) == 1:
                 changed_rows[shape[0]] = changed
             if dr.width(changed):
@@ -59,7 +59,7 @@ class SparseAdam(Adam):
         dr.eval(flat, first, second)
 
 
-def _changed(gradient, packets: int, rows=None):
+def _changed_entries(gradient, packets: int, rows=None):
     """Return the numbers of the entries with a gradient or, if a row has ``packets``, those of its packets.
 
     Of packets, only those of ``rows`` are looked at, if these are given.

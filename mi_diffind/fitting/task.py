@@ -2,10 +2,8 @@
 
 A task is a ground truth, arrays that are fitted to it, and a table file that holds them. It declares itself as
 ``TASK``, a :class:`Task`, in the package ``mi_diffind/tasks/NAME`` or in a module that an entry point of the group
-``mi_diffind.tasks`` names. No list of tasks exists: ``fit``, ``inspect``, ``decode`` and the documentation ask
-:func:`tasks`. The command line imports every declaration, so a declaration imports neither Dr.Jit nor Mitsuba.
-
-Code that needs them lies in other modules of the task's package, where :class:`Task` looks for it by name:
+``mi_diffind.tasks`` names; :func:`tasks` finds them. A declaration imports neither Dr.Jit nor Mitsuba. Code that needs
+them lies in other modules of the task's package, where :class:`Task` looks for it by name:
 
 =============  =====================================================================================
 ``fit.py``     ``check(request)`` and ``fit(request)``
@@ -47,10 +45,10 @@ if TYPE_CHECKING:
 #: Storage forms that a training may end in (:data:`.lookup.STORAGES`, without importing Dr.Jit).
 STORAGES = ("float32", "float16", "uint8")
 
-#: Share of a limited time beyond which the result says how long it took.
+#: Ratio of the duration and the limit of time beyond which the result says how long it took.
 OVERRUN = 1.15
 
-#: The folder of the tables that ship.
+#: Folder of the tables that ship.
 DATA = Path(__file__).resolve().parents[1] / "data"
 
 
@@ -71,11 +69,12 @@ class Stage:
 
     Example: a proxy in 30% of the time, then a residual on top of it::
 
-        problems = []
-        first, last = request.run([
-            Stage("proxy", lambda: problems.append(ProxyProblem(samples)) or problems[0], 0.3, PROXY_SETTINGS),
-            Stage("", lambda: ResidualProblem(samples, problems[0].net), finish=stored),
-        ])
+        def stages():
+            proxy = ProxyProblem(samples)
+            yield Stage("proxy", proxy, share=0.3, settings=PROXY_SETTINGS)
+            yield Stage("", ResidualProblem(samples, proxy.net), finish=stored)
+
+        first, last = request.run(stages())
     """
 
     name: str
@@ -120,14 +119,17 @@ class FitRequest:
         results: list[FitResult] = []
         with interruptible() as stop:
             for stage in stages:
-                if results and (results[-1].interrupted or stop.is_set()):
+                if results and stop.is_set():
                     results[-1] = dataclasses.replace(results[-1], interrupted=True)
                     break
                 problem = stage.problem() if callable(stage.problem) else stage.problem
-                if problem is not None:
-                    request = self._stage_request(stage)
-                    title = stage.title or stage.name or None
-                    results.append(request.train(problem, title, stage.finish, stage.times, stage.least))
+                if problem is None:
+                    continue
+                request, title = self._stage_request(stage), stage.title or stage.name or None
+                limits = {"times": stage.times, "least": stage.least}
+                results.append(request.train(problem, title, stage.finish, **limits))
+                if results[-1].interrupted:
+                    break
         return results
 
     def _stage_request(self, stage: Stage) -> FitRequest:
@@ -211,21 +213,12 @@ class Fitted:
     def report(self) -> dict:
         """All figures of the result, as ``mi-diffind fit --json`` writes them."""
         table, result = self.table, self.result
+        training = ("step", "seconds", "unfinished", "restarts", "history")
         return {
-            "interrupted": result.interrupted,
-            "task": (self.request and self.request.task) or table.task,
-            "preset": table.preset,
-            "bytes": table.nbytes,
-            "storage": table.storage,
-            "settings": table.settings,
-            "measured": table.measured,
-            "step": result.step,
-            "seconds": result.seconds,
-            "unfinished": result.unfinished,
-            "restarts": result.restarts,
-            "history": result.history,
-            **self.figures,
-        }
+            "interrupted": result.interrupted, "task": (self.request and self.request.task) or table.task,
+            "preset": table.preset, "bytes": table.nbytes, "storage": table.storage, "settings": table.settings,
+            "measured": table.measured, **{name: getattr(result, name) for name in training}, **self.figures,
+        }  # fmt: skip
 
     def save(self, path: str | os.PathLike) -> Path:
         """Write the table file ``path`` (``.npz``) and return its path.
@@ -329,10 +322,7 @@ class Model:
         """Write the content in an ordinary format, and return each file with a line about it.
 
         Without an ``output``, the content is returned: of maps a dictionary of arrays, of a distance field a
-        ``trimesh.Trimesh``.
-
-        Raises :class:`.TableError` if there is no such format, and
-        :class:`.UsageError` for bad options.
+        ``trimesh.Trimesh``. Raises :class:`.TableError` if there is no such format, and :class:`.UsageError`.
         """
         self._refuse("stand for nothing that could be decoded")
 
@@ -345,30 +335,31 @@ class Model:
 class Task:
     """Base class of tasks. Class attributes describe the task, methods carry it out.
 
-    A task has to have a ``name`` (that of its entry point, if any), a ``title`` (for help texts), its ``section`` in
-    the paper, ``presets`` (the first is the default), and either :meth:`problem` and :meth:`table` or a ``fit.py``.
+    A task has to have a ``name``, a ``title``, ``presets``, and either :meth:`problem` and :meth:`table` or a
+    ``fit.py``.
     """
 
-    #: The word that stands for it on the command line and in table files.
+    #: Word for the task on the command line and in table files, and name of its entry point, if any.
     name: str
-    #: What its tables stand for: "the GGX distribution of normals".
+    #: Content of the tables: "the GGX distribution of normals".
     title: str
-    #: Where the paper describes it.
+    #: Section of the paper.
     section: str = ""
     #: Source and options of the example in the help of ``fit``.
     example: str = ""
-    #: Named ways to lay out and train its tables; the first is the default.
+    #: Name → settings of a training; the first is the default.
     presets: Mapping[str, FitSettings]
     #: Preset → the table file that ships, relative to ``mi_diffind/data`` unless absolute.
     shipped: Mapping[str, str | os.PathLike] = {}
     #: Storage forms of a training's result, the first is the default; none: the task chooses.
     storages: tuple[str, ...] = STORAGES
-    #: The arguments of ``fit`` and ``decode`` that only this task adds.
+    #: Arguments of ``fit`` that only this task adds.
     arguments: tuple[Argument, ...] = ()
+    #: Arguments of ``decode`` that only this task adds.
     decode_arguments: tuple[Argument, ...] = ()
-    #: The module of the task's package that reads its table files.
+    #: Name of the submodule with ``load``, ``allocate``, ``stored`` and ``MODEL``.
     files: str = "files"
-    #: Number of measurements during a training; 0: as the settings of the preset say.
+    #: Measurements during a training; 0: one each ``measure_every`` steps of the preset.
     measurements: int = 0
     #: Object type and name of the plugin that reads the tables ("texture", "neural_image"); none: no plugin does.
     plugin: tuple[str, str] | None = None
@@ -501,11 +492,8 @@ class Task:
     def open(self, dtype, filename: str | os.PathLike = "", preset: str = "", storage: str = "") -> Model:
         """Return the model of ``filename``, or of the shipped tables of ``preset``, for the tensor type ``dtype``.
 
-        ``storage`` is the storage form ("": the file's own). Raises :class:`.TableError` or
-        ``ValueError``.
-
-        A file is read and checked once. Models share its memory (Dr.Jit arrays are never written in place), yet
-        assigning to the arrays of one model does not change another.
+        ``storage`` is the storage form ("": the file's own). A file is read and checked once; models share its memory,
+        yet assigning to the arrays of one does not change another. Raises :class:`.TableError` or ``ValueError``.
         """
         if storage and storage not in STORAGES:
             raise ValueError(f'parameter "storage": found "{storage}", allowed are {", ".join(STORAGES)}')
@@ -547,10 +535,8 @@ def load_model(path: str | os.PathLike, dtype, storage: str = "") -> Model:
 def open_model(path: str | os.PathLike = "", storage: str = "", *, task: str = "", preset: str = "") -> Model:
     """Open a table file of any task, or the tables that ship for a ``task`` and its ``preset``: ``mi_diffind.open``.
 
-    The model describes itself (``describe()``), has its size (``nbytes``), measures its errors against what it was
-    fitted to (``measure()``) and turns into ordinary files (``decode(output)``). ``storage`` is the storage form of its
-    arrays, ``"float32"``, ``"float16"`` or ``"uint8"`` ("": the file's own). It computes on the device of the Mitsuba
-    variant that is set. Raises :class:`.TableError` and ``ValueError``.
+    ``storage`` is the storage form of the arrays, ``"float32"``, ``"float16"`` or ``"uint8"`` ("": the file's own). The
+    model computes on the device of the Mitsuba variant that is set. Raises :class:`.TableError` and ``ValueError``.
     """
     from ..core.runtime import array_module
 

@@ -37,7 +37,7 @@ from mi_diffind.maps.source import Source, SourceError, from_arrays, load_source
 
 from .. import warn
 from . import properties
-from .stock import Kept
+from .properties import Kept
 from .tables import Entries, exposed
 
 STORAGES = ("uint8", "float32")

@@ -467,7 +467,7 @@ class FilteredTexture(MapTexture):
             ddx, ddy = footprint.footprint(si, self.cone)
             if self._transform is not None:
                 m = self._transform.matrix
-                ddx, ddy = footprint.transformed(ddx, ddy, [[m[i, j] for j in range(2)] for i in range(2)])
+                ddx, ddy = footprint.transform(ddx, ddy, [[m[i, j] for j in range(2)] for i in range(2)])
             return in_texels(ddx, ddy, self._size)
 
     def _filtered(self, uv, level) -> list:

@@ -12,7 +12,7 @@ from texture_scenes import linear
 from mi_diffind.core.compat import module_of
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
-from mi_diffind.measure.operations import count
+from mi_diffind.measure.clock import count
 from mi_diffind.scenes import loading
 
 SIZE = WIDTH, HEIGHT = 24, 16

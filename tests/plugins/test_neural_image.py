@@ -18,7 +18,7 @@ from mi_diffind.arrays.tables import StoredArray, Table, load_table, save_table
 from mi_diffind.core import compat
 from mi_diffind.maps.layout import Layout, MapLayout
 from mi_diffind.maps.source import load_source
-from mi_diffind.measure.operations import bsdf_operations
+from mi_diffind.measure.clock import bsdf_operations
 from mi_diffind.scenes import comparison, loading
 from mi_diffind.tasks.image import TASK
 from mi_diffind.tasks.image.arrays import CompressedImage

@@ -16,7 +16,7 @@ from texture_files import make
 import mi_diffind
 from mi_diffind import plugins
 from mi_diffind.maps.source import from_arrays
-from mi_diffind.measure.operations import bsdf_operations
+from mi_diffind.measure.clock import bsdf_operations
 from mi_diffind.plugins.support import footprint
 from mi_diffind.scenes import loading
 

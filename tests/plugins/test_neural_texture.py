@@ -15,7 +15,7 @@ from mi_diffind.core.compat import module_of
 from mi_diffind.maps.layout import Layout
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays, load_source
-from mi_diffind.measure.operations import bsdf_operations, count
+from mi_diffind.measure.clock import bsdf_operations, count
 from mi_diffind.scenes import loading
 from mi_diffind.tasks.texture import TASK
 from mi_diffind.tasks.texture.compressed import CompressedTexture, to_table
