@@ -47,7 +47,7 @@ class PairsField(NodeVolume):
         result = super().with_arrays(arrays)
         result.modules = {}
         for name, module in self.modules.items():
-            result.modules[name] = module._like()
+            result.modules[name] = module._replace()
             result.modules[name].data = arrays.get(name)
         return result
 
