@@ -6,16 +6,13 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import statistics
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 
-import tomllib
-
-MEASURED = Path(__file__).resolve().parent / "measured"
+from figures import commands, measured
 
 #: Of which training the bytes on disk of the paper's recipe are.
 TRAINED = "Bytes on disk of the paper's recipe are those after two minutes of training."
@@ -30,15 +27,7 @@ LINE = "<br>"
 NAMES = LINE.join(("**ours**", "instead", "paper"))
 
 #: JSON file → command that wrote it, without the file's name.
-COMMANDS = {
-    name: re.sub(r" --json docs/measured/\S+", "", command)
-    for name, command in tomllib.loads((MEASURED / "commands.toml").read_text(encoding="utf-8")).items()
-}
-
-
-def measured(name: str) -> dict:
-    """Return the JSON that a command wrote."""
-    return json.loads((MEASURED / f"{name}.json").read_text(encoding="utf-8"))
+COMMANDS = {name: re.sub(r" --json docs/measured/\S+", "", command) for name, command in commands().items()}
 
 
 @dataclass(frozen=True)
@@ -117,110 +106,109 @@ def benched(error: float | None, task: str, contender: str, base: str = "", **si
     return Contender(error, **times(task, contender, base), **{**known, **sizes})
 
 
-def ggx() -> Row:
-    """Return the row of the distribution of normals."""
-    study = measured("tradeoff_ggx")["candidates"]
-    ours, paper = (study[name]["errors"]["psnr_db"] for name in ("neural_ggx", "16→8 raw"))
-    return Row(
-        "`neural_ggx`", "ggx", "`roughconductor`", "PSNR of D", "dB",
-        benched(ours, "ggx", "ours"), benched(EXACT, "ggx", "roughconductor"),
-        benched(paper, "ggx", "paper"), {"errors": "tradeoff_ggx", "all others": "bench_backward"},
-    )  # fmt: skip
+def beside(
+    task: str,
+    page: str,
+    instead: str,
+    error: str,
+    unit: str,
+    bench: str,
+    errors: dict,
+    sources: dict,
+    note="",
+    base="",
+    **more,
+) -> Row:
+    """Return a row whose times and bytes are those of ``bench_backward``.
+
+    ``errors``: name of ours, theirs and the paper's recipe there → error.
+    """
+    contenders = (benched(value, bench, name, base) for name, value in errors.items())
+    return Row(task, page, instead, error, unit, *contenders, sources, note, **more)
 
 
-def disney() -> Row:
-    """Return the row of the Disney BRDF."""
-    study = measured("tradeoff_disney")["candidates"]
-    ours, paper = (study[name]["errors"]["psnr_db_training"] for name in ("tables, uint8", "paper, uint8"))
-    networks = measured("tradeoff_disney_network")["candidates"].values()
-    texts = [f"{size_text(c['bytes'])} has {c['errors']['psnr_db_training']:.1f} dB" for c in networks]
-    return Row(
-        "`neural_disney`", "disney", "`principled`", "PSNR of BRDF · cosine", "dB",
-        benched(ours, "disney", "ours"), benched(EXACT, "disney", "principled"), benched(paper, "disney", "paper"),
-        {"errors": "tradeoff_disney", "all others": "bench_backward", "the networks": "tradeoff_disney_network"},
+def rows_of_bsdfs() -> Iterator[Row]:
+    """Yield the rows of the distribution of normals, of the Disney BRDF, and of learned BSDFs."""
+    bench = {"all others": "bench_backward"}
+    study = measured("tradeoff_ggx").candidates
+    errors = {"ours": study["neural_ggx"].errors.psnr_db, "roughconductor": EXACT,
+              "paper": study["16→8 raw"].errors.psnr_db}  # fmt: skip
+    yield beside("`neural_ggx`", "ggx", "`roughconductor`", "PSNR of D", "dB", "ggx", errors,
+                 {"errors": "tradeoff_ggx", **bench})  # fmt: skip
+
+    study = measured("tradeoff_disney").candidates
+    errors = {"ours": study["tables, uint8"].errors.psnr_db_training, "principled": EXACT,
+              "paper": study["paper, uint8"].errors.psnr_db_training}  # fmt: skip
+    networks = measured("tradeoff_disney_network").candidates.values()
+    texts = [f"{size_text(c.bytes)} has {c.errors.psnr_db_training:.1f} dB" for c in networks]
+    yield beside(
+        "`neural_disney`", "disney", "`principled`", "PSNR of BRDF · cosine", "dB", "disney", errors,
+        {"errors": "tradeoff_disney", **bench, "the networks": "tradeoff_disney_network"},
         f"A network in {texts[0]}, one in {texts[1]}, in half precision and with the coordinates of the formulas as "
         "inputs; Mitsuba has no plugin that evaluates it.",
         others={"disney, exact": benched(EXACT, "disney", "disney")},
     )  # fmt: skip
-
-
-def bsdf() -> Row:
-    """Return the row of learned BSDFs: medians of the study's materials."""
-    study = measured("tradeoff_bsdf")
-    psnr = {
-        name: statistics.median(study["candidates"][f"{m}: {name}"]["errors"]["psnr_db"] for m in study["cases"])
-        for name in ("ours", "measured", "paper")
-    }
-    return Row(
-        "`neural_bsdf`", "bsdf", "`measured`", "PSNR, median of materials", "dB",
-        *(benched(psnr[name], "bsdf", name) for name in ("ours", "measured", "paper")),
-        {"errors": "tradeoff_bsdf", "all others": "bench_backward"},
-        "`measured` has no parameters that a step could optimise.", cells={"step": "none"},
-        others={"roughconductor, exact": benched(EXACT, "bsdf", "roughconductor")},
+    yield Row(
+        "`disney`", "disney", "`principled`", "a formula, as `principled` is", "",
+        benched(None, "disney", "disney"), benched(None, "disney", "principled"), Contender(),
+        {"all": "bench_backward"}, "The paper has no such row: not measured.", cells={"error": "exact"},
     )  # fmt: skip
 
-
-def bsdf_source() -> Row:
-    """Return the row of a learned BSDF beside the analytic one that it was fitted to."""
-    study, material, base = measured("tradeoff_bsdf")["candidates"], "GGX copper, α 0.01", "roughconductor"
-    ours, paper = (study[f"{material}: {name}"]["errors"]["psnr_db"] for name in ("ours", "paper"))
-    return Row(
+    study = measured("tradeoff_bsdf")
+    errors = {
+        name: statistics.median(study.candidates[f"{m}: {name}"].errors.psnr_db for m in study.cases)
+        for name in ("ours", "measured", "paper")
+    }
+    yield beside(
+        "`neural_bsdf`", "bsdf", "`measured`", "PSNR, median of materials", "dB", "bsdf", errors,
+        {"errors": "tradeoff_bsdf", **bench}, "`measured` has no parameters that a step could optimise.",
+        cells={"step": "none"}, others={"roughconductor, exact": benched(EXACT, "bsdf", "roughconductor")},
+    )  # fmt: skip
+    material, base = "GGX copper, α 0.01", "roughconductor"
+    ours, paper = (study.candidates[f"{material}: {name}"].errors.psnr_db for name in ("ours", "paper"))
+    yield Row(
         "`neural_bsdf`", "bsdf", "its source, `roughconductor`", "PSNR, copper", "dB",
         benched(ours, "bsdf", "ours", base), benched(EXACT, "bsdf", base, base, memory=0, disk=0),
-        benched(paper, "bsdf", "paper", base), {"errors": "tradeoff_bsdf", "all others": "bench_backward"},
+        benched(paper, "bsdf", "paper", base), {"errors": "tradeoff_bsdf", **bench},
         "A step of ours has the derivatives of all parameters of the proxy; the paper's form has no proxy, and `scale` "
         "alone.",
     )  # fmt: skip
 
 
-def image() -> Row:
-    """Return the row of compressed maps of a material."""
-    study = measured("tradeoff_image")["candidates"]
+def rows_of_images() -> Iterator[Row]:
+    """Yield the rows of compressed maps of a material, of 1024² and of 4096² texels."""
+    study = measured("tradeoff_image").candidates
     ours, paper = (
         next(c for name, c in study.items() if name.startswith(f"{preset} 12x ")) for preset in ("ours", "paper")
     )
-    codec = study["ASTC 12x, each map its own"]
-    decoded = measured("bench_backward")["bytes"]["image"]["bitmap"]["memory"]
-    again = measured("tradeoff_image_network")["candidates"]
+    codec, decoded = study["ASTC 12x, each map its own"], measured("bench_backward").bytes.image.bitmap.memory
+    again = measured("tradeoff_image_network").candidates
     network = next(c for name, c in again.items() if name.startswith("hash grid + network"))
-    return Row(
+    yield Row(
         "`neural_image`", "image", "`bitmap`, decoded from ASTC", "PSNR of 4 maps", "dB",
-        benched(ours["errors"]["psnr_db"], "image", "ours"),
-        benched(codec["errors"]["psnr_db"], "image", "bitmap", memory=decoded, disk=codec["bytes"]),
-        benched(paper["errors"]["psnr_db"], "image", "paper"),
+        benched(ours.errors.psnr_db, "image", "ours"),
+        benched(codec.errors.psnr_db, "image", "bitmap", memory=decoded, disk=codec.bytes),
+        benched(paper.errors.psnr_db, "image", "paper"),
         {"errors, bytes of ASTC": "tradeoff_image", "all others": "bench_backward",
          "the network": "tradeoff_image_network"},
-        f"A hash grid with a network in {size_text(network['bytes'])} has {network['errors']['psnr_db']:.1f} dB after "
-        f"{network['training_seconds']:.0f} s; Mitsuba has no plugin that renders it. {TRAINED}",
+        f"A hash grid with a network in {size_text(network.bytes)} has {network.errors.psnr_db:.1f} dB after "
+        f"{network.training_seconds:.0f} s; Mitsuba has no plugin that renders it. {TRAINED}",
     )  # fmt: skip
 
-
-def large_material() -> Row:
-    """Return the row of a material of 4096² texels."""
     study = measured("bench_large_material")
-    ours, paper, raw, codec = (study[name] for name in ("ours", "paper", "raw", "ASTC"))
-
-    def contender(name: str) -> Contender:
-        c = study[name]
-        return benched(c["psnr_db"], "large", name, memory=c["memory_bytes"], disk=c["file_bytes"])
-
-    return Row(
-        f"`neural_image`, {study['side']}²", "image", "`bitmap`, decoded from ASTC", "PSNR of 3 maps", "dB",
-        contender("ours"), benched(codec["psnr_db"], "large", "bitmap", memory=raw["bytes"], disk=codec["bytes"]),
-        contender("paper"), {"errors, bytes": "bench_large_material", "times": "bench_backward"},
-        f"Trained for {ours['seconds'] / 60:.0f} minutes each. The cascaded array takes "
-        f"{size_text(ours['cascaded_bytes'])} "
-        f"(the paper's recipe: {size_text(paper['cascaded_bytes'])}), the bound of the paper's equation 1 is 1 MB. "
-        f"ASTC has blocks of {codec['block']} for all maps, encoded by the preset `fast`.",
+    ours, paper = (
+        benched(c.psnr_db, "large", name, memory=c.memory_bytes, disk=c.file_bytes)
+        for name, c in study.items() if name in ("ours", "paper")
     )  # fmt: skip
-
-
-def exact_disney() -> Row:
-    """Return the row of the exact Disney BRDF beside Mitsuba's formula."""
-    return Row(
-        "`disney`", "disney", "`principled`", "a formula, as `principled` is", "",
-        benched(None, "disney", "disney"), benched(None, "disney", "principled"), Contender(),
-        {"all": "bench_backward"}, "The paper has no such row: not measured.", cells={"error": "exact"},
+    codec = study["ASTC"]
+    yield Row(
+        f"`neural_image`, {study.side}²", "image", "`bitmap`, decoded from ASTC", "PSNR of 3 maps", "dB", ours,
+        benched(codec.psnr_db, "large", "bitmap", memory=study.raw.bytes, disk=codec.bytes), paper,
+        {"errors, bytes": "bench_large_material", "times": "bench_backward"},
+        f"Trained for {study.ours.seconds / 60:.0f} minutes each. The cascaded array takes "
+        f"{size_text(study.ours.cascaded_bytes)} "
+        f"(the paper's recipe: {size_text(study.paper.cascaded_bytes)}), the bound of the paper's equation 1 is 1 MB. "
+        f"ASTC has blocks of {codec.block} for all maps, encoded by the preset `fast`.",
     )  # fmt: skip
 
 
@@ -230,55 +218,48 @@ SAMPLES, OF_SAMPLES = "bitmap, 4 spp, multijittered", "`bitmap`, 4 samples besid
 
 def plane(name: str, **sizes) -> Contender:
     """Return a contender of the study of filtered textures, with errors and times of its renders of a plane."""
-    study, first = measured("tradeoff_texture"), "bitmap, 1 spp"
-    ratios = study["cases"]["plane"]["ratios"]["render"]
-    times = [ratios[f"{contender} / {first}"]["median"] for contender in (name, SAMPLES)]
-    return Contender(study["candidates"][name]["errors"]["psnr_plane_db"], times[0] / times[1], **sizes)
+    study = measured("tradeoff_texture")
+    ratios = study.cases.plane.ratios.render
+    times = [ratios[f"{contender} / bitmap, 1 spp"].median for contender in (name, SAMPLES)]
+    return Contender(study.candidates[name].errors.psnr_plane_db, times[0] / times[1], **sizes)
 
 
-def texture() -> Row:
-    """Return the row of filtered textures, of renders of a plane."""
-    bench = measured("bench_backward")
-    network = measured("tradeoff_texture_network")["candidates"]["network 12x, trilinear"]
-    same = plane("ours 12x, trilinear").error
-    return Row(
+def rows_of_textures() -> Iterator[Row]:
+    """Yield the rows of filtered textures, of renders of a plane, and of uncompressed mip maps.
+
+    Mip maps are floats, of which the study counts 8 bits each.
+    """
+    study, stored = measured("tradeoff_texture"), measured("bench_backward").bytes.texture
+    network = measured("tradeoff_texture_network").candidates["network 12x, trilinear"]
+    same, sources = plane("ours 12x, trilinear").error, {"errors, renders": "tradeoff_texture"}
+    step = ("A step is not measured with these samples: 4 beside 16 of the bitmap take {:.2f} of the time.").format
+    steps = {name: step(times("texture", name)["step"]) for name in ("ours", "mipmap")}
+    yield Row(
         "`neural_texture`", "texture", OF_SAMPLES, "PSNR of a plane", "dB",
-        plane("ours 12x, anisotropic, centred", **bench["bytes"]["texture"]["ours"]),
-        plane(SAMPLES, **bench["bytes"]["texture"]["bitmap"]), Contender(),
-        {"errors, renders": "tradeoff_texture", "steps, bytes": "bench_backward",
-         "the network": "tradeoff_texture_network"},
-        f"A hash grid with a network in {size_text(network['bytes'])} has {network['errors']['psnr_plane_db']:.1f} dB, "
+        plane("ours 12x, anisotropic, centred", **stored.ours), plane(SAMPLES, **stored.bitmap), Contender(),
+        {**sources, "steps, bytes": "bench_backward", "the network": "tradeoff_texture_network"},
+        f"A hash grid with a network in {size_text(network.bytes)} has {network.errors.psnr_plane_db:.1f} dB, "
         f"ours with the same filter, trilinear, {same:.1f} dB; Mitsuba has no plugin that renders it. "
-        f"{step_of('ours')} The paper's recipe had {measured('tradeoff_texture')['details']['request']['seconds']:.0f} "
+        f"{steps['ours']} The paper's recipe had {study.details.request.seconds:.0f} "
         "s there, too few to converge: not measured.",
     )  # fmt: skip
-
-
-def step_of(contender: str) -> str:
-    """Return a sentence about the training step of a filtered texture, which has other samples than its renders."""
-    ratio = times("texture", contender)["step"]
-    return f"A step is not measured with these samples: 4 beside 16 of the bitmap take {ratio:.2f} of the time."
-
-
-def mip_maps() -> Row:
-    """Return the row of uncompressed mip maps: floats, of which the study counts 8 bits each."""
-    study, png = measured("tradeoff_texture")["candidates"], measured("bench_backward")["bytes"]["texture"]["bitmap"]
-    return Row(
+    memory = 4 * study.candidates["mipmap, trilinear"].bytes
+    yield Row(
         "`mipmap`", "texture", OF_SAMPLES, "PSNR of a plane", "dB",
-        plane("mipmap, trilinear", memory=4 * study["mipmap, trilinear"]["bytes"], disk=png["disk"]),
-        plane(SAMPLES, **png), Contender(), {"errors, renders": "tradeoff_texture", "steps, bytes": "bench_backward"},
-        step_of("mipmap"),
+        plane("mipmap, trilinear", memory=memory, disk=stored.bitmap.disk), plane(SAMPLES, **stored.bitmap),
+        Contender(), {**sources, "steps, bytes": "bench_backward"}, steps["mipmap"],
     )  # fmt: skip
 
 
-def shading() -> Row:
-    """Return the row of textures trained for shaded values, beside the best classical filter in equal bytes."""
-    study, material = measured("tradeoff_shading")["candidates"], "weave"
+def rows_of_shading() -> Iterator[Row]:
+    """Yield the rows of textures trained for shaded values, of a material in one plugin, and of training in a scene."""
+    material = "weave"
+    study = measured("tradeoff_shading").candidates
     mine = {name.removeprefix(f"{material}, "): c for name, c in study.items() if name.startswith(f"{material}, ")}
-    psnr = {name: c["errors"]["c_mean_db"] for name, c in mine.items()}
+    psnr = {name: c.errors.c_mean_db for name, c in mine.items()}
     best = max((name for name in psnr if name.endswith((", ASTC", ", compressed"))), key=psnr.get)
     best_text = best.replace(", ASTC", " filters in ASTC").replace(", compressed", " filters, compressed")
-    return Row(
+    yield Row(
         "`fit shading`", "shading", f"classical filters in equal bytes ({best_text})", f"PSNR of shaded {material}",
         "dB", Contender(psnr["lambda 0.9, clip, schedule"]), Contender(psnr[best]), Contender(),
         {"errors": "tradeoff_shading"},
@@ -286,103 +267,78 @@ def shading() -> Row:
         cells={"render": "no plugin", "step": "no plugin", "memory": "equal", "disk": "equal"},
     )  # fmt: skip
 
-
-def material() -> Row:
-    """Return the row of a material in one plugin, beside bitmaps without a filter."""
-    names = ("ours", "normalmap + principled + bitmaps", "paper")
     shares = [
-        scene["equal_error"]["neural_material, trained, trilinear"]["principled + bitmaps, multijittered"]["share"]
-        for scene in measured("tradeoff_shading_renders")["scenes"].values()
+        scene.equal_error["neural_material, trained, trilinear"]["principled + bitmaps, multijittered"].share
+        for scene in measured("tradeoff_shading_renders").scenes.values()
     ]
-    return Row(
-        "`neural_material`", "shading", "`normalmap`, `principled`, 4 bitmaps", "maps of rust", "",
-        *(benched(None, "shading", name) for name in names), {"all": "bench_backward"},
+    yield beside(
+        "`neural_material`", "shading", "`normalmap`, `principled`, 4 bitmaps", "maps of rust", "", "shading",
+        dict.fromkeys(("ours", "normalmap + principled + bitmaps", "paper")), {"all": "bench_backward"},
         f"At equal error of whole renders, ours with its default filter takes {min(shares):.2f} to {max(shares):.2f} "
         f"of the time of multijittered bitmaps (`tradeoff_shading_renders.json`). {TRAINED}",
         cells={"error": "not compared"},
     )  # fmt: skip
 
-
-def scene() -> Row:
-    """Return the row of textures trained inside a scene; its arrays are those of the row before."""
-    study = measured("tradeoff_scene_training_floor")["jobs"]
-    psnr = {r["details"]["way"]: r["details"]["psnr_db"] for r in study.values()}
-    balls = measured("tradeoff_scene_training_balls")["jobs"].values()
-    other = {r["details"]["way"]: r["details"]["psnr_db"] for r in balls}
-    return Row(
+    floor, balls = (
+        {r.details.way: r.details.psnr_db for r in measured(f"tradeoff_scene_training_{scene}").jobs.values()}
+        for scene in ("floor", "balls")
+    )
+    yield Row(
         "`fit scene`", "shading", "`fit shading`, as long", "PSNR of held-out views, floor", "dB",
-        Contender(psnr["scene"]), Contender(psnr["hemisphere"]), Contender(),
+        Contender(floor["scene"]), Contender(floor["hemisphere"]), Contender(),
         {"errors": "tradeoff_scene_training_floor", "balls": "tradeoff_scene_training_balls"},
-        f"On the scene of balls, training inside the scene alone has {other['scene']:.1f} dB, over the hemisphere "
-        f"{other['hemisphere']:.1f} dB, one after the other {other['hemisphere, then scene']:.1f} dB. "
+        f"On the scene of balls, training inside the scene alone has {balls['scene']:.1f} dB, over the hemisphere "
+        f"{balls['hemisphere']:.1f} dB, one after the other {balls['hemisphere, then scene']:.1f} dB. "
         "The paper's recipe is not measured: it does not train inside scenes.",
         cells=dict.fromkeys(("render", "step", "memory", "disk"), "equal"),
-        behind=(f"error {other['scene'] - other['hemisphere']:+.1f} dB on the scene of balls",),
+        behind=(f"error {balls['scene'] - balls['hemisphere']:+.1f} dB on the scene of balls",),
     )  # fmt: skip
 
 
-def sdf() -> Row:
-    """Return the row of distance fields."""
-    study = measured("tradeoff_sdf_suzanne")["candidates"]
-    ours, paper = (study[f"{name} 1 MiB"]["errors"]["normal_deg"] for name in ("ours", "paper"))
-    return Row(
-        "`neural_sdf`", "sdf", "mesh, Embree", "mean angle of normals", "°",
-        benched(ours, "sdf", "ours"),
-        benched(EXACT, "sdf", "mesh", memory=study["mesh (Embree)"]["bytes"]), benched(paper, "sdf", "paper"),
+def rows_of_fields() -> Iterator[Row]:
+    """Yield the rows of distance fields, and of radiance fields 75 times smaller than a dense grid."""
+    study, base = measured("tradeoff_sdf_suzanne").candidates, "sdfgrid"
+    ours, paper = (study[f"{name} 1 MiB"].errors.normal_deg for name in ("ours", "paper"))
+    yield Row(
+        "`neural_sdf`", "sdf", "mesh, Embree", "mean angle of normals", "°", benched(ours, "sdf", "ours"),
+        benched(EXACT, "sdf", "mesh", memory=study["mesh (Embree)"].bytes), benched(paper, "sdf", "paper"),
         {"errors, bytes of the mesh": "tradeoff_sdf_suzanne", "all others": "bench_backward"}, better=False,
     )  # fmt: skip
-
-
-def sdf_grid() -> Row:
-    """Return the row of distance fields beside Mitsuba's grid of distances, which can be optimised, too."""
-    study, base = measured("tradeoff_sdf_suzanne")["candidates"], "sdfgrid"
-    error = measured("bench_backward")["errors"][base]
-    ours, paper = (study[f"{name} 1 MiB"]["errors"]["normal_deg"] for name in ("ours", "paper"))
-    return Row(
-        "`neural_sdf`", "sdf", "`sdfgrid`, 128 cells along the longest side", "mean angle of normals", "°",
-        benched(ours, "sdf", "ours", base), benched(error, "sdf", base, base), benched(paper, "sdf", "paper", base),
+    yield beside(
+        "`neural_sdf`", "sdf", "`sdfgrid`, 128 cells along the longest side", "mean angle of normals", "°", "sdf",
+        {"ours": ours, base: measured("bench_backward").errors[base], "paper": paper},
         {"errors": "tradeoff_sdf_suzanne", "all others": "bench_backward"},
         "The grid has the exact distances of the mesh, and no file on disk. "
-        "Its bytes are those of its values; Mitsuba holds a box of each cell besides.",
-        better=False,
+        "Its bytes are those of its values; Mitsuba holds a box of each cell besides.", base, better=False,
     )  # fmt: skip
 
-
-def radiance() -> Row:
-    """Return the row of radiance fields, 75 times smaller than a dense grid."""
-    study = measured("tradeoff_field")
-    base, passes = "codebook 75×", study["cases"]["reads"]["passes"]["render"]
+    study, base = measured("tradeoff_field"), "codebook 75×"
+    passes = study.cases.reads.passes.render
 
     def contender(name: str) -> Contender:
-        c = study["candidates"][name]
-        render = passes[name]["time"] / passes[base]["time"] if name in passes else None
-        sizes = (c["details"].get(key) for key in ("memory_bytes", "file_bytes"))
-        return Contender(c["errors"]["psnr_foreground_db"], render, None, *sizes)
+        c = study.candidates[name]
+        render = passes[name].time / passes[base].time if name in passes else None
+        sizes = (c.details.get(key) for key in ("memory_bytes", "file_bytes"))
+        return Contender(c.errors.psnr_foreground_db, render, None, *sizes)
 
-    named = ("ours 75×", base, "paper 75×")
-    left_out = (*named, "hash grid + network 75×")  # its colours were not trained in this run
+    compared_ones = ("ours 75×", base, "paper 75×")
+    left_out = (*compared_ones, "hash grid + network 75×")  # its colours were not trained in this run
     steps = [times("field", name)["step"] for name in ("ours", "paper")]
-    return Row(
-        "`neural_field`", "field", "codebook (VQRF)", "PSNR of the foreground", "dB",
-        *map(contender, named), {"all": "tradeoff_field"},
+    yield Row(
+        "`neural_field`", "field", "codebook (VQRF)", "PSNR of the foreground", "dB", *map(contender, compared_ones),
+        {"all": "tradeoff_field"},
         "The codebook is the best contender of the study in equal bytes of memory. It is no plugin that could take a "
         f"step; a step of ours takes {steps[0]:.2f} (the paper's recipe: {steps[1]:.2f}) of that of a grid in "
         "single precision (`bench_backward.json`). Mitsuba's `volprim_rf_basic` is not measured: it needs 3D "
         "Gaussians of the capture.",
-        others={name: contender(name) for name in study["candidates"] if name not in left_out}, cells={"step": "none"},
+        others={name: contender(name) for name in study.candidates if name not in left_out}, cells={"step": "none"},
     )  # fmt: skip
-
-
-#: Functions that make the rows, in the order of the table.
-ROWS = (
-    ggx, disney, exact_disney, bsdf, bsdf_source, image, large_material, texture, mip_maps, shading, material, scene,
-    sdf, sdf_grid, radiance,
-)  # fmt: skip
 
 
 def rows() -> list[Row]:
     """Return all rows."""
-    return [make() for make in ROWS]
+    makers = (rows_of_bsdfs, rows_of_images, rows_of_textures, rows_of_shading, rows_of_fields)
+    return [row for make in makers for row in make()]
 
 
 def three(row: Row, text, key: str) -> str:

@@ -28,9 +28,9 @@ from mi_diffind.core.errors import UsageError
 from mi_diffind.core.files import write_json
 from mi_diffind.core.progress import progress_bar
 from mi_diffind.images import films
+from mi_diffind.measure import renders
+from mi_diffind.measure.renders import TextureZoom
 from mi_diffind.scenes import loading, poses, rendering
-from mi_diffind.studies.texture import test_scenes
-from mi_diffind.studies.texture.zoom import TextureZoom
 
 DOCS = Path(__file__).resolve().parent
 SCENES = DOCS.parent / "scenes"
@@ -173,12 +173,12 @@ def zoom(frames: int) -> Film:
         f"truth, {TRUTH} samples a pixel": {"type": "bitmap", "filename": albedo},
     }  # fmt: skip
     side = mi.Bitmap(albedo).size()[0]
-    view = TextureZoom(test_scenes.zoom_scene(), size, (side, side), frames)
+    view = TextureZoom(renders.zoom_scene(), size, (side, side), frames)
     panels = {}
     for label, texture in textures.items():
         truth = label.startswith("truth")
-        reader = test_scenes.TextureReader(
-            lambda repeats, texture=texture: {**texture, "to_uv": test_scenes.to_uv(repeats)},
+        reader = renders.TextureReader(
+            lambda repeats, texture=texture: {**texture, "to_uv": renders.to_uv(repeats)},
             spp=TRUTH if truth else 1,
             sampler="multijitter" if truth else "independent",
             prepare=loading.attach,

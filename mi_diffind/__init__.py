@@ -20,7 +20,7 @@ _NAMES = {
     "open": "fitting.task:open_model",
     "save": "scenes.conversion",
     "from_arrays": "maps.source",
-    "example_maps": "studies.shading.materials",
+    "example_maps": "studies.example_maps",
     # Scenes
     "load_file": "scenes.loading",
     "load_dict": "scenes.loading",
@@ -36,7 +36,7 @@ _NAMES = {
     "fetch": "scenes.examples",
     "view": "scenes.viewer",
     # Measurements
-    "tradeoff": "studies.tradeoffs",
+    "tradeoff": "studies",
     # Errors between images, and images as displayed
     "metrics": "images.metrics:",
     "srgb": "images.srgb:",

@@ -346,19 +346,19 @@ def test_scenes_in_memory_that_hold_existing_objects_are_known_once(mi_rgb):
 
 def test_keywords_of_a_study(monkeypatch, tmp_path, mi_rgb):
     """They become the arguments of the command, checked by its parser; the result shows its picture."""
+    from mi_diffind import studies
     from mi_diffind.measure.study import Tradeoff
-    from mi_diffind.studies import tradeoffs
 
     asked = []
 
-    class Recorded(tradeoffs.studies()["image"].__class__):
+    class Recorded(studies.studies()["image"].__class__):
         def run(self, arguments):
             asked.append(arguments)
             picture = Path(arguments.out) / "tradeoff_image.png"
             picture.write_bytes(b"\x89PNG")
             return Tradeoff({"quick": arguments.quick}, ["a line"], {"png": str(picture), "csv": "a.csv"})
 
-    monkeypatch.setattr(tradeoffs, "studies", lambda: {"image": Recorded()})
+    monkeypatch.setattr(studies, "studies", lambda: {"image": Recorded()})
     source = tmp_path / "a.png"
     Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(source)
     out = tmp_path / "out"

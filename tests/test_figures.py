@@ -8,9 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-import claims
-import derived
-import list_numbers
+import figures
 import make_tables
 import pytest
 
@@ -20,7 +18,7 @@ DOCS = ROOT / "docs"
 #: Numbers of a page that no file backs: more are refused, and whoever lowers a count lowers it here. Other pages: none.
 UNBACKED = {}
 #: Numbers of trials without a kept script, by the same rule.
-TRIALS = {"04_sdf_from_images.ipynb": 16, "bsdf.md": 69, "field.md": 18, "shading.md": 16, "texture.md": 10}
+TRIALS = {"04_sdf_from_images.ipynb": 16, "bsdf.md": 61, "field.md": 18, "shading.md": 16, "texture.md": 10}
 #: Tables of more than ten rows in a page: each task or plugin has a row, or shorter ones would hide what ours loses.
 LONG = {"cost", "cost_losses", "cost_sources", "trust", "shading_best"}
 
@@ -56,7 +54,7 @@ def spoiled(text: str, place: int) -> str:
 def test_one_digit_that_is_changed_by_hand_is_refused(copy):
     assert check(copy).returncode == 0
     readme, page = copy / "README.md", copy / "docs" / "sdf.md"
-    claim = next(c for c in claims.claims() if c.page == "README.md")
+    claim = next(c for c in figures.claims() if c.page == "README.md")
     whole = readme.read_text(encoding="utf-8")
     readme.write_text(spoiled(whole, claim.matches(whole)[0].start(1)), encoding="utf-8")
     result = check(copy)
@@ -72,7 +70,7 @@ def test_one_digit_that_is_changed_by_hand_is_refused(copy):
 
 def test_each_figure_of_a_claim_is_checked():
     """A digit of any figure makes a page that differs from the one written."""
-    for claim in claims.claims():
+    for claim in figures.claims():
         text = claim.path.read_text(encoding="utf-8")
         for match in claim.matches(text):
             for group in range(1, len(match.groups()) + 1):
@@ -88,8 +86,8 @@ def test_a_sentence_that_is_gone_is_named(copy):
 
 
 def test_a_claim_in_words_that_does_not_hold_is_refused():
-    claim = claims.Claim("README.md", "a grid of {n:.0f} dB", {"n": "nerf_scenes.rows[0].psnr_white_db"}, "1 > 2")
-    with pytest.raises(claims.ClaimError, match="does not hold: 1 > 2"):
+    claim = figures.Claim("README.md", "a grid of {n:.0f} dB", {"n": "nerf_scenes.rows[0].psnr_white_db"}, "1 > 2")
+    with pytest.raises(figures.ClaimError, match="does not hold: 1 > 2"):
         claim.written("a grid of 5 dB")
 
 
@@ -97,29 +95,33 @@ def test_a_claim_in_words_that_does_not_hold_is_refused():
     ("expression", "message"),
     [
         ("nothing_of_this_name.x", r"docs/measured/nothing_of_this_name\.json: no such file"),
-        ("nerf_scenes.row", "nerf_scenes\\['row'\\]; allowed: 'rows'"),
-        ("nerf_scenes.rows[99].minutes", "allowed: 0 to 3"),
+        ("nerf_scenes.row", r"nerf_scenes\.row: no entry 'row'; allowed: 'rows'"),
+        ("nerf_scenes.rows[99].minutes", r"nerf_scenes\.rows\[99\]\.minutes: list index out of range"),
         ('one(nerf_scenes.rows, scene="chair")', "0 rows have"),
         ("nerf_scenes.rows[0].minutes / 0", "claims.toml: nerf_scenes.rows.*division by zero"),
     ],
 )
 def test_expressions_name_what_is_missing(expression, message):
-    with pytest.raises(claims.ClaimError, match=message):
-        claims.evaluate(expression)
+    with pytest.raises(figures.ClaimError, match=message):
+        figures.evaluate(expression)
+
+
+def study_of(content):
+    return json.loads(json.dumps(content), object_hook=figures.Entries)
 
 
 def test_samples_at_equal_error():
     """Halfway between two counts in dB is their geometric mean; at a count, it is that count."""
     errors = {"bitmap, 1 spp": 10, "bitmap, 4 spp": 16, "bitmap, 16 spp": 22, "bitmap, 4 spp, multijittered": 20}
     errors |= {"ours": 19, "as four": 16}
-    study = claims.Node({"candidates": {n: {"errors": {"psnr_plane_db": e}} for n, e in errors.items()}}, "study")
-    assert derived.equal_samples(study, "plane", "ours") == pytest.approx(8)
-    assert derived.equal_samples(study, "plane", "as four") == pytest.approx(4)
-    assert derived.equal_samples(study, "plane", "as four", "multijittered") == pytest.approx(4**0.6)
+    study = study_of({"candidates": {n: {"errors": {"psnr_plane_db": e}} for n, e in errors.items()}})
+    assert figures.equal_samples(study, "plane", "ours") == pytest.approx(8)
+    assert figures.equal_samples(study, "plane", "as four") == pytest.approx(4)
+    assert figures.equal_samples(study, "plane", "as four", "multijittered") == pytest.approx(4**0.6)
     errors["ours"] = 30
-    study = claims.Node({"candidates": {n: {"errors": {"psnr_plane_db": e}} for n, e in errors.items()}}, "study")
+    study = study_of({"candidates": {n: {"errors": {"psnr_plane_db": e}} for n, e in errors.items()}})
     with pytest.raises(ValueError, match="no sample count"):
-        derived.equal_samples(study, "plane", "ours")
+        figures.equal_samples(study, "plane", "ours")
 
 
 def test_ratios_are_medians_in_either_order():
@@ -127,31 +129,32 @@ def test_ratios_are_medians_in_either_order():
         "ratios": {"eval": {"a / b": {"median": 4.0}}},
         "queries": {"eval": {"a": {"time": 9}, "b": {"time": 3}, "c": {"time": 6}}},
     }
-    study = claims.Node({"cases": {"plain": case}}, "study")
-    assert derived.ratio(study, "plain", "eval", "a", "b") == 4
-    assert derived.ratio(study, "plain", "eval", "b", "a") == 0.25
-    assert derived.ratio(study, "plain", "eval", "c", "b") == 2
-    assert derived.time_over(study, "plain", "eval", "a", "b") == 3
+    study = study_of({"cases": {"plain": case}})
+    assert figures.ratio(study, "plain", "eval", "a", "b") == 4
+    assert figures.ratio(study, "plain", "eval", "b", "a") == 0.25
+    assert figures.ratio(study, "plain", "eval", "c", "b") == 2
+    assert figures.time_over(study, "plain", "eval", "a", "b") == 3
 
 
 def test_figures_of_shading_are_those_of_its_table():
     """The function that sentences use, against the rows that the table has."""
-    rows = [line.split(" | ") for line in str(make_tables.shading_best("tradeoff_shading")).splitlines()[2:]]
+    table = make_tables.shading_best(figures.measured("tradeoff_shading"))
+    rows = [line.split(" | ") for line in str(table).splitlines()[2:]]
     for material in ("hammered", "weave", "lacquer"):
         by_label = {r[1]: r for r in rows if r[0].strip("| ") == material}
         (trained,) = [r for label, r in by_label.items() if label.startswith("trained")]
         (best,) = [r for label, r in by_label.items() if label.endswith("equal bytes")]
-        study = claims.measured("tradeoff_shading")
-        assert f"{derived.shading(study, material, 'trained'):.2f}" == trained[2].split()[0]
-        assert f"{derived.shading(study, material, 'equal bytes'):.2f}" == best[2].split()[0]
-        assert f"{derived.shading_level(study, material, 'trained', 3):.1f}" == trained[7]
-        assert f"{derived.flip(study, material, 'trained'):.3f}" == trained[3]
-        assert f"{derived.shading(study, material, 'trained', 'P'):.2f}" == trained[-1].strip(" |")
+        study = figures.measured("tradeoff_shading")
+        assert f"{figures.shading(study, material, 'trained'):.2f}" == trained[2].split()[0]
+        assert f"{figures.shading(study, material, 'equal bytes'):.2f}" == best[2].split()[0]
+        assert f"{figures.shading_level(study, material, 'trained', 3):.1f}" == trained[7]
+        assert f"{figures.flip(study, material, 'trained'):.3f}" == trained[3]
+        assert f"{figures.shading(study, material, 'trained', 'P'):.2f}" == trained[-1].strip(" |")
 
 
 def test_each_file_has_its_command():
     files = {path.stem: path for path in (DOCS / "measured").glob("*.json")}
-    commands = claims.commands()
+    commands = figures.commands()
     assert set(commands) == set(files)
     for name, command in commands.items():
         assert command.split()[0] in ("mi-diffind", "python") and "docs/measured" in command
@@ -165,27 +168,27 @@ def test_numbers_are_classed():
         "# A page\n\nAt 12x it has 34.5 dB after 1500 steps (Mitsuba 3.9, 2023, section 1.2, `x = 7`).\n"
         "<!-- table t -->\n| 8 |\n<!-- end -->\n<!-- trials: a script that is not kept -->\n9 dB\n<!-- /trials -->\n"
     )
-    found = {n.number: n.kind for n in list_numbers.numbers("page.md", text)}
+    found = {n.number: n.kind for n in figures.numbers("page.md", text)}
     assert found == {
         "12": "setting", "34.5": "unbacked", "1500": "setting", "8": "backed", "9": "trial",
     }  # fmt: skip
 
 
 def test_each_phrase_of_the_settings_stands_in_its_page():
-    pages = list_numbers.pages()
-    for page, phrases in list_numbers.settings().items():
+    pages = figures.pages()
+    for page, phrases in figures.toml("settings.toml").items():
         for phrase in phrases:
-            assert re.search(list_numbers.phrase_pattern(phrase), pages[page]), f"{page}: {phrase}"
+            assert re.search(figures.phrase_pattern(phrase), pages[page]), f"{page}: {phrase}"
 
 
 def test_numbers_without_a_file_only_become_fewer():
-    counts = {page: count["unbacked"] for page, count in list_numbers.counts().items()}
+    counts = {page: count["unbacked"] for page, count in figures.counts().items()}
     more = {page: n for page, n in counts.items() if n > UNBACKED.get(page, 0)}
-    assert more == {}, "python docs/list_numbers.py lists them"
+    assert more == {}, "python docs/figures.py lists them"
 
 
 def test_numbers_of_trials_only_become_fewer():
-    counts = {page: count["trial"] for page, count in list_numbers.counts().items() if count["trial"]}
+    counts = {page: count["trial"] for page, count in figures.counts().items() if count["trial"]}
     assert counts == TRIALS, "more are refused; fewer: lower the count here"
 
 
@@ -215,5 +218,5 @@ def test_a_changed_or_superfluous_csv_is_refused(copy):
 
 
 def test_headlines_of_the_readme_are_backed():
-    numbers = list_numbers.numbers("README.md", (ROOT / "README.md").read_text(encoding="utf-8"))
+    numbers = figures.numbers("README.md", (ROOT / "README.md").read_text(encoding="utf-8"))
     assert [n for n in numbers if n.headline and n.kind == "unbacked"] == []

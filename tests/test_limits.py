@@ -10,7 +10,9 @@ from pathlib import Path
 import damage
 import numpy as np
 import pytest
+from commands import refused
 
+import mi_diffind
 from mi_diffind import DiffindError, TableError, load_table
 from mi_diffind.core.archives import (
     FACTOR,
@@ -27,6 +29,7 @@ from mi_diffind.core.errors import LONGEST_MESSAGE, UsageError
 from mi_diffind.core.files import PATHS, OutputError
 from mi_diffind.core.units import labelled
 from mi_diffind.fitting.loop import checkpoint_settings
+from mi_diffind.fitting.settings import FitSettings, within_memory
 from mi_diffind.images.headers import picture_size
 from mi_diffind.maps.compressed import map_figure
 from mi_diffind.maps.source import SourceError, from_arrays, load_source
@@ -140,9 +143,10 @@ def test_few_lanes_hold_few_symbols():
 def test_coded_nodes_are_those_of_a_dense_grid(tmp_path, rng):
     """Places, neighbours and packed flags, against masks of the whole grid."""
     shape = (37, 18, 45)
-    from mi_diffind.tasks.radiance.nodes import corners_of, layers
+    from mi_diffind.arrays.sparse_grid import cell_corners
+    from mi_diffind.tasks.radiance.nodes import layers
 
-    stored = corners_of(rng.random(tuple(n - 1 for n in shape)) < 0.02)
+    stored = cell_corners(rng.random(tuple(n - 1 for n in shape)) < 0.02)
     count = int(stored.sum())
     numbers = rng.integers(0, 16, count), rng.integers(0, 300, count)
     places, *again = coding.decode(*coding.encode(stored, *numbers, 16, 300), shape, 16, 300)
@@ -193,6 +197,21 @@ def test_a_picture_of_30000_squared_is_refused_by_its_size(tmp_path):
         read_image(path)
     with pytest.raises(SourceError, match="30,000 x 30,000 pixels would take 2,700,000,000 bytes"):
         load_source(path)
+
+
+def test_a_batch_beyond_memory(tmp_path, capsys, monkeypatch):
+    """Dr.Jit ends the process with a segmentation fault where memory cannot be allocated."""
+    monkeypatch.setattr("mi_diffind.core.units.memory", lambda: 2**34)
+    for task in (["ggx"], ["sdf", "no.ply"]):
+        message = refused(capsys, "fit", *task, "-o", str(tmp_path / "a.npz"), "--batch", str(2**31 - 1))
+        assert "batch: found 2,147,483,647, which takes about 128 GiB of memory, this machine has 16 GiB" in message
+    assert within_memory(FitSettings(batch=2**28)).batch == 2**28
+    for given in ({"batch": 2**31}, {"seed": 2**32}, {"batch": "8"}, {"steps": 1.5}, {"lr": "1"}, {"seed": True}):
+        with pytest.raises(DiffindError, match=next(iter(given))):
+            FitSettings(**given)
+    for seconds in (0, -1, 10**400, float("nan"), float("inf")):
+        with pytest.raises(UsageError, match="seconds: found"):
+            mi_diffind.fit("ggx", seconds=seconds)
 
 
 # -- terminals and paths -----------------------------------------------------------------------------------------------

@@ -25,6 +25,7 @@ PATH = Path(__file__).resolve().parent / "benchmarks" / "bench_ratio.py"
 @pytest.fixture(scope="module")
 def bench():
     """The benchmark as a module."""
+    sys.path.insert(0, str(PATH.parent))
     spec = importlib.util.spec_from_file_location("bench_ratio", PATH)
     module = importlib.util.module_from_spec(spec)
     sys.modules["bench_ratio"] = module  # dataclasses look their module up

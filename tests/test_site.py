@@ -164,7 +164,7 @@ def test_every_plugin_has_a_manual_page_and_a_small_picture(mi_rgb):
 
 def test_the_reference_has_every_public_name():
     text = (DOCS / "reference.rst").read_text("utf-8")
-    documented = set(re.findall(r"^\.\. auto\w+:: mi_diffind\.(\w+)(?:\(\))?$", text, re.M))
+    documented = set(re.findall(r"^\.\. auto\w+:: mi_diffind\.(?:images\.)?(\w+)(?:\(\))?$", text, re.M))
     assert set(mi_diffind.__all__) - {"__version__"} <= documented
 
 

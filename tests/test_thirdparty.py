@@ -73,35 +73,15 @@ def environ(site):
 
 
 @pytest.fixture(scope="module")
-def python(environ):
-    """A function that runs Python code where the package is installed."""
-
-    def run(code, *arguments, cwd):
-        command = [sys.executable, "-c", code, *arguments]
-        return subprocess.run(command, capture_output=True, text=True, timeout=300, env=environ, cwd=cwd)
-
-    return run
-
-
-@pytest.fixture(scope="module")
 def commands(environ, tmp_path_factory):
     """A function that runs commands, one after the other, and returns their codes and what they printed.
 
     The command ``python`` runs code, with arguments.
     """
     errors = tmp_path_factory.mktemp("errors") / "stderr.txt"
-    with (
-        open(errors, "w") as stderr,
-        subprocess.Popen(
-            [sys.executable, "-c", COMMANDS],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=stderr,
-            text=True,
-            env=environ,
-            cwd=errors.parent,
-        ) as process,
-    ):
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "env": environ, "cwd": errors.parent}
+    command = [sys.executable, "-c", COMMANDS]
+    with open(errors, "w") as stderr, subprocess.Popen(command, stderr=stderr, **pipes) as process:
 
         def run(*commands, cwd):
             request = {"folder": str(cwd), "commands": [list(map(str, c)) for c in commands]}
@@ -136,10 +116,10 @@ def test_nothing_of_ours_names_it():
     assert files and not [p for p in files if "mi_profile" in p.read_text(encoding="utf-8")]
 
 
-def test_the_data_are_those_of_the_script(python, tmp_path):
+def test_the_data_are_those_of_the_script(commands, tmp_path):
     """A formula, so that nobody else's measurement is in the repository."""
     code = "from mi_profile import make_downlight as m; import pathlib; m.FILE = pathlib.Path('out.csv'); m.main()"
-    assert python(code, cwd=tmp_path).returncode == 0
+    assert commands(("python", code), cwd=tmp_path)[0] == [0]
     assert (tmp_path / "out.csv").read_text() == DATA.read_text()
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from ..core.arguments import WORKER_ARGUMENTS, add_arguments
-from ..studies import studies, tradeoffs
+from ..studies import run as run_study
+from ..studies import studies
 from .common import alternative, alternatives, require_scene, say, scene_options, set_variant, variant_option, verb
 
 HELP = "measure time against accuracy of the contenders of a task, or of a scene"
@@ -40,6 +41,6 @@ def run(arguments) -> dict:
     if study.of_scene:
         require_scene(arguments.scene)
         arguments.defines = dict(arguments.defines)
-    result = tradeoffs.run(study, arguments, lambda: set_variant(arguments.variant))
+    result = run_study(study, arguments, lambda: set_variant(arguments.variant))
     say(result)
     return result.figures

@@ -26,8 +26,7 @@ from tqdm import tqdm
 from ..core.jobs import run_jobs
 from ..core.progress import interruptible
 from ..core.runtime import use_variant
-from .clock import machine, timed, total
-from .operations import count_query
+from .clock import count_query, machine, timed, total
 from .statistics import pareto, ratio, spread, timing
 from .store import Store, fingerprint, models_folder, sources
 from .study import FLOOR, PASS, PASS_WALL, Case, Plan, in_competition
@@ -142,6 +141,7 @@ def measure(
         **{name: getattr(plan, name) for name in ("accuracy", "accuracy_label", "panels", "bytes_by_case", "details")},
         "notes": list(plan.notes),
         "sampled": plan.sampled,
+        "measures": [asdict(measure) for measure in plan.measures],
         **_assemble(plan, cases, settings, store.data),
     }
     result["conclusions"] = plan.conclusions(result)

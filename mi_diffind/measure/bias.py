@@ -48,12 +48,6 @@ RADIUS = 2
 #: Standard errors above zero from which a bias counts as measured; otherwise they bound it.
 CONFIDENCE = 2.0
 
-#: Relative error of a render by the arithmetic of 32-bit floats.
-ROUNDING = 1e-6
-
-#: Largest practical number of samples per pixel; a bias that only more samples would show does not matter.
-PRACTICAL = 1_000_000
-
 #: Fewest images that have a standard error.
 LEAST = 3
 
@@ -139,15 +133,13 @@ def root(square: float) -> float:
 def describe(relative: Estimate, displayed: Estimate) -> dict:
     """Return the bias as numbers, from estimates with relative weights and with those of displayed values.
 
-    ``measured`` (whether it differs from zero), ``mse`` (may be negative), ``mse_standard_error``; ``rmse``,
-    ``rmse_standard_error`` and ``rounding_only`` (no more than the rounding of 32-bit floats), or the bound
-    ``rmse_below``; ``psnr_db``, or the bound ``psnr_db_above``.
+    ``measured`` (whether it differs from zero), ``mse`` (may be negative), ``mse_standard_error``; ``rmse`` and
+    ``rmse_standard_error``, or the bound ``rmse_below``; ``psnr_db``, or the bound ``psnr_db_above``.
     """
     bias = {"measured": relative.measured, "mse": relative.square, "mse_standard_error": relative.standard_error}
     if relative.measured:
         rmse = math.sqrt(relative.square)
         bias |= {"rmse": rmse, "rmse_standard_error": relative.standard_error / (2 * rmse)}
-        bias["rounding_only"] = rmse < ROUNDING
     else:
         bias["rmse_below"] = math.sqrt(relative.bound)
     if displayed.measured:
@@ -166,22 +158,13 @@ def crossover(bias: Estimate, noise_of_a_sample: float, points: list[dict]) -> d
     """
     if not bias.measured:
         return {"spp_above": noise_of_a_sample / bias.bound if bias.bound else math.inf}
-    spp, low = (noise_of_a_sample / square for square in (bias.square, bias.bound))
-    result = {
-        "spp": spp,
-        "spp_low": low,
-        "spp_high": noise_of_a_sample / (bias.square - CONFIDENCE * bias.standard_error),
-        "extrapolated": spp > points[-1]["spp"],
-    }
+    margin = CONFIDENCE * bias.standard_error
+    spp, low, high = (noise_of_a_sample / (bias.square + shift) for shift in (0, margin, -margin))
+    result = {"spp": spp, "spp_low": low, "spp_high": high, "extrapolated": spp > points[-1]["spp"]}
     for clock in ("seconds", "seconds_wall"):
         seconds = {p["spp"]: p[clock] for p in points if p["version"] == "learned" and p["timed"]}
         result[clock] = seconds_of(spp, seconds)
     return result
-
-
-def practical(at: dict) -> bool:
-    """Return whether a :func:`crossover` is at a practical number of samples (:data:`PRACTICAL`)."""
-    return (at.get("spp", at.get("spp_above")) or math.inf) <= PRACTICAL
 
 
 def seconds_of(spp: float, seconds: dict[int, float]) -> float | None:

@@ -1,6 +1,13 @@
-"""Clock of all studies: seconds of kernels by Dr.Jit's own measurement, and a description of the machine.
+"""Clock of all studies: seconds of kernels by Dr.Jit's own measurement, operations of kernels, the machine.
 
 A time of kernels does not include tracing, code generation and compilation. No derivatives are computed.
+
+The accounting of operations is that of the paper's supplement (1.2.1): an addition or multiplication is 1 flop, a
+division 2, a square root or logarithm 4; a fused multiply-add is an addition and a multiplication. Minima, comparisons,
+selections, conversions and integer arithmetic are no flops, but part of ``instructions``. Counts are for one lane and
+one pass through the kernel: the body of a loop counts once; of a call with several possible functions, all count.
+Inputs, outputs and constants are not counted. The counts are read from LLVM's representation of a kernel, where
+logarithms and exponentials are polynomials; those of CUDA's kernels are 0.
 """
 
 from __future__ import annotations
@@ -9,8 +16,8 @@ import contextlib
 import platform
 import re
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, fields
 from importlib import metadata
 from pathlib import Path
 
@@ -100,3 +107,153 @@ def _target() -> str | None:
         code = "".join(map(compat.kernel_code, dr.kernel_history([dr.KernelType.JIT])))
     target = compat.llvm_target(code)
     return f"{target[0]}, {target[1]} lanes a vector" if target else None
+
+
+#: Flops of an operation in the paper's accounting.
+FLOPS = {"add": 1, "mul": 1, "div": 2, "sqrt": 4, "log": 4}
+
+
+@dataclass(frozen=True)
+class Operations:
+    """Operations of one lane.
+
+    Floating-point ``add`` (and subtract), ``mul``, ``div`` (and reciprocal), ``sqrt`` (and its reciprocal), ``log``
+    (and other transcendental functions that are one instruction); ``gathers``, reads of memory at a computed place (one
+    that fetches several neighbours counts once), and ``bytes_gathered`` by them; ``instructions``, all that compute:
+    the above with fused multiply-adds once, comparisons, selections, conversions, integer arithmetic, gathers.
+    """
+
+    add: int = 0
+    mul: int = 0
+    div: int = 0
+    sqrt: int = 0
+    log: int = 0
+    gathers: int = 0
+    bytes_gathered: int = 0
+    instructions: int = 0
+
+    @property
+    def flops(self) -> int:
+        """Flops in the paper's accounting, :data:`FLOPS`."""
+        return sum(weight * getattr(self, name) for name, weight in FLOPS.items())
+
+    def __add__(self, other: Operations) -> Operations:
+        return Operations(**{f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(self)})
+
+    def asdict(self) -> dict[str, int]:
+        """Return all counts by name, ``flops`` included."""
+        return {**asdict(self), "flops": self.flops}
+
+
+def count(function: Callable[[], object]) -> Operations:
+    """Count the operations of evaluating the result of ``function()``, a tree of LLVM or CUDA arrays of Dr.Jit.
+
+    Kernels that the function launches itself are counted, too. Inputs should be evaluated and opaque
+    (``dr.make_opaque``): pending computations become part of the count, and literals are folded into the kernel. Clears
+    the kernel history.
+    """
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.sync_thread()
+        dr.kernel_history_clear()
+        dr.eval(function())
+        history = dr.kernel_history([dr.KernelType.JIT])
+    return sum((count_ir(compat.kernel_code(entry)) for entry in history), Operations())
+
+
+def count_query(function: Query) -> Operations:
+    """Count the operations of a query, without the additions of :func:`.clock.total`."""
+    with dr.suspend_grad():
+        added = 0
+
+        def summed():
+            nonlocal added
+            result, added = total(function())
+            return result
+
+        operations = count(summed)
+    return operations + Operations(add=-added, instructions=-added)
+
+
+def count_ir(text: str) -> Operations:
+    """Count the operations of one kernel in LLVM's intermediate representation."""
+    counts = dict.fromkeys((f.name for f in fields(Operations)), 0)
+    for names, size in _llvm(text):
+        counts["instructions"] += 1
+        counts["bytes_gathered"] += size
+        for name in names:
+            counts[name] += 1
+    return Operations(**counts)
+
+
+_LLVM_OPS = {"fadd": ("add",), "fsub": ("add",), "fmul": ("mul",), "fdiv": ("div",)}
+_LLVM_CALLS = {"fma": ("add", "mul"), "fmuladd": ("add", "mul"), "sqrt": ("sqrt",)}
+_LLVM_CALLS |= dict.fromkeys(("exp", "exp2", "log", "log2", "pow", "sin", "cos", "tanh"), ("log",))
+
+#: Instructions that are neither arithmetic nor a gather: constants, addresses, input and output, flow of control.
+_LLVM_IGNORED = {
+    *("insertelement", "insertvalue", "extractelement", "extractvalue", "shufflevector", "bitcast"),
+    *("getelementptr", "inttoptr", "ptrtoint", "alloca", "load", "phi"),
+}
+
+#: Instructions of the lane's number, of the mask of existing lanes, and of addresses of packets, which do not count.
+_LLVM_LANES = re.compile(r"add <\d+ x i32> %r\d+_2, <|icmp ult <\d+ x i32> %r\d+, %p\d+_2$|select .* x ptr>")
+
+_BYTES = {"float": 4, "half": 2, "double": 8}
+
+
+def _llvm(text: str) -> Iterator[tuple[tuple[str, ...], int]]:
+    """Yield for each instruction the counts that it adds one to, and the bytes that it gathers."""
+    counted = False
+    for line in text.splitlines():
+        if line.startswith("define"):
+            # Kernels and the functions that they call; helpers of Dr.Jit (packet gathers) count at their call
+            counted = re.match(r"define .*?@(drjit_|func_)", line) is not None
+        instruction = re.match(r"\s+%\S+ = (?:tail )?(\w+)( .*)", line)
+        # Vectors hold one value a lane; scalars (addresses, the loop over lanes) serve all lanes
+        if not counted or instruction is None or "<" not in line:
+            continue
+        name, rest = instruction.groups()
+        if name in _LLVM_IGNORED or _LLVM_LANES.match(name + rest):
+            continue
+        if name != "call":
+            yield _LLVM_OPS.get(name, ()), 0
+            continue
+        called = re.search(r"@([\w.]+)\(", rest)
+        if called is None:  # a virtual function: it is counted itself
+            continue
+        called = called[1]
+        if packet := re.fullmatch(r"gather_(\d+)x[a-z](\d+)", called):
+            yield ("gathers",), int(packet[1]) * int(packet[2]) // 8
+        elif called.startswith("llvm.masked.gather"):
+            type_name = re.search(r"x (\w+)>", rest)[1]
+            yield ("gathers",), _BYTES.get(type_name) or max(int(type_name[1:]) // 8, 1)
+        elif "rsqrt" in called:
+            yield ("sqrt",), 0
+        elif "rcp" in called:
+            yield ("div",), 0
+        else:
+            yield _LLVM_CALLS.get(called.split(".")[1] if called.startswith("llvm.") else "", ()), 0
+
+
+def bsdf_operations(bsdf, methods: tuple[str, ...] = ("eval", "pdf", "sample")) -> dict[str, Operations]:
+    """Count the operations of methods of a Mitsuba BSDF (``mi.BSDF``), one call each, with all lobes.
+
+    Directions, position, frame and random numbers are inputs; texture lookups are part of the count. Compiles a kernel
+    for each of ``methods``, unless Dr.Jit has it in its cache. Raises ``ValueError`` for other methods.
+    """
+    import mitsuba as mi  # the rest of this module does not need it
+
+    inputs = {"eval": lambda: (wo,), "pdf": lambda: (wo,), "sample": lambda: (sample1, sample2)}
+    for method in methods:
+        if method not in inputs:
+            raise ValueError(f'found the method "{method}", allowed are {", ".join(inputs)}')
+    lanes = 64  # more than any vector has; a single lane would be a constant
+    si = dr.zeros(mi.SurfaceInteraction3f, lanes)
+    si.sh_frame = mi.Frame3f(dr.zeros(mi.Vector3f, lanes))
+    wo, sample1, sample2 = (dr.zeros(t, lanes) for t in (mi.Vector3f, mi.Float, mi.Point2f))
+    # Not the shape: an opaque one would become a call of all shapes
+    inputs_of_si = (si.t, si.time, si.wavelengths, si.p, si.n, si.uv, si.sh_frame, si.dp_du, si.dp_dv, si.wi)
+    dr.make_opaque(inputs_of_si, wo, sample1, sample2)
+    context = mi.BSDFContext()
+    with dr.suspend_grad():
+        return {m: count(lambda m=m: getattr(bsdf, m)(context, si, *inputs[m]())) for m in methods}

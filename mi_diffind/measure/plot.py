@@ -1,6 +1,6 @@
-"""Printable plots of measurements: panels of accuracy against time or bytes, with labels, Pareto front and caption.
+"""Printable plots of measurements: panels of accuracy against time or bytes, curves, and grids of pictures.
 
-Also training curves, and the parts of other plots: figures with a caption, logarithmic ticks, placement of labels.
+All figures have a title, a constrained layout and a caption.
 """
 
 from __future__ import annotations
@@ -8,13 +8,14 @@ from __future__ import annotations
 import math
 import os
 import textwrap
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from ..core.files import replacing
+from ..images import srgb
 
 #: Colour and marker of each representation, in order of appearance; markers differ for prints without colour.
 STYLES = (
@@ -23,13 +24,13 @@ STYLES = (
 )  # fmt: skip
 
 #: Distances from an anchor to the nearest edge of its label that are tried, in points (1/72 inch).
-RADII = (6, 9, 12, 18, 26, 36, 48, 62, 80)
+LABEL_DISTANCES = (6, 9, 12, 18, 26, 36, 48, 62, 80)
 
 #: Distance in points from which on a thin line leads from an anchor to its label.
-_LEADER = 12
+LEADER_DISTANCE = 12
 
-#: Places of a label around its anchor, in sixteenths of a turn from the best angle.
-_TURNS = (0, -1, 1, -2, 2, -3, 3, -4, 4, -5, 5, -6, 6, -7, 7, -8)
+#: Places of a label around its anchor that are tried at each distance.
+LABEL_DIRECTIONS = 16
 
 
 @dataclass(frozen=True)
@@ -66,20 +67,33 @@ class Panel:
 
 @dataclass(frozen=True)
 class Label:
-    """Text near ``at`` (data coordinates), best at an ``angle`` from the right; ``radii`` are in points."""
+    """Text near the point ``at``, in data coordinates."""
 
     text: str
     at: tuple[float, float]
     colour: str
     weight: str = "normal"
-    radii: Sequence[float] = RADII
-    angle: float = 0.0
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Curve of a plot: values ``y`` at ``x``, with ends of error bars or ``None``.
+
+    ``style``: keywords of Matplotlib's ``errorbar``.
+    """
+
+    label: str
+    x: Sequence[float]
+    y: Sequence[float]
+    low: Sequence[float] | None = None
+    high: Sequence[float] | None = None
+    style: Mapping = field(default_factory=dict)
 
 
 def figure(title: str, caption: str, width: float, height: float, above: float = 0.3, dpi: int = 200):
     """Return a Matplotlib figure with ``width`` × ``height`` inches for axes, a title above and a caption below.
 
-    The title takes ``above`` inches. The layout is constrained until :func:`fix_layout`.
+    The title takes ``above`` inches. The layout is constrained.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -95,36 +109,31 @@ def figure(title: str, caption: str, width: float, height: float, above: float =
     return framed
 
 
-def fix_layout(figure) -> None:
-    """Fix the layout, before labels are placed in it."""
-    figure.draw_without_rendering()
-    figure.set_layout_engine("none")
-
-
 def save(figure, path: str | os.PathLike) -> None:
     """Write a figure to ``path`` (``.png``). Raises :class:`.OutputError`."""
     with replacing(path) as temporary:
         figure.savefig(temporary, format=Path(path).suffix[1:])
 
 
-def log_ticks(axis, low: float, high: float, shown: Callable[[float], str]) -> None:
+def log_ticks(axis, low: float, high: float, shown: Callable[[float], str] | None = None) -> None:
     """Set ticks of a logarithmic axis from ``low`` to ``high``, written by ``shown``, finer for shorter ranges."""
     decades = math.log10(high / low)
     fine: Sequence[float] = (1, *np.arange(1.2, 9.8, 0.4))
     for limit, ticks in ((0.6, (1, 1.5, 2, 3, 4, 5, 7)), (1.1, (1, 2, 5)), (2.5, (1, 3)), (4, (1,))):
         fine = ticks if decades > limit else fine
     axis.set_ticks([m * 10.0**e for e in range(-12, 12) for m in fine if low <= m * 10.0**e <= high])
+    shown = shown or (lambda value: f"{value:,.0f}" if value >= 1000 else f"{value:g}")
     axis.set_major_formatter(lambda value, _: shown(value))
     axis.minorticks_off()
 
 
-def image_panel(axes, image: np.ndarray, title: str = "", label: str = "") -> None:
-    """Draw an image of displayed values in [0, 1], without ticks, with a title above and a label on the left."""
-    axes.imshow(image.clip(0, 1), vmin=0, vmax=1, interpolation="nearest")
-    axes.set_title(title, fontsize=8)
-    axes.set_ylabel(label, fontsize=7.5)
-    axes.set_xticks([])
-    axes.set_yticks([])
+def finish(axes, x_label: str, y_label: str) -> None:
+    """Label both axes and add a light grid."""
+    axes.set_xlabel(x_label, fontsize=8)
+    axes.set_ylabel(y_label, fontsize=8)
+    axes.tick_params(labelsize=7)
+    axes.grid(which="major", color="0.92", linewidth=0.5)
+    axes.set_axisbelow(True)
 
 
 def crop_to(mask: np.ndarray) -> tuple[slice, slice]:
@@ -133,9 +142,7 @@ def crop_to(mask: np.ndarray) -> tuple[slice, slice]:
     return (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)) if len(rows) else (slice(None),) * 2
 
 
-def plain(value: float) -> str:
-    """Return the text of a number at a tick."""
-    return f"{value:,.0f}" if value >= 1000 else f"{value:g}"
+# -- Accuracy against time or bytes ------------------------------------------------------------------------------------
 
 
 def draw_panels(title: str, panels: Sequence[Panel], y_label: str, caption: str):
@@ -156,23 +163,22 @@ def draw_panels(title: str, panels: Sequence[Panel], y_label: str, caption: str)
             Line2D([], [], color=colour, marker=marker, linestyle="none", markersize=6.5, label=name)
             for name, (colour, marker) in styles.items()
         ]
-        legend = plot.legend(handles=shown, loc="upper center", fontsize=8.5, frameon=False, ncols=len(shown),
-                              bbox_to_anchor=(0.5, 1 - 0.24 / plot.get_figheight()))  # fmt: skip
-        legend.set_in_layout(False)
+        place = {"loc": "upper center", "bbox_to_anchor": (0.5, 1 - 0.24 / plot.get_figheight())}
+        plot.legend(handles=shown, fontsize=8.5, frameon=False, ncols=len(shown), **place).set_in_layout(False)
     accuracies = [x.accuracy for p in panels for x in p.points]
     for k, panel in enumerate(panels):
         axes = plot.add_subplot(rows, columns, k + 1)
-        _draw(axes, panel, styles, accuracies)
+        _draw_panel(axes, panel, styles, accuracies)
         axes.set_title(panel.title, fontsize=10)
-        axes.set_xlabel(panel.x_label, fontsize=9)
-        axes.set_ylabel(y_label, fontsize=9)
-    fix_layout(plot)
+        finish(axes, panel.x_label, y_label)
+    plot.draw_without_rendering()
+    plot.set_layout_engine("none")  # labels are placed in the final layout
     for axes, panel in zip(plot.axes, panels, strict=True):
-        _label(axes, panel, styles)
+        _label_panel(axes, panel, styles)
     return plot
 
 
-def _draw(axes, panel: Panel, styles: dict, accuracies: list) -> None:
+def _draw_panel(axes, panel: Panel, styles: dict, accuracies: list) -> None:
     """Draw a panel without its labels."""
     axes.set_xscale("log")
     times = [x.time for x in (*panel.points, *panel.lines)] or [1.0]
@@ -182,118 +188,73 @@ def _draw(axes, panel: Panel, styles: dict, accuracies: list) -> None:
     bottom, top = (min(accuracies), max(accuracies)) if accuracies else (0, 100)
     margin = max(0.08 * (top - bottom), 2)
     axes.set_ylim(bottom - 1.2 * margin, top + 2.2 * margin)
-    log_ticks(axes.xaxis, low, high, plain)
-    axes.tick_params(labelsize=8)
-    axes.grid(which="major", color="0.9", linewidth=0.6)
-    axes.set_axisbelow(True)
+    log_ticks(axes.xaxis, low, high)
     front = sorted((p for p in panel.points if p.on_front), key=lambda p: p.time)
     if front:
-        xs, ys = [front[0].time], [axes.get_ylim()[0]]
-        for p, following in zip(front, [*front[1:], None], strict=False):
-            xs += [p.time, axes.get_xlim()[1] if following is None else following.time]
-            ys += [p.accuracy, p.accuracy]
-        axes.plot(xs, ys, color="0.35", linewidth=1.0, zorder=2)
+        xs = [front[0].time, *(p.time for p in front), high]
+        ys = [axes.get_ylim()[0], *(p.accuracy for p in front), front[-1].accuracy]
+        axes.step(xs, ys, where="post", color="0.35", linewidth=1.0, zorder=2)
+        axes.fill_between(xs, ys, ys[0], step="post", color="0.5", alpha=0.05, linewidth=0, zorder=1)
         axes.annotate("Pareto front", (1, front[-1].accuracy), (-4, -3), xycoords=axes.get_yaxis_transform(),
                       textcoords="offset points", fontsize=7, color="0.35", ha="right", va="top")  # fmt: skip
-        axes.fill_between(xs, ys, axes.get_ylim()[0], color="0.5", alpha=0.05, linewidth=0, zorder=1)
     for line in panel.lines:
         axes.axvline(line.time, color="0.1" if line.is_truth else "0.55", linewidth=1.0,
                      linestyle=(0, (5, 2)) if line.is_truth else (0, (1, 1.5)), zorder=2)  # fmt: skip
     for p in panel.points:
         colour, marker = styles[p.representation]
         error = [[max(p.time - max(p.q1, 1e-6), 0)], [max(p.q3 - p.time, 0)]]
-        axes.errorbar(p.time, p.accuracy, xerr=error, fmt=marker, color=colour, ecolor=colour, elinewidth=0.9,
-                      markersize=6.5, markerfacecolor=colour if p.on_front else "white", markeredgewidth=1.3,
-                      capsize=2, zorder=3)  # fmt: skip
+        axes.errorbar(p.time, p.accuracy, xerr=error, fmt=marker, color=colour, elinewidth=0.9, markersize=6.5,
+                      markerfacecolor=colour if p.on_front else "white", markeredgewidth=1.3, capsize=2,
+                      zorder=3)  # fmt: skip
 
 
-def _label(axes, panel: Panel, styles: dict) -> None:
+def _label_panel(axes, panel: Panel, styles: dict) -> None:
     """Label lines at the top, then points, those on the front first."""
-    labels = []
-    at_top = (axes.bbox.x0, axes.bbox.y1 - 9 * axes.figure.dpi / 72)
-    height = axes.transData.inverted().transform(at_top)[1]
-    for line in panel.lines:
-        colour = "0.1" if line.is_truth else "0.4"
-        if line.is_truth:
-            axes.plot([line.time], [1.0], marker="*", color=colour, markersize=9, clip_on=False, zorder=4,
-                      transform=axes.get_xaxis_transform())  # fmt: skip
-        text = f"{line.name} (exact)" if line.is_truth else line.name
-        labels.append(Label(text, (line.time, height), colour, radii=(4, 8, 12, 20, 30, 40, 52)))
+    top = axes.transData.inverted().transform((axes.bbox.x0, axes.bbox.y1 - 9 * axes.figure.dpi / 72))[1]
+    labels = [
+        Label(
+            f"{line.name} (exact)" if line.is_truth else line.name, (line.time, top), "0.1" if line.is_truth else "0.4"
+        )
+        for line in panel.lines
+    ]
     for p in sorted(panel.points, key=lambda p: (not p.on_front, -p.accuracy, p.time)):
         weight = "bold" if p.on_front else "normal"
         labels.append(Label(p.name, (p.time, p.accuracy), styles[p.representation][0], weight))
-    spans = [((max(p.q1, 1e-6), p.accuracy), (p.q3, p.accuracy)) for p in panel.points]
-    place_labels(axes, labels, [(p.time, p.accuracy) for p in panel.points], spans)
+    place_labels(axes, labels, [(p.time, p.accuracy) for p in panel.points])
 
 
-def place_labels(
-    axes,
-    labels: Iterable[Label],
-    points: Sequence[tuple[float, float]],
-    spans: Sequence[tuple[tuple[float, float], tuple[float, float]]] = (),
-) -> None:
-    """Write each label near its anchor where it covers no other text, in the given order.
+def place_labels(axes, labels: Sequence[Label], points: Sequence[tuple[float, float]]) -> None:
+    """Write each label near its anchor where it covers no other text and no point, in the given order.
 
-    Labels also avoid ``points`` and ``spans`` (pairs of ends), both in data coordinates, and if possible the lines of
-    ``axes``. A thin line leads from an anchor to a label that is away. The layout must be fixed (:func:`fix_layout`).
-    Each label takes the best of a fixed set of places: packages that move labels by forces stop after a time, so their
-    pictures would depend on the speed of the machine.
+    ``points`` are in data coordinates. A thin line leads from an anchor to a label that is away. The layout must be
+    final. Each label takes the best of a fixed set of places: packages that move labels by forces stop after a time, so
+    their pictures would depend on the speed of the machine.
     """
     renderer, scale = axes.figure.canvas.get_renderer(), axes.figure.dpi / 72
-    inside = axes.get_window_extent(renderer).extents[None]
-    pixels = axes.transData.transform
+    inside, pixels = axes.get_window_extent(renderer).extents[None], axes.transData.transform
+    turn = 2 * math.pi * np.arange(LABEL_DIRECTIONS) / LABEL_DIRECTIONS
+    distance, turn = (v.ravel() for v in np.meshgrid(LABEL_DISTANCES, turn, indexing="ij"))
     # Boxes in pixels, as rows of left, bottom, right, top
-    texts = [*axes.texts, *([axes.get_legend()] if axes.get_legend() else [])]
-    hard = [text.get_window_extent(renderer).extents for text in texts]
-    hard += [np.tile(pixels(p), 2) + 5 * scale * _OUT for p in points]
-    hard += [np.concatenate([pixels(a), pixels(b)]) + 2 * _OUT for a, b in spans]
-    soft = _boxes([box for line in axes.lines for box in _chain(line, scale)])
-    hard, placed = _boxes(hard), _boxes([])
+    taken = [text.get_window_extent(renderer).extents for text in axes.texts]
+    taken += [np.tile(pixels(p), 2) + 5 * scale * np.array([-1, -1, 1, 1]) for p in points]
     for label in labels:
         note = axes.annotate(label.text, label.at, xytext=(0, 0), textcoords="offset points", fontsize=8, ha="center",
                              va="center", color=label.colour, fontweight=label.weight, zorder=5,
                              bbox={"boxstyle": "square,pad=0.1", "fc": "w", "ec": "none", "alpha": 0.8})  # fmt: skip
         extent = note.get_window_extent(renderer)
         size = np.array([extent.width + 3 * scale, extent.height + 1.5 * scale])
-        start = pixels(label.at)
-        others = np.reshape([pixels(p) for p in points if tuple(p) != tuple(label.at)], (-1, 2))
-        radius, turn = (v.ravel() for v in np.meshgrid(label.radii, _TURNS, indexing="ij"))
-        angle = label.angle + 2 * math.pi * turn / len(_TURNS)
-        offset = (radius[:, None] * scale + size / 2) * np.column_stack([np.cos(angle), np.sin(angle)])
-        box = np.hstack([start + offset - size / 2, start + offset + size / 2])
-        cost = 50 * (size.prod() - _overlap(box, inside)) + (radius + np.abs(turn) / 4) * scale
-        cost += 30 * (_overlap(box, hard) + _overlap(box, placed)) + 20 * _overlap(box, soft)
-        # A label is nearest to its own point, and nothing crosses the line that leads to it
-        end = np.clip(start, box[:, :2], box[:, 2:])
-        to_others = others - np.clip(others, box[:, None, :2], box[:, None, 2:])
-        nearer = np.hypot(*(start - end).T)[:, None] + 4 * scale - np.hypot(*np.moveaxis(to_others, -1, 0))
-        cost += 30 * np.maximum(nearer, 0).sum(axis=1) / scale
-        way = (start + np.linspace(0, 1, 21)[:, None, None] * (end - start))[:, :, None]
-        across = ((way >= placed[:, :2]) & (way <= placed[:, 2:])).all(axis=-1).any(axis=0).sum(axis=1)
-        touched = (np.hypot(*np.moveaxis(way - others, -1, 0)) < 6 * scale).any(axis=0).sum(axis=1)
-        best = np.argmin(cost + 300 * (radius > _LEADER) * (across + touched))
-        radius, offset, box, end = radius[best], offset[best], box[best], end[best]
-        note.set_position(offset / scale)
-        if radius > _LEADER:
-            ends = axes.transData.inverted().transform([start, end])
+        offset = (distance[:, None] * scale + size / 2) * np.column_stack([np.cos(turn), np.sin(turn)])
+        centre = pixels(label.at) + offset
+        boxes = np.hstack([centre - size / 2, centre + size / 2])
+        outside = size.prod() - _overlap(boxes, inside)
+        cost = 50 * outside + 30 * _overlap(boxes, np.reshape(taken, (-1, 4))) + distance * scale
+        best = np.argmin(cost)
+        note.set_position(offset[best] / scale)
+        if distance[best] > LEADER_DISTANCE:
+            end = np.clip(pixels(label.at), boxes[best, :2], boxes[best, 2:])
+            ends = axes.transData.inverted().transform([pixels(label.at), end])
             axes.plot(*ends.T, color=label.colour, linewidth=0.5, zorder=2.5)
-        placed = np.vstack([placed, box])
-
-
-_OUT = np.array([-1, -1, 1, 1])
-
-
-def _boxes(rows: list) -> np.ndarray:
-    return np.reshape(np.array(rows, dtype=float), (-1, 4))
-
-
-def _chain(line, scale: float):
-    """Yield small boxes along a line."""
-    pixels = line.get_transform().transform(np.column_stack([np.asarray(v, dtype=float) for v in line.get_data()]))
-    for a, b in zip(pixels, [*pixels[1:], pixels[-1]], strict=True):
-        if np.isfinite([*a, *b]).all():
-            for t in np.linspace(0, 1, 1 + max(1, min(400, math.ceil(math.dist(a, b) / (3 * scale))))):
-                yield np.tile(a + t * (b - a), 2) + scale * _OUT
+        taken.append(boxes[best])
 
 
 def _overlap(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
@@ -302,30 +263,151 @@ def _overlap(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
     return np.maximum(sides, 0).prod(axis=-1).sum(axis=1)
 
 
+# -- Curves ------------------------------------------------------------------------------------------------------------
+
+
+def draw_curves(
+    title: str, caption: str, panels: Mapping[str, Sequence[Curve]], x_label: str, y_label: str, log: bool = False,
+    ticks: Sequence[str] = (), columns: int = 2, height: float = 3.6,
+):  # fmt: skip
+    """Return a Matplotlib figure with a panel of curves for each title; the first has a legend.
+
+    There are up to ``columns`` panels a row. The x axis is logarithmic if ``log``; ``ticks`` are labels at 0, 1, 2, …
+    """
+    columns = min(columns, len(panels))
+    rows = -(-len(panels) // columns)
+    plot = figure(title, caption, 6.0 * columns, height * rows)
+    for k, (name, curves) in enumerate(panels.items()):
+        axes = plot.add_subplot(rows, columns, k + 1)
+        for i, curve in enumerate(curves):
+            colour, marker = STYLES[i % len(STYLES)]
+            bars = None if curve.low is None else [np.subtract(curve.y, curve.low), np.subtract(curve.high, curve.y)]
+            style = {"color": colour, "marker": marker, "markersize": 4, "linewidth": 1.1, "capsize": 2, **curve.style}
+            axes.errorbar(curve.x, curve.y, bars, label=curve.label, **style)
+        axes.set_title(name, fontsize=9)
+        if log:
+            axes.set_xscale("log")
+            log_ticks(axes.xaxis, *axes.get_xlim())
+        if ticks:
+            axes.set_xticks(range(len(ticks)), ticks)
+        finish(axes, x_label, y_label)
+        if not k and len(curves) > 1:
+            axes.legend(fontsize=6.5, ncols=2)
+    return plot
+
+
 def draw_training_curves(title: str, records: dict[str, dict], caption: str):
     """Draw PSNR over steps of trainings (records of :class:`.training.ConvergenceTraining`).
 
-    Each training has a panel, each of its runs a line, from the shortest (light) to the longest (dark). A training
-    that has not converged is marked in red.
+    Each training has a panel, each of its runs a line, from the shortest (light) to the longest (dark). The title of a
+    training says whether it has converged.
     """
-    columns = min(5, len(records))
-    rows = -(-len(records) // columns)
-    about = "PSNR in dB over training steps; each line is a separate run, twice as long as the previous one."
-    plot = figure(title, f"{about} {caption}", 2.6 * columns, 1.9 * rows, 0.4, 160)
-    for k, (name, record) in enumerate(records.items()):
-        axes = plot.add_subplot(rows, columns, k + 1)
-        runs = record["runs"]
-        for i, run in enumerate(runs):
-            shade = str(0.75 * (1 - (i + 1) / len(runs)))
-            axes.plot(run["curve_steps"], run["curve_psnr_db"], color=shade, linewidth=1.1)
+    panels = {}
+    for name, record in records.items():
         gain = "" if record["gain_db"] is None else f", last doubling {record['gain_db']:+.1f} dB"
         state = "converged" if record["converged"] else "NOT converged"
-        axes.set_title(f"{name}: {record['psnr_db']:.1f} dB\n{state}{gain}", fontsize=7.5,
-                       color="0.1" if record["converged"] else "#b2182b")  # fmt: skip
-        axes.set_xscale("log")
-        log_ticks(axes.xaxis, *(end(step for run in runs for step in run["curve_steps"]) for end in (min, max)), plain)
-        top = max(v for run in runs for v in run["curve_psnr_db"])
-        axes.set_ylim(top - 20, top + 2)
-        axes.tick_params(labelsize=6.5)
-        axes.grid(color="0.92", linewidth=0.5)
+        runs = record["runs"]
+        panels[f"{name}: {record['psnr_db']:.1f} dB\n{state}{gain}"] = [
+            Curve(f"{run['steps']:,} steps", run["curve_steps"], run["curve_psnr_db"],
+                  style={"color": str(0.75 * (1 - (i + 1) / len(runs))), "marker": ""})
+            for i, run in enumerate(runs)
+        ]  # fmt: skip
+    about = "PSNR in dB over training steps; each line is a separate run, twice as long as the previous one."
+    return draw_curves(title, f"{about} {caption}", panels, "training steps", "PSNR, dB", True, columns=4, height=2.6)
+
+
+# -- Pictures ----------------------------------------------------------------------------------------------------------
+
+
+def draw_images(
+    title: str, caption: str, rows: Mapping[str, Mapping[str, np.ndarray]], width: float = 2.3, unit: str = ""
+):
+    """Return a Matplotlib figure with a row of images for each label, each image with its title.
+
+    Images are of displayed values in [0, 1], ``(height, width, 3)``, or errors in a ``unit``, ``(height, width)``,
+    which share the range of colours of their row.
+    """
+    columns, first = max(map(len, rows.values())), next(iter(next(iter(rows.values())).values()))
+    plot = figure(title, caption, width * columns, len(rows) * (width * first.shape[0] / first.shape[1] + 0.4))
+    for i, (label, images) in enumerate(rows.items()):
+        drawn, maps = [], [image for image in images.values() if image.ndim == 2]
+        worst = max((float(np.nanquantile(image, 0.98)) for image in maps), default=1.0)
+        for k, (name, image) in enumerate(images.items()):
+            axes = plot.add_subplot(len(rows), columns, i * columns + k + 1)
+            colours = {"vmin": 0, "vmax": worst, "cmap": "inferno_r"} if image.ndim == 2 else {}
+            shown = axes.imshow(image if colours else image.clip(0, 1), interpolation="nearest", **colours)
+            axes.set_title(name, fontsize=8)
+            axes.set_ylabel("" if k else label, fontsize=7.5)
+            axes.set(xticks=[], yticks=[])
+            drawn += [axes] if colours else []
+        if drawn:
+            bar = plot.colorbar(shown, cax=drawn[-1].inset_axes([1.04, 0.1, 0.05, 0.8]), extend="max")
+            bar.set_label(unit, fontsize=7.5)
+            bar.ax.tick_params(labelsize=6.5)
     return plot
+
+
+#: Function that draws one cell, of a Matplotlib figure and of the cell's axes.
+Cell = Callable[[object, object], None]
+
+
+def picture(title: str, image: np.ndarray, frame: tuple[int, int, int, int] | None = None) -> Cell:
+    """Return a cell with a linear image, ``(height, width, 3)`` or ``(height, width, 1)``, as displayed.
+
+    ``frame``: ``x, y, width, height`` of a window to mark, in pixels.
+    """
+
+    def draw(figure, axes):
+        if frame is not None:
+            x, y, width, height = frame
+            left, right, top, bottom = x - 0.5, x + width - 0.5, y - 0.5, y + height - 0.5
+            axes.plot([left, right, right, left, left], [top, top, bottom, bottom, top], color="yellow", linewidth=1.5)
+        axes.imshow(srgb.for_display(np.repeat(image, 3, -1) if image.shape[-1] == 1 else image))
+        axes.set_title(title)
+
+    return draw
+
+
+def colour_map(title: str, values: np.ndarray, extend: str = "neither", **options) -> Cell:
+    """Return a cell with values, ``(height, width)``, and a colour bar; ``options`` are those of ``imshow``."""
+
+    def draw(figure, axes):
+        shown = axes.imshow(values, **options)
+        axes.set_title(title)
+        figure.colorbar(shown, ax=axes, extend=extend, shrink=0.9)
+
+    return draw
+
+
+def error_map(error: np.ndarray, title: str = "absolute difference, mean of the channels (linear)") -> Cell:
+    """Draw an absolute difference ``(height, width)``, the mean of the channels, up to its 99.5% quantile."""
+    top = max(float(np.quantile(error, 0.995)), 1e-6)
+    return colour_map(title, error, "max", cmap="magma", vmin=0, vmax=top)
+
+
+def text(lines: Sequence[str]) -> Cell:
+    """Return a cell with lines of text."""
+
+    def draw(figure, axes):
+        options = {"va": "top", "family": "monospace", "fontsize": 12, "transform": axes.transAxes}
+        axes.text(0.02, 0.95, "\n".join(lines), **options).set_in_layout(False)  # long lines move no picture
+
+    return draw
+
+
+def write(path: str | os.PathLike, cells: Sequence[Cell], columns: int, shape: Sequence[int]) -> None:
+    """Draw ``cells`` row by row, each seven inches wide, and write ``path`` (``.png``).
+
+    ``shape`` is that of the pictures, (height, width, …). Raises :class:`.OutputError`.
+    """
+    from matplotlib.figure import Figure
+
+    rows = -(-len(cells) // columns)
+    size = (7 * columns, rows * (7 * shape[0] / shape[1] + 0.35))
+    figure = Figure(figsize=size, dpi=110, layout="constrained")
+    grid = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for axes in grid:
+        axes.set_axis_off()
+    for cell, axes in zip(cells, grid, strict=False):
+        cell(figure, axes)
+    save(figure, path)

@@ -6,14 +6,13 @@ import csv
 import io
 import math
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 from ..core.files import replacing, writable_folder, write_json
 from . import plot
-from .formatting import grid, machine_line, ratio_cell, state, time_cell
 from .statistics import finite, pareto
 from .store import Store
-from .study import PASS, Plan, Tradeoff, in_competition
+from .study import PASS, Measure, Plan, Tradeoff, in_competition
 
 #: Columns of the table before those of errors and of the candidates' details.
 COLUMNS = (
@@ -25,6 +24,10 @@ COLUMNS = (
 
 #: Quantities beside time that accuracy may be drawn against: the label of the axis, and the title of the panel.
 QUANTITIES = {"bytes": ("bytes", "bytes"), "training_seconds": ("seconds of training", "training")}
+
+
+#: Methods of contenders that are ours.
+OURS = ("ours", "indirection")
 
 
 def write_files(
@@ -181,9 +184,9 @@ def caption(result: dict) -> str:
     ])  # fmt: skip
 
 
-def summary(result: dict, plan: Plan | None = None) -> list[str]:
-    """Return the result as lines of text: the plan's table, times, ratios, and the plan's conclusions."""
-    lines = list(plan.table(result)) if plan else []
+def summary(result: dict) -> list[str]:
+    """Return the result as lines of text: errors of candidates, verdicts in equal bytes, times, ratios, conclusions."""
+    lines = [*_error_table(result), *verdicts(result)]
     for case, measured in result["cases"].items():
         queries, passes = measured["queries"], measured["passes"].get(PASS, {})
         floors = ", ".join(f"{q} {next(iter(t.values()))['floor']:.2f}" for q, t in queries.items())
@@ -214,3 +217,130 @@ def summary(result: dict, plan: Plan | None = None) -> list[str]:
             lines += grid([["", *ratios], *([pair, *row] for pair, row in zip(pairs, cells, strict=True))])
     lines += ["", *result["conclusions"]] if result["conclusions"] else []
     return [*lines, "", caption(result)]
+
+
+def _error_table(result: dict) -> list[str]:
+    """Return the plan's measures of all candidates as lines of text."""
+    measures = [Measure(**m) for m in result["measures"]]
+    cells = [["", "bytes", "seconds", *(m.label for m in measures)]]
+    for name, c in result["candidates"].items():
+        if any(m.key in c["errors"] for m in measures):
+            seconds = "-" if c["training_seconds"] is None else f"{c['training_seconds']:.1f}"
+            cells.append([name, f"{c['bytes']:,}", seconds, *(_error_cell(c["errors"], m) for m in measures)])
+    return grid(cells, "") if len(cells) > 1 else []
+
+
+def _error_cell(errors: dict, measure: Measure) -> str:
+    value = errors.get(measure.key)
+    return "-" if value is None else f"{value:{measure.form}}"
+
+
+def candidates_by_budget(result: dict) -> dict[float, dict[str, dict]]:
+    """Return a map from each memory budget, ascending, to the measured contenders of a result: name → candidate."""
+    groups: dict[float, dict[str, dict]] = {}
+    for name, candidate in result["candidates"].items():
+        budget = candidate["details"].get("asked")
+        if budget and candidate["errors"]:
+            groups.setdefault(budget, {})[name] = candidate
+    return dict(sorted(groups.items()))
+
+
+def verdicts(result: dict) -> list[str]:
+    """Return a line for each memory budget: the method "ours" against the best of the others, by each measure."""
+    lines = []
+    for candidates in candidates_by_budget(result).values():
+        ours = {name: c for name, c in candidates.items() if c["details"]["kind"] in OURS}
+        if not ours or len(ours) == len(candidates):
+            continue
+        texts = []
+        for m in (Measure(**m) for m in result["measures"]):
+            better = max if m.more else min
+            best = {
+                is_ours: better(
+                    ((c["errors"][m.key], name) for name, c in candidates.items()
+                     if (name in ours) == is_ours and c["errors"].get(m.key) is not None), default=None)
+                for is_ours in (True, False)
+            }  # fmt: skip
+            if all(best.values()):
+                (value, name), (other, rival) = best[True], best[False]
+                wins = "ahead" if better(value, other) == value != other else "not ahead"
+                texts.append(f"{m.label} {value:{m.form}} against {other:{m.form}} ({rival}): {wins}")
+        lines.append(f"{name}: {'; '.join(texts)}")
+    return ["", *lines] if lines else []
+
+
+def percent(value: float, digits: int = 3) -> str:
+    """Return a share as text, ``0.0123`` → ``"1.23%"``; very small shares are written with a power of ten."""
+    value = 100 * value
+    return f"{value:.{digits}g}%" if value == 0 or abs(value) >= 1e-4 else f"{value:.1e}%"
+
+
+def rounded(number: float) -> str:
+    """Return a count with two digits: ``"1.3"``, ``"12,000"``, ``"3.4 million"``; from 10¹⁵ on a power of ten."""
+    if number >= 1e15:
+        return f"{number:.1e}"
+    for size, name in ((1e12, " trillion"), (1e9, " billion"), (1e6, " million")):
+        if float(f"{number:.2g}") >= size:
+            return f"{float(f'{number / size:.2g}'):g}{name}"
+    number = float(f"{number:.2g}")
+    return f"{number:,.0f}" if number >= 10 else f"{number:g}"
+
+
+def duration(seconds: float) -> str:
+    """Return seconds with two digits in a readable unit: ``"0.35 s"``, ``"1.7 min"``, ``"3.2 years"``."""
+    year = 365.25 * 86400
+    units = ((year, year, "years"), (86400, 86400, "days"), (5400, 3600, "h"), (90, 60, "min"), (0.1, 1, "s"))
+    size, name = next((unit[1:] for unit in units if seconds >= unit[0]), (1e-3, "ms"))
+    return f"{rounded(seconds / size)} {name}"
+
+
+def enumeration(values: Sequence[object], last: str = "and") -> str:
+    """Return an enumeration: ``[1, 4, 16]`` → ``"1, 4 and 16"``."""
+    *before, end = map(str, values)
+    return f"{', '.join(before)} {last} {end}" if before else end
+
+
+def time_cell(t: dict | None, digits: int = 2) -> str:
+    """Return a time (:func:`.statistics.timing`) ± half its interquartile range, or the bound of a hidden time."""
+    if t is None:
+        return ""
+    if t["hidden"]:
+        return f"below {t['time']:.{digits}f}"
+    return f"{t['time']:.{digits}f} ±{(t['q3'] - t['q1']) / 2:.{digits}f}"
+
+
+def ratio_cell(r: dict | None, floor: bool = True) -> str:
+    """Return a ratio of times (:func:`.statistics.ratio`); with ``floor`` in brackets the ratio with the floor."""
+    if r is None:
+        return ""
+    median = f"{'below ' * r['hidden']}{r['median']:.2f}" if math.isfinite(r["median"]) else "-"
+    return f"{median} [{r['with_floor']:.2f}]" if floor else median
+
+
+def grid(rows: Sequence[Sequence[str]], indent: str = "  ") -> list[str]:
+    """Return rows of cells as aligned lines: the first column to the left, the others to the right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ([f"{cell:>{w + 2}}" for cell, w in zip(row[1:], widths[1:], strict=True)] for row in rows)
+    return [f"{indent}{row[0]:{widths[0]}}{''.join(line)}".rstrip() for row, line in zip(rows, lines, strict=True)]
+
+
+def machine_line(result: dict) -> str:
+    """Return the machine (:func:`.clock.machine`) and the date of a result as a sentence."""
+    m = result["machine"]
+    device = m["gpu"] if m["variant"].startswith("cuda") else f"{m['cpu']} ({m['instructions']}), {m['cores']} cores"
+    llvm = f", LLVM {m['llvm']}" if m["llvm"] else ""
+    return (
+        f"{device}; {m['variant']}, Mitsuba {m['mitsuba']}, Dr.Jit {m['drjit']}{llvm}, mi_diffind {m['mi-diffind']}; "
+        f"{result['date']}."
+    )
+
+
+def state(result: dict) -> str:
+    """Return the caption's sentences about a quick or interrupted run, "" for a complete one."""
+    quick = " A smoke run (--quick): times are not to be quoted." if result["settings"]["quick"] else ""
+    return quick + (" Interrupted: less was measured than asked for." if result["interrupted"] else "")
+
+
+def figure_caption(result: dict) -> str:
+    """Return the caption of a figure: the notes of a result, its machine, and its :func:`state`."""
+    return f"{' '.join(result['notes'])} {machine_line(result)}{state(result)}"

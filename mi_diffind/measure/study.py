@@ -1,8 +1,7 @@
 """Declaration of studies: a study, its plan, and the candidates, jobs and cases of the plan.
 
 A module of :mod:`mi_diffind.studies`, or one that an entry point of the group ``mi_diffind.studies`` names, has a
-:class:`Study` as its ``STUDY``. The command line imports all of them, so a declaration imports neither Mitsuba nor
-Dr.Jit.
+:class:`Study` as its ``STUDY``. The command ``tradeoff`` imports all of them.
 """
 
 from __future__ import annotations
@@ -156,6 +155,19 @@ class Case:
     of_passes: bool = False
 
 
+@dataclass(frozen=True)
+class Measure:
+    """Error that a report shows for all candidates: its ``label``, its ``key`` in ``errors``, and a format of a number.
+
+    The errors of contenders in equal bytes are compared by it; ``more`` is better, or less.
+    """
+
+    label: str
+    key: str
+    form: str = ".2f"
+    more: bool = True
+
+
 def _current_variant() -> str:
     import mitsuba as mi  # a declaration of a study does not need it
 
@@ -170,8 +182,8 @@ class Plan:
     pairs of candidates whose times are divided. Partial results are continued only if ``details`` and the files
     of this package are unchanged, models of ``jobs`` if ``jobs_fingerprint`` is.
     ``panels``: quantities that the accuracy of all candidates is drawn against (``"bytes"``, ``"training_seconds"``);
-    ``bytes_by_case``: also against bytes, for the candidates of each case. ``table(result)`` returns lines to print
-    before the times, ``conclusions(result)`` lines after them. ``pictures`` maps further names to functions of the
+    ``bytes_by_case``: also against bytes, for the candidates of each case. ``measures``: errors of the table of all
+    candidates; ``conclusions(result)`` returns further lines. ``pictures`` maps further names to functions of the
     result that draw a Matplotlib figure. ``sampled``: errors are those of as many samples as the settings say.
     """
 
@@ -191,7 +203,7 @@ class Plan:
     bytes_by_case: bool = False
     pictures: dict[str, Callable[[dict], object]] = field(default_factory=dict)
     sampled: bool = True
-    table: Callable[[dict], list[str]] = lambda result: []
+    measures: tuple[Measure, ...] = ()
     conclusions: Callable[[dict], list[str]] = lambda result: []
     variant: str = field(default_factory=_current_variant)
 

@@ -24,21 +24,29 @@ from .study import Job
 GAIN = 0.5
 
 
+def halve(net) -> None:
+    """Round all parameters of a module to half precision, in which they are stored."""
+    for key in net:
+        net[key] = type(net[key])(net[key].numpy().astype(np.float16).astype(np.float32))
+
+
 class ConvergenceTraining(Job):
     """Training of a representation to convergence.
 
     ``problem()`` returns a new problem with untrained parameters; ``settings`` are those of the first, shortest run,
     ``longest`` is the largest number of steps; each run is measured ``measurements`` times. After :meth:`run` or
-    :meth:`cached_record`, ``net`` is the trained module of the best run.
+    :meth:`cached_record`, ``net`` is the trained module of the best run. ``half``: its parameters are rounded to half
+    precision. ``finish(net, record)`` returns further entries of the record, such as ``bytes`` and ``errors``.
     """
 
     separable = True
 
     def __init__(
-        self, name: str, problem: Callable[[], Problem], settings: FitSettings, longest: int, measurements: int = 20
-    ):
+        self, name: str, problem: Callable[[], Problem], settings: FitSettings, longest: int, measurements: int = 20,
+        half: bool = False, finish: Callable[[object, dict], dict] = lambda net, record: {},
+    ):  # fmt: skip
         self.name, self.problem, self.settings, self.longest = name, problem, settings, longest
-        self.measurements = measurements
+        self.measurements, self.half, self.finish = measurements, half, finish
         self.net = None
 
     def cached_record(self, folder: Path | None, record: dict | None = None) -> dict | None:
@@ -93,6 +101,9 @@ class ConvergenceTraining(Job):
             "settings": self._settings(),
             "runs": runs,
         }
+        if self.half:
+            halve(self.net)
+        record |= self.finish(self.net, record)
         if file is not None:
             self._save(file, record)
             for checkpoint in file.parent.glob(f"{file.stem}_*.checkpoint"):

@@ -1,20 +1,126 @@
-"""Studies of ``mi-diffind tradeoff``: each compares candidates by accuracy, bytes and time.
+"""Studies of ``mi-diffind tradeoff``: each compares candidates by accuracy, bytes and time; ``mi_diffind.tradeoff``.
 
-Each module here, and each that an entry point of the group ``mi_diffind.studies`` names, declares a study as its
-``STUDY`` (:class:`mi_diffind.measure.study.Study`). Studies load plugins, so this package lies above them.
+Each module here that has a ``STUDY`` (:class:`mi_diffind.measure.study.Study`), and each that an entry point of the
+group ``mi_diffind.studies`` names, declares one. Studies load plugins, so this package lies above them.
 :mod:`.baselines` are the methods that tables compete with, :mod:`.equal_memory` the contenders of comparisons in equal
-bytes, :mod:`.maps` the shared parts of studies of maps.
+bytes.
 """
 
 from __future__ import annotations
 
+import argparse
 import functools
+import os
+from collections.abc import Callable, Mapping
 
 from ..core import discovery
-from ..measure.study import Study
+from ..core.errors import UsageError
+from ..core.files import writable_folder
+from ..core.runtime import use_variant
+from ..measure.study import Plan, Study, Tradeoff
 
 
 @functools.lru_cache
 def studies() -> dict[str, Study]:
     """Return all studies by name: those of this package, then those of entry points."""
-    return discovery.load(__name__, "STUDY", ignored=("baselines", "equal_memory", "maps"), expected=Study)
+    return discovery.load(__name__, "STUDY", ignored=("baselines",), expected=Study)
+
+
+def tradeoff(
+    study: str,
+    *sources: str | os.PathLike,
+    out: str | os.PathLike = "out",
+    quick: bool = False,
+    defines: Mapping[str, object] | None = None,
+    workers: int | None = None,
+    scheduler: str = "",
+    **options,
+) -> Tradeoff:
+    """Measure time against accuracy, in the variant that is set: ``mi-diffind tradeoff`` in Python.
+
+    - ``study``: ``"disney"``, ``"image"``, ``"scene"``, … (``mi-diffind tradeoff --help``); ``sources``: its
+      positional arguments, as an image, a mesh or a scene file.
+    - ``out``: folder for the table and the pictures; ``quick``: less of everything, times not to be quoted.
+    - ``defines``: values of a scene's ``<default>`` parameters.
+    - ``workers``, ``scheduler``: number of processes, or address of a Dask cluster, that do the trainings of the study.
+    - ``options``: options of the command as keywords, one of several values as a list (``compression=[6, 12]``). An
+      option that is a word of Python ends in an underscore (``lambda_=0.5``).
+
+    The result holds figures, lines of text and the paths of the files, and notebooks show its picture. After Ctrl-C, it
+    is incomplete. Raises :class:`.UsageError`, :class:`.OutputError`, and what the
+    study's own input raises.
+    """
+    if study not in studies():
+        raise UsageError(f'found the study "{study}", allowed are {", ".join(studies())}')
+    chosen = studies()[study]
+    if defines and not chosen.of_scene:
+        raise UsageError(f"defines: given to the study {study}, which has no scene file")
+    if (workers or scheduler) and chosen.of_scene:
+        raise UsageError(f"workers: given to the study {study}, whose renders are timed one after the other")
+    parser = _Keywords(prog=f"tradeoff {study}", allow_abbrev=False, add_help=False)
+    if chosen.of_scene:
+        parser.add_argument("scene", metavar="SCENE.xml")
+    chosen.add_arguments(parser)
+    arguments = parser.parse_args([*map(str, sources), *_words(options)])
+    arguments.out, arguments.quick, arguments.defines = str(out), quick, {k: str(v) for k, v in (defines or {}).items()}
+    arguments.workers, arguments.scheduler = workers, scheduler
+    return run(chosen, arguments)
+
+
+class _Keywords(argparse.ArgumentParser):
+    def error(self, message: str):
+        raise UsageError(f"{self.prog}: {message}")
+
+
+def _words(options: dict) -> list[str]:
+    """Return keywords as words of the command line."""
+    words = []
+    for name, value in options.items():
+        option = "--" + name.rstrip("_").replace("_", "-")
+        for one in value if isinstance(value, (list, tuple)) else [value]:
+            if one is True:
+                words.append(option)
+            elif one is not None and one is not False:
+                words.append(f"{option}={one}")
+    return words
+
+
+def run(study: Study, arguments, set_variant: Callable[[], object] = use_variant) -> Tradeoff:
+    """Run a study with the arguments of its command, see :func:`tradeoff`.
+
+    ``set_variant()`` sets the variant once the arguments are checked.
+    """
+    try:
+        study.check(arguments)
+    except ValueError as e:
+        raise UsageError(str(e)) from None
+    writable_folder(arguments.out, create=True)
+    set_variant()
+    import mitsuba as mi
+
+    from .. import plugins
+
+    if not plugins.supported(mi.variant()):
+        usable = ", ".join(v for v in mi.variants() if plugins.supported(v))
+        raise UsageError(f'the plugins do not run in the variant "{mi.variant()}"; use one of {usable}')
+    return study.run(arguments) or _measure(study, arguments)
+
+
+def _plan(name: str, arguments) -> Plan:
+    """Return the plan of a study, also in another process."""
+    return studies()[name].plan(arguments)
+
+
+def _measure(study: Study, arguments) -> Tradeoff:
+    from ..measure import benchmark, report
+
+    plan, workers = study.plan(arguments), None
+    count, scheduler = getattr(arguments, "workers", None), getattr(arguments, "scheduler", "")
+    if count or scheduler:
+        if not any(job.separable for job in plan.jobs):
+            raise UsageError(f"workers: the study {study.name} has no jobs that could run in other processes")
+        make = functools.partial(_plan, study.name, arguments)
+        workers = benchmark.Workers(make, count, scheduler)
+    settings = benchmark.BenchmarkSettings.choose(plan.variant, arguments.quick)
+    result = benchmark.measure(plan, settings, arguments.out, workers=workers)
+    return report.publish(result, report.write(result, arguments.out, plan), report.summary(result))

@@ -16,7 +16,7 @@ from mi_diffind.tasks.radiance import march as marching
 from mi_diffind.tasks.radiance.files import load
 from mi_diffind.tasks.radiance.volume_field import VolumeField
 
-from . import properties, upsampling
+from . import properties, textures
 from .placement import Placement, PlacementParameter
 from .tables import arrays_of
 
@@ -52,19 +52,18 @@ class PlacedField(PlacementParameter):
         """Return whether a derivative with respect to the field's arrays or its place is requested."""
         return self.moving() or any(compat.has_gradient(values) for values in self.exposed.values())
 
-    def _local(self, ray, far, active) -> tuple:
-        """Return the arguments of the functions of :mod:`.march` after the field."""
-        o = mi.Point3f(self.axes.to_local(mi.Vector3f(ray.o - self.origin)) / self.size)
-        return o, self.axes.to_local(ray.d), mi.Float(0), far / self.size, active
+    def _local(self, ray, far, active, numbers=None) -> tuple:
+        """Return the arguments of the functions of :mod:`.march` after the field.
 
-    @staticmethod
-    def _seen_from(numbers: list, ray, far, active) -> tuple:
-        """Return :meth:`_local` for a placement that is attached: ``numbers`` are those of :meth:`_numbers`."""
-        axes = mi.Frame3f(*(mi.Vector3f(*numbers[i : i + 3]) for i in (0, 3, 6)))
-        origin, size = mi.Point3f(*numbers[9:12]), numbers[12]
+        ``numbers`` are those of :meth:`_numbers` for a placement that is attached.
+        """
+        axes, origin, size = self.axes, self.origin, self.size
+        if numbers is not None:
+            axes = mi.Frame3f(*(mi.Vector3f(*numbers[i : i + 3]) for i in (0, 3, 6)))
+            origin, size = mi.Point3f(*numbers[9:12]), numbers[12]
+            far = dr.minimum(far, 1e18)  # infinity over the size has no derivative
         o = mi.Point3f(axes.to_local(mi.Vector3f(ray.o - origin)) / size)
-        # Infinity over the size has no derivative
-        return o, axes.to_local(ray.d), mi.Float(0), dr.minimum(far, 1e18) / size, active
+        return o, axes.to_local(ray.d), mi.Float(0), far / size, active
 
     def enters(self, ray, far, active=True) -> tuple:
         """Return the distance at which rays enter the field's box, and whether they do so before ``far``."""
@@ -97,15 +96,13 @@ class PlacedField(PlacementParameter):
 
     def replay(self, ray, far, active, marched, d_colour, d_transmittance, d_depth) -> None:
         """Call :func:`.march.replay`; ``depth`` is in units of the world."""
-        moving = self.moving()
+        moving, numbers = self.moving(), None
         with dr.resume_grad(when=moving):
             if moving:
                 # Gathered, so that the kernel of the rays sums the gradients: sums of a width of 1 are kernels each
                 first = dr.minimum(dr.arange(mi.UInt32, dr.width(ray.o)), 0)
                 numbers = [dr.gather(mi.Float, v, first) for v in self._numbers()]
-                local = self._seen_from(numbers, ray, far, active)
-            else:
-                local = self._local(ray, far, active)
+            local = self._local(ray, far, active, numbers)
         d_inside = d_depth * dr.detach(self.size)
         marching.replay(self.field, *local, 0.5, marched, d_colour, d_transmittance, d_inside, moving)
         if moving:
@@ -125,19 +122,17 @@ class PlacedField(PlacementParameter):
 
     def tangent(self, ray, far, active, marched) -> tuple:
         """Call :func:`.march.tangent`; ``depth`` is in units of the world."""
-        moving = self._turn is not None
-        if not moving:
-            local, size = self._local(ray, far, active), self.size
-        else:
-            with dr.resume_grad():
+        moving, numbers = self._turn is not None, None
+        with dr.resume_grad(when=moving):
+            if moving:
                 # Numbers of their own: tangents pass through these more than once
                 numbers = [mi.Float(dr.detach(v)) for v in self._numbers()]
                 for number, change in zip(numbers, self._turn, strict=True):
                     dr.enable_grad(number)
                     dr.set_grad(number, change)
-                size, local = numbers[12], self._seen_from(numbers, ray, far, active)
+            local = self._local(ray, far, active, numbers)
         colour, transmittance, depth = marching.tangent(self.field, *local, 0.5, marched, moving)
-        depth = depth * dr.detach(size)
+        depth = depth * dr.detach(self.size)
         if moving:
             depth += dr.select(active, dr.detach(marched.depth) * self._turn[12], 0)
         return colour, transmittance, depth
@@ -167,7 +162,7 @@ class VariantLight:
         scale = 2 * dr.maximum(dr.max(mi.Array3f(*colour)), 1e-20)
         at = dr.zeros(mi.SurfaceInteraction3f)
         at.wavelengths = wavelengths
-        spectrum = upsampling.spectrum([c / scale for c in colour], wavelengths)
+        spectrum = textures.upsampled_spectrum([c / scale for c in colour], wavelengths)
         return mi.Spectrum(spectrum * scale * self.illuminant.eval(at, active))
 
     def adjoint(self, colour, wavelengths, weight, active=True):
@@ -177,8 +172,7 @@ class VariantLight:
         if not mi.is_spectral:
             return mi.Array3f(*weight)
         with dr.resume_grad():
-            free = mi.Array3f(dr.detach(colour))
-            dr.enable_grad(free)
+            free = _attached(colour)
             dr.backward_from(dr.dot(weight, self.of(free, wavelengths, active)))
             return dr.select(active & _coloured(colour), dr.grad(free), 0)
 
@@ -187,10 +181,15 @@ class VariantLight:
         if not mi.is_spectral:
             return self.of(change, wavelengths, active)
         with dr.resume_grad():
-            free = mi.Array3f(dr.detach(colour))
-            dr.enable_grad(free)
+            free = _attached(colour)
             dr.set_grad(free, mi.Array3f(change))
             return dr.select(active & _coloured(colour), dr.forward_to(self.of(free, wavelengths, active)), 0)
+
+
+def _attached(colour):
+    free = mi.Array3f(dr.detach(colour))
+    dr.enable_grad(free)
+    return free
 
 
 def _coloured(colour):

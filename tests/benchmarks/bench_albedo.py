@@ -6,20 +6,17 @@ Measure how far the albedo of ``neural_bsdf`` lies above the source's, for the f
 Both albedos are integrals of ``eval`` over the same directions, at 19 angles of incidence and eight azimuths.
 """
 
-import argparse
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+from frame import ASSETS, VARIANT, parser, short_machine, write
 
 import mi_diffind  # noqa: F401  (registers the plugins)
-from mi_diffind.core.files import write_json
 from mi_diffind.core.runtime import array_module
-from mi_diffind.measure.clock import machine
 from mi_diffind.tasks.bsdf import TASK, energy
 from mi_diffind.tasks.bsdf.truth import MitsubaTruth
 
-LIBRARY = Path(__file__).resolve().parents[2] / "scenes" / "assets" / "library"
 ANGLES = (0, 1, 2, 4, *range(8, 88, 6), 88)
 
 
@@ -39,17 +36,15 @@ def excess(path: Path, samples: int) -> dict:
 
 def main() -> None:
     """Run."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", required=True, type=Path, metavar="FILE.json")
-    parser.add_argument("--samples", type=int, default=2**17, help="directions of an angle (default: 131072)")
-    arguments = parser.parse_args()
-    mi.set_variant("llvm_ad_rgb")
-    described = machine("llvm_ad_rgb")
-    result = {"machine": {name: described[name] for name in ("cpu", "cores", "system", "mi-diffind")}, "files": {}}
-    for path in sorted(LIBRARY.glob("*.npz")):
+    command = parser(__doc__, required=True)
+    command.add_argument("--samples", type=int, default=2**17, help="directions of an angle (default: 131072)")
+    arguments = command.parse_args()
+    mi.set_variant(VARIANT)
+    result = {"machine": short_machine(), "files": {}}
+    for path in sorted((ASSETS / "library").glob("*.npz")):
         result["files"][path.stem] = excess(path, arguments.samples)
         print(path.stem, result["files"][path.stem], flush=True)
-    write_json(arguments.json, result)
+    write(arguments.json, result)
 
 
 if __name__ == "__main__":

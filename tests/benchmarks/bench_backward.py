@@ -22,27 +22,19 @@ depend on the arrays alone.
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
-import multiprocessing
 import tempfile
-import time
 from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from bench_large_material import material
+from frame import ASSETS, ROOT, VARIANT, answer_passes, earlier, in_processes, parser, spread, write
 
 import mi_diffind
 from mi_diffind.core import compat
-from mi_diffind.core.files import write_json
 from mi_diffind.measure import clock
-
-ROOT = Path(__file__).resolve().parents[2]
-ASSETS = ROOT / "scenes" / "assets"
-VARIANT = "llvm_ad_rgb"
 
 #: Pass → side of the film; samples a pixel, and those of tasks whose rays or textures make up for fewer.
 SIDES, SPP, FEWER = {"render": 320, "step": 160}, 16, {"sdf": 4, "field": 4, "texture": 4}
@@ -55,141 +47,106 @@ WARM = 2
 
 DISNEY = {"base_color": {"type": "rgb", "value": [0.6, 0.3, 0.2]}, "roughness": 0.4, "metallic": 0.3, "clearcoat": 0.5}
 METAL = {"eta": {"type": "rgb", "value": [0.2, 0.9, 1.1]}, "k": {"type": "rgb", "value": [3.9, 2.4, 2.2]}, "alpha": 0.2}
+CONDUCTOR = {"type": "roughconductor", "distribution": "ggx", **METAL}
 
-#: Maps of the material rust.
-RUST = ("albedo", "normal", "roughness", "metallic")
+#: Maps of the materials.
+TILES = [f"tiles_{name}" for name in ("albedo", "normal", "roughness", "ao")]
+RUST = [f"rust_{name}" for name in ("albedo", "normal", "roughness", "metallic")]
+
+BITMAP = {"type": "bitmap", "filename": "tiles_albedo.png"}
+BITMAPS = {
+    "type": "normalmap", "normalmap": {"type": "bitmap", "filename": "rust_normal.png", "raw": True},
+    "bsdf": {
+        "type": "principled", "base_color": {"type": "bitmap", "filename": "rust_albedo.png"},
+        **{name: {"type": "bitmap", "filename": f"rust_{name}.png", "raw": True} for name in ("roughness", "metallic")},
+    },
+}  # fmt: skip
 
 #: Repetitions of textures on the plane.
 REPEATS = 6
 
 
-def asset(name: str) -> str:
-    """Return the path of a file of the repository's scenes."""
-    return str(ASSETS / name)
+def learned(plugin: str, file: str, **more) -> dict:
+    """Return a plugin that reads a table file; of images and textures, the albedo."""
+    channels = {"channels": "albedo"} if plugin in ("neural_image", "neural_texture") else {}
+    return {"type": plugin, "filename": file, **channels, **more}
 
 
-def on_ball(bsdf: dict, **_) -> dict:
-    """Return the parts of a scene with a ball of a material."""
-    return {"shape": {"type": "sphere", "center": [0, 0.8, 0], "radius": 0.8, "bsdf": bsdf}}
-
-
-def on_plane(texture: dict, bsdf: str = "diffuse", **_) -> dict:
-    """Return the parts of a scene with a plane of a textured material."""
-    material = {"type": "diffuse", "reflectance": texture} if bsdf == "diffuse" else texture
-    turn = mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale(6)
-    return {"shape": {"type": "rectangle", "to_world": turn, "bsdf": material}}
-
-
-def repeated(plugin: dict) -> dict:
-    """Return a texture or material that is repeated on the plane."""
-    return {**plugin, "to_uv": mi.ScalarTransform3f().scale(REPEATS)}
-
-
-def bitmap(file: str, storage: str, raw: bool = False) -> dict:
-    """Return Mitsuba's ``bitmap``; only one in the variant's precision can be optimised."""
-    precision = {"format": "variant"} if storage == "float32" else {}
-    return repeated({"type": "bitmap", "filename": asset(file), "raw": raw, **precision})
-
-
-def rust_bitmaps(storage: str) -> dict:
-    """Return Mitsuba's material of the maps of rust."""
-    maps = {name: bitmap(f"rust_{name}.png", storage, name != "albedo") for name in RUST}
-
-    parameters = {"base_color": "albedo", "roughness": "roughness", "metallic": "metallic"}
-    nested = {"type": "principled", **{parameter: maps[name] for parameter, name in parameters.items()}}
-    return {"type": "normalmap", "normalmap": maps["normal"], "bsdf": nested}
-
-
-def sdf_mesh() -> dict:
-    """Return Suzanne as a mesh."""
-    return {"shape": {"type": "ply", "filename": asset("suzanne.ply")}}
-
-
-def field(name: str, storage: str, folder: Path) -> dict:
-    """Return the integrator of a radiance field."""
-    return {"integrator": {"type": "neural_field", "filename": str(folder / f"field_{name}.npz"), "storage": storage}}
-
-
-def learned_image(filename, storage: str) -> dict:
-    """Return the albedo of a file of the task ``image``."""
-    return repeated({"type": "neural_image", "filename": str(filename), "channels": "albedo", "storage": storage})
-
-
-#: Task → name of a contender → parts of its scene, of ``storage`` and ``folder`` (the files of :func:`prepare`). The
-#: first contender is what a user would take instead. ``keys``: parameters of the step, a pattern.
+#: Task → name of a contender → its plugin, with files of ``scenes/assets`` or of :func:`prepare`. The first contender
+#: is what a user would take instead.
 CONTENDERS = {
     "ggx": {
-        "roughconductor": lambda **_: on_ball({"type": "roughconductor", "distribution": "ggx", **METAL}),
-        "ours": lambda **_: on_ball({"type": "neural_ggx", **METAL}),
-        "paper": lambda **_: on_ball({"type": "neural_ggx", "preset": "paper", **METAL}),
+        "roughconductor": CONDUCTOR, "ours": {"type": "neural_ggx", **METAL},
+        "paper": {"type": "neural_ggx", "preset": "paper", **METAL},
     },
     "disney": {
-        "principled": lambda **_: on_ball({"type": "principled", **DISNEY}),
-        "disney": lambda **_: on_ball({"type": "disney", **DISNEY}),
-        "ours": lambda **_: on_ball({"type": "neural_disney", **DISNEY}),
-        "paper": lambda **_: on_ball({"type": "neural_disney", "preset": "paper", **DISNEY}),
+        **{name: {"type": name, **DISNEY} for name in ("principled", "disney")},
+        "ours": {"type": "neural_disney", **DISNEY}, "paper": {"type": "neural_disney", "preset": "paper", **DISNEY},
     },
     "bsdf": {
-        "roughconductor": lambda **_: on_ball({"type": "roughconductor", "distribution": "ggx", **METAL}),
-        "ours": lambda **_: on_ball({"type": "neural_bsdf", "filename": asset("library/copper.npz")}),
-        "paper": lambda folder, **_: on_ball({"type": "neural_bsdf", "filename": str(folder / "bsdf_paper.npz")}),
+        "roughconductor": CONDUCTOR, "ours": learned("neural_bsdf", "library/copper.npz"),
+        "paper": learned("neural_bsdf", "bsdf_paper.npz"),
     },
     "image": {
-        "bitmap": lambda storage, **_: on_plane(bitmap("tiles_albedo.png", storage)),
-        "ours": lambda storage, **_: on_plane(learned_image(asset("tiles.npz"), storage)),
-        "paper": lambda storage, folder: on_plane(learned_image(folder / "image_paper.npz", storage)),
+        "bitmap": BITMAP, "ours": learned("neural_image", "tiles.npz"),
+        "paper": learned("neural_image", "image_paper.npz"),
     },
     "large": {
-        "bitmap": lambda storage, folder: on_plane(bitmap(str(folder / "large" / "albedo.png"), storage)),
-        "ours": lambda storage, folder: on_plane(learned_image(folder / "large_ours.npz", storage)),
-        "paper": lambda storage, folder: on_plane(learned_image(folder / "large_paper.npz", storage)),
+        "bitmap": {"type": "bitmap", "filename": "large/albedo.png"},
+        **{name: learned("neural_image", f"large_{name}.npz") for name in ("ours", "paper")},
     },
     "texture": {
-        "bitmap": lambda storage, **_: {
-            **on_plane(bitmap("tiles_albedo.png", storage)), "spp": SPP, "sampler": "multijitter",
-        },
-        "mipmap": lambda **_: on_plane(repeated({"type": "mipmap", "filename": asset("tiles_albedo.png")})),
-        "ours": lambda storage, **_: on_plane(
-            repeated({"type": "neural_texture", "filename": asset("tiles_filtered.npz"), "channels": "albedo",
-                      "storage": storage, "filter": "anisotropic"})
-        ),
-        "paper": lambda storage, folder: on_plane(
-            repeated({"type": "neural_texture", "filename": str(folder / "texture_paper.npz"), "channels": "albedo",
-                      "storage": storage})
-        ),
+        "bitmap": BITMAP, "mipmap": {"type": "mipmap", "filename": "tiles_albedo.png"},
+        "ours": learned("neural_texture", "tiles_filtered.npz", filter="anisotropic"),
+        "paper": learned("neural_texture", "texture_paper.npz"),
     },
     "shading": {
-        "normalmap + principled + bitmaps": lambda storage, **_: on_plane(rust_bitmaps(storage), "material"),
-        "ours": lambda storage, **_: on_plane(
-            repeated({"type": "neural_material", "filename": asset("rust_shaded.npz"), "storage": storage}), "material"
-        ),
-        "paper": lambda storage, folder: on_plane(
-            repeated({"type": "neural_material", "filename": str(folder / "shading_paper.npz"), "storage": storage}),
-            "material",
-        ),
+        "normalmap + principled + bitmaps": BITMAPS, "ours": learned("neural_material", "rust_shaded.npz"),
+        "paper": learned("neural_material", "shading_paper.npz"),
     },
     "sdf": {
-        "mesh": lambda **_: sdf_mesh(),
-        "sdfgrid": lambda folder, **_: {
-            "shape": {"type": "sdfgrid", "normals": "smooth", **grid_of(folder / "sdf_grid.npz")}
-        },
-        "ours": lambda storage, folder: {
-            "shape": {"type": "neural_sdf", "filename": str(folder / "sdf_ours.npz"), "storage": storage,
-                      "trace": "arrays"},
-            "traced": True,
-        },
-        "paper": lambda storage, folder: {
-            "shape": {"type": "neural_sdf", "filename": str(folder / "sdf_paper.npz"), "storage": storage,
-                      "trace": "arrays"},
-            "traced": True,
-        },
+        "mesh": {"type": "ply", "filename": "suzanne.ply"},
+        "sdfgrid": {"type": "sdfgrid", "normals": "smooth", "filename": "sdf_grid.npz"},
+        **{name: learned("neural_sdf", f"sdf_{name}.npz", trace="arrays") for name in ("ours", "paper")},
     },
-    "field": {
-        "grid": lambda folder, **_: field("grid", "float32", folder),
-        "ours": lambda storage, folder: field("ours", storage, folder),
-        "paper": lambda storage, folder: field("paper", storage, folder),
-    },
+    "field": {name: learned("neural_field", f"field_{name}.npz") for name in ("grid", "ours", "paper")},
 }  # fmt: skip
+
+
+def place(file: str, folder: Path) -> Path:
+    """Return the path of a file of ``scenes/assets`` or of the folder of :func:`prepare`."""
+    return ASSETS / file if (ASSETS / file).is_file() else folder / file
+
+
+def described(plugin: dict, storage: str, folder: Path) -> dict:
+    """Return a plugin for ``mi.load_dict``: paths of files, storage, repetitions of textures, and those within it."""
+    plugin = {key: described(value, storage, folder) if isinstance(value, dict) else value
+              for key, value in plugin.items()}  # fmt: skip
+    kind = plugin["type"]
+    if kind == "sdfgrid":
+        return {"type": kind, "normals": plugin["normals"], **grid_of(place(plugin["filename"], folder))}
+    if "filename" in plugin:
+        plugin["filename"] = str(place(plugin["filename"], folder))
+    if kind == "bitmap" and storage == "float32":
+        plugin["format"] = "variant"  # only a bitmap in the variant's precision can be optimised
+    if kind in ("neural_image", "neural_texture", "neural_material", "neural_sdf", "neural_field"):
+        plugin["storage"] = "float32" if plugin["filename"].endswith("field_grid.npz") else storage
+    if kind in ("bitmap", "mipmap", "neural_image", "neural_texture", "neural_material"):
+        plugin["to_uv"] = mi.ScalarTransform3f().scale(REPEATS)
+    return plugin
+
+
+def parts(task: str, contender: str, storage: str, folder: Path) -> dict:
+    """Return the parts of the scene of a contender: a ball or a plane of its material, a shape, or an integrator."""
+    plugin = described(CONTENDERS[task][contender], storage, folder)
+    if task in ("ggx", "disney", "bsdf"):
+        return {"shape": {"type": "sphere", "center": [0, 0.8, 0], "radius": 0.8, "bsdf": plugin}}
+    if task in ("sdf", "field"):
+        return {"shape" if task == "sdf" else "integrator": plugin}
+    bsdf = plugin if task == "shading" else {"type": "diffuse", "reflectance": plugin}
+    turn = mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale(6)
+    return {"shape": {"type": "rectangle", "to_world": turn, "bsdf": bsdf}}
+
 
 #: Task → pattern of the parameters of a step.
 KEYS = {
@@ -227,7 +184,7 @@ def write_grid(path: Path) -> None:
     from mi_diffind.tasks.sdf.distances import Distances
     from mi_diffind.tasks.sdf.mesh import load_mesh
 
-    mesh = load_mesh(asset("suzanne.ply"))
+    mesh = load_mesh(str(ASSETS / "suzanne.ply"))
     spacing = float((mesh.upper - mesh.lower).max()) / CELLS
     lower = mesh.lower - 3 * spacing
     counts = np.ceil((mesh.upper - lower) / spacing).astype(int) + 4
@@ -242,11 +199,10 @@ def write_grid(path: Path) -> None:
 
 def grid_error(path: Path, normal: str = "smooth", count: int = 2**18) -> float:
     """Return the mean angle, in degrees, of the normals of ``sdfgrid`` from the mesh's, where rays meet both."""
-    from mi_diffind.tasks.sdf.distances import Distances
+    from mi_diffind.tasks.sdf.distances import Distances, sample_surface
     from mi_diffind.tasks.sdf.mesh import load_mesh
-    from mi_diffind.tasks.sdf.sampling import sample_surface
 
-    mesh = load_mesh(asset("suzanne.ply"))
+    mesh = load_mesh(str(ASSETS / "suzanne.ply"))
     points, normals = sample_surface(Distances(mesh).surface, count, 1)
     shape = {"type": "sdfgrid", "normals": normal, **grid_of(path)}
     scene = mi.load_dict({"type": "scene", "shape": shape})
@@ -265,50 +221,25 @@ def file_sizes(path: Path, storage: str = "uint8") -> dict[str, int]:
     return {"memory": model.memory_nbytes, "disk": path.stat().st_size}
 
 
-def sizes(folder: Path, tasks: list[str]) -> dict[str, dict]:
-    """Return the bytes of the contenders in memory and on disk, by task; meshes and images as they are stored."""
-
-    def bitmaps(names) -> dict:
-        paths = [ASSETS / f"{name}.png" for name in names]
-        arrays = [mi.Bitmap(str(path)) for path in paths]
-        memory = sum(math.prod(np.array(a).shape) for a in arrays)
-        return {"memory": memory, "disk": sum(path.stat().st_size for path in paths)}
-
-    def shipped(name, storage: str) -> dict:
-        return file_sizes(ROOT / "mi_diffind" / "data" / f"{name}.npz", storage)
-
-    nothing = {"memory": 0, "disk": 0}
-
-    def files(ours: Path, paper: str, **theirs) -> dict:
-        return {**theirs, "ours": file_sizes(ours), "paper": file_sizes(folder / paper)}
-
-    tiles = [f"tiles_{name}" for name in ("albedo", "normal", "roughness", "ao")]
-    maps = {"normalmap + principled + bitmaps": [f"rust_{name}" for name in RUST]}
-    of_task = {
-        "ggx": lambda: {
-            "roughconductor": nothing,
-            "ours": shipped("ggx_tables", "float32"),
-            "paper": shipped("ggx_paper", "float32"),
-        },
-        "disney": lambda: {
-            **dict.fromkeys(("principled", "disney"), nothing),
-            "ours": shipped("disney_tables", "uint8"),
-            "paper": shipped("disney_paper", "uint8"),
-        },
-        "bsdf": lambda: files(ASSETS / "library" / "copper.npz", "bsdf_paper.npz"),
-        "image": lambda: files(ASSETS / "tiles.npz", "image_paper.npz", bitmap=bitmaps(tiles)),
-        "large": dict,
-        "texture": lambda: files(ASSETS / "tiles_filtered.npz", "texture_paper.npz", bitmap=bitmaps(tiles)),
-        "shading": lambda: files(
-            ASSETS / "rust_shaded.npz", "shading_paper.npz", **{name: bitmaps(maps[name]) for name in maps}
-        ),
-        "sdf": lambda: files(
-            folder / "sdf_ours.npz", "sdf_paper.npz", mesh={"disk": (ASSETS / "suzanne.ply").stat().st_size},
-            sdfgrid={"memory": int(np.load(folder / "sdf_grid.npz")["values"].nbytes)},
-        ),
-        "field": lambda: {name: file_sizes(folder / f"field_{name}.npz", "") for name in ("grid", "ours", "paper")},
-    }  # fmt: skip
-    return {task: of_task[task]() for task in tasks}
+def sizes(task: str, folder: Path) -> dict[str, dict]:
+    """Return the bytes of the contenders of a task in memory and on disk; meshes and images as they are stored."""
+    if task == "large":
+        return {}
+    storages = {"field": "", "ggx": "float32"}
+    result = {name: {"memory": 0, "disk": 0} for name in CONTENDERS[task] if task in ("ggx", "disney")}
+    for name, plugin in CONTENDERS[task].items():
+        if plugin["type"].startswith("neural_"):
+            shipped = ROOT / "mi_diffind" / "data" / f"{task}_{plugin.get('preset', 'tables')}.npz"
+            path = place(plugin["filename"], folder) if "filename" in plugin else shipped
+            result[name] = file_sizes(path, storages.get(task, "uint8"))
+    if task in ("image", "texture", "shading"):
+        paths = [ASSETS / f"{name}.png" for name in (RUST if task == "shading" else TILES)]
+        memory = sum(math.prod(np.array(mi.Bitmap(str(path))).shape) for path in paths)
+        result[next(iter(CONTENDERS[task]))] = {"memory": memory, "disk": sum(path.stat().st_size for path in paths)}
+    if task == "sdf":
+        result["mesh"] = {"disk": (ASSETS / "suzanne.ply").stat().st_size}
+        result["sdfgrid"] = {"memory": int(np.load(folder / "sdf_grid.npz")["values"].nbytes)}
+    return result
 
 
 def prepare(folder: Path, tasks: list[str]) -> None:
@@ -319,21 +250,21 @@ def prepare(folder: Path, tasks: list[str]) -> None:
         return mi_diffind.fit(task, source, progress=False, **options).save(folder / f"{name}.npz")
 
     if "bsdf" in tasks:
-        fitted("bsdf", {"type": "roughconductor", "distribution": "ggx", **METAL}, "bsdf_paper", preset="paper")
+        fitted("bsdf", CONDUCTOR, "bsdf_paper", preset="paper")
     if "image" in tasks:
-        fitted("image", asset("tiles.json"), "image_paper", preset="paper", seconds=SECONDS)
+        fitted("image", str(ASSETS / "tiles.json"), "image_paper", preset="paper", seconds=SECONDS)
     if "large" in tasks:
         manifest = material(folder / "large", "lacquer", 4096)
         for preset in ("ours", "paper"):
             options = {"preset": preset, "seconds": LARGE_SECONDS, "compression": 12}
             fitted("image", str(manifest), f"large_{preset}", **options)
     if "texture" in tasks:
-        fitted("texture", asset("tiles.json"), "texture_paper", preset="paper", seconds=SECONDS)
+        fitted("texture", str(ASSETS / "tiles.json"), "texture_paper", preset="paper", seconds=SECONDS)
     if "shading" in tasks:
-        fitted("texture", asset("rust.json"), "shading_paper", preset="paper", seconds=SECONDS)
+        fitted("texture", str(ASSETS / "rust.json"), "shading_paper", preset="paper", seconds=SECONDS)
     if "sdf" in tasks:
         for preset, name in (("sparse", "sdf_ours"), ("paper", "sdf_paper")):
-            fitted("sdf", asset("suzanne.ply"), name, preset=preset, bytes="1m")
+            fitted("sdf", str(ASSETS / "suzanne.ply"), name, preset=preset, bytes="1m")
         write_grid(folder / "sdf_grid.npz")
     if "field" in tasks:
         views = folder / "views"
@@ -345,14 +276,15 @@ def prepare(folder: Path, tasks: list[str]) -> None:
 
 def scene(task: str, contender: str, size: str, folder: Path):
     """Return the scene of a contender."""
-    parts = CONTENDERS[task][contender](storage="float32" if size == "step" else "uint8", folder=folder)
     eye, target = VIEWS.get(task, ([0, 2.2, 4.2], [0, 0.5, 0]))
-    integrator = {"type": "path_sdf" if parts.pop("traced", False) else "prb", "max_depth": 3}
-    side, spp, sampler = SIDES[size], parts.pop("spp", FEWER.get(task, SPP)), parts.pop("sampler", "independent")
+    traced = CONTENDERS[task][contender]["type"] == "neural_sdf"
+    many = (task, contender) == ("texture", "bitmap")
+    side, spp = SIDES[size], SPP if many else FEWER.get(task, SPP)
     return mi_diffind.load_dict({
-        "type": "scene", "integrator": integrator,
+        "type": "scene", "integrator": {"type": "path_sdf" if traced else "prb", "max_depth": 3},
         "sensor": {
-            "type": "perspective", "fov": 40, "sampler": {"type": sampler, "sample_count": spp},
+            "type": "perspective", "fov": 40,
+            "sampler": {"type": "multijitter" if many else "independent", "sample_count": spp},
             "to_world": mi.ScalarTransform4f().look_at(eye, target, [0, 1, 0]),
             "film": {
                 "type": "hdrfilm", "width": side, "height": side, "pixel_format": "rgb", "rfilter": {"type": "box"},
@@ -360,12 +292,12 @@ def scene(task: str, contender: str, size: str, folder: Path):
         },
         "sky": {"type": "constant", "radiance": 0.6},
         "lamp": {"type": "point", "position": [2.0, 4.0, 3.0], "intensity": 20.0},
-        **parts,
+        **parts(task, contender, "float32" if size == "step" else "uint8", folder),
     })  # fmt: skip
 
 
-def worker(task: str, contender: str, size: str, folder: str, pipe) -> None:
-    """Process of one scene: send its parameters, then the seconds of a pass for each seed received."""
+def worker(contender: str, task: str, size: str, folder: str, pipe) -> None:
+    """Process of one scene: send its parameters, then the times of passes."""
     mi.set_variant(VARIANT)
     mi.set_log_level(mi.LogLevel.Error)
     compat.use_threads(1)
@@ -394,66 +326,39 @@ def worker(task: str, contender: str, size: str, folder: str, pipe) -> None:
     except Exception as error:  # the reason is reported, and the task goes on without this contender
         pipe.send({"error": compat.one_sentence(error) if isinstance(error, RuntimeError) else repr(error)})
         return
-    while (i := pipe.recv()) is not None:
-        seed = dr.opaque(mi.UInt32, i)
-        dr.sync_thread()
-        start, start_cpu = time.perf_counter(), time.process_time()
-        dr.eval(run(seed))
-        dr.sync_thread()
-        pipe.send((1e3 * (time.perf_counter() - start), 1e3 * (time.process_time() - start_cpu)))
-
-
-def spread(values) -> dict:
-    """Return the median and the quartiles."""
-    low, median, high = np.quantile(values, (0.25, 0.5, 0.75))
-    return {"median": float(median), "q1": float(low), "q3": float(high)}
+    answer_passes(pipe, run)
 
 
 def measured(task: str, size: str, folder: Path, rounds: int) -> dict[str, dict]:
     """Return the milliseconds of a pass of each contender, and ratios to the first, by turns."""
-    context, pipes, results, times = multiprocessing.get_context("spawn"), {}, {}, {}
-    for name in CONTENDERS[task]:
-        pipe, other = context.Pipe()
-        context.Process(target=worker, args=(task, name, size, str(folder), other), daemon=True).start()
-        results[name] = pipe.recv()
-        if "error" in results[name]:
-            print(task, size, name, results[name], flush=True)
-        else:
-            pipes[name], times[name] = pipe, []
-    for i in range(rounds):
-        for name in pipes if i % 2 == 0 else reversed(pipes):
-            pipes[name].send(WARM + i)
-            times[name].append(pipes[name].recv())
-    for pipe in pipes.values():
-        pipe.send(None)
-    cpu = {name: np.array(both)[:, 1] for name, both in times.items()}
-    first = next(iter(CONTENDERS[task]))
-    for name, both in times.items():
-        results[name] |= {"ms": spread(np.array(both)[:, 0]), "cpu_ms": spread(cpu[name])}
-        if first in cpu:
-            results[name]["ratio"] = spread(cpu[name] / cpu[first])
+    results = in_processes(worker, list(CONTENDERS[task]), rounds, task, size, str(folder), warm=0)
+    first = next(iter(results.values())).get("cpu_ms")
+    for name, figures in results.items():
+        if "error" in figures:
+            print(task, size, name, figures, flush=True)
+            continue
+        cpu = figures["cpu_ms"]
+        figures |= {"ms": spread(figures["ms"]), "cpu_ms": spread(cpu)}
+        if first is not None:
+            figures["ratio"] = spread(cpu / first)
     return results
 
 
 def main() -> None:
     """Measure the tasks that are named, or all of them."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("tasks", nargs="*", metavar="TASK", help=", ".join(CONTENDERS))
-    parser.add_argument("--rounds", type=int, default=15)
-    parser.add_argument("--json", help="file to write; tasks that it holds already and that are not named stay")
-    arguments = parser.parse_args()
-    unknown = set(arguments.tasks) - set(CONTENDERS)
-    if unknown:
-        parser.error(f"unknown task {', '.join(sorted(unknown))}: allowed are {', '.join(CONTENDERS)}")
+    command = parser(__doc__, rounds=15)
+    command.add_argument("tasks", nargs="*", metavar="TASK", help=", ".join(CONTENDERS))
+    arguments = command.parse_args()
+    if unknown := set(arguments.tasks) - set(CONTENDERS):
+        command.error(f"unknown task {', '.join(sorted(unknown))}: allowed are {', '.join(CONTENDERS)}")
     mi.set_variant(VARIANT)
     mi.set_log_level(mi.LogLevel.Error)
     names = arguments.tasks or list(CONTENDERS)
-    kept = Path(arguments.json) if arguments.json else None
-    before = json.loads(kept.read_text(encoding="utf-8")) if kept and kept.is_file() else {}
-    results, counted, errors = (before.get(key, {}) for key in ("tasks", "bytes", "errors"))
+    before = earlier(arguments.json, tasks={}, bytes={}, errors={})
+    results, counted, errors = (before[key] for key in ("tasks", "bytes", "errors"))
     with tempfile.TemporaryDirectory() as folder:
         prepare(Path(folder), names)
-        counted |= sizes(Path(folder), names)
+        counted |= {task: sizes(task, Path(folder)) for task in names}
         if "sdf" in names:
             errors["sdfgrid"] = grid_error(Path(folder) / "sdf_grid.npz")
         for task in names:
@@ -464,11 +369,10 @@ def main() -> None:
                     if "ratio" in figures:
                         shown = {key: round(figures[key]["median"], 2) for key in ("ms", "cpu_ms", "ratio")}
                         print(task, size, name, shown, figures["parameters"], "of", figures["exposed"], flush=True)
-            if kept:
-                write_json(kept, {
-                    "machine": clock.machine(VARIANT), "rounds": arguments.rounds, "spp": SPP, "fewer": FEWER,
-                    "sides": SIDES, "bytes": counted, "errors": errors, "tasks": results,
-                })  # fmt: skip
+            write(arguments.json, {
+                "machine": clock.machine(VARIANT), "rounds": arguments.rounds, "spp": SPP, "fewer": FEWER,
+                "sides": SIDES, "bytes": counted, "errors": errors, "tasks": results,
+            })  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -5,14 +5,13 @@ Measure the parts of the compression of a radiance field: each is left out or ch
     python tests/benchmarks/bench_field.py out/group --grid out/group.grid.npz --json docs/measured/bench_field.json
 """
 
-import argparse
 import dataclasses
 import json
 import os
-import sys
 import time
 
-from mi_diffind.core.files import write_json
+from frame import parser, write
+
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting.task import FitRequest, tasks
 from mi_diffind.tasks.radiance import PRESETS, compression, dense_bytes, files, fit
@@ -31,12 +30,11 @@ ROWS = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("source", metavar="FOLDER")
-    parser.add_argument("--grid", required=True, metavar="FILE", help="grid, made by fit field --preset grid")
-    parser.add_argument("--steps", type=int, default=500)
-    parser.add_argument("--json", metavar="FILE")
-    arguments = parser.parse_args()
+    command = parser(__doc__)
+    command.add_argument("source", metavar="FOLDER")
+    command.add_argument("--grid", required=True, metavar="FILE", help="grid, made by fit field --preset grid")
+    command.add_argument("--steps", type=int, default=500)
+    arguments = command.parse_args()
     types = array_module("llvm")
     session = FieldSession.load(types, arguments.source)
     grid = files.grid_of(files.load(arguments.grid), types)
@@ -68,10 +66,9 @@ def main() -> None:
             row["compression"] = dense / row["bytes"]
         rows.append(row)
         print(json.dumps(row), flush=True)
-    if arguments.json:
-        source = os.path.basename(arguments.source)
-        write_json(arguments.json, {"steps": arguments.steps, "source": source, "rows": rows})
+    source = os.path.basename(arguments.source)
+    write(arguments.json, {"steps": arguments.steps, "source": source, "rows": rows})
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

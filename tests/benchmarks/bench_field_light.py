@@ -9,8 +9,6 @@ it, then lights a floor and a wall in the dark; so does the mesh with an area li
 
 from __future__ import annotations
 
-import argparse
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -18,11 +16,11 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from frame import ASSETS, VARIANT, parser, write
 
 import mi_diffind
-from mi_diffind.core.files import write_json
 
-KNOT = str(Path(__file__).parents[2] / "scenes/assets/knot.ply")
+KNOT = str(ASSETS / "knot.ply")
 
 RADIANCE = 0.8
 
@@ -70,12 +68,11 @@ def images(scene: mi.Scene, spp: int, count: int) -> tuple[np.ndarray, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--resolution", type=int, default=80, help="nodes along a side of the field")
-    parser.add_argument("--seconds", type=float, default=60, help="duration of the training")
-    parser.add_argument("--json", metavar="FILE")
-    arguments = parser.parse_args()
-    mi.set_variant("llvm_ad_rgb")
+    command = parser(__doc__)
+    command.add_argument("--resolution", type=int, default=80, help="nodes along a side of the field")
+    command.add_argument("--seconds", type=float, default=60, help="duration of the training")
+    arguments = command.parse_args()
+    mi.set_variant(VARIANT)
     with tempfile.TemporaryDirectory() as folder:
         path = fitted(Path(folder), arguments.resolution, arguments.seconds)
         field = {"type": "neural_field", "filename": str(path), "lit": True}
@@ -99,9 +96,8 @@ def main() -> None:
             results[name] = {"variance": variance, "cpu_seconds": seconds, "variance_times_seconds": variance * seconds}
     for name, value in results.items():
         print(name, value)
-    if arguments.json:
-        write_json(arguments.json, results)
+    write(arguments.json, results)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

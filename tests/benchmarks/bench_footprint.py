@@ -8,8 +8,6 @@ mirrors and through glass, with those of ``path_footprint``. Of the side and the
 percentile of the relative error. The scenes and the finite differences are those of the tests.
 """
 
-import argparse
-import json
 import sys
 from pathlib import Path
 
@@ -20,6 +18,7 @@ import footprints as fp  # noqa: E402
 import mitsuba as mi  # noqa: E402
 import test_footprint as direct  # noqa: E402
 import test_path_footprint as traced  # noqa: E402
+from frame import VARIANT, parser, write  # noqa: E402
 
 import mi_diffind  # noqa: E402, F401
 
@@ -40,10 +39,9 @@ def seen_in(shapes: dict, chain: tuple, size: tuple[int, int]) -> list:
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", metavar="FILE", help="where to write the errors")
-    parser.add_argument("--variant", default="llvm_ad_rgb")
-    arguments = parser.parse_args()
+    command = parser(__doc__)
+    command.add_argument("--variant", default=VARIANT)
+    arguments = command.parse_args()
     mi.set_variant(arguments.variant)
     small, large = (fp.WIDTH, fp.HEIGHT), (8 * fp.WIDTH, 8 * fp.HEIGHT)
     rows = {}
@@ -64,8 +62,7 @@ def main():
     result = {"variant": arguments.variant, "size": small, "rows": rows}
     for name, ((side, side_worst), (axis, axis_worst)) in rows.items():
         print(f"{name:40} side {side:8.2%} {side_worst:8.2%}   major axis {axis:8.2%} {axis_worst:8.2%}")
-    if arguments.json:
-        Path(arguments.json).write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    write(arguments.json, result)
 
 
 if __name__ == "__main__":

@@ -9,21 +9,18 @@ preparation. Files that FOLDER holds are not trained again. Raw bytes are those 
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+from frame import VARIANT, parser, write
 
 import mi_diffind
-from mi_diffind.core.files import write_json
 from mi_diffind.maps.source import load_source
 from mi_diffind.measure import clock
 from mi_diffind.studies.baselines import codecs
-
-VARIANT = "llvm_ad_rgb"
 
 #: The smallest blocks of ASTC in which three maps of 7 channels take less than a twelfth of their raw bytes.
 BLOCK = "10x10"
@@ -71,28 +68,26 @@ def astc(source) -> dict:
 
 def main() -> None:
     """Measure the contenders and write the JSON."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--material", default="lacquer")
-    parser.add_argument("--side", type=int, default=4096)
-    parser.add_argument("--seconds", type=float, default=300)
-    parser.add_argument("--compression", type=float, default=12)
-    parser.add_argument("--json")
-    arguments = parser.parse_args()
+    command = parser(__doc__)
+    command.add_argument("folder", type=Path)
+    command.add_argument("--material", default="lacquer")
+    command.add_argument("--side", type=int, default=4096)
+    command.add_argument("--seconds", type=float, default=300)
+    command.add_argument("--compression", type=float, default=12)
+    arguments = command.parse_args()
     mi.set_variant(VARIANT)
     manifest = material(arguments.folder, arguments.material, arguments.side)
     result = {"machine": clock.machine(VARIANT), "material": arguments.material, "side": arguments.side}
     for preset in ("ours", "paper"):
-        options = (manifest, preset, arguments.seconds, arguments.compression)
-        result[preset] = trained(arguments.folder / f"{preset}.npz", *options)
+        path = arguments.folder / f"{preset}.npz"
+        result[preset] = trained(path, manifest, preset, arguments.seconds, arguments.compression)
         print(preset, result[preset], flush=True)
     source = load_source(str(manifest))
     files = [arguments.folder / f"{m.name}.png" for m in source.maps]
     result["raw"] = {"bytes": source.nbytes, "file_bytes": sum(f.stat().st_size for f in files)}
     result["ASTC"] = astc(source)
     print("ASTC", result["ASTC"], flush=True)
-    if arguments.json:
-        write_json(arguments.json, result)
+    write(arguments.json, result)
 
 
 if __name__ == "__main__":

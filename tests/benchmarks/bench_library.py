@@ -9,7 +9,6 @@ A few materials are fitted once more, alone, and their bytes compared.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import random
@@ -18,6 +17,8 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+
+from frame import parser, resident, write
 
 
 def write_materials(folder: Path, count: int) -> None:
@@ -46,32 +47,25 @@ def write_materials(folder: Path, count: int) -> None:
 
 def children(process: int) -> list[int]:
     """Return the processes that a process has begun."""
-    listed = Path(f"/proc/{process}/task/{process}/children").read_text().split()
-    return [int(child) for child in listed]
+    return list(map(int, Path(f"/proc/{process}/task/{process}/children").read_text().split()))
 
 
 def runs(process: int) -> bool:
+    """Return whether a process has not ended."""
     try:
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
 
 
-def resident(process: int) -> float:
-    """Return the memory of a process in MB."""
-    pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-
 def main() -> None:
     """Run."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--materials", type=int, default=100)
-    parser.add_argument("--steps", type=int, default=20)
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--json", type=Path)
-    arguments = parser.parse_args()
+    command = parser(__doc__)
+    command.add_argument("folder", type=Path)
+    command.add_argument("--materials", type=int, default=100)
+    command.add_argument("--steps", type=int, default=20)
+    command.add_argument("--workers", type=int, default=2)
+    arguments = command.parse_args()
     arguments.folder.mkdir(exist_ok=True)
     sources, output = arguments.folder / "materials", arguments.folder / "learned"
     write_materials(sources, arguments.materials)
@@ -86,14 +80,14 @@ def main() -> None:
     while fitted() < arguments.materials // 3 and run.poll() is None:
         time.sleep(0.2)
     victim = children(run.pid)[0]
-    memory.append(resident(victim))
+    memory.append(1.048576 * resident(victim))
     os.kill(victim, signal.SIGKILL)
     at_worker = fitted()
     while fitted() < arguments.materials // 2 and run.poll() is None:
         time.sleep(0.2)
     assert victim not in children(run.pid) and len(children(run.pid)) == arguments.workers
     workers = children(run.pid)
-    memory += [resident(worker) for worker in workers]
+    memory += [1.048576 * resident(worker) for worker in workers]
     run.kill()
     run.wait()
     killed = time.perf_counter()
@@ -125,8 +119,7 @@ def main() -> None:
         "leftovers": [str(file.relative_to(output)) for file in output.rglob(".*")],
     }  # fmt: skip
     print(json.dumps(result, indent=2))
-    if arguments.json is not None:
-        arguments.json.write_text(json.dumps(result, indent=2) + "\n")
+    write(arguments.json, result)
 
 
 if __name__ == "__main__":

@@ -9,20 +9,15 @@ a step of a training inside the scene: a render by ``prb`` and its derivatives w
     python tests/benchmarks/bench_material.py [--rounds 21] [--json FILE]
 """
 
-import argparse
-import json
-import multiprocessing
 import time
-from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
+from frame import ASSETS, VARIANT, answer_passes, in_processes, parser, spread, write
 
 import mi_diffind
-from mi_diffind.measure import clock, operations
+from mi_diffind.measure import clock
 
-ASSETS = Path(__file__).resolve().parents[2] / "scenes" / "assets"
 FILE = str(ASSETS / "rust_plain.npz")
 
 #: Parameter of the BSDF → map of the file.
@@ -86,14 +81,9 @@ def scene(bsdf: dict, width: int, height: int, integrator: str = "path"):
     })  # fmt: skip
 
 
-def spread(values) -> dict:
-    low, median, high = np.quantile(values, (0.25, 0.5, 0.75))
-    return {"median": float(median), "q1": float(low), "q3": float(high)}
-
-
 def worker(name: str, size: str, pipe) -> None:
     """Process of one scene: Dr.Jit compiles the materials of all scenes that a process holds into each kernel."""
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     mi.set_log_level(mi.LogLevel.Error)
     trains = size == "step"
     bsdf = materials(8, "float32" if trains else "uint8")[name]
@@ -112,57 +102,29 @@ def worker(name: str, size: str, pipe) -> None:
         dr.backward(dr.mean(mi.render(loaded, parameters, spp=1, seed=seed, seed_grad=seed + 10_000), axis=None))
         return [parameters[key].grad for key in parameters.keys()]
 
-    counted = operations.count(lambda: run(dr.opaque(mi.UInt32, 0)))
-    pipe.send(counted.asdict())
-    while (i := pipe.recv()) is not None:
-        seed = dr.opaque(mi.UInt32, i)
-        dr.sync_thread()
-        start, start_cpu = time.perf_counter(), seconds()
-        dr.eval(run(seed))
-        dr.sync_thread()
-        pipe.send((1e3 * (time.perf_counter() - start), 1e3 * (seconds() - start_cpu)))
+    pipe.send({"operations": clock.count(lambda: run(dr.opaque(mi.UInt32, 0))).asdict()})
+    answer_passes(pipe, run, seconds)
 
 
 def measured(size: str, rounds: int) -> dict[str, dict]:
     """Operations of the kernels of each scene, milliseconds of a pass, and ratios to separate plugins, by turns."""
-    context, pipes, counted, times = multiprocessing.get_context("spawn"), {}, {}, {}
-    names = NAMES[: 2 if size == "step" else None]
-    for name in names:
-        pipes[name], other = context.Pipe()
-        context.Process(target=worker, args=(name, size, other), daemon=True).start()
-        counted[name], times[name] = pipes[name].recv(), []
-    for i in range(rounds + 2):
-        for name in names if i % 2 == 0 else reversed(names):
-            pipes[name].send(i)
-            both = pipes[name].recv()
-            if i > 1:  # the first ones compile
-                times[name].append(both)
-    for pipe in pipes.values():
-        pipe.send(None)
-    wall, cpu = ({name: np.array(both)[:, k] for name, both in times.items()} for k in (0, 1))
-    return {
-        name: {
-            "operations": counted[name],
-            "ms": spread(wall[name]), "cpu_ms": spread(cpu[name]),
-            "ratio": spread(wall[name] / wall[SEPARATE]), "cpu_ratio": spread(cpu[name] / cpu[SEPARATE]),
-        }
-        for name in names
-    }  # fmt: skip
+    results = in_processes(worker, NAMES[: 2 if size == "step" else None], rounds, size)
+    wall, cpu = ({name: figures.pop(key) for name, figures in results.items()} for key in ("ms", "cpu_ms"))
+    for name, figures in results.items():
+        figures |= {"ms": spread(wall[name]), "cpu_ms": spread(cpu[name])}
+        figures |= {"ratio": spread(wall[name] / wall[SEPARATE]), "cpu_ratio": spread(cpu[name] / cpu[SEPARATE])}
+    return results
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=21)
-    parser.add_argument("--json")
-    arguments = parser.parse_args()
-    results = {"machine": clock.machine("llvm_ad_rgb"), "spp": 1, "max_depth": 3, "sizes": SIZES}
+    arguments = parser(__doc__, rounds=21).parse_args()
+    results = {"machine": clock.machine(VARIANT), "spp": 1, "max_depth": 3, "sizes": SIZES}
     for size in SIZES:
         results[size] = measured(size, arguments.rounds)
         for name, figures in results[size].items():
             shown = {key: round(figures[key]["median"], 3) for key in ("ms", "cpu_ms", "ratio", "cpu_ratio")}
             print(size, name, shown, figures["operations"]["instructions"], figures["operations"]["flops"], flush=True)
-    if arguments.json:
-        Path(arguments.json).write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
+    write(arguments.json, results)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ for each size. The file grows with each result; rows of the same scene, size of 
 of fields stay in ``--work``; with the same folder, an interrupted run goes on behind the last finished training.
 """
 
-import argparse
 import json
 import os
 import subprocess
@@ -18,9 +17,9 @@ import tempfile
 import time
 from pathlib import Path
 
+from frame import earlier, parser, short_machine, write
+
 from mi_diffind.arrays.tables import load_table
-from mi_diffind.core.files import write_json
-from mi_diffind.measure.clock import machine
 from mi_diffind.tasks.radiance.views import load_views
 
 
@@ -44,7 +43,7 @@ def training(folder: str, output: Path, options: list[str]) -> dict:
     """Fit a field to a folder, and return its report and its cost."""
     report, costs = output.with_suffix(".json"), output.with_suffix(".cost.json")
     if not costs.is_file():
-        write_json(costs, timed(["fit", "field", folder, "-o", str(output), "--json", str(report), *options]))
+        write(costs, timed(["fit", "field", folder, "-o", str(output), "--json", str(report), *options]))
     cost, fitted = (json.loads(file.read_text(encoding="utf-8")) for file in (costs, report))
     return fitted | cost
 
@@ -70,22 +69,18 @@ def grid_row(fitted: dict, grid_file: Path, options: list[str]) -> dict:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folders", nargs="+", metavar="FOLDER")
-    parser.add_argument("-o", "--output", required=True, metavar="FILE.json")
-    parser.add_argument("--steps", type=int, metavar="N", help="steps of each training, for trials")
-    parser.add_argument(
+    command = parser(__doc__, required=True)
+    command.add_argument("folders", nargs="+", metavar="FOLDER")
+    command.add_argument("--steps", type=int, metavar="N", help="steps of each training, for trials")
+    command.add_argument(
         "--all-cores", action="store_true", help="train on all cores: results differ in the last digits"
     )
-    parser.add_argument("--disk", nargs="*", default=[], metavar="N", help="one more field of so many bytes on disk")
-    parser.add_argument(
+    command.add_argument("--disk", nargs="*", default=[], metavar="N", help="one more field of so many bytes on disk")
+    command.add_argument(
         "--work", metavar="FOLDER", help="folder for the files of the fields (default: a temporary one)"
     )
-    arguments = parser.parse_args()
-    result_file = Path(arguments.output)
-    result = json.loads(result_file.read_text(encoding="utf-8")) if result_file.is_file() else {"rows": []}
-    described = machine("llvm_ad_rgb")
-    quoted = {name: described[name] for name in ("cpu", "cores", "system", "mi-diffind")}
+    arguments = command.parse_args()
+    result, quoted = earlier(arguments.json, rows=[]), short_machine()
     options = [] if arguments.steps is None else ["--steps", str(arguments.steps)]
     options += ["--all-cores"] if arguments.all_cores else []
     work = Path(arguments.work or tempfile.mkdtemp())
@@ -99,7 +94,7 @@ def main() -> None:
             place = {"scene": scene, "side": side, "method": values["method"]}
             result["rows"] = [r for r in result["rows"] if any(r[k] != v for k, v in place.items())]
             result["rows"].append(place | values | {"machine": quoted})
-            write_json(result_file, result)
+            write(arguments.json, result)
 
         output = work / f"{scene}{side}.npz"
         fitted = training(folder, output, ["--grid", str(grid_file), *options])

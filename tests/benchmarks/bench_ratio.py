@@ -20,10 +20,8 @@ that was interrupted goes on. Budgets are trained in turn, so that an early end 
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import dataclasses
-import json
 import math
 import runpy
 import tempfile
@@ -34,9 +32,9 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from frame import ROOT, VARIANT, earlier, parser, write
 
 import mi_diffind
-from mi_diffind.core.files import write_json
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting.task import FitRequest, tasks
 from mi_diffind.maps.source import load_source
@@ -44,14 +42,12 @@ from mi_diffind.measure import clock
 from mi_diffind.tasks.image import PRESETS
 from mi_diffind.tasks.image import arrays as image_budget
 from mi_diffind.tasks.image.fit import default_size
-from mi_diffind.tasks.radiance import dense_bytes, ratio_for
+from mi_diffind.tasks.radiance import dense_bytes, files, ratio_for
 from mi_diffind.tasks.radiance import fit as field_fit
 from mi_diffind.tasks.radiance import paper as field_paper
 from mi_diffind.tasks.sdf import paper as sdf_paper
+from mi_diffind.tasks.sdf.model import build_field
 from mi_diffind.tasks.texture import arrays as texture_budget
-
-ROOT = Path(__file__).resolve().parents[2]
-VARIANT = "llvm_ad_rgb"
 
 #: Side and channels of the image, and the largest difference of bytes from those of a budget.
 SIDE, CHANNELS, TOLERANCE = 1024, 3, 0.05
@@ -217,8 +213,13 @@ def sdf_training(distances) -> Training:
 
     def train(layout: Layout, seed: int) -> dict:
         request = request_of("sdf", "paper", seed, ratio=layout.ratio)
-        table, _, field = sdf_paper.fit_pair(distances, int(layout.budget), request, SAMPLES, HELD_OUT)
-        errors = evaluation.measure(field)
+        extent = distances.mesh.upper - distances.mesh.lower
+        shapes = sdf_paper.resolutions(int(layout.budget), layout.ratio, extent)
+        problem = sdf_paper.PairProblem(distances, shapes, "ramp", request.types, seed, SAMPLES, HELD_OUT)
+        request.train(problem)
+        table = problem.table(seed)
+        arrays = tasks()["sdf"].allocate(table, request.types.TensorXf)
+        errors = evaluation.measure(build_field(table, arrays, request.types))
         return {"bytes": table.nbytes, **{name: float(f"{value:.6g}") for name, value in errors.items()}}
 
     return train
@@ -230,8 +231,8 @@ def field_training(session, grid) -> Training:
     def train(layout: Layout, seed: int) -> dict:
         options = {"compression": layout.budget, f"{layout.part}_ratio": layout.ratio}
         request = request_of("field", "paper", seed, **options)
-        table, _, field = field_fit.FieldFit(request, session).pairs(grid, False)
-        errors = session.held_out_images.evaluate(field)
+        table, _ = field_fit.FieldFit(request, session).pairs(grid, False)
+        errors = session.held_out_images.evaluate(files.field_of(table, session.types))
         arrays = sum(array.nbytes for name, array in table.arrays.items() if name.startswith(("density_", "colour_")))
         return {"bytes": arrays, **errors}
 
@@ -240,7 +241,6 @@ def field_training(session, grid) -> Training:
 
 def captured(folder: Path):
     """Return the session of a small capture in ``folder``, and its grid."""
-    from mi_diffind.tasks.radiance import files
     from mi_diffind.tasks.radiance.session import FieldSession
 
     views, path = folder / "views", folder / "grid.npz"
@@ -291,19 +291,16 @@ SHOWN = {"image": "psnr_db", "texture": "psnr_levels_db", "sdf": "normal_deg", "
 
 def main() -> None:
     """Train the layouts of the tasks that are named, or of all tasks."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("tasks", nargs="*", metavar="TASK", help=", ".join(BUDGETS))
-    parser.add_argument("--seeds", type=int, default=1, help="trainings of each layout, by seeds from 0 on")
-    parser.add_argument("--folder", help="folder for the image, the views and the grid, which a later run reads")
-    parser.add_argument("--json", help="file to write; trainings that it holds already are not repeated")
-    arguments = parser.parse_args()
-    unknown = set(arguments.tasks) - set(BUDGETS)
-    if unknown:
-        parser.error(f"unknown task {', '.join(sorted(unknown))}: allowed are {', '.join(BUDGETS)}")
+    command = parser(__doc__)
+    command.add_argument("tasks", nargs="*", metavar="TASK", help=", ".join(BUDGETS))
+    command.add_argument("--seeds", type=int, default=1, help="trainings of each layout, by seeds from 0 on")
+    command.add_argument("--folder", help="folder for the image, the views and the grid, which a later run reads")
+    arguments = command.parse_args()
+    if unknown := set(arguments.tasks) - set(BUDGETS):
+        command.error(f"unknown task {', '.join(sorted(unknown))}: allowed are {', '.join(BUDGETS)}")
     mi.set_variant(VARIANT)
     mi.set_log_level(mi.LogLevel.Error)
-    kept = Path(arguments.json) if arguments.json else None
-    rows = json.loads(kept.read_text(encoding="utf-8"))["rows"] if kept and kept.is_file() else []
+    rows = earlier(arguments.json, rows=[])["rows"]
 
     def identity(layout: Layout, seed: int) -> list:
         return [*layout.key[:-1], layout.cascaded, round(layout.primary, 3) if layout.primary == layout.primary else 0,
@@ -330,8 +327,7 @@ def main() -> None:
                     f"{row['primary']:.4g} / {row['cascaded']}, {row['bytes']:,} bytes, seed {seed}: {figure}",
                     flush=True,
                 )
-                if kept:
-                    write_json(kept, {"machine": clock.machine(VARIANT), "side": SIDE, "rows": rows})
+                write(arguments.json, {"machine": clock.machine(VARIANT), "side": SIDE, "rows": rows})
 
 
 if __name__ == "__main__":

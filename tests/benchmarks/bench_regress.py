@@ -9,21 +9,21 @@ checks. A lamp that is dimmed scales all passes, exactly, since it is the only l
 random place that is not dark is brightened by the change that a reference predicts to be found nine times of ten.
 """
 
-import argparse
 import json
 import time
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+from frame import VARIANT, earlier, parser, write
 
 import mi_diffind  # noqa: F401
 from mi_diffind.scenes import block_test, loading, regression
 
 WIDTH, HEIGHT = 96, 64
 PASSES, GROUP = block_test.CHECK_PASSES * block_test.GROUPS, block_test.CHECK_PASSES
-#: Changes of one object: its colour, its roughness, and its place by 0.2% of the width of the scene.
-CHANGES = ("colour −3%", "roughness +10%", "moved by 0.2%")
+#: Changes of one object: factors of its colour and its roughness, and its place as a share of the scene's width.
+CHANGES = {"": (1, 1, 0), "colour −3%": (0.97, 1, 0), "roughness +10%": (1, 1.1, 0), "moved by 0.2%": (1, 1, 0.002)}
 LAMPS = {"lamp −1%": 0.99, "lamp −2%": 0.98}
 #: Rows of the file that differ in one of these are kept.
 SETTINGS = ("scene", "variant", "sampler", "spp")
@@ -47,24 +47,20 @@ def ball(centre, radius, bsdf) -> dict:
     return {"type": "sphere", "center": list(centre), "radius": radius, "bsdf": bsdf}
 
 
-def box(change: str, sampler: str) -> dict:
-    """Return a box of diffuse walls with a diffuse and a rough metal ball; 2 units wide, ``change`` as in CHANGES."""
-    colour = 0.97 if change == CHANGES[0] else 1
-    roughness = 1.1 if change == CHANGES[1] else 1
-    moved = 0.004 if change == CHANGES[2] else 0
+def box(colour: float, roughness: float, moved: float, sampler: str) -> dict:
+    """Return a box of diffuse walls with a diffuse and a rough metal ball, 2 units wide."""
     scene = {key: value for key, value in mi.cornell_box().items() if key not in ("small-box", "large-box", "sensor")}
     scene["sensor"] = sensor([0, 0, 3.9], [0, 0, 0], 54, sampler)
     scene["integrator"] = {"type": "path", "max_depth": 5}
-    scene["diffuse ball"] = ball((-0.4 + moved, -0.55, -0.1), 0.45, diffuse(0.7 * colour, 0.6 * colour, 0.5 * colour))
+    scene["diffuse ball"] = ball(
+        (-0.4 + 2 * moved, -0.55, -0.1), 0.45, diffuse(0.7 * colour, 0.6 * colour, 0.5 * colour)
+    )
     scene["metal ball"] = ball((0.5, -0.6, 0.2), 0.4, metal(0.3 * roughness))
     return scene
 
 
-def glossy(change: str, sampler: str) -> dict:
+def glossy(colour: float, roughness: float, moved: float, sampler: str) -> dict:
     """Return metal balls on a floor under a small lamp, whose reflections throw rare bright paths."""
-    colour = 0.97 if change == CHANGES[0] else 1
-    roughness = 1.1 if change == CHANGES[1] else 1
-    moved = 0.008 if change == CHANGES[2] else 0
     floor = mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale(6)
     lamp = {"type": "area", "radiance": {"type": "rgb", "value": [900, 850, 800]}}
     return {
@@ -72,17 +68,14 @@ def glossy(change: str, sampler: str) -> dict:
         "sensor": sensor([0, 2.2, 5], [0, 0.6, 0], 40, sampler),
         "lamp": {"type": "sphere", "center": [-1.5, 4, 1.5], "radius": 0.05, "emitter": lamp},
         "floor": {"type": "rectangle", "to_world": floor, "bsdf": diffuse(0.5 * colour, 0.5 * colour, 0.45 * colour)},
-        "left": ball((-1.1 + moved, 0.7, 0), 0.7, metal(0.1 * roughness)),
+        "left": ball((-1.1 + 4 * moved, 0.7, 0), 0.7, metal(0.1 * roughness)),
         "right": ball((0.9, 0.8, 0.3), 0.8, metal(0.25)),
         "back": ball((0.1, 0.5, -1.4), 0.5, {"type": "roughplastic", "alpha": 0.15}),
     }  # fmt: skip
 
 
-def environment(change: str, sampler: str) -> dict:
+def environment(colour: float, roughness: float, moved: float, sampler: str) -> dict:
     """Return a diffuse, a plastic and a metal ball under a sky with a bright window."""
-    colour = 0.97 if change == CHANGES[0] else 1
-    roughness = 1.1 if change == CHANGES[1] else 1
-    moved = 0.008 if change == CHANGES[2] else 0
     sky = np.full((32, 64, 3), 0.3) * np.linspace(1.5, 0.3, 32)[:, None, None] * [0.8, 0.9, 1]
     sky[6:12, 8:16] = 8
     floor = mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale(4)
@@ -91,7 +84,7 @@ def environment(change: str, sampler: str) -> dict:
         "sensor": sensor([0, 1.8, 5], [0, 0.6, 0], 40, sampler),
         "sky": {"type": "envmap", "bitmap": mi.Bitmap(sky.astype(np.float32)), "to_world": mi.ScalarTransform4f()},
         "floor": {"type": "rectangle", "to_world": floor, "bsdf": diffuse(0.4, 0.4, 0.4)},
-        "left": ball((-1.2 + moved, 0.7, 0), 0.7, diffuse(0.7 * colour, 0.5 * colour, 0.3 * colour)),
+        "left": ball((-1.2 + 4 * moved, 0.7, 0), 0.7, diffuse(0.7 * colour, 0.5 * colour, 0.3 * colour)),
         "right": ball((1.2, 0.7, 0), 0.7, metal(0.3 * roughness)),
         "middle": ball((0, 0.5, 1), 0.5, {"type": "roughplastic", "alpha": 0.2}),
     }  # fmt: skip
@@ -107,9 +100,9 @@ class Passes:
         settings = (name, change or "unchanged", mi.variant(), arguments.sampler, arguments.spp)
         self.file = arguments.passes and Path(arguments.passes) / f"{'_'.join(map(str, settings))}.npy"
         self.kept = list(np.load(self.file)) if self.file and self.file.exists() else []
-        self.scene, self.taken = mi.load_dict(SCENES[name](change, arguments.sampler)), 0
+        self.scene, self.taken = mi.load_dict(SCENES[name](*CHANGES[change], arguments.sampler)), 0
         self.size = regression.PassSize.for_check(self.scene, arguments.spp)
-        self.first_seed = (CHANGES.index(change) + 1 if change else 0) << 24
+        self.first_seed = list(CHANGES).index(change) << 24
 
     def take(self, count: int) -> np.ndarray:
         """Return passes that nobody has taken before, ``(count, rows, columns, channels)``."""
@@ -166,7 +159,7 @@ def measure(arguments, name: str) -> dict:
                     brighter = with_brighter_tile(check, reference, change, rng)
                     seen, tiles = seen + (not reference.test(brighter).passed), tiles + 1
     same.keep()
-    for change in CHANGES:
+    for change in filter(None, CHANGES):
         other = Passes(arguments, name, change)
         alarms[change] = sum(not r.test(other.take(GROUP)).passed for r, _ in references for _ in range(changed))
         other.keep()
@@ -185,25 +178,22 @@ def measure(arguments, name: str) -> dict:
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", metavar="FILE", help="where to write the alarms; rows of other settings are kept")
-    parser.add_argument("--passes", metavar="DIR", help="folder in which rendered passes are kept for a further run")
-    parser.add_argument("--variant", default="llvm_ad_rgb")
-    parser.add_argument("--sampler", default="independent")
-    parser.add_argument("--spp", type=int, default=128)
-    parser.add_argument("--scenes", nargs="+", default=list(SCENES))
-    parser.add_argument("--references", type=int, default=5)
-    parser.add_argument("--unchanged", type=int, default=335, help="unchanged checks of a scene")
-    parser.add_argument("--changed", type=int, default=100, help="checks of each change")
-    arguments = parser.parse_args()
+    command = parser(__doc__)
+    command.add_argument("--passes", metavar="DIR", help="folder in which rendered passes are kept for a further run")
+    command.add_argument("--variant", default=VARIANT)
+    command.add_argument("--sampler", default="independent")
+    command.add_argument("--spp", type=int, default=128)
+    command.add_argument("--scenes", nargs="+", default=list(SCENES))
+    command.add_argument("--references", type=int, default=5)
+    command.add_argument("--unchanged", type=int, default=335, help="unchanged checks of a scene")
+    command.add_argument("--changed", type=int, default=100, help="checks of each change")
+    arguments = command.parse_args()
     mi.set_variant(arguments.variant)
-    path = arguments.json and Path(arguments.json)
-    rows = json.loads(path.read_text(encoding="utf-8"))["rows"] if path and path.exists() else []
+    rows = earlier(arguments.json, rows=[])["rows"]
     for name in arguments.scenes:
         row = measure(arguments, name)
         rows = [other for other in rows if any(other[key] != row[key] for key in SETTINGS)] + [row]
-        if path:
-            path.write_text(json.dumps({"rows": rows}, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        write(arguments.json, {"rows": rows})
 
 
 if __name__ == "__main__":

@@ -11,20 +11,17 @@ kernels, in nanoseconds a ray, and the median of the ratios to Embree. Meshes ha
 fitted.
 """
 
-import argparse
 import functools
 import json
-import statistics
-import sys
 import tempfile
 from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from frame import VARIANT, by_turns, parser, spread, write
 
 import mi_diffind  # noqa: F401
-from mi_diffind.core.files import write_json
 from mi_diffind.measure.clock import machine, timed
 from mi_diffind.tasks.sdf import TASK, grids, marching
 from mi_diffind.tasks.sdf.mesh import load_mesh
@@ -98,18 +95,15 @@ def measured(file: Path, resolution: int, rounds: int) -> dict:
     rows = []
     for ray_set in ("primary", "random"):
         o, d = rays(ray_set)
-        times, hits = {name: [] for name in runs}, {}
-        for _ in range(rounds + 2):
-            for name, run in runs.items():
-                result = timed(functools.partial(run, o, d, ray_set == "primary"))
-                times[name].append(result.seconds)
-                hits[name] = np.array(result.value[1])
-        first = times[MESH][2:]
-        for name, values in times.items():
-            ratios = [b / a for a, b in zip(first, values[2:], strict=True)]
+        passes = {name: functools.partial(run, o, d, ray_set == "primary") for name, run in runs.items()}
+        results = by_turns({name: functools.partial(timed, run) for name, run in passes.items()}, rounds, warm=2)
+        seconds = {name: np.array([result.seconds for result in values]) for name, values in results.items()}
+        hits = {name: np.array(values[-1].value[1]) for name, values in results.items()}
+        for name, values in seconds.items():
+            ratio = spread(values / seconds[MESH])
             rows.append({
-                "rays": ray_set, "name": name, "ns": 1e9 * statistics.median(values[2:]) / SIDE**2,
-                "ratio": statistics.median(ratios), "ratio_quartiles": statistics.quantiles(ratios)[::2],
+                "rays": ray_set, "name": name, "ns": 1e9 * float(np.median(values)) / SIDE**2,
+                "ratio": ratio["median"], "ratio_quartiles": [ratio["q1"], ratio["q3"]],
                 "hits_differ": float((hits[name] != hits[MESH]).mean()),
             })  # fmt: skip
             print(json.dumps(rows[-1]), flush=True)
@@ -120,20 +114,17 @@ def measured(file: Path, resolution: int, rounds: int) -> dict:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="as fit sdf made it; may be several")
-    parser.add_argument("--grid", type=int, default=256, help="cells of sdfgrid along the longest side; 0: none")
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--rounds", type=int, default=11)
-    parser.add_argument("--json", metavar="FILE")
-    arguments = parser.parse_args()
-    mi.set_variant("llvm_ad_rgb")
+    command = parser(__doc__, rounds=11)
+    command.add_argument("files", nargs="+", type=Path, metavar="FILE", help="as fit sdf made it; may be several")
+    command.add_argument("--grid", type=int, default=256, help="cells of sdfgrid along the longest side; 0: none")
+    command.add_argument("--threads", type=int, default=1)
+    arguments = command.parse_args()
+    mi.set_variant(VARIANT)
     dr.set_thread_count(arguments.threads)
     result = [measured(file, arguments.grid, arguments.rounds) for file in arguments.files]
-    if arguments.json:
-        given = {"threads": arguments.threads, "rounds": arguments.rounds, "grid": arguments.grid}
-        write_json(arguments.json, {**given, "machine": machine(mi.variant()), "files": result})
+    given = {"threads": arguments.threads, "rounds": arguments.rounds, "grid": arguments.grid}
+    write(arguments.json, {**given, "machine": machine(mi.variant()), "files": result})
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

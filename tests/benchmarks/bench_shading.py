@@ -5,15 +5,13 @@ made beside one that was trained as a texture alone, in turn.
     python tests/benchmarks/bench_shading.py [--steps 2000] [--json FILE]
 """
 
-import argparse
 import dataclasses
-import json
 import time
-from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from frame import ROOT, VARIANT, by_turns, parser, resident, spread, write
 
 from mi_diffind.core import compat
 from mi_diffind.core.runtime import array_module
@@ -26,12 +24,7 @@ from mi_diffind.tasks.texture import PRESETS as TEXTURES
 from mi_diffind.tasks.texture import TASK
 from mi_diffind.tasks.texture import training as textures
 
-SCENES = Path(__file__).resolve().parents[2] / "scenes"
-
-
-def resident() -> float:
-    """MiB of the process in memory."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 2**20
+SCENES = ROOT / "scenes"
 
 
 def long_training(steps: int) -> list[dict]:
@@ -63,33 +56,32 @@ def long_training(steps: int) -> list[dict]:
 
 def render_ratio(rounds: int = 15) -> dict:
     """Time of a render with ``rust_shaded.npz``, as a multiple of that with ``rust_plain.npz``: median, quartiles."""
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     defines = {"width": "320", "height": "180", "max_depth": "2"}
-    loaded = [loading.load(SCENES / "rust.xml", defines={**defines, "metal": f"rust_{name}.npz"})
-              for name in ("plain", "shaded")]  # fmt: skip
-    times = []
-    for i in range(rounds + 1):
-        own = []
-        for scene in loaded:
+
+    def render(name):
+        scene = loading.load(SCENES / "rust.xml", defines={**defines, "metal": f"rust_{name}.npz"})
+
+        def seconds():
             start = time.perf_counter()
-            loading.render_pass(scene, 4, i)
-            own.append(time.perf_counter() - start)
-        times.append(own)
-    ratios = [b / a for a, b in times[1:]]  # the first compiles
-    low, median, high = np.quantile(ratios, (0.25, 0.5, 0.75))
-    return {"median": float(median), "quartiles": [float(low), float(high)]}
+            loading.render_pass(scene, 4, 0)
+            return time.perf_counter() - start
+
+        return seconds
+
+    times = by_turns({name: render(name) for name in ("plain", "shaded")}, rounds)
+    ratio = spread(np.divide(times["shaded"], times["plain"]))
+    return {"median": ratio["median"], "quartiles": [ratio["q1"], ratio["q3"]]}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--steps", type=int, default=2000)
-    parser.add_argument("--json")
-    arguments = parser.parse_args()
+    command = parser(__doc__)
+    command.add_argument("--steps", type=int, default=2000)
+    arguments = command.parse_args()
     found = {"render_ratio": render_ratio()}
     print(found, flush=True)
     found["training"] = long_training(arguments.steps)
-    if arguments.json:
-        Path(arguments.json).write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
+    write(arguments.json, found)
 
 
 if __name__ == "__main__":

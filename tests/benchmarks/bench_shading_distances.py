@@ -11,19 +11,17 @@ folder of MaterialX's textures, ``boombox`` and ``brick``, at 512². They are tr
 steps as a texture, then with the defaults of ``fit shading``. Files in ``--out`` are not trained again.
 """
 
-import argparse
 import json
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+from frame import ASSETS, VARIANT, parser, write
 from PIL import Image
 
 import mi_diffind as md
 from mi_diffind.maps import as_seen
 from mi_diffind.maps.compressed import decibel
-
-ASSETS = Path(__file__).resolve().parents[2] / "scenes" / "assets"
 
 #: Copies of the material along the floor, by distance.
 DISTANCES = {"near": 0.25, "middle": 1.0, "far": 4.0}
@@ -113,14 +111,13 @@ def pictures(description: dict, spp: int) -> np.ndarray:
     return np.stack([mi.render(loaded, spp=spp, seed=seed).numpy() for seed in range(2)])
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", metavar="NAME", default=["wood", "tiles"])
-    parser.add_argument("--textures", type=Path, metavar="FOLDER")
-    parser.add_argument("--out", type=Path, default=Path("out"), metavar="FOLDER")
-    parser.add_argument("--json", type=Path, metavar="FILE")
-    options = parser.parse_args()
-    mi.set_variant("llvm_ad_rgb")
+def main() -> None:
+    command = parser(__doc__)
+    command.add_argument("names", nargs="*", metavar="NAME", default=["wood", "tiles"])
+    command.add_argument("--textures", type=Path, metavar="FOLDER")
+    command.add_argument("--out", type=Path, default=Path("out"), metavar="FOLDER")
+    options = command.parse_args()
+    mi.set_variant(VARIANT)
     options.out.mkdir(parents=True, exist_ok=True)
     found = {}
     for name in options.names:
@@ -139,10 +136,8 @@ def main() -> int:
                     "brightness": round(float(shown.mean() / reference.mean()), 4),
                 }
             print(name, distance, json.dumps(figures), flush=True)
-    if options.json is not None:
-        options.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
-    return 0
+    write(options.json, found)
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    main()

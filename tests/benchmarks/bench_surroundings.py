@@ -8,16 +8,14 @@ Each row is a process of its own, ``mi-diffind fit field`` with the options that
 rays and of nodes along a side. The row "scene, larger box" has an ``aabb`` of five times the side of the other boxes.
 """
 
-import argparse
 import json
 import shutil
 import tempfile
 from pathlib import Path
 
 from bench_nerf import training
+from frame import VARIANT, earlier, parser, short_machine, write
 
-from mi_diffind.core.files import write_json
-from mi_diffind.measure.clock import machine
 from mi_diffind.tasks.radiance.surroundings import inner_cube
 from mi_diffind.tasks.radiance.views import load_views
 
@@ -44,28 +42,24 @@ def with_box(folder: Path, copy: Path) -> Path:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", metavar="FOLDER")
-    parser.add_argument("--json", required=True, metavar="FILE.json")
-    parser.add_argument("--resolution", default="48", help="nodes along a side of all grids (default: 48)")
-    parser.add_argument("--steps", default="200", help="steps of a grid (default: 200)")
-    parser.add_argument("--downscale", default="2", help="factor by which the views are reduced (default: 2)")
-    parser.add_argument("--rows", nargs="*", default=list(ROWS), help="names of the rows (default: all)")
-    arguments = parser.parse_args()
-    output, folder = Path(arguments.json), Path(arguments.folder)
-    result = json.loads(output.read_text(encoding="utf-8")) if output.is_file() else {"rows": {}}
-    described = machine("llvm_ad_rgb")
-    result["machine"] = {name: described[name] for name in ("cpu", "cores", "system", "mi-diffind")}
+    command = parser(__doc__, required=True)
+    command.add_argument("folder", metavar="FOLDER")
+    command.add_argument("--resolution", default="48", help="nodes along a side of all grids (default: 48)")
+    command.add_argument("--steps", default="200", help="steps of a grid (default: 200)")
+    command.add_argument("--downscale", default="2", help="factor by which the views are reduced (default: 2)")
+    command.add_argument("--rows", nargs="*", default=list(ROWS), help="names of the rows (default: all)")
+    arguments = command.parse_args()
+    output, folder = arguments.json, Path(arguments.folder)
+    result = earlier(output, rows={}) | {"machine": short_machine()}
     with tempfile.TemporaryDirectory() as work:
         for name in arguments.rows:
             source = with_box(folder, Path(work) / "boxed") if "box" in name else folder
-            options = ["--variant", "llvm_ad_rgb", "--resolution", arguments.resolution, *ROWS[name]]
-            options += ["--downscale", arguments.downscale]
-            options += ["--preset", "grid", "--steps", arguments.steps]
+            options = ["--variant", VARIANT, "--resolution", arguments.resolution, *ROWS[name], "--preset", "grid"]
+            options += ["--downscale", arguments.downscale, "--steps", arguments.steps]
             report = Path(work) / "x.npz"
             row = training(str(source), report, options)
             result["rows"][name] = row
-            write_json(output, result)
+            write(output, result)
 
 
 if __name__ == "__main__":

@@ -8,29 +8,23 @@ a pixel. The hits are ``random`` (any place, any footprint up to the whole image
 horizon, pixel by pixel. The bitmaps hold the decoded maps and do not read the derivatives. Times are those of the
 kernels, one of each texture before the next of any; ratios are medians of the rounds.
 
-Then whole renders of the plane in a constant light, ``path_footprint`` against ``path``, and the methods of ``disney``
-with textures against those of ``principled``.
+Then whole renders of the plane in a constant light, ``path_footprint`` against ``path``.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from frame import ASSETS, VARIANT, by_turns, parser, spread, write
 
 import mi_diffind
 from mi_diffind.core.compat import use_threads
-from mi_diffind.measure.bsdf import bsdf_queries, directions, noise_texture
-from mi_diffind.measure.clock import machine, timed, total
-from mi_diffind.measure.operations import count_query
-from mi_diffind.measure.study import FLOOR
+from mi_diffind.measure.clock import count_query, machine, timed, total
 
-TILES = Path(__file__).parents[2] / "scenes/assets/tiles_filtered.npz"
+TILES = ASSETS / "tiles_filtered.npz"
 WIDTH, HEIGHT = 128, 128
 
 
@@ -56,47 +50,33 @@ def hits(coherent: bool, size: tuple[int, int]):
     return si
 
 
-def textures(path: Path) -> dict[str, list]:
-    """Return name → textures of all maps of a file: bitmaps of the decoded maps, and each filter of each plugin."""
-    model = mi_diffind.open(path)
-    layout = model.image.layout
-    decoded = model.image.decode()
-    plain = {
-        m.name: {"type": "bitmap", "data": mi.TensorXf(decoded[m.name]), "raw": True, "wrap_mode": "repeat"}
-        for m in layout.maps
-    }
-    result = {"bitmap": [mi.load_dict(d) for d in plain.values()]}
-    for name in ("off", "trilinear", "anisotropic"):
-        result[f"neural_texture, {name}"] = [
-            mi.load_dict(
-                {"type": "neural_texture", "filename": str(path), "channels": m.name, "filter": name, "raw": True}
-            )
-            for m in layout.maps
-        ]
-    return result, [m.channels for m in layout.maps]
+def textures(path: Path) -> tuple[dict[str, list], list[int]]:
+    """Return name → textures of all maps of a file (bitmaps of the decoded maps, and each filter), and channels."""
+    image = mi_diffind.open(path).image
+    maps, decoded = image.layout.maps, image.decode()
+    bitmap, learned = {"type": "bitmap", "wrap_mode": "repeat"}, {"type": "neural_texture", "filename": str(path)}
+    plugins = {"bitmap": lambda name: {**bitmap, "data": mi.TensorXf(decoded[name])}}
+    for f in ("off", "trilinear", "anisotropic"):
+        plugins[f"neural_texture, {f}"] = lambda name, f=f: {**learned, "channels": name, "filter": f}
+    loaded = {key: [mi.load_dict({**plugin(m.name), "raw": True}) for m in maps] for key, plugin in plugins.items()}
+    return loaded, [m.channels for m in maps]
 
 
 def rounds(functions: dict, number: int) -> dict[str, np.ndarray]:
-    """Return the seconds of the kernels of each function, one of all before the next of any."""
-    for function in functions.values():
-        timed(lambda f=function: total(f())[0])
-    seconds = {name: [] for name in functions}
-    for _ in range(number):
-        for name, function in functions.items():
-            seconds[name].append(timed(lambda f=function: total(f())[0]).seconds)
-    return {name: np.array(values) for name, values in seconds.items()}
+    """Return the seconds of the kernels of each function, by turns."""
+    measured = {name: lambda f=function: timed(lambda: total(f())[0]).seconds for name, function in functions.items()}
+    return {name: np.array(values) for name, values in by_turns(measured, number).items()}
 
 
 def against(seconds: dict, base: str, count: int) -> dict[str, dict]:
     """Return ns a lane, and the median ratio to ``base`` with its quartiles."""
     rows = {}
     for name, values in seconds.items():
-        low, middle, high = np.percentile(values / seconds[base], [25, 50, 75])
+        ratio = spread(values / seconds[base])
         rows[name] = {
-            "ns": float(np.median(values)) / count * 1e9,
-            "ratio": float(middle),
-            "quartiles": [float(low), float(high)],
-        }
+            "ns": float(np.median(values)) / count * 1e9, "ratio": ratio["median"],
+            "quartiles": [ratio["q1"], ratio["q3"]],
+        }  # fmt: skip
     return rows
 
 
@@ -142,58 +122,28 @@ def renders(path: Path, number: int) -> dict[str, dict]:
     return against(rounds(functions, number), "path", 192 * 128)
 
 
-def materials(number: int) -> dict[str, dict]:
-    """Return method → the costs of ``disney`` and ``principled`` with four textures."""
-    rng = np.random.default_rng(0)
-    values = {"base_color": [0.6, 0.3, 0.2], "roughness": [0.4], "metallic": [0.5], "anisotropic": [0.3]}
-    maps = {name: mi.load_dict(noise_texture(v, rng)) for name, v in values.items()}
-    bsdfs = {name: mi.load_dict({"type": name, **maps}) for name in ("principled", "disney")}
-    lanes = 2**14
-    inputs, context = directions(lanes), mi.BSDFContext()
-    queries = bsdf_queries(bsdfs, inputs, True)
-
-    def together(bsdf):
-        value, pdf, bs, weight = bsdf.eval_pdf_sample(context, *inputs)
-        return [value, pdf, bs.wo, bs.pdf, weight]
-
-    queries["eval_pdf_sample"] = {name: lambda b=bsdf: together(b) for name, bsdf in bsdfs.items()}
-    result = {}
-    for query, functions in queries.items():
-        costs = against(rounds({n: f for n, f in functions.items() if n != FLOOR}, number), "principled", lanes)
-        for name in costs:
-            operations = count_query(functions[name])
-            costs[name] |= {"instructions": operations.instructions, "gathers": operations.gathers}
-        result[query] = costs
-    return result
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--table", action="append", type=Path, metavar="FILE", help="texture to read (default: tiles)")
-    parser.add_argument("--rounds", type=int, default=101, help="rounds of each measurement (default: 101)")
-    parser.add_argument("--json", metavar="FILE", help="also write the numbers to this file")
-    parser.add_argument("--variant", default="llvm_ad_rgb")
-    parser.add_argument("--only", choices=("reads", "renders", "materials"))
-    options = parser.parse_args()
+def main() -> None:
+    command = parser(__doc__, rounds=101)
+    command.add_argument("--table", action="append", type=Path, metavar="FILE", help="texture (default: tiles)")
+    command.add_argument("--variant", default=VARIANT)
+    command.add_argument("--only", choices=("reads", "renders"))
+    options = command.parse_args()
     mi.set_variant(options.variant)
     use_threads(1)
     result = {"machine": machine(options.variant), "rounds": options.rounds}
+    parts = {
+        "reads": lambda: [row for path in options.table or [TILES] for row in reads(path, options.rounds)],
+        "renders": lambda: renders(TILES, options.rounds),
+    }
     with dr.suspend_grad():
-        if options.only in (None, "reads"):
-            result["reads"] = [row for path in options.table or [TILES] for row in reads(path, options.rounds)]
-        if options.only in (None, "renders"):
-            result["renders"] = renders(TILES, options.rounds)
-        if options.only in (None, "materials"):
-            result["materials"] = materials(options.rounds)
+        result |= {name: part() for name, part in parts.items() if options.only in (None, name)}
     for row in result.get("reads", []):
         print(f"{row['table']}, {row['hits']}, {row['maps']} map(s)")
         show(row["textures"])
-    for name, costs in {"renders": result.get("renders", {}), **result.get("materials", {})}.items():
-        print(name)
-        show(costs)
-    if options.json:
-        Path(options.json).write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
-    return 0
+    if "renders" in result:
+        print("renders")
+        show(result["renders"])
+    write(options.json, result)
 
 
 def show(costs: dict[str, dict]) -> None:
@@ -204,4 +154,4 @@ def show(costs: dict[str, dict]) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

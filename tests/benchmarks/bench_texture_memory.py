@@ -11,13 +11,13 @@ matter to memory: all are copies of one image, and the table is trained for a fe
 from __future__ import annotations
 
 import argparse
-import json
-import re
 import shutil
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
+
+from frame import VARIANT, parser, resident, write
 
 COUNT, SIDE, COMPRESSION = 16, 2048, 12.0
 
@@ -30,11 +30,6 @@ KINDS = {
 }
 
 
-def resident() -> int:
-    """Bytes of this process that are in memory."""
-    return 1024 * int(re.search(r"VmRSS:\s*(\d+) kB", Path("/proc/self/status").read_text(encoding="ascii"))[1])
-
-
 def child(kind: str, folder: Path) -> None:
     """Load, render once, and print the bytes."""
     import gc
@@ -44,7 +39,7 @@ def child(kind: str, folder: Path) -> None:
 
     import mi_diffind  # noqa: F401
 
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     from mi_diffind.scenes.loading import footprint
 
     quads = {}
@@ -74,14 +69,13 @@ def child(kind: str, folder: Path) -> None:
     del image
     gc.collect()
     dr.flush_malloc_cache()
-    print(resident())
+    print(round(2**20 * resident()))
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", metavar="FILE.json")
-    parser.add_argument("--child", nargs=2, help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
+    command = parser(__doc__)
+    command.add_argument("--child", nargs=2, help=argparse.SUPPRESS)
+    arguments = command.parse_args()
     if arguments.child:
         child(arguments.child[0], Path(arguments.child[1]))
         return
@@ -91,7 +85,7 @@ def main() -> None:
 
     import mi_diffind
 
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     found = {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -113,9 +107,7 @@ def main() -> None:
     print(f"{COUNT} textures of {SIDE}², without them {base / 2**20:.1f} MiB are resident")
     for kind, row in rows.items():
         print(f"{kind:24}{row['bytes'] / 2**20:>9.1f} MiB{row['times_less']:>8.1f}x less")
-    if arguments.json:
-        record = {"count": COUNT, "side": SIDE, "resident_without": base, "textures": rows}
-        Path(arguments.json).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+    write(arguments.json, {"count": COUNT, "side": SIDE, "resident_without": base, "textures": rows})
 
 
 if __name__ == "__main__":

@@ -9,27 +9,24 @@ of the viewer's session and of the JPEG that it would send, without a browser. `
 are two, interleaved with those of the viewer, so that ``speedup`` is a ratio of one run.
 """
 
-import argparse
 import json
 import os
 import statistics
 import time
 from io import BytesIO
-from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from frame import ROOT, VARIANT, parser, spread, write
 from PIL import Image
 
-from mi_diffind.core.files import write_json
 from mi_diffind.core.runtime import use_variant
 from mi_diffind.scenes import loading
 from mi_diffind.scenes.poses import rotation
 from mi_diffind.scenes.viewer import session as viewer
 from mi_diffind.scenes.viewer.page import MOVING_QUALITY
 
-ROOT = Path(__file__).resolve().parents[2]
 SCENES = ("materials", "solids", "field")
 
 
@@ -55,11 +52,6 @@ def by_mitsuba(session, pose, seed) -> float:
     for image in images:
         viewer.displayed(image.astype(np.float32))
     return time.perf_counter() - start
-
-
-def spread(seconds) -> dict:
-    q1, median, q3 = statistics.quantiles(seconds, n=4)
-    return {"median": median, "q1": q1, "q3": q3}
 
 
 def measure(name: str, pictures: int) -> dict:
@@ -115,12 +107,11 @@ def measure(name: str, pictures: int) -> dict:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", nargs="*", default=SCENES)
-    parser.add_argument("--pictures", type=int, default=20)
-    parser.add_argument("--variant", default="llvm_ad_rgb")
-    parser.add_argument("--json", metavar="FILE")
-    arguments = parser.parse_args()
+    command = parser(__doc__)
+    command.add_argument("scenes", nargs="*", default=SCENES)
+    command.add_argument("--pictures", type=int, default=20)
+    command.add_argument("--variant", default=VARIANT)
+    arguments = command.parse_args()
     use_variant(arguments.variant)
     mi.set_log_level(mi.LogLevel.Error)
     load = os.getloadavg()[0]
@@ -129,8 +120,7 @@ def main() -> None:
         rows.append(measure(name, arguments.pictures))
         print(json.dumps(rows[-1]), flush=True)
     result = {"variant": mi.variant(), "threads": dr.thread_count(), "load_before": load, "rows": rows}
-    if arguments.json:
-        write_json(arguments.json, {**result, "load_after": os.getloadavg()[0]})
+    write(arguments.json, {**result, "load_after": os.getloadavg()[0]})
 
 
 if __name__ == "__main__":

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import datetime
-import json
 import os
 import statistics
 import subprocess
@@ -23,12 +22,12 @@ import time
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
+from frame import ROOT, earlier
+
 from mi_diffind.core.errors import DiffindError
 from mi_diffind.core.files import OutputError, write_json
 from mi_diffind.core.runtime import use_variant
 from mi_diffind.measure.clock import machine
-
-ROOT = Path(__file__).resolve().parents[2]
 
 #: Parts of the report, in their order.
 PARTS = ("tests", "trust", "times")
@@ -41,20 +40,20 @@ STUDIES = {False: ("ggx", "disney"), True: ("ggx",)}
 LIMITS = {"tests": 3600, "trust": 4 * 3600, "times": 4 * 3600}
 
 
-def run(command: list, part: str, backend: str, folder: str = str(ROOT)) -> tuple[int, str]:
+def run(command: list, part: str, backend: str) -> tuple[int, str]:
     """Run a command in a process of its own; return its exit code (``-1``: out of time) and the end of its output.
 
     A crash of the driver ends that process alone. ``MI_DIFFIND_BACKENDS`` chooses the variants of the tests.
     """
-    environment = {**os.environ, "MI_DIFFIND_BACKENDS": backend}
-    options = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "errors": "replace"}
     try:
         done = subprocess.run(
-            list(map(str, command)), cwd=folder, env=environment, timeout=LIMITS[part], check=False, **options
-        )
+            [sys.executable, *map(str, command)], cwd=ROOT, env={**os.environ, "MI_DIFFIND_BACKENDS": backend},
+            timeout=LIMITS[part], check=False, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+            errors="replace",
+        )  # fmt: skip
     except subprocess.TimeoutExpired:
         return -1, f"out of time, {LIMITS[part]} s"
-    return done.returncode, done.stdout[-4000:]
+    return done.returncode, done.stdout[-1000:]
 
 
 def outcomes(path: Path) -> dict:
@@ -62,11 +61,11 @@ def outcomes(path: Path) -> dict:
     results = {"passed": 0, "failed": {}, "skipped": {}}
     for case in ElementTree.parse(path).getroot().iter("testcase"):
         name = f"{case.get('classname')}::{case.get('name')}"
-        reasons = {child.tag: child.get("message") or "" for child in case}
-        if "failure" in reasons or "error" in reasons:
-            results["failed"][name] = next(reasons[tag] for tag in ("failure", "error") if tag in reasons)[:500]
+        reasons = {child.tag: (child.get("message") or "")[:500] for child in case}
+        if failure := [reasons[tag] for tag in ("failure", "error") if tag in reasons]:
+            results["failed"][name] = failure[0]
         elif "skipped" in reasons:
-            results["skipped"][name] = reasons["skipped"][:200]
+            results["skipped"][name] = reasons["skipped"]
         else:
             results["passed"] += 1
     return results
@@ -75,22 +74,21 @@ def outcomes(path: Path) -> dict:
 def run_tests(report: dict, save, quick: bool, backend: str) -> None:
     """Run each file of tests in a process of its own."""
     tests = report["tests"] = {"passed": 0, "failed": {}, "skipped": {}, "seconds": {}}
-    files = [path for pattern in TESTS[quick] for path in sorted((ROOT / "tests").rglob(pattern))]
-    files = [path for path in files if path.relative_to(ROOT / "tests").parts[0] not in ("benchmarks", "thirdparty")]
-    for path in files:
+    for path in sorted({path for pattern in TESTS[quick] for path in (ROOT / "tests").rglob(pattern)}):
+        if path.relative_to(ROOT / "tests").parts[0] in ("benchmarks", "thirdparty"):
+            continue
         name, start = str(path.relative_to(ROOT)), time.perf_counter()
         print(f"{name} …", flush=True)
         with tempfile.TemporaryDirectory() as folder:
             junit = Path(folder) / "junit.xml"
-            command = [sys.executable, "-m", "pytest", "-q", "-n0", f"--junitxml={junit}", path]
-            code, output = run(command, "tests", backend)
+            code, output = run(["-m", "pytest", "-q", "-n0", f"--junitxml={junit}", path], "tests", backend)
             if junit.is_file():
                 result = outcomes(junit)
                 tests["passed"] += result["passed"]
                 for word in ("failed", "skipped"):
                     tests[word] |= result[word]
             elif code != 5:  # 5: no test is left of the file
-                tests["failed"][name] = f"exit code {code}: {output[-1000:]}"
+                tests["failed"][name] = f"exit code {code}: {output}"
         tests["seconds"][name] = round(time.perf_counter() - start, 1)
         save()
 
@@ -102,15 +100,13 @@ def run_trust(report: dict, save, quick: bool, backend: str, variants: list[str]
         print(f"trust, {variant} …", flush=True)
         with tempfile.TemporaryDirectory() as folder:
             output = Path(folder) / "trust.json"
-            command = [sys.executable, ROOT / "tests" / "trust" / "measure.py", "-o", output, "--variants", variant]
-            if quick:
-                command += ["--quick", "--properties", "energy,reciprocity,chi2"]
+            command = [ROOT / "tests" / "trust" / "measure.py", "-o", output, "--variants", variant]
+            command += ["--quick", "--properties", "energy,reciprocity,chi2"] if quick else []
             code, text = run(command, "trust", backend)
-            if output.is_file():
-                for name, by_variant in json.loads(output.read_text(encoding="utf-8"))["cells"].items():
-                    trust["cells"].setdefault(name, {})[variant] = by_variant[variant]
+            for name, by_variant in earlier(output, cells={})["cells"].items():
+                trust["cells"].setdefault(name, {})[variant] = by_variant[variant]
             if code not in (0, 1) or not output.is_file():
-                trust["errors"][variant] = f"exit code {code}: {text[-1000:]}"
+                trust["errors"][variant] = f"exit code {code}: {text}"
         save()
 
 
@@ -127,35 +123,24 @@ def medians(study: dict) -> dict[str, float]:
 
 def run_times(report: dict, save, quick: bool, variant: str) -> None:
     """Run quick studies in the variant and on the processor, and the ratio of their times."""
-    times = report["times"] = {}
-    processor = "llvm_" + variant.partition("_")[2]
+    times, processor = report.setdefault("times", {}), "llvm_" + variant.partition("_")[2]
     for study in STUDIES[quick]:
         entry = times[study] = {"errors": {}, "ns": {}, "ratios": {}}
         for chosen in dict.fromkeys((variant, processor)):
             print(f"tradeoff {study}, {chosen} …", flush=True)
             with tempfile.TemporaryDirectory() as folder:
                 output = Path(folder) / "study.json"
-                command = [
-                    sys.executable,
-                    "-m",
-                    "mi_diffind.commands.cli",
-                    "tradeoff",
-                    study,
-                    "--quick",
-                    "--variant",
-                    chosen,
-                ]
+                command = ["-m", "mi_diffind.commands.cli", "tradeoff", study, "--quick", "--variant", chosen]
                 code, text = run([*command, "--out", folder, "--json", output], "times", chosen.partition("_")[0])
                 if code == 0 and output.is_file():
-                    entry["ns"][chosen] = medians(json.loads(output.read_text(encoding="utf-8")))
+                    entry["ns"][chosen] = medians(earlier(output))
                 else:
-                    entry["errors"][chosen] = f"exit code {code}: {text[-1000:]}"
+                    entry["errors"][chosen] = f"exit code {code}: {text}"
             save()
         first, second = (entry["ns"].get(chosen, {}) for chosen in (variant, processor))
-        if variant != processor:
-            entry["ratios"] = {key: first[key] / second[key] for key in first.keys() & second.keys()}
-            if entry["ratios"]:
-                entry["median_ratio"] = statistics.median(entry["ratios"].values())
+        if variant != processor and (both := first.keys() & second.keys()):
+            entry["ratios"] = {key: first[key] / second[key] for key in both}
+            entry["median_ratio"] = statistics.median(entry["ratios"].values())
         save()
 
 
@@ -196,18 +181,17 @@ def main(arguments=None) -> int:
         return 2
     import mitsuba as mi
 
-    backend, _, mode = given.variant.partition("_")
+    backend = given.variant.partition("_")[0]
     variants = [v for v in mi.variants() if v.startswith(f"{backend}_ad_") and not v.endswith("_double")]
+    parts = {
+        "tests": lambda: run_tests(report, save, given.quick, backend),
+        "trust": lambda: run_trust(report, save, given.quick, backend, [given.variant] if given.quick else variants),
+        "times": lambda: run_times(report, save, given.quick, given.variant),
+    }
     try:
-        for part, function in {
-            "tests": lambda: run_tests(report, save, given.quick, backend),
-            "trust": lambda: run_trust(
-                report, save, given.quick, backend, [f"{backend}_{mode}"] if given.quick else variants
-            ),
-            "times": lambda: run_times(report, save, given.quick, given.variant),
-        }.items():
+        for part in parts:
             if part not in skipped:
-                function()
+                parts[part]()
     except KeyboardInterrupt:
         report["interrupted"] = True
         save()

@@ -3,7 +3,6 @@
 import argparse
 import json
 import os
-import subprocess
 import sys
 import types
 from pathlib import Path
@@ -123,9 +122,3 @@ def test_bad_usage(arguments, capsys):
     with pytest.raises(SystemExit) as e:
         main(["tradeoff", *arguments])
     assert e.value.code == 2
-
-
-def test_benchmark_is_the_same_command():
-    script = ROOT / "tests" / "benchmarks" / "bench_disney.py"
-    found = subprocess.run([sys.executable, str(script), "--help"], capture_output=True, text=True, timeout=60)
-    assert found.returncode == 0 and "--quick" in found.stdout

@@ -61,8 +61,8 @@ def picture(pose, side):
     return np.uint8(np.rint(255 * image))
 
 
-def write(folder, views=12, test=3, side=24):
-    """Views all around, and others to test by, in ``folder``."""
+def write(folder, views=12, test=3, side=24, picture=picture):
+    """Views of a ``picture`` all around, and others to test by, in ``folder``."""
     folder.mkdir(parents=True, exist_ok=True)
     for split, count, turn in (("train", views, 0.0), ("test", test, 1.1)):
         frames = []

@@ -137,8 +137,10 @@ def decoded(model) -> object:
     if inspect.signature(type(model).decode).parameters["output"].default is None:
         options.pop("rows", None)  # of a file only
         return model.decode(**options)
-    path = Path("decoded.npz")
+    path = Path("decoded.csv" if "rows" in names else "decoded.npz")
     model.decode(path, **options)
+    if "rows" in names:
+        return np.loadtxt(path, delimiter=",", skiprows=1)
     with np.load(path) as data:
         return {name: data[name] for name in data.files}
 

@@ -67,14 +67,14 @@ def measure_little() -> None:
 
 
 def small_study() -> None:
-    """Add a study ``killed``: one training to convergence, and one case."""
-    import drjit as dr
+    """Add a study ``killed``: the small one, with a training to convergence."""
     import numpy as np
+    from small_study import Log, small_plan
 
     from mi_diffind.arrays.indirection import DifferentiableArray
     from mi_diffind.core.runtime import array_module
     from mi_diffind.fitting.loop import FitSettings, Problem
-    from mi_diffind.measure.study import FLOOR, Candidate, Case, Plan, Study
+    from mi_diffind.measure.study import Study
     from mi_diffind.measure.training import ConvergenceTraining
     from mi_diffind.studies import studies
 
@@ -99,15 +99,9 @@ def small_study() -> None:
 
         def plan(self, arguments):
             settings = FitSettings(steps=5, batch=64, lr=1e-1, schedule="constant", seed=3)
-            x = dr.arange(types.Float, 1024) + 1
-            dr.make_opaque(x)
-            functions = {FLOOR: lambda: x, "ramp": lambda: x * 2, "exact": lambda: x * 3}
-            return Plan(
-                study="killed", title="A small study", queries=("eval",), accuracy="psnr_db",
-                accuracy_label="PSNR, dB", cases=[Case("one", lambda lanes: {"eval": dict(functions)})],
-                candidates=[Candidate("ramp", "a", job="training"), Candidate("exact", "b", is_truth=True)],
-                jobs=[ConvergenceTraining("training", Ramp, settings, 40)],
-            )  # fmt: skip
+            plan = small_plan(Log())
+            plan.study, plan.jobs = "killed", [ConvergenceTraining("training", Ramp, settings, 40)]
+            return plan
 
     studies()["killed"] = Killed()
 

@@ -15,9 +15,8 @@ from small_study import CALLS, KERNELS, SETTINGS, Log, separable_plan, small_pla
 
 from mi_diffind.measure import benchmark, plot, report
 from mi_diffind.measure.benchmark import measure
-from mi_diffind.measure.clock import Timed
-from mi_diffind.measure.operations import Operations
-from mi_diffind.measure.statistics import finite, pareto, spread
+from mi_diffind.measure.clock import Operations, Timed
+from mi_diffind.measure.statistics import finite, pareto
 from mi_diffind.measure.study import FLOOR, Job
 
 FILES = ["tradeoff_small.csv", "tradeoff_small.json", "tradeoff_small.png"]
@@ -40,24 +39,11 @@ def test_front_against_brute_force(rng, dims):
         assert pareto(points) == brute_force(points)
 
 
-def test_front_of_known_points():
-    assert pareto([(1, 5), (2, 3), (3, 3), (2, 3), (4, 1), (0.5, 9), (5, 1)]) == [
-        True, True, False, True, True, True, False,
-    ]  # fmt: skip
-    assert pareto([(math.nan, 0), (1, 1), (2, 2)]) == [False, True, False]
-    assert pareto([(math.inf, 0), (1, math.inf), (1, 1)]) == [True, False, True]
-
-
 def test_slack_makes_near_values_equal():
     points = [(1.00, 5), (0.98, 6), (0.5, 9)]  # the second is hardly faster, and less accurate
     assert pareto(points) == [True, True, True]
     assert pareto(points, (0.03, 0)) == [True, False, True]
     assert pareto([(1.0, 5.0), (1.01, 5.0)], (0.03, 0)) == [True, True]
-
-
-def test_spread():
-    assert spread([3.0, 1.0, 2.0, math.nan, 5.0, 4.0]) == {"median": 3.0, "q1": 2.0, "q3": 4.0}
-    assert math.isnan(spread([math.nan])["median"])
 
 
 # -- a small study ----------------------------------------------------------------------------------------------------
@@ -159,11 +145,6 @@ def test_files(tmp_path):
     assert "2 cases done" in text and "slow / good" in text and "exact: the truth" in text and "20.0 dB" in text
 
 
-def test_json_has_no_nan():
-    tree = finite({"a": math.nan, "b": [1.5, -math.inf], "c": ("x", None, True)})
-    assert tree == {"a": None, "b": [1.5, None], "c": ["x", None, True]}
-
-
 # -- interruption -----------------------------------------------------------------------------------------------------
 
 #: In the errors; while the first case is compiled; in its rounds; in its passes; in the last rounds.
@@ -205,34 +186,6 @@ def test_interruption_keeps_what_is_done_and_the_same_command_goes_on(tmp_path, 
     assert not list(tmp_path.glob("*.partial.json"))
 
 
-@pytest.mark.parametrize("change", ["settings", "details", "sources", "damage"])
-def test_a_run_of_something_else_is_not_gone_on_with(tmp_path, change, capsys, monkeypatch):
-    log = Log()
-    log.stop_at = CALLS - 1
-    measure(small_plan(log), SETTINGS, tmp_path, progress=False)
-    study, settings = small_plan(Log()), SETTINGS
-    if change == "settings":
-        settings = replace(SETTINGS, lanes=2048)
-    elif change == "details":
-        study = small_plan(Log(), details={"side": 2})
-    elif change == "sources":  # another plugin, another clock
-        monkeypatch.setattr(benchmark, "sources", lambda: [Path(__file__)])
-    else:
-        (tmp_path / "tradeoff_small.partial.json").write_text('{"key": [1')
-    result = measure(study, settings, tmp_path)
-    assert not result["resumed"] and not result["interrupted"]
-    said = "is damaged" if change == "damage" else f"is of a run with other {change}"
-    assert f"{said}: starting anew" in capsys.readouterr().err
-
-
-def test_nothing_is_measured_again_if_writing_fails(tmp_path):
-    measure(small_plan(Log()), SETTINGS, tmp_path, progress=False)
-    log = Log()
-    result = measure(small_plan(log), SETTINGS, tmp_path, progress=False)
-    assert log == [] and result["resumed"]
-    assert result["cases"]["second"]["queries"]["pdf"]["good"]["rounds"] == SETTINGS.rounds
-
-
 def test_an_error_keeps_what_is_done(tmp_path):
     study = small_plan(Log())
     study.cases[1].queries = lambda lanes: 1 / 0
@@ -267,13 +220,6 @@ def test_labels_do_not_cover_each_other(rng):
         inside = axes.get_window_extent(renderer).padded(1)
         assert all(inside.contains(b.x0, b.y0) and inside.contains(b.x1, b.y1) for b in boxes)
         assert axes.get_xscale() == "log"
-
-
-def test_a_picture_of_little(tmp_path):
-    alone = plot.Point("alone", 1.0, 0.0, 2.0, 50.0, "a", True)
-    for panel in (plot.Panel("a", "ns", [alone], []), plot.Panel("b", "ns", [], [plot.Line("exact", 2.0, True)])):
-        plot.save(plot.draw_panels("title", [panel], "dB", "caption"), tmp_path / "plot.png")
-        assert (tmp_path / "plot.png").stat().st_size > 5000
 
 
 def test_some_cases_have_fewer_candidates_and_other_queries(tmp_path):

@@ -2,7 +2,7 @@
 
 import math
 
-from mi_diffind.measure.formatting import duration, enumeration, grid, percent, ratio_cell, rounded, time_cell
+from mi_diffind.measure.report import duration, enumeration, grid, percent, ratio_cell, rounded, time_cell
 from mi_diffind.measure.statistics import ratio, timing
 
 

@@ -91,7 +91,7 @@ def test_fingerprint(tmp_path):
 
 def test_sources_are_all_that_a_measurement_depends_on():
     names = {path.name for path in sources()}
-    assert {"neural_image.py", "lookup.py", "clock.py", "plan.py", "codecs.py"} < names
+    assert {"neural_image.py", "lookup.py", "clock.py", "texture.py", "codecs.py"} < names
     assert any(name.endswith(".npz") for name in names)
 
 

@@ -1,11 +1,9 @@
 """Training to convergence: how long, what is kept, and what is done again."""
 
-import json
 import math
 import os
 import signal
 
-import drjit as dr
 import numpy as np
 import pytest
 from variants import BACKENDS
@@ -99,9 +97,3 @@ def test_interrupted_training_goes_on(tmp_path):
     assert [r["psnr_db"] for r in record["runs"]] == pytest.approx([r["psnr_db"] for r in whole["runs"]], abs=0.1)
     assert [record[k] for k in ("steps", "converged")] == [whole[k] for k in ("steps", "converged")]
     assert os.listdir(tmp_path) == ["a_ramp.npz"]
-
-
-def test_record_is_json():
-    record = training([], longest=20).run(progress=False)
-    assert json.loads(json.dumps(record)) == record
-    assert dr.width(training([]).problem().net.data) == 5

@@ -16,7 +16,7 @@ from texture_files import make
 import mi_diffind
 from mi_diffind import plugins
 from mi_diffind.maps.source import from_arrays
-from mi_diffind.measure.operations import bsdf_operations
+from mi_diffind.measure.clock import bsdf_operations
 from mi_diffind.plugins.support import footprint
 from mi_diffind.scenes import loading
 
@@ -241,108 +241,7 @@ def test_extras_shape_and_weigh_the_highlight(mi_rgb, files, rng):
     np.testing.assert_allclose(values, expected, rtol=2e-3, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["metal", "leaf", "shaped"])
-def test_chi2(mi_rgb, files, name, tmp_path, monkeypatch):
-    """Samples follow the density, on both sides and beside the horizon of a turned frame."""
-    from mitsuba.chi2 import BSDFAdapter, ChiSquareTest, SphericalDomain
-
-    monkeypatch.chdir(tmp_path)  # where a failing test leaves its histogram
-    xml = f'<string name="filename" value="{files[name]}"/><boolean name="two_sided" value="true"/>'
-    xml += '<float name="clearcoat" value="0.8"/>' + (
-        '<string name="ignore" value="opacity"/>' if name == "leaf" else ""
-    )
-    for angle in (20, 100):
-        theta = np.radians(angle)
-        wi = dr.opaque(mi_rgb.Vector3f, [np.sin(theta), 0, np.cos(theta)])  # one kernel for all
-        sample, pdf = BSDFAdapter("neural_material", xml, wi=wi)
-        test = ChiSquareTest(SphericalDomain(), sample, pdf, sample_dim=3, sample_count=500_000, res=61, ires=32)
-        assert test.run(test_count=2, quiet=True), test.messages
-
-
-def test_energy_and_reciprocity(mi_rgb, files, rng):
-    """No weight exceeds the light on average; without a normal map, both directions may be exchanged."""
-    mi, ctx, n = mi_rgb, mi_rgb.BSDFContext(), 2**16
-    for name, more in (("metal", {}), ("steep", {"ignore": "albedo"}), ("leaf", {}), ("shaped", {})):
-        bsdf = mi.load_dict({"type": "neural_material", "filename": files[name], **more})
-        for z in (0.1, 0.6, 1.0):
-            si = hits(mi, rng, n)
-            si.wi = mi.Vector3f((1 - z * z) ** 0.5, 0, z)
-            _, weight = bsdf.sample(ctx, si, *samples(mi, rng, n))
-            assert 0 < weight.numpy().mean(axis=1).max() < 1.01
-    bsdf = mi.load_dict({"type": "neural_material", "filename": files["shaped"], "ignore": "normal", "clearcoat": 0.5})
-    si, wo = hits(mi, rng, n), directions(mi, rng, n)
-    forth = bsdf.eval(ctx, si, wo).numpy() * si.wi.z.numpy()
-    wi, si.wi = mi.Vector3f(si.wi), wo
-    np.testing.assert_allclose(bsdf.eval(ctx, si, wi).numpy() * wo.z.numpy(), forth, rtol=1e-3, atol=1e-6)
-
-
-@pytest.mark.parametrize("name", ["steep", "smooth"])
-def test_extremes_are_finite(mi_rgb, files, rng, name):
-    """Roughness 0, black, steep normals, directions at both horizons and none at all: values and derivatives."""
-    mi, n = mi_rgb, 50_000
-    bsdf = mi.load_dict({"type": "neural_material", "filename": files[name], "storage": "float32", "clearcoat": 1.0})
-    z = rng.choice([0, 1e-38, 1e-20, 1e-8, 1e-4, 0.5, 1, -0.5, -1e-8], (2, n))
-    phi = rng.choice([0, 1.0, np.pi, 2.0], (2, n))
-    r = np.sqrt(1 - z * z)
-    wi, wo = (mi.Vector3f(aligned([r[i] * np.cos(phi[i]), r[i] * np.sin(phi[i]), z[i]])) for i in (0, 1))
-    si = hits(mi, rng, n)
-    si.wi = dr.select(mi.Bool(rng.random(n) < 0.01), mi.Vector3f(0), wi)
-    params = mi.traverse(bsdf)
-    keys = [key for key in params.keys() if key.startswith("maps.tables.")]
-    for key in keys:
-        dr.enable_grad(params[key])
-    params.update()
-    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, wo)
-    bs, weight = bsdf.sample(mi.BSDFContext(), si, *samples(mi, rng, n))
-    dr.backward(dr.sum(value.x + weight.x))
-    gradients = [params[key].grad for key in keys]
-    dr.eval(value, pdf, bs, weight, gradients)
-    for v in (value, pdf, bs.pdf, weight, bs.wo, *gradients):
-        assert np.isfinite(v.numpy()).all()
-    assert min(v.numpy().min() for v in (value, pdf, bs.pdf, weight)) >= 0
-    outside = (wi.z.numpy() <= 0) | (wo.z.numpy() <= 0)
-    assert (value.numpy()[:, outside] == 0).all() and (pdf.numpy()[outside] == 0).all()
-
-
 # -- parameters --------------------------------------------------------------------------------------------------------
-
-
-def test_gradients_are_those_of_differences(mi_rgb, files, rng):
-    """With respect to entries of the arrays, along a random direction, and to a constant."""
-    mi, ctx, n = mi_rgb, mi_rgb.BSDFContext(), 20_000
-    more = {"storage": "float32", "clearcoat": 0.5}
-    bsdf = mi.load_dict({"type": "neural_material", "filename": files["shaped"], **more})
-    params, si, wo = mi.traverse(bsdf), hits(mi, rng, n), directions(mi, rng, n, lowest=0.6)
-    si.wi = directions(mi, rng, n, lowest=0.6)  # off the horizons, across which values jump
-    key = "maps.tables.cascaded"
-    extras = "maps.tables.extras"
-    steps = {
-        key: (mi.TensorXf(aligned(rng.random(params[key].shape))), 1e-3),
-        extras: (mi.TensorXf(aligned(rng.random(params[extras].shape))), 1e-3),
-        "clearcoat.value": (mi.Float(1), 1e-2),
-    }
-
-    def total():
-        value = bsdf.eval(ctx, si, wo)
-        return dr.mean(dr.minimum(value.x + value.y + value.z, 4.0))
-
-    for name, (direction, step) in steps.items():
-        before = params[name] + 0
-        if name in (key, extras):
-            before = 0.1 + 0.8 * before  # away from the ends of [0, 1], where entries are folded
-        params[name] = before
-        dr.enable_grad(params[name])
-        params.update()
-        dr.backward(total())
-        gradient = dr.sum(params[name].grad * direction, axis=None).numpy().item()
-        sums = []
-        for sign in (1, -1):
-            params[name] = dr.detach(before) + sign * step * direction
-            params.update()
-            sums.append(total().numpy().item())
-        assert gradient == pytest.approx((sums[0] - sums[1]) / (2 * step), rel=0.03) and abs(gradient) > 1e-4
-        params[name] = dr.detach(before)
-        params.update()
 
 
 def test_what_the_file_rules_out_is_not_traced(mi_rgb, files):

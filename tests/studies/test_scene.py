@@ -1,4 +1,4 @@
-"""The study of a scene: sample counts, whole runs of a tiny one, verdicts, the picture."""
+"""The study of a scene: sample counts, whole runs of a tiny one, interruption."""
 
 import csv
 import itertools
@@ -6,7 +6,6 @@ import json
 import math
 import os
 import signal
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,17 +14,12 @@ import pytest
 from mi_diffind.core.files import OutputError
 from mi_diffind.images import metrics
 from mi_diffind.measure import bias
-from mi_diffind.measure.statistics import finite
 from mi_diffind.scenes import loading
 from mi_diffind.scenes.loading import SceneError
-from mi_diffind.studies.scene import picture, report
-from mi_diffind.studies.scene import renders as study
-from mi_diffind.studies.scene.renders import VERSIONS, SceneStudySettings
-from mi_diffind.studies.scene.report import verdict
+from mi_diffind.studies import scene as study
+from mi_diffind.studies.scene import VERSIONS, SceneStudySettings
 
 FILES = ["tradeoff_scene.csv", "tradeoff_scene.json", "tradeoff_scene.png"]
-
-# -- settings, times, numbers -----------------------------------------------------------------------------------------
 
 
 def test_sample_counts_are_powers_of_two():
@@ -36,8 +30,6 @@ def test_sample_counts_are_powers_of_two():
     assert SceneStudySettings.choose(spp=300).counts(64) == [1, 4, 16, 64, 256]
     assert SceneStudySettings.choose(quick=True, spp=16).counts(4) == [1, 2, 4, 8, 16]
 
-
-# -- whole runs -------------------------------------------------------------------------------------------------------
 
 SCENE = """<scene version="3.0.0">
     <default name="spp" value="16"/>
@@ -56,6 +48,8 @@ SCENE = """<scene version="3.0.0">
     <emitter type="directional"><vector name="direction" value="0.4, -0.8, -0.5"/></emitter>
     <shape type="sphere">MATERIAL</shape>
 </scene>"""
+
+
 LEARNED = """<bsdf type="neural_disney" id="ball"><string name="preset" value="paper"/>
     <rgb name="base_color" value="0.5, 0.3, 0.2"/> <float name="roughness" value="0.6"/> EXTRA</bsdf>"""
 
@@ -82,7 +76,11 @@ def whole(scene, wholes, mi_rgb):
 
 
 QUICK = SceneStudySettings.choose(quick=True)
+
+
 PASSES = 1 + 2 + 2 * QUICK.passes  # the first is for the brightness, and two compile
+
+
 RENDERS = PASSES + 2 * QUICK.rounds * 2
 
 
@@ -133,19 +131,19 @@ def test_a_run_from_scene_to_picture(scene, tmp_path, monkeypatch):
     assert at_crossover == pytest.approx(result["bias"]["rmse"] ** 2)
 
     assert any(".npz" in name for name in os.listdir(tmp_path / "out"))
-    paths = report.write(result, tmp_path / "out")
+    paths = study.write(result, tmp_path / "out")
     assert sorted(os.listdir(tmp_path / "out")) == FILES
     with open(paths["csv"], encoding="utf-8", newline="") as file:
         table = list(csv.DictReader(file))
-    assert list(table[0]) == list(report.COLUMNS) and len(table) == 2 * 3
+    assert list(table[0]) == list(study.COLUMNS) and len(table) == 2 * 3
     for row, p in zip(table, result["points"], strict=True):
         assert (row["scene"], row["version"], int(row["spp"])) == ("ball.xml", p["version"], p["spp"])
         assert float(row["mse"]) == pytest.approx(p["mse"], rel=1e-5) and float(row["seconds"]) > 0
         assert (row["time_ratio"] == "") == (row["version"] == "exact")
     assert json.loads(Path(paths["json"]).read_text(encoding="utf-8")) == result
     assert Path(paths["png"]).stat().st_size > 50_000
-    text = "\n".join(report.summary(result))
-    assert "ball.xml, 16 x 12, 1 learned plugin" in text and result["verdict"] in text and "PSNR" in text
+    text = "\n".join(study.summary(result))
+    assert "ball.xml, 16 x 12, learned plugins: 1" in text and result["verdict"] in text and "PSNR" in text
 
 
 def test_bias_is_that_of_converged_images(scene, whole, mi_rgb):
@@ -162,7 +160,7 @@ def test_bias_is_that_of_converged_images(scene, whole, mi_rgb):
 
 @pytest.mark.parametrize("stop_at", [3, PASSES + 3, RENDERS - 1])
 def test_interruption_and_the_same_errors_in_the_end(scene, whole, tmp_path, monkeypatch, capsys, stop_at):
-    monkeypatch.setattr(report.picture, "draw", lambda result, caption: None)
+    monkeypatch.setattr(study, "draw", lambda result: None)
     monkeypatch.setattr("mi_diffind.measure.plot.save", lambda sheet, path: Path(path).touch())
     out = tmp_path / "out"
     with monkeypatch.context() as patch:
@@ -170,8 +168,8 @@ def test_interruption_and_the_same_errors_in_the_end(scene, whole, tmp_path, mon
         result = study.measure(scene, QUICK, out, progress=False)
     assert result["interrupted"] and len(renders) == stop_at
     assert (result["points"] == []) == (stop_at <= 7)
-    paths = report.write(result, out)  # with whatever there is
-    assert ("png" in paths) == (stop_at > 7) and "interrupted" in "\n".join(report.summary(result))
+    paths = study.write(result, out)  # with whatever there is
+    assert ("png" in paths) == (stop_at > 7) and "interrupted" in "\n".join(study.summary(result))
     assert json.loads(Path(paths["json"]).read_text(encoding="utf-8"))["interrupted"]
 
     capsys.readouterr()
@@ -183,38 +181,8 @@ def test_interruption_and_the_same_errors_in_the_end(scene, whole, tmp_path, mon
     assert errors_of(finished) == errors_of(whole)
     done = len(renders)
     assert errors_of(study.measure(scene, QUICK, out)) == errors_of(whole) and len(renders) == done  # if writing fails
-    report.write(finished, out)
+    study.write(finished, out)
     assert sorted(os.listdir(out)) == FILES
-
-
-@pytest.mark.parametrize("change", ["scene", "settings", "seed"])
-def test_a_run_of_something_else_is_not_gone_on_with(scene, tmp_path, monkeypatch, capsys, change):
-    out, settings, seed = tmp_path / "out", QUICK, 0
-    with monkeypatch.context() as patch:
-        Renders(patch, 4)
-        assert study.measure(scene, settings, out, seed, progress=False)["interrupted"]
-    if change == "scene":
-        scene.write_text(scene.read_text(encoding="utf-8").replace("0.3, 0.2", "0.3, 0.1"), encoding="utf-8")
-    elif change == "settings":
-        settings = replace(QUICK, rounds=1)
-    else:
-        seed = 1
-    with monkeypatch.context() as patch:
-        Renders(patch, 1)
-        result = study.measure(scene, settings, out, seed)
-    assert not result["resumed"]
-    names = {"scene": "sources", "settings": "settings", "seed": "seed"}
-    assert f"is of a run with other {names[change]}: starting anew" in capsys.readouterr().err
-
-
-def test_large_images_are_rendered_in_several_launches(scene, monkeypatch):
-    renders = Renders(monkeypatch)
-    result = study.measure(scene, replace(QUICK, rounds=1), progress=False, launch_samples=16 * 12 * 2)
-    assert {spp for spp, _ in renders} == {1, 2}
-    top = [seed for spp, seed in renders if spp == 2][: 2 * (1 + 2 * QUICK.passes)]
-    lower = [seed for _, seed in renders][2 + len(top) :]
-    assert len(set(top)) == 2 * (1 + QUICK.passes) and not set(top) & set(lower)
-    assert result["bias"]["measured"] and result["points"][-1]["images"] == QUICK.passes
 
 
 def test_values_that_are_not_finite_are_counted(scene, monkeypatch):
@@ -229,13 +197,7 @@ def test_values_that_are_not_finite_are_counted(scene, monkeypatch):
     result = study.measure(scene, QUICK, progress=False)
     assert result["not_finite"] == 2 * (QUICK.passes + 2 * QUICK.rounds)
     assert math.isfinite(result["points"][0]["mse"])
-    assert "counted as 0" in "\n".join(report.summary(result)) and "counted as 0" in report.caption(result)
-
-
-def test_one_sample_count(scene, tmp_path):
-    settings = SceneStudySettings.choose(quick=True, spp=1)
-    result = study.measure(scene, settings, tmp_path, progress=False, defines={"spp": 2})
-    assert result["counts"] == [1] and len(result["points"]) == 2 and result["defines"] == {"spp": "2"}
+    assert "counted as 0" in "\n".join(study.summary(result)) and "counted as 0" in study.caption(result)
 
 
 def test_bad_input(scene, tmp_path):
@@ -247,80 +209,3 @@ def test_bad_input(scene, tmp_path):
     plain.write_text(SCENE.replace("MATERIAL", '<bsdf type="diffuse"/>'), encoding="utf-8")
     with pytest.raises(SceneError, match=r"plain\.xml: names no learned plugin \(neural_bsdf, neural_disney"):
         study.measure(plain, QUICK, progress=False)
-
-
-# -- verdicts and pictures --------------------------------------------------------------------------------------------
-
-
-def made_up(size, sigma=0.2, ratio=1.3, counts=(1, 4, 16, 64), error=None, load=1.0):
-    """A result with the relative bias and noise given; ``error``: the standard error of its square."""
-    error = 0.01 * size**2 if error is None else error
-    points = []
-    for spp, (name, factor) in itertools.product(counts, zip(VERSIONS, (1.0, ratio), strict=True)):
-        mse = sigma**2 / spp + (size**2 if name == "learned" else 0)
-        seconds = factor * (0.05 + 0.3 * spp)
-        point = {"version": name, "spp": spp, "mse": mse, "mse_q1": 0.9 * mse, "mse_q3": 1.2 * mse}
-        point |= {"rmse": math.sqrt(mse), "psnr_db": 30.0, "images": 5, "timed": 5}
-        for kind in ("seconds", "seconds_wall"):
-            point |= {kind: seconds, f"{kind}_q1": 0.95 * seconds / load, f"{kind}_q3": 1.1 * seconds * load}
-        points.append(point)
-    estimated = bias.Estimate(size**2, error, sigma**2 / counts[-1])
-    result = {
-        "scene": "some/where/room.xml", "variant": "llvm_ad_rgb", "width": 640, "height": 480, "seed": 0,
-        "defines": {"preset": "paper"}, "learned_plugins": 7, "settings": {"quick": False}, "counts": list(counts),
-        "date": "2025-01-01", "interrupted": False, "resumed": False, "not_finite": 0, "points": points,
-        "ratios": [{"spp": n, "median": ratio, "q1": ratio - 0.1, "q3": ratio + 0.1, "wall": ratio} for n in counts],
-        "machine": {"cpu": "A processor", "instructions": "16 lanes a vector", "cores": 2, "gpu": None,
-                    "variant": "llvm_ad_rgb", "llvm": "20.1.8", "mitsuba": "3.9.1", "drjit": "1.5.0",
-                    "mi-diffind": "0.1.0"},
-        "reference": {"spp": 8 * counts[-1], "passes": 8, "noise_rmse": sigma / math.sqrt(8 * counts[-1])},
-        "noise": {name: {"mse_of_a_sample": sigma**2} for name in VERSIONS},
-        "bias": bias.describe(estimated, estimated),
-        "crossover": bias.crossover(estimated, sigma**2, points),
-    }  # fmt: skip
-    return finite({**result, "verdict": verdict(result)})
-
-
-CASES = {
-    "within": (made_up(0.05), "Up to about 16 spp (6.3 s) noise dominates; beyond, the bias"),
-    "beyond": (made_up(0.008), "up to 64 spp (25 s); by extrapolation, it would equal the bias"),
-    "far": (made_up(1e-5), "is below what any practical number of samples (up to 1 million a pixel) would show"),
-    "rounding": (made_up(1e-8), "differ by rounding only"),
-    "below": (made_up(0.0, error=1e-8), "noise dominates at any practical number of samples"),
-    "below, near": (made_up(0.0, error=2e-4), "No bias was found; if there is one, it is below"),
-    "equal": (made_up(0.0, error=0.0), "do not differ at all"),
-    "everywhere": (made_up(0.6), "The approximation dominates throughout"),
-    "slow": (made_up(0.05, ratio=6.0), "noise dominates; beyond"),
-    "fast": (made_up(0.02, ratio=0.3), "by extrapolation"),
-    "alike": (made_up(0.001, ratio=1.0, load=2.0), "Noise dominates"),
-    "many": (made_up(0.01, counts=(1, 2, 4, 8, 16, 32, 64, 128, 256)), "Noise dominates"),
-    "one": (made_up(0.05, counts=(64,)), "The approximation dominates"),
-}
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_verdict_and_summary(case):
-    result, words = CASES[case]
-    assert words in result["verdict"]
-    text = report.summary(result)
-    assert text[-1] == result["verdict"] and "nan" not in "\n".join(text).lower()
-    assert "illion spp" not in "\n".join(text).replace("1 million spp", "") and "years" not in "\n".join(text)
-    assert f"reference   {8 * result['counts'][-1]} spp" in "\n".join(text)
-
-
-@pytest.mark.parametrize("case", ["within", "far", "below, near", "slow", "alike", "many", "one"])
-def test_labels_do_not_cover_each_other(case):
-    result = CASES[case][0]
-    sheet = picture.draw(result, report.caption(result))
-    sheet.draw_without_rendering()
-    renderer, (axes,) = sheet.canvas.get_renderer(), sheet.axes
-    assert [t for t in axes.texts if t.get_text().endswith(" spp")]
-    boxes = [t.get_window_extent(renderer) for t in axes.texts] + [axes.get_legend().get_window_extent(renderer)]
-    for a, b in itertools.combinations(boxes, 2):
-        assert not a.overlaps(b)
-    inside = axes.get_window_extent(renderer).padded(1)
-    assert all(inside.contains(b.x0, b.y0) and inside.contains(b.x1, b.y1) for b in boxes)
-    whole = sheet.bbox
-    for text in sheet.texts:
-        box = text.get_window_extent(renderer)
-        assert whole.x0 <= box.x0 and box.x1 <= whole.x1 and whole.y0 <= box.y0 and box.y1 <= whole.y1

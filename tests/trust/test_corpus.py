@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import struct
 import zipfile
@@ -17,15 +18,16 @@ from trial_files import all_seeds
 
 from mi_diffind.tasks.radiance import coding
 
-#: Name → function that writes the files to a folder and returns the probe and its arguments, and the right outcomes.
+#: Name → function that writes the files to a folder and returns the probe and its arguments, the right outcomes, and
+#: an expression that the sentence has to match.
 CASES = {}
 
 
-def case(name, *outcomes):
+def case(name, *outcomes, says=""):
     """Add a function to the corpus."""
 
     def add(write):
-        CASES[name] = write, outcomes or ("refused",)
+        CASES[name] = write, outcomes or ("refused",), says
         return write
 
     return add
@@ -192,19 +194,80 @@ def _(folder):
     return "still_ray", {"path": str(all_seeds()["sdf_sparse"][1])}
 
 
-FIT = "fit ggx --steps 1 --primary 4 --cascaded 3 --variant llvm_ad_rgb"
+FIT = "fit ggx --steps 1 --primary 4 --cascaded 3 --variant llvm_ad_rgb -o a.npz"
 
-for name, words in {
-    "2^31 samples a step": f"{FIT} -o x.npz --batch {2**31}",
-    "2^64 samples a step": f"{FIT} -o x.npz --batch {2**64}",
-    "seed 2^70": f"{FIT} -o x.npz --batch 64 --seed {2**70}",
-    "output of 300 characters": f"{FIT} --batch 64 -o {'x' * 300}.npz",
-    "report of 300 characters": f"{FIT} --batch 64 -o x.npz --json {'x' * 300}.json",
-    "checkpoint of 300 characters": f"{FIT} --batch 64 -o x.npz --checkpoint {'x' * 300}",
-    "file of 5000 characters": f"inspect {'x' * 5000}.npz --variant llvm_ad_rgb",
-    "report in place of the table": f"{FIT} --batch 64 -o x.npz --json x.npz",
-}.items():
-    case(name)(lambda folder, words=words: ("command", {"arguments": words.split()}))
+
+def command(words, says="", write=lambda folder: None):
+    """Add a command line that has to be refused."""
+
+    @case(words if len(words) < 200 else f"{words[:100]} ({len(words)} characters)", says=says)
+    def _(folder):
+        write(folder)
+        return "command", {"arguments": words.split()}
+
+
+command(f"{FIT} --json a.npz")
+for option in ("batch", "steps", "seconds", "seed"):
+    for value in (str(2**31), str(2**64), str(2**70), "9" * 5000):
+        if (option, value) != ("seed", str(2**31)):  # seeds have 32 bits
+            command(f"fit ggx -o a.npz --{option} {value}", f"--{option}: ")
+
+#: Command lines that read or write PATH.
+PATHS = """
+    fit ggx -o PATH.npz
+    fit ggx -o a.npz --json PATH
+    fit ggx -o a.npz --steps 1 --checkpoint PATH
+    fit image PATH.png -o a.npz
+    fit image PATH.json -o a.npz
+    fit sdf PATH.obj -o a.npz
+    fit field PATH -o a.npz
+    fit bsdf PATH.xml -o a.npz
+    inspect PATH.npz
+    render PATH.xml -o a.exr
+    decode PATH.npz -o a.png
+    decode a.npz -o PATH.png
+    compare PATH.xml
+    capture PATH.xml -o views
+"""
+
+#: Command lines that read PATH, or a file of the folder LINK that names it.
+SOURCES = """
+    fit image PATH.png -o a.npz
+    fit texture PATH.json -o a.npz
+    fit image LINK/m.json -o a.npz
+    fit sdf PATH.obj -o a.npz
+    fit bsdf PATH.csv -o a.npz
+    capture PATH.ply -o views
+    fit field LINK/views -o a.npz
+    fit ggx -o a.npz --resume --checkpoint PATH.c
+    inspect PATH.npz
+    render PATH.xml
+"""
+
+for words in PATHS.strip().splitlines():
+    for path in ("a" * 300, "a/" * 2500, "a" * 5000):
+        command(words.replace("PATH", path))
+
+
+def special_files(target):
+    """Return a function that writes pipes, which block whoever opens them, or devices that never end."""
+
+    def write(folder):
+        folder = folder / target
+        (folder / "views").mkdir(parents=True, exist_ok=True)
+        (folder / "m.json").write_text(json.dumps({"albedo": "PATH.png"}))
+        endings = ("png", "json", "obj", "csv", "ply", "c", "npz", "xml")
+        for name in (*(f"PATH.{ending}" for ending in endings), "views/transforms.json"):
+            if not os.path.lexists(folder / name):
+                os.mkfifo(folder / name) if target == "pipe" else os.symlink("/dev/zero", folder / name)
+
+    return write
+
+
+for target in ("pipe", "device"):
+    for words in SOURCES.strip().splitlines():
+        words = words.replace("PATH", f"{target}/PATH").replace("LINK", target)
+        command(words, f"is a {target}|holds no views", special_files(target))
 
 
 def put(*path):
@@ -289,11 +352,9 @@ def checkpoint(key, value):
         return "checkpoint", {"path": "mutant.npz"}
 
 
-for key, values in {
-    "step": ("x", [1], -1, 2**70), "lr_scale": ("x", None), "best_measured": (3,), "best_step": ("x",),
-    "history": (3, [1]), "restarts": ("x",), "seconds": ("x",), "plateau": (3,), "references": (3,), "settings": (3,),
-}.items():  # fmt: skip
-    for value in values:
+for key in ("step", "lr_scale", "best_measured", "best_step", "history", "restarts", "seconds", "plateau", "references",
+            "settings"):  # fmt: skip
+    for value in (None, "x", [1], {"a": "b"}, 3, -1, 2**70):
         checkpoint(key, value)
 
 
@@ -321,7 +382,10 @@ def child(tmp_path_factory):
 
 @pytest.mark.parametrize("name", CASES)
 def test_what_once_failed(child, name):
-    write, outcomes = CASES[name]
+    """A command that is refused leaves no file."""
+    write, outcomes, says = CASES[name]
     probe, arguments = write(child.folder)
+    before = set(child.folder.rglob("*"))
     answer = child.check(probe, **arguments)
-    assert answer["outcome"] in outcomes, answer
+    assert answer["outcome"] in outcomes and re.search(says, answer["message"]), answer
+    assert probe != "command" or set(child.folder.rglob("*")) == before

@@ -79,48 +79,31 @@ def check_back(mi, name: str, image: np.ndarray, fresh: np.ndarray, key: str) ->
         np.testing.assert_array_equal(image, fresh, err_msg=key)
 
 
+@pytest.mark.parametrize("together", [True, pytest.param(False, marks=pytest.mark.slow)], ids=["all", "each"])
 @pytest.mark.parametrize("variant, name, storage", CASES)
-def test_all_parameters_set_back(variant, name, storage):
-    """All parameters of a plugin at once: another image, and after they are set back that of a fresh scene."""
+def test_parameters_set_back(variant, name, storage, together):
+    """All parameters at once, or one after the other: another image, and that of a fresh scene once set back."""
     mi = loaded(variant, name, storage)
-    fresh = render(mi, examples.load(mi, name, storage))
-    scene = examples.load(mi, name, storage)
-    params, keys = examples.exposed(mi, scene, name)
-    before = {key: examples.copied(params[key]) for key in keys}
-    for key in keys:
-        params[key] = examples.another(params[key])
-    params.update()
-    changed = render(mi, scene)
-    assert np.isfinite(changed).all()
-    assert np.array_equal(changed, fresh) == (not keys)
-    for key in keys:
-        params[key] = before[key]
-    params.update()
-    check_back(mi, name, render(mi, scene), fresh, "all")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("variant, name, storage", CASES)
-def test_each_parameter_set_back(variant, name, storage):
-    """One parameter after the other, in one scene."""
-    mi = loaded(variant, name, storage)
-    fresh = render(mi, examples.load(mi, name, storage))
-    scene = examples.load(mi, name, storage)
+    fresh, scene = (examples.load(mi, name, storage) for _ in range(2))
+    fresh = render(mi, fresh)
     params, keys = examples.exposed(mi, scene, name)
     unseen = UNSEEN[0] + UNSEEN[1] * ("mono" in variant or name == "neural_material") + UNSEEN[2] * mi.is_polarized
-    for key in keys:
-        before = examples.copied(params[key])
-        params[key] = examples.another(params[key])
+    for group in [keys] if together else [[key] for key in keys]:
+        before = {key: examples.copied(params[key]) for key in group}
+        for key in group:
+            params[key] = examples.another(params[key])
         params.update()
         changed = render(mi, scene)
-        assert np.isfinite(changed).all(), key
-        assert key.endswith(unseen) or not np.array_equal(changed, fresh), f"{key} has no effect"
-        params[key] = before
+        assert np.isfinite(changed).all(), group
+        seen = [key for key in group if together or not key.endswith(unseen)]
+        assert not seen or not np.array_equal(changed, fresh), f"{group} has no effect"
+        for key in group:
+            params[key] = before[key]
         params.update()
-        check_back(mi, name, render(mi, scene), fresh, key)
+        check_back(mi, name, render(mi, scene), fresh, str(group))
 
 
-@pytest.mark.parametrize("variant, name, storage", CASES)
+@pytest.mark.parametrize("variant, name, storage", [c for c in CASES if c.marks])  # RGB: plugins/test_frozen.py
 def test_frozen_renders(variant, name, storage, no_garbage_collection):
     """A recorded render equals one that is not recorded, for other seeds and after a change of all parameters."""
     mi = loaded(variant, name, storage)

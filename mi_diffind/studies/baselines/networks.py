@@ -1,15 +1,63 @@
-"""Networks of ``drjit.nn`` that tables are compared with: alone, after a hash grid, and in front of a table."""
+"""Networks of ``drjit.nn`` that tables are compared with: alone, after a hash grid, and in front of a table.
+
+Here are the networks in place of tables of images and textures (hash grids of uv), of the Disney BRDF (its factors) and
+of measured and layered BSDFs. Those of fields are in :mod:`.fields`.
+
+Sources: Müller et al., *Instant Neural Graphics Primitives with a Multiresolution Hash Encoding*, 2022; Barron et al.,
+*Zip-NeRF: Anti-Aliased Grid-Based Neural Radiance Fields*, 2023, for features that fade with the footprint; Sztrajman
+et al., *Neural BRDF Representation and Importance Sampling*, 2021, for the size of networks of BSDFs.
+"""
 
 from __future__ import annotations
 
 import copy
+import math
+from collections.abc import Sequence
+from types import ModuleType
 
 import drjit as dr
+import mitsuba as mi
+import numpy as np
 from drjit import nn
 
 from ...arrays.indirection import DifferentiableArray, fold
+from ...arrays.lookup import clamp
 from ...core.compat import module_of
-from ...measure.operations import Operations
+from ...core.runtime import array_module
+from ...core.units import largest_fitting
+from ...fitting.loop import Problem
+from ...maps.compressed import FilteredMaps, decibel
+from ...maps.layout import Layout
+from ...maps.pyramid import Pyramid, level_sizes
+from ...maps.source import Source
+from ...measure.clock import Operations
+from ...tasks.bsdf import training as bsdf_training
+from ...tasks.bsdf.directions import SphereView
+from ...tasks.bsdf.model import DirectionPair, Form, coordinate_u, coordinate_w
+from ...tasks.bsdf.training import BSDFProblem
+from ...tasks.bsdf.truth import truth_of
+from ...tasks.disney import model
+from ...tasks.disney.decoder import Decoder
+from ...tasks.disney.model import TINY, Factors, compose, geometry
+from ...tasks.disney.training import measure, random_directions, random_materials, shade
+from ...tasks.texture import PRESETS
+from ...tasks.texture.training import TextureProblem
+
+#: Hidden units of a layer, and hidden layers, of networks after a hash grid.
+WIDTH = 32
+LAYERS = 2
+
+#: Levels of a hash grid, numbers at an entry of a level, and its coarsest resolution.
+LEVELS = 8
+FEATURES = 2
+COARSEST = 8
+
+#: Samples of a measurement during training.
+MEASURED_TEXELS = 2**16
+MEASURED = 2**17
+
+#: Limits of a logarithm before its exponential.
+LIMITS = (-30.0, 20.0)
 
 
 class Network(nn.Module):
@@ -99,3 +147,386 @@ class Network(nn.Module):
         macs = sum(dr.width(w) for w in weights)
         values = sum(dr.width(self.mlp[key]) for key in self.mlp)
         return Operations(add=macs, mul=macs, gathers=len(weights), bytes_gathered=4 * values, instructions=macs)
+
+
+def hash_grid(dimensions: int, nbytes: float, finest: float, outputs: int, direct: int = 0) -> dict:
+    """Return the options of the largest hash grid with which a network takes ``nbytes``, 2 bytes a parameter.
+
+    ``finest`` is the resolution of the last level. The network has :data:`LAYERS` hidden layers of :data:`WIDTH` units,
+    ``outputs``, and ``direct`` inputs beside the features of the grid. Raises ``ValueError`` if the bytes are too few.
+    """
+    scale = (max(2 * COARSEST, finest) / COARSEST) ** (1 / (LEVELS - 1))
+    weights = WIDTH * (FEATURES * LEVELS + direct + (LAYERS - 1) * WIDTH + outputs) + LAYERS * WIDTH + outputs
+    resolutions = [math.ceil(COARSEST * scale**level) for level in range(LEVELS)]
+    sizes = [int(2**power) // 16 * 16 for power in np.arange(6, 24, 0.05)]
+
+    def fits(index: int) -> bool:
+        entries = sum(min(sizes[index], (n + 1) ** dimensions) for n in resolutions)
+        return 2 * (FEATURES * entries + weights) <= nbytes
+
+    largest = largest_fitting(fits, -1, len(sizes))
+    if largest < 0:
+        raise ValueError(f"{nbytes:,.0f} bytes are too few for a hash grid of {LEVELS} levels")
+    return {"n_levels": LEVELS, "n_features_per_level": FEATURES, "hashmap_size": sizes[largest],
+            "base_resolution": COARSEST, "per_level_scale": scale, "align_corners": True,
+            "init_scale": 1e-4}  # fmt: skip
+
+
+# -- Images and filtered textures --------------------------------------------------------------------------------------
+
+
+def image_network(source: Source, nbytes: float) -> Network:
+    """Return the largest network with hash grid of uv of ``nbytes``, not yet allocated; raises as :func:`hash_grid`."""
+    grid = hash_grid(2, nbytes, max(source.width, source.height), source.channels)
+    return Network(2, WIDTH, LAYERS, grid, outputs=source.channels)
+
+
+class ImageNetworkProblem(Problem):
+    """Training of a :class:`Network` on the texels of ``source``, all channels together, drawn at random."""
+
+    def __init__(self, net: Network, types, source: Source):
+        self.net, self.types, self.source = net.alloc(types.TensorXf, 2, dr.rng(seed=1)), types, source
+        values = np.concatenate([np.clip(m.values, 0, 1) for m in source.maps], axis=-1).reshape(source.texels, -1)
+        self.values = [types.Float(np.ascontiguousarray(channel, np.float32)) for channel in values.T]
+        self.held = types.UInt32(
+            np.random.default_rng(2).integers(0, source.texels, min(MEASURED_TEXELS, source.texels))
+        )
+        self.identity = {"source": source.digest, "network": net.grid, "seed": 1}
+
+    def _at(self, index):
+        x, y = index % self.source.width, index // self.source.width
+        uv = [(self.types.Float(x) + 0.5) / self.source.width, (self.types.Float(y) + 0.5) / self.source.height]
+        return uv, {"maps": [dr.gather(self.types.Float, channel, index) for channel in self.values]}
+
+    def batch(self, rng, size: int):
+        count = self.source.texels
+        return self._at(dr.minimum(self.types.UInt32(rng.random(self.types.Float, size) * count), count - 1))
+
+    def predict(self, net, inputs) -> dict[str, list]:
+        return {"maps": net(inputs)}
+
+    def measure(self, net) -> dict[str, float]:
+        uv, targets = self._at(self.held)
+        pairs = zip(net(uv), targets["maps"], strict=True)
+        squares = [float(dr.mean(dr.square(dr.clip(value, 0, 1) - target))[0]) for value, target in pairs]
+        return {"psnr_db": decibel(sum(squares) / len(squares))}
+
+    def decode(self, net) -> dict[str, np.ndarray]:
+        """Return the maps that a network holds, ``(height, width, channels)`` in [0, 1], by name."""
+        uv, _ = self._at(dr.arange(self.types.UInt32, self.source.texels))
+        values = np.stack([np.clip(np.array(value), 0, 1) for value in net(uv)], axis=-1)
+        values = values.reshape(self.source.height, self.source.width, -1)
+        ends = np.cumsum([m.channels for m in self.source.maps])
+        return {m.name: values[..., end - m.channels : end] for m, end in zip(self.source.maps, ends, strict=True)}
+
+
+class FilteredNetwork(Network):
+    """Network of (u, v, level of detail), all in [0, 1], from a hash grid of uv of ``size`` texels at level 0.
+
+    Features of a grid level that is finer than the texels of the level of detail fade out over one octave; without the
+    fading, a network was 2 dB worse after 400 steps.
+    """
+
+    def __init__(self, size: int, levels: int, grid: dict, outputs: int):
+        super().__init__(2, WIDTH, LAYERS, grid, outputs=outputs, direct=1)
+        self.size, self.levels = size, levels
+
+    def features(self, x: list) -> list:
+        features, level = super().features(x), x[2] * (self.levels - 1)
+        count = self.grid["n_features_per_level"]
+        for i in range(self.grid["n_levels"]):
+            side = self.grid["base_resolution"] * self.grid["per_level_scale"] ** i
+            weight = clamp(1 + math.log2(self.size / side) - level, 0.0, 1.0)
+            for k in range(i * count, (i + 1) * count):
+                features[k] = features[k] * weight
+        return features
+
+
+def texture_network(source: Source, layout: Layout, nbytes: float) -> FilteredNetwork:
+    """Return the largest network of uv and level of ``nbytes``, not yet allocated; raises as :func:`hash_grid`."""
+    grid = hash_grid(2, nbytes, max(source.width, source.height), layout.stored, 1)
+    sizes = level_sizes(source.height, source.width)
+    return FilteredNetwork(max(sizes[0]), len(sizes), grid, layout.stored)
+
+
+class NetworkMaps(FilteredMaps):
+    """Maps that a network holds; if ``cooperative``, the plugin ``mipmap`` can read them as it reads a pyramid.
+
+    Without ``cooperative``, reads have derivatives, but cannot be part of the loops of a render.
+    """
+
+    def __init__(
+        self, net: Network, layout: Layout, types: ModuleType, border: Sequence[str], cooperative: bool = False
+    ):
+        self.net, self.layout, self.types, self.border = net, layout, types, tuple(border)
+        self.reading = net.cooperative() if cooperative else net
+        self.levels = len(level_sizes(layout.height, layout.width))
+
+    @property
+    def arrays(self) -> dict:
+        """Dr.Jit arrays of a read, by name."""
+        return {key: self.net[key] for key in self.net}
+
+    @property
+    def memory_nbytes(self) -> int:
+        """Bytes of all parameters in single precision."""
+        return self.net.nbytes
+
+    def stored(self, u, v, active=True) -> list:
+        return self.filtered(u, v, type(u)(0), active)
+
+    def filtered(self, u, v, level, active=True) -> list:
+        place = [
+            x - dr.floor(x) if border == "repeat" else clamp(x, 0.0, 1.0)
+            for x, border in ((u, self.border[1]), (v, self.border[0]))
+        ]
+        return self.reading([*place, self.clamped(level, type(u)) / (self.levels - 1)])
+
+    def interpolated(self, u, v, level, active=True, whole: bool = False) -> list:
+        """Return :meth:`filtered`."""
+        return self.filtered(u, v, level, active)
+
+    def interpolated_texels(self, index, active=True) -> list:
+        """Return the stored channels at texel centres of level 0, given their ``index``, row by row."""
+        Float, width = self.types.Float, self.layout.width
+        u, v = (Float(index % width) + 0.5) / width, (Float(index // width) + 0.5) / self.layout.height
+        return self.stored(u, v, active)
+
+    def encoded(self, values: list) -> list:
+        """Return ``values``: a network returns stored channels."""
+        return values
+
+    def is_linear(self, name: str) -> bool:
+        """Return False: sRGB values are interpolated as they are stored."""
+        return False
+
+
+class TextureNetworkProblem(TextureProblem):
+    """Training problem of a network on a pyramid, with the samples of our textures."""
+
+    tolerance = 0.0
+
+    def __init__(self, net: FilteredNetwork, pyramid: Pyramid, digest: str):
+        types = pyramid.types
+        net = net.alloc(types.TensorXf, rng=dr.rng(seed=dr.opaque(types.UInt64, 1)))
+        super().__init__(net, pyramid, PRESETS["ours"], digest)
+
+    @staticmethod
+    def form(net) -> dict:
+        return {"network": net.grid, "width": net.width, "layers": net.layers}
+
+    def maps(self, net) -> NetworkMaps:
+        """Return the maps that a network holds."""
+        return NetworkMaps(net, self.pyramid.layout, self.types, self.pyramid.border)
+
+    def predict(self, net, inputs) -> dict[str, list]:
+        u, v, level, _ = inputs
+        return self._grouped(self.maps(net).filtered(u, v, level))
+
+    def measure(self, net) -> dict[str, float]:
+        """Return the PSNR of the stored channels at held-out samples between texels and levels."""
+        jittered, self.jittered = self.jittered, True
+        with dr.suspend_grad():
+            inputs, targets = self.batch(dr.rng(seed=dr.opaque(self.types.UInt64, 2023)), MEASURED)
+            outputs = self.predict(net, inputs)
+            pairs = [pair for name in targets for pair in zip(outputs[name], targets[name], strict=True)]
+            squares = [dr.square(a - b) for a, b in pairs]
+            dr.eval(squares)
+        self.jittered = jittered
+        return {"psnr_db": decibel(sum(float(dr.mean(s)[0]) for s in squares) / len(squares))}
+
+
+# -- Disney BRDF -------------------------------------------------------------------------------------------------------
+
+#: Inputs and outputs of a network in place of the Disney BRDF's factors, and its hidden layers.
+DISNEY_INPUTS = 10
+DISNEY_OUTPUTS = 4
+DISNEY_LAYERS = 2
+
+#: Scale of inputs that are logarithms.
+LOGARITHM_SCALE = 0.2
+
+
+def disney_network(nbytes: int) -> Network:
+    """Return the widest network of ``nbytes``, 2 bytes a parameter, not yet allocated.
+
+    It returns the four factors (:class:`~mi_diffind.tasks.disney.model.Factors`) that are no polynomial of cosines and
+    parameters: specular and clearcoat as logarithms, both diffuse terms as they are. The model composes the colour of
+    them. In trials of 1000 steps, networks that return the three scalars of the colour or RGB were 9 and 13 dB worse.
+    """
+
+    def parameters(width: int) -> int:
+        hidden = (DISNEY_LAYERS - 1) * (width + 1) * width
+        return (DISNEY_INPUTS + 1) * width + hidden + (width + 1) * DISNEY_OUTPUTS
+
+    width = largest_fitting(lambda width: 2 * parameters(width) <= nbytes, 0, 4096)
+    if not width:
+        raise ValueError(f"{nbytes:,} bytes are too few for a network of {DISNEY_LAYERS} hidden layers")
+    return Network(DISNEY_INPUTS, width, DISNEY_LAYERS, outputs=DISNEY_OUTPUTS)
+
+
+def coordinates(p, wi, wo) -> list:
+    """Return the inputs of a network: numbers that the formulas contain.
+
+    They are roughness, clearcoat gloss, cos θ_i, cos θ_o and cos θ_d; the logarithms of the denominators of both
+    distributions (h stretched by α_x and α_y; sin² θ_h + α² cos² θ_h of the clearcoat) and of α_x α_y; and the
+    logarithm of the masking denominator of each direction.
+    """
+    g = geometry(wi, wo)
+    h = g.h * dr.rsqrt(g.h2 + TINY)
+    ax, ay = model.roughness_to_alpha(p.roughness, p.anisotropic)
+    sine2, cosine2 = dr.square(h.x) + dr.square(h.y), dr.square(h.z)
+    stretched = dr.square(h.x / ax) + dr.square(h.y / ay) + cosine2
+    coat = sine2 + dr.square(model.coat_alpha(p.clearcoat_gloss)) * cosine2
+    logarithms = [LOGARITHM_SCALE * dr.log(x + TINY) for x in (stretched, ax * ay, coat)]
+    masking = [dr.log(model.masking_denominator(w, ax, ay)) for w in (wi, wo)]
+    return [p.roughness, p.clearcoat_gloss, wi.z, wo.z, g.cos_d, *logarithms, *masking]
+
+
+class NetworkDecoder(Decoder):
+    """Form of the model whose factors a ``network`` returns; it needs no coefficients."""
+
+    def __init__(self, network: Network):
+        self.network = network
+
+    def required(self, e):
+        return ()
+
+    def value(self, c, e, lobes, p, wi, wo, active=True):
+        specular, diffuse, flat, clearcoat = self.network(coordinates(p, wi, wo))
+        s = model.schlick(geometry(wi, wo).cos_d)
+        specular, clearcoat = (dr.exp(clamp(v, *LIMITS)) for v in (specular, clearcoat))
+        factors = Factors(
+            specular=specular,
+            metal_base=p.metallic * (1 - s),
+            base=(1 - p.metallic) * (1 - s),
+            sheen=(1 - p.metallic) * s * wo.z,
+            grazing=s,
+            diffuse=diffuse * wo.z,
+            flat=flat * wo.z,
+            clearcoat=clearcoat * wo.z,
+        )
+        return model.colour(compose(p, factors, lobes).values(), p.albedo, p.luminance)
+
+
+def squared_errors(value, truth) -> list:
+    """Return the squared errors of each channel, for training.
+
+    Truth above 1 counts as 1, as in the measurement; values above 1 count as 1 there and as 1 + log(value) elsewhere,
+    so that their gradients stay finite and do not vanish.
+    """
+    errors = []
+    for v, t in zip(value, truth, strict=True):
+        compressed = dr.select(v > 1, 1 + dr.log(dr.maximum(v, 1)), v)
+        errors.append(dr.select(t >= 1, dr.minimum(v, 1) - 1, compressed - t))
+    return [dr.square(error) for error in errors]
+
+
+class DisneyNetworkProblem(Problem):
+    """Training problem of a network: BRDF · cosine in RGB, of the materials and directions of tables' trainings."""
+
+    def __init__(self, net: Network, types):
+        self.net = net.alloc(types.TensorXf, rng=dr.rng(seed=dr.opaque(types.UInt64, 1)))
+        self.types, self.identity = types, {"width": net.width, "layers": net.layers}
+
+    def loss(self, net, rng, size: int):
+        m, (wi, wo) = random_materials(rng, self.types, size), random_directions(rng, self.types, size)
+        albedo = self.types.Array3f([rng.random(self.types.Float, size) for _ in range(3)])
+        value = shade(NetworkDecoder(net), m, albedo, wi, wo)
+        return sum(squared_errors(value, shade(None, m, albedo, wi, wo))) * (1 / (3 * size))
+
+    def measure(self, net) -> dict[str, float]:
+        with dr.suspend_grad():
+            return measure(NetworkDecoder(net), self.types, MEASURED)
+
+
+# -- BSDFs -------------------------------------------------------------------------------------------------------------
+
+#: Hidden units of both layers of a network in place of a BSDF; weights and biases of 6 inputs and 3 outputs are 675.
+BSDF_WIDTH = 21
+
+#: Share of a training in which errors are those of logarithms; raw inputs stay near their start without it.
+LOGARITHMIC = 0.3
+
+#: Least f cos θ in errors of logarithms.
+DARK = 1e-6
+
+
+def bsdf_network() -> Network:
+    """Return the network of a BSDF, not yet allocated."""
+    return Network(6, BSDF_WIDTH, 2, outputs=3)
+
+
+class NetworkBSDF:
+    """BSDF of a network for ``inputs``, ``"raw"`` or ``"warped"``, with ``value`` and, for timing, Mitsuba's ``eval``.
+
+    Raw inputs are the half vector and the difference vector; warped ones u, v, w of :mod:`...tasks.bsdf.model`, cos
+    θ_h, cos θ_d and cos θ_i cos θ_o. The output is added to ``mean``.
+    """
+
+    def __init__(self, network: Network, inputs: str, mean: float, form: Form):
+        self.network, self.inputs, self.mean, self.form = network, inputs, mean, form
+
+    def coordinates(self, wi, wo) -> list:
+        """Return the inputs of the network, six arrays."""
+        g = DirectionPair.of(wi, wo)
+        h = g.half * dr.rsqrt(dr.squared_norm(g.half))
+        if self.inputs == "warped":
+            u = coordinate_u(g, self.form.scale)
+            return [u, dr.sqrt(1 - g.cos_d), clamp(coordinate_w(g, self.form), 0, 1), h.z, g.cos_d, wi.z * wo.z]
+        # wi in the frame of h whose first axis lies in the plane of the normal: turned about z, then about y
+        r = dr.rsqrt(dr.maximum(dr.square(h.x) + dr.square(h.y), 1e-12))
+        cos, sin = h.x * r, h.y * r
+        x, y = dr.fma(cos, wi.x, sin * wi.y), dr.fma(cos, wi.y, -sin * wi.x)
+        sin_h = dr.sqrt(dr.maximum(1 - dr.square(h.z), 0))
+        return [h.x, h.y, h.z, dr.fma(h.z, x, -sin_h * wi.z), y, g.cos_d]
+
+    def value(self, wi, wo) -> list:
+        """Return f without the cosine, three arrays."""
+        logarithms = self.network(self.coordinates(wi, wo))
+        return [dr.exp(clamp(v + self.mean, *LIMITS)) for v in logarithms]
+
+    def eval(self, context, si, wo, active=True):
+        """Return f cos θ_o, as a BSDF of Mitsuba."""
+        valid = (si.wi.z > 0) & (wo.z > 0)
+        return dr.select(valid, wo.z * mi.Color3f(self.value(si.wi, wo)), 0)
+
+
+class BSDFNetworkProblem(BSDFProblem):
+    """Training problem of a network on samples of a source: errors of logarithms, then the loss of learned BSDFs."""
+
+    def __init__(self, source: dict, inputs: str, scale: tuple[float, float]):
+        types = array_module(mi.variant())
+        truth = truth_of(source, types)
+        samples = bsdf_training.draw(truth, types, bsdf_training.SAMPLES, 2, True)
+        network = bsdf_network().alloc(mi.TensorXf, rng=dr.rng(seed=dr.opaque(mi.UInt64, 1)))
+        super().__init__(network, Form(scale=scale), samples, bsdf_training.view_psnr([((), SphereView(truth, types))]))
+        self.inputs, self.mean = inputs, mean_logarithm(samples)
+        self.identity = {"source": truth.digest, "inputs": inputs, "scale": list(scale)}
+
+    def bsdf(self, net: Network) -> NetworkBSDF:
+        """Return the BSDF of a network."""
+        return NetworkBSDF(net, self.inputs, self.mean, self.form)
+
+    def begin(self, step: int, share: float) -> str:
+        self._share = share
+        return "logarithms" if share < LOGARITHMIC else ""
+
+    def value(self, net, s) -> list:
+        return self.bsdf(net).value(s.wi, s.wo)
+
+    def error(self, value: list, s):
+        if self._share >= LOGARITHMIC:
+            return super().error(value, s)
+        pairs = zip(value, s.value, strict=True)
+        return sum(dr.abs(dr.log(dr.maximum(v * s.wo.z, DARK)) - dr.log(dr.maximum(t, DARK))) for v, t in pairs)
+
+    def measure(self, net) -> dict[str, float]:
+        with dr.suspend_grad():
+            return self._measure(lambda coordinates: self.bsdf(net))
+
+
+def mean_logarithm(samples) -> float:
+    """Return the mean of the logarithms of f over samples."""
+    cos = dr.maximum(samples.wo.z, 1e-3)
+    return sum(float(dr.mean(dr.log(dr.maximum(v, DARK) / cos))[0]) for v in samples.value) / 3

@@ -19,7 +19,7 @@ from ...core.files import relative_path, writable_folder, write_json
 from ...core.jobs import run_jobs
 from ...core.runtime import use_variant
 from ...fitting.task import FitRequest, Fitted, Model, fit, load_model
-from ...measure.formatting import grid
+from ...measure.report import grid
 from .files import load
 from .fit import use_rgb_variant
 from .truth import SUFFIXES, material_ids
@@ -225,14 +225,14 @@ def _identity(file: Path, options: list) -> str:
     """Return a hash of the content of a source, of the files that it names, and of ``options``; "" on any error."""
     digest = hashlib.sha256(json.dumps(options, sort_keys=True, default=str).encode())
     try:
-        for one in _files_of(file):
+        for one in _source_files(file):
             digest.update(one.name.encode() + b"\0" + one.read_bytes() + b"\0")
     except Exception:  # Mitsuba raises several types; the fit says what is wrong
         return ""
     return digest.hexdigest()
 
 
-def _files_of(file: Path) -> list[Path]:
+def _source_files(file: Path) -> list[Path]:
     """Return a source and, of XML, the files that it includes or names."""
     if file.suffix.lower() != ".xml":
         return [file]

@@ -114,8 +114,7 @@ class RadianceField(Task):
     arguments = (
         Argument(
             "source", file="read", metavar="FOLDER",
-            help="folder of views of mi-diffind capture, Blender, nerfstudio, instant-ngp (transforms*.json), COLMAP, "
-            "or SPLATS.ply: 3D Gaussians, of which views are rendered first"
+            help="folder of views of mi-diffind capture, Blender, nerfstudio, instant-ngp (transforms*.json) or COLMAP"
         ),
         Argument(
             "--bytes", group="size", type=checked(units.parse_bytes), metavar="N",

@@ -120,11 +120,10 @@ def read_image(path: Path) -> tuple[np.ndarray, bool]:
 
 def half_floats(image: np.ndarray) -> np.ndarray:
     """Return an image of :func:`read_image` in half precision: linear and multiplied by alpha."""
-    values = decoded(image) if image.dtype == np.uint8 else image
-    return np.clip(values, -LARGEST, LARGEST).astype(np.float16)
+    return np.clip(linear_pixels(image), -LARGEST, LARGEST).astype(np.float16)
 
 
-def decoded(image: np.ndarray) -> np.ndarray:
+def linear_pixels(image: np.ndarray) -> np.ndarray:
     """Return an image ``(…, 4)`` of bytes or halves as float32: linear colours multiplied by alpha, and alpha."""
     if image.dtype != np.uint8:
         return image.astype(np.float32)
@@ -135,15 +134,20 @@ def decoded(image: np.ndarray) -> np.ndarray:
     return values
 
 
-def encoded(image: np.ndarray) -> np.ndarray:
-    """Return an image ``(…, 4)`` of linear colours multiplied by alpha, and alpha, as bytes, see :func:`decoded`."""
+def byte_pixels(image: np.ndarray) -> np.ndarray:
+    """Return an image ``(…, 4)`` of linear colours multiplied by alpha, and alpha, as bytes of sRGB and alpha."""
     alpha = image[..., 3:]
     straight = image[..., :3] / np.where(alpha > 0, alpha, 1)
     shown = from_linear(np.clip(straight, 0, 1))
     return np.rint(255 * np.concatenate([shown, np.clip(alpha, 0, 1)], axis=-1)).astype(np.uint8)
 
 
-def reduced(image: np.ndarray, mask: np.ndarray | None, factor: int) -> tuple[np.ndarray, np.ndarray | None]:
+def like(image: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return linear ``values`` multiplied by alpha as bytes if an ``image`` has bytes, else as they are."""
+    return byte_pixels(values) if image.dtype == np.uint8 else values
+
+
+def reduce_image(image: np.ndarray, mask: np.ndarray | None, factor: int) -> tuple[np.ndarray, np.ndarray | None]:
     """Return an image of :func:`read_image` and its mask at a resolution that is lower by a whole ``factor``.
 
     Linear colours multiplied by alpha are averaged. A pixel counts if all that it covers count. Rows and columns at the
@@ -152,14 +156,12 @@ def reduced(image: np.ndarray, mask: np.ndarray | None, factor: int) -> tuple[np
     height, width = (side // factor for side in image.shape[:2])
     rows = []
     for row in range(height):  # one after the other, since a photograph in single precision is large
-        values = image[row * factor : (row + 1) * factor, : width * factor]
-        values = decoded(values) if image.dtype == np.uint8 else values
+        values = linear_pixels(image[row * factor : (row + 1) * factor, : width * factor])
         rows.append(values.reshape(factor, width, factor, 4).mean(axis=(0, 2)))
     if mask is not None:
         blocks = mask[: height * factor, : width * factor].reshape(height, factor, width, factor)
         mask = blocks.all(axis=(1, 3))
-    mean = np.stack(rows)
-    return encoded(mean) if image.dtype == np.uint8 else mean, mask
+    return like(image, np.stack(rows)), mask
 
 
 def read_mask(path: Path, image: np.ndarray, image_path: Path) -> tuple[np.ndarray, bool]:
@@ -241,7 +243,7 @@ DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 RADII = 1024
 
 
-def distorted(u: np.ndarray, v: np.ndarray, coefficients) -> tuple[np.ndarray, np.ndarray]:
+def distort(u: np.ndarray, v: np.ndarray, coefficients) -> tuple[np.ndarray, np.ndarray]:
     """Return where a lens shows the points (``u``, ``v``) of a pinhole of the focal length 1."""
     *k, p1, p2 = coefficients
     r2 = u * u + v * v
@@ -263,7 +265,7 @@ def _sources(height: int, width: int, focal, centre, coefficients) -> tuple[np.n
     """
     u = (np.arange(width) + 0.5 - centre[0]) / focal[0]
     v = (np.arange(height) + 0.5 - centre[1])[:, None] / focal[1]
-    x, y = distorted(u, v, coefficients)
+    x, y = distort(u, v, coefficients)
     x, y = x * focal[0] + centre[0] - 0.5, y * focal[1] + centre[1] - 0.5
     r2 = u * u + v * v
     radii = np.linspace(0, np.sqrt(r2.max()), RADII)
@@ -273,21 +275,21 @@ def _sources(height: int, width: int, focal, centre, coefficients) -> tuple[np.n
     return np.stack([y, x]).astype(np.float32), exists & (r2 <= limit**2)
 
 
-def undistorted(image: np.ndarray, mask: np.ndarray | None, focal, centre, coefficients) -> tuple:
+def undistort(image: np.ndarray, mask: np.ndarray | None, focal, centre, coefficients) -> tuple:
     """Return a photograph as a pinhole of the same ``focal`` lengths and ``centre`` sees it, and its mask.
 
-    ``image`` ``(height, width, 4)`` and the result are as :func:`.image_files.read_image` returns them; colours are
+    ``image`` ``(height, width, 4)`` and the result are as :func:`read_image` returns them; colours are
     interpolated linearly, as linear values multiplied by alpha. ``mask`` ``(height, width)``, bool, is true where a
     pixel counts (``None``: everywhere). The returned mask excludes pixels that the photograph does not show,
     which are 0.
     """
     places, exists = _sources(*image.shape[:2], tuple(focal), tuple(centre), tuple(coefficients))
-    values = decoded(image) if image.dtype == np.uint8 else image
+    values = linear_pixels(image)
     planes = [map_coordinates(values[..., c], places, order=1, mode="nearest", prefilter=False) for c in range(4)]
     straightened = np.stack(planes, axis=-1) * exists[..., None]
     if mask is not None:
         exists = exists & map_coordinates(mask.astype(np.uint8), places, order=0, mode="nearest", prefilter=False) > 0
-    return encoded(straightened) if image.dtype == np.uint8 else straightened, exists
+    return like(image, straightened), exists
 
 
 #: Axes of an image, and the keys of the focal length or of the field of view along each.
@@ -549,14 +551,18 @@ def _parse(file: Path) -> tuple[dict, list[dict]]:
     return content, frames
 
 
+def _numbers(value) -> np.ndarray | None:
+    try:
+        return np.array(value, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return None
+
+
 def _box(file: Path, content: dict) -> np.ndarray | None:
     if "aabb" not in content:
         return None
-    try:
-        box = np.array(content["aabb"], np.float64)
-    except (TypeError, ValueError, OverflowError):
-        box = np.zeros(0)
-    if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[0] < box[1]).all():
+    box = _numbers(content["aabb"])
+    if box is None or box.shape != (2, 3) or not np.isfinite(box).all() or not (box[0] < box[1]).all():
         raise ViewsError(
             f'{file}: has the "aabb" {content["aabb"]!r:.60}, expected two corners, the lower one first: '
             f"[[x, y, z], [x, y, z]]"
@@ -589,10 +595,9 @@ def _pose(where: str, matrix) -> np.ndarray:
     """Return a ``transform_matrix`` as a rigid motion, ``(4, 4)``."""
     if matrix is None:
         raise ViewsError(f'{where} has no "transform_matrix"')
-    try:
-        pose = np.array(matrix, np.float64)
-    except (TypeError, ValueError, OverflowError):
-        raise ViewsError(f"{where} has a transform_matrix that is not a matrix of numbers") from None
+    pose = _numbers(matrix)
+    if pose is None:
+        raise ViewsError(f"{where} has a transform_matrix that is not a matrix of numbers")
     if pose.shape == (3, 4):
         pose = np.vstack([pose, [0, 0, 0, 1]])
     if pose.shape != (4, 4):

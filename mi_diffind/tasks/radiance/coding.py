@@ -15,7 +15,8 @@ from operator import getitem
 
 import numpy as np
 
-from .nodes import cells_of, coarser
+from ...arrays.sparse_grid import complete_cells
+from .nodes import coarser
 
 #: Bits of a probability.
 PRECISION = 12
@@ -115,7 +116,7 @@ class SymbolDecoder:
         # A lane decodes one symbol after the other: few lanes for many symbols would take hours
         self.left = np.inf if lanes == MOST_LANES else LANE_SYMBOLS * (lanes + 1)
 
-    def code(self, group: str, contexts: int, symbols: int, context: np.ndarray, given: Callable) -> np.ndarray:
+    def code(self, group: str, contexts: int, symbols: int, context: np.ndarray, given=None) -> np.ndarray:
         """Return the symbol in each ``context``, for the same arguments as :meth:`SymbolEncoder.code` but ``given``."""
         if group not in self.tables:
             codes, self.probabilities = np.split(self.probabilities, [contexts * symbols])
@@ -326,7 +327,7 @@ def encode(stored: np.ndarray, levels: np.ndarray, index: np.ndarray, level_coun
     node is a corner of an occupied cell.
     """
     coder = SymbolEncoder()
-    _cells(coder, tuple(n - 1 for n in stored.shape), cells_of(stored))
+    _cells(coder, tuple(n - 1 for n in stored.shape), complete_cells(stored))
     _numbers(coder, passes_of(stored), level_count, colours, levels, index)
     return coder.finish()
 

@@ -17,13 +17,14 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ...arrays.indirection import device_array, device_tensor, fold
+from ...arrays.sparse_grid import cell_corners, complete_cells
 from ...arrays.tables import StoredArray
 from ...core.progress import Deadline
 from . import grid as grids
 from .coding import LOW_BITS, NAMED, NAMED_CONTEXTS, PARTS, Pass, encode, fresh_context, naming, passes_of
 from .grid import NodeGrid
 from .march import differentiable
-from .nodes import Nodes, cells_of, corners_of
+from .nodes import Nodes
 from .session import FieldSession, ImagesProblem, ViewImages, before
 from .volume_field import NodeField, PaletteArrays
 
@@ -372,7 +373,7 @@ def trial_part(grid: NodeGrid, importance: Importance) -> tuple[NodeGrid, Import
     chosen = np.zeros(side * side, bool)
     chosen[order[: last + 1]] = True
     # Nodes of cells that other columns cut are left out: a file holds corners of whole cells
-    stored = corners_of(cells_of(nodes.stored & chosen[column][..., None]))
+    stored = cell_corners(complete_cells(nodes.stored & chosen[column][..., None]))
     here = stored[nodes.stored]
     weights = Importance(importance.density[here], importance.colour[here], importance.metric, importance.loss)
     return grid.part(stored), weights

@@ -15,7 +15,7 @@ from scipy.ndimage import distance_transform_edt
 
 from ...core.errors import UsageError
 from ...core.files import replacing
-from .volume_field import DenseVolumeField, VolumeField, raw_of
+from .volume_field import VolumeField
 
 #: Points at which a field is evaluated at once.
 CHUNK = 2**20
@@ -108,12 +108,6 @@ def _exponential(field: VolumeField, point_data: list, p, active) -> list:
         a = [x + (plus + minus) / 6 for x, plus, minus in zip(a, *ends, strict=True)]
         slopes.append([(plus - minus) / 2 for plus, minus in zip(*ends, strict=True)])
     return [x for c in range(3) for x in (a[c], *(b[c] for b in slopes))]
-
-
-def dense(types, content: dict[str, np.ndarray]) -> DenseVolumeField:
-    """Return the field of the arrays that :func:`grid` returned, or that its archive holds."""
-    voxel = float(content["voxel"])
-    return DenseVolumeField(types, raw_of(content["density"], voxel), content["colour"], content["lower"], voxel)
 
 
 def mean_colour(numbers: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 
-from ...arrays.tables import MAX_BYTES, StoredArray, Table, save_table
+from ...arrays.tables import MAX_BYTES, Table, save_table
 from ...core import units
 from ...core.errors import UsageError
 from ...core.files import check_distinct
@@ -87,24 +87,21 @@ def check(request: FitRequest) -> None:
             f"source: {path} is a file of 3D Gaussians, a folder of views is needed: "
             f"mi-diffind capture {path.name} -o {path.stem}_views --views 80 --resolution 200"
         )
-    sized = [name for name in ("bytes", "compression", "disk") if options.get(name) is not None]
-    if preset == "grid" and sized:
-        raise UsageError(f"--{sized[0]} is an option of the presets sparse and paper, found the preset grid")
-    for name in ("density_ratio", "colour_ratio"):
-        if preset != "paper" and options.get(name) is not None:
-            raise UsageError(f"--{name.replace('_', '-')}: found the preset {preset}, allowed is paper")
+    sized = next((name for name in ("bytes", "compression", "disk") if options.get(name) is not None), "")
     reflections, surroundings = options.get("colours") == "reflections", options.get("background") == "surroundings"
-    if preset == "paper":
-        if options.get("disk"):
-            raise UsageError("--disk is an option of the preset sparse, found the preset paper")
-        if surroundings:
-            raise UsageError("--background: found surroundings with the preset paper, whose box is not contracted")
-        if reflections:
-            raise UsageError(
-                "--colours: found reflections with the preset paper, whose numbers are those of directions"
-            )
-    if reflections and surroundings:
-        raise UsageError("--colours: found reflections with --background surroundings, allowed is directions")
+    is_paper, given = preset == "paper", f"the preset {preset}"
+    for wrong, message in (
+        (preset == "grid" and sized, f"--{sized} is an option of the presets sparse and paper, found {given}"),
+        (not is_paper and options.get("density_ratio"), f"--density-ratio: found {given}, allowed is paper"),
+        (not is_paper and options.get("colour_ratio"), f"--colour-ratio: found {given}, allowed is paper"),
+        (is_paper and options.get("disk"), f"--disk is an option of the preset sparse, found {given}"),
+        (is_paper and surroundings, f"--background: found surroundings with {given}, whose box has an end"),
+        (is_paper and reflections, f"--colours: found reflections with {given}, allowed is directions"),
+        (surroundings and reflections, "--colours: found reflections with --background surroundings, allowed is "
+         "directions"),
+    ):  # fmt: skip
+        if wrong:
+            raise UsageError(message)
     for name in ("bytes", "disk"):
         if options.get(name) is not None:
             units.check_size(f"--{name}", _parsed(options, name), MAX_BYTES)
@@ -390,7 +387,8 @@ class FieldFit:
             before = [f"{request.checkpoint}.{name}" for name in ("stage0", "grid.npz")]
             request = dataclasses.replace(request, resume=not any(map(os.path.exists, before)))
         stage = Stage("", problem, title="through the images", finish=measured, times=self.times)
-        return table(), *request.run([stage])
+        (result,) = request.run([stage])
+        return table(), result
 
     def sparse(self, grid: NodeGrid, stopped: bool) -> tuple[Table, FitResult]:
         """Compress a grid to density levels and a palette, in the bytes that the options ask for."""
@@ -436,16 +434,9 @@ class FieldFit:
         nbytes = self.wanted_bytes(grid) or dense_bytes(grid.nodes.shape) / COMPRESSION
         grid = self.visible(grid)
         problem = self.pairs_problem(grid, nbytes, 0 if stopped else VALUE_STEPS)
-
-        def table() -> Table:
-            arrays = {}
-            for name in ("density", "colour"):
-                pair = getattr(problem.net, name)
-                arrays[f"{name}_primary"] = StoredArray.of(pair.primary[0].quantised(8))
-                arrays[f"{name}_cascaded"] = StoredArray.of(pair.cascaded.quantised(8))
-            return files.pairs_table(grid.nodes, arrays, problem.low, problem.high)
-
-        return self.train(problem, table, stopped)
+        return self.train(
+            problem, lambda: files.pairs_table(grid.nodes, problem.table_arrays(), problem.low, problem.high), stopped
+        )
 
     def pairs_problem(self, grid: NodeGrid, nbytes: float, steps: int) -> paper.PairsProblem:
         """Return the arrays of the supplement in ``nbytes``, trained on the numbers of the grid for ``steps``."""

@@ -14,9 +14,10 @@ import numpy as np
 from scipy.ndimage import binary_dilation, gaussian_filter, map_coordinates
 
 from ...arrays.indirection import device_array, device_tensor
+from ...arrays.sparse_grid import cell_corners, complete_cells
 from . import RESOLUTIONS, VOXELS_PER_PIXEL, surroundings
 from .march import march
-from .nodes import Nodes, cells_of, corners_of
+from .nodes import Nodes
 from .session import SIDE, FieldSession, ImagesProblem, ViewImages
 from .views import CapturedViews, box_of, hull, pixel_width
 from .volume_field import ENTRIES, NodeField, NodeVolume, add_reflections
@@ -180,8 +181,8 @@ def initial_grid(types, views: CapturedViews, nodes: int) -> NodeGrid:
         shape = np.maximum(2, np.ceil((upper - lower) / spacing - 1e-6).astype(int) + 1)
         inside = hull(views, lower, spacing, shape) if views.has_alpha else np.ones(shape, bool)
         # Occupied: all cells that have a corner in the hull
-        near = ~cells_of(~inside)
-        places = Nodes(types, lower, spacing, shape, corners_of(near))
+        near = ~complete_cells(~inside)
+        places = Nodes(types, lower, spacing, shape, cell_corners(near))
     colour = np.tile(np.float32([BEGIN_COLOUR, 0, 0, 0] * 3), (places.entries, 1))
     return NodeGrid(places, np.full(places.entries, density, np.float32), colour)
 
@@ -220,9 +221,9 @@ def dilate(cells: np.ndarray) -> np.ndarray:
 def refine(grid: NodeGrid, cells: np.ndarray, factor: float = 1.0) -> NodeGrid:
     """Return the grid reduced to ``cells`` (:func:`visible`), at ``factor`` times as many nodes along each side."""
     nodes = grid.nodes
-    cells = cells & cells_of(nodes.stored)
+    cells = cells & complete_cells(nodes.stored)
     if factor == 1:
-        return grid.part(corners_of(cells))
+        return grid.part(cell_corners(cells))
     spacing = nodes.spacing / factor
     shape = np.maximum(2, np.ceil((np.asarray(nodes.shape) - 1) * factor - 1e-6).astype(int) + 1)
     # A finer cell is kept if its middle lies in one that is
@@ -230,7 +231,7 @@ def refine(grid: NodeGrid, cells: np.ndarray, factor: float = 1.0) -> NodeGrid:
         np.minimum(((np.arange(n - 1) + 0.5) / factor).astype(int), m - 2)
         for n, m in zip(shape, nodes.shape, strict=True)
     ]
-    fine = nodes.like(spacing, shape, corners_of(cells[np.ix_(*middle)]))
+    fine = nodes.like(spacing, shape, cell_corners(cells[np.ix_(*middle)]))
     at = fine.positions().T / factor
 
     def resampled(column: np.ndarray, empty: float) -> np.ndarray:
@@ -248,9 +249,9 @@ def largest_factor(grid: NodeGrid, cells: np.ndarray, factor: float, numbers: fl
 
     A factor near 1 is 1.
     """
-    cells = cells & cells_of(grid.nodes.stored)
+    cells = cells & complete_cells(grid.nodes.stored)
     inside = np.count_nonzero(cells)
-    beside = np.count_nonzero(corners_of(cells)) - inside  # nodes at the border grow as a surface does
+    beside = np.count_nonzero(cell_corners(cells)) - inside  # nodes at the border grow as a surface does
     tried = np.linspace(factor, 1, FACTORS)
     counts = (inside * tried**3 + beside * tried**2) * (1 + grid.colour.shape[1])
     fits = tried[counts <= numbers]

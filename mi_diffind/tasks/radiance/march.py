@@ -26,7 +26,7 @@ OPAQUE = 1e-4
 #: Flags of derivatives: not all arrays have to be differentiated.
 ANY = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
 
-#: The same, and derivatives of results remain that others are computed from.
+#: Flags as :data:`ANY`, but the derivatives of intermediate results remain.
 KEPT = dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
 
 

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import drjit as dr
 import numpy as np
-from scipy.ndimage import distance_transform_cdt
 
 from ...arrays.indirection import device_array
 from ...arrays.lookup import mask_words
+from ...arrays.sparse_grid import complete_cells, empty_distances, rank
 
 #: Cells along a side of a cell of the coarser grid of distances.
 COARSE = 2
@@ -22,9 +22,6 @@ FARTHEST = 15
 
 #: Nodes of a dense grid that are processed at a time, in whole layers (:func:`layer_count`): each takes several bytes.
 PART = 2**20
-
-#: Cells along a side of the parts of the coarser grid whose distances are computed at a time, 12 bytes each.
-TILE = 64
 
 #: Cells of a column, along z. Each of its 32 nodes has a bit; the last node is also the first of the next column.
 COLUMN = 31
@@ -53,7 +50,7 @@ class Nodes:
         self._sides = dr.opaque(types.Array3u, self.shape)
         self.index = self.columns = self.filled = self.distances = None
         if stored is not None:
-            self.coarse_distances = _farthest(_occupied(stored, self.shape))
+            self.coarse_distances = empty_distances(_occupied(stored, self.shape), FARTHEST)
             self.distances = device_array(types.UInt32, nibbles(self.coarse_distances))
             self._coarse = dr.opaque(types.Array3u, self.coarse_distances.shape)
             if packed:
@@ -153,17 +150,17 @@ class Nodes:
 
     def _ranked(self, line, z, active) -> tuple:
         """Return the number of node ``z`` of a line and, from the masks, whether it and the next one are stored."""
-        Array2u, UInt32 = self.types.Array2u, self.types.UInt32
+        Array2u = self.types.Array2u
         part = z // COLUMN
         bit = z - part * COLUMN
         column = dr.fma(line, self._columns, part)
         filled = dr.gather(Array2u, self.filled, column >> 5, active)
         here = column & 31
         active = active & (((filled[0] >> here) & 1) != 0)
-        rank = filled[1] + dr.popcnt(filled[0] & ((UInt32(1) << here) - 1))
-        mask, number = dr.gather(Array2u, self.columns, rank, active)
+        place = filled[1] + rank(filled[0], here)
+        mask, number = dr.gather(Array2u, self.columns, place, active)
         active &= ((mask >> bit) & 3) == 3
-        return number + dr.popcnt(mask & ((UInt32(1) << bit) - 1)), active
+        return number + rank(mask, bit), active
 
     def free_distance(self, p, d, active=True):
         """Return a length from ``p`` along ``d`` that crosses no occupied cell, or 0."""
@@ -207,7 +204,7 @@ def layers(stored: np.ndarray, shape, more: int = 0):
 
 def _occupied(stored: np.ndarray, shape) -> np.ndarray:
     """Return the cells of the coarser grid that hold an occupied cell, of a mask or its packed flags."""
-    parts = [coarser(cells_of(part)) for part in layers(stored, shape, 1) if len(part) > 1]
+    parts = [coarser(complete_cells(part)) for part in layers(stored, shape, 1) if len(part) > 1]
     return np.concatenate(parts)
 
 
@@ -218,41 +215,12 @@ def coarser(cells: np.ndarray) -> np.ndarray:
     return padded.reshape(x, COARSE, y, COARSE, z, COARSE).any(axis=(1, 3, 5))
 
 
-def cells_of(stored: np.ndarray) -> np.ndarray:
-    """Return the occupied cells, bool ``(X − 1, Y − 1, Z − 1)``, of ``stored`` nodes: all their corners are stored."""
-    cells = np.ones(tuple(n - 1 for n in stored.shape), bool)
-    for corner in np.ndindex(2, 2, 2):
-        cells &= stored[tuple(slice(c, n - 1 + c) for c, n in zip(corner, stored.shape, strict=True))]
-    return cells
-
-
-def corners_of(cells: np.ndarray) -> np.ndarray:
-    """Return the nodes, bool ``(X + 1, Y + 1, Z + 1)``, that are corners of one of the ``cells``."""
-    nodes = np.zeros(tuple(n + 1 for n in cells.shape), bool)
-    for corner in np.ndindex(2, 2, 2):
-        nodes[tuple(slice(c, n + c) for c, n in zip(corner, cells.shape, strict=True))] |= cells
-    return nodes
-
-
 def chessboard_distances(cells: np.ndarray) -> np.ndarray:
-    """Return the distance of each cell of the coarser grid to the nearest one that holds an occupied cell.
+    """Return the distance of each cell of the coarser grid to the nearest one that holds one of the ``cells``.
 
     Distances are in cells of the coarser grid, in the maximum norm, at most :data:`FARTHEST`; uint8.
     """
-    return _farthest(coarser(cells))
-
-
-def _farthest(occupied: np.ndarray) -> np.ndarray:
-    """Return the distance of each cell of the coarser grid to the nearest ``occupied`` one, as above."""
-    result = np.full(occupied.shape, FARTHEST, np.uint8)
-    for tile in np.ndindex(*(-(-n // TILE) for n in occupied.shape)):
-        begin = [max(0, TILE * i - FARTHEST) for i in tile]
-        part = occupied[tuple(slice(b, TILE * (i + 1) + FARTHEST) for b, i in zip(begin, tile, strict=True))]
-        if part.any():
-            inner = tuple(slice(TILE * i - b, TILE * (i + 1) - b) for b, i in zip(begin, tile, strict=True))
-            distance = distance_transform_cdt(~part, "chessboard")[inner]
-            result[tuple(slice(TILE * i, TILE * (i + 1)) for i in tile)] = np.minimum(distance, FARTHEST)
-    return result
+    return empty_distances(coarser(cells), FARTHEST)
 
 
 def nibbles(values: np.ndarray) -> np.ndarray:

@@ -6,12 +6,16 @@ empty, as in all fields here; the supplement keeps them.
 
 from __future__ import annotations
 
+import math
+
 import drjit as dr
 import numpy as np
 from drjit import nn
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
+from ...arrays.budget import Budget, proportional_shape
 from ...arrays.indirection import DifferentiableArray, Indirection, ramp, rounded
+from ...arrays.tables import StoredArray
 from ...fitting.loop import Problem
 from .grid import NodeGrid
 from .nodes import Nodes
@@ -45,10 +49,8 @@ class PairsField(NodeVolume):
 
     def with_arrays(self, arrays):
         result = super().with_arrays(arrays)
-        result.modules = {}
-        for name, module in self.modules.items():
-            result.modules[name] = module._replace()
-            result.modules[name].data = arrays.get(name)
+        modules = self.modules.items()
+        result.modules = {name: module._replace(data=arrays.get(name)) for name, module in modules}
         return result
 
     def _read(self, quantity: str, p, active) -> list:
@@ -74,14 +76,14 @@ def sides(nbytes: float, ratio: float, channels: int, extent) -> tuple[tuple[int
     """
     shape = np.asarray(extent, np.float64) / np.max(extent)
 
-    def of(n: float):
-        return [np.maximum(2, np.round(m * shape).astype(int)) for m in (n, n / ratio)]
+    def arrays(n: float) -> list[tuple]:
+        sides = ((n, 3), (n / ratio, channels))
+        return [((*proportional_shape(side, extent), count), 8) for side, count in sides]
 
-    n = 4 + (nbytes / (3 + channels * ratio**-3) / np.prod(shape)) ** (1 / 3)
-    while n > 3 and 3 * of(n)[0].prod() + channels * of(n)[1].prod() > nbytes:
-        n -= 0.5
-    primary, cascaded = of(n)
-    return tuple(primary.tolist()), tuple(cascaded.tolist())
+    most = 4 + (nbytes / (3 + channels * ratio**-3) / np.prod(shape)) ** (1 / 3)
+    steps = range(max(0, math.ceil(2 * (most - 3))), -1, -1)
+    n = Budget(nbytes).largest(arrays, [most - step / 2 for step in steps], strict=False)
+    return tuple(shape[:3] for shape, _ in arrays(n))
 
 
 def dense(grid: NodeGrid) -> np.ndarray:
@@ -127,6 +129,23 @@ class PairsNet(nn.Module):
         self.density, self.colour = density, colour
 
 
+class PairsProblem(ImagesProblem):
+    """Training of the pairs through the images of a session."""
+
+    def __init__(self, net: PairsNet, nodes: Nodes, low, high, session: FieldSession):
+        self.nodes, self.low, self.high = nodes, low, high
+        super().__init__(session, net, self.field_of)
+
+    def field_of(self, net) -> PairsField:
+        """Return the field of the trained arrays, rounded as they are stored."""
+        return PairsField(self.nodes, rounded(net.density), rounded(net.colour), self.low, self.high)
+
+    def table_arrays(self) -> dict[str, StoredArray]:
+        """Return the trained arrays as a file stores them, by name."""
+        field = PairsField(self.nodes, self.net.density, self.net.colour, self.low, self.high)
+        return {name: StoredArray.of(module.quantised(8)) for name, module in field.modules.items()}
+
+
 class ValuesProblem(Problem):
     """Training of the pairs by the mean absolute error of the grid's numbers, at random points of occupied cells."""
 
@@ -159,15 +178,3 @@ class ValuesProblem(Problem):
 
     def measure(self, net):
         return {"step": 0.0}
-
-
-class PairsProblem(ImagesProblem):
-    """Training of the pairs through the images of a session."""
-
-    def __init__(self, net: PairsNet, nodes: Nodes, low, high, session: FieldSession):
-        self.nodes, self.low, self.high = nodes, low, high
-        super().__init__(session, net, self.field_of)
-
-    def field_of(self, net) -> PairsField:
-        """Return the field of the trained arrays, rounded as they are stored."""
-        return PairsField(self.nodes, rounded(net.density), rounded(net.colour), self.low, self.high)

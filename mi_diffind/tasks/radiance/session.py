@@ -57,7 +57,7 @@ GREY = 0.2
 #: the cameras look at to the nearest one.
 NEAR = 0.4
 
-#: Most held-out views of measurements during a training, and the same if time is limited.
+#: Most held-out views of measurements during a training, without and with a limit of time.
 MOST_WATCHED, MOST_WATCHED_LIMITED = 20, 8
 
 #: Share of the held-out views that are measured during a training if time is limited.

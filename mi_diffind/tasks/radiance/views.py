@@ -31,17 +31,17 @@ from .captures import (
     FrameList,
     MissingImageError,
     ViewsError,
-    decoded,
-    encoded,
+    byte_pixels,
     focal_lengths,
     half_floats,
     image_file,
     is_linear,
+    linear_pixels,
     list_frames,
     read_image,
     read_mask,
-    reduced,
-    undistorted,
+    reduce_image,
+    undistort,
 )
 
 #: Level of zlib for images that are kept compressed: the fastest.
@@ -50,8 +50,11 @@ PACKING = 1
 #: Longest side in pixels of images that are not reduced.
 LONGEST = 1600
 
-#: Fewest views for training, since one shows no depth, and names of missing images in a note.
-LEAST_VIEWS, NAMED_MISSING = 2, 3
+#: Fewest views for training, since one shows no depth.
+LEAST_VIEWS = 2
+
+#: Names of missing images in a note.
+NAMED_MISSING = 3
 
 #: Largest distance of a principal point from the middle of its image, as a share of the side, without a note.
 OFF_MIDDLE = 0.25
@@ -135,7 +138,7 @@ class CapturedViews:
 
     def image(self, view: int) -> np.ndarray:
         """Return the image of a view ``(height, width, 4)``, float32: linear, multiplied by alpha, and alpha."""
-        return decoded(self.stored(view))
+        return linear_pixels(self.stored(view))
 
     def counted(self, view: int) -> np.ndarray:
         """Return which pixels of a view count, bool ``(height, width)``."""
@@ -326,12 +329,12 @@ class _Images:
         if factor > min(height, width):
             raise ViewsError(f"{path}: has {width} × {height} pixels, which cannot be reduced by the factor {factor}")
         if factor > 1:
-            image, mask = reduced(image, mask, factor)
+            image, mask = reduce_image(image, mask, factor)
             self.reduced.add(factor)
             focal, centre = ((x / factor, y / factor) for x, y in (focal, centre))
         lens = tuple(numbers.get(name, 0.0) for name in DISTORTION)
         if any(lens):
-            image, mask = undistorted(image, mask, focal, centre, lens)
+            image, mask = undistort(image, mask, focal, centre, lens)
             self.undistorted += 1
         if not has_alpha:
             self.opaque.append(len(self.sizes))
@@ -397,7 +400,7 @@ SHARE_OF_BORDER = 0.9
 
 def _shown(image: np.ndarray) -> np.ndarray:
     """Return the bytes of sRGB of an image of bytes or halves, ``(…, 3)``."""
-    return (image if image.dtype == np.uint8 else encoded(image.astype(np.float32)))[..., :3]
+    return (image if image.dtype == np.uint8 else byte_pixels(image.astype(np.float32)))[..., :3]
 
 
 def _near(shown: np.ndarray, colour) -> np.ndarray:

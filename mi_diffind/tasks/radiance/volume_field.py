@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
-from ...arrays.indirection import device_array, device_tensor
+from ...arrays.indirection import device_array
 from ...arrays.lookup import as_words, pack_bits
 from ...arrays.tables import StoredArray
 from .nodes import Nodes
@@ -82,7 +82,20 @@ def _number(column, row, side: int):
     return dr.fma(row, side, column)
 
 
-def reflected(types, numbers: list, d, entry, active=True) -> list:
+def radiance_of(types, numbers: list, d, entry=None, active=True) -> list:
+    """Return the radiance [r, g, b] in direction ``d``, from the ``numbers`` of a point.
+
+    With reflections, ``entry`` is that of :func:`environment_at`.
+    """
+    radiance = colour_of(numbers, d)
+    return (
+        radiance
+        if entry is None
+        else [a + b for a, b in zip(radiance, reflection(types, numbers, d, entry, active), strict=True)]
+    )
+
+
+def reflection(types, numbers: list, d, entry, active=True) -> list:
     """Return the reflection [r, g, b] in direction ``d``, from the ``numbers`` of a point and the tables' ``entry``."""
     n = types.Array3f(*numbers[NORMAL])
     n *= dr.rsqrt(dr.squared_norm(n) + 1e-6)
@@ -233,12 +246,6 @@ def density_of(raw, per_voxel):
     return dr.maximum(soft - FAINT, 0) * per_voxel
 
 
-def raw_of(density: np.ndarray, voxel: float) -> np.ndarray:
-    """Return the raw numbers of NumPy densities, the inverse of :func:`density_of`."""
-    y = np.asarray(density, np.float64) * voxel + FAINT
-    return y + np.log(-np.expm1(-y))
-
-
 def colour_of(coefficients: list, d) -> list:
     """Return the radiance [r, g, b] in direction ``d``: exp(a + b·d), clamped at exp(:data:`BRIGHTEST`).
 
@@ -273,17 +280,14 @@ class NodeField(NodeVolume):
         return self.interpolated_density(lambda number, seen: dr.gather(Float, density, number, seen), p, active)
 
     def radiance_at(self, point_data, p, d, active=True):
-        numbers = self.coefficients(point_data, active)
-        radiance = colour_of(numbers, d)
-        if "environment" not in self.arrays:
-            return radiance
-        Array4f, environment = self.types.Array4f, self.arrays["environment"].array
+        entry = None
+        if "environment" in self.arrays:
+            Array4f, environment = self.types.Array4f, self.arrays["environment"].array
 
-        def entry(number, seen):
-            return list(dr.gather(Array4f, environment, number, seen))[:3]
+            def entry(number, seen):
+                return list(dr.gather(Array4f, environment, number, seen))[:3]
 
-        mirrored = reflected(self.types, numbers, d, entry, active)
-        return [a + b for a, b in zip(radiance, mirrored, strict=True)]
+        return radiance_of(self.types, self.coefficients(point_data, active), d, entry, active)
 
     def coefficients(self, point_data, active) -> list:
         """Return the blended columns of ``colour`` at points."""
@@ -302,22 +306,6 @@ def blended(types, flat, packets: int, weights: list, rows: list, active) -> lis
             for k in range(4):
                 sums[4 * j + k] = dr.fma(weight, four[k], sums[4 * j + k])
     return sums
-
-
-class DenseVolumeField(NodeField):
-    """:class:`NodeField` with a number at every node of a box, from NumPy arrays.
-
-    ``density`` ``(X, Y, Z)`` holds raw densities and ``colour`` is ``(X, Y, Z, 12)``; nodes begin at ``lower`` and are
-    ``voxel`` apart.
-    """
-
-    def __init__(self, types, density, colour, lower, voxel: float):
-        density = np.ascontiguousarray(density, np.float32)
-        colour = np.ascontiguousarray(colour, np.float32)
-        nodes = Nodes(types, lower, voxel, density.shape)
-        tensor = types.TensorXf
-        values = density.reshape(-1), colour.reshape(-1, 12)
-        super().__init__(nodes, *(device_tensor(tensor, v) for v in values))
 
 
 @dataclass
@@ -404,14 +392,10 @@ class PackedPaletteField(NodeVolume):
                 number = dr.reinterpret_array(types.Float, (byte & 0x7F8000) | 0x3F800000)
                 sums[k] = dr.fma(weight, number, sums[k])
         numbers = [dr.fma(s - 1, 256 * a, b) for s, a, b in zip(sums, self.scale, self.offset, strict=True)]
-        radiance = colour_of(numbers, d)
-        if self.environment is None:
-            return radiance
 
         def entry(number, seen):
             word = dr.gather(types.UInt32, self.environment, number, seen)
             scale, offset = self.environment_range
             return [dr.fma(types.Float((word >> 8 * c) & 255), scale[c], offset[c]) for c in range(3)]
 
-        mirrored = reflected(types, numbers, d, entry, active)
-        return [a + b for a, b in zip(radiance, mirrored, strict=True)]
+        return radiance_of(types, numbers, d, None if self.environment is None else entry, active)

@@ -1,10 +1,13 @@
 """Coded nodes of radiance fields: symbols, their bytes against the entropy, and the choice by rate and distortion."""
 
+from functools import partial
+from operator import getitem
+
 import numpy as np
 import pytest
 
+from mi_diffind.arrays.sparse_grid import cell_corners, complete_cells
 from mi_diffind.tasks.radiance import coding, compression
-from mi_diffind.tasks.radiance.nodes import cells_of, corners_of
 
 
 @pytest.fixture
@@ -12,7 +15,7 @@ def shell():
     """Nodes of a shell, smooth levels below 16, and the index of a palette of 300 colours that varies slowly."""
     x, y, z = np.ogrid[:33, :30, :37]
     distance = np.sqrt((x - 16) ** 2 + (y - 15) ** 2 + (z - 18) ** 2)
-    stored = corners_of(np.abs(distance[:-1, :-1, :-1] - 12) < 2)
+    stored = cell_corners(np.abs(distance[:-1, :-1, :-1] - 12) < 2)
     place = np.argwhere(stored)
     levels = np.clip(np.rint(8 + 2 * (12 - distance[stored])), 0, 15).astype(int)
     index = (place[:, 0] // 4 * 37 + place[:, 1] // 5 * 11) % 300
@@ -31,8 +34,8 @@ def test_symbols_take_the_bytes_of_their_entropy(rng):
     symbols = np.minimum(rng.geometric(np.array([0.9, 0.4, 0.05])[contexts]) - 1, 99)
     coder = coding.SymbolEncoder()
     for part in (slice(0, 7), slice(7, 60_000)):
-        coder.code("x", 3, 100, contexts[part], symbols[part])
-    coder.code("flags", 1, 2, np.zeros(3, int), np.array([1, 0, 1]))
+        coder.code("x", 3, 100, contexts[part], partial(getitem, symbols, part))
+    coder.code("flags", 1, 2, np.zeros(3, int), lambda: [1, 0, 1])
     probabilities, data = coder.finish()
     assert 8 * len(data) < 1.02 * entropy(symbols, contexts) + 32 * 17
     decoder = coding.SymbolDecoder(probabilities, data)
@@ -43,7 +46,7 @@ def test_symbols_take_the_bytes_of_their_entropy(rng):
 
 def test_nodes_come_back(shell, rng):
     stored, levels, index = shell
-    for mask, colours in ((stored, 300), (corners_of(rng.random((9, 7, 32)) < 0.2), 70)):
+    for mask, colours in ((stored, 300), (cell_corners(rng.random((9, 7, 32)) < 0.2), 70)):
         count = mask.sum()
         numbers = (levels, index) if mask is stored else (rng.integers(0, 16, count), rng.integers(0, colours, count))
         coded = coding.encode(mask, *numbers, 16, colours)
@@ -65,7 +68,7 @@ def test_smooth_nodes_take_few_bytes(shell):
     plain = (entropy(levels, 0 * levels) + entropy(index, 0 * index)) / 8
     assert len(coding.encode(stored, levels, index, 16, 300)[1]) < 0.4 * plain
     mask = coding.SymbolEncoder()
-    coding._cells(mask, tuple(n - 1 for n in stored.shape), cells_of(stored))
+    coding._cells(mask, tuple(n - 1 for n in stored.shape), complete_cells(stored))
     assert len(mask.finish()[1]) < 0.2 * stored.size / 8
 
 

@@ -6,10 +6,11 @@ import types
 import numpy as np
 import pytest
 
+from mi_diffind.arrays.sparse_grid import complete_cells
 from mi_diffind.core.errors import UsageError
 from mi_diffind.tasks.radiance import decode
-from mi_diffind.tasks.radiance.nodes import Nodes, cells_of
-from mi_diffind.tasks.radiance.volume_field import DenseVolumeField, NodeField, VolumeField
+from mi_diffind.tasks.radiance.nodes import Nodes
+from mi_diffind.tasks.radiance.volume_field import FAINT, NodeField, VolumeField
 
 
 @pytest.fixture
@@ -29,13 +30,20 @@ def numbers(rng, count=120):
     return raw.astype(np.float32), colour.astype(np.float32)
 
 
+def dense(t, raw, colour, voxel=VOXEL):
+    """A field with a number at every node of a box."""
+    flat = (np.ascontiguousarray(v, np.float32) for v in (raw.reshape(-1), colour.reshape(-1, 12)))
+    shape = SHAPE if raw.size == np.prod(SHAPE) else raw.shape
+    return NodeField(Nodes(t, LOWER, voxel, shape), *(t.TensorXf(v) for v in flat))
+
+
 def softplus(raw):
     return np.log1p(np.exp(np.asarray(raw, np.float64)))
 
 
 def test_a_grid_comes_back(t, rng):
     raw, colour = numbers(rng)
-    field = DenseVolumeField(t, raw.reshape(SHAPE), colour.reshape(*SHAPE, 12), LOWER, VOXEL)
+    field = dense(t, raw, colour)
     found = decode.grid(field)
     assert found["density"].shape == SHAPE and found["colour"].shape == (*SHAPE, 12)
     assert found["lower"] == pytest.approx(LOWER) and found["voxel"] == pytest.approx(VOXEL)
@@ -54,7 +62,7 @@ def test_what_was_decoded_is_the_same_field(t, rng):
     smooth = np.stack(np.meshgrid(*(np.linspace(0, 2, n) for n in SHAPE), indexing="ij"))
     raw = 2 * np.sin(smooth.sum(axis=0))
     colour = 0.3 * np.sin(np.multiply.outer(smooth[0] + 2 * smooth[1], np.arange(12)) + np.arange(12))
-    field = DenseVolumeField(t, raw, colour, LOWER, VOXEL)
+    field = dense(t, raw, colour)
     places = rng.uniform(np.array(LOWER) + 0.01, np.array(field.upper) - 0.01, (500, 3))
     ways = rng.normal(size=(500, 3))
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
@@ -65,13 +73,13 @@ def test_what_was_decoded_is_the_same_field(t, rng):
         return sigma.numpy(), np.array([c.numpy() for c in f.radiance_at(point_data, p, d, t.Bool(True))])
 
     sigma, radiance = seen(field)
-    again = decode.grid(field)
-    assert np.allclose(seen(decode.dense(t, again))[0], sigma, rtol=0.01)
-    assert np.allclose(seen(decode.dense(t, again))[1], radiance, rtol=0.01)
-    finer = decode.grid(field, 11)
-    assert finer["density"].shape == (11, 9, 7) and finer["voxel"] == pytest.approx(VOXEL / 2)
-    assert np.allclose(seen(decode.dense(t, finer))[0], sigma, rtol=0.1)
-    assert np.allclose(seen(decode.dense(t, finer))[1], radiance, rtol=0.02)
+    for resolution, shape, tolerances in ((None, SHAPE, (0.01, 0.01)), (11, (11, 9, 7), (0.1, 0.02))):
+        found = decode.grid(field, resolution)
+        assert found["density"].shape == shape and found["voxel"] == pytest.approx(VOXEL * 5 / (shape[0] - 1))
+        optical = found["density"] * np.float64(found["voxel"]) + FAINT
+        again = seen(dense(t, np.log(np.expm1(optical)), found["colour"], float(found["voxel"])))
+        for a, b, tolerance in zip(again, (sigma, radiance), tolerances, strict=True):
+            assert np.allclose(a, b, rtol=tolerance)
 
 
 def test_nodes_at_the_rim_of_what_is_stored_count(t, rng):
@@ -83,7 +91,7 @@ def test_nodes_at_the_rim_of_what_is_stored_count(t, rng):
     raw = np.abs(raw)
     field = NodeField(nodes, t.TensorXf(raw), t.TensorXf(colour))
     found = decode.grid(field)
-    assert cells_of(stored).sum() == 4 and np.array_equal(found["density"] > 0, stored)
+    assert complete_cells(stored).sum() == 4 and np.array_equal(found["density"] > 0, stored)
     assert found["density"][stored] == pytest.approx(softplus(raw[1:]) / VOXEL, rel=0.02)
     assert found["colour"][stored] == pytest.approx(colour[1:], abs=0.02)
 
@@ -100,12 +108,12 @@ def test_mean_colour():
 
 def test_an_archive_holds_the_grid(t, rng, tmp_path):
     raw, colour = numbers(rng)
-    field = DenseVolumeField(t, raw.reshape(SHAPE), colour.reshape(*SHAPE, 12), LOWER, VOXEL)
+    field = dense(t, raw, colour)
     ((path, line),) = decode.decode(field, tmp_path / "grid.npz")
     assert path == tmp_path / "grid.npz" and line.startswith("6 x 5 x 4 nodes (x, y, z), 6")
     with np.load(path) as content:
         assert np.array_equal(content["density"], decode.grid(field)["density"])
-        assert np.allclose(decode.dense(t, content).voxel, VOXEL)
+        assert np.allclose(content["voxel"], VOXEL)
 
 
 class Written:
@@ -132,7 +140,7 @@ class Written:
 
 def test_vdb_where_openvdb_is_there(t, rng, tmp_path, monkeypatch):
     raw, colour = numbers(rng)
-    field = DenseVolumeField(t, raw.reshape(SHAPE), colour.reshape(*SHAPE, 12), LOWER, VOXEL)
+    field = dense(t, raw, colour)
     for name in decode.MODULES:
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(UsageError, match=r"a VDB file needs the Python module openvdb, which is not installed"):
@@ -162,6 +170,6 @@ def test_what_is_refused(t, tmp_path):
 
 
 def test_an_empty_field_is_empty(t):
-    field = DenseVolumeField(t, np.full(SHAPE, -20.0), np.zeros((*SHAPE, 12)), LOWER, VOXEL)
+    field = dense(t, np.full(SHAPE, -20.0), np.zeros((*SHAPE, 12)))
     found = decode.grid(field)
     assert not found["density"].any() and np.isfinite(found["colour"]).all()

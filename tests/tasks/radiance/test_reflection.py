@@ -1,12 +1,11 @@
 """Colours with reflections: against NumPy and finite differences, in files, and trained on a mirror."""
 
 import dataclasses
-import json
 
+import captures
 import drjit as dr
 import numpy as np
 import pytest
-from PIL import Image
 
 from mi_diffind.arrays.tables import StoredArray, TableError, load_table, save_table
 from mi_diffind.commands.cli import main
@@ -16,8 +15,6 @@ from mi_diffind.tasks.radiance.grid import NodeGrid
 from mi_diffind.tasks.radiance.march import differentiable, march
 from mi_diffind.tasks.radiance.nodes import Nodes
 from mi_diffind.tasks.radiance.volume_field import NodeField
-
-SIZE, FOV = 48, 0.9
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +66,7 @@ def test_the_environment_in_the_mirrored_direction(ad, rng, environment, sharpne
     def entry(number, active):
         return list(dr.gather(ad.Array4f, table, number, active))[:3]
 
-    found = volume_field.reflected(ad, numbers, ad.Array3f(*np.float32(d.T)), entry)
+    found = volume_field.reflection(ad, numbers, ad.Array3f(*np.float32(d.T)), entry)
     mirrored = d - 2 * (d * n).sum(axis=1, keepdims=True) * n
     assert np.abs(np.log(np.array(found).T) - s - light(mirrored)).max() < tolerance
 
@@ -84,7 +81,7 @@ def test_hard_numbers_are_finite(ad, environment):
             d = ad.Array3f(*axes.T)
             numbers = [ad.Float(v) for v in values]
             dr.enable_grad(numbers, d)
-            found = volume_field.reflected(ad, numbers, d, lambda i, a: list(dr.gather(ad.Array4f, table, i, a))[:3])
+            found = volume_field.reflection(ad, numbers, d, lambda i, a: list(dr.gather(ad.Array4f, table, i, a))[:3])
             dr.backward(sum(found))
             assert np.isfinite(np.array(found)).all()
             assert all(np.isfinite(dr.grad(v).numpy()).all() for v in [*numbers, *d])
@@ -163,37 +160,24 @@ def test_files_keep_reflections(ad, rng, environment, tmp_path):
             files.load(tmp_path / "broken.npz")
 
 
-def write_mirror(folder, split, count, turn):
-    """Views of a ball that mirrors stripes."""
-    k = np.arange(count) + 0.5
-    z, angle = 1 - 2 * k / count, np.pi * (1 + 5**0.5) * k + turn
-    frames = []
-    x, y = np.meshgrid(np.arange(SIZE), np.arange(SIZE))
-    focal = SIZE / 2 / np.tan(FOV / 2)
-    pixels = np.stack([(x + 0.5 - SIZE / 2) / focal, -(y + 0.5 - SIZE / 2) / focal, -np.ones_like(x)], axis=-1)
-    for i, back in enumerate(np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], 1)):
-        pose = np.eye(4)
-        right = np.cross([0, 0, 1.0], back)
-        right /= np.linalg.norm(right)
-        pose[:3] = np.stack([right, np.cross(back, right), back, 2 * back], axis=1)
-        d = pixels / np.linalg.norm(pixels, axis=-1, keepdims=True) @ pose[:3, :3].T
-        b = d @ pose[:3, 3]
-        under = b**2 - 4 + 0.36
-        n = (pose[:3, 3] + (-b - np.sqrt(np.maximum(under, 0)))[..., None] * d) / 0.6
-        r = d - 2 * (d * n).sum(axis=-1, keepdims=True) * n
-        linear = 0.4 + 0.35 * np.sin(5 * r + [0, 1, 2])
-        shown = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-        image = np.concatenate([shown, (under > 0)[..., None]], axis=-1)
-        Image.fromarray(np.rint(255 * image).astype(np.uint8)).save(folder / f"{split}_{i}.png")
-        frames.append({"file_path": f"{split}_{i}.png", "transform_matrix": pose.tolist()})
-    content = {"camera_angle_x": FOV, "frames": frames}
-    (folder / f"transforms_{split}.json").write_text(json.dumps(content))
+def mirror(pose, side):
+    """sRGB and alpha, uint8, of a ball that mirrors stripes."""
+    x, y = np.meshgrid(*[np.arange(side) + 0.5 - side / 2] * 2)
+    d = np.stack([x, -y, np.full_like(x, -side / 2 / np.tan(captures.ANGLE / 2))], axis=-1)
+    d = d / np.linalg.norm(d, axis=-1, keepdims=True) @ pose[:3, :3].T
+    o = pose[:3, 3]
+    b = d @ o
+    under = b**2 - o @ o + 0.36
+    n = (o + (-b - np.sqrt(np.maximum(under, 0)))[..., None] * d) / 0.6
+    r = d - 2 * (d * n).sum(axis=-1, keepdims=True) * n
+    linear = 0.4 + 0.35 * np.sin(5 * r + [0, 1, 2])
+    shown = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return np.rint(255 * np.concatenate([shown, (under > 0)[..., None]], axis=-1)).astype(np.uint8)
 
 
 def test_a_mirror_is_fitted_by_reflections(tmp_path, capsys):
     """Held-out views gain, and the compressed file keeps the gain."""
-    write_mirror(tmp_path, "train", 24, 0)
-    write_mirror(tmp_path, "test", 4, 0.7)
+    captures.write(tmp_path, 24, 4, 48, mirror)
     options = ["--resolution", "32", "--batch", "2048", "--variant", "llvm_ad_rgb"]
     reached = {}
     for name in fit.COLOURS:
@@ -211,7 +195,7 @@ def test_a_mirror_is_fitted_by_reflections(tmp_path, capsys):
 
 @pytest.mark.parametrize(("worth", "chosen"), [(-100, "reflections"), (100, "directions")])
 def test_the_colours_that_show_left_out_views(tmp_path, capsys, monkeypatch, worth, chosen):
-    write_mirror(tmp_path, "train", 24, 0)
+    captures.write(tmp_path, 24, 2, 48, mirror)
     monkeypatch.setattr(fit, "WORTH", worth)
     path = tmp_path / "x.npz"
     options = ["--resolution", "20", "--batch", "512", "--variant", "llvm_ad_rgb", "--steps", "40"]

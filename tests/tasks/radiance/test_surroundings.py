@@ -9,12 +9,13 @@ import pytest
 from PIL import Image
 from scipy.ndimage import map_coordinates
 
+from mi_diffind.arrays import sparse_grid
 from mi_diffind.arrays.tables import TableError, load_table, save_table
 from mi_diffind.commands.cli import main
 from mi_diffind.core import compat
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting.loop import FitSettings
-from mi_diffind.tasks.radiance import files, march, nodes, surroundings
+from mi_diffind.tasks.radiance import files, march, surroundings
 from mi_diffind.tasks.radiance import fit as field_fit
 from mi_diffind.tasks.radiance import grid as grids
 from mi_diffind.tasks.radiance.views import load_views
@@ -69,8 +70,8 @@ def test_steps_grow_with_the_distance(ad, rng):
 
 
 def test_what_is_skipped_is_empty(ad, rng):
-    stored = nodes.corners_of(rng.random((SIDE - 1,) * 3) < 0.003)
-    grid, cells = contracted_nodes(ad, stored), nodes.cells_of(stored)
+    stored = sparse_grid.cell_corners(rng.random((SIDE - 1,) * 3) < 0.003)
+    grid, cells = contracted_nodes(ad, stored), sparse_grid.complete_cells(stored)
     o, d, *arrays = rays(ad, rng, 4000)
     free = grid.free_distance(*arrays).numpy()
     assert 0.5 < (free > 0).mean() < 1 and (free > HALF).any()

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from mi_diffind.arrays import sparse_grid
 from mi_diffind.arrays.tables import StoredArray, TableError, load_table, save_table
 from mi_diffind.commands.cli import main
 from mi_diffind.core.errors import UsageError
@@ -29,7 +30,7 @@ from mi_diffind.tasks.radiance import views as view_files
 from mi_diffind.tasks.radiance.session import FieldSession, ViewImages, displayed, scores
 from mi_diffind.tasks.radiance.views import load_views
 
-SIZE, FOV = 40, 0.9
+SIZE = 40
 SHORT = ["--resolution", "24", "--batch", "1024", "--variant", "llvm_ad_rgb", "--colours", "directions"]
 
 
@@ -50,22 +51,10 @@ def short_grids():
     patch.undo()
 
 
-def look_at(o):
-    """Camera to world, from ``o`` to the origin, as Blender has it."""
-    back = np.asarray(o) / np.linalg.norm(o)
-    right = np.cross([0, 0, 1.0], back)
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
-    pose[:3, 3] = o
-    return pose
-
-
-def picture(pose):
-    """Of a ball of radius 0.5 around (0.2, 0, 0), whose colour follows its normal: straight sRGB with alpha."""
-    focal = SIZE / 2 / np.tan(FOV / 2)
-    x, y = np.meshgrid(np.arange(SIZE), np.arange(SIZE))
-    d = np.stack([(x + 0.5 - SIZE / 2) / focal, -(y + 0.5 - SIZE / 2) / focal, -np.ones_like(x)], axis=-1)
+def ball(pose, side):
+    """sRGB and alpha, uint8, of a ball of radius 0.5 around (0.2, 0, 0), whose colour follows its normal."""
+    x, y = np.meshgrid(*[np.arange(side) + 0.5 - side / 2] * 2)
+    d = np.stack([x, -y, np.full_like(x, -side / 2 / np.tan(captures.ANGLE / 2))], axis=-1)
     d = d / np.linalg.norm(d, axis=-1, keepdims=True) @ pose[:3, :3].T
     o = pose[:3, 3] - [0.2, 0, 0]
     b = d @ o
@@ -76,26 +65,10 @@ def picture(pose):
     return np.rint(255 * np.concatenate([srgb, (under > 0)[..., None]], axis=-1)).astype(np.uint8)
 
 
-def write_views(folder, split, count, turn=0.0, alpha=True):
-    k = np.arange(count) + 0.5
-    z = 1 - 2 * k / count
-    angle = np.pi * (1 + 5**0.5) * k + turn
-    frames = []
-    for i, v in enumerate(np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], 1)):
-        pose, name = look_at(2.0 * v), f"{split}_{i}.png"
-        pixels = picture(pose)
-        Image.fromarray(pixels if alpha else pixels[..., :3]).save(folder / name)
-        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
-    content = {"camera_angle_x": FOV, "frames": frames}
-    (folder / f"transforms_{split}.json").write_text(json.dumps(content))
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A capture, its grid ``grid.npz``, and ``ball.npz``."""
-    path = tmp_path_factory.mktemp("field")
-    write_views(path, "train", 16)
-    write_views(path, "test", 3, turn=0.7)
+    path = captures.write(tmp_path_factory.mktemp("field"), 16, 3, SIZE, ball)
     assert main(["fit", "field", str(path), "-o", str(path / "ball.npz"), "--grid", str(path / "grid.npz"),
                  "--json", str(path / "fit.json"), "--steps", "60", *SHORT]) == 0  # fmt: skip
     return path
@@ -162,7 +135,7 @@ def test_a_trial_with_a_part_of_the_nodes_can_be_coded(folder, ad, monkeypatch):
     assert 0 < part.nodes.count < 0.7 * grid.nodes.count
     assert len(part.density) == part.nodes.entries == len(weights.density) + 1 == len(weights.colour) + 1
     np.testing.assert_array_equal(part.density[1:], grid.density[1:][weights.density.astype(int) - 1])
-    assert (nodes.corners_of(nodes.cells_of(part.nodes.stored)) == part.nodes.stored).all()
+    assert (sparse_grid.cell_corners(sparse_grid.complete_cells(part.nodes.stored)) == part.nodes.stored).all()
 
 
 def test_paper_preset(folder, tmp_path, ad):
@@ -298,7 +271,7 @@ def test_files_beside_a_checkpoint_are_not_replaced(folder, tmp_path, name):
 
 
 def test_a_grid_of_other_views_is_refused(folder, tmp_path, capsys):
-    write_views(tmp_path, "train", 4)
+    captures.write(tmp_path, 4, 2, SIZE, ball)
     assert main(["fit", "field", str(tmp_path), "-o", str(tmp_path / "x.npz"), "--grid", str(folder / "grid.npz"),
                  *SHORT]) == 2  # fmt: skip
     assert "was fitted to other views" in capsys.readouterr().err
@@ -367,18 +340,16 @@ def test_hull_and_box(folder, monkeypatch):
     views = load_views(folder, "train")
     lower, upper = view_files.box_of(views)
     assert np.all(lower < [-0.3, -0.5, -0.5]) and np.all(upper > [0.7, 0.5, 0.5])
-    assert np.all(upper - lower < 1.8)
-    spacing = 0.05
-    shape = np.ceil((upper - lower) / spacing).astype(int) + 1
-    inside = view_files.hull(views, lower, spacing, shape)
-    at = np.stack(np.meshgrid(*[a + spacing * np.arange(n) for a, n in zip(lower, shape, strict=True)], indexing="ij"))
-    distance = np.linalg.norm(at - np.array([0.2, 0, 0])[:, None, None, None], axis=0)
-    assert inside[distance < 0.5].all() and inside[distance > 0.75].mean() < 0.01
+    assert np.all(upper - lower < 2.0)
+    shape = np.ceil((upper - lower) / 0.05).astype(int) + 1
+    inside = view_files.hull(views, lower, 0.05, shape)
+    distance = np.linalg.norm(lower + 0.05 * np.argwhere(np.ones(shape, bool)) - [0.2, 0, 0], axis=1).reshape(shape)
+    assert inside[distance < 0.5].all() and inside[distance > 0.75].mean() < 0.02
 
 
 def test_index_by_masks_is_the_index(ad, rng):
     for shape in ((9, 7, 33), (6, 8, 32), (4, 5, 70), (12, 9, 2)):
-        stored = nodes.corners_of(rng.random(tuple(n - 1 for n in shape)) < 0.1)
+        stored = sparse_grid.cell_corners(rng.random(tuple(n - 1 for n in shape)) < 0.1)
         made = [nodes.Nodes(ad, (0, 0, 0), 0.1, shape, stored, packed=packed) for packed in (False, True)]
         p = ad.Array3f((rng.random((3, 4096)) * (np.array(shape)[:, None] - 1) * 0.1).astype(np.float32))
         (first, seen), (second, again) = (n.corners(p) for n in made)
@@ -464,7 +435,7 @@ def test_refined_grids_are_what_they_were(folder, ad, rng):
     grid = files.grid_of(files.load(folder / "grid.npz"), ad)
     images = ViewImages(ad, load_views(folder, "train"))
     finer = grids.refine(grid, grids.dilate(grids.visible(grid, images)), 2)
-    cells = nodes.cells_of(finer.nodes.stored)
+    cells = sparse_grid.complete_cells(finer.nodes.stored)
     places = np.argwhere(cells)[rng.choice(cells.sum(), 500)] + 0.5
     p = ad.Array3f((np.array(finer.nodes.lower) + finer.nodes.spacing * places).T.astype(np.float32))
     weights = np.array([c[0].numpy() for c in finer.nodes.corners(p)[0]])
@@ -481,7 +452,7 @@ def test_refined_grids_are_what_they_were(folder, ad, rng):
 
 
 def test_nothing_in_view_is_said(tmp_path, capsys):
-    write_views(tmp_path, "train", 4)
+    captures.write(tmp_path, 4, 2, SIZE, ball)
     for image in tmp_path.glob("*.png"):
         Image.fromarray(np.zeros((SIZE, SIZE, 4), np.uint8)).save(image)
     assert main(["fit", "field", str(tmp_path), "-o", str(tmp_path / "x.npz"), *SHORT]) == 2
@@ -490,10 +461,10 @@ def test_nothing_in_view_is_said(tmp_path, capsys):
 
 def test_views_without_alpha(tmp_path, capsys):
     """They are trained in the whole box, and what cannot be known is said."""
-    write_views(tmp_path, "train", 3, alpha=False)
-    file = tmp_path / "transforms_train.json"
-    content = json.loads(file.read_text()) | {"aabb": [[-0.6, -0.8, -0.8], [1, 0.8, 0.8]]}
-    file.write_text(json.dumps(content))
+    captures.write(tmp_path, 3, 2, SIZE, ball)
+    for path in tmp_path.glob("*.png"):
+        Image.open(path).convert("RGB").save(path)
+    captures.change(tmp_path, aabb=[[-0.6, -0.8, -0.8], [1, 0.8, 0.8]])
     assert main(["fit", "field", str(tmp_path), "-o", str(tmp_path / "x.npz"), "--steps", "5", *SHORT]) == 0
     assert "no alpha" in capsys.readouterr().err
 
@@ -543,7 +514,7 @@ def test_ten_thousand_steps_take_no_more_memory(folder, ad):
 def test_a_view_that_sees_nothing(folder):
     """An empty view that looks elsewhere takes nothing from the hull."""
     views = load_views(folder, "train")
-    away = look_at([0, 2.0, 0.1])
+    away = captures.look_at(np.array([0, 0.1, 2.0]))
     away[:3, :3] = away[:3, :3] @ np.diag([-1, 1, -1])
     more = dataclasses.replace(
         views, pixels=np.concatenate([views.pixels, np.zeros((SIZE**2, 1), np.uint32)]),

@@ -1,0 +1,391 @@
+"""Study ``tradeoff scene-training``: training inside a scene against training for shading over the hemisphere.
+
+*Runs*: the file that the scene names (*start*); training for shading over the hemisphere (``fit shading``) from it, for
+as many seconds as the largest λ at one sample a pixel takes inside the scene (*hemisphere*), and to its end
+(*hemisphere, longer*); training inside the scene (``fit scene``) from the start (*scene*; also with other λ, other
+samples a pixel, and without samples beyond these), from the result of the hemisphere, and from an untrained start.
+*Another material* is a texture of the same maps turned by 90° and inverted; training inside the scene starts from it,
+too, and from what hemisphere training makes of it.
+
+*Errors*: renders of views and lights that neither training nor its validation draws (the same ranges, another seed)
+against renders of exact plugins. The noise of both renders is not counted: the errors of two halves are multiplied.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import gc
+import json
+import resource
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..arrays.tables import Table
+from ..core.arguments import fraction, positive
+from ..core.files import writable_folder, write_json
+from ..fitting import task
+from ..images import metrics
+from ..images.srgb import for_display
+from ..maps.compressed import decibel
+from ..maps.source import load_source
+from ..measure import plot
+from ..measure.report import figure_caption
+from ..measure.study import Candidate, Measure, Plan, Study
+from ..scenes import loading
+from ..scenes.training.options import SceneRecipe, View, ViewDistribution
+from ..scenes.training.problem import exposure_of
+from ..scenes.training.references import ReferenceRenders
+from ..scenes.training.trained_scene import TrainedScene, original_of, texture_file
+from ..tasks.texture.compressed import load
+from .equal_memory import Contender
+
+#: Names of the runs.
+AFTER = "hemisphere, then scene"
+LONGER = "hemisphere, longer"
+FEW = "scene, few samples"
+OTHER = "another material"
+MENDED = f"{OTHER}, then hemisphere"
+
+
+#: Ranges of camera and lights of the scenes that ship, by the name of the file.
+RANGES = {
+    "training_balls": {
+        "azimuth": (-40, 40), "elevation": (15, 50), "light_azimuth": (-90, 90), "light_elevation": (20, 70),
+    },
+    "training_floor": {"azimuth": (-40, 40), "elevation": (12, 45), "light_azimuth": (-90, 90)},
+    "training_corner": {
+        "azimuth": (-25, 25), "elevation": (12, 35), "light_azimuth": (-35, 35), "light_elevation": (30, 70),
+    },
+}  # fmt: skip
+
+
+#: Runs in the picture.
+SHOWN = ("start", "hemisphere", "scene", AFTER)
+
+
+#: Seed of the views that errors are measured on; trainings have seed 0.
+SEED = 1000
+
+
+@dataclass(frozen=True)
+class SceneTrainingSettings:
+    """Settings of the study.
+
+    ``lambdas``: weights of the loss of renders. ``counts``: samples a pixel of trainings. ``steps`` of a training
+    inside a scene, on ``views`` views, of which ``held_out`` others choose the state; ``tests`` views are measured.
+    Renders are ``width`` pixels wide and 9/16 of this high, with paths of ``depth``. ``reference_spp`` and ``spp``:
+    samples a pixel of references, and of a measured render. ``hemisphere_steps``: steps of a training over the
+    hemisphere to its end; ``texture_steps``: those of the texture of another material.
+    """
+
+    lambdas: tuple[float, ...] = (0.5, 0.9, 1.0)
+    counts: tuple[int, ...] = (1, 4)
+    steps: int = 400
+    views: int = 16
+    held_out: int = 4
+    tests: int = 8
+    width: int = 96
+    depth: int = 3
+    reference_spp: int = 512
+    spp: int = 128
+    hemisphere_steps: int = 1500
+    texture_steps: int = 200
+
+    @classmethod
+    def quick(cls) -> SceneTrainingSettings:
+        """Return the settings of a smoke run."""
+        small = {"views": 2, "held_out": 1, "tests": 1, "width": 16, "depth": 2, "reference_spp": 8, "spp": 8}
+        return cls((0.9,), (1,), steps=2, hemisphere_steps=2, texture_steps=2, **small)
+
+    @property
+    def defines(self) -> dict[str, int]:
+        """Values of a scene's ``<default>`` parameters."""
+        return {"width": self.width, "height": self.width * 9 // 16, "max_depth": self.depth}
+
+
+class SceneTrainingStudy(Study):
+    """Errors of renders of held-out views and lights, after trainings from the same start."""
+
+    name = "scene-training"
+    title = "textures trained inside a scene, and over the hemisphere for the same seconds"
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        parser.add_argument("scenes", nargs="*", metavar="SCENE.xml",
+                            help="scenes that read one compressed material, seen as training_balls is "
+                            "unless it ships (default: scenes/training_*.xml; --quick: the first)")  # fmt: skip
+        parser.add_argument(
+            "--lambda",
+            action="append",
+            type=fraction,
+            dest="lambdas",
+            metavar="X",
+            help="weight of the loss of renders; may be repeated (default: 0.5, 0.9, 1; --quick: 0.9)",
+        )
+        parser.add_argument(
+            "--spp",
+            action="append",
+            type=positive,
+            dest="counts",
+            metavar="N",
+            help="samples a pixel of trainings; may be repeated (default: 1, 4; --quick: 1)",
+        )
+        parser.add_argument("--steps", type=positive, metavar="N",
+                            help="steps of each training inside a scene (default: 400; --quick: 2)")  # fmt: skip
+        parser.add_argument("--width", type=positive, metavar="N",
+                            help="pixels of a row of renders (default: 96; --quick: 16)")  # fmt: skip
+
+    def check(self, arguments) -> None:
+        """Check that the scenes exist."""
+        arguments.paths = scene_files(arguments.scenes, arguments.quick)
+
+    def plan(self, arguments) -> Plan:
+        settings = SceneTrainingSettings.quick() if arguments.quick else SceneTrainingSettings()
+        settings = dataclasses.replace(
+            settings,
+            lambdas=tuple(sorted(set(arguments.lambdas or settings.lambdas))),
+            counts=tuple(sorted(set(arguments.counts or settings.counts))),
+            steps=arguments.steps or settings.steps,
+            width=arguments.width or settings.width,
+        )
+        return plan(arguments.paths, settings)
+
+
+STUDY = SceneTrainingStudy()
+
+
+def scene_files(paths: Sequence[str], quick: bool) -> list[Path]:
+    """Return the scene files, by default those that ship. Raises ``ValueError`` if one does not exist."""
+    chosen = list(map(Path, paths or [f"scenes/{name}.xml" for name in [*RANGES][: 1 if quick else None]]))
+    for path in chosen:
+        if not path.is_file():
+            raise ValueError(f"scenes: found {path}, which is no file; give SCENE.xml, or run in the repository")
+    return chosen
+
+
+class SceneTrainingContext:
+    """A scene, its references, and the measurement of tables in it."""
+
+    def __init__(self, path: Path, settings: SceneTrainingSettings):
+        self.path, self.name, self.settings = path, path.stem.removeprefix("training_"), settings
+        self.ranges = RANGES.get(path.stem, RANGES["training_balls"])
+        self.parsed = loading.ParsedScene(path, settings.defines)
+        self.file, given = texture_file(self.parsed)
+        self.start = load(self.file)
+        self.source = original_of(self.start, self.file, given)
+        #: Folder that keeps references.
+        self.references: Path | None = None
+
+    @cached_property
+    def tests(self) -> tuple[ViewDistribution, list[View], list[np.ndarray], float]:
+        """The distribution of the measured views, the views, their references, and the exposure."""
+        views = ViewDistribution(1, self.settings.tests, seed=SEED, **self.ranges)
+        renders = ReferenceRenders(
+            self.parsed, views, self.settings.reference_spp, self.references, without=(self.file,)
+        )
+        images = renders.images(views.measured())
+        return views, views.measured(), images, exposure_of(images)
+
+    def measure(self, table: Table, spp: int) -> dict[str, float]:
+        """Return ``psnr_db`` and ``flip`` of a table in renders with footprints of ``spp`` samples a pixel."""
+        distribution, views, references, exposure = self.tests
+        scene = TrainedScene(self.parsed, {self.file: table}, distribution, spp)
+        errors, flips = [], []
+        with dr.suspend_grad():
+            for i, (view, reference) in enumerate(zip(views, references, strict=True)):
+                scene.place(view)
+                seeds = (dr.opaque(mi.UInt32, 2 * i + half) for half in range(2))
+                halves = [
+                    exposure * np.nan_to_num(scene.render(s, s + 2**30, self.settings.spp // 2).numpy()) for s in seeds
+                ]
+                truth = np.clip(exposure * reference, 0, 1)
+                a, b = (np.clip(half, 0, 1) - truth for half in halves)
+                errors.append(float(np.mean(a * b, dtype=np.float64)))
+                flips.append(metrics.flip(truth, np.clip(sum(halves) / 2, 0, 1)))
+        gc.collect()
+        return {"psnr_db": decibel(float(np.mean(errors))), "flip": float(np.mean(flips))}
+
+
+def picture(contexts: Sequence[SceneTrainingContext], runs: Sequence[Contender], result: dict):
+    """Draw the first measured view of each scene: after each of the :data:`SHOWN` runs, and the truth."""
+    rows = {}
+    for context in contexts:
+        distribution, views, references, exposure = context.tests
+        first = {}
+        for run in runs:
+            if run.details["context"] is context and run.method in SHOWN:
+                first.setdefault(run.method, run)
+        images = {}
+        for run in first.values():
+            share = run.details["share"]
+            scene = TrainedScene(context.parsed, {context.file: run.model}, distribution, int(run.budget))
+            with dr.suspend_grad():
+                scene.place(views[0])
+                image = scene.render(0, 1, context.settings.spp).numpy()
+            text = f"{run.method}{'' if share is None else f', λ {share:g}'}"
+            images[f"{text}\n{run.record['details']['psnr_db']:.1f} dB"] = image
+        rows[context.name] = {t: for_display(exposure * i) for t, i in {**images, "truth": references[0]}.items()}
+    return plot.draw_images(result["title"], figure_caption(result), rows)
+
+
+def training_run(
+    context: SceneTrainingContext,
+    method: str,
+    task_name: str = "",
+    spp: int = 1,
+    share: float | None = None,
+    begin: str = "file",
+    samples: int = SceneRecipe.samples,
+    after: Contender | None = None,
+    as_long: Contender | None = None,
+) -> Contender:
+    """Return the run ``method``: a file that is measured in a scene after a training of the task, ``""`` for none.
+
+    ``spp``: samples a pixel. ``share``: λ of a training inside the scene. ``begin``: its start, ``file`` or
+    ``untrained``. ``after``: the run it starts from (``None``: the file); ``as_long``: the run that
+    gives its seconds (``None``: it has steps). The record is kept beside the file of the result, so that further runs
+    of the same scene can follow.
+    """
+    settings = context.settings
+
+    def train(job: Contender, progress: bool) -> task.Fitted:
+        common = {"progress": progress, "output": job.file, "variant": mi.variant(), "deterministic": False}
+        if task_name == "texture":
+            fitted = task.fit("texture", other_maps(context.source), bytes=context.start.nbytes,
+                              steps=settings.texture_steps, **common)  # fmt: skip
+            fitted.table.settings["source"] = context.start.settings["source"]
+            return fitted
+        start = context.file if after is None else after.file
+        if task_name == "shading":
+            limit = {"steps": settings.hemisphere_steps}
+            if as_long is not None:
+                limit = {"seconds": max(1.0, as_long.record["details"]["training_seconds"])}
+            return task.fit("shading", context.source, start=start, **limit, **common)
+        given = {} if after is None else {"start": start}
+        ranges = {name: tuple(map(float, limits)) for name, limits in context.ranges.items()}
+        return task.fit(
+            "scene", context.path, defines=list(settings.defines.items()), steps=settings.steps,
+            measure_every=max(1, settings.steps // 8), views=settings.views, held_out=settings.held_out,
+            reference_spp=settings.reference_spp, references=context.references, spp=spp, begin=begin, share=share,
+            samples=samples, **ranges, **given, **common,
+        )  # fmt: skip
+
+    def fit(job: Contender, progress: bool) -> dict | None:
+        processor, figures = time.process_time(), {}
+        if not task_name:
+            job.model = context.start
+            if job.file is not None:
+                job.file.write_bytes(Path(context.file).read_bytes())
+        else:
+            fitted = train(job, progress)
+            if fitted.result.interrupted:
+                return None
+            job.model, result = fitted.table, fitted.result
+            figures = {"steps": result.steps, "kept_step": result.step, "training_seconds": result.seconds,
+                       "processor_seconds": time.process_time() - processor,
+                       "step_ms": 1000 * result.seconds / max(1, result.steps), "history": result.history,
+                       "level_bias": job.model.settings.get("level_bias", 0.0),
+                       "kept_start": job.model.settings.get("kept_start", False),
+                       "validation_db": result.measured.get("psnr_db")}  # fmt: skip
+            if job.file is not None:
+                fitted.save(job.file)
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+        details = {"scene": context.name, "way": method, "lambda": share, "spp": spp, "peak_mib": peak, **figures,
+                   **context.measure(job.model, spp)}  # fmt: skip
+        record = {"bytes": job.model.nbytes, "details": details}
+        if job.file is not None:
+            write_json(job.file.with_suffix(".json"), record)
+        return record
+
+    text = "" if share is None else f", λ {share:g}"
+    return KeptRun(
+        f"{context.name}, {method}{text}, {spp} spp", method, spp, fit, lambda job: load(job.file),
+        details={"context": context, "share": share},
+    )  # fmt: skip
+
+
+class KeptRun(Contender):
+    """Contender whose record is kept beside its file."""
+
+    def cached_record(self, folder: Path | None, record: dict | None) -> dict | None:
+        if folder is not None:
+            self.details["context"].references = writable_folder(folder / "references", create=True)
+        record = super().cached_record(folder, record)
+        if record is None and self.file is not None and self.file.is_file():
+            kept = self.file.with_suffix(".json")
+            record = self.record = json.loads(kept.read_text(encoding="utf-8")) if kept.is_file() else None
+        return record
+
+
+def other_maps(source: Path) -> dict[str, np.ndarray]:
+    """Return the maps of another material: those of ``source`` turned by 90°, and inverted but for normals, bytes."""
+    maps = {}
+    for entry in load_source(source).maps:
+        values = np.rot90(entry.values)
+        maps[entry.name] = np.rint(255 * (values if entry.role == "normal" else 1 - values)).astype(np.uint8)
+    return maps
+
+
+def planned_runs(context: SceneTrainingContext) -> list[Contender]:
+    """Return the runs of a scene in their order."""
+    settings, default = context.settings, SceneRecipe().share
+    share = default if default in settings.lambdas else settings.lambdas[-1]
+
+    def run(method: str, task: str = "", spp: int = settings.counts[0], **fields) -> Contender:
+        return training_run(context, method, task, spp, **fields)
+
+    def inside(method: str, after: Contender | None = None, **fields) -> Contender:
+        return run(method, "scene", **{"share": share, "after": after, **fields})
+
+    scene, other = inside("scene"), run(OTHER, "texture")
+    hemisphere = run("hemisphere", "shading", as_long=scene)
+    mended = run(MENDED, "shading", after=other, as_long=scene)
+    return [
+        *(run("start", spp=spp) for spp in settings.counts), scene, hemisphere, run(LONGER, "shading"),
+        inside(AFTER, hemisphere), inside("untrained, then scene", begin="untrained"), inside(FEW, samples=1),
+        other, inside(f"{OTHER}, then scene", other), mended, inside(f"{MENDED}, then scene", mended),
+        *(inside("scene", share=s) for s in settings.lambdas if s != share),
+        *(inside("scene", spp=spp) for spp in settings.counts[1:]),
+    ]  # fmt: skip
+
+
+def plan(paths: Sequence[Path], settings: SceneTrainingSettings) -> Plan:
+    """Return the plan for scene files in the current variant."""
+    contexts = [SceneTrainingContext(path, settings) for path in paths]
+    runs = [run for context in contexts for run in planned_runs(context)]
+
+    def candidate(run: Contender) -> Candidate:
+        def errors(samples: int) -> dict[str, float]:
+            return {key: run.record["details"][key] for key in ("psnr_db", "flip")}
+
+        return Candidate(run.name, run.method, f"{run.budget} spp", job=run.name, errors=errors)
+
+    request = json.loads(json.dumps(asdict(settings)))
+    shared = {name: value for name, value in request.items() if name not in ("lambdas", "counts")}
+    files = {c.name: c.parsed.description for c in contexts}
+    return Plan(
+        study="scene-training",
+        title="Training inside a scene",
+        candidates=[candidate(run) for run in runs],
+        cases=[],
+        queries=(),
+        accuracy="psnr_db",
+        accuracy_label="PSNR of held-out views and lights, dB",
+        details={"scenes": [c.name for c in contexts], "request": request},
+        notes=[
+            f"{settings.steps} steps, {settings.views} views of {settings.width} × {settings.width * 9 // 16} pixels; "
+            f"errors: {settings.tests} other views and lights against {settings.reference_spp} spp"
+        ],
+        jobs=runs,
+        jobs_fingerprint=f"{files} {shared}",
+        pictures={"png": lambda result: picture(contexts, runs, result)},
+        sampled=False,
+        measures=(Measure("PSNR, dB", "psnr_db"), Measure("FLIP", "flip", ".3f", False)),
+    )

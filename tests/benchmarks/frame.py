@@ -1,0 +1,118 @@
+"""Frame of the benchmarks: arguments, rounds by turns, medians and quartiles, processes, memory, JSON.
+
+Contenders are measured in turn, one of each before the next of any, in the other direction in each second round: what
+else the machine does, and its clock, then hit all of them alike.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from mi_diffind.core.files import write_json
+from mi_diffind.measure import clock
+
+ROOT = Path(__file__).resolve().parents[2]
+ASSETS = ROOT / "scenes" / "assets"
+VARIANT = "llvm_ad_rgb"
+
+
+def parser(description: str, rounds: int = 0, required: bool = False) -> argparse.ArgumentParser:
+    """Return a parser with the option ``--json`` and, with a default number of ``rounds``, ``--rounds``."""
+    result = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    result.add_argument("-o", "--json", type=Path, metavar="FILE.json", required=required, help="file to write")
+    if rounds:
+        result.add_argument("--rounds", type=int, default=rounds, help=f"rounds (default: {rounds})")
+    return result
+
+
+def write(path: Path | None, result: dict) -> None:
+    """Write the result of a benchmark, if there is a file for it."""
+    if path:
+        write_json(path, result)
+
+
+def earlier(path: Path | None, **empty) -> dict:
+    """Return what an earlier run has written to a file, or ``empty``."""
+    return json.loads(path.read_text(encoding="utf-8")) if path and path.is_file() else empty
+
+
+def short_machine() -> dict:
+    """Return the processor, its cores, the system and the version of this package."""
+    described = clock.machine(VARIANT)
+    return {name: described[name] for name in ("cpu", "cores", "system", "mi-diffind")}
+
+
+def spread(values) -> dict[str, float]:
+    """Return the median and the quartiles."""
+    low, median, high = np.quantile(values, (0.25, 0.5, 0.75))
+    return {"median": float(median), "q1": float(low), "q3": float(high)}
+
+
+def by_turns(functions: dict[str, Callable], rounds: int, warm: int = 1) -> dict[str, list]:
+    """Return what each function returns in ``rounds`` rounds, after ``warm`` ones that compile kernels."""
+    results = {name: [] for name in functions}
+    for i in range(warm + rounds):
+        for name in functions if i % 2 == 0 else reversed(functions):
+            value = functions[name]()
+            if i >= warm:
+                results[name].append(value)
+    return results
+
+
+def resident(process: int | str = "self") -> float:
+    """Return the memory of a process in MiB."""
+    return int(Path(f"/proc/{process}/statm").read_text().split()[1]) * 4096 / 2**20
+
+
+def timed_pass(run: Callable, seed: int, processor=time.process_time) -> tuple[float, float]:
+    """Return the milliseconds of ``run(seed)`` by the clock and by the processor; its result is evaluated."""
+    import drjit as dr
+
+    dr.sync_thread()
+    start, start_cpu = time.perf_counter(), processor()
+    dr.eval(run(seed))
+    dr.sync_thread()
+    return 1e3 * (time.perf_counter() - start), 1e3 * (processor() - start_cpu)
+
+
+def answer_passes(pipe, run: Callable, processor=time.process_time) -> None:
+    """Answer each request of :func:`in_processes` by the times of a pass, with another seed each time."""
+    import mitsuba as mi
+
+    i = 0
+    while pipe.recv():
+        i += 1
+        import drjit as dr
+
+        pipe.send(timed_pass(run, dr.opaque(mi.UInt32, i), processor))
+
+
+def in_processes(worker: Callable, names: list[str], rounds: int, *arguments, warm: int = 2) -> dict[str, dict]:
+    """Return what the process of each contender reports and, by turns, the times of its passes.
+
+    ``worker(name, *arguments, pipe)`` sends a dictionary, then calls :func:`answer_passes`. Each contender has a
+    process of its own, because Dr.Jit compiles the materials of all scenes that a process holds into each kernel. One
+    that reports an ``error`` is left out. To its dictionary are added ``ms``, ``cpu_ms``: rows of times.
+    """
+    context, pipes, reports = multiprocessing.get_context("spawn"), {}, {}
+    for name in names:
+        pipes[name], other = context.Pipe()
+        context.Process(target=worker, args=(name, *arguments, other), daemon=True).start()
+        reports[name] = pipes[name].recv()
+
+    def ask(pipe):
+        pipe.send(True)
+        return pipe.recv()
+
+    running = {name: lambda pipe=pipes[name]: ask(pipe) for name in names if "error" not in reports[name]}
+    for name, times in by_turns(running, rounds, warm).items():
+        pipes[name].send(False)
+        reports[name] |= dict(zip(("ms", "cpu_ms"), np.array(times).T, strict=True))
+    return reports

@@ -1,0 +1,262 @@
+"""Networks that tables are compared with: against NumPy, in their bytes, and what they learn."""
+
+import drjit as dr
+import numpy as np
+import pytest
+from variants import BACKENDS
+
+from mi_diffind.core.runtime import array_module
+from mi_diffind.fitting.loop import FitSettings, fit
+from mi_diffind.maps.pyramid import Pyramid
+from mi_diffind.maps.source import from_arrays
+from mi_diffind.measure.training import halve
+from mi_diffind.studies import disney, ggx, texture
+from mi_diffind.studies.baselines import distance_fields as rivals
+from mi_diffind.studies.baselines import networks
+from mi_diffind.studies.baselines.networks import Network
+from mi_diffind.tasks.ggx.model import Encoding
+from mi_diffind.tasks.ggx.training import GGXProblem
+
+GRID = {**ggx.HASH_GRID, "hashmap_size": 64}
+
+
+@pytest.fixture
+def ad():
+    return array_module(BACKENDS[0])
+
+
+def coordinates(ad, rng, n=500):
+    x = rng.random((2, n)).astype(np.float32)
+    return x, [ad.Float(v) for v in x]
+
+
+@pytest.mark.parametrize(("width", "layers"), [(8, 1), (16, 2)])
+def test_network_is_what_numpy_computes(ad, rng, width, layers):
+    net = Network(2, width, layers).alloc(ad.TensorXf, 2, dr.rng(seed=2))
+    values, x = coordinates(ad, rng)
+    weights = [net[k].numpy() for k in net if k.endswith("weights")]
+    biases = [net[k].numpy() for k in net if k.endswith("bias")]
+    y = values
+    for k, (w, b) in enumerate(zip(weights, biases, strict=True)):
+        y = w @ y + b[:, None]
+        y = np.where(y < 0, 0.01 * y, y) if k < layers else y
+    assert len(weights) == layers + 1 and y.shape[0] == 1
+    assert net.parameters == sum(v.size for v in (*weights, *biases)) and net.nbytes == 4 * net.parameters
+    for form in (net, net.cooperative()):
+        (found,) = form(x)
+        assert np.allclose(found.numpy(), y[0], atol=1e-5)
+
+
+@pytest.mark.parametrize("options", [{"grid": GRID}, {"table": 8}, {"grid": GRID, "table": 8}])
+def test_both_forms_agree(ad, rng, options):
+    net = Network(2, 8, 1, **options).alloc(ad.TensorXf, 2, dr.rng(seed=2))
+    if "table" in options:
+        net.table.data = ad.TensorXf(rng.random((8, 8, 1)).astype(np.float32))
+    _, x = coordinates(ad, rng)
+    found = [form(x)[0].numpy() for form in (net, net.cooperative())]
+    assert np.allclose(found[0], found[1], atol=1e-5) and np.ptp(found[0]) > 0
+
+
+def test_all_parameters_are_trained(ad):
+    """A hash grid keeps its entries to itself, so that an optimiser would not see them."""
+    net = Network(2, 8, 1, GRID, table=8).alloc(ad.TensorXf, 2, dr.rng(seed=2))
+    problem = GGXProblem(net, ad, "tables", Encoding())
+    before = {key: net[key].numpy().copy() for key in net}
+    assert {"entries", "table.data", "mlp.layers.0.weights", "mlp.layers.0.bias"} <= set(before)
+    fit(problem, FitSettings(steps=20, batch=4096, lr=1e-2, measure_every=20), progress=False)
+    for key, values in before.items():
+        assert not np.array_equal(net[key].numpy(), values), key
+
+
+def test_operations_of_products(ad):
+    net = Network(2, 16, 2).alloc(ad.TensorXf, 2)
+    n = net.products()
+    assert n.add == n.mul == 2 * 16 + 16 * 16 + 16 and n.bytes_gathered == 4 * net.parameters
+
+
+def draw(types, count=64):
+    """Return random materials, directions and albedos."""
+    import drjit as dr
+
+    from mi_diffind.tasks.disney.training import random_directions, random_materials
+
+    rng = dr.rng(seed=5)
+    m, (wi, wo) = random_materials(rng, types, count), random_directions(rng, types, count)
+    return m, types.Array3f([rng.random(types.Float, count) for _ in range(3)]), wi, wo
+
+
+def test_exact_factors_give_the_published_formulas(mi_rgb):
+    """A function that returns exact factors in place of a network gives BRDF · cosine of the model."""
+    import drjit as dr
+
+    from mi_diffind.tasks.disney.model import exact_factors
+    from mi_diffind.tasks.disney.training import shade
+
+    m, albedo, wi, wo = draw(array_module(mi_rgb.variant()))
+    f = exact_factors(m, wi, wo)
+
+    def exact(x):
+        return [dr.log(f.specular), f.diffuse / wo.z, f.flat / wo.z, dr.log(f.clearcoat / wo.z)]
+
+    decoded, truth = (np.array(shade(d, m, albedo, wi, wo)) for d in (networks.NetworkDecoder(exact), None))
+    np.testing.assert_allclose(decoded, truth, rtol=1e-4, atol=1e-6)
+
+
+def test_coordinates_hold_the_specular_lobe(mi_rgb):
+    """The specular factor is a product of powers of the inputs: D · G · cos θ_o / (4 cos θ_i cos θ_o)."""
+    from mi_diffind.tasks.disney.model import exact_factors
+
+    m, _, wi, wo = draw(array_module(mi_rgb.variant()))
+    x = [np.array(v) for v in networks.coordinates(m, wi, wo)]
+    assert len(x) == networks.DISNEY_INPUTS
+    stretched, roughness, _ = (v / networks.LOGARITHM_SCALE for v in x[5:8])
+    expected = np.exp(-2 * stretched - roughness - x[8] - x[9]) / np.pi * np.array(wo.z)
+    np.testing.assert_allclose(expected, np.array(exact_factors(m, wi, wo).specular), rtol=2e-3)
+
+
+def test_errors_of_training():
+    """Truth above 1 counts as 1, and values above 1 have errors, and gradients, that grow with their logarithms."""
+    import drjit as dr
+
+    Float = array_module("llvm_ad_rgb").Float
+    value, truth = Float(0.5, 3, 0.5, 2, 1000), Float(0.25, 7, 7, 0.5, 1)
+    dr.enable_grad(value)
+    (error,) = networks.squared_errors([value], [truth])
+    expected = np.array([0.25, 0, -0.5, 0.5 + np.log(2), 0]) ** 2
+    np.testing.assert_allclose(error.numpy(), expected, atol=1e-6)
+    dr.backward(error)
+    gradient = dr.grad(value).numpy()
+    assert (gradient[[1, 4]] == 0).all() and gradient[2] == pytest.approx(-1)
+    assert gradient[3] == pytest.approx((0.5 + np.log(2)), rel=1e-5)
+
+
+def ramps(width=64, height=64):
+    """Return a source of two maps, of which one varies along x and y; both repeat without a seam."""
+    y, x = np.mgrid[:height, :width]
+    x, y = 2 * np.pi * x / width, 2 * np.pi * y / height
+    albedo = 0.5 + 0.4 * np.stack([np.sin(x), np.cos(y), 0.5 * np.sin(x + y)], axis=-1)
+    maps = {"albedo": albedo, "roughness": (0.5 + 0.3 * np.cos(x))[..., None]}
+    return from_arrays({name: np.rint(255 * values).astype(np.uint8) for name, values in maps.items()})
+
+
+def filtered_problem(nbytes, mi):
+
+    source, types = ramps(), array_module(mi.variant())
+    pyramid = Pyramid.of(source, types=types, border=("repeat", "repeat"))
+    net = networks.texture_network(source, pyramid.layout, nbytes)
+    return networks.TextureNetworkProblem(net, pyramid, source.digest)
+
+
+def test_a_network_learns_all_levels(mi_rgb):
+    """After a short training, levels are those of the pyramid, in their sizes."""
+    problem = filtered_problem(12000, mi_rgb)
+    before = problem.measure(problem.net)["psnr_db"]
+    result = fit(problem, FitSettings(steps=150, batch=2048, lr=1e-2, loss="mse", measure_every=50), progress=False)
+    assert result.measured["psnr_db"] > before + 10
+    pyramid, maps = problem.pyramid, problem.maps(problem.net)
+    decoded = texture.decode_levels(maps, pyramid.layout.names, pyramid.levels)
+    errors = texture.level_errors(texture.level_images(pyramid), decoded)["all"]
+    assert min(errors[:3]) > 28 and min(errors) > 10  # coarse levels have few samples
+    assert [values.shape[:2] for values in decoded["albedo"]] == [values.shape[:2] for values in pyramid.values]
+
+
+def numpy_read(net, u, v, level, types):
+    """Return the outputs at places, ``(channels, n)``: features of Dr.Jit's grid, then fading and layers in NumPy."""
+    net.encoding.data = net.entries.array
+    features = np.array([f.numpy() for f in net.encoding([types.Float(u), types.Float(v)])], np.float64)
+    count = net.grid["n_features_per_level"]
+    for i in range(net.grid["n_levels"]):
+        side = net.grid["base_resolution"] * net.grid["per_level_scale"] ** i
+        visible = np.clip(1 + np.log2(net.size / 2**level / side), 0, 1)
+        features[i * count : (i + 1) * count] *= visible
+    x = np.concatenate([features, level[None] / (net.levels - 1)])
+    layers = [key.removesuffix(".weights") for key in net if key.endswith(".weights")]
+    for layer in layers:
+        x = net[f"{layer}.weights"].numpy().astype(np.float64) @ x + net[f"{layer}.bias"].numpy().reshape(-1, 1)
+        x = x if layer == layers[-1] else np.where(x > 0, x, 0.01 * x)
+    return x
+
+
+def test_the_plugin_reads_the_network(mi_rgb):
+    """Reads of maps and of the plugin ``mipmap`` are those of NumPy; the texture repeats; level 0 is the finest."""
+    import drjit as dr
+
+    import mi_diffind  # noqa: F401  (registers the plugins)
+    from mi_diffind.plugins.support.image_files import PYRAMIDS
+
+    types, problem = array_module(mi_rgb.variant()), filtered_problem(12000, mi_rgb)
+    net = problem.net
+    random = np.random.default_rng(4)
+    net["entries"] = types.TensorXf(random.normal(size=net.entries.shape).astype(np.float32))
+    halve(net)
+    u, v = random.random((2, 7), dtype=np.float32)
+    level = np.array([0, 0.4, 1, 2.7, 4, 5.5, 6], np.float32)
+    expected = numpy_read(net, u, v, level, types)
+    assert np.ptp(expected) > 0.05
+    for cooperative in (False, True):
+        maps = networks.NetworkMaps(net, problem.pyramid.layout, types, ("repeat", "repeat"), cooperative)
+        for shift in (0, 1):
+            with dr.suspend_grad():
+                actual = maps.filtered(types.Float(u) + shift, types.Float(v) - shift, types.Float(level))
+            np.testing.assert_allclose([a.numpy() for a in actual], expected, rtol=2e-3, atol=2e-3)
+    PYRAMIDS["test network"] = maps
+    try:
+        texture = mi_rgb.load_dict(
+            {"type": "mipmap", "pyramid": "test network", "channels": "albedo", "filter": "off", "raw": True}
+        )
+        si = dr.zeros(mi_rgb.SurfaceInteraction3f, len(u))
+        si.uv = mi_rgb.Point2f(u, v)
+        actual = np.array(texture.eval_3(si))
+    finally:
+        del PYRAMIDS["test network"]
+    finest = numpy_read(net, u, v, 0 * level, types)
+    decoded = np.array(maps.layout.decode("albedo", list(finest)))
+    np.testing.assert_allclose(np.clip(actual, 0, 1), np.clip(decoded, 0, 1), rtol=2e-3, atol=2e-3)
+
+
+def test_a_network_learns_the_maps(mi_rgb):
+    """After a short training, decoded maps are the source's, in its shape and orientation."""
+    source, types = ramps(48, 32), array_module(mi_rgb.variant())
+    problem = networks.ImageNetworkProblem(networks.image_network(source, 20000), types, source)
+    settings = FitSettings(steps=150, batch=1024, lr=1e-2, schedule="cosine", loss="mse", measure_every=50)
+    result = fit(problem, settings, progress=False)
+    decoded = problem.decode(problem.net)
+    for m in source.maps:
+        assert decoded[m.name].shape == m.values.shape
+        assert np.abs(decoded[m.name] - m.values).mean() < 0.03, m.name
+    error = np.mean(np.concatenate([(decoded[m.name] - m.values).ravel() ** 2 for m in source.maps]))
+    assert result.measured["psnr_db"] == pytest.approx(-10 * np.log10(error), abs=1.5)
+
+
+@pytest.mark.parametrize("nbytes", [6000, 12000])
+def test_networks_take_no_more_than_their_bytes(mi_rgb, nbytes):
+    """Two bytes a parameter, counted on the allocated network, are at most the bytes asked for, and most of them."""
+    types, source = array_module(mi_rgb.variant()), ramps()
+    nets = [
+        filtered_problem(nbytes, mi_rgb).net,
+        networks.ImageNetworkProblem(networks.image_network(source, nbytes), types, source).net,
+        networks.disney_network(nbytes).alloc(types.TensorXf),
+        rivals.network(4 * nbytes).alloc(types.TensorXf),
+    ]
+    for net, factor in zip(nets, (1, 1, 1, 4), strict=True):
+        assert 0.8 * factor * nbytes < 2 * net.parameters <= factor * nbytes
+
+
+def test_too_few_bytes_are_refused():
+    for build in (lambda: networks.image_network(ramps(), 200), lambda: networks.disney_network(20)):
+        with pytest.raises(ValueError, match="0 bytes are too few"):
+            build()
+
+
+def test_a_trained_network_of_factors(mi_rgb, tmp_path):
+    """Parameters are half-precision numbers, measured as such; a file brings them back."""
+    training = disney.network_training("network", 832, quick=True)
+    record = training.run(tmp_path, False)
+    assert record["bytes"] == 2 * training.net.parameters <= 832
+    again = disney.network_training("network", 832, quick=True)
+    assert again.cached_record(tmp_path) == record
+    for key in training.net:
+        value = training.net[key].numpy()
+        np.testing.assert_array_equal(value, value.astype(np.float16).astype(np.float32))
+        np.testing.assert_array_equal(again.net[key].numpy(), value)
+    assert disney.network_training("network", 700, quick=True).cached_record(tmp_path) is None

@@ -1,0 +1,210 @@
+"""All studies: quick runs with the smallest sizes, bad options; errors of images, runs inside scenes."""
+
+import csv
+import json
+import math
+import signal
+from pathlib import Path
+from types import SimpleNamespace
+
+import captures
+import numpy as np
+import pytest
+import solid_meshes as solids
+from scipy.ndimage import gaussian_filter
+
+from mi_diffind.commands.cli import main
+from mi_diffind.fitting import loop
+from mi_diffind.maps.source import from_arrays, load_source
+from mi_diffind.measure import benchmark
+from mi_diffind.studies import image, scene_training, studies
+from mi_diffind.studies.baselines import codecs
+
+ROOT = Path(__file__).resolve().parents[2]
+TRAINED = ["--steps", "2", "--pretrain-steps", "2"]
+
+#: Study → arguments beside ``--quick``; files are those of the fixture ``inputs``.
+RUNS = {
+    "bsdf": [],
+    "disney": [],
+    "field": ["balls", "--compression", "120", "--resolution", "16", "--steps", "10", "--seconds", "1"],
+    "ggx": [],
+    "image": ["m.json", "--seconds", "1", "--dims", "4"],
+    "scene": [str(ROOT / "scenes" / "metals.xml"), "-D", "width=32", "-D", "height=16"],
+    "scene-training": [str(ROOT / "scenes" / "training_floor.xml")],
+    "sdf": ["ball.ply", "--bytes", "24k", "--without", "paper", "--without", "indirection"],
+    "shading": ["lacquer", *TRAINED, "--lambda", "1", "--remedies", "on", "--side", "16", "--frames", "2"],
+    "texture": ["m.json", "--seconds", "1", "--width", "24", "--frames", "2", "--compression", "2x"],
+}
+
+#: Study → pictures beside accuracy against time or bytes.
+PICTURES = {
+    "sdf": ["shapes", "training"], "field": ["views"], "texture": ["crops", "zoom", "levels"], "ggx": ["training"],
+    "shading": ["levels", "strip", "zoom"], "disney": ["training"],
+}  # fmt: skip
+
+
+def smooth(height, width, channels, seed=0):
+    random = np.random.default_rng(seed).random((height, width, channels))
+    values = gaussian_filter(random, (3, 3, 0), mode="wrap")
+    values = (values - values.min()) / (values.max() - values.min())
+    return np.rint(255 * values).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory):
+    """The folder of a mesh, a capture of two balls and a material of three maps."""
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    folder = tmp_path_factory.mktemp("inputs")
+    captures.write(folder / "balls", 6, 2, 16)
+    vertices, faces = solids.sphere(12)
+    vertices[:, 2] = np.minimum(vertices[:, 2], 0.64 + 0.2 * vertices[:, 2])
+    solids.write(folder / "ball.ply", (vertices, faces))
+    normal = np.concatenate([smooth(48, 64, 2), np.full((48, 64, 1), 255, np.uint8)], -1)
+    maps = {"albedo": smooth(48, 64, 3, 1), "normal": normal, "roughness": smooth(48, 64, 1, 2)}
+    for name, values in maps.items():
+        mi.Bitmap(values).write(str(folder / f"{name}.png"))
+    (folder / "m.json").write_text(json.dumps({name: f"{name}.png" for name in maps}))
+    return folder
+
+
+def test_all_studies_are_run():
+    assert set(RUNS) == set(studies())
+
+
+def run(study, inputs, out, *more):
+    """The exit code of a study with the arguments :data:`RUNS`."""
+    arguments = [str(inputs / word) if (inputs / word).exists() else word for word in RUNS[study]]
+    first = next((i for i, word in enumerate(more) if word.startswith("-")), len(more))
+    return main(["tradeoff", study, *more[:first], *arguments, "--quick", "--out", str(out), *more[first:]])
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("study", RUNS)
+def test_quick_runs(study, inputs, tmp_path, monkeypatch, capsys):
+    """A run writes its table, JSON and pictures, and nothing else stays; all errors are numbers."""
+    small = benchmark.BenchmarkSettings(2**10, 2, 1, 2**10, True)
+    monkeypatch.setattr(benchmark.BenchmarkSettings, "choose", classmethod(lambda cls, variant, quick=False: small))
+    out = tmp_path / "out"
+    assert run(study, inputs, out, "--json", str(tmp_path / "r.json")) == 0
+    result = json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))
+    files = result.pop("files")
+    written = json.loads((out / f"tradeoff_{study}.json").read_text(encoding="utf-8"))
+    assert written == result and not result["interrupted"] and not list(out.glob("*.partial*"))
+    assert set(files) >= {"csv", "json", "png", *PICTURES.get(study, [])}
+    assert all(Path(path).stat().st_size > 5000 for path in files.values() if path.endswith(".png"))
+    with open(files["csv"], encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert rows and capsys.readouterr().out.endswith(", ".join(files.values()) + "\n")
+    if study == "scene":
+        return
+    assert {row["candidate"] for row in rows} == set(result["candidates"])
+    for name, c in result["candidates"].items():
+        assert all(v is None or math.isfinite(v) for v in c["errors"].values()), name
+        assert result["accuracy"] in c["errors"] or c["is_truth"] or c["is_reference"], name
+    for case in result["cases"].values():
+        assert all(t["with_floor"] > 0 for timings in case["queries"].values() for t in timings.values())
+
+
+@pytest.mark.long
+def test_a_run_goes_on(inputs, tmp_path, capfd, monkeypatch):
+    """After Ctrl-C in the second training, the first is not trained again if its file exists."""
+    step, seen = loop._Trainer.take_step, []
+
+    def interrupted(self, *args):
+        seen.append(self.problem)
+        if self.problem is not seen[0] and self.step == 2:
+            signal.raise_signal(signal.SIGINT)
+        return step(self, *args)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(loop._Trainer, "take_step", interrupted)
+        assert run("image", inputs, tmp_path) == 130
+    assert (tmp_path / "tradeoff_image.partial.json").exists()
+    assert len(list((tmp_path / "tradeoff_image_models").glob("*.npz"))) == 1
+    assert run("image", inputs, tmp_path) == 0
+    err = capfd.readouterr().err.rsplit("continuing from", 1)[1]
+    assert "1 of " not in err and "2 of " in err
+
+
+@pytest.mark.parametrize(
+    "study, options, message",
+    [
+        ("bsdf", ["gold"], 'found the material "gold", allowed are'),
+        ("disney", ["--only", "nothing"], "nothing"),
+        ("field", ["--compression", "0"], "0"),
+        ("field", ["--without", "vq"], '--without: found "vq", allowed are sparse'),
+        ("field", ["--resolution", "4"], "--resolution: found 4, at least 8 is needed"),
+        ("image", ["--dims", "5"], "5"),
+        ("image", ["--variant", "scalar_rgb"], "do not run"),
+        ("scene-training", ["nowhere.xml"], "nowhere.xml, which is no file"),
+        ("sdf", ["--without", "bricks"], '--without: found "bricks", allowed are dense, dense-trained'),
+        ("sdf", ["--ablation"], '--without: found "indirection", allowed are ours, bits6'),
+        ("sdf", ["--errors-of", "none.json"], "--errors-of: none.json is not a file that --json wrote of this study"),
+        ("shading", ["--lambda", "1.5"], "1.5"),
+        ("shading", ["granite"], "hammered, weave, lacquer"),
+        ("shading", ["lacquer"], "twice"),
+        ("shading", ["weave", "--renders", "file.npz"], "--renders: found 2 materials, one is needed"),
+        ("shading", ["--extras", "--preset", "paper"], "--extras: the arrays of the preset paper have none"),
+        ("texture", ["--map", "roughness"], "roughness"),
+        ("texture", ["--table", str(ROOT / "scenes" / "assets" / "tiles_filtered.npz")], "not trained on this source"),
+        ("texture", ["--only", "nothing"], "nothing"),
+    ],
+)
+def test_bad_options(study, options, message, inputs, tmp_path, capsys):
+    try:
+        assert run(study, inputs, tmp_path / "out", *options) == 2
+    except SystemExit as e:
+        assert e.code == 2
+    assert message in capsys.readouterr().err and not (tmp_path / "out" / f"tradeoff_{study}.json").exists()
+
+
+def test_missing_codecs(mi_rgb, monkeypatch):
+    monkeypatch.setattr(codecs, "available", lambda: ("jpeg", "bicubic"))
+    plan = image.plan(from_arrays({"albedo": smooth(32, 32, 3)}), "a.png", image.ImageStudySettings())
+    assert [c.name for c in plan.candidates if c.name.startswith(("ASTC", "BC7", "WebP"))] == []
+    assert plan.notes[1].startswith("Left out: ASTC, BC7, WebP; needed: the packages astc-encoder-py, ")
+
+
+def test_errors(mi_rgb):
+    reference = {"albedo": smooth(32, 32, 3), "normal": smooth(32, 32, 3, 1), "ao": smooth(32, 32, 1, 2)}
+    source = from_arrays(reference)
+    maps = {name: np.clip(v / 255 + 0.1 * (name == "ao"), 0, 1).astype(np.float32) for name, v in reference.items()}
+    found = image.errors_of(source, maps)
+    assert found["psnr_albedo_db"] == 120 and found["flip_albedo"] == 0 and found["ssim_albedo"] == pytest.approx(1)
+    assert found["angle_normal_deg"] == pytest.approx(0, abs=1e-4)
+    difference = np.rint(255 * maps["ao"]) / 255 - reference["ao"] / 255
+    mse = np.mean(difference**2)
+    assert found["psnr_ao_db"] == pytest.approx(-10 * math.log10(mse), abs=1e-3)
+    assert found["psnr_db"] == pytest.approx(-10 * math.log10(mse / 7), abs=1e-3)
+    assert found["psnr_mean_db"] == pytest.approx((240 + found["psnr_ao_db"]) / 3)
+    assert found["flip"] == pytest.approx(found["flip_ao"] / 3) and found["flip_ao"] > 0.01
+    assert image.between(source, maps) == pytest.approx(found["psnr_db"], abs=1)  # a nearly constant difference
+    assert image.between(source, {n: v / 255 for n, v in reference.items()}) == 120
+
+
+def test_names_of_trainings(mi_rgb):
+    source = from_arrays({"albedo": smooth(32, 32, 3)})
+    settings = image.ImageStudySettings((12.0, 6.0), (5.0, 2.0), (7.0,), (4, 3))
+    names = [job.name for job in image.trained_contenders(image.ImageStudyContext(source, "a", settings))]
+    assert names == ["ours 12x 2 s", "ours 12x 5 s", "paper 12x 7 s", "ours 2D→3D 12x 2 s", "ours 6x 2 s"]
+
+
+def test_maps_of_another_material():
+    path = ROOT / "scenes" / "assets" / "rust.json"
+    other = scene_training.other_maps(path)
+    for entry in load_source(path).maps:
+        values = np.round(255 * entry.values).astype(int)
+        turned = values[:, ::-1].swapaxes(0, 1)
+        assert np.array_equal(other[entry.name], turned if entry.name == "normal" else 255 - turned)
+
+
+def test_runs_of_a_scene():
+    """λ, 0.9 unless it is left out, and samples a pixel are changed one at a time."""
+    context = SimpleNamespace(name="room", settings=scene_training.SceneTrainingSettings())
+    runs = scene_training.planned_runs(context)
+    assert len({run.name for run in runs}) == len(runs)
+    inside = [(run.details["share"], run.budget) for run in runs if run.method == "scene"]
+    assert inside == [(0.9, 1), (0.5, 1), (1.0, 1), (0.9, 4)]
