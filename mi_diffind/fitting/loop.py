@@ -153,7 +153,7 @@ class Problem:
     beta_2: float = 0.999
 
     #: True if a step reads a small part of the tables: only entries with a gradient are updated
-    #: (:class:`.sparse_adam.SparseAdam`). ``net`` is a dictionary then.
+    #: (:class:`SparseAdam`). ``net`` is a dictionary then.
     sparse: bool = False
 
     #: Loss that is no explosion, however small the losses before: a training that starts next to its optimum first
