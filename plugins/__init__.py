@@ -53,9 +53,8 @@ class Stock:
     """Plugins of Mitsuba that a learned plugin can stand for, fitted to what they show if need be.
 
     ``word``: the name of all of them for users; ``names``: their types in a scene. ``convert(node)`` changes the
-    properties of a :class:`~mi_diffind.plugins.support.stock.StockNode`, without the type, and returns what was fitted
-    and how well, or "", or raises :class:`~mi_diffind.plugins.support.stock.Kept`. ``advised``: a scene gains from the
-    learned plugin, so that it is put in without being asked for.
+    properties of a :class:`.StockNode`, without the type, and returns what was fitted and how well, or "", or raises
+    :class:`.Kept`. ``advised``: a scene gains from the learned plugin, so that it is put in without being asked for.
     """
 
     word: str
@@ -191,7 +190,8 @@ def register(variant: str) -> None:
 
 def _load() -> list[Plugin]:
     """Execute the modules of plugins afresh and return their declarations."""
-    for name in discovery.modules(__name__, IGNORED).values():  # all of them first, since modules import each other
+    # All of them first, since modules import each other; the classes of the last one derive from ``mi.Texture``
+    for name in (*discovery.modules(__name__, IGNORED).values(), f"{__name__}.support.map_textures"):
         sys.modules.pop(name, None)
     return list(discovery.load(__name__, "PLUGIN", IGNORED, expected=Plugin).values())
 

@@ -10,10 +10,10 @@ from mi_diffind.images import srgb
 from mi_diffind.maps.pyramid import TexelPyramid
 
 from . import Plugin
-from .filtered_texture import FilteredTexture
-from .support.filtering import FILTERS
 from .support.image_files import SharedMaps, open_uncompressed
 from .support.manual import shared_parts
+from .support.map_textures import FilteredTexture
+from .support.textures import FILTERS
 
 
 class Texels:

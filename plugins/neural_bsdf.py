@@ -20,7 +20,7 @@ from mi_diffind.tasks.bsdf.model import ALPHA_MIN, DIFFUSE, EDGE, LOBE, LOGARITH
 from mi_diffind.tasks.bsdf.truth import MitsubaTruth
 
 from . import Counterpart, Plugin
-from .support import frozen, properties, tables, upsampling
+from .support import frozen, properties, tables, textures
 from .support.directions import are_directions
 from .support.manual import shared_parts
 from .support.tracked_parameter import TrackedParameter, when_outermost
@@ -247,7 +247,7 @@ class NeuralBSDF(mi.BSDF):
             for texture, known in zip(self.textures.values(), self.known, strict=True):
                 values.append(float(mi.Float(texture.eval_1(si))[0]) if known else None)
             if any(self.known):
-                self.member = self.model.fixed(values) if all(self.known) else self.model.reduced(values)
+                self.member = self.model.member(values) if all(self.known) else self.model.restrict(values)
         self._hold()
 
     def _compute_constants(self):
@@ -381,8 +381,8 @@ def _proxy(parameters: dict, form) -> Proxy:
             gamma = clamp(parameters[f"{name}.gamma"], 2 * low, 2 * high)  # files hold the logarithm of its half
             lobes[name] = ProxyLobe(alphas, gamma, *colours)
     if "diffuse" not in form.terms:
-        return Proxy.of_parts(None, None, lobes)
-    return Proxy.of_parts([limited(c) for c in parameters["diffuse"]], limited(parameters["edge"]), lobes)
+        return Proxy.from_parts(None, None, lobes)
+    return Proxy.from_parts([limited(c) for c in parameters["diffuse"]], limited(parameters["edge"]), lobes)
 
 
 def _proxy_array(parameters: dict, form) -> DifferentiableArray:
@@ -404,7 +404,7 @@ def _spectrum(rgb: list, wavelengths):
     if not mi.is_spectral:
         return mi.UnpolarizedSpectrum(*rgb)
     largest = dr.maximum(dr.maximum(dr.maximum(rgb[0], rgb[1]), rgb[2]), 1e-20)
-    return largest * upsampling.spectrum([v / largest for v in rgb], wavelengths)
+    return largest * textures.upsampled_spectrum([v / largest for v in rgb], wavelengths)
 
 
 class SourceBSDF(NeuralBSDF):

@@ -12,7 +12,7 @@ from . import Counterpart, Plugin, Stock
 from .disney import ETA_MAX, PRINCIPLED, Disney
 from .support import properties, tables
 from .support.manual import shared_parts
-from .support.stock import Kept, StockNode
+from .support.properties import Kept, StockNode
 
 #: Default storage form: the fastest to read, and within 82 dB of the formulas.
 STORAGE = "uint8"

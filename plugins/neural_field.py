@@ -15,7 +15,7 @@ from . import Counterpart, Plugin, warn
 from .path_footprint import integrator as path_footprint
 from .support import distance_shapes as sdf
 from .support import omissions, properties, tables
-from .support.differentials import Differentials
+from .support.footprint import Differentials
 from .support.manual import shared_parts
 from .support.placed_fields import FieldLight, PlacedField, VariantLight, grouped, in_order, to_grid
 
@@ -526,7 +526,7 @@ def integrator() -> type:
             path.ray = mi.Ray3f(dr.detach(ray))
             path.active, path.handed, path.turned = mi.Bool(active), mi.Bool(False), mi.Bool(False)
             path.throughput, path.clear = mi.Spectrum(1), mi.Float(1)
-            path.differentials = Differentials.of(ray)
+            path.differentials = Differentials.from_ray(ray)
             return path
 
         def _surfaces(self, mode, scene, sampler, ray, path, δL=None, state=None) -> tuple:
@@ -628,7 +628,7 @@ def integrator() -> type:
             if carried:
                 edges = compat.normal_edges(pi, si, ray, going)
                 arriving = path.differentials.at(ray, si)
-                leaving = arriving.bounced(ray, si, out, bs.eta, bs.pdf, mi.Bool(True), mi.Float(1), edges)
+                leaving = arriving.bounce(ray, si, out, bs.eta, bs.pdf, mi.Bool(True), mi.Float(1), edges)
                 path.differentials = dr.select(going, leaving, path.differentials)
             path.throughput = dr.select(going, passed * beyond, passed)
             path.clear = dr.select(turned, 0, path.clear)

@@ -9,10 +9,10 @@ import mitsuba as mi
 from mi_diffind.tasks.image import TASK
 
 from . import Counterpart, Plugin
-from .map_texture import MapTexture
 from .support import properties
 from .support.image_files import SharedMaps, open_compressed, to_bitmap
 from .support.manual import shared_parts
+from .support.map_textures import MapTexture
 
 
 @shared_parts

@@ -19,18 +19,30 @@ from mi_diffind.tasks.sdf import TASK
 
 from . import Counterpart, Plugin, Stock, reports_as, shown_as, warn
 from .support import properties, tables
-from .support.distance_shapes import CELL_BYTES, SEEN_BY, crop_grid, distance_shape, finest, native_grid
+from .support.distance_shapes import (
+    CELL_BYTES,
+    SEEN_BY,
+    check_normals,
+    closed_mesh_file,
+    crop_grid,
+    distance_shape,
+    finest,
+    native_grid,
+    to_mesh,
+)
 from .support.manual import shared_parts
 from .support.placement import Placement
-from .support.sdf_meshes import check_normals, closed_mesh_of, to_mesh
-from .support.stock import Kept, StockNode
+from .support.properties import Kept, StockNode
 
 #: Models whose arrays cannot be optimised, shared by all shapes of a file.
 _shared: WeakValueDictionary = WeakValueDictionary()
 _lock = threading.RLock()  # Mitsuba loads shapes in parallel; a thread that waits for a kernel may load another shape
 
-#: Limits of a grid whose resolution is chosen automatically: cells along the longest side, and bytes in Mitsuba.
-FINEST, LARGEST = 512, 3 * 2**30
+#: Cells along the longest side of the finest grid that is chosen automatically.
+FINEST = 512
+
+#: Bytes in Mitsuba of the largest such grid.
+LARGEST = 3 * 2**30
 
 #: Error, in cells of the field, assumed for a file without measurements; sparse fields have 0.002 to 0.007.
 TYPICAL_ERROR = 0.005
@@ -52,7 +64,7 @@ def open_model(props: mi.Properties):
         raise RuntimeError(str(e)) from None
 
 
-def decoded(model, resolution: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict]:
+def decode_grid(model, resolution: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict]:
     """Return a grid of a model's field for ``sdfgrid``, its corners in the unit frame, and its report.
 
     ``resolution`` is the number of cells along the longest side; 0 chooses the coarsest grid with an error below that
@@ -70,7 +82,7 @@ def decoded(model, resolution: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndar
         most = min(FINEST, finest(np.subtract(field.upper, field.lower), LARGEST))
         resolution, error = grids.resolution_for(field, wanted, most)
     values, lower, upper = grids.grid(field, resolution)
-    grids.sharpen(values, field.band)
+    values[1:-1, 1:-1, 1:-1] = grids.sharpen(values, field.band)
     values, lower, upper = crop_grid(values, lower, (upper[0] - lower[0]) / (values.shape[2] - 1))
     report = {
         "preset": model.table.preset,
@@ -238,7 +250,7 @@ class NeuralSDF(distance_shape(mi.Mesh)):
             return
         self._entries.accept()
         if not keys or any(key.startswith("tables.") for key in keys):
-            self.model.field.changed()
+            self.model.field.update_bound()
             self._hold()
 
     def report(self) -> dict:
@@ -269,7 +281,7 @@ def factory(props: mi.Properties):
     Placement.of(to_world, model.scale, model.centre)  # raises for an invalid transform
     normals = properties.one_of(props, "normals", ("smooth", "analytic"))
     try:
-        values, lower, upper, report = decoded(model, resolution)
+        values, lower, upper, report = decode_grid(model, resolution)
     except RuntimeError as e:
         raise RuntimeError(f"{model.table.path}: {e}") from None
     to_unit = mi.ScalarTransform4f().translate(list(model.centre)).scale(model.scale)
@@ -290,8 +302,11 @@ def factory(props: mi.Properties):
 BYTES = 2**18
 
 
-#: Limits of that fit: the least intersection over union with the solid, and the mean error of the normals, in degrees.
-LEAST_IOU, LARGEST_ANGLE = 0.98, 8.0
+#: Least intersection over union of that fit with the solid.
+LEAST_IOU = 0.98
+
+#: Largest mean error of the normals of that fit, in degrees.
+LARGEST_ANGLE = 8.0
 
 
 def _from_mesh(node: StockNode) -> str:
@@ -310,7 +325,7 @@ def _from_mesh(node: StockNode) -> str:
         Placement.of(props.get("to_world", mi.ScalarTransform4f()), 1.0, (0, 0, 0))
     except RuntimeError as e:
         raise Kept(f"cannot be placed: {e}") from None
-    source = closed_mesh_of(node.file(), node.folder, props.get("shape_index", 0))
+    source = closed_mesh_file(node.file(), node.folder, props.get("shape_index", 0))
     smooth = check_normals(props, source)
     table = node.fit(TASK.name, source, bytes=BYTES)
     quality = f"IoU {table.measured['iou']:.4f}, normals off by {table.measured['normal_deg']:.1f}°"

@@ -9,12 +9,12 @@ import mitsuba as mi
 from mi_diffind.tasks.texture import TASK
 
 from . import Counterpart, Plugin, Stock
-from .filtered_texture import FilteredTexture
-from .support.filtering import FILTERS, TYPES
-from .support.filtering import PROPERTIES as FILTERING
-from .support.image_files import SharedMaps, manifest_of, open_compressed, to_bitmap, to_mipmap
+from .support.image_files import SharedMaps, manifest_of, open_compressed, remove, to_bitmap, to_mipmap
 from .support.manual import shared_parts
-from .support.stock import Kept, StockNode
+from .support.map_textures import FilteredTexture
+from .support.properties import Kept, StockNode
+from .support.textures import FILTERS, TYPES
+from .support.textures import PROPERTIES as FILTERING
 
 
 @shared_parts
@@ -90,9 +90,7 @@ class NeuralTexture(FilteredTexture):
 
 def _to_bitmap(props: mi.Properties) -> None:
     to_bitmap(TASK, props)
-    for name in FILTERING:
-        if name in props:
-            del props[name]
+    remove(props, *FILTERING)
 
 
 #: Steps of the fit that a scene's bitmap gets without a file of its own: within 2 dB of the default training.
@@ -117,9 +115,7 @@ def _from_bitmap(node: StockNode) -> str:
         quality = f"{node.file().name} would have {table.measured['psnr_db']:.1f} dB"
         raise Kept(f"{quality}, at least {LEAST_DB:g} are needed: fit it by hand, with more bytes")
     props["filename"] = str(table.path)
-    for name in ("filter_type", "format", "accel"):  # a bitmap's "bilinear" would switch filtering off
-        if name in props:
-            del props[name]
+    remove(props, "filter_type", "format", "accel")  # a bitmap's "bilinear" would switch filtering off
     return f"{table.path.name}, {table.measured['psnr_db']:.1f} dB"
 
 

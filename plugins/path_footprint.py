@@ -11,7 +11,7 @@ from mi_diffind.core import compat
 
 from . import Plugin
 from .support import footprint, omissions
-from .support.differentials import Differentials
+from .support.footprint import Differentials
 from .support.manual import shared_parts
 
 #: ``max_depth`` where there is no limit.
@@ -108,7 +108,7 @@ def integrator() -> type:
     class PathFootprint(compat.replay_integrator()):
         __doc__ = MANUAL
 
-        #: Rays carry differentials, from which textures get footprints (:mod:`.filtered_texture`).
+        #: Rays carry differentials, from which textures get footprints (:mod:`.map_textures`).
         gives_footprints = True
 
         #: Radiance fields between the surfaces (:class:`.placed_fields.FieldLight`), or ``None``.
@@ -152,7 +152,7 @@ def integrator() -> type:
             ray.has_differentials = len(footprint.textures(scene)) > 0
             if not ray.has_differentials:
                 return
-            scale = dr.opaque(mi.Float, footprint.scale_of(sampler.sample_count()))
+            scale = dr.opaque(mi.Float, footprint.sample_scale(sampler.sample_count()))
             axis = sensor.world_transform() @ mi.Vector3f(0, 0, 1)
             # Rays start at the near clipping plane, and Mitsuba lets their neighbours start at the same point of it
             start = sensor.near_clip() / dr.dot(ray.d, dr.normalize(axis)) if hasattr(sensor, "near_clip") else 0
@@ -207,10 +207,10 @@ def integrator() -> type:
             unattached = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad  # a field may be all that is optimised
             carried = bool(getattr(ray, "has_differentials", False)) and not solids
             flags = compat.ray_flags(curvature=carried)
-            scale = dr.opaque(mi.Float, footprint.scale_of(sampler.sample_count()))
+            scale = dr.opaque(mi.Float, footprint.sample_scale(sampler.sample_count()))
             bsdf_ctx, mis_weight = mi.BSDFContext(), mi.ad.integrators.common.mis_weight
 
-            differentials = Differentials.of(ray)
+            differentials = Differentials.from_ray(ray)
             ray = mi.Ray3f(dr.detach(ray))
             active = mi.Bool(active)
             valid_ray = mi.Bool(scene.environment() is not None and not self.hide_emitters)
@@ -312,7 +312,7 @@ def integrator() -> type:
                 wo = si.to_world(bs.wo)
                 if dr.hint(carried, mode="scalar"):
                     edges = compat.normal_edges(hit, si, ray, active_next)
-                    differentials = differentials.bounced(ray, si, wo, bs.eta, bs.pdf, bsdf_delta, scale, edges)
+                    differentials = differentials.bounce(ray, si, wo, bs.eta, bs.pdf, bsdf_delta, scale, edges)
                 valid_ray |= active & si.is_valid() & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
                 ray, rest = self.spawn(solids, hit, si, wo)
                 β *= dr.detach(bsdf_weight)

@@ -8,39 +8,19 @@ from pathlib import Path
 
 import numpy as np
 from make_assets import drop_degenerate, grid_faces, write_ply
-from scene_xml import environment, head, plugin, transform, write
+from scene_xml import environment, head, mesh, place, plugin, principled, turn, write
 
 FOLDER = Path(__file__).resolve().parent
 
 ABOUT = """{what}, in the light of {light}: to be captured from all sides
 (mi-diffind capture), so that there is nothing below or behind. Written by make_captures.py: change that file."""
 
-CAMERA = {"origin": (2.6, 2.6, 5.6), "target": (0, 0.85, 0), "up": (0, 1, 0)}
-
-
-def place(x: float, y: float, z: float) -> dict:
-    """Where something is moved to."""
-    return {"x": x, "y": y, "z": z}
-
-
-def turn(axis: str, angle: float) -> dict:
-    """Return a rotation around an axis, in degrees."""
-    return {axis: 1, "angle": angle}
-
-
-def mesh(file: str, material, id: str = "", **steps):
-    """Return a mesh of the assets."""
-    return plugin("shape", "ply", transform(**steps), material, id=id or file, filename=f"assets/{file}.ply")
+CAMERA = (2.6, 2.6, 5.6), (0, 0.85, 0)
 
 
 def bitmap(name: str, file: str):
     """Return a texture."""
     return plugin("texture", "bitmap", name=name, filename=f"assets/{file}")
-
-
-def principled(*children, **parameters):
-    """Return a material."""
-    return plugin("bsdf", "principled", *children, **parameters)
 
 
 # -- meshes of the thin scene ------------------------------------------------------------------------------------------

@@ -6,12 +6,7 @@ The learned files are fitted to the sources by ``mi-diffind fit bsdf scenes/asse
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
-from scene_xml import element, environment, head, plugin, softbox, transform, write
-
-
-def principled(**parameters):
-    """Return a principled BSDF."""
-    return plugin("bsdf", "principled", **parameters)
+from scene_xml import element, environment, head, plugin, principled, softbox, transform, write
 
 
 def plastic(alpha: float, colour: tuple, **parameters):
@@ -83,15 +78,13 @@ def main() -> None:
         path = scenes / "assets" / "library" / f"{name}.xml"
         path.parent.mkdir(exist_ok=True, parents=True)
         path.write_text(ET.tostring(source, encoding="unicode") + "\n", encoding="utf-8", newline="\n")
-    camera = {"origin": (0, 1.5, 24), "target": (0, -0.05, 0), "up": (0, 1, 0)}
-    lamp = {"origin": (-5, 5, 8), "target": (0, 0, 0), "up": (0, 1, 0)}
     wall = plugin("bsdf", "diffuse", reflectance=(0.35, 0.35, 0.35))
     content = [
-        *head(1000, 400, {}, fov=22.0, camera=camera),
+        *head(1000, 400, {}, fov=22.0, camera=((0, 1.5, 24), (0, -0.05, 0))),
         "A hotel room by day",
         environment("interior.exr", scale=0.8, angle=200),
         "A softbox above on the left",
-        softbox((1.6, 1.6), lamp, radiance=(14, 13, 12)),
+        softbox((1.6, 1.6), (-5, 5, 8), (0, 0, 0), radiance=(14, 13, 12)),
         "The wall",
         plugin("shape", "rectangle", transform(scale={"x": 20, "y": 20}), wall),
     ]

@@ -9,7 +9,7 @@ A row starts from a material on which its parameter can be seen, and sweeps that
 
 from pathlib import Path
 
-from scene_xml import PRESET, element, environment, head, lying, plugin, softbox, transform, write
+from scene_xml import PRESET, element, environment, head, lying, plugin, softbox, transform, turn, write
 
 COLUMNS = 6
 PITCH_X, PITCH_Z = 1.13, 2.75  # distance between sphere centres; a sphere has radius 0.5
@@ -18,17 +18,9 @@ STRETCH = 1.7  # of the letters on the floor, against foreshortening
 FLOOR = 0.302  # albedo of the floor, and of the label texture between the letters
 
 DEFAULTS = {
-    "roughness": 0.5,
-    "anisotropic": 0.0,
-    "metallic": 0.0,
-    "specular": 0.5,
-    "spec_tint": 0.0,
-    "sheen": 0.0,
-    "sheen_tint": 0.0,
-    "flatness": 0.0,
-    "clearcoat": 0.0,
-    "clearcoat_gloss": 0.0,
-}
+    "roughness": 0.5, "anisotropic": 0.0, "metallic": 0.0, "specular": 0.5, "spec_tint": 0.0, "sheen": 0.0,
+    "sheen_tint": 0.0, "flatness": 0.0, "clearcoat": 0.0, "clearcoat_gloss": 0.0,
+}  # fmt: skip
 
 # parameter that is swept, linear sRGB base colour, parameters that differ from DEFAULTS
 ROWS = [
@@ -65,9 +57,7 @@ def sphere(row: int, column: int):
     name, color, changes = ROWS[row]
     x, z = place(row, column)
     placed = transform(
-        scale={"value": 0.5},
-        rotate={"x": 1, "angle": -90},
-        translate={"x": round(x, 3), "y": 0.5, "z": round(z, 3)},
+        scale={"value": 0.5}, rotate=turn("x", -90), translate={"x": round(x, 3), "y": 0.5, "z": round(z, 3)}
     )
     learned = {PRESET: f"${PRESET}", "storage": "$storage", "effects": "$effects"}
     values = {**DEFAULTS, **changes, name: column / (COLUMNS - 1)}
@@ -94,15 +84,14 @@ def label(row: int):
 
 def main() -> None:
     """Write the files."""
-    camera = {"origin": (0, 150, 250), "target": (0, 0.25, 0.15), "up": (0, 1, 0)}
-    lamp = {"origin": (-7, 5.5, -21), "target": (0, 0, 0), "up": (0, 1, 0)}
+    camera = (0, 150, 250), (0, 0.25, 0.15)
     floor = element("rgb", name="reflectance", value=FLOOR)
     content = [
         *head(960, 552, {PRESET: "tables", "storage": "uint8", "effects": "used"}, fov=2.9, camera=camera),
         "A hotel room by day, its window in front of the chart",
         environment("interior.exr", scale=0.9, angle=20),
         "A wide softbox behind the chart, on the left: rims, sheen, long highlights",
-        softbox((10, 4.2), lamp, radiance=(13, 12.6, 12)),
+        softbox((10, 4.2), (-7, 5.5, -21), (0, 0, 0), radiance=(13, 12.6, 12)),
         lying(80, 80, plugin("bsdf", "diffuse", floor, id="floor")),
     ]
     for row, (name, *_) in enumerate(ROWS):

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from scene_xml import PRESET, element, environment, head, lying, number, plugin, softbox, transform, write
+from scene_xml import PRESET, element, environment, head, lying, number, plugin, repeated, softbox, write
 
 METALS = (("gold", "Au"), ("copper", "Cu"), ("aluminium", "Al"))
 ALPHAS = (0.001, 0.01, 0.05, 0.15, 0.4, 1.0)
@@ -25,28 +25,20 @@ def ball(row: int, column: int):
 
 def table():
     """Dark metal, whose roughness is a bitmap, twelve times in each direction."""
-    roughness = plugin(
-        "texture",
-        "bitmap",
-        transform("to_uv", scale={"x": 12, "y": 12}),
-        name="alpha",
-        filename="assets/wood_roughness.png",
-        raw=True,
-    )
+    roughness = plugin("texture", "bitmap", repeated(12), name="alpha", filename="assets/wood_roughness.png", raw=True)
     dark = {"material": "W", "specular_reflectance": (0.35, 0.37, 0.4)}
     return lying(30, 30, plugin("bsdf", "neural_ggx", roughness, id="table", **LEARNED, **dark))
 
 
 def main() -> None:
     """Write the files."""
-    camera = {"origin": (0, 12, 15.5), "target": (0, 0.25, 0.1), "up": (0, 1, 0)}
-    lamp = {"origin": (-5, 6, -5), "target": (0, 0.5, 0), "up": (0, 1, 0)}
+    camera = (0, 12, 15.5), (0, 0.25, 0.1)
     content = [
         *head(960, 500, {PRESET: "tables", "storage": "float32"}, fov=24.0, camera=camera),
         "A park in the afternoon",
         environment("forest.exr", scale=0.8, angle=160),
         "A softbox behind on the left",
-        softbox((2.2, 1.4), lamp, radiance=(14, 13, 12)),
+        softbox((2.2, 1.4), (-5, 6, -5), (0, 0.5, 0), radiance=(14, 13, 12)),
         "Table: dark metal whose roughness is a bitmap",
         table(),
     ]

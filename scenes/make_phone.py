@@ -41,10 +41,7 @@ def bitmap(file: str, scale: float = 1.0) -> dict:
     to_uv = mi.ScalarTransform4f().scale([scale, scale, 1])
     return {
         "type": "twosided",
-        "bsdf": {
-            "type": "diffuse",
-            "reflectance": {"type": "bitmap", "filename": str(ASSETS / file), "to_uv": to_uv},
-        },
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "bitmap", "filename": str(ASSETS / file), "to_uv": to_uv}},
     }
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
-from scene_xml import element, head, lying, plugin, transform, write
+from scene_xml import ball, element, head, lying, plugin, ref, repeated, sun, write
 
 import mi_diffind as md
 from mi_diffind import metrics, scenes
@@ -40,8 +40,7 @@ def write_maps() -> None:
 
 def metal(repeats: float, id: str):
     """Return the material, its maps repeated the given number of times."""
-    scale = transform("to_uv", scale={"x": repeats, "y": repeats})
-    return plugin("bsdf", "neural_material", scale, id=id, filename="assets/$metal", lobes="tables",
+    return plugin("bsdf", "neural_material", repeated(repeats), id=id, filename="assets/$metal", lobes="tables",
                   storage="$storage", filter="$filter")  # fmt: skip
 
 
@@ -87,20 +86,16 @@ def main() -> None:
         return picture(arguments.json)
     mi.set_variant("scalar_rgb")
     write_maps()
-    camera = {"origin": (0, 4.2, 7.5), "target": (0, 0.35, 0.2), "up": (0, 1, 0)}
+    camera = (0, 4.2, 7.5), (0, 0.35, 0.2)
     defaults = {"metal": "rust_shaded.npz", "storage": "uint8", "filter": "anisotropic", "sky": 0.5}
     content = head(960, 540, defaults, fov=36.0, camera=camera)
-    sun = plugin("emitter", "directional", element("vector", name="direction", x=-0.55, y=-0.6, z=0.35),
-                 irradiance=(3.2, 3.0, 2.7))  # fmt: skip
     sky = element("emitter", element("float", name="radiance", value="$sky"),
                   element("float", name="sampling_weight", value="0"), type="constant")  # fmt: skip
-    balls = []
-    for i, (x, z, radius) in enumerate(((-1.7, 0.4, 0.8), (0.25, -0.6, 0.8), (1.9, 0.9, 0.6))):
-        placed = transform(rotate={"x": 1, "angle": -90}, translate={"x": x, "y": radius, "z": z})
-        balls.append(plugin("shape", "sphere", placed, metal((3.0, 8.0, 16.0)[i], f"ball_{i}"), radius=radius))
+    places = ((-1.7, 0.4, 0.8, 3.0), (0.25, -0.6, 0.8, 8.0), (1.9, 0.9, 0.6, 16.0))
+    balls = [ball(x, z, radius, metal(repeats, f"ball_{i}")) for i, (x, z, radius, repeats) in enumerate(places)]
     content += [
-        "A sun, and a sky that is found by scattering alone", sun, sky,
-        "The plate", metal(REPEATS, "plate"), lying(PLATE, PLATE, element("ref", id="plate")),
+        "A sun, and a sky that is found by scattering alone", sun(-0.55, -0.6, 0.35, (3.2, 3.0, 2.7)), sky,
+        "The plate", metal(REPEATS, "plate"), lying(PLATE, PLATE, ref("plate")),
         "Balls, on which the maps are repeated 3, 8 and 16 times", *balls,
     ]  # fmt: skip
     write(FOLDER / "rust.xml", ABOUT, content)

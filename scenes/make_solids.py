@@ -6,7 +6,20 @@
 from pathlib import Path
 
 import mitsuba as mi
-from scene_xml import element, environment, head, lying, plugin, softbox, transform, write
+from scene_xml import (
+    Whole,
+    environment,
+    head,
+    lying,
+    place,
+    plugin,
+    principled,
+    ref,
+    softbox,
+    transform,
+    turn,
+    write,
+)  # fmt: skip
 
 ABOUT = """Signed distance fields beside and in the place of meshes: Suzanne as a mesh (left) and as a field (right, the
 same clay), a knot of gold that casts a shadow on the latter, one behind a pane of glass, one of glass. Written by
@@ -17,21 +30,6 @@ make_solids.py: change that file.
 FOLDER = Path(__file__).resolve().parent
 
 
-def ref(name: str):
-    """Return a material by its name."""
-    return element("ref", id=name)
-
-
-def place(x: float, y: float, z: float) -> dict:
-    """Where something is moved to."""
-    return {"x": x, "y": y, "z": z}
-
-
-def turn(axis: str, angle: float) -> dict:
-    """Return a rotation around an axis, in degrees."""
-    return {axis: 1, "angle": angle}
-
-
 def solid(file: str, *children, **steps):
     """Return a signed distance field."""
     return plugin("shape", "neural_sdf", transform(**steps), *children, filename=f"assets/{file}.npz", trace="$trace")
@@ -40,22 +38,21 @@ def solid(file: str, *children, **steps):
 def main() -> None:
     """Write the files."""
     mi.set_variant("scalar_rgb")
-    camera = {"origin": (0.3, 3.1, 8.2), "target": (0.05, 0.85, 0), "up": (0, 1, 0)}
-    content = head(960, 540, {"trace": "arrays", "integrator": "path_sdf"}, fov=40.0, camera=camera)
-    integrator = next(item for item in content if item.tag == "integrator")
-    integrator.set("type", "$integrator")
-    clay = plugin("bsdf", "principled", id="clay", base_color=(0.62, 0.31, 0.2), roughness=0.6, specular=0.4)
+    tracer = plugin("integrator", "$integrator", max_depth=Whole("$max_depth"))
+    camera = (0.3, 3.1, 8.2), (0.05, 0.85, 0)
+    content = head(960, 540, {"trace": "arrays", "integrator": "path_sdf"}, 40.0, camera, tracer)
+    clay = principled(id="clay", base_color=(0.62, 0.31, 0.2), roughness=0.6, specular=0.4)
     gold = plugin("bsdf", "roughconductor", id="gold", material="Au", alpha=0.12)
     glass = plugin("bsdf", "dielectric", id="glass", int_ior=1.5)
-    blue = plugin("bsdf", "principled", id="blue", base_color=(0.08, 0.2, 0.5), roughness=0.25)
+    blue = principled(id="blue", base_color=(0.08, 0.2, 0.5), roughness=0.25)
     floor = plugin("bsdf", "diffuse", reflectance=(0.55, 0.53, 0.5))
     pane = plugin("shape", "cube", transform(
         scale={"x": 0.55, "y": 0.7, "z": 0.02}, rotate=turn("y", -12), translate=place(2.05, 0.7, 0.75),
-    ), element("ref", id="glass"))  # fmt: skip
+    ), ref("glass"))  # fmt: skip
     content += [
         "A room by day, and a softbox from the right",
         environment("interior.exr", 0.35, 60.0),
-        softbox((0.6, 0.6), {"origin": (5.5, 6.0, 4.0), "target": (0.6, 0.6, 0), "up": (0, 1, 0)}, (60.0, 54.0, 47.0)),
+        softbox((0.6, 0.6), (5.5, 6.0, 4.0), (0.6, 0.6, 0), (60.0, 54.0, 47.0)),
         "What things are made of", clay, gold, glass, blue,
         "The floor", lying(12, 12, floor),
         "Suzanne, a mesh and a field",

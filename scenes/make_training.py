@@ -5,7 +5,7 @@ Each scene shows one compressed material (``neural_material``), minified, under 
 
 from pathlib import Path
 
-from scene_xml import element, environment, head, lying, plugin, transform, write
+from scene_xml import ball, element, environment, head, lying, plugin, repeated, sun, transform, write
 
 ABOUT = """{}, for measurements of training inside a scene ("mi-diffind tradeoff scene-training"). Written by
 make_training.py: change that file. "-D material=FILE.npz" takes another file."""
@@ -15,28 +15,18 @@ FOLDER = Path(__file__).resolve().parent
 
 def material(repeats: float, **parameters):
     """Return the material, its maps repeated the given number of times."""
-    scale = transform("to_uv", scale={"x": repeats, "y": repeats})
-    return plugin("bsdf", "neural_material", scale, filename="assets/$material", storage="uint8",
+    return plugin("bsdf", "neural_material", repeated(repeats), filename="assets/$material", storage="uint8",
                   filter="anisotropic", **parameters)  # fmt: skip
 
 
-def ball(x: float, z: float, radius: float, bsdf):
-    """Return a ball on the floor."""
-    placed = transform(rotate={"x": 1, "angle": -90}, translate={"x": x, "y": radius, "z": z})
-    return plugin("shape", "sphere", placed, bsdf, radius=radius)
-
-
-def sun(x: float, y: float, z: float, irradiance: float):
+def warm_sun(x: float, y: float, z: float, irradiance: float):
     """Return a directional light of a warm colour."""
-    direction = element("vector", name="direction", x=x, y=y, z=z)
-    return plugin("emitter", "directional", direction, irradiance=(irradiance, 0.94 * irradiance, 0.85 * irradiance))
+    return sun(x, y, z, (irradiance, 0.94 * irradiance, 0.85 * irradiance))
 
 
 def save(name: str, what: str, file: str, fov: float, camera: tuple, content: list) -> None:
     """Write one scene; ``camera`` is its place and its target."""
-    origin, target = camera
-    lookat = {"origin": origin, "target": target, "up": (0, 1, 0)}
-    start = head(96, 54, {"material": file}, fov=fov, camera=lookat)
+    start = head(96, 54, {"material": file}, fov, camera)
     write(FOLDER / f"training_{name}.xml", ABOUT.format(what), [*start, *content])
 
 
@@ -47,7 +37,7 @@ def main() -> None:
     balls = [ball(x, z, radius, material(repeats)) for x, z, radius, repeats in places]
     plate = [lying(5, 5, material(24.0)), *balls]
     save("balls", "The plate and balls of rust.xml in one plugin a material", "rust_plain.npz", 36.0,
-         ((0, 4.2, 7.5), (0, 0.35, 0.2)), [sun(-0.55, -0.6, 0.35, 3.2), sky, *plate])  # fmt: skip
+         ((0, 4.2, 7.5), (0, 0.35, 0.2)), [warm_sun(-0.55, -0.6, 0.35, 3.2), sky, *plate])  # fmt: skip
 
     white = plugin("bsdf", "diffuse", reflectance=(0.7, 0.68, 0.64))
     floor = [environment("interior.exr", 0.9, 20), lying(6, 6, material(10.0, ignore="ao")),

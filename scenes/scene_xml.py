@@ -1,4 +1,4 @@
-"""Writing scene files for people to read: what ``make_materials.py``, ``make_metals.py`` and ``make_horizon.py`` share.
+"""Scene files for people to read: elements that the scripts beside share, and how they are written.
 
 Mitsuba's own writer (``mi.parser.write_file``, of a parsed dictionary) is made for converting scenes, and loses what
 these files are for: it knows no ``<default>`` but the width of the film, writes no comments, turns a ``lookat`` into
@@ -59,42 +59,90 @@ def transform(name: str = "to_world", **steps: dict) -> ET.Element:
     return element("transform", *(element(step, **attributes) for step, attributes in steps.items()), name=name)
 
 
-def head(width: int, height: int, learned: dict[str, str], fov: float, camera: dict) -> list[ET.Element]:
-    """Return the first elements of a scene: ``<default>`` values (and ``learned`` ones), path tracer, camera, film."""
+def head(
+    width: int, height: int, learned: dict[str, str], fov: float, camera: tuple, integrator: ET.Element | None = None
+) -> list[ET.Element]:
+    """Return the first elements of a scene: ``<default>`` values (and ``learned`` ones), integrator, camera, film.
+
+    ``camera`` is its place and its target; the ``integrator`` is by default a path tracer.
+    """
     defaults = {"spp": 64, "width": width, "height": height, "max_depth": 5, **learned}
     film = plugin(
-        "film",
-        "hdrfilm",
-        plugin("rfilter", "box"),
-        width=Whole("$width"),
-        height=Whole("$height"),
-        pixel_format="rgb",
-        component_format="float32",
-    )
+        "film", "hdrfilm", plugin("rfilter", "box"), width=Whole("$width"), height=Whole("$height"),
+        pixel_format="rgb", component_format="float32",
+    )  # fmt: skip
+    if integrator is None:
+        integrator = plugin("integrator", "path", max_depth=Whole("$max_depth"))
     sampler = plugin("sampler", "independent", sample_count=Whole("$spp"))
     return [
         *(element("default", name=name, value=value) for name, value in defaults.items()),
-        plugin("integrator", "path", max_depth=Whole("$max_depth")),
-        plugin("sensor", "perspective", transform(lookat=camera), sampler, film, fov_axis="x", fov=fov),
+        integrator,
+        plugin("sensor", "perspective", transform(lookat=look(*camera)), sampler, film, fov_axis="x", fov=fov),
     ]
+
+
+def look(origin: tuple, target: tuple = (0, 0, 0)) -> dict:
+    """Return the attributes of a ``lookat`` with y up."""
+    return {"origin": origin, "target": target, "up": (0, 1, 0)}
+
+
+def place(x: float, y: float, z: float) -> dict:
+    """Return the attributes of a translation."""
+    return {"x": x, "y": y, "z": z}
+
+
+def turn(axis: str, angle: float) -> dict:
+    """Return the attributes of a rotation around an axis, in degrees."""
+    return {axis: 1, "angle": angle}
+
+
+def repeated(u: float, v: float | None = None) -> ET.Element:
+    """Return the transform of a texture that is repeated so often along ``u`` and ``v`` (default: as along ``u``)."""
+    return transform("to_uv", scale={"x": u, "y": u if v is None else v})
+
+
+def ref(name: str) -> ET.Element:
+    """Return a material by its name."""
+    return element("ref", id=name)
+
+
+def principled(*children: ET.Element, **parameters) -> ET.Element:
+    """Return a principled BSDF."""
+    return plugin("bsdf", "principled", *children, **parameters)
+
+
+def mesh(file: str, material: ET.Element, id: str = "", **steps) -> ET.Element:
+    """Return a mesh of the assets."""
+    return plugin("shape", "ply", transform(**steps), material, id=id or file, filename=f"assets/{file}.ply")
+
+
+def ball(x: float, z: float, radius: float, bsdf: ET.Element) -> ET.Element:
+    """Return a ball on the floor, whose texture has its poles on top and below."""
+    placed = transform(rotate=turn("x", -90), translate=place(x, radius, z))
+    return plugin("shape", "sphere", placed, bsdf, radius=radius)
+
+
+def sun(x: float, y: float, z: float, irradiance: tuple) -> ET.Element:
+    """Return a directional light."""
+    return plugin("emitter", "directional", element("vector", name="direction", x=x, y=y, z=z), irradiance=irradiance)
 
 
 def environment(file: str, scale: float, angle: float) -> ET.Element:
     """Return a light probe, turned around y."""
-    turned = transform(rotate={"y": 1, "angle": angle})
+    turned = transform(rotate=turn("y", angle))
     return plugin("emitter", "envmap", turned, filename=f"assets/{file}", scale=scale)
 
 
-def softbox(size: tuple[float, float], lookat: dict, radiance: tuple[float, float, float]) -> ET.Element:
-    """Return a rectangle that emits light and reflects none."""
-    placed = transform(scale={"x": size[0], "y": size[1]}, lookat=lookat)
+def softbox(size: tuple[float, float], origin: tuple, target: tuple, radiance: tuple) -> ET.Element:
+    """Return a rectangle at ``origin``, turned to ``target``, that emits light and reflects none."""
+    placed = transform(scale={"x": size[0], "y": size[1]}, lookat=look(origin, target))
     black = plugin("bsdf", "diffuse", reflectance=(0, 0, 0))
     return plugin("shape", "rectangle", placed, black, plugin("emitter", "area", radiance=radiance))
 
 
 def lying(half_width: float, half_depth: float, *children: ET.Element, **translate) -> ET.Element:
     """Return a horizontal rectangle that faces up."""
-    steps = {"scale": {"x": half_width, "y": half_depth}, "rotate": {"x": 1, "angle": -90}}
+    steps = {"scale": {"x": half_width, "y": half_depth}, "rotate": turn("x", -90)}
     if translate:
         steps["translate"] = translate
     return plugin("shape", "rectangle", transform(**steps), *children)

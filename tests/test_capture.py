@@ -11,6 +11,11 @@ import pytest
 from PIL import Image
 
 from mi_diffind.commands import cli
+from mi_diffind.core.jobs import Outcome
+from mi_diffind.scenes import capture, loading
+from mi_diffind.scenes.capture import CaptureSettings
+from mi_diffind.scenes.poses import pose, upright_frame
+from mi_diffind.tasks.radiance.views import load_views
 
 SCENES = Path(__file__).resolve().parents[1] / "scenes"
 
@@ -70,8 +75,6 @@ def nearest(origin, direction):
 
 def test_images_show_what_rays_of_their_poses_meet(mi_rgb, scene, tmp_path, capsys):
     """Against spheres met by formulas: colours and alpha, from the files alone. Lights are hidden."""
-    from mi_diffind.tasks.radiance.views import load_views
-
     folder = tmp_path / "views"
     assert run(scene, folder) == 0
     assert "views: 6 of 6 views, 6 rendered now" in capsys.readouterr().out
@@ -94,8 +97,6 @@ def test_images_show_what_rays_of_their_poses_meet(mi_rgb, scene, tmp_path, caps
 
 
 def test_formats_agree(mi_rgb, scene, tmp_path):
-    from mi_diffind.tasks.radiance.views import load_views
-
     assert run(scene, tmp_path / "png") == run(scene, tmp_path / "exr", "--format", "exr") == 0
     png, exr = (load_views(tmp_path / name) for name in ("png", "exr"))
     assert exr.names[0] == "train/r_000.exr" and np.array_equal(png.poses, exr.poses)
@@ -142,9 +143,6 @@ def test_other_settings_are_refused(mi_rgb, scene, tmp_path, capsys):
 
 
 def test_an_interrupted_capture_is_gone_on_with(mi_rgb, scene, tmp_path, monkeypatch, capsys):
-    from mi_diffind.scenes import capture
-    from mi_diffind.tasks.radiance.views import load_views
-
     stop, render = threading.Event(), capture.CaptureCamera.render
 
     def third(self, *arguments):
@@ -175,9 +173,6 @@ def test_an_interrupted_capture_is_gone_on_with(mi_rgb, scene, tmp_path, monkeyp
 
 def test_views_of_other_processes(mi_rgb, scene, tmp_path, monkeypatch, capsys):
     """The same bytes, also of the lists; a view that fails ends the capture."""
-    from mi_diffind.core.jobs import Outcome
-    from mi_diffind.scenes import capture
-
     assert run(scene, tmp_path / "one", "-D", "red=0.5") == run(
         scene, tmp_path / "two", "-D", "red=0.5", "--workers", "1"
     )
@@ -194,8 +189,6 @@ def test_views_of_other_processes(mi_rgb, scene, tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize("integrator", ["direct", "prb"])
 def test_objects_alone_are_seen(mi_rgb, scene, tmp_path, capsys, integrator):
     """One of three, in the middle of the images, wholly, wherever the others stand; in their shadow."""
-    from mi_diffind.tasks.radiance.views import load_views
-
     wall = '<shape type="cube"><transform name="to_world"><scale x="0.1"/><translate x="1.5"/></transform></shape>'
     scene.write_text(scene.read_text().replace("</scene>", f"{wall}</scene>").replace("direct", integrator))
     options = ("--objects", "s1", "--views", "8", "--test", "0", "--resolution", "32", "--elevation", "-50", "60")
@@ -225,8 +218,6 @@ def test_objects_alone_are_seen(mi_rgb, scene, tmp_path, capsys, integrator):
 
 def test_meshes_of_one_material_keep_their_ids(mi_rgb, tmp_path):
     """Mitsuba makes one mesh of them, where it may."""
-    from mi_diffind.scenes import capture, loading
-
     path, cube = tmp_path / "cubes.xml", '<shape type="cube" id="{}"><ref id="grey"/><transform name="to_world">{}'
     cubes = [cube.format(name, f'<translate x="{x}"/></transform></shape>') for name, x in (("a", -2), ("b", 3))]
     path.write_text(f'<scene version="3.0.0"><bsdf type="diffuse" id="grey"/>{"".join(cubes)}</scene>')
@@ -240,8 +231,6 @@ def test_meshes_of_one_material_keep_their_ids(mi_rgb, tmp_path):
 
 def test_integrators_that_nest_another_leave_lights_to_it(mi_rgb, scene, tmp_path):
     """And further channels are none of the image's."""
-    from mi_diffind.tasks.radiance.views import load_views
-
     nested = '<integrator type="aov"><string name="aovs" value="d:depth"/><integrator type="direct"/></integrator>'
     other = tmp_path / "other.xml"
     other.write_text(scene.read_text().replace('<integrator type="direct"/>', nested))
@@ -252,8 +241,6 @@ def test_integrators_that_nest_another_leave_lights_to_it(mi_rgb, scene, tmp_pat
 
 def test_a_field_of_distances_is_captured_whole_only(mi_rgb, scene, tmp_path, capsys):
     """Its shape in the scene is a box, which the integrator alone knows what to do with."""
-    from mi_diffind.tasks.radiance.views import load_views
-
     knot = (
         f'<shape type="neural_sdf" id="knot"><string name="filename" value="{SCENES / "assets" / "knot.npz"}"/></shape>'
     )
@@ -281,10 +268,7 @@ def test_what_hides_nothing_is_said(mi_rgb, scene, tmp_path, capsys):
         (("--radius", "0"), "radius: found 0, allowed are numbers > 0"),
         (("--radius", "nan"), "radius: found nan, allowed are numbers > 0"),
         (("--fov", "180"), "fov: found 180, allowed are degrees between 0 and 170"),
-        (
-            ("--elevation", "30", "20"),
-            "elevation: found 30 to 20, allowed are degrees from −90 to 90, the lower first",
-        ),
+        (("--elevation", "30", "20"), "elevation: found 30 to 20, allowed are degrees from −90 to 90, the lower first"),
         (("--up", "0", "0", "0"), "up: found no direction"),
         (("--centre", "0", "inf", "0"), "centre: found NaN or infinity"),
     ],
@@ -306,8 +290,6 @@ def test_scenes_that_are_refused(mi_rgb, scene, tmp_path, capsys):
 @pytest.mark.parametrize("name", ["group", "thin", "glossy"])
 def test_scenes_that_ship_are_wholly_in_sight(mi_rgb, tmp_path, name):
     """From below, from the side and from above, from the distance that is taken by default."""
-    from mi_diffind.tasks.radiance.views import load_views
-
     options = ("--views", "3", "--test", "0", "--resolution", "40", "--spp", "4")
     assert cli.main(["capture", str(SCENES / f"capture_{name}.xml"), "-o", str(tmp_path / "views"), *options]) == 0
     content = json.loads((tmp_path / "views" / "transforms_train.json").read_text())
@@ -331,8 +313,6 @@ def angles(a, b):
 
 
 def test_views_on_a_sphere_are_even_and_test_views_between_them(mi_rgb):
-    from mi_diffind.scenes.capture import CaptureSettings
-
     train, test = CaptureSettings(seed=1).directions()
     assert train.shape == (60, 3) and test.shape == (20, 3)
     assert np.allclose(np.linalg.norm(train, axis=1), 1)
@@ -348,8 +328,6 @@ def test_views_on_a_sphere_are_even_and_test_views_between_them(mi_rgb):
 
 
 def test_an_orbit_closes_and_swings(mi_rgb):
-    from mi_diffind.scenes.capture import CaptureSettings
-
     train, test = CaptureSettings(path="orbit", views=12, test=6, elevation=(0.0, 60.0)).directions()
     azimuth = np.degrees(np.arctan2(train[:, 1], train[:, 0])) % 360
     assert np.allclose(azimuth, np.arange(12) * 30)
@@ -362,9 +340,7 @@ def test_an_orbit_closes_and_swings(mi_rgb):
 
 @pytest.mark.parametrize("up", [(0, 1, 0), (0, 0, 2), (1, 1, -1)])
 def test_poses_are_rigid_and_upright(mi_rgb, up):
-    from mi_diffind.scenes.poses import frame_of, pose
-
-    frame = frame_of(up)
+    frame = upright_frame(up)
     axis = np.array(up) / np.linalg.norm(up)
     assert np.allclose(frame.T @ frame, np.eye(3)) and np.allclose(frame[:, 2], axis)
     target = np.array([0.2, -1, 3])

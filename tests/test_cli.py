@@ -325,16 +325,6 @@ def test_tradeoff_of_a_scene(tmp_path, capsys):
     assert found["settings"]["quick"] and not found["interrupted"]
 
 
-def test_tradeoff_of_a_scene_is_interrupted(tmp_path, capsys, monkeypatch, mi_rgb):
-    from mi_diffind.studies import scene
-
-    monkeypatch.setattr(scene, "measure", lambda *arguments: {"interrupted": True})
-    monkeypatch.setattr(scene, "write", lambda result, folder: {"csv": f"{folder}/a.csv", "json": f"{folder}/a.json"})
-    monkeypatch.setattr(scene, "summary", lambda result: ["first", "second"])
-    assert main(["tradeoff", "scene", scene_file(tmp_path), "--out", str(tmp_path)]) == 130
-    assert capsys.readouterr().out == f"first\nsecond\n\nwritten     {tmp_path}/a.csv, {tmp_path}/a.json\n"
-
-
 # -- bad input ---------------------------------------------------------------------------------------------------------
 
 

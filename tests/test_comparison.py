@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import mi_diffind
 from mi_diffind.images import metrics
-from mi_diffind.scenes import comparison
+from mi_diffind.scenes import comparison, loading
 
 ASSETS = Path(__file__).resolve().parents[1] / "scenes" / "assets"
 
@@ -74,9 +75,6 @@ TEXTURED = """
 
 def test_a_filtered_texture_has_two_truths(mi_rgb, tmp_path):
     """The mip map at equal samples and the bitmap at eight times as many; other learned plugins are exact in both."""
-    import mi_diffind
-    from mi_diffind.scenes import loading
-
     path = tmp_path / "scene.xml"
     path.write_text(TEXTURED.replace("FILE", str(ASSETS / "tiles_filtered.npz")))
     first = comparison.compare(path, spp=8, passes=2, progress=False)

@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 import trimesh
 
+import mi_diffind
+from mi_diffind.commands.cli import main
 from mi_diffind.core.errors import UsageError
-from mi_diffind.plugins.support import sdf_meshes
-from mi_diffind.plugins.support.stock import Kept
+from mi_diffind.plugins.support import distance_shapes
+from mi_diffind.plugins.support.properties import Kept
 from mi_diffind.scenes import comparison, conversion, loading
 from mi_diffind.tasks.sdf.mesh import MeshError, load_mesh, read_serialized
 
@@ -208,9 +210,6 @@ def test_albedos_at_grazing_angles_of_what_is_replaced(mi_rgb, folder, metal, sp
 
 
 def test_the_command_and_a_comparison_with_the_stock_scene(mi_rgb, tmp_path, capsys):
-    import mi_diffind
-    from mi_diffind.commands.cli import main
-
     materials = '<bsdf type="principled" id="Clay"/><bsdf type="principled" id="Glass"><float name="spec_trans" '
     ball = 'value="1"/></bsdf><shape type="sphere"><ref id="Clay"/></shape>'
     parsed(tmp_path, materials + ball)
@@ -301,10 +300,10 @@ def test_windings_and_mirrorings(mi_rgb, tmp_path, wound):
             )
             inwards = np.mean(np.sum(np.array(si.n) * np.array(si.p), axis=0) < 0)
             if inwards < 0.005:
-                sdf_meshes.check_normals(props, tmp_path / "ball.ply")
+                distance_shapes.check_normals(props, tmp_path / "ball.ply")
                 continue
             with pytest.raises(Kept, match="is wound inside out") as kept:
-                sdf_meshes.check_normals(props, tmp_path / "ball.ply")
+                distance_shapes.check_normals(props, tmp_path / "ball.ply")
             assert abs(int(re.search(r"(\d+)%", str(kept.value))[1]) / 100 - inwards) < 0.03
 
 
@@ -322,9 +321,9 @@ def test_shading_normals(mi_rgb, tmp_path):
         props["filename"] = str(tmp_path / name)
         if angle is not None:
             with pytest.raises(Kept, match=f"has shading normals {angle}° from those of its triangles"):
-                sdf_meshes.check_normals(props, tmp_path / name)
+                distance_shapes.check_normals(props, tmp_path / name)
             props["face_normals"] = True
-        lost = sdf_meshes.check_normals(props, tmp_path / name)
+        lost = distance_shapes.check_normals(props, tmp_path / name)
         assert lost == pytest.approx(2.54 if name == "fine.ply" else 0, abs=0.02)
 
 
@@ -391,5 +390,5 @@ def test_shapes_of_a_scene(mi_rgb, tmp_path):
     assert load_mesh(path).components == 2 and load_mesh(path).scale == pytest.approx(7)
     with pytest.raises(MeshError, match='holds no mesh "round", found "ball", "box"'):
         load_mesh(f"{path}#round")
-    written = sdf_meshes._as_ply(tmp_path / "scene.xml#box", (0,))
+    written = distance_shapes._as_ply(tmp_path / "scene.xml#box", (0,))
     assert load_mesh(written).digest == load_mesh(f"{path}#box").digest

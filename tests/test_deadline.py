@@ -152,7 +152,7 @@ def started(task, **options):
 def capture(**options):
     from mi_diffind.scenes.capture import CaptureSettings
 
-    CaptureSettings(**options).check()
+    CaptureSettings(**options)
 
 
 def image(nbytes):

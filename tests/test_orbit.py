@@ -11,6 +11,9 @@ from film_files import decoded, needs_ffmpeg
 from PIL import Image
 
 from mi_diffind.commands import cli
+from mi_diffind.images import films
+from mi_diffind.scenes import loading, rendering
+from mi_diffind.scenes.poses import orbit_directions, pose, rotation
 
 SCENE = """
 <scene version="3.0.0">
@@ -44,8 +47,6 @@ def place_of(image, channel):
 
 def test_the_camera_goes_around(mi_rgb, path):
     """Two spheres about the axis: after half a turn, the far one is the near one; a quarter shows both."""
-    from mi_diffind.scenes import loading, rendering
-
     scene = loading.load(path)
     assert rendering.middle(scene) == pytest.approx([1, 0, 2])  # the light is none of it
     frames = rendering.render(scene, orbit=4, progress=False).frames
@@ -63,8 +64,6 @@ def test_the_camera_goes_around(mi_rgb, path):
 
 def test_random_numbers_of_frames(mi_rgb, path):
     """Frames of one view have the same noise, or that of the seeds that follow each other."""
-    from mi_diffind.scenes import loading, rendering
-
     scene, still = loading.load(path), [np.eye(4)] * 2
     same, new = (rendering.along(scene, still, 4, 7, new_seeds=new_seeds) for new_seeds in (False, True))
     assert np.array_equal(same[0], same[1]) and np.array_equal(same[0], new[0])
@@ -74,8 +73,6 @@ def test_random_numbers_of_frames(mi_rgb, path):
 @pytest.mark.parametrize(("views", "test"), [(8, 3), (5, 5), (4, 1)])
 def test_views_that_are_held_out_lie_between_the_others(views, test):
     """Halfway in azimuth between two neighbours, and as many steps of the orbit from each other, to one."""
-    from mi_diffind.scenes.poses import orbit_directions
-
     trained, held_out = orbit_directions(views, test, 0.1, 0.7)
     steps = np.degrees(np.arctan2(held_out[:, 1], held_out[:, 0])) % 360 / (360 / views)
     np.testing.assert_allclose(steps % 1, 0.5, atol=1e-9)
@@ -89,8 +86,6 @@ def test_views_that_are_held_out_lie_between_the_others(views, test):
 @pytest.mark.parametrize("aside", [0, 3e-7, 1e-3])
 def test_cameras_that_look_straight_down(aside):
     """The pose is a rotation and looks at its target, also where the way up is next to the line of sight."""
-    from mi_diffind.scenes.poses import pose
-
     origin = np.array([aside, 0, 2])
     turn = pose(origin, np.zeros(3), (0, 0, 1))[:3, :3]
     np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
@@ -119,9 +114,6 @@ def test_films_and_strips(mi_rgb, path, tmp_path, capsys):
 @needs_ffmpeg
 def test_an_orbit_as_h264(mi_rgb, path, tmp_path, capsys):
     """The frames of the decoded film are those of the orbit, in front of black, and each is nearest to its own."""
-    from mi_diffind.images import films
-    from mi_diffind.scenes import rendering
-
     film = tmp_path / "film.mp4"
     options = ("--orbit", "4", "--spp", "64", "-o", str(film))
     path.write_text(SCENE.replace('name="width" value="32"', 'name="width" value="31"'))
@@ -143,8 +135,6 @@ def test_an_orbit_as_h264(mi_rgb, path, tmp_path, capsys):
 
 
 def test_an_interrupted_orbit_keeps_its_frames(mi_rgb, path, tmp_path, monkeypatch, capsys):
-    from mi_diffind.scenes import rendering
-
     stop = threading.Event()
     stop.set()
     monkeypatch.setattr(rendering, "interruptible", lambda: contextlib.nullcontext(stop))
@@ -166,8 +156,6 @@ def test_what_is_refused(mi_rgb, path, tmp_path, capsys):
 
 
 def test_h264_is_refused_before_frames_are_rendered(mi_rgb, path, tmp_path, monkeypatch, capsys):
-    from mi_diffind.scenes import rendering
-
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)  # as if it were not installed
     monkeypatch.setattr(rendering, "along", lambda *_, **__: pytest.fail("rendered"))
     assert cli.main(["render", str(path), "--orbit", "3", "-o", str(tmp_path / "film.mp4")]) == 2
@@ -176,8 +164,6 @@ def test_h264_is_refused_before_frames_are_rendered(mi_rgb, path, tmp_path, monk
 
 
 def test_a_rotation_leaves_its_axis_in_place():
-    from mi_diffind.scenes.poses import rotation
-
     matrix = rotation((0, 1, 0), 90, (1, 2, 3))
     assert matrix @ [1, 7, 3, 1] == pytest.approx([1, 7, 3, 1])
     assert matrix @ [1, 2, 5, 1] == pytest.approx([3, 2, 3, 1])  # z goes to x

@@ -14,6 +14,7 @@ from commands import refused
 from variants import set_variant
 
 from mi_diffind.commands.cli import main
+from mi_diffind.scenes import regression as regress
 
 TESTS = Path(__file__).resolve().parent
 SCENES = TESTS.parent / "scenes"
@@ -24,13 +25,6 @@ STORED = [
     ),
     TESTS / "lamp.xml",
 ]
-
-
-@pytest.fixture
-def regress(mi_rgb):
-    from mi_diffind.scenes import regression as regress
-
-    return regress
 
 
 def scene_file(tmp_path, name="scene", reflectance=0.5):
@@ -50,7 +44,7 @@ def scene_file(tmp_path, name="scene", reflectance=0.5):
 # -- passes ------------------------------------------------------------------------------------------------------------
 
 
-def test_passes_share_no_samples(regress, monkeypatch, tmp_path):
+def test_passes_share_no_samples(mi_rgb, monkeypatch, tmp_path):
     """Neither with each other nor with those of the other side, also where a pass takes several renders."""
     taken = []
 
@@ -70,7 +64,7 @@ def test_passes_share_no_samples(regress, monkeypatch, tmp_path):
         taken.clear()
 
 
-def test_samplers_that_round(regress, tmp_path, capsys):
+def test_samplers_that_round(mi_rgb, tmp_path, capsys):
     """What is rendered is said; a check has the samples of its reference, or is refused."""
     path, report = scene_file(tmp_path), tmp_path / "report.json"
     rounded = {"independent": 24, "stratified": 32, "multijitter": 24, "orthogonal": 32, "ldsampler": 32}
@@ -92,7 +86,7 @@ def test_samplers_that_round(regress, tmp_path, capsys):
 # -- the repository's scenes -------------------------------------------------------------------------------------------
 
 
-def test_passes_of_references_repeat_to_the_last_bit(regress):
+def test_passes_of_references_repeat_to_the_last_bit(mi_rgb):
     """Passes of 30 or 54 samples do not on several cores: threads share pixels, and add up in any order."""
     scene = regress.loading.load(TESTS / "lamp.xml")
     for spp in (32, 64):
@@ -101,19 +95,12 @@ def test_passes_of_references_repeat_to_the_last_bit(regress):
 
 #: What other variants of the same scenes show already, and what takes longest.
 SLOW = {
-    ("field", "llvm_ad_mono"),
-    ("field", "llvm_ad_spectral"),
-    ("horizon", "llvm_ad_mono"),
-    ("library", "llvm_ad_mono"),
-    ("library", "llvm_ad_spectral"),
-    ("materials", "llvm_ad_mono"),
-    ("rust", "llvm_ad_mono"),
-    ("rust", "llvm_ad_spectral"),
-    ("solids", "llvm_ad_mono"),
-    ("solids", "llvm_ad_spectral"),
-    ("still_life", "llvm_ad_spectral"),
-    ("still_life", "llvm_ad_mono"),
-    ("metals", "llvm_ad_mono"),
+    *((name, "llvm_ad_mono") for name in ("horizon", "materials", "metals")),
+    *(
+        (name, f"llvm_ad_{v}")
+        for name in ("field", "library", "rust", "solids", "still_life")
+        for v in ("mono", "spectral")
+    ),
 }
 
 
@@ -130,8 +117,6 @@ SLOW = {
 def test_scene_renders_as_its_reference(path, variant):
     """If a change is meant, render the references again: scenes/README.md says how."""
     set_variant(variant)
-    from mi_diffind.scenes import regression as regress
-
     result = regress.regress(path, progress=False).figures
     assert result["passed"], result
     assert result["reference_spp"] == 16 * result["spp"] and result["spp"] >= 128
@@ -150,7 +135,7 @@ def seen_from_the_camera(scene):
     return si, scene.emitters()[0].sample_direction(si, mi.Point2f(0.5))[0].d
 
 
-def test_a_broken_table_entry_is_caught(regress, tmp_path, capsys, monkeypatch):
+def test_a_broken_table_entry_is_caught(mi_rgb, tmp_path, capsys, monkeypatch):
     """Of a table of the paper's layout, the entry that matters most for the image is changed by 10%; no other."""
     original = regress.loading.ParsedScene.load
 
@@ -256,7 +241,7 @@ def test_every_scene_is_checked(tmp_path, capsys):
     assert len(os.listdir(tmp_path / "out")) == 5
 
 
-def test_an_update_that_does_not_end_changes_nothing(regress, tmp_path, capsys, monkeypatch):
+def test_an_update_that_does_not_end_changes_nothing(mi_rgb, tmp_path, capsys, monkeypatch):
     import OpenEXR
 
     path = scene_file(tmp_path)
@@ -294,7 +279,7 @@ def test_an_update_that_does_not_end_changes_nothing(regress, tmp_path, capsys, 
     assert json.loads(report.read_text())["scenes"][0]["passed"] is None
 
 
-def test_a_reference_that_would_fail_unchanged_is_refused(regress, rng, tmp_path, capsys, monkeypatch):
+def test_a_reference_that_would_fail_unchanged_is_refused(mi_rgb, rng, tmp_path, capsys, monkeypatch):
     """One of two checks has to pass: one of a hundred fails by chance."""
     path, fails = scene_file(tmp_path), 2
 
@@ -310,7 +295,7 @@ def test_a_reference_that_would_fail_unchanged_is_refused(regress, rng, tmp_path
     assert main(["regress", path, "--update", "--spp", "16"]) == 0
 
 
-def test_pixels_that_are_not_finite(regress, tmp_path, capsys, monkeypatch):
+def test_pixels_that_are_not_finite(mi_rgb, tmp_path, capsys, monkeypatch):
     """A reference with such pixels is refused, a check fails and counts them."""
     path, original, out = scene_file(tmp_path), regress.loading.render_pass, tmp_path / "out"
 
@@ -329,7 +314,7 @@ def test_pixels_that_are_not_finite(regress, tmp_path, capsys, monkeypatch):
     assert "2 pixel(s) are not finite, so this cannot be a reference" in message
 
 
-def test_an_interrupted_update_goes_on(regress, tmp_path, capsys, monkeypatch):
+def test_an_interrupted_update_goes_on(mi_rgb, tmp_path, capsys, monkeypatch):
     """From where it was: the bytes of the reference are those of one that was never interrupted."""
     path, report = scene_file(tmp_path), tmp_path / "report.json"
     update = ["regress", path, "--update", "--spp", "16", "--json", str(report), "--references"]
@@ -366,7 +351,7 @@ def test_an_interrupted_update_goes_on(regress, tmp_path, capsys, monkeypatch):
     assert main([*update, str(folder)]) == 0
 
 
-def test_references_serve_both_backends(regress, tmp_path, monkeypatch):
+def test_references_serve_both_backends(mi_rgb, tmp_path, monkeypatch):
     path = scene_file(tmp_path)
     regress.regress(path, update=True, spp=8, progress=False)
     stored = regress.read_reference(path)
@@ -380,7 +365,7 @@ def test_references_serve_both_backends(regress, tmp_path, monkeypatch):
 # -- bad input ---------------------------------------------------------------------------------------------------------
 
 
-def test_bad_references(regress, tmp_path, capsys):
+def test_bad_references(mi_rgb, tmp_path, capsys):
     path, other = scene_file(tmp_path), scene_file(tmp_path, "other")
     out = ["--out", str(tmp_path / "out")]
     assert "with --update to make it" in refused(capsys, "regress", path, *out)
@@ -410,7 +395,7 @@ def test_bad_references(regress, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-def test_references_of_earlier_versions(regress, tmp_path, capsys):
+def test_references_of_earlier_versions(mi_rgb, tmp_path, capsys):
     """They are refused, and give their settings to an update."""
     import OpenEXR
 

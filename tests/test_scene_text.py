@@ -194,14 +194,14 @@ def test_a_text_that_reads_differently_is_not_written(mi_rgb, folders, monkeypat
         '<shape type="cube" id="box"><transform name="to_world">'
         '<scale value="1000"/></transform><ref id="m"/></shape></scene>'
     )
-    right, before = conversion.edited_text, set(a.iterdir())
+    right, before = conversion.edit_text, set(a.iterdir())
 
     def wrong(*arguments):
         content = right(*arguments)
         assert content.count(damage[0]) == 1
         return content.replace(*damage)
 
-    monkeypatch.setattr(conversion, "edited_text", wrong)
+    monkeypatch.setattr(conversion, "edit_text", wrong)
     with pytest.raises(loading.SceneError, match=fault):
         conversion.convert(a / "scene.xml", a / "new.xml", learn=["principled"], check=False)
     assert set(a.iterdir()) == before
@@ -225,6 +225,8 @@ def test_the_example_scenes(mi_rgb, tmp_path):
     """Each of them, with nothing learned, in another folder: the same objects in Mitsuba's words, but for paths."""
     for source in sorted((Path(__file__).parents[1] / "scenes").glob("*.xml")):
         conversion.convert(source, tmp_path / source.name, learn=[])
-        states = [loading.ParsedScene(path).change(scene_text.with_paths) for path in (source, tmp_path / source.name)]
+        states = [
+            loading.ParsedScene(path).change(scene_text.absolute_paths) for path in (source, tmp_path / source.name)
+        ]
         lines = [re.sub(r"object_\d+", "", "\n".join(str(node.props) for node in state.nodes)) for state in states]
         assert lines[0] == lines[1] and lines[0].count("\n") > 20

@@ -27,7 +27,7 @@ from mi_diffind.maps.source import load_source
 from mi_diffind.plugins.support import footprint
 from mi_diffind.scenes import loading
 from mi_diffind.scenes.training import references
-from mi_diffind.scenes.training.fit import fit_scene, joined, limit
+from mi_diffind.scenes.training.fit import fit_scene, joint_problem, limit
 from mi_diffind.scenes.training.options import (
     SCENE_ARGUMENTS,
     SceneRecipe,
@@ -41,12 +41,12 @@ from mi_diffind.scenes.training.references import ReferenceRenders
 from mi_diffind.scenes.training.rig import Rig
 from mi_diffind.scenes.training.trained_scene import (
     TrainedScene,
-    budget_of,
-    recipe_of,
-    stored_textures,
+    load_textures,
+    texture_budget,
     texture_file,
     texture_files,
     texture_problem,
+    texture_recipe,
 )
 from mi_diffind.tasks.texture import PRESETS
 from mi_diffind.tasks.texture.arrays import PaperBudget, TextureBudget, parse_structure
@@ -121,29 +121,23 @@ def test_views_without_ranges_and_in_a_box():
 
 
 @pytest.mark.parametrize(
-    ("change", "match"),
+    ("options", "change", "match"),
     [
-        ({"count": 0}, "count of the views: found 0"), ({"elevation": (10, 95)}, r"elevation: found 10 to 95"),
-        ({"azimuth": (5, -5)}, "azimuth: found 5 to -5"), ({"distance": (0, 1)}, "distance: found 0 to 1"),
-        ({"origins": ((0, 0, 0), (1, 1, 1)), "azimuth": (0, 1)}, "origins"), ({"up": (0, 0, 0)}, "up: found 0"),
+        (ViewDistribution, {"count": 0}, "count of the views: found 0"),
+        (ViewDistribution, {"elevation": (10, 95)}, r"elevation: found 10 to 95"),
+        (ViewDistribution, {"azimuth": (5, -5)}, "azimuth: found 5 to -5"),
+        (ViewDistribution, {"distance": (0, 1)}, "distance: found 0 to 1"),
+        (ViewDistribution, {"origins": ((0, 0, 0), (1, 1, 1)), "azimuth": (0, 1)}, "origins"),
+        (ViewDistribution, {"up": (0, 0, 0)}, "up: found 0"),
+        (SceneRecipe, {"share": 1.5}, "share: found 1.5"), (SceneRecipe, {"spp": 0}, "spp: found 0"),
+        (SceneRecipe, {"samples": 0}, "samples: found 0"), (SceneRecipe, {"bound": -1.0}, "bound: found -1"),
+        (SceneRecipe, {"start": "there"}, 'start: found "there"'),
+        (SceneRecipe, {"exposure": float("nan")}, "exposure: found nan"),
     ],
 )  # fmt: skip
-def test_bad_views(change, match):
+def test_bad_options(options, change, match):
     with pytest.raises(UsageError, match=match):
-        ViewDistribution(**change)
-
-
-@pytest.mark.parametrize(
-    ("change", "match"),
-    [
-        ({"share": 1.5}, "share: found 1.5"), ({"spp": 0}, "spp: found 0"), ({"samples": 0}, "samples: found 0"),
-        ({"bound": -1.0}, "bound: found -1"),
-        ({"start": "there"}, 'start: found "there"'), ({"exposure": float("nan")}, "exposure: found nan"),
-    ],
-)  # fmt: skip
-def test_bad_recipes(change, match):
-    with pytest.raises(UsageError, match=match):
-        SceneRecipe(**change)
+        options(**change)
 
 
 def parsed(*words):
@@ -171,8 +165,8 @@ def test_arguments():
     ("words", "match"),
     [
         (("--azimuth", "1:2:3"), "'1:2:3', expected LOW:HIGH"), (("--up", "0,1"), "'0,1', expected X,Y,Z"),
-        (("--origins", "0,1,2"), "'0,1,2', expected two corners"), (("--bound", "0"), "'0', expected a positive"),
-        (("--distance", "nan"), "expected LOW:HIGH"), (("--bound", "much"), "'much', expected a positive"),
+        (("--origins", "0,1,2"), "'0,1,2', expected two corners"), (("--bound", "0"), "found '0', allowed are"),
+        (("--distance", "nan"), "expected LOW:HIGH"), (("--bound", "much"), "found 'much', allowed are"),
     ],
 )  # fmt: skip
 def test_bad_arguments(words, match, capsys):
@@ -395,20 +389,15 @@ def test_references_of_other_processes(path, tmp_path, passes):
     views = ORBIT.trained()[:3]
     alone = references_of(path, ORBIT, 10, pass_samples=FOUR).images(views)
     seeds = list(passes.seeds)
-    shared = references_of(path, ORBIT, 10, tmp_path, pass_samples=FOUR, workers=1)
-    np.testing.assert_array_equal(shared.images(views), alone)
-    assert (shared.rendered, shared.reused) == (9, 0) and passes.seeds == seeds
-    again = references_of(path, ORBIT, 10, tmp_path, pass_samples=FOUR)
-    np.testing.assert_array_equal(again.images(views), alone)
-    assert (again.rendered, again.reused) == (0, 3)
+    for options, counts in (({"workers": 1}, (9, 0)), ({}, (0, 3))):
+        shared = references_of(path, ORBIT, 10, tmp_path, pass_samples=FOUR, **options)
+        np.testing.assert_array_equal(shared.images(views), alone)
+        assert (shared.rendered, shared.reused) == counts and passes.seeds == seeds
 
 
 def test_references_go_on_after_an_interruption(path, tmp_path, passes):
-    view, uninterrupted = (
-        ORBIT.trained()[0],
-        references_of(path, ORBIT, 10, pass_samples=FOUR),
-    )
-    expected = uninterrupted.images([view])[0]
+    view = ORBIT.trained()[0]
+    expected = references_of(path, ORBIT, 10, pass_samples=FOUR).images([view])[0]
     seeds = list(passes.seeds)
     kept = references_of(path, ORBIT, 10, tmp_path, pass_samples=FOUR)
     passes.stop = len(seeds) + 2
@@ -422,22 +411,15 @@ def test_references_go_on_after_an_interruption(path, tmp_path, passes):
     assert passes.seeds[-4:] == [seeds[0], seeds[1], seeds[1], seeds[2]]
 
 
-def test_references_are_the_exact_scene(path, passes):
-    """Against the scene rendered as it is written, in the view that it has."""
-    image = references_of(path, ViewDistribution(), 64).images([View()])[0]
-    expected = mi.render(loading.load(path, exact=True), spp=64, seed=9).numpy()
-    assert np.abs(image - expected).mean() < 0.05 * expected.mean() and not np.array_equal(image, expected)
-
-
-def test_only_colours_count(path):
-    """Of a film with transparency, too."""
+def test_references_are_the_exact_scene(path):
+    """Against the scene rendered as it is written, in the view that it has; of a transparent film the colours."""
     with_alpha = path.with_name("alpha.xml")
     with_alpha.write_text(path.read_text().replace('value="rgb"', 'value="rgba"'))
-    image, expected = (references_of(p, ViewDistribution(), 16).images([View()])[0] for p in (with_alpha, path))
-    assert image.shape == (24, 24, 3)
-    assert np.abs(image - expected).mean() < 0.1 * expected.mean()
-    assert loading.colour_channels(mi.TensorXf(np.zeros((2, 2, 4)))).shape == (2, 2, 3)
-    assert loading.colour_channels(np.zeros((2, 2, 2))).shape == (2, 2, 1)
+    expected = mi.render(loading.load(path, exact=True), spp=64, seed=9).numpy()
+    for file in (path, with_alpha):
+        image = references_of(file, ViewDistribution(), 64).images([View()])[0]
+        assert image.shape == (24, 24, 3) and not np.array_equal(image, expected)
+        assert np.abs(image - expected).mean() < 0.05 * expected.mean()
 
 
 def test_a_folder_for_references_that_cannot_be(path, tmp_path):
@@ -520,14 +502,8 @@ def test_a_scene_is_trained(folder, tmp_path, monkeypatch):
 
     def fitted_scene(**more):
         request = FitRequest("ours", recipe.settings, None, progress=False, output=tmp_path / "trained.npz", **more)
-        tables, result = fit_scene(
-            parsed,
-            ORBIT,
-            recipe,
-            request,
-            references=tmp_path / "kept",
-            preview=tmp_path / "preview.png",
-        )
+        files = {"references": tmp_path / "kept", "preview": tmp_path / "preview.png"}
+        tables, result = fit_scene(parsed, ORBIT, recipe, request, **files)
         return tables["material.npz"], result
 
     found, result = fitted_scene()
@@ -559,17 +535,16 @@ def test_a_scene_is_trained(folder, tmp_path, monkeypatch):
     save_table(tmp_path / "trained.npz", found)
     assert found.settings["source_path"] == "material.json" and found.task == "texture"
     assert found.measured["psnr_scene_db"] == pytest.approx(result.measured["psnr_db"], rel=1e-4)
-    assert recipe_of(load(tmp_path / "trained.npz")) == PRESETS["ours"]
-    assert {k: (a.shape, a.bits) for k, a in found.arrays.items()} == {
-        k: (a.shape, a.bits) for k, a in table.arrays.items()
-    }
+    assert texture_recipe(load(tmp_path / "trained.npz")) == PRESETS["ours"]
+    shapes, given = ({k: (a.shape, a.bits) for k, a in t.arrays.items()} for t in (found, table))
+    assert shapes == given
     # The scene that names it looks as was measured
     (tmp_path / "after.xml").write_text(scene.read_text().replace("material.npz", "trained.npz"))
     plain, view = loading.load(tmp_path / "after.xml"), ORBIT.measured()[0]
     own = {"without": (tmp_path / "material.npz",), "inputs": (found.settings["source"],)}
-    references = references_of(scene, ORBIT, 16, tmp_path / "kept", **own)
-    (truth,) = references.images([view])
-    assert references.reused == 1
+    kept = references_of(scene, ORBIT, 16, tmp_path / "kept", **own)
+    (truth,) = kept.images([view])
+    assert kept.reused == 1
     Rig(plain, ORBIT).place(view)
     warned = warnings_of(mi, monkeypatch)
     for spp in (4, 1, 4, None):
@@ -766,8 +741,8 @@ def test_gradients_of_several_files(pair, weights):
     images, gradients = {}, {}
     for b in ("a.npz", "b.npz"):
         parsed = loading.ParsedScene(pair, {"b": b})
-        textures = stored_textures(parsed)
-        problem = joined({t.file.name: t.problem for t in textures})
+        textures = load_textures(parsed)
+        problem = joint_problem({t.file.name: t.problem for t in textures})
         scene = TrainedScene(parsed, {t.file: t.table for t in textures}, ViewDistribution(), 1)
         images[b], gradients[b] = rendered(scene, inside(problem.net), weights, 1, 2)
     np.testing.assert_allclose(images["a.npz"], images["b.npz"], atol=1e-5)
@@ -884,8 +859,8 @@ def test_arrays_of_the_same_size(folder, preset, tmp_path):
     table = to_table(CompressedTexture(layout, stored_form(net)), {**own, "loss": "mae"})  # a render's
     save_table(tmp_path / "x.npz", table)
     table = load(tmp_path / "x.npz")
-    assert budget_of(table) == wanted
-    assert recipe_of(table) == recipe
+    assert texture_budget(table) == wanted
+    assert texture_recipe(table) == recipe
 
 
 def test_a_training_that_gains_nothing_keeps_its_start(folder, path):

@@ -7,7 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mi_diffind.commands import cli
 from mi_diffind.images import metrics
+from mi_diffind.scenes import comparison, loading
+from mi_diffind.tasks.disney.model import PARAMETERS
 
 SCENES = Path(__file__).resolve().parents[1] / "scenes"
 SMALL = {"width": 96, "height": 56}
@@ -16,8 +19,6 @@ SMALL = {"width": 96, "height": 56}
 @pytest.mark.parametrize("name", [pytest.param("materials", marks=pytest.mark.slow), "still_life"])
 def test_scene_as_written_and_exact(mi_rgb, name):
     """The bound on the approximation: 77.8 and 77.2 dB are reached, FLIP of 0.0010 and 0.0014."""
-    from mi_diffind.scenes import comparison
-
     result = comparison.compare(SCENES / f"{name}.xml", spp=32, passes=1, progress=False, defines=SMALL)
     assert np.isfinite(result.written).all() and result.written.min() >= 0
     assert result.written.std() > 0.05
@@ -46,8 +47,6 @@ UNNAMED = """
 
 
 def test_reports_have_the_parameters_of_their_own_node(mi_rgb, tmp_path):
-    from mi_diffind.scenes import loading
-
     path = tmp_path / "scene.xml"
     path.write_text(UNNAMED.replace("TILES", str(SCENES / "assets" / "tiles.npz")))
     found = loading.reports(loading.load(path))
@@ -84,8 +83,6 @@ PAIR = """
 @pytest.mark.parametrize("name", ["disney", "neural_disney"])
 def test_compare_against_principled(mi_rgb, tmp_path, name):
     """Another Fresnel term: a little darker than Mitsuba's model, in every parameter else the same."""
-    from mi_diffind.scenes import comparison
-
     path, given = tmp_path / "scene.xml", {"subsurface": 0.8, "clearcoat": 0.5, "eta": 1.4}
     parameters = "".join(f'<float name="{k}" value="{v}"/>' for k, v in given.items())
     parameters += '<string name="effects" value="all"/>'
@@ -121,8 +118,6 @@ def test_compare_against_principled(mi_rgb, tmp_path, name):
     ],
 )
 def test_what_cannot_be_compared(mi_rgb, tmp_path, plugin, parameters, against, sentence):
-    from mi_diffind.scenes import comparison, loading
-
     path = tmp_path / "scene.xml"
     path.write_text(PAIR.replace("PLUGIN", plugin).replace("PARAMETERS", parameters))
     with pytest.raises(loading.SceneError) as caught:
@@ -130,20 +125,7 @@ def test_what_cannot_be_compared(mi_rgb, tmp_path, plugin, parameters, against, 
     assert sentence in str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["materials", "still_life"])
-def test_exact_scene_names_no_learned_plugin(mi_rgb, name):
-    from mi_diffind.scenes import loading
-
-    exact = loading.load(SCENES / f"{name}.xml", exact=True, defines=SMALL)
-    assert "NeuralDisney" not in str(exact) and "Disney[" in str(exact)
-    written = loading.load(SCENES / f"{name}.xml", defines=SMALL)
-    assert "NeuralDisney" in str(written)
-
-
 def test_materials_cover_the_ten_parameters(mi_rgb):
-    from mi_diffind.scenes import loading
-    from mi_diffind.tasks.disney.model import PARAMETERS
-
     learned = loading.ParsedScene(SCENES / "materials.xml").learned_plugins()
     for name in PARAMETERS:
         row = [e["parameters"][name] for e in learned if e["id"].rpartition("_")[0] == name]
@@ -163,29 +145,16 @@ def test_scenes_are_what_their_scripts_write(tmp_path, name):
 
 
 def test_same_arguments_same_image(mi_rgb):
-    from mi_diffind.scenes import loading
-
+    """Passes of unequal size are weighed by their samples."""
     scene = loading.load(SCENES / "still_life.xml", defines=SMALL)
-    first, second = (loading.render(scene, 4, seed=5, passes=2)[0] for _ in range(2))
-    assert np.array_equal(first, second)
-    assert not np.array_equal(first, loading.render(scene, 4, seed=6, passes=2)[0])
-
-
-def test_passes_add_up_to_the_samples(mi_rgb):
-    """An average of passes of unequal size is the average of the samples."""
-    from mi_diffind.scenes import loading
-
-    scene = loading.load(SCENES / "still_life.xml", defines=SMALL)
+    first, second, other = (loading.render(scene, 4, seed=seed, passes=2)[0] for seed in (5, 5, 6))
+    assert np.array_equal(first, second) and not np.array_equal(first, other)
     image, seconds = loading.render(scene, 7, passes=3)
-    assert len(seconds) == 3
-    converged, _ = loading.render(scene, 64)
-    assert abs(image.mean() / converged.mean() - 1) < 0.1
+    assert len(seconds) == 3 and abs(image.mean() / loading.render(scene, 64)[0].mean() - 1) < 0.1
 
 
 def test_samples_that_a_sampler_adds_are_said(mi_rgb, tmp_path, capsys, monkeypatch):
     """By ``render`` and ``compare``: as many as Mitsuba takes."""
-    from mi_diffind.commands import cli
-
     text = (Path(__file__).parent / "lamp.xml").read_text().replace('type="independent"', 'type="multijitter"')
     (tmp_path / "a.xml").write_text(text)
     render, counts = mi_rgb.render, []
@@ -235,8 +204,6 @@ def test_metrics():
 
 def test_folders_of_a_scene_are_searched(mi_rgb, tmp_path):
     """``<path>`` counts when the scene is built, not only while it is parsed."""
-    from mi_diffind.scenes import loading
-
     (tmp_path / "common" / "textures").mkdir(parents=True)
     mi_rgb.Bitmap(np.full((2, 2, 3), 0.5, np.float32)).write(str(tmp_path / "common" / "textures" / "grey.exr"))
     (tmp_path / "scenes").mkdir()

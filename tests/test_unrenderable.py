@@ -7,8 +7,12 @@ from commands import refused
 from mi_diffind.commands.cli import main
 from mi_diffind.core import units
 from mi_diffind.core.errors import UsageError
+from mi_diffind.fitting.task import tasks
 from mi_diffind.images import metrics
 from mi_diffind.scenes import loading
+from mi_diffind.scenes.rendering import render
+from mi_diffind.scenes.viewer.page import status_lines
+from mi_diffind.scenes.viewer.session import Session
 
 PARTS = {
     "integrator": '<integrator type="path"><integer name="max_depth" value="2"/></integrator>',
@@ -86,8 +90,6 @@ def test_backslashes_in_names_of_files(tmp_path, mi_rgb, plugin):
 
 
 def test_scenes_in_memory(mi_rgb):
-    from mi_diffind.scenes.rendering import render
-
     scene = {"type": "scene", "sensor": {"type": "perspective"}, "shape": {"type": "sphere"}}
     with pytest.raises(loading.SceneError, match="scene: has no integrator"):
         render(scene, 1)
@@ -131,8 +133,6 @@ def nan_pixels(path, spp, seed=0):
 
 def test_render_counts_what_is_not_finite(tmp_path, capsys):
     path = scene_file(tmp_path, more=NAN)
-    from mi_diffind.scenes.rendering import render
-
     assert main(["render", str(path), "-o", str(tmp_path / "a.exr"), "--spp", "2"]) == 0
     count = nan_pixels(path, 2)
     assert 0 < count < 192
@@ -147,9 +147,6 @@ def test_compare_refuses_what_is_not_finite(tmp_path, capsys):
 
 
 def test_capture_and_viewer_count_what_is_not_finite(tmp_path, capsys):
-    from mi_diffind.scenes.viewer.page import status_lines
-    from mi_diffind.scenes.viewer.session import Session
-
     path = scene_file(tmp_path, more=NAN)
     views = ["--views", "2", "--test", "0", "--resolution", "8", "--spp", "16"]
     assert main(["capture", str(path), "-o", str(tmp_path / "views"), *views]) == 0
@@ -174,8 +171,6 @@ def test_no_error_of_what_is_not_finite(value, error):
 
 
 def test_inspect_refuses_measurements_that_are_no_numbers(monkeypatch, capsys):
-    from mi_diffind.fitting.task import tasks
-
     ggx = tasks()["ggx"]
     monkeypatch.setattr(ggx.model_class(), "measure", lambda self: {"mae": 0.1, "worst": np.nan, "psnr_db": np.inf})
     sentence = refused(capsys, "inspect", str(ggx.file()), "--measure")

@@ -15,8 +15,8 @@ from mi_diffind.core.errors import UsageError
 from mi_diffind.images import srgb
 from mi_diffind.scenes import loading
 from mi_diffind.scenes.viewer import passes
-from mi_diffind.scenes.viewer.page import Page, padded, server, status_lines, to_world
-from mi_diffind.scenes.viewer.session import Session, combined, rigid
+from mi_diffind.scenes.viewer.page import Page, pad, server, status_lines, to_world
+from mi_diffind.scenes.viewer.session import Session, combine, rigid
 
 ROOT = Path(__file__).resolve().parents[1]
 ASSETS = ROOT / "scenes" / "assets"
@@ -136,14 +136,14 @@ def test_an_oversampled_truth_has_more_samples_unless_the_camera_moves(mi_rgb):
 
 def test_divider_and_difference(rng):
     learned, exact = (rng.uniform(-0.2, 1.3, (5, 10, 3)).astype(np.float32) for _ in range(2))
-    shown = combined(learned, exact, "side by side", 0.4, 1.0)
+    shown = combine(learned, exact, "side by side", 0.4, 1.0)
     for side, columns in ((learned, slice(0, 4)), (exact, slice(5, None))):
         expected = 255 * srgb.from_linear(np.clip(side, 0, 1))
         assert np.abs(shown[:, columns] - expected[:, columns]).max() <= 0.5 + 1e-3
     assert (shown[:, 4] == 255).all()
     a, b = (np.minimum(np.maximum(side, 0), 1) for side in (learned, exact))
     difference = 255 * srgb.from_linear(np.minimum(3 * np.abs(a - b), 1))
-    assert np.abs(combined(learned, exact, "difference", 0.4, 3.0) - difference).max() <= 0.5 + 1e-3
+    assert np.abs(combine(learned, exact, "difference", 0.4, 3.0) - difference).max() <= 0.5 + 1e-3
 
 
 def test_parameters_are_numbers_and_colours(mi_rgb):
@@ -313,7 +313,7 @@ def test_pose_of_the_page():
 def test_bars_beside_a_picture(rng):
     picture = rng.integers(1, 255, (10, 20, 3)).astype(np.uint8)
     for aspect, shape in ((2.0, (10, 20)), (1.0, (20, 20)), (4.0, (10, 40)), (0.0, (10, 20))):
-        shown = padded(picture, aspect)
+        shown = pad(picture, aspect)
         assert shown.shape[:2] == shape and (shown > 0).sum() == picture.size
         np.testing.assert_array_equal(shown[(shown > 0).all(-1)], picture.reshape(-1, 3))
 

@@ -206,6 +206,13 @@ class SparseGrid:
         region, bit = np.nonzero(mask_flags(self.region_masks))
         return np.argwhere(self.regions == ACTIVE)[region] * REGION + place_of_bit(bit) * BLOCK
 
+    def empty_block_signs(self) -> np.ndarray:
+        """Return the signs of blocks without nodes at their places in the grid of blocks, bool (4 X, 4 Y, 4 Z)."""
+        signs = np.repeat((self.regions & 1).astype(bool)[..., None], 64, axis=-1)
+        signs[self.regions == ACTIVE] = mask_flags(self.region_signs)
+        signs = signs.reshape(*self.regions.shape, 4, 4, 4).transpose(0, 3, 1, 4, 2, 5)
+        return signs.reshape([4 * n for n in self.regions.shape])
+
     def node_positions(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the position of every stored node in the grid, ``(n, 3)``, and its block, ``(n,)``."""
         block, bit = np.nonzero(mask_flags(self.block_masks))

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 
 from . import compat
+from .compat import dr
 from .errors import UsageError
 
 #: Seconds between two lines where stderr is no terminal; shorter jobs say nothing.
@@ -142,8 +143,6 @@ def duration(work: Callable[[], object]) -> tuple[object, float]:
 
 def profiled(work: Callable[[], object]) -> tuple[object, float, list[dict]]:
     """Carry out ``work``; return the result and the seconds of :func:`duration`, and Dr.Jit's kernel history."""
-    import drjit as dr
-
     dr.sync_thread()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()

@@ -29,6 +29,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from . import compat, threads
+from .compat import dr, mi
 from .errors import UsageError
 
 ENV = "DRJIT_LIBLLVM_PATH"
@@ -289,9 +290,6 @@ def use_variant(name: str | None = None) -> str:
     ``None`` keeps the variant that is set; if none is set, it is the RGB variant of the GPU if there is one, else of
     the CPU. Raises :class:`.UsageError` if the variant cannot run here.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     default = "cuda_ad_rgb" if dr.has_backend(dr.JitBackend.CUDA) else "llvm_ad_rgb"
     name = name or mi.variant() or default
     if name == mi.variant():
@@ -310,8 +308,6 @@ def use_variant(name: str | None = None) -> str:
 
 
 def _require_gpu(variant: str) -> None:
-    import drjit as dr
-
     if not dr.has_backend(dr.JitBackend.CUDA):
         raise UsageError(f'the variant "{variant}" needs an NVIDIA GPU and its driver, and none was found')
 
@@ -322,8 +318,6 @@ def array_module(variant: str | None = None):
     It is ``drjit.llvm.ad`` or ``drjit.cuda.ad``, that of a Mitsuba ``variant``. ``None`` means the variant that is set
     if it is vectorised, else the GPU if there is one. Raises :class:`.UsageError` if that cannot run here.
     """
-    import drjit as dr
-
     if variant is None:
         active = ("mitsuba" in sys.modules and sys.modules["mitsuba"].variant()) or ""
         default = "cuda" if dr.has_backend(dr.JitBackend.CUDA) else "llvm"

@@ -14,6 +14,7 @@ import sys
 import threading
 
 from . import compat
+from .compat import dr
 
 #: Least number of threads of a process: with a single one, Mitsuba waits for ever for the content of an EXR file, which
 #: its library reads and writes on Dr.Jit's threads beside the calling one.
@@ -26,8 +27,6 @@ ONE_CORE = "MI_DIFFIND_ONE_CORE"
 @contextlib.contextmanager
 def threads_for_files():
     """Have at least :data:`LEAST_THREADS` in this context, which reads or writes pictures or loads a scene."""
-    import drjit as dr
-
     before = dr.thread_count()
     compat.use_threads(max(before, LEAST_THREADS))
     try:
@@ -42,8 +41,6 @@ def settle() -> None:
     Messages do not go through Python (:func:`log_beside_python`). Where the process has one core, Dr.Jit computes on
     :data:`LEAST_THREADS` all the same, and a sentence on standard error says so.
     """
-    import drjit as dr
-
     log_beside_python()
     if dr.thread_count() >= LEAST_THREADS:
         return
@@ -63,8 +60,6 @@ def log_beside_python() -> None:
     Dr.Jit logs with its lock held. In a thread that loads a scene it would then wait for Python, while the thread that
     runs Python waits for the lock. Without ``jit_set_log_level_stderr(LogLevel)``, messages stay as they are.
     """
-    import drjit as dr
-
     level = dr.log_level()
     if level == dr.LogLevel.Disable:  # already so
         return

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +14,12 @@ from ..arrays.tables import PAGES, Table, TableError, allocate_pages, page_sides
 from ..core.errors import UsageError
 from ..core.files import replacing
 from ..core.threads import threads_for_files
-from ..fitting.task import Model
+from ..fitting.loop import FitResult, Problem
+from ..fitting.task import FitRequest, Model
 from ..images import srgb
 from . import as_seen
 from .compressed import CompressedMaps, map_figure
-from .source import load_source
+from .source import Source, load_source
 
 
 def allocate_maps(
@@ -54,6 +55,41 @@ def stored_entries(table: Table, name: str, size: tuple[int, int]) -> int:
     if sides.max() > largest:
         raise TableError(f"{where} has a page of {sides.max()} entries along an axis, allowed are {largest}")
     return int(sides.prod(axis=2).sum())
+
+
+def fit_maps(
+    request: FitRequest,
+    source: Source,
+    problem: Problem | None,
+    stored: Callable[[], CompressedMaps],
+    to_table: Callable[[CompressedMaps, dict], Table],
+    read: Callable[[Table, type], CompressedMaps],
+    title: str | None = None,
+    **more,
+) -> tuple[Table, FitResult]:
+    """Train a ``problem`` of maps and return the table, with its errors, and the record of the training.
+
+    ``problem`` is ``None`` for maps of one colour each, which need no arrays. ``stored()`` returns the maps as they are
+    stored, ``to_table(maps, settings)`` their table, and ``read(table, dtype)`` reads it. ``more`` are further settings
+    of the table. Errors are those of :meth:`.CompressedMaps.measure`.
+    """
+
+    def errors(table: Table) -> dict[str, float]:
+        return read(table, request.types.TensorXf).measure(source)
+
+    if problem is None:
+        table, result = to_table(stored(), {"source": source.digest}), FitResult({}, 0, 0, 0.0, False, 0)
+    else:
+        result = request.train(problem, title, lambda: errors(to_table(stored(), problem.identity)))
+        table = to_table(stored(), {**request.recorded(result), **problem.identity, **more})
+    table.preset, table.seed = request.preset, request.settings.seed
+    table.measured = significant(errors(table))
+    return table, result
+
+
+def significant(figures: Mapping[str, float]) -> dict[str, float]:
+    """Return figures with five digits, as a table file holds them."""
+    return {name: float(f"{value:.5g}") for name, value in figures.items()}
 
 
 class MapsModel(Model):

@@ -274,15 +274,13 @@ def from_arrays(arrays: dict, color_spaces: dict[str, str] | None = None, nonfin
 
 def _load_manifest(path: Path, nonfinite: str) -> Source:
     """Read a manifest and its images. Raises :class:`SourceError`."""
+    data = _read_bytes(path)
     try:
-        data = _read_bytes(path)
         Allowance(path).check(json_bytes(data), "a manifest")
         content = json.loads(data.decode("utf-8-sig"), object_pairs_hook=_unique)
     except LimitError as e:
         raise SourceError(str(e)) from None
     except (ValueError, RecursionError) as e:
-        if isinstance(e, SourceError):
-            raise
         raise SourceError(f"{path}: is not valid JSON ({reason(e)})") from None
     entries = content["maps"] if isinstance(content, dict) and "maps" in content else content
     if not isinstance(entries, dict) or not entries:
@@ -293,34 +291,26 @@ def _load_manifest(path: Path, nonfinite: str) -> Source:
     maps, images = [], {}
     for name, entry in entries.items():
         _check_name(path, name)
-        if isinstance(entry, str):
-            entry = {"file": entry}
-        if not isinstance(entry, dict):
-            raise SourceError(f'{path}: map "{name}" is {entry!r:.40}, expected a file name or an object')
-        for key in entry:
-            if key not in ("file", "channels", "color_space"):
-                raise SourceError(
-                    f'{path}: map "{name}" has the key "{key}", allowed are "file", "channels" and "color_space"'
-                )
-        file = entry.get("file")
-        if not isinstance(file, str) or not file:
-            raise SourceError(f'{path}: map "{name}" has the file {file!r:.40}, expected a file name')
+        where = f'{path}: map "{name}"'
+        entry = {"file": entry} if isinstance(entry, str) else entry
+        known = isinstance(entry, dict) and entry.keys() <= {"file", "channels", "color_space"}
+        if not known or not isinstance(entry.get("file"), str) or not entry["file"]:
+            allowed = 'a file name, or an object with "file" and perhaps "channels" and "color_space"'
+            raise SourceError(f"{where} is {entry!r:.80}, expected {allowed}")
         color_space = entry.get("color_space")
         if color_space is not None and color_space not in COLOR_SPACES:
-            raise SourceError(
-                f'{path}: map "{name}" has the color space {color_space!r:.40}, allowed are {COLOR_SPACES}'
-            )
+            raise SourceError(f"{where} has the color space {color_space!r:.40}, allowed are {COLOR_SPACES}")
         try:
-            file = path_by_name(path.parent, file, path)
+            file = path_by_name(path.parent, entry["file"], path)
         except OutsideError as e:
             raise SourceError(str(e)) from None
         if file not in images:
             images[file] = _read(file)
         content_of_map = content_of(name)
         if "channels" in entry:
-            values = images[file].select(entry["channels"], f'{path}: map "{name}"')
+            values = images[file].select(entry["channels"], where)
         else:
-            values = images[file].opaque(f'{path}: map "{name}"')
+            values = images[file].opaque(where)
             content_of_map = content_of_map or content_of(file.stem)
             values = _one_of_equal(values, content_of_map.role if content_of_map else "")
         maps.append(_RawMap(name, values, content_of_map or _UNKNOWN, str(file), color_space))
@@ -346,6 +336,14 @@ class _ImageFile:
     has_alpha: bool
     named: bool  # grey or RGB, not the channels of a multi-channel EXR
     color_space: str | None = None  # if the image states it
+
+    @staticmethod
+    def of_pixels(values: np.ndarray, pixels, color_space: str | None = None) -> _ImageFile:
+        """Return the content of a ``mi.Bitmap`` of a pixel format."""
+        formats = type(pixels)
+        has_alpha = pixels in (formats.YA, formats.RGBA)
+        named = has_alpha or pixels in (formats.Y, formats.RGB)
+        return _ImageFile(values, values.shape[2] - has_alpha, has_alpha, named, color_space)
 
     def select(self, channels, where: str) -> np.ndarray:
         """Return the values of ``channels`` of a manifest; grey is red, green and blue at once."""
@@ -408,10 +406,7 @@ def _read(path: Path) -> _ImageFile:
     values = values.reshape(*values.shape[:2], -1)
     if values.shape[2] > MAX_CHANNELS:
         raise SourceError(f"{path}: has {values.shape[2]} channels, at most {MAX_CHANNELS} are supported")
-    formats = mi.Bitmap.PixelFormat
-    has_alpha = pixels in (formats.YA, formats.RGBA)
-    named = has_alpha or pixels in (formats.Y, formats.RGB)
-    return _ImageFile(values, values.shape[2] - has_alpha, has_alpha, named)
+    return _ImageFile.of_pixels(values, pixels)
 
 
 def _in_memory(array, where: str) -> _ImageFile:
@@ -425,13 +420,9 @@ def _in_memory(array, where: str) -> _ImageFile:
     values = values.reshape(*values.shape[:2], -1)
     if pixels is None:
         return _ImageFile(values, values.shape[2], False, values.shape[2] in (1, 3))
-    formats = type(pixels)
-    has_alpha = pixels in (formats.YA, formats.RGBA)
-    color_space = "linear"
-    if array.srgb_gamma() and values.dtype.name in _ENCODED:
-        color_space = None  # bitmaps of 8 bits are sRGB unless somebody says otherwise: the map's name decides
-    named = has_alpha or pixels in (formats.Y, formats.RGB)
-    return _ImageFile(values, values.shape[2] - has_alpha, has_alpha, named, color_space)
+    # Bitmaps of 8 bits are sRGB unless somebody says otherwise: the map's name decides
+    encoded = array.srgb_gamma() and values.dtype.name in _ENCODED
+    return _ImageFile.of_pixels(values, pixels, None if encoded else "linear")
 
 
 def _read_bytes(path: Path) -> bytes:
@@ -617,9 +608,7 @@ def _check_finite(values: np.ndarray, where: str, nonfinite: str) -> int:
 def _check_name(where, name) -> None:
     """Raise :class:`SourceError` for a name of a map that is no identifier."""
     if not isinstance(name, str) or not name.isidentifier():
-        raise SourceError(
-            f"{where}: a map is called {name!r:.40}, allowed are letters, digits and _ (not first a digit)"
-        )
+        raise SourceError(f"{where}: a map is called {name!r:.40}, allowed are letters, digits and _ (no digit first)")
 
 
 def _check_nonfinite(nonfinite: str) -> None:

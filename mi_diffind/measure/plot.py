@@ -341,7 +341,7 @@ def draw_images(
             axes.set(xticks=[], yticks=[])
             drawn += [axes] if colours else []
         if drawn:
-            bar = plot.colorbar(shown, ax=drawn, shrink=0.8, pad=0.01, extend="max")
+            bar = plot.colorbar(shown, cax=drawn[-1].inset_axes([1.04, 0.1, 0.05, 0.8]), extend="max")
             bar.set_label(unit, fontsize=7.5)
             bar.ax.tick_params(labelsize=6.5)
     return plot

@@ -36,7 +36,7 @@ from ..core.units import check_memory, check_samples
 from ..images import srgb
 from ..plugins.support import footprint
 from . import loading, splats
-from .poses import frame_of, orbit_directions, pose, sphere_directions
+from .poses import orbit_directions, pose, sphere_directions, upright_frame
 from .splats import is_splats
 
 #: Samples of the whole image in one pass.
@@ -82,7 +82,8 @@ class CaptureSettings:
     the image). ``path``: "sphere", all over it, or "orbit", once around the axis ``up``. ``elevation``: the lowest and
     the highest, degrees above the plane normal to ``up``; an orbit swings between them (default: −90, 90 for a sphere,
     20, 20 for an orbit). ``format``: "png", as displayed, 8 bits, or "exr", linear half floats. ``box``: of 3D
-    Gaussians, the lower and the upper corner of what is captured (default: :meth:`.splats.Splats.cropped`).
+    Gaussians, the lower and the upper corner of what is captured (default: :meth:`.splats.Splats.cropped`). Other
+    values raise :class:`.UsageError`.
     """
 
     views: int = 60
@@ -100,31 +101,30 @@ class CaptureSettings:
     format: str = "png"
     box: tuple[float, ...] | None = None
 
-    def check(self) -> None:
-        """Raise ``ValueError`` for values that are not allowed."""
+    def __post_init__(self):
         if self.path not in PATHS:
-            raise ValueError(f'path: found "{self.path}", allowed are {", ".join(PATHS)}')
+            raise UsageError(f'path: found "{self.path}", allowed are {", ".join(PATHS)}')
         if self.format not in FORMATS:
-            raise ValueError(f'format: found "{self.format}", allowed are {", ".join(FORMATS)}')
+            raise UsageError(f'format: found "{self.format}", allowed are {", ".join(FORMATS)}')
         for name, least in (("views", 1), ("test", 0), ("resolution", 1), ("spp", 1)):
             if getattr(self, name) < least:
-                raise ValueError(f"{name}: found {getattr(self, name)}, allowed are whole numbers ≥ {least}")
+                raise UsageError(f"{name}: found {getattr(self, name)}, allowed are whole numbers ≥ {least}")
         check_samples(self.spp)
         check_memory("resolution", self.resolution, SAMPLE_BYTES * self.resolution**2)
         check_memory("views", self.views + self.test, VIEW_BYTES * (self.views + self.test))
         if not 0 < self.fov < 170:
-            raise ValueError(f"fov: found {self.fov:g}, allowed are degrees between 0 and 170")
+            raise UsageError(f"fov: found {self.fov:g}, allowed are degrees between 0 and 170")
         if self.radius is not None and not 0 < self.radius < math.inf:
-            raise ValueError(f"radius: found {self.radius:g}, allowed are numbers > 0")
+            raise UsageError(f"radius: found {self.radius:g}, allowed are numbers > 0")
         if self.centre is not None and not np.isfinite(self.centre).all():
-            raise ValueError("centre: found NaN or infinity, allowed are numbers")
+            raise UsageError("centre: found NaN or infinity, allowed are numbers")
         if not np.isfinite(self.up).all() or not np.any(self.up):
-            raise ValueError("up: found no direction, allowed are three numbers that are not all 0")
+            raise UsageError("up: found no direction, allowed are three numbers that are not all 0")
         if self.box is not None and not (len(self.box) == 6 and np.less(self.box[:3], self.box[3:]).all()):
-            raise ValueError("box: found no box, allowed are six numbers, those of the lower corner first")
+            raise UsageError("box: found no box, allowed are six numbers, those of the lower corner first")
         low, high = self.elevations
         if not -90 <= low <= high <= 90:
-            raise ValueError(
+            raise UsageError(
                 f"elevation: found {low:g} to {high:g}, allowed are degrees from −90 to 90, the lower first"
             )
 
@@ -214,14 +214,13 @@ def capture(
     """Render the views of a ``scene`` into ``folder``, in the variant that is set.
 
     The scene is a file or a dictionary as of ``mi.load_dict``; of a loaded scene, lights could not be hidden. It may
-    also be a file of 3D Gaussians (:mod:`.splats`), of which ``box`` crops a part.
-    ``given`` are fields of :class:`CaptureSettings`, the options of ``mi-diffind capture`` as keywords: ``views=60``,
-    ``resolution=160``, ``path="orbit"``, …; ``defines`` replace the file's ``<default>`` parameters; ``workers``
-    processes share the views, or those of the Dask cluster ``scheduler``. The folder is created if its parent exists.
-    Views of an earlier capture with the same settings of the same scene are kept, unless a dictionary holds objects
-    that exist already; after Ctrl-C the current view is the last. Raises :class:`.UsageError` for bad
-    settings, :class:`CaptureError`, also for a folder with other settings, :class:`.SceneError`,
-    :class:`.SplatsError` and :class:`.OutputError`.
+    also be a file of 3D Gaussians (:mod:`.splats`), of which ``box`` crops a part. ``given`` are fields of
+    :class:`CaptureSettings`, the options of ``mi-diffind capture`` as keywords: ``views=60``, ``resolution=160``,
+    ``path="orbit"``, …; ``defines`` replace the file's ``<default>`` parameters; ``workers`` processes share the views,
+    or those of the Dask cluster ``scheduler``. The folder is created if its parent exists. Views of an earlier capture
+    with the same settings of the same scene are kept, unless a dictionary holds objects that exist already; after
+    Ctrl-C the current view is the last. Raises :class:`.UsageError` for bad settings, :class:`CaptureError`, also for a
+    folder with other settings, :class:`.SceneError`, :class:`.SplatsError` and :class:`.OutputError`.
     """
     use_variant()
     settings = _settings(scene, given)
@@ -248,7 +247,7 @@ def capture(
     total, start, rendered, opaque = sum(map(len, splits.values())), time.perf_counter(), 0, bool(left)
     _write_lists(folder, settings, splits, box)
     if left and (workers or scheduler):
-        views = _shared(scene, subject, (settings, centre, radius), folder, left)
+        views = _view_jobs(scene, subject, (settings, centre, radius), folder, left)
         outcomes = run_jobs(
             render_separately, views, workers, scheduler, progress, "capture", "view", total - len(left)
         )
@@ -279,7 +278,7 @@ def _render(camera: CaptureCamera, splits: dict, folder: Path, split: str, i: in
     return bool((image[..., 3] > 0.999).all())
 
 
-def _shared(scene, subject: SceneSubject, given: tuple, folder: Path, left: list) -> dict[str, tuple]:
+def _view_jobs(scene, subject: SceneSubject, given: tuple, folder: Path, left: list) -> dict[str, tuple]:
     """Return the jobs of :func:`render_separately`. Raises :class:`.UsageError`."""
     source = scene if isinstance(scene, dict) else str(subject.path.resolve())
     try:
@@ -292,12 +291,12 @@ def _shared(scene, subject: SceneSubject, given: tuple, folder: Path, left: list
 def render_separately(view: tuple[bytes, str, str, int]) -> bool:
     """Render a view in this process, which loads the scene once, and write it; return whether it is opaque."""
     content, folder, split, i = view
-    camera, splits = _camera_of(content)
+    camera, splits = _cached_camera(content)
     return _render(camera, splits, Path(folder), split, i)
 
 
 @functools.lru_cache(maxsize=1)
-def _camera_of(content: bytes) -> tuple[CaptureCamera, dict]:
+def _cached_camera(content: bytes) -> tuple[CaptureCamera, dict]:
     scene, defines, settings, centre, radius, variant = pickle.loads(content)
     use_variant(variant)
     return _subject(scene, defines, settings).camera(settings), _plan(settings, centre, radius)
@@ -398,17 +397,12 @@ def _settings(scene, given: dict) -> CaptureSettings:
     tuples = {name: tuple(given[name]) for name in names if given.get(name) is not None}
     if given.get("spp") is None:
         tuples["spp"] = splats.SPP if is_splats(scene) else CaptureSettings.spp
-    settings = CaptureSettings(**{**given, **tuples})
-    try:
-        settings.check()
-    except ValueError as e:
-        raise UsageError(str(e)) from None
-    return settings
+    return CaptureSettings(**{**given, **tuples})
 
 
 def _plan(settings: CaptureSettings, centre: np.ndarray, radius: float) -> dict[str, list[np.ndarray]]:
     """Return the poses of each split, ``"train"`` and ``"test"``."""
-    frame = frame_of(settings.up)
+    frame = upright_frame(settings.up)
     places = (d @ frame.T * radius + centre for d in settings.directions())
     return {
         split: [pose(origin, centre, settings.up) for origin in origins]
@@ -449,7 +443,7 @@ class CaptureCamera:
         most = 1 << (max(1, PASS // self.settings.resolution**2).bit_length() - 1)
         while done < self.settings.spp:
             n = min(most, self.settings.spp - done)
-            if loading.rounded(self.sensor, n) > n:  # multijitter takes powers of four as they are
+            if loading.sampler_count(self.sensor, n) > n:  # multijitter takes powers of four as they are
                 n = 4 ** ((n.bit_length() - 1) // 2)
             with loading.scene_errors(None):
                 image = mi.render(

@@ -140,7 +140,7 @@ class _Side:
 
     def render(self, spp: int, seed: int, on_pass) -> None:
         """Render one pass of ``spp`` samples, and further ones of as many where the side is oversampled."""
-        spp = loading.samples_taken(self.scene, spp)[0]
+        spp = loading.sample_counts(self.scene, spp)[0]
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
             image, seconds = loading.render(self.scene, spp * self.oversampling, seed, self.oversampling, on_pass)
@@ -169,36 +169,30 @@ def compare(
     defines: Mapping[str, object] | None = None,
     progress: bool = True,
 ) -> Comparison:
-    """Render a scene, a file or a dictionary as of ``mi.load_dict``, as written and with counterparts.
+    """Render a scene as written and with counterparts, in turn, pass by pass, with the same random numbers.
 
-    They are rendered in turn, pass by pass, with the same random numbers.
-
-    Every learned plugin is replaced by its exact counterpart. ``against`` may name another counterpart, such as
-    ``"principled"``: then every plugin that has it is replaced, learned or not. Without ``against``, a scene with
-    plugins that declare several truths (``neural_texture``: ``mipmap``, which filters as it does, and ``exact``, a
-    ``bitmap`` of 8 times the samples) is compared with each of them; other learned plugins are then replaced by their
-    exact counterparts. At least two passes are rendered, unless there is only one sample.
-
-    ``learn`` names groups of Mitsuba's plugins (:func:`.conversion.words`) that are replaced by learned ones before the
-    scene is rendered "as written"; the scene of the file is then the truth ``stock``, in place of ``exact``.
+    - ``scene``: a scene file or a dictionary as of ``mi.load_dict``; ``defines``: values of the file's ``<default>``.
+    - ``spp``: samples a pixel (``None``: the scene's), split into ``passes``: at least two, unless there is one
+      sample.
+    - ``against``: counterpart that replaces every plugin that has it, learned or not, such as ``"principled"``.
+      Without it, every learned plugin is replaced by its exact counterpart, and a scene with plugins that declare
+      several truths (``neural_texture``: ``mipmap``, which filters as it does, and ``exact``, a ``bitmap`` of 8 times
+      the samples) is compared with each of them (``further``).
+    - ``learn``: groups of Mitsuba's plugins (:func:`.conversion.words`) that learned ones replace before the scene is
+      rendered "as written"; the scene of the file is then the truth ``stock``, in place of ``exact``.
 
     Figures: ``against``; ``counterparts``, the plugins that were put in, and ``truth_spp``, their samples a pixel;
-    ``psnr_db``, ``flip``, ``mae`` of the image as written against the other one; ``brightness``, the ratio of their
-    means; ``noise_db`` and ``psnr_without_noise_db`` (:func:`noise`); ``worst``, the window ``x``, ``y``, ``width``,
-    ``height`` (:func:`worst_window`) of the largest ``mae`` of values clipped to [0, 1]; the median
-    ``seconds_per_pass`` of each. ``time_ratio``, written over the other at equal samples: ``median``, ``q1``, ``q3``,
-    ``min`` and ``max`` over the ``pairs`` of passes, rendered one after the other, in which neither side compiled a
-    kernel. The median is ``None`` if there are fewer than :data:`PAIRS` of them or ``q3`` exceeds :data:`WIDEST` times
-    ``q1``. Quote the ratio rather than the quotient of the two times: a slow phase of the machine slows both passes of
-    a pair. ``replaced_plugins``: how many were replaced; ``learned_plugins``: how many of these are learned;
-    ``table_bytes``: bytes of the distinct tables that the learned ones read; ``conversions``: what became of Mitsuba's
-    plugins (:class:`.conversion.Conversion`). Ctrl-C ends the comparison after the current pair of passes; ``spp`` and
-    ``passes`` then state how many there were, and ``interrupted`` is true.
+    ``psnr_db``, ``flip``, ``mae``; ``brightness``, the ratio of the means; ``noise_db`` and ``psnr_without_noise_db``
+    (:func:`noise`); ``worst``, the window (:func:`worst_window`) of the largest ``mae`` of values clipped to [0, 1];
+    the median ``seconds_per_pass`` of each; ``replaced_plugins``, of which ``learned_plugins`` are learned, and the
+    ``table_bytes`` of these; ``conversions``, what became of Mitsuba's plugins (:class:`.conversion.Conversion`).
+    ``time_ratio``, written over the other at equal samples: ``median``, ``q1``, ``q3``, ``min`` and ``max`` over the
+    ``pairs`` of passes, rendered one after the other, in which neither side compiled a kernel. The median is ``None``
+    if there are fewer than :data:`PAIRS` of them or ``q3`` exceeds :data:`WIDEST` times ``q1``. Quote this ratio
+    rather than the quotient of the times: a slow phase of the machine slows both passes of a pair.
 
-    ``passes``: passes that the samples are split into; ``defines``: values of the file's ``<default>`` parameters. A
-    notebook shows the picture of :meth:`Comparison.save`, and ``print`` the figures.
-
-    Raises :class:`.SceneError`, also if the scene names no plugin with such a counterpart.
+    Ctrl-C ends the comparison after the current pair; ``spp`` and ``passes`` then state how many there were, and
+    ``interrupted`` is true. Raises :class:`.SceneError`, also if the scene names no plugin with such a counterpart.
     """
     use_variant()
     if against and not plugins.with_counterpart(against):
@@ -243,7 +237,7 @@ def compare(
             if stop.is_set():
                 break
 
-    loading.warn_of_black(written.scene, parsed.path, [written.image, *(side.image for side in sides.values())])
+    loading.warn_if_black(written.scene, parsed.path, [written.image, *(side.image for side in sides.values())])
     common = {
         "scene": str(parsed.path),
         "variant": mi.variant(),

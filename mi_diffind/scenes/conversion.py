@@ -27,16 +27,19 @@ from ..core.errors import DiffindError, UsageError
 from ..core.files import OutputError, relative_path, replacing, shown, writable_file, writable_folder
 from ..core.runtime import use_variant
 from ..fitting.task import STORAGES, fit, table_path, task_of, tasks
-from ..plugins.support.stock import Kept, StockNode
+from ..plugins.support.properties import Kept, StockNode
 from .block_test import PictureCheck, check_picture
 from .loading import ParsedScene, SceneError
-from .scene_text import difference, edited_text, with_paths
+from .scene_text import absolute_paths, difference, edit_text
 
 #: Environment variable with the folder of fits for scenes that are rendered and not written.
 FOLDER = "MI_DIFFIND_CACHE"
 
-#: Integrator whose estimator those of ``Plugin.seen_by`` share, and the parameters that they take from it.
-TRACER, TRACER_PARAMETERS = "path", ("max_depth", "rr_depth", "hide_emitters")
+#: Integrator whose estimator those of ``Plugin.seen_by`` share.
+TRACER = "path"
+
+#: Parameters of :data:`TRACER` that those of ``Plugin.seen_by`` take.
+TRACER_PARAMETERS = ("max_depth", "rr_depth", "hide_emitters")
 
 
 @dataclass(frozen=True)
@@ -163,10 +166,10 @@ def replace_stock(
     if not learn:
         return []
     folder = cache_folder() if folder is None else writable_folder(folder, create=True)
-    return parsed.change(lambda state: _convert(state, {w: groups[w] for w in learn}, folder.resolve(), progress))
+    return parsed.change(lambda state: _replace_nodes(state, {w: groups[w] for w in learn}, folder.resolve(), progress))
 
 
-def _convert(state, groups: dict[str, plugins.Plugin], folder: Path, progress: bool) -> list[Conversion]:
+def _replace_nodes(state, groups: dict[str, plugins.Plugin], folder: Path, progress: bool) -> list[Conversion]:
     nodes, types = compat.properties_of(state), compat.parsed_types(state)
     references = compat.parsed_references(state)
     stock = {name: (word, plugin) for word, plugin in groups.items() for name in plugin.stock.names}
@@ -182,7 +185,7 @@ def _convert(state, groups: dict[str, plugins.Plugin], folder: Path, progress: b
         parents = [i for i in around if index in references[i]]
         node = StockNode(
             props, tuple(nodes[i] for i in parents), tuple((types[i], nodes[i]) for i in _below(references, index)),
-            folder, functools.partial(_fitted, folder, progress),
+            folder, functools.partial(_fit_table, folder, progress),
         )  # fmt: skip
         try:
             fitted = plugin.stock.convert(node)
@@ -235,10 +238,10 @@ def _trace_by(seen_by: tuple[str, ...], integrators: list) -> list[Conversion]:
     return conversions
 
 
-def _fitted(folder: Path, progress: bool, task: str, source: Path, **options) -> Table:
+def _fit_table(folder: Path, progress: bool, task: str, source: Path, **options) -> Table:
     """Return the table of a fit, of this call or an earlier one, as its file holds it.
 
-    Raises :class:`~.plugins.support.stock.Kept` for a source that the task refuses.
+    Raises :class:`~.plugins.support.properties.Kept` for a source that the task refuses.
     """
     key = [task, sorted(options.items()), relative_path(source, folder)]  # the file records its source by that path
     path = folder / f"{source.stem}_{_digest(source, key)}.npz"
@@ -284,12 +287,12 @@ def write_scene(
     if parsed.description:
         raise UsageError("scene: found one in memory, a scene file is needed")
     target, before = Path(path).resolve().parent, ParsedScene(parsed.path, parsed.defines)
-    content = before.change(lambda b: parsed.change(lambda a: edited_text(b, a, parsed.defines, target)))
+    content = before.change(lambda b: parsed.change(lambda a: edit_text(b, a, parsed.defines, target)))
     with replacing(path) as temporary:
         temporary.write_bytes(content)
         try:
             written = ParsedScene(temporary)
-            states = parsed.change(with_paths), written.change(with_paths)
+            states = parsed.change(absolute_paths), written.change(absolute_paths)
             if fault := parsed.change(lambda _: difference(*states)):
                 raise SceneError(f"{parsed.path}: cannot be written as {path}, which would have {fault}")
             if check is not None:

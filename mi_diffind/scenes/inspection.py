@@ -62,8 +62,7 @@ def inspect(file_or_scene, measure: bool = False, *, defines: Mapping[str, objec
     - ``measure``: measure the accuracy of a table file in each storage form, against the truth that it was fitted to.
     - ``defines``: values of a scene file's ``<default>`` parameters.
 
-    Raises :class:`.UsageError`, :class:`.TableError` and
-    :class:`.SceneError`.
+    Raises :class:`.UsageError`, :class:`.TableError` and :class:`.SceneError`.
     """
     use_variant()
     is_file = isinstance(file_or_scene, (str, os.PathLike))
@@ -74,29 +73,25 @@ def inspect(file_or_scene, measure: bool = False, *, defines: Mapping[str, objec
         return _inspect_table(file_or_scene, measure)
     if measure:
         raise UsageError(f"{file_or_scene if is_file else 'measure'}: --measure needs a table file (.npz)")
+    learned, tables, loaded = None, {}, file_or_scene
     if is_scene_file:
-        return _inspect_scene_file(file_or_scene, dict(defines or {}))
-    loaded = loading.load_dict(file_or_scene) if isinstance(file_or_scene, dict) else file_or_scene
+        parsed = loading.ParsedScene(file_or_scene, dict(defines or {}))
+        learned = parsed.learned_plugins()
+        tables = {key: table.nbytes for key, table in parsed.tables(learned).items()}
+        loaded = parsed.load(needs=())
+    elif isinstance(file_or_scene, dict):
+        loaded = loading.load_dict(file_or_scene)
     if not isinstance(loaded, mi.Object):
         raise UsageError(f"inspect: found a {type(loaded).__name__}, allowed are a file, a dictionary and a scene")
     reports = _reports(loaded)
-    tables = {
-        (r.get("filename") or r.get("preset", ""), r.get("storage", "")): r["table_bytes"]
-        for r in reports if r["learned"] and r.get("table_bytes")
-    }  # fmt: skip
-    return _scene_inspection(None, reports, [plugins.origin(i) for i in loading.learned_instances(loaded)], tables)
-
-
-def _inspect_scene_file(path, defines: dict) -> Inspection:
-    parsed = loading.ParsedScene(path, defines)
-    learned = parsed.learned_plugins()
-    tables = {key: table.nbytes for key, table in parsed.tables(learned).items()}
-    return _scene_inspection(str(path), _reports(parsed.load(needs=())), learned, tables)
-
-
-def _scene_inspection(file: str | None, reports: list[dict], learned: list[dict], tables: dict) -> Inspection:
+    if learned is None:
+        learned = [plugins.origin(instance) for instance in loading.learned_instances(loaded)]
+        tables = {
+            (r.get("filename") or r.get("preset", ""), r.get("storage", "")): r["table_bytes"]
+            for r in reports if r["learned"] and r.get("table_bytes")
+        }  # fmt: skip
     return Inspection({
-        "file": file,
+        "file": str(file_or_scene) if is_scene_file else None,
         "learned_plugins": learned,
         "reports": reports,
         "table_bytes": sum(tables.values()),
@@ -106,16 +101,16 @@ def _scene_inspection(file: str | None, reports: list[dict], learned: list[dict]
 
 def _reports(scene) -> list[dict]:
     """Return the report on each plugin of this package, with the ``owner`` of its parameters."""
-    paths, learned = paths_of(scene), plugins.with_counterpart()
-    owners, reports = owners_of(paths), []
+    paths, learned = object_paths(scene), plugins.with_counterpart()
+    owners, reports = owner_names(paths), []
     for path, node in paths.items():
         if plugins.origin(node) is not None:
-            report = loading.report_of(node, scene)
+            report = loading.instance_report(node, scene)
             reports.append({"owner": owners[path], "learned": report["plugin"] in learned, **report})
     return reports
 
 
-def paths_of(scene) -> dict[str, object]:
+def object_paths(scene) -> dict[str, object]:
     """Return all objects of a loaded scene, each once, by the path of its parameters in ``mi.traverse``.
 
     The scene's own path is "". Mitsuba names objects without an id ``object_…``, by their address.
@@ -150,7 +145,7 @@ def paths_of(scene) -> dict[str, object]:
     return paths
 
 
-def owners_of(paths: dict[str, object]) -> dict[str, str]:
+def owner_names(paths: dict[str, object]) -> dict[str, str]:
     """Return the name of each path for people.
 
     A path that begins with an address begins instead with the first id on it, else with the plugin in parentheses.
@@ -197,23 +192,12 @@ def _inspect_table(file, measure: bool) -> Inspection:
         bad = [name for name, value in measured[model.storage].items() if value != value]
         if bad:
             raise TableError(f"{file}: as {model.storage}, {', '.join(bad)} is no number: values are not finite")
-    return Inspection(
-        {
-            "file": str(file),
-            "task": table.task,
-            "preset": table.preset,
-            "storage": table.storage,
-            "bytes": table.nbytes,
-            "arrays": arrays,
-            "settings": table.settings,
-            "seed": table.seed,
-            "measured": table.measured,
-            **figures,
-            **({"measured_in_each_form": measured} if measured else {}),
-        },
-        remarks,
-        task.usage(table, Path(file).name),
-    )
+    figures = {
+        "file": str(file), "task": table.task, "preset": table.preset, "storage": table.storage, "bytes": table.nbytes,
+        "arrays": arrays, "settings": table.settings, "seed": table.seed, "measured": table.measured, **figures,
+        **({"measured_in_each_form": measured} if measured else {}),
+    }  # fmt: skip
+    return Inspection(figures, remarks, task.usage(table, Path(file).name))
 
 
 def _table_lines(inspection: Inspection, verbose: bool) -> list[str]:
@@ -245,10 +229,8 @@ def _scene_lines(inspection: Inspection, verbose: bool) -> list[str]:
     others = len(f["reports"]) - learned
     counted = _count(learned, "learned plugin") + (f" and {_count(others, 'other')}" if others else "")
     files = _count(len(f["tables"]), "file")
-    lines = [f"{f['file'] or 'scene'}: {counted}, {f['table_bytes']:,} bytes of tables in {files}"]
-    for report in f["reports"]:
-        lines += _report_lines(report, verbose)
-    return lines
+    head = f"{f['file'] or 'scene'}: {counted}, {f['table_bytes']:,} bytes of tables in {files}"
+    return [head, *(line for report in f["reports"] for line in _report_lines(report, verbose))]
 
 
 def _report_lines(report: dict, verbose: bool) -> list[str]:
@@ -278,13 +260,13 @@ def _report_lines(report: dict, verbose: bool) -> list[str]:
 
 def _given(parameters: dict, verbose: bool) -> list[str]:
     """Return parameters as text: numbers in short, of transforms and other lists the name alone."""
-    texts = []
-    for name, value in parameters.items():
+
+    def text(name: str, value) -> str:
         if isinstance(value, list) and isinstance(value[0], list) and not verbose:
-            texts.append(name)
-        else:
-            texts.append(f"{name} {value:g}" if isinstance(value, float) else f"{name} {value}")
-    return texts
+            return name
+        return f"{name} {value:g}" if isinstance(value, float) else f"{name} {value}"
+
+    return [text(name, value) for name, value in parameters.items()]
 
 
 def _ray_counts(n: dict) -> tuple[list[str], list[str]]:

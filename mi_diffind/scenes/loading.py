@@ -49,8 +49,7 @@ def check_renderable(scene, path: str | os.PathLike = "scene", needs: tuple[str,
 def check_size(scene, spp: int, size: tuple[int, int] | None = None) -> None:
     """Refuse a picture that takes more memory than this machine has, or too many samples per pixel.
 
-    ``size`` is its width and height, by default that of the first sensor's film. Raises
-    :class:`.UsageError`.
+    ``size`` is its width and height, by default that of the first sensor's film. Raises :class:`.UsageError`.
     """
     width, height = size or map(int, scene.sensors()[0].film().crop_size())
     channels = scene.sensors()[0].film().base_channels_count()
@@ -58,7 +57,7 @@ def check_size(scene, spp: int, size: tuple[int, int] | None = None) -> None:
     units.check_samples(spp)
 
 
-def warn_of_black(scene, path: str | os.PathLike, images) -> None:
+def warn_if_black(scene, path: str | os.PathLike, images) -> None:
     """Warn if all ``images`` of a loaded scene are black."""
     if not any(image[..., :3].any() for image in images):
         plugins.warn(f"{path}: the picture is black{'' if scene.emitters() else ', the scene has no emitter'}")
@@ -117,13 +116,10 @@ class ParsedScene:
 
     def __init__(self, source: str | os.PathLike | dict, defines: dict[str, str] | None = None, name: str = "scene"):
         in_memory = isinstance(source, dict)
-        if not in_memory and not isinstance(source, (str, os.PathLike)):
-            source_type = (
-                "loaded scene, which cannot be changed any more" if _is_scene(source) else type(source).__name__
-            )
-            raise UsageError(
-                f"scene: found a {source_type}; a scene file is needed, or a dictionary as of mi.load_dict"
-            )
+        if not isinstance(source, (dict, str, os.PathLike)):
+            loaded = isinstance(source, mi.Scene)
+            found_type = "loaded scene, which cannot be changed any more" if loaded else type(source).__name__
+            raise UsageError(f"scene: found a {found_type}; a scene file is needed, or a dictionary as of mi.load_dict")
         if in_memory and defines:
             raise UsageError("defines: given with a scene in memory, allowed are scene files")
         self.path = path = Path.cwd() / name if in_memory else Path(source)
@@ -136,11 +132,10 @@ class ParsedScene:
                 return
             if fault := irregular(path, MOST_TEXT):
                 raise RuntimeError(f"{shown(path)}: {fault}")
-            if not self.path.is_file():
-                raise RuntimeError(
-                    f"{path}: {'is a folder, a scene file is needed' if path.is_dir() else 'no such scene file'}"
-                )
-            if self.path.suffix.lower() == ".npz":
+            if not path.is_file():
+                fault = "is a folder, a scene file is needed" if path.is_dir() else "no such scene file"
+                raise RuntimeError(f"{path}: {fault}")
+            if path.suffix.lower() == ".npz":
                 raise RuntimeError(f"{path}: found a table file, a scene is needed: mi_diffind.inspect shows its use")
             _, self._state = compat.parse_file(path, self.defines)
             use_slashes(self._state)
@@ -235,14 +230,13 @@ class ParsedScene:
         tables = {}
         for entry in learned:
             plugin = plugins.declared()[entry["plugin"]]
-            if not plugin.task:
-                continue
-            name, storage = entry.get("filename", ""), entry.get("storage", "") or plugin.storage
-            task = tasks()[plugin.task]
-            file = task.file(name and self.path.resolve().parent / name, entry.get("preset", ""))
-            if (str(file), storage) not in tables:
-                table = task.load(file)
-                tables[str(file), storage] = table.to(storage) if storage else table
+            if plugin.task:
+                name, storage = entry.get("filename", ""), entry.get("storage", "") or plugin.storage
+                task = tasks()[plugin.task]
+                file = task.file(name and self.path.resolve().parent / name, entry.get("preset", ""))
+                if (str(file), storage) not in tables:
+                    table = task.load(file)
+                    tables[str(file), storage] = table.to(storage) if storage else table
         return tables
 
     def table_bytes(self, learned: list[dict]) -> int:
@@ -263,27 +257,6 @@ class ParsedScene:
             return list(dict.fromkeys(files))
 
 
-class LoadedScene(ParsedScene):
-    """Scene that Mitsuba has loaded, in the place of one that can be loaded: nothing of it can be changed."""
-
-    def __init__(self, scene: mi.Scene, name: str = "scene"):
-        self.scene, self.path, self.defines = scene, Path.cwd() / name, {}
-        self.description = _unique()
-
-    def load(self):
-        """Return the scene."""
-        return self.scene
-
-    def files(self) -> list[Path]:
-        """Return no files: they are not known."""
-        return []
-
-
-def _unique() -> str:
-    """Return a text that no other call returns."""
-    return os.urandom(16).hex()
-
-
 def _description(state) -> str:
     """Return a parsed scene as text: equal texts stand for equal scenes, without the content of files.
 
@@ -291,11 +264,7 @@ def _description(state) -> str:
     """
     nodes = compat.properties_of(state)
     existing = any(compat.property_kind(props, key) == "existing" for props in nodes for key in props)
-    return "\n".join([_unique() if existing else "", *map(str, nodes)])
-
-
-def _is_scene(value) -> bool:
-    return isinstance(value, mi.Scene)
+    return "\n".join([os.urandom(16).hex() if existing else "", *map(str, nodes)])
 
 
 @in_turn
@@ -321,24 +290,25 @@ def load_file(path: str | os.PathLike, parallel: bool = True, optimize: bool = T
     with _resolving(path):
         config, state = compat.parse_file(path, defines)
         use_slashes(state)
-        compat.build_as(config, parallel, optimize)
-        return _build(config, state, _integrators(state), plugins.warn)
+        return _build_as(config, state, parallel, optimize)
 
 
 @in_turn
 def load_dict(scene: dict, parallel: bool = True, optimize: bool = True):
     """Load a scene or an object from a dictionary as ``mi.load_dict`` does, prepared as by :func:`load_file`."""
     use_variant()
-    config, state = compat.parse(scene)
-    compat.build_as(config, parallel, optimize)
-    return _build(config, state, _integrators(state), plugins.warn)
+    return _build_as(*compat.parse(scene), parallel, optimize)
 
 
 @in_turn
 def load_string(text: str, parallel: bool = True, optimize: bool = True, **defines):
     """Load a scene from a text of XML as ``mi.load_string`` does, prepared as by :func:`load_file`."""
     use_variant()
-    config, state = compat.parse(text, defines)
+    return _build_as(*compat.parse(text, defines), parallel, optimize)
+
+
+def _build_as(config, state, parallel: bool, optimize: bool):
+    """Instantiate a parsed scene with Mitsuba's own arguments; what no integrator traces is a warning."""
     compat.build_as(config, parallel, optimize)
     return _build(config, state, _integrators(state), plugins.warn)
 
@@ -369,7 +339,7 @@ def _build(config, state, integrators: list[str], report: Callable[[str], None])
         if unseen:
             report(unseen)
             omissions.settle(instance for instance in instances(loaded) if hasattr(instance, "seen_by"))
-        _warn_of_decoded(loaded, decoded, integrators)
+        _warn_decoded(loaded, decoded, integrators)
         footprint.attach(loaded)
     return loaded
 
@@ -437,7 +407,7 @@ def _sees(integrators: list[str], seen_by: tuple[str, ...]) -> bool:
     return bool(set(seen_by) & set(integrators)) and "aov" not in integrators
 
 
-def _warn_of_decoded(scene, ids: list[str], integrators: list[str]) -> None:
+def _warn_decoded(scene, ids: list[str], integrators: list[str]) -> None:
     """Warn of each shape that was decoded because the ``integrators`` cannot trace its arrays."""
     names = ", ".join(f'"{name}"' for name in integrators)
     for instance in instances(scene) if ids else ():
@@ -484,10 +454,10 @@ def reports(scene) -> list[dict]:
     (:class:`~mi_diffind.measure.clock.Operations`, by name); for the integrator of a radiance field, how many
     steps of ``rays`` are taken, skipped, … (:class:`~mi_diffind.tasks.radiance.march.RayCounts`).
     """
-    return [report_of(instance, scene) for instance in learned_instances(scene)]
+    return [instance_report(instance, scene) for instance in learned_instances(scene)]
 
 
-def report_of(instance, scene) -> dict:
+def instance_report(instance, scene) -> dict:
     """Return the report (:func:`reports`) on one of the :func:`instances` of a loaded scene, or of another object."""
     counts = bsdf_operations(instance) if isinstance(instance, mi.BSDF) else {}
     counted = hasattr(instance, "counts") and isinstance(scene, mi.Scene) and scene.sensors()
@@ -506,14 +476,14 @@ def film_size(scene) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def samples_taken(scene, spp: int, passes: int = 1) -> list[int]:
+def sample_counts(scene, spp: int, passes: int = 1) -> list[int]:
     """Return the samples a pixel of each pass of :func:`render`: samplers other than ``independent`` may round up."""
     counts = [(i + 1) * spp // passes - i * spp // passes for i in range(passes)]
-    taken = {count: rounded(scene.sensors()[0], count) for count in set(counts)}
+    taken = {count: sampler_count(scene.sensors()[0], count) for count in set(counts)}
     return [taken[count] for count in counts]
 
 
-def rounded(sensor, spp: int) -> int:
+def sampler_count(sensor, spp: int) -> int:
     """Return the samples a pixel that the sampler of a sensor takes for ``spp``."""
     sampler = sensor.sampler().clone()
     sampler.set_sample_count(spp)
@@ -540,7 +510,7 @@ def render(
 
     Returns the linear image ``(height, width, channels)``, float32, and the seconds of each pass (the first includes
     compilation). ``on_pass()`` is called after each pass. Once ``stop`` is set, the running pass is the last, and the
-    image is the average of ``len(seconds)`` passes, of :func:`samples_taken` each. The same arguments give the same
+    image is the average of ``len(seconds)`` passes, of :func:`sample_counts` each. The same arguments give the same
     image if the film's filter is a box (other filters add up samples of neighbouring pixels in any order) and the
     samples of a pass are a power of two (else the last bit of a few pixels varies).
     """

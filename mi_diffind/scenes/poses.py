@@ -49,7 +49,7 @@ def _unit(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
     return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1)
 
 
-def frame_of(up) -> np.ndarray:
+def upright_frame(up) -> np.ndarray:
     """Return a rotation ``(3, 3)`` that takes z to ``up``; with y up, azimuth 0 is z and grows towards x."""
     z = np.array(up, np.float64) / np.linalg.norm(up)
     y = np.eye(3)[(int(np.argmax(np.abs(z))) + 2) % 3]
@@ -63,7 +63,7 @@ def pose(origin: np.ndarray, target: np.ndarray, up) -> np.ndarray:
     z = (origin - target) / np.linalg.norm(origin - target)
     x = np.cross(np.array(up, np.float64) / np.linalg.norm(up), z)
     if np.linalg.norm(x) < 1e-6:  # straight from above or below
-        x = frame_of(up)[:, 0]
+        x = upright_frame(up)[:, 0]
     x = x - (x @ z) * z
     x /= np.linalg.norm(x)
     matrix = np.eye(4)

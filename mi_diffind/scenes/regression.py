@@ -21,6 +21,7 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -185,12 +186,12 @@ def _reference(path: Path, about: dict, image: dict, means: dict) -> Reference:
     """Return the reference of a file from its two parts, which are checked."""
     names = _names(3 if "R" in image else 1)
 
-    def stacked(channels: dict, prefix: str = "") -> np.ndarray:
+    def stack(channels: dict, prefix: str = "") -> np.ndarray:
         return np.stack([channels[prefix + name] for name in names], axis=-1)
 
     try:
-        pixels, mean = stacked(image), np.float64(stacked(means, "mean."))
-        passes = np.float64([stacked(means, f"pass{i:02}.") for i in range(REFERENCE_PASSES)])
+        pixels, mean = stack(image), np.float64(stack(means, "mean."))
+        passes = np.float64([stack(means, f"pass{i:02}.") for i in range(REFERENCE_PASSES)])
         stops, change = np.array(about.pop("stops"), np.float64), about["visible_change"]
         good = (
             stops.shape == (GROUPS,)
@@ -325,7 +326,7 @@ def _update_reference(
     """
     output, stem = reference_path(path, references), Path(path).stem
     before = read_settings(path, references)
-    parsed = _parsed(scene, {**before.get("defines", {}), **defines})
+    parsed = _parse(scene, {**before.get("defines", {}), **defines})
     scene = parsed.load()
     writable_folder(output.parent, create=True)
     writable_file(output)
@@ -374,13 +375,13 @@ def _update_reference(
     return {**result, "tile": TILE, "visible_change": about["visible_change"], "bytes": output.stat().st_size}
 
 
-def _parsed(scene, defines: dict) -> loading.ParsedScene:
-    """Return a scene file or a dictionary parsed, or a loaded scene in their place."""
+def _parse(scene, defines: dict) -> loading.ParsedScene | SimpleNamespace:
+    """Return a scene file or a dictionary parsed, or a loaded scene in their place, of which no files are known."""
     if not isinstance(scene, mi.Scene):
         return loading.ParsedScene(scene, defines)
     if defines:
         raise UsageError("defines: given with a scene in memory, allowed are scene files")
-    return loading.LoadedScene(scene)
+    return SimpleNamespace(load=lambda: scene, files=list, defines={}, description=os.urandom(16).hex())
 
 
 def _facts(path, reference: str, width: int, height: int, seed: int, defines: dict) -> dict:
@@ -435,7 +436,7 @@ def regress(
         return Regression(_update_reference(scene, path, references, spp, seed, progress, dict(defines or {})))
     reference = read_reference(path, references)
     about = reference.about
-    parsed = _parsed(scene, {**about["defines"], **(defines or {})})
+    parsed = _parse(scene, {**about["defines"], **(defines or {})})
     loaded = parsed.load()
     width, height = loading.film_size(loaded)
     _check_size(path, reference, height, width)

@@ -139,7 +139,7 @@ def update_summary(figures: dict) -> list[str]:
     return [f"{text.format(**figures)} and would see {power(figures)}"]
 
 
-def _wrapped(title: str, text: str) -> list[str]:
+def _wrap(title: str, text: str) -> list[str]:
     return textwrap.wrap(f"{title:11} {text}", 58, subsequent_indent=" " * 12)
 
 
@@ -158,8 +158,8 @@ def _write_figure(path: str, result: Regression) -> None:
         f"reference   {figures['reference_spp']} samples a pixel",
         "",
         f"{verdict(figures):11} {figures['failing_blocks']} of {figures['blocks']} blocks of all sizes fail",
-        *_wrapped("", "; ".join(reasons(figures))),
-        *_wrapped("power", f"finds {power(figures)}"),
+        *_wrap("", "; ".join(reasons(figures))),
+        *_wrap("power", f"finds {power(figures)}"),
     ]
     blocks = f"blocks of {level.side} x {level.side}"
     frame = (worst.x, worst.y, worst.width, worst.height)

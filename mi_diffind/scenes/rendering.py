@@ -145,7 +145,7 @@ def render(
     if isinstance(scene, (str, os.PathLike)):
         parsed = loading.ParsedScene(scene, dict(defines or {}))
         conversions = conversion.replace_stock(parsed, learn, progress=progress)
-        chosen = _chosen_depth(parsed, depth, depth_tolerance, seed)
+        chosen = _choose_depth(parsed, depth, depth_tolerance, seed)
         changed = chosen["chosen"] != chosen["scene"]
         loaded = parsed.load(longest_path=chosen["chosen"] if changed else None)
     else:
@@ -171,18 +171,18 @@ def render(
             centre = middle(loaded) if centre is None else np.array(centre, np.float64)
             turns = [rotation(UP, 360 * i / orbit, centre) for i in range(orbit)]
             frames = along(loaded, turns, spp, seed, on_frame=bar.update, stop=stop)
-        interrupted, done = len(frames) < orbit, sum(loading.samples_taken(loaded, spp))
+        interrupted, done = len(frames) < orbit, sum(loading.sample_counts(loaded, spp))
     else:
         passes = pass_count(loaded, spp)
         with interruptible() as stop, progress_bar("render", passes, "pass", progress) as bar:
             image, seconds = loading.render(loaded, spp, seed, passes, bar.update, stop)
-        frames, done = [image], sum(loading.samples_taken(loaded, spp, passes)[: len(seconds)])
+        frames, done = [image], sum(loading.sample_counts(loaded, spp, passes)[: len(seconds)])
         interrupted = len(seconds) < passes
     bad = sum(map(metrics.nonfinite_pixels, frames))
     if bad:
         total = len(frames) * frames[0].shape[0] * frames[0].shape[1]
         plugins.warn(f"{name}: {bad:,} of {total:,} rendered pixels are not finite (NaN or infinite)")
-    loading.warn_of_black(loaded, name, frames)
+    loading.warn_if_black(loaded, name, frames)
     figures = {
         "interrupted": interrupted,
         "nonfinite_pixels": bad,
@@ -210,10 +210,10 @@ def pass_count(scene, spp: int) -> int:
     """Return the number of passes, of about :data:`PASS` samples, of which the sampler rounds up least."""
     about = max(1, spp // PASS)
     counts = range(about, min(2 * about, about + TRIED, spp) + 1)
-    return min(counts, key=lambda passes: sum(loading.samples_taken(scene, spp, passes)))
+    return min(counts, key=lambda passes: sum(loading.sample_counts(scene, spp, passes)))
 
 
-def _chosen_depth(parsed: loading.ParsedScene, requested, tolerance: float | None, seed: int) -> dict:
+def _choose_depth(parsed: loading.ParsedScene, requested, tolerance: float | None, seed: int) -> dict:
     """Choose the depth to render to and say why; what was not measured is ``None``."""
     if requested == "auto":
         return {"requested": "auto", **depths.auto_depth(parsed, tolerance or depths.TOLERANCE, seed)}

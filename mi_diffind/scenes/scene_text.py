@@ -55,7 +55,7 @@ class _Element:
     def edit(self, attribute: str, value: str | None = None) -> _Edit:
         """Return the edit that gives an attribute another value, or removes it."""
         _, start, end = self.attributes[attribute]
-        return (start, end, f"{attribute}={_quoted(value)}") if value is not None else (start, end, "")
+        return (start, end, f"{attribute}={_quote(value)}") if value is not None else (start, end, "")
 
     def walk(self) -> Iterator[_Element]:
         """Yield this element and all below, in the order of the text."""
@@ -94,7 +94,7 @@ def _character(match: re.Match) -> str:
     return "&amp;" if character == "&" else character
 
 
-def _quoted(text: str) -> str:
+def _quote(text: str) -> str:
     """Return text as the value of an attribute, quoted, one character a byte of UTF-8."""
     return quoteattr(text.replace("$", r"\$")).encode().decode("latin-1")
 
@@ -121,9 +121,9 @@ class _Editor:
             number = next(iter(self.changes))[0]
             raise RuntimeError(f"{self.files[number]}: found text in another encoding, needed is UTF-8")
         for name in sorted(self.undefined):
-            default = f"\n    <default name={_quoted(name)} value={_quoted(self.defines[name])}/>"
+            default = f"\n    <default name={_quote(name)} value={_quote(self.defines[name])}/>"
             edits.append((root.inner, root.inner, default))
-        return _applied(text, edits, 0, len(text))
+        return _apply(text, edits, 0, len(text))
 
     def value(self, element: _Element, name: str) -> str:
         """Return an attribute as Mitsuba takes it: with the values of parameters in the place of ``$name``."""
@@ -190,12 +190,12 @@ class _Editor:
         if _is_modern(root) != self.modern:
             raise RuntimeError(f"{file}: has to change, and is of another version than the scene that includes it")
         if root.tag == "scene":
-            return _applied(text, edits, root.inner, root.inner_end)
+            return _apply(text, edits, root.inner, root.inner_end)
         edits += [root.edit(attribute) for attribute in ("version", "name") if attribute in root.attributes]
         if "name" in element.attributes:
             place = root.start + 1 + len(root.tag)
-            edits.append((place, place, f" name={_quoted(self.value(element, 'name'))}"))
-        return _applied(text, edits, root.start, root.end)
+            edits.append((place, place, f" name={_quote(self.value(element, 'name'))}"))
+        return _apply(text, edits, root.start, root.end)
 
     def moved(self, name: str, folder: Path) -> str:
         """Return another name of the file ``name`` in a folder if it is needed in the target, else ""."""
@@ -229,7 +229,7 @@ class _Editor:
         shown = str(value).lower() if isinstance(value, bool) else str(value)  # of a float, its shortest text
         if isinstance(value, str) and Path(value).is_absolute():
             shown = relative_path(value, self.target)
-        return f"<{_PARAMETERS[type(value)]} name={_quoted(name)} value={_quoted(shown)}/>"
+        return f"<{_PARAMETERS[type(value)]} name={_quote(name)} value={_quote(shown)}/>"
 
 
 def _is_modern(root: _Element) -> bool:
@@ -242,7 +242,7 @@ def _may_be_file(name: str, value: str) -> bool:
     return "file" in name or bool(Path(value).suffix)
 
 
-def _applied(text: str, edits: list[_Edit], start: int, end: int) -> str:
+def _apply(text: str, edits: list[_Edit], start: int, end: int) -> str:
     """Return a part of a text with the edits in it. A line that they leave empty is dropped."""
     parts, place = [], start
     for first, last, new in sorted(edits, key=lambda edit: edit[:2]):
@@ -256,7 +256,7 @@ def _applied(text: str, edits: list[_Edit], start: int, end: int) -> str:
     return "".join([*parts, text[place:end]])
 
 
-def edited_text(before, after, defines: dict[str, str], target: Path) -> bytes:
+def edit_text(before, after, defines: dict[str, str], target: Path) -> bytes:
     """Return the content of a scene file to which a change of its parsed form is carried over.
 
     - ``before``: the form as the file is parsed with ``defines``; ``after``: the same objects with other plugins, or
@@ -281,7 +281,7 @@ def _shown(value) -> str:
     return " ".join(str(value).split())
 
 
-def with_paths(state):
+def absolute_paths(state):
     """Return a copy of a parsed scene in which the paths of files that exist are absolute."""
     state = compat.copy_parsed(state)[1]
     for props in compat.properties_of(state):

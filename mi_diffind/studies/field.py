@@ -478,12 +478,12 @@ def draw_views(context: RadianceStudyContext, result: dict):
     """Draw the first test view by all fields at the first budget, and the differences to it."""
     truth, first = context.session.held_out.image(0), result["details"]["first"]
     crop, reference = plot.crop_to(truth[..., 3] > 0), displayed(truth)
-    views, differences = {"test view": reference[crop]}, {}
+    views, differences = {"test view": reference[crop]}, {"": reference[crop]}
     for job in context.jobs.values():
         if job.budget == first and job.method in METHODS:
             picture = displayed(context.session.held_out_images.render(job.model, 0))
             errors = result["candidates"][job.name]["errors"]
             views[f"{job.label}\n{errors[WHITE]:.2f} / {errors[FOREGROUND]:.2f} dB"] = picture[crop]
             differences[job.label] = np.abs(picture - reference).mean(axis=-1)[crop]
-    rows = {"": views, "difference": differences} if differences else {"": views}
+    rows = {"": views, "difference": differences}
     return plot.draw_images(f"{result['title']}, {ratio_text(first)}", figure_caption(result), rows, 1.6, "sRGB")

@@ -35,7 +35,6 @@ from ..maps.compressed import decibel
 from ..maps.source import Source, load_source
 from ..measure.study import FLOOR, Candidate, Case, Measure, Plan, Study
 from ..measure.training import halve
-from ..tasks.image import IMPROVEMENTS
 from . import equal_memory
 from .baselines import codecs, networks
 from .equal_memory import Contender
@@ -63,7 +62,7 @@ class ImageStudySettings:
 
     ``compressions`` are the compression ratios, ``seconds`` and ``paper_seconds`` the lengths of trainings by our and
     by the paper's preset, ``dims`` the dimensions of the cascaded array (4: all trainings, others: the shortest).
-    ``ablation`` adds our preset with each improvement switched off. ``astc`` is the preset of the ASTC encoder,
+    ``astc`` is the preset of the ASTC encoder,
     ``astc_choice`` the one that selects block sizes.
     """
 
@@ -71,7 +70,6 @@ class ImageStudySettings:
     seconds: tuple[float, ...] = (60.0,)
     paper_seconds: tuple[float, ...] = (60.0,)
     dims: tuple[int, ...] = (2, 3, 4)
-    ablation: bool = False
     astc: str = "exhaustive"
     astc_choice: str = "medium"
 
@@ -98,7 +96,6 @@ class ImageStudy(Study):
             parser.add_argument(option, action="append", default=[], type=value_type, choices=choices, metavar="N",
                                 help=f"{text}; may be repeated")  # fmt: skip
         add_astc_option(parser)
-        parser.add_argument("--ablation", action="store_true", help="also switch off each improvement of our preset")
 
     def check(self, arguments) -> None:
         """Check the options and load the source; raise as :func:`.load_source` does."""
@@ -113,7 +110,6 @@ class ImageStudy(Study):
             seconds,
             tuple(map(float, arguments.paper_seconds)) or (max(seconds),),
             tuple(arguments.dims) or (2, 3, 4),
-            arguments.ablation,
             "fast" if quick else arguments.astc,
             "fast" if quick else "medium",
         )
@@ -220,8 +216,6 @@ def trained_contenders(context: ImageStudyContext) -> list[Contender]:
         jobs.append(context.network(first, max(settings.seconds)))
     for dims in sorted({*settings.dims} - {4}):
         jobs.append(context.trained(f"ours 2D→{dims}D", "indirection", first, shortest, dims=dims))
-    for name in IMPROVEMENTS if settings.ablation else ():
-        jobs.append(context.trained(f"ours without {name}", "indirection", first, shortest, without=[name]))
     return jobs + [context.trained("ours", "indirection", compression, shortest) for compression in others]
 
 
@@ -269,7 +263,7 @@ def plan(source: Source, name: str, settings: ImageStudySettings) -> Plan:
     trained = trained_contenders(context)
     jobs = [*trained, *coded_contenders(context)]
     candidates = [
-        job.candidate(competes=job.details["random_access"], in_passes=False, in_picture=" without " not in job.name,
+        job.candidate(competes=job.details["random_access"], in_passes=False,
                       label=job.name)
         for job in jobs
     ]  # fmt: skip
@@ -279,7 +273,7 @@ def plan(source: Source, name: str, settings: ImageStudySettings) -> Plan:
     ]
     timed = {
         job.name: job for job in trained
-        if job.has_file and job.budget == settings.compressions[0] and " without " not in job.name
+        if job.has_file and job.budget == settings.compressions[0]
     }  # fmt: skip
     cases = [
         Case(

@@ -448,7 +448,7 @@ def draw(result: dict):
         axes.errorbar(
             xs, ys, np.maximum(ends, 0), color=colour, marker=marker, markerfacecolor="white", capsize=2, label=name
         )
-        for p in curve:
+        for p in curve if name == "learned" else ():
             axes.annotate(f"{p['spp']} spp", (p["seconds"], p["rmse"]), (4, 4), textcoords="offset points", fontsize=7)
         if curve:
             axes.plot(*_continued(result, name, curve), color=colour, linestyle=(0, (4, 2.5)), alpha=0.75)

@@ -45,7 +45,7 @@ from ..scenes.training.problem import exposure_of
 from ..scenes.training.references import ReferenceRenders
 from ..scenes.training.trained_scene import TrainedScene, original_of, texture_file
 from ..tasks.texture.compressed import load
-from .equal_memory import Contender, add_without_option, check_without
+from .equal_memory import Contender
 
 #: Names of the runs.
 AFTER = "hemisphere, then scene"
@@ -53,10 +53,6 @@ LONGER = "hemisphere, longer"
 FEW = "scene, few samples"
 OTHER = "another material"
 MENDED = f"{OTHER}, then hemisphere"
-WAYS = (
-    "start", "scene", "hemisphere", LONGER, AFTER, "untrained, then scene", FEW,
-    OTHER, f"{OTHER}, then scene", MENDED, f"{MENDED}, then scene",
-)  # fmt: skip
 
 
 #: Ranges of camera and lights of the scenes that ship, by the name of the file.
@@ -145,11 +141,9 @@ class SceneTrainingStudy(Study):
                             help="steps of each training inside a scene (default: 400; --quick: 2)")  # fmt: skip
         parser.add_argument("--width", type=positive, metavar="N",
                             help="pixels of a row of renders (default: 96; --quick: 16)")  # fmt: skip
-        add_without_option(parser)
 
     def check(self, arguments) -> None:
-        """Check that the scenes and the runs to leave out exist."""
-        check_without(arguments.without, WAYS)
+        """Check that the scenes exist."""
         arguments.paths = scene_files(arguments.scenes, arguments.quick)
 
     def plan(self, arguments) -> Plan:
@@ -161,7 +155,7 @@ class SceneTrainingStudy(Study):
             steps=arguments.steps or settings.steps,
             width=arguments.width or settings.width,
         )
-        return plan(arguments.paths, settings, arguments.without)
+        return plan(arguments.paths, settings)
 
 
 STUDY = SceneTrainingStudy()
@@ -313,7 +307,7 @@ def training_run(
     text = "" if share is None else f", λ {share:g}"
     return KeptRun(
         f"{context.name}, {method}{text}, {spp} spp", method, spp, fit, lambda job: load(job.file),
-        details={"context": context, "share": share, "after": after, "as_long": as_long},
+        details={"context": context, "share": share},
     )  # fmt: skip
 
 
@@ -339,8 +333,8 @@ def other_maps(source: Path) -> dict[str, np.ndarray]:
     return maps
 
 
-def planned_runs(context: SceneTrainingContext, without: Sequence[str]) -> list[Contender]:
-    """Return the runs of a scene in their order, ``without`` those of these names and those that start from them."""
+def planned_runs(context: SceneTrainingContext) -> list[Contender]:
+    """Return the runs of a scene in their order."""
     settings, default = context.settings, SceneRecipe().share
     share = default if default in settings.lambdas else settings.lambdas[-1]
 
@@ -353,7 +347,7 @@ def planned_runs(context: SceneTrainingContext, without: Sequence[str]) -> list[
     scene, other = inside("scene"), run(OTHER, "texture")
     hemisphere = run("hemisphere", "shading", as_long=scene)
     mended = run(MENDED, "shading", after=other, as_long=scene)
-    runs = [
+    return [
         *(run("start", spp=spp) for spp in settings.counts), scene, hemisphere, run(LONGER, "shading"),
         inside(AFTER, hemisphere), inside("untrained, then scene", begin="untrained"), inside(FEW, samples=1),
         other, inside(f"{OTHER}, then scene", other), mended, inside(f"{MENDED}, then scene", mended),
@@ -361,18 +355,11 @@ def planned_runs(context: SceneTrainingContext, without: Sequence[str]) -> list[
         *(inside("scene", spp=spp) for spp in settings.counts[1:]),
     ]  # fmt: skip
 
-    def wanted(run: Contender) -> bool:
-        return run.method not in without and all(
-            wanted(r) for r in (run.details["after"], run.details["as_long"]) if r is not None
-        )
 
-    return [run for run in runs if wanted(run)]
-
-
-def plan(paths: Sequence[Path], settings: SceneTrainingSettings, without: Sequence[str] = ()) -> Plan:
-    """Return the plan for scene files in the current variant, ``without`` the runs of these names."""
+def plan(paths: Sequence[Path], settings: SceneTrainingSettings) -> Plan:
+    """Return the plan for scene files in the current variant."""
     contexts = [SceneTrainingContext(path, settings) for path in paths]
-    runs = [run for context in contexts for run in planned_runs(context, without)]
+    runs = [run for context in contexts for run in planned_runs(context)]
 
     def candidate(run: Contender) -> Candidate:
         def errors(samples: int) -> dict[str, float]:

@@ -128,11 +128,8 @@ class ShadingStudySettings:
 #: Options with a positive number → help.
 _NUMBERS = {
     "--seeds": "number of seeds of each training (default: 3; --quick: 1)",
-    "--seconds": "seconds of training for shading (default: 15; --quick: 1)",
-    "--pretrain-seconds": "seconds of training as a texture before (default: 20; --quick: 1)",
-    "--steps": "steps of training for shading in place of seconds, independent of the machine's speed; needs "
-    "--pretrain-steps",
-    "--pretrain-steps": "steps of training as a texture",
+    "--steps": "steps of training for shading (default: 15 seconds; --quick: 1 second); needs --pretrain-steps",
+    "--pretrain-steps": "steps of training as a texture before (default: 20 seconds; --quick: 1 second)",
     "--side": "texels on a side of generated materials (default: 512; --quick: 64)",
     "--frames": "frames of the zoom (default: 60; --quick: 4)",
 }
@@ -174,8 +171,6 @@ class ShadingStudy(Study):
         """Check the options and load the materials; raise as :func:`.load_source` does."""
         if (arguments.steps is None) != (arguments.pretrain_steps is None):
             raise ValueError("--steps and --pretrain-steps: found one of them, both or none are allowed")
-        if arguments.steps and (arguments.seconds or arguments.pretrain_seconds):
-            raise ValueError("--steps: found beside seconds, only one of them is allowed")
         if arguments.extras and arguments.preset == "paper":
             raise ValueError("--extras: the arrays of the preset paper have none")
         arguments.ratio = parse_compression(arguments.compression)
@@ -203,8 +198,8 @@ class ShadingStudy(Study):
             tuple(sorted({0.0, *(arguments.lambdas or ((0.9,) if quick else LAMBDAS))})),
             ways[:: len(ways) - 1] if quick and len(ways) > 1 else ways,
             arguments.seeds or (1 if quick else 3),
-            float(arguments.steps or arguments.seconds or (1 if quick else 15)),
-            float(arguments.pretrain_steps or arguments.pretrain_seconds or (1 if quick else 20)),
+            float(arguments.steps or (1 if quick else 15)),
+            float(arguments.pretrain_steps or (1 if quick else 20)),
             arguments.ratio,
             arguments.frames or (4 if quick else 60),
             quick,
@@ -426,11 +421,14 @@ class ShadingStudyContext:
         trained.preset, trained.seed = self.settings.preset, seed
         return trained, result
 
-    def trained(self, method: str, label: str, train: Callable[[bool], tuple[Table, FitResult, dict]]) -> Contender:
+    def trained(
+        self, method: str, label: str, train: Callable[[bool], tuple[Table, FitResult, dict]],
+        finish: Callable[[dict], None] = lambda record: None,
+    ) -> Contender:  # fmt: skip
         """Return the contender of a texture that ``train(progress)`` trains; its table stays in the folder of models.
 
-        ``train`` returns the table, the record of the training, and further details. The model has the attribute
-        ``table``.
+        ``train`` returns the table, the record of the training, and further details; ``finish`` completes the record.
+        The model has the attribute ``table``.
         """
 
         def fit(job: Contender, progress: bool) -> dict | None:
@@ -442,7 +440,9 @@ class ShadingStudyContext:
             job.model = TrainedReader(table, self)
             training = {"steps": result.steps, "kept_step": result.step, "restarts": result.restarts,
                         "history": result.history, "training_seconds": result.seconds}  # fmt: skip
-            return self.measure(job, table.nbytes, **training, **details)
+            record = self.measure(job, table.nbytes, **training, **details)
+            finish(record)
+            return record
 
         def read(job: Contender) -> TrainedReader:
             return TrainedReader(task.tasks()["texture"].load(job.file), self)
@@ -501,18 +501,13 @@ class ShadingStudyContext:
                 details["has_extras"] = table.settings.get("shading", {}).get("extras", False)
             return table, result, details
 
+        def finish(record: dict) -> None:
+            before = base.record["details"] if base is not None and base.record else None
+            record["details"]["trouble"] = troubles(record["details"], before)
+
         name = f"extras, seed {seed}" if extras else f"lambda {share:g}, {way.name}, seed {seed}"
-        job = self.trained("extras" if extras else "run", name, train)
-        fit = job.fit
-
-        def fit_with_troubles(job: Contender, progress: bool) -> dict | None:
-            record = fit(job, progress)
-            if record is not None:
-                before = base.record["details"] if base is not None and base.record else None
-                record["details"]["trouble"] = troubles(record["details"], before)
-            return record
-
-        job.fit, job.details = fit_with_troubles, {"share": share, "way": way, "base": base, "start": start}
+        job = self.trained("extras" if extras else "run", name, train, finish)
+        job.details = {"share": share, "way": way, "base": base, "start": start}
         return job
 
 

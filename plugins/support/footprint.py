@@ -13,7 +13,7 @@ The functions of this module neither evaluate nor differentiate: footprints are 
 from __future__ import annotations
 
 import weakref
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import drjit as dr
@@ -46,7 +46,7 @@ class Cone:
     - ``origin``: the centre of projection, or of the lens; ``axis``: the unit vector of the viewing direction;
     - ``dx``, ``dy``: the shift of the visible place for a step of one pixel to the right, or down, at depth 1 along the
       axis (for an orthographic sensor, at any depth);
-    - ``scale``: the width of a sample's footprint relative to a pixel's (:func:`scale_of`);
+    - ``scale``: the width of a sample's footprint relative to a pixel's (:func:`sample_scale`);
     - ``reach``: the least √(cos³) of the angle between a pixel and the axis, 1 if orthographic;
     - ``lens``: the radius of the lens, 0 without one;
     - ``corner``: the visible place at the film's corner, relative to ``origin`` and at the depth of ``dx``; ``None``
@@ -147,7 +147,7 @@ class Cone:
     @classmethod
     def _opaque(cls, projection, origin, axis, dx, dy, spp, reach, lens) -> Cone:
         vectors = (dr.opaque(mi.Vector3f, [float(x) for x in v]) for v in (axis, dx, dy))
-        numbers = (dr.opaque(mi.Float, float(x)) for x in (scale_of(spp), reach, lens))
+        numbers = (dr.opaque(mi.Float, float(x)) for x in (sample_scale(spp), reach, lens))
         return cls(projection, dr.opaque(mi.Point3f, [float(x) for x in origin]), *vectors, *numbers)
 
     @property
@@ -156,7 +156,7 @@ class Cone:
         return dr.norm(self.dx)
 
 
-def scale_of(spp: float) -> float:
+def sample_scale(spp: float) -> float:
     """Return the width of a sample's footprint relative to the pixel's: max(1/8, 1/√spp), as in pbrt-v4."""
     return float(max(1 / 8, 1 / np.sqrt(max(spp, 1))))
 
@@ -277,7 +277,7 @@ def _finite(v: mi.Vector2f) -> mi.Vector2f:
     return dr.select(dr.isnan(v), 0, dr.clip(v, -LARGEST, LARGEST))
 
 
-def transformed(ddx: mi.Vector2f, ddy: mi.Vector2f, matrix) -> tuple[mi.Vector2f, mi.Vector2f]:
+def transform(ddx: mi.Vector2f, ddy: mi.Vector2f, matrix) -> tuple[mi.Vector2f, mi.Vector2f]:
     """Apply ``to_uv`` to a footprint in uv; ``matrix``, 3 × 3, is a list of its rows."""
     (a, b), (c, d) = (tuple(row)[:2] for row in tuple(matrix)[:2])
     return tuple(mi.Vector2f(dr.fma(a, v.x, b * v.y), dr.fma(c, v.x, d * v.y)) for v in (ddx, ddy))
@@ -299,7 +299,7 @@ def axes(ddx: mi.Vector2f, ddy: mi.Vector2f) -> tuple[mi.Float, mi.Float, mi.Vec
     return major, dr.select(major > 0, dr.minimum(area(ddx, ddy) / major, major), 0), direction
 
 
-def joined(ddx: mi.Vector2f, ddy: mi.Vector2f, s: mi.Vector2f, t: mi.Vector2f) -> tuple[mi.Vector2f, mi.Vector2f]:
+def add_moments(ddx: mi.Vector2f, ddy: mi.Vector2f, s: mi.Vector2f, t: mi.Vector2f) -> tuple[mi.Vector2f, mi.Vector2f]:
     """Return the axes, major first, of two footprints blurred by each other: the second moments are added."""
     ddx, ddy, s, t = (_finite(v) for v in (ddx, ddy, s, t))
     p, q, r = (a + b for a, b in zip(_moments(ddx, ddy), _moments(s, t), strict=True))
@@ -387,3 +387,104 @@ def attached_sensor(texture) -> tuple[int, str]:
 
 #: Texture → :func:`attached_sensor`.
 _attached: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()
+
+
+#: Largest angle that a rough bounce adds to a sample's cone, in rad. The full angle of a diffuse lobe would be 1.8, and
+#: would blur textures so much that colour bleeds from places that send no light.
+WIDEST = 0.5
+
+#: Smallest absolute value of cosines in denominators.
+GRAZING = 1e-4
+
+
+@dataclass  # a type that loops of Dr.Jit accept as state
+class Differentials:
+    """Differentials of the rays of a wavefront.
+
+    A step in x or y adds ``ox`` or ``oy`` to the origin and ``dx`` or ``dy`` to the direction, all ``mi.Vector3f``.
+    Rough bounces add a cone around the ray, which is ``width`` wide at the origin and grows by ``spread`` per unit of
+    length.
+    """
+
+    ox: mi.Vector3f
+    oy: mi.Vector3f
+    dx: mi.Vector3f
+    dy: mi.Vector3f
+    width: mi.Float
+    spread: mi.Float
+
+    @classmethod
+    def from_ray(cls, ray) -> Differentials:
+        """Return those of a sensor's rays (``mi.RayDifferential3f``, scaled for samples); zero for other rays."""
+        if not (hasattr(ray, "d_x") and ray.has_differentials):
+            return cls(*(mi.Vector3f(0) for _ in range(4)), mi.Float(0), mi.Float(0))
+        ray = dr.detach(ray)
+        differences = (ray.o_x - ray.o, ray.o_y - ray.o, ray.d_x - ray.d, ray.d_y - ray.d)
+        return cls(*(mi.Vector3f(v) for v in differences), mi.Float(0), mi.Float(0))
+
+    def at(self, ray, si) -> Differentials:
+        """Return the differentials at a hit.
+
+        ``ox`` and ``oy`` are the shifts of the place on the tangent plane, ``width`` is the width of the cone there,
+        perpendicular to the ray.
+        """
+        n, d, t = mi.Vector3f(dr.detach(si.n)), dr.detach(ray.d), dr.select(si.is_valid(), dr.detach(si.t), 0)
+        cosine = _away_from_zero(dr.dot(n, d))
+
+        def moved(o, v):
+            o = o + t * v
+            return o - d * (dr.dot(n, o) / cosine)
+
+        return replace(
+            self, ox=moved(self.ox, self.dx), oy=moved(self.oy, self.dy), width=dr.fma(self.spread, t, self.width)
+        )
+
+    def footprint(self, ray, si) -> tuple[mi.Vector2f, mi.Vector2f]:
+        """Return the footprint ``ddx, ddy`` in uv at a hit (:meth:`at`).
+
+        The second moments of the steps' parallelogram and of the cone's disc are added.
+        """
+        du, dv = dr.detach(si.dp_du), dr.detach(si.dp_dv)
+        ddx, ddy = in_uv(self.ox, self.oy, ray.d, du, dv)
+        frame = mi.Frame3f(ray.d)
+        s, t = in_uv(self.width * frame.s, self.width * frame.t, ray.d, du, dv)
+        both = add_moments(ddx, ddy, s, t)
+        wide = self.width > 0
+        return dr.select(wide, both[0], ddx), dr.select(wide, both[1], ddy)
+
+    def bounce(self, ray, si, wo, eta, pdf, delta, scale, edges) -> Differentials:
+        """Return the differentials after a bounce at a hit (:meth:`at`) into the direction ``wo`` (world space).
+
+        ``pdf`` is the density of the direction per solid angle, unless it is the only one (``delta``); ``eta`` is the
+        relative index of refraction in that direction; ``scale`` is the scale of a sample's footprint.
+
+        The bounce is treated as that of a mirror, or of a smooth boundary, with the normal that maps one direction to
+        the other: a shading normal, a mapped normal or the normal of a microfacet. Its curvature is that of the
+        surface: ``dn_du`` and ``dn_dv`` belong to the ``edges`` (:func:`mi_diffind.core.compat.normal_edges`). Without
+        ``delta``, the ``spread`` s of the cone grows to √(s² + a²) with a² = scale² / pdf, the solid angle of one
+        sample's share of the lobe; a is at most :data:`WIDEST`.
+        """
+        d, wo, outward = dr.detach(ray.d), dr.detach(wo), mi.Vector3f(dr.detach(si.sh_frame.n))
+        ratio = dr.select(eta > 0, dr.rcp(eta), 1)
+        # ratio · d − wo is parallel to the normal; it is zero for an undeflected ray, where any normal is valid
+        normal = ratio * d - wo
+        length2 = dr.squared_norm(normal)
+        normal = dr.select(length2 > 1e-8, normal * dr.rsqrt(length2), outward)
+        normal = dr.mulsign(normal, dr.dot(normal, outward))
+        before, after = dr.dot(d, normal), dr.dot(wo, normal)
+        bend = ratio * before - after
+        slope = ratio - ratio * ratio * before / _away_from_zero(after)
+
+        turned = []
+        coefficients = in_uv(self.ox, self.oy, outward, *edges)
+        for v, uv in zip((self.dx, self.dy), coefficients, strict=True):
+            dn = dr.detach(si.dn_du) * uv.x + dr.detach(si.dn_dv) * uv.y
+            dn = dn - normal * dr.dot(normal, dn)
+            v = ratio * v - bend * dn - slope * (dr.dot(v, normal) + dr.dot(d, dn)) * normal
+            turned.append(dr.select(dr.isfinite(dr.squared_norm(v)), v, 0))
+        angle2 = dr.select(delta | ~(pdf > 0), 0, dr.minimum(dr.square(scale) / pdf, WIDEST**2))
+        return replace(self, dx=turned[0], dy=turned[1], spread=dr.sqrt(dr.fma(self.spread, self.spread, angle2)))
+
+
+def _away_from_zero(cosine):
+    return dr.select(dr.abs(cosine) < GRAZING, dr.mulsign(mi.Float(GRAZING), cosine), cosine)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import hashlib
 import shutil
 import threading
@@ -20,7 +19,15 @@ from mi_diffind.core import compat
 from mi_diffind.core.archives import LimitError
 from mi_diffind.core.compat import module_of
 from mi_diffind.core.errors import DiffindError
-from mi_diffind.core.files import OutsideError, is_within, path_within, relative_path, stamp, write_json
+from mi_diffind.core.files import (
+    OutsideError,
+    is_within,
+    path_within,
+    read_once,
+    relative_path,
+    stamp,
+    write_json,
+)
 from mi_diffind.fitting.task import Task
 from mi_diffind.images.headers import check_picture
 from mi_diffind.maps.compressed import CompressedMaps
@@ -30,7 +37,7 @@ from mi_diffind.maps.source import Source, SourceError, from_arrays, load_source
 
 from .. import warn
 from . import properties
-from .stock import Kept
+from .properties import Kept
 from .tables import Entries, exposed
 
 STORAGES = ("uint8", "float32")
@@ -95,22 +102,6 @@ class SharedMaps:
             return self._transforms[key]
 
 
-def open_file(task: Task, path: str | Path, storage: str) -> SharedMaps:
-    """Return the maps in a file of a task whose models have an ``image``. Raises ``TableError``.
-
-    They are shared by all textures that have the file open, unless their arrays have been changed since.
-    """
-    path = Path(path)
-
-    def load():
-        model = task.model(task.load(path), mi.TensorXf, storage)
-        if storage == "float32" and not model.arrays:
-            warn(f'parameter "storage": found "float32", but {path} is of one colour: it has no arrays to optimise')
-        return SharedMaps(model.image, model.arrays, model.table)
-
-    return shared((task.name, str(path.resolve()), *stamp(path), storage, mi.TensorXf), load)
-
-
 def shared(key: tuple, load: Callable[[], SharedMaps]) -> SharedMaps:
     """Return ``load()``, or its earlier result for this ``key`` if that is still in use and unchanged."""
     with _lock:
@@ -121,14 +112,25 @@ def shared(key: tuple, load: Callable[[], SharedMaps]) -> SharedMaps:
 
 
 def open_compressed(task: Task, props: mi.Properties) -> tuple[SharedMaps, str]:
-    """Return the maps that the properties ``filename`` and ``storage`` name, and the path of the file."""
+    """Return the maps that the properties ``filename`` and ``storage`` name, and the path of the file.
+
+    ``task`` is one whose models have an ``image``. The maps are shared by all textures that have the file open, unless
+    their arrays have been changed since. Raises ``RuntimeError``.
+    """
     path = properties.filename(props)
     if not path:
         raise RuntimeError('parameter "filename": not given, a compressed image (.npz) is needed')
     storage = properties.one_of(props, "storage", STORAGES)
     props.get("source", "")  # only the exact counterpart needs it
+
+    def load() -> SharedMaps:
+        model = task.read(path, mi.TensorXf, storage)
+        if storage == "float32" and not model.arrays:
+            warn(f'parameter "storage": found "float32", but {path} is of one colour: it has no arrays to optimise')
+        return SharedMaps(model.image, model.arrays, model.table)
+
     try:
-        return open_file(task, path, storage), path
+        return shared((task.name, str(Path(path).resolve()), *stamp(Path(path)), storage, mi.TensorXf), load), path
     except TableError as e:
         raise RuntimeError(f'parameter "filename": {e}') from None
 
@@ -137,9 +139,10 @@ def open_uncompressed(props: mi.Properties, wrap_mode: str) -> tuple[SharedMaps,
     """Return the mip pyramid that the properties name, and the path of its file ("" without a file).
 
     ``filename`` names an image or a manifest, ``bitmap`` is an object, ``pyramid`` names one of :data:`PYRAMIDS`. With
-    ``raw``, sRGB values are not converted.
+    ``raw``, sRGB values are not converted. Raises ``RuntimeError``.
     """
-    given = [name for name in ("filename", "bitmap", "pyramid") if name in props]
+    path = properties.filename(props)
+    given = [name for name in ("filename", "bitmap", "pyramid") if name in props and (name != "filename" or path)]
     if len(given) != 1:
         names = " and ".join(f'"{name}"' for name in given) or "none"
         raise RuntimeError(f'parameters "filename", "bitmap" and "pyramid": found {names}, exactly one is needed')
@@ -165,7 +168,6 @@ def open_uncompressed(props: mi.Properties, wrap_mode: str) -> tuple[SharedMaps,
             source = dataclasses.replace(source, maps=maps)
         return SharedMaps(Pyramid.of(source, types=types, border=border), {})
 
-    path = properties.filename(props)
     try:
         if not path:
             return load(), ""
@@ -175,27 +177,26 @@ def open_uncompressed(props: mi.Properties, wrap_mode: str) -> tuple[SharedMaps,
 
 
 def _source_of(bitmap) -> Source:
-    """Return a ``mi.Bitmap`` as a source of one map, ``image``."""
+    """Return a ``mi.Bitmap`` as a source of one map, ``image``, without alpha."""
     if not isinstance(bitmap, mi.Bitmap):
         raise RuntimeError(f'parameter "bitmap": found a {type(bitmap).__name__}, a Bitmap is needed')
     values = np.array(bitmap)
     values = values.reshape(*values.shape[:2], -1)
-    values = values[..., : 3 if values.shape[2] > 3 else 1 if values.shape[2] == 2 else None]  # without alpha
+    values = values[..., : 3 if values.shape[2] > 3 else 1 if values.shape[2] == 2 else None]
     return from_arrays({"image": values}, {"image": "srgb" if bitmap.srgb_gamma() else "linear"}, nonfinite="clean")
 
 
 def map_of(layout: Layout, channels: str) -> MapLayout:
     """Return the map called ``channels``; if that is empty, the only map, or the only albedo."""
-    if channels and channels not in layout.names:
-        raise RuntimeError(f'parameter "channels": found "{channels}", the file holds {", ".join(layout.names)}')
-    if channels:
-        chosen = layout[channels]
-    else:
-        candidates = layout.maps if len(layout.maps) == 1 else [m for m in layout.maps if m.role == "albedo"]
-        if len(candidates) != 1:
-            names = ", ".join(layout.names)
-            raise RuntimeError(f'parameter "channels": not given, and the file holds several maps: {names}')
-        chosen = candidates[0]
+    names = ", ".join(layout.names)
+    candidates = [m for m in layout.maps if m.name == channels or not channels]
+    if not candidates:
+        raise RuntimeError(f'parameter "channels": found "{channels}", the file holds {names}')
+    if len(candidates) > 1:
+        candidates = [m for m in candidates if m.role == "albedo"]
+    if len(candidates) != 1:
+        raise RuntimeError(f'parameter "channels": not given, and the file holds several maps: {names}')
+    (chosen,) = candidates
     if chosen.channels not in (1, 3):
         raise RuntimeError(
             f'parameter "channels": the map "{chosen.name}" has {chosen.channels} channels, a texture has 1 or 3'
@@ -225,26 +226,46 @@ def to_bitmap(task: Task, props: mi.Properties) -> None:
 def to_mipmap(task: Task, props: mi.Properties) -> None:
     """Add the properties that a ``mipmap`` needs to show the original of the map."""
     original, layout = original_of(task, props)
-    if original.suffix.lower() != ".json" and layout.role == "other":  # linear by the name of its file
+    manifest = original.suffix.lower() == ".json"
+    if not manifest and layout.role == "other":  # linear by the name of its file
         to_bitmap(task, props)
-        for name in ("filename", "channels"):
-            if name in props:
-                del props[name]
+        remove(props, "filename", "channels")
         return
     props["filename"] = str(original)
-    if original.suffix.lower() == ".json":
+    remove(props, "channels")
+    if manifest:
         props["channels"] = layout.name
-    elif "channels" in props:
-        del props["channels"]
     if "raw" not in props and is_data(layout):
         props["raw"] = True
 
 
+def remove(props: mi.Properties, *names: str) -> None:
+    """Remove properties, those that are there."""
+    for name in names:
+        if name in props:
+            del props[name]
+
+
 def original_of(task: Task, props: mi.Properties) -> tuple[Path, MapLayout]:
-    """Return the path of the image or manifest that a task's file was made from, and the map that is shown."""
+    """Return the path of the image or manifest that a task's file was made from, and the map that is shown.
+
+    The property ``source`` names the original, else the settings of the file do. Raises ``RuntimeError``.
+    """
     chosen = map_of(layout_of(task, props), str(props.get("channels", "")))
     path = Path(properties.filename(props))
-    return _original(props, path, task.load(path).settings), chosen
+    settings = task.load(path).settings
+    given, recorded = str(props.get("source", "")), str(settings.get("source_path", ""))
+    if not given and not recorded:
+        raise RuntimeError(f'{path}: does not record its original image, give it as the parameter "source"')
+    original = Path(str(mi.file_resolver().resolve(given))) if given else path.parent / recorded
+    if not original.is_file():
+        advice = "" if given else '; if it was moved, give its path as the parameter "source"'
+        raise RuntimeError(f"{original}: no such file, {path.name} was made from it{advice}")
+    # A stranger's file must not show any file of this machine
+    outside = not given and not is_within(path.parent, recorded)
+    if outside and read_once(_digest, original) != settings.get("source"):
+        raise RuntimeError(f"{original}: has changed since {path.name} was made from it")
+    return original, chosen
 
 
 def layout_of(task: Task, props: mi.Properties) -> Layout:
@@ -300,29 +321,7 @@ def _link(link: Path, target: str) -> None:
         shutil.copyfile(link.parent / target, link)
 
 
-def _original(props, path: Path, settings: dict) -> Path:
-    given, recorded = str(props.get("source", "")), str(settings.get("source_path", ""))
-    if given:
-        original = Path(str(mi.file_resolver().resolve(given)))
-    elif recorded:
-        original = path.parent / recorded
-    else:
-        raise RuntimeError(f'{path}: does not record its original image, give it as the parameter "source"')
-    if not original.is_file():
-        advice = "" if given else '; if it was moved, give its path as the parameter "source"'
-        raise RuntimeError(f"{original}: no such file, {path.name} was made from it{advice}")
-    # A stranger's file must not show any file of this machine
-    if (
-        not given
-        and not is_within(path.parent, recorded)
-        and _digest(original, stamp(original)) != settings.get("source")
-    ):
-        raise RuntimeError(f"{original}: has changed since {path.name} was made from it")
-    return original
-
-
-@functools.lru_cache
-def _digest(path: Path, stamp: tuple) -> str:
+def _digest(path: Path) -> str:
     """Return the digest of an image or manifest."""
     try:
         return load_source(path, nonfinite="clean").digest

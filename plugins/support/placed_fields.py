@@ -16,7 +16,7 @@ from mi_diffind.tasks.radiance import march as marching
 from mi_diffind.tasks.radiance.files import load
 from mi_diffind.tasks.radiance.volume_field import VolumeField
 
-from . import properties, upsampling
+from . import properties, textures
 from .placement import Placement, PlacementParameter
 from .tables import arrays_of
 
@@ -162,7 +162,7 @@ class VariantLight:
         scale = 2 * dr.maximum(dr.max(mi.Array3f(*colour)), 1e-20)
         at = dr.zeros(mi.SurfaceInteraction3f)
         at.wavelengths = wavelengths
-        spectrum = upsampling.spectrum([c / scale for c in colour], wavelengths)
+        spectrum = textures.upsampled_spectrum([c / scale for c in colour], wavelengths)
         return mi.Spectrum(spectrum * scale * self.illuminant.eval(at, active))
 
     def adjoint(self, colour, wavelengths, weight, active=True):

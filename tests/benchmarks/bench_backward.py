@@ -199,9 +199,8 @@ def write_grid(path: Path) -> None:
 
 def grid_error(path: Path, normal: str = "smooth", count: int = 2**18) -> float:
     """Return the mean angle, in degrees, of the normals of ``sdfgrid`` from the mesh's, where rays meet both."""
-    from mi_diffind.tasks.sdf.distances import Distances
+    from mi_diffind.tasks.sdf.distances import Distances, sample_surface
     from mi_diffind.tasks.sdf.mesh import load_mesh
-    from mi_diffind.tasks.sdf.sampling import sample_surface
 
     mesh = load_mesh(str(ASSETS / "suzanne.ply"))
     points, normals = sample_surface(Distances(mesh).surface, count, 1)

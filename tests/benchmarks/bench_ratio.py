@@ -46,6 +46,7 @@ from mi_diffind.tasks.radiance import dense_bytes, files, ratio_for
 from mi_diffind.tasks.radiance import fit as field_fit
 from mi_diffind.tasks.radiance import paper as field_paper
 from mi_diffind.tasks.sdf import paper as sdf_paper
+from mi_diffind.tasks.sdf.model import build_field
 from mi_diffind.tasks.texture import arrays as texture_budget
 
 #: Side and channels of the image, and the largest difference of bytes from those of a budget.
@@ -212,8 +213,13 @@ def sdf_training(distances) -> Training:
 
     def train(layout: Layout, seed: int) -> dict:
         request = request_of("sdf", "paper", seed, ratio=layout.ratio)
-        table, _, field = sdf_paper.fit_pair(distances, int(layout.budget), request, SAMPLES, HELD_OUT)
-        errors = evaluation.measure(field)
+        extent = distances.mesh.upper - distances.mesh.lower
+        shapes = sdf_paper.resolutions(int(layout.budget), layout.ratio, extent)
+        problem = sdf_paper.PairProblem(distances, shapes, "ramp", request.types, seed, SAMPLES, HELD_OUT)
+        request.train(problem)
+        table = problem.table(seed)
+        arrays = tasks()["sdf"].allocate(table, request.types.TensorXf)
+        errors = evaluation.measure(build_field(table, arrays, request.types))
         return {"bytes": table.nbytes, **{name: float(f"{value:.6g}") for name, value in errors.items()}}
 
     return train

@@ -164,7 +164,7 @@ def dense_table(shape=torus, half=(0.6, 0.6, 0.25), resolution=(48, 48, 20), sca
     net = paper.stored_form(net.alloc(array_module("llvm").TensorXf))
     arrays = {"primary": StoredArray.of(net.primary[0]), "cascaded": StoredArray.of(net.cascaded)}
     settings = {"layout": "pair", "lower": (-upper).tolist(), "upper": upper.tolist(), "band": band, "scale": scale}
-    settings |= {"slope": paper.slope_of(net, -upper, upper, band), "centre": list(centre)}
+    settings |= {"slope": paper.slope_bound(net, -upper, upper, band), "centre": list(centre)}
     return Table("sdf", arrays, "dense", settings)
 
 

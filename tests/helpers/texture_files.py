@@ -6,6 +6,9 @@ from arrays import aligned
 from mi_diffind.arrays.tables import save_table
 from mi_diffind.core.runtime import array_module
 from mi_diffind.maps.pyramid import Pyramid
+from mi_diffind.tasks import image
+from mi_diffind.tasks.image import arrays as image_arrays
+from mi_diffind.tasks.image import training as image_training
 from mi_diffind.tasks.texture import PRESETS, arrays, training
 from mi_diffind.tasks.texture.compressed import CompressedTexture, to_table
 from mi_diffind.tasks.texture.nets import neutral_extras
@@ -32,4 +35,16 @@ def make(path, source, preset="ours", border="repeat", extras=None, **settings):
         net.extras = neutral_extras(source.height, source.width, net.border).alloc(types.TensorXf)
         net.extras.data = types.TensorXf(aligned(extras(net.extras.numpy().shape)))
     save_table(path, to_table(CompressedTexture(pyramid.layout, training.stored_form(net)), settings))
+    return str(path)
+
+
+def make_image(path, source, border="repeat"):
+    """Write a file of the task ``image`` whose arrays are those at the start of a training, almost without loss."""
+    recipe, types = image.PRESETS["ours"], array_module("llvm")
+    stored = image_training.layout_of(source, recipe).stored
+    dims = min(3, stored)
+    size = image_arrays.ImageBudget(source.height, source.width, 8, stored, dims, 8)
+    problem = image_training.problem_of(source, size, recipe, types, border=(border, border))
+    stored_net = image_training.stored_form(problem.net, problem.bits)
+    save_table(path, image_arrays.to_table(image_arrays.CompressedImage(problem.layout, stored_net), {}))
     return str(path)

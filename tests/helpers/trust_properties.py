@@ -13,6 +13,7 @@ import drjit as dr
 import numpy as np
 import plugin_examples as examples
 from arrays import aligned, numpy_of
+from bsdf_queries import random_directions, uniform, vectors
 
 from mi_diffind import plugins
 
@@ -73,9 +74,7 @@ def kept_away(mi, name: str, types: tuple[str, ...], reason: str) -> Cell | None
 
 def directions(mi, rng, count: int, low: float = 0.05):
     """Return random directions of the upper hemisphere."""
-    z, phi = low + (1 - low) * rng.random(count), 2 * np.pi * rng.random(count)
-    r = np.sqrt(1 - z * z)
-    return mi.Vector3f(*(aligned(v) for v in (r * np.cos(phi), r * np.sin(phi), z)))
+    return vectors(mi, random_directions(rng, count, low))
 
 
 def hits(mi, wi, uv=None, count: int = 0):
@@ -98,12 +97,6 @@ def spectrum(mi, value) -> list:
     return list(mi.unpolarized_spectrum(value))
 
 
-def numbers(mi, rng, count: int):
-    """Return the random numbers of a sample of a BSDF."""
-    u = [mi.Float(aligned(rng.random(count))) for _ in range(3)]
-    return u[0], mi.Point2f(u[1], u[2])
-
-
 def energy(mi, name: str, effort: Effort) -> Cell:
     """Directional albedo of bright materials: the largest of all angles and channels, by importance sampling."""
     if cell := kept_away(mi, name, ("bsdf",), "only materials scatter light"):
@@ -113,7 +106,7 @@ def energy(mi, name: str, effort: Effort) -> Cell:
         bsdf = mi.load_dict(examples.example(name, **more))
         for degrees in (0, 30, 60, 80, 88):
             si = hits(mi, incident(mi, degrees), count=effort.lanes)
-            _, weight = bsdf.sample(ctx, si, *numbers(mi, rng, effort.lanes))
+            _, weight = bsdf.sample(ctx, si, *uniform(mi, rng, effort.lanes))
             values = numpy_of(spectrum(mi, weight))
             error = values.std(axis=0) / math.sqrt(effort.lanes)
             largest = max(largest, *zip(values.mean(axis=0), error, [degrees] * len(error), strict=True))

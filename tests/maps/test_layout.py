@@ -55,17 +55,6 @@ def test_colours_are_stored_as_they_are():
     np.testing.assert_array_equal(back(layout, source)["albedo"], source.maps[0].values)
 
 
-def test_grey_is_stored_once():
-    grey = np.repeat(noise(5, 4, 1), 3, axis=-1)
-    source = from_arrays({"albedo": grey})
-    layout = Layout.of(source)
-    assert layout.maps[0].where == (0, 0, 0) and layout.stored == 1 and layout.needed("albedo") == (0,)
-    np.testing.assert_array_equal(back(layout, source)["albedo"], source.maps[0].values)
-    layout = Layout.of(source, once=False)
-    assert layout.maps[0].where == (0, 1, 2) and layout.stored == 3
-    np.testing.assert_array_equal(back(layout, source)["albedo"], source.maps[0].values)
-
-
 def test_equal_channels_of_different_maps_are_stored_once():
     albedo = noise(5, 4, 3)
     source = from_arrays({"albedo": albedo, "height": albedo[..., 2], "other": albedo[..., 2] // 2})
@@ -91,36 +80,6 @@ def test_constant_channels_are_numbers():
     for m in source.maps:
         np.testing.assert_array_equal(found[m.name], m.values)
     assert Layout.of(source, once=False).stored == 5
-
-
-def test_nothing_is_stored_of_one_colour():
-    source = from_arrays({"albedo": np.full((3, 2, 3), (1, 2, 3), np.uint8)})
-    layout = Layout.of(source)
-    assert layout.stored == 0 and layout.encode(source).shape == (3, 2, 0)
-    np.testing.assert_array_equal(back(layout, source)["albedo"], source.maps[0].values)
-
-
-def test_sixteen_channels():
-    values = noise(5, 4, 16, dtype=np.float16)
-    source = from_arrays({"a": values[..., :7], "b": values[..., 7:]})
-    layout = Layout.of(source)
-    assert layout.stored == 16 and layout.maps[1].where == tuple(range(7, 16))
-    assert layout.source_nbytes == source.nbytes == values.nbytes
-    found = back(layout, source)
-    np.testing.assert_allclose(np.concatenate([found["a"], found["b"]], axis=-1), values, atol=1e-6)
-
-
-def test_initial_values_are_the_supplements():
-    names = {"albedo": 3, "normal": 3, "roughness": 1, "ao": 1, "metallic": 1, "height": 1}
-    source = from_arrays({name: noise(5, 4, c, seed=i) for i, (name, c) in enumerate(names.items())})
-    initial = dict.fromkeys(names, ())
-    layout = Layout.of(source, once=False, two_channel_normals=False)
-    for group, value in zip(layout.groups, layout.initial, strict=True):
-        initial[group] += (value,)
-    assert initial == {
-        "albedo": (0.5, 0.5, 0.5), "normal": (0.5, 0.5, 1.0), "roughness": (0.5,), "ao": (1.0,), "metallic": (0.0,),
-        "height": (0.0,),
-    }  # fmt: skip
 
 
 # -- normals ----------------------------------------------------------------------------------------------------------
@@ -194,22 +153,6 @@ def test_high_dynamic_range_is_logarithmic(largest):
     bright = values > knee
     assert (np.abs(found / np.maximum(values, 1e-30) - 1)[bright] <= 1.05 * step).all()
     np.testing.assert_allclose(back(layout, source)["image"], values, rtol=1e-4, atol=1e-5 * knee)
-
-
-def test_ranges_of_values_to_one():
-    """Bytes, colours and normals stand for 0 to 1; other data of more bits for what they reach, if that is little."""
-    values = noise(5, 4, 3, dtype=np.float32)
-    values[0, 0] = 1
-    for name, data, spaces in (
-        ("image", np.rint(255 * values).astype(np.uint8), None),
-        ("albedo", values, {"albedo": "srgb"}),
-        ("height", values, None),
-    ):
-        m = Layout.of(from_arrays({name: data}, spaces)).maps[0]
-        assert (m.low, m.high, m.knee) == (0, 1, 0), name
-        np.testing.assert_array_equal(m.encode(values), values)
-    m = Layout.of(from_arrays({"height": 0.02 * values})).maps[0]
-    assert (m.low, m.high) == pytest.approx((0.02 * values.min(), 0.02)) and m.knee == 0
 
 
 @pytest.mark.parametrize("low, high", [(-1, 1), (-3, -2), (-1e-3, 7), (-1e30, 1e30), (-65504, 0), (-1e-40, 1e-40)])
@@ -304,11 +247,6 @@ def test_json_round_trip():
     source = from_arrays({"normal": unit_normals(), "height": hdr(1e30)[:9, :8, 0], "ao": np.zeros((9, 8), np.uint8)})
     layout = Layout.of(source)
     assert Layout.from_json(json.loads(json.dumps(layout.to_json()))) == layout
-
-
-def test_a_map_that_is_not_there():
-    with pytest.raises(KeyError, match=r'found the map "x", the file holds albedo, normal'):
-        LAYOUT["x"]
 
 
 INFINITY, HUGE = float("inf"), 10**400

@@ -6,7 +6,7 @@ from arrays import aligned, numpy_of
 
 from mi_diffind.core.runtime import array_module
 from mi_diffind.maps.layout import Layout
-from mi_diffind.maps.pyramid import Pyramid, halved, level_sizes
+from mi_diffind.maps.pyramid import Pyramid, level_sizes
 from mi_diffind.maps.source import from_arrays
 
 
@@ -101,23 +101,6 @@ def test_no_footprint_is_bilinear(ad, rng, border):
         np.testing.assert_allclose(stored(pyramid, u, v), expected, atol=2e-5)
         for level in (0, -1, -1e30, np.nan, -np.inf):
             np.testing.assert_allclose(filtered(pyramid, u, v, level), expected, atol=2e-5)
-
-
-@pytest.mark.parametrize("border", ["repeat", "clamp"])
-def test_whole_levels_are_bilinear_in_them(ad, rng, border):
-    from scipy.ndimage import map_coordinates
-
-    pyramid = Pyramid.of(from_arrays({"data": noise(rng, 13, 22, 2)}), types=ad, border=(border, border))
-    u, v = rng.random((2, 300), dtype=np.float32)
-    mode = {"repeat": "grid-wrap", "clamp": "nearest"}[border]
-    for level, values in enumerate(pyramid.values):
-        rows, columns = values.shape[:2]
-        place = [np.float64(v) * rows - 0.5, np.float64(u) * columns - 0.5]
-        expected = np.stack([map_coordinates(values[..., c], place, order=1, mode=mode) for c in range(2)], axis=-1)
-        np.testing.assert_allclose(filtered(pyramid, u, v, level), expected, atol=1e-5)
-        # At its texel centres it is the level itself
-        own = filtered(pyramid, *centres(rows, columns), level)
-        np.testing.assert_allclose(own, values.reshape(-1, 2), atol=1e-5)
 
 
 def test_levels_blend_linearly_and_continuously(ad, rng):
@@ -249,15 +232,6 @@ def test_seams(ad, rng, border):
             np.testing.assert_allclose(filtered(pyramid, 7, t, level), filtered(pyramid, 1, t, level), atol=1e-6)
 
 
-def test_odd_numbers_lead_nowhere(ad, rng):
-    odd = np.float32([0, 1, -0.0, np.nan, np.inf, -np.inf, 1e30, -1e30, 1e-40])
-    u, v, level = (x.ravel() for x in np.meshgrid(odd, odd, odd))
-    for border in ("repeat", "clamp"):
-        pyramid = Pyramid.of(from_arrays({"data": noise(rng, 3, 5, 3)}), types=ad, border=(border, border))
-        found = filtered(pyramid, u, v, level)
-        assert np.isfinite(found).all() and found.min() >= 0 and found.max() <= 1
-
-
 def test_gradients_are_finite_and_right(ad, rng):
     import drjit as dr
 
@@ -274,24 +248,6 @@ def test_gradients_are_finite_and_right(ad, rng):
         low, high = (filtered(pyramid, *m).sum(axis=-1) for m in moved)
         slope = (high - low) / (2 * step)
         assert np.median(np.abs(slope - g) / np.maximum(np.abs(slope), 0.05)) < 0.01
-
-
-def test_levels_of_a_codec(ad, rng):
-    values = [noise(rng, rows, columns, 3) for rows, columns in level_sizes(6, 4)]
-    layout = Layout.of(from_arrays({"albedo": rng.integers(0, 256, (6, 4, 3), dtype=np.uint8)}), filtered=True)
-    pyramid = Pyramid(layout, values, ad, ("clamp", "clamp"))
-    for level, expected in enumerate(values):
-        np.testing.assert_allclose(pyramid.decode(level=level)["albedo"], expected, atol=1e-4)
-        own = filtered(pyramid, *centres(*expected.shape[:2]), level)
-        np.testing.assert_allclose(own, expected.reshape(-1, 3), atol=1e-4)
-    with pytest.raises(ValueError, match=r"levels: found \[\(6, 4, 3\)\], expected \[\(6, 4, 3\), \(3, 2, 3\)"):
-        Pyramid(layout, values[:1], ad, ("clamp", "clamp"))
-
-
-def test_texels_one_by_one(ad, rng):
-    pyramid = Pyramid.of(from_arrays({"albedo": rng.integers(0, 256, (5, 6, 3), dtype=np.uint8)}), types=ad)
-    flat = np.concatenate([level.reshape(-1, 3) for level in pyramid.values])
-    np.testing.assert_allclose(numpy_of(pyramid.texels(ad.UInt32(np.arange(len(flat))))), flat, atol=1e-6)
 
 
 # -- against OpenImageIO ----------------------------------------------------------------------------------------------
@@ -328,9 +284,3 @@ def test_openimageio_filters_alike(ad, rng, tmp_path, border):
             for a, b in zip(u, v, strict=True)
         ]
         np.testing.assert_allclose(filtered(pyramid, u, v, level), expected, atol=1e-5)
-
-
-def test_halving_keeps_what_is_one_texel_wide(rng):
-    column = noise(rng, 5, 1, 2)
-    assert halved(column).shape == (2, 1, 2) and halved(column[:1]).shape == (1, 1, 2)
-    np.testing.assert_array_equal(halved(column[:1]), column[:1])

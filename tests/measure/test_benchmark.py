@@ -186,26 +186,6 @@ def test_interruption_keeps_what_is_done_and_the_same_command_goes_on(tmp_path, 
     assert not list(tmp_path.glob("*.partial.json"))
 
 
-@pytest.mark.parametrize("change", ["settings", "details", "sources", "damage"])
-def test_a_run_of_something_else_is_not_gone_on_with(tmp_path, change, capsys, monkeypatch):
-    log = Log()
-    log.stop_at = CALLS - 1
-    measure(small_plan(log), SETTINGS, tmp_path, progress=False)
-    study, settings = small_plan(Log()), SETTINGS
-    if change == "settings":
-        settings = replace(SETTINGS, lanes=2048)
-    elif change == "details":
-        study = small_plan(Log(), details={"side": 2})
-    elif change == "sources":  # another plugin, another clock
-        monkeypatch.setattr(benchmark, "sources", lambda: [Path(__file__)])
-    else:
-        (tmp_path / "tradeoff_small.partial.json").write_text('{"key": [1')
-    result = measure(study, settings, tmp_path)
-    assert not result["resumed"] and not result["interrupted"]
-    said = "is damaged" if change == "damage" else f"is of a run with other {change}"
-    assert f"{said}: starting anew" in capsys.readouterr().err
-
-
 def test_an_error_keeps_what_is_done(tmp_path):
     study = small_plan(Log())
     study.cases[1].queries = lambda lanes: 1 / 0

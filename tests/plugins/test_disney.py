@@ -245,10 +245,7 @@ def test_a_narrow_line_of_a_spectrum_is_not_black():
 
 
 def test_a_texture_shared_by_materials(mi_rgb):
-    """
-    Mitsuba lists a shared texture once, and tells of its change only what it was found in: one of the materials, or, as
-    here in the second part, the scene.
-    """
+    """Mitsuba lists a shared texture once, and tells of its change only one of the materials."""
     mi, form = mi_rgb, "tables"
 
     def spheres(clearcoat):
@@ -261,29 +258,6 @@ def test_a_texture_shared_by_materials(mi_rgb):
         params[key_of(params, "clearcoat.value")] = mi.Float(value)
         params.update()
         assert equal_images(mi.render(scene, spp=4).numpy(), on if value else off)
-
-    described = "".join(
-        f'<shape type="sphere"><point name="center" x="{x}" y="0" z="0"/><bsdf type="{FORMS[form]["type"]}">'
-        f'<float name="roughness" value="{r}"/><ref name="clearcoat" id="coat"/></bsdf></shape>'
-        for x, r in ((-1.5, 0.3), (1.5, 0.6))
-    )
-
-    def image(value, update=None):
-        scene = mi.load_string(
-            '<scene version="3.0.0"><integrator type="direct"/><sensor type="perspective"><transform '
-            'name="to_world"><lookat origin="0,0,9" target="0,0,0" up="0,1,0"/></transform><film type="hdrfilm">'
-            '<integer name="width" value="16"/><integer name="height" value="8"/><rfilter type="box"/></film></sensor>'
-            '<emitter type="constant"/><texture type="uniform" id="coat">'
-            f'<float name="value" value="{value}"/></texture>{described}</scene>'
-        )
-        if update is not None:
-            params = mi.traverse(scene)
-            params["coat.value"] = mi.Float(update)
-            params.update()
-        return mi.render(scene, spp=4).numpy()
-
-    del scene, params
-    assert equal_images(image(0, update=1), image(1))
 
 
 def test_parameters_may_be_colours(mi_any, rng):

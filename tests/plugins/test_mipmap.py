@@ -1,7 +1,4 @@
-"""
-The texture ``mipmap`` inside Mitsuba, and with it all that textures which filter themselves share: against ``bitmap``,
-against the pyramid read at footprints that NumPy made something of, against many samples.
-"""
+"""The texture ``mipmap``: filters against NumPy and many samples, texels, sensors; see ``test_texture_contract``."""
 
 import math
 
@@ -10,8 +7,7 @@ import numpy as np
 import pytest
 import texture_scenes
 from arrays import aligned, numpy_of
-from texture_scenes import WRONG, linear
-from variants import set_variant
+from texture_scenes import linear
 
 from mi_diffind.core.compat import module_of
 from mi_diffind.maps.pyramid import Pyramid
@@ -94,18 +90,6 @@ def test_off_ignores_footprints(mi_rgb, file, rng):
     assert a.gathers == 4 and c.gathers == 8 + 2 and c.instructions > a.instructions + 100
 
 
-def test_reads_by_filter(mi_rgb, file, rng):
-    """As many as the filter says; one place for all taps of the stochastic one, and one level."""
-    mi = mi_rgb
-    si = texture_scenes.hits(mi, rng.random((2, 100)), *texture_scenes.footprints(rng, 100, SIZE))
-    found = {}
-    for name, taps in (("anisotropic", 1), ("anisotropic", 4), ("anisotropic", 7), ("stochastic", 4)):
-        texture = mi.load_dict(plugin(file, name, max_anisotropy=taps))
-        found[name, taps] = count(lambda t=texture: t.eval(si)).gathers
-        assert texture.report()["taps"] == (taps if name == "anisotropic" else 1)
-    assert list(found.values()) == [8 + 2, 4 * 8 + 2, 7 * 8 + 2, 4 + 1]
-
-
 @pytest.mark.parametrize("wrap_mode", ["repeat", "clamp"])
 def test_trilinear_is_the_pyramid_at_the_level_of_the_area(mi_any, file, image, rng, wrap_mode):
     mi = mi_any
@@ -154,65 +138,22 @@ def test_stochastic_is_unbiased(mi_rgb, file, rng, taps):
 def test_random_numbers(mi_rgb, rng):
     """Uniform, and independent of each other and of where the hits are, for places on a line or in a small patch."""
     mi = mi_rgb
-    from mi_diffind.plugins.support import filtering
+    from mi_diffind.plugins.support import textures
 
     n = 2**16
     line = np.linspace(0, 1, n)
     patch = np.mgrid[0:256, 0:256].reshape(2, -1) * 1e-3
     for uv, p in ((np.stack([line, 0 * line]), np.stack([line, line, 0 * line])), (patch, np.zeros((3, n)))):
-        a, b = (x.numpy() for x in filtering.random(texture_scenes.hits(mi, uv, p=p)))
+        a, b = (x.numpy() for x in textures.hit_numbers(texture_scenes.hits(mi, uv, p=p)))
         assert min(a.min(), b.min()) >= 0 and max(a.max(), b.max()) < 1
         for x, y in ((a, b), (a[:-1], a[1:]), (b[:-1], b[1:]), (a[:-256], a[256:])):
             counts = np.histogram2d(x, y, bins=16, range=[[0, 1]] * 2)[0]
             assert ((counts - len(x) / 256) ** 2 / (len(x) / 256)).sum() < 255 + 5 * math.sqrt(2 * 255)
-        again = filtering.random(texture_scenes.hits(mi, uv, p=p))[0].numpy()
+        again = textures.hit_numbers(texture_scenes.hits(mi, uv, p=p))[0].numpy()
         np.testing.assert_array_equal(again, a)
 
 
-@pytest.mark.parametrize("name", ["trilinear", "anisotropic"])
-def test_to_uv(mi_rgb, file, rng, name):
-    """A scale and a turn: as the texture without, at places and with footprints that went through them."""
-    mi = mi_rgb
-    to_uv = mi.ScalarTransform4f().translate([0.3, -0.2, 0]).rotate([0, 0, 1], 30).scale([1.5, -0.4, 1])
-    m = np.array([[float(to_uv.matrix[i, j]) for j in (0, 1, 3)] for i in (0, 1)])
-    uv, (ddx, ddy) = rng.random((2, 300)), texture_scenes.footprints(rng, 300, SIZE, 4)
-    found = mi.load_dict(plugin(file, name, to_uv=to_uv)).eval(texture_scenes.hits(mi, uv, ddx, ddy)).numpy()
-    inside = texture_scenes.hits(mi, m[:, :2] @ uv + m[:, 2:], m[:, :2] @ ddx, m[:, :2] @ ddy)
-    texture = mi.load_dict(plugin(file, name))
-    np.testing.assert_allclose(found, texture.eval(inside).numpy(), atol=2e-3)
-    params = mi.traverse(texture)
-    params["to_uv"] = mi.ScalarTransform3f([[*map(float, row)] for row in [*m, [0, 0, 1]]])
-    params.update()
-    np.testing.assert_allclose(texture.eval(texture_scenes.hits(mi, uv, ddx, ddy)).numpy(), found, atol=1e-5)
-
-
 # -- hard cases --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "name, wrap_mode",  # filters and wrap modes are apart: one chooses places, the other folds them
-    [("trilinear", "repeat"), ("anisotropic", "clamp"), ("stochastic", "mirror"), ("anisotropic", "repeat")],
-)
-def test_any_footprint_gives_a_finite_value(mi_rgb, file, rng, name, wrap_mode):
-    mi = mi_rgb
-    parts = np.stack(np.meshgrid(*[WRONG] * 4)).reshape(4, -1)
-    uv = rng.choice([0, 1, 0.3, -7.5, 1e20, math.nan, math.inf], (2, parts.shape[1]))
-    texture = mi.load_dict(plugin(file, name, wrap_mode=wrap_mode))
-    si = texture_scenes.hits(mi, uv, parts[:2], parts[2:])
-    found, slope = texture.eval(si), texture.eval_1_grad(si)
-    dr.eval(found, slope)
-    found = found.numpy()
-    assert np.isfinite(found).all() and found.min() >= 0 and found.max() <= 1
-    assert np.isfinite(slope.numpy()).all()
-
-
-def test_the_largest_footprint_is_the_mean(mi_rgb, file, image, rng):
-    mi = mi_rgb
-    mean = linear(image / 255).mean(axis=(0, 1))
-    for name in ("trilinear", "anisotropic", "stochastic"):
-        si = texture_scenes.hits(mi, rng.uniform(-2, 2, (2, 50)), (1000, 0), (0, 1000))
-        found = mi.load_dict(plugin(file, name)).eval(si).numpy()
-        np.testing.assert_allclose(found, np.broadcast_to(mean[:, None], found.shape), atol=1e-3, err_msg=name)
 
 
 @pytest.mark.parametrize("name", ["trilinear", "anisotropic"])
@@ -234,51 +175,7 @@ def test_seams(mi_rgb, file, rng, name):
         assert np.abs(ends - [0, 0, 1, 1]).max() < 1e-4 if mode != "repeat" else (np.abs(ends - 0.5) < 0.1).all()
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 16), (9, 1), (5, 7)])
-def test_odd_sizes(mi_rgb, rng, shape):
-    mi = mi_rgb
-    values = rng.integers(0, 256, (*shape, 3), np.uint8)
-    si = texture_scenes.hits(mi, rng.uniform(-1, 2, (2, 200)), *texture_scenes.footprints(rng, 200, shape[::-1], 6))
-    for name in ("trilinear", "anisotropic"):
-        texture = mi.load_dict({"type": "mipmap", "bitmap": mi.Bitmap(values), "filter": name})
-        found, slope = texture.eval(si), texture.eval_1_grad(si)
-        dr.eval(found, slope)
-        found = found.numpy()
-        assert np.isfinite(found).all() and linear(values.min() / 255) - 1e-4 <= found.min()
-        assert found.max() <= linear(values.max() / 255) + 1e-4 and np.isfinite(slope.numpy()).all()
-
-
 # -- gradients ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", ["trilinear", "stochastic"])
-def test_gradients_reach_the_coordinate(mi_rgb, file, rng, name):
-    """And are, but for the places between two texels, finite differences."""
-    mi = mi_rgb
-    uv, (ddx, ddy) = rng.random((2, 200)), texture_scenes.footprints(rng, 200, SIZE, 4)
-    texture = mi.load_dict(plugin(file, name))
-    si = texture_scenes.hits(mi, uv, ddx, ddy)
-    dr.enable_grad(si.uv)
-    dr.backward(dr.sum(texture.eval_1(si)))
-    gradient = dr.grad(si.uv).numpy()
-    assert np.isfinite(gradient).all()
-    if name == "stochastic":
-        return
-    for axis in (0, 1):
-        step = 5e-4 * np.eye(2)[:, axis : axis + 1]
-        a, b = (texture.eval_1(texture_scenes.hits(mi, uv + s * step, ddx, ddy)).numpy() for s in (1, -1))
-        error = np.abs((a - b) / 1e-3 - gradient[axis])
-        assert np.quantile(error, 0.8) < 0.02 * np.abs(gradient[axis]).max()
-
-
-def test_gradients_of_wrong_footprints_are_finite(mi_rgb, file):
-    mi = mi_rgb
-    parts = np.stack(np.meshgrid(*[(0, 1, 1e20, math.nan, math.inf, -math.inf)] * 4)).reshape(4, -1)
-    for name in ("trilinear", "anisotropic"):
-        si = texture_scenes.hits(mi, [[0.3], [0.7]], parts[:2], parts[2:])
-        dr.enable_grad(si.uv, si.duv_dx)
-        dr.backward(dr.sum(mi.load_dict(plugin(file, name)).eval_1(si)))
-        assert np.isfinite(dr.grad(si.uv).numpy()).all() and np.isfinite(dr.grad(si.duv_dx).numpy()).all()
 
 
 def changed(mi, texture, values):
@@ -415,15 +312,6 @@ def test_slope_of_a_filtered_texture(mi_rgb, rng):
     np.testing.assert_allclose(found.ravel(), [2 * 0.5, -0.3], atol=1e-3)
 
 
-def test_notes_on_a_manifest_are_warnings(mi_rgb, tmp_path, rng, capfd):
-    """Those of a fit, which its counterpart would repeat in silence."""
-    mi_rgb.Bitmap(rng.integers(0, 255, (8, 8, 3), np.uint8)).write(str(tmp_path / "c.png"))
-    (tmp_path / "m.json").write_text('{"paint": "c.png"}')
-    mi_rgb.load_dict({"type": "mipmap", "filename": str(tmp_path / "m.json"), "channels": "paint"})
-    printed = capfd.readouterr()
-    assert 'map "paint": an unknown name, taken for data' in printed.out + printed.err
-
-
 @pytest.mark.parametrize("raw", [False, True])
 @pytest.mark.parametrize("name", ["x_normal", "x_nor_dx", "x_Roughness", "x_arm"])
 def test_names_of_images_change_no_values(mi_rgb, tmp_path, rng, name, raw):
@@ -519,38 +407,6 @@ def test_sensors_and_places(mi_rgb, detailed, kind):
 # -- in scenes ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_spectral_polarized"])
-def test_materials(variant, file):
-    """As with bitmaps where nothing is minified; in the other variant, one alone."""
-    mi = set_variant(variant)
-    bsdfs = []
-    for t in (lambda **m: {"type": "bitmap", "filename": file, **m}, lambda **m: plugin(file, **m)):
-        bsdfs.append([
-            {"type": "principled", "base_color": t(), "roughness": t(raw=True)},
-            {"type": "roughplastic", "diffuse_reflectance": t()},
-            {"type": "bumpmap", "arbitrary": t(raw=True), "bsdf": {"type": "diffuse"}, "scale": 0.01},
-            {"type": "neural_disney", "base_color": t(), "roughness": t(raw=True)},
-        ])  # fmt: skip
-    images = []
-    for found in bsdfs:
-        found = found if mi.variant().endswith("ad_rgb") else found[:1]
-        shapes = {
-            f"wall{i}": {"type": "rectangle", "bsdf": bsdf,
-                         "to_world": mi.ScalarTransform4f().translate([2 * i - 3, 0, 0])}
-            for i, bsdf in enumerate(found)
-        }  # fmt: skip
-        to_world = mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
-        film = {"type": "hdrfilm", "width": 32, "height": 8, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
-        loaded = mi.load_dict({
-            "type": "scene", "integrator": {"type": "path", "max_depth": 2}, "sky": {"type": "constant"},
-            "sensor": {"type": "perspective", "to_world": to_world, "film": film, "fov": 90}, **shapes,
-        })  # fmt: skip
-        images.append(mi.render(loaded, spp=16).numpy())
-    assert images[0].mean() > 0.1 and np.isfinite(images[1]).all()
-    assert images[1].mean() == pytest.approx(images[0].mean(), rel=0.02)
-    assert np.abs(images[1] - images[0]).mean() < 0.08 * images[0].mean()
-
-
 def test_frozen_renders(mi_rgb, file, no_garbage_collection):
     """With the sensor that there was when a function was frozen."""
     mi = mi_rgb
@@ -567,19 +423,6 @@ def test_frozen_renders(mi_rgb, file, no_garbage_collection):
             images.append(frozen(loaded, mi.UInt32(seed)).numpy())
             np.testing.assert_allclose(images[-1], mi.render(loaded, spp=1, seed=seed).numpy(), atol=1e-5)
     assert np.abs(images[0] - images[5]).max() > 0.05
-
-
-def test_textures_of_one_file_are_read_once(mi_rgb, file, rng):
-    """One pyramid, and one read of it, of the same footprint: also with parameters that say the same sensor."""
-    mi = mi_rgb
-    a, b = (mi.load_dict(plugin(file, "anisotropic", **SENSOR(mi))) for _ in range(2))
-    assert a.image is b.image
-    si = texture_scenes.seen(mi, 100)
-    alone = count(lambda: a.eval(si)).gathers
-    assert np.abs(a.eval(si).numpy() - mi.load_dict(plugin(file, "off")).eval(si).numpy()).max() > 0.1
-    assert count(lambda: (a.eval(si), b.eval_1(si))).gathers == alone
-    other = mi.load_dict(plugin(file, "anisotropic", wrap_mode="clamp", **SENSOR(mi)))
-    assert other.image is not a.image
 
 
 def test_sources(mi_rgb, tmp_path, image, rng):
@@ -640,19 +483,12 @@ def test_words_of_bitmap(mi_rgb, file):
 
 
 BAD = {
-    "no source": ({}, 'found none, exactly one is needed'),
+    "no source": ({}, "found none, exactly one is needed"),
     "two sources": ({"filename": "a.png", "pyramid": "b"}, 'found "filename" and "pyramid", exactly one is needed'),
-    "missing": ({"filename": "/nowhere/a.png"}, 'parameter "filename": /nowhere/a.png: no such file'),
     "no such levels": ({"pyramid": "x"}, 'parameter "pyramid": found "x", allowed are the keys of PYRAMIDS: none'),
-    "filter": ({"filter": "nearest"}, 'parameter "filter": found "nearest", allowed are trilinear, off, anisotropic'),
     "type": ({"filter_type": "nearest"}, 'parameter "filter_type": found "nearest", allowed are bilinear, trilinear'),
-    "both": ({"filter": "off", "filter_type": "trilinear"}, 'found "trilinear", which contradicts the filter "off"'),
-    "no taps": ({"max_anisotropy": 0}, 'parameter "max_anisotropy": found 0, allowed are whole numbers 1 to 16'),
     "half a tap": ({"max_anisotropy": 2.5}, 'parameter "max_anisotropy": found 2.5, allowed are whole numbers'),
-    "many taps": ({"max_anisotropy": 17}, 'parameter "max_anisotropy": found 17, allowed are whole numbers 1 to 16'),
-    "sensor": ({"fov": 60.0}, 'parameter "sensor_to_world": not given'),
-    "unknown": ({"filename": "FILE", "filtre": "off"}, "filtre"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", list(BAD))
@@ -660,20 +496,3 @@ def test_bad_parameters(mi_rgb, file, case):
     wrong, sentence = BAD[case]
     wrong = {k: file if v == "FILE" else v for k, v in wrong.items()}
     assert sentence in texture_scenes.refused(mi_rgb, {"type": "mipmap", **wrong})
-
-
-def test_unsupported_variants_say_so(file):
-    mi = set_variant("scalar_rgb")
-    with pytest.raises(RuntimeError, match='"mipmap" does not run in the variant "scalar_rgb"'):
-        mi.load_dict(plugin(file))
-    mi = set_variant("llvm_ad_rgb")
-    assert list(mi.load_dict(plugin(file)).resolution()) == [WIDTH, HEIGHT]
-
-
-def test_two_variants_in_turn(file, rng):
-    uv, found = rng.random((2, 20)), {}
-    for variant in ("llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"):
-        mi = set_variant(variant)
-        values = mi.load_dict(plugin(file)).eval(texture_scenes.hits(mi, uv, (0.1, 0), (0, 0.1))).numpy()
-        np.testing.assert_array_equal(found.setdefault(variant, values), values)
-    assert found["llvm_ad_mono"].shape[0] == 1

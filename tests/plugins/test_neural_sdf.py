@@ -4,7 +4,6 @@ import json
 import os
 import time
 from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
 from weakref import WeakValueDictionary
 
 import drjit as dr
@@ -147,7 +146,7 @@ def test_grid_and_arrays_agree_and_are_where_the_mesh_is(mi_rgb, folder, turned)
     bsdf = {"bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.5, 0.2]}}}
     shapes = {
         "arrays": {"type": "neural_sdf", "filename": str(folder / "torus.npz"), "normals": "analytic"},
-        "grid": shape(folder, trace="grid", resolution=96, normals="analytic"),
+        "grid": shape(folder, trace="grid", normals="analytic"),
         "mesh": {"type": "ply", "filename": str(folder / "torus.ply")},
     }
     images, boxes = {}, {}
@@ -272,35 +271,20 @@ def test_a_moved_shape_is_that_of_a_new_scene(mi_rgb, folder):
     np.testing.assert_array_equal(np.array(mi.render(loaded, spp=4)), before)
 
 
-@pytest.mark.parametrize("file, storage", [("torus", "uint8"), ("torus", "float32"), ("dense", "uint8")])
-def test_frozen(mi_rgb, folder, dense, no_garbage_collection, file, storage):
-    """A recorded render is the other one to the last bit, with other seeds, places, materials and nodes, too."""
+def test_frozen_dense_arrays(mi_rgb, dense, no_garbage_collection):
+    """A recorded render is the other one to the last bit, with another seed and place; see also ``test_frozen.py``."""
     mi, at = mi_rgb, mi_rgb.AffineTransform4f
-    filename = str(dense if file == "dense" else folder / "torus.npz")
-    red = {"type": "rgb", "value": [0.8, 0.2, 0.1]}
-    more = {"storage": storage, "bsdf": {"type": "diffuse", "reflectance": red}}
-    loaded = scene(mi, {"a": {"type": "neural_sdf", "filename": filename, **more}})
+    loaded = scene(mi, {"a": {"type": "neural_sdf", "filename": str(dense)}})
     params = mi.traverse(loaded)
     frozen = dr.freeze(lambda scene, seed: mi.render(scene, spp=2, seed=seed))
-    changes = {
-        0: {},
-        1: {},
-        2: {"a.to_world": at().translate([0.2, 0.1, 0]).rotate([0, 0, 1], 30)},
-        3: {"a.bsdf.reflectance.value": mi.Color3f(0.1, 0.9, 0.3)},
-    }
-    if storage == "float32":
-        nodes = params["a.tables.nodes"].numpy()
-        changes[4] = {"a.tables.nodes": mi.TensorXf(aligned(nodes - np.float32([0.2, 0, 0, 0])))}
     images = []
-    for number, changed in changes.items():
-        for key, value in changed.items():
-            params[key] = value
+    for number, place in enumerate((at(), at(), at().translate([0.2, 0.1, 0]).rotate([0, 0, 1], 30))):
+        params["a.to_world"] = place
         params.update()
         seed = dr.opaque(mi.UInt32, min(number, 1))
         images.append(np.array(frozen(loaded, seed)))
         np.testing.assert_array_equal(images[-1], np.array(mi.render(loaded, spp=2, seed=seed)))
-    assert frozen.n_recordings < len(changes)
-    assert all(np.abs(a - b).mean() > 1e-3 for a, b in pairwise(images[1:]))
+    assert frozen.n_recordings < 3 and np.abs(images[2] - images[1]).mean() > 1e-3
 
 
 # -- how fine a grid is ------------------------------------------------------------------------------------------------
@@ -428,16 +412,6 @@ def test_grids_of_files_that_tell_no_error(mi_rgb, upright_files):
     assert report["error"] <= report["arrays_error"] and "about" in report["decoded"]
 
 
-def test_images_of_grids_are_those_of_arrays(mi_rgb, folder):
-    """At the resolution that is found by itself and with the same random numbers, most of the noise cancels."""
-    images = []
-    for trace in ("arrays", "grid"):
-        loaded = scene(mi_rgb, {"torus": shape(folder, trace=trace)})
-        images.append(np.array(mi_rgb.render(loaded, spp=64, seed=1)))
-    assert loading.reports(loaded)[0]["resolution"] < 80
-    assert np.abs(images[0] - images[1]).mean() < 1e-3 < np.abs(images[0] - images[0].mean()).mean() / 20
-
-
 def test_crops_keep_two_cells_around_what_is_inside(mi_rgb):
     """Two cells and no more, unless the grid ends; what is added until X and Z are equal is outside."""
     from mi_diffind.plugins.support import distance_shapes
@@ -450,13 +424,8 @@ def test_crops_keep_two_cells_around_what_is_inside(mi_rgb):
     assert (cropped[5:] == 1).all()
     np.testing.assert_allclose(lower, [2, 2, 4.5])
     np.testing.assert_allclose(upper, [6, 3.5, 8.5])
-
-
-def test_grids_without_anything_inside(mi_rgb):
-    from mi_diffind.plugins.support import distance_shapes
-
-    with pytest.raises(RuntimeError, match="nothing is inside at 6 cells"):
-        distance_shapes.crop_grid(np.ones((5, 6, 7)), np.zeros(3), 0.1)
+    with pytest.raises(RuntimeError, match="nothing is inside at 13 cells"):
+        distance_shapes.crop_grid(np.ones((12, 10, 14)), np.zeros(3), 0.1)
 
 
 # -- what cannot be ----------------------------------------------------------------------------------------------------
@@ -493,22 +462,11 @@ def test_scales_that_differ(mi_rgb, folder, trace):
     refused(mi_rgb, folder, 'parameter "to_world": found', to_world=at, trace=trace)
 
 
-@pytest.mark.parametrize("fault", ["missing", "truncated", "NaN", "other task"])
+@pytest.mark.parametrize("fault", ["missing", "other task"])
 def test_damaged_files(mi_rgb, folder, tmp_path, fault):
     from mi_diffind.tasks.ggx import TASK as GGX
 
-    path = tmp_path / "bad.npz"
-    whole = (folder / "torus.npz").read_bytes()
-    if fault == "truncated":
-        path.write_bytes(whole[: len(whole) // 2])
-    elif fault == "NaN":
-        with np.load(folder / "torus.npz") as file:
-            content = dict(file)
-        entries = next(v for v in content.values() if v.dtype == np.float32 and v.ndim == 2 and v.shape[1] == 3)
-        entries[3] = np.nan
-        np.savez(path, **content)
-    elif fault == "other task":
-        path = GGX.file()
+    path = GGX.file() if fault == "other task" else tmp_path / "bad.npz"
     sentence = refused(mi_rgb, folder, path.name, filename=str(path))
     assert len(sentence) < 400
 
@@ -617,7 +575,3 @@ def test_load_file_takes_what_mitsuba_takes(mi_rgb, folder, tmp_path):
         loading.load_file(tmp_path / "none.xml")
     with pytest.raises(RuntimeError, match="unused"):
         loading.load_file(path, unused=1)
-
-
-def test_plugin_is_declared(mi_rgb):
-    assert plugins.declared()["neural_sdf"].exact.name == "ply"

@@ -1,12 +1,6 @@
-"""
-The texture ``neural_texture`` inside Mitsuba: against its arrays, read at footprints that NumPy made something of, and
-against ``mipmap`` with the levels that it decodes to. (What all textures that filter themselves share:
-``test_mipmap_plugin.py``; all textures of compressed maps: ``test_image_plugin.py``.)
-"""
+"""The texture ``neural_texture``: levels, filters, the paper's arrays, counterparts; see ``test_texture_contract``."""
 
 import json
-import math
-import re
 
 import drjit as dr
 import numpy as np
@@ -14,7 +8,7 @@ import pytest
 import texture_scenes
 from arrays import aligned, numpy_of
 from texture_files import make
-from texture_scenes import WRONG, linear
+from texture_scenes import linear
 
 from mi_diffind.arrays.tables import load_table, save_table
 from mi_diffind.core.compat import module_of
@@ -94,18 +88,6 @@ def test_counterparts_of_images_with_names(mi_rgb, tmp_path, rng, name):
     np.testing.assert_allclose(*values, atol=5e-3)  # "mipmap" derives z of a normal from x and y
     expected = linear(image / 255) if name == "x_diff" else image / 255
     assert values[0].mean() == pytest.approx(expected.mean(), abs=0.02)
-
-
-@pytest.mark.parametrize("channels", ["albedo", "normal", "roughness"])
-@pytest.mark.parametrize("preset", ["ours", "paper"])
-def test_the_maximum_is_an_upper_bound(mi_rgb, files, rng, preset, channels):
-    """At any place, between texels, too, and at any level of detail; of 1 at most."""
-    mi = mi_rgb
-    uv, (ddx, ddy) = rng.random((2, 200_000)), texture_scenes.footprints(rng, 200_000, SIZE)
-    for name in ("off", "trilinear"):
-        texture = mi.load_dict(plugin(files[preset], name, channels))
-        values = texture.eval(texture_scenes.hits(mi, uv, ddx, ddy)).numpy()
-        assert values.max() <= texture.max() + 1e-6 and texture.max() <= 1
 
 
 @pytest.mark.parametrize("preset", ["ours", "paper"])
@@ -215,52 +197,7 @@ def test_clamped_images_know_nothing_of_the_other_end(mi_rgb, tmp_path):
             np.testing.assert_allclose(texture.eval_1(si).numpy(), ends, atol=0.02, err_msg=f"{mode} {level}")
 
 
-@pytest.mark.parametrize("name", ["albedo", "normal", "roughness"])
-def test_stochastic_is_unbiased(mi_rgb, file, rng, name):
-    """Over many hits of one place and footprint, of colours and data."""
-    mi = mi_rgb
-    n, cases = 2**13, 4
-    uv, (ddx, ddy) = rng.random((2, cases)), texture_scenes.footprints(rng, cases, SIZE, 3)
-    one, all_ = (mi.load_dict(plugin(file, x, name)) for x in ("stochastic", "anisotropic"))
-    repeated = [np.repeat(x, n, axis=1) for x in (uv, ddx, ddy)]
-    found = one.eval(texture_scenes.hits(mi, *repeated, rng.normal(size=(3, n * cases)))).numpy().reshape(3, cases, n)
-    truth = np.broadcast_to(all_.eval(texture_scenes.hits(mi, uv, ddx, ddy)).numpy(), (3, cases))
-    error = found.std(axis=-1) / np.sqrt(n)
-    # Of a normal, the third component of the mean is not the mean of those
-    assert (np.abs(found.mean(axis=-1) - truth) < 4.5 * error + 1e-4)[: 2 if name == "normal" else 3].all()
-    assert error.max() > 1e-4
-
-
 # -- hard cases --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("preset", ["ours", "paper"])
-def test_any_footprint_gives_a_finite_value(mi_rgb, files, rng, preset):
-    mi = mi_rgb
-    parts = np.stack(np.meshgrid(*[WRONG] * 4)).reshape(4, -1)
-    uv = rng.choice([0, 1, 0.3, -7.5, 1e20, math.nan, math.inf], (2, parts.shape[1]))
-    si = texture_scenes.hits(mi, uv, parts[:2], parts[2:])
-    for name, wrap_mode in (("trilinear", "repeat"), ("anisotropic", "clamp"), ("stochastic", "mirror")):
-        texture = mi.load_dict(plugin(files[preset], name, wrap_mode=wrap_mode))
-        found, slope = texture.eval(si), texture.eval_1_grad(si)
-        dr.eval(found, slope)
-        found = found.numpy()
-        assert np.isfinite(found).all() and found.min() >= 0 and found.max() <= 1 + 1e-4, name
-        assert np.isfinite(slope.numpy()).all(), name
-
-
-@pytest.mark.parametrize("shape", [(1, 16), (7, 5)])
-def test_odd_sizes(mi_rgb, tmp_path, rng, shape):
-    mi = mi_rgb
-    values = rng.integers(0, 256, (*shape, 3), np.uint8)
-    path = make(tmp_path / "a.npz", from_arrays({"albedo": values}))
-    si = texture_scenes.hits(mi, rng.uniform(-1, 2, (2, 100)), *texture_scenes.footprints(rng, 100, shape[::-1], 6))
-    for name in ("off", "anisotropic"):
-        texture = mi.load_dict(plugin(path, name))
-        assert list(texture.resolution()) == list(shape[::-1])
-        assert np.isfinite(texture.eval(si).numpy()).all() and np.isfinite(texture.eval_1_grad(si).numpy()).all()
-    largest = texture.eval(texture_scenes.hits(mi, [[0.3], [0.6]], (100, 0), (0, 100))).numpy().ravel()
-    np.testing.assert_allclose(largest, linear(values / 255).mean(axis=(0, 1)), atol=0.03)
 
 
 def test_no_arrays(mi_rgb, tmp_path):
@@ -277,91 +214,6 @@ def test_no_arrays(mi_rgb, tmp_path):
 
 
 # -- optimisation ------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("preset", ["ours", "paper"])
-def test_gradients_against_finite_differences(mi_rgb, files, rng, preset):
-    """With respect to every array and to uv, at footprints of every size."""
-    mi = mi_rgb
-    texture = mi.load_dict(plugin(files[preset], storage="float32"))
-    params = mi.traverse(texture)
-    names = ("level0", "coarse", "cascaded") if preset == "ours" else ("primary0", "primary1", "cascaded")
-    keys = [f"tables.{name}" for name in names]
-    assert sorted(params.keys()) == sorted([*keys, "to_uv"])
-    uv, (ddx, ddy) = rng.random((2, 64)), texture_scenes.footprints(rng, 64, SIZE, 4)
-    si = texture_scenes.hits(mi, uv, ddx, ddy)
-    weights = mi.Float(aligned(rng.normal(size=64)))
-
-    def total():
-        return dr.sum(weights * texture.eval_1(si))
-
-    for key in keys:
-        start = params[key].numpy() * 0.98 + 0.01  # away from the ends, where entries are folded
-        params[key] = mi.TensorXf(aligned(start))
-        params.update()
-        dr.enable_grad(params[key])
-        dr.backward(total())
-        gradient = dr.grad(params[key]).numpy().ravel()
-        dr.disable_grad(params[key])
-        assert np.isfinite(gradient).all()
-        strongest = np.argsort(-np.abs(gradient))[:3]
-        for i in strongest:
-            values = []
-            for sign in (-1, 1):
-                moved = start.copy()
-                moved.ravel()[i] += sign * 1e-3
-                params[key] = mi.TensorXf(aligned(moved))
-                params.update()
-                values.append(float(total()[0]))
-            largest = float(np.abs(gradient).max())
-            assert gradient[i] == pytest.approx((values[1] - values[0]) / 2e-3, rel=0.05, abs=0.03 * largest), key
-        params[key] = mi.TensorXf(aligned(start))
-        params.update()
-    dr.enable_grad(si.uv)
-    dr.backward(dr.sum(texture.eval_1(si)))
-    gradient = dr.grad(si.uv).numpy()
-    assert np.isfinite(gradient).all()
-    for axis in (0, 1):
-        step = 2e-4 * np.eye(2)[:, axis : axis + 1]
-        a, b = (texture.eval_1(texture_scenes.hits(mi, uv + s * step, ddx, ddy)).numpy() for s in (1, -1))
-        error = np.abs((a - b) / 4e-4 - gradient[axis])
-        assert np.median(error) < 0.03 * np.abs(gradient[axis]).max()
-
-
-def test_gradients_of_wrong_footprints_are_finite(mi_rgb, file):
-    mi = mi_rgb
-    parts = np.stack(np.meshgrid(*[(0, 1, 1e20, math.nan, math.inf, -math.inf)] * 4)).reshape(4, -1)
-    si = texture_scenes.hits(mi, [[0.3], [0.7]], parts[:2], parts[2:])
-    texture = mi.load_dict(plugin(file, "anisotropic", storage="float32", max_anisotropy=1))
-    params = mi.traverse(texture)
-    keys = [key for key in params.keys() if key.startswith("tables.")]
-    for key in keys:
-        dr.enable_grad(params[key])
-    params.update()
-    dr.enable_grad(si.uv)
-    dr.backward(dr.sum(texture.eval_1(si)))
-    assert all(np.isfinite(dr.grad(params[key]).numpy()).all() for key in keys)
-    assert np.isfinite(dr.grad(si.uv).numpy()).all()
-    dr.disable_grad(*(params[key] for key in keys))
-
-
-def test_parameters_are_shared_and_checked(mi_rgb, file, rng):
-    """What changes one texture of a file changes the other, and what had been found out about it."""
-    mi = mi_rgb
-    a, b = (mi.load_dict(plugin(file, channels=name, storage="float32")) for name in ("albedo", "roughness"))
-    si = texture_scenes.hits(mi, rng.random((2, 10)), (0.1, 0), (0, 0.1))
-    before, mean, largest = b.eval_1(si).numpy(), float(b.mean()[0]), b.max()
-    params = mi.traverse(a)
-    params["tables.cascaded"] = params["tables.cascaded"] * 0.5
-    params.update()
-    np.testing.assert_allclose(b.eval_1(si).numpy(), before / 2, atol=1e-4)
-    assert float(b.mean()[0]) == pytest.approx(mean / 2, abs=1e-3) and b.max() < 0.6 * largest
-    fresh = mi.load_dict(plugin(file, channels="roughness", storage="float32"))
-    np.testing.assert_array_equal(fresh.eval_1(si).numpy(), before)
-    params["tables.cascaded"] = mi.TensorXf(aligned(np.zeros((2, 2, 7), "f4")))
-    with pytest.raises(RuntimeError, match=re.escape('parameter "tables.cascaded": "data" has the shape (2, 2, 7)')):
-        params.update()
-    assert list(mi.traverse(mi.load_dict(plugin(file))).keys()) == ["to_uv"]
 
 
 # -- in scenes ---------------------------------------------------------------------------------------------------------
@@ -389,90 +241,6 @@ def test_maps_of_one_file_are_read_once(mi_rgb, file, name):
     other = {"base_color": {"type": "checkerboard"}, "roughness": {"type": "checkerboard"}}  # which gathers nothing
     tables = bsdf_operations(mi.load_dict({"type": "neural_disney", **other}), ("eval",))["eval"].gathers
     assert found[0] <= found[1] == found[2] - tables < 2 * found[0]
-
-
-def test_one_sample_a_pixel_on_a_plane(mi_rgb, tmp_path):
-    """Against many of its own level 0: anisotropic before trilinear before neither."""
-    mi = mi_rgb
-    from mi_diffind.plugins.support import footprint
-
-    rng = np.random.default_rng(3)
-    total = sum(np.kron(rng.random((2**i, 2**i, 3)), np.ones((64 >> i, 64 >> i, 1))) for i in range(2, 7))
-    path = make(tmp_path / "a.npz", from_arrays({"albedo": np.rint(255 * total / total.max()).astype(np.uint8)}))
-    more = {"to_uv": mi.ScalarTransform4f().scale([8, 8, 1])}
-    truth = mi.render(texture_scenes.plane(mi, plugin(path, "off", **more), 256, "multijitter", 32)).numpy()
-    quality = {}
-    for name in ("off", "trilinear", "anisotropic"):
-        loaded = texture_scenes.plane(mi, plugin(path, name, **more), size=32)
-        assert footprint.attach(loaded) == 1
-        quality[name] = texture_scenes.psnr(mi.render(loaded).numpy(), truth)
-    assert quality["off"] + 4 < quality["trilinear"] < quality["anisotropic"] - 2, quality
-
-
-def test_materials_and_integrators(mi_rgb, file):
-    """Filtered parameters of stock and of learned materials: as bright as with level 0 at many samples."""
-    mi = mi_rgb
-    to_uv = {"to_uv": mi.ScalarTransform4f().scale([9, 9, 1])}
-
-    def textures(name):
-        return {m: plugin(file, name, m, **to_uv) for m in ("albedo", "normal", "roughness")}
-
-    images = []
-    for name, integrator in (("off", "path"), ("trilinear", "path_footprint")):
-        t = textures(name)
-        bsdfs = [
-            {"type": "normalmap", "normalmap": t["normal"], "bsdf": {"type": "diffuse", "reflectance": t["albedo"]}},
-            {"type": "neural_disney", "base_color": t["albedo"], "roughness": t["roughness"]},
-        ]
-        walls = {
-            f"wall{i}": {"type": "rectangle", "bsdf": {"type": "twosided", "bsdf": bsdf},
-                         "to_world": mi.ScalarTransform4f().translate([2 * i - 1, 0, 0])}
-            for i, bsdf in enumerate(bsdfs)
-        }  # fmt: skip
-        film = {"type": "hdrfilm", "width": 16, "height": 8, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
-        to_world = mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
-        loaded = mi.load_dict({
-            "type": "scene", "integrator": {"type": integrator, "max_depth": 2}, "sky": {"type": "constant"},
-            "sensor": {"type": "perspective", "to_world": to_world, "film": film}, **walls,
-        })  # fmt: skip
-        from mi_diffind.plugins.support import footprint
-
-        footprint.attach(loaded, spp=1)
-        images.append(mi.render(loaded, spp=32).numpy())
-    assert all(np.isfinite(image).all() for image in images) and images[0].mean() > 0.1
-    for image in images[1:]:
-        assert image.mean() == pytest.approx(images[0].mean(), rel=0.05)
-
-
-def test_frozen_renders(mi_rgb, file, no_garbage_collection):
-    mi = mi_rgb
-    from mi_diffind.plugins.support import footprint
-
-    texture = plugin(file, storage="float32", to_uv=mi.ScalarTransform4f().scale(8))
-    loaded = texture_scenes.plane(mi, texture, size=16, integrator={"type": "path", "max_depth": 1})
-    footprint.attach(loaded)
-    frozen = dr.freeze(lambda loaded, seed: mi.render(loaded, spp=1, seed=seed))
-    for seed in range(5):
-        image = frozen(loaded, mi.UInt32(seed)).numpy()
-        np.testing.assert_allclose(image, mi.render(loaded, spp=1, seed=seed).numpy(), atol=1e-5)
-
-
-def test_textures_die_with_their_scene(mi_rgb, file, no_garbage_collection):
-    mi = mi_rgb
-    from mi_diffind.plugins.support import footprint
-
-    before = texture_scenes.alive("NeuralTexture")
-    loaded = texture_scenes.plane(mi, plugin(file), size=8)
-    footprint.attach(loaded)
-    mi.render(loaded, spp=1)
-    assert texture_scenes.alive("NeuralTexture") == before + 1
-    del loaded
-    assert texture_scenes.alive("NeuralTexture") == before
-
-
-def test_unsupported_variants_and_leaks(file):
-    """A sentence in a scalar variant; nothing is left of a texture that was rendered and optimised."""
-    texture_scenes.check_process(plugin(file, storage="float32"), ("llvm_ad_rgb",))
 
 
 # -- counterparts and words --------------------------------------------------------------------------------------------
@@ -526,34 +294,3 @@ def test_counterparts(mi_rgb, tmp_path):
             report["plugin"] == "neural_texture" and report["table_bytes"] == load_table(tmp_path / "wall.npz").nbytes
         )
         assert report["footprint"] == ["uv partials", "sensor"] and report["map"] == name
-
-
-def test_report_and_description(mi_rgb, file):
-    mi = mi_rgb
-    found = mi.load_dict(plugin(file, "anisotropic", "normal")).report()
-    assert (found["filter"], found["taps"], found["footprint"]) == ("anisotropic", 4, ["uv partials"])
-    assert found["map"] == "normal" and found["storage"] == "uint8" and found["table_bytes"] > 0
-    assert found["effects_left_out"]["sensor"].startswith("is not known")
-    off = mi.load_dict(plugin(file, "off")).report()
-    assert off["footprint"] == [] and off["effects_left_out"]["footprint"] == "the filter is off"
-    text = str(mi.load_dict(plugin(file)))
-    for part in ("NeuralTexture[", "map = albedo of albedo, normal, roughness", f"{WIDTH} x {HEIGHT}", "filter = tri"):
-        assert part in text
-
-
-BAD = {
-    "no file name": ({"filename": ""}, 'parameter "filename": not given'),
-    "missing file": ({"filename": "/nowhere/a.npz"}, "/nowhere/a.npz: no such file"),
-    "unknown map": ({"channels": "depth"}, 'parameter "channels": found "depth", the file holds albedo, normal, roug'),
-    "storage": ({"storage": "float16"}, 'parameter "storage": found "float16", allowed are uint8, float32'),
-    "filter": ({"filter": "cubic"}, 'parameter "filter": found "cubic", allowed are trilinear, off, anisotropic, stoc'),
-    "contradiction": ({"filter_type": "bilinear"}, 'found "bilinear", which contradicts the filter "trilinear"'),
-    "taps": ({"max_anisotropy": 0}, 'parameter "max_anisotropy": found 0, allowed are whole numbers 1 to 16'),
-    "unknown": ({"level": 3}, "level"),
-}
-
-
-@pytest.mark.parametrize("case", list(BAD))
-def test_bad_parameters(mi_rgb, file, case):
-    wrong, sentence = BAD[case]
-    assert sentence in texture_scenes.refused(mi_rgb, {**plugin(file), **wrong})

@@ -120,7 +120,7 @@ def test_rough_bounces_widen_and_samples_share(mi_rgb):
 
 def test_cones_of_rough_bounces_add_up(mi_rgb):
     """The variances of the angles add up over several bounces, each of the solid angle of its sample."""
-    from mi_diffind.plugins.support.differentials import Differentials
+    from mi_diffind.plugins.support.footprint import Differentials
 
     mi = mi_rgb
     si = dr.zeros(mi.SurfaceInteraction3f)
@@ -130,7 +130,7 @@ def test_cones_of_rough_bounces_add_up(mi_rgb):
     edges = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
     spreads = []
     for pdf, delta in ((400, False), (100, False), (1, True), (400, False)):
-        cone = cone.bounced(ray, si, mi.Vector3f(0, 0, 1), mi.Float(1), mi.Float(pdf), mi.Bool(delta), 0.5, edges)
+        cone = cone.bounce(ray, si, mi.Vector3f(0, 0, 1), mi.Float(1), mi.Float(pdf), mi.Bool(delta), 0.5, edges)
         spreads.append(cone.spread[0])
     assert spreads == pytest.approx(0.025 * np.sqrt([1, 1 + 4, 1 + 4, 1 + 4 + 1]))
 

@@ -73,12 +73,10 @@ def same_light(mi, actual: dict, expected: dict, view=((0, -5, 2.5), (0, 0, 0)),
     assert abs(difference.mean()) < 4 * np.sqrt((error**2).sum()) / error.size + 1e-5
 
 
-@pytest.mark.parametrize("integrator", ["path_footprint", "prb"])
-def test_scenes_without_solids(mi_rgb, integrator):
-    ball = {"ball": {"type": "sphere", "bsdf": BSDFS["rough"]}}
-    loaded = scene(mi_rgb, ball)
-    actual, expected = (render(mi_rgb, loaded, name) for name in ("path_sdf", integrator))
-    assert np.allclose(actual, expected, rtol=1e-5, atol=1e-6)
+def test_scenes_without_solids(mi_rgb):
+    """Rendered by ``path_footprint``, whose loop it is."""
+    loaded = scene(mi_rgb, {"ball": {"type": "sphere", "bsdf": BSDFS["rough"]}})
+    np.testing.assert_array_equal(*(render(mi_rgb, loaded, name) for name in ("path_sdf", "path_footprint")))
 
 
 @pytest.mark.parametrize("names", [("diffuse", "rough"), ("glass", "mask")], ids="-".join)
@@ -257,22 +255,6 @@ def test_derivatives_are_those_of_prb(mi_rgb, fields, name, depth):
     error = np.abs(actual - expected)
     assert np.median(error) < 0.02 * np.median(np.abs(expected))
     assert actual.mean() == pytest.approx(expected.mean(), rel=0.01 if depth == 2 else 0.15)
-
-
-def test_derivatives_against_differences(mi_rgb, fields):
-    """Of direct light without noise: of a point light, where the camera sees no silhouette."""
-    mi, ball = mi_rgb, fields["ball"]
-    point = {"type": "point", "position": [-3, -4, 4], "intensity": 20.0}
-    dark = {name: {"type": "sphere", "center": [0, 0, 99]} for name in ("lamp", "sky")}
-    loaded = scene(mi, {"ball": solid(mi, "ball", bsdf=BSDFS["rough"])}, **interior(mi), point=point, **dark)
-    integrator = mi.load_dict({"type": "path_sdf", "max_depth": 2})
-    images = []
-    for r in (0.399, 0.401):
-        ball.r = dr.opaque(mi.Float, r)
-        images.append(np.array(mi.render(loaded, spp=64, seed=3, integrator=integrator)))
-    differences = (images[1] - images[0]) / 2e-3
-    forward, _ = both_modes(mi, loaded, ball, 2)
-    assert np.abs(forward - differences).mean() < 2e-3 * np.abs(differences).mean()
 
 
 MOVES = {

@@ -19,7 +19,6 @@ from mi_diffind.maps.source import from_arrays, load_source
 from mi_diffind.measure import benchmark
 from mi_diffind.studies import image, scene_training, studies
 from mi_diffind.studies.baselines import codecs
-from mi_diffind.tasks.image import IMPROVEMENTS
 
 ROOT = Path(__file__).resolve().parents[2]
 TRAINED = ["--steps", "2", "--pretrain-steps", "2"]
@@ -148,7 +147,6 @@ def test_a_run_goes_on(inputs, tmp_path, capfd, monkeypatch):
         ("shading", ["granite"], "hammered, weave, lacquer"),
         ("shading", ["lacquer"], "twice"),
         ("shading", ["weave", "--renders", "file.npz"], "--renders: found 2 materials, one is needed"),
-        ("shading", ["--seconds", "1"], "beside seconds"),
         ("shading", ["--extras", "--preset", "paper"], "--extras: the arrays of the preset paper have none"),
         ("texture", ["--map", "roughness"], "roughness"),
         ("texture", ["--table", str(ROOT / "scenes" / "assets" / "tiles_filtered.npz")], "not trained on this source"),
@@ -189,12 +187,9 @@ def test_errors(mi_rgb):
 
 def test_names_of_trainings(mi_rgb):
     source = from_arrays({"albedo": smooth(32, 32, 3)})
-    settings = image.ImageStudySettings((12.0, 6.0), (5.0, 2.0), (7.0,), (4, 3), ablation=True)
+    settings = image.ImageStudySettings((12.0, 6.0), (5.0, 2.0), (7.0,), (4, 3))
     names = [job.name for job in image.trained_contenders(image.ImageStudyContext(source, "a", settings))]
-    assert names[:4] == ["ours 12x 2 s", "ours 12x 5 s", "paper 12x 7 s", "ours 2D→3D 12x 2 s"]
-    assert names[4:-1] == [f"ours without {name} 12x 2 s" for name in IMPROVEMENTS]
-    assert names[-1] == "ours 6x 2 s"
-    assert not any(c.in_picture for c in image.plan(source, "a", settings).candidates if " without " in c.name)
+    assert names == ["ours 12x 2 s", "ours 12x 5 s", "paper 12x 7 s", "ours 2D→3D 12x 2 s", "ours 6x 2 s"]
 
 
 def test_maps_of_another_material():
@@ -206,12 +201,10 @@ def test_maps_of_another_material():
         assert np.array_equal(other[entry.name], turned if entry.name == "normal" else 255 - turned)
 
 
-def test_runs_that_start_from_one_that_is_left_out():
+def test_runs_of_a_scene():
+    """λ, 0.9 unless it is left out, and samples a pixel are changed one at a time."""
     context = SimpleNamespace(name="room", settings=scene_training.SceneTrainingSettings())
-    runs = scene_training.planned_runs(context, [])
-    assert {run.method for run in runs} == set(scene_training.WAYS) and len({run.name for run in runs}) == len(runs)
-    # λ, 0.9 unless it is left out, and samples a pixel are changed one at a time
+    runs = scene_training.planned_runs(context)
+    assert len({run.name for run in runs}) == len(runs)
     inside = [(run.details["share"], run.budget) for run in runs if run.method == "scene"]
     assert inside == [(0.9, 1), (0.5, 1), (1.0, 1), (0.9, 4)]
-    left = {run.method for run in scene_training.planned_runs(context, ["hemisphere", "another material"])}
-    assert left == {"start", "scene", scene_training.LONGER, "untrained, then scene", scene_training.FEW}

@@ -6,7 +6,6 @@ import json
 import math
 import os
 import signal
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -184,16 +183,6 @@ def test_interruption_and_the_same_errors_in_the_end(scene, whole, tmp_path, mon
     assert errors_of(study.measure(scene, QUICK, out)) == errors_of(whole) and len(renders) == done  # if writing fails
     study.write(finished, out)
     assert sorted(os.listdir(out)) == FILES
-
-
-def test_large_images_are_rendered_in_several_launches(scene, monkeypatch):
-    renders = Renders(monkeypatch)
-    result = study.measure(scene, replace(QUICK, rounds=1), progress=False, launch_samples=16 * 12 * 2)
-    assert {spp for spp, _ in renders} == {1, 2}
-    top = [seed for spp, seed in renders if spp == 2][: 2 * (1 + 2 * QUICK.passes)]
-    lower = [seed for _, seed in renders][2 + len(top) :]
-    assert len(set(top)) == 2 * (1 + QUICK.passes) and not set(top) & set(lower)
-    assert result["bias"]["measured"] and result["points"][-1]["images"] == QUICK.passes
 
 
 def test_values_that_are_not_finite_are_counted(scene, monkeypatch):

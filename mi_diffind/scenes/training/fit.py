@@ -25,14 +25,20 @@ from ..conversion import cache_folder
 from .options import SceneRecipe, ViewDistribution, recipe_from, views_from
 from .problem import SceneProblem
 from .references import ReferenceRenders
-from .trained_scene import JointProblem, SceneTexture, TrainedScene, stored_textures
+from .trained_scene import JointProblem, SceneTexture, TrainedScene, load_textures
 
-#: Shares of a limited time: that of the references, and that of a measurement of renders.
-REFERENCES, MEASURING = 0.25, 0.1
+#: Share of a limited time for the references.
+REFERENCES = 0.25
 
-#: Duration of a step in renders of one sample a pixel, and of the compilation of its kernels in that of a render's: a
-#: step renders three times, once with derivatives, whose kernel is four times as long.
-STEP_RENDERS, STEP_KERNELS = 20, 8
+#: Share of a limited time for a measurement of renders.
+MEASURING = 0.1
+
+#: Duration of a training step, in renders of one sample a pixel.
+STEP_RENDERS = 20
+
+#: Duration of the compilation of a step, in that of a render: a step renders three times, once with derivatives, whose
+#: kernel is four times as long.
+STEP_KERNELS = 8
 
 #: Seconds that LLVM takes to compile one operation of a render's kernel.
 OPERATION = 3e-4
@@ -47,8 +53,8 @@ def fit(request: FitRequest) -> Fitted:
     views, recipe = views_from(options, request.settings.seed), recipe_from(options, request.settings)
     parsed = loading.ParsedScene(options["source"], dict(options["defines"] or ()))
     tables, result = fit_scene(
-        parsed, views, recipe, request, listed(options["texture"]), options["references"], preview_path(request),
-        listed(options["start"]),
+        parsed, views, recipe, request, as_list(options["texture"]), options["references"], preview_path(request),
+        as_list(options["start"]),
     )  # fmt: skip
     table = next(iter(tables.values()))
     count = len(views.trained())
@@ -70,7 +76,7 @@ def fit(request: FitRequest) -> Fitted:
     return Fitted(table, result, lines, figures)
 
 
-def listed(files) -> list:
+def as_list(files) -> list:
     """Return the files of an option that may be repeated; from Python, also a single one."""
     return [files] if isinstance(files, (str, os.PathLike)) else list(files or ())
 
@@ -94,12 +100,11 @@ def fit_scene(
     and level bias the training starts from, in place of the textures'. If no state renders the held-out views better
     than the start, the tables hold the start (setting ``kept_start``). Runs in the variant that is set.
 
-    Raises :class:`.SceneError`, :class:`.UsageError`,
-    :class:`.TableError`, :class:`~mi_diffind.maps.source.SourceError`,
-    :class:`.FittingError` and :class:`.OutputError`.
+    Raises :class:`.SceneError`, :class:`.UsageError`, :class:`.TableError`,
+    :class:`~mi_diffind.maps.source.SourceError`, :class:`.FittingError` and :class:`.OutputError`.
     """
     request = dataclasses.replace(request, settings=recipe.settings)
-    textures = stored_textures(parsed, files, starts, recipe.start == "file")
+    textures = load_textures(parsed, files, starts, recipe.start == "file")
     check_output(request.output, [texture.file for texture in textures])
     rendered = ReferenceRenders(
         parsed, views, recipe.reference_spp, references, recipe.against,
@@ -111,15 +116,15 @@ def fit_scene(
     images = rendered.images([*trained, *measured])
     scene = TrainedScene(parsed, {texture.file: texture.table for texture in textures}, views, recipe.spp)
     problem = SceneProblem(
-        joined({texture.file.name: texture.problem for texture in textures}), scene,
+        joint_problem({texture.file.name: texture.problem for texture in textures}), scene,
         [*zip(trained, images, strict=False)], [*zip(measured, images[len(trained) :], strict=True)],
         recipe, rendered.digest, preview,
     )  # fmt: skip
     problem.common |= {"views": dataclasses.asdict(views)}
     problem.identity |= problem.common
 
-    def stored(texture: SceneTexture, recorded: Mapping, more: Mapping) -> tuple[Table, dict[str, float]]:
-        table = texture.stored({**recorded, **texture.identity, **problem.common, **more})
+    def to_table(texture: SceneTexture, recorded: Mapping, more: Mapping) -> tuple[Table, dict[str, float]]:
+        table = texture.to_table({**recorded, **texture.identity, **problem.common, **more})
         return table, texture.measure(table)
 
     remark, before = "", None
@@ -129,7 +134,7 @@ def fit_scene(
     elif recipe.start == "file":
         before = problem.measure(problem.net)
     arrays = {name: array.data for name, array in problem.net.arrays.items()}
-    result = request.train(problem, finish=lambda: [stored(texture, {}, {}) for texture in textures])
+    result = request.train(problem, finish=lambda: [to_table(texture, {}, {}) for texture in textures])
     kept = recipe.start == "file" and before["psnr_db"] > result.measured["psnr_db"]
     if kept:
         for name, data in arrays.items():
@@ -145,7 +150,7 @@ def fit_scene(
     more |= {"trained_with": [t.file.name for t in textures]} if len(textures) > 1 else {}
     tables = {}
     for texture in textures:
-        table, errors = stored(texture, request.recorded(result), more)
+        table, errors = to_table(texture, request.recorded(result), more)
         table.settings |= request.paths(source_path=texture.source_path)
         table.preset, table.seed = request.preset, recipe.settings.seed
         errors["psnr_scene_db"] = result.measured["psnr_db"]
@@ -154,7 +159,7 @@ def fit_scene(
     return tables, result
 
 
-def joined(problems: Mapping[str, TextureProblem]) -> TextureProblem | JointProblem:
+def joint_problem(problems: Mapping[str, TextureProblem]) -> TextureProblem | JointProblem:
     """Return the problem of all textures, by name: that of a single one as it is."""
     return JointProblem(problems) if len(problems) > 1 else next(iter(problems.values()))
 

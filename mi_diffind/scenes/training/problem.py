@@ -51,10 +51,9 @@ class SceneProblem(Problem):
     """Training problem (:mod:`mi_diffind.fitting.loop`) of a texture in a scene.
 
     ``texture`` is the problem of the same arrays without a scene, of one texture or several, whose ``net`` is trained;
-    ``scene`` reads the arrays.
-    ``trained`` and ``measured`` are pairs of a view and its reference, ``(height, width, channels)``. ``preview`` is a
-    picture of the first measured view, written at each measurement: reference | render | :data:`SHOWN` times their
-    difference.
+    ``scene`` reads the arrays. ``trained`` and ``measured`` are pairs of a view and its reference, ``(height, width,
+    channels)``. ``preview`` is a picture of the first measured view, written at each measurement: reference | render |
+    :data:`SHOWN` times their difference.
     """
 
     #: Tolerance of the PSNR of renders, dB.
@@ -129,7 +128,7 @@ class SceneProblem(Problem):
             errors = []
             for i, (view, reference) in enumerate(self.measured):
                 self.scene.place(view)
-                a, b = (self._sampled(2 * i + half) for half in range(2))
+                a, b = (self._render_half(2 * i + half) for half in range(2))
                 truth = np.clip(reference, 0, 1)
                 errors.append(float(np.mean((np.clip(a, 0, 1) - truth) * (np.clip(b, 0, 1) - truth), dtype=np.float64)))
                 if i == 0 and self.preview is not None:
@@ -138,7 +137,7 @@ class SceneProblem(Problem):
         decibels = -10 * math.log10(max(float(np.mean(errors)), 1e-12))
         return {"psnr_db": decibels, **{f"texture_{name}": value for name, value in texture.items()}}
 
-    def _sampled(self, number: int) -> np.ndarray:
+    def _render_half(self, number: int) -> np.ndarray:
         """Render half the samples of a measurement, the same for the same number."""
         seed = dr.opaque(mi.UInt32, SEEDS - 1 - number)
         return self.exposure * np.nan_to_num(self.scene.render(seed, seed + SEEDS, self.samples).numpy())

@@ -71,9 +71,9 @@ class Rig:
         if view.origin is not None:
             to = np.array(view.origin)
         else:
-            to = self.target + self._turned(origin - self.target, view.azimuth, view.elevation, view.distance)
+            to = self.target + self._rotate_offset(origin - self.target, view.azimuth, view.elevation, view.distance)
         # Roll, scale and the angle to the target of the scene's own camera are preserved
-        return self._looking(to) @ np.linalg.inv(self._looking(origin)) @ before
+        return self._look_at(to) @ np.linalg.inv(self._look_at(origin)) @ before
 
     def _turn(self, light: _Movable, view: View) -> np.ndarray:
         """Return the 4×4 matrix that moves a light from its place in the scene to that of a view."""
@@ -81,8 +81,8 @@ class Rig:
         if light.environment:
             return rotation(self.up, view.light_azimuth or 0.0, centre)
         towards = -light.before[:3, 2] if light.at_infinity else light.centre - centre
-        turned = self._turned(towards, view.light_azimuth, view.light_elevation, None)
-        turn = _between(towards, turned, self.up, view.light_azimuth or 0.0)
+        turned = self._rotate_offset(towards, view.light_azimuth, view.light_elevation, None)
+        turn = _aligning_rotation(towards, turned, self.up, view.light_azimuth or 0.0)
         turn[:3, 3] = centre - turn[:3, :3] @ centre
         return turn
 
@@ -91,10 +91,10 @@ class Rig:
         if view.light_elevation is None:
             return light.sun
         sky = light.before[:3, :3]
-        towards = self._turned(sky @ light.sun, view.light_azimuth, view.light_elevation, None)
+        towards = self._rotate_offset(sky @ light.sun, view.light_azimuth, view.light_elevation, None)
         return np.linalg.solve(turn[:3, :3] @ sky, towards)
 
-    def _turned(self, offset: np.ndarray, azimuth, elevation, distance) -> np.ndarray:
+    def _rotate_offset(self, offset: np.ndarray, azimuth, elevation, distance) -> np.ndarray:
         """Return an offset from the target after a turn about ``up``, at an elevation and a distance."""
         length = np.linalg.norm(offset)
         if length == 0:
@@ -108,7 +108,7 @@ class Rig:
         angle = np.arcsin(np.clip(height / length, -1, 1)) if elevation is None else np.radians(elevation)
         return (distance or length) * (np.cos(angle) * flat + np.sin(angle) * self.up)
 
-    def _looking(self, origin: np.ndarray) -> np.ndarray:
+    def _look_at(self, origin: np.ndarray) -> np.ndarray:
         """Return the ``look_at`` matrix from ``origin`` to the target."""
         axis = self.target - origin
         if np.linalg.norm(axis) == 0:
@@ -169,7 +169,7 @@ class _Movable:
             self.scene.parameters_changed()  # rays are to find the shape at its place
 
 
-def _between(before: np.ndarray, after: np.ndarray, up: np.ndarray, degrees: float) -> np.ndarray:
+def _aligning_rotation(before: np.ndarray, after: np.ndarray, up: np.ndarray, degrees: float) -> np.ndarray:
     """Return the rotation by ``degrees`` about ``up``, then the shortest one that aligns ``before`` with ``after``."""
     turn = rotation(up, degrees)
     a, b = turn[:3, :3] @ before, after

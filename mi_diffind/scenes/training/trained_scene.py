@@ -149,7 +149,7 @@ def texture_problem(table: Table, source: Source) -> TextureProblem:
         raise UsageError(f"{table.path}: holds a texture of one colour, without arrays to train")
     texture = CompressedTexture.of(table, mi.TensorXf, "float32")
     pyramid = Pyramid.of(source, layout, compat.module_of(mi.TensorXf), texture.border)
-    problem = TextureProblem(texture.net, pyramid, recipe_of(table), source.digest)
+    problem = TextureProblem(texture.net, pyramid, texture_recipe(table), source.digest)
     problem.settings = problem.recipe.settings
     return problem
 
@@ -169,11 +169,11 @@ class SceneTexture:
         self.level_bias = bias_of(self.table.settings)
         if not trained:
             recipe, pyramid = self.problem.recipe, self.problem.pyramid
-            self.problem = problem_of(self.source, budget_of(self.table), recipe, pyramid)
+            self.problem = problem_of(self.source, texture_budget(self.table), recipe, pyramid)
             self.problem.settings = recipe.settings
-            self.table = self.stored({})
+            self.table = self.to_table({})
 
-    def stored(self, settings: Mapping) -> Table:
+    def to_table(self, settings: Mapping) -> Table:
         """Return the table of the arrays in their state, with ``settings``."""
         texture = CompressedTexture(self.problem.pyramid.layout, stored_form(self.problem.net), self.level_bias)
         return to_table(texture, dict(settings))
@@ -188,7 +188,7 @@ class SceneTexture:
         return {k: v for k, v in self.problem.identity.items() if k not in ("structure", "border")}
 
 
-def stored_textures(
+def load_textures(
     parsed: loading.ParsedScene,
     files: Sequence[str | os.PathLike] = (),
     starts: Sequence[str | os.PathLike] = (),
@@ -197,8 +197,7 @@ def stored_textures(
     """Return the textures of a scene that are trained: of the ``files``, by default of all that hold arrays.
 
     ``starts`` are files to start from; each belongs to the texture that has its maps and its source. Raises
-    :class:`.UsageError`, :class:`.TableError` and
-    :class:`~mi_diffind.maps.source.SourceError`.
+    :class:`.UsageError`, :class:`.TableError` and :class:`~mi_diffind.maps.source.SourceError`.
     """
     given = texture_files(parsed, files)
     tables = {file: load(file) for file in given}
@@ -220,14 +219,14 @@ def stored_textures(
     return [SceneTexture(file, table, given[file], begin.get(file), trained) for file, table in tables.items()]
 
 
-def recipe_of(table: Table) -> TextureRecipe:
+def texture_recipe(table: Table) -> TextureRecipe:
     """Return the recipe by which the arrays of a file were trained as a texture."""
     preset = PRESETS["ours" if table.settings.get("layered", True) else "paper"]
     names = [f.name for f in dataclasses.fields(TextureRecipe) if f.name != "settings"]
     return dataclasses.replace(preset, **{n: table.settings[n] for n in names if n in table.settings})
 
 
-def budget_of(table: Table) -> TextureBudget | PaperBudget:
+def texture_budget(table: Table) -> TextureBudget | PaperBudget:
     """Return the memory budget that the arrays of a texture were made for."""
     layout = Layout.from_json(table.settings["layout"])
     structure, _ = structure_of(table.settings, layout)

@@ -13,8 +13,11 @@ from ...core.progress import interruptible
 from .page import Page, server
 from .session import WIDTH, Session
 
-#: Address at which the page is served by default.
-HOST, PORT = "127.0.0.1", 8080
+#: Host at which the page is served by default: only this machine can open it.
+HOST = "127.0.0.1"
+
+#: Port at which the page is served by default.
+PORT = 8080
 
 
 def view(
@@ -41,8 +44,7 @@ def view(
     - ``announce``: called with a sentence that names the page.
 
     Returns the figures of the last picture (:attr:`.session.Session.figures`) with the ``url`` and ``seconds_shown``.
-    Raises :class:`.UsageError`, also if viser is not installed, and as
-    :class:`.session.Session` does.
+    Raises :class:`.UsageError`, also if viser is not installed, and as :class:`.session.Session` does.
     """
     start = time.perf_counter()
     session = Session(source, width, spp, seed, against=against, defines=defines)

@@ -147,21 +147,24 @@ class Page:
 
     def _slider(self, parameter) -> None:
         """Show the control of a parameter: a slider, a colour picker, or numbers for a colour beyond [0, 1]."""
-        gui, path, decoded = self.server.gui, parameter.path, lambda value: value
+        gui, path = self.server.gui, parameter.path
         value = self.session.learned.parameters.value(path)
         hint = path if self.session.on_both(path) else f"{path}: of the learned side only"
-        if not parameter.is_colour:
-            low, high = min(parameter.low, value), max(parameter.high, value)
-            control = gui.add_slider(parameter.name, low, high, (high - low) / STEPS, value, hint=hint)
-        elif min(value) >= 0 and max(value) <= 1 and parameter.high == 1:
+        picked = parameter.is_colour and min(value) >= 0 and max(value) <= 1 and parameter.high == 1
+        if picked:
             shown = tuple(int(x) for x in np.round(255 * srgb.from_linear(np.array(value))))
             control = gui.add_rgb(parameter.name, shown, hint=hint)
-
-            def decoded(value):
-                return tuple(float(x) for x in srgb.to_linear(np.array(value) / 255))
-        else:
+        elif parameter.is_colour:
             control = gui.add_vector3(parameter.name, value, step=parameter.high / STEPS, hint=hint)
-        control.on_update(lambda event: self._change(path, decoded(control.value)))
+        else:
+            low, high = min(parameter.low, value), max(parameter.high, value)
+            control = gui.add_slider(parameter.name, low, high, (high - low) / STEPS, value, hint=hint)
+
+        def change(event) -> None:
+            linear = srgb.to_linear(np.array(control.value) / 255).tolist() if picked else control.value
+            self._change(path, linear)
+
+        control.on_update(change)
 
     def _change(self, path: str, value) -> None:
         """Ask for another value of a parameter; of several that wait, the newest counts."""
@@ -269,7 +272,7 @@ class Page:
 
     def _send(self, client) -> None:
         if self._picture is not None:
-            image = padded(self._picture, client.camera.aspect)
+            image = pad(self._picture, client.camera.aspect)
             quality = MOVING_QUALITY if self.session.moving else QUALITY
             client.scene.set_background_image(image, format="jpeg", jpeg_quality=quality)
 
@@ -282,7 +285,7 @@ def to_world(wxyz: np.ndarray, position: np.ndarray) -> np.ndarray:
     return matrix
 
 
-def padded(picture: np.ndarray, aspect: float) -> np.ndarray:
+def pad(picture: np.ndarray, aspect: float) -> np.ndarray:
     """Return a picture ``(height, width, 3)`` between black bars, so that width over height is ``aspect``."""
     height, width = picture.shape[:2]
     if not math.isfinite(aspect) or not 0.05 < aspect < 20:

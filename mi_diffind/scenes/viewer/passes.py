@@ -20,7 +20,7 @@ from ...core import compat
 from ...core.errors import UsageError
 from ...plugins.support import footprint
 from .. import loading
-from ..inspection import owners_of, paths_of
+from ..inspection import object_paths, owner_names
 
 #: Passes of a region, the first ones, whose times include compilation and recording.
 SETTLED = 3
@@ -230,8 +230,8 @@ class NamedParameters:
 
     def __init__(self, scene):
         self._params, self._keys = mi.traverse(scene), {}
-        objects = paths_of(scene)
-        owners, first, rest = owners_of(objects), {}, {}
+        objects = object_paths(scene)
+        owners, first, rest = owner_names(objects), {}, {}
         for key in self._params.keys():
             path = next(p for p in _parents(key) if p in owners)
             value, node = _plain(self._params[key]), objects[path]
@@ -256,14 +256,14 @@ class NamedParameters:
         return _plain(self._params[self._keys[path]])
 
     def set(self, values: Mapping[str, float | tuple[float, float, float]]) -> None:
-        """Give parameters other values, as of :meth:`checked`, and update the scene."""
+        """Give parameters other values, as of :meth:`check`, and update the scene."""
         for path, value in values.items():
             value_type = type(self._params[self._keys[path]])
             # Opaque: another value needs no other kernel
             self._params[self._keys[path]] = value if value_type is float else dr.opaque(value_type, value)
         self._params.update()
 
-    def checked(self, path: str, value) -> float | tuple[float, float, float]:
+    def check(self, path: str, value) -> float | tuple[float, float, float]:
         """Return a value as the parameter holds it.
 
         Raises :class:`.UsageError` for a parameter that is not listed, and a value that is no finite number or colour.
@@ -280,7 +280,7 @@ class NamedParameters:
             raise UsageError(f'parameter "{path}": found {str(value)[:40]}, expected {expected}')
         return numbers if colour else numbers[0]
 
-    def named(self, path: str) -> str:
+    def counterpart(self, path: str) -> str:
         """Return the path of the parameter here that the learned scene calls ``path``, "" if there is none.
 
         Objects without an id are named by their plugin: ``(neural_disney 2)`` is ``(disney 2)`` in the exact scene.

@@ -104,7 +104,7 @@ class Session:
             raise loading.SceneError(f"{self._parsed.path}: the sensor {sensor.class_name()} cannot be moved")
         film = loading.film_size(self.learned.scene)
         self.full = (width, max(1, round(width * film[1] / film[0]))) if self.learned.by_pixels else film
-        self.spp = _checked_samples(spp or sensor.sampler().sample_count())
+        self.spp = _check_samples(spp or sensor.sampler().sample_count())
         loading.check_size(self.learned.scene, self.spp, self.full)
         written = np.array(self.learned.placement["to_world"].matrix, np.float64).reshape(4, 4)
         self.pose = self.start = rigid(written)
@@ -283,7 +283,7 @@ class Session:
 
         If the scene refuses them, it keeps the old ones. Raises :class:`.UsageError` and :class:`.SceneError`.
         """
-        checked = {path: self.learned.parameters.checked(path, value) for path, value in values.items()}
+        checked = {path: self.learned.parameters.check(path, value) for path, value in values.items()}
         before = {path: self.learned.parameters.value(path) for path in checked}
         try:
             with loading.scene_errors(self._parsed.path):
@@ -297,12 +297,12 @@ class Session:
     def _set(self, values: Mapping[str, object]) -> None:
         self.learned.change(values)
         if self.exact:
-            named = {self.exact.parameters.named(path): value for path, value in values.items()}
+            named = {self.exact.parameters.counterpart(path): value for path, value in values.items()}
             self.exact.change({path: value for path, value in named.items() if path})
 
     def on_both(self, path: str) -> bool:
         """Return whether a parameter changes the exact side, too."""
-        return self.exact is None or bool(self.exact.parameters.named(path))
+        return self.exact is None or bool(self.exact.parameters.counterpart(path))
 
     @property
     def choices(self) -> dict[str, tuple[str, ...]]:
@@ -333,7 +333,7 @@ class Session:
 
     def samples(self, spp: int) -> None:
         """Choose the samples per pixel of a finished picture. Raises :class:`.UsageError`."""
-        self.spp = _checked_samples(spp)
+        self.spp = _check_samples(spp)
         self._restart()  # the footprint of a sample depends on their number
 
     # -- picture and figures ------------------------------------------------------------------------------------------
@@ -347,7 +347,7 @@ class Session:
         sides = self._visible()
         if len(sides) == 1:
             return displayed(sides[0].image)
-        return combined(self.learned.image, self.exact.image, self.view, self.divider, self.gain)
+        return combine(self.learned.image, self.exact.image, self.view, self.divider, self.gain)
 
     @property
     def figures(self) -> dict:
@@ -380,7 +380,7 @@ class Session:
         }
 
 
-def _checked_samples(spp) -> int:
+def _check_samples(spp) -> int:
     if not isinstance(spp, int) or not 1 <= spp <= 2**16:
         raise UsageError(f"spp: found {spp}, allowed are whole numbers from 1 to {2**16}")
     return spp
@@ -394,7 +394,7 @@ def rigid(to_world: np.ndarray) -> np.ndarray:
     return matrix
 
 
-def combined(learned: np.ndarray, exact: np.ndarray, view: str, divider: float, gain: float) -> np.ndarray:
+def combine(learned: np.ndarray, exact: np.ndarray, view: str, divider: float, gain: float) -> np.ndarray:
     """Return two linear images ``(height, width, 3)`` side by side, or their difference, as bytes for a screen."""
     if view == "difference":
         return displayed(gain * np.abs(np.clip(learned, 0, 1) - np.clip(exact, 0, 1)))

@@ -23,12 +23,11 @@ from ...core.units import largest_fitting
 from ...fitting.loop import Problem
 from ...maps.compressed import decibel
 from ...tasks.sdf import nodes
-from ...tasks.sdf.distances import Distances
+from ...tasks.sdf.distances import Distances, sample_box, sample_near, surface_cells
 from ...tasks.sdf.encoding import sample
 from ...tasks.sdf.field import DistanceField
 from ...tasks.sdf.mesh import Mesh
 from ...tasks.sdf.nodes import SparseNodes, middles
-from ...tasks.sdf.sampling import sample_box, sample_near, surface_cells
 from .networks import LAYERS, WIDTH, Network, hash_grid
 
 #: Largest distance, in cells, between the surface and a corner of a cell that the surface crosses.

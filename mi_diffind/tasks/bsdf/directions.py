@@ -57,7 +57,7 @@ def sample_ggx(wi, alpha_u, alpha_v, u, v):
 def density_ggx(wi, wo, alpha_u, alpha_v, gamma=None):
     """Return the density of :func:`sample_ggx` per solid angle, D / (2 d(wi)).
 
-    With ``gamma``, the density if its number v is first mapped by :func:`shortened`.
+    With ``gamma``, the density if its number v is first mapped by :func:`shorten_tail`.
     """
     half = half_vector(wi, wo)
     inverse, visible = dr.rcp(dr.squared_norm(half)), masking(wi, dr.square(alpha_u), dr.square(alpha_v))
@@ -71,7 +71,7 @@ def density_ggx(wi, wo, alpha_u, alpha_v, gamma=None):
     return density * dr.select(rest > SMALLEST_REST, factor, 0)
 
 
-def shortened(v, gamma):
+def shorten_tail(v, gamma):
     """Return the number v for which a lobe of :func:`sample_ggx` has tails of the exponent ``gamma`` (2: ``v``).
 
     At normal incidence, slopes then have the distribution of the proxy's lobes. The map is t / (1 + t) with t = γ/2 ((1

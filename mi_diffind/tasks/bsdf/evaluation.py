@@ -118,16 +118,11 @@ def measure_family(model, truth: FamilyTruth) -> dict[str, float]:
     }
 
 
-class LearnedTruth(Truth):
-    """Model of a table file in the place of a source."""
-
-    samples = True
-
-    def __init__(self, model):
-        self.model, self.name, self.digest = model, str(model.table.settings.get("name", "")), ""
-        self.isotropic = model.form.isotropic or None
-        self.value = model.bsdf.cosine_value
-        self.sample, self.density = model.mixture.sample, model.mixture.density
+def learned_truth(model) -> Truth:
+    """Return a model in the place of a source."""
+    truth = FunctionTruth(str(model.table.settings.get("name", "")), model.bsdf.cosine_value, model.mixture)
+    truth.isotropic = model.form.isotropic or None
+    return truth
 
 
 def write(model, output: Path, source, rows: int | None = None, seed: int | None = None) -> list[tuple[Path, str]]:
@@ -161,7 +156,7 @@ def sample_rows(model, rows: int, seed: int) -> np.ndarray:
     Directions of incidence are those of trainings; ``wo`` is drawn from the lobes that sample the model, from wider and
     from narrower ones. The solid angle is the inverse of its density.
     """
-    types, truth, parts, count = model.types, LearnedTruth(model), [], 0
+    types, truth, parts, count = model.types, learned_truth(model), [], 0
     rng = dr.rng(seed=dr.opaque(types.UInt64, seed))
     while count < rows:
         s = outgoing(rng, types, incident(rng, types, 2 * rows, truth.isotropic), truth)
@@ -187,7 +182,7 @@ def picture(model, source) -> tuple[np.ndarray, str]:
         if not truth.function:
             raise TableError(f"{truth.name}: its rows show no picture")
     except TableError as e:
-        truth, alone = LearnedTruth(model), str(e)
+        truth, alone = learned_truth(model), str(e)
     learned, exact = 0, 0
     for seed in range(PASSES):
         view = SphereView(truth, model.types, seed, SIDE)

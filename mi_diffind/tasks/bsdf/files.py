@@ -210,7 +210,7 @@ class BSDFModel(Model):
             self.bsdf, self.mixture = self.at([self.types.Float(p.middle) for p in self.parameters])
             return
         proxy = self.arrays.get("proxy")
-        proxy = None if proxy is None else Proxy.of(BSDFArrays(None, proxy).logarithms(), self.form)
+        proxy = None if proxy is None else Proxy.from_logarithms(BSDFArrays(None, proxy).logarithms(), self.form)
         self.bsdf = LearnedBSDF(self.form, self._residual(), proxy, self.arrays.get("energy"))
         lobes = tuple(SampledLobe(*map(float, lobe)) for lobe in self.table.settings["lobes"])
         self.mixture = Mixture(self.arrays["weights"], lobes)
@@ -237,7 +237,7 @@ class BSDFModel(Model):
         alphas = [f * w for f, w in zip(factors, widths(bsdf.proxy, bsdf.scale), strict=True)]
         return bsdf, Mixture(weights, tuple(SampledLobe(a, a) for a in alphas))
 
-    def fixed(self, values: list[float]) -> tuple[LearnedBSDF, Mixture]:
+    def member(self, values: list[float]) -> tuple[LearnedBSDF, Mixture]:
         """Return the BSDF and the mixture of one member, a single material, without derivatives.
 
         The tables are interpolated once, so that it takes no more time than a single learned BSDF.
@@ -262,7 +262,7 @@ class BSDFModel(Model):
             dr.make_opaque(bsdf.terms)  # not numbers of Python, which would be part of kernels
         return bsdf, mixture
 
-    def reduced(self, values: list[float | None]) -> BSDFModel:
+    def restrict(self, values: list[float | None]) -> BSDFModel:
         """Return the family of the parameters whose value is ``None``, for ``values`` of the others."""
         result = self.copy()
         for name in PARAMETER_TABLES:
@@ -314,12 +314,14 @@ class BSDFModel(Model):
             return evaluation.measure_samples(self, measured.without_outliers(rows, self.form, self.bsdf)[0])
         return evaluation.measure(self, truth, SphereView(truth, self.types))
 
-    def decode(self, output: str | os.PathLike, rows: int | None = None, seed: int | None = None):
-        """Write a ``.csv`` or ``.exr`` file (:func:`.evaluation.write`).
+    def decode(self, output: str | os.PathLike | None = None, rows: int | None = None, seed: int | None = None):
+        """Write a ``.csv`` or ``.exr`` file (:func:`.evaluation.write`); without an ``output``, return the rows.
 
         ``rows`` and ``seed``: number of rows of a ``.csv`` file, and seed of its random directions. Raises
         :class:`.UsageError`.
         """
+        if output is None:
+            return evaluation.sample_rows(self, rows or evaluation.ROWS, seed or 0)
         return evaluation.write(self, Path(output), self.source, rows, seed)
 
 

@@ -18,7 +18,7 @@ from ...fitting.task import FitRequest, Fitted
 from . import energy, evaluation, measured, mixture, training
 from .directions import SphereView
 from .files import BSDFModel, allocate, to_table
-from .measured import WHITE, FunctionTruth, Truth, TurnedTruth
+from .measured import WHITE, FunctionTruth, Truth
 from .model import BYTES, TERMS, ResidualSizes, points, sizes_within
 from .truth import FamilyTruth, parameter_ranges, recorded_source, truth_of
 
@@ -69,7 +69,7 @@ def _fit_single(truth: Truth, request: FitRequest, stop: Event) -> Fitted:
     with dr.suspend_grad():
         rows = not truth.function
         symmetries = measured.measure_row_symmetry(truth) if rows else measured.measure_symmetry(truth, types)
-    isotropic, azimuth = _assumed(symmetries)
+    isotropic, azimuth = _assumed_symmetry(symmetries)
     lines = [*filter(None, [truth.remark]), symmetry_line(symmetries)]
     sizes = _sizes(request, plain=request.preset in ("table", "plain"))
     if rows:
@@ -93,7 +93,7 @@ def _fit_single(truth: Truth, request: FitRequest, stop: Event) -> Fitted:
         form = dataclasses.replace(form, terms=())
         form = dataclasses.replace(form, range=training.residual_range(form, logarithms, validation))
     if rows:
-        (samples, validation), form, line = measured.cleaned(truth, [samples, validation], form, logarithms)
+        (samples, validation), form, line = measured.remove_outliers(truth, [samples, validation], form, logarithms)
         lines.append(line)
     identity = {"source": truth.digest, "structure": sizes.to_json(), "form": form.to_json()}
     judge = judge or training.proxy_loss(validation)
@@ -104,7 +104,7 @@ def _fit_single(truth: Truth, request: FitRequest, stop: Event) -> Fitted:
         """Return the table of the arrays as they are, its limit of the albedo, and the PSNR without."""
         value = problem.net.at(form).cosine_value
         sampled = FunctionTruth(truth.name, value) if rows else truth
-        sampled = TurnedTruth(sampled, -angle) if angle else sampled
+        sampled = measured.rotate_truth(sampled, -angle) if angle else sampled
         lobes, weights = mixture.fit_mixture(sampled, types, isotropic, form.scale[1] / form.scale[0])
         raw, scale = None if rows else view.psnr(value), None
         if options["energy"] == "source":
@@ -135,7 +135,7 @@ def _fit_family(truth: FamilyTruth, request: FitRequest, stop: Event) -> Fitted:
     with dr.suspend_grad():
         truth.check_effects(types)
         symmetries = truth.symmetries(types)
-    isotropic, azimuth = _assumed(symmetries)
+    isotropic, azimuth = _assumed_symmetry(symmetries)
     members, count = training.MEMBERS, training.SAMPLES
     samples = training.draw_members(truth, types, count, members, settings.seed + 1, isotropic)
     validation = training.draw_members(truth, types, training.VALIDATION, members // 4, settings.seed + 2, isotropic)
@@ -175,7 +175,7 @@ def _fit_family(truth: FamilyTruth, request: FitRequest, stop: Event) -> Fitted:
     return Fitted(table, result, lines, {**_figures(table, symmetries), "family": described})
 
 
-def _assumed(symmetries: dict[str, float | None]) -> tuple[bool, str]:
+def _assumed_symmetry(symmetries: dict[str, float | None]) -> tuple[bool, str]:
     """Return whether a source counts as isotropic, and what its residual assumes of the azimuth."""
     isotropic, mirror = ((symmetries[name] or 0) <= measured.TOLERANCE for name in ("isotropy", "mirror"))
     return isotropic, "mirror" if mirror else "half"

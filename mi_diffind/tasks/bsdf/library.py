@@ -225,14 +225,14 @@ def _identity(file: Path, options: list) -> str:
     """Return a hash of the content of a source, of the files that it names, and of ``options``; "" on any error."""
     digest = hashlib.sha256(json.dumps(options, sort_keys=True, default=str).encode())
     try:
-        for one in _files_of(file):
+        for one in _source_files(file):
             digest.update(one.name.encode() + b"\0" + one.read_bytes() + b"\0")
     except Exception:  # Mitsuba raises several types; the fit says what is wrong
         return ""
     return digest.hexdigest()
 
 
-def _files_of(file: Path) -> list[Path]:
+def _source_files(file: Path) -> list[Path]:
     """Return a source and, of XML, the files that it includes or names."""
     if file.suffix.lower() != ".xml":
         return [file]

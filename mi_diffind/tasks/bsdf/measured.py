@@ -31,7 +31,8 @@ from ...arrays.lookup import clamp
 from ...core import tensor_files
 from ...core.errors import UsageError, reason
 from .directions import Samples, incident, outgoing
-from .model import BSDFArrays, DirectionPair, Form, LearnedBSDF, turned
+from .mixture import TurnedMixture
+from .model import BSDFArrays, DirectionPair, Form, LearnedBSDF, rotate
 from .training import module_types, proxy_array, residual_range
 
 #: Relative difference up to which a symmetry is assumed.
@@ -76,10 +77,10 @@ DENSITY = 8
 #: Neighbours that a row is compared with.
 NEIGHBOURS = 16
 
-#: A row is an outlier if its logarithm differs from its neighbours' median by this many times the usual difference …
+#: Multiple of the usual difference from the neighbours' median, of logarithms, above which a row is an outlier.
 OUTLIER = 6.0
 
-#: … and by more than this.
+#: Least difference of logarithms of an outlier.
 FAR = 0.4
 
 #: Number of rows whose neighbours measure symmetries.
@@ -135,27 +136,21 @@ class Truth:
 
 
 class FunctionTruth(Truth):
-    """Source whose values f cos θ_o are those of a function ``value(wi, wo)``."""
+    """Source whose values f cos θ_o are those of a function ``value(wi, wo)``, sampled by a mixture, if any."""
 
-    def __init__(self, name: str, value: Callable):
+    def __init__(self, name: str, value: Callable, mixture=None):
         self.name, self.digest, self.value = name, "", value
+        if mixture is not None:
+            self.samples, self.sample, self.density = True, mixture.sample, mixture.density
 
 
-class TurnedTruth(Truth):
-    """Source that is turned about the normal by ``angle``, radians."""
+def rotate_truth(truth: Truth, angle: float) -> Truth:
+    """Return a source after a rotation about the normal by ``angle``, radians."""
 
-    def __init__(self, truth: Truth, angle: float):
-        self.truth, self.angle, self.name, self.digest = truth, angle, truth.name, truth.digest
-        self.samples, self.remark = truth.samples, truth.remark
+    def value(wi, wo) -> list:
+        return truth.value(rotate(wi, -angle), rotate(wo, -angle))
 
-    def value(self, wi, wo) -> list:
-        return self.truth.value(turned(wi, -self.angle), turned(wo, -self.angle))
-
-    def sample(self, wi, w, u, v):
-        return turned(self.truth.sample(turned(wi, -self.angle), w, u, v), self.angle)
-
-    def density(self, wi, wo):
-        return self.truth.density(turned(wi, -self.angle), turned(wo, -self.angle))
+    return FunctionTruth(truth.name, value, TurnedMixture(truth, angle) if truth.samples else None)
 
 
 #: Diffuse source of albedo 1.
@@ -178,8 +173,8 @@ def axes_angle(samples: Samples, truth: Truth) -> float:
     half = half * dr.rsqrt(dr.maximum(dr.squared_norm(half), 1e-20))
     for k in range(4 if truth.function else 1):
         angle = k * math.pi / 4
-        value = truth.value(turned(samples.wi, angle), turned(samples.wo, angle)) if k else samples.value
-        light, h = samples.weight * dr.square(value[0] + value[1] + value[2]), turned(half, angle)
+        value = truth.value(rotate(samples.wi, angle), rotate(samples.wo, angle)) if k else samples.value
+        light, h = samples.weight * dr.square(value[0] + value[1] + value[2]), rotate(half, angle)
         if not truth.function:  # rows may be outliers
             light = dr.minimum(light, float(np.quantile(light.numpy(), BRIGHT_AXES)))
         columns = [light * (dr.square(h.x) - dr.square(h.y)), 2 * light * h.x * h.y]
@@ -477,11 +472,11 @@ def measure_row_symmetry(truth: ScatteredTruth, seed: int = 1) -> dict[str, floa
     if not isotropic:  # the plane of incidence of a row then means another material each time
         result["mirror"] = result["isotropy"]
     share = irreciprocal_share(truth, isotropic, (result["mirror"] or 0) <= TOLERANCE)
-    result["reciprocity"] = excess(places(exchanged(truth), True)) if share is None else share
+    result["reciprocity"] = excess(places(exchange(truth), True)) if share is None else share
     return result
 
 
-def exchanged(truth: ScatteredTruth) -> ScatteredTruth:
+def exchange(truth: ScatteredTruth) -> ScatteredTruth:
     """Return the rows with their directions exchanged."""
     result = copy.copy(truth)
     result.wi, result.wo = truth.wo, truth.wi
@@ -497,7 +492,7 @@ def irreciprocal_share(truth: ScatteredTruth, isotropic: bool, mirror: bool) -> 
     """
     from scipy.spatial import cKDTree
 
-    points, images = places(truth, isotropic), places(exchanged(truth), isotropic)
+    points, images = places(truth, isotropic), places(exchange(truth), isotropic)
     if isotropic and mirror:
         points[:, 2], images[:, 2] = np.abs(points[:, 2]), np.abs(images[:, 2])
     symmetric = np.linalg.norm(points - images, axis=1) < EXACT
@@ -596,7 +591,7 @@ def without_outliers(samples: Samples, form: Form, proxy: LearnedBSDF) -> tuple[
     from scipy.spatial import cKDTree
 
     with dr.suspend_grad():
-        g = DirectionPair.of(*(turned(w, -form.angle) for w in (samples.wi, samples.wo)))
+        g = DirectionPair.of(*(rotate(w, -form.angle) for w in (samples.wi, samples.wo)))
         columns = [*proxy.coordinates(g), *(v * samples.wo.z for v in proxy.value(samples.wi, samples.wo))]
         dr.eval(columns)
     u, v, w, *expected = (np.asarray(c.numpy(), np.float64) for c in columns)
@@ -612,7 +607,7 @@ def without_outliers(samples: Samples, form: Form, proxy: LearnedBSDF) -> tuple[
     return Samples(samples.wi, samples.wo, samples.weight * kept, samples.value), int(outlier.sum())
 
 
-def cleaned(
+def remove_outliers(
     truth: ScatteredTruth, parts: list[Samples], form: Form, logarithms: np.ndarray
 ) -> tuple[list[Samples], Form, str]:
     """Return samples without outliers from a fitted proxy, the form with the range of the first, and a line of text."""

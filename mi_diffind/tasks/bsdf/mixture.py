@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
-from .directions import density_ggx, incident, outgoing, sample_ggx, shortened
-from .model import SAMPLING_NODES, grid, opaque_numbers, table_nodes, turned, widths
+from .directions import density_ggx, incident, outgoing, sample_ggx, shorten_tail
+from .model import SAMPLING_NODES, grid, opaque_numbers, rotate, table_nodes, widths
 
 #: Directions of incidence for which weights are stored.
 NODES = 16
@@ -56,7 +56,7 @@ def cosines(nodes: int) -> np.ndarray:
 class SampledLobe:
     """Lobe of visible GGX normals of the roughnesses ``alpha_u`` and ``alpha_v``, numbers or arrays.
 
-    ``gamma`` is the exponent of its tails: 2 for those of GGX, larger for shorter ones (:func:`.pool.shortened`).
+    ``gamma`` is the exponent of its tails: 2 for those of GGX, larger for shorter ones (:func:`.pool.shorten_tail`).
     """
 
     alpha_u: object
@@ -191,7 +191,7 @@ class Mixture:
         r, (sin, cos) = dr.sqrt(u), dr.sincos(2 * dr.pi * v)
         diffuse = type(wi)(r * cos, r * sin, dr.sqrt(dr.maximum(1 - u, 0)))
         if not all(lobe.is_ggx for lobe in self.lobes):
-            v = shortened(v, gamma)
+            v = shorten_tail(v, gamma)
         return dr.select(w < cosine, diffuse, sample_ggx(wi, alpha_u, alpha_v, u, v))
 
     def density(self, wi, wo, active=True):
@@ -204,18 +204,18 @@ class Mixture:
 
 
 class TurnedMixture:
-    """Mixture that is turned about the normal by ``angle``, radians."""
+    """Mixture, or source that samples itself, that is turned about the normal by ``angle``, radians."""
 
-    def __init__(self, mixture: Mixture, angle: float):
+    def __init__(self, mixture, angle: float):
         self.mixture, self.angle = mixture, angle
 
-    def sample(self, wi, w, u, v, active=True):
+    def sample(self, wi, w, u, v):
         """Return directions ``wo`` from three uniform numbers each; some lie below the surface."""
-        return turned(self.mixture.sample(turned(wi, -self.angle), w, u, v, active), self.angle)
+        return rotate(self.mixture.sample(rotate(wi, -self.angle), w, u, v), self.angle)
 
-    def density(self, wi, wo, active=True):
+    def density(self, wi, wo):
         """Return the density of :meth:`sample` per solid angle, for directions above the surface."""
-        return self.mixture.density(turned(wi, -self.angle), turned(wo, -self.angle), active)
+        return self.mixture.density(rotate(wi, -self.angle), rotate(wo, -self.angle))
 
 
 def second_moment(truth_value, mixture: Mixture, truth, types, cos: float, size: int = 2**16, seed: int = 11) -> float:

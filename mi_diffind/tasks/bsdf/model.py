@@ -220,7 +220,7 @@ class Proxy:
     lobes: dict[str, LobeConstants]
 
     @classmethod
-    def of(cls, logarithms: list, form: Form) -> Proxy:
+    def from_logarithms(cls, logarithms: list, form: Form) -> Proxy:
         """Return the proxy of :data:`PARAMETERS` logarithms, arrays."""
         values = [dr.exp(clamp(x, *LOGARITHMS)) for x in logarithms]
         lobes = {}
@@ -229,10 +229,10 @@ class Proxy:
             if name in form.terms:
                 alphas = tuple(dr.clip(x, ALPHA_MIN, 1) for x in values[a : a + (1 if form.isotropic else 2)])
                 lobes[name] = ProxyLobe(alphas, 2 * values[a + 2], values[a + 3 : a + 6], values[a + 6 : a + 9])
-        return cls.of_parts(values[DIFFUSE] if "diffuse" in form.terms else None, values[EDGE], lobes)
+        return cls.from_parts(values[DIFFUSE] if "diffuse" in form.terms else None, values[EDGE], lobes)
 
     @classmethod
-    def of_parts(cls, diffuse: list | None, edge, lobes: dict[str, ProxyLobe]) -> Proxy:
+    def from_parts(cls, diffuse: list | None, edge, lobes: dict[str, ProxyLobe]) -> Proxy:
         """Return the proxy of an albedo (``None``: no diffuse lobe), its factor at the horizon, and lobes."""
         if diffuse is not None:
             diffuse, edge = [dr.inv_pi * c for c in diffuse], edge - 1
@@ -375,7 +375,9 @@ class BSDFArrays(nn.Module):
             mixing = None if mixing is None else mixing.rounded(8)
         if len(coordinates):
             return member(form, self.proxy_table(), residual, mixing, None, coordinates)
-        return LearnedBSDF(form, residual, None if self.proxy is None else Proxy.of(self.logarithms(), form))
+        return LearnedBSDF(
+            form, residual, None if self.proxy is None else Proxy.from_logarithms(self.logarithms(), form)
+        )
 
 
 class LearnedBSDF:
@@ -410,7 +412,7 @@ class LearnedBSDF:
 
     def value(self, wi, wo, active=True) -> list:
         """Return f without the cosine, three arrays, for unit directions above the surface."""
-        g = DirectionPair.of(turned(wi, -self.form.angle), turned(wo, -self.form.angle))
+        g = DirectionPair.of(rotate(wi, -self.form.angle), rotate(wo, -self.form.angle))
         result = [1, 1, 1] if self.proxy is None else self.proxy.value(g)
         if self.energy is not None:
             scale = self.energy([dr.sqrt(wi.z)], active)[0] * self.energy([dr.sqrt(wo.z)], active)[0]
@@ -471,7 +473,7 @@ def member_proxy(numbers: list, form: Form) -> tuple[Proxy, tuple]:
             colours = [[clamp(c, low, high) for c in numbers[i : i + 3]] for i in (a + 3, a + 6)]
             lobes[name] = ProxyLobe(roughness(a), 2 * shape(a + 2), *colours)
     diffuse = [clamp(c, low, high) for c in numbers[:3]] if "diffuse" in form.terms else None
-    return Proxy.of_parts(diffuse, shape(3), lobes), roughness(SCALE)
+    return Proxy.from_parts(diffuse, shape(3), lobes), roughness(SCALE)
 
 
 def widths(proxy: Proxy, scale: tuple) -> list:
@@ -484,7 +486,7 @@ def widths(proxy: Proxy, scale: tuple) -> list:
     return result
 
 
-def turned(w, angle: float):
+def rotate(w, angle: float):
     """Return directions after a rotation about the normal."""
     if not angle:
         return w

@@ -321,10 +321,10 @@ def fit_family_proxy(
     problem = BSDFProblem(net, Form(isotropic=isotropic), samples, proxy_loss(validation), identity)
     if not stop.is_set():
         train_stage(problem, FAMILY_PROXY, request.part(PRETRAINING), "proxies", "proxies")
-    return with_scale(net.proxy.numpy().astype(np.float64), isotropic).astype(np.float32)
+    return add_scale(net.proxy.numpy().astype(np.float64), isotropic).astype(np.float32)
 
 
-def with_scale(table: np.ndarray, isotropic: bool) -> np.ndarray:
+def add_scale(table: np.ndarray, isotropic: bool) -> np.ndarray:
     """Return a table of logarithms of proxies with those of the scale of u: the width of the narrowest lobe."""
     table, scales = table.copy(), []
     for k in range(2):

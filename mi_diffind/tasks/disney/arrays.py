@@ -64,7 +64,7 @@ class DisneyArrays(nn.Module):
         stored = {name: StoredArray(values.astype(np.float32)) for name, values in arrays.items()}
         return Table("disney", stored, self.PRESET)
 
-    def bounded(self, name: str, values: list) -> list:
+    def clamp_values(self, name: str, values: list) -> list:
         """Clamp values read from a table to its range, NaN included; bytes cannot leave the range."""
         if getattr(self, name).storage == "uint8":
             return values

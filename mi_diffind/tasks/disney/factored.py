@@ -188,4 +188,4 @@ class FactoredDecoder(decoder.Decoder):
             return super().masking(c, w, active)
         total = w.z + dr.sqrt(decoder.stretched(self.ggx(c)["alpha2"], w) + TINY)
         ratio = self.arrays.masking([w.z / total], active, inside=True)
-        return total * self.arrays.bounded("masking", ratio)[0]
+        return total * self.arrays.clamp_values("masking", ratio)[0]

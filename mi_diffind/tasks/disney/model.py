@@ -239,11 +239,9 @@ def specular_from_eta(eta):
     return dr.square((eta - 1) / (eta + 1)) / SPECULAR_SCALE
 
 
-def sanitize(material: Material, specular_max: float = 1.0) -> Material:
-    """Clamp every parameter to its range, NaN to 0, since textures and optimisers overshoot."""
-    return Material(
-        **{n: clamp(getattr(material, n), 0.0, specular_max if n == "specular" else 1.0) for n in PARAMETERS}
-    )
+def sanitize(material: Material) -> Material:
+    """Clamp every parameter to [0, 1], NaN to 0, since textures and optimisers overshoot."""
+    return Material(**{name: clamp(getattr(material, name), 0.0, 1.0) for name in PARAMETERS})
 
 
 @dataclass(frozen=True)

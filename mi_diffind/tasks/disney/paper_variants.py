@@ -57,7 +57,7 @@ class PaperArrays(DisneyArrays):
 
     def masking_root(self, encoded_roughness, cos_product, active=True):
         """Return ``√(d(wi) d(wo))``, the root of the specular term's denominator, from the roughness and (n·l)(n·v)."""
-        return self.bounded("masking", self.masking([encoded_roughness, dr.sqrt(cos_product + TINY)], active))[0]
+        return self.clamp_values("masking", self.masking([encoded_roughness, dr.sqrt(cos_product + TINY)], active))[0]
 
     def factors(self, material, wi, wo, encoded: dict, lobes, active=True) -> Factors:
         """Return the factors of :func:`.model.compose` for ``lobes``, from five reads; those of other lobes are 0.
@@ -74,10 +74,10 @@ class PaperArrays(DisneyArrays):
             quadric = qx * dr.square(g.h.x) + qy * dr.square(g.h.y) + qz * dr.square(g.h.z)
             specular = dr.square(g.h2 / (quadric * root + TINY)) * wo.z
 
-        read = self.bounded("fresnel", self.fresnel([g.cos_d, material.metallic], active))
+        read = self.clamp_values("fresnel", self.fresnel([g.cos_d, material.metallic], active))
         metal_base, base, coat_fresnel, sheen = read
         if "diffuse" in lobes or "clearcoat" in lobes:
-            read = self.bounded("diffuse", self.diffuse([wo.z, wi.z], active))
+            read = self.clamp_values("diffuse", self.diffuse([wo.z, wi.z], active))
             fresnel_sum, fresnel_product, cos_ratio, coat_masking = read
         if "diffuse" in lobes:
             diffuse, flat = diffuse_factors(
@@ -183,11 +183,11 @@ class PaperDecoder(decoder.Decoder):
 
     def _encoded(self, p, e):
         coordinates = self.arrays.encode(p)
-        logarithms = self.arrays.bounded("ggx", self.arrays.ggx(coordinates))
+        logarithms = self.arrays.clamp_values("ggx", self.arrays.ggx(coordinates))
         return {"roughness": coordinates[0], "q": tuple(map(dr.exp, logarithms))}
 
     def _encoded_coat(self, p, e):
-        return {"k": tuple(map(dr.exp, self.arrays.bounded("coat", self.arrays.coat([p.clearcoat_gloss]))))}
+        return {"k": tuple(map(dr.exp, self.arrays.clamp_values("coat", self.arrays.coat([p.clearcoat_gloss]))))}
 
     def value(self, c, e, lobes, p, wi, wo, active=True):
         lobes = tuple(lobe for lobe in lobes if lobe in e.lobes)

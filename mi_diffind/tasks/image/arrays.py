@@ -248,10 +248,10 @@ def from_ramp(layout: Layout, size: ImageBudget, border: tuple[str, str]) -> Ind
         for rows, columns, dims, _ in size.primaries
     ]
     cascaded = DifferentiableArray((size.cascaded,) * size.dims, layout.stored, "constant", layout.initial, fold=True)
-    return joined(primaries, cascaded)
+    return join_primaries(primaries, cascaded)
 
 
-def joined(primaries: Sequence[DifferentiableArray], cascaded: DifferentiableArray) -> Indirection:
+def join_primaries(primaries: Sequence[DifferentiableArray], cascaded: DifferentiableArray) -> Indirection:
     """Return the indirection of primaries that are all read at (v, u)."""
     return Indirection(primaries, cascaded, [(0, 1)] * len(primaries))
 
@@ -308,7 +308,7 @@ def from_components(values: np.ndarray, size: ImageBudget, border: tuple[str, st
         axis += dims
     shape = (size.cascaded,) * size.dims
     back = np.clip(np.broadcast_to(back / weights, (*shape, k)), 1e-3, 1 - 1e-3)
-    return joined(primaries, DifferentiableArray(shape, k, back.astype(np.float32), fold=True))
+    return join_primaries(primaries, DifferentiableArray(shape, k, back.astype(np.float32), fold=True))
 
 
 def gain_of_pages(values: np.ndarray, size: ImageBudget, border: tuple[str, str]) -> tuple[float, float]:
@@ -345,7 +345,9 @@ class CompressedImage(CompressedMaps):
     @staticmethod
     def of(table: Table, dtype, storage: str = "") -> CompressedImage:
         """Return the image of a checked table, in a storage form (:func:`allocate`)."""
-        return CompressedImage(Layout.from_json(table.settings["layout"]), joined_of(allocate(table, dtype, storage)))
+        return CompressedImage(
+            Layout.from_json(table.settings["layout"]), net_from_arrays(allocate(table, dtype, storage))
+        )
 
     def stored(self, u, v, active=True) -> list:
         """Return the stored channels at (u, v)."""
@@ -358,9 +360,11 @@ def allocate(table: Table, dtype, storage: str = "") -> dict[str, Differentiable
     return allocate_maps(table, dtype, storage, lambda name: (layout.height, layout.width))
 
 
-def joined_of(arrays: dict[str, DifferentiableArray]) -> Indirection | None:
+def net_from_arrays(arrays: dict[str, DifferentiableArray]) -> Indirection | None:
     """Return the indirection of named arrays; ``None`` for no arrays."""
-    return joined([arrays[name] for name in PRIMARIES if name in arrays], arrays["cascaded"]) if arrays else None
+    return (
+        join_primaries([arrays[name] for name in PRIMARIES if name in arrays], arrays["cascaded"]) if arrays else None
+    )
 
 
 def to_table(image: CompressedImage, settings: dict) -> Table:
@@ -412,7 +416,7 @@ class ImageModel(MapsModel):
     """Model of an image file; ``image`` is a :class:`CompressedImage`."""
 
     def build(self):
-        self.image = CompressedImage(Layout.from_json(self.table.settings["layout"]), joined_of(self.arrays))
+        self.image = CompressedImage(Layout.from_json(self.table.settings["layout"]), net_from_arrays(self.arrays))
 
 
 MODEL = ImageModel

@@ -17,10 +17,11 @@ from ...fitting.settings import FittingError
 from ...fitting.task import FitRequest, Fitted
 from ...maps import as_seen
 from ...maps.arguments import requested_border, requested_bytes, size_figures
+from ...maps.model import significant
 from ...maps.source import Source, load_source
 from . import PAGED, PRESETS, STRUCTURES, CoarsePrimary, ImageRecipe, parse_weights, replaced, without
 from .arrays import CompressedImage, ImageBudget, cascaded_side, fit_bytes, search
-from .training import dims_of, fit_image, layout_of, problem_of, structure_of
+from .training import fit_image, layout_of, pointer_dims, problem_of, structure_of
 
 #: Share of the steps that a candidate of a search is trained for.
 SHORT = 1 / 8
@@ -109,7 +110,7 @@ def fit(request: FitRequest) -> Fitted:
         request.deadline.rehearse(lambda: as_seen.reference(source, request.types))
     fitted, requested = _train(request, source, recipe)
     seen = as_seen.measure(source, CompressedImage.of(fitted.table, request.types.TensorXf))
-    fitted.table.measured |= {name: float(f"{value:.5g}") for name, value in seen.items()}
+    fitted.table.measured |= significant(seen)
     fitted.table.settings |= request.paths(source_path=options["source"])
     figures, lines = size_figures(source, fitted.table, requested)
     fitted.lines += [*lines, *source.notes]
@@ -180,15 +181,15 @@ def default_size(source: Source, nbytes: float, recipe: ImageRecipe, ratio: floa
     stored, structure = max(1, layout_of(source, recipe).stored), structure_of(source, recipe, nbytes)
     bits, coarse = STRUCTURES[structure]
     if recipe.components or coarse:
-        return sized(source, nbytes, recipe, cascaded_side(nbytes, stored, dims_of(recipe, structure, stored)))
+        return sized(source, nbytes, recipe, cascaded_side(nbytes, stored, pointer_dims(recipe, structure, stored)))
     size = (source.height, source.width)
     return search(source.nbytes, source.nbytes / nbytes, stored, *size, recipe.dims, bits, ratio)
 
 
 def sized(source: Source, nbytes: float, recipe: ImageRecipe, cascaded: int) -> ImageBudget:
-    """Return the budget for ``nbytes`` bytes with a cascaded array of a given side; its dims are :func:`.dims_of`."""
+    """Return the budget for ``nbytes`` bytes with a cascaded array of a given side."""
     stored, structure = max(1, layout_of(source, recipe).stored), structure_of(source, recipe, nbytes)
-    (bits, coarse), dims = STRUCTURES[structure], dims_of(recipe, structure, stored)
+    (bits, coarse), dims = STRUCTURES[structure], pointer_dims(recipe, structure, stored)
     size = fit_bytes(nbytes, stored, source.height, source.width, cascaded, dims, bits, coarse)
     return dataclasses.replace(size, paged=structure in PAGED)
 
@@ -343,7 +344,7 @@ def _weights(request: FitRequest, source: Source, recipe: ImageRecipe) -> dict[s
 
 
 def weights_as_seen(source: Source, recipe: ImageRecipe, nbytes: float, types: ModuleType) -> dict[str, float]:
-    """Return weights of maps by what an error of each does to a shaded picture (:func:`balanced`).
+    """Return weights of maps by what an error of each does to a shaded picture (:func:`balance_weights`).
 
     Returns {} (equal weights) if initial arrays of ``nbytes`` gain less than :data:`GAIN_DB` by them in pictures, if
     pictures do not show the ``source``, or if the recipe does not start from components.
@@ -355,7 +356,7 @@ def weights_as_seen(source: Source, recipe: ImageRecipe, nbytes: float, types: M
     sample = Source(tuple(maps), *maps[0].values.shape[:2], f"{source.digest} sample")
     channels = {name: len(indices) for name, indices in layout_of(sample, recipe).channels_by_map().items()}
     squares = as_seen.sensitivities(sample, types)
-    weights = balanced({name: squares[name] for name in channels}, channels)
+    weights = balance_weights({name: squares[name] for name in channels}, channels)
 
     def start_db(weights: dict) -> float:
         """Return the PSNR as seen from near of initial arrays."""
@@ -367,7 +368,7 @@ def weights_as_seen(source: Source, recipe: ImageRecipe, nbytes: float, types: M
     return weights if after >= before + GAIN_DB else {}
 
 
-def balanced(squares: Mapping[str, float], channels: Mapping[str, int]) -> dict[str, float]:
+def balance_weights(squares: Mapping[str, float], channels: Mapping[str, int]) -> dict[str, float]:
     """Return weights whose squares are proportional to ``squares``, where they are not below the least weights.
 
     Their geometric mean over all ``channels`` of a map is 1: about so many decibels as its weight has does a map gain.

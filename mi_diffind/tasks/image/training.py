@@ -21,6 +21,7 @@ from ...fitting.loop import FitResult, Problem
 from ...fitting.task import FitRequest
 from ...maps.compressed import decibel
 from ...maps.layout import Layout, choose_borders, smoothness
+from ...maps.model import fit_maps
 from ...maps.pyramid import padded_texels, weighted_sum
 from ...maps.source import Source
 from . import PAGED, STRUCTURES, ImageRecipe, arrays
@@ -52,7 +53,7 @@ def structure_of(source: Source, recipe: ImageRecipe, nbytes: float | None = Non
     return _structures[key]
 
 
-def dims_of(recipe: ImageRecipe, structure: str, stored: int) -> int:
+def pointer_dims(recipe: ImageRecipe, structure: str, stored: int) -> int:
     """Return the dimensions of the cascaded array for ``stored`` channels.
 
     A single primary of pages has at most ``stored`` (at least 2): more entries gain more than more coordinates.
@@ -68,7 +69,7 @@ def _suitable(values: np.ndarray, recipe: ImageRecipe, nbytes: float) -> str:
     if recipe.components and k:
         # More channels than dimensions need more precise pointers
         pages = "pages of 6 bits" if k > recipe.dims else "pages of 5 bits"
-        dims = dims_of(recipe, pages, k)
+        dims = pointer_dims(recipe, pages, k)
         side = arrays.cascaded_side(nbytes, k, dims)
         size = arrays.fit_bytes(nbytes, k, height, width, side, dims, STRUCTURES[pages][0])
         fewest = ENTRIES * math.prod(page_counts((height, width)))
@@ -223,26 +224,16 @@ def fit_image(
     :func:`.layout.choose_borders`. ``request`` holds the Dr.Jit types, the time and the checkpoint; its settings are
     replaced by those of the ``recipe``. Errors are those of :meth:`.CompressedImage.measure`.
     """
-    request = dataclasses.replace(request, settings=recipe.settings)
-    layout, types = layout_of(source, recipe), request.types
-    if not layout.stored:
-        table = to_table(CompressedImage(layout, None), {"source": source.digest})
-        result = FitResult({}, 0, 0, 0.0, False, 0)
-    else:
-        problem = problem_of(source, size, recipe, types, layout, border)
+    request, layout = dataclasses.replace(request, settings=recipe.settings), layout_of(source, recipe)
+    problem = problem_of(source, size, recipe, request.types, layout, border) if layout.stored else None
+    more = {}
+    if problem is not None:
+        more = {"ratio": size.ratio, "structure": recipe.structure if recipe.structure != "auto" else _name_of(size)}
 
-        def finish() -> None:
-            stored = to_table(CompressedImage(layout, stored_form(problem.net, problem.bits)), problem.identity)
-            CompressedImage.of(stored, types.TensorXf).measure(source)
+    def stored() -> CompressedImage:
+        return CompressedImage(layout, problem and stored_form(problem.net, problem.bits))
 
-        result = request.train(problem, title, finish)
-        settings = {**request.recorded(result), **problem.identity, "ratio": size.ratio}
-        settings["structure"] = recipe.structure if recipe.structure != "auto" else _name_of(size)
-        table = to_table(CompressedImage(layout, stored_form(problem.net, problem.bits)), settings)
-    table.preset, table.seed = request.preset, recipe.settings.seed
-    errors = CompressedImage.of(table, types.TensorXf).measure(source)
-    table.measured = {k: float(f"{v:.5g}") for k, v in errors.items()}
-    return table, result
+    return fit_maps(request, source, problem, stored, to_table, CompressedImage.of, title, **more)
 
 
 def _name_of(size: ImageBudget) -> str:

@@ -49,10 +49,8 @@ class PairsField(NodeVolume):
 
     def with_arrays(self, arrays):
         result = super().with_arrays(arrays)
-        result.modules = {}
-        for name, module in self.modules.items():
-            result.modules[name] = module._like()
-            result.modules[name].data = arrays.get(name)
+        modules = self.modules.items()
+        result.modules = {name: module._replace(data=arrays.get(name)) for name, module in modules}
         return result
 
     def _read(self, quantity: str, p, active) -> list:

@@ -1,10 +1,9 @@
 """Task 6: signed distance fields of meshes.
 
-- :mod:`.mesh`, :mod:`.boundary`, :mod:`.distances`, :mod:`.sampling`: ground truth;
-- :mod:`.field`: interface of all fields; :mod:`.nodes` (with :mod:`.structure` and :mod:`.codes`): our sparse layout;
-  :mod:`.paper`: the supplement's arrays;
-- :mod:`.encoding`, :mod:`.fit`: training;
-- :mod:`.tracing`, :mod:`.marching`: rays; :mod:`.grids`, :mod:`.extraction`: decoding; :mod:`.evaluation`: errors;
+- :mod:`.mesh`, :mod:`.distances`: ground truth;
+- :mod:`.field`: interface of all fields; :mod:`.nodes`: our sparse layout; :mod:`.paper`: the supplement's arrays;
+- :mod:`.encoding`, :mod:`.fit`: training; :mod:`.evaluation`: errors;
+- :mod:`.marching`: rays; :mod:`.grids`: decoding to grids and triangles;
 - :mod:`.model`: table files.
 """
 
@@ -15,7 +14,7 @@ from ...core.arguments import Argument, between, checked, positive
 from ...fitting.settings import FitSettings
 from ...fitting.task import Task
 
-#: Bits of a pointer that divide words evenly (:data:`.codes.POINTERS`, without importing Dr.Jit).
+#: Bits of a pointer that divide words evenly (:data:`.nodes.POINTERS`, without importing Dr.Jit).
 BITS = (4, 5, 6, 8, 10, 16)
 
 #: Settings of both presets with dense arrays.

@@ -1,10 +1,14 @@
-"""Exact distances to the solid that a mesh encloses, computed by libigl in a child process (:mod:`.distances_child`).
+"""Exact distances to the solid that a mesh encloses, points on and around it, and cells that its surface crosses.
 
+Distances are computed by libigl in a child process (:mod:`.distances_child`), since some meshes make libigl abort.
 The magnitude |d| comes from a bounding-volume tree, the sign from the winding number: a point is inside where the
 winding number is at least 1/2. That of a watertight mesh is a whole number. An open mesh is closed hole by hole first
 (:func:`.mesh.close_holes`) if the closed mesh agrees with its winding number; :attr:`Distances.ambiguity` is the
 share of space that is in doubt. Triangles inside of the solid, where pieces overlap, have no part in distances: with
 them, the distance would be zero where no surface is visible.
+
+A grid has a ``lower`` corner, cells with sides of length ``spacing``, and ``shape``, the number of cells along x, y and
+z. A ``seed`` is a number or a ``numpy.random.Generator``.
 """
 
 from __future__ import annotations
@@ -18,11 +22,11 @@ import pickle
 import signal
 import subprocess
 import sys
-import tempfile
 from pathlib import Path
 
 import numpy as np
 
+from ...arrays.sparse_grid import CORNERS
 from ...core.errors import DiffindError, missing_package, reason
 from .mesh import NO_VOLUME, Mesh, close_holes, outer_surface
 
@@ -35,9 +39,11 @@ TOUCHING = 1e-9
 #: Deviation of a winding number from a whole number beyond which the inside is ambiguous.
 AMBIGUOUS = 0.1
 
-#: Points at which the winding number of an open mesh is evaluated, and the share of the certain ones among them that
-#: may differ between the mesh and the closed mesh.
-AMBIGUITY_POINTS, DISAGREEMENT = 2**16, 0.01
+#: Points at which the winding number of an open mesh is evaluated.
+AMBIGUITY_POINTS = 2**16
+
+#: Largest share of the certain ones among these points that may differ between the mesh and the closed mesh.
+DISAGREEMENT = 0.01
 
 #: Cells along the longest side of the coarse grid with which far points are recognised.
 COARSE = 40
@@ -57,7 +63,6 @@ class Distances:
     def __init__(self, mesh: Mesh):
         self.mesh = mesh
         self._child: subprocess.Popen | None = None
-        self._stderr = None
         self._owner = 0
         self._sent: set[str] = set()
         self._doubt = (0.0, 0.0)
@@ -82,9 +87,6 @@ class Distances:
             with contextlib.suppress(OSError):
                 child.kill()
             child.wait()
-        if self._stderr is not None:
-            self._stderr.close()
-            self._stderr = None
 
     @functools.cached_property
     def solid(self) -> Mesh:
@@ -165,13 +167,13 @@ class Distances:
         With a small limit, many points all over space are several times as fast, since far ones are recognised by a
         coarse grid.
         """
-        points = _checked(points)
+        points = _check_points(points)
         if limit < math.inf and len(points) > COARSE**3:
-            return self._truncated(points, limit)
+            return self._signed_near(points, limit)
         sign = np.where(self.inside(points), -1, 1).astype(np.float32)
         return sign * np.minimum(self.unsigned(points), limit).astype(np.float32)
 
-    def _truncated(self, points: np.ndarray, limit: float) -> np.ndarray:
+    def _signed_near(self, points: np.ndarray, limit: float) -> np.ndarray:
         """Compute :meth:`signed` with a coarse grid: the distance of a cell's centre bounds those of its points."""
         lower, upper = points.min(axis=0), points.max(axis=0)
         side = max(float((upper - lower).max()) / COARSE, 1e-9)
@@ -194,7 +196,7 @@ class Distances:
 
         The gradient points away from the nearest point; on the surface it is the normal of the triangle.
         """
-        points = _checked(points)
+        points = _check_points(points)
         d, face, closest = self.nearest(points)
         sign = np.where(self.inside(points), -1.0, 1.0)
         near = d < TOUCHING
@@ -204,7 +206,7 @@ class Distances:
 
     def _ask(self, question: str, points, name: str, mesh: Mesh) -> tuple[np.ndarray, ...]:
         """Return the answers for all points, chunk by chunk; the mesh is sent once, under its ``name``."""
-        points = _checked(points)
+        points = _check_points(points)
         if not len(points):
             return tuple(array[:0] for array in self._ask(question, np.zeros((1, 3)), name, mesh))
         if self._owner != os.getpid():
@@ -224,7 +226,7 @@ class Distances:
             self._child.stdin.flush()
             error, arrays = pickle.load(self._child.stdout)
         except (OSError, EOFError, pickle.UnpicklingError):
-            self._died()
+            self._raise_ended()
         except BaseException:  # after Ctrl-C the rest of an answer would be read as the next one
             self.close()
             raise
@@ -240,31 +242,26 @@ class Distances:
             raise DistancesError(f"{self.mesh.path}: distances need {missing_package('libigl')}")
         self._owner = os.getpid()
         script = Path(__file__).with_name("distances_child.py")
-        self._stderr = tempfile.TemporaryFile()  # noqa: SIM115
         self._child = subprocess.Popen(
-            [sys.executable, str(script)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._stderr,
+            [sys.executable, str(script)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
             env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, map(os.path.abspath, sys.path)))},
         )  # fmt: skip
 
-    def _died(self) -> None:
+    def _raise_ended(self) -> None:
         """Raise :class:`DistancesError` with the reason why the child process ended."""
         code = self._child.wait()
-        self._stderr.seek(0, os.SEEK_END)
-        self._stderr.seek(max(0, self._stderr.tell() - 2000))
-        last = self._stderr.read().decode(errors="replace").strip().splitlines()
         cause = f"exit code {code}"
         if code < 0:
             with contextlib.suppress(ValueError):
                 cause = signal.Signals(-code).name
-        detail = f": {reason(Exception(last[-1]))}" if last else ""
         self.close()
         raise DistancesError(
-            f"{self.mesh.path}: libigl ended while it computed distances to this mesh ({cause}{detail}); a repaired "
-            f"mesh may work"
+            f"{self.mesh.path}: libigl ended while it computed distances to this mesh ({cause}); a repaired mesh may "
+            f"work"
         )
 
 
-def _checked(points) -> np.ndarray:
+def _check_points(points) -> np.ndarray:
     points = np.ascontiguousarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"points: found the shape {points.shape}, expected (N, 3)")
@@ -275,3 +272,71 @@ def _checked(points) -> np.ndarray:
 
 def _percent(share: float) -> str:
     return f"{100 * share:.2g}%" if share >= 1e-4 else ("0%" if share == 0 else "less than 0.01%")
+
+
+#: Largest number of cells along an axis at the coarsest level of :func:`surface_cells`.
+COARSEST = 16
+
+
+def sample_surface(mesh: Mesh, count: int, seed) -> tuple[np.ndarray, np.ndarray]:
+    """Return ``count`` points uniform over the area, and the normals of their triangles: ``(count, 3)`` twice, float64.
+
+    The area is divided into ``count`` equal parts with one point in each, so that small pieces get their share.
+    """
+    rng = np.random.default_rng(seed)
+    total = np.cumsum(mesh.areas)
+    places = (np.arange(count) + rng.random(count)) / count * total[-1]
+    triangle = np.minimum(np.searchsorted(total, places, side="right"), len(total) - 1)
+    # Folding the unit square over its diagonal keeps a point uniform over the triangle
+    u, v = rng.random((2, count, 1))
+    u, v = np.where(u + v > 1, (1 - u, 1 - v), (u, v))
+    a, b, c = np.moveaxis(mesh.corners[triangle], 1, 0)
+    return a + u * (b - a) + v * (c - a), mesh.normals[triangle]
+
+
+def sample_near(mesh: Mesh, count: int, width: float, seed) -> np.ndarray:
+    """Return ``count`` surface points, (count, 3), displaced by a normal distribution of deviation ``width``."""
+    rng = np.random.default_rng(seed)
+    points, _ = sample_surface(mesh, count, rng)
+    return points + rng.normal(scale=width, size=points.shape)
+
+
+def sample_box(lower, upper, count: int, seed) -> np.ndarray:
+    """Return ``count`` points uniform in the box between two corners, ``(count, 3)``."""
+    return np.random.default_rng(seed).uniform(lower, upper, (count, 3))
+
+
+def surface_cells(distances: Distances, lower, spacing: float, shape, reach: float = 0.0) -> np.ndarray:
+    """Return the cells whose circumscribed sphere comes within ``reach`` of the surface, searching from coarse to fine.
+
+    The result is ``(K, 3)``, int32, in lexicographic order. No cell that the surface passes through is missing; about a
+    sixth of the cells are only passed by.
+    """
+    lower, shape = np.asarray(lower, dtype=np.float64), np.asarray(shape)
+    side = 1
+    while -(-int(shape.max()) // side) > COARSEST:
+        side *= 2
+    cells = np.stack(np.meshgrid(*[np.arange(-(-n // side)) for n in shape], indexing="ij"), axis=-1).reshape(-1, 3)
+    while True:
+        centres = lower + (cells + 0.5) * (side * spacing)
+        near = distances.unsigned(centres) <= (np.sqrt(3) / 2 * side * spacing + reach) * (1 + 1e-6)
+        cells = cells[near]
+        if side == 1:
+            break
+        side //= 2
+        cells = (2 * cells[:, None] + CORNERS).reshape(-1, 3)
+        cells = cells[np.all(cells * side < shape, axis=1)]
+    keys = np.sort(np.ravel_multi_index(cells.T, tuple(shape)))
+    return np.stack(np.unravel_index(keys, tuple(shape)), axis=-1).astype(np.int32)
+
+
+def near_nodes(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners of cells, each once, and for each cell the positions of its eight corners among them.
+
+    The nodes are ``(M, 3)``, int32, in lexicographic order; the positions are ``(K, 8)``, z fastest.
+    """
+    cells = np.asarray(cells, dtype=np.int64)
+    shape = tuple(cells.max(axis=0, initial=0) + 2)
+    keys = np.ravel_multi_index(cells.T, shape)[:, None] + np.ravel_multi_index(CORNERS.T, shape)
+    keys, corners = np.unique(keys, return_inverse=True)
+    return np.stack(np.unravel_index(keys, shape), axis=-1).astype(np.int32), corners.reshape(-1, 8)

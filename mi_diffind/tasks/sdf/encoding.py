@@ -9,10 +9,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ...arrays.sparse_grid import SparseGrid
-from .distances import Distances
+from .distances import Distances, near_nodes, surface_cells
 from .nodes import (  # fmt: skip
+    POINTERS,
     bernstein,
-    decoded_nodes,
+    decode_to_array,
     entry_scale,
     entry_words,
     frame_words,
@@ -22,7 +23,6 @@ from .nodes import (  # fmt: skip
     unpack_entries,
     unpack_frames,
 )
-from .sampling import near_nodes, surface_cells
 
 #: Weights of an entry's coordinates when entries are chosen: a distance (in spacings) counts 5 times a normal.
 WEIGHTS = np.array([5.0, 1, 1])
@@ -60,9 +60,22 @@ class SampledNodes:
     #: Number of cells that the surface passes through or close by, and the share of them in which no sign changes.
     cells: int
     missed: float
+    #: Bits of the pointers that will code the nodes.
+    bits: int = 10
+
+    @property
+    def entries(self) -> int:
+        """Entries of the cascaded array: as many as pointers can name, and at most one for each node."""
+        return max(1, min(2**self.bits, self.structure.nodes))
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes in memory of the coded nodes: the grid, frames, pointers and entries."""
+        pointers = -(-self.structure.nodes // POINTERS[self.bits])
+        return self.structure.nbytes + 4 * (self.structure.blocks + pointers + self.entries)
 
 
-def sample(distances: Distances, spacing: float) -> SampledNodes:
+def sample(distances: Distances, spacing: float, bits: int = 10) -> SampledNodes:
     """Sample the nodes of a grid of this ``spacing`` (of the longest side) around the mesh of ``distances``."""
     mesh = distances.mesh
     lower = mesh.lower - 1.5 * spacing
@@ -82,7 +95,7 @@ def sample(distances: Distances, spacing: float) -> SampledNodes:
     missed = 1 - np.count_nonzero(keep) / max(1, len(cells))
     return SampledNodes(
         structure, positions, block, d[place].astype(np.float64) / spacing, normals[place].astype(np.float64),
-        crossed_cells(structure, d[place] < 0), len(cells), missed,
+        crossed_cells(structure, d[place] < 0), len(cells), missed, bits,
     )  # fmt: skip
 
 
@@ -273,4 +286,4 @@ class NodeCoding:
 
     def values(self) -> np.ndarray:
         """Return the coded nodes, decoded, (n, 4) float32."""
-        return decoded_nodes(self.sampled.structure, self.frames, self.entries[self.pointers])
+        return decode_to_array(self.sampled.structure, self.frames, self.entries[self.pointers])

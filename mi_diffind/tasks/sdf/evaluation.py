@@ -12,11 +12,10 @@ import drjit as dr
 import numpy as np
 
 from ...arrays.indirection import device_array
-from .distances import Distances
+from .distances import Distances, sample_box, sample_near, sample_surface, surface_cells
 from .field import DistanceField
-from .grids import OFF_NODE, components, march, point_array, point_values, trimesh_of
+from .grids import OFF_NODE, components, march, point_array, point_values, to_trimesh
 from .mesh import Mesh
-from .sampling import node_distances, sample_box, sample_near, sample_surface, surface_cells
 
 #: Distance from the surface within which points count as near.
 BAND = 0.01
@@ -70,7 +69,8 @@ class SurfaceEvaluation:
         rng = np.random.default_rng([seed, 7])
         self.seed = seed
         self.uniform = sample_box(mesh.lower - PADDING, mesh.upper + PADDING, count, rng).astype(np.float32)
-        self.uniform_inside = distances.inside(self.uniform)
+        signed = distances.signed(self.uniform, band)
+        self.uniform_inside, self.uniform_near = signed < 0, np.abs(signed) < band
         self.near, self.near_distance = self._near(rng)
         self.surface, self.normals = sample_surface(distances.surface, max(1, count // 4), rng)
 
@@ -91,20 +91,9 @@ class SurfaceEvaluation:
             distance.append(d[d < band])
             have, tried = have + len(points[-1]), tried + wanted
         self.band_volume = have / tried * len(cells) * band**3
-        self.uniform_near = self._in_band(self.uniform, lower, shape, cells)
         points, distance = np.concatenate(points)[: self.count], np.concatenate(distance)[: self.count]
         sign = np.where(self.distances.inside(points), -1, 1)
         return points, (sign * distance).astype(np.float32)
-
-    def _in_band(self, points: np.ndarray, lower, shape, cells) -> np.ndarray:
-        """Return which points lie in the band; distances are computed in its cells only."""
-        in_band = np.zeros(shape, dtype=bool)
-        in_band[tuple(cells.T)] = True
-        cell = np.floor((points - lower) / self.band).astype(int)
-        near = np.all((cell >= 0) & (cell < shape), axis=1)
-        near[near] = in_band[tuple(cell[near].T)]
-        near[near] = self.distances.unsigned(points[near]) < self.band
-        return near
 
     def measure(self, field: DistanceField) -> dict[str, float]:
         """Return the errors of a field.
@@ -176,9 +165,14 @@ class SurfaceEvaluation:
         spacing = 1 / resolution
         lower = self.mesh.lower - 1.5 * spacing
         cells = np.ceil((self.mesh.upper - lower) / spacing + 1.5).astype(int)
-        values = node_distances(self.distances, lower, spacing, cells + 1, 2 * spacing)
-        vertices, faces = march(lambda a, b: values[a : b + 1], cells, OFF_NODE * spacing)
-        return trimesh_of(self.mesh.to_file_frame(lower + spacing * vertices), faces)
+
+        def layers(first: int, end: int) -> np.ndarray:
+            nodes = np.argwhere(np.ones((end - first, *(cells[1:] + 1)), bool)) + np.array([first, 0, 0])
+            values = self.distances.signed(lower + spacing * nodes, 2 * spacing)
+            return values.reshape(end - first, *(cells[1:] + 1))
+
+        vertices, faces = march(layers, cells, OFF_NODE * spacing)
+        return to_trimesh(self.mesh.to_file_frame(lower + spacing * vertices), faces)
 
 
 def lost_pieces(field: DistanceField, distances: Distances, count: int = 32, seed: int = 2) -> int:

@@ -41,7 +41,7 @@ class DistanceField:
         """The ``slope`` as kernels read it: a number, or an opaque array if it may change."""
         return self.slope
 
-    def changed(self):
+    def update_bound(self):
         """Update the bound of the slope after entries were changed from outside, for example by an optimiser."""
 
     def inside(self, p):

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
 
 import drjit as dr
 import numpy as np
 from drjit import nn
 
+from ...arrays.budget import Budget, BudgetError
 from ...arrays.indirection import device_array, device_tensor
 from ...arrays.tables import MAX_BYTES, Table
 from ...core import units
@@ -17,40 +17,55 @@ from ...core.errors import UsageError
 from ...fitting.loop import Problem
 from ...fitting.settings import FittingError
 from ...fitting.task import FitRequest, Fitted
-from . import encoding
+from . import TASK, encoding
 from .distances import Distances
 from .evaluation import HELD_OUT, HeldOut, SurfaceEvaluation, lost_pieces
 from .mesh import Mesh, load_mesh
-from .model import coded_arrays, field_of
+from .model import build_field, coded_arrays
 from .nodes import POINTERS, SparseNodes
-from .paper import SAMPLES, fit_pair
+from .paper import SAMPLES, STARTS, PairProblem, ratio_for, resolutions
 
 #: Default size in memory, in bytes.
 BYTES = 2**20
 
 #: Bytes of samples of the nodes during the training for each byte of the field, roughly.
-SAMPLED = 64
+SAMPLE_BYTES = 64
 
-#: First, finest and coarsest spacing in the search for a grid's size, relative to the longest side.
-FIRST, FINEST, COARSEST = 1 / 64, 1 / 2048, 1 / 8
+#: First spacing in the search for a grid's size, relative to the longest side.
+FIRST_SPACING = 1 / 64
+
+#: Smallest spacing in that search.
+FINEST_SPACING = 1 / 2048
+
+#: Largest spacing in that search.
+COARSEST_SPACING = 1 / 8
 
 #: Share by which a sparse field may be smaller than requested.
 TOLERANCE = 0.02
 
-#: Least bytes for a cell that the surface passes through: of masks and frames, and of pointers with a word each.
-BYTES_PER_CELL, WORDS_PER_CELL = 1, 6
+#: Least bytes of masks and frames for a cell that the surface passes through.
+BYTES_PER_CELL = 1
+
+#: Least bytes of pointers for such a cell, times the pointers in a word.
+WORDS_PER_CELL = 6
 
 #: Held-out points of the final measurement.
 MEASURED = 2**18
 
 #: Share of the surface's cells without a change of sign above which a warning is printed.
-THIN = 0.3
+MISSED_CELLS = 0.3
 
-#: Weights in the loss: the distance (in spacings), the field's gradient and the blended normals of nodes.
-DISTANCE, GRADIENT, SMOOTH = 0.3, 0.05, 0.02
+#: Weight of the distance, in spacings, in the loss.
+DISTANCE_WEIGHT = 0.3
+
+#: Weight of the field's gradient in the loss.
+GRADIENT_WEIGHT = 0.05
+
+#: Weight of the blended normals of nodes in the loss.
+SMOOTH_WEIGHT = 0.02
 
 #: Distance, in spacings, below which errors are weighted by their squares.
-ROUND = 0.01
+ROUNDED_DISTANCE = 0.01
 
 
 class SurfaceSampler:
@@ -104,12 +119,12 @@ class NodeProblem(Problem):
     #: The last state is kept: rounding differs from state to state by more than the training still changes.
     tolerance = 1.0
 
-    def __init__(self, field: SparseNodes, mesh: Mesh, sampled: encoding.SampledNodes, bits: int, held_out: HeldOut):
-        self.field, self.types, self.held_out = field, field.types, held_out
-        self.surface = SurfaceSampler(mesh, self.types)
+    def __init__(self, sampled: encoding.SampledNodes, bits: int, mesh: Mesh, types, held_out: HeldOut):
+        self.sampled, self.bits, self.types, self.held_out = sampled, bits, types, held_out
+        self.field, self.surface = SparseNodes(types, sampled.structure, 1.0), SurfaceSampler(mesh, types)
         start = np.concatenate([sampled.distances[:, None], sampled.normals], axis=1)
-        self.net = NodeValues(device_tensor(self.types.TensorXf, start))
-        self.identity = {"source": mesh.digest, "nodes": len(start), "spacing": field.spacing, "bits": bits}
+        self.net = NodeValues(device_tensor(types.TensorXf, start))
+        self.identity = {"source": mesh.digest, "nodes": len(start), "spacing": self.field.spacing, "bits": bits}
 
     def loss(self, net, rng, size: int):
         p, n = self.surface.draw(rng, size)
@@ -117,8 +132,12 @@ class NodeProblem(Problem):
         value, slope, smooth, complete = self.field.blend(p)
         Array3f = self.types.Array3f
         square = dr.square(value)
-        error = DISTANCE * (dr.sqrt(square + ROUND**2) if self.settings.loss == "mae" else 10 * square)
-        error += GRADIENT * dr.squared_norm(Array3f(*slope) - n) + SMOOTH * dr.squared_norm(Array3f(*smooth) - n)
+        error = DISTANCE_WEIGHT * (
+            dr.sqrt(square + ROUNDED_DISTANCE**2) if self.settings.loss == "mae" else 10 * square
+        )
+        error += GRADIENT_WEIGHT * dr.squared_norm(Array3f(*slope) - n) + SMOOTH_WEIGHT * dr.squared_norm(
+            Array3f(*smooth) - n
+        )
         return dr.select(complete, error, 0) / size
 
     def measure(self, net):
@@ -126,9 +145,12 @@ class NodeProblem(Problem):
             self.field.nodes = dr.detach(net.unit(self.types))
             return self.held_out.measure(self.field)
 
-    def values(self) -> np.ndarray:
-        """Return the trained nodes, (n, 4) float64."""
-        return self.net.unit(self.types).numpy().astype(np.float64)
+    def table(self, seed: int) -> Table:
+        """Return the coded nodes as a file holds them."""
+        coding = encoding.NodeCoding(self.sampled, self.bits, seed)
+        coding.encode(self.net.unit(self.types).numpy().astype(np.float64))
+        arrays, settings = coded_arrays(coding)
+        return Table("sdf", arrays, settings=settings)
 
 
 def check(request: FitRequest) -> None:
@@ -150,7 +172,7 @@ def requested_bytes(options) -> int:
     except ValueError as e:
         raise UsageError(f"--bytes: {e}") from None
     units.check_size("--bytes", nbytes, MAX_BYTES)
-    units.check_memory("--bytes", nbytes, SAMPLED * nbytes)
+    units.check_memory("--bytes", nbytes, SAMPLE_BYTES * nbytes)
     return nbytes
 
 
@@ -161,39 +183,46 @@ def fit(request: FitRequest, measured: int = MEASURED, samples: int = SAMPLES, h
     ``samples`` the number of training samples of dense arrays. Raises :class:`UsageError`, :class:`.mesh.MeshError`,
     :class:`.distances.DistancesError` and :class:`.FittingError`.
     """
-    mesh = load_mesh(request.options["source"])
-    nbytes = requested_bytes(request.options)
-    start = time.perf_counter()
+    options, seed = request.options, request.settings.seed
+    mesh, nbytes = load_mesh(options["source"]), requested_bytes(options)
+    start, lines = time.perf_counter(), []
     with Distances(mesh) as distances:
         warnings = [*mesh.warnings, *distances.warnings]
         for warning in warnings:
             print(f"warning: {warning}", file=sys.stderr)
-        lines, evaluation = [], SurfaceEvaluation(mesh, distances, measured)
-
-        def measure(field) -> tuple[dict[str, float], int]:
-            return evaluation.measure(field), lost_pieces(field, distances)
-
+        evaluation = SurfaceEvaluation(mesh, distances, measured)
         if request.preset == "sparse":
-            sampled = search_grid(distances, nbytes, request.options["bits"])
-            if sampled.missed > THIN:
+            sampled = search_grid(distances, nbytes, options["bits"])
+            spacing = sampled.structure.spacing
+            if sampled.missed > MISSED_CELLS:
                 lines.append(
                     f"{100 * sampled.missed:.0f}% of the cells that the surface comes through or near to show no "
-                    f"change of sign: parts may be thinner than a cell, 1/{1 / sampled.structure.spacing:.0f} of the "
-                    f"longest side: more --bytes help"
+                    f"change of sign: parts may be thinner than a cell, 1/{1 / spacing:.0f} of the longest side: more "
+                    f"--bytes help"
                 )
-            table, result, field = fit_sparse(distances, sampled, request, held_out, measure)
+            held = HeldOut(distances, request.types, spacing, count=held_out)
+            problem = NodeProblem(sampled, options["bits"], distances.surface, request.types, held)
         else:
-            table, result, field = fit_pair(distances, nbytes, request, samples, held_out, measure)
+            start_from = "constant" if options["constant"] else STARTS[request.preset]
+            shapes = resolutions(nbytes, options["ratio"] or ratio_for(nbytes), mesh.upper - mesh.lower)
+            problem = PairProblem(distances, shapes, start_from, request.types, seed, samples, held_out)
+
+        def measure() -> tuple[Table, dict[str, float], int]:
+            table = problem.table(seed)
+            field = build_field(table, TASK.allocate(table, request.types.TensorXf), request.types)
+            return table, evaluation.measure(field), lost_pieces(field, distances)
+
+        result = request.train(problem, finish=measure)
         prepared = time.perf_counter() - start - result.seconds
-        errors, lost = measure(field)
+        table, errors, lost = measure()
     if lost:
         count = distances.surface.components
         lines.append(f"{lost} of {count} pieces of the mesh are too small for the field: more --bytes help")
-    table.preset, table.seed = request.preset, request.settings.seed
+    table.preset, table.seed = request.preset, seed
     table.settings = {
         **request.recorded(result),
         "source": mesh.digest,
-        **request.paths(mesh_path=request.options["source"]),
+        **request.paths(mesh_path=options["source"]),
         "scale": mesh.scale,
         "centre": list(mesh.centre),
         "warnings": warnings,
@@ -204,8 +233,7 @@ def fit(request: FitRequest, measured: int = MEASURED, samples: int = SAMPLES, h
     lines.append(f"{prepared:.1f} s for distances and samples, {result.seconds:.1f} s of training")
     lines.append(f"the mesh itself has {len(mesh.faces):,} triangles, {triangles:,} bytes of positions and indices")
     figures = {"bytes_asked": nbytes, "mesh_bytes": triangles, "prepared_seconds": prepared, "warnings": warnings}
-    figures["lost_pieces"] = lost
-    return Fitted(table, result, lines, figures)
+    return Fitted(table, result, lines, {**figures, "lost_pieces": lost})
 
 
 def search_grid(distances: Distances, nbytes: int, bits: int) -> encoding.SampledNodes:
@@ -213,69 +241,26 @@ def search_grid(distances: Distances, nbytes: int, bits: int) -> encoding.Sample
 
     Raises :class:`UsageError` if even the coarsest one is larger, and :class:`FittingError` if it has no nodes.
     """
-    spacing, best, tried = FIRST, None, {}
-    for _ in range(6):
-        sampled = encoding.sample(distances, spacing)
-        tried[spacing] = size = coded_bytes(sampled, bits)
-        fits = size <= nbytes
-        if fits and (best is None or spacing < best.structure.spacing):
-            best = sampled
-        if fits and size >= (1 - TOLERANCE) * nbytes:
-            break
+    budget = Budget(nbytes, TOLERANCE)
+
+    def following(spacing: float, sampled: encoding.SampledNodes) -> float:
         # Nodes, blocks and their words grow with the square. Where a solid is thinner than cells, so do the cells that
         # its surface passes through
-        fixed = 4 * entries_for(sampled, bits)
+        fixed = 4 * sampled.entries
         least = BYTES_PER_CELL + WORDS_PER_CELL / POINTERS[bits]
-        expected = max(size - fixed, least * sampled.cells)
+        expected = max(sampled.nbytes - fixed, least * sampled.cells)
         aim = spacing * np.sqrt(expected / max((1 - TOLERANCE / 2) * nbytes - fixed, 1))
-        following = float(np.clip(aim, FINEST, COARSEST))
-        if following in tried:
-            break
-        spacing = following
-    if best is None:
-        raise UsageError(f"--bytes: found {nbytes:,}, the coarsest grid of this mesh needs {min(tried.values()):,}")
+        return float(np.clip(aim, FINEST_SPACING, COARSEST_SPACING))
+
+    try:
+        best = budget.approach(
+            lambda spacing: encoding.sample(distances, spacing, bits), FIRST_SPACING, following, attempts=6
+        )
+    except BudgetError as e:
+        raise UsageError(f"--bytes: {e}") from None
     if best.structure.nodes == 0:
         raise FittingError(
             f"{distances.mesh.path}: the solid is thinner than the cells of {nbytes:,} bytes, "
             f"1/{1 / best.structure.spacing:.0f} of the longest side: ask for more --bytes"
         )
     return best
-
-
-def coded_bytes(sampled: encoding.SampledNodes, bits: int) -> int:
-    """Return the bytes in memory of a sampled grid whose nodes are pointers of ``bits`` bits."""
-    structure = sampled.structure
-    pointers = -(-structure.nodes // POINTERS[bits])
-    return structure.nbytes + 4 * (structure.blocks + pointers + entries_for(sampled, bits))
-
-
-def entries_for(sampled: encoding.SampledNodes, bits: int) -> int:
-    """Return the size of the cascaded array: as many entries as pointers can name, and at most one per node."""
-    return max(1, min(2**bits, sampled.structure.nodes))
-
-
-def fit_sparse(
-    distances: Distances,
-    sampled: encoding.SampledNodes,
-    request: FitRequest,
-    held_out: int = HELD_OUT,
-    measure: Callable[[SparseNodes], object] = lambda field: None,
-):
-    """Train and encode the nodes of a sampled grid: ``(table, training result, field)``.
-
-    ``measure`` is the measurement that will follow, for which a limit of time leaves room.
-    """
-    bits, structure, types = request.options["bits"], sampled.structure, request.types
-    held = HeldOut(distances, types, structure.spacing, count=held_out)
-    problem = NodeProblem(SparseNodes(types, structure, 1.0), distances.surface, sampled, bits, held)
-
-    def stored() -> tuple[Table, SparseNodes]:
-        coding = encoding.NodeCoding(sampled, bits, request.settings.seed)
-        coding.encode(problem.values())
-        arrays, settings = coded_arrays(coding)
-        table = Table("sdf", arrays, settings=settings)
-        return table, field_of(table, {}, types)
-
-    result = request.train(problem, finish=lambda: measure(stored()[1]))
-    table, field = stored()
-    return table, result, field

@@ -1,4 +1,4 @@
-"""Regular grids of a distance field's values, and the coarsest grid that interpolates the field well enough.
+"""Regular grids of a distance field's values, their surface as triangles, and the coarsest grid that is good enough.
 
 Grids have cubic cells, ``resolution`` of them along the longest side of the field's box.
 """
@@ -6,6 +6,9 @@ Grids have cubic cells, ``resolution`` of them along the longest side of the fie
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
+from collections.abc import Callable
+from functools import cache
 
 import drjit as dr
 import numpy as np
@@ -41,58 +44,56 @@ def grid(field: DistanceField, resolution: int) -> tuple[np.ndarray, np.ndarray,
 
     The box begins at the field's lower corner and ends where no cell is cut. Its sides are outside.
     """
-    spacing = spacing_for(field, resolution)
-    lower = np.array(field.lower)
+    spacing, lower = spacing_for(field, resolution), np.array(field.lower)
     nodes = np.ceil((np.array(field.upper) - lower) / spacing - 1e-6).astype(int) + 1
     values = np.empty(tuple(nodes[::-1]), np.float32)
-    crossed = crossed_blocks(field, lower, spacing, nodes)
-    # Where no stored node is near, all nodes of a block have the same value
-    same = node_values(field, lower, BLOCK * spacing, crossed.shape)
+    _, layers = grid_layers(field, lower, spacing, nodes)
     for x in range(0, nodes[0], BLOCK):
-        last = min(x + BLOCK, nodes[0])
-        shape = (last - x, *nodes[1:])
-        slab = _expand_blocks(same[x // BLOCK], shape)
-        where = np.flatnonzero(_expand_blocks(crossed[x // BLOCK], shape))
-        slab.reshape(-1)[where] = node_values(field, lower + spacing * np.array([x, 0, 0]), spacing, shape, where)
-        values[:, :, x:last] = slab.transpose(2, 1, 0)
+        values[:, :, x : x + BLOCK] = layers(x, min(x + BLOCK, nodes[0])).transpose(2, 1, 0)
     return values, lower, lower + spacing * (nodes - 1)
 
 
-def _expand_blocks(values: np.ndarray, shape) -> np.ndarray:
-    """Repeat the values of blocks (Y, Z) at the nodes of one layer of blocks, of the ``shape`` (x, y, z)."""
-    for axis in range(2):
-        values = np.repeat(values, BLOCK, axis=axis)
-    return np.broadcast_to(values[: shape[1], : shape[2]], shape).copy()
+def grid_layers(field: DistanceField, lower, spacing: float, nodes) -> tuple[np.ndarray, Callable]:
+    """Return the :func:`crossed_blocks` of a grid of ``nodes`` (x, y, z), and a function that computes its layers.
+
+    The function takes the first x, a multiple of :data:`BLOCK`, and the end of a range of nodes, and returns their
+    values, float32 ``(end − x, Y, Z)``. Where no stored node is near, all nodes of a block have the same value.
+    """
+    crossed = crossed_blocks(field, lower, spacing, nodes)
+    same = node_values(field, lower, BLOCK * spacing, crossed.shape)
+
+    def expand(blocks: np.ndarray, first: int, end: int) -> np.ndarray:
+        layers = blocks[np.arange(first, end) // BLOCK].repeat(BLOCK, axis=1).repeat(BLOCK, axis=2)
+        return np.ascontiguousarray(layers[:, : nodes[1], : nodes[2]])
+
+    def layers(first: int, end: int) -> np.ndarray:
+        values = expand(same, first, end)
+        where = np.flatnonzero(expand(crossed, first, end))
+        start = lower + spacing * np.array([first, 0, 0])
+        values.reshape(-1)[where] = node_values(field, start, spacing, values.shape, where)
+        return values
+
+    return crossed, layers
 
 
-def crossed_blocks(field: DistanceField, lower, spacing: float, cells) -> np.ndarray:
-    """Return which blocks of :data:`BLOCK` cells along each side the surface may pass through, bool (X, Y, Z).
+def crossed_blocks(field: DistanceField, lower, spacing: float, nodes) -> np.ndarray:
+    """Return which blocks of :data:`BLOCK` nodes along each side the surface may pass through, bool (X, Y, Z).
 
     For a sparse field these are the blocks with stored nodes around, for any other field all blocks.
     """
-    count = -(-np.asarray(cells) // BLOCK)
+    count = -(-np.asarray(nodes) // BLOCK)
     structure = getattr(field, "structure", None)
     if structure is None:
         return np.ones(count, dtype=bool)
-    # Summed-area table of the blocks of nodes: those in a box are counted by differences
-    places = structure.block_positions() // NODES
-    shape = np.array(structure.shape) // NODES
-    total = np.zeros(shape + 1, dtype=np.int32)
-    total[tuple(places.T + 1)] = 1
-    for axis in range(3):
-        total = np.cumsum(total, axis=axis, dtype=np.int32)
-    ranges = []
-    for axis, n in enumerate(count):
-        first = lower[axis] + spacing * BLOCK * np.arange(n) - structure.lower[axis]
-        side = NODES * structure.spacing
-        low = np.floor((first - structure.spacing) / side).astype(int)
-        high = np.floor((first + BLOCK * spacing + structure.spacing) / side).astype(int) + 1
-        ranges.append((low.clip(0, shape[axis]), high.clip(0, shape[axis])))
-    inside = 0
-    for a, b, c in CORNERS:
-        sign = (-1) ** (a + b + c + 1)
-        inside = inside + sign * total[np.ix_(ranges[0][a], ranges[1][b], ranges[2][c])]
-    return inside > 0
+    # Range of the blocks of this grid around each block of stored nodes, with a cell as margin
+    first = np.array(structure.lower) + structure.spacing * structure.block_positions() - lower
+    ends = [first - structure.spacing, first + (NODES + 1) * structure.spacing]
+    low, high = (np.floor(end / (BLOCK * spacing)).astype(int) for end in ends)
+    crossed = np.zeros(count, dtype=bool)
+    for step in np.ndindex(*((high - low).max(axis=0, initial=-1) + 1)):
+        at = np.minimum(low + step, high)
+        crossed[tuple(at[((at >= 0) & (at < count)).all(axis=1)].T)] = True
+    return crossed
 
 
 def node_values(field: DistanceField, lower, spacing: float, shape, where=None) -> np.ndarray:
@@ -126,42 +127,39 @@ def node_values(field: DistanceField, lower, spacing: float, shape, where=None) 
 REMAINDER = 0.1
 
 
-def sharpen(values: np.ndarray, band: float) -> None:
-    """Correct a :func:`grid` in place so that its trilinear interpolation is nearer to the field; signs stay.
-
-    ``band`` is the largest distance that the field returns; the correction is that of :func:`_sharpened`.
-    """
-    flat = values.reshape(-1)
-    near = np.abs(values) < band
-    for axis in range(3):
-        np.moveaxis(near, axis, 0)[[0, -1]] = False
-    where = np.flatnonzero(near)
-    steps = (1, values.shape[2], values.shape[2] * values.shape[1])
-    around = (flat[where + sign * step] for step in steps for sign in (1, -1))
-    flat[where] = _sharpened(flat[where], around, band)
-
-
-def _sharpened(values: np.ndarray, around, band: float) -> np.ndarray:
-    """Correct values at nodes, given those of their six neighbours, for the error of interpolation.
+def sharpen(values: np.ndarray, band: float) -> np.ndarray:
+    """Return the inner nodes of grids ``(…, Z, Y, X)`` such that trilinear interpolation is nearer to the field.
 
     The interpolation of a quadratic function exceeds it where it is convex, on average over a cell by a twelfth of the
-    second differences along the three axes. Values decrease by as much, unless that changes the sign or one of the
-    seven values is truncated.
+    second differences along the three axes. Values decrease by as much, unless that changes the sign, or one of the
+    seven values is truncated to ± ``band``.
     """
-    total, near = -6 * values, np.abs(values) < band
-    for other in around:
-        total += other
-        near &= np.abs(other) < band
-    moved = values - total / 12
-    moved = np.where((moved < 0) == (values < 0), moved, REMAINDER * values)
-    return np.where(near, moved, values)
+    inner = values[..., 1:-1, 1:-1, 1:-1]
+    total, near = -6 * inner, np.abs(inner) < band
+    for axis in (-1, -2, -3):
+        for end in (slice(2, None), slice(None, -2)):
+            beside = values[(..., *(end if axis == i else slice(1, -1) for i in (-3, -2, -1)))]
+            total += beside
+            near &= np.abs(beside) < band
+    moved = inner - total / 12
+    moved = np.where((moved < 0) == (inner < 0), moved, REMAINDER * inner)
+    return np.where(near, moved, inner)
 
 
-#: Coarsest grid that is considered, and the factor by which the result may be finer than needed.
-COARSEST, FINER = 8, 1.03
+#: Cells along the longest side of the coarsest grid that is considered.
+COARSEST = 8
 
-#: Sampling of surface points: points drawn at once, largest number of draws, Newton steps, and largest error in cells.
-DRAWN, DRAWS, NEWTON, ON_SURFACE = 2**15, 64, 6, 1e-3
+#: Surface points that are drawn at once.
+POINTS_PER_DRAW = 2**15
+
+#: Largest number of draws of surface points.
+MOST_DRAWS = 64
+
+#: Newton steps that move a point onto the surface.
+NEWTON_STEPS = 6
+
+#: Largest distance of a surface point from the surface, in cells.
+ON_SURFACE = 1e-3
 
 #: Parts along the longest side of a box; points are drawn in those that the surface may pass through.
 PARTS = 16
@@ -173,26 +171,15 @@ def resolution_for(
     """Return the coarsest sufficient grid's cells along the longest side, from 8 to ``finest``, and its mean error.
 
     A grid suffices if its trilinear interpolation differs from the field by at most ``error`` on average on the field's
-    surface; the result is within 3% of the coarsest one. If ``finest`` does not suffice, it is returned with its larger
-    error. ``error`` is meant to be the field's own (``mae_surface``). Grids are evaluated on the surface only.
+    surface. If ``finest`` does not suffice, it is returned with its larger error. ``error`` is meant to be the field's
+    own (``mae_surface``). Grids are evaluated on the surface only.
     """
     points = surface_points(field, 2**12, seed)
-    low, high = min(COARSEST, finest) - 1, finest
-    best = trilinear_error(field, points, high)
-    while best <= error and high > max(low + 1, FINER * low):
-        # Errors go with the square of the cells, or fall less steeply: usually this is fine enough
-        guess = round(high * math.sqrt(max(best, 1e-3 * error) / error)) if error > 0 else low
-        if low >= COARSEST:
-            guess = max(guess, round(math.sqrt(low * high)))
-        elif guess * FINER > high:
-            guess = math.floor(high / FINER)
-        guess = min(max(guess, low + 1), high - 1)
-        tried = trilinear_error(field, points, guess)
-        if tried <= error:
-            high, best = guess, tried
-        else:
-            low = guess
-    return high, best
+    grid_error = cache(lambda resolution: trilinear_error(field, points, resolution))
+    resolutions = range(min(COARSEST, finest), finest)
+    index = bisect_left(resolutions, True, key=lambda resolution: grid_error(resolution) <= error)
+    resolution = resolutions[index] if index < len(resolutions) else finest
+    return resolution, grid_error(resolution)
 
 
 def trilinear_error(field: DistanceField, points: np.ndarray, resolution: int) -> float:
@@ -202,21 +189,14 @@ def trilinear_error(field: DistanceField, points: np.ndarray, resolution: int) -
     """
     if not len(points):
         return 0.0
-    spacing = spacing_for(field, resolution)
-    place = (points - np.array(field.lower)) / spacing
+    spacing, lower = spacing_for(field, resolution), np.array(field.lower)
+    place = (points - lower) / spacing
     cell = np.floor(place).astype(np.int64)
     weights = place - cell
-    # Each node once; beyond the box, all have the same value
-    side = resolution + 4
-    numbers = (cell[:, None] + CORNERS + 1).clip(0, side - 1) @ np.array([side**2, side, 1])
-    numbers, index = np.unique(numbers, return_inverse=True)
-    nodes = np.stack(np.unravel_index(numbers, (side,) * 3), -1) - 1
-
-    def values_at(nodes):
-        return point_values(field, np.array(field.lower) + spacing * nodes)
-
-    around = (values_at(nodes + sign * step) for step in np.eye(3, dtype=int) for sign in (1, -1))
-    values = _sharpened(values_at(nodes), around, field.band)[index.reshape(len(points), 8)]
+    # The nodes of a cell and their neighbours: 4 × 4 × 4
+    around = cell[:, None] + np.argwhere(np.ones((4, 4, 4))) - 1
+    values = point_values(field, lower + spacing * around.reshape(-1, 3)).reshape(-1, 4, 4, 4)
+    values = sharpen(values, field.band).reshape(-1, 8)
     blend = np.prod(np.where(CORNERS == 1, weights[:, None], 1 - weights[:, None]), axis=2)
     return float(np.mean(np.abs((blend * values).sum(axis=1) - point_values(field, points))))
 
@@ -231,11 +211,11 @@ def surface_points(field: DistanceField, count: int, seed: int = 0) -> np.ndarra
     blocks = np.ceil((np.array(field.upper) - np.array(field.lower)) / side - 1e-6).astype(int)
     parts = np.argwhere(crossed_blocks(field, np.array(field.lower), side / BLOCK, BLOCK * blocks))
     points, have = [np.zeros((0, 3))], 0
-    for _ in range(DRAWS if len(parts) else 0):
-        p = parts[rng.integers(len(parts), size=DRAWN)] + rng.random((DRAWN, 3))
+    for _ in range(MOST_DRAWS if len(parts) else 0):
+        p = parts[rng.integers(len(parts), size=POINTS_PER_DRAW)] + rng.random((POINTS_PER_DRAW, 3))
         p = np.array(field.lower) + side * p
         p = p[np.abs(point_values(field, p)) < 0.9 * field.band][:count]
-        for _ in range(NEWTON if len(p) else 0):
+        for _ in range(NEWTON_STEPS if len(p) else 0):
             with dr.suspend_grad():
                 value, slope = (np.asarray(v.numpy(), np.float64) for v in field.gradient(point_array(field, p)))
             p = p - np.where((slope**2).sum(0) > 0.01, value / np.maximum((slope**2).sum(0), 0.01) * slope, 0).T
@@ -275,33 +255,19 @@ def extract(field: DistanceField, resolution: int, scale: float = 1.0, centre=(0
     # One more cell on either side, all outside, closes what the box cuts
     lower = np.array(field.lower) - spacing
     cells = np.ceil((np.array(field.upper) - np.array(field.lower)) / spacing - 1e-6).astype(int) + 2
-    crossed = crossed_blocks(field, lower, spacing, cells)
-
-    def layers(first: int, last: int) -> np.ndarray:
-        needed = np.zeros((last - first + 1, *(cells[1:] + 1)), dtype=bool)
-        for y, z in np.argwhere(crossed[first // BLOCK]) * BLOCK:
-            needed[:, y : y + BLOCK + 1, z : z + BLOCK + 1] = True
-        values = np.full(needed.shape, field.band, np.float32)
-        # Nodes beyond the box, on all sides, stay outside
-        needed[:, [0, -1]] = needed[:, :, [0, -1]] = False
-        needed[0] &= first > 0
-        needed[-1] &= last < cells[0]
-        where = np.flatnonzero(needed)
-        start = lower + spacing * np.array([first, 0, 0])
-        computed = node_values(field, start, spacing, needed.shape, where)
-        values.reshape(-1)[where] = np.nan_to_num(computed, nan=field.band, posinf=field.band, neginf=-field.band)
-        return values
-
-    vertices, faces = march(layers, cells, OFF_NODE * spacing, crossed)
-    return trimesh_of((lower + spacing * vertices) * scale + np.array(centre), faces)
+    crossed, layers = grid_layers(field, lower, spacing, cells + 1)
+    vertices, faces = march(
+        lambda a, b: np.nan_to_num(layers(a, b), nan=field.band), cells, OFF_NODE * spacing, crossed
+    )
+    return to_trimesh((lower + spacing * vertices) * scale + np.array(centre), faces)
 
 
 def march(layers, cells, smallest: float, crossed=None) -> tuple[np.ndarray, np.ndarray]:
     """Run marching cubes over ``cells`` (x, y, z): vertices ``(V, 3)`` float64 in units of cells, faces ``(F, 3)``.
 
-    Faces are counter-clockwise from outside. ``layers(first, last)`` returns the values at the nodes of x from
-    ``first`` to ``last``, ``(last − first + 1, Y, Z)``, which are kept ``smallest`` away from zero. Only the
-    ``crossed`` blocks (X, Y, Z) are processed, by default all.
+    Faces are counter-clockwise from outside. ``layers(first, end)`` returns the values at nodes of x, ``(end − first,
+    Y, Z)``, which are kept ``smallest`` away from zero. Only cells around ``crossed`` blocks of nodes are processed, by
+    default all.
     """
     from skimage.measure import marching_cubes
 
@@ -309,7 +275,7 @@ def march(layers, cells, smallest: float, crossed=None) -> tuple[np.ndarray, np.
     for x in range(0, cells[0], BLOCK):
         if crossed is not None and not crossed[x // BLOCK].any():
             continue
-        values = layers(x, min(x + BLOCK, int(cells[0])))
+        values = layers(x, min(x + BLOCK, int(cells[0])) + 1)
         values = np.where(values < 0, np.minimum(values, -smallest), np.maximum(values, smallest)).astype(np.float32)
         for y in range(0, cells[1], BLOCK):
             for z in range(0, cells[2], BLOCK):
@@ -324,10 +290,10 @@ def march(layers, cells, smallest: float, crossed=None) -> tuple[np.ndarray, np.
                 count += len(v)
     if not vertices:
         return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
-    return _joined(np.concatenate(vertices), np.concatenate(faces))
+    return _merge_vertices(np.concatenate(vertices), np.concatenate(faces))
 
 
-def _joined(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Merge the equal vertices of adjacent blocks.
 
     A vertex on a grid's edge is the same wherever it comes from. No vertex lies on a node, so the edge is identified by
@@ -345,7 +311,7 @@ def _joined(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
     return vertices[first], inverse[faces]
 
 
-def trimesh_of(vertices: np.ndarray, faces: np.ndarray):
+def to_trimesh(vertices: np.ndarray, faces: np.ndarray):
     """Return unprocessed triangles as a ``trimesh.Trimesh``."""
     import trimesh
 

@@ -22,13 +22,16 @@ import numpy as np
 
 from ...arrays.boxes import box_interval, is_direction
 from ...arrays.indirection import device_array
-from ...arrays.lookup import mask_flags, mask_words
-from ...arrays.sparse_grid import ACTIVE, BLOCK, CORNERS, empty_distances, mask_ranks, place_of_bit
+from ...arrays.lookup import mask_words
+from ...arrays.sparse_grid import BLOCK, CORNERS, empty_distances, place_of_bit
 from ...core import compat
 from .nodes import MIDDLE, bernstein, unpack_frames
 
-#: Places along the ray at which the field is evaluated in a cell, and steps by false position from there.
-SAMPLES, ROOTS = 3, 3
+#: Places along the ray at which the field is evaluated in a cell.
+SAMPLES = 3
+
+#: Steps by false position from the places between which the sign changes.
+FALSE_POSITION_STEPS = 3
 
 #: Distance by which a ray is advanced beyond the side of a cell, so that it is in the next one.
 EPSILON = 1e-3
@@ -38,92 +41,78 @@ TINY = 1e-12
 
 #: Smallest rise of a ray above a plane, per spacing. With less, distances would exceed the range of whole numbers; with
 #: more, the error would exceed a slab's margin in the longest grid.
-LEVEL = 1e-7
+LEAST_SLOPE = 1e-7
 
-#: Flags in the word of a block without crossed cells, above the distance to the next crossed one in blocks: the word is
-#: no number of a block; the block is inside.
-EMPTY, INSIDE = 1 << 31, 1 << 30
+#: Flag in the word of a block without crossed cells, above the distance to the next crossed one in blocks: the word is
+#: no number of a block.
+EMPTY = 1 << 31
 
-#: Largest height of a slab's bounds above or below a block's plane, number of steps in 16 bits, and safety margin.
-SLAB, STEPS, MARGIN = 10.0, 65535, 1e-3
+#: Flag in such a word: the block is inside.
+INSIDE = 1 << 30
+
+#: Largest height of a slab's bounds above or below the plane of its block, in spacings.
+SLAB = 10.0
+
+#: Number of steps of that height, in 16 bits.
+STEPS = 65535
+
+#: Safety margin of a slab, in spacings.
+MARGIN = 1e-3
 
 _lock = threading.RLock()  # a thread that waits for the copy of an array may load another shape
 
 #: Blocks whose cells are processed at a time.
-PART = 2**10
+PART = 2**11
 
 
 class GridCells:
-    """Cells of a structure's blocks, for B blocks with nodes (NumPy).
+    """Cells of the blocks of a field's grid, for B blocks with nodes (NumPy).
 
+    - ``places`` (B, 3): the blocks' places in the grid of blocks;
     - ``crossed`` (B, 64) bool: whether all corners of each cell are stored;
     - ``inside`` (B, 64) bool: the sign of the other cells;
-    - ``beside`` (B, 8): the blocks that the corners of cells lie in, the block itself where there is none;
-    - ``empty_signs`` (X, Y, Z) bool: signs of blocks without nodes, at their places in the grid of blocks.
+    - ``beside`` (B, 8): the blocks that the corners of cells lie in, the block itself where there is none.
     """
 
-    def __init__(self, structure):
-        self._structure, self._first = structure, mask_ranks(structure.block_masks).astype(np.int32)
-        place = structure.block_positions() // BLOCK
-        self._neighbours = _neighbours(place, [n // BLOCK + 1 for n in structure.shape])
-        # Signs of blocks without nodes; beyond the grid outside
-        regions = structure.regions.shape
-        signs = np.repeat((structure.regions & 1).astype(bool)[..., None], 64, axis=-1)
-        signs[structure.regions == ACTIVE] = mask_flags(structure.region_signs)
-        signs = signs.reshape(*regions, 4, 4, 4).transpose(0, 3, 1, 4, 2, 5)
-        self.empty_signs = signs.reshape([4 * n for n in regions])
-        del signs  # a dense grid takes most of the memory
-        empty = np.pad(self.empty_signs, [(0, 1)] * 3)
-
-        groups = (structure.block_signs[:, None] >> np.arange(8) & 1).astype(bool).reshape(-1, 2, 2, 2)
-        self.crossed, self.inside = np.empty((2, len(place), 4, 4, 4), bool)
+    def __init__(self, field):
+        self.field, self.places = field, field.structure.block_positions() // BLOCK
+        count, last = len(self.places), np.array(field.structure.shape) // BLOCK
+        self.crossed, self.inside = np.empty((2, count, 64), bool)
+        self.beside = np.repeat(np.arange(count, dtype=np.int32)[:, None], 8, axis=1)
         for part in self.parts():
-            inside, neighbours = np.zeros((len(place[part]), 5, 5, 5), bool), self._neighbours[part]
-            for neighbour, n in zip(neighbours.T, CORNERS, strict=True):
-                target, source = _shared(n)
-                signs = groups[neighbour].repeat(2, 1).repeat(2, 2).repeat(2, 3)
-                sign = empty[tuple((place[part] + n).T)][:, None, None, None]
-                inside[target] = np.where(neighbour[:, None, None, None] >= 0, signs, sign)[source]
-            stored = self.nodes(part) >= 0
-            crossed, within = np.ones((len(stored), 4, 4, 4), bool), np.zeros((len(stored), 4, 4, 4), bool)
-            for a, b, c in CORNERS:
-                corner = (slice(None), slice(a, a + 4), slice(b, b + 4), slice(c, c + 4))
-                crossed &= stored[corner]
-                within |= ~stored[corner] & inside[corner]
-            self.crossed[part], self.inside[part] = crossed, within
-        self.crossed, self.inside = self.crossed.reshape(-1, 64), self.inside.reshape(-1, 64)
-        self.beside = np.where(self._neighbours < 0, np.arange(len(place), dtype=np.int32)[:, None], self._neighbours)
+            stored, _, inside = self.corners(part)
+            self.crossed[part], self.inside[part] = stored.all(axis=0), (inside & ~stored).any(axis=0)
+            beside = self.places[part][:, None] + CORNERS
+            number, has = self._evaluate(
+                field.index.block(*self._columns(BLOCK * beside), field.types.Bool((beside < last).all(-1).ravel()))[:2]
+            )
+            self.beside[part][has.reshape(-1, 8)] = number[has]
 
     def parts(self) -> list[slice]:
         """Return slices of :data:`PART` blocks, which are processed at a time."""
-        return [slice(first, first + PART) for first in range(0, len(self._neighbours), PART)]
+        return [slice(first, first + PART) for first in range(0, len(self.places), PART)]
 
-    def nodes(self, part: slice) -> np.ndarray:
-        """Return the numbers of the nodes at the corners of the cells of some blocks, −1 where none is stored.
+    def corners(self, part: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return which corners of the cells of some blocks are stored, their numbers, and the signs of the others.
 
-        They have the shape (m, 5, 5, 5).
+        All are ``(8, m, 64)``. A cell beyond the last one, where no ray comes, counts as the last one.
         """
-        neighbours = self._neighbours[part]
-        node = np.full((len(neighbours), 5, 5, 5), -1, np.int32)
-        for neighbour, n in zip(neighbours.T, CORNERS, strict=True):
-            target, source = _shared(n)
-            stored = mask_flags(self._structure.block_masks[neighbour]) & (neighbour >= 0)[:, None]
-            numbers = self._first[neighbour, None] + np.cumsum(stored, axis=1, dtype=np.int32) - 1
-            node[target] = np.where(stored, numbers, -1).reshape(-1, 4, 4, 4)[source]
-        return node
+        cells = BLOCK * self.places[part][:, None] + place_of_bit(np.arange(64))
+        cells = np.minimum(cells, np.array(self.field.structure.shape) - 2)
+        corners = self.field.index.corners(self._columns(cells), self.field.types.Bool(True))
+        stored, number, _, _, inside = zip(*corners, strict=True)
+        arrays = self._evaluate([*stored, *number, *inside])
+        return tuple(np.stack(arrays[i : i + 8]).reshape(8, -1, 64) for i in (0, 8, 16))
 
+    def _columns(self, positions: np.ndarray) -> list:
+        """Return positions (…, 3) as three ``Int32``."""
+        return [device_array(self.field.types.Int32, v) for v in positions.reshape(-1, 3).T.astype(np.int32)]
 
-def _neighbours(place: np.ndarray, shape: list[int]) -> np.ndarray:
-    """Return the numbers of the blocks that the corners of the cells of each block lie in, (B, 8), −1 for none."""
-    number = np.full(shape, -1, np.int32)
-    number[tuple(place.T)] = np.arange(len(place))
-    return np.stack([number[tuple((place + n).T)] for n in CORNERS], axis=1)
-
-
-def _shared(corner: tuple) -> tuple[tuple, tuple]:
-    """Return the part of the nodes (m, 5, 5, 5) of cells that a neighbour holds, and its place in the neighbour."""
-    target = (slice(None), *(slice(4 * e, 4 + e) for e in corner))
-    return target, (slice(None), *(slice(0, 1 if e else 4) for e in corner))
+    @staticmethod
+    def _evaluate(arrays) -> list[np.ndarray]:
+        """Evaluate arrays in one kernel."""
+        dr.eval(arrays)
+        return [array.numpy() for array in arrays]
 
 
 def slab_words(cells: GridCells, nodes, frames) -> np.ndarray:
@@ -139,10 +128,10 @@ def slab_words(cells: GridCells, nodes, frames) -> np.ndarray:
     upper *= -1
     half = np.abs(normals).sum(axis=1) / 2
     for part in cells.parts():
-        node, distance, normal = cells.nodes(part), distances[part], normals[part]
+        distance, normal = distances[part], normals[part]
         block, bit = np.nonzero(cells.crossed[part])
         at = place_of_bit(bit)[:, None] + CORNERS
-        residual = nodes[node[block[:, None], at[..., 0], at[..., 1], at[..., 2]]].astype(np.float64)
+        residual = nodes[cells.corners(part)[1][:, block, bit].T].astype(np.float64)
         residual[..., 0] -= distance[block, None] + np.einsum("mki,mi->mk", at - MIDDLE, normal[block])
         residual[..., 1:] -= normal[block, None]
         coefficients = bernstein(residual)
@@ -165,9 +154,9 @@ def empty_space_words(structure, cells: GridCells) -> tuple[np.ndarray, np.ndarr
     A region's word is the number of its blocks' words, or flags and distance (:data:`EMPTY`); the words of the blocks
     ``(R, 64)`` of regions that are not empty are the number of the block, or flags and distance.
     """
-    sign, place = cells.empty_signs.copy(), structure.block_positions() // BLOCK
-    full = np.zeros(sign.shape, bool)
-    full[tuple(place.T)] = crossed = cells.crossed.any(axis=1)
+    sign, place = structure.empty_block_signs(), cells.places
+    full, crossed = np.zeros(sign.shape, bool), cells.crossed.any(axis=1)
+    full[tuple(place.T)] = crossed
     sign[tuple(place.T)] = cells.inside[:, 0]  # where no cell is crossed, all have the same
     layers, first_blocks = structure.regions.shape[0], place[:, 0] // 4
     some, region_signs, words = [], [], []
@@ -211,7 +200,7 @@ class Marcher:
     def __init__(self, field):
         self.field = field
         structure, UInt32 = field.structure, field.types.UInt32
-        cells = GridCells(structure)
+        cells = GridCells(field)
         regions, blocks = empty_space_words(structure, cells)
         masks = np.concatenate([mask_words(cells.crossed), mask_words(cells.inside)], axis=1)
         self.cells, self.beside, self.regions, self.words = (
@@ -292,7 +281,7 @@ class Marcher:
         at, slope = d, Float(0)
         for v, x, o, e in zip(n, cell, ray.o, ray.d, strict=True):
             at, slope = dr.fma(v, o - Float(x & ~3) - MIDDLE, at), dr.fma(v, e, slope)
-        slope = dr.select(dr.abs(slope) < LEVEL, LEVEL, slope)
+        slope = dr.select(dr.abs(slope) < LEAST_SLOPE, LEAST_SLOPE, slope)
         inverse = dr.rcp(slope)
         one, other = (low - at) * inverse, (high - at) * inverse
         first, last = dr.minimum(one, other), dr.maximum(one, other)
@@ -315,7 +304,7 @@ class Marcher:
         return corners
 
 
-def marcher_of(field) -> Marcher:
+def get_marcher(field) -> Marcher:
     """Return the field's cached marcher, the same one to all threads."""
     with _lock:
         if "_marcher" not in vars(field):
@@ -367,7 +356,7 @@ def cross(marcher, ray, low, end, number, leaving, fresh):
         high, b = dr.select(other & ~hit, t, high), dr.select(other & ~hit, v, b)
         hit |= other
         low, a = dr.select(hit, low, t), dr.select(hit, a, v)
-    for _ in range(ROOTS):
+    for _ in range(FALSE_POSITION_STEPS):
         t = dr.fma(high - low, _share(a, b), low)
         v = value(t)
         other = (v < 0) != leaving
@@ -463,8 +452,11 @@ def march(marcher, o, d, length, fresh, active):
 #: Shortest step, relative to the longest side; a ray may miss a solid that it crosses in less.
 SHORTEST_STEP = 1e-4
 
-#: Largest error of a hit along the ray, and the value at which a place counts as on the surface.
-TOLERANCE, ZERO = 1e-5, 1e-6
+#: Largest error of a hit along a sphere-traced ray, relative to the longest side.
+TOLERANCE = 1e-5
+
+#: Value at which a place counts as on the surface.
+ZERO = 1e-6
 
 #: Distance, in cells, by which a ray may exceed the safe step where the surface is expected.
 RELAXATION = 1.0
@@ -517,7 +509,7 @@ def intersect(field, o, d, maxt, active=True, exact: bool = True) -> Hit:
         if field.marched:
             scale = field.cells_per_unit
             origin = [(x - a) * scale for x, a in zip(start, field.box[0], strict=True)]
-            hit, t, leaving = march(marcher_of(field), origin, d, length * scale, near == 0, active)
+            hit, t, leaving = march(get_marcher(field), origin, d, length * scale, near == 0, active)
             t = t * field.cell
         else:
             hit, t, leaving = sphere_trace(field, start, d, length, near == 0, active, exact)
@@ -590,4 +582,4 @@ def occluded(field, o, d, maxt, active=True):
 
 def index_bytes(field) -> int:
     """Return the bytes of the field's ray-marching index; 0 if it is sphere-traced."""
-    return marcher_of(field).nbytes if field.marched else 0
+    return get_marcher(field).nbytes if field.marched else 0

@@ -30,8 +30,17 @@ from ...core.units import memory
 #: First number of a file and of each mesh in it.
 MAGIC = 0x041C
 
-#: Flags of a mesh: optional arrays before the triangles, and their precision.
-NORMALS, TEXTURE_COORDINATES, COLOURS, DOUBLE = 0x1, 0x2, 0x8, 0x2000
+#: Flag of a serialized mesh: normals follow its vertices.
+NORMALS = 0x1
+
+#: Flag of a serialized mesh: texture coordinates follow its vertices.
+TEXTURE_COORDINATES = 0x2
+
+#: Flag of a serialized mesh: colours follow its vertices.
+COLOURS = 0x8
+
+#: Flag of a serialized mesh: numbers have double precision.
+DOUBLE = 0x2000
 
 
 def read_serialized(path: str | os.PathLike, number: str = "") -> list[tuple[np.ndarray, np.ndarray]]:
@@ -222,7 +231,7 @@ def make_mesh(vertices: np.ndarray, faces: np.ndarray, name: str = "mesh") -> Me
     if len(faces) == 0:
         raise MeshError(f"{name}: has no triangles, expected a surface that encloses a solid")
     _check_indices(name, faces, len(vertices))
-    vertices, faces = _joined(vertices, faces)
+    vertices, faces = _merge_vertices(vertices, faces)
     if not np.all(np.isfinite(vertices)):
         raise MeshError(f"{name}: has vertices that are NaN or infinite, allowed are finite ones")
 
@@ -239,7 +248,7 @@ def make_mesh(vertices: np.ndarray, faces: np.ndarray, name: str = "mesh") -> Me
     vertices = (vertices - centre) / scale
 
     repairs = []
-    vertices, faces, watertight, turned = _repaired(vertices, faces, name, repairs)
+    vertices, faces, watertight, turned = _repair(vertices, faces, name, repairs)
     vertices, faces = np.ascontiguousarray(vertices), np.ascontiguousarray(faces, dtype=np.int32)
     digest = hashlib.sha256(vertices.tobytes() + faces.tobytes()).hexdigest()
     mesh = Mesh(vertices, faces, watertight, scale, tuple(float(c) for c in centre), name, digest, repairs, turned)
@@ -312,7 +321,7 @@ def _read(path: Path, part: str = "") -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(vertices), np.concatenate(faces)
 
 
-def _repaired(vertices: np.ndarray, faces: np.ndarray, name: str, repairs: list[str]):
+def _repair(vertices: np.ndarray, faces: np.ndarray, name: str, repairs: list[str]):
     """Drop degenerate triangles and turn wrongly wound ones; sentences are added to ``repairs``."""
     twice = (faces[:, 0] == faces[:, 1]) | (faces[:, 1] == faces[:, 2]) | (faces[:, 2] == faces[:, 0])
     faces = faces[~twice]
@@ -345,7 +354,7 @@ def _repaired(vertices: np.ndarray, faces: np.ndarray, name: str, repairs: list[
     return vertices[used], faces.reshape(-1, 3), not open_edges, int(np.count_nonzero(against != turned))
 
 
-def _joined(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Merge equal vertices and drop unused ones: vertices in lexicographic order, and faces that index them."""
     used = np.zeros(len(vertices), dtype=bool)
     used[faces] = True
@@ -445,9 +454,11 @@ def _windings(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray, place
 #: Distance from a triangle at which either side is tested: resolved by float32, and thinner than thin sheets.
 STEP = 2e-6
 
-#: Edge length above which a triangle is tested in parts, and the length down to which parts are halved while some of a
-#: part bounds the solid and some does not.
-COARSE, FINE = 1 / 32, 1 / 256
+#: Edge length above which a triangle is tested in parts.
+COARSE = 1 / 32
+
+#: Edge length down to which parts are halved while some of a part bounds the solid and some does not.
+FINE = 1 / 256
 
 #: Barycentric coordinates at which a triangle is tested: the middle and near the corners.
 PLACES = np.array([[1 / 3, 1 / 3, 1 / 3], [0.9, 0.05, 0.05], [0.05, 0.9, 0.05], [0.05, 0.05, 0.9]])

@@ -28,7 +28,7 @@ from ...core.units import check_memory
 from ...fitting.task import Model
 from .encoding import NodeCoding
 from .field import DistanceField
-from .nodes import POINTERS, SparseNodes, coded_field, decoded_nodes, pointer_words, unpack_pointers
+from .nodes import POINTERS, SparseNodes, coded_field, decode_to_array, pointer_words, unpack_pointers
 from .paper import PairField
 
 #: Arrays of each layout: name → number of dimensions, and channels (bytes in the sparse layout, except for entries).
@@ -40,8 +40,14 @@ LAYOUTS = {
 #: Bytes of memory for each cell of a side's square while a surface is extracted, roughly.
 TRIANGLES = 128
 
-#: Bytes of memory for each region, block and node while a sparse field and its index for rays are built, measured.
-REGION_BYTES, BLOCK_BYTES, NODE_BYTES = 300, 400, 28
+#: Bytes of memory for each region while a sparse field and its index for rays are built, measured.
+REGION_BYTES = 300
+
+#: Bytes of memory for each block meanwhile.
+BLOCK_BYTES = 400
+
+#: Bytes of memory for each node meanwhile.
+NODE_BYTES = 28
 
 #: Coordinates of a box are smaller.
 LARGEST = 1e9
@@ -92,7 +98,7 @@ def load(path) -> Table:
         regions, blocks = table.arrays["regions"].entries.size, len(table.arrays["blocks"].entries)
         nbytes = REGION_BYTES * regions + BLOCK_BYTES * blocks + NODE_BYTES * table.settings["nodes"]
         check_allowance(table, nbytes, f"a field of {regions:,} regions and {blocks:,} blocks")
-        structure_of(table)
+        read_grid(table)
     else:
         check_pair(table)
     return table
@@ -119,7 +125,7 @@ def _words(table: Table, name: str, part=slice(None)) -> np.ndarray:
     return np.ascontiguousarray(table.arrays[name].entries[:, part]).view("<u4")
 
 
-def structure_of(table: Table) -> SparseGrid:
+def read_grid(table: Table) -> SparseGrid:
     """Return the structure of a sparse field. Raises :class:`.TableError` if it is damaged."""
     settings = table.settings
     bits, nodes = settings["bits"], settings["nodes"]
@@ -146,7 +152,7 @@ def structure_of(table: Table) -> SparseGrid:
     return structure
 
 
-def field_of(table: Table, arrays: dict, types, storage: str = "") -> DistanceField:
+def build_field(table: Table, arrays: dict, types, storage: str = "") -> DistanceField:
     """Return the field of a checked table.
 
     ``arrays`` are the allocated arrays of a pair. With the ``storage`` ``"float32"``, the nodes of a sparse field are
@@ -156,12 +162,12 @@ def field_of(table: Table, arrays: dict, types, storage: str = "") -> DistanceFi
     if settings["layout"] == "pair":
         net = Indirection(arrays["primary"], arrays["cascaded"])
         return PairField(types, net, settings["lower"], settings["upper"], settings["band"], settings["slope"])
-    structure = structure_of(table)
+    structure = read_grid(table)
     frames, words = _words(table, "blocks", slice(9, 13))[: structure.blocks, 0], _words(table, "pointers")[:, 0]
     entries = table.arrays["entries"].values
     if storage == "float32":
         pointers = unpack_pointers(words, settings["bits"], structure.nodes)
-        nodes = decoded_nodes(structure, frames, entries, pointers)
+        nodes = decode_to_array(structure, frames, entries, pointers)
         return SparseNodes(types, structure, settings["slope"], nodes=device_tensor(types.TensorXf, nodes))
     return coded_field(types, structure, settings["slope"], frames, words, settings["bits"], entries)
 
@@ -176,10 +182,8 @@ def stored(table: Table, entries: dict, storage: str = "") -> Table:
         raise ValueError(f'storage: found "{storage}", allowed is uint8: the nodes of a sparse field are coded')
     values = entries["nodes"].numpy().astype(np.float64)
     values[:, 1:] /= np.maximum(np.linalg.norm(values[:, 1:], axis=1, keepdims=True), 1e-9)
-    before = field_of(table, {}, module_of(entries["nodes"]), "float32").nodes.numpy().astype(np.float64)
-    arrays, settings = coded_arrays(
-        encode_again(structure_of(table), before, values, table.settings["bits"], table.seed)
-    )
+    before = build_field(table, {}, module_of(entries["nodes"]), "float32").nodes.numpy().astype(np.float64)
+    arrays, settings = coded_arrays(encode_again(read_grid(table), before, values, table.settings["bits"], table.seed))
     settings = {**table.settings, **settings, "optimised": True}
     return replace(table, arrays=arrays, settings=settings, measured={}, path=None)
 
@@ -193,7 +197,7 @@ class SdfModel(Model):
     def build(self):
         settings = self.table.settings
         self.sparse = settings["layout"] == "sparse"
-        self.field = field_of(self.table, self.arrays, self.types, self.form)
+        self.field = build_field(self.table, self.arrays, self.types, self.form)
         self.scale, self.centre = float(settings["scale"]), tuple(settings["centre"])
 
     @property

@@ -21,8 +21,14 @@ from ...arrays.lookup import mask_flags
 from ...arrays.sparse_grid import BLOCK, CORNERS, GridIndex, SparseGrid, place_of_bit
 from .field import DistanceField
 
-#: Bits of a frame: each coordinate of the normal, the distance of the middle, the scale.
-NORMAL_BITS, DISTANCE_BITS, SCALE_BITS = 10, 8, 4
+#: Bits of each coordinate of a frame's normal.
+NORMAL_BITS = 10
+
+#: Bits of the distance of a block's middle in a frame.
+DISTANCE_BITS = 8
+
+#: Bits of a frame's scale.
+SCALE_BITS = 4
 
 #: Largest distance of a block's middle, in spacings.
 REACH = 4.5
@@ -194,7 +200,7 @@ class SparseNodes(DistanceField):
     """Field of the nodes of a ``structure``, in one of two forms.
 
     Decoded nodes can be trained: ``nodes`` is a tensor (n, 4) of distances in spacings and gradients. Coded nodes are
-    ``pointers`` (words, with ``bits`` bits each) into ``entries`` (words, with the :func:`.codes.entry_scale`
+    ``pointers`` (words, with ``bits`` bits each) into ``entries`` (words, with the :func:`entry_scale`
     ``offset`` and ``step``), relative to the ``frames`` of their blocks (words).
     """
 
@@ -328,7 +334,7 @@ class SparseNodes(DistanceField):
             return None
         pointers = unpack_pointers(np.array(self._pointers), self.bits, self.structure.nodes)
         entries = np.stack(unpack_entries(np.array(self._entries), *self._affine), axis=1)
-        return decoded_nodes(self.structure, self.frames(), entries, pointers)
+        return decode_to_array(self.structure, self.frames(), entries, pointers)
 
     @property
     def nbytes(self) -> int:
@@ -393,7 +399,7 @@ def middles(positions: np.ndarray) -> np.ndarray:
     return positions % BLOCK - MIDDLE
 
 
-def decoded_nodes(
+def decode_to_array(
     structure: SparseGrid, frames: np.ndarray, entries: np.ndarray, pointers: np.ndarray | None = None
 ) -> np.ndarray:
     """Decode nodes: distances in spacings and normals, (n, 4) float32, from the frames (B,) of their blocks.

@@ -7,36 +7,37 @@ distance itself.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import drjit as dr
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ...arrays.budget import Budget, BudgetError, proportional_shape
 from ...arrays.indirection import DifferentiableArray, Indirection, device_array, ramp, rounded, stored_form
 from ...arrays.tables import StoredArray, Table
 from ...core.errors import UsageError
-from ...core.units import largest_fitting
 from ...fitting.loop import Problem
-from ...fitting.task import FitRequest
-from .distances import Distances
+from .distances import Distances, sample_box, sample_near
 from .evaluation import HELD_OUT, HeldOut
 from .field import DistanceField
-from .mesh import Mesh
-from .sampling import sample_box, sample_near
 
 #: Table 5 of the supplement: sides of the primary over sides of the cascaded array, by megabytes of both. Its text says
 #: 1.5 to 2.5; the table's values are taken.
 RATIOS = {6: 2.0, 12: 2.56, 16: 2.81, 24: 2.08, 48: 2.71, 96: 2.56}
 
-#: Largest distance that is stored, in spacings of the primary array, and its minimum, relative to the longest side.
-BAND, LEAST_BAND = 2.5, 0.02
+#: Largest distance that is stored, in spacings of the primary array.
+BAND = 2.5
+
+#: Least value of that distance, relative to the longest side.
+LEAST_BAND = 0.02
 
 #: Number of cells of the cascaded array along an axis, beyond the first, up to which the bound of the slope is local.
 NARROW = 3
 
-#: Training samples, and the share of them that is uniform in the box.
-SAMPLES, UNIFORM = 2**20, 0.2
+#: Training samples.
+SAMPLES = 2**20
+
+#: Share of the training samples that is uniform in the box.
+UNIFORM = 0.2
 
 #: Starts of the arrays by preset; see :func:`initial`.
 STARTS = {"dense": "distance", "paper": "ramp"}
@@ -60,8 +61,8 @@ class PairField(DistanceField):
     def bound(self):
         return self._bound
 
-    def changed(self):
-        self.slope = slope_of(self.net, self.lower, self.upper, self.band)
+    def update_bound(self):
+        self.slope = slope_bound(self.net, self.lower, self.upper, self.band)
         self._bound = dr.opaque(self.types.Float, self.slope)
 
     def value(self, p, active=True):
@@ -88,22 +89,18 @@ def ratio_for(nbytes: int) -> float:
 def resolutions(nbytes: int, ratio: float, extent) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Return the largest resolutions of primary and cascaded array in this ``ratio`` that fit ``nbytes`` bytes.
 
-    Entries take 3 bytes in the primary and 1 byte in the cascaded array; sides follow the ``extent`` of the box.
+    Entries take 3 bytes in the primary and 1 byte in the cascaded array; sides follow the ``extent`` of the box. Raises
+    :class:`.UsageError` if even the smallest arrays are larger.
     """
-    extent = np.asarray(extent, dtype=np.float64)
 
-    def sides(n: float):
-        primary = np.maximum(2, np.round(n * extent / extent.max()).astype(int))
-        cascaded = np.maximum(2, np.round(n / ratio * extent / extent.max()).astype(int))
-        return primary, cascaded
+    def family(n: int) -> list:
+        return [((*proportional_shape(n, extent), 3), 8), (proportional_shape(n / ratio, extent), 8)]
 
-    def fits(n: float) -> bool:
-        primary, cascaded = sides(n)
-        return 3 * primary.prod() + cascaded.prod() <= nbytes
-
-    n = max(4, int((nbytes / (3 + ratio**-3) / np.prod(extent / extent.max())) ** (1 / 3)) + 4)
-    primary, cascaded = sides(largest_fitting(fits, 4, n + 1))
-    return tuple(primary.tolist()), tuple(cascaded.tolist())
+    try:
+        n = Budget(nbytes).largest(family, range(4, max(5, nbytes)))
+    except BudgetError as e:
+        raise UsageError(f"--bytes: {e}") from None
+    return proportional_shape(n, extent), proportional_shape(n / ratio, extent)
 
 
 def initial(start: str, primary, cascaded, grid_distance, samples, distances, band: float) -> Indirection:
@@ -128,7 +125,7 @@ def initial(start: str, primary, cascaded, grid_distance, samples, distances, ba
     )
 
 
-def slope_of(net: Indirection, lower, upper, band: float) -> float:
+def slope_bound(net: Indirection, lower, upper, band: float) -> float:
     """Return a bound Λ of the field's slope.
 
     For each cell of the primary array: how fast its pointers change, times the steepest slope of the cascaded array
@@ -177,18 +174,46 @@ def edge_steps(values: np.ndarray, axis: int) -> np.ndarray:
 
 
 class PairProblem(Problem):
-    """Training of the supplement: truncated distances, mostly near the surface, in units of the band."""
+    """Training of the supplement: truncated distances, mostly near the surface, in units of the band.
 
-    def __init__(self, field: PairField, mesh: Mesh, points: np.ndarray, distances: np.ndarray, held_out: HeldOut):
-        self.field, self.types, self.net = field, field.types, field.net
+    ``shapes`` are the :func:`resolutions` of both arrays and ``start`` is that of :func:`initial`; ``samples`` and
+    ``held_out`` are the numbers of training samples and of points measured on the way.
+    """
 
-        def flat(v):
-            return device_array(self.types.Float, v)
+    def __init__(
+        self, distances: Distances, shapes, start: str, types, seed: int = 0, samples: int = SAMPLES,
+        held_out: int = HELD_OUT,
+    ):  # fmt: skip
+        mesh, (primary, cascaded) = distances.mesh, shapes
+        extent = mesh.upper - mesh.lower
+        # The box ends a cell and a half outside of the mesh
+        padding = 1.5 * extent.max() / (max(primary) - 4)
+        lower, upper = mesh.lower - padding, mesh.upper + padding
+        size = upper - lower
+        spacing = float((size / (np.array(primary) - 1)).max())
+        band = max(LEAST_BAND, BAND * spacing)
+        uniform = int(UNIFORM * samples)
+        points = np.concatenate([
+            sample_near(distances.surface, samples - uniform, spacing / 2, [seed, 1]),
+            sample_box(lower, upper, uniform, [seed, 2]),
+        ]).clip(lower, upper)  # fmt: skip
+        d = distances.signed(points)
+        unit = (points - lower) / size
 
-        self.points = [flat(v) for v in points.T]
-        self.targets = flat(np.clip(distances / field.band, -1, 1) / 2 + 0.5)
-        self.identity = {"source": mesh.digest, "resolution": list(self.net.primary[0].resolution)}
-        self.held_out = held_out
+        def grid_distance(resolution):
+            axes = [np.linspace(a, b, n) for a, b, n in zip(lower, upper, resolution, strict=True)]
+            nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+            return distances.signed(nodes.reshape(-1, 3)).reshape(resolution)
+
+        # With a constant start, one sample on the surface is the nearest to all entries
+        known = (unit[:1], np.zeros(1)) if start == "constant" else (unit, d)
+        self.net = initial(start, primary, cascaded, grid_distance, *known, band).alloc(types.TensorXf)
+        self.field, self.types = PairField(types, self.net, lower, upper, band, 1.0), types
+        self.points = [device_array(types.Float, v) for v in unit.T]
+        self.targets = device_array(types.Float, np.clip(d / band, -1, 1) / 2 + 0.5)
+        self.held_out = HeldOut(distances, types, spacing / 2, count=held_out)
+        self.identity = {"source": mesh.digest, "resolution": list(primary)}
+        self.start, self.ratio = start, primary[0] / cascaded[0]
 
     def batch(self, rng, size: int):
         Float, UInt32 = self.types.Float, self.types.UInt32
@@ -206,63 +231,13 @@ class PairProblem(Problem):
             self.field.net = net
             return errors
 
-
-def fit_pair(
-    distances: Distances,
-    nbytes: int,
-    request: FitRequest,
-    samples: int = SAMPLES,
-    held_out: int = HELD_OUT,
-    measure: Callable[[PairField], object] = lambda field: None,
-):
-    """Fit dense arrays of ``nbytes`` bytes: ``(table, training result, field)``.
-
-    ``samples`` and ``held_out`` are the numbers of training samples and of points measured on the way;
-    ``measure`` is the measurement that will follow, for which a limit of time leaves room. Raises
-    :class:`.UsageError` if even the smallest arrays are larger.
-    """
-    mesh, options = distances.mesh, request.options
-    extent = mesh.upper - mesh.lower
-    primary, cascaded = resolutions(nbytes, options["ratio"] or ratio_for(nbytes), extent)
-    least = 3 * int(np.prod(primary)) + int(np.prod(cascaded))
-    if least > nbytes:
-        raise UsageError(f"--bytes: found {nbytes:,}, the smallest arrays need {least:,}")
-    # The box ends a cell and a half outside of the mesh
-    padding = 1.5 * extent.max() / (max(primary) - 4)
-    lower, upper = mesh.lower - padding, mesh.upper + padding
-    size = upper - lower
-    spacing = float((size / (np.array(primary) - 1)).max())
-    band = max(LEAST_BAND, BAND * spacing)
-    uniform, seed = int(UNIFORM * samples), request.settings.seed
-    points = np.concatenate([
-        sample_near(distances.surface, samples - uniform, spacing / 2, [seed, 1]),
-        sample_box(lower, upper, uniform, [seed, 2]),
-    ])  # fmt: skip
-    points = np.clip(points, lower, upper)
-    d = distances.signed(points)
-    unit = (points - lower) / size
-
-    def grid_distance(resolution):
-        axes = [np.linspace(a, b, n) for a, b, n in zip(lower, upper, resolution, strict=True)]
-        return distances.signed(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)).reshape(resolution)
-
-    start = "constant" if options["constant"] else STARTS[request.preset]
-    known = (unit[:1], np.zeros(1)) if start == "constant" else (unit, d)  # constant: the one sample's distance, 0
-    net = initial(start, primary, cascaded, grid_distance, *known, band).alloc(request.types.TensorXf)
-    field = PairField(request.types, net, lower, upper, band, 1.0)
-    held = HeldOut(distances, request.types, spacing / 2, count=held_out)
-    problem = PairProblem(field, mesh, unit, d, held)
-
-    def quantised() -> tuple[PairField, Indirection]:
-        stored = stored_form(problem.net)
-        return PairField(request.types, stored, lower, upper, band, slope_of(stored, lower, upper, band)), stored
-
-    result = request.train(problem, finish=lambda: measure(quantised()[0]))
-    field, stored = quantised()
-    arrays = {"primary": StoredArray.of(stored.primary[0]), "cascaded": StoredArray.of(stored.cascaded)}
-    settings = {
-        "layout": "pair", "lower": lower.tolist(), "upper": upper.tolist(), "band": band, "slope": field.slope,
-        "ratio": primary[0] / cascaded[0], "start": start,
-    }  # fmt: skip
-    table = Table("sdf", arrays, settings=settings)
-    return table, result, field
+    def table(self, seed: int) -> Table:
+        """Return the arrays as a file holds them."""
+        stored, field = stored_form(self.net), self.field
+        settings = {
+            "layout": "pair", "lower": list(field.lower), "upper": list(field.upper), "band": field.band,
+            "slope": slope_bound(stored, field.lower, field.upper, field.band), "ratio": self.ratio,
+            "start": self.start,
+        }  # fmt: skip
+        arrays = {"primary": StoredArray.of(stored.primary[0]), "cascaded": StoredArray.of(stored.cascaded)}
+        return Table("sdf", arrays, settings=settings)

@@ -1,13 +1,11 @@
-"""Task 5: textures that are trained for their shaded appearance, not for their values.
+"""Textures that are trained for their shaded appearance, not for their values (task 5), and recipes of their fits.
 
 The truth is filtered appearance: the analytic Disney BRDF of task 2, averaged over footprints. The arrays are those of
-task 4, shaded by frozen tables of task 2; the result is a file of the task ``texture``.
+task 4, shaded by frozen tables of task 2; the result is a file of the task ``texture``. Training through renders of a
+scene is :mod:`mi_diffind.scenes.training`.
 
-- :mod:`.material`: maps as parameters of the BRDF, and shading; :mod:`.reference`: filtered appearance;
-- :mod:`.evaluation`: images under views and lights that no training draws; :mod:`.preview`: a picture of the progress;
-- :mod:`.presets`, :mod:`.training`, :mod:`.fit`: recipes, the problem, and ``fit shading``.
-
-Training through renders of a scene is :mod:`mi_diffind.scenes.training`.
+:mod:`.material`: maps as parameters of the BRDF, and shading; :mod:`.evaluation`: references, images that measure, and
+a preview; :mod:`.training`: the training problem; :mod:`.fit`: the command ``fit shading``.
 """
 
 from __future__ import annotations
@@ -20,7 +18,7 @@ from ...fitting.settings import FitSettings
 from ...fitting.task import Task
 from ...maps.arguments import LEVEL_BIAS, PREVIEW, SIZES, SOURCES
 
-#: Sample patterns of the reference (:data:`.reference.SAMPLES_PER_SIDE`).
+#: Sample patterns of the reference (:data:`.evaluation.SAMPLES_PER_SIDE`).
 REFERENCES = ("jittered", "prefiltered", "converged")
 
 
@@ -67,7 +65,7 @@ PRESETS = {
 
 
 class Shading(Task):
-    """Task ``shading``: presets are the recipes of :mod:`.presets`, files are those of the task ``texture``."""
+    """Task ``shading``: presets are :data:`PRESETS`, files are those of the task ``texture``."""
 
     name = "shading"
     title = "a texture, for what it looks like when it is shaded"

@@ -1,4 +1,14 @@
-"""Evaluation of a shaded texture: images at levels of detail, under views and lights that no training draws."""
+"""Shaded textures: images under views and lights that no training draws, the reference, and a preview.
+
+**The reference** is appearance from afar: shaded first, filtered afterwards (supplemental 1.5). The footprint of a
+level of detail L is a square of 2^L × 2^L texels, along the axes. The analytic model shades samples of the footprint,
+and their mean is the reference. Three patterns of samples:
+
+- ``"converged"``: 256 stratified samples of unfiltered maps;
+- ``"prefiltered"``: the paper's 16, each read in the mip pyramid two levels finer than L, which averages normals before
+  they are shaded: mostly a filter of parameters;
+- ``"jittered"``: 16 random samples of unfiltered maps, one in each of 4 × 4 strata: noisy, yet right on average.
+"""
 
 from __future__ import annotations
 
@@ -26,12 +36,18 @@ ShadedReader = Callable[[Any, Any, Any, Any, Any], Any]
 #: References of the images: letter → sample pattern.
 TRUTHS = {"C": "converged", "P": "prefiltered"}
 
-#: Samples of the converged reference along the side of each texel of level 0, and their largest number along the side
-#: of a footprint: with 16 × 16 in all, the noise of the reference is at 36 dB on level 5 of a glossy material.
-PER_TEXEL, LARGEST = 4, 64
+#: Samples of the converged reference along the side of each texel of level 0.
+PER_TEXEL = 4
 
-#: Side of the images of :meth:`ShadedEvaluation.another`, and the largest number of their pixels on a level.
-PART, CHOOSING = 4, 2**14
+#: Most samples of the converged reference along the side of a footprint: with 16 × 16 in all, the noise of the
+#: reference is at 36 dB on level 5 of a glossy material.
+LARGEST = 64
+
+#: Side of the images of :meth:`ShadedEvaluation.another`, in texels.
+PART = 4
+
+#: Most pixels of these images on a level.
+CHOOSING = 2**14
 
 #: Seed of the views and lights; trainings use other generators.
 SEED = 20231212
@@ -161,13 +177,9 @@ def reference(pattern: str, pyramid: Pyramid, u, v, level, wi, wo, effects: Effe
     """Return the shaded value (:func:`.material.shaded`) of footprints around (u, v), ``Array3f``, without derivatives.
 
     ``level`` is the level of detail, a real number; each footprint is seen along ``wi`` and lit along ``wo``. ``rng``
-    jitters the samples (``"jittered"`` needs one; without, samples are the centres of strata); ``side`` replaces the
-    number of samples along a side.
+    jitters the samples (``"jittered"`` needs one; without, samples are the centres of strata). ``side``, a power of
+    two, replaces the number of samples along a side.
     """
-    if pattern not in SAMPLES_PER_SIDE:
-        raise ValueError(f'reference: found "{pattern}", allowed are {", ".join(SAMPLES_PER_SIDE)}')
-    if pattern == "jittered" and rng is None:
-        raise ValueError('reference: "jittered" needs random numbers')
     side, size = side or SAMPLES_PER_SIDE[pattern], dr.width(u)
     with dr.suspend_grad():
         if size * side * side <= CHUNK:
@@ -189,8 +201,6 @@ def _averaged(pattern, pyramid: Pyramid, u, v, level, wi, wo, effects: Effects, 
     lane = dr.arange(UInt32, size * samples)
     # Power of two: shifts and masks in place of divisions. Opaque, so that one kernel serves all numbers of samples
     shift = round(math.log2(side))
-    if side != 1 << shift:
-        raise ValueError(f"samples along a side: found {side}, allowed are powers of two")
     shift, mask, count, width = (dr.opaque(UInt32, n) for n in (shift, side - 1, samples - 1, side))
     place, sample, width = lane >> (2 * shift), lane & count, Float(width)
     x, y = Float(sample & mask), Float(sample >> shift)

@@ -10,7 +10,7 @@ from ...arrays.tables import Table
 from ...core.errors import UsageError
 from ...core.units import labelled
 from ...fitting.task import FitRequest, Fitted
-from ...maps.arguments import preview_path, requested_border, requested_bytes
+from ...maps.arguments import preview_path, requested_border, requested_bytes, size_figures
 from ...maps.pyramid import Pyramid
 from ...maps.source import load_source
 from ..texture import PRESETS as TEXTURES
@@ -22,26 +22,27 @@ from ..texture.nets import neutral_extras
 from . import PRESETS, ShadingRecipe, material, training
 from .evaluation import ShadedEvaluation
 
+#: Number of pairs of view and light of the images that measure. Many, since a few pairs near the mirror direction
+#: dominate the PSNR.
+PAIRS = 32
+
+#: Largest side of these images, in texels.
+SIDE = 32
+
+#: Share of the time in which the arrays are trained as a texture, if time is limited.
+PRETRAINING = 0.4
+
 
 def recipe_of(preset: str, settings, options) -> ShadingRecipe:
     """Return the recipe of a preset with the given options in place of its own."""
     recipe = PRESETS[preset]
-    given = {"share": options["share"], "reference": options["reference"], "level_bias": options["level_bias"]}
-    given = {k: v for k, v in given.items() if v is not None}
+    given = {name: options[name] for name in ("share", "reference", "level_bias") if options[name] is not None}
     if options["level_bias"] == "auto":
         given["level_bias"] = None
     if options["clip"] is not None:
         given["clip"] = None if options["clip"] == math.inf else options["clip"]
     extras = options["extras"] == "auto"
     return dataclasses.replace(recipe, settings=settings or recipe.settings, extras=extras, **given)
-
-
-#: Number of pairs of view and light, and size, of the images that measure. Many, since a few pairs near the mirror
-#: direction dominate the PSNR.
-PAIRS, SIDE = 32, 32
-
-#: Share of the time in which the arrays are trained as a texture, if time is limited.
-PRETRAINING = 0.4
 
 
 def check(request: FitRequest) -> None:
@@ -67,72 +68,59 @@ def fit(request: FitRequest) -> Fitted:
     options = request.options
     source = load_source(options["source"], nonfinite=options["nonfinite"])
     recipe = recipe_of(request.preset, request.settings, options)
-    texture = TEXTURES[recipe.texture]
-    pyramid = Pyramid.of(source, textures.layout_of(source, texture), request.types, requested_border(options))
-    effects, reasons = material.effects_of(pyramid.layout)
-    if not pyramid.layout.stored:
+    layout = textures.layout_of(source, TEXTURES[recipe.texture])
+    pyramid = Pyramid.of(source, layout, request.types, requested_border(options))
+    effects, reasons = material.effects_of(layout)
+    if not layout.stored:
         raise UsageError(f"{options['source']}: all of its maps are constant, there is nothing to learn")
-    start, result, size = None, None, None
-    if options["start"] is not None:
-        start = started(options["start"], source, request)
-    else:
-        size = size_of(source, pyramid, recipe, options)
+    start = None if options["start"] is None else load_start(options["start"], source, request)
+    size = size_of(source, pyramid, recipe, options) if start is None else None
     # Before any training, which gets a share of the time that is left
     evaluation = ShadedEvaluation(pyramid, effects, pairs=PAIRS, side=SIDE)
     evaluation.another()
+    first = result = None
     if start is None:
-        start, result = pretrained(source, pyramid, size, recipe, request)
-    first = result
-    if result is None or not result.interrupted:
+        start, first = pretrain(source, pyramid, size, recipe, request)
+    if first is not None and first.interrupted:
+        table, result = start, first
+    else:
         # Without a checkpoint, the training as a texture was interrupted
         resume = request.resume and os.path.exists(request.checkpoint or "")
-        shading_request = dataclasses.replace(request, resume=resume)
-        preview = preview_path(request)
         try:
             net = training.start_of(start, pyramid)
         except ValueError as e:
             raise UsageError(str(e)) from None
-        bias = bias_of(start.settings)
-        table, result = training.fit_shading(source, net, recipe, shading_request, pyramid, evaluation, preview, bias)
-    else:
-        table = start
-    table.settings |= request.paths(source_path=options["source"])
-    before, lines = table.settings.get("before", {}), []
-    if before:
-        lines.append(
-            "before the training for the shading: " + ", ".join(map(" ".join, map(str.split, labelled(before))))
-        )
-    if first is not None and first.unfinished and not first.interrupted:
-        lines.append(f"the training as a texture: {first.outcome}")
-    lines += [
-        f"{source.nbytes / table.nbytes:.2f}x",
-        *source.notes,
-        f"effects that are shaded: {', '.join(effects.names)}",
-    ]
-    if table.settings.get("level_bias"):
-        lines.append(f"read {-table.settings['level_bias']:g} levels finer than the footprint")
-    if table.settings.get("shading", {}).get("fixed") and not table.settings.get("kept_start"):
-        lines.append("fine levels keep the values of the texture: any training of theirs made some level worse")
-    if table.settings.get("kept_start"):
-        lines.append("training for the shading gained nothing: these are the arrays that it started from")
-    if reasons:
-        lines.append("left out: " + ", ".join(f"{effect} ({reason})" for effect, reason in reasons.items()))
-    not_shaded = material.left_out(pyramid.layout)
-    lines += [f"not shaded: {name} ({reason})" for name, reason in not_shaded.items()]
-    figures = {
+        table, result = training.fit_shading(
+            source, net, recipe, dataclasses.replace(request, resume=resume), pyramid, evaluation,
+            preview_path(request), bias_of(start.settings),
+        )  # fmt: skip
+    settings = table.settings
+    settings |= request.paths(source_path=options["source"])
+    before, not_shaded = settings.get("before", {}), material.left_out(layout)
+    figures, sizes = size_figures(source, table, None)
+    del figures["compression_asked"]
+    remarks = [
+        (before, "before the training for the shading: " + ", ".join(" ".join(x.split()) for x in labelled(before))),
+        (first and first.unfinished and not first.interrupted, f"the training as a texture: {first and first.outcome}"),
+        *((True, line) for line in (*sizes, *source.notes, f"effects that are shaded: {', '.join(effects.names)}")),
+        (settings.get("level_bias"), f"read {-settings.get('level_bias', 0):g} levels finer than the footprint"),
+        (settings.get("shading", {}).get("fixed") and not settings.get("kept_start"),
+         "fine levels keep the values of the texture: any training of theirs made some level worse"),
+        (settings.get("kept_start"),
+         "training for the shading gained nothing: these are the arrays that it started from"),
+        (reasons, "left out: " + ", ".join(f"{effect} ({reason})" for effect, reason in reasons.items())),
+        *((True, f"not shaded: {name} ({reason})") for name, reason in not_shaded.items()),
+    ]  # fmt: skip
+    figures |= {
         "before": before,
-        "source_bytes": source.nbytes,
-        "compression": source.nbytes / table.nbytes,
         "effects_in_use": list(effects.names),
         "effects_left_out": reasons,
         "maps_not_shaded": not_shaded,
-        "arrays": {name: list(a.shape) for name, a in table.arrays.items()},
-        "bits": {name: a.bits for name, a in table.arrays.items()},
     }
-    return Fitted(table, result, lines, figures)
+    return Fitted(table, result, [line for applies, line in remarks if applies], figures)
 
 
-def started(path, source, request: FitRequest) -> Table:
+def load_start(path, source, request: FitRequest) -> Table:
     """Return the texture to start from. Raises :class:`UsageError` for a texture of another source."""
     table = TEXTURE.load(path)
     if table.settings.get("source", source.digest) != source.digest:
@@ -141,7 +129,7 @@ def started(path, source, request: FitRequest) -> Table:
 
 
 def size_of(source, pyramid: Pyramid, recipe: ShadingRecipe, options):
-    """Return the memory budget of the arrays. Raises :class:`UsageError`."""
+    """Return the memory budget of the arrays, beside extras if the recipe has them. Raises :class:`UsageError`."""
     options = {argument.name: argument.default for argument in TEXTURE.arguments} | dict(options)
     nbytes = requested_bytes(options, source)
     nbytes = bytes_beside_extras(nbytes, pyramid) if recipe.extras else nbytes
@@ -157,13 +145,11 @@ def bytes_beside_extras(nbytes: float, pyramid: Pyramid) -> float:
     return nbytes - needed
 
 
-def pretrained(source, pyramid: Pyramid, size, recipe: ShadingRecipe, request: FitRequest) -> tuple:
+def pretrain(source, pyramid: Pyramid, size, recipe: ShadingRecipe, request: FitRequest) -> tuple:
     """Train as a texture alone, with a separate checkpoint; return the table and the run's record."""
     texture = TEXTURES[recipe.texture]
-    settings = dataclasses.replace(
-        texture.settings, seed=recipe.settings.seed, deterministic=recipe.settings.deterministic
-    )
-    texture = dataclasses.replace(texture, settings=settings)
+    seeded = {"seed": recipe.settings.seed, "deterministic": recipe.settings.deterministic}
+    texture = dataclasses.replace(texture, settings=dataclasses.replace(texture.settings, **seeded))
     checkpoint = None if request.checkpoint is None else f"{request.checkpoint}.texture"
     first = dataclasses.replace(
         request.part(PRETRAINING), preset=recipe.texture, checkpoint=checkpoint,

@@ -22,6 +22,7 @@ from ...arrays.tables import Table
 from ...core.progress import duration
 from ...fitting.loop import FitResult, checkpoint_settings, sample_losses
 from ...fitting.task import FitRequest
+from ...maps.model import significant
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source
 from ..disney.training import random_directions
@@ -33,11 +34,15 @@ from . import ShadingRecipe
 from .evaluation import TRUTHS, ShadedEvaluation, reader, reference, write_preview
 from .material import effects_of, frozen_decoder, shaded, surface_of
 
-#: Factor of the number of shaded samples from one level to the next coarser one, and the last level that it counts for.
-FALL, TOP = 0.7, 9
+#: Factor of the number of shaded samples from one level to the next coarser one, up to level :data:`TOP`.
+FALL = 0.7
+TOP = 9
 
-#: Level biases that are tried, and the share of the steps, or of the time that is left, that each of them is trained.
-BIASES, TRIAL = (0.0, -0.5, -1.0), 0.08
+#: Level biases that are tried.
+BIASES = (0.0, -0.5, -1.0)
+
+#: Share of the steps, or of the time that is left, for which each of them is trained.
+TRIAL = 0.08
 
 #: Level biases that are tried with the finest arrays as they are, if each of :data:`BIASES` loses at some level.
 FIXED_BIASES = (0.0, -0.25, -0.5)
@@ -225,16 +230,15 @@ def fit_shading(
         result = dataclasses.replace(result, step=0, measured={"gain_db": 0.0})
     else:
         texture = CompressedTexture(pyramid.layout, textures.stored_form(problem.net), problem.level_bias)
-    identity = {k: v for k, v in problem.identity.items() if k not in ("structure", "border")}
-    settings = {**request.recorded(result), **identity, "level_bias": texture.level_bias}
+    settings = {**request.recorded(result), **problem.identity, "level_bias": texture.level_bias}
     settings |= {"kept_start": True} if kept else {}
     table = to_table(texture, settings)
     table.preset, table.seed = request.preset, recipe.settings.seed
     errors = CompressedTexture.of(table, request.types.TensorXf).measure(source)
     if evaluation is not None:
-        table.settings["before"] = {name: float(f"{value:.5g}") for name, value in before.items()}
+        table.settings["before"] = significant(before)
         errors = {**(before if kept else shaded_errors(texture)), **errors}
-    table.measured = {k: float(f"{v:.5g}") for k, v in errors.items()}
+    table.measured = significant(errors)
     return table, result
 
 

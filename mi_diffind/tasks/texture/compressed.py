@@ -147,7 +147,8 @@ def to_table(texture: CompressedTexture, settings: dict) -> Table:
     stored = {}
     for name, array in texture.arrays.items():
         stored |= stored_arrays(name, array)
-    settings = {**settings, "layout": texture.layout.to_json()}
+    settings = {k: v for k, v in settings.items() if k not in ("structure", "border")}  # in "arrays" below
+    settings["layout"] = texture.layout.to_json()
     if texture.level_bias:
         settings["level_bias"] = texture.level_bias
     if texture.net is not None:
@@ -204,52 +205,49 @@ def structure_of(settings: dict, layout: Layout):
 
 def load(path: str | os.PathLike) -> Table:
     """Read and check a table file of this task. Raises :class:`.TableError`."""
-    table = load_table(path, "texture")
-    structure = border = None
+    table, expected = load_table(path, "texture"), ()
     try:
         layout = Layout.from_json(table.settings["layout"])
         bias_of(table.settings)
-        if layout.stored:
-            structure, border = structure_of(table.settings, layout)
+        structure, border = structure_of(table.settings, layout) if layout.stored else (None, None)
     except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as e:
         raise TableError(f"{path}: its settings describe no texture ({e})") from None
-    layers = {f"level{x.level}": x for x in structure.layers} if isinstance(structure, LayeredStructure) else {}
-    pages = [name + PAGES for name, x in layers.items() if x.paged]
-    extras = ["extras"] if "extras" in table.arrays else []
-    expected = PAPER if isinstance(structure, PaperStructure) else [*layers, *pages, "coarse", "cascaded", *extras]
-    if set(table.arrays) != set(expected if structure else ()):
-        names, wanted = (", ".join(sorted(n)) or "none" for n in (table.arrays, expected if structure else ()))
-        raise TableError(f"{path}: holds the arrays {names}, expected {wanted}")
-    if structure is None:
-        return table
+    layers = {f"level{x.level}": x for x in getattr(structure, "layers", ())}
     if isinstance(structure, PaperStructure):
-        wanted = {"primary0": (None, None, 3), "primary1": (None, 1), "cascaded": (None,) * 4 + (layout.stored,)}
-    else:
-        wanted = _layered_shapes(table, layout, structure, layers)
-    for name, shape in wanted.items():
+        expected = PAPER
+    elif structure is not None:
+        pages = [name + PAGES for name, x in layers.items() if x.paged]
+        extras = ["extras"] if "extras" in table.arrays else []
+        expected = (*layers, *pages, "coarse", "cascaded", *extras)
+    if set(table.arrays) != set(expected):
+        names, wanted = (", ".join(sorted(n)) or "none" for n in (table.arrays, expected))
+        raise TableError(f"{path}: holds the arrays {names}, expected {wanted}")
+    for name, shape in _shapes(table, layout, structure, layers).items():
         array = table.arrays[name]
-        actual = array.shape
-        if len(actual) != len(shape) or any(w not in (None, n) for n, w in zip(actual, shape, strict=True)):
+        if len(array.shape) != len(shape) or any(w not in (None, n) for n, w in zip(array.shape, shape, strict=True)):
             text = " x ".join("N" if n is None else str(n) for n in shape)
-            raise TableError(f'{path}: array "{name}" has the shape {actual}, expected {text}')
+            raise TableError(f'{path}: array "{name}" has the shape {array.shape}, expected {text}')
         if not array.is_pointer:
             raise TableError(f'{path}: array "{name}" has entries outside of [0, 1]')
-        if name == "extras" and array.border != ("clamp", *border):
-            raise TableError(f'{path}: array "{name}" has the borders {array.border}, expected {("clamp", *border)}')
-        if name not in layers:
-            continue
-        spread = table.arrays[name + PAGES] if layers[name].paged else array
-        if spread.border != border:
-            raise TableError(f'{path}: array "{name}" has the borders {spread.border}, expected {border}')
-        if array.storage == "uint8" and array.bits != layers[name].bits:
+        layer = layers.get(name)
+        if layer or name == "extras":
+            along = table.arrays[name + PAGES].border if layer and layer.paged else array.border
+            wanted = border if layer else ("clamp", *border)
+            if along != wanted:
+                raise TableError(f'{path}: array "{name}" has the borders {along}, expected {wanted}')
+        if layer and array.storage == "uint8" and array.bits != layer.bits:
             raise TableError(
-                f'{path}: array "{name}" has {array.bits} bits an entry, expected {layers[name].bits} by its settings'
+                f'{path}: array "{name}" has {array.bits} bits an entry, expected {layer.bits} by its settings'
             )
     return table
 
 
-def _layered_shapes(table: Table, layout: Layout, structure: LayeredStructure, layers: dict[str, FineLayer]) -> dict:
-    """Return the shapes of our arrays by name; ``None`` stands for any number. Raises :class:`TableError`."""
+def _shapes(table: Table, layout: Layout, structure, layers: dict[str, FineLayer]) -> dict[str, tuple]:
+    """Return the shapes of arrays by name; ``None`` stands for any number. Raises :class:`TableError`."""
+    if structure is None:
+        return {}
+    if isinstance(structure, PaperStructure):
+        return {"primary0": (None, None, 3), "primary1": (None, 1), "cascaded": (*(None,) * 4, layout.stored)}
     dims, axes = table.arrays["coarse"].shape[-1], len(table.arrays["cascaded"].shape) - 1
     shapes = {}
     for name, layer in layers.items():
@@ -259,9 +257,7 @@ def _layered_shapes(table: Table, layout: Layout, structure: LayeredStructure, l
         shapes[name] = (*((stored_entries(table, name, size),) if layer.paged else size), layer.channels)
     shapes["coarse"] = (sum(map(math.prod, structure.sizes[structure.skip :])), dims)
     shapes["cascaded"] = (structure.skip + 1,) * (axes > dims) + (None,) * dims + (layout.stored,)
-    if "extras" in table.arrays:
-        shapes["extras"] = (None, None, None, len(NEUTRAL))
-    return shapes
+    return shapes | ({"extras": (None, None, None, len(NEUTRAL))} if "extras" in table.arrays else {})
 
 
 class TextureModel(MapsModel):

@@ -10,6 +10,7 @@ from ...fitting.task import FitRequest, Fitted
 from ...maps import as_seen
 from ...maps.arguments import requested_border, requested_bytes, size_figures
 from ...maps.layout import smoothness
+from ...maps.model import significant
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source, load_source
 from . import PRESETS, TextureRecipe, arrays, parse_structure, training
@@ -61,7 +62,7 @@ def fit(request: FitRequest) -> Fitted:
         request.deadline.rehearse(lambda: as_seen.reference(source, request.types))
     table, result = training.fit_texture(source, size, recipe, request, pyramid, options["level_bias"])
     seen = as_seen.measure(source, CompressedTexture.of(table, request.types.TensorXf))
-    table.measured |= {name: float(f"{value:.5g}") for name, value in seen.items()}
+    table.measured |= significant(seen)
     table.settings |= request.paths(source_path=options["source"])
     figures, lines = size_figures(source, table, requested)
     return Fitted(table, result, [*lines, *source.notes], figures)

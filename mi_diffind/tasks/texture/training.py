@@ -19,6 +19,7 @@ from ...fitting.loop import FitResult, Problem
 from ...fitting.task import FitRequest
 from ...maps.compressed import decibel
 from ...maps.layout import Layout
+from ...maps.model import fit_maps
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source
 from . import TextureRecipe, arrays
@@ -186,24 +187,12 @@ def fit_texture(
     levels are trained as they are stored. Errors are those of :meth:`.CompressedTexture.measure`.
     """
     request = dataclasses.replace(request, settings=recipe.settings)
-    if size is None:
-        table = to_table(CompressedTexture(pyramid.layout, None), {"source": source.digest})
-        result = FitResult({}, 0, 0, 0.0, False, 0)
-    else:
-        problem = problem_of(source, size, recipe, pyramid)
-        identity = {k: v for k, v in problem.identity.items() if k not in ("structure", "border")}
+    problem = None if size is None else problem_of(source, size, recipe, pyramid)
 
-        def finish() -> None:
-            stored = to_table(CompressedTexture(pyramid.layout, stored_form(problem.net), level_bias), identity)
-            CompressedTexture.of(stored, request.types.TensorXf).measure(source)
+    def stored() -> CompressedTexture:
+        return CompressedTexture(pyramid.layout, problem and stored_form(problem.net), (problem and level_bias) or 0.0)
 
-        result = request.train(problem, finish=finish)
-        settings = {**request.recorded(result), **identity}
-        table = to_table(CompressedTexture(pyramid.layout, stored_form(problem.net), level_bias), settings)
-    table.preset, table.seed = request.preset, recipe.settings.seed
-    errors = CompressedTexture.of(table, request.types.TensorXf).measure(source)
-    table.measured = {k: float(f"{v:.5g}") for k, v in errors.items()}
-    return table, result
+    return fit_maps(request, source, problem, stored, to_table, CompressedTexture.of)
 
 
 def stored_form(net):

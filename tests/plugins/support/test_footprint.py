@@ -253,7 +253,7 @@ def test_axes_are_those_of_the_singular_values(mi_rgb, rng):
     np.testing.assert_allclose(np.array(footprint.area(ddx, ddy)), np.abs(np.linalg.det(matrix)), rtol=1e-3, atol=1e-6)
 
     rows = [[2.0, 1.0, 7.0], [-0.5, 3.0, 8.0], [0.0, 0.0, 1.0]]
-    found = footprint.transformed(ddx, ddy, rows)
+    found = footprint.transform(ddx, ddy, rows)
     expected = np.array(rows)[:2, :2] @ matrix
     for i in (0, 1):
         np.testing.assert_allclose(np.array(found[i]).T, expected[:, :, i], rtol=1e-4, atol=1e-4)
@@ -261,7 +261,7 @@ def test_axes_are_those_of_the_singular_values(mi_rgb, rng):
     # One blurred by another: covariances add
     other = np.roll(matrix, 7, axis=0)
     s, t = (mi.Vector2f(np.ascontiguousarray(other[:, :, i].T)) for i in (0, 1))
-    both = np.stack([np.array(v).T for v in footprint.joined(ddx, ddy, s, t)], axis=-1).astype(np.float64)
+    both = np.stack([np.array(v).T for v in footprint.add_moments(ddx, ddy, s, t)], axis=-1).astype(np.float64)
     sums = sum(m @ m.transpose(0, 2, 1) for m in (matrix.astype(np.float64), other.astype(np.float64)))
     scale = np.trace(sums, axis1=1, axis2=2)[:, None, None] + 1e-30
     np.testing.assert_allclose(both @ both.transpose(0, 2, 1) / scale, sums / scale, atol=1e-4)
@@ -277,7 +277,7 @@ def test_parameters_say_the_same_as_the_sensor(mi_rgb):
         a, b = np.array(getattr(found, name)), np.array(getattr(expected, name))
         np.testing.assert_allclose(a, b, atol=2e-5, err_msg=name)
     assert found.projection == expected.projection == "perspective"
-    assert [footprint.scale_of(n) for n in (0, 1, 4, 64, 4096)] == [1, 1, 0.5, 0.125, 0.125]
+    assert [footprint.sample_scale(n) for n in (0, 1, 4, 64, 4096)] == [1, 1, 0.5, 0.125, 0.125]
 
     assert Cone.from_properties(mi.Properties()) is None
     scaled = mi.ScalarTransform4f().scale(2)

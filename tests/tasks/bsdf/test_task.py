@@ -16,7 +16,7 @@ from mi_diffind.core.runtime import array_module
 from mi_diffind.tasks.bsdf import TASK, energy, measured, mixture, training
 from mi_diffind.tasks.bsdf import directions as pool
 from mi_diffind.tasks.bsdf.files import BSDFModel, allocate
-from mi_diffind.tasks.bsdf.measured import Truth, TurnedTruth
+from mi_diffind.tasks.bsdf.measured import Truth, rotate_truth
 from mi_diffind.tasks.bsdf.model import TERMS, Form, sizes_within
 from mi_diffind.tasks.bsdf.truth import MERLTruth, truth_of
 
@@ -136,7 +136,7 @@ def test_symmetries_are_measured(types, changes, broken):
 @pytest.mark.parametrize("degrees", [0, 0.3, 20, -40, 80])
 def test_axes_are_measured(types, degrees):
     """The axes of an anisotropic source, up to a quarter turn; small angles count as none."""
-    truth = TurnedTruth(FormulaTruth(anisotropy=8), math.radians(degrees))
+    truth = rotate_truth(FormulaTruth(anisotropy=8), math.radians(degrees))
     samples = training.draw(truth, types, 2**16, 1, False)
     expected = (degrees + 45) % 90 - 45 if abs(degrees) > 0.5 else 0
     assert math.degrees(measured.axes_angle(samples, truth)) == pytest.approx(expected, abs=0.5 if expected else 0)

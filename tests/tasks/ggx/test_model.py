@@ -442,20 +442,6 @@ def test_a_wrong_file_is_refused(tmp_path, shipped, what):
         assert str(caught.value).startswith(f"{path}: ") and "\n" not in str(caught.value)
 
 
-def test_a_wrong_request_is_refused(tmp_path, shipped):
-    dtype = array_module("llvm").TensorXf
-    save_table(tmp_path / "own.npz", shipped["paper"][0])
-    with pytest.raises(TableError, match=r'own\.npz: holds tables of the preset "paper", "tables" was asked for'):
-        TASK.open(dtype, tmp_path / "own.npz", "tables")
-    assert TASK.open(dtype, tmp_path / "own.npz").table.preset == "paper"
-    with pytest.raises(TableError, match=r"nowhere\.npz: no such file"):
-        TASK.open(dtype, tmp_path / "nowhere.npz")
-    with pytest.raises(ValueError, match='parameter "preset": found "best", allowed are tables, paper'):
-        TASK.open(dtype, "", "best")
-    with pytest.raises(ValueError, match='parameter "storage": found "float8", allowed are float32, float16, uint8'):
-        TASK.open(dtype, storage="float8")
-
-
 def test_a_file_that_was_replaced_is_read_again(tmp_path, shipped, ad):
     """Also within the resolution of its time, if its size is another."""
     path = tmp_path / "own.npz"

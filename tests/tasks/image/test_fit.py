@@ -266,14 +266,14 @@ def decibels(weights):
 def test_weights_follow_sensitivities():
     """Between the least weights, squares of weights are proportional; decibels of all channels sum to 0."""
     channels = {"albedo": 3, "normal": 2, "ao": 1}
-    result = decibels(fit.balanced({"albedo": 0.11, "normal": 0.1, "ao": 0.0}, channels))
+    result = decibels(fit.balance_weights({"albedo": 0.11, "normal": 0.1, "ao": 0.0}, channels))
     assert result["albedo"] - result["normal"] == pytest.approx(10 * np.log10(1.1), abs=0.1)
     assert result["ao"] == pytest.approx(fit.OTHER_DB, abs=0.05)
     assert sum(channels[name] * db for name, db in result.items()) == pytest.approx(0, abs=0.2)
-    result = decibels(fit.balanced({"albedo": 1e-4, "normal": 1.0, "ao": 0.0}, channels))
+    result = decibels(fit.balance_weights({"albedo": 1e-4, "normal": 1.0, "ao": 0.0}, channels))
     assert result["albedo"] == pytest.approx(fit.SHOWN_DB, abs=0.05)
     assert result["normal"] == pytest.approx(-(3 * fit.SHOWN_DB + fit.OTHER_DB) / 2, abs=0.1)
-    assert fit.balanced({"albedo": 0.0, "ao": 0.0}, channels) == {}
+    assert fit.balance_weights({"albedo": 0.0, "ao": 0.0}, channels) == {}
 
 
 def test_texts_of_weights():
@@ -316,7 +316,7 @@ def test_weights_as_seen(monkeypatch):
     tilted = np.dstack([0.5 + 0.3 * np.sin(x), 0.5 + 0 * x, 0.5 + 0 * x])
     maps = {"normal": np.uint8(255 * tilted), "ao": np.uint8(127 + 80 * np.sin(y))}
     given = {"steps": 1, "batch": 64, "progress": False, "structure": "8 bits", "dims": 1, "compression": 4}
-    expected = fit.balanced({"normal": 0.2, "ao": 0.0}, {"normal": 3, "ao": 1})
+    expected = fit.balance_weights({"normal": 0.2, "ao": 0.0}, {"normal": 3, "ao": 1})
     monkeypatch.setattr(fit, "GAIN_DB", 0.01)
     fitted = md.fit("image", maps, weights="auto", **given)
     assert fitted.table.settings["weights"] == pytest.approx(expected, abs=0.5)

@@ -141,34 +141,6 @@ def test_components_reproduce_a_smooth_image(ad, channels, border):
     assert psnr(stored, values) > 28
 
 
-def test_components_of_more_channels_than_dimensions(ad):
-    """Seven channels that are mixtures of two need two dimensions; of seven independent ones, two explain a part."""
-    rng = np.random.default_rng(0)
-    two = waves(32, 32, 2) - 0.5
-    mixed = (0.5 + 0.5 * two @ rng.uniform(-0.9, 0.9, (2, 7))).astype(np.float32)
-    size = ImageBudget(24, 24, 9, 7, 2, 6)
-    found = arrays.from_components(mixed, size, ("repeat",) * 2).alloc(ad.TensorXf)
-    assert psnr(numpy_of(found(texel_centres(ad, 32, 32))).reshape(mixed.shape), mixed) > 30
-    seven = rng.random((32, 32, 7)).astype(np.float32)
-    seven[..., 3:5] = 0.5 + 0.1 * (seven[..., 3:5] - 0.5)
-    found = arrays.from_components(seven, ImageBudget(32, 32, 9, 7, 2, 6), ("repeat",) * 2).alloc(ad.TensorXf)
-    colors = found.cascaded.numpy()[1:-1, 1:-1]  # a plane in the seven: the largest is hardly clipped
-    flat = colors.reshape(-1, 7) - colors.mean(axis=(0, 1))
-    assert np.linalg.svd(flat, compute_uv=False)[2] < 0.3 * np.linalg.svd(flat, compute_uv=False)[1]
-    assert np.ptp(flat[:, 3:5], axis=0).max() < 0.2 < np.ptp(flat, axis=0).max()  # not along what varies little
-
-
-def test_components_leave_other_dimensions_a_ramp(ad):
-    net = arrays.from_components(waves(16, 16, 1), ImageBudget(5, 9, 4, 1, 3, 8), ("clamp", "repeat")).alloc(
-        ad.TensorXf
-    )
-    entries = net.primary[0].numpy()
-    np.testing.assert_allclose(entries[..., 1], np.repeat(np.linspace(0, 1, 5)[:, None], 9, 1), atol=1e-6)
-    np.testing.assert_allclose(entries[..., 2], np.repeat(np.arange(9)[None] / 9, 5, 0), atol=1e-6)
-    colors = net.cascaded.numpy()  # they do not change what is read
-    assert np.ptp(colors, axis=(1, 2)).max() == 0 and np.ptp(colors) > 0.1
-
-
 @pytest.mark.parametrize("channels", [1, 2, 3, 4, 7])
 def test_components_in_two_arrays(ad, channels):
     """The first of two primaries is the finer one; together they reproduce what one does."""
@@ -349,7 +321,7 @@ def random_net(ad, dims=3, primaries=1, channels=3, low=-1.5, high=2.5):
         p = rng.uniform(low, high, (15 - 4 * k, 6, d)).astype(np.float32)
         made.append(DifferentiableArray(p.shape[:2], d, p, fold=True, border=("clamp", "repeat")))
     c = rng.uniform(low, high, (4,) * dims + (channels,)).astype(np.float32)
-    return arrays.joined(made, DifferentiableArray((4,) * dims, channels, c, fold=True)).alloc(ad.TensorXf)
+    return arrays.join_primaries(made, DifferentiableArray((4,) * dims, channels, c, fold=True)).alloc(ad.TensorXf)
 
 
 def random_places(ad, count=300):
@@ -430,21 +402,6 @@ def test_training_with_rounding_makes_up_for_it(ad):
 # -- whole trainings --------------------------------------------------------------------------------------------------
 
 
-def file_bytes(table, path):
-    save_table(path, table)
-    return path.read_bytes()
-
-
-def test_the_same_seed_gives_the_same_file(tmp_path):
-    source, size = from_arrays({"image": waves(9, 11)}), ImageBudget(6, 7, 4, 3, 3, 5)
-    recipe = short(steps=6, dims=3, batch=40)
-    made = [trained(source, size, replaced(recipe, seed=seed))[0] for seed in (3, 3, 4)]
-    first, again, other = (file_bytes(table, tmp_path / "t.npz") for table in made)
-    assert first == again != other
-    assert made[0].seed == 3 and [a.bits for a in made[0].arrays.values()] == [5, 8] and made[0].task == "image"
-    assert made[0].settings["source"] == source.digest
-
-
 def test_reported_qualities_are_those_of_the_decoded_image(ad):
     rng = np.random.default_rng(0)
     albedo = np.rint(255 * waves(15, 13)).astype(np.uint8)
@@ -508,27 +465,6 @@ def test_every_structure_makes_a_file(ad, tmp_path, structure):
     assert layout == training.layout_of(source, recipe)
 
 
-def test_decoding_reads_texel_centres(ad, monkeypatch):
-    """In pieces or at once, at its own size or another one, some maps or all."""
-
-    source = from_arrays({"albedo": waves(9, 11), "height": waves(9, 11, 1) * 0.9})
-    recipe = short(steps=2, dims=3)
-    table, _ = trained(source, ImageBudget(6, 6, 4, 4, 3, 6), recipe)
-    image = CompressedImage.of(table, ad.TensorXf)
-    whole = image.decode()
-    v, u = texel_centres(ad, 9, 11)
-    read = image.read(u, v)
-    for name, channels in read.items():
-        np.testing.assert_allclose(whole[name], numpy_of(channels).reshape(9, 11, -1), atol=1e-6)
-        assert whole[name].dtype == np.float32
-    monkeypatch.setattr("mi_diffind.maps.compressed.CHUNK", 17)
-    for name, values in image.decode().items():
-        np.testing.assert_array_equal(values, whole[name])
-    larger = image.decode(["height"], width=33, height=27)
-    assert list(larger) == ["height"] and larger["height"].shape == (27, 33, 1)
-    np.testing.assert_allclose(larger["height"][1::3, 1::3], whole["height"], atol=1e-5)  # the same centres
-
-
 def test_training_improves(ad):
     source = from_arrays({"image": np.rint(255 * waves(24, 24, periods=3)).astype(np.uint8)})
     size = ImageBudget(16, 16, 4, 3, 3, 6)
@@ -572,48 +508,6 @@ def test_without_everything_it_is_the_paper():
         assert getattr(recipe.settings, name) == getattr(paper.settings, name), name
     samples = OURS.settings.steps * OURS.settings.batch
     assert recipe.settings.steps * recipe.settings.batch == pytest.approx(samples, rel=0.01)
-
-
-def test_high_dynamic_range(ad):
-    """Five decades: errors are relative ones, and no value lies beyond the image's."""
-    values = (10 ** (5 * waves() - 1)).astype(np.float32)
-    source = from_arrays({"image": values})
-    recipe = short(steps=60, batch=576, dims=3, lr=1e-2)
-    table, _ = trained(source, ImageBudget(24, 24, 6, 3, 3, 6), recipe)
-    found = CompressedImage.of(table, ad.TensorXf).decode()["image"]
-    assert np.isfinite(found).all() and found.min() >= 0 and found.max() <= values.max() * 1.0001
-    assert table.measured["psnr_db"] > 35
-    bright = values > np.median(values)
-    assert np.median(np.abs(found / values - 1)[bright]) < 0.15
-
-
-def test_one_colour_needs_no_arrays(ad):
-    source = from_arrays({"image": np.full((5, 4, 3), (10, 20, 30), np.uint8)})
-    table, result = trained(source, None, OURS)
-    assert table.arrays == {} and table.nbytes == 0 and result.steps == 0 and not result.interrupted
-    decoded = CompressedImage.of(table, ad.TensorXf).decode(width=3, height=2)["image"]
-    np.testing.assert_array_equal(decoded, np.broadcast_to(source.maps[0].values[0, 0], (2, 3, 3)))
-    assert set(table.measured.values()) == {120.0}
-
-
-def test_no_seam(ad):
-    """What repeats reads the same at both ends, exactly there and beyond, in each storage form."""
-    source = from_arrays({"image": np.rint(255 * waves(16, 12)).astype(np.uint8)})
-    table, _ = trained(source, ImageBudget(8, 7, 4, 3, 3, 5), short(dims=3))
-    assert table.arrays["primary"].border == ("repeat", "repeat")
-    t = np.linspace(0, 1, 50, dtype=np.float32)
-    for storage in ("uint8", "float32"):
-        image = CompressedImage.of(table, ad.TensorXf, storage)
-        read = lambda u, v, image=image: numpy_of(image.read(ad.Float(aligned(u)), ad.Float(aligned(v)))["image"])  # noqa: E731
-        for k in (1, -3, 17):
-            np.testing.assert_allclose(read(0 * t, t), read(0 * t + k, t), atol=1e-6)
-            np.testing.assert_allclose(read(t, 0 * t), read(t, 0 * t + k), atol=1e-6)
-        before, after = read(0 * t + np.float32(1 - 1e-6), t), read(0 * t + np.float32(1e-6), t)
-        np.testing.assert_allclose(before, after, atol=1e-3)
-        assert np.ptp(read(0 * t, t), axis=0).max() > 0.1
-        odd = np.float32([0, 1, -0.0, np.nan, np.inf, -np.inf, 1e30, -1e30])
-        for u in odd:
-            assert np.isfinite(read(np.full(8, u, np.float32), odd)).all()
 
 
 # -- hard cases -------------------------------------------------------------------------------------------------------

@@ -130,7 +130,7 @@ ENDLESS = """
 import drjit as dr, mitsuba as mi, numpy as np
 mi.set_variant("VARIANT")
 from mi_diffind.core.compat import module_of
-from mi_diffind.tasks.sdf import model, tracing
+from mi_diffind.tasks.sdf import marching, model
 from sdf_fields import Ball, sparse_table
 types = module_of(mi.Float)
 table = sparse_table()
@@ -140,9 +140,9 @@ d = np.array([[0, 0, 0], [-0.0, 0, 0], [0, 0, 1e-30], [0, 1e-42, 0], [0, 0, 1e-7
               [nan, 0, 0], [0, nan, 1], [inf, 0, 0], [0, -inf, 0], [inf, inf, inf], [3e38, 3e38, 0]], np.float32)
 o = np.array([[0, 0, 0], [0.3, 0.2, 0.1], [0.01, 0.49, 0]], np.float32)
 o, d = np.repeat(o, len(d), axis=0), np.tile(d, (len(o), 1))
-for field in (Ball(types), model.field_of(table, arrays, types)):
+for field in (Ball(types), model.build_field(table, arrays, types)):
     ray = *(types.Array3f(*(types.Float(x.copy()) for x in v.T)) for v in (o, d)), types.Float(inf)
-    assert not tracing.trace(field, *ray)[1].numpy().any() and not tracing.occluded(field, *ray).numpy().any()
+    assert not marching.trace(field, *ray)[1].numpy().any() and not marching.occluded(field, *ray).numpy().any()
 print("ended")
 """
 
@@ -223,14 +223,14 @@ def table_of(shape, entries):
 @pytest.fixture(params=[(torus, 16), (torus, 256), (shell, 256)], ids=lambda v: f"{v[0].__name__}-{v[1]}")
 def coded(types, request):
     """The sparse field of a torus, well coded or badly, and of a thin wall."""
-    return model.field_of(table_of(*request.param), {}, types)
+    return model.build_field(table_of(*request.param), {}, types)
 
 
 def test_signs_beyond_slabs(coded, rng):
     """Above a block's slab everything is outside, below it inside; and slabs are thin where blocks are well coded."""
-    structure, marcher = coded.structure, marching.marcher_of(coded)
+    structure, marcher = coded.structure, marching.get_marcher(coded)
     words = np.array(marcher.slabs)[1::2]
-    full = marching.GridCells(structure).crossed.any(axis=1)
+    full = marching.GridCells(coded).crossed.any(axis=1)
     low, high = (v * (2 * marching.SLAB / marching.STEPS) - marching.SLAB for v in (words & 0xFFFF, words >> 16))
     axes, middles, _ = nodes.unpack_frames(coded.frames())
     normals = np.stack(axes, axis=1)
@@ -246,7 +246,7 @@ def test_signs_beyond_slabs(coded, rng):
 
 def test_slabs_keep_the_signs_of_other_cells(coded, rng):
     """Cells that are not crossed have the sign that they are said to have, whatever the block's plane says."""
-    cells = marching.GridCells(coded.structure)
+    cells = marching.GridCells(coded)
     crossed, inside = cells.crossed, cells.inside
     cell = np.argmax(~crossed, axis=1)
     block = np.flatnonzero(crossed.any(axis=1) & ~crossed.all(axis=1))
@@ -269,7 +269,7 @@ def test_slabs_change_no_hit(types, coded, rng):
     o = rng.uniform(-0.45, 0.45, (3 * COUNT, 3))
     o[:COUNT] -= 2 * d[:COUNT]
     t, is_hit, _, leaving = trace(coded, o, d)
-    marching.marcher_of(coded).slabs = None
+    marching.get_marcher(coded).slabs = None
     slow, met, _, left = trace(coded, o, d)
     assert 0.3 < is_hit.mean() < 0.95 and 0.05 < leaving.mean() < 0.5
     # Looked at in other places, a ray that grazes may be seen to touch, or start, elsewhere
@@ -280,10 +280,10 @@ def test_slabs_change_no_hit(types, coded, rng):
 
 def test_rays_along_the_plane_of_a_block(coded, rng):
     """They enter its slab, if ever, at a distance of which there is a cell."""
-    types, marcher, structure = coded.types, marching.marcher_of(coded), coded.structure
+    types, marcher, structure = coded.types, marching.get_marcher(coded), coded.structure
     axes, middles, _ = nodes.unpack_frames(coded.frames())
     normals = np.stack(axes, axis=1)
-    block = rng.choice(np.flatnonzero(marching.GridCells(structure).crossed.any(axis=1)), COUNT)
+    block = rng.choice(np.flatnonzero(marching.GridCells(coded).crossed.any(axis=1)), COUNT)
     aside = unit(np.cross(normals[block], rng.normal(size=(COUNT, 3))))
     middle = structure.block_positions()[block] + MIDDLE
     height = rng.uniform(-4, 4, COUNT) - middles[block]

@@ -77,17 +77,6 @@ def test_clip_changes_derivatives_only(ad):
     assert np.allclose(dr.grad(y).numpy(), 5 * dr.detach(x).numpy())
 
 
-def test_clip_of_vectors_and_forward(ad):
-    v = ad.Array3f([1.0, 2.0], [0.0, 0.0], [3.0, -3.0])
-    dr.enable_grad(v)
-    out = material.clipped(v, 0.25)
-    dr.set_grad(v, ad.Array3f(1.0, -0.1, -9.0))
-    dr.enqueue(dr.ADMode.Forward, v)
-    dr.traverse(dr.ADMode.Forward)
-    assert np.allclose(numpy_of(dr.grad(out))[0], [0.25, -0.1, -0.25])
-    assert material.clipped(2.5, 0.1) == 2.5 and material.clipped(dr.detach(v), 0.1) is not None
-
-
 def test_clip_is_for_the_specular_lobe(ad, rng):
     """With a bound, values stay, the diffuse lobe's derivatives too; those of a highlight are bounded."""
     wi, wo = directions(ad, rng, 512)
@@ -477,34 +466,6 @@ def test_share_zero_is_the_texture_alone(start, ad):
         assert np.array_equal(found.arrays[name].entries, array.codes()), name
 
 
-def test_training_can_be_resumed(start, ad, tmp_path):
-    whole, _ = trained(start, ad, quick(steps=8, measure_every=4, level_bias=-0.5))
-
-    class Stop(Exception):
-        pass
-
-    checkpoint, problem_measure, calls = tmp_path / "state", training.ShadingProblem.measure, []
-
-    def measure(self, net):
-        calls.append(1)
-        if len(calls) == 2:
-            raise Stop
-        return problem_measure(self, net)
-
-    training.ShadingProblem.measure = measure
-    try:
-        with pytest.raises(Stop):
-            trained(start, ad, quick(steps=8, measure_every=4, level_bias=-0.5), checkpoint=checkpoint)
-    finally:
-        training.ShadingProblem.measure = problem_measure
-    # The level bias is that of the checkpoint, without a choice
-    chosen = quick(steps=8, measure_every=4, level_bias=None)
-    again, result = trained(start, ad, chosen, checkpoint=checkpoint, resume=True)
-    assert result.steps == 8 and again.settings["level_bias"] == -0.5 and "level_biases" not in again.settings
-    for name, array in whole.arrays.items():
-        assert np.array_equal(array.entries, again.arrays[name].entries)
-
-
 def test_gradient_of_the_loss_is_that_of_finite_differences(start, ad):
     """Of the cascaded array's entries, without rounding and without bounds."""
     source, pyramid, table, *_ = start
@@ -603,14 +564,6 @@ def test_bad_arguments_are_one_sentence(manifest, tmp_path, capsys, changed, mes
     assert message in capsys.readouterr().err
 
 
-def test_scenes_and_materials_have_tasks_of_their_own(tmp_path, capsys):
-    output = ["-o", str(tmp_path / "x.npz")]
-    assert main(["fit", "shading", "room.xml", *output]) == 2
-    assert "found the scene room.xml; fit scene trains a texture inside a scene" in capsys.readouterr().err
-    assert main(["fit", "scene", "material.json", *output]) == 2
-    assert "found material.json, a scene file (.xml) is needed" in capsys.readouterr().err
-
-
 def test_sources_that_cannot_be_shaded_are_refused(ad, start, tmp_path):
     only = {"height": bumpy(8)["roughness"]}
     with pytest.raises(UsageError, match="found no map that shading reads, these are albedo, normal"):
@@ -618,10 +571,10 @@ def test_sources_that_cannot_be_shaded_are_refused(ad, start, tmp_path):
     wide = {"albedo": np.zeros((4, 4, 2), np.uint8)}
     with pytest.raises(UsageError, match='map "albedo": found 2 channels, allowed for albedo are 1 or 3'):
         material.effects_of(pyramid_of(wide, ad)[1].layout)
-    from mi_diffind.tasks.shading.fit import started
+    from mi_diffind.tasks.shading.fit import load_start
 
     with pytest.raises(UsageError, match=r"was made from another source than other\.json"):
-        started(
+        load_start(
             start[4],
             from_arrays(bumpy(seed=9)),
             FitRequest("ours", OURS.settings, ad, options={"source": "other.json"}),

@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import drjit as dr
 import numpy as np
 import pytest
 from arrays import aligned, numpy_of
@@ -105,17 +104,6 @@ def test_levels_are_continuous_and_any_is_allowed(table):
     np.testing.assert_array_equal(read(np.nan), read(0))
     np.testing.assert_array_equal(read(np.inf), read(6))
     np.testing.assert_array_equal(read(-3), read(0))
-
-
-def test_gradients_reach_every_array(table):
-    texture = CompressedTexture.of(table, TYPES.TensorXf, "float32")
-    u, v = (TYPES.Float(aligned(x)) for x in np.random.default_rng(3).random((2, 4096)))
-    data = [array.data for array in texture.arrays.values()]
-    dr.enable_grad(*data, u, v)
-    dr.backward(sum(texture.filtered(u, v, TYPES.Float(aligned(np.linspace(0, 6, 4096))))))
-    for value in (*(d.array for d in map(dr.grad, data)), dr.grad(u), dr.grad(v)):
-        found = value.numpy()
-        assert np.isfinite(found).all() and np.abs(found).max() > 0
 
 
 def test_files_come_back(table, tmp_path):

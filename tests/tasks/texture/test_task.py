@@ -48,14 +48,6 @@ def material(height=32, width=24, seed=0):
     return {name: np.rint(255 * values).astype(np.uint8) for name, values in maps.items()}
 
 
-def test_a_start_next_to_the_optimum_has_not_diverged(ad):
-    """The components of a ramp are exact: the first steps of a short training are worse, and no explosion."""
-    ramp = np.linspace(0, 65535, 256 * 256).reshape(256, 256, 1).astype(np.uint16)
-    fitted = fit("texture", {"image": ramp}, steps=3, progress=False)
-    assert fitted.result.restarts == 0 and fitted.table.measured["psnr_db"] > 30
-    assert fitted.history[1]["loss"] > 10 * fitted.history[0]["loss"]
-
-
 def quick(recipe=OURS, **settings):
     given = {"steps": 4, "batch": 2048, "measure_every": 4, **settings}
     return dataclasses.replace(recipe, settings=dataclasses.replace(recipe.settings, **given))
@@ -128,18 +120,6 @@ def test_levels_of_footprints(ad):
     back = nets.footprint_of(ad.Float(levels), 10)
     np.testing.assert_allclose(nets.level_of(back, 10).numpy(), levels, atol=1e-4)
     assert back.numpy()[-1] == pytest.approx(1) and nets.footprint_of(0.0, 10) == pytest.approx(2**-9)
-
-
-def test_which_levels_the_footprints_are_on(rng):
-    """The supplement rejects the exponential distribution since coarse levels get too few samples."""
-    power, exponential = (nets.footprint_histogram(name, 11) for name in nets.FOOTPRINTS)
-    assert power.sum() == pytest.approx(1) and exponential.sum() == pytest.approx(1)
-    # Level of u^10 is 10 + 10 log2 u: below ½ with probability 2^-0.95, each further level has 2^(0.1 · level) more
-    np.testing.assert_allclose(power, np.diff([0, *2 ** ((np.arange(10) + 0.5 - 10) / 10), 1]), atol=1e-6)
-    assert power[0] > 0.5 and power[5:].sum() > 0.2 and exponential[5:].sum() < 1e-3
-    drawn = np.log2(np.minimum(-np.log(1 - rng.random(200_000)) / nets.exponential_rate(2**-10), 1)) + 10
-    counted = np.bincount(np.clip(np.floor(drawn + 0.5).astype(int), 0, 10), minlength=11) / 200_000
-    np.testing.assert_allclose(exponential, counted, atol=0.005)
 
 
 # -- sizes ------------------------------------------------------------------------------------------------------------
@@ -273,20 +253,6 @@ def test_levels_are_continuous(made, rng):
     assert max(steps) < 0.06 and max(steps) > 1e-3
 
 
-def test_any_level_is_clamped(made, rng):
-    _, texture, single, _ = made
-    odd = np.float32([0, 1, -0.0, np.nan, np.inf, -np.inf, 1e30, -1e30, -1e-30])
-    u, v, level = (x.ravel() for x in np.meshgrid(odd, odd, odd))
-    for t in (texture, single):
-        found = read(t, u, v, level)
-        assert np.isfinite(found).all() and found.min() >= 0 and found.max() <= 1
-        u2, v2 = rng.random((2, 50), dtype=np.float32)
-        for wrong in (np.nan, -5, -np.inf):
-            np.testing.assert_array_equal(read(t, u2, v2, wrong), read(t, u2, v2, 0))
-        for wrong in (99, np.inf):
-            np.testing.assert_array_equal(read(t, u2, v2, wrong), read(t, u2, v2, t.levels - 1))
-
-
 def test_gradients_are_finite(made, rng):
     _, _, texture, _ = made
     types = texture.types
@@ -367,33 +333,6 @@ def test_the_papers_arrays(samples, tmp_path, ad, rng):
         np.testing.assert_allclose(stored, first, atol=1e-4)
         assert np.abs(stored - last).max() > 0
         assert np.isfinite(read(texture, 0.3, 0.4, np.float32([np.nan, np.inf, -np.inf, 77]))).all()
-
-
-@pytest.mark.parametrize("shape", [(1, 9, 1), (13, 1, 1), (7, 5, 2), (2, 2, 1)])
-def test_odd_sizes(shape, ad, rng):
-    source = from_arrays({"data": rng.integers(0, 256, shape, dtype=np.uint8)})
-    layout = training.layout_of(source, OURS)
-    for size in (
-        choose(*shape[:2], layout.stored, source.nbytes / 2),
-        choose(*shape[:2], layout.stored, 4 * source.nbytes),
-    ):
-        table, _ = trained(source, size, quick(steps=2, batch=64))
-        texture = CompressedTexture.of(table, ad.TensorXf)
-        for level, expected in enumerate(level_sizes(*shape[:2])):
-            decoded = texture.decode(level=level)["data"]
-            assert decoded.shape == (*expected, shape[2]) and np.isfinite(decoded).all()
-        assert np.isfinite(list(table.measured.values())).all()
-
-
-def test_one_colour_needs_no_arrays(tmp_path, ad):
-    source = from_arrays({"albedo": np.full((6, 5, 3), (9, 80, 200), np.uint8)})
-    table, result = trained(source, None, OURS)
-    save_table(tmp_path / "t.npz", table)
-    texture = CompressedTexture.of(TASK.load(tmp_path / "t.npz"), ad.TensorXf)
-    assert table.nbytes == 0 and result.steps == 0 and texture.levels == 3 and texture.arrays == {}
-    assert texture.filtered(ad.Float(0), ad.Float(0), ad.Float(0)) == []
-    np.testing.assert_allclose(texture.decode(level=1)["albedo"][0, 0] * 255, [9, 80, 200], rtol=1e-6)
-    assert table.measured["psnr_worst_db"] == 120 and table.measured["mean_error"] == 0
 
 
 # -- files ------------------------------------------------------------------------------------------------------------

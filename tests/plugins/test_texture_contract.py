@@ -1,0 +1,562 @@
+"""Properties that every texture of maps has, over the registry; the maps of ``neural_material`` are read as textures.
+
+The truth is ``bitmap`` with the image that a file decodes to, and NumPy. Plugin test files keep what only they do.
+"""
+
+import itertools
+import json
+import math
+import os
+import re
+import threading
+
+import drjit as dr
+import numpy as np
+import pytest
+from arrays import aligned
+from texture_files import make, make_image
+from texture_scenes import WRONG, alive, check_process, footprints, hits, linear, plane, refused
+from variants import VARIANTS, set_variant
+
+from mi_diffind import plugins
+from mi_diffind.arrays.tables import load_table
+from mi_diffind.fitting.task import task_of
+from mi_diffind.maps.source import from_arrays
+from mi_diffind.tasks.ggx import TASK as GGX
+
+SIZE = WIDTH, HEIGHT = 12, 10
+TEXTURES = ("mipmap", "neural_image", "neural_texture")
+READERS = (*TEXTURES, "neural_material")
+FILTERED = ("mipmap", "neural_texture", "neural_material")
+WRAP_MODES = ("repeat", "mirror", "clamp")
+FILTERS = ("trilinear", "anisotropic", "stochastic")
+
+#: Name of a map → parameter of ``neural_material``.
+PARAMETERS = {"albedo": "base_color", "normal": "normal", "roughness": "roughness"}
+
+#: Reads of bytes may be 1/64 of a step off; half precision of a third component that is derived.
+ROUNDING = 5e-4
+
+#: Each colour mode once.
+RENDERED = [v for v in VARIANTS if v.endswith(("ad_rgb", "ad_mono", "ad_spectral_polarized"))]
+
+
+def material():
+    """Return smooth maps of every kind, bytes, that repeat along both axes."""
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH] / [[[HEIGHT]], [[WIDTH]]]
+    wave = 0.5 + 0.35 * np.sin(2 * np.pi * np.stack([x + k * y for k in range(4)], axis=-1) + np.arange(4))
+    xy = 0.6 * (wave[..., :2] - 0.5)
+    normal = 0.5 + 0.5 * np.concatenate([xy, np.sqrt(1 - (xy**2).sum(axis=-1, keepdims=True))], axis=-1)
+    maps = {"albedo": wave[..., :3], "normal": normal, "roughness": wave[..., 3:]}
+    return {name: np.rint(255 * values).astype(np.uint8) for name, values in maps.items()}
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """Return the file that each plugin reads; those with ``_clamp`` have arrays that do not repeat."""
+    import mitsuba as mi
+
+    folder, source = tmp_path_factory.mktemp("contract"), from_arrays(material())
+    for name, values in material().items():
+        mi.Bitmap(values if values.shape[2] > 1 else np.ascontiguousarray(values[..., 0])).write(f"{folder}/{name}.png")
+    (folder / "wall.json").write_text(json.dumps({name: f"{name}.png" for name in material()}))
+    written = {"mipmap": str(folder / "wall.json")}
+    for border in ("repeat", "clamp"):
+        end = "" if border == "repeat" else "_clamp"
+        written[f"neural_image{end}"] = make_image(folder / f"image{end}.npz", source, border)
+        written[f"neural_texture{end}"] = make(folder / f"texture{end}.npz", source, border=border)
+        written[f"neural_material{end}"] = written[f"neural_texture{end}"]
+    return written
+
+
+def plugin(files, name, channels="albedo", **more):
+    """Return the description of a plugin that shows a map; ``neural_material`` shows all."""
+    more = {"filter": "off", **more} if name in FILTERED else more
+    more = more if name == "neural_material" else {"channels": channels, **more}
+    return {"type": name, "filename": files[name], **more}
+
+
+def decoded(mi, files, name, **level):
+    """Return the images that a file decodes to, by map."""
+    if name == "mipmap":
+        return {name: values.astype(np.float32) / 255 for name, values in material().items()}
+    table = load_table(files[name])
+    return task_of(table).model(table, mi.TensorXf).image.decode(**level)
+
+
+def bitmap(mi, files, name, channels="albedo", **more):
+    image = mi.Bitmap(np.ascontiguousarray(decoded(mi, files, name)[channels]))
+    image.set_srgb_gamma(channels == "albedo")
+    return {"type": "bitmap", "bitmap": image, "format": "variant", "raw": channels != "albedo", **more}
+
+
+def reader(mi, files, name, channels="albedo", **more):
+    """Return a function of hits that returns the channels of a map, ``(channels, n)``, linear."""
+    loaded = mi.load_dict(plugin(files, name, channels, **more))
+
+    def read(si):
+        if name == "neural_material":
+            return list(loaded.maps.read(si)[PARAMETERS[channels]])
+        return [loaded.eval_1(si)] if channels == "roughness" else list(loaded.eval_3(si))
+
+    return read, loaded
+
+
+def values(read, si):
+    channels = read(si)
+    dr.eval(channels)
+    return np.stack([np.broadcast_to(c.numpy(), dr.width(si.uv)) for c in channels])
+
+
+def centres(rng, n, tiles=0):
+    """Return texel centres, of ``tiles`` images to either side, too."""
+    return np.stack([(rng.integers(-tiles * size, (tiles + 1) * size, n) + 0.5) / size for size in SIZE])
+
+
+def test_the_contract_has_every_texture(mi_rgb):
+    registered = {name for name, p in plugins.declared().items() if p.object_type == "texture"}
+    assert registered == set(TEXTURES)
+
+
+# ---------------------- Values ----------------------
+
+
+@pytest.mark.parametrize("channels", PARAMETERS)
+@pytest.mark.parametrize("name", READERS)
+def test_reads_as_decoded(mi_rgb, files, rng, name, channels):
+    """At texel centres, in every method; the image's size, mean and largest value."""
+    mi = mi_rgb
+    si = hits(mi, centres(rng, 300))
+    read, ours = reader(mi, files, name, channels)
+    theirs = mi.load_dict(bitmap(mi, files, name, channels))
+    truth = theirs.eval(si).numpy()
+    found = values(read, si)
+    close = {"atol": 3e-3 if (name, channels) == ("mipmap", "normal") else ROUNDING}  # z follows from rounded x and y
+    np.testing.assert_allclose(found, truth[: len(found)], **close)
+    if name == "neural_material":
+        return
+    np.testing.assert_allclose(np.broadcast_to(ours.eval(si).numpy(), truth.shape), truth, **close)
+    np.testing.assert_allclose(ours.eval_1(si).numpy(), theirs.eval_1(si).numpy(), **close)
+    assert list(ours.resolution()) == list(SIZE) and ours.is_spatially_varying()
+    assert float(ours.mean()[0]) == pytest.approx(float(theirs.mean()[0]), abs=ROUNDING)
+    image = decoded(mi, files, name)[channels]
+    assert ours.max() >= (linear(image) if channels == "albedo" else image).max() - 1e-3
+
+
+@pytest.mark.parametrize("wrap_mode", WRAP_MODES)
+@pytest.mark.parametrize("name, border", [*((name, "") for name in READERS), *((n, "_clamp") for n in READERS[1:])])
+def test_wrap_modes(mi_rgb, files, rng, name, border, wrap_mode):
+    """At texel centres of neighbouring images, at both ends, and beyond the outermost centres."""
+    mi, more = mi_rgb, {"wrap_mode": wrap_mode}
+    files = {name: files[name + border]}
+    u, v = (rng.random(50) * 0.5 / n for n in SIZE)
+    places = np.concatenate([centres(rng, 300, tiles=3), [1 - u, v], [u, 1 - v], [0 * u, v], [0 * u + 1, v]], axis=1)
+    si = hits(mi, places)
+    found = values(reader(mi, files, name, **more)[0], si)
+    truth = mi.load_dict(bitmap(mi, files, name, **more)).eval(si).numpy()
+    exact = slice(None) if wrap_mode != "repeat" else slice(300)  # a seam may be blended in another encoding
+    np.testing.assert_allclose(found[:, exact], truth[:, exact], atol=2 * ROUNDING)
+    if not border:
+        np.testing.assert_allclose(found, truth, atol=0.05)
+
+
+@pytest.mark.parametrize("filtering", ["off", "trilinear", "anisotropic"])
+@pytest.mark.parametrize("name", READERS)
+def test_to_uv(mi_rgb, files, rng, name, filtering):
+    """A texture with a transformation is the one without it at places and footprints that went through it."""
+    if name == "neural_image" and filtering != "off":
+        pytest.skip("has no filter")
+    mi, more = mi_rgb, {"filter": filtering} if name in FILTERED else {}
+    to_uv = mi.ScalarTransform4f().translate([0.3, -0.2, 0]).rotate([0, 0, 1], 30).scale([1.5, -0.4, 1])
+    m = np.array([[float(to_uv.matrix[i, j]) for j in (0, 1, 3)] for i in (0, 1)])
+    uv, (ddx, ddy) = rng.random((2, 200)), footprints(rng, 200, SIZE, 3)
+    found = values(reader(mi, files, name, to_uv=to_uv, **more)[0], hits(mi, uv, ddx, ddy))
+    read, loaded = reader(mi, files, name, **more)
+    inside = hits(mi, m[:, :2] @ uv + m[:, 2:], m[:, :2] @ ddx, m[:, :2] @ ddy)
+    np.testing.assert_allclose(found, values(read, inside), atol=2e-3)
+    if name != "neural_material":
+        turned = mi.load_dict(plugin(files, name, to_uv=to_uv, **more)).eval_1_grad(hits(mi, uv, ddx, ddy)).numpy()
+        slope = m[:, :2].T @ loaded.eval_1_grad(inside).numpy()
+        assert np.quantile(np.abs(turned - slope), 0.95) < 0.02 * np.abs(slope).max()
+    params = mi.traverse(loaded)
+    key = next(k for k in params.keys() if k.endswith("to_uv"))
+    params[key] = mi.ScalarTransform3f([[*map(float, row)] for row in [*m, [0, 0, 1]]])
+    params.update()
+    np.testing.assert_allclose(values(read, hits(mi, uv, ddx, ddy)), found, atol=1e-5)
+
+
+@pytest.mark.parametrize("storage", ["uint8", "float32"])
+@pytest.mark.parametrize("name", READERS[1:])
+def test_storage_forms_agree(mi_rgb, files, rng, name, storage):
+    si = hits(mi_rgb, rng.random((2, 500)))
+    found, truth = (values(reader(mi_rgb, files, name, storage=s)[0], si) for s in (storage, "uint8"))
+    np.testing.assert_allclose(found, truth, rtol=1e-3, atol=ROUNDING)
+    exposed = [k for k in mi_rgb.traverse(reader(mi_rgb, files, name, storage=storage)[1]).keys() if "tables." in k]
+    assert bool(exposed) == (storage == "float32")
+
+
+# ---------------------- Footprints and hard cases ----------------------
+
+
+@pytest.mark.parametrize("filtering", FILTERS)
+@pytest.mark.parametrize("name", FILTERED)
+def test_zero_and_huge_footprints(mi_rgb, files, rng, name, filtering):
+    """Without a footprint level 0 is read, with the largest one the mean; ``off`` ignores footprints."""
+    mi, uv = mi_rgb, rng.uniform(-2, 2, (2, 100))
+    off, read = (reader(mi, files, name, filter=f)[0] for f in ("off", filtering))
+    huge = hits(mi, uv, (1000, 0), (0, 1000))
+    np.testing.assert_allclose(values(read, hits(mi, uv)), values(off, hits(mi, uv)), atol=ROUNDING)
+    np.testing.assert_array_equal(values(off, huge), values(off, hits(mi, uv)))
+    if name == "mipmap":
+        mean = linear(material()["albedo"] / 255).mean(axis=(0, 1))
+    else:
+        mean = linear(decoded(mi, files, name, level=3)["albedo"])[0, 0]
+        half = linear(decoded(mi, files, name, level=1)["albedo"])
+        y, x = np.mgrid[0 : HEIGHT // 2, 0 : WIDTH // 2].reshape(2, -1)
+        at = hits(mi, [(x + 0.5) / (WIDTH // 2), (y + 0.5) / (HEIGHT // 2)], (2 / WIDTH, 0), (0, 2 / HEIGHT))
+        if filtering == "trilinear":
+            np.testing.assert_allclose(values(read, at), half.reshape(-1, 3).T, atol=2 * ROUNDING)
+    np.testing.assert_allclose(values(read, huge), np.broadcast_to(mean[:, None], (3, 100)), atol=2 * ROUNDING)
+
+
+@pytest.mark.parametrize("filtering", FILTERS)
+@pytest.mark.parametrize("name", READERS)
+def test_any_place_and_footprint_gives_a_finite_value(mi_rgb, files, rng, name, filtering):
+    if name == "neural_image" and filtering != FILTERS[0]:
+        pytest.skip("has no filter")
+    mi, wrap_mode = mi_rgb, WRAP_MODES[FILTERS.index(filtering)]
+    parts = np.stack(np.meshgrid(*[WRONG[::2]] * 4)).reshape(4, -1)
+    uv = rng.choice([0, 1, 0.3, -7.5, 1e20, math.nan, math.inf, -math.inf], (2, parts.shape[1]))
+    si = hits(mi, uv, parts[:2], parts[2:])
+    more = {"filter": filtering} if name in FILTERED else {}
+    for channels in PARAMETERS:
+        read, loaded = reader(mi, files, name, channels, wrap_mode=wrap_mode, **more)
+        found = values(read, si)
+        assert np.isfinite(found).all() and found.min() >= 0 and found.max() <= 1 + 1e-4, channels
+        if name != "neural_material":
+            assert np.isfinite(loaded.eval_1_grad(si).numpy()).all(), channels
+
+
+@pytest.mark.parametrize("shape", [(1, 16), (7, 5), (2, 2)])
+@pytest.mark.parametrize("name", READERS)
+def test_odd_sizes(mi_rgb, tmp_path, rng, name, shape):
+    """Values between those of the image, at any footprint."""
+    mi, image = mi_rgb, rng.integers(0, 256, (*shape, 3), np.uint8)
+    mi.Bitmap(image).write(str(tmp_path / "albedo.png"))
+    (tmp_path / "m.json").write_text('{"albedo": "albedo.png"}')
+    source = from_arrays({"albedo": image})
+    files = {"mipmap": str(tmp_path / "m.json")}
+    if name != "mipmap":
+        files[name] = (make_image if name == "neural_image" else make)(tmp_path / "a.npz", source)
+    si = hits(mi, rng.uniform(-1, 2, (2, 100)), *footprints(rng, 100, shape[::-1], 6))
+    for filtering in ("off", "anisotropic") if name in FILTERED else ("off",):
+        more = {"filter": filtering} if name in FILTERED else {}
+        found = values(reader(mi, files, name, **more)[0], si)
+        image_of = decoded(mi, files, name)["albedo"] if name != "mipmap" else image / np.float32(255)
+        assert found.min() >= linear(image_of).min() - 0.06 and found.max() <= linear(image_of).max() + 0.06
+
+
+# ---------------------- Derivatives ----------------------
+
+
+@pytest.mark.parametrize("filtering", ["off", "trilinear"])
+@pytest.mark.parametrize("name", READERS)
+def test_gradients_reach_the_coordinate(mi_rgb, files, rng, name, filtering):
+    """But for the places between two texels, they are finite differences; ``eval_1_grad`` is the same of luminance."""
+    if name == "neural_image" and filtering != "off":
+        pytest.skip("has no filter")
+    mi, more = mi_rgb, {"filter": filtering} if name in FILTERED else {}
+    uv, (ddx, ddy) = rng.random((2, 300)), footprints(rng, 300, SIZE, 2)
+    read, loaded = reader(mi, files, name, "roughness", **more)
+    si = hits(mi, uv, ddx, ddy)
+    dr.enable_grad(si.uv)
+    dr.backward(dr.sum(read(si)[0]))
+    gradient = dr.grad(si.uv).numpy()
+    assert np.isfinite(gradient).all()
+    for axis in (0, 1):
+        step = 4e-4 * np.eye(2)[:, axis : axis + 1]
+        ahead, behind = (values(read, hits(mi, uv + s * step, ddx, ddy))[0] for s in (1, -1))
+        error = np.abs((ahead - behind) / 8e-4 - gradient[axis])
+        assert np.quantile(error, 0.7) < 0.03 * np.abs(gradient[axis]).max()
+    if name in TEXTURES[::2] and filtering == "off":  # ``neural_image`` interpolates texels for its slope
+        slope = loaded.eval_1_grad(hits(mi, uv)).numpy()
+        assert np.quantile(np.abs(slope - gradient), 0.7) < 0.15 * np.abs(gradient).max()
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_gradients_of_tables_are_finite_differences(mi_rgb, files, rng, name):
+    mi = mi_rgb
+    more = {} if name == "mipmap" else {"storage": "float32"}
+    read, loaded = reader(mi, files, name, **({"filter": "trilinear"} if name in FILTERED else {}), **more)
+    params = mi.traverse(loaded)
+    keys = [k for k in params.keys() if "tables." in k or k == "data"]
+    assert keys and all(params.flags(k) == mi.ParamFlags.Differentiable for k in keys)
+    si = hits(mi, rng.random((2, 64)), *footprints(rng, 64, SIZE, 2))
+    weights = mi.Float(aligned(rng.normal(size=64)))
+
+    def total():
+        return dr.sum(weights * sum(read(si)))
+
+    for key in keys:
+        start = params[key].numpy() * 0.98 + 0.01  # away from the ends, where entries are folded
+        params[key] = mi.TensorXf(aligned(start))
+        params.update()
+        dr.enable_grad(params[key])
+        params.update()
+        dr.backward(total())
+        gradient = dr.grad(params[key]).numpy().ravel()
+        dr.disable_grad(params[key])
+        assert np.isfinite(gradient).all()
+        for i in np.argsort(-np.abs(gradient))[:2]:
+            sums = []
+            for sign in (-1, 1):
+                moved = start.copy()
+                moved.ravel()[i] += sign * 1e-3
+                params[key] = mi.TensorXf(aligned(moved))
+                params.update()
+                sums.append(float(total()[0]))
+            expected = pytest.approx((sums[1] - sums[0]) / 2e-3, rel=0.05, abs=0.03 * float(np.abs(gradient).max()))
+            assert gradient[i] == expected, key
+        params[key] = mi.TensorXf(aligned(start))
+        params.update()
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf, 1e30])
+@pytest.mark.parametrize("name", READERS[1:])
+def test_wrong_tables_and_footprints_leave_finite_gradients(mi_rgb, files, rng, name, wrong):
+    """Values stay finite and within the map's range, too."""
+    mi = mi_rgb
+    parts = np.stack(np.meshgrid(*[(0, 1, 1e20, math.nan, -math.inf)] * 4)).reshape(4, -1)
+    more = {"filter": "anisotropic", "max_anisotropy": 1} if name in FILTERED else {}
+    read, loaded = reader(mi, files, name, storage="float32", **more)
+    params = mi.traverse(loaded)
+    keys = [k for k in params.keys() if "tables." in k]
+    for key in keys:
+        entries = params[key].numpy()
+        params[key] = mi.TensorXf(aligned(np.where(rng.random(entries.shape) < 0.1, np.float32(wrong), entries)))
+        dr.enable_grad(params[key])
+    params.update()
+    si = hits(mi, rng.random((2, parts.shape[1])), parts[:2], parts[2:])
+    dr.enable_grad(si.uv)
+    channels = read(si)
+    dr.backward(dr.sum(sum(channels)))
+    found = np.stack([dr.detach(c).numpy() for c in channels])
+    assert np.isfinite(found).all() and found.min() >= 0 and found.max() <= 1 + 1e-4
+    assert all(np.isfinite(dr.grad(params[key]).numpy()).all() for key in keys)
+    assert np.isfinite(dr.grad(si.uv).numpy()).all()
+
+
+@pytest.mark.parametrize("name", TEXTURES[1:])
+def test_textures_of_one_file_share_their_parameters(mi_rgb, files, rng, name):
+    """A change of one shows in the other, in its mean, maximum and positions; later ones start from the file."""
+    mi, si = mi_rgb, hits(mi_rgb, rng.random((2, 10)))
+    a, b = (mi.load_dict(plugin(files, name, channels, storage="float32")) for channels in ("albedo", "roughness"))
+    before, mean, largest = b.eval_1(si).numpy(), float(b.mean()[0]), b.max()
+    density = float(b.pdf_position(mi.Point2f(0.3, 0.4))[0])
+    params = mi.traverse(a)
+    entries = params["tables.cascaded"].numpy()
+    ramp = np.linspace(0.2, 0.9, entries.shape[-2])[:, None]
+    params["tables.cascaded"] = mi.TensorXf(aligned(entries * ramp))
+    params.update()
+    assert np.abs(b.eval_1(si).numpy() - before).max() > 1e-3
+    assert float(b.mean()[0]) < 0.9 * mean and b.max() < largest
+    assert float(b.pdf_position(mi.Point2f(0.3, 0.4))[0]) != density
+    fresh = mi.load_dict(plugin(files, name, "roughness", storage="float32"))
+    np.testing.assert_array_equal(fresh.eval_1(si).numpy(), before)
+    params["tables.cascaded"] = mi.TensorXf(aligned(np.zeros((2, 2, 7), "f4")))
+    with pytest.raises(RuntimeError, match=re.escape('parameter "tables.cascaded": "data" has the shape (2, 2, 7)')):
+        params.update()
+
+
+# ---------------------- Spectra and emitters ----------------------
+
+
+@pytest.mark.parametrize("variant", RENDERED)
+@pytest.mark.parametrize("name", TEXTURES)
+def test_colours_in_every_mode(variant, files, rng, name):
+    """``eval`` is a bitmap's at texel centres, with and without ``raw``; a texture refuses where a bitmap does."""
+    mi = set_variant(variant)
+    si = hits(mi, centres(rng, 200))
+    for channels, raw in itertools.product(("albedo", "roughness"), (False, True)):
+        more = {"raw": raw} if channels == "albedo" or raw else {}
+        ours, theirs = (mi.load_dict(t(channels, **more)) for t in (
+            lambda c, **m: plugin(files, name, c, **m),
+            lambda c, **m: bitmap(mi, files, name, c, **m)))  # fmt: skip
+        for method in ("eval", "eval_1", "eval_3"):
+            results = []
+            for texture in (ours, theirs):
+                try:
+                    results.append(getattr(texture, method)(si).numpy())
+                except RuntimeError:
+                    results.append(None)
+            assert (results[0] is None) == (results[1] is None), (channels, raw, method)
+            if results[1] is not None:
+                found = np.broadcast_to(results[0], results[1].shape)
+                np.testing.assert_allclose(found, results[1], atol=2e-3, err_msg=f"{channels} {raw} {method}")
+
+
+@pytest.mark.parametrize("wrap_mode, turned", [("repeat", ""), ("mirror", "turn"), ("clamp", "flip"), ("clamp", "any")])
+@pytest.mark.parametrize("name", TEXTURES)
+def test_sampled_positions_have_their_density(mi_rgb, files, rng, name, wrap_mode, turned):
+    mi, n, bins, side = mi_rgb, 50_000, 8, 80
+    t = mi.ScalarTransform4f()
+    to_uv = {
+        "turn": t.translate([1, 0, 0]).rotate([0, 0, 1], 90), "flip": t.translate([1, 0, 0]).scale([-1, 1, 1]),
+        "any": t.rotate([0, 0, 1], 30).scale(2),
+    }.get(turned)  # fmt: skip
+    texture = mi.load_dict(plugin(files, name, wrap_mode=wrap_mode, **({"to_uv": to_uv} if turned else {})))
+    uv, pdf = texture.sample_position(mi.Point2f(*[mi.Float(aligned(x)) for x in rng.random((2, n))]))
+    grid = (np.mgrid[0:side, 0:side].reshape(2, -1) + 0.5) / side
+    grid = mi.Point2f(*[mi.Float(aligned(x)) for x in grid])
+    density = np.broadcast_to(texture.pdf_position(grid).numpy(), side * side).reshape(bins, side // bins, bins, -1)
+    assert density.mean() == pytest.approx(1, abs=5e-3) and density.min() > 0
+    expected = density.mean(axis=(1, 3)) / bins**2 * n
+    counts, _, _ = np.histogram2d(*uv.numpy(), bins=bins, range=[[0, 1]] * 2)
+    assert counts.sum() == n and ((counts - expected) ** 2 / expected).sum() < bins**2 + 6 * bins
+    if turned != "any":  # brightness is what the density follows
+        np.testing.assert_allclose(pdf.numpy(), texture.pdf_position(uv).numpy(), rtol=1e-3)
+        brightness = texture.eval_1(hits(mi, grid.numpy())).numpy()
+        assert np.corrcoef(brightness, density.ravel())[0, 1] > 0.8
+    bad = [math.nan, math.inf, -math.inf, -1, 0, 1, 1 + 1e-6, 2, 1e30, 1 - 2**-24]
+    wrong = mi.Point2f(*(mi.Float(aligned(x.ravel())) for x in np.meshgrid(bad, bad)))
+    uv, pdf = texture.sample_position(wrong)
+    assert np.isfinite(np.broadcast_to(pdf.numpy(), 100)).all() and np.isfinite(texture.pdf_position(uv).numpy()).all()
+    assert turned == "any" or (np.isfinite(uv.numpy()).all() and uv.numpy().min() >= 0 and uv.numpy().max() <= 1)
+
+
+def lamp(mi, texture, **integrator):
+    """Return a scene of a wall under a lamp that shines as a texture says."""
+    t = mi.ScalarTransform4f()
+    film = {"type": "hdrfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    return mi.load_dict({
+        "type": "scene", "integrator": integrator or {"type": "path", "max_depth": 3},
+        "sensor": {"type": "perspective", "fov": 35, "to_world": t.look_at([0, 0, 3], [0, 0, 0], [0, 1, 0]),
+                   "film": film},
+        "wall": {"type": "rectangle", "bsdf": {"type": "diffuse"}},
+        "lamp": {"type": "rectangle", "to_world": t.translate([0, 1.2, 0.6]).rotate([1, 0, 0], 60).scale(0.6),
+                 "emitter": {"type": "area", "radiance": texture}},
+    })  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TEXTURES)
+def test_emitters(mi_rgb, files, name):
+    """Light that is sampled by position is the light that paths find by chance, and that of a bitmap."""
+    mi, means = mi_rgb, []
+    texture = plugin(files, name, wrap_mode="clamp")
+    for described, emitter, bsdf in ((texture, 1, 0), (texture, 0, 1), (bitmap(mi, files, name), 1, 0)):
+        scene = lamp(mi, described, type="direct", emitter_samples=emitter, bsdf_samples=bsdf)
+        means.append(mi.render(scene, spp=2**13).numpy().mean(dtype=np.float64))
+    assert means[0] == pytest.approx(means[1], rel=0.03) and means[0] == pytest.approx(means[2], rel=0.03)
+
+
+@pytest.mark.parametrize("variant", RENDERED)
+def test_particle_tracer(variant, files):
+    """A particle tracer asks for a wavelength and a ray from the emitter."""
+    mi, texture = set_variant(variant), plugin(files, "neural_image")
+    image = mi.render(lamp(mi, texture, type="ptracer", max_depth=3), spp=2**13).numpy()
+    assert image.mean() == pytest.approx(mi.render(lamp(mi, texture), spp=2**10).numpy().mean(), rel=0.05)
+
+
+# ---------------------- Scenes ----------------------
+
+
+@pytest.mark.parametrize("name", TEXTURES)
+def test_variants_in_turn_and_threads(files, rng, name):
+    """A texture keeps to the classes of its variant; scenes load in threads."""
+    uv, images, loaded, failed = rng.random((2, 50)), {}, [], []
+    for variant in ("llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"):
+        mi = set_variant(variant)
+        found = mi.load_dict(plugin(files, name)).eval(hits(mi, uv)).numpy()
+        np.testing.assert_array_equal(images.setdefault(variant, found), found)
+    assert images["llvm_ad_rgb"].shape == (3, 50) and images["llvm_ad_mono"].shape == (1, 50)
+
+    def load():
+        try:
+            mi.set_variant("llvm_ad_rgb")
+            loaded.append(lamp(mi, plugin(files, name)))
+        except Exception as e:
+            failed.append(e)
+
+    threads = [threading.Thread(target=load) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(120)
+    assert not failed and len(loaded) == 3
+
+
+@pytest.mark.parametrize("name", TEXTURES)
+def test_frozen_renders(mi_rgb, files, no_garbage_collection, name):
+    """Changes of parameters show; an emitter has to be rendered once before, as with ``bitmap``."""
+    mi = mi_rgb
+    loaded = lamp(mi, plugin(files, name, **({} if name == "mipmap" else {"storage": "float32"})))
+    params = mi.traverse(loaded)
+    key = next(k for k in params.keys() if k.endswith(("tables.cascaded", "radiance.data")))
+    frozen = dr.freeze(lambda loaded, seed: mi.render(loaded, spp=4, seed=seed))
+    dr.eval(mi.render(loaded, spp=4))
+    for step in range(4):
+        if step == 2:
+            params[key] = params[key] * 0.5
+            params.update()
+            dr.eval(mi.render(loaded, spp=4))
+        image, expected = (f(mi.UInt32(step)).numpy() for f in (
+            lambda seed: frozen(loaded, seed), lambda seed: mi.render(loaded, spp=4, seed=seed)))  # fmt: skip
+        np.testing.assert_allclose(image, expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", TEXTURES)
+def test_textures_die_with_their_scene(mi_rgb, files, no_garbage_collection, name):
+    cls = type(mi_rgb.load_dict(plugin(files, name))).__name__
+    before = alive(cls)
+    loaded = plane(mi_rgb, plugin(files, name), size=8)
+    mi_rgb.render(loaded, spp=1)
+    assert alive(cls) == before + 1
+    del loaded
+    assert alive(cls) == before
+
+
+@pytest.mark.parametrize("name", TEXTURES[1:])
+def test_scalar_variants_and_leaks(files, name):
+    """A sentence in a scalar variant; nothing is left of a texture that was rendered and optimised."""
+    check_process(plugin(files, name, storage="float32"), ("llvm_ad_rgb",))
+
+
+@pytest.mark.parametrize("name", TEXTURES)
+def test_report_and_description(mi_rgb, files, name):
+    texture = mi_rgb.load_dict(plugin(files, name, "normal"))
+    report, text = texture.report(), str(texture)
+    assert report["map"] == "normal" and report["table_bytes"] > 0 and "normal" in report["effects_in_use"]
+    assert sorted(report["channels_read"] + report["channels_left_out"]) == list(range(texture.image.layout.stored))
+    assert report["effects_left_out"]["albedo"] == "is another map of the file"
+    for part in (f"{type(texture).__name__}[", "map = normal", f"{WIDTH} x {HEIGHT}", "raw = true"):
+        assert part in text
+
+
+BAD = {
+    "no file name": ({"filename": ""}, 'parameter "filename": not given'),
+    "a missing file": ({"filename": "/nowhere/a.npz"}, '"filename": /nowhere/a.npz: no such file'),
+    "a folder": ({"filename": os.path.dirname(__file__)}, "is a folder"),
+    "another task": ({"filename": str(GGX.file())}, 'parameter "filename": '),
+    "an unknown map": ({"channels": "depth"}, 'parameter "channels": found "depth", the file holds albedo, normal'),
+    "a wrap mode": ({"wrap_mode": "tile"}, 'parameter "wrap_mode": found "tile", allowed are repeat, mirror, clamp'),
+    "a storage": ({"storage": "float16"}, 'parameter "storage": found "float16", allowed are uint8, float32'),
+    "a filter": ({"filter": "cubic"}, 'parameter "filter": found "cubic", allowed are trilinear, off, anisotropic'),
+    "contradicting filters": ({"filter": "off", "filter_type": "trilinear"}, "which contradicts the filter"),
+    "too many taps": ({"max_anisotropy": 17}, 'parameter "max_anisotropy": found 17, allowed are whole numbers 1 to'),
+    "half a sensor": ({"fov": 60.0}, 'parameter "sensor_to_world": not given'),
+    "raw": ({"raw": 0.5}, 'parameter "raw": found 0.5, allowed are true and false'),
+    "no transformation": ({"to_uv": 2.0}, 'parameter "to_uv": found 2'),
+    "an unknown name": ({"chanel": "x"}, "chanel"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+@pytest.mark.parametrize("name", TEXTURES)
+def test_bad_parameters(mi_rgb, files, name, case):
+    wrong, sentence = BAD[case]
+    unknown = {"neural_image": ("filter", "max_anisotropy", "fov"), "mipmap": ("storage",)}.get(name, ())
+    if next(iter(wrong)) in unknown:
+        sentence = next(iter(wrong))
+    if name == "mipmap" and case == "no file name":
+        sentence = "exactly one is needed"
+    assert sentence in refused(mi_rgb, {**plugin(files, name), **wrong})
