@@ -31,8 +31,10 @@ def test_values_are_burleys(mi_rgb, rng, name, decibels):
     n, ctx = 2**14, mi.BSDFContext()
     color, m, wi, wo = disney_formulas.random_case(rng, n, low_cosine=1e-3)
     color, m = color.astype(np.float32), {k: v.astype(np.float32) for k, v in m.items()}
-    textures = {"base_color": bitmap(mi, [color] * 2), **{k: texels(mi, v) for k, v in m.items()}}
-    exact, bsdf = (mi.load_dict({**FORMS[form], **textures}) for form in ("disney", name))
+    exact, bsdf = (  # each with textures of its own: loading takes their data
+        mi.load_dict({**FORMS[form], **{k: texels(mi, v) for k, v in {**m, "base_color": color}.items()}})
+        for form in ("disney", name)
+    )
     si, towards = interactions(mi, wi, np.arange(n), n), vectors(mi, wo)
     value, pdf = bsdf.eval_pdf(ctx, si, towards)
     reference = disney_formulas.brdf(color, m, wi.astype("f4"), wo.astype("f4")) * wo[:, 2:3]
