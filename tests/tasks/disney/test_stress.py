@@ -49,12 +49,18 @@ def evaluated(mi, bsdf, si, wo, u):
     return [value, pdf, bs.wo, bs.pdf, weight]
 
 
-def check_equal_to_unculled(mi, rng, form, materials, effects=None):
+@pytest.mark.parametrize(
+    "form, every", [("disney", 6), pytest.param("disney", 1, marks=pytest.mark.slow), ("tables", 40), ("paper", 40)]
+)
+def test_what_is_left_out_changes_nothing(mi_rgb, rng, form, every):
     """
     Each material as a constant, with only its effects, against all of them as texels, with all effects; in batches,
     since a kernel costs more than what it computes.
     """
-    n = 500
+    distinct = distinct_effects()
+    assert len(distinct) > 200
+    effects, materials = list(distinct)[::every], list(distinct.values())[::every]
+    mi, n = mi_rgb, 500
     unculled = textured(mi, form, materials, effects="all")
     wi, wo, u = random_directions(rng, n), random_directions(rng, n), uniform(mi, rng, n)
     wi_, wo_ = vectors(mi, wi), vectors(mi, wo)
@@ -68,8 +74,7 @@ def check_equal_to_unculled(mi, rng, form, materials, effects=None):
     for start in range(0, k, 4):
         batch = range(start, min(start + 4, k))
         bsdfs = [mi.load_dict(plugin(mi, form, materials[i])) for i in batch]
-        if effects is not None:
-            assert [b.report()["effects_in_use"] for b in bsdfs] == [list(effects[i].names) for i in batch]
+        assert [b.report()["effects_in_use"] for b in bsdfs] == [list(effects[i].names) for i in batch]
         results = [evaluated(mi, bsdf, si, wo_, u) for bsdf in bsdfs]
         dr.eval(results)
         for i, found in zip(batch, results, strict=True):
@@ -84,21 +89,6 @@ def check_equal_to_unculled(mi, rng, form, materials, effects=None):
             for what, a, b in zip(("sampled pdf", "weight"), found[3:], expected[3:], strict=True):
                 near = close(a[:, same], b[:, same], 5e-3)
                 assert near.mean() > 0.998, (what, materials[i])  # but for rounding of directions next to a peak
-
-
-@pytest.mark.parametrize("every", [6, pytest.param(1, marks=pytest.mark.slow)])
-def test_what_is_left_out_changes_nothing(mi_rgb, rng, every):
-    found = distinct_effects()
-    assert len(found) > 200
-    check_equal_to_unculled(mi_rgb, rng, "disney", list(found.values())[::every], list(found)[::every])
-
-
-@pytest.mark.parametrize("form", ["tables", "paper"])
-def test_what_is_left_out_changes_nothing_in_tables(mi_rgb, rng, form):
-    """Some of the sets, since what differs between presets is the factors and not what they are used for."""
-    found = list(distinct_effects().items())
-    chosen = [found[i] for i in rng.choice(len(found), 8, replace=False)]
-    check_equal_to_unculled(mi_rgb, rng, form, [m for _, m in chosen], [e for e, _ in chosen])
 
 
 # -- energy and accuracy -----------------------------------------------------------------------------------------------
