@@ -40,12 +40,12 @@ from mi_diffind.scenes.training.problem import SceneProblem, exposure_of
 from mi_diffind.scenes.training.references import ReferenceRenders
 from mi_diffind.scenes.training.rig import Rig
 from mi_diffind.scenes.training.trained_scene import (
+    SceneTexture,
     TrainedScene,
     load_textures,
     texture_budget,
     texture_file,
     texture_files,
-    texture_problem,
     texture_recipe,
 )
 from mi_diffind.tasks.texture import PRESETS
@@ -89,7 +89,7 @@ def trained(folder, path):
     parsed = loading.ParsedScene(path)
     file, _ = texture_file(parsed)
     table = load(file)
-    problem = texture_problem(table, load_source(folder / "material.json"))
+    problem = SceneTexture(file, table).problem
     scene = TrainedScene(parsed, {file: table}, ORBIT, 1)
     return scene, problem
 

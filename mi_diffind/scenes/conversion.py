@@ -212,13 +212,7 @@ def _around(references: list[list[int]], index: int) -> Iterator[int]:
 
 def _below(references: list[list[int]], index: int) -> list[int]:
     """Return all objects that one nests or refers to, directly or not."""
-    seen, todo = set(), list(references[index])
-    while todo:
-        other = todo.pop()
-        if other not in seen:
-            seen.add(other)
-            todo += references[other]
-    return sorted(seen)
+    return sorted({i for other in references[index] for i in (other, *_below(references, other))})
 
 
 def _trace_by(seen_by: tuple[str, ...], integrators: list) -> list[Conversion]:

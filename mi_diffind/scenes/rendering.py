@@ -286,7 +286,6 @@ def strip(frames: Sequence[np.ndarray], columns: int = COLUMNS) -> np.ndarray:
     columns = min(columns, len(frames))
     rows = -(-len(frames) // columns)
     height, width, channels = frames[0].shape
-    grid = np.zeros((rows, height, columns, width, channels), np.float32)
-    for i, frame in enumerate(frames):
-        grid[i // columns, :, i % columns] = frame
-    return grid.reshape(rows * height, columns * width, channels)
+    grid = np.zeros((rows * columns, height, width, channels), np.float32)
+    grid[: len(frames)] = frames
+    return grid.reshape(rows, columns, *frames[0].shape).swapaxes(1, 2).reshape(rows * height, -1, channels)

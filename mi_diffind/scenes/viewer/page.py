@@ -99,9 +99,9 @@ class Page:
         gain = gui.add_slider("gain", 1.0, 100.0, 1.0, session.gain, hint="factor of the difference")
         spp = gui.add_number("samples", session.spp, min=1, max=2**16, step=1, hint="samples per pixel")
         self._on_update(self._view, lambda view: session.show(view=view))
-        self._on_update(divider, lambda divider: session.show(divider=divider))
-        self._on_update(gain, lambda gain: session.show(gain=gain))
-        self._on_update(spp, lambda spp: session.samples(int(spp)))
+        self._on_update(divider, lambda value: session.show(divider=value))
+        self._on_update(gain, lambda value: session.show(gain=value))
+        self._on_update(spp, lambda value: session.samples(int(value)))
         for name, words in session.choices.items():
             menu = gui.add_dropdown(name, words, initial_value=words[0], hint="loads the scene again")
             self._on_update(menu, lambda word, name=name: self._choose(name, word))
@@ -291,10 +291,8 @@ def pad(picture: np.ndarray, aspect: float) -> np.ndarray:
     if not math.isfinite(aspect) or not 0.05 < aspect < 20:
         return picture
     wide, high = max(width, round(height * aspect)), max(height, round(width / aspect))
-    canvas = np.zeros((high, wide, 3), np.uint8)
     top, left = (high - height) // 2, (wide - width) // 2
-    canvas[top : top + height, left : left + width] = picture
-    return canvas
+    return np.pad(picture, ((top, high - height - top), (left, wide - width - left), (0, 0)))
 
 
 def status_lines(session: Session, message: str = "") -> list[str]:

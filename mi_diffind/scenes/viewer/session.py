@@ -60,16 +60,11 @@ LAMP = (-0.6, 1.0, 0.7)
 class Session:
     """Scene that is looked at: what is shown, from where, with which values, and the picture so far.
 
-    - ``source``: a scene file, a table file (:func:`table_scene`) or a dictionary as of ``mi.load_dict``;
-    - ``width``: of the picture, pixels; the height follows the scene's film;
-    - ``spp``: samples per pixel of a finished picture (``None``: the scene's); ``seed``: seed of the random numbers;
-    - ``against``: the counterpart that replaces learned plugins on the other side, as of :func:`mi_diffind.compare`;
-    - ``defines``: values of a scene file's ``<default>`` parameters.
-
-    A picture is the mean of passes of one sample, ``passes`` so far; :meth:`refine` adds one. A change of anything
-    restarts it. ``refusal`` is the sentence that says why there is no exact side, "" if there is one. Poses are
-    matrices ``(4, 4)`` of a sensor that only rotate and move; ``start`` is that of the scene. Computations run in the
-    thread that calls, and only one thread may.
+    The arguments are those of :func:`mi_diffind.view`. A table file is shown by :func:`table_scene`. A picture is the
+    mean of passes of one sample, ``passes`` so far; :meth:`refine` adds one. A change of anything restarts it.
+    ``refusal`` is the sentence that says why there is no exact side, "" if there is one. Poses are matrices ``(4, 4)``
+    of a sensor that only rotate and move; ``start`` is that of the scene. Computations run in the thread that calls,
+    and only one thread may.
 
     Raises :class:`.SceneError`, :class:`.TableError` and :class:`.UsageError`.
     """
