@@ -220,14 +220,16 @@ def test_render_to_a_given_depth(tmp_path, capsys):
     assert report["depth"]["requested"] == report["depth"]["chosen"] == 2 and report["depth"]["left_out"] is None
     assert np.array_equal(two, render(tmp_path, file, "--spp", "4", "-D", "depth=2")[0])
     assert not np.array_equal(two, own)
-    nested = f'<integrator type="moment">{PATH}</integrator>'
-    assert (
-        render(tmp_path, scene_file(tmp_path, FURNACE, nested), "--spp", "1", "--depth", "2")[1]["depth"]["scene"] == -1
-    )
-    default = '<integrator type="prb"/>'
-    assert render(tmp_path, scene_file(tmp_path, FURNACE, default), "--spp", "1")[1]["depth"]["scene"] == 6
-    direct = '<integrator type="direct"/>'
-    assert render(tmp_path, scene_file(tmp_path, FURNACE, direct), "--spp", "1")[1]["depth"]["chosen"] is None
+    for integrator, scene_depth in (
+        (f'<integrator type="moment">{PATH}</integrator>', -1),
+        ('<integrator type="prb"/>', 6),
+        ('<integrator type="direct"/>', None),
+    ):
+        report = render(tmp_path, scene_file(tmp_path, FURNACE, integrator), "--spp", "1")[1]
+        assert report["depth"]["chosen"] == report["depth"]["scene"] == scene_depth
+
+
+NESTED = '<integrator type="moment"><integrator type="path"/><integrator type="prb"/></integrator>'
 
 
 @pytest.mark.parametrize(
@@ -236,11 +238,7 @@ def test_render_to_a_given_depth(tmp_path, capsys):
         ('<integrator type="direct"/>', "auto", "a depth needs one integrator of path, volpath"),
         ('<integrator type="direct"/>', "3", "found direct"),
         ("", "auto", "found none"),
-        (
-            '<integrator type="moment"><integrator type="path"/><integrator type="prb"/></integrator>',
-            "auto",
-            "found moment, path, prb",
-        ),
+        (NESTED, "auto", "found moment, path, prb"),
     ],
 )
 def test_integrators_without_a_depth(tmp_path, capsys, integrator, request_, sentence):

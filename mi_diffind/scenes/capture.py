@@ -360,8 +360,7 @@ class SceneSubject:
 
     def bounds(self) -> np.ndarray:
         """Return the corners ``(2, 3)`` of the captured objects' box. Raises :class:`CaptureError`."""
-        boxes = np.array([_box(s) for s in self.shapes()])
-        box = np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
+        box = loading.bounds(self.shapes())
         if not np.isfinite(box).all():
             raise CaptureError("the box around the captured objects is not finite: name the objects")
         return box
@@ -374,17 +373,13 @@ class SceneSubject:
             if vertices in parameters:
                 points = np.array(parameters[vertices], np.float64).reshape(-1, 3)
             else:
-                points = np.array(list(itertools.product(*_box(shape).T)))
+                points = np.array(list(itertools.product(*loading.bounds([shape]).T)))
             reach = max(reach, float(np.linalg.norm(points - centre, axis=1).max()))
         return reach
 
     def camera(self, settings: CaptureSettings) -> CaptureCamera:
         """Return the camera of a capture with these settings."""
         return CaptureCamera(self, settings)
-
-
-def _box(shape) -> np.ndarray:
-    return np.array([shape.bbox().min, shape.bbox().max], np.float64).reshape(2, 3)
 
 
 def _settings(scene, given: dict) -> CaptureSettings:

@@ -476,6 +476,12 @@ def film_size(scene) -> tuple[int, int]:
     return int(width), int(height)
 
 
+def bounds(shapes) -> np.ndarray:
+    """Return the corners ``(2, 3)`` of the box around shapes; they are infinite if there are none."""
+    boxes = np.array([[s.bbox().min, s.bbox().max] for s in shapes], np.float64).reshape(-1, 2, 3)
+    return np.stack([boxes[:, 0].min(axis=0, initial=np.inf), boxes[:, 1].max(axis=0, initial=-np.inf)])
+
+
 def sample_counts(scene, spp: int, passes: int = 1) -> list[int]:
     """Return the samples a pixel of each pass of :func:`render`: samplers other than ``independent`` may round up."""
     counts = [(i + 1) * spp // passes - i * spp // passes for i in range(passes)]

@@ -4,9 +4,9 @@
 samples. The product is right on average only if both are independent: the value I comes from one set of samples, its
 derivative ∂I from another (``seed`` and ``seed_grad`` of ``mi.render``), and the reference R from a third. The result
 equals the loss (I₁ − R)(I₂ − R) of two renders, at the price of one derivative. An absolute error, and an error beyond
-the bound, contributes its sign, which noise biases however the samples are drawn. In return, no pixel (a highlight on
-metal, a firefly) has a larger gradient than the bound. A component of a BSDF in a scene has no gradient of its own that
-could be clipped; the image has.
+the bound, contributes its sign, which follows the median of noisy pixels rather than their mean. In return, no pixel (a
+highlight on metal, a firefly) has a larger gradient than the bound. A component of a BSDF in a scene has no gradient of
+its own that could be clipped; the image has.
 """
 
 from __future__ import annotations

@@ -311,9 +311,8 @@ class TrainedScene:
     def render(self, seed, seed_grad, spp: int | None = None):
         """Return the image of the current view, a tensor that is differentiable by the arrays.
 
-        Values come from the samples of ``seed``, derivatives from those of ``seed_grad``: the derivative of the loss by
-        the image is then independent of the derivative of the image by the arrays, and their product is right on
-        average for squared errors. ``spp`` (``None``: the scene's) changes no footprints.
+        Values come from the samples of ``seed``, derivatives from those of ``seed_grad`` (:mod:`.problem` says why).
+        ``spp`` (``None``: the scene's) changes no footprints.
         """
         spp = spp or self.spp
         image = mi.render(self.scene, self.parameters, spp=spp, spp_grad=spp, seed=seed, seed_grad=seed_grad)

@@ -6,7 +6,6 @@ import contextlib
 import gc
 import io
 import math
-import queue
 import socket
 import threading
 import time
@@ -68,18 +67,18 @@ def server(host: str, port: int):
 class Page:
     """Page of a session: controls that change it, and the loop that renders (:meth:`run`).
 
-    viser calls back in threads of its own; they only leave requests, which the loop carries out.
+    viser calls back in threads of its own; they only leave requests, which the loop carries out. Of several requests
+    with the same key, such as the value of one parameter, the newest counts.
     """
 
     def __init__(self, session: Session, viser_server):
         self.session, self.server = session, viser_server
-        self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._requests: dict[object, Callable[[], None]] = {}
         self._camera: tuple | None = None  # the newest position and orientation that nobody has looked from
         self._lock, self._wake = threading.Lock(), threading.Event()
         self._moved, self._sent = -math.inf, -math.inf
         self._message, self._picture = "", None
         self._halted = False  # after a refused picture, until something changes
-        self._values: dict[str, object] = {}  # parameters that were asked to change, and have not
         self._controls()
         self.server.on_client_connect(self._connected)
 
@@ -167,17 +166,8 @@ class Page:
         control.on_update(change)
 
     def _change(self, path: str, value) -> None:
-        """Ask for another value of a parameter; of several that wait, the newest counts."""
-        with self._lock:
-            waiting = bool(self._values)
-            self._values[path] = value
-        if not waiting:
-            self._ask(self._change_values)
-
-    def _change_values(self) -> None:
-        with self._lock:
-            values, self._values = self._values, {}
-        self.session.set(values)
+        """Ask for another value of a parameter."""
+        self._ask(lambda: self.session.set({path: value}), path)
 
     def _first_view(self) -> None:
         for client in self.server.get_clients().values():
@@ -188,8 +178,9 @@ class Page:
 
     # -- events of viser, in its threads ------------------------------------------------------------------------------
 
-    def _ask(self, request: Callable[[], None]) -> None:
-        self._requests.put(request)
+    def _ask(self, request: Callable[[], None], key: object = None) -> None:
+        with self._lock:
+            self._requests[request if key is None else key] = request
         self._wake.set()
 
     def _connected(self, client) -> None:
@@ -228,34 +219,30 @@ class Page:
 
     def _step(self) -> bool:
         """Do the next piece of work; return whether there was one."""
-        worked = False
-        while True:
-            try:
-                request = self._requests.get_nowait()
-            except queue.Empty:
-                break
-            self._message, self._halted, worked = "", False, True
+        with self._lock:
+            requests, self._requests = self._requests, {}
+            camera, self._camera = self._camera, None
+        for request in requests.values():
+            self._message, self._halted = "", False
             try:
                 request()
             except DiffindError as e:
                 self._message = str(e)
                 self._list_parameters()  # sliders of the values that the scene kept
-        if worked:
+        if requests:
             self._show(self.session.picture() if self._picture is not None and self.session.passes else None)
-        with self._lock:
-            camera, self._camera = self._camera, None
         if camera is not None and self._move(to_world(*camera)):
             self._halted = False
             self._show(self.session.moving_picture())
             return True
         if self.session.moving and time.monotonic() - self._moved < QUIET:
-            return worked
+            return bool(requests)
         if not self.session.finished and not self._halted:
             picture = self.session.refine()
             if self.session.finished or time.monotonic() - self._sent > INTERVAL:
                 self._show(picture)
             return True
-        return worked
+        return bool(requests)
 
     def _move(self, pose: np.ndarray) -> bool:
         moved = self.session.move_camera(pose)
