@@ -214,13 +214,19 @@ class ParsedScene:
             props["max_depth"] = longest_path
             return mi.PluginManager.instance().create_object(props)
 
-    def learned_plugins(self, against: str | tuple[str, ...] = "exact") -> list[dict]:
+    def learned_plugins(
+        self, against: str | tuple[str, ...] = "exact", change: Callable[[object], object] | None = None
+    ) -> list[dict]:
         """Return the descriptions (:meth:`.plugins.Plugin.described`) of the learned plugins, in the file's order.
 
-        With ``against``, of all plugins that have the counterpart of this name, or of one of these names.
+        With ``against``, of all plugins that have the counterpart of this name, or of one of these names; after a
+        ``change`` of the scene as of :meth:`load`.
         """
         with self._errors():
-            return [plugin.described(props) for props, plugin in _replaceable(self._copy(), against)]
+            state = self._copy()
+            if change is not None:
+                change(state)
+            return [plugin.described(props) for props, plugin in _replaceable(state, against)]
 
     def tables(self, learned: list[dict]) -> dict[tuple[str, str], object]:
         """Return the distinct tables of learned plugins: ``(file, storage)`` → :class:`.Table`.
