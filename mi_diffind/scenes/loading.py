@@ -22,7 +22,6 @@ from ..core.files import MOST_TEXT, irregular, replacing, shown
 from ..core.runtime import use_variant
 from ..core.threads import in_turn, threads_for_files
 from ..fitting.task import tasks
-from ..images import metrics
 from ..measure.clock import bsdf_operations
 from ..plugins.support import footprint, omissions
 
@@ -61,12 +60,6 @@ def warn_if_black(scene, path: str | os.PathLike, images) -> None:
     """Warn if all ``images`` of a loaded scene are black."""
     if not any(image[..., :3].any() for image in images):
         plugins.warn(f"{path}: the picture is black{'' if scene.emitters() else ', the scene has no emitter'}")
-
-
-def check_finite(image: np.ndarray, name: str) -> None:
-    """Raise :class:`SceneError` if pixels of the image ``name`` are NaN or infinite."""
-    if count := metrics.nonfinite_pixels(image):
-        raise SceneError(f"{name}: {count:,} of {image.shape[0] * image.shape[1]:,} pixels are not finite")
 
 
 def use_slashes(state) -> None:
