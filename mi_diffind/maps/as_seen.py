@@ -39,8 +39,11 @@ SIZE = (192, 144)
 #: Values of maps that a material lacks, by role.
 DEFAULTS = {"albedo": (0.5, 0.5, 0.5), "normal": (0.5, 0.5, 1.0), "roughness": (0.4,), "metallic": (0.0,)}
 
-#: Error of a channel by which sensitivities are measured, and the samples of their renders.
-NOISE, FEW = 0.01, 4
+#: Error of a channel by which sensitivities are measured.
+NOISE = 0.01
+
+#: Samples a pixel of the renders of sensitivities.
+FEW_SAMPLES = 4
 
 _references: dict[tuple, dict[str, np.ndarray]] = {}  # pictures of the latest source
 
@@ -105,11 +108,11 @@ def sensitivities(source: Source, types: ModuleType) -> dict[str, float]:
     truth = by_role(source, {m.name: m.values for m in source.maps})
     rng = np.random.default_rng(2023)
     squares = dict.fromkeys((m.name for m in source.maps), 0.0)
-    references = render(truth, types, NEAR, FEW)
+    references = render(truth, types, NEAR, FEW_SAMPLES)
     for role, m in _roles(source).items():
         change = NOISE * rng.choice(np.float32([-1, 1]), m.values.shape)
         noisy = by_role(source, {other.name: other.values for other in source.maps} | {m.name: m.values + change})
-        pictures = render({**truth, role: noisy[role]}, types, NEAR, FEW)
+        pictures = render({**truth, role: noisy[role]}, types, NEAR, FEW_SAMPLES)
         errors = [squared_error(references[way], pictures[way]) for way in NEAR]
         squares[m.name] = float(np.mean(errors)) / (NOISE**2 * m.channels)
     return squares

@@ -123,12 +123,18 @@ MAX_CHANNELS = 16
 COLOR_SPACES = ("srgb", "linear")
 NONFINITE = ("error", "clean")
 
-#: Largest distance of a normal's length from 1, and least share of such texels in an image that looks like normals, or
-#: that has the name of normals.
-_LENGTH, _LOOKS, _NAMED = 0.15, 0.95, 0.5
+#: Largest distance of a normal's length from 1.
+_NORMAL_LENGTH = 0.15
+
+#: Least share of normals among the texels of an image that looks like a normal map.
+_LOOKS_NORMAL = 0.95
+
+#: Least share of normals among the texels of an image that has the name of a normal map.
+_NAMED_NORMAL = 0.5
 
 #: Content of images without a name, and of maps with an unknown one.
-_COLOURS, _UNKNOWN = Content("albedo", colours=True), Content("other")
+_COLOURS = Content("albedo", colours=True)
+_UNKNOWN = Content("other")
 
 _DEPTHS = {"uint8": 1, "uint16": 2, "uint32": 4, "float16": 2, "float32": 4, "float64": 4}
 _ENCODED = ("uint8", "uint16")  # types whose full range means 0 … 1
@@ -234,9 +240,11 @@ def _content_of_image(path: Path, values: np.ndarray) -> tuple[Content, list[str
     content, share = content_of(path.stem) or _COLOURS, _share_of_normals(values)
     if content.colours:
         looks = f'{path.name}: looks like a normal map, but is taken for colours: a manifest may call it "normal"'
-        return _COLOURS, [looks] if share > _LOOKS else []
+        return _COLOURS, [looks] if share > _LOOKS_NORMAL else []
     described = {"other": "data", "ao": "an AO map"}.get(content.role, f"a {content.role} map")
-    fits = share > _NAMED if content.role == "normal" else content.packed or values.shape[2] == 1 or _equal(values)
+    fits = (
+        share > _NAMED_NORMAL if content.role == "normal" else content.packed or values.shape[2] == 1 or _equal(values)
+    )
     if not fits:
         return _COLOURS, [f"{path.name}: has the name of {described}, but the values of colours, which it is taken for"]
     down = "; y points down (DirectX), Mitsuba expects OpenGL" if content.y_down else ""
@@ -510,7 +518,7 @@ def _share_of_normals(values: np.ndarray) -> float:
         normals /= np.iinfo(values.dtype).max
     normals = normals if (normals < 0).any() else 2 * normals - 1  # signed, or stored as (n + 1)/2
     with np.errstate(over="ignore", invalid="ignore"):
-        unit = np.abs(np.linalg.norm(normals, axis=2) - 1) < _LENGTH
+        unit = np.abs(np.linalg.norm(normals, axis=2) - 1) < _NORMAL_LENGTH
     return float((unit & (normals[..., 2] > 0)).mean())
 
 
@@ -577,7 +585,7 @@ def _notes_on(m: _RawMap) -> list[str]:
         return [f'map "{m.name}": normals of DirectX, y is inverted to that of OpenGL, which Mitsuba expects']
     if m.content.packed and m.values.shape[2] > 1:
         return [f'map "{m.name}": holds several maps, which are kept as one: "channels" gives each a map of its own']
-    if m.content.role == "other" and not m.content.colours and _share_of_normals(m.values) > _LOOKS:
+    if m.content.role == "other" and not m.content.colours and _share_of_normals(m.values) > _LOOKS_NORMAL:
         return [f'map "{m.name}": looks like a normal map, but is taken for other data: call it "normal"']
     if m.content is not _UNKNOWN:
         return [] if content_of(m.name) else [f'map "{m.name}": has the role {m.content.role} by the name of its file']

@@ -222,8 +222,11 @@ def _inside(x, border: str):
     return x - dr.floor(x) if border == "repeat" else dr.clip(x, 0, 1)
 
 
-#: Levels of the preview, and the factor by which differences are amplified.
-LEVELS, AMPLIFIED = (0, 2, 4), 4
+#: Levels of the preview.
+LEVELS = (0, 2, 4)
+
+#: Factor by which the preview amplifies differences.
+AMPLIFIED = 4
 
 #: Approximate mean linear value of the image that is chosen.
 BRIGHTNESS = 0.3

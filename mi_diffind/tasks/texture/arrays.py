@@ -335,8 +335,11 @@ class PrincipalComponents:
     low: np.ndarray
     high: np.ndarray
 
-    #: Room between the components' range and the ends of [0, 1], and the share of texels beyond it at either end.
-    MARGIN, OUTSIDE = 0.02, 1e-3
+    #: Room between the range of components and the ends of [0, 1].
+    MARGIN = 0.02
+
+    #: Share of texels beyond the range of components at either end.
+    OUTSIDE = 1e-3
 
     @staticmethod
     def of(values: np.ndarray, dims: int) -> PrincipalComponents:
