@@ -37,7 +37,6 @@ from ..images import srgb
 from ..plugins.support import footprint
 from . import loading, splats
 from .poses import orbit_directions, pose, sphere_directions, upright_frame
-from .splats import is_splats
 
 #: Samples of the whole image in one pass.
 PASS = 1 << 23
@@ -304,7 +303,7 @@ def _cached_camera(content: bytes) -> tuple[CaptureCamera, dict]:
 
 def _subject(scene, defines: Mapping | None, settings: CaptureSettings) -> SceneSubject | splats.SplatSubject:
     """Return the subject of a capture. Raises :class:`.UsageError`."""
-    if not is_splats(scene):
+    if not splats.is_splats(scene):
         if settings.box is not None:
             raise UsageError("box: given with a scene, allowed are files of 3D Gaussians; objects names shapes")
         return SceneSubject(scene, defines, settings.objects)
@@ -391,7 +390,7 @@ def _settings(scene, given: dict) -> CaptureSettings:
     names = ("centre", "elevation", "up", "objects", "box")
     tuples = {name: tuple(given[name]) for name in names if given.get(name) is not None}
     if given.get("spp") is None:
-        tuples["spp"] = splats.SPP if is_splats(scene) else CaptureSettings.spp
+        tuples["spp"] = splats.SPP if splats.is_splats(scene) else CaptureSettings.spp
     return CaptureSettings(**{**given, **tuples})
 
 
