@@ -56,12 +56,6 @@ def folder(tmp_path, monkeypatch):
     return tmp_path, fits
 
 
-def save_image(path, values):
-    import mitsuba as mi
-
-    mi.Bitmap(np.ascontiguousarray(values, np.uint8)).write(str(path))
-
-
 def parsed(folder, objects, name="scene.xml"):
     (folder / name).write_text(SCENE.replace("OBJECTS", objects))
     return loading.ParsedScene(folder / name)
@@ -257,23 +251,17 @@ def test_small_and_noisy_images_stay(mi_rgb, folder):
     folder, fits = folder
     rng = np.random.default_rng(1)
     sizes = [(1, 1, 3), (4, 1, 3), (1, 64, 4), (7, 3, 1), (32, 32, 3), (36, 37, 3), (63, 64, 1)]
-    for i, size in enumerate(sizes):
-        save_image(folder / f"small{i}.png", rng.integers(0, 256, size))
-    save_image(folder / "noise.png", rng.integers(0, 256, (64, 64, 3)))
+    names = [f"small{i}" for i in range(len(sizes))]
+    for name, size in zip([*names, "noise"], [*sizes, (64, 64, 3)], strict=True):
+        mi_rgb.Bitmap(rng.integers(0, 256, size).astype(np.uint8)).write(str(folder / f"{name}.png"))
     material = """<bsdf type="diffuse" id="m{0}"><texture type="bitmap" name="reflectance">
         <string name="filename" value="{0}.png"/></texture></bsdf>"""
-    names = [f"small{i}" for i in range(len(sizes))]
     scene = parsed(folder, "".join(map(material.format, [*names, "noise"])))
     *small, noise = conversion.replace_stock(scene, ["bitmap"], folder / "tables", progress=False)
     for size, name, one in zip(sizes, names, small, strict=True):
         assert str(one) == f'bitmap "m{name}": {name}.png has {np.prod(size):,} bytes, of which no fit would save any'
-    assert (
-        len(fits) == 1
-        and noise.learned == ""
-        and re.fullmatch(
-            r"noise\.png would have 1\d\.\d dB, at least 25 are needed: fit it by hand, with more bytes", noise.reason
-        )
-    )
+    expected = r"noise\.png would have 1\d\.\d dB, at least 25 are needed: fit it by hand, with more bytes"
+    assert len(fits) == 1 and noise.learned == "" and re.fullmatch(expected, noise.reason)
     (again,) = [c for c in conversion.replace_stock(scene, ["bitmap"], folder / "tables") if c.name == "mnoise"]
     assert again == noise and len(fits) == 1
 
@@ -292,12 +280,9 @@ def test_windings_and_mirrorings(mi_rgb, tmp_path, wound):
             props["filename"], props["to_world"] = str(tmp_path / "ball.ply"), placed
             props["flip_normals"], props["face_normals"] = flipped, True
             shape = mi.load_dict({"type": "ply", **{key: props[key] for key in props}})
-            si = mi.load_dict({"type": "scene", "shape": shape}).ray_intersect(
-                mi.Ray3f(
-                    mi.Point3f(0),
-                    mi.warp.square_to_uniform_sphere(mi.Point2f(*np.random.default_rng(0).random((2, 999)))),
-                )
-            )
+            points = mi.Point2f(*np.random.default_rng(0).random((2, 999)))
+            rays = mi.Ray3f(mi.Point3f(0), mi.warp.square_to_uniform_sphere(points))
+            si = mi.load_dict({"type": "scene", "shape": shape}).ray_intersect(rays)
             inwards = np.mean(np.sum(np.array(si.n) * np.array(si.p), axis=0) < 0)
             if inwards < 0.005:
                 distance_shapes.check_normals(props, tmp_path / "ball.ply")

@@ -108,13 +108,8 @@ def test_what_is_refused(mi_rgb):
 
 
 def test_figures_for_people():
-    figures = {
-        "psnr_db": 27.176,
-        "psnr_l0_db": 30,
-        "psnr_l1_db": 31.5,
-        "normal_p95_deg": 6.1,
-        "peak_error_0.1_0.5": 0.87,
-    }
+    figures = {"psnr_db": 27.176, "psnr_l0_db": 30, "psnr_l1_db": 31.5}
+    figures |= {"normal_p95_deg": 6.1, "peak_error_0.1_0.5": 0.87}
     assert labelled(figures) == [
         "PSNR                   27.18 dB",
         "PSNR of levels         30.00, 31.50 dB",

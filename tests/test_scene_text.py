@@ -129,18 +129,12 @@ def test_files_includes_and_parameters(mi_rgb, folders, body, expected, folder):
     """Files are found from the new folder; an included file that changes takes the place of its include."""
     a, _ = folders
     new = written(a / "scene.xml", f"{HEAD}{body}</scene>", a.parent / folder / "new.xml")
-    up, file, dollar, quoted = "", "$f", "$p.png", '"ä &amp; &quot;b&quot;.png"'
-    numbered = "l&#101;a&#x66;.png" if folder != "b" else "../a/leaf.png"
-    if folder == "b":
-        up, file, dollar, quoted = "../a/", *2 * ["../a/leaf.png"], "'../a/ä &amp; \"b\".png'"
-    for placeholder, value in (
-        ("NUMBERED", numbered),
-        ("UP", up),
-        ("FILE", file),
-        ("DOLLAR", dollar),
-        ("QUOTED", quoted),
-    ):
-        expected = expected.replace(placeholder, value)
+    values = {
+        "a": ("l&#101;a&#x66;.png", "", "$f", "$p.png", '"ä &amp; &quot;b&quot;.png"'),
+        "b": ("../a/leaf.png", "../a/", "../a/leaf.png", "../a/leaf.png", "'../a/ä &amp; \"b\".png'"),
+    }
+    for name, value in zip(("NUMBERED", "UP", "FILE", "DOLLAR", "QUOTED"), values[folder], strict=True):
+        expected = expected.replace(name, value)
     assert new == f"{HEAD}{expected}</scene>"
 
 
@@ -225,8 +219,7 @@ def test_the_example_scenes(mi_rgb, tmp_path):
     """Each of them, with nothing learned, in another folder: the same objects in Mitsuba's words, but for paths."""
     for source in sorted((Path(__file__).parents[1] / "scenes").glob("*.xml")):
         conversion.convert(source, tmp_path / source.name, learn=[])
-        states = [
-            loading.ParsedScene(path).change(scene_text.absolute_paths) for path in (source, tmp_path / source.name)
-        ]
+        paths = source, tmp_path / source.name
+        states = [loading.ParsedScene(path).change(scene_text.absolute_paths) for path in paths]
         lines = [re.sub(r"object_\d+", "", "\n".join(str(node.props) for node in state.nodes)) for state in states]
         assert lines[0] == lines[1] and lines[0].count("\n") > 20

@@ -17,7 +17,6 @@ from mi_diffind.arrays.tables import TableError, load_table, save_table
 from mi_diffind.core.arguments import add_arguments
 from mi_diffind.core.compat import use_threads, was_compiled
 from mi_diffind.core.errors import UsageError
-from mi_diffind.core.files import OutputError
 from mi_diffind.core.progress import Deadline
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting.settings import FitSettings
@@ -40,12 +39,12 @@ from mi_diffind.scenes.training.problem import SceneProblem, exposure_of
 from mi_diffind.scenes.training.references import ReferenceRenders
 from mi_diffind.scenes.training.rig import Rig
 from mi_diffind.scenes.training.trained_scene import (
+    SceneTexture,
     TrainedScene,
     load_textures,
     texture_budget,
     texture_file,
     texture_files,
-    texture_problem,
     texture_recipe,
 )
 from mi_diffind.tasks.texture import PRESETS
@@ -89,7 +88,7 @@ def trained(folder, path):
     parsed = loading.ParsedScene(path)
     file, _ = texture_file(parsed)
     table = load(file)
-    problem = texture_problem(table, load_source(folder / "material.json"))
+    problem = SceneTexture(file, table).problem
     scene = TrainedScene(parsed, {file: table}, ORBIT, 1)
     return scene, problem
 
@@ -420,11 +419,6 @@ def test_references_are_the_exact_scene(path):
         image = references_of(file, ViewDistribution(), 64).images([View()])[0]
         assert image.shape == (24, 24, 3) and not np.array_equal(image, expected)
         assert np.abs(image - expected).mean() < 0.05 * expected.mean()
-
-
-def test_a_folder_for_references_that_cannot_be(path, tmp_path):
-    with pytest.raises(OutputError, match="does not exist"):
-        references_of(path, ViewDistribution(), 4, tmp_path / "nowhere" / "kept")
 
 
 def test_a_scene_may_be_a_dictionary(folder, trained):

@@ -220,15 +220,16 @@ class BlockReference:
     def from_groups(cls, passes: np.ndarray, groups: np.ndarray, height: int, width: int) -> BlockReference:
         """Return the reference of single ``passes`` and of the means of ``groups`` of passes."""
         mean = groups.mean(axis=0)
-        dark = _dark(mean, height, width)
+        reference = cls(passes, mean, np.empty(0), height, width)
         others = (len(groups) * mean - groups) / (len(groups) - 1)
-        stops = np.array([mean_stops(*pair, dark) for pair in zip(groups, others, strict=True)])
-        return cls(passes, mean, stops, height, width)
+        stops = [mean_stops(*pair, reference.dark) for pair in zip(groups, others, strict=True)]
+        return replace(reference, stops=np.array(stops))
 
     @property
     def dark(self) -> float:
         """Darkest brightness that counts, linear."""
-        return _dark(self.mean, self.height, self.width)
+        total = (np.abs(self.mean) * _pixels(self.height, self.width)).sum()
+        return DARK * float(total / (self.height * self.width * self.mean.shape[-1]))
 
     def test(self, check: np.ndarray, not_finite: int = 0) -> BlockTest:
         """Test whether a check, block means ``(8, rows, columns, channels)``, shows the scene of the reference.
@@ -310,10 +311,6 @@ class BlockReference:
                 change = np.minimum(change, needed.min(axis=(1, 2, 3)))
             smallest.extend(change)
         return float(np.quantile(smallest, POWER, method="higher")) if smallest else math.inf
-
-
-def _dark(blocks: np.ndarray, height: int, width: int) -> float:
-    return DARK * float((np.abs(blocks) * _pixels(height, width)).sum() / (height * width * blocks.shape[-1]))
 
 
 # -- pictures before and after ----------------------------------------------------------------------------------------

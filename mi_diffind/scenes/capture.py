@@ -37,7 +37,6 @@ from ..images import srgb
 from ..plugins.support import footprint
 from . import loading, splats
 from .poses import orbit_directions, pose, sphere_directions, upright_frame
-from .splats import is_splats
 
 #: Samples of the whole image in one pass.
 PASS = 1 << 23
@@ -304,7 +303,7 @@ def _cached_camera(content: bytes) -> tuple[CaptureCamera, dict]:
 
 def _subject(scene, defines: Mapping | None, settings: CaptureSettings) -> SceneSubject | splats.SplatSubject:
     """Return the subject of a capture. Raises :class:`.UsageError`."""
-    if not is_splats(scene):
+    if not splats.is_splats(scene):
         if settings.box is not None:
             raise UsageError("box: given with a scene, allowed are files of 3D Gaussians; objects names shapes")
         return SceneSubject(scene, defines, settings.objects)
@@ -360,8 +359,7 @@ class SceneSubject:
 
     def bounds(self) -> np.ndarray:
         """Return the corners ``(2, 3)`` of the captured objects' box. Raises :class:`CaptureError`."""
-        boxes = np.array([_box(s) for s in self.shapes()])
-        box = np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
+        box = loading.bounds(self.shapes())
         if not np.isfinite(box).all():
             raise CaptureError("the box around the captured objects is not finite: name the objects")
         return box
@@ -374,17 +372,13 @@ class SceneSubject:
             if vertices in parameters:
                 points = np.array(parameters[vertices], np.float64).reshape(-1, 3)
             else:
-                points = np.array(list(itertools.product(*_box(shape).T)))
+                points = np.array(list(itertools.product(*loading.bounds([shape]).T)))
             reach = max(reach, float(np.linalg.norm(points - centre, axis=1).max()))
         return reach
 
     def camera(self, settings: CaptureSettings) -> CaptureCamera:
         """Return the camera of a capture with these settings."""
         return CaptureCamera(self, settings)
-
-
-def _box(shape) -> np.ndarray:
-    return np.array([shape.bbox().min, shape.bbox().max], np.float64).reshape(2, 3)
 
 
 def _settings(scene, given: dict) -> CaptureSettings:
@@ -396,7 +390,7 @@ def _settings(scene, given: dict) -> CaptureSettings:
     names = ("centre", "elevation", "up", "objects", "box")
     tuples = {name: tuple(given[name]) for name in names if given.get(name) is not None}
     if given.get("spp") is None:
-        tuples["spp"] = splats.SPP if is_splats(scene) else CaptureSettings.spp
+        tuples["spp"] = splats.SPP if splats.is_splats(scene) else CaptureSettings.spp
     return CaptureSettings(**{**given, **tuples})
 
 

@@ -145,7 +145,8 @@ class _Side:
             dr.kernel_history_clear()
             image, seconds = loading.render(self.scene, spp * self.oversampling, seed, self.oversampling, on_pass)
             self.compiled.append(compat.was_compiled(dr.kernel_history()))
-        loading.check_finite(image, self.name)
+        if count := metrics.nonfinite_pixels(image):
+            raise loading.SceneError(f"{self.name}: {count:,} of {math.prod(image.shape[:2]):,} pixels are not finite")
         image = image[..., :3].astype(np.float64)
         half = len(self.seconds) % 2
         self.halves[half] = self.halves[half] + spp * np.repeat(image, 3 // image.shape[-1], -1)

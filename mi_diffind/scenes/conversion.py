@@ -212,13 +212,7 @@ def _around(references: list[list[int]], index: int) -> Iterator[int]:
 
 def _below(references: list[list[int]], index: int) -> list[int]:
     """Return all objects that one nests or refers to, directly or not."""
-    seen, todo = set(), list(references[index])
-    while todo:
-        other = todo.pop()
-        if other not in seen:
-            seen.add(other)
-            todo += references[other]
-    return sorted(seen)
+    return sorted({i for other in references[index] for i in (other, *_below(references, other))})
 
 
 def _trace_by(seen_by: tuple[str, ...], integrators: list) -> list[Conversion]:
@@ -361,7 +355,10 @@ def save(source, path: str | os.PathLike, storage: str = "", file: str | os.Path
         raise UsageError(f"{path}: {e}") from None
     stored.settings = moved_paths(stored.settings, Path(table.path or "x").resolve().parent, path.resolve().parent)
     save_table(path, stored)
-    return Saved(path, stored.nbytes, stored.storage, _rms_errors(stored, entries))
+    read = task_of(stored).model(stored, mi.TensorXf, "float32").entries()
+    errors = {name: array.numpy().reshape(-1) - read[name].numpy().reshape(-1) for name, array in entries.items()}
+    rms = {name: float(np.sqrt(np.mean(np.square(e, dtype=np.float64)))) for name, e in errors.items()}
+    return Saved(path, stored.nbytes, stored.storage, rms)
 
 
 def _optimised_table(source, file: str) -> tuple[Table, dict]:
@@ -387,10 +384,3 @@ def _optimised_table(source, file: str) -> tuple[Table, dict]:
         names = ", ".join(str(table.path) for table, _ in trained.values())
         raise UsageError(f"save: found the tables of several files ({names}): name one of them by file")
     return next(iter(trained.values()))
-
-
-def _rms_errors(stored: Table, entries: dict) -> dict[str, float]:
-    """Return the root mean square errors of stored entries."""
-    read = task_of(stored).model(stored, mi.TensorXf, "float32").entries()
-    pairs = {name: (array.numpy().reshape(-1), read[name].numpy().reshape(-1)) for name, array in entries.items()}
-    return {name: float(np.sqrt(np.mean(np.square(a - b, dtype=np.float64)))) for name, (a, b) in pairs.items()}

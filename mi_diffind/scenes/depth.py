@@ -123,21 +123,16 @@ def bounces(images: Sequence[np.ndarray], full: np.ndarray) -> list[Bounce]:
     return [Bounce(k + 1, *map(float, each)) for k, each in enumerate(parts)][:-1]
 
 
-def check_tolerance(tolerance: float) -> None:
-    """Raise ``ValueError`` unless the tolerance is between 0 and 1."""
-    if not 0 < tolerance < 1:
-        raise ValueError(f"tolerance: found {tolerance:g}, allowed is more than 0 and less than 1")
-
-
 def auto_depth(parsed: loading.ParsedScene, tolerance: float = TOLERANCE, seed: int = 0, progress: bool = True) -> dict:
     """Render a scene coarsely to growing depths, and choose the depth of its paths.
 
     Returns ``chosen``, the scene's own depth (``scene``, -1: infinite) if no smaller one is enough, the ``tolerance``,
     the ``shares`` of all depths up to it (:class:`Bounce`), the rest (``left_out``, ``left_out_in_a_tile``), and
     ``probe_seconds``. Raises :class:`.SceneError`, also for a scene that has not one integrator with a depth,
-    ``ValueError`` as :func:`check_tolerance`, and ``KeyboardInterrupt``.
+    ``ValueError`` unless the tolerance is between 0 and 1, and ``KeyboardInterrupt``.
     """
-    check_tolerance(tolerance)
+    if not 0 < tolerance < 1:
+        raise ValueError(f"tolerance: found {tolerance:g}, allowed is more than 0 and less than 1")
     _, max_depth = parsed.path_integrator()
     scene, start = parsed.load(), time.perf_counter()
     last = DEEPEST if max_depth < 0 else min(max_depth, DEEPEST)
@@ -153,7 +148,8 @@ def auto_depth(parsed: loading.ParsedScene, tolerance: float = TOLERANCE, seed: 
             bar.update()
             if shares[-1].is_enough(tolerance):
                 break
-    chosen = shares[-1].depth if images and shares[-1].is_enough(tolerance) else max_depth
+    enough = bool(images) and shares[-1].is_enough(tolerance)
+    chosen = shares[-1].depth if enough else max_depth
     return {
         "chosen": chosen,
         "scene": max_depth,

@@ -83,7 +83,12 @@ def inspect(file_or_scene, measure: bool = False, *, defines: Mapping[str, objec
         loaded = loading.load_dict(file_or_scene)
     if not isinstance(loaded, mi.Object):
         raise UsageError(f"inspect: found a {type(loaded).__name__}, allowed are a file, a dictionary and a scene")
-    reports = _reports(loaded)
+    paths, counterparts, reports = object_paths(loaded), plugins.with_counterpart(), []
+    owners = owner_names(paths)
+    for path, node in paths.items():
+        if plugins.origin(node) is not None:
+            report = loading.instance_report(node, loaded)
+            reports.append({"owner": owners[path], "learned": report["plugin"] in counterparts, **report})
     if learned is None:
         learned = [plugins.origin(instance) for instance in loading.learned_instances(loaded)]
         tables = {
@@ -97,17 +102,6 @@ def inspect(file_or_scene, measure: bool = False, *, defines: Mapping[str, objec
         "table_bytes": sum(tables.values()),
         "tables": [{"file": name, "storage": storage, "bytes": size} for (name, storage), size in tables.items()],
     })  # fmt: skip
-
-
-def _reports(scene) -> list[dict]:
-    """Return the report on each plugin of this package, with the ``owner`` of its parameters."""
-    paths, learned = object_paths(scene), plugins.with_counterpart()
-    owners, reports = owner_names(paths), []
-    for path, node in paths.items():
-        if plugins.origin(node) is not None:
-            report = loading.instance_report(node, scene)
-            reports.append({"owner": owners[path], "learned": report["plugin"] in learned, **report})
-    return reports
 
 
 def object_paths(scene) -> dict[str, object]:

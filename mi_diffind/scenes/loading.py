@@ -22,7 +22,6 @@ from ..core.files import MOST_TEXT, irregular, replacing, shown
 from ..core.runtime import use_variant
 from ..core.threads import in_turn, threads_for_files
 from ..fitting.task import tasks
-from ..images import metrics
 from ..measure.clock import bsdf_operations
 from ..plugins.support import footprint, omissions
 
@@ -61,12 +60,6 @@ def warn_if_black(scene, path: str | os.PathLike, images) -> None:
     """Warn if all ``images`` of a loaded scene are black."""
     if not any(image[..., :3].any() for image in images):
         plugins.warn(f"{path}: the picture is black{'' if scene.emitters() else ', the scene has no emitter'}")
-
-
-def check_finite(image: np.ndarray, name: str) -> None:
-    """Raise :class:`SceneError` if pixels of the image ``name`` are NaN or infinite."""
-    if count := metrics.nonfinite_pixels(image):
-        raise SceneError(f"{name}: {count:,} of {image.shape[0] * image.shape[1]:,} pixels are not finite")
 
 
 def use_slashes(state) -> None:
@@ -214,13 +207,19 @@ class ParsedScene:
             props["max_depth"] = longest_path
             return mi.PluginManager.instance().create_object(props)
 
-    def learned_plugins(self, against: str | tuple[str, ...] = "exact") -> list[dict]:
+    def learned_plugins(
+        self, against: str | tuple[str, ...] = "exact", change: Callable[[object], object] | None = None
+    ) -> list[dict]:
         """Return the descriptions (:meth:`.plugins.Plugin.described`) of the learned plugins, in the file's order.
 
-        With ``against``, of all plugins that have the counterpart of this name, or of one of these names.
+        With ``against``, of all plugins that have the counterpart of this name, or of one of these names; after a
+        ``change`` of the scene as of :meth:`load`.
         """
         with self._errors():
-            return [plugin.described(props) for props, plugin in _replaceable(self._copy(), against)]
+            state = self._copy()
+            if change is not None:
+                change(state)
+            return [plugin.described(props) for props, plugin in _replaceable(state, against)]
 
     def tables(self, learned: list[dict]) -> dict[tuple[str, str], object]:
         """Return the distinct tables of learned plugins: ``(file, storage)`` → :class:`.Table`.
@@ -474,6 +473,12 @@ def film_size(scene) -> tuple[int, int]:
     """Return the width and height, in pixels, of the images of a scene's first sensor."""
     width, height = scene.sensors()[0].film().crop_size()
     return int(width), int(height)
+
+
+def bounds(shapes) -> np.ndarray:
+    """Return the corners ``(2, 3)`` of the box around shapes; they are infinite if there are none."""
+    boxes = np.array([[s.bbox().min, s.bbox().max] for s in shapes], np.float64).reshape(-1, 2, 3)
+    return np.stack([boxes[:, 0].min(axis=0, initial=np.inf), boxes[:, 1].max(axis=0, initial=-np.inf)])
 
 
 def sample_counts(scene, spp: int, passes: int = 1) -> list[int]:

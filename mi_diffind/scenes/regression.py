@@ -19,7 +19,7 @@ import os
 import threading
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -110,12 +110,6 @@ def read_reference(path: str | os.PathLike, references: str | os.PathLike | None
     if len(parts) != 2:
         raise BadReference(f"{stored}: is a reference of an earlier version, render it again with --update")
     return _reference(stored, about, *(channels for _, channels in parts))
-
-
-def read_settings(path: str | os.PathLike, references: str | os.PathLike | None = None) -> dict:
-    """Return ``about`` of a scene's reference in this variant, also of earlier versions; nothing if there is none."""
-    stored = reference_path(path, references)
-    return _about(stored, Path(path).stem, _parts(stored)) if stored.is_file() else {}
 
 
 def _names(channels: int) -> str:
@@ -248,20 +242,13 @@ def _passes(scene, size: PassSize, seed: int, numbers: range, bar, stop: threadi
             return
 
 
-@dataclass(frozen=True)
-class Check:
-    """Passes of a check: their mean ``image``, and ``blocks``, ``(8, rows, columns, channels)``.
+def _render_check(
+    scene, size: PassSize, seed: int, title: str, progress: bool, stop: threading.Event
+) -> tuple[np.ndarray, np.ndarray, int] | None:
+    """Render a check; return its mean image, its blocks and the number of pixels that are not finite in a pass.
 
-    ``not_finite``: number of pixels that are not finite in a pass; the blocks that hold them are not finite either.
+    The blocks are ``(8, rows, columns, channels)``; those with such pixels are not finite. ``None`` after Ctrl-C.
     """
-
-    image: np.ndarray
-    blocks: np.ndarray
-    not_finite: int
-
-
-def _render_check(scene, size: PassSize, seed: int, title: str, progress: bool, stop: threading.Event) -> Check | None:
-    """Render the passes of a check; ``None`` after Ctrl-C."""
     image, blocks = 0, []
     with progress_bar(title, CHECK_PASSES, progress=progress) as bar, np.errstate(invalid="ignore", over="ignore"):
         for one in _passes(scene, size, seed, range(CHECK_PASSES), bar, stop):
@@ -270,45 +257,25 @@ def _render_check(scene, size: PassSize, seed: int, title: str, progress: bool, 
         image = np.float32(image)
     if stop.is_set():
         return None
-    return Check(image, np.stack(blocks), int((~np.isfinite(image)).any(axis=-1).sum()))
+    return image, np.stack(blocks), int((~np.isfinite(image)).any(axis=-1).sum())
 
 
-@dataclass
-class PassSums:
-    """Passes of a reference that is being rendered: the sum of the images, and the ``blocks`` of each pass."""
-
-    image: np.ndarray | float = 0.0
-    blocks: list[np.ndarray] = field(default_factory=list)
-
-    def add(self, image: np.ndarray) -> None:
-        """Add the next pass."""
-        self.image = self.image + image
-        self.blocks.append(block_means(image).astype(np.float32))
-
-    def reference(self, about: dict) -> Reference:
-        """Return the reference of all passes, with its ``visible_change``, ``None`` for infinity, in ``about``."""
-        image = np.float32(self.image / len(self.blocks))
-        passes = np.stack(self.blocks).astype(np.float64)
-        groups = passes.reshape(-1, CHECK_PASSES, *passes.shape[1:])
-        blocks = BlockReference.from_groups(passes[:REFERENCE_PASSES], groups.mean(axis=1), *image.shape[:2])
-        change = blocks.visible_change(groups[REFERENCE_PASSES // CHECK_PASSES :])
-        return Reference(image, blocks, {**about, "visible_change": change if math.isfinite(change) else None})
+def _from_passes(image: np.ndarray, blocks: list[np.ndarray], about: dict) -> Reference:
+    """Return the reference of the sum of all passes and the blocks of each, with ``visible_change`` in ``about``."""
+    image, passes = np.float32(image / len(blocks)), np.stack(blocks).astype(np.float64)
+    groups = passes.reshape(-1, CHECK_PASSES, *passes.shape[1:])
+    stored = BlockReference.from_groups(passes[:REFERENCE_PASSES], groups.mean(axis=1), *image.shape[:2])
+    change = stored.visible_change(groups[REFERENCE_PASSES // CHECK_PASSES :])
+    return Reference(image, stored, {**about, "visible_change": change if math.isfinite(change) else None})
 
 
-def write_partial(path: Path, sums: PassSums, key: dict) -> None:
-    """Keep the passes of an unfinished reference, with a ``key`` (JSON) of all that the render depends on."""
-    about = np.frombuffer(json.dumps(key).encode(), np.uint8)
-    with replacing(path) as temporary, open(temporary, "wb") as stream:
-        np.savez(stream, image=sums.image, blocks=np.stack(sums.blocks), about=about)
-
-
-def read_partial(path: Path, key: dict) -> PassSums:
-    """Return the kept passes of the render with the same ``key``; none if missing or damaged."""
+def _read_partial(path: Path, key: dict) -> tuple[np.ndarray | float, list[np.ndarray]]:
+    """Return the sum and the blocks of the kept passes of the render with the same ``key``; none if damaged."""
     with contextlib.suppress(Exception), Archive(path) as archive:
         image, blocks = archive.array("image").copy(), archive.array("blocks")
         if archive.json("about") == key and np.isfinite(image).all() and np.isfinite(blocks).all():
-            return PassSums(image, list(blocks))
-    return PassSums()
+            return image, list(blocks)
+    return 0.0, []
 
 
 # -- checks and updates -----------------------------------------------------------------------------------------------
@@ -325,7 +292,7 @@ def _update_reference(
     files, or this package have changed.
     """
     output, stem = reference_path(path, references), Path(path).stem
-    before = read_settings(path, references)
+    before = _about(output, stem, _parts(output)) if output.is_file() else {}
     parsed = _parse(scene, {**before.get("defines", {}), **defines})
     scene = parsed.load()
     writable_folder(output.parent, create=True)
@@ -338,30 +305,33 @@ def _update_reference(
     partial = output.with_suffix(".partial.npz")
     about = {"scene": stem, "variant": mi.variant(), "defines": parsed.defines, "seed": seed, "budget": size.check_spp}
     key = about | {"sources": fingerprint(sources() | set(parsed.files())) + mi.__version__ + parsed.description}
-    sums, start = read_partial(partial, key), time.perf_counter()
+    (total, blocks), start = _read_partial(partial, key), time.perf_counter()
     result = {
         **_facts(path, str(output), width, height, seed, parsed.defines), "budget": size.check_spp, "asked_spp": asked,
-        "spp": size.check_spp * GROUPS, "reused_passes": len(sums.blocks), "partial": None,
+        "spp": size.check_spp * GROUPS, "reused_passes": len(blocks), "partial": None,
     }  # fmt: skip
     with interruptible() as stop:
-        with progress_bar(f"{stem}: reference", PASSES, initial=len(sums.blocks), progress=progress) as bar:
-            for image in _passes(scene, size, seed, range(PASSES + len(sums.blocks), 2 * PASSES), bar, stop):
-                sums.add(image)
-        bad = int((~np.isfinite(sums.image)).any(axis=-1).sum())
+        with progress_bar(f"{stem}: reference", PASSES, initial=len(blocks), progress=progress) as bar:
+            for image in _passes(scene, size, seed, range(PASSES + len(blocks), 2 * PASSES), bar, stop):
+                total = total + image
+                blocks.append(block_means(image).astype(np.float32))
+        bad = int((~np.isfinite(total)).any(axis=-1).sum())
         if bad:
             raise loading.SceneError(f"{path}: {bad} pixel(s) are not finite, so this cannot be a reference")
         passed = False
         if not stop.is_set():
-            reference = sums.reference(about)
+            reference = _from_passes(total, blocks, about)
         for seed_of_check in () if stop.is_set() else _OWN_CHECKS:
             check = _render_check(scene, size, seed_of_check, f"{stem}: check", progress, stop)
-            passed = check is not None and reference.blocks.test(check.blocks, check.not_finite).passed
+            passed = check is not None and reference.blocks.test(*check[1:]).passed
             if passed or stop.is_set():
                 break
     result |= {"seconds": time.perf_counter() - start, "interrupted": stop.is_set()}
     if stop.is_set():
-        write_partial(partial, sums, key)
-        return {**result, "spp": len(sums.blocks) * size.renders * size.samples, "partial": str(partial)}
+        with replacing(partial) as temporary, open(temporary, "wb") as stream:
+            about = np.frombuffer(json.dumps(key).encode(), np.uint8)
+            np.savez(stream, image=total, blocks=np.stack(blocks), about=about)
+        return {**result, "spp": len(blocks) * size.renders * size.samples, "partial": str(partial)}
     if not passed:
         raise loading.SceneError(
             f"{path}: fails two checks at {size.check_spp} samples a pixel although nothing has changed: bright paths "
@@ -456,14 +426,15 @@ def regress(
     }  # fmt: skip
     if check is None:
         return Regression(figures)
-    _check_size(path, reference, *check.image.shape)
-    test = reference.blocks.test(check.blocks, check.not_finite)
+    image, *blocks = check
+    _check_size(path, reference, *image.shape)
+    test = reference.blocks.test(*blocks)
     figures |= {
         "passed": test.passed, "blocks": sum(level.failing.size for level in test.levels),
         "failing_blocks": test.failing_blocks, "worst": dataclasses.asdict(test.worst), "stops": test.stops,
         "stops_threshold": test.stops_threshold, "not_finite": test.not_finite,
     }  # fmt: skip
-    result = Regression(figures, check.image, reference.image, test)
+    result = Regression(figures, image, reference.image, test)
     if not test.passed and out is not None:
         figures["files"] = write_failure(out, result)
     return result

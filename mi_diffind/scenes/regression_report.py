@@ -97,18 +97,14 @@ def power(figures: dict) -> str:
     return f"{amount} of brightness in a tile of {width} x {height} nine times of ten"
 
 
-def block_sentence(worst: dict) -> str:
-    """Return the place and the change of a :class:`.block_test.Block`."""
-    return f"block of {Block(**worst)}, t = {worst['t']:.1f}, {worst['channel']}"
-
-
 def reasons(figures: dict) -> list[str]:
     """Return the reasons for which a check failed, as parts of a sentence."""
     parts = []
     if figures["not_finite"]:
         parts.append(f"{figures['not_finite']} pixel(s) are not finite")
     if figures["failing_blocks"]:
-        parts.append(block_sentence(figures["worst"]))
+        worst = figures["worst"]
+        parts.append(f"block of {Block(**worst)}, t = {worst['t']:.1f}, {worst['channel']}")
     if figures["stops"] > figures["stops_threshold"]:
         measured, threshold = figures["stops"], figures["stops_threshold"]
         parts.append(f"off by {measured:.3g} stops on average, noise by {threshold:.3g} at most")

@@ -274,11 +274,8 @@ def along(
 
 def middle(scene) -> np.ndarray:
     """Return the middle of the box of all shapes that are no lights, ``(3,)``; the origin without such shapes."""
-    boxes = [s.bbox() for s in scene.shapes() if not s.is_emitter()]
-    corners = np.array([[b.min, b.max] for b in boxes], np.float64).reshape(-1, 2, 3)
-    if not len(corners) or not np.isfinite(corners).all():
-        return np.zeros(3)
-    return (corners[:, 0].min(axis=0) + corners[:, 1].max(axis=0)) / 2
+    box = loading.bounds(s for s in scene.shapes() if not s.is_emitter())
+    return box.mean(axis=0) if np.isfinite(box).all() else np.zeros(3)
 
 
 def strip(frames: Sequence[np.ndarray], columns: int = COLUMNS) -> np.ndarray:
@@ -286,7 +283,6 @@ def strip(frames: Sequence[np.ndarray], columns: int = COLUMNS) -> np.ndarray:
     columns = min(columns, len(frames))
     rows = -(-len(frames) // columns)
     height, width, channels = frames[0].shape
-    grid = np.zeros((rows, height, columns, width, channels), np.float32)
-    for i, frame in enumerate(frames):
-        grid[i // columns, :, i % columns] = frame
-    return grid.reshape(rows * height, columns * width, channels)
+    grid = np.zeros((rows * columns, height, width, channels), np.float32)
+    grid[: len(frames)] = frames
+    return grid.reshape(rows, columns, *frames[0].shape).swapaxes(1, 2).reshape(rows * height, -1, channels)

@@ -3,11 +3,6 @@
 References are renders of the same scene with exact plugins and many samples. The result is a table file of the task
 ``texture``. This package stands above plugins and scenes, which it renders; :mod:`mi_diffind.tasks.shading` trains for
 shaded values without a scene.
-
-- :mod:`.options`: recipe, views and the arguments of ``fit scene``; :mod:`.fit`: the training and its result;
-- :mod:`.trained_scene`: textures that are trained, and their arrays as parameters of the scene;
-- :mod:`.rig`: camera and lights of a view; :mod:`.references`: renders with exact plugins;
-- :mod:`.problem`: the loss.
 """
 
 from __future__ import annotations

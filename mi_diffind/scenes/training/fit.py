@@ -68,12 +68,13 @@ def fit(request: FitRequest) -> Fitted:
         lines.append(f"the time allowed references of {samples} samples a pixel in place of {recipe.reference_spp}")
     if len(tables) > 1:
         return FittedFiles(table, result, lines, {"views": dataclasses.asdict(views)}, tables=tables)
-    figures = {
-        "arrays": {name: list(a.shape) for name, a in table.arrays.items()},
-        "bits": {name: a.bits for name, a in table.arrays.items()},
-        "views": dataclasses.asdict(views),
-    }
-    return Fitted(table, result, lines, figures)
+    return Fitted(table, result, lines, {**array_figures(table), "views": dataclasses.asdict(views)})
+
+
+def array_figures(table: Table) -> dict[str, dict]:
+    """Return the shapes and the bits of all arrays by their names, as reports contain them."""
+    arrays = table.arrays.items()
+    return {"arrays": {name: list(a.shape) for name, a in arrays}, "bits": {name: a.bits for name, a in arrays}}
 
 
 def as_list(files) -> list:
@@ -245,9 +246,7 @@ class FittedFiles(Fitted):
         common = {k: v for k, v in super().report.items() if k not in ("settings", "measured")}
         files = {
             name: {
-                "bytes": table.nbytes, "settings": table.settings, "measured": table.measured,
-                "arrays": {key: list(array.shape) for key, array in table.arrays.items()},
-                "bits": {key: array.bits for key, array in table.arrays.items()},
+                "bytes": table.nbytes, "settings": table.settings, "measured": table.measured, **array_figures(table)
             }
             for name, table in self.tables.items()
         }  # fmt: skip

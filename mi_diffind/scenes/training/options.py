@@ -37,10 +37,8 @@ class SceneRecipe:
     unlimited). ``reference_spp``: samples a pixel of a reference. ``against``: counterpart of learned plugins in
     references, ``"exact"`` or the name of another one. ``exposure``: factor of all radiance that maps white to 1
     (``None``: maps the value that 5% of the references' pixels exceed). ``start``: one of :data:`STARTS`.
-    ``settings``: the rest; its ``loss`` is that of images, its ``batch`` the texture samples of a step.
-
-    Only ``"mse"`` without a bound has gradients that are right on average at few samples; ``"mae"``, and squared errors
-    beyond the bound, follow the median of noisy pixels rather than their mean.
+    ``settings``: the rest; its ``loss`` is that of images (:mod:`.problem`), its ``batch`` the texture samples of a
+    step.
     """
 
     share: float = 0.9

@@ -4,9 +4,9 @@
 samples. The product is right on average only if both are independent: the value I comes from one set of samples, its
 derivative ∂I from another (``seed`` and ``seed_grad`` of ``mi.render``), and the reference R from a third. The result
 equals the loss (I₁ − R)(I₂ − R) of two renders, at the price of one derivative. An absolute error, and an error beyond
-the bound, contributes its sign, which noise biases however the samples are drawn. In return, no pixel (a highlight on
-metal, a firefly) has a larger gradient than the bound. A component of a BSDF in a scene has no gradient of its own that
-could be clipped; the image has.
+the bound, contributes its sign, which follows the median of noisy pixels rather than their mean. In return, no pixel (a
+highlight on metal, a firefly) has a larger gradient than the bound. A component of a BSDF in a scene has no gradient of
+its own that could be clipped; the image has.
 """
 
 from __future__ import annotations
@@ -128,7 +128,9 @@ class SceneProblem(Problem):
             errors = []
             for i, (view, reference) in enumerate(self.measured):
                 self.scene.place(view)
-                a, b = (self._render_half(2 * i + half) for half in range(2))
+                seeds = (dr.opaque(mi.UInt32, SEEDS - 1 - number) for number in (2 * i, 2 * i + 1))
+                halves = (self.scene.render(seed, seed + SEEDS, self.samples).numpy() for seed in seeds)
+                a, b = (self.exposure * np.nan_to_num(half) for half in halves)
                 truth = np.clip(reference, 0, 1)
                 errors.append(float(np.mean((np.clip(a, 0, 1) - truth) * (np.clip(b, 0, 1) - truth), dtype=np.float64)))
                 if i == 0 and self.preview is not None:
@@ -136,11 +138,6 @@ class SceneProblem(Problem):
             texture = self.texture.measure(net)
         decibels = -10 * math.log10(max(float(np.mean(errors)), 1e-12))
         return {"psnr_db": decibels, **{f"texture_{name}": value for name, value in texture.items()}}
-
-    def _render_half(self, number: int) -> np.ndarray:
-        """Render half the samples of a measurement, the same for the same number."""
-        seed = dr.opaque(mi.UInt32, SEEDS - 1 - number)
-        return self.exposure * np.nan_to_num(self.scene.render(seed, seed + SEEDS, self.samples).numpy())
 
     def _write(self, reference: np.ndarray, image: np.ndarray) -> None:
         difference = SHOWN * np.abs(image - reference)

@@ -82,7 +82,12 @@ class Rig:
             return rotation(self.up, view.light_azimuth or 0.0, centre)
         towards = -light.before[:3, 2] if light.at_infinity else light.centre - centre
         turned = self._rotate_offset(towards, view.light_azimuth, view.light_elevation, None)
-        turn = _aligning_rotation(towards, turned, self.up, view.light_azimuth or 0.0)
+        turn = rotation(self.up, view.light_azimuth or 0.0)
+        azimuthal = turn[:3, :3] @ towards
+        axis = np.cross(azimuthal, turned)
+        sine = np.linalg.norm(axis)
+        if sine >= 1e-12 * np.linalg.norm(azimuthal) * np.linalg.norm(turned):
+            turn = rotation(axis, np.degrees(np.arctan2(sine, azimuthal @ turned))) @ turn
         turn[:3, 3] = centre - turn[:3, :3] @ centre
         return turn
 
@@ -167,14 +172,3 @@ class _Movable:
         self.parameters.update()
         if self.scene:
             self.scene.parameters_changed()  # rays are to find the shape at its place
-
-
-def _aligning_rotation(before: np.ndarray, after: np.ndarray, up: np.ndarray, degrees: float) -> np.ndarray:
-    """Return the rotation by ``degrees`` about ``up``, then the shortest one that aligns ``before`` with ``after``."""
-    turn = rotation(up, degrees)
-    a, b = turn[:3, :3] @ before, after
-    axis = np.cross(a, b)
-    sine = np.linalg.norm(axis)
-    if sine < 1e-12 * np.linalg.norm(a) * np.linalg.norm(b):
-        return turn
-    return rotation(axis, np.degrees(np.arctan2(sine, a @ b))) @ turn

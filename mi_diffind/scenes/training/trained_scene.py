@@ -20,7 +20,7 @@ from ...core.errors import UsageError
 from ...fitting.loop import Problem
 from ...maps.layout import Layout
 from ...maps.pyramid import Pyramid
-from ...maps.source import Source, load_source
+from ...maps.source import load_source
 from ...plugins.support import footprint
 from ...tasks.texture import PRESETS, TextureRecipe
 from ...tasks.texture.arrays import FineArray, PaperBudget, TextureBudget
@@ -32,13 +32,11 @@ from .options import View, ViewDistribution
 from .rig import Rig
 
 
-def array_name(texture: str, array: str) -> str:
-    """Return the name of an array of one of several textures."""
-    return f"{texture}/{array}"
-
-
 class JointNet(nn.Module):
-    """Arrays of several textures; ``names`` are those of the textures, ``nets`` read their arrays."""
+    """Arrays of several textures; ``names`` are those of the textures, ``nets`` read their arrays.
+
+    Each array is called ``TEXTURE/ARRAY``.
+    """
 
     DRJIT_STRUCT = {"nets": tuple, "names": object}  # noqa: RUF012
 
@@ -47,9 +45,9 @@ class JointNet(nn.Module):
 
     @property
     def arrays(self) -> dict[str, DifferentiableArray]:
-        """The arrays by name (:func:`array_name`)."""
+        """The arrays by name."""
         pairs = zip(self.names, self.nets, strict=True)
-        return {array_name(name, key): array for name, net in pairs for key, array in net.arrays.items()}
+        return {f"{name}/{key}": array for name, net in pairs for key, array in net.arrays.items()}
 
     def changed(self, change) -> JointNet:
         """Return a copy with ``change(array, bits)`` in place of each array."""
@@ -142,18 +140,6 @@ def original_of(table: Table, file: Path, given: str = "") -> Path:
     return original.resolve()
 
 
-def texture_problem(table: Table, source: Source) -> TextureProblem:
-    """Return the training problem of a texture alone, by the recipe and from the arrays of its file."""
-    layout = Layout.from_json(table.settings["layout"])
-    if not layout.stored:
-        raise UsageError(f"{table.path}: holds a texture of one colour, without arrays to train")
-    texture = CompressedTexture.of(table, mi.TensorXf, "float32")
-    pyramid = Pyramid.of(source, layout, compat.module_of(mi.TensorXf), texture.border)
-    problem = TextureProblem(texture.net, pyramid, texture_recipe(table), source.digest)
-    problem.settings = problem.recipe.settings
-    return problem
-
-
 class SceneTexture:
     """Texture of a scene: its ``file``, the ``table`` that the training starts from, its source, and its ``problem``.
 
@@ -165,12 +151,17 @@ class SceneTexture:
         self.file, self.table = file, start or table
         self.source_path = original_of(table, file, given)
         self.source = load_source(self.source_path, nonfinite="clean")
-        self.problem = texture_problem(self.table, self.source)
-        self.level_bias = bias_of(self.table.settings)
-        if not trained:
-            recipe, pyramid = self.problem.recipe, self.problem.pyramid
+        layout, recipe = Layout.from_json(self.table.settings["layout"]), texture_recipe(self.table)
+        if not layout.stored:
+            raise UsageError(f"{self.table.path}: holds a texture of one colour, without arrays to train")
+        texture = CompressedTexture.of(self.table, mi.TensorXf, "float32")
+        pyramid = Pyramid.of(self.source, layout, compat.module_of(mi.TensorXf), texture.border)
+        if trained:
+            self.problem = TextureProblem(texture.net, pyramid, recipe, self.source.digest)
+        else:
             self.problem = problem_of(self.source, texture_budget(self.table), recipe, pyramid)
-            self.problem.settings = recipe.settings
+        self.problem.settings, self.level_bias = recipe.settings, bias_of(self.table.settings)
+        if not trained:
             self.table = self.to_table({})
 
     def to_table(self, settings: Mapping) -> Table:
@@ -250,7 +241,7 @@ class TrainedScene:
     """Loaded scene in which textures of the files in ``tables`` read the arrays of these, which can be replaced.
 
     All maps of a file read the same arrays. Each array has one parameter for each map; setting one of them sets the
-    array for all maps. Arrays of several files are called by :func:`array_name`. Renders use the
+    array for all maps. Arrays of several files are called as in :class:`JointNet`. Renders use the
     integrator ``prb`` in place of ``path``, the same estimator: paths are sampled *detached*, without derivatives of
     the sampling decisions, and the values along them are differentiated. The gradient is right on average, since
     neither visible surfaces nor the places of samples depend on a texture's values; the choice of a lobe does, but the
@@ -282,7 +273,7 @@ class TrainedScene:
         self.keys = {}
         for copy in copies.values():
             keys = self._parameters(copy)
-            self.keys |= {array_name(copy.name, n): k for n, k in keys.items()} if len(copies) > 1 else keys
+            self.keys |= {f"{copy.name}/{n}": k for n, k in keys.items()} if len(copies) > 1 else keys
         self.parameters = mi.traverse(self.scene)
         self.parameters.keep([re.escape(key) + "$" for key in self.keys.values()])
 
@@ -320,9 +311,8 @@ class TrainedScene:
     def render(self, seed, seed_grad, spp: int | None = None):
         """Return the image of the current view, a tensor that is differentiable by the arrays.
 
-        Values come from the samples of ``seed``, derivatives from those of ``seed_grad``: the derivative of the loss by
-        the image is then independent of the derivative of the image by the arrays, and their product is right on
-        average for squared errors. ``spp`` (``None``: the scene's) changes no footprints.
+        Values come from the samples of ``seed``, derivatives from those of ``seed_grad`` (:mod:`.problem` says why).
+        ``spp`` (``None``: the scene's) changes no footprints.
         """
         spp = spp or self.spp
         image = mi.render(self.scene, self.parameters, spp=spp, spp_grad=spp, seed=seed, seed_grad=seed_grad)

@@ -6,7 +6,6 @@ import contextlib
 import gc
 import io
 import math
-import queue
 import socket
 import threading
 import time
@@ -68,18 +67,18 @@ def server(host: str, port: int):
 class Page:
     """Page of a session: controls that change it, and the loop that renders (:meth:`run`).
 
-    viser calls back in threads of its own; they only leave requests, which the loop carries out.
+    viser calls back in threads of its own; they only leave requests, which the loop carries out. Of several requests
+    with the same key, such as the value of one parameter, the newest counts.
     """
 
     def __init__(self, session: Session, viser_server):
         self.session, self.server = session, viser_server
-        self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._requests: dict[object, Callable[[], None]] = {}
         self._camera: tuple | None = None  # the newest position and orientation that nobody has looked from
         self._lock, self._wake = threading.Lock(), threading.Event()
         self._moved, self._sent = -math.inf, -math.inf
         self._message, self._picture = "", None
         self._halted = False  # after a refused picture, until something changes
-        self._values: dict[str, object] = {}  # parameters that were asked to change, and have not
         self._controls()
         self.server.on_client_connect(self._connected)
 
@@ -99,9 +98,9 @@ class Page:
         gain = gui.add_slider("gain", 1.0, 100.0, 1.0, session.gain, hint="factor of the difference")
         spp = gui.add_number("samples", session.spp, min=1, max=2**16, step=1, hint="samples per pixel")
         self._on_update(self._view, lambda view: session.show(view=view))
-        self._on_update(divider, lambda divider: session.show(divider=divider))
-        self._on_update(gain, lambda gain: session.show(gain=gain))
-        self._on_update(spp, lambda spp: session.samples(int(spp)))
+        self._on_update(divider, lambda value: session.show(divider=value))
+        self._on_update(gain, lambda value: session.show(gain=value))
+        self._on_update(spp, lambda value: session.samples(int(value)))
         for name, words in session.choices.items():
             menu = gui.add_dropdown(name, words, initial_value=words[0], hint="loads the scene again")
             self._on_update(menu, lambda word, name=name: self._choose(name, word))
@@ -167,17 +166,8 @@ class Page:
         control.on_update(change)
 
     def _change(self, path: str, value) -> None:
-        """Ask for another value of a parameter; of several that wait, the newest counts."""
-        with self._lock:
-            waiting = bool(self._values)
-            self._values[path] = value
-        if not waiting:
-            self._ask(self._change_values)
-
-    def _change_values(self) -> None:
-        with self._lock:
-            values, self._values = self._values, {}
-        self.session.set(values)
+        """Ask for another value of a parameter."""
+        self._ask(lambda: self.session.set({path: value}), path)
 
     def _first_view(self) -> None:
         for client in self.server.get_clients().values():
@@ -188,8 +178,9 @@ class Page:
 
     # -- events of viser, in its threads ------------------------------------------------------------------------------
 
-    def _ask(self, request: Callable[[], None]) -> None:
-        self._requests.put(request)
+    def _ask(self, request: Callable[[], None], key: object = None) -> None:
+        with self._lock:
+            self._requests[request if key is None else key] = request
         self._wake.set()
 
     def _connected(self, client) -> None:
@@ -228,34 +219,30 @@ class Page:
 
     def _step(self) -> bool:
         """Do the next piece of work; return whether there was one."""
-        worked = False
-        while True:
-            try:
-                request = self._requests.get_nowait()
-            except queue.Empty:
-                break
-            self._message, self._halted, worked = "", False, True
+        with self._lock:
+            requests, self._requests = self._requests, {}
+            camera, self._camera = self._camera, None
+        for request in requests.values():
+            self._message, self._halted = "", False
             try:
                 request()
             except DiffindError as e:
                 self._message = str(e)
                 self._list_parameters()  # sliders of the values that the scene kept
-        if worked:
+        if requests:
             self._show(self.session.picture() if self._picture is not None and self.session.passes else None)
-        with self._lock:
-            camera, self._camera = self._camera, None
         if camera is not None and self._move(to_world(*camera)):
             self._halted = False
             self._show(self.session.moving_picture())
             return True
         if self.session.moving and time.monotonic() - self._moved < QUIET:
-            return worked
+            return bool(requests)
         if not self.session.finished and not self._halted:
             picture = self.session.refine()
             if self.session.finished or time.monotonic() - self._sent > INTERVAL:
                 self._show(picture)
             return True
-        return worked
+        return bool(requests)
 
     def _move(self, pose: np.ndarray) -> bool:
         moved = self.session.move_camera(pose)
@@ -291,10 +278,8 @@ def pad(picture: np.ndarray, aspect: float) -> np.ndarray:
     if not math.isfinite(aspect) or not 0.05 < aspect < 20:
         return picture
     wide, high = max(width, round(height * aspect)), max(height, round(width / aspect))
-    canvas = np.zeros((high, wide, 3), np.uint8)
     top, left = (high - height) // 2, (wide - width) // 2
-    canvas[top : top + height, left : left + width] = picture
-    return canvas
+    return np.pad(picture, ((top, high - height - top), (left, wide - width - left), (0, 0)))
 
 
 def status_lines(session: Session, message: str = "") -> list[str]:

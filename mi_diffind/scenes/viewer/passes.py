@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import collections
 import contextlib
 import gc
 import math
@@ -51,8 +50,8 @@ class RenderedSide:
             isinstance(scene.integrator(), mi.SamplingIntegrator) and not mi.is_spectral and not mi.is_polarized
         )
         self.recordable, self.region = True, (0, 0, 0, 0)
-        self.renders: dict[tuple[int, int, int, int], tuple] = {}
-        self.counts = collections.Counter()
+        #: Recorded render of each region, its pixels, and how often it was called.
+        self.renders: dict[tuple[int, int, int, int], list] = {}
         self.restart()
 
     def restart(self) -> None:
@@ -69,12 +68,8 @@ class RenderedSide:
     def change(self, values: Mapping[str, object]) -> None:
         """Change parameters. Plugins may then compute something else, so that recorded renders are of no use."""
         self.parameters.set(values)
-        self._forget()
-        self.restart()
-
-    def _forget(self) -> None:
         self.renders = {}
-        self.counts.clear()
+        self.restart()
 
     def add_pass(self, region: tuple[int, int, int, int], spp: int, seed: int, moving: bool = False) -> None:
         """Add one sample of the pixels of a ``region``, or unless ``moving`` as many as oversampled.
@@ -94,7 +89,7 @@ class RenderedSide:
     @property
     def settled(self) -> bool:
         """Whether the last pass compiled and recorded nothing."""
-        return self.counts[self.region] > SETTLED
+        return self.region in self.renders and self.renders[self.region][2] > SETTLED
 
     @property
     def image(self) -> np.ndarray:
@@ -111,10 +106,10 @@ class RenderedSide:
         render = _sample_pixels if self.by_pixels else _render_film
         if self.region not in self.renders:
             if len(self.renders) >= RECORDED:
-                self._forget()
-            self.renders[self.region] = dr.freeze(render), _pixels(*self.region)
-        self.counts[self.region] += 1
-        recorded, pixels = self.renders[self.region]
+                self.renders = {}
+            self.renders[self.region] = [dr.freeze(render), _pixels(*self.region), 0]
+        self.renders[self.region][2] += 1
+        recorded, pixels, _ = self.renders[self.region]
         arguments = (self.scene, *pixels, dr.opaque(mi.UInt32, seed), spp)
         with loading.scene_errors(None), dr.suspend_grad(), no_collection():
             values = None
@@ -122,7 +117,7 @@ class RenderedSide:
                 with contextlib.suppress(RuntimeError):  # of the scene, or of a plugin that computes outside Dr.Jit
                     values = np.array(recorded(*arguments))
             if values is None:
-                self._forget()
+                self.renders = {}
                 values = np.array(render(*arguments))
                 self.recordable = False
         if self.by_pixels:

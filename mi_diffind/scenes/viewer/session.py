@@ -60,16 +60,11 @@ LAMP = (-0.6, 1.0, 0.7)
 class Session:
     """Scene that is looked at: what is shown, from where, with which values, and the picture so far.
 
-    - ``source``: a scene file, a table file (:func:`table_scene`) or a dictionary as of ``mi.load_dict``;
-    - ``width``: of the picture, pixels; the height follows the scene's film;
-    - ``spp``: samples per pixel of a finished picture (``None``: the scene's); ``seed``: seed of the random numbers;
-    - ``against``: the counterpart that replaces learned plugins on the other side, as of :func:`mi_diffind.compare`;
-    - ``defines``: values of a scene file's ``<default>`` parameters.
-
-    A picture is the mean of passes of one sample, ``passes`` so far; :meth:`refine` adds one. A change of anything
-    restarts it. ``refusal`` is the sentence that says why there is no exact side, "" if there is one. Poses are
-    matrices ``(4, 4)`` of a sensor that only rotate and move; ``start`` is that of the scene. Computations run in the
-    thread that calls, and only one thread may.
+    The arguments are those of :func:`mi_diffind.view`. A table file is shown by :func:`table_scene`. A picture is the
+    mean of passes of one sample, ``passes`` so far; :meth:`refine` adds one. A change of anything restarts it.
+    ``refusal`` is the sentence that says why there is no exact side, "" if there is one. Poses are matrices ``(4, 4)``
+    of a sensor that only rotate and move; ``start`` is that of the scene. Computations run in the thread that calls,
+    and only one thread may.
 
     Raises :class:`.SceneError`, :class:`.TableError` and :class:`.UsageError`.
     """
@@ -98,7 +93,7 @@ class Session:
                 raise UsageError(f"{source}: found a table file with defines, which only a scene file has")
             source = table_scene(source)
         self._parsed = loading.ParsedScene(source, dict(defines or {}), self.name)
-        self.learned, self.exact, self.refusal = self._load({})
+        self.learned, self.exact, self.refusal, self.table_bytes = self._load({})
         sensor = self.learned.scene.sensors()[0]
         if "to_world" not in self.learned.placement:
             raise loading.SceneError(f"{self._parsed.path}: the sensor {sensor.class_name()} cannot be moved")
@@ -111,12 +106,11 @@ class Session:
         self._residue = np.linalg.inv(self.start) @ written
         self.view = self.views[0]
         self.divider, self.gain = 0.5, 10.0
-        self.table_bytes = self._bytes({})
         self.moving, self.reduction, self.pictures = False, REDUCTIONS[0], 0
         self._place()
 
-    def _load(self, chosen: Mapping[str, str]) -> tuple[RenderedSide, RenderedSide | None, str]:
-        """Load both sides with the ``chosen`` words, and return them; without an exact side, the reason."""
+    def _load(self, chosen: Mapping[str, str]) -> tuple[RenderedSide, RenderedSide | None, str, int]:
+        """Load both sides with the ``chosen`` words; return them, the reason of no exact side, and bytes of tables."""
 
         def change(state):
             _resize(state, self._width)
@@ -127,25 +121,16 @@ class Session:
         names = tuple(dict.fromkeys((self.against, "exact")))
         with no_collection():
             learned = RenderedSide(self._parsed.load(change=change), 1)
+            nbytes = self._parsed.table_bytes(self._parsed.learned_plugins(change=change))
             replaced = self._parsed.learned_plugins(names)
             if not replaced:
-                return learned, None, "the scene names no learned plugin, so there is nothing to compare"
+                return learned, None, "the scene names no learned plugin, so there is nothing to compare", nbytes
             counterparts = [plugins.declared()[entry["plugin"]].counterpart(names) for entry in replaced]
             try:
                 exact = self._parsed.load(exact=True, against=names, change=change)
             except DiffindError as e:
-                return learned, None, str(e)
-            return learned, RenderedSide(exact, max(c.oversampling for c in counterparts)), ""
-
-    def _bytes(self, chosen: Mapping[str, str]) -> int:
-        """Return the bytes of all tables, with another preset or storage form if it was chosen."""
-        entries = self._parsed.learned_plugins()
-        for entry in entries:
-            options = plugins.declared()[entry["plugin"]].choices
-            for name, word in chosen.items():
-                if word in options.get(name, ()) and not (name == "preset" and "filename" in entry):
-                    entry[name] = word
-        return self._parsed.table_bytes(entries)
+                return learned, None, str(e), nbytes
+            return learned, RenderedSide(exact, max(c.oversampling for c in counterparts)), "", nbytes
 
     # -- what is shown ------------------------------------------------------------------------------------------------
 
@@ -322,9 +307,8 @@ class Session:
             allowed = ", ".join(options.get(name, options)) or "none"
             raise UsageError(f'{name}: found "{word}", allowed are {allowed}')
         chosen = {k: v for k, v in {**self._chosen, name: word}.items() if v != AS_WRITTEN}
-        sides, table_bytes = self._load(chosen), self._bytes(chosen)
-        self.learned, self.exact, self.refusal = sides
-        self._chosen, self.table_bytes = chosen, table_bytes
+        self.learned, self.exact, self.refusal, self.table_bytes = self._load(chosen)
+        self._chosen = chosen
         self.view = self.view if self.view in self.views else self.views[0]
         kept = {path: value for path, value in self._values.items() if path in self.learned.parameters}
         if kept:
