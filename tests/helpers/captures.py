@@ -61,6 +61,19 @@ def picture(pose, side):
     return np.uint8(np.rint(255 * image))
 
 
+def ball(pose, side, centre, radius, linear):
+    """sRGB and alpha, uint8, of a ball with the colours ``linear`` (directions, normals)."""
+    y, x = np.mgrid[:side, :side] + 0.5 - side / 2
+    d = np.stack([x, -y, np.full_like(x, -side / 2 / math.tan(ANGLE / 2))], axis=-1)
+    d = d / np.linalg.norm(d, axis=-1, keepdims=True) @ pose[:3, :3].T
+    o = pose[:3, 3] - centre
+    b = d @ o
+    under = b**2 - o @ o + radius**2
+    values = linear(d, (o + (-b - np.sqrt(np.maximum(under, 0)))[..., None] * d) / radius)
+    srgb = np.where(values <= 0.0031308, 12.92 * values, 1.055 * values ** (1 / 2.4) - 0.055)
+    return np.rint(255 * np.concatenate([srgb, (under > 0)[..., None]], axis=-1)).astype(np.uint8)
+
+
 def write(folder, views=12, test=3, side=24, picture=picture):
     """Views of a ``picture`` all around, and others to test by, in ``folder``."""
     folder.mkdir(parents=True, exist_ok=True)

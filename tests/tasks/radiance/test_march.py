@@ -3,7 +3,7 @@
 import drjit as dr
 import numpy as np
 import pytest
-from radiance_fields import Bumps, Fog
+from radiance_fields import Bumps, Fog, haze
 
 from mi_diffind.core import compat
 from mi_diffind.tasks.radiance import march as marching
@@ -154,12 +154,15 @@ def attached(field, direction, step):
     return field.with_arrays(moved)
 
 
-@pytest.mark.parametrize("kind", ["fog", "bumps", "opaque"])
+@pytest.mark.parametrize("kind", ["fog", "bumps", "opaque", "surroundings"])
 def test_derivatives(mi_rgb, rng, kind):
     """Replay, tangent and the differentiable operation, against finite differences and one another."""
     mi = mi_rgb
     types = types_of(mi)
-    field = {"fog": Fog(types, 0.7), "bumps": Bumps(types, 3.0), "opaque": Bumps(types, 40.0, empty=True)}[kind]
+    field = {
+        "fog": lambda: Fog(types, 0.7), "bumps": lambda: Bumps(types, 3.0),
+        "opaque": lambda: Bumps(types, 40.0, empty=True), "surroundings": lambda: haze(types, rng),
+    }[kind]()  # fmt: skip
     o, d = around(rng, 300)
     at = (*rays(mi, o, d), mi.Float(0), mi.Float(np.inf), mi.Bool(True), mi.Float(np.float32(rng.random(300))))
     direction = {name: rng.normal(size=values.shape) for name, values in field.arrays.items()}
