@@ -311,12 +311,10 @@ def _quaternions(pixels: np.ndarray) -> np.ndarray:
     if (largest < 0).any():
         raise SplatsError(f"has {np.count_nonzero(largest < 0):,} rotations without a largest component")
     others = (2 * pixels[:, :3].astype(np.float64) / 255 - 1) / np.sqrt(2)
-    scalar_first = np.empty((len(pixels), 4))
-    for component in range(4):
-        rows = largest == component
-        scalar_first[np.ix_(rows, [c for c in range(4) if c != component])] = others[rows]
-        scalar_first[rows, component] = np.sqrt(np.maximum(0, 1 - np.square(others[rows]).sum(axis=1)))
-    return scalar_first[:, [1, 2, 3, 0]]
+    last = np.sqrt(np.maximum(0, 1 - np.square(others).sum(axis=1)))
+    # Columns of x, y, z and w, by the place of the largest among (w, x, y, z)
+    columns = np.array([(0, 1, 2, 3), (3, 1, 2, 0), (1, 3, 2, 0), (1, 2, 3, 0)])[largest]
+    return np.take_along_axis(np.column_stack([others, last]), columns, axis=1)
 
 
 class SplatSubject:

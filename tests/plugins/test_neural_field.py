@@ -51,20 +51,12 @@ def surfaces(mi):
 def scene(mi, field="fog", size=(36, 24), **more):
     """A field, seen from −y, one sample in the middle of each pixel."""
     film = {"type": "hdrfilm", "width": size[0], "height": size[1], "pixel_format": "rgba", "rfilter": {"type": "box"}}
-    integrator = more.pop("integrator", {})
+    at = mi.ScalarTransform4f().look_at([0.1, -5, 0.4], [0, 0, 0], [0, 0, 1])
+    integrator = {"type": "test_field", "id": "it", "field": field, **more.pop("integrator", {})}
     if not any(isinstance(v, dict) for v in integrator.values()):
-        integrator = {"jitter": False, **integrator}
-    return mi.load_dict({
-        "type": "scene",
-        "integrator": {"type": "test_field", "id": "it", "field": field, **integrator},
-        "sensor": {
-            "type": "perspective",
-            "fov": 45,
-            "to_world": mi.ScalarTransform4f().look_at([0.1, -5, 0.4], [0, 0, 0], [0, 0, 1]),
-            "film": film,
-        },
-        **more,
-    })  # fmt: skip
+        integrator["jitter"] = False
+    sensor = {"type": "perspective", "fov": 45, "to_world": at, "film": film}
+    return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor, **more})
 
 
 def render(mi, made, spp=1, seed=0, **more):
@@ -359,10 +351,10 @@ def test_solids_of_path_sdf(mi_rgb, fields):
 @pytest.mark.parametrize("inner", ["path", "volpath", "prb_projective"])
 def test_inner_integrators(mi_rgb, fields, inner):
     things = {**surfaces(mi_rgb), "glass": mirror(mi_rgb, {"type": "conductor"})}
-    expected = render(
-        mi_rgb, scene(mi_rgb, integrator={"c": {"type": "path_footprint", "max_depth": 2}}, **things), 256
+    expected, found = (
+        render(mi_rgb, scene(mi_rgb, integrator={"c": {"type": name, "max_depth": 2}}, **things), 256)
+        for name in ("path_footprint", inner)
     )
-    found = render(mi_rgb, scene(mi_rgb, integrator={"c": {"type": inner, "max_depth": 2}}, **things), 256)
     middle = slice(1, -1), slice(1, -1)
     assert np.abs(found - expected)[middle].mean() < 0.02
     assert np.abs(found.mean((0, 1)) / expected.mean((0, 1)) - 1).max() < 0.02
@@ -425,7 +417,7 @@ def test_within_aov(mi_rgb, fields):
     })  # fmt: skip
     image = render(mi_rgb, made, 64, integrator=outer)
     expected = render(mi_rgb, made, 64)
-    assert image.shape[2] == 4 + 5 + 1 or image.shape[2] >= 6
+    assert image.shape[2] >= 6
     assert np.abs(image[..., :3].mean((0, 1)) - expected[..., :3].mean((0, 1))).max() < 0.01
 
 
@@ -460,17 +452,13 @@ def test_variants(mi_any):
 def lit(mi, field="bumps", **more):
     """A field before a wall, under a point light, and a mirror that shows both."""
     at = mi.ScalarTransform4f().translate([-0.7, 0.3, 0]).rotate([1, 0, 0], 80)
-    colour = {"type": "rgb", "value": [0.8, 0.3, 0.2]}
-    return scene(
-        mi,
-        field,
-        size=(16, 12),
-        wall={"type": "rectangle", "to_world": at, "bsdf": {"type": "diffuse", "reflectance": colour}},
-        glass=mirror(mi, {"type": "conductor"}),
-        light={"type": "point", "position": [0, -5, 3], "intensity": 30.0},
-        sky={"type": "constant", "radiance": 0.5},
-        **more,
-    )
+    material = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.3, 0.2]}}
+    things = {
+        "wall": {"type": "rectangle", "to_world": at, "bsdf": material}, "glass": mirror(mi, {"type": "conductor"}),
+        "light": {"type": "point", "position": [0, -5, 3], "intensity": 30.0},
+        "sky": {"type": "constant", "radiance": 0.5},
+    }  # fmt: skip
+    return scene(mi, field, size=(16, 12), **things, **more)
 
 
 def check_along(mi, made, key, moved, spp, step, tolerance):
@@ -514,7 +502,7 @@ def check(mi, made, ending, spp=4, step=1e-2, tolerance=0.01):
     def moved(v):
         if dr.is_tensor_v(kind):
             return kind(dr.fma(mi.Float(direction.ravel()), v, mi.Float(start.ravel())), start.shape)
-        return kind(*(a + v * float(b) for a, b in zip(start.tolist(), direction, strict=True)))
+        return kind(*(a + v * float(b) for a, b in zip(start.ravel().tolist(), direction.ravel(), strict=True)))
 
     return check_along(mi, made, key, moved, spp, step, tolerance)
 
@@ -574,12 +562,8 @@ def test_a_moved_field_is_that_of_a_new_scene(mi_rgb, fields):
     params["it.to_world"] = at().scale([1, 2, 1])
     with pytest.raises(RuntimeError, match=r'parameter "to_world": found .* allowed are rotations'):
         params.update()
-    apart, close = (
-        scene(
-            mi, "bumps", integrator={"c": {"type": "test_field", "field": "fog", "to_world": at().translate([0, y, 0])}}
-        )
-        for y in (2.5, 1.5)
-    )
+    fogs = ({"type": "test_field", "field": "fog", "to_world": at().translate([0, y, 0])} for y in (2.5, 1.5))
+    apart, close = (scene(mi, "bumps", integrator={"c": fog}) for fog in fogs)
     params = mi.traverse(apart)
     assert len(apart.integrator().groups) == 2
     params["it.surfaces.to_world"] = at().translate([0, 1.5, 0])

@@ -1,5 +1,7 @@
 """Rays through radiance fields: against formulas, NumPy and finite differences, and where it is hard."""
 
+from types import SimpleNamespace
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -94,7 +96,7 @@ def test_nothing_is_read_that_does_not_count(mi_rgb):
     across = [[-3, 0.01 * i, 0.02] for i in range(20)], [[1, 0, 0]] * 20
 
     def counted(o, d, **more):
-        return marching.count(Bumps(types, **more), *rays(mi, o, d), 0, np.inf)
+        return SimpleNamespace(**marching.count(Bumps(types, **more), *rays(mi, o, d), 0, np.inf))
 
     whole = counted(*across, empty=True, blind=True, height=0.1)
     assert (whole.rays, whole.crossing, whole.opaque, whole.hidden, whole.skipped) == (20, 20, 0, 0, 0)

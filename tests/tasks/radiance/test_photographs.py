@@ -10,8 +10,9 @@ import drjit.llvm.ad as llvm
 import numpy as np
 import OpenEXR
 import pytest
-from captures import SIZE, Fog, change, pose, write_blender, write_image, write_json
+from captures import SIZE, change, pose, write_blender, write_image, write_json
 from PIL import Image
+from radiance_fields import Fog
 from scipy.ndimage import binary_erosion
 from scipy.spatial.transform import Rotation
 
@@ -185,7 +186,7 @@ def test_a_border_of_one_colour_is_the_background(studio_shots):
     session = FieldSession.load(llvm, folder)
     assert session.held_out.background == views.background and len(session.held_out) == 2
     # An empty field shows the background: no loss, and PSNR from the bytes of the files
-    empty = Fog(llvm, (5, 5, 5), (6, 6, 6), 0.5, {})
+    empty = Fog(llvm, 0)
     errors = [np.square((images[n][..., :3] - np.float64([240, 240, 235])) / 255) for n in session.held_out.names]
     expected = np.mean([-10 * np.log10(e.mean()) for e in errors])
     assert session.held_out_images.evaluate(empty)["psnr_white_db"] == pytest.approx(expected, abs=1e-3)
@@ -290,12 +291,6 @@ def test_a_field_records_its_background(studio_shots, monkeypatch, capsys):
 # -- COLMAP -----------------------------------------------------------------------------------------------------------
 
 
-def quaternion(rotation):
-    """(w, x, y, z) of a rotation matrix."""
-    x, y, z, w = Rotation.from_matrix(rotation).as_quat()
-    return w, x, y, z
-
-
 @pytest.fixture
 def colmap(tmp_path):
     """Ten views of a model as text, written line by line, and the poses that they should have."""
@@ -310,7 +305,8 @@ def colmap(tmp_path):
         matrix[:3, 3] = 2 - i, 1, 4
         poses.append(matrix)
         world_to_camera = np.linalg.inv(matrix @ np.diag([1, -1, -1, 1]))  # y downwards, along z
-        numbers = *quaternion(world_to_camera[:3, :3]), *world_to_camera[:3, 3]
+        turn = Rotation.from_matrix(world_to_camera[:3, :3]).as_quat(scalar_first=True)
+        numbers = *turn, *world_to_camera[:3, 3]
         # Numbers of images are not in the order of names; each sees the points 1 and 2, two see 7
         camera = " ".join(map(repr, map(float, numbers)))
         seventh = 7 if i in (1, 2) else -1
@@ -381,24 +377,20 @@ def test_colmap_models_and_masks_that_are_not_used_are_named(colmap):
 
 
 @pytest.mark.parametrize(
-    "camera", ["SIMPLE_RADIAL_FISHEYE 8 6 10 4 3 0", "RADIAL_FISHEYE 8 6 10 4 3 0 0", "FOV 8 6 10 10 4 3 0.1"]
-)
+    "camera",
+    ["SIMPLE_RADIAL_FISHEYE 8 6 10 4 3 0", "RADIAL_FISHEYE 8 6 10 4 3 0 0", "FOV 8 6 10 10 4 3 0.1",
+     "OPENCV_FISHEYE 8 6 10 11 4.5 3.25 0 0 0 0"],
+)  # fmt: skip
 def test_lenses_of_colmap_that_are_refused(colmap, camera):
     folder, _ = colmap
     (folder / "sparse" / "0" / "cameras.txt").write_text(f"1 {camera}\n2 PINHOLE 8 6 9 9 4 3\n")
-    with pytest.raises(ViewsError, match=rf"has the camera model {camera.split()[0]}, allowed are .*: undistort the"):
+    with pytest.raises(ViewsError, match=rf'"left/2.png" has the camera model {camera.split()[0]}, .*: undistort the'):
         load_views(folder)
 
 
 def test_colmap_models_that_are_refused(colmap, monkeypatch):
     folder, _ = colmap
-    cameras = folder / "sparse" / "0" / "cameras.txt"
-    cameras.write_text("1 OPENCV_FISHEYE 8 6 10 11 4.5 3.25 0 0 0 0\n2 PINHOLE 8 6 9 9 4 3\n")
-    with pytest.raises(
-        ViewsError, match=r'image "left/2.png" has the camera model OPENCV_FISHEYE, allowed are SIMPLE_'
-    ):
-        load_views(folder)
-    cameras.write_text("1 OPENCV x\n")
+    (folder / "sparse" / "0" / "cameras.txt").write_text("1 OPENCV x\n")
     with pytest.raises(ViewsError, match=r"sparse/0: cannot be read as a COLMAP model \("):
         load_views(folder)
     monkeypatch.setitem(sys.modules, "pycolmap", None)

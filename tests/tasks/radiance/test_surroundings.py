@@ -146,12 +146,6 @@ def test_damaged_cubes_are_refused(folder, tmp_path):
             files.load(tmp_path / "x.npz")
 
 
-def test_the_paper_preset_has_no_surroundings(folder, tmp_path, capsys):
-    output = ["-o", str(tmp_path / "x.npz"), "--variant", "llvm_ad_rgb", "--preset", "paper"]
-    assert main(["fit", "field", str(folder), *output, "--background", "surroundings"]) == 2
-    assert "found surroundings with the preset paper" in capsys.readouterr().err
-
-
 def test_surroundings_in_a_scene(field, tmp_path, mi_rgb):
     """They fill the picture, or are left out; sentences for what does not go together."""
     mi = mi_rgb

@@ -231,6 +231,7 @@ def test_ctrl_c_keeps_what_there_is(folder, tmp_path, monkeypatch, late):
             ["--preset", "grid", "--bytes", "1M"],
             "--bytes is an option of the presets sparse and paper, found the preset grid",
         ),
+        (["--preset", "paper", "--background", "surroundings"], "found surroundings with the preset paper"),
         (["--preset", "paper", "--disk", "9k"], "--disk is an option of the preset sparse, found the preset paper"),
         (["--bytes", "100"], "--bytes: 100 bytes are fewer than the smallest field needs"),
         (["--disk", "100"], "--disk: 100 bytes are fewer than a file needs"),

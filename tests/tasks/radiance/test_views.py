@@ -10,8 +10,9 @@ import drjit.llvm.ad as llvm
 import numpy as np
 import OpenEXR
 import pytest
-from captures import SIZE, Fog, change, pose, write_blender, write_image
+from captures import SIZE, change, pose, write_blender, write_image
 from PIL import Image
+from radiance_fields import Fog
 
 from mi_diffind.images import srgb
 from mi_diffind.tasks.radiance import session
@@ -121,7 +122,7 @@ def test_views_of_different_sizes(blender):
     for i, values in stored.items():
         assert np.array_equal(views.stored(i), values)
     assert_colours_are_images(views)
-    fog, images = Fog(llvm, (-1, 0, -1), (2, 2, 1), 0.5, {}), ViewImages(llvm, views)
+    fog, images = Fog(llvm, 1, (1, 1, 1), 0.5, (2, 2, 1)), ViewImages(llvm, views)
     for v, (height, width) in enumerate(views.sizes):
         # A pixel is the mean of rays through the middles of its quarters
         x, y = np.meshgrid(np.arange(width), np.arange(height))
@@ -213,7 +214,7 @@ def test_masked_pixels_do_not_count(masked):
             image[where] = 255 - image[where]
             Image.fromarray(image).save(masked / path)
         session = FieldSession.load(llvm, masked)
-        fog = Fog(llvm, (-1, 0, -1), (2, 2, 1), 0.5, {})
+        fog = Fog(llvm, 1, (1, 1, 1), 0.5, (2, 2, 1))
         problem = ImagesProblem(session, {}, lambda net, fog=fog: fog)
         loss = float(dr.sum(problem.loss({}, dr.rng(seed=3), 1024))[0])
         figures.append([loss, *session.held_out_images.evaluate(fog).values()])
@@ -234,13 +235,6 @@ def test_masked_pixels_carve_nothing(masked):
     assert (carved <= inside).all() and inside.sum() > 2 * carved.sum() and inside.any()
 
 
-class Clear(Fog):
-    """Nothing."""
-
-    def density_at(self, p, active=True):
-        return self.types.Float(0), []
-
-
 def test_patches_are_drawn_where_errors_are(blender):
     """Of the tiles, in proportion to the root of their error before grey; an empty field errs where something is."""
     stored = np.zeros((64, 48, 4), np.uint8)
@@ -248,7 +242,7 @@ def test_patches_are_drawn_where_errors_are(blender):
     for i in range(4):
         Image.fromarray(stored * (i == 2)).save(blender / "train" / f"r_{i}.png")
     images = ViewImages(llvm, load_views(blender))
-    empty = Clear(llvm, (-1, -1, -1), (1, 1, 1), 0.5, {})
+    empty = Fog(llvm, 0)
     cumulative = images.cumulative_errors(empty)
     # White before grey, of sRGB
     grey = srgb.from_linear(np.float64(session.GREY))
