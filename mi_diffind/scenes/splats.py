@@ -15,7 +15,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import io
-import itertools
 import json
 import os
 import re
@@ -342,8 +341,7 @@ class SplatSubject:
 
     def reach(self, centre: np.ndarray) -> float:
         """Return the radius of a sphere around a point that holds the Gaussians' box."""
-        corners = np.array(list(itertools.product(*self.bounds().T)))
-        return float(np.linalg.norm(corners - centre, axis=1).max())
+        return float(np.linalg.norm(np.abs(self.bounds() - centre).max(axis=0)))
 
     def camera(self, settings) -> SplatCamera:
         """Return the camera of a capture with these settings."""

@@ -4,7 +4,11 @@ import json
 import math
 
 import numpy as np
+import OpenEXR
+import pytest
 from PIL import Image
+
+from mi_diffind.tasks.radiance.views import ViewsError, load_views
 
 ANGLE = 0.7
 
@@ -104,6 +108,11 @@ def write_image(path, seed=0, channels=4, size=SIZE):
     return values
 
 
+def write_exr(path, channels):
+    with OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, channels) as file:
+        file.write(str(path))
+
+
 def write_json(path, **content):
     path.write_text(json.dumps(content))
 
@@ -128,3 +137,9 @@ def change(folder, name="transforms_train.json", frame=None, **changes):
     for key in [key for key, value in changes.items() if value is None]:
         del target[key]
     path.write_text(json.dumps(content))
+
+
+def refused(folder, message, *args, **reading):
+    """Views in a folder are refused with a message."""
+    with pytest.raises(ViewsError, match=message):
+        load_views(folder, *args, **reading)

@@ -150,10 +150,9 @@ def test_hard_rays(mi_rgb):
 
 def attached(field, direction, step):
     """The field with its arrays moved along ``direction``."""
-    moved = {}
-    for name, values in field.arrays.items():
-        moved[name] = type(values)(np.float32(values.numpy() + step * direction[name]))
-    return field.with_arrays(moved)
+    return field.with_arrays(
+        {name: type(v)(np.float32(v.numpy() + step * direction[name])) for name, v in field.arrays.items()}
+    )
 
 
 @pytest.mark.parametrize("kind", ["fog", "bumps", "opaque", "surroundings"])
