@@ -49,9 +49,6 @@ VISIBLE = 0.02
 #: Least factor by which a grid is refined, unless it asks for less, and factors that are tried.
 LEAST_FACTOR, FACTORS = 1.1, 65
 
-#: Arrays of a grid.
-NAMES = ("density", "colour", "environment")
-
 
 @dataclasses.dataclass
 class NodeGrid:
@@ -71,7 +68,7 @@ class NodeGrid:
 
     def tensors(self) -> dict:
         """Return the arrays of :meth:`field` by name."""
-        arrays = {name: getattr(self, name) for name in NAMES}
+        arrays = {"density": self.density, "colour": self.colour, "environment": self.environment}
         tensor = self.nodes.types.TensorXf
         return {name: device_tensor(tensor, values) for name, values in arrays.items() if values is not None}
 
