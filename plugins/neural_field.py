@@ -357,11 +357,11 @@ def integrator() -> type:
             )
 
         def counts(self, scene, sensor=0) -> dict:
-            """Return the counts (:class:`.march.RayCounts`) of camera rays, one for each pixel."""
+            """Return the counts (:func:`.march.count`) of camera rays, one for each pixel."""
             with dr.suspend_grad():
-                _, _, _, ray, _, _ = self._begin(scene, sensor, 0, 1)
+                _, _, ray, _ = self._begin(scene, sensor, 0, 1)
                 pi = scene.ray_intersect_preliminary(ray, coherent=True, active=True)
-                return vars(self.placed.count(ray, dr.minimum(pi.t, ray.maxt)))
+                return self.placed.count(ray, dr.minimum(pi.t, ray.maxt))
 
         def sample_rays(self, scene, sensor, sampler):
             """Sample camera rays as the inner integrator does."""
@@ -370,15 +370,27 @@ def integrator() -> type:
             return super().sample_rays(scene, sensor, sampler)
 
         def _begin(self, scene, sensor, seed, spp) -> tuple:
-            if not self._warned:
-                self._warned = True
-                omitted = self._unseen(scene)
-                if omitted:
-                    warn(f"neural_field: {omitted}")
+            """Return the film, a sampler, camera rays, and the function that returns the image of what they see.
+
+            Mitsuba's base classes write an alpha of 0 or 1, and multiply AOVs by the weight of a ray, which fails in
+            the backward pass. Here, the weight applies to the light alone.
+            """
+            if not self._warned and (omitted := self._unseen(scene)):
+                warn(f"neural_field: {omitted}")
+            self._warned = True
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             sampler, spp = self.prepare(sensor, seed, spp, self.aov_names())
             ray, weight, place = self.sample_rays(scene, sensor, sampler)
-            return sensor.film(), sampler, spp, ray, weight, place
+            film = sensor.film()
+
+            def developed(light, alpha, aovs):
+                block = film.create_block()
+                block.set_coalesce(block.coalesce() and spp >= 4)
+                compat.splat(block, film, place, light * weight, alpha, aovs, ray.wavelengths)
+                film.put_block(block)
+                return film.develop()
+
+            return film, sampler, ray, developed
 
         def _unseen(self, scene) -> str:
             """Return a sentence on where the field is not seen in a scene, or ``""``."""
@@ -387,19 +399,6 @@ def integrator() -> type:
                 return f'the field is not visible through the holes of "{holes[0]}", "lit" shows it' if holes else ""
             media = [shape.id() for shape in scene.shapes() if shape.is_medium_transition()]
             return f'with "lit", the participating medium of "{media[0]}" is not rendered' if media else ""
-
-        @staticmethod
-        def _developed(film, spp, place, light, alpha, aovs, wavelengths):
-            """Return the image of samples.
-
-            Mitsuba's base classes write an alpha of 0 or 1, and multiply AOVs by the weight of a ray, which fails in
-            the backward pass. Here, the weight applies to the light alone.
-            """
-            block = film.create_block()
-            block.set_coalesce(block.coalesce() and spp >= 4)
-            compat.splat(block, film, place, light, alpha, aovs, wavelengths)
-            film.put_block(block)
-            return film.develop()
 
         def omitted(self, integrators: list, sensor) -> str:
             """Return a sentence if no integrator among these renders a radiance field; see :mod:`.omissions`."""
@@ -416,58 +415,55 @@ def integrator() -> type:
                 raise RuntimeError("neural_field: found develop=False, allowed is develop=True")
             omissions.check(scene, self, sensor)
             with dr.suspend_grad():
-                film, sampler, spp, ray, weight, place = self._begin(scene, sensor, seed, spp)
-                light, alpha, aovs, _ = self.primal(scene, sampler, ray)
-                return self._developed(film, spp, place, light * weight, alpha, aovs, ray.wavelengths)
+                _, sampler, ray, developed = self._begin(scene, sensor, seed, spp)
+                return developed(*self.primal(scene, sampler, ray)[:3])
 
         def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
             with dr.suspend_grad():
-                film, sampler, spp, ray, weight, place = self._begin(scene, sensor, seed, spp)
+                _, sampler, ray, developed = self._begin(scene, sensor, seed, spp)
                 surfaces = self._surfaces_optimised(scene)
-                self._check_moving()
-                _, _, _, state = self.primal(scene, sampler.clone(), ray)
+                *_, state = self.primal(scene, sampler.clone(), ray)
                 for placed in self.groups:
                     placed.start_forward()
-                light, alpha, aovs = self.replayed(dr.ADMode.Forward, scene, sampler, ray, state, surfaces)
-                return self._developed(film, spp, place, light * weight, alpha, aovs, ray.wavelengths)
+                return developed(*self.replayed(dr.ADMode.Forward, scene, sampler, ray, state, surfaces))
 
         def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
             with dr.suspend_grad():
-                film, sampler, spp, ray, weight, place = self._begin(scene, sensor, seed, spp)
+                film, sampler, ray, developed = self._begin(scene, sensor, seed, spp)
                 surfaces = self._surfaces_optimised(scene)
-                self._check_moving()
                 # The film is linear in light, alpha and channels, so that their values do not matter
                 with dr.resume_grad():
                     count = dr.width(ray)
                     light, alpha = dr.full(mi.Spectrum, 1, count), dr.full(mi.Float, 1, count)
                     aovs = [dr.full(mi.Float, 1, count) for _ in self.aovs]
                     dr.enable_grad(light, alpha, aovs)
-                    image = self._developed(film, spp, place, light * weight, alpha, aovs, ray.wavelengths)
+                    image = developed(light, alpha, aovs)
                     dr.set_grad(image, grad_in)
                     dr.enqueue(dr.ADMode.Backward, image)
                     dr.traverse(dr.ADMode.Backward)
                     adjoint = dr.grad(light), dr.grad(alpha), dict(zip(self.aovs, dr.grad(aovs), strict=True))
                 film.clear()
-                _, _, _, state = self.primal(scene, sampler.clone(), ray)
+                *_, state = self.primal(scene, sampler.clone(), ray)
                 with dr.isolate_grad():  # derivatives come in parts to what a placement is attached to
                     self.replayed(dr.ADMode.Backward, scene, sampler, ray, state, surfaces, adjoint)
                 dr.eval()
 
         def _surfaces_optimised(self, scene) -> bool:
-            """Return whether a derivative with respect to another parameter than the fields' arrays is requested."""
-            field_arrays = {compat.identity(values) for placed in self.fields for values in placed.exposed.values()}
-            params = mi.traverse(scene)
-            values = [params[key] for key in params.keys()]
-            if self.lit and self.field_light.optimised():
-                return True
-            attached = [v for v in values if isinstance(v, dr.ArrayBase) and compat.has_gradient(v)]
-            return any(compat.identity(v) not in field_arrays for v in attached)
+            """Return whether a derivative with respect to another parameter than the fields' arrays is requested.
 
-        def _check_moving(self) -> None:
+            Raises ``RuntimeError`` for a derivative of a place that there is not.
+            """
             if any(placed.moving() and placed not in self.groups for placed in self.fields):
                 raise RuntimeError('parameter "to_world": has no derivatives for a field that overlaps another one')
             if any(placed.moving() and placed.field.unbounded for placed in self.fields):
                 raise RuntimeError('parameter "to_world": has no derivatives for a field with surroundings')
+            if self.lit and self.field_light.optimised():
+                return True
+            field_arrays = {compat.identity(values) for placed in self.fields for values in placed.exposed.values()}
+            params = mi.traverse(scene)
+            values = [params[key] for key in params.keys()]
+            attached = [v for v in values if isinstance(v, dr.ArrayBase) and compat.has_gradient(v)]
+            return any(compat.identity(v) not in field_arrays for v in attached)
 
         def sample(self, mode, scene, sampler, ray, δL=None, δaovs=None, state_in=None, active=True, **kwargs):
             """Sample as ``ADIntegrator.sample`` does, for an integrator around this one, in the primal mode only."""
@@ -501,14 +497,13 @@ def integrator() -> type:
             light, clear, depth, opacity, inner_state = state
             path = self._start(ray, True)
             path.light, path.depth, path.opacity = mi.Spectrum(light), mi.Float(depth), mi.Float(opacity)
-            more = dr.zeros(mi.Float), dr.zeros(mi.Float)
             if mode == dr.ADMode.Backward:
                 # All transmittances of a ray have the same derivative of alpha by their logarithm
                 aovs = adjoint[2]
                 path.change = mi.Spectrum(adjoint[0])
                 path.change_clear = mi.Float(-adjoint[1] * clear)
-                path.change_opacity = mi.Float(aovs.get("opacity", more[0]))
-                path.change_depth = mi.Float(aovs.get("depth", more[1]))
+                path.change_opacity = mi.Float(aovs.get("opacity", 0))
+                path.change_depth = mi.Float(aovs.get("depth", 0))
             sampler, path = self._follow(mode, scene, sampler, path, surfaces, carries(ray))
             change = path.change
             if surfaces and compat.replays_paths(self.surfaces):

@@ -264,7 +264,7 @@ def _given(parameters: dict, verbose: bool) -> list[str]:
 
 
 def _ray_counts(n: dict) -> tuple[list[str], list[str]]:
-    """Return lines about what camera rays read of a field (:class:`mi_diffind.tasks.radiance.march.RayCounts`)."""
+    """Return lines about what camera rays read of a field (:func:`mi_diffind.tasks.radiance.march.count`)."""
     total = max(1, n["steps"])
     return [f"{n['crossing']:,} of {n['rays']:,} cross the field, {n['opaque']:,} of them end opaque"], [
         f"{n['steps']:,}: {n['hidden'] / total:.0%} hidden, {n['skipped'] / total:.0%} skipped as empty, "

@@ -451,7 +451,7 @@ def reports(scene) -> list[dict]:
     ``effects_in_use``, ``effects_left_out`` (effect → reason), ``evaluated_once``, ``storage``, ``table_bytes`` and
     more; for a BSDF the ``operations`` of ``eval``, ``pdf`` and ``sample``
     (:class:`~mi_diffind.measure.clock.Operations`, by name); for the integrator of a radiance field, how many
-    steps of ``rays`` are taken, skipped, … (:class:`~mi_diffind.tasks.radiance.march.RayCounts`).
+    steps of ``rays`` are taken, skipped, … (:func:`~mi_diffind.tasks.radiance.march.count`).
     """
     return [instance_report(instance, scene) for instance in learned_instances(scene)]
 

@@ -15,7 +15,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import io
-import itertools
 import json
 import os
 import re
@@ -35,24 +34,11 @@ from ..core.units import check_memory, memory
 from ..images.srgb import to_linear
 
 #: Names of properties that every Gaussian of a PLY file has, in the order of the arrays that they become.
-NAMES = tuple(
-    [
-        "x",
-        "y",
-        "z",
-        "scale_0",
-        "scale_1",
-        "scale_2",
-        "rot_1",
-        "rot_2",
-        "rot_3",
-        "rot_0",
-        "opacity",
-        "f_dc_0",
-        "f_dc_1",
-        "f_dc_2",
-    ]
-)
+NAMES = (*"xyz", "scale_0", "scale_1", "scale_2", "rot_1", "rot_2", "rot_3", "rot_0", "opacity")
+NAMES += ("f_dc_0", "f_dc_1", "f_dc_2")
+
+#: Arrays of :class:`Splats`, in their order.
+ARRAYS = ("centres", "scales", "quaternions", "opacities", "colours")
 
 #: Numbers of further coefficients ``f_rest_*``: spherical harmonics of degree 0 to 3.
 REST = (0, 9, 24, 45)
@@ -164,9 +150,8 @@ class Splats:
             raise SplatsError(f"{path}: cannot be read as 3D Gaussians, or is damaged ({reason(e)})") from None
 
     def chosen(self, which: np.ndarray) -> Splats:
-        """Return some of the Gaussians, by a mask ``(N,)`` or numbers."""
-        names = ("centres", "scales", "quaternions", "opacities", "colours")
-        return dataclasses.replace(self, **{name: getattr(self, name)[which] for name in names})
+        """Return the Gaussians of a mask ``(N,)``."""
+        return dataclasses.replace(self, **{name: getattr(self, name)[which] for name in ARRAYS})
 
     def cropped(self, box=None) -> Splats:
         """Return the visible Gaussians whose centres lie in a ``box``: lower corner, upper corner.
@@ -186,12 +171,12 @@ class Splats:
 
     def most(self) -> np.ndarray:
         """Return the box ``(2, 3)`` outside of which Gaussians count as strays."""
-        box = np.empty((2, 3))
-        for axis, values in enumerate(self.centres.T.astype(np.float64)):
+        box = []
+        for values in self.centres.T.astype(np.float64):
             order = np.argsort(values)
             weight = np.cumsum(self.opacities[order], dtype=np.float64)
-            ends = np.searchsorted(weight, weight[-1] * np.array([STRAY, 1 - STRAY]))
-            box[:, axis] = values[order[np.minimum(ends, len(values) - 1)]]
+            box.append(values[order[np.searchsorted(weight, weight[-1] * np.array([STRAY, 1 - STRAY]))]])
+        box = np.stack(box, axis=1)
         return box + np.array([[-WIDER], [WIDER]]) * (box[1] - box[0])
 
     def extents(self) -> np.ndarray:
@@ -208,7 +193,7 @@ class Splats:
 
 def _checked(arrays: list[np.ndarray]) -> list[np.ndarray]:
     """Return arrays as :class:`Splats` holds them, given logarithms of the scales and quaternions of any length."""
-    for name, array in zip(("centres", "scales", "quaternions", "opacities", "colours"), arrays, strict=True):
+    for name, array in zip(ARRAYS, arrays, strict=True):
         if not np.isfinite(array).all():
             raise SplatsError(f"has {np.count_nonzero(~np.isfinite(array)):,} {name} that are NaN or infinite")
     centres, scales, quaternions, *others = arrays
@@ -254,18 +239,11 @@ def _ply(path: Path) -> tuple[list[np.ndarray], str, str | None]:
 
 def _sog(path: Path) -> tuple[list[np.ndarray], str, str | None]:
     """Return the arrays of a SOG archive or folder for :func:`_checked`, its SHA-256, and a note, as :func:`_ply`."""
-    if path.suffix.lower() == ".sog":
-        with zipfile.ZipFile(path) as archive:
-            return _sog_arrays(path, META, archive.open)
-    return _sog_arrays(path, path.name, lambda name: (path.parent / name).open("rb"))
-
-
-def _sog_arrays(path: Path, description: str, opened) -> tuple[list[np.ndarray], str, str | None]:
-    """Return what :func:`_sog` does; ``opened(name)`` opens a file, the ``description`` among them."""
-    digest = hashlib.sha256()
+    archived, digest = path.suffix.lower() == ".sog", hashlib.sha256()
+    folder = zipfile.Path(path) if archived else path.parent
 
     def content(name: str, most: int) -> bytes:
-        with opened(name) as file:
+        with (folder / name).open("rb") as file:
             data = file.read(most + 1)
         if len(data) > most:
             raise SplatsError(f"{name} has more than {most:,} bytes")
@@ -299,7 +277,7 @@ def _sog_arrays(path: Path, description: str, opened) -> tuple[list[np.ndarray],
     def pixels(name: str, which: int = 0) -> np.ndarray:
         return picture(name, which, count).reshape(-1, 4)[:count]
 
-    meta = json.loads(content(description, META_BYTES), object_hook=RecordedKeys)
+    meta = json.loads(content(META if archived else path.name, META_BYTES), object_hook=RecordedKeys)
     if meta["version"] != 2:
         raise SplatsError(f"has the SOG version {meta['version']!s:.20}, only 2 is read")
     count = number(meta, "count", 1, MOST)
@@ -332,12 +310,10 @@ def _quaternions(pixels: np.ndarray) -> np.ndarray:
     if (largest < 0).any():
         raise SplatsError(f"has {np.count_nonzero(largest < 0):,} rotations without a largest component")
     others = (2 * pixels[:, :3].astype(np.float64) / 255 - 1) / np.sqrt(2)
-    scalar_first = np.empty((len(pixels), 4))
-    for component in range(4):
-        rows = largest == component
-        scalar_first[np.ix_(rows, [c for c in range(4) if c != component])] = others[rows]
-        scalar_first[rows, component] = np.sqrt(np.maximum(0, 1 - np.square(others[rows]).sum(axis=1)))
-    return scalar_first[:, [1, 2, 3, 0]]
+    last = np.sqrt(np.maximum(0, 1 - np.square(others).sum(axis=1)))
+    # Columns of x, y, z and w, by the place of the largest among (w, x, y, z)
+    columns = np.array([(0, 1, 2, 3), (3, 1, 2, 0), (1, 3, 2, 0), (1, 2, 3, 0)])[largest]
+    return np.take_along_axis(np.column_stack([others, last]), columns, axis=1)
 
 
 class SplatSubject:
@@ -352,7 +328,7 @@ class SplatSubject:
         if not mi.is_rgb:
             raise SplatsError(f"{path}: the variant {mi.variant()} shows no Gaussians, one with rgb is needed")
         splats = Splats.read(path)
-        self.splats, self.total, self.notes = splats.cropped(box), len(splats), splats.notes
+        self.splats, self.notes = splats.cropped(box), splats.notes
         check_memory(f"{path}: Gaussians", len(self.splats), GAUSSIAN_BYTES * len(self.splats))
 
     def record(self) -> dict:
@@ -365,8 +341,7 @@ class SplatSubject:
 
     def reach(self, centre: np.ndarray) -> float:
         """Return the radius of a sphere around a point that holds the Gaussians' box."""
-        corners = np.array(list(itertools.product(*self.bounds().T)))
-        return float(np.linalg.norm(corners - centre, axis=1).max())
+        return float(np.linalg.norm(np.abs(self.bounds() - centre).max(axis=0)))
 
     def camera(self, settings) -> SplatCamera:
         """Return the camera of a capture with these settings."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import product
+from itertools import combinations, product
 from pathlib import Path
 
 import drjit as dr
@@ -90,7 +90,7 @@ class PlacedField(PlacementParameter):
         marched = marching.march(self.field, *self._local(ray, far, active))
         return marched, dr.select(marched.transmittance > marching.OPAQUE, marched.transmittance, 0)
 
-    def count(self, ray, far, active=True) -> marching.RayCounts:
+    def count(self, ray, far, active=True) -> dict[str, int]:
         """Return the counts of the reads of :meth:`march`."""
         return marching.count(self.field, *self._local(ray, far, active))
 
@@ -296,9 +296,7 @@ def grouped(fields: list) -> list:
     """Return placed fields without common volumes; those of ``fields`` whose boxes overlap are joined."""
     groups = [([placed], placed) for placed in fields]
     while True:
-        pair = next(
-            ((a, b) for i, a in enumerate(groups) for b in groups[i + 1 :] if a[1].overlaps(b[1])), None
-        )  # fmt: skip
+        pair = next((pair for pair in combinations(groups, 2) if pair[0][1].overlaps(pair[1][1])), None)
         if pair is None:
             return [placed for _, placed in groups]
         members = pair[0][0] + pair[1][0]

@@ -4,9 +4,11 @@ import json
 import math
 
 import numpy as np
+import OpenEXR
+import pytest
 from PIL import Image
 
-from mi_diffind.tasks.radiance.volume_field import VolumeField
+from mi_diffind.tasks.radiance.views import ViewsError, load_views
 
 ANGLE = 0.7
 
@@ -39,26 +41,33 @@ def images_of(views):
     return np.stack([views.image(v) for v in range(len(views))])
 
 
+def ball(pose, side, centre, radius, linear):
+    """sRGB and alpha, uint8, of a ball with the colours ``linear`` (directions, normals)."""
+    y, x = np.mgrid[:side, :side] + 0.5 - side / 2
+    d = np.stack([x, -y, np.full_like(x, -side / 2 / math.tan(ANGLE / 2))], axis=-1)
+    d = d / np.linalg.norm(d, axis=-1, keepdims=True) @ pose[:3, :3].T
+    o = pose[:3, 3] - centre
+    b = d @ o
+    under = b**2 - o @ o + radius**2
+    values = linear(d, (o + (-b - np.sqrt(np.maximum(under, 0)))[..., None] * d) / radius)
+    srgb = np.where(values <= 0.0031308, 12.92 * values, 1.055 * values ** (1 / 2.4) - 0.055)
+    return np.rint(255 * np.concatenate([srgb, (under > 0)[..., None]], axis=-1)).astype(np.uint8)
+
+
 def picture(pose, side):
     """sRGB and alpha, uint8: a red ball with stripes, and a blue one."""
-    focal = side / 2 / math.tan(ANGLE / 2)
-    v, u = np.mgrid[:side, :side] + 0.5
-    d = np.stack([(u - side / 2) / focal, (side / 2 - v) / focal, -np.ones_like(u)], -1) @ pose[:3, :3].T
-    d /= np.linalg.norm(d, axis=-1, keepdims=True)
-    image, nearest = np.zeros((side, side, 4)), np.full((side, side), np.inf)
-    for centre, radius, colour in (([-0.25, 0, 0.1], 0.35, [0.9, 0.3, 0.2]), ([0.3, 0.1, -0.1], 0.25, [0.2, 0.4, 0.9])):
-        to = pose[:3, 3] - centre
-        b, c = d @ to, to @ to - radius**2
-        hit = b * b > c
-        t = np.where(hit, -b - np.sqrt(np.maximum(b * b - c, 0)), np.inf)
-        n = (to + np.where(hit, t, 0)[..., None] * d) / radius
-        shade = (
-            0.35 + 0.65 * np.clip(n @ [0.5, 0.7, 0.5], 0, 1) * (0.7 + 0.3 * np.sign(np.sin(9 * n[..., 1:2])))[..., 0]
-        )
-        closer = hit & (t < nearest)
-        image[closer] = np.concatenate([shade[..., None] * colour, np.ones((side, side, 1))], -1)[closer]
-        nearest = np.minimum(nearest, t)
-    return np.uint8(np.rint(255 * image))
+
+    def shaded(colour):
+        def linear(d, n):
+            light = np.clip(n @ [0.5, 0.7, 0.5], 0, 1)[..., None] * (0.7 + 0.3 * np.sign(np.sin(9 * n[..., 1:2])))
+            return (0.35 + 0.65 * light) * colour
+
+        return linear
+
+    balls = ([-0.25, 0, 0.1], 0.35, [0.9, 0.3, 0.2]), ([0.3, 0.1, -0.1], 0.25, [0.2, 0.4, 0.9])
+    near, far = sorted(balls, key=lambda ball: np.linalg.norm(pose[:3, 3] - ball[0]))
+    near, far = (ball(pose, side, centre, radius, shaded(colour)) for centre, radius, colour in (near, far))
+    return np.where(near[..., 3:] > 0, near, far)
 
 
 def write(folder, views=12, test=3, side=24, picture=picture):
@@ -99,6 +108,11 @@ def write_image(path, seed=0, channels=4, size=SIZE):
     return values
 
 
+def write_exr(path, channels):
+    with OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, channels) as file:
+        file.write(str(path))
+
+
 def write_json(path, **content):
     path.write_text(json.dumps(content))
 
@@ -125,11 +139,7 @@ def change(folder, name="transforms_train.json", frame=None, **changes):
     path.write_text(json.dumps(content))
 
 
-class Fog(VolumeField):
-    """White, of the density 1."""
-
-    def density_at(self, p, active=True):
-        return self.types.Float(1), []
-
-    def radiance_at(self, point_data, p, d, active=True):
-        return [self.types.Float(1)] * 3
+def refused(folder, message, *args, **reading):
+    """Views in a folder are refused with a message."""
+    with pytest.raises(ViewsError, match=message):
+        load_views(folder, *args, **reading)

@@ -68,6 +68,17 @@ class Bumps(VolumeField):
         return dr.select((p.x > 0) & active, away, 0)
 
 
+def haze(types, rng, centre=(0.2, -0.1, 0.3), half=0.7, side=13):
+    """A field of random numbers with surroundings, thin enough that rays see the horizon."""
+    from mi_diffind.tasks.radiance.surroundings import ContractedNodes
+    from mi_diffind.tasks.radiance.volume_field import NodeField
+
+    place = np.subtract(centre, 2 * half), 4 * half / (side - 1), (side,) * 3, np.ones((side,) * 3, bool)
+    nodes = ContractedNodes(types, *place, inner=(*centre, half))
+    density, colour = rng.normal(-4, 2, nodes.entries), rng.normal(0, 0.3, (nodes.entries, 12))
+    return NodeField(nodes, *(types.TensorXf(np.float32(v)) for v in (density, colour)))
+
+
 def ball_table(inner=None):
     """The table of a ball that is red to the left and blue to the right, in half precision.
 

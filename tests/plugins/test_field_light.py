@@ -27,12 +27,9 @@ def fields(mi_rgb):
 
 
 def scene(mi, integrator, **more):
-    sensor = {
-        "type": "perspective",
-        "fov": 50,
-        "to_world": mi.ScalarTransform4f().look_at([0.5, -3, 4], [0, 0, -0.3], [0, 0, 1]),
-        "film": {"type": "hdrfilm", "width": 32, "height": 24, "pixel_format": "rgba", "rfilter": {"type": "box"}},
-    }
+    film = {"type": "hdrfilm", "width": 32, "height": 24, "pixel_format": "rgba", "rfilter": {"type": "box"}}
+    at = mi.ScalarTransform4f().look_at([0.5, -3, 4], [0, 0, -0.3], [0, 0, 1])
+    sensor = {"type": "perspective", "fov": 50, "to_world": at, "film": film}
     return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor, **more})
 
 

@@ -28,7 +28,7 @@ from ...arrays.sparse_grid import cell_corners, complete_cells
 from ...core.units import largest_fitting
 from ...tasks.radiance.grid import DENSITY_SCALE
 from ...tasks.radiance.march import march, replay
-from ...tasks.radiance.nodes import COARSE, FARTHEST, Nodes, chessboard_distances
+from ...tasks.radiance.nodes import COARSE, FARTHEST, Nodes, coarser
 from ...tasks.radiance.volume_field import NodeField, NodeVolume, VolumeField, colour_of, density_of
 
 #: Strategies of zlib that are tried: repetitions and frequencies, mostly frequencies, or frequencies alone.
@@ -453,7 +453,7 @@ class Occupancy:
 def occupied_bytes(state: dict) -> int:
     """Return the bytes on disk of the occupancy of the nodes of a state."""
     cells = complete_cells(cell_corners(wide_cells(state["stored"])))
-    return len(mask_bytes(chessboard_distances(cells) == 0))
+    return len(mask_bytes(coarser(cells)))
 
 
 class HashVolumeField(VolumeField):

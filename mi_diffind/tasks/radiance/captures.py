@@ -53,9 +53,6 @@ BLACK_OF_JPEG = 127
 #: Byte of sRGB → linear value, and byte of alpha → share.
 LINEAR, SHARE = to_linear(np.arange(256) / 255).astype(np.float32), np.arange(256, dtype=np.float32) / np.float32(255)
 
-#: Largest number in half precision.
-LARGEST = 65504.0
-
 
 class ViewsError(DiffindError, ValueError):
     """Error for unusable images or poses; the message is one sentence that names the file and the fault."""
@@ -116,11 +113,6 @@ def read_image(path: Path) -> tuple[np.ndarray, bool]:
     if has_alpha:
         image[..., 3] = values[..., -1] if encoded else np.clip(values[..., -1], 0, 1)
     return image, has_alpha
-
-
-def half_floats(image: np.ndarray) -> np.ndarray:
-    """Return an image of :func:`read_image` in half precision: linear and multiplied by alpha."""
-    return np.clip(linear_pixels(image), -LARGEST, LARGEST).astype(np.float16)
 
 
 def linear_pixels(image: np.ndarray) -> np.ndarray:
@@ -572,27 +564,22 @@ def _box(file: Path, content: dict) -> np.ndarray | None:
 
 def _camera(file: Path, content: dict, frame: dict) -> Frame:
     where = f'{file}: frame "{frame["file_path"]}"'
-    numbers, pose = camera_numbers(where, frame, content), _pose(where, _matrix(where, frame))
+    numbers, pose = camera_numbers(where, frame, content), _pose(where, frame)
     if content.get("from_mitsuba", "normal_mts_args" in content):  # cameras look along z, with x to the left
         pose = pose @ np.diag([-1.0, 1.0, -1.0, 1.0])
     return Frame(frame["file_path"], pose, numbers, frame.get("mask_path") or None)
 
 
-def _matrix(where: str, frame: dict):
-    """Return the matrix of a frame: that of the time at which the shutter opens, too, if the camera stands still."""
-    if frame.get("transform_matrix") is not None:
-        return frame["transform_matrix"]
-    begin, end = (frame.get(f"transform_matrix_{time}") for time in ("start", "end"))
-    if end is not None and end != begin:
-        raise ViewsError(
-            f'{where} moves while the shutter is open, from the "transform_matrix_start" to another '
-            f'"transform_matrix_end": a "transform_matrix" is needed'
-        )
-    return begin
-
-
-def _pose(where: str, matrix) -> np.ndarray:
-    """Return a ``transform_matrix`` as a rigid motion, ``(4, 4)``."""
+def _pose(where: str, frame: dict) -> np.ndarray:
+    """Return the matrix of a frame as a rigid motion, ``(4, 4)``; a camera must stand still."""
+    matrix = frame.get("transform_matrix")
+    if matrix is None:
+        matrix, end = (frame.get(f"transform_matrix_{time}") for time in ("start", "end"))
+        if end is not None and end != matrix:
+            raise ViewsError(
+                f'{where} moves while the shutter is open, from the "transform_matrix_start" to another '
+                f'"transform_matrix_end": a "transform_matrix" is needed'
+            )
     if matrix is None:
         raise ViewsError(f'{where} has no "transform_matrix"')
     pose = _numbers(matrix)

@@ -20,6 +20,7 @@ from ...arrays.indirection import device_array, device_tensor, fold
 from ...arrays.sparse_grid import cell_corners, complete_cells
 from ...arrays.tables import StoredArray
 from ...core.progress import Deadline
+from ...core.units import largest_fitting
 from . import grid as grids
 from .coding import LOW_BITS, NAMED, NAMED_CONTEXTS, PARTS, Pass, encode, fresh_context, naming, passes_of
 from .grid import NodeGrid
@@ -353,10 +354,8 @@ def coding_in(
     low, high = np.log(SLOPES)
     if not fits(np.exp(high)):
         return None
-    for _ in range(TRIALS):
-        middle = (low + high) / 2
-        low, high = (low, middle) if fits(np.exp(middle)) else (middle, high)
-    coding = coded_by(grid, importance, palette, np.exp(high) * per_node)
+    slope = np.exp(-largest_fitting(lambda flatness: fits(np.exp(-flatness)), -high, -low, steps=TRIALS))
+    coding = coded_by(grid, importance, palette, slope * per_node)
     coding.file_bytes = nbytes
     return coding
 
@@ -491,16 +490,13 @@ def in_memory(grid: NodeGrid, images: ViewImages, nbytes: int | None) -> tuple[N
     for bits in sorted(INDEX_BITS, reverse=True):
         if bits >= 8 and packed_bytes(whole, bits) <= nbytes:
             return whole, bits
-    low, high, largest = SMALLEST, 1.0, None
-    for _ in range(7):
-        middle = (low + high) / 2
-        smaller = grids.refine(grid, cells, middle)
-        bits = 10 if packed_bytes(smaller, 10) <= nbytes else 8
-        if packed_bytes(smaller, bits) <= nbytes:
-            low, largest = middle, (smaller, bits)
-        else:
-            high = middle
-    if largest is None:
-        smallest = packed_bytes(grids.refine(grid, cells, SMALLEST), 6)
+
+    def smaller(share: float) -> tuple[NodeGrid, int]:
+        part = grids.refine(grid, cells, share)
+        return part, 10 if packed_bytes(part, 10) <= nbytes else 8
+
+    share = largest_fitting(lambda share: packed_bytes(*smaller(share)) <= nbytes, SMALLEST, 1.0, steps=7)
+    if share == SMALLEST:
+        smallest = packed_bytes(smaller(SMALLEST)[0], 6)
         raise ValueError(f"{nbytes:,} bytes are fewer than the smallest field needs, about {smallest:,}")
-    return largest
+    return smaller(share)

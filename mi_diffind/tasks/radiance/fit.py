@@ -252,7 +252,8 @@ class FieldFit:
                 problem, grid = grids.GridProblem(grid, self.session, SIDE if last else 1), None
                 if number:
                     problem.draw_by_errors()
-                finish = functools.partial(self.finish_grid, problem) if last and request.preset == "grid" else None
+                finish = functools.partial(self.measured, lambda p=problem: self.grid_table(p.grid()))
+                finish = finish if last and request.preset == "grid" else None
                 stage, title = dataclasses.replace(stage, steps=steps), f"grid, {round(nodes * reached)}³"
                 least = 1 if number else FIRST_STEPS
                 stages = [Stage(f"stage{number}", problem, 1.0, stage, title, finish, self.times, least)]
@@ -344,10 +345,9 @@ class FieldFit:
         )
         return trained[better]
 
-    def finish_grid(self, problem: grids.GridProblem) -> dict[str, float]:
-        """Measure the table of a grid, as at the end of the preset ``grid``."""
-        table = self.grid_table(problem.grid())
-        return self.session.watched_images.evaluate(files.field_of(table, self.request.types))
+    def measured(self, table: Callable[[], Table]) -> dict[str, float]:
+        """Measure the field of a table in the watched views."""
+        return self.session.watched_images.evaluate(files.field_of(table(), self.request.types))
 
     @property
     def times(self) -> float:
@@ -376,17 +376,14 @@ class FieldFit:
         run then continues with the grid.
         """
         request = self.request
-
-        def measured() -> dict[str, float]:
-            return self.session.watched_images.evaluate(files.field_of(table(), request.types))
-
         if stopped:
             return table(), FitResult(problem.measure(problem.net), 0, 0, 0.0, True, 0)
         if request.checkpoint and request.resume and not os.path.exists(request.checkpoint):
             # The interrupted part may have been the grid
             before = [f"{request.checkpoint}.{name}" for name in ("stage0", "grid.npz")]
             request = dataclasses.replace(request, resume=not any(map(os.path.exists, before)))
-        stage = Stage("", problem, title="through the images", finish=measured, times=self.times)
+        finish = functools.partial(self.measured, table)
+        stage = Stage("", problem, title="through the images", finish=finish, times=self.times)
         (result,) = request.run([stage])
         return table(), result
 

@@ -49,9 +49,6 @@ VISIBLE = 0.02
 #: Least factor by which a grid is refined, unless it asks for less, and factors that are tried.
 LEAST_FACTOR, FACTORS = 1.1, 65
 
-#: Arrays of a grid.
-NAMES = ("density", "colour", "environment")
-
 
 @dataclasses.dataclass
 class NodeGrid:
@@ -71,12 +68,9 @@ class NodeGrid:
 
     def tensors(self) -> dict:
         """Return the arrays of :meth:`field` by name."""
+        arrays = {"density": self.density, "colour": self.colour, "environment": self.environment}
         tensor = self.nodes.types.TensorXf
-        return {name: device_tensor(tensor, values) for name, values in self.arrays().items()}
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Return density, colour and environment, if there is one, by name."""
-        return {name: values for name in NAMES if (values := getattr(self, name)) is not None}
+        return {name: device_tensor(tensor, values) for name, values in arrays.items() if values is not None}
 
     def part(self, stored: np.ndarray) -> NodeGrid:
         """Return the grid with those of its nodes alone that a mask marks as ``stored``."""
@@ -145,7 +139,7 @@ class GridProblem(ImagesProblem):
 
     def grid(self) -> NodeGrid:
         """Return the grid with the trained numbers."""
-        net = {name: self.net[name].numpy() for name in NAMES if name in self.net}
+        net = {name: tensor.numpy() for name, tensor in self.net.items()}
         net["density"] *= DENSITY_SCALE
         return NodeGrid(self.nodes, **net)
 

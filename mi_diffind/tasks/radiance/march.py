@@ -12,8 +12,6 @@ from a step on and the transmittance T behind the step, ∂L/∂σ = δ (T c −
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import drjit as dr
 
 from ...arrays.boxes import box_interval, is_direction
@@ -38,10 +36,6 @@ class Marched:
 
     def __init__(self, colour=None, transmittance=None, depth=None):
         self.colour, self.transmittance, self.depth = colour, transmittance, depth
-
-    @property
-    def opacity(self):
-        return 1 - self.transmittance
 
 
 def box(field, o, d, near, far, active):
@@ -292,24 +286,6 @@ def differentiable(field, o, d, near, far, active=True, offset=0.5) -> Marched:
     return Marched(*dr.custom(_March, field.arrays, field.with_arrays({}), o, d, near, far, active, offset))
 
 
-@dataclass(frozen=True)
-class RayCounts:
-    """Numbers of ``rays``, of those ``crossing`` the field's box, and of those that end ``opaque``.
-
-    ``steps`` is the number of steps in the box. Of these, ``hidden`` lie behind an opaque part, ``skipped`` in space
-    known to be empty, ``looks`` read the density, and ``colours`` read the radiance, too.
-    """
-
-    rays: int
-    crossing: int
-    opaque: int
-    steps: int
-    hidden: int
-    skipped: int
-    looks: int
-    colours: int
-
-
 class CountingField(VolumeField):
     """Field that counts the reads of density and radiance of another ``field``.
 
@@ -337,8 +313,12 @@ class CountingField(VolumeField):
         return self.types.Float(0) if self.reads_all else self.field.free_distance(p, d, active)
 
 
-def count(field: VolumeField, o, d, near, far, active=True) -> RayCounts:
-    """Return the counts of :func:`march` for these rays; two marches are needed."""
+def count(field: VolumeField, o, d, near, far, active=True) -> dict[str, int]:
+    """Return the numbers of ``rays``, of those ``crossing`` the field's box, and of those that end ``opaque``.
+
+    ``steps`` is the number of steps in the box. Of these, ``hidden`` lie behind an opaque part, ``skipped`` in space
+    known to be empty, ``looks`` read the density, and ``colours`` read the radiance, too. Two marches are needed.
+    """
     types = field.types
     with dr.suspend_grad():
         o, active = types.Array3f(o), types.Bool(active)
@@ -352,7 +332,7 @@ def count(field: VolumeField, o, d, near, far, active=True) -> RayCounts:
         looks, colours = (int(n) for n in skipping.counts.numpy())
         reached = int(all_steps.counts[0])
         total = round(float(dr.sum(types.Float64(steps))[0]))
-        return RayCounts(
-            rays, int(dr.count(crossing)[0]), int(dr.count(opaque)[0]), total, max(0, total - reached),
-            max(0, reached - looks), looks, colours,
-        )  # fmt: skip
+        return {
+            "rays": rays, "crossing": int(dr.count(crossing)[0]), "opaque": int(dr.count(opaque)[0]), "steps": total,
+            "hidden": max(0, total - reached), "skipped": max(0, reached - looks), "looks": looks, "colours": colours,
+        }  # fmt: skip

@@ -80,7 +80,7 @@ class RadianceFieldModel(Model):
         return {name: values for name, values in self.field.arrays.items() if dr.is_float_v(values)}
 
     def counts(self) -> dict[str, int]:
-        """Return the counts (:class:`.march.RayCounts`) of parallel rays along the axes, in both directions."""
+        """Return the counts (:func:`.march.count`) of parallel rays along the axes, in both directions."""
         from .march import count
 
         lower, upper = np.array(self.field.lower), np.array(self.field.upper)
@@ -96,7 +96,7 @@ class RadianceFieldModel(Model):
             self.types.Array3f(*(device_array(self.types.Float, x) for x in np.concatenate(v).T))
             for v in (origins, directions)
         )
-        return vars(count(self.field, o, d, 0, np.inf))
+        return count(self.field, o, d, 0, np.inf)
 
     def measure(self, capture=None):
         """Return PSNR and SSIM of the test views of a capture.

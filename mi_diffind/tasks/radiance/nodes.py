@@ -215,14 +215,6 @@ def coarser(cells: np.ndarray) -> np.ndarray:
     return padded.reshape(x, COARSE, y, COARSE, z, COARSE).any(axis=(1, 3, 5))
 
 
-def chessboard_distances(cells: np.ndarray) -> np.ndarray:
-    """Return the distance of each cell of the coarser grid to the nearest one that holds one of the ``cells``.
-
-    Distances are in cells of the coarser grid, in the maximum norm, at most :data:`FARTHEST`; uint8.
-    """
-    return empty_distances(coarser(cells), FARTHEST)
-
-
 def nibbles(values: np.ndarray) -> np.ndarray:
     """Return 4-bit numbers packed into 32-bit words, eight to a word, the lowest bits first."""
     flat = values.reshape(-1)

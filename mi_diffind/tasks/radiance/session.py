@@ -104,6 +104,11 @@ class ViewImages:
         """Return the number of the first pixel of a view, its height and its width."""
         return list(dr.gather(self.types.Array4u, self.places, view))[:3]
 
+    def _index(self, view, x, y):
+        """Return the numbers of pixels among those of all views."""
+        offset, _, width = self._place(view)
+        return offset + dr.fma(y, width, x)
+
     @functools.cached_property
     def tiles(self):
         """View, first column and first row of the tiles in which, or beside which, something is seen: Array3u."""
@@ -139,9 +144,7 @@ class ViewImages:
 
     def colours(self, view, x, y):
         """Return linear red, green and blue, multiplied by alpha, and alpha."""
-        types = self.types
-        offset, _, width = self._place(view)
-        index = offset + dr.fma(y, width, x)
+        types, index = self.types, self._index(view, x, y)
         if self.views.pixels.shape[1] == 2:
             return types.Array4f(dr.gather(types.Array4f16, self.pixels, index))
         word = dr.gather(types.UInt32, self.pixels, index)
@@ -158,8 +161,7 @@ class ViewImages:
         """Return whether pixels count."""
         if self.mask is None:
             return self.types.Bool(True)
-        offset, _, width = self._place(view)
-        return dr.gather(self.types.Bool, self.mask, offset + dr.fma(y, width, x))
+        return dr.gather(self.types.Bool, self.mask, self._index(view, x, y))
 
     def behind(self, rng, count: int) -> list:
         """Return linear red, green and blue behind ``count`` rays: a random grey, or the background of the views."""
@@ -312,13 +314,10 @@ class FieldSession:
     @functools.cached_property
     def watched_images(self) -> ViewImages:
         """Held-out views for measurements during a training, evenly spread in the list; fewer if time is limited."""
-        watched = min(len(self.held_out), MOST_WATCHED)
+        count, most = len(self.held_out), MOST_WATCHED
         if self.pixels is not None:
-            share = max(1, min(MOST_WATCHED_LIMITED, round(WATCHED_SHARE * len(self.held_out))))
-            watched = min(watched, share)
-        if watched == len(self.held_out):
-            return self.held_out_images
-        return ViewImages(self.types, self.held_out.spread(watched))
+            most = max(1, min(MOST_WATCHED_LIMITED, round(WATCHED_SHARE * count)))
+        return self.held_out_images if count <= most else ViewImages(self.types, self.held_out.spread(most))
 
 
 def load_held_out(folder, most: int | None = None, **reading) -> tuple[CapturedViews, bool]:
@@ -356,13 +355,12 @@ def scores(pictures: Iterable[np.ndarray], views: CapturedViews, ssim: bool = Fa
         foreground.append(squared[covered].mean() if covered.any() else squared.mean())
         if ssim:
             similarities.append(metrics.ssim_published(expected, shown, counted))
-    psnr = [float(np.mean(-10 * np.log10(np.maximum(errors, 1e-12)))) for errors in (foreground, white)]
-    similar = [s for s in similarities if s is not None]
-    return {
-        "psnr_foreground_db": psnr[0],
-        "psnr_white_db": psnr[1],
-        **({"ssim_white": float(np.mean(similar))} if similar else {}),
+    figures = {
+        f"psnr_{name}_db": float(np.mean(-10 * np.log10(np.maximum(errors, 1e-12))))
+        for name, errors in (("foreground", foreground), ("white", white))
     }
+    similar = [s for s in similarities if s is not None]
+    return figures | ({"ssim_white": float(np.mean(similar))} if similar else {})
 
 
 class ImagesProblem(Problem):

@@ -33,7 +33,6 @@ from .captures import (
     ViewsError,
     byte_pixels,
     focal_lengths,
-    half_floats,
     image_file,
     is_linear,
     linear_pixels,
@@ -46,6 +45,9 @@ from .captures import (
 
 #: Level of zlib for images that are kept compressed: the fastest.
 PACKING = 1
+
+#: Largest number in half precision.
+LARGEST = 65504.0
 
 #: Longest side in pixels of images that are not reduced.
 LONGEST = 1600
@@ -374,7 +376,7 @@ class _Images:
             grown = aligned((self.count + (self.views - len(self.sizes) + 1) * size, words), np.uint32)
             grown[: self.count] = self.pixels[: self.count]
             self.pixels = grown
-        stored = image if words == 1 else half_floats(image)
+        stored = image if words == 1 else np.clip(linear_pixels(image), -LARGEST, LARGEST).astype(np.float16)
         self.pixels[self.count : end] = stored.reshape(-1).view(np.uint32).reshape(-1, words)
         self.count = end
 
@@ -382,10 +384,8 @@ class _Images:
         """Return the masks of all images one after the other, or ``None`` if all pixels count."""
         if all(mask is None for mask in self.masks):
             return None
-        whole = (
-            np.ones(h * w, bool) if m is None else m.ravel() for m, (h, w) in zip(self.masks, self.sizes, strict=True)
-        )
-        return np.concatenate(list(whole))
+        masks = zip(self.masks, self.sizes, strict=True)
+        return np.concatenate([np.ones(h * w, bool) if mask is None else mask.ravel() for mask, (h, w) in masks])
 
 
 #: Name → bytes of sRGB.
@@ -409,12 +409,9 @@ def _near(shown: np.ndarray, colour) -> np.ndarray:
 
 def border_colour(views: CapturedViews, chosen: list[int]) -> tuple[int, int, int] | None:
     """Return the colour that most pixels at the borders of some views have, bytes of sRGB, or ``None``."""
-    pixels = []
-    for view in chosen:
-        shown, counts = views.stored(view), views.counted(view)
-        for side in ((0, slice(None)), (-1, slice(None)), (slice(None), 0), (slice(None), -1)):
-            pixels.append(_shown(shown[side])[counts[side]])
-    pixels = np.concatenate(pixels)
+    sides = np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1]
+    images = ((views.stored(v), views.counted(v)) for v in chosen)
+    pixels = np.concatenate([_shown(shown[side])[counts[side]] for shown, counts in images for side in sides])
     if not len(pixels):
         return None
     colour = np.median(pixels, axis=0).astype(int)

@@ -88,11 +88,9 @@ def radiance_of(types, numbers: list, d, entry=None, active=True) -> list:
     With reflections, ``entry`` is that of :func:`environment_at`.
     """
     radiance = colour_of(numbers, d)
-    return (
-        radiance
-        if entry is None
-        else [a + b for a, b in zip(radiance, reflection(types, numbers, d, entry, active), strict=True)]
-    )
+    if entry is None:
+        return radiance
+    return [a + b for a, b in zip(radiance, reflection(types, numbers, d, entry, active), strict=True)]
 
 
 def reflection(types, numbers: list, d, entry, active=True) -> list:

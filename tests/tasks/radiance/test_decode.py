@@ -1,7 +1,8 @@
 """Radiance fields as dense grids: the numbers of a grid come back, and what is not installed is said."""
 
 import sys
-import types
+from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -116,28 +117,6 @@ def test_an_archive_holds_the_grid(t, rng, tmp_path):
         assert np.allclose(content["voxel"], VOXEL)
 
 
-class Written:
-    """What stands in for OpenVDB's module: keeps what it is given."""
-
-    GridClass = types.SimpleNamespace(FOG_VOLUME="fog volume")
-
-    def __init__(self):
-        class Grid:
-            def copyFromArray(self, array):
-                self.array = array
-
-        self.FloatGrid = self.Vec3SGrid = Grid
-        self.grids = []
-
-    def createLinearTransform(self, matrix):
-        return np.array(matrix)
-
-    def write(self, path, grids):
-        self.grids = grids
-        with open(path, "wb") as file:
-            file.write(b"vdb")
-
-
 def test_vdb_where_openvdb_is_there(t, rng, tmp_path, monkeypatch):
     raw, colour = numbers(rng)
     field = dense(t, raw, colour)
@@ -146,14 +125,16 @@ def test_vdb_where_openvdb_is_there(t, rng, tmp_path, monkeypatch):
     with pytest.raises(UsageError, match=r"a VDB file needs the Python module openvdb, which is not installed"):
         decode.decode(field, tmp_path / "grid.vdb")
     assert not list(tmp_path.iterdir())
-    written = Written()
-    monkeypatch.setitem(sys.modules, "pyopenvdb", written)
+    module, written = Mock(FloatGrid=Mock, Vec3SGrid=Mock, createLinearTransform=np.array), []
+    module.write = lambda path, grids: written.extend(grids) or Path(path).write_bytes(b"vdb")
+    monkeypatch.setitem(sys.modules, "pyopenvdb", module)
     decode.decode(field, tmp_path / "grid.vdb")
-    density, color = written.grids
+    density, color = written
+    densities, colours = (grid.copyFromArray.call_args.args[0] for grid in written)
     found = decode.grid(field)
-    assert (density.name, color.name) == ("density", "color") and np.array_equal(density.array, found["density"])
+    assert (density.name, color.name) == ("density", "color") and np.array_equal(densities, found["density"])
     assert np.array([2, 0, 1, 1]) @ density.transform == pytest.approx([LOWER[0] + 0.5, LOWER[1], LOWER[2] + 0.25, 1])
-    assert np.array_equal(color.array.any(axis=-1), found["density"] > 0)
+    assert np.array_equal(colours.any(axis=-1), found["density"] > 0)
     assert (tmp_path / "grid.vdb").read_bytes() == b"vdb"
 
 

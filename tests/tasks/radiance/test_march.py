@@ -1,9 +1,11 @@
 """Rays through radiance fields: against formulas, NumPy and finite differences, and where it is hard."""
 
+from types import SimpleNamespace
+
 import drjit as dr
 import numpy as np
 import pytest
-from radiance_fields import Bumps, Fog
+from radiance_fields import Bumps, Fog, haze
 
 from mi_diffind.core import compat
 from mi_diffind.tasks.radiance import march as marching
@@ -94,7 +96,7 @@ def test_nothing_is_read_that_does_not_count(mi_rgb):
     across = [[-3, 0.01 * i, 0.02] for i in range(20)], [[1, 0, 0]] * 20
 
     def counted(o, d, **more):
-        return marching.count(Bumps(types, **more), *rays(mi, o, d), 0, np.inf)
+        return SimpleNamespace(**marching.count(Bumps(types, **more), *rays(mi, o, d), 0, np.inf))
 
     whole = counted(*across, empty=True, blind=True, height=0.1)
     assert (whole.rays, whole.crossing, whole.opaque, whole.hidden, whole.skipped) == (20, 20, 0, 0, 0)
@@ -148,18 +150,20 @@ def test_hard_rays(mi_rgb):
 
 def attached(field, direction, step):
     """The field with its arrays moved along ``direction``."""
-    moved = {}
-    for name, values in field.arrays.items():
-        moved[name] = type(values)(np.float32(values.numpy() + step * direction[name]))
-    return field.with_arrays(moved)
+    return field.with_arrays(
+        {name: type(v)(np.float32(v.numpy() + step * direction[name])) for name, v in field.arrays.items()}
+    )
 
 
-@pytest.mark.parametrize("kind", ["fog", "bumps", "opaque"])
+@pytest.mark.parametrize("kind", ["fog", "bumps", "opaque", "surroundings"])
 def test_derivatives(mi_rgb, rng, kind):
     """Replay, tangent and the differentiable operation, against finite differences and one another."""
     mi = mi_rgb
     types = types_of(mi)
-    field = {"fog": Fog(types, 0.7), "bumps": Bumps(types, 3.0), "opaque": Bumps(types, 40.0, empty=True)}[kind]
+    field = {
+        "fog": lambda: Fog(types, 0.7), "bumps": lambda: Bumps(types, 3.0),
+        "opaque": lambda: Bumps(types, 40.0, empty=True), "surroundings": lambda: haze(types, rng),
+    }[kind]()  # fmt: skip
     o, d = around(rng, 300)
     at = (*rays(mi, o, d), mi.Float(0), mi.Float(np.inf), mi.Bool(True), mi.Float(np.float32(rng.random(300))))
     direction = {name: rng.normal(size=values.shape) for name, values in field.arrays.items()}

@@ -7,6 +7,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from PIL import Image
+from radiance_fields import haze
 from scipy.ndimage import map_coordinates
 
 from mi_diffind.arrays import sparse_grid
@@ -19,7 +20,6 @@ from mi_diffind.tasks.radiance import files, march, surroundings
 from mi_diffind.tasks.radiance import fit as field_fit
 from mi_diffind.tasks.radiance import grid as grids
 from mi_diffind.tasks.radiance.views import load_views
-from mi_diffind.tasks.radiance.volume_field import NodeField
 
 CENTRE, HALF, SIDE = np.array([0.2, -0.1, 0.3]), 0.7, 13
 SPACING = 4 * HALF / (SIDE - 1)
@@ -52,11 +52,7 @@ def rays(types, rng, n):
 
 @pytest.fixture
 def field(ad, rng):
-    """A field of random numbers, thin enough that rays see the horizon."""
-    grid = contracted_nodes(ad, np.ones((SIDE,) * 3, bool))
-    density = rng.normal(-4, 2, grid.entries).astype(np.float32)
-    colour = rng.normal(0, 0.3, (grid.entries, 12)).astype(np.float32)
-    return NodeField(grid, ad.TensorXf(density), ad.TensorXf(colour))
+    return haze(ad, rng, CENTRE, HALF, SIDE)
 
 
 def test_steps_grow_with_the_distance(ad, rng):
@@ -105,37 +101,6 @@ def test_rays_against_numpy(field, ad, rng):
         assert np.allclose(np.array(found.colour)[:, i], seen, atol=1e-2)
 
 
-def test_derivatives(field, ad, rng):
-    """Of sums over rays, by replay and by tangents, against finite differences."""
-    *_, o, d = rays(ad, rng, 200)
-    at = o, d, 0, ad.Float(np.inf), ad.Bool(True), ad.Float(0.5)
-    weights = [ad.Float(rng.normal(size=200).astype(np.float32)) for _ in range(5)]
-    direction = {name: rng.normal(size=v.shape).astype(np.float32) for name, v in field.arrays.items()}
-
-    def moved(step):
-        return field.with_arrays({n: ad.TensorXf(v.numpy() + step * direction[n]) for n, v in field.arrays.items()})
-
-    def total(seen):
-        colour, transmittance, depth = seen
-        parts = [*colour, transmittance, depth * 0.1]
-        return float(
-            np.float64(sum((w * p).numpy().astype(np.float64).sum() for w, p in zip(weights, parts, strict=True)))
-        )
-
-    def loss(step):
-        seen = march.march(moved(step), *at)
-        return total((seen.colour, seen.transmittance, seen.depth))
-
-    difference = (loss(0.02) - loss(-0.02)) / 0.04
-    seen, back, ahead = march.march(field, *at), moved(0), moved(0)
-    dr.enable_grad(back.arrays, ahead.arrays)
-    march.replay(back, *at, seen, ad.Array3f(*weights[:3]), weights[3], weights[4] * 0.1)
-    replayed = sum((dr.grad(v).numpy() * direction[n]).sum() for n, v in back.arrays.items())
-    dr.set_grad(ahead.arrays, {n: ad.TensorXf(v) for n, v in direction.items()})
-    assert total(march.tangent(ahead, *at, seen)) == pytest.approx(difference, rel=0.02)
-    assert replayed == pytest.approx(difference, rel=0.02)
-
-
 # -- captures ----------------------------------------------------------------------------------------------------------
 
 
@@ -179,12 +144,6 @@ def test_damaged_cubes_are_refused(folder, tmp_path):
         save_table(tmp_path / "x.npz", table)
         with pytest.raises(TableError, match="inner"):
             files.load(tmp_path / "x.npz")
-
-
-def test_the_paper_preset_has_no_surroundings(folder, tmp_path, capsys):
-    output = ["-o", str(tmp_path / "x.npz"), "--variant", "llvm_ad_rgb", "--preset", "paper"]
-    assert main(["fit", "field", str(folder), *output, "--background", "surroundings"]) == 2
-    assert "found surroundings with the preset paper" in capsys.readouterr().err
 
 
 def test_surroundings_in_a_scene(field, tmp_path, mi_rgb):

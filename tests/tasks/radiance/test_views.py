@@ -8,15 +8,15 @@ import captures
 import drjit as dr
 import drjit.llvm.ad as llvm
 import numpy as np
-import OpenEXR
 import pytest
-from captures import SIZE, Fog, change, pose, write_blender, write_image
+from captures import SIZE, change, pose, refused, write_blender, write_exr, write_image
 from PIL import Image
+from radiance_fields import Fog
 
 from mi_diffind.images import srgb
 from mi_diffind.tasks.radiance import session
 from mi_diffind.tasks.radiance.session import TILE, FieldSession, ImagesProblem, ViewImages
-from mi_diffind.tasks.radiance.views import ViewsError, hull, load_views
+from mi_diffind.tasks.radiance.views import hull, load_views
 
 
 def test_few_views_of_many_are_evenly_spread(blender):
@@ -29,17 +29,16 @@ def test_compressed_views_are_the_same(blender, suffix):
     """Of all views and of some of them, whatever the pixels are."""
     if suffix == "exr":
         image = np.random.default_rng(0).uniform(size=(*SIZE, 4)).astype(np.float32)
-        OpenEXR.File({"type": OpenEXR.scanlineimage}, {"RGBA": image}).write(str(blender / "train/r_1.exr"))
+        write_exr(blender / "train/r_1.exr", {"RGBA": image})
         listed = json.loads((blender / "transforms_train.json").read_text())["frames"]
         listed[1]["file_path"] = "./train/r_1.exr"
         change(blender, "transforms_train.json", frames=listed)
     views = load_views(blender)
     packed = views.compressed()
     assert packed.digest == views.digest and packed.pixels.size == 0
-    numbers = np.array([3, 1])
-    for a, b in zip(packed.chosen(numbers).names, numbers, strict=True):
-        assert a == views.names[b]
-    np.testing.assert_array_equal(packed.chosen(numbers).image(1), views.image(1))
+    few = packed.chosen(np.array([3, 1]))
+    assert few.names == (views.names[3], views.names[1])
+    np.testing.assert_array_equal(few.image(1), views.image(1))
 
 
 def test_a_limit_of_pixels_leaves_out_held_out_views(blender):
@@ -122,7 +121,7 @@ def test_views_of_different_sizes(blender):
     for i, values in stored.items():
         assert np.array_equal(views.stored(i), values)
     assert_colours_are_images(views)
-    fog, images = Fog(llvm, (-1, 0, -1), (2, 2, 1), 0.5, {}), ViewImages(llvm, views)
+    fog, images = Fog(llvm, 1, (1, 1, 1), 0.5, (2, 2, 1)), ViewImages(llvm, views)
     for v, (height, width) in enumerate(views.sizes):
         # A pixel is the mean of rays through the middles of its quarters
         x, y = np.meshgrid(np.arange(width), np.arange(height))
@@ -143,20 +142,16 @@ def test_views_of_different_sizes(blender):
 
 def test_exr_is_taken_as_it_is(blender):
     values = np.random.default_rng(3).random((*SIZE, 4)).astype(np.float32) * [4, 4, 4, 1]
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     byte_image = load_views(blender).image(0)
     (blender / "train" / "r_1.png").unlink()
-    with OpenEXR.File(header, {"RGBA": values.astype(np.float32)}) as file:
-        file.write(str(blender / "train" / "r_1.exr"))
+    write_exr(blender / "train" / "r_1.exr", {"RGBA": values.astype(np.float32)})
     views = load_views(blender)
     assert np.array_equal(views.image(1), values.astype(np.float16)) and views.names[1] == "train/r_1.exr"
     np.testing.assert_allclose(views.image(0), byte_image, rtol=1e-3, atol=1e-7)
     assert_colours_are_images(views)
     values[2, 3, 1] = np.nan
-    with OpenEXR.File(header, {"RGBA": values.astype(np.float32)}) as file:
-        file.write(str(blender / "train" / "r_1.exr"))
-    with pytest.raises(ViewsError, match=r"r_1\.exr: has 1 values that are NaN or infinite$"):
-        load_views(blender)
+    write_exr(blender / "train" / "r_1.exr", {"RGBA": values.astype(np.float32)})
+    refused(blender, r"r_1\.exr: has 1 values that are NaN or infinite$")
 
 
 def test_images_without_alpha_are_opaque(blender):
@@ -194,22 +189,6 @@ def test_rays_go_through_the_middles_of_pixels(blender):
         np.testing.assert_allclose(np.broadcast_to(actual.numpy().T, expected.shape), expected, atol=1e-6)
 
 
-def test_without_test_views_every_eighth_is_one(blender):
-    (blender / "transforms_test.json").unlink()
-    assert load_views(blender).names == tuple(f"train/r_{i}.png" for i in (1, 2, 3))
-    assert load_views(blender, "test").names == ("train/r_0.png",)
-
-
-def test_a_box_is_read(blender):
-    change(blender, aabb=[[-1, 0, -1], [1, 2, 1]])
-    assert np.array_equal(load_views(blender).box, [[-1, 0, -1], [1, 2, 1]])
-    for wrong in ([[0, 0, 0], [1, 1, 0]], [0, 1], [[0, 0, 0], [1, "a", 1]], None):
-        if wrong is not None:
-            change(blender, aabb=wrong)
-            with pytest.raises(ViewsError, match=r'train\.json: has the "aabb" .*, expected two corners'):
-                load_views(blender)
-
-
 @pytest.fixture
 def masked(blender):
     """The third training view and the first test view with masks: a rectangle does not count."""
@@ -230,7 +209,7 @@ def test_masked_pixels_do_not_count(masked):
             image[where] = 255 - image[where]
             Image.fromarray(image).save(masked / path)
         session = FieldSession.load(llvm, masked)
-        fog = Fog(llvm, (-1, 0, -1), (2, 2, 1), 0.5, {})
+        fog = Fog(llvm, 1, (1, 1, 1), 0.5, (2, 2, 1))
         problem = ImagesProblem(session, {}, lambda net, fog=fog: fog)
         loss = float(dr.sum(problem.loss({}, dr.rng(seed=3), 1024))[0])
         figures.append([loss, *session.held_out_images.evaluate(fog).values()])
@@ -251,13 +230,6 @@ def test_masked_pixels_carve_nothing(masked):
     assert (carved <= inside).all() and inside.sum() > 2 * carved.sum() and inside.any()
 
 
-class Clear(Fog):
-    """Nothing."""
-
-    def density_at(self, p, active=True):
-        return self.types.Float(0), []
-
-
 def test_patches_are_drawn_where_errors_are(blender):
     """Of the tiles, in proportion to the root of their error before grey; an empty field errs where something is."""
     stored = np.zeros((64, 48, 4), np.uint8)
@@ -265,7 +237,7 @@ def test_patches_are_drawn_where_errors_are(blender):
     for i in range(4):
         Image.fromarray(stored * (i == 2)).save(blender / "train" / f"r_{i}.png")
     images = ViewImages(llvm, load_views(blender))
-    empty = Clear(llvm, (-1, -1, -1), (1, 1, 1), 0.5, {})
+    empty = Fog(llvm, 0)
     cumulative = images.cumulative_errors(empty)
     # White before grey, of sRGB
     grey = srgb.from_linear(np.float64(session.GREY))
