@@ -28,7 +28,7 @@ from ...core.units import check_memory
 from ...fitting.task import Model
 from .encoding import NodeCoding
 from .field import DistanceField
-from .nodes import POINTERS, SparseNodes, coded_field, decode_to_array, pointer_words, unpack_pointers
+from .nodes import POINTERS, SparseNodes, decode_to_array, pointer_words, unpack_pointers
 from .paper import PairField
 
 #: Arrays of each layout: name → number of dimensions, and channels (bytes in the sparse layout, except for entries).
@@ -76,10 +76,10 @@ def sparse_arrays(structure: SparseGrid, frames, pointers, entries) -> dict[str,
 
 def coded_arrays(coding: NodeCoding) -> tuple[dict[str, StoredArray], dict]:
     """Return the arrays of a file for the codes of a grid's nodes, and the settings that go with them."""
-    structure = coding.sampled.structure
-    arrays = sparse_arrays(structure, coding.frames, pointer_words(coding.pointers, coding.bits), coding.entries)
+    structure, bits = coding.sampled.structure, coding.sampled.bits
+    arrays = sparse_arrays(structure, coding.frames, pointer_words(coding.pointers, bits), coding.entries)
     settings = {
-        "layout": "sparse", "lower": list(structure.lower), "spacing": structure.spacing, "bits": coding.bits,
+        "layout": "sparse", "lower": list(structure.lower), "spacing": structure.spacing, "bits": bits,
         "nodes": structure.nodes, "slope": coding.slope,
     }  # fmt: skip
     return arrays, settings
@@ -169,7 +169,8 @@ def build_field(table: Table, arrays: dict, types, storage: str = "") -> Distanc
         pointers = unpack_pointers(words, settings["bits"], structure.nodes)
         nodes = decode_to_array(structure, frames, entries, pointers)
         return SparseNodes(types, structure, settings["slope"], nodes=device_tensor(types.TensorXf, nodes))
-    return coded_field(types, structure, settings["slope"], frames, words, settings["bits"], entries)
+    codes = {"frames": frames, "pointers": words, "bits": settings["bits"], "entries": entries}
+    return SparseNodes(types, structure, settings["slope"], **codes)
 
 
 def stored(table: Table, entries: dict, storage: str = "") -> Table:

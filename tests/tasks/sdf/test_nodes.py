@@ -1,13 +1,20 @@
-"""The sparse layout of signed distance fields: masks, codes, what cells say."""
+"""The sparse layout of signed distance fields: masks, codes, what cells say; no holes and no floaters."""
+
+import math
+from dataclasses import replace
 
 import drjit as dr
 import numpy as np
 import pytest
-from solid_meshes import box, sphere, together
+from sdf_fields import codes
+from solid_meshes import box, sphere, together, turned
 
+from mi_diffind.arrays.sparse_grid import CORNERS
+from mi_diffind.arrays.tables import Table
 from mi_diffind.core.runtime import array_module
-from mi_diffind.tasks.sdf import encoding, grids, nodes
-from mi_diffind.tasks.sdf.distances import Distances
+from mi_diffind.tasks.sdf import encoding, grids, model, nodes
+from mi_diffind.tasks.sdf.distances import Distances, sample_box
+from mi_diffind.tasks.sdf.marching import trace
 from mi_diffind.tasks.sdf.mesh import make_mesh
 
 
@@ -34,13 +41,13 @@ def decoded(types, sampled):
     return nodes.SparseNodes(types, sampled.structure, 3.0, nodes=types.TensorXf(values))
 
 
-def coded(types, sampled, bits=8):
-    frames = encoding.fit_frames(sampled)
-    wanted = encoding.exact_entries(sampled, frames)
-    entries = encoding.cluster(wanted, min(2**bits, len(wanted)))
-    pointers = encoding.assign(wanted, entries)
-    words = nodes.pointer_words(pointers, bits)
-    return nodes.coded_field(types, sampled.structure, 3.0, frames, words, bits, entries), frames, entries[pointers]
+def coded(types, sampled, slope=3.0):
+    """Sampled, not trained: entries of 8 bits are coarse enough for errors."""
+    frames, entries, pointers = codes(sampled)
+    words = nodes.pointer_words(pointers, 8)
+    return nodes.SparseNodes(
+        types, sampled.structure, slope, frames=frames, pointers=words, bits=8, entries=entries.astype(np.float32)
+    )
 
 
 # -- masks -------------------------------------------------------------------------------------------------------------
@@ -175,9 +182,8 @@ def test_gradients_are_those_of_the_values(ad, solid):
 def test_coded_nodes_are_the_decoded_ones(ad, solid):
     """Read from pointers, entries and frames in the kernel, and decoded by NumPy: one field."""
     _, _, sampled = solid
-    field, frames, entries = coded(ad, sampled)
-    values = nodes.decode_to_array(sampled.structure, frames, entries)
-    other = nodes.SparseNodes(ad, sampled.structure, 3.0, nodes=ad.TensorXf(values))
+    field = coded(ad, sampled)
+    other = nodes.SparseNodes(ad, sampled.structure, 3.0, nodes=ad.TensorXf(field.decoded()))
     rng = np.random.default_rng(3)
     p = points(ad, rng.uniform(field.lower, field.upper, (20000, 3)))
     assert np.abs(field.value(p).numpy() - other.value(p).numpy()).max() < 2e-2 * field.spacing
@@ -200,7 +206,7 @@ def test_slope_is_bounded(ad, solid):
 
 def test_places_where_there_is_nothing(ad, solid):
     _, _, sampled = solid
-    field, *_ = coded(ad, sampled)
+    field = coded(ad, sampled)
     p = points(ad, [[np.nan, 0, 0], [0, 0, 9], [-1e30, 0, 0], [np.inf, 0, 0]])
     value, slope = field.gradient(p)
     assert np.array_equal(value.numpy(), np.full(4, np.float32(field.band)))
@@ -218,12 +224,12 @@ def test_the_surface_stays_in_its_cells(ad, solid):
     values[:, 0] += rng.normal(scale=0.1, size=len(values))
     values[:, 1:] += rng.normal(scale=0.5, size=(len(values), 3))
     values[:, 1:] /= np.linalg.norm(values[:, 1:], axis=1, keepdims=True)
-    coding = encoding.NodeCoding(sampled, 8)
+    coding = encoding.NodeCoding(replace(sampled, bits=8))
     coding.encode(values)
     distances = coding.values()[:, 0]
     assert np.all((distances < 0) == (sampled.distances < 0)) and np.all(np.abs(distances) > 0.005)
-    words = nodes.pointer_words(coding.pointers, 8)
-    field = nodes.coded_field(ad, sampled.structure, 3.0, coding.frames, words, 8, coding.entries)
+    arrays, settings = model.coded_arrays(coding)
+    field = model.build_field(Table("sdf", arrays, settings=settings), {}, ad)
     assert len(grids.components(grids.extract(field, 200))) == 2
 
     # On the sides of stored cells behind which there is none, the sign is that of their corners
@@ -245,3 +251,105 @@ def test_the_surface_stays_in_its_cells(ad, solid):
     assert len(places) > 20000 and np.mean(complete.numpy()) > 0.999
     wrong = (value.numpy() * signs < -0.005) & complete.numpy()
     assert np.mean(wrong) < 1e-4
+
+
+@pytest.fixture(scope="module")
+def shapes():
+    """A ball with a cavity, a box that cuts into it, a thin rod and a turned cube: distances and samples."""
+    ball, cavity, rod = sphere(24), turned(sphere(16, 0.6)), box((0.08, 2.6, 0.08), (1.15, 0, 0.3))
+    vertices, faces = box((0.5, 0.5, 0.5))
+    turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    cube = vertices @ (turn * np.sign(np.linalg.det(turn))) + (-1.2, 0.9, 0), faces
+    with Distances(make_mesh(*together(ball, cavity, box((0.6, 0.6, 0.6), (0.9, 0, 0)), rod, cube))) as distances:
+        yield distances, encoding.sample(distances, 1 / 72)
+
+
+def spoiled(types, sampled):
+    """The field with three tenths of its nodes on the wrong side, as an optimisation may leave them."""
+    values = np.concatenate([sampled.distances[:, None], sampled.normals], axis=1).astype(np.float32)
+    values[np.random.default_rng(4).random(len(values)) < 0.3, 0] *= -1
+    return nodes.SparseNodes(types, sampled.structure, 3.0, nodes=types.TensorXf(values))
+
+
+# -- floaters ---------------------------------------------------------------------------------------------------------
+
+
+def test_wrong_nodes_make_no_floaters(ad, shapes):
+    """They have a part in the cells that the surface crosses only: all others keep their signs."""
+    distances, s = shapes
+    field = spoiled(ad, s)
+    places = sample_box(field.lower, field.upper, 40000, 5)
+    cell = np.floor((places - field.lower) / field.spacing).astype(int)
+    stored = set(map(tuple, s.structure.node_positions()[0].tolist()))
+    corners = (cell[:, None] + CORNERS).tolist()
+    count = np.array([sum(tuple(c) in stored for c in eight) for eight in corners])
+    inside = distances.inside(places)
+    wrong = (field.value(points(ad, places)).numpy() < 0) != inside
+    assert not wrong[count < 8].any() and wrong[count == 8].any()
+    assert np.any((count > 0) & (count < 8) & inside) and np.any((count > 0) & (count < 8) & ~inside)
+
+
+def test_as_many_pieces_as_the_mesh(ad, shapes):
+    """Also after coding, decoded finer than the field's cells: two solids, one with a cavity, and nothing else."""
+    distances, s = shapes
+    volumes = grids.components(grids.extract(coded(ad, s), 108)) * distances.mesh.scale**3
+    assert len(volumes) == 3 and np.sum(volumes < 0) == 1
+    assert volumes[1] == pytest.approx(-4 / 3 * math.pi * 0.6**3, rel=0.05)
+    assert volumes[2] == pytest.approx(0.5**3, rel=0.05)
+
+
+def test_empty_blocks_are_left_out_of_decoding(ad, shapes, monkeypatch):
+    """The same triangles and values, whether all of the grid is looked at or what is near stored nodes only."""
+    field = coded(ad, shapes[1])
+    few, (values, *_) = grids.extract(field, 100), grids.grid(field, 100)
+    blocks = grids.crossed_blocks(field, np.array(field.lower), 1 / 100, [100] * 3)
+    assert blocks.shape == (4, 4, 4) and 0.2 < blocks.mean() < 0.95
+    monkeypatch.setattr(grids, "crossed_blocks", lambda field, lower, spacing, cells: np.ones(-(-cells // 32), bool))
+    every = grids.extract(field, 100)
+    assert np.abs(values - grids.grid(field, 100)[0]).max() < 1e-6
+    assert np.array_equal(few.vertices, every.vertices) and np.array_equal(few.faces, every.faces)
+
+
+# -- holes ------------------------------------------------------------------------------------------------------------
+
+
+def shoot(ad, distances, field, count, seed):
+    """
+    ``count`` rays that start outside, from a sphere around the solid, from afar, along axes and from places in the box,
+    each at a place that lies deeper inside than the field's cells are wide: how many go through, how many end elsewhere
+    than on the surface.
+    """
+    rng = np.random.default_rng(seed)
+    h = field.spacing
+    pool = sample_box(distances.mesh.lower - 3 * h, distances.mesh.upper + 3 * h, min(4 * count, 400_000), rng)
+    d = distances.signed(pool, 4 * h)
+    deep, free = pool[d < -1.5 * h], pool[d > 1.5 * h]
+    target = deep[rng.integers(len(deep), size=count)] + rng.uniform(-0.25, 0.25, (count, 3)) * h
+    away, start = rng.normal(size=(count, 3)), rng.integers(8, size=count)
+    along, flat = start == 0, start == 1
+    away[along] = np.eye(3)[rng.integers(3, size=along.sum())] * rng.choice([-1, 1], (along.sum(), 1))
+    away[flat, rng.integers(3, size=flat.sum())] = 0
+    away /= np.linalg.norm(away, axis=1)[:, None]
+    o = target + np.where(start == 2, 30, 2)[:, None] * away
+    box = start >= 5
+    o[box] = free[rng.integers(len(free), size=box.sum())]
+    o = o.astype(np.float32).astype(np.float64)
+    length = np.linalg.norm(target - o, axis=1)
+    d = (target - o) / length[:, None]
+    t, hit = trace(field, points(ad, o), points(ad, d), ad.Float(math.inf))
+    t, hit = t.numpy().astype(np.float64), hit.numpy()
+    some = rng.choice(np.flatnonzero(hit & (start != 2)), min(20_000, int(hit.sum() // 2)), replace=False)
+    place = o[some] + d[some] * t[some, None]
+    return int(np.sum(~hit | (t > length))), int(np.sum(distances.unsigned(place) > 1.5 * h))
+
+
+def test_no_holes(ad, shapes):
+    distances, s = shapes
+    values = coded(ad, s).decoded().astype(np.float64)
+    slope = nodes.slope_bound(values[:, 0], values[:, 1:], s.corners)
+    assert shoot(ad, distances, coded(ad, s, slope), 2**17, 6) == (0, 0)
+
+
+def test_no_holes_where_nodes_are_wrong(ad, shapes):
+    """Rays end at the latest where signs are known."""
+    assert shoot(ad, shapes[0], spoiled(ad, shapes[1]), 2**15, 9)[0] == 0

@@ -291,15 +291,10 @@ def test_damaged_files(folder, tmp_path, name, change, says, ad):
 # -- hard cases --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("extent", [(1, 1, 20), (2**-20, 2**-20, 2**-19), (2**20, 2**20, 2**21)])
+@pytest.mark.parametrize("extent", [(1, 1, 20), (2**-20, 2**-20, 2**-19)])
 def test_extents_and_scales(tmp_path, ad, extent):
-    """A box of 1:1:20, a tiny and a huge one: its middle and sides are where they ought to be.
-
-    The last two differ by a power of two, so their kernels are the same.
-    """
-    mesh = box(extent, (5 * extent[0], 0, 0))
-    write(tmp_path / "box.obj", (mesh[0], mesh[1])) if extent[0] > 1e-3 else write(tmp_path / "box.ply", mesh)
-    source = next(tmp_path.glob("box.*"))
+    """A box of 1:1:20 and a tiny one: its middle and sides are where they ought to be."""
+    source = write(tmp_path / "box.ply", box(extent, (5 * extent[0], 0, 0)))
     done = fit("sdf", source=str(source), bytes="24k", steps=10, batch=4096, variant="llvm_ad_rgb", progress=False)
     model = tasks()["sdf"].model(done.table, ad.TensorXf)
     assert done.table.measured["iou"] > 0.98
