@@ -24,38 +24,45 @@ def ad():
 
 
 @pytest.fixture(scope="module")
-def solid():
-    """A ball and a box apart from it, and the nodes of a grid around them: mesh, distances, samples."""
-    mesh = make_mesh(*together(sphere(24, 0.5, (0, 0, 0)), box((0.3, 0.5, 0.4), (1.1, 0.1, -0.1))))
-    with Distances(mesh) as distances:
-        sampled = encoding.sample(distances, 1 / 96)
-        yield mesh, distances, sampled
+def shapes():
+    """A ball with a cavity, a box that cuts into it, a thin rod and a turned cube: distances and samples."""
+    ball, cavity, rod = sphere(24), turned(sphere(16, 0.6)), box((0.08, 2.6, 0.08), (1.15, 0, 0.3))
+    vertices, faces = box((0.5, 0.5, 0.5))
+    turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    cube = vertices @ (turn * np.sign(np.linalg.det(turn))) + (-1.2, 0.9, 0), faces
+    with Distances(make_mesh(*together(ball, cavity, box((0.6, 0.6, 0.6), (0.9, 0, 0)), rod, cube))) as distances:
+        yield distances, encoding.sample(distances, 1 / 72)
+
+
+@pytest.fixture(scope="module")
+def sampled(shapes):
+    return shapes[1]
 
 
 def points(types, values):
     return types.Array3f(*np.ascontiguousarray(np.asarray(values, np.float32).T))
 
 
-def decoded(types, sampled):
+def decoded(types, sampled, wrong=0.0):
+    """The sampled nodes; this share of them is on the wrong side, as an optimisation may leave them."""
     values = np.concatenate([sampled.distances[:, None], sampled.normals], axis=1).astype(np.float32)
+    values[np.random.default_rng(4).random(len(values)) < wrong, 0] *= -1
     return nodes.SparseNodes(types, sampled.structure, 3.0, nodes=types.TensorXf(values))
 
 
-def coded(types, sampled, slope=3.0):
+def coded(types, sampled):
     """Sampled, not trained: entries of 8 bits are coarse enough for errors."""
     frames, entries, pointers = codes(sampled)
-    words = nodes.pointer_words(pointers, 8)
-    return nodes.SparseNodes(
-        types, sampled.structure, slope, frames=frames, pointers=words, bits=8, entries=entries.astype(np.float32)
-    )
+    given = {"frames": frames, "pointers": nodes.pointer_words(pointers, 8), "entries": entries.astype(np.float32)}
+    return nodes.SparseNodes(types, sampled.structure, 3.0, bits=8, **given)
 
 
 # -- masks -------------------------------------------------------------------------------------------------------------
 
 
-def test_every_node_of_the_grid_has_its_sign(ad, solid):
+def test_every_node_of_the_grid_has_its_sign(ad, shapes):
     """Also those that are not stored, of which there is one bit for eight: against winding numbers."""
-    _mesh, distances, sampled = solid
+    distances, sampled = shapes
     s = sampled.structure
     grid = np.stack(np.meshgrid(*[np.arange(n - 1) for n in s.shape], indexing="ij"), axis=-1).reshape(-1, 3)
     places = np.array(s.lower) + s.spacing * grid
@@ -122,9 +129,8 @@ def test_pointers_in_words(ad, bits, rng):
 # -- what cells say ----------------------------------------------------------------------------------------------------
 
 
-def test_quadratic_functions_are_exact(ad, solid):
+def test_quadratic_functions_are_exact(ad, sampled):
     """f(x) = Σ wᵢ (dᵢ + ½ gᵢ·(x − xᵢ)) has no error but rounding for any quadratic f, and so have its gradients."""
-    _, _, sampled = solid
     s = sampled.structure
     positions, _ = s.node_positions()
     a = np.array([[0.02, 0.01, -0.03], [0.01, -0.04, 0.02], [-0.03, 0.02, 0.05]])
@@ -145,9 +151,8 @@ def test_quadratic_functions_are_exact(ad, solid):
     assert np.abs(np.stack([v.numpy() for v in slope], axis=1) - (2 * cells @ a + b) / 40).max() < 1e-3
 
 
-def test_gradients_are_those_of_the_values(ad, solid):
+def test_gradients_are_those_of_the_values(ad, sampled):
     """In place: central differences. In the nodes: changes of nodes, one by one."""
-    _, _, sampled = solid
     field, s = decoded(ad, sampled), sampled.structure
     rng = np.random.default_rng(2)
     corner = s.node_positions()[0][sampled.corners[rng.integers(len(sampled.corners), size=400), 0]]
@@ -179,9 +184,8 @@ def test_gradients_are_those_of_the_values(ad, solid):
         assert (result[0] - result[1]) / 0.02 == pytest.approx(grad[node, channel], rel=2e-2, abs=2e-3)
 
 
-def test_coded_nodes_are_the_decoded_ones(ad, solid):
+def test_coded_nodes_are_the_decoded_ones(ad, sampled):
     """Read from pointers, entries and frames in the kernel, and decoded by NumPy: one field."""
-    _, _, sampled = solid
     field = coded(ad, sampled)
     other = nodes.SparseNodes(ad, sampled.structure, 3.0, nodes=ad.TensorXf(field.decoded()))
     rng = np.random.default_rng(3)
@@ -192,8 +196,7 @@ def test_coded_nodes_are_the_decoded_ones(ad, solid):
     assert known.sum() > 500 and gap.max() < 0.02
 
 
-def test_slope_is_bounded(ad, solid):
-    _, _, sampled = solid
+def test_slope_is_bounded(ad, sampled):
     bound = nodes.slope_bound(sampled.distances, sampled.normals, sampled.corners)
     rng = np.random.default_rng(5)
     corner = sampled.structure.node_positions()[0][np.repeat(sampled.corners[:, 0], 16)]
@@ -204,8 +207,7 @@ def test_slope_is_bounded(ad, solid):
     assert 0.5 * bound < steepest <= bound < 3
 
 
-def test_places_where_there_is_nothing(ad, solid):
-    _, _, sampled = solid
+def test_places_where_there_is_nothing(ad, sampled):
     field = coded(ad, sampled)
     p = points(ad, [[np.nan, 0, 0], [0, 0, 9], [-1e30, 0, 0], [np.inf, 0, 0]])
     value, slope = field.gradient(p)
@@ -216,9 +218,8 @@ def test_places_where_there_is_nothing(ad, solid):
     assert np.all(field.value(corners).numpy() > 0)
 
 
-def test_the_surface_stays_in_its_cells(ad, solid):
+def test_the_surface_stays_in_its_cells(ad, sampled):
     """Nodes that training spoiled keep their sides when they are coded, and nothing is left beside the solids."""
-    _, _, sampled = solid
     rng = np.random.default_rng(7)
     values = np.concatenate([sampled.distances[:, None], sampled.normals], axis=1)
     values[:, 0] += rng.normal(scale=0.1, size=len(values))
@@ -230,7 +231,7 @@ def test_the_surface_stays_in_its_cells(ad, solid):
     assert np.all((distances < 0) == (sampled.distances < 0)) and np.all(np.abs(distances) > 0.005)
     arrays, settings = model.coded_arrays(coding)
     field = model.build_field(Table("sdf", arrays, settings=settings), {}, ad)
-    assert len(grids.components(grids.extract(field, 200))) == 2
+    assert len(grids.components(grids.extract(field, 200))) == 3
 
     # On the sides of stored cells behind which there is none, the sign is that of their corners
     s = sampled.structure
@@ -253,31 +254,13 @@ def test_the_surface_stays_in_its_cells(ad, solid):
     assert np.mean(wrong) < 1e-4
 
 
-@pytest.fixture(scope="module")
-def shapes():
-    """A ball with a cavity, a box that cuts into it, a thin rod and a turned cube: distances and samples."""
-    ball, cavity, rod = sphere(24), turned(sphere(16, 0.6)), box((0.08, 2.6, 0.08), (1.15, 0, 0.3))
-    vertices, faces = box((0.5, 0.5, 0.5))
-    turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
-    cube = vertices @ (turn * np.sign(np.linalg.det(turn))) + (-1.2, 0.9, 0), faces
-    with Distances(make_mesh(*together(ball, cavity, box((0.6, 0.6, 0.6), (0.9, 0, 0)), rod, cube))) as distances:
-        yield distances, encoding.sample(distances, 1 / 72)
-
-
-def spoiled(types, sampled):
-    """The field with three tenths of its nodes on the wrong side, as an optimisation may leave them."""
-    values = np.concatenate([sampled.distances[:, None], sampled.normals], axis=1).astype(np.float32)
-    values[np.random.default_rng(4).random(len(values)) < 0.3, 0] *= -1
-    return nodes.SparseNodes(types, sampled.structure, 3.0, nodes=types.TensorXf(values))
-
-
 # -- floaters ---------------------------------------------------------------------------------------------------------
 
 
 def test_wrong_nodes_make_no_floaters(ad, shapes):
     """They have a part in the cells that the surface crosses only: all others keep their signs."""
     distances, s = shapes
-    field = spoiled(ad, s)
+    field = decoded(ad, s, 0.3)
     places = sample_box(field.lower, field.upper, 40000, 5)
     cell = np.floor((places - field.lower) / field.spacing).astype(int)
     stored = set(map(tuple, s.structure.node_positions()[0].tolist()))
@@ -344,12 +327,9 @@ def shoot(ad, distances, field, count, seed):
 
 
 def test_no_holes(ad, shapes):
-    distances, s = shapes
-    values = coded(ad, s).decoded().astype(np.float64)
-    slope = nodes.slope_bound(values[:, 0], values[:, 1:], s.corners)
-    assert shoot(ad, distances, coded(ad, s, slope), 2**17, 6) == (0, 0)
+    assert shoot(ad, shapes[0], coded(ad, shapes[1]), 2**17, 6) == (0, 0)
 
 
 def test_no_holes_where_nodes_are_wrong(ad, shapes):
     """Rays end at the latest where signs are known."""
-    assert shoot(ad, shapes[0], spoiled(ad, shapes[1]), 2**15, 9)[0] == 0
+    assert shoot(ad, shapes[0], decoded(ad, shapes[1], 0.3), 2**15, 9)[0] == 0
