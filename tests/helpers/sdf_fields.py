@@ -100,21 +100,31 @@ def torus(p):
     return length - 0.12, np.concatenate([flat, to[:, 1:] / length[:, None]], axis=1)
 
 
-def codes(sampled, bits=8, count=None) -> tuple:
-    """The frames, entries and pointers of sampled nodes, not trained."""
+def coded(sampled, count=None):
+    """The codes of sampled nodes, not trained: ``count`` entries, by default as many as pointers can name."""
     from mi_diffind.tasks.sdf import encoding
 
-    frames = encoding.fit_frames(sampled)
-    wanted = encoding.exact_entries(sampled, frames)
-    entries = encoding.cluster(wanted, count or min(2**bits, len(wanted)))
-    return frames, entries, encoding.assign(wanted, entries)
+    coding = encoding.NodeCoding(sampled)
+    coding.frames = encoding.fit_frames(sampled)
+    wanted = encoding.exact_entries(sampled, coding.frames)
+    coding.entries = encoding.cluster(wanted, count or sampled.entries)
+    coding.pointers = encoding.assign(wanted, coding.entries)
+    return coding
+
+
+def coded_table(coding):
+    """The table of these codes."""
+    from mi_diffind.arrays.tables import Table
+    from mi_diffind.tasks.sdf import model
+
+    arrays, settings = model.coded_arrays(coding)
+    return Table("sdf", arrays, "sparse", settings)
 
 
 def sparse_table(shape=torus, spacing=1 / 40, entries=256, scale=2.0, centre=(0.5, -1.0, 0.25)):
     """The table of a formula's sparse field, as ``fit sdf`` would write it; pointers have 8 bits."""
     from mi_diffind.arrays.sparse_grid import SparseGrid, cell_corners, complete_cells
-    from mi_diffind.arrays.tables import Table
-    from mi_diffind.tasks.sdf import encoding, model, nodes
+    from mi_diffind.tasks.sdf import encoding
 
     lower = np.array([-0.5, -0.5, -0.5]) - 1.5 * spacing
     n = int(np.ceil((1 + 3 * spacing) / spacing)) + 1
@@ -128,12 +138,9 @@ def sparse_table(shape=torus, spacing=1 / 40, entries=256, scale=2.0, centre=(0.
     positions, block = grid.node_positions()
     d, g = shape(np.array(grid.lower) + spacing * positions)
     corners = encoding.crossed_cells(grid, d < 0)
-    sampled = encoding.SampledNodes(grid, positions, block, d / spacing, g, corners, len(corners), 0.0)
-    frames, chosen, pointers = codes(sampled, count=entries)
-    table = Table("sdf", model.sparse_arrays(grid, frames, nodes.pointer_words(pointers, 8), chosen), "sparse")
-    slope = nodes.slope_bound(d / spacing, g, corners)
-    table.settings = {"layout": "sparse", "lower": list(grid.lower), "spacing": spacing, "bits": 8,
-                      "nodes": grid.nodes, "slope": slope, "scale": scale, "centre": list(centre)}  # fmt: skip
+    sampled = encoding.SampledNodes(grid, positions, block, d / spacing, g, corners, len(corners), 0.0, 8)
+    table = coded_table(coded(sampled, entries))
+    table.settings |= {"scale": scale, "centre": list(centre)}
     return table
 
 

@@ -61,26 +61,20 @@ def _word_bytes(words: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(words, "<u4").view(np.uint8).reshape(len(words), -1)
 
 
-def sparse_arrays(structure: SparseGrid, frames, pointers, entries) -> dict[str, StoredArray]:
-    """Return the arrays of a sparse field: words of frames (B,) and pointers, and the entries (K, 3), float32."""
-    blocks = [_word_bytes(structure.block_masks), structure.block_signs[:, None], _word_bytes(frames[:, None])]
-    masks = np.concatenate([structure.region_masks, structure.region_signs], axis=1)
-    return {
-        "regions": byte_array(structure.regions[..., None]),
-        "region_masks": byte_array(_word_bytes(masks)),
-        "blocks": byte_array(np.concatenate(blocks, axis=1)),
-        "pointers": byte_array(_word_bytes(pointers[:, None])),
-        "entries": StoredArray(np.ascontiguousarray(entries, np.float32)),
-    }
-
-
 def coded_arrays(coding: NodeCoding) -> tuple[dict[str, StoredArray], dict]:
     """Return the arrays of a file for the codes of a grid's nodes, and the settings that go with them."""
-    structure, bits = coding.sampled.structure, coding.sampled.bits
-    arrays = sparse_arrays(structure, coding.frames, pointer_words(coding.pointers, bits), coding.entries)
+    grid, bits = coding.sampled.structure, coding.sampled.bits
+    blocks = [_word_bytes(grid.block_masks), grid.block_signs[:, None], _word_bytes(coding.frames[:, None])]
+    arrays = {
+        "regions": byte_array(grid.regions[..., None]),
+        "region_masks": byte_array(_word_bytes(np.concatenate([grid.region_masks, grid.region_signs], axis=1))),
+        "blocks": byte_array(np.concatenate(blocks, axis=1)),
+        "pointers": byte_array(_word_bytes(pointer_words(coding.pointers, bits)[:, None])),
+        "entries": StoredArray(np.ascontiguousarray(coding.entries, np.float32)),
+    }
     settings = {
-        "layout": "sparse", "lower": list(structure.lower), "spacing": structure.spacing, "bits": bits,
-        "nodes": structure.nodes, "slope": coding.slope,
+        "layout": "sparse", "lower": list(grid.lower), "spacing": grid.spacing, "bits": bits, "nodes": grid.nodes,
+        "slope": coding.slope,
     }  # fmt: skip
     return arrays, settings
 

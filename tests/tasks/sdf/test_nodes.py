@@ -1,16 +1,14 @@
 """The sparse layout of signed distance fields: masks, codes, what cells say; no holes and no floaters."""
 
 import math
-from dataclasses import replace
 
 import drjit as dr
 import numpy as np
 import pytest
-from sdf_fields import codes
+from sdf_fields import coded, coded_table
 from solid_meshes import box, sphere, together, turned
 
 from mi_diffind.arrays.sparse_grid import CORNERS
-from mi_diffind.arrays.tables import Table
 from mi_diffind.core.runtime import array_module
 from mi_diffind.tasks.sdf import encoding, grids, model, nodes
 from mi_diffind.tasks.sdf.distances import Distances, sample_box
@@ -31,7 +29,7 @@ def shapes():
     turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
     cube = vertices @ (turn * np.sign(np.linalg.det(turn))) + (-1.2, 0.9, 0), faces
     with Distances(make_mesh(*together(ball, cavity, box((0.6, 0.6, 0.6), (0.9, 0, 0)), rod, cube))) as distances:
-        yield distances, encoding.sample(distances, 1 / 72)
+        yield distances, encoding.sample(distances, 1 / 72, 8)
 
 
 @pytest.fixture(scope="module")
@@ -50,11 +48,8 @@ def decoded(types, sampled, wrong=0.0):
     return nodes.SparseNodes(types, sampled.structure, 3.0, nodes=types.TensorXf(values))
 
 
-def coded(types, sampled):
-    """Sampled, not trained: entries of 8 bits are coarse enough for errors."""
-    frames, entries, pointers = codes(sampled)
-    given = {"frames": frames, "pointers": nodes.pointer_words(pointers, 8), "entries": entries.astype(np.float32)}
-    return nodes.SparseNodes(types, sampled.structure, 3.0, bits=8, **given)
+def field_of(types, coding):
+    return model.build_field(coded_table(coding), {}, types)
 
 
 # -- masks -------------------------------------------------------------------------------------------------------------
@@ -186,7 +181,7 @@ def test_gradients_are_those_of_the_values(ad, sampled):
 
 def test_coded_nodes_are_the_decoded_ones(ad, sampled):
     """Read from pointers, entries and frames in the kernel, and decoded by NumPy: one field."""
-    field = coded(ad, sampled)
+    field = field_of(ad, coded(sampled))
     other = nodes.SparseNodes(ad, sampled.structure, 3.0, nodes=ad.TensorXf(field.decoded()))
     rng = np.random.default_rng(3)
     p = points(ad, rng.uniform(field.lower, field.upper, (20000, 3)))
@@ -208,7 +203,7 @@ def test_slope_is_bounded(ad, sampled):
 
 
 def test_places_where_there_is_nothing(ad, sampled):
-    field = coded(ad, sampled)
+    field = field_of(ad, coded(sampled))
     p = points(ad, [[np.nan, 0, 0], [0, 0, 9], [-1e30, 0, 0], [np.inf, 0, 0]])
     value, slope = field.gradient(p)
     assert np.array_equal(value.numpy(), np.full(4, np.float32(field.band)))
@@ -225,12 +220,11 @@ def test_the_surface_stays_in_its_cells(ad, sampled):
     values[:, 0] += rng.normal(scale=0.1, size=len(values))
     values[:, 1:] += rng.normal(scale=0.5, size=(len(values), 3))
     values[:, 1:] /= np.linalg.norm(values[:, 1:], axis=1, keepdims=True)
-    coding = encoding.NodeCoding(replace(sampled, bits=8))
+    coding = encoding.NodeCoding(sampled)
     coding.encode(values)
     distances = coding.values()[:, 0]
     assert np.all((distances < 0) == (sampled.distances < 0)) and np.all(np.abs(distances) > 0.005)
-    arrays, settings = model.coded_arrays(coding)
-    field = model.build_field(Table("sdf", arrays, settings=settings), {}, ad)
+    field = field_of(ad, coding)
     assert len(grids.components(grids.extract(field, 200))) == 3
 
     # On the sides of stored cells behind which there is none, the sign is that of their corners
@@ -275,7 +269,7 @@ def test_wrong_nodes_make_no_floaters(ad, shapes):
 def test_as_many_pieces_as_the_mesh(ad, shapes):
     """Also after coding, decoded finer than the field's cells: two solids, one with a cavity, and nothing else."""
     distances, s = shapes
-    volumes = grids.components(grids.extract(coded(ad, s), 108)) * distances.mesh.scale**3
+    volumes = grids.components(grids.extract(field_of(ad, coded(s)), 108)) * distances.mesh.scale**3
     assert len(volumes) == 3 and np.sum(volumes < 0) == 1
     assert volumes[1] == pytest.approx(-4 / 3 * math.pi * 0.6**3, rel=0.05)
     assert volumes[2] == pytest.approx(0.5**3, rel=0.05)
@@ -283,7 +277,7 @@ def test_as_many_pieces_as_the_mesh(ad, shapes):
 
 def test_empty_blocks_are_left_out_of_decoding(ad, shapes, monkeypatch):
     """The same triangles and values, whether all of the grid is looked at or what is near stored nodes only."""
-    field = coded(ad, shapes[1])
+    field = field_of(ad, coded(shapes[1]))
     few, (values, *_) = grids.extract(field, 100), grids.grid(field, 100)
     blocks = grids.crossed_blocks(field, np.array(field.lower), 1 / 100, [100] * 3)
     assert blocks.shape == (4, 4, 4) and 0.2 < blocks.mean() < 0.95
@@ -327,7 +321,7 @@ def shoot(ad, distances, field, count, seed):
 
 
 def test_no_holes(ad, shapes):
-    assert shoot(ad, shapes[0], coded(ad, shapes[1]), 2**17, 6) == (0, 0)
+    assert shoot(ad, shapes[0], field_of(ad, coded(shapes[1])), 2**17, 6) == (0, 0)
 
 
 def test_no_holes_where_nodes_are_wrong(ad, shapes):
