@@ -432,11 +432,13 @@ def test_scales_that_differ(mi_rgb, folder, trace):
     refused(mi_rgb, folder, 'parameter "to_world": found', to_world=at, trace=trace)
 
 
-@pytest.mark.parametrize("fault", ["missing", "other task"])
+@pytest.mark.parametrize("fault", ["missing", "truncated", "other task"])
 def test_damaged_files(mi_rgb, folder, tmp_path, fault):
     from mi_diffind.tasks.ggx import TASK as GGX
 
     path = GGX.file() if fault == "other task" else tmp_path / "bad.npz"
+    if fault == "truncated":
+        path.write_bytes((folder / "torus.npz").read_bytes()[:1000])
     sentence = refused(mi_rgb, folder, path.name, filename=str(path))
     assert len(sentence) < 400
 

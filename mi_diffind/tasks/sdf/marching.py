@@ -208,7 +208,7 @@ class Marcher:
         )
         self.slabs, nodes = None, field.decoded()
         if nodes is not None:
-            frames = field.index.block_words
+            frames = field.frames()
             slabs = np.stack([frames, slab_words(cells, nodes, frames)], axis=1)
             self.slabs = device_array(UInt32, slabs)
 

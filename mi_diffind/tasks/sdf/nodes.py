@@ -215,9 +215,9 @@ class SparseNodes(DistanceField):
         self.structure, self.slope = structure, float(slope)
         self.index = GridIndex(types, structure, frames)
         self.nodes, self.bits, self._entries = nodes, bits, None
+        self._pointers = None if pointers is None else device_array(types.UInt32, pointers)
         if entries is not None:
             offset, step = entry_scale(entries)
-            self._pointers = device_array(types.UInt32, pointers)
             self._entries = device_array(types.UInt32, entry_words(entries, offset, step))
             self._affine = tuple(map(float, offset)), tuple(map(float, step))
             self._scale = [dr.opaque(types.Array3f, v) for v in self._affine]
@@ -327,13 +327,17 @@ class SparseNodes(DistanceField):
 
         return dr.select(active, value, self.largest), vector(slope), vector(smooth)
 
+    def frames(self) -> np.ndarray:
+        """Return the words of the blocks' frames, ``(B,)``."""
+        return self.index.block_words
+
     def decoded(self) -> np.ndarray | None:
         """Return distances in spacings and gradients of coded nodes, ``(n, 4)``; ``None`` for decoded ones."""
         if self._entries is None:
             return None
         pointers = unpack_pointers(np.array(self._pointers), self.bits, self.structure.nodes)
         entries = np.stack(unpack_entries(np.array(self._entries), *self._affine), axis=1)
-        return decode_to_array(self.structure, self.index.block_words, entries, pointers)
+        return decode_to_array(self.structure, self.frames(), entries, pointers)
 
     @property
     def nbytes(self) -> int:

@@ -217,7 +217,7 @@ def bounds(words):
 
 def planes(field):
     """The normals (B, 3) of a field's blocks and the distances of their middles (B,)."""
-    axes, middles, _ = nodes.unpack_frames(field.index.block_words)
+    axes, middles, _ = nodes.unpack_frames(field.frames())
     return np.stack(axes, axis=1), middles
 
 
@@ -250,7 +250,7 @@ def test_slabs_keep_the_signs_of_other_cells(coded, rng):
     block = np.flatnonzero(crossed.any(axis=1) & ~crossed.all(axis=1))
     cell = cell[block]
     inside[block, cell] = rng.random(len(block)) < 0.5
-    low, high = bounds(marching.slab_words(cells, coded.decoded(), coded.index.block_words)[block])
+    low, high = bounds(marching.slab_words(cells, coded.decoded(), coded.frames())[block])
     normals, middles = (v[block] for v in planes(coded))
     place = np.stack([cell // 16, cell // 4 % 4, cell % 4], axis=1) + rng.random((len(block), 3))
     height = middles + np.sum(normals * (place - MIDDLE), axis=1)
