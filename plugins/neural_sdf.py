@@ -15,7 +15,7 @@ import numpy as np
 from mi_diffind.arrays.tables import TableError
 from mi_diffind.core import compat
 from mi_diffind.core.files import stamp
-from mi_diffind.tasks.sdf import TASK
+from mi_diffind.tasks.sdf import TASK, grids, marching
 
 from . import Counterpart, Plugin, Stock, reports_as, shown_as, warn
 from .support import properties, tables
@@ -70,8 +70,6 @@ def decode_grid(model, resolution: int = 0) -> tuple[np.ndarray, np.ndarray, np.
     ``resolution`` is the number of cells along the longest side; 0 chooses the coarsest grid with an error below that
     of the arrays.
     """
-    from mi_diffind.tasks.sdf import grids
-
     field, wanted = model.field, model.table.measured.get("mae_surface")
     measured = isinstance(wanted, (int, float)) and 0 < wanted < math.inf
     if not measured:
@@ -259,7 +257,7 @@ class NeuralSDF(distance_shape(mi.Mesh)):
             "storage": self.model.storage,
             "table_bytes": self.model.nbytes,
             "trace": "arrays",
-            "index_bytes": self.index_bytes,
+            "index_bytes": marching.index_bytes(self.model.field),
         }
 
     def to_string(self) -> str:

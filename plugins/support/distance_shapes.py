@@ -19,7 +19,6 @@ import hashlib
 import shutil
 import tempfile
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
 import drjit as dr
@@ -32,7 +31,7 @@ from mi_diffind.core import compat
 from mi_diffind.core.errors import DiffindError
 from mi_diffind.core.files import is_within, stamp
 from mi_diffind.tasks.sdf import TASK, marching
-from mi_diffind.tasks.sdf.mesh import directed_edges, load_mesh, read_serialized, split_part
+from mi_diffind.tasks.sdf.mesh import Mesh, edge_balance, load_mesh, read_serialized, split_part
 
 from .. import warn
 from . import omissions, properties
@@ -59,7 +58,7 @@ CORNERS = 8
 UNMERGED = "face_solid"
 
 
-@cache
+@functools.cache
 def distance_shape(mesh: type) -> type:
     """Return the base class of distance shapes for ``mi.Mesh`` of the current variant; each variant has its class."""
 
@@ -127,14 +126,11 @@ def distance_shape(mesh: type) -> type:
             if any(getattr(i, "traces_solids", False) for i in integrators) and compat.INTERSECTING not in names:
                 return ""
             name = compat.INTERSECTING if compat.INTERSECTING in names else names[-1]
-            decoded = (
-                ""
-                if self.optimisable()
-                else (', set its parameter trace="grid", or load the scene with mi_diffind.load_file, which decodes it')
-            )
+            decoded = ', set its parameter trace="grid", or load the scene with mi_diffind.load_file, which decodes it'
             return (
                 f'the shape "{self.id()}" ({omissions.plugin_of(self)}) is left out: the integrator {name} does not '
-                f"trace its arrays; render with the integrator {' or '.join(SEEN_BY)}{decoded}"
+                f"trace its arrays; render with the integrator {' or '.join(SEEN_BY)}"
+                + ("" if self.optimisable() else decoded)
             )
 
         def optimisable(self) -> bool:
@@ -148,11 +144,6 @@ def distance_shape(mesh: type) -> type:
         def optimised(self) -> bool:
             """Return whether derivatives with respect to the field or its place are enabled."""
             return bool(self.attached())
-
-        @property
-        def index_bytes(self) -> int:
-            """Bytes of the field's ray-marching index."""
-            return marching.index_bytes(self.field)
 
         def local_ray(self, o, d, rest=0):
             """Return a ray's origin and direction in the unit frame: lengths are those of the world by ``size``."""
@@ -234,9 +225,6 @@ class DistanceShapes:
 
     def __len__(self) -> int:
         return len(self._shapes)
-
-    def __iter__(self):
-        return iter(self._shapes)
 
     def __getitem__(self, i: int):
         return self._shapes[i]
@@ -457,10 +445,9 @@ def closed_mesh_file(path: Path, folder: Path, index: int = 0) -> Path:
         raise Kept(f"has the shape_index {index}, which {path} lacks") from None
     except (ValueError, OSError) as e:
         raise Kept(f"is no solid: {e}") from None
-    edges, signs = directed_edges(faces, int(faces.max()) + 1)
-    balance = np.bincount(np.unique(edges, return_inverse=True)[1], signs)
-    if np.count_nonzero(balance) > OPEN * len(balance):
-        raise Kept(f"encloses no solid: {np.count_nonzero(balance):,} of {len(balance):,} edges are open")
+    _, surplus, _ = edge_balance(faces, int(faces.max()) + 1)
+    if np.count_nonzero(surplus) > OPEN * len(surplus):
+        raise Kept(f"encloses no solid: {np.count_nonzero(surplus):,} of {len(surplus):,} edges are open")
     return path
 
 
@@ -511,22 +498,23 @@ def _folder() -> Path:
     return folder
 
 
+def _load(path: Path) -> Mesh:
+    try:
+        return load_mesh(path)
+    except DiffindError as e:
+        raise RuntimeError(str(e)) from None
+
+
 @functools.lru_cache
 def _digest(path: Path, stamp: tuple) -> str:
     """Return the digest of a mesh file."""
-    try:
-        return load_mesh(path).digest
-    except DiffindError as e:
-        raise RuntimeError(str(e)) from None
+    return _load(path).digest
 
 
 @functools.lru_cache
 def _as_ply(path: Path, stamp: tuple) -> str:
     """Return a PLY copy of a mesh file, kept until the process ends."""
-    try:
-        mesh = load_mesh(path)
-    except DiffindError as e:
-        raise RuntimeError(str(e)) from None
+    mesh = _load(path)
     written = _folder() / f"{split_part(path)[0].stem}_{abs(hash((path, stamp))):x}.ply"
     trimesh.Trimesh(mesh.to_file_frame(mesh.vertices), mesh.faces, process=False).export(written)
     return str(written)

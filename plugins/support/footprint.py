@@ -83,20 +83,15 @@ class Cone:
         cosine = d @ axis
         size = np.array(film.crop_size(), np.float64)
 
-        radius = 0.0
+        projection, radius, apart = "", 0.0, np.abs(np.cross(o[:5] - origin, d[:5])).max()
         if np.abs(d - d[0]).max() < 1e-6:
             projection, seen, origin = "orthographic", o, o[4]
-        elif (cosine > 0).all():
+        elif (cosine > 0).all() and apart <= 1e-4 * (1 + np.abs(origin).max()):
             projection, seen = "perspective", d / np.maximum(cosine, 1e-9)[:, None]
             if sensor.needs_aperture_sample():
                 projection = "thinlens"
                 on_lens = o[5] - seen[5] * ((o[5] - origin) @ axis)  # rays start at the near clipping plane
                 radius = float(np.linalg.norm(on_lens - origin))
-            away = np.cross(o[:5] - origin, d[:5])
-            if np.abs(away).max() > 1e-4 * (1 + np.abs(origin).max()):
-                projection = ""
-        else:
-            projection = ""
         if projection:
             dx, dy = seen[1] - seen[0], seen[2] - seen[0]
             error = max(np.abs(seen[0] + dx + dy - seen[3]).max(), np.abs(seen[0] + (dx + dy) / 2 - seen[4]).max())

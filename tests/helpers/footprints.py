@@ -17,13 +17,11 @@ ASSETS = Path(__file__).resolve().parents[2] / "scenes" / "assets"
 WIDTH, HEIGHT = 48, 32
 
 
-def probe_type():
-    """A texture, in the variant that is set: the side √|det|, the major axis, and 1."""
+def register_probe() -> None:
+    """The texture ``probe``, in the variant that is set: the side √|det|, the major axis, and 1."""
 
     class Probe(mi.Texture):
-        def __init__(self, props):
-            super().__init__(props)
-            self.cone = None
+        cone = None
 
         def set_cone(self, cone):
             self.cone = cone
@@ -47,25 +45,14 @@ def probe_type():
         def traverse(self, cb):
             pass
 
-        def to_string(self):
-            return "Probe[]"
-
-    return Probe
-
-
-def register_probe() -> None:
-    kind = probe_type()
-    mi.register_texture("probe", lambda props: kind(props))
+    mi.register_texture("probe", Probe)
 
 
 def sensor(kind="perspective", to_world=None, **more) -> dict:
     film = {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "rfilter": {"type": "box"}}
-    found = {"type": kind, "film": film, "sampler": {"type": "independent", "sample_count": 1}}
-    if to_world is not None:
-        found["to_world"] = to_world
-    if kind == "thinlens":
-        found.update(aperture_radius=0.01, focus_distance=2.0)
-    return {**found, **more}
+    lens = {"aperture_radius": 0.01, "focus_distance": 2.0} if kind == "thinlens" else {}
+    place = {} if to_world is None else {"to_world": to_world}
+    return {"type": kind, "film": film, "sampler": {"type": "independent", "sample_count": 1}, **lens, **place, **more}
 
 
 def look_at(origin, target, up=(0, 1, 0)):

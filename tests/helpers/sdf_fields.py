@@ -1,21 +1,25 @@
 """Signed distance fields that are formulas, for tests, and how a scene gets them as shapes."""
 
+import math
+
 import drjit as dr
 import numpy as np
 
-from mi_diffind.arrays.lookup import clamp
 from mi_diffind.core.compat import module_of
 from mi_diffind.tasks.sdf.field import DistanceField
-from mi_diffind.tasks.sdf.paper import edge_steps
 
 
 class Ball(DistanceField):
-    """A ball of the radius ``r`` (a number, or an array that may be optimised) around ``centre``."""
+    """A ball of the radius ``r`` (a number, or an array that may be optimised) around ``centre``.
 
-    def __init__(self, types, r=0.4, centre=(0, 0, 0), half=0.5):
-        super().__init__(types, (-half,) * 3, (half,) * 3, 0.01, 1.0)
+    Its distance is told within ``band``; ``tilt`` turns the gradient about z, and smooth normals are not of length 1.
+    """
+
+    def __init__(self, types, r=0.4, centre=(0, 0, 0), half=0.5, band=1.0, tilt=0.0):
+        super().__init__(types, (-half,) * 3, (half,) * 3, 0.01, band)
         # Opaque: balls of other sizes and places use the same kernels
         self.r, self.centre = dr.opaque(types.Float, r), dr.opaque(types.Array3f, centre)
+        self.cosine, self.sine = math.cos(tilt), math.sin(tilt)
 
     def value(self, p, active=True):
         return self.gradient(p, active)[0]
@@ -24,8 +28,13 @@ class Ball(DistanceField):
         to = self.types.Array3f(*(x - c for x, c in zip(p, self.centre, strict=True)))
         length = dr.norm(to)
         inside = self.inside(p) & active
-        unit = dr.select(length > 0, to / dr.select(length > 0, length, 1), 0)
-        return dr.select(inside, length - self.r, self.band), dr.select(inside, unit, 0)
+        x, y, z = dr.select(length > 0, to / dr.select(length > 0, length, 1), 0)
+        n = self.types.Array3f(self.cosine * x - self.sine * y, self.sine * x + self.cosine * y, z)
+        distance = dr.clip(length - self.r, -self.band, self.band)
+        return dr.select(inside, distance, self.band), dr.select(inside, n, 0)
+
+    def normal(self, p, active=True):
+        return 3 * self.types.Array3f(*(x - c for x, c in zip(p, self.centre, strict=True)))
 
 
 class Slab(DistanceField):
@@ -62,48 +71,24 @@ class TrilinearField(DistanceField):
     """Trilinear interpolation of ``values``, a tensor (X, Y, Z) whose outermost entries lie on the sides of the box."""
 
     def __init__(self, values, lower, upper, band: float):
-        self.values = values
-        self.resolution = tuple(values.shape)
-        size = [(b - a) / (n - 1) for a, b, n in zip(lower, upper, self.resolution, strict=True)]
+        array, self.resolution = values.numpy().astype(np.float64), values.shape
+        size = [(b - a) / (n - 1) for a, b, n in zip(lower, upper, values.shape, strict=True)]
         super().__init__(module_of(values), lower, upper, min(size), band)
-        self.size = tuple(map(float, size))
-        # In each cell, every component of the gradient lies between its four differences along the edges
-        steps = [edge_steps(values.numpy(), axis).astype(np.float64) / h for axis, h in enumerate(self.size)]
-        self.slope = max(1.0, float(np.sqrt(sum(s**2 for s in steps).max())))
-
-    def _read(self, p, active):
-        """For each axis the weight of the upper entry, and the eight entries around points."""
-        UInt32, index, weights = self.types.UInt32, [], []
-        for x, a, h, n in zip(p, self.lower, self.size, self.resolution, strict=True):
-            t = clamp((x - a) / h, 0.0, n - 1.0)
-            i = dr.minimum(UInt32(dr.detach(t)), n - 2)
-            index.append(i)
-            weights.append(t - self.types.Float(i))
-        _, ny, nz = self.resolution
-        first = (index[0] * ny + index[1]) * nz + index[2]
-
-        def get(n):
-            return dr.gather(self.types.Float, self.values.array, first + n, active)
-
-        return weights, [[[get((a * ny + b) * nz + c) for c in (0, 1)] for b in (0, 1)] for a in (0, 1)]
+        self.texture = self.types.Texture3f(type(values)(values.array, (*values.shape, 1)), use_accel=False)
+        steps = [np.abs(np.diff(array, axis=axis)).max() / h for axis, h in enumerate(size)]
+        self.slope = max(1.0, float(np.linalg.norm(steps)))
 
     def value(self, p, active=True):
         active = self.inside(p) & active
-        (u, s, w), v = self._read(p, active)
-        rows = [dr.lerp(dr.lerp(v[a][0][0], v[a][0][1], w), dr.lerp(v[a][1][0], v[a][1][1], w), s) for a in (0, 1)]
-        return dr.select(active, dr.lerp(rows[0], rows[1], u), self.band)
+        sides = zip(p, self.lower, self.upper, self.resolution, strict=True)
+        place = [((x - a) / (b - a) * (n - 1) + 0.5) / n for x, a, b, n in sides]
+        return dr.select(active, self.texture.eval(self.types.Array3f(*reversed(place)), active)[0], self.band)
 
     def gradient(self, p, active=True):
-        active = self.inside(p) & active
-        (u, s, w), v = self._read(p, active)
-        edge = [[dr.lerp(v[a][b][0], v[a][b][1], w) for b in (0, 1)] for a in (0, 1)]
-        across = [[v[a][b][1] - v[a][b][0] for b in (0, 1)] for a in (0, 1)]
-        lines = [dr.lerp(edge[a][0], edge[a][1], s) for a in (0, 1)]
-        dx = lines[1] - lines[0]
-        dy = dr.lerp(edge[0][1] - edge[0][0], edge[1][1] - edge[1][0], u)
-        dz = dr.lerp(dr.lerp(across[0][0], across[0][1], s), dr.lerp(across[1][0], across[1][1], s), u)
-        slope = self.types.Array3f(dx / self.size[0], dy / self.size[1], dz / self.size[2])
-        return dr.select(active, dr.lerp(lines[0], lines[1], u), self.band), dr.select(active, slope, 0)
+        h, p = 0.01 * self.spacing, self.types.Array3f(p)
+        steps = [self.types.Array3f(*v) for v in (h * np.eye(3)).tolist()]
+        slope = [(self.value(p + v, active) - self.value(p - v, active)) / (2 * h) for v in steps]
+        return self.value(p, active), self.types.Array3f(*slope)
 
 
 def torus(p):
@@ -115,36 +100,47 @@ def torus(p):
     return length - 0.12, np.concatenate([flat, to[:, 1:] / length[:, None]], axis=1)
 
 
+def coded(sampled, count=None):
+    """The codes of sampled nodes, not trained: ``count`` entries, by default as many as pointers can name."""
+    from mi_diffind.tasks.sdf import encoding
+
+    coding = encoding.NodeCoding(sampled)
+    coding.frames = encoding.fit_frames(sampled)
+    wanted = encoding.exact_entries(sampled, coding.frames)
+    coding.entries = encoding.cluster(wanted, count or sampled.entries)
+    coding.pointers = encoding.assign(wanted, coding.entries)
+    return coding
+
+
+def coded_table(coding):
+    """The table of these codes."""
+    from mi_diffind.arrays.tables import Table
+    from mi_diffind.tasks.sdf import model
+
+    arrays, settings = model.coded_arrays(coding)
+    return Table("sdf", arrays, "sparse", settings)
+
+
 def sparse_table(shape=torus, spacing=1 / 40, entries=256, scale=2.0, centre=(0.5, -1.0, 0.25)):
     """The table of a formula's sparse field, as ``fit sdf`` would write it; pointers have 8 bits."""
-    from mi_diffind.arrays.sparse_grid import SparseGrid, cell_corners
-    from mi_diffind.arrays.tables import Table
-    from mi_diffind.tasks.sdf import encoding, model, nodes
+    from mi_diffind.arrays.sparse_grid import SparseGrid, cell_corners, complete_cells
+    from mi_diffind.tasks.sdf import encoding
 
     lower = np.array([-0.5, -0.5, -0.5]) - 1.5 * spacing
     n = int(np.ceil((1 + 3 * spacing) / spacing)) + 1
-    index = np.stack(np.meshgrid(*[np.arange(n)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    inside = (shape(lower + spacing * index)[0] < 0).reshape(n, n, n)
-    corner = np.lib.stride_tricks.sliding_window_view(inside, (2, 2, 2)).reshape(n - 1, n - 1, n - 1, 8)
-    used = np.argwhere(cell_corners(corner.any(-1) & ~corner.all(-1)))
 
     def sign(p):
         return shape(np.asarray(p))[0] < 0
 
-    grid = SparseGrid.from_nodes(used, sign(lower + spacing * used), (n, n, n), lower, spacing, sign)
+    inside = sign(lower + spacing * np.argwhere(np.ones((n, n, n)))).reshape(n, n, n)
+    used = np.argwhere(cell_corners(~complete_cells(inside) & ~complete_cells(~inside)))
+    grid = SparseGrid.from_nodes(used, inside[tuple(used.T)], (n, n, n), lower, spacing, sign)
     positions, block = grid.node_positions()
     d, g = shape(np.array(grid.lower) + spacing * positions)
     corners = encoding.crossed_cells(grid, d < 0)
-    sampled = encoding.SampledNodes(grid, positions, block, d / spacing, g, corners, len(corners), 0.0)
-    frames = encoding.fit_frames(sampled)
-    wanted = encoding.exact_entries(sampled, frames)
-    bits, entries = 8, encoding.cluster(wanted, entries)
-    pointers = encoding.assign(wanted, entries)
-    table = Table("sdf", model.sparse_arrays(grid, frames, nodes.pointer_words(pointers, bits), entries))
-    table.preset = "sparse"
-    slope = nodes.slope_bound(d / spacing, g, corners)
-    table.settings = {"layout": "sparse", "lower": list(grid.lower), "spacing": spacing, "bits": bits,
-                      "nodes": grid.nodes, "slope": slope, "scale": scale, "centre": list(centre)}  # fmt: skip
+    sampled = encoding.SampledNodes(grid, positions, block, d / spacing, g, corners, len(corners), 0.0, 8)
+    table = coded_table(coded(sampled, entries))
+    table.settings |= {"scale": scale, "centre": list(centre)}
     return table
 
 

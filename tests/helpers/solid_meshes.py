@@ -1,6 +1,7 @@
-"""Meshes made in code, some of them broken on purpose, and distances to them found without any library."""
+"""Meshes made in code, some of them broken on purpose, and distances to them found without libigl."""
 
 import numpy as np
+import trimesh
 
 CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
 CUBE_FACES = np.array([
@@ -35,10 +36,7 @@ def sphere(rings=16, radius=1.0, centre=(0, 0, 0)):
 
 def together(*meshes):
     """Several meshes as one."""
-    first = np.cumsum([0] + [len(v) for v, _ in meshes])
-    return np.concatenate([v for v, _ in meshes]), np.concatenate(
-        [f + n for (_, f), n in zip(meshes, first[:-1], strict=True)]
-    )
+    return trimesh.util.append_faces(*zip(*meshes, strict=True))
 
 
 def turned(mesh):
@@ -47,16 +45,12 @@ def turned(mesh):
 
 
 def without(mesh, dropped):
-    """A mesh whose faces with these numbers (or for which this mask says so) are missing."""
-    return mesh[0], np.delete(
-        mesh[1], np.flatnonzero(dropped) if np.asarray(dropped).dtype == bool else dropped, axis=0
-    )
+    """A mesh without the faces that have these numbers, or for which this mask says so."""
+    return mesh[0], np.delete(mesh[1], dropped, axis=0)
 
 
 def write(path, mesh):
     """As the format that the name says."""
-    import trimesh
-
     trimesh.Trimesh(*mesh, process=False).export(path)
     return path
 
@@ -68,23 +62,9 @@ def box_distance(points, size, centre=(0, 0, 0)):
 
 
 def brute_distance(points, corners):
-    """
-    |d| of points (N, 3) to triangles (F, 3, 3): the smallest distance to the inside of a triangle's projection, to its
-    three edges.
-    """
-    best = np.full(len(points), np.inf)
-    for a, b, c in corners:
-        n = np.cross(b - a, c - a)
-        p = points - a
-        # Barycentric coordinates of the foot on the plane
-        v = np.einsum("ij,j->i", np.cross(p, c - a), n) / (n @ n)
-        w = np.einsum("ij,j->i", np.cross(b - a, p), n) / (n @ n)
-        above = (v >= 0) & (w >= 0) & (v + w <= 1)
-        best[above] = np.minimum(best[above], np.abs(p[above] @ n) / np.sqrt(n @ n))
-        for s, e in ((a, b), (b, c), (c, a)):
-            t = np.clip((points - s) @ (e - s) / ((e - s) @ (e - s)), 0, 1)
-            best = np.minimum(best, np.linalg.norm(points - s - t[:, None] * (e - s), axis=1))
-    return best
+    """|d| of points (N, 3) to triangles (F, 3, 3), one after the other."""
+    places = (trimesh.triangles.closest_point(np.broadcast_to(t, (len(points), 3, 3)), points) for t in corners)
+    return np.min([np.linalg.norm(points - place, axis=1) for place in places], axis=0)
 
 
 def brute_winding(points, corners):

@@ -1,5 +1,6 @@
 """The plugin ``neural_sdf``: files, places, the two ways in which it is traced, what it refuses."""
 
+import itertools
 import json
 import os
 import time
@@ -9,7 +10,9 @@ from weakref import WeakValueDictionary
 import drjit as dr
 import numpy as np
 import pytest
+import trimesh
 from arrays import aligned
+from scipy.ndimage import map_coordinates
 from sdf_fields import dense_table, sparse_table, torus
 from variants import warnings_of
 
@@ -18,6 +21,7 @@ from mi_diffind.arrays.tables import load_table, save_table
 from mi_diffind.core import compat
 from mi_diffind.scenes import loading
 from mi_diffind.scenes.loading import SceneError
+from mi_diffind.tasks.sdf import TASK, grids, marching
 from mi_diffind.tasks.sdf.mesh import load_mesh
 
 SCALE, CENTRE = 2.0, (0.5, -1.0, 0.25)
@@ -26,8 +30,6 @@ SCALE, CENTRE = 2.0, (0.5, -1.0, 0.25)
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """``torus.npz`` and the mesh ``torus.ply`` that its settings name."""
-    import trimesh
-
     path = tmp_path_factory.mktemp("sdf")
     table = sparse_table(scale=SCALE, centre=CENTRE)
     mesh = trimesh.creation.torus(0.38, 0.12, 96, 48)
@@ -84,8 +86,6 @@ def analytic(o, d):
 
 def test_sparse_grids_are_traced_where_their_surface_is(mi_rgb, folder, rng):
     """From cell to cell, hits are those of sphere tracing through the same field, and near the torus itself."""
-    from mi_diffind.tasks.sdf import TASK, grids, marching
-
     mi = mi_rgb
     field = TASK.open(mi.TensorXf, folder / "torus.npz").field
     o, d = rays(rng)
@@ -112,24 +112,17 @@ def test_sparse_grids_are_traced_where_their_surface_is(mi_rgb, folder, rng):
 
 def test_axis_aligned_rays_through_cells(mi_rgb, folder):
     """Also those that run exactly in the sides of cells, and those from far away."""
-    from mi_diffind.tasks.sdf import TASK, marching
-
     mi = mi_rgb
     field = TASK.open(mi.TensorXf, folder / "torus.npz").field
-    o, d, expected = [], [], []
     lower, h = np.array(field.lower), field.spacing
     at = lower + h * np.round((np.array([0.38, 0.0, 0.0]) - lower) / h)  # a node in the tube
-    for offset in (0.0, 0.3 * h):
-        for distance in (0.9, 1000.0):
-            for axis, side in ((2, np.sqrt(0.12**2 - (at[0] + offset - 0.38) ** 2)), (0, 0.5)):
-                for sign in (1.0, -1.0):
-                    origin, direction = np.array([at[0] + offset, 0.0, 0.0]), np.zeros(3)
-                    origin[axis], direction[axis] = -sign * distance, sign
-                    if axis == 0:
-                        origin[1:] = at[1:] if offset == 0 else 0
-                        side = np.hypot(*[0.5, 0]) if offset else 0.38 + np.sqrt(0.12**2 - at[2] ** 2)
-                    o.append(origin), d.append(direction), expected.append(distance - side)
-    o, d = (mi.Vector3f(*(mi.Float(aligned(x)) for x in np.transpose(values))) for values in (o, d))
+    starts, ways, expected = [], [], []
+    for axis, offset, distance in itertools.product((0, 2), (0.0, 0.3 * h), (0.9, 1000.0)):
+        for d in np.eye(3)[[axis, axis]] * [[1], [-1]]:
+            o = np.where(d == 0, at + np.array([offset, offset, 0]), -0.9 * d)
+            expected.append(analytic(o[None], d[None])[0] + distance - 0.9)
+            starts.append(np.where(d == 0, o, -distance * d)), ways.append(d)
+    o, d = (mi.Vector3f(*(mi.Float(aligned(x)) for x in np.transpose(values))) for values in (starts, ways))
     hit = marching.intersect(field, o, d, dr.inf)
     dr.eval(hit)
     assert np.array(hit.hit).all()
@@ -220,11 +213,8 @@ def test_shapes_made_at_once_share_their_arrays(mi_rgb, folder, monkeypatch):
 def test_derivatives_reach_the_nodes(mi_rgb, folder):
     """All nodes further out: by the integrator as by differences."""
     mi = mi_rgb
-    close = {
-        "type": "perspective",
-        "fov": 3,
-        "to_world": mi.ScalarTransform4f().look_at([0.5, -3, 2.5], [0.5, -1.75, 0.4], [0, 0, 1]),
-    }
+    view = mi.ScalarTransform4f().look_at([0.5, -3, 2.5], [0.5, -1.75, 0.4], [0, 0, 1])
+    close = {"type": "perspective", "fov": 3, "to_world": view}
     close["film"] = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
     loaded = scene(mi, {"a": shape(folder, storage="float32", normals="analytic")}, sensor=close)
     params = mi.traverse(loaded)
@@ -328,10 +318,6 @@ def grid_of(mi, file, **more):
 
 def off_the_field(mi, file, values, lower, upper):
     """How much a grid in the world differs from the field of a file, on the torus, on average."""
-    from scipy.ndimage import map_coordinates
-
-    from mi_diffind.tasks.sdf import TASK
-
     field = TASK.open(mi.TensorXf, file).field
     a, b = np.random.default_rng(3).uniform(0, 2 * np.pi, (2, 30000))
     p = np.stack([(0.38 + 0.12 * np.cos(b)) * np.cos(a), 0.12 * np.sin(b), (0.38 + 0.12 * np.cos(b)) * np.sin(a)], 1)
@@ -360,34 +346,17 @@ def test_grids_are_cut_to_what_is_inside(mi_rgb, upright_files):
     assert report["grid_bytes"] == 4 * x * y * z and report["memory_bytes"] == 40 * (x - 1) * (y - 1) * (z - 1)
     half, cell = SCALE * np.array([0.5, 0.12, 0.5]), (upper - lower) / np.array([x - 1, y - 1, z - 1])
     assert np.allclose(cell, cell[0], rtol=1e-4)
-    assert (
-        (lower < CENTRE - half).all() and (CENTRE + half < upper).all() and (upper - lower < 2 * half + 6 * cell).all()
-    )
+    assert (lower < CENTRE - half).all() and (CENTRE + half < upper).all()
+    assert (upper - lower < 2 * half + 6 * cell).all()
     o, d = rays(np.random.default_rng(4))
     o, d = o[:, [0, 2, 1]], d[:, [0, 2, 1]]
     expected = analytic(o[:, [0, 2, 1]], d[:, [0, 2, 1]])
-    loaded = mi.load_dict(
-        {"type": "scene", "a": {"type": "neural_sdf", "filename": str(upright_files[3e-4]), "trace": "grid"}}
-    )
+    loaded = as_grid(mi, upright_files[3e-4])
     ray = mi.Ray3f(mi.Point3f((SCALE * o + CENTRE).T.astype(np.float32)), mi.Vector3f(d.T.astype(np.float32)))
     t = np.array(loaded.ray_intersect(ray).t) / SCALE
     both = np.isfinite(expected) & np.isfinite(t)
     assert (np.isfinite(expected) == np.isfinite(t)).mean() > 0.995 and both.mean() > 0.3
     assert np.median(np.abs(t[both] - expected[both])) < 1e-3
-
-
-def test_grids_of_sparse_fields(mi_rgb, upright_files):
-    """Where no node is stored, one value of a block stands for all: as if each had been asked for."""
-    from mi_diffind.tasks.sdf import TASK, grids
-
-    field = TASK.open(mi_rgb.TensorXf, upright_files[None]).field
-    for resolution in (70, 150):
-        values, lower, upper = grids.grid(field, resolution)
-        shape = values.shape[::-1]
-        expected = grids.node_values(field, lower, (upper[0] - lower[0]) / (shape[0] - 1), shape).transpose(2, 1, 0)
-        assert np.abs(values - expected).max() < 1e-6
-        crossed = grids.crossed_blocks(field, lower, (upper[0] - lower[0]) / (shape[0] - 1), shape)
-        assert crossed.any() and (resolution < 100 or crossed.mean() < 0.9)
 
 
 def test_grids_are_no_larger_than_allowed(mi_rgb, upright_files, monkeypatch):
@@ -463,11 +432,13 @@ def test_scales_that_differ(mi_rgb, folder, trace):
     refused(mi_rgb, folder, 'parameter "to_world": found', to_world=at, trace=trace)
 
 
-@pytest.mark.parametrize("fault", ["missing", "other task"])
+@pytest.mark.parametrize("fault", ["missing", "truncated", "other task"])
 def test_damaged_files(mi_rgb, folder, tmp_path, fault):
     from mi_diffind.tasks.ggx import TASK as GGX
 
     path = GGX.file() if fault == "other task" else tmp_path / "bad.npz"
+    if fault == "truncated":
+        path.write_bytes((folder / "torus.npz").read_bytes()[:1000])
     sentence = refused(mi_rgb, folder, path.name, filename=str(path))
     assert len(sentence) < 400
 
@@ -563,12 +534,8 @@ def test_mesh_elsewhere(mi_rgb, folder, tmp_path):
 
 
 def test_load_file_takes_what_mitsuba_takes(mi_rgb, folder, tmp_path):
-    path = written(
-        folder,
-        tmp_path,
-        EXPLICIT,
-        '<default name="n" value="3"/>' + integrator("path_sdf", '<integer name="max_depth" value="$n"/>'),
-    )
+    depth = '<default name="n" value="3"/>' + integrator("path_sdf", '<integer name="max_depth" value="$n"/>')
+    path = written(folder, tmp_path, EXPLICIT, depth)
     for parallel in (True, False):
         loaded = loading.load_file(path, parallel=parallel, optimize=False, n=7)
         assert loaded.integrator().max_depth == 7

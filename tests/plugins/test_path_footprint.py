@@ -61,25 +61,20 @@ def test_directly_seen_from_a_far_near_plane_and_in_a_crop(mi_rgb):
 @pytest.mark.parametrize("kind", ["plane", "ball", "knot", "vase", "mirrored", "instance"])
 def test_through_mirrors(mi_rgb, kind):
     mi = mi_rgb
-    turn = mi.ScalarTransform4f().rotate([1, 0, 0], -60) @ scaled(mi, 2)
-    vase = mesh(mi, "vase", bsdf=MIRROR) if kind in ("vase", "mirrored", "instance") else None
-    shapes = {
-        "plane": lambda: {"m": {"type": "rectangle", "to_world": turn, "bsdf": MIRROR}},
-        "ball": lambda: {"m": {"type": "sphere", "to_world": scaled(mi, 1.4), "bsdf": MIRROR}},
-        "vase": lambda: {"m": vase},
-        "knot": lambda: {"m": mesh(mi, "knot", bsdf=MIRROR)},
-        "mirrored": lambda: {
-            "m": {
-                **vase,
-                "to_world": scaled(mi, -1, 1, 1) @ vase["to_world"],
-                "bsdf": {"type": "twosided", "bsdf": MIRROR},
-            }
-        },
-        "instance": lambda: {
-            "group": {"type": "shapegroup", "m": {k: v for k, v in vase.items() if k != "to_world"}},
-            "m": {"type": "instance", "to_world": vase["to_world"], "group": {"type": "ref", "id": "group"}},
-        },
-    }[kind]()
+    if kind == "plane":
+        turn = mi.ScalarTransform4f().rotate([1, 0, 0], -60) @ scaled(mi, 2)
+        shapes = {"m": {"type": "rectangle", "to_world": turn, "bsdf": MIRROR}}
+    elif kind == "ball":
+        shapes = {"m": {"type": "sphere", "to_world": scaled(mi, 1.4), "bsdf": MIRROR}}
+    else:
+        shapes = {"m": mesh(mi, "knot" if kind == "knot" else "vase", bsdf=MIRROR)}
+    place = shapes["m"]["to_world"]
+    if kind == "mirrored":
+        shapes["m"] |= {"to_world": scaled(mi, -1, 1, 1) @ place, "bsdf": {"type": "twosided", "bsdf": MIRROR}}
+    elif kind == "instance":
+        del shapes["m"]["to_world"]
+        instance = {"type": "instance", "to_world": place, "group": {"type": "ref", "id": "group"}}
+        shapes = {"group": {"type": "shapegroup", **shapes}, "m": instance}
     # Of meshes, a pixel spans several triangles, over which differences are not derivatives
     median, worst = (0.01, 0.05) if kind in ("plane", "ball") else (0.1, 1.5)
     check(mi, shapes, (fp.mirrored,), median, worst)
@@ -199,10 +194,8 @@ def test_derivatives_are_those_of_finite_differences(mi_rgb, forward):
     def mean():
         return float(dr.mean(mi.render(scene, spp=64, seed=5, integrator=integrator), axis=None).array[0])
 
-    for key in (
-        "ball.bsdf.specular_reflectance.value",
-        next(k for k in params.keys() if k.endswith("reflectance.data")),
-    ):
+    texels = next(k for k in params.keys() if k.endswith("reflectance.data"))
+    for key in ("ball.bsdf.specular_reflectance.value", texels):
         before, step = type(params[key])(params[key]), 1e-2
         sides = []
         for sign in (1, -1):
@@ -241,10 +234,9 @@ def test_light_is_that_of_path(mi_rgb):
         passes = []
         for seed, plugin in enumerate(("path", "path_footprint")):
             integrator = mi.load_dict({"type": plugin, **given})
-            passes.append(
-                [np.array(mi.render(scene, spp=64, seed=9 * seed + i, integrator=integrator)) for i in range(8)]
-            )
-        a, b = (np.array([image.mean((0, 1)) for image in images]) for images in passes)
+            images = (mi.render(scene, spp=64, seed=9 * seed + i, integrator=integrator) for i in range(8))
+            passes.append(np.array([np.array(image).mean((0, 1)) for image in images]))
+        a, b = passes
         error = np.sqrt((a.var(0, ddof=1) + b.var(0, ddof=1)) / 8)
         assert (np.abs(a.mean(0) - b.mean(0)) < 5 * error + 1e-6).all(), (bsdf, given, a.mean(0), b.mean(0), error)
 
@@ -253,11 +245,8 @@ def test_spheres_behind_hidden_emitters(mi_rgb):
     """Shaded where they are: with a hidden lamp that sends no light before the camera as without it."""
     mi, images = mi_rgb, []
     place = mi.ScalarTransform4f().translate([0, -4, 0]).rotate([1, 0, 0], 90)
-    lamp = {
-        "type": "rectangle",
-        "to_world": place,
-        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 0}},
-    }
+    dark = {"type": "area", "radiance": {"type": "rgb", "value": 0}}
+    lamp = {"type": "rectangle", "to_world": place, "emitter": dark}
     for more in ({}, {"lamp": lamp}):
         camera = fp.sensor(to_world=fp.look_at([0, -5, 0], [0, 0, 0], [0, 0, 1]), fov=30, film=SIZE)
         light = {"type": "point", "position": [-6, -6, 6], "intensity": 40.0}

@@ -3,9 +3,9 @@
 Distances are computed by libigl in a child process (:mod:`.distances_child`), since some meshes make libigl abort.
 The magnitude |d| comes from a bounding-volume tree, the sign from the winding number: a point is inside where the
 winding number is at least 1/2. That of a watertight mesh is a whole number. An open mesh is closed hole by hole first
-(:func:`.mesh.close_holes`) if the closed mesh agrees with its winding number; :attr:`Distances.ambiguity` is the
-share of space that is in doubt. Triangles inside of the solid, where pieces overlap, have no part in distances: with
-them, the distance would be zero where no surface is visible.
+(:func:`.mesh.close_holes`) if the closed mesh agrees with its winding number; :attr:`Distances.warnings` tell the share
+of space that is in doubt. Triangles inside of the solid, where pieces overlap, have no part in distances: with them,
+the distance would be zero where no surface is visible.
 
 A grid has a ``lower`` corner, cells with sides of length ``spacing``, and ``shape``, the number of cells along x, y and
 z. A ``seed`` is a number or a ``numpy.random.Generator``.
@@ -114,12 +114,6 @@ class Distances:
         if not len(outer.faces) or (outer.watertight and abs(outer.volume) < NO_VOLUME):
             raise DistancesError(f"{self.mesh.path}: encloses no volume, expected the surface of a solid")
         return outer
-
-    @property
-    def ambiguity(self) -> float:
-        """Share of the bounding box in which it is ambiguous what is inside of an open mesh; 0 for a watertight one."""
-        self.solid  # noqa: B018
-        return self._doubt[0]
 
     @property
     def warnings(self) -> list[str]:

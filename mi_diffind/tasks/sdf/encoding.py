@@ -115,8 +115,8 @@ def encode_again(structure: SparseGrid, before: np.ndarray, values: np.ndarray, 
     side = np.where(before[:, 0] < 0, -1.0, 1.0)
     corners = crossed_cells(structure, side < 0)
     distances = side * np.maximum(np.abs(before[:, 0]), LEAST)
-    sampled = SampledNodes(structure, positions, block, distances, before[:, 1:], corners, len(corners), 0.0)
-    coding = NodeCoding(sampled, bits, seed)
+    sampled = SampledNodes(structure, positions, block, distances, before[:, 1:], corners, len(corners), 0.0, bits)
+    coding = NodeCoding(sampled, seed)
     coding.encode(values)
     return coding
 
@@ -182,8 +182,8 @@ class NodeCoding:
     leave them: where a stored cell borders on one that is not, nodes are moved until its face has one sign.
     """
 
-    def __init__(self, sampled: SampledNodes, bits: int, seed: int = 0):
-        self.sampled, self.bits, self.seed = sampled, bits, seed
+    def __init__(self, sampled: SampledNodes, seed: int = 0):
+        self.sampled, self.seed = sampled, seed
         count = sampled.structure.nodes
         self.frames = self.entries = None
         self.pointers = np.zeros(count, np.uint32)
@@ -209,7 +209,7 @@ class NodeCoding:
 
     def _choose_entries(self, wanted: np.ndarray) -> np.ndarray:
         """Return the cascaded array (K, 3), float32, for nodes with the exact entries ``wanted`` (n, 3)."""
-        entries = cluster(wanted, max(1, min(2**self.bits, len(wanted))), self.seed)
+        entries = cluster(wanted, self.sampled.entries, self.seed)
         # The extreme entries reach far enough for nodes that no other entry would keep on their side
         plane, scale = self._planes
         furthest = np.where(self.side < 0, entries[:, 0].min(), entries[:, 0].max())

@@ -119,12 +119,13 @@ class NodeProblem(Problem):
     #: The last state is kept: rounding differs from state to state by more than the training still changes.
     tolerance = 1.0
 
-    def __init__(self, sampled: encoding.SampledNodes, bits: int, mesh: Mesh, types, held_out: HeldOut):
-        self.sampled, self.bits, self.types, self.held_out = sampled, bits, types, held_out
+    def __init__(self, sampled: encoding.SampledNodes, mesh: Mesh, types, held_out: HeldOut):
+        self.sampled, self.types, self.held_out = sampled, types, held_out
         self.field, self.surface = SparseNodes(types, sampled.structure, 1.0), SurfaceSampler(mesh, types)
         start = np.concatenate([sampled.distances[:, None], sampled.normals], axis=1)
         self.net = NodeValues(device_tensor(types.TensorXf, start))
-        self.identity = {"source": mesh.digest, "nodes": len(start), "spacing": self.field.spacing, "bits": bits}
+        self.identity = {"source": mesh.digest, "nodes": len(start), "spacing": self.field.spacing}
+        self.identity["bits"] = sampled.bits
 
     def loss(self, net, rng, size: int):
         p, n = self.surface.draw(rng, size)
@@ -147,7 +148,7 @@ class NodeProblem(Problem):
 
     def table(self, seed: int) -> Table:
         """Return the coded nodes as a file holds them."""
-        coding = encoding.NodeCoding(self.sampled, self.bits, seed)
+        coding = encoding.NodeCoding(self.sampled, seed)
         coding.encode(self.net.unit(self.types).numpy().astype(np.float64))
         arrays, settings = coded_arrays(coding)
         return Table("sdf", arrays, settings=settings)
@@ -201,7 +202,7 @@ def fit(request: FitRequest, measured: int = MEASURED, samples: int = SAMPLES, h
                     f"--bytes help"
                 )
             held = HeldOut(distances, request.types, spacing, count=held_out)
-            problem = NodeProblem(sampled, options["bits"], distances.surface, request.types, held)
+            problem = NodeProblem(sampled, distances.surface, request.types, held)
         else:
             start_from = "constant" if options["constant"] else STARTS[request.preset]
             shapes = resolutions(nbytes, options["ratio"] or ratio_for(nbytes), mesh.upper - mesh.lower)

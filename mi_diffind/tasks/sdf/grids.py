@@ -272,22 +272,20 @@ def march(layers, cells, smallest: float, crossed=None) -> tuple[np.ndarray, np.
     from skimage.measure import marching_cubes
 
     vertices, faces, count = [], [], 0
+    crossed = np.ones(-(-cells // BLOCK), bool) if crossed is None else crossed
     for x in range(0, cells[0], BLOCK):
-        if crossed is not None and not crossed[x // BLOCK].any():
+        if not crossed[x // BLOCK].any():
             continue
         values = layers(x, min(x + BLOCK, int(cells[0])) + 1)
         values = np.where(values < 0, np.minimum(values, -smallest), np.maximum(values, smallest)).astype(np.float32)
-        for y in range(0, cells[1], BLOCK):
-            for z in range(0, cells[2], BLOCK):
-                if crossed is not None and not crossed[x // BLOCK, y // BLOCK, z // BLOCK]:
-                    continue
-                block = values[:, y : y + BLOCK + 1, z : z + BLOCK + 1]
-                if min(block.shape) < 2 or (block.min() < 0) == (block.max() < 0):
-                    continue
-                v, f, _, _ = marching_cubes(block, 0.0, gradient_direction="descent")
-                vertices.append(v.astype(np.float64) + np.array((x, y, z)))
-                faces.append(f.astype(np.int64) + count)
-                count += len(v)
+        for y, z in BLOCK * np.argwhere(crossed[x // BLOCK]):
+            block = values[:, y : y + BLOCK + 1, z : z + BLOCK + 1]
+            if min(block.shape) < 2 or (block.min() < 0) == (block.max() < 0):
+                continue
+            v, f, _, _ = marching_cubes(block, 0.0, gradient_direction="descent")
+            vertices.append(v.astype(np.float64) + np.array((x, y, z)))
+            faces.append(f.astype(np.int64) + count)
+            count += len(v)
     if not vertices:
         return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
     return _merge_vertices(np.concatenate(vertices), np.concatenate(faces))

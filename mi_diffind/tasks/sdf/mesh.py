@@ -30,14 +30,8 @@ from ...core.units import memory
 #: First number of a file and of each mesh in it.
 MAGIC = 0x041C
 
-#: Flag of a serialized mesh: normals follow its vertices.
-NORMALS = 0x1
-
-#: Flag of a serialized mesh: texture coordinates follow its vertices.
-TEXTURE_COORDINATES = 0x2
-
-#: Flag of a serialized mesh: colours follow its vertices.
-COLOURS = 0x8
+#: Flag of a serialized mesh → numbers of each vertex that follow its position: normal, texture coordinates, colour.
+ATTRIBUTES = {0x1: 3, 0x2: 2, 0x8: 3}
 
 #: Flag of a serialized mesh: numbers have double precision.
 DOUBLE = 0x2000
@@ -74,7 +68,7 @@ def _serialized_mesh(data: bytes, start: int, version: int) -> tuple[np.ndarray,
     vertices, faces = struct.unpack_from("<2Q", content, place)
     place += 16
     positions = np.frombuffer(content, "<f8" if flags & DOUBLE else "<f4", 3 * vertices, place)
-    numbers = 3 + 3 * bool(flags & NORMALS) + 2 * bool(flags & TEXTURE_COORDINATES) + 3 * bool(flags & COLOURS)
+    numbers = 3 + sum(count for flag, count in ATTRIBUTES.items() if flags & flag)
     place += numbers * vertices * positions.itemsize
     indices = np.frombuffer(content, "<u8" if vertices > 0xFFFFFFFF else "<u4", 3 * faces, place)
     return positions.reshape(-1, 3).astype(np.float64), indices.reshape(-1, 3).astype(np.int64)
@@ -339,7 +333,7 @@ def _repair(vertices: np.ndarray, faces: np.ndarray, name: str, repairs: list[st
         repairs.append(f"{name}: {share} wound inside out and were turned")
 
     # Slivers connect their neighbours, but have no part in distances or in winding numbers
-    open_edges = int(np.count_nonzero(_balance(faces, len(vertices))[0]))
+    open_edges = int(np.count_nonzero(edge_balance(faces, len(vertices))[1]))
     if open_edges:
         repairs.append(f"{name}: is not closed, {open_edges:,} edges have more triangles on one side than on the other")
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
@@ -369,31 +363,22 @@ def _merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray
     return ordered[first], renamed[faces]
 
 
-def directed_edges(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return a key of each triangle's three edges that both directions share, ``(3 F,)``, and the direction, ±1."""
+def edge_balance(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return each edge's two ends ``(E, 2)``, ascending, and how often its direction is in surplus ``(E,)``.
+
+    The third array holds the edges of each triangle, ``(F, 3)``. ``count`` is the number of vertices.
+    """
     ends = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
-    return ends.min(axis=1) * count + ends.max(axis=1), np.where(ends[:, 0] < ends[:, 1], 1, -1)
-
-
-def _balance(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return by how much one direction of each edge outnumbers the other, and each triangle's edges, (F, 3)."""
-    keys, signs = directed_edges(faces, count)
-    unique, edge_of = np.unique(keys, return_inverse=True)
-    return np.bincount(edge_of, signs, len(unique)), edge_of.reshape(-1, 3)
-
-
-def vertex_labels(edges: np.ndarray, count: int) -> np.ndarray:
-    """Return the component number of each of ``count`` vertices, ``(count,)``, given the ``edges`` (n, 2)."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    graph = coo_array((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(count, count))
-    return connected_components(graph, directed=False)[1]
+    keys, edge = np.unique(ends.min(axis=1) * count + ends.max(axis=1), return_inverse=True)
+    surplus = np.bincount(edge, np.where(ends[:, 0] < ends[:, 1], 1, -1), len(keys)).astype(int)
+    return np.stack([keys // count, keys % count], axis=-1), surplus, edge.reshape(-1, 3)
 
 
 def component_labels(faces: np.ndarray, count: int) -> np.ndarray:
     """Return the component number of each triangle, ``(F,)``, given the ``count`` of vertices."""
-    labels = vertex_labels(faces[:, [0, 1, 1, 2]].reshape(-1, 2), count)
+    from trimesh.graph import connected_component_labels
+
+    labels = connected_component_labels(faces[:, [0, 1, 1, 2]].reshape(-1, 2), count)
     return np.unique(labels[faces[:, 0]], return_inverse=True)[1]
 
 
@@ -419,16 +404,14 @@ def _inside_out(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     volume as a whole, they are all triangles.
     """
     labels = component_labels(faces, len(vertices))
-    edges, edge_of = _balance(faces, len(vertices))
-    unbalanced = np.bincount(labels, (edges != 0)[edge_of].sum(axis=1))
+    _, surplus, edges = edge_balance(faces, len(vertices))
+    unbalanced = np.bincount(labels, (surplus != 0)[edges].sum(axis=1))
     volumes = np.bincount(labels, tetrahedron_volumes(vertices, faces))
     if unbalanced.any() and volumes.sum() < 0:
         return np.ones(len(faces), dtype=bool)
     turned = np.zeros(len(faces), dtype=bool)
     suspects = np.flatnonzero((volumes < 0) & (unbalanced == 0))
-    if len(suspects) > MAX_ORIENTED:
-        suspects = suspects[np.argsort(volumes[suspects])[:MAX_ORIENTED]]
-    for label in suspects:
+    for label in suspects[np.argsort(volumes[suspects])[:MAX_ORIENTED]]:
         piece = labels == label
         place = vertices[faces[piece][0]].mean(axis=0)
         # Magnitudes, since the orientation of the other pieces is not known either
@@ -465,21 +448,16 @@ PLACES = np.array([[1 / 3, 1 / 3, 1 / 3], [0.9, 0.05, 0.05], [0.05, 0.9, 0.05], 
 
 
 def close_holes(mesh: Mesh) -> Mesh:
-    """Return the mesh with each hole closed by a fan of triangles around the middle of its edge.
+    """Return the mesh with each hole, of any shape, closed by a fan of triangles around the middle of its edge."""
+    from trimesh.graph import connected_component_labels
 
-    The result is watertight for any holes.
-    """
     count = len(mesh.vertices)
-    keys, signs = directed_edges(mesh.faces, count)
-    unique, edge = np.unique(keys, return_inverse=True)
-    missing = np.rint(np.bincount(edge, signs, len(unique))).astype(int)
-    ends = np.stack([unique // count, unique % count], axis=-1)
-    # Each surplus direction of an edge, as often as it is in surplus
-    ends[missing < 0] = ends[missing < 0][:, ::-1]
-    ends = np.repeat(ends, np.abs(missing), axis=0)
+    ends, surplus, _ = edge_balance(mesh.faces, count)
+    ends[surplus < 0] = ends[surplus < 0][:, ::-1]
+    ends = np.repeat(ends, np.abs(surplus), axis=0)
     if not len(ends):
         return mesh
-    hole = np.unique(vertex_labels(ends, count)[ends[:, 0]], return_inverse=True)[1]
+    hole = np.unique(connected_component_labels(ends, count)[ends[:, 0]], return_inverse=True)[1]
     a, b = mesh.vertices[ends[:, 0]], mesh.vertices[ends[:, 1]]
     length = np.linalg.norm(b - a, axis=1)
     middles = np.stack([np.bincount(hole, length * x) for x in ((a + b) / 2).T], axis=-1)

@@ -28,7 +28,7 @@ from ...core.units import check_memory
 from ...fitting.task import Model
 from .encoding import NodeCoding
 from .field import DistanceField
-from .nodes import POINTERS, SparseNodes, coded_field, decode_to_array, pointer_words, unpack_pointers
+from .nodes import POINTERS, SparseNodes, decode_to_array, pointer_words, unpack_pointers
 from .paper import PairField
 
 #: Arrays of each layout: name → number of dimensions, and channels (bytes in the sparse layout, except for entries).
@@ -61,26 +61,20 @@ def _word_bytes(words: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(words, "<u4").view(np.uint8).reshape(len(words), -1)
 
 
-def sparse_arrays(structure: SparseGrid, frames, pointers, entries) -> dict[str, StoredArray]:
-    """Return the arrays of a sparse field: words of frames (B,) and pointers, and the entries (K, 3), float32."""
-    blocks = [_word_bytes(structure.block_masks), structure.block_signs[:, None], _word_bytes(frames[:, None])]
-    masks = np.concatenate([structure.region_masks, structure.region_signs], axis=1)
-    return {
-        "regions": byte_array(structure.regions[..., None]),
-        "region_masks": byte_array(_word_bytes(masks)),
-        "blocks": byte_array(np.concatenate(blocks, axis=1)),
-        "pointers": byte_array(_word_bytes(pointers[:, None])),
-        "entries": StoredArray(np.ascontiguousarray(entries, np.float32)),
-    }
-
-
 def coded_arrays(coding: NodeCoding) -> tuple[dict[str, StoredArray], dict]:
     """Return the arrays of a file for the codes of a grid's nodes, and the settings that go with them."""
-    structure = coding.sampled.structure
-    arrays = sparse_arrays(structure, coding.frames, pointer_words(coding.pointers, coding.bits), coding.entries)
+    grid, bits = coding.sampled.structure, coding.sampled.bits
+    blocks = [_word_bytes(grid.block_masks), grid.block_signs[:, None], _word_bytes(coding.frames[:, None])]
+    arrays = {
+        "regions": byte_array(grid.regions[..., None]),
+        "region_masks": byte_array(_word_bytes(np.concatenate([grid.region_masks, grid.region_signs], axis=1))),
+        "blocks": byte_array(np.concatenate(blocks, axis=1)),
+        "pointers": byte_array(_word_bytes(pointer_words(coding.pointers, bits)[:, None])),
+        "entries": StoredArray(np.ascontiguousarray(coding.entries, np.float32)),
+    }
     settings = {
-        "layout": "sparse", "lower": list(structure.lower), "spacing": structure.spacing, "bits": coding.bits,
-        "nodes": structure.nodes, "slope": coding.slope,
+        "layout": "sparse", "lower": list(grid.lower), "spacing": grid.spacing, "bits": bits, "nodes": grid.nodes,
+        "slope": coding.slope,
     }  # fmt: skip
     return arrays, settings
 
@@ -169,7 +163,8 @@ def build_field(table: Table, arrays: dict, types, storage: str = "") -> Distanc
         pointers = unpack_pointers(words, settings["bits"], structure.nodes)
         nodes = decode_to_array(structure, frames, entries, pointers)
         return SparseNodes(types, structure, settings["slope"], nodes=device_tensor(types.TensorXf, nodes))
-    return coded_field(types, structure, settings["slope"], frames, words, settings["bits"], entries)
+    codes = {"frames": frames, "pointers": words, "bits": settings["bits"], "entries": entries}
+    return SparseNodes(types, structure, settings["slope"], **codes)
 
 
 def stored(table: Table, entries: dict, storage: str = "") -> Table:

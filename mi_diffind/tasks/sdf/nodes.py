@@ -200,24 +200,27 @@ class SparseNodes(DistanceField):
     """Field of the nodes of a ``structure``, in one of two forms.
 
     Decoded nodes can be trained: ``nodes`` is a tensor (n, 4) of distances in spacings and gradients. Coded nodes are
-    ``pointers`` (words, with ``bits`` bits each) into ``entries`` (words, with the :func:`entry_scale`
-    ``offset`` and ``step``), relative to the ``frames`` of their blocks (words).
+    ``pointers`` (words, with ``bits`` bits each) into ``entries`` (K, 3), float32, which are kept as words, relative to
+    the ``frames`` of their blocks (words).
     """
 
     marched = True
 
-    def __init__(self, types, structure: SparseGrid, slope: float, *, nodes=None, frames=None, pointers=None, bits=0,
-                 entries=None, offset=None, step=None):  # fmt: skip
+    def __init__(
+        self, types, structure: SparseGrid, slope: float, *, nodes=None, frames=None, pointers=None, bits=0,
+        entries=None,
+    ):  # fmt: skip
         h = structure.spacing
         super().__init__(types, structure.lower, structure.upper, h, BAND * h)
         self.structure, self.slope = structure, float(slope)
         self.index = GridIndex(types, structure, frames)
-        self.nodes = nodes
-        self.bits = bits
+        self.nodes, self.bits, self._entries = nodes, bits, None
         self._pointers = None if pointers is None else device_array(types.UInt32, pointers)
-        self._entries = None if entries is None else device_array(types.UInt32, entries)
-        self._affine = None if offset is None else (tuple(map(float, offset)), tuple(map(float, step)))
-        self._scale = self._affine and [dr.opaque(types.Array3f, v) for v in self._affine]
+        if entries is not None:
+            offset, step = entry_scale(entries)
+            self._entries = device_array(types.UInt32, entry_words(entries, offset, step))
+            self._affine = tuple(map(float, offset)), tuple(map(float, step))
+            self._scale = [dr.opaque(types.Array3f, v) for v in self._affine]
 
     def _grid(self, p):
         """Return the cell of points, as whole numbers of its lowest corner, and the place within it."""
@@ -343,15 +346,6 @@ class SparseNodes(DistanceField):
         if self.nodes is not None:
             return total + 16 * self.structure.nodes
         return total + 4 * (self.structure.blocks + dr.width(self._pointers) + dr.width(self._entries))
-
-
-def coded_field(types, structure: SparseGrid, slope: float, frames, pointers, bits: int, entries) -> SparseNodes:
-    """Return a field whose nodes are ``pointers`` (words) into ``entries`` (K, 3), float32."""
-    offset, step = entry_scale(entries)
-    return SparseNodes(
-        types, structure, slope, frames=frames, pointers=pointers, bits=bits,
-        entries=entry_words(entries, offset, step), offset=offset, step=step,
-    )  # fmt: skip
 
 
 def slope_bound(values: np.ndarray, gradients: np.ndarray, corners: np.ndarray, part: int = 2**17) -> float:

@@ -1,12 +1,15 @@
 """What is measured of a field, and what it is decoded to: against fields whose errors are known by formulas."""
 
+import functools
 import math
 
 import drjit as dr
 import drjit.llvm.ad as T
 import numpy as np
 import pytest
+import sdf_fields
 import solid_meshes as solids
+import trimesh
 from scipy.ndimage import map_coordinates
 from sdf_fields import TrilinearField
 
@@ -18,24 +21,20 @@ from mi_diffind.tasks.sdf.field import DistanceField
 from mi_diffind.tasks.sdf.mesh import make_mesh
 
 
-class Ball(DistanceField):
-    """The exact distance to a ball, told within ``band``; ``tilt`` turns its gradient about z."""
+class Ball(sdf_fields.Ball):
+    def __init__(self, radius, centre=(0, 0, 0), half=0.55, band=0.05, tilt=0.0):
+        super().__init__(T, radius, centre, half, band, tilt)
 
-    def __init__(self, radius, centre=(0, 0, 0), band=0.05, tilt=0.0, half=0.55):
-        super().__init__(T, [-half] * 3, [half] * 3, 0.01, band)
-        self.radius, self.centre, self.tilt = radius, centre, tilt
+
+class Shell(Ball):
+    """A ball with a cavity of the radius ``inner`` in its middle."""
+
+    def __init__(self, radius, inner):
+        super().__init__(radius)
+        self.inner = inner
 
     def value(self, p, active=True):
-        d = dr.norm(p - T.Array3f(*self.centre)) - self.radius
-        return dr.select(self.inside(p) & active, dr.clip(d, -self.band, self.band), self.band)
-
-    def gradient(self, p, active=True):
-        c, s = math.cos(self.tilt), math.sin(self.tilt)
-        n = dr.normalize(p - T.Array3f(*self.centre))
-        return self.value(p, active), T.Array3f(c * n.x - s * n.y, s * n.x + c * n.y, n.z)
-
-    def normal(self, p, active=True):
-        return 3 * (p - T.Array3f(*self.centre))
+        return dr.maximum(super().value(p, active), self.inner - dr.norm(p))
 
 
 class Union(DistanceField):
@@ -46,10 +45,7 @@ class Union(DistanceField):
         self.fields = fields
 
     def value(self, p, active=True):
-        measured = [f.value(p, active) for f in self.fields]
-        for other in measured[1:]:
-            measured[0] = dr.minimum(measured[0], other)
-        return measured[0]
+        return functools.reduce(dr.minimum, (f.value(p, active) for f in self.fields))
 
     def gradient(self, p, active=True):
         return self.value(p, active), T.Array3f(p)
@@ -135,12 +131,7 @@ def test_errors_are_told(held_out):
 
 def test_iou_knows_what_is_far(held_out):
     """A cavity deep inside and a ball apart count by their volumes."""
-
-    class Shell(Ball):
-        def value(self, p, active=True):
-            return dr.maximum(super().value(p, active), 0.2 - dr.norm(p))
-
-    field = Union(Shell(0.5), Ball(0.04, (0.45, 0.45, 0.45)))
+    field = Union(Shell(0.5, 0.2), Ball(0.04, (0.45, 0.45, 0.45)))
     assert held_out.measure(field)["iou"] == pytest.approx((0.5**3 - 0.2**3) / (0.5**3 + 0.04**3), abs=2e-3)
 
 
@@ -174,9 +165,8 @@ def test_fields_that_say_nothing(held_out):
             return T.Array3f(math.nan) * p.x
 
     measured = held_out.measure(Nothing(0.5))
-    assert (
-        measured["iou"] == measured["iou_near"] == 0 and measured["normal_deg"] == measured["normal_smooth_deg"] == 90
-    )
+    assert measured["iou"] == measured["iou_near"] == 0
+    assert measured["normal_deg"] == measured["normal_smooth_deg"] == 90
     assert math.isfinite(measured["mae_near"])
 
 
@@ -199,9 +189,7 @@ def test_a_decoded_ball(ball, held_out, resolution):
     radius = np.linalg.norm((mesh.vertices - np.array((1, 2, 3))) / 4 - np.array((0.05, -0.02, 0.01)), axis=1)
     assert np.abs(radius - 0.4).max() < 0.3 * (1.1 / resolution) ** 2 / 0.4 + 2e-5
     volumes = grids.components(mesh)
-    assert len(volumes) == 1 and volumes[0] == pytest.approx(
-        4**3 * 4 / 3 * math.pi * 0.4**3, rel=10 / resolution**2 + 1e-3
-    )
+    assert volumes == pytest.approx([4**3 * 4 / 3 * math.pi * 0.4**3], rel=10 / resolution**2 + 1e-3)
 
 
 def test_what_the_box_cuts_is_closed():
@@ -213,11 +201,7 @@ def test_what_the_box_cuts_is_closed():
 
 
 def test_pieces_and_cavities():
-    class Shell(Ball):
-        def value(self, p, active=True):
-            return dr.maximum(super().value(p, active), 0.1 - dr.norm(p))
-
-    field = Union(Shell(0.3), Ball(0.03, (0.45, 0.45, 0.45)), Ball(0.02, (-0.45, 0.4, 0)))
+    field = Union(Shell(0.3, 0.1), Ball(0.03, (0.45, 0.45, 0.45)), Ball(0.02, (-0.45, 0.4, 0)))
     volumes = grids.components(grids.extract(field, 120)) / (4 / 3 * math.pi)
     assert volumes == pytest.approx([0.3**3, -(0.1**3), 0.03**3, 0.02**3], rel=0.15)
     empty = grids.extract(Ball(-1.0), 64)
@@ -227,11 +211,8 @@ def test_pieces_and_cavities():
 def test_values_on_nodes_make_no_cracks():
     """Planes of zeros, and a checkerboard of signs: whatever the values, the surface is closed."""
     rng = np.random.default_rng(0)
-    for values in (
-        rng.integers(-1, 2, (37, 35, 33)),
-        rng.choice([-1, 1], (40, 40, 40)) * 1e-7,
-        rng.normal(size=(36, 36, 36)),
-    ):
+    zeros, checked = rng.integers(-1, 2, (37, 35, 33)), rng.choice([-1, 1], (40, 40, 40)) * 1e-7
+    for values in (zeros, checked, rng.normal(size=(36, 36, 36))):
         n = np.array(values.shape)
         field = TrilinearField(T.TensorXf(values.astype(np.float32)), [0, 0, 0], (n - 1) / 8, 1.0)
         mesh = grids.extract(field, int(n.max()) - 1)
@@ -262,9 +243,8 @@ def test_grid():
     values, lower, upper = grids.grid(field, 50)
     assert values.shape == (32 + 1, 40 + 1, 50 + 1) and values.dtype == np.float32
     assert np.allclose(lower, field.lower) and np.allclose(upper, (0.5, 0.4, 0.31))
-    z, y, x = np.meshgrid(
-        *[np.linspace(a, b, n) for a, b, n in zip(lower[::-1], upper[::-1], values.shape, strict=True)], indexing="ij"
-    )
+    sides = zip(lower[::-1], upper[::-1], values.shape, strict=True)
+    z, y, x = np.meshgrid(*[np.linspace(a, b, n) for a, b, n in sides], indexing="ij")
     truth = np.clip(np.sqrt((x - 0.1) ** 2 + y**2 + z**2) - 0.3, -0.2, 0.2)
     assert np.abs(values - truth)[:-1, 1:-1, 1:-1].max() < 1e-5 and np.all(values[-1] == np.float32(0.2))
 
@@ -289,11 +269,8 @@ def test_how_fine_a_grid_has_to_be():
         assert measured <= error and grids.trilinear_error(field, points, chosen) == pytest.approx(measured, rel=0.05)
         assert grids.trilinear_error(field, points, int(chosen / 1.04)) > 0.98 * error
     chosen, measured = grids.resolution_for(field, 2e-5, finest=60)
-    assert (
-        chosen == 60
-        and measured == pytest.approx(grids.trilinear_error(field, points, 60), rel=0.05)
-        and measured > 2e-5
-    )
+    assert chosen == 60 and measured > 2e-5
+    assert measured == pytest.approx(grids.trilinear_error(field, points, 60), rel=0.05)
     assert grids.resolution_for(field, 0, finest=60)[0] == 60
     assert grids.resolution_for(Ball(-0.1), 1e-3) == (8, 0)  # no surface
 
@@ -325,11 +302,8 @@ def test_chamfer(ball, held_out):
         measured = held_out.chamfer(decoded, 2**14)
         assert measured["chamfer"] == pytest.approx(0.5 - radius, abs=2e-4) and measured["components"] == 1
         assert measured["components_mesh"] == 1
-    import trimesh
-
-    half = trimesh.Trimesh(
-        *solids.without(solids.sphere(96), solids.sphere(96)[0][solids.sphere(96)[1]][:, :, 2].max(1) > 1e-6)
-    )
+    vertices, faces = solids.sphere(96)
+    half = trimesh.Trimesh(*solids.without((vertices, faces), vertices[faces][:, :, 2].max(1) > 1e-6))
     measured = held_out.chamfer(half, 2**14)["chamfer"]
     # From the missing half's points to the equator
     z = np.linspace(0, 1, 2001)
@@ -341,9 +315,8 @@ def test_chamfer(ball, held_out):
 
 def test_components_of_overlapping_pieces():
     """Two balls that overlap and one apart: two solids, however many pieces the mesh has."""
-    mesh = make_mesh(
-        *solids.together(solids.sphere(12), solids.sphere(12, 1, (1, 0, 0)), solids.sphere(12, 0.5, (4, 0, 0)))
-    )
+    balls = (solids.sphere(12, *v) for v in ((), (1, (1, 0, 0)), (0.5, (4, 0, 0))))
+    mesh = make_mesh(*solids.together(*balls))
     with Distances(mesh) as d:
         e = SurfaceEvaluation(mesh, d, count=2**8, band=WIDE)
         assert mesh.components == 3 and e.components == 2
@@ -356,11 +329,9 @@ def test_components_of_overlapping_pieces():
 
 def test_lost_pieces():
     """A piece that is smaller than the cells is missing in the field, and is counted."""
-    mesh = make_mesh(
-        *solids.together(solids.sphere(12), solids.sphere(6, 0.02, (1.5, 0, 0)), solids.sphere(6, 0.02, (0, 1.4, 0)))
-    )
-    place = [(np.array(c) - mesh.centre) / mesh.scale for c in ((0, 0, 0), (1.5, 0, 0), (0, 1.4, 0))]
-    parts = [Ball(r / mesh.scale, tuple(c.tolist()), half=0.6) for r, c in zip((1, 0.02, 0.02), place, strict=True)]
+    balls = (1, (0, 0, 0)), (0.02, (1.5, 0, 0)), (0.02, (0, 1.4, 0))
+    mesh = make_mesh(*solids.together(*(solids.sphere(12, *ball) for ball in balls)))
+    parts = [Ball(r / mesh.scale, ((np.array(c) - mesh.centre) / mesh.scale).tolist(), half=0.6) for r, c in balls]
     with Distances(mesh) as d:
         for missing in (0, 1, 2, 3):
             field = Union(*parts[missing:]) if missing < 3 else Ball(-1.0)

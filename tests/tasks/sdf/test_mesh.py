@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import textwrap
 import time
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 import solid_meshes as solids
 import trimesh
+from scipy.spatial import KDTree
 
 from mi_diffind.core.errors import DiffindError
 from mi_diffind.tasks.sdf.distances import (
@@ -90,37 +90,31 @@ def test_digest_knows_content():
     assert make_mesh(vertices * [1, 1, 0.999], faces).digest != digest
 
 
+POINTS = b"ply\nformat ascii 1.0\nelement vertex 1\n" + b"".join(b"property float %c\n" % c for c in b"xyz")
+GLB = trimesh.Trimesh(*solids.box()).export(file_type="glb")
+
+
 @pytest.mark.parametrize(
-    "content, result",
+    "name, content, result",
     [
-        (b"", "cannot be read as a mesh"),
-        (b"OFF\n3 1 0\n0 0 0\n1 0", "cannot be read as a mesh"),
-        (b"\x00\xff\xfe nonsense", "cannot be read as a mesh"),
-        (b"OFF\n3 0 0\n0 0 0\n1 0 0\n0 1 0\n", ""),
+        ("a.off", b"", "cannot be read as a mesh"),
+        ("a.off", b"OFF\n3 1 0\n0 0 0\n1 0", "cannot be read as a mesh"),
+        ("a.off", b"\x00\xff\xfe nonsense", "cannot be read as a mesh"),
+        ("a.off", b"OFF\n3 0 0\n0 0 0\n1 0 0\n0 1 0\n", ""),
+        ("a.glb", GLB[: len(GLB) // 2], "cannot be read as a mesh"),
+        ("a.xyzzy", b"what", "cannot be read as a mesh"),
+        ("a.ply", POINTS + b"end_header\n0 0 0\n", "has no triangles"),
+        ("none.ply", None, "there is no such file"),
+        ("", None, "is a folder"),
     ],
 )
-def test_unreadable_files(tmp_path, content, result):
-    (tmp_path / "a.off").write_bytes(content)
+def test_unreadable_files(tmp_path, name, content, result):
+    path = tmp_path / name
+    if content is not None:
+        path.write_bytes(content)
     with pytest.raises(MeshError) as error:
-        load_mesh(tmp_path / "a.off")
-    assert result in sentence(error) and str(tmp_path / "a.off") in str(error.value)
-
-
-def test_files_that_are_none(tmp_path):
-    with pytest.raises(MeshError, match="there is no such file"):
-        load_mesh(tmp_path / "none.ply")
-    with pytest.raises(MeshError, match="is a folder"):
-        load_mesh(tmp_path)
-    (tmp_path / "a.xyzzy").write_text("what")
-    with pytest.raises(MeshError) as error:
-        load_mesh(tmp_path / "a.xyzzy")
-    assert "a.xyzzy: cannot be read as a mesh" in sentence(error)
-    (tmp_path / "points.ply").write_text(
-        "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
-        "0 0 0\n1 1 1\n"
-    )
-    with pytest.raises(MeshError, match="has no triangles"):
-        load_mesh(tmp_path / "points.ply")
+        load_mesh(path)
+    assert result in sentence(error) and str(error.value).startswith(str(path))
 
 
 NOTHING = np.zeros((0, 3), int)
@@ -201,15 +195,8 @@ def test_orientation_is_repaired():
 
 
 def test_a_moebius_strip_does_no_harm():
-    n = 40
-    angle = np.linspace(0, 2 * np.pi, n, endpoint=False)
-    across = np.stack([np.cos(angle / 2) * np.cos(angle), np.cos(angle / 2) * np.sin(angle), np.sin(angle / 2)], -1)
-    ring = np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1)
-    vertices = np.concatenate([ring + 0.3 * across, ring - 0.3 * across])
-    i, j = np.arange(n), (np.arange(n) + 1) % n
-    flip = i == n - 1
-    c, d = np.where(flip, j + n, j), np.where(flip, j, j + n)
-    mesh = make_mesh(vertices, np.concatenate([np.stack([i, c, d], 1), np.stack([i, d, i + n], 1)]))
+    """That of five triangles."""
+    mesh = make_mesh(np.random.default_rng(0).random((5, 3)), (np.arange(5)[:, None] + np.arange(3)) % 5)
     assert not mesh.watertight and mesh.components == 1
     with Distances(mesh) as d, contextlib.suppress(DistancesError):
         assert np.isfinite(d.signed(np.zeros((1, 3)))).all()
@@ -218,11 +205,13 @@ def test_a_moebius_strip_does_no_harm():
 # -- distances --------------------------------------------------------------------------------------------------------
 
 
-def test_distances_of_a_box():
-    """Against the formula, in a frame where the box's longest side is 1."""
-    size = np.array([1, 0.6, 0.3])
+@pytest.mark.parametrize("size", [(1, 0.6, 0.3), (0.05, 0.05, 1), (1, 1, 0.001)])
+def test_distances_of_a_box(size):
+    """Against the formula, in a frame where the box's longest side is 1; also of a rod and of a plate."""
+    size = np.array(size)
     mesh = make_mesh(*solids.box(7 * size, (3, 2, 1)))
-    points = np.concatenate([sample_box([-0.7] * 3, [0.7] * 3, 3000, 0), sample_near(mesh, 3000, 0.01, 1)])
+    near = sample_near(mesh, 3000, min(0.01, 0.3 * size.min()), 1)
+    points = np.concatenate([sample_box([-0.7] * 3, [0.7] * 3, 3000, 0), near])
     with Distances(mesh) as d:
         truth = solids.box_distance(points, size)
         result = d.signed(points)
@@ -233,7 +222,8 @@ def test_distances_of_a_box():
         step = 1e-5
         ahead = solids.box_distance(points + step * gradient, size)
     assert np.array_equal(value, result) and np.allclose(np.linalg.norm(gradient, axis=1), 1, atol=1e-5)
-    assert np.quantile(np.abs((ahead - truth) / step - 1), 0.99) < 1e-3  # but for those with several nearest points
+    several = np.abs(truth) < 2 * step  # a step may go through the box
+    assert np.quantile(np.abs((ahead - truth) / step - 1)[~several], 0.99) < 1e-3  # but for several nearest points
 
 
 def test_distances_and_windings_of_a_bad_mesh():
@@ -285,10 +275,10 @@ def test_an_open_mesh_is_closed():
     mesh = make_mesh(*open_mesh, "bowl.ply")
     assert not mesh.watertight and "bowl.ply: is not closed" in mesh.warnings[0]
     with Distances(mesh) as d:
-        assert d.solid.watertight and 0.3 < d.ambiguity < 0.9
+        assert d.solid.watertight and 0.3 < d._doubt[0] < 0.9
         doubt = [w for w in d.warnings if "ambiguous" in w]
         assert len(doubt) == 1 and doubt[0].startswith("bowl.ply: ") and "%" in doubt[0]
-        assert f"{100 * d.ambiguity:.2g}%" in doubt[0]
+        assert f"{100 * d._doubt[0]:.2g}%" in doubt[0]
         # On the axis, from the bottom to beyond the opening: the distance to the lid's plane
         lid = mesh.upper[2]
         points = np.array([[0, 0, lid - 0.05], [0, 0, lid + 0.05]])
@@ -301,7 +291,7 @@ def test_an_open_mesh_is_closed():
 def test_a_small_hole_is_a_small_doubt():
     mesh = make_mesh(*solids.without(solids.sphere(16), [100]))
     with Distances(mesh) as d:
-        assert 0 < d.ambiguity < 0.02
+        assert d.solid.watertight and 0 < d._doubt[0] < 0.02
         assert inside_share(mesh, d) == pytest.approx(np.pi / 6, abs=0.02)
 
 
@@ -338,8 +328,6 @@ def test_overlapping_boxes_are_their_union(shift):
     cloud, normals = sample_surface(make_mesh(*solids.box()), 40000, 2)
     cloud, ahead = (np.concatenate([c, c + np.array(shift)]) for c in (cloud, cloud + 1e-6 * normals))
     seen = np.minimum(solids.box_distance(ahead, (1, 1, 1)), solids.box_distance(ahead, (1, 1, 1), shift)) > 0
-    from scipy.spatial import KDTree
-
     truth, _ = KDTree(cloud[seen]).query(file)
     error = np.abs(np.abs(result) - truth / mesh.scale)
     assert np.quantile(error, 0.99) < 0.01 and error.max() < 0.02
@@ -354,44 +342,6 @@ def test_a_sheet_has_no_part():
     with Distances(mesh) as d:
         at = (np.array([[1.9, 0.2, 0.1]]) - mesh.centre) / mesh.scale
         assert d.signed(at) == pytest.approx((np.linalg.norm([1.9, 0.2, 0.1]) - 1) / mesh.scale, rel=0.02)
-
-
-def test_self_intersecting():
-    """A tube that runs through itself: inside is where it winds at least once around."""
-    t = np.linspace(0, 2 * np.pi, 120, endpoint=False)
-    path = np.stack([np.sin(t), np.sin(2 * t) * 0.8, 0.02 * np.cos(t)], axis=-1)
-    ahead = np.roll(path, -1, axis=0) - np.roll(path, 1, axis=0)
-    ahead /= np.linalg.norm(ahead, axis=1)[:, None]
-    side = np.cross(ahead, [0, 0, 1])
-    side /= np.linalg.norm(side, axis=1)[:, None]
-    up = np.cross(side, ahead)
-    s = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    ring = path[:, None] + 0.15 * (np.cos(s)[None, :, None] * side[:, None] + np.sin(s)[None, :, None] * up[:, None])
-    i, j = np.meshgrid(np.arange(120), np.arange(24), indexing="ij")
-    n = lambda a, b: (a % 120 * 24 + b % 24).ravel()  # noqa: E731
-    faces = np.concatenate([np.stack([n(i, j), n(i + 1, j), n(i + 1, j + 1)], 1),
-                            np.stack([n(i, j), n(i + 1, j + 1), n(i, j + 1)], 1)])  # fmt: skip
-    mesh = make_mesh(ring.reshape(-1, 3), faces)
-    points = sample_box(mesh.lower, mesh.upper, 5000, 4)
-    distance = np.min(np.linalg.norm(mesh.to_file_frame(points)[:, None] - path[None], axis=-1), axis=1)
-    with Distances(mesh) as d:
-        inside = d.inside(points)
-        crossing = (np.array([[0, 0, 0.05]]) - mesh.centre) / mesh.scale
-        depth = d.signed(crossing)
-    sure = np.abs(distance - 0.15) > 0.02
-    assert np.array_equal(inside[sure], distance[sure] < 0.15)
-    assert depth < -0.08 / mesh.scale, "where the tube crosses itself, its walls do not count"
-
-
-def test_thin_plate():
-    """1 : 1 : 20, and a plate of a thousandth of its length."""
-    for size in ((1, 1, 20), (1, 1, 0.001)):
-        mesh = make_mesh(*solids.box(size))
-        unit = np.array(size) / max(size)
-        points = sample_near(mesh, 4000, 0.3 * unit.min(), 3)
-        with Distances(mesh) as d:
-            truth = solids.box_distance(points, unit)
-            assert np.abs(d.signed(points) - truth).max() < 1e-6 and (truth < 0).mean() > 0.05
 
 
 # -- cells and grids --------------------------------------------------------------------------------------------------
@@ -467,23 +417,29 @@ def test_without_libigl(monkeypatch):
     assert "box.ply: distances need the package libigl" in sentence(error) and "pip install libigl" in str(error.value)
 
 
+START = """
+import os, numpy as np, solid_meshes as solids
+from mi_diffind.tasks.sdf.distances import Distances
+from mi_diffind.tasks.sdf.mesh import make_mesh
+d = Distances(make_mesh(*solids.box()))
+before, child = d.signed(np.zeros((1, 3))), d._child
+"""
+
+
+def python(program):
+    """Run a program that begins with a question."""
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    return subprocess.run([sys.executable, "-c", START + program], capture_output=True, text=True, env=env)
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 def test_the_child_ends_with_its_parent():
     """However the parent ends, and without the parent's modules in it."""
-    program = textwrap.dedent("""
-        import os, numpy as np, solid_meshes as solids
-        from mi_diffind.tasks.sdf.distances import Distances
-        from mi_diffind.tasks.sdf.mesh import make_mesh
-        d = Distances(make_mesh(*solids.box()))
-        d.signed(np.zeros((1, 3)))
-        maps = open(f"/proc/{d._child.pid}/maps").read()
-        print(d._child.pid, "drjit" in maps or "mitsuba" in maps, flush=True)
-        os.kill(os.getpid(), 9)
-    """)
-    path = os.pathsep.join(filter(None, sys.path))
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path}
-    )
+    done = python("""
+maps = open(f"/proc/{child.pid}/maps").read()
+print(child.pid, "drjit" in maps or "mitsuba" in maps, flush=True)
+os.kill(os.getpid(), 9)
+""")
     assert done.returncode == -9, done.stderr
     pid, loaded = done.stdout.split()
     assert loaded == "False"
@@ -523,21 +479,12 @@ def test_ctrl_c_ends_a_question():
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
 def test_a_fork_leaves_the_child_alone():
     """A forked copy of the parent asks a process of its own, and ends only that."""
-    program = textwrap.dedent("""
-        import os, numpy as np, solid_meshes as solids
-        from mi_diffind.tasks.sdf.distances import Distances
-        from mi_diffind.tasks.sdf.mesh import make_mesh
-        d = Distances(make_mesh(*solids.box()))
-        before, child = d.signed(np.zeros((1, 3))), d._child
-        pid = os.fork()
-        if pid == 0:
-            same = d.signed(np.zeros((1, 3))) == before and d._child.pid != child.pid
-            d.close()
-            os._exit(0 if same else 1)
-        print(os.waitpid(pid, 0)[1], (d.signed(np.zeros((1, 3))) == before).all(), d._child is child)
-    """)
-    path = os.pathsep.join(filter(None, sys.path))
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path}
-    )
+    done = python("""
+pid = os.fork()
+if pid == 0:
+    same = d.signed(np.zeros((1, 3))) == before and d._child.pid != child.pid
+    d.close()
+    os._exit(0 if same else 1)
+print(os.waitpid(pid, 0)[1], (d.signed(np.zeros((1, 3))) == before).all(), d._child is child)
+""")
     assert done.stdout.split() == ["0", "True", "True"], done.stderr

@@ -1,13 +1,18 @@
-"""The sparse layout of signed distance fields: masks, codes, what cells say."""
+"""The sparse layout of signed distance fields: masks, codes, what cells say; no holes and no floaters."""
+
+import math
 
 import drjit as dr
 import numpy as np
 import pytest
-from solid_meshes import box, sphere, together
+from sdf_fields import coded, coded_table
+from solid_meshes import box, sphere, together, turned
 
+from mi_diffind.arrays.sparse_grid import CORNERS
 from mi_diffind.core.runtime import array_module
-from mi_diffind.tasks.sdf import encoding, grids, nodes
-from mi_diffind.tasks.sdf.distances import Distances
+from mi_diffind.tasks.sdf import encoding, grids, model, nodes
+from mi_diffind.tasks.sdf.distances import Distances, sample_box
+from mi_diffind.tasks.sdf.marching import trace
 from mi_diffind.tasks.sdf.mesh import make_mesh
 
 
@@ -17,38 +22,42 @@ def ad():
 
 
 @pytest.fixture(scope="module")
-def solid():
-    """A ball and a box apart from it, and the nodes of a grid around them: mesh, distances, samples."""
-    mesh = make_mesh(*together(sphere(24, 0.5, (0, 0, 0)), box((0.3, 0.5, 0.4), (1.1, 0.1, -0.1))))
-    with Distances(mesh) as distances:
-        sampled = encoding.sample(distances, 1 / 96)
-        yield mesh, distances, sampled
+def shapes():
+    """A ball with a cavity, a box that cuts into it, a thin rod and a turned cube: distances and samples."""
+    ball, cavity, rod = sphere(24), turned(sphere(16, 0.6)), box((0.08, 2.6, 0.08), (1.15, 0, 0.3))
+    vertices, faces = box((0.5, 0.5, 0.5))
+    turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    cube = vertices @ (turn * np.sign(np.linalg.det(turn))) + (-1.2, 0.9, 0), faces
+    with Distances(make_mesh(*together(ball, cavity, box((0.6, 0.6, 0.6), (0.9, 0, 0)), rod, cube))) as distances:
+        yield distances, encoding.sample(distances, 1 / 72, 8)
+
+
+@pytest.fixture(scope="module")
+def sampled(shapes):
+    return shapes[1]
 
 
 def points(types, values):
     return types.Array3f(*np.ascontiguousarray(np.asarray(values, np.float32).T))
 
 
-def decoded(types, sampled):
+def decoded(types, sampled, wrong=0.0):
+    """The sampled nodes; this share of them is on the wrong side, as an optimisation may leave them."""
     values = np.concatenate([sampled.distances[:, None], sampled.normals], axis=1).astype(np.float32)
+    values[np.random.default_rng(4).random(len(values)) < wrong, 0] *= -1
     return nodes.SparseNodes(types, sampled.structure, 3.0, nodes=types.TensorXf(values))
 
 
-def coded(types, sampled, bits=8):
-    frames = encoding.fit_frames(sampled)
-    wanted = encoding.exact_entries(sampled, frames)
-    entries = encoding.cluster(wanted, min(2**bits, len(wanted)))
-    pointers = encoding.assign(wanted, entries)
-    words = nodes.pointer_words(pointers, bits)
-    return nodes.coded_field(types, sampled.structure, 3.0, frames, words, bits, entries), frames, entries[pointers]
+def field_of(types, coding):
+    return model.build_field(coded_table(coding), {}, types)
 
 
 # -- masks -------------------------------------------------------------------------------------------------------------
 
 
-def test_every_node_of_the_grid_has_its_sign(ad, solid):
+def test_every_node_of_the_grid_has_its_sign(ad, shapes):
     """Also those that are not stored, of which there is one bit for eight: against winding numbers."""
-    _mesh, distances, sampled = solid
+    distances, sampled = shapes
     s = sampled.structure
     grid = np.stack(np.meshgrid(*[np.arange(n - 1) for n in s.shape], indexing="ij"), axis=-1).reshape(-1, 3)
     places = np.array(s.lower) + s.spacing * grid
@@ -115,9 +124,8 @@ def test_pointers_in_words(ad, bits, rng):
 # -- what cells say ----------------------------------------------------------------------------------------------------
 
 
-def test_quadratic_functions_are_exact(ad, solid):
+def test_quadratic_functions_are_exact(ad, sampled):
     """f(x) = Σ wᵢ (dᵢ + ½ gᵢ·(x − xᵢ)) has no error but rounding for any quadratic f, and so have its gradients."""
-    _, _, sampled = solid
     s = sampled.structure
     positions, _ = s.node_positions()
     a = np.array([[0.02, 0.01, -0.03], [0.01, -0.04, 0.02], [-0.03, 0.02, 0.05]])
@@ -138,9 +146,8 @@ def test_quadratic_functions_are_exact(ad, solid):
     assert np.abs(np.stack([v.numpy() for v in slope], axis=1) - (2 * cells @ a + b) / 40).max() < 1e-3
 
 
-def test_gradients_are_those_of_the_values(ad, solid):
+def test_gradients_are_those_of_the_values(ad, sampled):
     """In place: central differences. In the nodes: changes of nodes, one by one."""
-    _, _, sampled = solid
     field, s = decoded(ad, sampled), sampled.structure
     rng = np.random.default_rng(2)
     corner = s.node_positions()[0][sampled.corners[rng.integers(len(sampled.corners), size=400), 0]]
@@ -172,12 +179,10 @@ def test_gradients_are_those_of_the_values(ad, solid):
         assert (result[0] - result[1]) / 0.02 == pytest.approx(grad[node, channel], rel=2e-2, abs=2e-3)
 
 
-def test_coded_nodes_are_the_decoded_ones(ad, solid):
+def test_coded_nodes_are_the_decoded_ones(ad, sampled):
     """Read from pointers, entries and frames in the kernel, and decoded by NumPy: one field."""
-    _, _, sampled = solid
-    field, frames, entries = coded(ad, sampled)
-    values = nodes.decode_to_array(sampled.structure, frames, entries)
-    other = nodes.SparseNodes(ad, sampled.structure, 3.0, nodes=ad.TensorXf(values))
+    field = field_of(ad, coded(sampled))
+    other = nodes.SparseNodes(ad, sampled.structure, 3.0, nodes=ad.TensorXf(field.decoded()))
     rng = np.random.default_rng(3)
     p = points(ad, rng.uniform(field.lower, field.upper, (20000, 3)))
     assert np.abs(field.value(p).numpy() - other.value(p).numpy()).max() < 2e-2 * field.spacing
@@ -186,8 +191,7 @@ def test_coded_nodes_are_the_decoded_ones(ad, solid):
     assert known.sum() > 500 and gap.max() < 0.02
 
 
-def test_slope_is_bounded(ad, solid):
-    _, _, sampled = solid
+def test_slope_is_bounded(ad, sampled):
     bound = nodes.slope_bound(sampled.distances, sampled.normals, sampled.corners)
     rng = np.random.default_rng(5)
     corner = sampled.structure.node_positions()[0][np.repeat(sampled.corners[:, 0], 16)]
@@ -198,9 +202,8 @@ def test_slope_is_bounded(ad, solid):
     assert 0.5 * bound < steepest <= bound < 3
 
 
-def test_places_where_there_is_nothing(ad, solid):
-    _, _, sampled = solid
-    field, *_ = coded(ad, sampled)
+def test_places_where_there_is_nothing(ad, sampled):
+    field = field_of(ad, coded(sampled))
     p = points(ad, [[np.nan, 0, 0], [0, 0, 9], [-1e30, 0, 0], [np.inf, 0, 0]])
     value, slope = field.gradient(p)
     assert np.array_equal(value.numpy(), np.full(4, np.float32(field.band)))
@@ -210,21 +213,19 @@ def test_places_where_there_is_nothing(ad, solid):
     assert np.all(field.value(corners).numpy() > 0)
 
 
-def test_the_surface_stays_in_its_cells(ad, solid):
+def test_the_surface_stays_in_its_cells(ad, sampled):
     """Nodes that training spoiled keep their sides when they are coded, and nothing is left beside the solids."""
-    _, _, sampled = solid
     rng = np.random.default_rng(7)
     values = np.concatenate([sampled.distances[:, None], sampled.normals], axis=1)
     values[:, 0] += rng.normal(scale=0.1, size=len(values))
     values[:, 1:] += rng.normal(scale=0.5, size=(len(values), 3))
     values[:, 1:] /= np.linalg.norm(values[:, 1:], axis=1, keepdims=True)
-    coding = encoding.NodeCoding(sampled, 8)
+    coding = encoding.NodeCoding(sampled)
     coding.encode(values)
     distances = coding.values()[:, 0]
     assert np.all((distances < 0) == (sampled.distances < 0)) and np.all(np.abs(distances) > 0.005)
-    words = nodes.pointer_words(coding.pointers, 8)
-    field = nodes.coded_field(ad, sampled.structure, 3.0, coding.frames, words, 8, coding.entries)
-    assert len(grids.components(grids.extract(field, 200))) == 2
+    field = field_of(ad, coding)
+    assert len(grids.components(grids.extract(field, 200))) == 3
 
     # On the sides of stored cells behind which there is none, the sign is that of their corners
     s = sampled.structure
@@ -245,3 +246,84 @@ def test_the_surface_stays_in_its_cells(ad, solid):
     assert len(places) > 20000 and np.mean(complete.numpy()) > 0.999
     wrong = (value.numpy() * signs < -0.005) & complete.numpy()
     assert np.mean(wrong) < 1e-4
+
+
+# -- floaters ---------------------------------------------------------------------------------------------------------
+
+
+def test_wrong_nodes_make_no_floaters(ad, shapes):
+    """They have a part in the cells that the surface crosses only: all others keep their signs."""
+    distances, s = shapes
+    field = decoded(ad, s, 0.3)
+    places = sample_box(field.lower, field.upper, 40000, 5)
+    cell = np.floor((places - field.lower) / field.spacing).astype(int)
+    stored = set(map(tuple, s.structure.node_positions()[0].tolist()))
+    corners = (cell[:, None] + CORNERS).tolist()
+    count = np.array([sum(tuple(c) in stored for c in eight) for eight in corners])
+    inside = distances.inside(places)
+    wrong = (field.value(points(ad, places)).numpy() < 0) != inside
+    assert not wrong[count < 8].any() and wrong[count == 8].any()
+    assert np.any((count > 0) & (count < 8) & inside) and np.any((count > 0) & (count < 8) & ~inside)
+
+
+def test_as_many_pieces_as_the_mesh(ad, shapes):
+    """Also after coding, decoded finer than the field's cells: two solids, one with a cavity, and nothing else."""
+    distances, s = shapes
+    volumes = grids.components(grids.extract(field_of(ad, coded(s)), 108)) * distances.mesh.scale**3
+    assert len(volumes) == 3 and np.sum(volumes < 0) == 1
+    assert volumes[1] == pytest.approx(-4 / 3 * math.pi * 0.6**3, rel=0.05)
+    assert volumes[2] == pytest.approx(0.5**3, rel=0.05)
+
+
+def test_empty_blocks_are_left_out_of_decoding(ad, shapes, monkeypatch):
+    """The same triangles and values, whether all of the grid is looked at or what is near stored nodes only."""
+    field = field_of(ad, coded(shapes[1]))
+    few, (values, *_) = grids.extract(field, 100), grids.grid(field, 100)
+    blocks = grids.crossed_blocks(field, np.array(field.lower), 1 / 100, [100] * 3)
+    assert blocks.shape == (4, 4, 4) and 0.2 < blocks.mean() < 0.95
+    monkeypatch.setattr(grids, "crossed_blocks", lambda field, lower, spacing, cells: np.ones(-(-cells // 32), bool))
+    every = grids.extract(field, 100)
+    assert np.abs(values - grids.grid(field, 100)[0]).max() < 1e-6
+    assert np.array_equal(few.vertices, every.vertices) and np.array_equal(few.faces, every.faces)
+
+
+# -- holes ------------------------------------------------------------------------------------------------------------
+
+
+def shoot(ad, distances, field, count, seed):
+    """
+    ``count`` rays that start outside, from a sphere around the solid, from afar, along axes and from places in the box,
+    each at a place that lies deeper inside than the field's cells are wide: how many go through, how many end elsewhere
+    than on the surface.
+    """
+    rng = np.random.default_rng(seed)
+    h = field.spacing
+    pool = sample_box(distances.mesh.lower - 3 * h, distances.mesh.upper + 3 * h, min(4 * count, 400_000), rng)
+    d = distances.signed(pool, 4 * h)
+    deep, free = pool[d < -1.5 * h], pool[d > 1.5 * h]
+    target = deep[rng.integers(len(deep), size=count)] + rng.uniform(-0.25, 0.25, (count, 3)) * h
+    away, start = rng.normal(size=(count, 3)), rng.integers(8, size=count)
+    along, flat = start == 0, start == 1
+    away[along] = np.eye(3)[rng.integers(3, size=along.sum())] * rng.choice([-1, 1], (along.sum(), 1))
+    away[flat, rng.integers(3, size=flat.sum())] = 0
+    away /= np.linalg.norm(away, axis=1)[:, None]
+    o = target + np.where(start == 2, 30, 2)[:, None] * away
+    box = start >= 5
+    o[box] = free[rng.integers(len(free), size=box.sum())]
+    o = o.astype(np.float32).astype(np.float64)
+    length = np.linalg.norm(target - o, axis=1)
+    d = (target - o) / length[:, None]
+    t, hit = trace(field, points(ad, o), points(ad, d), ad.Float(math.inf))
+    t, hit = t.numpy().astype(np.float64), hit.numpy()
+    some = rng.choice(np.flatnonzero(hit & (start != 2)), min(20_000, int(hit.sum() // 2)), replace=False)
+    place = o[some] + d[some] * t[some, None]
+    return int(np.sum(~hit | (t > length))), int(np.sum(distances.unsigned(place) > 1.5 * h))
+
+
+def test_no_holes(ad, shapes):
+    assert shoot(ad, shapes[0], field_of(ad, coded(shapes[1])), 2**17, 6) == (0, 0)
+
+
+def test_no_holes_where_nodes_are_wrong(ad, shapes):
+    """Rays end at the latest where signs are known."""
+    assert shoot(ad, shapes[0], decoded(ad, shapes[1], 0.3), 2**15, 9)[0] == 0

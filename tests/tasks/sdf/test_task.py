@@ -62,8 +62,8 @@ def evaluation(folder):
         yield SurfaceEvaluation(mesh, distances, 2**16)
 
 
-def opened(path, ad, storage=""):
-    return tasks()["sdf"].open(ad.TensorXf, path, storage=storage)
+def opened(path, ad):
+    return tasks()["sdf"].open(ad.TensorXf, path)
 
 
 # -- what comes out ----------------------------------------------------------------------------------------------------
@@ -107,25 +107,14 @@ def test_training_earns_its_place(folder, evaluation, ad):
 @pytest.mark.parametrize("preset", ["dense", "paper"])
 def test_presets_of_the_supplement(folder, evaluation, ad, preset, tmp_path):
     path = tmp_path / "pair.npz"
-    steps = ["--steps", "40", "--batch", "16384", "--variant", "llvm_ad_rgb"]
-    command = ["fit", "sdf", str(folder / "solids.ply"), "--bytes", str(BYTES), "--preset", preset, *steps]
+    command = ["fit", "sdf", str(folder / "solids.ply"), "--bytes", str(BYTES), "--preset", preset, *SHORT]
     assert main([*command, "-o", str(path)]) == 0
     table = load_table(path)
     assert 0.8 * BYTES <= table.nbytes <= BYTES and table.storage == "uint8"
     primary, cascaded = table.arrays["primary"].shape, table.arrays["cascaded"].shape
     assert primary[-1] == 3 and 1.7 < max(primary[:3]) / max(cascaded[:3]) < 2.4  # Table 5 at 6 MB: 2
-    field = opened(path, ad).field
-    result = evaluation.measure(field)
+    result = evaluation.measure(opened(path, ad).field)
     assert result["iou"] > 0.95 and result["iou_near"] > 0.85
-    # The bound of the slope: against small steps all over the box
-    rng = np.random.default_rng(0)
-    p = ad.Array3f(*rng.uniform(field.lower, field.upper, (50000, 3)).T.astype(np.float32))
-    d = rng.normal(size=(50000, 3))
-    d = ad.Array3f(*(1e-3 * d / np.linalg.norm(d, axis=1, keepdims=True)).T.astype(np.float32))
-    steps = dr.abs(field.value(p + d) - field.value(p)) / 1e-3
-    inside = field.inside(p) & field.inside(p + d)
-    steepest = dr.max(dr.select(inside, steps, 0))[0]
-    assert 1 < steepest <= 1.01 * field.slope
 
 
 def test_start_from_nearest_samples(rng):
@@ -162,14 +151,6 @@ def test_the_bound_of_the_slope_follows_entries(ad, rng):
         assert field.bound[0] == np.float32(field.slope)
         assert 0.3 * bounds[-1] < steepest <= 1.01 * bounds[-1]
     assert bounds[1] == pytest.approx(3 * bounds[0])
-
-
-def test_decoded_nodes_are_the_field(folder, ad, rng):
-    """storage="float32": the same distances, with nodes that can be trained."""
-    field, other = (opened(folder / "solids.npz", ad, storage).field for storage in ("", "float32"))
-    p = ad.Array3f(*rng.uniform(field.lower, field.upper, (20000, 3)).T.astype(np.float32))
-    assert np.abs(field.value(p).numpy() - other.value(p).numpy()).max() < 0.02 * field.spacing
-    assert other.nodes.shape == (field.structure.nodes, 4) and field.nodes is None
 
 
 def test_files_with_bounds_of_empty_regions(folder, tmp_path, ad, rng):
@@ -291,15 +272,10 @@ def test_damaged_files(folder, tmp_path, name, change, says, ad):
 # -- hard cases --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("extent", [(1, 1, 20), (2**-20, 2**-20, 2**-19), (2**20, 2**20, 2**21)])
+@pytest.mark.parametrize("extent", [(1, 1, 20), (2**-20, 2**-20, 2**-19)])
 def test_extents_and_scales(tmp_path, ad, extent):
-    """A box of 1:1:20, a tiny and a huge one: its middle and sides are where they ought to be.
-
-    The last two differ by a power of two, so their kernels are the same.
-    """
-    mesh = box(extent, (5 * extent[0], 0, 0))
-    write(tmp_path / "box.obj", (mesh[0], mesh[1])) if extent[0] > 1e-3 else write(tmp_path / "box.ply", mesh)
-    source = next(tmp_path.glob("box.*"))
+    """A box of 1:1:20 and a tiny one: its middle and sides are where they ought to be."""
+    source = write(tmp_path / "box.ply", box(extent, (5 * extent[0], 0, 0)))
     done = fit("sdf", source=str(source), bytes="24k", steps=10, batch=4096, variant="llvm_ad_rgb", progress=False)
     model = tasks()["sdf"].model(done.table, ad.TensorXf)
     assert done.table.measured["iou"] > 0.98

@@ -11,7 +11,8 @@ import pytest
 from arrays import aligned
 from sdf_fields import Ball, Slab, Steps, TrilinearField, sparse_table, torus
 
-import mi_diffind.core.runtime
+from mi_diffind.core.compat import module_of
+from mi_diffind.core.runtime import use_variant
 from mi_diffind.tasks.sdf import grids, marching, model, nodes
 from mi_diffind.tasks.sdf.nodes import MIDDLE
 
@@ -20,9 +21,7 @@ COUNT = 4096
 
 @pytest.fixture
 def types(mi_rgb):
-    import mi_diffind.core.compat
-
-    return mi_diffind.core.compat.module_of(mi_rgb.Float)
+    return module_of(mi_rgb.Float)
 
 
 def unit(v):
@@ -115,17 +114,8 @@ def test_length_of_rays(types):
     assert np.array_equal(short[0].numpy(), t) and np.array_equal(short[1].numpy(), is_hit)
 
 
-def test_what_is_no_ray_ends(types):
-    """NaN, infinity and no direction at all: nothing is found, and nothing goes on for ever."""
-    bad = [[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 0]]
-    o = np.array([[0, 0, -2.0]] * 3 + bad[:2] + [[0.45, 0.45, 0.45]])
-    d = np.array([*bad, [1.0, 0, 0], [1.0, 0, 0], [0, 0, 0]])
-    _, is_hit, _, _ = trace(Ball(types), o, d, 4.0)
-    assert not is_hit.any()
-
-
-#: Rays inside the box of a ball's field and of a torus's cells, in a process of its own, since without an end they
-#: could not be interrupted.
+#: What is no ray, from within and from outside of the box of a ball's field and of a torus's cells, in a process of its
+#: own, since without an end it could not be interrupted.
 ENDLESS = """
 import drjit as dr, mitsuba as mi, numpy as np
 mi.set_variant("VARIANT")
@@ -138,7 +128,7 @@ arrays = {name: array.allocate(mi.TensorXf) for name, array in table.arrays.item
 nan, inf = np.nan, np.inf
 d = np.array([[0, 0, 0], [-0.0, 0, 0], [0, 0, 1e-30], [0, 1e-42, 0], [0, 0, 1e-7], [1e-3, 0, 0], [0, 0, 100],
               [nan, 0, 0], [0, nan, 1], [inf, 0, 0], [0, -inf, 0], [inf, inf, inf], [3e38, 3e38, 0]], np.float32)
-o = np.array([[0, 0, 0], [0.3, 0.2, 0.1], [0.01, 0.49, 0]], np.float32)
+o = np.array([[0, 0, 0], [0.3, 0.2, 0.1], [0.01, 0.49, 0], [0, 0, -2], [nan, 0, 0], [inf, 0, 0]], np.float32)
 o, d = np.repeat(o, len(d), axis=0), np.tile(d, (len(o), 1))
 for field in (Ball(types), model.build_field(table, arrays, types)):
     ray = *(types.Array3f(*(types.Float(x.copy()) for x in v.T)) for v in (o, d)), types.Float(inf)
@@ -147,8 +137,8 @@ print("ended")
 """
 
 
-def test_directions_without_a_length_end(types):
-    script = ENDLESS.replace("VARIANT", mi_diffind.core.runtime.use_variant())
+def test_what_is_no_ray_ends(types):
+    script = ENDLESS.replace("VARIANT", use_variant())
     env = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     done = subprocess.run([sys.executable, "-c", script], env=env, capture_output=True, text=True, timeout=100)
     assert done.stdout.strip() == "ended", done.stderr
@@ -220,6 +210,17 @@ def table_of(shape, entries):
     return sparse_table(shape, entries=entries)
 
 
+def bounds(words):
+    """The heights, in spacings, between which the slabs of blocks lie."""
+    return (v * (2 * marching.SLAB / marching.STEPS) - marching.SLAB for v in (words & 0xFFFF, words >> 16))
+
+
+def planes(field):
+    """The normals (B, 3) of a field's blocks and the distances of their middles (B,)."""
+    axes, middles, _ = nodes.unpack_frames(field.frames())
+    return np.stack(axes, axis=1), middles
+
+
 @pytest.fixture(params=[(torus, 16), (torus, 256), (shell, 256)], ids=lambda v: f"{v[0].__name__}-{v[1]}")
 def coded(types, request):
     """The sparse field of a torus, well coded or badly, and of a thin wall."""
@@ -229,11 +230,8 @@ def coded(types, request):
 def test_signs_beyond_slabs(coded, rng):
     """Above a block's slab everything is outside, below it inside; and slabs are thin where blocks are well coded."""
     structure, marcher = coded.structure, marching.get_marcher(coded)
-    words = np.array(marcher.slabs)[1::2]
     full = marching.GridCells(coded).crossed.any(axis=1)
-    low, high = (v * (2 * marching.SLAB / marching.STEPS) - marching.SLAB for v in (words & 0xFFFF, words >> 16))
-    axes, middles, _ = nodes.unpack_frames(coded.frames())
-    normals = np.stack(axes, axis=1)
+    (low, high), (normals, middles) = bounds(np.array(marcher.slabs)[1::2]), planes(coded)
     block = rng.choice(np.flatnonzero(full), 50 * COUNT)
     place = rng.uniform(0, 4, (len(block), 3))
     p = np.array(structure.lower) + structure.spacing * (structure.block_positions()[block] + place)
@@ -252,10 +250,8 @@ def test_slabs_keep_the_signs_of_other_cells(coded, rng):
     block = np.flatnonzero(crossed.any(axis=1) & ~crossed.all(axis=1))
     cell = cell[block]
     inside[block, cell] = rng.random(len(block)) < 0.5
-    words = marching.slab_words(cells, coded.decoded(), coded.frames())[block]
-    low, high = (v * (2 * marching.SLAB / marching.STEPS) - marching.SLAB for v in (words & 0xFFFF, words >> 16))
-    axes, middles, _ = nodes.unpack_frames(coded.frames())
-    normals, middles = np.stack(axes, axis=1)[block], middles[block]
+    low, high = bounds(marching.slab_words(cells, coded.decoded(), coded.frames())[block])
+    normals, middles = (v[block] for v in planes(coded))
     place = np.stack([cell // 16, cell // 4 % 4, cell % 4], axis=1) + rng.random((len(block), 3))
     height = middles + np.sum(normals * (place - MIDDLE), axis=1)
     within = inside[block, cell]
@@ -281,8 +277,7 @@ def test_slabs_change_no_hit(types, coded, rng):
 def test_rays_along_the_plane_of_a_block(coded, rng):
     """They enter its slab, if ever, at a distance of which there is a cell."""
     types, marcher, structure = coded.types, marching.get_marcher(coded), coded.structure
-    axes, middles, _ = nodes.unpack_frames(coded.frames())
-    normals = np.stack(axes, axis=1)
+    normals, middles = planes(coded)
     block = rng.choice(np.flatnonzero(marching.GridCells(coded).crossed.any(axis=1)), COUNT)
     aside = unit(np.cross(normals[block], rng.normal(size=(COUNT, 3))))
     middle = structure.block_positions()[block] + MIDDLE
@@ -294,7 +289,7 @@ def test_rays_along_the_plane_of_a_block(coded, rng):
     first, last, below = marcher.slab(ray, t, number, cell, True)
     dr.eval(first, last, below)
     assert np.abs(np.array(first)).max() < 2**31 and np.abs(np.array(last)).max() < 2**31
-    low = (np.array(marcher.slabs)[1::2] & 0xFFFF)[block] * (2 * marching.SLAB / marching.STEPS) - marching.SLAB
+    low, _ = bounds(np.array(marcher.slabs)[1::2][block])
     off = (np.array(first) > 0) | (np.array(last) < 0)
     above = middles[block] + height
     clear = off & (np.abs(above - low) > 1e-3)
