@@ -277,7 +277,13 @@ def asked_for_help(commands):
 
 
 def test_help_is_light():
-    """Of the command, and of each verb and task but studies: neither Mitsuba nor Dr.Jit, nor what trains."""
+    """Of the command, and of each verb and task but studies: neither Mitsuba nor Dr.Jit, nor what trains.
+
+    The command itself does not even look for tasks.
+    """
+    modules = asked_for_help([[]])[1]
+    assert not (HEAVY | {"numpy", "tqdm"}) & modules
+    assert not [m for m in modules if m.startswith("mi_diffind.tasks.") and m.split(".")[2] in tasks()]
     own = [[verb, name] for verb, names in verbs_with_tasks().items() for name in names]
     light = [[], *([verb] for verb in VERBS), *own]
     text, modules = asked_for_help([command for command in light if "tradeoff" not in command])

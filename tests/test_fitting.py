@@ -174,17 +174,23 @@ def test_same_seed_same_bytes(ad):
     assert results[0][0] != results[2][0]
 
 
-def test_the_number_of_threads_is_restored(ad):
-    before = dr.thread_count()
-    seen = []
-    problem = Curve(ad, {3: lambda y: seen.append(dr.thread_count()) or y})
-    run(problem, settings(steps=5))
-    assert seen == [1] and dr.thread_count() == before
-    run(Curve(ad, {3: lambda y: seen.append(dr.thread_count()) or y}), settings(steps=5, deterministic=False))
-    assert seen == [1, before] and dr.thread_count() == before
+def test_global_state_is_restored(ad):
+    """Threads and the limit of expanded sums, after each end of a training."""
+
+    def state():
+        return dr.thread_count(), dr.expand_threshold()
+
+    before, seen = state(), []
+    for deterministic in (True, False):
+        look = {3: lambda y: seen.append(state()) or y}
+        run(Curve(ad, look), settings(steps=5, deterministic=deterministic))
+        assert state() == before
+    run(Curve(ad, {3: interrupt}), settings(steps=5))
+    assert state() == before
     with pytest.raises(ZeroDivisionError):
         run(Curve(ad, {3: lambda y: 1 / 0}), settings(steps=5))
-    assert dr.thread_count() == before
+    assert state() == before
+    assert [threads for threads, _ in seen] == [1, before[0]] and min(limit for _, limit in seen) > before[1]
 
 
 @pytest.mark.parametrize("schedule", loop.SCHEDULES)
@@ -215,6 +221,8 @@ def test_resumed_equals_uninterrupted(ad, tmp_path, schedule):
         assert (result.step, result.steps, result.restarts) == (expected.step, 70, 0)
         assert [h["loss"] for h in result.history] == [h["loss"] for h in expected.history]
         assert os.listdir(tmp_path).count(path.name) == 1
+        finished = Curve(ad)
+        assert run(finished, chosen, checkpoint=path, resume=True)[0].step == expected.step and finished.calls == 0
     assert len(os.listdir(tmp_path)) == 2  # nothing temporary
 
 
@@ -375,10 +383,11 @@ def test_diverging_again_and_again_is_an_error(ad):
         run(Curve(ad), settings(lr=1e38))
 
 
-def test_progress_bar(ad, capsys):
-    fit(Curve(ad), settings(), progress=True)
+@pytest.mark.parametrize("progress", [True, False])
+def test_messages_go_to_stderr(ad, capsys, progress):
+    fit(Curve(ad, {35: nan}), settings(), progress=progress)
     captured = capsys.readouterr()
-    assert captured.out == ""  # results belong to stdout, progress does not
+    assert captured.out == "" and "half the learning rate" in captured.err  # results belong to stdout
 
 
 @pytest.fixture
@@ -471,9 +480,10 @@ def rates(ad, **changes):
     return np.diff(problem.positions)
 
 
-def test_cosine_schedule(ad):
+def test_schedules_of_the_step(ad):
     expected = 1e-2 * 0.5 * (1 + np.cos(np.pi * np.arange(40) / 40))
     np.testing.assert_allclose(rates(ad, schedule="cosine", steps=40), expected, rtol=1e-2, atol=1e-6)
+    np.testing.assert_allclose(rates(ad, schedule="constant", steps=40), np.full(40, 1e-2), rtol=1e-3)
 
 
 def test_plateau_schedule(ad):
@@ -483,6 +493,10 @@ def test_plateau_schedule(ad):
     np.testing.assert_allclose(found, 0.5**halvings, rtol=2e-3)
     assert halvings[0] == 0 and halvings[-1] in (8, 9, 10)
     assert set(np.diff(halvings)) == {0, 1} and np.diff(np.flatnonzero(np.diff(halvings))).tolist() == [10] * 8
+    improving = Curve(ad)
+    improving.net = DifferentiableArray(16, 1, value=50.0).alloc(ad.TensorXf)
+    losses = [h["loss"] for h in run(improving, settings(schedule="plateau", lr=0.1, steps=100))[0].history]
+    assert losses[0] - losses[-1] == pytest.approx(0.1 * 80, rel=0.05)  # 80 steps at the full rate
 
 
 # -- cost -------------------------------------------------------------------------------------------------------------
@@ -791,12 +805,14 @@ def test_checkpoint_of_another_run(checkpoint):
     not_resumable(checkpoint, "damaged or of another task", other)
 
 
-def test_interrupt_before_the_first_measurement(ad):
-    """What has been reached by then is measured and kept."""
+def test_interrupt_before_the_first_measurement(ad, terminal):
+    """What has been reached by then is measured and kept; its loss nobody has seen."""
     problem = Curve(ad, {7: interrupt})
     start = contents(problem)
-    result, _ = run(problem, settings())
+    result = fit(problem, settings(), title="x")
     assert result.interrupted and result.steps == result.step == 7 and contents(problem) != start
+    assert [h["loss"] for h in result.history] == [None]
+    assert "psnr_db=" in terminal.states[-1] and "loss=" not in terminal.states[0]
     assert problem.measure(problem.net)["psnr_db"] == result.measured["psnr_db"]
 
 

@@ -125,6 +125,12 @@ def test_random_is_seeded(ad):
     assert a != b != c != a
 
 
+def test_numpy_integers_are_integers():
+    array = DifferentiableArray(np.int64(4), np.int32(2))
+    assert array.resolution == (4,) and array.channels == 2
+    assert DifferentiableArray(np.array([4, 5])).resolution == (4, 5)
+
+
 def test_half_precision_allocation(ad):
     array = DifferentiableArray((3, 3), 3, "ramp").alloc(ad.TensorXf16)
     assert array.storage == "float16" and array.nbytes == 2 * 27
@@ -289,6 +295,12 @@ def test_masked_lanes_are_zero(ad, storage):
     x = [ad.Float([0.2, 0.4]), ad.Float([0.7, 0.1])]
     values = net(x, active=ad.Bool([True, False]))
     assert all(v.numpy()[0] == w.numpy()[0] and v.numpy()[1] == 0 for v, w in zip(values, net(x), strict=True))
+    gradients = []  # of a masked lane, and of a lane that is not there
+    for lanes, active in ((x, ad.Bool([True, False])), ([v[0] for v in x], True)):
+        dr.enable_grad(lanes := [ad.Float(v) for v in lanes])
+        dr.backward(sum(net(lanes, active=active)))
+        gradients.append([v.grad.numpy() for v in lanes])
+    np.testing.assert_allclose(gradients[0], np.pad(gradients[1], ((0, 0), (0, 1))), rtol=1e-6)
 
 
 # -- a coordinate that is known ----------------------------------------------------------------------------------------
@@ -304,10 +316,11 @@ def known(ad, dims, channels, storage, border="clamp", fold=False):
 
 @pytest.mark.parametrize("storage", lookup.STORAGES)
 @pytest.mark.parametrize("dims, channels", [(2, 1), (2, 2), (2, 5), (3, 3), (4, 1), (4, 2)])
-@pytest.mark.parametrize("border", lookup.BORDERS)
+@pytest.mark.parametrize("border", ["clamp", "mixed"])
 def test_what_remains_where_a_coordinate_is_known(ad, dims, channels, storage, border):
     """``array.at(x)`` is read as the array is, with ``x`` as its last coordinate: inside, at entries, beyond, NaN."""
-    array = known(ad, dims, channels, storage, border)
+    borders = ("clamp", "repeat", "clamp", "repeat")[-dims:]
+    array = known(ad, dims, channels, storage, borders if border == "mixed" else border)
     rest = uniform(dims, 100, dims - 1) * 1.4 - 0.2
     # Bytes are read at up to 1/64 of a step, and once more; the entries of a row are in single precision
     tolerance = 0.05 * max(array.scale) if storage == "uint8" else 2e-6
@@ -333,7 +346,16 @@ def test_what_remains_is_folded(ad):
     line = DifferentiableArray.from_numpy(np.arange(12.0).reshape(1, 4, 3), ad.TensorXf)
     np.testing.assert_allclose(read(line.at(ad.Float(0.5)), ad, uniform(0, 5, 1)), [[4.5, 5.5, 6.5]] * 5)
     single = DifferentiableArray.from_numpy(np.arange(12.0).reshape(4, 1, 3), ad.TensorXf)
-    np.testing.assert_array_equal(single.at(ad.Float(0.5)).numpy(), single.numpy()[:, 0])
+    for x in (ad.Float(0.5), 0.5):
+        np.testing.assert_array_equal(single.at(x).numpy(), single.numpy()[:, 0])
+
+
+@pytest.mark.parametrize("storage", lookup.STORAGES)
+def test_a_row_of_an_indirection(ad, storage):
+    net = pair(ad).to(storage)
+    row, x = Indirection(net.primary[0].at(ad.Float(0.6)), net.cascaded), uniform(2, 100, 1)
+    expected = read(net, ad, np.column_stack([x, np.full(100, 0.6, np.float32)]))
+    np.testing.assert_allclose(read(row, ad, x), expected, atol=2e-3 if storage == "uint8" else 2e-5)
 
 
 @pytest.mark.parametrize("dims", [2, 3, 4])

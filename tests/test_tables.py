@@ -409,12 +409,11 @@ def test_unwritable_tables_are_refused(tmp_path, fault):
 # -- reading: the archive ----------------------------------------------------------------------------------------------
 
 
-def test_no_such_file(tmp_path):
+def test_places_that_hold_no_file(tmp_path):
+    (tmp_path / "file").write_text("")
     refused(tmp_path / "none.npz", "no such file")
-
-
-def test_a_folder(tmp_path):
     refused(tmp_path, "is a folder")
+    refused(tmp_path / "file" / "t.npz", "cannot be read")
 
 
 @pytest.mark.parametrize("content", [b"", b"hello", b"PK", b"PK\x03\x04" + bytes(100), npy(np.zeros(3)), bytes(70000)])
@@ -594,6 +593,22 @@ def test_not_finite(tmp_path, storage, value):
     broken[1, 2, 3] = value
     rebuild(path, {**parts(path), "cascaded.npy": npy(broken)})
     refused(path, '"cascaded" contains NaN or infinity')
+
+
+@pytest.mark.parametrize("dtype", ["<f8", ">f4", "<i4", "u1", "<f2", "S4", "<M8[s]"])
+def test_wrong_type(plain, dtype):
+    rebuild(plain, {**parts(plain), "cascaded.npy": npy(np.zeros((3, 3, 7), dtype))})
+    refused(plain, 'array "cascaded" has the type .*, expected float32')
+
+
+def test_fortran_order(plain):
+    """Written in C order, and refused in the other one."""
+    table = load_table(plain)
+    content = plain.read_bytes()
+    save_table(plain, changed(table, "cascaded", entries=np.asfortranarray(table.arrays["cascaded"].entries)))
+    assert plain.read_bytes() == content
+    rebuild(plain, {**parts(plain), "cascaded.npy": npy(np.asfortranarray(np.zeros((3, 3, 7), np.float32)))})
+    refused(plain, "cascaded")
 
 
 def test_too_little_or_too_much_data(plain):
