@@ -86,8 +86,8 @@ def test_kernels(mi_rgb, history):
     kernels = history(compute)
     with hook("keys of dr.kernel_history: ir"):
         code = compat.kernel_code(kernels[0])
-        assert ("fmuladd" in code or "fma" in code) and compat.is_ptx(code) == mi_rgb.variant().startswith("cuda")
-    if not compat.is_ptx(code):
+        assert "fmuladd" in code or "fma" in code
+    if mi_rgb.variant().startswith("llvm"):
         with hook("target-cpu and vectors in LLVM code"):
             name, lanes = compat.llvm_target(code)
             assert name and lanes in (1, 2, 4, 8, 16, 32)
