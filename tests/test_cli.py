@@ -54,9 +54,8 @@ def test_render(tmp_path, capsys):
     assert image.shape == (28, 48, 3) and np.isfinite(image).all() and image.mean() > 0.01
     found = json.loads(report.read_text())
     assert found["spp"] == 4 and found["width"] == 48 and found["variant"].endswith("_ad_rgb")
-    assert (
-        len(found["learned_plugins"]) == 9 and found["table_bytes"] == entries("disney") and found["seconds_render"] > 0
-    )
+    assert len(found["learned_plugins"]) == 9 and found["seconds_render"] > 0
+    assert found["table_bytes"] == entries("disney")
     assert sorted(os.listdir(tmp_path)) == ["image.exr", "report.json"]  # nothing temporary stays
     assert main(["render", str(SCENES / "still_life.xml"), "-o", str(tmp_path / "image.png"), *SMALL]) == 0
     assert np.array(mi.Bitmap(str(tmp_path / "image.png"))).shape == (28, 48, 3)
@@ -123,11 +122,8 @@ def test_fit(tmp_path, capsys, few_samples):
     arguments = ["fit", "disney", *FIT, "--storage", "float16"]
     assert main([*arguments, "-o", str(out), "--json", str(report)]) == 0
     found, table = json.loads(report.read_text()), load_table(out)
-    assert (
-        found["bytes"] == 2 * entries("disney")
-        and found["measured"]["psnr_db"] > 60
-        and found["settings"]["steps"] == 10
-    )
+    assert found["bytes"] == 2 * entries("disney") and found["settings"]["steps"] == 10
+    assert found["measured"]["psnr_db"] > 60
     assert found["task"] == table.task == "disney" and found["preset"] == table.preset == "tables"
     assert found["measured"] == table.measured and found["storage"] == table.storage == "float16"
     assert f"{out}: {found['bytes']:,} bytes as float16; best step " in capsys.readouterr().out
@@ -241,12 +237,6 @@ def test_interrupted_renders_keep_what_they_have(tmp_path):
     assert (folder / "comparison.png").exists()
 
 
-def verbs_with_tasks():
-    """Verb → the names of what has a parser of its own."""
-    found = {"fit": list(tasks()), "tradeoff": list(tasks())}
-    return {**found, "tradeoff": [*found["tradeoff"], "scene"]}
-
-
 HELP = """
 import contextlib, io, json, sys
 from mi_diffind.commands.cli import main
@@ -284,7 +274,7 @@ def test_help_is_light():
     modules = asked_for_help([[]])[1]
     assert not (HEAVY | {"numpy", "tqdm"}) & modules
     assert not [m for m in modules if m.startswith("mi_diffind.tasks.") and m.split(".")[2] in tasks()]
-    own = [[verb, name] for verb, names in verbs_with_tasks().items() for name in names]
+    own = [[verb, name] for verb, more in (("fit", []), ("tradeoff", ["scene"])) for name in [*tasks(), *more]]
     light = [[], *([verb] for verb in VERBS), *own]
     text, modules = asked_for_help([command for command in light if "tradeoff" not in command])
     text |= asked_for_help([command for command in light if "tradeoff" in command])[0]  # studies are imported whole
@@ -385,18 +375,6 @@ def test_bad_options(tmp_path, capsys):
     assert caught.value.code == 2 and "expected NAME=VALUE" in capsys.readouterr().err
     assert "nothing" in refused(capsys, "render", path, "-D", "nothing=1")
     assert "allowed are .exr and .png" in refused(capsys, "render", path, "-o", str(tmp_path / "image.tiff"))
-    assert "allowed is .npz" in refused(capsys, "fit", "disney", "-o", str(tmp_path / "t.bin"))
-    assert "lr: found -1" in refused(capsys, "fit", "disney", "-o", str(tmp_path / "t.npz"), "--lr", "-1")
-    assert "there is nothing to resume" in refused(
-        capsys,
-        "fit",
-        "disney",
-        "-o",
-        str(tmp_path / "t.npz"),
-        "--resume",
-        "--checkpoint",
-        str(tmp_path / "c.npz"),
-    )
     for arguments in (["render", path, "--spp", "0"], ["nothing"], []):
         with pytest.raises(SystemExit) as caught:
             main(arguments)
@@ -421,13 +399,7 @@ def test_bad_tasks(capsys):
 
 def test_bad_sizes(tmp_path, capsys):
     fit = ["fit", "ggx", "--steps", "2", "-o", str(tmp_path / "own.npz")]
-    for name, value in (
-        ("primary", "1"),
-        ("cascaded", "5000"),
-        ("primary", "0"),
-        ("primary", "-3"),
-        ("primary", "many"),
-    ):
+    for name, value in (("cascaded", "5000"), *(("primary", value) for value in ("1", "0", "-3", "many"))):
         with pytest.raises(SystemExit) as caught:
             main([*fit, f"--{name}={value}"])
         sentence = f"mi-diffind fit ggx: error: argument --{name}: found {value}, allowed are 2 to 4096 entries a side"
@@ -438,21 +410,9 @@ def test_bad_sizes(tmp_path, capsys):
 def test_checkpoints_replace_nothing_else(tmp_path, capsys, few_samples):
     table, checkpoint = tmp_path / "table.npz", tmp_path / "state.npz"
     table.write_bytes(shipped("disney").read_bytes())
-    fit = [
-        "fit",
-        "disney",
-        "--steps",
-        "4",
-        "--batch",
-        "64",
-        "--variant",
-        "llvm_ad_rgb",
-        "-o",
-        str(tmp_path / "own.npz"),
-    ]
+    fit = ["fit", "disney", *FIT, "-o", str(tmp_path / "own.npz")]
     assert "would replace a file that is not one" in refused(capsys, *fit, "--checkpoint", str(table))
     assert table.read_bytes() == shipped("disney").read_bytes()
-    assert "the same file as -o" in refused(capsys, *fit, "--checkpoint", str(tmp_path / "own.npz"))
     for _ in range(2):  # its own checkpoint may be replaced
         assert main([*fit, "--checkpoint", str(checkpoint)]) == 0
     assert "is the checkpoint of a training" in refused(capsys, "inspect", str(checkpoint))

@@ -112,38 +112,6 @@ def test_converges(ad, loss):
     assert result.history[-1]["loss"] < 0.1 * 0.2 and result.seconds > 0
 
 
-def test_several_targets_and_weights(ad):
-    """Each target counts by its weight, 1 if it has none; 0 means that it is not trained."""
-
-    class Two(Curve):
-        def __init__(self, ad, weights):
-            super().__init__(ad)
-            self.weights = weights
-            self.net = DifferentiableArray(4, 2).alloc(ad.TensorXf)
-
-        def batch(self, rng, size):
-            x = rng.random(self.ad.Float, size)
-            return [x], {"a": [self.ad.Float(1)], "b": [self.ad.Float(2)]}
-
-        def predict(self, net, inputs):
-            a, b = net(inputs)
-            return {"a": [a], "b": [b]}
-
-        def measure(self, net):
-            return {"q": 1.0}
-
-    first = {}
-    for name, weights in {"plain": {}, "a": {"b": 0.0}, "heavy": {"a": 3.0}}.items():
-        problem = Two(ad, weights)
-        first[name] = run(problem, settings(steps=1))[0].history[0]["loss"]
-        if name == "a":
-            entries = problem.net.numpy()
-            assert (entries[:, 0] > 0.5).all() and (entries[:, 1] == 0.5).all()
-    assert first["plain"] == pytest.approx(0.5 + 1.5)
-    assert first["a"] == pytest.approx(0.5)
-    assert first["heavy"] == pytest.approx(3 * 0.5 + 1.5)
-
-
 def test_the_best_state_is_kept(ad):
     """When later measurements are worse, the tables are those of the best one."""
 

@@ -170,8 +170,7 @@ def test_values(ad, storage):
     x = uniform(1, 300, 2)
     before = net.primary[0].numpy()
     np.testing.assert_allclose(before, triangle(net["primary.0.data"].numpy()[..., :2]), atol=3e-7)
-    if storage != "float32":
-        net = net.to(storage)
+    net = net.to(storage)
     p, c = net.primary[0].numpy(), net.cascaded.numpy()
     assert net.nbytes == {"float32": 4, "float16": 2, "uint8": 1}[storage] * (p.size + c.size)
     assert p.min() >= 0 and p.max() <= 1
@@ -281,7 +280,7 @@ def test_several_primaries(ad, storage):
         groups,
     ).alloc(ad.TensorXf)
     assert list(net) == ["primary.0.data", "primary.1.data", "primary.2.data", "cascaded.data"]
-    net = net if storage == "float32" else net.to(storage)
+    net = net.to(storage)
     x = uniform(6, 200, 3)
     pointers = [interpolate(p.numpy(), x[:, list(g)]) for p, g in zip(net.primary, groups, strict=True)]
     expected = interpolate(net.cascaded.numpy(), np.concatenate(pointers, axis=1))
@@ -290,8 +289,7 @@ def test_several_primaries(ad, storage):
 
 @pytest.mark.parametrize("storage", lookup.STORAGES)
 def test_masked_lanes_are_zero(ad, storage):
-    net = pair(ad)
-    net = net if storage == "float32" else net.to(storage)
+    net = pair(ad).to(storage)
     x = [ad.Float([0.2, 0.4]), ad.Float([0.7, 0.1])]
     values = net(x, active=ad.Bool([True, False]))
     assert all(v.numpy()[0] == w.numpy()[0] and v.numpy()[1] == 0 for v, w in zip(values, net(x), strict=True))
@@ -310,8 +308,7 @@ def known(ad, dims, channels, storage, border="clamp", fold=False):
     """An array of random entries, beyond [0, 1] if they are to be folded."""
     low, high = (-2, 3) if fold else (0.5, 1.5)
     table = np.random.default_rng(dims).uniform(low, high, (*(3, 4, 2, 5)[-dims:], channels))
-    array = DifferentiableArray.from_numpy(table, ad.TensorXf, border, fold=fold)
-    return array if storage == "float32" else array.to(storage)
+    return DifferentiableArray.from_numpy(table, ad.TensorXf, border, fold=fold).to(storage)
 
 
 @pytest.mark.parametrize("storage", lookup.STORAGES)
@@ -410,8 +407,7 @@ def test_an_array_of_one_dimension_has_nothing_that_remains(ad):
 @pytest.mark.parametrize("storage", lookup.STORAGES)
 def test_forms_of_the_coordinate(ad, storage):
     """Lists, tuples, vectors, numbers and other precisions mean the same; results are single precision."""
-    net = pair(ad)
-    net = net if storage == "float32" else net.to(storage)
+    net = pair(ad).to(storage)
     expected = [v.numpy()[0] for v in net([ad.Float(0.25), ad.Float(0.5)])]
     forms = (
         (ad.Float(0.25), ad.Float(0.5)), ad.Array2f(0.25, 0.5), [0.25, ad.Float(0.5)], [ad.Float(0.25), 0.5],
@@ -429,8 +425,7 @@ def test_forms_of_the_coordinate(ad, storage):
 @pytest.mark.parametrize("storage", lookup.STORAGES)
 def test_cooperative_vectors(ad, storage):
     """A cooperative vector in, a cooperative vector out, with gradients."""
-    net = pair(ad)
-    net = net if storage == "float32" else net.to(storage)
+    net = pair(ad).to(storage)
     x = [ad.Float([0.2, 0.4]), ad.Float([0.7, 0.1])]
     for module in (net, net.cascaded):
         out = module(nn.CoopVec(*x))
@@ -523,8 +518,7 @@ def test_copies_are_independent(ad):
 @pytest.mark.parametrize("storage", lookup.STORAGES)
 def test_pytree(ad, storage, no_garbage_collection):
     """Traversed by Dr.Jit: evaluation, gradients on and off, frozen functions."""
-    net = pair(ad)
-    net = net if storage == "float32" else net.to(storage)
+    net = pair(ad).to(storage)
     dr.schedule(net)
     dr.make_opaque(net)
     dr.eval(net)
@@ -545,8 +539,7 @@ def test_pytree(ad, storage, no_garbage_collection):
 @pytest.mark.parametrize("as_state", [False, True])
 def test_in_a_loop(ad, storage, mode, as_state):
     """Reading inside a recorded loop, with the net as a loop variable or from outside."""
-    net = pair(ad)
-    net = net if storage == "float32" else net.to(storage)
+    net = pair(ad).to(storage)
     x = [ad.Float(v) for v in uniform(8, 16, 2).T.copy()]
     expected = sum(net([x[0] * (i / 4), x[1]])[1] for i in range(4)).numpy()
 
@@ -705,13 +698,6 @@ def test_denormal_components_count_as_zero():
     """Also along a side of the box, where the product with the reciprocal would be NaN."""
     ad = array_module("llvm")
     for tiny in (1e-45, -1e-45, 1e-31):
-        near, far, active = box_interval(
-            ad.Array3f(0, 0.5, -1),
-            ad.Array3f(tiny, 0, 1),
-            (0, 0, 0),
-            (1, 1, 1),
-            ad.Float(0),
-            ad.Float(9),
-            ad.Bool(True),
-        )
+        o, d, start = ad.Array3f(0, 0.5, -1), ad.Array3f(tiny, 0, 1), (ad.Float(0), ad.Float(9), ad.Bool(True))
+        near, far, active = box_interval(o, d, (0, 0, 0), (1, 1, 1), *start)
         assert active[0] and near[0] == 1 and far[0] == 2
