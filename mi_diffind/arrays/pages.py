@@ -104,11 +104,8 @@ class PagedArray(DifferentiableArray):
     def _shape(self) -> tuple[int]:
         return (self.entries,)
 
-    def _alloc(self, dtype, size=-1, rng=None):
-        if size not in (-1, self.dims):
-            raise ValueError(f"an array of {self.dims} dimension(s) was given {size} input(s)")
-        values = np.broadcast_to(self.init, (self.entries, self.channels))
-        return self._replace()._hold(values, dtype, "float16" if dr.is_half_v(dtype) else "float32"), self.channels
+    def _initial_values(self, dtype, rng) -> np.ndarray:
+        return np.broadcast_to(self.init, (self.entries, self.channels))
 
     def _words(self, dtype):
         """Return the index: for each page, its first entry and, in the lower bits, its sides less one.
