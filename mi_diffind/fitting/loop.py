@@ -569,7 +569,7 @@ def _checkpoint_meta(path) -> dict:
 def checkpoint_settings(path) -> dict:
     """Return the settings of the training and the identity of the problem in a checkpoint; {} if it holds none."""
     settings = _checkpoint_meta(path).get("settings")
-    return dict(settings) if isinstance(settings, dict) else {}
+    return settings if isinstance(settings, dict) else {}
 
 
 def _check_meta(meta: dict) -> None:
@@ -581,14 +581,11 @@ def _check_meta(meta: dict) -> None:
         if type(meta[key]) not in (int, float) or not 0 <= meta[key] < math.inf:
             raise TypeError(f"{key} is {meta[key]!r:.40}")
     figures = [meta["best_measured"], *meta["history"]]
-    if not figures[0] or not all(isinstance(row.get("step", 0), int) for row in figures):
-        raise TypeError("the measurements are not lists of numbers")
-    name = next(iter(figures[0]))
     values = [v for row in figures for v in row.values() if v is not None] + list(meta["references"].values())
     factor, best, since = meta["plateau"]
-    if not all(type(v) in (int, float) for v in (*values, factor, since, best or 0)) or any(
-        name not in r for r in figures
-    ):
+    numbers = all(type(v) in (int, float) for v in (*values, factor, since, best or 0))
+    name = next(iter(figures[0]), None)
+    if not numbers or any(name not in row or not isinstance(row.get("step", 0), int) for row in figures):
         raise TypeError("the measurements are not lists of numbers")
 
 
