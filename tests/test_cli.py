@@ -325,28 +325,20 @@ def test_tradeoff_of_a_scene(tmp_path, capsys):
 
 
 def test_missing_files(tmp_path, capsys):
-    assert "nowhere.xml: no such scene file" in refused(capsys, "render", "nowhere.xml")
-    assert "nowhere.xml: no such scene file" in refused(capsys, "compare", "nowhere.xml", "--out", str(tmp_path / "o"))
-    scene = ["tradeoff", "scene", "nowhere.xml", "--out", str(tmp_path / "o")]
-    assert "nowhere.xml: no such scene file" in refused(capsys, *scene)
+    out = ["--out", str(tmp_path / "o")]
+    for words, options in ((["render"], []), (["compare"], out), (["tradeoff", "scene"], out), (["inspect"], [])):
+        assert "nowhere.xml: no such scene file" in refused(capsys, *words, "nowhere.xml", *options)
     assert not (tmp_path / "o").exists()
-    assert "nowhere.xml: no such scene file" in refused(capsys, "inspect", "nowhere.xml")
     assert "nowhere.npz: no such file" in refused(capsys, "inspect", "nowhere.npz")
 
 
 @pytest.mark.parametrize(
     "bsdf, sentence",
     [
-        (
-            '<bsdf type="neural_disney"><float name="roughness" value="1.5"/></bsdf>',
-            "found 1.5, allowed is [0, 1]",
-        ),
+        ('<bsdf type="neural_disney"><float name="roughness" value="1.5"/></bsdf>', "found 1.5, allowed is [0, 1]"),
         ('<bsdf type="neural_disney"><float name="roughnes" value="0.5"/></bsdf>', '"roughnes"'),
         ('<bsdf type="neural_disney"><float name="spec_trans" value="0.5"/></bsdf>', "no transmission"),
-        (
-            '<bsdf type="neural_disney"><string name="filename" value="no.npz"/></bsdf>',
-            "no.npz: no such file",
-        ),
+        ('<bsdf type="neural_disney"><string name="filename" value="no.npz"/></bsdf>', "no.npz: no such file"),
         (
             '<bsdf type="neural_disney"><string name="filename" value="scene.xml"/></bsdf>',
             "scene.xml: not a table file",
@@ -364,12 +356,11 @@ def test_bad_scenes(tmp_path, capsys, bsdf, sentence):
 
 def test_bad_options(tmp_path, capsys):
     path = scene_file(tmp_path)
-    assert 'the variant "llvm_rgb" does not exist; available are' in refused(
-        capsys, "render", path, "--variant", "llvm_rgb"
-    )
-    assert 'does not run in the variant "scalar_rgb"; use one of' in refused(
-        capsys, "render", path, "--variant", "scalar_rgb"
-    )
+    for name, fault in (
+        ("llvm_rgb", 'the variant "llvm_rgb" does not exist; available are'),
+        ("scalar_rgb", 'does not run in the variant "scalar_rgb"; use one of'),
+    ):
+        assert fault in refused(capsys, "render", path, "--variant", name)
     with pytest.raises(SystemExit) as caught:
         main(["render", path, "-D", "width"])
     assert caught.value.code == 2 and "expected NAME=VALUE" in capsys.readouterr().err

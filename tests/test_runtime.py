@@ -397,33 +397,30 @@ except Exception as e:
     assert done.stdout.split() == ["refused"] * 4 and done.stderr.count("RuntimeWarning") == 1
 
 
-@pytest.mark.parametrize("imported", ["drjit", "mitsuba"])
-def test_too_late_after_a_kernel(aborting, imported):
+KERNEL_THAT_RUNS = (
+    "import drjit as dr, drjit.llvm as ll; assert (dr.arange(ll.Float, 3) + 1).numpy().tolist() == [1, 2, 3]"
+)
+
+
+@pytest.mark.parametrize(
+    "begun, fault",
+    [
+        (KERNEL_THAT_RUNS, "has run kernels on it"),
+        (f"import mitsuba; {KERNEL_THAT_RUNS}", "has run kernels on it"),
+        ("import mitsuba as mi; mi.set_variant('llvm_ad_rgb'); b = mi.load_dict({'type': 'diffuse'})", "holds scene"),
+    ],
+)
+def test_too_late(aborting, begun, fault):
     """
-    A kernel has run on an old LLVM (one that it can compile), and its code cannot be taken back: importing says so,
-    as an exception.
+    A kernel has run on an old LLVM (one that it can compile), and its code cannot be taken back, or there are objects:
+    importing says so, as an exception.
     """
-    code = f"import {imported}\nimport drjit as dr, drjit.llvm as ll\n"
-    code += "assert (dr.arange(ll.Float, 3) + 1).numpy().tolist() == [1, 2, 3]\nprint('ran')\nimport mi_diffind\n"
     # Without a setting, Dr.Jit would have to find the old library by itself: the setting is removed after its start.
-    code = "import os, drjit; drjit.detail.llvm_version(); " + f"del os.environ['{ENV}']\n" + code
-    done = python(code, aborting)
+    code = f"import os, drjit; drjit.detail.llvm_version(); del os.environ['{ENV}']\n"
+    done = python(f"{code}{begun}\nprint('ran')\nimport mi_diffind\n", aborting)
     assert "ran" in done.stdout and done.returncode == 1
     last = done.stderr.strip().splitlines()[-1]
-    assert last.startswith("ImportError: ") and "has run kernels on it" in last and "import mi_diffind before" in last
-
-
-def test_too_late_with_scene_objects(aborting):
-    code = f"""
-import os, mitsuba as mi
-mi.set_variant("llvm_ad_rgb")
-import drjit; drjit.detail.llvm_version(); del os.environ["{ENV}"]
-bsdf = mi.load_dict({{"type": "diffuse"}})
-import mi_diffind
-"""
-    done = python(code, aborting)
-    assert done.returncode == 1
-    assert done.stderr.strip().splitlines()[-1].startswith("ImportError: ")
+    assert last.startswith("ImportError: ") and fault in last and "import mi_diffind before" in last
 
 
 @pytest.mark.parametrize("first", ["drjit", "mitsuba"])

@@ -1,6 +1,7 @@
 """The optimiser of large tables: the steps of Dr.Jit's own Adam for entries with a gradient, and no others."""
 
 import drjit as dr
+import drjit.llvm.ad as ad
 import numpy as np
 import pytest
 from drjit.opt import Adam
@@ -8,14 +9,7 @@ from drjit.opt import Adam
 from mi_diffind.fitting.loop import SparseAdam
 
 
-@pytest.fixture
-def ad():
-    from drjit.llvm import ad
-
-    return ad
-
-
-def trained(ad, optimizer, shape, steps=12):
+def trained(optimizer, shape, steps=12):
     """Return a tensor of random numbers after steps that read few of its rows, and how often each row was read."""
     rng, width = np.random.default_rng(3), shape[1] if len(shape) == 2 else 1
     optimizer["x"] = ad.TensorXf(rng.normal(size=shape).astype(np.float32))
@@ -33,17 +27,17 @@ def trained(ad, optimizer, shape, steps=12):
 
 
 @pytest.mark.parametrize("shape", [(60,), (40, 12), (40, 3)])
-def test_steps(ad, shape):
+def test_steps(shape):
     """Of entries alone and of columns in packets; a learning rate of 0.1 moves what was read by more than rounding."""
-    values, reads = trained(ad, SparseAdam(lr=0.1, beta_2=0.99), shape)
-    expected, _ = trained(ad, Adam(lr=0.1, beta_2=0.99, mask_updates=True), shape)
+    values, reads = trained(SparseAdam(lr=0.1, beta_2=0.99), shape)
+    expected, _ = trained(Adam(lr=0.1, beta_2=0.99, mask_updates=True), shape)
     np.testing.assert_allclose(values, expected, rtol=0, atol=1e-5)
-    begun, _ = trained(ad, SparseAdam(lr=0.1), shape, steps=0)
+    begun, _ = trained(SparseAdam(lr=0.1), shape, steps=0)
     moved = np.abs(values - begun).reshape(shape[0], -1).max(axis=1)
     assert (moved[reads == 0] == 0).all() and (moved[reads > 0] > 1e-3).all() and (reads == 0).any()
 
 
-def test_columns_move_together(ad):
+def test_columns_move_together():
     """A row of four of which one column has a gradient: the others continue as their moments say."""
     optimizer = SparseAdam(lr=0.1)
     optimizer["x"] = ad.TensorXf(np.zeros((2, 4), np.float32))
@@ -56,7 +50,7 @@ def test_columns_move_together(ad):
     assert (values[0, 1:] < -0.11).all() and (values[0, 1:] > -0.19).all()
 
 
-def test_nothing_to_do(ad):
+def test_nothing_to_do():
     """No gradient at all."""
     optimizer = SparseAdam(lr=0.1)
     optimizer["x"] = ad.TensorXf(np.float32([1, 2, 3]))
@@ -65,7 +59,7 @@ def test_nothing_to_do(ad):
     np.testing.assert_array_equal(optimizer["x"].numpy(), [1, 2, 3])
 
 
-def test_rows_without_a_gradient_in_the_column_of_their_own(ad):
+def test_rows_without_a_gradient_in_the_column_of_their_own():
     """A tensor of columns beside one without: rows that the latter does not read are left alone."""
     optimizer = SparseAdam(lr=0.1)
     optimizer["density"], optimizer["colour"] = (ad.TensorXf(np.zeros(s, np.float32)) for s in ((3,), (3, 8)))

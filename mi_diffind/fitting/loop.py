@@ -369,7 +369,7 @@ def fit(
                 continue
             record.references[trainer.phase] = value if reference is None else 0.5 * (reference + value)
             if settings.schedule == "plateau":
-                record.plateau = _after_plateau(*record.plateau, trainer.step, value, settings)
+                record.plateau = _plateau_after(*record.plateau, trainer.step, value, settings)
             bar.show_loss(value)
             good = before  # not the state after this step: nobody has seen its loss yet
             if measured or last:
@@ -460,7 +460,7 @@ class _Bar:
         self.shown.set_postfix(self.text, refresh=not self.lines)
 
 
-def _after_plateau(factor: float, best: float | None, since: int, step: int, loss: float, settings) -> list:
+def _plateau_after(factor: float, best: float | None, since: int, step: int, loss: float, settings) -> list:
     """Return :attr:`_Record.plateau` after ``step``: the factor halves if no loss improved for a tenth of the steps."""
     if best is None or loss < 0.999 * best:
         return [factor, loss, step]
