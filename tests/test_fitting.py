@@ -811,7 +811,7 @@ def test_the_guard_survives_resuming(ad, tmp_path):
     assert result.restarts == 2 and "(0.0025)" in messages[0]
 
 
-# -- the optimiser of large tables: Adam for entries with a gradient -----------------------------------------------------
+# -- the optimiser of large tables: Adam for entries with a gradient ---------------------------------------------------
 
 
 def sparse_steps(ad, optimizer, shape, steps=12):

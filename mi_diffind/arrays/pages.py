@@ -239,8 +239,9 @@ def page_sizes_of(images: Sequence[np.ndarray], border: tuple[str, str], entries
     """
     errors = []
     for values in images:
-        page_errors = np.concatenate([_errors(part) for part in _parts(_windows(values, border))])
-        errors.append(page_errors / math.prod(values.shape[:2]))
+        windows = _windows(values, border)
+        parts = [_errors(windows[i : i + PART]) for i in range(0, len(windows), PART)]
+        errors.append(np.concatenate(parts) / math.prod(values.shape[:2]))
     chosen = _OPTIONS[_allocate(np.concatenate(errors), entries)]
     parts = np.split(chosen, np.cumsum([len(e) for e in errors])[:-1])
     return [part.reshape(*page_counts(i.shape[:2]), 2) for part, i in zip(parts, images, strict=True)]
@@ -351,10 +352,6 @@ def _windows(values: np.ndarray, border: tuple[str, str]) -> np.ndarray:
     side = SAMPLES + 1
     windows = np.lib.stride_tricks.sliding_window_view(values, (side, side), axis=(0, 1))[::SAMPLES, ::SAMPLES]
     return windows.reshape(-1, values.shape[2], side, side)
-
-
-def _parts(windows: np.ndarray):
-    return (windows[i : i + PART] for i in range(0, len(windows), PART))
 
 
 def _errors(windows: np.ndarray) -> np.ndarray:
