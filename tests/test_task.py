@@ -218,10 +218,7 @@ class LineTask(Task):
         "default": FitSettings(steps=60, batch=256, lr=0.05, measure_every=20),
         "short": FitSettings(steps=5, batch=16),
     }
-    arguments = (
-        Argument("--slope", type=float, default=1.0),
-        Argument("--steep", action="store_true"),
-    )
+    arguments = (Argument("--slope", type=float, default=1.0), Argument("--steep", action="store_true"))
 
     def check(self, request):
         if request.options["slope"] != 1:
