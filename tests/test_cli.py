@@ -54,9 +54,8 @@ def test_render(tmp_path, capsys):
     assert image.shape == (28, 48, 3) and np.isfinite(image).all() and image.mean() > 0.01
     found = json.loads(report.read_text())
     assert found["spp"] == 4 and found["width"] == 48 and found["variant"].endswith("_ad_rgb")
-    assert (
-        len(found["learned_plugins"]) == 9 and found["table_bytes"] == entries("disney") and found["seconds_render"] > 0
-    )
+    assert len(found["learned_plugins"]) == 9 and found["seconds_render"] > 0
+    assert found["table_bytes"] == entries("disney")
     assert sorted(os.listdir(tmp_path)) == ["image.exr", "report.json"]  # nothing temporary stays
     assert main(["render", str(SCENES / "still_life.xml"), "-o", str(tmp_path / "image.png"), *SMALL]) == 0
     assert np.array(mi.Bitmap(str(tmp_path / "image.png"))).shape == (28, 48, 3)
@@ -123,11 +122,8 @@ def test_fit(tmp_path, capsys, few_samples):
     arguments = ["fit", "disney", *FIT, "--storage", "float16"]
     assert main([*arguments, "-o", str(out), "--json", str(report)]) == 0
     found, table = json.loads(report.read_text()), load_table(out)
-    assert (
-        found["bytes"] == 2 * entries("disney")
-        and found["measured"]["psnr_db"] > 60
-        and found["settings"]["steps"] == 10
-    )
+    assert found["bytes"] == 2 * entries("disney") and found["settings"]["steps"] == 10
+    assert found["measured"]["psnr_db"] > 60
     assert found["task"] == table.task == "disney" and found["preset"] == table.preset == "tables"
     assert found["measured"] == table.measured and found["storage"] == table.storage == "float16"
     assert f"{out}: {found['bytes']:,} bytes as float16; best step " in capsys.readouterr().out
@@ -241,12 +237,6 @@ def test_interrupted_renders_keep_what_they_have(tmp_path):
     assert (folder / "comparison.png").exists()
 
 
-def verbs_with_tasks():
-    """Verb → the names of what has a parser of its own."""
-    found = {"fit": list(tasks()), "tradeoff": list(tasks())}
-    return {**found, "tradeoff": [*found["tradeoff"], "scene"]}
-
-
 HELP = """
 import contextlib, io, json, sys
 from mi_diffind.commands.cli import main
@@ -277,8 +267,14 @@ def asked_for_help(commands):
 
 
 def test_help_is_light():
-    """Of the command, and of each verb and task but studies: neither Mitsuba nor Dr.Jit, nor what trains."""
-    own = [[verb, name] for verb, names in verbs_with_tasks().items() for name in names]
+    """Of the command, and of each verb and task but studies: neither Mitsuba nor Dr.Jit, nor what trains.
+
+    The command itself does not even look for tasks.
+    """
+    modules = asked_for_help([[]])[1]
+    assert not (HEAVY | {"numpy", "tqdm"}) & modules
+    assert not [m for m in modules if m.startswith("mi_diffind.tasks.") and m.split(".")[2] in tasks()]
+    own = [[verb, name] for verb, more in (("fit", []), ("tradeoff", ["scene"])) for name in [*tasks(), *more]]
     light = [[], *([verb] for verb in VERBS), *own]
     text, modules = asked_for_help([command for command in light if "tradeoff" not in command])
     text |= asked_for_help([command for command in light if "tradeoff" in command])[0]  # studies are imported whole
@@ -329,28 +325,20 @@ def test_tradeoff_of_a_scene(tmp_path, capsys):
 
 
 def test_missing_files(tmp_path, capsys):
-    assert "nowhere.xml: no such scene file" in refused(capsys, "render", "nowhere.xml")
-    assert "nowhere.xml: no such scene file" in refused(capsys, "compare", "nowhere.xml", "--out", str(tmp_path / "o"))
-    scene = ["tradeoff", "scene", "nowhere.xml", "--out", str(tmp_path / "o")]
-    assert "nowhere.xml: no such scene file" in refused(capsys, *scene)
+    out = ["--out", str(tmp_path / "o")]
+    for words, options in ((["render"], []), (["compare"], out), (["tradeoff", "scene"], out), (["inspect"], [])):
+        assert "nowhere.xml: no such scene file" in refused(capsys, *words, "nowhere.xml", *options)
     assert not (tmp_path / "o").exists()
-    assert "nowhere.xml: no such scene file" in refused(capsys, "inspect", "nowhere.xml")
     assert "nowhere.npz: no such file" in refused(capsys, "inspect", "nowhere.npz")
 
 
 @pytest.mark.parametrize(
     "bsdf, sentence",
     [
-        (
-            '<bsdf type="neural_disney"><float name="roughness" value="1.5"/></bsdf>',
-            "found 1.5, allowed is [0, 1]",
-        ),
+        ('<bsdf type="neural_disney"><float name="roughness" value="1.5"/></bsdf>', "found 1.5, allowed is [0, 1]"),
         ('<bsdf type="neural_disney"><float name="roughnes" value="0.5"/></bsdf>', '"roughnes"'),
         ('<bsdf type="neural_disney"><float name="spec_trans" value="0.5"/></bsdf>', "no transmission"),
-        (
-            '<bsdf type="neural_disney"><string name="filename" value="no.npz"/></bsdf>',
-            "no.npz: no such file",
-        ),
+        ('<bsdf type="neural_disney"><string name="filename" value="no.npz"/></bsdf>', "no.npz: no such file"),
         (
             '<bsdf type="neural_disney"><string name="filename" value="scene.xml"/></bsdf>',
             "scene.xml: not a table file",
@@ -368,29 +356,16 @@ def test_bad_scenes(tmp_path, capsys, bsdf, sentence):
 
 def test_bad_options(tmp_path, capsys):
     path = scene_file(tmp_path)
-    assert 'the variant "llvm_rgb" does not exist; available are' in refused(
-        capsys, "render", path, "--variant", "llvm_rgb"
-    )
-    assert 'does not run in the variant "scalar_rgb"; use one of' in refused(
-        capsys, "render", path, "--variant", "scalar_rgb"
-    )
+    for name, fault in (
+        ("llvm_rgb", 'the variant "llvm_rgb" does not exist; available are'),
+        ("scalar_rgb", 'does not run in the variant "scalar_rgb"; use one of'),
+    ):
+        assert fault in refused(capsys, "render", path, "--variant", name)
     with pytest.raises(SystemExit) as caught:
         main(["render", path, "-D", "width"])
     assert caught.value.code == 2 and "expected NAME=VALUE" in capsys.readouterr().err
     assert "nothing" in refused(capsys, "render", path, "-D", "nothing=1")
     assert "allowed are .exr and .png" in refused(capsys, "render", path, "-o", str(tmp_path / "image.tiff"))
-    assert "allowed is .npz" in refused(capsys, "fit", "disney", "-o", str(tmp_path / "t.bin"))
-    assert "lr: found -1" in refused(capsys, "fit", "disney", "-o", str(tmp_path / "t.npz"), "--lr", "-1")
-    assert "there is nothing to resume" in refused(
-        capsys,
-        "fit",
-        "disney",
-        "-o",
-        str(tmp_path / "t.npz"),
-        "--resume",
-        "--checkpoint",
-        str(tmp_path / "c.npz"),
-    )
     for arguments in (["render", path, "--spp", "0"], ["nothing"], []):
         with pytest.raises(SystemExit) as caught:
             main(arguments)
@@ -415,13 +390,7 @@ def test_bad_tasks(capsys):
 
 def test_bad_sizes(tmp_path, capsys):
     fit = ["fit", "ggx", "--steps", "2", "-o", str(tmp_path / "own.npz")]
-    for name, value in (
-        ("primary", "1"),
-        ("cascaded", "5000"),
-        ("primary", "0"),
-        ("primary", "-3"),
-        ("primary", "many"),
-    ):
+    for name, value in (("cascaded", "5000"), *(("primary", value) for value in ("1", "0", "-3", "many"))):
         with pytest.raises(SystemExit) as caught:
             main([*fit, f"--{name}={value}"])
         sentence = f"mi-diffind fit ggx: error: argument --{name}: found {value}, allowed are 2 to 4096 entries a side"
@@ -432,21 +401,9 @@ def test_bad_sizes(tmp_path, capsys):
 def test_checkpoints_replace_nothing_else(tmp_path, capsys, few_samples):
     table, checkpoint = tmp_path / "table.npz", tmp_path / "state.npz"
     table.write_bytes(shipped("disney").read_bytes())
-    fit = [
-        "fit",
-        "disney",
-        "--steps",
-        "4",
-        "--batch",
-        "64",
-        "--variant",
-        "llvm_ad_rgb",
-        "-o",
-        str(tmp_path / "own.npz"),
-    ]
+    fit = ["fit", "disney", *FIT, "-o", str(tmp_path / "own.npz")]
     assert "would replace a file that is not one" in refused(capsys, *fit, "--checkpoint", str(table))
     assert table.read_bytes() == shipped("disney").read_bytes()
-    assert "the same file as -o" in refused(capsys, *fit, "--checkpoint", str(tmp_path / "own.npz"))
     for _ in range(2):  # its own checkpoint may be replaced
         assert main([*fit, "--checkpoint", str(checkpoint)]) == 0
     assert "is the checkpoint of a training" in refused(capsys, "inspect", str(checkpoint))

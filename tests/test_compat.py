@@ -46,14 +46,6 @@ def history():
     return record
 
 
-def test_importing_it_is_free():
-    """It comes before LLVM is chosen."""
-    code = "import importlib.util, sys; s = importlib.util.spec_from_file_location('compat', sys.argv[1])\n"
-    code += "s.loader.exec_module(importlib.util.module_from_spec(s)); print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code, compat.__file__], capture_output=True, text=True, check=True)
-    assert not {"drjit", "mitsuba", "numpy", "mi_diffind"} & set(done.stdout.split())
-
-
 # -- Dr.Jit ------------------------------------------------------------------------------------------------------------
 
 
@@ -86,8 +78,8 @@ def test_kernels(mi_rgb, history):
     kernels = history(compute)
     with hook("keys of dr.kernel_history: ir"):
         code = compat.kernel_code(kernels[0])
-        assert ("fmuladd" in code or "fma" in code) and compat.is_ptx(code) == mi_rgb.variant().startswith("cuda")
-    if not compat.is_ptx(code):
+        assert "fmuladd" in code or "fma" in code
+    if mi_rgb.variant().startswith("llvm"):
         with hook("target-cpu and vectors in LLVM code"):
             name, lanes = compat.llvm_target(code)
             assert name and lanes in (1, 2, 4, 8, 16, 32)
@@ -240,18 +232,12 @@ def test_what_is_known_while_integrators_are_recorded(mi_rgb, name):
 
 def test_classes_of_textures(mi_any):
     bitmap = {"type": "bitmap", "raw": True}
-    uniform, colour, float_, bytes_, other = (
-        mi_any.load_dict(d)
-        for d in (
-            {"type": "uniform", "value": 0.5},
-            {"type": "srgb", "color": [0.1, 0.2, 0.3]}
-            if not mi_any.is_monochromatic
-            else {"type": "uniform", "value": 0.2},
-            {**bitmap, "data": mi_any.TensorXf(np.full((2, 2, 1), 0.5))},
-            {**bitmap, "bitmap": mi_any.Bitmap(np.full((2, 2, 3), 128, np.uint8))},
-            {"type": "checkerboard"},
-        )
-    )
+    grey = {"type": "uniform", "value": 0.5}
+    uniform, colour, float_, bytes_, other = map(mi_any.load_dict, (
+        grey, grey if mi_any.is_monochromatic else {"type": "srgb", "color": [0.1, 0.2, 0.3]},
+        {**bitmap, "data": mi_any.TensorXf(np.full((2, 2, 1), 0.5))},
+        {**bitmap, "bitmap": mi_any.Bitmap(np.full((2, 2, 3), 128, np.uint8))}, {"type": "checkerboard"},
+    ))  # fmt: skip
     with hook("class_name of UniformSpectrum and SRGBReflectanceSpectrum"):
         assert compat.is_constant_texture(uniform) and compat.is_uniform_spectrum(uniform)
         assert "value" in mi_any.traverse(uniform).keys()
@@ -505,7 +491,8 @@ def test_functions_are_transformed_one_at_a_time(monkeypatch):
 @pytest.mark.parametrize("name", ["Float", "UInt32"])
 def test_copies_are_not_numpys_memory(mi_rgb, name):
     dtype = getattr(mi_rgb, name)
-    values = np.array([0, -0.0, 1, 7] if name == "Float" else [0, 1, 2**32 - 1], "f4" if name == "Float" else "u4")
+    numbers = {"Float": [0, -0.0, 1, 1e-37, np.nan, np.inf, -np.inf], "UInt32": [0, 1, 2**32 - 1]}[name]
+    values = np.array(numbers, "f4" if name == "Float" else "u4")
     array, kept = dtype(values), values.copy()
     copy = compat.owned(array)
     dr.sync_thread()  # copies are made in the background
@@ -514,11 +501,8 @@ def test_copies_are_not_numpys_memory(mi_rgb, name):
         values[:] = 3
         np.testing.assert_array_equal(array.numpy(), 3)  # what the copy is for
     np.testing.assert_array_equal(copy.numpy().view("u4"), kept.view("u4"))
-
-
-def test_numbers_that_are_none_stay(mi_rgb):
-    copy = compat.owned(mi_rgb.Float(np.array([np.nan, np.inf, -np.inf, 1e-37], np.float32)))
-    np.testing.assert_array_equal(copy.numpy(), np.float32([np.nan, np.inf, -np.inf, 1e-37]))
+    computed = array + 1
+    assert compat.owned(computed) is computed
 
 
 def test_derivatives_pass_through(mi_rgb):
@@ -529,11 +513,6 @@ def test_derivatives_pass_through(mi_rgb):
     dr.backward(dr.sum(dr.square(copy)))
     np.testing.assert_array_equal(dr.grad(array).numpy(), [0, 2, 4])
     np.testing.assert_array_equal(dr.grad(copy).numpy(), [0, 2, 4])
-
-
-def test_what_is_not_evaluated_is_no_copy(mi_rgb):
-    array = mi_rgb.Float(np.arange(3, dtype=np.float32)) + 1
-    assert compat.owned(array) is array
 
 
 def test_assignments_are_seen_by_all(mi_rgb):

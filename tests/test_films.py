@@ -79,9 +79,9 @@ def test_the_same_frames_give_the_same_bytes(tmp_path):
 @needs_ffmpeg
 def test_a_name_like_an_address_is_a_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for name in ("http:film.mp4", "-y.mp4"):
-        films.write(name, smooth_frames(2, 16, 16))
-        assert decoded(tmp_path / name).shape[0] == 2
+    for count, name in enumerate(("http:film.mp4", "-y.mp4"), 1):  # one frame is a film, too
+        films.write(name, smooth_frames(count, 16, 16))
+        assert decoded(tmp_path / name).shape[0] == count
 
 
 @needs_ffmpeg

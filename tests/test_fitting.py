@@ -12,6 +12,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from drjit import nn
+from drjit.opt import Adam
 from variants import BACKENDS
 
 from mi_diffind import DifferentiableArray, DiffindError, Indirection
@@ -112,38 +113,6 @@ def test_converges(ad, loss):
     assert result.history[-1]["loss"] < 0.1 * 0.2 and result.seconds > 0
 
 
-def test_several_targets_and_weights(ad):
-    """Each target counts by its weight, 1 if it has none; 0 means that it is not trained."""
-
-    class Two(Curve):
-        def __init__(self, ad, weights):
-            super().__init__(ad)
-            self.weights = weights
-            self.net = DifferentiableArray(4, 2).alloc(ad.TensorXf)
-
-        def batch(self, rng, size):
-            x = rng.random(self.ad.Float, size)
-            return [x], {"a": [self.ad.Float(1)], "b": [self.ad.Float(2)]}
-
-        def predict(self, net, inputs):
-            a, b = net(inputs)
-            return {"a": [a], "b": [b]}
-
-        def measure(self, net):
-            return {"q": 1.0}
-
-    first = {}
-    for name, weights in {"plain": {}, "a": {"b": 0.0}, "heavy": {"a": 3.0}}.items():
-        problem = Two(ad, weights)
-        first[name] = run(problem, settings(steps=1))[0].history[0]["loss"]
-        if name == "a":
-            entries = problem.net.numpy()
-            assert (entries[:, 0] > 0.5).all() and (entries[:, 1] == 0.5).all()
-    assert first["plain"] == pytest.approx(0.5 + 1.5)
-    assert first["a"] == pytest.approx(0.5)
-    assert first["heavy"] == pytest.approx(3 * 0.5 + 1.5)
-
-
 def test_the_best_state_is_kept(ad):
     """When later measurements are worse, the tables are those of the best one."""
 
@@ -174,17 +143,23 @@ def test_same_seed_same_bytes(ad):
     assert results[0][0] != results[2][0]
 
 
-def test_the_number_of_threads_is_restored(ad):
-    before = dr.thread_count()
-    seen = []
-    problem = Curve(ad, {3: lambda y: seen.append(dr.thread_count()) or y})
-    run(problem, settings(steps=5))
-    assert seen == [1] and dr.thread_count() == before
-    run(Curve(ad, {3: lambda y: seen.append(dr.thread_count()) or y}), settings(steps=5, deterministic=False))
-    assert seen == [1, before] and dr.thread_count() == before
+def test_global_state_is_restored(ad):
+    """Threads and the limit of expanded sums, after each end of a training."""
+
+    def state():
+        return dr.thread_count(), dr.expand_threshold()
+
+    before, seen = state(), []
+    for deterministic in (True, False):
+        look = {3: lambda y: seen.append(state()) or y}
+        run(Curve(ad, look), settings(steps=5, deterministic=deterministic))
+        assert state() == before
+    run(Curve(ad, {3: interrupt}), settings(steps=5))
+    assert state() == before
     with pytest.raises(ZeroDivisionError):
         run(Curve(ad, {3: lambda y: 1 / 0}), settings(steps=5))
-    assert dr.thread_count() == before
+    assert state() == before
+    assert [threads for threads, _ in seen] == [1, before[0]] and min(limit for _, limit in seen) > before[1]
 
 
 @pytest.mark.parametrize("schedule", loop.SCHEDULES)
@@ -215,6 +190,8 @@ def test_resumed_equals_uninterrupted(ad, tmp_path, schedule):
         assert (result.step, result.steps, result.restarts) == (expected.step, 70, 0)
         assert [h["loss"] for h in result.history] == [h["loss"] for h in expected.history]
         assert os.listdir(tmp_path).count(path.name) == 1
+        finished = Curve(ad)
+        assert run(finished, chosen, checkpoint=path, resume=True)[0].step == expected.step and finished.calls == 0
     assert len(os.listdir(tmp_path)) == 2  # nothing temporary
 
 
@@ -375,10 +352,11 @@ def test_diverging_again_and_again_is_an_error(ad):
         run(Curve(ad), settings(lr=1e38))
 
 
-def test_progress_bar(ad, capsys):
-    fit(Curve(ad), settings(), progress=True)
+@pytest.mark.parametrize("progress", [True, False])
+def test_messages_go_to_stderr(ad, capsys, progress):
+    fit(Curve(ad, {35: nan}), settings(), progress=progress)
     captured = capsys.readouterr()
-    assert captured.out == ""  # results belong to stdout, progress does not
+    assert captured.out == "" and "half the learning rate" in captured.err  # results belong to stdout
 
 
 @pytest.fixture
@@ -471,9 +449,10 @@ def rates(ad, **changes):
     return np.diff(problem.positions)
 
 
-def test_cosine_schedule(ad):
+def test_schedules_of_the_step(ad):
     expected = 1e-2 * 0.5 * (1 + np.cos(np.pi * np.arange(40) / 40))
     np.testing.assert_allclose(rates(ad, schedule="cosine", steps=40), expected, rtol=1e-2, atol=1e-6)
+    np.testing.assert_allclose(rates(ad, schedule="constant", steps=40), np.full(40, 1e-2), rtol=1e-3)
 
 
 def test_plateau_schedule(ad):
@@ -483,6 +462,10 @@ def test_plateau_schedule(ad):
     np.testing.assert_allclose(found, 0.5**halvings, rtol=2e-3)
     assert halvings[0] == 0 and halvings[-1] in (8, 9, 10)
     assert set(np.diff(halvings)) == {0, 1} and np.diff(np.flatnonzero(np.diff(halvings))).tolist() == [10] * 8
+    improving = Curve(ad)
+    improving.net = DifferentiableArray(16, 1, value=50.0).alloc(ad.TensorXf)
+    losses = [h["loss"] for h in run(improving, settings(schedule="plateau", lr=0.1, steps=100))[0].history]
+    assert losses[0] - losses[-1] == pytest.approx(0.1 * 80, rel=0.05)  # 80 steps at the full rate
 
 
 # -- cost -------------------------------------------------------------------------------------------------------------
@@ -791,12 +774,14 @@ def test_checkpoint_of_another_run(checkpoint):
     not_resumable(checkpoint, "damaged or of another task", other)
 
 
-def test_interrupt_before_the_first_measurement(ad):
-    """What has been reached by then is measured and kept."""
+def test_interrupt_before_the_first_measurement(ad, terminal):
+    """What has been reached by then is measured and kept; its loss nobody has seen."""
     problem = Curve(ad, {7: interrupt})
     start = contents(problem)
-    result, _ = run(problem, settings())
+    result = fit(problem, settings(), title="x")
     assert result.interrupted and result.steps == result.step == 7 and contents(problem) != start
+    assert [h["loss"] for h in result.history] == [None]
+    assert "psnr_db=" in terminal.states[-1] and "loss=" not in terminal.states[0]
     assert problem.measure(problem.net)["psnr_db"] == result.measured["psnr_db"]
 
 
@@ -824,3 +809,70 @@ def test_the_guard_survives_resuming(ad, tmp_path):
     run(Curve(ad, {35: nan, 57: interrupt}), settings(steps=80), checkpoint=path)
     result, messages = run(Curve(ad, {15: nan}), settings(steps=80), checkpoint=path, resume=True)
     assert result.restarts == 2 and "(0.0025)" in messages[0]
+
+
+# -- the optimiser of large tables: Adam for entries with a gradient ---------------------------------------------------
+
+
+def sparse_steps(ad, optimizer, shape, steps=12):
+    """Return a tensor of random numbers after steps that read few of its rows, and how often each row was read."""
+    rng, width = np.random.default_rng(3), shape[1] if len(shape) == 2 else 1
+    optimizer["x"] = ad.TensorXf(rng.normal(size=shape).astype(np.float32))
+    reads = np.zeros(shape[0], int)
+    for _ in range(steps):
+        rows = rng.choice(shape[0], 5, replace=False)
+        reads[rows] += 1
+        entries = (rows[:, None] * width + np.arange(width)).reshape(-1)
+        slopes = ad.Float(rng.normal(size=entries.size).astype(np.float32))
+        read = dr.gather(ad.Float, optimizer["x"].array, ad.UInt32(entries.astype(np.uint32)))
+        dr.backward(dr.sum(dr.square(read) * slopes))
+        del read
+        optimizer.step()
+    return optimizer["x"].numpy(), reads
+
+
+@pytest.mark.parametrize("shape", [(60,), (40, 12), (40, 3)])
+def test_steps_of_the_sparse_optimiser(ad, shape):
+    """Of entries alone and of columns in packets; a learning rate of 0.1 moves what was read by more than rounding."""
+    values, reads = sparse_steps(ad, loop.SparseAdam(lr=0.1, beta_2=0.99), shape)
+    expected, _ = sparse_steps(ad, Adam(lr=0.1, beta_2=0.99, mask_updates=True), shape)
+    np.testing.assert_allclose(values, expected, rtol=0, atol=1e-5)
+    begun, _ = sparse_steps(ad, loop.SparseAdam(lr=0.1), shape, steps=0)
+    moved = np.abs(values - begun).reshape(shape[0], -1).max(axis=1)
+    assert (moved[reads == 0] == 0).all() and (moved[reads > 0] > 1e-3).all() and (reads == 0).any()
+
+
+def test_columns_move_together(ad):
+    """A row of four of which one column has a gradient: the others continue as their moments say."""
+    optimizer = loop.SparseAdam(lr=0.1)
+    optimizer["x"] = ad.TensorXf(np.zeros((2, 4), np.float32))
+    for columns in ((1, 1, 1, 1), (1, 0, 0, 0)):
+        slopes = ad.Float(np.float32([*columns, 0, 0, 0, 0]))
+        dr.backward(dr.sum(optimizer["x"].array * slopes))
+        optimizer.step()
+    values = optimizer["x"].numpy()
+    assert (values[1] == 0).all() and values[0, 0] == pytest.approx(-0.2, abs=1e-3)
+    assert (values[0, 1:] < -0.11).all() and (values[0, 1:] > -0.19).all()
+
+
+def test_steps_without_a_gradient(ad):
+    """No gradient at all."""
+    optimizer = loop.SparseAdam(lr=0.1)
+    optimizer["x"] = ad.TensorXf(np.float32([1, 2, 3]))
+    dr.backward(dr.sum(optimizer["x"].array * ad.Float(np.zeros(3, np.float32))))
+    optimizer.step()
+    np.testing.assert_array_equal(optimizer["x"].numpy(), [1, 2, 3])
+
+
+def test_rows_without_a_gradient_in_the_column_of_their_own(ad):
+    """A tensor of columns beside one without: rows that the latter does not read are left alone."""
+    optimizer = loop.SparseAdam(lr=0.1)
+    optimizer["density"], optimizer["colour"] = (ad.TensorXf(np.zeros(s, np.float32)) for s in ((3,), (3, 8)))
+    read = ad.Float(np.float32([1, 0, 1])), ad.Float(np.float32([1] * 8 + [1] * 8 + [1] * 4 + [0] * 4))
+    total = dr.sum(optimizer["density"].array * read[0]) + dr.sum(optimizer["colour"].array * read[1])
+    dr.backward(total)
+    del total
+    optimizer.step()
+    np.testing.assert_allclose(optimizer["density"].numpy(), [-0.1, 0, -0.1], atol=1e-5)
+    expected = [[-0.1] * 8, [0] * 8, [-0.1] * 4 + [0] * 4]
+    np.testing.assert_allclose(optimizer["colour"].numpy(), expected, atol=1e-5)

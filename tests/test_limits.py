@@ -19,11 +19,11 @@ from mi_diffind.core.archives import (
     FREE,
     VARIABLE,
     Allowance,
+    Archive,
     ArchiveError,
     LimitError,
     allowed,
     json_bytes,
-    read_arrays,
 )
 from mi_diffind.core.errors import LONGEST_MESSAGE, UsageError
 from mi_diffind.core.files import PATHS, OutputError
@@ -114,6 +114,11 @@ def test_the_bound_of_json_holds():
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         assert len(content) == 20_001 and peak <= json_bytes(text), part
+
+
+def read_arrays(path) -> dict:
+    with Archive(path) as archive:
+        return {name: archive.array(name) for name in archive.members}
 
 
 def test_archives_hold_plain_numbers(tmp_path):

@@ -329,31 +329,25 @@ def test_a_file_reads_as_it_was_trained(ad, tmp_path, structure):
     np.testing.assert_allclose(single, decoded, atol=2e-3)
 
 
-def _without_a_page(table):
-    pages = table.arrays["primary" + PAGES]
-    table.arrays["primary" + PAGES] = dataclasses.replace(pages, entries=pages.entries[:, 1:])
-
-
-def _larger(table):
-    pages = table.arrays["primary" + PAGES]
-    table.arrays["primary" + PAGES] = dataclasses.replace(pages, entries=np.full_like(pages.entries, 31))
-
-
-def _of_no_sizes(table):
-    pages = table.arrays["primary" + PAGES]
-    table.arrays["primary" + PAGES] = dataclasses.replace(pages, offset=(0.0, 0.0))
-
-
-def _in_two_dimensions(table):
-    primary = table.arrays["primary"]
+def _in_two_dimensions(primary):
     entries = primary.entries[: len(primary.entries) // 2 * 2].reshape(-1, 2, primary.shape[-1])
-    table.arrays["primary"] = dataclasses.replace(primary, entries=entries, border=("clamp", "clamp"))
+    return {"entries": entries, "border": ("clamp", "clamp")}
 
 
-@pytest.mark.parametrize("damage", [_without_a_page, _larger, _of_no_sizes, _in_two_dimensions])
+#: What is wrong → an array of the file, and what of it is changed.
+DAMAGE = {
+    "a page less": ("primary" + PAGES, lambda pages: {"entries": pages.entries[:, 1:]}),
+    "larger pages": ("primary" + PAGES, lambda pages: {"entries": np.full_like(pages.entries, 31)}),
+    "no sizes": ("primary" + PAGES, lambda pages: {"offset": (0.0, 0.0)}),
+    "two dimensions": ("primary", _in_two_dimensions),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
 def test_damaged_pages_are_refused(ad, tmp_path, damage):
     table = trained(ad, short("pages of 5 bits", steps=1))
-    damage(table)
+    name, change = DAMAGE[damage]
+    table.arrays[name] = dataclasses.replace(table.arrays[name], **change(table.arrays[name]))
     save_table(tmp_path / "t.npz", table)
     load_table(tmp_path / "t.npz", "image")
     with pytest.raises(TableError, match=r"t\.npz: "):

@@ -83,18 +83,14 @@ def test_what_ships_is_found():
     assert all(isinstance(task, Task) for task in tasks().values())
 
 
-def test_tasks_of_others_are_found(install):
-    install({"line": "their_line"}, their_line=LINE)
+@pytest.mark.parametrize("entry_point", ["their_line", "their_line:TASK"])
+def test_tasks_of_others_are_found(install, entry_point):
+    """Also by an object in a module, as other packages write their entry points."""
+    install({"line": entry_point}, their_line=LINE)
     assert tuple(tasks()) == (*BUILT_IN, "line") and tasks()["line"].title == "a straight line"
     assert sys.modules["their_line"].TASK is tasks()["line"]
     with pytest.raises(UsageError, match='line: found the preset "best", allowed are default'):
         fit("line", preset="best")
-
-
-def test_an_object_in_a_module_is_as_good(install):
-    """As other packages write their entry points."""
-    install({"line": "their_line:TASK"}, their_line=LINE)
-    assert tasks()["line"].title == "a straight line"
 
 
 BROKEN = {
@@ -222,10 +218,7 @@ class LineTask(Task):
         "default": FitSettings(steps=60, batch=256, lr=0.05, measure_every=20),
         "short": FitSettings(steps=5, batch=16),
     }
-    arguments = (
-        Argument("--slope", type=float, default=1.0),
-        Argument("--steep", action="store_true"),
-    )
+    arguments = (Argument("--slope", type=float, default=1.0), Argument("--steep", action="store_true"))
 
     def check(self, request):
         if request.options["slope"] != 1:

@@ -33,16 +33,9 @@ def test_ratio_is_table_2_at_4k():
 
 
 def test_ratio_falls_with_resolution_within_the_useful_range():
-    assert (
-        arrays.resolution_ratio(3, 1024)
-        == arrays.resolution_ratio(3, 2048)
-        == arrays.resolution_ratio(3, 1)
-        == pytest.approx(128 * 64 / 80)
-    )
+    assert [arrays.resolution_ratio(3, n) for n in (1, 1024, 2048)] == pytest.approx([128 * 64 / 80] * 3)
     assert arrays.resolution_ratio(3, 2048 * math.sqrt(2)) == pytest.approx(128 * 0.9)
-    assert (
-        arrays.resolution_ratio(12, 1024) == arrays.resolution_ratio(12, 2048) == pytest.approx(64)
-    )  # the safe default
+    assert [arrays.resolution_ratio(12, n) for n in (1024, 2048)] == pytest.approx([64] * 2)  # the safe default
     values = [arrays.resolution_ratio(e, n) for e in (0.01, 1, 5, 12, 100, 1e6) for n in (1, 500, 3000, 1e5)]
     assert min(values) >= 40 and max(values) <= 128
 
@@ -134,26 +127,22 @@ def test_fit_of_exactly_the_image():
     assert fit_bytes(nbytes - 1, 3, 7, 5, 4).rows * 5 < 35
 
 
-@pytest.mark.parametrize("text, value", [("12x", 12), ("12", 12), (" 7.5X ", 7.5), ("1e2×", 100), (".5x", 0.5), (3, 3)])
-def test_compressions(text, value):
-    assert units.parse_compression(text) == value
+QUANTITIES = {
+    units.parse_compression: {"12x": 12, "12": 12, " 7.5X ": 7.5, "1e2×": 100, ".5x": 0.5, 3: 3},
+    units.parse_bytes: {
+        "262144": 262144, "256k": 262144, "256K": 262144, "1.5M": 1572864, "1 MiB": 1048576, "2kB": 2048, "1G": 2**30,
+        1000: 1000,
+    },
+    units.parse_bpp: {"2": 2, "0.5": 0.5, 1.25: 1.25},
+}  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    "text, value",
-    [("262144", 262144), ("256k", 262144), ("256K", 262144), ("1.5M", 1572864), ("1 MiB", 1048576), ("2kB", 2048),
-     ("1G", 2**30), (1000, 1000)],
-)  # fmt: skip
-def test_bytes(text, value):
-    assert units.parse_bytes(text) == value
+@pytest.mark.parametrize("parse", QUANTITIES)
+def test_quantities(parse):
+    assert {text: parse(text) for text in QUANTITIES[parse]} == QUANTITIES[parse]
 
 
-@pytest.mark.parametrize("text, value", [("2", 2), ("0.5", 0.5), (1.25, 1.25)])
-def test_bits_per_texel(text, value):
-    assert units.parse_bpp(text) == value
-
-
-@pytest.mark.parametrize("parse", [units.parse_compression, units.parse_bytes, units.parse_bpp])
+@pytest.mark.parametrize("parse", QUANTITIES)
 @pytest.mark.parametrize(
     "text", ["0", "-1", "nan", "inf", "1e999", "", "x", "twelve", "1_000", "1,5", "12 x 3", "٣", "0x10", math.nan, None]
 )

@@ -71,18 +71,9 @@ class DifferentiableArray(nn.Module):
     """
 
     DRJIT_STRUCT = {  # noqa: RUF012
-        "resolution": tuple,
-        "channels": int,
-        "border": tuple,
-        "folded": bool,
-        "storage": str,
-        "bits": int,
-        "scale": tuple,
-        "offset": tuple,
-        "init": object,
-        "value": object,
-        "data": dr.ArrayBase,
-    }
+        "resolution": tuple, "channels": int, "border": tuple, "folded": bool, "storage": str, "bits": int,
+        "scale": tuple, "offset": tuple, "init": object, "value": object, "data": dr.ArrayBase,
+    }  # fmt: skip
 
     def __init__(self, resolution=(2,), channels=1, init="constant", value=None, fold=False, border="clamp"):
         resolution = tuple(int(n) for n in np.atleast_1d(resolution))
@@ -111,19 +102,21 @@ class DifferentiableArray(nn.Module):
     def _alloc(self, dtype, size=-1, rng=None):
         if size not in (-1, self.dims):
             raise ValueError(f"an array of {self.dims} dimension(s) was given {size} input(s)")
+        values = self._initial_values(dtype, rng)
+        return self._replace()._hold(values, dtype, "float16" if dr.is_half_v(dtype) else "float32"), self.channels
+
+    def _initial_values(self, dtype, rng) -> np.ndarray:
         shape = (*self.resolution, self.channels)
         if not isinstance(self.init, str):
-            values = np.asarray(self.init, dtype=np.float32)
-        elif self.init == "ramp":
-            values = ramp(self.resolution, self.channels, self.border)
-        elif self.init == "constant":
-            values = np.broadcast_to(np.asarray(self.value, dtype=np.float32), shape)
-        else:
-            rng = rng if rng is not None else dr.rng(seed=0)
-            low, high = self.value
-            drawn = rng.random(module_of(dtype).Float, int(np.prod(shape)))
-            values = low + (high - low) * drawn.numpy().reshape(shape)
-        return self._replace()._hold(values, dtype, "float16" if dr.is_half_v(dtype) else "float32"), self.channels
+            return np.asarray(self.init, dtype=np.float32)
+        if self.init == "ramp":
+            return ramp(self.resolution, self.channels, self.border)
+        if self.init == "constant":
+            return np.broadcast_to(np.asarray(self.value, dtype=np.float32), shape)
+        rng = rng if rng is not None else dr.rng(seed=0)
+        low, high = self.value
+        drawn = rng.random(module_of(dtype).Float, int(np.prod(shape)))
+        return low + (high - low) * drawn.numpy().reshape(shape)
 
     def _require_entries(self) -> None:
         if self.data is None:

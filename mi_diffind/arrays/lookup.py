@@ -128,12 +128,11 @@ def _is_zero(weight) -> bool:
 
 def weighted_sum(terms):
     """Return Σ weight · value for each channel."""
-    total = None
+    terms = iter(terms)  # values are fetched one after the other
+    weight, values = next(terms)
+    total = [weight * v for v in values]
     for weight, values in terms:
-        if total is None:
-            total = [weight * v for v in values]
-        else:
-            total = [dr.fma(weight, v, t) for v, t in zip(values, total, strict=True)]
+        total = [dr.fma(weight, v, t) for v, t in zip(values, total, strict=True)]
     return total
 
 

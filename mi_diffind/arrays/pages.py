@@ -104,11 +104,8 @@ class PagedArray(DifferentiableArray):
     def _shape(self) -> tuple[int]:
         return (self.entries,)
 
-    def _alloc(self, dtype, size=-1, rng=None):
-        if size not in (-1, self.dims):
-            raise ValueError(f"an array of {self.dims} dimension(s) was given {size} input(s)")
-        values = np.broadcast_to(self.init, (self.entries, self.channels))
-        return self._replace()._hold(values, dtype, "float16" if dr.is_half_v(dtype) else "float32"), self.channels
+    def _initial_values(self, dtype, rng) -> np.ndarray:
+        return np.broadcast_to(self.init, (self.entries, self.channels))
 
     def _words(self, dtype):
         """Return the index: for each page, its first entry and, in the lower bits, its sides less one.
@@ -242,8 +239,9 @@ def page_sizes_of(images: Sequence[np.ndarray], border: tuple[str, str], entries
     """
     errors = []
     for values in images:
-        page_errors = np.concatenate([_errors(part) for part in _parts(_windows(values, border))])
-        errors.append(page_errors / math.prod(values.shape[:2]))
+        windows = _windows(values, border)
+        parts = [_errors(windows[i : i + PART]) for i in range(0, len(windows), PART)]
+        errors.append(np.concatenate(parts) / math.prod(values.shape[:2]))
     chosen = _OPTIONS[_allocate(np.concatenate(errors), entries)]
     parts = np.split(chosen, np.cumsum([len(e) for e in errors])[:-1])
     return [part.reshape(*page_counts(i.shape[:2]), 2) for part, i in zip(parts, images, strict=True)]
@@ -354,10 +352,6 @@ def _windows(values: np.ndarray, border: tuple[str, str]) -> np.ndarray:
     side = SAMPLES + 1
     windows = np.lib.stride_tricks.sliding_window_view(values, (side, side), axis=(0, 1))[::SAMPLES, ::SAMPLES]
     return windows.reshape(-1, values.shape[2], side, side)
-
-
-def _parts(windows: np.ndarray):
-    return (windows[i : i + PART] for i in range(0, len(windows), PART))
 
 
 def _errors(windows: np.ndarray) -> np.ndarray:

@@ -22,7 +22,7 @@ import numpy as np
 from ..core.archives import Allowance, Archive, ArchiveError, LimitError
 from ..core.errors import DiffindError, printable, reason
 from ..core.files import irregular, replacing, shown
-from .indirection import DifferentiableArray
+from .indirection import DifferentiableArray, check_storage
 from .lookup import BORDERS, STORAGES, gathers, pack_bits, pair_words, quantize, unpack_bits
 from .pages import SIDE_BITS, PagedArray
 
@@ -94,8 +94,7 @@ class StoredArray:
 
     def to(self, storage: str) -> StoredArray:
         """Return the array in another storage form; precision that bytes or halves have lost does not come back."""
-        if storage not in STORAGES:
-            raise ValueError(f'storage: found "{storage}", allowed are {STORAGES}')
+        check_storage(storage)
         if storage == self.storage:
             return self
         values = self.values
@@ -147,10 +146,9 @@ def stored_arrays(name: str, array: DifferentiableArray) -> dict[str, StoredArra
     """
     if not isinstance(array, PagedArray):
         return {name: StoredArray.of(array)}
-    entries = array.codes() if array.storage == "uint8" else array.numpy().astype(_DTYPES[array.storage])
     ones, bits = (1.0,) * array.dims, SIDE_BITS[array.dims - 1]
     return {
-        name: StoredArray(entries, ("clamp",), array.scale, array.offset, array.bits),
+        name: replace(StoredArray.of(array), border=("clamp",)),
         name + PAGES: StoredArray((array.sizes - 1).astype(np.uint8), array.border, ones, ones, bits),
     }
 
@@ -260,14 +258,9 @@ def save_table(path: str | os.PathLike, table: Table) -> None:
         if array.storage == "uint8":
             described[name] |= {"scale": list(array.scale), "offset": list(array.offset), "bits": array.bits}
     meta = {
-        "format_version": FORMAT_VERSION,
-        "task": table.task,
-        "preset": table.preset,
-        "arrays": described,
-        "settings": table.settings,
-        "seed": table.seed,
-        "measured": table.measured,
-    }
+        "format_version": FORMAT_VERSION, "task": table.task, "preset": table.preset, "arrays": described,
+        "settings": table.settings, "seed": table.seed, "measured": table.measured,
+    }  # fmt: skip
     try:
         text = np.frombuffer(json.dumps(meta, indent=1, allow_nan=False).encode(), dtype=np.uint8)
     except (ValueError, TypeError) as e:

@@ -38,13 +38,9 @@ def add(commands) -> None:
         help="point that the cameras face (default: the middle of the box)",
     )  # fmt: skip
     sub.add_argument(
-        "--up",
-        type=float,
-        nargs=3,
-        metavar=("X", "Y", "Z"),
-        default=(0, 1, 0),
+        "--up", type=float, nargs=3, metavar=("X", "Y", "Z"), default=(0, 1, 0),
         help="upward direction (default: 0 1 0)",
-    )
+    )  # fmt: skip
     sub.add_argument("--fov", type=float, default=40.0, help="field of view in degrees (default: 40)")
     sub.add_argument(
         "--objects", nargs="+", metavar="ID", default=(),

@@ -38,21 +38,20 @@ def main(argv: list[str] | None = None) -> int:
             write_json(arguments.json, result)
         return 130 if result.get("interrupted") else 1 if result.get("failed") else 0
     except DiffindError as e:
-        print(f"mi-diffind: error: {shortened(str(e), 280)}", file=sys.stderr)
-        return 2
+        fault = shortened(str(e), 280)
     except KeyboardInterrupt:
         print("mi-diffind: interrupted", file=sys.stderr)
         return 130
-    except MemoryError:
-        print("mi-diffind: error: the memory of this machine does not suffice", file=sys.stderr)
-        return 2
     except BrokenPipeError:  # the reader of a pipe has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except MemoryError:
+        fault = "the memory of this machine does not suffice"
     except OSError as e:  # a file that no reader refuses by itself, such as one that may not be read
         named = f'"{shown(e.filename)}": ' if isinstance(e.filename, (str, os.PathLike)) else ""
-        print(f"mi-diffind: error: {named}{e.strerror or reason(e)}", file=sys.stderr)
-        return 2
+        fault = f"{named}{e.strerror or reason(e)}"
+    print(f"mi-diffind: error: {fault}", file=sys.stderr)
+    return 2
 
 
 class _Parser(argparse.ArgumentParser):

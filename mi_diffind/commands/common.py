@@ -63,14 +63,9 @@ def scene_options(sub: argparse.ArgumentParser, rendering: bool = True) -> None:
     """Add ``--variant``, ``-D`` (``defines``: pairs of strings) and, with ``rendering``, ``--spp`` and ``--seed``."""
     variant_option(sub)
     sub.add_argument(
-        "-D",
-        dest="defines",
-        action="append",
-        type=define,
-        default=[],
-        metavar="NAME=VALUE",
+        "-D", dest="defines", action="append", type=define, default=[], metavar="NAME=VALUE",
         help="set a <default> of the scene",
-    )
+    )  # fmt: skip
     if rendering:
         sub.add_argument("--spp", type=positive, help="samples per pixel (default: the scene's)")
         sub.add_argument("--seed", type=natural, default=0, help="seed of the random numbers (default: 0)")
@@ -92,14 +87,6 @@ def say(text) -> None:
     """Print a text of one or more lines; control characters, which strings of files may hold, are escaped."""
     for line in str(text).splitlines():
         print(printable(line))
-
-
-def print_conversions(conversions: list[dict]) -> None:
-    """Print what was replaced and what was kept."""
-    from ..scenes import conversion
-
-    for line in conversion.summary(conversions):
-        say(line)
 
 
 def set_variant(name: str | None) -> None:

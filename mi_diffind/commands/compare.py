@@ -40,15 +40,8 @@ def run(arguments) -> dict:
     set_variant(arguments.variant)
     from ..scenes import comparison
 
-    result = comparison.compare(
-        arguments.scene,
-        arguments.spp,
-        arguments.seed,
-        passes=arguments.passes,
-        against=arguments.against,
-        learn=arguments.learn,
-        defines=dict(arguments.defines),
-    )
+    given = {name: getattr(arguments, name) for name in ("spp", "seed", "passes", "against", "learn")}
+    result = comparison.compare(arguments.scene, defines=dict(arguments.defines), **given)
     paths = result.save(arguments.out)
     say(result)
     say(f"picture     {paths['figure']}")

@@ -37,13 +37,9 @@ def run(arguments) -> dict:
     from ..scenes.conversion import convert
 
     conversions = convert(
-        arguments.scene,
-        arguments.output,
-        learn=arguments.learn or None,
-        tables=arguments.tables,
-        defines=dict(arguments.defines),
-        check=arguments.check,
-    )
+        arguments.scene, arguments.output, learn=arguments.learn or None, tables=arguments.tables,
+        defines=dict(arguments.defines), check=arguments.check,
+    )  # fmt: skip
     say(conversions)
     say(f"scene       {arguments.output}")
     check = conversions.check and dataclasses.asdict(conversions.check)

@@ -7,17 +7,7 @@ from pathlib import Path
 
 from ..core.arguments import proper_fraction
 from ..core.files import writable_file
-from .common import (
-    UsageError,
-    learn_option,
-    positive,
-    print_conversions,
-    require_scene,
-    say,
-    scene_options,
-    set_variant,
-    verb,
-)
+from .common import UsageError, learn_option, positive, require_scene, say, scene_options, set_variant, verb
 
 #: Extensions of films (:data:`mi_diffind.images.films.FILMS`, without importing NumPy).
 FILMS = (".mp4", ".webp", ".gif")
@@ -84,23 +74,14 @@ def run(arguments) -> dict:
 
         check_encoder(output)
     set_variant(arguments.variant)
-    from ..scenes import depth, loading
+    from ..scenes import conversion, depth, loading
     from ..scenes.rendering import render
 
-    rendering = render(
-        arguments.scene,
-        arguments.spp,
-        arguments.seed,
-        depth=arguments.depth,
-        depth_tolerance=arguments.depth_tolerance,
-        orbit=arguments.orbit,
-        centre=arguments.centre,
-        defines=dict(arguments.defines),
-        output=output,
-        learn=arguments.learn,
-    )
+    names = ("spp", "seed", "depth", "depth_tolerance", "orbit", "centre", "learn")
+    given = {name: getattr(arguments, name) for name in names}
+    rendering = render(arguments.scene, defines=dict(arguments.defines), output=output, **given)
     figures = rendering.figures
-    print_conversions(figures["conversions"])
+    say("\n".join(conversion.summary(figures["conversions"])))
     if arguments.depth == "auto":
         say("\n".join(depth.summary(figures["depth"])))
     rendering.save(output)

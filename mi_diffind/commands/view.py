@@ -34,18 +34,9 @@ def run(arguments) -> dict:
     set_variant(arguments.variant)
     from ..scenes.viewer import view
 
-    return view(
-        arguments.file,
-        host=arguments.host,
-        port=arguments.port,
-        width=arguments.width,
-        spp=arguments.spp,
-        seed=arguments.seed,
-        against=arguments.against,
-        defines=dict(arguments.defines),
-        seconds=arguments.seconds,
-        announce=_announce,
-    )
+    names = ("host", "port", "width", "spp", "seed", "against", "seconds")
+    given = {name: getattr(arguments, name) for name in names}
+    return view(arguments.file, defines=dict(arguments.defines), announce=_announce, **given)
 
 
 def _announce(text: str) -> None:

@@ -133,12 +133,6 @@ def _whole(digits: str) -> int:
     return int(digits)
 
 
-def read_arrays(path: str | os.PathLike) -> dict[str, np.ndarray]:
-    """Return all arrays of an archive. Raises as :class:`Archive` does, ``zlib.error`` and ``EOFError``."""
-    with Archive(path) as archive:
-        return {name: archive.array(name) for name in archive.members}
-
-
 #: Bytes of memory that the content of any file may take.
 FREE = 64 * 2**20
 

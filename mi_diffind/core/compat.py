@@ -91,11 +91,6 @@ def kernel_code(entry: dict) -> str:
     return entry["ir"].getvalue()
 
 
-def is_ptx(code: str) -> bool:
-    """Return whether this is PTX, for CUDA, and not LLVM's code, by its first word."""
-    return code.lstrip().startswith(".version")
-
-
 def llvm_target(code: str) -> tuple[str, int] | None:
     """Return the processor and the lanes of vectors in LLVM code; ``None`` if they are not found."""
     name, width = re.search(r'"target-cpu"="([^"]+)"', code), re.search(r"<(\d+) x float>", code)

@@ -150,12 +150,12 @@ def check_distinct(outputs: Mapping[str, object], sources: Mapping[str, object])
 
 
 def _paths(named: Mapping[str, object]) -> list[tuple[str, str | os.PathLike]]:
-    pairs = [(name, v) for name, value in named.items() for v in (value if isinstance(value, list) else [value])]
-    pairs = [
-        (name, os.fspath(path)) for name, path in pairs if isinstance(path, (str, os.PathLike)) and os.fspath(path)
-    ]
-    # FILE#PART names a part of a file
-    pairs = [(name, path if os.path.exists(path) else path.rpartition("#")[0] or path) for name, path in pairs]
+    pairs = []
+    for name, value in named.items():
+        for path in value if isinstance(value, list) else [value]:
+            if isinstance(path, (str, os.PathLike)) and (path := os.fspath(path)):
+                # FILE#PART names a part of a file
+                pairs.append((name, path if os.path.exists(path) else path.rpartition("#")[0] or path))
     return [(name, path) for name, path in pairs if not os.path.isdir(path)]
 
 
@@ -218,14 +218,12 @@ def _create_locked(path: Path) -> tuple[int, Path]:
 
 
 def _lock(handle: int) -> bool:
-    """Lock an open file; return whether no other process holds its lock."""
+    """Lock an open file, if the file system has locks; return whether no other process holds its lock."""
     try:
         if fcntl is not None:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:  # the file system has no locks
-        return True
+    except OSError as e:
+        return not isinstance(e, BlockingIOError)
     return True
 
 
@@ -279,8 +277,7 @@ def _read(read, path: Path, stamp: tuple, form: tuple):
 
 def is_within(folder: str | os.PathLike, name: str | os.PathLike) -> bool:
     """Return whether the path ``name``, from a folder, stays in the folder."""
-    path, inside = os.path.abspath(os.path.join(folder, name)), os.path.abspath(folder)
-    return os.path.commonpath([path, inside]) == inside
+    return Path(os.path.abspath(os.path.join(folder, name))).is_relative_to(os.path.abspath(folder))
 
 
 def path_within(folder: str | os.PathLike, name: str, file: str | os.PathLike) -> Path:

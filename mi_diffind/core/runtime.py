@@ -25,7 +25,6 @@ import re
 import sys
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 from . import compat, threads
@@ -48,19 +47,6 @@ _SYSTEM_PATTERNS = (
 
 _ADVICE = "install one without root by 'pip install karellen-llvm-core' or point DRJIT_LIBLLVM_PATH to one"
 _CORRECT = "correct the path, or unset the variable to use the one of 'pip install karellen-llvm-core'"
-
-
-@dataclass(frozen=True)
-class Choice:
-    """Outcome of the search for LLVM.
-
-    ``path`` is the library to use, or ``None`` to leave the search to Dr.Jit (platforms that we do not search);
-    ``origin`` says where it was found; ``problem`` is a sentence for the user if no library is usable.
-    """
-
-    path: str | None
-    origin: str
-    problem: str | None = None
 
 
 def library_version(path: str) -> int | None:
@@ -106,10 +92,13 @@ def _newest_first(paths) -> list[str]:
     return sorted(usable, key=lambda p: (_named_version(os.path.basename(p)), p), reverse=True)
 
 
-def choose_llvm(environ=os.environ, pip=pip_libraries, system=system_libraries, version=library_version) -> Choice:
+def choose_llvm(
+    environ=os.environ, pip=pip_libraries, system=system_libraries, version=library_version
+) -> tuple[str | None, str | None]:
     """Choose the LLVM library: an explicit setting wins, then pip's, then the system's. Changes nothing.
 
-    The arguments exist for tests: the environment, the two searches and the function that reads a version.
+    Returned are its path (``None``: the search is left to Dr.Jit) and, if none is usable, a sentence for the user. The
+    arguments exist for tests: the environment, the two searches and the function that reads a version.
     """
     if explicit := environ.get(ENV):
         major, problem = version(explicit), None
@@ -120,16 +109,15 @@ def choose_llvm(environ=os.environ, pip=pip_libraries, system=system_libraries, 
                 f"{ENV}={explicit} is LLVM {major if major > 15 else '15 or older'}, with which Dr.Jit aborts: "
                 f"version {MIN_LLVM} or newer is needed: {_CORRECT}."
             )
-        return Choice(explicit, ENV, problem)
+        return explicit, problem
     if not sys.platform.startswith("linux"):
-        return Choice(None, "Dr.Jit's own search")
-    libraries = [("pip", path) for path in pip()] + [("system", path) for path in system()]
-    for origin, path in libraries:
+        return None, None
+    libraries = [*pip(), *system()]
+    for path in libraries:
         if (version(path) or 0) >= MIN_LLVM:
-            return Choice(path, origin)
-    seen = f" (found only {libraries[0][1]}, which is too old)" if libraries else ""
-    problem = f"Dr.Jit's CPU variants need LLVM {MIN_LLVM} or newer and none was found{seen}: {_ADVICE}."
-    return Choice(None, "none", problem)
+            return path, None
+    seen = f" (found only {libraries[0]}, which is too old)" if libraries else ""
+    return None, f"Dr.Jit's CPU variants need LLVM {MIN_LLVM} or newer and none was found{seen}: {_ADVICE}."
 
 
 _problem: str | None = None
@@ -148,7 +136,7 @@ def install(register_plugins: Callable[[], None]) -> None:
     """
     hooks = {}
     if "drjit" in sys.modules:
-        correct_llvm()
+        _correct_llvm()
         threads.settle()
     else:
         hooks["drjit"] = _starting_drjit
@@ -197,11 +185,10 @@ def _followed_by(action: Callable[[], None]):
 def _starting_drjit():
     """Surround the import of Dr.Jit, which then uses the library that :func:`choose_llvm` names, or none."""
     global _problem
-    choice = choose_llvm()
-    _problem = choice.problem
+    path, _problem = choose_llvm()
     with _hidden_llvm() if _problem else contextlib.nullcontext():
-        if _problem is None and choice.path is not None:
-            os.environ[ENV] = choice.path
+        if _problem is None and path is not None:
+            os.environ[ENV] = path
         yield
         running = compat.llvm_version()  # waits for the asynchronous start
     if _problem is None and 0 <= running[0] < MIN_LLVM:  # only where the search was left to Dr.Jit
@@ -211,7 +198,7 @@ def _starting_drjit():
     _warn()
 
 
-def correct_llvm() -> Choice:
+def _correct_llvm() -> None:
     """Make Dr.Jit, which has been imported already, use the library that :func:`choose_llvm` names.
 
     Raises ``ImportError`` with one sentence if Dr.Jit already runs kernels on, or holds objects of, an LLVM that would
@@ -220,16 +207,14 @@ def correct_llvm() -> Choice:
     global _problem
     running = compat.llvm_version()
     if running[0] >= MIN_LLVM:
-        return Choice(os.environ.get(ENV), "already running")
-    choice = choose_llvm()
-    _problem = choice.problem
-    if choice.problem is None and choice.path is not None:
-        _restart_llvm(choice.path)
+        return
+    path, _problem = choose_llvm()
+    if _problem is None and path is not None:
+        _restart_llvm(path)
     elif running[0] >= 0:
         _problem = _problem or f"Dr.Jit found LLVM {running[0]}, with which it aborts: {_ADVICE}."
         _restart_llvm(None)
     _warn()
-    return choice
 
 
 def _warn() -> None:

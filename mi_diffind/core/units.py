@@ -119,7 +119,7 @@ def largest_fitting(fits: Callable[[float], bool], low: float, high: float, step
     while high - low > 1 if steps is None else steps > 0:
         middle = (low + high) // 2 if steps is None else (low + high) / 2
         low, high = (middle, high) if fits(middle) else (low, middle)
-        steps = None if steps is None else steps - 1
+        steps = steps and steps - 1
     return low
 
 

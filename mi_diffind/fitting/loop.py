@@ -113,9 +113,9 @@ UNFINISHED = 0.05
 EXPONENTIAL_RATE = 3.0
 
 
-def exponential_like(u, rate: float = EXPONENTIAL_RATE):
-    """Return a number in [0, 1] with density ∝ exp(−rate·x), from a uniform number ``u`` in [0, 1)."""
-    return dr.minimum(-dr.log(1 - u * (1 - math.exp(-rate))) / rate, 1)
+def exponential_like(u):
+    """Return a number x in [0, 1] with density ∝ exp(−:data:`EXPONENTIAL_RATE`·x), from a uniform ``u`` in [0, 1)."""
+    return dr.minimum(-dr.log(1 - u * (1 - math.exp(-EXPONENTIAL_RATE))) / EXPONENTIAL_RATE, 1)
 
 
 def sample_losses(outputs: Mapping, targets: Mapping, weights: Mapping[str, float], size: int, loss: str) -> list:
@@ -250,6 +250,7 @@ class _Record:
     """Record of a training so far, which a checkpoint keeps beside the state.
 
     ``references`` are running means of the loss by phase, from its first step on, lest an explosion sets them.
+    ``plateau`` holds the factor of the learning rate, the best loss and the step since which both are the same.
     """
 
     best: dict | None = None
@@ -258,7 +259,7 @@ class _Record:
     history: list = field(default_factory=list)
     restarts: int = 0
     seconds: float = 0.0
-    plateau: list = field(default_factory=list)
+    plateau: list = field(default_factory=lambda: [1.0, None, 0])
     references: dict = field(default_factory=dict)
 
 
@@ -290,16 +291,17 @@ def fit(
     net, problem.settings = problem.net, settings
     if checkpoint is not None:
         writable_file(checkpoint)
-        if os.path.exists(checkpoint) and not resume and not _is_checkpoint(checkpoint):
+        if os.path.exists(checkpoint) and not resume and not _checkpoint_meta(checkpoint):
             raise FittingError(f'the checkpoint "{checkpoint}" would replace a file that is not one')
     elif resume:
         raise FittingError("resuming (--resume) needs the checkpoint (--checkpoint FILE) of the run to go on with")
-    trainer, plateau, record = _Trainer(problem, settings), _Plateau(settings), _Record()
+    trainer, record = _Trainer(problem, settings), _Record()
+    # The settings that a checkpoint has to agree in
+    agreed = {**asdict(settings), **json.loads(json.dumps(dict(problem.identity)))}
     if resume:
-        state, record = _load_checkpoint(checkpoint, _all_settings(problem, settings), trainer)
+        state, record = _load_checkpoint(checkpoint, agreed, trainer)
         trainer.restore(state)
         trainer.restarts = record.restarts
-        plateau.restore(record.plateau)
     start = time.perf_counter() - record.seconds
     clock = None if deadline is None else _Clock(start, deadline.left())
 
@@ -333,7 +335,7 @@ def fit(
             # A snapshot of tables that are written in place is a copy
             kept = not problem.sparse or (trainer.step + 1) % settings.check_every == 0
             before, share_before = trainer.earlier() if kept else good, trainer.share
-            loss = trainer.take_step(plateau.factor)
+            loss = trainer.take_step(record.plateau[0])
             if clock is not None:
                 dr.eval(loss)
                 dr.sync_thread()
@@ -348,7 +350,8 @@ def fit(
             if not (due or last or reference is None):
                 continue
             value = float(loss[0])
-            if _has_diverged(value, reference, problem.harmless) or not trainer.finite():
+            exploded = reference is not None and value > 10 * reference + problem.harmless
+            if not math.isfinite(value) or exploded or not trainer.finite():
                 trainer.restarts = record.restarts = record.restarts + 1
                 if record.restarts > 8:
                     raise FittingError(
@@ -365,14 +368,15 @@ def fit(
                 bar.show(trainer)
                 continue
             record.references[trainer.phase] = value if reference is None else 0.5 * (reference + value)
-            plateau.update(trainer.step, value)
+            if settings.schedule == "plateau":
+                record.plateau = _plateau_after(*record.plateau, trainer.step, value, settings)
             bar.show_loss(value)
             good = before  # not the state after this step: nobody has seen its loss yet
             if measured or last:
                 measure(value)
                 if checkpoint is not None:
-                    record.seconds, record.plateau = time.perf_counter() - start, plateau.state()
-                    _save_checkpoint(checkpoint, _all_settings(problem, settings), trainer.snapshot(), record)
+                    record.seconds = time.perf_counter() - start
+                    _save_checkpoint(checkpoint, agreed, trainer.snapshot(), record)
         if stop.is_set() and trainer.share < 1:
             interrupted = True
             history = record.history
@@ -381,7 +385,7 @@ def fit(
 
     if record.best is None:
         raise FittingError("the training was stopped before its first measurement: there is nothing to keep")
-    trainer.load_parameters(record.best)
+    net.update({key: type(trainer.optimizer[key])(value) for key, value in record.best.items()})
     spent = time.perf_counter() - start
     unfinished = clock is not None and not interrupted and trainer.step < UNFINISHED * settings.steps
     return FitResult(
@@ -456,32 +460,13 @@ class _Bar:
         self.shown.set_postfix(self.text, refresh=not self.lines)
 
 
-def _has_diverged(value: float, reference: float | None, harmless: float) -> bool:
-    return not math.isfinite(value) or (reference is not None and value > 10 * reference + harmless)
-
-
-class _Plateau:
-    """Halve the learning rate when the loss has not improved for a tenth of the steps (``schedule="plateau"``)."""
-
-    def __init__(self, settings: FitSettings):
-        self.active = settings.schedule == "plateau"
-        self.patience = max(settings.check_every, settings.steps // 10)
-        self.factor, self.best, self.since = 1.0, math.inf, 0
-
-    def update(self, step: int, loss: float) -> None:
-        if not self.active:
-            return
-        if loss < 0.999 * self.best:
-            self.best, self.since = loss, step
-        elif step - self.since >= self.patience:
-            self.factor, self.since = self.factor / 2, step
-
-    def state(self) -> list:
-        return [self.factor, self.best if math.isfinite(self.best) else None, self.since]
-
-    def restore(self, state: list) -> None:
-        self.factor, best, self.since = state
-        self.best = math.inf if best is None else best
+def _plateau_after(factor: float, best: float | None, since: int, step: int, loss: float, settings) -> list:
+    """Return :attr:`_Record.plateau` after ``step``: the factor halves if no loss improved for a tenth of the steps."""
+    if best is None or loss < 0.999 * best:
+        return [factor, loss, step]
+    if step - since >= max(settings.check_every, settings.steps // 10):
+        return [factor / 2, best, step]
+    return [factor, best, since]
 
 
 class _Trainer:
@@ -494,12 +479,6 @@ class _Trainer:
         self.optimizer = (SparseAdam if problem.sparse else Adam)(lr=settings.lr, beta_2=problem.beta_2)
         self.optimizer.update(problem.net)
         self.module = compat.module_of(next(iter(self.optimizer.values())))
-
-    def learning_rate(self, plateau: float) -> float:
-        rate = self.settings.lr * self.lr_scale
-        if self.settings.schedule == "cosine":
-            rate *= 0.5 * (1 + math.cos(math.pi * self.share))
-        return rate * plateau
 
     def take_step(self, plateau: float = 1.0):
         net, settings = self.problem.net, self.settings
@@ -520,7 +499,10 @@ class _Trainer:
             dr.set_grad(values, 1)
             dr.enqueue(dr.ADMode.Backward, values)
         dr.traverse(dr.ADMode.Backward)
-        rate = self.learning_rate(plateau)
+        rate = settings.lr * self.lr_scale
+        if settings.schedule == "cosine":
+            rate *= 0.5 * (1 + math.cos(math.pi * self.share))
+        rate *= plateau
         self.optimizer.set_learning_rate({name: rate for name in self.optimizer})
         if self.problem.sparse:
             net.clear()  # the tables are written in place
@@ -560,14 +542,6 @@ class _Trainer:
             compat.set_adam_state(self.optimizer, key, value, *moments)
         self.problem.net.update(self.optimizer)
 
-    def load_parameters(self, parameters: dict) -> None:
-        self.problem.net.update({key: type(self.optimizer[key])(value) for key, value in parameters.items()})
-
-
-def _all_settings(problem: Problem, settings: FitSettings) -> dict:
-    """Return the settings that a checkpoint has to agree in."""
-    return {**asdict(settings), **json.loads(json.dumps(dict(problem.identity)))}
-
 
 def _save_checkpoint(path, settings: dict, state: _State, record: _Record) -> None:
     arrays = {}
@@ -595,11 +569,7 @@ def _checkpoint_meta(path) -> dict:
 def checkpoint_settings(path) -> dict:
     """Return the settings of the training and the identity of the problem in a checkpoint; {} if it holds none."""
     settings = _checkpoint_meta(path).get("settings")
-    return dict(settings) if isinstance(settings, dict) else {}
-
-
-def _is_checkpoint(path) -> bool:
-    return bool(_checkpoint_meta(path))
+    return settings if isinstance(settings, dict) else {}
 
 
 def _check_meta(meta: dict) -> None:
@@ -611,14 +581,11 @@ def _check_meta(meta: dict) -> None:
         if type(meta[key]) not in (int, float) or not 0 <= meta[key] < math.inf:
             raise TypeError(f"{key} is {meta[key]!r:.40}")
     figures = [meta["best_measured"], *meta["history"]]
-    if not figures[0] or not all(isinstance(row.get("step", 0), int) for row in figures):
-        raise TypeError("the measurements are not lists of numbers")
-    name = next(iter(figures[0]))
     values = [v for row in figures for v in row.values() if v is not None] + list(meta["references"].values())
     factor, best, since = meta["plateau"]
-    if not all(type(v) in (int, float) for v in (*values, factor, since, best or 0)) or any(
-        name not in r for r in figures
-    ):
+    numbers = all(type(v) in (int, float) for v in (*values, factor, since, best or 0))
+    name = next(iter(figures[0]), None)
+    if not numbers or any(name not in row or not isinstance(row.get("step", 0), int) for row in figures):
         raise TypeError("the measurements are not lists of numbers")
 
 

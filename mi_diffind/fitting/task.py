@@ -126,8 +126,7 @@ class FitRequest:
                 if problem is None:
                     continue
                 request, title = self._stage_request(stage), stage.title or stage.name or None
-                limits = {"times": stage.times, "least": stage.least}
-                results.append(request.train(problem, title, stage.finish, **limits))
+                results.append(request.train(problem, title, stage.finish, stage.times, stage.least))
                 if results[-1].interrupted:
                     break
         return results
@@ -165,11 +164,10 @@ class FitRequest:
 
     def recorded(self, result: FitResult | None = None) -> dict:
         """Return the settings as a table file keeps them: with a limit of time, the steps are those of the result."""
-        settings = asdict(self.settings)
         if self.deadline is None:
-            return settings
+            return asdict(self.settings)
         steps = {} if result is None else {"steps": result.steps}
-        return {**settings, **steps, "seconds": self.deadline.total}
+        return {**asdict(self.settings), **steps, "seconds": self.deadline.total}
 
     @property
     def folder(self) -> Path:

@@ -9,6 +9,7 @@ import zipfile
 
 import numpy as np
 import pytest
+from commands import refused
 
 from mi_diffind import StoredArray, load_model
 from mi_diffind.arrays.tables import Table, load_table, save_table
@@ -59,15 +60,6 @@ def waves(height=16, width=16):
 
 def fit(source, *options, output="out.npz"):
     return main(["fit", "image", str(source), "-o", output, *SHORT, *map(str, options)])
-
-
-def refused(capsys, *arguments):
-    """Run a command that must fail with exit code 2 and one sentence, and return the sentence."""
-    capsys.readouterr()
-    assert main(list(map(str, arguments))) == 2
-    lines = [line for line in capsys.readouterr().err.strip().splitlines() if "error" in line or "Traceback" in line]
-    assert len(lines) == 1 and lines[0].startswith("mi-diffind: error: "), lines
-    return lines[0]
 
 
 def report():

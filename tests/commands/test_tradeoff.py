@@ -115,10 +115,3 @@ def test_bad_input(tmp_path, monkeypatch, capsys, arguments, message):
     assert main(["tradeoff", "disney", *arguments]) == 2
     error = capsys.readouterr().err.strip().splitlines()
     assert len(error) == 1 and error[0].startswith("mi-diffind: error: ") and message in error[0]
-
-
-@pytest.mark.parametrize("arguments", [[], ["nerf"], ["disney", "--rounds", "3"]])
-def test_bad_usage(arguments, capsys):
-    with pytest.raises(SystemExit) as e:
-        main(["tradeoff", *arguments])
-    assert e.value.code == 2
