@@ -72,19 +72,19 @@ class CompressedMaps:
                     images[name][start : start + count, c] = value if isinstance(value, float) else value.numpy()
         return {name: image.reshape(height, width, -1) for name, image in images.items()}
 
-    def bounds(self, name: str) -> list[float] | None:
-        """Return upper bounds of the channels of a map, in its color space, at any place and level of detail.
+    def largest(self, name: str) -> float | None:
+        """Return an upper bound of the values of a map, in its color space, at any place and level of detail.
 
-        A read interpolates entries of the array ``cascaded``, so that none of its values is above the largest entry.
-        ``None`` if the maps have no such array: they interpolate texels.
+        A read interpolates entries of the array ``cascaded``, so that none of its values is above the largest entry; a
+        component that is derived from others reaches 1. ``None`` if texels are interpolated.
         """
+        if FROM_NORMAL in self.layout[name].where:
+            return 1.0
         net = getattr(self, "net", None)
         if net is None:
             return None
         entries = net.cascaded.numpy()
-        largest = self.layout.decode(name, entries.reshape(-1, entries.shape[-1]).max(axis=0).tolist())
-        channels = zip(self.layout[name].where, largest, strict=True)
-        return [1.0 if where == FROM_NORMAL else float(value) for where, value in channels]
+        return float(max(self.layout.decode(name, entries.reshape(-1, entries.shape[-1]).max(axis=0).tolist())))
 
     def measure(self, source: Source) -> dict[str, float]:
         """Return the errors at texel centres against ``source``.

@@ -289,8 +289,8 @@ class MapTexture(base_class("Texture")):
     def max(self):
         self._check_cache()
         if self._max is None:
-            bounds = self._elsewhere(lambda: self.image.bounds(self.map.name))
-            self._max = float(self._decoded().max() if bounds is None else self._linear(np.array(bounds)).max())
+            largest = self._elsewhere(lambda: self.image.largest(self.map.name))
+            self._max = float(self._decoded().max() if largest is None else self._linear(np.array(largest)))
         return self._max
 
     def _decoded(self) -> np.ndarray:
