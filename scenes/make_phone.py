@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 from PIL import Image
 
-from mi_diffind.images import srgb
+from mi_diffind import srgb
 
 ASSETS = Path(__file__).resolve().parent / "assets"
 

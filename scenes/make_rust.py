@@ -15,8 +15,7 @@ import numpy as np
 from scene_xml import ball, element, head, lying, plugin, ref, repeated, sun, write
 
 import mi_diffind as md
-from mi_diffind.images import metrics
-from mi_diffind.scenes import loading
+from mi_diffind import metrics, scenes
 
 ABOUT = """Hammered metal with rust, minified: what a texture that is trained for its shading is for. Written by
 make_rust.py: change that file.
@@ -56,7 +55,9 @@ def picture(json_file: str | None) -> None:
 
     def rendered(file: str, spp: int, exact: bool = False) -> np.ndarray:
         defines = {**PICTURE, "spp": spp, "metal": file}  # the scene's samples scale the footprints
-        return loading.render(loading.load(FOLDER / "rust.xml", defines, exact=exact), passes=max(1, spp // 16))[0]
+        path = FOLDER / "rust.xml"
+        scene = scenes.loading.load(path, defines, exact=True) if exact else md.load_file(path, **defines)
+        return scenes.loading.render(scene, passes=max(1, spp // 16))[0]
 
     files = ("rust_plain.npz", "rust_shaded.npz")
     images, truth = {file: rendered(file, 1) for file in files}, rendered(files[0], 256, exact=True)

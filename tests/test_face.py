@@ -362,9 +362,9 @@ def test_keywords_of_a_study(monkeypatch, tmp_path, mi_rgb):
     source = tmp_path / "a.png"
     Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(source)
     out = tmp_path / "out"
-    result = mi_diffind.tradeoff("image", source, out=out, quick=True, compression=["6x", "12x"], ablation=True)
+    result = mi_diffind.tradeoff("image", source, out=out, quick=True, compression=["6x", "12x"])
     (arguments,) = asked
-    assert arguments.compression == ["6x", "12x"] and arguments.ablation and arguments.source == str(source)
+    assert arguments.compression == ["6x", "12x"] and arguments.source == str(source)
     assert result.figures == {"quick": True} and result.pictures == {"png": str(out / "tradeoff_image.png")}
     assert result._repr_png_() == b"\x89PNG" and str(result).startswith("a line\n")
     with pytest.raises(UsageError, match="tradeoff image: unrecognized arguments: --ratio=6"):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from drjit.opt import Adam
 
-from mi_diffind.fitting.sparse_adam import SparseAdam
+from mi_diffind.fitting.loop import SparseAdam
 
 
 @pytest.fixture

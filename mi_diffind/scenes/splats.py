@@ -244,7 +244,7 @@ def _ply(path: Path) -> tuple[list[np.ndarray], str, str | None]:
     centres, scales, quaternions, opacities, first, others = np.split(columns, (3, 6, 10, 11, 14), axis=1)
     with np.errstate(over="ignore"):
         opacities = 1 / (1 + np.exp(-opacities[:, 0]))
-    others = others.reshape(-1, 3, rest // 3).swapaxes(1, 2)  # all of red first
+    others = others.reshape(len(others), 3, rest // 3).swapaxes(1, 2)  # all of red first
     # Normals are 0 in the files of the reference implementation
     unused = [name for name in names if name not in used and np.any(vertices[name])]
     note = unused_note(path, [], (*unused, *(name for name in elements if name != "vertex")))

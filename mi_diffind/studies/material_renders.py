@@ -345,7 +345,9 @@ def draw(result: dict):
                 at, psnr = [nbytes], psnr[:1]
             panels[case].append(plot.Curve(name, at, psnr, style=style))
     caption = figure_caption(result)
-    return plot.draw_curves(result["title"], caption, panels, "ms of a render", "PSNR, dB", True, columns=3, height=4.2)
+    return plot.draw_curves(
+        result["title"], caption, panels, "ms of a render (last: bytes)", "PSNR, dB", True, columns=3, height=4.2
+    )
 
 
 def run_renders(name: str, source: Source, tables: Sequence[Table], settings: RenderSettings, folder: str) -> Tradeoff:

@@ -106,9 +106,9 @@ def lie_in_json(draw, content, among=lambda path: True) -> tuple:
 
 @st.composite
 def json_mutants(draw, content) -> Mutant:
-    """JSON content with one to three lies."""
+    """JSON content with one or two lies."""
     content = json.loads(json.dumps(content))
-    lies = [lie_in_json(draw, content) for _ in range(draw(st.integers(1, 3)))]
+    lies = [lie_in_json(draw, content) for _ in range(draw(st.sampled_from((1, 1, 2))))]
     return Mutant(dump(content), lies=lies)
 
 
@@ -301,7 +301,7 @@ def record(draw, data: bytes) -> bytes:
 @st.composite
 def archive_mutants(draw, data: bytes) -> Mutant:
     """An archive with lies in its content, in its records, or in both."""
-    number = draw(st.integers(0, 3))
+    number = draw(st.sampled_from((0, 1, 1, 2, 3)))
     archive, lies = Archive(data), draw(st.lists(st.sampled_from(ARCHIVE_LIES), min_size=number, max_size=number))
     names, untouched = sorted(archive.arrays), None
     for lie in lies:
@@ -366,8 +366,8 @@ BYTE_LIES = (other_bytes, cut, repeated, inserted)
 
 @st.composite
 def mutants(draw, data: bytes, lies=BYTE_LIES) -> Mutant:
-    """Any file with one to three lies."""
-    chosen = draw(st.lists(st.sampled_from(lies), min_size=1, max_size=3))
+    """Any file with one or two lies."""
+    chosen = draw(st.lists(st.sampled_from(lies), min_size=1, max_size=2))
     for lie in chosen:
         data = lie(draw, data)
     return Mutant(data, lies=[lie.__name__ for lie in chosen])

@@ -249,6 +249,24 @@ def test_light_is_that_of_path(mi_rgb):
         assert (np.abs(a.mean(0) - b.mean(0)) < 5 * error + 1e-6).all(), (bsdf, given, a.mean(0), b.mean(0), error)
 
 
+def test_spheres_behind_hidden_emitters(mi_rgb):
+    """Shaded where they are: with a hidden lamp that sends no light before the camera as without it."""
+    mi, images = mi_rgb, []
+    place = mi.ScalarTransform4f().translate([0, -4, 0]).rotate([1, 0, 0], 90)
+    lamp = {
+        "type": "rectangle",
+        "to_world": place,
+        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 0}},
+    }
+    for more in ({}, {"lamp": lamp}):
+        camera = fp.sensor(to_world=fp.look_at([0, -5, 0], [0, 0, 0], [0, 0, 1]), fov=30, film=SIZE)
+        light = {"type": "point", "position": [-6, -6, 6], "intensity": 40.0}
+        scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere"}, "light": light, "sensor": camera, **more})
+        integrator = mi.load_dict({"type": "path_footprint", "max_depth": 2, "hide_emitters": True})
+        images.append(np.array(mi.render(scene, spp=256, integrator=integrator)))
+    assert images[0].mean() > 0.01 and np.abs(images[0] - images[1]).mean() < 0.1 * images[0].mean()
+
+
 def test_centres_of_pixels_and_parameters(mi_rgb):
     mi = mi_rgb
     scene = mi.load_dict(lit(mi, {"type": "diffuse"}))

@@ -11,7 +11,7 @@ import json
 import campaigns
 import pytest
 import trial_files
-from damage import MUTANTS
+from damage import MUTANTS, Mutant
 from limited_child import FAULTS, LimitedChild
 
 from mi_diffind.fitting.task import tasks
@@ -49,6 +49,14 @@ def test_damaged_files(child, name, structured, raw, share):
         figures = campaigns.run(child, name, target, form, count, share=share)
         assert figures["mutants"] >= min(count, 2)
         assert not any(figures[fault] for fault in FAULTS), json.dumps(figures["faults"], indent=1, default=repr)
+
+
+@pytest.mark.parametrize("name", campaigns.OTHERS)
+def test_undamaged_files_load(child, name):
+    target = campaigns.target(name, child)
+    file, _ = target.mutants["raw"]
+    answer = child.check(target.probe, **target.write(child.folder, file, Mutant(target.files[file])))
+    assert answer["outcome"] == "loaded", answer
 
 
 @pytest.mark.slow
