@@ -192,17 +192,3 @@ def test_more_than_fits_is_refused(monkeypatch):
     units.check_size("bytes", 2**20, 2**20)
     with pytest.raises(UsageError, match="bytes: found 1,048,577 bytes, a table file holds at most 1,048,576"):
         units.check_size("bytes", 2**20 + 1, 2**20)
-
-
-@pytest.mark.parametrize("threshold", [-3, 0, 1, 7, 99, 100, 250])
-def test_largest_fitting(threshold):
-    tried = []
-
-    def fits(n):
-        tried.append(n)
-        return n <= threshold
-
-    assert units.largest_fitting(fits, 0, 100) == min(max(threshold, 0), 99)
-    assert len(tried) <= 7 and all(0 < n < 100 for n in tried)
-    assert units.largest_fitting(fits, 5, 6) == 5
-    assert units.largest_fitting(lambda x: x * x <= 2, 0.0, 2.0, steps=40) == pytest.approx(2**0.5)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 from .errors import UsageError
 
@@ -108,19 +108,6 @@ def _positive(text, ending: str, quantity: str, example: str) -> tuple[float, re
     if not (value > 0 and math.isfinite(value)):
         raise ValueError(f"{text!r} is not {quantity}, allowed are finite numbers > 0 such as {example}")
     return value, match
-
-
-def largest_fitting(fits: Callable[[float], bool], low: float, high: float, steps: int | None = None) -> float:
-    """Return the largest number from ``low`` to below ``high`` that ``fits``, by bisection; ``low`` if none does.
-
-    ``fits`` holds up to some number and not beyond, such as "this side takes at most so many bytes". Both ends are
-    whole numbers, and so is the result; with ``steps``, they are real numbers and are halved that often.
-    """
-    while high - low > 1 if steps is None else steps > 0:
-        middle = (low + high) // 2 if steps is None else (low + high) / 2
-        low, high = (middle, high) if fits(middle) else (low, middle)
-        steps = None if steps is None else steps - 1
-    return low
 
 
 def labelled(figures: Mapping[str, float]) -> list[str]:

@@ -198,6 +198,13 @@ def root(v):
     return dr.select(v > 1e-6, dr.sqrt(dr.maximum(v, 1e-6)), 0)
 
 
+def mean_square(values: list, truth: list) -> float:
+    """Return the mean squared difference of channels, Dr.Jit arrays."""
+    squares = [dr.square(a - b) for a, b in zip(values, truth, strict=True)]
+    dr.eval(squares)  # one kernel in place of one for each channel
+    return sum(float(dr.mean(s)[0]) for s in squares) / len(squares)
+
+
 def decibel(mse: float) -> float:
     """Return the PSNR of a mean squared error, for a peak of 1, at most 120 dB."""
     return -10 * math.log10(max(mse, 1e-12))

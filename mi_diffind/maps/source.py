@@ -62,6 +62,8 @@ class Content:
     y_down: bool = False
 
 
+_NORMALS = ("normal", "normals", "normalmap", "nrm", "nor", "norm")
+
 #: Content → names of maps. Normal maps may have an end that tells whether y points down, as in DirectX.
 _NAMES = {
     Content("albedo", colours=True): "albedo basecolor basecolour base basemap diff diffuse diffusecolor diffusecolour "
@@ -75,7 +77,7 @@ _NAMES = {
     Content("other", packed=True): "arm orm rma mra mro metallicroughness metalrough occlusionroughnessmetallic "
     "metallicsmoothness metallicgloss maskmap",
     **{
-        Content("normal", y_down=down): " ".join(f"normal{e} normals{e} normalmap{e} nrm{e} nor{e} norm{e}" for e in ends)
+        Content("normal", y_down=down): " ".join(name + end for name in _NORMALS for end in ends)
         for down, ends in ((False, ("", "gl", "ogl", "opengl")), (True, ("dx", "directx", "d3d")))
     },
 }

@@ -116,7 +116,7 @@ class MapTexture(base_class("Texture")):
     def _update_transformation(self) -> None:
         m = self.to_uv.matrix
         matrix = [[float(m[i, j]) for j in range(3)] for i in range(3)]
-        identity = matrix == [[float(i == j) for j in range(3)] for i in range(3)]
+        identity = matrix == np.eye(3).tolist()
         self._transform = None if identity else self._shared.transform(matrix)
         self._permutes = textures.permutes_corners(matrix)
         self._update_key()
@@ -363,7 +363,7 @@ class MapTexture(base_class("Texture")):
 
     def _storage(self) -> dict:
         """Return the part of :meth:`report` on the arrays."""
-        return tables.described(self._shared.preset, self._shared.arrays)
+        return tables.described(self._shared.table.preset if self._shared.table else "", self._shared.arrays)
 
     def _description(self) -> list[str]:
         """Return the lines of :meth:`to_string`."""

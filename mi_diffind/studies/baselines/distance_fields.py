@@ -19,7 +19,6 @@ import numpy as np
 from ...arrays.lookup import clamp
 from ...arrays.sparse_grid import CORNERS, SparseGrid
 from ...core.files import replacing
-from ...core.units import largest_fitting
 from ...fitting.loop import Problem
 from ...maps.compressed import decibel
 from ...tasks.sdf import nodes
@@ -167,11 +166,12 @@ def dense(types, distances: Distances, spacing: float, train: bool = False) -> B
 
 def dense_spacing(mesh: Mesh, nbytes: int) -> float:
     """Return the spacing of the finest :func:`dense` grid of ``nbytes``."""
-
-    def fits(fineness: float) -> bool:
-        return np.prod(_dense_cells(mesh, math.exp(-fineness)) + 1.0) <= nbytes
-
-    return math.exp(-largest_fitting(fits, 0.0, math.log(1e4), steps=40))
+    low, high = 0.0, math.log(1e4)
+    for _ in range(40):
+        fineness = (low + high) / 2
+        fits = np.prod(_dense_cells(mesh, math.exp(-fineness)) + 1.0) <= nbytes
+        low, high = (fineness, high) if fits else (low, fineness)
+    return math.exp(-low)
 
 
 def _dense_cells(mesh: Mesh, spacing: float) -> np.ndarray:

@@ -570,7 +570,10 @@ def test_sources_that_cannot_be_shaded_are_refused(ad, start, tmp_path):
     for maps, message in (
         ({"height": small["roughness"]}, "found no map that shading reads, these are albedo, normal"),
         ({"albedo": zeros}, 'map "albedo": found 2 channels, allowed for albedo are 1 or 3'),
-        ({"albedo": small["albedo"], "diffuse": small["albedo"]}, 'map "diffuse": found a second albedo beside "albedo'),
+        (
+            {"albedo": small["albedo"], "diffuse": small["albedo"]},
+            'map "diffuse": found a second albedo',
+        ),
     ):
         with pytest.raises(UsageError, match=message):
             material.effects_of(pyramid_of(maps, ad)[1].layout)
