@@ -313,20 +313,7 @@ def test_cut_short(tmp_path, capfd, extension, size):
     load_source(tmp_path / f"whole.{extension}")
     path = tmp_path / f"cut.{extension}"
     count = len(data)
-    for length in (
-        0,
-        1,
-        4,
-        8,
-        20,
-        count // 4,
-        count // 2,
-        count * 3 // 4,
-        count - 20,
-        count - 12,
-        count - 2,
-        count - 1,
-    ):
+    for length in (0, 1, 4, 8, 20, *(count * k // 4 for k in (1, 2, 3)), *(count - k for k in (20, 12, 2, 1))):
         path.write_bytes(data[:length])
         with pytest.raises(SourceError) as e:
             load_source(path)
