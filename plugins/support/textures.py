@@ -257,12 +257,6 @@ _cones: weakref.WeakValueDictionary = weakref.WeakValueDictionary()
 _cone_lock = threading.RLock()  # a thread that waits for a kernel may go on with another constructor
 
 
-def in_texels(ddx: mi.Vector2f, ddy: mi.Vector2f, size: tuple[int, int]) -> tuple[mi.Vector2f, mi.Vector2f]:
-    """Return the footprint in texels of an image of ``size`` (width, height)."""
-    scale = mi.Vector2f(*size)
-    return ddx * scale, ddy * scale
-
-
 def isotropic(ddx: mi.Vector2f, ddy: mi.Vector2f) -> mi.Float:
     """Return the level whose texels have the area of a footprint, which is given in texels of the image."""
     return 0.5 * _log2(footprint.area(ddx, ddy))
@@ -283,11 +277,6 @@ def anisotropic(ddx: mi.Vector2f, ddy: mi.Vector2f, taps: int) -> tuple[mi.Float
 def _log2(x):
     """Return the binary logarithm of a length or an area in texels, 0 below 1."""
     return dr.log2(dr.clip(x, 1, LARGEST**2))
-
-
-def offsets(taps: int) -> list[float]:
-    """Return the places of the taps along the major axis, relative to its middle."""
-    return [(k + 0.5) / taps - 0.5 for k in range(taps)]
 
 
 def hit_numbers(si: mi.SurfaceInteraction3f) -> tuple[mi.Float, mi.Float]:
