@@ -19,7 +19,7 @@ from mi_diffind.tasks.texture import TASK
 from . import Counterpart, Plugin
 from .disney import Disney, Parameters, ShadedPoint, to_principled
 from .support import properties, textures
-from .support.image_files import SharedMaps, layout_of, open_compressed, to_bitmap, to_mipmap
+from .support.image_files import SharedMaps, layout_of, open_compressed, remove, to_bitmap, to_mipmap
 from .support.manual import shared_parts
 from .support.map_textures import FilteredTexture
 from .support.textures import FILTERS, anisotropic, isotropic
@@ -454,15 +454,11 @@ def _convert(props: mi.Properties, bsdf: str, texture: str) -> str:
             inner[parameter] = shown(m.name)
     if bsdf == "principled":
         to_principled(inner)
-        if "effects" in inner:
-            del inner["effects"]
+        remove(inner, "effects")
     if "normal" in maps and maps["normal"].low < 0:
         raise RuntimeError(f'{props["filename"]}: the map "normal" has negative values, which normalmap does not take')
-    outer = [
-        *(["normalmap"] if "normal" in maps else []), *(["twosided"] if sides else []),
-        *(["mask"] if "opacity" in maps else []),
-    ]  # fmt: skip
-    for name in outer:
+    outer = {"normalmap": "normal" in maps, "twosided": sides, "mask": "opacity" in maps}
+    for name in (name for name, needed in outer.items() if needed):
         around = mi.Properties(name)
         around["nested"] = mi.PluginManager.instance().create_object(inner)
         if name == "normalmap":
@@ -470,8 +466,7 @@ def _convert(props: mi.Properties, bsdf: str, texture: str) -> str:
         if name == "mask":
             around["opacity"] = shown(maps["opacity"].name)
         inner = around
-    for key in list(props):
-        del props[key]
+    remove(props, *list(props))
     for key in inner:
         props[key] = inner[key]
     return inner.plugin_name()

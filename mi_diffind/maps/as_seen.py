@@ -105,14 +105,13 @@ def sensitivities(source: Source, types: ModuleType) -> dict[str, float]:
     A little noise (:data:`NOISE`) is added to one map after the other, and pictures from near, of few samples, are
     compared with those of the source. A map that is not shown has 0.
     """
-    truth = by_role(source, {m.name: m.values for m in source.maps})
+    truth = {m.name: m.values for m in source.maps}
     rng = np.random.default_rng(2023)
-    squares = dict.fromkeys((m.name for m in source.maps), 0.0)
-    references = render(truth, types, NEAR, FEW_SAMPLES)
-    for role, m in _roles(source).items():
+    squares = dict.fromkeys(truth, 0.0)
+    references = render(by_role(source, truth), types, NEAR, FEW_SAMPLES)
+    for m in _roles(source).values():
         change = NOISE * rng.choice(np.float32([-1, 1]), m.values.shape)
-        noisy = by_role(source, {other.name: other.values for other in source.maps} | {m.name: m.values + change})
-        pictures = render({**truth, role: noisy[role]}, types, NEAR, FEW_SAMPLES)
+        pictures = render(by_role(source, truth | {m.name: m.values + change}), types, NEAR, FEW_SAMPLES)
         errors = [squared_error(references[way], pictures[way]) for way in NEAR]
         squares[m.name] = float(np.mean(errors)) / (NOISE**2 * m.channels)
     return squares
@@ -242,11 +241,8 @@ def _variant(types: ModuleType) -> Iterator[None]:
     """Set the variant of Mitsuba of RGB colours on the device of ``types``, and afterwards the earlier one again."""
     import mitsuba as mi
 
-    before, wanted = mi.variant(), f"{types.__name__.split('.')[1]}_ad_rgb"
-    if before == wanted:
-        yield
-        return
-    mi.set_variant(wanted)
+    before = mi.variant()
+    mi.set_variant(f"{types.__name__.split('.')[1]}_ad_rgb")
     try:
         yield
     finally:

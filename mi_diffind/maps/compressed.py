@@ -72,19 +72,19 @@ class CompressedMaps:
                     images[name][start : start + count, c] = value if isinstance(value, float) else value.numpy()
         return {name: image.reshape(height, width, -1) for name, image in images.items()}
 
-    def bounds(self, name: str) -> list[float] | None:
-        """Return upper bounds of the channels of a map, in its color space, at any place and level of detail.
+    def largest(self, name: str) -> float | None:
+        """Return an upper bound of the values of a map, in its color space, at any place and level of detail.
 
-        A read interpolates entries of the array ``cascaded``, so that none of its values is above the largest entry.
-        ``None`` if the maps have no such array: they interpolate texels.
+        A read interpolates entries of the array ``cascaded``, so that none of its values is above the largest entry; a
+        component that is derived from others reaches 1. ``None`` if texels are interpolated.
         """
+        if FROM_NORMAL in self.layout[name].where:
+            return 1.0
         net = getattr(self, "net", None)
         if net is None:
             return None
         entries = net.cascaded.numpy()
-        largest = self.layout.decode(name, entries.reshape(-1, entries.shape[-1]).max(axis=0).tolist())
-        channels = zip(self.layout[name].where, largest, strict=True)
-        return [1.0 if where == FROM_NORMAL else float(value) for where, value in channels]
+        return float(max(self.layout.decode(name, entries.reshape(-1, entries.shape[-1]).max(axis=0).tolist())))
 
     def measure(self, source: Source) -> dict[str, float]:
         """Return the errors at texel centres against ``source``.
@@ -196,6 +196,13 @@ def taps(x: np.ndarray, n: int, border: str) -> list:
 def root(v):
     """Return the square root, 0 for negative numbers; its derivative is finite everywhere."""
     return dr.select(v > 1e-6, dr.sqrt(dr.maximum(v, 1e-6)), 0)
+
+
+def mean_square(values: list, truth: list) -> float:
+    """Return the mean squared difference of channels, Dr.Jit arrays."""
+    squares = [dr.square(a - b) for a, b in zip(values, truth, strict=True)]
+    dr.eval(squares)  # one kernel in place of one for each channel
+    return sum(float(dr.mean(s)[0]) for s in squares) / len(squares)
 
 
 def decibel(mse: float) -> float:

@@ -15,9 +15,10 @@ from ..core.errors import UsageError
 from ..core.files import replacing
 from ..core.threads import threads_for_files
 from ..fitting.loop import FitResult, Problem
-from ..fitting.task import FitRequest, Model
+from ..fitting.task import FitRequest, Fitted, Model
 from ..images import srgb
 from . import as_seen
+from .arguments import size_figures
 from .compressed import CompressedMaps, map_figure
 from .source import Source, load_source
 
@@ -85,6 +86,24 @@ def fit_maps(
     table.preset, table.seed = request.preset, request.settings.seed
     table.measured = significant(errors(table))
     return table, result
+
+
+def rehearse_pictures(request: FitRequest, source: Source) -> None:
+    """Render the pictures of a source before a training whose time is limited: their measurement takes as long."""
+    if request.deadline is not None and as_seen.shows(source):
+        request.deadline.rehearse(lambda: as_seen.reference(source, request.types))
+
+
+def complete(
+    request: FitRequest, source: Source, fitted: Fitted, image: CompressedMaps, requested: float | None
+) -> Fitted:
+    """Add to the result of a training what pictures, sizes and the source say; ``requested`` are the bytes wanted."""
+    fitted.table.measured |= significant(as_seen.measure(source, image))
+    fitted.table.settings |= request.paths(source_path=request.options["source"])
+    figures, lines = size_figures(source, fitted.table, requested)
+    fitted.lines += [*lines, *source.notes]
+    fitted.figures = {**figures, **fitted.figures}
+    return fitted
 
 
 def significant(figures: Mapping[str, float]) -> dict[str, float]:

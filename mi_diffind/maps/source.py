@@ -36,31 +36,6 @@ from ..images.headers import check_picture
 #: Roles of maps.
 ROLES = ("albedo", "normal", "roughness", "ao", "metallic", "other")
 
-#: Role → names. Those of ``"other"`` are colours (sRGB) or data (linear), some of which pack several maps.
-ALBEDO = (
-    *("albedo", "basecolor", "basecolour", "base", "basemap", "diff", "diffuse", "diffusecolor", "diffusecolour"),
-    *("color", "colour", "col", "maintex", "albedotransparency"),
-)
-NORMAL = ("normal", "normals", "normalmap", "nrm", "nor", "norm")
-ROUGHNESS = ("roughness", "rough", "specularroughness")
-AO = ("ao", "occlusion", "ambientocclusion", "mixedao")
-METALLIC = ("metallic", "metalness", "metal", "basemetalness")
-COLOURS = ("emissive", "emission", "emit", "translucency", "speccolor", "specularcolor")
-DATA = (
-    *("data", "alpha", "opacity", "mask", "height", "disp", "displacement", "bump", "cavity", "curvature", "thickness"),
-    *("spec", "specular", "gloss", "glossiness", "smoothness", "anisotropy", "transmission", "parallax", "refl"),
-)
-PACKED = (
-    *("arm", "orm", "rma", "mra", "mro", "metallicroughness", "metalrough", "occlusionroughnessmetallic"),
-    *("metallicsmoothness", "metallicgloss", "maskmap"),
-)
-
-#: Ends of the names of normal maps → whether y points down in the image's green channel, as DirectX has it.
-NORMAL_FORMS = {
-    "": False, "gl": False, "ogl": False, "opengl": False,
-    "dx": True, "directx": True, "d3d": True,
-}  # fmt: skip
-
 #: Words before the others that name a further lobe: its colour is no albedo, its roughness not that of the material.
 LOBES = {
     *("sheen", "specular", "spec", "coat", "clearcoat", "emission", "emissive", "subsurface", "transmission", "detail"),
@@ -87,16 +62,26 @@ class Content:
     y_down: bool = False
 
 
-_CONTENTS = {
-    **dict.fromkeys(ALBEDO, Content("albedo", colours=True)),
-    **{name + form: Content("normal", y_down=down) for name in NORMAL for form, down in NORMAL_FORMS.items()},
-    **dict.fromkeys(ROUGHNESS, Content("roughness")),
-    **dict.fromkeys(AO, Content("ao")),
-    **dict.fromkeys(METALLIC, Content("metallic")),
-    **dict.fromkeys(COLOURS, Content("other", colours=True)),
-    **dict.fromkeys(DATA, Content("other")),
-    **dict.fromkeys(PACKED, Content("other", packed=True)),
+_NORMALS = ("normal", "normals", "normalmap", "nrm", "nor", "norm")
+
+#: Content → names of maps. Normal maps may have an end that tells whether y points down, as in DirectX.
+_NAMES = {
+    Content("albedo", colours=True): "albedo basecolor basecolour base basemap diff diffuse diffusecolor diffusecolour "
+    "color colour col maintex albedotransparency",
+    Content("roughness"): "roughness rough specularroughness",
+    Content("ao"): "ao occlusion ambientocclusion mixedao",
+    Content("metallic"): "metallic metalness metal basemetalness",
+    Content("other", colours=True): "emissive emission emit translucency speccolor specularcolor",
+    Content("other"): "data alpha opacity mask height disp displacement bump cavity curvature thickness spec specular "
+    "gloss glossiness smoothness anisotropy transmission parallax refl",
+    Content("other", packed=True): "arm orm rma mra mro metallicroughness metalrough occlusionroughnessmetallic "
+    "metallicsmoothness metallicgloss maskmap",
+    **{
+        Content("normal", y_down=down): " ".join(name + end for name in _NORMALS for end in ends)
+        for down, ends in ((False, ("", "gl", "ogl", "opengl")), (True, ("dx", "directx", "d3d")))
+    },
 }
+_CONTENTS = {name: content for content, names in _NAMES.items() for name in names.split()}
 
 #: Most words of a name of :data:`_CONTENTS`.
 _LONGEST = 3
@@ -212,7 +197,6 @@ def load_source(source, nonfinite: str = "error", named: bool = True) -> Source:
     NaN and infinite values are an error. With ``nonfinite="clean"`` NaN becomes 0 and infinity the largest (negative:
     the smallest) finite value of the channel, 0 if there is none. Raises :class:`SourceError`.
     """
-    _check_nonfinite(nonfinite)
     if isinstance(source, Source):
         return source
     if isinstance(source, dict):
@@ -259,7 +243,6 @@ def from_arrays(arrays: dict, color_spaces: dict[str, str] | None = None, nonfin
     are a manifest's, or those that a bitmap states; ``"image"`` of 1 or 3 channels counts as an albedo. ``nonfinite``
     is that of :func:`load_source`. Raises :class:`SourceError`.
     """
-    _check_nonfinite(nonfinite)
     color_spaces = dict(color_spaces or {})
     maps = []
     for name, array in arrays.items():
@@ -453,7 +436,7 @@ _JPEG_MARKER = re.compile(rb"\xff+([\x01-\xcf\xd8-\xfe])")  # without the marker
 
 def _check_complete(path: Path, data: bytes) -> None:
     """Raise :class:`SourceError` for faults that Mitsuba's decoders accept: a missing end, colours of a palette."""
-    if data.startswith(b"\x89PNG\r\n\x1a\n") and not _png_ends(data):
+    if data.startswith(b"\x89PNG\r\n\x1a\n") and b"IEND\xaeB`\x82" not in data:
         raise SourceError(f"{path}: is cut short, a PNG file ends with an IEND chunk")
     if data.startswith(b"\xff\xd8\xff") and not _jpeg_ends(data):
         raise SourceError(f"{path}: is cut short, a JPEG file ends with an end-of-image marker")
@@ -462,16 +445,6 @@ def _check_complete(path: Path, data: bytes) -> None:
         entries = min(int.from_bytes(data[46:50], "little") or 256, 256)
         if any(set(data[start + 4 * i : start + 4 * i + 3]) != {i} for i in range(entries)):
             raise SourceError(f"{path}: is a BMP file with a palette, which is not supported")
-
-
-def _png_ends(data: bytes) -> bool:
-    """Return whether a PNG file has its last chunk."""
-    position = 8
-    while position + 12 <= len(data):
-        if data[position + 4 : position + 8] == b"IEND":
-            return True
-        position += 12 + int.from_bytes(data[position : position + 4], "big")
-    return False
 
 
 def _jpeg_ends(data: bytes) -> bool:
@@ -522,16 +495,10 @@ def _share_of_normals(values: np.ndarray) -> float:
     return float((unit & (normals[..., 2] > 0)).mean())
 
 
-def _inverted(values: np.ndarray) -> np.ndarray:
-    """Return normals with their second component inverted, in integers or floats, signed or stored as (n + 1)/2."""
-    values = values.copy()
-    one = np.iinfo(values.dtype).max if values.dtype.kind == "u" else 0 if (values < 0).any() else 1
-    values[..., 1] = one - values[..., 1]
-    return values
-
-
 def _assemble(raw: list[_RawMap], where, nonfinite: str, notes: list[str] = ()) -> Source:
     """Return the source of some maps. Raises :class:`SourceError` if they do not go together."""
+    if nonfinite not in NONFINITE:
+        raise ValueError(f'nonfinite: found "{nonfinite}", allowed are {NONFINITE}')
     if not raw:
         raise SourceError(f"{where}: has no maps")
     first = raw[0]
@@ -560,7 +527,12 @@ def _assemble(raw: list[_RawMap], where, nonfinite: str, notes: list[str] = ()) 
             srgb = m.content.colours and number_type in _ENCODED and m.values.shape[2] in (1, 3)
             color_space = "srgb" if srgb else "linear"
         notes += _notes_on(m)
-        values = _inverted(m.values) if m.content.y_down and m.name != "image" else m.values
+        values = m.values
+        if m.content.y_down and m.name != "image":
+            # Normals of integers or floats, signed or stored as (n + 1)/2
+            one = np.iinfo(values.dtype).max if values.dtype.kind == "u" else 0 if (values < 0).any() else 1
+            values = values.copy()
+            values[..., 1] = one - values[..., 1]
         with np.errstate(over="ignore"):  # float64 beyond float32 becomes infinite and is reported below
             values = values.astype("<f4", order="C")
         if number_type in _ENCODED:
@@ -617,9 +589,3 @@ def _check_name(where, name) -> None:
     """Raise :class:`SourceError` for a name of a map that is no identifier."""
     if not isinstance(name, str) or not name.isidentifier():
         raise SourceError(f"{where}: a map is called {name!r:.40}, allowed are letters, digits and _ (no digit first)")
-
-
-def _check_nonfinite(nonfinite: str) -> None:
-    """Raise ``ValueError`` for an unknown way to treat NaN and infinity."""
-    if nonfinite not in NONFINITE:
-        raise ValueError(f'nonfinite: found "{nonfinite}", allowed are {NONFINITE}')

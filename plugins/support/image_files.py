@@ -70,11 +70,6 @@ class SharedMaps:
         self._transforms = {}
 
     @property
-    def preset(self) -> str:
-        """Preset of the table, "" without one."""
-        return self.table.preset if self.table else ""
-
-    @property
     def tables(self) -> dict:
         """Arrays that can be optimised, by name."""
         return exposed(self.arrays)

@@ -26,10 +26,8 @@ from .textures import (
     anisotropic,
     cone_of,
     hit_numbers,
-    in_texels,
     isotropic,
     luminance,
-    offsets,
 )
 
 #: Most texels that are decoded for the mean, the maximum and the sampling of positions; larger images are reduced.
@@ -116,7 +114,7 @@ class MapTexture(base_class("Texture")):
     def _update_transformation(self) -> None:
         m = self.to_uv.matrix
         matrix = [[float(m[i, j]) for j in range(3)] for i in range(3)]
-        identity = matrix == [[float(i == j) for j in range(3)] for i in range(3)]
+        identity = matrix == np.eye(3).tolist()
         self._transform = None if identity else self._shared.transform(matrix)
         self._permutes = textures.permutes_corners(matrix)
         self._update_key()
@@ -289,8 +287,8 @@ class MapTexture(base_class("Texture")):
     def max(self):
         self._check_cache()
         if self._max is None:
-            bounds = self._elsewhere(lambda: self.image.bounds(self.map.name))
-            self._max = float(self._decoded().max() if bounds is None else self._linear(np.array(bounds)).max())
+            largest = self._elsewhere(lambda: self.image.largest(self.map.name))
+            self._max = float(self._decoded().max() if largest is None else self._linear(np.array(largest)))
         return self._max
 
     def _decoded(self) -> np.ndarray:
@@ -363,7 +361,7 @@ class MapTexture(base_class("Texture")):
 
     def _storage(self) -> dict:
         """Return the part of :meth:`report` on the arrays."""
-        return tables.described(self._shared.preset, self._shared.arrays)
+        return tables.described(self._shared.table.preset if self._shared.table else "", self._shared.arrays)
 
     def _description(self) -> list[str]:
         """Return the lines of :meth:`to_string`."""
@@ -447,14 +445,14 @@ class FilteredTexture(MapTexture):
         uv = uv + dr.detach(footprint.to_centre(self.cone, si, ddx, ddy)) / mi.Vector2f(*self._size)
         if self.filter.name == "trilinear":
             return self._used_of(self._filtered(uv, isotropic(ddx, ddy)))
-        level, axis = anisotropic(ddx, ddy, self.filter.taps)
+        taps = self.filter.taps
+        level, axis = anisotropic(ddx, ddy, taps)
         axis = axis / mi.Vector2f(*self._size)
         if self.filter.name == "anisotropic":
-            taps = [self._filtered(dr.fma(axis, x, uv), level) for x in offsets(self.filter.taps)]
-            scale = 1 / len(taps)
-            return self._used_of([sum(channel[1:], channel[0]) * scale for channel in zip(*taps, strict=True)])
+            values = [self._filtered(dr.fma(axis, (k + 0.5) / taps - 0.5, uv), level) for k in range(taps)]
+            scale = 1 / taps
+            return self._used_of([sum(channel[1:], channel[0]) * scale for channel in zip(*values, strict=True)])
         choice, rounding = hit_numbers(si)
-        taps = self.filter.taps
         if taps > 1:
             uv = dr.fma(axis, (dr.floor(choice * taps) + 0.5) * (1 / taps) - 0.5, uv)
         return self._used_of(self._rounded(uv, level, rounding))
@@ -468,7 +466,8 @@ class FilteredTexture(MapTexture):
             if self._transform is not None:
                 m = self._transform.matrix
                 ddx, ddy = footprint.transform(ddx, ddy, [[m[i, j] for j in range(2)] for i in range(2)])
-            return in_texels(ddx, ddy, self._size)
+            size = mi.Vector2f(*self._size)
+            return ddx * size, ddy * size
 
     def _filtered(self, uv, level) -> list:
         """Return the values of one place at a level of detail, in a form that can be averaged (:meth:`_used_of`).

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import threading
 import weakref
@@ -14,6 +15,7 @@ import numpy as np
 from mi_diffind.arrays.indirection import DifferentiableArray, fold
 from mi_diffind.arrays.lookup import clamp
 from mi_diffind.core import compat
+from mi_diffind.maps.pyramid import around
 
 from . import footprint, properties
 
@@ -109,20 +111,11 @@ class PositionDistribution:
 
     def density(self, uv, active):
         """Return the density at ``uv``: the bilinear interpolation of the texels' probabilities per area."""
-        corners = []
-        for x, n in zip((uv.x, uv.y), self.size, strict=True):
-            position = dr.fma(clamp(x, 0.0, 1.0), n, -0.5)
-            lower = dr.floor(position)
-            i, w = mi.Int32(lower), position - lower
-            if self.repeats:
-                both = dr.select(i < 0, n - 1, i), dr.select(i + 1 >= n, 0, i + 1)
-            else:
-                both = dr.maximum(i, 0), dr.minimum(i + 1, n - 1)
-            corners.append(list(zip(both, (1 - w, w), strict=True)))
+        border = "repeat" if self.repeats else "clamp"
+        columns, rows = (around(clamp(x, 0.0, 1.0), n, border) for x, n in zip(uv, self.size, strict=True))
         total = 0
-        for i, a in corners[0]:
-            for j, b in corners[1]:
-                total = total + a * b * self.distribution.pdf(mi.Point2u(mi.UInt32(i), mi.UInt32(j)), active)
+        for (i, a), (j, b) in itertools.product(columns, rows):
+            total = total + a * b * self.distribution.pdf(mi.Point2u(i, j), active)
         return total * (self.size[0] * self.size[1])
 
 
@@ -132,17 +125,12 @@ _model_lock = threading.RLock()
 
 def spectral_model():
     """Return the table for the variant's backend: side, positions along the brightness, coefficients padded to four."""
-    key = mi.Float
     with _model_lock:
-        if key not in _spectral_models:
-            _spectral_models[key] = _load_model()
-        return _spectral_models[key]
-
-
-def _load_model():
-    side, positions, entries = compat.srgb_coefficients()
-    table = DifferentiableArray.from_numpy(entries, mi.TensorXf)  # pads and aligns them
-    return side, mi.Float(positions.copy()), mi.Float(table.data.array)
+        if mi.Float not in _spectral_models:
+            side, positions, entries = compat.srgb_coefficients()
+            table = DifferentiableArray.from_numpy(entries, mi.TensorXf)  # pads and aligns them
+            _spectral_models[mi.Float] = side, mi.Float(positions.copy()), mi.Float(table.data.array)
+        return _spectral_models[mi.Float]
 
 
 def spectral_coefficients(rgb):
@@ -168,36 +156,35 @@ def spectral_coefficients(rgb):
         i = dr.minimum(mi.UInt32(v), side - 2)
         axes.append((i, v - mi.Float(i)))
     total = [0, 0, 0]
-    for a in (0, 1):
-        for b_ in (0, 1):
-            for c in (0, 1):
-                index, weight = plane, 1
-                for (i, w), up in zip(axes, (a, b_, c), strict=True):
-                    index = dr.fma(index, side, i + up)
-                    weight = weight * (w if up else 1 - w)
-                entry = dr.gather(mi.Vector4f, table, index)
-                total = [dr.fma(weight, entry[n], total[n]) for n in range(3)]
+    for corner in itertools.product((0, 1), repeat=3):
+        index, weight = plane, 1
+        for (i, w), up in zip(axes, corner, strict=True):
+            index = dr.fma(index, side, i + up)
+            weight = weight * (w if up else 1 - w)
+        entry = dr.gather(mi.Vector4f, table, index)
+        total = [dr.fma(weight, entry[n], total[n]) for n in range(3)]
     return total
 
 
 def upsampled_spectrum(rgb, wavelengths):
     """Return the reflectance at ``wavelengths`` (nm), for linear sRGB colours in [0, 1]."""
     r, g, b = (clamp(mi.Float(c), 0.0, 1.0) for c in rgb)
-    c0, c1, c2 = spectral_coefficients(rgb)
-    v = dr.fma(dr.fma(c0, wavelengths, c1), wavelengths, c2)
-    reflectance = dr.fma(0.5 * v, dr.rsqrt(dr.fma(v, v, 1)), 0.5)
     grey = (r == g) & (g == b)
-    return mi.UnpolarizedSpectrum(dr.select(grey, r, reflectance))
+    return mi.UnpolarizedSpectrum(dr.select(grey, r, _reflectance(spectral_coefficients(rgb), wavelengths)))
+
+
+def _reflectance(coefficients: list, wavelengths):
+    """Return the sigmoid of a polynomial of the wavelength (nm)."""
+    c0, c1, c2 = coefficients
+    v = dr.fma(dr.fma(c0, wavelengths, c1), wavelengths, c2)
+    return dr.fma(0.5 * v, dr.rsqrt(dr.fma(v, v, 1)), 0.5)
 
 
 def upsampled_mean(rgb):
     """Return the mean of the spectrum over 16 wavelengths, as Mitsuba computes it."""
-    wavelengths = np.linspace(mi.MI_CIE_MIN, mi.MI_CIE_MAX, 16)
-    c0, c1, c2 = spectral_coefficients(rgb)
-    total = 0
-    for wavelength in wavelengths.tolist():
-        v = dr.fma(dr.fma(c0, wavelength, c1), wavelength, c2)
-        total = total + dr.fma(0.5 * v, dr.rsqrt(dr.fma(v, v, 1)), 0.5)
+    wavelengths = np.linspace(mi.MI_CIE_MIN, mi.MI_CIE_MAX, 16).tolist()
+    coefficients = spectral_coefficients(rgb)
+    total = sum(_reflectance(coefficients, wavelength) for wavelength in wavelengths)
     r, g, b = (clamp(mi.Float(c), 0.0, 1.0) for c in rgb)
     return dr.select((r == g) & (g == b), r, total / len(wavelengths))
 
@@ -270,12 +257,6 @@ _cones: weakref.WeakValueDictionary = weakref.WeakValueDictionary()
 _cone_lock = threading.RLock()  # a thread that waits for a kernel may go on with another constructor
 
 
-def in_texels(ddx: mi.Vector2f, ddy: mi.Vector2f, size: tuple[int, int]) -> tuple[mi.Vector2f, mi.Vector2f]:
-    """Return the footprint in texels of an image of ``size`` (width, height)."""
-    scale = mi.Vector2f(*size)
-    return ddx * scale, ddy * scale
-
-
 def isotropic(ddx: mi.Vector2f, ddy: mi.Vector2f) -> mi.Float:
     """Return the level whose texels have the area of a footprint, which is given in texels of the image."""
     return 0.5 * _log2(footprint.area(ddx, ddy))
@@ -296,11 +277,6 @@ def anisotropic(ddx: mi.Vector2f, ddy: mi.Vector2f, taps: int) -> tuple[mi.Float
 def _log2(x):
     """Return the binary logarithm of a length or an area in texels, 0 below 1."""
     return dr.log2(dr.clip(x, 1, LARGEST**2))
-
-
-def offsets(taps: int) -> list[float]:
-    """Return the places of the taps along the major axis, relative to its middle."""
-    return [(k + 0.5) / taps - 0.5 for k in range(taps)]
 
 
 def hit_numbers(si: mi.SurfaceInteraction3f) -> tuple[mi.Float, mi.Float]:

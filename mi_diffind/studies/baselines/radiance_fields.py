@@ -22,10 +22,10 @@ from drjit import nn
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
+from ...arrays.budget import Budget
 from ...arrays.indirection import device_array, device_tensor
 from ...arrays.lookup import pack_bits
 from ...arrays.sparse_grid import cell_corners, complete_cells
-from ...core.units import largest_fitting
 from ...tasks.radiance.grid import DENSITY_SCALE
 from ...tasks.radiance.march import march, replay
 from ...tasks.radiance.nodes import COARSE, FARTHEST, Nodes, coarser
@@ -560,4 +560,4 @@ def _parameters(entries: int, finest: float) -> int:
 def hash_entries(nbytes: float, finest: float) -> int:
     """Return the most entries a level with which a hash grid and its network take ``nbytes``, 2 bytes a parameter."""
     sizes = [int(2**power) // 16 * 16 for power in np.arange(8, 24, 0.1)]
-    return sizes[largest_fitting(lambda i: 2 * _parameters(sizes[i], finest) <= nbytes, 0, len(sizes))]
+    return Budget(nbytes).largest(lambda size: 2 * _parameters(size, finest), sizes, strict=False)

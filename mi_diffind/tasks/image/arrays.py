@@ -345,9 +345,7 @@ class CompressedImage(CompressedMaps):
     @staticmethod
     def of(table: Table, dtype, storage: str = "") -> CompressedImage:
         """Return the image of a checked table, in a storage form (:func:`allocate`)."""
-        return CompressedImage(
-            Layout.from_json(table.settings["layout"]), net_from_arrays(allocate(table, dtype, storage))
-        )
+        return assembled(table, allocate(table, dtype, storage))
 
     def stored(self, u, v, active=True) -> list:
         """Return the stored channels at (u, v)."""
@@ -360,21 +358,19 @@ def allocate(table: Table, dtype, storage: str = "") -> dict[str, Differentiable
     return allocate_maps(table, dtype, storage, lambda name: (layout.height, layout.width))
 
 
-def net_from_arrays(arrays: dict[str, DifferentiableArray]) -> Indirection | None:
-    """Return the indirection of named arrays; ``None`` for no arrays."""
-    return (
-        join_primaries([arrays[name] for name in PRIMARIES if name in arrays], arrays["cascaded"]) if arrays else None
-    )
+def assembled(table: Table, arrays: dict[str, DifferentiableArray]) -> CompressedImage:
+    """Return the image of a checked table from its allocated arrays."""
+    primaries = [arrays[name] for name in PRIMARIES if name in arrays]
+    net = join_primaries(primaries, arrays["cascaded"]) if arrays else None
+    return CompressedImage(Layout.from_json(table.settings["layout"]), net)
 
 
 def to_table(image: CompressedImage, settings: dict) -> Table:
     """Return the table file of an image, with ``settings``."""
-    named = []
-    if image.net is not None:
-        named = [*zip(PRIMARIES, image.net.primary, strict=False), ("cascaded", image.net.cascaded)]
     stored = {}
-    for name, array in named:
-        stored |= stored_arrays(name, array)
+    if image.net is not None:
+        for name, array in (*zip(PRIMARIES, image.net.primary, strict=False), ("cascaded", image.net.cascaded)):
+            stored |= stored_arrays(name, array)
     return Table("image", stored, settings={**settings, "layout": image.layout.to_json()})
 
 
@@ -416,7 +412,7 @@ class ImageModel(MapsModel):
     """Model of an image file; ``image`` is a :class:`CompressedImage`."""
 
     def build(self):
-        self.image = CompressedImage(Layout.from_json(self.table.settings["layout"]), net_from_arrays(self.arrays))
+        self.image = assembled(self.table, self.arrays)
 
 
 MODEL = ImageModel

@@ -16,8 +16,8 @@ from ...fitting.loop import FitResult
 from ...fitting.settings import FittingError
 from ...fitting.task import FitRequest, Fitted
 from ...maps import as_seen
-from ...maps.arguments import requested_border, requested_bytes, size_figures
-from ...maps.model import significant
+from ...maps.arguments import requested_border, requested_bytes
+from ...maps.model import complete, rehearse_pictures
 from ...maps.source import Source, load_source
 from . import PAGED, PRESETS, STRUCTURES, CoarsePrimary, ImageRecipe, parse_weights, replaced, without
 from .arrays import CompressedImage, ImageBudget, cascaded_side, fit_bytes, search
@@ -106,16 +106,9 @@ def fit(request: FitRequest) -> Fitted:
     source = load_source(options["source"], nonfinite=options["nonfinite"])
     recipe = recipe_of(request.preset, request.settings, options)
     recipe = dataclasses.replace(recipe, weights=_weights(request, source, recipe))
-    if request.deadline is not None and as_seen.shows(source):
-        request.deadline.rehearse(lambda: as_seen.reference(source, request.types))
+    rehearse_pictures(request, source)
     fitted, requested = _train(request, source, recipe)
-    seen = as_seen.measure(source, CompressedImage.of(fitted.table, request.types.TensorXf))
-    fitted.table.measured |= significant(seen)
-    fitted.table.settings |= request.paths(source_path=options["source"])
-    figures, lines = size_figures(source, fitted.table, requested)
-    fitted.lines += [*lines, *source.notes]
-    fitted.figures = {**figures, **fitted.figures}
-    return fitted
+    return complete(request, source, fitted, CompressedImage.of(fitted.table, request.types.TensorXf), requested)
 
 
 def _train(request: FitRequest, source: Source, recipe: ImageRecipe) -> tuple[Fitted, float | None]:

@@ -19,7 +19,7 @@ from ...arrays.pages import most_entries, page_counts
 from ...arrays.tables import Table
 from ...fitting.loop import FitResult, Problem
 from ...fitting.task import FitRequest
-from ...maps.compressed import decibel
+from ...maps.compressed import decibel, mean_square
 from ...maps.layout import Layout, choose_borders, smoothness
 from ...maps.model import fit_maps
 from ...maps.pyramid import padded_texels, weighted_sum
@@ -184,9 +184,7 @@ class ImageProblem(Problem):
             index = self._texel(rng, size)
             x, y = self.types.Float(index % self.width) + 0.5, self.types.Float(index // self.width) + 0.5
             outputs = rounded(net, self.bits)([y / self.height, x / self.width])
-            squares = [dr.square(a - b) for a, b in zip(outputs, self._texels(index), strict=True)]
-            dr.eval(squares)  # one kernel in place of one for each channel
-        return {"psnr_db": decibel(sum(float(dr.mean(s)[0]) for s in squares) / self.channels)}
+            return {"psnr_db": decibel(mean_square(outputs, self._texels(index)))}
 
 
 def problem_of(

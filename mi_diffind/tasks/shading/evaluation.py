@@ -209,17 +209,14 @@ def _averaged(pattern, pyramid: Pyramid, u, v, level, wi, wo, effects: Effects, 
     extent = dr.exp2(level)
     u = dr.fma((x / width - 0.5) * extent, 1 / layout.width, u)
     v = dr.fma((y / width - 0.5) * extent, 1 / layout.height, v)
-    u, v = (_inside(x, border) for x, border in zip((u, v), reversed(pyramid.border), strict=True))
+    # Wrapped in a repeating texture, else clamped to the edge
+    borders = zip((u, v), reversed(pyramid.border), strict=True)
+    u, v = (x - dr.floor(x) if border == "repeat" else dr.clip(x, 0, 1) for x, border in borders)
     finer = dr.maximum(level - FINER, 0)
     stored = pyramid.filtered(u, v, finer) if pattern == "prefiltered" else pyramid.stored(u, v)
     value = shaded(Decoder(), surface_of(pyramid, stored), wi, wo, effects)
     dr.eval(value)  # all three at once: a sum over blocks evaluates what it is given
     return types.Array3f([dr.block_sum(c, samples) / samples for c in value])
-
-
-def _inside(x, border: str):
-    """Return a coordinate in [0, 1]: wrapped in a repeating texture, else clamped to the edge."""
-    return x - dr.floor(x) if border == "repeat" else dr.clip(x, 0, 1)
 
 
 #: Levels of the preview.

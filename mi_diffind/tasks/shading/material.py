@@ -82,19 +82,9 @@ def effects_of(layout: Layout) -> tuple[Effects, dict[str, str]]:
         if role == "normal":
             continue
         constants = [w[1] for w in m.where if isinstance(w, tuple)]
-        # Equal channels are stored once: an albedo of one stored channel is grey
-        grey = len({w for w in m.where}) == 1
-        bounds[name] = ValueBounds(grey=grey)
-        if len(constants) == m.channels:
-            bounds[name] = ValueBounds(min(constants), max(constants), grey=grey)
+        ends = (min(constants), max(constants)) if len(constants) == m.channels else ()
+        bounds[name] = ValueBounds(*ends, grey=len(set(m.where)) == 1)  # equal channels are stored once
     return find_effects(bounds)
-
-
-def linear(values, m: MapLayout):
-    """Return linear channels of a map: decoded from sRGB if the map is encoded in it."""
-    if m.color_space != "srgb":
-        return values
-    return [srgb.to_linear(v, fused=False) for v in values]
 
 
 #: Largest length of (c, s) of a lobe.
@@ -112,7 +102,10 @@ def surface_of(maps: FilteredMaps, stored: list, extra: list | None = None) -> S
     """Return the material at points with the stored channels ``stored``, and extras, if there are any."""
     by_role = maps_of(maps.layout)
     read = maps.maps(stored, [m.name for m in by_role.values()])
-    channels = {role: linear(read[m.name], m) for role, m in by_role.items()}
+    channels = {
+        role: [srgb.to_linear(v, fused=False) for v in read[m.name]] if m.color_space == "srgb" else read[m.name]
+        for role, m in by_role.items()
+    }
     array = next((v for values in channels.values() for v in values if dr.is_jit_v(v)), None)
     types = None if array is None else module_of(array)
 

@@ -7,10 +7,9 @@ import dataclasses
 from ...arrays.tables import MAX_BYTES
 from ...core.errors import UsageError
 from ...fitting.task import FitRequest, Fitted
-from ...maps import as_seen
-from ...maps.arguments import requested_border, requested_bytes, size_figures
+from ...maps.arguments import requested_border, requested_bytes
 from ...maps.layout import smoothness
-from ...maps.model import significant
+from ...maps.model import complete, rehearse_pictures
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source, load_source
 from . import PRESETS, TextureRecipe, arrays, parse_structure, training
@@ -58,24 +57,18 @@ def fit(request: FitRequest) -> Fitted:
     requested, size = requested_bytes(options, source), None
     if pyramid.layout.stored:
         size = size_of(source, pyramid, requested, recipe, options)
-    if request.deadline is not None and as_seen.shows(source):
-        request.deadline.rehearse(lambda: as_seen.reference(source, request.types))
-    table, result = training.fit_texture(source, size, recipe, request, pyramid, options["level_bias"])
-    seen = as_seen.measure(source, CompressedTexture.of(table, request.types.TensorXf))
-    table.measured |= significant(seen)
-    table.settings |= request.paths(source_path=options["source"])
-    figures, lines = size_figures(source, table, requested)
-    return Fitted(table, result, [*lines, *source.notes], figures)
+    rehearse_pictures(request, source)
+    fitted = Fitted(*training.fit_texture(source, size, recipe, request, pyramid, options["level_bias"]))
+    return complete(request, source, fitted, CompressedTexture.of(fitted.table, request.types.TensorXf), requested)
 
 
 def size_of(source: Source, pyramid: Pyramid, nbytes: float, recipe: TextureRecipe, options):
     """Return the memory budget of the arrays for ``nbytes`` bytes. Raises :class:`UsageError`."""
-    layout = pyramid.layout
-    shape = (layout.height, layout.width)
     if recipe.layered:
         size = _layered_size(pyramid, nbytes, options["structure"] or "auto", options["skip"], options["cascaded"])
     else:
-        size = arrays.paper_size(nbytes, source.nbytes, layout.stored, *shape, options["ratio"])
+        shape = pyramid.values[0].shape
+        size = arrays.paper_size(nbytes, source.nbytes, shape[2], *shape[:2], options["ratio"])
     if size.nbytes > MAX_BYTES:
         raise UsageError(f"size: found {size.nbytes:,} bytes of arrays, allowed are {MAX_BYTES:,}")
     return size
@@ -83,21 +76,19 @@ def size_of(source: Source, pyramid: Pyramid, nbytes: float, recipe: TextureReci
 
 def _layered_size(pyramid: Pyramid, nbytes: float, structure: str, skip: int | None, cascaded: int | None):
     """Return the budget of pages or fine arrays: those of a ``structure``, or the best for the texture."""
-    layout, fine = pyramid.layout, parse_structure(structure) or None
+    shape, fine = pyramid.values[0].shape, parse_structure(structure) or None
     if fine is not None:
         skip = fine[-1].level + 1 if skip is None else skip
         if skip <= fine[-1].level:
             raise UsageError(f"--skip: found {skip}, the structure has a fine array on level {fine[-1].level}")
     if skip is not None and not 0 <= skip < pyramid.levels:
         raise UsageError(f"--skip: found {skip}, the texture has levels 0 to {pyramid.levels - 1}")
-    shape = (layout.height, layout.width, layout.stored)
     if skip is None:
         size = arrays.paged(*shape, nbytes, cascaded)
-        if structure == "pages" and size is None:
+        wanted = structure == "pages"
+        if wanted and size is None:
             raise UsageError("--structure: found pages, for which the texture or its bytes are too small or too large")
-        if structure == "pages":
-            return size
-        if size and arrays.gain_of_pages(pyramid.values, size, pyramid.border) >= training.GAIN_DB:
+        if wanted or (size and arrays.gain_of_pages(pyramid.values, size, pyramid.border) >= training.GAIN_DB):
             return size
     try:
         smooth = smoothness(pyramid.values[0]) >= SMOOTH_DB

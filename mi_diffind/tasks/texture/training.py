@@ -17,7 +17,7 @@ from ...arrays.indirection import aligned_copy, unfolded
 from ...arrays.tables import Table
 from ...fitting.loop import FitResult, Problem
 from ...fitting.task import FitRequest
-from ...maps.compressed import decibel
+from ...maps.compressed import decibel, mean_square
 from ...maps.layout import Layout
 from ...maps.model import fit_maps
 from ...maps.pyramid import Pyramid
@@ -139,7 +139,7 @@ class TextureProblem(Problem):
 
     def measure(self, net) -> dict[str, float]:
         """Return the PSNR of the stored channels at the centres of at most 2¹⁶ texels a level, entries rounded."""
-        types, errors_by_level = self.types, []
+        types, decibels = self.types, []
         net = rounded(unfolded(net))
         with dr.suspend_grad():
             for level, (rows, columns) in enumerate(self.sizes):
@@ -153,10 +153,7 @@ class TextureProblem(Problem):
                 v = (types.Float(index // columns) + 0.5) / types.Float(rows)
                 actual = net.filtered(u, v, dr.opaque(types.Float, level, count))
                 expected = self.pyramid.texels(index + start)
-                squares = [dr.square(a - b) for a, b in zip(actual, expected, strict=True)]
-                dr.eval(squares)  # one kernel in place of one for each channel
-                errors_by_level.append(sum(float(dr.mean(s)[0]) for s in squares) / len(squares))
-        decibels = list(map(decibel, errors_by_level))
+                decibels.append(decibel(mean_square(actual, expected)))
         return {"psnr_db": decibels[0], "psnr_worst_db": min(decibels)}
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from arrays import numpy_of
 
+import mi_diffind
 from mi_diffind.arrays.tables import TableError, load_table, save_table
 from mi_diffind.commands.cli import main
 from mi_diffind.core.errors import UsageError
@@ -565,12 +566,24 @@ def test_bad_arguments_are_one_sentence(manifest, tmp_path, capsys, changed, mes
 
 
 def test_sources_that_cannot_be_shaded_are_refused(ad, start, tmp_path):
-    only = {"height": bumpy(8)["roughness"]}
-    with pytest.raises(UsageError, match="found no map that shading reads, these are albedo, normal"):
-        material.effects_of(pyramid_of(only, ad)[1].layout)
-    wide = {"albedo": np.zeros((4, 4, 2), np.uint8)}
-    with pytest.raises(UsageError, match='map "albedo": found 2 channels, allowed for albedo are 1 or 3'):
-        material.effects_of(pyramid_of(wide, ad)[1].layout)
+    small, zeros = bumpy(8), np.zeros((4, 4, 2), np.uint8)
+    for maps, message in (
+        ({"height": small["roughness"]}, "found no map that shading reads, these are albedo, normal"),
+        ({"albedo": zeros}, 'map "albedo": found 2 channels, allowed for albedo are 1 or 3'),
+        (
+            {"albedo": small["albedo"], "diffuse": small["albedo"]},
+            'map "diffuse": found a second albedo',
+        ),
+    ):
+        with pytest.raises(UsageError, match=message):
+            material.effects_of(pyramid_of(maps, ad)[1].layout)
+    for source, message in (
+        ({"albedo": zeros[..., :1]}, "all of its maps are constant, there is nothing to learn"),
+        (None, "source: not given, a manifest"),
+        ("scene.xml", r"found the scene scene\.xml; fit scene trains"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            mi_diffind.fit("shading", source=source, variant="llvm_ad_rgb", progress=False)
     from mi_diffind.tasks.shading.fit import load_start
 
     with pytest.raises(UsageError, match=r"was made from another source than other\.json"):
