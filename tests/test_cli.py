@@ -267,17 +267,19 @@ def asked_for_help(commands):
 
 
 def test_help_is_light():
-    """Of the command, and of each verb and task but studies: neither Mitsuba nor Dr.Jit, nor what trains.
+    """Of the command, and of each verb and task: neither Mitsuba nor Dr.Jit, nor what trains; of a study, no other.
 
     The command itself does not even look for tasks.
     """
     modules = asked_for_help([[]])[1]
     assert not (HEAVY | {"numpy", "tqdm"}) & modules
     assert not [m for m in modules if m.startswith("mi_diffind.tasks.") and m.split(".")[2] in tasks()]
-    own = [[verb, name] for verb, more in (("fit", []), ("tradeoff", ["scene"])) for name in [*tasks(), *more]]
-    light = [[], *([verb] for verb in VERBS), *own]
-    text, modules = asked_for_help([command for command in light if "tradeoff" not in command])
-    text |= asked_for_help([command for command in light if "tradeoff" in command])[0]  # studies are imported whole
+    text, modules = asked_for_help([[], *([verb] for verb in VERBS), *(["fit", name] for name in tasks())])
+    of_studies, of_disney = asked_for_help([["tradeoff", "disney"]])
+    assert {m for m in of_disney if m.startswith("mi_diffind.studies.") and ".baselines" not in m} == {
+        "mi_diffind.studies.disney"
+    }
+    text |= of_studies | asked_for_help([["tradeoff", "scene"]])[0]
     for command, found in text.items():
         assert found.startswith(" ".join(["usage: mi-diffind", *command]) + " [-h]"), command
     assert all(f"\n    {verb} " in text[()] for verb in VERBS)

@@ -440,8 +440,9 @@ def test_modules(package):
 def test_what_of_ours_is_broken_is_an_error(package):
     """Left out is only what does not claim to be one, or what is not asked for."""
     package({"one": "THING = 1", "none": "", "broken": "1 / 0"})
-    assert discovery.load("its_package", "THING", only=("one", "none"), expected=int) == {"one": 1}
+    known = {name: f"its_package.{name}" for name in ("one", "none")}
+    assert discovery.load("its_package", "THING", known=known, expected=int) == {"one": 1}
     with pytest.raises(ZeroDivisionError):
         discovery.load("its_package", "THING")
     with pytest.raises(TypeError, match="its THING is a int, a str is needed"):
-        discovery.load("its_package", "THING", only=("one",), expected=str)
+        discovery.load("its_package", "THING", known={"one": known["one"]}, expected=str)

@@ -66,6 +66,7 @@ def _parser(argv: list[str]) -> argparse.ArgumentParser:
     parser = _Parser(prog="mi-diffind", description="Learned lookup tables for Mitsuba 3: differentiable indirection.")
     parser.add_argument("--version", action="version", version=f"mi-diffind {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    commands.words = argv  # of which a verb may need to know the study
     chosen = next((word for word in argv if not word.startswith("-")), None)
     for name in VERBS:
         module = importlib.import_module(f"{__package__}.{name}")

@@ -16,11 +16,16 @@ EXAMPLE = "mi-diffind tradeoff ggx --quick --out out"
 
 
 def add(commands) -> None:
-    """Add the verb and the studies that are found to ``commands``, the subparsers of the command line."""
+    """Add the verb to ``commands``, the subparsers of the command line; studies not in its ``words`` are only named."""
     parsers = alternatives(verb(commands, "tradeoff", run, HELP, EXAMPLE, reads=READS), "study")
-    for name, study in studies().items():
+    for name in studies():
+        title = f"measure time against accuracy of {studies().title(name)}"
+        if name not in commands.words:
+            parsers.add_parser(name, help=title)
+            continue
+        study = studies()[name]
         words = " ".join(filter(None, ("mi-diffind tradeoff", name, study.example, "--quick --out out")))
-        sub = alternative(parsers, name, f"measure time against accuracy of {study.title}", words)
+        sub = alternative(parsers, name, title, words)
         sub.add_argument("--out", default="out", metavar="DIR", help="folder for table and plot (default: out)")
         sub.add_argument("--quick", action="store_true", help="smoke run: less of everything, times not to be quoted")
         if study.of_scene:

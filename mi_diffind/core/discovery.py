@@ -14,7 +14,7 @@ import importlib
 import importlib.metadata
 import pkgutil
 import warnings
-from collections.abc import Iterable
+from collections.abc import Mapping
 
 
 def modules(package: str, ignored: tuple[str, ...] = ()) -> dict[str, str]:
@@ -39,17 +39,17 @@ def load(
     package: str,
     attribute: str,
     ignored: tuple[str, ...] = (),
-    only: Iterable[str] | None = None,
+    known: Mapping[str, str] | None = None,
     expected: type = object,
 ) -> dict:
-    """Import :func:`modules` (or ``only`` some of them) and return name → the ``attribute`` that each declares.
+    """Import :func:`modules` (or the ``known`` ones) and return name → the ``attribute`` that each declares.
 
     A declaration is an instance of ``expected``; its ``name`` counts, if it has one, and has to be that of the entry
     point. A module of another package that cannot be imported, lacks the attribute or declares a name of this package
     is left out with a warning; a module of this package that lacks the attribute declares nothing.
     """
-    shipped, others, known = {}, {}, modules(package, ignored)
-    for name in known if only is None else only:
+    shipped, others, known = {}, {}, modules(package, ignored) if known is None else known
+    for name in known:
         ours = known[name].startswith(f"{package.partition('.')[0]}.")
         try:
             module = importlib.import_module(known[name])

@@ -98,6 +98,7 @@ def figure(title: str, caption: str, width: float, height: float, above: float =
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    width = max(width, 0.105 * len(title))  # few small pictures may be narrower than their title
     text = "\n".join(textwrap.wrap(caption, int(17.3 * width)))
     below = 0.16 * (text.count("\n") + 1) + 0.15
     framed = Figure(figsize=(width, height + above + below), dpi=dpi, layout="constrained")

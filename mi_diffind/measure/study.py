@@ -1,7 +1,8 @@
 """Declaration of studies: a study, its plan, and the candidates, jobs and cases of the plan.
 
 A module of :mod:`mi_diffind.studies`, or one that an entry point of the group ``mi_diffind.studies`` names, has a
-:class:`Study` as its ``STUDY``. The command ``tradeoff`` imports all of them.
+:class:`Study` as its ``STUDY``. The command ``tradeoff`` imports the one
+that it runs; the lines ``name`` and ``title`` at the beginning of the classes of others are read as text.
 """
 
 from __future__ import annotations

@@ -10,8 +10,13 @@ from __future__ import annotations
 
 import argparse
 import functools
+import importlib
 import os
+import re
+from collections import UserDict
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
 
 from ..core import discovery
 from ..core.errors import UsageError
@@ -20,10 +25,43 @@ from ..core.runtime import use_variant
 from ..measure.study import Plan, Study, Tradeoff
 
 
+@dataclass
+class _Unread:
+    """Study of a module of this package that is not imported yet."""
+
+    module: str
+    title: str
+
+
+class Studies(UserDict):
+    """Studies by name. Those of this package, which load plugins, are imported when they are looked up."""
+
+    def __getitem__(self, name: str) -> Study:
+        if isinstance(self.data[name], _Unread):
+            self.data[name] = importlib.import_module(self.data[name].module).STUDY
+        return self.data[name]
+
+    def title(self, name: str) -> str:
+        """Return the title of a study, without an import."""
+        return self.data[name].title
+
+
+#: Name and title in the class of a study.
+_DECLARATION = re.compile('^    name = "(.+)"\n    title = "(.+)"$', re.MULTILINE)
+
+
 @functools.lru_cache
-def studies() -> dict[str, Study]:
+def studies() -> Studies:
     """Return all studies by name: those of this package, then those of entry points."""
-    return discovery.load(__name__, "STUDY", ignored=("baselines",), expected=Study)
+    ours, others = {}, {}
+    for name, module in discovery.modules(__name__, ignored=("baselines",)).items():
+        if module == f"{__name__}.{name}":
+            text = Path(__file__).with_name(f"{name}.py").read_text(encoding="utf-8")
+            ours |= {n: _Unread(module, title) for n, title in _DECLARATION.findall(text)}
+        else:
+            others[name] = module
+    others = discovery.load(__name__, "STUDY", known=others, expected=Study)
+    return Studies({**dict(sorted(ours.items())), **{n: study for n, study in others.items() if n not in ours}})
 
 
 def tradeoff(

@@ -67,6 +67,8 @@ def small(tmp_path, monkeypatch):
 
 def test_studies_are_found():
     assert list(studies()) == STUDIES
+    titles = {name: studies().title(name) for name in STUDIES}
+    assert titles == {name: study.title for name, study in studies().items()}
 
 
 def test_studies_of_others_are_found(small):

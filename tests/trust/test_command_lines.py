@@ -15,6 +15,7 @@ from limited_child import GOOD, LimitedChild
 from trial_files import all_seeds
 
 from mi_diffind.commands import cli
+from mi_diffind.studies import studies
 
 SCENE = """
 <scene version="3.0.0">
@@ -56,7 +57,7 @@ def parsers():
     """The parsers of all verbs, and of their tasks and studies, by their words."""
     by_words = {}
     for verb in cli.VERBS:
-        root = cli._parser([verb])
+        root = cli._parser([verb, *studies()])
         sub = next(a for a in root._actions if isinstance(a, argparse._SubParsersAction)).choices[verb]
         below = [a for a in sub._actions if isinstance(a, argparse._SubParsersAction)]
         by_words |= {f"{verb} {name}": p for name, p in below[0].choices.items()} if below else {verb: sub}
