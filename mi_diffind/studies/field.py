@@ -8,7 +8,7 @@ k-means (the idea of VQRF). The *hash grid* is that of ``drjit.nn`` with a netwo
 Equal bytes: ours is counted in memory, index included; all others on disk, where the numbers of grids are predicted
 from their neighbours and deflated. Grids are as fine as the budget allows: a coarser grid is trained for half of the
 steps, loses the cells that no ray sees, and is trained in its stored form for the other half. The network, whose steps
-take longer, has :attr:`RadianceStudySettings.seconds`.
+take longer, has the time ``--seconds``.
 
 Errors are PSNR of sRGB values before white in held-out views: of the pixels of the foreground
 (``psnr_foreground_db``) and of all pixels (``psnr_white_db``), which flatters.
@@ -20,8 +20,9 @@ import argparse
 import functools
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
@@ -108,25 +109,6 @@ def references(result: dict) -> dict[str, dict]:
     return {name: c for name, c in result["candidates"].items() if c["is_reference"] and c["errors"]}
 
 
-@dataclass(frozen=True)
-class RadianceStudySettings:
-    """Settings of the study.
-
-    ``ratios`` are the budgets, as compression against a dense float32 grid; the first is timed and shown. ``without``
-    names the methods left out. ``resolution`` is that of the grid, trained for ``grid_steps`` (0: as its preset says).
-    Each contender is trained for ``steps``, or for ``seconds`` if its steps take long. ``film`` is the side of the
-    timed picture in pixels.
-    """
-
-    ratios: tuple[float, ...]
-    without: tuple[str, ...] = ()
-    resolution: int = 128
-    grid_steps: int = 0
-    steps: int = 500
-    seconds: float = 90.0
-    film: int = 200
-
-
 class RadianceStudy(Study):
     """Study of radiance fields in equal bytes: errors in held-out views, and the times of reads and renders."""
 
@@ -174,14 +156,14 @@ class RadianceStudy(Study):
 
     def plan(self, arguments) -> Plan:
         quick = arguments.quick
-        settings = RadianceStudySettings(
+        settings = SimpleNamespace(
             ratios=arguments.ratios,
             without=tuple(arguments.without),
             resolution=arguments.resolution or (24 if quick else 128),
-            grid_steps=60 if quick else 0,
+            grid_steps=60 if quick else 0,  # of the initial grid; 0: as its preset says
             steps=arguments.steps or (40 if quick else 500),
             seconds=arguments.seconds or (3.0 if quick else 90.0),
-            film=48 if quick else 200,
+            film=48 if quick else 200,  # pixels on a side of the timed picture
         )
         session = FieldSession(array_module(mi.variant()), *arguments.views)
         return plan(session, arguments.source, settings)
@@ -199,7 +181,7 @@ class RadianceStudyContext:
 
     session: FieldSession
     source: str
-    settings: RadianceStudySettings
+    settings: SimpleNamespace
     jobs: dict[str, Contender] = field(default_factory=dict)
 
     @property
@@ -379,7 +361,7 @@ def contender(method: str, ratio: float, context: RadianceStudyContext) -> Conte
 # -- The plan ----------------------------------------------------------------------------------------------------------
 
 
-def plan(session: FieldSession, source: str, settings: RadianceStudySettings) -> Plan:
+def plan(session: FieldSession, source: str, settings: SimpleNamespace) -> Plan:
     """Return the plan of the study for a session of the capture in the folder ``source``."""
     context = RadianceStudyContext(session, source, settings)
     views, held_out, first, jobs = session.views, session.held_out, settings.ratios[0], context.jobs
@@ -413,7 +395,7 @@ def plan(session: FieldSession, source: str, settings: RadianceStudySettings) ->
         ratios=[(ours, n) for n in shown if jobs[n].method in AGAINST] if ours else [],
         details={
             "source": source, "source_digest": views.digest + held_out.digest, "views": [len(views), len(held_out)],
-            "pixels": [width, height], "request": asdict(settings), "first": first,
+            "pixels": [width, height], "request": vars(settings), "first": first,
         },
         notes=[
             f"{Path(source).name}, {len(views)} views of {width} × {height} and {len(held_out)} to test. "

@@ -17,8 +17,9 @@ import contextlib
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
@@ -56,24 +57,6 @@ MEASURES = (
 )
 
 
-@dataclass(frozen=True)
-class ImageStudySettings:
-    """Settings of the image study.
-
-    ``compressions`` are the compression ratios, ``seconds`` and ``paper_seconds`` the lengths of trainings by our and
-    by the paper's preset, ``dims`` the dimensions of the cascaded array (4: all trainings, others: the shortest).
-    ``astc`` is the preset of the ASTC encoder,
-    ``astc_choice`` the one that selects block sizes.
-    """
-
-    compressions: tuple[float, ...] = (12.0,)
-    seconds: tuple[float, ...] = (60.0,)
-    paper_seconds: tuple[float, ...] = (60.0,)
-    dims: tuple[int, ...] = (2, 3, 4)
-    astc: str = "exhaustive"
-    astc_choice: str = "medium"
-
-
 #: Options that may be repeated → help, type, choices.
 _REPEATED = {
     "--compression": ("compression ratio, such as 12x (default)", str, None),
@@ -105,13 +88,13 @@ class ImageStudy(Study):
     def plan(self, arguments) -> Plan:
         quick = arguments.quick
         seconds = tuple(map(float, arguments.seconds)) or (2.0 if quick else 60.0,)
-        settings = ImageStudySettings(
-            arguments.compressions[:1] if quick else arguments.compressions,
-            seconds,
-            tuple(map(float, arguments.paper_seconds)) or (max(seconds),),
-            tuple(arguments.dims) or (2, 3, 4),
-            "fast" if quick else arguments.astc,
-            "fast" if quick else "medium",
+        settings = SimpleNamespace(
+            compressions=arguments.compressions[:1] if quick else arguments.compressions,
+            seconds=seconds,
+            paper_seconds=tuple(map(float, arguments.paper_seconds)) or (max(seconds),),
+            dims=tuple(arguments.dims) or (2, 3, 4),
+            astc="fast" if quick else arguments.astc,
+            astc_choice="fast" if quick else "medium",  # preset that selects block sizes
         )
         return plan(arguments.loaded, arguments.source, settings)
 
@@ -128,7 +111,7 @@ class ImageStudyContext:
 
     source: Source
     name: str
-    settings: ImageStudySettings
+    settings: SimpleNamespace
 
     def record(
         self, job: Contender, nbytes: int, seconds: float | None, maps: dict, between_db=None, **details
@@ -257,7 +240,7 @@ def coded_contenders(context: ImageStudyContext) -> list[Contender]:
 # -- The plan ----------------------------------------------------------------------------------------------------------
 
 
-def plan(source: Source, name: str, settings: ImageStudySettings) -> Plan:
+def plan(source: Source, name: str, settings: SimpleNamespace) -> Plan:
     """Return the plan for ``source``, read from the file ``name``, in the current variant."""
     context = ImageStudyContext(source, name, settings)
     trained = trained_contenders(context)
@@ -297,7 +280,7 @@ def plan(source: Source, name: str, settings: ImageStudySettings) -> Plan:
         accuracy="psnr_db",
         accuracy_label="PSNR, dB",
         ratios=[(c.name, "bitmap, 8 bits") for c in candidates if c.name != "bitmap, 8 bits"],
-        details={**source_details(source, name), "request": asdict(settings), "codecs": list(codecs.available())},
+        details={**source_details(source, name), "request": vars(settings), "codecs": list(codecs.available())},
         notes=[note, *codecs.install_notes()],
         jobs=jobs,
         jobs_fingerprint=source.digest,

@@ -20,8 +20,9 @@ import functools
 import json
 import math
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
@@ -105,27 +106,13 @@ def size_text(nbytes: int) -> str:
     return f"{nbytes / 2**20:g} MiB" if nbytes >= 2**20 else f"{nbytes / 2**10:g} KiB"
 
 
-@dataclass(frozen=True)
-class DistanceStudySettings:
-    """Arguments of the study.
-
-    ``sizes``: memory budgets in bytes, the first of which is timed; ``without``: methods that are left out;
-    ``ablation``: parts of ours in place of other methods, and no rays; ``points``: held-out points; ``steps`` of
-    trainings by presets (0: the preset's own); ``hash_steps`` of the network's shortest and longest training; ``film``:
-    width and height of pictures; ``grid``: cells of ``sdfgrid`` along the longest side; ``decoded``: the finest
-    decoding of which the Chamfer distance is measured, in cells; ``spp`` of the render.
-    """
-
-    sizes: tuple[int, ...]
-    without: tuple[str, ...] = ()
-    ablation: bool = False
-    points: int = 2**20
-    steps: int = 0
-    hash_steps: tuple[int, int] = (500, 4000)
-    film: tuple[int, int] = (480, 320)
-    grid: int = 256
-    decoded: int = 768
-    spp: int = 4
+#: Settings of a run: held-out points; steps of trainings by presets (0: the preset's own), and of the shortest and the
+#: longest of the network; width and height of pictures; cells of ``sdfgrid`` along the longest side, and of the finest
+#: decoding whose Chamfer distance is measured; samples of a render.
+FULL = {"points": 2**20, "steps": 0, "hash_steps": (500, 4000), "film": (480, 320), "grid": 256, "decoded": 768,
+        "spp": 4}  # fmt: skip
+QUICK = {"points": 2**14, "steps": 20, "hash_steps": (40, 80), "film": (48, 32), "grid": 32, "decoded": 96,
+         "spp": 1}  # fmt: skip
 
 
 class SdfStudy(Study):
@@ -165,11 +152,10 @@ class SdfStudy(Study):
         arguments.before = earlier(arguments) if arguments.errors_of else {}
 
     def plan(self, arguments) -> Plan:
-        quick = {"points": 2**14, "steps": 20, "hash_steps": (40, 80), "film": (48, 32), "grid": 32, "decoded": 96,
-                 "spp": 1}  # fmt: skip
-        settings = DistanceStudySettings(
-            arguments.sizes, tuple(arguments.without), arguments.ablation, **(quick if arguments.quick else {})
-        )
+        settings = SimpleNamespace(
+            sizes=arguments.sizes, without=tuple(arguments.without), ablation=arguments.ablation,
+            **(QUICK if arguments.quick else FULL),
+        )  # fmt: skip
         return plan(arguments.loaded, arguments.source, settings, arguments.before)
 
 
@@ -201,7 +187,7 @@ class DistanceStudyContext:
 
     mesh: Mesh
     name: str
-    settings: DistanceStudySettings
+    settings: SimpleNamespace
     types: object
     _sparse: dict[int, tuple[rivals.DistanceNodes, float]] = field(default_factory=dict)
 
@@ -308,7 +294,7 @@ def hash_contender(nbytes: int, context: DistanceStudyContext) -> NetworkContend
 # -- The plan ----------------------------------------------------------------------------------------------------------
 
 
-def plan(mesh: Mesh, name: str, settings: DistanceStudySettings, before: dict[str, dict] | None = None) -> Plan:
+def plan(mesh: Mesh, name: str, settings: SimpleNamespace, before: dict[str, dict] | None = None) -> Plan:
     """Return the plan for a ``mesh``, of the file ``name``, in the variant that is set.
 
     ``before``: records of an earlier run, which are taken over at all budgets but the first.
@@ -365,7 +351,7 @@ def plan(mesh: Mesh, name: str, settings: DistanceStudySettings, before: dict[st
         accuracy_label="near the surface, −10 log₁₀(1 − IoU), dB",
         ratios=[(ours, n) for n in compared] if ours else [],
         details={
-            "source": name, "source_digest": mesh.digest, "triangles": len(mesh.faces), "request": asdict(settings),
+            "source": name, "source_digest": mesh.digest, "triangles": len(mesh.faces), "request": vars(settings),
             "first": first, "film": list(settings.film),
         },
         notes=[

@@ -21,9 +21,10 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
@@ -97,33 +98,6 @@ NETWORK_LONGEST = 16
 ASTC_PRESETS = ("fastest", "fast", "medium", "thorough", "verythorough", "exhaustive")
 
 
-@dataclass(frozen=True)
-class TextureStudySettings:
-    """Settings of the texture study.
-
-    ``map`` is the name of the rendered map; a texture is trained for ``seconds`` at each of ``compressions``. ``astc``
-    and ``astc_choice`` are presets of the ASTC encoder as in the image study. ``film`` and ``zoom_film`` are sizes of
-    images (width, height), ``frames`` is the length of the zoom, ``truth_spp`` a square number, ``seeds`` the number of
-    renders that errors are averaged over. ``footprints`` adds trainings with other distributions of footprints.
-    ``network_steps`` is the length of the first training of a network. ``only`` are the methods that are measured
-    (default: all).
-    """
-
-    map: str
-    compressions: tuple[float, ...] = (12.0,)
-    seconds: float = 60.0
-    astc: str = "exhaustive"
-    astc_choice: str = "medium"
-    film: tuple[int, int] = (480, 320)
-    zoom_film: tuple[int, int] = (240, 160)
-    frames: int = 60
-    truth_spp: int = 256
-    seeds: int = 4
-    footprints: bool = False
-    network_steps: int = NETWORK_STEPS
-    only: tuple[str, ...] = ()
-
-
 def add_astc_option(parser: argparse.ArgumentParser) -> None:
     """Add the option ``--astc``, the preset of the encoder."""
     parser.add_argument(
@@ -177,20 +151,20 @@ class TextureStudy(Study):
     def plan(self, arguments) -> Plan:
         quick = arguments.quick
         width = arguments.width or (96 if quick else 480)
-        settings = TextureStudySettings(
-            arguments.map,
-            arguments.compressions,
-            float(arguments.seconds or (2 if quick else 60)),
-            "fast" if quick else arguments.astc,
-            "fast" if quick else "medium",
-            (width, max(2, width * 2 // 3)),
-            (max(2, width // 2), max(2, width // 3)),
-            arguments.frames or (6 if quick else 60),
-            64 if quick else 256,
-            1 if quick else 4,
-            arguments.footprints,
-            30 if quick else NETWORK_STEPS,
-            tuple(arguments.only),
+        settings = SimpleNamespace(
+            map=arguments.map,
+            compressions=arguments.compressions,
+            seconds=float(arguments.seconds or (2 if quick else 60)),
+            astc="fast" if quick else arguments.astc,
+            astc_choice="fast" if quick else "medium",  # preset that selects block sizes
+            film=(width, max(2, width * 2 // 3)),
+            zoom_film=(max(2, width // 2), max(2, width // 3)),
+            frames=arguments.frames or (6 if quick else 60),
+            truth_spp=64 if quick else 256,  # square numbers
+            seeds=1 if quick else 4,  # renders that errors are averaged over
+            footprints=arguments.footprints,
+            network_steps=30 if quick else NETWORK_STEPS,  # of the first training
+            only=tuple(arguments.only),
         )
         return plan(arguments.loaded, arguments.source, settings, arguments.tables)
 
@@ -283,7 +257,7 @@ class TextureStudyContext:
 
     source: Source
     name: str
-    settings: TextureStudySettings
+    settings: SimpleNamespace
     scenes: dict[str, TextureScene]
     truths: dict[str, Contender] = field(default_factory=dict)
 
@@ -553,7 +527,7 @@ class TextureCandidates:
 def plan(
     source: Source,
     name: str,
-    settings: TextureStudySettings,
+    settings: SimpleNamespace,
     tables: Sequence[Table] = (),
     reads: Sequence[tuple[str, bool]] = READS,
     more_reads: Sequence[tuple[str, bool]] = MORE_READS,
@@ -590,14 +564,14 @@ def plan(
         ratios=[(c.name, BASE) for c in candidates if c.name != BASE],
         details={
             **source_details(source, name),
-            "request": asdict(settings),
+            "request": vars(settings),
             "tables": digests,
             "codecs": list(codecs.available()),
             "counted": {n: float(context.counted(s).mean()) for n, s in context.scenes.items()},
         },
         notes=[note, *codecs.install_notes(["astc"])],
         jobs=builder.jobs,
-        jobs_fingerprint=f"{source.digest} {asdict(settings)} {digests}",
+        jobs_fingerprint=f"{source.digest} {vars(settings)} {digests}",
         pictures={
             "crops": functools.partial(draw_crops, context, shown),
             "zoom": functools.partial(draw_zoom, context, shown),

@@ -218,7 +218,8 @@ def test_fields_and_meshes_are_in_one_place(mi_rgb):
 
 def test_records_and_models_of_earlier_runs(mi_rgb, tmp_path):
     """Errors of an earlier run stand for contenders that are not timed; those that are timed need their files."""
-    settings = sdf.DistanceStudySettings((24576, 32768), ("ours", "indirection", "paper", "hash"), points=2**10)
+    settings = SimpleNamespace(sizes=(24576, 32768), without=("ours", "indirection", "paper", "hash"), ablation=False,
+                               **{**sdf.FULL, "points": 2**10})  # fmt: skip
     plan = sdf.plan(Ball.mesh, "ball.ply", settings)
     names = [job.name for job in plan.jobs]
     assert names[:2] == ["dense grid 24 KiB", "dense grid, trained 24 KiB"] and len(names) == 8

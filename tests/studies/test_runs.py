@@ -163,7 +163,10 @@ def test_bad_options(study, options, message, inputs, tmp_path, capsys):
 
 def test_missing_codecs(mi_rgb, monkeypatch):
     monkeypatch.setattr(codecs, "available", lambda: ("jpeg", "bicubic"))
-    plan = image.plan(from_arrays({"albedo": smooth(32, 32, 3)}), "a.png", image.ImageStudySettings())
+    settings = SimpleNamespace(
+        compressions=(12.0,), seconds=(60.0,), paper_seconds=(60.0,), dims=(2, 3, 4), astc="fast", astc_choice="fast"
+    )
+    plan = image.plan(from_arrays({"albedo": smooth(32, 32, 3)}), "a.png", settings)
     assert [c.name for c in plan.candidates if c.name.startswith(("ASTC", "BC7", "WebP"))] == []
     assert plan.notes[1].startswith("Left out: ASTC, BC7, WebP; needed: the packages astc-encoder-py, ")
 
@@ -187,7 +190,7 @@ def test_errors(mi_rgb):
 
 def test_names_of_trainings(mi_rgb):
     source = from_arrays({"albedo": smooth(32, 32, 3)})
-    settings = image.ImageStudySettings((12.0, 6.0), (5.0, 2.0), (7.0,), (4, 3))
+    settings = SimpleNamespace(compressions=(12.0, 6.0), seconds=(5.0, 2.0), paper_seconds=(7.0,), dims=(4, 3))
     names = [job.name for job in image.trained_contenders(image.ImageStudyContext(source, "a", settings))]
     assert names == ["ours 12x 2 s", "ours 12x 5 s", "paper 12x 7 s", "ours 2D→3D 12x 2 s", "ours 6x 2 s"]
 

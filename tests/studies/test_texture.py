@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -172,7 +173,17 @@ def test_a_table_in_place_of_a_training(mi_rgb):
     path = ASSETS / "tiles.json"
     source = load_source(path)
     tables = texture.load_tables([str(ASSETS / "tiles_filtered.npz")], source)
-    settings = texture.TextureStudySettings("albedo", (), film=FILM, zoom_film=FILM, frames=2)
+    settings = SimpleNamespace(
+        map="albedo",
+        compressions=(),
+        film=FILM,
+        zoom_film=FILM,
+        frames=2,
+        truth_spp=256,
+        seeds=4,
+        footprints=False,
+        only=(),
+    )
     plan = texture.plan(source, str(path), settings, tables)
     mark = f"ours {source.nbytes / tables[0].nbytes:.3g}x"
     assert [job.name for job in plan.jobs if "truth" not in job.name and "ASTC" not in job.name] == [mark]
