@@ -79,9 +79,9 @@ def test_a_limited_time_is_shared(short, tmp_path, monkeypatch):
     """With ``seconds``, starts of the proxy take a part of the time, and what follows the training is rehearsed."""
     limits, train = [], training.FitRequest.train
 
-    def recorded(self, problem, title=None, finish=None, **more):
+    def recorded(self, problem, title=None, finish=None, *more):
         limits.append((self.deadline.seconds, finish is not None))
-        return train(self, problem, title, finish, **more)
+        return train(self, problem, title, finish, *more)
 
     monkeypatch.setattr(training.FitRequest, "train", recorded)
     result = fitted(seconds=6)
