@@ -16,11 +16,15 @@ EXAMPLE = "mi-diffind tradeoff ggx --quick --out out"
 
 
 def add(commands) -> None:
-    """Add the verb to ``commands``, the subparsers of the command line; studies not in its ``words`` are only named."""
+    """Add the verb to ``commands``, the subparsers of the command line.
+
+    Studies that are not in its ``words``, those of the command line, are only named; without ``words``, all are added.
+    """
+    asked = getattr(commands, "words", studies())
     parsers = alternatives(verb(commands, "tradeoff", run, HELP, EXAMPLE, reads=READS), "study")
     for name in studies():
         title = f"measure time against accuracy of {studies().title(name)}"
-        if name not in commands.words:
+        if name not in asked:
             parsers.add_parser(name, help=title)
             continue
         study = studies()[name]
