@@ -7,11 +7,16 @@ imports neither of them itself; each name below is imported when it is asked for
 """
 
 import importlib as _importlib
+from pathlib import Path as _Path
 
 from .core import runtime as _runtime
 from .core.errors import DiffindError
 
 __version__ = "0.2.0"
+
+_here = _Path(__file__).resolve().parent
+if not (_here / "plugins").is_dir():  # a checkout has the folder `plugins` beside this one, an installation inside
+    __path__.append(str(_here.parent))
 
 #: Public name → the module that holds it, and its name there if it is another one; ":" ends the name of a module.
 _NAMES = {
