@@ -267,7 +267,7 @@ def asked_for_help(commands):
 
 
 def test_help_is_light():
-    """Of the command, and of each verb and task: neither Mitsuba nor Dr.Jit, nor what trains; of a study, no other.
+    """Help of the command, a verb or a task imports neither Mitsuba nor Dr.Jit, nor training; of a study, no other one.
 
     The command itself does not even look for tasks.
     """

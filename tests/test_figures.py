@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -220,3 +221,21 @@ def test_a_changed_or_superfluous_csv_is_refused(copy):
 def test_headlines_of_the_readme_are_backed():
     numbers = figures.numbers("README.md", (ROOT / "README.md").read_text(encoding="utf-8"))
     assert [n for n in numbers if n.headline and n.kind == "unbacked"] == []
+
+
+def test_commands_are_accepted_today():
+    """Each ``mi-diffind`` command that wrote a file of figures: its options exist, and its methods are not cut."""
+    from mi_diffind.commands import cli
+    from mi_diffind.measure.study import Study
+    from mi_diffind.studies import equal_memory, field, sdf, studies
+
+    lines = [part for line in figures.commands().values() for part in line.split("&&")]
+    words = [shlex.split(line)[1:] for line in lines if line.split()[0] == "mi-diffind"]
+    for each in words:
+        arguments = cli._parser(each).parse_args(each)
+        if each[0] == "tradeoff":
+            assert isinstance(studies()[arguments.study], Study)
+            methods = {"field": field.METHODS, "sdf": sdf.METHODS}.get(arguments.study, ())
+            if not getattr(arguments, "ablation", False):
+                equal_memory.check_without(getattr(arguments, "without", ()), methods)
+    assert len(words) > 40

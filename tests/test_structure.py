@@ -2,6 +2,8 @@
 
 import ast
 import functools
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -265,3 +267,14 @@ def test_a_wrong_import_would_be_noticed(tmp_path):
     rising = ("core.files", "arrays.lookup", "fitting.loop", "maps.layout", "tasks.ggx.model", "plugins.disney",
               "scenes.loading", "studies.ggx", "commands.cli")  # fmt: skip
     assert [floor(f"mi_diffind.{name}") for name in rising] == list(range(9))
+
+
+def test_a_checkout_has_its_plugins():
+    """Without an editable installation, too, as for a script that is started in the folder of a clone."""
+    code = (
+        "import sys; sys.meta_path[:] = [f for f in sys.meta_path if 'Editable' not in getattr(f, '__name__', '')]\n"
+        f"sys.path.insert(0, {str(ROOT)!r}); import importlib.util\n"
+        "print(importlib.util.find_spec('mi_diffind.plugins').origin)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert Path(done.stdout.strip()) == ROOT / "plugins" / "__init__.py", done.stderr

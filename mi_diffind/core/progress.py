@@ -1,4 +1,4 @@
-"""How a long run reports, is stopped by Ctrl-C and is limited in time. Importing this imports no Dr.Jit and no tqdm."""
+"""Progress, interruption and time limit of long runs. Importing this imports no Dr.Jit and no tqdm."""
 
 from __future__ import annotations
 

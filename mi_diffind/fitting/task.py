@@ -568,7 +568,7 @@ def fit(
       file, a dictionary as of ``mi.load_dict``, a ``mi.BSDF``, or a measured file. Of ``image``, ``texture`` and
       ``shading``: an image file or a manifest, an array ``(height, width, channels)``, a ``mi.Bitmap``, or a dictionary
       of such maps by name. Of ``sdf``: a mesh file, a ``trimesh.Trimesh`` or a ``mi.Mesh``. Of ``field``: a folder of
-      views or a file of 3D Gaussians. Of ``scene``: a scene file or dictionary. ``ggx`` and ``disney`` have none.
+      views. Of ``scene``: a scene file or dictionary. ``ggx`` and ``disney`` have none.
     - ``preset``: layout and training ("": the task's default).
     - ``variant``: variant of Mitsuba on whose device to train (``None``: the one that is set; the GPU if none is set
       and there is one).

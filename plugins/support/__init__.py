@@ -1,1 +1,1 @@
-"""What several plugins need, and no plugin itself."""
+"""Helpers that several plugins share."""

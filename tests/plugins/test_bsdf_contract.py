@@ -289,7 +289,7 @@ SMOOTHEST = {"disney": {"roughness": 0.0, "clearcoat_gloss": 1.0, "metallic": 1.
 
 @pytest.mark.parametrize("name, more", [*((name, {}) for name in BSDFS), *SMOOTHEST.items()])
 def test_vectors_that_are_no_directions(mi_rgb, name, more):
-    """As masked lanes hold them: values are 0, and derivatives, which are those of the pairs of directions alone."""
+    """Vectors of masked lanes: values and derivatives are 0, beside those of the pairs of directions."""
     mi, pairs, wrong = mi_rgb, np.concatenate([FROM, TO, RIGHT]), len(FROM) + len(TO)
     bsdf, n = load(mi, name, **more), len(pairs)
     si, towards = interactions(mi, pairs[:, 0], np.full(n, 0.3)), vectors(mi, pairs[:, 1])
@@ -555,7 +555,7 @@ def test_an_optimised_parameter_keeps_its_effect(mi_rgb, name, update):
 @pytest.mark.parametrize("update", [False, True])
 @pytest.mark.parametrize("name", ["neural_disney", "neural_disney paper", "neural_ggx", "neural_bsdf family"])
 def test_tables_keep_their_gradients_where_parameters_are_constant(mi_rgb, rng, name, update):
-    """What is evaluated once is evaluated without derivatives, which tables being trained do not want."""
+    """Constant parameters are evaluated once, and yet tables that are trained get derivatives."""
     mi, n, gradients = mi_rgb, 1000, []
     si, wo = interactions(mi, random_directions(rng, n, 0.1), np.zeros(n)), vectors(mi, random_directions(rng, n, 0.1))
     constants = {p: ends[1] for p, ends in TEXTURED[name].items()}
@@ -666,7 +666,7 @@ RECOVERED = {
 
 @pytest.mark.parametrize("case", ["neural_ggx", "disney", pytest.param("neural_disney", marks=pytest.mark.slow)])
 def test_parameters_are_recovered_from_an_image(mi_rgb, case):
-    """Of the exact plugin, also from a coat of exactly 0; no kernel appears after the first steps."""
+    """The image is of the exact plugin; a coat starts at exactly 0, too; no kernel appears after the first steps."""
     mi, (exact, learned, parameters) = mi_rgb, RECOVERED[case]
     lamps = {f"lamp{i}": {"type": "point", "position": position, "intensity": 15.0}
              for i, position in enumerate(([-3.0, 1.0, 3.0], [0.0, -3.0, 4.0]))}  # fmt: skip

@@ -26,7 +26,7 @@ def directions(mi, rng, n, low=0.0):
 
 @pytest.mark.parametrize("name, decibels", [("disney", 120), ("tables", 84), ("paper", 34)])
 def test_values_are_burleys(mi_rgb, rng, name, decibels):
-    """Of random texels; densities are those of the exact plugin."""
+    """Values for random texels; densities are those of the exact plugin."""
     mi = mi_rgb
     n, ctx = 2**14, mi.BSDFContext()
     color, m, wi, wo = disney_formulas.random_case(rng, n, low_cosine=1e-3)
