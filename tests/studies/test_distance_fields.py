@@ -192,6 +192,16 @@ def test_hash_grid(rng):
         field.safe_step(arrays(points), arrays(points))
 
 
+def test_the_pool_of_a_network_is_near_the_surface():
+    """Three quarters of the points lie around the surface, the others anywhere in the box."""
+    truth = SimpleNamespace(mesh=make_mesh(*solids.sphere(24)), signed=Torus().signed)
+    box = truth.mesh.lower, truth.mesh.upper
+    points, _ = rivals.pool(truth, *box, 4000, 3)
+    radius = np.linalg.norm(points - np.mean(box, axis=0), axis=1)
+    assert points.shape == (4000, 3)
+    assert 0.72 < (np.abs(radius - (box[1] - box[0]).max() / 2) < 0.04).mean() < 0.9
+
+
 def test_as_fine_as_the_bytes_allow():
     field = rivals.fit_bytes(lambda h: rivals.distance_nodes(T, Ball(), h), 60000)
     assert 0.97 * 60000 <= field.nbytes <= 60000
