@@ -432,7 +432,7 @@ def _learned_or_source(props: mi.Properties):
 
 def _is_textured(bsdf) -> bool:
     """Return whether a BSDF differs from place to place; plugins of Mitsuba do not all set a flag."""
-    nodes = compat.objects_of(bsdf)
+    nodes = compat.scene_objects(bsdf)
     varies = any(isinstance(node, base_class("Texture")) and node.is_spatially_varying() for node in nodes)
     return varies or mi.has_flag(bsdf.flags(), mi.BSDFFlags.SpatiallyVarying)
 

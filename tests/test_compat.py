@@ -117,8 +117,8 @@ def test_sums_and_threads():
 
 def test_arrays(mi_rgb):
     with hook("modules of array types"):
-        module = compat.module_of(mi_rgb.TensorXf)
-        assert module is compat.module_of(mi_rgb.Float(1)) and module.Float is mi_rgb.Float and module.Array4f
+        module = compat.backend_module(mi_rgb.TensorXf)
+        assert module is compat.backend_module(mi_rgb.Float(1)) and module.Float is mi_rgb.Float and module.Array4f
     with hook("index: what tells arrays apart"):
         a, tensor = mi_rgb.Float(1, 2), mi_rgb.TensorXf(np.ones((2, 2)))
         colour = mi_rgb.Color3f(a, a + 1, 0)
@@ -273,11 +273,11 @@ def test_parsed_scenes(mi_rgb):
     with hook("mi.parser"):
         config, state = compat.parse_file(SCENE, {"width": "20", "height": "12"})
         assert [Path(f).name for f in compat.parsed_files(state)] == ["lamp.xml"]
-        sensors = compat.properties_of(state, mi_rgb.ObjectType.Sensor)
+        sensors = compat.parsed_properties(state, mi_rgb.ObjectType.Sensor)
         assert [p.plugin_name() for p in sensors] == ["orthographic"]
-        names = [p.plugin_name() for p in compat.properties_of(state)]
+        names = [p.plugin_name() for p in compat.parsed_properties(state)]
         assert "hdrfilm" in names
-        film = compat.properties_of(state)[names.index("hdrfilm")]
+        film = compat.parsed_properties(state)[names.index("hdrfilm")]
         film["height"] = 10
         scene = compat.instantiate(config, state)
         assert isinstance(scene, mi_rgb.Scene) and tuple(scene.sensors()[0].film().size()) == (20, 10)
@@ -315,7 +315,7 @@ def test_properties(mi_rgb):
         assert kinds == {"number": "number", "whole": "number", "text": "text", "colour": "colour", "flag": "other"}
     with hook("mi.Properties: objects in parsed scenes"):
         _, state = compat.parse_file(SCENE)
-        found = [compat.property_kind(p, key) for p in compat.properties_of(state) for key in p]
+        found = [compat.property_kind(p, key) for p in compat.parsed_properties(state) for key in p]
         assert "object" in found
     with hook("mi.Properties: renaming, deleting"):
         props.set_plugin_name("conductor")
@@ -412,7 +412,7 @@ def test_objects_of_scenes(mi_rgb):
             "type": "scene", "group": group, "one": {"type": "instance", "group": ref},
             "two": {"type": "instance", "group": ref}, "rectangle": {"type": "rectangle"},
         })  # fmt: skip
-        objects = compat.objects_of(scene)
+        objects = compat.scene_objects(scene)
         names = [node.class_name() for node in objects]
         assert len({id(node) for node in objects}) == len(objects) and names.count("Checkerboard") == 1
     with hook("class_name of instances"):
@@ -437,7 +437,7 @@ def test_integrators_in_python(mi_rgb):
         assert not compat.samples_in_python(mi_rgb.load_dict({"type": "path"}))
     with hook("class_name of integrators"):
         channels = mi_rgb.load_dict({"type": "aov", "aovs": "d:depth", "inner": {"type": "prb"}})
-        names = [compat.integrator_name(integrator) for integrator in compat.objects_of(channels)]
+        names = [compat.integrator_name(integrator) for integrator in compat.scene_objects(channels)]
         assert names == [compat.INTERSECTING, "PRBIntegrator"]
 
 
@@ -449,7 +449,7 @@ def test_parsed_scenes_as_graphs(mi_rgb, tmp_path):
     )
     (tmp_path / "a.xml").write_text(text)
     _, state = compat.parse_file(tmp_path / "a.xml")
-    names = [props.plugin_name() for props in compat.properties_of(state)]
+    names = [props.plugin_name() for props in compat.parsed_properties(state)]
     assert names == ["scene", "twosided", "diffuse", "sphere"]
     assert [str(t).rpartition(".")[2] for t in compat.parsed_types(state)] == ["Scene", "BSDF", "BSDF", "Shape"]
     assert compat.parsed_references(state) == [[1, 3], [2], [], [1]]

@@ -8,7 +8,7 @@ import pytest
 import mi_diffind
 from mi_diffind.commands.cli import main
 from mi_diffind.core.errors import UsageError
-from mi_diffind.core.units import labelled
+from mi_diffind.core.units import figure_lines
 
 ASSETS = Path(__file__).resolve().parents[1] / "scenes" / "assets"
 SENSOR = {"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8}}
@@ -110,10 +110,10 @@ def test_what_is_refused(mi_rgb):
 def test_figures_for_people():
     figures = {"psnr_db": 27.176, "psnr_l0_db": 30, "psnr_l1_db": 31.5}
     figures |= {"normal_p95_deg": 6.1, "peak_error_0.1_0.5": 0.87}
-    assert labelled(figures) == [
+    assert figure_lines(figures) == [
         "PSNR                   27.18 dB",
         "PSNR of levels         30.00, 31.50 dB",
         "normal p95             6.10°",
         "peak error 0.1 to 0.5  0.87",
     ]
-    assert labelled({}) == []
+    assert figure_lines({}) == []

@@ -27,7 +27,7 @@ from mi_diffind.core.archives import (
 )
 from mi_diffind.core.errors import LONGEST_MESSAGE, UsageError
 from mi_diffind.core.files import PATHS, OutputError
-from mi_diffind.core.units import labelled
+from mi_diffind.core.units import figure_lines
 from mi_diffind.fitting.loop import checkpoint_settings
 from mi_diffind.fitting.settings import FitSettings, within_memory
 from mi_diffind.images.headers import picture_size
@@ -303,6 +303,6 @@ def test_maps_may_be_called_as_figures(rng):
     assert len({map_figure(name) for name in names}) == len(names)
     assert set(figures) == {"psnr_db", "psnr_mean_db", "psnr_between_db", *map(map_figure, names)}
     assert map_figure("albedo") == "psnr_albedo_db" and map_figure("mean") == "psnr_map_mean_db"
-    assert labelled({"psnr_map_between_db": 1.0, "psnr_map_l0_db": 2.0}) == [
+    assert figure_lines({"psnr_map_between_db": 1.0, "psnr_map_l0_db": 2.0}) == [
         "PSNR map between  1.00 dB", "PSNR map l0       2.00 dB",
     ]  # fmt: skip

@@ -20,7 +20,7 @@ from mi_diffind.arrays.pages import (
     page_shift,
     page_sizes,
 )
-from mi_diffind.arrays.tables import PAGES, TableError, gathers_of, load_table, save_table
+from mi_diffind.arrays.tables import PAGES, TableError, load_table, read_gathers, save_table
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting.task import FitRequest
 from mi_diffind.maps.source import from_arrays
@@ -319,8 +319,8 @@ def test_a_file_reads_as_it_was_trained(ad, tmp_path, structure):
     assert loaded.nbytes == table.nbytes <= 1500
     fine, coarse = STRUCTURES[structure]
     width = fine * (3 if coarse is None else recipe.dims - coarse.dims)
-    assert gathers_of(loaded, "primary") == 2 * (2 if width <= 16 else 3 if width < 32 else 4)
-    assert gathers_of(loaded, "primary" + PAGES) == 1
+    assert read_gathers(loaded, "primary") == 2 * (2 if width <= 16 else 3 if width < 32 else 4)
+    assert read_gathers(loaded, "primary" + PAGES) == 1
     image = CompressedImage.of(loaded, ad.TensorXf)
     assert isinstance(image.net.primary[0], PagedArray) and image.net.nbytes == table.nbytes
     decoded, source = image.decode()["albedo"], np.rint(255 * half_empty()) / 255

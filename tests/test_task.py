@@ -26,7 +26,7 @@ from mi_diffind.core.progress import Deadline
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting import task as task_module
 from mi_diffind.fitting.loop import FitSettings, Problem
-from mi_diffind.fitting.task import FitRequest, Model, Stage, Task, fit, task_of, tasks
+from mi_diffind.fitting.task import FitRequest, Model, Stage, Task, find_task, fit, tasks
 
 ROOT = Path(__file__).resolve().parents[1]
 BUILT_IN = ("bsdf", "disney", "field", "ggx", "image", "scene", "sdf", "shading", "texture")
@@ -172,7 +172,7 @@ def test_what_a_task_declares(name):
     assert set(task.shipped) <= set(task.presets)
     for preset in task.shipped:
         table = task.load(task.file(preset=preset))
-        assert (table.task, table.preset) == (name, preset) and task_of(table) is task
+        assert (table.task, table.preset) == (name, preset) and find_task(table) is task
         assert {k: table.settings[k] for k in ("steps", "lr", "batch")} == {
             k: getattr(task.presets[preset], k) for k in ("steps", "lr", "batch")
         }

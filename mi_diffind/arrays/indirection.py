@@ -15,7 +15,7 @@ import drjit as dr
 import numpy as np
 from drjit import nn
 
-from ..core.compat import module_of, owned
+from ..core.compat import backend_module, owned
 from ..core.runtime import llvm_problem
 from . import lookup
 from .lookup import as_words, pack_bits, unpack_bits
@@ -115,7 +115,7 @@ class DifferentiableArray(nn.Module):
             return np.broadcast_to(np.asarray(self.value, dtype=np.float32), shape)
         rng = rng if rng is not None else dr.rng(seed=0)
         low, high = self.value
-        drawn = rng.random(module_of(dtype).Float, int(np.prod(shape)))
+        drawn = rng.random(backend_module(dtype).Float, int(np.prod(shape)))
         return low + (high - low) * drawn.numpy().reshape(shape)
 
     def _require_entries(self) -> None:
@@ -217,7 +217,7 @@ class DifferentiableArray(nn.Module):
             codes, *affine = lookup.quantize(values, self.channels)
         self.scale, self.offset = (tuple(map(float, numbers)) for numbers in affine)
         self.bits = bits
-        self.data = owned(device_array(module_of(dtype).UInt32, self._pack(codes, bits)))
+        self.data = owned(device_array(backend_module(dtype).UInt32, self._pack(codes, bits)))
         return self
 
     def _pack(self, codes: np.ndarray, bits: int) -> np.ndarray:
@@ -263,7 +263,7 @@ class DifferentiableArray(nn.Module):
             raise ValueError("an array of 1 dimension has no coordinate to fix but its only one")
         if dr.width(x) != 1:
             raise ValueError(f"x: found {dr.width(x)} numbers, 1 is needed")
-        module, (*resolution, _) = module_of(self.data), self.resolution
+        module, (*resolution, _) = backend_module(self.data), self.resolution
         index = dr.arange(module.UInt32, math.prod(resolution))
         positions = []
         for n, border in reversed(list(zip(resolution, self.border, strict=False))):
@@ -348,7 +348,7 @@ class DifferentiableArray(nn.Module):
         in [0, 1], as those from bytes may be.
         """
         self._require_entries()
-        coordinates, is_coopvec = coordinates_of(x, module_of(self.data).Float)
+        coordinates, is_coopvec = as_coordinates(x, backend_module(self.data).Float)
         if len(coordinates) != self.dims:
             raise ValueError(f"an array of {self.dims} dimension(s) was read at {len(coordinates)} coordinate(s)")
         values = self._read(coordinates, active, inside)
@@ -427,7 +427,7 @@ class Indirection(nn.Module):
 
     def pointer(self, x, active=True) -> list:
         """Return the coordinate at which the cascaded array is read for the inputs ``x``."""
-        x, _ = coordinates_of(x)
+        x, _ = as_coordinates(x)
         if len(x) != self.dims:
             raise ValueError(f"an indirection of {self.dims} input(s) was read at {len(x)} coordinate(s)")
         result = []
@@ -506,7 +506,7 @@ def check_storage(storage: str) -> None:
 
 def _tensor_type(dtype, storage: str):
     """Return the tensor type of a float storage form: never double, also in such variants."""
-    return module_of(dtype).TensorXf16 if storage == "float16" else module_of(dtype).TensorXf
+    return backend_module(dtype).TensorXf16 if storage == "float16" else backend_module(dtype).TensorXf
 
 
 def require_backend(dtype) -> None:
@@ -560,7 +560,7 @@ def device_tensor(dtype, values) -> dr.ArrayBase:
     return dtype(device_array(dr.array_t(dtype), values), np.shape(values))
 
 
-def coordinates_of(x, default=None):
+def as_coordinates(x, default=None):
     """Return coordinates as a list of single-precision arrays, and whether they were a cooperative vector.
 
     Numbers become arrays like the others, or like ``default``.

@@ -23,7 +23,7 @@ from collections.abc import Sequence
 import drjit as dr
 import numpy as np
 
-from ..core.compat import module_of
+from ..core.compat import backend_module
 
 #: Storage forms: for training, for storing, for inference.
 STORAGES = ("float32", "float16", "uint8")
@@ -152,7 +152,7 @@ def read_floats(data, channels: int, stored: int, corners, active=True, transfor
     packet = _packet(stored)
     groups = stored // packet
     suffix = "f16" if dr.is_half_v(type(data)) else "f"
-    Packet = None if packet == 1 else getattr(module_of(Float), f"Array{packet}{suffix}")
+    Packet = None if packet == 1 else getattr(backend_module(Float), f"Array{packet}{suffix}")
 
     def fetch(index) -> list:
         values = []
@@ -189,7 +189,7 @@ def read_packed(
     """
     Float = type(x[0])
     UInt32, Int32 = type(words), dr.int32_array_t(type(words))
-    module = module_of(Float)
+    module = backend_module(Float)
     inner, stride, per_texel = packed_layout(resolution, channels)
     axes = [_axis(v, n, b, inside) for v, n, b in zip(x, resolution, border, strict=True)]
     outer = len(resolution) - inner

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import drjit as dr
 import numpy as np
 
-from ..core.compat import module_of, owned
+from ..core.compat import backend_module, owned
 from . import lookup
 from .indirection import DifferentiableArray, check_storage, device_array, require_backend
 from .lookup import as_words, pack_bits, unpack_bits
@@ -29,7 +29,7 @@ __all__ = [
     "page_positions",
     "page_shift",
     "page_sizes",
-    "page_sizes_of",
+    "shared_page_sizes",
 ]
 
 #: Bits of an index word for the entries along a side of a page, by the number of dimensions; the rest counts entries.
@@ -116,7 +116,7 @@ class PagedArray(DifferentiableArray):
         index = np.cumsum(flat.prod(axis=1)) - flat.prod(axis=1)
         for axis in range(self.dims):
             index = index << bits | (flat[:, axis] - 1)
-        return owned(device_array(module_of(dtype).UInt32, index))
+        return owned(device_array(backend_module(dtype).UInt32, index))
 
     @classmethod
     def from_numpy(
@@ -229,10 +229,10 @@ def page_sizes(values: np.ndarray, border: tuple[str, str], entries: float) -> n
     All pages together have at most ``entries`` entries, but at least one each. The choice has the smallest squared
     error of all channels together, if entries are fitted to the image and read linearly.
     """
-    return page_sizes_of([values], border, entries)[0]
+    return shared_page_sizes([values], border, entries)[0]
 
 
-def page_sizes_of(images: Sequence[np.ndarray], border: tuple[str, str], entries: float) -> list[np.ndarray]:
+def shared_page_sizes(images: Sequence[np.ndarray], border: tuple[str, str], entries: float) -> list[np.ndarray]:
     """Choose the resolutions of the pages of several images that share the ``entries``.
 
     The choice has the smallest sum of the mean squared errors of the images; otherwise like :func:`page_sizes`.

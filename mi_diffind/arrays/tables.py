@@ -138,7 +138,7 @@ class StoredArray:
         return all(o >= 0 and s >= 0 and o + steps * s <= 1 + 1e-6 for s, o in pairs)
 
 
-def stored_arrays(name: str, array: DifferentiableArray) -> dict[str, StoredArray]:
+def to_stored_arrays(name: str, array: DifferentiableArray) -> dict[str, StoredArray]:
     """Return the stored form of an allocated array by name.
 
     An array of pages gives two: its entries, and as ``NAME_pages`` the sizes of the pages, ``(A, …, d)``, with the
@@ -153,7 +153,7 @@ def stored_arrays(name: str, array: DifferentiableArray) -> dict[str, StoredArra
     }
 
 
-def moved_paths(settings: dict, before: Path, after: Path) -> dict:
+def move_paths(settings: dict, before: Path, after: Path) -> dict:
     """Return settings whose files (keys in ``_path``), relative to the folder ``before``, are relative to ``after``."""
     files = {key: value for key, value in settings.items() if key.endswith("_path")}
     return {**settings, **{key: os.path.relpath(before / value, after) for key, value in files.items()}}
@@ -171,18 +171,18 @@ def restored(table: Table, arrays: dict[str, DifferentiableArray], storage: str 
         form = storage or before.storage
         bits = before.bits if before.storage == "uint8" else 8
         if form == "uint8" and before.storage == "uint8" and before.is_pointer:
-            stored |= stored_arrays(name, array.quantised(bits))
+            stored |= to_stored_arrays(name, array.quantised(bits))
         elif form == "uint8":
             stored |= {name: StoredArray.of(array).to("uint8")}
         else:
-            stored |= stored_arrays(name, array.to(form))
+            stored |= to_stored_arrays(name, array.to(form))
     return replace(table, arrays=stored, settings={**table.settings, "optimised": True}, measured={}, path=None)
 
 
 def allocate_pages(
     entries: StoredArray, pages: StoredArray, dtype, shift=0.0, storage: str = "", fold: bool = False
 ) -> PagedArray:
-    """Return the array of pages whose ``entries`` and sizes are stored (:func:`stored_arrays`).
+    """Return the array of pages whose ``entries`` and sizes are stored (:func:`to_stored_arrays`).
 
     Other parameters are those of :meth:`.StoredArray.allocate`. Raises ``ValueError`` if the two arrays do not match.
     """
@@ -200,7 +200,7 @@ def page_sides(pages: StoredArray) -> np.ndarray:
     return pages.entries.astype(np.int64) + 1
 
 
-def gathers_of(table: Table, name: str) -> int:
+def read_gathers(table: Table, name: str) -> int:
     """Return the number of gather instructions of a read of an array of a table (of the sizes of pages: one)."""
     array = table.arrays[name]
     if name.endswith(PAGES) and name.removesuffix(PAGES) in table.arrays:

@@ -7,7 +7,7 @@ from pathlib import Path
 from ..core.arguments import add_arguments
 from ..core.errors import UsageError
 from ..core.files import writable_file
-from ..fitting.task import load_model, task_of, tasks
+from ..fitting.task import find_task, load_model, tasks
 from .common import say, set_variant, variant_option, verb
 
 HELP = "turn a table file back into ordinary files, as images"
@@ -35,7 +35,7 @@ def run(arguments) -> dict:
     from ..arrays.tables import load_table
     from ..core.runtime import array_module
 
-    accepted = {argument.name for argument in task_of(load_table(arguments.file)).decode_arguments}
+    accepted = {argument.name for argument in find_task(load_table(arguments.file)).decode_arguments}
     given = {a.name: getattr(arguments, a.name) for task in tasks().values() for a in task.decode_arguments}
     given = {name: value for name, value in given.items() if value is not None}
     for name in given:

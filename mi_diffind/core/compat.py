@@ -134,7 +134,7 @@ def use_threads(count: int) -> None:
         dr.set_thread_count(count)
 
 
-def module_of(array):
+def backend_module(array):
     """Return the module with the types of the same backend as an array or type, such as ``drjit.llvm.ad``."""
     return sys.modules[(array if isinstance(array, type) else type(array)).__module__]
 
@@ -304,7 +304,7 @@ def splat(block, film, place, light, alpha, aovs: list, wavelengths) -> None:
     put(block, film, place, value=light, weight=1.0, alpha=alpha, aovs=aovs, wavelengths=wavelengths)
 
 
-def objects_of(scene) -> list:
+def scene_objects(scene) -> list:
     """Return all objects of a loaded scene, each once, nested ones too (in a ``twosided``, a ``bumpmap``, …)."""
     return nodes_of(mi.traverse(scene))
 
@@ -349,7 +349,7 @@ def parse(scene: dict | str, defines: dict[str, str] | None = None) -> tuple:
     return config, mi.parser.parse_string(config, scene, **{k: str(v) for k, v in (defines or {}).items()})
 
 
-def copy_parsed(state) -> tuple:
+def copy_state(state) -> tuple:
     """Return a configuration and a copy of a parsed scene's state, since :func:`instantiate` changes the state."""
     return mi.parser.ParserConfig(mi.variant()), mi.parser.ParserState(state)
 
@@ -370,7 +370,7 @@ def build_as(config, parallel: bool, optimize: bool) -> None:
     config.parallel, config.merge_equivalent, config.merge_meshes = parallel, optimize, optimize
 
 
-def properties_of(state, object_type=None, names=()) -> list:
+def parsed_properties(state, object_type=None, names=()) -> list:
     """Return the properties (``mi.Properties``) of all objects of a parsed scene, or of one ``mi.ObjectType``.
 
     Changing them changes the scene. In dictionaries, Mitsuba does not know the type of plugins that are written in
@@ -384,18 +384,18 @@ def properties_of(state, object_type=None, names=()) -> list:
 
 
 def parsed_types(state) -> list:
-    """Return the ``mi.ObjectType`` of all objects of a parsed scene, in the order of :func:`properties_of`."""
+    """Return the ``mi.ObjectType`` of all objects of a parsed scene, in the order of :func:`parsed_properties`."""
     return [node.type for node in state.nodes]
 
 
 def parsed_references(state) -> list[list[int]]:
-    """Return for each object of a parsed scene, in the order of :func:`properties_of`, those it nests or refers to.
+    """Return for each object of a parsed scene, in the order of :func:`parsed_properties`, those it nests or refers to.
 
     They are indices in that order. References are resolved only when a scene is built. Raises ``RuntimeError`` for an
     id that does not exist.
     """
     types, result = mi.Properties.Type, []
-    for props in properties_of(state):
+    for props in parsed_properties(state):
         values = [props[key] for key in props if props.type(key) in (types.Reference, types.ResolvedReference)]
         for value in values:
             if not hasattr(value, "index") and value.id() not in state.id_to_index:

@@ -123,7 +123,7 @@ def largest_fitting(fits: Callable[[float], bool], low: float, high: float, step
     return low
 
 
-def labelled(figures: Mapping[str, float]) -> list[str]:
+def figure_lines(figures: Mapping[str, float]) -> list[str]:
     """Return figures as lines of a table for people: ``psnr_albedo_db``, 42.4 → ``PSNR albedo  42.40 dB``.
 
     Figures of levels of detail (``psnr_l0_db``, ``psnr_l1_db``, …) share a line.

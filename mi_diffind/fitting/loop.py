@@ -66,7 +66,7 @@ class SparseAdam(Adam):
 
     def _update(self, gradient, flat, first, second, packets: int, changed, rate: float, t) -> None:
         """Update the ``changed`` groups of ``flat`` and its moments in place; ``t`` counts the steps before."""
-        module = compat.module_of(flat)
+        module = compat.backend_module(flat)
         Group = module.Array4f if packets else module.Float
         g, p, m, v = (dr.gather(Group, array, changed) for array in (gradient, flat, first, second))
         m = dr.lerp(g, m, self.beta_1)
@@ -85,7 +85,7 @@ def _changed_entries(gradient, packets: int, rows=None):
 
     Of packets, only those of ``rows`` are looked at, if these are given.
     """
-    module = compat.module_of(gradient)
+    module = compat.backend_module(gradient)
     if not packets:
         return dr.compress(gradient != 0)
     if rows is None:
@@ -478,7 +478,7 @@ class _Trainer:
         self.share = 0.0  # of the training that is over
         self.optimizer = (SparseAdam if problem.sparse else Adam)(lr=settings.lr, beta_2=problem.beta_2)
         self.optimizer.update(problem.net)
-        self.module = compat.module_of(next(iter(self.optimizer.values())))
+        self.module = compat.backend_module(next(iter(self.optimizer.values())))
 
     def take_step(self, plateau: float = 1.0):
         net, settings = self.problem.net, self.settings

@@ -30,11 +30,11 @@ from typing import TYPE_CHECKING, Any
 
 from ..core import discovery
 from ..core.arguments import Argument, check_files
-from ..core.compat import module_of
+from ..core.compat import backend_module
 from ..core.errors import UsageError
 from ..core.files import read_once
 from ..core.progress import Deadline, interruptible
-from ..core.units import labelled
+from ..core.units import figure_lines
 from .settings import FitSettings, within_memory
 
 if TYPE_CHECKING:
@@ -200,7 +200,7 @@ class Fitted:
     @functools.cached_property
     def model(self) -> Model:
         """Model of the result, ready to be evaluated, measured and decoded."""
-        return task_of(self.table).model(self.table, self.request.types.TensorXf)
+        return find_task(self.table).model(self.table, self.request.types.TensorXf)
 
     @property
     def history(self) -> list[dict]:
@@ -224,11 +224,11 @@ class Fitted:
         Files that the table names, such as its source, are named relative to the new file's folder. Raises
         :class:`.UsageError` for another extension and :class:`.OutputError`.
         """
-        from ..arrays.tables import moved_paths, save_table
+        from ..arrays.tables import move_paths, save_table
 
         path, table = table_path(path), self.table
         if self.request is not None:
-            settings = moved_paths(table.settings, self.request.folder, path.resolve().parent)
+            settings = move_paths(table.settings, self.request.folder, path.resolve().parent)
             table = dataclasses.replace(table, settings=settings)
         save_table(path, table)
         return path
@@ -237,7 +237,7 @@ class Fitted:
         """Return the result as lines of text: bytes, accuracy, remarks, and how a scene names the file ``path``."""
         table = self.table
         lines = [f"{path}: {table.nbytes:,} bytes as {table.storage}; {self.result.outcome}"]
-        lines += [f"  {line}" for line in (*labelled(table.measured), *self.lines)]
+        lines += [f"  {line}" for line in (*figure_lines(table.measured), *self.lines)]
         usage = tasks()[table.task].usage(table, Path(path).name) if table.task in tasks() else []
         return [*lines, *(["in a scene:"] if usage else []), *(f"  {line}" for line in usage)]
 
@@ -276,7 +276,7 @@ class Model:
     @property
     def types(self) -> ModuleType:
         """Module of the Dr.Jit types to compute with."""
-        return module_of(self.dtype)
+        return backend_module(self.dtype)
 
     def copy(self) -> Model:
         """Return another model that shares the memory of this one's arrays."""
@@ -510,7 +510,7 @@ def tasks() -> dict[str, Task]:
     return discovery.load("mi_diffind.tasks", "TASK", expected=Task)
 
 
-def task_of(table: Table) -> Task:
+def find_task(table: Table) -> Task:
     """Return the task of a table that was read.
 
     Raises :class:`.TableError` if it is not installed.
@@ -527,7 +527,7 @@ def load_model(path: str | os.PathLike, dtype, storage: str = "") -> Model:
     """Return the model of a table file of any task. Raises :class:`.TableError`."""
     from ..arrays.tables import load_table
 
-    return task_of(load_table(path)).read(path, dtype, storage)
+    return find_task(load_table(path)).read(path, dtype, storage)
 
 
 def open_model(path: str | os.PathLike = "", storage: str = "", *, task: str = "", preset: str = "") -> Model:

@@ -227,7 +227,7 @@ class TexelPyramid(Pyramid):
         height, width, count = texels.shape
         plain = replace(entry, color_space="linear", where=tuple(range(count)), low=0.0, high=1.0, knee=0.0)
         self.layout = Layout(width, height, (plain,), (0.5,) * count, (entry.name,) * count)
-        self.types, self.border, self.values = compat.module_of(texels), tuple(border), []
+        self.types, self.border, self.values = compat.backend_module(texels), tuple(border), []
         self._owners, self._padded = [plain] * count, lookup.padded_channels(count)
         Float, UInt32 = self.types.Float, self.types.UInt32
         sizes = level_sizes(height, width)

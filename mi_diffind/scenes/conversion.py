@@ -21,12 +21,12 @@ import mitsuba as mi
 import numpy as np
 
 from .. import plugins
-from ..arrays.tables import Table, moved_paths, save_table
+from ..arrays.tables import Table, move_paths, save_table
 from ..core import compat
 from ..core.errors import DiffindError, UsageError
 from ..core.files import OutputError, relative_path, replacing, shown, writable_file, writable_folder
 from ..core.runtime import use_variant
-from ..fitting.task import STORAGES, fit, table_path, task_of, tasks
+from ..fitting.task import STORAGES, find_task, fit, table_path, tasks
 from ..plugins.support.properties import Kept, StockNode
 from .block_test import PictureCheck, check_picture
 from .loading import ParsedScene, SceneError
@@ -170,7 +170,7 @@ def replace_stock(
 
 
 def _replace_nodes(state, groups: dict[str, plugins.Plugin], folder: Path, progress: bool) -> list[Conversion]:
-    nodes, types = compat.properties_of(state), compat.parsed_types(state)
+    nodes, types = compat.parsed_properties(state), compat.parsed_types(state)
     references = compat.parsed_references(state)
     stock = {name: (word, plugin) for word, plugin in groups.items() for name in plugin.stock.names}
     conversions = []
@@ -198,7 +198,7 @@ def _replace_nodes(state, groups: dict[str, plugins.Plugin], folder: Path, progr
             props.mark_queried(key, False)  # else Mitsuba takes what was read here for known to the plugin
     for plugin in groups.values():
         if plugin.seen_by and any(c.learned == plugin.name for c in conversions):
-            conversions += _trace_by(plugin.seen_by, compat.properties_of(state, mi.ObjectType.Integrator))
+            conversions += _trace_by(plugin.seen_by, compat.parsed_properties(state, mi.ObjectType.Integrator))
     return conversions
 
 
@@ -350,12 +350,12 @@ def save(source, path: str | os.PathLike, storage: str = "", file: str | os.Path
         raise UsageError(f'storage: found "{storage}", allowed are {", ".join(STORAGES)}')
     table, entries = _optimised_table(source, str(file))
     try:
-        stored = task_of(table).stored(table, entries, storage)
+        stored = find_task(table).stored(table, entries, storage)
     except ValueError as e:
         raise UsageError(f"{path}: {e}") from None
-    stored.settings = moved_paths(stored.settings, Path(table.path or "x").resolve().parent, path.resolve().parent)
+    stored.settings = move_paths(stored.settings, Path(table.path or "x").resolve().parent, path.resolve().parent)
     save_table(path, stored)
-    read = task_of(stored).model(stored, mi.TensorXf, "float32").entries()
+    read = find_task(stored).model(stored, mi.TensorXf, "float32").entries()
     errors = {name: array.numpy().reshape(-1) - read[name].numpy().reshape(-1) for name, array in entries.items()}
     rms = {name: float(np.sqrt(np.mean(np.square(e, dtype=np.float64)))) for name, e in errors.items()}
     return Saved(path, stored.nbytes, stored.storage, rms)
@@ -366,7 +366,7 @@ def _optimised_table(source, file: str) -> tuple[Table, dict]:
     if isinstance(source, mi.SceneParameters):
         nodes = compat.nodes_of(source)
     else:
-        nodes = [source] if hasattr(source, "trained") else compat.objects_of(source)
+        nodes = [source] if hasattr(source, "trained") else compat.scene_objects(source)
     trained = {}
     for node in nodes:
         if hasattr(node, "trained") and plugins.origin(node) is not None:

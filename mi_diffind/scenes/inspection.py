@@ -13,11 +13,11 @@ from pathlib import Path
 import mitsuba as mi
 
 from .. import plugins
-from ..arrays.tables import TableError, gathers_of, load_table
+from ..arrays.tables import TableError, load_table, read_gathers
 from ..core.errors import UsageError, printable
 from ..core.runtime import array_module, use_variant
-from ..core.units import labelled
-from ..fitting.task import task_of
+from ..core.units import figure_lines
+from ..fitting.task import find_task
 from . import loading
 
 #: Facts about how rays meet a shape: key of its report → text.
@@ -161,7 +161,7 @@ def owner_names(paths: dict[str, object]) -> dict[str, str]:
 
 
 def _inspect_table(file, measure: bool) -> Inspection:
-    task = task_of(load_table(file))
+    task = find_task(load_table(file))
     table = task.load(file)
     dtype = array_module().TensorXf
     arrays = {}
@@ -173,7 +173,7 @@ def _inspect_table(file, measure: bool) -> Inspection:
             "storage": array.storage,
             "bytes": array.nbytes,
             "bits": 8 * array.entries.itemsize if array.bits == 8 else array.bits,
-            "gathers_per_read": gathers_of(table, name),
+            "gathers_per_read": read_gathers(table, name),
             "min": float(values.min()),
             "max": float(values.max()),
         }
@@ -209,11 +209,11 @@ def _table_lines(inspection: Inspection, verbose: bool) -> list[str]:
         settings = {k: v for k, v in f["settings"].items() if not isinstance(v, (dict, list))} | {"seed": f["seed"]}
         lines.append("  trained with: " + ", ".join(f"{k} {v}" for k, v in settings.items()))
     if f["measured"]:
-        lines += ["  measured after the training:", *(f"    {line}" for line in labelled(f["measured"]))]
+        lines += ["  measured after the training:", *(f"    {line}" for line in figure_lines(f["measured"]))]
     for storage, measured in f.get("measured_in_each_form", {}).items():
         errors = {k: v for k, v in measured.items() if k not in ("bytes", "memory_bytes")}
         lines.append(f"  as {storage}: {measured['bytes']:,} bytes ({measured['memory_bytes']:,} in memory)")
-        lines += [f"    {line}" for line in labelled(errors)]
+        lines += [f"    {line}" for line in figure_lines(errors)]
     return [*lines, *(["in a scene:"] if inspection.usage else []), *(f"  {line}" for line in inspection.usage)]
 
 

@@ -64,8 +64,8 @@ def warn_if_black(scene, path: str | os.PathLike, images) -> None:
 
 def use_slashes(state) -> None:
     """Write names of files in a parsed scene with slashes where they have backslashes, and only that is a file."""
-    copies = compat.properties_of(compat.copy_parsed(state)[1])  # a parameter that was read counts as known
-    for props, copy in zip(compat.properties_of(state), copies, strict=True):
+    copies = compat.parsed_properties(compat.copy_state(state)[1])  # a parameter that was read counts as known
+    for props, copy in zip(compat.parsed_properties(state), copies, strict=True):
         for key in copy:
             text = str(copy[key]) if compat.property_kind(copy, key) == "text" else ""
             if "\\" in text and not _is_file(text) and _is_file(text.replace("\\", "/")):
@@ -81,7 +81,7 @@ def _is_file(name: str) -> bool:
 
 def check_measured(state) -> None:
     """Refuse damaged files of measured materials that a parsed scene names. Raises UsageError."""
-    for props in compat.properties_of(state):
+    for props in compat.parsed_properties(state):
         if props.plugin_name() in ("measured", "measured_polarized") and "filename" in props:
             path = Path(str(mi.file_resolver().resolve(str(props["filename"]))))
             if path.is_file():
@@ -163,7 +163,7 @@ class ParsedScene:
         memory, unless the scene forbids decoding; then this is an error.
         """
         with self._errors():
-            config, state = compat.copy_parsed(self._state)
+            config, state = compat.copy_state(self._state)
             if not merge:
                 compat.keep_meshes(config)
             config.parallel = parallel
@@ -188,7 +188,7 @@ class ParsedScene:
 
     def _copy(self):
         """Return a copy of the parsed state to read: Mitsuba takes a parameter that was read once for a known one."""
-        return compat.copy_parsed(self._state)[1]
+        return compat.copy_state(self._state)[1]
 
     def path_integrator(self) -> tuple[str, int]:
         """Return the plugin name and the ``max_depth`` of the integrator that follows the scene's paths.
@@ -247,7 +247,7 @@ class ParsedScene:
         with self._errors():
             state = self._copy()
             files = [Path(file).resolve() for file in compat.parsed_files(state)]
-            for props in compat.properties_of(state):
+            for props in compat.parsed_properties(state):
                 texts = (props[k] for k in props if compat.property_kind(props, k) == "text")
                 for file in (self.path.resolve().parent / text for text in texts if text):
                     with contextlib.suppress(OSError, ValueError):  # most texts are no names of files
@@ -261,7 +261,7 @@ def _description(state) -> str:
 
     Objects that exist already, such as bitmaps, have no such text: the result is then another one each time.
     """
-    nodes = compat.properties_of(state)
+    nodes = compat.parsed_properties(state)
     existing = any(compat.property_kind(props, key) == "existing" for props in nodes for key in props)
     return "\n".join([os.urandom(16).hex() if existing else "", *map(str, nodes)])
 
@@ -355,7 +355,7 @@ def _integrators(state) -> list[str]:
 def integrator_properties(state) -> list:
     """Return the properties of all integrators of a parsed scene, nested ones included."""
     names = {name for name, plugin in plugins.declared().items() if plugin.object_type == "integrator"}
-    return compat.properties_of(state, mi.ObjectType.Integrator, names)
+    return compat.parsed_properties(state, mi.ObjectType.Integrator, names)
 
 
 def _path_integrator(state):
@@ -380,7 +380,7 @@ def nests_another(props) -> bool:
 def _replaceable(state, against: str | tuple[str, ...]) -> list[tuple]:
     """Return ``(properties, plugin)`` of all nodes whose plugin has the counterpart ``against``."""
     declared = plugins.declared()
-    nodes = [(props, declared.get(props.plugin_name())) for props in compat.properties_of(state)]
+    nodes = [(props, declared.get(props.plugin_name())) for props in compat.parsed_properties(state)]
     return [(props, plugin) for props, plugin in nodes if plugin and plugin.counterpart(against)]
 
 
@@ -390,7 +390,7 @@ def _decode_unseen(state, integrators: list[str]) -> list[str]:
     Left out are shapes for which the scene states how they are traced, or that their arrays are optimised.
     """
     ids = []
-    for props in compat.properties_of(state):
+    for props in compat.parsed_properties(state):
         plugin = plugins.declared().get(props.plugin_name())
         if plugin is None or plugin.otherwise is None or _sees(integrators, plugin.seen_by):
             continue
@@ -435,7 +435,7 @@ def instances(scene) -> list:
     Nested objects (in a ``twosided``, a ``bumpmap``, …) are included.
     """
     # All nodes, not only owners of parameters: tables of bytes are no parameters
-    return [node for node in compat.objects_of(scene) if plugins.origin(node) is not None]
+    return [node for node in compat.scene_objects(scene) if plugins.origin(node) is not None]
 
 
 def learned_instances(scene) -> list:

@@ -107,7 +107,7 @@ class _Editor:
         self.target, self.origin = target, self.files[0].parent
         self.parameters, self.defines, self.undefined = dict(defines), defines, set(defines)
         self.next_file = 0
-        properties = zip(compat.properties_of(before), compat.properties_of(after), strict=True)
+        properties = zip(compat.parsed_properties(before), compat.parsed_properties(after), strict=True)
         self.changes = {
             place: (a, b) for place, (a, b) in zip(compat.parsed_offsets(before), properties, strict=True) if a != b
         }
@@ -283,8 +283,8 @@ def _shown(value) -> str:
 
 def absolute_paths(state):
     """Return a copy of a parsed scene in which the paths of files that exist are absolute."""
-    state = compat.copy_parsed(state)[1]
-    for props in compat.properties_of(state):
+    state = compat.copy_state(state)[1]
+    for props in compat.parsed_properties(state):
         for key in props:
             if compat.property_kind(props, key) == "text" and props[key] and _may_be_file(key, props[key]):
                 file = Path(str(mi.file_resolver().resolve(props[key])))
@@ -299,7 +299,7 @@ def difference(before, after) -> str:
     Compared are the objects, their order, ids, plugins and parameters, with transforms and colours to the last bit, and
     to which other objects they refer, by any alias.
     """
-    pairs = list(zip(compat.properties_of(before), compat.properties_of(after), strict=False))
+    pairs = list(zip(compat.parsed_properties(before), compat.parsed_properties(after), strict=False))
     for index, (a, b) in enumerate(pairs):
         name = f'{b.plugin_name()} "{b.id() or Path(compat.parsed_place(after, index)).name}"'
         if (a.plugin_name(), a.id()) != (b.plugin_name(), b.id()):
@@ -309,7 +309,7 @@ def difference(before, after) -> str:
                 return f'{name} {"lacks" if key in a else "has"} "{key}"'
             if not _is_equal(key, a, b) and compat.property_kind(a, key) != "object":
                 return f"{name} has {key} {_shown(b[key])} in place of {_shown(a[key])}"
-    counts = [len(compat.properties_of(state)) for state in (before, after)]
+    counts = [len(compat.parsed_properties(state)) for state in (before, after)]
     if counts[0] != counts[1]:
         return f"{counts[1]} objects in place of {counts[0]}"
     if compat.parsed_types(before) != compat.parsed_types(after):

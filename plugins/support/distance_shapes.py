@@ -233,7 +233,7 @@ class DistanceShapes:
 def distance_shapes_in(scene: mi.Scene) -> DistanceShapes:
     """Return the distance shapes of a scene. Raises ``RuntimeError`` if one is in a shape group."""
     shapes = [shape for shape in scene.shapes() if hasattr(shape, "local_ray")]
-    hidden = [s for s in compat.objects_of(scene) if hasattr(s, "local_ray") and s not in shapes]
+    hidden = [s for s in compat.scene_objects(scene) if hasattr(s, "local_ray") and s not in shapes]
     if hidden:
         raise RuntimeError(
             f'"{hidden[0].id()}": is in a shapegroup, where its arrays cannot be traced; several shapes of one file '

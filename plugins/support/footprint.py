@@ -326,7 +326,7 @@ def _major(p, q, r) -> tuple:
 
 def textures(scene: mi.Scene) -> list:
     """Return the textures of a loaded scene that have a method ``set_cone(cone)``, each once."""
-    return [node for node in compat.objects_of(scene) if hasattr(node, "set_cone")]
+    return [node for node in compat.scene_objects(scene) if hasattr(node, "set_cone")]
 
 
 def attach(scene: mi.Scene, sensor: int | mi.Sensor = 0, spp: int | None = None) -> int:

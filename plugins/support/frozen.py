@@ -28,7 +28,7 @@ def key(*settings) -> list:
     A plugin keeps them as an attribute of its instance: a frozen function records again where they differ. They are
     never computed.
     """
-    types = compat.module_of(mi.Float)
+    types = compat.backend_module(mi.Float)
     digest = int.from_bytes(hashlib.blake2b(repr(settings).encode(), digest_size=8).digest(), "little")
     return [getattr(types, _DIGITS[digest >> 3 * i & 7])(0) for i in range(_LENGTH)]
 

@@ -17,7 +17,7 @@ import numpy as np
 from mi_diffind.arrays.tables import Table, TableError
 from mi_diffind.core import compat
 from mi_diffind.core.archives import LimitError
-from mi_diffind.core.compat import module_of
+from mi_diffind.core.compat import backend_module
 from mi_diffind.core.errors import DiffindError
 from mi_diffind.core.files import (
     OutsideError,
@@ -142,7 +142,7 @@ def open_uncompressed(props: mi.Properties, wrap_mode: str) -> tuple[SharedMaps,
         names = " and ".join(f'"{name}"' for name in given) or "none"
         raise RuntimeError(f'parameters "filename", "bitmap" and "pyramid": found {names}, exactly one is needed')
     raw = props.get("raw", False) is True
-    types, border = module_of(mi.TensorXf), ("repeat" if wrap_mode == "repeat" else "clamp",) * 2
+    types, border = backend_module(mi.TensorXf), ("repeat" if wrap_mode == "repeat" else "clamp",) * 2
     if given == ["pyramid"]:
         name = str(props["pyramid"])
         if name not in PYRAMIDS:

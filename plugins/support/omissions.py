@@ -66,9 +66,9 @@ def check(scene, integrator=None, sensor=0) -> None:
     if len(_checked) >= MOST:
         _checked.clear()
     _checked.add(ids)
-    integrators = compat.objects_of(integrator)
+    integrators = compat.scene_objects(integrator)
     groups: dict[str, list] = {}
-    for instance in compat.objects_of(scene):
+    for instance in compat.scene_objects(scene):
         if instance in _watched:
             groups.setdefault(plugin_of(instance), []).append(instance)
     for instances in groups.values():

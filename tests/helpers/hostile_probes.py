@@ -21,7 +21,7 @@ from mi_diffind.arrays.tables import load_table
 from mi_diffind.core import compat
 from mi_diffind.core.errors import DiffindError
 from mi_diffind.core.runtime import array_module
-from mi_diffind.fitting.task import Model, task_of
+from mi_diffind.fitting.task import Model, find_task
 
 #: Memory that reading a file may take: bytes, and multiples of the file's size.
 MEMORY, TIMES = 64 << 20, 20
@@ -85,7 +85,7 @@ def printable(lines) -> dict | None:
 
 def load(path: str):
     """Return the checked table of a file of any task."""
-    return task_of(load_table(path)).load(path)
+    return find_task(load_table(path)).load(path)
 
 
 #: Checked table of an original file.
@@ -119,20 +119,20 @@ def table(path: str, original: str, untouched: list[str] | None, evaluate: bool 
         return fault
     if not evaluate:
         return None
-    return finite(decode=decoded(model)) or finite(picture=rendered(task_of(loaded), loaded, path))
+    return finite(decode=decoded(model)) or finite(picture=rendered(find_task(loaded), loaded, path))
 
 
 def opened(path: str) -> tuple:
     """Return the table of a file, and its model."""
     loaded = load(path)
-    return loaded, task_of(loaded).model(loaded, array_module("llvm").TensorXf)
+    return loaded, find_task(loaded).model(loaded, array_module("llvm").TensorXf)
 
 
 def decoded(model) -> object:
     """Return the content of a model in an ordinary format, ``None`` if there is no such format."""
     if type(model).decode is Model.decode:
         return None
-    names = {argument.name for argument in task_of(model.table).decode_arguments}
+    names = {argument.name for argument in find_task(model.table).decode_arguments}
     options = {name: value for name, value in DECODED.items() if name in names}
     if inspect.signature(type(model).decode).parameters["output"].default is None:
         options.pop("rows", None)  # of a file only

@@ -5,7 +5,7 @@ import math
 import drjit as dr
 import numpy as np
 
-from mi_diffind.core.compat import module_of
+from mi_diffind.core.compat import backend_module
 from mi_diffind.tasks.sdf.field import DistanceField
 
 
@@ -73,7 +73,7 @@ class TrilinearField(DistanceField):
     def __init__(self, values, lower, upper, band: float):
         array, self.resolution = values.numpy().astype(np.float64), values.shape
         size = [(b - a) / (n - 1) for a, b, n in zip(lower, upper, values.shape, strict=True)]
-        super().__init__(module_of(values), lower, upper, min(size), band)
+        super().__init__(backend_module(values), lower, upper, min(size), band)
         self.texture = self.types.Texture3f(type(values)(values.array, (*values.shape, 1)), use_accel=False)
         steps = [np.abs(np.diff(array, axis=axis)).max() / h for axis, h in enumerate(size)]
         self.slope = max(1.0, float(np.linalg.norm(steps)))

@@ -225,7 +225,7 @@ def field_furnace(mi, parts: dict, effort: Effort) -> Cell:
 
     from mi_diffind.core import compat
 
-    fog = radiance_fields.Fog(compat.module_of(mi.Float), 0.8, (1.0, 1.0, 1.0))
+    fog = radiance_fields.Fog(compat.backend_module(mi.Float), 0.8, (1.0, 1.0, 1.0))
     radiance_fields.register(mi, {"white": fog}, "furnace_field")
     parts["integrator"] = {"type": "furnace_field", "field": "white", "max_depth": 64, "rr_depth": 1000}
     parts["shape"] |= {"bsdf": {"type": "diffuse", "reflectance": 1.0}}

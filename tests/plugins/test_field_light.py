@@ -16,7 +16,7 @@ RADIANCE = (3.0, 2.0, 1.0)
 
 @pytest.fixture
 def fields(mi_rgb):
-    types = compat.module_of(mi_rgb.Float)
+    types = compat.backend_module(mi_rgb.Float)
     fields = {
         "lamp": Fog(types, 1e3, RADIANCE, voxel=0.01, half=HALF),
         "black": Fog(types, 1e3, (0, 0, 0), voxel=0.01, half=HALF),
@@ -200,7 +200,7 @@ def test_the_place_of_the_light_is_found_in_a_large_empty_box(mi_rgb):
 
     field_light = plugins.declared()["neural_field"].factory.__globals__["FieldLight"]
     bright_spheres = __import__(field_light.__module__, fromlist=["x"]).bright_spheres
-    spheres = bright_spheres(Speck(compat.module_of(mi_rgb.Float), 1e3, voxel=0.01), 16)
+    spheres = bright_spheres(Speck(compat.backend_module(mi_rgb.Float), 1e3, voxel=0.01), 16)
     assert len(spheres) == 16 and np.linalg.norm(spheres[:, :3] - [0.5, -0.2, 0.3], axis=1).max() < 0.1
     assert spheres[:, 3].max() < 0.1
 

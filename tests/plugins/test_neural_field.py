@@ -21,7 +21,7 @@ def fields(mi_rgb):
 
 
 def registered(mi):
-    types = compat.module_of(mi.Float)
+    types = compat.backend_module(mi.Float)
     found = {"fog": Fog(types, DENSITY, HUE), "bumps": Bumps(types), "black": Fog(types, DENSITY, (0, 0, 0))}
     register(mi, found)
     return found
@@ -276,7 +276,7 @@ def test_several_fields(mi_rgb, fields):
 def test_fields_that_overlap(mi_rgb, fields):
     """Densities and emissions add up: a Riemann sum in NumPy, with surfaces before, within and behind."""
     mi = mi_rgb
-    types = compat.module_of(mi.Float)
+    types = compat.backend_module(mi.Float)
     colours = np.array([[0.2, 0.5, 0.8], [0.9, 0.3, 0.1]])
     register(mi, {"fine": Fog(types, 0.8, colours[0], voxel=0.02), "dense": Fog(types, 1.5, colours[1], voxel=0.05)})
     place = mi.ScalarTransform4f().translate([0.3, 0.7, -0.2]).rotate(AXIS, 30).scale(0.8)
@@ -338,7 +338,7 @@ def test_solids_of_path_sdf(mi_rgb, fields):
     import sdf_fields
 
     mi = mi_rgb
-    sdf_fields.register(mi, {"ball": sdf_fields.Ball(compat.module_of(mi.Float))})
+    sdf_fields.register(mi, {"ball": sdf_fields.Ball(compat.backend_module(mi.Float))})
     ball = {"type": "test_solid", "field": "ball", "to_world": mi.ScalarTransform4f().scale(1.5)}
     integrator = {"aovs": "opacity,depth", "c": {"type": "path_sdf", "jitter": False, "max_depth": 2}}
     image = render(mi, scene(mi, integrator=integrator, ball=ball))
@@ -376,7 +376,7 @@ def test_what_the_inner_integrator_is_asked(mi_rgb, fields):
             return ray, weight, place
 
     mi.register_integrator("test_inner", Inner)
-    dense = Fog(compat.module_of(mi.Float), 20.0)
+    dense = Fog(compat.backend_module(mi.Float), 20.0)
     register(mi, {"dense": dense}, "test_dense")
     made = scene(mi, glass=mirror(mi, {"type": "conductor"}, place=(1.6, 0.5, 0)))
     integrator = mi.load_dict({"type": "test_dense", "field": "dense", "c": {"type": "test_inner"}})
@@ -730,7 +730,7 @@ def test_reflections_of_a_file(mi_rgb, fields, file, tmp_path):
 
     mi = mi_rgb
     rng = np.random.default_rng(8)
-    grid = files.grid_of(files.load(file), compat.module_of(mi.Float)).with_reflections()
+    grid = files.grid_of(files.load(file), compat.backend_module(mi.Float)).with_reflections()
     place = grid.nodes.positions() - (np.array(grid.nodes.shape) - 1) / 2
     grid.colour[1:, volume_field.NORMAL] = place / np.maximum(np.linalg.norm(place, axis=1, keepdims=True), 1)
     grid.colour[:, volume_field.TINT] = -0.5

@@ -11,7 +11,7 @@ from texture_files import make
 from texture_scenes import linear
 
 from mi_diffind.arrays.tables import load_table, save_table
-from mi_diffind.core.compat import module_of
+from mi_diffind.core.compat import backend_module
 from mi_diffind.maps.layout import Layout
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays, load_source
@@ -169,7 +169,7 @@ def test_equals_a_mipmap_of_what_it_decodes_to(mi_rgb, files, rng, border, wrap_
         y, x = np.mgrid[0:rows, 0:columns]
         u, v, at = floats(mi, (x.ravel() + 0.5) / columns, (y.ravel() + 0.5) / rows, np.full(x.size, level))
         levels.append(numpy_of(image.filtered(u, v, at)).reshape(rows, columns, -1))
-    image_files.PYRAMIDS["decoded"] = Pyramid(layout, levels, module_of(mi.TensorXf), along)
+    image_files.PYRAMIDS["decoded"] = Pyramid(layout, levels, backend_module(mi.TensorXf), along)
     try:
         ours = mi.load_dict(plugin(files[border], wrap_mode=wrap_mode))
         theirs = mi.load_dict({"type": "mipmap", "pyramid": "decoded", "channels": "albedo", "wrap_mode": wrap_mode})

@@ -44,7 +44,7 @@ def render(mi, loaded, integrator="path_sdf", spp=16, seed=0, **options):
 @pytest.fixture
 def fields(mi_rgb):
     """The fields that a ``test_solid`` may name."""
-    types = compat.module_of(mi_rgb.Float)
+    types = compat.backend_module(mi_rgb.Float)
     by_name = {"ball": Ball(types), "aside": Ball(types, 0.3, (0.15, 0.1, -0.05))}
     register(mi_rgb, by_name)
     return by_name

@@ -137,7 +137,7 @@ REFUSED = {
 def test_radiance_fields_around_each_integrator(mi_rgb, name):
     """Uniform fog before a sky: what is seen is the formula's mixture of both."""
     mi, colour, density = mi_rgb, np.array([0.2, 0.5, 0.8]), 0.8
-    register(mi, {"fog": Fog(compat.module_of(mi.Float), density, colour)})
+    register(mi, {"fog": Fog(compat.backend_module(mi.Float), density, colour)})
     field = {"type": "test_field", "field": "fog", "surfaces": {"type": name, **INTEGRATORS[name]}}
     if name in REFUSED:
         with pytest.raises(RuntimeError, match=REFUSED[name]):

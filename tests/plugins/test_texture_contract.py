@@ -20,7 +20,7 @@ from variants import VARIANTS, set_variant
 
 from mi_diffind import plugins
 from mi_diffind.arrays.tables import load_table
-from mi_diffind.fitting.task import task_of
+from mi_diffind.fitting.task import find_task
 from mi_diffind.maps import compressed
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.tasks.ggx import TASK as GGX
@@ -83,7 +83,7 @@ def decoded(mi, files, name, **level):
     if name == "mipmap":
         return {name: values.astype(np.float32) / 255 for name, values in material().items()}
     table = load_table(files[name])
-    return task_of(table).model(table, mi.TensorXf).image.decode(**level)
+    return find_task(table).model(table, mi.TensorXf).image.decode(**level)
 
 
 def bitmap(mi, files, name, channels="albedo", **more):

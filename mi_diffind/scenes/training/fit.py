@@ -10,14 +10,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ...arrays.tables import Table, moved_paths, save_table
+from ...arrays.tables import Table, move_paths, save_table
 from ...core import compat
 from ...core.errors import UsageError
 from ...core.files import replacing, writable_folder
 from ...core.progress import profiled
-from ...core.units import labelled
+from ...core.units import figure_lines
 from ...fitting.loop import FitResult, cores
-from ...fitting.task import FitRequest, Fitted, Model, table_path, task_of, tasks
+from ...fitting.task import FitRequest, Fitted, Model, find_task, table_path, tasks
 from ...maps.arguments import preview_path
 from ...tasks.texture.training import TextureProblem
 from .. import loading
@@ -233,7 +233,7 @@ class FittedFiles(Fitted):
     @property
     def models(self) -> dict[str, Model]:
         """Model of each file, ready to be evaluated, measured and decoded."""
-        return {n: task_of(table).model(table, self.request.types.TensorXf) for n, table in self.tables.items()}
+        return {n: find_task(table).model(table, self.request.types.TensorXf) for n, table in self.tables.items()}
 
     @property
     def model(self) -> Model:
@@ -263,7 +263,7 @@ class FittedFiles(Fitted):
             for name, table in self.tables.items():
                 settings = table.settings
                 if self.request is not None:
-                    settings = moved_paths(settings, self.request.folder, folder.resolve())
+                    settings = move_paths(settings, self.request.folder, folder.resolve())
                 save_table(stack.enter_context(replacing(folder / name)), dataclasses.replace(table, settings=settings))
         return folder
 
@@ -272,7 +272,7 @@ class FittedFiles(Fitted):
         lines = [f"{path}: {len(self.tables)} files; {self.result.outcome}"]
         for name, table in self.tables.items():
             lines.append(f"{Path(path) / name}: {table.nbytes:,} bytes as {table.storage}")
-            lines += [f"  {line}" for line in labelled(table.measured)]
+            lines += [f"  {line}" for line in figure_lines(table.measured)]
         lines += [f"  {line}" for line in self.lines]
         usage = [f"  {line}" for n, table in self.tables.items() for line in tasks()[table.task].usage(table, n)]
         return [*lines, *(["in a scene:"] if usage else []), *usage]

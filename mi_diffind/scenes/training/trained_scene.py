@@ -155,7 +155,7 @@ class SceneTexture:
         if not layout.stored:
             raise UsageError(f"{self.table.path}: holds a texture of one colour, without arrays to train")
         texture = CompressedTexture.of(self.table, mi.TensorXf, "float32")
-        pyramid = Pyramid.of(self.source, layout, compat.module_of(mi.TensorXf), texture.border)
+        pyramid = Pyramid.of(self.source, layout, compat.backend_module(mi.TensorXf), texture.border)
         if trained:
             self.problem = TextureProblem(texture.net, pyramid, recipe, self.source.digest)
         else:
@@ -257,7 +257,7 @@ class TrainedScene:
                 save_table(copies[file], table)
 
             def change(state):
-                for props in compat.properties_of(state):
+                for props in compat.parsed_properties(state):
                     name = props.plugin_name()
                     file = (folder / str(props.get("filename", ""))).resolve() if name in PLUGINS else None
                     if file in copies:

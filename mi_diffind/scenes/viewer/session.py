@@ -16,7 +16,7 @@ from ...arrays.tables import load_table
 from ...core import compat
 from ...core.errors import DiffindError, UsageError
 from ...core.runtime import array_module, use_variant
-from ...fitting.task import task_of
+from ...fitting.task import find_task
 from ...images import metrics
 from ...images.films import displayed
 from .. import loading
@@ -395,7 +395,7 @@ def _resize(state, width: int) -> None:
 
     The default size of a film is 768 x 576 pixels.
     """
-    for props in compat.properties_of(state, mi.ObjectType.Film):
+    for props in compat.parsed_properties(state, mi.ObjectType.Film):
         if not any(key.startswith("crop_") for key in props):
             props["height"] = max(1, round(width * props.get("height", 576) / props.get("width", 768)))
             props["width"] = width
@@ -406,7 +406,7 @@ def _choices(state) -> Iterator[tuple]:
 
     A preset names a table that ships: there is no such choice beside a file.
     """
-    for props in compat.properties_of(state):
+    for props in compat.parsed_properties(state):
         plugin = plugins.declared().get(props.plugin_name())
         for name, words in plugin.choices.items() if plugin else ():
             if not (name == "preset" and "filename" in props):
@@ -424,7 +424,7 @@ def table_scene(file: str | os.PathLike) -> dict:
     task whose tables no plugin reads.
     """
     path = Path(file).resolve()
-    task = task_of(load_table(file))
+    task = find_task(load_table(file))
     table = task.load(file)
     if task.plugin is None:
         raise UsageError(f'{file}: holds tables for the task "{task.name}", which no plugin shows')

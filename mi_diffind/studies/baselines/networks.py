@@ -23,7 +23,7 @@ from drjit import nn
 from ...arrays.budget import Budget, BudgetError
 from ...arrays.indirection import DifferentiableArray, fold
 from ...arrays.lookup import clamp
-from ...core.compat import module_of
+from ...core.compat import backend_module
 from ...core.runtime import array_module
 from ...fitting.loop import Problem
 from ...maps.compressed import FilteredMaps, decibel
@@ -91,7 +91,7 @@ class Network(nn.Module):
     def _alloc(self, dtype, size=-1, rng=None):
         result, size = copy.copy(self), self.inputs
         if self.grid:
-            Float = module_of(dtype).Float
+            Float = backend_module(dtype).Float
             result.encoding = nn.HashGridEncoding(Float, self.inputs, rng=rng, **self.grid)
             result.entries = dtype(result.encoding.params)
             size = self.grid["n_levels"] * self.grid["n_features_per_level"] + self.direct

@@ -237,7 +237,7 @@ def _source_files(file: Path) -> list[Path]:
     if file.suffix.lower() != ".xml":
         return [file]
     _, state = compat.parse_file(file)
-    properties = compat.properties_of(state)
+    properties = compat.parsed_properties(state)
     texts = {props[k] for props in properties for k in props if compat.property_kind(props, k) == "text"}
     named = (file.parent / text for text in sorted(texts) if 0 < len(text) < 1000)
     return [*dict.fromkeys([*map(Path, compat.parsed_files(state)), *(path for path in named if path.is_file())])]

@@ -29,7 +29,7 @@ import numpy as np
 
 from ...arrays.lookup import clamp
 from ...core import tensor_files
-from ...core.compat import module_of
+from ...core.compat import backend_module
 from ...core.errors import UsageError, reason
 from .directions import Samples, incident, outgoing
 from .mixture import TurnedMixture
@@ -600,7 +600,7 @@ def remove_outliers(
     truth: ScatteredTruth, parts: list[Samples], form: Form, logarithms: np.ndarray
 ) -> tuple[list[Samples], Form, str]:
     """Return samples without outliers from a fitted proxy, the form with the range of the first, and a line of text."""
-    proxy, types = proxy_array(logarithms, 1.0) if form.terms else None, module_of(parts[0].weight)
+    proxy, types = proxy_array(logarithms, 1.0) if form.terms else None, backend_module(parts[0].weight)
     net = BSDFArrays(None, proxy).alloc(types.TensorXf)
     parts, outliers = zip(*(without_outliers(s, form, net.at(form)) for s in parts), strict=True)
     form = dataclasses.replace(form, range=residual_range(form, logarithms, parts[0]))

@@ -14,7 +14,7 @@ import drjit as dr
 import numpy as np
 
 from ...arrays.indirection import DifferentiableArray, device_array
-from ...core.compat import module_of
+from ...core.compat import backend_module
 from ...core.progress import interruptible
 from ...fitting.loop import FitResult, Problem
 from ...fitting.settings import FitSettings
@@ -355,7 +355,7 @@ def choose_form(
 
 def residual_range(form: Form, logarithms: np.ndarray, samples: Samples) -> tuple[float, float]:
     """Return the range of log(f / proxy) over samples, from quantiles; without a proxy, black channels count, too."""
-    types = module_of(samples.weight)
+    types = backend_module(samples.weight)
     if form.terms:
         net = BSDFArrays(None, proxy_array(logarithms, 1.0)).alloc(types.TensorXf)
         with dr.suspend_grad():
@@ -399,5 +399,5 @@ def residual_problem(
         start = (1 - low) / step
     residual, mixing = sizes.arrays(float(np.clip(start, 0, 1)), form.azimuth)
     proxy = proxy_array(logarithms, RATE) if form.terms else None
-    net = BSDFArrays(residual, proxy, mixing, RATE).alloc(module_of(samples.weight).TensorXf)
+    net = BSDFArrays(residual, proxy, mixing, RATE).alloc(backend_module(samples.weight).TensorXf)
     return BSDFProblem(net, form, samples, measure, identity)

@@ -21,8 +21,8 @@ import numpy as np
 from ...arrays.budget import Budget, array_bytes
 from ...arrays.indirection import DifferentiableArray, Indirection, ramp
 from ...arrays.pages import PagedArray, page_counts, page_entries, page_gain, page_positions, page_shift, page_sizes
-from ...arrays.tables import PAGES, Table, TableError, load_table, stored_arrays
-from ...core.compat import module_of
+from ...arrays.tables import PAGES, Table, TableError, load_table, to_stored_arrays
+from ...core.compat import backend_module
 from ...maps.compressed import CompressedMaps
 from ...maps.layout import Layout, channel_covariance, downscale, eigenvectors, neighbour_covariance
 from ...maps.model import MapsModel, allocate_maps, stored_entries
@@ -339,7 +339,7 @@ class CompressedImage(CompressedMaps):
 
     def __init__(self, layout: Layout, net: Indirection | None):
         self.layout, self.net = layout, net
-        self.types = None if net is None else module_of(net.cascaded.data)
+        self.types = None if net is None else backend_module(net.cascaded.data)
         self.border = ("clamp", "clamp") if net is None else net.primary[0].border
 
     @staticmethod
@@ -370,7 +370,7 @@ def to_table(image: CompressedImage, settings: dict) -> Table:
     stored = {}
     if image.net is not None:
         for name, array in (*zip(PRIMARIES, image.net.primary, strict=False), ("cascaded", image.net.cascaded)):
-            stored |= stored_arrays(name, array)
+            stored |= to_stored_arrays(name, array)
     return Table("image", stored, settings={**settings, "layout": image.layout.to_json()})
 
 

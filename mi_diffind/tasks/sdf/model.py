@@ -21,7 +21,7 @@ from ...arrays.tables import (  # fmt: skip
     load_layout,
     restored,
 )
-from ...core.compat import module_of
+from ...core.compat import backend_module
 from ...core.errors import UsageError
 from ...core.files import replacing
 from ...core.units import check_memory
@@ -177,7 +177,7 @@ def stored(table: Table, entries: dict, storage: str = "") -> Table:
         raise ValueError(f'storage: found "{storage}", allowed is uint8: the nodes of a sparse field are coded')
     values = entries["nodes"].numpy().astype(np.float64)
     values[:, 1:] /= np.maximum(np.linalg.norm(values[:, 1:], axis=1, keepdims=True), 1e-9)
-    before = build_field(table, {}, module_of(entries["nodes"]), "float32").nodes.numpy().astype(np.float64)
+    before = build_field(table, {}, backend_module(entries["nodes"]), "float32").nodes.numpy().astype(np.float64)
     arrays, settings = coded_arrays(encode_again(read_grid(table), before, values, table.settings["bits"], table.seed))
     settings = {**table.settings, **settings, "optimised": True}
     return replace(table, arrays=arrays, settings=settings, measured={}, path=None)

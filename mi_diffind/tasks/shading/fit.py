@@ -8,7 +8,7 @@ import os
 
 from ...arrays.tables import Table
 from ...core.errors import UsageError
-from ...core.units import labelled
+from ...core.units import figure_lines
 from ...fitting.task import FitRequest, Fitted
 from ...maps.arguments import preview_path, requested_border, requested_bytes, size_figures
 from ...maps.pyramid import Pyramid
@@ -99,8 +99,9 @@ def fit(request: FitRequest) -> Fitted:
     before, not_shaded = settings.get("before", {}), material.left_out(layout)
     figures, sizes = size_figures(source, table, None)
     del figures["compression_asked"]
+    figures_before = ", ".join(" ".join(x.split()) for x in figure_lines(before))
     remarks = [
-        (before, "before the training for the shading: " + ", ".join(" ".join(x.split()) for x in labelled(before))),
+        (before, f"before the training for the shading: {figures_before}"),
         (first and first.unfinished and not first.interrupted, f"the training as a texture: {first and first.outcome}"),
         *((True, line) for line in (*sizes, *source.notes, f"effects that are shaded: {', '.join(effects.names)}")),
         (settings.get("level_bias"), f"read {-settings.get('level_bias', 0):g} levels finer than the footprint"),

@@ -17,7 +17,7 @@ from typing import Any
 import drjit as dr
 
 from ...arrays.boxes import ValueBounds
-from ...core.compat import module_of
+from ...core.compat import backend_module
 from ...core.errors import UsageError
 from ...images import srgb
 from ...maps.compressed import FilteredMaps
@@ -107,7 +107,7 @@ def surface_of(maps: FilteredMaps, stored: list, extra: list | None = None) -> S
         for role, m in by_role.items()
     }
     array = next((v for values in channels.values() for v in values if dr.is_jit_v(v)), None)
-    types = None if array is None else module_of(array)
+    types = None if array is None else backend_module(array)
 
     def vector(values):
         return types.Array3f(values * 3 if len(values) == 1 else values)

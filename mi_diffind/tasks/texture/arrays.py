@@ -27,7 +27,7 @@ from ...arrays.pages import (
     page_gain,
     page_positions,
     page_shift,
-    page_sizes_of,
+    shared_page_sizes,
 )
 from ...maps.compressed import taps
 from ...maps.layout import Layout, channel_covariance, eigenvectors, neighbour_covariance
@@ -440,7 +440,7 @@ def _pages(pointers: list, basis: PrincipalComponents, size: TextureBudget, bord
     weighted = [(pointers[level][..., :used] * (basis.high - basis.low)).astype(np.float32) for level in size.pages]
     layers, fine = [], []
     ends = [*size.pages[1:], size.skip]
-    sides = page_sizes_of(weighted, border, size.page_entries)
+    sides = shared_page_sizes(weighted, border, size.page_entries)
     for level, end, sizes in zip(size.pages, ends, sides, strict=True):
         values = pointers[level]
         shift = page_shift(values.shape[:2])

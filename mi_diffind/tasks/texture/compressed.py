@@ -11,8 +11,8 @@ import numpy as np
 
 from ...arrays.indirection import DifferentiableArray, aligned_copy
 from ...arrays.lookup import BORDERS
-from ...arrays.tables import PAGES, Table, TableError, load_table, stored_arrays
-from ...core.compat import module_of
+from ...arrays.tables import PAGES, Table, TableError, load_table, to_stored_arrays
+from ...core.compat import backend_module
 from ...core.errors import UsageError
 from ...maps.arguments import BIAS_RANGE
 from ...maps.compressed import FilteredMaps, decibel, map_figure
@@ -36,7 +36,7 @@ class CompressedTexture(FilteredMaps):
 
     def __init__(self, layout: Layout, net: PaperNet | LayeredNet | None, level_bias: float = 0.0):
         self.layout, self.net, self.level_bias = layout, net, level_bias
-        self.types = None if net is None else module_of(net.cascaded.data)
+        self.types = None if net is None else backend_module(net.cascaded.data)
         self.border = ("clamp", "clamp") if net is None else net.border
         self.levels = len(level_sizes(layout.height, layout.width))
 
@@ -146,7 +146,7 @@ def to_table(texture: CompressedTexture, settings: dict) -> Table:
     """Return the table file of a texture, with ``settings``."""
     stored = {}
     for name, array in texture.arrays.items():
-        stored |= stored_arrays(name, array)
+        stored |= to_stored_arrays(name, array)
     settings = {k: v for k, v in settings.items() if k not in ("structure", "border")}  # in "arrays" below
     settings["layout"] = texture.layout.to_json()
     if texture.level_bias:

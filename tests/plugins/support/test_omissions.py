@@ -210,7 +210,7 @@ def test_sensors_that_textures_do_not_know(mi_rgb, warned):
 
 def test_fields_that_another_integrator_leaves_out(mi_rgb, warned):
     mi = mi_rgb
-    register_field(mi, {"fog": Fog(compat.module_of(mi.Float))})
+    register_field(mi, {"fog": Fog(compat.backend_module(mi.Float))})
     field = {"type": "test_field", "field": "fog"}
     loaded = mi.load_dict(scene(mi, integrator={**field, "inner": {"type": "direct"}}))
     render(mi, loaded)
@@ -242,7 +242,7 @@ def test_render_stays_as_it_is(mi_rgb, warned, monkeypatch):
     def traversed(*objects):
         raise AssertionError("a scene was traversed")
 
-    monkeypatch.setattr(compat, "objects_of", traversed)
+    monkeypatch.setattr(compat, "scene_objects", traversed)
     frozen = dr.freeze(lambda loaded, seed: mi.render(scene=loaded, spp=1, seed=seed, sensor=0))
     with dr.suspend_grad():
         images = [np.array(frozen(plain, mi.UInt32(i))) for i in (0, 0, 1)]

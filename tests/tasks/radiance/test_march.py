@@ -12,7 +12,7 @@ from mi_diffind.tasks.radiance import march as marching
 
 
 def types_of(mi):
-    return compat.module_of(mi.Float)
+    return compat.backend_module(mi.Float)
 
 
 def rays(mi, o, d):

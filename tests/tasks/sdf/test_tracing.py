@@ -11,7 +11,7 @@ import pytest
 from arrays import aligned
 from sdf_fields import Ball, Slab, Steps, TrilinearField, sparse_table, torus
 
-from mi_diffind.core.compat import module_of
+from mi_diffind.core.compat import backend_module
 from mi_diffind.core.runtime import use_variant
 from mi_diffind.tasks.sdf import grids, marching, model, nodes
 from mi_diffind.tasks.sdf.nodes import MIDDLE
@@ -21,7 +21,7 @@ COUNT = 4096
 
 @pytest.fixture
 def types(mi_rgb):
-    return module_of(mi_rgb.Float)
+    return backend_module(mi_rgb.Float)
 
 
 def unit(v):
@@ -119,10 +119,10 @@ def test_length_of_rays(types):
 ENDLESS = """
 import drjit as dr, mitsuba as mi, numpy as np
 mi.set_variant("VARIANT")
-from mi_diffind.core.compat import module_of
+from mi_diffind.core.compat import backend_module
 from mi_diffind.tasks.sdf import marching, model
 from sdf_fields import Ball, sparse_table
-types = module_of(mi.Float)
+types = backend_module(mi.Float)
 table = sparse_table()
 arrays = {name: array.allocate(mi.TensorXf) for name, array in table.arrays.items()}
 nan, inf = np.nan, np.inf
