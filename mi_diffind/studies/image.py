@@ -48,7 +48,7 @@ BITMAPS = {"bitmap, 8 bits": True, "bitmap, floats": False}
 NETWORK_SETTINGS = FitSettings(steps=10**6, batch=2**12, lr=1e-2, schedule="cosine", loss="mse", measure_every=200)
 
 MEASURES = (
-    Measure("PSNR", "psnr_db"),
+    Measure("PSNR, dB", "psnr_db"),
     Measure("between texels", "psnr_between_db"),
     Measure("mean of maps", "psnr_mean_db"),
     Measure("FLIP", "flip", ".4f", False),
@@ -245,13 +245,9 @@ def plan(source: Source, name: str, settings: SimpleNamespace) -> Plan:
     context = ImageStudyContext(source, name, settings)
     trained = trained_contenders(context)
     jobs = [*trained, *coded_contenders(context)]
-    candidates = [
-        job.candidate(competes=job.details["random_access"], in_passes=False,
-                      label=job.name)
-        for job in jobs
-    ]  # fmt: skip
+    candidates = [job.candidate(competes=job.details["random_access"], label=job.name) for job in jobs]
     candidates += [
-        Candidate(label, "Mitsuba", is_reference=True, bytes=source.nbytes * (1 if eight else 4), in_passes=False)
+        Candidate(label, "Mitsuba", is_reference=True, bytes=source.nbytes * (1 if eight else 4))
         for label, eight in BITMAPS.items()
     ]
     timed = {
@@ -262,7 +258,6 @@ def plan(source: Source, name: str, settings: SimpleNamespace) -> Plan:
         Case(
             f"{place} places",
             lambda lanes, p=place: _reads(source, timed, p, lanes),
-            candidates=(*timed, *BITMAPS),
             in_picture=place == "random",
         )
         for place in ("random", "coherent")
@@ -276,9 +271,6 @@ def plan(source: Source, name: str, settings: SimpleNamespace) -> Plan:
         title=f"Compressed image: {Path(name).stem}",
         candidates=candidates,
         cases=cases,
-        queries=("read",),
-        accuracy="psnr_db",
-        accuracy_label="PSNR, dB",
         ratios=[(c.name, "bitmap, 8 bits") for c in candidates if c.name != "bitmap, 8 bits"],
         details={**source_details(source, name), "request": vars(settings), "codecs": list(codecs.available())},
         notes=[note, *codecs.install_notes()],

@@ -574,9 +574,6 @@ def plan(sources: dict[str, Source], settings: ShadingStudySettings) -> Plan:
         title="Textures trained for their shading",
         candidates=candidates,
         cases=[],
-        queries=(),
-        accuracy="c_mean_db",
-        accuracy_label="PSNR of shaded values against converged truth, mean of levels, dB",
         details={
             "sources": digests,
             "request": request,
@@ -595,13 +592,11 @@ def plan(sources: dict[str, Source], settings: ShadingStudySettings) -> Plan:
             "strip": lambda result: draw_crops(contexts, result),
             "zoom": lambda result: draw_zoom(contexts, result),
         },
-        sampled=False,
         measures=(
             *measures,
             Measure("FLIP", "c_flip", ".4f", False),
             Measure("flicker", "flicker_error", ".2e", False),
         ),
-        conclusions=conclusions,
     )
 
 

@@ -443,7 +443,7 @@ class TextureCandidates:
             self.add(
                 f"{name}, {filter_name}{', centred' * centred}", method,
                 functools.partial(reader, filter_name, centred), setting=filter_name,
-                queries=() if centred else None, in_picture=in_picture and filter_name not in ("off", "stochastic"),
+                in_picture=in_picture and filter_name not in ("off", "stochastic"),
                 **fields,
             )  # fmt: skip
 
@@ -460,7 +460,7 @@ class TextureCandidates:
             for spp in COUNTS if sampler == "independent" else COUNTS[1:]:
                 name = f"bitmap, {spp} spp{method.removeprefix(BITMAP)}"
                 self.add(name, method, functools.partial(context.bitmap, spp, sampler), bytes=nbytes,
-                         setting=f"{spp} spp", queries=None if spp == 1 else ())  # fmt: skip
+                         setting=f"{spp} spp")  # fmt: skip
         mipmap = functools.partial(context.mipmap, lambda: context.pyramid)
         self.add_filtered("mipmap", MIPMAP, mipmap, self.reads, bytes=context.pyramid.nbytes)
 
@@ -479,7 +479,7 @@ class TextureCandidates:
         cache: dict = {}
         for i, job in enumerate(textures):
             self.jobs.append(job)
-            fields = {"job": job.name, "training_seconds": None, "in_picture": i == 0 or job.method == OURS}
+            fields = {"job": job.name, "in_picture": i == 0 or job.method == OURS}
 
             def reader(filter_name: str, centred: bool, job=job) -> TextureReader:
                 plugin = {"type": "neural_texture", "filename": str(job.model.table.path)}
@@ -509,7 +509,7 @@ class TextureCandidates:
                 job = self.context.network(compression)
                 self.jobs.append(job)
                 mipmap = functools.partial(self.context.mipmap, lambda job=job: job.model)
-                self.add_filtered(job.name, NETWORK, mipmap, self.reads[:1], job=job.name, training_seconds=None)
+                self.add_filtered(job.name, NETWORK, mipmap, self.reads[:1], job=job.name)
 
     def select(self, only: Sequence[str]) -> None:
         """Keep the candidates of the methods ``only``, unless there are none, and the jobs that these need."""
@@ -558,9 +558,6 @@ def plan(
         title=f"Filtered texture: {Path(name).stem}",
         candidates=candidates,
         cases=[_case(context, scene, candidates, readers) for scene in context.scenes.values()],
-        queries=("read",),
-        accuracy="psnr_plane_db",
-        accuracy_label="PSNR of displayed values, dB",
         ratios=[(c.name, BASE) for c in candidates if c.name != BASE],
         details={
             **source_details(source, name),
@@ -577,9 +574,7 @@ def plan(
             "zoom": functools.partial(draw_zoom, context, shown),
             "levels": functools.partial(draw_levels, context),
         },
-        sampled=False,
         measures=(*itertools.chain(*measures), *flicker),
-        conclusions=conclusions,
     )
 
 
@@ -597,7 +592,7 @@ def _case(context: TextureStudyContext, scene: TextureScene, candidates: list[Ca
         cone = footprint.Cone.of(loaded.sensors()[0])
         functions = {FLOOR: lambda: [si.uv.x, si.uv.y]}
         for candidate in candidates:
-            if candidate.queries is None:
+            if candidate.name == BASE or (candidate.setting in FILTERS and not candidate.name.endswith("centred")):
                 texture = mi.load_dict(readers[candidate.name]().texture(repeats))
                 if hasattr(texture, "set_cone"):
                     texture.set_cone(cone)
