@@ -346,7 +346,7 @@ def draw(result: dict):
             panels[case].append(plot.Curve(name, at, psnr, style=style))
     caption = figure_caption(result)
     return plot.draw_curves(
-        result["title"], caption, panels, "ms of a render (last: bytes)", "PSNR, dB", True, columns=3, height=4.2
+        result["title"], caption, panels, "ms of a render (last: bytes)", "PSNR, dB", "x", columns=3, height=4.2
     )
 
 
