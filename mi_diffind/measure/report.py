@@ -333,5 +333,5 @@ def machine_line(result: dict) -> str:
 def figure_caption(result: dict) -> str:
     """Return the sentences below a figure: the notes of a result, and whether the run is quick or interrupted."""
     quick = "A smoke run (--quick): times are not to be quoted." * result["settings"]["quick"]
-    interrupted = "Interrupted: less was measured than asked for." * result["interrupted"]
+    interrupted = "Interrupted: the same command continues the run." * result["interrupted"]
     return " ".join(filter(None, (*result["notes"], quick, interrupted)))

@@ -282,8 +282,10 @@ def _images(store: Store) -> dict[str, list[np.ndarray]]:
 
 def _assemble(store: Store, counts: list[int]) -> dict:
     done, images, top = store.data["pairs"], _images(store), counts[-1]
+    not_finite = sum(record["not_finite"] for pair in done.values() for record in pair.values())
     result = {
-        "not_finite": sum(record["not_finite"] for pair in done.values() for record in pair.values()),
+        "not_finite": not_finite,
+        "notes": [f"{not_finite} values were not finite and counted as 0."] if not_finite else [],
         **dict.fromkeys(("reference", "noise", "bias", "crossover")),
         "points": [],
         "ratios": [],
@@ -354,7 +356,7 @@ def summary(result: dict) -> list[str]:
         "",
     ]
     if not result["points"]:
-        return [*lines, "interrupted before the first point; the same command continues the run"]
+        return [*lines, report.figure_caption(result)]
     lines.append("relative RMS error and seconds of the kernels, medians; learned / exact with quartiles")
     cells = [["spp", "exact: error", "seconds", "learned: error", "seconds", "learned / exact"]]
     ratios = {r["spp"]: f"{r['median']:.2f} ({r['q1']:.2f} to {r['q3']:.2f})" for r in result["ratios"]}
@@ -371,11 +373,7 @@ def summary(result: dict) -> list[str]:
         lines.append(f"noise equals the bias at {at['spp']:,.0f} spp{time_text}")
     elif at["spp_above"] is not None:
         lines.append(f"noise dominates up to {at['spp_above']:,.0f} spp at least")
-    if result["not_finite"]:
-        lines.append(f"not finite  {result['not_finite']} values, counted as 0")
-    if result["interrupted"]:
-        lines.append("interrupted: the same command continues the run")
-    return lines
+    return [*lines, report.figure_caption(result)]
 
 
 def bias_text(bias: dict) -> str:
@@ -398,8 +396,7 @@ def draw(result: dict):
             continue
         x, y = ([p[key] for p in points] for key in ("seconds", "rmse"))
         low, high = ([_root(p[key]) for p in points] for key in ("mse_q1", "mse_q3"))
-        counts = "counts" if len(points) > 1 else "count"
-        label = f"{name}, {counts} {', '.join(str(p['spp']) for p in points)} spp"
+        label = f"{name}, {', '.join(str(p['spp']) for p in points)} spp"
         curves.append(plot.Curve(label, x, y, low, high, {"color": colour, "marker": marker, "linestyle": ""}))
         times, noise = {p["spp"]: p["seconds"] for p in points}, result["noise"][name]["mse_of_a_sample"]
         square = max(bias["mse"], 0.0) if name == "learned" and bias["measured"] else 0.0
@@ -413,6 +410,6 @@ def draw(result: dict):
     label = f"bias of the approximation{'' if bias['measured'] else ', upper bound'}: {bias_text(bias)}"
     curves.append(plot.Curve(label, [min(ends), max(ends)], [floor] * 2, style={"color": "#7a3b8f", "marker": ""}))
     title = f"{Path(result['scene']).stem}, {width} × {height}: noise and bias at a given render time"
-    bad = f"{result['not_finite']} values were not finite and counted as 0." * bool(result["not_finite"])
-    return plot.draw_curves(title, bad, {"": curves}, "seconds of a render (kernels)", "relative RMS error", "xy",
+    caption = report.figure_caption(result)
+    return plot.draw_curves(title, caption, {"": curves}, "seconds of a render (kernels)", "relative RMS error", "xy",
                             height=4.9)  # fmt: skip
