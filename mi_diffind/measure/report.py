@@ -19,7 +19,7 @@ COLUMNS = (
     *("task", "case", "query", "candidate", "representation", "setting"),
     *("unit", "time", "time_q1", "time_q3", "time_with_floor", "floor", "hidden", "rounds"),
     *("reads", "bytes_gathered", "add", "mul", "div", "sqrt", "log", "flops", "instructions"),
-    *("bytes", "training_seconds", "converged", "on_front", "note"),
+    *("bytes", "training_seconds", "converged", "on_front"),
 )
 
 #: Quantities beside time that accuracy may be drawn against: the label of the axis, and the title of the panel.
@@ -76,10 +76,11 @@ def write(result: dict, folder: str | os.PathLike, plan: Plan | None = None) -> 
     trainings = {name: record for name, record in result["jobs"].items() if "runs" in record}
     drawn = panels(result)
     if drawn:
-        pictures["png"] = lambda: plot.draw_panels(result["title"], drawn, result["accuracy_label"], caption(result))
+        label = result["measures"][0]["label"]
+        pictures["png"] = lambda: plot.draw_panels(result["title"], drawn, label, figure_caption(result))
     if trainings:
         title = f"{result['title']}: training"
-        pictures["training"] = lambda: plot.draw_training_curves(title, trainings, machine_line(result))
+        pictures["training"] = lambda: plot.draw_training_curves(title, trainings, figure_caption(result))
     if plan is not None and not result["interrupted"]:
         pictures |= {word: (lambda draw=draw: draw(result)) for word, draw in plan.pictures.items()}
     names = dict.fromkeys(name for row in table for name in row if name not in COLUMNS)
@@ -116,7 +117,7 @@ def rows(result: dict) -> list[dict]:
 
 def _candidate_cells(result: dict, name: str) -> dict:
     c = result["candidates"][name]
-    cells = {k: c[k] for k in ("representation", "setting", "bytes", "note", "training_seconds", "converged")}
+    cells = {k: c[k] for k in ("representation", "setting", "bytes", "training_seconds", "converged")}
     details = {k: v for k, v in c["details"].items() if isinstance(v, (int, float, str))}
     return {"candidate": name, **cells, **c["errors"], **details}
 
@@ -125,17 +126,23 @@ def panels(result: dict) -> list[plot.Panel]:
     """Return the panels of a result: accuracy against the plan's quantities, then against time, one panel a case.
 
     Times are those of the first query, or of a pass. Candidates have labels and quartiles, references vertical lines.
+    If the cases have different candidates, each has its own panel of bytes.
     """
-    candidates = list(result["candidates"].values())
-    drawn = [_against(quantity, candidates, result, QUANTITIES[quantity][1]) for quantity in result["panels"]]
+    candidates, cases, drawn = result["candidates"], [], []
     for case, measured in result["cases"].items():
-        if not measured["in_picture"]:
-            continue
-        of_passes, accuracy = bool(measured.get("of_passes")), measured.get("accuracy") or result["accuracy"]
-        query, timings = next(iter(measured["passes" if of_passes else "queries"].items()), ("", {}))
+        if measured["in_picture"]:
+            timings = next(iter(measured["passes" if measured["of_passes"] else "queries"].values()), {})
+            cases.append((case, measured, timings))
+    several = len({frozenset(timings) for _, _, timings in cases}) > 1
+    for quantity in result["panels"]:
+        if quantity != "bytes" or not several:
+            drawn.append(_against(quantity, candidates.values(), result, QUANTITIES[quantity][1]))
+    for case, measured, timings in cases:
+        of_passes, accuracy = measured["of_passes"], measured["accuracy"]
+        query = next(iter(measured["queries"]))
         points, lines = [], []
         for name, t in timings.items():
-            c = result["candidates"][name]
+            c = candidates[name]
             if of_passes and not c["in_picture"]:
                 continue
             if c["is_truth"] or c["is_reference"]:
@@ -143,9 +150,10 @@ def panels(result: dict) -> list[plot.Panel]:
                 lines.append(plot.Line(label, t["time"], c["is_truth"]))
             elif accuracy in c["errors"]:
                 points.append(_point(c, accuracy, t["time"], t["q1"], t["q3"], bool(t["on_front"])))
-        drawn.append(plot.Panel(case, f"time of one {query}, {'ms' if of_passes else 'ns'}", points, lines))
-        if result["bytes_by_case"]:
-            drawn.append(_against("bytes", [result["candidates"][name] for name in timings], result, case))
+        unit = f"{PASS}, ms" if of_passes else f"{query}, ns"
+        drawn.append(plot.Panel(case, f"time of one {unit}", points, lines))
+        if several and "bytes" in result["panels"]:
+            drawn.append(_against("bytes", [candidates[name] for name in timings], result, case))
     return [panel for panel in drawn if panel.points or panel.lines]
 
 
@@ -153,39 +161,27 @@ def _point(c: dict, accuracy: str, x: float, low: float, high: float, on_front: 
     return plot.Point(c["label"], x, low, high, c["errors"][accuracy], c["representation"], on_front)
 
 
-def _against(quantity: str, candidates: list[dict], result: dict, title: str) -> plot.Panel:
+def _against(quantity: str, candidates: Iterable[dict], result: dict, title: str) -> plot.Panel:
     """Return a panel of accuracy against ``quantity``; candidates equal in both, or of one job, are one point."""
     distinct: dict[tuple, dict] = {}
+    key = result["measures"][0]["key"]
     for c in candidates:
-        accuracy = c["errors"].get(result["accuracy"])
+        accuracy = c["errors"].get(key)
         if accuracy is not None and not (c["is_truth"] or c["is_reference"]) and c["in_picture"] and c[quantity]:
             distinct.setdefault((c[quantity], c["job"] or accuracy), c)
     values = [
-        (math.log(c[quantity]), -c["errors"][result["accuracy"]]) if in_competition(c) else (math.nan, math.nan)
+        (math.log(c[quantity]), -c["errors"][key]) if in_competition(c) else (math.nan, math.nan)
         for c in distinct.values()
     ]
     points = [
-        _point(c, result["accuracy"], *[c[quantity]] * 3, on_front)
+        _point(c, key, *[c[quantity]] * 3, on_front)
         for c, on_front in zip(distinct.values(), pareto(values), strict=True)
     ]
     return plot.Panel(title, QUANTITIES[quantity][0], points, [])
 
 
-def caption(result: dict) -> str:
-    """Return one paragraph on the machine, the settings and the notes of a result."""
-    s, jobs = result["settings"], result["jobs"]
-    sampled = any(c["errors"] and "errors" not in jobs.get(c["job"], {}) for c in result["candidates"].values())
-    sampled &= result.get("sampled", True)
-    errors = f"; errors from {s['samples']:,} samples" if sampled else ""
-    return " ".join([
-        *result["notes"],
-        f"{machine_line(result)} Medians and quartiles of {s['rounds']} interleaved rounds of {s['lanes']:,} lanes on "
-        f"all cores, input and output (the floor) subtracted{errors}.{state(result)}",
-    ])  # fmt: skip
-
-
 def summary(result: dict) -> list[str]:
-    """Return the result as lines of text: errors of candidates, verdicts in equal bytes, times, ratios, conclusions."""
+    """Return the result as lines of text: errors of candidates, verdicts in equal bytes, times, ratios, the machine."""
     lines = [*_error_table(result), *verdicts(result)]
     for case, measured in result["cases"].items():
         queries, passes = measured["queries"], measured["passes"].get(PASS, {})
@@ -195,7 +191,7 @@ def summary(result: dict) -> list[str]:
         cells = [["", *queries, "flops", "reads", *([f"ms {PASS}"] if passes else []), "bytes", "accuracy", ""]]
         for name, t in queries[query].items():
             c, operations = result["candidates"][name], t["operations"]
-            accuracy = c["errors"].get(measured.get("accuracy") or result["accuracy"])
+            accuracy = c["errors"].get(measured["accuracy"])
             shown = "exact" if c["is_truth"] else "-" if accuracy is None else f"{accuracy:.1f} dB"
             cells.append([
                 name, *(time_cell(timings.get(name)) for timings in queries.values()),
@@ -206,8 +202,6 @@ def summary(result: dict) -> list[str]:
         lines += grid(cells)
     if result["cases"]:
         lines.append(f"  (* on the Pareto front of accuracy and {query}; flops and reads are those of {query})")
-    notes = [f"  {name}: {c['note']}" for name, c in result["candidates"].items() if c["note"]]
-    lines += ["", *notes] if notes else []
     for case, measured in result["cases"].items():
         ratios = measured["ratios"]
         pairs = dict.fromkeys(pair for by_pair in ratios.values() for pair in by_pair)
@@ -215,8 +209,9 @@ def summary(result: dict) -> list[str]:
             lines += ["", f"{case}: ratios, medians of the rounds, floor subtracted [with the floor]"]
             cells = [[ratio_cell(r.get(pair), q in measured["queries"]) for q, r in ratios.items()] for pair in pairs]
             lines += grid([["", *ratios], *([pair, *row] for pair, row in zip(pairs, cells, strict=True))])
-    lines += ["", *result["conclusions"]] if result["conclusions"] else []
-    return [*lines, "", caption(result)]
+    s = result["settings"]
+    how = f"{s['rounds']} interleaved rounds of {s['lanes']:,} lanes; errors from {s['samples']:,} samples where drawn"
+    return [*lines, "", f"{machine_line(result)} Medians of {how}.", figure_caption(result)]
 
 
 def _error_table(result: dict) -> list[str]:
@@ -335,12 +330,8 @@ def machine_line(result: dict) -> str:
     )
 
 
-def state(result: dict) -> str:
-    """Return the caption's sentences about a quick or interrupted run, "" for a complete one."""
-    quick = " A smoke run (--quick): times are not to be quoted." if result["settings"]["quick"] else ""
-    return quick + (" Interrupted: less was measured than asked for." if result["interrupted"] else "")
-
-
 def figure_caption(result: dict) -> str:
-    """Return the caption of a figure: the notes of a result, its machine, and its :func:`state`."""
-    return f"{' '.join(result['notes'])} {machine_line(result)}{state(result)}"
+    """Return the sentences below a figure: the notes of a result, and whether the run is quick or interrupted."""
+    quick = "A smoke run (--quick): times are not to be quoted." * result["settings"]["quick"]
+    interrupted = "Interrupted: less was measured than asked for." * result["interrupted"]
+    return " ".join(filter(None, (*result["notes"], quick, interrupted)))

@@ -214,16 +214,12 @@ def plan(materials: tuple[str, ...] = (), quick: bool = False) -> Plan:
         title="Learned BSDFs: accuracy against time and bytes",
         candidates=candidates,
         cases=cases,
-        queries=QUERIES,
-        accuracy="psnr_db",
-        accuracy_label="PSNR of a lit sphere, dB",
         ratios=ratios,
         jobs=jobs,
         jobs_fingerprint=fingerprint(code),
-        bytes_by_case=True,
-        sampled=False,
+        panels=("bytes",),
         measures=(
-            Measure("PSNR, dB", "psnr_db", ".1f"),
+            Measure("PSNR of a lit sphere, dB", "psnr_db", ".1f"),
             Measure("proxy, dB", "psnr_proxy_db", ".1f"),
             Measure("albedo", "albedo_excess", ".2%", False),
             Measure("E[w²]/E[w]²", "moment_learned", ".2f", False),
@@ -240,36 +236,24 @@ def _material(material: str, quick: bool) -> tuple[Case, list[Candidate], list[J
     if not quick and nbytes == "2k":
         nets = [network_training(material, inputs, trainings[0].scale) for inputs in INPUTS]
 
-    def learned(job, label: str, representation: str, **options) -> Candidate:
-        return Candidate(
-            f"{material}: {label}", representation, label, job=job.name, in_passes=False, label=label, **options
-        )
+    def learned(job, label: str, representation: str) -> Candidate:
+        return Candidate(f"{material}: {label}", representation, label, job=job.name, label=label)
 
     candidates = [
-        Candidate(f"{material}: source", "source", is_truth=True, in_passes=False, label="source"),
-        Candidate(
-            f"{material}: principled", "Mitsuba", is_reference=True, in_passes=False, label="principled",
-            note="another material",
-        ),
+        Candidate(f"{material}: source", "source", is_truth=True, label="source"),
+        Candidate(f"{material}: principled", "Mitsuba", is_reference=True, label="principled"),
         *(learned(job, job.preset, "learned") for job in trainings),
-        *(
-            learned(job, f"network, {inputs}", "network", queries=("eval",))
-            for job, inputs in zip(nets, INPUTS, strict=False)
-        ),
-    ]  # fmt: skip
+        *(learned(job, f"network, {inputs}", "network") for job, inputs in zip(nets, INPUTS, strict=False)),
+    ]
 
     def queries(lanes: int) -> dict:
         bsdfs = {f"{material}: source": mi.load_dict(source), f"{material}: principled": mi.load_dict(PEER)}
         bsdfs |= {f"{material}: {job.preset}": job.load() for job in trainings}
-        bsdfs |= {
-            f"{material}: network, {i}": job.problem().bsdf(job.net.cooperative())
-            for job, i in zip(nets, INPUTS, strict=False)
-        }
-        return bsdf_queries(bsdfs, directions(lanes), False)
+        inputs = directions(lanes)
+        functions = bsdf_queries(bsdfs, inputs, False, QUERIES)
+        for job, name in zip(nets, INPUTS, strict=False):
+            bsdf = job.problem().bsdf(job.net.cooperative())
+            functions["eval"] |= bsdf_queries({f"{material}: network, {name}": bsdf}, inputs, False, ("eval",))["eval"]
+        return functions
 
-    members = tuple(candidate.name for candidate in candidates)
-    return (
-        Case(material, queries, None, {"material": source}, members, QUERIES),
-        candidates,
-        [*trainings, *nets],
-    )
+    return Case(material, queries, None, {"material": source}), candidates, [*trainings, *nets]

@@ -9,6 +9,7 @@ tables only. Networks (:func:`.disney_network`) have as many bytes as the tables
 from __future__ import annotations
 
 import argparse
+import functools
 from collections.abc import Callable, Sequence
 
 import drjit as dr
@@ -19,8 +20,7 @@ from ..arrays.lookup import STORAGES
 from ..core.runtime import array_module
 from ..fitting.settings import FitSettings
 from ..measure.clock import FLOPS, Operations, count_query
-from ..measure.renders import QUERIES, TEXTURE_SIZE, bsdf_queries, directions, noise_texture
-from ..measure.report import grid
+from ..measure.renders import TEXTURE_SIZE, bsdf_queries, directions, noise_texture
 from ..measure.store import fingerprint, package_files
 from ..measure.study import Candidate, Case, Measure, Plan, Study
 from ..measure.training import ConvergenceTraining
@@ -76,15 +76,6 @@ QUICK = ("principled", "disney", "tables")
 QUICK_PRESETS = ("tables",)
 
 
-_PRINCIPLED_NOTE = "another model (full Fresnel terms, no flatness without `thin`): no error against this one"
-
-
-_FORMULAS_NOTE = "the formulas alone, without a plugin's checks of directions and selection of lobes"
-
-
-_NETWORK_NOTE = "in half precision; timed without a plugin's checks of directions and selection of lobes"
-
-
 class DisneyStudy(Study):
     """Accuracy of the Disney BRDF against time."""
 
@@ -120,45 +111,25 @@ def plan(quick: bool = False, only: Sequence[str] = ()) -> Plan:
     combinations = [(m, l) for m in ("constant", "textured") for l in lobes]
     if quick:
         combinations = [("constant", "all lobes"), ("textured", "diffuse + specular")]
-        for candidate in candidates:
-            candidate.in_passes &= candidate.name in QUICK
-    rendered = {c.name: plugins[c.name] for c in candidates if c.in_passes}
     cases = []
     for material, name in combinations:
-        parameters = lobes[name]
-        bare = {}
-        if material == "constant" and mi.is_rgb:
-            bare = {
-                FORMULAS: lambda: None,
-                **{n: (lambda t=t: networks.NetworkDecoder(t.net.cooperative())) for n, t in trainings.items()},
-            }
-        names = [*plugins, *(c.name for c in candidates if c.name in bare)]
-        if quick and cases:
-            names = [n for n in QUICK if n in plugins]
-        if not names:
-            continue
-        timed = {n: plugins[n] for n in names if n in plugins}
-        evaluated = {n: bare[n] for n in names if n in bare}
-        passes = rendered and not (quick and cases)
-        cases.append(
-            Case(
-                f"{material}, {name}",
-                lambda lanes, t=timed, b=evaluated, m=material, p=parameters: _queries(t, b, m, p, lanes),
-                (lambda m=material, p=parameters: _passes(rendered, m, p, quick)) if passes else None,
-                {"material": material, "lobes": name, "base_color": BASE_COLOR, **parameters},
-                tuple(names),
-                query_names=None if timed else ("eval",),
-            )
-        )
+        small = quick and bool(cases)
+        timed = {n: build for n, build in plugins.items() if not small or n in QUICK}
+        bare = dict.fromkeys(trainings) | {FORMULAS: None} if material == "constant" and mi.is_rgb else {}
+        bare = {c.name: trainings.get(c.name) for c in candidates if c.name in bare}
+        rendered = {n: build for n, build in timed.items() if not n.startswith("only ") and (not quick or n in QUICK)}
+        if timed or bare:
+            arguments = (material, lobes[name])
+            details = {"material": material, "lobes": name, "base_color": BASE_COLOR, **lobes[name]}
+            queries = functools.partial(_queries, timed, bare, *arguments)
+            passes = functools.partial(_passes, rendered, *arguments, quick) if rendered and not small else None
+            cases.append(Case(f"{material}, {name}", queries, passes, details))
     code = package_files("fitting/loop.py", "studies/baselines/networks.py", "tasks/disney/*.py")
     return Plan(
         study="disney",
         title="Disney BRDF: accuracy against time",
         candidates=candidates,
         cases=cases,
-        queries=QUERIES,
-        accuracy="psnr_db_training",
-        accuracy_label="PSNR of BRDF · cosine, dB",
         ratios=[
             ("principled", "disney"),
             *(("principled", name) for name in ("tables", "tables, uint8")),
@@ -174,8 +145,10 @@ def plan(quick: bool = False, only: Sequence[str] = ()) -> Plan:
         },
         jobs=list(trainings.values()),
         jobs_fingerprint=fingerprint(code),
-        measures=tuple(Measure(f"dB, {name}", f"psnr_db_{name}") for name in ("training", "uniform")),
-        conclusions=operation_table,
+        measures=(
+            Measure("PSNR of BRDF · cosine, dB", "psnr_db_training"),
+            Measure("uniform materials, dB", "psnr_db_uniform"),
+        ),
     )
 
 
@@ -222,7 +195,7 @@ def _network_candidate(training: ConvergenceTraining) -> Candidate:
 
     return Candidate(
         training.name, "network", "float16", errors=_errors(lambda: networks.NetworkDecoder(training.net)),
-        in_passes=False, job=training.name, queries=("eval",), operations=counted, note=_NETWORK_NOTE,
+        job=training.name, operations=counted,
     )  # fmt: skip
 
 
@@ -260,8 +233,8 @@ def _candidates(quick: bool) -> tuple[list[Candidate], dict]:
         return build
 
     candidates = [
-        Candidate("principled", "Mitsuba", is_reference=True, note=_PRINCIPLED_NOTE),
-        Candidate(FORMULAS, "formulas", is_truth=True, in_passes=False, queries=("eval",), note=_FORMULAS_NOTE),
+        Candidate("principled", "Mitsuba", is_reference=True),
+        Candidate(FORMULAS, "formulas", is_truth=True),
         Candidate("disney", "arithmetic", errors=errors(Decoder())),
     ]
     plugins = {"principled": loaded(type="principled"), "disney": loaded(type="disney")}
@@ -269,7 +242,7 @@ def _candidates(quick: bool) -> tuple[list[Candidate], dict]:
         for storage in ("float32", "uint8") if quick else STORAGES:
             name = preset if storage == "float32" else f"{preset}, {storage}"
             model = TASK.open(types.TensorXf, preset=preset, storage=storage)
-            candidates.append(Candidate(name, preset, storage, model.nbytes, None, errors(model.decoder)))
+            candidates.append(Candidate(name, preset, storage, model.nbytes, errors(model.decoder)))
             plugins[name] = loaded(type="neural_disney", preset=preset, storage=storage)
     model = TASK.open(types.TensorXf, preset="tables")
     for factor in FactoredDecoder.FACTORS:
@@ -277,8 +250,7 @@ def _candidates(quick: bool) -> tuple[list[Candidate], dict]:
         read = [n for n in model.arrays if n == factor or (factor == "alpha" and n.startswith("encoder"))]
         size = sum(model.arrays[n].nbytes for n in read)
         decoder = FactoredDecoder(model.layout, read=(factor,))
-        once = "read once where the material is constant" if factor in ("alpha", "coat") else ""
-        candidates.append(Candidate(name, "one table", factor, size, None, errors(decoder), in_passes=False, note=once))
+        candidates.append(Candidate(name, "one table", factor, size, errors(decoder)))
         plugins[name] = with_decoder(lambda arrays, f=factor: FactoredDecoder(arrays, read=(f,)))
     return candidates, plugins
 
@@ -296,17 +268,14 @@ def _material(material: str, parameters: dict) -> dict:
 
 
 def _queries(plugins: dict, bare: dict, material: str, parameters: dict, lanes: int) -> dict:
-    """Return the queries of BSDFs, and ``eval`` of the forms of ``bare``: functions that return a decoder or ``None``.
-
-    ``None`` stands for the published formulas.
-    """
+    """Return the queries of BSDFs, and ``eval`` of the networks of ``bare``; ``None`` stands for the formulas."""
     bsdfs = {name: build(_material(material, parameters)) for name, build in plugins.items()}
     functions = bsdf_queries(bsdfs, directions(lanes), material == "textured")
     constant, albedo, wi, wo = _constants(parameters, lanes)
-    decoders = {name: decoder() for name, decoder in bare.items()}
-    for name, decoder in decoders.items():
+    for name, training in bare.items():
+        decoder = training and networks.NetworkDecoder(training.net.cooperative())
         functions["eval"][name] = lambda d=decoder: shade(d, constant, albedo, wi, wo)
-    return functions
+    return functions if plugins else {"eval": functions["eval"]}
 
 
 def _constants(parameters: dict, lanes: int) -> tuple:
@@ -346,18 +315,3 @@ def _passes(plugins: dict, material: str, parameters: dict, quick: bool) -> dict
         })  # fmt: skip
         renders[name] = lambda number, scene=scene: mi.render(scene, spp=spp, seed=number)
     return renders
-
-
-def operation_table(result: dict) -> list[str]:
-    """Return tables of the operations of one evaluation of constant materials, beside the paper's."""
-    names = [*FLOPS, "flops", "gathers", "bytes_gathered", "instructions"]
-    lines = []
-    for case, measured in result["cases"].items():
-        if measured["details"]["material"] == "constant":
-            counts = {name: t["operations"] for name, t in measured["queries"]["eval"].items()}
-            if measured["details"]["lobes"] == "all lobes":
-                unknown = dict.fromkeys(("bytes_gathered", "instructions"), "")
-                counts = {name: o.asdict() | unknown for name, o in PAPER.items()} | counts
-            lines.append(f"operations of one eval, {case} (add, mul 1 flop; div 2; sqrt, log 4)")
-            lines += grid([["", *names], *([name, *(str(o[key]) for key in names)] for name, o in counts.items())])
-    return lines

@@ -379,9 +379,8 @@ def plan(session: FieldSession, source: str, settings: SimpleNamespace) -> Plan:
     ours = next((n for n in shown if jobs[n].method == "ours"), "")
     timed = tuple([GRID, *shown])
     cases = [
-        Case("reads", lambda lanes: _reads(context, timed, lanes), lambda: _renders(context, timed), candidates=timed,
-             query_names=("density", "both")),
-    ]  # fmt: skip
+        Case("reads", lambda lanes: _reads(context, timed, lanes), lambda: _renders(context, timed)),
+    ]
     code = package_files("tasks/radiance/*.py", "fitting/loop.py", "studies/field.py",
                          "studies/baselines/radiance_fields.py")  # fmt: skip
     return Plan(
@@ -389,9 +388,6 @@ def plan(session: FieldSession, source: str, settings: SimpleNamespace) -> Plan:
         title=f"Radiance field: {Path(source).name}",
         candidates=candidates,
         cases=cases,
-        queries=("density",),
-        accuracy=FOREGROUND,
-        accuracy_label="PSNR of the foreground in test views, dB",
         ratios=[(ours, n) for n in shown if jobs[n].method in AGAINST] if ours else [],
         details={
             "source": source, "source_digest": views.digest + held_out.digest, "views": [len(views), len(held_out)],
@@ -405,8 +401,7 @@ def plan(session: FieldSession, source: str, settings: SimpleNamespace) -> Plan:
         jobs_fingerprint=fingerprint(code) + views.digest[:16],
         panels=("bytes",),
         pictures={"views": functools.partial(draw_views, context)},
-        sampled=False,
-        measures=(Measure("dB, white", WHITE), Measure("dB, foreground", FOREGROUND)),
+        measures=(Measure("PSNR of the foreground, dB", FOREGROUND), Measure("of all pixels", WHITE)),
     )  # fmt: skip
 
 

@@ -25,9 +25,9 @@ from ..arrays.lookup import STORAGES
 from ..core.runtime import array_module
 from ..fitting.loop import FitSettings
 from ..measure.clock import FLOPS, Operations, count_query
-from ..measure.renders import QUERIES, bsdf_queries, directions, noise_texture
+from ..measure.renders import bsdf_queries, directions, noise_texture
 from ..measure.store import fingerprint, package_files
-from ..measure.study import FLOOR, Candidate, Case, Plan, Study
+from ..measure.study import FLOOR, Candidate, Case, Measure, Plan, Study
 from ..measure.training import ConvergenceTraining
 from ..tasks.ggx import TASK
 from ..tasks.ggx.model import INPUTS, Encoding, LearnedGGX, ggx, indirection
@@ -130,9 +130,7 @@ def plan(quick: bool = False, quick_steps: int = QUICK_STEPS) -> Plan:
         title="GGX distribution of normals: accuracy against time and bytes",
         candidates=builder.candidates,
         cases=cases,
-        queries=("read",),
-        accuracy="psnr_db",
-        accuracy_label="PSNR of D clipped to [0, 1], dB",
+        measures=(Measure("PSNR of D clipped to [0, 1], dB", "psnr_db"),),
         ratios=builder.ratios,
         details={
             "flops": FLOPS,
@@ -143,8 +141,7 @@ def plan(quick: bool = False, quick_steps: int = QUICK_STEPS) -> Plan:
         },
         jobs=builder.trainings,
         jobs_fingerprint=fingerprint(code),
-        bytes_by_case=True,
-        conclusions=lambda result: conclusions(result, builder.reference("plain")),
+        panels=("bytes",),
     )
 
 
@@ -184,7 +181,7 @@ class GGXCandidates:
         self.trainings.append(ConvergenceTraining(name, problem, settings, longest, 4 if self.quick else 20))
         return self.trainings[-1]
 
-    def add(self, label, representation, setting, size, training, form, encoding, operations=None, note=""):
+    def add(self, label, representation, setting, size, training, form, encoding, operations=None):
         """Register a candidate; ``form(net)`` turns the trained module into the module to read."""
         name = self.name(label, encoding.inputs)
         reader = functools.cache(lambda: LearnedGGX(form(training.net), encoding, tail=False))
@@ -192,7 +189,7 @@ class GGXCandidates:
             Candidate(
                 name, representation, setting, size,
                 errors=lambda samples: measure(reader(), self.types, samples),
-                note=note, label=label, job=training.name, operations=operations, in_passes=False,
+                label=label, job=training.name, operations=operations,
             )
         )  # fmt: skip
         self.readers[name], self.inputs[name] = reader, encoding.inputs
@@ -228,13 +225,12 @@ class GGXCandidates:
         else:
             label, entries = f"{side}²", side**2
             net = functools.partial(DifferentiableArray, (side, side), 1, "constant", 0.5)
-        note = "learns D as it is, at the paper's learning rate" if settings_key == "raw" else ""
         label += " raw" * (settings_key == "raw")
         training = self.train(label, net, settings_key, encoding)
         for storage in storages:
             suffix, size = _STORED[storage]
             form = lambda net, s=storage: net.to(s)  # noqa: E731
-            self.add(label + suffix, representation, storage, size * entries, training, form, encoding, note=note)
+            self.add(label + suffix, representation, storage, size * entries, training, form, encoding)
 
     def add_networks(self, inputs: str) -> None:
         """Register networks as tensors and as cooperative vectors, after a hash grid, and in front of a table."""
@@ -267,14 +263,14 @@ class GGXCandidates:
 
     def add_formula(self) -> None:
         """Register the formula: the truth, read at both kinds of inputs."""
-        self.candidates.append(Candidate("formula", "formula", is_truth=True, label="formula", in_passes=False))
+        self.candidates.append(Candidate("formula", "formula", is_truth=True, label="formula"))
         self.readers["formula"] = lambda: lambda cos, sin2, alpha: ggx(sin2, alpha)
         self.inputs["formula"] = "any"
         self.ratios += [(self.reference(inputs), "formula") for inputs in INPUTS[::-1]]
 
     def case(self, name: str, inputs: str, details: dict) -> Case:
         names = [n for n in self.readers if self.inputs[n] in (inputs, "any")]
-        return Case(name, lambda lanes: self._queries(names, lanes), None, details, tuple(names))
+        return Case(name, lambda lanes: self._queries(names, lanes), details=details)
 
     def _queries(self, names: list[str], lanes: int) -> dict:
         cos, sin2, alpha = directions = self.directions(lanes)
@@ -293,24 +289,19 @@ class GGXCandidates:
     def conductors(self) -> list[Case]:
         """Register ``neural_ggx`` with its shipped tables and ``roughconductor``; return a case per roughness."""
         plugins = {"roughconductor": {"type": "roughconductor", "distribution": "ggx"}}
-        self.candidates.append(Candidate("roughconductor", "Mitsuba", is_truth=True, in_passes=False))
+        self.candidates.append(Candidate("roughconductor", "Mitsuba", is_truth=True))
         for storage in STORAGES:
             name = "neural_ggx" + ("" if storage == "float32" else f", {storage}")
             plugins[name] = {"type": "neural_ggx", "storage": storage}
             model = TASK.open(self.types.TensorXf, storage=storage)
-            self.candidates.append(
-                Candidate(name, "indirection", storage, model.nbytes, None, model.measure, in_passes=False)
-            )
+            self.candidates.append(Candidate(name, "indirection", storage, model.nbytes, model.measure))
             self.ratios.append((name, "roughconductor"))
         return [
             Case(
                 f"conductor, {roughness} roughness",
                 lambda lanes, r=roughness: _conductor_queries(plugins, r, lanes),
-                None,
-                {"material": "Cu", "alpha": 0.2, "roughness": roughness},
-                tuple(plugins),
-                QUERIES,
-                False,
+                details={"material": "Cu", "alpha": 0.2, "roughness": roughness},
+                in_picture=False,
             )
             for roughness in (("constant",) if self.quick else ("constant", "textured"))
         ]
@@ -370,18 +361,3 @@ def equal_quality(result: dict, reference: str) -> list[EqualQuality]:
         converged = bool(candidates[name]["converged"])
         rows.append(EqualQuality(family, name, _psnr(result, name), ratios, paper, converged, bool(good)))
     return rows
-
-
-def conclusions(result: dict, reference: str) -> list[str]:
-    """Return lines about the members of all families at the quality of ``reference``, if it has converged."""
-    if PLAIN not in result["cases"] or not result["candidates"].get(reference, {}).get("converged"):
-        return [f"{reference} has not converged: no statement is made"]
-    lines = [
-        f"at the quality of {reference}, {_psnr(result, reference):.1f} dB, times as many flops, bytes read, bytes, ns"
-    ]
-    for row in equal_quality(result, reference):
-        state = "" if row.converged and row.reaches else " (not converged)" if row.reaches else " (does not reach it)"
-        ratios = ", ".join(f"{ratio:.2f}" for ratio in row.ratios)
-        paper = f"; the paper's {', '.join(f'{r:g}' for r in row.paper)}" if row.paper else ""
-        lines.append(f"  {row.family}: {row.name}, {row.psnr_db:.1f} dB{state}: {ratios}{paper}")
-    return lines

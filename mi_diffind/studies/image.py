@@ -53,7 +53,7 @@ STREAMS = ("JPEG", "WebP")
 NETWORK_SETTINGS = FitSettings(steps=10**6, batch=2**12, lr=1e-2, schedule="cosine", loss="mse", measure_every=200)
 
 MEASURES = (
-    Measure("PSNR", "psnr_db"),
+    Measure("PSNR, dB", "psnr_db"),
     Measure("between texels", "psnr_between_db"),
     Measure("FLIP", "flip", ".4f", False),
     Measure("as seen", "seen_db"),
@@ -222,13 +222,9 @@ def plan(source: Source, name: str, settings: SimpleNamespace) -> Plan:
     contenders, compressions = ImageContenders(source, name), settings.compressions
     trained = trained_contenders(contenders, compressions, settings.seconds)
     jobs = [*trained, *coded_contenders(contenders, compressions, settings.astc)]
-    candidates = [
-        job.candidate(competes=job.details["random_access"], in_passes=False,
-                      label=job.name)
-        for job in jobs
-    ]  # fmt: skip
+    candidates = [job.candidate(competes=job.details["random_access"], label=job.name) for job in jobs]
     candidates += [
-        Candidate(label, "Mitsuba", is_reference=True, bytes=source.nbytes * (1 if eight else 4), in_passes=False)
+        Candidate(label, "Mitsuba", is_reference=True, bytes=source.nbytes * (1 if eight else 4))
         for label, eight in BITMAPS.items()
     ]
     timed = {job.name: job for job in trained if job.has_file and job.budget == compressions[0]}
@@ -240,10 +236,7 @@ def plan(source: Source, name: str, settings: SimpleNamespace) -> Plan:
         study="image",
         title=f"Compressed image: {Path(name).stem}",
         candidates=candidates,
-        cases=[Case("random places", partial(reads, source, timed), candidates=(*timed, *BITMAPS))],
-        queries=("read",),
-        accuracy="psnr_db",
-        accuracy_label="PSNR, dB",
+        cases=[Case("random places", partial(reads, source, timed))],
         ratios=[(c.name, "bitmap, 8 bits") for c in candidates if c.name != "bitmap, 8 bits"],
         details={**source_details(source, name), "request": vars(settings), "codecs": list(codecs.available())},
         notes=[note, *codecs.install_notes()],

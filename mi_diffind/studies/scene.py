@@ -29,7 +29,7 @@ from ..measure import plot, report
 from ..measure.benchmark import Stopped
 from ..measure.bias import LEAST, crossover, describe, error, estimate, root, seconds_of, weights_of
 from ..measure.clock import machine, timed
-from ..measure.report import duration, grid, machine_line, percent, rounded, state
+from ..measure.report import duration, grid, percent, rounded
 from ..measure.statistics import finite, flat_spread, spread
 from ..measure.store import Store, fingerprint, sources
 from ..measure.study import Study, Tradeoff
@@ -373,7 +373,7 @@ def caption(result: dict) -> str:
         f"{Path(result['scene']).name}{defines}, {result['width']} × {result['height']}, {counts} "
         f"samples per pixel (spp). Relative RMS error against {reference['spp']} spp of the exact scene, whose own "
         f"noise, {percent(reference['noise_rmse'])}, is subtracted. Medians and quartiles of images of "
-        f"different seeds; seconds of the kernels of a whole render. {machine_line(result)}{bad}{state(result)}"
+        f"different seeds; seconds of the kernels of a whole render.{bad}"
     )
 
 

@@ -375,9 +375,6 @@ def plan(paths: Sequence[Path], settings: SceneTrainingSettings) -> Plan:
         title="Training inside a scene",
         candidates=[candidate(run) for run in runs],
         cases=[],
-        queries=(),
-        accuracy="psnr_db",
-        accuracy_label="PSNR of held-out views and lights, dB",
         details={"scenes": [c.name for c in contexts], "request": request},
         notes=[
             f"{settings.steps} steps, {settings.views} views of {settings.width} × {settings.width * 9 // 16} pixels; "
@@ -386,6 +383,5 @@ def plan(paths: Sequence[Path], settings: SceneTrainingSettings) -> Plan:
         jobs=runs,
         jobs_fingerprint=f"{files} {shared}",
         pictures={"png": lambda result: picture(contexts, runs, result)},
-        sampled=False,
-        measures=(Measure("PSNR, dB", "psnr_db"), Measure("FLIP", "flip", ".3f", False)),
+        measures=(Measure("PSNR of held-out views and lights, dB", "psnr_db"), Measure("FLIP", "flip", ".3f", False)),
     )

@@ -92,6 +92,7 @@ HASH_SETTINGS = {"seed": 1, "schedule": "cosine", "deterministic": False, "lr": 
 MESH = "mesh (Embree)"
 
 MEASURES = (
+    Measure("near the surface, −10 log₁₀(1 − IoU), dB", "iou_near_db", ".1f"),
     Measure("IoU", "iou", ".4f"),
     Measure("IoU near", "iou_near", ".4f"),
     Measure("normals, °", "normal_deg", ".2f", False),
@@ -308,11 +309,10 @@ def plan(mesh: Mesh, name: str, settings: SimpleNamespace, before: dict[str, dic
         jobs[job.name] = job
     first_jobs = {name: job for name, job in jobs.items() if job.budget == first}
     ours = next((n for n, job in first_jobs.items() if job.method == "ours"), "")
-    candidates = [job.candidate(in_passes=job.method in RENDERED) for job in jobs.values()]
+    candidates = [job.candidate() for job in jobs.values()]
     cases = [
-        Case("reads", lambda lanes: _reads(context, first_jobs, lanes), candidates=tuple(first_jobs),
-             query_names=("value", "normal")),
-    ]  # fmt: skip
+        Case("reads", lambda lanes: _reads(context, first_jobs, lanes)),
+    ]
     compared, drawn = [n for n, job in first_jobs.items() if job.method in AGAINST], {}
     if not settings.ablation:
         grid = f"sdfgrid {settings.grid}³"
@@ -332,10 +332,7 @@ def plan(mesh: Mesh, name: str, settings: SimpleNamespace, before: dict[str, dic
             scenes |= references(True)
             return {name: lambda k, s=s: mi.render(s, spp=settings.spp, seed=k) for name, s in scenes.items()}
 
-        cases.append(
-            Case("rays", lambda lanes: _rays(context, view(), traced, references(False), lanes), renders,
-                 candidates=(*traced, MESH, grid), query_names=("ray",))
-        )  # fmt: skip
+        cases.append(Case("rays", lambda lanes: _rays(context, view(), traced, references(False), lanes), renders))
         compared += [MESH, grid]
         drawn = {"shapes": lambda result: shapes(context, first_jobs, view(), result)}
     warnings = [w.removeprefix(f"{mesh.path}: ") for w in (*mesh.warnings, *context.distances.warnings)]
@@ -346,9 +343,6 @@ def plan(mesh: Mesh, name: str, settings: SimpleNamespace, before: dict[str, dic
         title=f"Signed distance field: {Path(name).stem}" + ", parts of ours" * settings.ablation,
         candidates=candidates,
         cases=cases,
-        queries=("value",),
-        accuracy="iou_near_db",
-        accuracy_label="near the surface, −10 log₁₀(1 − IoU), dB",
         ratios=[(ours, n) for n in compared] if ours else [],
         details={
             "source": name, "source_digest": mesh.digest, "triangles": len(mesh.faces), "request": vars(settings),

@@ -317,17 +317,18 @@ class ShadingContenders:
         job = self.add(label, kind, fit, lambda job: read())
         self.add_candidate(job.name, label, [job], kind=label)
 
-    def add_kernel(self, job: Contender) -> None:
-        """Register a contender read at the levels of detail with the smallest error."""
+    def add_kernel(self, job: Contender, label: str = "") -> None:
+        """Register a contender, of another ``label``, read at the levels of detail with the smallest error."""
         places = 2**10 if self.settings.quick else normals.PLACES
-        name, *storage = job.label.split(", ")
+        name, *storage = (label or job.label).split(", ")
         label = ", ".join([*([] if name == "filtered" else [name]), "kernel", *storage])
+        kind = "classical" if job.method == "classical" else "compressed"
 
         def read() -> ShadedReader:
             biases = normals.choose_biases(job.model, self.pyramid, self.effects, places)
             return normals.biased(job.model, biases)
 
-        self.add_filter(label, job.method, lambda: job.record["bytes"], read)
+        self.add_filter(label, kind, lambda: job.record["bytes"], read)
 
     def last(self) -> Contender:
         """Return the contender that was registered last."""
@@ -434,9 +435,8 @@ class ShadingContenders:
     def add_compressed(self, label: str, pyramid: Callable[[], Pyramid]) -> None:
         """Register a texture trained on a classical filter's pyramid, for the time of start and run together."""
         length = self.settings.pretraining + self.settings.length
-        job = self.add_trained(
-            label, "compressed", lambda progress: (*self.fit_texture(pyramid(), length, 0, progress), {})
-        )
+        train = lambda progress: (*self.fit_texture(pyramid(), length, 0, progress), {})  # noqa: E731
+        job = self.add_trained(label, "compressed", train)
         self.add_candidate(job.name, label, [job], kind=label)
 
     def add_run(
@@ -497,7 +497,7 @@ class ShadingContenders:
                 groups.setdefault((share, way), []).append(run)
                 if share == 0:
                     if not bases and seed == 0:
-                        self.add_kernel(dataclasses.replace(run, label="filtered, compressed", method="compressed"))
+                        self.add_kernel(run, "filtered, compressed")
                     bases[schedule] = run
             if settings.extras:
                 way, start = settings.ways[0], self.add_start(seed, True)
@@ -551,9 +551,6 @@ def plan(sources: dict[str, Source], settings: SimpleNamespace) -> Plan:
         title="Textures trained for their shading",
         candidates=[candidate for context in contexts.values() for candidate in context.candidates],
         cases=[],
-        queries=(),
-        accuracy="c_mean_db",
-        accuracy_label="PSNR of shaded values against converged truth, mean of levels, dB",
         details=details,
         notes=[
             *codecs.install_notes(["astc"]),
@@ -568,7 +565,6 @@ def plan(sources: dict[str, Source], settings: SimpleNamespace) -> Plan:
             "strip": partial(draw_crops, contexts),
             "zoom": partial(draw_zoom, contexts),
         },
-        sampled=False,
         measures=(
             Measure("C", "c_mean_db"),
             Measure("C coarse", "c_coarse_db"),
@@ -630,7 +626,7 @@ def curves(result: dict) -> dict[str, MaterialCurves]:
     """Return the records of all materials with any measurement, by name."""
     materials: dict[str, MaterialCurves] = {}
     for record in result["jobs"].values():
-        d = record.get("details", {})
+        d = record["details"]
         material = materials.setdefault(d["material"], MaterialCurves())
         if d["kind"] in ("classical", "compressed"):
             getattr(material, d["kind"])[d["label"]] = d

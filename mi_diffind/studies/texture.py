@@ -303,7 +303,7 @@ class TextureContenders:
             for spp in COUNTS if sampler == "independent" else COUNTS[1:]:
                 name = f"bitmap, {spp} spp{method.removeprefix(BITMAP)}"
                 self.add(name, method, partial(self.bitmap, spp, sampler), bytes=self.source.nbytes,
-                         setting=f"{spp} spp", queries=None if spp == 1 else ())  # fmt: skip
+                         setting=f"{spp} spp")  # fmt: skip
 
     def add_textures(self, tables: Sequence[Table]) -> None:
         """Register trained textures, those of ``tables`` first, and ASTC in the bytes of each of ours."""
@@ -318,7 +318,7 @@ class TextureContenders:
                 textures.append(self.texture(f"paper {compression:g}x", PAPER, compression, "paper"))
         for i, job in enumerate(textures):
             self.jobs.append(job)
-            fields = {"job": job.name, "in_picture": i == 0 or job.method == OURS, "training_seconds": None}
+            fields = {"job": job.name, "in_picture": i == 0 or job.method == OURS}
             plugin = lambda job=job: {"type": "neural_texture", "filename": str(job.model.table.path)}  # noqa: E731
             if job.method != OURS:
                 self.add_filtered(job.name, job.method, plugin, ("trilinear",), **fields)
@@ -340,7 +340,7 @@ class TextureContenders:
                 job = self.network(compression)
                 self.jobs.append(job)
                 plugin = partial(mipmap, lambda job=job: job.model)
-                self.add_filtered(job.name, NETWORK, plugin, ("trilinear",), job=job.name, training_seconds=None)
+                self.add_filtered(job.name, NETWORK, plugin, ("trilinear",), job=job.name)
 
     # -- Jobs
 
@@ -482,9 +482,6 @@ def plan(source: Source, name: str, settings: SimpleNamespace, tables: Sequence[
         title=f"Filtered texture: {Path(name).stem}",
         candidates=candidates,
         cases=[_case(context, scene, candidates) for scene in context.scenes.values()],
-        queries=("read",),
-        accuracy="psnr_plane_db",
-        accuracy_label="PSNR of displayed values, dB",
         ratios=[(c.name, BASE) for c in candidates if c.name != BASE],
         details={
             **source_details(source, name),
@@ -501,7 +498,6 @@ def plan(source: Source, name: str, settings: SimpleNamespace, tables: Sequence[
             "zoom": partial(draw_zoom, context),
             "levels": partial(draw_levels, context),
         },
-        sampled=False,
         measures=(*itertools.chain(*measures), *flicker),
     )
 
