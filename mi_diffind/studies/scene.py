@@ -344,7 +344,7 @@ def write(result: dict, folder: str | os.PathLike) -> dict[str, str]:
     ratios = {r["spp"]: r["median"] for r in result["ratios"]}
     rows = [{"scene": Path(result["scene"]).name, **p, "time_ratio": ratios.get(p["spp"])} for p in result["points"]]
     pictures = {"png": lambda: draw(result)} if any(p["timed"] and p["rmse"] for p in result["points"]) else {}
-    return report.write_files("scene", folder, result, rows, rows[0] if rows else ("scene",), pictures)
+    return report.write_files("scene", folder, result, rows, pictures)
 
 
 def summary(result: dict) -> list[str]:
