@@ -328,18 +328,14 @@ def equal_errors(points: list[dict]) -> dict:
 
 
 def draw(result: dict):
-    """Draw the error against the time of a render in each scene, and against bytes in the first."""
-    panels, first = {}, next(iter(result["scenes"]))
-    styles = [{"linestyle": line, "color": c, "marker": m} for line in ("-", ":") for c, m in plot.STYLES]
-    for case, scene in [*result["scenes"].items(), (f"{first}, one sample a pixel: bytes", result["scenes"][first])]:
-        panels[case] = []
+    """Draw the error against the time of a render in each scene; the legend has the bytes."""
+    ways = ({"linestyle": "-"}, {"linestyle": ":", "markerfacecolor": "white"})
+    styles = [{"color": colour, "marker": marker, **way} for way in ways for colour, marker in plot.STYLES]
+    panels = {case: [] for case in result["scenes"]}
+    for case, scene in result["scenes"].items():
         for (name, nbytes), style in zip(result["bytes"].items(), styles, strict=False):
             points = [p for p in scene["points"] if p["name"] == name]
             at, psnr = [p["cpu_ms"]["median"] for p in points], [p["psnr_db"] for p in points]
-            if case.endswith("bytes"):
-                at, psnr = [nbytes], psnr[:1]
-            panels[case].append(plot.Curve(name, at, psnr, style=style))
-    caption = figure_caption(result)
-    return plot.draw_curves(
-        result["title"], caption, panels, "ms of a render (last: bytes)", "PSNR, dB", "x", columns=3, height=4.2
-    )
+            panels[case].append(plot.Curve(f"{name}, {nbytes / 1e3:,.0f} kB", at, psnr, style=style))
+    labels = "ms of a render, 1 to 64 samples a pixel", "PSNR, dB"
+    return plot.draw_curves(result["title"], figure_caption(result), panels, *labels, "x", height=4.6)
