@@ -379,8 +379,8 @@ def page_of_figures(pages: dict[Path, str]) -> str:
     parts = [
         "# Where the figures come from",
         "Each figure of the README and of the pages is inserted from a file in `docs/measured`, which the command "
-        "below wrote. Files of version 0.1.0 were measured on the way to 0.2.0. A script after `git checkout` is one "
-        "of that commit, which this version has no longer.\n"
+        "below wrote. Files of version 0.1.0 were measured on the way to 0.2.0. A command after `git checkout` is "
+        "one of that commit: this version has its script, or some of its rivals, no longer.\n"
         "This page is made by `python docs/make_tables.py`; `--list` prints the numbers that no file backs.",
         "## Files and commands",
         table(["file", "command"], written_by),
