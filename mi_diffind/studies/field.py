@@ -24,7 +24,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..arrays.sparse_grid import cell_corners, complete_cells
+from ..arrays.sparse_grid import complete_cells
 from ..core.progress import Deadline
 from ..core.runtime import array_module
 from ..core.units import parse_compression
@@ -34,6 +34,7 @@ from ..measure.store import fingerprint, package_files
 from ..measure.study import FLOOR, Candidate, Case, Measure, Plan, Study
 from ..tasks.radiance import dense_bytes
 from ..tasks.radiance import grid as grids
+from ..tasks.radiance.compression import Importance, importance
 from ..tasks.radiance.files import grid_of, load
 from ..tasks.radiance.march import march
 from ..tasks.radiance.session import FieldSession, ImagesProblem, displayed
@@ -160,21 +161,23 @@ class RadianceStudyContext:
         return self.session.types
 
     @functools.cached_property
-    def grid(self) -> grids.NodeGrid:
-        """The part of the trained grid that some ray sees."""
-        trained = grid_of(load(self.jobs[GRID].file), self.types)
-        cells = grids.visible(trained, self.session.images) & complete_cells(trained.nodes.stored)
-        return trained.part(cell_corners(cells))
+    def trained(self) -> grids.NodeGrid:
+        """The trained grid."""
+        return grid_of(load(self.jobs[GRID].file), self.types)
 
     @functools.cached_property
-    def seen(self) -> np.ndarray:
-        """The largest weight in a ray of each entry of the grid."""
-        return grids.weights(self.grid.field(), self.session.images)
+    def cells(self) -> np.ndarray:
+        """The cells of the trained grid that some ray sees."""
+        return grids.visible(self.trained, self.session.images)
+
+    def importance(self, grid: grids.NodeGrid) -> Importance:
+        """Return the weights of the nodes of a grid in the training views."""
+        return importance(grid, self.session, SETTINGS.seed)
 
     @functools.cached_property
     def dense_bytes(self) -> int:
         """Bytes of the dense float32 grid, to which ratios refer."""
-        return dense_bytes(self.grid.nodes.shape)
+        return dense_bytes(self.trained.nodes.shape)
 
     def record(self, job: Contender, model: VolumeField, nbytes: int, file_bytes: int, **details) -> dict:
         """Return the record of a contender, with its errors."""
@@ -210,15 +213,16 @@ def rival_contender(context: RadianceStudyContext, fields: dict) -> Contender:
     rival = rivals.HashVolumeFit if fields["method"] == "hash" else rivals.NodesFit
 
     def train(job: Contender, progress: bool) -> dict | None:
-        nbytes, grid, seen = context.dense_bytes / job.budget, context.grid, context.seen
+        nbytes, steps, rate, deadline = context.dense_bytes / job.budget, settings.steps, SETTINGS.lr, None
         if job.method == "hash":
-            trained, rate, steps, deadline = rival(grid, seen, nbytes), HASH_RATE, 10**6, Deadline(settings.seconds)
+            grid = grids.refine(context.trained, context.cells)
+            trained, rate, steps = rival(grid, context.importance(grid), nbytes), HASH_RATE, 10**6
+            deadline = Deadline(settings.seconds)
         else:
-            entries = min(ENTRIES, int(nbytes / 4) // rivals.COEFFICIENTS) if job.method == "codebook" else 0
-            scale, steps, deadline = rivals.choose_scale(grid, nbytes, entries), settings.steps, None
-            if scale > 1:
-                grid, seen = rivals.resample(grid, seen, scale)
-            trained, rate = rival(grid, seen, entries), COARSER_RATE if scale > 1 else SETTINGS.lr
+            entries = min(ENTRIES, int(nbytes / 64)) if job.method == "codebook" else 0
+            grid = rivals.fitting_grid(context.trained, context.cells, nbytes, entries)
+            trained = rival(grid, context.importance(grid), entries)
+            rate = COARSER_RATE if grid.nodes.spacing > context.trained.nodes.spacing else rate
         problem = ImagesProblem(context.session, trained.net, trained.field_of)
         problem.measure = lambda net: {"step": 0.0}  # the last step counts for all contenders
         options = replace(SETTINGS, lr=rate, steps=steps, measure_every=steps)
@@ -290,9 +294,9 @@ def plan(session: FieldSession, source: str, settings: SimpleNamespace) -> Plan:
 
 def _reads(context: RadianceStudyContext, names, lanes: int) -> dict:
     """Return queries of density, and of density and colour, at random points of the visible cells."""
-    types, nodes = context.types, context.grid.nodes
+    types, nodes = context.types, context.trained.nodes
     rng = np.random.default_rng(1)
-    cells = np.argwhere(complete_cells(nodes.stored))
+    cells = np.argwhere(context.cells & complete_cells(nodes.stored))
     places = cells[rng.integers(len(cells), size=lanes)] + rng.random((lanes, 3))
     away = rng.normal(size=(lanes, 3))
     away /= np.linalg.norm(away, axis=1, keepdims=True)

@@ -8,6 +8,7 @@ import pytest
 from mi_diffind.arrays.sparse_grid import cell_corners, complete_cells
 from mi_diffind.studies.baselines import radiance_fields as rivals
 from mi_diffind.tasks.radiance import march
+from mi_diffind.tasks.radiance.compression import Importance
 from mi_diffind.tasks.radiance.grid import NodeGrid
 from mi_diffind.tasks.radiance.nodes import Nodes
 from mi_diffind.tasks.radiance.volume_field import FAINT
@@ -28,9 +29,9 @@ def grid(rng):
 
 
 @pytest.fixture
-def seen(grid, rng):
-    """Random weights of its entries."""
-    return rng.random(grid.nodes.entries)
+def importance(grid, rng):
+    """Random weights of its nodes."""
+    return Importance(rng.random(grid.nodes.count), rng.random(grid.nodes.count), rng.uniform(0.5, 1, 12), 1.0)
 
 
 def rays(rng, count):
@@ -56,15 +57,15 @@ def interpolated(grid, numbers, points):
 
 def numbers_of(state):
     """Return density and twelve numbers of colour of each node of a state."""
-    density = -8 + 20 / 255 * state["density"].astype(np.float64)[:, None]
-    colour = state["colour_low"] + state["colour_step"] * state["colour"].astype(np.float64)
-    return np.concatenate([density, colour[state["rows"]] if "rows" in state else colour], axis=1)
+    density = -7 + 15 / 255 * state["density"].astype(np.float64)[:, None]
+    colour = state["low"] + state["step"] * state["colour"].astype(np.float64)
+    return np.concatenate([density, colour[state["index"]] if "index" in state else colour], axis=1)
 
 
-@pytest.mark.parametrize("entries", [0, 50])
-def test_bytes_are_read_as_numbers(grid, seen, entries, rng):
+@pytest.mark.parametrize("entries", [0, 64])
+def test_bytes_are_read_as_numbers(grid, importance, entries, rng):
     """The field that is trained and that which reads bytes, against NumPy; all bytes are counted."""
-    made = rivals.NodesFit(grid, seen, entries)
+    made = rivals.NodesFit(grid, importance, entries)
     state = made.state()
     assert state["density"].dtype == state["colour"].dtype == np.uint8
     points, directions, p, d = rays(rng, 3000)
@@ -79,63 +80,44 @@ def test_bytes_are_read_as_numbers(grid, seen, entries, rng):
         assert np.abs(found.numpy() - sigma).max() < 2e-3
         colour = np.array(field.radiance_at(point_data, p, d, found > 0))
         assert 0.1 < (sigma > 0).mean() < 0.9
-        assert np.allclose(colour[:, sigma > 0], np.exp(exponents)[:, sigma > 0], rtol=2e-4)
-    numbers = grid.nodes.entries * (3 if entries else 13) + 12 * entries
-    assert 0 <= stored.nbytes - stored.nodes.nbytes - numbers < 4
-    assert rivals.compressed_bytes(state) < stored.nbytes
+        assert np.allclose(colour[:, sigma > 0], np.exp(exponents)[:, sigma > 0], rtol=2e-3)
+    assert rivals.compressed_bytes(state) < stored.nbytes <= rivals.memory_bytes(grid, entries) < stored.nbytes + 16
 
 
-def test_numbers_are_rounded_once(grid, seen):
+def test_numbers_are_rounded_once(grid, importance):
     """Rounding is within half a step, and rounded numbers stay."""
-    made = rivals.NodesFit(grid, seen)
+    made = rivals.NodesFit(grid, importance)
     found = numbers_of(made.state())
-    assert np.abs(found[:, 0] - np.clip(grid.density[1:], -8, 12)).max() <= 0.51 * 20 / 255
-    inner = np.abs(found[:, 1:] - grid.colour[1:]) <= 0.51 * made.steps.step
+    assert np.abs(found[:, 0] - np.clip(grid.density[1:], -7, 8)).max() <= 0.51 * 15 / 255
+    inner = np.abs(found[:, 1:] - grid.colour[1:]) <= 0.51 * made.step
     assert inner.mean() > 0.99  # all but the tails
-    tensor = T.TensorXf(np.float32(found[:, 1:]))
-    assert np.abs(made.steps.rounded(T, tensor).numpy() - found[:, 1:]).max() < 1e-6
+    colour = np.vstack([np.zeros(12), found[:, 1:]]).astype(np.float32)
+    again = made.field_of({**made.net, "colour": T.TensorXf(colour)}).arrays["colour"].numpy()
+    assert np.abs(again[1:] - colour[1:]).max() < 1e-5
 
 
-def test_codebook_has_the_nearest(grid, seen):
-    made = rivals.NodesFit(grid, seen, 50)
-    scale = rivals.display_scale(grid.colour[1:], seen[1:])
+def test_a_codebook_has_the_nearest_colours(grid, importance):
+    made, scale = rivals.NodesFit(grid, importance, 50), np.sqrt(importance.metric)
     centres, points = made.net["colour"].numpy() * scale, grid.colour[1:] * scale
     distances = np.linalg.norm(points[:, None] - centres[None], axis=2)
-    best = distances[np.arange(len(points)), made.rows[1:]]
+    best = distances[np.arange(len(points)), made.index[1:]]
     assert np.allclose(best, distances.min(axis=1), rtol=1e-3)
     random = np.linalg.norm(points[:, None] - points[None, :50], axis=2).min(axis=1)
-    assert np.average(best**2, weights=seen[1:]) < np.average(random**2, weights=seen[1:])
+    assert np.average(best**2, weights=importance.colour) < np.average(random**2, weights=importance.colour)
 
 
-def test_coarser_grids_are_read_from_finer_ones():
-    """Numbers that are linear in the place are met where nodes are inside; there is nothing outside."""
-    cells = np.zeros((15, 15, 15), bool)
-    cells[3:12, 3:12, 3:12] = True
-    nodes = Nodes(T, LOWER, SPACING, (16, 16, 16), cell_corners(cells))
-
-    def linear(place):
-        colour = np.stack([place @ [k, 1, 2] for k in range(12)], axis=1)
-        return 0.3 * place[:, 0] - 0.1 * place[:, 2], colour
-
-    density, colour = linear(nodes.positions())
-    grid = NodeGrid(nodes, np.pad(density, (1, 0)), np.pad(colour, ((1, 0), (0, 0))))
-    found, _ = rivals.resample(grid, np.ones(nodes.entries), 1.4)
-    assert found.nodes.spacing == pytest.approx(1.4 * SPACING) and found.nodes.shape == (12, 12, 12)
-    place = 1.4 * found.nodes.positions()
-    inside = ((place >= 3) & (place <= 12)).all(axis=1)
-    assert inside.sum() == 6**3
-    for values, expected in zip((found.density[1:], found.colour[1:]), linear(place), strict=True):
-        assert np.abs(values - expected)[inside].max() < 1e-3
-    assert found.density[1:][~inside].max() < 1.0 and not inside.all()
-    for entries in (0, 50):
-        nbytes = 0.5 * rivals.NodesFit.field(T, rivals.NodesFit(grid, np.ones(nodes.entries), entries).state()).nbytes
-        coarse = rivals.resample(grid, np.ones(nodes.entries), rivals.choose_scale(grid, nbytes, entries))
-        assert 0.5 * nbytes < rivals.NodesFit.field(T, rivals.NodesFit(*coarse, entries).state()).nbytes <= nbytes + 4
+def test_grids_are_as_fine_as_the_bytes_allow(grid):
+    cells = complete_cells(grid.nodes.stored)
+    for entries in (0, 64):
+        whole = rivals.memory_bytes(grid, entries)
+        assert rivals.fitting_grid(grid, cells, whole, entries).nodes.shape == SHAPE
+        part = rivals.fitting_grid(grid, cells, 0.7 * whole, entries)
+        assert part.nodes.spacing > SPACING and 0.4 * whole < rivals.memory_bytes(part, entries) <= 0.7 * whole
 
 
-def test_all_outputs_of_a_network_are_trained(grid, seen, rng):
+def test_all_outputs_of_a_network_are_trained(grid, importance, rng):
     """Derivatives of rays reach the density and all coefficients of the colours, as finite differences do."""
-    made = rivals.HashVolumeFit(grid, seen, BYTES)
+    made = rivals.HashVolumeFit(grid, importance, BYTES)
     assert 0.8 * BYTES < made.field(T, made.state()).nbytes <= BYTES
     made.net["weights"] = made.net["weights"] * 1.5  # some density
     _, _, o, d = rays(rng, 500)

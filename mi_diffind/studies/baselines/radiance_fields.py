@@ -11,44 +11,41 @@ modules of ``drjit.nn``.
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass
 
 import drjit as dr
 import numpy as np
 from drjit import nn
-from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
 from ...arrays.indirection import device_array, device_tensor
-from ...arrays.lookup import as_words, pack_bits
 from ...arrays.sparse_grid import cell_corners, complete_cells
+from ...arrays.tables import StoredArray
 from ...core.units import largest_fitting
-from ...tasks.radiance.grid import DENSITY_SCALE, NodeGrid
+from ...tasks.radiance.compression import DENSEST, EMPTIEST, SMALLEST, Importance, clusters
+from ...tasks.radiance.grid import DENSITY_SCALE, NodeGrid, refine
 from ...tasks.radiance.nodes import COARSE, Nodes, coarser
-from ...tasks.radiance.volume_field import NodeField, NodeVolume, VolumeField, colour_of, density_of
+from ...tasks.radiance.volume_field import (  # fmt: skip
+    NodeField,
+    NodeVolume,
+    PackedPaletteField,
+    PaletteArrays,
+    VolumeField,
+    colour_of,
+    density_of,
+)
 from .networks import LAYERS, WIDTH, hash_grid
-
-#: Range of stored raw densities: empty at the lower end, opaque at the upper.
-RAW = (-8.0, 12.0)
 
 #: Coefficients of a colour by direction: four for red, green and blue each.
 COEFFICIENTS = 12
 
-#: Weight of a node that no ray sees, so that its colour is defined, too.
-LEAST = 1e-6
+#: Lowest stored raw density, and the step to the next one.
+DENSITY_RANGE = (EMPTIEST, (DENSEST - EMPTIEST) / 255)
 
-#: Share of the weights at either end of the range of colours that is clipped.
+#: Share of the nodes at either end of the range of colours that is clipped.
 TAIL = 1e-3
-
-#: Points that centres of a codebook are computed from, and rounds of k-means.
-KMEANS_POINTS = 2**16
-KMEANS_ROUNDS = 10
 
 #: Raw density of a network before training.
 BEGIN = -4.0
-
-#: Largest ratio of node distances of a coarser grid.
-COARSEST_RATIO = 6.0
 
 
 def compressed_bytes(state: dict[str, np.ndarray]) -> int:
@@ -57,183 +54,118 @@ def compressed_bytes(state: dict[str, np.ndarray]) -> int:
     return sum(len(zlib.compress(a.tobytes(), 9)) for a in arrays)
 
 
-@dataclass(frozen=True, eq=False)
-class QuantisationSteps:
-    """Uniform quantisation of the channels of an array ``(n, C)`` in 256 steps.
-
-    Value = ``low`` + ``step`` · code; ``low`` and ``step`` are float32 ``(C,)``.
-    """
-
-    low: np.ndarray
-    step: np.ndarray
-
-    @staticmethod
-    def over(values: np.ndarray, weights: np.ndarray, tail: float) -> QuantisationSteps:
-        """Return steps over the range of ``values`` (n, C) without the share ``tail`` of ``weights`` at either end."""
-        ends = []
-        for v in values.T:
-            order = np.argsort(v)
-            share = np.cumsum(weights[order]) / weights.sum()
-            ends.append(v[order[np.searchsorted(share, (tail, 1 - tail)).clip(0, len(v) - 1)]])
-        low, high = np.array(ends, np.float64).T
-        return QuantisationSteps(low.astype(np.float32), (np.maximum(high - low, 1e-6) / 255).astype(np.float32))
-
-    def codes(self, values: np.ndarray) -> np.ndarray:
-        """Return the codes of ``values``, uint8 ``(n, C)``."""
-        return np.clip(np.rint((values - self.low) / self.step), 0, 255).astype(np.uint8)
-
-    def rounded(self, types, tensor):
-        """Return a tensor ``(n, C)`` rounded to its steps, with the gradients of the tensor (straight through)."""
-        low, step = (types.TensorXf(np.asarray(v, np.float32)[None]) for v in (self.low, self.step))
-        exact = dr.detach(tensor)
-        code = dr.clip(dr.round((exact - low) / step), 0, 255)
-        return tensor + (code * step + low - exact)
-
-
-#: Steps of raw densities.
-DENSITY_STEPS = QuantisationSteps(np.float32([RAW[0]]), np.float32([(RAW[1] - RAW[0]) / 255]))
-
-
 # -- Grids of bytes ----------------------------------------------------------------------------------------------------
 
 
 class ByteField(NodeVolume):
-    """Field of nodes that reads bytes.
+    """Field of sparse nodes that reads bytes: ``density`` (n,) and ``colour`` (n, 12), uint8.
 
-    ``density`` (n,) and ``colour`` (m, 12) are uint8; ``rows`` (n,) is the row of each node or ``None``. Nodes are in
-    lexicographic order, without an entry for no node. ``nbytes`` are all bytes in memory.
+    ``low`` and ``step`` (12,) say what the steps of colours mean. ``nbytes`` are all bytes in memory.
     """
 
-    def __init__(self, nodes: Nodes, density, colour, colour_steps: QuantisationSteps, rows=None):
+    def __init__(self, nodes: Nodes, density: np.ndarray, colour: np.ndarray, low: np.ndarray, step: np.ndarray):
         types = nodes.types
         super().__init__(nodes.like(nodes.spacing, nodes.shape, nodes.stored, packed=True), {})
-        self.colour_steps = colour_steps
-        self.density = types.UInt8(np.pad(density, (1, 0)))  # 0 stands for no node
-        table = colour if rows is not None else np.pad(colour, ((1, 0), (0, 0)))
-        self.table = device_array(types.UInt32, np.ascontiguousarray(table).view("<u4"))
-        self.nbytes = self.nodes.nbytes + dr.width(self.density) + 4 * dr.width(self.table)
-        self.rows = None
-        if rows is not None:  # two rows of 16 bits a word
-            self.rows = device_array(types.UInt32, as_words(pack_bits(np.pad(rows, (1, 0)), 16)))
-            self.nbytes += 4 * dr.width(self.rows)
+        self.low, self.step_of_colour = low.tolist(), step.tolist()
+        # The first entry stands for no node
+        self.density = types.UInt8(np.pad(density, (1, 0)))
+        self.colour = device_array(types.UInt32, np.pad(colour, ((1, 0), (0, 0))).view("<u4"))
+        self.nbytes = self.nodes.nbytes + dr.width(self.density) + 4 * dr.width(self.colour)
 
     def density_at(self, p, active=True):
         def level(number, seen):
             return self.types.Float(dr.gather(self.types.UInt8, self.density, number, seen))
 
-        return self.interpolated_density(level, p, active, float(DENSITY_STEPS.low[0]), float(DENSITY_STEPS.step[0]))
+        return self.interpolated_density(level, p, active, *DENSITY_RANGE)
 
     def radiance_at(self, point_data, p, d, active=True):
-        types, UInt32 = self.types, self.types.UInt32
+        types = self.types
         sums = [types.Float(0)] * COEFFICIENTS
         for weight, number in zip(point_data[:8], point_data[8:], strict=True):
-            if self.rows is not None:
-                number = (dr.gather(UInt32, self.rows, number >> 1, active) >> ((number & 1) << 4)) & 0xFFFF
             for j in range(COEFFICIENTS // 4):
-                word = dr.gather(UInt32, self.table, dr.fma(number, COEFFICIENTS // 4, j), active)
+                word = dr.gather(types.UInt32, self.colour, dr.fma(number, COEFFICIENTS // 4, j), active)
                 for k in range(4):
                     byte = types.Float(types.Int32((word >> (8 * k)) & 255))
                     sums[4 * j + k] = dr.fma(weight, byte, sums[4 * j + k])
-        s = self.colour_steps
-        return colour_of([dr.fma(v, float(a), float(b)) for v, a, b in zip(sums, s.step, s.low, strict=True)], d)
+        return colour_of([dr.fma(v, a, b) for v, a, b in zip(sums, self.step_of_colour, self.low, strict=True)], d)
 
 
-def coarser_nodes(grid: NodeGrid, scale: float) -> Nodes:
-    """Return nodes ``scale`` times as far apart, whose cells cover the occupied cells of a grid."""
+def memory_bytes(grid: NodeGrid, entries: int = 0) -> int:
+    """Return the bytes in memory of a grid of bytes, with ``entries`` those of a codebook of so many colours."""
     nodes = grid.nodes
-    shape = [int(np.ceil((n - 1) / scale - 1e-6)) + 1 for n in nodes.shape]
-    old, last = np.argwhere(complete_cells(nodes.stored)), np.array(shape) - 2
-    cells = np.zeros([n - 1 for n in shape], bool)
-    for corner in np.ndindex(2, 2, 2):
-        new = ((old + np.array(corner) * (1 - 1e-6)) / scale).astype(int)
-        cells[tuple(np.minimum(new, last).T)] = True
-    return nodes.like(scale * nodes.spacing, shape, cell_corners(cells), packed=True)
+    index = nodes.like(nodes.spacing, nodes.shape, nodes.stored, packed=True).nbytes
+    bits = 8 + (max(1, (entries - 1).bit_length()) if entries else 8 * COEFFICIENTS)
+    return index + nodes.entries * bits // 8 + 8 + 16 * entries
 
 
-def resample(grid: NodeGrid, seen: np.ndarray, scale: float) -> tuple[NodeGrid, np.ndarray]:
-    """Return a grid and the weights ``seen`` (n,) of its entries on the nodes of :func:`coarser_nodes`.
+def fitting_grid(grid: NodeGrid, cells: np.ndarray, nbytes: float, entries: int = 0) -> NodeGrid:
+    """Return the part of a grid in ``cells``, bool, at the highest resolution that fits in ``nbytes``."""
+    whole = refine(grid, cells)
+    if memory_bytes(whole, entries) <= nbytes:
+        return whole
 
-    Raw densities are interpolated; colours are means weighted by ``seen``. (Mean densities over cells would make walls
-    transparent.)
-    """
-    nodes = coarser_nodes(grid, scale)
-    nodes = nodes.like(nodes.spacing, nodes.shape, nodes.stored)
+    def fits(share: float) -> bool:
+        return memory_bytes(refine(grid, cells, share), entries) <= nbytes
 
-    def dense(values: np.ndarray, outside: float = 0.0) -> np.ndarray:
-        box = np.full(grid.nodes.shape, outside, np.float32)
-        box[grid.nodes.stored] = values[1:]
-        return box
-
-    weight = seen + LEAST
-    values = [
-        np.maximum(dense(grid.density, RAW[0]), RAW[0]),
-        dense(weight),
-        *(dense(c * weight) for c in grid.colour.T),
-    ]
-    at = nodes.positions().T * scale
-    raw, weight, *sums = (map_coordinates(v, at, order=1, mode="nearest", prefilter=False) for v in values)
-    mean = np.average(grid.colour[1:], axis=0, weights=seen[1:] + LEAST)
-    colour = np.where(weight[:, None] > 1e-9, np.stack(sums, axis=1) / np.maximum(weight, 1e-12)[:, None], mean)
-    density, colour, weight = np.pad(raw, (1, 0)), np.pad(colour, ((1, 0), (0, 0))), np.pad(weight, (1, 0))
-    return NodeGrid(nodes, density.astype(np.float32), colour.astype(np.float32)), weight
-
-
-def choose_scale(grid: NodeGrid, nbytes: float, entries: int = 0) -> float:
-    """Return the smallest ratio of node distances, at least 1, with which a grid of bytes takes ``nbytes`` in memory.
-
-    ``entries`` are those of a codebook, without which each node has its colour.
-    """
-
-    def fits(fineness: float) -> bool:
-        nodes = coarser_nodes(grid, 1 / fineness)
-        return nodes.nbytes + nodes.entries * (3 if entries else 13) + 12 * entries <= nbytes
-
-    return 1.0 if fits(1.0) else 1 / largest_fitting(fits, 1 / COARSEST_RATIO, 1.0, steps=10)
+    return refine(grid, cells, largest_fitting(fits, SMALLEST, 1.0, steps=7))
 
 
 class NodesFit:
-    """Training of a ``grid`` of bytes, each node with a colour of its own or, with ``entries``, a row of a codebook.
+    """Training of a ``grid`` of bytes, each node with a colour of its own or, with ``entries``, a row of a codebook."""
 
-    ``seen`` (n,) are the weights of the entries of the grid in the training views.
-    """
-
-    def __init__(self, grid: NodeGrid, seen: np.ndarray, entries: int = 0):
-        self.nodes, self.rows, types = grid.nodes, None, grid.nodes.types
-        colour, weights = grid.colour, seen + LEAST
+    def __init__(self, grid: NodeGrid, importance: Importance, entries: int = 0):
+        self.nodes, self.index, types = grid.nodes, None, grid.nodes.types
+        colour = grid.colour
         if entries:
-            scale = display_scale(colour[1:], weights[1:])
-            centres, rows = k_means((colour[1:] * scale).astype(np.float32), weights[1:], entries)
-            colour, self.rows = centres / scale, np.pad(rows, (1, 0)).astype(np.uint16)
-            self.steps = QuantisationSteps.over(colour, np.ones(len(colour)), 0.0)
-        else:
-            self.steps = QuantisationSteps.over(colour[1:], weights[1:], TAIL)
-        density = np.clip(grid.density, *RAW)[:, None].astype(np.float32)
+            scale = np.sqrt(importance.metric)
+            centres = clusters(colour[1:] * scale, importance.colour, entries, 1)
+            rows = cKDTree(centres).query(colour[1:] * scale)[1]
+            colour, self.index = centres / scale, np.pad(rows, (1, 0)).astype(np.uint32)
+        low, high = np.quantile(colour, (0, 1) if entries else (TAIL, 1 - TAIL), axis=0)
+        self.low, self.step = low.astype(np.float32), (np.maximum(high - low, 1e-6) / 255).astype(np.float32)
         self.net = {
-            "density": device_tensor(types.TensorXf, density / DENSITY_SCALE),
+            "density": device_tensor(types.TensorXf, np.float32(grid.density)[:, None] / DENSITY_SCALE),
             "colour": device_tensor(types.TensorXf, np.float32(colour)),
         }
-        self.numbers = None if self.rows is None else device_array(types.UInt32, self.rows.astype(np.uint32))
+        self.rows = None if self.index is None else device_array(types.UInt32, self.index)
 
     def field_of(self, net) -> NodeField:
-        """Return the field of the trained parameters, rounded as they are stored."""
+        """Return the field of the trained parameters, rounded as they are stored, with straight-through gradients."""
         types = self.nodes.types
-        density = DENSITY_STEPS.rounded(types, net["density"] * DENSITY_SCALE)
-        return NodeField(self.nodes, density, self.steps.rounded(types, net["colour"]), self.numbers)
+
+        def rounded(tensor, low, step):
+            low, step = (types.TensorXf(np.atleast_2d(np.float32(v))) for v in (low, step))
+            exact = dr.detach(tensor)
+            return tensor + (dr.clip(dr.round((exact - low) / step), 0, 255) * step + low - exact)
+
+        density = rounded(net["density"] * DENSITY_SCALE, *DENSITY_RANGE)
+        return NodeField(self.nodes, density, rounded(net["colour"], self.low, self.step), self.rows)
 
     def state(self) -> dict[str, np.ndarray]:
         """Return the arrays of a file by name."""
-        density, colour = (self.net[name].numpy() for name in ("density", "colour"))
-        state = {"density": DENSITY_STEPS.codes(density[1:] * DENSITY_SCALE)[:, 0], **nodes_state(self.nodes)}
-        state |= {"colour_low": self.steps.low, "colour_step": self.steps.step}
-        if self.rows is None:
-            return state | {"colour": self.steps.codes(colour[1:])}
-        return state | {"colour": self.steps.codes(colour), "rows": self.rows[1:]}
+
+        def codes(values, low, step):
+            return np.clip(np.rint((values - low) / step), 0, 255).astype(np.uint8)
+
+        density = codes(self.net["density"].numpy()[1:, 0] * DENSITY_SCALE, *DENSITY_RANGE)
+        colour = codes(self.net["colour"].numpy(), self.low, self.step)
+        state = {**nodes_state(self.nodes), "density": density, "low": self.low, "step": self.step}
+        if self.index is None:
+            return state | {"colour": colour[1:]}
+        return state | {"colour": colour, "index": self.index[1:].astype(np.uint16)}
 
     @staticmethod
-    def field(types, state: dict) -> ByteField:
+    def field(types, state: dict) -> NodeVolume:
         """Return the field that reads what :meth:`state` returned."""
-        steps = QuantisationSteps(state["colour_low"], state["colour_step"])
-        return ByteField(read_nodes(types, state), state["density"], state["colour"], steps, state.get("rows"))
+        nodes, density, colour, low, step = read_nodes(types, state), *(
+            state[name] for name in ("density", "colour", "low", "step")
+        )  # fmt: skip
+        if "index" not in state:
+            return ByteField(nodes, density, colour, low, step)
+        palette = StoredArray(colour, (), tuple(step.tolist()), tuple(low.tolist()))
+        index = np.pad(state["index"], (1, 0))
+        numbers = PaletteArrays(np.pad(density, (1, 0)), 8, DENSITY_RANGE, index, palette)
+        return PackedPaletteField(nodes.like(nodes.spacing, nodes.shape, nodes.stored, packed=True), numbers)
 
 
 def nodes_state(nodes: Nodes) -> dict[str, np.ndarray]:
@@ -244,32 +176,6 @@ def nodes_state(nodes: Nodes) -> dict[str, np.ndarray]:
 def read_nodes(types, state: dict) -> Nodes:
     """Return the nodes of a state."""
     return Nodes(types, state["lower"], float(state["spacing"]), state["stored"].shape, state["stored"])
-
-
-def display_scale(colour: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the sensitivity of the displayed image to each coefficient of colour, (12,).
-
-    It is the slope of sRGB times the radiance, as a root mean square over nodes.
-    """
-    radiance = np.exp(np.clip(colour[:, ::4], -12, 1.5))
-    slope = np.where(radiance <= 0.0031308, 12.92, 1.055 / 2.4 * np.maximum(radiance, 0.0031308) ** (1 / 2.4 - 1))
-    return np.repeat(np.sqrt(np.average((slope * radiance) ** 2, axis=0, weights=weights)), 4)
-
-
-def k_means(points: np.ndarray, weights: np.ndarray, count: int):
-    """Return centres ``(count, D)`` of weighted ``points`` (n, D), and the index of the nearest of each (n,)."""
-    rng = np.random.default_rng(1)
-    count = min(count, len(points))
-    share = weights / weights.sum()
-    centres = points[rng.choice(len(points), count, replace=False, p=0.5 * share + 0.5 / len(points))]
-    chosen = rng.choice(len(points), min(KMEANS_POINTS, len(points)), replace=False)
-    sample, mass = points[chosen], weights[chosen]
-    for _ in range(KMEANS_ROUNDS):
-        nearest = cKDTree(centres).query(sample)[1]
-        total = np.bincount(nearest, mass, count)
-        sums = np.stack([np.bincount(nearest, mass * v, count) for v in sample.T], axis=1)
-        centres = np.where(total[:, None] > 0, sums / np.maximum(total, 1e-30)[:, None], centres).astype(np.float32)
-    return centres, cKDTree(centres).query(points)[1]
 
 
 # -- Hash grid and network ---------------------------------------------------------------------------------------------
@@ -326,13 +232,13 @@ class HashVolumeField(VolumeField):
 class HashVolumeFit:
     """Training of the largest hash grid and network of ``nbytes``, with cells as fine as those of a ``grid``."""
 
-    def __init__(self, grid: NodeGrid, seen: np.ndarray, nbytes: float, seed: int = 1):
+    def __init__(self, grid: NodeGrid, importance: Importance, nbytes: float, seed: int = 1):
         self.nodes, self.nbytes, types = grid.nodes, nbytes, grid.nodes.types
         self.encoding, self.network = modules(self.nodes, nbytes, seed)
         weights = types.TensorXf(dr.detach(self.network["weights"])).numpy()
         # The last layer begins with an empty field of the mean colour
         bias = self.network.layers[-1].bias
-        mean = np.average(grid.colour[1:], axis=0, weights=seen[1:] + LEAST)
+        mean = np.average(grid.colour[1:], axis=0, weights=importance.colour + 1e-9 * importance.colour.max())
         weights[bias.offset : bias.offset + 13 * bias.stride : bias.stride] = [0.0, *mean]
         self.net = {"entries": types.TensorXf(dr.detach(self.encoding.params)), "weights": types.TensorXf(weights)}
 
