@@ -7,7 +7,7 @@ budget allows; the search for the spacing is part of the seconds. All bytes coun
 
 Errors are those of :class:`~mi_diffind.tasks.sdf.evaluation.SurfaceEvaluation`; lengths are relative to the longest
 side. Times: reads at random points within 0.01 of the surface; primary rays, beside Embree on the mesh and Mitsuba's
-``sdfgrid``; a whole render.
+``sdfgrid``.
 """
 
 from __future__ import annotations
@@ -31,8 +31,7 @@ from ..fitting.loop import FitSettings
 from ..measure import plot
 from ..measure.store import fingerprint, package_files
 from ..measure.study import FLOOR, Candidate, Case, Measure, Plan, Study
-from ..plugins.support.distance_shapes import crop_grid, distance_shape
-from ..plugins.support.placement import Placement
+from ..plugins.support.distance_shapes import crop_grid
 from ..tasks.sdf import grids, marching
 from ..tasks.sdf.distances import Distances
 from ..tasks.sdf.evaluation import SurfaceEvaluation
@@ -56,8 +55,8 @@ FIRST_ONLY = ("paper", "hash")
 #: Method → preset of ``fit sdf``; the default is "".
 PRESETS = {"ours": "", "paper": "paper"}
 
-#: Methods of which an image is rendered, and whose errors are shown; ours is compared with the first two.
-RENDERED = ("dense", "distances", "ours")
+#: Methods whose errors are shown; ours is compared with the first two.
+SHOWN = ("dense", "distances", "ours")
 
 #: How much finer than its cells a field is decoded to measure its surface.
 FINER = 1.5
@@ -66,7 +65,7 @@ FINER = 1.5
 POOL = 2**20
 HASH_SETTINGS = {"seed": 1, "schedule": "cosine", "deterministic": False, "lr": 1e-2, "batch": 2**13, "loss": "mae"}
 
-#: Candidate that renders and rays are compared with, beside ``sdfgrid``.
+#: Candidate that rays are compared with, beside ``sdfgrid``.
 MESH = "mesh (Embree)"
 
 MEASURES = (
@@ -80,11 +79,13 @@ MEASURES = (
 
 #: Settings of a run: held-out points; steps of trainings by presets (0: the preset's own), and of the shortest and the
 #: longest of the network; width and height of pictures; cells of ``sdfgrid`` along the longest side, and of the finest
-#: decoding whose Chamfer distance is measured; samples of a render.
-FULL = {"points": 2**20, "steps": 0, "hash_steps": (500, 4000), "film": (480, 320), "grid": 256, "decoded": 768,
-        "spp": 4}  # fmt: skip
-QUICK = {"points": 2**14, "steps": 20, "hash_steps": (40, 80), "film": (96, 64), "grid": 32, "decoded": 96,
-         "spp": 1}  # fmt: skip
+#: decoding whose Chamfer distance is measured.
+FULL = {
+    "points": 2**20, "steps": 0, "hash_steps": (500, 4000), "film": (480, 320), "grid": 256, "decoded": 768,
+}  # fmt: skip
+QUICK = {
+    "points": 2**14, "steps": 20, "hash_steps": (40, 80), "film": (96, 64), "grid": 32, "decoded": 96,
+}  # fmt: skip
 
 
 def size_text(nbytes: int) -> str:
@@ -93,10 +94,10 @@ def size_text(nbytes: int) -> str:
 
 
 class SdfStudy(Study):
-    """Distance fields in equal bytes: errors against the mesh, and times of reads, rays and renders."""
+    """Distance fields in equal bytes: errors against the mesh, and times of reads and rays."""
 
     name = "sdf"
-    title = "the distance field of a mesh, in equal bytes, reads, rays and renders"
+    title = "the distance field of a mesh, in equal bytes, reads and rays"
     example = "mesh.ply"
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
@@ -107,7 +108,7 @@ class SdfStudy(Study):
         parser.add_argument(
             "--bytes", action="append", default=[], metavar="N",
             help=f"memory budget; may be repeated (default: {', '.join(SIZES)}; --quick: 64k); at the first one "
-            "all methods are trained, and reads, rays and renders are timed",
+            "all methods are trained, and reads and rays are timed",
         )  # fmt: skip
         equal_memory.add_without_option(parser)
 
@@ -245,12 +246,7 @@ def plan(mesh: Mesh, name: str, settings: SimpleNamespace) -> Plan:
     jobs = [contender(method, nbytes, context) for method, nbytes in chosen]
     timed = {job.method: job for job in jobs if job.budget == settings.sizes[0]}
     traced = {job.name: job for method, job in timed.items() if method != "hash"}
-    view, grid = MeshView(mesh, settings.film), f"sdfgrid {settings.grid}³"
-
-    @functools.cache
-    def references(lit: bool) -> dict[str, mi.Scene]:
-        decoded = min(traced.values(), key=lambda job: job.method != "ours").model
-        return {MESH: view.mesh_scene(lit), grid: view.grid_scene(decoded, settings.grid, lit)}
+    grid = f"sdfgrid {settings.grid}³"
 
     def reads(lanes: int) -> dict:
         points = np.resize(context.evaluation.near, (lanes, 3)).T
@@ -263,23 +259,20 @@ def plan(mesh: Mesh, name: str, settings: SimpleNamespace) -> Plan:
         return {"value": value, "normal": normal}
 
     def rays(lanes: int) -> dict:
-        o, d = view.rays(lanes)
+        o, d = camera_rays(settings.film, lanes)
         queries = {FLOOR: lambda: [*o, *d]}
         queries |= {name: (lambda f=job.model: [field_distance(f, o, d)]) for name, job in traced.items()}
-        queries |= {name: (lambda s=scene: [scene_distance(s, o, d)]) for name, scene in references(False).items()}
+        decoded = min(traced.values(), key=lambda job: job.method != "ours").model
+        scenes = {MESH: mesh_scene(mesh), grid: grid_scene(decoded, settings.grid)}
+        queries |= {name: (lambda s=scene: [scene_distance(s, o, d)]) for name, scene in scenes.items()}
         return {"ray": queries}
 
-    def renders() -> dict:
-        scenes = {name: view.field_scene(job.model, True) for name, job in traced.items() if job.method in RENDERED}
-        scenes |= references(True)
-        return {name: lambda k, s=s: mi.render(s, spp=settings.spp, seed=k) for name, s in scenes.items()}
-
-    candidates = [job.candidate(in_passes=job.method in RENDERED) for job in jobs]
+    candidates = [job.candidate() for job in jobs]
     nbytes = 12 * (len(mesh.vertices) + len(mesh.faces))
     candidates.append(Candidate(MESH, "mesh", bytes=nbytes, is_reference=True,
                                 details={"file_bytes": Path(name).stat().st_size}))  # fmt: skip
     candidates.append(Candidate(grid, "sdfgrid", bytes=4 * settings.grid**3, is_reference=True))
-    compared = [timed[m].name for m in RENDERED[:2] if m in timed] + [MESH, grid]
+    compared = [timed[m].name for m in SHOWN[:2] if m in timed] + [MESH, grid]
     warnings = [w.removeprefix(f"{mesh.path}: ") for w in (*mesh.warnings, *context.distances.warnings)]
     code = package_files("tasks/sdf/*.py", "fitting/loop.py", "arrays/indirection.py", "studies/sdf.py",
                          "studies/baselines/distance_fields.py", "studies/baselines/networks.py")  # fmt: skip
@@ -289,7 +282,7 @@ def plan(mesh: Mesh, name: str, settings: SimpleNamespace) -> Plan:
         candidates=candidates,
         cases=[
             Case("reads", reads, candidates=tuple(j.name for j in timed.values()), query_names=("value", "normal")),
-            Case("rays", rays, renders, candidates=(*traced, MESH, grid), query_names=("ray",)),
+            Case("rays", rays, candidates=(*traced, MESH, grid), query_names=("ray",)),
         ],
         queries=("value",),
         accuracy="iou_near_db",
@@ -308,7 +301,7 @@ def plan(mesh: Mesh, name: str, settings: SimpleNamespace) -> Plan:
         jobs_fingerprint=f"{fingerprint(code)}{mesh.digest[:16]}-{settings.steps}-{settings.hash_steps[-1]}-"
         f"{settings.points}",
         panels=("bytes",),
-        pictures={"shapes": lambda result: draw_normals(view, [timed[m] for m in RENDERED if m in timed], result)},
+        pictures={"shapes": lambda result: draw_normals(context, [timed[m] for m in SHOWN if m in timed], result)},
         measures=MEASURES,
     )  # fmt: skip
 
@@ -323,83 +316,46 @@ FOV = 32.0
 #: Rays end there.
 FAR = 1e3
 
-MATERIAL = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.55, 0.5, 0.45]}}
+
+def camera_rays(film: tuple[int, int], count: int | None = None):
+    """Return origins and directions of the rays of a camera, which sees all of a mesh, through its pixels' centres.
+
+    Rays are those of a ``film`` of (width, height) pixels, row by row from the top, or so many of a film of the same
+    shape as ``count`` says; they are evaluated.
+    """
+    width, height = film
+    if count is not None:
+        width = max(1, round(math.sqrt(count * width / height)))
+        height = -(-count // width)
+    origin = (DISTANCE * np.array(DIRECTION) / np.linalg.norm(DIRECTION)).tolist()
+    sensor = mi.load_dict({
+        "type": "perspective", "fov": FOV, "fov_axis": "larger",
+        "to_world": mi.ScalarTransform4f().look_at(origin, [0, 0, 0], [0, 1, 0]),
+        "film": {"type": "hdrfilm", "width": width, "height": height},
+    })  # fmt: skip
+    i = dr.arange(mi.UInt32, count or width * height)
+    place = mi.Point2f((i % width + 0.5) / width, (i // width + 0.5) / height)
+    ray, _ = sensor.sample_ray(0, 0, place, mi.Point2f(0.5))
+    dr.make_opaque(ray.o, ray.d)
+    return ray.o, ray.d
 
 
-class MeshView:
-    """A camera that sees all of ``mesh``, with a ``film`` of (width, height) pixels."""
-
-    def __init__(self, mesh: Mesh, film: tuple[int, int]):
-        self.mesh, self.film = mesh, film
-
-    def sensor(self, width: int, height: int) -> dict:
-        """Return the camera with a film of this size."""
-        origin = (DISTANCE * np.array(DIRECTION) / np.linalg.norm(DIRECTION)).tolist()
-        return {
-            "type": "perspective", "fov": FOV, "fov_axis": "larger", "sampler": {"type": "independent"},
-            "to_world": mi.ScalarTransform4f().look_at(origin, [0, 0, 0], [0, 1, 0]),
-            "film": {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}},
-        }  # fmt: skip
-
-    def rays(self, count: int | None = None):
-        """Return origins and directions of the rays through all pixels' centres, row by row from the top, evaluated.
-
-        With ``count``, so many rays of a film of the same shape.
-        """
-        width, height = self.film
-        if count is not None:
-            width = max(1, round(math.sqrt(count * width / height)))
-            height = -(-count // width)
-        i = dr.arange(mi.UInt32, count or width * height)
-        place = mi.Point2f((i % width + 0.5) / width, (i // width + 0.5) / height)
-        ray, _ = mi.load_dict(self.sensor(width, height)).sample_ray(0, 0, place, mi.Point2f(0.5))
-        dr.make_opaque(ray.o, ray.d)
-        return ray.o, ray.d
-
-    def mesh_scene(self, lit: bool = False):
-        """Return a scene of the mesh, alone or ``lit`` on a floor."""
-        shape = mi.Mesh(*compat.mesh_arguments(_material(), len(self.mesh.vertices), len(self.mesh.faces)))
-        buffers = mi.traverse(shape)
-        compat.set_triangles(buffers, self.mesh.vertices, self.mesh.faces)
-        buffers.update()
-        return self._scene(shape, "path", lit)
-
-    def grid_scene(self, field: DistanceField, resolution: int, lit: bool = False):
-        """Return a scene of Mitsuba's ``sdfgrid``, decoded with ``resolution`` cells along the longest side."""
-        values, lower, upper = grids.grid(field, resolution)
-        values, lower, upper = crop_grid(values, lower, (upper[0] - lower[0]) / (values.shape[2] - 1))
-        to_world = mi.ScalarTransform4f().translate(lower.tolist()).scale((upper - lower).tolist())
-        grid = mi.TensorXf(np.ascontiguousarray(values[..., None], np.float32))
-        shape = {"type": "sdfgrid", "grid": grid, "to_world": to_world, "normals": "smooth", "bsdf": MATERIAL}
-        return self._scene(mi.load_dict(shape), "path", lit)
-
-    def field_scene(self, field: DistanceField, lit: bool = False):
-        """Return a scene of the field, traced by ``path_sdf``."""
-        placement = Placement.of(mi.ScalarTransform4f(), 1.0, (0.0, 0.0, 0.0))
-        shape = distance_shape(mi.Mesh)(_material(), field, placement, True)
-        return self._scene(shape, "path_sdf", lit)
-
-    def _scene(self, shape, integrator: str, lit: bool):
-        scene = {"type": "scene", "shape": shape}
-        if lit:
-            low = float(self.mesh.lower[1])
-            turn = mi.ScalarTransform4f().translate([0, low, 0]).rotate([1, 0, 0], -90).scale(4.0)
-            lamp = mi.ScalarTransform4f().look_at([1.5, 2.5, 1.0], [0, 0, 0], [0, 1, 0]).scale(0.6)
-            scene |= {
-                "integrator": {"type": integrator, "max_depth": 4},
-                "floor": {"type": "rectangle", "to_world": turn, "bsdf": {"type": "diffuse"}},
-                "sky": {"type": "constant", "radiance": 0.4},
-                "lamp": {"type": "rectangle", "to_world": lamp,
-                         "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 8.0}}},
-                "sensor": self.sensor(*self.film),
-            }  # fmt: skip
-        return mi.load_dict(scene)
+def mesh_scene(mesh: Mesh) -> mi.Scene:
+    """Return a scene of a mesh in the unit frame."""
+    shape = mi.Mesh(*compat.mesh_arguments(mi.Properties("mesh"), len(mesh.vertices), len(mesh.faces)))
+    buffers = mi.traverse(shape)
+    compat.set_triangles(buffers, mesh.vertices, mesh.faces)
+    buffers.update()
+    return mi.load_dict({"type": "scene", "shape": shape})
 
 
-def _material() -> mi.Properties:
-    props = mi.Properties("neural_sdf")
-    props["bsdf"] = mi.load_dict(MATERIAL)
-    return props
+def grid_scene(field: DistanceField, resolution: int) -> mi.Scene:
+    """Return a scene of Mitsuba's ``sdfgrid``, decoded with ``resolution`` cells along the longest side."""
+    values, lower, upper = grids.grid(field, resolution)
+    values, lower, upper = crop_grid(values, lower, (upper[0] - lower[0]) / (values.shape[2] - 1))
+    to_world = mi.ScalarTransform4f().translate(lower.tolist()).scale((upper - lower).tolist())
+    grid = mi.TensorXf(np.ascontiguousarray(values[..., None], np.float32))
+    return mi.load_dict({"type": "scene", "shape": {"type": "sdfgrid", "grid": grid, "to_world": to_world}})
 
 
 def field_distance(field: DistanceField, o, d):
@@ -412,10 +368,10 @@ def scene_distance(scene, o, d):
     return scene.ray_intersect_preliminary(mi.Ray3f(o, d), coherent=True).t
 
 
-def draw_normals(view: MeshView, jobs: list[Contender], result: dict):
+def draw_normals(context: DistanceStudyContext, jobs: list[Contender], result: dict):
     """Draw the errors of normals of contenders on the shape, where rays meet mesh and fields."""
-    (o, d), (width, height) = view.rays(), view.film
-    scene = view.mesh_scene()
+    width, height = context.settings.film
+    (o, d), scene = camera_rays((width, height)), mesh_scene(context.mesh)
     si = scene.ray_intersect(mi.Ray3f(o, d))
     hit, normals = si.is_valid().numpy(), np.array(si.n).T
     light = np.array([-0.4, 0.7, 0.6]) / np.linalg.norm([-0.4, 0.7, 0.6])

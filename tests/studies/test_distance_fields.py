@@ -147,9 +147,9 @@ def test_hash_grid(rng):
 
 def test_fields_and_meshes_are_in_one_place(mi_rgb):
     """The rays of fields, of the mesh and of the decoded grid meet surfaces in the same places."""
-    view, model = sdf.MeshView(Ball.mesh, (64, 48)), rivals.distance_nodes(T, Ball(), 1 / 30)
-    o, d = view.rays()
-    scenes = view.mesh_scene(), view.grid_scene(model, 48)  # what is not evaluated yet needs them
+    model = rivals.distance_nodes(T, Ball(), 1 / 30)
+    o, d = sdf.camera_rays((64, 48))
+    scenes = sdf.mesh_scene(Ball.mesh), sdf.grid_scene(model, 48)  # what is not evaluated yet needs them
     expected = sdf.scene_distance(scenes[0], o, d).numpy()
     hit = np.isfinite(expected)
     assert 0.1 < hit.mean() < 0.8
