@@ -61,15 +61,12 @@ def draw(axes, row: dict) -> None:
         axes.annotate("exact", (1, line), xycoords=("axes fraction", "data"), xytext=(-3, 2),
                       textcoords="offset points", ha="right", va="bottom", fontsize=8, color="0.35")  # fmt: skip
     axes.set_ylim(ends if better else ends[::-1])
-    times = [time for _, time, _ in shown]
-    first, last = min(*times, 1) / 1.35, max(*times, 1) * 1.35
+    times = [1, *(time for _, time, _ in shown)]
+    first, last = min(times) / 1.35, max(times) * 1.35
     axes.set_xscale("log")
     axes.set_xlim(first, last)
-    if last / first > 5:
-        ticks = [t for t in (0.03, 0.1, 0.3, 1, 3, 10, 30) if first < t < last]
-    else:
-        ticks = [t for t in (0.25, 0.5, 0.75, 1, 1.5, 2, 3, 4) if first < t < last]
-    axes.set_xticks(ticks)
+    ticks = (0.03, 0.1, 0.3, 1, 3, 10, 30, 100) if last / first > 5 else (0.25, 0.5, 0.75, 1, 1.5, 2, 3, 4)
+    axes.set_xticks([t for t in ticks if first < t < last])
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_locator(NullLocator())
     axes.tick_params(labelsize=8.5)
@@ -87,11 +84,10 @@ def picture(rows: list[dict]):
 
     drawn = list({row.task: row for row in reversed(rows) if len(points(row)) > 1}.values())[::-1]
     lines = -(-len(drawn) // COLUMNS)
-    above = 0.42 if len(drawn) == lines * COLUMNS else 0.05  # inches of a legend above the panels
-    figure = Figure((PANEL[0] * COLUMNS, PANEL[1] * lines + 0.33 + above), layout="constrained")
+    figure = Figure((PANEL[0] * COLUMNS, PANEL[1] * lines + 0.75), layout="constrained")
     FigureCanvasAgg(figure)
     height = figure.get_figheight()
-    figure.get_layout_engine().set(rect=(0, 0.33 / height, 1, 1 - (0.33 + above) / height))
+    figure.get_layout_engine().set(rect=(0, 0.33 / height, 1, 1 - 0.75 / height))
     grid = figure.subplots(lines, COLUMNS, squeeze=False)
     for axes in grid.flat[len(drawn) :]:
         axes.set_axis_off()
@@ -101,11 +97,7 @@ def picture(rows: list[dict]):
         figure.axes[0].scatter([], [], s=size, c=colour, marker=marker, label=label, edgecolors="black", linewidths=0.6)
         for label, colour, marker, size in ROLES.values()
     ]
-    options = {"handles": marks, "fontsize": 9, "frameon": False, "handletextpad": 0.3}
-    if len(drawn) < grid.size:
-        grid.flat[-1].legend(loc="center", labelspacing=1.1, **options)
-    else:
-        figure.legend(loc="upper center", ncols=4, columnspacing=1.2, **options)
+    figure.legend(loc="upper center", ncols=4, handles=marks, fontsize=9, frameon=False, handletextpad=0.3)
     label = "time of a render, over that of what a user would take instead (better: up and left)"
     figure.text(0.5, 0.1 / height, label, ha="center", va="bottom", fontsize=9)
     return figure
