@@ -220,7 +220,7 @@ class SceneRun:
                 if spp == top:
                     store.keep(str(k), **images)
                 else:
-                    truth = truth or Truth.of_passes(store)
+                    truth = truth or SceneTruth.of_passes(store)
                     records = {name: records[name] | truth.errors(images[name]) for name in VERSIONS}
                 done[f"{spp}/{k}"] = records
                 store.save()
@@ -250,7 +250,7 @@ class SceneRun:
 
 
 @dataclass(frozen=True)
-class Truth:
+class SceneTruth:
     """Mean of ``passes`` exact images, with the weights of errors and the mean square of the noise of one image."""
 
     image: np.ndarray
@@ -259,7 +259,7 @@ class Truth:
     noise: float
 
     @classmethod
-    def of_passes(cls, store: Store) -> Truth:
+    def of_passes(cls, store: Store) -> SceneTruth:
         """Return the truth of the passes in a store."""
         exact = _images(store)["exact"]
         weights = relative_weights(store.arrays[BRIGHTNESS]["exact"])
@@ -292,7 +292,7 @@ def _assemble(store: Store, counts: list[int]) -> dict:
     }
     if len(images["exact"]) < LEAST:
         return result
-    truth, times = Truth.of_passes(store), {name: {} for name in VERSIONS}
+    truth, times = SceneTruth.of_passes(store), {name: {} for name in VERSIONS}
     for spp in counts:
         pairs = [dict(pair) for key, pair in done.items() if key.startswith(f"{spp}/")]
         for k, pair in enumerate(pairs if spp == top else ()):

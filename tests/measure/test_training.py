@@ -1,4 +1,4 @@
-"""Training to convergence: how long, what is kept, and what is done again."""
+"""Training to convergence: its length, models that are read again, interruption."""
 
 import math
 import os
@@ -60,7 +60,7 @@ def test_doubles_until_it_gains_nothing():
         assert len(run["curve_psnr_db"]) == len(run["curve_loss"]) == len(run["curve_steps"])
 
 
-def test_says_so_if_it_has_not_converged():
+def test_not_converged():
     record = training([], longest=40).run(progress=False)
     assert [run["steps"] for run in record["runs"]] == [10, 20, 40]
     assert not record["converged"] and record["gain_db"] > GAIN
@@ -68,7 +68,7 @@ def test_says_so_if_it_has_not_converged():
     assert only["gain_db"] is None and not only["converged"]
 
 
-def test_kept_models_are_read_and_not_trained(tmp_path):
+def test_trained_models_are_read(tmp_path):
     first = training([], longest=20)
     record = first.run(tmp_path, progress=False)
     assert os.listdir(tmp_path) == ["a_ramp.npz"]  # no checkpoint stays
