@@ -122,7 +122,7 @@ def panels(result: dict) -> list[plot.Panel]:
                 continue
             if c["is_truth"] or c["is_reference"]:
                 label = f"{c['label']}, below {t['time']:.2g} ns" if t["hidden"] else c["label"]
-                lines.append(plot.Line(label, t["time"], c["is_truth"]))
+                lines.append((label, t["time"], c["is_truth"]))
             elif accuracy in c["errors"]:
                 points.append(_point(c, accuracy, t["time"], t["q1"], t["q3"], bool(t["on_front"])))
         unit = f"{PASS}, ms" if of_passes else f"{query}, ns"

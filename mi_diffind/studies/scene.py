@@ -116,13 +116,12 @@ def measure(
     seed: int = 0,
     defines: dict[str, str] | None = None,
     progress: bool = True,
-    launch_samples: int = LAUNCH_SAMPLES,
 ) -> dict:
     """Measure the errors and times of a scene file, learned and exact.
 
     If ``folder`` holds an interrupted run of the same key, only the missing part is measured; measurements stay there
     until :func:`write` has written the result. Equal arguments give equal errors if the film's filter is a box.
-    Values that are not finite count as 0. ``launch_samples`` limits the samples of a launch.
+    Values that are not finite count as 0.
 
     Returns the result, a tree of numbers and strings (JSON; ``None`` for unknown values). Errors are relative: ``mse``
     as in :mod:`~mi_diffind.measure.bias`, ``rmse`` its root. Seconds are those of the kernels of a whole render.
@@ -167,7 +166,7 @@ def measure(
     key = {**facts, "scene": Path(scene_path).name, "sources": fingerprint([*sources(), *files])}
     store, interrupted = Store(folder, "scene", key, ("pairs",), progress), False
     with interruptible() as stop:
-        run = SceneRun(loaded, counts, settings, seed, store, width * height, stop, launch_samples)
+        run = SceneRun(loaded, counts, settings, seed, store, width * height, stop)
         try:
             run.renders(progress)
         except Stopped:
@@ -192,7 +191,6 @@ class SceneRun:
     store: Store
     pixels: int
     stop: threading.Event
-    launch_samples: int
     is_compiled: bool = False
 
     def schedule(self) -> list[tuple[int, int, int, bool]]:
@@ -241,7 +239,7 @@ class SceneRun:
 
     def _render(self, name: str, spp: int, number: int) -> tuple[np.ndarray, dict]:
         """Return an image, float32, with its ``seconds`` (``None`` if it compiled) and ``not_finite`` values."""
-        launches = 1 << ((spp * self.pixels - 1) // self.launch_samples).bit_length()
+        launches = 1 << ((spp * self.pixels - 1) // LAUNCH_SAMPLES).bit_length()
         render = timed(lambda: loading.render(self.loaded[name], spp, (self.seed << 8) + number, launches)[0])
         image = loading.colour_channels(render.value)
         bad = ~np.isfinite(image)
