@@ -17,12 +17,12 @@ from ..fitting.task import fit, load_model
 from ..measure.renders import bsdf_queries, directions
 from ..measure.store import fingerprint, package_files
 from ..measure.study import Candidate, Case, Measure, Plan, Study
+from ..measure.training import Contender, NetworkContender
 from ..tasks.bsdf import mixture
 from ..tasks.bsdf.directions import SphereView
 from ..tasks.bsdf.model import LearnedBSDF
 from ..tasks.bsdf.truth import truth_of
 from .baselines import networks
-from .equal_memory import Contender, NetworkContender
 
 
 def _rgb(*value):

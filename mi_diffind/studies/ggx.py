@@ -185,9 +185,8 @@ def forms(inputs: str, quick: bool) -> list[GGXForm]:
     nets = [(f"MLP {w}x{n}", "network", Network(2, w, n)) for w, n in (NETWORKS if plain else NETWORKS[1:])]
     if plain:
         nets.append(("grid + MLP 16", "hash grid + network", Network(2, 16, 1, HASH_GRID)))
-        nets.append((f"MLP 8 + {PRIMARY}²", "network + table", Network(2, 8, 2, table=PRIMARY)))
     if quick:
-        nets = [nets[0], *nets[-2:]] if plain else []
+        nets = [nets[0], nets[-1]] if plain else []
     for label, representation, network in nets:
         nbytes = network.alloc(array_module(mi.variant()).TensorXf, 2, dr.rng(seed=1)).nbytes
         key = "network" if network.width < 32 else "wide network"

@@ -42,12 +42,12 @@ from ..measure.renders import TextureReader, TextureScene, TextureZoom
 from ..measure.report import figure_caption
 from ..measure.store import fingerprint
 from ..measure.study import FLOOR, Candidate, Case, Job, Measure, Plan, Study
+from ..measure.training import Contender, NetworkContender, load_arrays
 from ..plugins.support.image_files import PYRAMIDS
 from ..scenes.loading import footprint
 from ..tasks.texture import nets, training
 from . import equal_memory
 from .baselines import codecs, networks
-from .equal_memory import Contender, NetworkContender
 
 #: Names of methods in legends.
 BITMAP = "bitmap"
@@ -359,7 +359,7 @@ class TextureContenders:
             job.save_arrays(truth=job.model)
             return {}
 
-        read = lambda job: equal_memory.load_arrays(job.file)["truth"]  # noqa: E731
+        read = lambda job: load_arrays(job.file)["truth"]  # noqa: E731
         self.truths[name] = Contender(f"truth, {name}", "truth", spp, fit, read)
         self.jobs.append(self.truths[name])
 
@@ -411,7 +411,7 @@ class TextureContenders:
             return self.record(ASTC, job.budget, nbytes, None, maps, how=how)
 
         def read(job: Contender) -> Pyramid:
-            arrays, names = equal_memory.load_arrays(job.file), self.pyramid.layout.names
+            arrays, names = load_arrays(job.file), self.pyramid.layout.names
             maps = {n: [arrays[f"{n}_{i}"] for i in range(self.pyramid.levels)] for n in names}
             return level_pyramid(maps, self.pyramid)
 
