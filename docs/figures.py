@@ -136,6 +136,23 @@ def equal_samples(study: Entries, stage: str, name: str, sampling: str = "") -> 
     raise ValueError(f"{name}: no sample count of the study has this error")
 
 
+def time_at_equal_error(study: Entries, stage: str, name: str, sampling: str = "") -> tuple[float, bool]:
+    """Return the time of a bitmap with the error of a candidate, relative to the candidate's, and a flag.
+
+    The flag is true if the ratio is only a lower bound, because even the highest sample count has a larger error.
+    Between sample counts, PSNR is linear in the logarithm of time. ``sampling`` is ``""`` or ``", multijittered"``.
+    """
+    key, times, base = f"psnr_{stage}_db", study.cases[stage].passes.render, "bitmap, 1 spp"
+    bitmaps = [n for n in times if n == base or re.fullmatch(rf"bitmap, \d+ spp{sampling}", n)]
+    curve = sorted((times[n].time, study.candidates[n].errors[key]) for n in bitmaps)
+    goal, time = study.candidates[name].errors[key], times[name].time
+    for (t0, low), (t1, high) in itertools.pairwise(curve):
+        if goal <= high:
+            share = (goal - low) / (high - low) if high != low else 0.0
+            return math.exp(math.log(t0) + share * math.log(t1 / t0)) / time, False
+    return curve[-1][0] / time, True
+
+
 def _runs(study: Entries, material: str, which: str) -> list[dict]:
     """Return the records of a material: of a filter by its name, of the best one, or of all seeds of a training.
 

@@ -36,6 +36,7 @@ from figures import (
     ratio_best,
     ratio_loss,
     ratio_rows,
+    time_at_equal_error,
 )
 
 import mi_diffind
@@ -418,10 +419,9 @@ def texture_renders(*studies: Entries) -> Table:
 @table_of(("", "tradeoff_texture"), ("_boombox", "tradeoff_texture_boombox"))
 def texture_factors(study: Entries) -> Table:
     """Return how many times as long a bitmap takes for the same error."""
-    from mi_diffind.studies.texture import speed
 
     def cell(name, stage):
-        speeds = [speed(study, stage, name, against) for against in ("bitmap", "bitmap, multijittered")]
+        speeds = [time_at_equal_error(study, stage, name, against) for against in ("", ", multijittered")]
         return " / ".join(f"{'> ' * more}{value:.1f}" for value, more in speeds)
 
     stages = [s for s, c in study.cases.items() if c.in_picture]
@@ -435,10 +435,8 @@ def texture_factors(study: Entries) -> Table:
 @table_of(("", "tradeoff_texture", "tradeoff_texture_network"), ("_boombox", "texture_levels_boombox"))
 def texture_levels(*studies: Entries) -> Table:
     """Return PSNR of each level of detail."""
-    from mi_diffind.studies.texture import levels
-
     study = with_network(*studies)
-    by_name = {name: values["all"] for name, values in levels(study).items()}
+    by_name = {n: r["details"]["levels"]["all"] for n, r in study.jobs.items() if "levels" in r.get("details", {})}
     rows = [[n, f"{study.jobs[n].details.ratio:.1f}x", *(f"{v:.1f}" for v in db)] for n, db in by_name.items()]
     return Table(["", "ratio", *(f"L{i}" for i in range(max(map(len, by_name.values()))))], rows)
 

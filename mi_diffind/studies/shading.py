@@ -348,7 +348,7 @@ class ShadingContenders:
         pyramids = {"filtered": lambda: pyramid, **pyramids}
         for name, make in pyramids.items():
             nbytes = lambda make=make: make().nbytes  # noqa: E731
-            self.add_filter(name, "classical", nbytes, lambda make=make: normals.reader(make(), effects))
+            self.add_filter(name, "classical", nbytes, lambda make=make: reader(make(), effects))
             self.add_kernel(self.last())
         moments = 6 * sum(v[..., 0].size for v in pyramid.values)
         self.add_filter("LEAN", "classical", lambda: pyramid.nbytes + moments, lambda: normals.lean(pyramid, effects))
@@ -358,7 +358,7 @@ class ShadingContenders:
             self.add_kernel(self.last())
         for name, make in pyramids.items() if "astc" in codecs.available() and not quick else ():
             coded = cache(partial(self.encode, make))
-            read = lambda coded=coded: normals.reader(coded()[0], effects)  # noqa: E731
+            read = lambda coded=coded: reader(coded()[0], effects)  # noqa: E731
             self.add_filter(f"{name}, ASTC", "compressed", lambda coded=coded: coded()[1], read)
             self.add_kernel(self.last())
 
