@@ -109,23 +109,27 @@ def equal_samples(study: Entries, stage: str, name: str, sampling: str = "") -> 
     raise ValueError(f"{name}: no sample count of the study has this error")
 
 
-def speed(study: Entries, case: str, name: str, against: str) -> str:
-    """Return the time of a bitmap with the error of a candidate over the candidate's time; "> " before a lower bound.
+def time_at_equal_error(study: Entries, stage: str, name: str, sampling: str = "") -> tuple[float, bool]:
+    """Return the time of a bitmap with the error of a candidate, relative to the candidate's, and a flag.
 
-    Between sample counts, time is a power of the error. ``against`` is the sampling of the bitmap.
+    The flag is true if the ratio is only a lower bound, because even the highest sample count has a larger error.
+    Between sample counts, PSNR is linear in the logarithm of time. ``sampling`` is ``""`` or ``", multijittered"``.
     """
-    accuracy, times = study.cases[case].accuracy, study.cases[case].passes.render
-    curve = sorted(
-        (times[n].time, c.errors[accuracy])
-        for n, c in study.candidates.items()
-        if n in times and accuracy in c.errors and (c.representation == against or n == "bitmap, 1 spp")
-    )
-    goal, time = study.candidates[name].errors[accuracy], times[name].time
-    for (t0, a0), (t1, a1) in itertools.pairwise(curve):
-        if goal <= a1:
-            share = (goal - a0) / (a1 - a0) if a1 != a0 else 0.0
-            return f"{math.exp(math.log(t0) + share * math.log(t1 / t0)) / time:.1f}"
-    return f"> {curve[-1][0] / time:.1f}"
+    key, times, base = f"psnr_{stage}_db", study.cases[stage].passes.render, "bitmap, 1 spp"
+    bitmaps = [n for n in times if n == base or re.fullmatch(rf"bitmap, \d+ spp{sampling}", n)]
+    curve = sorted((times[n].time, study.candidates[n].errors[key]) for n in bitmaps)
+    goal, time = study.candidates[name].errors[key], times[name].time
+    for (t0, low), (t1, high) in itertools.pairwise(curve):
+        if goal <= high:
+            share = (goal - low) / (high - low) if high != low else 0.0
+            return math.exp(math.log(t0) + share * math.log(t1 / t0)) / time, False
+    return curve[-1][0] / time, True
+
+
+def speed(study: Entries, case: str, name: str, sampling: str = "") -> str:
+    """Return :func:`time_at_equal_error` as text; "> " before a lower bound."""
+    value, more = time_at_equal_error(study, case, name, sampling)
+    return f"{'> ' * more}{value:.1f}"
 
 
 def every(pattern: str) -> list[Entries]:
