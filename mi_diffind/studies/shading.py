@@ -311,63 +311,57 @@ class ShadingContenders:
         details = {"material": self.name, **self.evaluation.measure(job.model), "kind": job.method, **details}
         return {"bytes": nbytes, "details": {**details, "label": job.label}}
 
-    def add_filter(self, label: str, method: str, nbytes: Callable[[], int], read: Callable[[], ShadedReader]) -> None:
-        """Register a filter that nothing is trained for."""
-        fit = lambda job, progress: self.record(job, nbytes())  # noqa: E731
-        job = self.add(label, method, fit, lambda job: read())
+    def add_filter(self, label: str, method: str, build: Callable[[], tuple[ShadedReader, int]]) -> Contender:
+        """Register a filter that nothing is trained for; ``build()`` returns its reader and its bytes."""
+        once = cache(build)
+        fit = lambda job, progress: self.record(job, once()[1])  # noqa: E731
+        job = self.add(label, method, fit, lambda job: once()[0])
         self.add_candidate(job.name, label, [job], kind=label)
+        return job
 
     def add_kernel(self, job: Contender, label: str = "") -> None:
         """Register a contender, of another ``label``, read at the levels of detail with the smallest error."""
-        places = 2**10 if self.settings.quick else normals.PLACES
         name, *storage = (label or job.label).split(", ")
         label = ", ".join([*([] if name == "filtered" else [name]), "kernel", *storage])
-        method = "classical" if job.method == "classical" else "compressed"
 
-        def read() -> ShadedReader:
-            biases = normals.choose_biases(job.model, self.pyramid, self.effects, places)
-            return normals.biased(job.model, biases)
+        def build() -> tuple[ShadedReader, int]:
+            biases = normals.choose_biases(job.model, self.evaluation.another())
+            return normals.biased(job.model, biases), job.record["bytes"]
 
-        self.add_filter(label, method, lambda: job.record["bytes"], read)
-
-    def last(self) -> Contender:
-        """Return the contender that was registered last."""
-        return next(reversed(self.jobs.values()))
+        self.add_filter(label, "classical" if job.method == "classical" else "compressed", build)
 
     # -- Classical filters
 
     def add_classical(self) -> None:
-        """Register classical filters: uncompressed, compressed as ours, and by ASTC, each also with its kernel."""
-        quick, pyramid, effects = self.settings.quick, self.pyramid, self.effects
-        levels = {
-            "Toksvig": lambda: normals.toksvig_levels(pyramid),
-            "baked": lambda: normals.bake(pyramid, effects, 4 if quick else normals.PAIRS),
-        }
-        pyramids = {name: cache(lambda make=make: normals.with_roughness(pyramid, make()))
-                    for name, make in levels.items()}  # fmt: skip
-        pyramids = {"filtered": lambda: pyramid, **pyramids}
-        for name, make in pyramids.items():
-            nbytes = lambda make=make: make().nbytes  # noqa: E731
-            self.add_filter(name, "classical", nbytes, lambda make=make: reader(make(), effects))
-            self.add_kernel(self.last())
+        """Register classical filters, each also with its kernel: uncompressed, and for our preset in equal bytes."""
+        settings, pyramid = self.settings, self.pyramid
+        pairs = 4 if settings.quick else normals.PAIRS
         moments = 6 * sum(v[..., 0].size for v in pyramid.values)
-        self.add_filter("LEAN", "classical", lambda: pyramid.nbytes + moments, lambda: normals.lean(pyramid, effects))
-        self.add_kernel(self.last())
-        for name in levels:
-            self.add_compressed(f"{name}, compressed", pyramids[name])
-            self.add_kernel(self.last())
-        for name, make in pyramids.items() if "astc" in codecs.available() and not quick else ():
-            coded = cache(partial(self.encode, make))
-            read = lambda coded=coded: reader(coded()[0], effects)  # noqa: E731
-            self.add_filter(f"{name}, ASTC", "compressed", lambda coded=coded: coded()[1], read)
-            self.add_kernel(self.last())
+        pyramids = {
+            "filtered": lambda: pyramid,
+            "Toksvig": cache(lambda: normals.with_roughness(pyramid, normals.toksvig_levels(pyramid))),
+            "baked": cache(lambda: normals.with_roughness(pyramid, normals.bake(pyramid, self.effects, pairs))),
+        }
+        builds = {name: partial(self.uncompressed, make) for name, make in pyramids.items()}
+        builds["LEAN"] = lambda: (normals.lean(pyramid, self.effects), pyramid.nbytes + moments)
+        for name, build in builds.items():
+            self.add_kernel(self.add_filter(name, "classical", build))
+        for name, make in pyramids.items() if settings.preset == "ours" else ():
+            if name != "filtered":  # that is λ = 0
+                self.add_kernel(self.add_compressed(f"{name}, compressed", make))
+            if "astc" in codecs.available():
+                self.add_kernel(self.add_filter(f"{name}, ASTC", "compressed", partial(self.encoded, make)))
 
-    def encode(self, make: Callable[[], Pyramid]) -> tuple[Pyramid, int]:
-        """Return a pyramid whose levels ASTC stores in the bytes of the trainings, and the bytes."""
-        pyramid = make()
-        names = [m.name for m in pyramid.layout.maps if m.role == "normal"]
-        coded, nbytes = codecs.astc_levels(level_images(pyramid), self.source.nbytes / COMPRESSION, "thorough", names)
-        return level_pyramid({name: e.levels for name, e in coded.items()}, pyramid), nbytes
+    def uncompressed(self, pyramid: Callable[[], Pyramid]) -> tuple[ShadedReader, int]:
+        """Return the reader of a pyramid, and its bytes."""
+        return reader(pyramid(), self.effects), pyramid().nbytes
+
+    def encoded(self, pyramid: Callable[[], Pyramid]) -> tuple[ShadedReader, int]:
+        """Return the reader of a pyramid that ASTC stores in the bytes of the trainings, and its bytes."""
+        levels, nbytes = level_images(pyramid()), self.source.nbytes / COMPRESSION
+        names = [m.name for m in pyramid().layout.maps if m.role == "normal"]
+        coded, nbytes = codecs.astc_levels(levels, nbytes, "thorough", names)
+        return reader(level_pyramid({name: e.levels for name, e in coded.items()}, pyramid()), self.effects), nbytes
 
     # -- Trainings
 
@@ -437,12 +431,13 @@ class ShadingContenders:
         train = lambda progress: (*self.fit_texture(self.pyramid, length, seed, progress, extras), {"seed": seed})  # noqa: E731
         return self.add_trained(label, "start", train)
 
-    def add_compressed(self, label: str, pyramid: Callable[[], Pyramid]) -> None:
+    def add_compressed(self, label: str, pyramid: Callable[[], Pyramid]) -> Contender:
         """Register a texture trained on a classical filter's pyramid, for the time of start and run together."""
         length = self.settings.pretraining + self.settings.length
         train = lambda progress: (*self.fit_texture(pyramid(), length, 0, progress), {})  # noqa: E731
         job = self.add_trained(label, "compressed", train)
         self.add_candidate(job.name, label, [job], kind=label)
+        return job
 
     def add_run(
         self, start: Contender, way: str, share: float, seed: int, base: Contender | None, extras: bool = False
@@ -572,10 +567,6 @@ def plan(sources: dict[str, Source], settings: SimpleNamespace) -> Plan:
 
 # -- Pictures ----------------------------------------------------------------------------------------------------------
 
-#: Line style of each classical filter.
-CLASSICAL = {"filtered": ":", "kernel": (0, (1, 3)), "Toksvig": (0, (5, 1)), "LEAN": "--", "LEAN, kernel": (0, (6, 2)),
-             "baked": "-."}  # fmt: skip
-
 #: Level of detail of the crops.
 CROP_LEVEL = 3
 
@@ -602,18 +593,22 @@ class MaterialCurves:
         """Return the mean PSNR of levels of each seed."""
         return [d[letter]["mean_db"] for d in self.runs.get((remedy, share), [])]
 
-    def shown(self) -> dict[str, dict]:
-        """Return records to show: the best classical filter, λ = 0 and the best λ against C, of the first seed."""
-        filters = {k: d for k, d in self.classical.items() if k != "filtered"}
-        records = {}
-        if filters:
-            best = max(filters, key=lambda label: filters[label]["C"]["mean_db"])
-            records[f"{best}, uncompressed"] = filters[best]
-        runs = [key for key in self.runs if key[1] > 0 and (key[0], 0.0) in self.runs]
-        if runs:
-            way, share = max(runs, key=lambda key: float(np.mean(self.values(*key))))
-            records |= {f"λ {s:g}, compressed": self.runs[way, s][0] for s in (0.0, share)}
+    def filters(self) -> dict[str, dict]:
+        """Return records of filtered parameters, and of the best classical filters against C, by their names."""
+        records = {"parameters filtered": self.classical["filtered"]} if "filtered" in self.classical else {}
+        for text, filters in (("uncompressed", self.classical), ("equal bytes", self.compressed)):
+            if filters:
+                best = max(filters, key=lambda label: filters[label]["C"]["mean_db"])
+                records[f"{best.removesuffix(', compressed')}, {text}"] = filters[best]
         return records
+
+    def trained(self) -> dict[str, dict]:
+        """Return records of λ = 0 and of the best λ against C, of the first seed."""
+        keys = [key for key in self.runs if key[1] > 0 and (key[0], 0.0) in self.runs]
+        if not keys:
+            return {}
+        way, best = max(keys, key=lambda key: float(np.mean(self.values(*key))))
+        return {f"λ {share:g}": self.runs[way, share][0] for share in (0.0, best)}
 
 
 def curves(result: dict) -> dict[str, MaterialCurves]:
@@ -651,11 +646,7 @@ def draw_lambdas(result: dict):
             troubled = trouble([d for s in shares if s for d in material.runs.get((way, s), [])])
             ends = [[end(v) for v in values.values()] for end in (np.mean, min, max)]
             drawn.append(plot.Curve(f"{way} ({troubled or 'no trouble'})", list(values), *ends))
-        drawn += _classical_curves(material, lambda d: ((0, len(shares) - 1), [d[letter]["mean_db"]] * 2))
-        for label, d in material.compressed.items():
-            style = {"marker": "*", "markersize": 8, "linestyle": "", "color": "0.3"}
-            drawn.append(plot.Curve(label, [0], [d[letter]["mean_db"]], style=style))
-        return drawn
+        return drawn + _filter_curves(material, lambda d: ((0, len(shares) - 1), [d[letter]["mean_db"]] * 2))
 
     return _draw_both(result, "", draw, "λ, weight of the shading loss", [f"{s:g}" for s in shares])
 
@@ -667,20 +658,18 @@ def draw_levels(result: dict):
         def by_level(d: dict) -> tuple:
             return range(len(d[letter]["psnr_db"])), d[letter]["psnr_db"]
 
-        trained = [plot.Curve(text, *by_level(d)) for text, d in material.shown().items() if d["kind"] == "run"]
-        return trained + _classical_curves(material, by_level)
+        trained = [plot.Curve(text, *by_level(d)) for text, d in material.trained().items()]
+        return trained + _filter_curves(material, by_level)
 
     return _draw_both(result, ": levels of detail", draw, "level of detail")
 
 
-def _classical_curves(material: MaterialCurves, x: Callable[[dict], tuple[Sequence, Sequence]]) -> list[plot.Curve]:
+def _filter_curves(material: MaterialCurves, x: Callable[[dict], tuple[Sequence, Sequence]]) -> list[plot.Curve]:
     """Return the curves of classical filters; ``x(details)`` returns both coordinates."""
-    labels = [label for label in CLASSICAL if label in material.classical]
     return [
-        plot.Curve(f"{label}, uncompressed", *x(material.classical[label]),
-                   style={"linestyle": CLASSICAL[label], "color": f"{0.12 * i}", "marker": ""})
-        for i, label in enumerate(labels)
-    ]  # fmt: skip
+        plot.Curve(text, *x(d), style={"linestyle": (":", "--", "-.")[i], "color": "0.3", "marker": ""})
+        for i, (text, d) in enumerate(material.filters().items())
+    ]
 
 
 def _draw_both(result: dict, title: str, draw: Callable, x_label: str, ticks: Sequence[str] = ()):
@@ -695,13 +684,13 @@ def _draw_both(result: dict, title: str, draw: Callable, x_label: str, ticks: Se
 
 
 def _readers(context: ShadingContenders, material: MaterialCurves) -> dict[str, ShadedReader]:
-    """Return the readers in crops and zooms: filtered parameters, and those of :meth:`MaterialCurves.shown`."""
-    labels = {"parameters filtered": "filtered", **{text: d["label"] for text, d in material.shown().items()}}
-    return {text: context.jobs[f"{context.name}, {label}"].model for text, label in labels.items()}
+    """Return the readers in crops and zooms: classical filters, λ = 0 and the best λ."""
+    records = {**material.filters(), **material.trained()}
+    return {text: context.jobs[f"{context.name}, {d['label']}"].model for text, d in records.items()}
 
 
 def draw_crops(contexts: dict[str, ShadingContenders], result: dict):
-    """Draw crops of a minified level: filtered parameters, the best classical filter, λ = 0, the best λ, the truth."""
+    """Draw crops of a minified level, by each of the readers and of the truth."""
     rows = {}
     for name, material in curves(result).items():
         evaluation = contexts[name].evaluation
@@ -709,7 +698,7 @@ def draw_crops(contexts: dict[str, ShadingContenders], result: dict):
         truths = evaluation.truths["C"][level].clip(0, 1)
         readers = _readers(contexts[name], material)
         images = {text: evaluation.images(read, level).clip(0, 1) for text, read in readers.items()}
-        first = images["parameters filtered"]
+        first = next(iter(images.values()))
         pair = int(np.argmax(((first - truths) ** 2).mean(axis=(1, 2, 3))))  # with the largest error of the filter
         texts = {f"{t}\n{decibel(float(np.mean((i[pair] - truths[pair]) ** 2))):.1f} dB": i for t, i in images.items()}
         crops = {t: srgb.for_display(i[pair, :CROP_SIDE, :CROP_SIDE]) for t, i in {**texts, "truth": truths}.items()}

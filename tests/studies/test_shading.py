@@ -66,16 +66,16 @@ def test_records_of_seeds():
         return {"details": {**details, "C": {"mean_db": psnr}, "trouble": ["below"] * (psnr < 20)}}
 
     both, none = "clip, schedule", "no clip, schedule"
-    records = [record("classical", "filtered", 25), record("classical", "LEAN", 22), record("compressed", "baked", 21)]
+    records = [record("classical", "filtered", 20), record("classical", "LEAN", 22), record("compressed", "baked", 21)]
     records += [record("run", f"{share}, {way}", psnr, share, way) for share, way, psnr in (
         (0, both, 20), (0, both, 21), (0.9, both, 23), (0.9, both, 24), (0.9, none, 18), (0.9, none, 30))]  # fmt: skip
     material = shading.curves({"jobs": dict(enumerate(records))})["m"]
     assert list(material.classical) == ["filtered", "LEAN"] and list(material.compressed) == ["baked"]
     assert material.remedies == [both, none] and material.values(none, 0.0) == [20, 21]
     assert shading.trouble(material.runs[none, 0.9]) == "below 1"
-    shown = material.shown()
-    assert list(shown) == ["LEAN, uncompressed", "λ 0, compressed", "λ 0.9, compressed"]
-    assert shown["λ 0.9, compressed"]["way"] == none
+    assert list(material.filters()) == ["parameters filtered", "LEAN, uncompressed", "baked, equal bytes"]
+    trained = material.trained()
+    assert list(trained) == ["λ 0", "λ 0.9"] and trained["λ 0.9"]["way"] == none
 
 
 def test_the_zoom_is_what_the_camera_sees(mi_rgb):
