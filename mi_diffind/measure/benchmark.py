@@ -10,6 +10,7 @@ candidates is the median of the ratios of the rounds.
 from __future__ import annotations
 
 import functools
+import json
 import math
 import os
 import pickle
@@ -165,7 +166,8 @@ class BenchmarkSteps:
         plan, done = self.plan, self.store.data["jobs"]
         folder = None
         if self.store.folder is not None and plan.jobs:
-            folder = models_folder(self.store.folder, plan.study, plan.jobs_fingerprint)
+            key = f"{plan.jobs_fingerprint} {json.dumps(self.store.key['details'])} {self.settings.quick}"
+            folder = models_folder(self.store.folder, plan.study, key)
         if workers is not None and folder is not None:
             self._separate_jobs(workers, folder)
         for i, job in enumerate(plan.jobs):

@@ -52,6 +52,7 @@ from ..measure import plot
 from ..measure.renders import POINTS, MovingView
 from ..measure.report import figure_caption
 from ..measure.study import Candidate, Measure, Plan, Study
+from ..measure.training import Contender
 from ..tasks import shading as shading_task
 from ..tasks import texture as texture_task
 from ..tasks.disney.model import Effects
@@ -63,7 +64,6 @@ from ..tasks.texture import training as textures
 from ..tasks.texture.compressed import CompressedTexture
 from ..tasks.texture.fit import size_of
 from .baselines import codecs, normals
-from .equal_memory import Contender
 from .example_maps import MATERIALS, generated_source
 from .material_renders import RenderSettings, run_renders
 from .texture import level_images, level_pyramid, load_tables

@@ -42,12 +42,12 @@ from ..measure.renders import TextureReader, TextureScene, TextureZoom
 from ..measure.report import figure_caption
 from ..measure.store import fingerprint
 from ..measure.study import FLOOR, Candidate, Case, Job, Measure, Plan, Study
+from ..measure.training import Contender, NetworkContender, load_arrays
 from ..plugins.support.image_files import PYRAMIDS
 from ..scenes.loading import footprint
 from ..tasks.texture import nets, training
 from . import equal_memory
 from .baselines import codecs, networks
-from .equal_memory import Contender, NetworkContender
 
 #: Names of methods in legends.
 BITMAP = "bitmap"
@@ -399,7 +399,7 @@ class TextureContenders:
             return self.record(ASTC, job.budget, nbytes, None, maps, how=how)
 
         def read(job: Contender) -> Pyramid:
-            arrays, names = equal_memory.load_arrays(job.file), self.pyramid.layout.names
+            arrays, names = load_arrays(job.file), self.pyramid.layout.names
             maps = {n: [arrays[f"{n}_{i}"] for i in range(self.pyramid.levels)] for n in names}
             return level_pyramid(maps, self.pyramid)
 
