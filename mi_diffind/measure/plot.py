@@ -249,14 +249,14 @@ def draw_curves(
     title: str, caption: str, panels: Mapping[str, Sequence[Curve]], x_label: str, y_label: str, log: str = "",
     ticks: Sequence[str] = (), columns: int = 2, height: float = 3.6,
 ):  # fmt: skip
-    """Return a Matplotlib figure with a panel of curves for each title; the first has a legend.
+    """Return a Matplotlib figure with a panel of curves for each title, with a legend where labels change.
 
     There are up to ``columns`` panels a row. The axes in ``log`` (``"x"``, ``"xy"``) are logarithmic; ``ticks`` are
     labels at 0, 1, 2, …
     """
     columns = min(columns, len(panels))
     rows = -(-len(panels) // columns)
-    plot = figure(title, caption, 6.0 * columns, height * rows)
+    plot, explained = figure(title, caption, 6.0 * columns, height * rows), []
     for k, (name, curves) in enumerate(panels.items()):
         axes = plot.add_subplot(rows, columns, k + 1)
         for i, curve in enumerate(curves):
@@ -276,8 +276,10 @@ def draw_curves(
         if ticks:
             axes.set_xticks(range(len(ticks)), ticks)
         finish(axes, x_label, y_label)
-        if not k and len(curves) > 1:
+        labels = [curve.label for curve in curves]
+        if len(labels) > 1 and labels != explained:
             axes.legend(fontsize=6.5, ncols=2)
+            explained = labels
     return plot
 
 
