@@ -320,7 +320,7 @@ def plan(paths: Sequence[Path], settings: SimpleNamespace) -> Plan:
         details={"scenes": [c.name for c in contexts], "request": vars(settings)},
         notes=[
             f"{settings.steps} steps, {settings.views} views of {settings.width} × {settings.width * 9 // 16} pixels; "
-            f"errors: {settings.tests} other views and lights against {settings.reference_spp} spp"
+            f"errors: {settings.tests} other views and lights against {settings.reference_spp} spp."
         ],
         jobs=runs,
         jobs_fingerprint=fingerprint(file for c in contexts for file in (c.file, *c.parsed.files())),
