@@ -145,6 +145,7 @@ class TextureStudy(Study):
             frames=arguments.frames or (6 if quick else 60),
             truth_spp=64 if quick else 256,  # square numbers
             seeds=1 if quick else 4,  # renders that errors are averaged over
+            scenes=1 if quick else 3,  # number of stills
             footprints=arguments.footprints,
             network_steps=(10, 20) if quick else NETWORK_STEPS,  # of the first and of the longest training
             only=tuple(arguments.only),
@@ -224,10 +225,13 @@ class TextureContenders:
     source: Source
     name: str
     settings: SimpleNamespace
-    scenes: dict[str, TextureScene] = field(default_factory=renders.still_scenes)
     jobs: list[Job] = field(default_factory=list)
     candidates: list[Candidate] = field(default_factory=list)
     readers: dict[str, Callable[[], TextureReader]] = field(default_factory=dict)
+
+    @cached_property
+    def scenes(self) -> dict[str, TextureScene]:
+        return dict(itertools.islice(renders.still_scenes().items(), self.settings.scenes))
 
     @cached_property
     def zoom(self) -> TextureZoom:

@@ -140,7 +140,7 @@ def test_a_table_in_place_of_a_training(mi_rgb):
     path = ASSETS / "tiles.json"
     source = load_source(path)
     tables = texture.load_tables([str(ASSETS / "tiles_filtered.npz")], source)
-    settings = SimpleNamespace(compressions=(), film=FILM, zoom_film=FILM, frames=2, truth_spp=256, seeds=4,
+    settings = SimpleNamespace(compressions=(), film=FILM, zoom_film=FILM, frames=2, truth_spp=256, seeds=4, scenes=3,
                                footprints=False, only=(), astc="fast")  # fmt: skip
     plan = texture.plan(source, str(path), settings, tables)
     mark = f"ours {source.nbytes / tables[0].nbytes:.3g}x"
