@@ -282,7 +282,7 @@ def plan(mesh: Mesh, name: str, settings: SimpleNamespace) -> Plan:
         candidates=candidates,
         cases=[
             Case("reads", reads, candidates=tuple(j.name for j in timed.values()), query_names=("value", "normal")),
-            Case("rays", rays, candidates=(*traced, MESH, grid), query_names=("ray",)),
+            *([Case("rays", rays, candidates=(*traced, MESH, grid), query_names=("ray",))] if traced else []),
         ],
         queries=("value",),
         accuracy="iou_near_db",
