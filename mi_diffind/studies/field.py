@@ -5,8 +5,7 @@ All contenders begin with one trained grid and are trained through the same imag
 The *hash grid* is that of ``drjit.nn`` with a network. *Paper* and *ours* are presets of ``fit field``. Cells that no
 ray sees are removed from the grid.
 
-Bytes are those in memory of all that a read needs, the index included. Grids are as fine as the budget allows; the
-network, whose steps take longer, has 90 seconds.
+Bytes are those in memory of all that a read needs, the index included. Grids are as fine as the budget allows.
 
 Errors are PSNR of sRGB values before white in held-out views: of the pixels of the foreground
 (``psnr_foreground_db``) and of all pixels (``psnr_white_db``), which flatters.
@@ -25,7 +24,6 @@ import mitsuba as mi
 import numpy as np
 
 from ..arrays.sparse_grid import complete_cells
-from ..core.progress import Deadline
 from ..core.runtime import array_module
 from ..core.units import parse_compression
 from ..fitting.loop import FitSettings, fit
@@ -126,7 +124,6 @@ class RadianceStudy(Study):
             resolution=arguments.resolution or (24 if quick else 128),
             grid_steps=60 if quick else 0,  # of the initial grid; 0: as its preset says
             steps=arguments.steps or (40 if quick else 500),
-            seconds=3.0 if quick else 90.0,  # of the network, whose steps take longer
         )
         session = FieldSession(array_module(mi.variant()), *arguments.views)
         return plan(session, arguments.source, settings)
@@ -205,20 +202,19 @@ def rival_contender(context: RadianceStudyContext, fields: dict) -> Contender:
     rival = rivals.HashVolumeFit if fields["method"] == "hash" else rivals.NodesFit
 
     def train(job: Contender, progress: bool) -> dict | None:
-        nbytes, steps, rate, deadline = context.dense_bytes / job.budget, settings.steps, SETTINGS.lr, None
+        nbytes, rate = context.dense_bytes / job.budget, HASH_RATE
         if job.method == "hash":
             grid = grids.refine(context.trained, context.cells)
-            trained, rate, steps = rival(grid, context.importance(grid), nbytes), HASH_RATE, 10**6
-            deadline = Deadline(settings.seconds)
+            trained = rival(grid, context.importance(grid), nbytes)
         else:
             entries = min(ENTRIES, int(nbytes / 64)) if job.method == "codebook" else 0
             grid = rivals.fitting_grid(context.trained, context.cells, nbytes, entries)
             trained = rival(grid, context.importance(grid), entries)
-            rate = COARSER_RATE if grid.nodes.spacing > context.trained.nodes.spacing else rate
+            rate = COARSER_RATE if grid.nodes.spacing > context.trained.nodes.spacing else SETTINGS.lr
         problem = ImagesProblem(context.session, trained.net, trained.field_of)
         problem.measure = lambda net: {"step": 0.0}  # the last step counts for all contenders
-        options = replace(SETTINGS, lr=rate, steps=steps, measure_every=steps)
-        result = fit(problem, options, progress=progress, title=job.name, deadline=deadline)
+        options = replace(SETTINGS, lr=rate, steps=settings.steps, measure_every=settings.steps)
+        result = fit(problem, options, progress=progress, title=job.name)
         if result.interrupted:
             return None
         trained.net = problem.net
