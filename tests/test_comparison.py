@@ -174,7 +174,7 @@ def test_a_slow_contender_takes_fewer_samples(mi_rgb, monkeypatch):
     scene = mi.load_dict({"type": "scene", "sensor": {
         "type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4},
         "sampler": {"type": "multijitter", "sample_count": 64}}})  # fmt: skip
-    slow, exact = (equal_time._Contender(scene, [], spp) for spp in (64, 64))
+    slow, exact = (equal_time._EqualSide(scene, [], spp) for spp in (64, 64))
     monkeypatch.setattr(slow, "render", lambda seed: (None, 4.0 * slow.spp))
     monkeypatch.setattr(exact, "render", lambda seed: (None, 1.0 * exact.spp))
     slow.fill(exact)

@@ -160,7 +160,7 @@ class _Side:
 
 
 @dataclass
-class Contenders:
+class ComparedScenes:
     """Scenes that are compared: the one as ``written``, and its ``truths`` by name, the exact one last.
 
     For each truth, ``put_in`` lists the plugins that replace others, and ``oversampling`` is the multiple of samples
@@ -178,9 +178,9 @@ class Contenders:
     conversions: list[conversion.Conversion]
 
 
-def load_contenders(
+def load_compared(
     scene, against: str | None = None, learn: Sequence[str] = (), defines=None, progress: bool = True
-) -> Contenders:
+) -> ComparedScenes:
     """Load a scene as written and with counterparts; arguments and errors as of :func:`compare`."""
     use_variant()
     if against and not plugins.with_counterpart(against):
@@ -208,7 +208,7 @@ def load_contenders(
             truths[name] = parsed.load(exact=True, against=names)
         put_in[name] = list(dict.fromkeys(plugins_put_in))
         oversampling[name] = max(c.oversampling for c in counterparts)
-    return Contenders(parsed, parsed.load(), truths, put_in, oversampling, replaced, learned, conversions)
+    return ComparedScenes(parsed, parsed.load(), truths, put_in, oversampling, replaced, learned, conversions)
 
 
 def compare(
@@ -247,13 +247,13 @@ def compare(
     Ctrl-C ends the comparison after the current pair; ``spp`` and ``passes`` then state how many there were, and
     ``interrupted`` is true. Raises :class:`.SceneError`, also if the scene names no plugin with such a counterpart.
     """
-    contenders = load_contenders(scene, against, learn, defines, progress)
-    parsed, put_in = contenders.parsed, contenders.put_in
+    compared = load_compared(scene, against, learn, defines, progress)
+    parsed, put_in = compared.parsed, compared.put_in
     sides = {
-        name: _Side(loaded, contenders.oversampling[name], f"{parsed.path} with {', '.join(put_in[name])}")
-        for name, loaded in contenders.truths.items()
+        name: _Side(loaded, compared.oversampling[name], f"{parsed.path} with {', '.join(put_in[name])}")
+        for name, loaded in compared.truths.items()
     }
-    written = _Side(contenders.written, name=f"{parsed.path}, as written")
+    written = _Side(compared.written, name=f"{parsed.path}, as written")
     spp = spp or written.scene.sensors()[0].sampler().sample_count()
     footprint.check_samples(footprint.textures(written.scene), spp)
     loading.check_size(written.scene, spp)
@@ -280,10 +280,10 @@ def compare(
         "passes": len(written.seconds),
         "interrupted": done < spp,
         "spp_requested": spp,
-        "replaced_plugins": len(contenders.replaced),
-        "learned_plugins": len(contenders.learned),
-        "table_bytes": parsed.table_bytes(contenders.learned),
-        "conversions": [vars(c) for c in contenders.conversions],
+        "replaced_plugins": len(compared.replaced),
+        "learned_plugins": len(compared.learned),
+        "table_bytes": parsed.table_bytes(compared.learned),
+        "conversions": [vars(c) for c in compared.conversions],
     }
     first, *further = (
         Comparison(written.image, side.image, {

@@ -116,7 +116,7 @@ def _weighted(squared: np.ndarray, reference: np.ndarray) -> np.ndarray:
     return (squared / (reference**2 + EPSILON)).mean(axis=-1)
 
 
-class _Contender:
+class _EqualSide:
     """Scene whose passes have ``spp`` samples a pixel."""
 
     def __init__(self, scene, plugins: list[str], spp: int):
@@ -140,11 +140,11 @@ class _Contender:
         metrics.check_finite(image)
         return np.repeat(image, 3 // image.shape[-1], -1), seconds
 
-    def fill(self, exact: _Contender) -> None:
+    def fill(self, exact: _EqualSide) -> None:
         """Choose the samples whose pass takes as long as one of ``exact``, as far as the sampler allows."""
         for _ in range(CORRECTIONS):
             pairs = [(self.render(i)[1], exact.render(i)[1]) for i in range(PAIRS + 1)][1:]  # the first ones compile
-            if not self.choose(round(self.spp / np.median([own / other for own, other in pairs]))):
+            if not self.choose(round(self.spp / np.median([a / b for a, b in pairs]))):
                 break
 
 
@@ -158,10 +158,10 @@ def errors(passes: Sequence[np.ndarray], references: Sequence[np.ndarray]) -> di
     without bias, so ``error`` may differ from the sum by rounding, and those of small errors may be negative.
     """
     reference = sum(references) / len(references)
-    own = (references[0] - references[1]) ** 2 / 4  # variance of the mean of the halves
-    each = [float(_weighted((image - reference) ** 2 - own, reference).mean()) for image in passes]
+    reference_noise = (references[0] - references[1]) ** 2 / 4  # variance of the mean of the halves
+    each = [float(_weighted((image - reference) ** 2 - reference_noise, reference).mean()) for image in passes]
     mean, variance = np.mean(passes, axis=0), np.var(passes, axis=0, ddof=1)
-    squared = _weighted((mean - reference) ** 2 - variance / len(passes) - own, reference)
+    squared = _weighted((mean - reference) ** 2 - variance / len(passes) - reference_noise, reference)
     bias, resolution = float(squared.mean()), SEEN * float(squared.std()) / squared.size**0.5
     return {
         "error": float(np.mean(each)),
@@ -172,7 +172,7 @@ def errors(passes: Sequence[np.ndarray], references: Sequence[np.ndarray]) -> di
     }
 
 
-def _remark(contender: _Contender, exact: _Contender) -> str:
+def _remark(contender: _EqualSide, exact: _EqualSide) -> str:
     """Return a sentence if the times of two contenders differ by more than :data:`TOLERANCE`, else ""."""
     ratio = float(np.median(np.divide(contender.seconds, exact.seconds)))
     if abs(ratio - 1) <= TOLERANCE:
@@ -204,11 +204,11 @@ def compare_at_equal_time(
     ``error_ratio`` (median and quartiles of the ratios of a pass's error to that of the exact scene), and a ``remark``
     if the times are not equal. Raises :class:`.SceneError`, as :func:`.comparison.compare` does.
     """
-    loaded, passes = comparison.load_contenders(scene, against, learn, defines, progress), max(2, passes)
+    loaded, passes = comparison.load_compared(scene, against, learn, defines, progress), max(2, passes)
     spp = spp or loaded.written.sensors()[0].sampler().sample_count()
     names = list(dict.fromkeys(entry["plugin"] for entry in loaded.replaced))
-    contenders = {"as written": _Contender(loaded.written, names, spp)}
-    contenders |= {name: _Contender(truth, loaded.put_in[name], spp) for name, truth in loaded.truths.items()}
+    contenders = {"as written": _EqualSide(loaded.written, names, spp)}
+    contenders |= {name: _EqualSide(truth, loaded.put_in[name], spp) for name, truth in loaded.truths.items()}
     reference_name = list(loaded.truths)[-1]
     exact = contenders[reference_name]
     for contender in contenders.values():
