@@ -116,6 +116,14 @@ def _weighted(squared: np.ndarray, reference: np.ndarray) -> np.ndarray:
     return (squared / (reference**2 + EPSILON)).mean(axis=-1)
 
 
+def attach_samples(scene, spp: int) -> int:
+    """Return the largest number of samples a pixel up to ``spp`` that a scene's sampler allows, and filter for it."""
+    sensor = scene.sensors()[0]
+    spp = next((n for n in range(max(1, spp), 0, -1) if loading.sampler_count(sensor, n) == n), 1)
+    footprint.attach(scene, 0, spp)
+    return spp
+
+
 class _EqualSide:
     """Scene whose passes have ``spp`` samples a pixel."""
 
@@ -127,9 +135,7 @@ class _EqualSide:
 
     def choose(self, spp: int) -> bool:
         """Take the most samples up to ``spp`` that the sampler allows; return whether that is another number."""
-        before, sensor = self.spp, self.scene.sensors()[0]
-        self.spp = next((n for n in range(max(1, spp), 0, -1) if loading.sampler_count(sensor, n) == n), 1)
-        footprint.attach(self.scene, 0, self.spp)
+        before, self.spp = self.spp, attach_samples(self.scene, spp)
         return self.spp != before
 
     def render(self, seed: int) -> tuple[np.ndarray, float]:
