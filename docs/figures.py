@@ -1,46 +1,19 @@
-"""
-Figures of the pages: expressions over the JSON in ``docs/measured``, sentences that they are inserted in, and a list of
-the numbers that no file backs:
-
-    python docs/figures.py [--all] [--headlines] [PAGE …]
-
-``claims.toml`` maps sentences to figures. Each entry names a page (the README, a page of ``docs``, or the file of a
-plugin, whose docstring is a page of the manual), a part of a sentence with fields as of ``str.format``, and an
-expression for each field:
-
-    [["README.md"]]
-    text = "a grid of {grid:.1f} dB in {minutes:.0f} minutes"
-    grid = "nerf_scenes.rows[0].psnr_white_db"
-    minutes = "nerf_scenes.rows[0].minutes"
+"""Expressions over the JSON files in ``docs/measured``, by which ``make_tables.py`` inserts figures into pages.
 
 An expression begins with the name of a file in ``docs/measured`` and goes on by keys and indices. It may compute:
-``a.x / a.y``, ``min(…)``, ``max(…)``, ``mean(…)``, ``one(rows, name="ours")`` for the only row of a list with these
-values, and the other functions of :data:`FUNCTIONS`. ``holds`` is an expression that must be true, for a sentence in
-words. ``commands.toml`` in ``docs/measured`` has the command that wrote each file.
-
-A number is *backed* if ``make_tables.py`` inserts it: in a table, or by a sentence of ``claims.toml``. It is a *trial*
-between ``<!-- trials: … -->`` and ``<!-- /trials -->``, where the comment says what became of the script. It is a
-*setting* if it says what was chosen and not what came out: bits, samples, views, steps, sides of images and arrays,
-ratios such as 12x, and the phrases of ``settings.toml``. All others are listed.
-
-Not numbers: code, addresses, versions, years, numbers of sections, tables, figures, equations, tasks and notebooks,
-and digits that are a part of a name (``float32``, ``BC7``). ``--headlines`` lists those of the README's tables and
-lists and of the first paragraph of each page alone; ``--all`` lists all classes.
+``a.x / a.y``, ``min(…)``, ``one(rows, name="ours")`` for the only row of a list with these values, and the other
+functions of :data:`FUNCTIONS`. ``commands.toml`` in ``docs/measured`` has the command that wrote each file.
 """
 
 from __future__ import annotations
 
-import argparse
 import ast
 import itertools
 import json
 import math
-import re
-import string
+import statistics
 import sys
-from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from statistics import fmean as mean
@@ -58,7 +31,7 @@ ROOT = DOCS.parent
 
 
 class ClaimError(Exception):
-    """Raised when a sentence, a file or a value of a claim is not there."""
+    """Raised when a sentence, a file or a figure is not there."""
 
 
 class Entries(dict):
@@ -90,7 +63,7 @@ def commands() -> dict[str, str]:
     return toml("measured/commands.toml")
 
 
-# -- functions of expressions ------------------------------------------------------------------------------------------
+# -- times, samples and sizes ------------------------------------------------------------------------------------------
 
 
 def one(rows: Iterable[Entries], **values: Any) -> Entries:
@@ -136,24 +109,205 @@ def equal_samples(study: Entries, stage: str, name: str, sampling: str = "") -> 
     raise ValueError(f"{name}: no sample count of the study has this error")
 
 
-def _runs(study: Entries, material: str, which: str) -> list[dict]:
+def speed(study: Entries, case: str, name: str, against: str) -> str:
+    """Return the time of a bitmap with the error of a candidate over the candidate's time; "> " before a lower bound.
+
+    Between sample counts, time is a power of the error. ``against`` is the sampling of the bitmap.
+    """
+    accuracy, times = study.cases[case].accuracy, study.cases[case].passes.render
+    curve = sorted(
+        (times[n].time, c.errors[accuracy])
+        for n, c in study.candidates.items()
+        if n in times and accuracy in c.errors and (c.representation == against or n == "bitmap, 1 spp")
+    )
+    goal, time = study.candidates[name].errors[accuracy], times[name].time
+    for (t0, a0), (t1, a1) in itertools.pairwise(curve):
+        if goal <= a1:
+            share = (goal - a0) / (a1 - a0) if a1 != a0 else 0.0
+            return f"{math.exp(math.log(t0) + share * math.log(t1 / t0)) / time:.1f}"
+    return f"> {curve[-1][0] / time:.1f}"
+
+
+def every(pattern: str) -> list[Entries]:
+    """Return the files whose names match a pattern, in the order of their names."""
+    return [measured(path.stem) for path in sorted((DOCS / "measured").glob(f"{pattern}.json"))]
+
+
+def cells(values: Iterable) -> str:
+    """Return values as neighbouring cells of a table."""
+    return " | ".join(map(str, values))
+
+
+def median(entry: dict | None) -> str:
+    """Return the median of a ratio as text, "–" if it is not measured."""
+    return f"{entry['median']:.2f}" if entry else "–"
+
+
+def quartiles(entry: dict) -> str:
+    """Return a ratio as text: its median and quartiles."""
+    return "{median:.2f} ({q1:.2f} to {q3:.2f})".format_map(entry)
+
+
+def with_spread(values: list[float]) -> str:
+    """Return a mean with half the range, if there are several values."""
+    return f"{mean(values):.2f}" + (f" ± {(max(values) - min(values)) / 2:.2f}" if len(values) > 1 else "")
+
+
+def size_text(nbytes: float) -> str:
+    """Return a number of bytes with three digits."""
+    for unit, scale in (("MB", 1e6), ("kB", 1e3)):
+        if nbytes >= scale:
+            return f"{nbytes / scale:.3g} {unit}"
+    return f"{nbytes:.0f} B" if nbytes else "none"
+
+
+def binary_size(nbytes: int) -> str:
+    """Return a budget as text: ``262144`` → ``"256 KiB"``."""
+    return f"{nbytes / 2**20:g} MiB" if nbytes >= 2**20 else f"{nbytes / 2**10:g} KiB"
+
+
+def asset_bytes(pattern: str) -> int:
+    """Return the bytes of files of ``scenes/assets``."""
+    return sum(path.stat().st_size for path in (ROOT / "scenes" / "assets").glob(pattern))
+
+
+# -- rows of studies ---------------------------------------------------------------------------------------------------
+
+
+def equal_quality(study: Entries) -> list[Entries]:
+    """Return a member of each family at the quality of ``16→8``: costs over its costs, in parentheses the paper's.
+
+    Costs are flops, bytes read, bytes stored and time; ``gain_db`` is the difference in PSNR.
+    """
+    paper = {"network": (113.7, 256, 4), "single table": (0.33, 0.5, 512), "network + table": (28.4, 64, 0.5)}
+    times, candidates, rows = study.cases["inputs as in the paper"].queries.read, study.candidates, []
+    goal = candidates["16→8"].errors.psnr_db
+    for family in (*paper, "hash grid + network"):
+        members = [
+            n for n in times
+            if candidates[n].representation == family and candidates[n].setting not in ("float16", "uint8", "tensors")
+            and "raw" not in n
+        ]  # fmt: skip
+        good = [n for n in members if candidates[n].errors.psnr_db >= goal - 0.25]
+        name = min(good or members, key=lambda n: candidates[n].bytes if good else -candidates[n].errors.psnr_db)
+        mine, reference = ((times[n].operations.flops, times[n].operations.bytes_gathered, candidates[n].bytes,
+                            times[n].time) for n in (name, "16→8"))  # fmt: skip
+        notes = [f" ({value:g})" for value in paper.get(family, ())]
+        ratios = [f"{a / b:.3g}" for a, b in zip(mine, reference, strict=True)]
+        ratios = ["".join(pair) for pair in itertools.zip_longest(ratios, notes, fillvalue="")]
+        gain = candidates[name].errors.psnr_db - goal
+        rows.append(Entries(family=family, name=name, ratios=ratios, gain_db=gain))
+    return rows
+
+
+def scene_runs(study: Entries) -> list[Entries]:
+    """Return the trainings of a study inside a scene, each with its name ``run``."""
+    runs = [job.details for job in study.jobs.values()]
+    weights = [d["lambda"] for d in runs if d["lambda"] is not None]
+    rows = []
+    for d in runs:
+        run = d.way + (f", λ {d['lambda']:g}" if d["lambda"] not in (None, *weights[:1]) else "")
+        rows.append(Entries(d, run=run + (f", {d.spp} samples a pixel" if d.spp != runs[0].spp else "")))
+    return rows
+
+
+def groups(rows: Iterable[dict], *keys: str) -> dict[tuple, list[dict]]:
+    """Return rows by the values of some keys."""
+    result = {}
+    for row in rows:
+        result.setdefault(tuple(row[key] for key in keys), []).append(row)
+    return result
+
+
+def with_network(study: Entries, network: Entries) -> Entries:
+    """Return a study with the candidates and jobs of another one, whose times are not used."""
+    return Entries(study, **{key: Entries(study[key], **network[key]) for key in ("candidates", "jobs")})
+
+
+def budgets(study: Entries) -> list[float]:
+    """Return the memory budgets of a study, ascending."""
+    return sorted({c.details.asked for c in study.candidates.values() if c.details.get("asked") and c.errors})
+
+
+def by_label(study: Entries) -> dict[str, dict]:
+    """Return the errors of each contender of a study by its label and its budget, from the least budget on."""
+    found = sorted(
+        (c for c in study.candidates.values() if c.details.get("asked") and c.errors), key=lambda c: c.details.asked
+    )
+    return {label: {c.details.asked: c.errors for c in found if c.label == label} for label in (c.label for c in found)}
+
+
+def surface_errors(row: dict, size: float) -> str:
+    """Return the errors of a distance field of a budget as text: IoU, IoU near the surface, normals."""
+    return "{iou:.4f} / {iou_near:.4f} / {normal_deg:.2f}°".format_map(row[size]) if size in row else ""
+
+
+def trust_cell(results: list[Entries]) -> str:
+    """Return the worst figure of a property over the variants that were measured."""
+    failed, held = ([c for c in results if c.result == word] for word in ("fails", "holds"))
+    figures = [c.figure for c in failed or held if c.figure is not None]
+    text = f"{max(figures):.3g}" if figures else "error" if failed else ""
+    if failed:
+        return f"**fails: {text}** ({len(failed)} of {len(failed) + len(held)})"
+    if held:
+        return f"{text} ({len(held)})"
+    return "–" if any(c.result == "does not apply" for c in results) else "not run"
+
+
+# -- training for shaded values ----------------------------------------------------------------------------------------
+
+
+def _of_kind(study: Entries, material: str, kind: str) -> list[Entries]:
+    details = [job.details for job in study.jobs.values() if "material" in job.get("details", {})]
+    return [d for d in details if d.material == material and d.kind == kind]
+
+
+def shading_runs(study: Entries) -> dict[str, dict[tuple[str, float], list[Entries]]]:
+    """Return the trainings of each material by remedies and λ; those of λ = 0 stand under all they are a base of."""
+    materials = [job.details.material for job in study.jobs.values() if "material" in job.get("details", {})]
+    result = {}
+    for material in dict.fromkeys(materials):
+        runs = groups(_of_kind(study, material, "run"), "way", "share")
+        bases = {d.schedule: remedy for (remedy, share), ds in runs.items() if share == 0 for d in ds}
+        for remedy, (first, *_) in {r: ds for (r, share), ds in runs.items() if share > 0}.items():
+            if first.schedule in bases:
+                runs[remedy, 0.0] = runs[bases[first.schedule], 0.0]
+        result[material] = runs
+    return result
+
+
+def trouble(runs: list[Entries]) -> str:
+    """Return the names of troubles, each with the number of runs."""
+    names = [name for d in runs for name in d.get("trouble", [])]
+    return ", ".join(f"{name} {names.count(name)}" for name in dict.fromkeys(names)) or "none"
+
+
+def shading_best(study: Entries) -> list[Entries]:
+    """Return for each material the best filter uncompressed and in equal bytes, and the trainings of λ = 0.9."""
+    rows = []
+    for material in shading_runs(study):
+        for which, label in (("uncompressed", "uncompressed"), ("equal bytes", "equal bytes"), ("trained", "")):
+            runs = _runs(study, material, which)
+            label = f"{runs[0].label.removesuffix(', compressed')}, {label}" if label else "trained, λ = 0.9"
+            rows.append(Entries(material=material, label=label, runs=runs))
+    return rows
+
+
+def _runs(study: Entries, material: str, which: str) -> list[Entries]:
     """Return the records of a material: of a filter by its name, of the best one, or of all seeds of a training.
 
     ``which`` is the name of a filter, ``uncompressed`` or ``equal bytes`` for the best of either, ``trained`` for the
     weight λ = 0.9, or another weight as ``λ 0.5``; ``, no schedule`` after it names that way of a study with several.
     """
-    from mi_diffind.studies.shading import curves
-
-    curve = curves(study)[material]
-    filters = {**curve.classical, **curve.compressed}
+    filters = {d.label: d for kind in ("classical", "compressed") for d in _of_kind(study, material, kind)}
     if which in filters:
         return [filters[which]]
     if which in ("uncompressed", "equal bytes"):
-        filters = curve.classical if which == "uncompressed" else curve.compressed
-        return [max(filters.values(), key=lambda f: f["C"]["mean_db"])]
+        kind = "classical" if which == "uncompressed" else "compressed"
+        return [max(_of_kind(study, material, kind), key=lambda d: d.C.mean_db)]
     way = "clip, no schedule" if which.endswith(", no schedule") else "clip, schedule"
     weight = which.removesuffix(", no schedule")
-    return curve.runs[way, 0.9 if weight == "trained" else float(weight.removeprefix("λ "))]
+    return shading_runs(study)[material][way, 0.9 if weight == "trained" else float(weight.removeprefix("λ "))]
 
 
 def shading(study: Entries, material: str, which: str, letter: str = "C") -> float:
@@ -200,70 +354,35 @@ def trust_cells(study: Entries) -> tuple[int, int]:
     return len(results) - results.count("not run"), len(results)
 
 
-#: Task of ``bench_ratio`` → figure of its tables; the angles of ``sdf`` are errors.
-RATIO_FIGURES = {
-    "image": "psnr_db", "texture": "psnr_levels_db", "sdf": "normal_deg", "field": "psnr_foreground_db",
-}  # fmt: skip
+#: Rows of the pages' tables of renders with filtered textures.
+RENDERS = (
+    "bitmap, 1 spp", "bitmap, 4 spp", "bitmap, 4 spp, multijittered", "bitmap, 16 spp, multijittered",
+    "mipmap, trilinear", "ours 12x, trilinear", "ours 12x, anisotropic, centred", "ASTC 12x, trilinear",
+    "ASTC 12x, anisotropic, centred", "network 12x, trilinear",
+)  # fmt: skip
 
+#: Error of a contender that is the reference itself.
+EXACT = math.inf
 
-def groups(rows: Iterable[dict], *keys: str) -> dict[tuple, list[dict]]:
-    """Return rows by the values of some keys."""
-    result = {}
-    for row in rows:
-        result.setdefault(tuple(row[key] for key in keys), []).append(row)
-    return result
-
-
-def ratio_rows(study: Entries, task: str, budget: float, preset: str = "paper", part: str = "") -> list[dict]:
-    """Return the trainings of a sweep of ρ, from the largest on; figures are means over seeds."""
-    sweep = groups(study.rows, "task", "budget", "preset", "part").get((task, budget, preset, part), [])
-    figure = RATIO_FIGURES[task]
-    means = [{**same[0], figure: mean(row[figure] for row in same)} for same in groups(sweep, "ratio").values()]
-    return sorted(means, key=lambda row: -row["ratio"])
-
-
-def ratio_best(study: Entries, task: str, budget: float, preset: str = "paper", part: str = "") -> dict:
-    """Return the training of the best ρ of a sweep."""
-    sign = 1 if task == "sdf" else -1
-    return min(ratio_rows(study, task, budget, preset, part), key=lambda row: sign * row[RATIO_FIGURES[task]])
-
-
-def ratio_loss(study: Entries, task: str, budget: float, preset: str = "paper", part: str = "") -> float:
-    """Return how far the default ρ lies behind the best: in dB, of an angle relative to the best."""
-    figure = RATIO_FIGURES[task]
-    (default,) = [row for row in ratio_rows(study, task, budget, preset, part) if row["default"]]
-    best = ratio_best(study, task, budget, preset, part)[figure]
-    return default[figure] / best - 1 if task == "sdf" else best - default[figure]
-
-
-def _largest_difference(study: Entries, task: str, *keys: str) -> float:
-    rows = [row for row in study.rows if row.task == task]
-    values = [[row[RATIO_FIGURES[task]] for row in same] for same in groups(rows, "preset", "budget", *keys).values()]
-    return max(max(same) - min(same) for same in values)
-
-
-def ratio_noise(study: Entries, task: str) -> float:
-    """Return the largest difference between trainings of the same arrays by different seeds."""
-    return _largest_difference(study, task, "ratio")
-
-
-def ratio_range(study: Entries, task: str) -> float:
-    """Return the largest difference, in dB, of a sweep of ρ."""
-    return _largest_difference(study, task, "part")
-
-
-#: Functions of an expression, by name.
+#: Functions and constants of an expression, by name.
 FUNCTIONS = {
     f.__name__: f
     for f in (
-        min, max, sum, len, round, abs, all, any, sorted, one, ratio, time_over, equal_samples, shading, shading_level,
-        shading_spread, flip, held_out, rendered, shipped, trust_cells, ratio_rows, ratio_best, ratio_loss, ratio_noise,
-        ratio_range,
+        min, max, sum, len, round, abs, all, any, sorted, next, iter, zip, map, list, dict, range, tuple, float,
+        Entries, measured, every, one, ratio, time_over, equal_samples, speed, cells, median, quartiles, with_spread,
+        size_text, binary_size, asset_bytes, equal_quality, scene_runs, with_network, budgets, by_label,
+        surface_errors, trust_cell, shading_runs, trouble, shading_best, shading, shading_level, shading_spread, flip,
+        held_out, rendered, shipped, trust_cells,
     )
-} | {"mean": mean}  # fmt: skip
+} | {"mean": mean, "median_of": statistics.median, "RENDERS": RENDERS, "EXACT": EXACT}  # fmt: skip
 
 
-# -- claims ------------------------------------------------------------------------------------------------------------
+# -- evaluation --------------------------------------------------------------------------------------------------------
+
+
+def formatted(text: str) -> str:
+    """Return a text with expressions in braces as the expression of an f-string."""
+    return f'f"""{text} """[:-1]'
 
 
 def files(expression: str) -> set[str]:
@@ -273,219 +392,16 @@ def files(expression: str) -> set[str]:
     return {node.id for node in names} - bound - FUNCTIONS.keys()
 
 
-def evaluate(expression: str) -> Any:
-    """Return the value of an expression."""
-    names = {name: measured(name) for name in files(expression)}
-    try:
-        return eval(expression, {"__builtins__": {}, **FUNCTIONS, **names})
-    except (ArithmeticError, AttributeError, LookupError, StopIteration, TypeError, ValueError) as error:
-        raise ClaimError(f"claims.toml: {expression}: {error}") from error
-
-
-@dataclass
-class Claim:
-    """One part of a sentence of a page, with an expression for each field."""
-
-    page: str
-    text: str
-    values: dict[str, str] = field(default_factory=dict)
-    holds: str | None = None
-
-    @property
-    def path(self) -> Path:
-        """The file of the page: the README, a page of ``docs``, or the source of a plugin with its docstring."""
-        return ROOT / self.page if self.page == "README.md" or "/" in self.page else DOCS / self.page
-
-    @property
-    def files(self) -> list[str]:
-        """The names of the files that the claim reads."""
-        return sorted(set().union(*map(files, [*self.values.values(), *filter(None, [self.holds])])))
-
-    def pattern(self) -> re.Pattern:
-        """Return the regular expression of the sentence: any number in each field, any white space."""
-        parts = []
-        for literal, name, _, _ in string.Formatter().parse(self.text):
-            parts.append(phrase_pattern(literal))
-            if name is not None:
-                parts.append(r"([-+−]?\d+(?:[.,]\d+)*%?)")
-        return re.compile("".join(parts))
-
-    def numbers(self) -> list[str]:
-        """Return the numbers of the fields, as the page should have them."""
-        values = {name: evaluate(expression) for name, expression in self.values.items()}
-        fields = ((name, spec) for _, name, spec, _ in string.Formatter().parse(self.text) if name is not None)
-        return [format(values[name], spec) for name, spec in fields]
-
-    def matches(self, text: str) -> list[re.Match]:
-        """Return where the page has the sentence, with whatever numbers."""
-        return list(self.pattern().finditer(text))
-
-    def written(self, text: str) -> str:
-        """Return the page with the numbers of the JSON in this sentence."""
-        numbers, matches = self.numbers(), self.matches(text)
-        if not matches:
-            raise ClaimError(f"{self.page}: no such sentence: “{self.text}”; claims.toml has it, mend either")
-        if self.holds is not None and not evaluate(self.holds):
-            raise ClaimError(f"{self.page}: “{self.text}” does not hold: {self.holds}")
-        for match in reversed(matches):
-            for group in reversed(range(len(numbers))):
-                start, end = match.span(group + 1)
-                text = text[:start] + numbers[group] + text[end:]
-        return text
-
-
 @cache
-def claims() -> tuple[Claim, ...]:
-    """Return all claims of ``claims.toml``."""
-    return tuple(
-        Claim(page, entry["text"], {k: v for k, v in entry.items() if k not in ("text", "holds")}, entry.get("holds"))
-        for page, entries in toml("claims.toml").items()
-        for entry in entries
-    )
+def _compiled(expression: str):
+    return compile(expression, expression, "eval"), files(expression)
 
 
-# -- numbers that no file backs ----------------------------------------------------------------------------------------
-
-NUMBER = re.compile(r"(?<![\w.])\d+(?:[.,]\d+)*(?:·10[⁻⁰-⁹]+|e-?\d+)?")
-
-#: Parts of a page in which no number is a claim.
-CODE = (
-    r"^ *```.*?^ *```", r"(?<!`)`(?!`)[^`]+`", r"(?<=\])\([^)\n]*\)", r"https?://\S+", r"<[a-z/][^>\n]*>",
-)  # fmt: skip
-#: Versions, years, parts of papers, names.
-NAMES = (
-    r"(?:Mitsuba|Python|LLVM|PyTorch|Dr\.Jit|[Vv]ersions?|CUDA|OpenEXR|EPYC|CC|BSD|Zen|NeRF|mip-NeRF|MaterialX)"
-    r" \(?\d[\w.]*(?:(?: to |, | and | or )\d[\d.]*)*",
-    r"\b(?:19[89]\d|20[0-3][1-9]|20[1-3]\d)(?:-\d\d-\d\d)?\b(?! (?:steps|samples|rays|texels|pixels|spp|views))",
-    r"(?:[Ss]upplement(?:al)?|[Ss]ections?|[Tt]ables?|[Ff]igures?|[Ee]quations?|[Ee]q\.|[Tt]asks?|[Nn]otebooks?|"
-    r"[Ll]evels?|paper) \(?\d[\d.]*(?:(?:, | and | to )\d[\d.]*)*",
-    r"^\s*\d+\. ", r"BSD-\d", r"#\d+", r"\b3\.(?:9|10)(?:\.\d+)?\b(?! (?:times|dB|ms|ns|s|MB|kB|GB)|%)",
-    r"\[\^?\d+\]", r"[1234]D\b|x86-64|AVX-512",
-    r"\[10\.\d+/[^\]]+\]|^\| 1\.\d(?:\.\d)?\b|§\s*[\d.]+", r"[Rr]ec\. \d+", r"[Ee]xit codes?:?.*$",
-)  # fmt: skip
-#: Nouns of which a page says how many were chosen.
-CHOSEN = (
-    r"bits?|bytes? (?:a|of each)|bytes?/|samples?|spp|views?|steps?|rays?|pixels?|texels?|entries|entry|nodes?|cells?|"
-    r"levels?|layers?|units|weights|channels?|dimensions?|numbers?|colours?|seeds?|textures|maps|materials|frames|rounds|"
-    r"workers?|processes|cores?|threads?|passes|patches|directions|queries|points|rows|columns|images|pictures|photographs|"
-    r"things|spheres|lines|angles|tiles|reads|test|training|held-out|random|independent|multijittered|scattered|"
-    r"stratified|corners|octaves|lobes|fields|meshes|axes|parameters|sides?|bricks|blocks|pages?|primaries|cascaded|"
-    r"competitors|optional|days?|scripts?|plugins?|files?|commands?|runs?|scenes?|variants?|properties|primary|hidden"
-)
-SETTINGS = (
-    r"\d[\d.,]*(?:²|³|⁴)",
-    r"\d[\d.,]*(?: ?[×x] ?\d[\d.,]*)+",
-    r"\d[\d.,]*(?:(?:, | and | or | to |; )\d[\d.,]*)*[- ](?:" + CHOSEN + r")\b",
-    r"\b\d+x\b",
-    r"(?<!\w)(?:λ|α|ρ|gloss|roughness|depth|L|σ|γ|r|spp)(?: =| of)? ?\d[\d.]*(?:(?:, | and | to )\d[\d.]*)*",
-    r"\[-?\d+, -?\d+[\])]", r"[<>≤≥=] ?\d[\d.]*", r"(?:defaults? is|by default,?) \d[\d.]*",
-    r"10[⁰-⁹⁻]+|2[⁰-⁹⁻]+|\d²", r"\b(?:1|2|4|256|512) [MK]iB", r"\b(?:128|256) kB",
-)  # fmt: skip
-
-
-@dataclass
-class Found:
-    """One number of a page: its line, its class, the text around it, and whether a headline has it."""
-
-    page: str
-    line: int
-    number: str
-    kind: str
-    headline: bool
-    context: str
-
-
-def phrase_pattern(phrase: str) -> str:
-    """Return the regular expression of a phrase, with any white space between its words."""
-    return r"\s+".join(map(re.escape, re.split(r"\s+", phrase)))
-
-
-def _blank(text: str, pattern: str, flags: int = re.M) -> str:
-    """Return the text with spaces in place of what a pattern matches, line breaks kept."""
-    return re.sub(pattern, lambda m: re.sub(r"[^\n]", " ", m[0]), text, flags=flags)
-
-
-def _spans(text: str, pattern: str, flags: int = re.M) -> list[tuple[int, int]]:
-    return [m.span() for m in re.finditer(pattern, text, flags)]
-
-
-def headlines(page: str, text: str) -> list[tuple[int, int]]:
-    """Return where a page makes its headlines: tables and lists of the README, the first paragraph of others."""
-    if page == "README.md":
-        return _spans(text, r"^(?:\||- |  \S).*$")
-    first = page.endswith(".md") and re.search(r"^(?![#!\[<\s`|]).+(?:\n(?!\n).+)*", text, re.M)
-    return [first.span()] if first else []
-
-
-def numbers(page: str, text: str) -> list[Found]:
-    """Return all numbers of a page, with their classes."""
-    inside = lambda place, spans: any(a <= place < b for a, b in spans)  # noqa: E731
-    lines = [0, *(m.end() for m in re.finditer("\n", text))]
-    spans = {
-        "backed": [
-            *_spans(text, r"<!-- table \w+ -->\n.*?<!-- end -->", re.S),
-            *(span for c in claims() if c.path.name == page for m in c.matches(text) for span in m.regs[1:]),
-        ],
-        "trial": _spans(text, r"<!-- trials: .*?<!-- /trials -->", re.S),
-    }  # fmt: skip
-    top = headlines(page, text)
-    chosen = [span for phrase in toml("settings.toml").get(page, ()) for span in _spans(text, phrase_pattern(phrase))]
-    bare = text
-    for pattern in CODE:
-        bare = _blank(bare, pattern, re.M | re.S)
-    bare = _blank(bare, r"<!--.*?-->", re.S)
-    for pattern in NAMES:
-        bare = _blank(bare, pattern)
-    flat = bare.replace("\n", " ")
-    chosen += [span for pattern in SETTINGS for span in _spans(flat, pattern)]
-    result = []
-    for match in NUMBER.finditer(bare):
-        start, end = match.span()
-        kind = next((k for k, places in spans.items() if inside(start, places)), None)
-        kind = kind or ("setting" if inside(start, chosen) else "unbacked")
-        line = sum(start >= begin for begin in lines)
-        context = re.sub(r"\s+", " ", text[max(0, start - 45) : end + 35])
-        result.append(Found(page, line, match[0], kind, inside(start, top), context))
-    return result
-
-
-def pages() -> dict[str, str]:
-    """Return the text of the README, of each page that is written by hand, and of each notebook, by its name."""
-    paths = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-    texts = {p.name: p.read_text(encoding="utf-8") for p in paths if p.name not in ("tasks.md", "figures.md")}
-    for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
-        cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
-        texts[path.name] = "\n\n".join("".join(c["source"]) for c in cells if c["cell_type"] == "markdown")
-    return texts
-
-
-def counts() -> dict[str, Counter]:
-    """Return how many numbers of each class a page has."""
-    return {page: Counter(n.kind for n in numbers(page, text)) for page, text in pages().items()}
-
-
-def main(arguments: list[str]) -> int:
-    """Print the numbers and their counts; return the exit code."""
-    parser = argparse.ArgumentParser(description="List the numbers of pages that no file backs.")
-    parser.add_argument("pages", nargs="*", metavar="PAGE", help="names of pages (default: all)")
-    parser.add_argument("--all", action="store_true", help="list backed numbers, trials and settings, too")
-    parser.add_argument("--headlines", action="store_true", help="list those of headlines alone")
-    chosen = parser.parse_args(arguments)
-    for page in sorted(set(chosen.pages) - set(pages())):
-        print(f"figures.py: no page {page!r}; allowed: {', '.join(pages())}", file=sys.stderr)
-        return 2
-    for page, text in pages().items():
-        if chosen.pages and page not in chosen.pages:
-            continue
-        for n in numbers(page, text):
-            if (chosen.all or n.kind == "unbacked") and (n.headline or not chosen.headlines):
-                mark = f"{n.kind} headline" if n.headline else n.kind
-                print(f"{Path(n.page).name}:{n.line}: {n.number}  ({mark})  …{n.context}…")
-    print(f"\n{'page':32} {'backed':>8} {'trials':>8} {'settings':>8} {'unbacked':>8}")
-    for page, count in counts().items():
-        print(f"{page:32} " + " ".join(f"{count[k]:8}" for k in ("backed", "trial", "setting", "unbacked")))
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+def evaluate(expression: str, **known: Any) -> Any:
+    """Return the value of an expression, in which the names ``known`` are defined, too."""
+    code, names = _compiled(expression)
+    read = {name: measured(name) for name in names - known.keys()}
+    try:
+        return eval(code, {"__builtins__": {}, **FUNCTIONS, **read, **known})
+    except (ArithmeticError, AttributeError, LookupError, StopIteration, TypeError, ValueError) as error:
+        raise ClaimError(f"{expression}: {error}") from error

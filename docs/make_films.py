@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -24,7 +23,6 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from mi_diffind.core.errors import UsageError
 from mi_diffind.core.files import write_json
 from mi_diffind.core.progress import progress_bar
 from mi_diffind.images import films
@@ -56,7 +54,7 @@ METAL = {"sky": 0, "max_depth": 2}
 Panels = dict[str, list[np.ndarray]]
 
 #: Motions of the camera, a matrix in world space for each frame.
-Motions = list[np.ndarray]
+Motions = Sequence[np.ndarray]
 
 
 @dataclass
@@ -77,21 +75,14 @@ def times(frames: int) -> list[float]:
     return [(1 - math.cos(math.pi * i / (frames - 1))) / 2 for i in range(frames)]
 
 
-def turned(degrees: float, frames: int) -> Motions:
+def turned(angles: Sequence[float]) -> Motions:
+    """Return motions about the vertical through the origin by angles in degrees."""
+    return [poses.rotation((0, 1, 0), angle) for angle in angles]
+
+
+def swing(degrees: float, frames: int) -> Motions:
     """Return motions about the vertical through the origin, from ``-degrees`` to ``degrees``."""
-    return [poses.rotation((0, 1, 0), degrees * (2 * t - 1)) for t in times(frames)]
-
-
-def moved(offset: Sequence[float], frames: int) -> Motions:
-    """Return motions along a line."""
-    motions = np.tile(np.eye(4), (frames, 1, 1))
-    motions[:, :3, 3] = np.outer(times(frames), offset)
-    return list(motions)
-
-
-def once_around(frames: int) -> Motions:
-    """Return motions once about the vertical through the origin, at equal steps."""
-    return [poses.rotation((0, 1, 0), 360 * i / frames) for i in range(frames)]
+    return turned([degrees * (2 * t - 1) for t in times(frames)])
 
 
 def rendered(
@@ -117,14 +108,15 @@ def rendered(
 
 def suite(frames: int) -> Film:
     """Render the README's film."""
-    size, back = (288, 172), moved((0.0, 0.5, 2.2), frames)
+    size, back = (288, 172), np.tile(np.eye(4), (frames, 1, 1))
+    back[:, :3, 3] = np.outer(times(frames), (0.0, 0.5, 2.2))
     panels = {
         f"bitmap, {SAMPLES} samples a pixel": rendered("horizon", back, size, SAMPLES, against="exact", **FLOOR),
         f"neural_texture, {SAMPLES} samples a pixel": rendered("horizon", back, size, SAMPLES, **FLOOR),
-        "neural_field among mirrors and glass": rendered("field", turned(22.0, frames), size, 48, max_depth=6),
+        "neural_field among mirrors and glass": rendered("field", swing(22.0, frames), size, 48, max_depth=6),
         "neural_material, filtered maps": metal("rust_plain.npz", frames, size),
         "neural_material, trained for shading": metal("rust_shaded.npz", frames, size),
-        "neural_bsdf: left exact, right learned": rendered("library", turned(14.0, frames), size, 64),
+        "neural_bsdf: left exact, right learned": rendered("library", swing(14.0, frames), size, 64),
     }
     wall = [f"library/{path.name}" for path in sorted((ASSETS / "library").glob("*.npz"))]
     return Film(panels, 3, ["tiles_filtered.npz", "group.npz", "rust_plain.npz", "rust_shaded.npz", *wall])
@@ -132,12 +124,12 @@ def suite(frames: int) -> Film:
 
 def metal(file: str, frames: int, size: tuple[int, int], **options) -> list[np.ndarray]:
     """Render a panel of hammered metal, its pixels enlarged."""
-    return rendered("rust", turned(8.0, frames), size, scale=2, metal=file, **METAL, **options)
+    return rendered("rust", swing(8.0, frames), size, scale=2, metal=file, **METAL, **options)
 
 
 def floor(frames: int) -> Film:
     """Render an orbit through the pillars of ``horizon.xml``, of three times as many frames."""
-    size, around = (288, 162), once_around(3 * frames)
+    size, around = (288, 162), turned([120 * i / frames for i in range(3 * frames)])
     panels = {
         f"bitmap, {SAMPLES} samples a pixel": rendered("horizon", around, size, SAMPLES, against="exact", **FLOOR),
         f"mipmap, {SAMPLES} samples a pixel": rendered("horizon", around, size, SAMPLES, against="mipmap", **FLOOR),
@@ -207,20 +199,16 @@ def beside(
 
     ``panels``: label → frames of bytes, ``(height, width, 3)``. The label stands above its panel, in text of
     ``text_height`` pixels; ``gap`` pixels separate columns.
-
-    Raises :class:`.UsageError` for panels of different lengths or sizes.
     """
+    import matplotlib
     from PIL import Image, ImageDraw, ImageFont
 
-    if len({len(frames) for frames in panels.values()}) != 1:
-        counts = ", ".join(f"{len(frames)} of {label!r}" for label, frames in panels.items()) or "no panel"
-        raise UsageError(f"panels: found {counts}, allowed are one or more panels of equally many frames")
-    films.check_frames([frame for frames in panels.values() for frame in frames], (3,))
+    fonts = Path(matplotlib.get_data_path(), "fonts", "ttf")
     height, width, _ = next(iter(panels.values()))[0].shape
     columns, band = min(columns, len(panels)), round(LABEL * text_height)
     rows = -(-len(panels) // columns)
     size = (columns * (width + gap) - gap, rows * (height + band))
-    sheet, font = Image.new("RGB", size, PAPER), ImageFont.truetype(_font(), text_height)
+    sheet, font = Image.new("RGB", size, PAPER), ImageFont.truetype(str(fonts / "DejaVuSans.ttf"), text_height)
     corners, draw = [], ImageDraw.Draw(sheet)
     for i, label in enumerate(panels):
         x, y = i % columns * (width + gap), i // columns * (height + band)
@@ -233,13 +221,6 @@ def beside(
             frame[y : y + height, x : x + width] = image
         frames.append(frame)
     return frames
-
-
-def _font() -> str:
-    """Return the path of DejaVu Sans, which Matplotlib brings."""
-    import matplotlib
-
-    return os.path.join(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf")
 
 
 def make(name: str, frames: int, out: Path, json_folder: Path | None, quality: float) -> None:

@@ -1,27 +1,12 @@
-"""The page of costs: its tables come from the JSON of the studies, and no cell is empty without a reason."""
+"""The page of costs holds the figures of the JSON files, and no cell is empty without a reason."""
 
-import importlib.util
 import json
-import sys
 from pathlib import Path
 
+import make_tables
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
-DOCS = ROOT / "docs"
-
-
-def module(name: str):
-    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
-    loaded = importlib.util.module_from_spec(spec)
-    sys.modules[name] = loaded
-    spec.loader.exec_module(loaded)
-    return loaded
-
-
-@pytest.fixture(scope="module")
-def cost_table():
-    return module("cost_table")
+DOCS = Path(__file__).resolve().parents[1] / "docs"
 
 
 def page_table(name: str) -> list[list[str]]:
@@ -35,17 +20,7 @@ def measured(name: str) -> dict:
     return json.loads((DOCS / "measured" / f"{name}.json").read_text(encoding="utf-8"))
 
 
-def test_the_page_is_as_measured():
-    """The tables of the page are those that ``make_tables.py`` makes of the JSON, and a changed digit is noticed."""
-    make_tables = module("make_tables")
-    page = DOCS / "cost.md"
-    assert make_tables.written()[page] == page.read_text(encoding="utf-8")
-    for name in ("cost", "cost_losses", "cost_sources"):
-        assert str(make_tables.TABLES[name]()) in page.read_text(encoding="utf-8")
-
-
 def test_figures_are_those_of_the_json():
-    """Cells hold what the JSON of studies and of the benchmark holds, read here without the module of the table."""
     cells = {line[0] + line[1]: line[4:] for line in page_table("cost")}
     sdf = cells["[`neural_sdf`](sdf.md)mesh, Embree"]
     study = measured("tradeoff_sdf_suzanne")["candidates"]
@@ -63,31 +38,12 @@ def test_figures_are_those_of_the_json():
     assert shown == pytest.approx(sizes, rel=0.005)
 
 
-def test_missing_figures_have_a_reason(cost_table):
-    """Each row with a cell that is not measured says why, and each row names commands."""
-    notes = [line[2] for line in page_table("cost_sources")]
-    rows = page_table("cost")
-    assert len(rows) == len(notes) >= 10
-    for cells, sources, note in zip(rows, page_table("cost_sources"), notes, strict=True):
-        assert sources[1].count("`") >= 2
+def test_missing_figures_have_a_reason():
+    """Each row with a cell that is not measured says why, and each row names the commands of its files."""
+    commands = make_tables.commands()
+    for row, cells, sources in zip(
+        make_tables.cost_rows(), page_table("cost"), page_table("cost_sources"), strict=True
+    ):
+        assert row.files and all(commands[name].split(" --json")[0] in sources[1] for name in row.files)
         if any("not measured" in cell or "–" in cell.split("<br>") for cell in cells):
-            assert any(reason in note for reason in ("not measured", "no plugin", "no file on disk")), cells[0]
-    assert set(cost_table.COMMANDS) <= {path.stem for path in (DOCS / "measured").glob("*.json")}
-
-
-def test_a_loss_is_a_loss(cost_table):
-    """Better and worse are told apart by the direction of the error, and ratios near 1 are equal."""
-
-    def row(better, unit):
-        good, bad = (40.0, 30.0) if better else (1.0, 2.0)
-        ours = cost_table.Contender(good, 2.0, 1.02, 100, 10)
-        theirs = cost_table.Contender(bad, 1.0, 1.0, 200, 0)
-        return cost_table.Row("a", "a", "b", "e", unit, ours, theirs, theirs, {}, better=better)
-
-    for better, unit in ((True, "dB"), (False, "°")):
-        made = row(better, unit)
-        wins, losses = cost_table.compared(made, made.theirs)
-        assert len(wins) == 2 and wins[0].startswith("error") and wins[1].startswith("memory 0.5")
-        assert len(losses) == 2 and losses[0].startswith("a render 2") and losses[1].startswith("disk 10 B")
-    exact = cost_table.Contender(cost_table.EXACT)
-    assert cost_table.compared(row(True, "dB"), exact) == ([], ["not exact"])
+            assert any(reason in sources[2] for reason in ("not measured", "no plugin", "no file on disk")), cells[0]

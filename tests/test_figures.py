@@ -16,16 +16,12 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 
-#: Numbers of a page that no file backs: more are refused, and whoever lowers a count lowers it here. Other pages: none.
-UNBACKED = {}
-#: Numbers of trials without a kept script, by the same rule.
-TRIALS = {"04_sdf_from_images.ipynb": 16, "bsdf.md": 61, "field.md": 18, "shading.md": 16, "texture.md": 10}
 #: Tables of more than ten rows in a page: each task or plugin has a row, or shorter ones would hide what ours loses.
-LONG = {"cost", "cost_losses", "cost_sources", "trust", "shading_best"}
+LONG = {"cost", "cost_sources", "trust", "shading_best"}
 
 
 def test_pages_are_as_the_files_say():
-    pages, troubles = make_tables.figures(make_tables.written())
+    pages, troubles = make_tables.written()
     assert troubles == []
     assert [p.name for p, text in pages.items() if p.read_text(encoding="utf-8") != text] == []
 
@@ -40,38 +36,35 @@ def copy(tmp_path):
     return tmp_path
 
 
-def check(folder: Path) -> subprocess.CompletedProcess:
-    command = [sys.executable, str(folder / "docs" / "make_tables.py"), "--check"]
-    return subprocess.run(
-        command, capture_output=True, text=True, cwd=folder, env={**os.environ, "PYTHONPATH": str(ROOT)}
-    )
-
-
 def spoiled(text: str, place: int) -> str:
     """Change one digit."""
     return text[:place] + str((int(text[place]) + 1) % 10) + text[place + 1 :]
 
 
-def test_one_digit_that_is_changed_by_hand_is_refused(copy):
-    assert check(copy).returncode == 0
-    readme, page = copy / "README.md", copy / "docs" / "sdf.md"
-    claim = next(c for c in figures.claims() if c.page == "README.md")
-    whole = readme.read_text(encoding="utf-8")
-    readme.write_text(spoiled(whole, claim.matches(whole)[0].start(1)), encoding="utf-8")
-    result = check(copy)
-    assert result.returncode == 1 and "README.md: would change" in result.stdout
-    readme.write_text(whole, encoding="utf-8")
-
-    whole = page.read_text(encoding="utf-8")
-    row = re.search(r"<!-- table sdf_parts -->\n(?:.*\n){2}\| ours \| (\d)", whole)
-    page.write_text(spoiled(whole, row.start(1)), encoding="utf-8")
-    result = check(copy)
-    assert result.returncode == 1 and "sdf.md: would change" in result.stdout
+def test_changes_by_hand_are_refused(copy):
+    """A digit of a sentence, of a table and of a CSV file, a sentence that is gone, and a superfluous file."""
+    claim = next(c for c in make_tables.claims() if c.page == "README.md")
+    readme, page, data = copy / "README.md", copy / "docs" / "sdf.md", copy / "docs" / "measured" / "field_errors.csv"
+    text = readme.read_text(encoding="utf-8")
+    readme.write_text(spoiled(text, claim.matches(text)[0].start(1)).replace("a grid of ", "the grid of "), "utf-8")
+    row = re.search(r"<!-- table sdf_parts -->\n(?:.*\n){2}\| ours \| (\d)", text := page.read_text(encoding="utf-8"))
+    page.write_text(spoiled(text, row.start(1)), encoding="utf-8")
+    text = data.read_text(encoding="utf-8")
+    data.write_text(spoiled(text, re.search(r"\d", text).start()), encoding="utf-8")
+    (data.parent / "nothing.csv").write_text("a\n", encoding="utf-8")
+    command = [sys.executable, str(copy / "docs" / "make_tables.py"), "--check"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    result = subprocess.run(command, capture_output=True, text=True, cwd=copy, env=environment)
+    assert result.returncode == 1
+    for name in ("README.md", "sdf.md", "field_errors.csv"):
+        assert f"{name}: would change" in result.stdout
+    assert "README.md: no such sentence: “a grid of" in result.stderr
+    assert "measured/nothing.csv: no page has" in result.stderr
 
 
 def test_each_figure_of_a_claim_is_checked():
     """A digit of any figure makes a page that differs from the one written."""
-    for claim in figures.claims():
+    for claim in make_tables.claims():
         text = claim.path.read_text(encoding="utf-8")
         for match in claim.matches(text):
             for group in range(1, len(match.groups()) + 1):
@@ -79,15 +72,8 @@ def test_each_figure_of_a_claim_is_checked():
                 assert claim.written(spoiled(text, place)) == text, claim.text
 
 
-def test_a_sentence_that_is_gone_is_named(copy):
-    readme = copy / "README.md"
-    readme.write_text(readme.read_text(encoding="utf-8").replace("a grid of ", "the grid of "), encoding="utf-8")
-    result = check(copy)
-    assert result.returncode == 1 and "README.md: no such sentence: “a grid of" in result.stderr
-
-
 def test_a_claim_in_words_that_does_not_hold_is_refused():
-    claim = figures.Claim("README.md", "a grid of {n:.0f} dB", {"n": "nerf_scenes.rows[0].psnr_white_db"}, "1 > 2")
+    claim = make_tables.Claim("README.md", "a grid of {n:.0f} dB", {"n": "nerf_scenes.rows[0].psnr_white_db"}, "1 > 2")
     with pytest.raises(figures.ClaimError, match="does not hold: 1 > 2"):
         claim.written("a grid of 5 dB")
 
@@ -99,7 +85,7 @@ def test_a_claim_in_words_that_does_not_hold_is_refused():
         ("nerf_scenes.row", r"nerf_scenes\.row: no entry 'row'; allowed: 'rows'"),
         ("nerf_scenes.rows[99].minutes", r"nerf_scenes\.rows\[99\]\.minutes: list index out of range"),
         ('one(nerf_scenes.rows, scene="chair")', "0 rows have"),
-        ("nerf_scenes.rows[0].minutes / 0", "claims.toml: nerf_scenes.rows.*division by zero"),
+        ("nerf_scenes.rows[0].minutes / 0", "nerf_scenes.rows.*division by zero"),
     ],
 )
 def test_expressions_name_what_is_missing(expression, message):
@@ -114,15 +100,23 @@ def study_of(content):
 def test_samples_at_equal_error():
     """Halfway between two counts in dB is their geometric mean; at a count, it is that count."""
     errors = {"bitmap, 1 spp": 10, "bitmap, 4 spp": 16, "bitmap, 16 spp": 22, "bitmap, 4 spp, multijittered": 20}
-    errors |= {"ours": 19, "as four": 16}
+    errors |= {"ours": 19, "as four": 16, "best": 30}
     study = study_of({"candidates": {n: {"errors": {"psnr_plane_db": e}} for n, e in errors.items()}})
     assert figures.equal_samples(study, "plane", "ours") == pytest.approx(8)
     assert figures.equal_samples(study, "plane", "as four") == pytest.approx(4)
     assert figures.equal_samples(study, "plane", "as four", "multijittered") == pytest.approx(4**0.6)
-    errors["ours"] = 30
-    study = study_of({"candidates": {n: {"errors": {"psnr_plane_db": e}} for n, e in errors.items()}})
     with pytest.raises(ValueError, match="no sample count"):
-        figures.equal_samples(study, "plane", "ours")
+        figures.equal_samples(study, "plane", "best")
+
+
+def test_times_at_equal_error():
+    """Halfway between two bitmaps in dB, the time is their geometric mean; beyond all of them, it is a bound."""
+    values = {"bitmap, 1 spp": (10, 1.0), "bitmap, 4 spp": (16, 4.0), "ours": (13, 0.5), "best": (30, 1.0)}
+    study = study_of({
+        "candidates": {n: {"representation": n.split(",")[0], "errors": {"e": v[0]}} for n, v in values.items()},
+        "cases": {"plane": {"accuracy": "e", "passes": {"render": {n: {"time": v[1]} for n, v in values.items()}}}},
+    })  # fmt: skip
+    assert [figures.speed(study, "plane", n, "bitmap") for n in ("ours", "best")] == ["4.0", "> 4.0"]
 
 
 def test_ratios_are_medians_in_either_order():
@@ -137,105 +131,66 @@ def test_ratios_are_medians_in_either_order():
     assert figures.time_over(study, "plain", "eval", "a", "b") == 3
 
 
-def test_figures_of_shading_are_those_of_its_table():
-    """The function that sentences use, against the rows that the table has."""
-    table = make_tables.shading_best(figures.measured("tradeoff_shading"))
-    rows = [line.split(" | ") for line in str(table).splitlines()[2:]]
-    for material in ("hammered", "weave", "lacquer"):
-        by_label = {r[1]: r for r in rows if r[0].strip("| ") == material}
-        (trained,) = [r for label, r in by_label.items() if label.startswith("trained")]
-        (best,) = [r for label, r in by_label.items() if label.endswith("equal bytes")]
-        study = figures.measured("tradeoff_shading")
-        assert f"{figures.shading(study, material, 'trained'):.2f}" == trained[2].split()[0]
-        assert f"{figures.shading(study, material, 'equal bytes'):.2f}" == best[2].split()[0]
-        assert f"{figures.shading_level(study, material, 'trained', 3):.1f}" == trained[7]
-        assert f"{figures.flip(study, material, 'trained'):.3f}" == trained[3]
-        assert f"{figures.shading(study, material, 'trained', 'P'):.2f}" == trained[-1].strip(" |")
+def test_cells_of_a_table():
+    """Fields, several cells of one field, and a cell whose figure is missing."""
+    known = {"row": figures.Entries(a=1.25, b=[1, 2])}
+    text = '{row.a:.1f} | {cells(row.b)}\n | {"x" if row.a else "y"} | {row.c:.1f}'
+    assert make_tables.cells_of(text, known, "–") == ["1.2", "1", "2", "x", "–"]
+    with pytest.raises(figures.ClaimError, match="no entry 'c'"):
+        make_tables.cells_of(text, known)
 
 
 def test_each_file_has_its_command():
     files = {path.stem: path for path in (DOCS / "measured").glob("*.json")}
-    commands = figures.commands()
+    commands = make_tables.commands()
     assert set(commands) == set(files)
     for name, command in commands.items():
-        assert command.split()[0] in ("mi-diffind", "python") and "docs/measured" in command
         json.loads(files[name].read_text(encoding="utf-8"))
+        program = re.sub("^git checkout [0-9a-f]{7} && ", "", command).split()[0]
+        assert "docs/measured" in command and program in ("mi-diffind", "python")
         if command.startswith("python"):
             assert (ROOT / command.split()[1]).is_file(), command
 
 
-def test_numbers_are_classed():
-    text = (
-        "# A page\n\nAt 12x it has 34.5 dB after 1500 steps (Mitsuba 3.9, 2023, section 1.2, `x = 7`).\n"
-        "<!-- table t -->\n| 8 |\n<!-- end -->\n<!-- trials: a script that is not kept -->\n9 dB\n<!-- /trials -->\n"
-    )
-    found = {n.number: n.kind for n in figures.numbers("page.md", text)}
-    assert found == {
-        "12": "setting", "34.5": "unbacked", "1500": "setting", "8": "backed", "9": "trial",
-    }  # fmt: skip
-
-
-def test_each_phrase_of_the_settings_stands_in_its_page():
-    pages = figures.pages()
-    for page, phrases in figures.toml("settings.toml").items():
-        for phrase in phrases:
-            assert re.search(figures.phrase_pattern(phrase), pages[page]), f"{page}: {phrase}"
-
-
-def test_numbers_without_a_file_only_become_fewer():
-    counts = {page: count["unbacked"] for page, count in figures.counts().items()}
-    more = {page: n for page, n in counts.items() if n > UNBACKED.get(page, 0)}
-    assert more == {}, "python docs/figures.py lists them"
-
-
-def test_numbers_of_trials_only_become_fewer():
-    counts = {page: count["trial"] for page, count in figures.counts().items() if count["trial"]}
-    assert counts == TRIALS, "more are refused; fewer: lower the count here"
-
-
-def test_long_tables_are_shortened():
-    """A page shows at most ten rows, and links to all of them."""
-    for name, make in make_tables.TABLES.items():
-        table = make()
-        text = table.of_page(name)
-        rows = text.count("\n|") - 1
-        assert rows <= 10 or name in LONG, name
-        assert (f"measured/{name}.csv" in text) == (table.shown is not None), name
-        assert table.csv().count("\n") == len(table.rows) + 1
-        if table.shown:
-            assert 0 < rows < len(table.rows), name
-
-
-def test_a_changed_or_superfluous_csv_is_refused(copy):
-    path = copy / "docs" / "measured" / "field_errors.csv"
-    whole = path.read_text(encoding="utf-8")
-    path.write_text(spoiled(whole, re.search(r"\d", whole).start()), encoding="utf-8")
-    result = check(copy)
-    assert result.returncode == 1 and "field_errors.csv: would change" in result.stdout
-    path.write_text(whole, encoding="utf-8")
-    (path.parent / "nothing.csv").write_text("a\n", encoding="utf-8")
-    result = check(copy)
-    assert result.returncode == 1 and "measured/nothing.csv: no page has" in result.stderr
-
-
-def test_headlines_of_the_readme_are_backed():
-    numbers = figures.numbers("README.md", (ROOT / "README.md").read_text(encoding="utf-8"))
-    assert [n for n in numbers if n.headline and n.kind == "unbacked"] == []
-
-
 def test_commands_are_accepted_today():
-    """Each ``mi-diffind`` command that wrote a file of figures: its options exist, and its methods are not cut."""
+    """Each ``mi-diffind`` command that wrote a file of figures: its options exist."""
     from mi_diffind.commands import cli
     from mi_diffind.measure.study import Study
-    from mi_diffind.studies import equal_memory, field, sdf, studies
+    from mi_diffind.studies import studies
 
-    lines = [part for line in figures.commands().values() for part in line.split("&&")]
+    kept = [line for line in make_tables.commands().values() if not line.startswith("git checkout")]
+    lines = [part for line in kept for part in line.split("&&")]
     words = [shlex.split(line)[1:] for line in lines if line.split()[0] == "mi-diffind"]
     for each in words:
         arguments = cli._parser(each).parse_args(each)
         if each[0] == "tradeoff":
             assert isinstance(studies()[arguments.study], Study)
-            methods = {"field": field.METHODS, "sdf": sdf.METHODS}.get(arguments.study, ())
-            if not getattr(arguments, "ablation", False):
-                equal_memory.check_without(getattr(arguments, "without", ()), methods)
     assert len(words) > 40
+
+
+def test_numbers_that_no_file_backs():
+    text = (
+        "# A page\n\nAt 12x it has 34.5 dB after 1500 steps (Mitsuba 3.9, 2023, section 1.2, `x = 7`).\n"
+        "<!-- table t -->\n| 8 |\n<!-- end -->\n"
+    )
+    (line,) = make_tables.unbacked("page.md", text)
+    assert line.startswith("page.md:3: 34.5 ")
+    found = [line for page, text in make_tables.pages().items() for line in make_tables.unbacked(page, text)]
+    assert found == []
+
+
+def test_each_phrase_of_the_settings_stands_in_its_page():
+    pages = make_tables.pages()
+    for page, phrases in figures.toml("settings.toml").items():
+        for phrase in phrases:
+            assert re.search(make_tables.phrase_pattern(phrase), pages[page]), f"{page}: {phrase}"
+
+
+def test_long_tables_are_shortened():
+    """A page shows at most ten rows, and links to all of them."""
+    for name, table in make_tables.tables().items():
+        text = table.page_text(name)
+        assert 0 < len(table.shown) <= 10 or name in LONG, name
+        assert (f"measured/{name}.csv" in text) == (len(table.shown) < len(table.rows)), name
+        assert table.csv().count("\n") == len(table.rows) + 1
+        assert {len(row) for row in table.rows} <= {len(table.head)} or name.startswith("texture_levels")

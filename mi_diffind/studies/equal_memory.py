@@ -62,8 +62,7 @@ class Contender(Job):
     nothing is in a file, ``has_file`` is false and ``read`` builds the model anew.
 
     ``label`` is the name of the method in tables, ``family`` the group that it belongs to in pictures, ``setting`` the
-    budget as text. ``earlier`` is a record of an earlier run: it stands for a contender whose model is not needed
-    (``timed`` is false), or whose file exists.
+    budget as text.
     """
 
     name: str
@@ -75,8 +74,6 @@ class Contender(Job):
     family: str = ""
     setting: str = ""
     has_file: bool = True
-    timed: bool = True
-    earlier: dict | None = None
     details: dict = field(default_factory=dict)
     file: Path | None = None
     record: dict | None = None
@@ -90,9 +87,8 @@ class Contender(Job):
     def cached_record(self, folder: Path | None, record: dict | None) -> dict | None:
         self.file = folder / f"{file_name(self.name)}.npz" if folder and self.has_file else None
         self.__dict__.pop("model", None)
-        record = record or self.earlier
         is_there = not self.has_file or (self.file is not None and self.file.is_file())
-        self.record = record if is_there or (self.earlier and not self.timed) else None
+        self.record = record if is_there else None
         return self.record
 
     def run(self, folder: Path | None, progress: bool) -> dict | None:

@@ -29,11 +29,11 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from bench_large_material import material
 from frame import ASSETS, ROOT, VARIANT, answer_passes, earlier, in_processes, parser, spread, write
 
 import mi_diffind
 from mi_diffind.core import compat
+from mi_diffind.core.files import write_json
 from mi_diffind.measure import clock
 
 #: Pass → side of the film; samples a pixel, and those of tasks whose rays or textures make up for fewer.
@@ -242,6 +242,17 @@ def sizes(task: str, folder: Path) -> dict[str, dict]:
     return result
 
 
+def write_maps(folder: Path) -> Path:
+    """Write the maps of a procedural material of 4096² texels and return their manifest."""
+    folder.mkdir()
+    maps = mi_diffind.example_maps("lacquer", 4096)
+    for name, values in maps.items():
+        mi.Bitmap(values if values.ndim == 3 else values[..., None]).write(str(folder / f"{name}.png"))
+    manifest = folder / "material.json"
+    write_json(manifest, {"maps": {name: f"{name}.png" for name in maps}})
+    return manifest
+
+
 def prepare(folder: Path, tasks: list[str]) -> None:
     """Write the files that the repository lacks to ``folder``."""
 
@@ -254,7 +265,7 @@ def prepare(folder: Path, tasks: list[str]) -> None:
     if "image" in tasks:
         fitted("image", str(ASSETS / "tiles.json"), "image_paper", preset="paper", seconds=SECONDS)
     if "large" in tasks:
-        manifest = material(folder / "large", "lacquer", 4096)
+        manifest = write_maps(folder / "large")
         for preset in ("ours", "paper"):
             options = {"preset": preset, "seconds": LARGE_SECONDS, "compression": 12}
             fitted("image", str(manifest), f"large_{preset}", **options)
@@ -331,7 +342,7 @@ def worker(contender: str, task: str, size: str, folder: str, pipe) -> None:
 
 def measured(task: str, size: str, folder: Path, rounds: int) -> dict[str, dict]:
     """Return the milliseconds of a pass of each contender, and ratios to the first, by turns."""
-    results = in_processes(worker, list(CONTENDERS[task]), rounds, task, size, str(folder), warm=0)
+    results = in_processes(worker, list(CONTENDERS[task]), rounds, task, size, str(folder))
     first = next(iter(results.values())).get("cpu_ms")
     for name, figures in results.items():
         if "error" in figures:

@@ -13,7 +13,6 @@ fitted.
 
 import functools
 import json
-import tempfile
 from pathlib import Path
 
 import drjit as dr
@@ -23,7 +22,8 @@ from frame import VARIANT, by_turns, parser, spread, write
 
 import mi_diffind  # noqa: F401
 from mi_diffind.measure.clock import machine, timed
-from mi_diffind.tasks.sdf import TASK, grids, marching
+from mi_diffind.studies.sdf import camera_rays, grid_scene, mesh_scene
+from mi_diffind.tasks.sdf import TASK, marching
 from mi_diffind.tasks.sdf.mesh import load_mesh
 
 SIDE = 512
@@ -33,55 +33,25 @@ MESH, GRID, ARRAYS = "Embree, the mesh", "sdfgrid {}³", "the arrays"
 
 
 def rays(ray_set: str):
-    """Origins and directions in the unit frame."""
-    count = SIDE * SIDE
+    """Return origins and directions in the unit frame."""
     if ray_set == "primary":
-        at = mi.ScalarTransform4f().look_at([0.9, 0.5, 1.3], [0, 0, 0], [0, 1, 0])
-        film = {"type": "hdrfilm", "width": SIDE, "height": SIDE}
-        sensor = mi.load_dict({"type": "perspective", "fov": 40, "to_world": at, "film": film})
-        i = dr.arange(mi.UInt32, count)
-        place = (mi.Point2f(i % SIDE, i // SIDE) + 0.5) / SIDE
-        ray, _ = sensor.sample_ray(0, 0, place, mi.Point2f(0.5))
-        result = mi.Point3f(ray.o), mi.Vector3f(ray.d)
-    else:
-        rng = np.random.default_rng(1)
-        start, end = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in rng.normal(size=(2, count, 3)))
-        o = 0.8 * start
-        d = 0.3 * end - o
-        d /= np.linalg.norm(d, axis=1, keepdims=True)
-        result = mi.Point3f(np.float32(o.T)), mi.Vector3f(np.float32(d.T))
+        return camera_rays((SIDE, SIDE))
+    rng = np.random.default_rng(1)
+    start, end = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in rng.normal(size=(2, SIDE * SIDE, 3)))
+    o, d = 0.8 * start, 0.3 * end - 0.8 * start
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    result = mi.Point3f(np.float32(o.T)), mi.Vector3f(np.float32(d.T))
     dr.eval(result)
     return result
 
 
-def scene_of_mesh(mesh):
-    """A scene of the mesh alone, in the unit frame."""
-    import trimesh
-
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "mesh.ply"
-        trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file)
-        return mi.load_dict({"type": "scene", "shape": {"type": "ply", "filename": str(file)}})
-
-
-def scene_of_grid(field, resolution: int):
-    """A scene of Mitsuba's ``sdfgrid`` with so many cells along the longest side."""
-    from mi_diffind.plugins.support.distance_shapes import crop_grid
-
-    values, lower, upper = grids.grid(field, resolution)
-    values, lower, upper = crop_grid(values, lower, (upper[0] - lower[0]) / (values.shape[2] - 1))
-    box = mi.ScalarTransform4f().translate(lower.tolist()).scale((upper - lower).tolist())
-    grid = mi.TensorXf(np.ascontiguousarray(values[..., None], np.float32))
-    return mi.load_dict({"type": "scene", "shape": {"type": "sdfgrid", "grid": grid, "to_world": box}})
-
-
 def measured(file: Path, resolution: int, rounds: int) -> dict:
-    """What the rows of one file are, and how large it is."""
+    """Return the rows of one file, and its sizes."""
     model = TASK.open(mi.TensorXf, file)
     mesh = load_mesh(file.resolve().parent / model.table.settings["mesh_path"])
-    scenes = {MESH: scene_of_mesh(mesh)}
+    scenes = {MESH: mesh_scene(mesh)}
     if resolution:
-        scenes[GRID.format(resolution)] = scene_of_grid(model.field, resolution)
+        scenes[GRID.format(resolution)] = grid_scene(model.field, resolution)
 
     def native(scene):
         def run(o, d, coherent):

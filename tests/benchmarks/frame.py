@@ -1,4 +1,4 @@
-"""Frame of the benchmarks: arguments, rounds by turns, medians and quartiles, processes, memory, JSON.
+"""Frame of the benchmarks: arguments, rounds by turns, medians and quartiles, processes, JSON.
 
 Contenders are measured in turn, one of each before the next of any, in the other direction in each second round: what
 else the machine does, and its clock, then hit all of them alike.
@@ -13,22 +13,22 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from mi_diffind.core.files import write_json
-from mi_diffind.measure import clock
 
 ROOT = Path(__file__).resolve().parents[2]
 ASSETS = ROOT / "scenes" / "assets"
 VARIANT = "llvm_ad_rgb"
 
 
-def parser(description: str, rounds: int = 0, required: bool = False) -> argparse.ArgumentParser:
-    """Return a parser with the option ``--json`` and, with a default number of ``rounds``, ``--rounds``."""
+def parser(description: str, rounds: int) -> argparse.ArgumentParser:
+    """Return a parser with the options ``--json`` and ``--rounds``, whose default is ``rounds``."""
     result = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
-    result.add_argument("-o", "--json", type=Path, metavar="FILE.json", required=required, help="file to write")
-    if rounds:
-        result.add_argument("--rounds", type=int, default=rounds, help=f"rounds (default: {rounds})")
+    result.add_argument("-o", "--json", type=Path, metavar="FILE.json", help="file to write")
+    result.add_argument("--rounds", type=int, default=rounds, help=f"rounds (default: {rounds})")
     return result
 
 
@@ -41,12 +41,6 @@ def write(path: Path | None, result: dict) -> None:
 def earlier(path: Path | None, **empty) -> dict:
     """Return what an earlier run has written to a file, or ``empty``."""
     return json.loads(path.read_text(encoding="utf-8")) if path and path.is_file() else empty
-
-
-def short_machine() -> dict:
-    """Return the processor, its cores, the system and the version of this package."""
-    described = clock.machine(VARIANT)
-    return {name: described[name] for name in ("cpu", "cores", "system", "mi-diffind")}
 
 
 def spread(values) -> dict[str, float]:
@@ -66,35 +60,24 @@ def by_turns(functions: dict[str, Callable], rounds: int, warm: int = 1) -> dict
     return results
 
 
-def resident(process: int | str = "self") -> float:
-    """Return the memory of a process in MiB."""
-    return int(Path(f"/proc/{process}/statm").read_text().split()[1]) * 4096 / 2**20
-
-
-def timed_pass(run: Callable, seed: int, processor=time.process_time) -> tuple[float, float]:
+def timed_pass(run: Callable, seed: int) -> tuple[float, float]:
     """Return the milliseconds of ``run(seed)`` by the clock and by the processor; its result is evaluated."""
-    import drjit as dr
-
     dr.sync_thread()
-    start, start_cpu = time.perf_counter(), processor()
+    start, start_cpu = time.perf_counter(), time.process_time()
     dr.eval(run(seed))
     dr.sync_thread()
-    return 1e3 * (time.perf_counter() - start), 1e3 * (processor() - start_cpu)
+    return 1e3 * (time.perf_counter() - start), 1e3 * (time.process_time() - start_cpu)
 
 
-def answer_passes(pipe, run: Callable, processor=time.process_time) -> None:
+def answer_passes(pipe, run: Callable) -> None:
     """Answer each request of :func:`in_processes` by the times of a pass, with another seed each time."""
-    import mitsuba as mi
-
     i = 0
     while pipe.recv():
         i += 1
-        import drjit as dr
-
-        pipe.send(timed_pass(run, dr.opaque(mi.UInt32, i), processor))
+        pipe.send(timed_pass(run, dr.opaque(mi.UInt32, i)))
 
 
-def in_processes(worker: Callable, names: list[str], rounds: int, *arguments, warm: int = 2) -> dict[str, dict]:
+def in_processes(worker: Callable, names: list[str], rounds: int, *arguments) -> dict[str, dict]:
     """Return what the process of each contender reports and, by turns, the times of its passes.
 
     ``worker(name, *arguments, pipe)`` sends a dictionary, then calls :func:`answer_passes`. Each contender has a
@@ -112,7 +95,7 @@ def in_processes(worker: Callable, names: list[str], rounds: int, *arguments, wa
         return pipe.recv()
 
     running = {name: lambda pipe=pipes[name]: ask(pipe) for name in names if "error" not in reports[name]}
-    for name, times in by_turns(running, rounds, warm).items():
+    for name, times in by_turns(running, rounds, 0).items():
         pipes[name].send(False)
         reports[name] |= dict(zip(("ms", "cpu_ms"), np.array(times).T, strict=True))
     return reports

@@ -1,29 +1,26 @@
-"""Rivals of distance fields in equal bytes: dense grids, sparse distances without indirection, a hash grid.
+"""Rivals of distance fields in equal bytes: dense and sparse grids of 8 bits, and a hash grid with a network.
 
-Everything is in the unit frame of :mod:`mi_diffind.tasks.sdf.field`. Distances are stored in ``2^bits`` equal steps
+Everything is in the unit frame of :mod:`mi_diffind.tasks.sdf.field`. Grids hold exact distances in 256 equal steps
 between ± ``band``; no step has its middle at zero, so no sign is lost. Bytes are those of all that a read needs: nodes
-and index. Nodes are exact, or trained by linear least squares (:func:`least_squares`).
+and index.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import io
 import math
-from collections.abc import Callable
-from pathlib import Path
+import zlib
 
 import drjit as dr
 import numpy as np
 
+from ...arrays.budget import Budget
 from ...arrays.lookup import clamp
-from ...arrays.sparse_grid import CORNERS, SparseGrid
-from ...core.files import replacing
+from ...arrays.sparse_grid import SparseGrid
 from ...core.units import largest_fitting
 from ...fitting.loop import Problem
 from ...maps.compressed import decibel
 from ...tasks.sdf import nodes
-from ...tasks.sdf.distances import Distances, sample_box, sample_near, surface_cells
+from ...tasks.sdf.distances import Distances, sample_box, sample_near
 from ...tasks.sdf.encoding import sample
 from ...tasks.sdf.field import DistanceField
 from ...tasks.sdf.mesh import Mesh
@@ -33,20 +30,7 @@ from .networks import LAYERS, WIDTH, Network, hash_grid
 #: Largest distance, in cells, between the surface and a corner of a cell that the surface crosses.
 NEAREST = 1.75
 
-#: Samples of a cell in the training of nodes, and of all cells together.
-SAMPLES = 16
-MOST_SAMPLES = 2**21
-
-#: Weight of gradients, times the side of a cell, in the training of nodes.
-GRADIENT_WEIGHT = 0.2
-
-#: Distance from the surface, in cells, at which a sample weighs half.
-FOCUS = 0.5
-
-#: Weight of the distance that was sampled at a node.
-KEEP = 0.03
-
-#: Spacing, of the longest side, that :func:`fit_bytes` tries first, and its limits.
+#: Spacing, of the longest side, that :func:`sparse_nodes` tries first, and its limits.
 FIRST_SPACING = 1 / 64
 FINEST_SPACING = 1 / 2048
 COARSEST_SPACING = 1 / 12
@@ -61,21 +45,14 @@ PADDING = 0.01
 FINEST = 256
 
 
-def quantise(values: np.ndarray, band: float, bits: int = 8) -> np.ndarray:
+def quantise(values: np.ndarray, band: float) -> np.ndarray:
     """Return the steps that hold ``values``, uint8; :func:`dequantise` is the reverse."""
-    half = 2 ** (bits - 1)
-    return np.clip(np.floor(values * (half / band)) + half, 0, 2 * half - 1).astype(np.uint8)
+    return np.clip(np.floor(values * (128 / band)) + 128, 0, 255).astype(np.uint8)
 
 
-def dequantise(codes: np.ndarray, band: float, bits: int = 8) -> np.ndarray:
+def dequantise(codes: np.ndarray, band: float) -> np.ndarray:
     """Return the distances in the middles of steps, float32."""
-    half = 2 ** (bits - 1)
-    return (codes.astype(np.float32) + np.float32(0.5 - half)) * np.float32(band / half)
-
-
-def places(shape) -> np.ndarray:
-    """Return all whole-numbered places of a grid, ``(N, 3)``, in C order."""
-    return np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1).reshape(-1, 3)
+    return (codes.astype(np.float32) - np.float32(127.5)) * np.float32(band / 128)
 
 
 def slope_bound(values: np.ndarray, spacing: float) -> float:
@@ -84,89 +61,62 @@ def slope_bound(values: np.ndarray, spacing: float) -> float:
     for axis in (-3, -2, -1):
         steps = np.abs(np.diff(values, axis=axis))
         for other in {-3, -2, -1} - {axis}:
-            ends = [[slice(None)] * 3, [slice(None)] * 3]
-            ends[0][other], ends[1][other] = slice(1, None), slice(None, -1)
-            steps = np.maximum(*(steps[(..., *e)] for e in ends))
+            first, second = (np.take(steps, range(i, steps.shape[other] - 1 + i), other) for i in (0, 1))
+            steps = np.maximum(first, second)
         total = total + (steps.astype(np.float64) / spacing) ** 2
     return max(1.0, float(np.sqrt(np.max(total))))
 
 
 class ByteGrid(DistanceField):
-    """Dense grid of ``nodes``, uint8 ``(X, Y, Z)``, the first of which is at ``lower``, interpolated trilinearly."""
+    """Dense grid of ``codes``, uint8 ``(X, Y, Z)``, the first of which is at ``lower``, interpolated trilinearly."""
 
-    def __init__(self, types, nodes: np.ndarray, lower, spacing: float, band: float):
-        self.cells = tuple(n - 1 for n in nodes.shape)
+    def __init__(self, types, codes: np.ndarray, lower, spacing: float, band: float):
+        self.cells = tuple(n - 1 for n in codes.shape)
         upper = [a + n * spacing for a, n in zip(lower, self.cells, strict=True)]
         super().__init__(types, lower, upper, spacing, band)
-        self.step = band / 128
-        self.state = {"nodes": nodes, "lower": np.array(lower), "spacing": spacing, "band": band}
-        self.nodes = types.UInt8(np.ascontiguousarray(nodes.ravel()))
-        self.nbytes = nodes.size
+        self.nodes, self.nbytes = types.UInt8(np.ascontiguousarray(codes.ravel())), codes.size
+        self.file_bytes = len(zlib.compress(codes.tobytes(), 9))
         # Slabs of 32 cells that share their ends, to save memory
-        slabs = (nodes[i : i + 33] for i in range(0, nodes.shape[0] - 1, 32))
+        slabs = (codes[i : i + 33] for i in range(0, codes.shape[0] - 1, 32))
         self.slope = max(slope_bound(dequantise(slab, band), spacing) for slab in slabs)
 
-    def _corners(self, index, active):
-        i, j, k = index
-        _, ny, nz = (n + 1 for n in self.cells)
-        first = (i * ny + j) * nz + k
-
-        def read(offset: int):
-            return self.types.Float(dr.gather(self.types.UInt8, self.nodes, first + offset, active))
-
-        return [[[read((a * ny + b) * nz + c) for c in (0, 1)] for b in (0, 1)] for a in (0, 1)]
-
-    def _cell(self, p):
-        """Return for each axis the cell and the place in it, from 0 to 1."""
-        axes = []
-        for x, a, n in zip(p, self.lower, self.cells, strict=True):
-            t = clamp((x - a) / self.spacing, 0.0, float(n))
-            i = dr.minimum(self.types.UInt32(dr.detach(t)), n - 1)
-            axes.append((i, t - self.types.Float(i)))
-        return axes
-
-    def _interpolated(self, corners, weights):
-        c, (u, v, w) = corners, weights
-        rows = [dr.lerp(dr.lerp(c[a][0][0], c[a][0][1], w), dr.lerp(c[a][1][0], c[a][1][1], w), v) for a in (0, 1)]
-        return self._distance(dr.lerp(rows[0], rows[1], u))
-
-    def _distance(self, code):
-        return dr.fma(code, self.step, -127.5 * self.step)
-
     def value(self, p, active=True):
-        active = self.inside(p) & active
-        index, weights = zip(*self._cell(p), strict=True)
-        return dr.select(active, self._interpolated(self._corners(index, active), weights), self.band)
+        return self.gradient(p, active)[0]  # Dr.Jit leaves out what only the slope needs
 
     def gradient(self, p, active=True):
-        active = self.inside(p) & active
-        index, (u, v, w) = zip(*self._cell(p), strict=True)
-        c = self._corners(index, active)
-        edges = [[dr.lerp(c[a][b][0], c[a][b][1], w) for b in (0, 1)] for a in (0, 1)]
-        across = [[c[a][b][1] - c[a][b][0] for b in (0, 1)] for a in (0, 1)]
-        lines = [dr.lerp(edges[a][0], edges[a][1], v) for a in (0, 1)]
-        slope = self.types.Array3f(
-            lines[1] - lines[0],
-            dr.lerp(edges[0][1] - edges[0][0], edges[1][1] - edges[1][0], u),
-            dr.lerp(dr.lerp(across[0][0], across[0][1], v), dr.lerp(across[1][0], across[1][1], v), u),
-        )
-        value = self._distance(dr.lerp(lines[0], lines[1], u))
-        return dr.select(active, value, self.band), dr.select(active, slope * (self.step / self.spacing), 0)
+        active, Float = self.inside(p) & active, self.types.Float
+        first, (_, ny, nz), place = 0, (n + 1 for n in self.cells), []
+        for x, a, n, side in zip(p, self.lower, self.cells, (1, ny, nz), strict=True):
+            t = clamp((x - a) / self.spacing, 0.0, float(n))
+            i = dr.minimum(self.types.UInt32(dr.detach(t)), n - 1)
+            first = first * side + i
+            place.append(t - Float(i))
+        offsets = [(a * ny + b) * nz + c for a in (0, 1) for b in (0, 1) for c in (0, 1)]
+        codes = [Float(dr.gather(self.types.UInt8, self.nodes, first + offset, active)) for offset in offsets]
+        slope = []
+        for axis in (2, 1, 0):  # interpolate along z, then y, then x
+            pairs = list(zip(codes[::2], codes[1::2], strict=True))
+            slope = [[dr.lerp(a, b, place[axis]) for a, b in zip(s[::2], s[1::2], strict=True)] for s in slope]
+            slope.append([b - a for a, b in pairs])
+            codes = [dr.lerp(a, b, place[axis]) for a, b in pairs]
+        step = self.band / 128
+        slope = self.types.Array3f(*(s[0] for s in reversed(slope))) * (step / self.spacing)
+        value = dr.fma(codes[0], step, -127.5 * step)
+        return dr.select(active, value, self.band), dr.select(active, slope, 0)
 
 
-def dense(types, distances: Distances, spacing: float, train: bool = False) -> ByteGrid:
-    """Return a dense grid with exact distances at its nodes, or with trained nodes (:func:`least_squares`)."""
-    cells = _dense_cells(distances.mesh, spacing)
-    lower, shape = (distances.mesh.lower + distances.mesh.upper) / 2 - cells * spacing / 2, cells + 1
-    values = distances.signed(lower + places(shape) * spacing, 3 * spacing)
-    if train:
-        values = least_squares(distances, lower, spacing, shape, np.arange(len(values)), values)
-    band = NEAREST * spacing
-    return ByteGrid(types, quantise(values.reshape(shape), band), lower, spacing, band)
+def dense_grid(types, distances: Distances, spacing: float) -> ByteGrid:
+    """Return a dense grid of this spacing around the mesh."""
+    mesh = distances.mesh
+    cells = _dense_cells(mesh, spacing)
+    lower, band = (mesh.lower + mesh.upper) / 2 - cells * spacing / 2, NEAREST * spacing
+    places = np.stack(np.meshgrid(*map(np.arange, cells + 1), indexing="ij"), -1).reshape(-1, 3)
+    values = distances.signed(lower + places * spacing, 3 * spacing)
+    return ByteGrid(types, quantise(values.reshape(cells + 1), band), lower, spacing, band)
 
 
 def dense_spacing(mesh: Mesh, nbytes: int) -> float:
-    """Return the spacing of the finest :func:`dense` grid of ``nbytes``."""
+    """Return the spacing of the finest :func:`dense_grid` of ``nbytes``."""
 
     def fits(fineness: float) -> bool:
         return np.prod(_dense_cells(mesh, math.exp(-fineness)) + 1.0) <= nbytes
@@ -178,73 +128,31 @@ def _dense_cells(mesh: Mesh, spacing: float) -> np.ndarray:
     return np.ceil((mesh.upper - mesh.lower) / spacing + 1).astype(int)
 
 
-def least_squares(
-    distances: Distances, lower, spacing: float, shape, keys: np.ndarray, values: np.ndarray, keep: float = KEEP
-) -> np.ndarray:
-    """Return ``values`` with those nodes trained that belong to a cell which the surface crosses.
-
-    ``keys`` are the places of the nodes in a grid of ``shape`` nodes (C order, ascending); only cells with all of their
-    nodes count. Trilinear interpolation of the trained nodes is nearest to distances and normals at random points of
-    the cells, by linear least squares: the exact minimum, without a rate, a schedule or a batch. ``keep`` is the weight
-    of the given ``values``.
-    """
-    from scipy import sparse
-    from scipy.sparse.linalg import cg
-
-    rng = np.random.default_rng(1)
-    cells = surface_cells(distances, lower, spacing, np.asarray(shape) - 1)
-    corners = np.ravel_multi_index((cells[:, None] + CORNERS).reshape(-1, 3).T, shape)
-    at = np.minimum(np.searchsorted(keys, corners), len(keys) - 1)
-    whole = (keys[at] == corners).reshape(-1, 8).all(axis=1)
-    cells, corners = cells[whole], at.reshape(-1, 8)[whole]
-    each = int(np.clip(MOST_SAMPLES / max(1, len(cells)), 4, SAMPLES))
-    blocks, right = np.empty((len(cells), 8, 8), np.float32), np.empty((len(cells), 8), np.float32)
-    for part in np.array_split(np.arange(len(cells)), max(1, len(cells) * each // 2**18)):
-        place = rng.random((len(part), each, 3))
-        d, g = distances.signed_normals((lower + (cells[part][:, None] + place) * spacing).reshape(-1, 3))
-        # Per sample a row for the distance, in cells, and three for the gradient
-        ends = np.where(CORNERS == 1, place[..., None, :], 1 - place[..., None, :])
-        signs = 2.0 * CORNERS - 1
-        rows = [ends.prod(-1), *(ends[..., np.delete(np.arange(3), a)].prod(-1) * signs[:, a] for a in range(3))]
-        truth = np.concatenate([d[:, None] / spacing, g], axis=1).reshape(len(part), each, 4)
-        weight = 1 / (1 + (truth[..., :1] / FOCUS) ** 2) * np.array([1, *[GRADIENT_WEIGHT**2] * 3])
-        rows = np.stack(rows, -2)
-        weighted = rows * weight[..., None]
-        blocks[part] = np.einsum("nsrc,nsrd->ncd", weighted, rows, optimize=True)
-        right[part] = np.einsum("nsrc,nsr->nc", weighted, truth, optimize=True)
-    used, at = np.unique(corners, return_inverse=True)
-    at = at.reshape(-1, 8)
-    start, keep = values[used].astype(np.float64) / spacing, keep * each
-    entries = np.repeat(at, 8, axis=1).ravel(), np.tile(at, (1, 8)).ravel()
-    matrix = sparse.coo_array((blocks.ravel(), entries), (len(used),) * 2).tocsr().astype(np.float64)
-    matrix += sparse.diags_array(np.full(len(used), keep))
-    target = np.bincount(at.ravel(), right.ravel(), len(used)) + keep * start
-    solution, _ = cg(matrix, target, start, rtol=1e-4, maxiter=200)
-    trained = values.copy()
-    trained[used] = solution * spacing
-    return trained
-
-
 class DistanceNodes(SparseNodes):
-    """Distances of ``bits`` each at the nodes of a sparse ``structure``: our layout without normals and indirection."""
+    """Distances of 8 bits at the nodes of a sparse ``structure``: our layout without normals and indirection."""
 
-    def __init__(self, types, structure: SparseGrid, numbers: np.ndarray, band: float, bits: int, slope: float):
-        words = nodes.pointer_words(numbers, bits)
-        super().__init__(types, structure, slope, pointers=words, bits=bits)
-        self.state = {"numbers": numbers, "band": band, "bits": bits, "slope": slope, **structure_arrays(structure)}
-        self.band_spacings, self.number_bytes = band / self.spacing, 4 * len(words)
+    def __init__(self, types, structure: SparseGrid, codes: np.ndarray, band: float, slope: float):
+        words = nodes.pointer_words(codes, 8)
+        super().__init__(types, structure, slope, pointers=words, bits=8)
+        self.codes, self.band_spacings = codes, band / self.spacing
+        masks = (structure.regions, structure.region_masks, structure.region_signs, structure.block_masks,
+                 structure.block_signs)  # fmt: skip
+        self.file_bytes = sum(len(zlib.compress(array.tobytes(), 9)) for array in (codes, *masks))
+
+    @property
+    def nbytes(self) -> int:
+        return self.structure.nbytes + 4 * dr.width(self._pointers)
 
     def _node(self, number, record, i, j, k, active):
-        value = self.types.Float(nodes.pointer_at(self._pointers, number, self.bits, active))
-        half = 2 ** (self.bits - 1)
+        code = self.types.Float(nodes.pointer_at(self._pointers, number, 8, active))
         zero = self.types.Float(0)
-        return (value + (0.5 - half)) * (self.band_spacings / half), (zero, zero, zero)
+        return (code - 127.5) * (self.band_spacings / 128), (zero, zero, zero)
 
     def normal(self, p, active=True):
         return self.gradient(p, active)[1]
 
     def decoded(self) -> np.ndarray:
-        distances = dequantise(self.state["numbers"], self.band_spacings, self.bits)
+        distances = dequantise(self.codes, self.band_spacings)
         return np.stack([distances, *[np.zeros_like(distances)] * 3], axis=1)
 
     def frames(self) -> np.ndarray:
@@ -259,85 +167,24 @@ class DistanceNodes(SparseNodes):
         normals = np.where(length > 0, planes[:, 1:] / np.maximum(length, 1e-9), [0.0, 0.0, 1.0])
         return nodes.frame_words(normals, planes[:, 0], np.ones(len(planes)))
 
-    @property
-    def nbytes(self) -> int:
-        return self.structure.nbytes + self.number_bytes
 
-
-def distance_nodes(types, distances: Distances, spacing: float, train: bool = False, bits: int = 6) -> DistanceNodes:
-    """Return the corners of all cells that have corners of both signs, with exact distances or trained ones."""
-    sampled = sample(distances, spacing)
-    structure, band = sampled.structure, NEAREST * spacing
-    keys = np.ravel_multi_index(sampled.positions.astype(np.int64).T, structure.shape)
-    order = np.argsort(keys)
-    values = sampled.distances * spacing
-    if train:
-        # Nodes keep their sides: the signs decide which nodes there are
-        lower = np.asarray(structure.lower)
-        trained = least_squares(distances, lower, spacing, structure.shape, keys[order], values[order])
-        least = 0.5 * band / 2 ** (bits - 1)
-        values[order] = np.where(values[order] < 0, np.minimum(trained, -least), np.maximum(trained, least))
-    numbers = quantise(values, band, bits)
-    corners = dequantise(numbers, band, bits)[sampled.corners].reshape(-1, 2, 2, 2)
+def distance_nodes(types, distances: Distances, spacing: float) -> DistanceNodes:
+    """Return the corners of all cells that have corners of both signs, with their exact distances."""
+    sampled, band = sample(distances, spacing), NEAREST * spacing
+    codes = quantise(sampled.distances * spacing, band)
+    corners = dequantise(codes, band)[sampled.corners].reshape(-1, 2, 2, 2)
     slope = max(slope_bound(part, spacing) for part in np.array_split(corners, max(1, corners.size // 2**21)))
-    return DistanceNodes(types, structure, numbers, band, bits, slope)
+    return DistanceNodes(types, sampled.structure, codes, band, slope)
 
 
-def structure_arrays(structure: SparseGrid) -> dict:
-    """Return the fields of a structure for the ``state`` of a field, each name with ``structure_`` before it."""
-    return {f"structure_{f.name}": getattr(structure, f.name) for f in dataclasses.fields(structure)}
+def sparse_nodes(types, distances: Distances, nbytes: int) -> DistanceNodes:
+    """Return the finest :func:`distance_nodes` of ``nbytes``; raises :class:`.BudgetError` if none fits."""
 
+    def following(spacing: float, field: DistanceNodes) -> float:
+        return float(np.clip(spacing * math.sqrt(field.nbytes / (0.985 * nbytes)), FINEST_SPACING, COARSEST_SPACING))
 
-def save(path: Path | str | None, field: DistanceField) -> int:
-    """Write a field's ``state``, the arguments of its class without ``types``, unless ``path`` is ``None``.
-
-    :func:`load` reads the file. Returns its size; the arrays are compressed (zlib).
-    """
-    file = io.BytesIO()
-    np.savez_compressed(file, class_name=type(field).__name__, **field.state)
-    if path:
-        with replacing(path) as temporary:
-            temporary.write_bytes(file.getvalue())
-    return len(file.getvalue())
-
-
-def load(path: Path | str, types) -> DistanceField:
-    """Return the field of a file that :func:`save` wrote."""
-    with np.load(path, allow_pickle=False) as file:
-        state = {name: file[name] if file[name].ndim else file[name].item() for name in file}
-    field_class = {c.__name__: c for c in (ByteGrid, DistanceNodes)}[state.pop("class_name")]
-    parts = {name: state.pop(name) for name in list(state) if name.startswith("structure_")}
-    if parts:
-        parts = {name.removeprefix("structure_"): v for name, v in parts.items()}
-        state["structure"] = SparseGrid(**{**parts, "lower": tuple(parts["lower"].tolist())})
-    return field_class(types, **state)
-
-
-def fit_bytes(make: Callable[[float], DistanceField], nbytes: int) -> DistanceField:
-    """Return the field ``make(spacing)`` with the finest spacing that fits into ``nbytes``.
-
-    The field is within 1.5% of ``nbytes`` if few attempts reach that, else within 3% if possible. Raises ``ValueError``
-    if no spacing fits.
-    """
-    spacing, power, before, best = FIRST_SPACING, 2.0, None, None
-    for attempt in range(8):
-        field = make(spacing)
-        if field.nbytes <= nbytes and (best is None or field.nbytes > best.nbytes):
-            best = field
-        if best is not None and best.nbytes >= (0.985 if attempt < 3 else 0.97) * nbytes:
-            break
-        if before is not None and field.nbytes != before[1]:
-            power = math.log(field.nbytes / before[1]) / math.log(before[0] / spacing)
-        before = spacing, field.nbytes
-        # A quarter of the bytes shows how they grow, and takes a quarter of the time
-        aim = 0.25 if attempt == 0 and field.nbytes < nbytes / 8 else 0.993
-        spacing *= (field.nbytes / (aim * nbytes)) ** (1 / np.clip(power, 1.5, 3.0))
-        spacing = float(np.clip(spacing, FINEST_SPACING, COARSEST_SPACING))
-        if spacing == before[0]:
-            break
-    if best is None:
-        raise ValueError(f"{nbytes:,} bytes are too few: {field.nbytes:,} are the least that was found")
-    return best
+    budget = Budget(nbytes, 0.03)
+    return budget.approach(lambda spacing: distance_nodes(types, distances, spacing), FIRST_SPACING, following)
 
 
 # -- Hash grid and network ---------------------------------------------------------------------------------------------
@@ -354,20 +201,20 @@ class HashDistanceField(DistanceField):
     def __init__(self, types, net: Network, mesh: Mesh):
         finest = net.grid["base_resolution"] * net.grid["per_level_scale"] ** (net.grid["n_levels"] - 1)
         super().__init__(types, mesh.lower - PADDING, mesh.upper + PADDING, 1 / finest, BAND)
-        self.net = net
-        self.nbytes = 2 * net.parameters
+        self.net, self.nbytes = net, 2 * net.parameters
+        self.file_bytes = self.nbytes
 
     def value(self, p, active=True):
         active = self.inside(p) & active
-        value = self.net([(x - a) for x, a in zip(p, self.lower, strict=True)])[0]
-        return dr.select(active, dr.clip(value * BAND, -BAND, BAND), BAND)
+        value = self.net([x - a for x, a in zip(p, self.lower, strict=True)])[0] * BAND
+        return dr.select(active, dr.clip(value, -BAND, BAND), BAND)
 
     def gradient(self, p, active=True):
         active = self.inside(p) & active
         with dr.resume_grad():
             q = self.types.Array3f(dr.detach(p))
             dr.enable_grad(q)
-            value = self.net([(x - a) for x, a in zip(q, self.lower, strict=True)])[0] * BAND
+            value = self.net([x - a for x, a in zip(q, self.lower, strict=True)])[0] * BAND
             dr.backward(value)
             slope = dr.detach(dr.grad(q))
         value = dr.clip(dr.detach(value), -BAND, BAND)
