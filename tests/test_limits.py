@@ -29,7 +29,7 @@ from mi_diffind.core.errors import LONGEST_MESSAGE, UsageError
 from mi_diffind.core.files import PATHS, OutputError
 from mi_diffind.core.units import figure_lines
 from mi_diffind.fitting.loop import checkpoint_settings
-from mi_diffind.fitting.settings import FitSettings, within_memory
+from mi_diffind.fitting.task import FitSettings, within_memory
 from mi_diffind.images.headers import picture_size
 from mi_diffind.maps.compressed import map_figure
 from mi_diffind.maps.source import SourceError, from_arrays, load_source

@@ -12,8 +12,7 @@ import pytest
 import trimesh
 
 from mi_diffind.core.errors import UsageError
-from mi_diffind.fitting.settings import FitSettings
-from mi_diffind.fitting.task import FitRequest, tasks
+from mi_diffind.fitting.task import FitRequest, FitSettings, tasks
 from mi_diffind.tasks.image import arrays as image_budget
 from mi_diffind.tasks.radiance import dense_bytes
 from mi_diffind.tasks.radiance import fit as field_fit

@@ -19,8 +19,7 @@ from mi_diffind.core.compat import use_threads, was_compiled
 from mi_diffind.core.errors import UsageError
 from mi_diffind.core.progress import Deadline
 from mi_diffind.core.runtime import array_module
-from mi_diffind.fitting.settings import FitSettings
-from mi_diffind.fitting.task import FitRequest
+from mi_diffind.fitting.task import FitRequest, FitSettings
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import load_source
 from mi_diffind.plugins.support import footprint

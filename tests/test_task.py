@@ -35,7 +35,7 @@ BUILT_IN = ("bsdf", "disney", "field", "ggx", "image", "scene", "sdf", "shading"
 # -- what is found ----------------------------------------------------------------------------------------------------
 
 LINE = """
-from mi_diffind.fitting.settings import FitSettings
+from mi_diffind.fitting.task import FitSettings
 from mi_diffind.fitting.task import Task
 
 class Line(Task):

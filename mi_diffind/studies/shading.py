@@ -43,7 +43,7 @@ from ..core.runtime import array_module
 from ..core.units import parse_compression
 from ..fitting import task
 from ..fitting.loop import FitResult
-from ..fitting.settings import FitSettings, FittingError
+from ..fitting.task import FitSettings, FittingError
 from ..images import srgb
 from ..maps.compressed import decibel
 from ..maps.pyramid import Pyramid

@@ -35,7 +35,7 @@ from ..core.arguments import positive
 from ..core.runtime import array_module
 from ..core.units import parse_compression
 from ..fitting import task
-from ..fitting.settings import FitSettings
+from ..fitting.task import FitSettings
 from ..maps.compressed import FilteredMaps, decibel
 from ..maps.pyramid import Pyramid
 from ..maps.source import Source, load_source

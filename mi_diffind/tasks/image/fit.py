@@ -13,8 +13,7 @@ from ...arrays.pages import most_entries
 from ...arrays.tables import MAX_BYTES, Table
 from ...core.errors import UsageError
 from ...fitting.loop import FitResult
-from ...fitting.settings import FittingError
-from ...fitting.task import FitRequest, Fitted
+from ...fitting.task import FitRequest, Fitted, FittingError
 from ...maps import as_seen
 from ...maps.arguments import requested_border, requested_bytes
 from ...maps.model import complete, rehearse_pictures

@@ -14,8 +14,7 @@ import dataclasses
 from dataclasses import dataclass
 
 from ...core.arguments import Argument, fraction, positive_or_none
-from ...fitting.settings import FitSettings
-from ...fitting.task import Task
+from ...fitting.task import FitSettings, Task
 from ...maps.arguments import LEVEL_BIAS, PREVIEW, SIZES, SOURCES
 
 #: Sample patterns of the reference (:data:`.evaluation.SAMPLES_PER_SIDE`).

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from ...core.arguments import Argument, between, checked, natural, positive
-from ...fitting.settings import FitSettings
-from ...fitting.task import Task
+from ...fitting.task import FitSettings, Task
 from ...maps.arguments import BIAS_RANGE, DECODED, SIZES, SOURCE, SOURCES
 
 
