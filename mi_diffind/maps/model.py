@@ -19,7 +19,7 @@ from ..fitting.task import FitRequest, Fitted, Model
 from ..images import srgb
 from . import as_seen
 from .arguments import size_figures
-from .compressed import CompressedMaps, map_figure
+from .pyramid import CompressedMaps, map_figure
 from .source import Source, load_source
 
 

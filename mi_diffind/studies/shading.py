@@ -45,8 +45,7 @@ from ..fitting import task
 from ..fitting.loop import FitResult
 from ..fitting.task import FitSettings, FittingError
 from ..images import srgb
-from ..maps.compressed import decibel
-from ..maps.pyramid import Pyramid
+from ..maps.pyramid import Pyramid, decibel
 from ..maps.source import Source, SourceError, load_source
 from ..measure import plot
 from ..measure.renders import POINTS, MovingView
@@ -59,7 +58,7 @@ from ..tasks.shading import fit as shading_fit
 from ..tasks.shading.evaluation import ShadedEvaluation, ShadedReader, reader, reference
 from ..tasks.shading.material import effects_of, frozen_decoder
 from ..tasks.shading.training import ShadingProblem, fit_shading, start_of
-from ..tasks.texture import training as textures
+from ..tasks.texture import fit as textures
 from ..tasks.texture.compressed import CompressedTexture
 from ..tasks.texture.fit import size_of
 from .baselines import codecs, normals

@@ -22,7 +22,7 @@ from mi_diffind.scenes import loading
 from mi_diffind.tasks.shading import PRESETS, training
 from mi_diffind.tasks.texture import PRESETS as TEXTURES
 from mi_diffind.tasks.texture import TASK
-from mi_diffind.tasks.texture import training as textures
+from mi_diffind.tasks.texture import fit as textures
 
 SCENES = ROOT / "scenes"
 

@@ -21,7 +21,7 @@ from PIL import Image
 
 import mi_diffind as md
 from mi_diffind.maps import as_seen
-from mi_diffind.maps.compressed import decibel
+from mi_diffind.maps.pyramid import decibel
 
 #: Copies of the material along the floor, by distance.
 DISTANCES = {"near": 0.25, "middle": 1.0, "far": 4.0}

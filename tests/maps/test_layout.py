@@ -10,8 +10,8 @@ import pytest
 from variants import BACKENDS
 
 from mi_diffind.core.runtime import array_module
-from mi_diffind.maps.compressed import root
 from mi_diffind.maps.layout import NORMAL_FLOOR_DB, Layout, MapLayout
+from mi_diffind.maps.pyramid import root
 from mi_diffind.maps.source import from_arrays
 
 

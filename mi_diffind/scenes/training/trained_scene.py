@@ -24,9 +24,8 @@ from ...maps.source import load_source
 from ...plugins.support import footprint
 from ...tasks.texture import PRESETS, TextureRecipe
 from ...tasks.texture.arrays import FineArray, PaperBudget, TextureBudget
-from ...tasks.texture.compressed import CompressedTexture, bias_of, load, structure_of, to_table
-from ...tasks.texture.nets import PaperStructure
-from ...tasks.texture.training import TextureProblem, problem_of, stored_form
+from ...tasks.texture.compressed import CompressedTexture, PaperStructure, bias_of, load, structure_of, to_table
+from ...tasks.texture.fit import TextureProblem, problem_of, stored_form
 from .. import loading
 from .options import View, ViewDistribution
 from .rig import Rig

@@ -21,7 +21,7 @@ from ...arrays.sparse_grid import CORNERS, SparseGrid
 from ...core.files import replacing
 from ...core.units import largest_fitting
 from ...fitting.loop import Problem
-from ...maps.compressed import decibel
+from ...maps.pyramid import decibel
 from ...tasks.sdf import nodes
 from ...tasks.sdf.distances import Distances, sample_box, sample_near, surface_cells
 from ...tasks.sdf.encoding import sample

@@ -23,9 +23,9 @@ from ...arrays.indirection import DifferentiableArray, Indirection, ramp
 from ...arrays.pages import PagedArray, page_counts, page_entries, page_gain, page_positions, page_shift, page_sizes
 from ...arrays.tables import PAGES, Table, TableError, load_table, to_stored_arrays
 from ...core.compat import backend_module
-from ...maps.compressed import CompressedMaps
 from ...maps.layout import Layout, channel_covariance, downscale, eigenvectors, neighbour_covariance
 from ...maps.model import MapsModel, allocate_maps, stored_entries
+from ...maps.pyramid import CompressedMaps
 from . import CoarsePrimary
 
 #: Best resolution ratio for compression ratios of RGB textures at 4K (the supplement's table 2).

@@ -19,10 +19,9 @@ from ...arrays.pages import most_entries, page_counts
 from ...arrays.tables import Table
 from ...fitting.loop import FitResult, Problem
 from ...fitting.task import FitRequest
-from ...maps.compressed import decibel, mean_square
 from ...maps.layout import Layout, choose_borders, smoothness
 from ...maps.model import fit_maps
-from ...maps.pyramid import padded_texels, weighted_sum
+from ...maps.pyramid import decibel, mean_square, padded_texels, weighted_sum
 from ...maps.source import Source
 from . import PAGED, STRUCTURES, ImageRecipe, arrays
 from .arrays import CompressedImage, ImageBudget, to_table

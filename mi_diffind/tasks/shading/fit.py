@@ -16,9 +16,8 @@ from ...maps.source import load_source
 from ..texture import PRESETS as TEXTURES
 from ..texture import TASK as TEXTURE
 from ..texture import fit as texture_fit
-from ..texture import training as textures
-from ..texture.compressed import bias_of
-from ..texture.nets import neutral_extras
+from ..texture import fit as textures
+from ..texture.compressed import bias_of, neutral_extras
 from . import PRESETS, ShadingRecipe, material, training
 from .evaluation import ShadedEvaluation
 

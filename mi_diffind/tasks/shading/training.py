@@ -27,9 +27,8 @@ from ...maps.pyramid import Pyramid
 from ...maps.source import Source
 from ..disney.training import random_directions
 from ..texture import PRESETS as TEXTURES
-from ..texture import training as textures
-from ..texture.compressed import CompressedTexture, to_table
-from ..texture.nets import neutral_extras
+from ..texture import fit as textures
+from ..texture.compressed import CompressedTexture, neutral_extras, to_table
 from . import ShadingRecipe
 from .evaluation import TRUTHS, ShadedEvaluation, reader, reference, write_preview
 from .material import effects_of, frozen_decoder, shaded, surface_of

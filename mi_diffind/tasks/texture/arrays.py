@@ -29,11 +29,10 @@ from ...arrays.pages import (
     page_shift,
     shared_page_sizes,
 )
-from ...maps.compressed import taps
 from ...maps.layout import Layout, channel_covariance, eigenvectors, neighbour_covariance
-from ...maps.pyramid import level_sizes
+from ...maps.pyramid import level_sizes, taps
 from . import FineArray, parse_structure
-from .nets import FineLayer, LayeredNet, LayeredStructure, PaperNet, PaperStructure
+from .compressed import FineLayer, LayeredNet, LayeredStructure, PaperNet, PaperStructure
 
 #: Best resolution ratio for compression ratios of RGB textures at 4K (the supplement's table 4).
 RATIOS = {3: 80, 6: 64, 12: 64, 24: 48}

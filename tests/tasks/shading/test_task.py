@@ -30,7 +30,7 @@ from mi_diffind.tasks.shading import PRESETS, material, training
 from mi_diffind.tasks.shading.evaluation import ShadedEvaluation, reader, reference
 from mi_diffind.tasks.texture import PRESETS as TEXTURES
 from mi_diffind.tasks.texture import TASK as TEXTURE
-from mi_diffind.tasks.texture import training as textures
+from mi_diffind.tasks.texture import fit as textures
 from mi_diffind.tasks.texture.compressed import CompressedTexture
 
 OURS = PRESETS["ours"]
