@@ -24,7 +24,7 @@ from mi_diffind.arrays.tables import PAGES, TableError, load_table, read_gathers
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting.task import FitRequest
 from mi_diffind.maps.source import from_arrays
-from mi_diffind.tasks.image import PAGED, PRESETS, STRUCTURES, TASK, fit, replaced, training
+from mi_diffind.tasks.image import PAGED, PRESETS, STRUCTURES, TASK, fit, training
 from mi_diffind.tasks.image.arrays import CompressedImage
 
 SHAPES = {1: (7,), 2: (5, 3), 3: (2, 3, 2)}
@@ -288,14 +288,14 @@ def test_positions_of_entries():
 
 
 def short(structure, steps=30, **changes):
-    recipe = replaced(PRESETS["ours"], steps=steps, batch=4096, measure_every=steps)
+    recipe = dataclasses.replace(PRESETS["ours"], steps=steps, batch=4096, measure_every=steps)
     return dataclasses.replace(recipe, structure=structure, **changes)
 
 
 def trained(ad, recipe, nbytes=1500):
     source = from_arrays({"albedo": np.rint(255 * half_empty()).astype(np.uint8)})
     size = fit.default_size(source, nbytes, recipe)
-    asked = FitRequest("ours", recipe.settings, ad, progress=False)
+    asked = FitRequest("ours", recipe, ad, progress=False)
     return training.fit_image(source, size, recipe, asked)[0]
 
 

@@ -848,7 +848,7 @@ def test_arrays_of_the_same_size(folder, preset, tmp_path):
         wanted = TextureBudget(32, 32, layout.stored, parse_structure("0:2:4,1:3:6"), 2, 3, 6, 3)
     pyramid = Pyramid.of(source, layout, array_module("llvm"))
     net = problem_of(source, wanted, recipe, pyramid).net
-    own = {k: v for k, v in dataclasses.asdict(recipe).items() if k != "settings"}
+    own = recipe.further
     table = to_table(CompressedTexture(layout, stored_form(net)), {**own, "loss": "mae"})  # a render's
     save_table(tmp_path / "x.npz", table)
     table = load(tmp_path / "x.npz")

@@ -13,7 +13,7 @@ import os
 import sys
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 
 import drjit as dr
 import numpy as np
@@ -267,7 +267,7 @@ def fit(
         raise FittingError("resuming (--resume) needs the checkpoint (--checkpoint FILE) of the run to go on with")
     trainer, record = _Trainer(problem, settings), _Record()
     # The settings that a checkpoint has to agree in
-    agreed = {**asdict(settings), **json.loads(json.dumps(dict(problem.identity)))}
+    agreed = {**settings.common, **json.loads(json.dumps(dict(problem.identity)))}
     if resume:
         state, record = _load_checkpoint(checkpoint, agreed, trainer)
         trainer.restore(state)

@@ -25,7 +25,7 @@ import numbers
 import os
 import sys
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -73,6 +73,8 @@ class FitSettings:
 
     With ``deterministic``, the same settings give the same bytes: the LLVM backend then trains on one core, because the
     last digits of a sum over several cores depend on their order. It has no effect on CUDA, which sums by atomics.
+
+    A task that has further settings derives a class of its own, whose defaults are those of its first preset.
     """
 
     steps: int = 2000
@@ -100,6 +102,16 @@ class FitSettings:
             raise FittingError(f'schedule: found "{self.schedule}", allowed are {SCHEDULES}')
         if self.loss not in LOSSES:
             raise FittingError(f'loss: found "{self.loss}", allowed are {LOSSES}')
+
+    @property
+    def common(self) -> dict:
+        """The settings that all tasks share, by name."""
+        return {f.name: getattr(self, f.name) for f in fields(FitSettings)}
+
+    @property
+    def further(self) -> dict:
+        """The settings of the task alone, by name."""
+        return {name: value for name, value in asdict(self).items() if name not in self.common}
 
 
 def within_memory(settings: FitSettings) -> FitSettings:
@@ -255,9 +267,9 @@ class FitRequest:
     def recorded(self, result: FitResult | None = None) -> dict:
         """Return the settings as a table file keeps them: with a limit of time, the steps are those of the result."""
         if self.deadline is None:
-            return asdict(self.settings)
+            return self.settings.common
         steps = {} if result is None else {"steps": result.steps}
-        return {**asdict(self.settings), **steps, "seconds": self.deadline.total}
+        return {**self.settings.common, **steps, "seconds": self.deadline.total}
 
     @property
     def folder(self) -> Path:
@@ -454,7 +466,10 @@ class Task:
 
     def settings(self, preset: str, given: Mapping, options: Mapping) -> FitSettings:
         """Return the settings of a preset with the ``given`` ones in place; ``options`` are the task's own."""
-        defaults = self.presets[preset]
+        return self.change_settings(self.presets[preset], given)
+
+    def change_settings(self, defaults: FitSettings, given: Mapping) -> FitSettings:
+        """Return ``defaults`` with the ``given`` settings in place, and so many :attr:`measurements`."""
         if self.measurements:
             steps = given.get("steps", defaults.steps)
             defaults = dataclasses.replace(defaults, measure_every=max(1, steps // self.measurements))
@@ -686,15 +701,15 @@ def fit(
         given["source"] = source
     deadline = Deadline(seconds) if isinstance(seconds, (int, float)) else seconds
     arguments = {argument.name: argument for argument in chosen.arguments}
-    options, fields = {k: a.default for k, a in arguments.items()}, {f.name for f in dataclasses.fields(FitSettings)}
+    options, names = {k: a.default for k, a in arguments.items()}, {f.name for f in fields(FitSettings)}
     for key, value in given.items():
         if key == "source" and key not in options:
             raise UsageError(f"{task}: found a source, but this task has none")
-        if key not in options and key not in fields:
-            allowed = ", ".join(sorted({*options, *fields}))
+        if key not in options and key not in names:
+            allowed = ", ".join(sorted({*options, *names}))
             raise UsageError(f'{task}: found the argument "{key}", allowed are {allowed}')
         options |= {key: arguments[key].parsed(value)} if key in options else {}
-    settings = within_memory(chosen.settings(preset, {k: v for k, v in given.items() if k in fields}, options))
+    settings = within_memory(chosen.settings(preset, {k: v for k, v in given.items() if k in names}, options))
     output = None if output is None else chosen.output_path(output)
     check_files(chosen.arguments, options, {"-o": output, "--checkpoint": checkpoint})
     if resume and deadline is not None:

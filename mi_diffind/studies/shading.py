@@ -120,7 +120,7 @@ class ShadingStudySettings:
     extras: bool = False
 
     @property
-    def recipe(self) -> shading_task.ShadingRecipe:
+    def recipe(self) -> shading_task.ShadingSettings:
         return shading_task.PRESETS[self.preset]
 
 
@@ -408,8 +408,8 @@ class ShadingStudyContext:
 
         With ``extras``, the arrays leave room for them.
         """
-        request = self.request(texture_task.PRESETS["ours"].settings, length, seed, progress)
-        recipe = dataclasses.replace(self.recipe, settings=request.settings)
+        request = self.request(texture_task.PRESETS["ours"], length, seed, progress)
+        recipe = dataclasses.replace(self.recipe, **request.settings.common)
         nbytes = self.source.nbytes / self.settings.compression
         nbytes = shading_fit.bytes_beside_extras(nbytes, pyramid) if extras else nbytes
         size = size_of(self.source, pyramid, nbytes, recipe, request.options)
@@ -482,11 +482,11 @@ class ShadingStudyContext:
         def train(progress: bool) -> tuple:
             preset = self.settings.recipe
             schedule = "cosine" if way.schedule else "constant"
-            settings = dataclasses.replace(preset.settings, schedule=schedule)
+            settings = dataclasses.replace(preset, schedule=schedule)
             request = self.request(settings, self.settings.length, seed, progress)
             recipe = dataclasses.replace(
                 preset, share=share, clip=(preset.clip or CLIP) if way.clip else None, extras=extras,
-                level_bias=preset.level_bias if share else 0.0, settings=request.settings,
+                level_bias=preset.level_bias if share else 0.0, **request.settings.common,
             )  # fmt: skip
             net = start_of(start.model.table, self.pyramid)
             try:

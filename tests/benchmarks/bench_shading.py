@@ -33,7 +33,7 @@ def long_training(steps: int) -> list[dict]:
     source = load_source(SCENES / "assets" / "rust.json")
     pyramid = Pyramid.of(source, textures.layout_of(source, TEXTURES["ours"]), types)
     table = TASK.load(SCENES / "assets" / "rust_plain.npz")
-    settings = dataclasses.replace(recipe.settings, steps=steps, batch=2**14)
+    settings = dataclasses.replace(recipe, steps=steps, batch=2**14)
     problem = training.ShadingProblem(training.start_of(table, pyramid), pyramid, recipe, source.digest)
     problem.settings = settings
     trainer, found = loop._Trainer(problem, settings), []

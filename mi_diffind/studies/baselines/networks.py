@@ -320,7 +320,7 @@ class TextureNetworkProblem(TextureProblem):
 
     def predict(self, net, inputs) -> dict[str, list]:
         u, v, level, _ = inputs
-        return self._grouped(self.maps(net).filtered(u, v, level))
+        return self.by_map(self.maps(net).filtered(u, v, level))
 
     def measure(self, net) -> dict[str, float]:
         """Return the PSNR of the stored channels at held-out samples between texels and levels."""

@@ -12,13 +12,11 @@ from ...arrays.budget import Budget
 from ...arrays.pages import most_entries
 from ...arrays.tables import MAX_BYTES, Table
 from ...core.errors import UsageError
-from ...fitting.loop import FitResult
-from ...fitting.task import FitRequest, Fitted, FittingError
+from ...fitting.task import FitRequest, FitResult, Fitted, FittingError
 from ...maps import as_seen
-from ...maps.arguments import requested_border, requested_bytes
-from ...maps.model import complete, rehearse_pictures
+from ...maps.model import complete, rehearse_pictures, requested_border, requested_bytes
 from ...maps.source import Source, load_source
-from . import PAGED, PRESETS, STRUCTURES, CoarsePrimary, ImageRecipe, parse_weights, replaced, without
+from . import PAGED, STRUCTURES, CoarsePrimary, ImageSettings, parse_weights
 from .arrays import CompressedImage, ImageBudget, cascaded_side, fit_bytes, search
 from .training import fit_image, layout_of, pointer_dims, problem_of, structure_of
 
@@ -59,18 +57,6 @@ SAMPLE_SIDE = 512
 SAMPLE_PATCH = 64
 
 
-def recipe_of(preset: str, settings, options) -> ImageRecipe:
-    """Return the recipe of a preset, changed by the options. Raises :class:`UsageError`."""
-    recipe = without(PRESETS[preset], options["without"])
-    given = {k: options[k] for k in ("structure", "dims") if options[k] is not None}
-    recipe = dataclasses.replace(recipe, settings=settings or recipe.settings, **given)
-    if STRUCTURES.get(recipe.structure, (8, None))[1] and recipe.dims < 3:
-        raise UsageError(f'--structure "{recipe.structure}" has two primary arrays, allowed are --dims 3 and 4')
-    if recipe.structure in PAGED and not recipe.components:
-        raise UsageError(f'--structure "{recipe.structure}" starts from components: leave out --without components')
-    return recipe
-
-
 def check(request: FitRequest) -> None:
     """Raise :class:`UsageError` for options that do not go together."""
     options = request.options
@@ -87,7 +73,11 @@ def check(request: FitRequest) -> None:
         raise UsageError("--without: the preset paper has none of our improvements: leave it out")
     if options["source"] is None:
         raise UsageError("source: not given, an image or a manifest of the maps of a material is needed")
-    recipe = recipe_of(request.preset, request.settings, options)
+    recipe = request.settings
+    if STRUCTURES.get(recipe.structure, (8, None))[1] and recipe.dims < 3:
+        raise UsageError(f'--structure "{recipe.structure}" has two primary arrays, allowed are --dims 3 and 4')
+    if recipe.structure in PAGED and not recipe.components:
+        raise UsageError(f'--structure "{recipe.structure}" starts from components: leave out --without components')
     if options["ratio"] is not None:
         if recipe.components or STRUCTURES[recipe.structure][1]:
             raise UsageError("--ratio: for the preset paper with one primary array; ours takes --cascaded")
@@ -103,14 +93,13 @@ def fit(request: FitRequest) -> Fitted:
     """
     options = request.options
     source = load_source(options["source"], nonfinite=options["nonfinite"])
-    recipe = recipe_of(request.preset, request.settings, options)
-    recipe = dataclasses.replace(recipe, weights=_weights(request, source, recipe))
+    recipe = dataclasses.replace(request.settings, weights=_weights(request, source, request.settings))
     rehearse_pictures(request, source)
     fitted, requested = _train(request, source, recipe)
     return complete(request, source, fitted, CompressedImage.of(fitted.table, request.types.TensorXf), requested)
 
 
-def _train(request: FitRequest, source: Source, recipe: ImageRecipe) -> tuple[Fitted, float | None]:
+def _train(request: FitRequest, source: Source, recipe: ImageSettings) -> tuple[Fitted, float | None]:
     """Return the result of the training or search, and the requested bytes."""
     options = request.options
     border = requested_border(options)
@@ -148,7 +137,7 @@ def _train(request: FitRequest, source: Source, recipe: ImageRecipe) -> tuple[Fi
     return Fitted(*fit_image(source, size, recipe, request, border), lines, {"tried": tried}), requested
 
 
-def _for_psnr(request: FitRequest, source: Source, recipe: ImageRecipe, border) -> Fitted:
+def _for_psnr(request: FitRequest, source: Source, recipe: ImageSettings, border) -> Fitted:
     """Return the smallest file of a wanted quality. Raises :class:`FittingError`."""
     goal = float(request.options["psnr"])
     table, result, tried = psnr_search(source, goal, recipe, request, border)
@@ -164,7 +153,7 @@ def _for_psnr(request: FitRequest, source: Source, recipe: ImageRecipe, border) 
 # ---------------------- Sizes ----------------------
 
 
-def default_size(source: Source, nbytes: float, recipe: ImageRecipe, ratio: float | None = None) -> ImageBudget:
+def default_size(source: Source, nbytes: float, recipe: ImageSettings, ratio: float | None = None) -> ImageBudget:
     """Return the default budget of a recipe for ``nbytes`` bytes.
 
     The supplement's search, with ``ratio`` in place of its table if given; or, with ``components`` or two primaries, a
@@ -178,7 +167,7 @@ def default_size(source: Source, nbytes: float, recipe: ImageRecipe, ratio: floa
     return search(source.nbytes, source.nbytes / nbytes, stored, *size, recipe.dims, bits, ratio)
 
 
-def sized(source: Source, nbytes: float, recipe: ImageRecipe, cascaded: int) -> ImageBudget:
+def sized(source: Source, nbytes: float, recipe: ImageSettings, cascaded: int) -> ImageBudget:
     """Return the budget for ``nbytes`` bytes with a cascaded array of a given side."""
     stored, structure = max(1, layout_of(source, recipe).stored), structure_of(source, recipe, nbytes)
     (bits, coarse), dims = STRUCTURES[structure], pointer_dims(recipe, structure, stored)
@@ -194,13 +183,13 @@ class RatioSearch(NamedTuple):
     """
 
     size: ImageBudget
-    recipe: ImageRecipe
+    recipe: ImageSettings
     tried: list[dict]
     best: tuple[Table, FitResult] | None = None
 
 
 def ratio_search(
-    source: Source, nbytes: float, recipe: ImageRecipe, request: FitRequest, free: bool = True, border=None
+    source: Source, nbytes: float, recipe: ImageSettings, request: FitRequest, free: bool = True, border=None
 ) -> RatioSearch:
     """Return the best of several budgets of ``nbytes`` bytes, each trained for :data:`SHORT` of the steps.
 
@@ -208,7 +197,7 @@ def ratio_search(
     and the dimensions. The best mean of the qualities at texels and between them is kept after each. ``request`` and
     ``border`` are those of :func:`.fit_image`.
     """
-    steps, limit = max(20, round(recipe.settings.steps * SHORT)), request.part(SEARCHED).deadline
+    steps, limit = max(20, round(recipe.steps * SHORT)), request.part(SEARCHED).deadline
     tried, best = {}, None
 
     def quality(key: tuple) -> float:
@@ -228,7 +217,7 @@ def ratio_search(
         if tried and limit is not None and limit.left() < limit.seconds / CANDIDATES:
             continue
         share = 1.0 if limit is None else limit.seconds / CANDIDATES / limit.left()
-        shortened = replaced(dataclasses.replace(candidate, dims=size.dims), steps=steps, measure_every=steps)
+        shortened = dataclasses.replace(candidate, dims=size.dims, steps=steps, measure_every=steps)
         title = f"try {size.columns}×{size.rows}×{size.dims} of {candidate.structure} → {size.cascaded}"
         limited = request if limit is None else dataclasses.replace(request, deadline=limit.part(share))
         table, result = fit_image(source, size, shortened, limited, border, title)
@@ -249,7 +238,7 @@ def ratio_search(
     return RatioSearch(sized(source, nbytes, recipe, side), recipe, list(tried.values()), best)
 
 
-def _candidates(recipe: ImageRecipe, side: int, free: bool, leader: Callable) -> Iterator[tuple[ImageRecipe, int]]:
+def _candidates(recipe: ImageSettings, side: int, free: bool, leader: Callable) -> Iterator[tuple[ImageSettings, int]]:
     """Yield recipes with sides of the cascaded array to try; later ones depend on the ``leader`` of those before."""
     yield from ((recipe, s) for s in sorted(SIDES[recipe.dims], key=lambda s: abs(math.log(s / side))))
     if not free or leader() is None:
@@ -270,7 +259,7 @@ def _candidates(recipe: ImageRecipe, side: int, free: bool, leader: Callable) ->
 
 
 def psnr_search(
-    source: Source, goal: float, recipe: ImageRecipe, request: FitRequest, border=None, most: int = TRAININGS
+    source: Source, goal: float, recipe: ImageSettings, request: FitRequest, border=None, most: int = TRAININGS
 ) -> tuple[Table | None, FitResult | None, list[dict]]:
     """Search the smallest file whose ``psnr_db`` is at least ``goal``, by trainings of full length.
 
@@ -320,7 +309,7 @@ def psnr_search(
 # ---------------------- Weights of maps ----------------------
 
 
-def _weights(request: FitRequest, source: Source, recipe: ImageRecipe) -> dict[str, float]:
+def _weights(request: FitRequest, source: Source, recipe: ImageSettings) -> dict[str, float]:
     """Return the weights of maps that differ from 1. Raises :class:`UsageError` for a map that the source lacks."""
     given = request.options["weights"]
     given = parse_weights(given) if isinstance(given, str) else dict(given)
@@ -335,7 +324,7 @@ def _weights(request: FitRequest, source: Source, recipe: ImageRecipe) -> dict[s
     return given
 
 
-def weights_as_seen(source: Source, recipe: ImageRecipe, nbytes: float, types: ModuleType) -> dict[str, float]:
+def weights_as_seen(source: Source, recipe: ImageSettings, nbytes: float, types: ModuleType) -> dict[str, float]:
     """Return weights of maps by what an error of each does to a shaded picture (:func:`balance_weights`).
 
     Returns {} (equal weights) if initial arrays of ``nbytes`` gain less than :data:`GAIN_DB` by them in pictures, if

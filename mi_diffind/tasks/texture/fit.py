@@ -11,14 +11,20 @@ from ...arrays import lookup
 from ...arrays.indirection import aligned_copy, unfolded
 from ...arrays.tables import MAX_BYTES, Table
 from ...core.errors import UsageError
-from ...fitting.loop import FitResult, Problem
-from ...fitting.task import FitRequest, Fitted
-from ...maps.arguments import requested_border, requested_bytes
+from ...fitting.task import FitRequest, FitResult, Fitted
 from ...maps.layout import Layout, smoothness
-from ...maps.model import complete, fit_maps, rehearse_pictures
+from ...maps.model import (
+    MapsProblem,
+    complete,
+    fit_maps,
+    rehearse_pictures,
+    requested_border,
+    requested_bytes,
+    strata,
+)
 from ...maps.pyramid import Pyramid, decibel, mean_square
 from ...maps.source import Source, load_source
-from . import PRESETS, TextureRecipe, arrays, parse_structure
+from . import TextureSettings, arrays, parse_structure
 from .arrays import PaperBudget, TextureBudget
 from .compressed import CompressedTexture, PaperNet, footprints, level_of, to_table
 
@@ -26,7 +32,7 @@ from .compressed import CompressedTexture, PaperNet, footprints, level_of, to_ta
 GAIN_DB = 1.0
 
 
-def layout_of(source: Source, recipe: TextureRecipe) -> Layout:
+def layout_of(source: Source, recipe: TextureSettings) -> Layout:
     """Return the layout of ``source`` by a recipe."""
     return Layout.of(source, recipe.once, None if recipe.normals else False, filtered=True)
 
@@ -37,86 +43,66 @@ def shares(levels: int) -> np.ndarray:
     return halves / halves.sum()
 
 
-class TextureProblem(Problem):
+class TextureProblem(MapsProblem):
     """Training problem of a texture: ``net`` (:mod:`.nets`) against the reference ``pyramid``."""
 
     tolerance = 0.02
-    harmless = 1e-2  # of values in [0, 1]
 
-    def __init__(self, net, pyramid: Pyramid, recipe: TextureRecipe, digest: str = ""):
-        self.net, self.pyramid, self.recipe, self.types = net, pyramid, recipe, pyramid.types
-        layout = pyramid.layout
-        self.groups = layout.channels_by_map()
-        self.weights = {name: len(channels) / layout.stored for name, channels in self.groups.items()}
+    def __init__(self, net, pyramid: Pyramid, recipe: TextureSettings, digest: str = ""):
+        super().__init__(net, pyramid.layout, recipe, pyramid.types)
+        self.pyramid = pyramid
         self.sizes = [level.shape[:2] for level in pyramid.values]
         self.starts = np.cumsum([0] + [rows * columns for rows, columns in self.sizes])
-        self.identity = {
-            "source": digest, **{k: v for k, v in dataclasses.asdict(recipe).items() if k != "settings"},
-            **self.form(net),
-        }  # fmt: skip
-        self.jittered = False
-        self._stretches = {}  # size of a batch → level, first texel, number of texels, … of each sample
+        self.identity = {"source": digest, **recipe.further, **self.form(net)}
 
     @staticmethod
     def form(net) -> dict:
         """Return what identifies the arrays to train, as JSON."""
         return {"structure": dataclasses.asdict(net.structure), "border": list(net.border)}
 
-    def begin(self, step: int, share: float) -> str:
-        """Start a step: decide whether its samples are jittered. Returns a text that names the decision."""
-        jitter = self.recipe.jitter
-        self.jittered = int((step + 1) * jitter) > int(step * jitter)
-        return f"jittered: {self.jittered}"
-
-    def _stretch(self, size: int) -> tuple:
+    def _stratum(self, size: int) -> tuple:
         """Return the stratum of each of ``size`` samples, as arrays of whole numbers.
 
         Level of detail; first texel, and number of texels, that the sample may be in; columns and rows of the level;
         index of the level's first texel among those of all levels.
         """
-        if size not in self._stretches:
+        if size not in self._strata:
             share = shares(len(self.sizes)) if self.recipe.samples == "levels" else np.array([1.0])
             counts = np.floor(share * size).astype(np.int64)
             counts[0] += size - counts.sum()
             parts = []
             for level, count in enumerate(counts):
                 rows, columns = self.sizes[level]
-                edges = np.arange(count + 1, dtype=np.uint64) * np.uint64(rows * columns) // np.uint64(max(1, count))
-                ones = np.ones(count, np.int64)
-                widths = np.maximum(np.diff(edges), 1)
-                start = int(self.starts[level])
-                parts.append((level * ones, edges[:-1], widths, columns * ones, rows * ones, start * ones))
+                ones, start = np.ones(count, np.int64), int(self.starts[level])
+                parts.append((level * ones, *strata(rows * columns, count), columns * ones, rows * ones, start * ones))
             merged = (np.concatenate(part).astype(np.uint32) for part in zip(*parts, strict=True))
-            self._stretches = {size: tuple(self.types.UInt32(aligned_copy(part)) for part in merged)}
-            dr.eval(self._stretches)
-        return self._stretches[size]
+            self._strata = {size: tuple(self.types.UInt32(aligned_copy(part)) for part in merged)}
+            dr.eval(self._strata)
+        return self._strata[size]
 
     def batch(self, rng, size: int):
         Float, UInt32 = self.types.Float, self.types.UInt32
-        level, first, count, columns, rows, start = self._stretch(size)
+        level, first, count, columns, rows, start = self._stratum(size)
         index = first + dr.minimum(UInt32(rng.random(Float, size) * Float(count)), count - 1)
         # Lanes of a packet beyond the last sample hold zeros, and an integer division by zero ends the process
         columns, rows = dr.maximum(columns, 1), dr.maximum(rows, 1)
         x, y = Float(index % columns) + 0.5, Float(index // columns) + 0.5
         if self.recipe.samples != "levels":
             x, y = x + rng.random(Float, size) - 0.5, y + rng.random(Float, size) - 0.5
-            layout = self.pyramid.layout
-            base, samples = max(layout.height, layout.width), self.recipe.samples
+            layout, samples = self.layout, self.recipe.samples
+            base = max(layout.height, layout.width)
             footprint = footprints(1 - rng.random(Float, size), samples, base)  # uniform in (0, 1]
             level = level_of(footprint, len(self.sizes))
             u, v = x / layout.width, y / layout.height
-            return [u, v, level, footprint], self._grouped(self.pyramid.filtered(u, v, level))
+            return [u, v, level, footprint], self.by_map(self.pyramid.filtered(u, v, level))
         level = Float(level)
         if not self.jittered:
             target = self.pyramid.texels(start + index)
-            return [x / Float(columns), y / Float(rows), level, None], self._grouped(target)
+            return [x / Float(columns), y / Float(rows), level, None], self.by_map(target)
         x, y = x + rng.random(Float, size) - 0.5, y + rng.random(Float, size) - 0.5
         level = lookup.clamp(level + rng.random(Float, size) - 0.5, 0.0, float(len(self.sizes) - 1))
         u, v = x / Float(columns), y / Float(rows)
-        return [u, v, level, None], self._grouped(self.pyramid.filtered(u, v, level))
-
-    def _grouped(self, stored: list) -> dict[str, list]:
-        return {name: [stored[i] for i in channels] for name, channels in self.groups.items()}
+        return [u, v, level, None], self.by_map(self.pyramid.filtered(u, v, level))
 
     def predict(self, net, inputs) -> dict[str, list]:
         return self.read(self.seen(net), inputs)
@@ -129,8 +115,8 @@ class TextureProblem(Problem):
         """Return the outputs of arrays (:meth:`seen`) for the inputs of a batch, by map."""
         u, v, level, footprint = inputs
         if isinstance(net, PaperNet) and footprint is not None:
-            return self._grouped(net.at_footprint(u, v, footprint))
-        return self._grouped(net.filtered(u, v, level))
+            return self.by_map(net.at_footprint(u, v, footprint))
+        return self.by_map(net.filtered(u, v, level))
 
     def measure(self, net) -> dict[str, float]:
         """Return the PSNR of the stored channels at the centres of at most 2¹⁶ texels a level, entries rounded."""
@@ -153,7 +139,7 @@ class TextureProblem(Problem):
 
 
 def problem_of(
-    source: Source, size: TextureBudget | PaperBudget, recipe: TextureRecipe, pyramid: Pyramid
+    source: Source, size: TextureBudget | PaperBudget, recipe: TextureSettings, pyramid: Pyramid
 ) -> TextureProblem:
     """Return the problem of training ``source`` at a size by a recipe, with initial arrays."""
     if isinstance(size, PaperBudget):
@@ -167,7 +153,7 @@ def problem_of(
 def fit_texture(
     source: Source,
     size: TextureBudget | PaperBudget | None,
-    recipe: TextureRecipe,
+    recipe: TextureSettings,
     request: FitRequest,
     pyramid: Pyramid,
     level_bias: float = 0.0,
@@ -178,7 +164,7 @@ def fit_texture(
     time and the checkpoint; its settings are replaced by those of the ``recipe``. ``level_bias`` is stored in the file;
     levels are trained as they are stored. Errors are those of :meth:`.CompressedTexture.measure`.
     """
-    request = dataclasses.replace(request, settings=recipe.settings)
+    request = dataclasses.replace(request, settings=recipe)
     problem = None if size is None else problem_of(source, size, recipe, pyramid)
 
     def stored() -> CompressedTexture:
@@ -199,13 +185,6 @@ def rounded(net):
 
 #: Least smoothness of a smooth texture, in dB (:func:`~mi_diffind.maps.layout.smoothness`).
 SMOOTH_DB = 30.0
-
-
-def recipe_of(preset: str, settings, options) -> TextureRecipe:
-    """Return the recipe of a preset, changed by the options."""
-    recipe = PRESETS[preset]
-    samples = options["footprint_samples"] or recipe.samples
-    return dataclasses.replace(recipe, settings=settings or recipe.settings, samples=samples)
 
 
 def check(request: FitRequest) -> None:
@@ -234,7 +213,7 @@ def fit(request: FitRequest) -> Fitted:
     """
     options = request.options
     source = load_source(options["source"], nonfinite=options["nonfinite"])
-    recipe = recipe_of(request.preset, request.settings, options)
+    recipe = request.settings
     pyramid = Pyramid.of(source, layout_of(source, recipe), request.types, requested_border(options))
     requested, size = requested_bytes(options, source), None
     if pyramid.layout.stored:
@@ -244,7 +223,7 @@ def fit(request: FitRequest) -> Fitted:
     return complete(request, source, fitted, CompressedTexture.of(fitted.table, request.types.TensorXf), requested)
 
 
-def size_of(source: Source, pyramid: Pyramid, nbytes: float, recipe: TextureRecipe, options):
+def size_of(source: Source, pyramid: Pyramid, nbytes: float, recipe: TextureSettings, options):
     """Return the memory budget of the arrays for ``nbytes`` bytes. Raises :class:`UsageError`."""
     if recipe.layered:
         size = _layered_size(pyramid, nbytes, options["structure"] or "auto", options["skip"], options["cascaded"])

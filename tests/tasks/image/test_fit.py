@@ -14,7 +14,7 @@ from mi_diffind.fitting.loop import FitResult
 from mi_diffind.fitting.task import FitRequest
 from mi_diffind.maps import as_seen
 from mi_diffind.maps.source import from_arrays
-from mi_diffind.tasks.image import PAGED, PRESETS, STRUCTURES, fit, parse_weights, replaced, training
+from mi_diffind.tasks.image import PAGED, PRESETS, STRUCTURES, fit, parse_weights, training
 from mi_diffind.tasks.image.arrays import CASCADED_LIMITS, CASCADED_STEP, CompressedImage
 
 OURS, PAPER = PRESETS["ours"], PRESETS["paper"]
@@ -22,7 +22,7 @@ OURS, PAPER = PRESETS["ours"], PRESETS["paper"]
 pytestmark = pytest.mark.usefixtures("few_samples")
 
 #: Request of searches whose trainings are pretended.
-REQUEST = FitRequest("ours", OURS.settings, None)
+REQUEST = FitRequest("ours", OURS, None)
 
 
 def noise(height=16, width=16, channels=3):
@@ -37,7 +37,7 @@ def smooth(side=24):
 
 
 def short(steps=8, **changed):
-    return replaced(dataclasses.replace(OURS, **changed), steps=steps, batch=64, measure_every=steps)
+    return dataclasses.replace(OURS, steps=steps, batch=64, measure_every=steps, **changed)
 
 
 def bytes_of(size, channels):
@@ -145,11 +145,11 @@ def test_ratio_search_picks_the_best_that_it_tried(monkeypatch, seed, interrupt)
     assert (found.size.dims, found.size.cascaded) == (best["dims"], best["cascaded"])
     assert (found.size.bits, found.size.coarse) == STRUCTURES[best["structure"]]
     assert (found.recipe.dims, found.recipe.structure) == (best["dims"], best["structure"])
-    assert found.recipe.settings == short(steps=400).settings  # not those of the short trainings
+    assert found.recipe.common == short(steps=400).common  # not those of the short trainings
     assert found.best[0].measured["psnr_db"] == best["psnr_db"]
     for tried, (size, recipe) in zip(found.tried, calls, strict=True):
         assert tried["bytes"] == size.nbytes == bytes_of(size, 3) <= 3000 * 1.05
-        assert recipe.settings.steps == 50
+        assert recipe.steps == 50
     assert len({(t["dims"], t["structure"], t["cascaded"]) for t in found.tried}) == len(calls)  # none twice
 
 

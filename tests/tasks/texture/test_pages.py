@@ -27,14 +27,13 @@ def sparse(side=64):
 
 def recipe(steps=4):
     own = PRESETS["ours"]
-    settings = dataclasses.replace(own.settings, steps=steps, batch=2048, measure_every=steps)
-    return dataclasses.replace(own, settings=settings)
+    return dataclasses.replace(own, steps=steps, batch=2048, measure_every=steps)
 
 
 def trained(source, size, steps=4):
     own = recipe(steps)
     pyramid = Pyramid.of(source, fit.layout_of(source, own), TYPES, ("repeat", "clamp"))
-    table, _ = fit.fit_texture(source, size, own, FitRequest("ours", own.settings, TYPES, progress=False), pyramid)
+    table, _ = fit.fit_texture(source, size, own, FitRequest("ours", own, TYPES, progress=False), pyramid)
     return table
 
 

@@ -51,7 +51,7 @@ def material(height=32, width=24, seed=0):
 
 def quick(recipe=OURS, **settings):
     given = {"steps": 4, "batch": 2048, "measure_every": 4, **settings}
-    return dataclasses.replace(recipe, settings=dataclasses.replace(recipe.settings, **given))
+    return dataclasses.replace(recipe, **given)
 
 
 def trained(source, size, recipe, **request):
@@ -59,7 +59,7 @@ def trained(source, size, recipe, **request):
     # Of one size and one border, mostly: what differs has to be compiled anew
     border = request.pop("border", ("repeat", "clamp"))
     pyramid = Pyramid.of(source, fit.layout_of(source, recipe), types, border)
-    request = FitRequest("ours" if recipe.layered else "paper", recipe.settings, types, progress=False, **request)
+    request = FitRequest("ours" if recipe.layered else "paper", recipe, types, progress=False, **request)
     return fit.fit_texture(source, size, recipe, request, pyramid)
 
 
