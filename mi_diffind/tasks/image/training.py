@@ -18,7 +18,7 @@ from ...arrays.indirection import aligned, aligned_copy, rounded, stored_form
 from ...arrays.pages import most_entries, page_counts
 from ...arrays.tables import Table
 from ...fitting.task import FitRequest, FitResult
-from ...maps.layout import Layout, choose_borders, smoothness
+from ...maps.layout import Layout, choose_borders, gain_of_pages, smoothness
 from ...maps.model import MapsProblem, fit_maps, strata
 from ...maps.pyramid import decibel, mean_square, padded_texels, weighted_sum
 from ...maps.source import Source
@@ -71,8 +71,9 @@ def _suitable(values: np.ndarray, recipe: ImageSettings, nbytes: float) -> str:
         side = arrays.cascaded_side(nbytes, k, dims)
         size = arrays.fit_bytes(nbytes, k, height, width, side, dims, STRUCTURES[pages][0])
         fewest = ENTRIES * math.prod(page_counts((height, width)))
-        if fewest <= arrays.page_budget(size, values.shape) <= most_entries(2):
-            gain, psnr = arrays.gain_of_pages(values, size, choose_borders(values))
+        entries = arrays.page_budget(size, values.shape)
+        if fewest <= entries <= most_entries(2):
+            gain, psnr = gain_of_pages(values, size.dims, entries, choose_borders(values))
             if gain >= GAIN_DB:
                 return pages if smooth or psnr >= FINE_DB else "pages of 2 + 6 bits"
     return "6 bits" if smooth else "2 + 6 bits"

@@ -12,7 +12,7 @@ from ...arrays.indirection import aligned_copy, unfolded
 from ...arrays.tables import MAX_BYTES, Table
 from ...core.errors import UsageError
 from ...fitting.task import FitRequest, FitResult, Fitted
-from ...maps.layout import Layout, smoothness
+from ...maps.layout import Layout, gain_of_pages, smoothness
 from ...maps.model import (
     MapsProblem,
     complete,
@@ -235,6 +235,11 @@ def size_of(source: Source, pyramid: Pyramid, nbytes: float, recipe: TextureSett
     return size
 
 
+def _page_gain(pyramid: Pyramid, size: TextureBudget) -> float:
+    """Return the gain of pages over one grid of equal bytes at level 0, in dB."""
+    return gain_of_pages(pyramid.values[0], size.dims, size.page_entries, pyramid.border)[0]
+
+
 def _layered_size(pyramid: Pyramid, nbytes: float, structure: str, skip: int | None, cascaded: int | None):
     """Return the budget of pages or fine arrays: those of a ``structure``, or the best for the texture."""
     shape, fine = pyramid.values[0].shape, parse_structure(structure) or None
@@ -246,10 +251,9 @@ def _layered_size(pyramid: Pyramid, nbytes: float, structure: str, skip: int | N
         raise UsageError(f"--skip: found {skip}, the texture has levels 0 to {pyramid.levels - 1}")
     if skip is None:
         size = arrays.paged(*shape, nbytes, cascaded)
-        wanted = structure == "pages"
-        if wanted and size is None:
+        if size is None and structure == "pages":
             raise UsageError("--structure: found pages, for which the texture or its bytes are too small or too large")
-        if wanted or (size and arrays.gain_of_pages(pyramid.values, size, pyramid.border) >= GAIN_DB):
+        if size is not None and (structure == "pages" or _page_gain(pyramid, size) >= GAIN_DB):
             return size
     try:
         smooth = smoothness(pyramid.values[0]) >= SMOOTH_DB

@@ -139,7 +139,7 @@ def test_which_textures_get_pages():
     noise = np.random.default_rng(4).integers(0, 256, (64, 64, 3), np.uint8)
     for maps, more in ((source, True), (from_arrays({"albedo": noise}), False)):
         pyramid = Pyramid.of(maps, fit.layout_of(maps, recipe()), TYPES, ("repeat", "clamp"))
-        gain = arrays.gain_of_pages(pyramid.values, paged(maps), pyramid.border)
+        gain = fit._page_gain(pyramid, paged(maps))
         assert (gain >= fit.GAIN_DB) == more, gain
     assert arrays.paged(8, 8, 3, 100) is None and arrays.paged(1024, 1024, 3, 20000) is None
     assert arrays.paged(512, 512, 3, 65536).nbytes <= 65536
