@@ -46,7 +46,36 @@ def allocate_maps(
     return arrays
 
 
-def stored_entries(table: Table, name: str, size: tuple[int, int]) -> int:
+def read_layout(table: Table) -> Layout:
+    """Return the layout of the maps in a table. Raises :class:`TableError` for damaged settings."""
+    try:
+        return Layout.from_json(table.settings["layout"])
+    except (KeyError, TypeError, ValueError, OverflowError) as e:
+        raise TableError(f"{table.path}: its settings describe no {table.task} ({e})") from None
+
+
+def check_arrays(table: Table, shapes: Mapping[str, tuple], pages: Mapping[str, tuple[int, int]]) -> None:
+    """Raise :class:`TableError` unless a table holds arrays of these ``shapes``, of numbers in [0, 1].
+
+    ``None`` in a shape stands for any number. ``pages`` maps the names of arrays of pages to the rows and columns of
+    the image that they cover; the first number of their shapes is that of all their entries.
+    """
+    path, expected = table.path, {*shapes, *(name + PAGES for name in pages)}
+    if set(table.arrays) != expected:
+        names, wanted = (", ".join(sorted(n)) or "none" for n in (table.arrays, expected))
+        raise TableError(f"{path}: holds the arrays {names}, expected {wanted}")
+    for name, shape in shapes.items():
+        array = table.arrays[name]
+        if name in pages:
+            shape = (_page_entries(table, name, pages[name]), shape[-1])
+        if len(array.shape) != len(shape) or any(w not in (None, n) for n, w in zip(array.shape, shape, strict=True)):
+            text = " x ".join("N" if n is None else str(n) for n in shape)
+            raise TableError(f'{path}: array "{name}" has the shape {array.shape}, expected {text}')
+        if not array.is_pointer:
+            raise TableError(f'{path}: array "{name}" has entries outside of [0, 1]')
+
+
+def _page_entries(table: Table, name: str, size: tuple[int, int]) -> int:
     """Return the number of entries of the pages of an array, on an image of ``size``. Raises :class:`TableError`."""
     pages, counts, largest = table.arrays[name + PAGES], page_counts(size), 2 ** SIDE_BITS[1]
     where = f'{table.path}: array "{name}{PAGES}"'

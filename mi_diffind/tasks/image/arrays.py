@@ -21,7 +21,7 @@ import numpy as np
 from ...arrays.budget import Budget, array_bytes
 from ...arrays.indirection import DifferentiableArray, Indirection, ramp
 from ...arrays.pages import PagedArray, page_counts, page_entries, page_positions, page_shift, page_sizes
-from ...arrays.tables import PAGES, Table, TableError, load_table, to_stored_arrays
+from ...arrays.tables import PAGES, Table, load_table, to_stored_arrays
 from ...core.compat import backend_module
 from ...maps.layout import (
     MARGIN,
@@ -33,7 +33,7 @@ from ...maps.layout import (
     linear_in_pointer,
     neighbour_covariance,
 )
-from ...maps.model import MapsModel, allocate_maps, stored_entries
+from ...maps.model import MapsModel, allocate_maps, check_arrays, read_layout
 from ...maps.pyramid import CompressedMaps
 from . import CoarsePrimary
 
@@ -337,34 +337,16 @@ def to_table(image: CompressedImage, settings: dict) -> Table:
 def load(path: str | os.PathLike) -> Table:
     """Read and check a table file of this task. Raises :class:`.TableError`."""
     table = load_table(path, "image")
-    try:
-        layout = Layout.from_json(table.settings["layout"])
-    except (KeyError, TypeError, ValueError, OverflowError) as e:
-        raise TableError(f"{path}: its settings describe no image ({e})") from None
-    names = set(table.arrays) - {PRIMARY_PAGES}
-    expected = [{"primary", "cascaded"}, {*PRIMARIES, "cascaded"}] if layout.stored else [set()]
-    if names not in expected:
-        allowed = " or ".join(", ".join(sorted(e)) or "none" for e in expected)
-        raise TableError(f"{path}: holds the arrays {', '.join(sorted(names)) or 'none'}, expected {allowed}")
+    layout, arrays = read_layout(table), table.arrays
     if not layout.stored:
+        check_arrays(table, {}, {})
         return table
-    shapes = {name: array.shape for name, array in table.arrays.items() if name != PRIMARY_PAGES}
-    if PRIMARY_PAGES in table.arrays:
-        entries, size = shapes["primary"], (layout.height, layout.width)
-        count = stored_entries(table, "primary", size)
-        if len(entries) != 2 or entries[0] != count:
-            raise TableError(f'{path}: array "primary" has the shape {entries}, expected {count} entries of its pages')
-        shapes["primary"] = (*page_counts(size), entries[-1])
-    cascaded = shapes.pop("cascaded")
-    pointers = sum(shape[-1] for shape in shapes.values())
-    if any(len(s) != 3 for s in shapes.values()) or len(cascaded) != pointers + 1 or cascaded[-1] != layout.stored:
-        raise TableError(
-            f"{path}: primary arrays of the shapes {', '.join(map(str, shapes.values()))} and a cascaded array of "
-            f"{cascaded} do not fit an image of {layout.stored} stored channel(s)"
-        )
-    for name, array in table.arrays.items():
-        if name != PRIMARY_PAGES and not array.is_pointer:
-            raise TableError(f'{path}: array "{name}" has entries outside of [0, 1]')
+    pages = {"primary": (layout.height, layout.width)} if PRIMARY_PAGES in arrays else {}
+    shapes = {name: (None,) * 3 for name in PRIMARIES if name == "primary" or name in arrays}
+    pointers = sum(arrays[name].shape[-1] for name in shapes if name in arrays)
+    if pages and "primary" in arrays:
+        shapes["primary"] = (None, arrays["primary"].shape[-1])
+    check_arrays(table, {**shapes, "cascaded": (None,) * pointers + (layout.stored,)}, pages)
     return table
 
 

@@ -19,7 +19,7 @@ from ...core.compat import backend_module
 from ...core.errors import UsageError
 from ...maps.arguments import BIAS_RANGE
 from ...maps.layout import Layout
-from ...maps.model import MapsModel, allocate_maps, stored_entries
+from ...maps.model import MapsModel, allocate_maps, check_arrays, read_layout
 from ...maps.pyramid import FilteredMaps, Pyramid, around, decibel, level_sizes, map_figure
 from ...maps.source import Source
 
@@ -30,19 +30,17 @@ FOOTPRINTS = ("power", "exponential")
 FRACTION = 0.5
 
 
-def threshold(base: int) -> float:
-    """Return ``t = 1 / N_base`` for the side of a texture in texels; half of [0, 1] for a side of 1."""
-    return 1 / max(2, base)
+def exponent(base: int) -> float:
+    """Return ``n = log_p(t)``, for which a fraction p of all ``u^n`` lies below ``t`` (equation 6).
+
+    ``t = 1 / base`` for the side of a texture in texels; half of [0, 1] for a side of 1.
+    """
+    return math.log(1 / max(2, base)) / math.log(FRACTION)
 
 
-def exponent(t: float) -> float:
-    """Return ``n = log_p(t)``, for which a fraction p of all ``u^n`` lies below ``t`` (equation 6)."""
-    return math.log(t) / math.log(FRACTION)
-
-
-def exponential_rate(t: float) -> float:
+def exponential_rate(base: int) -> float:
     """Return ``λ_e = −ln(1 − p) / t``, for which a fraction p of all samples lies below ``t`` (equation 9)."""
-    return -math.log1p(-FRACTION) / t
+    return -math.log1p(-FRACTION) / (1 / max(2, base))
 
 
 def footprints(u, distribution: str, base: int):
@@ -51,16 +49,14 @@ def footprints(u, distribution: str, base: int):
     ``distribution`` is one of :data:`FOOTPRINTS`: ``x = u^n`` (equation 3), or ``x = −ln(u) / λ_e`` (equation 7), at
     most 1.
     """
-    t = threshold(base)
     if distribution == "power":
-        return u ** exponent(t)
-    return dr.minimum(-dr.log(dr.maximum(u, 1e-30)) / exponential_rate(t), 1)
+        return u ** exponent(base)
+    return dr.minimum(-dr.log(dr.maximum(u, 1e-30)) / exponential_rate(base), 1)
 
 
 def share_below(x: np.ndarray, distribution: str, base: int) -> np.ndarray:
     """Return the fraction of footprints below ``x`` in [0, 1): ``x^(1/n)`` or ``1 − e^(−λ_e x)`` (equations 5, 8)."""
-    t = threshold(base)
-    return x ** (1 / exponent(t)) if distribution == "power" else 1 - np.exp(-exponential_rate(t) * x)
+    return x ** (1 / exponent(base)) if distribution == "power" else 1 - np.exp(-exponential_rate(base) * x)
 
 
 def footprint_histogram(distribution: str, levels: int) -> np.ndarray:
@@ -556,59 +552,46 @@ def structure_of(settings: dict, layout: Layout):
 
 def load(path: str | os.PathLike) -> Table:
     """Read and check a table file of this task. Raises :class:`.TableError`."""
-    table, expected = load_table(path, "texture"), ()
+    table = load_table(path, "texture")
+    layout = read_layout(table)
     try:
-        layout = Layout.from_json(table.settings["layout"])
         bias_of(table.settings)
         structure, border = structure_of(table.settings, layout) if layout.stored else (None, None)
     except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as e:
         raise TableError(f"{path}: its settings describe no texture ({e})") from None
-    layers = {f"level{x.level}": x for x in getattr(structure, "layers", ())}
-    if isinstance(structure, PaperStructure):
-        expected = PAPER
-    elif structure is not None:
-        pages = [name + PAGES for name, x in layers.items() if x.paged]
-        extras = ["extras"] if "extras" in table.arrays else []
-        expected = (*layers, *pages, "coarse", "cascaded", *extras)
-    if set(table.arrays) != set(expected):
-        names, wanted = (", ".join(sorted(n)) or "none" for n in (table.arrays, expected))
-        raise TableError(f"{path}: holds the arrays {names}, expected {wanted}")
-    for name, shape in _shapes(table, layout, structure, layers).items():
-        array = table.arrays[name]
-        if len(array.shape) != len(shape) or any(w not in (None, n) for n, w in zip(array.shape, shape, strict=True)):
-            text = " x ".join("N" if n is None else str(n) for n in shape)
-            raise TableError(f'{path}: array "{name}" has the shape {array.shape}, expected {text}')
-        if not array.is_pointer:
-            raise TableError(f'{path}: array "{name}" has entries outside of [0, 1]')
-        layer = layers.get(name)
-        if layer or name == "extras":
-            along = table.arrays[name + PAGES].border if layer and layer.paged else array.border
-            wanted = border if layer else ("clamp", *border)
-            if along != wanted:
-                raise TableError(f'{path}: array "{name}" has the borders {along}, expected {wanted}')
-        if layer and array.storage == "uint8" and array.bits != layer.bits:
-            raise TableError(
-                f'{path}: array "{name}" has {array.bits} bits an entry, expected {layer.bits} by its settings'
-            )
+    if structure is None:
+        check_arrays(table, {}, {})
+    elif isinstance(structure, PaperStructure):
+        check_arrays(
+            table, {"primary0": (None, None, 3), "primary1": (None, 1), "cascaded": (*(None,) * 4, layout.stored)}, {}
+        )
+    else:
+        _check_layers(table, layout, structure, border)
     return table
 
 
-def _shapes(table: Table, layout: Layout, structure, layers: dict[str, FineLayer]) -> dict[str, tuple]:
-    """Return the shapes of arrays by name; ``None`` stands for any number. Raises :class:`TableError`."""
-    if structure is None:
-        return {}
-    if isinstance(structure, PaperStructure):
-        return {"primary0": (None, None, 3), "primary1": (None, 1), "cascaded": (*(None,) * 4, layout.stored)}
-    dims, axes = table.arrays["coarse"].shape[-1], len(table.arrays["cascaded"].shape) - 1
-    shapes = {}
-    for name, layer in layers.items():
-        if layer.channels > dims or (layer.channels < dims and structure.is_pointer(layer)):
-            raise TableError(f'{table.path}: array "{name}" has {layer.channels} channels, its pointers have {dims}')
-        size = structure.sizes[layer.level]
-        shapes[name] = (*((stored_entries(table, name, size),) if layer.paged else size), layer.channels)
+def _check_layers(table: Table, layout: Layout, structure: LayeredStructure, border: tuple[str, str]) -> None:
+    """Raise :class:`TableError` unless a table holds the arrays of a structure."""
+    path, arrays, layers = table.path, table.arrays, {f"level{x.level}": x for x in structure.layers}
+    dims = arrays["coarse"].shape[-1] if "coarse" in arrays else 0
+    axes = len(arrays["cascaded"].shape) - 1 if "cascaded" in arrays else 0
+    sizes = {name: structure.sizes[x.level] for name, x in layers.items()}
+    shapes = {name: (*sizes[name], x.channels) for name, x in layers.items()}
     shapes["coarse"] = (sum(map(math.prod, structure.sizes[structure.skip :])), dims)
     shapes["cascaded"] = (structure.skip + 1,) * (axes > dims) + (None,) * dims + (layout.stored,)
-    return shapes | ({"extras": (None, None, None, len(NEUTRAL))} if "extras" in table.arrays else {})
+    shapes |= {"extras": (None, None, None, len(NEUTRAL))} if "extras" in arrays else {}
+    check_arrays(table, shapes, {name: sizes[name] for name, x in layers.items() if x.paged})
+    for name, layer in layers.items():
+        array, along = arrays[name], arrays[name + PAGES if layer.paged else name].border
+        if layer.channels > dims or (layer.channels < dims and structure.is_pointer(layer)):
+            raise TableError(f'{path}: array "{name}" has {layer.channels} channels, its pointers have {dims}')
+        if along != border:
+            raise TableError(f'{path}: array "{name}" has the borders {along}, expected {border}')
+        if array.storage == "uint8" and array.bits != layer.bits:
+            bits = f"{layer.bits} by its settings"
+            raise TableError(f'{path}: array "{name}" has {array.bits} bits an entry, expected {bits}')
+    if "extras" in arrays and (along := arrays["extras"].border) != ("clamp", *border):
+        raise TableError(f'{path}: array "extras" has the borders {along}, expected {("clamp", *border)}')
 
 
 class TextureModel(MapsModel):
