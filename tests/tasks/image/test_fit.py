@@ -15,7 +15,7 @@ from mi_diffind.fitting.task import FitRequest
 from mi_diffind.maps import as_seen
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.tasks.image import PAGED, PRESETS, STRUCTURES, fit, parse_weights, training
-from mi_diffind.tasks.image.arrays import CASCADED_LIMITS, CASCADED_STEP, CompressedImage
+from mi_diffind.tasks.image.arrays import CompressedImage
 
 OURS, PAPER = PRESETS["ours"], PRESETS["paper"]
 
@@ -80,15 +80,6 @@ def test_default_sizes_have_the_requested_bytes(height, width, recipe, monkeypat
                 more = dataclasses.replace(size, rows=size.rows + 1, columns=size.columns + 1)
                 few = requested < 10_000 and size.nbytes <= requested < more.nbytes
                 assert few or size.nbytes == pytest.approx(requested, rel=0.05)
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (7, 5), (1, 30)])
-@pytest.mark.parametrize("recipe", [OURS, PAPER])
-def test_tiny_images_have_the_smallest_arrays(shape, recipe):
-    source = noise(*shape)
-    size = fit.default_size(source, source.nbytes / 12, recipe)
-    stored = training.layout_of(source, recipe).stored
-    assert (size.rows, size.columns, size.cascaded) == (1, 1, 4) and size.channels == max(1, stored)
 
 
 def test_the_structure_follows_the_image():
@@ -172,22 +163,6 @@ def test_ratio_search_finds_a_peak(monkeypatch):
     assert found.size.bits == 3 and found.size.coarse is not None
 
 
-def test_ratio_search_where_nothing_fits(monkeypatch):
-    source = noise(7, 5)
-    calls = pretend(lambda size, recipe: 30, monkeypatch)
-    for recipe in (OURS, PAPER):
-        found = fit.ratio_search(source, 20, recipe, REQUEST, recipe is OURS)
-        assert found.tried == [] and not calls and found.best is None
-        assert found.size == fit.default_size(source, 20, recipe)
-
-
-def test_sides_to_try_are_allowed():
-    for dims, sides in fit.SIDES.items():
-        assert max(sides) <= CASCADED_LIMITS[dims - 1] and list(sides) == sorted(sides)
-        assert all(side % CASCADED_STEP == 0 for side in sides)
-    assert set(fit.TRIED) <= set(STRUCTURES)
-
-
 # ---------------------- By quality ----------------------
 
 
@@ -217,15 +192,6 @@ def test_quality_search_is_small_enough(monkeypatch, capsys, slope, bend, wobble
     missed = [t["bytes"] for t in tried if t["psnr_db"] < goal and t["bytes"] < table.nbytes]
     if wobble == 0 and missed:
         assert table.nbytes <= (1.1 if len(tried) < 8 else 2) * max(missed)  # a row is more than NEAR of a small file
-
-
-def test_quality_search_needs_few_trainings(monkeypatch):
-    """Quality rises by as much an octave as is supposed."""
-    for goal in (26, 30):
-        calls = pretend(by_bytes(fit.OCTAVE_DB), monkeypatch)
-        table, *_ = fit.psnr_search(noise(256, 256), goal, short(), REQUEST)
-        exact = 1000 * 2 ** ((goal - 25) / 2.5)
-        assert exact <= table.nbytes < 1.07 * exact and len(calls) <= 6
 
 
 def test_quality_search_ends(monkeypatch):

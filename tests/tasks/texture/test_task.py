@@ -254,26 +254,6 @@ def test_levels_are_continuous(made, rng):
     assert max(steps) < 0.06 and max(steps) > 1e-3
 
 
-def test_gradients_are_finite(made, rng):
-    _, _, texture, _ = made
-    types = texture.types
-    u, v = (types.Float(aligned(x)) for x in rng.random((2, 400)))
-    level = types.Float(aligned(rng.uniform(0, texture.levels - 1, 400)))
-    level[0], u[1] = 0, 0
-    dr.enable_grad(u, v, level, [a.data for a in texture.arrays.values()])
-    dr.backward(sum(texture.filtered(u, v, level), types.Float(0)))
-    for x in (u, v, level, *(a.data.array for a in texture.arrays.values())):
-        g = dr.grad(x).numpy()
-        assert np.isfinite(g).all() and np.abs(g).max() > 0
-    # Along u: against finite differences at places where it is smooth
-    eps = 1e-3
-    with dr.suspend_grad():
-        high, low = (sum(texture.filtered(u + dr.opaque(types.Float, e), v, level)).numpy() for e in (eps, -eps))
-    slope = (high - low) / (2 * eps)
-    assert np.median(np.abs(slope - dr.grad(u).numpy())) < 0.1 * np.median(np.abs(slope))
-    dr.disable_grad([a.data for a in texture.arrays.values()])
-
-
 # -- what comes out ---------------------------------------------------------------------------------------------------
 
 
