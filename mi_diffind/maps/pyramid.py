@@ -382,11 +382,11 @@ class Pyramid(FilteredMaps):
             corners.append(around(x, dr.maximum(UInt32(n) >> level, 1), border))
         columns = dr.maximum(UInt32(self.layout.width) >> level, 1)
         offset = dr.gather(UInt32, self._offsets, level, active)
-        total = None
-        for row, a in corners[0]:
-            for column, b in corners[1]:
-                total = weighted_sum(a * b, self.interpolated_texels(offset + row * columns + column, active), total)
-        return total
+        return lookup.weighted_sum(
+            (a * b, self.interpolated_texels(offset + row * columns + column, active))
+            for row, a in corners[0]
+            for column, b in corners[1]
+        )
 
     def interpolated_texels(self, index, active=True) -> list:
         """Return the values of texels, given their ``index`` as in :meth:`texels`, in the form that is interpolated."""
@@ -452,12 +452,9 @@ def _halved_channels(types: ModuleType, channels: list, rows: int, columns: int)
     # Opaque, so that one kernel halves images of all sizes
     width, stride = dr.opaque(types.UInt32, max(1, columns // 2)), dr.opaque(types.UInt32, columns)
     down, across = _covered(types, index // width, rows), _covered(types, index % width, columns)
-    total = None
-    for i, a in down:
-        for j, b in across:
-            place = dr.fma(i, stride, j)
-            total = weighted_sum(a * b, [dr.gather(types.Float, x, place) for x in channels], total)
-    return total
+    return lookup.weighted_sum(
+        (a * b, [dr.gather(types.Float, x, dr.fma(i, stride, j)) for x in channels]) for i, a in down for j, b in across
+    )
 
 
 def _covered(types: ModuleType, i, n: int) -> list:
@@ -477,13 +474,6 @@ def _rescaled(types: ModuleType, mean: list, signed: bool) -> list:
     valid = length > 1e-6
     vector = dr.select(valid, vector / dr.select(valid, length, 1), types.Array3f(0, 0, 1)) * mean[3]
     return list(vector if signed else dr.fma(vector, 0.5, 0.5))
-
-
-def weighted_sum(weight, values: list, total: list | None) -> list:
-    """Return ``total + weight · values``, channel by channel; ``total`` is ``None`` at the start of a sum."""
-    if total is None:
-        return [weight * value for value in values]
-    return [dr.fma(weight, value, t) for value, t in zip(values, total, strict=True)]
 
 
 def padded_texels(types: ModuleType, texels, width: int, index, active=True) -> list:

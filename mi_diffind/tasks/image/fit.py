@@ -106,7 +106,8 @@ def _train(request: FitRequest, source: Source, recipe: ImageSettings) -> tuple[
     if not layout_of(source, recipe).stored:  # all channels are constant
         return Fitted(*fit_image(source, None, recipe, request, border), figures={"tried": []}), None
     if options["psnr"] is not None:
-        return _for_psnr(request, source, recipe, border), None
+        table, result, tried = psnr_search(source, float(options["psnr"]), recipe, request, border)
+        return Fitted(table, result, figures={"tried": tried}), None
     requested = requested_bytes(options, source)
     tried, lines = [], []
     if options["ratio_search"]:
@@ -135,19 +136,6 @@ def _train(request: FitRequest, source: Source, recipe: ImageSettings) -> tuple[
             f"{most_entries(2):,} entries: request fewer bytes or another structure"
         )
     return Fitted(*fit_image(source, size, recipe, request, border), lines, {"tried": tried}), requested
-
-
-def _for_psnr(request: FitRequest, source: Source, recipe: ImageSettings, border) -> Fitted:
-    """Return the smallest file of a wanted quality. Raises :class:`FittingError`."""
-    goal = float(request.options["psnr"])
-    table, result, tried = psnr_search(source, goal, recipe, request, border)
-    if table is None:
-        best = max(tried, key=lambda t: t["psnr_db"])
-        raise FittingError(
-            f"{request.options['source']}: {goal:g} dB were not reached; the best of {len(tried)} sizes had "
-            f"{best['psnr_db']:.2f} dB in {best['bytes']:,} bytes: give more --steps or a lower --psnr"
-        )
-    return Fitted(table, result, figures={"tried": tried})
 
 
 # ---------------------- Sizes ----------------------
@@ -260,16 +248,15 @@ def _candidates(recipe: ImageSettings, side: int, free: bool, leader: Callable) 
 
 def psnr_search(
     source: Source, goal: float, recipe: ImageSettings, request: FitRequest, border=None, most: int = TRAININGS
-) -> tuple[Table | None, FitResult | None, list[dict]]:
+) -> tuple[Table, FitResult, list[dict]]:
     """Search the smallest file whose ``psnr_db`` is at least ``goal``, by trainings of full length.
 
     Sizes follow the secant of quality over the logarithm of bytes. The search ends when a sufficient size is within
-    :data:`NEAR` of an insufficient one, or after ``most`` trainings. Returns the table (``None`` if not even the
-    largest primary reaches the goal), the record of its training, and the list of trainings; a line is printed for
-    each. After Ctrl-C the record is marked ``interrupted``; ``KeyboardInterrupt`` is raised if no training had reached
-    the goal.
+    :data:`NEAR` of an insufficient one, or after ``most`` trainings. Returns the table, the record of its training, and
+    the list of trainings; a line is printed for each. After Ctrl-C the record is marked ``interrupted``. Raises
+    :class:`FittingError`, or after Ctrl-C ``KeyboardInterrupt``, if no training has reached the goal.
     """
-    tried, best = [], (None, None)
+    tried, best = [], None
     most = most if request.deadline is None else min(most, LIMITED_TRAININGS)
     nbytes = middle = source.nbytes / 12
     while len(tried) < most:
@@ -282,10 +269,10 @@ def psnr_search(
         psnr = table.measured["psnr_db"]
         tried.append({"bytes": size.nbytes, "psnr_db": psnr, "rows": size.rows, "cascaded": size.cascaded})
         print(f"{size.nbytes:,} bytes: {psnr:.2f} dB")
-        if psnr >= goal and (best[0] is None or table.nbytes < best[0].nbytes):
+        if psnr >= goal and (best is None or table.nbytes < best[0].nbytes):
             best = table, result
         if result.interrupted:
-            if best[0] is None:
+            if best is None:
                 raise KeyboardInterrupt
             best[1].interrupted = True
             break
@@ -303,6 +290,12 @@ def psnr_search(
         octaves = (goal - psnr) / OCTAVE_DB
         octaves = math.copysign(min(max(abs(octaves) * 1.2, 0.25), 3), octaves)
         nbytes = middle = size.nbytes * 2**octaves
+    if best is None:
+        nearest = max(tried, key=lambda t: t["psnr_db"])
+        raise FittingError(
+            f"{request.options['source']}: {goal:g} dB were not reached; the best of {len(tried)} sizes had "
+            f"{nearest['psnr_db']:.2f} dB in {nearest['bytes']:,} bytes: give more --steps or a lower --psnr"
+        )
     return *best, tried
 
 

@@ -20,7 +20,7 @@ from ...arrays.tables import Table
 from ...fitting.task import FitRequest, FitResult
 from ...maps.layout import Layout, choose_borders, gain_of_pages, smoothness
 from ...maps.model import MapsProblem, fit_maps, strata
-from ...maps.pyramid import decibel, mean_square, padded_texels, weighted_sum
+from ...maps.pyramid import decibel, mean_square, padded_texels
 from ...maps.source import Source
 from . import PAGED, STRUCTURES, ImageSettings, arrays
 from .arrays import CompressedImage, ImageBudget, to_table
@@ -140,7 +140,7 @@ class ImageProblem(MapsProblem):
 
     def target(self, y, x) -> list:
         """Return the stored channels at a place in texels from the corner of the image, bilinear as in ``bitmap``."""
-        UInt32, Int32, Float = self.types.UInt32, self.types.Int32, self.types.Float
+        UInt32, Int32 = self.types.UInt32, self.types.Int32
         corners = []
         for position, n, border in ((y, self.height, self.border[0]), (x, self.width, self.border[1])):
             lower = dr.floor(position - 0.5)
@@ -151,11 +151,8 @@ class ImageProblem(MapsProblem):
             else:
                 both = [dr.clip(i, 0, n - 1), dr.clip(i + 1, 0, n - 1)]
             corners.append([(UInt32(both[0]), 1 - weight), (UInt32(both[1]), weight)])
-        total = [Float(0)] * self.channels
-        for row, a in corners[0]:
-            for column, b in corners[1]:
-                total = weighted_sum(a * b, self._texels(row * self.width + column), total)
-        return total
+        rows, columns = corners
+        return lookup.weighted_sum((a * b, self._texels(row * self.width + x)) for row, a in rows for x, b in columns)
 
     def predict(self, net, inputs) -> dict[str, list]:
         return self.by_map((rounded(net, self.bits) if self.rounded else net)(inputs))

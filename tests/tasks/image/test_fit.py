@@ -11,7 +11,7 @@ import mi_diffind as md
 from mi_diffind.core.errors import UsageError
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting.loop import FitResult
-from mi_diffind.fitting.task import FitRequest
+from mi_diffind.fitting.task import FitRequest, FittingError
 from mi_diffind.maps import as_seen
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.tasks.image import PAGED, PRESETS, STRUCTURES, fit, parse_weights, training
@@ -22,7 +22,7 @@ OURS, PAPER = PRESETS["ours"], PRESETS["paper"]
 pytestmark = pytest.mark.usefixtures("few_samples")
 
 #: Request of searches whose trainings are pretended.
-REQUEST = FitRequest("ours", OURS, None)
+REQUEST = FitRequest("ours", OURS, None, options={"source": "x.png"})
 
 
 def noise(height=16, width=16, channels=3):
@@ -181,13 +181,14 @@ def by_bytes(slope, bend=0.0, wobble=0.0):
 def test_quality_search_is_small_enough(monkeypatch, capsys, slope, bend, wobble, goal):
     quality = by_bytes(slope, bend, wobble)
     calls = pretend(quality, monkeypatch)
-    table, result, tried = fit.psnr_search(noise(256, 256), goal, short(), REQUEST)
+    try:
+        table, result, tried = fit.psnr_search(noise(256, 256), goal, short(), REQUEST)
+    except FittingError:
+        assert calls[-1][0].full or len(calls) == 8
+        return
     assert len(tried) == len(calls) == len(capsys.readouterr().out.splitlines()) <= 8
     assert [t["bytes"] for t in tried] == [size.nbytes for size, _ in calls]
     reached = [t["bytes"] for t in tried if t["psnr_db"] >= goal]
-    if table is None:
-        assert not reached and (calls[-1][0].full or len(tried) == 8)
-        return
     assert table.measured["psnr_db"] >= goal and table.nbytes == min(reached) and not result.interrupted
     missed = [t["bytes"] for t in tried if t["psnr_db"] < goal and t["bytes"] < table.nbytes]
     if wobble == 0 and missed:
@@ -198,11 +199,13 @@ def test_quality_search_ends(monkeypatch):
     """At a primary as large as the image, after ``most`` trainings, and at the smallest arrays."""
     source = noise(64, 64)
     calls = pretend(by_bytes(2.5), monkeypatch)
-    table, result, tried = fit.psnr_search(source, 100, short(), REQUEST)
-    assert table is None and result is None and calls[-1][0].full and len(tried) == len(calls)
+    with pytest.raises(FittingError, match=r"x\.png: 100 dB were not reached; the best of \d sizes had"):
+        fit.psnr_search(source, 100, short(), REQUEST)
+    assert calls[-1][0].full
     assert not any(size.full for size, _ in calls[:-1])
     calls = pretend(by_bytes(0), monkeypatch)
-    assert fit.psnr_search(source, 100, short(), REQUEST, most=1)[0] is None and len(calls) == 1
+    with pytest.raises(FittingError, match="best of 1 sizes"):
+        fit.psnr_search(source, 100, short(), REQUEST, most=1)
     calls = pretend(by_bytes(0), monkeypatch)
     table, _, tried = fit.psnr_search(source, 1, short(), REQUEST)
     smallest = fit.sized(source, 1, short(), 4)
