@@ -29,9 +29,9 @@ from mi_diffind.core.errors import LONGEST_MESSAGE, UsageError
 from mi_diffind.core.files import PATHS, OutputError
 from mi_diffind.core.units import figure_lines
 from mi_diffind.fitting.loop import checkpoint_settings
-from mi_diffind.fitting.settings import FitSettings, within_memory
+from mi_diffind.fitting.task import FitSettings, within_memory
 from mi_diffind.images.headers import picture_size
-from mi_diffind.maps.compressed import map_figure
+from mi_diffind.maps.pyramid import map_figure
 from mi_diffind.maps.source import SourceError, from_arrays, load_source
 from mi_diffind.scenes.inspection import Inspection
 from mi_diffind.tasks.radiance import coding, files
@@ -291,8 +291,8 @@ def test_readers_that_are_not_installed(tmp_path, monkeypatch):
 
 def test_maps_may_be_called_as_figures(rng):
     """A map's PSNR has a name of its own, whatever the map is called."""
-    from mi_diffind.maps.compressed import CompressedMaps
     from mi_diffind.maps.layout import Layout
+    from mi_diffind.maps.pyramid import CompressedMaps
 
     names = ("mean", "between", "worst", "l0", "map_mean", "albedo")
     source = from_arrays({name: np.full((2, 2, 1), 0.1 * i, np.float32) for i, name in enumerate(names)})

@@ -19,8 +19,7 @@ from mi_diffind.core.compat import use_threads, was_compiled
 from mi_diffind.core.errors import UsageError
 from mi_diffind.core.progress import Deadline
 from mi_diffind.core.runtime import array_module
-from mi_diffind.fitting.settings import FitSettings
-from mi_diffind.fitting.task import FitRequest
+from mi_diffind.fitting.task import FitRequest, FitSettings
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import load_source
 from mi_diffind.plugins.support import footprint
@@ -50,7 +49,7 @@ from mi_diffind.scenes.training.trained_scene import (
 from mi_diffind.tasks.texture import PRESETS
 from mi_diffind.tasks.texture.arrays import PaperBudget, TextureBudget, parse_structure
 from mi_diffind.tasks.texture.compressed import CompressedTexture, load, to_table
-from mi_diffind.tasks.texture.training import layout_of, problem_of, rounded, stored_form
+from mi_diffind.tasks.texture.fit import layout_of, problem_of, rounded, stored_form
 
 NAMES = ("albedo", "roughness")
 ORBIT = ViewDistribution(
@@ -849,7 +848,7 @@ def test_arrays_of_the_same_size(folder, preset, tmp_path):
         wanted = TextureBudget(32, 32, layout.stored, parse_structure("0:2:4,1:3:6"), 2, 3, 6, 3)
     pyramid = Pyramid.of(source, layout, array_module("llvm"))
     net = problem_of(source, wanted, recipe, pyramid).net
-    own = {k: v for k, v in dataclasses.asdict(recipe).items() if k != "settings"}
+    own = recipe.further
     table = to_table(CompressedTexture(layout, stored_form(net)), {**own, "loss": "mae"})  # a render's
     save_table(tmp_path / "x.npz", table)
     table = load(tmp_path / "x.npz")

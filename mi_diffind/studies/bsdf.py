@@ -13,8 +13,7 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from ..fitting.settings import FitSettings
-from ..fitting.task import fit, load_model
+from ..fitting.task import FitSettings, fit, load_model
 from ..measure.renders import bsdf_queries, directions
 from ..measure.store import file_name, fingerprint, package_files
 from ..measure.study import Candidate, Case, Job, Measure, Plan, Study

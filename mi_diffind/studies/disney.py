@@ -17,7 +17,7 @@ import numpy as np
 
 from ..arrays.lookup import STORAGES
 from ..core.runtime import array_module
-from ..fitting.settings import FitSettings
+from ..fitting.task import FitSettings
 from ..measure.clock import FLOPS, Operations, count_query
 from ..measure.renders import QUERIES, TEXTURE_SIZE, bsdf_queries, directions, noise_texture
 from ..measure.report import grid

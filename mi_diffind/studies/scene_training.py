@@ -34,7 +34,7 @@ from ..core.files import writable_folder, write_json
 from ..fitting import task
 from ..images import metrics
 from ..images.srgb import for_display
-from ..maps.compressed import decibel
+from ..maps.pyramid import decibel
 from ..maps.source import load_source
 from ..measure import plot
 from ..measure.report import figure_caption

@@ -43,10 +43,9 @@ from ..core.runtime import array_module
 from ..core.units import parse_compression
 from ..fitting import task
 from ..fitting.loop import FitResult
-from ..fitting.settings import FitSettings, FittingError
+from ..fitting.task import FitSettings, FittingError
 from ..images import srgb
-from ..maps.compressed import decibel
-from ..maps.pyramid import Pyramid
+from ..maps.pyramid import Pyramid, decibel
 from ..maps.source import Source, SourceError, load_source
 from ..measure import plot
 from ..measure.renders import POINTS, MovingView
@@ -59,7 +58,7 @@ from ..tasks.shading import fit as shading_fit
 from ..tasks.shading.evaluation import ShadedEvaluation, ShadedReader, reader, reference
 from ..tasks.shading.material import effects_of, frozen_decoder
 from ..tasks.shading.training import ShadingProblem, fit_shading, start_of
-from ..tasks.texture import training as textures
+from ..tasks.texture import fit as textures
 from ..tasks.texture.compressed import CompressedTexture
 from ..tasks.texture.fit import size_of
 from .baselines import codecs, normals
@@ -121,7 +120,7 @@ class ShadingStudySettings:
     extras: bool = False
 
     @property
-    def recipe(self) -> shading_task.ShadingRecipe:
+    def recipe(self) -> shading_task.ShadingSettings:
         return shading_task.PRESETS[self.preset]
 
 
@@ -409,8 +408,8 @@ class ShadingStudyContext:
 
         With ``extras``, the arrays leave room for them.
         """
-        request = self.request(texture_task.PRESETS["ours"].settings, length, seed, progress)
-        recipe = dataclasses.replace(self.recipe, settings=request.settings)
+        request = self.request(texture_task.PRESETS["ours"], length, seed, progress)
+        recipe = dataclasses.replace(self.recipe, **request.settings.common)
         nbytes = self.source.nbytes / self.settings.compression
         nbytes = shading_fit.bytes_beside_extras(nbytes, pyramid) if extras else nbytes
         size = size_of(self.source, pyramid, nbytes, recipe, request.options)
@@ -483,11 +482,11 @@ class ShadingStudyContext:
         def train(progress: bool) -> tuple:
             preset = self.settings.recipe
             schedule = "cosine" if way.schedule else "constant"
-            settings = dataclasses.replace(preset.settings, schedule=schedule)
+            settings = dataclasses.replace(preset, schedule=schedule)
             request = self.request(settings, self.settings.length, seed, progress)
             recipe = dataclasses.replace(
                 preset, share=share, clip=(preset.clip or CLIP) if way.clip else None, extras=extras,
-                level_bias=preset.level_bias if share else 0.0, settings=request.settings,
+                level_bias=preset.level_bias if share else 0.0, **request.settings.common,
             )  # fmt: skip
             net = start_of(start.model.table, self.pyramid)
             try:

@@ -30,9 +30,8 @@ from mi_diffind.core.files import (
 )
 from mi_diffind.fitting.task import Task
 from mi_diffind.images.headers import check_picture
-from mi_diffind.maps.compressed import CompressedMaps
 from mi_diffind.maps.layout import Layout, MapLayout
-from mi_diffind.maps.pyramid import Pyramid
+from mi_diffind.maps.pyramid import CompressedMaps, Pyramid
 from mi_diffind.maps.source import Source, SourceError, from_arrays, load_source
 
 from .. import warn

@@ -39,7 +39,7 @@ BRIGHTEST = 1e9
 
 
 class MapTexture(base_class("Texture")):
-    """Texture of one map of a :class:`~mi_diffind.maps.compressed.CompressedMaps`.
+    """Texture of one map of a :class:`~mi_diffind.maps.pyramid.CompressedMaps`.
 
     The class implements colours and data, wrapping, transformation, spectra and the sampling of positions. A derived
     class opens the maps in :meth:`_open`, and may override the read in :meth:`_values`. Like the modules of plugins,
@@ -383,7 +383,7 @@ class MapTexture(base_class("Texture")):
 
 
 class FilteredTexture(MapTexture):
-    """Texture of one map of a :class:`~mi_diffind.maps.compressed.FilteredMaps`, read at the footprint's level.
+    """Texture of one map of a :class:`~mi_diffind.maps.pyramid.FilteredMaps`, read at the footprint's level.
 
     No gradient passes through the footprint at a hit (:func:`.footprint.footprint`). ``cone`` describes the sensor that
     sees the texture (:class:`.footprint.Cone`; ``None``: unknown). A sample that is the only one of its pixel is read

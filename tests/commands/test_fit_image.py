@@ -1,5 +1,6 @@
 """``fit image``, ``decode`` and ``inspect`` on images: sources, sizes, searches, interruptions, refusals."""
 
+import dataclasses
 import errno
 import json
 import os
@@ -18,7 +19,7 @@ from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting.task import tasks
 from mi_diffind.maps.layout import Layout, MapLayout
 from mi_diffind.tasks.image import fit as image_fit
-from mi_diffind.tasks.image import replaced, training
+from mi_diffind.tasks.image import training
 
 SHORT = ["--steps", "4", "--batch", "256", "--variant", "llvm_ad_rgb", "--dims", "2"]
 
@@ -211,7 +212,7 @@ def test_ratio_search(folder, capsys, monkeypatch):
     fit_image, trained = training.fit_image, []
 
     def ranked(source, size, recipe, request, border=None, title=None):
-        recipe = recipe if title is None else replaced(recipe, steps=2)
+        recipe = recipe if title is None else dataclasses.replace(recipe, steps=2)
         table, result = fit_image(source, size, recipe, request, border, title)
         if title is not None:  # a candidate
             decibels = 20.0 + 3 * (size.dims == 3) + len(trained) / 10

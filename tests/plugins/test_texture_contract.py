@@ -21,7 +21,7 @@ from variants import VARIANTS, set_variant
 from mi_diffind import plugins
 from mi_diffind.arrays.tables import load_table
 from mi_diffind.fitting.task import find_task
-from mi_diffind.maps import compressed
+from mi_diffind.maps import pyramid
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.tasks.ggx import TASK as GGX
 
@@ -148,7 +148,7 @@ def test_reads_as_decoded(mi_rgb, files, rng, name, channels):
 @pytest.mark.parametrize("name", READERS[1:3])
 def test_images_are_decoded_in_parts(mi_rgb, files, monkeypatch, name):
     whole = decoded(mi_rgb, files, name)
-    monkeypatch.setattr(compressed, "CHUNK", 37)
+    monkeypatch.setattr(pyramid, "CHUNK", 37)
     for m, image in decoded(mi_rgb, files, name).items():
         np.testing.assert_array_equal(image, whole[m])
 

@@ -18,8 +18,8 @@ from ...core.progress import profiled
 from ...core.units import figure_lines
 from ...fitting.loop import FitResult, cores
 from ...fitting.task import FitRequest, Fitted, Model, find_task, table_path, tasks
-from ...maps.arguments import preview_path
-from ...tasks.texture.training import TextureProblem
+from ...maps.model import preview_path
+from ...tasks.texture.fit import TextureProblem
 from .. import loading
 from ..conversion import cache_folder
 from .options import SceneRecipe, ViewDistribution, recipe_from, views_from

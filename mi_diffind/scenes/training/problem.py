@@ -25,7 +25,7 @@ from ...core.files import replacing
 from ...fitting.loop import Problem
 from ...images import srgb
 from ...tasks.shading.evaluation import titled
-from ...tasks.texture.training import TextureProblem, rounded
+from ...tasks.texture.fit import TextureProblem, rounded
 from .options import SceneRecipe, View
 from .references import SEEDS
 from .trained_scene import JointProblem, TrainedScene

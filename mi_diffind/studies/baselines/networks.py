@@ -26,9 +26,8 @@ from ...arrays.lookup import clamp
 from ...core.compat import backend_module
 from ...core.runtime import array_module
 from ...fitting.loop import Problem
-from ...maps.compressed import FilteredMaps, decibel
 from ...maps.layout import Layout
-from ...maps.pyramid import Pyramid, level_sizes
+from ...maps.pyramid import FilteredMaps, Pyramid, decibel, level_sizes
 from ...maps.source import Source
 from ...measure.clock import Operations
 from ...tasks.bsdf import training as bsdf_training
@@ -41,7 +40,7 @@ from ...tasks.disney.decoder import Decoder
 from ...tasks.disney.model import TINY, Factors, compose, geometry
 from ...tasks.disney.training import measure, random_directions, random_materials, shade
 from ...tasks.texture import PRESETS
-from ...tasks.texture.training import TextureProblem
+from ...tasks.texture.fit import TextureProblem
 
 #: Hidden units of a layer, and hidden layers, of networks after a hash grid.
 WIDTH = 32
@@ -321,7 +320,7 @@ class TextureNetworkProblem(TextureProblem):
 
     def predict(self, net, inputs) -> dict[str, list]:
         u, v, level, _ = inputs
-        return self._grouped(self.maps(net).filtered(u, v, level))
+        return self.by_map(self.maps(net).filtered(u, v, level))
 
     def measure(self, net) -> dict[str, float]:
         """Return the PSNR of the stored channels at held-out samples between texels and levels."""

@@ -16,8 +16,7 @@ from pathlib import Path
 
 from ...core.arguments import WORKER_ARGUMENTS, Argument, checked, natural, positive
 from ...core.units import parse_bytes
-from ...fitting.settings import FitSettings
-from ...fitting.task import FitRequest, Fitted, Task, table_path
+from ...fitting.task import FitRequest, FitSettings, Fitted, Task, table_path
 
 
 def _coordinate(text: str) -> float:

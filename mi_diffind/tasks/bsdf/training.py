@@ -17,8 +17,7 @@ from ...arrays.indirection import DifferentiableArray, device_array
 from ...core.compat import backend_module
 from ...core.progress import interruptible
 from ...fitting.loop import FitResult, Problem
-from ...fitting.settings import FitSettings
-from ...fitting.task import FitRequest, Stage
+from ...fitting.task import FitRequest, FitSettings, Stage
 from .directions import Samples, SphereView, incident, outgoing
 from .model import (
     ALPHA_MIN,

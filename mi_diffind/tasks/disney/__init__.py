@@ -10,8 +10,7 @@
 
 from __future__ import annotations
 
-from ...fitting.settings import FitSettings
-from ...fitting.task import FitRequest, Task
+from ...fitting.task import FitRequest, FitSettings, Task
 
 
 class DisneyTask(Task):

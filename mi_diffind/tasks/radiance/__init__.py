@@ -15,8 +15,7 @@ from math import log, prod
 
 from ...core import units
 from ...core.arguments import Argument, between, checked, positive
-from ...fitting.settings import FitSettings
-from ...fitting.task import Task
+from ...fitting.task import FitSettings, Task
 
 #: Voxels per pixel of the views at the distance of the box, and the range of the resolution that follows from them:
 #: nodes along each side of a cube with the volume of the box.

@@ -8,7 +8,6 @@ import ggx_formulas
 import numpy as np
 import pytest
 from arrays import aligned
-from variants import BACKENDS
 
 from mi_diffind import DifferentiableArray, StoredArray, load_model
 from mi_diffind import fit as fit_task
@@ -22,11 +21,6 @@ from mi_diffind.tasks.ggx.model import ALPHA_FLOOR, ALPHA_MIN, ENCODINGS, Encodi
 from mi_diffind.tasks.ggx.training import BANDS, GGXProblem, draw, measure, table_encoding
 
 PRESETS = tuple(TASK.presets)
-
-
-@pytest.fixture(params=BACKENDS)
-def ad(request):
-    return array_module(request.param)
 
 
 @pytest.fixture(scope="module")

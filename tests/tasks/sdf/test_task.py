@@ -15,8 +15,7 @@ from mi_diffind.arrays.indirection import DifferentiableArray, Indirection, ramp
 from mi_diffind.arrays.tables import StoredArray, TableError, load_table, save_table
 from mi_diffind.commands.cli import main
 from mi_diffind.core.runtime import array_module
-from mi_diffind.fitting.settings import FitSettings
-from mi_diffind.fitting.task import fit, tasks
+from mi_diffind.fitting.task import FitSettings, fit, tasks
 from mi_diffind.tasks.sdf import fit as sdf_fit
 from mi_diffind.tasks.sdf import paper
 from mi_diffind.tasks.sdf.distances import Distances
