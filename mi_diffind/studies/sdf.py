@@ -441,7 +441,7 @@ class MeshView:
     def mesh_scene(self, lit: bool = False):
         """Return a scene of the mesh, alone or ``lit`` on a floor."""
         counts = len(self.mesh.vertices), len(self.mesh.faces)
-        shape = mi.Mesh(*compat.mesh_arguments(_material(), *counts))
+        shape = mi.Mesh(_material().plugin_name(), *counts, _material())
         buffers = mi.traverse(shape)
         compat.set_triangles(buffers, self.mesh.vertices, self.mesh.faces)
         buffers.update()
