@@ -16,7 +16,7 @@ EXAMPLE = "mi-diffind capture scene.xml -o views --objects statue --views 60"
 def add(commands) -> None:
     """Add the verb and its options to ``commands``, the subparsers of the command line."""
     sub = verb(commands, "capture", run, HELP, EXAMPLE, reads=("scene",))
-    sub.add_argument("scene", metavar="SCENE.xml", help="scene file, or 3D Gaussians: SPLATS.ply, SPLATS.sog")
+    sub.add_argument("scene", metavar="SCENE.xml", help="scene file, or 3D Gaussians: SPLATS.ply")
     sub.add_argument(
         "-o", "--output", required=True, metavar="FOLDER", help="folder of the views; an unfinished one is completed"
     )

@@ -81,7 +81,7 @@ class CaptureSettings:
     the image). ``path``: "sphere", all over it, or "orbit", once around the axis ``up``. ``elevation``: the lowest and
     the highest, degrees above the plane normal to ``up``; an orbit swings between them (default: −90, 90 for a sphere,
     20, 20 for an orbit). ``format``: "png", as displayed, 8 bits, or "exr", linear half floats. ``box``: of 3D
-    Gaussians, the lower and the upper corner of what is captured (default: :meth:`.splats.Splats.cropped`). Other
+    Gaussians, the lower and the upper corner of what is captured (default: :meth:`.splats.Splats.crop`). Other
     values raise :class:`.UsageError`.
     """
 
