@@ -331,7 +331,9 @@ class SceneSubject:
                 if not loading.nests_another(props):  # the nested one follows the paths
                     props["hide_emitters"] = True
 
-        return self.parsed.load(change=hide, merge=False, needs=())
+        parsed = self.parsed.copy()
+        parsed.change(hide)
+        return parsed.load(merge=False, needs=())
 
     def shapes(self) -> list:
         """Return the captured shapes, without ``objects`` all that are no lights. Raises :class:`CaptureError`."""

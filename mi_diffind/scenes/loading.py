@@ -6,6 +6,7 @@ Everything here runs in the variant that is set.
 from __future__ import annotations
 
 import contextlib
+import copy
 import os
 import threading
 import time
@@ -65,9 +66,9 @@ def warn_if_black(scene, path: str | os.PathLike, images) -> None:
 def use_slashes(state) -> None:
     """Write names of files in a parsed scene with slashes where they have backslashes, and only that is a file."""
     copies = compat.parsed_properties(compat.copy_state(state)[1])  # a parameter that was read counts as known
-    for props, copy in zip(compat.parsed_properties(state), copies, strict=True):
-        for key in copy:
-            text = str(copy[key]) if compat.property_kind(copy, key) == "text" else ""
+    for props, known in zip(compat.parsed_properties(state), copies, strict=True):
+        for key in known:
+            text = str(known[key]) if compat.property_kind(known, key) == "text" else ""
             if "\\" in text and not _is_file(text) and _is_file(text.replace("\\", "/")):
                 props[key] = text.replace("\\", "/")
 
@@ -144,20 +145,17 @@ class ParsedScene:
         exact: bool = False,
         longest_path: int | None = None,
         against: str | tuple[str, ...] = "exact",
-        change: Callable[[object], object] | None = None,
         merge: bool = True,
         parallel: bool = True,
         needs: tuple[str, ...] = NEEDS,
     ):
         """Return a loaded scene, as :func:`load_file` does.
 
-        With ``exact``, every learned plugin is replaced by its exact counterpart, or by the one that ``against`` names
-        (the first of several that it has).
-        ``longest_path`` replaces the ``max_depth`` of the scene's integrator (1: emitted light, 2: direct light, …; -1:
-        infinite). ``change(state)`` may change the parsed scene (``mi.parser.ParserState``) before anything else does.
-        Without ``merge``, Mitsuba joins no meshes, and each keeps its id. Objects that are not loaded in ``parallel``
-        have the same order in each run, so that the kernels of an earlier run are found again. A scene without what it
-        ``needs`` to be rendered is an error (:func:`check_renderable`).
+        With ``exact``, every plugin that has a counterpart called ``against`` is replaced by it (the first of several
+        names that it has). ``longest_path`` replaces the ``max_depth`` of the scene's integrator (1: emitted light, 2:
+        direct light, …; -1: infinite). Without ``merge``, Mitsuba joins no meshes, and each keeps its id. Without
+        ``parallel``, the order of objects is the same in each run, and the kernels of an earlier run are found again.
+        A scene without what it ``needs`` to be rendered is an error (:func:`check_renderable`).
 
         Shapes whose stored arrays the scene's integrator cannot trace are decoded, with a warning that states the
         memory, unless the scene forbids decoding; then this is an error.
@@ -167,11 +165,8 @@ class ParsedScene:
             if not merge:
                 compat.keep_meshes(config)
             config.parallel = parallel
-            if change is not None:
-                change(state)
-            if exact:
-                for props, plugin in _replaceable(state, against):
-                    plugin.counterpart(against).replace(props)
+            for props, plugin in _replaceable(state, against) if exact else ():
+                plugin.counterpart(against).replace(props)
             if longest_path is not None:
                 _path_integrator(state)["max_depth"] = longest_path
             integrators = _integrators(state) or ["path"]  # used by commands for a scene without an integrator
@@ -185,6 +180,12 @@ class ParsedScene:
         """Change the parsed scene (``mi.parser.ParserState``) for good by ``change(state)``, and return its result."""
         with self._errors():
             return change(self._state)
+
+    def copy(self) -> ParsedScene:
+        """Return a copy, which may be changed."""
+        other = copy.copy(self)
+        other._state = self._copy()
+        return other
 
     def _copy(self):
         """Return a copy of the parsed state to read: Mitsuba takes a parameter that was read once for a known one."""
@@ -207,19 +208,13 @@ class ParsedScene:
             props["max_depth"] = longest_path
             return mi.PluginManager.instance().create_object(props)
 
-    def learned_plugins(
-        self, against: str | tuple[str, ...] = "exact", change: Callable[[object], object] | None = None
-    ) -> list[dict]:
+    def learned_plugins(self, against: str | tuple[str, ...] = "exact") -> list[dict]:
         """Return the descriptions (:meth:`.plugins.Plugin.described`) of the learned plugins, in the file's order.
 
-        With ``against``, of all plugins that have the counterpart of this name, or of one of these names; after a
-        ``change`` of the scene as of :meth:`load`.
+        With ``against``, of all plugins that have the counterpart of this name, or of one of these names.
         """
         with self._errors():
-            state = self._copy()
-            if change is not None:
-                change(state)
-            return [plugin.described(props) for props, plugin in _replaceable(state, against)]
+            return [plugin.described(props) for props, plugin in _replaceable(self._copy(), against)]
 
     def tables(self, learned: list[dict]) -> dict[tuple[str, str], object]:
         """Return the distinct tables of learned plugins: ``(file, storage)`` → :class:`.Table`.

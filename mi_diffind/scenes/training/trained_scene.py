@@ -266,7 +266,9 @@ class TrainedScene:
                         props["max_depth"] = props.get("max_depth", loading.MAX_DEPTHS[name])
                         props.set_plugin_name("prb")
 
-            self.scene = parsed.load(change=change, parallel=False)
+            changed = parsed.copy()
+            changed.change(change)
+            self.scene = changed.load(parallel=False)
         self.spp, self.rig, self._cones = spp, Rig(self.scene, views), {}
         self._seeing = footprint.textures(self.scene)
         #: Name of each array → the parameter of the scene that is set for it.
