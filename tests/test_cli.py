@@ -133,25 +133,6 @@ def test_fit(tmp_path, capsys, few_samples):
     assert out.read_bytes() == again.read_bytes()
 
 
-def test_fit_for_some_seconds(tmp_path, capsys, few_samples, monkeypatch):
-    """By a clock of its own: as many steps as there is time for; the file says how many, and how long."""
-    from mi_diffind.fitting import loop
-
-    now = [0.0]
-
-    def tick():
-        now[0] += 1 / 16
-        return now[0]
-
-    monkeypatch.setattr(loop.time, "perf_counter", tick)
-    out = tmp_path / "own.npz"
-    arguments = ["fit", "ggx", "--batch", "512", "--variant", "llvm_ad_rgb", "-o", str(out), "--json"]
-    assert main([*arguments, str(tmp_path / "r.json"), "--seconds", "2"]) == 0
-    settings = load_table(out).settings
-    assert settings["seconds"] == 2 and 8 <= settings["steps"] <= 32
-    assert settings == json.loads((tmp_path / "r.json").read_text())["settings"]
-
-
 def interrupt_at(step, monkeypatch):
     """Ctrl-C in the batch with the number ``step``."""
     from mi_diffind.tasks.ggx.training import GGXProblem

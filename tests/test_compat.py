@@ -4,8 +4,6 @@ import contextlib
 import importlib
 import importlib.metadata
 import re
-import threading
-import time
 from pathlib import Path
 
 import drjit as dr
@@ -461,25 +459,6 @@ def test_parsed_scenes_as_graphs(mi_rgb, tmp_path):
     (tmp_path / "c.xml").write_text('<scene version="3.0.0"><shape type="sphere"><ref id="none"/></shape></scene>')
     with pytest.raises(RuntimeError, match='refers to the id "none", which no object has'):
         compat.parsed_references(compat.parse_file(tmp_path / "c.xml")[1])
-
-
-def test_functions_are_transformed_one_at_a_time(monkeypatch):
-    inside, most = [], []
-
-    def transform(function):
-        inside.append(function)
-        most.append(len(inside))
-        time.sleep(0.01)
-        inside.remove(function)
-        return function
-
-    monkeypatch.setattr("drjit.syntax", transform)
-    workers = [threading.Thread(target=compat.syntax, args=(i,)) for i in range(8)]
-    for thread in workers:
-        thread.start()
-    for thread in workers:
-        thread.join()
-    assert most == [1] * 8
 
 
 # -- memory of arrays -------------------------------------------------------------------------------------------------

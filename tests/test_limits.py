@@ -272,23 +272,6 @@ def test_meshes_say_what_is_wrong(tmp_path):
         load_mesh(tmp_path / "a.ply")
 
 
-def test_readers_that_are_not_installed(tmp_path, monkeypatch):
-    import trimesh
-
-    (tmp_path / "a.3mf").write_bytes(b"")
-    for error, package in (
-        (ImportError("No module named 'lxml'"), "lxml"), (ImportError("missing `pip install pycollada`"), "pycollada"),
-        (ModuleNotFoundError("x", name="openctm"), "openctm"),
-    ):  # fmt: skip
-
-        def missing(*arguments, error=error, **options):
-            raise error
-
-        monkeypatch.setattr(trimesh, "load", missing)
-        with pytest.raises(MeshError, match=rf"\.3mf files need the package {package}, .*: pip install {package}$"):
-            load_mesh(tmp_path / "a.3mf")
-
-
 def test_maps_may_be_called_as_figures(rng):
     """A map's PSNR has a name of its own, whatever the map is called."""
     from mi_diffind.maps.compressed import CompressedMaps

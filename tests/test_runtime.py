@@ -3,9 +3,7 @@ The choice of LLVM: as a function, and in fresh processes, where a wrong one wou
 only a process of its own can show that it does not happen).
 """
 
-import contextlib
 import glob
-import importlib
 import os
 import subprocess
 import sys
@@ -260,30 +258,6 @@ spec = importlib.util.find_spec("drjit")
 assert spec is not None and "drjit" not in sys.modules
 {KERNEL}{PRINT_VERSION}"""
     assert int(succeeds(code).stdout.split()[-1]) >= MIN_LLVM
-
-
-def test_an_import_that_failed_is_met_again(tmp_path, monkeypatch):
-    (tmp_path / "flaky_at_first.py").write_text("import os\nassert 'FLAKY' in os.environ\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    events = []
-
-    @contextlib.contextmanager
-    def context():
-        events.append("before")
-        yield
-        events.append("after")
-
-    finder = runtime._Hook({"flaky_at_first": context})
-    monkeypatch.setattr(sys, "meta_path", [finder, *sys.meta_path])
-    with pytest.raises(AssertionError):
-        importlib.import_module("flaky_at_first")
-    monkeypatch.setenv("FLAKY", "1")
-    importlib.import_module("flaky_at_first")
-    assert events == ["before", "before", "after"] and not finder.contexts
-    del sys.modules["flaky_at_first"]
-    importlib.import_module("flaky_at_first")
-    assert len(events) == 3
-    del sys.modules["flaky_at_first"]
 
 
 @pytest.mark.parametrize("name", ["drjit", "mitsuba"])

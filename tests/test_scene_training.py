@@ -616,19 +616,6 @@ def weights(one_core):
     return mi.TensorXf(np.random.default_rng(0).random((24, 24, 3), dtype=np.float32))
 
 
-def test_small_films_are_rendered_with_more_samples(trained, monkeypatch):
-    """A step draws as many samples as the recipe says, for values and derivatives alike; the footprints stay."""
-    (scene, texture), given = trained, []
-    black = np.zeros((24, 24, 3), np.float32)
-    monkeypatch.setattr(mi, "render", lambda *_, **options: given.append(options) or mi.TensorXf(black))
-    for samples, spp in ((1, 1), (576, 1), (577, 2), (2**15, 57)):
-        problem = SceneProblem(texture, scene, [(View(), black)], [], SceneRecipe(samples=samples))
-        problem.settings = problem.recipe.settings
-        problem.image_loss(problem.net, dr.rng(seed=0))
-        options = given.pop()
-        assert (options["spp"], options["spp_grad"], scene.spp) == (spp, spp, 1)
-
-
 def test_values_and_derivatives_have_their_own_samples(trained, weights):
     scene, problem = trained
     scene.place(View())

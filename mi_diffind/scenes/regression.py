@@ -106,10 +106,7 @@ def read_reference(path: str | os.PathLike, references: str | os.PathLike | None
     if stored is None:
         raise BadReference(f'{path}: has no reference "{wanted}"; run the same command with --update to make it')
     parts = _parts(stored)
-    about = _about(stored, Path(path).stem, parts)
-    if len(parts) != 2:
-        raise BadReference(f"{stored}: is a reference of an earlier version, render it again with --update")
-    return _reference(stored, about, *(channels for _, channels in parts))
+    return _reference(stored, _about(stored, Path(path).stem, parts), parts[0][1], parts[-1][1])
 
 
 def _names(channels: int) -> str:
