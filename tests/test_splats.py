@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 
 from mi_diffind.commands import cli
+from mi_diffind.core.errors import UsageError
 
 COUNT = 6
 
@@ -19,9 +20,7 @@ def read(path):
 
 
 def refused(path, message):
-    from mi_diffind.scenes.splats import SplatsError
-
-    with pytest.raises(SplatsError, match=message):
+    with pytest.raises(UsageError, match=message):
         read(path)
 
 
@@ -93,7 +92,8 @@ def test_rays_agree_with_numpy_at_every_size(mi_rgb, tmp_path, rng, size):
     from mi_diffind.scenes.splats import SplatSubject
 
     g = gaussians(rng, size)
-    camera = SplatSubject(write(tmp_path / "s.ply", columns(g))).camera(CaptureSettings())
+    camera = SplatSubject(write(tmp_path / "s.ply", columns(g)), CaptureSettings())
+    camera.prepare()
     d = np.concatenate([rng.uniform(-0.02, 0.02, (200, 2)), np.full((200, 1), -1.0)], axis=1)
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     o = np.array([0, 0, 14.0]) * size
@@ -155,7 +155,7 @@ def test_strays_and_faint_gaussians_are_left_out(tmp_path, rng):
     assert len(kept) == 50 * COUNT - 3 and np.abs(kept.centres).max() <= 1
     half = splats.crop((-2, -2, -2, 0, 2, 2))
     assert len(half) == np.count_nonzero((table["x"] > -2) & (table["x"] < 0) & (table["opacity"] > -10))
-    with pytest.raises(ValueError, match=r"box: holds none of the 300 Gaussians of .*s.ply, most lie in \(-1"):
+    with pytest.raises(UsageError, match=r"box: holds none of the 300 Gaussians of .*s.ply, most lie in \(-1"):
         splats.crop((50, 0, 0, 60, 1, 1))
 
 

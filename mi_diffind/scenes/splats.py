@@ -23,7 +23,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..core import compat
-from ..core.errors import DiffindError, reason
+from ..core.errors import UsageError, reason
 from ..core.files import irregular, shown, unused_note
 from ..core.units import check_memory, memory
 from ..images.srgb import to_linear
@@ -75,10 +75,6 @@ GAUSSIAN_BYTES = 4096
 SPP = 4
 
 
-class SplatsError(DiffindError, ValueError):
-    """Error for a file that holds no usable Gaussians; the message is one sentence that names the file."""
-
-
 def is_splats(source) -> bool:
     """Return whether a source is the name of a file of Gaussians (:data:`EXTENSIONS`)."""
     return isinstance(source, (str, os.PathLike)) and os.fspath(source).lower().endswith(EXTENSIONS)
@@ -108,16 +104,16 @@ class Splats:
 
     @staticmethod
     def read(path: str | os.PathLike) -> Splats:
-        """Read a PLY file. Raises :class:`SplatsError`."""
+        """Read a PLY file. Raises :class:`.UsageError`."""
         path = Path(path)
         if fault := irregular(path, memory() // 4) or ("" if path.exists() else "no such file"):
-            raise SplatsError(f"{shown(path)}: {fault}")
+            raise UsageError(f"{shown(path)}: {fault}")
         try:
             return _read_ply(path)
-        except SplatsError as e:
-            raise SplatsError(f"{path}: {e}") from None
+        except UsageError as e:
+            raise UsageError(f"{path}: {e}") from None
         except Exception as e:  # trimesh and NumPy raise errors of their own for a damaged file
-            raise SplatsError(f"{path}: cannot be read as 3D Gaussians, or is damaged ({reason(e)})") from None
+            raise UsageError(f"{path}: cannot be read as 3D Gaussians, or is damaged ({reason(e)})") from None
 
     def select(self, which: np.ndarray) -> Splats:
         """Return the Gaussians of a mask ``(N,)``."""
@@ -127,17 +123,17 @@ class Splats:
         """Return the visible Gaussians whose centres lie in a ``box``: lower corner, upper corner.
 
         The default box holds 98% of the opacity along each axis, and a quarter more on both sides. Raises
-        :class:`SplatsError` if none is left.
+        :class:`UsageError` if none is left.
         """
         visible = self.select(self.opacities >= FAINT)
         if not len(visible):
-            raise SplatsError(f"{self.path}: has {len(self):,} Gaussians, none with an opacity of 1/255 or more")
+            raise UsageError(f"{self.path}: has {len(self):,} Gaussians, none with an opacity of 1/255 or more")
         most = visible._box_without_strays()
         box = most if box is None else np.array(box, np.float64).reshape(2, 3)
         inside = ((visible.centres >= box[0]) & (visible.centres <= box[1])).all(axis=1)
         if not inside.any():
             text = " to ".join("(" + ", ".join(f"{x:.4g}" for x in corner) + ")" for corner in most)
-            raise SplatsError(f"box: holds none of the {len(self):,} Gaussians of {self.path}, most lie in {text}")
+            raise UsageError(f"box: holds none of the {len(self):,} Gaussians of {self.path}, most lie in {text}")
         return visible.select(inside)
 
     def _box_without_strays(self) -> np.ndarray:
@@ -171,30 +167,30 @@ def _read_ply(path: Path) -> Splats:
     if packed or path.suffix.lower() != ".ply":
         fault = "compressed Gaussians" if packed else "Gaussians in another format"
         advice = f'PlayCanvas\' splat-transform converts it ("splat-transform {path.name} OUTPUT.ply")'
-        raise SplatsError(f"holds {fault}, an uncompressed PLY file is needed: {advice}")
+        raise UsageError(f"holds {fault}, an uncompressed PLY file is needed: {advice}")
     elements = load_ply(io.BytesIO(content))["metadata"]["_ply_raw"]
     vertices = elements["vertex"]["data"]
     names = vertices.dtype.names if isinstance(vertices, np.ndarray) else tuple(vertices)
     rest = sum(name.startswith("f_rest_") for name in names)
     if rest not in REST:
-        raise SplatsError(f"has {rest} properties f_rest_*, allowed are {', '.join(map(str, REST))}")
+        raise UsageError(f"has {rest} properties f_rest_*, allowed are {', '.join(map(str, REST))}")
     used = (*NAMES, *(f"f_rest_{i}" for i in range(rest)))
     if missing := [name for name in used if name not in names]:
-        raise SplatsError(f"holds no 3D Gaussians, its vertices lack {', '.join(missing)}")
+        raise UsageError(f"holds no 3D Gaussians, its vertices lack {', '.join(missing)}")
     columns = np.stack([np.asarray(vertices[name], np.float64).reshape(-1) for name in used], axis=1)
     if not len(columns):
-        raise SplatsError("holds no Gaussians")
+        raise UsageError("holds no Gaussians")
     for name, values in zip(used, columns.T, strict=True):
         if not np.isfinite(values).all():
-            raise SplatsError(f"has {np.count_nonzero(~np.isfinite(values)):,} {name} that are NaN or infinite")
+            raise UsageError(f"has {np.count_nonzero(~np.isfinite(values)):,} {name} that are NaN or infinite")
     centres, scales, quaternions, opacities, first, others = np.split(columns, (3, 6, 10, 11, 14), axis=1)
     lengths = np.linalg.norm(quaternions, axis=1, keepdims=True)
     if not lengths.all():
-        raise SplatsError(f"has {np.count_nonzero(lengths == 0):,} rotations of length 0")
+        raise UsageError(f"has {np.count_nonzero(lengths == 0):,} rotations of length 0")
     with np.errstate(over="ignore"):
         scales, opacities = np.exp(scales), 1 / (1 + np.exp(-opacities[:, 0]))
     if scales.max() > FARTHEST or np.abs(centres).max() > FARTHEST:
-        raise SplatsError("has places or scales above 1e18, are the scales logarithms?")
+        raise UsageError("has places or scales above 1e18, are the scales logarithms?")
     others = others.reshape(len(others), 3, rest // 3).swapaxes(1, 2)  # all of red first
     colours = np.concatenate([first[:, None], others], axis=1)
     # Normals are 0 in the files of the reference implementation
@@ -206,19 +202,21 @@ def _read_ply(path: Path) -> Splats:
 
 
 class SplatSubject:
-    """Gaussians of a file as the subject of a capture, cropped to a ``box`` (default: :meth:`Splats.crop`).
+    """Gaussians of a file as the subject of a capture, cropped to the ``box`` of the settings.
 
-    Raises :class:`SplatsError`, also in a variant without RGB, and :class:`.UsageError` if the
-    Gaussians need more memory than there is.
+    ``settings`` are :class:`.capture.CaptureSettings`. Raises :class:`.UsageError`, also in a variant without RGB, and
+    if the Gaussians need more memory than there is.
     """
 
-    def __init__(self, path: str | os.PathLike, box=None):
-        self.path = Path(path)
+    def __init__(self, path: str | os.PathLike, settings):
+        self.path, self.settings = Path(path), settings
         if not mi.is_rgb:
-            raise SplatsError(f"{path}: the variant {mi.variant()} shows no Gaussians, one with rgb is needed")
+            raise UsageError(f"{path}: the variant {mi.variant()} shows no Gaussians, one with rgb is needed")
         splats = Splats.read(path)
-        self.splats, self.notes = splats.crop(box), splats.notes
+        self.splats, self.notes = splats.crop(settings.box), splats.notes
         check_memory(f"{path}: Gaussians", len(self.splats), GAUSSIAN_BYTES * len(self.splats))
+        box = self.splats.box()
+        self.centre, self.scale = box.mean(axis=0), SIZE / max(np.linalg.norm(box[1] - box[0]) / 2, 1e-30)
 
     def record(self) -> dict:
         """Return what the images depend on beside the settings."""
@@ -232,18 +230,9 @@ class SplatSubject:
         """Return the radius of a sphere around a point that holds the Gaussians' box."""
         return float(np.linalg.norm(np.abs(self.bounds() - centre).max(axis=0)))
 
-    def camera(self, settings) -> SplatCamera:
-        """Return the camera of a capture with these settings."""
-        return SplatCamera(self.splats, settings)
-
-
-class SplatCamera:
-    """Camera that sees Gaussians, ``settings`` (:class:`.capture.CaptureSettings`) as for a scene."""
-
-    def __init__(self, splats: Splats, settings):
-        self.settings = settings
-        box = splats.box()
-        self.centre, self.scale = box.mean(axis=0), SIZE / max(np.linalg.norm(box[1] - box[0]) / 2, 1e-30)
+    def prepare(self) -> None:
+        """Load the scene of the Gaussians, at the traced size."""
+        splats = self.splats
         centres = (splats.centres - self.centre) * self.scale
         data = np.concatenate([centres, splats.scales * self.scale, splats.quaternions], axis=1)
         arrays = {
