@@ -297,7 +297,7 @@ def test_refused_renderings(mi_rgb, tmp_path):
     scene = mi_diffind.load_dict(wall(mi_rgb, texture()))
     for options, sentence in (
         ({"centre": (0, 0, 0)}, "centre: given without orbit"),
-        ({"depth": 3}, "depth, defines: given with a scene in memory"),
+        ({"depth": 3}, "learn, depth, defines: given with a scene in memory"),
         ({"depth_tolerance": 0.1}, "depth_tolerance: given without depth"),
     ):
         with pytest.raises(UsageError, match=sentence):

@@ -160,20 +160,6 @@ def test_arguments():
     assert views_from(parsed("--origins", "0,0,0:1,1,1")).origins == ((0, 0, 0), (1, 1, 1))
 
 
-@pytest.mark.parametrize(
-    ("words", "match"),
-    [
-        (("--azimuth", "1:2:3"), "'1:2:3', expected LOW:HIGH"), (("--up", "0,1"), "'0,1', expected X,Y,Z"),
-        (("--origins", "0,1,2"), "'0,1,2', expected two corners"), (("--bound", "0"), "found '0', allowed are"),
-        (("--distance", "nan"), "expected LOW:HIGH"), (("--bound", "much"), "found 'much', allowed are"),
-    ],
-)  # fmt: skip
-def test_bad_arguments(words, match, capsys):
-    with pytest.raises(SystemExit):
-        parsed(*words)
-    assert match in capsys.readouterr().err
-
-
 LIGHTS = {
     "sun": {"type": "directional", "direction": [0.3, 0.5, -1]},
     "lamp": {"type": "point", "position": [1, 0, 1]},

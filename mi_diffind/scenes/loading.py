@@ -63,23 +63,6 @@ def warn_if_black(scene, path: str | os.PathLike, images) -> None:
         plugins.warn(f"{path}: the picture is black{'' if scene.emitters() else ', the scene has no emitter'}")
 
 
-def use_slashes(state) -> None:
-    """Write names of files in a parsed scene with slashes where they have backslashes, and only that is a file."""
-    copies = compat.parsed_properties(compat.copy_state(state)[1])  # a parameter that was read counts as known
-    for props, known in zip(compat.parsed_properties(state), copies, strict=True):
-        for key in known:
-            text = str(known[key]) if compat.property_kind(known, key) == "text" else ""
-            if "\\" in text and not _is_file(text) and _is_file(text.replace("\\", "/")):
-                props[key] = text.replace("\\", "/")
-
-
-def _is_file(name: str) -> bool:
-    """Return whether a name is that of a file, as Mitsuba resolves it."""
-    with contextlib.suppress(OSError, ValueError):
-        return Path(str(mi.file_resolver().resolve(name))).is_file()
-    return False
-
-
 def check_measured(state) -> None:
     """Refuse damaged files of measured materials that a parsed scene names. Raises UsageError."""
     for props in compat.parsed_properties(state):
@@ -132,7 +115,6 @@ class ParsedScene:
             if path.suffix.lower() == ".npz":
                 raise RuntimeError(f"{path}: found a table file, a scene is needed: mi_diffind.inspect shows its use")
             _, self._state = compat.parse_file(path, self.defines)
-            use_slashes(self._state)
 
     @contextlib.contextmanager
     def _errors(self):
@@ -282,9 +264,7 @@ def load_file(path: str | os.PathLike, parallel: bool = True, optimize: bool = T
     if not Path(path).is_file():
         return mi.load_file(str(path))
     with _resolving(path):
-        config, state = compat.parse_file(path, defines)
-        use_slashes(state)
-        return _build_as(config, state, parallel, optimize)
+        return _build_as(*compat.parse_file(path, defines), parallel, optimize)
 
 
 @in_turn

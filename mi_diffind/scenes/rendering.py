@@ -141,19 +141,17 @@ def render(
     if depth_tolerance is not None and depth != "auto":
         raise UsageError('depth_tolerance: given without depth="auto"')
     start = time.perf_counter()
-    parsed = None
+    parsed, chosen, conversions = None, None, []
     if isinstance(scene, (str, os.PathLike)):
         parsed = loading.ParsedScene(scene, dict(defines or {}))
         conversions = conversion.replace_stock(parsed, learn, progress=progress)
         chosen = _choose_depth(parsed, depth, depth_tolerance, seed)
         changed = chosen["chosen"] != chosen["scene"]
         loaded = parsed.load(longest_path=chosen["chosen"] if changed else None)
+    elif learn or depth != "scene" or defines:
+        raise UsageError("learn, depth, defines: given with a scene in memory, allowed are scene files")
     else:
-        if learn:
-            raise UsageError("learn: given with a scene in memory, allowed are scene files")
-        if depth != "scene" or defines:
-            raise UsageError("depth, defines: given with a scene in memory, allowed are scene files")
-        chosen, conversions, loaded = None, [], loading.load_dict(scene) if isinstance(scene, dict) else scene
+        loaded = loading.load_dict(scene) if isinstance(scene, dict) else scene
         if not isinstance(loaded, mi.Scene):
             raise UsageError(f"scene: found a {type(loaded).__name__}, expected a scene, its file or its dictionary")
     name = str(parsed.path) if parsed else "scene"
@@ -186,7 +184,7 @@ def render(
     figures = {
         "interrupted": interrupted,
         "nonfinite_pixels": bad,
-        "scene": str(parsed.path) if parsed else None,
+        "scene": name if parsed else None,
         "variant": mi.variant(),
         "width": frames[0].shape[1],
         "height": frames[0].shape[0],
