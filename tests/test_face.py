@@ -400,7 +400,7 @@ def test_a_table_file_is_no_scene(mi_rgb, capsys):
     with pytest.raises(mi_diffind.DiffindError, match="found a table file, a scene is needed"):
         mi_diffind.render(TILES)
     assert main(["render", str(TILES)]) == 2
-    assert "found a table file, a scene (.xml) is needed" in capsys.readouterr().err
+    assert "found a table file, a scene is needed" in capsys.readouterr().err
 
 
 def test_a_normal_map_of_one_channel():

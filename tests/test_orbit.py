@@ -100,7 +100,7 @@ def test_what_is_refused(mi_rgb, path, tmp_path, capsys):
         (("--orbit", "3", "-o", str(tmp_path / "film.avi")), "allowed are .exr, .png, .mp4, .webp, .gif"),
         (("-o", str(tmp_path / "film.mp4")), "allowed are .exr and .png"),
         (("-o", str(tmp_path / "film.webp")), "allowed are .exr and .png"),
-        (("--centre", "0", "0", "0"), "--centre needs --orbit"),
+        (("--centre", "0", "0", "0"), "centre: given without orbit"),
     ):
         assert cli.main(["render", str(path), *options]) == 2
         assert message in capsys.readouterr().err

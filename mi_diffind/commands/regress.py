@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..core.files import writable_folder
-from .common import UsageError, natural, positive, require_scene, say, scene_options, set_variant, verb
+from ..core.errors import UsageError
+from ..core.files import check_scene_file, writable_folder
+from .common import natural, positive, say, scene_options, set_variant, verb
 
 HELP = "check that scenes render as their stored references do"
 
@@ -35,7 +36,7 @@ def run(arguments) -> dict:
     :mod:`mi_diffind.scenes.regression` does.
     """
     for path in arguments.scenes:
-        require_scene(path)
+        check_scene_file(path)
     stems = [Path(path).stem for path in arguments.scenes]
     for stem in stems:
         if stems.count(stem) > 1:

@@ -80,6 +80,18 @@ def irregular(path: str | os.PathLike, most: int | None = None) -> str:
     return ""
 
 
+def check_scene_file(path: str | os.PathLike) -> None:
+    """Raise :class:`.UsageError` if there is no file ``path``, or if it cannot be a scene."""
+    path = Path(path)
+    fault = irregular(path, MOST_TEXT)
+    if not fault and not path.is_file():
+        fault = "is a folder, a scene file is needed" if path.is_dir() else "no such scene file"
+    elif path.suffix.lower() == ".npz":
+        fault = 'found a table file, a scene is needed: "mi-diffind inspect" prints the lines by which a scene reads it'
+    if fault:
+        raise UsageError(f"{shown(path)}: {fault}")
+
+
 def writable_folder(path: str | os.PathLike, create: bool = False) -> Path:
     """Return the folder ``path``, made if ``create`` is set and its parent exists.
 

@@ -19,7 +19,7 @@ import numpy as np
 from .. import plugins
 from ..core import compat, tensor_files, units
 from ..core.errors import DiffindError, UsageError
-from ..core.files import MOST_TEXT, irregular, replacing, shown
+from ..core.files import check_scene_file, replacing
 from ..core.runtime import use_variant
 from ..core.threads import in_turn, threads_for_files
 from ..fitting.task import tasks
@@ -102,18 +102,16 @@ class ParsedScene:
         self.path = path = Path.cwd() / name if in_memory else Path(source)
         self.defines = {name: str(value) for name, value in (defines or {}).items()}
         self._resolver = None  # parsing adds the folders of <path> to it
+        try:
+            if not in_memory:
+                check_scene_file(path)
+        except UsageError as e:
+            raise SceneError(str(e)) from None
         with self._errors():
             if in_memory:
                 _, self._state = compat.parse(source)
                 self.description = _description(self._state)
                 return
-            if fault := irregular(path, MOST_TEXT):
-                raise RuntimeError(f"{shown(path)}: {fault}")
-            if not path.is_file():
-                fault = "is a folder, a scene file is needed" if path.is_dir() else "no such scene file"
-                raise RuntimeError(f"{path}: {fault}")
-            if path.suffix.lower() == ".npz":
-                raise RuntimeError(f"{path}: found a table file, a scene is needed: mi_diffind.inspect shows its use")
             _, self._state = compat.parse_file(path, self.defines)
 
     @contextlib.contextmanager

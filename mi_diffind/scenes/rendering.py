@@ -140,6 +140,8 @@ def render(
         raise UsageError("centre: given without orbit, whose middle it is")
     if depth_tolerance is not None and depth != "auto":
         raise UsageError('depth_tolerance: given without depth="auto"')
+    if output is not None:
+        image_path(output, bool(orbit))
     start = time.perf_counter()
     parsed, chosen, conversions = None, None, []
     if isinstance(scene, (str, os.PathLike)):
@@ -157,7 +159,7 @@ def render(
     name = str(parsed.path) if parsed else "scene"
     loading.check_renderable(loaded, name)
     if output is not None:
-        _check_channels(image_path(output, bool(orbit)), channel_count(loaded))
+        _check_channels(Path(output), channel_count(loaded))
     ready = time.perf_counter()
     spp = spp or loaded.sensors()[0].sampler().sample_count()
     footprint.check_samples(footprint.textures(loaded), spp)
