@@ -172,7 +172,7 @@ def test_an_interrupted_capture_is_gone_on_with(mi_rgb, scene, tmp_path, monkeyp
 
 
 def test_views_of_other_processes(mi_rgb, scene, tmp_path, monkeypatch, capsys):
-    """The same bytes, also of the lists; a view that fails ends the capture."""
+    """Images and lists are equal to the last byte; a view that fails ends the capture."""
     assert run(scene, tmp_path / "one", "-D", "red=0.5") == run(
         scene, tmp_path / "two", "-D", "red=0.5", "--workers", "1"
     )

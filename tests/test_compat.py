@@ -348,7 +348,7 @@ def test_errors_in_one_sentence(mi_rgb, tmp_path):
 
 
 def test_edges_of_shading_normals(mi_rgb):
-    """What normals change by, of a mesh and of a sphere, is told in units of these; neighbouring rays agree."""
+    """Normals of a mesh and of a sphere change along these edges as between neighbouring rays."""
     mesh = {"type": "ply", "filename": str(Path(__file__).resolve().parents[1] / "scenes" / "assets" / "vase.ply")}
     vase = mi_rgb.load_dict({"type": "scene", "mesh": mesh})
     box = vase.bbox()

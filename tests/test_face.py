@@ -277,7 +277,7 @@ def test_nothing_to_save(mi_rgb, tmp_path):
 
 
 def test_a_rendering_is_that_of_mitsuba(mi_rgb, tmp_path):
-    """Of a dictionary, a loaded scene and a file; ``save`` and the picture of a notebook show its image."""
+    """A dictionary and a loaded scene give Mitsuba's image; ``save`` and the picture of a notebook show it."""
     mi = mi_rgb
     content = wall(mi, small(mi))
     loaded = mi_diffind.load_dict(content)

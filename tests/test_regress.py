@@ -59,7 +59,7 @@ def test_passes_share_no_samples(mi_rgb, monkeypatch, tmp_path):
 
 
 def test_samplers_that_round(mi_rgb, tmp_path, capsys):
-    """What is rendered is said; a check has the samples of its reference, or is refused."""
+    """Reports state the rendered samples; a check has the samples of its reference, or is refused."""
     path, report = scene_file(tmp_path), tmp_path / "report.json"
     rounded = {"independent": 24, "stratified": 32, "multijitter": 24, "orthogonal": 32, "ldsampler": 32}
     for sampler, spp in rounded.items():

@@ -236,7 +236,7 @@ def tilted(tmp_path):
 
 
 def test_area_lights_are_where_a_view_has_them(tilted):
-    """As images of a scene that is written so, by Mitsuba's own rotations; no kernel depends on the place."""
+    """Images equal those of a scene that is written so, by Mitsuba's own rotations; no kernel depends on the place."""
     t = mi.ScalarTransform4f
     film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
     sensor = {"type": "perspective", "to_world": t().look_at([0, -4, 4], [0, 0, 0], [0, 0, 1]), "film": film}
@@ -370,7 +370,7 @@ def test_references_are_rendered_once(path, tmp_path, passes):
 
 
 def test_references_of_other_processes(path, tmp_path, passes):
-    """The same images, rendered elsewhere, and kept in the same files."""
+    """Workers render equal images and keep them in the same files."""
     views = ORBIT.trained()[:3]
     alone = references_of(path, ORBIT, 10, pass_samples=FOUR).images(views)
     seeds = list(passes.seeds)
@@ -622,7 +622,7 @@ def test_values_and_derivatives_have_their_own_samples(trained, weights):
 
 
 def test_a_material_is_trained_as_its_maps_are(folder, path, trained, weights):
-    """The same images and gradients from one plugin that reads all maps."""
+    """One plugin that reads all maps gives the images and gradients of a plugin for each map."""
     text = re.sub(
         "<bsdf .*</bsdf>", '<bsdf type="neural_material"><string name="filename" value="material.npz"/><string '
         'name="lobes" value="tables"/></bsdf>', path.read_text(encoding="utf-8"),

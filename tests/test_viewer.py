@@ -56,7 +56,7 @@ def check(shown, mi, passes=3, atol=1e-4, exact=True, **options):
 
 @pytest.mark.parametrize("integrator", ["path", "path_sdf", "path_footprint", "prb", "ptracer"])
 def test_a_picture_is_the_mean_of_mitsubas_passes(mi_rgb, integrator):
-    """Of both sides; ``prb`` is written in Python by Mitsuba, ``ptracer`` follows no rays of a camera."""
+    """Both sides agree with Mitsuba; ``prb`` is written in Python, ``ptracer`` follows no rays of a camera."""
     shown = Session(content(mi_rgb, integrator), WIDTH, seed=3)
     check(shown, mi_rgb, integrator=integrator, atol=1e-3 if integrator == "ptracer" else 2e-6)
     assert shown.figures["samples"] == 3 and not shown.finished

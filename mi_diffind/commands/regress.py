@@ -42,7 +42,7 @@ def run(arguments) -> dict:
         if stems.count(stem) > 1:
             raise UsageError(f'{len(stems)} scenes, and more than one is called "{stem}": check them one at a time')
     set_variant(arguments.variant)
-    from ..scenes import regression, regression_report
+    from ..scenes import regression
 
     results, options = [], {"spp": arguments.spp, "seed": arguments.seed, "defines": dict(arguments.defines)}
     if not arguments.update:
@@ -61,7 +61,7 @@ def run(arguments) -> dict:
                 break
     finally:
         if results and not arguments.update:
-            say("\n".join(regression_report.summary(results)))
+            say("\n".join(regression.summary(results)))
     return {
         "interrupted": results[-1]["interrupted"],
         "failed": sum(r.get("passed") is False for r in results),
