@@ -280,7 +280,7 @@ def test_references_serve_both_backends(mi_rgb, tmp_path, monkeypatch):
     monkeypatch.setattr(mi, "variant", lambda: "cuda_ad_rgb")
     assert np.array_equal(regress.read_reference(path).image, stored.image)
     monkeypatch.setattr(mi, "variant", lambda: "llvm_ad_spectral")
-    with pytest.raises(regress.BadReference, match=r'no reference ".*scene.llvm_ad_spectral.exr"; run'):
+    with pytest.raises(regress.loading.SceneError, match=r'no reference ".*scene.llvm_ad_spectral.exr"; run'):
         regress.read_reference(path)
 
 

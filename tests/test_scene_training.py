@@ -35,7 +35,7 @@ from mi_diffind.scenes.training.options import (
     recipe_from,
     views_from,
 )
-from mi_diffind.scenes.training.problem import SceneProblem, exposure_of
+from mi_diffind.scenes.training.problem import SceneProblem, estimate_exposure
 from mi_diffind.scenes.training.references import ReferenceRenders
 from mi_diffind.scenes.training.rig import Rig
 from mi_diffind.scenes.training.trained_scene import (
@@ -810,8 +810,8 @@ def test_errors_of_pixels():
 
 def test_exposure():
     image = np.linspace(0, 2, 100, dtype=np.float32).reshape(10, 10, 1) * np.float32([1, 0.5, 0.2])
-    assert exposure_of([image]) == pytest.approx(1 / 1.9, rel=0.02)
-    assert exposure_of([np.zeros((2, 2, 3))]) == 1
+    assert estimate_exposure([image]) == pytest.approx(1 / 1.9, rel=0.02)
+    assert estimate_exposure([np.zeros((2, 2, 3))]) == 1
 
 
 @pytest.mark.parametrize("preset", ["ours", "paper"])

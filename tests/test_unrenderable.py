@@ -149,7 +149,7 @@ def test_no_error_of_what_is_not_finite(value, error):
     other = image.copy()
     other[3, 4, 1] = other[3, 4, 2] = other[0, 0, 0] = value
     for pair in ((image, other), (other, image)):
-        with pytest.raises(metrics.NotFiniteError, match="2 of 144 pixels are not finite"):
+        with pytest.raises(UsageError, match="2 of 144 pixels are not finite"):
             error(*pair)
     assert metrics.nonfinite_pixels(other) == 2 and metrics.nonfinite_pixels(image) == 0
 

@@ -79,10 +79,6 @@ _REMEDY = "remove it and make it again with --update"
 # -- files ------------------------------------------------------------------------------------------------------------
 
 
-class BadReference(loading.SceneError):
-    """A stored reference is missing, damaged, or of another size; the message is one sentence that names it."""
-
-
 @dataclass(frozen=True)
 class Reference:
     """A stored rendering: its ``image``, ``(height, width, channels)``, and its ``blocks``, for the test of a check.
@@ -108,14 +104,14 @@ def reference_path(path: str | os.PathLike, references: str | os.PathLike | None
 def read_reference(path: str | os.PathLike, references: str | os.PathLike | None = None) -> Reference:
     """Return the stored reference of a scene file in the current variant, or in its twin for the other backend.
 
-    ``llvm_…`` and ``cuda_…`` variants render the same. Raises :class:`BadReference`.
+    ``llvm_…`` and ``cuda_…`` variants render the same. Raises :class:`.SceneError`.
     """
     wanted = reference_path(path, references)
     backend, _, mode = mi.variant().partition("_")
     twins = [wanted.with_name(f"{Path(path).stem}.{b}_{mode}.exr") for b in ("llvm", "cuda") if b != backend]
     stored = next((file for file in (wanted, *twins) if file.is_file()), None)
     if stored is None:
-        raise BadReference(f'{path}: has no reference "{wanted}"; run the same command with --update to make it')
+        raise loading.SceneError(f'{path}: has no reference "{wanted}"; run the same command with --update to make it')
     parts = _parts(stored)
     return _reference(stored, _about(stored, Path(path).stem, parts), parts[0][1], parts[-1][1])
 
@@ -168,7 +164,7 @@ def _parts(path: Path) -> list[tuple[dict, dict]]:
                 for part in file.parts
             ]
     except (RuntimeError, ValueError) as e:
-        raise BadReference(f"{path}: cannot be read as an EXR image; {_REMEDY}") from e
+        raise loading.SceneError(f"{path}: cannot be read as an EXR image; {_REMEDY}") from e
 
 
 def _about(path: Path, stem: str, parts: list[tuple[dict, dict]]) -> dict:
@@ -176,11 +172,11 @@ def _about(path: Path, stem: str, parts: list[tuple[dict, dict]]) -> dict:
         about = json.loads(parts[0][0][_ATTRIBUTE])
         good = all(isinstance(about[key], expected) for key, expected in _ABOUT.items())
     except (KeyError, TypeError, ValueError) as e:
-        raise BadReference(f"{path}: is an EXR image, but no reference; {_REMEDY}") from e
+        raise loading.SceneError(f"{path}: is an EXR image, but no reference; {_REMEDY}") from e
     if not (good and about["budget"] > 0 and about["spp"] > 0):
-        raise BadReference(f"{path}: is a damaged reference; {_REMEDY}")
+        raise loading.SceneError(f"{path}: is a damaged reference; {_REMEDY}")
     if (about["scene"], f"{about['scene']}.{about['variant']}.exr") != (stem, path.name):
-        raise BadReference(f'{path}: is the reference of the scene "{about["scene"]}" in {about["variant"]}')
+        raise loading.SceneError(f'{path}: is the reference of the scene "{about["scene"]}" in {about["variant"]}')
     return about
 
 
@@ -204,7 +200,7 @@ def _reference(path: Path, about: dict, image: dict, means: dict) -> Reference:
     except (KeyError, TypeError, ValueError):
         good = False
     if not good:
-        raise BadReference(f"{path}: is a damaged reference; {_REMEDY}")
+        raise loading.SceneError(f"{path}: is a damaged reference; {_REMEDY}")
     return Reference(pixels, BlockReference(passes, mean, stops, *pixels.shape[:2]), about)
 
 
@@ -402,7 +398,7 @@ def regress(
     (:class:`.block_test.Block`), ``stops``, ``stops_threshold``, ``not_finite`` (pixels), and ``files`` (written
     paths). Of an update: ``budget`` (samples per pixel of a check, which a sampler may have rounded up from
     ``asked_spp``), ``bytes``, ``reused_passes``, and ``partial``, the file of kept passes after Ctrl-C. Raises
-    :class:`.SceneError`, among them :class:`BadReference`, :class:`.UsageError` and :class:`.OutputError`.
+    :class:`.SceneError`, :class:`.UsageError` and :class:`.OutputError`.
     """
     use_variant()
     seed_of_check, path = seed or 0, scene
@@ -420,7 +416,7 @@ def regress(
     _check_size(path, reference, height, width)
     size, start = PassSize.for_check(loaded, spp or about["budget"]), time.perf_counter()
     if size.check_spp != about["budget"]:
-        raise BadReference(
+        raise loading.SceneError(
             f"{path}: a check would have {size.check_spp} samples a pixel, its reference is for {about['budget']}: "
             f"keep --spp and the sampler, or render it again with --update --spp {size.check_spp}"
         )
@@ -452,7 +448,7 @@ def _check_size(path, reference: Reference, height: int, width: int, channels: i
     expected = reference.image.shape
     if (height, width, expected[2] if channels is None else channels) != expected:
         rendered = f"{width} x {height} pixels" + ("" if channels is None else f" of {channels} channel(s)")
-        raise BadReference(
+        raise loading.SceneError(
             f"{path}: renders {rendered}, its reference has {expected[1]} x {expected[0]} of {expected[2]} channel(s); "
             "leave the size to the reference, or render it again with --update"
         )

@@ -278,9 +278,9 @@ def middle(scene) -> np.ndarray:
     return box.mean(axis=0) if np.isfinite(box).all() else np.zeros(3)
 
 
-def strip(frames: Sequence[np.ndarray], columns: int = COLUMNS) -> np.ndarray:
-    """Return one image of all frames, at most ``columns`` in a row; missing cells are 0."""
-    columns = min(columns, len(frames))
+def strip(frames: Sequence[np.ndarray]) -> np.ndarray:
+    """Return one image of all frames, at most :data:`COLUMNS` in a row; missing cells are 0."""
+    columns = min(COLUMNS, len(frames))
     rows = -(-len(frames) // columns)
     height, width, channels = frames[0].shape
     grid = np.zeros((rows * columns, height, width, channels), np.float32)
