@@ -447,12 +447,16 @@ def test_renders_that_fit_into_a_limited_time(monkeypatch, seconds, compiling, k
 
     def profiled(work):
         start = clock.now
-        return work(), clock.now - start, [{}, {"backend_time": 1e3 * compiling, "operation_count": 20_000}]
+        return (
+            work(),
+            clock.now - start,
+            [{}, {"backend_time": 1e3 * compiling, "operation_count": 20_000, "cache_hit": known}],
+        )
 
     monkeypatch.setattr("mi_diffind.scenes.training.fit.profiled", profiled)
     problem = Timed(clock)
     request = FitRequest("ours", problem.recipe.settings, None, deadline=Deadline(seconds))
-    sentence, figures = limit(problem, request, known)
+    sentence, figures = limit(problem, request)
     assert figures == {"psnr_db": 20.0}
     assert sentence.startswith("no step through renders: " + remark if remark else remark)
     assert bool(sentence) == bool(remark) == (problem.recipe.share == 0)
