@@ -105,21 +105,6 @@ def test_formats_agree(mi_rgb, scene, tmp_path):
     assert len(np.unique(exr)) > len(np.unique(png))
 
 
-def test_what_is_there_is_kept(mi_rgb, scene, tmp_path, capsys):
-    folder = tmp_path / "views"
-    assert run(scene, folder) == 0
-    images = sorted(folder.glob("*/*.png"))
-    before = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in images}
-    lists = (folder / "transforms_train.json").read_text()
-    images[2].unlink()
-    capsys.readouterr()
-    assert run(scene, folder) == 0
-    assert "6 of 6 views, 1 rendered now" in capsys.readouterr().out
-    assert sorted(folder.glob("*/*.png")) == images and (folder / "transforms_train.json").read_text() == lists
-    assert [p for p in images if p.stat().st_mtime_ns != before[p][1]] == [images[2]]
-    assert images[2].read_bytes() == before[images[2]][0]  # the same view, and the same random numbers
-
-
 def test_other_settings_are_refused(mi_rgb, scene, tmp_path, capsys):
     folder = tmp_path / "views"
     assert run(scene, folder, "--seed", "3") == 0
@@ -276,12 +261,6 @@ def test_what_hides_nothing_is_said(mi_rgb, scene, tmp_path, capsys):
 def test_options_that_are_refused(mi_rgb, scene, tmp_path, capsys, options, message):
     assert run(scene, tmp_path / "views", *options) == 2
     assert message in capsys.readouterr().err and not (tmp_path / "views").exists()
-
-
-def test_a_scene_without_surfaces_is_refused(mi_rgb, scene, tmp_path, capsys):
-    scene.write_text('<scene version="3.0.0"><emitter type="constant"/></scene>')
-    assert run(scene, tmp_path / "views") == 2
-    assert "the scene has no surfaces but lights, there is nothing to capture" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["group", "thin", "glossy"])

@@ -399,11 +399,6 @@ def test_defines_may_have_any_name(tmp_path):
     assert main(["compare", str(LAMP), "--out", str(tmp_path), "--passes", "1", *small]) == 0
 
 
-def test_options_for_the_other_kind_of_file(tmp_path, capsys):
-    assert "--measure needs a table file" in refused(capsys, "inspect", scene_file(tmp_path), "--measure")
-    assert "-D needs a scene file" in refused(capsys, "inspect", str(shipped("disney")), "-D", "a=1")
-
-
 @pytest.mark.skipif("cuda" in "".join(BACKENDS), reason="this machine has a GPU")
 def test_variant_without_its_device(tmp_path, capsys):
     assert "needs an NVIDIA GPU" in refused(capsys, "render", scene_file(tmp_path), "--variant", "cuda_ad_rgb")
