@@ -212,7 +212,7 @@ def _checking_factory(plugin: Plugin):
 
     def make(props):
         instance = plugin.factory(props)
-        needed = compat.base_class(OBJECT_TYPES[plugin.object_type])
+        needed = getattr(compat.mi, OBJECT_TYPES[plugin.object_type])
         if not isinstance(instance, needed):  # Mitsuba would crash
             returned = "nothing" if instance is None else f"a {type(instance).__name__}"
             raise RuntimeError(

@@ -5,7 +5,6 @@ from __future__ import annotations  # Delayed parsing of type annotations
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind.core.compat import base_class, lobe_rates
 from mi_diffind.tasks.disney import model, sampling
 from mi_diffind.tasks.disney.decoder import Decoder, Lobe
 from mi_diffind.tasks.disney.model import LOBES, Effects, find_effects
@@ -259,7 +258,7 @@ class Disney(mi.BSDF):
 
     def _textures(self) -> dict[str, mi.Texture]:
         textures = {"base_color": self.base_color, **self.scalars, self.reflectance_name: self.reflectance}
-        return {name: texture for name, texture in textures.items() if isinstance(texture, base_class("Texture"))}
+        return {name: texture for name, texture in textures.items() if isinstance(texture, mi.Texture)}
 
     def _numbers(self) -> dict:
         """Return the parameters that are numbers, by name."""
@@ -343,7 +342,7 @@ class Disney(mi.BSDF):
             return mi.UnpolarizedSpectrum(model.clamp(self.base_color.eval(si, active), 0.0, 1.0))
         if name != "specular":
             return model.clamp(self.scalars[name].eval_1(si, active), 0.0, 1.0)
-        texture = isinstance(self.reflectance, base_class("Texture"))
+        texture = isinstance(self.reflectance, mi.Texture)
         value = self.reflectance.eval_1(si, active) if texture else self.reflectance
         if self.reflectance_name == "eta":
             value = model.specular_from_eta(value)
@@ -473,7 +472,7 @@ class Disney(mi.BSDF):
 
     def to_string(self):
         lines = [f"{name} = {texture}" for name, texture in self._textures().items()]
-        if not isinstance(self.reflectance, base_class("Texture")):
+        if not isinstance(self.reflectance, mi.Texture):
             lines.append(f"{self.reflectance_name} = {self.reflectance}")
         report = self.report()
         if report["storage"]:
@@ -563,9 +562,6 @@ def to_principled(props: mi.Properties) -> None:
     if "subsurface" in props:
         props["flatness"] = props["subsurface"]
         del props["subsurface"]
-    for name in set(Disney.RATES.values()) - set(lobe_rates()):
-        if name in props:
-            del props[name]
 
 
 #: Mitsuba's own model with the same parameters.

@@ -12,7 +12,6 @@ from mi_diffind.arrays.indirection import DifferentiableArray
 from mi_diffind.arrays.lookup import clamp
 from mi_diffind.arrays.tables import TableError
 from mi_diffind.core import compat
-from mi_diffind.core.compat import base_class
 from mi_diffind.core.errors import UsageError
 from mi_diffind.tasks.bsdf import TASK
 from mi_diffind.tasks.bsdf.files import RESIDUAL
@@ -433,7 +432,7 @@ def _learned_or_source(props: mi.Properties):
 def _is_textured(bsdf) -> bool:
     """Return whether a BSDF differs from place to place; plugins of Mitsuba do not all set a flag."""
     nodes = compat.scene_objects(bsdf)
-    varies = any(isinstance(node, base_class("Texture")) and node.is_spatially_varying() for node in nodes)
+    varies = any(isinstance(node, mi.Texture) and node.is_spatially_varying() for node in nodes)
     return varies or mi.has_flag(bsdf.flags(), mi.BSDFFlags.SpatiallyVarying)
 
 

@@ -8,7 +8,6 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_diffind.core import compat
-from mi_diffind.core.compat import base_class, normal_mapped
 from mi_diffind.maps.layout import Layout, MapLayout
 from mi_diffind.tasks.disney import TASK as DISNEY
 from mi_diffind.tasks.disney.decoder import Lobe
@@ -269,11 +268,7 @@ class NeuralMaterial(Disney):
             raise RuntimeError(f'parameter "two_sided": found {self.two_sided}, allowed are true and false')
         self.maps = MaterialMaps(props)
         for name in ("base_color", *self.scalars, "subsurface", "specular", "eta"):
-            if (
-                name in props
-                and isinstance(props[name], base_class("Texture"))
-                and not compat.is_constant_texture(props[name])
-            ):
+            if name in props and isinstance(props[name], mi.Texture) and not compat.is_constant_texture(props[name]):
                 raise RuntimeError(f'parameter "{name}": found a texture, allowed are numbers: maps come from the file')
         for name, m in self.maps.maps.items():
             others = {"flatness": ("subsurface",), "specular": ("eta",)}.get(name, ())
@@ -303,8 +298,6 @@ class NeuralMaterial(Disney):
             )
         self._is_anisotropic |= extras or "anisotropic" in self.maps.maps
         sides = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide if self.two_sided else mi.BSDFFlags.FrontSide
-        if "normal" in self.maps.maps:
-            sides = sides | normal_mapped()
         self._set_flags(self.maps.is_spatially_varying(), self._is_anisotropic, sides)
         if "opacity" in self.maps.maps:
             self.m_components = [*self.m_components, mi.BSDFFlags.Null | mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide]

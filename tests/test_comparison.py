@@ -24,7 +24,7 @@ def halves(rng, mean, shared, deviation, samples):
 @pytest.mark.parametrize("samples", [[32, 32], [48, 16]])
 @pytest.mark.parametrize("bias", [0.0, 0.01])
 def test_noise_of_a_difference(rng, samples, bias):
-    """Of known parts: 0.1 a sample on each side makes sqrt(2/64) 0.1; what both sides share is no error at all."""
+    """Independent noise of 0.1 a sample on each side makes sqrt(2/64) 0.1; shared noise is no error at all."""
     mean = rng.uniform(0.3, 0.6, (80, 60, 3))
     shared = [rng.normal(0, 0.3, mean.shape) for _ in samples]
     written = halves(rng, mean + bias, shared, 0.1, samples)

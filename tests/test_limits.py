@@ -34,9 +34,8 @@ from mi_diffind.images.headers import picture_size
 from mi_diffind.maps.pyramid import map_figure
 from mi_diffind.maps.source import SourceError, from_arrays, load_source
 from mi_diffind.scenes.inspection import Inspection
-from mi_diffind.tasks.radiance import coding, files
+from mi_diffind.tasks.radiance import coding
 from mi_diffind.tasks.radiance.captures import ViewsError, image_file, read_image
-from mi_diffind.tasks.sdf.mesh import MeshError, load_mesh, make_mesh
 
 
 def archive(path, members: dict) -> Path:
@@ -145,31 +144,6 @@ def test_few_lanes_hold_few_symbols():
         decoder.code("x", 1, 2, np.zeros(10**6, int), None)
 
 
-def test_coded_nodes_are_those_of_a_dense_grid(tmp_path, rng):
-    """Places, neighbours and packed flags, against masks of the whole grid."""
-    shape = (37, 18, 45)
-    from mi_diffind.arrays.sparse_grid import cell_corners
-    from mi_diffind.tasks.radiance.nodes import layers
-
-    stored = cell_corners(rng.random(tuple(n - 1 for n in shape)) < 0.02)
-    count = int(stored.sum())
-    numbers = rng.integers(0, 16, count), rng.integers(0, 300, count)
-    places, *again = coding.decode(*coding.encode(stored, *numbers, 16, 300), shape, 16, 300)
-    np.testing.assert_array_equal(places, np.flatnonzero(stored))
-    assert all(np.array_equal(a, b) for a, b in zip(again, numbers, strict=True))
-    with pytest.raises(coding.TooManyNodes, match="at most 100 are accepted"):
-        coding.decode(*coding.encode(stored, *numbers, 16, 300), shape, 16, 300, 100)
-    assert np.array_equal(files._packed(places, stored.size), np.packbits(stored.reshape(-1)))
-    for mask in (stored, np.packbits(stored.reshape(-1))):
-        np.testing.assert_array_equal(np.concatenate([*layers(mask, shape)]), stored)
-    number = np.full(np.array(shape) + 8, -1)
-    number[4:-4, 4:-4, 4:-4][stored] = np.arange(count)
-    place = np.argwhere(stored) + 4
-    for part in coding.passes_of(stored):
-        around = {int(number[tuple(place[part.rows[0]] + np.array(o) - 2)]) for o in np.ndindex(5, 5, 5)}
-        assert set(part.near[0].tolist()) <= around | {-1}
-
-
 def test_sizes_of_pictures(tmp_path, rng):
     """Against what Mitsuba decodes."""
     import mitsuba as mi
@@ -259,34 +233,6 @@ def test_files_name_others_in_their_folder(tmp_path, monkeypatch):
     for name in ("maps/inside.png", "./maps/../maps/inside.png", os.path.join(folder, "maps", "inside.png")):
         manifest.write_text(json.dumps({"albedo": name}))
         assert load_source(manifest).texels == 16
-
-
-def test_meshes_say_what_is_wrong(tmp_path):
-    corners = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]
-    with pytest.raises(MeshError, match="names vertex -7, there are vertices 0 to 3"):
-        make_mesh(np.array(corners), np.array([(0, 1, 2), (-7, 1, 3)]))
-    with pytest.raises(MeshError, match="names vertex 9, there are vertices 0 to 3"):
-        make_mesh(np.array(corners), np.array([(0, 1, 2), (9, 1, 3)]))
-    (tmp_path / "a.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nend_header\n")
-    with pytest.raises(MeshError, match=r"a\.ply: cannot be read as a mesh, it is damaged or of an unknown format"):
-        load_mesh(tmp_path / "a.ply")
-
-
-def test_readers_that_are_not_installed(tmp_path, monkeypatch):
-    import trimesh
-
-    (tmp_path / "a.3mf").write_bytes(b"")
-    for error, package in (
-        (ImportError("No module named 'lxml'"), "lxml"), (ImportError("missing `pip install pycollada`"), "pycollada"),
-        (ModuleNotFoundError("x", name="openctm"), "openctm"),
-    ):  # fmt: skip
-
-        def missing(*arguments, error=error, **options):
-            raise error
-
-        monkeypatch.setattr(trimesh, "load", missing)
-        with pytest.raises(MeshError, match=rf"\.3mf files need the package {package}, .*: pip install {package}$"):
-            load_mesh(tmp_path / "a.3mf")
 
 
 def test_maps_may_be_called_as_figures(rng):

@@ -167,7 +167,7 @@ def test_a_size_is_asked_for_in_one_way():
 
 
 def test_more_than_fits_is_refused(monkeypatch):
-    """What fits exactly is allowed, one byte more is not."""
+    """A size that fits exactly is allowed, one byte more is not."""
     assert 2**28 < units.memory() < 2**45
     monkeypatch.setattr(units, "memory", lambda: 3 * 2**30)
     units.check_memory("batch", 10, 3 * 2**30)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from ..core.files import writable_folder
-from .common import learn_option, positive, require_scene, say, scene_options, set_variant, verb
+from ..core.files import check_scene_file, writable_folder
+from .common import learn_option, positive, say, scene_options, set_variant, verb
 
 HELP = "render a scene as written and with exact plugins, and show the difference"
 
@@ -41,7 +41,7 @@ def run(arguments) -> dict:
 
     Raises :class:`.UsageError`, and as :mod:`mi_diffind.scenes.comparison` does.
     """
-    require_scene(arguments.scene)
+    check_scene_file(arguments.scene)
     writable_folder(arguments.out, create=True)
     set_variant(arguments.variant)
     from ..scenes import comparison, equal_time

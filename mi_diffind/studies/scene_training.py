@@ -41,9 +41,9 @@ from ..measure.report import figure_caption
 from ..measure.study import Candidate, Measure, Plan, Study
 from ..scenes import loading
 from ..scenes.training.options import SceneRecipe, View, ViewDistribution
-from ..scenes.training.problem import exposure_of
+from ..scenes.training.problem import estimate_exposure
 from ..scenes.training.references import ReferenceRenders
-from ..scenes.training.trained_scene import TrainedScene, original_of, texture_file
+from ..scenes.training.trained_scene import TrainedScene, find_source, texture_file
 from ..tasks.texture.compressed import load
 from .equal_memory import Contender
 
@@ -179,7 +179,7 @@ class SceneTrainingContext:
         self.parsed = loading.ParsedScene(path, settings.defines)
         self.file, given = texture_file(self.parsed)
         self.start = load(self.file)
-        self.source = original_of(self.start, self.file, given)
+        self.source = find_source(self.start, self.file, given)
         #: Folder that keeps references.
         self.references: Path | None = None
 
@@ -191,7 +191,7 @@ class SceneTrainingContext:
             self.parsed, views, self.settings.reference_spp, self.references, without=(self.file,)
         )
         images = renders.images(views.measured())
-        return views, views.measured(), images, exposure_of(images)
+        return views, views.measured(), images, estimate_exposure(images)
 
     def measure(self, table: Table, spp: int) -> dict[str, float]:
         """Return ``psnr_db`` and ``flip`` of a table in renders with footprints of ``spp`` samples a pixel."""

@@ -74,7 +74,7 @@ def distance_shape(mesh: type) -> type:
         def __init__(self, props: mi.Properties, field, placement: Placement, smooth: bool):
             self.field, self.smooth, self.position = field, smooth, PlacementParameter(placement)
             self.ready, self.differentiated = False, False
-            super().__init__(*compat.mesh_arguments(props, CORNERS, CORNERS))
+            super().__init__(props.plugin_name(), CORNERS, CORNERS, props)
             if self.is_emitter():
                 raise RuntimeError("emitter: found one, signed distance fields emit no light")
             if self.is_medium_transition():

@@ -1,6 +1,6 @@
 """Footprint of a pixel at a surface hit: two full conjugate diameters of an ellipse in uv, ``ddx`` and ``ddy``.
 
-Both are ``mi.Vector2f``, the columns of ``si.footprint`` in Mitsuba 3.10. Their |det| (:func:`area`) is
+Both are ``mi.Vector2f``. Their |det| (:func:`area`) is
 |ddx(uv) × ddy(uv)| of Datta et al., *Efficient Graphics Representation with Differentiable Indirection*, SIGGRAPH Asia
 2023, task 4.
 
@@ -166,23 +166,16 @@ def _number(props: mi.Properties, name: str, default: float) -> float:
 def footprint(si: mi.SurfaceInteraction3f, cone: Cone | None = None) -> tuple[mi.Vector2f, mi.Vector2f]:
     """Return the footprint at a hit: ``ddx, ddy`` in the surface's uv, before any ``to_uv``. It is always finite.
 
-    In each lane, the first of these sources counts that is neither zero nor infinite nor NaN: ``si.footprint``, which
-    Mitsuba 3.10 has; the partial derivatives ``si.duv_dx`` and ``si.duv_dy``, if an integrator filled them; the
-    ``cone`` (:func:`seen_by`). Without any, infinite values of the last source are limited to :data:`LARGEST`, and NaN
-    or no source at all is 0, the sharpest footprint.
+    In each lane, the first of these sources counts that is neither zero nor infinite nor NaN: the partial derivatives
+    ``si.duv_dx`` and ``si.duv_dy``, if an integrator filled them; the ``cone`` (:func:`seen_by`). Without any, infinite
+    values of the last source are limited to :data:`LARGEST`, and NaN or no source at all is 0, the sharpest footprint.
     """
-    sources = []
-    if (given := compat.footprint_of(si)) is not None:
-        sources.append(given)
-    sources.append((si.duv_dx, si.duv_dy))
     ddx, ddy = (mi.Vector2f(0), mi.Vector2f(0)) if cone is None else seen_by(cone, si)
-    for x, y in reversed(sources):
-        x, y = dr.detach(x), dr.detach(y)
-        size = _size(x, y)
-        valid = (size > 0) & (size < dr.inf)  # NaN: false
-        valid |= _size(ddx, ddy) == 0
-        ddx, ddy = dr.select(valid, _finite(x), ddx), dr.select(valid, _finite(y), ddy)
-    return ddx, ddy
+    x, y = dr.detach(si.duv_dx), dr.detach(si.duv_dy)
+    size = _size(x, y)
+    valid = (size > 0) & (size < dr.inf)  # NaN: false
+    valid |= _size(ddx, ddy) == 0
+    return dr.select(valid, _finite(x), ddx), dr.select(valid, _finite(y), ddy)
 
 
 def seen_by(cone: Cone, si: mi.SurfaceInteraction3f) -> tuple[mi.Vector2f, mi.Vector2f]:

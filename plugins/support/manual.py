@@ -70,7 +70,7 @@ PARTS = {
           - --""",
     "footprint": """\
         **The footprint** is that of one sample: that of a pixel, reduced by the square root of the number of samples.
-        It comes from the first of these sources that has it: Mitsuba itself (from version 3.10); an integrator that
+        It comes from the first of these sources that has it: an integrator that
         fills the partial derivatives of uv, such as :monosp:`path_footprint`; the sensor, if the ray comes straight
         from it; otherwise an estimate that is rather too sharp than too blurred. Without any source, for instance
         without a sensor, the footprint is zero and the texture is not filtered: :monosp:`mi.render` warns once. No

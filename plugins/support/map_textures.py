@@ -12,7 +12,6 @@ import numpy as np
 from mi_diffind.arrays.boxes import ValueBounds
 from mi_diffind.arrays.lookup import clamp
 from mi_diffind.core import compat
-from mi_diffind.core.compat import base_class
 from mi_diffind.images import srgb
 from mi_diffind.maps.layout import MapLayout
 
@@ -38,7 +37,7 @@ DECODED = 2**22
 BRIGHTEST = 1e9
 
 
-class MapTexture(base_class("Texture")):
+class MapTexture(mi.Texture):
     """Texture of one map of a :class:`~mi_diffind.maps.pyramid.CompressedMaps`.
 
     The class implements colours and data, wrapping, transformation, spectra and the sampling of positions. A derived
@@ -524,10 +523,6 @@ class FilteredTexture(MapTexture):
             gradient.append((ahead - behind) / width)
         return self._before(*gradient)
 
-    def filtered(self) -> bool:
-        """Return whether footprints are read; if no texture says so, Mitsuba 3.10 computes none."""
-        return self.filter.name != "off" and self.is_spatially_varying()
-
     def report(self) -> dict:
         """Return the description of :meth:`.MapTexture.report` and three more keys.
 
@@ -540,7 +535,7 @@ class FilteredTexture(MapTexture):
         if self.filter.name == "off" or not self.is_spatially_varying():
             left_out["footprint"] = "the filter is off" if self.filter.name == "off" else "the map is constant"
         else:
-            sources = [*(["interaction"] if compat.has_footprints() else []), "uv partials"]
+            sources = ["uv partials"]
             if self.cone is not None:
                 sources.append("sensor" if self.cone is not self._cone_of_parameters else "parameters")
             else:

@@ -84,7 +84,7 @@ def mirrored(si):
 
 
 def refracted(ior: float):
-    """What follows the ray through a boundary, outside of which is vacuum."""
+    """Ray behind a boundary, outside of which is vacuum."""
 
     def follow(si):
         _, cosine, _, ratio = mi.fresnel(mi.Frame3f.cos_theta(si.wi), ior)

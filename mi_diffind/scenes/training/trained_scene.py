@@ -128,7 +128,7 @@ def texture_file(parsed: loading.ParsedScene) -> tuple[Path, str]:
     return next(iter(files.items()))
 
 
-def original_of(table: Table, file: Path, given: str = "") -> Path:
+def find_source(table: Table, file: Path, given: str = "") -> Path:
     """Return the image or manifest of a texture, recorded or ``given``. Raises :class:`TableError`."""
     recorded = str(table.settings.get("source_path", ""))
     if not given and not recorded:
@@ -148,7 +148,7 @@ class SceneTexture:
 
     def __init__(self, file: Path, table: Table, given: str = "", start: Table | None = None, trained: bool = True):
         self.file, self.table = file, start or table
-        self.source_path = original_of(table, file, given)
+        self.source_path = find_source(table, file, given)
         self.source = load_source(self.source_path, nonfinite="clean")
         layout, recipe = Layout.from_json(self.table.settings["layout"]), texture_recipe(self.table)
         if not layout.stored:
@@ -264,7 +264,9 @@ class TrainedScene:
                         props["max_depth"] = props.get("max_depth", loading.MAX_DEPTHS[name])
                         props.set_plugin_name("prb")
 
-            self.scene = parsed.load(change=change, parallel=False)
+            changed = parsed.copy()
+            changed.change(change)
+            self.scene = changed.load(parallel=False)
         self.spp, self.rig, self._cones = spp, Rig(self.scene, views), {}
         self._seeing = footprint.textures(self.scene)
         #: Name of each array → the parameter of the scene that is set for it.
