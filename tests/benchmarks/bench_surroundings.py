@@ -16,7 +16,7 @@ from pathlib import Path
 from bench_nerf import training
 from frame import VARIANT, earlier, parser, short_machine, write
 
-from mi_diffind.tasks.radiance.surroundings import inner_cube
+from mi_diffind.tasks.radiance.grid import inner_cube
 from mi_diffind.tasks.radiance.views import load_views
 
 #: Name of a row → further options of ``fit field``.

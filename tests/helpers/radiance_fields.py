@@ -70,7 +70,7 @@ class Bumps(VolumeField):
 
 def haze(types, rng, centre=(0.2, -0.1, 0.3), half=0.7, side=13):
     """A field of random numbers with surroundings, thin enough that rays see the horizon."""
-    from mi_diffind.tasks.radiance.surroundings import ContractedNodes
+    from mi_diffind.tasks.radiance.nodes import ContractedNodes
     from mi_diffind.tasks.radiance.volume_field import NodeField
 
     place = np.subtract(centre, 2 * half), 4 * half / (side - 1), (side,) * 3, np.ones((side,) * 3, bool)
@@ -86,7 +86,7 @@ def ball_table(inner=None):
     """
     import drjit.llvm as types
 
-    from mi_diffind.tasks.radiance import files, nodes, surroundings
+    from mi_diffind.tasks.radiance import files, nodes
     from mi_diffind.tasks.radiance.grid import NodeGrid
 
     side, spacing = 25, 0.1
@@ -97,7 +97,7 @@ def ball_table(inner=None):
         stored = nodes.Nodes(*grid, radius < 1)
         raw = np.clip(12 * (0.8 - radius), -6, 4)[stored.stored]
     else:
-        stored = surroundings.ContractedNodes(*grid, np.ones((side,) * 3, bool), inner=inner)
+        stored = nodes.ContractedNodes(*grid, np.ones((side,) * 3, bool), inner=inner)
         raw = np.full(side**3, -5.0)
     colour = np.zeros((stored.count, 12))
     colour[:, 0], colour[:, 4], colour[:, 8] = -place[stored.stored][:, 0], -1, place[stored.stored][:, 0]

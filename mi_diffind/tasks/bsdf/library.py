@@ -27,12 +27,6 @@ from .truth import SUFFIXES, material_ids
 #: Material that stands for all of a scene.
 ALL = "all"
 
-#: Options of ``fit bsdf`` that say where and how a library is fitted, and not what.
-ELSEWHERE = ("source", "material", "workers", "scheduler")
-
-#: File of a library's report, beside its tables.
-REPORT = "report.json"
-
 #: Columns of the printed table: heading → text of a material's record.
 COLUMNS = {
     "bytes": lambda m: f"{m['bytes']:,}",
@@ -172,7 +166,7 @@ def fit_library(request: FitRequest) -> FittedLibrary:
     interrupted = any(r["status"] == "left" for r in records.values())
     library = FittedLibrary(None, None, request=request, folder=folder, materials=records, interrupted=interrupted)
     library.seconds = time.perf_counter() - start
-    write_json(folder / REPORT, library.report)
+    write_json(folder / "report.json", library.report)
     return library
 
 
@@ -190,7 +184,9 @@ def find_materials(request: FitRequest, folder: Path) -> tuple[dict[str, Library
         files = sorted(f for f in source.iterdir() if f.suffix.lower() in SUFFIXES and not f.name.startswith("."))
         if not files:
             raise UsageError(f"{source}: holds no sources, allowed are files that end in {', '.join(SUFFIXES)}")
-    given = {k: v for k, v in request.options.items() if k not in ELSEWHERE} | dataclasses.asdict(request.settings)
+    given = {**request.options, **dataclasses.asdict(request.settings)}
+    for name in ("source", "material", "workers", "scheduler"):  # where and how a library is fitted, and not what
+        del given[name]
     common = [given, request.preset, mi.variant(), __version__, mi.__version__]
     names: set[str] = set()
     materials, broken = {}, {}

@@ -24,12 +24,6 @@ from .model import MOST_PARAMETERS, Parameter, points
 #: Extensions of files that are sources.
 SUFFIXES = (".xml", ".bsdf", ".pbsdf", ".binary", ".csv")
 
-#: Relative difference of f below which a parameter of a family has no effect.
-EFFECT = 1e-5
-
-#: Share of the values of a source that may be NaN or infinite: a few are at the horizon.
-MOST_NONFINITE = 0.01
-
 #: Largest value f cos θ that counts; a plugin may exceed it next to the horizon.
 LARGEST = 1e8
 
@@ -77,7 +71,7 @@ class MitsubaTruth(Truth):
             dr.eval(sides)
         front, back = (np.stack([channel.numpy() for channel in side]) for side in sides)
         bad, remarks = float((~np.isfinite(front)).any(axis=0).mean()), []
-        if bad > MOST_NONFINITE:
+        if bad > 0.01:  # a few are at the horizon
             raise UsageError(f"{self.name}: {bad:.1%} of its values are not finite, nothing can be fitted to them")
         if bad:
             remarks.append(f"{bad:.2g} of its values are not finite and count as 0")
@@ -223,7 +217,7 @@ class FamilyTruth:
                 coordinates[k] = end
                 value = self.at(coordinates).value(samples.wi, samples.wo)
                 ends.append(np.stack([(samples.weight * v).numpy() for v in value]))
-            if np.abs(ends[1] - ends[0]).sum() <= EFFECT * np.abs(ends[0]).sum():
+            if np.abs(ends[1] - ends[0]).sum() <= 1e-5 * np.abs(ends[0]).sum():
                 raise UsageError(
                     f"over: {parameter.name} changes nothing of {self.truth.name}, which may need it in the source, too"
                 )

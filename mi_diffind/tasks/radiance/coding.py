@@ -8,10 +8,8 @@ most lie between coded ones, which are the context of their symbols.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
-from operator import getitem
 
 import numpy as np
 
@@ -65,9 +63,9 @@ class SymbolEncoder:
     def __init__(self):
         self.alphabets, self.calls = {}, []
 
-    def code(self, group: str, contexts: int, symbols: int, context: np.ndarray, given: Callable) -> np.ndarray:
-        """Add each symbol (below ``symbols``) that ``given`` returns in its ``context`` (below ``contexts``)."""
-        symbol = np.asarray(given(), np.int64)
+    def code(self, group: str, contexts: int, symbols: int, context: np.ndarray, given: np.ndarray) -> np.ndarray:
+        """Add each ``given`` symbol (below ``symbols``) in its ``context`` (below ``contexts``)."""
+        symbol = np.asarray(given, np.int64)
         self.alphabets[group] = (contexts, symbols)
         self.calls.append((group, np.asarray(context, np.int64), symbol))
         return symbol
@@ -369,7 +367,8 @@ def _cells(coder, shape: tuple, cells: np.ndarray | None = None, most: int = MOS
         sides.append(tuple(-(-n // 2) for n in sides[-1]))
         masks.append(None if cells is None else coarser(masks[-1]))
     nothing = np.zeros(int(np.prod(sides[-1])), np.int64)
-    occupied = coder.code("blocks", 1, 2, nothing, lambda: masks[-1].reshape(-1)).astype(bool)
+    given = None if cells is None else masks[-1].reshape(-1)
+    occupied = coder.code("blocks", 1, 2, nothing, given).astype(bool)
     parents = _unravelled(np.flatnonzero(occupied), sides[-1])
     for level in reversed(range(HALVINGS)):
         inside, room = np.array(sides[level]), np.array(sides[level + 1]) + 2
@@ -392,7 +391,8 @@ def _cells(coder, shape: tuple, cells: np.ndarray | None = None, most: int = MOS
                     near += value
             context = (rank * 7 + beside.astype(np.int64)) * 7 + np.minimum(near // 3, 6)
             place = tuple((2 * parents[within] + parity).T)
-            symbol = coder.code(f"cells {min(level, 2)}", 8 * 49, 2, context, partial(getitem, masks[level], place))
+            given = None if cells is None else masks[level][place]
+            symbol = coder.code(f"cells {min(level, 2)}", 8 * 49, 2, context, given)
             halves[at[symbol == 0]] &= np.uint8(255 ^ 1 << _bit_of(parity))
         if (count := int(_COUNTS[halves[flat]].sum())) > most:
             raise TooManyNodes(count, most)
@@ -421,34 +421,30 @@ def _bit_of(parity) -> int:
 
 
 def _numbers(coder, passes: list[Pass], level_count: int, colours: int, levels=None, index=None) -> tuple:
-    """Code the levels and the indices of nodes, each given those of its coded neighbours."""
+    """Code the levels and the indices of nodes, each given those of its coded neighbours; without them, decode them."""
     count = sum(len(part.rows) for part in passes)
     coded_levels, coded_index = np.zeros(count, np.uint8), np.zeros(count, np.uint16)
     for part in passes:
-        context, given = part.level_context(coded_levels, level_count), partial(getitem, levels, part.rows)
+        context, given = part.level_context(coded_levels, level_count), None if levels is None else levels[part.rows]
         symbol = coder.code(f"levels {part.group}", 7 * level_count + 1, level_count, context, given)
         coded_levels[part.rows] = symbol
     upper = ((colours - 1) >> LOW_BITS) + 1
     for part in passes:
         names, context = part.named(coded_index)
-        given = partial(naming, names, index, part.rows)
+        given = None if index is None else naming(names, index, part.rows)
         symbol = coder.code(f"names {part.group}", NAMED_CONTEXTS, NAMED + 1, context, given)
         value = names[np.arange(len(names)), np.minimum(symbol, NAMED - 1)]
         new = np.flatnonzero(symbol == NAMED)
-        fresh, given = fresh_context(names[new], colours), partial(_halves, index, part.rows[new])
-        high = coder.code("upper", PARTS + 1, upper, fresh, partial(given, 0))
-        low = coder.code("lower", upper, 1 << LOW_BITS, high, partial(given, 1))
+        fresh = fresh_context(names[new], colours)
+        given = (None, None) if index is None else divmod(index[part.rows[new]], 1 << LOW_BITS)
+        high = coder.code("upper", PARTS + 1, upper, fresh, given[0])
+        low = coder.code("lower", upper, 1 << LOW_BITS, high, given[1])
         value[new] = high << LOW_BITS | low
         # Before the next pass, whose contexts follow from it
         if value.min(initial=0) < 0 or value.max(initial=0) >= colours:
             raise ValueError("found an index beyond the palette")
         coded_index[part.rows] = value
     return coded_levels, coded_index
-
-
-def _halves(index: np.ndarray, rows: np.ndarray, which: int) -> np.ndarray:
-    """Return the upper (0) or the lower (1) part of the indices of some rows."""
-    return divmod(index[rows], 1 << LOW_BITS)[which]
 
 
 def naming(names: np.ndarray, index: np.ndarray, rows: np.ndarray) -> np.ndarray:

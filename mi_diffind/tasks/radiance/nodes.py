@@ -1,8 +1,14 @@
-"""Nodes of a dense or sparse grid: their numbers, their memory index, and the empty distances between them.
+"""Nodes of a dense or sparse grid, in a box or in all space: numbers, memory index, and empty distances.
 
 A sparse grid stores the corners of all occupied cells. A cell is occupied if all its corners are stored, and empty
 otherwise. Rays cross empty space by the distances of a coarser grid, whose cells span :data:`COARSE` cells along each
 axis.
+
+Surroundings of captured objects fill all space, in a grid of finite size that is coarser with the distance. The
+contraction is that of mip-NeRF 360 (Barron et al. 2022) in the maximum norm, with a cube of half side R around the
+objects: points of the cube stay, and a point p at r = ‖p‖ / R > 1 from the cube's centre moves to (2 − 1/r) p / r, into
+a cube of twice the side. Nodes are equidistant there. Steps of rays grow as √(1 + (r / ρ)²) with the Euclidean distance
+r, on both sides of the point next to the centre, and so do voxels: the density of a node is that of a step.
 """
 
 from __future__ import annotations
@@ -20,8 +26,11 @@ COARSE = 2
 #: Largest stored distance, in cells of the coarser grid: 4 bits.
 FARTHEST = 15
 
-#: Nodes of a dense grid that are processed at a time, in whole layers (:func:`layer_count`): each takes several bytes.
-PART = 2**20
+#: Distance in half sides of the inner cube at which steps begin to grow (ρ).
+GROWTH = 2.0
+
+#: Distance in half sides of the inner cube at which rays end.
+HORIZON = 32.0
 
 #: Cells of a column, along z. Each of its 32 nodes has a bit; the last node is also the first of the next column.
 COLUMN = 31
@@ -41,7 +50,7 @@ class Nodes:
         self.lower, self.spacing = tuple(map(float, lower)), float(spacing)
         self.shape = tuple(int(n) for n in shape)
         self._stored = stored
-        #: Contraction of space (:class:`.surroundings.Contraction`), if the grid has one.
+        #: Contraction of space (:class:`Contraction`), if the grid has one.
         self.contraction = None
         # Opaque: grids of another size use the same kernels
         self._inverse = dr.opaque(types.Float, 1 / self.spacing)
@@ -176,6 +185,106 @@ class Nodes:
         return dr.select(active & (steps > 0), length, 0)
 
 
+class EqualSteps:
+    """Distances along rays as multiples of steps: here, steps are of equal length."""
+
+    @staticmethod
+    def of_steps(s):
+        """Return the distances of a ray at the places ``s`` among its steps."""
+        return s
+
+    @staticmethod
+    def in_steps(t):
+        """Return the places of distances among the steps, the inverse of :meth:`of_steps`."""
+        return t
+
+    @staticmethod
+    def skipped(s, t, free):
+        """Return the length in steps of ``free`` space behind the distance ``t``, which is at ``s``."""
+        return free
+
+
+class Contraction:
+    """Contraction around a cube with the centre ``inner[:3]`` and the half side ``inner[3]``."""
+
+    def __init__(self, types, inner):
+        self.types, self.inner = types, tuple(map(float, inner))
+        # Opaque: other cubes use the same kernels
+        self.centre = dr.opaque(types.Array3f, list(self.inner[:3]))
+        self.half = dr.opaque(types.Float, self.inner[3])
+        self._inverse = dr.opaque(types.Float, 1 / self.inner[3])
+
+    def box(self, size: float) -> tuple[tuple, tuple]:
+        """Return the lower and the upper corner of a cube of ``size`` half sides."""
+        centre, half = self.inner[:3], size * self.inner[3]
+        return tuple(c - half for c in centre), tuple(c + half for c in centre)
+
+    def places(self, p) -> tuple:
+        """Return points in contracted space, and their distances r in the maximum norm, at least 1."""
+        v = p - self.centre
+        r = dr.maximum(dr.max(dr.abs(v)) * self._inverse, 1)
+        return dr.fma(v, (2 - 1 / r) / r, self.centre), r
+
+    def growth(self, p):
+        """Return the ratio of steps at points to those at the centre."""
+        return dr.sqrt(dr.fma(dr.squared_norm(p - self.centre), dr.square(self._inverse) / GROWTH**2, 1))
+
+    def along(self, o, d) -> GrowingSteps:
+        """Return the distances of steps on rays from ``o``."""
+        return GrowingSteps(self.half, (o - self.centre) * self._inverse, d)
+
+
+class GrowingSteps(EqualSteps):
+    """Steps that grow with the distance, u = w sinh(s / ρ) from the point of the ray that is next to the centre.
+
+    ``half`` is the half side of the inner cube, ``o`` the origin of a ray in units of it, from its centre.
+    """
+
+    def __init__(self, half, o, d):
+        self.scale, self.half = GROWTH * half, half
+        self.begin = dr.dot(o, d)
+        beside = dr.maximum(dr.squared_norm(o) - dr.square(self.begin), 0)
+        self.width = dr.sqrt(beside + GROWTH**2)
+        self.before = dr.asinh(self.begin / self.width)
+
+    def of_steps(self, s):
+        """Return the distances of a ray at the places ``s`` of its steps."""
+        return self.half * dr.fma(self.width, dr.sinh(s / self.scale + self.before), -self.begin)
+
+    def in_steps(self, t):
+        """Return the places of distances among the steps, the inverse of :meth:`of_steps`."""
+        return self.scale * (dr.asinh((t / self.half + self.begin) / self.width) - self.before)
+
+    def skipped(self, s, t, free):
+        """Return the length in steps of ``free`` space behind the distance ``t``, which is at ``s``."""
+        # Never less than 0, by rounding: rays go on
+        return dr.maximum(self.in_steps(t + free) - s, 0)
+
+
+class ContractedNodes(Nodes):
+    """Nodes in contracted space; ``inner`` holds the centre and the half side of the inner cube."""
+
+    def __init__(self, types, lower, spacing: float, shape, stored=None, packed: bool = False, *, inner):
+        super().__init__(types, lower, spacing, shape, stored, packed)
+        self.contraction = Contraction(types, inner)
+
+    def like(self, spacing: float, shape, stored=None, packed: bool = False) -> Nodes:
+        return ContractedNodes(
+            self.types, self.lower, spacing, shape, stored, packed, inner=self.contraction.inner
+        )  # fmt: skip
+
+    def _place(self, p) -> tuple:
+        return super()._place(self.contraction.places(p)[0])
+
+    def free_distance(self, p, d, active=True):
+        # Contracted points move at most (4r − 3) / r² as far in the maximum norm: below 4/3, and below 4 / r
+        contracted = super().free_distance(p, d, active)
+        fastest = dr.maximum(dr.maximum(dr.abs(d.x), dr.abs(d.y)), dr.abs(d.z))
+        _, r = self.contraction.places(p)
+        wide = contracted * fastest / self.contraction.half
+        return contracted * dr.maximum(0.75, r / (4 + wide))
+
+
 def unpacked(flags: np.ndarray, shape) -> np.ndarray:
     """Return the mask of ``shape`` that ``np.packbits`` has packed, bool."""
     return np.unpackbits(flags, count=int(np.prod(shape))).view(bool).reshape(shape)
@@ -183,7 +292,7 @@ def unpacked(flags: np.ndarray, shape) -> np.ndarray:
 
 def layer_count(shape) -> int:
     """Return how many layers of a grid of ``shape`` are processed at a time, a multiple of :data:`COARSE`."""
-    return COARSE * max(1, PART // (COARSE * int(shape[1]) * int(shape[2])))
+    return COARSE * max(1, 2**20 // (COARSE * int(shape[1]) * int(shape[2])))  # nodes, which take several bytes each
 
 
 def layers(stored: np.ndarray, shape, more: int = 0):

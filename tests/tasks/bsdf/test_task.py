@@ -18,7 +18,7 @@ from mi_diffind.tasks.bsdf import TASK, energy, measured, mixture, training
 from mi_diffind.tasks.bsdf import directions as pool
 from mi_diffind.tasks.bsdf.files import BSDFModel, allocate
 from mi_diffind.tasks.bsdf.measured import Truth, rotate_truth
-from mi_diffind.tasks.bsdf.model import TERMS, Form, sizes_within
+from mi_diffind.tasks.bsdf.model import TERMS, Form, Parameter, sizes_within
 from mi_diffind.tasks.bsdf.truth import MERLTruth, truth_of
 
 FORMS = {
@@ -83,10 +83,13 @@ def test_reciprocity(types, model, rng, form):
 
 
 def test_sizes_follow_the_bytes():
-    assert sizes_within(2048).nbytes <= 2048 and sizes_within(2048).nbytes > 1700
+    parameters = [Parameter("a", 0.01, 1.0), Parameter("b", 0.0, 1.0), Parameter("c", 0.0, 1.0)]
+    for count, nbytes in enumerate((2048, 4000, 9000, 12000)):
+        assert 0.75 * nbytes < sizes_within(nbytes, parameters[:count]).nbytes <= nbytes
     assert sizes_within(8192, plain=True).first is None and sizes_within(8192, plain=True).nbytes > 7000
-    with pytest.raises(ValueError, match="found 10 bytes, the smallest arrays need 64"):
-        sizes_within(10)
+    for family, least in (([], "64"), (parameters, "")):
+        with pytest.raises(ValueError, match=f"found 10 bytes, the smallest arrays need {least}"):
+            sizes_within(10, family)
 
 
 # -- sources -----------------------------------------------------------------------------------------------------------
@@ -252,38 +255,32 @@ def test_the_albedo_is_limited(types):
 
 # -- files and training ------------------------------------------------------------------------------------------------
 
+#: Of files of a BSDF, and of a family; shapes and additional arrays of any file are those of ``test_tables.py``.
 DAMAGES = {
-    "form": (lambda t: t.settings.pop("form"), "its setting \"form\" is 'None', which is no form of a BSDF"),
-    "range": (lambda t: t.settings["form"].update(range=[3, -3]), "which is no form of a BSDF"),
-    "scale": (lambda t: t.settings["form"].update(scale=[0, 0.1]), "which is no form of a BSDF"),
-    "terms": (lambda t: t.settings["form"].update(terms=["third"]), "which is no form of a BSDF"),
-    "lobes": (lambda t: t.settings.update(lobes=[0.1, "x"]), r'its setting "lobes" is "\[0.1, \'x\'\]"'),
-    "proxy": (lambda t: t.arrays.pop("proxy"), 'the array "proxy" is missing'),
-    "length": (lambda t: t.arrays.update(proxy=StoredArray(np.zeros((5, 1), np.float32))), r"expected \(22, 1\)"),
-    "shape": (lambda t: t.arrays.update(cascaded=t.arrays["primary_uv"]), "expected 3 dimension"),
-    "one primary": (lambda t: t.arrays.pop("primary_vw"), 'the array "primary_vw" is missing'),
-    "other": (lambda t: t.arrays.update(more=t.arrays["energy"]), 'has an unexpected array "more"'),
-    "high": (lambda t: t.arrays.update(energy=StoredArray(np.full((3, 1), 2, np.float32))), "allowed is"),
-}  # fmt: skip
-
-
-#: Of files of families.
-FAMILY_DAMAGES = {
-    "name": (lambda t: t.settings.update(family=[{"name": "a b", "low": 0, "high": 1}]), "which are no parameters"),
-    "range": (lambda t: t.settings["family"].__setitem__(0, {"name": "a", "low": 1, "high": 1}), "are no parameters"),
-    "fewer": (lambda t: t.settings["family"].pop(), "expected 1 dimension"),
-    "factors": (lambda t: t.settings.update(factors=[1]), r'its setting "factors" is \[1\]'),
-    "mixing": (lambda t: t.arrays.pop("mixing"), 'the array "mixing" is missing'),
-    "rank": (lambda t: t.arrays.update(mixing=t.arrays["energy"]), 'the array "mixing" has the shape'),
-    "proxy": (lambda t: t.arrays.update(proxy=StoredArray(np.zeros((4, 3, 5), np.float16))), "and 24 channel"),
-    "terms": (lambda t: t.settings["form"].update(terms=[]), "a family needs a proxy"),
-    "other": (lambda t: t.arrays.update(more=t.arrays["energy"]), 'has an unexpected array "more"'),
+    handmade: [
+        (lambda t: t.settings.pop("form"), "its setting \"form\" is 'None', which is no form of a BSDF"),
+        (lambda t: t.settings["form"].update(range=[3, -3]), "which is no form of a BSDF"),
+        (lambda t: t.settings["form"].update(scale=[0, 0.1]), "which is no form of a BSDF"),
+        (lambda t: t.settings["form"].update(terms=["third"]), "which is no form of a BSDF"),
+        (lambda t: t.settings.update(lobes=[0.1, "x"]), r'its setting "lobes" is "\[0.1, \'x\'\]"'),
+        (lambda t: t.arrays.update(proxy=StoredArray(np.zeros((5, 1), np.float32))), r"expected \(22, 1\)"),
+        (lambda t: t.arrays.pop("primary_vw"), 'the array "primary_vw" is missing'),
+        (lambda t: t.arrays.update(energy=StoredArray(np.full((3, 1), 2, np.float32))), "allowed is"),
+    ],
+    handmade_family: [
+        (lambda t: t.settings.update(family=[{"name": "a b", "low": 0, "high": 1}]), "which are no parameters"),
+        (lambda t: t.settings["family"].__setitem__(0, {"name": "a", "low": 1, "high": 1}), "are no parameters"),
+        (lambda t: t.settings["family"].pop(), "has the shape"),
+        (lambda t: t.settings.update(factors=[1]), r'its setting "factors" is \[1\]'),
+        (lambda t: t.arrays.pop("mixing"), 'the array "mixing" is missing'),
+        (lambda t: t.arrays.update(mixing=StoredArray(np.zeros((4, 3, 5), np.float32))), "channels, expected 15"),
+        (lambda t: t.settings["form"].update(terms=[]), "a family needs a proxy"),
+    ],
 }  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    "file, change, message",
-    [(f, *d) for f, damages in ((handmade, DAMAGES), (handmade_family, FAMILY_DAMAGES)) for d in damages.values()],
+    "file, change, message", [(file, *damage) for file, damages in DAMAGES.items() for damage in damages]
 )
 def test_damaged_files_are_refused(tmp_path, file, change, message):
     table = file()

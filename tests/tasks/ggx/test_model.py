@@ -1,5 +1,6 @@
 """The GGX distribution, its encodings and the tables that stand in for it, against an independent implementation."""
 
+import copy
 import dataclasses
 import os
 
@@ -10,16 +11,16 @@ import pytest
 from arrays import aligned
 from variants import BACKENDS
 
-from mi_diffind import DifferentiableArray, StoredArray, load_model
 from mi_diffind import fit as fit_task
+from mi_diffind import load_model
 from mi_diffind.arrays import lookup
 from mi_diffind.arrays.tables import TableError, save_table
 from mi_diffind.core.runtime import array_module
-from mi_diffind.fitting.loop import EXPONENTIAL_RATE, fit
+from mi_diffind.fitting.loop import EXPONENTIAL_RATE
 from mi_diffind.fitting.task import FitRequest
 from mi_diffind.tasks.ggx import TASK
-from mi_diffind.tasks.ggx.model import ALPHA_FLOOR, ALPHA_MIN, ENCODINGS, Encoding, LearnedGGX, ggx, indirection
-from mi_diffind.tasks.ggx.training import BANDS, GGXProblem, draw, measure, table_encoding
+from mi_diffind.tasks.ggx.model import ALPHA_FLOOR, ALPHA_MIN, ENCODINGS, LearnedGGX, ggx, indirection
+from mi_diffind.tasks.ggx.training import BANDS, draw, measure, table_encoding
 
 PRESETS = tuple(TASK.presets)
 
@@ -241,28 +242,6 @@ def test_constant_roughness_reads_the_same(ad, shipped, preset, storage):
 # -- training ----------------------------------------------------------------------------------------------------------
 
 
-def short(preset, **changes):
-    changes = {"steps": 150, "batch": 8192, "measure_every": 50, **changes}
-    return dataclasses.replace(TASK.presets[preset], **changes)
-
-
-def test_indirection_beats_a_single_table_of_equal_bytes():
-    """
-    With plain inputs, by more than 2 dB; both learn the root, at the rates of the study, where it is 13 dB (README).
-    With logarithmic inputs the single table is better, by 3 to 4 dB.
-    """
-    ad = array_module("llvm")
-
-    def psnr(net):
-        settings = short("tables", steps=1000, batch=2048, measure_every=500, lr=5e-2)
-        problem = GGXProblem(net.alloc(ad.TensorXf), ad, "paper", Encoding("plain", "root"))
-        return fit(problem, settings, progress=False).measured["psnr_db"]
-
-    single, found = psnr(DifferentiableArray((24, 24), 1, "constant", 0.5)), psnr(indirection())
-    print(f"indirection {found:.2f} dB, a single table {single:.2f} dB")
-    assert found >= single + 2
-
-
 def run(preset, storage="float32", **changes):
     return fit_task("ggx", preset=preset, variant="llvm", storage=storage, progress=False, **changes)
 
@@ -325,33 +304,21 @@ def test_impossible_sizes_are_refused(name, sides):
 # -- files -------------------------------------------------------------------------------------------------------------
 
 
-def set_entry(name, value):
-    def change(table):
-        entries = table.arrays[name].entries.copy()
-        entries.flat[3] = value
-        table.arrays[name] = StoredArray(entries)
-
-    return change
+def set_pointer(table):
+    table.arrays["primary"].entries.flat[3] = 1.5
 
 
 BROKEN = {
     "no encoding": (lambda t: t.settings.pop("inputs"), "the settings name no known encoding"),
     "an unknown encoding": (lambda t: t.settings.update(output="cube"), "the settings name no known encoding"),
-    "a pointer out of the table": (set_entry("primary", 1.5), r'entries of "primary" lie in \[.*, 1.5\], allowed is'),
-    "a pointer below 0": (set_entry("primary", -0.1), r'entries of "primary" lie in \[-0.1, .*\], allowed is \[0, 1\]'),
-    "an answer out of range": (set_entry("cascaded", 3), r'entries of "cascaded" lie in \[.*, 3\], allowed is'),
-    "a pointer of one channel": (
-        lambda t: t.arrays.update(primary=StoredArray(np.zeros((16, 16, 1), np.float32))),
-        r'array "primary" has the shape \(16, 16, 1\), expected \(None, None, 2\)',
-    ),
+    "a pointer out of the table": (set_pointer, r'entries of "primary" lie in \[.*, 1.5\], allowed is'),
 }
 
 
 @pytest.mark.parametrize("what", BROKEN)
 def test_a_wrong_file_is_refused(tmp_path, shipped, what):
     change, sentence = BROKEN[what]
-    path, table = tmp_path / "own.npz", shipped["tables"][0]
-    table = dataclasses.replace(table, arrays=dict(table.arrays), settings=dict(table.settings))
+    path, table = tmp_path / "own.npz", copy.deepcopy(shipped["tables"][0])
     change(table)
     save_table(path, table)
     dtype = array_module("llvm").TensorXf

@@ -1,8 +1,5 @@
 """Coded nodes of radiance fields: symbols, their bytes against the entropy, and the choice by rate and distortion."""
 
-from functools import partial
-from operator import getitem
-
 import numpy as np
 import pytest
 
@@ -34,8 +31,8 @@ def test_symbols_take_the_bytes_of_their_entropy(rng):
     symbols = np.minimum(rng.geometric(np.array([0.9, 0.4, 0.05])[contexts]) - 1, 99)
     coder = coding.SymbolEncoder()
     for part in (slice(0, 7), slice(7, 60_000)):
-        coder.code("x", 3, 100, contexts[part], partial(getitem, symbols, part))
-    coder.code("flags", 1, 2, np.zeros(3, int), lambda: [1, 0, 1])
+        coder.code("x", 3, 100, contexts[part], symbols[part])
+    coder.code("flags", 1, 2, np.zeros(3, int), [1, 0, 1])
     probabilities, data = coder.finish()
     assert 8 * len(data) < 1.02 * entropy(symbols, contexts) + 32 * 17
     decoder = coding.SymbolDecoder(probabilities, data)

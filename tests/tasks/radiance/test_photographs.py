@@ -356,20 +356,6 @@ def test_colmap_text_distortion_and_masks(colmap):
     refused(folder, r'transforms\.json: has no "frames"')
 
 
-def test_colmap_models_and_masks_that_are_not_used_are_named(colmap):
-    folder, _ = colmap
-    assert not load_views(folder).notes
-    (folder / "images" / "left" / "3.png").unlink()
-    shutil.copytree(folder / "sparse" / "0", folder / "sparse" / "1")
-    (folder / "masks" / "left").mkdir(parents=True)
-    for name in ("3.png", "4.png.png"):  # the second one is the mask of an image
-        Image.fromarray(np.full(SIZE, 255, np.uint8)).save(folder / "masks" / "left" / name)
-    models, masks, images = load_views(folder).notes
-    assert models.startswith("1: further models beside ") and models.endswith("sparse/0, which are not used")
-    assert masks.endswith("masks: 1 files are masks of no image, such as left/3.png: the mask of a.jpg is a.jpg.png")
-    assert images == 'sparse/0: 1 of 8 images of the split "train" do not exist and are left out: images/left/3.png'
-
-
 @pytest.mark.parametrize(
     "camera",
     ["SIMPLE_RADIAL_FISHEYE 8 6 10 4 3 0", "RADIAL_FISHEYE 8 6 10 4 3 0 0", "FOV 8 6 10 10 4 3 0.1",

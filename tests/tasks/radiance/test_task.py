@@ -1,10 +1,7 @@
 """``fit field``, ``inspect`` and ``decode``: presets, sizes, interruptions, damaged files, and how they refuse."""
 
 import dataclasses
-import gc
 import json
-import resource
-from pathlib import Path
 
 import captures
 import drjit as dr
@@ -147,14 +144,6 @@ def test_inspect_says_what_rays_leave_out(folder, capsys):
     assert "skipped as empty" in said and "read no colour" in said and "on disk" in said
     text = (folder / "inspect.json").read_text()
     assert all(f'"{name}"' in text for name in ("memory_bytes", "skipped", "hidden", "colours"))
-
-
-def test_same_command_same_file(folder, tmp_path):
-    for name in "ab":
-        assert run(folder, tmp_path / f"{name}.npz", "--steps", 5) == 0
-    a, b = (load_table(tmp_path / f"{name}.npz") for name in "ab")
-    for name, array in a.arrays.items():
-        np.testing.assert_array_equal(array.entries, b.arrays[name].entries)
 
 
 def test_numbers_limit_the_resolution(folder, monkeypatch, capsys):
@@ -477,22 +466,6 @@ def test_the_layout_of_before(folder, tmp_path, ad):
     first, *others = (held_out.render(tasks()["field"].open(ad.TensorXf, p).field, 0) for p in (coded, path, again))
     for picture in others:
         np.testing.assert_allclose(picture, first, atol=1e-6)
-
-
-@pytest.mark.slow
-def test_ten_thousand_steps_take_no_more_memory(folder, ad):
-    def resident() -> float:
-        gc.collect()
-        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 2**20
-
-    grid = files.grid_of(files.load(folder / "grid.npz"), ad)
-    problem = grids.GridProblem(grid, FieldSession.load(ad, folder))
-    settings = FitSettings(steps=1000, batch=256, lr=1e-3, measure_every=1000, check_every=100)
-    train(problem, settings, progress=False)
-    before = resident()
-    result = train(problem, dataclasses.replace(settings, steps=10_000), progress=False)
-    assert resident() - before < 30
-    assert result.restarts == 0 and np.isfinite(result.measured["psnr_white_db"])
 
 
 def test_a_view_that_sees_nothing(folder):

@@ -19,11 +19,6 @@ from mi_diffind.tasks.radiance.session import TILE, FieldSession, ImagesProblem,
 from mi_diffind.tasks.radiance.views import hull, load_views
 
 
-def test_few_views_of_many_are_evenly_spread(blender):
-    assert load_views(blender, most=2).names == ("train/r_0.png", "train/r_2.png")
-    assert load_views(blender, most=9).digest == load_views(blender).digest
-
-
 @pytest.mark.parametrize("suffix", ["png", "exr"])
 def test_compressed_views_are_the_same(blender, suffix):
     """Of all views and of some of them, whatever the pixels are."""
