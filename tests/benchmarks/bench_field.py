@@ -56,7 +56,7 @@ def main() -> None:
             problem = field_fit.pairs_problem(visible, dense / 50, fit.VALUE_STEPS)
         else:
             weights = compression.importance(visible, session, 0)
-            problem = compression.PaletteProblem(compression.palette_coding(visible, weights, bits, 0), session)
+            problem = compression.PaletteProblem(compression.palette_coding(visible, weights, None, bits, 0), session)
         if steps:
             request.train(problem)
         measured = session.held_out_images.evaluate(problem.field_of(problem.net))

@@ -218,25 +218,23 @@ def _free_name(text: str, names: set[str]) -> str:
 
 
 def _identity(file: Path, options: list) -> str:
-    """Return a hash of the content of a source, of the files that it names, and of ``options``; "" on any error."""
-    digest = hashlib.sha256(json.dumps(options, sort_keys=True, default=str).encode())
+    """Return a hash of the content of a source, of the files that XML includes or names, and of ``options``.
+
+    It is "" on any error.
+    """
+    digest, files = hashlib.sha256(json.dumps(options, sort_keys=True, default=str).encode()), [file]
     try:
-        for one in _source_files(file):
+        if file.suffix.lower() == ".xml":
+            _, state = compat.parse_file(file)
+            properties = compat.parsed_properties(state)
+            texts = {props[k] for props in properties for k in props if compat.property_kind(props, k) == "text"}
+            named = (file.parent / text for text in sorted(texts) if 0 < len(text) < 1000)
+            files = [*map(Path, compat.parsed_files(state)), *(path for path in named if path.is_file())]
+        for one in dict.fromkeys(files):
             digest.update(one.name.encode() + b"\0" + one.read_bytes() + b"\0")
     except Exception:  # Mitsuba raises several types; the fit says what is wrong
         return ""
     return digest.hexdigest()
-
-
-def _source_files(file: Path) -> list[Path]:
-    """Return a source and, of XML, the files that it includes or names."""
-    if file.suffix.lower() != ".xml":
-        return [file]
-    _, state = compat.parse_file(file)
-    properties = compat.parsed_properties(state)
-    texts = {props[k] for props in properties for k in props if compat.property_kind(props, k) == "text"}
-    named = (file.parent / text for text in sorted(texts) if 0 < len(text) < 1000)
-    return [*dict.fromkeys([*map(Path, compat.parsed_files(state)), *(path for path in named if path.is_file())])]
 
 
 def _is_fitted(material: LibraryMaterial) -> bool:

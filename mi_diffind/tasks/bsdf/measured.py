@@ -135,8 +135,8 @@ def axes_angle(samples: Samples, truth: Truth) -> float:
     """Return the azimuth of the axes of an anisotropic source, radians from −π/4 to π/4.
 
     They are the principal axes of the half vectors, weighted by the squares of contributions, most of which lie in the
-    peak. Of a function, four turned values of each sample are used, so that what is isotropic cancels. The result is 0
-    if it is below :data:`TURN`, or if halves of the samples disagree.
+    peak. The values of a function are averaged over four rotations of each sample, which removes their isotropic part.
+    The result is 0 if it is below :data:`TURN`, or if halves of the samples disagree by more than 4 degrees.
     """
     index = dr.arange(dr.uint32_array_t(type(samples.weight)), min(2**18, dr.width(samples.weight)))
     samples, moments = samples.at(index), 0
@@ -213,15 +213,6 @@ def colour_weights(wavelengths: np.ndarray, illuminant: str) -> np.ndarray:
     return hats @ density
 
 
-def rgb_fields(fields: dict, illuminant: str) -> dict:
-    """Return the fields of a spectral file of ``measured`` as those of an RGB one."""
-    weights = colour_weights(np.asarray(fields["wavelengths"], np.float64), illuminant)
-    spectra = np.asarray(fields["spectra"])
-    rgb = np.einsum("ptwyx,wc->ptcyx", spectra, weights.astype(np.float32))
-    kept = {name: np.asarray(value) for name, value in fields.items() if name not in ("spectra", "wavelengths")}
-    return {**kept, "rgb": np.ascontiguousarray(rgb, np.float32)}
-
-
 def measured_bsdf(path: Path, illuminant: str):
     """Return Mitsuba's ``measured`` of a file in an RGB variant, and a remark about colours ("" for an RGB file).
 
@@ -233,7 +224,10 @@ def measured_bsdf(path: Path, illuminant: str):
     tensor_files.check(path, fields)
     if "wavelengths" not in fields or mi.is_spectral:
         return mi.load_dict({"type": "measured", "filename": str(path)}), ""
-    fields = rgb_fields(fields, illuminant)
+    fields = {name: np.asarray(value) for name, value in fields.items()}
+    weights = colour_weights(fields.pop("wavelengths").astype(np.float64), illuminant).astype(np.float32)
+    rgb = np.einsum("ptwyx,wc->ptcyx", fields.pop("spectra"), weights)
+    fields["rgb"] = np.ascontiguousarray(rgb, np.float32)
     with tempfile.TemporaryDirectory() as folder:
         converted = os.path.join(folder, path.name)
         tensor_files.write(converted, fields)
@@ -316,7 +310,11 @@ class ScatteredTruth(Truth):
             refuse(wrong, f"{name} is {{{names.index(name)}:g}}, allowed is 0 to {limit}")
         for name in OPTIONAL:
             refuse(columns.get(name, np.zeros(1)) < 0, f"{name} is negative, allowed are numbers ≥ 0")
-        self.wi, self.wo = (_direction(columns[f"theta_{k}"], columns[f"phi_{k}"]) for k in "io")
+        angles = [(columns[f"theta_{k}"], columns[f"phi_{k}"]) for k in "io"]
+        self.wi, self.wo = (
+            np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=1)
+            for theta, phi in angles
+        )
         self.f = np.stack([columns[name] for name in VALUES], axis=1)
         self.weight = columns.get("weight", np.ones(len(rows)))
         self.solid_angle = columns.get("solid_angle")
@@ -362,11 +360,6 @@ def read_rows(path: Path) -> tuple[list[str], np.ndarray, list[int]]:
     if not rows:
         raise UsageError(f"{path}: has no rows below its header")
     return names, np.array(rows), [number for number, _ in body]
-
-
-def _direction(theta: np.ndarray, phi: np.ndarray) -> np.ndarray:
-    sin = np.sin(theta)
-    return np.stack([sin * np.cos(phi), sin * np.sin(phi), np.cos(theta)], axis=1)
 
 
 def along_x(truth: ScatteredTruth) -> np.ndarray:

@@ -34,7 +34,7 @@ RANKING = (256, 8)
 class SampledLobe:
     """Lobe of visible GGX normals of the roughnesses ``alpha_u`` and ``alpha_v``, numbers or arrays.
 
-    ``gamma`` is the exponent of its tails: 2 for those of GGX, larger for shorter ones (:func:`.pool.shorten_tail`).
+    ``gamma`` is the exponent of its tails: 2 for GGX, larger for shorter ones (:func:`.directions.shorten_tail`).
     """
 
     alpha_u: object

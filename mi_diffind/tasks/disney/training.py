@@ -23,7 +23,7 @@ from .arrays import DisneyArrays
 from .decoder import Decoder, Lobe
 from .factored import FactoredArrays, FactoredDecoder
 from .model import PARAMETERS, Effects, Material, compose, exact_factors
-from .paper_variants import PaperArrays, PaperDecoder
+from .paper import PaperArrays, PaperDecoder
 
 #: Luminance weights of linear sRGB, as ``mi.luminance``.
 LUMINANCE = (0.212671, 0.715160, 0.072169)

@@ -18,9 +18,9 @@ from ...core.arguments import Argument, between, checked, positive
 from ...fitting.settings import FitSettings
 from ...fitting.task import Task
 
-#: Voxels per pixel of the views at the distance of the box, and the range of the resolution that follows from them:
-#: nodes along each side of a cube with the volume of the box.
-VOXELS_PER_PIXEL, RESOLUTIONS = 1.25, (32, 352)
+#: Range of the resolution that follows from the pixels of the views: nodes along each side of a cube with the volume of
+#: the box.
+RESOLUTIONS = (32, 352)
 
 #: Stages of the grid from coarse to fine: share of the resolution, and share of the training steps. Between them, cells
 #: that no ray sees are removed.
@@ -36,14 +36,8 @@ RATIOS = {
     "colour": {5: 5.05, 10: 3.42, 25: 4.14, 50: 4.53, 75: 3.58, 100: 5.74},
 }
 
-#: Default compression of the preset ``paper``.
-COMPRESSION = 50.0
-
 #: Colours of a field that a user may choose: with reflections (:mod:`.volume_field`), or twelve numbers of directions.
 COLOURS = ("reflections", "directions")
-
-#: Share of the resolution from which on reflections are trained; before, normals are not known.
-REFLECTING = 0.5
 
 #: Bytes of a node of the uncompressed grid: a density and twelve numbers of colour in float32.
 NODE_BYTES = 52

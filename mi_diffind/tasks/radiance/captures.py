@@ -446,9 +446,10 @@ def list_frames(folder: Path, split: str) -> FrameList:
 
     Raises :class:`ViewsError`.
     """
-    model = None if any(folder.glob("transforms*.json")) else model_folder(folder)
-    if model is not None:
-        return colmap_frames(folder, model, split)
+    if not any(folder.glob("transforms*.json")):
+        for name in ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse"):
+            if any((folder / name / f"cameras.{suffix}").is_file() for suffix in ("bin", "txt")):
+                return colmap_frames(folder, folder / name, split)
     file, content, frames = _frames(folder, split)
     content["frames"] = frames  # those of other splits are not read
     cameras, box = [_camera(file, content, frame) for frame in frames], _box(file, content)
@@ -563,15 +564,8 @@ def _camera(file: Path, content: dict, frame: dict) -> Frame:
 
 
 def _pose(where: str, frame: dict) -> np.ndarray:
-    """Return the matrix of a frame as a rigid motion, ``(4, 4)``; a camera must stand still."""
+    """Return the matrix of a frame as a rigid motion, ``(4, 4)``."""
     matrix = frame.get("transform_matrix")
-    if matrix is None:
-        matrix, end = (frame.get(f"transform_matrix_{time}") for time in ("start", "end"))
-        if end is not None and end != matrix:
-            raise ViewsError(
-                f'{where} moves while the shutter is open, from the "transform_matrix_start" to another '
-                f'"transform_matrix_end": a "transform_matrix" is needed'
-            )
     if matrix is None:
         raise ViewsError(f'{where} has no "transform_matrix"')
     pose = _numbers(matrix)
@@ -597,9 +591,6 @@ def _pose(where: str, frame: dict) -> np.ndarray:
     return pose
 
 
-#: Folders that may hold a model, the first one first.
-FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
-
 #: Folders of images and masks; the mask of ``a.jpg`` is ``a.jpg.png``, as COLMAP has it.
 IMAGES, MASKS = "images", "masks"
 
@@ -612,12 +603,6 @@ PARAMETERS = {
     "OPENCV": "fl_x fl_y cx cy k1 k2 p1 p2",
     "FULL_OPENCV": "fl_x fl_y cx cy k1 k2 p1 p2 k3 k4 k5 k6",
 }
-
-
-def model_folder(folder: Path) -> Path | None:
-    """Return the folder of the COLMAP model of a capture, or ``None``."""
-    files = (folder / name / f"cameras.{suffix}" for name in FOLDERS for suffix in ("bin", "txt"))
-    return next((file.parent for file in files if file.is_file()), None)
 
 
 def colmap_frames(folder: Path, model: Path, split: str) -> FrameList:

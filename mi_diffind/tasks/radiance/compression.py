@@ -267,18 +267,18 @@ class PaletteCoding:
 
 
 def palette_coding(
-    grid: NodeGrid, importance: Importance, index_bits: int, seed: int, deadline: Deadline | None = None
+    grid: NodeGrid, importance: Importance, deadline: Deadline | None, index_bits: int, seed: int
 ) -> PaletteCoding:
     """Return the initial coding of a grid of visible nodes, with fewer rounds of :func:`clusters` at the deadline.
 
     A bit for each node is worth the share :data:`SLOPE` of the error of the grid's images.
     """
-    palette = sorted_clusters(grid, importance, 2**index_bits, seed, deadline)
-    return coded_by(grid, importance, palette, SLOPE * importance.loss / grid.nodes.count)
+    palette = sorted_clusters(grid, importance, deadline, 2**index_bits, seed)
+    return choose_coding(grid, importance, palette, SLOPE * importance.loss / grid.nodes.count)
 
 
 def sorted_clusters(
-    grid: NodeGrid, importance: Importance, count: int, seed: int, deadline: Deadline | None = None
+    grid: NodeGrid, importance: Importance, deadline: Deadline | None, count: int, seed: int
 ) -> np.ndarray:
     """Return ``count`` weighted clusters of the colours of a grid, in units of its metric, along a line."""
     palette = clusters(grid.colour[1:] * np.sqrt(importance.metric), importance.colour, count, seed, deadline)
@@ -287,7 +287,7 @@ def sorted_clusters(
     return palette[np.argsort(centred @ np.linalg.eigh(centred.T @ centred)[1][:, -1], kind="stable")]
 
 
-def coded_by(grid: NodeGrid, importance: Importance, palette: np.ndarray, rate: float) -> PaletteCoding:
+def choose_coding(grid: NodeGrid, importance: Importance, palette: np.ndarray, rate: float) -> PaletteCoding:
     """Return the coding of a grid by a palette of :func:`sorted_clusters`; a bit of the file counts ``rate``."""
     metric = np.sqrt(importance.metric)
     passes = passes_of(grid.nodes.stored)
@@ -309,20 +309,20 @@ def coded_by(grid: NodeGrid, importance: Importance, palette: np.ndarray, rate: 
 
 
 def coding_in(
-    grid: NodeGrid, importance: Importance, nbytes: float, seed: int, deadline: Deadline | None = None
+    grid: NodeGrid, importance: Importance, deadline: Deadline | None, nbytes: float, seed: int
 ) -> PaletteCoding | None:
     """Return a coding of a grid whose file has at most ``nbytes`` once it is trained, or ``None`` if there is none.
 
     The number of colours follows from ``nbytes``, the slope from trials with a part of the nodes.
     """
     colours = int(np.clip(0.12 * nbytes / grid.colour.shape[1], 2 ** INDEX_BITS[0], 2**DEFAULT_BITS))
-    palette = sorted_clusters(grid, importance, colours, seed, deadline)
+    palette = sorted_clusters(grid, importance, deadline, colours, seed)
     per_node = importance.loss / grid.nodes.count
     part, weights = trial_part(grid, importance)
     share = part.nodes.count / grid.nodes.count
 
     def fits(slope: float) -> bool:
-        coding = coded_by(part, weights, palette, slope * per_node)
+        coding = choose_coding(part, weights, palette, slope * per_node)
         levels = np.rint(coding.levels[1:] * LAST_LEVEL).astype(int)
         return coding.estimated_bytes(levels, share) <= 0.92 * nbytes  # the training adds to it
 
@@ -330,7 +330,7 @@ def coding_in(
     if not fits(np.exp(high)):
         return None
     slope = np.exp(-largest_fitting(lambda flatness: fits(np.exp(-flatness)), -high, -low, steps=6))
-    coding = coded_by(grid, importance, palette, slope * per_node)
+    coding = choose_coding(grid, importance, palette, slope * per_node)
     coding.file_bytes = nbytes
     return coding
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...arrays.indirection import Indirection, device_array, device_tensor
+from ...arrays.indirection import Indirection, device_array
 from ...arrays.tables import (
     StoredArray,
     Table,
@@ -26,7 +26,7 @@ from . import COLOURS
 from .coding import MOST_STORED, TooManyNodes, decode, encode
 from .compression import INDEX_BITS, MOST_BITS, to_bytes
 from .grid import NodeGrid
-from .nodes import ContractedNodes, Nodes, layer_count, layers, unpacked
+from .nodes import Nodes, layer_count, layers, unpack_mask
 from .paper import PairsField
 from .volume_field import COLUMNS, DIRECTIONS, ENTRIES, NodeField, PackedPaletteField, PaletteArrays, VolumeField
 
@@ -95,11 +95,11 @@ def palette_arrays(table: Table) -> tuple[np.ndarray, PaletteArrays]:
     if settings["layout"] == "sparse":
         density, index = arrays["density"], arrays["index"].entries.astype(np.uint32)
         levels = density.entries[:, 0], settings.get("density_bits", SPARSE_BITS), (density.offset[0], density.scale[0])
-        return flags_of(table), PaletteArrays(*levels, index[:, 0] | index[:, 1] << 8, *shared)
+        return stored_flags(table), PaletteArrays(*levels, index[:, 0] | index[:, 1] << 8, *shared)
     bits, colours, shape = settings["density_bits"], len(arrays["palette"].entries), tuple(settings["shape"])
     coding = (arrays[name].entries.tobytes() for name in ("probabilities", "nodes"))
     try:
-        flags, levels, index = decoded(*coding, shape, 2**bits, colours, _most_nodes(table.path, shape))
+        flags, levels, index = decode_once(*coding, shape, 2**bits, colours, _most_nodes(table.path, shape))
     except ValueError as e:
         if isinstance(e, TooManyNodes):
             check_nodes(table, e.count)
@@ -109,7 +109,7 @@ def palette_arrays(table: Table) -> tuple[np.ndarray, PaletteArrays]:
 
 
 @functools.lru_cache(maxsize=1)
-def decoded(probabilities: bytes, data: bytes, *sizes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def decode_once(probabilities: bytes, data: bytes, *sizes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return flags of the stored nodes, eight to a byte, and their levels and indices; the last result is kept.
 
     Levels (uint8) and indices (uint16) have a first entry of 0 for no node. Raises ``ValueError`` as
@@ -238,7 +238,7 @@ def faults(table: Table) -> Iterator[str]:
         check_numbers(table, "low", 13)
         check_numbers(table, "high", 13)
         return
-    nodes = sum(int(np.count_nonzero(part)) for part in layers(flags_of(table), shape))
+    nodes = sum(int(np.count_nonzero(part)) for part in layers(stored_flags(table), shape))
     check_nodes(table, nodes)
     for name in ("density", "index" if layout == "sparse" else "colour"):
         if (entries := len(arrays[name].entries)) != nodes + 1:
@@ -279,34 +279,34 @@ def stored(table: Table, entries: dict, storage: str = "") -> Table:
         if "environment" in values:
             shared["environment"] = to_bytes(values["environment"])
         numbers = replace(numbers, levels=levels.astype(np.uint8), **shared)
-        arrays = coded_arrays(unpacked(flags, table.settings["shape"]), numbers)
+        arrays = coded_arrays(unpack_mask(flags, table.settings["shape"]), numbers)
         settings |= {"layout": "coded", "density_bits": numbers.density_bits}
         settings |= {"density_offset": offset, "density_scale": scale}
     return replace(table, arrays=arrays, settings={**table.settings, **settings}, measured={}, path=None)
 
 
-def flags_of(table: Table) -> np.ndarray:
+def stored_flags(table: Table) -> np.ndarray:
     """Return the flags of stored nodes, eight to a byte."""
     return np.ascontiguousarray(table.arrays["cells"].entries[:, 0])
 
 
-def nodes_of(table: Table, types, flags: np.ndarray, packed: bool = False) -> Nodes:
-    """Return the nodes of a checked table with these ``flags``. Raises :class:`TableError` if there are none."""
-    settings = table.settings
+def read_nodes(table: Table, types, packed: bool = False, flags: np.ndarray | None = None) -> Nodes:
+    """Return the nodes of a checked table, or those with ``flags``. Raises :class:`TableError` if there are none."""
+    settings, flags = table.settings, stored_flags(table) if flags is None else flags
     if not flags.any():
         raise TableError(f"{table.path or 'the field'}: holds no nodes")
-    stored = flags if packed else unpacked(flags, settings["shape"])
-    place = types, settings["lower"], settings["spacing"], settings["shape"], stored, packed
-    return ContractedNodes(*place, inner=settings["inner"]) if "inner" in settings else Nodes(*place)
+    stored = flags if packed else unpack_mask(flags, settings["shape"])
+    place = settings["lower"], settings["spacing"], settings["shape"]
+    return Nodes(types, *place, stored, packed, settings.get("inner"))
 
 
 def grid_of(table: Table, types, packed: bool = False) -> NodeGrid:
     """Return the grid of a checked table of the layout "grid"."""
     density, colour = (table.arrays[name].values for name in ("density", "colour"))
-    return NodeGrid(nodes_of(table, types, flags_of(table), packed), density[:, 0], colour, environment_of(table))
+    return NodeGrid(read_nodes(table, types, packed), density[:, 0], colour, read_environment(table))
 
 
-def environment_of(table: Table) -> np.ndarray | None:
+def read_environment(table: Table) -> np.ndarray | None:
     """Return the environment of a table as :class:`.NodeField` takes it, or ``None``."""
     array = table.arrays.get("environment")
     return None if array is None else np.pad(array.values, ((0, 0), (0, 1)))
@@ -318,21 +318,19 @@ def field_of(table: Table, types, storage: str = "") -> VolumeField:
     It is packed for rendering; with the ``storage`` ``"float32"``, its ``arrays`` can be trained instead.
     """
     settings, layout, arrays = table.settings, table.settings["layout"], table.arrays
-    packed, tensor = storage != "float32", types.TensorXf
+    packed = storage != "float32"
     if layout == "grid":
         return grid_of(table, types, packed).field()
     if layout == "pairs":
-        allocated = {name: arrays[name].allocate(tensor, storage) for name in PairsField.NAMES}
+        allocated = {name: arrays[name].allocate(types.TensorXf, storage) for name in PairsField.NAMES}
         pairs = (
             Indirection([allocated[f"{name}_primary"]], allocated[f"{name}_cascaded"]) for name in ("density", "colour")
         )
-        return PairsField(nodes_of(table, types, flags_of(table), packed), *pairs, settings["low"], settings["high"])
+        return PairsField(read_nodes(table, types, packed), *pairs, settings["low"], settings["high"])
     flags, numbers = palette_arrays(table)
-    nodes = nodes_of(table, types, flags, packed)
+    nodes = read_nodes(table, types, packed, flags)
     if packed:
         return PackedPaletteField(nodes, numbers)
     density = byte_array(numbers.levels[:, None], numbers.density_range[1], numbers.density_range[0]).values[:, 0]
-    environment = environment_of(table)
-    environment = None if environment is None else device_tensor(tensor, environment)
-    colours = device_tensor(tensor, density), device_tensor(tensor, numbers.palette.values)
-    return NodeField(nodes, *colours, device_array(types.UInt32, numbers.index.astype(np.uint32)), environment)
+    tensors = NodeGrid(nodes, density, numbers.palette.values, read_environment(table)).tensors()
+    return NodeField(nodes, **tensors, palette_index=device_array(types.UInt32, numbers.index.astype(np.uint32)))

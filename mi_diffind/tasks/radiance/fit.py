@@ -17,15 +17,13 @@ from ...arrays.tables import MAX_BYTES, Table, save_table
 from ...core import units
 from ...core.errors import UsageError
 from ...core.files import check_distinct
-from ...core.progress import interruptible
+from ...core.progress import Deadline, interruptible
 from ...fitting.loop import FitResult, FittingError, cores
 from ...fitting.task import FitRequest, Fitted, Stage
 from . import (
     COLOURS,
-    COMPRESSION,
     MOST_NUMBERS,
     PRESETS,
-    REFLECTING,
     RESOLUTIONS,
     STAGES,
     compression,
@@ -221,7 +219,7 @@ class FieldFit:
             schedule, every = "cosine" if last else "constant", max(1, steps // 2)
             stage = dataclasses.replace(settings, steps=steps, schedule=schedule, measure_every=every)
             limited = request.part(part / sum(later for _, later in STAGES[number:]))
-            if share == REFLECTING and self.colours != "directions":
+            if share == 0.5 and self.colours != "directions":
                 tried = dataclasses.replace(stage, steps=min(steps, 600))  # steps of each colour
                 grid, chosen = self.with_colours(grid, dataclasses.replace(limited, settings=tried))
                 if chosen is not None:
@@ -231,7 +229,7 @@ class FieldFit:
             if steps:
                 problem, grid = grids.GridProblem(grid, self.session, SIDE if last else 1), None
                 if number:
-                    problem.draw_by_errors()
+                    problem.cumulative = self.session.images.cumulative_errors(problem.field_of(problem.net))
                 finish = functools.partial(self.measured, lambda p=problem: self.grid_table(p.grid()))
                 finish = finish if last and request.preset == "grid" else None
                 stage, title = dataclasses.replace(stage, steps=steps), f"grid, {round(nodes * reached)}³"
@@ -378,20 +376,15 @@ class FieldFit:
             except ValueError as e:
                 given = "bytes" if self.request.options["bytes"] is not None else "compression"
                 raise UsageError(f"--{given}: {e}") from None
-            limit, weights = self.cluster_time(), self.importance(grid)
-            coding = compression.palette_coding(grid, weights, bits, seed, limit)
+            coding = compression.palette_coding(grid, *self.importance(grid), bits, seed)
         problem = compression.PaletteProblem(coding, self.session)
         return self.train(problem, lambda: files.palette_table(coding.nodes, problem.numbers()), stopped)
 
-    def cluster_time(self):
-        """Return the deadline of clusters and of the importance of nodes, or ``None``."""
-        return self.request.part(0.25).deadline
-
-    def importance(self, grid: NodeGrid) -> compression.Importance:
-        """Return the importance of the nodes of a grid."""
-        settings = self.request.settings
+    def importance(self, grid: NodeGrid) -> tuple[compression.Importance, Deadline | None]:
+        """Return the importance of the nodes of a grid, and the deadline of its clusters, if time is limited."""
+        settings, limit = self.request.settings, self.request.part(0.25).deadline
         with cores(settings.deterministic):
-            return compression.importance(grid, self.session, settings.seed, self.cluster_time())
+            return compression.importance(grid, self.session, settings.seed, limit), limit
 
     def coding_in_file(self, grid: NodeGrid, nbytes: int) -> compression.PaletteCoding:
         """Return the coding of a grid in a file of at most ``nbytes``, at the highest resolution that allows it."""
@@ -400,24 +393,16 @@ class FieldFit:
         cells, seed = grids.visible(grid, self.session.seeing_images), self.request.settings.seed
         for share in (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2):  # of the resolution
             smaller = grids.refine(grid, cells, share)
-            limit, weights = self.cluster_time(), self.importance(smaller)
-            coding = compression.coding_in(smaller, weights, nbytes, seed, limit)
+            coding = compression.coding_in(smaller, *self.importance(smaller), nbytes, seed)
             if coding is not None:
                 return coding
         raise UsageError(f"--disk: {nbytes:,} bytes are fewer than the smallest file of this capture needs")
 
     def pairs(self, grid: NodeGrid, stopped: bool) -> tuple[Table, FitResult]:
         """Compress a grid to the pairs of dense arrays of the supplement."""
-        nbytes = self.wanted_bytes(grid) or dense_bytes(grid.nodes.shape) / COMPRESSION
-        grid = self.visible(grid)
-        problem = self.pairs_problem(grid, nbytes, 0 if stopped else VALUE_STEPS)
-        return self.train(
-            problem, lambda: files.pairs_table(grid.nodes, problem.table_arrays(), problem.low, problem.high), stopped
-        )
-
-    def pairs_problem(self, grid: NodeGrid, nbytes: float, steps: int) -> paper.PairsProblem:
-        """Return the arrays of the supplement in ``nbytes``, trained on the numbers of the grid for ``steps``."""
         request, types = self.request, self.request.types
+        nbytes = self.wanted_bytes(grid) or dense_bytes(grid.nodes.shape) / 50  # as the help says
+        grid = self.visible(grid)
         ratio = dense_bytes(grid.nodes.shape) / nbytes
         extent = np.array(grid.nodes.upper) - np.array(grid.nodes.lower)
         shapes = {}
@@ -426,12 +411,13 @@ class FieldFit:
             shapes[name] = paper.sides(share * nbytes, given, channels, extent)
         density, colour, low, high = paper.initial(paper.dense(grid), shapes, types)
         net = paper.PairsNet(density, colour)
-        if steps:
+        if not stopped:
             values = paper.ValuesProblem(net, paper.PairsField(grid.nodes, density, colour, low, high), grid)
-            settings = {"steps": steps, "batch": 2**15, "lr": 1e-2, "measure_every": steps}
+            settings = {"steps": VALUE_STEPS, "batch": 2**15, "lr": 1e-2, "measure_every": VALUE_STEPS}
             settings = dataclasses.replace(request.settings, **settings)
             request.run([Stage("", values, 0.2, settings, "the numbers of the grid", resumable=False)])
-        return paper.PairsProblem(net, grid.nodes, low, high, self.session)
+        problem = paper.PairsProblem(net, grid.nodes, low, high, self.session)
+        return self.train(problem, lambda: files.pairs_table(grid.nodes, problem.table_arrays(), low, high), stopped)
 
 
 def five_digits(measured: dict[str, float]) -> dict[str, float]:

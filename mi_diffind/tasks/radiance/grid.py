@@ -15,11 +15,11 @@ from scipy.ndimage import binary_dilation, gaussian_filter, map_coordinates
 
 from ...arrays.indirection import device_array, device_tensor
 from ...arrays.sparse_grid import cell_corners, complete_cells
-from . import RESOLUTIONS, VOXELS_PER_PIXEL
+from . import RESOLUTIONS
 from .march import march
-from .nodes import ContractedNodes, Nodes
+from .nodes import Nodes
 from .session import SIDE, FieldSession, ImagesProblem, ViewImages
-from .views import CapturedViews, box_of, focus, hull, pixel_width
+from .views import CapturedViews, focus, hull, object_box, pixel_width
 from .volume_field import ENTRIES, NodeField, NodeVolume, add_reflections
 
 #: Raw density per unit of the trained parameter, so that one learning rate suits density and colour.
@@ -170,7 +170,7 @@ def inner_cube(views: CapturedViews) -> tuple[np.ndarray, float]:
 
 
 def resolution(views: CapturedViews) -> int:
-    """Return the resolution at which a pixel, seen at the middle of the box, is :data:`VOXELS_PER_PIXEL` voxels wide.
+    """Return the resolution at which a pixel, seen at the middle of the box, is 1.25 voxels wide.
 
     It is that of :func:`initial_grid`.
     """
@@ -178,9 +178,9 @@ def resolution(views: CapturedViews) -> int:
         centre, half = inner_cube(views)
         nodes = 4 * half / pixel_width(views, centre)
     else:
-        lower, upper = box_of(views)
+        lower, upper = object_box(views)
         nodes = float(np.prod(upper - lower)) ** (1 / 3) / pixel_width(views, (lower + upper) / 2)
-    return int(np.clip(round(nodes * VOXELS_PER_PIXEL), *RESOLUTIONS))
+    return int(np.clip(round(nodes * 1.25), *RESOLUTIONS))
 
 
 def initial_grid(types, views: CapturedViews, nodes: int) -> NodeGrid:
@@ -189,9 +189,9 @@ def initial_grid(types, views: CapturedViews, nodes: int) -> NodeGrid:
         # Denser, which keeps haze away that shows each camera a picture of its own
         (centre, half), density, shape = inner_cube(views), -3.0, (nodes,) * 3
         place = centre - 2 * half, 4 * half / (nodes - 1), shape, np.ones(shape, bool)
-        places = ContractedNodes(types, *place, inner=(*centre, half))
+        places = Nodes(types, *place, inner=(*centre, half))
     else:
-        lower, upper = box_of(views)
+        lower, upper = object_box(views)
         spacing, density = float((np.prod(upper - lower) / nodes**3) ** (1 / 3)), BEGIN_DENSITY
         shape = np.maximum(2, np.ceil((upper - lower) / spacing - 1e-6).astype(int) + 1)
         inside = hull(views, lower, spacing, shape) if views.has_alpha else np.ones(shape, bool)

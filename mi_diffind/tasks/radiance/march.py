@@ -41,7 +41,7 @@ class Marched:
 def box(field, o, d, near, far, active):
     """Return the part of each ray in the field's box: origin, distance, length, and whether it exists.
 
-    A ray with NaN, or without a direction (:func:`.rays.is_direction`), has no part in the box.
+    A ray with NaN, or without a direction (:func:`.boxes.is_direction`), has no part in the box.
     """
     types = field.types
     near, far = types.Float(near), types.Float(far)

@@ -278,7 +278,7 @@ class RadianceFieldModel(Model):
         return ViewImages(self.types, load_held_out(path, **reading)[0])
 
     def decode(self, output: Path, resolution: int | None = None):
-        """Write density and colour on a dense grid (:mod:`.decode`)."""
+        """Write density and colour on a dense grid (:func:`decode`)."""
         pass
 
         return decode(self.field, Path(output), resolution)

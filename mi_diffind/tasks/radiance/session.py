@@ -390,10 +390,6 @@ class ImagesProblem(Problem):
         total = sum((dr.square(shown - reference) for shown, reference in pairs), types.Float(0))
         return dr.select(images.counted(view, x, y), total, 0) * (1 / (3 * count))
 
-    def draw_by_errors(self) -> None:
-        """Draw rays by the errors of the present state from now on."""
-        self.cumulative = self.session.images.cumulative_errors(self.field_of(self.net))
-
     def measure(self, net):
         return self.session.watched_images.evaluate(self.field_of(net))
 

@@ -91,7 +91,7 @@ class CapturedViews:
     notes: tuple[str, ...] = ()
     background: tuple[int, int, int] | None = None
     settings: dict = dataclasses.field(default_factory=dict)
-    #: Whether fields have surroundings (:class:`.nodes.ContractedNodes`) instead of a box around everything.
+    #: Whether fields have surroundings (:class:`.nodes.Contraction`) instead of a box around everything.
     surroundings: bool = False
     #: Images of :meth:`compressed` views, by zlib; ``pixels`` is empty then.
     packed: tuple[bytes, ...] | None = None
@@ -415,7 +415,7 @@ SEARCH = 64
 MARGIN = 2
 
 
-def box_of(views: CapturedViews) -> tuple[np.ndarray, np.ndarray]:
+def object_box(views: CapturedViews) -> tuple[np.ndarray, np.ndarray]:
     """Return the lower and upper corner of the box of the captured objects.
 
     The box is the ``aabb`` of the capture, cut to the visual hull if the images have alpha. Without an ``aabb``, the

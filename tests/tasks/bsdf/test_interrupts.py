@@ -50,10 +50,8 @@ def interrupted(monkeypatch):
 
 
 def fitted(source=SOURCE, **options):
-    steps = {} if "seconds" in options else {"steps": RESIDUAL}
-    return mi_diffind.fit(
-        "bsdf", source, batch=2**11, measure_every=10, energy="raw", progress=False, **steps, **options
-    )
+    short = {"steps": RESIDUAL, "batch": 2**11, "measure_every": 10, "energy": "raw", "progress": False}
+    return mi_diffind.fit("bsdf", source, **short, **options)
 
 
 def test_fits_go_on(short, interrupted, tmp_path):

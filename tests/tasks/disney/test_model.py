@@ -22,7 +22,7 @@ N = 100_000
 
 
 def decoder_of(preset, storage=""):
-    """What reads the tables that ship; of the formulas, rearranged, if there is no such preset."""
+    """Decoder of the tables that ship, or of the rearranged formulas."""
     return Decoder() if preset == "formulas" else TASK.open(ad.TensorXf, "", preset, storage).decoder
 
 

@@ -61,7 +61,7 @@ def evaluate(ad, distribution, sin2, alpha):
 
 
 def evaluated(row):
-    """What depends on a constant roughness, as plugins keep it."""
+    """Terms of a constant roughness, opaque as plugins keep them."""
     dr.make_opaque(row)
     return row
 
@@ -200,7 +200,7 @@ PROMISED = {"float32": (57, 0.001, 0.03), "float16": (56.5, 0.002, 0.03), "uint8
 @pytest.mark.parametrize("storage", lookup.STORAGES)
 @pytest.mark.parametrize("preset", PRESETS)
 def test_accuracy_by_an_independent_reader(ad, shipped, rng, preset, storage):
-    """What NumPy and SciPy read in the same entries, and its PSNR over a million samples of their own."""
+    """Values equal those that NumPy and SciPy read, whose PSNR is that of a million other samples."""
     table, encoding = shipped[preset]
     independent = ggx_formulas.learned(table.to(storage), encoding.inputs, encoding.output)
     sin2, alpha = random_case(rng, 100_000)
@@ -329,7 +329,7 @@ def test_a_wrong_file_is_refused(tmp_path, shipped, what):
 
 
 def test_a_file_that_was_replaced_is_read_again(tmp_path, shipped, ad):
-    """Also within the resolution of its time, if its size is another."""
+    """A replaced file is read again, also within the resolution of its time if its size differs."""
     path = tmp_path / "own.npz"
     found = []
     for i, preset in enumerate(PRESETS):
@@ -354,7 +354,7 @@ def test_a_file_is_read_once(tmp_path, shipped, ad, monkeypatch):
 
 
 def test_entries_an_optimiser_left_out_of_range_are_folded(ad, shipped):
-    """In single precision; the triangle wave maps them to pointers."""
+    """The triangle wave maps single-precision entries out of range to pointers."""
     read = stored(ad, shipped, "tables")
     sin2 = ad.Float(np.linspace(0, 1, 100, dtype=np.float32))
     cos, alpha = dr.sqrt(1 - sin2), ad.Float(0.2)

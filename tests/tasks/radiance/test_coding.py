@@ -41,16 +41,9 @@ def test_symbols_take_the_bytes_of_their_entropy(rng):
     np.testing.assert_array_equal(decoder.code("flags", 1, 2, np.zeros(3, int)), [1, 0, 1])
 
 
-def test_nodes_come_back(shell, rng):
-    stored, levels, index = shell
-    for mask, colours in ((stored, 300), (cell_corners(rng.random((9, 7, 32)) < 0.2), 70)):
-        count = mask.sum()
-        numbers = (levels, index) if mask is stored else (rng.integers(0, 16, count), rng.integers(0, colours, count))
-        coded = coding.encode(mask, *numbers, 16, colours)
-        again = coding.decode(*coded, mask.shape, 16, colours)
-        for a, b in zip(again, (np.flatnonzero(mask), *numbers), strict=True):
-            np.testing.assert_array_equal(a, b)
-    # Each node is in one pass, and its context has been coded before
+def test_passes(shell):
+    """Each node is in one pass, and its context has been coded before; ``test_limits.py`` decodes them."""
+    stored, *_ = shell
     passes = coding.passes_of(stored)
     order = np.empty(stored.sum(), int)
     for number, part in enumerate(passes):

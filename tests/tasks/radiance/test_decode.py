@@ -33,9 +33,11 @@ def numbers(rng, count=120):
 
 def dense(t, raw, colour, voxel=VOXEL):
     """A field with a number at every node of a box."""
-    flat = (np.ascontiguousarray(v, np.float32) for v in (raw.reshape(-1), colour.reshape(-1, 12)))
+    flat = raw.reshape(-1), colour.reshape(-1, 12)
     shape = SHAPE if raw.size == np.prod(SHAPE) else raw.shape
-    return NodeField(Nodes(t, LOWER, voxel, shape), *(t.TensorXf(v) for v in flat))
+    entries = (np.concatenate([np.zeros_like(v[:1]), v]) for v in flat)
+    nodes = Nodes(t, LOWER, voxel, shape, np.ones(shape, bool))
+    return NodeField(nodes, *(t.TensorXf(np.ascontiguousarray(v, np.float32)) for v in entries))
 
 
 def softplus(raw):
@@ -59,7 +61,7 @@ def test_a_grid_comes_back(t, rng):
 
 
 def test_what_was_decoded_is_the_same_field(t, rng):
-    """At other points, the same densities and radiances, and at twice the resolution, too."""
+    """A field made of the decoded grid has the same densities and radiances between nodes, at two resolutions."""
     smooth = np.stack(np.meshgrid(*(np.linspace(0, 2, n) for n in SHAPE), indexing="ij"))
     raw = 2 * np.sin(smooth.sum(axis=0))
     colour = 0.3 * np.sin(np.multiply.outer(smooth[0] + 2 * smooth[1], np.arange(12)) + np.arange(12))
@@ -84,7 +86,7 @@ def test_what_was_decoded_is_the_same_field(t, rng):
 
 
 def test_nodes_at_the_rim_of_what_is_stored_count(t, rng):
-    """Such a node belongs to cells of which some are not looked at."""
+    """A node at the border of the occupied cells keeps its density and colour."""
     stored = np.zeros(SHAPE, bool)
     stored[1:4, 1:4, 1:3] = True
     nodes = Nodes(t, LOWER, VOXEL, SHAPE, stored)
@@ -98,7 +100,7 @@ def test_nodes_at_the_rim_of_what_is_stored_count(t, rng):
 
 
 def test_mean_colour():
-    """Against an average over many directions."""
+    """The mean colour is the average over many random directions."""
     rng = np.random.default_rng(1)
     d = rng.normal(size=(200_000, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)

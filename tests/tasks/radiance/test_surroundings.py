@@ -31,7 +31,7 @@ def ad():
 
 
 def contracted_nodes(types, stored):
-    return nodes.ContractedNodes(
+    return nodes.Nodes(
         types, CENTRE - 2 * HALF, SPACING, (SIDE,) * 3, stored, inner=(*CENTRE, HALF)
     )  # fmt: skip
 
@@ -147,7 +147,7 @@ def test_damaged_cubes_are_refused(folder, tmp_path):
 
 
 def test_surroundings_in_a_scene(field, tmp_path, mi_rgb):
-    """They fill the picture, or are left out; sentences for what does not go together."""
+    """Surroundings fill the picture or are switched off; combinations that are not supported are refused."""
     mi = mi_rgb
     density, colour = (values.numpy() for values in field.arrays.values())
     save_table(tmp_path / "x.npz", files.grid_table(grids.NodeGrid(field.nodes, density + 4, colour)))
