@@ -138,7 +138,7 @@ def test_few_lanes_hold_few_symbols():
     """A lane decodes one symbol after the other: many symbols in one lane would take hours."""
     coder = coding.SymbolEncoder()
     context = np.zeros(100, int)
-    coder.code("x", 1, 2, context, lambda: context)
+    coder.code("x", 1, 2, context, context)
     decoder = coding.SymbolDecoder(*coder.finish())
     with pytest.raises(ValueError, match="more symbols than its lanes"):
         decoder.code("x", 1, 2, np.zeros(10**6, int), None)

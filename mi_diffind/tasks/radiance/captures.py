@@ -231,9 +231,6 @@ def _read_exr(path: Path) -> np.ndarray:
 #: Coefficients of a distortion, in the order in which they are kept.
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
-#: Radii at which a distortion is tried for the one from which on it turns back.
-RADII = 1024
-
 
 def distort(u: np.ndarray, v: np.ndarray, coefficients) -> tuple[np.ndarray, np.ndarray]:
     """Return where a lens shows the points (``u``, ``v``) of a pinhole of the focal length 1."""
@@ -260,7 +257,7 @@ def _sources(height: int, width: int, focal, centre, coefficients) -> tuple[np.n
     x, y = distort(u, v, coefficients)
     x, y = x * focal[0] + centre[0] - 0.5, y * focal[1] + centre[1] - 0.5
     r2 = u * u + v * v
-    radii = np.linspace(0, np.sqrt(r2.max()), RADII)
+    radii = np.linspace(0, np.sqrt(r2.max()), 1024)  # radii at which the distortion is tried
     turning = np.flatnonzero(np.diff(radii * _factor(radii**2, coefficients[:6])) <= 0)
     limit = radii[turning[0]] if len(turning) else np.inf
     exists = (np.abs(x - (width - 1) / 2) <= width / 2) & (np.abs(y - (height - 1) / 2) <= height / 2)
@@ -305,9 +302,6 @@ LONGEST = 1e9
 #: Fields of view in radians are larger: those of telescopes.
 SMALLEST_ANGLE = 1e-6
 
-#: Largest ratio of the focal length that a field of view gives to that in pixels, minus 1, without a note.
-AGREEMENT = 5e-3
-
 
 def camera_numbers(where: str, frame: dict, file: dict) -> dict[str, float]:
     """Return the numbers of the camera of a ``frame`` by their names, those that the ``file`` gives for all included.
@@ -348,7 +342,7 @@ def focal_lengths(numbers: dict[str, float], width: int, height: int) -> tuple[t
     for (axis, (pixels, _, angle)), side in zip(FOCAL.items(), (width, height), strict=True):
         by_angle = side / 2 / np.tan(numbers[angle] / 2) if angle in numbers else focal.get("x")
         focal[axis] = numbers.get(pixels, by_angle)
-        if angle in numbers and abs(by_angle / focal[axis] - 1) > AGREEMENT:
+        if angle in numbers and abs(by_angle / focal[axis] - 1) > 5e-3:  # the focal lengths differ by half a percent
             notes.append(
                 f'the field of view {numbers[angle]:.4g} ("{angle}") would be a focal length of {by_angle:.4g} pixels, '
                 f'the "{pixels}" {focal[axis]:.4g} is used'
@@ -411,9 +405,6 @@ SPLITS = ("train", "test", "val")
 #: Tolerance of the columns of a rotation: lengths against 1, and dot products against 0.
 RIGID = 1e-3
 
-#: Interval of the test views in a list without splits, beginning with the first view (as in LLFF's data).
-EVERY = 8
-
 
 @dataclass(frozen=True)
 class Frame:
@@ -455,9 +446,10 @@ def list_frames(folder: Path, split: str) -> FrameList:
 
     Raises :class:`ViewsError`.
     """
-    model = None if any(folder.glob("transforms*.json")) else model_folder(folder)
-    if model is not None:
-        return colmap_frames(folder, model, split)
+    if not any(folder.glob("transforms*.json")):
+        for name in ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse"):
+            if any((folder / name / f"cameras.{suffix}").is_file() for suffix in ("bin", "txt")):
+                return colmap_frames(folder, folder / name, split)
     file, content, frames = _frames(folder, split)
     content["frames"] = frames  # those of other splits are not read
     cameras, box = [_camera(file, content, frame) for frame in frames], _box(file, content)
@@ -468,7 +460,8 @@ def list_frames(folder: Path, split: str) -> FrameList:
 
 def _part(entries: list, split: str) -> list:
     """Return the entries of a split of a list without splits: every eighth one is a test view."""
-    return entries if len(entries) == 1 else [e for i, e in enumerate(entries) if (i % EVERY == 0) == (split == "test")]
+    # Every eighth view, as in LLFF's data
+    return entries if len(entries) == 1 else [e for i, e in enumerate(entries) if (i % 8 == 0) == (split == "test")]
 
 
 def _frames(folder: Path, split: str) -> tuple[Path, dict, list[dict]]:
@@ -571,15 +564,8 @@ def _camera(file: Path, content: dict, frame: dict) -> Frame:
 
 
 def _pose(where: str, frame: dict) -> np.ndarray:
-    """Return the matrix of a frame as a rigid motion, ``(4, 4)``; a camera must stand still."""
+    """Return the matrix of a frame as a rigid motion, ``(4, 4)``."""
     matrix = frame.get("transform_matrix")
-    if matrix is None:
-        matrix, end = (frame.get(f"transform_matrix_{time}") for time in ("start", "end"))
-        if end is not None and end != matrix:
-            raise ViewsError(
-                f'{where} moves while the shutter is open, from the "transform_matrix_start" to another '
-                f'"transform_matrix_end": a "transform_matrix" is needed'
-            )
     if matrix is None:
         raise ViewsError(f'{where} has no "transform_matrix"')
     pose = _numbers(matrix)
@@ -605,9 +591,6 @@ def _pose(where: str, frame: dict) -> np.ndarray:
     return pose
 
 
-#: Folders that may hold a model, the first one first.
-FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
-
 #: Folders of images and masks; the mask of ``a.jpg`` is ``a.jpg.png``, as COLMAP has it.
 IMAGES, MASKS = "images", "masks"
 
@@ -620,15 +603,6 @@ PARAMETERS = {
     "OPENCV": "fl_x fl_y cx cy k1 k2 p1 p2",
     "FULL_OPENCV": "fl_x fl_y cx cy k1 k2 p1 p2 k3 k4 k5 k6",
 }
-
-#: Least images that see a point.
-TRACK = 3
-
-
-def model_folder(folder: Path) -> Path | None:
-    """Return the folder of the COLMAP model of a capture, or ``None``."""
-    files = (folder / name / f"cameras.{suffix}" for name in FOLDERS for suffix in ("bin", "txt"))
-    return next((file.parent for file in files if file.is_file()), None)
 
 
 def colmap_frames(folder: Path, model: Path, split: str) -> FrameList:
@@ -663,23 +637,5 @@ def colmap_frames(folder: Path, model: Path, split: str) -> FrameList:
         pose[:3, 1:3] *= -1  # COLMAP's cameras look along z, with y downwards
         mask_name = str(mask.relative_to(folder)) if mask.is_file() else None
         frames.append(Frame(f"{IMAGES}/{image.name}", pose, numbers, mask_name))
-    points = [p.xyz for p in reconstruction.points3D.values() if p.track.length() >= TRACK]
-    return FrameList(model, folder, frames, points=np.array(points).reshape(-1, 3), notes=_notes(folder, model, images))
-
-
-def _notes(folder: Path, model: Path, images: list) -> tuple[str, ...]:
-    """Return notes on further models and on masks that are not used."""
-    notes, masks = [], (path for path in (folder / MASKS).rglob("*.*") if path.suffix.lower() in EXTENSIONS)
-    others = [path.parent for path in model.parent.glob("*/cameras.*") if path.parent != model and model.name == "0"]
-    if others:
-        notes.append(
-            f"{', '.join(sorted({p.name for p in others}))}: further models beside {model}, which are not used"
-        )
-    names = {path.relative_to(folder / MASKS).as_posix() for path in masks} - {f"{image.name}.png" for image in images}
-    unused = [name for name in names if not (folder / IMAGES / name.removesuffix(".png")).is_file()]
-    if unused:
-        notes.append(
-            f"{folder / MASKS}: {len(unused):,} files are masks of no image, such as {min(unused)}: the mask of a.jpg "
-            f"is a.jpg.png"
-        )
-    return tuple(notes)
+    points = [p.xyz for p in reconstruction.points3D.values() if p.track.length() >= 3]  # images that see it
+    return FrameList(model, folder, frames, points=np.array(points).reshape(-1, 3))
