@@ -16,7 +16,6 @@ import numpy as np
 
 from mi_diffind.arrays.tables import Table, TableError
 from mi_diffind.core import compat
-from mi_diffind.core.archives import LimitError
 from mi_diffind.core.compat import backend_module
 from mi_diffind.core.errors import DiffindError
 from mi_diffind.core.files import (
@@ -29,7 +28,7 @@ from mi_diffind.core.files import (
     write_json,
 )
 from mi_diffind.fitting.task import Task
-from mi_diffind.images.headers import check_picture
+from mi_diffind.images.reader import PictureError, read_picture
 from mi_diffind.maps.compressed import CompressedMaps
 from mi_diffind.maps.layout import Layout, MapLayout
 from mi_diffind.maps.pyramid import Pyramid
@@ -274,26 +273,18 @@ def layout_of(task: Task, props: mi.Properties) -> Layout:
 def manifest_of(image: Path, folder: Path, raw: bool, normal: bool) -> Path:
     """Write a manifest of an image's colours as ``bitmap`` reads them, and return its path.
 
-    ``raw``: values are left as they are; ``normal``: they are a normal map. Raises ``RuntimeError``, and
-    :class:`~.stock.Kept` for fewer bytes than :data:`LEAST_BYTES`.
+    ``raw``: values are left as they are; ``normal``: they are a normal map. Raises :class:`.Kept` for a picture that
+    cannot be read, and for fewer bytes than :data:`LEAST_BYTES`.
     """
     try:
-        check_picture(image)
-    except LimitError as e:
-        raise RuntimeError(str(e)) from None
-    try:
-        bitmap = mi.Bitmap(str(image))
-    except RuntimeError as e:
-        raise Kept(f"{image.name} cannot be read: {compat.one_sentence(e)}") from None
-    if bitmap.buffer_size() < LEAST_BYTES:
-        raise Kept(f"{image.name} has {bitmap.buffer_size():,} bytes, of which no fit would save any")
-    formats = mi.Bitmap.PixelFormat
-    entry = {
-        "file": relative_path(image, folder),
-        "color_space": "srgb" if bitmap.srgb_gamma() and not raw else "linear",
-    }
-    if bitmap.pixel_format() in (formats.YA, formats.RGBA):
-        entry["channels"] = "rgb" if bitmap.pixel_format() == formats.RGBA else "r"
+        picture = read_picture(image)
+    except PictureError as e:
+        raise Kept(f"{image.name}: {str(e).removeprefix(f'{image}: ')}") from None
+    if picture.values.nbytes < LEAST_BYTES:
+        raise Kept(f"{image.name} has {picture.values.nbytes:,} bytes, of which no fit would save any")
+    entry = {"file": relative_path(image, folder), "color_space": "srgb" if picture.srgb and not raw else "linear"}
+    if picture.has_alpha:
+        entry["channels"] = "rgb" if picture.colors == 3 else "r"
     name = "normal" if normal else "data" if raw else "albedo"
     digest = hashlib.sha256(str([name, entry]).encode()).hexdigest()[:12]
     path = folder / f"{image.stem}_{digest}.json"
