@@ -37,7 +37,7 @@ from mi_diffind.maps.source import Source, SourceError, from_arrays, load_source
 from .. import warn
 from . import properties
 from .properties import Kept
-from .tables import Entries, exposed
+from .tables import Tables
 
 STORAGES = ("uint8", "float32")
 
@@ -63,19 +63,13 @@ class SharedMaps:
     """
 
     def __init__(self, image: CompressedMaps, arrays: dict, table: Table | None = None):
-        self.image, self.arrays, self.table = image, arrays, table
-        self.entries = Entries(exposed(arrays))
+        self.image, self.tables = image, Tables(arrays, table)
         self._loaded = self.state()
         self._transforms = {}
 
-    @property
-    def tables(self) -> dict:
-        """Arrays that can be optimised, by name."""
-        return exposed(self.arrays)
-
     def state(self) -> list:
         """Return the present variables of the arrays; a reference keeps their indices from being used again."""
-        return [dr.detach(array.data.array) for array in self.tables.values()]
+        return [dr.detach(array.data.array) for array in self.tables.exposed.values()]
 
     def unchanged(self, state: list) -> bool:
         """Return whether the arrays are still those of ``state``."""
@@ -83,7 +77,7 @@ class SharedMaps:
 
     def as_loaded(self) -> bool:
         """Return whether the arrays are those of the file, and no gradient of them is enabled."""
-        return self.unchanged(self._loaded) and not any(compat.has_gradient(a.data) for a in self.tables.values())
+        return self.unchanged(self._loaded) and not self.tables.optimised()
 
     def transform(self, matrix: list):
         """Return the transformation by a 3×3 ``matrix``, the same variable for equal matrices."""

@@ -16,9 +16,10 @@ from mi_diffind.core.compat import base_class
 from mi_diffind.images import srgb
 from mi_diffind.maps.layout import MapLayout
 
-from . import footprint, frozen, omissions, properties, tables, textures
+from . import footprint, omissions, properties, textures
 from .footprint import Cone
 from .image_files import SharedMaps, is_data, map_of
+from .tables import frozen_key
 from .textures import (
     WRAP_MODES,
     Filter,
@@ -96,15 +97,15 @@ class MapTexture(base_class("Texture")):
             )
 
     def traverse(self, cb: mi.TraversalCallback):
-        tables.traverse(cb, self._shared.tables)
+        self._shared.tables.traverse(cb)
         cb.put("to_uv", self.to_uv, mi.ParamFlags.NonDifferentiable)
 
     def trained(self) -> tuple:
         """Return the table of the file (``None`` without one), and the arrays that can be optimised, by name."""
-        return self._shared.table, self._shared.tables
+        return self._shared.tables.table, self._shared.tables.exposed
 
     def parameters_changed(self, keys: list[str] = ()):
-        self._shared.entries.accept()
+        self._shared.tables.accept()
         self._update_transformation()
         emits = self._positions is not None
         self._clear_cache()
@@ -121,12 +122,12 @@ class MapTexture(base_class("Texture")):
 
     def _update_key(self) -> None:
         """Tell frozen functions what decides how the texture is read, besides its arrays."""
-        self.key = frozen.key(*self._settings())
+        self.key = frozen_key(*self._settings())
 
     def _settings(self) -> tuple:
-        """Return the settings of :func:`.frozen.key`."""
+        """Return the settings of :func:`.frozen_key`."""
         identity = self._transform is None
-        return self._size, self.map, self.raw, self.wrap_mode, identity, self._permutes, self._shared.entries.shapes()
+        return self._size, self.map, self.raw, self.wrap_mode, identity, self._permutes, self._shared.tables.shapes()
 
     def _clear_cache(self) -> None:
         """Discard the mean, the maximum and the distribution of positions."""
@@ -361,7 +362,7 @@ class MapTexture(base_class("Texture")):
 
     def _storage(self) -> dict:
         """Return the part of :meth:`report` on the arrays."""
-        return tables.described(self._shared.table.preset if self._shared.table else "", self._shared.arrays)
+        return self._shared.tables.report()
 
     def _description(self) -> list[str]:
         """Return the lines of :meth:`to_string`."""
