@@ -148,24 +148,6 @@ def sentence(error):
     return text
 
 
-def lamp_place(mi):
-    return mi.ScalarTransform4f().translate([0, 1.2, 0.6]).rotate([1, 0, 0], 60).scale(0.6)
-
-
-def scene(mi, bsdf=None, emitter=None, size=16, **integrator):
-    rotated = mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0])
-    film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
-    found = {
-        "type": "scene",
-        "integrator": integrator or {"type": "path", "max_depth": 3},
-        "sensor": {"type": "perspective", "fov": 35, "to_world": rotated, "film": film},
-        "wall": {"type": "rectangle", "bsdf": bsdf or {"type": "diffuse"}},
-    }
-    if emitter is None:
-        return mi.load_dict({**found, "sky": {"type": "constant"}})
-    return mi.load_dict({**found, "lamp": {"type": "rectangle", "to_world": lamp_place(mi), "emitter": emitter}})
-
-
 # -- the same as a bitmap ----------------------------------------------------------------------------------------------
 
 
@@ -245,16 +227,8 @@ def test_reads_as_an_independent_implementation_does(mi_rgb, tmp_path, rng, bord
     assert normal.max() <= 1 + 1e-6 and glow.max() > 1
 
 
-TRANSFORMS = {
-    "scale": lambda t: t.scale([2, 3, 1]),
-    "flip": lambda t: t.translate([0, 1, 0]).scale([1, -1, 1]),
-    "turn": lambda t: t.translate([1, 0, 0]).rotate([0, 0, 1], 90),
-    "any": lambda t: t.translate([0.3, -0.2, 0]).rotate([0, 0, 1], 30).scale([1.5, 0.7, 1]),
-}
-
-
 def test_gradient_of_the_image(mi_rgb, file, rng):
-    """``eval_1_grad``: differences of the texels around, per unit of uv, through ``to_uv``, for sides that differ."""
+    """``eval_1_grad``: differences of the texels around, per unit of uv, for sides that differ."""
     mi = mi_rgb
     for name in ("height", "albedo"):
         image = mi.load_dict(plugin(file, name))
@@ -271,12 +245,6 @@ def test_gradient_of_the_image(mi_rgb, file, rng):
         ]
         uv = np.stack([(x + 0.5 + a) / WIDTH, (y + 0.5 + b) / HEIGHT])
         np.testing.assert_allclose(image.eval_1_grad(interactions(mi, *uv)).numpy(), expected, atol=2e-3)
-        to_uv = TRANSFORMS["any"](mi.ScalarTransform4f())
-        m = np.array([[float(to_uv.matrix[i, j]) for j in (0, 1)] for i in (0, 1)])
-        shift = np.array([[float(to_uv.matrix[i, 3])] for i in (0, 1)])
-        turned = mi.load_dict(plugin(file, name, to_uv=to_uv))
-        found = turned.eval_1_grad(interactions(mi, *np.linalg.solve(m, uv - shift))).numpy()
-        np.testing.assert_allclose(found, m.T @ expected, atol=5e-3)
 
 
 # -- spectra -----------------------------------------------------------------------------------------------------------
@@ -322,74 +290,16 @@ def test_upsampling_is_mitsubas(rng):
         assert np.median(error) < 0.02 * np.abs(difference[:n][inside]).mean()
 
 
-# -- positions ---------------------------------------------------------------------------------------------------------
-
-
 # -- in materials ------------------------------------------------------------------------------------------------------
 
 
 def materials(t):
-    """BSDFs that use textures ``t(map)`` in every way that there is."""
-    plain = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
+    """BSDFs of one and of three textures ``t(map)``."""
+    maps = {"base_color": t("albedo"), "roughness": t("roughness"), "metallic": t("metallic")}
     return {
         "diffuse": {"type": "diffuse", "reflectance": t("albedo")},
-        "principled": {
-            "type": "principled",
-            "base_color": t("albedo"),
-            "roughness": t("roughness"),
-            "metallic": t("metallic"),
-        },
-        "roughconductor": {"type": "roughconductor", "alpha": t("roughness"), "specular_reflectance": t("albedo")},
-        "roughplastic": {"type": "roughplastic", "diffuse_reflectance": t("albedo"), "alpha": 0.3},
-        "plastic": {"type": "plastic", "diffuse_reflectance": t("grey")},
-        "normalmap": {"type": "normalmap", "normalmap": t("normal"), "bsdf": plain},
-        "bumpmap": {"type": "bumpmap", "texture": t("height"), "bsdf": plain, "scale": 0.05},
-        "blendbsdf": {
-            "type": "blendbsdf",
-            "weight": t("roughness"),
-            "a": plain,
-            "b": {"type": "diffuse", "reflectance": t("albedo")},
-        },
-        "mask": {"type": "mask", "opacity": t("stain"), "bsdf": plain},
-        "neural_disney": {"type": "neural_disney", "base_color": t("albedo"), "roughness": t("roughness")},
-        "neural_ggx": {"type": "neural_ggx", "alpha": t("roughness")},
+        "principled": {"type": "principled", **maps},
     }
-
-
-@pytest.mark.parametrize("variant", RENDERED)
-def test_renders_as_with_bitmaps(variant, tmp_path):
-    """Of arrays that are smooth enough for both to agree between texels; all materials in one scene, side by side."""
-    mi = set_variant(variant)
-    path = make(tmp_path / "a.npz", spread=(110, 140))
-    names, images = list(materials(lambda m: m)), []
-    for t in (lambda m: plugin(path, m), lambda m: counterpart(mi, path, m)):
-        shapes = {
-            f"wall{i}": {
-                "type": "rectangle",
-                "to_world": mi.ScalarTransform4f().translate([2 * i + 1 - len(names), 0, 0]),
-                "bsdf": bsdf,
-            }
-            for i, bsdf in enumerate(materials(t).values())
-        }
-        to_world = mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, -1, 0])  # x goes right
-        film = {"type": "hdrfilm", "width": 12 * len(names), "height": 12, "rfilter": {"type": "box"}}
-        loaded = mi.load_dict({
-            "type": "scene",
-            "integrator": {"type": "path", "max_depth": 3},
-            "sensor": {
-                "type": "orthographic", "film": {**film, "pixel_format": "rgb"},
-                "to_world": to_world @ mi.ScalarTransform4f().scale([len(names), len(names), 1]),
-            },
-            "sky": {"type": "constant"},
-            **shapes,
-        })  # fmt: skip
-        images.append(mi.render(loaded, spp=32).numpy().reshape(12, len(names), 12, -1))
-    for i, name in enumerate(names):
-        a, b = (image[:, i] for image in images)
-        assert np.isfinite(a).all() and b.mean() > 0.01, name
-        assert a.mean() == pytest.approx(b.mean(), rel=0.02), name
-        assert np.abs(a - b).mean() < 0.05 * b.mean(), name
-    assert not any(np.allclose(images[1][:, 0], images[1][:, i], rtol=0.05) for i in range(1, len(names)))
 
 
 def test_maps_of_one_file_are_decoded_once(mi_rgb, file):
@@ -443,9 +353,6 @@ def test_no_arrays(variant, tmp_path, rng, monkeypatch):
         assert not texture.is_spatially_varying()
         assert (storage == "float32") == any("a.npz is of one colour: it has no arrays" in text for text in warned)
         assert float(texture.mean()[0]) == pytest.approx(float(theirs.mean()[0]), abs=1e-5)
-        t = plugin(path, "image", storage=storage)
-        lit = scene(mi, {"type": "diffuse", "reflectance": t}, {"type": "area", "radiance": t})
-        assert mi.render(lit, spp=4).numpy().mean() > 0
 
 
 def test_a_file_that_was_written_anew_is_read_anew(mi_rgb, tmp_path, rng):
@@ -595,6 +502,3 @@ def test_exact_counterpart_elsewhere(mi_rgb, material, tmp_path):
         else:
             with pytest.raises(loading.SceneError, match="has changed since"):
                 loading.load(tmp_path / "s.xml", exact=True)
-
-
-# -- what scenes do to a texture ---------------------------------------------------------------------------------------

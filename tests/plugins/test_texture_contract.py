@@ -19,7 +19,7 @@ from texture_scenes import WRONG, alive, check_process, footprints, hits, linear
 from variants import VARIANTS, set_variant
 
 from mi_diffind import plugins
-from mi_diffind.arrays.tables import load_table
+from mi_diffind.arrays.tables import load_table, save_table
 from mi_diffind.fitting.task import find_task
 from mi_diffind.maps import compressed
 from mi_diffind.maps.source import from_arrays
@@ -531,25 +531,6 @@ def test_variants_in_turn_and_threads(files, rng, name):
 
 
 @pytest.mark.parametrize("name", TEXTURES)
-def test_frozen_renders(mi_rgb, files, no_garbage_collection, name):
-    """Changes of parameters show; an emitter has to be rendered once before, as with ``bitmap``."""
-    mi = mi_rgb
-    loaded = lamp(mi, plugin(files, name, **({} if name == "mipmap" else {"storage": "float32"})))
-    params = mi.traverse(loaded)
-    key = next(k for k in params.keys() if k.endswith(("tables.cascaded", "radiance.data")))
-    frozen = dr.freeze(lambda loaded, seed: mi.render(loaded, spp=4, seed=seed))
-    dr.eval(mi.render(loaded, spp=4))
-    for step in range(4):
-        if step == 2:
-            params[key] = params[key] * 0.5
-            params.update()
-            dr.eval(mi.render(loaded, spp=4))
-        image, expected = (f(mi.UInt32(step)).numpy() for f in (
-            lambda seed: frozen(loaded, seed), lambda seed: mi.render(loaded, spp=4, seed=seed)))  # fmt: skip
-        np.testing.assert_allclose(image, expected, rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize("name", TEXTURES)
 def test_textures_die_with_their_scene(mi_rgb, files, no_garbage_collection, name):
     cls = type(mi_rgb.load_dict(plugin(files, name))).__name__
     before = alive(cls)
@@ -605,3 +586,71 @@ def test_bad_parameters(mi_rgb, files, name, case):
     if name == "mipmap" and case == "no file name":
         sentence = "exactly one is needed"
     assert sentence in refused(mi_rgb, {**plugin(files, name), **wrong})
+
+
+# ---------------------- Values that single precision cannot carry through a path ----------------------
+
+ALLOWED = "allowed in a scene are -1e+09 to 1e+09"
+
+
+def constants(values, file, folder, name="albedo"):
+    """Return a copy of a file with other settings of a map."""
+    table = load_table(file)
+    (entry,) = (m for m in table.settings["layout"]["maps"] if m["name"] == name)
+    entry.update(values)
+    entry["where"] = [entry["where"]] * 3 if entry["where"][0] == "constant" else entry["where"]
+    save_table(folder / "changed.npz", table)
+    return str(folder / "changed.npz")
+
+
+@pytest.mark.parametrize("values, found", [
+    ({"where": ["constant", 1e30], "color_space": "linear"}, "found values up to 1e+30 in the map"),
+    ({"where": ["constant", 2e9], "color_space": "linear"}, "found values up to 2e+09 in the map"),
+    ({"where": ["constant", -1e300]}, "has the constant -1e+300, allowed are numbers from -1.7e+38 to 1.7e+38"),
+    ({"where": ["constant", 1e4]}, "found values up to 3.5e+09 in the map"),  # sRGB
+    ({"low": -1e30, "color_space": "linear"}, "found values up to -1e+30 in the map"),
+    ({"high": 1e30, "knee": 1e25, "color_space": "linear"}, "found values up to 1e+30 in the map"),
+    ({"where": ["constant", 1e9], "color_space": "linear"}, ""),
+    ({"where": ["constant", 1e3]}, ""),
+])  # fmt: skip
+@pytest.mark.parametrize("name", READERS[1:])
+def test_values_in_files(mi_rgb, files, tmp_path, name, values, found):
+    """Too large ones are refused; the largest are finite along paths of four bounces."""
+    mi = mi_rgb
+    described = plugin({name: constants(values, files[name], tmp_path)}, name)
+    if found:
+        sentence = refused(mi, described)
+        assert 'parameter "filename": ' in sentence and found in sentence
+        assert "constant" in found or f'the map "albedo", {ALLOWED}' in sentence
+        return
+    bsdf = described if name == "neural_material" else {"type": "diffuse", "reflectance": described}
+    inside = {"type": "sphere", "radius": 9, "flip_normals": True, "bsdf": bsdf}
+    lamp = {"type": "point", "position": [0.0, 0.0, 3.0], "intensity": 1.0}
+    sensor = {"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8}}
+    loaded = {"type": "scene", "integrator": {"type": "path", "max_depth": 5}, "lamp": lamp, "sensor": sensor}
+    assert np.isfinite(mi.render(mi.load_dict({**loaded, "room": inside}), spp=4).numpy()).all()
+
+
+def test_every_map_of_a_material_is_checked(mi_rgb, files, tmp_path):
+    path = constants({"where": ["constant", 1e30]}, files["neural_material"], tmp_path, "normal")
+    assert 'in the map "normal"' in refused(mi_rgb, {"type": "neural_material", "filename": path})
+    mi_rgb.load_dict({"type": "neural_material", "filename": path, "ignore": "normal"})
+
+
+@pytest.mark.parametrize("raw", [False, True])
+def test_values_of_bitmaps(mi_rgb, raw):
+    def texture(value):
+        return {"type": "mipmap", "bitmap": mi_rgb.Bitmap(np.full((4, 4, 3), value, np.float32)), "raw": raw}
+
+    for value in (1e30, -1e30, 2e9):
+        assert f'"bitmap": found values up to {value:.3g} in the map "image", {ALLOWED}' in refused(
+            mi_rgb, texture(value)
+        )
+    mi_rgb.load_dict(texture(1e9))
+
+
+@pytest.mark.parametrize("value", [1e30, 1e300, math.nan])
+def test_transformations_beyond_single_precision(mi_rgb, files, value):
+    matrix = mi_rgb.ScalarTransform4f([[value, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    sentence = refused(mi_rgb, plugin(files, "neural_image", to_uv=matrix))
+    assert 'parameter "to_uv": found an entry of ' in sentence and "allowed are up to 1e+18" in sentence

@@ -110,22 +110,6 @@ def test_integrators_around_the_one_that_traces(mi_rgb, warned):
     assert (image.numpy()[..., -1] == 0).all() and "AOVIntegrator" in warned()[0]
 
 
-def test_load_file_decodes_for_channels(mi_rgb, warned, tmp_path):
-    path = tmp_path / "scene.xml"
-    path.write_text(f"""<scene version="3.0.0">
-        <shape type="neural_sdf"><string name="filename" value="{SOLID}"/><integer name="resolution" value="24"/>
-        </shape>
-        <sensor type="perspective">
-            <transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform>
-            <film type="hdrfilm"><integer name="width" value="4"/><integer name="height" value="4"/></film>
-        </sensor>
-        <integrator type="aov"><string name="aovs" value="d:depth"/><integrator type="path_sdf"/></integrator>
-    </scene>""")
-    loaded = mi_diffind.load_file(path)
-    assert ["decoded to a grid" in line for line in warned()] == [True]
-    assert render(mi_rgb, loaded).numpy()[..., -1].max() > 2 and not warned()
-
-
 def test_textures_that_nothing_filters(mi_rgb, warned):
     mi = mi_rgb
     loaded = mi.load_dict(scene(mi, **textured(mi)))
