@@ -410,29 +410,21 @@ class FilteredTexture(MapTexture):
         return *super()._settings(), self.filter, cone
 
     def omitted(self, integrators: list, sensor) -> str:
-        """Return a sentence if no footprints reach the texture, or those of another sensor; see :mod:`.omissions`.
-
-        Whether an integrator gives footprints is known of a few only, and of all others to :func:`.omissions.reading`.
-        """
-        names = [compat.integrator_name(integrator) for integrator in integrators]
+        """Return a sentence if no footprints reach the texture, or those of another sensor; see :mod:`.omissions`."""
         attached, name = footprint.attached_sensor(self)
-        if not self.is_spatially_varying() or any(hasattr(i, "gives_footprints") for i in integrators):
+        if not self.is_spatially_varying() or any(getattr(i, "gives_footprints", False) for i in integrators):
             return ""
         if self.cone is None:
-            return self.unfiltered() if set(names) & set(compat.CARRYING) else ""
+            return (
+                f"{self._title()} is not filtered: it does not know the sensor, and the integrator gives no "
+                f"footprints; load the scene with mi_diffind.load_file or load_dict, call mi_diffind.attach(scene), or "
+                f"render with the integrator path_footprint"
+            )
         if sensor is None or attached in (0, id(sensor)):
             return ""
         return (
             f'{self._title()} is filtered for the sensor "{name}", found "{sensor.id()}": call '
             f"mi_diffind.attach(scene, sensor) before a render of another sensor"
-        )
-
-    def unfiltered(self) -> str:
-        """Return a warning that the texture is not filtered."""
-        return (
-            f"{self._title()} is not filtered: it does not know the sensor, and the integrator gives no footprints; "
-            f"load the scene with mi_diffind.load_file or load_dict, call mi_diffind.attach(scene), or render with the "
-            f"integrator path_footprint"
         )
 
     def _title(self) -> str:
@@ -460,8 +452,6 @@ class FilteredTexture(MapTexture):
 
     def _footprint(self, si) -> tuple:
         """Return the footprint in texels of the image, with ``to_uv`` applied."""
-        if self.cone is None:
-            omissions.reading(self, si)
         with dr.suspend_grad():
             ddx, ddy = footprint.footprint(si, self.cone)
             if self._transform is not None:

@@ -125,7 +125,6 @@ def test_textures_that_are_filtered_or_not_read(mi_rgb, warned):
     mi = mi_rgb
     render(mi, mi.load_dict(scene(mi, **textured(mi))), "path_footprint", max_depth=2)
     render(mi, mi.load_dict(scene(mi, **textured(mi))), "moment", inner={"type": "path_footprint", "max_depth": 2})
-    render(mi, mi.load_dict(scene(mi, **textured(mi))), "depth")
     render(mi, mi.load_dict(scene(mi, **textured(mi, filter="off"))), "direct")
     at = mi.ScalarTransform4f().look_at([0, 0, -4], [0, 0, 0], [0, 1, 0])
     sensor = {"sensor_to_world": at, "fov": 40, "resolution": 4}
@@ -138,12 +137,8 @@ def test_textures_that_are_filtered_or_not_read(mi_rgb, warned):
     assert not warned()
 
 
-def test_parts_that_are_not_filtered(mi_rgb, warned):
-    """Of a render whose image is filtered: the albedo of ``aov``, and all in a scene with a distance field."""
+def test_textures_beside_a_distance_field(mi_rgb, warned):
     mi = mi_rgb
-    inner = {"type": "path_footprint", "max_depth": 2}
-    render(mi, mi.load_dict(scene(mi, **textured(mi))), "aov", aovs="a:albedo", inner=inner)
-    assert len(warned()) == 1
     both = {**textured(mi), "solid": {"type": "neural_sdf", "filename": SOLID}}
     render(mi, mi.load_dict(scene(mi, **both)), "path_sdf", max_depth=2)
     assert len(warned()) == 1
