@@ -148,27 +148,7 @@ class Disney(mi.BSDF):
 
     {executable}
 
-    .. tabs::
-        .. code-tab:: xml
-            :name: disney
-
-            <bsdf type="disney">
-                <rgb name="base_color" value="0.8, 0.2, 0.1"/>
-                <float name="roughness" value="0.3"/>
-                <float name="clearcoat" value="1.0"/>
-                <float name="clearcoat_gloss" value="0.9"/>
-            </bsdf>
-
-        .. code-tab:: python
-
-            'type': 'disney',
-            'base_color': {
-                'type': 'rgb',
-                'value': [0.8, 0.2, 0.1]
-            },
-            'roughness': 0.3,
-            'clearcoat': 1.0,
-            'clearcoat_gloss': 0.9
+    {example bsdf disney: base_color=[0.8, 0.2, 0.1], roughness=0.3, clearcoat=1.0, clearcoat_gloss=0.9}
     """
 
     #: Parameter → default, in the order of the manual page.

@@ -110,18 +110,7 @@ class NeuralBSDF(mi.BSDF):
 
     {executable}
 
-    .. tabs::
-        .. code-tab:: xml
-            :name: neural_bsdf
-
-            <bsdf type="neural_bsdf">
-                <string name="filename" value="paint.npz"/>
-            </bsdf>
-
-        .. code-tab:: python
-
-            'type': 'neural_bsdf',
-            'filename': 'paint.npz'
+    {example bsdf neural_bsdf: filename="paint.npz"}
 
     **Families**: a file that ``mi-diffind fit bsdf plastic.xml --over alpha=0.02:0.8 -o plastic.npz`` wrote holds a
     BSDF that depends on parameters. Each is a property, and may be a texture, also where the plugin that was fitted

@@ -107,20 +107,7 @@ class NeuralGGX(mi.BSDF):
 
     {executable}
 
-    .. tabs::
-        .. code-tab:: xml
-            :name: neural_ggx
-
-            <bsdf type="neural_ggx">
-                <string name="material" value="Cu"/>
-                <float name="alpha" value="0.15"/>
-            </bsdf>
-
-        .. code-tab:: python
-
-            'type': 'neural_ggx',
-            'material': 'Cu',
-            'alpha': 0.15
+    {example bsdf neural_ggx: material="Cu", alpha=0.15}
     """
 
     def __init__(self, props: mi.Properties):

@@ -243,20 +243,7 @@ class NeuralMaterial(Disney):
 
     {executable}
 
-    .. tabs::
-        .. code-tab:: xml
-            :name: neural_material
-
-            <bsdf type="neural_material">
-                <string name="filename" value="wall.npz"/>
-                <float name="clearcoat" value="0.5"/>
-            </bsdf>
-
-        .. code-tab:: python
-
-            'type': 'neural_material',
-            'filename': 'wall.npz',
-            'clearcoat': 0.5
+    {example bsdf neural_material: filename="wall.npz", clearcoat=0.5}
     """
 
     def _set_up(self, props):
