@@ -74,23 +74,6 @@ def test_off_is_bitmap(mi_rgb, file, image, rng, wrap_mode):
     assert ours.max() == pytest.approx(linear(image.max() / 255), abs=1e-4)
 
 
-@pytest.mark.parametrize("wrap_mode", ["repeat", "clamp"])
-def test_trilinear_is_the_pyramid_at_the_level_of_the_area(mi_any, file, image, rng, wrap_mode):
-    mi = mi_any
-    uv, (ddx, ddy) = rng.random((2, 1000)), texture_scenes.footprints(rng, 1000, SIZE)
-    truth = expected(mi, pyramid(mi, image, wrap_mode), uv, texture_scenes.isotropic(ddx, ddy, SIZE))
-    si = texture_scenes.hits(mi, uv, ddx, ddy)
-    texture = mi.load_dict(plugin(file, wrap_mode=wrap_mode))
-    if mi.is_spectral:
-        with pytest.raises(RuntimeError, match="asked for a colour"):
-            texture.eval_3(si)
-        assert np.isfinite(texture.eval(si).numpy()).all()
-        texture = mi.load_dict(plugin(file, wrap_mode=wrap_mode, raw=True))
-        place = [mi.Float(aligned(x)) for x in (*uv, texture_scenes.isotropic(ddx, ddy, SIZE))]
-        truth = numpy_of(pyramid(mi, image, wrap_mode, "linear").filtered(*place)).T
-    np.testing.assert_allclose(texture.eval_3(si).numpy(), truth, atol=2e-4)
-
-
 @pytest.mark.parametrize("taps", [1, 7])
 def test_anisotropic_is_the_mean_along_the_major_axis(mi_rgb, file, image, rng, taps):
     """By singular values: ``taps`` places, half a level finer than each is wide."""
@@ -138,25 +121,6 @@ def test_random_numbers(mi_rgb, rng):
 
 
 # -- hard cases --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", ["trilinear", "anisotropic"])
-def test_seams(mi_rgb, file, rng, name):
-    """Repeated and mirrored images go on with any footprint; a clamped one knows nothing of its other end."""
-    mi = mi_rgb
-    uv, (ddx, ddy) = rng.random((2, 300)), texture_scenes.footprints(rng, 300, SIZE, 3)
-    texture = {w: mi.load_dict(plugin(file, name, wrap_mode=w)) for w in ("repeat", "mirror")}
-    for mode, x in (("repeat", uv - [[1], [2]]), ("repeat", uv - [[-3], [0]]), ("mirror", uv - [[-2], [2]])):
-        a, b = (texture[mode].eval(texture_scenes.hits(mi, y, ddx, ddy)).numpy() for y in (uv, x))
-        np.testing.assert_allclose(a, b, atol=1e-3)
-    a, b = (texture["mirror"].eval(texture_scenes.hits(mi, s * uv, s * ddx, s * ddy)).numpy() for s in (1, -1))
-    np.testing.assert_allclose(a, b, atol=1e-3)
-    halves = np.zeros((16, 16, 3), np.uint8)
-    halves[:, 8:] = 255
-    for mode in ("mirror", "clamp", "repeat"):
-        tall = mi.load_dict({"type": "mipmap", "bitmap": mi.Bitmap(halves), "filter": name, "wrap_mode": mode})
-        ends = tall.eval(texture_scenes.hits(mi, [[0, 1e-3, 1, 0.999], [0.5] * 4], (1e-4, 0), (0, 0.25))).numpy()[0]
-        assert np.abs(ends - [0, 0, 1, 1]).max() < 1e-4 if mode != "repeat" else (np.abs(ends - 0.5) < 0.1).all()
 
 
 # -- gradients ---------------------------------------------------------------------------------------------------------

@@ -11,14 +11,13 @@ import numpy as np
 import pytest
 from arrays import aligned
 from scipy.ndimage import map_coordinates
-from texture_scenes import refused, scene_xml
+from texture_scenes import hits, refused, scene_xml
 from variants import VARIANTS, set_variant, warnings_of
 
 from mi_diffind.arrays.tables import StoredArray, Table, load_table, save_table
 from mi_diffind.core import compat
 from mi_diffind.maps.layout import Layout, MapLayout
 from mi_diffind.maps.source import load_source
-from mi_diffind.measure.clock import bsdf_operations
 from mi_diffind.scenes import comparison, loading
 from mi_diffind.tasks.image import TASK
 from mi_diffind.tasks.image.arrays import CompressedImage
@@ -113,16 +112,6 @@ def counterpart(mi, file, channels="albedo", **more):
     return {"type": "bitmap", "bitmap": bitmap, "format": "variant", **raw, **more}
 
 
-def interactions(mi, u, v):
-    u, v = (np.atleast_1d(x) for x in (u, v))
-    si = dr.zeros(mi.SurfaceInteraction3f, max(len(u), len(v)))
-    si.uv = mi.Point2f(mi.Float(aligned(u)), mi.Float(aligned(v)))
-    if mi.is_spectral:
-        wavelengths = np.random.default_rng(5).uniform(360, 830, (4, dr.width(si.uv)))
-        si.wavelengths = type(si.wavelengths)(*[mi.Float(aligned(w)) for w in wavelengths])
-    return si
-
-
 def centres(rng, n, tiles=0):
     """Coordinates of texel centres, of ``tiles`` images to either side, too."""
     x = rng.integers(-tiles * WIDTH, (tiles + 1) * WIDTH, n)
@@ -142,12 +131,6 @@ def values_of(textures, si, methods=METHODS):
     return {key: None if v is None else v.numpy() for key, v in values.items()}
 
 
-def sentence(error):
-    text = compat.one_sentence(error)
-    assert "Traceback" not in text and len(text) < 350, text
-    return text
-
-
 # -- the same as a bitmap ----------------------------------------------------------------------------------------------
 
 
@@ -156,7 +139,7 @@ def test_equals_a_bitmap_of_what_it_decodes_to(mi_any, file, rng):
     mi = mi_any
     ours = {name: mi.load_dict(plugin(file, name)) for name in USABLE}
     theirs = {name: mi.load_dict(counterpart(mi, file, name)) for name in USABLE}
-    si = interactions(mi, *centres(rng, 400))
+    si = hits(mi, centres(rng, 400))
     found = values_of(ours, si)
     for (name, method), b in values_of(theirs, si).items():
         a = found[name, method]
@@ -184,17 +167,13 @@ def test_two_primaries(mi_rgb, tmp_path, rng, border, wrap_mode):
     mi = mi_rgb
     path = make(tmp_path / "a.npz", border=border, coarse=True)
     theirs = mi.load_dict(counterpart(mi, path, wrap_mode=wrap_mode))
-    si = interactions(mi, *centres(rng, 500, tiles=2))
+    si = hits(mi, centres(rng, 500, tiles=2))
     textures = {s: mi.load_dict(plugin(path, wrap_mode=wrap_mode, storage=s)) for s in ("uint8", "float32")}
     found = values_of({**textures, "bitmap": theirs}, si, ("eval",))
     for storage in textures:
         np.testing.assert_allclose(found[storage, "eval"], found["bitmap", "eval"], atol=3 * ROUNDING)
     keys = sorted(mi.traverse(textures["float32"]).keys())
     assert keys == ["tables.cascaded", "tables.coarse", "tables.primary", "to_uv"]
-    bsdf = mi.load_dict(materials(lambda m: plugin(path, m, wrap_mode=wrap_mode))["principled"])
-    one = mi.load_dict(materials(lambda m: plugin(path, m, wrap_mode=wrap_mode))["diffuse"])
-    both, one = (bsdf_operations(b, ("eval",))["eval"].gathers for b in (bsdf, one))
-    assert one <= both < 2 * one  # a further word of each corner for further channels
 
 
 @pytest.mark.parametrize("border", [("repeat", "clamp"), ("clamp", "repeat")])
@@ -211,7 +190,7 @@ def test_reads_as_an_independent_implementation_does(mi_rgb, tmp_path, rng, bord
             primary = np.concatenate([primary, np.take(primary, [0], axis)], axis)
     pointer = [map_coordinates(primary[..., k], x, order=1) * 3 for k in range(2)]
     stored = [map_coordinates(arrays["cascaded"].entries[..., k] / 255, pointer, order=1) for k in range(7)]
-    si = interactions(mi, u, v)
+    si = hits(mi, [u, v])
     s = np.stack(stored[:3])
     albedo = np.where(s < 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
     textures = {name: mi.load_dict(plugin(path, name)) for name in ("albedo", "normal", "glow")}
@@ -234,7 +213,7 @@ def test_gradient_of_the_image(mi_rgb, file, rng):
         image = mi.load_dict(plugin(file, name))
         x, y = rng.integers(0, WIDTH - 1, 200), rng.integers(0, HEIGHT - 1, 200)
         f = {
-            (i, j): image.eval_1(interactions(mi, (x + i + 0.5) / WIDTH, (y + j + 0.5) / HEIGHT)).numpy()
+            (i, j): image.eval_1(hits(mi, [(x + i + 0.5) / WIDTH, (y + j + 0.5) / HEIGHT])).numpy()
             for i in (0, 1)
             for j in (0, 1)
         }
@@ -244,7 +223,7 @@ def test_gradient_of_the_image(mi_rgb, file, rng):
             HEIGHT * ((1 - a) * (f[0, 1] - f[0, 0]) + a * (f[1, 1] - f[1, 0])),
         ]
         uv = np.stack([(x + 0.5 + a) / WIDTH, (y + 0.5 + b) / HEIGHT])
-        np.testing.assert_allclose(image.eval_1_grad(interactions(mi, *uv)).numpy(), expected, atol=2e-3)
+        np.testing.assert_allclose(image.eval_1_grad(hits(mi, uv)).numpy(), expected, atol=2e-3)
 
 
 # -- spectra -----------------------------------------------------------------------------------------------------------
@@ -293,35 +272,10 @@ def test_upsampling_is_mitsubas(rng):
 # -- in materials ------------------------------------------------------------------------------------------------------
 
 
-def materials(t):
-    """BSDFs of one and of three textures ``t(map)``."""
-    maps = {"base_color": t("albedo"), "roughness": t("roughness"), "metallic": t("metallic")}
-    return {
-        "diffuse": {"type": "diffuse", "reflectance": t("albedo")},
-        "principled": {"type": "principled", **maps},
-    }
-
-
-def test_maps_of_one_file_are_decoded_once(mi_rgb, file):
-    mi = mi_rgb
-    for more in ({}, {"to_uv": mi.ScalarTransform4f().scale(3)}, {"wrap_mode": "mirror"}):
-        found = {k: mi.load_dict(b) for k, b in materials(lambda m, k=more: plugin(file, m, **k)).items()}
-        once = bsdf_operations(found["diffuse"], ("eval",))["eval"].gathers
-        assert 0 < once <= 8 + 4  # a primary of 2 channels, a cascaded array of 2 dimensions
-        for method in ("eval", "pdf", "sample"):
-            gathers = bsdf_operations(found["principled"], (method,))[method].gathers
-            assert once <= gathers <= once + 4, (method, more)  # a further word of four corners for further channels
-        both = mi.load_dict({
-            "type": "normalmap", "normalmap": plugin(file, "normal", **more), "bsdf": materials(
-                lambda m, k=more: plugin(file, m, **k))["principled"],
-        })  # fmt: skip
-        assert once <= bsdf_operations(both, ("eval",))["eval"].gathers <= once + 4
-
-
 def test_maps_of_other_places_are_not_confused(mi_rgb, file, rng):
     mi = mi_rgb
     forms = [{}, {"to_uv": mi.ScalarTransform4f().scale(2)}, {"wrap_mode": "clamp"}, {"storage": "float32"}]
-    si = interactions(mi, *rng.uniform(-1, 2, (2, 200)))
+    si = hits(mi, rng.uniform(-1, 2, (2, 200)))
     alone = [mi.load_dict(plugin(file, **f)).eval(si).numpy() for f in forms]
     textures = [mi.load_dict(plugin(file, **f)) for f in forms]
     together = [t.eval(si) for t in textures]
@@ -341,7 +295,7 @@ def test_no_arrays(variant, tmp_path, rng, monkeypatch):
     one = MapLayout("image", "albedo", "srgb", 1, (("constant", 0.5), ("constant", 0.2), ("constant", 0.7)))
     path = make(tmp_path / "a.npz", Layout(WIDTH, HEIGHT, (one,), (), ()))
     theirs = mi.load_dict(counterpart(mi, path, "image"))
-    si = interactions(mi, *rng.random((2, 30)))
+    si = hits(mi, rng.random((2, 30)))
     expected = values_of({"": theirs}, si)
     for storage in ("uint8", "float32"):
         texture = mi.load_dict({"type": "neural_image", "filename": path, "storage": storage})
@@ -357,7 +311,7 @@ def test_no_arrays(variant, tmp_path, rng, monkeypatch):
 
 def test_a_file_that_was_written_anew_is_read_anew(mi_rgb, tmp_path, rng):
     mi = mi_rgb
-    si = interactions(mi, *rng.random((2, 20)))
+    si = hits(mi, rng.random((2, 20)))
     path = make(tmp_path / "a.npz")
     first = mi.load_dict(plugin(path))
     before = first.eval(si).numpy()
@@ -381,7 +335,7 @@ def test_relative_names_and_xml(mi_rgb, tmp_path, rng):
     found = mi.load_file(str(tmp_path / "b.xml"))
     to_uv = mi.ScalarTransform4f().translate([0.1, 0, 0]).scale([2, 3, 1])
     expected = mi.load_dict(plugin(str(tmp_path / "a.npz"), raw=True, wrap_mode="clamp", to_uv=to_uv))
-    si = interactions(mi, *rng.uniform(-0.2, 0.6, (2, 100)))
+    si = hits(mi, rng.uniform(-0.2, 0.6, (2, 100)))
     np.testing.assert_allclose(found.eval_diffuse_reflectance(si).numpy(), expected.eval(si).numpy(), rtol=0, atol=1e-5)
     assert "map = albedo of albedo, normal" in str(expected)
 
@@ -479,7 +433,7 @@ def test_exact_counterpart_without_a_source(mi_rgb, material, tmp_path):
         loading.load(tmp_path / "s.xml")  # as written it needs none
         with pytest.raises(loading.SceneError) as e:
             loading.load(tmp_path / "s.xml", exact=True)
-        cases.append((expected, sentence(e.value)))
+        cases.append((expected, compat.one_sentence(e.value)))
     for expected, found in cases:
         assert expected in found
 
@@ -497,7 +451,7 @@ def test_exact_counterpart_elsewhere(mi_rgb, material, tmp_path):
         if recorded == digest:
             exact = loading.load(tmp_path / "s.xml", exact=True).shapes()[0].bsdf()
             bitmap = mi_rgb.load_dict({"type": "bitmap", "bitmap": mi_rgb.Bitmap(albedo)})
-            si = interactions(mi_rgb, np.float32([0.2, 0.7]), np.float32([0.4, 0.1]))
+            si = hits(mi_rgb, [[0.2, 0.7], [0.4, 0.1]])
             np.testing.assert_array_equal(exact.eval_diffuse_reflectance(si).numpy(), bitmap.eval(si).numpy())
         else:
             with pytest.raises(loading.SceneError, match="has changed since"):
