@@ -18,12 +18,12 @@ from mi_diffind.tasks.texture import TASK
 from . import Counterpart, Plugin
 from .disney import Disney, Parameters, ShadedPoint, to_principled
 from .support import properties, textures
+from .support.bsdfs import TrackedParameter
 from .support.image_files import SharedMaps, layout_of, open_compressed, remove, to_bitmap, to_mipmap
 from .support.manual import shared_parts
 from .support.map_textures import FilteredTexture
 from .support.textures import FILTERS, anisotropic, isotropic
 from .support.textures import PROPERTIES as FILTERING
-from .support.tracked_parameter import FixedParameter
 
 #: Forms of the lobes.
 LOBES = ("exact", "tables")
@@ -242,20 +242,7 @@ class NeuralMaterial(Disney):
 
     {executable}
 
-    .. tabs::
-        .. code-tab:: xml
-            :name: neural_material
-
-            <bsdf type="neural_material">
-                <string name="filename" value="wall.npz"/>
-                <float name="clearcoat" value="0.5"/>
-            </bsdf>
-
-        .. code-tab:: python
-
-            'type': 'neural_material',
-            'filename': 'wall.npz',
-            'clearcoat': 0.5
+    {example bsdf neural_material: filename="wall.npz", clearcoat=0.5}
     """
 
     def _set_up(self, props):
@@ -280,8 +267,8 @@ class NeuralMaterial(Disney):
                     )
             if name not in self._tracked:
                 continue
-            constant = self.maps.is_constant(name) and not (name == "base_color" and mi.is_spectral)
-            self._tracked[name] = FixedParameter(self.maps.layout_bounds(m), constant)
+            self._tracked[name] = TrackedParameter(self.maps, known=self.maps.layout_bounds(m))
+            self._tracked[name].constant = self.maps.is_constant(name) and not (name == "base_color" and mi.is_spectral)
             if name == "base_color":
                 self.base_color = None
             elif name == "specular":

@@ -99,6 +99,9 @@ def integrator() -> type:
         #: Rays are traced through distance shapes (:mod:`.distance_shapes`).
         traces_solids = True
 
+        #: Rays carry no differentials, since a distance field has none.
+        gives_footprints = False
+
         def to_string(self) -> str:
             return super().to_string().replace("PathFootprint", "PathSDF", 1)
 

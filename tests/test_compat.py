@@ -192,39 +192,6 @@ def test_callback_of_renders(mi_rgb, monkeypatch):
             mi.set_variant("llvm_ad_rgb")
 
 
-@pytest.mark.parametrize("name", ["direct", "path", "prb", "ptracer", "volpath", "volpathmis", "prbvolpath"])
-def test_what_is_known_while_integrators_are_recorded(mi_rgb, name):
-    """Partial derivatives of uv are known to be zero, unless interactions are in the state of the integrator's loop."""
-    mi, known = mi_rgb, []
-
-    class Probe(mi.Texture):
-        def __init__(self, props):
-            mi.Texture.__init__(self, props)
-
-        def eval(self, si, active=True):
-            known.append((compat.is_recording(), compat.is_zero(*si.duv_dx, *si.duv_dy), compat.is_zero(si.uv.x)))
-            return mi.Color3f(0.5)
-
-        def mean(self):
-            return mi.Float(0.5)
-
-        def to_string(self):
-            return "Probe[]"
-
-    mi.register_texture("known_probe", Probe)
-    film = {"type": "hdrfilm", "width": 1, "height": 1}
-    scene = mi.load_dict({
-        "type": "scene", "sky": {"type": "constant"}, "sensor": {"type": "perspective", "film": film},
-        "ball": {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": {"type": "known_probe"}}},
-    })  # fmt: skip
-    integrator = mi.load_dict({"type": name})
-    with hook("dr.VarState, dr.JitFlag.SymbolicScope, names of integrators"):
-        mi.render(scene, integrator=integrator, spp=1)
-        carrying = compat.integrator_name(integrator) in compat.CARRYING
-        assert set(known) == {(True, not carrying, False)} and carrying == ("vol" in name)
-        assert not compat.is_recording() and not compat.is_zero(mi.Float(0.5))
-
-
 def test_classes_of_textures(mi_any):
     bitmap = {"type": "bitmap", "raw": True}
     grey = {"type": "uniform", "value": 0.5}

@@ -30,7 +30,7 @@ from mi_diffind.core.files import PATHS, OutputError
 from mi_diffind.core.units import figure_lines
 from mi_diffind.fitting.loop import checkpoint_settings
 from mi_diffind.fitting.task import FitSettings, within_memory
-from mi_diffind.images.headers import picture_size
+from mi_diffind.images.reader import picture_size
 from mi_diffind.maps.pyramid import map_figure
 from mi_diffind.maps.source import SourceError, from_arrays, load_source
 from mi_diffind.scenes.inspection import Inspection
@@ -157,10 +157,9 @@ def test_sizes_of_pictures(tmp_path, rng):
     mi.Bitmap(values.astype(np.float16)).write(str(tmp_path / "half.exr"))
     for path in tmp_path.iterdir():
         size = picture_size(path)
-        assert (size.width, size.height) == (17, 13), path
+        assert size[:2] == (17, 13), path
         depth = {".ppm": 2, ".exr": 2 if path.stem == "half" else 4, ".hdr": 4, ".pfm": 4}.get(path.suffix, 1)
-        assert size.nbytes == 17 * 13 * 3 * depth, path
-        assert picture_size(path) is not None
+        assert size[2] == 3 * depth, path
     (tmp_path / "cut.png").write_bytes((tmp_path / "x.png").read_bytes()[:20])
     (tmp_path / "text").write_text("no picture")
     assert picture_size(tmp_path / "cut.png") is None and picture_size(tmp_path / "text") is None
@@ -172,7 +171,7 @@ def test_a_picture_of_30000_squared_is_refused_by_its_size(tmp_path):
     content[20:24] = struct.pack(">I", 30000)
     content[29:33] = struct.pack(">I", zlib.crc32(content[12:29]))
     path.write_bytes(content)
-    with pytest.raises(ViewsError, match="30,000 x 30,000 pixels would take 3,600,000,000 bytes"):
+    with pytest.raises(ViewsError, match="30,000 x 30,000 pixels would take 2,700,000,000 bytes"):
         read_image(path)
     with pytest.raises(SourceError, match="30,000 x 30,000 pixels would take 2,700,000,000 bytes"):
         load_source(path)

@@ -609,7 +609,7 @@ def test_values_and_derivatives_have_their_own_samples(trained, weights):
     scene, problem = trained
     scene.place(View())
     (bsdf,) = (made for made in loading.instances(scene.scene) if hasattr(made, "decoder"))
-    tables = {name: array.codes() for name, array in bsdf._arrays().items()}
+    tables = {name: array.codes() for name, array in bsdf.tables.arrays.items()}
     (a, da), (b, db), (c, dc) = (
         rendered(scene, inside(problem.net), weights, *seeds) for seeds in ((1, 2), (1, 3), (5, 2))
     )
@@ -619,7 +619,7 @@ def test_values_and_derivatives_have_their_own_samples(trained, weights):
         np.testing.assert_array_equal(gradient, dc[name])
         assert np.abs(gradient - db[name]).max() > 1e-3 * np.abs(gradient).max()
     # The tables of the BRDF are bytes, which no derivative reaches
-    for name, array in bsdf._arrays().items():
+    for name, array in bsdf.tables.arrays.items():
         np.testing.assert_array_equal(array.codes(), tables[name])
     assert not [key for key in mi.traverse(bsdf).keys() if key.startswith("tables.")]
 

@@ -189,22 +189,6 @@ def on_variant_change(callback) -> None:
     mi.detail.add_variant_callback(callback)
 
 
-def is_recording() -> bool:
-    """Return whether Dr.Jit records a loop or a call symbolically, as integrators do while they trace a scene."""
-    return dr.flag(dr.JitFlag.SymbolicScope)
-
-
-def is_zero(*values) -> bool:
-    """Return whether Dr.Jit knows of each of these arrays, without an evaluation, that it is zero in all lanes.
-
-    Within a recorded call, inputs stay known if the caller computed them outside of the state of a loop.
-    """
-    return all(value.state == dr.VarState.Literal and value[0] == 0 for value in values)
-
-
-#: Mitsuba's classes of integrators that carry interactions in the state of a loop, of which :func:`is_zero` knows none.
-CARRYING = ("VolumetricPathIntegrator", "VolpathMisIntegratorImpl", "PRBVolpathIntegrator")
-
 #: Mitsuba's class of integrators that intersect rays with the scene beside their nested integrators.
 INTERSECTING = "AOVIntegrator"
 

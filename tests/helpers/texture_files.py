@@ -13,6 +13,16 @@ from mi_diffind.tasks.texture import PRESETS, arrays, fit
 from mi_diffind.tasks.texture.compressed import CompressedTexture, neutral_extras, to_table
 
 
+def material(width, height):
+    """Smooth maps of every kind, bytes, that repeat along both axes."""
+    y, x = np.mgrid[0:height, 0:width] / [[[height]], [[width]]]
+    wave = 0.5 + 0.35 * np.sin(2 * np.pi * np.stack([x + k * y for k in range(4)], axis=-1) + np.arange(4))
+    xy = 0.6 * (wave[..., :2] - 0.5)
+    normal = 0.5 + 0.5 * np.concatenate([xy, np.sqrt(1 - (xy**2).sum(axis=-1, keepdims=True))], axis=-1)
+    maps = {"albedo": wave[..., :3], "normal": normal, "roughness": wave[..., 3:]}
+    return {name: np.rint(255 * values).astype(np.uint8) for name, values in maps.items()}
+
+
 def make(path, source, preset="ours", border="repeat", extras=None, **settings):
     """A file of arrays as a training starts with them, almost without loss; the paper's are random.
 

@@ -38,7 +38,7 @@ from ...core.archives import Allowance, LimitError, json_bytes
 from ...core.errors import DiffindError, missing_package, reason
 from ...core.files import MOST_TEXT, OutsideError, RecordedKeys, irregular, path_by_name, shown, unused_note
 from ...core.units import memory
-from ...images.headers import check_picture
+from ...images.reader import ENCODED, Picture, PictureError, read_picture
 from ...images.srgb import from_linear, to_linear
 
 #: Extensions tried in turn for an image name without one.
@@ -94,25 +94,38 @@ def read_image(path: Path) -> tuple[np.ndarray, bool]:
 
     That is uint8, or float32 for EXR. Raises :class:`ViewsError`.
     """
-    encoded = not is_linear(path)
-    try:
-        values = _read_bytes(path) if encoded else _read_exr(path)
-    except (ViewsError, ImportError):
-        raise
-    except LimitError as e:
-        raise ViewsError(str(e)) from None
-    except Exception as e:  # each decoder raises errors of its own for a damaged file
-        raise ViewsError(
-            f"{path}: cannot be read as an image, it is damaged or of an unknown format ({reason(e)})"
-        ) from None
-    if not encoded and not np.isfinite(values).all():
-        raise ViewsError(f"{path}: has {np.count_nonzero(~np.isfinite(values)):,} values that are NaN or infinite")
-    has_alpha = values.shape[2] in (2, 4)
+    picture, encoded = _read(path), not is_linear(path)
+    values = picture.values
+    if encoded:
+        if values.dtype.name not in ENCODED or not picture.named:
+            raise ViewsError(f"{path}: holds {values.shape[2]} channels of {values.dtype}, allowed are grey and RGB")
+        values, has_alpha = _as_bytes(values), picture.has_alpha
+    else:
+        places = {name: i for i, name in enumerate(picture.channels)}
+        colours = next((c for c in (("R", "G", "B"), ("Y",)) if set(c) <= set(places)), None)
+        if colours is None or values.dtype.name in ENCODED:
+            raise ViewsError(f"{path}: has the channels {', '.join(sorted(places))}, expected R, G, B or Y, and A")
+        has_alpha = "A" in places
+        values = values[..., [places[name] for name in (*colours, *(("A",) if has_alpha else ()))]].astype(np.float32)
+        if not np.isfinite(values).all():
+            raise ViewsError(f"{path}: has {np.count_nonzero(~np.isfinite(values)):,} values that are NaN or infinite")
     image = np.full((*values.shape[:2], 4), 255 if encoded else 1, values.dtype)
     image[..., :3] = values[..., :-1] if has_alpha else values
     if has_alpha:
         image[..., 3] = values[..., -1] if encoded else np.clip(values[..., -1], 0, 1)
     return image, has_alpha
+
+
+def _read(path: Path) -> Picture:
+    try:
+        return read_picture(path)
+    except PictureError as e:
+        raise ViewsError(str(e)) from None
+
+
+def _as_bytes(values: np.ndarray) -> np.ndarray:
+    """Return numbers of 8 or 16 bits as bytes."""
+    return values if values.dtype == np.uint8 else (values >> 8).astype(np.uint8)
 
 
 def linear_pixels(image: np.ndarray) -> np.ndarray:
@@ -162,70 +175,23 @@ def read_mask(path: Path, image: np.ndarray, image_path: Path) -> tuple[np.ndarr
     Alpha holds the mask if the file has an alpha that is not 1 everywhere, else the luminance does. A pixel counts
     where it is not 0 or, in a JPEG, above :data:`BLACK_OF_JPEG`. Raises :class:`ViewsError`, also if the sizes differ.
     """
-    try:
-        with _opened(path, 4) as opened:
-            alpha = np.array(opened.convert("RGBA"))[..., 3] if opened.has_transparency_data else None
-            if in_alpha := alpha is not None and bool(alpha.min() < 255):
-                mask = alpha > 0
-            else:
-                single = opened.mode in ("1", "L", "I", "F") or opened.mode.startswith("I;")  # of 16 bits, too
-                values = np.array(opened if single else opened.convert("L"))
-                mask = values > (BLACK_OF_JPEG if opened.format == "JPEG" else 0)
-    except LimitError as e:
-        raise ViewsError(str(e)) from None
-    except Exception as e:
-        raise ViewsError(f"{path}: cannot be read as a mask ({reason(e)})") from None
+    picture = _read(path)
+    values, alpha = picture.values[..., : picture.colors], picture.values[..., picture.colors :]
+    if values.dtype.name not in ENCODED or not picture.named:
+        raise ViewsError(f"{path}: cannot be read as a mask, it holds {values.shape[2]} channels of {values.dtype}")
+    if in_alpha := picture.has_alpha and bool(alpha.min() < np.iinfo(alpha.dtype).max):
+        mask = alpha[..., 0] > 0
+    else:
+        luminance = values[..., 0]
+        if values.shape[2] == 3:  # Rec. 601, in 16 bits after the point
+            luminance = (_as_bytes(values).astype(np.uint32) @ np.uint32([19595, 38470, 7471]) + 2**15) >> 16
+        with open(path, "rb") as file:
+            is_jpeg = file.read(2) == b"\xff\xd8"
+        mask = luminance > (BLACK_OF_JPEG if is_jpeg else 0)
     if mask.shape != image.shape[:2]:
         sizes = " × ".join(map(str, mask.shape[::-1])), " × ".join(map(str, image.shape[1::-1]))
         raise ViewsError(f"{path}: has {sizes[0]} pixels, its image {image_path.name} has {sizes[1]}")
     return mask, in_alpha
-
-
-def _opened(path: Path, channels: int):
-    """Return an open image file of Pillow, not yet decoded, that may have so many ``channels`` of a byte.
-
-    Raises :class:`.LimitError` for one that takes more memory than a file of its size may.
-    """
-    from PIL import Image
-
-    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None  # the limit here is the one of all readers
-    try:
-        image = Image.open(path)
-    finally:
-        Image.MAX_IMAGE_PIXELS = limit
-    try:
-        content = f"a picture of {image.width:,} x {image.height:,} pixels"
-        Allowance(path).check(channels * image.width * image.height, content)
-    except LimitError:
-        image.close()
-        raise
-    return image
-
-
-def _read_bytes(path: Path) -> np.ndarray:
-    """Return an image of 8 bits, ``(height, width, 1 to 4)``, uint8."""
-    with _opened(path, 4) as image:
-        if image.mode not in ("RGB", "RGBA", "L", "LA"):
-            if image.mode in ("CMYK", "YCbCr", "LAB", "HSV", "1", "F", "I") or image.mode.startswith("I;"):
-                raise ViewsError(f"{path}: has pixels of the mode {image.mode}, allowed are 8 bits of grey or RGB")
-            image = image.convert("RGBA" if image.has_transparency_data else "RGB")
-        elif image.mode in ("RGB", "L") and image.has_transparency_data:
-            image = image.convert("RGBA")
-        values = np.array(image)
-    return values.reshape(*values.shape[:2], -1)
-
-
-def _read_exr(path: Path) -> np.ndarray:
-    """Return an EXR image, ``(height, width, 1 to 4)``, float32: R, G, B or Y, and A."""
-    import OpenEXR
-
-    check_picture(path)
-    with OpenEXR.File(str(path), separate_channels=True) as file:
-        planes = {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}
-    colours = next((c for c in (("R", "G", "B"), ("Y",)) if set(c) <= set(planes)), None)
-    if colours is None:
-        raise ViewsError(f"{path}: has the channels {', '.join(sorted(planes))}, expected R, G, B or Y, and A")
-    return np.stack([planes[name] for name in (*colours, *(("A",) if "A" in planes else ()))], axis=-1)
 
 
 #: Coefficients of a distortion, in the order in which they are kept.

@@ -130,7 +130,7 @@ REFUSED_FRAMES = [
     ({"mask_path": 3}, 'frame 0 has a "mask_path" that is no name of a file$'),
     ({"mask_path": "mask.png"}, r"mask\.png: no such image"),
     ({"mask_path": "small.png"}, r"small\.png: has 3 × 3 pixels, its image 0\.png has 8 × 6$"),
-    ({"mask_path": "broken.png"}, r"broken\.png: cannot be read as a mask"),
+    ({"mask_path": "broken.png"}, r"broken\.png: cannot be read as an image"),
     ({"transform_matrix": None}, 'frame "images/0.png" has no "transform_matrix"'),
     ({"transform_matrix": pose(np.nan)}, "with NaN or infinite numbers"),
     ({"transform_matrix": pose(0, 0.5)}, r"that scales \(columns of length 0.5, 0.5, 0.5\)"),
@@ -172,9 +172,7 @@ def test_files_that_are_refused(tmp_path):
     data = path.read_bytes()
     for broken in (data[: len(data) // 2], b"", b"not an image", data[:40] + b"\0" * 40 + data[80:]):
         path.write_bytes(broken)
-        refused(tmp_path, r"1\.png: cannot be read as an image")
-    Image.fromarray(np.zeros(SIZE, np.uint16)).save(path)
-    refused(tmp_path, r"1\.png: has pixels of the mode I")
+        refused(tmp_path, r"1\.png: (cannot be read as an image|is cut short)")
     path.unlink()
     path = path.with_suffix(".exr")
     path.write_bytes(b"no")
