@@ -12,8 +12,8 @@ from mi_diffind.arrays.tables import TableError
 from mi_diffind.core import compat
 
 from . import Counterpart, Plugin, warn
+from .path_footprint import SURFACES
 from .path_footprint import integrator as path_footprint
-from .support import distance_shapes as sdf
 from .support import omissions, properties, tables
 from .support.footprint import Differentials
 from .support.manual import shared_parts
@@ -549,19 +549,19 @@ def integrator() -> type:
 
             A ``mode`` of ``None`` is the primal phase. Without smooth surfaces, a single piece is enough.
             """
-            solids = sdf.distance_shapes_in(scene) if getattr(self.surfaces, "traces_solids", False) else ()
+            geometry = self.surfaces.geometry(scene) if isinstance(self.surfaces, path_footprint()) else SURFACES
             if self.smooth_depth == 0 or not has_smooth(scene):
-                return sampler, self._piece(mode, scene, sampler, path, solids, surfaces, False, False)
+                return sampler, self._piece(mode, scene, sampler, path, geometry, surfaces, False, False)
 
             def body(sampler, path):
-                return sampler, self._piece(mode, scene, sampler, path, solids, surfaces, True, carried)
+                return sampler, self._piece(mode, scene, sampler, path, geometry, surfaces, True, carried)
 
             label = "neural_field" if mode is None else f"neural_field ({mode.name})"
             return dr.while_loop(
                 (sampler, path), lambda _, path: path.active, body, max_iterations=self.smooth_depth + 1, label=label
             )
 
-        def _piece(self, mode, scene, sampler, path, solids, surfaces, onward: bool, carried: bool) -> FollowedRays:
+        def _piece(self, mode, scene, sampler, path, geometry, surfaces, onward: bool, carried: bool) -> FollowedRays:
             """Follow a piece of each ray up to a surface and, if ``onward``, across it where it is smooth.
 
             ``carried``: the rays have differentials.
@@ -574,7 +574,7 @@ def integrator() -> type:
                 met = mi.Bool(False)
                 for _, crossed in entered:
                     met |= crossed
-            pi, far, solid = self._meet(scene, solids, ray, met, path.turned)
+            pi, far, solid = self._meet(scene, geometry, ray, met, path.turned)
             through = mi.Float(1)
             for placed, crossed in in_order(self.groups, entered):
                 through = self._see(mode, path, placed, ray, far, crossed, first, through)
@@ -633,7 +633,7 @@ def integrator() -> type:
             path.count = dr.select(going, path.count + 1, path.count)
             return path
 
-        def _meet(self, scene, solids, ray, active, turned) -> tuple:
+        def _meet(self, scene, geometry, ray, active, turned) -> tuple:
             """Return the first hit of rays, its distance (or ``maxt``), and whether it is a solid of ``path_sdf``."""
             pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
             if self.surfaces.hide_emitters:
@@ -643,12 +643,8 @@ def integrator() -> type:
                 after = self.skip_area_emitters(scene, at.spawn_ray(ray.d), True, hidden)
                 after.t += at.t
                 pi[hidden] = after
-            far = dr.minimum(pi.t, ray.maxt)
-            if not solids:
-                return pi, far, mi.Bool(False)
-            hit = sdf.intersect(solids, ray.o, ray.d, far, active)
-            pi.t = dr.select(hit.number > 0, dr.inf, pi.t)
-            return pi, hit.t, hit.number > 0
+            far = dr.minimum(geometry.nearest(ray, pi, active).t, ray.maxt)
+            return pi, far, ~pi.is_valid() & (far < ray.maxt)
 
         def _see(self, mode, path, placed, ray, far, crossed, first, before):
             """Add the light of a field behind a transmittance ``before``; return the transmittance behind the field."""

@@ -136,7 +136,7 @@ def test_hits_far_from_the_origin_are_those_near_it(mi_rgb, shapes, rng):
     for far in (0.0, 2.0**13):
         shape = mi.load_dict({**shapes["field"], "to_world": at().translate([far, -far, far])})
         start = o + far * np.array([[1], [-1], [1]])
-        hit = distance_shapes.intersect([shape], mi.Point3f(start), mi.Vector3f(d), mi.Float(dr.inf))
+        hit = distance_shapes.Solids([shape]).intersect(mi.Point3f(start), mi.Vector3f(d), mi.Float(dr.inf))
         results.append([np.array(v) for v in (hit.number, hit.t, hit.p)])
     (near, t, p), (moved, far_t, far_p) = results
     assert (near == moved).all() and near.mean() > 0.5

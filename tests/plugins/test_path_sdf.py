@@ -148,13 +148,14 @@ def test_shadows_of_a_sky_far_from_the_origin(mi_rgb, fields):
     small = {**solid(mi, "ball"), "to_world": at([far, 3, 0])}
     large = {**solid(mi, "ball"), "to_world": at([far, 0, 0]).scale(2.5)}
     loaded = mi.load_dict({"type": "scene", "sky": {"type": "constant"}, "small": small, "large": large})
-    shapes = distance_shapes.distance_shapes_in(loaded)
-    number = 1 + [shape.id() for shape in shapes].index("small")
-    hit = distance_shapes.ShapeHit(mi.UInt32(number), mi.Float(1), mi.Point3f(0, -0.4, 0))
+    solids = distance_shapes.solids_in(loaded)
+    number = 1 + [shape.id() for shape in solids.shapes].index("small")
+    hit = distance_shapes.ShapeHit(mi.UInt32(number), mi.Float(1), mi.Point3f(0, -0.4, 0), mi.Vector3f(0))
+    hit = distance_shapes.SolidHit(dr.zeros(mi.PreliminaryIntersection3f), hit, hit)
     si = dr.zeros(mi.SurfaceInteraction3f, count)
     si.p, si.n = mi.Point3f(far, 2.6, 0), mi.Normal3f(0, -1, 0)
     ds, _ = loaded.emitters()[0].sample_direction(si, mi.Point2f(np.random.default_rng(1).random((2, count))))
-    found, d = np.array(distance_shapes.occluded_from(shapes, hit, si, ds)), np.array(ds.d, np.float64).T
+    found, d = np.array(solids.occluded(hit, si, ds, True)), np.array(ds.d, np.float64).T
     below = d[:, 1] < -0.05
     expected = 2.6**2 * (1 - d[:, 1] ** 2) < 1
     assert 0.05 < expected[below].mean() < 0.2 and (found != expected)[below].sum() <= 2
