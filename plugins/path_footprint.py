@@ -341,9 +341,8 @@ def integrator() -> type:
                 β[rr_active] *= dr.rcp(rr_prob)
                 active = active_next & (β_max != 0) & (~rr_active | rr_continue)
                 depth[active_next] += 1
-                hit = geometry.nearest(
-                    ray, scene.ray_intersect_preliminary(ray, coherent=False, active=active), active, rest, hit
-                )
+                pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+                hit = geometry.nearest(ray, pi, active, rest, hit)
 
                 # ---------------------- Differential phases ----------------------
 

@@ -111,7 +111,7 @@ def _here(function, jobs: Mapping[str, object], stop: threading.Event) -> Iterat
 
 
 class WorkerProcess:
-    """New process of Python that carries out one job at a time, with so many ``threads`` of Dr.Jit.
+    """New process of Python that carries out one job at a time, with so many ``threads`` of Dr.Jit (0: without it).
 
     It does not run the main script again, ignores Ctrl-C, and ends with this process, or after ``idle`` seconds without
     a job (``None``: never).
@@ -166,9 +166,10 @@ def serve(descriptor: int, threads: int, idle: float | None) -> None:
             name, function, value = pickle.loads(jobs.get(timeout=idle))
         except queue.Empty:
             os._exit(0)
-        from .compat import use_threads
+        if threads:
+            from .compat import use_threads
 
-        use_threads(threads)
+            use_threads(threads)
         outcome = _attempt(name, function, value)
         try:
             content = pickle.dumps(outcome)

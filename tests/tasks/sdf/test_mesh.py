@@ -391,14 +391,14 @@ def test_a_child_that_dies_is_one_sentence():
     mesh = make_mesh(*solids.box(), "box.ply")
     with Distances(mesh) as d:
         assert d.signed(np.zeros((1, 3))) == pytest.approx(-0.5)
-        os.kill(d._child.pid, signal.SIGABRT)
-        d._child.wait()
+        os.kill(d._child.process.pid, signal.SIGABRT)
+        d._child.process.wait()
         with pytest.raises(DistancesError) as error:
             d.signed(np.zeros((1, 3)))
         assert "box.ply: libigl ended" in sentence(error) and "SIGABRT" in str(error.value)
         assert d.signed(np.zeros((1, 3))) == pytest.approx(-0.5)
         child = d._child
-    assert child.poll() is not None, "it ends with the block"
+    assert child.process.poll() is not None, "it ends with the block"
 
 
 def test_a_mesh_on_which_libigl_crashes():
@@ -436,8 +436,8 @@ def python(program):
 def test_the_child_ends_with_its_parent():
     """However the parent ends, and without the parent's modules in it."""
     done = python("""
-maps = open(f"/proc/{child.pid}/maps").read()
-print(child.pid, "drjit" in maps or "mitsuba" in maps, flush=True)
+maps = open(f"/proc/{child.process.pid}/maps").read()
+print(child.process.pid, "drjit" in maps or "mitsuba" in maps, flush=True)
 os.kill(os.getpid(), 9)
 """)
     assert done.returncode == -9, done.stderr
@@ -482,7 +482,7 @@ def test_a_fork_leaves_the_child_alone():
     done = python("""
 pid = os.fork()
 if pid == 0:
-    same = d.signed(np.zeros((1, 3))) == before and d._child.pid != child.pid
+    same = d.signed(np.zeros((1, 3))) == before and d._child.process.pid != child.process.pid
     d.close()
     os._exit(0 if same else 1)
 print(os.waitpid(pid, 0)[1], (d.signed(np.zeros((1, 3))) == before).all(), d._child is child)
