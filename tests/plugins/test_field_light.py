@@ -218,3 +218,5 @@ def test_what_is_refused_and_warned_of(mi_rgb, fields):
     made = scene(mi, field("lamp"), smoke=smoke, **room(mi))
     assert 'the participating medium of "smoke" is not rendered' in made.integrator()._unseen(made)
     assert made.integrator()._unseen(scene(mi, field("lamp"), **room(mi))) == ""
+    unlit = scene(mi, field("lamp") | {"lit": False}, **room(mi))
+    assert 'not visible through the holes of "leaf", "lit" shows it' in unlit.integrator()._unseen(unlit)

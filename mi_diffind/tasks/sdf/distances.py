@@ -16,7 +16,6 @@ from __future__ import annotations
 import functools
 import importlib.util
 import math
-import os
 
 import numpy as np
 
@@ -59,7 +58,6 @@ class Distances:
     def __init__(self, mesh: Mesh):
         self.mesh = mesh
         self._child: WorkerProcess | None = None
-        self._owner = 0
         self._sent: set[str] = set()
         self._doubt = (0.0, 0.0)
 
@@ -75,7 +73,7 @@ class Distances:
     def close(self) -> None:
         """End the child process if it runs."""
         child, self._child, self._sent = self._child, None, set()
-        if child is not None and self._owner == os.getpid():  # not the process of a forked copy's parent
+        if child is not None:
             child.process.kill()
             child.close()
 
@@ -194,12 +192,10 @@ class Distances:
         points = _check_points(points)
         if not len(points):
             return tuple(array[:0] for array in self._ask(question, np.zeros((1, 3)), name, mesh))
-        if self._owner != os.getpid():
-            self.close()
         if self._child is None:
             if importlib.util.find_spec("igl") is None:
                 raise DistancesError(f"{self.mesh.path}: distances need {missing_package('libigl')}")
-            self._child, self._owner = WorkerProcess(threads=0), os.getpid()
+            self._child = WorkerProcess(threads=0)
         if name not in self._sent:
             faces = np.ascontiguousarray(mesh.faces, np.int64)
             self._request("mesh", name, (np.ascontiguousarray(mesh.vertices), faces, mesh.watertight))

@@ -1,12 +1,8 @@
 """Meshes in the unit frame and distances to them: against formulas, brute force, and meshes that are broken."""
 
-import contextlib
 import os
 import signal
-import subprocess
 import sys
-import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -81,13 +77,6 @@ def test_scale_and_place_do_not_matter():
         assert mesh.scale == pytest.approx(2 * scale) and mesh.centre == pytest.approx([centre] * 3)
         with Distances(mesh) as d:
             assert np.allclose(d.signed(points), truth, atol=1e-6)
-
-
-def test_digest_knows_content():
-    vertices, faces = solids.box()
-    digest = make_mesh(vertices, faces).digest
-    assert make_mesh(3 * vertices, faces).digest == digest and len(digest) == 64
-    assert make_mesh(vertices * [1, 1, 0.999], faces).digest != digest
 
 
 POINTS = b"ply\nformat ascii 1.0\nelement vertex 1\n" + b"".join(b"property float %c\n" % c for c in b"xyz")
@@ -194,14 +183,6 @@ def test_orientation_is_repaired():
     assert mesh.volume == pytest.approx(volume * (1 - 1 / 8 + 1 / 64)) and mesh.warnings == []
 
 
-def test_a_moebius_strip_does_no_harm():
-    """That of five triangles."""
-    mesh = make_mesh(np.random.default_rng(0).random((5, 3)), (np.arange(5)[:, None] + np.arange(3)) % 5)
-    assert not mesh.watertight and mesh.components == 1
-    with Distances(mesh) as d, contextlib.suppress(DistancesError):
-        assert np.isfinite(d.signed(np.zeros((1, 3)))).all()
-
-
 # -- distances --------------------------------------------------------------------------------------------------------
 
 
@@ -302,13 +283,6 @@ def test_cracks_everywhere():
     mesh = make_mesh(corners.reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3))
     with Distances(mesh) as d:
         assert d.solid is mesh and inside_share(mesh, d) == pytest.approx(np.pi / 6, abs=0.02)
-
-
-def test_one_triangle_encloses_nothing():
-    mesh = make_mesh([[0, 0, 0], [1, 0, 0.2], [0, 1, 1]], [[0, 1, 2]], "one.ply")
-    with Distances(mesh) as d, pytest.raises(DistancesError) as error:
-        d.signed(np.zeros((1, 3)))
-    assert sentence(error) == "one.ply: encloses no volume, expected the surface of a solid"
 
 
 @pytest.mark.parametrize("shift", [(0.5, 0.3, 0.2), (0.5, 0, 0), (1, 0, 0)])
@@ -417,44 +391,6 @@ def test_without_libigl(monkeypatch):
     assert "box.ply: distances need the package libigl" in sentence(error) and "pip install libigl" in str(error.value)
 
 
-START = """
-import os, numpy as np, solid_meshes as solids
-from mi_diffind.tasks.sdf.distances import Distances
-from mi_diffind.tasks.sdf.mesh import make_mesh
-d = Distances(make_mesh(*solids.box()))
-before, child = d.signed(np.zeros((1, 3))), d._child
-"""
-
-
-def python(program):
-    """Run a program that begins with a question."""
-    env = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    return subprocess.run([sys.executable, "-c", START + program], capture_output=True, text=True, env=env)
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
-def test_the_child_ends_with_its_parent():
-    """However the parent ends, and without the parent's modules in it."""
-    done = python("""
-maps = open(f"/proc/{child.process.pid}/maps").read()
-print(child.process.pid, "drjit" in maps or "mitsuba" in maps, flush=True)
-os.kill(os.getpid(), 9)
-""")
-    assert done.returncode == -9, done.stderr
-    pid, loaded = done.stdout.split()
-    assert loaded == "False"
-    for _ in range(100):
-        try:
-            state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-        except FileNotFoundError:
-            break
-        if state == "Z":
-            break
-        time.sleep(0.05)
-    else:
-        pytest.fail("the child lives on")
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="signals")
 def test_ctrl_c_ends_a_question():
     """A Ctrl-C in the middle of a question goes through, and the next one is answered rightly."""
@@ -474,17 +410,3 @@ def test_ctrl_c_ends_a_question():
             signal.setitimer(signal.ITIMER_REAL, 0)
             signal.signal(signal.SIGINT, handler)
         assert np.array_equal(d.signed(points[:100]), few)
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
-def test_a_fork_leaves_the_child_alone():
-    """A forked copy of the parent asks a process of its own, and ends only that."""
-    done = python("""
-pid = os.fork()
-if pid == 0:
-    same = d.signed(np.zeros((1, 3))) == before and d._child.process.pid != child.process.pid
-    d.close()
-    os._exit(0 if same else 1)
-print(os.waitpid(pid, 0)[1], (d.signed(np.zeros((1, 3))) == before).all(), d._child is child)
-""")
-    assert done.stdout.split() == ["0", "True", "True"], done.stderr
