@@ -341,7 +341,7 @@ def integrator() -> type:
             return list(self.aovs)
 
         def report(self) -> dict:
-            voxel = self.placed.field.voxel * self.placed.placement.size
+            voxel = self.placed.field.voxel * self.placed.length
             report = {"voxel": voxel, "surfaces": compat.integrator_name(self.surfaces)}
             if (model := self.model) is None:
                 return report

@@ -459,7 +459,7 @@ class MeshView:
 
     def field_scene(self, field: DistanceField, lit: bool = False):
         """Return a scene of the field, traced by ``path_sdf``."""
-        placement = Placement.of(mi.ScalarTransform4f(), 1.0, (0.0, 0.0, 0.0))
+        placement = Placement()
         shape = distance_shape(mi.Mesh)(_material(), field, placement, True)
         return self._scene(shape, "path_sdf", lit)
 

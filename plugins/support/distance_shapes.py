@@ -32,9 +32,9 @@ from mi_diffind.tasks.sdf.mesh import Mesh, edge_balance, load_mesh, read_serial
 
 from .. import warn
 from . import omissions, properties
-from .placement import Placement, PlacementParameter
+from .placement import Placement
 from .properties import Kept
-from .tables import arrays_of
+from .tables import Entries, arrays_of
 
 #: Distance of secondary rays' origins from the surface: three shortest steps of a ray.
 OFFSET = 3 * marching.SHORTEST_STEP
@@ -62,15 +62,17 @@ def distance_shape(mesh: type) -> type:
     class DistanceShape(mesh):
         """Shape of a distance ``field``'s surface, placed in the world by ``placement``.
 
-        ``smooth``: shading normals are the field's smooth ones.
+        ``smooth``: shading normals are the field's smooth ones. A class whose field can be optimised overrides
+        :meth:`entries`.
         """
 
         #: Integrators that trace it.
         seen_by = SEEN_BY
 
         def __init__(self, props: mi.Properties, field, placement: Placement, smooth: bool):
-            self.field, self.smooth, self.position = field, smooth, PlacementParameter(placement)
+            self.field, self.smooth, self.placement = field, smooth, placement
             self.ready, self.differentiated = False, False
+            self._accepted = Entries(self.entries())
             super().__init__(*compat.mesh_arguments(props, CORNERS, CORNERS))
             if self.is_emitter():
                 raise RuntimeError("emitter: found one, signed distance fields emit no light")
@@ -81,15 +83,10 @@ def distance_shape(mesh: type) -> type:
             self.add_attribute(UNMERGED, 1, [0.0] * CORNERS)
             omissions.watch(self)
 
-        @property
-        def placement(self) -> Placement:
-            """Placement of the unit frame in the world."""
-            return self.position.placement
-
         def _place(self) -> None:
             """Move the triangles to the corners of the field's box in the world, and the frame with them."""
             # Attributes of their own, where frozen functions (``dr.freeze``) look for arrays
-            self.axes, self.origin, self.size = self.position.axes, self.position.origin, self.position.size
+            self.axes, self.origin, self.size = self.placement.axes, self.placement.origin, self.placement.size
             box = np.array([self.field.lower, self.field.upper], np.float64)
             corners = np.stack(np.meshgrid(*box.T, indexing="ij"), -1).reshape(-1, 3)
             self.ready = False
@@ -108,14 +105,21 @@ def distance_shape(mesh: type) -> type:
                 super().traverse(cb)
                 return
             cb.put("bsdf", self.bsdf(), mi.ParamFlags.Differentiable)
-            cb.put("to_world", self.position.transform, mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous)
+            cb.put("to_world", self.placement.transform, mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous)
+            for name, values in self.tensors().items():
+                cb.put(f"tables.{name}", values, mi.ParamFlags.Differentiable)
 
         def parameters_changed(self, keys=()) -> None:
             if not self.ready:
                 super().parameters_changed(keys)
-            elif not keys or "to_world" in keys:
-                self.position.update()
+                return
+            if not keys or "to_world" in keys:
+                self.placement.update()
                 self._place()
+            self._accepted.accept()
+            if self.optimisable() and (not keys or any(key.startswith("tables.") for key in keys)):
+                self.field.update_bound()
+                self._hold()
 
         def omitted(self, integrators: list, sensor) -> str:
             """Return a sentence if these integrators do not trace the shape; see :mod:`.omissions`."""
@@ -132,11 +136,20 @@ def distance_shape(mesh: type) -> type:
 
         def optimisable(self) -> bool:
             """Return whether the field's arrays are kept in a form that can be optimised."""
-            return False
+            return bool(self.entries())
+
+        def entries(self) -> dict:
+            """Return the arrays that can be optimised by name: tensors, or ``DifferentiableArray``."""
+            return {}
+
+        def tensors(self) -> dict:
+            """Return the tensors that can be optimised, by name."""
+            return {name: v if dr.is_tensor_v(v) else v.data for name, v in self.entries().items()}
 
         def attached(self) -> list:
             """Return the arrays of the field and the transform whose derivatives are tracked."""
-            return [self.position.transform.matrix] if self.position.moving() else []
+            moved = [self.placement.transform.matrix] if self.placement.moving() else []
+            return moved + [values for values in self.tensors().values() if compat.has_gradient(values)]
 
         def optimised(self) -> bool:
             """Return whether derivatives with respect to the field or its place are enabled."""
@@ -180,7 +193,7 @@ def distance_shape(mesh: type) -> type:
             slope = dr.detach(slope)
             along = dr.dot(slope, direction)
             along = dr.copysign(dr.maximum(dr.abs(along), dr.maximum(GRAZING * dr.norm(slope), 1e-6)), along)
-            moving = self.position.moving()
+            moving = self.placement.moving()
             if moving:
                 # The frame moves, this place of the world does not
                 place = dr.detach(self.to_world(p))
