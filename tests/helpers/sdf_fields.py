@@ -38,7 +38,7 @@ class Ball(DistanceField):
 
 
 class Slab(DistanceField):
-    """What lies within ``thickness`` / 2 of the plane z = 0, up to the sides of the box."""
+    """Solid within ``thickness`` / 2 of the plane z = 0, up to the sides of the box."""
 
     def __init__(self, types, thickness, normal=(0.0, 0.0, 1.0)):
         super().__init__(types, (-0.5,) * 3, (0.5,) * 3, 0.01, 1.0)

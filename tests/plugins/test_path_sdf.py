@@ -127,7 +127,7 @@ def test_where_the_camera_is(mi_rgb, fields, name, pane, view):
 
 
 def test_shadows_of_a_sky_far_from_the_origin(mi_rgb, fields):
-    """From the lowest place of a small ball on a larger one: a place on the sky is rounded, its direction counts."""
+    """Directions to a sky count, since its places are rounded far away: from between two balls."""
     mi, count, far = mi_rgb, 4000, 1e7
     at = mi.ScalarTransform4f().translate
     small = {**solid(mi, "ball"), "to_world": at([far, 3, 0])}
@@ -180,15 +180,11 @@ def test_solids_in_groups_are_refused(mi_rgb, fields):
     [
         ({"emitter": {"type": "area"}}, "emit no light"),
         ({"interior": {"type": "homogeneous"}}, "hold none"),
-        ({"to_world": [1.0, 1.0, 2.0]}, 'parameter "to_world": found'),
     ],
 )
 def test_what_solids_cannot_be(mi_rgb, fields, more, message):
-    mi = mi_rgb
-    if "to_world" in more:
-        more = {"to_world": mi.ScalarTransform4f().scale(more["to_world"])}
     with pytest.raises(RuntimeError, match=message):
-        mi.load_dict({"type": "test_solid", "field": "ball", **more})
+        mi_rgb.load_dict({"type": "test_solid", "field": "ball", **more})
 
 
 # -- derivatives -------------------------------------------------------------------------------------------------------
@@ -206,7 +202,7 @@ OTHER = {"other": {"type": "sphere", "center": [0.6, -0.9, 1.6], "radius": 0.5, 
 
 
 def check_derivatives(actual, expected, depth):
-    """They are alike, but where paths part, by a rounding error or since frames differ."""
+    """Compare derivatives, except where paths part, by a rounding error or since frames differ."""
     assert np.median(np.abs(actual - expected)) < 0.02 * np.median(np.abs(expected))
     assert actual.mean() == pytest.approx(expected.mean(), rel=0.01 if depth == 2 else 0.15)
 
@@ -282,7 +278,7 @@ def test_derivatives_of_the_place_are_those_of_prb(mi_rgb, fields, move, depth):
 
 @pytest.mark.parametrize("moved", ["field", "place"])
 def test_derivatives_that_are_zero_are_said(mi_rgb, fields, monkeypatch, moved):
-    """Of a black ball before a sky, whose outline alone shows: once, and not of a ball that is lit."""
+    """One warning for a black ball, of which only the outline shows, and none for a lit ball."""
     mi, ball, warned = mi_rgb, fields["ball"], warnings_of(mi_rgb, monkeypatch)
     integrator = mi.load_dict({"type": "path_sdf", "max_depth": 2})
     for reflectance, count in ((0.5, 0), (0.0, 1)):

@@ -1,4 +1,4 @@
-"""What is measured of a field, and what it is decoded to: against fields whose errors are known by formulas."""
+"""Errors of distance fields and their decoding, against fields whose errors are known by formulas."""
 
 import functools
 import math
@@ -277,7 +277,7 @@ def test_interpolable_grids():
 
 
 def test_chamfer(ball, held_out):
-    """Of concentric spheres, the difference of radii; of a sphere and half of it, only one way."""
+    """For concentric spheres it is the difference of the radii; for half a sphere one direction counts."""
     mesh, _ = ball
     for radius in (0.49, 0.5):
         decoded = grids.extract(Ball(radius), 150, mesh.scale, mesh.centre)

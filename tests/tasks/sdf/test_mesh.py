@@ -188,7 +188,7 @@ def test_orientation_is_repaired():
 
 @pytest.mark.parametrize("size", [(1, 0.6, 0.3), (0.05, 0.05, 1), (1, 1, 0.001)])
 def test_distances_of_a_box(size):
-    """Against the formula, in a frame where the box's longest side is 1; also of a rod and of a plate."""
+    """Boxes, a rod and a plate, against the formula, in a frame where the longest side is 1."""
     size = np.array(size)
     mesh = make_mesh(*solids.box(7 * size, (3, 2, 1)))
     near = sample_near(mesh, 3000, min(0.01, 0.3 * size.min()), 1)
@@ -287,7 +287,7 @@ def test_cracks_everywhere():
 
 @pytest.mark.parametrize("shift", [(0.5, 0.3, 0.2), (0.5, 0, 0), (1, 0, 0)])
 def test_overlapping_boxes_are_their_union(shift):
-    """Also where sides coincide: |d| inside is to the union's surface, not to the sides buried in it."""
+    """Distances inside are those to the union's surface, not to buried sides, also where sides coincide."""
     mesh = make_mesh(*solids.together(solids.box(), solids.box(centre=shift)))
     points = sample_box([-0.6] * 3, [0.6] * 3, 4000, 1)
     with Distances(mesh) as d:

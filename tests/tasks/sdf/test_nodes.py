@@ -56,7 +56,7 @@ def field_of(types, coding):
 
 
 def test_every_node_of_the_grid_has_its_sign(ad, shapes):
-    """Also those that are not stored, of which there is one bit for eight: against winding numbers."""
+    """Stored nodes, and all others, of which eight share a bit, against winding numbers."""
     distances, sampled = shapes
     s = sampled.structure
     grid = np.stack(np.meshgrid(*[np.arange(n - 1) for n in s.shape], indexing="ij"), axis=-1).reshape(-1, 3)
@@ -147,7 +147,7 @@ def test_quadratic_functions_are_exact(ad, sampled):
 
 
 def test_gradients_are_those_of_the_values(ad, sampled):
-    """In place: central differences. In the nodes: changes of nodes, one by one."""
+    """Derivatives by place against central differences, those by nodes against changes of single nodes."""
     field, s = decoded(ad, sampled), sampled.structure
     rng = np.random.default_rng(2)
     corner = s.node_positions()[0][sampled.corners[rng.integers(len(sampled.corners), size=400), 0]]
@@ -232,7 +232,7 @@ def test_spoiled_nodes_keep_their_sides(ad, sampled):
 
 
 def test_wrong_nodes_make_no_floaters(ad, shapes):
-    """They have a part in the cells that the surface crosses only: all others keep their signs."""
+    """Stored nodes count only in cells that the surface crosses: all other cells keep their signs."""
     distances, s = shapes
     field = decoded(ad, s, 0.3)
     places = sample_box(field.lower, field.upper, 40000, 5)
@@ -247,7 +247,7 @@ def test_wrong_nodes_make_no_floaters(ad, shapes):
 
 
 def test_as_many_pieces_as_the_mesh(ad, shapes):
-    """Also after coding, decoded finer than the field's cells: two solids, one with a cavity, and nothing else."""
+    """Coded and decoded finer than the field's cells: two solids, one with a cavity, and no other piece."""
     distances, s = shapes
     volumes = grids.components(grids.extract(field_of(ad, coded(s)), 108)) * distances.mesh.scale**3
     assert len(volumes) == 3 and np.sum(volumes < 0) == 1

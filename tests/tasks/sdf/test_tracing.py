@@ -1,4 +1,4 @@
-"""Where rays meet a signed distance field, against formulas and a slow march."""
+"""Hits of rays with signed distance fields, against formulas and a slow march."""
 
 import functools
 
@@ -51,7 +51,7 @@ def sphere(o, d, r):
 
 @pytest.mark.parametrize("start", ["far", "near", "within"])
 def test_spheres(types, rng, start):
-    """From outside of the box, from within it and from within the solid, whichever way the ray goes."""
+    """Rays start outside of the box, within it, or within the solid, in any direction."""
     d = unit(rng.normal(size=(COUNT, 3)))
     at = unit(rng.normal(size=(COUNT, 3)))
     o = {"far": 0.3 * at - 2 * d, "near": 0.45 * at, "within": 0.35 * at * rng.random((COUNT, 1))}[start]
@@ -136,7 +136,7 @@ def test_what_the_box_cuts_is_closed(types):
 
 
 def test_jumps_are_bracketed(types, rng):
-    """Where the sign changes without a zero, bisection ends at the jump."""
+    """A change of sign without a zero is bisected."""
     d = unit(rng.normal(size=(COUNT, 3)))
     o = 0.3 * unit(rng.normal(size=(COUNT, 3))) - 2 * d
     t, is_hit, _, _ = trace(Steps(types), o, d)
@@ -145,7 +145,7 @@ def test_jumps_are_bracketed(types, rng):
 
 
 def test_grids_against_a_slow_march(types, rng):
-    """Of a bumpy grid, the first change of sign that steps of 2e-4 see, but where a ray only touches."""
+    """Hits with a bumpy grid are the first changes of sign that steps of 2e-4 see, except where a ray only touches."""
     n = 17
     x = np.linspace(-0.5, 0.5, n)
     grid = np.stack(np.meshgrid(x, x, x, indexing="ij"), -1)
@@ -241,7 +241,7 @@ def test_slabs_change_no_hit(types, coded, rng):
 
 
 def test_rays_along_the_plane_of_a_block(coded, rng):
-    """They enter its slab, if ever, at a distance of which there is a cell."""
+    """Their distances to a slab stay within the range of whole numbers."""
     types, marcher, structure = coded.types, marching.get_marcher(coded), coded.structure
     normals, middles = planes(coded)
     block = rng.choice(np.flatnonzero(marching.GridCells(coded).crossed.any(axis=1)), COUNT)
