@@ -144,6 +144,15 @@ class Surfaces:
 SURFACES = Surfaces()
 
 
+def skip_emitters(integrator, scene, ray, pi, active) -> None:
+    """Replace hits ``pi`` of emitters with an area by the hits behind them."""
+    hidden = active & pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711  (lane by lane)
+    at = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, hidden)
+    behind = integrator.skip_area_emitters(scene, at.spawn_ray(ray.d), True, hidden)
+    behind.t += at.t
+    pi[hidden] = behind
+
+
 @cache
 def integrator() -> type:
     """Return the class for the variant that is set; its base class exists only after Mitsuba loaded this file."""
@@ -243,11 +252,7 @@ def integrator() -> type:
 
             pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
             if dr.hint(self.hide_emitters, mode="scalar"):
-                hidden = active & pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711  (lane by lane)
-                at = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, hidden)
-                behind = self.skip_area_emitters(scene, at.spawn_ray(ray.d), True, hidden)
-                behind.t += at.t
-                pi[hidden] = behind
+                skip_emitters(self, scene, ray, pi, active)
             hit = geometry.nearest(ray, pi, active)
 
             while dr.hint(active, max_iterations=self.max_depth, label=f"{type(self).__name__} ({mode.name})"):
