@@ -283,7 +283,6 @@ def test_chamfer(ball, held_out):
         decoded = grids.extract(Ball(radius), 150, mesh.scale, mesh.centre)
         measured = held_out.chamfer(decoded, 2**14)
         assert measured["chamfer"] == pytest.approx(0.5 - radius, abs=2e-4) and measured["components"] == 1
-        assert measured["components_mesh"] == 1
     vertices, faces = solids.sphere(96)
     half = trimesh.Trimesh(*solids.without((vertices, faces), vertices[faces][:, :, 2].max(1) > 1e-6))
     measured = held_out.chamfer(half, 2**14)["chamfer"]
@@ -292,21 +291,7 @@ def test_chamfer(ball, held_out):
     away = 0.5 * 2 * np.sin(np.arcsin(z) / 2)
     assert measured == pytest.approx((away.mean() / 2) / 2, rel=0.03)
     nothing = trimesh.Trimesh(np.zeros((0, 3)), np.zeros((0, 3), int))
-    assert held_out.chamfer(nothing) == {"chamfer": math.inf, "components": 0, "components_mesh": 1}
-
-
-def test_components_of_overlapping_pieces():
-    """Two balls that overlap and one apart: two solids, however many pieces the mesh has."""
-    balls = (solids.sphere(12, *v) for v in ((), (1, (1, 0, 0)), (0.5, (4, 0, 0))))
-    mesh = make_mesh(*solids.together(*balls))
-    with Distances(mesh) as d:
-        e = SurfaceEvaluation(mesh, d, count=2**8, band=0.04)  # a wide band has fewer cells
-        assert mesh.components == 3 and e.components == 2
-        truth = e.truth(64)
-    assert truth.is_watertight and len(grids.components(truth)) == 2
-    lens = math.pi * 2 * (1 - 1 / 2) ** 2 * (1 - (1 - 1 / 2) / 3)
-    volume = 2 * 4 / 3 * math.pi - lens + 4 / 3 * math.pi / 8
-    assert truth.volume == pytest.approx(volume, rel=0.05)
+    assert held_out.chamfer(nothing) == {"chamfer": math.inf, "components": 0}
 
 
 def test_lost_pieces():
