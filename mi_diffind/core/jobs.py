@@ -108,7 +108,7 @@ def _here(function, jobs: Mapping[str, object], stop: threading.Event) -> Iterat
 
 
 class WorkerProcess:
-    """New process of Python that carries out one job at a time, with so many ``threads`` of Dr.Jit.
+    """New process of Python that carries out one job at a time, with so many ``threads`` of Dr.Jit (0: without it).
 
     It does not run the main script again, ignores Ctrl-C, and ends with this process.
     """
@@ -159,9 +159,10 @@ def serve(descriptor: int, threads: int) -> None:
     threading.Thread(target=receive, daemon=True).start()
     while True:
         name, function, value = pickle.loads(jobs.get())
-        from .compat import use_threads
+        if threads:
+            from .compat import use_threads
 
-        use_threads(threads)
+            use_threads(threads)
         outcome = _attempt(name, function, value)
         try:
             content = pickle.dumps(outcome)

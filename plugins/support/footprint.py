@@ -192,22 +192,10 @@ def seen_by(cone: Cone, si: mi.SurfaceInteraction3f) -> tuple[mi.Vector2f, mi.Ve
     curved mirrors and rough bounces widen the footprint; only after concave mirrors and lenses may the true footprint
     be smaller. If dp_du and dp_dv are parallel or zero, the footprint is zero.
     """
-    p, du, dv = dr.detach(si.p), dr.detach(si.dp_du), dr.detach(si.dp_dv)
+    du, dv = dr.detach(si.dp_du), dr.detach(si.dp_dv)
     unit = dr.normalize(dr.cross(du, dv))
-    if cone.projection == "orthographic":
-        to, distance, depth = cone.axis, mi.Float(1), mi.Float(1)
-        tolerance = mi.Float(STRAIGHT)
-    else:
-        to = p - cone.origin
-        distance, depth = dr.norm(to), dr.dot(to, cone.axis)
-        to = to * dr.rcp(distance)
-        tolerance = STRAIGHT + cone.lens * dr.rcp(distance)
-    # A two-sided material may have flipped si.wi, so that the sign of z has no meaning
-    local, wi = dr.detach(si.sh_frame).to_local(to), dr.detach(si.wi)
-    away = mi.Vector3f(local.x + wi.x, local.y + wi.y, dr.abs(local.z) - dr.abs(wi.z))
-    direct = (dr.squared_norm(away) < dr.square(tolerance)) & (depth > 0)
-
-    last, incident = dr.detach(si.t), dr.detach(si.sh_frame).to_world(wi)
+    direct, to, distance, depth = _line_of_sight(cone, si)
+    last, incident = dr.detach(si.t), dr.detach(si.sh_frame).to_world(dr.detach(si.wi))
     oblique = dr.abs(dr.dot(incident, unit))
     by_last = dr.square(last) > dr.square(distance) * oblique
     if cone.projection == "orthographic":  # a pixel is as wide at any distance
@@ -220,6 +208,24 @@ def seen_by(cone: Cone, si: mi.SurfaceInteraction3f) -> tuple[mi.Vector2f, mi.Ve
     return in_uv(x, y, along, du, dv)
 
 
+def _line_of_sight(cone: Cone, si) -> tuple:
+    """Return whether a sensor sees a hit directly, the direction to the hit, and its distance and depth.
+
+    With an orthographic sensor, distance and depth are 1.
+    """
+    if cone.projection == "orthographic":
+        to, distance, depth, tolerance = cone.axis, mi.Float(1), mi.Float(1), mi.Float(STRAIGHT)
+    else:
+        to = dr.detach(si.p) - cone.origin
+        distance, depth = dr.norm(to), dr.dot(to, cone.axis)
+        to = to * dr.rcp(distance)
+        tolerance = STRAIGHT + cone.lens * dr.rcp(distance)
+    # A two-sided material may have flipped si.wi, so that the sign of z has no meaning
+    local, wi = dr.detach(si.sh_frame).to_local(to), dr.detach(si.wi)
+    away = mi.Vector3f(local.x + wi.x, local.y + wi.y, dr.abs(local.z) - dr.abs(wi.z))
+    return (dr.squared_norm(away) < dr.square(tolerance)) & (depth > 0), to, distance, depth
+
+
 def to_centre(cone: Cone | None, si: mi.SurfaceInteraction3f, ddx, ddy) -> mi.Vector2f:
     """Return the offset in uv from a hit to the place seen at the centre of its pixel.
 
@@ -228,13 +234,8 @@ def to_centre(cone: Cone | None, si: mi.SurfaceInteraction3f, ddx, ddy) -> mi.Ve
     """
     if cone is None or cone.corner is None:
         return mi.Vector2f(0)
-    to = dr.detach(si.p) - cone.origin
-    depth = mi.Float(1) if cone.projection == "orthographic" else dr.dot(to, cone.axis)
-    way = cone.axis if cone.projection == "orthographic" else dr.normalize(to)
-    local, wi = dr.detach(si.sh_frame).to_local(way), dr.detach(si.wi)
-    away = mi.Vector3f(local.x + wi.x, local.y + wi.y, dr.abs(local.z) - dr.abs(wi.z))
-    direct = (dr.squared_norm(away) < STRAIGHT**2) & (depth > 0)
-    place = to * dr.rcp(depth) - cone.corner
+    direct, _, _, depth = _line_of_sight(cone, si)
+    place = (dr.detach(si.p) - cone.origin) * dr.rcp(depth) - cone.corner
     steps = (dr.dot(place, v) * dr.rcp(dr.squared_norm(v)) for v in (cone.dx, cone.dy))
     x, y = (0.5 - (v - dr.floor(v)) for v in steps)
     return dr.select(direct, ddx * x + ddy * y, 0)

@@ -170,7 +170,7 @@ def register(mi, fields: dict, name: str = "test_solid") -> None:
     from mi_diffind.plugins.support.placement import Placement
 
     def make(props):
-        placement = Placement.of(props.get("to_world", mi.ScalarTransform4f()), 1.0, (0, 0, 0))
+        placement = Placement(props.get("to_world"))
         return Held(props, fields[props["field"]], placement, props.get("smooth", False))
 
     class Held(shapes.distance_shape(mi.Mesh)):
