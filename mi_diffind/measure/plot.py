@@ -20,7 +20,7 @@ from ..images import srgb
 #: Colour and marker of each representation, in order of appearance; markers differ for prints without colour.
 STYLES = (
     ("#b2182b", "o"), ("#2166ac", "s"), ("#c47a00", "D"), ("#1b7837", "^"), ("#762a83", "v"), ("#4d4d4d", "P"),
-    ("#12908e", "X"),
+    ("#12908e", "X"), ("#8c564b", "*"),
 )  # fmt: skip
 
 #: Distances from an anchor to the nearest edge of its label that are tried, in points (1/72 inch).

@@ -63,7 +63,8 @@ def write(result: dict, folder: str | os.PathLike, plan: Plan | None = None) -> 
     trainings = {name: record for name, record in result["jobs"].items() if "runs" in record}
     drawn = panels(result)
     if drawn:
-        label = result["measures"][0]["label"]
+        of_cases = {case["accuracy"] for case in result["cases"].values()}
+        label = result["measures"][0]["label"] if len(of_cases) < 2 else "PSNR, dB"
         pictures["png"] = lambda: plot.draw_panels(result["title"], drawn, label, figure_caption(result))
     if trainings:
         title = f"{result['title']}: training"

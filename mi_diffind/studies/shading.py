@@ -284,10 +284,10 @@ class ShadingContenders:
 
     # -- Registration
 
-    def add(self, label: str, kind: str, fit: Callable, read: Callable, has_file: bool = False, **details) -> Contender:
-        """Register the contender ``kind`` with a label; its model is a reader of shaded values."""
-        budget = 1 if kind == "classical" else COMPRESSION
-        job = Contender(f"{self.name}, {label}", kind, budget, fit, read, label, has_file=has_file, details=details)
+    def add(self, label: str, method: str, fit: Callable, read: Callable, has_file: bool = False) -> Contender:
+        """Register the contender of a method with a label; its model is a reader of shaded values."""
+        budget = 1 if method == "classical" else COMPRESSION
+        job = Contender(f"{self.name}, {label}", method, budget, fit, read, label, has_file=has_file)
         self.jobs[job.name] = job
         return job
 
@@ -310,10 +310,10 @@ class ShadingContenders:
         details = {"material": self.name, **self.evaluation.measure(job.model), "kind": job.method, **details}
         return {"bytes": nbytes, "details": {**details, "label": job.label}}
 
-    def add_filter(self, label: str, kind: str, nbytes: Callable[[], int], read: Callable[[], ShadedReader]) -> None:
+    def add_filter(self, label: str, method: str, nbytes: Callable[[], int], read: Callable[[], ShadedReader]) -> None:
         """Register a filter that nothing is trained for."""
         fit = lambda job, progress: self.record(job, nbytes())  # noqa: E731
-        job = self.add(label, kind, fit, lambda job: read())
+        job = self.add(label, method, fit, lambda job: read())
         self.add_candidate(job.name, label, [job], kind=label)
 
     def add_kernel(self, job: Contender, label: str = "") -> None:
@@ -321,13 +321,13 @@ class ShadingContenders:
         places = 2**10 if self.settings.quick else normals.PLACES
         name, *storage = (label or job.label).split(", ")
         label = ", ".join([*([] if name == "filtered" else [name]), "kernel", *storage])
-        kind = "classical" if job.method == "classical" else "compressed"
+        method = "classical" if job.method == "classical" else "compressed"
 
         def read() -> ShadedReader:
             biases = normals.choose_biases(job.model, self.pyramid, self.effects, places)
             return normals.biased(job.model, biases)
 
-        self.add_filter(label, kind, lambda: job.record["bytes"], read)
+        self.add_filter(label, method, lambda: job.record["bytes"], read)
 
     def last(self) -> Contender:
         """Return the contender that was registered last."""
@@ -347,7 +347,7 @@ class ShadingContenders:
         pyramids = {"filtered": lambda: pyramid, **pyramids}
         for name, make in pyramids.items():
             nbytes = lambda make=make: make().nbytes  # noqa: E731
-            self.add_filter(name, "classical", nbytes, lambda make=make: normals.reader(make(), effects))
+            self.add_filter(name, "classical", nbytes, lambda make=make: reader(make(), effects))
             self.add_kernel(self.last())
         moments = 6 * sum(v[..., 0].size for v in pyramid.values)
         self.add_filter("LEAN", "classical", lambda: pyramid.nbytes + moments, lambda: normals.lean(pyramid, effects))
@@ -357,7 +357,7 @@ class ShadingContenders:
             self.add_kernel(self.last())
         for name, make in pyramids.items() if "astc" in codecs.available() and not quick else ():
             coded = cache(partial(self.encode, make))
-            read = lambda coded=coded: normals.reader(coded()[0], effects)  # noqa: E731
+            read = lambda coded=coded: reader(coded()[0], effects)  # noqa: E731
             self.add_filter(f"{name}, ASTC", "compressed", lambda coded=coded: coded()[1], read)
             self.add_kernel(self.last())
 
@@ -400,10 +400,12 @@ class ShadingContenders:
         trained.preset, trained.seed = self.settings.preset, seed
         return trained, result
 
-    def add_trained(self, label: str, kind: str, train: Callable[[bool], tuple], **details) -> Contender:
+    def add_trained(
+        self, label: str, method: str, train: Callable[[bool], tuple], base: Contender | None = None
+    ) -> Contender:
         """Register a texture that ``train(progress)`` trains: it returns the table, the training's record, and details.
 
-        The table stays in the folder of models.
+        The table stays in the folder of models. ``base`` is the run of the same seed with λ = 0, for troubles of a run.
         """
 
         def fit(job: Contender, progress: bool) -> dict | None:
@@ -413,13 +415,16 @@ class ShadingContenders:
             save_table(job.file, table)
             training = {"steps": result.steps, "kept_step": result.step, "restarts": result.restarts,
                         "history": result.history, "training_seconds": result.seconds}  # fmt: skip
-            return self.record(job, table.nbytes, **training, **more)
+            record = self.record(job, table.nbytes, **training, **more)
+            if method in ("run", "extras"):
+                record["details"]["trouble"] = troubles(record["details"], base and base.record["details"])
+            return record
 
         def read(job: Contender) -> ShadedReader:
             texture = CompressedTexture.of(self.table(job), self.pyramid.types.TensorXf)
             return reader(texture, self.effects, frozen_decoder(self.pyramid.types))
 
-        return self.add(label, kind, fit, read, True, **details)
+        return self.add(label, method, fit, read, True)
 
     @staticmethod
     def table(job: Contender) -> Table:
@@ -470,18 +475,7 @@ class ShadingContenders:
             return table, result, details
 
         label = f"extras, seed {seed}" if extras else f"lambda {share:g}, {way}, seed {seed}"
-        job = self.add_trained(label, "extras" if extras else "run", train, share=share, way=way)
-        fit = job.fit
-
-        def fit_and_compare(job: Contender, progress: bool) -> dict | None:
-            record = fit(job, progress)
-            if record is not None:
-                before = base.record["details"] if base is not None else None
-                record["details"]["trouble"] = troubles(record["details"], before)
-            return record
-
-        job.fit = fit_and_compare
-        return job
+        return self.add_trained(label, "extras" if extras else "run", train, base)
 
     def add_runs(self) -> None:
         """Register the trainings of all seeds; without a shading loss, there is nothing to clip."""
@@ -523,7 +517,7 @@ def troubles(details: dict, base: dict | None) -> list[str]:
     losses = [h["loss"] for h in history if h["loss"] is not None and math.isfinite(h["loss"])]
     key = next((k for h in history[-1:] for k in h if k not in ("step", "loss")), None)
     values = [h[key] for h in history if math.isfinite(h[key])]
-    found = {
+    applying = {
         "diverged": not history,
         "nan": not np.isfinite(np.asarray([*numbers, psnr], float)).all(),
         "restarts": details["restarts"],
@@ -531,7 +525,7 @@ def troubles(details: dict, base: dict | None) -> list[str]:
         "drift": values and max(values) - history[-1][key] > DRIFT,
         "below": base is not None and psnr < base["C"]["mean_db"],
     }
-    return [name for name, applies in found.items() if applies]
+    return [name for name, applies in applying.items() if applies]
 
 
 # -- The plan ----------------------------------------------------------------------------------------------------------

@@ -80,11 +80,8 @@ ZOOM_SPP = 64
 #: Seed of the truth, far from those of candidates.
 TRUTH_SEED = 1 << 20
 
-#: Steps of the first training of a network.
-NETWORK_STEPS = 1000
-
-#: Steps of the longest training of a network, as a multiple.
-NETWORK_LONGEST = 16
+#: Steps of the first and of the longest training of a network.
+NETWORK_STEPS = (1000, 16000)
 
 
 def add_astc_option(parser: argparse.ArgumentParser) -> None:
@@ -148,7 +145,7 @@ class TextureStudy(Study):
             truth_spp=64 if quick else 256,  # square numbers
             seeds=1 if quick else 4,  # renders that errors are averaged over
             footprints=arguments.footprints,
-            network_steps=30 if quick else NETWORK_STEPS,  # of the first training
+            network_steps=(10, 20) if quick else NETWORK_STEPS,  # of the first and of the longest training
             only=tuple(arguments.only),
         )
         return plan(arguments.loaded, arguments.source, settings, arguments.tables)
@@ -221,16 +218,12 @@ def level_errors(truth: dict[str, list[np.ndarray]], maps: dict[str, list[np.nda
 
 @dataclass
 class TextureContenders:
-    """Contenders of a source, read from the file ``name``; scenes of the stills, and their truths, which jobs render.
-
-    ``filters`` are those of :data:`FILTERS` that a candidate has.
-    """
+    """Contenders of a source, read from the file ``name``, in the scenes of the stills."""
 
     source: Source
     name: str
     settings: SimpleNamespace
     scenes: dict[str, TextureScene] = field(default_factory=renders.still_scenes)
-    truths: dict[str, Contender] = field(default_factory=dict)
     jobs: list[Job] = field(default_factory=list)
     candidates: list[Candidate] = field(default_factory=list)
     readers: dict[str, Callable[[], TextureReader]] = field(default_factory=dict)
@@ -247,6 +240,13 @@ class TextureContenders:
     @cached_property
     def truth_levels(self) -> dict[str, list[np.ndarray]]:
         return level_images(self.pyramid)
+
+    @cached_property
+    def truths(self) -> dict[str, np.ndarray]:
+        """The converged pictures of the scenes, and of the zoom."""
+        bitmap, zoom = self.bitmap(self.settings.truth_spp, "multijitter"), self.bitmap(ZOOM_SPP, "multijitter")
+        truths = {name: self.render(bitmap, scene, TRUTH_SEED) for name, scene in self.scenes.items()}
+        return {**truths, "zoom": self.zoom.render(zoom, TRUTH_SEED >> 12)}
 
     @property
     def size(self) -> tuple[int, int]:
@@ -267,11 +267,11 @@ class TextureContenders:
         """
         errors = {}
         for name, scene in self.scenes.items():
-            counted, truth = self.counted(scene), self.truths[name].model
+            counted, truth = self.counted(scene), self.truths[name]
             each = [renders.errors(truth, self.render(reader, scene, k), counted) for k in range(self.settings.seeds)]
             errors[f"psnr_{name}_db"] = decibel(float(np.mean([e["mse"] for e in each])))
             errors[f"flip_{name}"] = float(np.mean([e["flip"] for e in each]))
-        return {**errors, **self.zoom.errors(self.zoom.render(reader), self.truths["zoom"].model)}
+        return {**errors, **self.zoom.errors(self.zoom.render(reader), self.truths["zoom"])}
 
     # -- Candidates
 
@@ -350,18 +350,6 @@ class TextureContenders:
         bitmap = {"type": "bitmap", "bitmap": data, "raw": m.color_space != "srgb"}
         return TextureReader(lambda repeats: {**bitmap, "to_uv": renders.to_uv(repeats)}, spp, sampler)
 
-    def add_truth(self, name: str, spp: int, render: Callable[[TextureReader], np.ndarray]) -> None:
-        """Register the job that renders the converged picture of a scene, or of the zoom."""
-
-        def fit(job: Contender, progress: bool) -> dict:
-            job.model = render(self.bitmap(spp, "multijitter"))
-            job.save_arrays(truth=job.model)
-            return {}
-
-        read = lambda job: equal_memory.load_arrays(job.file)["truth"]  # noqa: E731
-        self.truths[name] = Contender(f"truth, {name}", "truth", spp, fit, read)
-        self.jobs.append(self.truths[name])
-
     def record(self, method: str, budget: float, nbytes: int, seconds: float | None, maps: dict, **details) -> dict:
         """Return the record of compressed ``maps``, name → decoded levels, with the errors of levels."""
         details |= {"compression": budget, "ratio": self.source.nbytes / nbytes, "kind": method}
@@ -421,7 +409,7 @@ class TextureContenders:
 
         Its model is the pyramid of its levels, decoded. Raises ``ValueError`` if the bytes are too few.
         """
-        pyramid, steps = self.pyramid, self.settings.network_steps
+        pyramid, (first, longest) = self.pyramid, self.settings.network_steps
         net = networks.texture_network(pyramid.layout, self.source.nbytes / budget, pyramid.levels)
 
         def levels(trained) -> dict[str, list[np.ndarray]]:
@@ -430,14 +418,14 @@ class TextureContenders:
         def finish(trained, record: dict) -> dict:
             return self.record(
                 NETWORK, budget, 2 * record["entries"], sum(run["seconds"] for run in record["runs"]), levels(trained),
-                steps=record["steps"], steps_first=steps, steps_longest=NETWORK_LONGEST * steps, batch=settings.batch,
+                steps=record["steps"], steps_first=first, steps_longest=longest, batch=settings.batch,
             )  # fmt: skip
 
-        settings = FitSettings(steps=steps, batch=2**14, lr=1e-2, schedule="cosine", loss="mse", seed=1)
+        settings = FitSettings(steps=first, batch=2**14, lr=1e-2, schedule="cosine", loss="mse", seed=1)
         return NetworkContender(
             f"network {budget:g}x", NETWORK, budget, NETWORK, "", lambda net: level_pyramid(levels(net), pyramid),
-            lambda: networks.TextureNetworkProblem(net, pyramid, self.source.digest), settings, NETWORK_LONGEST * steps,
-            5, True, finish,
+            lambda: networks.TextureNetworkProblem(net, pyramid, self.source.digest), settings, longest, 5, True,
+            finish,
         )  # fmt: skip
 
 
@@ -455,9 +443,6 @@ def mipmap(model: Callable[[], Pyramid]) -> dict:
 def plan(source: Source, name: str, settings: SimpleNamespace, tables: Sequence[Table] = ()) -> Plan:
     """Return the plan for ``source``, read from the file ``name``, in the current variant; ``tables`` are trained."""
     context = TextureContenders(source, name, settings)
-    for scene_name, scene in context.scenes.items():
-        context.add_truth(scene_name, settings.truth_spp, partial(context.render, scene=scene, seed=TRUTH_SEED))
-    context.add_truth("zoom", ZOOM_SPP, lambda reader: context.zoom.render(reader, TRUTH_SEED >> 12))
     context.add_bitmaps()
     context.add_filtered("mipmap", MIPMAP, partial(mipmap, lambda: context.pyramid), bytes=context.pyramid.nbytes)
     context.add_textures(tables)
@@ -467,7 +452,7 @@ def plan(source: Source, name: str, settings: SimpleNamespace, tables: Sequence[
         candidates = [c for c in candidates if c.representation in settings.only]
         needed = {c.job for c in candidates}
         needed |= {job.details.get("equal_to") for job in jobs if job.name in needed}
-        jobs = [job for job in jobs if job.method == "truth" or job.name in needed]
+        jobs = [job for job in jobs if job.name in needed]
     note = (
         f"{name}, {source.width} × {source.height}, {len(source.maps)} map(s), of which {colour_map(source).name} is "
         "rendered. PSNR of displayed values. Bytes are those of all maps, with mip maps but for bitmaps."
@@ -553,7 +538,7 @@ def draw_crops(context: TextureContenders, result: dict):
 
     side, rows, readers = max(8, context.settings.film[1] * 2 // 5), {}, shown_readers(context, result)
     for name, scene in context.scenes.items():
-        truth = context.truths[name].model
+        truth = context.truths[name]
         images = {
             f"{reader}\n{result['candidates'][reader]['errors'][f'psnr_{name}_db']:.1f} dB":
             context.render(read, scene) for reader, read in readers.items()
@@ -570,7 +555,7 @@ def draw_crops(context: TextureContenders, result: dict):
 def draw_zoom(context: TextureContenders, result: dict):
     """Draw frames of the zoom, by each of the readers and of the truth."""
     strips = {name: context.zoom.render(reader) for name, reader in shown_readers(context, result).items()}
-    rows = context.zoom.rows({**strips, "truth": context.truths["zoom"].model})
+    rows = context.zoom.rows({**strips, "truth": context.truths["zoom"]})
     title = f"{result['title']}: a zoom of {context.zoom.frames} frames"
     return plot.draw_images(title, figure_caption(result), rows, 2.0)
 
