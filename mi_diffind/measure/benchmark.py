@@ -10,6 +10,7 @@ candidates is the median of the ratios of the rounds.
 from __future__ import annotations
 
 import functools
+import json
 import math
 import os
 import pickle
@@ -21,6 +22,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import drjit as dr
+import mitsuba as mi
 from tqdm import tqdm
 
 from ..core.jobs import run_jobs
@@ -29,7 +31,7 @@ from ..core.runtime import use_variant
 from .clock import count_query, machine, timed, total
 from .statistics import pareto, ratio, spread, timing
 from .store import Store, fingerprint, models_folder, sources
-from .study import FLOOR, PASS, PASS_WALL, Case, Plan, in_competition
+from .study import FLOOR, PASS, Case, Plan, in_competition
 
 #: Times that differ by a smaller factor count as equal on the Pareto front.
 SAME_TIME = 1.05
@@ -48,10 +50,10 @@ class BenchmarkSettings:
     quick: bool = False
 
     @classmethod
-    def choose(cls, variant: str, quick: bool = False) -> BenchmarkSettings:
-        """Return settings for this machine: enough lanes that each core, or the GPU, gets several blocks of them."""
+    def choose(cls, quick: bool = False) -> BenchmarkSettings:
+        """Return settings for this machine and variant: each core, or the GPU, gets several blocks of lanes."""
         blocks = 2 ** math.ceil(math.log2(max(dr.thread_count(), 2)))
-        lanes = 2**22 if variant.startswith("cuda") else blocks * 2**16
+        lanes = 2**22 if mi.variant().startswith("cuda") else blocks * 2**16
         return cls(lanes // 4, 3, 2, 2**17, True) if quick else cls(lanes)
 
 
@@ -108,29 +110,27 @@ def measure(
     """
     key = {
         "settings": asdict(settings),
-        "machine": machine(plan.variant),
+        "machine": machine(mi.variant()),
         "sources": fingerprint(sources()),
         "details": plan.details,
         "candidates": [c.name for c in plan.candidates],
         "cases": [c.name for c in plan.cases],
     }
-    store = Store(folder, plan.study, key, SECTIONS, progress)
-    interrupted, cases = False, [plan.resolved(case) for case in plan.cases]
+    store, interrupted = Store(folder, plan.study, key, SECTIONS, progress), False
     with interruptible() as stop:
         steps = BenchmarkSteps(plan, settings, store, stop, progress)
         try:
             steps.jobs(workers)
-            with steps.bar(cases):
-                steps.errors()
-                for case in cases:
-                    steps.queries(case)
-                    if case.passes is not None:
-                        steps.passes(case)
+            steps.errors()
+            for case in plan.cases:
+                steps.queries(case)
+                if case.passes is not None:
+                    steps.passes(case)
         except Stopped:
             interrupted = True
         finally:
             store.save()
-    result = {
+    return {
         "task": plan.study,
         "title": plan.title,
         "interrupted": interrupted,
@@ -138,14 +138,10 @@ def measure(
         "machine": key["machine"],
         "date": time.strftime("%Y-%m-%d"),
         "settings": asdict(settings),
-        **{name: getattr(plan, name) for name in ("accuracy", "accuracy_label", "panels", "bytes_by_case", "details")},
-        "notes": list(plan.notes),
-        "sampled": plan.sampled,
         "measures": [asdict(measure) for measure in plan.measures],
-        **_assemble(plan, cases, settings, store.data),
+        **{name: getattr(plan, name) for name in ("panels", "details", "notes")},
+        **_assemble(plan, settings, store.data),
     }
-    result["conclusions"] = plan.conclusions(result)
-    return result
 
 
 class BenchmarkSteps:
@@ -153,27 +149,15 @@ class BenchmarkSteps:
 
     def __init__(self, plan: Plan, settings: BenchmarkSettings, store: Store, stop: threading.Event, progress: bool):
         self.plan, self.settings, self.store, self.stop, self.progress = plan, settings, store, stop, progress
+        self.operations = {c.name: c.operations for c in plan.candidates}
 
-    def bar(self, cases: list[Case]) -> tqdm:
-        """Return the progress bar of all steps after the jobs; a unit is a kernel, an error or a pass."""
-        units = sum(c.errors is not None for c in self.plan.candidates)
-        for case in cases:
-            units += len(self._kernels(case)) * (1 + self.settings.rounds)
-            units += len(self._in_passes(case)) * (1 + self.settings.passes)
+    def _bar(self, title: str, total: int) -> tqdm:
+        """Return a progress bar; :meth:`_tick` after each of its steps."""
         disable = None if self.progress else True
-        self._bar = tqdm(total=units, desc="measure", unit="step", smoothing=0.02, disable=disable)
-        return self._bar
+        return tqdm(total=total, desc=title, unit="step", smoothing=0.02, disable=disable)
 
-    def _kernels(self, case: Case) -> list[tuple[str, str]]:
-        return [(q, name) for q in case.query_names for name in (FLOOR, *self.plan.takers(case, q))]
-
-    def _in_passes(self, case: Case) -> list[str]:
-        if case.passes is None:
-            return []
-        return [c.name for c in self.plan.candidates if c.in_passes and c.name in case.candidates]
-
-    def _tick(self) -> None:
-        self._bar.update(1)
+    def _tick(self, bar: tqdm) -> None:
+        bar.update(1)
         if self.stop.is_set():
             raise Stopped
 
@@ -182,7 +166,8 @@ class BenchmarkSteps:
         plan, done = self.plan, self.store.data["jobs"]
         folder = None
         if self.store.folder is not None and plan.jobs:
-            folder = models_folder(self.store.folder, plan.study, plan.jobs_fingerprint)
+            key = f"{plan.jobs_fingerprint} {json.dumps(self.store.key['details'])} {self.settings.quick}"
+            folder = models_folder(self.store.folder, plan.study, key)
         if workers is not None and folder is not None:
             self._separate_jobs(workers, folder)
         for i, job in enumerate(plan.jobs):
@@ -202,7 +187,7 @@ class BenchmarkSteps:
         done = self.store.data["jobs"]
         plan, path = pickle.dumps(workers.plan), str(folder.resolve())
         todo = {
-            job.name: (plan, job.name, path, self.plan.variant)
+            job.name: (plan, job.name, path, mi.variant())
             for job in self.plan.jobs
             if job.separable and job.cached_record(folder, done.get(job.name)) is None
         }
@@ -217,73 +202,69 @@ class BenchmarkSteps:
             raise Stopped
 
     def errors(self) -> None:
+        """Measure the errors of the candidates that have a function for them."""
         done = self.store.data["errors"]
-        for candidate in self.plan.candidates:
-            if candidate.errors is None:
-                continue
-            if candidate.name not in done:
+        todo = [c for c in self.plan.candidates if c.errors is not None and c.name not in done]
+        with self._bar("errors", len(todo)) as bar:
+            for candidate in todo:
                 done[candidate.name] = candidate.errors(self.settings.samples)
                 self.store.save(5)
-            self._tick()
+                self._tick(bar)
 
     def queries(self, case: Case) -> None:
         """Count operations, which compiles the kernels, then time the queries in rounds."""
-        known_operations = {c.name: c.operations for c in self.plan.candidates}
-        operations = self.store.data["operations"].setdefault(case.name, {})
         times = self.store.data["queries"].setdefault(case.name, [])
         if len(times) >= self.settings.rounds:
-            self._bar.update(len(self._kernels(case)) * (1 + self.settings.rounds))
             return
-        functions = case.queries(self.settings.lanes)
-        flat = {(q, name): functions[q][name] for q, name in self._kernels(case)}
-        for (query, name), function in flat.items():
-            counted = operations.setdefault(query, {})
+        functions = {
+            (query, name): function
+            for query, by_name in case.queries(self.settings.lanes).items()
+            for name, function in by_name.items()
+            if name == FLOOR or name in self.operations
+        }
+        operations = self.store.data["operations"].setdefault(case.name, {})
+
+        def compiled(key) -> None:
+            query, name = key
+            counted, known = operations.setdefault(query, {}), self.operations.get(name)
             if name not in counted:
-                in_kernel = count_query(function)
-                known = known_operations.get(name)
+                in_kernel = count_query(functions[key])
                 counted[name] = (known(query) if known else in_kernel).asdict()
-            self._tick()
 
         def seconds(key) -> float:
-            return timed(lambda: total(flat[key]())[0]).seconds
+            return timed(lambda: total(functions[key]())[0]).seconds
 
-        self._rounds(times, list(flat), self.settings.rounds, seconds)
+        self._rounds(case.name, times, list(functions), self.settings.rounds, compiled, seconds)
 
     def passes(self, case: Case) -> None:
         """Time whole passes in rounds, after a first pass of each candidate that compiles it."""
-        names = self._in_passes(case)
         times = self.store.data["passes"].setdefault(case.name, [])
         if len(times) >= self.settings.passes:
-            self._bar.update(len(names) * (1 + self.settings.passes))
             return
-        functions = case.passes()
-        for name in names:
-            timed(lambda f=functions[name]: f(0))
-            self._tick()
+        functions = {(PASS, name): f for name, f in case.passes().items() if name in self.operations}
 
-        def seconds(key) -> float:
-            one_pass = timed(lambda: functions[key[1]](1 + len(times)))
-            walls[key[1]] = one_pass.seconds_wall
-            return one_pass.seconds
+        def seconds(key, number: int | None = None) -> float:
+            return timed(lambda: functions[key](1 + len(times) if number is None else number)).seconds
 
-        walls: dict[str, float] = {}
-        self._rounds(times, [(PASS, name) for name in names], self.settings.passes, seconds, walls)
+        title = f"{case.name}, {PASS}"
+        self._rounds(title, times, list(functions), self.settings.passes, lambda key: seconds(key, 0), seconds)
 
-    def _rounds(self, times: list, keys: list, number: int, seconds, walls: dict | None = None) -> None:
+    def _rounds(self, title: str, times: list, keys: list, number: int, compiled, seconds) -> None:
         """Append the missing rounds to ``times``: query → name → seconds; every other round runs backwards."""
-        self._bar.update(len(keys) * len(times))
-        while len(times) < number:
-            this_round: dict[str, dict[str, float]] = {}
-            for key in keys if len(times) % 2 == 0 else reversed(keys):
-                this_round.setdefault(key[0], {})[key[1]] = seconds(key)
-                self._tick()
-            if walls:
-                this_round[PASS_WALL] = dict(walls)
-            times.append(this_round)
-            self.store.save(5)
+        with self._bar(title, len(keys) * (1 + number - len(times))) as bar:
+            for key in keys:
+                compiled(key)
+                self._tick(bar)
+            while len(times) < number:
+                this_round: dict[str, dict[str, float]] = {}
+                for key in keys if len(times) % 2 == 0 else reversed(keys):
+                    this_round.setdefault(key[0], {})[key[1]] = seconds(key)
+                    self._tick(bar)
+                times.append(this_round)
+                self.store.save(5)
 
 
-def _assemble(plan: Plan, cases: list[Case], settings: BenchmarkSettings, data: dict) -> dict:
+def _assemble(plan: Plan, settings: BenchmarkSettings, data: dict) -> dict:
     candidates, records = {}, data["jobs"]
     for c in plan.candidates:
         record = records.get(c.job, {})
@@ -291,22 +272,22 @@ def _assemble(plan: Plan, cases: list[Case], settings: BenchmarkSettings, data: 
             continue  # its job has not run yet
         candidates[c.name] = {
             **{k: getattr(c, k) for k in ("representation", "setting", "job", "is_truth", "is_reference", "competes")},
-            **{"label": c.label or c.name, "in_picture": c.in_picture, "note": c.note},
+            **{"label": c.label or c.name, "in_picture": c.in_picture},
             "bytes": record.get("bytes", c.bytes),
-            "training_seconds": record.get("seconds") if c.job else c.training_seconds,
+            "training_seconds": record.get("seconds"),
             "converged": record.get("converged"),
             "details": {**c.details, **record.get("details", {})},
             "errors": {**record.get("errors", {}), **data["errors"].get(c.name, {})},
         }
     measured_cases = {}
-    for case in cases:
+    for case in plan.cases:
         rounds, passes = data["queries"].get(case.name, []), data["passes"].get(case.name, [])
         if not rounds:
             continue
-        accuracy = case.accuracy or plan.accuracy
+        accuracy = case.accuracy or plan.measures[0].key
         measured = {"details": case.details, "in_picture": case.in_picture, "accuracy": accuracy,
-                 "of_passes": case.of_passes, "queries": {}, "passes": {}, "ratios": {}}  # fmt: skip
-        for query in case.query_names:
+                    "of_passes": case.of_passes, "queries": {}, "passes": {}, "ratios": {}}  # fmt: skip
+        for query in data["operations"][case.name]:
             ns = _by_name(rounds, query, 1e9 / settings.lanes)
             floor = spread(ns.pop(FLOOR))["median"]
             counted = data["operations"][case.name][query]
@@ -315,12 +296,12 @@ def _assemble(plan: Plan, cases: list[Case], settings: BenchmarkSettings, data: 
             }
             _mark_front(measured["queries"][query], candidates, accuracy)
             measured["ratios"][query] = _ratios(plan.ratios, ns, floor)
-        for query in (PASS, PASS_WALL) if passes else ():
-            ms = _by_name(passes, query, 1e3)
-            measured["passes"][query] = {name: timing(values) for name, values in ms.items()}
+        if passes:
+            ms = _by_name(passes, PASS, 1e3)
+            measured["passes"][PASS] = {name: timing(values) for name, values in ms.items()}
             if case.of_passes:
-                _mark_front(measured["passes"][query], candidates, accuracy)
-            measured["ratios"][query] = _ratios(plan.ratios, ms, 0.0)
+                _mark_front(measured["passes"][PASS], candidates, accuracy)
+            measured["ratios"][PASS] = _ratios(plan.ratios, ms, 0.0)
         measured_cases[case.name] = measured
     in_order = {job.name: records[job.name] for job in plan.jobs if job.name in records}
     return {"candidates": candidates, "cases": measured_cases, "jobs": in_order}

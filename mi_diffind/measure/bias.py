@@ -8,27 +8,19 @@ Noise is that of the samples, which more time reduces; bias is that of the appro
 
 where ``m`` is the brightness around the pixel, a mean over 5 × 5 pixels of an exact pass that is used for nothing
 else. The denominator depends on none of the compared images, and nothing is clipped, so squares add up exactly:
-E[mse] = bias² + noise², and for independent samples noise² = σ² / spp. (A denominator made of the truth itself would
-be large where the noise of the truth is positive, and hide a part of the noise.) The PSNR of
-:mod:`.metrics` clips to [0, 1]; a clipped noisy image has another mean, so PSNR does not add up. It is given
-as well; the PSNR of the bias uses values of the truth up to 1, where clipping changes nothing. A dark pixel that one
-rare bright path hits may outweigh all others: errors are those of several images with different seeds, given as median
-and quartiles. The median of few samples therefore tends to be below the noise σ² / spp, which is a mean.
+E[mse] = bias² + noise², and for independent samples noise² = σ² / spp. A PSNR clips to [0, 1]; a clipped noisy image
+has another mean, so it does not add up.
 
-*The truth* is the mean of all exact passes at the highest sample count. They are independent, so their scatter gives
-the noise of the truth, which is subtracted: E|a − r|² = bias² + noise² of ``a`` + noise² of ``r``. The passes are also
-the images at that count; each is measured against the mean of the others, so no image is compared with its own seeds.
+*The truth* is the mean of all exact passes at the highest sample count. Their scatter gives the noise of the truth,
+which is subtracted. Each of these passes is measured against the mean of the others.
 
-*The bias* is measured with common random numbers. Each exact pass has a learned twin with the same seed; most of the
-noise is in both, and not in their difference ``d``. Of K independent differences, the mean of the scalar products
-⟨dᵢ, dⱼ⟩ of all pairs i ≠ j is an unbiased estimate of bias²: the noise of two passes is uncorrelated. It may be
-negative where there is no bias. Its standard error is the jackknife's (Efron and Stein 1981: on average not smaller
-than the true one, and about 1.5 times as large where there is no bias). A bias counts as measured from two standard
-errors on.
+*The bias* is measured with common random numbers: each exact pass has a learned twin with the same seed, and most of
+the noise is not in their difference ``d``. Of K independent differences, the mean of the scalar products ⟨dᵢ, dⱼ⟩ of
+all pairs i ≠ j is an unbiased estimate of bias², which may be negative. Its standard error is the jackknife's (Efron
+and Stein 1981: on average not smaller than the true one). A bias counts as measured from two standard errors on.
 
-*The crossover* is the sample count at which the noise of the learned render, σ² / spp, equals bias²; σ² is the scatter
-of its passes, and the law σ² / spp is that of independent samples (stratified ones do better). Beyond the counts that
-were rendered, it is extrapolated, as is its time.
+*The crossover* is the sample count at which the noise of the learned render, σ² / spp, equals bias². Beyond the counts
+that were rendered, it is extrapolated, as is its time.
 """
 
 from __future__ import annotations
@@ -38,12 +30,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import uniform_filter
 
 #: Added to the square of the brightness in the denominator of the error: linear values, 1 is white.
 EPSILON = 0.01
 
-#: The brightness is a mean over the pixels at most so far away in x and in y.
-RADIUS = 2
+#: Pixels along a side of the square that the brightness is a mean of.
+SIDE = 5
 
 #: Standard errors above zero from which a bias counts as measured; otherwise they bound it.
 CONFIDENCE = 2.0
@@ -99,22 +92,15 @@ def estimate(images: Sequence[np.ndarray], weights: np.ndarray | float = 1.0) ->
     return Estimate(float(square), error, float(gram.diagonal().mean() - square))
 
 
-def weights_of(image: np.ndarray) -> np.ndarray:
+def relative_weights(image: np.ndarray) -> np.ndarray:
     """Return the weights of the relative error, 1 / (m² + 0.01), of a linear ``image`` ``(height, width, channels)``.
 
     m is the mean of the image over 5 × 5 pixels, at its edges over those that exist.
     """
-    sums, number = image.astype(np.float64), np.ones(image.shape)
-    for axis in (0, 1):
-        sums, number = (_along(v, axis) for v in (sums, number))
+    sums, number = (
+        uniform_filter(v, (SIDE, SIDE, 0), mode="constant") for v in (image.astype(np.float64), np.ones(image.shape))
+    )
     return 1 / ((sums / number) ** 2 + EPSILON)
-
-
-def _along(values: np.ndarray, axis: int) -> np.ndarray:
-    """Return sums over the neighbours along an axis."""
-    width = [(RADIUS, RADIUS) if k == axis else (0, 0) for k in range(values.ndim)]
-    windows = np.lib.stride_tricks.sliding_window_view(np.pad(values, width), 2 * RADIUS + 1, axis)
-    return windows.sum(axis=-1)
 
 
 def error(image: np.ndarray, truth: np.ndarray, weights: np.ndarray, truth_noise: float) -> float:
@@ -125,18 +111,13 @@ def error(image: np.ndarray, truth: np.ndarray, weights: np.ndarray, truth_noise
     return float(np.mean(weights * (image.astype(np.float64) - truth) ** 2)) - truth_noise
 
 
-def root(square: float) -> float:
-    """Return the root of an estimate of a square, 0 if the estimate is negative."""
-    return math.sqrt(max(square, 0.0))
-
-
 def describe(relative: Estimate, displayed: Estimate) -> dict:
     """Return the bias as numbers, from estimates with relative weights and with those of displayed values.
 
-    ``measured`` (whether it differs from zero), ``mse`` (may be negative), ``mse_standard_error``; ``rmse`` and
-    ``rmse_standard_error``, or the bound ``rmse_below``; ``psnr_db``, or the bound ``psnr_db_above``.
+    ``measured`` (whether it differs from zero), ``mse`` (may be negative); ``rmse`` and ``rmse_standard_error``, or the
+    bound ``rmse_below``; ``psnr_db``, or the bound ``psnr_db_above``.
     """
-    bias = {"measured": relative.measured, "mse": relative.square, "mse_standard_error": relative.standard_error}
+    bias = {"measured": relative.measured, "mse": relative.square}
     if relative.measured:
         rmse = math.sqrt(relative.square)
         bias |= {"rmse": rmse, "rmse_standard_error": relative.standard_error / (2 * rmse)}
@@ -149,25 +130,20 @@ def describe(relative: Estimate, displayed: Estimate) -> dict:
     return bias
 
 
-def crossover(bias: Estimate, noise_of_a_sample: float, points: list[dict]) -> dict:
+def crossover(bias: Estimate, noise_of_a_sample: float, seconds: dict[int, float]) -> dict:
     """Return the sample count at which the noise of the learned render equals the bias.
 
-    ``spp`` with ``spp_low`` and ``spp_high`` (two standard errors), ``seconds``, ``seconds_wall``, ``extrapolated``; if
-    no bias was measured, only ``spp_above``. ``points`` are dictionaries with ``version``, ``spp``, ``timed``,
-    ``seconds`` and ``seconds_wall``, by ascending ``spp``.
+    ``spp`` with ``spp_low`` and ``spp_high`` (two standard errors), and its ``seconds``, from those of measured counts;
+    if no bias was measured, only ``spp_above``.
     """
     if not bias.measured:
         return {"spp_above": noise_of_a_sample / bias.bound if bias.bound else math.inf}
     margin = CONFIDENCE * bias.standard_error
     spp, low, high = (noise_of_a_sample / (bias.square + shift) for shift in (0, margin, -margin))
-    result = {"spp": spp, "spp_low": low, "spp_high": high, "extrapolated": spp > points[-1]["spp"]}
-    for clock in ("seconds", "seconds_wall"):
-        seconds = {p["spp"]: p[clock] for p in points if p["version"] == "learned" and p["timed"]}
-        result[clock] = seconds_of(spp, seconds)
-    return result
+    return {"spp": spp, "spp_low": low, "spp_high": high, "seconds": seconds_at(spp, seconds)}
 
 
-def seconds_of(spp: float, seconds: dict[int, float]) -> float | None:
+def seconds_at(spp: float, seconds: dict[int, float]) -> float | None:
     """Return the time of a render of ``spp`` samples per pixel, from measured times (count → seconds).
 
     Linear between them, and beyond with the slope from the first to the last; ``None`` below the first or without any.

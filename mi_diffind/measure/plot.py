@@ -20,7 +20,7 @@ from ..images import srgb
 #: Colour and marker of each representation, in order of appearance; markers differ for prints without colour.
 STYLES = (
     ("#b2182b", "o"), ("#2166ac", "s"), ("#c47a00", "D"), ("#1b7837", "^"), ("#762a83", "v"), ("#4d4d4d", "P"),
-    ("#12908e", "X"),
+    ("#12908e", "X"), ("#8c564b", "*"),
 )  # fmt: skip
 
 #: Distances from an anchor to the nearest edge of its label that are tried, in points (1/72 inch).
@@ -268,12 +268,13 @@ def _overlap(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 
 def draw_curves(
-    title: str, caption: str, panels: Mapping[str, Sequence[Curve]], x_label: str, y_label: str, log: bool = False,
+    title: str, caption: str, panels: Mapping[str, Sequence[Curve]], x_label: str, y_label: str, log: str = "",
     ticks: Sequence[str] = (), columns: int = 2, height: float = 3.6,
 ):  # fmt: skip
     """Return a Matplotlib figure with a panel of curves for each title; the first has a legend.
 
-    There are up to ``columns`` panels a row. The x axis is logarithmic if ``log``; ``ticks`` are labels at 0, 1, 2, …
+    There are up to ``columns`` panels a row. The axes in ``log`` (``"x"``, ``"xy"``) are logarithmic; ``ticks`` are
+    labels at 0, 1, 2, …
     """
     columns = min(columns, len(panels))
     rows = -(-len(panels) // columns)
@@ -282,13 +283,18 @@ def draw_curves(
         axes = plot.add_subplot(rows, columns, k + 1)
         for i, curve in enumerate(curves):
             colour, marker = STYLES[i % len(STYLES)]
-            bars = None if curve.low is None else [np.subtract(curve.y, curve.low), np.subtract(curve.high, curve.y)]
+            bars = (
+                None
+                if curve.low is None
+                else np.maximum([np.subtract(curve.y, curve.low), np.subtract(curve.high, curve.y)], 0)
+            )
             style = {"color": colour, "marker": marker, "markersize": 4, "linewidth": 1.1, "capsize": 2, **curve.style}
             axes.errorbar(curve.x, curve.y, bars, label=curve.label, **style)
         axes.set_title(name, fontsize=9)
-        if log:
-            axes.set_xscale("log")
-            log_ticks(axes.xaxis, *axes.get_xlim())
+        for name, axis, limits in (("x", axes.xaxis, axes.get_xlim), ("y", axes.yaxis, axes.get_ylim)):
+            if name in log:
+                axes.set(**{f"{name}scale": "log"})
+                log_ticks(axis, *limits())
         if ticks:
             axes.set_xticks(range(len(ticks)), ticks)
         finish(axes, x_label, y_label)
@@ -314,7 +320,7 @@ def draw_training_curves(title: str, records: dict[str, dict], caption: str):
             for i, run in enumerate(runs)
         ]  # fmt: skip
     about = "PSNR in dB over training steps; each line is a separate run, twice as long as the previous one."
-    return draw_curves(title, f"{about} {caption}", panels, "training steps", "PSNR, dB", True, columns=4, height=2.6)
+    return draw_curves(title, f"{about} {caption}", panels, "training steps", "PSNR, dB", "x", columns=4, height=2.6)
 
 
 # -- Pictures ----------------------------------------------------------------------------------------------------------

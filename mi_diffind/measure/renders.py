@@ -8,6 +8,7 @@ pixel, so that a scene means the same for textures and images of any size.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -334,8 +335,10 @@ def directions(lanes: int, seed: int = 7):
     return si, wo, sample1, sample2
 
 
-def bsdf_queries(bsdfs: dict[str, object], inputs: tuple, textured: bool) -> dict[str, dict]:
-    """Return query (:data:`QUERIES`, ``eval_pdf``) → name of a BSDF → function.
+def bsdf_queries(
+    bsdfs: dict[str, object], inputs: tuple, textured: bool, queries: Sequence[str] = QUERIES
+) -> dict[str, dict]:
+    """Return query (one of ``eval``, ``sample``, ``pdf``, ``eval_pdf``) → name of a BSDF → function.
 
     ``inputs`` are those of :func:`directions`. The floor has the same inputs, ``uv`` among them if the materials are
     ``textured``.
@@ -349,18 +352,22 @@ def bsdf_queries(bsdfs: dict[str, object], inputs: tuple, textured: bool) -> dic
         "pdf": [si.wi, wo, *uv],
     }
     floors["eval_pdf"] = floors["eval"]
-    queries = {query: {FLOOR: lambda values=values: values} for query, values in floors.items()}
 
     def sample(bsdf):
         bs, weight = bsdf.sample(context, si, sample1, sample2)
         return [bs.wo, bs.pdf, mi.Float(bs.sampled_component), weight]
 
-    for name, bsdf in bsdfs.items():
-        queries["eval"][name] = lambda b=bsdf: b.eval(context, si, wo)
-        queries["eval_pdf"][name] = lambda b=bsdf: list(b.eval_pdf(context, si, wo))
-        queries["sample"][name] = lambda b=bsdf: sample(b)
-        queries["pdf"][name] = lambda b=bsdf: b.pdf(context, si, wo)
-    return queries
+    functions = {
+        "eval": lambda b: b.eval(context, si, wo),
+        "eval_pdf": lambda b: list(b.eval_pdf(context, si, wo)),
+        "sample": sample,
+        "pdf": lambda b: b.pdf(context, si, wo),
+    }
+    return {
+        query: {FLOOR: lambda values=floors[query]: values}
+        | {name: functools.partial(functions[query], bsdf) for name, bsdf in bsdfs.items()}
+        for query in queries
+    }
 
 
 def noise_texture(values: Sequence[float], rng: np.random.Generator) -> dict:

@@ -12,15 +12,7 @@ from ..core.files import replacing, writable_folder, write_json
 from . import plot
 from .statistics import finite, pareto
 from .store import Store
-from .study import PASS, Measure, Plan, Tradeoff, in_competition
-
-#: Columns of the table before those of errors and of the candidates' details.
-COLUMNS = (
-    *("task", "case", "query", "candidate", "representation", "setting"),
-    *("unit", "time", "time_q1", "time_q3", "time_with_floor", "floor", "hidden", "rounds"),
-    *("reads", "bytes_gathered", "add", "mul", "div", "sqrt", "log", "flops", "instructions"),
-    *("bytes", "training_seconds", "converged", "on_front", "note"),
-)
+from .study import PASS, Plan, Tradeoff, in_competition
 
 #: Quantities beside time that accuracy may be drawn against: the label of the axis, and the title of the panel.
 QUANTITIES = {"bytes": ("bytes", "bytes"), "training_seconds": ("seconds of training", "training")}
@@ -31,12 +23,7 @@ OURS = ("ours", "indirection")
 
 
 def write_files(
-    name: str,
-    folder: str | os.PathLike,
-    result: dict,
-    rows: list[dict],
-    columns: Iterable[str],
-    pictures: dict[str, Callable[[], object]],
+    name: str, folder: str | os.PathLike, result: dict, rows: list[dict], pictures: dict[str, Callable[[], object]]
 ) -> dict[str, str]:
     """Write ``tradeoff_NAME.csv`` (``rows``), ``.json`` (``result``) and pictures, and return the paths.
 
@@ -47,7 +34,7 @@ def write_files(
     folder = writable_folder(folder, create=True)
     start = str(folder / f"tradeoff_{name}")
     text = io.StringIO()
-    writer = csv.DictWriter(text, list(columns), lineterminator="\n")
+    writer = csv.DictWriter(text, list(dict.fromkeys(key for row in rows for key in row)), lineterminator="\n")
     writer.writeheader()
     writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows)
     with replacing(f"{start}.csv") as temporary:
@@ -72,51 +59,41 @@ def write(result: dict, folder: str | os.PathLike, plan: Plan | None = None) -> 
 
     The pictures are the panels, training curves, and those of the ``plan`` if the run is complete.
     """
-    table, pictures = rows(result), {}
+    pictures = {}
     trainings = {name: record for name, record in result["jobs"].items() if "runs" in record}
     drawn = panels(result)
     if drawn:
-        pictures["png"] = lambda: plot.draw_panels(result["title"], drawn, result["accuracy_label"], caption(result))
+        of_cases = {case["accuracy"] for case in result["cases"].values()}
+        label = result["measures"][0]["label"] if len(of_cases) < 2 else "PSNR, dB"
+        pictures["png"] = lambda: plot.draw_panels(result["title"], drawn, label, figure_caption(result))
     if trainings:
         title = f"{result['title']}: training"
-        pictures["training"] = lambda: plot.draw_training_curves(title, trainings, machine_line(result))
+        pictures["training"] = lambda: plot.draw_training_curves(title, trainings, figure_caption(result))
     if plan is not None and not result["interrupted"]:
         pictures |= {word: (lambda draw=draw: draw(result)) for word, draw in plan.pictures.items()}
-    names = dict.fromkeys(name for row in table for name in row if name not in COLUMNS)
-    return write_files(result["task"], folder, result, table, (*COLUMNS, *names), pictures)
+    return write_files(result["task"], folder, result, rows(result), pictures)
 
 
 def rows(result: dict) -> list[dict]:
     """Return the result as rows of a table: one for each case, query (or whole pass) and candidate.
 
-    Candidates of no case have one row. The columns are :data:`COLUMNS`, one for each error and one for each number or
-    text among the details of candidates. ``time`` is in ``unit``, floor subtracted (``hidden``: it is only a bound).
+    Candidates of no case have one row. The columns are those of times and operations in the result, one for each error
+    and one for each number or text among the details of candidates.
     """
-    table, timed = [], set()
+    table, rest = [], dict.fromkeys(result["candidates"])
     for case, measured in result["cases"].items():
         for query, timings in {**measured["queries"], **measured["passes"]}.items():
-            whole = query in measured["passes"]
             for name, t in timings.items():
-                operations = dict(t.get("operations", {}))
-                if operations:
-                    operations = {"reads": operations.pop("gathers"), **operations}
-                timed.add(name)
-                table.append({
-                    **{"task": result["task"], "case": case, "query": query, **_candidate_cells(result, name)},
-                    "unit": "ms a pass" if whole else "ns",
-                    **{"time": t["time"], "time_q1": t["q1"], "time_q3": t["q3"], "time_with_floor": t["with_floor"]},
-                    "floor": None if whole else t["floor"],
-                    **{k: t[k] for k in ("hidden", "rounds")},
-                    "on_front": t.get("on_front"),
-                    **operations,
-                })  # fmt: skip
-    others = [name for name in result["candidates"] if name not in timed]
-    return table + [{"task": result["task"], **_candidate_cells(result, name)} for name in others]
+                rest.pop(name, None)
+                times = {key: value for key, value in t.items() if key != "operations"} | t.get("operations", {})
+                unit = "ms" if query in measured["passes"] else "ns"
+                table.append({"case": case, "query": query, **_cells(result, name), "unit": unit, **times})
+    return table + [{"case": "", "query": "", **_cells(result, name)} for name in rest]
 
 
-def _candidate_cells(result: dict, name: str) -> dict:
+def _cells(result: dict, name: str) -> dict:
     c = result["candidates"][name]
-    cells = {k: c[k] for k in ("representation", "setting", "bytes", "note", "training_seconds", "converged")}
+    cells = {k: c[k] for k in ("representation", "setting", "bytes", "training_seconds", "converged")}
     details = {k: v for k, v in c["details"].items() if isinstance(v, (int, float, str))}
     return {"candidate": name, **cells, **c["errors"], **details}
 
@@ -125,17 +102,23 @@ def panels(result: dict) -> list[plot.Panel]:
     """Return the panels of a result: accuracy against the plan's quantities, then against time, one panel a case.
 
     Times are those of the first query, or of a pass. Candidates have labels and quartiles, references vertical lines.
+    If the cases have different candidates, each has its own panel of bytes.
     """
-    candidates = list(result["candidates"].values())
-    drawn = [_against(quantity, candidates, result, QUANTITIES[quantity][1]) for quantity in result["panels"]]
+    candidates, cases, drawn = result["candidates"], [], []
     for case, measured in result["cases"].items():
-        if not measured["in_picture"]:
-            continue
-        of_passes, accuracy = bool(measured.get("of_passes")), measured.get("accuracy") or result["accuracy"]
-        query, timings = next(iter(measured["passes" if of_passes else "queries"].items()), ("", {}))
+        if measured["in_picture"]:
+            timings = next(iter(measured["passes" if measured["of_passes"] else "queries"].values()), {})
+            cases.append((case, measured, timings))
+    several = len({frozenset(timings) for _, _, timings in cases}) > 1
+    for quantity in result["panels"]:
+        if quantity != "bytes" or not several:
+            drawn.append(_against(quantity, candidates.values(), result, QUANTITIES[quantity][1]))
+    for case, measured, timings in cases:
+        of_passes, accuracy = measured["of_passes"], measured["accuracy"]
+        query = next(iter(measured["queries"]))
         points, lines = [], []
         for name, t in timings.items():
-            c = result["candidates"][name]
+            c = candidates[name]
             if of_passes and not c["in_picture"]:
                 continue
             if c["is_truth"] or c["is_reference"]:
@@ -143,49 +126,38 @@ def panels(result: dict) -> list[plot.Panel]:
                 lines.append(plot.Line(label, t["time"], c["is_truth"]))
             elif accuracy in c["errors"]:
                 points.append(_point(c, accuracy, t["time"], t["q1"], t["q3"], bool(t["on_front"])))
-        drawn.append(plot.Panel(case, f"time of one {query}, {'ms' if of_passes else 'ns'}", points, lines))
-        if result["bytes_by_case"]:
-            drawn.append(_against("bytes", [result["candidates"][name] for name in timings], result, case))
-    return [panel for panel in drawn if panel.points or panel.lines]
+        unit = f"{PASS}, ms" if of_passes else f"{query}, ns"
+        drawn.append(plot.Panel(case, f"time of one {unit}", points, lines))
+        if several and "bytes" in result["panels"]:
+            drawn.append(_against("bytes", [candidates[name] for name in timings], result, case))
+    return [panel for panel in drawn if len(panel.points) > 1 or panel.lines]
 
 
 def _point(c: dict, accuracy: str, x: float, low: float, high: float, on_front: bool) -> plot.Point:
     return plot.Point(c["label"], x, low, high, c["errors"][accuracy], c["representation"], on_front)
 
 
-def _against(quantity: str, candidates: list[dict], result: dict, title: str) -> plot.Panel:
+def _against(quantity: str, candidates: Iterable[dict], result: dict, title: str) -> plot.Panel:
     """Return a panel of accuracy against ``quantity``; candidates equal in both, or of one job, are one point."""
     distinct: dict[tuple, dict] = {}
+    key = result["measures"][0]["key"]
     for c in candidates:
-        accuracy = c["errors"].get(result["accuracy"])
+        accuracy = c["errors"].get(key)
         if accuracy is not None and not (c["is_truth"] or c["is_reference"]) and c["in_picture"] and c[quantity]:
             distinct.setdefault((c[quantity], c["job"] or accuracy), c)
     values = [
-        (math.log(c[quantity]), -c["errors"][result["accuracy"]]) if in_competition(c) else (math.nan, math.nan)
+        (math.log(c[quantity]), -c["errors"][key]) if in_competition(c) else (math.nan, math.nan)
         for c in distinct.values()
     ]
     points = [
-        _point(c, result["accuracy"], *[c[quantity]] * 3, on_front)
+        _point(c, key, *[c[quantity]] * 3, on_front)
         for c, on_front in zip(distinct.values(), pareto(values), strict=True)
     ]
     return plot.Panel(title, QUANTITIES[quantity][0], points, [])
 
 
-def caption(result: dict) -> str:
-    """Return one paragraph on the machine, the settings and the notes of a result."""
-    s, jobs = result["settings"], result["jobs"]
-    sampled = any(c["errors"] and "errors" not in jobs.get(c["job"], {}) for c in result["candidates"].values())
-    sampled &= result.get("sampled", True)
-    errors = f"; errors from {s['samples']:,} samples" if sampled else ""
-    return " ".join([
-        *result["notes"],
-        f"{machine_line(result)} Medians and quartiles of {s['rounds']} interleaved rounds of {s['lanes']:,} lanes on "
-        f"all cores, input and output (the floor) subtracted{errors}.{state(result)}",
-    ])  # fmt: skip
-
-
 def summary(result: dict) -> list[str]:
-    """Return the result as lines of text: errors of candidates, verdicts in equal bytes, times, ratios, conclusions."""
+    """Return the result as lines of text: errors of candidates, verdicts in equal bytes, times, ratios, the machine."""
     lines = [*_error_table(result), *verdicts(result)]
     for case, measured in result["cases"].items():
         queries, passes = measured["queries"], measured["passes"].get(PASS, {})
@@ -195,7 +167,7 @@ def summary(result: dict) -> list[str]:
         cells = [["", *queries, "flops", "reads", *([f"ms {PASS}"] if passes else []), "bytes", "accuracy", ""]]
         for name, t in queries[query].items():
             c, operations = result["candidates"][name], t["operations"]
-            accuracy = c["errors"].get(measured.get("accuracy") or result["accuracy"])
+            accuracy = c["errors"].get(measured["accuracy"])
             shown = "exact" if c["is_truth"] else "-" if accuracy is None else f"{accuracy:.1f} dB"
             cells.append([
                 name, *(time_cell(timings.get(name)) for timings in queries.values()),
@@ -206,8 +178,6 @@ def summary(result: dict) -> list[str]:
         lines += grid(cells)
     if result["cases"]:
         lines.append(f"  (* on the Pareto front of accuracy and {query}; flops and reads are those of {query})")
-    notes = [f"  {name}: {c['note']}" for name, c in result["candidates"].items() if c["note"]]
-    lines += ["", *notes] if notes else []
     for case, measured in result["cases"].items():
         ratios = measured["ratios"]
         pairs = dict.fromkeys(pair for by_pair in ratios.values() for pair in by_pair)
@@ -215,24 +185,22 @@ def summary(result: dict) -> list[str]:
             lines += ["", f"{case}: ratios, medians of the rounds, floor subtracted [with the floor]"]
             cells = [[ratio_cell(r.get(pair), q in measured["queries"]) for q, r in ratios.items()] for pair in pairs]
             lines += grid([["", *ratios], *([pair, *row] for pair, row in zip(pairs, cells, strict=True))])
-    lines += ["", *result["conclusions"]] if result["conclusions"] else []
-    return [*lines, "", caption(result)]
+    s = result["settings"]
+    how = f"{s['rounds']} interleaved rounds of {s['lanes']:,} lanes; errors from {s['samples']:,} samples where drawn"
+    return [*lines, "", f"{machine_line(result)} Medians of {how}.", figure_caption(result)]
 
 
 def _error_table(result: dict) -> list[str]:
     """Return the plan's measures of all candidates as lines of text."""
-    measures = [Measure(**m) for m in result["measures"]]
-    cells = [["", "bytes", "seconds", *(m.label for m in measures)]]
+    measures = result["measures"]
+    cells = [["", "bytes", "seconds", *(m["label"] for m in measures)]]
     for name, c in result["candidates"].items():
-        if any(m.key in c["errors"] for m in measures):
+        errors = [c["errors"].get(m["key"]) for m in measures]
+        if any(e is not None for e in errors):
+            texts = ["-" if e is None else f"{e:{m['form']}}" for e, m in zip(errors, measures, strict=True)]
             seconds = "-" if c["training_seconds"] is None else f"{c['training_seconds']:.1f}"
-            cells.append([name, f"{c['bytes']:,}", seconds, *(_error_cell(c["errors"], m) for m in measures)])
+            cells.append([name, f"{c['bytes']:,}", seconds, *texts])
     return grid(cells, "") if len(cells) > 1 else []
-
-
-def _error_cell(errors: dict, measure: Measure) -> str:
-    value = errors.get(measure.key)
-    return "-" if value is None else f"{value:{measure.form}}"
 
 
 def candidates_by_budget(result: dict) -> dict[float, dict[str, dict]]:
@@ -246,58 +214,25 @@ def candidates_by_budget(result: dict) -> dict[float, dict[str, dict]]:
 
 
 def verdicts(result: dict) -> list[str]:
-    """Return a line for each memory budget: the method "ours" against the best of the others, by each measure."""
-    lines = []
+    """Return a table: by budget and measure the best of the method "ours" and the best of the others."""
+    cells = [["in equal bytes", *(m["label"] for m in result["measures"])]]
     for candidates in candidates_by_budget(result).values():
-        ours = {name: c for name, c in candidates.items() if c["details"]["kind"] in OURS}
-        if not ours or len(ours) == len(candidates):
-            continue
-        texts = []
-        for m in (Measure(**m) for m in result["measures"]):
-            better = max if m.more else min
-            best = {
-                is_ours: better(
-                    ((c["errors"][m.key], name) for name, c in candidates.items()
-                     if (name in ours) == is_ours and c["errors"].get(m.key) is not None), default=None)
-                for is_ours in (True, False)
-            }  # fmt: skip
-            if all(best.values()):
-                (value, name), (other, rival) = best[True], best[False]
-                wins = "ahead" if better(value, other) == value != other else "not ahead"
-                texts.append(f"{m.label} {value:{m.form}} against {other:{m.form}} ({rival}): {wins}")
-        lines.append(f"{name}: {'; '.join(texts)}")
-    return ["", *lines] if lines else []
+        ours = [name for name, c in candidates.items() if c["details"]["kind"] in OURS]
+        others = [name for name in candidates if name not in ours]
+        for names in (ours, others) if ours and others else ():
+            texts = []
+            for m in result["measures"]:
+                errors = {n: e for n in names if (e := candidates[n]["errors"].get(m["key"])) is not None}
+                best = (max if m["more"] else min)(errors, key=errors.get, default=None)
+                texts.append("-" if best is None else f"{errors[best]:{m['form']}} ({best})")
+            cells.append(["ours" if names is ours else "best of the others", *texts])
+    return ["", *grid(cells, "")] if len(cells) > 1 else []
 
 
 def percent(value: float, digits: int = 3) -> str:
     """Return a share as text, ``0.0123`` → ``"1.23%"``; very small shares are written with a power of ten."""
     value = 100 * value
     return f"{value:.{digits}g}%" if value == 0 or abs(value) >= 1e-4 else f"{value:.1e}%"
-
-
-def rounded(number: float) -> str:
-    """Return a count with two digits: ``"1.3"``, ``"12,000"``, ``"3.4 million"``; from 10¹⁵ on a power of ten."""
-    if number >= 1e15:
-        return f"{number:.1e}"
-    for size, name in ((1e12, " trillion"), (1e9, " billion"), (1e6, " million")):
-        if float(f"{number:.2g}") >= size:
-            return f"{float(f'{number / size:.2g}'):g}{name}"
-    number = float(f"{number:.2g}")
-    return f"{number:,.0f}" if number >= 10 else f"{number:g}"
-
-
-def duration(seconds: float) -> str:
-    """Return seconds with two digits in a readable unit: ``"0.35 s"``, ``"1.7 min"``, ``"3.2 years"``."""
-    year = 365.25 * 86400
-    units = ((year, year, "years"), (86400, 86400, "days"), (5400, 3600, "h"), (90, 60, "min"), (0.1, 1, "s"))
-    size, name = next((unit[1:] for unit in units if seconds >= unit[0]), (1e-3, "ms"))
-    return f"{rounded(seconds / size)} {name}"
-
-
-def enumeration(values: Sequence[object], last: str = "and") -> str:
-    """Return an enumeration: ``[1, 4, 16]`` → ``"1, 4 and 16"``."""
-    *before, end = map(str, values)
-    return f"{', '.join(before)} {last} {end}" if before else end
 
 
 def time_cell(t: dict | None, digits: int = 2) -> str:
@@ -335,12 +270,8 @@ def machine_line(result: dict) -> str:
     )
 
 
-def state(result: dict) -> str:
-    """Return the caption's sentences about a quick or interrupted run, "" for a complete one."""
-    quick = " A smoke run (--quick): times are not to be quoted." if result["settings"]["quick"] else ""
-    return quick + (" Interrupted: less was measured than asked for." if result["interrupted"] else "")
-
-
 def figure_caption(result: dict) -> str:
-    """Return the caption of a figure: the notes of a result, its machine, and its :func:`state`."""
-    return f"{' '.join(result['notes'])} {machine_line(result)}{state(result)}"
+    """Return the sentences below a figure: the notes of a result, and whether the run is quick or interrupted."""
+    quick = "A smoke run (--quick): times are not to be quoted." * result["settings"]["quick"]
+    interrupted = "Interrupted: the same command continues the run." * result["interrupted"]
+    return " ".join(filter(None, (*result["notes"], quick, interrupted)))

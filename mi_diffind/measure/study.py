@@ -8,7 +8,6 @@ that it runs; the lines ``name`` and ``title`` at the beginning of the classes o
 from __future__ import annotations
 
 import argparse
-import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,11 +15,8 @@ from pathlib import Path
 #: Name of the floor among the queries of a case.
 FLOOR = "floor"
 
-#: Name of a whole pass among the queries: time of its kernels.
+#: Name of a whole pass among the queries.
 PASS = "render"
-
-#: Name of a whole pass among the queries: time from beginning to end.
-PASS_WALL = "render, with tracing"
 
 
 @dataclass
@@ -85,28 +81,24 @@ class Candidate:
     """Candidate of a comparison: a representation at a setting.
 
     ``errors(samples)`` measures its errors against the truth. Without it, the errors are those of its job's record, or
-    it has none: the truth (``is_truth``), or a candidate that computes something else, which ``note`` explains.
+    it has none: the truth (``is_truth``), or a candidate that computes something else.
     ``is_reference``: others are compared with it, and it does not compete, like the truth. ``competes``: it may be on
-    the Pareto front. ``bytes`` and ``training_seconds`` (``None``: not known) are those of its job's record, if any.
-    ``job``: name of the job that trains it; ``queries`` that it takes part in (default: all); ``operations(query)``
-    counts operations that a kernel does not show; ``details`` go to the result.
+    the Pareto front. ``bytes`` are those of its job's record, if any. ``job``: name of the job that trains it;
+    ``operations(query)`` counts operations that a kernel does not show; ``label`` is its name in pictures; ``details``
+    go to the result.
     """
 
     name: str
     representation: str
     setting: str = ""
     bytes: int = 0
-    training_seconds: float | None = 0.0
     errors: Callable[[int], dict[str, float]] | None = None
     is_truth: bool = False
     is_reference: bool = False
     competes: bool = True
-    in_passes: bool = True
     in_picture: bool = True
-    note: str = ""
     label: str = ""
     job: str = ""
-    queries: tuple[str, ...] | None = None
     operations: Callable[[str], object] | None = None
     details: dict = field(default_factory=dict)
 
@@ -138,19 +130,16 @@ class Case:
     """Situation in which candidates are timed.
 
     ``queries(lanes)`` returns query → name of a candidate, or :data:`FLOOR` → function. ``passes()``, if given, returns
-    name of a candidate (those with ``in_passes``) → function of the pass number that does one whole pass, such as a
-    render. Both are called when they are needed. ``candidates``: names of those that take part (default: all);
-    ``query_names`` (default: the plan's). ``in_picture``: the case has a panel, of the error ``accuracy`` (default: the
-    plan's) against the time of its first query, or of a pass if ``of_passes``; the Pareto front uses the same two.
-    ``details`` go to the result.
+    name of a candidate → function of the pass number that does one whole pass, such as a render. Both are called when
+    they are needed; names that are no candidates are left out. ``in_picture``: the case has a panel, of the error
+    ``accuracy`` (default: the plan's first measure) against the time of its first query, or of a pass if ``of_passes``;
+    the Pareto front uses the same two. ``details`` go to the result.
     """
 
     name: str
     queries: Callable[[int], dict[str, dict[str, Callable[[], object]]]]
     passes: Callable[[], dict[str, Callable[[int], object]]] | None = None
     details: dict = field(default_factory=dict)
-    candidates: tuple[str, ...] | None = None
-    query_names: tuple[str, ...] | None = None
     in_picture: bool = True
     accuracy: str = ""
     of_passes: bool = False
@@ -169,54 +158,30 @@ class Measure:
     more: bool = True
 
 
-def _current_variant() -> str:
-    import mitsuba as mi  # a declaration of a study does not need it
-
-    return mi.variant()
-
-
 @dataclass
 class Plan:
     """Plan of a measurement: candidates, cases, jobs, and the reports of a study.
 
-    ``accuracy`` names the error of pictures and of the Pareto front; larger is better, as for a PSNR. ``ratios`` are
-    pairs of candidates whose times are divided. Partial results are continued only if ``details`` and the files
-    of this package are unchanged, models of ``jobs`` if ``jobs_fingerprint`` is.
-    ``panels``: quantities that the accuracy of all candidates is drawn against (``"bytes"``, ``"training_seconds"``);
-    ``bytes_by_case``: also against bytes, for the candidates of each case. ``measures``: errors of the table of all
-    candidates; ``conclusions(result)`` returns further lines. ``pictures`` maps further names to functions of the
-    result that draw a Matplotlib figure. ``sampled``: errors are those of as many samples as the settings say.
+    The first of the ``measures`` is the accuracy of pictures and of the Pareto front; more of it is better, as of a
+    PSNR. ``ratios`` are pairs of candidates whose times are divided. Partial results are continued only if ``details``
+    and the files of this package are unchanged, models of ``jobs`` if ``jobs_fingerprint`` is.
+    ``panels``: quantities that the accuracy is drawn against beside time: ``"bytes"`` (for each case, if the cases have
+    different candidates) and ``"training_seconds"``. ``pictures`` maps further names to functions of the
+    result that draw a Matplotlib figure; ``notes`` are sentences below pictures.
     """
 
     study: str
     title: str
     candidates: list[Candidate]
     cases: list[Case]
-    queries: tuple[str, ...]
-    accuracy: str
-    accuracy_label: str
+    measures: tuple[Measure, ...]
     ratios: list[tuple[str, str]] = field(default_factory=list)
     details: dict = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     jobs: list[Job] = field(default_factory=list)
     jobs_fingerprint: str = ""
     panels: tuple[str, ...] = ()
-    bytes_by_case: bool = False
     pictures: dict[str, Callable[[dict], object]] = field(default_factory=dict)
-    sampled: bool = True
-    measures: tuple[Measure, ...] = ()
-    conclusions: Callable[[dict], list[str]] = lambda result: []
-    variant: str = field(default_factory=_current_variant)
-
-    def resolved(self, case: Case) -> Case:
-        """Return ``case`` with the names of its candidates and queries."""
-        names = tuple(c.name for c in self.candidates if case.candidates is None or c.name in case.candidates)
-        return dataclasses.replace(case, candidates=names, query_names=case.query_names or self.queries)
-
-    def takers(self, case: Case, query: str) -> list[str]:
-        """Return the names of the candidates that take part in a query of a :meth:`resolved` case."""
-        in_case = [c for c in self.candidates if c.name in case.candidates]
-        return [c.name for c in in_case if c.queries is None or query in c.queries]
 
 
 def in_competition(candidate: dict) -> bool:

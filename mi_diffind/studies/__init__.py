@@ -159,6 +159,6 @@ def _measure(study: Study, arguments) -> Tradeoff:
             raise UsageError(f"workers: the study {study.name} has no jobs that could run in other processes")
         make = functools.partial(_plan, study.name, arguments)
         workers = benchmark.Workers(make, count, scheduler)
-    settings = benchmark.BenchmarkSettings.choose(plan.variant, arguments.quick)
+    settings = benchmark.BenchmarkSettings.choose(arguments.quick)
     result = benchmark.measure(plan, settings, arguments.out, workers=workers)
     return report.publish(result, report.write(result, arguments.out, plan), report.summary(result))

@@ -8,22 +8,20 @@ indirection alone (``paper``), one array alone (``plain``), and networks of 675 
 from __future__ import annotations
 
 import argparse
-import time
-from pathlib import Path
+import functools
 
 import mitsuba as mi
 
-from ..fitting.settings import FitSettings
-from ..fitting.task import fit, load_model
+from ..fitting.task import FitSettings, fit, load_model
 from ..measure.renders import bsdf_queries, directions
-from ..measure.store import file_name, fingerprint, package_files
-from ..measure.study import Candidate, Case, Job, Measure, Plan, Study
-from ..measure.training import ConvergenceTraining, halve
+from ..measure.store import fingerprint, package_files
+from ..measure.study import Candidate, Case, Measure, Plan, Study
 from ..tasks.bsdf import mixture
 from ..tasks.bsdf.directions import SphereView
 from ..tasks.bsdf.model import LearnedBSDF
 from ..tasks.bsdf.truth import truth_of
 from .baselines import networks
+from .equal_memory import Contender, NetworkContender
 
 
 def _rgb(*value):
@@ -115,98 +113,75 @@ class BSDFStudy(Study):
 STUDY = BSDFStudy()
 
 
-class BSDFTraining(Job):
-    """Fit of one material with one preset, whose table file is kept."""
+def fitted_contender(material: str, preset: str, quick: bool) -> Contender:
+    """Return the contender of a preset of ``fit bsdf`` for a material; its model is the plugin that reads the file."""
+    source, nbytes = MATERIALS[material]
 
-    separable = True
-
-    def __init__(self, material: str, preset: str, quick: bool):
-        self.material, self.preset, self.quick = material, preset, quick
-        self.name = f"{material}, {preset}"
-        self.path: Path | None = None
-
-    def cached_record(self, folder: Path | None, record: dict | None) -> dict | None:
-        """Return the record if the folder holds the file of an uninterrupted fit; without ``record``, measure it."""
-        if folder is None or not self._file(folder).is_file():
-            return None
-        self.path = self._file(folder)
-        return record or {"seconds": None, **self._measured()}
-
-    def run(self, folder: Path | None, progress: bool) -> dict | None:
-        """Fit, write the file, and return the record; ``None`` after Ctrl-C."""
-        source, nbytes = MATERIALS[self.material]
-        start = time.perf_counter()
-        options = QUICK_FIT if self.quick else {}
-        fitted = fit("bsdf", source, preset=self.preset, bytes=nbytes, progress=progress, **options)
+    def train(job: Contender, progress: bool) -> dict | None:
+        options = QUICK_FIT if quick else {}
+        fitted = fit("bsdf", source, preset=preset, bytes=nbytes, progress=progress, **options)
         if fitted.result.interrupted:
             return None
-        seconds = time.perf_counter() - start
-        self.path = self._file(Path(folder or "."))
-        fitted.save(self.path)
-        return {"seconds": seconds, **self._measured()}
+        fitted.save(job.file)
+        return measured(job)
 
-    def _measured(self) -> dict:
-        """Return bytes, errors and details of the file: also the errors of the proxy alone and of both samplings."""
-        model = load_model(self.path, mi.TensorXf)
-        truth = truth_of(MATERIALS[self.material][0], model.types)
-        errors = dict(model.table.measured)
+    def measured(job: Contender) -> dict:
+        """Return bytes and errors of the file: also the errors of the proxy alone, and the noise of both samplings."""
+        model = load_model(job.file, mi.TensorXf)
+        truth, errors = truth_of(source, model.types), dict(model.table.measured)
         if model.bsdf.proxy is not None:
             proxy = LearnedBSDF(model.form, None, model.bsdf.proxy)
             errors["psnr_proxy_db"] = SphereView(truth, model.types).psnr(proxy.cosine_value)
         for name, sampled in (("learned", model.mixture), ("native", truth)):
             moments = [mixture.second_moment(truth, sampled, model.types, cos) for cos in COSINES]
             errors[f"moment_{name}"] = sum(moments) / len(moments)
-        settings = model.table.settings
-        details = {key: settings[key] for key in ("form", "symmetry", "steps")}
-        return {"bytes": model.table.nbytes, "errors": errors, "details": details}
+        return {"bytes": model.table.nbytes, "errors": errors, "details": {"steps": model.table.settings["steps"]}}
 
-    def _file(self, folder: Path) -> Path:
-        return Path(folder) / f"{file_name(self.name)}.npz"
+    def read(job: Contender):
+        return mi.load_dict({"type": "neural_bsdf", "filename": str(job.file)})
 
-    def load(self):
-        """Return the plugin that reads the file."""
-        return mi.load_dict({"type": "neural_bsdf", "filename": str(self.path)})
-
-    def scale(self) -> tuple[float, float]:
-        """Return the scale of the coordinate u of the fitted file."""
-        return load_model(self.path, mi.TensorXf).form.scale
+    name = f"{material}: {preset}"
+    return Contender(name, preset, 0, train, read, preset, "learned", preset, separable=True)
 
 
-def network_training(material: str, inputs: str, scale) -> ConvergenceTraining:
-    """Return the training of a network to convergence, for inputs in the scale of a learned BSDF, ``scale()``.
-
-    The record has the PSNR of the weights in half precision, too.
-    """
+def network_contender(material: str, inputs: str, learned: Contender) -> NetworkContender:
+    """Return the contender of a network, trained to convergence for inputs in the scale of a learned BSDF."""
 
     def problem() -> networks.BSDFNetworkProblem:
-        return networks.BSDFNetworkProblem(MATERIALS[material][0], inputs, scale())
+        scale = load_model(learned.file, mi.TensorXf).form.scale
+        return networks.BSDFNetworkProblem(MATERIALS[material][0], inputs, scale)
 
     def finish(net, record: dict) -> dict:
-        half = networks.bsdf_network().alloc(mi.TensorXf)
-        for key in net:
-            half[key] = net[key]
-        halve(half)
-        errors = {"psnr_db": record["psnr_db"], "psnr_half_db": problem().measure(half)["psnr_db"]}
-        return {"bytes": 4 * record["entries"], "errors": errors}
+        return {"bytes": 4 * record["entries"], "errors": {"psnr_db": record["psnr_db"]}}
 
-    settings = FitSettings(steps=1000, batch=2**12, lr=2e-2, seed=1)
-    training = ConvergenceTraining(f"{material}, network, {inputs}", problem, settings, 4000, finish=finish)
-    training.separable = False  # its inputs are those of another job
-    return training
+    def build(net):
+        return problem().bsdf(net.cooperative())
+
+    settings, label = FitSettings(steps=1000, batch=2**12, lr=2e-2, seed=1), f"network, {inputs}"
+    training = (problem, settings, 4000, 20, False, finish)
+    network = NetworkContender(f"{material}: {label}", "network", 0, label, "", build, *training)
+    network.family, network.separable = "network", False  # its inputs are those of another job
+    return network
 
 
 def plan(materials: tuple[str, ...] = (), quick: bool = False) -> Plan:
     """Return the plan for some materials (default: all), in the current variant."""
-    names = materials or (QUICK_MATERIALS if quick else tuple(MATERIALS))
     candidates, cases, jobs, ratios = [], [], [], []
-    for material in names:
-        case, its_candidates, its_jobs = _material(material, quick)
-        cases.append(case)
-        candidates += its_candidates
-        jobs += its_jobs
-        references = [c.name for c in its_candidates if c.is_truth or c.is_reference]
-        learned = [c.name for c in its_candidates if c.name not in references]
-        ratios += [(name, reference) for name in learned for reference in references]
+    for material in materials or (QUICK_MATERIALS if quick else MATERIALS):
+        source, nbytes = MATERIALS[material]
+        learned = [fitted_contender(material, preset, quick) for preset in (PRESETS[:1] if quick else PRESETS)]
+        nets = []
+        if not quick and nbytes == "2k":
+            nets = [network_contender(material, inputs, learned[0]) for inputs in INPUTS]
+        references = [
+            Candidate(f"{material}: source", "source", is_truth=True, label="source"),
+            Candidate(f"{material}: principled", "Mitsuba", is_reference=True, label="principled"),
+        ]
+        queries = functools.partial(_queries, material, learned, nets)
+        cases.append(Case(material, queries, details={"material": source}))
+        candidates += [*references, *(job.candidate() for job in (*learned, *nets))]
+        ratios += [(job.name, reference.name) for job in (*learned, *nets) for reference in references]
+        jobs += [*learned, *nets]
     code = package_files("arrays/lookup.py", "arrays/indirection.py", "fitting/loop.py", "tasks/bsdf/*.py",
                          "studies/bsdf.py")  # fmt: skip
     return Plan(
@@ -214,62 +189,25 @@ def plan(materials: tuple[str, ...] = (), quick: bool = False) -> Plan:
         title="Learned BSDFs: accuracy against time and bytes",
         candidates=candidates,
         cases=cases,
-        queries=QUERIES,
-        accuracy="psnr_db",
-        accuracy_label="PSNR of a lit sphere, dB",
-        ratios=ratios,
-        jobs=jobs,
-        jobs_fingerprint=fingerprint(code),
-        bytes_by_case=True,
-        sampled=False,
         measures=(
-            Measure("PSNR, dB", "psnr_db", ".1f"),
+            Measure("PSNR of a lit sphere, dB", "psnr_db", ".1f"),
             Measure("proxy, dB", "psnr_proxy_db", ".1f"),
             Measure("albedo", "albedo_excess", ".2%", False),
             Measure("E[w²]/E[w]²", "moment_learned", ".2f", False),
             Measure("source's", "moment_native", ".2f", False),
         ),
+        ratios=ratios,
+        jobs=jobs,
+        jobs_fingerprint=fingerprint(code),
+        panels=("bytes",),
     )
 
 
-def _material(material: str, quick: bool) -> tuple[Case, list[Candidate], list[Job]]:
-    """Return the case of a material, its candidates and their jobs."""
-    source, nbytes = MATERIALS[material]
-    trainings = [BSDFTraining(material, preset, quick) for preset in (PRESETS[:1] if quick else PRESETS)]
-    nets = []
-    if not quick and nbytes == "2k":
-        nets = [network_training(material, inputs, trainings[0].scale) for inputs in INPUTS]
-
-    def learned(job, label: str, representation: str, **options) -> Candidate:
-        return Candidate(
-            f"{material}: {label}", representation, label, job=job.name, in_passes=False, label=label, **options
-        )
-
-    candidates = [
-        Candidate(f"{material}: source", "source", is_truth=True, in_passes=False, label="source"),
-        Candidate(
-            f"{material}: principled", "Mitsuba", is_reference=True, in_passes=False, label="principled",
-            note="another material",
-        ),
-        *(learned(job, job.preset, "learned") for job in trainings),
-        *(
-            learned(job, f"network, {inputs}", "network", queries=("eval",))
-            for job, inputs in zip(nets, INPUTS, strict=False)
-        ),
-    ]  # fmt: skip
-
-    def queries(lanes: int) -> dict:
-        bsdfs = {f"{material}: source": mi.load_dict(source), f"{material}: principled": mi.load_dict(PEER)}
-        bsdfs |= {f"{material}: {job.preset}": job.load() for job in trainings}
-        bsdfs |= {
-            f"{material}: network, {i}": job.problem().bsdf(job.net.cooperative())
-            for job, i in zip(nets, INPUTS, strict=False)
-        }
-        return bsdf_queries(bsdfs, directions(lanes), False)
-
-    members = tuple(candidate.name for candidate in candidates)
-    return (
-        Case(material, queries, None, {"material": source}, members, QUERIES),
-        candidates,
-        [*trainings, *nets],
-    )
+def _queries(material: str, learned: list[Contender], nets: list[NetworkContender], lanes: int) -> dict:
+    """Return the queries of the source, ``principled`` and the contenders; networks have ``eval`` alone."""
+    bsdfs = {f"{material}: source": mi.load_dict(MATERIALS[material][0]), f"{material}: principled": mi.load_dict(PEER)}
+    bsdfs |= {job.name: job.model for job in learned}
+    inputs = directions(lanes)
+    functions = bsdf_queries(bsdfs, inputs, False, QUERIES)
+    functions["eval"] |= bsdf_queries(bsdfs | {job.name: job.model for job in nets}, inputs, False, ("eval",))["eval"]
+    return functions

@@ -1,12 +1,10 @@
-"""Equal-memory comparison: each method is trained once per memory budget (:class:`Contender`) and cached.
-
-Trained models are files in a folder, so an interrupted study continues with the models that are there.
-"""
+"""Equal-memory comparison: each method is trained once per memory budget (:class:`Contender`) and cached."""
 
 from __future__ import annotations
 
 import argparse
 import functools
+import json
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -17,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..arrays.tables import save_table
-from ..core.files import replacing
+from ..core.files import replacing, write_json
 from ..fitting import task
 from ..measure.store import file_name
 from ..measure.study import Candidate, Job
@@ -57,6 +55,8 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
 class Contender(Job):
     """A ``method`` at one memory ``budget``: the job that trains or encodes it, and the candidate that is measured.
 
+    The record lies beside the model in the folder of models, so that a study that is run again trains nothing twice.
+
     ``fit(contender, progress)`` trains or encodes: it sets :attr:`model`, writes ``file`` unless it is ``None``, and
     returns the record (:class:`.Job`), or ``None`` after Ctrl-C. ``read(contender)`` returns the model of ``file``; if
     nothing is in a file, ``has_file`` is false and ``read`` builds the model anew.
@@ -74,8 +74,10 @@ class Contender(Job):
     family: str = ""
     setting: str = ""
     has_file: bool = True
+    separable: bool = False
     details: dict = field(default_factory=dict)
     file: Path | None = None
+    folder: Path | None = None
     record: dict | None = None
 
     def candidate(self, **fields) -> Candidate:
@@ -84,18 +86,27 @@ class Contender(Job):
         given = {"label": label, "details": {"kind": self.method, "asked": self.budget, **self.details}, **fields}
         return Candidate(self.name, self.family or label, self.setting, job=self.name, **given)
 
-    def cached_record(self, folder: Path | None, record: dict | None) -> dict | None:
+    def cached_record(self, folder: Path | None, record: dict | None = None) -> dict | None:
+        self.folder = folder
         self.file = folder / f"{file_name(self.name)}.npz" if folder and self.has_file else None
         self.__dict__.pop("model", None)
+        if record is None and folder and self._record_file.is_file():
+            record = json.loads(self._record_file.read_text(encoding="utf-8"))
         is_there = not self.has_file or (self.file is not None and self.file.is_file())
         self.record = record if is_there else None
         return self.record
+
+    @property
+    def _record_file(self) -> Path:
+        return self.folder / f"{file_name(self.name)}.json"
 
     def run(self, folder: Path | None, progress: bool) -> dict | None:
         start = time.perf_counter()
         self.record = self.fit(self, progress)
         if self.record is not None:
             self.record.setdefault("seconds", time.perf_counter() - start)
+            if folder:
+                write_json(self._record_file, self.record)
         return self.record
 
     @functools.cached_property

@@ -256,12 +256,8 @@ def plan(session: FieldSession, source: str, settings: SimpleNamespace) -> Plan:
         title=f"Radiance field: {Path(source).name}",
         candidates=candidates,
         cases=[
-            Case("reads", lambda lanes: _reads(context, timed, lanes), candidates=timed,
-                 query_names=("density", "both")),
+            Case("reads", lambda lanes: _reads(context, timed, lanes)),
         ],
-        queries=("density",),
-        accuracy=FOREGROUND,
-        accuracy_label="PSNR of the foreground in test views, dB",
         ratios=[(ours, n) for n in shown if jobs[n].method in AGAINST] if ours else [],
         details={
             "source": source, "source_digest": views.digest + held_out.digest, "views": [len(views), len(held_out)],
@@ -275,8 +271,7 @@ def plan(session: FieldSession, source: str, settings: SimpleNamespace) -> Plan:
         jobs_fingerprint=fingerprint(code) + views.digest[:16],
         panels=("bytes",),
         pictures={"views": functools.partial(draw_views, context, shown)},
-        sampled=False,
-        measures=(Measure("dB, white", WHITE), Measure("dB, foreground", FOREGROUND)),
+        measures=(Measure("PSNR of the foreground, dB", FOREGROUND), Measure("of all pixels", WHITE)),
     )  # fmt: skip
 
 

@@ -13,8 +13,9 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -24,13 +25,13 @@ from ..arrays.indirection import DifferentiableArray
 from ..arrays.lookup import STORAGES
 from ..core.runtime import array_module
 from ..fitting.loop import FitSettings
-from ..measure.clock import FLOPS, Operations, count_query
-from ..measure.renders import QUERIES, bsdf_queries, directions, noise_texture
+from ..measure.clock import Operations, count_query
+from ..measure.renders import bsdf_queries, directions, noise_texture
 from ..measure.store import fingerprint, package_files
-from ..measure.study import FLOOR, Candidate, Case, Plan, Study
+from ..measure.study import FLOOR, Candidate, Case, Measure, Plan, Study
 from ..measure.training import ConvergenceTraining
 from ..tasks.ggx import TASK
-from ..tasks.ggx.model import INPUTS, Encoding, LearnedGGX, ggx, indirection
+from ..tasks.ggx.model import Encoding, LearnedGGX, ggx, indirection
 from ..tasks.ggx.training import GGXProblem, draw, measure
 from .baselines.networks import Network
 
@@ -39,16 +40,15 @@ PRIMARY = 16
 CASCADED = 8
 ENTRIES = 2 * PRIMARY**2 + CASCADED**2
 
+#: Indirection of these sizes, at whose quality costs are compared.
+REFERENCE = f"{PRIMARY}→{CASCADED}"
+
 #: Names of the cases, one for each parametrisation of the inputs.
 PLAIN = "inputs as in the paper"
 LOGARITHMIC = "logarithmic inputs"
 
-#: The paper's ratios to its own indirection at equal quality: flops, bytes read by a query, bytes stored; and those of
-#: its indirection.
+#: The paper's ratios to its own indirection at equal quality: flops, bytes read by a query, bytes stored.
 PAPER = {"network": (113.7, 256, 4), "single table": (0.33, 0.5, 512), "network + table": (28.4, 64, 0.5)}
-PAPER_FLOPS = 36
-PAPER_BYTES_READ = 16
-PAPER_BYTES = 1024
 
 #: PSNR, in dB, by which a candidate may be worse and still count as of equal quality.
 EQUAL_DB = 0.25
@@ -89,8 +89,11 @@ HASH_GRID = {
 }  # fmt: skip
 
 
-#: Storage form → its suffix in labels, bytes of an entry.
-_STORED = {"float32": ("", 4), "float16": (" f16", 2), "uint8": (" u8", 1)}
+#: How networks are read.
+COOPERATIVE = "cooperative vectors"
+
+#: Storage → its suffix in labels, bytes of an entry of four.
+READ_AS = {"float32": ("", 4), "float16": (" f16", 2), "uint8": (" u8", 1), COOPERATIVE: ("", 4)}
 
 
 class GGXStudy(Study):
@@ -106,214 +109,162 @@ class GGXStudy(Study):
 STUDY = GGXStudy()
 
 
+@dataclass(frozen=True)
+class Form:
+    """Representation of one size for one kind of ``inputs``, before its training.
+
+    ``net`` is the module, not yet allocated, ``nbytes`` its bytes as it is trained, ``settings_key`` the key of
+    :data:`SETTINGS`. It is read in each of the ``storages`` (:data:`READ_AS`).
+    """
+
+    label: str
+    representation: str
+    inputs: str
+    net: object
+    nbytes: int
+    settings_key: str
+    storages: tuple[str, ...] = (COOPERATIVE,)
+    output: str = "root"
+
+    def name(self, suffix: str = "") -> str:
+        """Return the name of the training, or of the candidate with a suffix."""
+        return self.label + suffix + ", log" * (self.inputs == "logarithmic")
+
+    def training(self, types, quick: bool, quick_steps: int) -> ConvergenceTraining:
+        """Return the training to convergence."""
+        options = dict(SETTINGS[self.settings_key])
+        longest = options.pop("longest")
+        settings = FitSettings(seed=1, schedule="cosine", deterministic=False, **options)
+        if quick:
+            settings, longest = dataclasses.replace(settings, steps=quick_steps), 2 * quick_steps
+        samples, encoding = "tables" if self.inputs == "logarithmic" else "paper", Encoding(self.inputs, self.output)
+
+        def problem() -> GGXProblem:
+            return GGXProblem(self.net.alloc(types.TensorXf, 2, dr.rng(seed=1)), types, samples, encoding)
+
+        return ConvergenceTraining(self.name(), problem, settings, longest, 4 if quick else 20)
+
+    def candidates(self, training: ConvergenceTraining, types) -> Iterator[tuple[Candidate, Callable]]:
+        """Yield a candidate for each storage, with a function that returns the reader of the trained module."""
+
+        @functools.cache
+        def reader(storage: str) -> LearnedGGX:
+            net = training.net.cooperative() if storage == COOPERATIVE else training.net.to(storage)
+            return LearnedGGX(net, Encoding(self.inputs, self.output), tail=False)
+
+        def counted(query: str) -> Operations:
+            inputs = _inputs(types, 64)
+            return count_query(lambda: [reader(COOPERATIVE)(*inputs)]) + training.net.products()
+
+        for storage in self.storages:
+            suffix, size = READ_AS[storage]
+            yield Candidate(
+                self.name(suffix), self.representation, storage, self.nbytes * size // 4,
+                errors=lambda samples, storage=storage: measure(reader(storage), types, samples),
+                label=self.label + suffix, job=training.name,
+                operations=counted if storage == COOPERATIVE else None,
+            ), functools.partial(reader, storage)  # fmt: skip
+
+
+def forms(inputs: str, quick: bool) -> list[Form]:
+    """Return the representations for ``inputs``: indirection and single tables, networks; ``quick``: fewer."""
+    plain = inputs == "plain"
+    sizes, multiples = (SIZES, MULTIPLES) if plain else ((PRIMARY, 2 * PRIMARY), (1, 4))
+    if quick:
+        sizes, multiples = (sizes[:2], multiples[:2]) if plain else (sizes[:1], multiples[:1])
+
+    def cascade(side: int) -> tuple:
+        return f"{side}→{side // 2}", inputs, indirection(side, side // 2), 4 * (2 * side**2 + (side // 2) ** 2)
+
+    def single(side: int) -> tuple:
+        return f"{side}²", inputs, DifferentiableArray((side, side), 1, "constant", 0.5), 4 * side**2
+
+    def form(representation: str, described: tuple, *options) -> Form:
+        label, *rest = described
+        return Form(label + " raw" * (representation == "raw"), representation, *rest, *options)
+
+    chosen = [form("indirection", cascade(side), f"indirection, {inputs}", STORAGES) for side in sizes]
+    for multiple in multiples:
+        storages = STORAGES[: None if multiple == 1 else 1]
+        chosen.append(form("single table", single(math.isqrt(ENTRIES * multiple)), "single table", storages))
+    if plain and not quick:  # learn D as it is, at the paper's learning rate
+        for described in (cascade(PRIMARY), single(math.isqrt(ENTRIES))):
+            chosen.append(form("raw", described, "raw", STORAGES[:1], "raw"))
+    nets = [(f"MLP {w}x{n}", "network", Network(2, w, n)) for w, n in (NETWORKS if plain else NETWORKS[1:])]
+    if plain:
+        nets.append(("grid + MLP 16", "hash grid + network", Network(2, 16, 1, HASH_GRID)))
+        nets.append((f"MLP 8 + {PRIMARY}²", "network + table", Network(2, 8, 2, table=PRIMARY)))
+    if quick:
+        nets = [nets[0], *nets[-2:]] if plain else []
+    for label, representation, network in nets:
+        nbytes = network.alloc(array_module(mi.variant()).TensorXf, 2, dr.rng(seed=1)).nbytes
+        key = "network" if network.width < 32 else "wide network"
+        chosen.append(Form(label, representation, inputs, network, nbytes, key))
+    return chosen
+
+
 def plan(quick: bool = False, quick_steps: int = QUICK_STEPS) -> Plan:
     """Return the plan of the study in the current variant.
 
     ``quick``: fewer candidates, whose first training takes ``quick_steps`` steps and whose longest twice as many.
     """
-    builder = GGXCandidates(array_module(mi.variant()), quick, quick_steps)
-    for inputs in INPUTS[::-1]:
-        builder.add_tables(inputs)
-        builder.add_networks(inputs)
-    builder.add_formula()
-    cases = [
-        builder.case(PLAIN, "plain", {"inputs": "cos θ_h and α, both vary", "output": "root, or raw where marked"}),
-        builder.case(
-            LOGARITHMIC, "logarithmic", {"inputs": "logarithms of sin²θ_h and α, both vary", "output": "root"}
-        ),
-        *builder.conductors(),
-    ]
+    types = array_module(mi.variant())
+    candidates, trainings, cases, ratios = [], [], [], []
+    for inputs, case in {"plain": PLAIN, "logarithmic": LOGARITHMIC}.items():
+        readers = {}
+        for form in forms(inputs, quick):
+            training = form.training(types, quick, quick_steps)
+            trainings.append(training)
+            for candidate, reader in form.candidates(training, types):
+                candidates.append(candidate)
+                readers[candidate.name] = reader
+        end = ", log" * (inputs == "logarithmic")
+        reference, names = f"{REFERENCE}{end}", [f"{REFERENCE} f16", f"{REFERENCE} u8", f"{math.isqrt(ENTRIES)}²"]
+        ratios += [*((name + end, reference) for name in names), (reference, "formula")]
+        readers["formula"] = lambda: lambda cos, sin2, alpha: ggx(sin2, alpha)
+        cases.append(Case(case, functools.partial(_reads, types, readers)))
+    candidates += [
+        Candidate("formula", "formula", is_truth=True), Candidate("roughconductor", "Mitsuba", is_truth=True)
+    ]  # fmt: skip
+    conductors = {"roughconductor": {"type": "roughconductor", "distribution": "ggx"}}
+    for storage in STORAGES:
+        name = "neural_ggx" + ("" if storage == "float32" else f", {storage}")
+        conductors[name] = {"type": "neural_ggx", "storage": storage}
+        model = TASK.open(types.TensorXf, storage=storage)
+        candidates.append(Candidate(name, "indirection", storage, model.nbytes, model.measure))
+        ratios.append((name, "roughconductor"))
+    for roughness in ("constant",) if quick else ("constant", "textured"):
+        queries = functools.partial(_conductor_queries, conductors, roughness)
+        cases.append(Case(f"conductor, {roughness} roughness", queries, in_picture=False))
     code = package_files("arrays/lookup.py", "arrays/indirection.py", "fitting/loop.py", "tasks/*.py",
                          "tasks/ggx/*.py", "studies/baselines/networks.py")  # fmt: skip
     return Plan(
         study="ggx",
         title="GGX distribution of normals: accuracy against time and bytes",
-        candidates=builder.candidates,
+        candidates=candidates,
         cases=cases,
-        queries=("read",),
-        accuracy="psnr_db",
-        accuracy_label="PSNR of D clipped to [0, 1], dB",
-        ratios=builder.ratios,
-        details={
-            "flops": FLOPS,
-            "paper": {"flops": PAPER_FLOPS, "bytes_read": PAPER_BYTES_READ, "bytes": PAPER_BYTES, "ratios": PAPER},
-            "errors": "PSNR in dB and mean absolute error of D clipped to [0, 1], over cosine-weighted normals and "
-            "exponential-like roughness; and by bands of roughness: the largest relative error at the normal, and the "
-            "99th percentile of it where D is at least a tenth of the peak",
-        },
-        jobs=builder.trainings,
+        measures=(Measure("PSNR of D clipped to [0, 1], dB", "psnr_db"),),
+        ratios=ratios,
+        jobs=trainings,
         jobs_fingerprint=fingerprint(code),
-        bytes_by_case=True,
-        conclusions=lambda result: conclusions(result, builder.reference("plain")),
+        panels=("bytes",),
     )
 
 
-class GGXCandidates:
-    """Builder of the plan: the candidates, their trainings, and the function that reads each of them."""
+def _inputs(types, lanes: int) -> tuple:
+    """Return ``(cos θ_h, sin² θ_h, α)`` of ``lanes`` reads, evaluated."""
+    samples = draw(dr.rng(seed=dr.opaque(types.UInt64, 7)), types, lanes)
+    dr.make_opaque(*samples)
+    return samples
 
-    def __init__(self, types, quick: bool, quick_steps: int):
-        self.types, self.quick, self.quick_steps = types, quick, quick_steps
-        self.candidates: list[Candidate] = []
-        self.trainings: list[ConvergenceTraining] = []
-        self.ratios: list[tuple[str, str]] = []
-        #: Name of a candidate → function that returns its reader; and the inputs that it is read at.
-        self.readers: dict[str, Callable[[], Callable]] = {}
-        self.inputs: dict[str, str] = {}
 
-    @staticmethod
-    def name(label: str, inputs: str) -> str:
-        return label if inputs == "plain" else f"{label}, log"
-
-    def reference(self, inputs: str) -> str:
-        """Return the name of the indirection of the paper's sizes."""
-        return self.name(f"{PRIMARY}→{CASCADED}", inputs)
-
-    def train(self, label: str, net: Callable, settings_key: str, encoding: Encoding) -> ConvergenceTraining:
-        """Register a training by the settings :data:`SETTINGS` ``[settings_key]``."""
-        options = dict(SETTINGS[settings_key])
-        longest = options.pop("longest")
-        settings = FitSettings(seed=1, schedule="cosine", deterministic=False, **options)
-        if self.quick:
-            settings, longest = dataclasses.replace(settings, steps=self.quick_steps), 2 * self.quick_steps
-        samples = "tables" if encoding.inputs == "logarithmic" else "paper"
-
-        def problem():
-            return GGXProblem(net().alloc(self.types.TensorXf, 2, dr.rng(seed=1)), self.types, samples, encoding)
-
-        name = self.name(label, encoding.inputs)
-        self.trainings.append(ConvergenceTraining(name, problem, settings, longest, 4 if self.quick else 20))
-        return self.trainings[-1]
-
-    def add(self, label, representation, setting, size, training, form, encoding, operations=None, note=""):
-        """Register a candidate; ``form(net)`` turns the trained module into the module to read."""
-        name = self.name(label, encoding.inputs)
-        reader = functools.cache(lambda: LearnedGGX(form(training.net), encoding, tail=False))
-        self.candidates.append(
-            Candidate(
-                name, representation, setting, size,
-                errors=lambda samples: measure(reader(), self.types, samples),
-                note=note, label=label, job=training.name, operations=operations, in_passes=False,
-            )
-        )  # fmt: skip
-        self.readers[name], self.inputs[name] = reader, encoding.inputs
-
-    def add_tables(self, inputs: str) -> None:
-        """Register indirection at several sizes and single tables; with plain inputs also with raw output."""
-        plain = inputs == "plain"
-        sizes, multiples = (SIZES, MULTIPLES) if plain else ((PRIMARY, 2 * PRIMARY), (1, 4))
-        if self.quick:
-            sizes, multiples = sizes[:2] if plain else sizes[:1], multiples[:2] if plain else multiples[:1]
-        encoding, reference = Encoding(inputs, "root"), self.reference(inputs)
-        for side in sizes:
-            self._add_table(side, f"indirection, {inputs}", encoding, STORAGES)
-        self.ratios += [
-            (self.name(f"{PRIMARY}→{CASCADED}{_STORED[storage][0]}", inputs), reference) for storage in STORAGES[1:]
-        ]
-        for multiple in multiples:
-            storages = STORAGES if multiple == 1 else STORAGES[:1]
-            self._add_table(math.isqrt(ENTRIES * multiple), "single table", encoding, storages)
-        self.ratios.append((self.name(f"{math.isqrt(ENTRIES)}²", inputs), reference))
-        if plain and not self.quick:
-            for side, representation in ((PRIMARY, "indirection"), (math.isqrt(ENTRIES), "single table")):
-                self._add_table(side, "raw", Encoding("plain", "raw"), STORAGES[:1], representation)
-
-    def _add_table(
-        self, side: int, settings_key: str, encoding: Encoding, storages: Sequence[str], representation: str = ""
-    ) -> None:
-        """Register a training, and a candidate in each storage form, of indirection or of a single table."""
-        representation = representation or settings_key.split(",")[0]
-        if representation == "indirection":
-            label, entries = f"{side}→{side // 2}", 2 * side**2 + (side // 2) ** 2
-            net = functools.partial(indirection, side, side // 2)
-        else:
-            label, entries = f"{side}²", side**2
-            net = functools.partial(DifferentiableArray, (side, side), 1, "constant", 0.5)
-        note = "learns D as it is, at the paper's learning rate" if settings_key == "raw" else ""
-        label += " raw" * (settings_key == "raw")
-        training = self.train(label, net, settings_key, encoding)
-        for storage in storages:
-            suffix, size = _STORED[storage]
-            form = lambda net, s=storage: net.to(s)  # noqa: E731
-            self.add(label + suffix, representation, storage, size * entries, training, form, encoding, note=note)
-
-    def add_networks(self, inputs: str) -> None:
-        """Register networks as tensors and as cooperative vectors, after a hash grid, and in front of a table."""
-        plain = inputs == "plain"
-        networks = [(f"MLP {w}x{n}", "network", Network(2, w, n)) for w, n in (NETWORKS if plain else NETWORKS[1:])]
-        if plain:
-            networks.append(("grid + MLP 16", "hash grid + network", Network(2, 16, 1, HASH_GRID)))
-            networks.append((f"MLP 8 + {PRIMARY}²", "network + table", Network(2, 8, 2, table=PRIMARY)))
-        if self.quick:
-            networks = [networks[0], *networks[-2:]] if plain else []
-        encoding = Encoding(inputs, "root")
-        for label, representation, network in networks:
-            settings_key = "network" if network.width < 32 else "wide network"
-            training = self.train(label, lambda n=network: n, settings_key, encoding)
-            size = network.alloc(self.types.TensorXf, 2, dr.rng(seed=1)).nbytes
-            operations = self._network_operations(training, encoding)
-            self.add(label, representation, "cooperative vectors", size, training, Network.cooperative, encoding,
-                     operations)  # fmt: skip
-            self.add(f"{label} tensor", representation, "tensors", size, training, lambda net: net, encoding,
-                     operations)  # fmt: skip
-
-    def _network_operations(self, training: ConvergenceTraining, encoding: Encoding) -> Callable[[str], Operations]:
-        """Return a counter of the operations in a kernel and of the matrix products, which a kernel does not show."""
-
-        def counted(query: str) -> Operations:
-            read, inputs = LearnedGGX(training.net.cooperative(), encoding), self.directions(64)
-            return count_query(lambda: [read(*inputs)]) + training.net.products()
-
-        return counted
-
-    def add_formula(self) -> None:
-        """Register the formula: the truth, read at both kinds of inputs."""
-        self.candidates.append(Candidate("formula", "formula", is_truth=True, label="formula", in_passes=False))
-        self.readers["formula"] = lambda: lambda cos, sin2, alpha: ggx(sin2, alpha)
-        self.inputs["formula"] = "any"
-        self.ratios += [(self.reference(inputs), "formula") for inputs in INPUTS[::-1]]
-
-    def case(self, name: str, inputs: str, details: dict) -> Case:
-        names = [n for n in self.readers if self.inputs[n] in (inputs, "any")]
-        return Case(name, lambda lanes: self._queries(names, lanes), None, details, tuple(names))
-
-    def _queries(self, names: list[str], lanes: int) -> dict:
-        cos, sin2, alpha = directions = self.directions(lanes)
-        functions = {FLOOR: lambda: list(directions)}
-        for name in names:
-            distribution = self.readers[name]()
-            functions[name] = lambda d=distribution: [d(cos, sin2, alpha)]
-        return {"read": functions}
-
-    def directions(self, lanes: int) -> tuple:
-        """Return ``(cos θ_h, sin² θ_h, α)`` of ``lanes`` reads, evaluated."""
-        samples = draw(dr.rng(seed=dr.opaque(self.types.UInt64, 7)), self.types, lanes)
-        dr.make_opaque(*samples)
-        return samples
-
-    def conductors(self) -> list[Case]:
-        """Register ``neural_ggx`` with its shipped tables and ``roughconductor``; return a case per roughness."""
-        plugins = {"roughconductor": {"type": "roughconductor", "distribution": "ggx"}}
-        self.candidates.append(Candidate("roughconductor", "Mitsuba", is_truth=True, in_passes=False))
-        for storage in STORAGES:
-            name = "neural_ggx" + ("" if storage == "float32" else f", {storage}")
-            plugins[name] = {"type": "neural_ggx", "storage": storage}
-            model = TASK.open(self.types.TensorXf, storage=storage)
-            self.candidates.append(
-                Candidate(name, "indirection", storage, model.nbytes, None, model.measure, in_passes=False)
-            )
-            self.ratios.append((name, "roughconductor"))
-        return [
-            Case(
-                f"conductor, {roughness} roughness",
-                lambda lanes, r=roughness: _conductor_queries(plugins, r, lanes),
-                None,
-                {"material": "Cu", "alpha": 0.2, "roughness": roughness},
-                tuple(plugins),
-                QUERIES,
-                False,
-            )
-            for roughness in (("constant",) if self.quick else ("constant", "textured"))
-        ]
+def _reads(types, readers: dict[str, Callable], lanes: int) -> dict:
+    """Return the reads of all candidates for one kind of inputs."""
+    inputs = _inputs(types, lanes)
+    functions = {FLOOR: lambda: list(inputs)}
+    for name, reader in readers.items():
+        functions[name] = lambda reader=reader: [reader()(*inputs)]
+    return {"read": functions}
 
 
 def _conductor_queries(plugins: dict, roughness: str, lanes: int) -> dict:
@@ -325,8 +276,7 @@ def _conductor_queries(plugins: dict, roughness: str, lanes: int) -> dict:
     return bsdf_queries(bsdfs, directions(lanes), roughness == "textured")
 
 
-@dataclass(frozen=True)
-class EqualQuality:
+class EqualQuality(NamedTuple):
     """The smallest member of a family as good as a reference, else its best member.
 
     ``ratios`` are flops, bytes read, bytes stored and time, relative to the reference; ``paper`` has the paper's first
@@ -338,50 +288,26 @@ class EqualQuality:
     psnr_db: float
     ratios: tuple[float, float, float, float]
     paper: tuple[float, float, float] | None
-    converged: bool
-    reaches: bool
 
 
-def _psnr(result: dict, name: str) -> float:
-    return result["candidates"][name]["errors"]["psnr_db"]
-
-
-def equal_quality(result: dict, reference: str) -> list[EqualQuality]:
+def equal_quality(result: dict, reference: str = REFERENCE) -> list[EqualQuality]:
     """Return a member of each family beside the candidate ``reference``, for the inputs of the paper."""
-    timings, candidates = result["cases"][PLAIN]["queries"]["read"], result["candidates"]
-    goal, operations = _psnr(result, reference), timings[reference]["operations"]
-    rows = []
+    timings, candidates, rows = result["cases"][PLAIN]["queries"]["read"], result["candidates"], []
+    psnr = {name: candidates[name]["errors"].get("psnr_db") for name in timings}
+
+    def costs(name: str) -> tuple[float, float, float, float]:
+        t = timings[name]
+        return t["operations"]["flops"], t["operations"]["bytes_gathered"], candidates[name]["bytes"], t["time"]
+
     for family, paper in {**PAPER, "hash grid + network": None}.items():
         members = [
             name for name in timings
-            if candidates[name]["representation"] == family and candidates[name]["setting"] not in STORAGES[1:]
-            and "raw" not in name and candidates[name]["setting"] != "tensors"
+            if candidates[name]["representation"] == family and "raw" not in name
+            and candidates[name]["setting"] not in STORAGES[1:]
         ]  # fmt: skip
-        if not members:
-            continue
-        good = [name for name in members if _psnr(result, name) >= goal - EQUAL_DB]
-        name = min(good or members, key=lambda n: candidates[n]["bytes"] if good else -_psnr(result, n))
-        timing = timings[name]
-        ratios = (
-            timing["operations"]["flops"] / operations["flops"],
-            timing["operations"]["bytes_gathered"] / operations["bytes_gathered"],
-            candidates[name]["bytes"] / candidates[reference]["bytes"], timing["time"] / timings[reference]["time"],
-        )  # fmt: skip
-        converged = bool(candidates[name]["converged"])
-        rows.append(EqualQuality(family, name, _psnr(result, name), ratios, paper, converged, bool(good)))
+        good = [name for name in members if psnr[name] >= psnr[reference] - EQUAL_DB]
+        if members:
+            name = min(good or members, key=lambda n: candidates[n]["bytes"] if good else -psnr[n])
+            ratios = tuple(a / b for a, b in zip(costs(name), costs(reference), strict=True))
+            rows.append(EqualQuality(family, name, psnr[name], ratios, paper))
     return rows
-
-
-def conclusions(result: dict, reference: str) -> list[str]:
-    """Return lines about the members of all families at the quality of ``reference``, if it has converged."""
-    if PLAIN not in result["cases"] or not result["candidates"].get(reference, {}).get("converged"):
-        return [f"{reference} has not converged: no statement is made"]
-    lines = [
-        f"at the quality of {reference}, {_psnr(result, reference):.1f} dB, times as many flops, bytes read, bytes, ns"
-    ]
-    for row in equal_quality(result, reference):
-        state = "" if row.converged and row.reaches else " (not converged)" if row.reaches else " (does not reach it)"
-        ratios = ", ".join(f"{ratio:.2f}" for ratio in row.ratios)
-        paper = f"; the paper's {', '.join(f'{r:g}' for r in row.paper)}" if row.paper else ""
-        lines.append(f"  {row.family}: {row.name}, {row.psnr_db:.1f} dB{state}: {ratios}{paper}")
-    return lines

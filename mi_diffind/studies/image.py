@@ -1,29 +1,30 @@
 """Study ``tradeoff image``: quality of a compressed image or material against bytes, seconds of training and read time.
 
-*Bytes*: at each compression ratio, indirection into cascaded arrays of 2, 3 and 4 dimensions by our preset and the
-paper's is compared with a hash grid and network and with codecs (:mod:`.baselines.codecs`) at the largest size that is
-not above; ASTC with one block size for all maps and with the best block size of each map. *Seconds*: trainings of
-several lengths by both presets, each with its own schedule. *Time*: kernels read all maps of a material at random and
-at coherent places, from ``neural_image`` and from ``bitmap`` with 8 bits and with floats.
+*Bytes*: at each compression ratio, arrays trained by our preset and the paper's are compared with a hash grid and
+network and with codecs (:mod:`.baselines.codecs`) at the largest size that is not above; ASTC with one block size for
+all maps and with the best block size of each map. *Seconds*: trainings of several lengths, each with its own schedule.
+*Time*: kernels read all maps of a material at random places, from ``neural_image`` and from ``bitmap`` with 8 bits and
+with floats.
 
-Errors are those of the values in the source's files; FLIP and SSIM are means over maps, each shown as a picture.
-Materials with normals or roughness are also compared as they are seen (:mod:`mi_diffind.maps.as_seen`).
+Errors are those of the values in the source's files; FLIP is a mean over maps, each shown as a picture. Materials with
+normals or roughness are also compared as they are seen (:mod:`mi_diffind.maps.as_seen`).
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
-import math
-import time
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from PIL.Image import Resampling
 
 from ..core.arguments import positive
 from ..core.progress import Deadline
@@ -32,7 +33,7 @@ from ..core.units import parse_compression
 from ..fitting.loop import FitSettings, fit
 from ..images import metrics
 from ..maps import as_seen
-from ..maps.compressed import decibel
+from ..maps.pyramid import Pyramid, decibel
 from ..maps.source import Source, load_source
 from ..measure.study import FLOOR, Candidate, Case, Measure, Plan, Study
 from ..measure.training import halve
@@ -44,26 +45,18 @@ from .texture import add_astc_option, source_details
 #: Bitmaps whose reads are timed → whether they hold 8-bit values.
 BITMAPS = {"bitmap, 8 bits": True, "bitmap, floats": False}
 
+#: Methods without random access.
+STREAMS = ("JPEG", "WebP")
+
 #: Training of the network; ``seconds`` end it.
 NETWORK_SETTINGS = FitSettings(steps=10**6, batch=2**12, lr=1e-2, schedule="cosine", loss="mse", measure_every=200)
 
 MEASURES = (
-    Measure("PSNR", "psnr_db"),
+    Measure("PSNR, dB", "psnr_db"),
     Measure("between texels", "psnr_between_db"),
-    Measure("mean of maps", "psnr_mean_db"),
     Measure("FLIP", "flip", ".4f", False),
-    Measure("SSIM", "ssim", ".3f"),
     Measure("as seen", "seen_db"),
 )
-
-
-#: Options that may be repeated → help, type, choices.
-_REPEATED = {
-    "--compression": ("compression ratio, such as 12x (default)", str, None),
-    "--seconds": ("seconds of each training by our preset (default: 60; --quick: 2)", positive, None),
-    "--paper-seconds": ("seconds of each by the paper's preset (default: the longest of --seconds)", positive, None),
-    "--dims": ("dimensions of the cascaded array, 2, 3 or 4 (default: all)", int, (2, 3, 4)),
-}
 
 
 class ImageStudy(Study):
@@ -75,9 +68,11 @@ class ImageStudy(Study):
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         parser.add_argument("source", metavar="IMAGE|MATERIAL.json")
-        for option, (text, value_type, choices) in _REPEATED.items():
-            parser.add_argument(option, action="append", default=[], type=value_type, choices=choices, metavar="N",
-                                help=f"{text}; may be repeated")  # fmt: skip
+        parser.add_argument("--compression", action="append", default=[], metavar="N",
+                            help="compression ratio (default: 12x); may be repeated")  # fmt: skip
+        parser.add_argument("--seconds", action="append", default=[], type=positive, metavar="N",
+                            help="seconds of each training by our preset (default: 60; --quick: 2); may be repeated; "
+                            "other methods are trained for the longest")  # fmt: skip
         add_astc_option(parser)
 
     def check(self, arguments) -> None:
@@ -87,14 +82,10 @@ class ImageStudy(Study):
 
     def plan(self, arguments) -> Plan:
         quick = arguments.quick
-        seconds = tuple(map(float, arguments.seconds)) or (2.0 if quick else 60.0,)
         settings = SimpleNamespace(
             compressions=arguments.compressions[:1] if quick else arguments.compressions,
-            seconds=seconds,
-            paper_seconds=tuple(map(float, arguments.paper_seconds)) or (max(seconds),),
-            dims=tuple(arguments.dims) or (2, 3, 4),
+            seconds=sorted(map(float, arguments.seconds)) or [2.0 if quick else 60.0],
             astc="fast" if quick else arguments.astc,
-            astc_choice="fast" if quick else "medium",  # preset that selects block sizes
         )
         return plan(arguments.loaded, arguments.source, settings)
 
@@ -106,134 +97,119 @@ STUDY = ImageStudy()
 
 
 @dataclass
-class ImageStudyContext:
-    """The source, the file ``name`` that it was read from, and the settings."""
+class ImageContenders:
+    """Contenders of a source, which was read from the file ``name``."""
 
     source: Source
     name: str
-    settings: SimpleNamespace
 
-    def record(
-        self, job: Contender, nbytes: int, seconds: float | None, maps: dict, between_db=None, **details
-    ) -> dict:
-        """Return the record of an encoding with its errors; ``maps`` are the decoded maps by name."""
-        errors = errors_of(self.source, maps)
-        errors["psnr_between_db"] = between(self.source, maps) if between_db is None else between_db
-        seen = as_seen.compare(self.source, maps, array_module())
-        errors |= {name: value for name, value in seen.items() if name.startswith("seen_")}
-        details |= {"compression": job.budget or None, "ratio": self.source.nbytes / nbytes, "kind": job.method}
-        details["random_access"] = job.details["random_access"]
-        return {"bytes": nbytes, "seconds": seconds, "errors": errors, "details": details}
+    def contender(self, name: str, method: str, budget: float, encode: Callable, read=None) -> Contender:
+        """Return a contender; a budget of 0 stands for a method of one size.
 
-    def contender(self, name: str, method: str, budget: float, fit: Callable, read=None, random_access=True):
-        """Return a contender; a budget of 0 stands for a method of one size."""
-        label = method + ("" if random_access else " (no random access)")
-        return Contender(name, method, budget, fit, read, label, has_file=read is not None,
-                         details={"random_access": random_access})  # fmt: skip
+        ``encode(job, progress)`` returns the decoded maps by name, bytes, seconds of training and details, or ``None``
+        after Ctrl-C.
+        """
+        details = {"random_access": method not in STREAMS, "kind": method, "compression": budget or None}
 
-    def trained(self, name: str, method: str, compression: float, seconds: float, **options) -> Contender:
-        """Return an indirection, trained for ``seconds`` by the preset that begins its name, with further options."""
+        def fit(job: Contender, progress: bool) -> dict | None:
+            result = encode(job, progress)
+            if result is None:
+                return None
+            maps, nbytes, seconds, more = result
+            more = {**more, **details, "ratio": self.source.nbytes / nbytes}
+            return {"bytes": nbytes, "seconds": seconds, "errors": errors_of(self.source, maps), "details": more}
 
-        def train(job: Contender, progress: bool) -> dict | None:
-            arguments = {"source": self.name, "compression": compression, "seconds": seconds, **options}
-            trained = equal_memory.fit_preset(job, progress, "image", "image", name.split()[0], arguments)
+        label = method + " (no random access)" * (method in STREAMS)
+        return Contender(name, method, budget, fit, read, label, has_file=read is not None, details=details)
+
+    def trained(self, preset: str, method: str, compression: float, seconds: float) -> Contender:
+        """Return the arrays that a preset trains for ``seconds``."""
+
+        def train(job: Contender, progress: bool) -> tuple | None:
+            arguments = {"source": self.name, "compression": compression, "seconds": seconds}
+            trained = equal_memory.fit_preset(job, progress, "image", "image", preset, arguments)
             if trained is None:
                 return None
             model, fitted = trained
             table, result = fitted.table, fitted.result
-            primary, *_, cascaded = (array.shape for array in table.arrays.values())
-            curve = [(h["step"] * result.seconds / result.steps, h["psnr_db"]) for h in result.history]
-            return self.record(
-                job, table.nbytes, result.seconds, model.image.decode(), table.measured["psnr_between_db"],
-                file=str(job.file), seconds_asked=seconds, steps=result.steps, structure=table.settings["structure"],
-                course=curve, rows=primary[0], cascaded=cascaded[0], dims=len(cascaded) - 1,
-                memory_bytes=model.memory_nbytes,
-            )  # fmt: skip
+            details = {"file": str(job.file), "structure": table.settings["structure"], "steps": result.steps}
+            return model.image.decode(), table.nbytes, result.seconds, details
 
         def read(job: Contender):
             return equal_memory.open_preset(job, "image").image
 
-        return self.contender(f"{name} {compression:g}x {seconds:g} s", method, compression, train, read)
-
-    def encoded(self, name: str, method: str, budget: float, encode: Callable, random_access: bool = True) -> Contender:
-        """Return maps encoded by a codec; ``encode()`` returns the encoded maps by name, and their bytes."""
-
-        def fit(job: Contender, progress: bool) -> dict:
-            start = time.perf_counter()
-            encoded, nbytes = encode()
-            seconds = time.perf_counter() - start
-            how = ", ".join(f"{name} {e.codec}" for name, e in encoded.items())
-            maps = {name: e.image for name, e in encoded.items()}
-            return self.record(job, nbytes, None, maps, how=how, encoding_seconds=seconds)
-
-        return self.contender(name, method, budget, fit, random_access=random_access)
+        return self.contender(f"{preset} {compression:g}x {seconds:g} s", method, compression, train, read)
 
     def network(self, compression: float, seconds: float) -> Contender:
-        """Return a hash grid and network in half precision, trained for ``seconds``."""
+        """Return a hash grid and network in half precision; raise ``ValueError`` if the bytes are too few."""
         name = f"hash grid + network {compression:g}x {seconds:g} s"
+        pyramid = Pyramid.of(self.source, types=array_module())
+        net = networks.texture_network(pyramid.layout, self.source.nbytes / compression, levels=1)
 
-        def train(job: Contender, progress: bool) -> dict | None:
-            net = networks.image_network(self.source, self.source.nbytes / compression)
-            problem = networks.ImageNetworkProblem(net, array_module(mi.variant()), self.source)
+        def train(job: Contender, progress: bool) -> tuple | None:
+            problem = networks.TextureNetworkProblem(net, pyramid, self.source.digest)
             title = f"train {name}" if progress else None
             result = fit(problem, NETWORK_SETTINGS, progress=progress, title=title, deadline=Deadline(seconds))
             if result.interrupted:
                 return None
             halve(problem.net)
-            curve = [(h["step"] * result.seconds / result.steps, h["psnr_db"]) for h in result.history]
-            nbytes, maps = 2 * problem.net.parameters, problem.decode(problem.net)
-            return self.record(job, nbytes, result.seconds, maps, steps=result.steps, course=curve)
+            maps = networks.NetworkMaps(problem.net, pyramid).decode()
+            return maps, 2 * problem.net.parameters, result.seconds, {"steps": result.steps}
 
         return self.contender(name, "network", compression, train)
 
+    def encoded(self, name: str, method: str, budget: float, encode: Callable[[], dict]) -> Contender:
+        """Return maps encoded by a codec; ``encode()`` returns the encoded maps by name."""
 
-def trained_contenders(context: ImageStudyContext) -> list[Contender]:
-    """Return the trainings at all ratios; further lengths, presets and dimensions are those of the first one."""
-    settings, (first, *others) = context.settings, context.settings.compressions
-    shortest = min(settings.seconds)
-    jobs = [context.trained("ours", "indirection", first, seconds) for seconds in sorted(settings.seconds)]
-    for seconds in settings.paper_seconds:
-        jobs.append(context.trained("paper", "indirection, paper's preset", first, seconds))
+        def fit(job: Contender, progress: bool) -> tuple:
+            encoded = encode()
+            how = ", ".join(f"{name} {e.codec}" for name, e in encoded.items())
+            maps = {name: e.image for name, e in encoded.items()}
+            return maps, sum(e.nbytes for e in encoded.values()), None, {"how": how}
+
+        return self.contender(name, method, budget, fit)
+
+
+def trained_contenders(contenders: ImageContenders, compressions: Sequence[float], seconds: Sequence[float]) -> list:
+    """Return the trainings at all ratios; further lengths and methods are those of the first one."""
+    first, *others = compressions
+    jobs = [contenders.trained("ours", "indirection", first, length) for length in seconds]
+    jobs.append(contenders.trained("paper", "indirection, paper's preset", first, seconds[-1]))
     with contextlib.suppress(ValueError):  # too few bytes for a network
-        networks.image_network(context.source, context.source.nbytes / first)
-        jobs.append(context.network(first, max(settings.seconds)))
-    for dims in sorted({*settings.dims} - {4}):
-        jobs.append(context.trained(f"ours 2D→{dims}D", "indirection", first, shortest, dims=dims))
-    return jobs + [context.trained("ours", "indirection", compression, shortest) for compression in others]
+        jobs.append(contenders.network(first, seconds[-1]))
+    return jobs + [contenders.trained("ours", "indirection", compression, seconds[0]) for compression in others]
 
 
-def coded_contenders(context: ImageStudyContext) -> list[Contender]:
+def coded_contenders(contenders: ImageContenders, compressions: Sequence[float], quality: str) -> list[Contender]:
     """Return a contender for each installed codec at each ratio; all maps together take at most the bytes of it."""
-    source, settings = context.source, context.settings
+    source, jobs, cache = contenders.source, [], {}
     values = {m.name: _clipped(m.values) for m in source.maps}
     normals = [m.name for m in source.maps if m.role == "normal"]
-    installed, cache, jobs = codecs.available(), {}, []
     if any(v.shape[-1] > 4 for v in values.values()):
         return []
-    for compression in settings.compressions:
-        nbytes, ratio = source.nbytes / compression, f"{compression:g}x"
 
-        def blocks(uniform: bool, nbytes=nbytes):
-            return codecs.astc_material(
-                values, nbytes, settings.astc, uniform, normals, (1, 2), settings.astc_choice, cache
-            )
+    def resolutions(image: np.ndarray) -> list[np.ndarray]:
+        rounded = np.rint(255 * image) / np.float32(255)
+        return [image, codecs.resized(rounded, *(-(-n // 2) for n in image.shape[:2]), Resampling.LANCZOS)]
 
-        def maps(codec: str, nbytes=nbytes):
-            shares = {name: int(nbytes * v.shape[-1] / source.channels) for name, v in values.items()}
-            parts = {name: codecs.at_bytes(codec, v, shares[name]) for name, v in values.items()}
-            return parts, sum(p.nbytes for p in parts.values())
+    def astc(compression: float, uniform: bool) -> dict:
+        maps = {name: resolutions(v) for name, v in values.items()}
+        return codecs.astc_levels(maps, source.nbytes / compression, quality, normals, False, uniform, cache)[0]
 
-        if "astc" in installed:
-            jobs.append(context.encoded(f"ASTC {ratio}, one block size", "ASTC", compression, lambda b=blocks: b(True)))
-            if len(values) > 1:
-                each = f"ASTC {ratio}, each map its own"
-                jobs.append(context.encoded(each, "ASTC", compression, lambda b=blocks: b(False)))
-        if "bc7" in installed and compression == settings.compressions[0]:
-            jobs.append(context.encoded("BC7", "BC7", 0.0, lambda m=maps: m("bc7")))
-        for codec, name in (("jpeg", "JPEG"), ("webp", "WebP"), ("bicubic", "bicubic")):
-            if codec in installed:
-                encode = lambda m=maps, c=codec: m(c)  # noqa: E731
-                jobs.append(context.encoded(f"{name} {ratio}", name, compression, encode, codec == "bicubic"))
+    def by_map(codec: str, compression: float) -> dict:
+        share = source.nbytes / compression / source.channels
+        return {name: codecs.at_bytes(codec, v, int(share * v.shape[-1])) for name, v in values.items()}
+
+    for codec, compression in itertools.product(codecs.available(), compressions):
+        title, ratio = codecs.TITLES[codec], f"{compression:g}x"
+        if codec == "astc":
+            for text, uniform in (("one block size", True), ("each map its own", False))[: len(values)]:
+                encode = partial(astc, compression, uniform)
+                jobs.append(contenders.encoded(f"{title} {ratio}, {text}", title, compression, encode))
+        elif codec != "bc7":
+            jobs.append(contenders.encoded(f"{title} {ratio}", title, compression, partial(by_map, codec, compression)))
+        elif compression == compressions[0]:  # of one size
+            jobs.append(contenders.encoded(title, title, 0.0, partial(by_map, codec, compression)))
     return jobs
 
 
@@ -242,31 +218,15 @@ def coded_contenders(context: ImageStudyContext) -> list[Contender]:
 
 def plan(source: Source, name: str, settings: SimpleNamespace) -> Plan:
     """Return the plan for ``source``, read from the file ``name``, in the current variant."""
-    context = ImageStudyContext(source, name, settings)
-    trained = trained_contenders(context)
-    jobs = [*trained, *coded_contenders(context)]
-    candidates = [
-        job.candidate(competes=job.details["random_access"], in_passes=False,
-                      label=job.name)
-        for job in jobs
-    ]  # fmt: skip
+    contenders, compressions = ImageContenders(source, name), settings.compressions
+    trained = trained_contenders(contenders, compressions, settings.seconds)
+    jobs = [*trained, *coded_contenders(contenders, compressions, settings.astc)]
+    candidates = [job.candidate(competes=job.details["random_access"], label=job.name) for job in jobs]
     candidates += [
-        Candidate(label, "Mitsuba", is_reference=True, bytes=source.nbytes * (1 if eight else 4), in_passes=False)
+        Candidate(label, "Mitsuba", is_reference=True, bytes=source.nbytes * (1 if eight else 4))
         for label, eight in BITMAPS.items()
     ]
-    timed = {
-        job.name: job for job in trained
-        if job.has_file and job.budget == settings.compressions[0]
-    }  # fmt: skip
-    cases = [
-        Case(
-            f"{place} places",
-            lambda lanes, p=place: _reads(source, timed, p, lanes),
-            candidates=(*timed, *BITMAPS),
-            in_picture=place == "random",
-        )
-        for place in ("random", "coherent")
-    ]
+    timed = {job.name: job for job in trained if job.has_file and job.budget == compressions[0]}
     note = (
         f"{name}, {source.width} × {source.height}, {len(source.maps)} map(s), {source.nbytes:,} bytes. PSNR of all "
         "channels together. JPEG and WebP have no random access."
@@ -275,10 +235,7 @@ def plan(source: Source, name: str, settings: SimpleNamespace) -> Plan:
         study="image",
         title=f"Compressed image: {Path(name).stem}",
         candidates=candidates,
-        cases=cases,
-        queries=("read",),
-        accuracy="psnr_db",
-        accuracy_label="PSNR, dB",
+        cases=[Case("random places", partial(reads, source, timed))],
         ratios=[(c.name, "bitmap, 8 bits") for c in candidates if c.name != "bitmap, 8 bits"],
         details={**source_details(source, name), "request": vars(settings), "codecs": list(codecs.available())},
         notes=[note, *codecs.install_notes()],
@@ -297,79 +254,50 @@ def _clipped(values: np.ndarray) -> np.ndarray:
 def errors_of(source: Source, maps: dict[str, np.ndarray]) -> dict:
     """Return the errors of decoded maps, rounded to 8 bits.
 
-    ``psnr_db`` is that of all channels together; ``psnr_mean_db``, ``flip`` and ``ssim`` are means over maps. Each map
-    has ``psnr_NAME_db``, ``flip_NAME``, ``ssim_NAME``, and normal maps ``angle_NAME_deg``, the mean angle.
+    ``psnr_db`` is that of all channels together, ``psnr_between_db`` that of bilinear reads, one in each texel, without
+    rounding; ``psnr_NAME_db`` is that of a map, and ``flip`` the mean of all maps. Errors as seen are those of
+    :func:`.as_seen.compare`.
     """
-    errors, squares, weights = {}, [], []
+    by_map, squares, between, flips = {}, [], [], []
+    a, b = np.random.default_rng(2023).random((2, source.height, source.width, 1), dtype=np.float32)
     for m in source.maps:
         reference, image = _clipped(m.values), _clipped(np.round(np.clip(maps[m.name], 0, 1) * 255) / 255)
         squares.append(float(np.mean((reference - image) ** 2, dtype=np.float64)))
-        weights.append(m.channels)
-        errors[f"psnr_{m.name}_db"] = decibel(squares[-1])
-        errors[f"flip_{m.name}"] = metrics.flip_shown(_picture(reference), _picture(image))
-        errors[f"ssim_{m.name}"] = metrics.ssim(reference, image)
-        if m.role == "normal" and m.channels == 3:
-            errors[f"angle_{m.name}_deg"] = metrics.angle(reference, image)
-
-    def mean(measure: str) -> float | None:
-        values = [v for k, v in errors.items() if k.startswith(f"{measure}_")]
-        return float(np.mean(values)) if None not in values else None
-
-    joint = decibel(float(np.average(squares, weights=weights)))
-    return {"psnr_db": joint, "psnr_mean_db": mean("psnr"), "flip": mean("flip"), "ssim": mean("ssim"), **errors}
-
-
-def between(source: Source, maps: dict[str, np.ndarray]) -> float:
-    """Return the PSNR, in dB, of all channels between texels: bilinear reads of maps and source, one in each texel."""
-    total, random = 0.0, np.random.default_rng(2023)
-    a, b = random.random((2, source.height, source.width, 1), dtype=np.float32)
-    for m in source.maps:
-        e = _clipped(maps[m.name]) - _clipped(m.values)
+        by_map[f"psnr_{m.name}_db"] = decibel(squares[-1])
+        shown = [0, 1, 2] if m.channels > 2 else [0, 0, 0]
+        flips.append(metrics.flip_shown(reference[..., shown], image[..., shown]))
+        e = _clipped(maps[m.name]) - reference
         e = (1 - a) * e + a * np.roll(e, -1, axis=0)  # the interpolation of the difference
         e = (1 - b) * e + b * np.roll(e, -1, axis=1)
-        total += float(np.mean(e**2, dtype=np.float64)) * m.channels / source.channels
-    return decibel(total)
+        between.append(float(np.mean(e**2, dtype=np.float64)))
+    weights = [m.channels for m in source.maps]
+    psnr, psnr_between = (decibel(float(np.average(each, weights=weights))) for each in (squares, between))
+    seen = as_seen.compare(source, maps, array_module())
+    seen = {name: value for name, value in seen.items() if name.startswith("seen_")}
+    return {"psnr_db": psnr, "psnr_between_db": psnr_between, "flip": float(np.mean(flips)), **by_map, **seen}
 
 
-def _picture(values: np.ndarray) -> np.ndarray:
-    """Return three channels to show a map as a picture."""
-    return values[..., :3] if values.shape[-1] >= 3 else np.repeat(values[..., :1], 3, axis=-1)
+def reads(source: Source, jobs: dict[str, Contender], lanes: int) -> dict:
+    """Return functions that read all maps at random places, from each trained file and from bitmaps.
 
-
-def _reads(source: Source, jobs: dict[str, Contender], place: str, lanes: int) -> dict:
-    """Return functions that read all maps, at places of a kind, from each trained file and from bitmaps."""
-    rng, index = dr.rng(seed=dr.opaque(mi.UInt64, 3)), dr.arange(mi.UInt32, lanes)
-    si = dr.zeros(mi.SurfaceInteraction3f, lanes)
-    if place == "random":
-        si.uv = mi.Point2f(rng.random(mi.Float, lanes), rng.random(mi.Float, lanes))
-    else:  # a square of neighbouring texels
-        side = 2 ** (round(math.log2(lanes)) // 2)
-        si.uv = mi.Point2f(mi.Float(index % side) / source.width, mi.Float(index // side) / source.height)
+    Bitmaps have 1 or 3 channels of a map.
+    """
+    rng, si = dr.rng(seed=dr.opaque(mi.UInt64, 3)), dr.zeros(mi.SurfaceInteraction3f, lanes)
+    si.uv = mi.Point2f(rng.random(mi.Float, lanes), rng.random(mi.Float, lanes))
     dr.make_opaque(si.uv)
 
-    def read(textures: list):
-        return lambda: [_evaluated(texture, si, channels) for texture, channels in textures]
+    def read(plugins: list[dict], channels: list[int]):
+        methods = [{1: "eval_1", 3: "eval_3"}.get(n, "eval") for n in channels]
+        textures = [mi.load_dict({**plugin, "raw": True}) for plugin in plugins]
+        return lambda: [getattr(t, method)(si) for t, method in zip(textures, methods, strict=True)]
 
     functions = {FLOOR: lambda: [si.uv.x, si.uv.y]}
-    functions |= {name: read(_bitmaps(source, eight)) for name, eight in BITMAPS.items()}
+    values = [np.ascontiguousarray(_clipped(m.values[..., : 3 if m.channels > 2 else 1])) for m in source.maps]
+    for name, eight in BITMAPS.items():
+        bitmaps = [mi.Bitmap(np.rint(255 * v).astype(np.uint8) if eight else v) for v in values]
+        plugins = [{"type": "bitmap", "bitmap": bitmap} for bitmap in bitmaps]
+        functions[name] = read(plugins, [v.shape[-1] for v in values])
     for name, job in jobs.items():
-        plugin = {"type": "neural_image", "filename": str(job.file), "raw": True}
-        functions[name] = read([(mi.load_dict({**plugin, "channels": m.name}), m.channels) for m in source.maps])
+        plugins = [{"type": "neural_image", "filename": str(job.file), "channels": m.name} for m in source.maps]
+        functions[name] = read(plugins, [m.channels for m in source.maps])
     return {"read": functions}
-
-
-def _bitmaps(source: Source, eight: bool) -> list:
-    """Return ``(texture, channels)`` for each map: Mitsuba's bitmap of 1 or 3 of its channels."""
-    textures = []
-    for m in source.maps:
-        values = _clipped(m.values[..., :3] if m.channels >= 3 else m.values[..., :1])
-        data = np.ascontiguousarray(np.rint(values * 255).astype(np.uint8) if eight else values)
-        bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(data), "raw": True}
-        textures.append((mi.load_dict(bitmap), values.shape[-1]))
-    return textures
-
-
-def _evaluated(texture, si, channels: int):
-    if channels == 1:
-        return texture.eval_1(si)
-    return texture.eval_3(si) if channels == 3 else texture.eval(si)

@@ -1,22 +1,24 @@
 """Whole renders of a material: errors of pictures against time and bytes, and the time of a training step.
 
-A slanted plane, a plane to the horizon and a
-sphere have one material, in the sun, which adds no noise, and the sphere also in the sun and a sky. Contenders are
+A slanted plane, a plane to the horizon and a sphere have one material, in the sun, which adds no noise, and the sphere
+also in the sun and a sky. Contenders are
 ``principled`` and ``disney`` with bitmaps, with uncompressed mip maps, with mip maps of LEAN's roughness (isotropic:
 neither BSDF turns its axes from texel to texel), also those of ASTC in the bytes of the trained file, and the trained
 files, read by separate textures and by ``neural_material``. The truth is a converged render of the bitmaps with the
 contender's BSDF; errors are those of linear values clipped to [0, 1], in pixels that are minified and on the surface.
 Each contender is rendered by a process of its own, since Dr.Jit compiles the materials of all scenes that a process
-holds into each kernel. They take turns, on one core; times are medians, of a clock (``ms``) and of the processor
-(``cpu_ms``), which depends less on what else the machine does.
+holds into each kernel. They take turns, on one core; times are medians of the time of the processor, which depends less
+on what else the machine does.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import multiprocessing
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,12 +31,11 @@ from ..arrays.tables import Table
 from ..core.compat import use_threads
 from ..core.runtime import array_module
 from ..fitting import task
-from ..maps.compressed import decibel
-from ..maps.pyramid import Pyramid
+from ..maps.pyramid import Pyramid, decibel
 from ..maps.source import Source
 from ..measure import clock, plot
 from ..measure.renders import TextureScene, still_scenes, to_uv, zoom_scene
-from ..measure.report import figure_caption, publish, write_files
+from ..measure.report import figure_caption, grid, publish, write_files
 from ..measure.statistics import spread
 from ..measure.study import Tradeoff
 from ..plugins.support.image_files import PYRAMIDS
@@ -150,25 +151,27 @@ class RenderedMaterial:
             yield m.role, {"type": self.texture, "channels": m.name, **common}
 
 
-def rendered_materials(source: Source, tables: Sequence[Table]) -> list[RenderedMaterial]:
-    """Return the contenders for a material and textures that were trained on it, the first one in the tables' bytes."""
-    types = array_module(mi.variant())
-    pyramid = Pyramid.of(source, types=types, border=("repeat", "repeat"))
-    lean = normals.with_roughness(pyramid, normals.lean_levels(source, pyramid))
+def mip_maps(source: Source, nbytes: int) -> dict[str, tuple[Pyramid, int]]:
+    """Return uncompressed levels of a material, those of LEAN, and these in ASTC in ``nbytes``, with their bytes."""
+    pyramid = Pyramid.of(source, types=array_module(mi.variant()), border=("repeat", "repeat"))
+    lean = normals.with_roughness(pyramid, normals.lean_levels(pyramid))
     pyramids = {"mip maps": (pyramid, pyramid.nbytes), "LEAN mip maps": (lean, lean.nbytes)}
     if "astc" in codecs.available():
         names = [m.name for m in source.maps if m.role == "normal"]
-        coded, nbytes = codecs.astc_levels(level_images(lean), tables[0].nbytes, "thorough", names)
-        pyramids["LEAN mip maps, ASTC"] = (
-            level_pyramid({name: e.levels for name, e in coded.items()}, lean), nbytes
-        )  # fmt: skip
+        coded, size = codecs.astc_levels(level_images(lean), nbytes, "thorough", names)
+        pyramids["LEAN mip maps, ASTC"] = level_pyramid({name: e.levels for name, e in coded.items()}, lean), size
+    return pyramids
+
+
+def rendered_materials(source: Source, tables: Sequence[Table], quick: bool) -> list[RenderedMaterial]:
+    """Return the contenders for a material and textures that were trained on it; ``quick``: without mip maps."""
     size, few = (source.width, source.height), (1, 4)
     peer = RenderedMaterial(PEER, "principled", "bitmap", source, size, source.nbytes, COUNTS)
     materials = [
         peer, dataclasses.replace(peer, name=MULTIJITTERED, counts=STRATIFIED, sampler="multijitter"),
         dataclasses.replace(peer, name="disney + bitmaps", bsdf="disney", counts=COUNTS[::2]),
     ]  # fmt: skip
-    for name, (levels_of, nbytes) in pyramids.items():
+    for name, (levels_of, nbytes) in ({} if quick else mip_maps(source, tables[0].nbytes)).items():
         values = (levels_of.layout, levels_of.values, levels_of.border)
         for bsdf in ("principled", "disney") if name == "mip maps" else ("principled",):
             materials.append(
@@ -184,21 +187,28 @@ def rendered_materials(source: Source, tables: Sequence[Table]) -> list[Rendered
     return materials
 
 
-def _worker(material: RenderedMaterial, case: str, film, trains: bool, pipe) -> None:
-    """Process of a contender in a scene: answer a pass ``(spp, seed)`` with an image and two times in ms."""
-    mi.set_variant(pipe.recv())
+# -- Processes ---------------------------------------------------------------------------------------------------------
+
+
+def _load(variant: str, material: RenderedMaterial, case: str, film: tuple[int, int], trains: bool) -> None:
+    """Load the scene of a contender, in a process of its own."""
+    global _scene
+    mi.set_variant(variant)
     use_threads(1)  # threads that wait for each other count as time of the processor
     mi.set_log_level(mi.LogLevel.Error)
-    loaded = material.load(textured_scene(case), film, SCENES[case][2], trains)
-    while (request := pipe.recv()) is not None:
-        spp, seed = request[0], dr.opaque(mi.UInt32, request[1])
-        dr.sync_thread()
-        start, start_cpu = time.perf_counter(), time.process_time()
-        result = _step(loaded, seed) if trains else mi.render(loaded, spp=spp, seed=seed)
-        dr.eval(result)
-        dr.sync_thread()
-        times = 1e3 * (time.perf_counter() - start), 1e3 * (time.process_time() - start_cpu)
-        pipe.send((None if trains else np.array(result), *times))
+    _scene = material.load(textured_scene(case), film, SCENES[case][2], trains)
+
+
+def _pass(spp: int, seed: int, trains: bool) -> tuple[np.ndarray | None, float]:
+    """Return an image of the process's scene, or none of a training step, and its time of the processor in ms."""
+    seed = dr.opaque(mi.UInt32, seed)
+    dr.sync_thread()
+    start = time.process_time()
+    result = _step(_scene, seed) if trains else mi.render(_scene, spp=spp, seed=seed)
+    dr.eval(result)
+    dr.sync_thread()
+    elapsed = 1e3 * (time.process_time() - start)
+    return None if trains else np.array(result), elapsed
 
 
 def _step(scene, seed):
@@ -213,94 +223,87 @@ def _step(scene, seed):
     return [parameters[key].grad for key in parameters.keys()]
 
 
-class _Contenders:
-    """Processes of all contenders of a scene."""
-
-    def __init__(self, materials, case: str, film, trains: bool = False):
-        context, self.pipes = multiprocessing.get_context("spawn"), {}
-        for material in materials:
-            self.pipes[material.name], other = context.Pipe()
-            arguments = (material, case, film, trains, other)
-            context.Process(target=_worker, args=arguments, daemon=True).start()
-            self.pipes[material.name].send(mi.variant())
-
-    def run(self, name: str, spp: int, seed: int) -> tuple:
-        self.pipes[name].send((spp, seed))
-        return self.pipes[name].recv()
-
-    def close(self) -> None:
-        for pipe in self.pipes.values():
-            pipe.send(None)
+@contextlib.contextmanager
+def _processes(materials: Iterable[RenderedMaterial], case: str, film: tuple[int, int], trains: bool = False):
+    """Start a process for each contender; yield the function that does a pass ``(name, spp, seed)`` in its process."""
+    context = multiprocessing.get_context("spawn")
+    with contextlib.ExitStack() as stack:
+        pools = {
+            m.name: stack.enter_context(
+                ProcessPoolExecutor(1, context, _load, (mi.variant(), m, case, film, trains))
+            ) for m in materials
+        }  # fmt: skip
+        wait([pool.submit(_pass, 1, 0, trains) for pool in pools.values()])  # all compile at the same time
+        yield lambda name, spp, seed: pools[name].submit(_pass, spp, seed, trains).result()
 
 
-def measure(name: str, source: Source, tables: Sequence[Table], settings: RenderSettings) -> dict:
-    """Measure renders of a material with a name; return the result, a tree of numbers and strings (JSON).
+# -- Measurement -------------------------------------------------------------------------------------------------------
 
-    ``scenes``: name → ``points``, a list of ``name``, ``sampler``, ``spp``, ``psnr_db``, ``brightness`` (over the
-    truth's), ``ms`` and ``cpu_ms`` with quartiles; ``models_db``, the PSNR of one truth against the other;
-    ``equal_error`` (:func:`equal_errors`). ``steps``: name → ``ms``, ``cpu_ms``, ``ratio`` (to :data:`PEER`).
-    ``bytes``: name → bytes.
+
+def run_renders(name: str, source: Source, tables: Sequence[Table], settings: RenderSettings, folder: str) -> Tradeoff:
+    """Measure renders of a material with a name, write the files into ``folder`` and return the result.
+
+    ``scenes``: name → ``points``, a list of ``name``, ``spp``, ``psnr_db`` and ``cpu_ms`` with quartiles, and
+    ``equal_error`` (:func:`equal_errors`). ``steps``: name → ``cpu_ms``, ``ratio`` (to :data:`PEER`). ``bytes``: name →
+    bytes.
     """
-    materials = rendered_materials(source, tables)
-    cases = {name: _scene(materials, name, settings) for name in list(SCENES)[: 1 if settings.quick else None]}
+    materials = rendered_materials(source, tables, settings.quick)
     result = {
         "task": "shading_renders", "title": f"Whole renders: {name}", "interrupted": False,
         "machine": clock.machine(mi.variant()), "date": time.strftime("%Y-%m-%d"),
         "settings": dataclasses.asdict(settings), "tables": [Path(t.path).name for t in tables],
         "notes": [f"{name}, {source.width} × {source.height}; {settings.film[0]} × {settings.film[1]} pixels; "
                   "times of the processor, one core.", *codecs.install_notes(["astc"])],
-        "bytes": {m.name: m.nbytes for m in materials}, "scenes": cases,
+        "bytes": {m.name: m.nbytes for m in materials},
+        "scenes": {case: _measure(materials, case, settings) for case in list(SCENES)[: 1 if settings.quick else None]},
         "steps": _steps(materials, settings),
     }  # fmt: skip
-    result["conclusions"] = [
-        f"{case}, {name}: {'below ' * s['bound']}{s['share']:.2f} of the time of {peer} at equal error"
-        for case, scene in cases.items()
-        for name, shares in scene["equal_error"].items()
-        for peer, s in shares.items()
-    ]
-    return result
+    table = [
+        {"scene": case, **point, "cpu_ms": point["cpu_ms"]["median"], "bytes": result["bytes"][point["name"]]}
+        for case, scene in result["scenes"].items() for point in scene["points"]
+    ]  # fmt: skip
+    shares = [["at equal error, time over that of", PEER, "multijittered"]] + [
+        [f"{case}, {name}", *(f"{'below ' * s['bound']}{s['share']:.2f}" for s in shares.values())]
+        for case, scene in result["scenes"].items() for name, shares in scene["equal_error"].items()
+    ]  # fmt: skip
+    files = write_files(result["task"], folder, result, table, {"png": lambda: draw(result)})
+    return publish(result, files, grid(shares))
 
 
-def _scene(materials: list[RenderedMaterial], case: str, settings: RenderSettings) -> dict:
-    contenders, film = _Contenders(materials, case, settings.film), settings.film
-    mask = textured_scene(case).counted(film, materials[0].size)
-    truths = {}
-    for bsdf, name in (("principled", MULTIJITTERED), ("disney", "disney + bitmaps")):
-        images = [contenders.run(name, 64, 1000 + i)[0] for i in range(settings.truth)]
-        truths[bsdf] = np.mean(images, axis=0, dtype=np.float64)[mask]
+def _measure(materials: list[RenderedMaterial], case: str, settings: RenderSettings) -> dict:
+    """Return the errors and times of all contenders in a scene."""
+    mask, truths = textured_scene(case).counted(settings.film, materials[0].size), {}
     records = {(m.name, spp): [] for m in materials for spp in m.counts}
-    for i in tqdm(range(settings.rounds + 1), desc=case, unit="round"):
-        for m in materials if i % 2 == 0 else reversed(materials):
-            for spp in m.counts:
-                image, *times = contenders.run(m.name, spp, 1 + i)
-                if i:  # the first one compiles
-                    truth, shown = truths[m.truth], image[mask].astype(np.float64)
-                    mse = float(np.mean((shown.clip(0, 1) - truth.clip(0, 1)) ** 2))
-                    records[m.name, spp].append((mse, shown.mean() / truth.mean(), *times))
-    contenders.close()
-    points = []
-    for (name, spp), values in records.items():
-        mse, brightness, ms, cpu_ms = np.array(values).T
-        points.append({"name": name, "spp": spp, "psnr_db": decibel(float(mse.mean())),
-                       "brightness": float(brightness.mean()), "ms": spread(ms), "cpu_ms": spread(cpu_ms)})  # fmt: skip
-    models = decibel(float(np.mean((truths["principled"].clip(0, 1) - truths["disney"].clip(0, 1)) ** 2)))
-    return {"points": points, "models_db": models, "equal_error": equal_errors(points)}
+    with _processes(materials, case, settings.film) as render:
+        for bsdf, name in (("principled", MULTIJITTERED), ("disney", "disney + bitmaps")):
+            images = [render(name, 64, 1000 + i)[0] for i in range(settings.truth)]
+            truths[bsdf] = np.mean(images, axis=0, dtype=np.float64)[mask].clip(0, 1)
+        for i in tqdm(range(settings.rounds + 1), desc=case, unit="round"):
+            for m in materials if i % 2 == 0 else reversed(materials):
+                for spp in m.counts:
+                    image, cpu_ms = render(m.name, spp, 1 + i)
+                    if i:  # the first one compiles
+                        mse = np.mean((image[mask].astype(np.float64).clip(0, 1) - truths[m.truth]) ** 2)
+                        records[m.name, spp].append((float(mse), cpu_ms))
+    points = [
+        {"name": name, "spp": spp, "psnr_db": decibel(float(np.mean([mse for mse, _ in values]))),
+         "cpu_ms": spread(ms for _, ms in values)}
+        for (name, spp), values in records.items()
+    ]  # fmt: skip
+    return {"points": points, "equal_error": equal_errors(points)}
 
 
 def _steps(materials: list[RenderedMaterial], settings: RenderSettings) -> dict:
     """Return the times of a training step on the sphere, with trilinear filters: one for each form of material."""
     chosen = {(m.bsdf, m.texture): dataclasses.replace(m, options={}) for m in reversed(materials)}.values()
-    contenders = _Contenders(chosen, "sphere", settings.step_film, True)
     times: dict[str, list] = {m.name: [] for m in chosen}
-    for i in tqdm(range(settings.rounds + 2), desc="training step", unit="round"):
-        for m in chosen:
-            both = contenders.run(m.name, 1, i)[1:]
-            if i > 1:
-                times[m.name].append(both)
-    contenders.close()
-    ms, cpu = ({name: np.array(both)[:, k] for name, both in times.items()} for k in (0, 1))
-    return {name: {"ms": spread(ms[name]), "cpu_ms": spread(cpu[name]), "ratio": spread(cpu[name] / cpu[PEER])}
-            for name in times}  # fmt: skip
+    with _processes(chosen, "sphere", settings.step_film, True) as step:
+        for i in tqdm(range(settings.rounds + 2), desc="training step", unit="round"):
+            for m in chosen:
+                cpu_ms = step(m.name, 1, i)[1]
+                if i > 1:
+                    times[m.name].append(cpu_ms)
+    return {name: {"cpu_ms": spread(ms), "ratio": spread(np.divide(ms, times[PEER]))} for name, ms in times.items()}
 
 
 def equal_errors(points: list[dict]) -> dict:
@@ -323,36 +326,15 @@ def equal_errors(points: list[dict]) -> dict:
     return shares
 
 
-def rows(result: dict) -> list[dict]:
-    """Return a row for each scene, contender and number of samples."""
-    return [
-        {"scene": case, **point, "ms": point["ms"]["median"], "cpu_ms": point["cpu_ms"]["median"],
-         "bytes": result["bytes"][point["name"]]}
-        for case, scene in result["scenes"].items() for point in scene["points"]
-    ]  # fmt: skip
-
-
 def draw(result: dict):
-    """Draw the error against the time of a render in each scene, and against bytes in the first."""
-    panels, first = {}, next(iter(result["scenes"]))
-    styles = [{"linestyle": line, "color": c, "marker": m} for line in ("-", ":") for c, m in plot.STYLES]
-    for case, scene in [*result["scenes"].items(), (f"{first}, one sample a pixel: bytes", result["scenes"][first])]:
-        panels[case] = []
+    """Draw the error against the time of a render in each scene; the legend has the bytes."""
+    ways = ({"linestyle": "-"}, {"linestyle": ":", "markerfacecolor": "white"})
+    styles = [{"color": colour, "marker": marker, **way} for way in ways for colour, marker in plot.STYLES]
+    panels = {case: [] for case in result["scenes"]}
+    for case, scene in result["scenes"].items():
         for (name, nbytes), style in zip(result["bytes"].items(), styles, strict=False):
             points = [p for p in scene["points"] if p["name"] == name]
             at, psnr = [p["cpu_ms"]["median"] for p in points], [p["psnr_db"] for p in points]
-            if case.endswith("bytes"):
-                at, psnr = [nbytes], psnr[:1]
-            panels[case].append(plot.Curve(name, at, psnr, style=style))
-    caption = figure_caption(result)
-    return plot.draw_curves(
-        result["title"], caption, panels, "ms of a render (last: bytes)", "PSNR, dB", True, columns=3, height=4.2
-    )
-
-
-def run_renders(name: str, source: Source, tables: Sequence[Table], settings: RenderSettings, folder: str) -> Tradeoff:
-    """Measure, write the files into ``folder`` and return the result."""
-    result = measure(name, source, tables, settings)
-    table = rows(result)
-    files = write_files(result["task"], folder, result, table, table[0], {"png": lambda: draw(result)})
-    return publish(result, files, result["conclusions"])
+            panels[case].append(plot.Curve(f"{name}, {nbytes / 1e3:,.0f} kB", at, psnr, style=style))
+    labels = "ms of a render, 1 to 64 samples a pixel", "PSNR, dB"
+    return plot.draw_curves(result["title"], figure_caption(result), panels, *labels, "x", height=4.6)

@@ -2,9 +2,8 @@
 
 Monte Carlo noise decreases with render time, the bias of learned tables does not; the study measures both and the
 sample count at which they are equal (:mod:`~mi_diffind.measure.bias`). *Times* are those of the kernels of a whole
-render (:mod:`~mi_diffind.measure.clock`) and the wall-clock time. Exact and learned versions are rendered in turn. The
-kernel of a pass is the same for all sample counts and is compiled before the first pass; times of a pass that compiles
-anything are dropped. Ratios are medians of the ratios of pairs.
+render (:mod:`~mi_diffind.measure.clock`). Exact and learned versions are rendered in turn. The kernel of a pass is the
+same for all sample counts and is compiled before the first pass; times of a pass that compiles anything are dropped.
 """
 
 from __future__ import annotations
@@ -27,9 +26,9 @@ from ..core.progress import interruptible
 from ..images import metrics
 from ..measure import plot, report
 from ..measure.benchmark import Stopped
-from ..measure.bias import LEAST, crossover, describe, error, estimate, root, seconds_of, weights_of
+from ..measure.bias import LEAST, crossover, describe, error, estimate, relative_weights, seconds_at
 from ..measure.clock import machine, timed
-from ..measure.report import duration, grid, machine_line, percent, rounded, state
+from ..measure.report import grid, percent
 from ..measure.statistics import finite, flat_spread, spread
 from ..measure.store import Store, fingerprint, sources
 from ..measure.study import Study, Tradeoff
@@ -37,13 +36,6 @@ from ..scenes import loading
 
 #: Versions of the scene: with the exact counterparts of learned plugins, and as written.
 VERSIONS = ("exact", "learned")
-
-#: Columns of the table.
-COLUMNS = (
-    *("scene", "version", "spp", "mse", "mse_q1", "mse_q3", "rmse", "psnr_db", "images"),
-    *("seconds", "seconds_q1", "seconds_q3", "seconds_wall", "seconds_wall_q1", "seconds_wall_q3", "timed"),
-    *("time_ratio", "time_ratio_q1", "time_ratio_q3", "time_ratio_wall"),
-)
 
 #: Largest ratio of the crossover's sample count to that of the last point at which curves are still continued.
 REACH = 100
@@ -133,15 +125,15 @@ def measure(
     Values that are not finite count as 0. ``launch_samples`` limits the samples of a launch.
 
     Returns the result, a tree of numbers and strings (JSON; ``None`` for unknown values). Errors are relative: ``mse``
-    as in :mod:`~mi_diffind.measure.bias`, ``rmse`` its root. Seconds without ``_wall`` are those of the kernels.
+    as in :mod:`~mi_diffind.measure.bias`, ``rmse`` its root. Seconds are those of the kernels of a whole render.
 
     - ``scene``, ``variant``, ``width``, ``height``, ``seed``, ``defines``, ``learned_plugins``, ``settings``,
       ``machine``, ``date``, ``interrupted``, ``resumed``, ``counts`` (all sample counts), ``not_finite`` (number of
       values);
     - ``points``, a list: ``version``, ``spp``, ``mse`` (median; ``mse_q1``, ``mse_q3``), ``rmse``, ``psnr_db`` (as in
       ``compare``, not corrected for the noise of the truth), ``images``, ``seconds`` (likewise with quartiles),
-      ``seconds_wall``, ``timed`` (number of timed renders);
-    - ``ratios``, a list: ``spp``, ``median``, ``q1``, ``q3`` of learned / exact, ``wall`` the median of wall times;
+      ``timed`` (number of timed renders);
+    - ``ratios``, a list: ``spp``, ``median``, ``q1``, ``q3`` of the times learned / exact;
     - ``reference``: ``spp``, ``passes``, ``noise_rmse`` (subtracted from all errors);
     - ``noise``: for each version ``mse_of_a_sample``, σ²;
     - ``bias``: :func:`~mi_diffind.measure.bias.describe`; ``crossover``: :func:`~mi_diffind.measure.bias.crossover`.
@@ -173,31 +165,25 @@ def measure(
     }
     files = {file for file, _ in parsed.tables(learned)} | set(parsed.files())
     key = {**facts, "scene": Path(scene_path).name, "sources": fingerprint([*sources(), *files])}
-    store = Store(folder, "scene", key, ("passes", "rounds"), progress)
-    samples = len(VERSIONS) * (settings.passes * counts[-1] + settings.rounds * sum(counts[:-1])) + counts[-1]
-    interrupted = False
-    # A unit is a sample per pixel, so the remaining time is in proportion to the remaining units
-    bar = tqdm(total=samples, desc="render", unit="spp", smoothing=0.05, disable=None if progress else True)
-    with interruptible() as stop, bar:
-        run = SceneRun(loaded, counts, settings, seed, store, width * height, bar, stop, launch_samples)
+    store, interrupted = Store(folder, "scene", key, ("pairs",), progress), False
+    with interruptible() as stop:
+        run = SceneRun(loaded, counts, settings, seed, store, width * height, stop, launch_samples)
         try:
-            run.passes()
-            run.rounds()
+            run.renders(progress)
         except Stopped:
             interrupted = True
-    result = finite({
+    return finite({
         **facts,
         "date": time.strftime("%Y-%m-%d"),
         "interrupted": interrupted,
         "resumed": store.resumed,
         **_assemble(store, counts),
     })  # fmt: skip
-    return result | {"verdict": verdict(result)}
 
 
 @dataclass
 class SceneRun:
-    """Renders of a run: each method renders the missing images and raises :class:`Stopped` after Ctrl-C."""
+    """Renders of a run: pairs of an exact and a learned image with the same seed."""
 
     loaded: dict
     counts: list[int]
@@ -205,45 +191,41 @@ class SceneRun:
     seed: int
     store: Store
     pixels: int
-    bar: tqdm
     stop: threading.Event
     launch_samples: int
     is_compiled: bool = False
 
-    def passes(self) -> None:
-        """Render the exact pass for the brightness, and pairs of the highest count with equal seeds."""
-        top = self.counts[-1]
-        store, done = self.store, self.store.data["passes"]
+    def schedule(self) -> list[tuple[int, int, int, bool]]:
+        """Return sample count, index, number of the seed, and whether the learned image comes first, of all pairs."""
+        *lower, top = self.counts
+        pairs = [(top, k, 1 + k, k % 2 == 1) for k in range(self.settings.passes)]
+        for k in range(self.settings.rounds):
+            for spp in lower if k % 2 == 0 else reversed(lower):
+                number = k * len(lower) + lower.index(spp)
+                pairs.append((spp, k, 1 + self.settings.passes + number, (k + number) % 2 == 1))
+        return pairs
+
+    def renders(self, progress: bool) -> None:
+        """Render the exact pass for the brightness and the missing pairs. Raises :class:`Stopped` after Ctrl-C."""
+        store, done, top = self.store, self.store.data["pairs"], self.counts[-1]
         if BRIGHTNESS not in store.arrays:
             store.keep(BRIGHTNESS, exact=self._render("exact", top, 0)[0])
             store.save()
-        self.bar.update(top + len(VERSIONS) * top * len(done))
-        for k in range(len(done), self.settings.passes):
-            images, times = self._pair(top, 1 + k, k % 2 == 1)
-            store.keep(str(k), **images)
-            done[str(k)] = times
-            store.save()
+        todo, truth = [pair for pair in self.schedule() if f"{pair[0]}/{pair[1]}" not in done], None
+        # A unit is a sample per pixel, so the remaining time is in proportion to the remaining units
+        units = sum(len(VERSIONS) * spp for spp, *_ in todo)
+        with tqdm(total=units, desc="render", unit="spp", smoothing=0.05, disable=None if progress else True) as bar:
+            for spp, k, number, learned_first in todo:
+                images, records = self._pair(spp, number, learned_first, bar)
+                if spp == top:
+                    store.keep(str(k), **images)
+                else:
+                    truth = truth or Truth.of_passes(store)
+                    records = {name: records[name] | truth.errors(images[name]) for name in VERSIONS}
+                done[f"{spp}/{k}"] = records
+                store.save()
 
-    def rounds(self) -> None:
-        """Render pairs of the lower counts, learned and exact, with seeds that no pass has."""
-        lower, done = self.counts[:-1], self.store.data["rounds"]
-        self.bar.update(len(VERSIONS) * sum(spp * len(done.get(str(spp), [])) for spp in lower))
-        exact = _images(self.store)["exact"]
-        truth = np.mean(exact, axis=0, dtype=np.float64)
-        weights = weights_of(self.store.arrays[BRIGHTNESS]["exact"])
-        truth_noise = estimate(exact, weights).noise / self.settings.passes
-        for k in range(self.settings.rounds):
-            for spp in lower if k % 2 == 0 else reversed(lower):
-                if len(done.get(str(spp), [])) > k:
-                    continue
-                number = k * len(lower) + lower.index(spp)
-                images, records = self._pair(spp, 1 + self.settings.passes + number, (k + number) % 2 == 1)
-                for name in VERSIONS:
-                    records[name] |= _errors(images[name], truth, weights, truth_noise)
-                done.setdefault(str(spp), []).append(records)
-                self.store.save()
-
-    def _pair(self, spp: int, number: int, learned_first: bool) -> tuple[dict, dict]:
+    def _pair(self, spp: int, number: int, learned_first: bool, bar: tqdm) -> tuple[dict, dict]:
         """Return both images of ``spp`` samples and their times; ``number`` selects their common seed."""
         if not self.is_compiled:
             for name in VERSIONS:
@@ -254,131 +236,119 @@ class SceneRun:
             if self.stop.is_set():
                 raise Stopped
             images[name], records[name] = self._render(name, spp, number)
-            self.bar.update(spp)
+            bar.update(spp)
         return images, records
 
     def _render(self, name: str, spp: int, number: int) -> tuple[np.ndarray, dict]:
-        """Return an image, float32, with ``seconds``, ``seconds_wall`` (``None`` if it compiled) and ``not_finite``."""
+        """Return an image, float32, with its ``seconds`` (``None`` if it compiled) and ``not_finite`` values."""
         launches = 1 << ((spp * self.pixels - 1) // self.launch_samples).bit_length()
         render = timed(lambda: loading.render(self.loaded[name], spp, (self.seed << 8) + number, launches)[0])
-        image = render.value[..., : 3 if render.value.shape[-1] >= 3 else 1]
+        image = loading.colour_channels(render.value)
         bad = ~np.isfinite(image)
-        return np.where(bad, np.float32(0), image), {
-            "seconds": None if render.compiled else render.seconds,
-            "seconds_wall": None if render.compiled else render.seconds_wall,
-            "not_finite": int(bad.sum()),
-        }
+        seconds = None if render.compiled else render.seconds
+        return np.where(bad, np.float32(0), image), {"seconds": seconds, "not_finite": int(bad.sum())}
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Mean of ``passes`` exact images, with the weights of errors and the mean square of the noise of one image."""
+
+    image: np.ndarray
+    passes: int
+    weights: np.ndarray
+    noise: float
+
+    @classmethod
+    def of_passes(cls, store: Store) -> Truth:
+        """Return the truth of the passes in a store."""
+        exact = _images(store)["exact"]
+        weights = relative_weights(store.arrays[BRIGHTNESS]["exact"])
+        return cls(np.mean(exact, axis=0, dtype=np.float64), len(exact), weights, estimate(exact, weights).noise)
+
+    def errors(self, image: np.ndarray, left_out: np.ndarray | None = None) -> dict[str, float]:
+        """Return ``mse`` and ``psnr_db`` of an image; against the mean without ``left_out``, one of the passes."""
+        truth, passes = self.image, self.passes
+        if left_out is not None:
+            truth, passes = (passes * truth - left_out) / (passes - 1), passes - 1
+        mse = error(image, truth, self.weights, self.noise / passes)
+        return {"mse": mse, "psnr_db": metrics.psnr(truth, image)}
 
 
 def _images(store: Store) -> dict[str, list[np.ndarray]]:
-    """Return the images of the passes, by version."""
-    return {name: [store.arrays[k][name] for k in store.data["passes"]] for name in VERSIONS}
-
-
-def _errors(image: np.ndarray, truth: np.ndarray, weights: np.ndarray, truth_noise: float) -> dict[str, float]:
-    return {"mse": error(image, truth, weights, truth_noise), "psnr_db": metrics.psnr(truth, image)}
+    """Return the images of the passes at the highest count, by version."""
+    passes = [arrays for name, arrays in store.arrays.items() if name != BRIGHTNESS]
+    return {name: [arrays[name] for arrays in passes] for name in VERSIONS}
 
 
 def _assemble(store: Store, counts: list[int]) -> dict:
-    passes, rounds = list(store.data["passes"].values()), store.data["rounds"]
-    records = {str(counts[-1]): [], **rounds}
-    every = [*passes, *(pair for pairs in rounds.values() for pair in pairs)]
+    done, images, top = store.data["pairs"], _images(store), counts[-1]
+    not_finite = sum(record["not_finite"] for pair in done.values() for record in pair.values())
     result = {
-        "not_finite": sum(t["not_finite"] for pair in every for t in pair.values()),
+        "not_finite": not_finite,
+        "notes": [f"{not_finite} values were not finite and counted as 0."] if not_finite else [],
         **dict.fromkeys(("reference", "noise", "bias", "crossover")),
         "points": [],
         "ratios": [],
     }
-    k = len(passes)
-    if k < LEAST:
+    if len(images["exact"]) < LEAST:
         return result
-    images = _images(store)
-    exact, learned = (images[name] for name in ("exact", "learned"))
-    truth = np.mean(exact, axis=0, dtype=np.float64)
-    weights = weights_of(store.arrays[BRIGHTNESS]["exact"])
-    scatter = {name: estimate(images[name], weights) for name in VERSIONS}
-    for i, times in enumerate(passes):
-        mean_of_others, noise_of_mean = (k * truth - exact[i]) / (k - 1), scatter["exact"].noise / (k - 1)
-        records[str(counts[-1])].append(
-            {n: times[n] | _errors(images[n][i], mean_of_others, weights, noise_of_mean) for n in VERSIONS}
-        )
+    truth, times = Truth.of_passes(store), {name: {} for name in VERSIONS}
     for spp in counts:
-        pairs = records.get(str(spp), [])
-        result["points"] += [{"version": n, "spp": spp, **_point([r[n] for r in pairs])} for n in VERSIONS if pairs]
-        ratio = _ratio(pairs)
-        if ratio:
-            result["ratios"].append({"spp": spp, **ratio})
-    differences = [l.astype(np.float64) - e for l, e in zip(learned, exact, strict=True)]
-    bias, displayed = estimate(differences, weights), estimate(differences, truth <= 1)
-    result["reference"] = {"spp": k * counts[-1], "passes": k, "noise_rmse": root(scatter["exact"].noise / k)}
-    result["noise"] = {name: {"mse_of_a_sample": max(scatter[name].noise, 0.0) * counts[-1]} for name in VERSIONS}
+        pairs = [dict(pair) for key, pair in done.items() if key.startswith(f"{spp}/")]
+        for k, pair in enumerate(pairs if spp == top else ()):
+            for name in VERSIONS:
+                pair[name] = pair[name] | truth.errors(images[name][k], images["exact"][k])
+        for name in VERSIONS if pairs else ():
+            point = {"version": name, "spp": spp, **_point([pair[name] for pair in pairs])}
+            result["points"].append(point)
+            if point["timed"]:
+                times[name][spp] = point["seconds"]
+        seconds = [[pair[name]["seconds"] for name in VERSIONS] for pair in pairs]
+        ratios = [learned / exact for exact, learned in seconds if exact is not None and learned is not None]
+        if ratios:
+            result["ratios"].append({"spp": spp, **spread(ratios)})
+    differences = [l.astype(np.float64) - e for l, e in zip(images["learned"], images["exact"], strict=True)]
+    bias, displayed = estimate(differences, truth.weights), estimate(differences, truth.image <= 1)
+    noise = {name: max(estimate(images[name], truth.weights).noise, 0.0) * top for name in VERSIONS}
+    result["reference"] = {
+        "spp": truth.passes * top, "passes": truth.passes, "noise_rmse": _root(truth.noise / truth.passes)
+    }  # fmt: skip
+    result["noise"] = {name: {"mse_of_a_sample": noise[name]} for name in VERSIONS}
     result["bias"] = describe(bias, displayed)
-    result["crossover"] = crossover(bias, result["noise"]["learned"]["mse_of_a_sample"], result["points"])
+    result["crossover"] = crossover(bias, noise["learned"], times["learned"])
     return result
 
 
 def _point(records: list[dict]) -> dict:
-    timed_records = [r for r in records if r["seconds"] is not None]
-    mse = flat_spread("mse", (r["mse"] for r in records))
+    mse, seconds = [r["mse"] for r in records], [r["seconds"] for r in records if r["seconds"] is not None]
     return {
-        **mse,
-        "rmse": root(mse["mse"]),
+        **flat_spread("mse", mse),
+        "rmse": _root(float(np.median(mse))),
         "psnr_db": float(np.median([r["psnr_db"] for r in records])),
         "images": len(records),
-        **flat_spread("seconds", (r["seconds"] for r in timed_records)),
-        **flat_spread("seconds_wall", (r["seconds_wall"] for r in timed_records)),
-        "timed": len(timed_records),
+        **flat_spread("seconds", seconds),
+        "timed": len(seconds),
     }
 
 
-def _ratio(pairs: list[dict]) -> dict | None:
-    timed_pairs = [r for r in pairs if all(r[name]["seconds"] is not None for name in VERSIONS)]
-    if not timed_pairs:
-        return None
-    ratios = {key: [r["learned"][key] / r["exact"][key] for r in timed_pairs] for key in ("seconds", "seconds_wall")}
-    return {**spread(ratios["seconds"]), "wall": spread(ratios["seconds_wall"])["median"]}
-
-
-def rows(result: dict) -> list[dict]:
-    """Return one table row, with the columns :data:`COLUMNS`, for each version and sample count.
-
-    Time ratios (learned / exact) are in the rows of ``learned``.
-    """
-    ratios = {r["spp"]: r for r in result["ratios"]}
-    table = []
-    for point in result["points"]:
-        row = {"scene": Path(result["scene"]).name, **point}
-        if point["version"] == "learned" and point["spp"] in ratios:
-            r = ratios[point["spp"]]
-            row |= {"time_ratio": r["median"], "time_ratio_q1": r["q1"], "time_ratio_q3": r["q3"]}
-            row["time_ratio_wall"] = r["wall"]
-        table.append(row)
-    return table
+def _root(square: float) -> float:
+    """Return the root of an estimate of a square, 0 if the estimate is negative."""
+    return math.sqrt(max(square, 0.0))
 
 
 def write(result: dict, folder: str | os.PathLike) -> dict[str, str]:
-    """Write the files of a result, with a picture if there is a timed point; return their paths."""
-    pictures = {}
-    if any(p["timed"] and p["rmse"] for p in result["points"]):
-        pictures["png"] = lambda: draw(result)
-    return report.write_files("scene", folder, result, rows(result), COLUMNS, pictures)
+    """Write the files of a result, with a picture if there is a timed point; return their paths.
 
-
-def caption(result: dict) -> str:
-    """Return one paragraph about what was measured, on which machine and how."""
-    reference, counts = result["reference"], ", ".join(map(str, result["counts"]))
-    defines = "".join(f", {k}={v}" for k, v in result["defines"].items())
-    bad = f" {result['not_finite']} values were not finite and counted as 0." if result["not_finite"] else ""
-    return (
-        f"{Path(result['scene']).name}{defines}, {result['width']} × {result['height']}, {counts} "
-        f"samples per pixel (spp). Relative RMS error against {reference['spp']} spp of the exact scene, whose own "
-        f"noise, {percent(reference['noise_rmse'])}, is subtracted. Medians and quartiles of images of "
-        f"different seeds; seconds of the kernels of a whole render. {machine_line(result)}{bad}{state(result)}"
-    )
+    The table has a row for each version and sample count; ``time_ratio`` is learned / exact.
+    """
+    ratios = {r["spp"]: r["median"] for r in result["ratios"]}
+    rows = [{"scene": Path(result["scene"]).name, **p, "time_ratio": ratios.get(p["spp"])} for p in result["points"]]
+    pictures = {"png": lambda: draw(result)} if any(p["timed"] and p["rmse"] for p in result["points"]) else {}
+    return report.write_files("scene", folder, result, rows, pictures)
 
 
 def summary(result: dict) -> list[str]:
-    """Return lines of text: errors and times by sample count, the bias, the crossover and the verdict."""
+    """Return lines of text: errors and times by sample count, the bias and the crossover."""
     lines = [
         f"scene       {Path(result['scene']).name}, {result['width']} x {result['height']}, learned plugins: "
         f"{result['learned_plugins']}",
@@ -386,7 +356,7 @@ def summary(result: dict) -> list[str]:
         "",
     ]
     if not result["points"]:
-        return [*lines, "interrupted before the first point; the same command continues the run"]
+        return [*lines, report.figure_caption(result)]
     lines.append("relative RMS error and seconds of the kernels, medians; learned / exact with quartiles")
     cells = [["spp", "exact: error", "seconds", "learned: error", "seconds", "learned / exact"]]
     ratios = {r["spp"]: f"{r['median']:.2f} ({r['q1']:.2f} to {r['q3']:.2f})" for r in result["ratios"]}
@@ -395,81 +365,51 @@ def summary(result: dict) -> list[str]:
         both = [points.get((name, spp)) for name in VERSIONS]
         texts = [t for p in both for t in ((percent(p["rmse"]), f"{p['seconds'] or 0:.3g}") if p else ("", ""))]
         cells.append([str(spp), *texts, ratios.get(spp, "")])
-    lines += grid(cells)
-    reference, bias = result["reference"], result["bias"]
-    lines += ["", f"reference   {reference['spp']} spp, its own noise {percent(reference['noise_rmse'])} (subtracted)"]
-    size = "not measured"
-    if bias["measured"]:
-        size = f"{percent(bias['rmse'])} ± {percent(bias['rmse_standard_error'], 2)}"
-    lines.append(f"bias        {size}, {decibel(bias)}")
-    if result["not_finite"]:
-        lines.append(f"not finite  {result['not_finite']} values, counted as 0")
-    if result["interrupted"]:
-        lines.append("interrupted: the same command continues the run")
-    return [*lines, "", result["verdict"]]
+    reference, at = result["reference"], result["crossover"]
+    lines += [*grid(cells), "", f"reference   {reference['spp']} spp, noise {percent(reference['noise_rmse'])}"]
+    lines.append(f"bias        {bias_text(result['bias'])}")
+    if "spp" in at:
+        time_text = "" if at["seconds"] is None else f", {at['seconds']:.3g} s"
+        lines.append(f"noise equals the bias at {at['spp']:,.0f} spp{time_text}")
+    elif at["spp_above"] is not None:
+        lines.append(f"noise dominates up to {at['spp_above']:,.0f} spp at least")
+    return [*lines, report.figure_caption(result)]
 
 
-def decibel(bias: dict) -> str:
-    """Return the PSNR of a bias, or its lower bound, as text."""
-    if "psnr_db" in bias:
-        return f"PSNR {bias['psnr_db']:.1f} dB"
-    return "PSNR infinite" if bias["psnr_db_above"] is None else f"PSNR above {bias['psnr_db_above']:.1f} dB"
-
-
-def verdict(result: dict) -> str | None:
-    """Return one sentence about the sample count at which noise equals the bias; ``None`` before a bias is known."""
-    bias, at = result["bias"], result["crossover"]
-    if bias is None:
-        return None
-    if not bias["measured"]:
-        count = at["spp_above"]
-        limit = "at any number of samples" if count is None else f"up to {rounded(count)} spp at least"
-        return f"No bias was found; it is below {percent(bias['rmse_below'])}, and noise dominates {limit}."
-    seconds = f", {duration(at['seconds'])}" if at["seconds"] else ""
-    how = ", extrapolated" * at["extrapolated"]
-    return f"The noise equals the bias, {percent(bias['rmse'])}, at {rounded(at['spp'])} spp{seconds}{how}."
+def bias_text(bias: dict) -> str:
+    """Return the relative bias and its PSNR, or their bounds, as text."""
+    rmse = percent(bias["rmse"]) if bias["measured"] else f"below {percent(bias['rmse_below'])}"
+    psnr = bias.get("psnr_db") or bias["psnr_db_above"]
+    return f"{rmse}, PSNR {'above ' * ('psnr_db' not in bias)}{'infinite' if psnr is None else f'{psnr:.1f} dB'}"
 
 
 def draw(result: dict):
     """Draw the error of both versions against render time, and the bias or its upper bound as a line.
 
-    Both axes are logarithmic, points have quartiles. Dashed curves continue the sum of noise and bias beyond the last
-    point.
+    Both axes are logarithmic, points have quartiles. Dashed curves are the sum of noise and bias, σ² / spp + bias².
     """
-    title = f"{Path(result['scene']).stem}: noise and bias at a given render time"
-    figure = plot.figure(title, caption(result), 7.6, 4.9)
-    axes = figure.add_subplot()
-    bias = result["bias"]
-    floor = bias["rmse"] if bias["measured"] else bias["rmse_below"]
+    bias, curves, (width, height) = result["bias"], [], (result["width"], result["height"])
+    floor, ends = bias["rmse"] if bias["measured"] else bias["rmse_below"], []
     for (colour, marker), name in zip(plot.STYLES, reversed(VERSIONS), strict=False):
-        curve = [p for p in result["points"] if p["version"] == name and p["timed"] and p["rmse"] > 0]
-        xs, ys = [p["seconds"] for p in curve], [p["rmse"] for p in curve]
-        ends = np.array([(p["rmse"] - root(p["mse_q1"]), root(p["mse_q3"]) - p["rmse"]) for p in curve]).T
-        axes.errorbar(
-            xs, ys, np.maximum(ends, 0), color=colour, marker=marker, markerfacecolor="white", capsize=2, label=name
-        )
-        for p in curve if name == "learned" else ():
-            axes.annotate(f"{p['spp']} spp", (p["seconds"], p["rmse"]), (4, 4), textcoords="offset points", fontsize=7)
-        if curve:
-            axes.plot(*_continued(result, name, curve), color=colour, linestyle=(0, (4, 2.5)), alpha=0.75)
-    shown = "bias of the approximation" if bias["measured"] else "bias of the approximation, upper bound"
-    if floor:
-        axes.axhline(floor, color="#7a3b8f", label=f"{shown}: {percent(floor)}, {decibel(bias)}")
-    axes.set(xscale="log", yscale="log")
-    plot.log_ticks(axes.xaxis, *axes.get_xlim())
-    plot.log_ticks(axes.yaxis, *axes.get_ylim(), percent)
-    plot.finish(axes, "seconds of a render (kernels)", "relative RMS error")
-    axes.legend(fontsize=8)
-    return figure
-
-
-def _continued(result: dict, name: str, curve: list[dict]) -> tuple[list, list]:
-    """Extrapolate noise (and, of the learned version, bias) from the last point on; return times and errors."""
-    times, last = {p["spp"]: p["seconds"] for p in curve}, curve[-1]
-    noise = result["noise"][name]["mse_of_a_sample"]
-    square = max(result["bias"]["mse"], 0.0) if name == "learned" and result["bias"]["measured"] else 0.0
-    offset = last["mse"] - square - noise / last["spp"]  # makes the curve begin at the last point
-    most = min(max(result["crossover"].get("spp") or 0, 4 * last["spp"]), REACH * last["spp"])
-    counts = np.geomspace(last["spp"], most, 100)
-    errors = [math.sqrt(max(square + noise / n + offset * last["spp"] / n, 1e-30)) for n in counts]
-    return [seconds_of(n, times) for n in counts], errors
+        points = [p for p in result["points"] if p["version"] == name and p["timed"] and p["rmse"] > 0]
+        if not points:
+            continue
+        x, y = ([p[key] for p in points] for key in ("seconds", "rmse"))
+        low, high = ([_root(p[key]) for p in points] for key in ("mse_q1", "mse_q3"))
+        label = f"{name}, {', '.join(str(p['spp']) for p in points)} spp"
+        curves.append(plot.Curve(label, x, y, low, high, {"color": colour, "marker": marker, "linestyle": ""}))
+        times, noise = {p["spp"]: p["seconds"] for p in points}, result["noise"][name]["mse_of_a_sample"]
+        square = max(bias["mse"], 0.0) if name == "learned" and bias["measured"] else 0.0
+        most = min(max(2 * (result["crossover"].get("spp") or 0), 4 * max(times)), REACH * max(times))
+        spps = np.geomspace(min(times), most, 100)
+        at = [seconds_at(n, times) for n in spps]
+        style = {"color": colour, "marker": "", "linestyle": (0, (4, 2.5)), "alpha": 0.75}
+        label = f"{name}, noise σ² / spp{' + bias²' * (square > 0)}"
+        curves.append(plot.Curve(label, at, np.sqrt(square + noise / spps), style=style))
+        ends += [at[0], at[-1]]
+    label = f"bias of the approximation{'' if bias['measured'] else ', upper bound'}: {bias_text(bias)}"
+    curves.append(plot.Curve(label, [min(ends), max(ends)], [floor] * 2, style={"color": "#7a3b8f", "marker": ""}))
+    title = f"{Path(result['scene']).stem}, {width} × {height}: noise and bias at a given render time"
+    caption = report.figure_caption(result)
+    return plot.draw_curves(title, caption, {"": curves}, "seconds of a render (kernels)", "relative RMS error", "xy",
+                            height=4.9)  # fmt: skip

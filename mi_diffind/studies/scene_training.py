@@ -17,11 +17,10 @@ import argparse
 import dataclasses
 import gc
 import json
-import resource
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from functools import cached_property
+from functools import cache
 from pathlib import Path
 
 import drjit as dr
@@ -30,20 +29,21 @@ import numpy as np
 
 from ..arrays.tables import Table
 from ..core.arguments import fraction, positive
-from ..core.files import writable_folder, write_json
+from ..core.files import writable_folder
 from ..fitting import task
 from ..images import metrics
 from ..images.srgb import for_display
-from ..maps.compressed import decibel
+from ..maps.pyramid import decibel
 from ..maps.source import load_source
 from ..measure import plot
 from ..measure.report import figure_caption
-from ..measure.study import Candidate, Measure, Plan, Study
+from ..measure.store import fingerprint
+from ..measure.study import Measure, Plan, Study
 from ..scenes import loading
-from ..scenes.training.options import SceneRecipe, View, ViewDistribution
-from ..scenes.training.problem import exposure_of
+from ..scenes.training.options import SceneRecipe, ViewDistribution
+from ..scenes.training.problem import estimate_exposure
 from ..scenes.training.references import ReferenceRenders
-from ..scenes.training.trained_scene import TrainedScene, original_of, texture_file
+from ..scenes.training.trained_scene import TrainedScene, find_source, texture_file
 from ..tasks.texture.compressed import load
 from .equal_memory import Contender
 
@@ -179,23 +179,16 @@ class SceneTrainingContext:
         self.parsed = loading.ParsedScene(path, settings.defines)
         self.file, given = texture_file(self.parsed)
         self.start = load(self.file)
-        self.source = original_of(self.start, self.file, given)
-        #: Folder that keeps references.
-        self.references: Path | None = None
+        self.source = find_source(self.start, self.file, given)
 
-    @cached_property
-    def tests(self) -> tuple[ViewDistribution, list[View], list[np.ndarray], float]:
-        """The distribution of the measured views, the views, their references, and the exposure."""
-        views = ViewDistribution(1, self.settings.tests, seed=SEED, **self.ranges)
-        renders = ReferenceRenders(
-            self.parsed, views, self.settings.reference_spp, self.references, without=(self.file,)
-        )
-        images = renders.images(views.measured())
-        return views, views.measured(), images, exposure_of(images)
+    @staticmethod
+    def references(folder: Path) -> Path:
+        """Return the folder that keeps references, in the folder of models."""
+        return writable_folder(folder / "references", create=True)
 
-    def measure(self, table: Table, spp: int) -> dict[str, float]:
+    def measure(self, table: Table, spp: int, folder: Path) -> dict[str, float]:
         """Return ``psnr_db`` and ``flip`` of a table in renders with footprints of ``spp`` samples a pixel."""
-        distribution, views, references, exposure = self.tests
+        distribution, views, references, exposure = measured_views(self, folder)
         scene = TrainedScene(self.parsed, {self.file: table}, distribution, spp)
         errors, flips = [], []
         with dr.suspend_grad():
@@ -213,25 +206,34 @@ class SceneTrainingContext:
         return {"psnr_db": decibel(float(np.mean(errors))), "flip": float(np.mean(flips))}
 
 
+@cache
+def measured_views(context: SceneTrainingContext, folder: Path) -> tuple:
+    """Return the distribution of the measured views, the views, their references and the exposure.
+
+    ``folder`` keeps references.
+    """
+    distribution = ViewDistribution(1, context.settings.tests, seed=SEED, **context.ranges)
+    spp, views = context.settings.reference_spp, distribution.measured()
+    images = ReferenceRenders(context.parsed, distribution, spp, folder, without=(context.file,)).images(views)
+    return distribution, views, images, estimate_exposure(images)
+
+
 def picture(contexts: Sequence[SceneTrainingContext], runs: Sequence[Contender], result: dict):
     """Draw the first measured view of each scene: after each of the :data:`SHOWN` runs, and the truth."""
     rows = {}
     for context in contexts:
-        distribution, views, references, exposure = context.tests
-        first = {}
+        images, names = {}, []
         for run in runs:
-            if run.details["context"] is context and run.method in SHOWN:
-                first.setdefault(run.method, run)
-        images = {}
-        for run in first.values():
-            share = run.details["share"]
-            scene = TrainedScene(context.parsed, {context.file: run.model}, distribution, int(run.budget))
-            with dr.suspend_grad():
-                scene.place(views[0])
-                image = scene.render(0, 1, context.settings.spp).numpy()
-            text = f"{run.method}{'' if share is None else f', λ {share:g}'}"
-            images[f"{text}\n{run.record['details']['psnr_db']:.1f} dB"] = image
-        rows[context.name] = {t: for_display(exposure * i) for t, i in {**images, "truth": references[0]}.items()}
+            if run.details["context"] == context.name and run.method in SHOWN and run.method not in names:
+                distribution, views, references, exposure = measured_views(context, context.references(run.folder))
+                scene = TrainedScene(context.parsed, {context.file: run.model}, distribution, int(run.budget))
+                with dr.suspend_grad():
+                    scene.place(views[0])
+                    image = scene.render(0, 1, context.settings.spp).numpy()
+                names.append(run.method)
+                images[f"{run.method}\n{run.record['errors']['psnr_db']:.1f} dB"] = image
+        images["truth"] = references[0]
+        rows[context.name] = {title: for_display(exposure * image) for title, image in images.items()}
     return plot.draw_images(result["title"], figure_caption(result), rows)
 
 
@@ -241,17 +243,14 @@ def training_run(
     task_name: str = "",
     spp: int = 1,
     share: float | None = None,
-    begin: str = "file",
-    samples: int = SceneRecipe.samples,
     after: Contender | None = None,
-    as_long: Contender | None = None,
+    limit: Callable[[], dict] = dict,
+    **options,
 ) -> Contender:
     """Return the run ``method``: a file that is measured in a scene after a training of the task, ``""`` for none.
 
-    ``spp``: samples a pixel. ``share``: λ of a training inside the scene. ``begin``: its start, ``file`` or
-    ``untrained``. ``after``: the run it starts from (``None``: the file); ``as_long``: the run that
-    gives its seconds (``None``: it has steps). The record is kept beside the file of the result, so that further runs
-    of the same scene can follow.
+    ``spp``: samples a pixel. ``share``: λ of a training inside the scene. ``after``: the run it starts from (``None``:
+    the file); ``limit()`` returns its steps or seconds; ``options`` are further ones of ``fit scene``.
     """
     settings = context.settings
 
@@ -262,66 +261,40 @@ def training_run(
                               steps=settings.texture_steps, **common)  # fmt: skip
             fitted.table.settings["source"] = context.start.settings["source"]
             return fitted
-        start = context.file if after is None else after.file
         if task_name == "shading":
-            limit = {"steps": settings.hemisphere_steps}
-            if as_long is not None:
-                limit = {"seconds": max(1.0, as_long.record["details"]["training_seconds"])}
-            return task.fit("shading", context.source, start=start, **limit, **common)
-        given = {} if after is None else {"start": start}
+            start = context.file if after is None else after.file
+            return task.fit("shading", context.source, start=start, **limit(), **common)
+        given = {} if after is None else {"start": after.file}
         ranges = {name: tuple(map(float, limits)) for name, limits in context.ranges.items()}
         return task.fit(
             "scene", context.path, defines=list(settings.defines.items()), steps=settings.steps,
             measure_every=max(1, settings.steps // 8), views=settings.views, held_out=settings.held_out,
-            reference_spp=settings.reference_spp, references=context.references, spp=spp, begin=begin, share=share,
-            samples=samples, **ranges, **given, **common,
+            reference_spp=settings.reference_spp, references=context.references(job.folder), spp=spp, share=share,
+            **ranges, **given, **options, **common,
         )  # fmt: skip
 
     def fit(job: Contender, progress: bool) -> dict | None:
         processor, figures = time.process_time(), {}
         if not task_name:
             job.model = context.start
-            if job.file is not None:
-                job.file.write_bytes(Path(context.file).read_bytes())
+            job.file.write_bytes(Path(context.file).read_bytes())
         else:
             fitted = train(job, progress)
             if fitted.result.interrupted:
                 return None
-            job.model, result = fitted.table, fitted.result
-            figures = {"steps": result.steps, "kept_step": result.step, "training_seconds": result.seconds,
+            job.model = fitted.table
+            fitted.save(job.file)
+            figures = {"steps": fitted.result.steps, "training_seconds": fitted.result.seconds,
                        "processor_seconds": time.process_time() - processor,
-                       "step_ms": 1000 * result.seconds / max(1, result.steps), "history": result.history,
-                       "level_bias": job.model.settings.get("level_bias", 0.0),
-                       "kept_start": job.model.settings.get("kept_start", False),
-                       "validation_db": result.measured.get("psnr_db")}  # fmt: skip
-            if job.file is not None:
-                fitted.save(job.file)
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
-        details = {"scene": context.name, "way": method, "lambda": share, "spp": spp, "peak_mib": peak, **figures,
-                   **context.measure(job.model, spp)}  # fmt: skip
-        record = {"bytes": job.model.nbytes, "details": details}
-        if job.file is not None:
-            write_json(job.file.with_suffix(".json"), record)
-        return record
+                       "level_bias": job.model.settings.get("level_bias", 0.0)}  # fmt: skip
+        errors = context.measure(job.model, spp, context.references(job.folder))
+        details = {"scene": context.name, "way": method, "lambda": share, "spp": spp, **figures, **errors}
+        return {"bytes": job.model.nbytes, "errors": errors, "details": details}
 
     text = "" if share is None else f", λ {share:g}"
-    return KeptRun(
-        f"{context.name}, {method}{text}, {spp} spp", method, spp, fit, lambda job: load(job.file),
-        details={"context": context, "share": share},
-    )  # fmt: skip
-
-
-class KeptRun(Contender):
-    """Contender whose record is kept beside its file."""
-
-    def cached_record(self, folder: Path | None, record: dict | None) -> dict | None:
-        if folder is not None:
-            self.details["context"].references = writable_folder(folder / "references", create=True)
-        record = super().cached_record(folder, record)
-        if record is None and self.file is not None and self.file.is_file():
-            kept = self.file.with_suffix(".json")
-            record = self.record = json.loads(kept.read_text(encoding="utf-8")) if kept.is_file() else None
-        return record
+    name = f"{context.name}, {method}{text}, {spp} spp"
+    return Contender(name, method, spp, fit, lambda job: load(job.file), method, setting=f"{spp} spp",
+                     details={"context": context.name, "share": share})  # fmt: skip
 
 
 def other_maps(source: Path) -> dict[str, np.ndarray]:
@@ -345,10 +318,11 @@ def planned_runs(context: SceneTrainingContext) -> list[Contender]:
         return run(method, "scene", **{"share": share, "after": after, **fields})
 
     scene, other = inside("scene"), run(OTHER, "texture")
-    hemisphere = run("hemisphere", "shading", as_long=scene)
-    mended = run(MENDED, "shading", after=other, as_long=scene)
+    long = {"limit": lambda: {"seconds": max(1.0, scene.record["details"]["training_seconds"])}}
+    end = {"limit": lambda: {"steps": settings.hemisphere_steps}}
+    hemisphere, mended = run("hemisphere", "shading", **long), run(MENDED, "shading", after=other, **long)
     return [
-        *(run("start", spp=spp) for spp in settings.counts), scene, hemisphere, run(LONGER, "shading"),
+        *(run("start", spp=spp) for spp in settings.counts), scene, hemisphere, run(LONGER, "shading", **end),
         inside(AFTER, hemisphere), inside("untrained, then scene", begin="untrained"), inside(FEW, samples=1),
         other, inside(f"{OTHER}, then scene", other), mended, inside(f"{MENDED}, then scene", mended),
         *(inside("scene", share=s) for s in settings.lambdas if s != share),
@@ -360,32 +334,21 @@ def plan(paths: Sequence[Path], settings: SceneTrainingSettings) -> Plan:
     """Return the plan for scene files in the current variant."""
     contexts = [SceneTrainingContext(path, settings) for path in paths]
     runs = [run for context in contexts for run in planned_runs(context)]
-
-    def candidate(run: Contender) -> Candidate:
-        def errors(samples: int) -> dict[str, float]:
-            return {key: run.record["details"][key] for key in ("psnr_db", "flip")}
-
-        return Candidate(run.name, run.method, f"{run.budget} spp", job=run.name, errors=errors)
-
-    request = json.loads(json.dumps(asdict(settings)))
-    shared = {name: value for name, value in request.items() if name not in ("lambdas", "counts")}
-    files = {c.name: c.parsed.description for c in contexts}
     return Plan(
         study="scene-training",
         title="Training inside a scene",
-        candidates=[candidate(run) for run in runs],
+        candidates=[run.candidate(label=run.name) for run in runs],
         cases=[],
-        queries=(),
-        accuracy="psnr_db",
-        accuracy_label="PSNR of held-out views and lights, dB",
-        details={"scenes": [c.name for c in contexts], "request": request},
+        measures=(
+            Measure("PSNR of held-out views and lights, dB", "psnr_db"),
+            Measure("FLIP", "flip", ".3f", False),
+        ),
+        details={"scenes": [c.name for c in contexts], "request": json.loads(json.dumps(asdict(settings)))},
         notes=[
             f"{settings.steps} steps, {settings.views} views of {settings.width} × {settings.width * 9 // 16} pixels; "
             f"errors: {settings.tests} other views and lights against {settings.reference_spp} spp"
         ],
         jobs=runs,
-        jobs_fingerprint=f"{files} {shared}",
+        jobs_fingerprint=fingerprint(file for c in contexts for file in (c.file, *c.parsed.files())),
         pictures={"png": lambda result: picture(contexts, runs, result)},
-        sampled=False,
-        measures=(Measure("PSNR, dB", "psnr_db"), Measure("FLIP", "flip", ".3f", False)),
     )

@@ -69,6 +69,7 @@ HASH_SETTINGS = {"seed": 1, "schedule": "cosine", "deterministic": False, "lr": 
 MESH = "mesh (Embree)"
 
 MEASURES = (
+    Measure("near the surface, −10 log₁₀(1 − IoU), dB", "iou_near_db", ".1f"),
     Measure("IoU", "iou", ".4f"),
     Measure("IoU near", "iou_near", ".4f"),
     Measure("normals, °", "normal_deg", ".2f", False),
@@ -281,12 +282,9 @@ def plan(mesh: Mesh, name: str, settings: SimpleNamespace) -> Plan:
         title=f"Signed distance field: {Path(name).stem}",
         candidates=candidates,
         cases=[
-            Case("reads", reads, candidates=tuple(j.name for j in timed.values()), query_names=("value", "normal")),
-            *([Case("rays", rays, candidates=(*traced, MESH, grid), query_names=("ray",))] if traced else []),
+            Case("reads", reads),
+            *([Case("rays", rays)] if traced else []),
         ],
-        queries=("value",),
-        accuracy="iou_near_db",
-        accuracy_label="near the surface, −10 log₁₀(1 − IoU), dB",
         ratios=[(timed["ours"].name, other) for other in compared] if "ours" in timed else [],
         details={
             "source": name, "source_digest": mesh.digest, "triangles": len(mesh.faces), "request": vars(settings),
@@ -342,7 +340,7 @@ def camera_rays(film: tuple[int, int], count: int | None = None):
 
 def mesh_scene(mesh: Mesh) -> mi.Scene:
     """Return a scene of a mesh in the unit frame."""
-    shape = mi.Mesh(*compat.mesh_arguments(mi.Properties("mesh"), len(mesh.vertices), len(mesh.faces)))
+    shape = mi.Mesh("mesh", len(mesh.vertices), len(mesh.faces), mi.Properties("mesh"))
     buffers = mi.traverse(shape)
     compat.set_triangles(buffers, mesh.vertices, mesh.faces)
     buffers.update()

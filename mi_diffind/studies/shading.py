@@ -7,8 +7,8 @@ for several seeds.
 
 Classical filters of normals (:mod:`.baselines.normals`) are measured uncompressed; those that an ordinary texture can
 hold, Toksvig's and baked roughness, also compressed as λ = 0 is, in as much time, and by ASTC in equal bytes. LEAN's
-moments have no limits, which encoders of bytes need. The *kernel* control reads at other levels of detail, those with
-the smallest error; compressed textures are read in this way, too.
+moments have no limits, which encoders of bytes need. Each is also read at other levels of detail, those with the
+smallest error: the *kernel*.
 
 *Errors* are those of :class:`~mi_diffind.tasks.shading.evaluation.ShadedEvaluation`: PSNR of shaded values and FLIP,
 under views and lights of no training, against C, the converged truth, and P, the paper's reference. *Flicker*:
@@ -24,12 +24,13 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
+import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
-from functools import cache, cached_property
+from dataclasses import dataclass, field
+from functools import cache, cached_property, partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
@@ -40,13 +41,11 @@ from ..arrays.tables import Table, save_table
 from ..core.arguments import fraction, positive
 from ..core.progress import Deadline
 from ..core.runtime import array_module
-from ..core.units import parse_compression
 from ..fitting import task
 from ..fitting.loop import FitResult
-from ..fitting.settings import FitSettings, FittingError
+from ..fitting.task import FitSettings, FittingError
 from ..images import srgb
-from ..maps.compressed import decibel
-from ..maps.pyramid import Pyramid
+from ..maps.pyramid import Pyramid, decibel
 from ..maps.source import Source, SourceError, load_source
 from ..measure import plot
 from ..measure.renders import POINTS, MovingView
@@ -59,7 +58,7 @@ from ..tasks.shading import fit as shading_fit
 from ..tasks.shading.evaluation import ShadedEvaluation, ShadedReader, reader, reference
 from ..tasks.shading.material import effects_of, frozen_decoder
 from ..tasks.shading.training import ShadingProblem, fit_shading, start_of
-from ..tasks.texture import training as textures
+from ..tasks.texture import fit as textures
 from ..tasks.texture.compressed import CompressedTexture
 from ..tasks.texture.fit import size_of
 from .baselines import codecs, normals
@@ -71,8 +70,8 @@ from .texture import level_images, level_pyramid, load_tables
 #: Weights λ of the paper's figure 2.
 LAMBDAS = (0.0, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)
 
-#: The material that ships.
-SHIPPED = "scenes/assets/tiles.json"
+#: Compression ratio of all trainings.
+COMPRESSION = 12.0
 
 #: dB by which a run may end below its best state.
 DRIFT = 0.2
@@ -80,49 +79,16 @@ DRIFT = 0.2
 #: Limit of clipped derivatives of the specular lobe, unless our preset has one.
 CLIP = 0.1
 
+#: Remedies → whether derivatives are clipped, and whether the learning rate falls.
+REMEDIES = {
+    "clip, schedule": (True, True),
+    "no clip, schedule": (False, True),
+    "clip, no schedule": (True, False),
+    "no clip, no schedule": (False, False),
+}
 
-@dataclass(frozen=True)
-class Remedies:
-    """Remedies against instability: ``clip``, clipped derivatives; ``schedule``, a falling learning rate."""
-
-    clip: bool
-    schedule: bool
-
-    @property
-    def name(self) -> str:
-        return f"{'clip' if self.clip else 'no clip'}, {'schedule' if self.schedule else 'no schedule'}"
-
-
-#: Both remedies, one of them, none.
-REMEDIES = (Remedies(True, True), Remedies(False, True), Remedies(True, False), Remedies(False, False))
-
-
-@dataclass(frozen=True)
-class ShadingStudySettings:
-    """Settings of the shading study.
-
-    ``lambdas`` are the weights λ, 0 among them, ``ways`` the combinations of remedies, ``seeds`` the number of seeds.
-    ``preset`` is the recipe: the paper's has neither validation nor level bias, and ends in its last state. ``extras``:
-    also train, with the preset's λ, arrays that leave room for extras.
-    ``length`` is that of the training for shading, ``pretraining`` that of the training as a texture before it, in the
-    ``unit`` ``"s"`` or ``"steps"``. ``frames`` is the length of the zoom; ``quick`` makes it a smoke run.
-    """
-
-    lambdas: tuple[float, ...]
-    ways: tuple[Remedies, ...] = REMEDIES
-    seeds: int = 3
-    length: float = 15.0
-    pretraining: float = 20.0
-    compression: float = 12.0
-    frames: int = 60
-    quick: bool = False
-    unit: str = "s"
-    preset: str = "ours"
-    extras: bool = False
-
-    @property
-    def recipe(self) -> shading_task.ShadingRecipe:
-        return shading_task.PRESETS[self.preset]
+#: Choices of ``--remedies`` → remedies.
+CHOICES = {"all": tuple(REMEDIES), "on": ("clip, schedule",), "clip": ("clip, schedule", "clip, no schedule")}
 
 
 #: Options with a positive number → help.
@@ -145,22 +111,19 @@ class ShadingStudy(Study):
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         parser.add_argument(
             "materials", nargs="*", default=[], metavar="MATERIAL.json|NAME",
-            help="manifests of maps, or names of generated materials: hammered, weave, lacquer "
-            "(default: scenes/assets/tiles.json, if the file exists, and these; --quick: hammered)",
+            help="manifests of maps, or names of generated materials: hammered, weave, lacquer (default: these; "
+            "--quick: hammered)",
         )  # fmt: skip
         parser.add_argument("--lambda", action="append", type=fraction, dest="lambdas", metavar="X",
                             help="weight of the shading loss; may be repeated; 0 is always among them (default: "
                             "0, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 1; --quick: 0, 0.9)")  # fmt: skip
         for option, text in _NUMBERS.items():
             parser.add_argument(option, type=positive, metavar="N", help=text)
-        parser.add_argument("--compression", default="12x", metavar="N",
-                            help="compression ratio of all trainings (default: 12x)")  # fmt: skip
         parser.add_argument("--preset", choices=("ours", "paper"), default="ours",
                             help="recipe of the trainings (default: ours); the paper's has no validation")  # fmt: skip
-        parser.add_argument("--remedies", choices=("all", "both", "on", "clip"), default="all",
-                            help="clipped derivatives and a falling rate: all four combinations, both or none, both "
-                            "only, or clipped derivatives with either rate (default: all)")  # fmt: skip
-
+        parser.add_argument("--remedies", choices=tuple(CHOICES), default="all",
+                            help="clipped derivatives and a falling rate: all four combinations, both on, or clipped "
+                            "derivatives with either rate (default: all)")  # fmt: skip
         parser.add_argument("--extras", action="store_true",
                             help="also train arrays with extras beside them, as fit shading --extras auto")  # fmt: skip
         parser.add_argument("--renders", action="append", metavar="FILE.npz",
@@ -173,9 +136,8 @@ class ShadingStudy(Study):
             raise ValueError("--steps and --pretrain-steps: found one of them, both or none are allowed")
         if arguments.extras and arguments.preset == "paper":
             raise ValueError("--extras: the arrays of the preset paper have none")
-        arguments.ratio = parse_compression(arguments.compression)
-        arguments.loaded = load_materials(arguments.materials, arguments.side or (64 if arguments.quick else 512),
-                                          arguments.quick)  # fmt: skip
+        names = arguments.materials or (["hammered"] if arguments.quick else list(MATERIALS))
+        arguments.loaded = load_materials(names, arguments.side or (64 if arguments.quick else 512))
         if arguments.renders:
             if len(arguments.loaded) != 1:
                 raise ValueError(f"--renders: found {len(arguments.loaded)} materials, one is needed")
@@ -191,21 +153,18 @@ class ShadingStudy(Study):
         return run_renders(name, source, arguments.tables, settings, arguments.out)
 
     def plan(self, arguments) -> Plan:
-        quick = arguments.quick
-        steps = {"all": slice(None), "both": slice(None, None, 3), "on": slice(1), "clip": slice(None, None, 2)}
-        ways = REMEDIES[steps[arguments.remedies]]
-        settings = ShadingStudySettings(
-            tuple(sorted({0.0, *(arguments.lambdas or ((0.9,) if quick else LAMBDAS))})),
-            ways[:: len(ways) - 1] if quick and len(ways) > 1 else ways,
-            arguments.seeds or (1 if quick else 3),
-            float(arguments.steps or (1 if quick else 15)),
-            float(arguments.pretrain_steps or (1 if quick else 20)),
-            arguments.ratio,
-            arguments.frames or (4 if quick else 60),
-            quick,
-            "steps" if arguments.steps else "s",
-            arguments.preset,
-            arguments.extras,
+        quick, ways = arguments.quick, CHOICES[arguments.remedies]
+        settings = SimpleNamespace(
+            lambdas=sorted({0.0, *(arguments.lambdas or ((0.9,) if quick else LAMBDAS))}),
+            ways=ways[:1] if quick else ways,
+            seeds=arguments.seeds or (1 if quick else 3),
+            length=float(arguments.steps or (1 if quick else 15)),
+            pretraining=float(arguments.pretrain_steps or (1 if quick else 20)),
+            unit="steps" if arguments.steps else "s",
+            frames=arguments.frames or (4 if quick else 60),
+            quick=quick,
+            preset=arguments.preset,
+            extras=arguments.extras,
         )
         return plan(arguments.loaded, settings)
 
@@ -213,13 +172,8 @@ class ShadingStudy(Study):
 STUDY = ShadingStudy()
 
 
-def load_materials(names: Sequence[str], side: int, quick: bool = False) -> dict[str, Source]:
-    """Return the sources of manifests and of generated materials, by name; a default list if ``names`` is empty.
-
-    Raises ``SourceError`` and ``ValueError``.
-    """
-    if not names:
-        names = ["hammered"] if quick else [*([SHIPPED] if Path(SHIPPED).is_file() else []), *MATERIALS]
+def load_materials(names: Sequence[str], side: int) -> dict[str, Source]:
+    """Return the sources of manifests and of generated materials, by name. Raises ``SourceError``, ``ValueError``."""
     sources = {}
     for text in names:
         name = text if text in MATERIALS else Path(text).stem
@@ -231,13 +185,16 @@ def load_materials(names: Sequence[str], side: int, quick: bool = False) -> dict
     return sources
 
 
-#: Texels along a pixel in the first and in the last frame.
+#: Texels along a pixel in the first frame of the zoom.
 FAR = 12.0
+
+#: Texels along a pixel in the last frame.
 NEAR = 3.0
 
-
-#: Field of view of the zoom in degrees, and the direction to its light.
+#: Field of view of the zoom, in degrees.
 FOV = 50.0
+
+#: Direction to the light of the zoom.
 LIGHT = (0.45, 0.25, 0.86)
 
 
@@ -304,90 +261,114 @@ class ShadedZoom(MovingView):
 
 
 @dataclass
-class ShadingStudyContext:
-    """A material, the data that its contenders share, and their jobs by name."""
+class ShadingContenders:
+    """Contenders of a material: their jobs by name, and the candidates, of which all seeds of a run are one."""
 
     name: str
     source: Source
-    settings: ShadingStudySettings
+    settings: SimpleNamespace
     jobs: dict[str, Contender] = field(default_factory=dict)
+    candidates: list[Candidate] = field(default_factory=list)
 
-    @cached_property
-    def types(self):
-        return array_module(mi.variant())
-
-    @cached_property
-    def recipe(self):
-        return texture_task.PRESETS[self.settings.recipe.texture]
-
-    @cached_property
-    def pyramid(self) -> Pyramid:
-        return Pyramid.of(self.source, textures.layout_of(self.source, self.recipe), self.types)
-
-    @cached_property
-    def effects(self) -> Effects:
-        return effects_of(self.pyramid.layout)[0]
-
-    @cached_property
-    def decoder(self):
-        return frozen_decoder(self.types)
+    def __post_init__(self):
+        types, quick = array_module(mi.variant()), self.settings.quick
+        self.preset = shading_task.PRESETS[self.settings.preset]
+        self.recipe = texture_task.PRESETS[self.preset.texture]
+        self.pyramid = Pyramid.of(self.source, textures.layout_of(self.source, self.recipe), types)
+        self.effects = effects_of(self.pyramid.layout)[0]
+        self.zoom = ShadedZoom(self.pyramid, self.effects, self.settings.frames, 32 if quick else 96)
 
     @cached_property
     def evaluation(self) -> ShadedEvaluation:
-        levels, pairs, side = (3, 2, 16) if self.settings.quick else (6, 16, 64)
-        return ShadedEvaluation(self.pyramid, self.effects, levels, pairs, side)
+        return ShadedEvaluation(self.pyramid, self.effects, *((3, 2, 16) if self.settings.quick else (6, 16, 64)))
 
-    @cached_property
-    def zoom(self) -> ShadedZoom:
-        return ShadedZoom(self.pyramid, self.effects, self.settings.frames, 32 if self.settings.quick else 96)
+    # -- Registration
 
-    def measure(self, job: Contender, nbytes: int, **details) -> dict:
+    def add(self, label: str, method: str, fit: Callable, read: Callable, has_file: bool = False) -> Contender:
+        """Register the contender of a method with a label; its model is a reader of shaded values."""
+        budget = 1 if method == "classical" else COMPRESSION
+        job = Contender(f"{self.name}, {label}", method, budget, fit, read, label, has_file=has_file)
+        self.jobs[job.name] = job
+        return job
+
+    def add_candidate(self, name: str, representation: str, jobs: Sequence[Contender], **details) -> None:
+        """Register the candidate of jobs of all seeds; its bytes, seconds and flicker are those of the first seed."""
+
+        def errors(samples: int) -> dict[str, float]:
+            records, values = [job.record["details"] for job in jobs], {}
+            for letter, key in itertools.product("CP", ("mean_db", "coarse_db", "flip")):
+                measured = [d[letter][key] for d in records if d[letter][key]]
+                if measured:  # the FLIP of small images is not measured
+                    values[f"{letter.lower()}_{key}"] = float(np.mean(measured))
+            return {**values, **self.zoom.errors(self.zoom.render(jobs[0].model), self.zoom.truth)}
+
+        details |= {"material": self.name}
+        self.candidates.append(Candidate(name, representation, job=jobs[0].name, errors=errors, details=details))
+
+    def record(self, job: Contender, nbytes: int, **details) -> dict:
         """Measure the model of a job; return its record."""
         details = {"material": self.name, **self.evaluation.measure(job.model), "kind": job.method, **details}
-        details |= {"label": job.label} if job.label else {}
-        return {"bytes": nbytes, "details": details}
+        return {"bytes": nbytes, "details": {**details, "label": job.label}}
 
-    def contender(self, method: str, label: str, fit: Callable, read: Callable, **fields) -> Contender:
-        """Return a contender of this material with a label, whose model is a reader of shaded values."""
-        budget = 1 if method == "classical" else self.settings.compression
-        return Contender(f"{self.name}, {label}", method, budget, fit, read, label, **fields)
+    def add_filter(self, label: str, method: str, nbytes: Callable[[], int], read: Callable[[], ShadedReader]) -> None:
+        """Register a filter that nothing is trained for."""
+        fit = lambda job, progress: self.record(job, nbytes())  # noqa: E731
+        job = self.add(label, method, fit, lambda job: read())
+        self.add_candidate(job.name, label, [job], kind=label)
 
-    def classical(self, label: str, build: Callable[[Contender], ShadedReader], channels: int = 0) -> Contender:
-        """Return an uncompressed filter, which needs ``channels`` beside those of the maps."""
-
-        def fit(job: Contender, progress: bool) -> dict:
-            texels = sum(v[..., 0].size for v in self.pyramid.values)
-            return self.measure(job, self.pyramid.nbytes + channels * texels)
-
-        return self.contender("classical", label, fit, build, has_file=False)
-
-    def encoded(self, label: str, pyramid: Callable[[], Pyramid]) -> Contender:
-        """Return a filter whose levels ASTC stores in the bytes of the trainings."""
-
-        @cache
-        def levels() -> tuple[Pyramid, int]:
-            filtered = pyramid()
-            names = [m.name for m in filtered.layout.maps if m.role == "normal"]
-            nbytes = int(self.source.nbytes / self.settings.compression)
-            coded, nbytes = codecs.astc_levels(level_images(filtered), nbytes, "thorough", names)
-            return level_pyramid({name: e.levels for name, e in coded.items()}, filtered), nbytes
-
-        return self.contender(
-            "compressed", label, lambda job, progress: self.measure(job, levels()[1]),
-            lambda job: normals.reader(levels()[0], self.effects), has_file=False,
-        )  # fmt: skip
-
-    def biased(self, label: str, base: Contender) -> Contender:
-        """Return a compressed texture read at the levels of detail that suit the truth's kernel; nothing is trained."""
-        return self.contender(
-            "compressed", label, lambda job, progress: self.measure(job, base.record["bytes"]),
-            lambda job: self.best_levels(base.model), has_file=False,
-        )  # fmt: skip
-
-    def best_levels(self, read: ShadedReader) -> ShadedReader:
-        """Return a reader at the levels of detail with the smallest error."""
+    def add_kernel(self, job: Contender, label: str = "") -> None:
+        """Register a contender, of another ``label``, read at the levels of detail with the smallest error."""
         places = 2**10 if self.settings.quick else normals.PLACES
-        return normals.biased(read, normals.choose_biases(read, self.pyramid, self.effects, places))
+        name, *storage = (label or job.label).split(", ")
+        label = ", ".join([*([] if name == "filtered" else [name]), "kernel", *storage])
+        method = "classical" if job.method == "classical" else "compressed"
+
+        def read() -> ShadedReader:
+            biases = normals.choose_biases(job.model, self.pyramid, self.effects, places)
+            return normals.biased(job.model, biases)
+
+        self.add_filter(label, method, lambda: job.record["bytes"], read)
+
+    def last(self) -> Contender:
+        """Return the contender that was registered last."""
+        return next(reversed(self.jobs.values()))
+
+    # -- Classical filters
+
+    def add_classical(self) -> None:
+        """Register classical filters: uncompressed, compressed as ours, and by ASTC, each also with its kernel."""
+        quick, pyramid, effects = self.settings.quick, self.pyramid, self.effects
+        levels = {
+            "Toksvig": lambda: normals.toksvig_levels(pyramid),
+            "baked": lambda: normals.bake(pyramid, effects, 4 if quick else normals.PAIRS),
+        }
+        pyramids = {name: cache(lambda make=make: normals.with_roughness(pyramid, make()))
+                    for name, make in levels.items()}  # fmt: skip
+        pyramids = {"filtered": lambda: pyramid, **pyramids}
+        for name, make in pyramids.items():
+            nbytes = lambda make=make: make().nbytes  # noqa: E731
+            self.add_filter(name, "classical", nbytes, lambda make=make: reader(make(), effects))
+            self.add_kernel(self.last())
+        moments = 6 * sum(v[..., 0].size for v in pyramid.values)
+        self.add_filter("LEAN", "classical", lambda: pyramid.nbytes + moments, lambda: normals.lean(pyramid, effects))
+        self.add_kernel(self.last())
+        for name in levels:
+            self.add_compressed(f"{name}, compressed", pyramids[name])
+            self.add_kernel(self.last())
+        for name, make in pyramids.items() if "astc" in codecs.available() and not quick else ():
+            coded = cache(partial(self.encode, make))
+            read = lambda coded=coded: reader(coded()[0], effects)  # noqa: E731
+            self.add_filter(f"{name}, ASTC", "compressed", lambda coded=coded: coded()[1], read)
+            self.add_kernel(self.last())
+
+    def encode(self, make: Callable[[], Pyramid]) -> tuple[Pyramid, int]:
+        """Return a pyramid whose levels ASTC stores in the bytes of the trainings, and the bytes."""
+        pyramid = make()
+        names = [m.name for m in pyramid.layout.maps if m.role == "normal"]
+        coded, nbytes = codecs.astc_levels(level_images(pyramid), self.source.nbytes / COMPRESSION, "thorough", names)
+        return level_pyramid({name: e.levels for name, e in coded.items()}, pyramid), nbytes
+
+    # -- Trainings
 
     def request(self, settings: FitSettings, length: float, seed: int, progress: bool) -> task.FitRequest:
         """Return the request for a training of a ``length``, with ``settings`` changed for it."""
@@ -397,10 +378,8 @@ class ShadingStudyContext:
             every = max(1, int(length) // 10)
             settings, seconds = dataclasses.replace(settings, steps=int(length), measure_every=every), None
         options = {argument.name: argument.default for argument in task.tasks()["texture"].arguments}
-        options["compression"] = self.settings.compression
-        preset = self.settings.preset
-        return task.FitRequest(preset, settings, self.types, deadline=seconds and Deadline(seconds),
-                               progress=progress, options=options)  # fmt: skip
+        return task.FitRequest(self.settings.preset, settings, self.pyramid.types, progress=progress, options=options,
+                               deadline=seconds and Deadline(seconds))  # fmt: skip
 
     def fit_texture(
         self, pyramid: Pyramid, length: float, seed: int, progress: bool, extras: bool = False
@@ -409,9 +388,9 @@ class ShadingStudyContext:
 
         With ``extras``, the arrays leave room for them.
         """
-        request = self.request(texture_task.PRESETS["ours"].settings, length, seed, progress)
-        recipe = dataclasses.replace(self.recipe, settings=request.settings)
-        nbytes = self.source.nbytes / self.settings.compression
+        request = self.request(texture_task.PRESETS["ours"], length, seed, progress)
+        recipe = dataclasses.replace(self.recipe, **request.settings.common)
+        nbytes = self.source.nbytes / COMPRESSION
         nbytes = shading_fit.bytes_beside_extras(nbytes, pyramid) if extras else nbytes
         size = size_of(self.source, pyramid, nbytes, recipe, request.options)
         problem = textures.problem_of(self.source, size, recipe, pyramid)
@@ -421,105 +400,105 @@ class ShadingStudyContext:
         trained.preset, trained.seed = self.settings.preset, seed
         return trained, result
 
-    def trained(
-        self, method: str, label: str, train: Callable[[bool], tuple[Table, FitResult, dict]],
-        finish: Callable[[dict], None] = lambda record: None,
-    ) -> Contender:  # fmt: skip
-        """Return the contender of a texture that ``train(progress)`` trains; its table stays in the folder of models.
+    def add_trained(
+        self, label: str, method: str, train: Callable[[bool], tuple], base: Contender | None = None
+    ) -> Contender:
+        """Register a texture that ``train(progress)`` trains: it returns the table, the training's record, and details.
 
-        ``train`` returns the table, the record of the training, and further details; ``finish`` completes the record.
-        The model has the attribute ``table``.
+        The table stays in the folder of models. ``base`` is the run of the same seed with λ = 0, for troubles of a run.
         """
 
         def fit(job: Contender, progress: bool) -> dict | None:
-            table, result, details = train(progress)
+            table, result, more = train(progress)
             if result.interrupted:
                 return None
-            if job.file is not None:
-                save_table(job.file, table)
-            job.model = TrainedReader(table, self)
+            save_table(job.file, table)
             training = {"steps": result.steps, "kept_step": result.step, "restarts": result.restarts,
                         "history": result.history, "training_seconds": result.seconds}  # fmt: skip
-            record = self.measure(job, table.nbytes, **training, **details)
-            finish(record)
+            record = self.record(job, table.nbytes, **training, **more)
+            if method in ("run", "extras"):
+                record["details"]["trouble"] = troubles(record["details"], base and base.record["details"])
             return record
 
-        def read(job: Contender) -> TrainedReader:
-            return TrainedReader(task.tasks()["texture"].load(job.file), self)
+        def read(job: Contender) -> ShadedReader:
+            texture = CompressedTexture.of(self.table(job), self.pyramid.types.TensorXf)
+            return reader(texture, self.effects, frozen_decoder(self.pyramid.types))
 
-        job = self.contender(method, label, fit, read)
-        job.label = "" if method in ("start", "run") else label
-        return job
+        return self.add(label, method, fit, read, True)
 
-    def start(self, seed: int, extras: bool = False) -> Contender:
-        """Return a texture trained as task 4 trains it: the start of the runs of a seed."""
+    @staticmethod
+    def table(job: Contender) -> Table:
+        return task.tasks()["texture"].load(job.file)
 
-        def train(progress: bool) -> tuple:
-            length = self.settings.pretraining
-            return *self.fit_texture(self.pyramid, length, seed, progress, extras), {"seed": seed}
+    def add_start(self, seed: int, extras: bool = False) -> Contender:
+        """Register a texture trained as task 4 trains it: the start of the runs of a seed."""
+        length, label = self.settings.pretraining, f"texture{' beside extras' * extras}, seed {seed}"
+        train = lambda progress: (*self.fit_texture(self.pyramid, length, seed, progress, extras), {"seed": seed})  # noqa: E731
+        return self.add_trained(label, "start", train)
 
-        return self.trained(
-            "start", f"texture beside extras, seed {seed}" if extras else f"texture, seed {seed}", train
-        )
+    def add_compressed(self, label: str, pyramid: Callable[[], Pyramid]) -> None:
+        """Register a texture trained on a classical filter's pyramid, for the time of start and run together."""
+        length = self.settings.pretraining + self.settings.length
+        train = lambda progress: (*self.fit_texture(pyramid(), length, 0, progress), {})  # noqa: E731
+        job = self.add_trained(label, "compressed", train)
+        self.add_candidate(job.name, label, [job], kind=label)
 
-    def compressed(self, label: str, pyramid: Callable[[], Pyramid]) -> Contender:
-        """Return a texture trained on the pyramid of a classical filter, for the time of start and run together."""
-
-        def train(progress: bool) -> tuple:
-            length = self.settings.pretraining + self.settings.length
-            return *self.fit_texture(pyramid(), length, 0, progress), {}
-
-        return self.trained("compressed", label, train)
-
-    def run(
-        self, start: Contender, way: Remedies, share: float, seed: int, base: Contender | None, extras: bool = False
+    def add_run(
+        self, start: Contender, way: str, share: float, seed: int, base: Contender | None, extras: bool = False
     ) -> Contender:
-        """Return a training for shading with weight ``share``; ``base`` is the run of the same seed with λ = 0.
+        """Register a training for shading with weight ``share``; ``base`` is the run of the same seed with λ = 0.
 
         λ = 0 is read at the level of the footprint; for other λ, the training chooses the level bias, and with
         ``extras`` whether there are any.
         """
+        clip, schedule = REMEDIES[way]
 
         def train(progress: bool) -> tuple:
-            preset = self.settings.recipe
-            schedule = "cosine" if way.schedule else "constant"
-            settings = dataclasses.replace(preset.settings, schedule=schedule)
+            preset = self.preset
+            settings = dataclasses.replace(preset, schedule="cosine" if schedule else "constant")
             request = self.request(settings, self.settings.length, seed, progress)
             recipe = dataclasses.replace(
-                preset, share=share, clip=(preset.clip or CLIP) if way.clip else None, extras=extras,
-                level_bias=preset.level_bias if share else 0.0, settings=request.settings,
+                preset, share=share, clip=(preset.clip or CLIP) if clip else None, extras=extras,
+                level_bias=preset.level_bias if share else 0.0, **request.settings.common,
             )  # fmt: skip
-            net = start_of(start.model.table, self.pyramid)
+            before = self.table(start)
             try:
                 fit = fit_shading if preset.bounded else fit_to_the_end
+                net = start_of(before, self.pyramid)
                 table, result = fit(self.source, net, recipe, request, self.pyramid, self.evaluation)
             except FittingError:  # diverged repeatedly: the result is the start
-                table, result = start.model.table, FitResult({}, 0, 0, 0.0, False, 0, [])
-            details = {"share": share, "clip": way.clip, "schedule": way.schedule, "seed": seed, "way": way.name,
+                table, result = before, FitResult({}, 0, 0, 0.0, False, 0, [])
+            details = {"share": share, "clip": clip, "schedule": schedule, "seed": seed, "way": way,
                        "level_bias": table.settings.get("level_bias", 0.0)}  # fmt: skip
             if extras:
                 details["has_extras"] = table.settings.get("shading", {}).get("extras", False)
             return table, result, details
 
-        def finish(record: dict) -> None:
-            before = base.record["details"] if base is not None and base.record else None
-            record["details"]["trouble"] = troubles(record["details"], before)
+        label = f"extras, seed {seed}" if extras else f"lambda {share:g}, {way}, seed {seed}"
+        return self.add_trained(label, "extras" if extras else "run", train, base)
 
-        name = f"extras, seed {seed}" if extras else f"lambda {share:g}, {way.name}, seed {seed}"
-        job = self.trained("extras" if extras else "run", name, train, finish)
-        job.details = {"share": share, "way": way, "base": base, "start": start}
-        return job
-
-
-class TrainedReader:
-    """Reader of shaded values of a compressed texture, shaded by the tables of the BRDF that it was trained through."""
-
-    def __init__(self, table: Table, context: ShadingStudyContext):
-        self.table = table
-        self.read = reader(CompressedTexture.of(table, context.types.TensorXf), context.effects, context.decoder)
-
-    def __call__(self, *lanes):
-        return self.read(*lanes)
+    def add_runs(self) -> None:
+        """Register the trainings of all seeds; without a shading loss, there is nothing to clip."""
+        settings, groups = self.settings, {}
+        for seed in range(settings.seeds):
+            start, bases = self.add_start(seed), {}
+            for share, way in itertools.product(settings.lambdas, settings.ways):
+                schedule = REMEDIES[way][1]
+                if share == 0 and schedule in bases:
+                    continue
+                run = self.add_run(start, way, share, seed, bases.get(schedule))
+                groups.setdefault((share, way), []).append(run)
+                if share == 0:
+                    if not bases and seed == 0:
+                        self.add_kernel(run, "filtered, compressed")
+                    bases[schedule] = run
+            if settings.extras:
+                way, start = settings.ways[0], self.add_start(seed, True)
+                run = self.add_run(start, way, self.preset.share, seed, bases[REMEDIES[way][1]], True)
+                self.add_candidate(run.name, run.label, [run], kind=run.label)
+        for (share, way), runs in groups.items():
+            name, details = f"{self.name}, lambda {share:g}, {way}", {"lambda": share, "way": way, "kind": "run"}
+            self.add_candidate(name, "lambda", runs, **details)
 
 
 def fit_to_the_end(source, net, recipe, request, pyramid: Pyramid, evaluation: ShadedEvaluation) -> tuple:
@@ -533,250 +512,124 @@ def fit_to_the_end(source, net, recipe, request, pyramid: Pyramid, evaluation: S
 
 def troubles(details: dict, base: dict | None) -> list[str]:
     """Return the troubles of a run, by their names above; ``base`` are the details of λ = 0 of the same seed."""
-    history, names = details["history"], []
-    if not history:
-        names.append("diverged")
+    history, psnr = details["history"], details["C"]["mean_db"]
     numbers = [v for h in history for k, v in h.items() if k != "step" and v is not None]
-    if not np.isfinite(np.asarray([*numbers, details["C"]["mean_db"]], float)).all():
-        names.append("nan")
-    if details["restarts"]:
-        names.append("restarts")
     losses = [h["loss"] for h in history if h["loss"] is not None and math.isfinite(h["loss"])]
-    if losses and max(losses) > 10 * float(np.median(losses)) + 1e-9:
-        names.append("spike")
-    if history:
-        key = next(k for k in history[-1] if k not in ("step", "loss"))
-        values = [h[key] for h in history if math.isfinite(h[key])]
-        if values and max(values) - history[-1][key] > DRIFT:
-            names.append("drift")
-    if base is not None and details["C"]["mean_db"] < base["C"]["mean_db"]:
-        names.append("below")
-    return names
+    key = next((k for h in history[-1:] for k in h if k not in ("step", "loss")), None)
+    values = [h[key] for h in history if math.isfinite(h[key])]
+    applying = {
+        "diverged": not history,
+        "nan": not np.isfinite(np.asarray([*numbers, psnr], float)).all(),
+        "restarts": details["restarts"],
+        "spike": losses and max(losses) > 10 * float(np.median(losses)) + 1e-9,
+        "drift": values and max(values) - history[-1][key] > DRIFT,
+        "below": base is not None and psnr < base["C"]["mean_db"],
+    }
+    return [name for name, applies in applying.items() if applies]
 
 
 # -- The plan ----------------------------------------------------------------------------------------------------------
 
 
-def plan(sources: dict[str, Source], settings: ShadingStudySettings) -> Plan:
+def plan(sources: dict[str, Source], settings: SimpleNamespace) -> Plan:
     """Return the plan for the materials in the current variant."""
-    contexts = {name: ShadingStudyContext(name, source, settings) for name, source in sources.items()}
-    candidates: list[Candidate] = []
+    contexts = {name: ShadingContenders(name, source, settings) for name, source in sources.items()}
     for context in contexts.values():
-        context.jobs = {job.name: job for job in shading_jobs(context)}
-        candidates += shading_candidates(context)
+        context.add_classical()
+        context.add_runs()
     sizes = ", ".join(f"{name} ({s.width} × {s.height})" for name, s in sources.items())
-    request = json.loads(json.dumps(asdict(settings)))
-    digests = {name: s.digest for name, s in sources.items()}
-    measures = [Measure(f"{letter}{' coarse' * coarse}", f"{letter.lower()}_{'coarse' if coarse else 'mean'}_db")
-                for letter in "CP" for coarse in (False, True)]  # fmt: skip
+    details = {"sources": {name: s.digest for name, s in sources.items()}, "request": vars(settings)}
     return Plan(
         study="shading",
         title="Textures trained for their shading",
-        candidates=candidates,
+        candidates=[candidate for context in contexts.values() for candidate in context.candidates],
         cases=[],
-        queries=(),
-        accuracy="c_mean_db",
-        accuracy_label="PSNR of shaded values against converged truth, mean of levels, dB",
-        details={
-            "sources": digests,
-            "request": request,
-            "evaluation": "3 levels, 2 pairs" if settings.quick else "6 levels, 16 pairs of a view and a light",
-        },
+        details=details,
         notes=[
             *codecs.install_notes(["astc"]),
-            f"{sizes}; {settings.compression:g}x, {settings.pretraining:g} {settings.unit} of training as a texture, "
+            f"{sizes}; {COMPRESSION:g}x, {settings.pretraining:g} {settings.unit} of training as a texture, "
             f"then {settings.length:g} {settings.unit} for shading; C: converged truth, P: the paper's reference.",
         ],
         jobs=[job for context in contexts.values() for job in context.jobs.values()],
-        jobs_fingerprint=f"{digests} {request}",
+        jobs_fingerprint=str(details),
         pictures={
             "png": draw_lambdas,
             "levels": draw_levels,
-            "strip": lambda result: draw_crops(contexts, result),
-            "zoom": lambda result: draw_zoom(contexts, result),
+            "strip": partial(draw_crops, contexts),
+            "zoom": partial(draw_zoom, contexts),
         },
-        sampled=False,
         measures=(
-            *measures,
+            Measure("C", "c_mean_db"),
+            Measure("C coarse", "c_coarse_db"),
+            Measure("P", "p_mean_db"),
+            Measure("P coarse", "p_coarse_db"),
             Measure("FLIP", "c_flip", ".4f", False),
             Measure("flicker", "flicker_error", ".2e", False),
         ),
-        conclusions=conclusions,
     )
 
 
-def shading_jobs(context: ShadingStudyContext) -> list[Contender]:
-    """Return the jobs of a material in their order: cheap ones first, then all λ of each seed."""
-    source, settings, pyramid, effects = context.source, context.settings, context.pyramid, context.effects
-
-    @cache
-    def bake() -> list[np.ndarray]:
-        return normals.bake(pyramid, effects, 4 if settings.quick else normals.PAIRS)
-
-    filters = {
-        "filtered": lambda: normals.reader(pyramid, effects),
-        "Toksvig": lambda: normals.toksvig(source, pyramid, effects),
-        "LEAN": lambda: normals.lean(source, pyramid, effects),
-        "baked": lambda: normals.roughness_reader(pyramid, effects, bake()),
-    }
-    best = context.best_levels
-    classical = {
-        "filtered": filters["filtered"], "kernel": lambda: best(filters["filtered"]()), "Toksvig": filters["Toksvig"],
-        "LEAN": filters["LEAN"], "LEAN, kernel": lambda: best(normals.lean(source, pyramid, effects, True)),
-        "baked": filters["baked"], "baked, kernel": lambda: best(filters["baked"]()),
-    }  # fmt: skip
-    roughness = {
-        "Toksvig": lambda: normals.with_roughness(pyramid, normals.toksvig_levels(source, pyramid)),
-        "baked": lambda: normals.with_roughness(pyramid, bake()),
-    }
-    if settings.preset == "paper":  # its figure has no further filters
-        classical, roughness = {"filtered": classical["filtered"]}, {}
-    elif settings.quick:
-        del classical["baked, kernel"], roughness["baked"]
-    jobs = [
-        context.classical(label, lambda job, build=build: build(), 6 if label.startswith("LEAN") else 0)
-        for label, build in classical.items()
-    ]
-    for label, levels in roughness.items():
-        jobs.append(context.compressed(f"{label}, compressed", levels))
-        if label == "baked":
-            jobs.append(context.biased("baked, kernel, compressed", jobs[-1]))
-    with_astc = roughness and "astc" in codecs.available() and not settings.quick
-    for label, levels in {"filtered": lambda: pyramid, **roughness}.items() if with_astc else ():
-        jobs.append(context.encoded(f"{label}, ASTC", levels))
-        if label != "Toksvig":
-            jobs.append(context.biased(f"{label}, kernel, ASTC".removeprefix("filtered, "), jobs[-1]))
-    for seed in range(settings.seeds):
-        start, bases = context.start(seed), {}
-        jobs.append(start)
-        for share in settings.lambdas:
-            for way in settings.ways:
-                if share == 0 and way.schedule in bases:
-                    continue  # without a shading loss, there is nothing to clip
-                run = context.run(start, way, share, seed, bases.get(way.schedule))
-                jobs.append(run)
-                if share == 0:
-                    if not bases and seed == 0:
-                        jobs.append(context.biased("kernel, compressed", run))
-                    bases[way.schedule] = run
-        if settings.extras:
-            way, start = settings.ways[0], context.start(seed, True)
-            run = context.run(start, way, settings.recipe.share, seed, bases[way.schedule], True)
-            jobs += [start, run]
-    return jobs
-
-
-def shading_candidates(context: ShadingStudyContext) -> list[Candidate]:
-    """Return the candidates of a material; runs of all seeds are one."""
-    candidates, groups = [], {}
-    for job in context.jobs.values():
-        if job.label:
-            candidates.append(_candidate(context, job.name, [job], job.label, {"kind": job.label}))
-        elif job.method == "run":
-            groups.setdefault((job.details["share"], job.details["way"]), []).append(job)
-    for (share, way), runs in groups.items():
-        details = {"lambda": share, "way": way.name, "kind": "run"}
-        name = f"{context.name}, lambda {share:g}, {way.name}"
-        candidates.append(_candidate(context, name, runs, "lambda", details))
-    return candidates
-
-
-def _candidate(context: ShadingStudyContext, name: str, jobs: list, representation: str, details: dict) -> Candidate:
-    """Return the candidate of the runs of all seeds; its bytes, seconds and flicker are those of the first seed."""
-
-    def errors(samples: int) -> dict[str, float]:
-        records, values = [job.record["details"] for job in jobs], {}
-        for letter in "CP":
-            for key in ("mean_db", "coarse_db"):
-                psnr = [d[letter][key] for d in records]
-                name = f"{letter.lower()}_{key}"
-                values |= {name: float(np.mean(psnr)), f"{name}_low": min(psnr), f"{name}_high": max(psnr)}
-            flips = [np.mean(d[letter]["flip"]) for d in records if d[letter]["flip"]]
-            if flips:
-                values[f"{letter.lower()}_flip"] = float(np.mean(flips))
-            for i in range(len(records[0][letter]["psnr_db"])):
-                values[f"{letter.lower()}_l{i}_db"] = float(np.mean([d[letter]["psnr_db"][i] for d in records]))
-        return {**values, **context.zoom.errors(context.zoom.render(jobs[0].model), context.zoom.truth)}
-
-    return Candidate(
-        name, representation, job=jobs[0].name, errors=errors, details={**details, "material": context.name}
-    )
-
-
-# -- Conclusions and pictures ------------------------------------------------------------------------------------------
+# -- Pictures ----------------------------------------------------------------------------------------------------------
 
 #: Line style of each classical filter.
 CLASSICAL = {"filtered": ":", "kernel": (0, (1, 3)), "Toksvig": (0, (5, 1)), "LEAN": "--", "LEAN, kernel": (0, (6, 2)),
              "baked": "-."}  # fmt: skip
 
-#: Level of detail of the crops, and their largest side in texels.
+#: Level of detail of the crops.
 CROP_LEVEL = 3
+
+#: Largest side of the crops, in texels.
 CROP_SIDE = 48
 
 
 @dataclass
 class MaterialCurves:
-    """Records of a material: ``classical``, ``compressed``, ``extras`` (by label), ``runs`` (by remedies and λ).
+    """Records of a material: ``classical`` and ``compressed`` filters by label, ``runs`` by remedies and λ.
 
     ``runs`` has the details of all seeds; those of λ = 0 stand under all remedies that they are the base of.
     """
 
-    name: str
     classical: dict[str, dict] = field(default_factory=dict)
     compressed: dict[str, dict] = field(default_factory=dict)
-    extras: dict[str, dict] = field(default_factory=dict)
     runs: dict[tuple[str, float], list[dict]] = field(default_factory=dict)
 
     @property
     def remedies(self) -> list[str]:
         return list(dict.fromkeys(remedy for remedy, share in self.runs if share > 0))
 
-    def shares(self, remedy: str) -> list[float]:
-        return sorted(share for r, share in self.runs if r == remedy)
+    def values(self, remedy: str, share: float, letter: str = "C") -> list[float]:
+        """Return the mean PSNR of levels of each seed."""
+        return [d[letter]["mean_db"] for d in self.runs.get((remedy, share), [])]
 
-    def values(self, remedy: str, share: float, letter: str = "C", key: str = "mean_db") -> list[float]:
-        """Return ``mean_db``, ``coarse_db`` or ``flip`` of each seed."""
-        errors = [d[letter] for d in self.runs.get((remedy, share), [])]
-        return [float(np.mean(e["flip"])) if key == "flip" else e[key] for e in errors if e.get(key)]
-
-    def mean(self, *key) -> float:
-        values = self.values(*key)
-        return float(np.mean(values)) if values else float("nan")
-
-    def levels(self, remedy: str, share: float, letter: str = "C") -> np.ndarray:
-        """Return the PSNR of each level, averaged over seeds."""
-        return np.mean([d[letter]["psnr_db"] for d in self.runs[remedy, share]], axis=0)
-
-    def best(self) -> tuple[str, float] | None:
-        """Return the remedies and λ > 0 with the best mean against C, of those with a run of λ = 0, or ``None``."""
-        keys = [(remedy, s) for remedy, s in self.runs if s > 0 and (remedy, 0.0) in self.runs]
-        return max(keys, key=lambda key: self.mean(*key), default=None)
-
-    @property
-    def best_classical(self) -> str | None:
-        """The best classical filter against C, uncompressed."""
-        filters = [label for label in self.classical if label != "filtered"]
-        return max(filters, key=lambda label: self.classical[label]["C"]["mean_db"], default=None)
+    def shown(self) -> dict[str, dict]:
+        """Return records to show: the best classical filter, λ = 0 and the best λ against C, of the first seed."""
+        filters = {k: d for k, d in self.classical.items() if k != "filtered"}
+        records = {}
+        if filters:
+            best = max(filters, key=lambda label: filters[label]["C"]["mean_db"])
+            records[f"{best}, uncompressed"] = filters[best]
+        runs = [key for key in self.runs if key[1] > 0 and (key[0], 0.0) in self.runs]
+        if runs:
+            way, share = max(runs, key=lambda key: float(np.mean(self.values(*key))))
+            records |= {f"λ {s:g}, compressed": self.runs[way, s][0] for s in (0.0, share)}
+        return records
 
 
 def curves(result: dict) -> dict[str, MaterialCurves]:
     """Return the records of all materials with any measurement, by name."""
     materials: dict[str, MaterialCurves] = {}
     for record in result["jobs"].values():
-        d = record.get("details", {})
-        if "material" not in d:
-            continue
-        material = materials.setdefault(d["material"], MaterialCurves(d["material"]))
-        if d["kind"] in ("classical", "compressed", "extras"):
+        d = record["details"]
+        material = materials.setdefault(d["material"], MaterialCurves())
+        if d["kind"] in ("classical", "compressed"):
             getattr(material, d["kind"])[d["label"]] = d
         elif d["kind"] == "run":
             material.runs.setdefault((d["way"], d["share"]), []).append(d)
     for material in materials.values():
-        bases = {d["schedule"]: remedy for (remedy, share), ds in material.runs.items() if share == 0 for d in ds}
+        bases = {d["schedule"]: ds for (_, share), ds in material.runs.items() if share == 0 for d in ds}
         for remedy in material.remedies:
-            schedule = next(ds[0]["schedule"] for (r, s), ds in material.runs.items() if r == remedy and s > 0)
-            if schedule in bases:
-                material.runs[remedy, 0.0] = material.runs[bases[schedule], 0.0]
+            if REMEDIES[remedy][1] in bases:
+                material.runs[remedy, 0.0] = bases[REMEDIES[remedy][1]]
     return materials
 
 
@@ -786,19 +639,37 @@ def trouble(runs: list[dict]) -> str:
     return ", ".join(f"{name} {names.count(name)}" for name in dict.fromkeys(names))
 
 
-def conclusions(result: dict) -> list[str]:
-    """Return a line for each material and combination of remedies: gains of each λ over λ = 0, and troubles."""
-    lines = []
-    for material in curves(result).values():
+def draw_lambdas(result: dict):
+    """Draw PSNR over λ for all remedies, with bars over seeds, beside classical filters."""
+    shares = sorted({s for material in curves(result).values() for _, s in material.runs})
+
+    def draw(material: MaterialCurves, letter: str) -> list[plot.Curve]:
+        drawn = []
         for way in material.remedies:
-            shares = [share for share in material.shares(way) if share > 0]
-            runs = [d for share in shares for d in material.runs[way, share]]
-            for letter in "CP":
-                base = material.mean(way, 0.0, letter)
-                gains = ", ".join(f"{material.mean(way, s, letter) - base:+.2f} dB at {s:g}" for s in shares)
-                lines.append(f"{material.name}, {way}: over lambda = 0, against {letter}, {gains}")
-            lines.append(f"{material.name}, {way}: of {len(runs)} runs, trouble: {trouble(runs) or 'none'}")
-    return lines
+            values = {i: material.values(way, s, letter) for i, s in enumerate(shares) if (way, s) in material.runs}
+            troubled = trouble([d for s in shares if s for d in material.runs.get((way, s), [])])
+            ends = [[end(v) for v in values.values()] for end in (np.mean, min, max)]
+            drawn.append(plot.Curve(f"{way} ({troubled or 'no trouble'})", list(values), *ends))
+        drawn += _classical_curves(material, lambda d: ((0, len(shares) - 1), [d[letter]["mean_db"]] * 2))
+        for label, d in material.compressed.items():
+            style = {"marker": "*", "markersize": 8, "linestyle": "", "color": "0.3"}
+            drawn.append(plot.Curve(label, [0], [d[letter]["mean_db"]], style=style))
+        return drawn
+
+    return _draw_both(result, "", draw, "λ, weight of the shading loss", [f"{s:g}" for s in shares])
+
+
+def draw_levels(result: dict):
+    """Draw PSNR by level of detail of λ = 0, the best λ and classical filters."""
+
+    def draw(material: MaterialCurves, letter: str) -> list[plot.Curve]:
+        def by_level(d: dict) -> tuple:
+            return range(len(d[letter]["psnr_db"])), d[letter]["psnr_db"]
+
+        trained = [plot.Curve(text, *by_level(d)) for text, d in material.shown().items() if d["kind"] == "run"]
+        return trained + _classical_curves(material, by_level)
+
+    return _draw_both(result, ": levels of detail", draw, "level of detail")
 
 
 def _classical_curves(material: MaterialCurves, x: Callable[[dict], tuple[Sequence, Sequence]]) -> list[plot.Curve]:
@@ -814,89 +685,41 @@ def _classical_curves(material: MaterialCurves, x: Callable[[dict], tuple[Sequen
 def _draw_both(result: dict, title: str, draw: Callable, x_label: str, ticks: Sequence[str] = ()):
     """Return a figure with a row for each material and a column for each truth."""
     panels = {
-        f"{material.name}, against {truth} ({letter})": draw(material, letter)
-        for material in curves(result).values()
+        f"{name}, against {truth} ({letter})": draw(material, letter)
+        for name, material in curves(result).items()
         for letter, truth in (("C", "converged truth"), ("P", "the paper's reference"))
     }
     caption, label = figure_caption(result), "PSNR of shaded values, dB"
     return plot.draw_curves(result["title"] + title, caption, panels, x_label, label, ticks=ticks)
 
 
-def draw_lambdas(result: dict):
-    """Draw PSNR over λ for all remedies, with bars over seeds, beside classical filters."""
-    shares = sorted({s for material in curves(result).values() for _, s in material.runs})
-
-    def draw(material: MaterialCurves, letter: str) -> list[plot.Curve]:
-        drawn = []
-        for way in material.remedies:
-            values = {shares.index(s): material.values(way, s, letter) for s in material.shares(way)}
-            troubled = trouble([d for s in material.shares(way) if s for d in material.runs[way, s]])
-            ends = [[end(v) for v in values.values()] for end in (np.mean, min, max)]
-            drawn.append(plot.Curve(f"{way} ({troubled or 'no trouble'})", list(values), *ends))
-        last = len(shares) - 1
-        drawn += _classical_curves(material, lambda d: ((0, last), [d[letter]["mean_db"]] * 2))
-        for label, d in material.compressed.items():
-            style = {"marker": "*", "markersize": 8, "linestyle": "", "color": "0.3"}
-            drawn.append(plot.Curve(label, [0], [d[letter]["mean_db"]], style=style))
-        return drawn
-
-    return _draw_both(result, "", draw, "λ, weight of the shading loss", [f"{s:g}" for s in shares])
+def _readers(context: ShadingContenders, material: MaterialCurves) -> dict[str, ShadedReader]:
+    """Return the readers in crops and zooms: filtered parameters, and those of :meth:`MaterialCurves.shown`."""
+    labels = {"parameters filtered": "filtered", **{text: d["label"] for text, d in material.shown().items()}}
+    return {text: context.jobs[f"{context.name}, {label}"].model for text, label in labels.items()}
 
 
-def draw_levels(result: dict):
-    """Draw PSNR by level of detail of λ = 0, the best λ and classical filters."""
-
-    def draw(material: MaterialCurves, letter: str) -> list[plot.Curve]:
-        def by_level(psnr) -> tuple:
-            return range(len(psnr)), psnr
-
-        trained = [plot.Curve(f"λ {share:g}", *by_level(material.levels(way, share, letter)))
-                   for way, share in _shown(material)]  # fmt: skip
-        return trained + _classical_curves(material, lambda d: by_level(d[letter]["psnr_db"]))
-
-    return _draw_both(result, ": levels of detail", draw, "level of detail")
-
-
-def _shown(material: MaterialCurves) -> list[tuple[str, float]]:
-    """Return λ = 0 and the best λ, each with its remedies."""
-    best = material.best()
-    return [] if best is None else [(best[0], 0.0), best]
-
-
-def _readers(material: MaterialCurves, context: ShadingStudyContext) -> dict[str, ShadedReader]:
-    """Return the readers in crops and zooms: filtered parameters, the best classical filter, λ = 0, the best λ."""
-    best = material.best_classical
-    jobs = {"parameters filtered": "filtered"} if "filtered" in material.classical else {}
-    jobs |= {f"{best}, uncompressed": best} if best is not None else {}
-    for way, share in _shown(material):
-        d = material.runs[way, share][0]
-        jobs[f"λ {share:g}, compressed"] = f"lambda {share:g}, {d['way']}, seed {d['seed']}"
-    return {text: context.jobs[f"{material.name}, {job}"].model for text, job in jobs.items()}
-
-
-def draw_crops(contexts: dict[str, ShadingStudyContext], result: dict):
+def draw_crops(contexts: dict[str, ShadingContenders], result: dict):
     """Draw crops of a minified level: filtered parameters, the best classical filter, λ = 0, the best λ, the truth."""
     rows = {}
-    for material in curves(result).values():
-        evaluation = contexts[material.name].evaluation
+    for name, material in curves(result).items():
+        evaluation = contexts[name].evaluation
         level = min(CROP_LEVEL, evaluation.levels - 1)
         truths = evaluation.truths["C"][level].clip(0, 1)
-        readers = _readers(material, contexts[material.name])
+        readers = _readers(contexts[name], material)
         images = {text: evaluation.images(read, level).clip(0, 1) for text, read in readers.items()}
-        first = next(iter(images.values()))
+        first = images["parameters filtered"]
         pair = int(np.argmax(((first - truths) ** 2).mean(axis=(1, 2, 3))))  # with the largest error of the filter
-        side = min(CROP_SIDE, *truths.shape[1:3])
         texts = {f"{t}\n{decibel(float(np.mean((i[pair] - truths[pair]) ** 2))):.1f} dB": i for t, i in images.items()}
-        crops = {text: srgb.for_display(i[pair, :side, :side]) for text, i in {**texts, "truth": truths}.items()}
-        rows[f"{material.name}, level {level}"] = crops
+        crops = {t: srgb.for_display(i[pair, :CROP_SIDE, :CROP_SIDE]) for t, i in {**texts, "truth": truths}.items()}
+        rows[f"{name}, level {level}"] = crops
     return plot.draw_images(f"{result['title']}: crops", figure_caption(result), rows)
 
 
-def draw_zoom(contexts: dict[str, ShadingStudyContext], result: dict):
+def draw_zoom(contexts: dict[str, ShadingContenders], result: dict):
     """Draw frames of the zoom of the first material."""
-    material = next(iter(curves(result).values()))
-    context = contexts[material.name]
-    strips = {text: context.zoom.render(read) for text, read in _readers(material, context).items()}
-    title = f"{result['title']}: {material.name}, a zoom of {context.zoom.frames} frames"
-    rows = context.zoom.rows({**strips, "truth": context.zoom.truth})
-    return plot.draw_images(title, figure_caption(result), rows, 2.0)
+    name, material = next(iter(curves(result).items()))
+    zoom = contexts[name].zoom
+    strips = {text: zoom.render(read) for text, read in _readers(contexts[name], material).items()}
+    title = f"{result['title']}: {name}, a zoom of {zoom.frames} frames"
+    return plot.draw_images(title, figure_caption(result), zoom.rows({**strips, "truth": zoom.truth}), 2.0)

@@ -58,7 +58,7 @@ def small(tmp_path, monkeypatch):
     monkeypatch.setattr(
         metadata, "entry_points", lambda **k: points if k.get("group") == "mi_diffind.studies" else others(**k)
     )
-    monkeypatch.setattr(BenchmarkSettings, "choose", classmethod(lambda cls, variant, quick=False: SETTINGS))
+    monkeypatch.setattr(BenchmarkSettings, "choose", lambda quick: SETTINGS)
     studies.cache_clear()
     yield log
     monkeypatch.undo()

@@ -4,11 +4,12 @@ import os
 import signal
 
 import drjit as dr
+import mitsuba as mi
 from variants import BACKENDS
 
 from mi_diffind.core.runtime import array_module
 from mi_diffind.measure.benchmark import BenchmarkSettings
-from mi_diffind.measure.study import FLOOR, Candidate, Case, Job, Plan
+from mi_diffind.measure.study import FLOOR, Candidate, Case, Job, Measure, Plan
 
 SETTINGS = BenchmarkSettings(lanes=1024, rounds=4, passes=3, samples=100)
 
@@ -26,6 +27,7 @@ class Log(list):
 
 def small_plan(log, details=None):
     """Candidates ``slow`` (20 dB), ``good`` (30 dB), ``exact`` (the truth); a case with passes and one without."""
+    mi.set_variant(f"{BACKENDS[0]}_ad_rgb")
     ad = array_module(BACKENDS[0])
     x = dr.arange(ad.Float, SETTINGS.lanes) + 1
     dr.make_opaque(x)
@@ -63,19 +65,15 @@ def small_plan(log, details=None):
     return Plan(
         study="small",
         title="A small study",
-        variant=f"{BACKENDS[0]}_ad_rgb",
         candidates=[
-            Candidate("slow", "a", "x", 10, None, errors("slow", 20.0)),
-            Candidate("good", "b", errors=errors("good", 30.0), in_passes=False),
-            Candidate("exact", "c", is_truth=True, note="the truth"),
+            Candidate("slow", "a", "x", 10, errors("slow", 20.0)),
+            Candidate("good", "b", errors=errors("good", 30.0)),
+            Candidate("exact", "c", is_truth=True),
         ],
         cases=[case("first", True), case("second", False)],
-        queries=("eval", "pdf"),
-        accuracy="db",
-        accuracy_label="PSNR, dB",
+        measures=(Measure("PSNR, dB", "db"),),
         ratios=[("slow", "good"), ("good", "exact"), ("slow", "nobody")],
         details=details or {},
-        conclusions=lambda result: [f"{len(result['cases'])} cases done"],
     )
 
 

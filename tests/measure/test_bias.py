@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mi_diffind.measure import bias as measure
-from mi_diffind.measure.bias import estimate, seconds_of
+from mi_diffind.measure.bias import estimate, seconds_at
 
 
 def noisy(rng, mean, sigma, number, heavy=False):
@@ -67,7 +67,7 @@ def test_estimates_of_given_images(rng):
 
 def test_noise_of_the_truth_is_subtracted(rng):
     truth = rng.uniform(0, 1, (64, 64, 3))
-    weights = measure.weights_of(truth)
+    weights = measure.relative_weights(truth)
     passes = list(noisy(rng, truth, 0.2, 8))
     noise = estimate(passes, weights).noise / 8
     images = noisy(rng, truth + 0.03, 0.1, 10)
@@ -78,19 +78,19 @@ def test_noise_of_the_truth_is_subtracted(rng):
 
 def test_weights(rng):
     image = rng.uniform(0, 2, (7, 4, 3)).astype(np.float32)
-    weights = measure.weights_of(image)
+    weights = measure.relative_weights(image)
     brightness = [
         image[max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3].astype(np.float64).mean(axis=(0, 1))
         for y in range(7)
         for x in range(4)
     ]
     assert weights == pytest.approx(1 / (np.reshape(brightness, image.shape) ** 2 + 0.01))
-    assert measure.weights_of(np.zeros((1, 2, 1))) == pytest.approx(100)
+    assert measure.relative_weights(np.zeros((1, 2, 1))) == pytest.approx(100)
 
 
 def test_times_between_and_beyond():
-    assert seconds_of(10, {1: 1.0, 4: 2.5, 16: 8.5}) == pytest.approx(5.5)
-    assert seconds_of(32, {1: 1.0, 4: 2.5, 16: 8.5}) == pytest.approx(16.5)
-    assert seconds_of(8, {4: 2.0}) == pytest.approx(4.0)
-    assert seconds_of(8, {2: 3.0, 4: 2.0}) == pytest.approx(4.0)  # disturbed: more samples cannot take less time
-    assert seconds_of(0.5, {1: 1.0}) is None and seconds_of(1, {}) is None
+    assert seconds_at(10, {1: 1.0, 4: 2.5, 16: 8.5}) == pytest.approx(5.5)
+    assert seconds_at(32, {1: 1.0, 4: 2.5, 16: 8.5}) == pytest.approx(16.5)
+    assert seconds_at(8, {4: 2.0}) == pytest.approx(4.0)
+    assert seconds_at(8, {2: 3.0, 4: 2.0}) == pytest.approx(4.0)  # disturbed: more samples cannot take less time
+    assert seconds_at(0.5, {1: 1.0}) is None and seconds_at(1, {}) is None

@@ -47,25 +47,18 @@ def test_network_is_what_numpy_computes(ad, rng, width, layers):
         assert np.allclose(found.numpy(), y[0], atol=1e-5)
 
 
-@pytest.mark.parametrize("options", [{"grid": GRID}, {"table": 8}, {"grid": GRID, "table": 8}])
-def test_both_forms_agree(ad, rng, options):
-    net = Network(2, 8, 1, **options).alloc(ad.TensorXf, 2, dr.rng(seed=2))
-    if "table" in options:
-        net.table.data = ad.TensorXf(rng.random((8, 8, 1)).astype(np.float32))
-    _, x = coordinates(ad, rng)
-    found = [form(x)[0].numpy() for form in (net, net.cooperative())]
-    assert np.allclose(found[0], found[1], atol=1e-5) and np.ptp(found[0]) > 0
-
-
-def test_all_parameters_are_trained(ad):
-    """A hash grid keeps its entries to itself, so that an optimiser would not see them."""
+def test_both_forms_agree(ad, rng):
+    """Tensors and cooperative vectors between a hash grid and a table; an optimiser changes all parameters."""
     net = Network(2, 8, 1, GRID, table=8).alloc(ad.TensorXf, 2, dr.rng(seed=2))
-    problem = GGXProblem(net, ad, "tables", Encoding())
     before = {key: net[key].numpy().copy() for key in net}
     assert {"entries", "table.data", "mlp.layers.0.weights", "mlp.layers.0.bias"} <= set(before)
+    problem = GGXProblem(net, ad, "tables", Encoding())
     fit(problem, FitSettings(steps=20, batch=4096, lr=1e-2, measure_every=20), progress=False)
     for key, values in before.items():
         assert not np.array_equal(net[key].numpy(), values), key
+    _, x = coordinates(ad, rng)
+    found = [form(x)[0].numpy() for form in (net, net.cooperative())]
+    assert np.allclose(found[0], found[1], atol=1e-5) and np.ptp(found[0]) > 0
 
 
 def test_operations_of_products(ad):
@@ -130,120 +123,72 @@ def test_errors_of_training():
     assert gradient[3] == pytest.approx((0.5 + np.log(2)), rel=1e-5)
 
 
-def ramps(width=64, height=64):
-    """Return a source of two maps, of which one varies along x and y; both repeat without a seam."""
-    y, x = np.mgrid[:height, :width]
-    x, y = 2 * np.pi * x / width, 2 * np.pi * y / height
+@pytest.fixture
+def source():
+    """Two maps of which one varies along x and y; both repeat without a seam."""
+    y, x = (2 * np.pi * i / 64 for i in np.mgrid[:64, :64])
     albedo = 0.5 + 0.4 * np.stack([np.sin(x), np.cos(y), 0.5 * np.sin(x + y)], axis=-1)
     maps = {"albedo": albedo, "roughness": (0.5 + 0.3 * np.cos(x))[..., None]}
     return from_arrays({name: np.rint(255 * values).astype(np.uint8) for name, values in maps.items()})
 
 
-def filtered_problem(nbytes, mi):
-
-    source, types = ramps(), array_module(mi.variant())
-    pyramid = Pyramid.of(source, types=types, border=("repeat", "repeat"))
-    net = networks.texture_network(source, pyramid.layout, nbytes)
+def texture_problem(source, mi, nbytes=12000, levels=0):
+    pyramid = Pyramid.of(source, types=array_module(mi.variant()), border=("repeat", "repeat"))
+    net = networks.texture_network(pyramid.layout, nbytes, levels or pyramid.levels)
     return networks.TextureNetworkProblem(net, pyramid, source.digest)
 
 
-def test_a_network_learns_all_levels(mi_rgb):
-    """After a short training, levels are those of the pyramid, in their sizes."""
-    problem = filtered_problem(12000, mi_rgb)
+@pytest.mark.parametrize("levels", [0, 1])
+def test_a_network_learns_all_levels(mi_rgb, source, levels):
+    """After a short training, maps are those of the pyramid, of all its levels or of the finest alone."""
+    problem = texture_problem(source, mi_rgb, levels=levels)
     before = problem.measure(problem.net)["psnr_db"]
     result = fit(problem, FitSettings(steps=150, batch=2048, lr=1e-2, loss="mse", measure_every=50), progress=False)
     assert result.measured["psnr_db"] > before + 10
-    pyramid, maps = problem.pyramid, problem.maps(problem.net)
-    decoded = texture.decode_levels(maps, pyramid.layout.names, pyramid.levels)
-    errors = texture.level_errors(texture.level_images(pyramid), decoded)["all"]
+    decoded = texture.level_images(networks.NetworkMaps(problem.net, problem.pyramid))
+    truth = {name: values[: levels or None] for name, values in texture.level_images(problem.pyramid).items()}
+    errors = texture.level_errors(truth, decoded)["all"]
     assert min(errors[:3]) > 28 and min(errors) > 10  # coarse levels have few samples
-    assert [values.shape[:2] for values in decoded["albedo"]] == [values.shape[:2] for values in pyramid.values]
+    assert len(errors) == (levels or problem.pyramid.levels)
 
 
-def numpy_read(net, u, v, level, types):
-    """Return the outputs at places, ``(channels, n)``: features of Dr.Jit's grid, then fading and layers in NumPy."""
+def test_reads_of_a_network(mi_rgb, source):
+    """Reads repeat, and are those of NumPy: features of Dr.Jit's grid, fading, layers."""
+    types, problem = array_module(mi_rgb.variant()), texture_problem(source, mi_rgb)
+    net, random = problem.net, np.random.default_rng(4)
+    net["entries"] = types.TensorXf(random.normal(size=net.entries.shape).astype(np.float32))
+    halve(net)
+    u, v = random.random((2, 7), dtype=np.float32)
+    level = np.array([0, 0.4, 1, 2.7, 4, 5.5, 6], np.float32)
     net.encoding.data = net.entries.array
     features = np.array([f.numpy() for f in net.encoding([types.Float(u), types.Float(v)])], np.float64)
-    count = net.grid["n_features_per_level"]
     for i in range(net.grid["n_levels"]):
         side = net.grid["base_resolution"] * net.grid["per_level_scale"] ** i
-        visible = np.clip(1 + np.log2(net.size / 2**level / side), 0, 1)
-        features[i * count : (i + 1) * count] *= visible
+        features[2 * i : 2 * i + 2] *= np.clip(1 + np.log2(net.size / 2**level / side), 0, 1)
     x = np.concatenate([features, level[None] / (net.levels - 1)])
     layers = [key.removesuffix(".weights") for key in net if key.endswith(".weights")]
     for layer in layers:
         x = net[f"{layer}.weights"].numpy().astype(np.float64) @ x + net[f"{layer}.bias"].numpy().reshape(-1, 1)
         x = x if layer == layers[-1] else np.where(x > 0, x, 0.01 * x)
-    return x
-
-
-def test_the_plugin_reads_the_network(mi_rgb):
-    """Reads of maps and of the plugin ``mipmap`` are those of NumPy; the texture repeats; level 0 is the finest."""
-    import drjit as dr
-
-    import mi_diffind  # noqa: F401  (registers the plugins)
-    from mi_diffind.plugins.support.image_files import PYRAMIDS
-
-    types, problem = array_module(mi_rgb.variant()), filtered_problem(12000, mi_rgb)
-    net = problem.net
-    random = np.random.default_rng(4)
-    net["entries"] = types.TensorXf(random.normal(size=net.entries.shape).astype(np.float32))
-    halve(net)
-    u, v = random.random((2, 7), dtype=np.float32)
-    level = np.array([0, 0.4, 1, 2.7, 4, 5.5, 6], np.float32)
-    expected = numpy_read(net, u, v, level, types)
-    assert np.ptp(expected) > 0.05
-    for cooperative in (False, True):
-        maps = networks.NetworkMaps(net, problem.pyramid.layout, types, ("repeat", "repeat"), cooperative)
-        for shift in (0, 1):
-            with dr.suspend_grad():
-                actual = maps.filtered(types.Float(u) + shift, types.Float(v) - shift, types.Float(level))
-            np.testing.assert_allclose([a.numpy() for a in actual], expected, rtol=2e-3, atol=2e-3)
-    PYRAMIDS["test network"] = maps
-    try:
-        texture = mi_rgb.load_dict(
-            {"type": "mipmap", "pyramid": "test network", "channels": "albedo", "filter": "off", "raw": True}
-        )
-        si = dr.zeros(mi_rgb.SurfaceInteraction3f, len(u))
-        si.uv = mi_rgb.Point2f(u, v)
-        actual = np.array(texture.eval_3(si))
-    finally:
-        del PYRAMIDS["test network"]
-    finest = numpy_read(net, u, v, 0 * level, types)
-    decoded = np.array(maps.layout.decode("albedo", list(finest)))
-    np.testing.assert_allclose(np.clip(actual, 0, 1), np.clip(decoded, 0, 1), rtol=2e-3, atol=2e-3)
-
-
-def test_a_network_learns_the_maps(mi_rgb):
-    """After a short training, decoded maps are the source's, in its shape and orientation."""
-    source, types = ramps(48, 32), array_module(mi_rgb.variant())
-    problem = networks.ImageNetworkProblem(networks.image_network(source, 20000), types, source)
-    settings = FitSettings(steps=150, batch=1024, lr=1e-2, schedule="cosine", loss="mse", measure_every=50)
-    result = fit(problem, settings, progress=False)
-    decoded = problem.decode(problem.net)
-    for m in source.maps:
-        assert decoded[m.name].shape == m.values.shape
-        assert np.abs(decoded[m.name] - m.values).mean() < 0.03, m.name
-    error = np.mean(np.concatenate([(decoded[m.name] - m.values).ravel() ** 2 for m in source.maps]))
-    assert result.measured["psnr_db"] == pytest.approx(-10 * np.log10(error), abs=1.5)
+    assert np.ptp(x) > 0.05
+    maps = networks.NetworkMaps(net, problem.pyramid)
+    for shift in (0, 1):
+        with dr.suspend_grad():
+            actual = maps.filtered(types.Float(u) + shift, types.Float(v) - shift, types.Float(level))
+        np.testing.assert_allclose([a.numpy() for a in actual], x, rtol=2e-3, atol=2e-3)
 
 
 @pytest.mark.parametrize("nbytes", [6000, 12000])
-def test_networks_take_no_more_than_their_bytes(mi_rgb, nbytes):
+def test_networks_take_no_more_than_their_bytes(mi_rgb, source, nbytes):
     """Two bytes a parameter, counted on the allocated network, are at most the bytes asked for, and most of them."""
-    types, source = array_module(mi_rgb.variant()), ramps()
-    nets = [
-        filtered_problem(nbytes, mi_rgb).net,
-        networks.ImageNetworkProblem(networks.image_network(source, nbytes), types, source).net,
-        networks.disney_network(nbytes).alloc(types.TensorXf),
-        rivals.network(4 * nbytes).alloc(types.TensorXf),
-    ]
-    for net, factor in zip(nets, (1, 1, 1, 4), strict=True):
-        assert 0.8 * factor * nbytes < 2 * net.parameters <= factor * nbytes
+    types = array_module(mi_rgb.variant())
+    nets = [texture_problem(source, mi_rgb, nbytes).net, networks.disney_network(nbytes).alloc(types.TensorXf)]
+    for net in (*nets, rivals.network(nbytes).alloc(types.TensorXf)):
+        assert 0.8 * nbytes < 2 * net.parameters <= nbytes
 
 
-def test_too_few_bytes_are_refused():
-    for build in (lambda: networks.image_network(ramps(), 200), lambda: networks.disney_network(20)):
+def test_too_few_bytes_are_refused(mi_rgb, source):
+    for build in (lambda: texture_problem(source, mi_rgb, 200), lambda: networks.disney_network(20)):
         with pytest.raises(ValueError, match="0 bytes are too few"):
             build()
 

@@ -1,10 +1,11 @@
-"""``tradeoff shading``: materials, trouble of trainings, gains, the zoom, equal errors of renders."""
+"""``tradeoff shading``: materials, trouble of trainings, records of seeds, the zoom, equal errors of renders."""
+
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import mi_diffind
-from mi_diffind.commands.cli import main
 from mi_diffind.core.errors import UsageError
 from mi_diffind.core.runtime import array_module
 from mi_diffind.maps.pyramid import Pyramid
@@ -56,49 +57,25 @@ def test_trouble(changes, trouble):
     assert shading.troubles(run, {"C": {"mean_db": 20.0}}) == trouble
 
 
-def measured(values, flip=0.1):
-    return {"psnr_db": list(values), "mean_db": float(np.mean(values)), "coarse_db": float(np.mean(values[2:])),
-            "flip": [flip]}  # fmt: skip
+def test_records_of_seeds():
+    """Records of λ = 0 stand under both clips of a schedule; the best λ and filter are shown."""
 
+    def record(kind, label, psnr, share=0.0, way=""):
+        schedule = bool(way) and shading.REMEDIES[way][1]
+        details = {"material": "m", "kind": kind, "label": label, "share": share, "way": way, "schedule": schedule}
+        return {"details": {**details, "C": {"mean_db": psnr}, "trouble": ["below"] * (psnr < 20)}}
 
-def run(way, share, seed, values, trouble=()):
-    clip, schedule = ("no clip" not in way), ("no schedule" not in way)
-    return {"material": "m", "kind": "run", "way": way, "share": share, "seed": seed, "clip": clip,
-            "schedule": schedule, "C": measured(values), "P": measured([v + 1 for v in values]),
-            "trouble": list(trouble)}  # fmt: skip
-
-
-@pytest.fixture
-def result():
-    """A result as jobs leave it: two seeds, both remedies or none; numbers that can be followed by hand."""
-    with_, without = "clip, schedule", "no clip, no schedule"
-    details = [
-        *({"material": "m", "kind": "classical", "label": label, "C": measured(v), "P": measured(v)} for label, v in {
-            "filtered": [20, 20, 20, 20], "kernel": [21, 20, 20, 20], "LEAN": [22, 22, 22, 30],
-            "Toksvig": [18, 18, 19, 19],
-        }.items()),
-        *(run(with_, 0.0, seed, [20, 20, 20, 20 + seed]) for seed in (0, 1)),
-        *(run(without, 0.0, seed, [19, 19, 19, 19]) for seed in (0, 1)),
-        *(run(with_, 0.9, seed, [21, 22, 24, 24 + seed]) for seed in (0, 1)),
-        *(run(with_, 0.1, seed, [20.5, 20.5, 21, 21]) for seed in (0, 1)),
-        *(run(without, 0.9, seed, [18, 18, 18, 18], ["restarts", "below"][: 2 - seed]) for seed in (0, 1)),
-    ]  # fmt: skip
-    return {"jobs": {str(i): {"bytes": 1000, "seconds": 1.0, "details": d} for i, d in enumerate(details)}}
-
-
-def test_gains_of_seeds(result):
-    """Means over seeds, the best weight, and troubles, of whatever an interrupted run has."""
-    material = shading.curves(result)["m"]
-    assert material.best() == ("clip, schedule", 0.9) and material.best_classical == "LEAN"
-    assert material.mean("clip, schedule", 0.9) - material.mean("clip, schedule", 0.0) == pytest.approx(2.75)
-    assert shading.trouble(material.runs["no clip, no schedule", 0.9]) == "restarts 2, below 1"
-    jobs = list(result["jobs"].items())
-    for n in range(len(jobs)):
-        shading.conclusions({"jobs": dict(jobs[:n])})
-    assert (
-        shading.conclusions(result)[0]
-        == "m, clip, schedule: over lambda = 0, against C, +0.62 dB at 0.1, +2.75 dB at 0.9"
-    )
+    both, none = "clip, schedule", "no clip, schedule"
+    records = [record("classical", "filtered", 25), record("classical", "LEAN", 22), record("compressed", "baked", 21)]
+    records += [record("run", f"{share}, {way}", psnr, share, way) for share, way, psnr in (
+        (0, both, 20), (0, both, 21), (0.9, both, 23), (0.9, both, 24), (0.9, none, 18), (0.9, none, 30))]  # fmt: skip
+    material = shading.curves({"jobs": dict(enumerate(records))})["m"]
+    assert list(material.classical) == ["filtered", "LEAN"] and list(material.compressed) == ["baked"]
+    assert material.remedies == [both, none] and material.values(none, 0.0) == [20, 21]
+    assert shading.trouble(material.runs[none, 0.9]) == "below 1"
+    shown = material.shown()
+    assert list(shown) == ["LEAN, uncompressed", "λ 0, compressed", "λ 0.9, compressed"]
+    assert shown["λ 0.9, compressed"]["way"] == none
 
 
 def test_the_zoom_is_what_the_camera_sees(mi_rgb):
@@ -126,24 +103,17 @@ def test_the_zoom_is_what_the_camera_sees(mi_rgb):
     np.testing.assert_allclose(aligned[0][inner], aligned[2][inner], atol=1e-3)
 
 
-def test_extras_in_equal_bytes(mi_rgb, tmp_path, capsys):
+def test_extras_in_equal_bytes(mi_rgb):
     """Extras and the smaller arrays beside them take the bytes of the arrays alone, or a sentence says they cannot."""
-    settings = shading.ShadingStudySettings((0.0, 0.9), shading.REMEDIES[:1], 1, 0, 1, unit="steps", extras=True)
-    jobs = shading.plan({"lacquer": example_maps.generated_source("lacquer", 64)}, settings).jobs
-    (run,) = (job for job in jobs if job.method == "extras")
-    assert run.details["share"] == 0.9 and run.details["base"].details["share"] == 0
-    context = shading.ShadingStudyContext("lacquer", example_maps.generated_source("lacquer", 64), settings)
-    sizes = []
-    for extras in (False, True):
-        table, _ = context.fit_texture(context.pyramid, 1, 0, False, extras)
-        sizes.append(table.nbytes)
+    settings = SimpleNamespace(lambdas=[0.0, 0.9], ways=["clip, schedule"], seeds=1, length=0, pretraining=1,
+                               unit="steps", frames=2, quick=True, preset="ours", extras=True)  # fmt: skip
+    context = shading.ShadingContenders("lacquer", example_maps.generated_source("lacquer", 64), settings)
+    sizes = [context.fit_texture(context.pyramid, 1, 0, False, extras)[0].nbytes for extras in (False, True)]
     budget = context.source.nbytes / 12
     assert sizes[1] + 4 * 8 * 8 * 3 <= budget and sizes[0] <= budget and sizes[0] > sizes[1]
-    small = shading.ShadingStudyContext("lacquer", example_maps.generated_source("lacquer", 16), settings)
+    small = shading.ShadingContenders("lacquer", example_maps.generated_source("lacquer", 16), settings)
     with pytest.raises(UsageError, match="--extras: found 149 bytes for all arrays, extras alone need"):
         small.fit_texture(small.pyramid, 1, 0, False, True)
-    assert main(["tradeoff", "shading", "lacquer", "--preset", "paper", "--extras", "--out", str(tmp_path)]) == 2
-    assert "--extras: the arrays of the preset paper have none" in capsys.readouterr().err
 
 
 def test_equal_errors():

@@ -1,7 +1,7 @@
-"""Networks of ``drjit.nn`` that tables are compared with: alone, after a hash grid, and in front of a table.
+"""Networks of ``drjit.nn`` that tables are compared with, alone or after a hash grid.
 
 Here are the networks in place of tables of images and textures (hash grids of uv), of the Disney BRDF (its factors) and
-of measured and layered BSDFs. Those of fields are in :mod:`.fields`.
+of measured and layered BSDFs. Those of fields are in :mod:`.distance_fields` and :mod:`.radiance_fields`.
 
 Sources: Müller et al., *Instant Neural Graphics Primitives with a Multiresolution Hash Encoding*, 2022; Barron et al.,
 *Zip-NeRF: Anti-Aliased Grid-Based Neural Radiance Fields*, 2023, for features that fade with the footprint; Sztrajman
@@ -12,8 +12,6 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
-from types import ModuleType
 
 import drjit as dr
 import mitsuba as mi
@@ -26,10 +24,8 @@ from ...arrays.lookup import clamp
 from ...core.compat import backend_module
 from ...core.runtime import array_module
 from ...fitting.loop import Problem
-from ...maps.compressed import FilteredMaps, decibel
 from ...maps.layout import Layout
-from ...maps.pyramid import Pyramid, level_sizes
-from ...maps.source import Source
+from ...maps.pyramid import FilteredMaps, Pyramid, decibel, mean_square
 from ...measure.clock import Operations
 from ...tasks.bsdf import training as bsdf_training
 from ...tasks.bsdf.directions import SphereView
@@ -41,19 +37,24 @@ from ...tasks.disney.decoder import Decoder
 from ...tasks.disney.model import TINY, Factors, compose, geometry
 from ...tasks.disney.training import measure, random_directions, random_materials, shade
 from ...tasks.texture import PRESETS
-from ...tasks.texture.training import TextureProblem
+from ...tasks.texture.fit import TextureProblem
 
-#: Hidden units of a layer, and hidden layers, of networks after a hash grid.
+#: Hidden units of a layer of a network after a hash grid.
 WIDTH = 32
+
+#: Hidden layers of a network after a hash grid.
 LAYERS = 2
 
-#: Levels of a hash grid, numbers at an entry of a level, and its coarsest resolution.
+#: Levels of a hash grid.
 LEVELS = 8
+
+#: Numbers at an entry of a level.
 FEATURES = 2
+
+#: Resolution of the coarsest level.
 COARSEST = 8
 
 #: Samples of a measurement during training.
-MEASURED_TEXELS = 2**16
 MEASURED = 2**17
 
 #: Limits of a logarithm before its exponential.
@@ -61,28 +62,21 @@ LIMITS = (-30.0, 20.0)
 
 
 class Network(nn.Module):
-    """Multilayer perceptron from ``inputs`` coordinates to one number, or as many as ``outputs``.
+    """Multilayer perceptron from ``inputs`` coordinates to as many numbers as ``outputs``.
 
     There are ``layers`` hidden layers of ``width`` leaky rectified units. With ``grid``, the options of
     ``nn.HashGridEncoding``, a hash grid encodes the coordinates; ``direct`` further coordinates bypass it. With
-    ``table``, a number of entries on a side, the network's outputs point into a square
-    :class:`.DifferentiableArray`, as the primary array of an indirection does. A call with a
-    list of coordinates returns a list of arrays. As allocated, the network computes with tensors, the faster form to
-    train; :meth:`cooperative` returns it in cooperative vectors.
+    ``table``, a number of entries on a side, the outputs point into a square :class:`.DifferentiableArray`, as the
+    primary array of an indirection does. A call with a list of coordinates returns a list of arrays. As allocated, the
+    network computes with tensors, the faster form to train; :meth:`cooperative` returns it in cooperative vectors.
     """
 
     DRJIT_STRUCT = {"entries": object, "mlp": nn.Module, "table": object}  # noqa: RUF012
 
     def __init__(
-        self,
-        inputs: int = 2,
-        width: int = 16,
-        layers: int = 2,
-        grid: dict | None = None,
-        table: int = 0,
-        outputs: int = 1,
-        direct: int = 0,
-    ):
+        self, inputs: int = 2, width: int = 16, layers: int = 2, grid: dict | None = None, table: int = 0,
+        outputs: int = 1, direct: int = 0,
+    ):  # fmt: skip
         self.inputs, self.width, self.layers, self.grid, self.table_size = inputs, width, layers, grid, table
         self.outputs, self.direct = 2 if table else outputs, direct
         self.entries = self.mlp = self.table = self.encoding = None
@@ -93,15 +87,14 @@ class Network(nn.Module):
         if self.grid:
             Float = backend_module(dtype).Float
             result.encoding = nn.HashGridEncoding(Float, self.inputs, rng=rng, **self.grid)
-            result.entries = dtype(result.encoding.params)
+            result.entries = dtype(result.encoding.params)  # the encoding is no module: an optimiser sees these
             size = self.grid["n_levels"] * self.grid["n_features_per_level"] + self.direct
         hidden = []
         for _ in range(self.layers):
             hidden += [nn.Linear(-1, self.width), nn.LeakyReLU()]
         result.mlp = nn.Sequential(*hidden, nn.Linear(self.width, self.outputs)).alloc(dtype, size, rng)
         if self.table_size:
-            array = DifferentiableArray((self.table_size,) * 2, 1, "constant", 0.5)
-            result.table = array.alloc(dtype)
+            result.table = DifferentiableArray((self.table_size,) * 2, 1, "constant", 0.5).alloc(dtype)
         return result, self.outputs
 
     def __call__(self, x, active=True):
@@ -175,51 +168,6 @@ def hash_grid(dimensions: int, nbytes: float, finest: float, outputs: int, direc
 # -- Images and filtered textures --------------------------------------------------------------------------------------
 
 
-def image_network(source: Source, nbytes: float) -> Network:
-    """Return the largest network with hash grid of uv of ``nbytes``, not yet allocated; raises as :func:`hash_grid`."""
-    grid = hash_grid(2, nbytes, max(source.width, source.height), source.channels)
-    return Network(2, WIDTH, LAYERS, grid, outputs=source.channels)
-
-
-class ImageNetworkProblem(Problem):
-    """Training of a :class:`Network` on the texels of ``source``, all channels together, drawn at random."""
-
-    def __init__(self, net: Network, types, source: Source):
-        self.net, self.types, self.source = net.alloc(types.TensorXf, 2, dr.rng(seed=1)), types, source
-        values = np.concatenate([np.clip(m.values, 0, 1) for m in source.maps], axis=-1).reshape(source.texels, -1)
-        self.values = [types.Float(np.ascontiguousarray(channel, np.float32)) for channel in values.T]
-        self.held = types.UInt32(
-            np.random.default_rng(2).integers(0, source.texels, min(MEASURED_TEXELS, source.texels))
-        )
-        self.identity = {"source": source.digest, "network": net.grid, "seed": 1}
-
-    def _at(self, index):
-        x, y = index % self.source.width, index // self.source.width
-        uv = [(self.types.Float(x) + 0.5) / self.source.width, (self.types.Float(y) + 0.5) / self.source.height]
-        return uv, {"maps": [dr.gather(self.types.Float, channel, index) for channel in self.values]}
-
-    def batch(self, rng, size: int):
-        count = self.source.texels
-        return self._at(dr.minimum(self.types.UInt32(rng.random(self.types.Float, size) * count), count - 1))
-
-    def predict(self, net, inputs) -> dict[str, list]:
-        return {"maps": net(inputs)}
-
-    def measure(self, net) -> dict[str, float]:
-        uv, targets = self._at(self.held)
-        pairs = zip(net(uv), targets["maps"], strict=True)
-        squares = [float(dr.mean(dr.square(dr.clip(value, 0, 1) - target))[0]) for value, target in pairs]
-        return {"psnr_db": decibel(sum(squares) / len(squares))}
-
-    def decode(self, net) -> dict[str, np.ndarray]:
-        """Return the maps that a network holds, ``(height, width, channels)`` in [0, 1], by name."""
-        uv, _ = self._at(dr.arange(self.types.UInt32, self.source.texels))
-        values = np.stack([np.clip(np.array(value), 0, 1) for value in net(uv)], axis=-1)
-        values = values.reshape(self.source.height, self.source.width, -1)
-        ends = np.cumsum([m.channels for m in self.source.maps])
-        return {m.name: values[..., end - m.channels : end] for m, end in zip(self.source.maps, ends, strict=True)}
-
-
 class FilteredNetwork(Network):
     """Network of (u, v, level of detail), all in [0, 1], from a hash grid of uv of ``size`` texels at level 0.
 
@@ -242,35 +190,21 @@ class FilteredNetwork(Network):
         return features
 
 
-def texture_network(source: Source, layout: Layout, nbytes: float) -> FilteredNetwork:
-    """Return the largest network of uv and level of ``nbytes``, not yet allocated; raises as :func:`hash_grid`."""
-    grid = hash_grid(2, nbytes, max(source.width, source.height), layout.stored, 1)
-    sizes = level_sizes(source.height, source.width)
-    return FilteredNetwork(max(sizes[0]), len(sizes), grid, layout.stored)
+def texture_network(layout: Layout, nbytes: float, levels: int) -> FilteredNetwork:
+    """Return the largest network of ``nbytes`` for a number of levels of detail, not yet allocated.
+
+    An image has one level. Raises as :func:`hash_grid`.
+    """
+    size = max(layout.height, layout.width)
+    return FilteredNetwork(size, levels, hash_grid(2, nbytes, size, layout.stored, 1), layout.stored)
 
 
 class NetworkMaps(FilteredMaps):
-    """Maps that a network holds; if ``cooperative``, the plugin ``mipmap`` can read them as it reads a pyramid.
+    """Maps of a material that a network holds, with the layout and the border of a ``pyramid``."""
 
-    Without ``cooperative``, reads have derivatives, but cannot be part of the loops of a render.
-    """
-
-    def __init__(
-        self, net: Network, layout: Layout, types: ModuleType, border: Sequence[str], cooperative: bool = False
-    ):
-        self.net, self.layout, self.types, self.border = net, layout, types, tuple(border)
-        self.reading = net.cooperative() if cooperative else net
-        self.levels = len(level_sizes(layout.height, layout.width))
-
-    @property
-    def arrays(self) -> dict:
-        """Dr.Jit arrays of a read, by name."""
-        return {key: self.net[key] for key in self.net}
-
-    @property
-    def memory_nbytes(self) -> int:
-        """Bytes of all parameters in single precision."""
-        return self.net.nbytes
+    def __init__(self, net: FilteredNetwork, pyramid: Pyramid):
+        self.net, self.levels = net, net.levels
+        self.layout, self.types, self.border = pyramid.layout, pyramid.types, pyramid.border
 
     def stored(self, u, v, active=True) -> list:
         return self.filtered(u, v, type(u)(0), active)
@@ -280,29 +214,11 @@ class NetworkMaps(FilteredMaps):
             x - dr.floor(x) if border == "repeat" else clamp(x, 0.0, 1.0)
             for x, border in ((u, self.border[1]), (v, self.border[0]))
         ]
-        return self.reading([*place, self.clamped(level, type(u)) / (self.levels - 1)])
-
-    def interpolated(self, u, v, level, active=True, whole: bool = False) -> list:
-        """Return :meth:`filtered`."""
-        return self.filtered(u, v, level, active)
-
-    def interpolated_texels(self, index, active=True) -> list:
-        """Return the stored channels at texel centres of level 0, given their ``index``, row by row."""
-        Float, width = self.types.Float, self.layout.width
-        u, v = (Float(index % width) + 0.5) / width, (Float(index // width) + 0.5) / self.layout.height
-        return self.stored(u, v, active)
-
-    def encoded(self, values: list) -> list:
-        """Return ``values``: a network returns stored channels."""
-        return values
-
-    def is_linear(self, name: str) -> bool:
-        """Return False: sRGB values are interpolated as they are stored."""
-        return False
+        return self.net([*place, self.clamped(level, type(u)) / max(self.levels - 1, 1)])
 
 
 class TextureNetworkProblem(TextureProblem):
-    """Training problem of a network on a pyramid, with the samples of our textures."""
+    """Training problem of a network on the levels of a pyramid that it has, with the samples of our textures."""
 
     tolerance = 0.0
 
@@ -310,18 +226,15 @@ class TextureNetworkProblem(TextureProblem):
         types = pyramid.types
         net = net.alloc(types.TensorXf, rng=dr.rng(seed=dr.opaque(types.UInt64, 1)))
         super().__init__(net, pyramid, PRESETS["ours"], digest)
+        self.sizes = self.sizes[: net.levels]
 
     @staticmethod
     def form(net) -> dict:
         return {"network": net.grid, "width": net.width, "layers": net.layers}
 
-    def maps(self, net) -> NetworkMaps:
-        """Return the maps that a network holds."""
-        return NetworkMaps(net, self.pyramid.layout, self.types, self.pyramid.border)
-
     def predict(self, net, inputs) -> dict[str, list]:
         u, v, level, _ = inputs
-        return self._grouped(self.maps(net).filtered(u, v, level))
+        return self.by_map(NetworkMaps(net, self.pyramid).filtered(u, v, level))
 
     def measure(self, net) -> dict[str, float]:
         """Return the PSNR of the stored channels at held-out samples between texels and levels."""
@@ -329,11 +242,10 @@ class TextureNetworkProblem(TextureProblem):
         with dr.suspend_grad():
             inputs, targets = self.batch(dr.rng(seed=dr.opaque(self.types.UInt64, 2023)), MEASURED)
             outputs = self.predict(net, inputs)
-            pairs = [pair for name in targets for pair in zip(outputs[name], targets[name], strict=True)]
-            squares = [dr.square(a - b) for a, b in pairs]
-            dr.eval(squares)
+            values, truth = ([v for name in targets for v in maps[name]] for maps in (outputs, targets))
+            result = {"psnr_db": decibel(mean_square(values, truth))}
         self.jittered = jittered
-        return {"psnr_db": decibel(sum(float(dr.mean(s)[0]) for s in squares) / len(squares))}
+        return result
 
 
 # -- Disney BRDF -------------------------------------------------------------------------------------------------------

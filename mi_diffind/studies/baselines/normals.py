@@ -1,24 +1,25 @@
 """Classical filters of normal maps that shading-aware textures are compared with.
 
-Each filter takes the maps of a material at every level of detail, uncompressed, and returns a reader, as in
-:mod:`mi_diffind.tasks.shading.evaluation`: ``(u, v, level, wi, wo) → Array3f`` of shaded values.
+Each takes the maps of a material at every level of detail, uncompressed. A reader is a function
+``(u, v, level, wi, wo) → Array3f`` of shaded values, as in :mod:`mi_diffind.tasks.shading.evaluation`, whose ``reader``
+shades a pyramid of filtered parameters, with normals brought to length 1.
 
-- ``reader``, that of the same module: filtered parameters with normals brought to length 1, as a mip map does;
-- :func:`toksvig`: roughness increased by the length of the mean normal (Toksvig, *Mipmapping Normal Maps*, 2005);
+- :func:`toksvig_levels`: roughness increased by the length of the mean normal (Toksvig, *Mipmapping Normal Maps*,
+  2005);
 - :func:`lean`: first and second moments of slopes, filtered linearly, make an anisotropic lobe (Olano and Baker, *LEAN
   Mapping*, 2010), a GGX one in place of their Beckmann's (Dupuy et al., *Linear Efficient Antialiased Displacement and
-  Reflectance Mapping*, 2013);
+  Reflectance Mapping*, 2013); :func:`lean_levels`: the roughness of an isotropic one;
 - :func:`bake`: each texel of each level has the roughness with which it looks most like the converged truth;
-- :func:`biased`: any of these at other levels of detail, chosen on training pairs; its gain over filtered parameters
-  is due to the filter's kernel, not to shading.
+- :func:`biased`: any of these at other levels of detail; its gain is due to the filter's kernel, not to shading.
 
-Toksvig's and LEAN's filters know the source's moments, not compressed ones. The variance of slopes of a GGX lobe is
+A roughness by level becomes part of a pyramid by :func:`with_roughness`. The variance of slopes of a GGX lobe is
 infinite; in its place stands that of the Beckmann lobe of the same α, which is α²/2 along each axis.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Sequence
 from dataclasses import replace
 
 import drjit as dr
@@ -26,14 +27,13 @@ import numpy as np
 
 from ...arrays.indirection import aligned_copy
 from ...arrays.lookup import clamp
-from ...maps.layout import FROM_NORMAL, Layout, MapLayout
-from ...maps.pyramid import Pyramid, halved, level_sizes
-from ...maps.source import Source
-from ...tasks.disney.decoder import Decoder, ggx_coefficients
-from ...tasks.disney.model import ALPHA_MIN, PARAMETERS, Effects, Material, sanitize
-from ...tasks.disney.training import Shaded, shade, uniform_hemisphere
-from ...tasks.shading.evaluation import ShadedReader, reader, reference
-from ...tasks.shading.material import DEFAULTS, SurfaceParameters, frame, maps_of, shaded, shadowing, surface_of
+from ...maps.layout import Layout, MapLayout
+from ...maps.pyramid import Pyramid, halved
+from ...tasks.disney.decoder import Decoder, Lobe
+from ...tasks.disney.model import ALPHA_MIN, Effects
+from ...tasks.disney.training import uniform_hemisphere
+from ...tasks.shading.evaluation import ShadedReader, reference
+from ...tasks.shading.material import DEFAULTS, frame, maps_of, shaded, surface_of
 
 #: Least third component in the slope of a normal: a slope of 10.
 STEEPEST = 0.1
@@ -45,90 +45,47 @@ BIASES = tuple(np.arange(-8, 5) / 8)
 #: of three of them refines the best one.
 TRIED = np.linspace(0, 1, 28)
 
-#: Pairs of a view and a light that :func:`bake` averages over, and the seed of pairs and places; no other uses it.
-PAIRS, SEED = 32, 20050711
+#: Pairs of a view and a light that :func:`bake` averages over.
+PAIRS = 32
 
-#: Places of each level, each with its own view and light, that a bias is chosen for; number of levels with a bias.
-PLACES, BIASED = 2**14, 7
+#: Seed of pairs and places; trainings and evaluations use others.
+SEED = 20050711
 
-#: Samples along each side of a texel at which moments are averaged.
+#: Places of each level, each with its own view and light, by which a bias is chosen.
+PLACES = 2**14
+
+#: Number of levels with a bias of their own.
+BIASED = 7
+
+#: Places along each side of a texel at which moments are averaged.
 INSIDE = 4
 
 #: Lanes of one evaluation in :func:`bake`.
 CHUNK = 2**22
 
 
-def moment_pyramid(levels: Sequence[np.ndarray], types, border) -> Pyramid:
-    """Return a pyramid of channels of any meaning, ``(height, width, k)`` for each level, interpolated linearly."""
-    height, width, count = levels[0].shape
-    maps = (MapLayout("moments", "other", "linear", 1, tuple(range(count))),)
-    return Pyramid(Layout(width, height, maps, (0.5,) * count, ("moments",) * count), levels, types, border)
+def surface_moments(pyramid: Pyramid) -> list[np.ndarray]:
+    """Return the moments of the unfiltered surface, ``(height, width, 9)`` for each level.
 
-
-def unit_normals(source: Source) -> np.ndarray | None:
-    """Return the source's normals, ``(height, width, 3)``, of length 1; ``None`` without a normal map."""
-    m = next((m for m in source.maps if m.role == "normal"), None)
-    if m is None:
-        return None
-    normal = (m.values if m.values.min() < 0 else 2 * m.values - 1).astype(np.float64)
-    length = np.linalg.norm(normal, axis=-1, keepdims=True)
-    return np.where(length > 1e-6, normal / np.maximum(length, 1e-6), [0.0, 0.0, 1.0])
-
-
-def slopes(normals: np.ndarray) -> np.ndarray:
-    """Return slopes ``(x/z, y/z)`` and their products ``(xx, yy, xy)/z²`` of unit normals, ``(…, 5)``."""
-    b = normals[..., :2] / np.maximum(normals[..., 2:], STEEPEST)
-    return np.concatenate([b, b**2, b[..., :1] * b[..., 1:]], axis=-1)
-
-
-def roughness(source: Source) -> np.ndarray:
-    """Return the source's roughness, ``(height, width, 1)``."""
-    m = next((m for m in source.maps if m.role == "roughness"), None)
-    if m is None:
-        return np.full((source.height, source.width, 1), DEFAULTS["roughness"])
-    return m.values.astype(np.float64)
-
-
-def slope_moments(normals: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-    """Return :func:`slopes` and α², ``(…, 6)``."""
-    return np.concatenate([slopes(normals), np.maximum(roughness**2, ALPHA_MIN) ** 2], axis=-1)
-
-
-def interpolated(
-    function: Callable, normals: np.ndarray, roughness: np.ndarray, border, two: bool = False
-) -> np.ndarray:
-    """Return means over each texel of a ``function`` of normals and roughness, ``(height, width, k)``.
-
-    Normals and roughness are interpolated bilinearly at :data:`INSIDE` positions along each side of a texel. With
-    ``two``, the third component of normals is not interpolated but computed from the other two.
+    They are the means of slopes (x/z, y/z), of their products (xx, yy, xy)/z², of α², and of the unit normal, over the
+    texels of level 0 that a texel covers, each read with interpolation at :data:`INSIDE` × :data:`INSIDE` places.
     """
-    total, places = 0.0, (np.arange(INSIDE) + 0.5) / INSIDE - 0.5
-    for dy in places:
-        for dx in places:
-            n, r = (_shifted(_shifted(base, dy, 0, border), dx, 1, border) for base in (normals, roughness))
-            if two:
-                z = np.sqrt(np.maximum(1 - (n[..., :2] ** 2).sum(-1, keepdims=True), 0))
-                n = np.concatenate([n[..., :2], z], -1)
-            n = n / np.maximum(np.linalg.norm(n, axis=-1, keepdims=True), 1e-6)
-            total = total + function(n, r)
-    return total / INSIDE**2
-
-
-def _shifted(base: np.ndarray, by: float, axis: int, border: Sequence[str]) -> np.ndarray:
-    """Return values interpolated ``by`` (less than one) texels further along an axis."""
-    edges = [(0, 0)] * base.ndim
-    edges[axis] = (1, 0) if by < 0 else (0, 1)
-    padded = np.pad(base, edges, "wrap" if border[axis] == "repeat" else "edge")
-    n = base.shape[axis]
-    first, second = (np.take(padded, np.arange(n) + i, axis) for i in (0, 1))
-    share = by + 1 if by < 0 else by
-    return (1 - share) * first + share * second
-
-
-def means(base: np.ndarray) -> list[np.ndarray]:
-    """Return all levels of a level 0, ``(height, width, k)``: each texel is the mean of the texels that it covers."""
-    levels = [base]
-    for _ in level_sizes(*base.shape[:2])[1:]:
+    types, (rows, columns, _) = pyramid.types, pyramid.values[0].shape
+    Float, index, total = types.Float, dr.arange(types.UInt32, rows * columns), 0.0
+    x, y = Float(index % columns), Float(index // columns)
+    places = [dr.opaque(Float, (i + 0.5) / INSIDE) for i in range(INSIDE)]
+    for dx, dy in itertools.product(places, places):
+        surface = surface_of(pyramid, pyramid.stored((x + dx) / columns, (y + dy) / rows))
+        n = types.Array3f(0, 0, 1) if surface.normal is None else surface.normal
+        n = dr.select(dr.squared_norm(n) > 1e-12, dr.normalize(n), types.Array3f(0, 0, 1))
+        bx, by = (c / dr.maximum(n.z, STEEPEST) for c in (n.x, n.y))
+        alpha = dr.maximum(dr.square(Float(surface.roughness)), ALPHA_MIN)
+        moments = [bx, by, bx * bx, by * by, bx * by, dr.square(alpha), *n]
+        moments = [m + dr.zeros(Float, rows * columns) for m in moments]  # constants, too, have a value for each texel
+        dr.eval(moments)
+        total = total + np.stack([m.numpy().astype(np.float64) for m in moments], axis=-1)
+    levels = [(total / INSIDE**2).reshape(rows, columns, -1)]
+    for _ in pyramid.values[1:]:
         levels.append(halved(levels[-1]))
     return levels
 
@@ -144,66 +101,57 @@ def toksvig_alpha2(alpha2, length):
     return 2 / (scaled + 2)
 
 
-def toksvig(source: Source, pyramid: Pyramid, effects: Effects) -> ShadedReader:
-    """Return the reader whose roughness is :func:`toksvig_alpha2` of the length of the mean normal."""
-    if unit_normals(source) is None:
-        return reader(pyramid, effects)
-    moments = _moments(lambda n, r: n, source, pyramid, False)
-
-    def read(u, v, level, wi, wo):
-        surface = surface_of(pyramid, pyramid.filtered(u, v, level))
-        mean = pyramid.types.Array3f(moments.filtered(u, v, level))
-        length = clamp(dr.norm(mean), 1e-3, 1.0)
-        alpha = dr.maximum(dr.square(type(u)(surface.roughness)), ALPHA_MIN)
-        alpha2 = toksvig_alpha2(dr.square(alpha), length)
-        return shaded(None, replace(surface, roughness=dr.sqrt(dr.sqrt(alpha2))), wi, wo, effects)
-
-    return read
+def toksvig_levels(pyramid: Pyramid) -> list[np.ndarray]:
+    """Return the roughness of each level, ``(height, width)``, with :func:`toksvig_alpha2` of the mean normals."""
+    lengths = [np.clip(np.linalg.norm(m[..., 6:], axis=-1), 1e-3, 1) for m in surface_moments(pyramid)]
+    alpha2s = [np.maximum(r.astype(np.float64) ** 2, ALPHA_MIN) ** 2 for r in roughness_levels(pyramid)]
+    return [toksvig_alpha2(a, r) ** 0.25 for a, r in zip(alpha2s, lengths, strict=True)]
 
 
-def _moments(function: Callable, source: Source, pyramid: Pyramid, smooth: bool) -> Pyramid:
-    """Return all levels of a ``function`` of normals and roughness."""
-    maps, two = (unit_normals(source), roughness(source)), FROM_NORMAL in maps_of(pyramid.layout)["normal"].where
-    base = interpolated(function, *maps, pyramid.border, two) if smooth else function(*maps)
-    return moment_pyramid(means(base), pyramid.types, pyramid.border)
+def lean_levels(pyramid: Pyramid) -> list[np.ndarray]:
+    """Return the roughness of the isotropic lobe with the mean variance of :func:`lean`'s, ``(height, width)``."""
+    levels = []
+    for bx, by, xx, yy, _, a2, *_ in (np.moveaxis(m, -1, 0) for m in surface_moments(pyramid)):
+        variance = np.maximum(xx - bx**2, 0) + np.maximum(yy - by**2, 0)
+        levels.append(np.clip(a2 + variance / (1 + bx**2 + by**2), 0, 1) ** 0.25)
+    return levels
 
 
-def lean(source: Source, pyramid: Pyramid, effects: Effects, smooth: bool = False) -> ShadedReader:
-    """Return the reader of an anisotropic lobe around the normal of the mean slope.
+def lean(pyramid: Pyramid, effects: Effects) -> ShadedReader:
+    """Return the reader of an anisotropic lobe around the normal of the mean slope (:func:`lobe`).
 
-    The covariance of slopes is measured in the surface's tangent plane; in the frame of a tilted normal n, slopes are,
-    to first order, n_z times their projections onto the frame's tangents. The mean of α²/2 is added to the covariance;
-    the eigenvectors of the sum are the axes of the lobe, twice the eigenvalues its α². All other lobes are those of
-    filtered parameters, times the length of the mean normal: a cosine is linear in the normal, and so is its mean
-    (worth 0.8 dB on bricks and cloth). With ``smooth``, moments are those of interpolated normals
-    (:func:`interpolated`), as in the truth.
+    All other lobes are those of filtered parameters, times the length of the mean normal: a cosine is linear in the
+    normal, and so is its mean (worth 0.8 dB on bricks and cloth).
     """
-    if unit_normals(source) is None:
-        return reader(pyramid, effects)
-    moments = _moments(lambda n, r: np.concatenate([slope_moments(n, r), n], axis=-1), source, pyramid, smooth)
-    rest = tuple(lobe for lobe in effects.lobes if lobe != "specular")
-    Array3f = pyramid.types.Array3f
+    levels = surface_moments(pyramid)
+    height, width, count = levels[0].shape
+    maps = (MapLayout("moments", "other", "linear", 1, tuple(range(count))),)
+    layout = Layout(width, height, maps, (0.5,) * count, ("moments",) * count)
+    moments = Pyramid(layout, levels, pyramid.types, pyramid.border)
+    specular = replace(effects, diffuse=False, subsurface=False, sheen=False, clearcoat=False)
 
     def read(u, v, level, wi, wo):
         surface = surface_of(pyramid, pyramid.filtered(u, v, level))
-        material, albedo = _parameters(surface, type(u))
         bx, by, xx, yy, xy, a2, *mean = moments.filtered(u, v, level)
         covariance = (dr.maximum(xx - bx * bx, 0), dr.maximum(yy - by * by, 0), xy - bx * by)
-        s, t, n = frame(Array3f(bx, by, 1), wi)
-        ax, ay, s, t = lobe(covariance, a2, s, t, n)
-        value = _in_frame((s, t, n), wi, wo, lambda i, o: specular(material, albedo, ax, ay, i, o, effects))
-        if rest:
-            axes, length = frame(surface.normal, wi), dr.norm(Array3f(mean))
-            value += length * _in_frame(axes, wi, wo, lambda i, o: shade(None, material, albedo, i, o, effects, rest))
-        return dr.pi * value
+        normal = pyramid.types.Array3f(bx, by, 1)
+        roughness, shape = lobe(covariance, a2, *frame(normal, wi))
+        highlight = replace(surface, normal=normal, roughness=roughness, lobe=shape)
+        value = shaded(Decoder(), highlight, wi, wo, specular)
+        if effects.lobes == specular.lobes:
+            return value
+        rest = replace(surface, lobe=Lobe(*[type(u)(0)] * 3))  # without a specular lobe
+        return value + dr.norm(pyramid.types.Array3f(mean)) * shaded(Decoder(), rest, wi, wo, effects)
 
     return read
 
 
 def lobe(covariance, alpha2, s, t, n) -> tuple:
-    """Return ``α_x, α_y`` and the two axes of a lobe about a normal ``n`` with tangents ``s``, ``t``.
+    """Return roughness and shape of a lobe about a normal ``n`` with tangents ``s``, ``t``.
 
-    ``covariance`` is that of the slopes in the surface, ``(xx, yy, xy)``, ``alpha2`` the α² of facets on them.
+    ``covariance`` is that of the slopes in the surface's tangent plane, ``(xx, yy, xy)``, ``alpha2`` the α² of facets
+    on them. In the frame of a tilted normal n, slopes are, to first order, n_z times their projections onto the frame's
+    tangents. GGX's matrix A (:class:`~mi_diffind.tasks.disney.decoder.Lobe`) is α² plus twice their covariance.
     """
     xx, yy, xy = covariance
 
@@ -211,47 +159,8 @@ def lobe(covariance, alpha2, s, t, n) -> tuple:
         return dr.square(n.z) * (xx * a.x * b.x + yy * a.y * b.y + xy * (a.x * b.y + a.y * b.x))
 
     p, q, r = projected(s, s) + 0.5 * alpha2, projected(t, t) + 0.5 * alpha2, projected(s, t)
-    mean, half = 0.5 * (p + q), 0.5 * (p - q)
-    root = dr.sqrt(half * half + r * r + 1e-20)
-    angle = 0.5 * dr.atan2(r, half)
-    sin, cos = dr.sincos(angle)
-    ax, ay = (dr.sqrt(dr.maximum(2 * e, ALPHA_MIN**2)) for e in (mean + root, mean - root))
-    return ax, ay, cos * s + sin * t, cos * t - sin * s
-
-
-def specular(material: Material, albedo, ax, ay, wi, wo, effects: Effects):
-    """Return the specular lobe times the cosine, with ``ax``, ``ay`` along the frame's axes as α."""
-    p, decoder = Shaded.of(material, albedo), Decoder()
-    c = {"ggx": ggx_coefficients(ax, ay)}
-    if "f0" in decoder.required(effects):
-        c["f0"] = decoder.coefficients("f0", p, effects)
-    return type(wi)(decoder.value(c, replace(effects, sheen=False), ("specular",), p, wi, wo))
-
-
-def _parameters(surface: SurfaceParameters, Float) -> tuple:
-    values = {**DEFAULTS, "roughness": surface.roughness, "metallic": surface.metallic}
-    material = Material(**{name: Float(values[name]) for name in PARAMETERS})
-    return sanitize(material), dr.maximum(surface.albedo, 0)
-
-
-def _in_frame(axes, wi, wo, value: Callable):
-    """Return a value in a perturbed frame, masked and shadowed as in :func:`.material.shaded`."""
-    i, o = (type(w)(*(dr.dot(w, axis) for axis in axes)) for w in (wi, wo))
-    visible = (wi.z > 0) & (wo.z > 0) & (i.z > 0) & (o.z > 0)
-    up = type(wi)(0, 0, 1)
-    i, o = dr.select(visible, i, up), dr.select(visible, o, up)
-    return dr.select(visible, shadowing(axes[2], wo) * value(i, o), 0)
-
-
-def roughness_reader(pyramid: Pyramid, effects: Effects, levels: Sequence[np.ndarray]) -> ShadedReader:
-    """Return the reader of filtered parameters with another roughness, ``(height, width)`` for each level."""
-    baked = moment_pyramid([level[..., None] for level in levels], pyramid.types, pyramid.border)
-
-    def read(u, v, level, wi, wo):
-        surface = surface_of(pyramid, pyramid.filtered(u, v, level))
-        return shaded(None, replace(surface, roughness=baked.filtered(u, v, level)[0]), wi, wo, effects)
-
-    return read
+    scale = dr.rcp(p + q)
+    return dr.sqrt(dr.sqrt(p + q)), Lobe((p - q) * scale, 2 * r * scale, type(p)(1))
 
 
 def directions(types, count: int = PAIRS, seed: int = SEED) -> list[tuple]:
@@ -271,7 +180,7 @@ def bake(pyramid: Pyramid, effects: Effects, pairs: int = PAIRS) -> list[np.ndar
     ``pairs`` of a view and a light. The roughness is never below the filtered one (where light is lost, least squares
     would have no highlight at all), and equal to it on level 0.
     """
-    types, filtered_levels = pyramid.types, roughness_of(pyramid)
+    types, filtered_levels = pyramid.types, roughness_levels(pyramid)
     baked_levels = [np.array(filtered_levels[0])]
     Float, UInt32 = types.Float, types.UInt32
     view_lights, tried = directions(types, pairs), len(TRIED)
@@ -283,20 +192,19 @@ def bake(pyramid: Pyramid, effects: Effects, pairs: int = PAIRS) -> list[np.ndar
         errors = []
         for start in range(0, rows * columns, step):
             count = min(step, rows * columns - start)
-            lane = dr.arange(UInt32, count)
-            index = lane + dr.opaque(UInt32, start)
+            index = dr.arange(UInt32, count) + dr.opaque(UInt32, start)
             n, m = dr.opaque(UInt32, columns), dr.opaque(UInt32, rows)
-            u, v = (Float(index % n) + 0.5) / Float(n), (Float(index // n) + 0.5) / Float(m)
-            detail = dr.opaque(Float, level, count)
-            pair, n = dr.arange(UInt32, count * tried), dr.opaque(UInt32, tried)
-            texel, trial = pair // n, pair - pair // n * n
-            surface = surface_of(pyramid, pyramid.filtered(*(dr.gather(Float, x, texel) for x in (u, v, detail))))
+            place = (Float(index % n) + 0.5) / Float(n), (Float(index // n) + 0.5) / Float(m)
+            place = (*place, dr.opaque(Float, level, count))
+            lane, n = dr.arange(UInt32, count * tried), dr.opaque(UInt32, tried)
+            texel, trial = lane // n, lane % n
+            surface = surface_of(pyramid, pyramid.filtered(*(dr.gather(Float, x, texel) for x in place)))
             roughness = dr.lerp(Float(surface.roughness), 1, dr.gather(Float, shares, trial))
             surface = replace(surface, roughness=roughness)
             dr.eval(surface.albedo, surface.normal, surface.roughness, surface.metallic)
             total = dr.zeros(Float, count * tried)
             for wi, wo in view_lights:
-                truth = reference("converged", pyramid, u, v, detail, *_wide(count, wi, wo), effects, side=side)
+                truth = reference("converged", pyramid, *place, *_wide(count, wi, wo), effects, side=side)
                 truth = dr.gather(types.Array3f, dr.clip(truth, 0, 1), texel)
                 value = dr.clip(shaded(None, surface, *_wide(count * tried, wi, wo), effects), 0, 1)
                 total += dr.squared_norm(value - truth)
@@ -331,28 +239,7 @@ def _refined_minimum(errors: np.ndarray) -> np.ndarray:
     return TRIED[middle] + shift * (TRIED[1] - TRIED[0])
 
 
-def toksvig_levels(source: Source, pyramid: Pyramid) -> list[np.ndarray]:
-    """Return the roughness of :func:`toksvig` at the texels of each level, ``(height, width)``."""
-    normals, filtered_levels = unit_normals(source), roughness_of(pyramid)
-    if normals is None:
-        return filtered_levels
-    lengths = [np.clip(np.linalg.norm(n, axis=-1), 1e-3, 1) for n in means(normals)]
-    alpha2s = [np.maximum(r.astype(np.float64) ** 2, ALPHA_MIN) ** 2 for r in filtered_levels]
-    return [toksvig_alpha2(a, r) ** 0.25 for a, r in zip(alpha2s, lengths, strict=True)]
-
-
-def lean_levels(source: Source, pyramid: Pyramid) -> list[np.ndarray]:
-    """Return the roughness of the isotropic lobe with the mean variance of :func:`lean`'s, ``(height, width)``."""
-    normals, levels = unit_normals(source), []
-    if normals is None:
-        return roughness_of(pyramid)
-    for bx, by, xx, yy, _, a2 in (np.moveaxis(m, -1, 0) for m in means(slope_moments(normals, roughness(source)))):
-        variance = np.maximum(xx - bx**2, 0) + np.maximum(yy - by**2, 0)
-        levels.append(np.clip(a2 + variance / (1 + bx**2 + by**2), 0, 1) ** 0.25)
-    return levels
-
-
-def roughness_of(pyramid: Pyramid) -> list[np.ndarray]:
+def roughness_levels(pyramid: Pyramid) -> list[np.ndarray]:
     """Return the roughness of each level of a pyramid, ``(height, width)``."""
     m, levels = maps_of(pyramid.layout).get("roughness"), []
     for values in pyramid.values:

@@ -12,7 +12,7 @@ from mi_diffind.arrays.indirection import DifferentiableArray
 from mi_diffind.arrays.lookup import STORAGES
 from mi_diffind.core.runtime import array_module
 from mi_diffind.measure.store import fingerprint
-from mi_diffind.measure.study import FLOOR, Candidate, Case, Plan
+from mi_diffind.measure.study import FLOOR, Candidate, Case, Measure, Plan
 from mi_diffind.measure.training import ConvergenceTraining
 
 from . import measurement
@@ -45,7 +45,7 @@ def plan(source: str, quick: bool) -> Plan:
                 Candidate(
                     full, name, storage, entries * {"float32": 4, "float16": 2, "uint8": 1}[storage],
                     errors=lambda samples, read=readers[full]: errors(read(), truth, types),
-                    job=name, in_passes=False,
+                    job=name,
                 )
             )  # fmt: skip
 
@@ -58,12 +58,9 @@ def plan(source: str, quick: bool) -> Plan:
     return Plan(
         study="profile",
         title="Goniometric profile: accuracy against time and bytes",
-        variant=mi.variant(),
         candidates=candidates,
         cases=[Case("random angles", queries)],
-        queries=("read",),
-        accuracy="psnr_db",
-        accuracy_label="PSNR of the intensity relative to its peak, dB",
+        measures=(Measure("PSNR of the intensity relative to its peak, dB", "psnr_db"),),
         ratios=[("indirection, uint8", "indirection, float32"), ("single table, float32", "indirection, float32")],
         details={"source": truth.digest},
         jobs=list(jobs.values()),
