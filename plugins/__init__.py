@@ -114,20 +114,24 @@ class Plugin:
         matrices as lists, ``"texture"`` for any named object). Parameters that only the learned plugin has, and the
         file that it reads, are keys of their own.
         """
-        learned_only = self.exact.learned_only if self.exact else ()
-        if self.task and "filename" not in learned_only:
-            learned_only = (*learned_only, "filename")
-        return {
-            "plugin": self.name,
-            "kind": self.object_type,
-            "id": props.id(),
-            "parameters": {
-                key: _plain(props, key, self.object_type)
-                for key in props
-                if key not in learned_only and not key.startswith("_arg_")
-            },
-            **{key: str(props[key]) for key in learned_only if key in props},
-        }
+        learned = dict.fromkeys(
+            (*(self.exact.learned_only if self.exact else ()), *(("filename",) if self.task else ()))
+        )
+        parameters = {k: self._plain(props, k) for k in props if k not in learned and not k.startswith("_arg_")}
+        described = {"plugin": self.name, "kind": self.object_type, "id": props.id(), "parameters": parameters}
+        return described | {key: str(props[key]) for key in learned if key in props}
+
+    def _plain(self, props, key: str):
+        word, is_transform = compat.property_kind(props, key), props.type(key) == type(props).Type.Transform
+        if props.type(key) == type(props).Type.Any:
+            return type(props[key]).__name__
+        if word in ("object", "existing"):
+            return "nested" if self.object_type == "integrator" else "texture"
+        if word == "number":
+            return float(props[key])
+        if word == "colour":
+            return [float(v) for v in props[key]]
+        return _rows(props[key].matrix) if is_transform else str(props[key])
 
 
 #: Variant that was set → its plugins by name.
@@ -212,7 +216,7 @@ def _checking_factory(plugin: Plugin):
 
     def make(props):
         instance = plugin.factory(props)
-        needed = compat.base_class(OBJECT_TYPES[plugin.object_type])
+        needed = getattr(compat.mi, OBJECT_TYPES[plugin.object_type])
         if not isinstance(instance, needed):  # Mitsuba would crash
             returned = "nothing" if instance is None else f"a {type(instance).__name__}"
             raise RuntimeError(
@@ -291,17 +295,5 @@ def report(instance) -> dict | None:
     return None if entry is None or entry[2] is None else entry[2]()
 
 
-def _plain(props, key: str, object_type: str):
-    value_type, types = props.type(key), type(props).Type
-    if value_type in (types.Float, types.Integer):
-        return float(props[key])
-    if value_type == types.Color:
-        return [float(v) for v in props[key]]
-    if value_type in (types.Reference, types.ResolvedReference, types.Object):
-        return "nested" if object_type == "integrator" else "texture"
-    if value_type == types.Transform:
-        m = props[key].matrix
-        return [[float(m[i, j]) for j in range(4)] for i in range(4)]
-    if value_type == types.Any:
-        return type(props[key]).__name__
-    return str(props[key])
+def _rows(matrix) -> list[list[float]]:
+    return [[float(matrix[i, j]) for j in range(4)] for i in range(4)]

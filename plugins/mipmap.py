@@ -95,20 +95,7 @@ class MipMap(FilteredTexture):
 
     {executable}
 
-    .. tabs::
-        .. code-tab:: xml
-            :name: mipmap
-
-            <texture type="mipmap">
-                <string name="filename" value="wall.png"/>
-                <string name="filter" value="anisotropic"/>
-            </texture>
-
-        .. code-tab:: python
-
-            'type': 'mipmap',
-            'filename': 'wall.png',
-            'filter': 'anisotropic'
+    {example texture mipmap: filename="wall.png", filter="anisotropic"}
     """
 
     def _open(self, props: mi.Properties) -> SharedMaps:

@@ -10,10 +10,10 @@ from mi_diffind.tasks.ggx import TASK
 from mi_diffind.tasks.ggx.model import Roughness
 
 from . import Counterpart, Plugin
-from .support import frozen, properties, tables
-from .support.directions import glossy_directions
+from .support import properties
+from .support.bsdfs import TrackedParameter, glossy_directions, when_outermost
 from .support.manual import shared_parts
-from .support.tracked_parameter import TrackedParameter, when_outermost
+from .support.tables import Tables, arrays_of, frozen_key, open_tables
 
 
 @shared_parts
@@ -107,20 +107,7 @@ class NeuralGGX(mi.BSDF):
 
     {executable}
 
-    .. tabs::
-        .. code-tab:: xml
-            :name: neural_ggx
-
-            <bsdf type="neural_ggx">
-                <string name="material" value="Cu"/>
-                <float name="alpha" value="0.15"/>
-            </bsdf>
-
-        .. code-tab:: python
-
-            'type': 'neural_ggx',
-            'material': 'Cu',
-            'alpha': 0.15
+    {example bsdf neural_ggx: material="Cu", alpha=0.15}
     """
 
     def __init__(self, props: mi.Properties):
@@ -141,9 +128,9 @@ class NeuralGGX(mi.BSDF):
         has_factor = "specular_reflectance" in props
         self.specular_reflectance = props.get_texture("specular_reflectance") if has_factor else None
 
-        opened = tables.open_tables(props, TASK)
-        self.distribution, self.preset, self._table = opened.distribution, opened.table.preset, opened.table
-        self._entries = tables.Entries(self._tables())
+        opened = open_tables(props, TASK)
+        self.distribution, net = opened.distribution, opened.distribution.net
+        self.tables = Tables({"primary": net.primary[0], "cascaded": net.cascaded}, opened.table)
 
         self._tracked_alpha = TrackedParameter(self.alpha)
         self._tracked_ior = [TrackedParameter(self.eta, colour=True), TrackedParameter(self.k, colour=True)]
@@ -164,27 +151,19 @@ class NeuralGGX(mi.BSDF):
             textures["specular_reflectance"] = self.specular_reflectance
         return textures
 
-    def _arrays(self) -> dict:
-        net = self.distribution.net
-        return {"primary": net.primary[0], "cascaded": net.cascaded}
-
-    def _tables(self) -> dict:
-        """Return the arrays that are exposed."""
-        return tables.exposed(self._arrays())
-
     def trained(self) -> tuple:
         """Return the table of the file, and the arrays that can be optimised, by name."""
-        return self._table, self._tables()
+        return self.tables.table, self.tables.exposed
 
     def traverse(self, cb: mi.TraversalCallback):
         discontinuous = mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous
         for name, texture in self._textures().items():
             flags = mi.ParamFlags.Differentiable if name == "specular_reflectance" else discontinuous
             cb.put(name, texture, flags)
-        tables.traverse(cb, self._tables())
+        self.tables.traverse(cb)
 
     def parameters_changed(self, keys: list[str] = ()):
-        self._entries.accept()
+        self.tables.accept()
         self._prepare_constants()
 
     def _parameters(self) -> list[TrackedParameter]:
@@ -200,13 +179,12 @@ class NeuralGGX(mi.BSDF):
                 constant = self.distribution.constant_roughness(alpha)
             dr.make_opaque(constant)
             self._constant = constant
-        known = self._constant is None, self._reflects_all(), self._has_factor(), self._entries.shapes()
-        self.held = [frozen.key(*known), tables.arrays_of([self.distribution, self._constant])]
+        key = frozen_key(self._constant is None, self._reflects_all(), self._has_factor(), self.tables.shapes())
+        self.held = [key, arrays_of([self.distribution, self._constant])]
 
     def _is_constant(self) -> bool:
         """Return whether the roughness is constant, and neither changed nor, like the tables, being optimised."""
-        alpha = self._tracked_alpha
-        return alpha.constant and not (alpha.optimised() or alpha.changed() or tables.optimised(self._tables()))
+        return self._tracked_alpha.is_fixed() and not self.tables.optimised()
 
     def _roughness(self, si, active) -> Roughness:
         if self._constant is not None and self._is_constant():
@@ -303,16 +281,16 @@ class NeuralGGX(mi.BSDF):
             left_out["specular_reflectance"] = "is 1" if self.specular_reflectance else "is not given"
         effects = ("distribution", "masking", "fresnel", "specular_reflectance")
         return {
-            **tables.described(self.preset, self._arrays()),
+            **self.tables.report(),
             "effects_in_use": [name for name in effects if name not in left_out],
             "effects_left_out": left_out,
             "evaluated_once": [] if self._constant is None else ["roughness"],
         }
 
     def to_string(self):
-        net = self.distribution.net
         lines = [f"  {name} = {t!s}," for name, t in self._textures().items()]
-        lines.append(f"  preset = {self.preset}, {net.nbytes} bytes as {net.cascaded.storage},")
+        preset, storage, nbytes = self.tables.report().values()
+        lines.append(f"  preset = {preset}, {nbytes} bytes as {storage},")
         return "NeuralGGX[\n" + "\n".join(line.replace("\n", "\n  ") for line in lines) + "\n]"
 
 

@@ -67,20 +67,7 @@ class NeuralTexture(FilteredTexture):
 
     {executable}
 
-    .. tabs::
-        .. code-tab:: xml
-            :name: neural_texture
-
-            <texture type="neural_texture">
-                <string name="filename" value="wall.npz"/>
-                <string name="channels" value="albedo"/>
-            </texture>
-
-        .. code-tab:: python
-
-            'type': 'neural_texture',
-            'filename': 'wall.npz',
-            'channels': 'albedo'
+    {example texture neural_texture: filename="wall.npz", channels="albedo"}
     """
 
     def _open(self, props: mi.Properties) -> SharedMaps:

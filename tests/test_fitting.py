@@ -1,11 +1,8 @@
 """The training loop, on problems of a few entries: repeatable, resumable, interruptible, and hard to derail."""
 
-import io
 import math
 import os
 import signal
-import subprocess
-import sys
 import threading
 
 import drjit as dr
@@ -13,20 +10,12 @@ import numpy as np
 import pytest
 from drjit import nn
 from drjit.opt import Adam
-from variants import BACKENDS
 
 from mi_diffind import DifferentiableArray, DiffindError, Indirection
-from mi_diffind.arrays.indirection import unfolded
 from mi_diffind.core.files import OutputError
-from mi_diffind.core.progress import Deadline
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting import loop
 from mi_diffind.fitting.loop import FitResult, FitSettings, FittingError, Problem, fit
-
-
-@pytest.fixture(params=BACKENDS)
-def ad(request):
-    return array_module(request.param)
 
 
 class Curve(Problem):
@@ -373,54 +362,6 @@ def clock(monkeypatch):
     return now
 
 
-class Terminal(io.StringIO):
-    """What a progress bar is drawn on; of all that it showed, the states, one after the other."""
-
-    def isatty(self):
-        return True
-
-    @property
-    def states(self):
-        text = self.getvalue()
-        assert "nan" not in text and "loss=None" not in text
-        lines = text.replace("\n", "\r").split("\r")
-        return [line for line in lines if line.strip() and not line.startswith("stopping after")]
-
-
-@pytest.fixture
-def terminal(monkeypatch):
-    """A terminal on which the progress bar is drawn as often as it changes, as on a slow machine."""
-    original, terminal = loop.tqdm.__init__, Terminal()
-    for module in ("fitting.loop", "core.progress"):
-        monkeypatch.setattr(f"mi_diffind.{module}.in_terminal", lambda: True)
-    always = {"file": terminal, "mininterval": 0, "miniters": 0, "ncols": 200}
-    monkeypatch.setattr(loop.tqdm, "__init__", lambda self, *a, **k: original(self, *a, **{**k, **always}))
-    return terminal
-
-
-def test_the_bar_of_a_run_in_steps(ad, terminal):
-    fit(Curve(ad), settings(steps=40), title="a curve")
-    states = terminal.states
-    assert all(line.startswith("a curve") for line in states)
-    assert "0/40" in states[0] and "40/40" in states[-1] and "psnr_db=" in states[-1]
-    # No loss before one is known; from then on each
-    known = ["loss=" in line for line in states]
-    assert not known[0] and known[-1] and known == sorted(known)
-
-
-def test_the_bar_of_a_limited_run_shows_the_time_left(ad, clock, terminal):
-    """Its schedule and its end are those of the clock; how long it will take is known from the start."""
-    result = fit(Curve(ad), settings(steps=10**6, lr=1e-2), deadline=Deadline(40), title="timed")
-    assert result.steps < 2000 and not result.interrupted and 8 <= len(result.history) <= 11
-    states = terminal.states
-    assert all(line.startswith("timed") for line in states) and "step" not in "".join(states)
-    assert len(states) > 50 and not any("?" in line for line in states)
-    left = [line.split("<")[1].split(",")[0].strip() for line in states]
-    seconds = [60 * int(minutes) + int(rest) for minutes, rest in (text.split(":") for text in left)]
-    assert seconds[0] == 39 and seconds[-1] == 0 and set(np.diff(seconds)) == {0, -1}
-    assert "100%" in states[-1]
-
-
 # -- schedules --------------------------------------------------------------------------------------------------------
 
 
@@ -560,106 +501,6 @@ def test_the_loss_and_its_gradient(ad):
     np.testing.assert_allclose(found, gradient, rtol=1e-4, atol=1e-6)
 
 
-# -- losses of another kind -------------------------------------------------------------------------------------------
-
-
-class Own(Problem):
-    """No samples with targets: a loss of its own, the integral of a difference over random intervals."""
-
-    def __init__(self, ad):
-        self.ad, self.sizes = ad, []
-        self.net = DifferentiableArray(8, 1, "random", fold=True).alloc(ad.TensorXf, rng=dr.rng(seed=1))
-
-    def loss(self, net, rng, size):
-        self.sizes.append(size)
-        x = rng.random(self.ad.Float, size)
-        return dr.sum(dr.square(unfolded(net)([x])[0] - 0.25)) / size
-
-    def measure(self, net):
-        return {"q": -float(np.abs(net.numpy() - 0.25).max())}
-
-
-def test_a_problem_with_a_loss_of_its_own(ad):
-    """One number instead of one for each sample; neither batch() nor predict() is needed."""
-    problem = Own(ad)
-    result, messages = run(problem, settings(steps=200, batch=128, lr=0.02))
-    assert result.measured["q"] > -0.01 and messages == [] and set(problem.sizes) == {128}
-    assert problem.settings.batch == 128  # fit() sets them
-    assert 0 <= result.history[-1]["loss"] < 1e-3 < result.history[0]["loss"]
-
-
-def test_the_base_class_says_what_is_missing(ad):
-    class Empty(Problem):
-        def __init__(self):
-            self.net = DifferentiableArray(2, 1).alloc(ad.TensorXf)
-
-    with pytest.raises(NotImplementedError, match=r"Empty has neither batch\(\) and predict\(\) nor a loss\(\)"):
-        run(Empty(), settings(steps=1))
-
-
-RENDERED = """
-import sys
-import threading
-import drjit as dr, mitsuba as mi
-mi.set_variant("llvm_ad_rgb")
-import numpy as np
-from mi_diffind.fitting.loop import FitSettings, Problem, fit
-
-scene = mi.load_dict({
-    "type": "scene", "integrator": {"type": "direct"},
-    "sensor": {"type": "orthographic", "film": {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}},
-               "to_world": mi.ScalarTransform4f().look_at([0, 0, 2], [0, 0, 0], [0, 1, 0])},
-    "shape": {"type": "rectangle", "emitter": {"type": "area", "radiance": {
-        "type": "bitmap", "raw": True, "format": "variant", "filter_type": "nearest",
-        "data": dr.full(mi.TensorXf, 0.5, (8, 8, 3))}}},
-})
-KEY = "shape.emitter.radiance.data"
-wanted = np.random.default_rng(0).uniform(0.1, 0.9, (8, 8, 3)).astype(np.float32)
-
-
-class Rendered(Problem):
-    identity = {"scene": "a rectangle"}
-
-    def __init__(self):
-        self.net = mi.traverse(scene)
-        self.net.keep([KEY])
-        self.net[KEY] = mi.TensorXf(wanted)
-        self.net.update()
-        self.goal = dr.detach(mi.render(scene, self.net, spp=4, seed=0))
-        self.net[KEY] = dr.full(mi.TensorXf, 0.5, (8, 8, 3))
-        self.net.update()
-        self.seeds = 0
-
-    def loss(self, net, rng, size):
-        self.seeds += 1
-        image = mi.render(scene, net, spp=size, seed=self.seeds)
-        return dr.mean(dr.square(image - self.goal), axis=None)
-
-    def measure(self, net):
-        return {"psnr_db": float(-10 * np.log10(np.mean((net[KEY].numpy() - wanted) ** 2)))}
-
-
-problem = Rendered()
-before = problem.measure(problem.net)["psnr_db"]
-settings = FitSettings(steps=80, batch=4, lr=0.05, measure_every=20, check_every=5)
-result = fit(problem, settings, sys.argv[1], progress=False)
-print(before, result.measured["psnr_db"], result.restarts)
-assert before < 15 and result.measured["psnr_db"] > 30 and result.restarts == 0
-assert problem.measure(problem.net)["psnr_db"] == result.measured["psnr_db"]
-# What the scene renders is what was learned: the tables are its parameters
-np.testing.assert_allclose(mi.render(scene, spp=4), problem.goal, atol=0.1)
-again = fit(Rendered(), settings, sys.argv[1], resume=True, progress=False)
-assert again.measured == result.measured
-"""
-
-
-def test_training_through_a_render(tmp_path):
-    """The tables are parameters of a loaded scene, and the loss is that of its image; in a process of its own."""
-    command = [sys.executable, "-c", RENDERED, str(tmp_path / "c.npz")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-
-
 # -- mistakes ---------------------------------------------------------------------------------------------------------
 
 
@@ -774,14 +615,13 @@ def test_checkpoint_of_another_run(checkpoint):
     not_resumable(checkpoint, "damaged or of another task", other)
 
 
-def test_interrupt_before_the_first_measurement(ad, terminal):
+def test_interrupt_before_the_first_measurement(ad):
     """What has been reached by then is measured and kept; its loss nobody has seen."""
     problem = Curve(ad, {7: interrupt})
     start = contents(problem)
-    result = fit(problem, settings(), title="x")
+    result, _ = run(problem, settings())
     assert result.interrupted and result.steps == result.step == 7 and contents(problem) != start
     assert [h["loss"] for h in result.history] == [None]
-    assert "psnr_db=" in terminal.states[-1] and "loss=" not in terminal.states[0]
     assert problem.measure(problem.net)["psnr_db"] == result.measured["psnr_db"]
 
 

@@ -6,7 +6,6 @@ import pytest
 from arrays import aligned
 from drjit import nn
 from scipy.ndimage import map_coordinates
-from variants import BACKENDS
 
 from mi_diffind import DifferentiableArray, Indirection, fold
 from mi_diffind.arrays import lookup
@@ -15,11 +14,6 @@ from mi_diffind.arrays.indirection import unfolded
 from mi_diffind.core.runtime import array_module
 
 BELOW_ONE = np.float32(1) - np.float32(2**-23)
-
-
-@pytest.fixture(params=BACKENDS)
-def ad(request):
-    return array_module(request.param)
 
 
 def interpolate(table, x):
@@ -122,12 +116,6 @@ def test_random_is_seeded(ad):
     ).alloc(ad.TensorXf)
     a, b, c = (net[key].numpy().ravel()[:4].tolist() for key in net)
     assert a != b != c != a
-
-
-def test_numpy_integers_are_integers():
-    array = DifferentiableArray(np.int64(4), np.int32(2))
-    assert array.resolution == (4,) and array.channels == 2
-    assert DifferentiableArray(np.array([4, 5])).resolution == (4, 5)
 
 
 def test_half_precision_allocation(ad):
@@ -333,28 +321,6 @@ def test_what_remains_where_a_coordinate_is_known(ad, dims, channels, storage, b
             np.testing.assert_allclose(values, interpolate(array.numpy(), position), atol=tolerance)
 
 
-def test_what_remains_is_folded(ad):
-    """Entries that need folding, and a single entry along an axis."""
-    array = known(ad, 3, 3, "float32", fold=True)
-    expected = interpolate(
-        triangle(array.data.numpy()[..., :3]), np.column_stack([uniform(3, 50, 2), np.full(50, 0.4)])
-    )
-    np.testing.assert_allclose(read(array.at(ad.Float(0.4)), ad, uniform(3, 50, 2)), expected, atol=2e-6)
-    line = DifferentiableArray.from_numpy(np.arange(12.0).reshape(1, 4, 3), ad.TensorXf)
-    np.testing.assert_allclose(read(line.at(ad.Float(0.5)), ad, uniform(0, 5, 1)), [[4.5, 5.5, 6.5]] * 5)
-    single = DifferentiableArray.from_numpy(np.arange(12.0).reshape(4, 1, 3), ad.TensorXf)
-    for x in (ad.Float(0.5), 0.5):
-        np.testing.assert_array_equal(single.at(x).numpy(), single.numpy()[:, 0])
-
-
-@pytest.mark.parametrize("storage", lookup.STORAGES)
-def test_a_row_of_an_indirection(ad, storage):
-    net = pair(ad).to(storage)
-    row, x = Indirection(net.primary[0].at(ad.Float(0.6)), net.cascaded), uniform(2, 100, 1)
-    expected = read(net, ad, np.column_stack([x, np.full(100, 0.6, np.float32)]))
-    np.testing.assert_allclose(read(row, ad, x), expected, atol=2e-3 if storage == "uint8" else 2e-5)
-
-
 @pytest.mark.parametrize("dims", [2, 3, 4])
 @pytest.mark.parametrize("border", lookup.BORDERS)
 def test_gradients_of_what_remains(ad, dims, border):
@@ -537,33 +503,6 @@ def test_in_a_loop(ad, storage, mode, as_state):
             mode=mode,
         )
     np.testing.assert_allclose(found.numpy(), expected, rtol=1e-5)
-
-
-@pytest.mark.parametrize("mode", ["symbolic", "evaluated"])
-def test_in_an_indirect_call(ad, mode):
-    """Inside ``dr.switch`` (as in a BSDF that Mitsuba calls), with gradients to both tables and to the inputs."""
-    net = pair(ad)
-    other = net.to("uint8")
-    x = [ad.Float(v) for v in uniform(9, 40, 2).T.copy()]
-    which = dr.arange(ad.UInt, 40) % 2
-
-    def gradients(function):
-        dr.enable_grad(net["primary.0.data"], net["cascaded.data"], *x)
-        dr.backward(function())
-        arrays = (net["primary.0.data"], net["cascaded.data"], *x)
-        result, _ = [a.grad.numpy() for a in arrays], dr.disable_grad(arrays)
-        return result
-
-    calls = [lambda a, b: net([a, b])[1], lambda a, b: other([a, b])[1]]
-    expected = gradients(lambda: dr.select(which == 0, net(x)[1], other(x)[1]))
-    with dr.scoped_set_flag(dr.JitFlag.SymbolicCalls, mode == "symbolic"):
-        np.testing.assert_allclose(
-            dr.switch(which, calls, *x).numpy(), dr.select(which == 0, net(x)[1], other(x)[1]).numpy(), rtol=1e-6
-        )
-        found = gradients(lambda: dr.switch(which, calls, *x))
-    for a, b in zip(found, expected, strict=True):
-        assert b.any()
-        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
 
 
 # -- mistakes ----------------------------------------------------------------------------------------------------------

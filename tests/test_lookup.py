@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from arrays import aligned
 from scipy.interpolate import RegularGridInterpolator
-from variants import BACKENDS
 
 from mi_diffind import DifferentiableArray
 from mi_diffind.arrays import lookup
@@ -29,11 +28,6 @@ SPECIAL = (
     0.0, -0.0, 1.0, BELOW_ONE, ABOVE_ONE, DENORMAL, -DENORMAL, 1e-38, -1e-38, -1e-9, 0.5, 2.0, -1.0,
     -5.3, 7.25, 1e9, -1e9, 3.4e38, -3.4e38, np.inf, -np.inf, np.nan,
 )  # fmt: skip
-
-
-@pytest.fixture(params=BACKENDS)
-def ad(request):
-    return array_module(request.param)
 
 
 def borders(dims):
@@ -338,16 +332,6 @@ def test_entries_are_aligned(storage):
             assert dr.detach(data).numpy().ctypes.data % 64 == 0  # on the CPU, this is the memory itself
 
 
-def test_quantising_a_constant_and_refusing_nan(ad):
-    constant = np.full((3, 3, 2), 0.3, np.float32)
-    array = DifferentiableArray.from_numpy(constant, ad.TensorXf, storage="uint8")
-    np.testing.assert_array_equal(read(array, ad, [[0.2, 0.7]]), np.float32([[0.3, 0.3]]))
-    for bad in (np.nan, np.inf):
-        constant[1, 1, 1] = bad
-        with pytest.raises(ValueError, match="NaN or infinite"):
-            DifferentiableArray.from_numpy(constant, ad.TensorXf, storage="uint8")
-
-
 def kernel_gathers(ad, array) -> int:
     """Return the number of gathers in the kernel of a read."""
     x = [dr.linspace(ad.Float, 0, 1, 123) for _ in array.resolution]
@@ -489,13 +473,6 @@ def test_bits_survive_packing(bits, count):
     np.testing.assert_array_equal(unpacked, codes)
     wider = codes | np.uint8(0xFF << bits & 0xFF)  # what lies above is left out
     np.testing.assert_array_equal(pack_bits(wider, bits), packed)
-
-
-def test_numbers_of_more_than_a_byte():
-    numbers = np.array([1000, 3, 2**17 - 1, 2**20 + 5], np.uint32)
-    number = sum((int(n) % 2**17) << (17 * k) for k, n in enumerate(numbers))
-    assert pack_bits(numbers, 17).tobytes() == number.to_bytes(9, "little")
-    assert pack_bits(numbers.astype(np.int64)[::2], 17).tobytes() == pack_bits(numbers[::2], 17).tobytes()
 
 
 def test_words(rng):

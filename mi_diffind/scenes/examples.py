@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..core.errors import DiffindError, UsageError, reason
+from ..core.errors import UsageError, reason
 from ..core.files import irregular, replacing, shown, writable_folder, write_json
 
 #: Files of the scenes, as patterns: scenes, what they read, and the page that says where each comes from. References of
@@ -93,10 +93,6 @@ TIMEOUT = 30.0
 
 #: Schemes of addresses.
 SCHEMES = ("https", "http")
-
-
-class DownloadError(DiffindError):
-    """A file cannot be fetched, or is not the one that is expected; the message is one sentence that names it."""
 
 
 @dataclass(frozen=True)
@@ -201,7 +197,7 @@ def fetch(
 
     A material gets a manifest, ``NAME.json``. Files that are there and have the right SHA-256 stay. ``base``: another
     address, of a mirror, that ends in a folder of the files of each name. ``progress`` is called with a line for each
-    file to fetch. Raises :class:`UsageError`, :class:`DownloadError` and :class:`.OutputError`; no unfinished file
+    file to fetch. Raises :class:`UsageError` and :class:`.OutputError`; no unfinished file
     stays.
     """
     names = tuple(dict.fromkeys([names] if isinstance(names, str) else names))
@@ -235,12 +231,12 @@ def fetch(
 
 
 def _load(address: str, sha256: str, path: Path) -> None:
-    """Write the file at an address to ``path``. Raises :class:`DownloadError`."""
+    """Write the file at an address to ``path``. Raises :class:`UsageError`."""
     import pooch
 
     try:
         pooch.HTTPDownloader(timeout=TIMEOUT)(address, str(path), None)
     except (OSError, ValueError) as e:  # of requests
-        raise DownloadError(f"{shown(address)}: cannot be fetched: {reason(e)}") from None
+        raise UsageError(f"{shown(address)}: cannot be fetched: {reason(e)}") from None
     if (digest := pooch.file_hash(str(path))) != sha256:
-        raise DownloadError(f"{shown(address)}: found the SHA-256 {digest[:16]}…, {sha256[:16]}… is expected")
+        raise UsageError(f"{shown(address)}: found the SHA-256 {digest[:16]}…, {sha256[:16]}… is expected")

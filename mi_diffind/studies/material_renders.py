@@ -31,8 +31,7 @@ from ..arrays.tables import Table
 from ..core.compat import use_threads
 from ..core.runtime import array_module
 from ..fitting import task
-from ..maps.compressed import decibel
-from ..maps.pyramid import Pyramid
+from ..maps.pyramid import Pyramid, decibel
 from ..maps.source import Source
 from ..measure import clock, plot
 from ..measure.renders import TextureScene, still_scenes, to_uv, zoom_scene

@@ -33,7 +33,7 @@ from ..core.files import writable_folder
 from ..fitting import task
 from ..images import metrics
 from ..images.srgb import for_display
-from ..maps.compressed import decibel
+from ..maps.pyramid import decibel
 from ..maps.source import load_source
 from ..measure import plot
 from ..measure.report import figure_caption
@@ -42,9 +42,9 @@ from ..measure.study import Measure, Plan, Study
 from ..measure.training import Contender
 from ..scenes import loading
 from ..scenes.training.options import SceneRecipe, ViewDistribution
-from ..scenes.training.problem import exposure_of
+from ..scenes.training.problem import estimate_exposure
 from ..scenes.training.references import ReferenceRenders
-from ..scenes.training.trained_scene import TrainedScene, original_of, texture_file
+from ..scenes.training.trained_scene import TrainedScene, find_source, texture_file
 from ..tasks.texture.compressed import load
 
 #: Names of the runs.
@@ -179,7 +179,7 @@ class SceneTrainingContext:
         self.parsed = loading.ParsedScene(path, settings.defines)
         self.file, given = texture_file(self.parsed)
         self.start = load(self.file)
-        self.source = original_of(self.start, self.file, given)
+        self.source = find_source(self.start, self.file, given)
 
     @staticmethod
     def references(folder: Path) -> Path:
@@ -215,7 +215,7 @@ def measured_views(context: SceneTrainingContext, folder: Path) -> tuple:
     distribution = ViewDistribution(1, context.settings.tests, seed=SEED, **context.ranges)
     spp, views = context.settings.reference_spp, distribution.measured()
     images = ReferenceRenders(context.parsed, distribution, spp, folder, without=(context.file,)).images(views)
-    return distribution, views, images, exposure_of(images)
+    return distribution, views, images, estimate_exposure(images)
 
 
 def picture(contexts: Sequence[SceneTrainingContext], runs: Sequence[Contender], result: dict):

@@ -43,10 +43,9 @@ from ..core.progress import Deadline
 from ..core.runtime import array_module
 from ..fitting import task
 from ..fitting.loop import FitResult
-from ..fitting.settings import FitSettings, FittingError
+from ..fitting.task import FitSettings, FittingError
 from ..images import srgb
-from ..maps.compressed import decibel
-from ..maps.pyramid import Pyramid
+from ..maps.pyramid import Pyramid, decibel
 from ..maps.source import Source, SourceError, load_source
 from ..measure import plot
 from ..measure.renders import POINTS, MovingView
@@ -60,7 +59,7 @@ from ..tasks.shading import fit as shading_fit
 from ..tasks.shading.evaluation import ShadedEvaluation, ShadedReader, reader, reference
 from ..tasks.shading.material import effects_of, frozen_decoder
 from ..tasks.shading.training import ShadingProblem, fit_shading, start_of
-from ..tasks.texture import training as textures
+from ..tasks.texture import fit as textures
 from ..tasks.texture.compressed import CompressedTexture
 from ..tasks.texture.fit import size_of
 from .baselines import codecs, normals
@@ -387,8 +386,8 @@ class ShadingContenders:
 
         With ``extras``, the arrays leave room for them.
         """
-        request = self.request(texture_task.PRESETS["ours"].settings, length, seed, progress)
-        recipe = dataclasses.replace(self.recipe, settings=request.settings)
+        request = self.request(texture_task.PRESETS["ours"], length, seed, progress)
+        recipe = dataclasses.replace(self.recipe, **request.settings.common)
         nbytes = self.source.nbytes / COMPRESSION
         nbytes = shading_fit.bytes_beside_extras(nbytes, pyramid) if extras else nbytes
         size = size_of(self.source, pyramid, nbytes, recipe, request.options)
@@ -455,11 +454,11 @@ class ShadingContenders:
 
         def train(progress: bool) -> tuple:
             preset = self.preset
-            settings = dataclasses.replace(preset.settings, schedule="cosine" if schedule else "constant")
+            settings = dataclasses.replace(preset, schedule="cosine" if schedule else "constant")
             request = self.request(settings, self.settings.length, seed, progress)
             recipe = dataclasses.replace(
                 preset, share=share, clip=(preset.clip or CLIP) if clip else None, extras=extras,
-                level_bias=preset.level_bias if share else 0.0, settings=request.settings,
+                level_bias=preset.level_bias if share else 0.0, **request.settings.common,
             )  # fmt: skip
             before = self.table(start)
             try:

@@ -33,9 +33,8 @@ from ..core.arguments import positive
 from ..core.runtime import array_module
 from ..core.units import parse_compression
 from ..fitting import task
-from ..fitting.settings import FitSettings
-from ..maps.compressed import FilteredMaps, decibel
-from ..maps.pyramid import Pyramid
+from ..fitting.task import FitSettings
+from ..maps.pyramid import FilteredMaps, Pyramid, decibel
 from ..maps.source import Map, Source, load_source
 from ..measure import plot, renders
 from ..measure.renders import TextureReader, TextureScene, TextureZoom
@@ -45,7 +44,7 @@ from ..measure.study import FLOOR, Candidate, Case, Job, Measure, Plan, Study
 from ..measure.training import Contender, NetworkContender, load_arrays
 from ..plugins.support.image_files import PYRAMIDS
 from ..scenes.loading import footprint
-from ..tasks.texture import nets, training
+from ..tasks.texture import compressed, fit
 from . import equal_memory
 from .baselines import codecs, networks
 
@@ -571,8 +570,8 @@ def draw_levels(context: TextureContenders, result: dict):
     """
     count, panels = context.pyramid.levels, {}
     if context.settings.footprints:
-        shares = {"by level (ours)": training.shares(count)}
-        shares |= {name: nets.footprint_histogram(name, count) for name in nets.FOOTPRINTS}
+        shares = {"by level (ours)": fit.shares(count)}
+        shares |= {name: compressed.footprint_histogram(name, count) for name in compressed.FOOTPRINTS}
         panels["% of the samples of a training"] = [
             plot.Curve(name, range(count), 100 * np.asarray(share)) for name, share in shares.items()
         ]

@@ -16,7 +16,6 @@ import numpy as np
 
 from mi_diffind.arrays.tables import Table, TableError
 from mi_diffind.core import compat
-from mi_diffind.core.archives import LimitError
 from mi_diffind.core.compat import backend_module
 from mi_diffind.core.errors import DiffindError
 from mi_diffind.core.files import (
@@ -29,16 +28,15 @@ from mi_diffind.core.files import (
     write_json,
 )
 from mi_diffind.fitting.task import Task
-from mi_diffind.images.headers import check_picture
-from mi_diffind.maps.compressed import CompressedMaps
+from mi_diffind.images.reader import PictureError, read_picture
 from mi_diffind.maps.layout import Layout, MapLayout
-from mi_diffind.maps.pyramid import Pyramid
+from mi_diffind.maps.pyramid import CompressedMaps, Pyramid
 from mi_diffind.maps.source import Source, SourceError, from_arrays, load_source
 
 from .. import warn
 from . import properties
 from .properties import Kept
-from .tables import Entries, exposed
+from .tables import Tables
 
 STORAGES = ("uint8", "float32")
 
@@ -64,19 +62,13 @@ class SharedMaps:
     """
 
     def __init__(self, image: CompressedMaps, arrays: dict, table: Table | None = None):
-        self.image, self.arrays, self.table = image, arrays, table
-        self.entries = Entries(exposed(arrays))
+        self.image, self.tables = image, Tables(arrays, table)
         self._loaded = self.state()
         self._transforms = {}
 
-    @property
-    def tables(self) -> dict:
-        """Arrays that can be optimised, by name."""
-        return exposed(self.arrays)
-
     def state(self) -> list:
         """Return the present variables of the arrays; a reference keeps their indices from being used again."""
-        return [dr.detach(array.data.array) for array in self.tables.values()]
+        return [dr.detach(array.data.array) for array in self.tables.exposed.values()]
 
     def unchanged(self, state: list) -> bool:
         """Return whether the arrays are still those of ``state``."""
@@ -84,7 +76,7 @@ class SharedMaps:
 
     def as_loaded(self) -> bool:
         """Return whether the arrays are those of the file, and no gradient of them is enabled."""
-        return self.unchanged(self._loaded) and not any(compat.has_gradient(a.data) for a in self.tables.values())
+        return self.unchanged(self._loaded) and not self.tables.optimised()
 
     def transform(self, matrix: list):
         """Return the transformation by a 3×3 ``matrix``, the same variable for equal matrices."""
@@ -274,26 +266,18 @@ def layout_of(task: Task, props: mi.Properties) -> Layout:
 def manifest_of(image: Path, folder: Path, raw: bool, normal: bool) -> Path:
     """Write a manifest of an image's colours as ``bitmap`` reads them, and return its path.
 
-    ``raw``: values are left as they are; ``normal``: they are a normal map. Raises ``RuntimeError``, and
-    :class:`~.stock.Kept` for fewer bytes than :data:`LEAST_BYTES`.
+    ``raw``: values are left as they are; ``normal``: they are a normal map. Raises :class:`.Kept` for a picture that
+    cannot be read, and for fewer bytes than :data:`LEAST_BYTES`.
     """
     try:
-        check_picture(image)
-    except LimitError as e:
-        raise RuntimeError(str(e)) from None
-    try:
-        bitmap = mi.Bitmap(str(image))
-    except RuntimeError as e:
-        raise Kept(f"{image.name} cannot be read: {compat.one_sentence(e)}") from None
-    if bitmap.buffer_size() < LEAST_BYTES:
-        raise Kept(f"{image.name} has {bitmap.buffer_size():,} bytes, of which no fit would save any")
-    formats = mi.Bitmap.PixelFormat
-    entry = {
-        "file": relative_path(image, folder),
-        "color_space": "srgb" if bitmap.srgb_gamma() and not raw else "linear",
-    }
-    if bitmap.pixel_format() in (formats.YA, formats.RGBA):
-        entry["channels"] = "rgb" if bitmap.pixel_format() == formats.RGBA else "r"
+        picture = read_picture(image)
+    except PictureError as e:
+        raise Kept(f"{image.name}: {str(e).removeprefix(f'{image}: ')}") from None
+    if picture.values.nbytes < LEAST_BYTES:
+        raise Kept(f"{image.name} has {picture.values.nbytes:,} bytes, of which no fit would save any")
+    entry = {"file": relative_path(image, folder), "color_space": "srgb" if picture.srgb and not raw else "linear"}
+    if picture.has_alpha:
+        entry["channels"] = "rgb" if picture.colors == 3 else "r"
     name = "normal" if normal else "data" if raw else "albedo"
     digest = hashlib.sha256(str([name, entry]).encode()).hexdigest()[:12]
     path = folder / f"{image.stem}_{digest}.json"

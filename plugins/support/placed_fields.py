@@ -17,14 +17,14 @@ from mi_diffind.tasks.radiance.files import load
 from mi_diffind.tasks.radiance.volume_field import VolumeField
 
 from . import properties, textures
-from .placement import Placement, PlacementParameter
+from .placement import Placement
 from .tables import arrays_of
 
 #: Luminance of linear sRGB, the same as in Mitsuba.
 LUMINANCE = (0.212671, 0.715160, 0.072169)
 
 
-class PlacedField(PlacementParameter):
+class PlacedField(Placement):
     """Radiance field (:class:`mi_diffind.tasks.radiance.volume_field.VolumeField`) in a scene, placed by ``to_world``.
 
     The transform is a similarity. Densities are per unit of length in the field's frame, so that a scaled field keeps
@@ -32,7 +32,7 @@ class PlacedField(PlacementParameter):
     """
 
     def __init__(self, field, to_world):
-        super().__init__(Placement.of(to_world, 1.0, (0, 0, 0)))
+        super().__init__(to_world)
         self.field, self._turn = field, None
 
     def held(self) -> list:
@@ -74,7 +74,7 @@ class PlacedField(PlacementParameter):
     def overlaps(self, other: PlacedField) -> bool:
         """Return whether the boxes of two fields have a volume in common, by the separating axis theorem."""
         points = corners(self), corners(other)
-        axes = [self.placement.rotation.T, other.placement.rotation.T]
+        axes = [self.rotation.T, other.rotation.T]
         crossed = np.cross(axes[0][:, None], axes[1][None]).reshape(-1, 3)
         for axis in (*axes[0], *axes[1], *crossed[np.linalg.norm(crossed, axis=1) > 1e-6]):
             a, b = (p @ axis for p in points)
@@ -141,7 +141,7 @@ class PlacedField(PlacementParameter):
 def corners(placed: PlacedField) -> np.ndarray:
     """Return the corners ``(8, 3)`` of a field's box in the world."""
     field = placed.field
-    return placed.placement.world(np.array(list(product(*zip(field.lower, field.upper, strict=True)))))
+    return placed.world(np.array(list(product(*zip(field.lower, field.upper, strict=True)))))
 
 
 class VariantLight:
@@ -234,7 +234,7 @@ class JoinedField(VolumeField):
 
     def __init__(self, members: list):
         points = np.concatenate([corners(placed) for placed in members])
-        voxel = min(placed.field.voxel * placed.placement.size for placed in members)
+        voxel = min(placed.field.voxel * placed.length for placed in members)
         super().__init__(members[0].field.types, points.min(axis=0), points.max(axis=0), voxel, {})
         self.members = members
 
@@ -328,8 +328,8 @@ class FieldLight:
         """Follow a change of the fields."""
         rows = []
         for placed in self.fields:
-            bright, placement = bright_spheres(placed.field, SPHERES // len(self.fields)), placed.placement
-            rows.append(np.column_stack([placement.world(bright[:, :3]), bright[:, 3] * placement.size, bright[:, 4]]))
+            bright = bright_spheres(placed.field, SPHERES // len(self.fields))
+            rows.append(np.column_stack([placed.world(bright[:, :3]), bright[:, 3] * placed.length, bright[:, 4]]))
         rows = np.concatenate([*rows, np.zeros((SPHERES, 5))])[:SPHERES].astype(np.float32)
         # Always as many, so that a frozen function takes other ones
         self.spheres = mi.Float(np.ascontiguousarray(rows[:, :4]).reshape(-1))

@@ -217,7 +217,7 @@ def splats(path: str) -> dict | None:
 
     loaded = bounded(lambda: Splats.read(path), path)
     names = ("centres", "scales", "quaternions", "opacities", "colours")
-    return finite(**{name: getattr(loaded, name) for name in names}) or finite(box=loaded.cropped().box())
+    return finite(**{name: getattr(loaded, name) for name in names}) or finite(box=loaded.crop().box())
 
 
 def checkpoint(path: str, write: bool = False) -> dict | None:

@@ -7,17 +7,10 @@ from dataclasses import replace
 import drjit as dr
 import numpy as np
 import pytest
-from variants import BACKENDS
 
-from mi_diffind.core.runtime import array_module
-from mi_diffind.maps.compressed import root
 from mi_diffind.maps.layout import NORMAL_FLOOR_DB, Layout, MapLayout
+from mi_diffind.maps.pyramid import root
 from mi_diffind.maps.source import from_arrays
-
-
-@pytest.fixture(params=BACKENDS)
-def ad(request):
-    return array_module(request.param)
 
 
 def noise(*shape, seed=0, dtype=np.uint8):

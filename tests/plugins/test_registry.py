@@ -14,7 +14,7 @@ import pytest
 from mi_diffind import plugins
 from mi_diffind.scenes import loading
 
-#: A learned shape whose factory returns a native object, another of Mitsuba's, a volume, and factories that fail.
+#: A learned shape whose factory returns a native object, a volume, and factories that fail.
 MODULES = {
     "toy_ball": """
         import mitsuba as mi
@@ -34,23 +34,6 @@ MODULES = {
             props["radius"] = float(props.get("size", 0.5))
 
         PLUGIN = Plugin("toy_ball", "shape", make, exact=Counterpart("sphere", ("preset", "size"), convert=to_sphere))
-    """,
-    "toy_field": """
-        import drjit as dr
-        import mitsuba as mi
-        import numpy as np
-        from mi_diffind.plugins import Counterpart, Plugin
-
-        def make(props):
-            native = mi.Properties("sdfgrid")
-            native.set_id(props.id())
-            x = np.stack(np.meshgrid(*[np.linspace(-0.5, 0.5, 8)] * 3, indexing="ij"), -1)
-            for name, child in props.objects():
-                native[name] = child
-            native["grid"] = mi.TensorXf((np.linalg.norm(x, axis=-1) - 0.3).astype(np.float32)[..., None])
-            return mi.PluginManager.instance().create_object(native)
-
-        PLUGIN = Plugin("toy_field", "shape", make, exact=Counterpart("cube"))
     """,
     "toy_fog": """
         import mitsuba as mi
@@ -136,7 +119,6 @@ SCENE = """
     <emitter type="constant"/>
     <shape type="toy_ball" id="ball"><string name="preset" value="paper"/></shape>
     <shape type="toy_ball"><float name="size" value="0.25"/></shape>
-    <shape type="toy_field"><bsdf type="diffuse"/></shape>
 </scene>
 """
 
@@ -203,14 +185,14 @@ def test_after_a_purge_of_modules():
 def test_plugins_of_other_packages(mi_toys, tmp_path):
     """Shapes whose factories return native objects are found, compared and inspected; also by scalar variants."""
     mi = mi_toys
-    assert {"toy_ball", "toy_field", "toy_fog", "neural_disney"} <= set(plugins.declared())
+    assert {"toy_ball", "toy_fog", "neural_disney"} <= set(plugins.declared())
     (tmp_path / "scene.xml").write_text(SCENE)
     found = loading.ParsedScene(tmp_path / "scene.xml").learned_plugins()
     assert [(e["plugin"], e["id"], e.get("preset"), e.get("size")) for e in found] == [
-        ("toy_ball", "ball", "paper", None), ("toy_ball", "", None, "0.25"), ("toy_field", "", None, None)
+        ("toy_ball", "ball", "paper", None), ("toy_ball", "", None, "0.25")
     ]  # fmt: skip
     exact = loading.load(tmp_path / "scene.xml", exact=True)
-    assert [shape.class_name() for shape in exact.shapes()] == ["Sphere", "Sphere", "Cube"]
+    assert [shape.class_name() for shape in exact.shapes()] == ["Sphere", "Sphere"]
     assert loading.instances(exact) == []
     if not plugins.supported(mi.variant()):
         with pytest.raises(loading.SceneError, match='"toy_ball" does not run in the variant "scalar_rgb"'):
@@ -218,11 +200,11 @@ def test_plugins_of_other_packages(mi_toys, tmp_path):
         return
     scene = loading.load(tmp_path / "scene.xml")
     reports = loading.reports(scene)
-    assert [(r["plugin"], r["id"], r.get("preset")) for r in reports[:2]] == [
+    assert [(r["plugin"], r["id"], r.get("preset")) for r in reports] == [
         ("toy_ball", "ball", "paper"), ("toy_ball", "", "tables")
     ]  # fmt: skip
-    assert [r["size"] for r in reports[:2]] == [0.5, 0.25] and reports[2]["plugin"] == "toy_field"
-    assert len(reports) == 3 and mi.render(scene, spp=1).numpy().std() >= 0
+    assert [r["size"] for r in reports] == [0.5, 0.25]
+    assert len(reports) == 2 and mi.render(scene, spp=1).numpy().std() >= 0
 
 
 def test_native_objects_are_forgotten(mi_toys):

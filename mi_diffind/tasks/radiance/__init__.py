@@ -1,11 +1,11 @@
 """Task 7: radiance fields from images of a scene.
 
 - :mod:`.captures`, :mod:`.views`: captured images with cameras, and the space that captured objects may occupy;
-- :mod:`.volume_field`, :mod:`.nodes`, :mod:`.surroundings`, :mod:`.march`: fields, the nodes that hold their numbers,
-  the space around the objects, and ray marching;
+- :mod:`.volume_field`, :mod:`.nodes`, :mod:`.march`: fields, the nodes that hold their numbers, in a box or in all
+  space, and ray marching;
 - :mod:`.session`, :mod:`.grid`: training through images, and the grid that is compressed;
 - :mod:`.compression`, :mod:`.coding`, :mod:`.paper`: our compressed layout, and that of the supplement;
-- :mod:`.fit`, :mod:`.files`, :mod:`.model`, :mod:`.decode`: the steps of ``fit field`` and its result.
+- :mod:`.fit`, :mod:`.files`, :mod:`.model`: the steps of ``fit field`` and its result.
 """
 
 from __future__ import annotations
@@ -15,12 +15,11 @@ from math import log, prod
 
 from ...core import units
 from ...core.arguments import Argument, between, checked, positive
-from ...fitting.settings import FitSettings
-from ...fitting.task import Task
+from ...fitting.task import FitSettings, Task
 
-#: Voxels per pixel of the views at the distance of the box, and the range of the resolution that follows from them:
-#: nodes along each side of a cube with the volume of the box.
-VOXELS_PER_PIXEL, RESOLUTIONS = 1.25, (32, 352)
+#: Range of the resolution that follows from the pixels of the views: nodes along each side of a cube with the volume of
+#: the box.
+RESOLUTIONS = (32, 352)
 
 #: Stages of the grid from coarse to fine: share of the resolution, and share of the training steps. Between them, cells
 #: that no ray sees are removed.
@@ -30,26 +29,14 @@ STAGES = ((0.25, 0.08), (0.5, 0.12), (0.75, 0.12), (1.0, 0.1), (1.0, 0.58))
 #: unless the resolution is given. In the last stage, a third of them has been removed.
 MOST_NUMBERS = 36_000_000
 
-#: Most steps that follow from the pixels of the views.
-MOST_STEPS = 11_000
-
 #: Ratio ρ of the sides of primary and cascaded array by compression (Table 6 of the supplement).
 RATIOS = {
     "density": {5: 3.57, 10: 3.8, 25: 2.69, 50: 1.97, 75: 2.82, 100: 2.51},
     "colour": {5: 5.05, 10: 3.42, 25: 4.14, 50: 4.53, 75: 3.58, 100: 5.74},
 }
 
-#: Default compression of the preset ``paper``.
-COMPRESSION = 50.0
-
 #: Colours of a field that a user may choose: with reflections (:mod:`.volume_field`), or twelve numbers of directions.
 COLOURS = ("reflections", "directions")
-
-#: Share of the resolution from which on reflections are trained; before, normals are not known.
-REFLECTING = 0.5
-
-#: Backgrounds of images without alpha that a user may choose (:mod:`.views`).
-BACKGROUNDS = ("white", "black", "scene", "surroundings")
 
 #: Bytes of a node of the uncompressed grid: a density and twelve numbers of colour in float32.
 NODE_BYTES = 52
@@ -77,7 +64,8 @@ class RadianceRecipe:
         """Return ``settings`` with steps for the pixels of all training ``views``, if they have the default steps."""
         if settings.steps != self.settings.steps:
             return settings
-        steps = min(MOST_STEPS, round(self.rays_per_pixel * (len(views) * views.mean_pixels) / settings.batch))
+        # However many pixels there are
+        steps = min(11_000, round(self.rays_per_pixel * (len(views) * views.mean_pixels) / settings.batch))
         return replace(settings, steps=max(settings.steps, steps))
 
 
@@ -142,7 +130,7 @@ class RadianceField(Task):
             "0.8 of the width of a pixel (default: auto)",
         ),
         Argument(
-            "--background", choices=BACKGROUNDS,
+            "--background", choices=("white", "black", "scene", "surroundings"),
             help="background of images without alpha: a colour, scene (a box around everything), or surroundings "
             "(coarser with the distance, without an end) (default: the colour of their borders if it is one, else "
             "scene)"

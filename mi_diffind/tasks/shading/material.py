@@ -20,13 +20,13 @@ from ...arrays.boxes import ValueBounds
 from ...core.compat import backend_module
 from ...core.errors import UsageError
 from ...images import srgb
-from ...maps.compressed import FilteredMaps
 from ...maps.layout import Layout, MapLayout
+from ...maps.pyramid import FilteredMaps
 from ..disney import TASK as DISNEY
 from ..disney.decoder import Decoder, Lobe
 from ..disney.model import PARAMETERS, Effects, Material, find_effects, sanitize
 from ..disney.training import shade
-from ..texture.nets import NEUTRAL
+from ..texture.compressed import NEUTRAL
 
 #: Values of parameters without a map, the defaults of the plugin ``disney``.
 DEFAULTS = {**dict.fromkeys(PARAMETERS, 0.0), "roughness": 0.5, "specular": 0.5}

@@ -27,10 +27,9 @@ from ...maps.pyramid import Pyramid
 from ...maps.source import Source
 from ..disney.training import random_directions
 from ..texture import PRESETS as TEXTURES
-from ..texture import training as textures
-from ..texture.compressed import CompressedTexture, to_table
-from ..texture.nets import neutral_extras
-from . import ShadingRecipe
+from ..texture import fit as textures
+from ..texture.compressed import CompressedTexture, neutral_extras, to_table
+from . import ShadingSettings
 from .evaluation import TRUTHS, ShadedEvaluation, reader, reference, write_preview
 from .material import effects_of, frozen_decoder, shaded, surface_of
 
@@ -79,7 +78,7 @@ class ShadingProblem(textures.TextureProblem):
     tolerance = 0.02
 
     def __init__(
-        self, net, pyramid: Pyramid, recipe: ShadingRecipe, digest: str = "",
+        self, net, pyramid: Pyramid, recipe: ShadingSettings, digest: str = "",
         evaluation: ShadedEvaluation | None = None, base: Sequence[float] = (),
     ):  # fmt: skip
         super().__init__(net, pyramid, TEXTURES[recipe.texture], digest)
@@ -92,8 +91,7 @@ class ShadingProblem(textures.TextureProblem):
         self.level_gains = np.zeros(0)
         self.effects, _ = effects_of(pyramid.layout)
         self.decoder = frozen_decoder(self.types)
-        recorded = {k: v for k, v in dataclasses.asdict(recipe).items() if k != "settings"}
-        self.identity = {**self.identity, "shading": recorded}
+        self.identity = {**self.identity, "shading": recipe.further}
 
     def loss(self, net, rng, size: int):
         net, share = self.seen(unfolded(net)), self.shading.share
@@ -102,7 +100,7 @@ class ShadingProblem(textures.TextureProblem):
         if share < 1:
             inputs, targets = self.batch(rng, size)
             weights = {name: (1 - share) * weight for name, weight in self.weights.items()}
-            losses += sample_losses(self.read(net, inputs), targets, weights, size, self.recipe.settings.loss)
+            losses += sample_losses(self.read(net, inputs), targets, weights, size, self.recipe.loss)
         if share > 0:
             losses.append(share / size * self.shading_errors(net, rng, size))
         return losses
@@ -176,7 +174,7 @@ def start_of(table: Table, pyramid: Pyramid):
 def fit_shading(
     source: Source,
     start,
-    recipe: ShadingRecipe,
+    recipe: ShadingSettings,
     request: FitRequest,
     pyramid: Pyramid,
     evaluation: ShadedEvaluation | None = None,
@@ -191,7 +189,7 @@ def fit_shading(
     ``kept_start``). The setting ``before`` has the errors of the start as shaded images, ``level_biases`` the gains by
     which the bias was chosen (:func:`choose`). ``preview`` is a picture that is written at each measurement.
     """
-    request = dataclasses.replace(request, settings=recipe.settings)
+    request = dataclasses.replace(request, settings=recipe)
     validation = None if evaluation is None else evaluation.another()
     effects, decoder = effects_of(pyramid.layout)[0], frozen_decoder(pyramid.types)
     texture = CompressedTexture(pyramid.layout, textures.stored_form(start), start_bias)
@@ -233,7 +231,7 @@ def fit_shading(
     settings = {**request.recorded(result), **problem.identity, "level_bias": texture.level_bias}
     settings |= {"kept_start": True} if kept else {}
     table = to_table(texture, settings)
-    table.preset, table.seed = request.preset, recipe.settings.seed
+    table.preset, table.seed = request.preset, recipe.seed
     errors = CompressedTexture.of(table, request.types.TensorXf).measure(source)
     if evaluation is not None:
         table.settings["before"] = significant(before)
@@ -243,7 +241,7 @@ def fit_shading(
 
 
 def choose(
-    problem_of: Callable[[Trial], ShadingProblem], request: FitRequest, biases: Sequence[float], recipe: ShadingRecipe
+    problem_of: Callable[[Trial], ShadingProblem], request: FitRequest, biases: Sequence[float], recipe: ShadingSettings
 ) -> tuple:
     """Return the best :class:`Trial` after a short training with each, the gains, and ``None``.
 

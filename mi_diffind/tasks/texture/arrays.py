@@ -24,16 +24,22 @@ from ...arrays.pages import (
     most_entries,
     page_counts,
     page_entries,
-    page_gain,
     page_positions,
     page_shift,
     shared_page_sizes,
 )
-from ...maps.compressed import taps
-from ...maps.layout import Layout, channel_covariance, eigenvectors, neighbour_covariance
-from ...maps.pyramid import level_sizes
+from ...maps.layout import (
+    MARGIN,
+    Layout,
+    channel_covariance,
+    component_range,
+    eigenvectors,
+    linear_in_pointer,
+    neighbour_covariance,
+)
+from ...maps.pyramid import level_sizes, taps
 from . import FineArray, parse_structure
-from .nets import FineLayer, LayeredNet, LayeredStructure, PaperNet, PaperStructure
+from .compressed import FineLayer, LayeredNet, LayeredStructure, PaperNet, PaperStructure
 
 #: Best resolution ratio for compression ratios of RGB textures at 4K (the supplement's table 4).
 RATIOS = {3: 80, 6: 64, 12: 64, 24: 48}
@@ -143,12 +149,10 @@ class PaperBudget:
 def paper_size(
     nbytes: float, source_bytes: int, channels: int, height: int, width: int, rho: float | None = None
 ) -> PaperBudget:
-    """Return the result of the paper's search over the sides ``N_c`` = 4, 8, ….
+    """Return the result of the paper's search over the sides ``N_c`` of the array (:meth:`.Budget.paper_side`).
 
-    The search minimises the difference of compression ratios, with ``N_p0 = ρ N_c`` in multiples of 8 and no larger
-    than the image; ``rho`` is by default :func:`resolution_ratio`. If the best is more than 5% off, primary 0 is
-    resized to fit beside the same ``N_c``, or beside a smaller one if the cascaded array alone takes more than half of
-    the bytes.
+    ``N_p0 = ρ N_c`` in multiples of 8 and no larger than the image; ``rho`` is by default :func:`resolution_ratio`. If
+    the best is more than 5% off, primary 0 is resized to fit beside the cascaded array.
     """
     lods, budget = lod_count(height, width), Budget(nbytes)
     rho = rho or resolution_ratio(max(source_bytes / nbytes, 1e-6), channels)
@@ -157,15 +161,11 @@ def paper_size(
         side = PRIMARY_STEP * max(1, round(rho * cascaded / PRIMARY_STEP))
         return PaperBudget(*_spread(side**2, height, width), lods, cascaded, channels)
 
-    most = int((nbytes / (channels * lods)) ** (1 / 3)) + 2 * CASCADED_STEP  # takes more than all bytes
-    best = sized(budget.nearest(sized, range(CASCADED_STEP, most + 1, CASCADED_STEP), source_bytes))
-    if budget.is_met(best.nbytes):
-        return best
-    cascaded = best.cascaded
-    while cascaded > CASCADED_STEP and channels * cascaded**3 * lods > nbytes / 2:
-        cascaded -= CASCADED_STEP
-    entries = (nbytes - PaperBudget(0, 0, lods, cascaded, channels).nbytes) / 3
-    return PaperBudget(*_spread(max(1, entries), height, width), lods, cascaded, channels)
+    side, met = budget.paper_side(sized, channels * lods, 3, source_bytes, CASCADED_STEP)
+    if met:
+        return sized(side)
+    entries = (nbytes - PaperBudget(0, 0, lods, side, channels).nbytes) / 3
+    return PaperBudget(*_spread(max(1, entries), height, width), lods, side, channels)
 
 
 def _spread(entries: float, height: int, width: int) -> tuple[int, int]:
@@ -335,12 +335,6 @@ class PrincipalComponents:
     low: np.ndarray
     high: np.ndarray
 
-    #: Room between the range of components and the ends of [0, 1].
-    MARGIN = 0.02
-
-    #: Share of texels beyond the range of components at either end.
-    OUTSIDE = 1e-3
-
     @staticmethod
     def of(values: np.ndarray, dims: int) -> PrincipalComponents:
         """Return the first ``dims`` components of level 0, ``(height, width, k)``, at most ``k``."""
@@ -352,8 +346,7 @@ class PrincipalComponents:
         detail = directions @ neighbour_covariance(values) @ directions.T
         directions = eigenvectors(detail, len(directions)) @ directions
         projected = (values.reshape(-1, k) - mean) @ directions.T
-        low, high = np.quantile(projected, [PrincipalComponents.OUTSIDE, 1 - PrincipalComponents.OUTSIDE], axis=0)
-        return PrincipalComponents(mean, directions, low, np.maximum(high, low + 1e-3))
+        return PrincipalComponents(mean, directions, *component_range(projected))
 
     @property
     def dims(self) -> int:
@@ -362,16 +355,12 @@ class PrincipalComponents:
     def pointers(self, values: np.ndarray) -> np.ndarray:
         """Return the pointers of texels, ``(height, width, dims)`` in [0, 1], float32."""
         unit = ((values - self.mean) @ self.directions.T - self.low) / (self.high - self.low)
-        return np.clip(self.MARGIN + (1 - 2 * self.MARGIN) * unit, 0, 1).astype(np.float32)
+        return np.clip(MARGIN + (1 - 2 * MARGIN) * unit, 0, 1).astype(np.float32)
 
     def back(self, side: int) -> np.ndarray:
         """Return the channels at the entries of a cascaded array, ``(side, …, k)``: linear in the pointer."""
-        grid = (np.linspace(0, 1, side) - self.MARGIN) / (1 - 2 * self.MARGIN) if side > 1 else np.array([0.5])
-        channels = self.mean
-        for d in range(self.dims):
-            shape = [-1 if axis == d else 1 for axis in range(self.dims)] + [1]
-            along = np.reshape(self.low[d] + grid * (self.high[d] - self.low[d]), shape)
-            channels = channels + along * self.directions[d]
+        axes = range(self.dims)
+        channels = linear_in_pointer(self.mean, self.directions, self.low, self.high, side, axes, self.dims)
         return np.clip(channels, 1e-3, 1 - 1e-3).astype(np.float32)
 
 
@@ -450,16 +439,6 @@ def _pages(pointers: list, basis: PrincipalComponents, size: TextureBudget, bord
         layers.append(FineLayer(level, end - 1, size.page_bits, (1.0,) * size.dims, True))
         fine.append(PagedArray(sizes, size.dims, entries, shift, fold=True, border=border))
     return layers, fine
-
-
-def gain_of_pages(values: Sequence[np.ndarray], size: TextureBudget, border: tuple[str, str]) -> float:
-    """Return the gain of pages over one grid of equal bytes at level 0, in dB (:func:`.page_gain`)."""
-    basis = PrincipalComponents.of(values[0], size.dims)
-    flat = values[0].reshape(-1, values[0].shape[-1]) - basis.mean
-    exact = flat @ basis.directions.T
-    rest = float(np.mean(flat**2, axis=0).sum() - np.mean(exact**2, axis=0).sum())
-    exact = exact.reshape(*values[0].shape[:2], -1).astype(np.float32)
-    return page_gain(exact, border, size.page_entries, max(rest, 0.0))[0]
 
 
 def _ramps(rows: int, columns: int, count: int) -> np.ndarray:

@@ -84,7 +84,7 @@ def test_shapes_and_sensors_that_are_out_of_the_ordinary(mi_rgb, kind):
 
 @pytest.mark.parametrize("integrator", ["path", "prb", "direct"])
 def test_textures_of_stock_integrators_get_it(mi_rgb, integrator):
-    """On both sides of a material, and below a normal map; lit evenly and alone, a diffuse surface shows it."""
+    """Both sides of a material, and a material below a normal map, evenly lit."""
     mi = mi_rgb
     fp.register_probe()
     diffuse = {"type": "diffuse", "reflectance": {"type": "probe"}}
@@ -106,7 +106,7 @@ def test_textures_of_stock_integrators_get_it(mi_rgb, integrator):
 
 
 def test_what_is_not_seen_directly_is_never_blurred_more_than_in_truth(mi_rgb):
-    """In a flat mirror, where the way is longer, and rather sharp beyond it."""
+    """In a flat mirror, beyond which the path is longer, the estimate is below the true footprint."""
     mi = mi_rgb
     mirror = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(3)}
     room = {"type": "cube", "to_world": mi.ScalarTransform4f().scale(6), "flip_normals": True}

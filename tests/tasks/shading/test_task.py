@@ -30,7 +30,7 @@ from mi_diffind.tasks.shading import PRESETS, material, training
 from mi_diffind.tasks.shading.evaluation import ShadedEvaluation, reader, reference
 from mi_diffind.tasks.texture import PRESETS as TEXTURES
 from mi_diffind.tasks.texture import TASK as TEXTURE
-from mi_diffind.tasks.texture import training as textures
+from mi_diffind.tasks.texture import fit as textures
 from mi_diffind.tasks.texture.compressed import CompressedTexture
 
 OURS = PRESETS["ours"]
@@ -272,13 +272,11 @@ def start(ad, tmp_path_factory):
 
     source, pyramid = pyramid_of(bumpy(), ad)
     recipe = TEXTURES["ours"]
-    recipe = dataclasses.replace(
-        recipe, settings=dataclasses.replace(recipe.settings, steps=60, batch=4096, measure_every=60)
-    )
+    recipe = dataclasses.replace(recipe, steps=60, batch=4096, measure_every=60)
     options = {argument.name: argument.default for argument in TEXTURE.arguments} | {"structure": "0:1:2,1:2:4"}
     options["skip"] = 2
     size = size_of(source, pyramid, source.nbytes / 2, recipe, options)
-    request = FitRequest("ours", recipe.settings, ad, progress=False)
+    request = FitRequest("ours", recipe, ad, progress=False)
     table, _ = textures.fit_texture(source, size, recipe, request, pyramid)
     path = tmp_path_factory.mktemp("shading") / "start.npz"
     save_table(path, table)
@@ -288,17 +286,15 @@ def start(ad, tmp_path_factory):
 
 
 def quick(**changed):
-    settings = {"steps": 60, "batch": 4096, "measure_every": 60, "lr": 1e-2}
-    changed = {"level_bias": 0.0, **changed}
-    settings |= {k: changed.pop(k) for k in list(changed) if k in ("steps", "batch", "measure_every", "lr", "loss")}
-    return dataclasses.replace(OURS, settings=dataclasses.replace(OURS.settings, **settings), **changed)
+    settings = {"steps": 60, "batch": 4096, "measure_every": 60, "lr": 1e-2, "level_bias": 0.0}
+    return dataclasses.replace(OURS, **settings | changed)
 
 
 def trained(start, ad, recipe, measured=True, **request):
     source, pyramid, table, evaluation, *_ = start
     evaluation = evaluation if measured else None
     net = training.start_of(table, pyramid)
-    asked = FitRequest("ours", recipe.settings, ad, progress=False, **request)
+    asked = FitRequest("ours", recipe, ad, progress=False, **request)
     return training.fit_shading(source, net, recipe, asked, pyramid, evaluation)
 
 
@@ -384,7 +380,7 @@ def test_choice_by_short_trainings(ad, gains, expected):
 
     recipe = dataclasses.replace(OURS, extras=any("extras" in name for name in gains))
     for limit in ({}, {"deadline": Deadline(1e-9)}):
-        trained, settings = [], dataclasses.replace(OURS.settings, steps=100)
+        trained, settings = [], dataclasses.replace(OURS, steps=100)
         request = Request("ours", settings, ad, checkpoint="x", **limit)
         choice, kept, stopped = training.choose(Figures, request, training.BIASES, recipe)
         assert choice.name == expected and stopped is None and trained == ([] if limit else list(gains))
@@ -445,7 +441,7 @@ def test_training_reads_the_level_that_a_file_is_read_at(start, ad):
 
     _, pyramid, table, *_ = start
     problem = training.ShadingProblem(training.start_of(table, pyramid), pyramid, quick(share=1.0))
-    problem.settings, losses = problem.shading.settings, []
+    problem.settings, losses = problem.shading, []
     for bias, net in ((-0.5, problem.net), (0.0, CompressedTexture(pyramid.layout, problem.net, -0.5))):
         problem.level_bias = bias
         losses.append(problem.shading_errors(net, dr.rng(seed=dr.opaque(ad.UInt64, 7)), 512).numpy())
@@ -461,7 +457,7 @@ def test_share_zero_is_the_texture_alone(start, ad):
     problem = textures.TextureProblem(training.start_of(table, pyramid), pyramid, TEXTURES["ours"], source.digest)
     from mi_diffind.fitting.loop import fit
 
-    fit(problem, recipe.settings, progress=False)
+    fit(problem, recipe, progress=False)
     # Settings say "mse" in both, and the samples are those of the same seed
     for name, array in textures.stored_form(problem.net).arrays.items():
         assert np.array_equal(found.arrays[name].entries, array.codes()), name
@@ -472,7 +468,7 @@ def test_gradient_of_the_loss_is_that_of_finite_differences(start, ad):
     source, pyramid, table, *_ = start
     recipe = quick(share=1.0, clip=None, reference="converged")
     problem = training.ShadingProblem(training.start_of(table, pyramid), pyramid, recipe, source.digest)
-    problem.settings = recipe.settings
+    problem.settings = recipe
     problem.recipe = dataclasses.replace(problem.recipe, rounded=False)
     net = problem.net
     original = dr.detach(net.cascaded.data)
@@ -523,8 +519,8 @@ def test_command_trains_both_and_the_plugin_reads_it(mi_rgb, start, manifest, tm
     from mi_diffind.tasks.shading import fit as shading_fit
 
     mi = mi_rgb
-    short = dataclasses.replace(TEXTURES["ours"].settings, steps=6, batch=4096, measure_every=6)
-    monkeypatch.setitem(TEXTURES, "ours", dataclasses.replace(TEXTURES["ours"], settings=short))
+    short = dataclasses.replace(TEXTURES["ours"], steps=6, batch=4096, measure_every=6)
+    monkeypatch.setitem(TEXTURES, "ours", dataclasses.replace(TEXTURES["ours"], **short.common))
     monkeypatch.setattr(
         shading_fit, "ShadedEvaluation", functools.partial(ShadedEvaluation, levels=4, pairs=24, side=16)
     )
@@ -590,5 +586,5 @@ def test_sources_that_cannot_be_shaded_are_refused(ad, start, tmp_path):
         load_start(
             start[4],
             from_arrays(bumpy(seed=9)),
-            FitRequest("ours", OURS.settings, ad, options={"source": "other.json"}),
+            FitRequest("ours", OURS, ad, options={"source": "other.json"}),
         )
