@@ -152,7 +152,7 @@ class RenderedMaterial:
 def rendered_materials(source: Source, tables: Sequence[Table]) -> list[RenderedMaterial]:
     """Return the contenders for a material and textures that were trained on it, the first one in the tables' bytes."""
     types = array_module(mi.variant())
-    pyramid = Pyramid.of(source, types=types, border=("repeat", "repeat"))
+    pyramid = Pyramid.from_source(source, types=types, border=("repeat", "repeat"))
     lean = normals.with_roughness(pyramid, normals.lean_levels(source, pyramid))
     pyramids = {"mip maps": (pyramid, pyramid.nbytes), "LEAN mip maps": (lean, lean.nbytes)}
     if "astc" in codecs.available():

@@ -56,11 +56,11 @@ from ..tasks import texture as texture_task
 from ..tasks.disney.model import Effects
 from ..tasks.shading import fit as shading_fit
 from ..tasks.shading.evaluation import ShadedEvaluation, ShadedReader, reader, reference
-from ..tasks.shading.material import effects_of, frozen_decoder
-from ..tasks.shading.training import ShadingProblem, fit_shading, start_of
+from ..tasks.shading.material import frozen_decoder, material_effects
+from ..tasks.shading.training import ShadingProblem, fit_shading, trainable_arrays
 from ..tasks.texture import fit as textures
 from ..tasks.texture.compressed import CompressedTexture
-from ..tasks.texture.fit import size_of
+from ..tasks.texture.fit import find_size
 from .baselines import codecs, normals
 from .equal_memory import Contender
 from .example_maps import MATERIALS, generated_source
@@ -321,11 +321,11 @@ class ShadingStudyContext:
 
     @cached_property
     def pyramid(self) -> Pyramid:
-        return Pyramid.of(self.source, textures.layout_of(self.source, self.recipe), self.types)
+        return Pyramid.from_source(self.source, textures.source_layout(self.source, self.recipe), self.types)
 
     @cached_property
     def effects(self) -> Effects:
-        return effects_of(self.pyramid.layout)[0]
+        return material_effects(self.pyramid.layout)[0]
 
     @cached_property
     def decoder(self):
@@ -412,8 +412,8 @@ class ShadingStudyContext:
         recipe = dataclasses.replace(self.recipe, **request.settings.common)
         nbytes = self.source.nbytes / self.settings.compression
         nbytes = shading_fit.bytes_beside_extras(nbytes, pyramid) if extras else nbytes
-        size = size_of(self.source, pyramid, nbytes, recipe, request.options)
-        problem = textures.problem_of(self.source, size, recipe, pyramid)
+        size = find_size(self.source, pyramid, nbytes, recipe, request.options)
+        problem = textures.build_problem(self.source, size, recipe, pyramid)
         result = request.train(problem, f"{self.name}: texture, seed {seed}")
         stored = CompressedTexture(pyramid.layout, textures.stored_form(problem.net))
         trained = textures.to_table(stored, {**request.recorded(), "source": self.source.digest, "steps": result.steps})
@@ -488,7 +488,7 @@ class ShadingStudyContext:
                 preset, share=share, clip=(preset.clip or CLIP) if way.clip else None, extras=extras,
                 level_bias=preset.level_bias if share else 0.0, **request.settings.common,
             )  # fmt: skip
-            net = start_of(start.model.table, self.pyramid)
+            net = trainable_arrays(start.model.table, self.pyramid)
             try:
                 fit = fit_shading if preset.bounded else fit_to_the_end
                 table, result = fit(self.source, net, recipe, request, self.pyramid, self.evaluation)
@@ -515,7 +515,9 @@ class TrainedReader:
 
     def __init__(self, table: Table, context: ShadingStudyContext):
         self.table = table
-        self.read = reader(CompressedTexture.of(table, context.types.TensorXf), context.effects, context.decoder)
+        self.read = reader(
+            CompressedTexture.from_table(table, context.types.TensorXf), context.effects, context.decoder
+        )
 
     def __call__(self, *lanes):
         return self.read(*lanes)

@@ -31,10 +31,10 @@ def long_training(steps: int) -> list[dict]:
     """Ten equal parts of a training: milliseconds a step, of one core, memory, and whether all entries are finite."""
     types, recipe = array_module(), PRESETS["ours"]
     source = load_source(SCENES / "assets" / "rust.json")
-    pyramid = Pyramid.of(source, textures.layout_of(source, TEXTURES["ours"]), types)
+    pyramid = Pyramid.from_source(source, textures.source_layout(source, TEXTURES["ours"]), types)
     table = TASK.load(SCENES / "assets" / "rust_plain.npz")
     settings = dataclasses.replace(recipe, steps=steps, batch=2**14)
-    problem = training.ShadingProblem(training.start_of(table, pyramid), pyramid, recipe, source.digest)
+    problem = training.ShadingProblem(training.trainable_arrays(table, pyramid), pyramid, recipe, source.digest)
     problem.settings = settings
     trainer, found = loop._Trainer(problem, settings), []
     compat.use_threads(1)

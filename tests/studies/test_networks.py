@@ -142,7 +142,7 @@ def ramps(width=64, height=64):
 def filtered_problem(nbytes, mi):
 
     source, types = ramps(), array_module(mi.variant())
-    pyramid = Pyramid.of(source, types=types, border=("repeat", "repeat"))
+    pyramid = Pyramid.from_source(source, types=types, border=("repeat", "repeat"))
     net = networks.texture_network(source, pyramid.layout, nbytes)
     return networks.TextureNetworkProblem(net, pyramid, source.digest)
 

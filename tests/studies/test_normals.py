@@ -11,7 +11,7 @@ from mi_diffind.maps.source import from_arrays
 from mi_diffind.studies.baselines import normals
 from mi_diffind.tasks.disney.model import Material
 from mi_diffind.tasks.shading.evaluation import reader
-from mi_diffind.tasks.shading.material import effects_of, surface_of
+from mi_diffind.tasks.shading.material import material_effects, surface_of
 
 SIDE = 32
 WI, WO = np.array([0.3, 0.1, 0.95]), np.array([-0.2, 0.35, 0.9])
@@ -41,8 +41,8 @@ def material(slopes, roughness=0.4, metallic=None, seed=5):
 
 
 def prepared(source, types):
-    pyramid = Pyramid.of(source, types=types, border=("repeat", "repeat"))
-    return pyramid, effects_of(pyramid.layout)[0]
+    pyramid = Pyramid.from_source(source, types=types, border=("repeat", "repeat"))
+    return pyramid, material_effects(pyramid.layout)[0]
 
 
 def lanes(types, u, v, level, wi=WI, wo=WO):
@@ -189,15 +189,15 @@ def test_another_roughness_is_stored(types, rng):
     noisy = from_arrays({"roughness": rng.random((8, 8)).astype(np.float32),
                          "albedo": rng.random((8, 8, 3)).astype(np.float32)})  # fmt: skip
     for source in (material(rng.normal(0, 0.2, (8, 8, 2))), noisy):
-        pyramid = Pyramid.of(source, types=types, border=("repeat", "repeat"))
+        pyramid = Pyramid.from_source(source, types=types, border=("repeat", "repeat"))
         levels = [np.full(level.shape[:2], 0.2 + 0.1 * i) for i, level in enumerate(pyramid.values)]
         changed = normals.with_roughness(pyramid, levels)
         place = lanes(types, rng.random(20), rng.random(20), 2)[:3]
         before, after = (surface_of(p, p.filtered(*place)) for p in (pyramid, changed))
         np.testing.assert_allclose(after.roughness.numpy(), 0.4, atol=1e-5)
         np.testing.assert_allclose(numpy_of(after.albedo), numpy_of(before.albedo), atol=1e-5)
-        read = normals.roughness_reader(pyramid, effects_of(pyramid.layout)[0], levels)
-        also = reader(changed, effects_of(changed.layout)[0])
+        read = normals.roughness_reader(pyramid, material_effects(pyramid.layout)[0], levels)
+        also = reader(changed, material_effects(changed.layout)[0])
         place = lanes(types, rng.random(20), rng.random(20), 3 * rng.random(20))
         np.testing.assert_allclose(numpy_of(read(*place)), numpy_of(also(*place)), atol=1e-4)
 
@@ -234,7 +234,7 @@ def test_a_bias_that_is_known_is_found(types, rng):
 def test_moments_of_what_is_interpolated(types, rng, border):
     """Against many samples of the normals that the unfiltered read of a pyramid finds."""
     source = material(rng.normal(0, 0.3, (8, 8, 2)))
-    pyramid = Pyramid.of(source, types=types, border=(border, border))
+    pyramid = Pyramid.from_source(source, types=types, border=(border, border))
     n, r = normals.unit_normals(source), normals.roughness(source)
     found = normals.interpolated(normals.slope_moments, n, r, (border, border), True)
     fine = 16

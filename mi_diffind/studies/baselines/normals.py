@@ -27,7 +27,7 @@ import numpy as np
 from ...arrays.indirection import aligned_copy
 from ...arrays.lookup import clamp
 from ...maps.layout import FROM_NORMAL, Layout, MapLayout
-from ...maps.pyramid import Pyramid, halved, level_sizes
+from ...maps.pyramid import Pyramid, halve, level_sizes
 from ...maps.source import Source
 from ...tasks.disney.decoder import Decoder, ggx_coefficients
 from ...tasks.disney.model import ALPHA_MIN, PARAMETERS, Effects, Material, sanitize
@@ -129,7 +129,7 @@ def means(base: np.ndarray) -> list[np.ndarray]:
     """Return all levels of a level 0, ``(height, width, k)``: each texel is the mean of the texels that it covers."""
     levels = [base]
     for _ in level_sizes(*base.shape[:2])[1:]:
-        levels.append(halved(levels[-1]))
+        levels.append(halve(levels[-1]))
     return levels
 
 

@@ -336,7 +336,7 @@ class PrincipalComponents:
     high: np.ndarray
 
     @staticmethod
-    def of(values: np.ndarray, dims: int) -> PrincipalComponents:
+    def from_values(values: np.ndarray, dims: int) -> PrincipalComponents:
         """Return the first ``dims`` components of level 0, ``(height, width, k)``, at most ``k``."""
         k = values.shape[-1]
         mean = values.reshape(-1, k).mean(axis=0, dtype=np.float64)
@@ -364,7 +364,7 @@ class PrincipalComponents:
         return np.clip(channels, 1e-3, 1 - 1e-3).astype(np.float32)
 
 
-def enlarged(values: np.ndarray, rows: int, columns: int, border: Sequence[str]) -> np.ndarray:
+def enlarge(values: np.ndarray, rows: int, columns: int, border: Sequence[str]) -> np.ndarray:
     """Return a level, ``(height, width, k)``, read bilinearly at the texel centres of ``rows`` × ``columns``."""
     for axis, (n, along) in enumerate(zip((rows, columns), border, strict=True)):
         places = (np.arange(n) + 0.5) / n
@@ -381,7 +381,7 @@ def from_components(values: Sequence[np.ndarray], size: TextureBudget, border: t
 
     Each fine array holds the difference between the pointers of its level and the sum of the coarser arrays.
     """
-    basis = PrincipalComponents.of(values[0], size.dims)
+    basis = PrincipalComponents.from_values(values[0], size.dims)
     # A texture has at most as many components as channels: further coordinates start as ramps along u or v
     pointers = [
         np.concatenate([basis.pointers(level), _ramps(*level.shape[:2], size.dims - basis.dims)], axis=-1)
@@ -394,7 +394,7 @@ def from_components(values: Sequence[np.ndarray], size: TextureBudget, border: t
         rows, columns = values[spec.level].shape[:2]
         while level > spec.level:
             level -= 1
-            reached = enlarged(reached, *values[level].shape[:2], border)
+            reached = enlarge(reached, *values[level].shape[:2], border)
         until = (size.fine[i + 1].level if i + 1 < len(size.fine) else size.skip) - 1
         if size.base and i + 1 == len(size.fine):
             reached = np.clip(pointers[level], 1e-3, 1 - 1e-3)
