@@ -191,22 +191,6 @@ def lanes(ad, rng, n, level):
     return u, v, dr.full(ad.Float, level, n), *directions(ad, rng, n)
 
 
-def test_references_agree_where_nothing_varies(ad, rng):
-    maps = bumpy(8, metallic=0.0)
-    flat = {name: np.repeat(np.repeat(v[:1, :1], 8, 0), 8, 1) for name, v in maps.items()}
-    flat["roughness"][0, 0] += 1  # one texel differs: something has to be stored
-    _, pyramid = pyramid_of(flat, ad)
-    effects, _ = material.material_effects(pyramid.layout)
-    at = lanes(ad, rng, 64, 0.0)
-    at = (ad.Float(0.6), ad.Float(0.6), *at[2:])
-    at = tuple(x + dr.zeros(ad.Float, 64) if i < 2 else x for i, x in enumerate(at))
-    expected = numpy_of(reader(pyramid, effects)(*at))
-    for kind in ("converged", "prefiltered", "jittered"):
-        got = numpy_of(reference(kind, pyramid, *at, effects, dr.rng(seed=1)))
-        assert np.allclose(got, expected, rtol=1e-4, atol=1e-5)
-    assert expected.max() > 0
-
-
 def test_converged_reference_is_the_mean_of_shaded_texels(ad, rng):
     """Against NumPy: bilinear reads, and the formulas shaded texel by texel."""
     size, n, level = 16, 6, 2.0
