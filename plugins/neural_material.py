@@ -12,7 +12,7 @@ from mi_diffind.maps.layout import Layout, MapLayout
 from mi_diffind.tasks.disney import TASK as DISNEY
 from mi_diffind.tasks.disney.decoder import Lobe
 from mi_diffind.tasks.disney.model import PARAMETERS, clamp
-from mi_diffind.tasks.shading.material import frame, lobe_of, shadowing
+from mi_diffind.tasks.shading.material import frame, shadowing, specular_lobe
 from mi_diffind.tasks.texture import TASK
 
 from . import Counterpart, Plugin
@@ -133,7 +133,7 @@ class MaterialMaps(FilteredTexture):
             ddx, ddy = self._footprint(si)
             taps = self.filter.taps
             level = isotropic(ddx, ddy) if self.filter.name == "trilinear" else anisotropic(ddx, ddy, taps)[0]
-        return lobe_of(self.image.extra(*self._wrapped_at(uv, self.image.biased(level)), level))
+        return specular_lobe(self.image.extra(*self._wrapped_at(uv, self.image.biased(level)), level))
 
     def is_constant(self, parameter: str) -> bool:
         """Return whether the map of a parameter is one colour or number."""

@@ -239,7 +239,7 @@ class TextureContenders:
     @cached_property
     def pyramid(self) -> Pyramid:
         """The uncompressed levels, repeated as bitmaps are."""
-        return Pyramid.of(self.source, types=array_module(mi.variant()), border=("repeat", "repeat"))
+        return Pyramid.from_source(self.source, types=array_module(mi.variant()), border=("repeat", "repeat"))
 
     @cached_property
     def truth_levels(self) -> dict[str, list[np.ndarray]]:

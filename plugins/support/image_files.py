@@ -153,7 +153,7 @@ def open_uncompressed(props: mi.Properties, wrap_mode: str) -> tuple[SharedMaps,
         if raw:
             maps = tuple(dataclasses.replace(m, color_space="linear") for m in source.maps)
             source = dataclasses.replace(source, maps=maps)
-        return SharedMaps(Pyramid.of(source, types=types, border=border), {})
+        return SharedMaps(Pyramid.from_source(source, types=types, border=border), {})
 
     try:
         if not path:

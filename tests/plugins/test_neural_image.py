@@ -100,7 +100,7 @@ def plugin(file, channels="albedo", **more):
 
 @functools.lru_cache
 def decoded(dtype, file, stamp):
-    return CompressedImage.of(TASK.load(file), dtype).decode()
+    return CompressedImage.from_table(TASK.load(file), dtype).decode()
 
 
 def counterpart(mi, file, channels="albedo", **more):
@@ -380,7 +380,7 @@ def material(tmp_path_factory):
     mi.Bitmap(orm).write(str(folder / "orm.png"))
     maps = {"albedo": "albedo.png", "roughness": {"file": "orm.png", "channels": "g"}}
     (folder / "wall.json").write_text(json.dumps(maps))
-    layout = Layout.of(load_source(folder / "wall.json"))
+    layout = Layout.from_source(load_source(folder / "wall.json"))
     tabulated(folder / "wall.npz", layout, stored, source_path="wall.json")
     textures = texture_xml("base_color", "wall.npz", channels="albedo") + texture_xml(
         "roughness", "wall.npz", channels="roughness", wrap_mode="mirror"

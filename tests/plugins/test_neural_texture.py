@@ -164,7 +164,7 @@ def test_no_arrays(mi_rgb, tmp_path):
     """A texture of one colour is a few numbers, and has no footprint."""
     mi = mi_rgb
     source = from_arrays({"albedo": np.full((4, 8, 3), 128, np.uint8)})
-    layout = Layout.of(source, filtered=True)
+    layout = Layout.from_source(source, filtered=True)
     save_table(tmp_path / "a.npz", to_table(CompressedTexture(layout, None), {}))
     for name in FILTERS:
         texture = mi.load_dict(plugin(str(tmp_path / "a.npz"), name))
