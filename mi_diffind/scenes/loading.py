@@ -38,6 +38,13 @@ class SceneError(DiffindError, RuntimeError):
     """A scene cannot be loaded or rendered; the message is one sentence that names the file and the fault."""
 
 
+def check_counterpart(name: str) -> None:
+    """Raise :class:`SceneError` if no plugin has the counterpart ``name``."""
+    if not plugins.with_counterpart(name):
+        others = dict.fromkeys(c.name for plugin in plugins.declared().values() for c in plugin.others)
+        raise SceneError(f'against: found "{name}", allowed are exact, {", ".join(others)}')
+
+
 def check_renderable(scene, path: str | os.PathLike = "scene", needs: tuple[str, ...] = NEEDS) -> None:
     """Raise :class:`SceneError` if a loaded scene lacks what it ``needs`` to be rendered."""
     for name in needs:
