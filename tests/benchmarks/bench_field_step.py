@@ -49,7 +49,7 @@ def child(arguments) -> dict:
     begin = files.grid_of(files.load(arguments.grid), types)
     with loop.cores(True), compat.room_for_sums(loop.LARGEST_SUMS):
         problem = grid.GridProblem(begin, views, 1)
-        settings = dataclasses.replace(PRESETS["grid"].settings, batch=arguments.rays, steps=100000)
+        settings = dataclasses.replace(PRESETS["grid"], batch=arguments.rays, steps=100000)
         problem.settings = settings
         trainer = loop._Trainer(problem, settings)
 
