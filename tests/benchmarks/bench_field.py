@@ -44,7 +44,7 @@ def main() -> None:
         start, steps = time.process_time(), change.get("steps", arguments.steps)
         paper, bits = change.get("paper", False), change.get("bits", compression.DEFAULT_BITS)
         preset = "paper" if paper else "sparse"
-        settings = dataclasses.replace(PRESETS[preset].settings, steps=max(1, steps), measure_every=max(1, steps))
+        settings = dataclasses.replace(PRESETS[preset], steps=max(1, steps), measure_every=max(1, steps))
         options = {a.name: a.default for a in tasks()["field"].arguments}
         request = FitRequest(preset, settings, types, options=options, progress=False)
         field_fit = fit.FieldFit(request, session)
