@@ -210,7 +210,7 @@ class ParsedScene:
     def learned_plugins(
         self, against: str | tuple[str, ...] = "exact", change: Callable[[object], object] | None = None
     ) -> list[dict]:
-        """Return the descriptions (:meth:`.plugins.Plugin.described`) of the learned plugins, in the file's order.
+        """Return the descriptions (:meth:`.plugins.Plugin.describe`) of the learned plugins, in the file's order.
 
         With ``against``, of all plugins that have the counterpart of this name, or of one of these names; after a
         ``change`` of the scene as of :meth:`load`.
@@ -219,7 +219,7 @@ class ParsedScene:
             state = self._copy()
             if change is not None:
                 change(state)
-            return [plugin.described(props) for props, plugin in _replaceable(state, against)]
+            return [plugin.describe(props) for props, plugin in _replaceable(state, against)]
 
     def tables(self, learned: list[dict]) -> dict[tuple[str, str], object]:
         """Return the distinct tables of learned plugins: ``(file, storage)`` → :class:`.Table`.
