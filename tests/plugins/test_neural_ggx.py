@@ -90,7 +90,7 @@ def roughness_of(material):
 
 
 def normals(form):
-    """What the tables of a form say, read by NumPy and SciPy."""
+    """Distribution of normals of a form, read in its tables by NumPy and SciPy."""
     table = shipped(FORMS[form].get("preset", "tables"))
     encoding = table_encoding(table)
     return ggx_formulas.learned(table.to(FORMS[form].get("storage", table.storage)), encoding.inputs, encoding.output)
@@ -226,7 +226,7 @@ def test_energy(mi_rgb, rng, form):
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_gradients_with_respect_to_directions(mi_rgb, rng, preset):
-    """As a moving light or shape asks for them: against differences along great circles, and finite at the extremes."""
+    """Derivatives by directions are differences along great circles, and finite at the extremes."""
     mi, n, alpha, step = mi_rgb, 10_000, 0.2371, 1e-6
     bsdf = mi.load_dict({**FORMS[preset], "alpha": alpha, "eta": 0.6, "k": 2.3})
 

@@ -149,7 +149,7 @@ def test_manual_pages_are_complete(mi_rgb):
 
 
 def test_program_of_mitsuba_loads_no_plugins(mi_rgb, tmp_path):
-    """As manual pages and the README have it; they change when this fails."""
+    """Mitsuba's program loads no Python plugins; manual pages and the README change when this fails."""
     (tmp_path / "scene.xml").write_text('<scene version="3.0.0"><bsdf type="neural_disney"/></scene>')
     program = Path(mi_rgb.__file__).parent / ("mitsuba.exe" if sys.platform == "win32" else "mitsuba")
     command = [str(program), "-m", "scalar_rgb", str(tmp_path / "scene.xml")]
@@ -258,7 +258,7 @@ def test_two_plugins_of_one_name(mi_rgb, monkeypatch):
 
 
 def test_choices_are_the_words_that_plugins_allow(mi_rgb):
-    """As they list them themselves when they refuse another one."""
+    """Declared words of a parameter are those that its plugin lists when it refuses another one."""
     choices = [
         (name, key, words) for name, plugin in plugins.declared().items() for key, words in plugin.choices.items()
     ]
