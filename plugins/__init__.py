@@ -19,7 +19,7 @@ from mi_diffind.core import compat, discovery
 IGNORED = ("support", "mitsuba_entry")
 
 #: Type of a plugin → the class in ``mitsuba`` whose instances its factory returns.
-OBJECT_TYPES = {"bsdf": "BSDF", "texture": "Texture", "shape": "Shape", "volume": "Volume", "integrator": "Integrator"}
+OBJECT_TYPES = {"bsdf": "BSDF", "texture": "Texture", "shape": "Shape", "integrator": "Integrator"}
 
 
 @dataclass(frozen=True)
@@ -183,12 +183,8 @@ def register(variant: str) -> None:
     _declared[variant] = declarations = {}
     for plugin in _load():
         declarations[plugin.name] = plugin
-        if supported(variant):
-            factory = _checking_factory(plugin)
-        elif plugin.object_type != "volume":  # in scalar variants, Mitsuba needs the type of every object it loads
-            factory = _refusing_factory(plugin.name, variant)
-        else:
-            continue
+        # In scalar variants, Mitsuba needs the type of every object that it loads
+        factory = _checking_factory(plugin) if supported(variant) else _refusing_factory(plugin.name, variant)
         compat.register(plugin.object_type, plugin.name, factory)
 
 

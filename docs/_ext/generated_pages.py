@@ -31,7 +31,6 @@ HEADINGS = {
     "bsdf": "BSDFs",
     "texture": "Textures",
     "shape": "Shapes",
-    "volume": "Volumes",
     "integrator": "Integrators",
 }
 

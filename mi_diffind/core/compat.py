@@ -505,15 +505,8 @@ def object_type(name: str):
 
 
 def register(object_type: str, name: str, factory) -> None:
-    """Register a plugin with the variant that is set.
-
-    Mitsuba has no ``register_volume``; in a scene, volumes are looked up among textures, or among fields (#1885).
-    """
-    if object_type in ("texture", "volume"):
-        function = getattr(mi, "register_texture", None) or mi.register_field
-    else:
-        function = getattr(mi, f"register_{object_type}")
-    function(name, factory)
+    """Register a plugin with the variant that is set. A later Mitsuba may register textures as fields (#1885)."""
+    (getattr(mi, f"register_{object_type}", None) or mi.register_field)(name, factory)
 
 
 def mesh_arguments(props, vertices: int, faces: int) -> tuple:
