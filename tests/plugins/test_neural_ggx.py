@@ -271,7 +271,7 @@ def test_what_is_left_out_changes_nothing(mi_rgb, rng):
         m = {name: bitmap(mi, np.full((2, 2), v)) if name in unknown else v for name, v in used.items()}
         bsdf = mi.load_dict({**FORMS["tables"], **m})
         if unknown:
-            bsdf._tracked_ior[0].bounds = bsdf._tracked_factor.bounds = ValueBounds
+            bsdf._tracked["eta"].bounds = bsdf._tracked["specular_reflectance"].bounds = ValueBounds
         left_out = bsdf.report()["effects_left_out"]
         assert (left_out == {"fresnel": "eta is 0 and k is 1", "specular_reflectance": "is 1"}) == (not unknown)
         bs, weight = bsdf.sample(mi.BSDFContext(), si, *u)
