@@ -426,7 +426,7 @@ class FilteredTexture(MapTexture):
         return f'the texture "{self.id()}" ({described})'
 
     def _values(self, si):
-        if self.filter.name == "off" or not self.is_spatially_varying():
+        if not self.filtered():
             return super()._values(si)
         uv, (ddx, ddy) = self._uv(si), self._footprint(si)
         uv = uv + dr.detach(footprint.to_centre(self.cone, si, ddx, ddy)) / mi.Vector2f(*self._size)
@@ -521,7 +521,7 @@ class FilteredTexture(MapTexture):
         description = super().report()
         left_out = description["effects_left_out"]
         sources = []
-        if self.filter.name == "off" or not self.is_spatially_varying():
+        if not self.filtered():
             left_out["footprint"] = "the filter is off" if self.filter.name == "off" else "the map is constant"
         else:
             sources = [*(["interaction"] if compat.has_footprints() else []), "uv partials"]
