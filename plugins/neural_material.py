@@ -19,7 +19,7 @@ from . import Counterpart, Plugin
 from .disney import Disney, Parameters, ShadedPoint, to_principled
 from .support import properties, textures
 from .support.bsdfs import TrackedParameter
-from .support.image_files import SharedMaps, layout_of, open_compressed, remove, to_bitmap, to_mipmap
+from .support.image_files import SharedMaps, file_layout, open_compressed, remove, to_bitmap, to_mipmap
 from .support.manual import shared_parts
 from .support.map_textures import FilteredTexture
 from .support.textures import FILTERS, anisotropic, isotropic
@@ -250,9 +250,7 @@ class NeuralMaterial(Disney):
         if lobes != "exact":
             self.decoder = DISNEY.open(mi.TensorXf, preset=lobes, storage="uint8").decoder
         self.lobes = lobes
-        self.two_sided = props.get("two_sided", False)
-        if not isinstance(self.two_sided, bool):
-            raise RuntimeError(f'parameter "two_sided": found {self.two_sided}, allowed are true and false')
+        self.two_sided = properties.flag(props, "two_sided")
         self.maps = MaterialMaps(props)
         for name in ("base_color", *self.scalars, "subsurface", "specular", "eta"):
             if name in props and isinstance(props[name], mi.Texture) and not compat.is_constant_texture(props[name]):
@@ -412,7 +410,7 @@ class MapPoint(ShadedPoint):
 
 def _convert(props: mi.Properties, bsdf: str, texture: str) -> str:
     """Change properties to those of Mitsuba's plugins, nested, and return the name of the outermost one."""
-    maps, _ = material_maps(layout_of(TASK, props), ignored(props))
+    maps, _ = material_maps(file_layout(TASK, props), ignored(props))
     sides = props.get("two_sided", False)
 
     def shown(name: str) -> mi.Texture:

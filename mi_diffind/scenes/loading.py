@@ -196,12 +196,12 @@ class ParsedScene:
             return mi.PluginManager.instance().create_object(props)
 
     def learned_plugins(self, against: str | tuple[str, ...] = "exact") -> list[dict]:
-        """Return the descriptions (:meth:`.plugins.Plugin.described`) of the learned plugins, in the file's order.
+        """Return the descriptions (:meth:`.plugins.Plugin.describe`) of the learned plugins, in the file's order.
 
         With ``against``, of all plugins that have the counterpart of this name, or of one of these names.
         """
         with self._errors():
-            return [plugin.described(props) for props, plugin in _replaceable(self._copy(), against)]
+            return [plugin.describe(props) for props, plugin in _replaceable(self._copy(), against)]
 
     def tables(self, learned: list[dict]) -> dict[tuple[str, str], object]:
         """Return the distinct tables of learned plugins: ``(file, storage)`` → :class:`.Table`.
