@@ -17,7 +17,7 @@ from .path_footprint import integrator as path_footprint
 from .support import omissions, properties, tables
 from .support.footprint import Differentials
 from .support.manual import shared_parts
-from .support.placed_fields import FieldLight, PlacedField, VariantLight, grouped, in_order, to_grid
+from .support.placed_fields import FieldLight, PlacedField, VariantLight, in_order, join_overlapping, to_grid
 
 #: Properties that the default integrator of surfaces takes.
 INNER = ("max_depth", "rr_depth", "hide_emitters", "jitter")
@@ -265,7 +265,7 @@ def integrator() -> type:
                     'parameter "surroundings": true for a field among nested ones, allowed is false, since '
                     "surroundings fill all space"
                 )
-            self.groups = grouped(self.fields)
+            self.groups = join_overlapping(self.fields)
             if self.lit and type(self.surfaces) is not path_footprint():
                 raise RuntimeError(
                     f'parameter "lit": the nested integrator {compat.integrator_name(self.surfaces)} does not see '
@@ -425,7 +425,7 @@ def integrator() -> type:
                 *_, state = self.primal(scene, sampler.clone(), ray)
                 for placed in self.groups:
                     placed.start_forward()
-                return developed(*self.replayed(dr.ADMode.Forward, scene, sampler, ray, state, surfaces))
+                return developed(*self.differentiate(dr.ADMode.Forward, scene, sampler, ray, state, surfaces))
 
         def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
             with dr.suspend_grad():
@@ -445,7 +445,7 @@ def integrator() -> type:
                 film.clear()
                 *_, state = self.primal(scene, sampler.clone(), ray)
                 with dr.isolate_grad():  # derivatives come in parts to what a placement is attached to
-                    self.replayed(dr.ADMode.Backward, scene, sampler, ray, state, surfaces, adjoint)
+                    self.differentiate(dr.ADMode.Backward, scene, sampler, ray, state, surfaces, adjoint)
                 dr.eval()
 
         def _surfaces_optimised(self, scene) -> bool:
@@ -488,7 +488,7 @@ def integrator() -> type:
             state = light, clear, path.depth, path.opacity, state
             return light, 1 - clear, [aovs[name] for name in self.aovs], state
 
-        def replayed(self, mode, scene, sampler, ray, state, surfaces, adjoint=None) -> tuple:
+        def differentiate(self, mode, scene, sampler, ray, state, surfaces, adjoint=None) -> tuple:
             """Run a differential phase.
 
             ``Forward`` returns the derivatives of light, alpha and channels. ``Backward`` propagates the derivatives
@@ -649,7 +649,7 @@ def integrator() -> type:
         def _see(self, mode, path, placed, ray, far, crossed, first, before):
             """Add the light of a field behind a transmittance ``before``; return the transmittance behind the field."""
             marched, through = placed.march(ray, far, crossed)
-            light = dr.select(crossed, path.β * self.light.of(marched.colour, ray.wavelengths, crossed), 0)
+            light = dr.select(crossed, path.β * self.light.convert(marched.colour, ray.wavelengths, crossed), 0)
             depth = dr.select(first, before * marched.depth * placed.size, 0)
             if mode is None:
                 path.L, path.depth = path.L + light, path.depth + depth

@@ -153,7 +153,7 @@ class VariantLight:
     def __init__(self):
         self.illuminant = mi.load_dict({"type": "d65"}, parallel=False) if mi.is_spectral else None
 
-    def of(self, colour, wavelengths, active=True):
+    def convert(self, colour, wavelengths, active=True):
         """Return the light of RGB ``colour`` (three floats)."""
         if mi.is_monochromatic:
             return mi.Spectrum(sum(w * c for w, c in zip(LUMINANCE, colour, strict=True)))
@@ -166,24 +166,24 @@ class VariantLight:
         return mi.Spectrum(spectrum * scale * self.illuminant.eval(at, active))
 
     def adjoint(self, colour, wavelengths, weight, active=True):
-        """Return the derivative of ``dot(weight, of(colour))`` with respect to ``colour``: three floats."""
+        """Return the derivative of ``dot(weight, convert(colour))`` with respect to ``colour``: three floats."""
         if mi.is_monochromatic:
             return mi.Array3f(*(w * weight.x for w in LUMINANCE))
         if not mi.is_spectral:
             return mi.Array3f(*weight)
         with dr.resume_grad():
             free = _attached(colour)
-            dr.backward_from(dr.dot(weight, self.of(free, wavelengths, active)))
+            dr.backward_from(dr.dot(weight, self.convert(free, wavelengths, active)))
             return dr.select(active & _coloured(colour), dr.grad(free), 0)
 
     def tangent(self, colour, change, wavelengths, active=True):
         """Return the derivative of the light of ``colour`` along ``change``."""
         if not mi.is_spectral:
-            return self.of(change, wavelengths, active)
+            return self.convert(change, wavelengths, active)
         with dr.resume_grad():
             free = _attached(colour)
             dr.set_grad(free, mi.Array3f(change))
-            return dr.select(active & _coloured(colour), dr.forward_to(self.of(free, wavelengths, active)), 0)
+            return dr.select(active & _coloured(colour), dr.forward_to(self.convert(free, wavelengths, active)), 0)
 
 
 def _attached(colour):
@@ -292,7 +292,7 @@ def _local(placed: PlacedField, p, d) -> tuple:
     return mi.Point3f(axes.to_local(mi.Vector3f(*p) - mi.Vector3f(origin)) / size), axes.to_local(mi.Vector3f(*d))
 
 
-def grouped(fields: list) -> list:
+def join_overlapping(fields: list) -> list:
     """Return placed fields without common volumes; those of ``fields`` whose boxes overlap are joined."""
     groups = [([placed], placed) for placed in fields]
     while True:
@@ -341,7 +341,7 @@ class FieldLight:
         light, through = mi.Spectrum(0), mi.Float(1)
         for placed, crossed in in_order(self.fields, [f.enters(ray, far, active) for f in self.fields]):
             marched, passed = placed.march(ray, far, crossed)
-            seen = self.light.of(marched.colour, ray.wavelengths, crossed)
+            seen = self.light.convert(marched.colour, ray.wavelengths, crossed)
             light += dr.select(crossed, through * seen, 0)
             through *= passed
         return light, through
@@ -360,7 +360,7 @@ class FieldLight:
         for placed, crossed in in_order(self.fields, [f.enters(ray, far, active) for f in self.fields]):
             marched, through = placed.march(ray, far, crossed)
             share = mi.Spectrum(factor) * before
-            beyond -= dr.select(crossed, share * self.light.of(marched.colour, ray.wavelengths, crossed), 0)
+            beyond -= dr.select(crossed, share * self.light.convert(marched.colour, ray.wavelengths, crossed), 0)
             if placed.optimised():
                 inverse = dr.select(through > 0, dr.rcp(through), 0)
                 if mode == dr.ADMode.Backward:
