@@ -8,7 +8,6 @@ from functools import cache
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind.arrays.tables import TableError
 from mi_diffind.core import compat
 
 from . import Counterpart, Plugin, warn
@@ -659,16 +658,13 @@ def integrator() -> type:
 
 
 def open_model(props: mi.Properties):
-    """Return the model that the properties ``filename`` and ``storage`` name. Raises ``RuntimeError``."""
+    """Return the model that the properties ``filename`` and ``storage`` name."""
     path, storage = properties.filename(props), properties.one_of(props, "storage", ("uint8", "float32"))
     if not path:
         raise RuntimeError('parameter "filename": not given, a file of "mi-diffind fit field" is needed')
     from mi_diffind.tasks.radiance import TASK
 
-    try:
-        return TASK.open(mi.TensorXf, path, storage=storage if storage == "float32" else "")
-    except (TableError, ValueError) as e:
-        raise RuntimeError(str(e)) from None
+    return TASK.open(mi.TensorXf, path, storage=storage if storage == "float32" else "")
 
 
 PLUGIN = Plugin(
