@@ -13,7 +13,6 @@ fitted.
 
 import functools
 import json
-import tempfile
 from pathlib import Path
 
 import drjit as dr
@@ -23,7 +22,8 @@ from frame import VARIANT, by_turns, parser, spread, write
 
 import mi_diffind  # noqa: F401
 from mi_diffind.measure.clock import machine, timed
-from mi_diffind.tasks.sdf import TASK, grids, marching
+from mi_diffind.studies.sdf import MeshView
+from mi_diffind.tasks.sdf import TASK, marching
 from mi_diffind.tasks.sdf.mesh import load_mesh
 
 SIDE = 512
@@ -54,34 +54,14 @@ def rays(ray_set: str):
     return result
 
 
-def scene_of_mesh(mesh):
-    """A scene of the mesh alone, in the unit frame."""
-    import trimesh
-
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "mesh.ply"
-        trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file)
-        return mi.load_dict({"type": "scene", "shape": {"type": "ply", "filename": str(file)}})
-
-
-def scene_of_grid(field, resolution: int):
-    """A scene of Mitsuba's ``sdfgrid`` with so many cells along the longest side."""
-    from mi_diffind.plugins.support.distance_shapes import crop_grid
-
-    values, lower, upper = grids.grid(field, resolution)
-    values, lower, upper = crop_grid(values, lower, (upper[0] - lower[0]) / (values.shape[2] - 1))
-    box = mi.ScalarTransform4f().translate(lower.tolist()).scale((upper - lower).tolist())
-    grid = mi.TensorXf(np.ascontiguousarray(values[..., None], np.float32))
-    return mi.load_dict({"type": "scene", "shape": {"type": "sdfgrid", "grid": grid, "to_world": box}})
-
-
 def measured(file: Path, resolution: int, rounds: int) -> dict:
     """What the rows of one file are, and how large it is."""
     model = TASK.open(mi.TensorXf, file)
     mesh = load_mesh(file.resolve().parent / model.table.settings["mesh_path"])
-    scenes = {MESH: scene_of_mesh(mesh)}
+    view = MeshView(mesh, (SIDE, SIDE))
+    scenes = {MESH: view.mesh_scene()}
     if resolution:
-        scenes[GRID.format(resolution)] = scene_of_grid(model.field, resolution)
+        scenes[GRID.format(resolution)] = view.grid_scene(model.field, resolution)
 
     def native(scene):
         def run(o, d, coherent):
