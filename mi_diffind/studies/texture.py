@@ -500,7 +500,7 @@ def _case(context: TextureContenders, scene: TextureScene, candidates: list[Cand
         index = np.arange(lanes)
         si = scene.hits(loaded, (index % width + 0.5) / width, (index // width + 0.5) / -(-lanes // width))
         dr.make_opaque(si.uv, si.p, si.dp_du, si.dp_dv, si.wi, si.sh_frame, si.duv_dx, si.duv_dy)
-        cone = footprint.Cone.of(loaded.sensors()[0])
+        cone = footprint.Cone.from_sensor(loaded.sensors()[0])
         functions = {FLOOR: lambda: [si.uv.x, si.uv.y]}
         for c in candidates:
             if c.name == BASE or c.setting in FILTERS:
