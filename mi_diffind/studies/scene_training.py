@@ -31,7 +31,7 @@ from ..core.files import writable_folder
 from ..fitting import task
 from ..images import metrics
 from ..images.srgb import for_display
-from ..maps.compressed import decibel
+from ..maps.pyramid import decibel
 from ..maps.source import load_source
 from ..measure import plot
 from ..measure.report import figure_caption
@@ -40,9 +40,9 @@ from ..measure.study import Measure, Plan, Study
 from ..measure.training import Contender
 from ..scenes import loading
 from ..scenes.training.options import SceneRecipe, ViewDistribution
-from ..scenes.training.problem import exposure_of
+from ..scenes.training.problem import estimate_exposure
 from ..scenes.training.references import ReferenceRenders
-from ..scenes.training.trained_scene import TrainedScene, original_of, texture_file
+from ..scenes.training.trained_scene import TrainedScene, find_source, texture_file
 from ..tasks.texture.compressed import load
 
 #: Names of the runs.
@@ -153,7 +153,7 @@ class SceneTrainingContext:
         self.parsed = loading.ParsedScene(path, self.defines)
         self.file, given = texture_file(self.parsed)
         self.start = load(self.file)
-        self.source = original_of(self.start, self.file, given)
+        self.source = find_source(self.start, self.file, given)
 
     @staticmethod
     def references(folder: Path) -> Path:
@@ -189,7 +189,7 @@ def measured_views(context: SceneTrainingContext, folder: Path) -> tuple:
     distribution = ViewDistribution(1, context.settings.tests, seed=SEED, **context.ranges)
     spp, views = context.settings.reference_spp, distribution.measured()
     images = ReferenceRenders(context.parsed, distribution, spp, folder, without=(context.file,)).images(views)
-    return distribution, views, images, exposure_of(images)
+    return distribution, views, images, estimate_exposure(images)
 
 
 def picture(contexts: Sequence[SceneTrainingContext], runs: Sequence[Contender], result: dict):

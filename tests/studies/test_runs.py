@@ -27,7 +27,7 @@ TRAINED = ["--steps", "2", "--pretrain-steps", "2"]
 RUNS = {
     "bsdf": [],
     "disney": [],
-    "field": ["balls", "--compression", "120", "--resolution", "16", "--steps", "10", "--seconds", "1"],
+    "field": ["balls", "--compression", "120", "--resolution", "16", "--steps", "10"],
     "ggx": [],
     "image": ["m.json", "--seconds", "1"],
     "scene": [str(ROOT / "scenes" / "metals.xml"), "-D", "width=32", "-D", "height=16"],
