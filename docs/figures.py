@@ -91,28 +91,33 @@ def time_over(study: Entries, case: str, query: str, name: str, other: str) -> f
     return times[name].time / times[other].time
 
 
+def reach(curve: Iterable[tuple[float, float]], goal: float) -> float | None:
+    """Return where a curve of pairs (x, dB) reaches a goal, ``None`` if it does not; dB are linear in the logarithm."""
+    for (x0, y0), (x1, y1) in itertools.pairwise(curve):
+        if goal <= y1:
+            share = (goal - y0) / (y1 - y0) if y1 != y0 else 0.0
+            return math.exp(math.log(x0) + share * math.log(x1 / x0))
+    return None
+
+
 def equal_samples(study: Entries, stage: str, name: str, sampling: str = "") -> float:
     """Return how many samples a pixel a bitmap needs for the error of a filtered texture with one.
 
-    ``sampling`` is ``""`` for independent samples, or ``"multijittered"``. Between sample counts, PSNR is linear in the
-    logarithm of the count.
+    ``sampling`` is ``""`` for independent samples, or ``"multijittered"``.
     """
     key, suffix = f"psnr_{stage}_db", f", {sampling}" if sampling else ""
     names = {1: "bitmap, 1 spp", **{2**i: f"bitmap, {2**i} spp{suffix}" for i in range(1, 9)}}
     errors = {count: study.candidates.get(bitmap, {}).get("errors", {}) for count, bitmap in names.items()}
-    curve = {count: e[key] for count, e in errors.items() if key in e}
-    goal = study.candidates[name].errors[key]
-    for low, high in itertools.pairwise(curve):
-        if goal <= curve[high]:
-            share = (goal - curve[low]) / (curve[high] - curve[low])
-            return math.exp(math.log(low) + share * math.log(high / low))
-    raise ValueError(f"{name}: no sample count of the study has this error")
+    count = reach([(count, e[key]) for count, e in errors.items() if key in e], study.candidates[name].errors[key])
+    if count is None:
+        raise ValueError(f"{name}: no sample count of the study has this error")
+    return count
 
 
 def speed(study: Entries, case: str, name: str, against: str) -> str:
     """Return the time of a bitmap with the error of a candidate over the candidate's time; "> " before a lower bound.
 
-    Between sample counts, time is a power of the error. ``against`` is the sampling of the bitmap.
+    ``against`` is the sampling of the bitmap.
     """
     accuracy, times = study.cases[case].accuracy, study.cases[case].passes.render
     curve = sorted(
@@ -120,12 +125,8 @@ def speed(study: Entries, case: str, name: str, against: str) -> str:
         for n, c in study.candidates.items()
         if n in times and accuracy in c.errors and (c.representation == against or n == "bitmap, 1 spp")
     )
-    goal, time = study.candidates[name].errors[accuracy], times[name].time
-    for (t0, a0), (t1, a1) in itertools.pairwise(curve):
-        if goal <= a1:
-            share = (goal - a0) / (a1 - a0) if a1 != a0 else 0.0
-            return f"{math.exp(math.log(t0) + share * math.log(t1 / t0)) / time:.1f}"
-    return f"> {curve[-1][0] / time:.1f}"
+    time = reach(curve, study.candidates[name].errors[accuracy])
+    return f"{time / times[name].time:.1f}" if time else f"> {curve[-1][0] / times[name].time:.1f}"
 
 
 def every(pattern: str) -> list[Entries]:

@@ -124,9 +124,9 @@ def fitted_contender(material: str, preset: str, quick: bool) -> Contender:
         if fitted.result.interrupted:
             return None
         fitted.save(job.file)
-        return measured(job)
+        return measure_file(job)
 
-    def measured(job: Contender) -> dict:
+    def measure_file(job: Contender) -> dict:
         """Return bytes and errors of the file: also the errors of the proxy alone, and the noise of both samplings."""
         model = load_model(job.file, mi.TensorXf)
         truth, errors = truth_of(source, model.types), dict(model.table.measured)

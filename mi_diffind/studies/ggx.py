@@ -144,7 +144,7 @@ class GGXForm:
             net = training.net.cooperative() if storage == COOPERATIVE else training.net.to(storage)
             return LearnedGGX(net, Encoding(self.inputs, self.output), tail=False)
 
-        def counted(query: str) -> Operations:
+        def count_operations(query: str) -> Operations:
             inputs = _inputs(types, 64)
             return count_query(lambda: [reader(COOPERATIVE)(*inputs)]) + training.net.products()
 
@@ -154,7 +154,7 @@ class GGXForm:
                 self.name(suffix), self.representation, storage, self.nbytes * size // 4,
                 errors=lambda samples, storage=storage: measure(reader(storage), types, samples),
                 label=self.label + suffix, job=training.name,
-                operations=counted if storage == COOPERATIVE else None,
+                operations=count_operations if storage == COOPERATIVE else None,
             ), functools.partial(reader, storage)  # fmt: skip
 
 

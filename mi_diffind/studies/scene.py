@@ -218,7 +218,7 @@ class SceneRun:
                 if spp == top:
                     store.keep(str(k), **images)
                 else:
-                    truth = truth or SceneTruth.of_passes(store)
+                    truth = truth or SceneTruth.from_store(store)
                     records = {name: records[name] | truth.errors(images[name]) for name in VERSIONS}
                 done[f"{spp}/{k}"] = records
                 store.save()
@@ -257,7 +257,7 @@ class SceneTruth:
     noise: float
 
     @classmethod
-    def of_passes(cls, store: Store) -> SceneTruth:
+    def from_store(cls, store: Store) -> SceneTruth:
         """Return the truth of the passes in a store."""
         exact = _images(store)["exact"]
         weights = relative_weights(store.arrays[BRIGHTNESS]["exact"])
@@ -290,7 +290,7 @@ def _assemble(store: Store, counts: list[int]) -> dict:
     }
     if len(images["exact"]) < LEAST:
         return result
-    truth, times = SceneTruth.of_passes(store), {name: {} for name in VERSIONS}
+    truth, times = SceneTruth.from_store(store), {name: {} for name in VERSIONS}
     for spp in counts:
         pairs = [dict(pair) for key, pair in done.items() if key.startswith(f"{spp}/")]
         for k, pair in enumerate(pairs if spp == top else ()):
