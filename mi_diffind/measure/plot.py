@@ -150,9 +150,8 @@ def draw_panels(title: str, panels: Sequence[Panel], y_label: str, caption: str)
             for name, (colour, marker) in styles.items()
         ]
         place = {"loc": "upper center", "bbox_to_anchor": (0.5, 1 - 0.24 / plot.get_figheight())}
-        plot.legend(handles=shown, fontsize=8.5, frameon=False, ncols=-(-len(shown) // lines), **place).set_in_layout(
-            False
-        )
+        place["ncols"] = -(-len(shown) // lines)
+        plot.legend(handles=shown, fontsize=8.5, frameon=False, **place).set_in_layout(False)
     accuracies = [x.accuracy for p in panels for x in p.points] or [0, 100]
     margin = max(0.08 * (max(accuracies) - min(accuracies)), 2)
     for k, panel in enumerate(panels):
