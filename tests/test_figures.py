@@ -1,7 +1,6 @@
 """Tables and figures of the pages are those of the JSON files that commands wrote."""
 
 import json
-import math
 import os
 import re
 import shlex
@@ -118,19 +117,6 @@ def test_times_at_equal_error():
         "cases": {"plane": {"accuracy": "e", "passes": {"render": {n: {"time": v[1]} for n, v in values.items()}}}},
     })  # fmt: skip
     assert [figures.speed(study, "plane", n, "bitmap") for n in ("ours", "best")] == ["4.0", "> 4.0"]
-
-
-def test_time_at_equal_error():
-    """An error that halves with each doubling of the time: the bitmap takes as long as the PSNR says."""
-    times = {"bitmap, 1 spp": 2.0, "bitmap, 4 spp": 8.0, "bitmap, 16 spp": 32.0, "ours": 3.0, "best": 4.0}
-    errors = dict(zip(times, (20, 20 + 20 * math.log10(2), 20 + 20 * math.log10(4), 29.0, 40.0), strict=True))
-    study = study_of({
-        "candidates": {name: {"errors": {"psnr_plane_db": psnr}} for name, psnr in errors.items()},
-        "cases": {"plane": {"passes": {"render": {name: {"time": t} for name, t in times.items()}}}},
-    })  # fmt: skip
-    assert figures.time_at_equal_error(study, "plane", "ours") == (pytest.approx(2.0 * 10**0.9 / 3.0), False)
-    assert figures.time_at_equal_error(study, "plane", "best") == (32.0 / 4.0, True)
-    assert figures.time_at_equal_error(study, "plane", "bitmap, 4 spp") == (pytest.approx(1), False)
 
 
 def test_ratios_are_medians_in_either_order():

@@ -70,7 +70,7 @@ class Workers:
 
 
 @functools.lru_cache(maxsize=1)
-def _plan_of(plan: bytes) -> Plan:
+def _load_plan(plan: bytes) -> Plan:
     return pickle.loads(plan)()
 
 
@@ -78,7 +78,7 @@ def run_separately(job: tuple[bytes, str, str, str]) -> dict | None:
     """Run a job in this process; ``job``: its pickled plan, its name, the folder of models, and the variant."""
     plan, name, folder, variant = job
     use_variant(variant)
-    chosen = next(j for j in _plan_of(plan).jobs if j.name == name)
+    chosen = next(j for j in _load_plan(plan).jobs if j.name == name)
     return chosen.cached_record(Path(folder), None) or chosen.run(Path(folder), False)
 
 
@@ -224,7 +224,7 @@ class BenchmarkSteps:
         }
         operations = self.store.data["operations"].setdefault(case.name, {})
 
-        def compiled(key) -> None:
+        def compile_kernel(key) -> None:
             query, name = key
             counted, known = operations.setdefault(query, {}), self.operations.get(name)
             if name not in counted:
@@ -234,7 +234,7 @@ class BenchmarkSteps:
         def seconds(key) -> float:
             return timed(lambda: total(functions[key]())[0]).seconds
 
-        self._rounds(case.name, times, list(functions), self.settings.rounds, compiled, seconds)
+        self._rounds(case.name, times, list(functions), self.settings.rounds, compile_kernel, seconds)
 
     def passes(self, case: Case) -> None:
         """Time whole passes in rounds, after a first pass of each candidate that compiles it."""
@@ -249,11 +249,11 @@ class BenchmarkSteps:
         title = f"{case.name}, {PASS}"
         self._rounds(title, times, list(functions), self.settings.passes, lambda key: seconds(key, 0), seconds)
 
-    def _rounds(self, title: str, times: list, keys: list, number: int, compiled, seconds) -> None:
+    def _rounds(self, title: str, times: list, keys: list, number: int, compile_kernel, seconds) -> None:
         """Append the missing rounds to ``times``: query → name → seconds; every other round runs backwards."""
         with self._bar(title, len(keys) * (1 + number - len(times))) as bar:
             for key in keys:
-                compiled(key)
+                compile_kernel(key)
                 self._tick(bar)
             while len(times) < number:
                 this_round: dict[str, dict[str, float]] = {}

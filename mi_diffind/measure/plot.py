@@ -47,32 +47,16 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Line:
-    """Vertical line of a panel: the time of the truth, or of a reference."""
-
-    name: str
-    time: float
-    is_truth: bool
-
-
-@dataclass(frozen=True)
 class Panel:
-    """Panel of a plot: accuracy against time or bytes."""
+    """Panel of a plot: accuracy against time or bytes.
+
+    ``lines`` are vertical: the name, the time, and whether it is that of the truth or of a reference.
+    """
 
     title: str
     x_label: str
     points: Sequence[Point]
-    lines: Sequence[Line]
-
-
-@dataclass(frozen=True)
-class Label:
-    """Text near the point ``at``, in data coordinates."""
-
-    text: str
-    at: tuple[float, float]
-    colour: str
-    weight: str = "normal"
+    lines: Sequence[tuple[str, float, bool]]
 
 
 @dataclass(frozen=True)
@@ -166,29 +150,36 @@ def draw_panels(title: str, panels: Sequence[Panel], y_label: str, caption: str)
         ]
         place = {"loc": "upper center", "bbox_to_anchor": (0.5, 1 - 0.24 / plot.get_figheight())}
         plot.legend(handles=shown, fontsize=8.5, frameon=False, ncols=len(shown), **place).set_in_layout(False)
-    accuracies = [x.accuracy for p in panels for x in p.points]
+    accuracies = [x.accuracy for p in panels for x in p.points] or [0, 100]
+    margin = max(0.08 * (max(accuracies) - min(accuracies)), 2)
     for k, panel in enumerate(panels):
         axes = plot.add_subplot(rows, columns, k + 1)
-        _draw_panel(axes, panel, styles, accuracies)
+        axes.set_ylim(min(accuracies) - 1.2 * margin, max(accuracies) + 2.2 * margin)
+        _draw_panel(axes, panel, styles)
         axes.set_title(panel.title, fontsize=10)
         finish(axes, panel.x_label, y_label)
     plot.draw_without_rendering()
     plot.set_layout_engine("none")  # labels are placed in the final layout
     for axes, panel in zip(plot.axes, panels, strict=True):
-        _label_panel(axes, panel, styles)
+        top = axes.transData.inverted().transform((axes.bbox.x0, axes.bbox.y1 - 9 * axes.figure.dpi / 72))[1]
+        labels = [
+            (f"{name}{' (exact)' * is_truth}", (time, top), {"color": "0.1" if is_truth else "0.4"})
+            for name, time, is_truth in panel.lines
+        ]
+        for p in sorted(panel.points, key=lambda p: (not p.on_front, -p.accuracy, p.time)):
+            style = {"color": styles[p.representation][0], "fontweight": "bold" if p.on_front else "normal"}
+            labels.append((p.name, (p.time, p.accuracy), style))
+        place_labels(axes, labels, [(p.time, p.accuracy) for p in panel.points])
     return plot
 
 
-def _draw_panel(axes, panel: Panel, styles: dict, accuracies: list) -> None:
+def _draw_panel(axes, panel: Panel, styles: dict) -> None:
     """Draw a panel without its labels."""
     axes.set_xscale("log")
-    times = [x.time for x in (*panel.points, *panel.lines)] or [1.0]
+    times = [*(x.time for x in panel.points), *(time for _, time, _ in panel.lines)]
     room = (max(times) / min(times)) ** 0.12 * 1.25  # for labels beside points
     low, high = min(times) / room, max(times) * room
     axes.set_xlim(low, high)
-    bottom, top = (min(accuracies), max(accuracies)) if accuracies else (0, 100)
-    margin = max(0.08 * (top - bottom), 2)
-    axes.set_ylim(bottom - 1.2 * margin, top + 2.2 * margin)
     log_ticks(axes.xaxis, low, high)
     front = sorted((p for p in panel.points if p.on_front), key=lambda p: p.time)
     if front:
@@ -198,9 +189,9 @@ def _draw_panel(axes, panel: Panel, styles: dict, accuracies: list) -> None:
         axes.fill_between(xs, ys, ys[0], step="post", color="0.5", alpha=0.05, linewidth=0, zorder=1)
         axes.annotate("Pareto front", (1, front[-1].accuracy), (-4, -3), xycoords=axes.get_yaxis_transform(),
                       textcoords="offset points", fontsize=7, color="0.35", ha="right", va="top")  # fmt: skip
-    for line in panel.lines:
-        axes.axvline(line.time, color="0.1" if line.is_truth else "0.55", linewidth=1.0,
-                     linestyle=(0, (5, 2)) if line.is_truth else (0, (1, 1.5)), zorder=2)  # fmt: skip
+    for _, time, is_truth in panel.lines:
+        dashes = {"color": "0.1", "linestyle": (0, (5, 2))} if is_truth else {"color": "0.55", "linestyle": ":"}
+        axes.axvline(time, linewidth=1.0, zorder=2, **dashes)
     for p in panel.points:
         colour, marker = styles[p.representation]
         error = [[max(p.time - max(p.q1, 1e-6), 0)], [max(p.q3 - p.time, 0)]]
@@ -209,27 +200,14 @@ def _draw_panel(axes, panel: Panel, styles: dict, accuracies: list) -> None:
                       zorder=3)  # fmt: skip
 
 
-def _label_panel(axes, panel: Panel, styles: dict) -> None:
-    """Label lines at the top, then points, those on the front first."""
-    top = axes.transData.inverted().transform((axes.bbox.x0, axes.bbox.y1 - 9 * axes.figure.dpi / 72))[1]
-    labels = [
-        Label(
-            f"{line.name} (exact)" if line.is_truth else line.name, (line.time, top), "0.1" if line.is_truth else "0.4"
-        )
-        for line in panel.lines
-    ]
-    for p in sorted(panel.points, key=lambda p: (not p.on_front, -p.accuracy, p.time)):
-        weight = "bold" if p.on_front else "normal"
-        labels.append(Label(p.name, (p.time, p.accuracy), styles[p.representation][0], weight))
-    place_labels(axes, labels, [(p.time, p.accuracy) for p in panel.points])
-
-
-def place_labels(axes, labels: Sequence[Label], points: Sequence[tuple[float, float]]) -> None:
+def place_labels(
+    axes, labels: Sequence[tuple[str, tuple[float, float], dict]], points: Sequence[tuple[float, float]]
+) -> None:
     """Write each label near its anchor where it covers no other text and no point, in the given order.
 
-    ``points`` are in data coordinates. A thin line leads from an anchor to a label that is away. The layout must be
-    final. Each label takes the best of a fixed set of places: packages that move labels by forces stop after a time, so
-    their pictures would depend on the speed of the machine.
+    ``labels`` are texts, anchors and styles; anchors and ``points`` are in data coordinates. A thin line leads from an
+    anchor to a label that is away. The layout must be final. Each label takes the best of a fixed set of places:
+    packages that move labels by forces stop after a time, so their pictures would depend on the speed of the machine.
     """
     renderer, scale = axes.figure.canvas.get_renderer(), axes.figure.dpi / 72
     inside, pixels = axes.get_window_extent(renderer).extents[None], axes.transData.transform
@@ -238,23 +216,23 @@ def place_labels(axes, labels: Sequence[Label], points: Sequence[tuple[float, fl
     # Boxes in pixels, as rows of left, bottom, right, top
     taken = [text.get_window_extent(renderer).extents for text in axes.texts]
     taken += [np.tile(pixels(p), 2) + 5 * scale * np.array([-1, -1, 1, 1]) for p in points]
-    for label in labels:
-        note = axes.annotate(label.text, label.at, xytext=(0, 0), textcoords="offset points", fontsize=8, ha="center",
-                             va="center", color=label.colour, fontweight=label.weight, zorder=5,
-                             bbox={"boxstyle": "square,pad=0.1", "fc": "w", "ec": "none", "alpha": 0.8})  # fmt: skip
+    for text, anchor, style in labels:
+        note = axes.annotate(text, anchor, xytext=(0, 0), textcoords="offset points", fontsize=8, ha="center",
+                             va="center", zorder=5, bbox={"boxstyle": "square,pad=0.1", "fc": "w", "ec": "none",
+                                                          "alpha": 0.8}, **style)  # fmt: skip
         extent = note.get_window_extent(renderer)
         size = np.array([extent.width + 3 * scale, extent.height + 1.5 * scale])
         offset = (distance[:, None] * scale + size / 2) * np.column_stack([np.cos(turn), np.sin(turn)])
-        centre = pixels(label.at) + offset
+        centre = pixels(anchor) + offset
         boxes = np.hstack([centre - size / 2, centre + size / 2])
         outside = size.prod() - _overlap(boxes, inside)
         cost = 50 * outside + 30 * _overlap(boxes, np.reshape(taken, (-1, 4))) + distance * scale
         best = np.argmin(cost)
         note.set_position(offset[best] / scale)
         if distance[best] > LEADER_DISTANCE:
-            end = np.clip(pixels(label.at), boxes[best, :2], boxes[best, 2:])
-            ends = axes.transData.inverted().transform([pixels(label.at), end])
-            axes.plot(*ends.T, color=label.colour, linewidth=0.5, zorder=2.5)
+            end = np.clip(pixels(anchor), boxes[best, :2], boxes[best, 2:])
+            ends = axes.transData.inverted().transform([pixels(anchor), end])
+            axes.plot(*ends.T, color=style["color"], linewidth=0.5, zorder=2.5)
         taken.append(boxes[best])
 
 
@@ -271,14 +249,14 @@ def draw_curves(
     title: str, caption: str, panels: Mapping[str, Sequence[Curve]], x_label: str, y_label: str, log: str = "",
     ticks: Sequence[str] = (), columns: int = 2, height: float = 3.6,
 ):  # fmt: skip
-    """Return a Matplotlib figure with a panel of curves for each title; the first has a legend.
+    """Return a Matplotlib figure with a panel of curves for each title, with a legend where labels change.
 
     There are up to ``columns`` panels a row. The axes in ``log`` (``"x"``, ``"xy"``) are logarithmic; ``ticks`` are
     labels at 0, 1, 2, …
     """
     columns = min(columns, len(panels))
     rows = -(-len(panels) // columns)
-    plot = figure(title, caption, 6.0 * columns, height * rows)
+    plot, explained = figure(title, caption, 6.0 * columns, height * rows), []
     for k, (name, curves) in enumerate(panels.items()):
         axes = plot.add_subplot(rows, columns, k + 1)
         for i, curve in enumerate(curves):
@@ -298,8 +276,10 @@ def draw_curves(
         if ticks:
             axes.set_xticks(range(len(ticks)), ticks)
         finish(axes, x_label, y_label)
-        if not k and len(curves) > 1:
+        labels = [curve.label for curve in curves]
+        if len(labels) > 1 and labels != explained:
             axes.legend(fontsize=6.5, ncols=2)
+            explained = labels
     return plot
 
 

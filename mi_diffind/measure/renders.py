@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from ..core.compat import ray_flags
 from ..images import srgb
@@ -302,14 +303,9 @@ def flicker(points: np.ndarray) -> float:
 
 def bilinear(image: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Return the values of an image, ``(height, width, channels)``, at ``places`` in pixels, ``(n, 2)``; clamped."""
-    height, width = image.shape[:2]
-    position = places - 0.5
-    lower = np.floor(position).astype(int)
-    a, b = (position - lower).T[..., None]
-    x0, x1 = (np.clip(lower[:, 0] + i, 0, width - 1) for i in (0, 1))
-    y0, y1 = (np.clip(lower[:, 1] + i, 0, height - 1) for i in (0, 1))
-    upper, under = (image[y, x0] * (1 - a) + image[y, x1] * a for y in (y0, y1))
-    return upper * (1 - b) + under * b
+    x, y = places.T - 0.5
+    channels = np.moveaxis(image.astype(np.float64), -1, 0)
+    return np.stack([map_coordinates(channel, (y, x), order=1, mode="nearest") for channel in channels], -1)
 
 
 #: Methods of a BSDF that are timed.

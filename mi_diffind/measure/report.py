@@ -123,7 +123,7 @@ def panels(result: dict) -> list[plot.Panel]:
                 continue
             if c["is_truth"] or c["is_reference"]:
                 label = f"{c['label']}, below {t['time']:.2g} ns" if t["hidden"] else c["label"]
-                lines.append(plot.Line(label, t["time"], c["is_truth"]))
+                lines.append((label, t["time"], c["is_truth"]))
             elif accuracy in c["errors"]:
                 points.append(_point(c, accuracy, t["time"], t["q1"], t["q3"], bool(t["on_front"])))
         unit = f"{PASS}, ms" if of_passes else f"{query}, ns"
@@ -203,20 +203,14 @@ def _error_table(result: dict) -> list[str]:
     return grid(cells, "") if len(cells) > 1 else []
 
 
-def candidates_by_budget(result: dict) -> dict[float, dict[str, dict]]:
-    """Return a map from each memory budget, ascending, to the measured contenders of a result: name → candidate."""
-    groups: dict[float, dict[str, dict]] = {}
-    for name, candidate in result["candidates"].items():
-        budget = candidate["details"].get("asked")
-        if budget and candidate["errors"]:
-            groups.setdefault(budget, {})[name] = candidate
-    return dict(sorted(groups.items()))
-
-
 def verdicts(result: dict) -> list[str]:
     """Return a table: by budget and measure the best of the method "ours" and the best of the others."""
+    budgets: dict[float, dict[str, dict]] = {}
+    for name, candidate in result["candidates"].items():
+        if candidate["details"].get("asked") and candidate["errors"]:
+            budgets.setdefault(candidate["details"]["asked"], {})[name] = candidate
     cells = [["in equal bytes", *(m["label"] for m in result["measures"])]]
-    for candidates in candidates_by_budget(result).values():
+    for _, candidates in sorted(budgets.items()):
         ours = [name for name, c in candidates.items() if c["details"]["kind"] in OURS]
         others = [name for name in candidates if name not in ours]
         for names in (ours, others) if ours and others else ():

@@ -1,24 +1,27 @@
-"""Training to convergence: runs of twice as many steps, until a run gains next to nothing.
+"""Contenders of studies: representations that are trained once, whose models and records are kept in a folder.
 
-Only representations that are trained to convergence can be compared. A representation has converged if a run of twice
-as many steps, with the same schedule stretched to them, gained less than :data:`GAIN` dB; if the longest run gained
-more, the record says so. The records keep the curves of all runs.
+Only representations that are trained to convergence can be compared (:class:`ConvergenceTraining`). A representation
+has converged if a run of twice as many steps, with the same schedule stretched to them, gained less than :data:`GAIN`
+dB; if the longest run gained more, the record says so. The records keep the curves of all runs.
 """
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
+import functools
 import json
+import time
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ..core.files import replacing
+from ..core.files import replacing, write_json
 from ..fitting.loop import FitSettings, Problem, fit
 from .store import file_name
-from .study import Job
+from .study import Candidate, Job
 
 #: Gain of a run of twice as many steps, in dB, below which a training has converged.
 GAIN = 0.5
@@ -30,47 +33,131 @@ def halve(net) -> None:
         net[key] = type(net[key])(net[key].numpy().astype(np.float16).astype(np.float32))
 
 
-class ConvergenceTraining(Job):
-    """Training of a representation to convergence.
+def load_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays that :meth:`Contender.save_arrays` wrote."""
+    with np.load(path, allow_pickle=False) as data:
+        return dict(data)
 
-    ``problem()`` returns a new problem with untrained parameters; ``settings`` are those of the first, shortest run,
-    ``longest`` is the largest number of steps; each run is measured ``measurements`` times. After :meth:`run` or
-    :meth:`cached_record`, ``net`` is the trained module of the best run. ``half``: its parameters are rounded to half
-    precision. ``finish(net, record)`` returns further entries of the record, such as ``bytes`` and ``errors``.
+
+@dataclass
+class Contender(Job):
+    """A ``method`` at one memory ``budget``: the job that trains or encodes it, and the candidate that is measured.
+
+    The record lies beside the model in the folder of models, so that a study that is run again trains nothing twice.
+
+    ``fit(contender, progress)`` trains or encodes: it sets :attr:`model`, writes ``file`` unless it is ``None``, and
+    returns the record (:class:`.Job`), or ``None`` after Ctrl-C. ``read(contender)`` returns the model of ``file``; if
+    nothing is in a file, ``has_file`` is false and ``read`` builds the model anew.
+
+    ``label`` is the name of the method in tables, ``family`` the group that it belongs to in pictures, ``setting`` the
+    budget as text.
     """
 
-    separable = True
+    name: str
+    method: str
+    budget: float
+    fit: Callable[[Contender, bool], dict | None]
+    read: Callable[[Contender], Any]
+    label: str = ""
+    family: str = ""
+    setting: str = ""
+    has_file: bool = True
+    separable: bool = False
+    details: dict = field(default_factory=dict)
+    file: Path | None = None
+    folder: Path | None = None
+    record: dict | None = None
+
+    def candidate(self, **fields) -> Candidate:
+        """Return the candidate to measure; ``fields`` are further ones of :class:`Candidate`."""
+        label = self.label or self.method
+        given = {"label": label, "details": {"kind": self.method, "asked": self.budget, **self.details}, **fields}
+        return Candidate(self.name, self.family or label, self.setting, job=self.name, **given)
+
+    def _locate(self, folder: Path | None) -> None:
+        self.folder = folder
+        self.file = folder / f"{file_name(self.name)}.npz" if folder and self.has_file else None
+
+    def cached_record(self, folder: Path | None, record: dict | None = None) -> dict | None:
+        self._locate(folder)
+        self.__dict__.pop("model", None)
+        if record is None and folder and self._record_file.is_file():
+            record = json.loads(self._record_file.read_text(encoding="utf-8"))
+        is_there = not self.has_file or (self.file is not None and self.file.is_file())
+        self.record = record if is_there else None
+        return self.record
+
+    @property
+    def _record_file(self) -> Path:
+        return self.folder / f"{file_name(self.name)}.json"
+
+    def run(self, folder: Path | None = None, progress: bool = True) -> dict | None:
+        self._locate(folder)
+        start = time.perf_counter()
+        self.record = self.fit(self, progress)
+        if self.record is not None:
+            self.record.setdefault("seconds", time.perf_counter() - start)
+            if folder:
+                write_json(self._record_file, self.record)
+        return self.record
+
+    @functools.cached_property
+    def model(self):
+        """The trained or encoded representation."""
+        return self.read(self)
+
+    def save_arrays(self, **arrays) -> None:
+        """Write arrays to ``file``, if there is a folder for models."""
+        if self.file is not None:
+            with replacing(self.file) as temporary, open(temporary, "wb") as stream:
+                np.savez(stream, **arrays)
+
+
+class ConvergenceTraining(Contender):
+    """Contender that is trained to convergence.
+
+    ``problem()`` returns a new problem with untrained parameters; ``settings`` are those of the first, shortest run,
+    ``longest`` is the largest number of steps; each run is measured ``measurements`` times. ``half``: the parameters
+    are rounded to half precision. ``finish(net, record)`` returns further entries of the record, such as ``bytes`` and
+    ``errors``. The model, :attr:`net`, is the trained module of the best run.
+    """
 
     def __init__(
         self, name: str, problem: Callable[[], Problem], settings: FitSettings, longest: int, measurements: int = 20,
         half: bool = False, finish: Callable[[object, dict], dict] = lambda net, record: {},
     ):  # fmt: skip
-        self.name, self.problem, self.settings, self.longest = name, problem, settings, longest
+        super().__init__(name, "", 0.0, ConvergenceTraining.train, lambda job: job.net, separable=True)
+        self.problem, self.settings, self.longest = problem, settings, longest
         self.measurements, self.half, self.finish = measurements, half, finish
-        self.net = None
 
     def cached_record(self, folder: Path | None, record: dict | None = None) -> dict | None:
         """Return the record that :meth:`run` wrote to ``folder``, if its settings are the same."""
-        if folder is None or not self._file(folder).is_file():
-            return None
-        with contextlib.suppress(Exception):  # damaged, or of other settings: train again
-            return self._load(self._file(folder))
-        return None
+        self.__dict__.pop("net", None)
+        self.record = super().cached_record(folder, record)
+        if self.record and self.record["settings"] != json.loads(json.dumps(self._settings())):
+            self.record = None
+        return self.record
 
-    def run(self, folder: Path | None = None, progress: bool = True) -> dict | None:
-        """Train, from the checkpoint if ``folder`` has one.
+    @functools.cached_property
+    def net(self):
+        """The trained module."""
+        arrays, net = load_arrays(self.file), self.problem().net
+        for key in net:
+            net[key] = type(net[key])(arrays[key])
+        return net
+
+    def train(self, progress: bool = True) -> dict | None:
+        """Train, from the checkpoint if there is one.
 
         Returns the record, or ``None`` after Ctrl-C: ``name``, ``steps``, ``seconds`` and ``psnr_db`` of the best run,
         ``gain_db`` of the last doubling (``None``: there was none), ``converged``, ``entries`` (numbers trained), and
-        ``runs``: of each run its ``steps``, ``seconds``, and for each measurement ``curve_steps``, ``curve_loss``,
-        ``curve_psnr_db``.
+        ``runs``: of each run its ``steps``, ``seconds``, and for each measurement ``curve_steps``, ``curve_psnr_db``.
         """
-        file = None if folder is None else self._file(folder)
         runs, best, steps = [], None, self.settings.steps
         while True:
             settings = dataclasses.replace(self.settings, steps=steps, measure_every=max(1, steps // self.measurements))
             problem = self.problem()
-            checkpoint = None if file is None else file.with_name(f"{file.stem}_{steps}.checkpoint")
+            checkpoint = self.file and self.file.with_name(f"{self.file.stem}_{steps}.checkpoint")
             resume = checkpoint is not None and checkpoint.is_file()
             title = f"train {self.name}" if progress else None
             result = fit(problem, settings, checkpoint, resume, progress, title=title)
@@ -82,7 +169,6 @@ class ConvergenceTraining(Job):
                 "seconds": result.seconds,
                 "psnr_db": result.measured[first],
                 "curve_steps": [h["step"] for h in result.history],
-                "curve_loss": [h["loss"] for h in result.history],
                 "curve_psnr_db": [h[first] for h in result.history],
             })  # fmt: skip
             if best is None or runs[-1]["psnr_db"] >= best["psnr_db"]:
@@ -104,30 +190,27 @@ class ConvergenceTraining(Job):
         if self.half:
             halve(self.net)
         record |= self.finish(self.net, record)
-        if file is not None:
-            self._save(file, record)
-            for checkpoint in file.parent.glob(f"{file.stem}_*.checkpoint"):
-                checkpoint.unlink()
+        self.save_arrays(**{key: self.net[key].numpy() for key in self.net})
+        for checkpoint in self.file.parent.glob(f"{self.file.stem}_*.checkpoint") if self.file else ():
+            checkpoint.unlink()
         return record
-
-    def _file(self, folder: Path) -> Path:
-        return Path(folder) / f"{file_name(self.name)}.npz"
 
     def _settings(self) -> dict:
         return {**dataclasses.asdict(self.settings), "longest": self.longest, **self.problem().identity}
 
-    def _save(self, file: Path, record: dict) -> None:
-        arrays = {f"parameter/{key}": self.net[key].numpy() for key in self.net}
-        with replacing(file) as temporary, open(temporary, "wb") as stream:
-            np.savez(stream, record=np.frombuffer(json.dumps(record).encode(), np.uint8), **arrays)
 
-    def _load(self, file: Path) -> dict:
-        with np.load(file, allow_pickle=False) as data:
-            record = json.loads(data["record"].tobytes())
-            if record["settings"] != json.loads(json.dumps(self._settings())):
-                raise ValueError("the file is of other settings")
-            net = self.problem().net
-            for key in net:
-                net[key] = type(net[key])(data[f"parameter/{key}"])
-        self.net = net
-        return record
+class NetworkContender(ConvergenceTraining):
+    """A network at a memory budget, trained to convergence in half precision.
+
+    ``build(net)`` returns its model of the trained network; ``training`` are the arguments of
+    :class:`ConvergenceTraining` after the name.
+    """
+
+    def __init__(self, name: str, method: str, budget: float, label: str, setting: str, build: Callable, *training):
+        super().__init__(name, *training)
+        self.method, self.budget, self.label, self.setting, self.build = method, budget, label, setting, build
+
+    @property
+    def model(self):
+        """The trained representation."""
+        return self.build(self.net)

@@ -16,12 +16,12 @@ from ..fitting.task import FitSettings, fit, load_model
 from ..measure.renders import bsdf_queries, directions
 from ..measure.store import fingerprint, package_files
 from ..measure.study import Candidate, Case, Measure, Plan, Study
+from ..measure.training import Contender, NetworkContender
 from ..tasks.bsdf import mixture
 from ..tasks.bsdf.directions import SphereView
 from ..tasks.bsdf.model import LearnedBSDF
 from ..tasks.bsdf.truth import truth_of
 from .baselines import networks
-from .equal_memory import Contender, NetworkContender
 
 
 def _rgb(*value):
@@ -123,9 +123,9 @@ def fitted_contender(material: str, preset: str, quick: bool) -> Contender:
         if fitted.result.interrupted:
             return None
         fitted.save(job.file)
-        return measured(job)
+        return measure_file(job)
 
-    def measured(job: Contender) -> dict:
+    def measure_file(job: Contender) -> dict:
         """Return bytes and errors of the file: also the errors of the proxy alone, and the noise of both samplings."""
         model = load_model(job.file, mi.TensorXf)
         truth, errors = truth_of(source, model.types), dict(model.table.measured)

@@ -166,14 +166,14 @@ def network_training(name: str, nbytes: int, quick: bool = False) -> Convergence
 def _network_candidate(training: ConvergenceTraining) -> Candidate:
     """Return the candidate of a trained network."""
 
-    def counted(query: str) -> Operations:
+    def count_operations(query: str) -> Operations:
         material, albedo, wi, wo = _constants(LOBES["all lobes"], 64)
         decoder = networks.NetworkDecoder(training.net.cooperative())
         return count_query(lambda: shade(decoder, material, albedo, wi, wo)) + training.net.products()
 
     return Candidate(
         training.name, "network", "float16", errors=_errors(lambda: networks.NetworkDecoder(training.net)),
-        job=training.name, operations=counted,
+        job=training.name, operations=count_operations,
     )  # fmt: skip
 
 

@@ -30,6 +30,7 @@ from ..fitting.loop import FitSettings, fit
 from ..measure import plot
 from ..measure.store import fingerprint, package_files
 from ..measure.study import FLOOR, Candidate, Case, Measure, Plan, Study
+from ..measure.training import Contender, load_arrays
 from ..tasks.radiance import dense_bytes
 from ..tasks.radiance import grid as grids
 from ..tasks.radiance.compression import Importance, importance
@@ -39,7 +40,6 @@ from ..tasks.radiance.views import load_views
 from ..tasks.radiance.volume_field import VolumeField
 from . import equal_memory
 from .baselines import radiance_fields as rivals
-from .equal_memory import Contender
 
 #: Default budgets, as compression against a dense float32 grid. At the first one, all methods are trained and timed.
 RATIOS = (75.0, 50.0, 200.0)
@@ -225,7 +225,7 @@ def rival_contender(context: RadianceStudyContext, fields: dict) -> Contender:
         return context.record(job, job.model, job.model.nbytes, rivals.compressed_bytes(state), **details)
 
     def read(job: Contender) -> VolumeField:
-        return rival.field(context.types, equal_memory.load_arrays(job.file))
+        return rival.field(context.types, load_arrays(job.file))
 
     return Contender(fit=train, read=read, **fields)
 

@@ -15,7 +15,6 @@ import functools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -40,19 +39,12 @@ PRIMARY = 16
 CASCADED = 8
 ENTRIES = 2 * PRIMARY**2 + CASCADED**2
 
-#: Indirection of these sizes, at whose quality costs are compared.
+#: Indirection of the paper's sizes, which ratios are to.
 REFERENCE = f"{PRIMARY}→{CASCADED}"
 
 #: Names of the cases, one for each parametrisation of the inputs.
 PLAIN = "inputs as in the paper"
 LOGARITHMIC = "logarithmic inputs"
-
-#: The paper's ratios to its own indirection at equal quality: flops, bytes read by a query, bytes stored.
-PAPER = {"network": (113.7, 256, 4), "single table": (0.33, 0.5, 512), "network + table": (28.4, 64, 0.5)}
-
-#: PSNR, in dB, by which a candidate may be worse and still count as of equal quality.
-EQUAL_DB = 0.25
-
 
 #: Sides of the primary arrays, with cascaded ones half as long (ρ = 2).
 SIZES = (8, 16, 32, 64)
@@ -110,7 +102,7 @@ STUDY = GGXStudy()
 
 
 @dataclass(frozen=True)
-class Form:
+class GGXForm:
     """Representation of one size for one kind of ``inputs``, before its training.
 
     ``net`` is the module, not yet allocated, ``nbytes`` its bytes as it is trained, ``settings_key`` the key of
@@ -152,7 +144,7 @@ class Form:
             net = training.net.cooperative() if storage == COOPERATIVE else training.net.to(storage)
             return LearnedGGX(net, Encoding(self.inputs, self.output), tail=False)
 
-        def counted(query: str) -> Operations:
+        def count_operations(query: str) -> Operations:
             inputs = _inputs(types, 64)
             return count_query(lambda: [reader(COOPERATIVE)(*inputs)]) + training.net.products()
 
@@ -162,11 +154,11 @@ class Form:
                 self.name(suffix), self.representation, storage, self.nbytes * size // 4,
                 errors=lambda samples, storage=storage: measure(reader(storage), types, samples),
                 label=self.label + suffix, job=training.name,
-                operations=counted if storage == COOPERATIVE else None,
+                operations=count_operations if storage == COOPERATIVE else None,
             ), functools.partial(reader, storage)  # fmt: skip
 
 
-def forms(inputs: str, quick: bool) -> list[Form]:
+def forms(inputs: str, quick: bool) -> list[GGXForm]:
     """Return the representations for ``inputs``: indirection and single tables, networks; ``quick``: fewer."""
     plain = inputs == "plain"
     sizes, multiples = (SIZES, MULTIPLES) if plain else ((PRIMARY, 2 * PRIMARY), (1, 4))
@@ -179,9 +171,9 @@ def forms(inputs: str, quick: bool) -> list[Form]:
     def single(side: int) -> tuple:
         return f"{side}²", inputs, DifferentiableArray((side, side), 1, "constant", 0.5), 4 * side**2
 
-    def form(representation: str, described: tuple, *options) -> Form:
+    def form(representation: str, described: tuple, *options) -> GGXForm:
         label, *rest = described
-        return Form(label + " raw" * (representation == "raw"), representation, *rest, *options)
+        return GGXForm(label + " raw" * (representation == "raw"), representation, *rest, *options)
 
     chosen = [form("indirection", cascade(side), f"indirection, {inputs}", STORAGES) for side in sizes]
     for multiple in multiples:
@@ -193,13 +185,12 @@ def forms(inputs: str, quick: bool) -> list[Form]:
     nets = [(f"MLP {w}x{n}", "network", Network(2, w, n)) for w, n in (NETWORKS if plain else NETWORKS[1:])]
     if plain:
         nets.append(("grid + MLP 16", "hash grid + network", Network(2, 16, 1, HASH_GRID)))
-        nets.append((f"MLP 8 + {PRIMARY}²", "network + table", Network(2, 8, 2, table=PRIMARY)))
     if quick:
-        nets = [nets[0], *nets[-2:]] if plain else []
+        nets = [nets[0], nets[-1]] if plain else []
     for label, representation, network in nets:
         nbytes = network.alloc(array_module(mi.variant()).TensorXf, 2, dr.rng(seed=1)).nbytes
         key = "network" if network.width < 32 else "wide network"
-        chosen.append(Form(label, representation, inputs, network, nbytes, key))
+        chosen.append(GGXForm(label, representation, inputs, network, nbytes, key))
     return chosen
 
 
@@ -274,40 +265,3 @@ def _conductor_queries(plugins: dict, roughness: str, lanes: int) -> dict:
 
     bsdfs = {name: load(plugin) for name, plugin in plugins.items()}
     return bsdf_queries(bsdfs, directions(lanes), roughness == "textured")
-
-
-class EqualQuality(NamedTuple):
-    """The smallest member of a family as good as a reference, else its best member.
-
-    ``ratios`` are flops, bytes read, bytes stored and time, relative to the reference; ``paper`` has the paper's first
-    three.
-    """
-
-    family: str
-    name: str
-    psnr_db: float
-    ratios: tuple[float, float, float, float]
-    paper: tuple[float, float, float] | None
-
-
-def equal_quality(result: dict, reference: str = REFERENCE) -> list[EqualQuality]:
-    """Return a member of each family beside the candidate ``reference``, for the inputs of the paper."""
-    timings, candidates, rows = result["cases"][PLAIN]["queries"]["read"], result["candidates"], []
-    psnr = {name: candidates[name]["errors"].get("psnr_db") for name in timings}
-
-    def costs(name: str) -> tuple[float, float, float, float]:
-        t = timings[name]
-        return t["operations"]["flops"], t["operations"]["bytes_gathered"], candidates[name]["bytes"], t["time"]
-
-    for family, paper in {**PAPER, "hash grid + network": None}.items():
-        members = [
-            name for name in timings
-            if candidates[name]["representation"] == family and "raw" not in name
-            and candidates[name]["setting"] not in STORAGES[1:]
-        ]  # fmt: skip
-        good = [name for name in members if psnr[name] >= psnr[reference] - EQUAL_DB]
-        if members:
-            name = min(good or members, key=lambda n: candidates[n]["bytes"] if good else -psnr[n])
-            ratios = tuple(a / b for a, b in zip(costs(name), costs(reference), strict=True))
-            rows.append(EqualQuality(family, name, psnr[name], ratios, paper))
-    return rows

@@ -36,10 +36,9 @@ from ..maps import as_seen
 from ..maps.pyramid import Pyramid, decibel
 from ..maps.source import Source, load_source
 from ..measure.study import FLOOR, Candidate, Case, Measure, Plan, Study
-from ..measure.training import halve
+from ..measure.training import Contender, halve
 from . import equal_memory
 from .baselines import codecs, networks
-from .equal_memory import Contender
 from .texture import add_astc_option, source_details
 
 #: Bitmaps whose reads are timed → whether they hold 8-bit values.

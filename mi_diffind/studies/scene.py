@@ -116,13 +116,12 @@ def measure(
     seed: int = 0,
     defines: dict[str, str] | None = None,
     progress: bool = True,
-    launch_samples: int = LAUNCH_SAMPLES,
 ) -> dict:
     """Measure the errors and times of a scene file, learned and exact.
 
     If ``folder`` holds an interrupted run of the same key, only the missing part is measured; measurements stay there
     until :func:`write` has written the result. Equal arguments give equal errors if the film's filter is a box.
-    Values that are not finite count as 0. ``launch_samples`` limits the samples of a launch.
+    Values that are not finite count as 0.
 
     Returns the result, a tree of numbers and strings (JSON; ``None`` for unknown values). Errors are relative: ``mse``
     as in :mod:`~mi_diffind.measure.bias`, ``rmse`` its root. Seconds are those of the kernels of a whole render.
@@ -167,7 +166,7 @@ def measure(
     key = {**facts, "scene": Path(scene_path).name, "sources": fingerprint([*sources(), *files])}
     store, interrupted = Store(folder, "scene", key, ("pairs",), progress), False
     with interruptible() as stop:
-        run = SceneRun(loaded, counts, settings, seed, store, width * height, stop, launch_samples)
+        run = SceneRun(loaded, counts, settings, seed, store, width * height, stop)
         try:
             run.renders(progress)
         except Stopped:
@@ -192,7 +191,6 @@ class SceneRun:
     store: Store
     pixels: int
     stop: threading.Event
-    launch_samples: int
     is_compiled: bool = False
 
     def schedule(self) -> list[tuple[int, int, int, bool]]:
@@ -220,7 +218,7 @@ class SceneRun:
                 if spp == top:
                     store.keep(str(k), **images)
                 else:
-                    truth = truth or Truth.of_passes(store)
+                    truth = truth or SceneTruth.from_store(store)
                     records = {name: records[name] | truth.errors(images[name]) for name in VERSIONS}
                 done[f"{spp}/{k}"] = records
                 store.save()
@@ -241,7 +239,7 @@ class SceneRun:
 
     def _render(self, name: str, spp: int, number: int) -> tuple[np.ndarray, dict]:
         """Return an image, float32, with its ``seconds`` (``None`` if it compiled) and ``not_finite`` values."""
-        launches = 1 << ((spp * self.pixels - 1) // self.launch_samples).bit_length()
+        launches = 1 << ((spp * self.pixels - 1) // LAUNCH_SAMPLES).bit_length()
         render = timed(lambda: loading.render(self.loaded[name], spp, (self.seed << 8) + number, launches)[0])
         image = loading.colour_channels(render.value)
         bad = ~np.isfinite(image)
@@ -250,7 +248,7 @@ class SceneRun:
 
 
 @dataclass(frozen=True)
-class Truth:
+class SceneTruth:
     """Mean of ``passes`` exact images, with the weights of errors and the mean square of the noise of one image."""
 
     image: np.ndarray
@@ -259,7 +257,7 @@ class Truth:
     noise: float
 
     @classmethod
-    def of_passes(cls, store: Store) -> Truth:
+    def from_store(cls, store: Store) -> SceneTruth:
         """Return the truth of the passes in a store."""
         exact = _images(store)["exact"]
         weights = relative_weights(store.arrays[BRIGHTNESS]["exact"])
@@ -292,7 +290,7 @@ def _assemble(store: Store, counts: list[int]) -> dict:
     }
     if len(images["exact"]) < LEAST:
         return result
-    truth, times = Truth.of_passes(store), {name: {} for name in VERSIONS}
+    truth, times = SceneTruth.from_store(store), {name: {} for name in VERSIONS}
     for spp in counts:
         pairs = [dict(pair) for key, pair in done.items() if key.startswith(f"{spp}/")]
         for k, pair in enumerate(pairs if spp == top else ()):

@@ -39,13 +39,13 @@ from ..measure import plot
 from ..measure.report import figure_caption
 from ..measure.store import fingerprint
 from ..measure.study import Measure, Plan, Study
+from ..measure.training import Contender
 from ..scenes import loading
 from ..scenes.training.options import SceneRecipe, ViewDistribution
 from ..scenes.training.problem import estimate_exposure
 from ..scenes.training.references import ReferenceRenders
 from ..scenes.training.trained_scene import TrainedScene, find_source, texture_file
 from ..tasks.texture.compressed import load
-from .equal_memory import Contender
 
 #: Names of the runs.
 AFTER = "hemisphere, then scene"

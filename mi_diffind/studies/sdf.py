@@ -31,6 +31,7 @@ from ..fitting.loop import FitSettings
 from ..measure import plot
 from ..measure.store import fingerprint, package_files
 from ..measure.study import FLOOR, Candidate, Case, Measure, Plan, Study
+from ..measure.training import Contender, NetworkContender
 from ..plugins.support.distance_shapes import crop_grid
 from ..tasks.sdf import grids, marching
 from ..tasks.sdf.distances import Distances
@@ -39,7 +40,6 @@ from ..tasks.sdf.field import DistanceField
 from ..tasks.sdf.mesh import Mesh, load_mesh
 from . import equal_memory
 from .baselines import distance_fields as rivals
-from .equal_memory import Contender, NetworkContender
 
 #: Default memory budgets; all methods are trained and timed at the first one.
 SIZES = ("1M", "256k", "512k", "2M", "4M")

@@ -51,6 +51,7 @@ from ..measure import plot
 from ..measure.renders import POINTS, MovingView
 from ..measure.report import figure_caption
 from ..measure.study import Candidate, Measure, Plan, Study
+from ..measure.training import Contender
 from ..tasks import shading as shading_task
 from ..tasks import texture as texture_task
 from ..tasks.disney.model import Effects
@@ -62,7 +63,6 @@ from ..tasks.texture import fit as textures
 from ..tasks.texture.compressed import CompressedTexture
 from ..tasks.texture.fit import size_of
 from .baselines import codecs, normals
-from .equal_memory import Contender
 from .example_maps import MATERIALS, generated_source
 from .material_renders import RenderSettings, run_renders
 from .texture import level_images, level_pyramid, load_tables
@@ -262,13 +262,17 @@ class ShadedZoom(MovingView):
 
 @dataclass
 class ShadingContenders:
-    """Contenders of a material: their jobs by name, and the candidates, of which all seeds of a run are one."""
+    """Contenders of a material: their jobs by name, and the candidates, of which all seeds of a run are one.
+
+    ``runs`` has the jobs of all seeds by remedies and λ; with λ = 0, remedies share them.
+    """
 
     name: str
     source: Source
     settings: SimpleNamespace
     jobs: dict[str, Contender] = field(default_factory=dict)
     candidates: list[Candidate] = field(default_factory=list)
+    runs: dict[tuple[str, float], list[Contender]] = field(default_factory=dict)
 
     def __post_init__(self):
         types, quick = array_module(mi.variant()), self.settings.quick
@@ -310,63 +314,57 @@ class ShadingContenders:
         details = {"material": self.name, **self.evaluation.measure(job.model), "kind": job.method, **details}
         return {"bytes": nbytes, "details": {**details, "label": job.label}}
 
-    def add_filter(self, label: str, method: str, nbytes: Callable[[], int], read: Callable[[], ShadedReader]) -> None:
-        """Register a filter that nothing is trained for."""
-        fit = lambda job, progress: self.record(job, nbytes())  # noqa: E731
-        job = self.add(label, method, fit, lambda job: read())
+    def add_filter(self, label: str, method: str, build: Callable[[], tuple[ShadedReader, int]]) -> Contender:
+        """Register a filter that nothing is trained for; ``build()`` returns its reader and its bytes."""
+        once = cache(build)
+        fit = lambda job, progress: self.record(job, once()[1])  # noqa: E731
+        job = self.add(label, method, fit, lambda job: once()[0])
         self.add_candidate(job.name, label, [job], kind=label)
+        return job
 
     def add_kernel(self, job: Contender, label: str = "") -> None:
         """Register a contender, of another ``label``, read at the levels of detail with the smallest error."""
-        places = 2**10 if self.settings.quick else normals.PLACES
         name, *storage = (label or job.label).split(", ")
         label = ", ".join([*([] if name == "filtered" else [name]), "kernel", *storage])
-        method = "classical" if job.method == "classical" else "compressed"
 
-        def read() -> ShadedReader:
-            biases = normals.choose_biases(job.model, self.pyramid, self.effects, places)
-            return normals.biased(job.model, biases)
+        def build() -> tuple[ShadedReader, int]:
+            biases = normals.choose_biases(job.model, self.evaluation.another())
+            return normals.biased(job.model, biases), job.record["bytes"]
 
-        self.add_filter(label, method, lambda: job.record["bytes"], read)
-
-    def last(self) -> Contender:
-        """Return the contender that was registered last."""
-        return next(reversed(self.jobs.values()))
+        self.add_filter(label, "classical" if job.method == "classical" else "compressed", build)
 
     # -- Classical filters
 
     def add_classical(self) -> None:
-        """Register classical filters: uncompressed, compressed as ours, and by ASTC, each also with its kernel."""
-        quick, pyramid, effects = self.settings.quick, self.pyramid, self.effects
-        levels = {
-            "Toksvig": lambda: normals.toksvig_levels(pyramid),
-            "baked": lambda: normals.bake(pyramid, effects, 4 if quick else normals.PAIRS),
-        }
-        pyramids = {name: cache(lambda make=make: normals.with_roughness(pyramid, make()))
-                    for name, make in levels.items()}  # fmt: skip
-        pyramids = {"filtered": lambda: pyramid, **pyramids}
-        for name, make in pyramids.items():
-            nbytes = lambda make=make: make().nbytes  # noqa: E731
-            self.add_filter(name, "classical", nbytes, lambda make=make: reader(make(), effects))
-            self.add_kernel(self.last())
+        """Register classical filters, each also with its kernel: uncompressed, and for our preset in equal bytes."""
+        settings, pyramid = self.settings, self.pyramid
+        pairs = 4 if settings.quick else normals.PAIRS
         moments = 6 * sum(v[..., 0].size for v in pyramid.values)
-        self.add_filter("LEAN", "classical", lambda: pyramid.nbytes + moments, lambda: normals.lean(pyramid, effects))
-        self.add_kernel(self.last())
-        for name in levels:
-            self.add_compressed(f"{name}, compressed", pyramids[name])
-            self.add_kernel(self.last())
-        for name, make in pyramids.items() if "astc" in codecs.available() and not quick else ():
-            coded = cache(partial(self.encode, make))
-            read = lambda coded=coded: reader(coded()[0], effects)  # noqa: E731
-            self.add_filter(f"{name}, ASTC", "compressed", lambda coded=coded: coded()[1], read)
-            self.add_kernel(self.last())
+        pyramids = {
+            "filtered": lambda: pyramid,
+            "Toksvig": cache(lambda: normals.with_roughness(pyramid, normals.toksvig_levels(pyramid))),
+            "baked": cache(lambda: normals.with_roughness(pyramid, normals.bake(pyramid, self.effects, pairs))),
+        }
+        builds = {name: partial(self.uncompressed, make) for name, make in pyramids.items()}
+        builds["LEAN"] = lambda: (normals.lean(pyramid, self.effects), pyramid.nbytes + moments)
+        for name, build in builds.items():
+            self.add_kernel(self.add_filter(name, "classical", build))
+        for name, make in pyramids.items() if settings.preset == "ours" else ():
+            if name != "filtered":  # that is λ = 0
+                self.add_kernel(self.add_compressed(f"{name}, compressed", make))
+            if "astc" in codecs.available():
+                self.add_kernel(self.add_filter(f"{name}, ASTC", "compressed", partial(self.encoded, make)))
 
-    def encode(self, make: Callable[[], Pyramid]) -> tuple[Pyramid, int]:
-        """Return a pyramid whose levels ASTC stores in the bytes of the trainings, and the bytes."""
-        pyramid = make()
-        names = [m.name for m in pyramid.layout.maps if m.role == "normal"]
-        coded, nbytes = codecs.astc_levels(level_images(pyramid), self.source.nbytes / COMPRESSION, "thorough", names)
-        return level_pyramid({name: e.levels for name, e in coded.items()}, pyramid), nbytes
+    def uncompressed(self, pyramid: Callable[[], Pyramid]) -> tuple[ShadedReader, int]:
+        """Return the reader of a pyramid, and its bytes."""
+        return reader(pyramid(), self.effects), pyramid().nbytes
+
+    def encoded(self, pyramid: Callable[[], Pyramid]) -> tuple[ShadedReader, int]:
+        """Return the reader of a pyramid that ASTC stores in the bytes of the trainings, and its bytes."""
+        levels, nbytes = level_images(pyramid()), self.source.nbytes / COMPRESSION
+        names = [m.name for m in pyramid().layout.maps if m.role == "normal"]
+        coded, nbytes = codecs.astc_levels(levels, nbytes, "thorough", names)
+        return reader(level_pyramid({name: e.levels for name, e in coded.items()}, pyramid()), self.effects), nbytes
 
     # -- Trainings
 
@@ -436,12 +434,13 @@ class ShadingContenders:
         train = lambda progress: (*self.fit_texture(self.pyramid, length, seed, progress, extras), {"seed": seed})  # noqa: E731
         return self.add_trained(label, "start", train)
 
-    def add_compressed(self, label: str, pyramid: Callable[[], Pyramid]) -> None:
+    def add_compressed(self, label: str, pyramid: Callable[[], Pyramid]) -> Contender:
         """Register a texture trained on a classical filter's pyramid, for the time of start and run together."""
         length = self.settings.pretraining + self.settings.length
         train = lambda progress: (*self.fit_texture(pyramid(), length, 0, progress), {})  # noqa: E731
         job = self.add_trained(label, "compressed", train)
         self.add_candidate(job.name, label, [job], kind=label)
+        return job
 
     def add_run(
         self, start: Contender, way: str, share: float, seed: int, base: Contender | None, extras: bool = False
@@ -479,26 +478,44 @@ class ShadingContenders:
 
     def add_runs(self) -> None:
         """Register the trainings of all seeds; without a shading loss, there is nothing to clip."""
-        settings, groups = self.settings, {}
+        settings = self.settings
         for seed in range(settings.seeds):
             start, bases = self.add_start(seed), {}
             for share, way in itertools.product(settings.lambdas, settings.ways):
                 schedule = REMEDIES[way][1]
-                if share == 0 and schedule in bases:
-                    continue
-                run = self.add_run(start, way, share, seed, bases.get(schedule))
-                groups.setdefault((share, way), []).append(run)
-                if share == 0:
-                    if not bases and seed == 0:
-                        self.add_kernel(run, "filtered, compressed")
-                    bases[schedule] = run
+                run = bases.get(schedule)
+                if share or run is None:
+                    run = self.add_run(start, way, share, seed, run)
+                bases.setdefault(schedule, run)
+                self.runs.setdefault((way, share), []).append(run)
+            if not seed:
+                self.add_kernel(self.runs[settings.ways[0], 0.0][0], "filtered, compressed")
             if settings.extras:
                 way, start = settings.ways[0], self.add_start(seed, True)
                 run = self.add_run(start, way, self.preset.share, seed, bases[REMEDIES[way][1]], True)
                 self.add_candidate(run.name, run.label, [run], kind=run.label)
-        for (share, way), runs in groups.items():
-            name, details = f"{self.name}, lambda {share:g}, {way}", {"lambda": share, "way": way, "kind": "run"}
-            self.add_candidate(name, "lambda", runs, **details)
+        for (way, share), runs in self.runs.items():
+            if runs[0].label.startswith(f"lambda {share:g}, {way},"):
+                name, details = f"{self.name}, lambda {share:g}, {way}", {"lambda": share, "way": way, "kind": "run"}
+                self.add_candidate(name, "lambda", runs, **details)
+
+    # -- Pictures
+
+    def psnr(self, way: str, share: float, letter: str = "C") -> list[float]:
+        """Return the mean PSNR of levels of each seed."""
+        return [job.record["details"][letter]["mean_db"] for job in self.runs[way, share]]
+
+    def shown(self, runs: bool = True) -> dict[str, Contender]:
+        """Return the contenders in pictures: filtered parameters, the best filters against C, λ = 0 and the best λ."""
+        shown = {"parameters filtered": self.jobs[f"{self.name}, filtered"]}
+        for text, method in (("uncompressed", "classical"), ("equal bytes", "compressed")):
+            jobs = [job for job in self.jobs.values() if job.method == method]
+            best = max(jobs, key=lambda job: job.record["details"]["C"]["mean_db"])
+            shown[f"{best.label.removesuffix(', compressed')}, {text}"] = best
+        if runs:
+            way, share = max(self.runs, key=lambda key: (key[1] > 0, np.mean(self.psnr(*key))))
+            shown |= {f"λ {s:g}": self.runs[way, s][0] for s in (0.0, share)}
+        return shown
 
 
 def fit_to_the_end(source, net, recipe, request, pyramid: Pyramid, evaluation: ShadedEvaluation) -> tuple:
@@ -553,8 +570,8 @@ def plan(sources: dict[str, Source], settings: SimpleNamespace) -> Plan:
         jobs=[job for context in contexts.values() for job in context.jobs.values()],
         jobs_fingerprint=str(details),
         pictures={
-            "png": draw_lambdas,
-            "levels": draw_levels,
+            "png": partial(draw_lambdas, contexts),
+            "levels": partial(draw_levels, contexts),
             "strip": partial(draw_crops, contexts),
             "zoom": partial(draw_zoom, contexts),
         },
@@ -571,10 +588,6 @@ def plan(sources: dict[str, Source], settings: SimpleNamespace) -> Plan:
 
 # -- Pictures ----------------------------------------------------------------------------------------------------------
 
-#: Line style of each classical filter.
-CLASSICAL = {"filtered": ":", "kernel": (0, (1, 3)), "Toksvig": (0, (5, 1)), "LEAN": "--", "LEAN, kernel": (0, (6, 2)),
-             "baked": "-."}  # fmt: skip
-
 #: Level of detail of the crops.
 CROP_LEVEL = 3
 
@@ -582,132 +595,66 @@ CROP_LEVEL = 3
 CROP_SIDE = 48
 
 
-@dataclass
-class MaterialCurves:
-    """Records of a material: ``classical`` and ``compressed`` filters by label, ``runs`` by remedies and λ.
+def draw_lambdas(contexts: dict[str, ShadingContenders], result: dict):
+    """Draw PSNR over λ for all remedies, with bars over seeds and troubles, beside the best classical filters."""
+    settings = next(iter(contexts.values())).settings
+    shares = settings.lambdas
 
-    ``runs`` has the details of all seeds; those of λ = 0 stand under all remedies that they are the base of.
-    """
-
-    classical: dict[str, dict] = field(default_factory=dict)
-    compressed: dict[str, dict] = field(default_factory=dict)
-    runs: dict[tuple[str, float], list[dict]] = field(default_factory=dict)
-
-    @property
-    def remedies(self) -> list[str]:
-        return list(dict.fromkeys(remedy for remedy, share in self.runs if share > 0))
-
-    def values(self, remedy: str, share: float, letter: str = "C") -> list[float]:
-        """Return the mean PSNR of levels of each seed."""
-        return [d[letter]["mean_db"] for d in self.runs.get((remedy, share), [])]
-
-    def shown(self) -> dict[str, dict]:
-        """Return records to show: the best classical filter, λ = 0 and the best λ against C, of the first seed."""
-        filters = {k: d for k, d in self.classical.items() if k != "filtered"}
-        records = {}
-        if filters:
-            best = max(filters, key=lambda label: filters[label]["C"]["mean_db"])
-            records[f"{best}, uncompressed"] = filters[best]
-        runs = [key for key in self.runs if key[1] > 0 and (key[0], 0.0) in self.runs]
-        if runs:
-            way, share = max(runs, key=lambda key: float(np.mean(self.values(*key))))
-            records |= {f"λ {s:g}, compressed": self.runs[way, s][0] for s in (0.0, share)}
-        return records
-
-
-def curves(result: dict) -> dict[str, MaterialCurves]:
-    """Return the records of all materials with any measurement, by name."""
-    materials: dict[str, MaterialCurves] = {}
-    for record in result["jobs"].values():
-        d = record["details"]
-        material = materials.setdefault(d["material"], MaterialCurves())
-        if d["kind"] in ("classical", "compressed"):
-            getattr(material, d["kind"])[d["label"]] = d
-        elif d["kind"] == "run":
-            material.runs.setdefault((d["way"], d["share"]), []).append(d)
-    for material in materials.values():
-        bases = {d["schedule"]: ds for (_, share), ds in material.runs.items() if share == 0 for d in ds}
-        for remedy in material.remedies:
-            if REMEDIES[remedy][1] in bases:
-                material.runs[remedy, 0.0] = bases[REMEDIES[remedy][1]]
-    return materials
-
-
-def trouble(runs: list[dict]) -> str:
-    """Return the names of troubles, each with the number of runs."""
-    names = [name for d in runs for name in d.get("trouble", [])]
-    return ", ".join(f"{name} {names.count(name)}" for name in dict.fromkeys(names))
-
-
-def draw_lambdas(result: dict):
-    """Draw PSNR over λ for all remedies, with bars over seeds, beside classical filters."""
-    shares = sorted({s for material in curves(result).values() for _, s in material.runs})
-
-    def draw(material: MaterialCurves, letter: str) -> list[plot.Curve]:
+    def draw(context: ShadingContenders, letter: str) -> list[plot.Curve]:
         drawn = []
-        for way in material.remedies:
-            values = {i: material.values(way, s, letter) for i, s in enumerate(shares) if (way, s) in material.runs}
-            troubled = trouble([d for s in shares if s for d in material.runs.get((way, s), [])])
-            ends = [[end(v) for v in values.values()] for end in (np.mean, min, max)]
-            drawn.append(plot.Curve(f"{way} ({troubled or 'no trouble'})", list(values), *ends))
-        drawn += _classical_curves(material, lambda d: ((0, len(shares) - 1), [d[letter]["mean_db"]] * 2))
-        for label, d in material.compressed.items():
-            style = {"marker": "*", "markersize": 8, "linestyle": "", "color": "0.3"}
-            drawn.append(plot.Curve(label, [0], [d[letter]["mean_db"]], style=style))
-        return drawn
+        for way in settings.ways:
+            values = [context.psnr(way, share, letter) for share in shares]
+            jobs = [job for share in shares if share for job in context.runs[way, share]]
+            met = [name for job in jobs for name in job.record["details"]["trouble"]]
+            text = ", ".join(f"{name} {met.count(name)}" for name in dict.fromkeys(met)) or "no trouble"
+            ends = [[end(v) for v in values] for end in (np.mean, min, max)]
+            drawn.append(plot.Curve(f"{way} ({text})", range(len(shares)), *ends))
+        return drawn + _filter_curves(context, lambda d: ((0, len(shares) - 1), [d[letter]["mean_db"]] * 2))
 
-    return _draw_both(result, "", draw, "λ, weight of the shading loss", [f"{s:g}" for s in shares])
+    return _draw_both(contexts, result, "", draw, "λ, weight of the shading loss", [f"{s:g}" for s in shares])
 
 
-def draw_levels(result: dict):
-    """Draw PSNR by level of detail of λ = 0, the best λ and classical filters."""
+def draw_levels(contexts: dict[str, ShadingContenders], result: dict):
+    """Draw PSNR by level of detail of λ = 0, the best λ and the best classical filters."""
 
-    def draw(material: MaterialCurves, letter: str) -> list[plot.Curve]:
+    def draw(context: ShadingContenders, letter: str) -> list[plot.Curve]:
         def by_level(d: dict) -> tuple:
             return range(len(d[letter]["psnr_db"])), d[letter]["psnr_db"]
 
-        trained = [plot.Curve(text, *by_level(d)) for text, d in material.shown().items() if d["kind"] == "run"]
-        return trained + _classical_curves(material, by_level)
+        runs = {text: job for text, job in context.shown().items() if job.method == "run"}
+        trained = [plot.Curve(text, *by_level(job.record["details"])) for text, job in runs.items()]
+        return trained + _filter_curves(context, by_level)
 
-    return _draw_both(result, ": levels of detail", draw, "level of detail")
+    return _draw_both(contexts, result, ": levels of detail", draw, "level of detail")
 
 
-def _classical_curves(material: MaterialCurves, x: Callable[[dict], tuple[Sequence, Sequence]]) -> list[plot.Curve]:
+def _filter_curves(context: ShadingContenders, x: Callable[[dict], tuple[Sequence, Sequence]]) -> list[plot.Curve]:
     """Return the curves of classical filters; ``x(details)`` returns both coordinates."""
-    labels = [label for label in CLASSICAL if label in material.classical]
     return [
-        plot.Curve(f"{label}, uncompressed", *x(material.classical[label]),
-                   style={"linestyle": CLASSICAL[label], "color": f"{0.12 * i}", "marker": ""})
-        for i, label in enumerate(labels)
-    ]  # fmt: skip
+        plot.Curve(text, *x(job.record["details"]), style={"linestyle": line, "color": "0.3", "marker": ""})
+        for (text, job), line in zip(context.shown(False).items(), (":", "--", "-."), strict=True)
+    ]
 
 
-def _draw_both(result: dict, title: str, draw: Callable, x_label: str, ticks: Sequence[str] = ()):
+def _draw_both(contexts: dict, result: dict, title: str, draw: Callable, x_label: str, ticks: Sequence[str] = ()):
     """Return a figure with a row for each material and a column for each truth."""
     panels = {
-        f"{name}, against {truth} ({letter})": draw(material, letter)
-        for name, material in curves(result).items()
+        f"{name}, against {truth} ({letter})": draw(context, letter)
+        for name, context in contexts.items()
         for letter, truth in (("C", "converged truth"), ("P", "the paper's reference"))
     }
     caption, label = figure_caption(result), "PSNR of shaded values, dB"
     return plot.draw_curves(result["title"] + title, caption, panels, x_label, label, ticks=ticks)
 
 
-def _readers(context: ShadingContenders, material: MaterialCurves) -> dict[str, ShadedReader]:
-    """Return the readers in crops and zooms: filtered parameters, and those of :meth:`MaterialCurves.shown`."""
-    labels = {"parameters filtered": "filtered", **{text: d["label"] for text, d in material.shown().items()}}
-    return {text: context.jobs[f"{context.name}, {label}"].model for text, label in labels.items()}
-
-
 def draw_crops(contexts: dict[str, ShadingContenders], result: dict):
-    """Draw crops of a minified level: filtered parameters, the best classical filter, λ = 0, the best λ, the truth."""
+    """Draw crops of a minified level, by each of the contenders shown and of the truth."""
     rows = {}
-    for name, material in curves(result).items():
-        evaluation = contexts[name].evaluation
+    for name, context in contexts.items():
+        evaluation = context.evaluation
         level = min(CROP_LEVEL, evaluation.levels - 1)
         truths = evaluation.truths["C"][level].clip(0, 1)
-        readers = _readers(contexts[name], material)
-        images = {text: evaluation.images(read, level).clip(0, 1) for text, read in readers.items()}
+        images = {text: evaluation.images(job.model, level).clip(0, 1) for text, job in context.shown().items()}
         first = images["parameters filtered"]
         pair = int(np.argmax(((first - truths) ** 2).mean(axis=(1, 2, 3))))  # with the largest error of the filter
         texts = {f"{t}\n{decibel(float(np.mean((i[pair] - truths[pair]) ** 2))):.1f} dB": i for t, i in images.items()}
@@ -718,8 +665,8 @@ def draw_crops(contexts: dict[str, ShadingContenders], result: dict):
 
 def draw_zoom(contexts: dict[str, ShadingContenders], result: dict):
     """Draw frames of the zoom of the first material."""
-    name, material = next(iter(curves(result).items()))
-    zoom = contexts[name].zoom
-    strips = {text: zoom.render(read) for text, read in _readers(contexts[name], material).items()}
+    name, context = next(iter(contexts.items()))
+    zoom = context.zoom
+    strips = {text: zoom.render(job.model) for text, job in context.shown().items()}
     title = f"{result['title']}: {name}, a zoom of {zoom.frames} frames"
     return plot.draw_images(title, figure_caption(result), zoom.rows({**strips, "truth": zoom.truth}), 2.0)

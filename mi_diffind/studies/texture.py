@@ -41,12 +41,12 @@ from ..measure.renders import TextureReader, TextureScene, TextureZoom
 from ..measure.report import figure_caption
 from ..measure.store import fingerprint
 from ..measure.study import FLOOR, Candidate, Case, Job, Measure, Plan, Study
+from ..measure.training import Contender, NetworkContender, load_arrays
 from ..plugins.support.image_files import PYRAMIDS
 from ..scenes.loading import footprint
 from ..tasks.texture import compressed, fit
 from . import equal_memory
 from .baselines import codecs, networks
-from .equal_memory import Contender, NetworkContender
 
 #: Names of methods in legends.
 BITMAP = "bitmap"
@@ -392,15 +392,14 @@ class TextureContenders:
             nbytes = equal_to.model.table.nbytes
             encoded, nbytes = codecs.astc_levels(self.truth_levels, nbytes, self.settings.astc, normals, cache=cache)
             maps = {name: e.levels for name, e in encoded.items()}
-            job.save_arrays(**{f"{name}_{i}": v for name, levels in maps.items() for i, v in enumerate(levels)})
             job.model = level_pyramid(maps, self.pyramid)
+            job.save_arrays(**{f"level_{i}": values for i, values in enumerate(job.model.values)})
             how = ", ".join(f"{name} {e.codec}" for name, e in encoded.items())
             return self.record(ASTC, job.budget, nbytes, None, maps, how=how)
 
         def read(job: Contender) -> Pyramid:
-            arrays, names = equal_memory.load_arrays(job.file), self.pyramid.layout.names
-            maps = {n: [arrays[f"{n}_{i}"] for i in range(self.pyramid.levels)] for n in names}
-            return level_pyramid(maps, self.pyramid)
+            arrays, like = load_arrays(job.file), self.pyramid
+            return Pyramid(like.layout, [arrays[f"level_{i}"] for i in range(like.levels)], like.types, like.border)
 
         return Contender(name, ASTC, equal_to.budget, fit, read, details={"equal_to": equal_to.name})
 

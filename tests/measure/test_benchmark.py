@@ -202,7 +202,7 @@ def crowd(rng, number):
     for k in range(number):
         time, accuracy = float(np.exp(rng.normal(1, 0.6))), float(rng.choice([40, 41, 70, 110]))
         points.append(plot.Point(f"candidate {k}", time, 0.95 * time, 1.1 * time, accuracy, f"form {k % 5}", k == 0))
-    return plot.Panel("crowd", "ns", points, [plot.Line("exact", 3.0, True), plot.Line("reference", 3.1, False)])
+    return plot.Panel("crowd", "ns", points, [("exact", 3.0, True), ("reference", 3.1, False)])
 
 
 def test_labels_do_not_cover_each_other(rng):

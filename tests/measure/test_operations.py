@@ -1,4 +1,4 @@
-"""Counts of operations: against expressions counted by hand, and whether effects that are left out fall out."""
+"""Counts of operations of expressions counted by hand, and of BSDFs with and without effects."""
 
 import drjit as dr
 import pytest
@@ -35,7 +35,7 @@ BY_HAND = {
     "all": (lambda x, y, z: (x * y + dr.sqrt(z)) / (x - y), (2, 1, 1, 1)),
     "two outputs that share": (lambda x, y, z: [x * y + z, x * y - z], (2, 1, 0, 0)),
     "fma of three, and a dot product": (lambda x, y, z: dr.fma(x, x, dr.fma(y, y, z * z)), (2, 3, 0, 0)),
-    "what the accounting leaves out": (
+    "minima and selections": (
         lambda x, y, z: dr.select(x < y, dr.maximum(x, z), dr.minimum(dr.abs(x), -z)),
         (0, 0, 0, 0),
     ),
@@ -84,7 +84,7 @@ def test_gathers(ad, kind, size):
     assert (twice.gathers, twice.bytes_gathered) == (2, 2 * size)
 
 
-def test_transcendental_functions_count_as_what_they_are(ad):
+def test_transcendental_functions(ad):
     x, _, _ = floats(ad, 3)
     found = count(lambda: dr.log(x))
     if ad.__name__.startswith("drjit.llvm"):  # a polynomial

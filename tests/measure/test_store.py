@@ -1,4 +1,4 @@
-"""What is kept of a run: taken over under the same key, else discarded with one sentence."""
+"""Partial results: used again under the same key, else discarded with one sentence."""
 
 import json
 import os
@@ -12,14 +12,14 @@ from mi_diffind.measure.store import Store, fingerprint, models_folder, sources
 KEY = {"settings": {"rounds": 3, "sides": (1, 2)}, "machine": "here", "limit": float("nan")}
 
 
-def made(folder, key=KEY, progress=False):
+def store_in(folder, key=KEY, progress=False):
     return Store(folder, "small", key, ("errors", "rounds"), progress)
 
 
 @pytest.fixture
-def kept(tmp_path):
-    """A folder with what a run has left."""
-    store = made(tmp_path)
+def interrupted(tmp_path):
+    """A folder with the partial results of a run."""
+    store = store_in(tmp_path)
     store.data["errors"]["a"] = {"db": 20.0}
     store.keep("image", exact=np.arange(6.0).reshape(2, 3), learned=np.ones(2))
     store.save()
@@ -27,57 +27,55 @@ def kept(tmp_path):
     return tmp_path
 
 
-def test_goes_on(kept, capsys):
-    store = made(kept, progress=True)
+def test_continued(interrupted, capsys):
+    store = store_in(interrupted, progress=True)
     assert store.resumed and store.data == {"errors": {"a": {"db": 20.0}}, "rounds": {}}
     assert np.array_equal(store.arrays["image"]["exact"], np.arange(6.0).reshape(2, 3))
-    assert capsys.readouterr().err == f"continuing from {kept / 'tradeoff_small.partial.json'}\n"
-    Store.remove(kept, "small")
-    assert os.listdir(kept) == ["other.txt"]
+    assert capsys.readouterr().err == f"continuing from {interrupted / 'tradeoff_small.partial.json'}\n"
+    Store.remove(interrupted, "small")
+    assert os.listdir(interrupted) == ["other.txt"]
 
 
-def damaged(path, what):
-    if what == "cut off":
-        path.write_text(path.read_text()[:-20])
-    elif what == "another kind":
-        path.write_text(json.dumps([1, 2]))
-    elif what == "another form":
-        path.write_text(json.dumps({**json.loads(path.read_text()), "data": {"errors": 3, "rounds": {}}}))
-    elif what == "no text":
-        path.write_bytes(b"\xff\x00\xfe")
-    elif what == "no array":
-        path.with_suffix(".image.npz").unlink()
-    else:
-        path.with_suffix(".image.npz").write_bytes(b"nothing")
+#: Damage → function of the file of a store.
+DAMAGES = {
+    "cut off": lambda path: path.write_text(path.read_text()[:-20]),
+    "a list": lambda path: path.write_text("[1, 2]"),
+    "a section": lambda path: path.write_text(
+        json.dumps({**json.loads(path.read_text()), "data": {"errors": 3, "rounds": {}}})
+    ),
+    "no text": lambda path: path.write_bytes(b"\xff\x00\xfe"),
+    "no array": lambda path: path.with_suffix(".image.npz").unlink(),
+    "array": lambda path: path.with_suffix(".image.npz").write_bytes(b"nothing"),
+}
 
 
-@pytest.mark.parametrize("what", ["cut off", "another kind", "another form", "no text", "no array", "array"])
-def test_what_is_damaged_is_discarded(kept, what, capsys):
-    path = kept / "tradeoff_small.partial.json"
-    damaged(path, what)
-    store = made(kept, progress=True)
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damaged_results_are_discarded(interrupted, damage, capsys):
+    path = interrupted / "tradeoff_small.partial.json"
+    DAMAGES[damage](path)
+    store = store_in(interrupted, progress=True)
     assert not store.resumed and store.data == {"errors": {}, "rounds": {}} and not store.arrays
     assert capsys.readouterr().err == f"{path} is damaged: starting anew\n"
-    assert os.listdir(kept) == ["other.txt"]
+    assert os.listdir(interrupted) == ["other.txt"]
 
 
 @pytest.mark.parametrize("change", [{"machine": "there"}, {"settings": {"rounds": 4}, "machine": "x"}, {"new": 1}])
-def test_another_key_is_said(kept, change, capsys):
-    store = made(kept, {**KEY, **change}, progress=True)
+def test_another_key_is_named(interrupted, change, capsys):
+    store = store_in(interrupted, {**KEY, **change}, progress=True)
     assert not store.resumed
     names = ", ".join(change)
-    path = kept / "tradeoff_small.partial.json"
+    path = interrupted / "tradeoff_small.partial.json"
     assert capsys.readouterr().err == f"{path} is of a run with other {names}: starting anew\n"
 
 
-def test_without_a_folder_nothing_is_kept(tmp_path, monkeypatch):
+def test_without_a_folder_nothing_is_written(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    store = made(None)
+    store = store_in(None)
     store.keep("image", exact=np.ones(2))
     store.save()
     assert os.listdir(tmp_path) == [] and store.arrays["image"]["exact"].size == 2
     with pytest.raises(OutputError, match="does not exist"):
-        made(tmp_path / "nowhere" / "out")
+        store_in(tmp_path / "nowhere" / "out")
 
 
 def test_fingerprint(tmp_path):
@@ -89,7 +87,7 @@ def test_fingerprint(tmp_path):
     assert both != fingerprint([tmp_path / "a.py", tmp_path / "b.py"])
 
 
-def test_sources_are_all_that_a_measurement_depends_on():
+def test_sources():
     names = {path.name for path in sources()}
     assert {"neural_image.py", "lookup.py", "clock.py", "texture.py", "codecs.py"} < names
     assert any(name.endswith(".npz") for name in names)

@@ -169,7 +169,7 @@ def test_interruption_and_the_same_errors_in_the_end(scene, whole, tmp_path, mon
     assert result["interrupted"] and len(renders) == stop_at
     assert (result["points"] == []) == (stop_at <= 7)
     paths = study.write(result, out)  # with whatever there is
-    assert ("png" in paths) == (stop_at > 7) and "interrupted" in "\n".join(study.summary(result))
+    assert ("png" in paths) == (stop_at > 7) and "Interrupted" in "\n".join(study.summary(result))
     assert json.loads(Path(paths["json"]).read_text(encoding="utf-8"))["interrupted"]
 
     capsys.readouterr()

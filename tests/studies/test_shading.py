@@ -1,4 +1,4 @@
-"""``tradeoff shading``: materials, trouble of trainings, records of seeds, the zoom, equal errors of renders."""
+"""``tradeoff shading``: materials, trouble of trainings, the zoom, equal errors of renders."""
 
 from types import SimpleNamespace
 
@@ -55,27 +55,6 @@ def history(losses, values):
 def test_trouble(changes, trouble):
     run = {"history": history([2, 1, 1], [20, 21, 22]), "restarts": 0, "C": {"mean_db": 22.0}, **changes}
     assert shading.troubles(run, {"C": {"mean_db": 20.0}}) == trouble
-
-
-def test_records_of_seeds():
-    """Records of λ = 0 stand under both clips of a schedule; the best λ and filter are shown."""
-
-    def record(kind, label, psnr, share=0.0, way=""):
-        schedule = bool(way) and shading.REMEDIES[way][1]
-        details = {"material": "m", "kind": kind, "label": label, "share": share, "way": way, "schedule": schedule}
-        return {"details": {**details, "C": {"mean_db": psnr}, "trouble": ["below"] * (psnr < 20)}}
-
-    both, none = "clip, schedule", "no clip, schedule"
-    records = [record("classical", "filtered", 25), record("classical", "LEAN", 22), record("compressed", "baked", 21)]
-    records += [record("run", f"{share}, {way}", psnr, share, way) for share, way, psnr in (
-        (0, both, 20), (0, both, 21), (0.9, both, 23), (0.9, both, 24), (0.9, none, 18), (0.9, none, 30))]  # fmt: skip
-    material = shading.curves({"jobs": dict(enumerate(records))})["m"]
-    assert list(material.classical) == ["filtered", "LEAN"] and list(material.compressed) == ["baked"]
-    assert material.remedies == [both, none] and material.values(none, 0.0) == [20, 21]
-    assert shading.trouble(material.runs[none, 0.9]) == "below 1"
-    shown = material.shown()
-    assert list(shown) == ["LEAN, uncompressed", "λ 0, compressed", "λ 0.9, compressed"]
-    assert shown["λ 0.9, compressed"]["way"] == none
 
 
 def test_the_zoom_is_what_the_camera_sees(mi_rgb):

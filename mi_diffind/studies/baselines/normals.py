@@ -32,14 +32,14 @@ from ...maps.pyramid import Pyramid, halved
 from ...tasks.disney.decoder import Decoder, Lobe
 from ...tasks.disney.model import ALPHA_MIN, Effects
 from ...tasks.disney.training import uniform_hemisphere
-from ...tasks.shading.evaluation import ShadedReader, reference
+from ...tasks.shading.evaluation import ShadedEvaluation, ShadedReader, reference
 from ...tasks.shading.material import DEFAULTS, frame, maps_of, shaded, surface_of
 
 #: Least third component in the slope of a normal: a slope of 10.
 STEEPEST = 0.1
 
 #: Biases of the level of detail that :func:`choose_biases` tries.
-BIASES = tuple(np.arange(-8, 5) / 8)
+BIASES = tuple(float(bias) for bias in np.arange(-8, 5) / 8)
 
 #: Shares of the way from a texel's filtered roughness (0) to 1 that :func:`bake` tries; a parabola through the errors
 #: of three of them refines the best one.
@@ -48,14 +48,8 @@ TRIED = np.linspace(0, 1, 28)
 #: Pairs of a view and a light that :func:`bake` averages over.
 PAIRS = 32
 
-#: Seed of pairs and places; trainings and evaluations use others.
+#: Seed of pairs; trainings and evaluations use others.
 SEED = 20050711
-
-#: Places of each level, each with its own view and light, by which a bias is chosen.
-PLACES = 2**14
-
-#: Number of levels with a bias of their own.
-BIASED = 7
 
 #: Places along each side of a texel at which moments are averaged.
 INSIDE = 4
@@ -241,13 +235,10 @@ def _refined_minimum(errors: np.ndarray) -> np.ndarray:
 
 def roughness_levels(pyramid: Pyramid) -> list[np.ndarray]:
     """Return the roughness of each level of a pyramid, ``(height, width)``."""
-    m, levels = maps_of(pyramid.layout).get("roughness"), []
-    for values in pyramid.values:
-        value = DEFAULTS["roughness"]
-        if m is not None:
-            (value,) = pyramid.layout.decode(m.name, np.moveaxis(values, -1, 0))
-        levels.append(np.broadcast_to(np.asarray(value, np.float32), values.shape[:2]))
-    return levels
+    m = maps_of(pyramid.layout).get("roughness")
+    if m is None:
+        return [np.full(values.shape[:2], DEFAULTS["roughness"], np.float32) for values in pyramid.values]
+    return [pyramid.decode([m.name], level=level)[m.name][..., 0] for level in range(pyramid.levels)]
 
 
 def with_roughness(pyramid: Pyramid, levels: Sequence[np.ndarray]) -> Pyramid:
@@ -288,25 +279,7 @@ def biased(read: ShadedReader, biases: Sequence[float]) -> ShadedReader:
     return at
 
 
-def choose_biases(read: ShadedReader, pyramid: Pyramid, effects: Effects, places: int = PLACES) -> list[float]:
-    """Return, for each level, the entry of :data:`BIASES` whose ``read`` is nearest to the converged truth.
-
-    The error is measured at random ``places``, views and lights. Few of them see a highlight, so the same ones are used
-    for all levels.
-    """
-    types, chosen = pyramid.types, []
-    rng = np.random.default_rng(SEED)
-    numbers = [types.Float(aligned_copy(x)) for x in rng.random((6, places), dtype=np.float32)]
-    u, v = numbers[:2]
-    view_light = [uniform_hemisphere(types, numbers[i], numbers[i + 1]) for i in (2, 4)]
-    dr.eval(view_light)
-    for level in range(min(BIASED, pyramid.levels)):
-        detail = dr.opaque(types.Float, level, places)
-        truth = dr.clip(reference("converged", pyramid, u, v, detail, *view_light, effects, side=_side(level)), 0, 1)
-        dr.eval(truth)
-        errors = []
-        for bias in BIASES:
-            value = read(u, v, dr.opaque(types.Float, max(level + bias, 0), places), *view_light)
-            errors.append(float(dr.mean(dr.squared_norm(dr.clip(value, 0, 1) - truth))[0]))
-        chosen.append(float(BIASES[int(np.argmin(errors))]))
-    return chosen
+def choose_biases(read: ShadedReader, evaluation: ShadedEvaluation) -> list[float]:
+    """Return, for each level, the one of :data:`BIASES` with which ``read`` is nearest to the converged truth."""
+    psnr = [evaluation.measure(biased(read, [bias]), False)["C"]["psnr_db"] for bias in BIASES]
+    return [BIASES[i] for i in np.argmax(psnr, axis=0)]
