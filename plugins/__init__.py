@@ -19,7 +19,7 @@ from mi_diffind.core import compat, discovery
 IGNORED = ("support", "mitsuba_entry")
 
 #: Type of a plugin → the class in ``mitsuba`` whose instances its factory returns.
-OBJECT_TYPES = {"bsdf": "BSDF", "texture": "Texture", "shape": "Shape", "volume": "Volume", "integrator": "Integrator"}
+OBJECT_TYPES = {"bsdf": "BSDF", "texture": "Texture", "shape": "Shape", "integrator": "Integrator"}
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class Plugin:
         named = {**{c.name: c for c in self.others}, "exact": self.exact}
         return next(filter(None, map(named.get, (against,) if isinstance(against, str) else against)), None)
 
-    def described(self, props) -> dict:
+    def describe(self, props) -> dict:
         """Return a plain description of the properties (``mi.Properties``) of an instance.
 
         It has the keys ``plugin``, ``kind`` (the object type), ``id`` and ``parameters`` (numbers, text, colours and
@@ -183,12 +183,8 @@ def register(variant: str) -> None:
     _declared[variant] = declarations = {}
     for plugin in _load():
         declarations[plugin.name] = plugin
-        if supported(variant):
-            factory = _checking_factory(plugin)
-        elif plugin.object_type != "volume":  # in scalar variants, Mitsuba needs the type of every object it loads
-            factory = _refusing_factory(plugin.name, variant)
-        else:
-            continue
+        # In scalar variants, Mitsuba needs the type of every object that it loads
+        factory = _checking_factory(plugin) if supported(variant) else _refusing_factory(plugin.name, variant)
         compat.register(plugin.object_type, plugin.name, factory)
 
 
@@ -223,7 +219,7 @@ def _checking_factory(plugin: Plugin):
                 f'plugin "{plugin.name}": the factory returned {returned}, a {plugin.object_type} is needed'
             )
         unknown = [key for key in props if not props.was_queried(key)]  # Mitsuba refuses these, if they stay so
-        description = plugin.described(props)
+        description = plugin.describe(props)
         for key in unknown:
             props.mark_queried(key, False)
         part = _parts.pop(id(instance), instance)
@@ -279,7 +275,7 @@ def _forget_dead() -> None:
 
 
 def origin(instance) -> dict | None:
-    """Return the description of an instance of a plugin (:meth:`Plugin.described`); ``None`` for any other object."""
+    """Return the description of an instance of a plugin (:meth:`Plugin.describe`); ``None`` for any other object."""
     recorded = getattr(instance, "_origin", None)
     if recorded is not None:
         return recorded.description

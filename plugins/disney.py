@@ -236,28 +236,25 @@ class Disney(mi.BSDF):
         self.m_components = [mi.BSDFFlags.DiffuseReflection | sides, anisotropic if is_anisotropic else glossy, glossy]
         self.m_flags = self.m_components[0] | self.m_components[1] | self.m_components[2]
 
-    def _textures(self) -> dict[str, mi.Texture]:
-        textures = {"base_color": self.base_color, **self.scalars, self.reflectance_name: self.reflectance}
-        return {name: texture for name, texture in textures.items() if isinstance(texture, mi.Texture)}
+    def _parameters(self) -> dict:
+        """Return the textures and numbers of the model that the material has itself, by name."""
+        given = {"base_color": self.base_color, **self.scalars, self.reflectance_name: self.reflectance}
+        return {name: value for name, value in given.items() if value is not None}
 
-    def _numbers(self) -> dict:
-        """Return the parameters that are numbers, by name."""
-        rates = {name: self.rates[lobe] for lobe, name in self.RATES.items()}
-        is_number = isinstance(self.reflectance, dr.ArrayBase)
-        return {**rates, self.reflectance_name: self.reflectance} if is_number else rates
+    def _textures(self) -> dict[str, mi.Texture]:
+        return {name: v for name, v in self._parameters().items() if not isinstance(v, dr.ArrayBase)}
 
     def traverse(self, cb: mi.TraversalCallback):
-        given = {"base_color": self.base_color, **self.scalars, self.reflectance_name: self.reflectance}
-        for name, texture in given.items():
-            if texture is not None:
-                cb.put(name, texture, _DISCONTINUOUS if name in ("roughness", "specular", "eta") else _DIFFERENTIABLE)
+        for name, value in self._parameters().items():
+            cb.put(name, value, _DISCONTINUOUS if name in ("roughness", "specular", "eta") else _DIFFERENTIABLE)
         for lobe, name in self.RATES.items():
             cb.put(name, self.rates[lobe], mi.ParamFlags.NonDifferentiable)
         self.tables.traverse(cb)
 
     def parameters_changed(self, keys: list[str] = ()):
         self.tables.accept()
-        make_opaque(self._numbers())
+        rates = {name: self.rates[lobe] for lobe, name in self.RATES.items()}
+        make_opaque(rates | {name: v for name, v in self._parameters().items() if isinstance(v, dr.ArrayBase)})
         self._prepare_constants()
 
     def _find_effects(self) -> tuple[Effects, dict[str, str]]:
@@ -377,25 +374,26 @@ class Disney(mi.BSDF):
             return dr.detach(dr.select(active, mi.Float(pdf) * point.share, 0))
 
     def eval(self, ctx, si, wo, active=True):
-        point, effects = self._point(ctx, si, active), self._effects()
-        coefficients = self._surface(point, effects, density=False)
-        lobes = tuple(self._rates(ctx, effects))
-        return self._value(point, coefficients, effects, lobes, wo, self._prepare(point, wo, active))
+        return self._answer(ctx, si, wo, active, density=False)[0]
 
     def pdf(self, ctx, si, wo, active=True):
-        point, effects = self._point(ctx, si, active), self._effects()
-        coefficients = self._surface(point, effects, value=False)
-        return self._density(point, coefficients, effects, self._rates(ctx, effects), self._prepare(point, wo, active))
+        return self._answer(ctx, si, wo, active, value=False)[1]
 
     def eval_pdf(self, ctx, si, wo, active=True):
-        point, effects = self._point(ctx, si, active), self._effects()
-        coefficients = self._surface(point, effects)
-        return self._eval_pdf(point, coefficients, effects, self._rates(ctx, effects), wo, active)
+        return self._answer(ctx, si, wo, active)
 
-    def _eval_pdf(self, point, coefficients, effects, rates, wo, active):
+    def _answer(self, ctx, si, wo, active, value: bool = True, density: bool = True) -> tuple:
+        """Return the value and the density, ``None`` for the one that is not asked for."""
+        point, effects = self._point(ctx, si, active), self._effects()
+        coefficients, rates = self._surface(point, effects, value, density), self._rates(ctx, effects)
+        return self._eval_pdf(point, coefficients, effects, rates, wo, active, value, density)
+
+    def _eval_pdf(self, point, coefficients, effects, rates, wo, active, value=True, density=True) -> tuple:
         directions = self._prepare(point, wo, active)
-        value = self._value(point, coefficients, effects, tuple(rates), wo, directions)
-        return value, self._density(point, coefficients, effects, rates, directions)
+        return (
+            self._value(point, coefficients, effects, tuple(rates), wo, directions) if value else None,
+            self._density(point, coefficients, effects, rates, directions) if density else None,
+        )
 
     def sample(self, ctx, si, sample1, sample2, active=True):
         return self._sample(ctx, self._point(ctx, si, active), sample1, sample2, active)
@@ -446,10 +444,7 @@ class Disney(mi.BSDF):
         return mi.depolarizer(mi.Spectrum(self.base_color.eval(si, active)))
 
     def to_string(self):
-        lines = [f"{name} = {texture}" for name, texture in self._textures().items()]
-        if not isinstance(self.reflectance, mi.Texture):
-            lines.append(f"{self.reflectance_name} = {self.reflectance}")
-        report = self.report()
+        lines, report = [f"{name} = {value}" for name, value in self._parameters().items()], self.report()
         if report["storage"]:
             lines.append(f"preset = {report['preset']}, {report['table_bytes']} bytes as {report['storage']}")
         lines.append(f"effects = {', '.join(report['effects_in_use'])}")

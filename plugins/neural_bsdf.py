@@ -139,9 +139,7 @@ class NeuralBSDF(mi.BSDF):
         if "filename" not in props:
             raise RuntimeError('parameter "filename": not given, a table file is needed (mi-diffind fit bsdf)')
         properties.check_range(props, "scale", 0, 1)
-        self.two_sided = props.get("two_sided", False)
-        if not isinstance(self.two_sided, bool):
-            raise RuntimeError(f'parameter "two_sided": found {self.two_sided}, allowed are true and false')
+        self.two_sided = properties.flag(props, "two_sided")
         self.energy = properties.one_of(props, "energy", ("source", "raw"))
         self.scale = dr.opaque(mi.Float, float(props.get("scale", 1.0)))
         self.model = open_tables(props, TASK)

@@ -8,7 +8,6 @@ from functools import cache
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind.arrays.tables import TableError
 from mi_diffind.core import compat
 
 from . import Counterpart, Plugin, warn
@@ -17,7 +16,7 @@ from .path_footprint import integrator as path_footprint
 from .support import omissions, properties, tables
 from .support.footprint import Differentials
 from .support.manual import shared_parts
-from .support.placed_fields import FieldLight, PlacedField, VariantLight, grouped, in_order, to_grid
+from .support.placed_fields import FieldLight, PlacedField, VariantLight, join_overlapping, to_grid
 
 #: Properties that the default integrator of surfaces takes.
 INNER = ("max_depth", "rr_depth", "hide_emitters", "jitter")
@@ -265,15 +264,15 @@ def integrator() -> type:
                     'parameter "surroundings": true for a field among nested ones, allowed is false, since '
                     "surroundings fill all space"
                 )
-            self.groups = grouped(self.fields)
+            self.groups = join_overlapping(self.fields)
+            self.field_light = FieldLight(self.groups, self.light, self.lit)
             if self.lit and type(self.surfaces) is not path_footprint():
                 raise RuntimeError(
                     f'parameter "lit": the nested integrator {compat.integrator_name(self.surfaces)} does not see '
                     f"fields, allowed are path_footprint and none"
                 )
-            self.field_light = FieldLight(self.groups, self.light) if self.lit else None
             if isinstance(self.surfaces, path_footprint()):
-                self.surfaces.between = self.field_light
+                self.surfaces.between = self.field_light if self.lit else None
             self._hold()
 
         def _hold(self) -> None:
@@ -425,7 +424,7 @@ def integrator() -> type:
                 *_, state = self.primal(scene, sampler.clone(), ray)
                 for placed in self.groups:
                     placed.start_forward()
-                return developed(*self.replayed(dr.ADMode.Forward, scene, sampler, ray, state, surfaces))
+                return developed(*self.differentiate(dr.ADMode.Forward, scene, sampler, ray, state, surfaces))
 
         def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
             with dr.suspend_grad():
@@ -445,7 +444,7 @@ def integrator() -> type:
                 film.clear()
                 *_, state = self.primal(scene, sampler.clone(), ray)
                 with dr.isolate_grad():  # derivatives come in parts to what a placement is attached to
-                    self.replayed(dr.ADMode.Backward, scene, sampler, ray, state, surfaces, adjoint)
+                    self.differentiate(dr.ADMode.Backward, scene, sampler, ray, state, surfaces, adjoint)
                 dr.eval()
 
         def _surfaces_optimised(self, scene) -> bool:
@@ -488,7 +487,7 @@ def integrator() -> type:
             state = light, clear, path.depth, path.opacity, state
             return light, 1 - clear, [aovs[name] for name in self.aovs], state
 
-        def replayed(self, mode, scene, sampler, ray, state, surfaces, adjoint=None) -> tuple:
+        def differentiate(self, mode, scene, sampler, ray, state, surfaces, adjoint=None) -> tuple:
             """Run a differential phase.
 
             ``Forward`` returns the derivatives of light, alpha and channels. ``Backward`` propagates the derivatives
@@ -570,7 +569,7 @@ def integrator() -> type:
 
             # ---------------------- Next surface ----------------------
 
-            entered = [placed.enters(ray, ray.maxt, active) for placed in self.groups]
+            entered = self.field_light.enters(ray, ray.maxt, active)
             met = active
             if not onward and "depth" not in self.aovs:
                 met = mi.Bool(False)
@@ -585,13 +584,22 @@ def integrator() -> type:
 
             # ---------------------- Fields up to the surface ----------------------
 
-            through = mi.Float(1)
-            for placed, crossed in in_order(self.groups, entered):
-                through = self._see(mode, path, placed, ray, far, crossed, first, through)
             if mode is None:
-                distance = dr.select(met & (pi.is_valid() | solid), far, 0)
+                L, through, depth = self.field_light.cross(ray, far, active, entered)
+                depth += through * dr.select(met & (pi.is_valid() | solid), far, 0)
                 path.opacity = dr.select(first, 1 - through, path.opacity)
-                path.depth += dr.select(first, through * distance, 0)
+                path.L, path.depth = path.L + path.β * L, path.depth + dr.select(first, depth, 0)
+            else:
+                δdepth, clear = dr.select(first, path.δdepth, 0), dr.select(first, 1 - path.opacity, 0)
+                change, (L, through, depth) = self.field_light.derive(
+                    mode, ray, far, active, path.δL, path.β, path.L, entered, path.δclear - path.δopacity * clear,
+                    δdepth, path.depth,
+                )  # fmt: skip
+                path.L, path.depth = path.L - path.β * L, path.depth - dr.select(first, depth, 0)
+                path.δL, path.δclear = path.δL + change[0], path.δclear + change[1]
+                path.δopacity -= clear * change[1]
+                path.δdepth += dr.select(first, change[2], 0)
+            path.β, path.clear = path.β * through, path.clear * through
             path.active, path.handed = mi.Bool(False), path.handed | (active & (through > 0))
             if not onward:
                 return path
@@ -646,54 +654,17 @@ def integrator() -> type:
             path.count = dr.select(active_next, path.count + 1, path.count)
             return path
 
-        def _see(self, mode, path, placed, ray, far, crossed, first, before):
-            """Add the light of a field behind a transmittance ``before``; return the transmittance behind the field."""
-            marched, through = placed.march(ray, far, crossed)
-            light = dr.select(crossed, path.β * self.light.of(marched.colour, ray.wavelengths, crossed), 0)
-            depth = dr.select(first, before * marched.depth * placed.size, 0)
-            if mode is None:
-                path.L, path.depth = path.L + light, path.depth + depth
-            else:
-                path.L, path.depth = path.L - light, path.depth - depth
-                if placed.optimised():
-                    self._derive(mode, path, placed, ray, far, crossed, first, before, marched, through)
-            path.β, path.clear = path.β * through, path.clear * through
-            return before * through
-
-        def _derive(self, mode, path, placed, ray, far, crossed, first, before, marched, through) -> None:
-            """Propagate the derivatives of the light that a field adds; ``path`` holds the light behind the field."""
-            inverse = dr.select(through > 0, dr.rcp(through), 0)
-            # The derivative by the logarithm of a transmittance is all that is transmitted
-            behind, clear = dr.select(first, path.depth, 0), dr.select(first, 1 - path.opacity, 0)
-            if mode == dr.ADMode.Backward:
-                d_colour = self.light.adjoint(marched.colour, ray.wavelengths, path.δL * path.β, crossed)
-                d_through = dr.sum(path.δL * path.L) + path.δclear
-                d_through += path.δdepth * behind - path.δopacity * clear
-                d_depth = dr.select(first, path.δdepth * before, 0)
-                placed.replay(ray, far, crossed, marched, d_colour, d_through * inverse, d_depth)
-                return
-            colour, transmittance, depth = placed.tangent(ray, far, crossed, marched)
-            seen = self.light.tangent(marched.colour, colour, ray.wavelengths, crossed)
-            share = transmittance * inverse
-            path.δL += dr.select(crossed, path.β * seen + path.L * share, 0)
-            path.δclear += share
-            path.δopacity -= clear * share
-            path.δdepth += dr.select(first, before * depth, 0) + behind * share
-
     return NeuralField
 
 
 def open_model(props: mi.Properties):
-    """Return the model that the properties ``filename`` and ``storage`` name. Raises ``RuntimeError``."""
+    """Return the model that the properties ``filename`` and ``storage`` name."""
     path, storage = properties.filename(props), properties.one_of(props, "storage", ("uint8", "float32"))
     if not path:
         raise RuntimeError('parameter "filename": not given, a file of "mi-diffind fit field" is needed')
     from mi_diffind.tasks.radiance import TASK
 
-    try:
-        return TASK.open(mi.TensorXf, path, storage=storage if storage == "float32" else "")
-    except (TableError, ValueError) as e:
-        raise RuntimeError(str(e)) from None
+    return TASK.open(mi.TensorXf, path, storage=storage if storage == "float32" else "")
 
 
 PLUGIN = Plugin(

@@ -132,9 +132,7 @@ class NeuralGGX(mi.BSDF):
         self.distribution, net = opened.distribution, opened.distribution.net
         self.tables = Tables({"primary": net.primary[0], "cascaded": net.cascaded}, opened.table)
 
-        self._tracked_alpha = TrackedParameter(self.alpha)
-        self._tracked_ior = [TrackedParameter(self.eta, colour=True), TrackedParameter(self.k, colour=True)]
-        self._tracked_factor = TrackedParameter(self.specular_reflectance, colour=True) if has_factor else None
+        self._tracked = {name: TrackedParameter(t, colour=name != "alpha") for name, t in self._textures().items()}
         #: Evaluated terms of a constant roughness.
         self._constant: Roughness | None = None
 
@@ -146,10 +144,8 @@ class NeuralGGX(mi.BSDF):
         when_outermost(self._prepare_constants)
 
     def _textures(self) -> dict[str, mi.Texture]:
-        textures = {"alpha": self.alpha, "eta": self.eta, "k": self.k}
-        if self.specular_reflectance is not None:
-            textures["specular_reflectance"] = self.specular_reflectance
-        return textures
+        factor = {} if self.specular_reflectance is None else {"specular_reflectance": self.specular_reflectance}
+        return {"alpha": self.alpha, "eta": self.eta, "k": self.k, **factor}
 
     def trained(self) -> tuple:
         """Return the table of the file, and the arrays that can be optimised, by name."""
@@ -166,11 +162,8 @@ class NeuralGGX(mi.BSDF):
         self.tables.accept()
         self._prepare_constants()
 
-    def _parameters(self) -> list[TrackedParameter]:
-        return [self._tracked_alpha, *self._tracked_ior, *([self._tracked_factor] if self._tracked_factor else [])]
-
     def _prepare_constants(self) -> None:
-        for parameter in self._parameters():
+        for parameter in self._tracked.values():
             parameter.update()
         self._constant = None
         if self._is_constant():
@@ -184,7 +177,7 @@ class NeuralGGX(mi.BSDF):
 
     def _is_constant(self) -> bool:
         """Return whether the roughness is constant, and neither changed nor, like the tables, being optimised."""
-        return self._tracked_alpha.is_fixed() and not self.tables.optimised()
+        return self._tracked["alpha"].is_fixed() and not self.tables.optimised()
 
     def _roughness(self, si, active) -> Roughness:
         if self._constant is not None and self._is_constant():
@@ -193,11 +186,11 @@ class NeuralGGX(mi.BSDF):
 
     def _reflects_all(self) -> bool:
         """Return whether the index of refraction is 0 + 1i, which reflects all light."""
-        eta, k = (parameter.bounds() for parameter in self._tracked_ior)
-        return eta.is_always(0) and k.is_always(1)
+        return self._tracked["eta"].bounds().is_always(0) and self._tracked["k"].bounds().is_always(1)
 
     def _has_factor(self) -> bool:
-        return self._tracked_factor is not None and not self._tracked_factor.bounds().is_always(1)
+        factor = self._tracked.get("specular_reflectance")
+        return factor is not None and not factor.bounds().is_always(1)
 
     def _value(self, ctx, si, r: Roughness, wi, wo, active):
         """Return f · cos = F D̂ (n·o) / (d(n·i) d(n·o)).
@@ -307,17 +300,6 @@ def _masking(r: Roughness, c):
     return c + dr.sqrt(dr.fma(r.alpha2, 1 - c2, c2))
 
 
-class _Children(mi.TraversalCallback):
-    """Callback that collects the parameters and nested objects of a plugin, by name."""
-
-    def __init__(self):
-        super().__init__()
-        self.values = {}
-
-    def put(self, name, value, flags):
-        self.values[name] = value
-
-
 def _index_of_refraction(props: mi.Properties) -> tuple[mi.Texture, mi.Texture]:
     """Return the textures ``eta`` and ``k``, given as properties or by the name of a material, as in Mitsuba."""
     material = str(props.get("material", "none"))
@@ -325,15 +307,19 @@ def _index_of_refraction(props: mi.Properties) -> tuple[mi.Texture, mi.Texture]:
         raise RuntimeError('parameter "material": sets "eta" and "k", give either a material or these')
     if material == "none":
         return props.get_unbounded_texture("eta", 0.0), props.get_unbounded_texture("k", 1.0)
-    children, preset = _Children(), mi.Properties("roughconductor")
-    preset["material"] = material
+    children = {}
+
+    class Children(mi.TraversalCallback):
+        def put(self, name, value, flags):
+            children[name] = value
+
     try:
-        mi.PluginManager.instance().create_object(preset).traverse(children)
+        mi.load_dict({"type": "roughconductor", "material": material}).traverse(Children())
     except RuntimeError as e:
         if "does not exist" not in str(e):
             raise
         raise RuntimeError(f'parameter "material": found "{material}", Mitsuba has no such preset') from None
-    return children.values["eta"], children.values["k"]
+    return children["eta"], children["k"]
 
 
 def _polarised(ctx, eta, k, h, cos, wi, wo):

@@ -12,14 +12,14 @@ from mi_diffind.maps.layout import Layout, MapLayout
 from mi_diffind.tasks.disney import TASK as DISNEY
 from mi_diffind.tasks.disney.decoder import Lobe
 from mi_diffind.tasks.disney.model import PARAMETERS, clamp
-from mi_diffind.tasks.shading.material import frame, lobe_of, shadowing
+from mi_diffind.tasks.shading.material import frame, shadowing, specular_lobe
 from mi_diffind.tasks.texture import TASK
 
 from . import Counterpart, Plugin
 from .disney import Disney, Parameters, ShadedPoint, to_principled
 from .support import properties, textures
 from .support.bsdfs import TrackedParameter
-from .support.image_files import SharedMaps, layout_of, open_compressed, remove, to_bitmap, to_mipmap
+from .support.image_files import SharedMaps, file_layout, open_compressed, remove, to_bitmap, to_mipmap
 from .support.manual import shared_parts
 from .support.map_textures import FilteredTexture
 from .support.textures import FILTERS, anisotropic, isotropic
@@ -133,7 +133,7 @@ class MaterialMaps(FilteredTexture):
             ddx, ddy = self._footprint(si)
             taps = self.filter.taps
             level = isotropic(ddx, ddy) if self.filter.name == "trilinear" else anisotropic(ddx, ddy, taps)[0]
-        return lobe_of(self.image.extra(*self._wrapped_at(uv, self.image.biased(level)), level))
+        return specular_lobe(self.image.extra(*self._wrapped_at(uv, self.image.biased(level)), level))
 
     def is_constant(self, parameter: str) -> bool:
         """Return whether the map of a parameter is one colour or number."""
@@ -250,9 +250,7 @@ class NeuralMaterial(Disney):
         if lobes != "exact":
             self.decoder = DISNEY.open(mi.TensorXf, preset=lobes, storage="uint8").decoder
         self.lobes = lobes
-        self.two_sided = props.get("two_sided", False)
-        if not isinstance(self.two_sided, bool):
-            raise RuntimeError(f'parameter "two_sided": found {self.two_sided}, allowed are true and false')
+        self.two_sided = properties.flag(props, "two_sided")
         self.maps = MaterialMaps(props)
         for name in ("base_color", *self.scalars, "subsurface", "specular", "eta"):
             if name in props and isinstance(props[name], mi.Texture) and not compat.is_constant_texture(props[name]):
@@ -412,7 +410,7 @@ class MapPoint(ShadedPoint):
 
 def _convert(props: mi.Properties, bsdf: str, texture: str) -> str:
     """Change properties to those of Mitsuba's plugins, nested, and return the name of the outermost one."""
-    maps, _ = material_maps(layout_of(TASK, props), ignored(props))
+    maps, _ = material_maps(file_layout(TASK, props), ignored(props))
     sides = props.get("two_sided", False)
 
     def shown(name: str) -> mi.Texture:

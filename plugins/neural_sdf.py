@@ -11,7 +11,6 @@ from weakref import WeakValueDictionary
 import mitsuba as mi
 import numpy as np
 
-from mi_diffind.arrays.tables import TableError
 from mi_diffind.core.files import stamp
 from mi_diffind.tasks.sdf import TASK, grids, marching
 
@@ -47,19 +46,16 @@ TYPICAL_ERROR = 0.005
 
 
 def open_model(props: mi.Properties):
-    """Return the model that the properties ``filename`` and ``storage`` name. Raises ``RuntimeError``."""
+    """Return the model that the properties ``filename`` and ``storage`` name."""
     path, storage = properties.filename(props), properties.one_of(props, "storage", ("uint8", "float32"))
     if not path:
         raise RuntimeError('parameter "filename": not given, a file of "mi-diffind fit sdf" is needed')
+    if storage == "float32":
+        return TASK.open(mi.TensorXf, path, storage=storage)
     key = (path, stamp(Path(path)), mi.TensorXf)
-    try:
-        if storage == "float32":
-            return TASK.open(mi.TensorXf, path, storage=storage)
-        with _lock:
-            model = _shared.get(key)
-            return model if model is not None else _shared.setdefault(key, TASK.open(mi.TensorXf, path))
-    except (TableError, ValueError) as e:
-        raise RuntimeError(str(e)) from None
+    with _lock:
+        model = _shared.get(key)
+        return model if model is not None else _shared.setdefault(key, TASK.open(mi.TensorXf, path))
 
 
 def decode_grid(model, resolution: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict]:

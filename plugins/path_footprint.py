@@ -287,7 +287,7 @@ def integrator() -> type:
                 through, ray_em = mi.Float(1), mi.Ray3f(ray)
                 if dr.hint(fields is not None, mode="scalar"):
                     ray_em = si.spawn_ray_to(ds.p)
-                    through = fields.transmittance(ray_em, ray_em.maxt, active_em)
+                    _, through, _ = fields.cross(ray_em, ray_em.maxt, active_em)
                 with dr.resume_grad(when=not primal):
                     J = mi.Float(1)
                     if dr.hint(solids_move, mode="scalar"):
@@ -308,7 +308,9 @@ def integrator() -> type:
                 # ---------------------- Light from a field ----------------------
 
                 if dr.hint(fields_move, mode="scalar"):
-                    δL += fields.derive(mode, ray_em, ray_em.maxt, active_em, δL, mi.Spectrum(0), dr.detach(Lr_dir))
+                    total = dr.detach(Lr_dir)
+                    change, _ = fields.derive(mode, ray_em, ray_em.maxt, active_em, δL, mi.Spectrum(0), total)
+                    δL += change[0]
                 if dr.hint(fields is not None, mode="scalar"):
                     d, field_pdf = fields.sample(si.p, sampler.next_1d(), sampler.next_2d(), active_field)
                     active_field &= field_pdf > 0
@@ -317,14 +319,15 @@ def integrator() -> type:
                     active_field &= dr.max(dr.detach(bsdf_value)) > 0
                     ray_em = si.spawn_ray(d)
                     far = scene.ray_intersect_preliminary(ray_em, coherent=False, active=active_field).t
-                    Le_field, _ = fields.cross(ray_em, far, active_field)
+                    Le_field, _, _ = fields.cross(ray_em, far, active_field)
                     weight = mis_weight(field_pdf, dr.detach(bsdf_pdf)) * dr.rcp(field_pdf)
                     weight = dr.select(active_field, β * weight, 0)
                     with dr.resume_grad(when=not primal):
                         Lr_dir += dr.select(active_field, weight * bsdf_value * Le_field, 0)
                     if dr.hint(fields_move, mode="scalar"):
                         weight = weight * dr.detach(bsdf_value)
-                        δL += fields.derive(mode, ray_em, far, active_field, δL, weight, weight * Le_field)
+                        change, _ = fields.derive(mode, ray_em, far, active_field, δL, weight, weight * Le_field)
+                        δL += change[0]
                 L = L + Le + Lr_dir if primal else L - dr.detach(Le + Lr_dir)
 
                 # ---------------------- Next vertex ----------------------
@@ -370,11 +373,11 @@ def integrator() -> type:
                 prev_si, prev_bsdf_pdf, prev_bsdf_delta = si, bs.pdf, bsdf_delta
                 if dr.hint(fields is not None, mode="scalar"):
                     # Weighted against having sampled this direction towards them
-                    Le_field, through = fields.cross(ray, hit.t, active)
+                    Le_field, through, _ = fields.cross(ray, hit.t, active)
                     field_pdf = fields.density(prev_si.p, ray.d, active & ~prev_bsdf_delta)
                     weight = dr.select(active, β * mis_weight(prev_bsdf_pdf, field_pdf), 0)
                     if dr.hint(fields_move, mode="scalar"):
-                        δL += fields.derive(mode, ray, hit.t, active, δL, weight, L)
+                        δL += fields.derive(mode, ray, hit.t, active, δL, weight, L)[0][0]
                     Le_field = dr.select(active, weight * Le_field, 0)
                     L = L + Le_field if primal else L - Le_field
                     clear = dr.select(active & ~valid_ray, clear * through, clear)

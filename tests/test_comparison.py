@@ -107,34 +107,22 @@ def side(seconds, compiled):
 
 
 @pytest.mark.parametrize(
-    "written, compiled, lines",
+    "written, compiled, text",
     [
-        ([9, 1.1, 1.2, 1.3, 1.4, 1.5], [1], [
-            "time        1.30 times that of exact at 8 spp (1 s a pass)",
-            "            median of 5 pairs of passes, quartiles 1.20 to 1.40",
-        ]),
-        ([9, 1.2], [1], [
-            "time        not measured: 1 pair of passes without compilation,",
-            "            3 are needed (--passes)",
-        ]),
-        ([9, 1.2, 1.4, 1.3], [1, 0, 1], [
-            "time        not measured: 2 pairs of passes without compilation,",
-            "            3 are needed (--passes)",
-        ]),
-        ([9, 40, 126, 200], [1], [
-            "time        not measurable here: quartiles 83.00 to 163.00",
-            "            of the ratios of 3 pairs of passes",
-        ]),
+        ([9, 1.1, 1.2, 1.3, 1.4, 1.5], [1], "1.30 times that of exact at 8 spp (1 s a pass)"),
+        ([9, 1.2], [1], "not measured: 1 pair of passes without compilation,"),
+        ([9, 1.2, 1.4, 1.3], [1, 0, 1], "not measured: 2 pairs of passes without compilation,"),
+        ([9, 40, 126, 200], [1], "not measurable here: quartiles 83.00 to 163.00"),
     ],
-)  # fmt: skip
-def test_times_that_say_nothing_are_refused(written, compiled, lines):
+)
+def test_times_that_say_nothing_are_refused(written, compiled, text):
     """Compilation on one side only, too few pairs, and quartiles as wide as their median."""
     count = len(written)
     flags = [bool(i < len(compiled) and compiled[i]) for i in range(count)]
     times = comparison._times(side(written, flags), side([1.0] * count, [False] * count), "exact")
-    assert (times["time_ratio"]["median"] is None) == ("not" in lines[0])
+    assert (times["time_ratio"]["median"] is None) == ("not" in text)
     assert times["seconds_first_pass"] == {"written": 9, "exact": 1.0}
-    assert comparison._time_lines({**times, "against": "exact", "spp": 8}) == lines
+    assert text in comparison._time_lines({**times, "against": "exact", "spp": 8})[0]
 
 
 @pytest.mark.parametrize("bias", [0.0, 0.1])

@@ -129,26 +129,6 @@ def test_half_precision_allocation(ad):
 # -- one array read with another ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("dims", [1, 2, 3, 4])
-def test_ramp_and_grid_are_an_ordinary_lookup(ad, dims):
-    """
-    With a ramp as the primary array, an indirection is the cascaded array read directly: bit by bit where no rounding
-    is possible (dyadic coordinates and positions), to the last digits elsewhere.
-    """
-    rng = np.random.default_rng(dims)
-    grid = rng.integers(0, 256, (*(5, 3, 9, 5)[:dims], 3)).astype(np.float32)
-    primary = DifferentiableArray((9, 5, 5, 3)[:dims], dims, "ramp", fold=True)
-    net = Indirection(primary, DifferentiableArray(grid.shape[:-1], 3, grid)).alloc(ad.TensorXf)
-    # The ramp's last entry is a hair below 1, so its last cell is left out of the exact comparison.
-    last = np.array([(n - 2) / (n - 1) for n in primary.resolution])
-    dyadic = (np.floor(rng.uniform(0, 1, (200, dims)) * last * 64) / 64).astype(np.float32)
-    np.testing.assert_array_equal(read(net, ad, dyadic), read(net.cascaded, ad, dyadic))
-    anywhere = rng.uniform(-0.2, 1.2, (200, dims)).astype(np.float32)
-    np.testing.assert_allclose(read(net, ad, anywhere), interpolate(grid, anywhere), atol=255 * 1e-5)
-    constant = Indirection(primary, DifferentiableArray(grid.shape[:-1], 3)).alloc(ad.TensorXf)
-    np.testing.assert_allclose(read(constant, ad, anywhere), 0.5, rtol=1e-6)
-
-
 @pytest.mark.parametrize("storage", lookup.STORAGES)
 def test_values(ad, storage):
     # Packed 2D reads: 1/64 of a step (tests/test_lookup.py), times the slope of the cascaded array
@@ -275,20 +255,6 @@ def test_several_primaries(ad, storage):
     np.testing.assert_allclose(read(net, ad, x), expected, rtol=1e-5, atol=5e-4 if storage == "uint8" else 0)
 
 
-@pytest.mark.parametrize("storage", lookup.STORAGES)
-def test_masked_lanes_are_zero(ad, storage):
-    net = pair(ad).to(storage)
-    x = [ad.Float([0.2, 0.4]), ad.Float([0.7, 0.1])]
-    values = net(x, active=ad.Bool([True, False]))
-    assert all(v.numpy()[0] == w.numpy()[0] and v.numpy()[1] == 0 for v, w in zip(values, net(x), strict=True))
-    gradients = []  # of a masked lane, and of a lane that is not there
-    for lanes, active in ((x, ad.Bool([True, False])), ([v[0] for v in x], True)):
-        dr.enable_grad(lanes := [ad.Float(v) for v in lanes])
-        dr.backward(sum(net(lanes, active=active)))
-        gradients.append([v.grad.numpy() for v in lanes])
-    np.testing.assert_allclose(gradients[0], np.pad(gradients[1], ((0, 0), (0, 1))), rtol=1e-6)
-
-
 # -- a coordinate that is known ----------------------------------------------------------------------------------------
 
 
@@ -356,15 +322,6 @@ def test_gradients_of_what_remains(ad, dims, border):
         assert gradient[index] == pytest.approx(expected, rel=1e-3, abs=1e-4)
     expected = (number(table, x + 1e-2) - number(table, x - 1e-2)) / 2e-2  # linear within a cell
     assert coordinate.grad.numpy()[0] == pytest.approx(expected, rel=1e-3, abs=1e-3)
-
-
-def test_an_array_of_one_dimension_has_nothing_that_remains(ad):
-    with pytest.raises(ValueError, match="1 dimension"):
-        DifferentiableArray(4).alloc(ad.TensorXf).at(ad.Float(0.5))
-    with pytest.raises(RuntimeError, match="no entries yet"):
-        DifferentiableArray((4, 4)).at(ad.Float(0.5))
-    with pytest.raises(ValueError, match="found 4 numbers"):
-        DifferentiableArray((4, 4)).alloc(ad.TensorXf).at(ad.Float(0, 0.1, 0.2, 0.3))
 
 
 # -- what coordinates can be -------------------------------------------------------------------------------------------

@@ -242,7 +242,7 @@ def test_maps_may_be_called_as_figures(rng):
     names = ("mean", "between", "worst", "l0", "map_mean", "albedo")
     source = from_arrays({name: np.full((2, 2, 1), 0.1 * i, np.float32) for i, name in enumerate(names)})
     image = CompressedMaps()
-    image.layout, image.types, image.border = Layout.of(source), None, ("clamp", "clamp")
+    image.layout, image.types, image.border = Layout.from_source(source), None, ("clamp", "clamp")
     image.stored = lambda u, v, active=True: []
     figures = image.measure(source)
     assert len({map_figure(name) for name in names}) == len(names)

@@ -285,5 +285,5 @@ def test_pages_are_chosen_and_win(ad):
     assert paged.nbytes <= 1.01 * dense.nbytes
     assert paged.measured["psnr_db"] > dense.measured["psnr_db"] + 2
     noise = from_arrays({"albedo": np.random.default_rng(0).integers(0, 255, (64, 64, 3)).astype(np.uint8)})
-    assert training.structure_of(noise, short("auto"), 1500) not in PAGED
-    assert training.structure_of(noise, short("auto", components=False), 1500) not in PAGED
+    assert training.choose_structure(noise, short("auto"), 1500) not in PAGED
+    assert training.choose_structure(noise, short("auto", components=False), 1500) not in PAGED

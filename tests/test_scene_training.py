@@ -49,7 +49,7 @@ from mi_diffind.scenes.training.trained_scene import (
 from mi_diffind.tasks.texture import PRESETS
 from mi_diffind.tasks.texture.arrays import PaperBudget, TextureBudget, parse_structure
 from mi_diffind.tasks.texture.compressed import CompressedTexture, load, to_table
-from mi_diffind.tasks.texture.fit import layout_of, problem_of, rounded, stored_form
+from mi_diffind.tasks.texture.fit import build_problem, rounded, source_layout, stored_form
 
 NAMES = ("albedo", "roughness")
 ORBIT = ViewDistribution(
@@ -821,12 +821,12 @@ def test_exposure():
 def test_arrays_of_the_same_size(folder, preset, tmp_path):
     """A file says all that is needed to begin anew."""
     source, recipe = load_source(folder / "material.json"), PRESETS[preset]
-    layout = layout_of(source, recipe)
+    layout = source_layout(source, recipe)
     wanted = PaperBudget(16, 24, 4, 5, layout.stored)
     if preset == "ours":
         wanted = TextureBudget(32, 32, layout.stored, parse_structure("0:2:4,1:3:6"), 2, 3, 6, 3)
-    pyramid = Pyramid.of(source, layout, array_module("llvm"))
-    net = problem_of(source, wanted, recipe, pyramid).net
+    pyramid = Pyramid.from_source(source, layout, array_module("llvm"))
+    net = build_problem(source, wanted, recipe, pyramid).net
     own = recipe.further
     table = to_table(CompressedTexture(layout, stored_form(net)), {**own, "loss": "mae"})  # a render's
     save_table(tmp_path / "x.npz", table)

@@ -99,7 +99,7 @@ def test_compare_against_principled(mi_rgb, tmp_path, name):
     [
         ("disney", "", "exact", "names no learned plugin (neural_bsdf, neural_disney, neural_field, neural_ggx, "),
         ("neural_ggx", "", "principled", 'names no plugin that "principled" can stand for (disney, neural_disney, '),
-        ("disney", "", "plastic", '"plastic": no plugin has this counterpart; there are principled'),
+        ("disney", "", "plastic", 'against: found "plastic", allowed are exact, '),
         ("disney", '<texture name="specular" type="checkerboard"/>', "principled", '"specular": is a texture, but'),
     ],
 )

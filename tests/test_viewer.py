@@ -251,7 +251,7 @@ def test_refused_input(mi_rgb, tmp_path):
     for source, options, error, sentence in (
         (scene, {"width": 8}, UsageError, "width: found 8, allowed are whole numbers from 16 to 4096"),
         (scene, {"spp": 2**17}, UsageError, "spp: found 131072, allowed are whole numbers from 1 to 65536"),
-        (scene, {"against": "bitmap"}, UsageError, 'against: found "bitmap", allowed are exact, '),
+        (scene, {"against": "bitmap"}, loading.SceneError, 'against: found "bitmap", allowed are exact, '),
         (scene, {"defines": {"a": 1}}, UsageError, "defines: given with a scene in memory"),
         (loading.load_dict(scene), {}, UsageError, "found a loaded scene, which cannot be changed any more"),
         (ASSETS / "tiles.npz", {"defines": {"a": 1}}, UsageError, r"tiles\.npz: found a table file with defines"),

@@ -29,7 +29,6 @@ HEADINGS = {
     "bsdf": "BSDFs",
     "texture": "Textures",
     "shape": "Shapes",
-    "volume": "Volumes",
     "integrator": "Integrators",
 }
 

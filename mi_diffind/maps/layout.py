@@ -93,7 +93,7 @@ class Layout:
     groups: tuple[str, ...]
 
     @staticmethod
-    def of(
+    def from_source(
         source: Source, once: bool = True, two_channel_normals: bool | None = None, filtered: bool = False
     ) -> Layout:
         """Return the layout of ``source``.

@@ -229,7 +229,7 @@ def level_sizes(height: int, width: int) -> list[tuple[int, int]]:
     return [(max(1, height >> level), max(1, width >> level)) for level in range(count)]
 
 
-def halved(values: np.ndarray) -> np.ndarray:
+def halve(values: np.ndarray) -> np.ndarray:
     """Return the next level of ``values``, ``(height, width, k)``: each texel is the mean of the area it covers."""
     for axis in (0, 1):
         n = values.shape[axis]
@@ -281,14 +281,15 @@ class Pyramid(FilteredMaps):
         dr.eval(self._texels)
 
     @staticmethod
-    def of(source: Source, layout: Layout | None = None, types: ModuleType | None = None, border=None) -> Pyramid:
+    def from_source(
+        source: Source, layout: Layout | None = None, types: ModuleType | None = None, border=None
+    ) -> Pyramid:
         """Return the pyramid of a source.
 
-        ``layout`` is any layout of this source (default: ``Layout.of(source, filtered=True)``); a stored channel of
-        several maps is averaged as in the first of them. ``border`` along v and u is by default
-        :func:`.layout.choose_borders`.
+        ``layout`` is any layout of this source, by default the one for filtered reads; a stored channel of several maps
+        is averaged as in the first of them. ``border`` along v and u is by default :func:`.layout.choose_borders`.
         """
-        layout = layout or Layout.of(source, filtered=True)
+        layout = layout or Layout.from_source(source, filtered=True)
         sizes = level_sizes(source.height, source.width)
         values = [np.zeros((*size, layout.stored), np.float32) for size in sizes]
         values[0] = layout.encode(source)
@@ -305,7 +306,7 @@ class Pyramid(FilteredMaps):
                 level = srgb.to_linear(m.values) if m.color_space == "srgb" else m.values
                 level = level.astype(np.float32)
             for stored in values[1:]:
-                level = halved(level)
+                level = halve(level)
                 if vectors:
                     length = np.linalg.norm(level[..., :3], axis=-1, keepdims=True)
                     mean = np.where(length > 1e-6, level[..., :3] / np.maximum(length, 1e-6), [0, 0, 1])
@@ -447,7 +448,7 @@ class TexelPyramid(Pyramid):
 
 
 def _halved_channels(types: ModuleType, channels: list, rows: int, columns: int) -> list:
-    """Return :func:`halved` for ``channels``, flat Dr.Jit arrays of ``rows · columns`` texels each."""
+    """Return :func:`halve` for ``channels``, flat Dr.Jit arrays of ``rows · columns`` texels each."""
     index = dr.arange(types.UInt32, max(1, rows // 2) * max(1, columns // 2))
     # Opaque, so that one kernel halves images of all sizes
     width, stride = dr.opaque(types.UInt32, max(1, columns // 2)), dr.opaque(types.UInt32, columns)

@@ -172,14 +172,6 @@ class Captured:
         }  # fmt: skip
 
     @property
-    def poses(self) -> np.ndarray:
-        """Camera-to-world matrices ``(views, 4, 4)`` of all ``files``, in this order; cameras look along −z."""
-        lists = [json.loads(path.read_text(encoding="utf-8")) for path in self.folder.glob("transforms_*.json")]
-        frames = [frame for one in lists for frame in one["frames"]]
-        matrices = {frame["file_path"].removeprefix("./"): frame["transform_matrix"] for frame in frames}
-        return np.array([matrices[name] for name in self.files], np.float64).reshape(-1, 4, 4)
-
-    @property
     def images(self) -> list[np.ndarray]:
         """Images of all ``files``, ``(height, width, 4)``, read when asked for: uint8, or of EXR linear floats."""
         with threads_for_files():

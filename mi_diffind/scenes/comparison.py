@@ -183,9 +183,7 @@ def load_compared(
 ) -> ComparedScenes:
     """Load a scene as written and with counterparts; arguments and errors as of :func:`compare`."""
     use_variant()
-    if against and not plugins.with_counterpart(against):
-        others = dict.fromkeys(c.name for plugin in plugins.declared().values() for c in plugin.others)
-        raise loading.SceneError(f'"{against}": no plugin has this counterpart; there are {", ".join(others)}')
+    loading.check_counterpart(against or "exact")
     parsed = loading.ParsedScene(scene, defines)
     if learn and parsed.description:
         raise UsageError("learn: given with a scene in memory, allowed are scene files")

@@ -38,6 +38,13 @@ class SceneError(DiffindError, RuntimeError):
     """A scene cannot be loaded or rendered; the message is one sentence that names the file and the fault."""
 
 
+def check_counterpart(name: str) -> None:
+    """Raise :class:`SceneError` if no plugin has the counterpart ``name``."""
+    if not plugins.with_counterpart(name):
+        others = dict.fromkeys(c.name for plugin in plugins.declared().values() for c in plugin.others)
+        raise SceneError(f'against: found "{name}", allowed are exact, {", ".join(others)}')
+
+
 def check_renderable(scene, path: str | os.PathLike = "scene", needs: tuple[str, ...] = NEEDS) -> None:
     """Raise :class:`SceneError` if a loaded scene lacks what it ``needs`` to be rendered."""
     for name in needs:
@@ -189,12 +196,12 @@ class ParsedScene:
             return mi.PluginManager.instance().create_object(props)
 
     def learned_plugins(self, against: str | tuple[str, ...] = "exact") -> list[dict]:
-        """Return the descriptions (:meth:`.plugins.Plugin.described`) of the learned plugins, in the file's order.
+        """Return the descriptions (:meth:`.plugins.Plugin.describe`) of the learned plugins, in the file's order.
 
         With ``against``, of all plugins that have the counterpart of this name, or of one of these names.
         """
         with self._errors():
-            return [plugin.described(props) for props, plugin in _replaceable(self._copy(), against)]
+            return [plugin.describe(props) for props, plugin in _replaceable(self._copy(), against)]
 
     def tables(self, learned: list[dict]) -> dict[tuple[str, str], object]:
         """Return the distinct tables of learned plugins: ``(file, storage)`` → :class:`.Table`.

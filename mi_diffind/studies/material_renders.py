@@ -153,7 +153,7 @@ class RenderedMaterial:
 
 def mip_maps(source: Source, nbytes: int) -> dict[str, tuple[Pyramid, int]]:
     """Return uncompressed levels of a material, those of LEAN, and these in ASTC in ``nbytes``, with their bytes."""
-    pyramid = Pyramid.of(source, types=array_module(mi.variant()), border=("repeat", "repeat"))
+    pyramid = Pyramid.from_source(source, types=array_module(mi.variant()), border=("repeat", "repeat"))
     lean = normals.with_roughness(pyramid, normals.lean_levels(pyramid))
     pyramids = {"mip maps": (pyramid, pyramid.nbytes), "LEAN mip maps": (lean, lean.nbytes)}
     if "astc" in codecs.available():

@@ -57,11 +57,11 @@ from ..tasks import texture as texture_task
 from ..tasks.disney.model import Effects
 from ..tasks.shading import fit as shading_fit
 from ..tasks.shading.evaluation import ShadedEvaluation, ShadedReader, reader, reference
-from ..tasks.shading.material import effects_of, frozen_decoder
-from ..tasks.shading.training import ShadingProblem, fit_shading, start_of
+from ..tasks.shading.material import frozen_decoder, material_effects
+from ..tasks.shading.training import ShadingProblem, fit_shading, trainable_arrays
 from ..tasks.texture import fit as textures
 from ..tasks.texture.compressed import CompressedTexture
-from ..tasks.texture.fit import size_of
+from ..tasks.texture.fit import find_size
 from .baselines import codecs, normals
 from .example_maps import MATERIALS, generated_source
 from .material_renders import RenderSettings, run_renders
@@ -278,8 +278,8 @@ class ShadingContenders:
         types, quick = array_module(mi.variant()), self.settings.quick
         self.preset = shading_task.PRESETS[self.settings.preset]
         self.recipe = texture_task.PRESETS[self.preset.texture]
-        self.pyramid = Pyramid.of(self.source, textures.layout_of(self.source, self.recipe), types)
-        self.effects = effects_of(self.pyramid.layout)[0]
+        self.pyramid = Pyramid.from_source(self.source, textures.source_layout(self.source, self.recipe), types)
+        self.effects = material_effects(self.pyramid.layout)[0]
         self.zoom = ShadedZoom(self.pyramid, self.effects, self.settings.frames, 32 if quick else 96)
 
     @cached_property
@@ -390,8 +390,8 @@ class ShadingContenders:
         recipe = dataclasses.replace(self.recipe, **request.settings.common)
         nbytes = self.source.nbytes / COMPRESSION
         nbytes = shading_fit.bytes_beside_extras(nbytes, pyramid) if extras else nbytes
-        size = size_of(self.source, pyramid, nbytes, recipe, request.options)
-        problem = textures.problem_of(self.source, size, recipe, pyramid)
+        size = find_size(self.source, pyramid, nbytes, recipe, request.options)
+        problem = textures.build_problem(self.source, size, recipe, pyramid)
         result = request.train(problem, f"{self.name}: texture, seed {seed}")
         stored = CompressedTexture(pyramid.layout, textures.stored_form(problem.net))
         trained = textures.to_table(stored, {**request.recorded(), "source": self.source.digest, "steps": result.steps})
@@ -463,7 +463,7 @@ class ShadingContenders:
             before = self.table(start)
             try:
                 fit = fit_shading if preset.bounded else fit_to_the_end
-                net = start_of(before, self.pyramid)
+                net = trainable_arrays(before, self.pyramid)
                 table, result = fit(self.source, net, recipe, request, self.pyramid, self.evaluation)
             except FittingError:  # diverged repeatedly: the result is the start
                 table, result = before, FitResult({}, 0, 0, 0.0, False, 0, [])

@@ -144,6 +144,7 @@ class TextureStudy(Study):
             frames=arguments.frames or (6 if quick else 60),
             truth_spp=64 if quick else 256,  # square numbers
             seeds=1 if quick else 4,  # renders that errors are averaged over
+            scenes=1 if quick else 3,  # number of stills
             footprints=arguments.footprints,
             network_steps=(10, 20) if quick else NETWORK_STEPS,  # of the first and of the longest training
             only=tuple(arguments.only),
@@ -223,10 +224,13 @@ class TextureContenders:
     source: Source
     name: str
     settings: SimpleNamespace
-    scenes: dict[str, TextureScene] = field(default_factory=renders.still_scenes)
     jobs: list[Job] = field(default_factory=list)
     candidates: list[Candidate] = field(default_factory=list)
     readers: dict[str, Callable[[], TextureReader]] = field(default_factory=dict)
+
+    @cached_property
+    def scenes(self) -> dict[str, TextureScene]:
+        return dict(itertools.islice(renders.still_scenes().items(), self.settings.scenes))
 
     @cached_property
     def zoom(self) -> TextureZoom:
@@ -235,7 +239,7 @@ class TextureContenders:
     @cached_property
     def pyramid(self) -> Pyramid:
         """The uncompressed levels, repeated as bitmaps are."""
-        return Pyramid.of(self.source, types=array_module(mi.variant()), border=("repeat", "repeat"))
+        return Pyramid.from_source(self.source, types=array_module(mi.variant()), border=("repeat", "repeat"))
 
     @cached_property
     def truth_levels(self) -> dict[str, list[np.ndarray]]:
@@ -496,7 +500,7 @@ def _case(context: TextureContenders, scene: TextureScene, candidates: list[Cand
         index = np.arange(lanes)
         si = scene.hits(loaded, (index % width + 0.5) / width, (index // width + 0.5) / -(-lanes // width))
         dr.make_opaque(si.uv, si.p, si.dp_du, si.dp_dv, si.wi, si.sh_frame, si.duv_dx, si.duv_dy)
-        cone = footprint.Cone.of(loaded.sensors()[0])
+        cone = footprint.Cone.from_sensor(loaded.sensors()[0])
         functions = {FLOOR: lambda: [si.uv.x, si.uv.y]}
         for c in candidates:
             if c.name == BASE or c.setting in FILTERS:

@@ -10,10 +10,8 @@ Once Mitsuba has Python shapes (``mi.Shape`` with ``bbox``, ``ray_intersect_prel
 
 from __future__ import annotations
 
-import atexit
 import functools
 import hashlib
-import shutil
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +26,7 @@ from mi_diffind.core import compat
 from mi_diffind.core.errors import DiffindError
 from mi_diffind.core.files import is_within, stamp
 from mi_diffind.tasks.sdf import TASK, marching
-from mi_diffind.tasks.sdf.mesh import Mesh, edge_balance, load_mesh, read_serialized, split_part
+from mi_diffind.tasks.sdf.mesh import edge_balance, load_mesh, read_serialized, split_part
 
 from .. import warn
 from . import omissions, properties
@@ -466,9 +464,13 @@ def to_mesh(props: mi.Properties) -> None:
     file, _ = split_part(mesh)
     if not file.is_file():
         raise RuntimeError(f"{file}: no such file, {path.name} was made from it")
-    if not is_within(path.resolve().parent, recorded) and _digest(mesh, stamp(file)) != settings.get("source"):
+    beside = is_within(path.resolve().parent, recorded)
+    if beside and mesh.suffix.lower() == ".ply":
+        props["filename"] = str(mesh)
+        return
+    digest, props["filename"] = _as_ply(mesh, stamp(file))
+    if not beside and digest != settings.get("source"):
         raise RuntimeError(f"{file}: has changed since {path.name} was made from it")
-    props["filename"] = str(mesh) if mesh.suffix.lower() == ".ply" else _as_ply(mesh, stamp(file))
 
 
 def closed_mesh_file(path: Path, folder: Path, index: int = 0) -> Path:
@@ -533,29 +535,20 @@ def _smoothness(mesh: mi.Mesh) -> float:
 
 
 @functools.lru_cache
-def _folder() -> Path:
-    folder = Path(tempfile.mkdtemp(prefix="mi_diffind_"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return folder
+def _folder() -> tempfile.TemporaryDirectory:
+    """Return a folder that is removed when the process ends."""
+    return tempfile.TemporaryDirectory(prefix="mi_diffind_")
 
 
-def _load(path: Path) -> Mesh:
+@functools.lru_cache
+def _as_ply(path: Path, stamp: tuple) -> tuple[str, str]:
+    """Return the digest of a mesh file, and the path of the mesh as a PLY file, kept until the process ends."""
     try:
-        return load_mesh(path)
+        mesh = load_mesh(path)
     except DiffindError as e:
         raise RuntimeError(str(e)) from None
-
-
-@functools.lru_cache
-def _digest(path: Path, stamp: tuple) -> str:
-    """Return the digest of a mesh file."""
-    return _load(path).digest
-
-
-@functools.lru_cache
-def _as_ply(path: Path, stamp: tuple) -> str:
-    """Return a PLY copy of a mesh file, kept until the process ends."""
-    mesh = _load(path)
-    written = _folder() / f"{split_part(path)[0].stem}_{abs(hash((path, stamp))):x}.ply"
+    if path.suffix.lower() == ".ply":
+        return mesh.digest, str(path)
+    written = Path(_folder().name) / f"{split_part(path)[0].stem}_{abs(hash((path, stamp))):x}.ply"
     trimesh.Trimesh(mesh.to_file_frame(mesh.vertices), mesh.faces, process=False).export(written)
-    return str(written)
+    return mesh.digest, str(written)

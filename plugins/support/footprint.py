@@ -64,7 +64,7 @@ class Cone:
     corner: mi.Vector3f | None = None
 
     @classmethod
-    def of(cls, sensor: mi.Sensor, spp: int | None = None) -> Cone:
+    def from_sensor(cls, sensor: mi.Sensor, spp: int | None = None) -> Cone:
         """Return the cone of a loaded sensor, at ``spp`` samples per pixel (default: that of its sampler).
 
         The projection is derived from the sensor's rays: all go through one point or one lens, or all are parallel, and
@@ -327,8 +327,8 @@ def attach(scene: mi.Scene, sensor: int | mi.Sensor = 0, spp: int | None = None)
     """Set the cone of all textures of a loaded scene that use one (:func:`textures`), and return their number.
 
     ``spp`` is the number of samples per pixel (default: that of the sampler). Call again after a change of the sensor
-    or of the samples. Without a supported sensor (:meth:`Cone.of`) the cone is ``None``, with a warning if there is an
-    unsupported one.
+    or of the samples. Without a supported sensor (:meth:`Cone.from_sensor`) the cone is ``None``, with a warning if
+    there is an unsupported one.
     """
     filtering = textures(scene)
     if not filtering:
@@ -338,7 +338,7 @@ def attach(scene: mi.Scene, sensor: int | mi.Sensor = 0, spp: int | None = None)
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor] if scene.sensors() else None
         if sensor is not None:
-            cone = Cone.of(sensor, spp)
+            cone = Cone.from_sensor(sensor, spp)
     except RuntimeError as e:
         mi.Log(mi.LogLevel.Warn, f"textures are not filtered: {e}")
         omissions.settle(filtering)

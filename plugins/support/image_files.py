@@ -147,13 +147,13 @@ def open_uncompressed(props: mi.Properties, wrap_mode: str) -> tuple[SharedMaps,
 
     def load() -> SharedMaps:
         # A single image without "raw" is colours, whatever its name, as for Mitsuba's "bitmap"
-        source = load_source(path, nonfinite="clean", named=raw) if path else _source_of(props["bitmap"])
+        source = load_source(path, nonfinite="clean", named=raw) if path else _from_bitmap_object(props["bitmap"])
         for note in source.notes if path.lower().endswith(".json") else ():
             warn(note)
         if raw:
             maps = tuple(dataclasses.replace(m, color_space="linear") for m in source.maps)
             source = dataclasses.replace(source, maps=maps)
-        return SharedMaps(Pyramid.of(source, types=types, border=border), {})
+        return SharedMaps(Pyramid.from_source(source, types=types, border=border), {})
 
     try:
         if not path:
@@ -163,7 +163,7 @@ def open_uncompressed(props: mi.Properties, wrap_mode: str) -> tuple[SharedMaps,
         raise RuntimeError(f'parameter "{given[0]}": {e}') from None
 
 
-def _source_of(bitmap) -> Source:
+def _from_bitmap_object(bitmap) -> Source:
     """Return a ``mi.Bitmap`` as a source of one map, ``image``, without alpha."""
     if not isinstance(bitmap, mi.Bitmap):
         raise RuntimeError(f'parameter "bitmap": found a {type(bitmap).__name__}, a Bitmap is needed')
@@ -173,7 +173,7 @@ def _source_of(bitmap) -> Source:
     return from_arrays({"image": values}, {"image": "srgb" if bitmap.srgb_gamma() else "linear"}, nonfinite="clean")
 
 
-def map_of(layout: Layout, channels: str) -> MapLayout:
+def choose_map(layout: Layout, channels: str) -> MapLayout:
     """Return the map called ``channels``; if that is empty, the only map, or the only albedo."""
     names = ", ".join(layout.names)
     candidates = [m for m in layout.maps if m.name == channels or not channels]
@@ -198,7 +198,7 @@ def is_data(layout: MapLayout) -> bool:
 
 def to_bitmap(task: Task, props: mi.Properties) -> None:
     """Add the properties that a ``bitmap`` needs to show the original of the map."""
-    original, layout = original_of(task, props)
+    original, layout = find_original(task, props)
     try:
         values = _values(original, layout)
     except SourceError as e:
@@ -212,7 +212,7 @@ def to_bitmap(task: Task, props: mi.Properties) -> None:
 
 def to_mipmap(task: Task, props: mi.Properties) -> None:
     """Add the properties that a ``mipmap`` needs to show the original of the map."""
-    original, layout = original_of(task, props)
+    original, layout = find_original(task, props)
     manifest = original.suffix.lower() == ".json"
     if not manifest and layout.role == "other":  # linear by the name of its file
         to_bitmap(task, props)
@@ -233,12 +233,12 @@ def remove(props: mi.Properties, *names: str) -> None:
             del props[name]
 
 
-def original_of(task: Task, props: mi.Properties) -> tuple[Path, MapLayout]:
+def find_original(task: Task, props: mi.Properties) -> tuple[Path, MapLayout]:
     """Return the path of the image or manifest that a task's file was made from, and the map that is shown.
 
     The property ``source`` names the original, else the settings of the file do. Raises ``RuntimeError``.
     """
-    chosen = map_of(layout_of(task, props), str(props.get("channels", "")))
+    chosen = choose_map(file_layout(task, props), str(props.get("channels", "")))
     path = Path(properties.filename(props))
     settings = task.load(path).settings
     given, recorded = str(props.get("source", "")), str(settings.get("source_path", ""))
@@ -255,7 +255,7 @@ def original_of(task: Task, props: mi.Properties) -> tuple[Path, MapLayout]:
     return original, chosen
 
 
-def layout_of(task: Task, props: mi.Properties) -> Layout:
+def file_layout(task: Task, props: mi.Properties) -> Layout:
     """Return the layout of the file that the property ``filename`` names."""
     try:
         return Layout.from_json(task.load(properties.filename(props)).settings["layout"])
@@ -263,7 +263,7 @@ def layout_of(task: Task, props: mi.Properties) -> Layout:
         raise RuntimeError(str(e)) from None
 
 
-def manifest_of(image: Path, folder: Path, raw: bool, normal: bool) -> Path:
+def write_manifest(image: Path, folder: Path, raw: bool, normal: bool) -> Path:
     """Write a manifest of an image's colours as ``bitmap`` reads them, and return its path.
 
     ``raw``: values are left as they are; ``normal``: they are a normal map. Raises :class:`.Kept` for a picture that

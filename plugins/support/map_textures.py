@@ -16,17 +16,17 @@ from mi_diffind.maps.layout import MapLayout
 
 from . import footprint, omissions, properties, textures
 from .footprint import Cone
-from .image_files import SharedMaps, is_data, map_of
+from .image_files import SharedMaps, choose_map, is_data
 from .tables import frozen_key
 from .textures import (
     WRAP_MODES,
     Filter,
     PositionDistribution,
     anisotropic,
-    cone_of,
     hit_numbers,
     isotropic,
     luminance,
+    shared_cone,
 )
 
 #: Most texels that are decoded for the mean, the maximum and the sampling of positions; larger images are reduced.
@@ -68,11 +68,8 @@ class MapTexture(mi.Texture):
 
     def _choose(self, props: mi.Properties) -> tuple[MapLayout, bool]:
         """Return the map to show, and whether its values stay as they are. Raises ``RuntimeError``."""
-        chosen = map_of(self.image.layout, str(props.get("channels", "")))
-        raw = props.get("raw", is_data(chosen))
-        if not isinstance(raw, bool):
-            raise RuntimeError(f'parameter "raw": found {raw}, allowed are true and false')
-        return chosen, raw
+        chosen = choose_map(self.image.layout, str(props.get("channels", "")))
+        return chosen, properties.flag(props, "raw", is_data(chosen))
 
     def _shown(self) -> list[MapLayout]:
         """Return the maps that are read."""
@@ -389,7 +386,7 @@ class FilteredTexture(MapTexture):
 
     def __init__(self, props: mi.Properties):
         self.filter = Filter.from_properties(props)
-        self._cone_of_parameters = cone_of(props)
+        self._cone_of_parameters = shared_cone(props)
         self.cone = self._cone_of_parameters
         super().__init__(props)
         if self.filter.name != "off":
@@ -427,23 +424,23 @@ class FilteredTexture(MapTexture):
         return f'the texture "{self.id()}" ({described})'
 
     def _values(self, si):
-        if self.filter.name == "off" or not self.is_spatially_varying():
+        if not self.filtered():
             return super()._values(si)
         uv, (ddx, ddy) = self._uv(si), self._footprint(si)
         uv = uv + dr.detach(footprint.to_centre(self.cone, si, ddx, ddy)) / mi.Vector2f(*self._size)
         if self.filter.name == "trilinear":
-            return self._used_of(self._filtered(uv, isotropic(ddx, ddy)))
+            return self._decode_mean(self._filtered(uv, isotropic(ddx, ddy)))
         taps = self.filter.taps
         level, axis = anisotropic(ddx, ddy, taps)
         axis = axis / mi.Vector2f(*self._size)
         if self.filter.name == "anisotropic":
             values = [self._filtered(dr.fma(axis, (k + 0.5) / taps - 0.5, uv), level) for k in range(taps)]
             scale = 1 / taps
-            return self._used_of([sum(channel[1:], channel[0]) * scale for channel in zip(*values, strict=True)])
+            return self._decode_mean([sum(channel[1:], channel[0]) * scale for channel in zip(*values, strict=True)])
         choice, rounding = hit_numbers(si)
         if taps > 1:
             uv = dr.fma(axis, (dr.floor(choice * taps) + 0.5) * (1 / taps) - 0.5, uv)
-        return self._used_of(self._rounded(uv, level, rounding))
+        return self._decode_mean(self._rounded(uv, level, rounding))
 
     def _footprint(self, si) -> tuple:
         """Return the footprint in texels of the image, with ``to_uv`` applied."""
@@ -456,7 +453,7 @@ class FilteredTexture(MapTexture):
             return ddx * size, ddy * size
 
     def _filtered(self, uv, level) -> list:
-        """Return the values of one place at a level of detail, in a form that can be averaged (:meth:`_used_of`).
+        """Return the values of one place at a level of detail, in a form that can be averaged (:meth:`_decode_mean`).
 
         They are linear colours of maps in sRGB, and stored channels of all other maps.
         """
@@ -469,7 +466,7 @@ class FilteredTexture(MapTexture):
         """Return :meth:`_filtered`; a derived class may round the level at random by ``sample`` in [0, 1)."""
         return self._filtered(uv, level)
 
-    def _used_of(self, values: list) -> list[mi.Float]:
+    def _decode_mean(self, values: list) -> list[mi.Float]:
         """Return the channels of the maps that are read, converted from averaged values of :meth:`_filtered`."""
         remaining, used = iter(values), []
         for m in self._shown():
@@ -505,7 +502,7 @@ class FilteredTexture(MapTexture):
         for axis, n in enumerate(self._size):
             width = dr.minimum(side * (1 / n), 1)
             step = mi.Vector2f(*(0.5 * width if i == axis else 0 for i in range(2)))
-            ahead, behind = (luminance(self._used_of(self._filtered(p, level))) for p in (uv + step, uv - step))
+            ahead, behind = (luminance(self._decode_mean(self._filtered(p, level))) for p in (uv + step, uv - step))
             gradient.append((ahead - behind) / width)
         return self._before(*gradient)
 
@@ -518,7 +515,7 @@ class FilteredTexture(MapTexture):
         description = super().report()
         left_out = description["effects_left_out"]
         sources = []
-        if self.filter.name == "off" or not self.is_spatially_varying():
+        if not self.filtered():
             left_out["footprint"] = "the filter is off" if self.filter.name == "off" else "the map is constant"
         else:
             sources = ["uv partials"]

@@ -234,7 +234,7 @@ class Filter:
         return self.taps if self.name == "anisotropic" else 1
 
 
-def cone_of(props: mi.Properties) -> footprint.Cone | None:
+def shared_cone(props: mi.Properties) -> footprint.Cone | None:
     """Return :meth:`.Cone.from_properties`, the same object for equal properties.
 
     Dr.Jit merges the reads of several textures only if they share their variables.

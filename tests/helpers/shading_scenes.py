@@ -44,11 +44,11 @@ def fitted(manifest: Path, steps=2, fine="0:2:4", skip=2, cascaded=5, batch=2048
     """A table file of a material beside its manifest."""
     source, recipe = load_source(manifest), PRESETS[preset]
     recipe = dataclasses.replace(recipe, steps=steps, batch=batch, measure_every=steps)
-    layout = fit.layout_of(source, recipe)
+    layout = fit.source_layout(source, recipe)
     arrays = parse_structure(fine) if fine else ()
     size = size or TextureBudget(source.height, source.width, layout.stored, arrays, skip, 3, cascaded, skip + 1)
     types = array_module("llvm")
-    pyramid = Pyramid.of(source, layout, types, ("repeat", "repeat"))
+    pyramid = Pyramid.from_source(source, layout, types, ("repeat", "repeat"))
     request = FitRequest(preset, recipe, types, progress=False)
     table, _ = fit.fit_texture(source, size, recipe, request, pyramid)
     table.settings["source_path"] = manifest.name

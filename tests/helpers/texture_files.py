@@ -29,14 +29,14 @@ def make(path, source, preset="ours", border="repeat", extras=None, **settings):
     ``extras``: a function that returns entries from their shape.
     """
     recipe, types = PRESETS[preset], array_module("llvm")
-    pyramid = Pyramid.of(source, fit.layout_of(source, recipe), types, (border, border))
+    pyramid = Pyramid.from_source(source, fit.source_layout(source, recipe), types, (border, border))
     stored = pyramid.layout.stored
     if preset == "paper":
         size = arrays.PaperBudget(9, 12, 4, 4, stored)
     else:
         dims = min(3, stored)
         size = arrays.TextureBudget(source.height, source.width, stored, (arrays.FineArray(0, dims, 8),), 1, dims, 12)
-    net, rng = fit.problem_of(source, size, recipe, pyramid).net, np.random.default_rng(7)
+    net, rng = fit.build_problem(source, size, recipe, pyramid).net, np.random.default_rng(7)
     if preset == "paper":
         for array in net.arrays.values():
             array.data = types.TensorXf(aligned(rng.random(array.data.shape)))
@@ -50,10 +50,10 @@ def make(path, source, preset="ours", border="repeat", extras=None, **settings):
 def make_image(path, source, border="repeat"):
     """Write a file of the task ``image`` whose arrays are those at the start of a training, almost without loss."""
     recipe, types = image.PRESETS["ours"], array_module("llvm")
-    stored = image_training.layout_of(source, recipe).stored
+    stored = image_training.source_layout(source, recipe).stored
     dims = min(3, stored)
     size = image_arrays.ImageBudget(source.height, source.width, 8, stored, dims, 8)
-    problem = image_training.problem_of(source, size, recipe, types, border=(border, border))
+    problem = image_training.build_problem(source, size, recipe, types, border=(border, border))
     stored_net = image_training.stored_form(problem.net, problem.bits)
     save_table(path, image_arrays.to_table(image_arrays.CompressedImage(problem.layout, stored_net), {}))
     return str(path)

@@ -424,33 +424,6 @@ def test_updated_parameters_show(mi_rgb, rng, name, kind):
             np.testing.assert_allclose(value(changed), fresh[end], rtol=1e-3, atol=1e-5, err_msg=f"{parameter} {end}")
 
 
-@pytest.mark.parametrize("name, parameter, values", [("disney", "clearcoat", (0.0, 0.0, 0.5, 0.0, 1.0)),
-                                                     ("neural_ggx", "alpha", (0.3, 0.3, 0.5, 0.05, 1.0))])  # fmt: skip
-def test_parameters_updated_inside_a_frozen_function(mi_rgb, no_garbage_collection, name, parameter, values):
-    """Each image is that of a scene loaded so, also after an update outside of it again."""
-    mi, seed = mi_rgb, mi_rgb.UInt32(0)
-
-    def load_scene(value):
-        return sphere_scene(mi, described(name, **{parameter: value}), "direct", size=8)
-
-    expected = {value: mi.render(load_scene(value), spp=4, seed=seed).numpy() for value in {*values, 0.7}}
-    scene = load_scene(values[0])
-    params = mi.traverse(scene)
-    key = key_of(params, f"{parameter}.value")
-
-    @dr.freeze
-    def frozen(scene, params, value, seed):
-        params[key] = value
-        params.update()
-        return mi.render(scene, params, spp=4, seed=seed)
-
-    for value in values:
-        assert equal_images(frozen(scene, params, dr.opaque(mi.Float, value), seed).numpy(), expected[value]), value
-    params[key] = mi.Float(0.7)
-    params.update()
-    assert equal_images(mi.render(scene, params, spp=4, seed=seed).numpy(), expected[0.7])
-
-
 @pytest.mark.parametrize("name, parameter", [("disney", "clearcoat"), ("neural_ggx", "alpha")])
 def test_textures_that_vary_without_saying_so(mi_rgb, name, parameter):
     """Mitsuba's ``mesh_attribute`` calls itself constant: its value at no mesh at all is not that of the material."""
@@ -479,7 +452,7 @@ LEFT_OUT["neural_disney"] = LEFT_OUT["disney"]
 @pytest.mark.parametrize("update", [False, True])
 @pytest.mark.parametrize("name", LEFT_OUT)
 def test_an_optimised_parameter_keeps_its_effect(mi_rgb, name, update):
-    """… through the renderer, at the very value at which it is left out, and loses it when it is optimised no more."""
+    """An optimised parameter at the value at which its effect is left out has a gradient, through the renderer, too."""
     mi, (values, effects) = mi_rgb, LEFT_OUT[name]
     scene = sphere_scene(mi, described(name, **values), "prb", size=8)
     params, bsdf = mi.traverse(scene), scene.shapes()[0].bsdf()
@@ -637,15 +610,6 @@ def test_several_materials_in_one_loop(mi_rgb, integrator):
         i = names.index(name)
         assert equal_images(tile(together, i, 4, 8), tile(image([name]), i, 4, 8)), name
     assert np.array_equal(together, image(names))
-
-
-def test_one_instance_on_many_shapes(mi_rgb):
-    mi = mi_rgb
-    for name in PLUGINS:
-        shared = load(mi, name)
-        images = [mi.render(sphere_scene(mi, bsdfs, "direct"), spp=4).numpy()
-                  for bsdfs in ([shared] * 4, [described(name) for _ in range(4)])]  # fmt: skip
-        assert equal_images(*images), name
 
 
 @pytest.mark.parametrize("name, count", [("neural_disney", 600), ("neural_ggx", 300), ("neural_bsdf family", 200)])

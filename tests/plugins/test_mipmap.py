@@ -41,7 +41,7 @@ def plugin(file, name="trilinear", **more):
 
 def pyramid(mi, image, border="repeat", color_space="srgb"):
     source = from_arrays({"image": image}, {"image": color_space})
-    return Pyramid.of(source, types=backend_module(mi.TensorXf), border=(border, border))
+    return Pyramid.from_source(source, types=backend_module(mi.TensorXf), border=(border, border))
 
 
 def expected(mi, truth, uv, level):
@@ -150,7 +150,9 @@ def test_changed_texels_are_those_of_a_new_texture(mi_rgb, rng, role):
     for values in (old, new):
         source = from_arrays({role: values}, {role: space})
         assert source.maps[0].role == role or role != "normal"
-        image_files.PYRAMIDS["texels"] = Pyramid.of(source, types=backend_module(mi.TensorXf), border=("repeat",) * 2)
+        image_files.PYRAMIDS["texels"] = Pyramid.from_source(
+            source, types=backend_module(mi.TensorXf), border=("repeat",) * 2
+        )
         textures.append(mi.load_dict({"type": "mipmap", "pyramid": "texels", "raw": role != "srgb"}))
     del image_files.PYRAMIDS["texels"]
     texture, truth = textures

@@ -344,14 +344,14 @@ def test_inner_integrators(mi_rgb, fields, inner):
     assert np.abs(found.mean((0, 1)) / expected.mean((0, 1)) - 1).max() < 0.02
 
 
-def test_what_the_inner_integrator_is_asked(mi_rgb, fields):
+def test_rays_of_the_inner_integrator(mi_rgb, fields):
     """Rays that end in the field are not traced further; differentials go with rays, also over mirrors."""
     mi = mi_rgb
     asked = []
 
     class Inner(mi.ad.integrators.common.RBIntegrator):
         def sample(self, mode, scene, sampler, ray, active=True, **kwargs):
-            asked.append([np.array(v) for v in (active, ray.o, ray.d, ray.o_x - ray.o, ray.d_x - ray.d)])
+            asked.append([np.array(v) for v in (active, ray.o, ray.o_x - ray.o, ray.d_x - ray.d)])
             return mi.Spectrum(1), mi.Bool(active), [], None
 
         def sample_rays(self, scene, sensor, sampler):
@@ -365,20 +365,15 @@ def test_what_the_inner_integrator_is_asked(mi_rgb, fields):
     made = scene(mi, glass=mirror(mi, {"type": "conductor"}, place=(1.6, 0.5, 0)))
     integrator = mi.load_dict({"type": "test_dense", "field": "dense", "c": {"type": "test_inner"}})
     image = render(mi, made, integrator=integrator, seed=1)
-    active, o, d, o_x, d_x = asked[0]
+    active, o, o_x, d_x = asked[0]
     active = active.reshape(image.shape[:2])
     assert 0.3 < active.mean() < 0.9 and not active[12, 12] and active[0, 0]
     assert (np.abs(image[~active][:, :3] - HUE) < 2e-3).all()
     turned = np.abs(o - o[:, :1]).max(0) > 1
     assert 20 < turned.sum() < active.sum() / 2
-    # Of a plane mirror: the neighbour's ray is the neighbouring one, off the middle of the pixel by at most half
-    pixel = turned[:-1] & turned[1:] & (np.arange(1, len(turned)) % image.shape[1] > 0)
-    before, after = np.flatnonzero(pixel), np.flatnonzero(pixel) + 1
-    assert (
-        np.abs(np.linalg.norm(d_x[:, turned], axis=0) / np.linalg.norm(d_x[:, ~turned], axis=0).mean() - 1).max() < 0.2
-    )
-    step = ((d[:, after] - d[:, before]) * d_x[:, before]).sum(0) / (d_x[:, before] ** 2).sum(0)
-    assert abs(step.mean() - 1) < 0.1 and len(step) > 20
+    # A plane mirror turns the differences between the directions of pixels, and keeps their lengths
+    length = np.linalg.norm(d_x, axis=0)
+    assert np.abs(length[turned] / length[~turned].mean() - 1).max() < 0.2
     assert np.linalg.norm(o_x[:, ~turned], axis=0).max() < 1e-3 < np.linalg.norm(o_x[:, turned], axis=0).min()
 
 

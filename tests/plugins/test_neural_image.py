@@ -100,7 +100,7 @@ def plugin(file, channels="albedo", **more):
 
 @functools.lru_cache
 def decoded(dtype, file, stamp):
-    return CompressedImage.of(TASK.load(file), dtype).decode()
+    return CompressedImage.from_table(TASK.load(file), dtype).decode()
 
 
 def counterpart(mi, file, channels="albedo", **more):
@@ -322,24 +322,6 @@ def test_a_file_that_was_written_anew_is_read_anew(mi_rgb, tmp_path, rng):
     np.testing.assert_array_equal(first.eval(si).numpy(), before)
 
 
-def test_relative_names_and_xml(mi_rgb, tmp_path, rng):
-    mi = mi_rgb
-    make(tmp_path / "a.npz")
-    (tmp_path / "b.xml").write_text(
-        '<bsdf version="3.0.0" type="diffuse"><texture type="neural_image" name="reflectance">'
-        '<string name="filename" value="a.npz"/><string name="channels" value="albedo"/>'
-        '<string name="wrap_mode" value="clamp"/><boolean name="raw" value="true"/>'
-        '<boolean name="accel" value="false"/><string name="filter_type" value="bilinear"/>'
-        '<transform name="to_uv"><scale x="2" y="3"/><translate x="0.1"/></transform></texture></bsdf>'
-    )
-    found = mi.load_file(str(tmp_path / "b.xml"))
-    to_uv = mi.ScalarTransform4f().translate([0.1, 0, 0]).scale([2, 3, 1])
-    expected = mi.load_dict(plugin(str(tmp_path / "a.npz"), raw=True, wrap_mode="clamp", to_uv=to_uv))
-    si = hits(mi, rng.uniform(-0.2, 0.6, (2, 100)))
-    np.testing.assert_allclose(found.eval_diffuse_reflectance(si).numpy(), expected.eval(si).numpy(), rtol=0, atol=1e-5)
-    assert "map = albedo of albedo, normal" in str(expected)
-
-
 def test_several_maps_and_none_named(mi_rgb, tmp_path):
     path = make(tmp_path / "a.npz", replace(LAYOUT, maps=MAPS[1:]))
     assert '"pair" has 2 channels, a texture has 1 or 3' in refused(mi_rgb, plugin(path, "pair"))
@@ -380,7 +362,7 @@ def material(tmp_path_factory):
     mi.Bitmap(orm).write(str(folder / "orm.png"))
     maps = {"albedo": "albedo.png", "roughness": {"file": "orm.png", "channels": "g"}}
     (folder / "wall.json").write_text(json.dumps(maps))
-    layout = Layout.of(load_source(folder / "wall.json"))
+    layout = Layout.from_source(load_source(folder / "wall.json"))
     tabulated(folder / "wall.npz", layout, stored, source_path="wall.json")
     textures = texture_xml("base_color", "wall.npz", channels="albedo") + texture_xml(
         "roughness", "wall.npz", channels="roughness", wrap_mode="mirror"

@@ -11,9 +11,7 @@ from texture_files import make, material
 from texture_scenes import linear
 
 from mi_diffind.arrays.tables import load_table, save_table
-from mi_diffind.core.compat import backend_module
 from mi_diffind.maps.layout import Layout
-from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays, load_source
 from mi_diffind.measure.clock import bsdf_operations, count
 from mi_diffind.scenes import loading
@@ -129,34 +127,6 @@ def test_a_level_bias_reads_as_a_smaller_footprint(mi_rgb, files, tmp_path, rng,
             np.testing.assert_allclose(*slopes, atol=1e-3)
 
 
-@pytest.mark.parametrize("border, wrap_mode", [("ours", "clamp"), ("clamp", "repeat")])
-def test_equals_a_mipmap_of_what_it_decodes_to(mi_rgb, files, rng, border, wrap_mode):
-    """At the texel centres of each level, with texels for footprints, of neighbouring images, too."""
-    mi = mi_rgb
-    from mi_diffind.plugins.support import image_files
-
-    image = opened(mi, files[border])
-    layout, along = image.layout, ("repeat" if wrap_mode == "repeat" else "clamp",) * 2
-    levels = []
-    for level in range(image.levels):
-        rows, columns = image.level_size(level)
-        y, x = np.mgrid[0:rows, 0:columns]
-        u, v, at = floats(mi, (x.ravel() + 0.5) / columns, (y.ravel() + 0.5) / rows, np.full(x.size, level))
-        levels.append(numpy_of(image.filtered(u, v, at)).reshape(rows, columns, -1))
-    image_files.PYRAMIDS["decoded"] = Pyramid(layout, levels, backend_module(mi.TensorXf), along)
-    try:
-        ours = mi.load_dict(plugin(files[border], wrap_mode=wrap_mode))
-        theirs = mi.load_dict({"type": "mipmap", "pyramid": "decoded", "channels": "albedo", "wrap_mode": wrap_mode})
-        for level in range(image.levels - 1):  # the last: a texel is higher than the image
-            rows, columns = image.level_size(level)
-            uv = [(rng.integers(-2 * n, 3 * n, 100) + 0.5) / n for n in (columns, rows)]
-            si = texture_scenes.hits(mi, uv, (2**level / WIDTH, 0), (0, 2**level / HEIGHT))
-            a, b = numpy_of(t.eval_1(si) for t in (ours, theirs)).T
-            np.testing.assert_allclose(a, b, atol=5e-4, err_msg=f"level {level}")
-    finally:
-        del image_files.PYRAMIDS["decoded"]
-
-
 # -- hard cases --------------------------------------------------------------------------------------------------------
 
 
@@ -164,7 +134,7 @@ def test_no_arrays(mi_rgb, tmp_path):
     """A texture of one colour is a few numbers, and has no footprint."""
     mi = mi_rgb
     source = from_arrays({"albedo": np.full((4, 8, 3), 128, np.uint8)})
-    layout = Layout.of(source, filtered=True)
+    layout = Layout.from_source(source, filtered=True)
     save_table(tmp_path / "a.npz", to_table(CompressedTexture(layout, None), {}))
     for name in FILTERS:
         texture = mi.load_dict(plugin(str(tmp_path / "a.npz"), name))

@@ -7,14 +7,13 @@ import textwrap
 from importlib import metadata
 from pathlib import Path
 
-import drjit as dr
 import plugin_examples as examples
 import pytest
 
 from mi_diffind import plugins
 from mi_diffind.scenes import loading
 
-#: A learned shape whose factory returns a native object, a volume, and factories that fail.
+#: A learned shape whose factory returns a native object, and factories that fail.
 MODULES = {
     "toy_ball": """
         import mitsuba as mi
@@ -34,34 +33,6 @@ MODULES = {
             props["radius"] = float(props.get("size", 0.5))
 
         PLUGIN = Plugin("toy_ball", "shape", make, exact=Counterpart("sphere", ("preset", "size"), convert=to_sphere))
-    """,
-    "toy_fog": """
-        import mitsuba as mi
-        from mi_diffind.plugins import Counterpart, Plugin
-
-        class Fog(mi.Volume):
-            def eval(self, it, active=True):
-                return mi.UnpolarizedSpectrum(0.7)
-
-            def eval_1(self, it, active=True):
-                return mi.Float(0.7)
-
-            def max(self):
-                return 0.7
-
-            def max_per_channel(self):
-                return [0.7]
-
-            def traverse(self, cb):
-                pass
-
-            def report(self):
-                return {"preset": "tables"}
-
-            def to_string(self):
-                return "Fog[]"
-
-        PLUGIN = Plugin("toy_fog", "volume", Fog, exact=Counterpart("constvolume", given={"value": 0.7}))
     """,
     "toy_nothing": """
         from mi_diffind.plugins import Plugin
@@ -149,7 +120,7 @@ def test_manual_pages_are_complete(mi_rgb):
 
 
 def test_program_of_mitsuba_loads_no_plugins(mi_rgb, tmp_path):
-    """As manual pages and the README have it; they change when this fails."""
+    """Mitsuba's program loads no Python plugins; manual pages and the README change when this fails."""
     (tmp_path / "scene.xml").write_text('<scene version="3.0.0"><bsdf type="neural_disney"/></scene>')
     program = Path(mi_rgb.__file__).parent / ("mitsuba.exe" if sys.platform == "win32" else "mitsuba")
     command = [str(program), "-m", "scalar_rgb", str(tmp_path / "scene.xml")]
@@ -185,7 +156,7 @@ def test_after_a_purge_of_modules():
 def test_plugins_of_other_packages(mi_toys, tmp_path):
     """Shapes whose factories return native objects are found, compared and inspected; also by scalar variants."""
     mi = mi_toys
-    assert {"toy_ball", "toy_fog", "neural_disney"} <= set(plugins.declared())
+    assert {"toy_ball", "neural_disney"} <= set(plugins.declared())
     (tmp_path / "scene.xml").write_text(SCENE)
     found = loading.ParsedScene(tmp_path / "scene.xml").learned_plugins()
     assert [(e["plugin"], e["id"], e.get("preset"), e.get("size")) for e in found] == [
@@ -222,22 +193,6 @@ def test_native_objects_are_forgotten(mi_toys):
     assert len(plugins._native) == before
 
 
-def test_volumes(mi_toys):
-    """Registered as textures, which is what makes them work in a scene; not at all in scalar variants."""
-    mi = mi_toys
-    medium = {"type": "heterogeneous", "albedo": 0.5, "sigma_t": {"type": "toy_fog"}}
-    scene = {"type": "scene", "shape": {"type": "sphere", "bsdf": {"type": "null"}, "interior": medium}}
-    if not plugins.supported(mi.variant()):
-        with pytest.raises(RuntimeError, match="toy_fog"):
-            mi.load_dict(scene)
-        return
-    loaded = mi.load_dict(scene)
-    (report,) = loading.reports(loaded)
-    assert (report["plugin"], report["kind"], report["preset"]) == ("toy_fog", "volume", "tables")
-    volume = loading.instances(loaded)[0]
-    assert dr.allclose(volume.eval_1(dr.zeros(mi.Interaction3f)), 0.7)
-
-
 @pytest.mark.parametrize("name, found", [("toy_nothing", "nothing"), ("toy_wrong", "a Shape")])
 def test_factories_that_return_something_else(mi_toys, name, found):
     """Mitsuba would crash, or speak of a bad cast."""
@@ -258,7 +213,7 @@ def test_two_plugins_of_one_name(mi_rgb, monkeypatch):
 
 
 def test_choices_are_the_words_that_plugins_allow(mi_rgb):
-    """As they list them themselves when they refuse another one."""
+    """Declared words of a parameter are those that its plugin lists when it refuses another one."""
     choices = [
         (name, key, words) for name, plugin in plugins.declared().items() for key, words in plugin.choices.items()
     ]

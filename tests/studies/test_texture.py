@@ -118,7 +118,7 @@ def test_flicker():
 def test_levels(mi_rgb):
     """Errors of each level, and that what was decoded comes back in a pyramid of the same layout."""
     source = from_arrays({"albedo": smooth(8, 16, 3), "ao": smooth(8, 16, 1, 1)})
-    pyramid = Pyramid.of(source, types=array_module("llvm_ad_rgb"))
+    pyramid = Pyramid.from_source(source, types=array_module("llvm_ad_rgb"))
     truth = texture.level_images(pyramid)
     np.testing.assert_allclose(truth["albedo"][0], source.maps[0].values, atol=1e-6)
     assert [v.shape for v in truth["ao"]] == [(8, 16, 1), (4, 8, 1), (2, 4, 1), (1, 2, 1), (1, 1, 1)]
@@ -140,7 +140,7 @@ def test_a_table_in_place_of_a_training(mi_rgb):
     path = ASSETS / "tiles.json"
     source = load_source(path)
     tables = texture.load_tables([str(ASSETS / "tiles_filtered.npz")], source)
-    settings = SimpleNamespace(compressions=(), film=FILM, zoom_film=FILM, frames=2, truth_spp=256, seeds=4,
+    settings = SimpleNamespace(compressions=(), film=FILM, zoom_film=FILM, frames=2, truth_spp=256, seeds=4, scenes=3,
                                footprints=False, only=(), astc="fast")  # fmt: skip
     plan = texture.plan(source, str(path), settings, tables)
     mark = f"ours {source.nbytes / tables[0].nbytes:.3g}x"

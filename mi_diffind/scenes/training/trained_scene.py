@@ -24,8 +24,15 @@ from ...maps.source import load_source
 from ...plugins.support import footprint
 from ...tasks.texture import PRESETS, TextureSettings
 from ...tasks.texture.arrays import FineArray, PaperBudget, TextureBudget
-from ...tasks.texture.compressed import CompressedTexture, PaperStructure, bias_of, load, structure_of, to_table
-from ...tasks.texture.fit import TextureProblem, problem_of, stored_form
+from ...tasks.texture.compressed import (
+    CompressedTexture,
+    PaperStructure,
+    load,
+    read_level_bias,
+    read_structure,
+    to_table,
+)
+from ...tasks.texture.fit import TextureProblem, build_problem, stored_form
 from .. import loading
 from .options import View, ViewDistribution
 from .rig import Rig
@@ -153,13 +160,13 @@ class SceneTexture:
         layout, recipe = Layout.from_json(self.table.settings["layout"]), texture_recipe(self.table)
         if not layout.stored:
             raise UsageError(f"{self.table.path}: holds a texture of one colour, without arrays to train")
-        texture = CompressedTexture.of(self.table, mi.TensorXf, "float32")
-        pyramid = Pyramid.of(self.source, layout, compat.backend_module(mi.TensorXf), texture.border)
+        texture = CompressedTexture.from_table(self.table, mi.TensorXf, "float32")
+        pyramid = Pyramid.from_source(self.source, layout, compat.backend_module(mi.TensorXf), texture.border)
         if trained:
             self.problem = TextureProblem(texture.net, pyramid, recipe, self.source.digest)
         else:
-            self.problem = problem_of(self.source, texture_budget(self.table), recipe, pyramid)
-        self.problem.settings, self.level_bias = recipe, bias_of(self.table.settings)
+            self.problem = build_problem(self.source, texture_budget(self.table), recipe, pyramid)
+        self.problem.settings, self.level_bias = recipe, read_level_bias(self.table.settings)
         if not trained:
             self.table = self.to_table({})
 
@@ -170,7 +177,7 @@ class SceneTexture:
 
     def measure(self, table: Table) -> dict[str, float]:
         """Return the errors of a table against the source (:meth:`.CompressedTexture.measure`)."""
-        return CompressedTexture.of(table, mi.TensorXf).measure(self.source)
+        return CompressedTexture.from_table(table, mi.TensorXf).measure(self.source)
 
     @property
     def identity(self) -> dict:
@@ -218,7 +225,7 @@ def texture_recipe(table: Table) -> TextureSettings:
 def texture_budget(table: Table) -> TextureBudget | PaperBudget:
     """Return the memory budget that the arrays of a texture were made for."""
     layout = Layout.from_json(table.settings["layout"])
-    structure, _ = structure_of(table.settings, layout)
+    structure, _ = read_structure(table.settings, layout)
     shapes = {name: array.shape for name, array in table.arrays.items()}
     if isinstance(structure, PaperStructure):
         rows, columns, _ = shapes["primary0"]

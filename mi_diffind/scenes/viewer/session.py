@@ -79,9 +79,7 @@ class Session:
         use_variant()
         if not isinstance(width, int) or not NARROWEST <= width <= WIDEST:
             raise UsageError(f"width: found {width}, allowed are whole numbers from {NARROWEST} to {WIDEST}")
-        if against != "exact" and not plugins.with_counterpart(against):
-            others = dict.fromkeys(c.name for plugin in plugins.declared().values() for c in plugin.others)
-            raise UsageError(f'against: found "{against}", allowed are exact, {", ".join(others)}')
+        loading.check_counterpart(against)
         self.against, self.seed, self._values = against, seed, {}
         in_file = isinstance(source, (str, os.PathLike))
         self.name = Path(source).name if in_file else "scene"

@@ -387,7 +387,7 @@ def measure_row_symmetry(truth: ScatteredTruth) -> dict[str, float | None]:
     from scipy.spatial import cKDTree
 
     points, f = places(truth, True), truth.f.mean(axis=1)
-    rows = np.random.default_rng(1).permutation(len(f))[:20_000]
+    rows = np.random.default_rng(1).permutation(len(f))[:20_000]  # those that are compared
     light = np.maximum(f * truth.wi[:, 2] * truth.wo[:, 2], 1e-12)
     bright = np.quantile(light, 0.9)
     tree, azimuth = cKDTree(points), np.arctan2(truth.wi[:, 1], truth.wi[:, 0])
@@ -403,7 +403,7 @@ def measure_row_symmetry(truth: ScatteredTruth) -> dict[str, float | None]:
         return float((weight * np.abs(a - b) / (a + b)).sum() / weight.sum())
 
     def difference_beyond(usual: float | None, other: float | None) -> float | None:
-        return None if other is None or usual is None else max(0.0, other - 1.5 * usual)
+        return None if other is None or usual is None else max(0.0, other - 1.5 * usual)  # noise, distance
 
     def first(condition: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the nearest neighbour that meets a condition, and whether there is one."""
@@ -552,7 +552,7 @@ def without_outliers(samples: Samples, form: Form, proxy: LearnedBSDF) -> tuple[
     points = np.stack([u, v, 0.25 * w], axis=1)
     median = np.median(ratio[cKDTree(points).query(points, min(NEIGHBOURS, len(points) - 1) + 1)[1][:, 1:]], axis=1)
     difference = np.abs(ratio - median)
-    outlier = difference > max(0.4, 6.0 * float(np.median(difference)))
+    outlier = difference > max(0.4, 6.0 * float(np.median(difference)))  # of logarithms
     kept = type(samples.weight)(np.ascontiguousarray(~outlier, np.float32))
     return Samples(samples.wi, samples.wo, samples.weight * kept, samples.value), int(outlier.sum())
 

@@ -333,37 +333,26 @@ def choose_form(
 
 def residual_range(form: Form, logarithms: np.ndarray, samples: Samples) -> tuple[float, float]:
     """Return the range of log(f / proxy) over samples, from quantiles; without a proxy, black channels count, too."""
-    types = backend_module(samples.weight)
-    if form.terms:
-        net = BSDFArrays(None, proxy_array(logarithms, 1.0)).alloc(types.TensorXf)
-        with dr.suspend_grad():
+    types, value = backend_module(samples.weight), [1.0, 1.0, 1.0]
+    with dr.suspend_grad():
+        if form.terms:
+            net = BSDFArrays(None, proxy_array(logarithms, 1.0)).alloc(types.TensorXf)
             value = net.at(form, samples.coordinates).value(samples.wi, samples.wo)
-        return range_above(value, samples)
-    low, high = range_above([1.0, 1.0, 1.0], samples)
-    with dr.suspend_grad():
-        light = [float(dr.mean(samples.weight * t)[0]) for t in samples.value]
-    if not any(light):
+        light, ratios = [float(dr.mean(samples.weight * t)[0]) for t in samples.value], []
+        for v, t in zip(value, samples.value, strict=True):
+            ratio = dr.log(dr.maximum(t, 1e-12) / dr.maximum(v * samples.wo.z, 1e-12))
+            ratios.append(ratio.numpy()[(t * samples.weight).numpy() > DARK * sum(light) / 3])
+    if not (form.terms or any(light)):
         return LOGARITHMS[0] - LEAST_RANGE, LOGARITHMS[0] + LEAST_RANGE
-    return (min(low, high + math.log(1e-4)) if min(light) < DARK * max(light) else low), high  # of the largest value
-
-
-def range_above(value: list, samples: Samples) -> tuple[float, float]:
-    """Return the range of log(f / ``value``) over samples of f, from quantiles; ``value`` has no cosine."""
-    with dr.suspend_grad():
-        least = DARK * sum(float(dr.mean(samples.weight * t)[0]) for t in samples.value) / 3
-        ratios = [
-            (dr.log(dr.maximum(t, 1e-12) / dr.maximum(v * samples.wo.z, 1e-12))).numpy()[
-                (t * samples.weight).numpy() > least
-            ]
-            for v, t in zip(value, samples.value, strict=True)
-        ]
-    ratios = np.concatenate(ratios)
-    if not len(ratios):
-        return -LEAST_RANGE, LEAST_RANGE
-    low, high = np.quantile(ratios, [1 - QUANTILE, QUANTILE])
-    low, high = min(low, -LEAST_RANGE), max(high, LEAST_RANGE)
-    margin = 0.25 * (high - low)
-    return float(low - margin), float(high + margin)
+    ratios, low, high = np.concatenate(ratios), -LEAST_RANGE, LEAST_RANGE
+    if len(ratios):
+        ends = np.quantile(ratios, [1 - QUANTILE, QUANTILE])
+        low, high = min(ends[0], low), max(ends[1], high)
+        margin = 0.25 * (high - low)
+        low, high = float(low - margin), float(high + margin)
+    if not form.terms and min(light) < DARK * max(light):
+        low = min(low, high + math.log(1e-4))  # a black channel, relative to the largest value
+    return low, high
 
 
 def residual_problem(

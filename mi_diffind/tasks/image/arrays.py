@@ -303,9 +303,9 @@ class CompressedImage(CompressedMaps):
         self.border = ("clamp", "clamp") if net is None else net.primary[0].border
 
     @staticmethod
-    def of(table: Table, dtype, storage: str = "") -> CompressedImage:
+    def from_table(table: Table, dtype, storage: str = "") -> CompressedImage:
         """Return the image of a checked table, in a storage form (:func:`allocate`)."""
-        return assembled(table, allocate(table, dtype, storage))
+        return assemble(table, allocate(table, dtype, storage))
 
     def stored(self, u, v, active=True) -> list:
         """Return the stored channels at (u, v)."""
@@ -318,7 +318,7 @@ def allocate(table: Table, dtype, storage: str = "") -> dict[str, Differentiable
     return allocate_maps(table, dtype, storage, lambda name: (layout.height, layout.width))
 
 
-def assembled(table: Table, arrays: dict[str, DifferentiableArray]) -> CompressedImage:
+def assemble(table: Table, arrays: dict[str, DifferentiableArray]) -> CompressedImage:
     """Return the image of a checked table from its allocated arrays."""
     primaries = [arrays[name] for name in PRIMARIES if name in arrays]
     net = join_primaries(primaries, arrays["cascaded"]) if arrays else None
@@ -354,7 +354,7 @@ class ImageModel(MapsModel):
     """Model of an image file; ``image`` is a :class:`CompressedImage`."""
 
     def build(self):
-        self.image = assembled(self.table, self.arrays)
+        self.image = assemble(self.table, self.arrays)
 
 
 MODEL = ImageModel

@@ -18,7 +18,7 @@ from ...maps.model import complete, rehearse_pictures, requested_border, request
 from ...maps.source import Source, load_source
 from . import PAGED, STRUCTURES, CoarsePrimary, ImageSettings, parse_weights
 from .arrays import CompressedImage, ImageBudget, cascaded_side, fit_bytes, search
-from .training import fit_image, layout_of, pointer_dims, problem_of, structure_of
+from .training import build_problem, choose_structure, fit_image, pointer_dims, source_layout
 
 #: Share of the steps that a candidate of a search is trained for.
 SHORT = 1 / 8
@@ -96,14 +96,16 @@ def fit(request: FitRequest) -> Fitted:
     recipe = dataclasses.replace(request.settings, weights=_weights(request, source, request.settings))
     rehearse_pictures(request, source)
     fitted, requested = _train(request, source, recipe)
-    return complete(request, source, fitted, CompressedImage.of(fitted.table, request.types.TensorXf), requested)
+    return complete(
+        request, source, fitted, CompressedImage.from_table(fitted.table, request.types.TensorXf), requested
+    )
 
 
 def _train(request: FitRequest, source: Source, recipe: ImageSettings) -> tuple[Fitted, float | None]:
     """Return the result of the training or search, and the requested bytes."""
     options = request.options
     border = requested_border(options)
-    if not layout_of(source, recipe).stored:  # all channels are constant
+    if not source_layout(source, recipe).stored:  # all channels are constant
         return Fitted(*fit_image(source, None, recipe, request, border), figures={"tried": []}), None
     if options["psnr"] is not None:
         table, result, tried = psnr_search(source, float(options["psnr"]), recipe, request, border)
@@ -147,7 +149,7 @@ def default_size(source: Source, nbytes: float, recipe: ImageSettings, ratio: fl
     The supplement's search, with ``ratio`` in place of its table if given; or, with ``components`` or two primaries, a
     cascaded array of :func:`.cascaded_side` and the largest primary that fits beside it.
     """
-    stored, structure = max(1, layout_of(source, recipe).stored), structure_of(source, recipe, nbytes)
+    stored, structure = max(1, source_layout(source, recipe).stored), choose_structure(source, recipe, nbytes)
     bits, coarse = STRUCTURES[structure]
     if recipe.components or coarse:
         return sized(source, nbytes, recipe, cascaded_side(nbytes, stored, pointer_dims(recipe, structure, stored)))
@@ -157,7 +159,7 @@ def default_size(source: Source, nbytes: float, recipe: ImageSettings, ratio: fl
 
 def sized(source: Source, nbytes: float, recipe: ImageSettings, cascaded: int) -> ImageBudget:
     """Return the budget for ``nbytes`` bytes with a cascaded array of a given side."""
-    stored, structure = max(1, layout_of(source, recipe).stored), structure_of(source, recipe, nbytes)
+    stored, structure = max(1, source_layout(source, recipe).stored), choose_structure(source, recipe, nbytes)
     (bits, coarse), dims = STRUCTURES[structure], pointer_dims(recipe, structure, stored)
     size = fit_bytes(nbytes, stored, source.height, source.width, cascaded, dims, bits, coarse)
     return dataclasses.replace(size, paged=structure in PAGED)
@@ -196,7 +198,7 @@ def ratio_search(
         return max(tried, key=quality, default=None)
 
     start = default_size(source, nbytes, recipe)
-    recipe = dataclasses.replace(recipe, structure=structure_of(source, recipe, nbytes), dims=start.dims)
+    recipe = dataclasses.replace(recipe, structure=choose_structure(source, recipe, nbytes), dims=start.dims)
     for candidate, side in _candidates(recipe, start.cascaded, free, leader):
         size = sized(source, nbytes, candidate, side)
         key = candidate.structure, size.dims, side
@@ -323,19 +325,19 @@ def weights_as_seen(source: Source, recipe: ImageSettings, nbytes: float, types:
     Returns {} (equal weights) if initial arrays of ``nbytes`` gain less than :data:`GAIN_DB` by them in pictures, if
     pictures do not show the ``source``, or if the recipe does not start from components.
     """
-    if not (as_seen.shows(source) and recipe.components and layout_of(source, recipe).stored):
+    if not (as_seen.shows(source) and recipe.components and source_layout(source, recipe).stored):
         return {}
     share = nbytes / source.nbytes
     maps = [dataclasses.replace(m, values=as_seen.patchwork(m.values, SAMPLE_SIDE, SAMPLE_PATCH)) for m in source.maps]
     sample = Source(tuple(maps), *maps[0].values.shape[:2], f"{source.digest} sample")
-    channels = {name: len(indices) for name, indices in layout_of(sample, recipe).channels_by_map().items()}
+    channels = {name: len(indices) for name, indices in source_layout(sample, recipe).channels_by_map().items()}
     squares = as_seen.sensitivities(sample, types)
     weights = balance_weights({name: squares[name] for name in channels}, channels)
 
     def start_db(weights: dict) -> float:
         """Return the PSNR as seen from near of initial arrays."""
         weighted = dataclasses.replace(recipe, weights=weights)
-        problem = problem_of(sample, default_size(sample, share * sample.nbytes, weighted), weighted, types)
+        problem = build_problem(sample, default_size(sample, share * sample.nbytes, weighted), weighted, types)
         return as_seen.measure(sample, CompressedImage(problem.layout, problem.net), as_seen.NEAR)["seen_db"]
 
     before, after = start_db({}), start_db(weights)

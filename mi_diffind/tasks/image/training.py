@@ -40,14 +40,14 @@ ENTRIES = 3
 _structures: dict[tuple, str] = {}  # structures of "auto" by source and recipe: the choice takes a second
 
 
-def structure_of(source: Source, recipe: ImageSettings, nbytes: float | None = None) -> str:
+def choose_structure(source: Source, recipe: ImageSettings, nbytes: float | None = None) -> str:
     """Return the structure of a recipe; ``"auto"`` is chosen by the image and ``nbytes`` (default: a twelfth)."""
     if recipe.structure != "auto":
         return recipe.structure
     nbytes = source.nbytes / 12 if nbytes is None else nbytes
     key = (source.digest, recipe.once, recipe.normals, recipe.components, recipe.dims, nbytes)
     if key not in _structures:
-        _structures[key] = _suitable(layout_of(source, recipe).encode(source), recipe, nbytes)
+        _structures[key] = _suitable(source_layout(source, recipe).encode(source), recipe, nbytes)
     return _structures[key]
 
 
@@ -79,9 +79,9 @@ def _suitable(values: np.ndarray, recipe: ImageSettings, nbytes: float) -> str:
     return "6 bits" if smooth else "2 + 6 bits"
 
 
-def layout_of(source: Source, recipe: ImageSettings) -> Layout:
+def source_layout(source: Source, recipe: ImageSettings) -> Layout:
     """Return the layout of ``source`` by a recipe."""
-    return Layout.of(source, recipe.once, None if recipe.normals else False)
+    return Layout.from_source(source, recipe.once, None if recipe.normals else False)
 
 
 class ImageProblem(MapsProblem):
@@ -168,7 +168,7 @@ class ImageProblem(MapsProblem):
             return {"psnr_db": decibel(mean_square(outputs, self._texels(index)))}
 
 
-def problem_of(
+def build_problem(
     source: Source, size: ImageBudget, recipe: ImageSettings, types, layout: Layout | None = None, border=None
 ) -> ImageProblem:
     """Return the problem of training ``source`` at a size by a recipe, with initial arrays.
@@ -177,7 +177,7 @@ def problem_of(
     """
     if size.paged and not recipe.components:
         raise ValueError("size: found pages, which need a recipe with components")
-    layout = layout or layout_of(source, recipe)
+    layout = layout or source_layout(source, recipe)
     values = layout.encode(source)
     border = border or choose_borders(values)
     if recipe.components:
@@ -203,8 +203,8 @@ def fit_image(
     :func:`.layout.choose_borders`. ``request`` holds the Dr.Jit types, the time and the checkpoint; its settings are
     replaced by those of the ``recipe``. Errors are those of :meth:`.CompressedImage.measure`.
     """
-    request, layout = dataclasses.replace(request, settings=recipe), layout_of(source, recipe)
-    problem = problem_of(source, size, recipe, request.types, layout, border) if layout.stored else None
+    request, layout = dataclasses.replace(request, settings=recipe), source_layout(source, recipe)
+    problem = build_problem(source, size, recipe, request.types, layout, border) if layout.stored else None
     more = {}
     if problem is not None:
         more = {"ratio": size.ratio, "structure": recipe.structure if recipe.structure != "auto" else _name_of(size)}
@@ -212,7 +212,7 @@ def fit_image(
     def stored() -> CompressedImage:
         return CompressedImage(layout, problem and stored_form(problem.net, problem.bits))
 
-    return fit_maps(request, source, problem, stored, to_table, CompressedImage.of, title, **more)
+    return fit_maps(request, source, problem, stored, to_table, CompressedImage.from_table, title, **more)
 
 
 def _name_of(size: ImageBudget) -> str:

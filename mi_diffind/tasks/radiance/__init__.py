@@ -10,7 +10,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from math import log, prod
 
 from ...core import units
@@ -20,14 +20,6 @@ from ...fitting.task import FitSettings, Task
 #: Range of the resolution that follows from the pixels of the views: nodes along each side of a cube with the volume of
 #: the box.
 RESOLUTIONS = (32, 352)
-
-#: Stages of the grid from coarse to fine: share of the resolution, and share of the training steps. Between them, cells
-#: that no ray sees are removed.
-STAGES = ((0.25, 0.08), (0.5, 0.12), (0.75, 0.12), (1.0, 0.1), (1.0, 0.58))
-
-#: Most numbers of the nodes of a grid while it is trained, which bounds memory and time: grids with more stay coarser,
-#: unless the resolution is given. In the last stage, a third of them has been removed.
-MOST_NUMBERS = 36_000_000
 
 #: Ratio ρ of the sides of primary and cascaded array by compression (Table 6 of the supplement).
 RATIOS = {
@@ -47,34 +39,23 @@ def dense_bytes(shape) -> int:
     return NODE_BYTES * prod(map(int, shape))
 
 
-@dataclass(frozen=True)
-class RadianceRecipe:
-    """Layout of the arrays and settings of the training.
-
-    The layout is ``"sparse"`` (:mod:`.compression`), ``"pairs"`` (:mod:`.paper`) or ``"grid"`` (:mod:`.grid`). By
-    default, a training draws ``rays_per_pixel`` rays for each pixel of the training views, but not fewer than the steps
-    of the settings do.
-    """
-
-    layout: str
-    settings: FitSettings = field(default_factory=FitSettings)
-    rays_per_pixel: float = 0.0
-
-    def scaled(self, settings: FitSettings, views) -> FitSettings:
-        """Return ``settings`` with steps for the pixels of all training ``views``, if they have the default steps."""
-        if settings.steps != self.settings.steps:
-            return settings
-        # However many pixels there are
-        steps = min(11_000, round(self.rays_per_pixel * (len(views) * views.mean_pixels) / settings.batch))
-        return replace(settings, steps=max(settings.steps, steps))
-
-
-#: Preset name → recipe; the first is the default.
+#: Preset name → settings of the training; the first is the default.
 PRESETS = {
-    "sparse": RadianceRecipe("sparse", FitSettings(steps=1000, batch=16384, lr=5e-3, loss="mse", check_every=50), 2.0),
-    "paper": RadianceRecipe("pairs", FitSettings(steps=1000, batch=16384, lr=5e-3, loss="mse", check_every=50), 2.0),
-    "grid": RadianceRecipe("grid", FitSettings(steps=2000, batch=16384, lr=4e-2, loss="mse", check_every=50), 20.0),
+    "sparse": FitSettings(steps=1000, batch=16384, lr=5e-3, loss="mse", check_every=50),
+    "paper": FitSettings(steps=1000, batch=16384, lr=5e-3, loss="mse", check_every=50),
+    "grid": FitSettings(steps=2000, batch=16384, lr=4e-2, loss="mse", check_every=50),
 }
+
+
+def scale_steps(preset: str, settings: FitSettings, views) -> FitSettings:
+    """Return ``settings`` with steps for the pixels of all training ``views``, if they have the steps of the preset.
+
+    Two rays are drawn for each pixel, twenty while a grid is trained, but not fewer than the settings say.
+    """
+    if settings.steps != PRESETS[preset].steps:
+        return settings
+    rays = (20 if preset == "grid" else 2) * (len(views) * views.mean_pixels)
+    return replace(settings, steps=max(settings.steps, min(11_000, round(rays / settings.batch))))
 
 
 def ratio_for(quantity: str, compression: float) -> float:
@@ -96,7 +77,7 @@ class RadianceField(Task):
     section = "supplemental 1.7"
     example = "views --bytes 600k"
     plugin = ("integrator", "neural_field")
-    presets = {name: recipe.settings for name, recipe in PRESETS.items()}  # noqa: RUF012
+    presets = PRESETS
     storages = ()
     measurements = 2
     arguments = (

@@ -98,7 +98,9 @@ def read_image(path: Path) -> tuple[np.ndarray, bool]:
     values = picture.values
     if encoded:
         if values.dtype.name not in ENCODED or not picture.named:
-            raise ViewsError(f"{path}: holds {values.shape[2]} channels of {values.dtype}, allowed are grey and RGB")
+            raise ViewsError(
+                f"{path}: holds {values.shape[2]} channels of {values.dtype}, allowed are bytes of grey or RGB"
+            )
         values, has_alpha = _as_bytes(values), picture.has_alpha
     else:
         places = {name: i for i, name in enumerate(picture.channels)}

@@ -315,6 +315,7 @@ def coding_in(
 
     The number of colours follows from ``nbytes``, the slope from trials with a part of the nodes.
     """
+    # Of the bytes, the palette may have an eighth
     colours = int(np.clip(0.12 * nbytes / grid.colour.shape[1], 2 ** INDEX_BITS[0], 2**DEFAULT_BITS))
     palette = sorted_clusters(grid, importance, deadline, colours, seed)
     per_node = importance.loss / grid.nodes.count

@@ -20,21 +20,18 @@ from ...core.files import check_distinct
 from ...core.progress import Deadline, interruptible
 from ...fitting.loop import FitResult, FittingError, cores
 from ...fitting.task import FitRequest, Fitted, Stage
-from . import (
-    COLOURS,
-    MOST_NUMBERS,
-    PRESETS,
-    RESOLUTIONS,
-    STAGES,
-    compression,
-    dense_bytes,
-    files,
-    paper,
-    ratio_for,
-)
+from . import COLOURS, PRESETS, RESOLUTIONS, compression, dense_bytes, files, paper, ratio_for, scale_steps
 from . import grid as grids
 from .grid import NodeGrid
 from .session import MOST_WATCHED_LIMITED, SIDE, FieldSession, ImagesProblem
+
+#: Stages of the grid from coarse to fine: share of the resolution, and share of the training steps. Between them, cells
+#: that no ray sees are removed.
+STAGES = ((0.25, 0.08), (0.5, 0.12), (0.75, 0.12), (1.0, 0.1), (1.0, 0.58))
+
+#: Most numbers of the nodes of a grid while it is trained, which bounds memory and time: grids with more stay coarser,
+#: unless the resolution is given. In the last stage, a third of them has been removed.
+MOST_NUMBERS = 36_000_000
 
 #: Steps of the training of pairs on the numbers of the grid, before the images.
 VALUE_STEPS = 300
@@ -109,7 +106,7 @@ def fit(request: FitRequest) -> Fitted:
     pixels = None if request.deadline is None else PIXELS * request.deadline.seconds
     reading = {name: request.options.get(name) for name in ("background", "downscale")}
     session = FieldSession.load(request.types, request.options["source"], pixels, progress=request.progress, **reading)
-    settings = PRESETS[request.preset].scaled(request.settings, session.views)
+    settings = scale_steps(request.preset, request.settings, session.views)
     return FieldFit(dataclasses.replace(request, settings=settings), session).run()
 
 
@@ -133,12 +130,11 @@ class FieldFit:
         start = time.perf_counter()
         grid, grid_result = self.grid()
         grid_seconds = time.perf_counter() - start
-        layout = PRESETS[request.preset].layout
-        if layout == "grid":
+        if request.preset == "grid":
             table, result = self.grid_table(grid), grid_result
         else:
             stopped = grid_result is not None and grid_result.interrupted
-            table, result = (self.sparse if layout == "sparse" else self.pairs)(grid, stopped)
+            table, result = (self.sparse if request.preset == "sparse" else self.pairs)(grid, stopped)
         field = files.field_of(table, request.types)
         measured = session.held_out_images.evaluate(field, ssim=True)
         table.preset, table.seed = request.preset, request.settings.seed
@@ -155,7 +151,7 @@ class FieldFit:
         dense = dense_bytes(grid.nodes.shape)
         seconds = time.perf_counter() - start - grid_seconds
         lines = [f"{grid_seconds:.1f} s for the grid, {seconds:.1f} s for the rest"]
-        if layout != "grid" and grid_result is not None and grid_result.unfinished:
+        if request.preset != "grid" and grid_result is not None and grid_result.unfinished:
             steps = f"{grid_result.steps} step{'s' if grid_result.steps != 1 else ''}"
             lines.append(f"the grid was trained for {steps}: unfinished")
         if request.deadline is not None:
@@ -198,11 +194,10 @@ class FieldFit:
         With a checkpoint, each stage has one of its own beside it, and the grid of the last finished stage is kept in
         ``CHECKPOINT.grid.npz``.
         """
-        request, views, recipe = self.request, self.session.views, PRESETS["grid"]
-        settings = request.settings
+        request, views, settings = self.request, self.session.views, self.request.settings
         if request.preset != "grid":
             same = {name: getattr(settings, name) for name in ("seed", "deterministic")}
-            settings = recipe.scaled(dataclasses.replace(recipe.settings, **same), views)
+            settings = scale_steps("grid", dataclasses.replace(PRESETS["grid"], **same), views)
             request = request.part(0.6)  # of the time
         nodes = request.options["resolution"] or grids.resolution(views)
         grid, finished, reached, result = self.kept_grid(nodes)

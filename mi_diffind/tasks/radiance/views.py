@@ -49,9 +49,6 @@ LARGEST = 65504.0
 #: Longest side in pixels of images that are not reduced.
 LONGEST = 1600
 
-#: Names of missing images in a note.
-NAMED_MISSING = 3
-
 
 @dataclass(eq=False)
 class CapturedViews:
@@ -248,10 +245,6 @@ def _set_background(views: CapturedViews, opaque: list[int], background) -> None
 def _with_images(listed: FrameList, split: str) -> tuple[list[Frame], list[Path], list[str]]:
     """Return the views whose images exist, the paths of these images, and notes on the others."""
     file, least = listed.file, 2 if split == "train" else 1  # one view shows no depth
-    if split == "train" and len(listed.frames) < least:
-        raise ViewsError(
-            f"{file}: has {len(listed.frames)} view for training, at least {least} are needed: one shows no depth"
-        )
     if not listed.frames:
         raise ViewsError(f'{file}: has no views for the split "{split}"')
     frames, paths, missing = [], [], []
@@ -260,15 +253,14 @@ def _with_images(listed: FrameList, split: str) -> tuple[list[Frame], list[Path]
             paths.append(image_file(listed.root, frame.image, file))
             frames.append(frame)
         except MissingImageError as e:
-            missing.append((frame.image, e))
-    if not missing:
-        return frames, paths, []
+            missing.append((printable(frame.image), e))
     count = f'{len(missing):,} of {len(listed.frames):,} images of the split "{split}" do not exist'
     if len(frames) < least:
-        raise ViewsError(f"{missing[0][1]}; {count}, at least {least} {'is' if least == 1 else 'are'} needed")
-    names = ", ".join(shortened(printable(name), 60) for name, _ in missing[:NAMED_MISSING])
-    more = f" and {len(missing) - NAMED_MISSING:,} more" if len(missing) > NAMED_MISSING else ""
-    return frames, paths, [f"{listed.name}: {count} and are left out: {names}{more}"]
+        fault = f"{missing[0][1]}; {count}" if missing else f"{file}: has {len(frames)} view for training"
+        raise ViewsError(f"{fault}, at least {least} {'is' if least == 1 else 'are'} needed")
+    if not missing:
+        return frames, paths, []
+    return frames, paths, [f"{listed.name}: {count} and are left out, such as {shortened(missing[0][0], 60)}"]
 
 
 def _box(listed: FrameList, has_alpha: bool) -> np.ndarray | None:

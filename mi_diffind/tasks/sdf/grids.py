@@ -104,7 +104,6 @@ def node_values(field: DistanceField, lower, spacing: float, shape, where=None) 
     t = field.types
     # Opaque: all grids of all fields use the same kernel
     first, step = dr.opaque(t.Array3f, list(map(float, lower))), dr.opaque(t.Float, spacing)
-    inverse = dr.opaque(t.Float64, 1 / shape[2]), dr.opaque(t.Float64, 1 / shape[1])
     sides = dr.opaque(t.Array3u, [int(n) for n in shape])
     count, values = math.prod(shape) if where is None else len(where), [np.zeros(0, np.float32)]
     with dr.suspend_grad():
@@ -114,10 +113,8 @@ def node_values(field: DistanceField, lower, spacing: float, shape, where=None) 
                 n = dr.arange(t.UInt32, last - start) + dr.opaque(t.UInt32, start)
             else:
                 n = device_array(t.UInt32, where[start:last])
-            # In double precision, the product is never rounded up to the next whole number
-            rows = t.UInt32((t.Float64(n) + 0.5) * inverse[0])
-            layer = t.UInt32((t.Float64(rows) + 0.5) * inverse[1])
-            index = layer, rows - layer * sides.y, n - rows * sides.z
+            rows = n // sides.z
+            index = rows // sides.y, rows % sides.y, n % sides.z
             p = [dr.fma(t.Float(i), step, a) for i, a in zip(index, first, strict=True)]
             values.append(field.value(t.Array3f(*p)).numpy())
     return np.concatenate(values).reshape(shape if where is None else count)

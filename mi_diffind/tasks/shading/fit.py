@@ -17,7 +17,7 @@ from ..texture import PRESETS as TEXTURES
 from ..texture import TASK as TEXTURE
 from ..texture import fit as texture_fit
 from ..texture import fit as textures
-from ..texture.compressed import bias_of, neutral_extras
+from ..texture.compressed import neutral_extras, read_level_bias
 from . import ShadingSettings, material, training
 from .evaluation import ShadedEvaluation
 
@@ -55,13 +55,13 @@ def fit(request: FitRequest) -> Fitted:
     options = request.options
     source = load_source(options["source"], nonfinite=options["nonfinite"])
     recipe = request.settings
-    layout = textures.layout_of(source, TEXTURES[recipe.texture])
-    pyramid = Pyramid.of(source, layout, request.types, requested_border(options))
-    effects, reasons = material.effects_of(layout)
+    layout = textures.source_layout(source, TEXTURES[recipe.texture])
+    pyramid = Pyramid.from_source(source, layout, request.types, requested_border(options))
+    effects, reasons = material.material_effects(layout)
     if not layout.stored:
         raise UsageError(f"{options['source']}: all of its maps are constant, there is nothing to learn")
     start = None if options["start"] is None else load_start(options["start"], source, request)
-    size = size_of(source, pyramid, recipe, options) if start is None else None
+    size = find_size(source, pyramid, recipe, options) if start is None else None
     # Before any training, which gets a share of the time that is left
     evaluation = ShadedEvaluation(pyramid, effects, pairs=PAIRS, side=SIDE)
     evaluation.another()
@@ -74,12 +74,12 @@ def fit(request: FitRequest) -> Fitted:
         # Without a checkpoint, the training as a texture was interrupted
         resume = request.resume and os.path.exists(request.checkpoint or "")
         try:
-            net = training.start_of(start, pyramid)
+            net = training.trainable_arrays(start, pyramid)
         except ValueError as e:
             raise UsageError(str(e)) from None
         table, result = training.fit_shading(
             source, net, recipe, dataclasses.replace(request, resume=resume), pyramid, evaluation,
-            preview_path(request), bias_of(start.settings),
+            preview_path(request), read_level_bias(start.settings),
         )  # fmt: skip
     settings = table.settings
     settings |= request.paths(source_path=options["source"])
@@ -116,12 +116,12 @@ def load_start(path, source, request: FitRequest) -> Table:
     return table
 
 
-def size_of(source, pyramid: Pyramid, recipe: ShadingSettings, options):
+def find_size(source, pyramid: Pyramid, recipe: ShadingSettings, options):
     """Return the memory budget of the arrays, beside extras if the recipe has them. Raises :class:`UsageError`."""
     options = {argument.name: argument.default for argument in TEXTURE.arguments} | dict(options)
     nbytes = requested_bytes(options, source)
     nbytes = bytes_beside_extras(nbytes, pyramid) if recipe.extras else nbytes
-    return texture_fit.size_of(source, pyramid, nbytes, TEXTURES[recipe.texture], options)
+    return texture_fit.find_size(source, pyramid, nbytes, TEXTURES[recipe.texture], options)
 
 
 def bytes_beside_extras(nbytes: float, pyramid: Pyramid) -> float:

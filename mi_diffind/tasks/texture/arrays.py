@@ -322,49 +322,7 @@ def from_ramps(layout: Layout, size: PaperBudget, border: tuple[str, str], level
     return PaperNet(primary0, primary1, cascaded, PaperStructure(levels))
 
 
-@dataclass(frozen=True)
-class PrincipalComponents:
-    """Principal components of a texture, scaled to [0, 1] as pointers of its texels.
-
-    ``mean``, ``(k,)``; ``directions``, ``(dims, k)``, those with the largest differences between neighbours first;
-    ``low`` and ``high``, ``(dims,)``, the range of each component.
-    """
-
-    mean: np.ndarray
-    directions: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-
-    @staticmethod
-    def of(values: np.ndarray, dims: int) -> PrincipalComponents:
-        """Return the first ``dims`` components of level 0, ``(height, width, k)``, at most ``k``."""
-        k = values.shape[-1]
-        mean = values.reshape(-1, k).mean(axis=0, dtype=np.float64)
-        covariance = channel_covariance(values, mean)
-        directions = eigenvectors(covariance, min(dims, k))
-        # Rotated within the same space so that the first axes have the most detail: fine arrays hold only these
-        detail = directions @ neighbour_covariance(values) @ directions.T
-        directions = eigenvectors(detail, len(directions)) @ directions
-        projected = (values.reshape(-1, k) - mean) @ directions.T
-        return PrincipalComponents(mean, directions, *component_range(projected))
-
-    @property
-    def dims(self) -> int:
-        return len(self.directions)
-
-    def pointers(self, values: np.ndarray) -> np.ndarray:
-        """Return the pointers of texels, ``(height, width, dims)`` in [0, 1], float32."""
-        unit = ((values - self.mean) @ self.directions.T - self.low) / (self.high - self.low)
-        return np.clip(MARGIN + (1 - 2 * MARGIN) * unit, 0, 1).astype(np.float32)
-
-    def back(self, side: int) -> np.ndarray:
-        """Return the channels at the entries of a cascaded array, ``(side, …, k)``: linear in the pointer."""
-        axes = range(self.dims)
-        channels = linear_in_pointer(self.mean, self.directions, self.low, self.high, side, axes, self.dims)
-        return np.clip(channels, 1e-3, 1 - 1e-3).astype(np.float32)
-
-
-def enlarged(values: np.ndarray, rows: int, columns: int, border: Sequence[str]) -> np.ndarray:
+def enlarge(values: np.ndarray, rows: int, columns: int, border: Sequence[str]) -> np.ndarray:
     """Return a level, ``(height, width, k)``, read bilinearly at the texel centres of ``rows`` × ``columns``."""
     for axis, (n, along) in enumerate(zip((rows, columns), border, strict=True)):
         places = (np.arange(n) + 0.5) / n
@@ -381,20 +339,30 @@ def from_components(values: Sequence[np.ndarray], size: TextureBudget, border: t
 
     Each fine array holds the difference between the pointers of its level and the sum of the coarser arrays.
     """
-    basis = PrincipalComponents.of(values[0], size.dims)
-    # A texture has at most as many components as channels: further coordinates start as ramps along u or v
-    pointers = [
-        np.concatenate([basis.pointers(level), _ramps(*level.shape[:2], size.dims - basis.dims)], axis=-1)
-        for level in values
-    ]
+    k = values[0].shape[-1]
+    mean = values[0].reshape(-1, k).mean(axis=0, dtype=np.float64)
+    directions = eigenvectors(channel_covariance(values[0], mean), min(size.dims, k))
+    # Rotated within the same space so that the first axes have the most detail: fine arrays hold only these
+    detail = directions @ neighbour_covariance(values[0]) @ directions.T
+    directions = eigenvectors(detail, len(directions)) @ directions
+    low, high = component_range((values[0].reshape(-1, k) - mean) @ directions.T)
+    used = len(directions)
+
+    def pointer(level: np.ndarray) -> np.ndarray:
+        unit = MARGIN + (1 - 2 * MARGIN) * (((level - mean) @ directions.T - low) / (high - low))
+        # A texture has at most as many components as channels: further coordinates start as ramps along u or v
+        further = _ramps(*level.shape[:2], size.dims - used)
+        return np.concatenate([np.clip(unit, 0, 1).astype(np.float32), further], axis=-1)
+
+    pointers = [pointer(level) for level in values]
     reached, level = pointers[size.skip], size.skip
-    layers, fine = _pages(pointers, basis, size, border)
+    layers, fine = _pages(pointers, high - low, size, border)
     for i in reversed(range(len(size.fine))):
         spec = size.fine[i]
         rows, columns = values[spec.level].shape[:2]
         while level > spec.level:
             level -= 1
-            reached = enlarged(reached, *values[level].shape[:2], border)
+            reached = enlarge(reached, *values[level].shape[:2], border)
         until = (size.fine[i + 1].level if i + 1 < len(size.fine) else size.skip) - 1
         if size.base and i + 1 == len(size.fine):
             reached = np.clip(pointers[level], 1e-3, 1 - 1e-3)
@@ -413,20 +381,21 @@ def from_components(values: Sequence[np.ndarray], size: TextureBudget, border: t
     coarse = np.concatenate([p.reshape(-1, size.dims) for p in pointers[size.skip :]])
     coarse = DifferentiableArray((len(coarse),), size.dims, np.clip(coarse, 1e-3, 1 - 1e-3), fold=True)
     shape = (size.knots,) * (size.knots > 1) + (size.cascaded,) * size.dims
-    back = basis.back(size.cascaded)
-    back = back.reshape(*back.shape[:-1], *[1] * (size.dims - basis.dims), back.shape[-1])
+    back = linear_in_pointer(mean, directions, low, high, size.cascaded, range(used), used)
+    back = np.clip(back, 1e-3, 1 - 1e-3).astype(np.float32)
+    back = back.reshape(*back.shape[:-1], *[1] * (size.dims - used), k)
     cascaded = np.broadcast_to(back, (*shape, size.channels)).astype(np.float32)
     cascaded = DifferentiableArray(shape, size.channels, cascaded, fold=True)
     structure = LayeredStructure(size.height, size.width, tuple(layers), size.skip, size.bits, size.base)
     return LayeredNet(fine, coarse, cascaded, structure, border)
 
 
-def _pages(pointers: list, basis: PrincipalComponents, size: TextureBudget, border) -> tuple[list, list]:
-    """Return the layers of pages and their arrays."""
+def _pages(pointers: list, ranges: np.ndarray, size: TextureBudget, border) -> tuple[list, list]:
+    """Return the layers of pages and their arrays; ``ranges`` are those of the components."""
     if not size.pages:
         return [], []
-    used = basis.dims
-    weighted = [(pointers[level][..., :used] * (basis.high - basis.low)).astype(np.float32) for level in size.pages]
+    used = len(ranges)
+    weighted = [(pointers[level][..., :used] * ranges).astype(np.float32) for level in size.pages]
     layers, fine = [], []
     ends = [*size.pages[1:], size.skip]
     sides = shared_page_sizes(weighted, border, size.page_entries)

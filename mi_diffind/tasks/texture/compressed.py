@@ -69,13 +69,13 @@ def footprint_histogram(distribution: str, levels: int) -> np.ndarray:
     return np.diff(np.concatenate([[0.0], below, [1.0]]))
 
 
-def level_of(x, levels: int):
+def footprint_level(x, levels: int):
     """Return the level of detail in [0, levels − 1] of a footprint in [0, 1]."""
     return dr.maximum(dr.log2(dr.maximum(x, 1e-30)) + (levels - 1), 0)
 
 
-def footprint_of(level, levels: int):
-    """Return the footprint in [0, 1] of a level of detail: the inverse of :func:`level_of`.
+def level_footprint(level, levels: int):
+    """Return the footprint in [0, 1] of a level of detail: the inverse of :func:`footprint_level`.
 
     Level 0 has the footprint of one texel; smaller footprints are magnified and read level 0, too.
     """
@@ -133,11 +133,11 @@ class PaperNet(nn.Module):
 
     def filtered(self, u, v, level, active=True) -> list:
         """Return the channels at (u, v) and a level of detail from 0 to ``levels − 1``."""
-        return self.at_footprint(u, v, footprint_of(level, self.structure.levels), active)
+        return self.at_footprint(u, v, level_footprint(level, self.structure.levels), active)
 
     def stored(self, u, v, active=True) -> list:
         """Return the channels at level 0; with bytes, the footprint's array is one constant and is not read."""
-        array, x = self.primary1, float(footprint_of(0.0, self.structure.levels))
+        array, x = self.primary1, float(level_footprint(0.0, self.structure.levels))
         if array.storage == "uint8":
             entries, at = array.numpy()[:, 0], x * (array.resolution[0] - 1)
             lower = min(int(at), len(entries) - 2)
@@ -393,9 +393,9 @@ class CompressedTexture(FilteredMaps):
         return {} if self.net is None else self.net.arrays
 
     @staticmethod
-    def of(table: Table, dtype, storage: str = "") -> CompressedTexture:
+    def from_table(table: Table, dtype, storage: str = "") -> CompressedTexture:
         """Return the texture of a checked table, in a storage form (:func:`allocate`)."""
-        return assembled(table, allocate(table, dtype, storage))
+        return assemble(table, allocate(table, dtype, storage))
 
     def stored(self, u, v, active=True) -> list:
         """Return the stored channels at (u, v) in level 0, with as few reads as that takes."""
@@ -426,7 +426,7 @@ class CompressedTexture(FilteredMaps):
 
         Values are compared in the encoding of the file, values of high dynamic range as logarithms.
         """
-        pyramid = Pyramid.of(source, self.layout, self.types, self.border)
+        pyramid = Pyramid.from_source(source, self.layout, self.types, self.border)
         by_level, by_map, worst_mean = [], {}, 0.0
         for level, values in enumerate(pyramid.values):
             decoded, errors, weights = self.decode(level=level), [], []
@@ -476,12 +476,12 @@ def allocate(table: Table, dtype, storage: str = "") -> dict[str, Differentiable
     return allocate_maps(table, dtype, storage, lambda name: sizes[int(name.removeprefix("level"))])
 
 
-def assembled(table: Table, arrays: dict[str, DifferentiableArray]) -> CompressedTexture:
+def assemble(table: Table, arrays: dict[str, DifferentiableArray]) -> CompressedTexture:
     """Return the texture of a checked table from its allocated arrays."""
-    layout, bias = Layout.from_json(table.settings["layout"]), bias_of(table.settings)
+    layout, bias = Layout.from_json(table.settings["layout"]), read_level_bias(table.settings)
     if not arrays:
         return CompressedTexture(layout, None)
-    structure, border = structure_of(table.settings, layout)
+    structure, border = read_structure(table.settings, layout)
     if isinstance(structure, PaperStructure):
         return CompressedTexture(layout, PaperNet(*(arrays[name] for name in PAPER), structure), bias)
     fine = [arrays[f"level{layer.level}"] for layer in structure.layers]
@@ -510,7 +510,7 @@ def to_table(texture: CompressedTexture, settings: dict) -> Table:
     return Table("texture", stored, settings=settings)
 
 
-def bias_of(settings: dict) -> float:
+def read_level_bias(settings: dict) -> float:
     """Return the level bias of a file, 0 if its settings have none. Raises ``ValueError`` beyond the allowed range."""
     bias = settings.get("level_bias", 0.0)
     low, high = BIAS_RANGE
@@ -519,7 +519,7 @@ def bias_of(settings: dict) -> float:
     return float(bias)
 
 
-def structure_of(settings: dict, layout: Layout):
+def read_structure(settings: dict, layout: Layout):
     """Return the structure of the arrays of a file and the border along v and u (``None`` for the paper's arrays).
 
     Raises ``KeyError``, ``TypeError`` or ``ValueError`` for damaged settings.
@@ -555,8 +555,8 @@ def load(path: str | os.PathLike) -> Table:
     table = load_table(path, "texture")
     layout = read_layout(table)
     try:
-        bias_of(table.settings)
-        structure, border = structure_of(table.settings, layout) if layout.stored else (None, None)
+        read_level_bias(table.settings)
+        structure, border = read_structure(table.settings, layout) if layout.stored else (None, None)
     except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as e:
         raise TableError(f"{path}: its settings describe no texture ({e})") from None
     if structure is None:
@@ -598,7 +598,7 @@ class TextureModel(MapsModel):
     """Model of a texture file; ``image`` is a :class:`CompressedTexture`."""
 
     def build(self):
-        self.image = assembled(self.table, self.arrays)
+        self.image = assemble(self.table, self.arrays)
 
     def describe(self):
         figures, lines = super().describe()

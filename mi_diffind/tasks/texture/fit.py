@@ -26,15 +26,15 @@ from ...maps.pyramid import Pyramid, decibel, mean_square
 from ...maps.source import Source, load_source
 from . import TextureSettings, arrays, parse_structure
 from .arrays import PaperBudget, TextureBudget
-from .compressed import CompressedTexture, PaperNet, footprints, level_of, to_table
+from .compressed import CompressedTexture, PaperNet, footprint_level, footprints, to_table
 
 #: Least gain of pages, in dB before training, over one grid of equal bytes. (0.7 on bricks, where pages lose 0.4.)
 GAIN_DB = 1.0
 
 
-def layout_of(source: Source, recipe: TextureSettings) -> Layout:
+def source_layout(source: Source, recipe: TextureSettings) -> Layout:
     """Return the layout of ``source`` by a recipe."""
-    return Layout.of(source, recipe.once, None if recipe.normals else False, filtered=True)
+    return Layout.from_source(source, recipe.once, None if recipe.normals else False, filtered=True)
 
 
 def shares(levels: int) -> np.ndarray:
@@ -92,7 +92,7 @@ class TextureProblem(MapsProblem):
             layout, samples = self.layout, self.recipe.samples
             base = max(layout.height, layout.width)
             footprint = footprints(1 - rng.random(Float, size), samples, base)  # uniform in (0, 1]
-            level = level_of(footprint, len(self.sizes))
+            level = footprint_level(footprint, len(self.sizes))
             u, v = x / layout.width, y / layout.height
             return [u, v, level, footprint], self.by_map(self.pyramid.filtered(u, v, level))
         level = Float(level)
@@ -138,7 +138,7 @@ class TextureProblem(MapsProblem):
         return {"psnr_db": decibels[0], "psnr_worst_db": min(decibels)}
 
 
-def problem_of(
+def build_problem(
     source: Source, size: TextureBudget | PaperBudget, recipe: TextureSettings, pyramid: Pyramid
 ) -> TextureProblem:
     """Return the problem of training ``source`` at a size by a recipe, with initial arrays."""
@@ -165,12 +165,12 @@ def fit_texture(
     levels are trained as they are stored. Errors are those of :meth:`.CompressedTexture.measure`.
     """
     request = dataclasses.replace(request, settings=recipe)
-    problem = None if size is None else problem_of(source, size, recipe, pyramid)
+    problem = None if size is None else build_problem(source, size, recipe, pyramid)
 
     def stored() -> CompressedTexture:
         return CompressedTexture(pyramid.layout, problem and stored_form(problem.net), (problem and level_bias) or 0.0)
 
-    return fit_maps(request, source, problem, stored, to_table, CompressedTexture.of)
+    return fit_maps(request, source, problem, stored, to_table, CompressedTexture.from_table)
 
 
 def stored_form(net):
@@ -214,16 +214,18 @@ def fit(request: FitRequest) -> Fitted:
     options = request.options
     source = load_source(options["source"], nonfinite=options["nonfinite"])
     recipe = request.settings
-    pyramid = Pyramid.of(source, layout_of(source, recipe), request.types, requested_border(options))
+    pyramid = Pyramid.from_source(source, source_layout(source, recipe), request.types, requested_border(options))
     requested, size = requested_bytes(options, source), None
     if pyramid.layout.stored:
-        size = size_of(source, pyramid, requested, recipe, options)
+        size = find_size(source, pyramid, requested, recipe, options)
     rehearse_pictures(request, source)
     fitted = Fitted(*fit_texture(source, size, recipe, request, pyramid, options["level_bias"]))
-    return complete(request, source, fitted, CompressedTexture.of(fitted.table, request.types.TensorXf), requested)
+    return complete(
+        request, source, fitted, CompressedTexture.from_table(fitted.table, request.types.TensorXf), requested
+    )
 
 
-def size_of(source: Source, pyramid: Pyramid, nbytes: float, recipe: TextureSettings, options):
+def find_size(source: Source, pyramid: Pyramid, nbytes: float, recipe: TextureSettings, options):
     """Return the memory budget of the arrays for ``nbytes`` bytes. Raises :class:`UsageError`."""
     if recipe.layered:
         size = _layered_size(pyramid, nbytes, options["structure"] or "auto", options["skip"], options["cascaded"])

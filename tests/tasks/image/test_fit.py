@@ -61,8 +61,8 @@ def test_default_sizes_have_the_requested_bytes(height, width, recipe, monkeypat
     """Within 5% (if few: a row), unless the primary is as large as the image, or it is a single texel already."""
     single = recipe.structure in PAGED and STRUCTURES[recipe.structure][1] is None
     for channels in (1, 3, 7):
-        layout = training.layout_of(from_arrays({"other": noise(8, 8, channels).maps[0].values}), recipe)
-        monkeypatch.setattr(fit, "layout_of", lambda source, recipe, layout=layout: layout)
+        layout = training.source_layout(from_arrays({"other": noise(8, 8, channels).maps[0].values}), recipe)
+        monkeypatch.setattr(fit, "source_layout", lambda source, recipe, layout=layout: layout)
         source = SimpleNamespace(height=height, width=width, nbytes=height * width * channels)
         for compression in (1.5, 6, 12, 48, 200):
             requested = source.nbytes / compression
@@ -85,11 +85,11 @@ def test_default_sizes_have_the_requested_bytes(height, width, recipe, monkeypat
 def test_the_structure_follows_the_image():
     """Two primary arrays for noise, one for smooth images and few dimensions, else the requested structure."""
     for source, several in ((noise(64, 64), True), (smooth(64), False)):
-        chosen = training.structure_of(source, OURS, source.nbytes / 12)
+        chosen = training.choose_structure(source, OURS, source.nbytes / 12)
         assert (STRUCTURES[chosen][1] is not None) == several
-        assert training.structure_of(source, dataclasses.replace(OURS, structure="5 bits"), 1) == "5 bits"
+        assert training.choose_structure(source, dataclasses.replace(OURS, structure="5 bits"), 1) == "5 bits"
     for dims in (1, 2):
-        chosen = training.structure_of(noise(64, 64), dataclasses.replace(OURS, dims=dims), 1024)
+        chosen = training.choose_structure(noise(64, 64), dataclasses.replace(OURS, dims=dims), 1024)
         assert STRUCTURES[chosen][1] is None
 
 
@@ -113,7 +113,7 @@ def pretend(quality, monkeypatch, interrupt=None):
 
     def fit_image(source, size, recipe, request, border=None, title=None):
         assert request is REQUEST and recipe.dims == size.dims
-        assert STRUCTURES[training.structure_of(source, recipe, source.nbytes / 12)] == (size.bits, size.coarse)
+        assert STRUCTURES[training.choose_structure(source, recipe, source.nbytes / 12)] == (size.bits, size.coarse)
         calls.append((size, recipe))
         decibel = quality(size, recipe)
         measured = {"psnr_db": decibel, "psnr_between_db": decibel + 2}
@@ -259,7 +259,7 @@ def test_initial_arrays_hold_the_heavier_map(heavy, light):
     waves = np.uint8(127 + 100 * np.sin(np.mgrid[0:32, 0:32] * np.pi / 16))
     source = from_arrays({"left": waves[0], "right": waves[1]})
     recipe = dataclasses.replace(OURS, weights={heavy: 3.0}, structure="8 bits", dims=1)
-    problem = training.problem_of(source, fit.default_size(source, 800, recipe), recipe, array_module("llvm"))
+    problem = training.build_problem(source, fit.default_size(source, 800, recipe), recipe, array_module("llvm"))
     decoded = CompressedImage(problem.layout, problem.net).decode()
     errors = {m.name: float(np.mean((m.values - decoded[m.name]) ** 2)) for m in source.maps}
     assert errors[heavy] < 0.3 * errors[light]

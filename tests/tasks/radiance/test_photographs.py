@@ -272,7 +272,7 @@ def test_a_field_records_its_background(studio_shots, monkeypatch, capsys):
     notes = [line for line in capsys.readouterr().err.splitlines() if line.startswith("transforms_")]
     assert notes == [
         "transforms_train.json: keys that are not used: aabb_scale",
-        'transforms_train.json: 1 of 6 images of the split "train" do not exist and are left out: train_4.png',
+        'transforms_train.json: 1 of 6 images of the split "train" do not exist and are left out, such as train_4.png',
         "transforms_test.json: keys that are not used: frames.sharpness",
     ]
     assert set(notes) < set(json.loads((folder / "x.json").read_text())["notes"])

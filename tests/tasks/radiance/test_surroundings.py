@@ -15,7 +15,6 @@ from mi_diffind.arrays.tables import TableError, load_table, save_table
 from mi_diffind.commands.cli import main
 from mi_diffind.core import compat
 from mi_diffind.core.runtime import array_module
-from mi_diffind.fitting.loop import FitSettings
 from mi_diffind.tasks.radiance import files, march, nodes
 from mi_diffind.tasks.radiance import fit as field_fit
 from mi_diffind.tasks.radiance import grid as grids
@@ -112,8 +111,7 @@ def folder(tmp_path_factory):
     for image in path.glob("*.png"):
         grey, picture = Image.new("RGBA", (24, 24), (150, 140, 130, 255)), Image.open(image)
         Image.alpha_composite(grey, picture).convert("RGB").save(image)
-    recipe = field_fit.PRESETS["grid"]
-    short = dataclasses.replace(recipe, settings=FitSettings(**{**vars(recipe.settings), "steps": 80, "batch": 1024}))
+    short = dataclasses.replace(field_fit.PRESETS["grid"], steps=80, batch=1024)
     patch.setitem(field_fit.PRESETS, "grid", short)
     options = ["--steps", "5", "--batch", "1024", "--resolution", "20", "--variant", "llvm_ad_rgb"]
     assert main(["fit", "field", str(path), "-o", str(path / "x.npz"), "--background", "surroundings",

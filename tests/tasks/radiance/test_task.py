@@ -16,7 +16,6 @@ from mi_diffind.core.errors import UsageError
 from mi_diffind.core.progress import Deadline
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting import loop
-from mi_diffind.fitting.loop import FitSettings
 from mi_diffind.fitting.loop import fit as train
 from mi_diffind.fitting.task import fit, tasks
 from mi_diffind.images import metrics
@@ -39,9 +38,9 @@ def ad():
 @pytest.fixture(scope="module", autouse=True)
 def short_grids():
     patch = pytest.MonkeyPatch()
-    grid = field_fit.PRESETS["grid"]
-    short = type(grid)(grid.layout, FitSettings(**{**vars(grid.settings), "steps": 60, "batch": 1024}))
+    short = dataclasses.replace(field_fit.PRESETS["grid"], steps=60, batch=1024)
     patch.setitem(field_fit.PRESETS, "grid", short)
+    patch.setattr(field_fit, "scale_steps", lambda preset, settings, views: settings)
     patch.setattr(field_fit, "VALUE_STEPS", 20)
     patch.setattr(view_files, "SEARCH", 32)
     yield

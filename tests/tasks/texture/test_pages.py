@@ -32,7 +32,7 @@ def recipe(steps=4):
 
 def trained(source, size, steps=4):
     own = recipe(steps)
-    pyramid = Pyramid.of(source, fit.layout_of(source, own), TYPES, ("repeat", "clamp"))
+    pyramid = Pyramid.from_source(source, fit.source_layout(source, own), TYPES, ("repeat", "clamp"))
     table, _ = fit.fit_texture(source, size, own, FitRequest("ours", own, TYPES, progress=False), pyramid)
     return table
 
@@ -72,7 +72,7 @@ def page_read(table, name, side, u, v):
 
 def test_reading_against_numpy(table):
     """Level 0 reads its pages alone; between levels 1 and 2 the pointers of both arrays are mixed."""
-    texture = CompressedTexture.of(table, TYPES.TensorXf)
+    texture = CompressedTexture.from_table(table, TYPES.TensorXf)
     cascaded = texture.arrays["cascaded"]
     rng = np.random.default_rng(1)
     for level in (0.0, 1.0, 1.25, 2.0):
@@ -91,7 +91,7 @@ def test_reading_against_numpy(table):
 
 
 def test_levels_are_continuous_and_any_is_allowed(table):
-    texture = CompressedTexture.of(table, TYPES.TensorXf, "float32")
+    texture = CompressedTexture.from_table(table, TYPES.TensorXf, "float32")
     u, v = np.random.default_rng(2).random((2, 64)).astype(np.float32)
 
     def read(level):
@@ -138,7 +138,7 @@ def test_which_textures_get_pages():
     source = sparse()
     noise = np.random.default_rng(4).integers(0, 256, (64, 64, 3), np.uint8)
     for maps, more in ((source, True), (from_arrays({"albedo": noise}), False)):
-        pyramid = Pyramid.of(maps, fit.layout_of(maps, recipe()), TYPES, ("repeat", "clamp"))
+        pyramid = Pyramid.from_source(maps, fit.source_layout(maps, recipe()), TYPES, ("repeat", "clamp"))
         gain = fit._page_gain(pyramid, paged(maps))
         assert (gain >= fit.GAIN_DB) == more, gain
     assert arrays.paged(8, 8, 3, 100) is None and arrays.paged(1024, 1024, 3, 20000) is None
