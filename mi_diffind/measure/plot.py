@@ -142,14 +142,16 @@ def draw_panels(title: str, panels: Sequence[Panel], y_label: str, caption: str)
     styles: dict[str, tuple[str, str]] = {}
     for point in (x for panel in panels for x in panel.points):
         styles.setdefault(point.representation, STYLES[len(styles) % len(STYLES)])
-    plot = figure(title, caption, 6.4 * columns, 4.6 * rows, 0.55 if len(styles) > 1 else 0.3)
+    lines = -(-len(styles) // (4 * columns))  # of the legend
+    plot = figure(title, caption, 6.4 * columns, 4.6 * rows, 0.33 + 0.22 * lines if len(styles) > 1 else 0.3)
     if len(styles) > 1:
         shown = [
             Line2D([], [], color=colour, marker=marker, linestyle="none", markersize=6.5, label=name)
             for name, (colour, marker) in styles.items()
         ]
         place = {"loc": "upper center", "bbox_to_anchor": (0.5, 1 - 0.24 / plot.get_figheight())}
-        plot.legend(handles=shown, fontsize=8.5, frameon=False, ncols=len(shown), **place).set_in_layout(False)
+        place["ncols"] = -(-len(shown) // lines)
+        plot.legend(handles=shown, fontsize=8.5, frameon=False, **place).set_in_layout(False)
     accuracies = [x.accuracy for p in panels for x in p.points] or [0, 100]
     margin = max(0.08 * (max(accuracies) - min(accuracies)), 2)
     for k, panel in enumerate(panels):

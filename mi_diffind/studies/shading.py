@@ -625,7 +625,8 @@ def draw_levels(contexts: dict[str, ShadingContenders], result: dict):
         trained = [plot.Curve(text, *by_level(job.record["details"])) for text, job in runs.items()]
         return trained + _filter_curves(context, by_level)
 
-    return _draw_both(contexts, result, ": levels of detail", draw, "level of detail")
+    levels = range(max(context.evaluation.levels for context in contexts.values()))
+    return _draw_both(contexts, result, ": levels of detail", draw, "level of detail", list(map(str, levels)))
 
 
 def _filter_curves(context: ShadingContenders, x: Callable[[dict], tuple[Sequence, Sequence]]) -> list[plot.Curve]:
