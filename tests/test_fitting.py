@@ -16,6 +16,7 @@ from mi_diffind.core.files import OutputError
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting import loop
 from mi_diffind.fitting.loop import FitResult, FitSettings, FittingError, Problem, fit
+from mi_diffind.fitting.task import LOSSES, SCHEDULES
 
 
 class Curve(Problem):
@@ -90,7 +91,7 @@ def interrupt(y):
 # -- results ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("loss", loop.LOSSES)
+@pytest.mark.parametrize("loss", LOSSES)
 def test_converges(ad, loss):
     problem = Curve(ad)
     before = problem.measure(problem.net)["psnr_db"]
@@ -138,7 +139,7 @@ def test_global_state_is_restored(ad):
     assert [threads for threads, _ in seen] == [1, before[0]] and min(limit for _, limit in seen) > before[1]
 
 
-@pytest.mark.parametrize("schedule", loop.SCHEDULES)
+@pytest.mark.parametrize("schedule", SCHEDULES)
 def test_resumed_equals_uninterrupted(ad, tmp_path, schedule):
     """Stopped by Ctrl-C between two checkpoints, or by a crash: the continued run is the same, bit by bit."""
     if ad.Float is not array_module("llvm").Float:
@@ -353,7 +354,7 @@ def test_plateau_schedule(ad):
 # -- cost -------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("schedule", loop.SCHEDULES)
+@pytest.mark.parametrize("schedule", SCHEDULES)
 def test_no_compilation_after_the_first_steps(ad, schedule):
     """
     A step that changes a literal would compile a new kernel each time. The cache on disk could hide that, so distinct
