@@ -141,7 +141,7 @@ def test_declarations_are_light():
     assert done.returncode == 0, done.stderr
     modules = set(json.loads(done.stdout))
     assert not {"drjit", "mitsuba", "matplotlib", "tqdm", "scipy"} & modules
-    heavy = (".fit", ".fitting.loop", ".model", "texture.training")
+    heavy = (".fit", ".fitting.loop", ".model", "texture.compressed")
     assert not [m for m in modules if m.startswith("mi_diffind.") and m.endswith(heavy)]
 
 
