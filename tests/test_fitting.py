@@ -176,7 +176,7 @@ def test_resumed_equals_uninterrupted(ad, tmp_path, schedule):
 
 
 class Falling(Curve):
-    """What is measured falls: of all states, the first one that is measured is the best."""
+    """A problem whose measurements fall: the first measured state is the best."""
 
     def measure(self, net):
         return {"psnr_db": 90.0 - self.calls, "mae": 1.0}
@@ -525,7 +525,7 @@ def test_checkpoint_without_something(checkpoint):
 
 
 def test_checkpoint_of_another_problem(ad, tmp_path):
-    """What the settings do not say is in the problem's identity; tuples are lists in a file."""
+    """The problem's identity is compared beside the settings; tuples are lists in a file."""
 
     class Named(Curve):
         def __init__(self, ad, **identity):
@@ -558,7 +558,7 @@ def test_checkpoint_of_another_run(checkpoint):
 
 
 def test_interrupt_before_the_first_measurement(ad):
-    """What has been reached by then is measured and kept; its loss nobody has seen."""
+    """The state at the interrupt is measured and kept; its loss is unknown."""
     problem = Curve(ad, {7: interrupt})
     start = contents(problem)
     result, _ = run(problem, settings())
@@ -615,7 +615,7 @@ def sparse_steps(ad, optimizer, shape, steps=12):
 
 @pytest.mark.parametrize("shape", [(60,), (40, 12), (40, 3)])
 def test_steps_of_the_sparse_optimiser(ad, shape):
-    """Of entries alone and of columns in packets; a learning rate of 0.1 moves what was read by more than rounding."""
+    """Single entries and columns in packets move as in Adam; a rate of 0.1 moves entries by more than rounding."""
     values, reads = sparse_steps(ad, loop.SparseAdam(lr=0.1, beta_2=0.99), shape)
     expected, _ = sparse_steps(ad, Adam(lr=0.1, beta_2=0.99, mask_updates=True), shape)
     np.testing.assert_allclose(values, expected, rtol=0, atol=1e-5)
