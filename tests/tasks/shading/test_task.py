@@ -364,11 +364,11 @@ def test_choice_by_short_trainings(ad, gains, expected):
             trained.append(problem.choice.name)
             return FitResult(problem.measure("trained"), 8, 8, 0.0, False, 0)
 
-    recipe = dataclasses.replace(OURS, extras=any("extras" in name for name in gains))
+    settings = dataclasses.replace(OURS, steps=100, extras=any("extras" in name for name in gains))
     for limit in ({}, {"deadline": Deadline(1e-9)}):
-        trained, settings = [], dataclasses.replace(OURS, steps=100)
+        trained = []
         request = Request("ours", settings, ad, checkpoint="x", **limit)
-        choice, kept, stopped = training.choose(Figures, request, training.BIASES, recipe)
+        choice, kept, stopped = training.choose(Figures, request, training.BIASES)
         assert choice.name == expected and stopped is None and trained == ([] if limit else list(gains))
         which = {name: 2 if limit and len(figures) > 2 else 0 for name, figures in gains.items()}
         assert kept == {name: pytest.approx(gains[name][k]) for name, k in which.items()}
