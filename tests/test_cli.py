@@ -264,7 +264,7 @@ def test_help_is_light():
     for command, found in text.items():
         assert found.startswith(" ".join(["usage: mi-diffind", *command]) + " [-h]"), command
     assert all(f"\n    {verb} " in text[()] for verb in VERBS)
-    assert not HEAVY & modules and not [m for m in modules if m.endswith((".texture.training", ".loading", ".loop"))]
+    assert not HEAVY & modules and not [m for m in modules if m.endswith((".texture.fit", ".loading", ".loop"))]
     assert "--primary" in text["fit", "ggx"] and "--primary" not in text["fit", "disney"]  # those of the task only
     assert "-D NAME" in text["tradeoff", "scene"] and "-D NAME" not in text["tradeoff", "disney"]
 

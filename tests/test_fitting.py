@@ -16,6 +16,7 @@ from mi_diffind.core.files import OutputError
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting import loop
 from mi_diffind.fitting.loop import FitResult, FitSettings, FittingError, Problem, fit
+from mi_diffind.fitting.task import LOSSES, SCHEDULES
 
 
 class Curve(Problem):
@@ -90,7 +91,7 @@ def interrupt(y):
 # -- results ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("loss", loop.LOSSES)
+@pytest.mark.parametrize("loss", LOSSES)
 def test_converges(ad, loss):
     problem = Curve(ad)
     before = problem.measure(problem.net)["psnr_db"]
@@ -138,7 +139,7 @@ def test_global_state_is_restored(ad):
     assert [threads for threads, _ in seen] == [1, before[0]] and min(limit for _, limit in seen) > before[1]
 
 
-@pytest.mark.parametrize("schedule", loop.SCHEDULES)
+@pytest.mark.parametrize("schedule", SCHEDULES)
 def test_resumed_equals_uninterrupted(ad, tmp_path, schedule):
     """Stopped by Ctrl-C between two checkpoints, or by a crash: the continued run is the same, bit by bit."""
     if ad.Float is not array_module("llvm").Float:
@@ -175,7 +176,7 @@ def test_resumed_equals_uninterrupted(ad, tmp_path, schedule):
 
 
 class Falling(Curve):
-    """What is measured falls: of all states, the first one that is measured is the best."""
+    """A problem whose measurements fall: the first measured state is the best."""
 
     def measure(self, net):
         return {"psnr_db": 90.0 - self.calls, "mae": 1.0}
@@ -353,7 +354,7 @@ def test_plateau_schedule(ad):
 # -- cost -------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("schedule", loop.SCHEDULES)
+@pytest.mark.parametrize("schedule", SCHEDULES)
 def test_no_compilation_after_the_first_steps(ad, schedule):
     """
     A step that changes a literal would compile a new kernel each time. The cache on disk could hide that, so distinct
@@ -524,7 +525,7 @@ def test_checkpoint_without_something(checkpoint):
 
 
 def test_checkpoint_of_another_problem(ad, tmp_path):
-    """What the settings do not say is in the problem's identity; tuples are lists in a file."""
+    """The problem's identity is compared beside the settings; tuples are lists in a file."""
 
     class Named(Curve):
         def __init__(self, ad, **identity):
@@ -557,7 +558,7 @@ def test_checkpoint_of_another_run(checkpoint):
 
 
 def test_interrupt_before_the_first_measurement(ad):
-    """What has been reached by then is measured and kept; its loss nobody has seen."""
+    """The state at the interrupt is measured and kept; its loss is unknown."""
     problem = Curve(ad, {7: interrupt})
     start = contents(problem)
     result, _ = run(problem, settings())
@@ -614,7 +615,7 @@ def sparse_steps(ad, optimizer, shape, steps=12):
 
 @pytest.mark.parametrize("shape", [(60,), (40, 12), (40, 3)])
 def test_steps_of_the_sparse_optimiser(ad, shape):
-    """Of entries alone and of columns in packets; a learning rate of 0.1 moves what was read by more than rounding."""
+    """Single entries and columns in packets move as in Adam; a rate of 0.1 moves entries by more than rounding."""
     values, reads = sparse_steps(ad, loop.SparseAdam(lr=0.1, beta_2=0.99), shape)
     expected, _ = sparse_steps(ad, Adam(lr=0.1, beta_2=0.99, mask_updates=True), shape)
     np.testing.assert_allclose(values, expected, rtol=0, atol=1e-5)

@@ -183,7 +183,7 @@ def test_gradients_equal_central_differences(ad):
 
 
 def test_copies_keep_few_bits(ad):
-    """Of an array with 5 bits an entry: in its own form, as a PyTree, and what any other form makes of it."""
+    """Copies of an array with 5 bits an entry keep the bits; other storages hold the same values."""
     codes = np.random.default_rng(5).integers(0, 32, (5, 6, 3)).astype(np.uint8)
     array = DifferentiableArray.from_numpy(
         codes, ad.TensorXf, storage="uint8", quantization=((1 / 31,) * 3, (0.0,) * 3), bits=5
@@ -568,7 +568,7 @@ def test_only_vectors_of_about_unit_length_are_directions():
 
 
 def test_denormal_components_count_as_zero():
-    """Also along a side of the box, where the product with the reciprocal would be NaN."""
+    """Denormal components count as zero along a side of the box, where the product with the reciprocal would be NaN."""
     ad = array_module("llvm")
     for tiny in (1e-45, -1e-45, 1e-31):
         o, d, start = ad.Array3f(0, 0.5, -1), ad.Array3f(tiny, 0, 1), (ad.Float(0), ad.Float(9), ad.Bool(True))

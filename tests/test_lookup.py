@@ -284,7 +284,7 @@ def test_padding_has_no_influence_and_no_gradient(ad, channels, fold):
 @pytest.mark.parametrize("channels", CHANNELS)
 @pytest.mark.parametrize("dims", [1, 2, 3, 4])
 def test_bytes_survive_packing(ad, dims, channels):
-    """What is packed is what ``codes`` gives back, and the extreme bytes mean the extreme values exactly."""
+    """``codes`` returns the packed bytes, and the extreme bytes stand for the extreme values exactly."""
     rng = np.random.default_rng(dims)
     codes = rng.integers(0, 256, (*RESOLUTION[:dims], channels)).astype(np.uint8)
     scale, offset = rng.uniform(0.1, 1, channels), rng.uniform(-1, 1, channels)
@@ -417,7 +417,7 @@ def test_few_bits_take_that_memory(ad, bits):
 
 
 def test_gathers_of_few_bits_that_the_kernel_makes():
-    """Those of two pairs of neighbours, no more than of single entries, as :func:`.gathers` says."""
+    """A kernel has as many gathers as :func:`.gathers` says: those of pairs, no more than of single entries."""
     ad = array_module("llvm")
     for bits, channels, words, pair in (
         (4, 4, 1, 2), (1, 1, 1, 2), (2, 4, 1, 2), (4, 3, 2, 2), (5, 3, 2, 2), (6, 3, 2, 3), (5, 4, 2, 3), (6, 4, 2, 3),

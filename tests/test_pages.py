@@ -28,7 +28,7 @@ SHAPES = {1: (7,), 2: (5, 3), 3: (2, 3, 2)}
 
 
 def random_sizes(dims, seed=0):
-    """Among them, in two dimensions, pages of 1 × 1, 1 × n and n × 1."""
+    """Random sizes; in two dimensions pages of 1 × 1, 1 × n and n × 1 are among them."""
     found = np.random.default_rng(seed).integers(1, {1: 40, 2: 18, 3: 6}[dims], (*SHAPES[dims], dims))
     if dims == 2:
         found[0, :, :] = [(1, 1), (1, 6), (6, 1)]
@@ -43,7 +43,7 @@ def pages_of(entries, sizes):
 
 
 def reference(entries, sizes, x, shift, border):
-    """What is read at ``x``, ``(samples, d)``, in float64: SciPy's first-order spline of its page."""
+    """Values at ``x``, ``(samples, d)``, in float64: SciPy's first-order spline of each page."""
     counts, pages = np.array(sizes.shape[:-1]), pages_of(np.asarray(entries, np.float64), sizes)
     t = np.where(np.array(border) == "repeat", x - np.floor(x), x) * counts - shift
     t = np.where((np.array(border) == "repeat") & (t < 0), t + counts, np.clip(t, 0, counts))
@@ -57,7 +57,7 @@ def reference(entries, sizes, x, shift, border):
 
 
 def places(dims, count=400, seed=1, low=-0.3, high=1.3):
-    """None where two pages meet: rounding decides there which is read."""
+    """Random places away from the borders of pages, where rounding decides which page is read."""
     return np.random.default_rng(seed).uniform(low, high, (count, dims)).astype(np.float32)
 
 
@@ -206,7 +206,7 @@ def test_pages_as_fine_as_an_image_hold_it(ad, height, width, border):
 
 
 def test_entries_are_the_best_fit(ad):
-    """Of a page in the middle, against the least squares of what its reads depend on."""
+    """Entries of a page in the middle, against least squares over all reads that depend on them."""
     rng = np.random.default_rng(1)
     values = rng.random((48, 48, 1)).astype(np.float32)
     sizes = np.ones((3, 3, 2), int)

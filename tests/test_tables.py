@@ -329,7 +329,7 @@ UNWRITABLE = {
 
 @pytest.mark.parametrize("fault", UNWRITABLE)
 def test_unwritable_tables_are_refused(tmp_path, fault):
-    """What could not be loaded again is not written either."""
+    """A table that could not be loaded again is not written."""
     make, match = UNWRITABLE[fault]
     with pytest.raises(TableError, match=match) as caught:
         save_table(tmp_path / "t.npz", make())
@@ -404,7 +404,7 @@ def limited(path, match, **kwargs):
 
 
 def test_a_header_that_claims_a_huge_shape(plain):
-    """Also when the description agrees with it."""
+    """A claimed shape beyond the content is refused, also if the description agrees with it."""
     shape = (60000, 60000, 7)
     members = parts(plain)
     members["cascaded.npy"] = header(shape) + bytes(63 * 4)

@@ -85,7 +85,7 @@ def test_what_ships_is_found():
 
 @pytest.mark.parametrize("entry_point", ["their_line", "their_line:TASK"])
 def test_tasks_of_others_are_found(install, entry_point):
-    """Also by an object in a module, as other packages write their entry points."""
+    """Entry points may name a module, or an object in a module."""
     install({"line": entry_point}, their_line=LINE)
     assert tuple(tasks()) == (*BUILT_IN, "line") and tasks()["line"].title == "a straight line"
     assert sys.modules["their_line"].TASK is tasks()["line"]
@@ -116,7 +116,7 @@ def test_broken_tasks_of_others_are_left_out(install, fault):
 
 
 def test_a_name_that_is_taken(install):
-    """Whoever comes first keeps it: this package, and of others the first in the order of the path."""
+    """The first task of a name is kept: that of this package, or the first on the path."""
     install({"ggx": "their_ggx"}, their_ggx=LINE)
     with pytest.warns(RuntimeWarning, match=r'^"ggx" \(their_ggx\) is left out: mi_diffind\.tasks has mi_diffind'):
         assert tuple(tasks()) == BUILT_IN and tasks()["ggx"].title == "the GGX distribution of normals"
@@ -141,7 +141,7 @@ def test_declarations_are_light():
     assert done.returncode == 0, done.stderr
     modules = set(json.loads(done.stdout))
     assert not {"drjit", "mitsuba", "matplotlib", "tqdm", "scipy"} & modules
-    heavy = (".fit", ".fitting.loop", ".model", "texture.training")
+    heavy = (".fit", ".fitting.loop", ".model", "texture.compressed")
     assert not [m for m in modules if m.startswith("mi_diffind.") and m.endswith(heavy)]
 
 
@@ -231,7 +231,7 @@ def run(**options):
 
 
 def test_fit(line, tmp_path):
-    """What a task leaves to the base class: the training, the settings, the storage form, what is measured of it."""
+    """The base class trains, records the settings, converts to the storage and measures."""
     fitted = run(seed=4, lr=0.1, storage="uint8", output=tmp_path / "line.npz")
     table, request = fitted.table, line.request
     assert (table.task, table.preset, table.seed, table.storage) == ("line", "default", 4, "uint8")
@@ -356,7 +356,7 @@ def exceptions():
 
 
 def test_all_errors_have_one_base_class():
-    """What the command line catches: each error of the library is, in the end, a ``DiffindError``."""
+    """Each error of the library derives from ``DiffindError``, which the command line catches."""
     classes = exceptions()
     assert {"TableError", "OutputError", "FittingError", "SourceError", "SceneError", "UsageError"} <= set(classes)
 

@@ -21,17 +21,6 @@ from . import lookup
 from .indirection import DifferentiableArray, check_storage, device_array, require_backend
 from .lookup import as_words, pack_bits, unpack_bits
 
-__all__ = [
-    "PagedArray",
-    "page_counts",
-    "page_entries",
-    "page_gain",
-    "page_positions",
-    "page_shift",
-    "page_sizes",
-    "shared_page_sizes",
-]
-
 #: Bits of an index word for the entries along a side of a page, by the number of dimensions; the rest counts entries.
 SIDE_BITS = (8, 5, 4)
 

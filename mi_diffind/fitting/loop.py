@@ -26,7 +26,7 @@ from ..core.archives import Archive, ArchiveError, LimitError
 from ..core.errors import reason
 from ..core.files import irregular, replacing, shown, writable_file
 from ..core.progress import Deadline, duration, in_terminal, interruptible, progress_bar
-from .task import LOSSES, SCHEDULES, FitResult, FitSettings, FittingError
+from .task import FitResult, FitSettings, FittingError
 
 #: Columns that are updated together.
 PACKET = 4
@@ -95,9 +95,6 @@ def _changed_entries(gradient, packets: int, rows=None):
     packet = dr.fma(dr.gather(module.UInt32, rows, lane // packets), packets, lane % packets)
     kept = dr.compress(dr.any(dr.gather(module.Array4f, gradient, packet) != 0))
     return dr.gather(module.UInt32, packet, kept)
-
-
-__all__ = ["LOSSES", "SCHEDULES", "FitResult", "FitSettings", "FittingError", "Problem", "fit"]
 
 
 #: Most measurements of a training whose time is limited.

@@ -88,14 +88,11 @@ class FitSettings:
     deterministic: bool = True
 
     def __post_init__(self):
-        for name, low in (("steps", 1), ("batch", 1), ("measure_every", 1), ("check_every", 1), ("seed", 0)):
-            value, most = getattr(self, name), MOST_NATURAL if name == "seed" else MOST
-            if isinstance(value, bool) or not isinstance(value, numbers.Integral):
-                raise FittingError(f"{name}: found {value!r:.40}, a whole number is needed")
-            if value < low:
-                raise FittingError(f"{name}: found {value}, at least {low} is needed")
-            if value > most:
-                raise FittingError(f"{name}: found {value!s:.40}, at most {most:,} is allowed")
+        for name in ("steps", "batch", "measure_every", "check_every", "seed"):
+            value, low, most = getattr(self, name), int(name != "seed"), MOST_NATURAL if name == "seed" else MOST
+            whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
+            if not whole or not low <= value <= most:
+                raise FittingError(f"{name}: found {value!s:.40}, a whole number from {low} to {most:,} is needed")
         if not (isinstance(self.lr, numbers.Real) and math.isfinite(self.lr) and self.lr > 0):
             raise FittingError(f"lr: found {self.lr}, a positive number is needed")
         if self.schedule not in SCHEDULES:

@@ -6,7 +6,6 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping
 from types import ModuleType
-from typing import NamedTuple
 
 from ...arrays.budget import Budget
 from ...arrays.pages import most_entries
@@ -114,15 +113,14 @@ def _train(request: FitRequest, source: Source, recipe: ImageSettings) -> tuple[
     tried, lines = [], []
     if options["ratio_search"]:
         short = dataclasses.replace(request, checkpoint=None)
-        searched = ratio_search(source, requested, recipe, short, request.preset != "paper", border)
-        tried, recipe, size = searched.tried, searched.recipe, searched.size
+        size, recipe, tried, best = ratio_search(source, requested, recipe, short, request.preset != "paper", border)
         lines += [
             f"tried {t['columns']} x {t['rows']} x {t['dims']} of {t['structure']} → {t['cascaded']}: "
             f"{t['psnr_db']:.2f} dB at texels, {t['psnr_between_db']:.2f} between"
             for t in tried
         ]
-        if searched.best and searched.best[1].interrupted:
-            return Fitted(*searched.best, lines, {"tried": tried}), requested
+        if best is not None and best[1].interrupted:
+            return Fitted(*best, lines, {"tried": tried}), requested
     elif options["cascaded"]:
         size = sized(source, requested, recipe, options["cascaded"])
         if size.nbytes > MAX_BYTES:
@@ -165,27 +163,17 @@ def sized(source: Source, nbytes: float, recipe: ImageSettings, cascaded: int) -
     return dataclasses.replace(size, paged=structure in PAGED)
 
 
-class RatioSearch(NamedTuple):
-    """Result of :func:`ratio_search`.
-
-    ``tried`` has one dictionary a training (sizes, ``bytes``, ``psnr_db``). ``best`` is the table and the record of the
-    best short training, ``interrupted`` if Ctrl-C ended the search; ``None`` if nothing was tried.
-    """
-
-    size: ImageBudget
-    recipe: ImageSettings
-    tried: list[dict]
-    best: tuple[Table, FitResult] | None = None
-
-
 def ratio_search(
     source: Source, nbytes: float, recipe: ImageSettings, request: FitRequest, free: bool = True, border=None
-) -> RatioSearch:
+) -> tuple[ImageBudget, ImageSettings, list[dict], tuple[Table, FitResult] | None]:
     """Return the best of several budgets of ``nbytes`` bytes, each trained for :data:`SHORT` of the steps.
 
     The side of the cascaded array (and so the ratio ρ) is varied first; with ``free`` then the structure of the primary
     and the dimensions. The best mean of the qualities at texels and between them is kept after each. ``request`` and
     ``border`` are those of :func:`.fit_image`.
+
+    The result is the budget, its recipe, a dictionary for each training (sizes, ``bytes``, ``psnr_db``), and table and
+    record of the best one, ``interrupted`` if Ctrl-C ended the search; ``None`` if not even the smallest array fits.
     """
     steps, limit = max(20, round(recipe.steps * SHORT)), request.part(SEARCHED).deadline
     tried, best = {}, None
@@ -221,11 +209,11 @@ def ratio_search(
         if result.interrupted:
             best[1].interrupted = True
             break
-    if best is None:  # not even the smallest cascaded array fits
-        return RatioSearch(start, recipe, [])
+    if best is None:
+        return start, recipe, [], None
     structure, dims, side = leader()
     recipe = dataclasses.replace(recipe, structure=structure, dims=dims)
-    return RatioSearch(sized(source, nbytes, recipe, side), recipe, list(tried.values()), best)
+    return sized(source, nbytes, recipe, side), recipe, list(tried.values()), best
 
 
 def _candidates(recipe: ImageSettings, side: int, free: bool, leader: Callable) -> Iterator[tuple[ImageSettings, int]]:

@@ -217,7 +217,7 @@ def fit_shading(
         before = begin(lambda: shaded_errors(texture))
         base = validation.measure(reader(texture, effects, decoder), False)["C"]["psnr_db"]
         if choice is None:
-            choice, gains, stopped = choose(build_problem, request, biases, recipe)
+            choice, gains, stopped = choose(build_problem, request, biases)
     problem, result = stopped or (build_problem(choice or Trial(biases[0])), None)
     if result is None:
         problem.identity |= {"level_biases": gains} if gains else {}
@@ -241,23 +241,20 @@ def fit_shading(
 
 
 def choose(
-    build_problem: Callable[[Trial], ShadingProblem],
-    request: FitRequest,
-    biases: Sequence[float],
-    recipe: ShadingSettings,
-) -> tuple:
+    build_problem: Callable[[Trial], ShadingProblem], request: FitRequest, biases: Sequence[float]
+) -> tuple[Trial, dict, tuple | None]:
     """Return the best :class:`Trial` after a short training with each, the gains, and ``None``.
 
     The best has the largest mean of levels among those that lose at no level, or among all if each loses somewhere. If
-    each of ``biases`` does, :data:`FIXED_BIASES` follow, with fixed fine levels; a recipe with a bias has its own. One
-    of these with a level whose loss the short training leaves as it is comes last. With
-    extras in the ``recipe``, the best so far is trained with them, too. The gains are ``gain_db`` by the name of a
-    choice. If Ctrl-C ends a training, its problem and record are returned in place of ``None``. If the time is too
-    short (:data:`SHORTEST`), the untrained arrays are compared.
+    each of ``biases`` does, :data:`FIXED_BIASES` follow, with fixed fine levels, unless the settings have a bias. One
+    of these with a level whose loss the short training leaves as it is comes last. If the settings have extras, the
+    best so far is trained with them, too. The gains are ``gain_db`` by the name of a choice. If Ctrl-C ends a training,
+    its problem and record are returned in place of ``None``. If the time is too short (:data:`SHORTEST`), the untrained
+    arrays are compared.
     """
-    measured, constant, steps = {}, set(), max(1, round(TRIAL * request.settings.steps))
-    settings = dataclasses.replace(request.settings, steps=steps, measure_every=steps)
-    short = None
+    recipe, measured, constant, short = request.settings, {}, set(), None
+    steps = max(1, round(TRIAL * recipe.steps))
+    settings = dataclasses.replace(recipe, steps=steps, measure_every=steps)
 
     def best() -> Trial:
         def rank(choice: Trial) -> tuple:

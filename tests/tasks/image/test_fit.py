@@ -129,19 +129,19 @@ def pretend(quality, monkeypatch, interrupt=None):
 def test_ratio_search_picks_the_best_that_it_tried(monkeypatch, seed, interrupt):
     rng = np.random.default_rng(seed)
     calls = pretend(lambda size, recipe: rng.uniform(20, 40), monkeypatch, interrupt)
-    found = fit.ratio_search(noise(64, 64), 3000, short(steps=400), REQUEST)
-    assert len(found.tried) == len(calls) >= (interrupt or 3) and found.best[1].interrupted == bool(interrupt)
+    size, chosen, tried, kept = fit.ratio_search(noise(64, 64), 3000, short(steps=400), REQUEST)
+    assert len(tried) == len(calls) >= (interrupt or 3) and kept[1].interrupted == bool(interrupt)
     assert interrupt is None or len(calls) == interrupt
-    best = max(found.tried, key=lambda t: t["psnr_db"])
-    assert (found.size.dims, found.size.cascaded) == (best["dims"], best["cascaded"])
-    assert (found.size.bits, found.size.coarse) == STRUCTURES[best["structure"]]
-    assert (found.recipe.dims, found.recipe.structure) == (best["dims"], best["structure"])
-    assert found.recipe.common == short(steps=400).common  # not those of the short trainings
-    assert found.best[0].measured["psnr_db"] == best["psnr_db"]
-    for tried, (size, recipe) in zip(found.tried, calls, strict=True):
-        assert tried["bytes"] == size.nbytes == bytes_of(size, 3) <= 3000 * 1.05
+    best = max(tried, key=lambda t: t["psnr_db"])
+    assert (size.dims, size.cascaded) == (best["dims"], best["cascaded"])
+    assert (size.bits, size.coarse) == STRUCTURES[best["structure"]]
+    assert (chosen.dims, chosen.structure) == (best["dims"], best["structure"])
+    assert chosen.common == short(steps=400).common  # not those of the short trainings
+    assert kept[0].measured["psnr_db"] == best["psnr_db"]
+    for each, (one, recipe) in zip(tried, calls, strict=True):
+        assert each["bytes"] == one.nbytes == bytes_of(one, 3) <= 3000 * 1.05
         assert recipe.steps == 50
-    assert len({(t["dims"], t["structure"], t["cascaded"]) for t in found.tried}) == len(calls)  # none twice
+    assert len({(t["dims"], t["structure"], t["cascaded"]) for t in tried}) == len(calls)  # none twice
 
 
 def test_ratio_search_finds_a_peak(monkeypatch):
@@ -153,14 +153,14 @@ def test_ratio_search_finds_a_peak(monkeypatch):
         return 40 - abs(size.bits - 4) - 5 * other - 3 * abs(size.dims - 3) - abs(math.log2(size.cascaded / 16))
 
     pretend(peak, monkeypatch)
-    found = fit.ratio_search(source, 20_000, base, REQUEST)
-    assert (found.size.dims, found.size.bits, found.size.coarse, found.size.cascaded) == (3, 4, None, 16)
-    sides = fit.ratio_search(source, 20_000, base, REQUEST, free=False)
-    assert {(t["dims"], t["structure"]) for t in sides.tried} == {(4, "6 bits")}
-    assert sides.recipe == base and len(sides.tried) >= 2
+    size, *_ = fit.ratio_search(source, 20_000, base, REQUEST)
+    assert (size.dims, size.bits, size.coarse, size.cascaded) == (3, 4, None, 16)
+    _, recipe, tried, _ = fit.ratio_search(source, 20_000, base, REQUEST, free=False)
+    assert {(t["dims"], t["structure"]) for t in tried} == {(4, "6 bits")}
+    assert recipe == base and len(tried) >= 2
     pretend(lambda size, recipe: 40 - abs(size.bits - 3) - 5 * (size.coarse is None), monkeypatch)
-    found = fit.ratio_search(source, 20_000, base, REQUEST)
-    assert found.size.bits == 3 and found.size.coarse is not None
+    size, *_ = fit.ratio_search(source, 20_000, base, REQUEST)
+    assert size.bits == 3 and size.coarse is not None
 
 
 # ---------------------- By quality ----------------------

@@ -143,7 +143,7 @@ def test_components_in_two_arrays(ad, channels):
 
 @pytest.mark.parametrize("name", ["grey", "twice", "a row", "one colour"])
 def test_components_that_do_not_vary(ad, name):
-    """What an array has already, none gets again: channels that follow from others, with one array and with two."""
+    """Channels that follow from others get no component a second time, with one array and with two."""
     values = {
         "grey": np.repeat(waves(24, 24, 1), 3, axis=-1),
         "twice": np.concatenate([waves(24, 24, 2)] * 2, axis=-1),
@@ -255,7 +255,7 @@ def test_targets_are_bilinear(ad, border, channels):
 
 @pytest.mark.parametrize("border", [("repeat", "clamp"), ("clamp", "repeat")])
 def test_targets_of_jittered_samples(ad, border):
-    """What a batch pairs: each place lies in its texel, anywhere in it, with the value there."""
+    """Each place of a batch lies in its texel, and its target is the value there."""
     height, width = 6, 9
     values = np.random.default_rng(1).random((height, width, 3)).astype(np.float32)
     found = problem(ad, values, border=border)
@@ -352,7 +352,7 @@ def test_a_step_is_one_kernel(ad, recipe, structure):
 
 @pytest.mark.parametrize("bits", [(4,), (2, 5)])
 def test_the_gradient_passes_through_rounding(ad, bits):
-    """That of arrays which hold the rounded entries, with the sign of the fold's slope."""
+    """The gradient is that of arrays which hold the rounded entries, times the sign of the fold's slope."""
     net, x = random_net(ad, 3, len(bits)), random_places(ad)
     weight = np.random.default_rng(3).uniform(-1, 1, 3)
     parts = (*net.primary, net.cascaded)

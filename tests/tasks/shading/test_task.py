@@ -364,11 +364,11 @@ def test_choice_by_short_trainings(ad, gains, expected):
             trained.append(problem.choice.name)
             return FitResult(problem.measure("trained"), 8, 8, 0.0, False, 0)
 
-    recipe = dataclasses.replace(OURS, extras=any("extras" in name for name in gains))
+    settings = dataclasses.replace(OURS, steps=100, extras=any("extras" in name for name in gains))
     for limit in ({}, {"deadline": Deadline(1e-9)}):
-        trained, settings = [], dataclasses.replace(OURS, steps=100)
+        trained = []
         request = Request("ours", settings, ad, checkpoint="x", **limit)
-        choice, kept, stopped = training.choose(Figures, request, training.BIASES, recipe)
+        choice, kept, stopped = training.choose(Figures, request, training.BIASES)
         assert choice.name == expected and stopped is None and trained == ([] if limit else list(gains))
         which = {name: 2 if limit and len(figures) > 2 else 0 for name, figures in gains.items()}
         assert kept == {name: pytest.approx(gains[name][k]) for name, k in which.items()}
@@ -452,7 +452,7 @@ def test_share_zero_is_the_texture_alone(start, ad):
 
 
 def test_gradient_of_the_loss_is_that_of_finite_differences(start, ad):
-    """Of the cascaded array's entries, without rounding and without bounds."""
+    """The gradient of the cascaded array's entries, without rounding and without bounds."""
     source, pyramid, table, *_ = start
     recipe = quick(share=1.0, clip=None, reference="converged")
     problem = training.ShadingProblem(training.trainable_arrays(table, pyramid), pyramid, recipe, source.digest)

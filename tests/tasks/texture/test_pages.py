@@ -58,7 +58,7 @@ def bilinear(entries, x, y):
 
 
 def page_read(table, name, side, u, v):
-    """What an array of pages, 16 texels wide from the first texel's centre on, says at (u, v); u clamps, v wraps."""
+    """Value of an array of pages, 16 texels wide from the first texel's centre on, at (u, v); u clamps, v wraps."""
     sizes = table.arrays[f"{name}_pages"].entries.astype(int) + 1
     starts = np.cumsum(sizes.prod(axis=2).ravel()) - sizes.prod(axis=2).ravel()
     pages, values = len(sizes), table.arrays[name].values
@@ -134,7 +134,7 @@ def test_damaged_files_are_refused(table, tmp_path, change, message):
 
 
 def test_which_textures_get_pages():
-    """Those whose detail is in few places; not those that are noise all over, nor those too small for pages."""
+    """Textures with detail in few places get pages; noise and textures smaller than a page do not."""
     source = sparse()
     noise = np.random.default_rng(4).integers(0, 256, (64, 64, 3), np.uint8)
     for maps, more in ((source, True), (from_arrays({"albedo": noise}), False)):
