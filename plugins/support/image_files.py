@@ -14,10 +14,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_diffind.arrays.tables import Table, TableError
+from mi_diffind.arrays.tables import Table
 from mi_diffind.core import compat
 from mi_diffind.core.compat import backend_module
-from mi_diffind.core.errors import DiffindError
 from mi_diffind.core.files import (
     OutsideError,
     is_within,
@@ -32,11 +31,11 @@ from mi_diffind.images.reader import PictureError, read_picture
 from mi_diffind.maps.compressed import CompressedMaps
 from mi_diffind.maps.layout import Layout, MapLayout
 from mi_diffind.maps.pyramid import Pyramid
-from mi_diffind.maps.source import Source, SourceError, from_arrays, load_source
+from mi_diffind.maps.source import Source, from_arrays, load_source
 
 from .. import warn
 from . import properties
-from .properties import Kept
+from .properties import Kept, refused_as
 from .tables import Tables
 
 STORAGES = ("uint8", "float32")
@@ -117,10 +116,8 @@ def open_compressed(task: Task, props: mi.Properties) -> tuple[SharedMaps, str]:
             warn(f'parameter "storage": found "float32", but {path} is of one colour: it has no arrays to optimise')
         return SharedMaps(model.image, model.arrays, model.table)
 
-    try:
-        return shared((task.name, str(Path(path).resolve()), *stamp(Path(path)), storage, mi.TensorXf), load), path
-    except TableError as e:
-        raise RuntimeError(f'parameter "filename": {e}') from None
+    with refused_as("filename"):
+        return shared((task.name, str(Path(path).resolve()), *stamp(path), storage, mi.TensorXf), load), path
 
 
 def open_uncompressed(props: mi.Properties, wrap_mode: str) -> tuple[SharedMaps, str]:
@@ -156,12 +153,9 @@ def open_uncompressed(props: mi.Properties, wrap_mode: str) -> tuple[SharedMaps,
             source = dataclasses.replace(source, maps=maps)
         return SharedMaps(Pyramid.of(source, types=types, border=border), {})
 
-    try:
-        if not path:
-            return load(), ""
-        return shared((str(Path(path).resolve()), *stamp(Path(path)), raw, border, mi.TensorXf), load), path
-    except SourceError as e:
-        raise RuntimeError(f'parameter "{given[0]}": {e}') from None
+    with refused_as(given[0]):
+        key = str(Path(path).resolve()), *stamp(path), raw, border, mi.TensorXf
+        return shared(key, load) if path else load(), path
 
 
 def _from_bitmap_object(bitmap) -> Source:
@@ -200,10 +194,7 @@ def is_data(layout: MapLayout) -> bool:
 def to_bitmap(task: Task, props: mi.Properties) -> None:
     """Add the properties that a ``bitmap`` needs to show the original of the map."""
     original, layout = find_original(task, props)
-    try:
-        values = _values(original, layout)
-    except SourceError as e:
-        raise RuntimeError(str(e)) from None
+    values = _values(original, layout)
     # Bytes stay bytes; 16 bits become float32, since "bitmap" would reduce them to half precision
     bitmap = mi.Bitmap(np.rint(values * 255).astype(np.uint8) if layout.depth == 1 else np.ascontiguousarray(values))
     bitmap.set_srgb_gamma(layout.color_space == "srgb")
@@ -258,10 +249,8 @@ def find_original(task: Task, props: mi.Properties) -> tuple[Path, MapLayout]:
 
 def file_layout(task: Task, props: mi.Properties) -> Layout:
     """Return the layout of the file that the property ``filename`` names."""
-    try:
+    with refused_as():
         return Layout.from_json(task.load(properties.filename(props)).settings["layout"])
-    except TableError as e:
-        raise RuntimeError(str(e)) from None
 
 
 def write_manifest(image: Path, folder: Path, raw: bool, normal: bool) -> Path:
@@ -303,15 +292,14 @@ def _link(link: Path, target: str) -> None:
 
 def _digest(path: Path) -> str:
     """Return the digest of an image or manifest."""
-    try:
+    with refused_as():
         return load_source(path, nonfinite="clean").digest
-    except DiffindError as e:
-        raise RuntimeError(str(e)) from None
 
 
 def _values(original: Path, layout: MapLayout) -> np.ndarray:
     """Return the values of the map in its source, ``(height, width, channels)``."""
-    maps = load_source(original, nonfinite="clean").maps
+    with refused_as():
+        maps = load_source(original, nonfinite="clean").maps
     named = [m for m in maps if m.name == layout.name]
     if original.suffix.lower() == ".json" and not named:
         raise RuntimeError(f'{original}: holds no map "{layout.name}", only {", ".join(m.name for m in maps)}')
