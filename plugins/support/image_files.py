@@ -5,9 +5,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import shutil
-import threading
-import weakref
-from collections.abc import Callable
 from pathlib import Path
 
 import drjit as dr
@@ -36,7 +33,7 @@ from mi_diffind.maps.source import Source, from_arrays, load_source
 from .. import warn
 from . import properties
 from .properties import Kept, refused_as
-from .tables import Tables
+from .tables import Tables, lock, shared
 
 STORAGES = ("uint8", "float32")
 
@@ -50,15 +47,11 @@ LEAST_BYTES = 2**12
 #: Name → :class:`~mi_diffind.maps.pyramid.Pyramid`, for textures that name one (no property can hold a pyramid).
 PYRAMIDS: dict[str, Pyramid] = {}
 
-_cache: weakref.WeakValueDictionary = weakref.WeakValueDictionary()
-_lock = threading.RLock()  # a thread that waits for a kernel may enter another constructor
-
 
 class SharedMaps:
     """Maps and their arrays (name → ``DifferentiableArray``), shared by all textures that read them.
 
-    ``table`` is the table that they were read from, if any. Equal reads are merged by Dr.Jit only if textures share
-    their variables.
+    ``table`` is the table that they were read from, if any.
     """
 
     def __init__(self, image: CompressedMaps, arrays: dict, table: Table | None = None):
@@ -81,21 +74,11 @@ class SharedMaps:
     def transform(self, matrix: list):
         """Return the transformation by a 3×3 ``matrix``, the same variable for equal matrices."""
         key = (mi.variant(), tuple(map(tuple, matrix)))
-        with _lock:
+        with lock:
             if key not in self._transforms:
-                transform = mi.AffineTransform3f(mi.ScalarAffineTransform3f(matrix))
-                dr.make_opaque(transform)
-                self._transforms[key] = transform
+                self._transforms[key] = mi.AffineTransform3f(mi.ScalarAffineTransform3f(matrix))
+                dr.make_opaque(self._transforms[key])
             return self._transforms[key]
-
-
-def shared(key: tuple, load: Callable[[], SharedMaps]) -> SharedMaps:
-    """Return ``load()``, or its earlier result for this ``key`` if that is still in use and unchanged."""
-    with _lock:
-        maps = _cache.get(key)
-        if maps is None or not maps.as_loaded():
-            maps = _cache[key] = load()
-        return maps
 
 
 def open_compressed(task: Task, props: mi.Properties) -> tuple[SharedMaps, str]:
@@ -117,7 +100,8 @@ def open_compressed(task: Task, props: mi.Properties) -> tuple[SharedMaps, str]:
         return SharedMaps(model.image, model.arrays, model.table)
 
     with refused_as("filename"):
-        return shared((task.name, str(Path(path).resolve()), *stamp(path), storage, mi.TensorXf), load), path
+        key = task.name, str(Path(path).resolve()), *stamp(path), storage, mi.TensorXf
+        return shared(key, load, SharedMaps.as_loaded), path
 
 
 def open_uncompressed(props: mi.Properties, wrap_mode: str) -> tuple[SharedMaps, str]:
@@ -141,7 +125,7 @@ def open_uncompressed(props: mi.Properties, wrap_mode: str) -> tuple[SharedMaps,
         pyramid = PYRAMIDS[name]
         if pyramid.types is not types:
             pyramid = Pyramid(pyramid.layout, pyramid.values, types, pyramid.border)
-        return shared(("pyramid", id(pyramid)), lambda: SharedMaps(pyramid, {})), ""
+        return shared(("pyramid", id(pyramid)), lambda: SharedMaps(pyramid, {}), SharedMaps.as_loaded), ""
 
     def load() -> SharedMaps:
         # A single image without "raw" is colours, whatever its name, as for Mitsuba's "bitmap"
@@ -155,7 +139,7 @@ def open_uncompressed(props: mi.Properties, wrap_mode: str) -> tuple[SharedMaps,
 
     with refused_as(given[0]):
         key = str(Path(path).resolve()), *stamp(path), raw, border, mi.TensorXf
-        return shared(key, load) if path else load(), path
+        return shared(key, load, SharedMaps.as_loaded) if path else load(), path
 
 
 def _from_bitmap_object(bitmap) -> Source:
