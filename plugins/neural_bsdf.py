@@ -10,7 +10,6 @@ import numpy as np
 
 from mi_diffind.arrays.indirection import DifferentiableArray
 from mi_diffind.arrays.lookup import clamp
-from mi_diffind.arrays.tables import TableError
 from mi_diffind.core import compat
 from mi_diffind.core.errors import UsageError
 from mi_diffind.tasks.bsdf import TASK
@@ -398,10 +397,8 @@ def _learned_or_source(props: mi.Properties):
     if properties.one_of(props, "evaluate", ("learned", "source")) == "learned":
         return NeuralBSDF(props)
     learned = NeuralBSDF(props)  # checks the properties
-    try:
+    with properties.refused_as():
         truth = _source(learned, props)
-    except (TableError, UsageError) as e:
-        raise RuntimeError(str(e)) from None
     if isinstance(truth, MitsubaTruth) and not _is_textured(truth.bsdf):
         if learned.two_sided and not mi.has_flag(truth.bsdf.flags(), mi.BSDFFlags.BackSide):
             return mi.load_dict({"type": "twosided", "bsdf": truth.bsdf})

@@ -189,6 +189,9 @@ def on_variant_change(callback) -> None:
     mi.detail.add_variant_callback(callback)
 
 
+#: Mitsuba's class of integrators that read no textures.
+UNTEXTURED = "DepthIntegrator"
+
 #: Mitsuba's class of integrators that intersect rays with the scene beside their nested integrators.
 INTERSECTING = "AOVIntegrator"
 

@@ -5,19 +5,15 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import shutil
-import threading
-import weakref
-from collections.abc import Callable
 from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_diffind.arrays.tables import Table, TableError
+from mi_diffind.arrays.tables import Table
 from mi_diffind.core import compat
 from mi_diffind.core.compat import backend_module
-from mi_diffind.core.errors import DiffindError
 from mi_diffind.core.files import (
     OutsideError,
     is_within,
@@ -31,12 +27,12 @@ from mi_diffind.fitting.task import Task
 from mi_diffind.images.reader import PictureError, read_picture
 from mi_diffind.maps.layout import Layout, MapLayout
 from mi_diffind.maps.pyramid import CompressedMaps, Pyramid
-from mi_diffind.maps.source import Source, SourceError, from_arrays, load_source
+from mi_diffind.maps.source import Source, from_arrays, load_source
 
 from .. import warn
 from . import properties
-from .properties import Kept
-from .tables import Tables
+from .properties import Kept, refused_as
+from .tables import Tables, lock, shared
 
 STORAGES = ("uint8", "float32")
 
@@ -50,15 +46,11 @@ LEAST_BYTES = 2**12
 #: Name → :class:`~mi_diffind.maps.pyramid.Pyramid`, for textures that name one (no property can hold a pyramid).
 PYRAMIDS: dict[str, Pyramid] = {}
 
-_cache: weakref.WeakValueDictionary = weakref.WeakValueDictionary()
-_lock = threading.RLock()  # a thread that waits for a kernel may enter another constructor
-
 
 class SharedMaps:
     """Maps and their arrays (name → ``DifferentiableArray``), shared by all textures that read them.
 
-    ``table`` is the table that they were read from, if any. Equal reads are merged by Dr.Jit only if textures share
-    their variables.
+    ``table`` is the table that they were read from, if any.
     """
 
     def __init__(self, image: CompressedMaps, arrays: dict, table: Table | None = None):
@@ -81,21 +73,11 @@ class SharedMaps:
     def transform(self, matrix: list):
         """Return the transformation by a 3×3 ``matrix``, the same variable for equal matrices."""
         key = (mi.variant(), tuple(map(tuple, matrix)))
-        with _lock:
+        with lock:
             if key not in self._transforms:
-                transform = mi.AffineTransform3f(mi.ScalarAffineTransform3f(matrix))
-                dr.make_opaque(transform)
-                self._transforms[key] = transform
+                self._transforms[key] = mi.AffineTransform3f(mi.ScalarAffineTransform3f(matrix))
+                dr.make_opaque(self._transforms[key])
             return self._transforms[key]
-
-
-def shared(key: tuple, load: Callable[[], SharedMaps]) -> SharedMaps:
-    """Return ``load()``, or its earlier result for this ``key`` if that is still in use and unchanged."""
-    with _lock:
-        maps = _cache.get(key)
-        if maps is None or not maps.as_loaded():
-            maps = _cache[key] = load()
-        return maps
 
 
 def open_compressed(task: Task, props: mi.Properties) -> tuple[SharedMaps, str]:
@@ -116,10 +98,9 @@ def open_compressed(task: Task, props: mi.Properties) -> tuple[SharedMaps, str]:
             warn(f'parameter "storage": found "float32", but {path} is of one colour: it has no arrays to optimise')
         return SharedMaps(model.image, model.arrays, model.table)
 
-    try:
-        return shared((task.name, str(Path(path).resolve()), *stamp(Path(path)), storage, mi.TensorXf), load), path
-    except TableError as e:
-        raise RuntimeError(f'parameter "filename": {e}') from None
+    with refused_as("filename"):
+        key = task.name, str(Path(path).resolve()), *stamp(path), storage, mi.TensorXf
+        return shared(key, load, SharedMaps.as_loaded), path
 
 
 def open_uncompressed(props: mi.Properties, wrap_mode: str) -> tuple[SharedMaps, str]:
@@ -143,7 +124,7 @@ def open_uncompressed(props: mi.Properties, wrap_mode: str) -> tuple[SharedMaps,
         pyramid = PYRAMIDS[name]
         if pyramid.types is not types:
             pyramid = Pyramid(pyramid.layout, pyramid.values, types, pyramid.border)
-        return shared(("pyramid", id(pyramid)), lambda: SharedMaps(pyramid, {})), ""
+        return shared(("pyramid", id(pyramid)), lambda: SharedMaps(pyramid, {}), SharedMaps.as_loaded), ""
 
     def load() -> SharedMaps:
         # A single image without "raw" is colours, whatever its name, as for Mitsuba's "bitmap"
@@ -155,12 +136,9 @@ def open_uncompressed(props: mi.Properties, wrap_mode: str) -> tuple[SharedMaps,
             source = dataclasses.replace(source, maps=maps)
         return SharedMaps(Pyramid.from_source(source, types=types, border=border), {})
 
-    try:
-        if not path:
-            return load(), ""
-        return shared((str(Path(path).resolve()), *stamp(Path(path)), raw, border, mi.TensorXf), load), path
-    except SourceError as e:
-        raise RuntimeError(f'parameter "{given[0]}": {e}') from None
+    with refused_as(given[0]):
+        key = str(Path(path).resolve()), *stamp(path), raw, border, mi.TensorXf
+        return shared(key, load, SharedMaps.as_loaded) if path else load(), path
 
 
 def _from_bitmap_object(bitmap) -> Source:
@@ -199,10 +177,7 @@ def is_data(layout: MapLayout) -> bool:
 def to_bitmap(task: Task, props: mi.Properties) -> None:
     """Add the properties that a ``bitmap`` needs to show the original of the map."""
     original, layout = find_original(task, props)
-    try:
-        values = _values(original, layout)
-    except SourceError as e:
-        raise RuntimeError(str(e)) from None
+    values = _values(original, layout)
     # Bytes stay bytes; 16 bits become float32, since "bitmap" would reduce them to half precision
     bitmap = mi.Bitmap(np.rint(values * 255).astype(np.uint8) if layout.depth == 1 else np.ascontiguousarray(values))
     bitmap.set_srgb_gamma(layout.color_space == "srgb")
@@ -257,10 +232,8 @@ def find_original(task: Task, props: mi.Properties) -> tuple[Path, MapLayout]:
 
 def file_layout(task: Task, props: mi.Properties) -> Layout:
     """Return the layout of the file that the property ``filename`` names."""
-    try:
+    with refused_as():
         return Layout.from_json(task.load(properties.filename(props)).settings["layout"])
-    except TableError as e:
-        raise RuntimeError(str(e)) from None
 
 
 def write_manifest(image: Path, folder: Path, raw: bool, normal: bool) -> Path:
@@ -302,15 +275,14 @@ def _link(link: Path, target: str) -> None:
 
 def _digest(path: Path) -> str:
     """Return the digest of an image or manifest."""
-    try:
+    with refused_as():
         return load_source(path, nonfinite="clean").digest
-    except DiffindError as e:
-        raise RuntimeError(str(e)) from None
 
 
 def _values(original: Path, layout: MapLayout) -> np.ndarray:
     """Return the values of the map in its source, ``(height, width, channels)``."""
-    maps = load_source(original, nonfinite="clean").maps
+    with refused_as():
+        maps = load_source(original, nonfinite="clean").maps
     named = [m for m in maps if m.name == layout.name]
     if original.suffix.lower() == ".json" and not named:
         raise RuntimeError(f'{original}: holds no map "{layout.name}", only {", ".join(m.name for m in maps)}')

@@ -404,7 +404,9 @@ class FilteredTexture(MapTexture):
     def omitted(self, integrators: list, sensor) -> str:
         """Return a sentence if no footprints reach the texture, or those of another sensor; see :mod:`.omissions`."""
         attached, name = footprint.attached_sensor(self)
-        if not self.is_spatially_varying() or any(getattr(i, "gives_footprints", False) for i in integrators):
+        reads = any(compat.integrator_name(i) != compat.UNTEXTURED for i in integrators)
+        filters = any(getattr(i, "gives_footprints", False) for i in integrators)
+        if filters or not reads or not self.is_spatially_varying():
             return ""
         if self.cone is None:
             return (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +10,16 @@ from pathlib import Path
 import mitsuba as mi
 
 from mi_diffind.arrays.tables import Table
+from mi_diffind.core.errors import DiffindError
+
+
+@contextlib.contextmanager
+def refused_as(name: str = ""):
+    """Raise errors of this package as ``RuntimeError``, as Mitsuba's plugins do; ``name`` is the parameter at fault."""
+    try:
+        yield
+    except DiffindError as e:
+        raise RuntimeError(f'parameter "{name}": {e}' if name else str(e)) from None
 
 
 def one_of(props: mi.Properties, name: str, allowed: tuple[str, ...]) -> str:

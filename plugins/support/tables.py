@@ -9,6 +9,9 @@ NumPy's, are constants of a recording.
 from __future__ import annotations
 
 import hashlib
+import threading
+import weakref
+from collections.abc import Callable
 from types import ModuleType
 
 import drjit as dr
@@ -111,6 +114,24 @@ class Tables(Entries):
             "storage": "/".join(dict.fromkeys(array.storage for array in arrays)) or None,
             "table_bytes": sum(array.nbytes for array in arrays),
         }
+
+
+_alive: weakref.WeakValueDictionary = weakref.WeakValueDictionary()
+
+#: Lock of objects that threads share; a thread that waits for a kernel may enter another constructor.
+lock = threading.RLock()
+
+
+def shared(key: tuple, make: Callable, is_usable: Callable = bool):
+    """Return ``make()``, or its earlier result for this ``key`` if that is still in use and ``is_usable``.
+
+    Dr.Jit merges equal reads of several plugins only if they share their variables.
+    """
+    with lock:
+        value = _alive.get(key)
+        if value is None or not is_usable(value):
+            value = _alive[key] = make()
+        return value
 
 
 def _tensor(entries):

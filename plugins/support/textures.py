@@ -5,8 +5,6 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-import threading
-import weakref
 from dataclasses import dataclass
 
 import drjit as dr
@@ -19,6 +17,7 @@ from mi_diffind.core import compat
 from mi_diffind.maps.pyramid import around
 
 from . import footprint, properties
+from .tables import shared
 
 WRAP_MODES = ("repeat", "mirror", "clamp")
 
@@ -235,21 +234,13 @@ class Filter:
 
 
 def shared_cone(props: mi.Properties) -> footprint.Cone | None:
-    """Return :meth:`.Cone.from_properties`, the same object for equal properties.
-
-    Dr.Jit merges the reads of several textures only if they share their variables.
-    """
+    """Return :meth:`.Cone.from_properties`, the same object for equal properties (:func:`.shared`)."""
     cone = footprint.Cone.from_properties(props)
     if cone is None:
         return None
     matrix = tuple(np.array(props["sensor_to_world"].matrix).ravel().tolist())
     key = (mi.variant(), matrix, *(float(props.get(name, 1)) for name in ("fov", "resolution", "spp")))
-    with _cone_lock:
-        return _cones.setdefault(key, cone)
-
-
-_cones: weakref.WeakValueDictionary = weakref.WeakValueDictionary()
-_cone_lock = threading.RLock()  # a thread that waits for a kernel may go on with another constructor
+    return shared(("cone", *key), lambda: cone)
 
 
 def isotropic(ddx: mi.Vector2f, ddy: mi.Vector2f) -> mi.Float:

@@ -14,6 +14,7 @@ from mi_diffind.arrays.tables import load_table, save_table
 from mi_diffind.maps.layout import Layout
 from mi_diffind.maps.source import from_arrays, load_source
 from mi_diffind.measure.clock import bsdf_operations, count
+from mi_diffind.plugins.support import footprint
 from mi_diffind.scenes import loading
 from mi_diffind.tasks.texture import TASK
 from mi_diffind.tasks.texture.compressed import CompressedTexture, to_table
@@ -153,8 +154,6 @@ def test_maps_of_one_file_are_read_once(mi_rgb, file, name):
     Only the words of a further map's channels are read in addition.
     """
     mi = mi_rgb
-    from mi_diffind.plugins.support import footprint
-
     found = []
     for bsdf in (
         {"type": "diffuse", "reflectance": plugin(file, name)},
@@ -181,8 +180,6 @@ LAMP = """<shape type="rectangle"><emitter type="area"><texture name="radiance" 
 def test_counterparts(mi_rgb, tmp_path):
     """The image or the manifest that it was made from, unfiltered or filtered; parameters of filters are left out."""
     mi = mi_rgb
-    from mi_diffind.plugins.support import footprint
-
     maps = material(WIDTH, HEIGHT)
     mi.Bitmap(maps["albedo"]).write(str(tmp_path / "albedo.png"))
     mi.Bitmap(maps["roughness"]).write(str(tmp_path / "roughness.png"))
@@ -196,10 +193,8 @@ def test_counterparts(mi_rgb, tmp_path):
         ("roughness", "wall.json", '<string name="filter" value="anisotropic"/>' + sensor),
         ("albedo", "albedo.png", '<integer name="max_anisotropy" value="2"/>'),
     ):
-        maps_of = {"albedo": maps["albedo"]} if source.endswith("png") else {
-            k: v for k, v in maps.items() if k != "normal"
-        }  # fmt: skip
-        make(tmp_path / "wall.npz", from_arrays(maps_of), source_path=source)
+        held = ("albedo",) if source.endswith("png") else ("albedo", "roughness")
+        make(tmp_path / "wall.npz", from_arrays({k: maps[k] for k in held}), source_path=source)
         scene = texture_scenes.scene_xml(LAMP.replace("MAP", name).replace("MORE", more), size=8, depth=1)
         (tmp_path / "scene.xml").write_text(scene)
         bitmap = {"type": "bitmap", "filename": str(tmp_path / f"{name}.png"), "raw": name == "roughness"}

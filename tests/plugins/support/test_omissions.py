@@ -125,6 +125,7 @@ def test_textures_that_are_filtered_or_not_read(mi_rgb, warned):
     mi = mi_rgb
     render(mi, mi.load_dict(scene(mi, **textured(mi))), "path_footprint", max_depth=2)
     render(mi, mi.load_dict(scene(mi, **textured(mi))), "moment", inner={"type": "path_footprint", "max_depth": 2})
+    render(mi, mi.load_dict(scene(mi, **textured(mi))), "depth")
     render(mi, mi.load_dict(scene(mi, **textured(mi, filter="off"))), "direct")
     at = mi.ScalarTransform4f().look_at([0, 0, -4], [0, 0, 0], [0, 1, 0])
     sensor = {"sensor_to_world": at, "fov": 40, "resolution": 4}
