@@ -28,10 +28,10 @@ WIDTH, HEIGHT, LARGEST = 384, 240, 25_000
 
 #: Plugin → what its picture shows.
 CAPTIONS = {
-    "disney": "Paints, metals, cloth and lacquer of ``scenes/materials.xml``, by the formulas.",
+    "disney": "A still life of constant and textured materials, by the formulas.",
     "mipmap": "One sample a pixel: ``bitmap`` on the left, ``mipmap`` with ``filter`` ``anisotropic`` on the right.",
     "neural_bsdf": "Six materials: left of each pair the source, right a file of four kilobytes.",
-    "neural_disney": "The materials of the picture of ``disney``, from 384 bytes of tables.",
+    "neural_disney": "The still life of the picture of ``disney``, from 384 bytes of tables.",
     "neural_field": "A captured field of 0.6 MB on a mirror, among meshes.",
     "neural_ggx": "Metals of many roughnesses, ``scenes/metals.xml``.",
     "neural_image": "Albedo, normal and roughness of glazed tiles from one file of 98 kB.",
@@ -39,16 +39,16 @@ CAPTIONS = {
     "neural_sdf": "Suzanne as a mesh and as a field of 256 kB, and knots as fields of 128 kB.",
     "neural_texture": "One sample a pixel: ``bitmap`` on the left, ``neural_texture`` with ``filter`` ``anisotropic`` "
     "on the right, a twelfth of the bytes.",
-    "path_footprint": "Filtered tiles, one sample a pixel: ``path`` on the left, ``path_footprint`` on the right.",
+    "path_footprint": "Tiles in a mirror, one sample a pixel: ``path`` on the left, ``path_footprint`` on the right.",
     "path_sdf": "Fields of glass and gold among meshes: they refract, reflect and cast shadows.",
 }
 
 #: Plugin → scene of ``scenes/``, samples a pixel, counterpart that replaces its learned plugins ("": none).
 SCENES = {
-    "disney": ("materials", 96, "exact"),
+    "disney": ("still_life", 64, "exact"),
     "mipmap": ("horizon", 1, "mipmap"),
     "neural_bsdf": ("library", 96, ""),
-    "neural_disney": ("materials", 96, ""),
+    "neural_disney": ("still_life", 64, ""),
     "neural_field": ("field", 96, ""),
     "neural_ggx": ("metals", 96, ""),
     "neural_image": ("tiles", 128, ""),
@@ -59,28 +59,27 @@ SCENES = {
     "path_sdf": ("solids", 64, ""),
 }
 
-#: Light of renders with one sample a pixel, whose error is that of textures: paths end at the first surface.
-DIRECT = 2
+#: Depth of renders with one sample a pixel, whose error is mostly that of textures, and the column between the halves.
+DEPTH, SPLIT = 3, 130
 
 
 def render(name: str, spp: int, against: str, integrator: str = "") -> np.ndarray:
     """Return a linear render ``(HEIGHT, WIDTH, 3)`` of a scene, with another integrator if one is given."""
-    defines = {"width": WIDTH, "height": HEIGHT, **({"max_depth": DIRECT} if spp == 1 else {})}
+    defines = {"width": WIDTH, "height": HEIGHT, **({"max_depth": DEPTH} if spp == 1 else {})}
     options = {"exact": True, "against": against} if against else {}
     scene = loading.load(ROOT / "scenes" / f"{name}.xml", {k: str(v) for k, v in defines.items()}, **options)
-    other = mi.load_dict({"type": integrator, "max_depth": DIRECT}) if integrator else None
+    other = mi.load_dict({"type": integrator, "max_depth": DEPTH}) if integrator else None
     return np.array(mi.render(scene, integrator=other, spp=spp, seed=7))[..., :3]
 
 
 def picture(name: str) -> np.ndarray:
-    """Return the picture of a plugin; with one sample a pixel, its left half shows what the plugin improves."""
+    """Return the picture of a plugin; with one sample a pixel, its left part shows what the plugin improves."""
     scene, spp, against = SCENES[name]
     image = render(scene, spp, against)
     if spp == 1:
-        middle = WIDTH // 2
         left = render(scene, spp, "", "path") if name == "path_footprint" else render(scene, spp, "exact")
-        image[:, :middle] = left[:, :middle]
-        image[:, middle - 1 : middle + 1] = 1
+        image[:, :SPLIT] = left[:, :SPLIT]
+        image[:, SPLIT - 1 : SPLIT + 1] = 1
     return image
 
 

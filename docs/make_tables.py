@@ -39,16 +39,23 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from figures import DOCS, EXACT, ROOT, ClaimError, Entries, evaluate, files, formatted, measured, size_text, toml
+from figures import (
+    DOCS,
+    EXACT,
+    ROOT,
+    ClaimError,
+    Entries,
+    commands,
+    evaluate,
+    files,
+    formatted,
+    measured,
+    size_text,
+    toml,
+)
 
 import mi_diffind
 from mi_diffind.fitting.task import tasks
-
-
-def commands() -> dict[str, str]:
-    """Return the command that wrote each file of ``docs/measured``, by the name of the file."""
-    return toml("measured/commands.toml")
-
 
 # -- tables ------------------------------------------------------------------------------------------------------------
 

@@ -4,7 +4,6 @@ Take the picture of the viewer's page, ``docs/viewer.jpg``, in headless Chromium
     python docs/make_viewer.py
 """
 
-import argparse
 import io
 import re
 import shutil
@@ -21,26 +20,14 @@ ROOT = Path(__file__).resolve().parents[1]
 
 OPTIONS = ["--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--disable-background-networking"]
 
+#: Samples a pixel that are waited for.
+SAMPLES = "256"
+
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scene", nargs="?", default=str(ROOT / "scenes" / "solids.xml"))
-    parser.add_argument("--find", default="clay", help="parameters to show")
-    parser.add_argument("--spp", default="256")
-    parser.add_argument("-o", "--output", default=str(ROOT / "docs" / "viewer.jpg"))
-    arguments = parser.parse_args()
-    command = [
-        sys.executable,
-        "-m",
-        "mi_diffind.commands.cli",
-        "view",
-        arguments.scene,
-        "--port",
-        "0",
-        "--width",
-        "640",
-    ]
-    server = subprocess.Popen([*command, "--spp", arguments.spp], stdout=subprocess.PIPE, text=True)
+    scene = str(ROOT / "scenes" / "solids.xml")
+    command = [sys.executable, "-m", "mi_diffind.commands.cli", "view", scene, "--port", "0", "--width", "640"]
+    server = subprocess.Popen([*command, "--spp", SAMPLES], stdout=subprocess.PIPE, text=True)
     try:
         url = re.search(r"http://\S+", server.stdout.readline())[0]
         with tempfile.TemporaryDirectory() as profile, sync_playwright() as playwright:
@@ -50,12 +37,12 @@ def main() -> None:
             )
             page = browser.new_page()
             page.goto(url)
-            page.locator("xpath=//label[normalize-space()='find']/following::input").first.fill(arguments.find)
+            page.locator("xpath=//label[normalize-space()='find']/following::input").first.fill("clay")
             page.get_by_text("Software WebGL").locator("xpath=following::button | preceding::button").last.wait_for()
             notice = page.locator(".mantine-Notification-closeButton")
             for _ in range(notice.count()):
                 notice.first.click()
-            while not re.search(rf"samples\s+{arguments.spp} of", page.inner_text("body")):
+            while not re.search(rf"samples\s+{SAMPLES} of", page.inner_text("body")):
                 time.sleep(0.5)
             time.sleep(2)
             image = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
@@ -63,8 +50,7 @@ def main() -> None:
     finally:
         server.terminate()
         server.wait()
-    image.save(arguments.output, quality=82, optimize=True)
-    print(f"{arguments.output}: {Path(arguments.output).stat().st_size:,} bytes")
+    image.save(ROOT / "docs" / "viewer.jpg", quality=82, optimize=True)
 
 
 if __name__ == "__main__":

@@ -33,6 +33,7 @@ _NAMES = {
     "attach": "scenes.loading",
     "capture": "scenes.capture",
     "compare": "scenes.comparison",
+    "compare_at_equal_time": "scenes.equal_time",
     "convert": "scenes.conversion",
     "inspect": "scenes.inspection",
     "regress": "scenes.regression",

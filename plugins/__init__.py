@@ -19,7 +19,7 @@ from mi_diffind.core import compat, discovery
 IGNORED = ("support", "mitsuba_entry")
 
 #: Type of a plugin → the class in ``mitsuba`` whose instances its factory returns.
-OBJECT_TYPES = {"bsdf": "BSDF", "texture": "Texture", "shape": "Shape", "volume": "Volume", "integrator": "Integrator"}
+OBJECT_TYPES = {"bsdf": "BSDF", "texture": "Texture", "shape": "Shape", "integrator": "Integrator"}
 
 
 @dataclass(frozen=True)
@@ -107,27 +107,31 @@ class Plugin:
         named = {**{c.name: c for c in self.others}, "exact": self.exact}
         return next(filter(None, map(named.get, (against,) if isinstance(against, str) else against)), None)
 
-    def described(self, props) -> dict:
+    def describe(self, props) -> dict:
         """Return a plain description of the properties (``mi.Properties``) of an instance.
 
         It has the keys ``plugin``, ``kind`` (the object type), ``id`` and ``parameters`` (numbers, text, colours and
         matrices as lists, ``"texture"`` for any named object). Parameters that only the learned plugin has, and the
         file that it reads, are keys of their own.
         """
-        learned_only = self.exact.learned_only if self.exact else ()
-        if self.task and "filename" not in learned_only:
-            learned_only = (*learned_only, "filename")
-        return {
-            "plugin": self.name,
-            "kind": self.object_type,
-            "id": props.id(),
-            "parameters": {
-                key: _plain(props, key, self.object_type)
-                for key in props
-                if key not in learned_only and not key.startswith("_arg_")
-            },
-            **{key: str(props[key]) for key in learned_only if key in props},
-        }
+        learned = dict.fromkeys(
+            (*(self.exact.learned_only if self.exact else ()), *(("filename",) if self.task else ()))
+        )
+        parameters = {k: self._plain(props, k) for k in props if k not in learned and not k.startswith("_arg_")}
+        described = {"plugin": self.name, "kind": self.object_type, "id": props.id(), "parameters": parameters}
+        return described | {key: str(props[key]) for key in learned if key in props}
+
+    def _plain(self, props, key: str):
+        word, is_transform = compat.property_kind(props, key), props.type(key) == type(props).Type.Transform
+        if props.type(key) == type(props).Type.Any:
+            return type(props[key]).__name__
+        if word in ("object", "existing"):
+            return "nested" if self.object_type == "integrator" else "texture"
+        if word == "number":
+            return float(props[key])
+        if word == "colour":
+            return [float(v) for v in props[key]]
+        return _rows(props[key].matrix) if is_transform else str(props[key])
 
 
 #: Variant that was set → its plugins by name.
@@ -179,12 +183,8 @@ def register(variant: str) -> None:
     _declared[variant] = declarations = {}
     for plugin in _load():
         declarations[plugin.name] = plugin
-        if supported(variant):
-            factory = _checking_factory(plugin)
-        elif plugin.object_type != "volume":  # in scalar variants, Mitsuba needs the type of every object it loads
-            factory = _refusing_factory(plugin.name, variant)
-        else:
-            continue
+        # In scalar variants, Mitsuba needs the type of every object that it loads
+        factory = _checking_factory(plugin) if supported(variant) else _refusing_factory(plugin.name, variant)
         compat.register(plugin.object_type, plugin.name, factory)
 
 
@@ -212,14 +212,14 @@ def _checking_factory(plugin: Plugin):
 
     def make(props):
         instance = plugin.factory(props)
-        needed = compat.base_class(OBJECT_TYPES[plugin.object_type])
+        needed = getattr(compat.mi, OBJECT_TYPES[plugin.object_type])
         if not isinstance(instance, needed):  # Mitsuba would crash
             returned = "nothing" if instance is None else f"a {type(instance).__name__}"
             raise RuntimeError(
                 f'plugin "{plugin.name}": the factory returned {returned}, a {plugin.object_type} is needed'
             )
         unknown = [key for key in props if not props.was_queried(key)]  # Mitsuba refuses these, if they stay so
-        description = plugin.described(props)
+        description = plugin.describe(props)
         for key in unknown:
             props.mark_queried(key, False)
         part = _parts.pop(id(instance), instance)
@@ -275,7 +275,7 @@ def _forget_dead() -> None:
 
 
 def origin(instance) -> dict | None:
-    """Return the description of an instance of a plugin (:meth:`Plugin.described`); ``None`` for any other object."""
+    """Return the description of an instance of a plugin (:meth:`Plugin.describe`); ``None`` for any other object."""
     recorded = getattr(instance, "_origin", None)
     if recorded is not None:
         return recorded.description
@@ -291,17 +291,5 @@ def report(instance) -> dict | None:
     return None if entry is None or entry[2] is None else entry[2]()
 
 
-def _plain(props, key: str, object_type: str):
-    value_type, types = props.type(key), type(props).Type
-    if value_type in (types.Float, types.Integer):
-        return float(props[key])
-    if value_type == types.Color:
-        return [float(v) for v in props[key]]
-    if value_type in (types.Reference, types.ResolvedReference, types.Object):
-        return "nested" if object_type == "integrator" else "texture"
-    if value_type == types.Transform:
-        m = props[key].matrix
-        return [[float(m[i, j]) for j in range(4)] for i in range(4)]
-    if value_type == types.Any:
-        return type(props[key]).__name__
-    return str(props[key])
+def _rows(matrix) -> list[list[float]]:
+    return [[float(matrix[i, j]) for j in range(4)] for i in range(4)]

@@ -5,16 +5,15 @@ from __future__ import annotations  # Delayed parsing of type annotations
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind.core.compat import base_class, lobe_rates
 from mi_diffind.tasks.disney import model, sampling
-from mi_diffind.tasks.disney.decoder import Decoder, Lobe
+from mi_diffind.tasks.disney.decoder import GROUPS, Decoder, Lobe
 from mi_diffind.tasks.disney.model import LOBES, Effects, find_effects
 
 from . import Counterpart, Plugin
-from .support import frozen, properties, tables
-from .support.directions import are_directions
+from .support import properties
+from .support.bsdfs import TrackedParameter, are_directions, when_outermost
 from .support.manual import shared_parts
-from .support.tracked_parameter import tracked, when_outermost
+from .support.tables import Tables, arrays_of, frozen_key, make_opaque
 
 _DIFFERENTIABLE = mi.ParamFlags.Differentiable
 _DISCONTINUOUS = mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous
@@ -148,27 +147,7 @@ class Disney(mi.BSDF):
 
     {executable}
 
-    .. tabs::
-        .. code-tab:: xml
-            :name: disney
-
-            <bsdf type="disney">
-                <rgb name="base_color" value="0.8, 0.2, 0.1"/>
-                <float name="roughness" value="0.3"/>
-                <float name="clearcoat" value="1.0"/>
-                <float name="clearcoat_gloss" value="0.9"/>
-            </bsdf>
-
-        .. code-tab:: python
-
-            'type': 'disney',
-            'base_color': {
-                'type': 'rgb',
-                'value': [0.8, 0.2, 0.1]
-            },
-            'roughness': 0.3,
-            'clearcoat': 1.0,
-            'clearcoat_gloss': 0.9
+    {example bsdf disney: base_color=[0.8, 0.2, 0.1], roughness=0.3, clearcoat=1.0, clearcoat_gloss=0.9}
     """
 
     #: Parameter → default, in the order of the manual page.
@@ -233,12 +212,12 @@ class Disney(mi.BSDF):
 
         self.effects = properties.one_of(props, "effects", ("used", "all"))
         #: The form of the model that computes coefficients and values, by arithmetic or from tables.
-        self.decoder, self.preset = Decoder(), ""
+        self.decoder, self.tables = Decoder(), Tables({})
         #: Name of a parameter of the model → its bounds and changes.
         self._tracked = {
-            "base_color": tracked(self.base_color, colour=True),
-            **{name: tracked(texture) for name, texture in self.scalars.items()},
-            "specular": tracked(self.reflectance, is_eta=self.reflectance_name == "eta"),
+            "base_color": TrackedParameter(self.base_color, colour=True),
+            **{name: TrackedParameter(texture) for name, texture in self.scalars.items()},
+            "specular": TrackedParameter(self.reflectance, is_eta=self.reflectance_name == "eta"),
         }
         self._set_up(props)
         #: Coefficients that depend on constants alone, evaluated, and the effects that they are for.
@@ -257,26 +236,25 @@ class Disney(mi.BSDF):
         self.m_components = [mi.BSDFFlags.DiffuseReflection | sides, anisotropic if is_anisotropic else glossy, glossy]
         self.m_flags = self.m_components[0] | self.m_components[1] | self.m_components[2]
 
-    def _textures(self) -> dict[str, mi.Texture]:
-        textures = {"base_color": self.base_color, **self.scalars, self.reflectance_name: self.reflectance}
-        return {name: texture for name, texture in textures.items() if isinstance(texture, base_class("Texture"))}
+    def _parameters(self) -> dict:
+        """Return the textures and numbers of the model that the material has itself, by name."""
+        given = {"base_color": self.base_color, **self.scalars, self.reflectance_name: self.reflectance}
+        return {name: value for name, value in given.items() if value is not None}
 
-    def _numbers(self) -> dict:
-        """Return the parameters that are numbers, by name."""
-        rates = {name: self.rates[lobe] for lobe, name in self.RATES.items()}
-        is_number = isinstance(self.reflectance, dr.ArrayBase)
-        return {**rates, self.reflectance_name: self.reflectance} if is_number else rates
+    def _textures(self) -> dict[str, mi.Texture]:
+        return {name: v for name, v in self._parameters().items() if not isinstance(v, dr.ArrayBase)}
 
     def traverse(self, cb: mi.TraversalCallback):
-        given = {"base_color": self.base_color, **self.scalars, self.reflectance_name: self.reflectance}
-        for name, texture in given.items():
-            if texture is not None:
-                cb.put(name, texture, _DISCONTINUOUS if name in ("roughness", "specular", "eta") else _DIFFERENTIABLE)
+        for name, value in self._parameters().items():
+            cb.put(name, value, _DISCONTINUOUS if name in ("roughness", "specular", "eta") else _DIFFERENTIABLE)
         for lobe, name in self.RATES.items():
             cb.put(name, self.rates[lobe], mi.ParamFlags.NonDifferentiable)
+        self.tables.traverse(cb)
 
     def parameters_changed(self, keys: list[str] = ()):
-        frozen.make_opaque(self._numbers())
+        self.tables.accept()
+        rates = {name: self.rates[lobe] for lobe, name in self.RATES.items()}
+        make_opaque(rates | {name: v for name, v in self._parameters().items() if isinstance(v, dr.ArrayBase)})
         self._prepare_constants()
 
     def _find_effects(self) -> tuple[Effects, dict[str, str]]:
@@ -295,8 +273,8 @@ class Disney(mi.BSDF):
 
     def _is_constant(self, group: str) -> bool:
         """Return whether a group of coefficients depends on constants alone, neither optimised nor changed."""
-        parameters = [self._tracked[name] for name in self.decoder.groups[group]]
-        return all(p.constant and not p.optimised() and not p.changed() for p in parameters)
+        reads_optimised_tables = group not in GROUPS and self.tables.optimised()
+        return not reads_optimised_tables and all(self._tracked[p].is_fixed() for p in self.decoder.groups[group])
 
     def _prepare_constants(self) -> None:
         """Determine the parameters' bounds, and evaluate the groups of coefficients that depend on constants alone."""
@@ -313,15 +291,8 @@ class Disney(mi.BSDF):
             }
         dr.make_opaque(constant)
         self._constant, self._constant_for = constant, effects
-        self.held = [frozen.key(*self._settings()), tables.arrays_of([constant, self._arrays()])]
-
-    def _settings(self) -> tuple:
-        """Return what decides how the material is evaluated, besides arrays, for :func:`.frozen.key`."""
-        return self._constant_for.names, sorted(self._constant)
-
-    def _arrays(self) -> dict:
-        """Return the tables that are read, by name."""
-        return {}
+        key = frozen_key(effects.names, sorted(constant), self.tables.shapes())
+        self.held = [key, arrays_of([constant, self.tables.arrays])]
 
     def report(self) -> dict:
         """Return a description of this instance, for ``mi-diffind inspect``.
@@ -331,7 +302,7 @@ class Disney(mi.BSDF):
         """
         effects, reasons = self._find_effects()
         return {
-            **tables.described(self.preset, self._arrays()),
+            **self.tables.report(),
             "effects_in_use": list(effects.names),
             "effects_left_out": reasons,
             "evaluated_once": sorted(self._constant),
@@ -343,7 +314,7 @@ class Disney(mi.BSDF):
             return mi.UnpolarizedSpectrum(model.clamp(self.base_color.eval(si, active), 0.0, 1.0))
         if name != "specular":
             return model.clamp(self.scalars[name].eval_1(si, active), 0.0, 1.0)
-        texture = isinstance(self.reflectance, base_class("Texture"))
+        texture = isinstance(self.reflectance, mi.Texture)
         value = self.reflectance.eval_1(si, active) if texture else self.reflectance
         if self.reflectance_name == "eta":
             value = model.specular_from_eta(value)
@@ -403,25 +374,26 @@ class Disney(mi.BSDF):
             return dr.detach(dr.select(active, mi.Float(pdf) * point.share, 0))
 
     def eval(self, ctx, si, wo, active=True):
-        point, effects = self._point(ctx, si, active), self._effects()
-        coefficients = self._surface(point, effects, density=False)
-        lobes = tuple(self._rates(ctx, effects))
-        return self._value(point, coefficients, effects, lobes, wo, self._prepare(point, wo, active))
+        return self._answer(ctx, si, wo, active, density=False)[0]
 
     def pdf(self, ctx, si, wo, active=True):
-        point, effects = self._point(ctx, si, active), self._effects()
-        coefficients = self._surface(point, effects, value=False)
-        return self._density(point, coefficients, effects, self._rates(ctx, effects), self._prepare(point, wo, active))
+        return self._answer(ctx, si, wo, active, value=False)[1]
 
     def eval_pdf(self, ctx, si, wo, active=True):
-        point, effects = self._point(ctx, si, active), self._effects()
-        coefficients = self._surface(point, effects)
-        return self._eval_pdf(point, coefficients, effects, self._rates(ctx, effects), wo, active)
+        return self._answer(ctx, si, wo, active)
 
-    def _eval_pdf(self, point, coefficients, effects, rates, wo, active):
+    def _answer(self, ctx, si, wo, active, value: bool = True, density: bool = True) -> tuple:
+        """Return the value and the density, ``None`` for the one that is not asked for."""
+        point, effects = self._point(ctx, si, active), self._effects()
+        coefficients, rates = self._surface(point, effects, value, density), self._rates(ctx, effects)
+        return self._eval_pdf(point, coefficients, effects, rates, wo, active, value, density)
+
+    def _eval_pdf(self, point, coefficients, effects, rates, wo, active, value=True, density=True) -> tuple:
         directions = self._prepare(point, wo, active)
-        value = self._value(point, coefficients, effects, tuple(rates), wo, directions)
-        return value, self._density(point, coefficients, effects, rates, directions)
+        return (
+            self._value(point, coefficients, effects, tuple(rates), wo, directions) if value else None,
+            self._density(point, coefficients, effects, rates, directions) if density else None,
+        )
 
     def sample(self, ctx, si, sample1, sample2, active=True):
         return self._sample(ctx, self._point(ctx, si, active), sample1, sample2, active)
@@ -472,10 +444,7 @@ class Disney(mi.BSDF):
         return mi.depolarizer(mi.Spectrum(self.base_color.eval(si, active)))
 
     def to_string(self):
-        lines = [f"{name} = {texture}" for name, texture in self._textures().items()]
-        if not isinstance(self.reflectance, base_class("Texture")):
-            lines.append(f"{self.reflectance_name} = {self.reflectance}")
-        report = self.report()
+        lines, report = [f"{name} = {value}" for name, value in self._parameters().items()], self.report()
         if report["storage"]:
             lines.append(f"preset = {report['preset']}, {report['table_bytes']} bytes as {report['storage']}")
         lines.append(f"effects = {', '.join(report['effects_in_use'])}")
@@ -563,9 +532,6 @@ def to_principled(props: mi.Properties) -> None:
     if "subsurface" in props:
         props["flatness"] = props["subsurface"]
         del props["subsurface"]
-    for name in set(Disney.RATES.values()) - set(lobe_rates()):
-        if name in props:
-            del props[name]
 
 
 #: Mitsuba's own model with the same parameters.

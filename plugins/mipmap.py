@@ -95,20 +95,7 @@ class MipMap(FilteredTexture):
 
     {executable}
 
-    .. tabs::
-        .. code-tab:: xml
-            :name: mipmap
-
-            <texture type="mipmap">
-                <string name="filename" value="wall.png"/>
-                <string name="filter" value="anisotropic"/>
-            </texture>
-
-        .. code-tab:: python
-
-            'type': 'mipmap',
-            'filename': 'wall.png',
-            'filter': 'anisotropic'
+    {example texture mipmap: filename="wall.png", filter="anisotropic"}
     """
 
     def _open(self, props: mi.Properties) -> SharedMaps:
@@ -130,7 +117,7 @@ class MipMap(FilteredTexture):
             (width, height), channels, needed = self._size, self.map.channels, self._needed()
             index = dr.arange(mi.UInt32, width * height * channels)
             stored = self.image.interpolated_texels(index // channels) if needed else []
-            values = self._used_of([stored[i] for i in needed])
+            values = self._decode_mean([stored[i] for i in needed])
             flat = values[0] + dr.zeros(mi.Float, width * height * channels)  # as many where a channel is constant
             for c in range(1, channels):
                 flat = dr.select(index % channels == c, values[c], flat)
@@ -150,7 +137,7 @@ class MipMap(FilteredTexture):
         super().parameters_changed(keys)
 
     def _read(self, uv):
-        return self._used_of(self._interpolated(uv, mi.Float(0), whole=True))
+        return self._decode_mean(self._interpolated(uv, mi.Float(0), whole=True))
 
     def _filtered(self, uv, level):
         return self._interpolated(uv, level, whole=False)
@@ -163,7 +150,7 @@ class MipMap(FilteredTexture):
         stored = self.image.interpolated(*self._wrapped_at(uv, level), level, whole=whole)
         return [stored[i] for i in self._needed()]
 
-    def _used_of(self, values):
+    def _decode_mean(self, values):
         stored = [None] * self.image.layout.stored
         for i, value in zip(self._needed(), values, strict=True):
             stored[i] = value

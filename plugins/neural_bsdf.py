@@ -12,7 +12,6 @@ from mi_diffind.arrays.indirection import DifferentiableArray
 from mi_diffind.arrays.lookup import clamp
 from mi_diffind.arrays.tables import TableError
 from mi_diffind.core import compat
-from mi_diffind.core.compat import base_class
 from mi_diffind.core.errors import UsageError
 from mi_diffind.tasks.bsdf import TASK
 from mi_diffind.tasks.bsdf.files import RESIDUAL
@@ -20,10 +19,10 @@ from mi_diffind.tasks.bsdf.model import ALPHA_MIN, DIFFUSE, EDGE, LOBE, LOGARITH
 from mi_diffind.tasks.bsdf.truth import MitsubaTruth
 
 from . import Counterpart, Plugin
-from .support import frozen, properties, tables, textures
-from .support.directions import glossy_directions
+from .support import properties, textures
+from .support.bsdfs import TrackedParameter, glossy_directions, when_outermost
 from .support.manual import shared_parts
-from .support.tracked_parameter import TrackedParameter, when_outermost
+from .support.tables import Tables, arrays_of, frozen_key, make_opaque, open_tables
 
 #: Smallest density of a sample that counts.
 SMALLEST_DENSITY = 1e-20
@@ -110,18 +109,7 @@ class NeuralBSDF(mi.BSDF):
 
     {executable}
 
-    .. tabs::
-        .. code-tab:: xml
-            :name: neural_bsdf
-
-            <bsdf type="neural_bsdf">
-                <string name="filename" value="paint.npz"/>
-            </bsdf>
-
-        .. code-tab:: python
-
-            'type': 'neural_bsdf',
-            'filename': 'paint.npz'
+    {example bsdf neural_bsdf: filename="paint.npz"}
 
     **Families**: a file that ``mi-diffind fit bsdf plastic.xml --over alpha=0.02:0.8 -o plastic.npz`` wrote holds a
     BSDF that depends on parameters. Each is a property, and may be a texture, also where the plugin that was fitted
@@ -151,12 +139,10 @@ class NeuralBSDF(mi.BSDF):
         if "filename" not in props:
             raise RuntimeError('parameter "filename": not given, a table file is needed (mi-diffind fit bsdf)')
         properties.check_range(props, "scale", 0, 1)
-        self.two_sided = props.get("two_sided", False)
-        if not isinstance(self.two_sided, bool):
-            raise RuntimeError(f'parameter "two_sided": found {self.two_sided}, allowed are true and false')
+        self.two_sided = properties.flag(props, "two_sided")
         self.energy = properties.one_of(props, "energy", ("source", "raw"))
         self.scale = dr.opaque(mi.Float, float(props.get("scale", 1.0)))
-        self.model = tables.open_tables(props, TASK)
+        self.model = open_tables(props, TASK)
         if self.energy == "raw":
             self.model.arrays.pop("energy", None)
             self.model.refresh()
@@ -167,7 +153,8 @@ class NeuralBSDF(mi.BSDF):
         self.proxy = _parameters(self.model) if self.model.form.terms and not self.textures else {}
         self._tracked = [TrackedParameter(texture) for texture in self.textures.values()]
         self.known, self.member = [], None
-        self._entries = tables.Entries(tables.exposed(self._arrays()))
+        names = (*RESIDUAL, "proxy") if self.textures else RESIDUAL
+        self.tables = Tables(self.model.arrays, self.model.table, names)
         self.parameters_changed()
 
         side = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide if self.two_sided else mi.BSDFFlags.FrontSide
@@ -179,26 +166,20 @@ class NeuralBSDF(mi.BSDF):
         self.m_components = [flags]
         self.m_flags = flags
 
-    def _arrays(self) -> dict:
-        names = (*RESIDUAL, "proxy") if self.textures else RESIDUAL
-        return {name: self.model.arrays[name] for name in names if name in self.model.arrays}
-
     def trained(self) -> tuple:
         """Return the table of the file, and the arrays that can be optimised, by name."""
-        arrays = tables.exposed(self._arrays())
-        if self.proxy:
-            arrays = {**arrays, "proxy": _proxy_array(self.proxy, self.model.form)}
-        return self.model.table, arrays
+        proxy = {"proxy": _proxy_array(self.proxy, self.model.form)} if self.proxy else {}
+        return self.tables.table, {**self.tables.exposed, **proxy}
 
     def traverse(self, cb: mi.TraversalCallback):
         cb.put("scale", self.scale, mi.ParamFlags.Differentiable)
         for name, value in (*self.proxy.items(), *self.textures.items()):
             cb.put(name, value, mi.ParamFlags.Differentiable)
-        tables.traverse(cb, tables.exposed(self._arrays()))
+        self.tables.traverse(cb)
 
     def parameters_changed(self, keys: list[str] = ()):
-        self._entries.accept()
-        frozen.make_opaque({"scale": self.scale, **self.proxy})
+        self.tables.accept()
+        make_opaque({"scale": self.scale, **self.proxy})
         if self.proxy:  # what depends on its parameters alone, once for all lanes
             with dr.suspend_grad():
                 self.constants = dr.detach(_proxy(self.proxy, self.model.form))
@@ -210,8 +191,7 @@ class NeuralBSDF(mi.BSDF):
     def _hold(self) -> None:
         """Keep all arrays that are read as an attribute, for frozen functions."""
         parts = [self.model, self.member, getattr(self, "constants", None), getattr(self, "source", None)]
-        arrays = tables.arrays_of(parts)
-        self.held = [frozen.key(self.known, self._entries.shapes()), arrays]
+        self.held = [frozen_key(self.known, self.tables.shapes()), arrays_of(parts)]
 
     def _at(self, si, active):
         """Return the BSDF with its present parameters, and the mixture that samples it."""
@@ -233,9 +213,8 @@ class NeuralBSDF(mi.BSDF):
 
     def _constants(self) -> list[bool]:
         """Return which parameters of a family are constant, and neither changed nor, like the tables, optimised."""
-        if tables.optimised(tables.exposed(self._arrays())):
-            return [False] * len(self._tracked)
-        return [p.constant and not (p.optimised() or p.changed()) for p in self._tracked]
+        tables_fixed = not self.tables.optimised()
+        return [tables_fixed and p.is_fixed() for p in self._tracked]
 
     def _compute_member(self):
         """Compute the family of the parameters that are not constant, or its member if all are."""
@@ -315,7 +294,7 @@ class NeuralBSDF(mi.BSDF):
             left_out["energy"] = "energy is raw" if "energy" in self.model.table.arrays else "the file has no limit"
         in_use = ["residual", *form.terms, *(["energy"] if "energy" in arrays else [])]
         return {
-            **tables.described(self.model.table.preset, arrays),
+            **self.tables.report(),
             "effects_in_use": in_use,
             "effects_left_out": left_out,
         }
@@ -433,7 +412,7 @@ def _learned_or_source(props: mi.Properties):
 def _is_textured(bsdf) -> bool:
     """Return whether a BSDF differs from place to place; plugins of Mitsuba do not all set a flag."""
     nodes = compat.scene_objects(bsdf)
-    varies = any(isinstance(node, base_class("Texture")) and node.is_spatially_varying() for node in nodes)
+    varies = any(isinstance(node, mi.Texture) and node.is_spatially_varying() for node in nodes)
     return varies or mi.has_flag(bsdf.flags(), mi.BSDFFlags.SpatiallyVarying)
 
 

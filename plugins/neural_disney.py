@@ -2,17 +2,15 @@
 
 from __future__ import annotations  # Delayed parsing of type annotations
 
-import mitsuba as mi
-
 from mi_diffind.fitting.task import STORAGES
 from mi_diffind.tasks.disney import TASK
-from mi_diffind.tasks.disney.decoder import GROUPS
 
 from . import Counterpart, Plugin, Stock
 from .disney import ETA_MAX, PRINCIPLED, Disney
-from .support import properties, tables
+from .support import properties
 from .support.manual import shared_parts
 from .support.properties import Kept, StockNode
+from .support.tables import Tables, open_tables
 
 #: Default storage form: the fastest to read, and within 82 dB of the formulas.
 STORAGE = "uint8"
@@ -72,59 +70,17 @@ class NeuralDisney(Disney):
 
     {executable}
 
-    .. tabs::
-        .. code-tab:: xml
-            :name: neural_disney
-
-            <bsdf type="neural_disney">
-                <rgb name="base_color" value="0.8, 0.2, 0.1"/>
-                <float name="roughness" value="0.3"/>
-                <float name="clearcoat" value="1.0"/>
-                <float name="clearcoat_gloss" value="0.9"/>
-            </bsdf>
-
-        .. code-tab:: python
-
-            'type': 'neural_disney',
-            'base_color': {
-                'type': 'rgb',
-                'value': [0.8, 0.2, 0.1]
-            },
-            'roughness': 0.3,
-            'clearcoat': 1.0,
-            'clearcoat_gloss': 0.9
+    {example bsdf neural_disney: base_color=[0.8, 0.2, 0.1], roughness=0.3, clearcoat=1.0, clearcoat_gloss=0.9}
     """
 
     def _set_up(self, props):
-        opened = tables.open_tables(props, TASK, STORAGE)
-        self.decoder, self.preset, self._table = opened.decoder, opened.table.preset, opened.table
-        self._entries = tables.Entries(self._tables())
-
-    def _arrays(self) -> dict:
-        return {name: getattr(self.decoder.arrays, name) for name in self.decoder.arrays.SHAPES}
-
-    def _tables(self) -> dict:
-        """Return the tables that are exposed."""
-        return tables.exposed(self._arrays())
+        opened = open_tables(props, TASK, STORAGE)
+        self.decoder, arrays = opened.decoder, opened.decoder.arrays
+        self.tables = Tables({name: getattr(arrays, name) for name in arrays.SHAPES}, opened.table)
 
     def trained(self) -> tuple:
         """Return the table of the file, and the arrays that can be optimised, by name."""
-        return self._table, self._tables()
-
-    def _settings(self):
-        return *super()._settings(), self._entries.shapes()
-
-    def _is_constant(self, group):
-        reads_tables = group not in GROUPS
-        return super()._is_constant(group) and not (reads_tables and tables.optimised(self._tables()))
-
-    def traverse(self, cb: mi.TraversalCallback):
-        super().traverse(cb)
-        tables.traverse(cb, self._tables())
-
-    def parameters_changed(self, keys: list[str] = ()):
-        self._entries.accept()
-        super().parameters_changed(keys)
+        return self.tables.table, self.tables.exposed
 
 
 #: Least ``specular`` and ``eta`` of a metal. Where the dielectric Fresnel term is 0, ``principled`` leaves out the

@@ -8,16 +8,15 @@ from functools import cache
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind.arrays.tables import TableError
 from mi_diffind.core import compat
 
 from . import Counterpart, Plugin, warn
+from .path_footprint import SURFACES, skip_emitters
 from .path_footprint import integrator as path_footprint
-from .support import distance_shapes as sdf
 from .support import omissions, properties, tables
 from .support.footprint import Differentials
 from .support.manual import shared_parts
-from .support.placed_fields import FieldLight, PlacedField, VariantLight, grouped, in_order, to_grid
+from .support.placed_fields import FieldLight, PlacedField, VariantLight, join_overlapping, to_grid
 
 #: Properties that the default integrator of surfaces takes.
 INNER = ("max_depth", "rr_depth", "hide_emitters", "jitter")
@@ -160,26 +159,26 @@ class FollowedRays:
 
     ``active`` rays continue; ``handed`` rays have ended where the inner integrator takes over. ``clear`` is the product
     of the transmittances up to the first surface that changed the ray, ``turned`` tells whether one did, and ``count``
-    is the number of smooth surfaces. ``light`` and ``depth`` are sums so far; in the differential phases they are the
-    parts still to come, and ``opacity`` is the total. ``change`` is the derivative of ``light``, ``change_clear`` that
-    of ``clear`` divided by ``clear``, followed by those of the further channels. ``differentials`` are those of the
-    rays, if textures need footprints.
+    is the number of smooth surfaces. The radiance ``L`` and ``depth`` are sums so far; in the differential phases they
+    are the parts still to come, and ``opacity`` is the total. ``δL`` is the derivative of ``L``, ``δclear`` that of
+    ``clear`` divided by ``clear``, followed by those of the further channels. ``differentials`` are those of the rays,
+    if textures need footprints.
     """
 
     ray: mi.Ray3f
     active: mi.Bool
     handed: mi.Bool
-    throughput: mi.Spectrum
+    β: mi.Spectrum
     clear: mi.Float
     turned: mi.Bool
     count: mi.UInt32
-    light: mi.Spectrum
+    L: mi.Spectrum
     opacity: mi.Float
     depth: mi.Float
-    change: mi.Spectrum
-    change_clear: mi.Float
-    change_opacity: mi.Float
-    change_depth: mi.Float
+    δL: mi.Spectrum
+    δclear: mi.Float
+    δopacity: mi.Float
+    δdepth: mi.Float
     differentials: Differentials
 
 
@@ -265,15 +264,15 @@ def integrator() -> type:
                     'parameter "surroundings": true for a field among nested ones, allowed is false, since '
                     "surroundings fill all space"
                 )
-            self.groups = grouped(self.fields)
+            self.groups = join_overlapping(self.fields)
+            self.field_light = FieldLight(self.groups, self.light, self.lit)
             if self.lit and type(self.surfaces) is not path_footprint():
                 raise RuntimeError(
                     f'parameter "lit": the nested integrator {compat.integrator_name(self.surfaces)} does not see '
                     f"fields, allowed are path_footprint and none"
                 )
-            self.field_light = FieldLight(self.groups, self.light) if self.lit else None
             if isinstance(self.surfaces, path_footprint()):
-                self.surfaces.between = self.field_light
+                self.surfaces.between = self.field_light if self.lit else None
             self._hold()
 
         def _hold(self) -> None:
@@ -341,7 +340,7 @@ def integrator() -> type:
             return list(self.aovs)
 
         def report(self) -> dict:
-            voxel = self.placed.field.voxel * self.placed.placement.size
+            voxel = self.placed.field.voxel * self.placed.length
             report = {"voxel": voxel, "surfaces": compat.integrator_name(self.surfaces)}
             if (model := self.model) is None:
                 return report
@@ -425,7 +424,7 @@ def integrator() -> type:
                 *_, state = self.primal(scene, sampler.clone(), ray)
                 for placed in self.groups:
                     placed.start_forward()
-                return developed(*self.replayed(dr.ADMode.Forward, scene, sampler, ray, state, surfaces))
+                return developed(*self.differentiate(dr.ADMode.Forward, scene, sampler, ray, state, surfaces))
 
         def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
             with dr.suspend_grad():
@@ -445,7 +444,7 @@ def integrator() -> type:
                 film.clear()
                 *_, state = self.primal(scene, sampler.clone(), ray)
                 with dr.isolate_grad():  # derivatives come in parts to what a placement is attached to
-                    self.replayed(dr.ADMode.Backward, scene, sampler, ray, state, surfaces, adjoint)
+                    self.differentiate(dr.ADMode.Backward, scene, sampler, ray, state, surfaces, adjoint)
                 dr.eval()
 
         def _surfaces_optimised(self, scene) -> bool:
@@ -482,13 +481,13 @@ def integrator() -> type:
             path = self._start(ray, active)
             sampler, path = self._follow(None, scene, sampler, path, None, carries(ray))
             inner, valid, passed, state = self._surfaces(dr.ADMode.Primal, scene, sampler, ray, path)
-            light = path.light + dr.select(path.handed, path.throughput * inner, 0)
+            light = path.L + dr.select(path.handed, path.β * inner, 0)
             clear = dr.select(path.handed & valid, 0, path.clear * passed)
             aovs = {"depth": path.depth, "opacity": path.opacity}
             state = light, clear, path.depth, path.opacity, state
             return light, 1 - clear, [aovs[name] for name in self.aovs], state
 
-        def replayed(self, mode, scene, sampler, ray, state, surfaces, adjoint=None) -> tuple:
+        def differentiate(self, mode, scene, sampler, ray, state, surfaces, adjoint=None) -> tuple:
             """Run a differential phase.
 
             ``Forward`` returns the derivatives of light, alpha and channels. ``Backward`` propagates the derivatives
@@ -496,31 +495,31 @@ def integrator() -> type:
             """
             light, clear, depth, opacity, inner_state = state
             path = self._start(ray, True)
-            path.light, path.depth, path.opacity = mi.Spectrum(light), mi.Float(depth), mi.Float(opacity)
+            path.L, path.depth, path.opacity = mi.Spectrum(light), mi.Float(depth), mi.Float(opacity)
             if mode == dr.ADMode.Backward:
                 # All transmittances of a ray have the same derivative of alpha by their logarithm
                 aovs = adjoint[2]
-                path.change = mi.Spectrum(adjoint[0])
-                path.change_clear = mi.Float(-adjoint[1] * clear)
-                path.change_opacity = mi.Float(aovs.get("opacity", 0))
-                path.change_depth = mi.Float(aovs.get("depth", 0))
+                path.δL = mi.Spectrum(adjoint[0])
+                path.δclear = mi.Float(-adjoint[1] * clear)
+                path.δopacity = mi.Float(aovs.get("opacity", 0))
+                path.δdepth = mi.Float(aovs.get("depth", 0))
             sampler, path = self._follow(mode, scene, sampler, path, surfaces, carries(ray))
-            change = path.change
+            change = path.δL
             if surfaces and compat.replays_paths(self.surfaces):
                 δ = None
                 if mode == dr.ADMode.Backward:
-                    δ = dr.select(path.handed, path.change * path.throughput, 0)
+                    δ = dr.select(path.handed, path.δL * path.β, 0)
                 inner, *_ = self._surfaces(mode, scene, sampler, ray, path, δ, inner_state)
                 if mode == dr.ADMode.Forward:
-                    change = change + dr.select(path.handed, path.throughput * inner, 0)
-            aovs = {"depth": path.change_depth, "opacity": path.change_opacity}
-            return change, -clear * path.change_clear, [aovs[name] for name in self.aovs]
+                    change = change + dr.select(path.handed, path.β * inner, 0)
+            aovs = {"depth": path.δdepth, "opacity": path.δopacity}
+            return change, -clear * path.δclear, [aovs[name] for name in self.aovs]
 
         def _start(self, ray, active) -> FollowedRays:
             path = dr.zeros(FollowedRays)
             path.ray = mi.Ray3f(dr.detach(ray))
             path.active, path.handed, path.turned = mi.Bool(active), mi.Bool(False), mi.Bool(False)
-            path.throughput, path.clear = mi.Spectrum(1), mi.Float(1)
+            path.β, path.clear = mi.Spectrum(1), mi.Float(1)
             path.differentials = Differentials.from_ray(ray)
             return path
 
@@ -549,155 +548,123 @@ def integrator() -> type:
 
             A ``mode`` of ``None`` is the primal phase. Without smooth surfaces, a single piece is enough.
             """
-            solids = sdf.distance_shapes_in(scene) if getattr(self.surfaces, "traces_solids", False) else ()
+            geometry = self.surfaces.geometry(scene) if isinstance(self.surfaces, path_footprint()) else SURFACES
             if self.smooth_depth == 0 or not has_smooth(scene):
-                return sampler, self._piece(mode, scene, sampler, path, solids, surfaces, False, False)
+                return sampler, self._piece(mode, scene, sampler, path, geometry, surfaces, False, False)
 
             def body(sampler, path):
-                return sampler, self._piece(mode, scene, sampler, path, solids, surfaces, True, carried)
+                return sampler, self._piece(mode, scene, sampler, path, geometry, surfaces, True, carried)
 
             label = "neural_field" if mode is None else f"neural_field ({mode.name})"
             return dr.while_loop(
                 (sampler, path), lambda _, path: path.active, body, max_iterations=self.smooth_depth + 1, label=label
             )
 
-        def _piece(self, mode, scene, sampler, path, solids, surfaces, onward: bool, carried: bool) -> FollowedRays:
+        def _piece(self, mode, scene, sampler, path, geometry, surfaces, onward: bool, carried: bool) -> FollowedRays:
             """Follow a piece of each ray up to a surface and, if ``onward``, across it where it is smooth.
 
             ``carried``: the rays have differentials.
             """
-            ray, active = path.ray, path.active
-            first = path.count == 0
-            entered = [placed.enters(ray, ray.maxt, active) for placed in self.groups]
+            ray, active, first = path.ray, path.active, path.count == 0
+
+            # ---------------------- Next surface ----------------------
+
+            entered = self.field_light.enters(ray, ray.maxt, active)
             met = active
             if not onward and "depth" not in self.aovs:
                 met = mi.Bool(False)
                 for _, crossed in entered:
                     met |= crossed
-            pi, far, solid = self._meet(scene, solids, ray, met, path.turned)
-            through = mi.Float(1)
-            for placed, crossed in in_order(self.groups, entered):
-                through = self._see(mode, path, placed, ray, far, crossed, first, through)
+            pi = scene.ray_intersect_preliminary(ray, coherent=True, active=met)
+            if self.surfaces.hide_emitters:
+                # The inner integrator hides emitters that a camera ray meets first
+                skip_emitters(self, scene, ray, pi, met & ~path.turned)
+            far = dr.minimum(geometry.nearest(ray, pi, met).t, ray.maxt)
+            solid = ~pi.is_valid() & (far < ray.maxt)  # of path_sdf
+
+            # ---------------------- Fields up to the surface ----------------------
+
             if mode is None:
-                distance = dr.select(met & (pi.is_valid() | solid), far, 0)
+                L, through, depth = self.field_light.cross(ray, far, active, entered)
+                depth += through * dr.select(met & (pi.is_valid() | solid), far, 0)
                 path.opacity = dr.select(first, 1 - through, path.opacity)
-                path.depth += dr.select(first, through * distance, 0)
+                path.L, path.depth = path.L + path.β * L, path.depth + dr.select(first, depth, 0)
+            else:
+                δdepth, clear = dr.select(first, path.δdepth, 0), dr.select(first, 1 - path.opacity, 0)
+                change, (L, through, depth) = self.field_light.derive(
+                    mode, ray, far, active, path.δL, path.β, path.L, entered, path.δclear - path.δopacity * clear,
+                    δdepth, path.depth,
+                )  # fmt: skip
+                path.L, path.depth = path.L - path.β * L, path.depth - dr.select(first, depth, 0)
+                path.δL, path.δclear = path.δL + change[0], path.δclear + change[1]
+                path.δopacity -= clear * change[1]
+                path.δdepth += dr.select(first, change[2], 0)
+            path.β, path.clear = path.β * through, path.clear * through
             path.active, path.handed = mi.Bool(False), path.handed | (active & (through > 0))
             if not onward:
                 return path
-            light, passed = path.light, path.throughput
 
-            # Across a smooth surface
+            # ---------------------- Across a smooth surface ----------------------
+
             arrived = active & (through > 0) & ~solid
             flags = compat.ray_flags(curvature=carried)
             si = pi.compute_surface_interaction(ray, ray_flags=flags, active=arrived)
             bsdf = si.bsdf(ray)
-            going = arrived & si.is_valid() & (path.count < self.smooth_depth)
-            going &= is_smooth(bsdf) & ~si.shape.is_medium_transition()
-            shining = mi.Bool(going)
+            active_next = arrived & si.is_valid() & (path.count < self.smooth_depth)
+            active_next &= is_smooth(bsdf) & ~si.shape.is_medium_transition()
+            shining = mi.Bool(active_next)
             if self.surfaces.hide_emitters:
                 # The inner integrator would hide them in mirrors, too
                 emitter = si.emitter(scene, arrived)
-                ended = arrived & path.turned & ~going & (emitter != None)  # noqa: E711  (lane by lane)
+                ended = arrived & path.turned & ~active_next & (emitter != None)  # noqa: E711  (lane by lane)
                 shining |= ended
                 path.handed &= ~ended
             with dr.resume_grad(when=bool(mode is not None and surfaces)):
-                emitted = passed * si.emitter(scene, shining).eval(si, shining)
-                bs, weight = bsdf.sample(
-                    mi.BSDFContext(), si, sampler.next_1d(going), sampler.next_2d(going), going
-                )  # fmt: skip
-            beyond = dr.detach(weight)
-            emitted_now = dr.select(shining, dr.detach(emitted), 0)
-            path.light = light + emitted_now if mode is None else light - emitted_now
+                Le = path.β * si.emitter(scene, shining).eval(si, shining)
+                bs, bsdf_weight = bsdf.sample(
+                    mi.BSDFContext(), si, sampler.next_1d(active_next), sampler.next_2d(active_next), active_next
+                )
+            Le_now = dr.select(shining, dr.detach(Le), 0)
+            path.L = path.L + Le_now if mode is None else path.L - Le_now
             if mode is not None and surfaces:
                 with dr.resume_grad():
-                    both = dr.select(shining, emitted, 0) + dr.select(going, path.light * dr.relative_grad(weight), 0)
+                    Lo = dr.select(shining, Le, 0)
+                    Lo += dr.select(active_next, path.L * dr.relative_grad(bsdf_weight), 0)
                     if mode == dr.ADMode.Backward:
-                        dr.backward_from(path.change * both, dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+                        dr.backward_from(path.δL * Lo, dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
                     else:
-                        path.change += dr.forward_to(both, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+                        path.δL += dr.forward_to(Lo, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+
+            # ---------------------- Next piece ----------------------
+
             bs = dr.detach(bs)
-            turned = going & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
-            out = si.to_world(bs.wo)
-            path.ray = dr.select(going, si.spawn_ray(out), ray)
+            turned = active_next & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+            wo = si.to_world(bs.wo)
+            path.ray = dr.select(active_next, si.spawn_ray(wo), ray)
             if carried:
-                edges = compat.normal_edges(pi, si, ray, going)
+                edges = compat.normal_edges(pi, si, ray, active_next)
                 arriving = path.differentials.at(ray, si)
-                leaving = arriving.bounce(ray, si, out, bs.eta, bs.pdf, mi.Bool(True), mi.Float(1), edges)
-                path.differentials = dr.select(going, leaving, path.differentials)
-            path.throughput = dr.select(going, passed * beyond, passed)
+                leaving = arriving.bounce(ray, si, wo, bs.eta, bs.pdf, mi.Bool(True), mi.Float(1), edges)
+                path.differentials = dr.select(active_next, leaving, path.differentials)
+            path.β = dr.select(active_next, path.β * dr.detach(bsdf_weight), path.β)
             path.clear = dr.select(turned, 0, path.clear)
             path.turned |= turned
-            path.handed &= ~going
-            path.active = going & (dr.max(path.throughput) > 0)
-            path.count = dr.select(going, path.count + 1, path.count)
+            path.handed &= ~active_next
+            path.active = active_next & (dr.max(path.β) > 0)
+            path.count = dr.select(active_next, path.count + 1, path.count)
             return path
-
-        def _meet(self, scene, solids, ray, active, turned) -> tuple:
-            """Return the first hit of rays, its distance (or ``maxt``), and whether it is a solid of ``path_sdf``."""
-            pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-            if self.surfaces.hide_emitters:
-                # The inner integrator hides emitters that a camera ray meets first
-                hidden = active & ~turned & pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711  (lane by lane)
-                at = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, hidden)
-                after = self.skip_area_emitters(scene, at.spawn_ray(ray.d), True, hidden)
-                after.t += at.t
-                pi[hidden] = after
-            far = dr.minimum(pi.t, ray.maxt)
-            if not solids:
-                return pi, far, mi.Bool(False)
-            hit = sdf.intersect(solids, ray.o, ray.d, far, active)
-            pi.t = dr.select(hit.number > 0, dr.inf, pi.t)
-            return pi, hit.t, hit.number > 0
-
-        def _see(self, mode, path, placed, ray, far, crossed, first, before):
-            """Add the light of a field behind a transmittance ``before``; return the transmittance behind the field."""
-            marched, through = placed.march(ray, far, crossed)
-            light = dr.select(crossed, path.throughput * self.light.of(marched.colour, ray.wavelengths, crossed), 0)
-            depth = dr.select(first, before * marched.depth * placed.size, 0)
-            if mode is None:
-                path.light, path.depth = path.light + light, path.depth + depth
-            else:
-                path.light, path.depth = path.light - light, path.depth - depth
-                if placed.optimised():
-                    self._derive(mode, path, placed, ray, far, crossed, first, before, marched, through)
-            path.throughput, path.clear = path.throughput * through, path.clear * through
-            return before * through
-
-        def _derive(self, mode, path, placed, ray, far, crossed, first, before, marched, through) -> None:
-            """Propagate the derivatives of the light that a field adds; ``path`` holds the light behind the field."""
-            inverse = dr.select(through > 0, dr.rcp(through), 0)
-            # The derivative by the logarithm of a transmittance is all that is transmitted
-            behind, clear = dr.select(first, path.depth, 0), dr.select(first, 1 - path.opacity, 0)
-            if mode == dr.ADMode.Backward:
-                d_colour = self.light.adjoint(marched.colour, ray.wavelengths, path.change * path.throughput, crossed)
-                d_through = dr.sum(path.change * path.light) + path.change_clear
-                d_through += path.change_depth * behind - path.change_opacity * clear
-                d_depth = dr.select(first, path.change_depth * before, 0)
-                placed.replay(ray, far, crossed, marched, d_colour, d_through * inverse, d_depth)
-                return
-            colour, transmittance, depth = placed.tangent(ray, far, crossed, marched)
-            seen = self.light.tangent(marched.colour, colour, ray.wavelengths, crossed)
-            share = transmittance * inverse
-            path.change += dr.select(crossed, path.throughput * seen + path.light * share, 0)
-            path.change_clear += share
-            path.change_opacity -= clear * share
-            path.change_depth += dr.select(first, before * depth, 0) + behind * share
 
     return NeuralField
 
 
 def open_model(props: mi.Properties):
-    """Return the model that the properties ``filename`` and ``storage`` name. Raises ``RuntimeError``."""
+    """Return the model that the properties ``filename`` and ``storage`` name."""
     path, storage = properties.filename(props), properties.one_of(props, "storage", ("uint8", "float32"))
     if not path:
         raise RuntimeError('parameter "filename": not given, a file of "mi-diffind fit field" is needed')
     from mi_diffind.tasks.radiance import TASK
 
-    try:
-        return TASK.open(mi.TensorXf, path, storage=storage if storage == "float32" else "")
-    except (TableError, ValueError) as e:
-        raise RuntimeError(str(e)) from None
+    return TASK.open(mi.TensorXf, path, storage=storage if storage == "float32" else "")
 
 
 PLUGIN = Plugin(

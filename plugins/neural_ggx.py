@@ -10,10 +10,10 @@ from mi_diffind.tasks.ggx import TASK
 from mi_diffind.tasks.ggx.model import Roughness
 
 from . import Counterpart, Plugin
-from .support import frozen, properties, tables
-from .support.directions import glossy_directions
+from .support import properties
+from .support.bsdfs import TrackedParameter, glossy_directions, when_outermost
 from .support.manual import shared_parts
-from .support.tracked_parameter import TrackedParameter, when_outermost
+from .support.tables import Tables, arrays_of, frozen_key, open_tables
 
 
 @shared_parts
@@ -107,20 +107,7 @@ class NeuralGGX(mi.BSDF):
 
     {executable}
 
-    .. tabs::
-        .. code-tab:: xml
-            :name: neural_ggx
-
-            <bsdf type="neural_ggx">
-                <string name="material" value="Cu"/>
-                <float name="alpha" value="0.15"/>
-            </bsdf>
-
-        .. code-tab:: python
-
-            'type': 'neural_ggx',
-            'material': 'Cu',
-            'alpha': 0.15
+    {example bsdf neural_ggx: material="Cu", alpha=0.15}
     """
 
     def __init__(self, props: mi.Properties):
@@ -141,13 +128,11 @@ class NeuralGGX(mi.BSDF):
         has_factor = "specular_reflectance" in props
         self.specular_reflectance = props.get_texture("specular_reflectance") if has_factor else None
 
-        opened = tables.open_tables(props, TASK)
-        self.distribution, self.preset, self._table = opened.distribution, opened.table.preset, opened.table
-        self._entries = tables.Entries(self._tables())
+        opened = open_tables(props, TASK)
+        self.distribution, net = opened.distribution, opened.distribution.net
+        self.tables = Tables({"primary": net.primary[0], "cascaded": net.cascaded}, opened.table)
 
-        self._tracked_alpha = TrackedParameter(self.alpha)
-        self._tracked_ior = [TrackedParameter(self.eta, colour=True), TrackedParameter(self.k, colour=True)]
-        self._tracked_factor = TrackedParameter(self.specular_reflectance, colour=True) if has_factor else None
+        self._tracked = {name: TrackedParameter(t, colour=name != "alpha") for name, t in self._textures().items()}
         #: Evaluated terms of a constant roughness.
         self._constant: Roughness | None = None
 
@@ -159,39 +144,26 @@ class NeuralGGX(mi.BSDF):
         when_outermost(self._prepare_constants)
 
     def _textures(self) -> dict[str, mi.Texture]:
-        textures = {"alpha": self.alpha, "eta": self.eta, "k": self.k}
-        if self.specular_reflectance is not None:
-            textures["specular_reflectance"] = self.specular_reflectance
-        return textures
-
-    def _arrays(self) -> dict:
-        net = self.distribution.net
-        return {"primary": net.primary[0], "cascaded": net.cascaded}
-
-    def _tables(self) -> dict:
-        """Return the arrays that are exposed."""
-        return tables.exposed(self._arrays())
+        factor = {} if self.specular_reflectance is None else {"specular_reflectance": self.specular_reflectance}
+        return {"alpha": self.alpha, "eta": self.eta, "k": self.k, **factor}
 
     def trained(self) -> tuple:
         """Return the table of the file, and the arrays that can be optimised, by name."""
-        return self._table, self._tables()
+        return self.tables.table, self.tables.exposed
 
     def traverse(self, cb: mi.TraversalCallback):
         discontinuous = mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous
         for name, texture in self._textures().items():
             flags = mi.ParamFlags.Differentiable if name == "specular_reflectance" else discontinuous
             cb.put(name, texture, flags)
-        tables.traverse(cb, self._tables())
+        self.tables.traverse(cb)
 
     def parameters_changed(self, keys: list[str] = ()):
-        self._entries.accept()
+        self.tables.accept()
         self._prepare_constants()
 
-    def _parameters(self) -> list[TrackedParameter]:
-        return [self._tracked_alpha, *self._tracked_ior, *([self._tracked_factor] if self._tracked_factor else [])]
-
     def _prepare_constants(self) -> None:
-        for parameter in self._parameters():
+        for parameter in self._tracked.values():
             parameter.update()
         self._constant = None
         if self._is_constant():
@@ -200,13 +172,12 @@ class NeuralGGX(mi.BSDF):
                 constant = self.distribution.constant_roughness(alpha)
             dr.make_opaque(constant)
             self._constant = constant
-        known = self._constant is None, self._reflects_all(), self._has_factor(), self._entries.shapes()
-        self.held = [frozen.key(*known), tables.arrays_of([self.distribution, self._constant])]
+        key = frozen_key(self._constant is None, self._reflects_all(), self._has_factor(), self.tables.shapes())
+        self.held = [key, arrays_of([self.distribution, self._constant])]
 
     def _is_constant(self) -> bool:
         """Return whether the roughness is constant, and neither changed nor, like the tables, being optimised."""
-        alpha = self._tracked_alpha
-        return alpha.constant and not (alpha.optimised() or alpha.changed() or tables.optimised(self._tables()))
+        return self._tracked["alpha"].is_fixed() and not self.tables.optimised()
 
     def _roughness(self, si, active) -> Roughness:
         if self._constant is not None and self._is_constant():
@@ -215,11 +186,11 @@ class NeuralGGX(mi.BSDF):
 
     def _reflects_all(self) -> bool:
         """Return whether the index of refraction is 0 + 1i, which reflects all light."""
-        eta, k = (parameter.bounds() for parameter in self._tracked_ior)
-        return eta.is_always(0) and k.is_always(1)
+        return self._tracked["eta"].bounds().is_always(0) and self._tracked["k"].bounds().is_always(1)
 
     def _has_factor(self) -> bool:
-        return self._tracked_factor is not None and not self._tracked_factor.bounds().is_always(1)
+        factor = self._tracked.get("specular_reflectance")
+        return factor is not None and not factor.bounds().is_always(1)
 
     def _value(self, ctx, si, r: Roughness, wi, wo, active):
         """Return f · cos = F D̂ (n·o) / (d(n·i) d(n·o)).
@@ -303,16 +274,16 @@ class NeuralGGX(mi.BSDF):
             left_out["specular_reflectance"] = "is 1" if self.specular_reflectance else "is not given"
         effects = ("distribution", "masking", "fresnel", "specular_reflectance")
         return {
-            **tables.described(self.preset, self._arrays()),
+            **self.tables.report(),
             "effects_in_use": [name for name in effects if name not in left_out],
             "effects_left_out": left_out,
             "evaluated_once": [] if self._constant is None else ["roughness"],
         }
 
     def to_string(self):
-        net = self.distribution.net
         lines = [f"  {name} = {t!s}," for name, t in self._textures().items()]
-        lines.append(f"  preset = {self.preset}, {net.nbytes} bytes as {net.cascaded.storage},")
+        preset, storage, nbytes = self.tables.report().values()
+        lines.append(f"  preset = {preset}, {nbytes} bytes as {storage},")
         return "NeuralGGX[\n" + "\n".join(line.replace("\n", "\n  ") for line in lines) + "\n]"
 
 
@@ -329,17 +300,6 @@ def _masking(r: Roughness, c):
     return c + dr.sqrt(dr.fma(r.alpha2, 1 - c2, c2))
 
 
-class _Children(mi.TraversalCallback):
-    """Callback that collects the parameters and nested objects of a plugin, by name."""
-
-    def __init__(self):
-        super().__init__()
-        self.values = {}
-
-    def put(self, name, value, flags):
-        self.values[name] = value
-
-
 def _index_of_refraction(props: mi.Properties) -> tuple[mi.Texture, mi.Texture]:
     """Return the textures ``eta`` and ``k``, given as properties or by the name of a material, as in Mitsuba."""
     material = str(props.get("material", "none"))
@@ -347,15 +307,19 @@ def _index_of_refraction(props: mi.Properties) -> tuple[mi.Texture, mi.Texture]:
         raise RuntimeError('parameter "material": sets "eta" and "k", give either a material or these')
     if material == "none":
         return props.get_unbounded_texture("eta", 0.0), props.get_unbounded_texture("k", 1.0)
-    children, preset = _Children(), mi.Properties("roughconductor")
-    preset["material"] = material
+    children = {}
+
+    class Children(mi.TraversalCallback):
+        def put(self, name, value, flags):
+            children[name] = value
+
     try:
-        mi.PluginManager.instance().create_object(preset).traverse(children)
+        mi.load_dict({"type": "roughconductor", "material": material}).traverse(Children())
     except RuntimeError as e:
         if "does not exist" not in str(e):
             raise
         raise RuntimeError(f'parameter "material": found "{material}", Mitsuba has no such preset') from None
-    return children.values["eta"], children.values["k"]
+    return children["eta"], children["k"]
 
 
 def _polarised(ctx, eta, k, h, cos, wi, wo):

@@ -80,20 +80,7 @@ class NeuralImage(MapTexture):
 
     {executable}
 
-    .. tabs::
-        .. code-tab:: xml
-            :name: neural_image
-
-            <texture type="neural_image">
-                <string name="filename" value="wall.npz"/>
-                <string name="channels" value="albedo"/>
-            </texture>
-
-        .. code-tab:: python
-
-            'type': 'neural_image',
-            'filename': 'wall.npz',
-            'channels': 'albedo'
+    {example texture neural_image: filename="wall.npz", channels="albedo"}
     """
 
     def _open(self, props: mi.Properties) -> SharedMaps:

@@ -8,23 +8,22 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_diffind.core import compat
-from mi_diffind.core.compat import base_class, normal_mapped
 from mi_diffind.maps.layout import Layout, MapLayout
 from mi_diffind.tasks.disney import TASK as DISNEY
 from mi_diffind.tasks.disney.decoder import Lobe
 from mi_diffind.tasks.disney.model import PARAMETERS, clamp
-from mi_diffind.tasks.shading.material import frame, lobe_of, shadowing
+from mi_diffind.tasks.shading.material import frame, shadowing, specular_lobe
 from mi_diffind.tasks.texture import TASK
 
 from . import Counterpart, Plugin
 from .disney import Disney, Parameters, ShadedPoint, to_principled
 from .support import properties, textures
-from .support.image_files import SharedMaps, layout_of, open_compressed, remove, to_bitmap, to_mipmap
+from .support.bsdfs import TrackedParameter
+from .support.image_files import SharedMaps, file_layout, open_compressed, remove, to_bitmap, to_mipmap
 from .support.manual import shared_parts
 from .support.map_textures import FilteredTexture
 from .support.textures import FILTERS, anisotropic, isotropic
 from .support.textures import PROPERTIES as FILTERING
-from .support.tracked_parameter import FixedParameter
 
 #: Forms of the lobes.
 LOBES = ("exact", "tables")
@@ -134,7 +133,7 @@ class MaterialMaps(FilteredTexture):
             ddx, ddy = self._footprint(si)
             taps = self.filter.taps
             level = isotropic(ddx, ddy) if self.filter.name == "trilinear" else anisotropic(ddx, ddy, taps)[0]
-        return lobe_of(self.image.extra(*self._wrapped_at(uv, self.image.biased(level)), level))
+        return specular_lobe(self.image.extra(*self._wrapped_at(uv, self.image.biased(level)), level))
 
     def is_constant(self, parameter: str) -> bool:
         """Return whether the map of a parameter is one colour or number."""
@@ -243,20 +242,7 @@ class NeuralMaterial(Disney):
 
     {executable}
 
-    .. tabs::
-        .. code-tab:: xml
-            :name: neural_material
-
-            <bsdf type="neural_material">
-                <string name="filename" value="wall.npz"/>
-                <float name="clearcoat" value="0.5"/>
-            </bsdf>
-
-        .. code-tab:: python
-
-            'type': 'neural_material',
-            'filename': 'wall.npz',
-            'clearcoat': 0.5
+    {example bsdf neural_material: filename="wall.npz", clearcoat=0.5}
     """
 
     def _set_up(self, props):
@@ -264,16 +250,10 @@ class NeuralMaterial(Disney):
         if lobes != "exact":
             self.decoder = DISNEY.open(mi.TensorXf, preset=lobes, storage="uint8").decoder
         self.lobes = lobes
-        self.two_sided = props.get("two_sided", False)
-        if not isinstance(self.two_sided, bool):
-            raise RuntimeError(f'parameter "two_sided": found {self.two_sided}, allowed are true and false')
+        self.two_sided = properties.flag(props, "two_sided")
         self.maps = MaterialMaps(props)
         for name in ("base_color", *self.scalars, "subsurface", "specular", "eta"):
-            if (
-                name in props
-                and isinstance(props[name], base_class("Texture"))
-                and not compat.is_constant_texture(props[name])
-            ):
+            if name in props and isinstance(props[name], mi.Texture) and not compat.is_constant_texture(props[name]):
                 raise RuntimeError(f'parameter "{name}": found a texture, allowed are numbers: maps come from the file')
         for name, m in self.maps.maps.items():
             others = {"flatness": ("subsurface",), "specular": ("eta",)}.get(name, ())
@@ -285,8 +265,8 @@ class NeuralMaterial(Disney):
                     )
             if name not in self._tracked:
                 continue
-            constant = self.maps.is_constant(name) and not (name == "base_color" and mi.is_spectral)
-            self._tracked[name] = FixedParameter(self.maps.layout_bounds(m), constant)
+            self._tracked[name] = TrackedParameter(self.maps, known=self.maps.layout_bounds(m))
+            self._tracked[name].constant = self.maps.is_constant(name) and not (name == "base_color" and mi.is_spectral)
             if name == "base_color":
                 self.base_color = None
             elif name == "specular":
@@ -303,8 +283,6 @@ class NeuralMaterial(Disney):
             )
         self._is_anisotropic |= extras or "anisotropic" in self.maps.maps
         sides = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide if self.two_sided else mi.BSDFFlags.FrontSide
-        if "normal" in self.maps.maps:
-            sides = sides | normal_mapped()
         self._set_flags(self.maps.is_spatially_varying(), self._is_anisotropic, sides)
         if "opacity" in self.maps.maps:
             self.m_components = [*self.m_components, mi.BSDFFlags.Null | mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide]
@@ -432,7 +410,7 @@ class MapPoint(ShadedPoint):
 
 def _convert(props: mi.Properties, bsdf: str, texture: str) -> str:
     """Change properties to those of Mitsuba's plugins, nested, and return the name of the outermost one."""
-    maps, _ = material_maps(layout_of(TASK, props), ignored(props))
+    maps, _ = material_maps(file_layout(TASK, props), ignored(props))
     sides = props.get("two_sided", False)
 
     def shown(name: str) -> mi.Texture:

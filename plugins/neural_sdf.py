@@ -8,17 +8,14 @@ import time
 from pathlib import Path
 from weakref import WeakValueDictionary
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_diffind.arrays.tables import TableError
-from mi_diffind.core import compat
 from mi_diffind.core.files import stamp
 from mi_diffind.tasks.sdf import TASK, grids, marching
 
 from . import Counterpart, Plugin, Stock, reports_as, shown_as, warn
-from .support import properties, tables
+from .support import properties
 from .support.distance_shapes import (
     CELL_BYTES,
     SEEN_BY,
@@ -31,7 +28,7 @@ from .support.distance_shapes import (
     to_mesh,
 )
 from .support.manual import shared_parts
-from .support.placement import Placement
+from .support.placement import Placement, similarity
 from .support.properties import Kept, StockNode
 
 #: Models whose arrays cannot be optimised, shared by all shapes of a file.
@@ -49,19 +46,16 @@ TYPICAL_ERROR = 0.005
 
 
 def open_model(props: mi.Properties):
-    """Return the model that the properties ``filename`` and ``storage`` name. Raises ``RuntimeError``."""
+    """Return the model that the properties ``filename`` and ``storage`` name."""
     path, storage = properties.filename(props), properties.one_of(props, "storage", ("uint8", "float32"))
     if not path:
         raise RuntimeError('parameter "filename": not given, a file of "mi-diffind fit sdf" is needed')
+    if storage == "float32":
+        return TASK.open(mi.TensorXf, path, storage=storage)
     key = (path, stamp(Path(path)), mi.TensorXf)
-    try:
-        if storage == "float32":
-            return TASK.open(mi.TensorXf, path, storage=storage)
-        with _lock:
-            model = _shared.get(key)
-            return model if model is not None else _shared.setdefault(key, TASK.open(mi.TensorXf, path))
-    except (TableError, ValueError) as e:
-        raise RuntimeError(str(e)) from None
+    with _lock:
+        model = _shared.get(key)
+        return model if model is not None else _shared.setdefault(key, TASK.open(mi.TensorXf, path))
 
 
 def decode_grid(model, resolution: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict]:
@@ -219,37 +213,14 @@ class NeuralSDF(distance_shape(mi.Mesh)):
             raise RuntimeError('parameter "resolution": has no effect with trace="arrays"')
         props.get("resolution", 0)  # for a grid, if the scene's integrator needs one
         to_world = props.get("to_world", mi.ScalarTransform4f())
-        self._entries = tables.Entries(self.model.entries())
-        super().__init__(props, self.model.field, Placement.of(to_world, self.model.scale, self.model.centre), smooth)
+        super().__init__(props, self.model.field, Placement(to_world, self.model.scale, self.model.centre), smooth)
 
     def entries(self) -> dict:
-        """Return the tensors that can be optimised, by name."""
-        return {name: v if dr.is_tensor_v(v) else v.data for name, v in self.model.entries().items()}
+        return self.model.entries()
 
     def trained(self) -> tuple:
         """Return the table of the file, and the entries that can be optimised, by name."""
         return self.model.table, self.model.entries()
-
-    def optimisable(self) -> bool:
-        return bool(self.entries())
-
-    def attached(self) -> list:
-        return super().attached() + [values for values in self.entries().values() if compat.has_gradient(values)]
-
-    def traverse(self, cb: mi.TraversalCallback) -> None:
-        super().traverse(cb)
-        if self.ready:
-            for name, values in self.entries().items():
-                cb.put(f"tables.{name}", values, mi.ParamFlags.Differentiable)
-
-    def parameters_changed(self, keys=()) -> None:
-        super().parameters_changed(keys)
-        if not self.ready:
-            return
-        self._entries.accept()
-        if not keys or any(key.startswith("tables.") for key in keys):
-            self.model.field.update_bound()
-            self._hold()
 
     def report(self) -> dict:
         return {
@@ -261,7 +232,7 @@ class NeuralSDF(distance_shape(mi.Mesh)):
         }
 
     def to_string(self) -> str:
-        path, size = self.model.table.path, self.placement.size
+        path, size = self.model.table.path, self.placement.length
         return f'NeuralSDF[\n  filename = "{path}",\n  trace = arrays,\n  size = {size:g}\n]'
 
 
@@ -276,7 +247,7 @@ def factory(props: mi.Properties):
     if not isinstance(resolution, int) or ("resolution" in props and not 4 <= resolution <= 512):
         raise RuntimeError(f'parameter "resolution": found {resolution}, allowed are whole numbers from 4 to 512')
     to_world = props.get("to_world", mi.ScalarTransform4f())
-    Placement.of(to_world, model.scale, model.centre)  # raises for an invalid transform
+    similarity(to_world)  # raises for an invalid transform
     normals = properties.one_of(props, "normals", ("smooth", "analytic"))
     try:
         values, lower, upper, report = decode_grid(model, resolution)
@@ -320,7 +291,7 @@ def _from_mesh(node: StockNode) -> str:
         raise Kept(f"has a material with textures ({', '.join(textures)}), distance fields have no texture coordinates")
     node.allow("filename", "shape_index", "face_normals", "flip_normals", "flip_tex_coords", "to_world", "bsdf")
     try:
-        Placement.of(props.get("to_world", mi.ScalarTransform4f()), 1.0, (0, 0, 0))
+        similarity(props.get("to_world", mi.ScalarTransform4f()))
     except RuntimeError as e:
         raise Kept(f"cannot be placed: {e}") from None
     source = closed_mesh_file(node.file(), node.folder, props.get("shape_index", 0))

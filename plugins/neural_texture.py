@@ -9,7 +9,7 @@ import mitsuba as mi
 from mi_diffind.tasks.texture import TASK
 
 from . import Counterpart, Plugin, Stock
-from .support.image_files import SharedMaps, manifest_of, open_compressed, remove, to_bitmap, to_mipmap
+from .support.image_files import SharedMaps, open_compressed, remove, to_bitmap, to_mipmap, write_manifest
 from .support.manual import shared_parts
 from .support.map_textures import FilteredTexture
 from .support.properties import Kept, StockNode
@@ -67,20 +67,7 @@ class NeuralTexture(FilteredTexture):
 
     {executable}
 
-    .. tabs::
-        .. code-tab:: xml
-            :name: neural_texture
-
-            <texture type="neural_texture">
-                <string name="filename" value="wall.npz"/>
-                <string name="channels" value="albedo"/>
-            </texture>
-
-        .. code-tab:: python
-
-            'type': 'neural_texture',
-            'filename': 'wall.npz',
-            'channels': 'albedo'
+    {example texture neural_texture: filename="wall.npz", channels="albedo"}
     """
 
     def _open(self, props: mi.Properties) -> SharedMaps:
@@ -108,7 +95,7 @@ def _from_bitmap(node: StockNode) -> str:
     if str(props.get("filter_type", "bilinear")) not in TYPES:
         raise Kept(f'has the filter_type "{props["filter_type"]}", allowed are {", ".join(TYPES)}')
     normal = any(parent.plugin_name() == "normalmap" for parent in node.parents)
-    source = manifest_of(node.file(), node.folder, props.get("raw", False) is True, normal)
+    source = write_manifest(node.file(), node.folder, props.get("raw", False) is True, normal)
     border = "repeat" if str(props.get("wrap_mode", "repeat")) == "repeat" else "clamp"
     table = node.fit(TASK.name, source, steps=STEPS, border=border)
     if table.measured["psnr_db"] < LEAST_DB:

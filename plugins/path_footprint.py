@@ -100,6 +100,59 @@ class Centred:
         return getattr(self._sampler, name)
 
 
+class Surfaces:
+    """Shapes that Mitsuba intersects, as paths meet them; ``path_sdf`` adds its own (:class:`.distance_shapes.Solids`).
+
+    A ``hit`` is the result of :meth:`nearest`. The derivatives of these shapes are those of constants.
+    """
+
+    #: Shapes that Mitsuba does not see.
+    shapes = ()
+
+    def optimised(self) -> bool:
+        """Return whether derivatives with respect to :attr:`shapes` are enabled."""
+        return False
+
+    def nearest(self, ray, pi, active, rest=0, before=None):
+        """Return the first hit of a ray, given that of Mitsuba's shapes and the hit of the vertex ``before``.
+
+        ``rest`` is the second result of :meth:`spawn`.
+        """
+        return pi
+
+    def interaction(self, ray, hit, flags, active, moving=False):
+        """Return the surface interaction at a hit, attached to its shape and to the vertex before if ``moving``."""
+        return hit.compute_surface_interaction(ray, ray_flags=flags, active=active)
+
+    def occluded(self, hit, si, ds, active):
+        """Return whether one of :attr:`shapes` lies between a vertex and the sample of an emitter."""
+        return mi.Bool(False)
+
+    def spawn(self, hit, si, d) -> tuple:
+        """Return the ray from a vertex in the direction ``d``, and what single precision rounds off its origin."""
+        return si.spawn_ray(d), 0
+
+    def attach_emitter(self, si, ds):
+        """Attach the sample of an emitter to a vertex that moves; return a factor of 1 with the derivative."""
+        return mi.Float(1)
+
+    def attach_direction(self, si, bs, ray, hit, active) -> tuple:
+        """Return the sampled direction, attached to a vertex that moves, and a factor of 1 with the derivative."""
+        return bs.wo, mi.Float(1)
+
+
+SURFACES = Surfaces()
+
+
+def skip_emitters(integrator, scene, ray, pi, active) -> None:
+    """Replace hits ``pi`` of emitters with an area by the hits behind them."""
+    hidden = active & pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711  (lane by lane)
+    at = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, hidden)
+    behind = integrator.skip_area_emitters(scene, at.spawn_ray(ray.d), True, hidden)
+    behind.t += at.t
+    pi[hidden] = behind
+
+
 @cache
 def integrator() -> type:
     """Return the class for the variant that is set; its base class exists only after Mitsuba loaded this file."""
@@ -161,38 +214,9 @@ def integrator() -> type:
                 setattr(ray, f"o_{x}", ray.o + (getattr(ray, f"o_{x}") - ray.o) * scale + start * turn)
                 setattr(ray, f"d_{x}", ray.d + turn)
 
-        # ---------------- What a path meets (path_sdf adds its shapes) ----------------
-
-        def solids(self, scene):
-            """Return the shapes of a scene that rays are traced through, and Mitsuba does not see: none."""
-            return ()
-
-        def nearest(self, solids, ray, pi, active, rest=0, before=None):
-            """Return the hit of a ray: ``pi``, or that of a nearer solid. ``before`` is the hit of the vertex before.
-
-            ``rest`` is what :meth:`spawn` returned with the ray.
-            """
-            return pi
-
-        def interaction(self, solids, ray, hit, flags, active, moving=False):
-            """Return the surface interaction at a hit, attached to solids and to the vertex before if ``moving``."""
-            return hit.compute_surface_interaction(ray, ray_flags=flags, active=active)
-
-        def occluded(self, solids, hit, si, ds, active):
-            """Return whether a solid lies between a vertex and the sample of an emitter."""
-            return mi.Bool(False)
-
-        def spawn(self, solids, hit, si, d) -> tuple:
-            """Return the ray from a vertex in the direction ``d``, and the rest of its origin."""
-            return si.spawn_ray(d), 0
-
-        def attach_emitter(self, si, ds):
-            """Attach the sample of an emitter to a vertex that moves; return a factor of 1 with the derivative."""
-            return mi.Float(1)
-
-        def attach_direction(self, solids, si, bs, ray, hit, active) -> tuple:
-            """Return the sampled direction, attached to a vertex that moves, and a factor of 1 with the derivative."""
-            return bs.wo, mi.Float(1)
+        def geometry(self, scene):
+            """Return the shapes of a scene that paths meet: :class:`Surfaces`, or an object with its methods."""
+            return SURFACES
 
         @compat.syntax
         def sample(self, mode, scene, sampler, ray, δL=None, state_in=None, active=True, **kwargs):
@@ -201,11 +225,11 @@ def integrator() -> type:
             In the differential phases, ``L`` is the radiance that is still to come at the current vertex; it starts as
             the radiance of the whole path (``state_in``).
             """
-            primal, solids, fields = mode == dr.ADMode.Primal, self.solids(scene), self.between
-            solids_move = not primal and any(solid.optimised() for solid in solids)
+            primal, geometry, fields = mode == dr.ADMode.Primal, self.geometry(scene), self.between
+            solids_move = not primal and geometry.optimised()
             fields_move = not primal and fields is not None and fields.optimised()
             unattached = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad  # a field may be all that is optimised
-            carried = bool(getattr(ray, "has_differentials", False)) and not solids
+            carried = bool(getattr(ray, "has_differentials", False)) and not geometry.shapes
             flags = compat.ray_flags(curvature=carried)
             scale = dr.opaque(mi.Float, footprint.sample_scale(sampler.sample_count()))
             bsdf_ctx, mis_weight = mi.BSDFContext(), mi.ad.integrators.common.mis_weight
@@ -228,16 +252,12 @@ def integrator() -> type:
 
             pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
             if dr.hint(self.hide_emitters, mode="scalar"):
-                hidden = active & pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711  (lane by lane)
-                at = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, hidden)
-                behind = self.skip_area_emitters(scene, at.spawn_ray(ray.d), True, hidden)
-                behind.t += at.t
-                pi[hidden] = behind
-            hit = self.nearest(solids, ray, pi, active)
+                skip_emitters(self, scene, ray, pi, active)
+            hit = geometry.nearest(ray, pi, active)
 
             while dr.hint(active, max_iterations=self.max_depth, label=f"{type(self).__name__} ({mode.name})"):
                 with dr.resume_grad(when=solids_move):
-                    moving_si = self.interaction(solids, ray, hit, flags, active, solids_move)
+                    moving_si = geometry.interaction(ray, hit, flags, active, solids_move)
                 if dr.hint(carried, mode="scalar"):
                     differentials = differentials.at(ray, moving_si)
                     moving_si.duv_dx, moving_si.duv_dy = differentials.footprint(ray, moving_si)
@@ -263,15 +283,15 @@ def integrator() -> type:
                 active_em = mi.Bool(active_field)
                 ds, em_weight = scene.sample_emitter_direction(si, sampler.next_2d(), True, active_em)
                 active_em &= ds.pdf != 0
-                active_em &= ~self.occluded(solids, hit, si, ds, active_em)
+                active_em &= ~geometry.occluded(hit, si, ds, active_em)
                 through, ray_em = mi.Float(1), mi.Ray3f(ray)
                 if dr.hint(fields is not None, mode="scalar"):
                     ray_em = si.spawn_ray_to(ds.p)
-                    through = fields.transmittance(ray_em, ray_em.maxt, active_em)
+                    _, through, _ = fields.cross(ray_em, ray_em.maxt, active_em)
                 with dr.resume_grad(when=not primal):
                     J = mi.Float(1)
                     if dr.hint(solids_move, mode="scalar"):
-                        J = self.attach_emitter(moving_si, ds)
+                        J = geometry.attach_emitter(moving_si, ds)
                     if dr.hint(not primal, mode="scalar"):
                         em_value = scene.eval_emitter_direction(moving_si, ds, active_em)
                         em_weight = dr.replace_grad(em_weight, em_value * dr.select(active_em, dr.rcp(ds.pdf), 0)) * J
@@ -288,7 +308,9 @@ def integrator() -> type:
                 # ---------------------- Light from a field ----------------------
 
                 if dr.hint(fields_move, mode="scalar"):
-                    δL += fields.derive(mode, ray_em, ray_em.maxt, active_em, δL, mi.Spectrum(0), dr.detach(Lr_dir))
+                    total = dr.detach(Lr_dir)
+                    change, _ = fields.derive(mode, ray_em, ray_em.maxt, active_em, δL, mi.Spectrum(0), total)
+                    δL += change[0]
                 if dr.hint(fields is not None, mode="scalar"):
                     d, field_pdf = fields.sample(si.p, sampler.next_1d(), sampler.next_2d(), active_field)
                     active_field &= field_pdf > 0
@@ -297,14 +319,15 @@ def integrator() -> type:
                     active_field &= dr.max(dr.detach(bsdf_value)) > 0
                     ray_em = si.spawn_ray(d)
                     far = scene.ray_intersect_preliminary(ray_em, coherent=False, active=active_field).t
-                    Le_field, _ = fields.cross(ray_em, far, active_field)
+                    Le_field, _, _ = fields.cross(ray_em, far, active_field)
                     weight = mis_weight(field_pdf, dr.detach(bsdf_pdf)) * dr.rcp(field_pdf)
                     weight = dr.select(active_field, β * weight, 0)
                     with dr.resume_grad(when=not primal):
                         Lr_dir += dr.select(active_field, weight * bsdf_value * Le_field, 0)
                     if dr.hint(fields_move, mode="scalar"):
                         weight = weight * dr.detach(bsdf_value)
-                        δL += fields.derive(mode, ray_em, far, active_field, δL, weight, weight * Le_field)
+                        change, _ = fields.derive(mode, ray_em, far, active_field, δL, weight, weight * Le_field)
+                        δL += change[0]
                 L = L + Le + Lr_dir if primal else L - dr.detach(Le + Lr_dir)
 
                 # ---------------------- Next vertex ----------------------
@@ -314,7 +337,7 @@ def integrator() -> type:
                     edges = compat.normal_edges(hit, si, ray, active_next)
                     differentials = differentials.bounce(ray, si, wo, bs.eta, bs.pdf, bsdf_delta, scale, edges)
                 valid_ray |= active & si.is_valid() & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
-                ray, rest = self.spawn(solids, hit, si, wo)
+                ray, rest = geometry.spawn(hit, si, wo)
                 β *= dr.detach(bsdf_weight)
                 η *= bs.eta
 
@@ -326,16 +349,15 @@ def integrator() -> type:
                 β[rr_active] *= dr.rcp(rr_prob)
                 active = active_next & (β_max != 0) & (~rr_active | rr_continue)
                 depth[active_next] += 1
-                hit = self.nearest(
-                    solids, ray, scene.ray_intersect_preliminary(ray, coherent=False, active=active), active, rest, hit
-                )
+                pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+                hit = geometry.nearest(ray, pi, active, rest, hit)
 
                 # ---------------------- Differential phases ----------------------
 
                 if dr.hint(not primal, mode="scalar"):
                     wo, J = bs.wo, mi.Float(1)
                     if dr.hint(solids_move, mode="scalar"):
-                        wo, J = self.attach_direction(solids, moving_si, bs, ray, hit, active)
+                        wo, J = geometry.attach_direction(moving_si, bs, ray, hit, active)
                     with dr.resume_grad():
                         # A smooth mirror cannot be evaluated: its weight is differentiated instead
                         rough = bsdf.eval(bsdf_ctx, moving_si, wo, active_next & ~bsdf_delta)
@@ -351,11 +373,11 @@ def integrator() -> type:
                 prev_si, prev_bsdf_pdf, prev_bsdf_delta = si, bs.pdf, bsdf_delta
                 if dr.hint(fields is not None, mode="scalar"):
                     # Weighted against having sampled this direction towards them
-                    Le_field, through = fields.cross(ray, hit.t, active)
+                    Le_field, through, _ = fields.cross(ray, hit.t, active)
                     field_pdf = fields.density(prev_si.p, ray.d, active & ~prev_bsdf_delta)
                     weight = dr.select(active, β * mis_weight(prev_bsdf_pdf, field_pdf), 0)
                     if dr.hint(fields_move, mode="scalar"):
-                        δL += fields.derive(mode, ray, hit.t, active, δL, weight, L)
+                        δL += fields.derive(mode, ray, hit.t, active, δL, weight, L)[0][0]
                     Le_field = dr.select(active, weight * Le_field, 0)
                     L = L + Le_field if primal else L - Le_field
                     clear = dr.select(active & ~valid_ray, clear * through, clear)

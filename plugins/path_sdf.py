@@ -2,13 +2,7 @@
 
 from __future__ import annotations  # Delayed parsing of type annotations
 
-from dataclasses import dataclass
 from functools import cache
-
-import drjit as dr
-import mitsuba as mi
-
-from mi_diffind.core.compat import ray_flags
 
 from . import Plugin, path_footprint
 from .support import distance_shapes as sdf
@@ -73,24 +67,9 @@ supported.
 """
 
 
-@dataclass  # a type that loops of Dr.Jit accept as state
-class SolidHit:
-    """Hit of Mitsuba's shapes ``pi`` or of a distance shape ``solid``; one of them is not valid.
-
-    ``d`` is the direction of the ray; ``previous`` and ``previous_d`` are ``solid`` and ``d`` of the vertex before.
-    """
-
-    pi: mi.PreliminaryIntersection3f
-    solid: sdf.ShapeHit
-    d: mi.Vector3f
-    previous: sdf.ShapeHit
-    previous_d: mi.Vector3f
-
-
 @cache
 def integrator() -> type:
     """Return the integrator's class in the current variant."""
-    jacobian = mi.ad.integrators.common.solid_angle_to_area_jacobian
 
     @shared_parts
     class PathSDF(path_footprint.integrator()):
@@ -99,65 +78,20 @@ def integrator() -> type:
         #: Rays are traced through distance shapes (:mod:`.distance_shapes`).
         traces_solids = True
 
+        #: Rays carry no differentials, since a distance field has none.
+        gives_footprints = False
+
         def to_string(self) -> str:
             return super().to_string().replace("PathFootprint", "PathSDF", 1)
 
         def render_backward(self, scene, params, grad_in, *args, **kwargs):
             """See ``ADIntegrator.render_backward``. Warns of a shape without derivatives."""
             super().render_backward(scene, params, grad_in, *args, **kwargs)
-            sdf.check_derivatives(self.solids(scene), grad_in)
+            sdf.solids_in(scene).check_derivatives(grad_in)
 
-        def solids(self, scene):
-            return sdf.distance_shapes_in(scene)
-
-        def nearest(self, solids, ray, pi, active, rest=0, before=None):
-            if not solids:
-                return pi
-            solid = sdf.intersect(solids, ray.o, ray.d, dr.minimum(pi.t, ray.maxt), active, rest)
-            pi.t = dr.select(solid.number > 0, dr.inf, pi.t)
-            previous = (dr.zeros(sdf.ShapeHit), mi.Vector3f(ray.d)) if before is None else (before.solid, before.d)
-            return SolidHit(pi, solid, mi.Vector3f(ray.d), *previous)
-
-        def interaction(self, solids, ray, hit, flags, active, moving=False):
-            if not solids:
-                return super().interaction(solids, ray, hit, flags, active)
-            with dr.suspend_grad():  # ordinary shapes are constants
-                si = hit.pi.compute_surface_interaction(ray, ray_flags=flags, active=active)
-            si = sdf.interaction(solids, hit.solid, ray, si, active)
-            if moving:
-                # Seen from the vertex before, which also moves
-                aside = sdf.shift(solids, hit.previous, hit.previous_d, active & si.is_valid())
-                turn = aside - ray.d * dr.dot(aside, ray.d)
-                si.wi += dr.detach(si.sh_frame).to_local(turn) * dr.rcp(dr.select(si.is_valid(), si.t, 1))
-            return si
-
-        def occluded(self, solids, hit, si, ds, active):
-            return sdf.occluded_from(solids, hit.solid, si, ds, active) if solids else mi.Bool(False)
-
-        def spawn(self, solids, hit, si, d):
-            ray, rest = super().spawn(solids, hit, si, d)
-            if solids:
-                ray.o, rest = sdf.spawn(solids, hit.solid, si, d)
-            return ray, rest
-
-        def attach_emitter(self, si, ds):
-            # Points of emitters stay fixed, and so do directions to infinite ones
-            flags = ds.emitter.flags()
-            finite = ~mi.has_flag(flags, mi.EmitterFlags.Infinite)
-            distance = dr.norm(ds.p - si.p)
-            ds.d = dr.replace_grad(ds.d, dr.select(finite, (ds.p - si.p) / distance, ds.d))
-            ds.dist = dr.replace_grad(ds.dist, dr.select(finite, distance, ds.dist))
-            surface = mi.has_flag(flags, mi.EmitterFlags.Surface)
-            return dr.select(surface, dr.relative_grad(jacobian(si.p, ds.p, ds.n)), 1)
-
-        def attach_direction(self, solids, si, bs, ray, hit, active):
-            # The next vertex stays fixed, or the direction if there is none
-            target = self.interaction(solids, ray, hit, ray_flags(), active)
-            active = active & target.is_valid()
-            with dr.resume_grad():
-                d = dr.select(active, dr.normalize(target.p - si.p), ray.d)
-                wo = dr.replace_grad(bs.wo, si.to_local(d))
-                return wo, dr.select(active, dr.relative_grad(jacobian(si.p, target.p, target.n)), 1)
+        def geometry(self, scene):
+            solids = sdf.solids_in(scene)
+            return solids if solids.shapes else super().geometry(scene)
 
     return PathSDF
 

@@ -8,6 +8,8 @@ import pytest
 from _pytest.faulthandler import fault_handler_stderr_fd_key
 from variants import BACKENDS, VARIANTS, set_variant
 
+from mi_diffind.core.runtime import array_module
+
 #: Seconds that a test marked ``slow`` or ``long`` may take; others have ``faulthandler_timeout`` of ``pyproject.toml``.
 LONG_LIMIT = 3600
 
@@ -33,6 +35,12 @@ def pytest_collection_modifyitems(items):
         return files.setdefault(item.path, len(files)), order.get(named[0] if named else "", 0)
 
     items.sort(key=place)
+
+
+@pytest.fixture(params=BACKENDS)
+def ad(request):
+    """The Dr.Jit types of a backend with derivatives."""
+    return array_module(request.param)
 
 
 @pytest.fixture(params=[f"{backend}_ad_rgb" for backend in BACKENDS])
@@ -62,7 +70,7 @@ def collect_garbage():
 @pytest.fixture
 def few_samples(monkeypatch):
     """What a training measures of its result in the end is measured at fewer places than for a user."""
-    from mi_diffind.tasks.disney.files import DisneyModel
+    from mi_diffind.tasks.disney.training import DisneyModel
     from mi_diffind.tasks.ggx.training import GGXModel
     from mi_diffind.tasks.image.arrays import CompressedImage
 

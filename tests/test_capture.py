@@ -105,21 +105,6 @@ def test_formats_agree(mi_rgb, scene, tmp_path):
     assert len(np.unique(exr)) > len(np.unique(png))
 
 
-def test_what_is_there_is_kept(mi_rgb, scene, tmp_path, capsys):
-    folder = tmp_path / "views"
-    assert run(scene, folder) == 0
-    images = sorted(folder.glob("*/*.png"))
-    before = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in images}
-    lists = (folder / "transforms_train.json").read_text()
-    images[2].unlink()
-    capsys.readouterr()
-    assert run(scene, folder) == 0
-    assert "6 of 6 views, 1 rendered now" in capsys.readouterr().out
-    assert sorted(folder.glob("*/*.png")) == images and (folder / "transforms_train.json").read_text() == lists
-    assert [p for p in images if p.stat().st_mtime_ns != before[p][1]] == [images[2]]
-    assert images[2].read_bytes() == before[images[2]][0]  # the same view, and the same random numbers
-
-
 def test_other_settings_are_refused(mi_rgb, scene, tmp_path, capsys):
     folder = tmp_path / "views"
     assert run(scene, folder, "--seed", "3") == 0
@@ -143,7 +128,7 @@ def test_other_settings_are_refused(mi_rgb, scene, tmp_path, capsys):
 
 
 def test_an_interrupted_capture_is_gone_on_with(mi_rgb, scene, tmp_path, monkeypatch, capsys):
-    stop, render = threading.Event(), capture.CaptureCamera.render
+    stop, render = threading.Event(), capture.SceneSubject.render
 
     def third(self, *arguments):
         third.calls += 1
@@ -153,15 +138,15 @@ def test_an_interrupted_capture_is_gone_on_with(mi_rgb, scene, tmp_path, monkeyp
 
     third.calls = 0
     with monkeypatch.context() as patch:
-        patch.setattr(capture, "interruptible", lambda: contextlib.nullcontext(stop))
-        patch.setattr(capture.CaptureCamera, "render", third)
+        patch.setattr("mi_diffind.core.jobs.interruptible", lambda: contextlib.nullcontext(stop))
+        patch.setattr(capture.SceneSubject, "render", third)
         assert run(scene, tmp_path / "views") == 130
     assert "3 of 6 views, 3 rendered now" in capsys.readouterr().out
     assert len(load_views(tmp_path / "views")) == 3  # what there is can be used
     with monkeypatch.context() as patch:  # and a failure on the way leaves no half image
 
         def failing(path, image):
-            raise capture.CaptureError("disk")
+            raise capture.SceneError("disk")
 
         patch.setattr(capture, "_write", failing)
         assert run(scene, tmp_path / "views") == 2
@@ -172,7 +157,7 @@ def test_an_interrupted_capture_is_gone_on_with(mi_rgb, scene, tmp_path, monkeyp
 
 
 def test_views_of_other_processes(mi_rgb, scene, tmp_path, monkeypatch, capsys):
-    """The same bytes, also of the lists; a view that fails ends the capture."""
+    """Images and lists are equal to the last byte; a view that fails ends the capture."""
     assert run(scene, tmp_path / "one", "-D", "red=0.5") == run(
         scene, tmp_path / "two", "-D", "red=0.5", "--workers", "1"
     )
@@ -181,7 +166,7 @@ def test_views_of_other_processes(mi_rgb, scene, tmp_path, monkeypatch, capsys):
     for file in files:
         assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes(), file
     (tmp_path / "two" / "train" / "r_000.png").unlink()
-    monkeypatch.setattr(capture, "run_jobs", lambda *_: [Outcome("train/r_000.png", failure="disk full")])
+    monkeypatch.setattr(capture, "run_jobs", lambda *_: (o for o in [Outcome("train/r_000.png", failure="disk full")]))
     assert run(scene, tmp_path / "two", "-D", "red=0.5", "--workers", "1") == 2
     assert "train/r_000.png: disk full" in capsys.readouterr().err
 
@@ -222,8 +207,8 @@ def test_meshes_of_one_material_keep_their_ids(mi_rgb, tmp_path):
     cubes = [cube.format(name, f'<translate x="{x}"/></transform></shape>') for name, x in (("a", -2), ("b", 3))]
     path.write_text(f'<scene version="3.0.0"><bsdf type="diffuse" id="grey"/>{"".join(cubes)}</scene>')
     assert len(loading.load(path).shapes()) == 1
-    assert capture.SceneSubject(path, None).bounds().tolist() == [[-3, -1, -1], [4, 1, 1]]
-    subject = capture.SceneSubject(path, None, ("b",))
+    assert capture.SceneSubject(path, None, capture.CaptureSettings()).bounds().tolist() == [[-3, -1, -1], [4, 1, 1]]
+    subject = capture.SceneSubject(path, None, capture.CaptureSettings(objects=("b",)))
     assert subject.bounds().tolist() == [[2, -1, -1], [4, 1, 1]]
     # As far as their vertices, which is nearer than the corners of a box around both
     assert subject.reach(np.array([3.0, 0, 0])) == pytest.approx(np.sqrt(3))
@@ -276,12 +261,6 @@ def test_what_hides_nothing_is_said(mi_rgb, scene, tmp_path, capsys):
 def test_options_that_are_refused(mi_rgb, scene, tmp_path, capsys, options, message):
     assert run(scene, tmp_path / "views", *options) == 2
     assert message in capsys.readouterr().err and not (tmp_path / "views").exists()
-
-
-def test_a_scene_without_surfaces_is_refused(mi_rgb, scene, tmp_path, capsys):
-    scene.write_text('<scene version="3.0.0"><emitter type="constant"/></scene>')
-    assert run(scene, tmp_path / "views") == 2
-    assert "the scene has no surfaces but lights, there is nothing to capture" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["group", "thin", "glossy"])

@@ -133,25 +133,6 @@ def test_fit(tmp_path, capsys, few_samples):
     assert out.read_bytes() == again.read_bytes()
 
 
-def test_fit_for_some_seconds(tmp_path, capsys, few_samples, monkeypatch):
-    """By a clock of its own: as many steps as there is time for; the file says how many, and how long."""
-    from mi_diffind.fitting import loop
-
-    now = [0.0]
-
-    def tick():
-        now[0] += 1 / 16
-        return now[0]
-
-    monkeypatch.setattr(loop.time, "perf_counter", tick)
-    out = tmp_path / "own.npz"
-    arguments = ["fit", "ggx", "--batch", "512", "--variant", "llvm_ad_rgb", "-o", str(out), "--json"]
-    assert main([*arguments, str(tmp_path / "r.json"), "--seconds", "2"]) == 0
-    settings = load_table(out).settings
-    assert settings["seconds"] == 2 and 8 <= settings["steps"] <= 32
-    assert settings == json.loads((tmp_path / "r.json").read_text())["settings"]
-
-
 def interrupt_at(step, monkeypatch):
     """Ctrl-C in the batch with the number ``step``."""
     from mi_diffind.tasks.ggx.training import GGXProblem
@@ -416,11 +397,6 @@ def test_defines_may_have_any_name(tmp_path):
     """``spp`` is a default of the scenes, and a parameter of functions."""
     small = ["-D", "spp=2", "-D", "width=24", "-D", "height=14"]
     assert main(["compare", str(LAMP), "--out", str(tmp_path), "--passes", "1", *small]) == 0
-
-
-def test_options_for_the_other_kind_of_file(tmp_path, capsys):
-    assert "--measure needs a table file" in refused(capsys, "inspect", scene_file(tmp_path), "--measure")
-    assert "-D needs a scene file" in refused(capsys, "inspect", str(shipped("disney")), "-D", "a=1")
 
 
 @pytest.mark.skipif("cuda" in "".join(BACKENDS), reason="this machine has a GPU")

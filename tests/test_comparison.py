@@ -1,13 +1,16 @@
 """Comparisons of scenes: the noise in an error, the worst place, the truths, and refusals to state a time."""
 
+import json
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
 import mi_diffind
+from mi_diffind.commands import cli
 from mi_diffind.images import metrics
-from mi_diffind.scenes import comparison, loading
+from mi_diffind.scenes import comparison, equal_time, loading
 
 ASSETS = Path(__file__).resolve().parents[1] / "scenes" / "assets"
 
@@ -21,7 +24,7 @@ def halves(rng, mean, shared, deviation, samples):
 @pytest.mark.parametrize("samples", [[32, 32], [48, 16]])
 @pytest.mark.parametrize("bias", [0.0, 0.01])
 def test_noise_of_a_difference(rng, samples, bias):
-    """Of known parts: 0.1 a sample on each side makes sqrt(2/64) 0.1; what both sides share is no error at all."""
+    """Independent noise of 0.1 a sample on each side makes sqrt(2/64) 0.1; shared noise is no error at all."""
     mean = rng.uniform(0.3, 0.6, (80, 60, 3))
     shared = [rng.normal(0, 0.3, mean.shape) for _ in samples]
     written = halves(rng, mean + bias, shared, 0.1, samples)
@@ -104,31 +107,63 @@ def side(seconds, compiled):
 
 
 @pytest.mark.parametrize(
-    "written, compiled, lines",
+    "written, compiled, text",
     [
-        ([9, 1.1, 1.2, 1.3, 1.4, 1.5], [1], [
-            "time        1.30 times that of exact at 8 spp (1 s a pass)",
-            "            median of 5 pairs of passes, quartiles 1.20 to 1.40",
-        ]),
-        ([9, 1.2], [1], [
-            "time        not measured: 1 pair of passes without compilation,",
-            "            3 are needed (--passes)",
-        ]),
-        ([9, 1.2, 1.4, 1.3], [1, 0, 1], [
-            "time        not measured: 2 pairs of passes without compilation,",
-            "            3 are needed (--passes)",
-        ]),
-        ([9, 40, 126, 200], [1], [
-            "time        not measurable here: quartiles 83.00 to 163.00",
-            "            of the ratios of 3 pairs of passes",
-        ]),
+        ([9, 1.1, 1.2, 1.3, 1.4, 1.5], [1], "1.30 times that of exact at 8 spp (1 s a pass)"),
+        ([9, 1.2], [1], "not measured: 1 pair of passes without compilation,"),
+        ([9, 1.2, 1.4, 1.3], [1, 0, 1], "not measured: 2 pairs of passes without compilation,"),
+        ([9, 40, 126, 200], [1], "not measurable here: quartiles 83.00 to 163.00"),
     ],
-)  # fmt: skip
-def test_times_that_say_nothing_are_refused(written, compiled, lines):
+)
+def test_times_that_say_nothing_are_refused(written, compiled, text):
     """Compilation on one side only, too few pairs, and quartiles as wide as their median."""
     count = len(written)
     flags = [bool(i < len(compiled) and compiled[i]) for i in range(count)]
     times = comparison._times(side(written, flags), side([1.0] * count, [False] * count), "exact")
-    assert (times["time_ratio"]["median"] is None) == ("not" in lines[0])
+    assert (times["time_ratio"]["median"] is None) == ("not" in text)
     assert times["seconds_first_pass"] == {"written": 9, "exact": 1.0}
-    assert comparison._time_lines({**times, "against": "exact", "spp": 8}) == lines
+    assert text in comparison._time_lines({**times, "against": "exact", "spp": 8})[0]
+
+
+@pytest.mark.parametrize("bias", [0.0, 0.1])
+def test_parts_of_an_error(rng, bias):
+    """Of known parts: noise of deviation 0.2 a pass, a bias, and a reference that is noisy itself."""
+    mean = rng.uniform(0.2, 2, (90, 80, 3))
+    weight = np.mean(1 / (mean**2 + equal_time.EPSILON))
+    passes = [mean + bias + rng.normal(0, 0.2, mean.shape) for _ in range(4)]
+    halves = [mean + rng.normal(0, 0.05, mean.shape) for _ in range(2)]
+    found = equal_time.errors(passes, halves)
+    assert found["noise"] == pytest.approx(weight * 0.2**2, rel=0.05)
+    assert found["error"] == pytest.approx(weight * (0.2**2 + bias**2), rel=0.05)
+    assert found["bias"] is None if bias == 0 else found["bias"] == pytest.approx(weight * bias**2, rel=0.15)
+    assert found["bias_resolution"] < 0.1 * found["error"] and len(found["errors"]) == 4
+
+
+def test_equal_time(mi_rgb, tmp_path, capsys):
+    """Figures and picture of both truths; the exact scene has the asked samples, no bias and a ratio of one."""
+    path = tmp_path / "scene.xml"
+    path.write_text(TEXTURED.replace("FILE", str(ASSETS / "tiles_filtered.npz")))
+    assert cli.main(["compare", str(path), "--equal-time", "--spp", "4", "--passes", "3",
+                     "--out", str(tmp_path / "out"), "--json", str(tmp_path / "figures.json")]) == 0  # fmt: skip
+    figures = json.loads((tmp_path / "figures.json").read_text())
+    contenders = figures["contenders"]
+    assert list(contenders) == ["as written", "mipmap", "exact"] and figures["reference"] == "exact"
+    exact = contenders["exact"]
+    assert exact["spp"] == 4 and exact["plugins"] == ["disney", "bitmap"] and exact["bias"] is None
+    assert exact["error_ratio"]["median"] == 1 and figures["reference_spp"] == 4 * 3 * equal_time.REFERENCE
+    for c in contenders.values():
+        assert c["spp"] >= 1 and c["error"] > 0 and c["noise"] > 0 and c["seconds"]["median"] > 0
+    out = capsys.readouterr().out
+    assert "of it bias" in out and Path(figures["files"]["figure"]).read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_slow_contender_takes_fewer_samples(mi_rgb, monkeypatch):
+    """Four times the time at equal samples: a quarter of the samples, of those that the sampler allows."""
+    scene = mi.load_dict({"type": "scene", "sensor": {
+        "type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4},
+        "sampler": {"type": "multijitter", "sample_count": 64}}})  # fmt: skip
+    slow, exact = (equal_time._EqualSide(scene, [], spp) for spp in (64, 64))
+    monkeypatch.setattr(slow, "render", lambda seed: (None, 4.0 * slow.spp))
+    monkeypatch.setattr(exact, "render", lambda seed: (None, 1.0 * exact.spp))
+    slow.fill(exact)
+    assert slow.spp == 16 and exact.spp == 64

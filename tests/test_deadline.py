@@ -13,7 +13,7 @@ from mi_diffind.core.progress import Deadline
 from mi_diffind.fitting import loop
 from mi_diffind.fitting.loop import FitSettings, Problem, fit
 from mi_diffind.fitting.task import FitRequest, tasks
-from mi_diffind.maps.arguments import requested_bytes
+from mi_diffind.maps.model import requested_bytes
 from mi_diffind.maps.source import from_arrays
 
 

@@ -235,7 +235,7 @@ def test_integrators_without_a_depth(tmp_path, capsys, integrator, request_, sen
 
 def test_bad_options(tmp_path, capsys):
     file = scene_file(tmp_path, FURNACE)
-    assert "needs --depth auto" in refused(capsys, "render", file, "--depth-tolerance", "0.1")
+    assert "depth_tolerance: given without depth" in refused(capsys, "render", file, "--depth-tolerance", "0.1")
     for option in ("--depth=0", "--depth=-1", "--depth=deep", "--depth=2.5"):
         with pytest.raises(SystemExit) as caught:
             main(["render", file, option])

@@ -277,7 +277,7 @@ def test_nothing_to_save(mi_rgb, tmp_path):
 
 
 def test_a_rendering_is_that_of_mitsuba(mi_rgb, tmp_path):
-    """Of a dictionary, a loaded scene and a file; ``save`` and the picture of a notebook show its image."""
+    """A dictionary and a loaded scene give Mitsuba's image; ``save`` and the picture of a notebook show it."""
     mi = mi_rgb
     content = wall(mi, small(mi))
     loaded = mi_diffind.load_dict(content)
@@ -297,7 +297,7 @@ def test_refused_renderings(mi_rgb, tmp_path):
     scene = mi_diffind.load_dict(wall(mi_rgb, texture()))
     for options, sentence in (
         ({"centre": (0, 0, 0)}, "centre: given without orbit"),
-        ({"depth": 3}, "depth, defines: given with a scene in memory"),
+        ({"depth": 3}, "learn, depth, defines: given with a scene in memory"),
         ({"depth_tolerance": 0.1}, "depth_tolerance: given without depth"),
     ):
         with pytest.raises(UsageError, match=sentence):
@@ -400,7 +400,7 @@ def test_a_table_file_is_no_scene(mi_rgb, capsys):
     with pytest.raises(mi_diffind.DiffindError, match="found a table file, a scene is needed"):
         mi_diffind.render(TILES)
     assert main(["render", str(TILES)]) == 2
-    assert "found a table file, a scene (.xml) is needed" in capsys.readouterr().err
+    assert "found a table file, a scene is needed" in capsys.readouterr().err
 
 
 def test_a_normal_map_of_one_channel():

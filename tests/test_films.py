@@ -121,34 +121,6 @@ def test_h264_has_no_alpha(tmp_path):
         films.write(tmp_path / "film.mp4", [np.zeros((8, 8, 4), np.uint8)])
 
 
-def test_panels_stand_beside_one_another(mi_rgb):
-    from make_films import beside
-
-    red, blue = (np.full((3, 20, 40, 3), colour, np.uint8) for colour in ((200, 0, 0), (0, 0, 200)))
-    blue[2] = 90
-    frames = beside({"left": list(red), "right": list(blue), "below": list(red)}, columns=2, text_height=10, gap=4)
-    assert len(frames) == 3 and all(frame.shape == (2 * (20 + 17), 84, 3) for frame in frames)
-    first = frames[0]
-    assert (first[17:37, :40] == red[0]).all() and (first[17:37, 44:] == blue[0]).all()
-    assert (first[17:37, 40:44] == 255).all() and (first[54:74, 44:] == 255).all()
-    assert (frames[2][17:37, 44:] == 90).all()
-    for label in (first[:17, :40], first[:17, 44:], first[37:54, :40]):
-        assert label.min() < 120  # text
-    assert not (first[:17, :40] == first[37:54, :40]).all()
-
-
-def test_films_that_begin_again(tmp_path):
-    frames = smooth_frames(6, 24, 32)
-    for name in ("film.webp", "film.gif"):
-        films.write(tmp_path / name, frames, seconds=1.2)
-        with Image.open(tmp_path / name) as film:
-            assert film.n_frames == 6 and film.info["loop"] == 0
-            film.seek(4)
-            film.load()
-            assert film.info["duration"] == 200
-            assert np.abs(np.array(film.convert("RGB")).astype(float) - frames[4]).mean() < 8
-
-
 @pytest.mark.parametrize("name", ["film.webp", "film.gif"])
 def test_nothing_stays_of_the_frame_before(tmp_path, name):
     """A square without a corner that moves in front of nothing: each frame is clear but for its own square."""

@@ -6,7 +6,6 @@ import pytest
 from arrays import aligned
 from drjit import nn
 from scipy.ndimage import map_coordinates
-from variants import BACKENDS
 
 from mi_diffind import DifferentiableArray, Indirection, fold
 from mi_diffind.arrays import lookup
@@ -15,11 +14,6 @@ from mi_diffind.arrays.indirection import unfolded
 from mi_diffind.core.runtime import array_module
 
 BELOW_ONE = np.float32(1) - np.float32(2**-23)
-
-
-@pytest.fixture(params=BACKENDS)
-def ad(request):
-    return array_module(request.param)
 
 
 def interpolate(table, x):
@@ -124,12 +118,6 @@ def test_random_is_seeded(ad):
     assert a != b != c != a
 
 
-def test_numpy_integers_are_integers():
-    array = DifferentiableArray(np.int64(4), np.int32(2))
-    assert array.resolution == (4,) and array.channels == 2
-    assert DifferentiableArray(np.array([4, 5])).resolution == (4, 5)
-
-
 def test_half_precision_allocation(ad):
     array = DifferentiableArray((3, 3), 3, "ramp").alloc(ad.TensorXf16)
     assert array.storage == "float16" and array.nbytes == 2 * 27
@@ -139,26 +127,6 @@ def test_half_precision_allocation(ad):
 
 
 # -- one array read with another ---------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("dims", [1, 2, 3, 4])
-def test_ramp_and_grid_are_an_ordinary_lookup(ad, dims):
-    """
-    With a ramp as the primary array, an indirection is the cascaded array read directly: bit by bit where no rounding
-    is possible (dyadic coordinates and positions), to the last digits elsewhere.
-    """
-    rng = np.random.default_rng(dims)
-    grid = rng.integers(0, 256, (*(5, 3, 9, 5)[:dims], 3)).astype(np.float32)
-    primary = DifferentiableArray((9, 5, 5, 3)[:dims], dims, "ramp", fold=True)
-    net = Indirection(primary, DifferentiableArray(grid.shape[:-1], 3, grid)).alloc(ad.TensorXf)
-    # The ramp's last entry is a hair below 1, so its last cell is left out of the exact comparison.
-    last = np.array([(n - 2) / (n - 1) for n in primary.resolution])
-    dyadic = (np.floor(rng.uniform(0, 1, (200, dims)) * last * 64) / 64).astype(np.float32)
-    np.testing.assert_array_equal(read(net, ad, dyadic), read(net.cascaded, ad, dyadic))
-    anywhere = rng.uniform(-0.2, 1.2, (200, dims)).astype(np.float32)
-    np.testing.assert_allclose(read(net, ad, anywhere), interpolate(grid, anywhere), atol=255 * 1e-5)
-    constant = Indirection(primary, DifferentiableArray(grid.shape[:-1], 3)).alloc(ad.TensorXf)
-    np.testing.assert_allclose(read(constant, ad, anywhere), 0.5, rtol=1e-6)
 
 
 @pytest.mark.parametrize("storage", lookup.STORAGES)
@@ -287,20 +255,6 @@ def test_several_primaries(ad, storage):
     np.testing.assert_allclose(read(net, ad, x), expected, rtol=1e-5, atol=5e-4 if storage == "uint8" else 0)
 
 
-@pytest.mark.parametrize("storage", lookup.STORAGES)
-def test_masked_lanes_are_zero(ad, storage):
-    net = pair(ad).to(storage)
-    x = [ad.Float([0.2, 0.4]), ad.Float([0.7, 0.1])]
-    values = net(x, active=ad.Bool([True, False]))
-    assert all(v.numpy()[0] == w.numpy()[0] and v.numpy()[1] == 0 for v, w in zip(values, net(x), strict=True))
-    gradients = []  # of a masked lane, and of a lane that is not there
-    for lanes, active in ((x, ad.Bool([True, False])), ([v[0] for v in x], True)):
-        dr.enable_grad(lanes := [ad.Float(v) for v in lanes])
-        dr.backward(sum(net(lanes, active=active)))
-        gradients.append([v.grad.numpy() for v in lanes])
-    np.testing.assert_allclose(gradients[0], np.pad(gradients[1], ((0, 0), (0, 1))), rtol=1e-6)
-
-
 # -- a coordinate that is known ----------------------------------------------------------------------------------------
 
 
@@ -331,28 +285,6 @@ def test_what_remains_where_a_coordinate_is_known(ad, dims, channels, storage, b
         if border == "clamp":
             position = np.nan_to_num(everywhere)
             np.testing.assert_allclose(values, interpolate(array.numpy(), position), atol=tolerance)
-
-
-def test_what_remains_is_folded(ad):
-    """Entries that need folding, and a single entry along an axis."""
-    array = known(ad, 3, 3, "float32", fold=True)
-    expected = interpolate(
-        triangle(array.data.numpy()[..., :3]), np.column_stack([uniform(3, 50, 2), np.full(50, 0.4)])
-    )
-    np.testing.assert_allclose(read(array.at(ad.Float(0.4)), ad, uniform(3, 50, 2)), expected, atol=2e-6)
-    line = DifferentiableArray.from_numpy(np.arange(12.0).reshape(1, 4, 3), ad.TensorXf)
-    np.testing.assert_allclose(read(line.at(ad.Float(0.5)), ad, uniform(0, 5, 1)), [[4.5, 5.5, 6.5]] * 5)
-    single = DifferentiableArray.from_numpy(np.arange(12.0).reshape(4, 1, 3), ad.TensorXf)
-    for x in (ad.Float(0.5), 0.5):
-        np.testing.assert_array_equal(single.at(x).numpy(), single.numpy()[:, 0])
-
-
-@pytest.mark.parametrize("storage", lookup.STORAGES)
-def test_a_row_of_an_indirection(ad, storage):
-    net = pair(ad).to(storage)
-    row, x = Indirection(net.primary[0].at(ad.Float(0.6)), net.cascaded), uniform(2, 100, 1)
-    expected = read(net, ad, np.column_stack([x, np.full(100, 0.6, np.float32)]))
-    np.testing.assert_allclose(read(row, ad, x), expected, atol=2e-3 if storage == "uint8" else 2e-5)
 
 
 @pytest.mark.parametrize("dims", [2, 3, 4])
@@ -390,15 +322,6 @@ def test_gradients_of_what_remains(ad, dims, border):
         assert gradient[index] == pytest.approx(expected, rel=1e-3, abs=1e-4)
     expected = (number(table, x + 1e-2) - number(table, x - 1e-2)) / 2e-2  # linear within a cell
     assert coordinate.grad.numpy()[0] == pytest.approx(expected, rel=1e-3, abs=1e-3)
-
-
-def test_an_array_of_one_dimension_has_nothing_that_remains(ad):
-    with pytest.raises(ValueError, match="1 dimension"):
-        DifferentiableArray(4).alloc(ad.TensorXf).at(ad.Float(0.5))
-    with pytest.raises(RuntimeError, match="no entries yet"):
-        DifferentiableArray((4, 4)).at(ad.Float(0.5))
-    with pytest.raises(ValueError, match="found 4 numbers"):
-        DifferentiableArray((4, 4)).alloc(ad.TensorXf).at(ad.Float(0, 0.1, 0.2, 0.3))
 
 
 # -- what coordinates can be -------------------------------------------------------------------------------------------
@@ -537,33 +460,6 @@ def test_in_a_loop(ad, storage, mode, as_state):
             mode=mode,
         )
     np.testing.assert_allclose(found.numpy(), expected, rtol=1e-5)
-
-
-@pytest.mark.parametrize("mode", ["symbolic", "evaluated"])
-def test_in_an_indirect_call(ad, mode):
-    """Inside ``dr.switch`` (as in a BSDF that Mitsuba calls), with gradients to both tables and to the inputs."""
-    net = pair(ad)
-    other = net.to("uint8")
-    x = [ad.Float(v) for v in uniform(9, 40, 2).T.copy()]
-    which = dr.arange(ad.UInt, 40) % 2
-
-    def gradients(function):
-        dr.enable_grad(net["primary.0.data"], net["cascaded.data"], *x)
-        dr.backward(function())
-        arrays = (net["primary.0.data"], net["cascaded.data"], *x)
-        result, _ = [a.grad.numpy() for a in arrays], dr.disable_grad(arrays)
-        return result
-
-    calls = [lambda a, b: net([a, b])[1], lambda a, b: other([a, b])[1]]
-    expected = gradients(lambda: dr.select(which == 0, net(x)[1], other(x)[1]))
-    with dr.scoped_set_flag(dr.JitFlag.SymbolicCalls, mode == "symbolic"):
-        np.testing.assert_allclose(
-            dr.switch(which, calls, *x).numpy(), dr.select(which == 0, net(x)[1], other(x)[1]).numpy(), rtol=1e-6
-        )
-        found = gradients(lambda: dr.switch(which, calls, *x))
-    for a, b in zip(found, expected, strict=True):
-        assert b.any()
-        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
 
 
 # -- mistakes ----------------------------------------------------------------------------------------------------------

@@ -62,7 +62,7 @@ def test_lines_hide_internals(mi_rgb):
 
 
 def test_a_file_and_its_scene_in_memory_agree(mi_rgb, tmp_path, capsys):
-    """The same reports of a file, of the loaded scene, and of the command; addresses do not show."""
+    """A file, the loaded scene and the command give equal reports; addresses do not show."""
     material = f"""<bsdf type="twosided"><bsdf type="diffuse" id="paint"><texture name="reflectance"
         type="neural_image"><string name="filename" value="{ASSETS / "tiles.npz"}"/>
         <string name="channels" value="albedo"/></texture></bsdf></bsdf>"""

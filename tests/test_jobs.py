@@ -53,7 +53,7 @@ def test_in_processes(tmp_path):
 
 
 def test_interrupted_here():
-    """What is done stays; what fails for the Ctrl-C has not failed."""
+    """Finished jobs stay; a job that fails because of the Ctrl-C has not failed."""
     assert list(run(worker_jobs.interrupt, {"a": 1, "b": 2, "c": 3})) == ["a", "b"]
     assert list(run(worker_jobs.interrupt, {"a": 1, "b": "word", "c": 3})) == ["a"]
 

@@ -29,14 +29,13 @@ from mi_diffind.core.errors import LONGEST_MESSAGE, UsageError
 from mi_diffind.core.files import PATHS, OutputError
 from mi_diffind.core.units import figure_lines
 from mi_diffind.fitting.loop import checkpoint_settings
-from mi_diffind.fitting.settings import FitSettings, within_memory
-from mi_diffind.images.headers import picture_size
-from mi_diffind.maps.compressed import map_figure
+from mi_diffind.fitting.task import FitSettings, within_memory
+from mi_diffind.images.reader import picture_size
+from mi_diffind.maps.pyramid import map_figure
 from mi_diffind.maps.source import SourceError, from_arrays, load_source
 from mi_diffind.scenes.inspection import Inspection
-from mi_diffind.tasks.radiance import coding, files
+from mi_diffind.tasks.radiance import coding
 from mi_diffind.tasks.radiance.captures import ViewsError, image_file, read_image
-from mi_diffind.tasks.sdf.mesh import MeshError, load_mesh, make_mesh
 
 
 def archive(path, members: dict) -> Path:
@@ -139,35 +138,10 @@ def test_few_lanes_hold_few_symbols():
     """A lane decodes one symbol after the other: many symbols in one lane would take hours."""
     coder = coding.SymbolEncoder()
     context = np.zeros(100, int)
-    coder.code("x", 1, 2, context, lambda: context)
+    coder.code("x", 1, 2, context, context)
     decoder = coding.SymbolDecoder(*coder.finish())
     with pytest.raises(ValueError, match="more symbols than its lanes"):
         decoder.code("x", 1, 2, np.zeros(10**6, int), None)
-
-
-def test_coded_nodes_are_those_of_a_dense_grid(tmp_path, rng):
-    """Places, neighbours and packed flags, against masks of the whole grid."""
-    shape = (37, 18, 45)
-    from mi_diffind.arrays.sparse_grid import cell_corners
-    from mi_diffind.tasks.radiance.nodes import layers
-
-    stored = cell_corners(rng.random(tuple(n - 1 for n in shape)) < 0.02)
-    count = int(stored.sum())
-    numbers = rng.integers(0, 16, count), rng.integers(0, 300, count)
-    places, *again = coding.decode(*coding.encode(stored, *numbers, 16, 300), shape, 16, 300)
-    np.testing.assert_array_equal(places, np.flatnonzero(stored))
-    assert all(np.array_equal(a, b) for a, b in zip(again, numbers, strict=True))
-    with pytest.raises(coding.TooManyNodes, match="at most 100 are accepted"):
-        coding.decode(*coding.encode(stored, *numbers, 16, 300), shape, 16, 300, 100)
-    assert np.array_equal(files._packed(places, stored.size), np.packbits(stored.reshape(-1)))
-    for mask in (stored, np.packbits(stored.reshape(-1))):
-        np.testing.assert_array_equal(np.concatenate([*layers(mask, shape)]), stored)
-    number = np.full(np.array(shape) + 8, -1)
-    number[4:-4, 4:-4, 4:-4][stored] = np.arange(count)
-    place = np.argwhere(stored) + 4
-    for part in coding.passes_of(stored):
-        around = {int(number[tuple(place[part.rows[0]] + np.array(o) - 2)]) for o in np.ndindex(5, 5, 5)}
-        assert set(part.near[0].tolist()) <= around | {-1}
 
 
 def test_sizes_of_pictures(tmp_path, rng):
@@ -183,10 +157,9 @@ def test_sizes_of_pictures(tmp_path, rng):
     mi.Bitmap(values.astype(np.float16)).write(str(tmp_path / "half.exr"))
     for path in tmp_path.iterdir():
         size = picture_size(path)
-        assert (size.width, size.height) == (17, 13), path
+        assert size[:2] == (17, 13), path
         depth = {".ppm": 2, ".exr": 2 if path.stem == "half" else 4, ".hdr": 4, ".pfm": 4}.get(path.suffix, 1)
-        assert size.nbytes == 17 * 13 * 3 * depth, path
-        assert picture_size(path) is not None
+        assert size[2] == 3 * depth, path
     (tmp_path / "cut.png").write_bytes((tmp_path / "x.png").read_bytes()[:20])
     (tmp_path / "text").write_text("no picture")
     assert picture_size(tmp_path / "cut.png") is None and picture_size(tmp_path / "text") is None
@@ -198,7 +171,7 @@ def test_a_picture_of_30000_squared_is_refused_by_its_size(tmp_path):
     content[20:24] = struct.pack(">I", 30000)
     content[29:33] = struct.pack(">I", zlib.crc32(content[12:29]))
     path.write_bytes(content)
-    with pytest.raises(ViewsError, match="30,000 x 30,000 pixels would take 3,600,000,000 bytes"):
+    with pytest.raises(ViewsError, match="30,000 x 30,000 pixels would take 2,700,000,000 bytes"):
         read_image(path)
     with pytest.raises(SourceError, match="30,000 x 30,000 pixels would take 2,700,000,000 bytes"):
         load_source(path)
@@ -261,43 +234,15 @@ def test_files_name_others_in_their_folder(tmp_path, monkeypatch):
         assert load_source(manifest).texels == 16
 
 
-def test_meshes_say_what_is_wrong(tmp_path):
-    corners = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]
-    with pytest.raises(MeshError, match="names vertex -7, there are vertices 0 to 3"):
-        make_mesh(np.array(corners), np.array([(0, 1, 2), (-7, 1, 3)]))
-    with pytest.raises(MeshError, match="names vertex 9, there are vertices 0 to 3"):
-        make_mesh(np.array(corners), np.array([(0, 1, 2), (9, 1, 3)]))
-    (tmp_path / "a.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nend_header\n")
-    with pytest.raises(MeshError, match=r"a\.ply: cannot be read as a mesh, it is damaged or of an unknown format"):
-        load_mesh(tmp_path / "a.ply")
-
-
-def test_readers_that_are_not_installed(tmp_path, monkeypatch):
-    import trimesh
-
-    (tmp_path / "a.3mf").write_bytes(b"")
-    for error, package in (
-        (ImportError("No module named 'lxml'"), "lxml"), (ImportError("missing `pip install pycollada`"), "pycollada"),
-        (ModuleNotFoundError("x", name="openctm"), "openctm"),
-    ):  # fmt: skip
-
-        def missing(*arguments, error=error, **options):
-            raise error
-
-        monkeypatch.setattr(trimesh, "load", missing)
-        with pytest.raises(MeshError, match=rf"\.3mf files need the package {package}, .*: pip install {package}$"):
-            load_mesh(tmp_path / "a.3mf")
-
-
 def test_maps_may_be_called_as_figures(rng):
     """A map's PSNR has a name of its own, whatever the map is called."""
-    from mi_diffind.maps.compressed import CompressedMaps
     from mi_diffind.maps.layout import Layout
+    from mi_diffind.maps.pyramid import CompressedMaps
 
     names = ("mean", "between", "worst", "l0", "map_mean", "albedo")
     source = from_arrays({name: np.full((2, 2, 1), 0.1 * i, np.float32) for i, name in enumerate(names)})
     image = CompressedMaps()
-    image.layout, image.types, image.border = Layout.of(source), None, ("clamp", "clamp")
+    image.layout, image.types, image.border = Layout.from_source(source), None, ("clamp", "clamp")
     image.stored = lambda u, v, active=True: []
     figures = image.measure(source)
     assert len({map_figure(name) for name in names}) == len(names)

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from arrays import aligned
 from scipy.interpolate import RegularGridInterpolator
-from variants import BACKENDS
 
 from mi_diffind import DifferentiableArray
 from mi_diffind.arrays import lookup
@@ -29,11 +28,6 @@ SPECIAL = (
     0.0, -0.0, 1.0, BELOW_ONE, ABOVE_ONE, DENORMAL, -DENORMAL, 1e-38, -1e-38, -1e-9, 0.5, 2.0, -1.0,
     -5.3, 7.25, 1e9, -1e9, 3.4e38, -3.4e38, np.inf, -np.inf, np.nan,
 )  # fmt: skip
-
-
-@pytest.fixture(params=BACKENDS)
-def ad(request):
-    return array_module(request.param)
 
 
 def borders(dims):
@@ -190,18 +184,6 @@ def test_no_bit_pattern_leads_outside_the_table(ad, border, storage):
         assert values.min() >= 2 - 1e-6 and values.max() <= 3 + 1e-6
 
 
-def test_large_tables(ad):
-    """The position inside a table of 512 entries a side still has the resolution that single precision allows."""
-    rng = np.random.default_rng(11)
-    table = entries(rng, (512, 512), 4)
-    x = rng.uniform(0, 1, (5000, 2)).astype(np.float32)
-    values = read(DifferentiableArray.from_numpy(table, ad.TensorXf), ad, x)
-    expected = reference(table, x, ("clamp", "clamp"))
-    # A coordinate of 24 bits times 511: the weight is known to 2^-16, at worst.
-    assert np.abs(values - expected).max() <= 2 * 2.0**-16
-    assert np.sqrt(np.mean((values - expected) ** 2)) <= 1e-5
-
-
 @pytest.mark.parametrize("storage", [*lookup.STORAGES, *range(1, 8)])
 @pytest.mark.parametrize("channels", CHANNELS)
 def test_masked_lanes_are_zero(ad, channels, storage):
@@ -274,14 +256,6 @@ def test_slope_at_the_ends(ad, storage):
         assert min(abs(denormal_slope - slope) for slope in (expected[0], expected[5])) <= tolerance
 
 
-def test_entries_get_the_gradient_of_reads_outside(ad):
-    """Beyond a clamped border, the end entry is what is read and what is trained."""
-    array = DifferentiableArray.from_numpy(np.zeros((3, 1), np.float32), ad.TensorXf)
-    dr.enable_grad(array.data)
-    dr.backward(array(ad.Float([-2.0, np.nan, 1.0, 5.0, np.inf]))[0])
-    np.testing.assert_array_equal(array.data.grad.numpy()[:, 0], [2, 0, 3])
-
-
 # -- storage -----------------------------------------------------------------------------------------------------------
 
 
@@ -336,16 +310,6 @@ def test_entries_are_aligned(storage):
         fresh = DifferentiableArray(size, 3, "ramp").alloc(ad.TensorXf)
         for data in (array.data, fresh.data):
             assert dr.detach(data).numpy().ctypes.data % 64 == 0  # on the CPU, this is the memory itself
-
-
-def test_quantising_a_constant_and_refusing_nan(ad):
-    constant = np.full((3, 3, 2), 0.3, np.float32)
-    array = DifferentiableArray.from_numpy(constant, ad.TensorXf, storage="uint8")
-    np.testing.assert_array_equal(read(array, ad, [[0.2, 0.7]]), np.float32([[0.3, 0.3]]))
-    for bad in (np.nan, np.inf):
-        constant[1, 1, 1] = bad
-        with pytest.raises(ValueError, match="NaN or infinite"):
-            DifferentiableArray.from_numpy(constant, ad.TensorXf, storage="uint8")
 
 
 def kernel_gathers(ad, array) -> int:
@@ -489,13 +453,6 @@ def test_bits_survive_packing(bits, count):
     np.testing.assert_array_equal(unpacked, codes)
     wider = codes | np.uint8(0xFF << bits & 0xFF)  # what lies above is left out
     np.testing.assert_array_equal(pack_bits(wider, bits), packed)
-
-
-def test_numbers_of_more_than_a_byte():
-    numbers = np.array([1000, 3, 2**17 - 1, 2**20 + 5], np.uint32)
-    number = sum((int(n) % 2**17) << (17 * k) for k, n in enumerate(numbers))
-    assert pack_bits(numbers, 17).tobytes() == number.to_bytes(9, "little")
-    assert pack_bits(numbers.astype(np.int64)[::2], 17).tobytes() == pack_bits(numbers[::2], 17).tobytes()
 
 
 def test_words(rng):

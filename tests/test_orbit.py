@@ -7,11 +7,9 @@ import threading
 
 import numpy as np
 import pytest
-from film_files import decoded, needs_ffmpeg
 from PIL import Image
 
 from mi_diffind.commands import cli
-from mi_diffind.images import films
 from mi_diffind.scenes import loading, rendering
 
 SCENE = """
@@ -87,26 +85,6 @@ def test_films_and_strips(mi_rgb, path, tmp_path, capsys):
     assert pixels[24:, : 2 * 32, 3].any() and not pixels[24:, 2 * 32 :].any()
 
 
-@needs_ffmpeg
-def test_an_orbit_as_h264(mi_rgb, path, tmp_path, capsys):
-    """The frames of the decoded film are those of the orbit, in front of black, and each is nearest to its own."""
-    film = tmp_path / "film.mp4"
-    options = ("--orbit", "4", "--spp", "64", "-o", str(film))
-    path.write_text(SCENE.replace('name="width" value="32"', 'name="width" value="31"'))
-    assert cli.main(["render", str(path), *options]) == 0
-    out = capsys.readouterr().out
-    assert "film.mp4: 4 frames of 31 x 24, 64 spp" in out and "even width and height" in out
-    frames = decoded(film)
-    assert frames.shape == (4, 24, 32, 3)
-    expected = rendering.render(path, 64, orbit=4, progress=False).frames
-    shown = np.stack([films.displayed(frame[..., :3]) for frame in expected])
-    errors = np.square(frames[:, None, :, :31].astype(float) - shown[None]).mean(axis=(2, 3, 4))
-    assert (10 * np.log10(255**2 / np.diag(errors)) > 30).all()
-    assert (errors.argmin(axis=1) == np.arange(4)).all()
-    # The empty corner is black, as far as H.264 holds it
-    assert frames[:, 0, 0].max() <= 3
-
-
 def test_an_interrupted_orbit_keeps_its_frames(mi_rgb, path, tmp_path, monkeypatch, capsys):
     stop = threading.Event()
     stop.set()
@@ -122,7 +100,7 @@ def test_what_is_refused(mi_rgb, path, tmp_path, capsys):
         (("--orbit", "3", "-o", str(tmp_path / "film.avi")), "allowed are .exr, .png, .mp4, .webp, .gif"),
         (("-o", str(tmp_path / "film.mp4")), "allowed are .exr and .png"),
         (("-o", str(tmp_path / "film.webp")), "allowed are .exr and .png"),
-        (("--centre", "0", "0", "0"), "--centre needs --orbit"),
+        (("--centre", "0", "0", "0"), "centre: given without orbit"),
     ):
         assert cli.main(["render", str(path), *options]) == 2
         assert message in capsys.readouterr().err

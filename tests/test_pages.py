@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from arrays import aligned
 from scipy.ndimage import map_coordinates
-from variants import BACKENDS
 
 from mi_diffind.arrays.indirection import DifferentiableArray, Indirection, unfolded
 from mi_diffind.arrays.pages import (
@@ -20,19 +19,12 @@ from mi_diffind.arrays.pages import (
     page_shift,
     page_sizes,
 )
-from mi_diffind.arrays.tables import PAGES, TableError, load_table, read_gathers, save_table
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting.task import FitRequest
 from mi_diffind.maps.source import from_arrays
-from mi_diffind.tasks.image import PAGED, PRESETS, STRUCTURES, TASK, fit, replaced, training
-from mi_diffind.tasks.image.arrays import CompressedImage
+from mi_diffind.tasks.image import PAGED, PRESETS, fit, training
 
 SHAPES = {1: (7,), 2: (5, 3), 3: (2, 3, 2)}
-
-
-@pytest.fixture(params=BACKENDS)
-def ad(request):
-    return array_module(request.param)
 
 
 def random_sizes(dims, seed=0):
@@ -150,19 +142,6 @@ def test_masked_lanes_are_zero(ad):
     for form in (array, array.to("uint8")):
         for value in form([ad.Float(0.2, 0.3), ad.Float(0.7, 0.1)], active):
             np.testing.assert_allclose(value.numpy(), [0.5, 0])
-
-
-def test_reads_inside_of_a_loop(ad):
-    """Recorded once, with entries that are folded."""
-    rng, sizes = np.random.default_rng(3), random_sizes(2)
-    array = PagedArray(sizes, 1, rng.uniform(0, 2, (sizes.prod(-1).sum(), 1)), fold=True).alloc(ad.TensorXf)
-    x = places(2, 50, low=0, high=1)
-
-    u, v = (ad.Float(np.ascontiguousarray(c)) for c in x.T)
-    _, found = dr.while_loop(
-        (ad.UInt32(0), dr.zeros(ad.Float, len(x))), lambda i, f: i < 3, lambda i, f: (i + 1, f + array([u, v])[0])
-    )
-    np.testing.assert_allclose(found.numpy(), 3 * read(array, ad, x)[:, 0], atol=1e-5)
 
 
 def test_the_index_is_no_parameter(ad):
@@ -288,14 +267,14 @@ def test_positions_of_entries():
 
 
 def short(structure, steps=30, **changes):
-    recipe = replaced(PRESETS["ours"], steps=steps, batch=4096, measure_every=steps)
+    recipe = dataclasses.replace(PRESETS["ours"], steps=steps, batch=4096, measure_every=steps)
     return dataclasses.replace(recipe, structure=structure, **changes)
 
 
 def trained(ad, recipe, nbytes=1500):
     source = from_arrays({"albedo": np.rint(255 * half_empty()).astype(np.uint8)})
     size = fit.default_size(source, nbytes, recipe)
-    asked = FitRequest("ours", recipe.settings, ad, progress=False)
+    asked = FitRequest("ours", recipe, ad, progress=False)
     return training.fit_image(source, size, recipe, asked)[0]
 
 
@@ -306,49 +285,5 @@ def test_pages_are_chosen_and_win(ad):
     assert paged.nbytes <= 1.01 * dense.nbytes
     assert paged.measured["psnr_db"] > dense.measured["psnr_db"] + 2
     noise = from_arrays({"albedo": np.random.default_rng(0).integers(0, 255, (64, 64, 3)).astype(np.uint8)})
-    assert training.structure_of(noise, short("auto"), 1500) not in PAGED
-    assert training.structure_of(noise, short("auto", components=False), 1500) not in PAGED
-
-
-@pytest.mark.parametrize("structure", PAGED)
-def test_a_file_reads_as_it_was_trained(ad, tmp_path, structure):
-    recipe = short(structure, steps=4)
-    table = trained(ad, recipe)
-    save_table(tmp_path / "t.npz", table)
-    loaded = TASK.load(tmp_path / "t.npz")
-    assert loaded.nbytes == table.nbytes <= 1500
-    fine, coarse = STRUCTURES[structure]
-    width = fine * (3 if coarse is None else recipe.dims - coarse.dims)
-    assert read_gathers(loaded, "primary") == 2 * (2 if width <= 16 else 3 if width < 32 else 4)
-    assert read_gathers(loaded, "primary" + PAGES) == 1
-    image = CompressedImage.of(loaded, ad.TensorXf)
-    assert isinstance(image.net.primary[0], PagedArray) and image.net.nbytes == table.nbytes
-    decoded, source = image.decode()["albedo"], np.rint(255 * half_empty()) / 255
-    assert -10 * math.log10(np.mean((decoded - source) ** 2)) == pytest.approx(table.measured["psnr_db"], abs=0.01)
-    single = CompressedImage.of(loaded, ad.TensorXf, "float32").decode()["albedo"]
-    np.testing.assert_allclose(single, decoded, atol=2e-3)
-
-
-def _in_two_dimensions(primary):
-    entries = primary.entries[: len(primary.entries) // 2 * 2].reshape(-1, 2, primary.shape[-1])
-    return {"entries": entries, "border": ("clamp", "clamp")}
-
-
-#: What is wrong → an array of the file, and what of it is changed.
-DAMAGE = {
-    "a page less": ("primary" + PAGES, lambda pages: {"entries": pages.entries[:, 1:]}),
-    "larger pages": ("primary" + PAGES, lambda pages: {"entries": np.full_like(pages.entries, 31)}),
-    "no sizes": ("primary" + PAGES, lambda pages: {"offset": (0.0, 0.0)}),
-    "two dimensions": ("primary", _in_two_dimensions),
-}
-
-
-@pytest.mark.parametrize("damage", DAMAGE)
-def test_damaged_pages_are_refused(ad, tmp_path, damage):
-    table = trained(ad, short("pages of 5 bits", steps=1))
-    name, change = DAMAGE[damage]
-    table.arrays[name] = dataclasses.replace(table.arrays[name], **change(table.arrays[name]))
-    save_table(tmp_path / "t.npz", table)
-    load_table(tmp_path / "t.npz", "image")
-    with pytest.raises(TableError, match=r"t\.npz: "):
-        TASK.load(tmp_path / "t.npz")
+    assert training.choose_structure(noise, short("auto"), 1500) not in PAGED
+    assert training.choose_structure(noise, short("auto", components=False), 1500) not in PAGED

@@ -6,8 +6,7 @@ import drjit.llvm.ad as T
 import pytest
 
 from mi_diffind.core.errors import UsageError
-from mi_diffind.fitting.settings import FitSettings
-from mi_diffind.fitting.task import FitRequest, tasks
+from mi_diffind.fitting.task import FitRequest, FitSettings, tasks
 from mi_diffind.tasks.radiance import fit as field_fit
 
 

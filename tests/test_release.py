@@ -135,9 +135,9 @@ def test_fetch(server, tmp_path, capsys):
     assert Handler.asked == ["/thing/one.bin", "/thing/two.bin"]
     assert "3 files, 2 fetched" in capsys.readouterr().out and json.loads(report.read_text())["loaded"] == 2
     (folder / "thing" / "two.bin").unlink()
-    assert mi_diffind.fetch("thing", folder).loaded == 1 and Handler.asked[2:] == ["/thing/two.bin"]
+    assert mi_diffind.fetch("thing", folder).figures["loaded"] == 1 and Handler.asked[2:] == ["/thing/two.bin"]
     mirror = mi_diffind.fetch(["thing"], tmp_path / "other", base=f"{server}/")
-    assert mirror.loaded == 2 and below(tmp_path / "other") == below(folder)
+    assert mirror.figures["loaded"] == 2 and below(tmp_path / "other") == below(folder)
 
 
 @pytest.mark.parametrize(

@@ -19,8 +19,7 @@ from mi_diffind.core.compat import use_threads, was_compiled
 from mi_diffind.core.errors import UsageError
 from mi_diffind.core.progress import Deadline
 from mi_diffind.core.runtime import array_module
-from mi_diffind.fitting.settings import FitSettings
-from mi_diffind.fitting.task import FitRequest
+from mi_diffind.fitting.task import FitRequest, FitSettings
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import load_source
 from mi_diffind.plugins.support import footprint
@@ -35,7 +34,7 @@ from mi_diffind.scenes.training.options import (
     recipe_from,
     views_from,
 )
-from mi_diffind.scenes.training.problem import SceneProblem, exposure_of
+from mi_diffind.scenes.training.problem import SceneProblem, estimate_exposure
 from mi_diffind.scenes.training.references import ReferenceRenders
 from mi_diffind.scenes.training.rig import Rig
 from mi_diffind.scenes.training.trained_scene import (
@@ -50,7 +49,7 @@ from mi_diffind.scenes.training.trained_scene import (
 from mi_diffind.tasks.texture import PRESETS
 from mi_diffind.tasks.texture.arrays import PaperBudget, TextureBudget, parse_structure
 from mi_diffind.tasks.texture.compressed import CompressedTexture, load, to_table
-from mi_diffind.tasks.texture.training import layout_of, problem_of, rounded, stored_form
+from mi_diffind.tasks.texture.fit import build_problem, rounded, source_layout, stored_form
 
 NAMES = ("albedo", "roughness")
 ORBIT = ViewDistribution(
@@ -160,20 +159,6 @@ def test_arguments():
     assert views_from(parsed("--origins", "0,0,0:1,1,1")).origins == ((0, 0, 0), (1, 1, 1))
 
 
-@pytest.mark.parametrize(
-    ("words", "match"),
-    [
-        (("--azimuth", "1:2:3"), "'1:2:3', expected LOW:HIGH"), (("--up", "0,1"), "'0,1', expected X,Y,Z"),
-        (("--origins", "0,1,2"), "'0,1,2', expected two corners"), (("--bound", "0"), "found '0', allowed are"),
-        (("--distance", "nan"), "expected LOW:HIGH"), (("--bound", "much"), "found 'much', allowed are"),
-    ],
-)  # fmt: skip
-def test_bad_arguments(words, match, capsys):
-    with pytest.raises(SystemExit):
-        parsed(*words)
-    assert match in capsys.readouterr().err
-
-
 LIGHTS = {
     "sun": {"type": "directional", "direction": [0.3, 0.5, -1]},
     "lamp": {"type": "point", "position": [1, 0, 1]},
@@ -250,7 +235,7 @@ def tilted(tmp_path):
 
 
 def test_area_lights_are_where_a_view_has_them(tilted):
-    """As images of a scene that is written so, by Mitsuba's own rotations; no kernel depends on the place."""
+    """Images equal those of a scene that is written so, by Mitsuba's own rotations; no kernel depends on the place."""
     t = mi.ScalarTransform4f
     film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
     sensor = {"type": "perspective", "to_world": t().look_at([0, -4, 4], [0, 0, 0], [0, 0, 1]), "film": film}
@@ -384,7 +369,7 @@ def test_references_are_rendered_once(path, tmp_path, passes):
 
 
 def test_references_of_other_processes(path, tmp_path, passes):
-    """The same images, rendered elsewhere, and kept in the same files."""
+    """Workers render equal images and keep them in the same files."""
     views = ORBIT.trained()[:3]
     alone = references_of(path, ORBIT, 10, pass_samples=FOUR).images(views)
     seeds = list(passes.seeds)
@@ -461,12 +446,16 @@ def test_renders_that_fit_into_a_limited_time(monkeypatch, seconds, compiling, k
 
     def profiled(work):
         start = clock.now
-        return work(), clock.now - start, [{}, {"backend_time": 1e3 * compiling, "operation_count": 20_000}]
+        return (
+            work(),
+            clock.now - start,
+            [{}, {"backend_time": 1e3 * compiling, "operation_count": 20_000, "cache_hit": known}],
+        )
 
     monkeypatch.setattr("mi_diffind.scenes.training.fit.profiled", profiled)
     problem = Timed(clock)
     request = FitRequest("ours", problem.recipe.settings, None, deadline=Deadline(seconds))
-    sentence, figures = limit(problem, request, known)
+    sentence, figures = limit(problem, request)
     assert figures == {"psnr_db": 20.0}
     assert sentence.startswith("no step through renders: " + remark if remark else remark)
     assert bool(sentence) == bool(remark) == (problem.recipe.share == 0)
@@ -581,10 +570,12 @@ def test_the_scene_reads_what_it_is_given(path, trained):
 
 def test_no_other_scene_reads_the_same_arrays(path, trained):
     scene, problem = trained
-    other = loading.load(path, change=lambda state: [
+    parsed = loading.ParsedScene(path)
+    parsed.change(lambda state: [
         props.__setitem__("storage", "float32") for props in loading.compat.parsed_properties(state)
         if props.plugin_name() == "neural_texture"
     ])  # fmt: skip
+    other = parsed.load(needs=())
     key = next(key for key in mi.traverse(other).keys() if key.endswith("tables.coarse"))
     before = mi.traverse(other)[key].numpy()
     scene.hold(problem.net.changed(lambda array, bits: array.unfolded(lambda entries: 0.5 * entries)))
@@ -614,24 +605,11 @@ def weights(one_core):
     return mi.TensorXf(np.random.default_rng(0).random((24, 24, 3), dtype=np.float32))
 
 
-def test_small_films_are_rendered_with_more_samples(trained, monkeypatch):
-    """A step draws as many samples as the recipe says, for values and derivatives alike; the footprints stay."""
-    (scene, texture), given = trained, []
-    black = np.zeros((24, 24, 3), np.float32)
-    monkeypatch.setattr(mi, "render", lambda *_, **options: given.append(options) or mi.TensorXf(black))
-    for samples, spp in ((1, 1), (576, 1), (577, 2), (2**15, 57)):
-        problem = SceneProblem(texture, scene, [(View(), black)], [], SceneRecipe(samples=samples))
-        problem.settings = problem.recipe.settings
-        problem.image_loss(problem.net, dr.rng(seed=0))
-        options = given.pop()
-        assert (options["spp"], options["spp_grad"], scene.spp) == (spp, spp, 1)
-
-
 def test_values_and_derivatives_have_their_own_samples(trained, weights):
     scene, problem = trained
     scene.place(View())
     (bsdf,) = (made for made in loading.instances(scene.scene) if hasattr(made, "decoder"))
-    tables = {name: array.codes() for name, array in bsdf._arrays().items()}
+    tables = {name: array.codes() for name, array in bsdf.tables.arrays.items()}
     (a, da), (b, db), (c, dc) = (
         rendered(scene, inside(problem.net), weights, *seeds) for seeds in ((1, 2), (1, 3), (5, 2))
     )
@@ -641,13 +619,13 @@ def test_values_and_derivatives_have_their_own_samples(trained, weights):
         np.testing.assert_array_equal(gradient, dc[name])
         assert np.abs(gradient - db[name]).max() > 1e-3 * np.abs(gradient).max()
     # The tables of the BRDF are bytes, which no derivative reaches
-    for name, array in bsdf._arrays().items():
+    for name, array in bsdf.tables.arrays.items():
         np.testing.assert_array_equal(array.codes(), tables[name])
     assert not [key for key in mi.traverse(bsdf).keys() if key.startswith("tables.")]
 
 
 def test_a_material_is_trained_as_its_maps_are(folder, path, trained, weights):
-    """The same images and gradients from one plugin that reads all maps."""
+    """One plugin that reads all maps gives the images and gradients of a plugin for each map."""
     text = re.sub(
         "<bsdf .*</bsdf>", '<bsdf type="neural_material"><string name="filename" value="material.npz"/><string '
         'name="lobes" value="tables"/></bsdf>', path.read_text(encoding="utf-8"),
@@ -835,21 +813,21 @@ def test_errors_of_pixels():
 
 def test_exposure():
     image = np.linspace(0, 2, 100, dtype=np.float32).reshape(10, 10, 1) * np.float32([1, 0.5, 0.2])
-    assert exposure_of([image]) == pytest.approx(1 / 1.9, rel=0.02)
-    assert exposure_of([np.zeros((2, 2, 3))]) == 1
+    assert estimate_exposure([image]) == pytest.approx(1 / 1.9, rel=0.02)
+    assert estimate_exposure([np.zeros((2, 2, 3))]) == 1
 
 
 @pytest.mark.parametrize("preset", ["ours", "paper"])
 def test_arrays_of_the_same_size(folder, preset, tmp_path):
     """A file says all that is needed to begin anew."""
     source, recipe = load_source(folder / "material.json"), PRESETS[preset]
-    layout = layout_of(source, recipe)
+    layout = source_layout(source, recipe)
     wanted = PaperBudget(16, 24, 4, 5, layout.stored)
     if preset == "ours":
         wanted = TextureBudget(32, 32, layout.stored, parse_structure("0:2:4,1:3:6"), 2, 3, 6, 3)
-    pyramid = Pyramid.of(source, layout, array_module("llvm"))
-    net = problem_of(source, wanted, recipe, pyramid).net
-    own = {k: v for k, v in dataclasses.asdict(recipe).items() if k != "settings"}
+    pyramid = Pyramid.from_source(source, layout, array_module("llvm"))
+    net = build_problem(source, wanted, recipe, pyramid).net
+    own = recipe.further
     table = to_table(CompressedTexture(layout, stored_form(net)), {**own, "loss": "mae"})  # a render's
     save_table(tmp_path / "x.npz", table)
     table = load(tmp_path / "x.npz")

@@ -21,7 +21,7 @@ from mi_diffind.arrays.lookup import STORAGES
 from mi_diffind.arrays.tables import Table
 from mi_diffind.core import discovery
 from mi_diffind.core.arguments import Argument
-from mi_diffind.core.errors import UsageError, reason
+from mi_diffind.core.errors import UsageError
 from mi_diffind.core.progress import Deadline
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting import task as task_module
@@ -35,7 +35,7 @@ BUILT_IN = ("bsdf", "disney", "field", "ggx", "image", "scene", "sdf", "shading"
 # -- what is found ----------------------------------------------------------------------------------------------------
 
 LINE = """
-from mi_diffind.fitting.settings import FitSettings
+from mi_diffind.fitting.task import FitSettings
 from mi_diffind.fitting.task import Task
 
 class Line(Task):
@@ -125,22 +125,6 @@ def test_a_name_that_is_taken(install):
     with pytest.warns(RuntimeWarning) as caught:
         assert tuple(tasks()) == (*BUILT_IN, "line")
     assert sum("is left out: mi_diffind.tasks has" in str(w.message) for w in caught) == 2
-
-
-def test_a_declared_name_that_is_taken(install):
-    """Also where the folder of this package's own task has another name."""
-    install({"field": "their_field"}, their_field=LINE.replace('"line"', '"field"'))
-    with pytest.warns(RuntimeWarning, match=r'^"field" \(their_field\) is left out: mi_diffind\.tasks has one'):
-        assert tuple(tasks()) == BUILT_IN and tasks()["field"].title == "a radiance field, from images of a scene"
-
-
-def test_the_same_entry_point_twice_is_no_conflict(install):
-    """As of a package that is on the path twice, installed and as a checkout."""
-    for _ in range(2):
-        install({"line": "their_line"}, their_line=LINE)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert tuple(tasks()) == (*BUILT_IN, "line")
 
 
 LIGHT = """
@@ -316,17 +300,6 @@ def test_models_of_any_task(line, tmp_path):
         load_model(path, dtype)
 
 
-def test_tables_that_ship_with_others(line, tmp_path):
-    """Anywhere: the path is that of their package."""
-    path = tmp_path / "line.npz"
-    save_table(path, run(preset="short").table)
-    line.shipped = {"short": str(path)}
-    assert line.file() == line.file(preset="short") == path
-    assert line.open(array_module("llvm").TensorXf).table.preset == "short"
-    with pytest.raises(ValueError, match='parameter "preset": found "default", allowed are short'):
-        line.file(preset="default")
-
-
 @pytest.mark.parametrize("method", ["measure", "decode"])
 def test_what_a_model_leaves_out_is_refused(method, tmp_path):
     table = Table("line", {"a": StoredArray(np.zeros((2, 1), np.float32))}, path=tmp_path / "line.npz")
@@ -393,14 +366,6 @@ def test_all_errors_have_one_base_class():
     # No errors, but how a loop is left, what keeps a plugin as it is, and what a decoder tells the reader that calls it
     signals = {"Stopped", "Kept", "TooManyNodes", "BudgetError"}
     assert [name for name in classes if not derives(name) and name not in signals] == []
-
-
-def test_reasons_are_one_line():
-    assert reason(ValueError("a\n  b\tc")) == "a b c"
-    assert reason(KeyError()) == "KeyError" and reason(ValueError("x " * 300)).endswith("…")
-    assert len(reason(ValueError("x " * 300))) <= 100
-    long = "/tmp/" + "a" * 200
-    assert reason(ValueError(f"{long}: no space left"), **{"b.npz": long}) == "b.npz: no space left"
 
 
 def test_what_can_be_asked_of_the_package():

@@ -9,7 +9,7 @@ from mi_diffind.core import units
 from mi_diffind.core.errors import UsageError
 from mi_diffind.core.units import parse_size
 from mi_diffind.tasks.image import arrays
-from mi_diffind.tasks.image.arrays import ImageBudget, fit_bytes, paper_search, search
+from mi_diffind.tasks.image.arrays import ImageBudget, fit_bytes, search
 
 IMAGES = [(1, 1), (1, 4096), (4096, 1), (7, 5), (64, 64), (100, 100), (333, 1000), (1024, 1024), (4096, 4096)]
 
@@ -52,20 +52,15 @@ def test_search_is_the_papers(side, channels, compression, ratio):
         primary = min(round(ratio * cascaded / 8) * 8, side)
         candidates.append((cascaded, primary, 4 * primary**2 + channels * cascaded**4))
     cascaded, primary, nbytes = min(candidates, key=lambda c: abs(compression - uncompressed / c[2]))
-    size = paper_search(uncompressed, compression, channels, side, side, ratio)
-    assert size == ImageBudget(primary, primary, cascaded, channels)
-    assert size.nbytes == nbytes
-    if ratio == arrays.resolution_ratio(compression, side):
-        corrected = search(uncompressed, compression, channels, side, side)
-        assert corrected.cascaded == cascaded
-        assert uncompressed / corrected.nbytes == pytest.approx(compression, rel=0.05)
-        assert corrected == size or abs(uncompressed / size.nbytes / compression - 1) > 0.04
+    size = search(uncompressed, compression, channels, side, side, ratio=ratio)
+    assert size.cascaded == cascaded and uncompressed / size.nbytes == pytest.approx(compression, rel=0.05)
+    if size.nbytes == nbytes:
+        assert size == ImageBudget(primary, primary, cascaded, channels)
+    else:  # more than 5% off: the primary is resized
+        assert abs(uncompressed / nbytes / compression - 1) > 0.04
 
 
 def test_search_at_4k():
-    size = paper_search(4096**2 * 3, 12, 3, 4096, 4096, 80)
-    assert (size.rows, size.columns, size.cascaded, size.ratio) == (960, 960, 12, 80)
-    assert 4096**2 * 3 / size.nbytes == pytest.approx(13.43, abs=0.01)  # the nearest in such steps
     size = search(4096**2 * 3, 12, 3, 4096, 4096)
     assert (size.rows, size.cascaded) == (1016, 12) and size.ratio == pytest.approx(80, rel=0.06)
     assert 4096**2 * 3 / size.nbytes == pytest.approx(12, rel=0.005)
@@ -80,9 +75,9 @@ def test_side_of_the_cascaded_array():
 
 
 def test_search_keeps_the_proportions():
-    square = paper_search(2048**2 * 3, 6, 3, 2048, 2048, 64)
-    wide = paper_search(2048**2 * 3, 6, 3, 1024, 4096, 64)
-    tall = paper_search(2048**2 * 3, 6, 3, 4096, 1024, 64)
+    square = search(2048**2 * 3, 6, 3, 2048, 2048, ratio=64)
+    wide = search(2048**2 * 3, 6, 3, 1024, 4096, ratio=64)
+    tall = search(2048**2 * 3, 6, 3, 4096, 1024, ratio=64)
     assert (wide.rows, wide.columns) == (tall.columns, tall.rows)
     assert wide.columns / wide.rows == pytest.approx(4, rel=0.01)
     assert wide.nbytes == pytest.approx(square.nbytes, rel=0.01)
@@ -172,7 +167,7 @@ def test_a_size_is_asked_for_in_one_way():
 
 
 def test_more_than_fits_is_refused(monkeypatch):
-    """What fits exactly is allowed, one byte more is not."""
+    """A size that fits exactly is allowed, one byte more is not."""
     assert 2**28 < units.memory() < 2**45
     monkeypatch.setattr(units, "memory", lambda: 3 * 2**30)
     units.check_memory("batch", 10, 3 * 2**30)

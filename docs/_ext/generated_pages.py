@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import argparse
 import base64
-import functools
 import importlib
-import importlib.util
 import json
 import os
 import re
@@ -31,7 +29,6 @@ HEADINGS = {
     "bsdf": "BSDFs",
     "texture": "Textures",
     "shape": "Shapes",
-    "volume": "Volumes",
     "integrator": "Integrators",
 }
 
@@ -124,14 +121,6 @@ def _picture(name: str) -> str:
     return f"/pictures/{name}.jpg" if (DOCS / "pictures" / f"{name}.jpg").is_file() else ""
 
 
-@functools.cache
-def _captions() -> dict[str, str]:
-    """Return what the pictures of plugins show."""
-    specification = importlib.util.spec_from_file_location("make_plugin_pictures", DOCS / "make_plugin_pictures.py")
-    specification.loader.exec_module(module := importlib.util.module_from_spec(specification))
-    return module.CAPTIONS
-
-
 def _title(page: str) -> str:
     """Return the heading of a manual page without the plugin's name."""
     return re.search(r"^(.+) \(:monosp:`\w+`\)$", page, re.MULTILINE)[1]
@@ -152,7 +141,9 @@ def _with_picture(page: str, plugin) -> str:
         facts["Seen by"] = f"{seen}; with ``{plugin.otherwise[0]}`` ``{plugin.otherwise[1]}`` by any integrator"
     lines = [f":{name}: {text}" for name, text in facts.items()]
     if _picture(plugin.name):
-        caption = _captions().get(plugin.name, "")
+        from make_plugin_pictures import CAPTIONS
+
+        caption = CAPTIONS.get(plugin.name, "")
         command = f"``python docs/make_plugin_pictures.py {plugin.name}``"
         lines += ["", f".. figure:: {_picture(plugin.name)}", f"   :alt: A render of {plugin.name}"]
         lines += ["   :class: plugin-picture", "", f"   {caption} Made by {command}."]

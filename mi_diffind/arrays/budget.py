@@ -85,6 +85,23 @@ class Budget:
 
         return min((size, *following), key=difference)
 
+    def paper_side(
+        self, family: Callable[[int], Member], cells: int, dims: int, source_bytes: float, step: int = 4
+    ) -> tuple[int, bool]:
+        """Return the side of the paper's cascaded array for this budget, and whether its member meets the request.
+
+        The search (supplement, section 1.3) is :meth:`nearest` over the sides in multiples of ``step``; the array has
+        ``cells`` · side^``dims`` bytes. If the request is not met, the side is reduced until it takes at most half of
+        the budget, so that the primary array can be resized beside it.
+        """
+        most = int((self.nbytes / cells) ** (1 / dims)) + 2 * step  # takes more than all bytes
+        side = self.nearest(family, range(step, most + 1, step), source_bytes)
+        if met := self.is_met(_nbytes(family(side))):
+            return side, met
+        while side > step and cells * side**dims > self.nbytes / 2:
+            side -= step
+        return side, met
+
     def approach(
         self, make: Callable[[float], Member], first: float, following: Callable[[float, Member], float],
         attempts: int = 8,

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..core.arguments import WORKER_ARGUMENTS, add_arguments
-from ..core.files import writable_folder
-from .common import natural, positive, require_scene, say, scene_options, set_variant, verb
+from ..core.files import check_scene_file, writable_folder
+from .common import natural, positive, say, scene_options, set_variant, verb
 
 HELP = "render views of a scene, or of 3D Gaussians, from all sides, with their poses"
 
@@ -16,7 +16,7 @@ EXAMPLE = "mi-diffind capture scene.xml -o views --objects statue --views 60"
 def add(commands) -> None:
     """Add the verb and its options to ``commands``, the subparsers of the command line."""
     sub = verb(commands, "capture", run, HELP, EXAMPLE, reads=("scene",))
-    sub.add_argument("scene", metavar="SCENE.xml", help="scene file, or 3D Gaussians: SPLATS.ply, SPLATS.sog")
+    sub.add_argument("scene", metavar="SCENE.xml", help="scene file, or 3D Gaussians: SPLATS.ply")
     sub.add_argument(
         "-o", "--output", required=True, metavar="FOLDER", help="folder of the views; an unfinished one is completed"
     )
@@ -63,7 +63,7 @@ def run(arguments) -> dict:
     After Ctrl-C, the result lists the views that exist. Raises :class:`UsageError`, and as
     :mod:`mi_diffind.scenes.capture` does.
     """
-    require_scene(arguments.scene)
+    check_scene_file(arguments.scene)
     writable_folder(Path(arguments.output).parent)
     set_variant(arguments.variant)
     from ..scenes.capture import capture

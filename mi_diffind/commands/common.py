@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import os
-from pathlib import Path
 
 from ..core import runtime
 from ..core.arguments import define, natural, positive
-from ..core.errors import UsageError, printable
-from ..core.files import check_distinct, irregular, shown
+from ..core.errors import printable
+from ..core.files import check_distinct
 
 
 def verb(
@@ -99,17 +97,3 @@ def set_variant(name: str | None) -> None:
 
     runtime.use_variant(name or ("cuda_ad_rgb" if dr.has_backend(dr.JitBackend.CUDA) else "llvm_ad_rgb"))
     mi.set_log_level(mi.LogLevel.Error)
-
-
-def require_scene(path: str) -> None:
-    """Raise :class:`UsageError` if there is no file ``path``, or if it is a table file."""
-    if fault := irregular(path):
-        raise UsageError(f"{shown(path)}: {fault}")
-    if not os.path.isfile(path):
-        fault = "is a folder, a scene file is needed" if os.path.isdir(path) else "no such scene file"
-        raise UsageError(f"{shown(path)}: {fault}")
-    if Path(path).suffix.lower() == ".npz":
-        raise UsageError(
-            f'{path}: found a table file, a scene (.xml) is needed; "mi-diffind inspect {path}" prints the lines by '
-            f"which a scene reads it"
-        )

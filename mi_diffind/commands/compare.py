@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from ..core.files import writable_folder
-from .common import learn_option, positive, require_scene, say, scene_options, set_variant, verb
+from ..core.files import check_scene_file, writable_folder
+from .common import learn_option, positive, say, scene_options, set_variant, verb
 
 HELP = "render a scene as written and with exact plugins, and show the difference"
 
@@ -24,6 +24,12 @@ def add(commands) -> None:
         help="compare with one counterpart: exact, or another one, such as Mitsuba's principled (default: those that "
         "the plugins declare as truths: exact, for filtered textures mipmap, too)",
     )
+    sub.add_argument(
+        "--equal-time",
+        action="store_true",
+        help="compare at equal time instead of equal samples: --spp is that of a pass of the exact scene; errors are "
+        "against a render of many samples, noise and bias apart",
+    )
     learn_option(sub, "none")
     scene_options(sub)
 
@@ -35,12 +41,18 @@ def run(arguments) -> dict:
 
     Raises :class:`.UsageError`, and as :mod:`mi_diffind.scenes.comparison` does.
     """
-    require_scene(arguments.scene)
+    check_scene_file(arguments.scene)
     writable_folder(arguments.out, create=True)
     set_variant(arguments.variant)
-    from ..scenes import comparison
+    from ..scenes import comparison, equal_time
 
     given = {name: getattr(arguments, name) for name in ("spp", "seed", "passes", "against", "learn")}
+    if arguments.equal_time:
+        result = equal_time.compare_at_equal_time(arguments.scene, defines=dict(arguments.defines), **given)
+        paths = result.save(arguments.out)
+        say(result)
+        say(f"picture     {paths['figure']}")
+        return {**result.figures, "files": paths}
     result = comparison.compare(arguments.scene, defines=dict(arguments.defines), **given)
     paths = result.save(arguments.out)
     say(result)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 
-from .common import learn_option, require_scene, say, scene_options, set_variant, verb
+from ..core.files import check_scene_file
+from .common import learn_option, say, scene_options, set_variant, verb
 
 HELP = "write a scene with learned plugins in place of Mitsuba's, by default its textures, fitted to what they show"
 
@@ -32,7 +33,7 @@ def run(arguments) -> dict:
 
     Raises :class:`.UsageError`, and as :mod:`mi_diffind.scenes.conversion` does.
     """
-    require_scene(arguments.scene)
+    check_scene_file(arguments.scene)
     set_variant(arguments.variant)
     from ..scenes.conversion import convert
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from ..core.arguments import add_arguments, natural, positive
 from ..core.files import writable_file, writable_folder
 from ..core.progress import Deadline
-from ..fitting.settings import LOSSES, SCHEDULES, FittingError
-from ..fitting.task import Task, fit, tasks
+from ..fitting.task import LOSSES, SCHEDULES, FittingError, Task, fit, tasks
 from .common import alternative, alternatives, say, set_variant, variant_option, verb
 
 #: Settings of a training that every task has: what they are, and the options of their parsers.

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .common import require_scene, say, scene_options, set_variant, verb
+from ..core.files import check_scene_file
+from .common import say, scene_options, set_variant, verb
 
 HELP = "describe a table file, or the plugins of this package in a scene"
 
@@ -25,7 +26,7 @@ def add(commands) -> None:
 def run(arguments) -> dict:
     """Print the description of the file and return its figures (:func:`mi_diffind.scenes.inspection.inspect`)."""
     if Path(arguments.file).suffix.lower() == ".xml":
-        require_scene(arguments.file)
+        check_scene_file(arguments.file)
     set_variant(arguments.variant)
     from ..scenes.inspection import inspect
 

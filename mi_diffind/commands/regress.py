@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..core.files import writable_folder
-from .common import UsageError, natural, positive, require_scene, say, scene_options, set_variant, verb
+from ..core.errors import UsageError
+from ..core.files import check_scene_file, writable_folder
+from .common import natural, positive, say, scene_options, set_variant, verb
 
 HELP = "check that scenes render as their stored references do"
 
@@ -35,13 +36,13 @@ def run(arguments) -> dict:
     :mod:`mi_diffind.scenes.regression` does.
     """
     for path in arguments.scenes:
-        require_scene(path)
+        check_scene_file(path)
     stems = [Path(path).stem for path in arguments.scenes]
     for stem in stems:
         if stems.count(stem) > 1:
             raise UsageError(f'{len(stems)} scenes, and more than one is called "{stem}": check them one at a time')
     set_variant(arguments.variant)
-    from ..scenes import regression, regression_report
+    from ..scenes import regression
 
     results, options = [], {"spp": arguments.spp, "seed": arguments.seed, "defines": dict(arguments.defines)}
     if not arguments.update:
@@ -60,7 +61,7 @@ def run(arguments) -> dict:
                 break
     finally:
         if results and not arguments.update:
-            say("\n".join(regression_report.summary(results)))
+            say("\n".join(regression.summary(results)))
     return {
         "interrupted": results[-1]["interrupted"],
         "failed": sum(r.get("passed") is False for r in results),

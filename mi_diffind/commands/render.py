@@ -6,11 +6,8 @@ import argparse
 from pathlib import Path
 
 from ..core.arguments import proper_fraction
-from ..core.files import writable_file
-from .common import UsageError, learn_option, positive, require_scene, say, scene_options, set_variant, verb
-
-#: Extensions of films (:data:`mi_diffind.images.films.FILMS`, without importing NumPy).
-FILMS = (".mp4", ".webp", ".gif")
+from ..core.files import check_scene_file, writable_file
+from .common import learn_option, positive, say, scene_options, set_variant, verb
 
 HELP = "render a scene that names learned plugins"
 
@@ -58,21 +55,9 @@ def run(arguments) -> dict:
 
     Raises :class:`.UsageError`, and as :mod:`mi_diffind.scenes.loading` does.
     """
-    require_scene(arguments.scene)
-    if arguments.centre is not None and not arguments.orbit:
-        raise UsageError("--centre needs --orbit")
-    if arguments.depth_tolerance is not None and arguments.depth != "auto":
-        raise UsageError("--depth-tolerance needs --depth auto")
+    check_scene_file(arguments.scene)
     output = Path(arguments.output or Path(arguments.scene).with_suffix(".exr").name)
-    films = FILMS if arguments.orbit else ()
-    if output.suffix.lower() not in (".exr", ".png", *films):
-        allowed = ", ".join((".exr", ".png", *films)) if films else ".exr and .png"
-        raise UsageError(f'output "{output}": found the extension "{output.suffix}", allowed are {allowed}')
     writable_file(output)
-    if arguments.orbit:
-        from ..images.films import check_encoder
-
-        check_encoder(output)
     set_variant(arguments.variant)
     from ..scenes import conversion, depth, loading
     from ..scenes.rendering import render

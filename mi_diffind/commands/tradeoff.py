@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from ..core.arguments import WORKER_ARGUMENTS, add_arguments
+from ..core.files import check_scene_file
 from ..studies import run as run_study
 from ..studies import studies
-from .common import alternative, alternatives, require_scene, say, scene_options, set_variant, variant_option, verb
+from .common import alternative, alternatives, say, scene_options, set_variant, variant_option, verb
 
 HELP = "measure time against accuracy of the contenders of a task, or of a scene"
 
@@ -48,7 +49,7 @@ def run(arguments) -> dict:
     """
     study = studies()[arguments.study]
     if study.of_scene:
-        require_scene(arguments.scene)
+        check_scene_file(arguments.scene)
         arguments.defines = dict(arguments.defines)
     result = run_study(study, arguments, lambda: set_variant(arguments.variant))
     say(result)

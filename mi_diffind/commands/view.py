@@ -5,7 +5,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from .common import natural, positive, require_scene, say, scene_options, set_variant, verb
+from ..core.files import check_scene_file
+from .common import natural, positive, say, scene_options, set_variant, verb
 
 HELP = "show a scene or a table file in a browser, learned plugins beside exact ones"
 
@@ -30,7 +31,7 @@ def run(arguments) -> dict:
     Raises :class:`.UsageError`, and as :mod:`mi_diffind.scenes.viewer` does.
     """
     if Path(arguments.file).suffix.lower() != ".npz":
-        require_scene(arguments.file)
+        check_scene_file(arguments.file)
     set_variant(arguments.variant)
     from ..scenes.viewer import view
 

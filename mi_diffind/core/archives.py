@@ -172,14 +172,10 @@ def json_bytes(text: bytes) -> int:
 
 
 class Allowance:
-    """Memory that the content of one file may take, and that part of it which is taken.
+    """Memory that the content of the file ``path`` may take, and that part of it which is taken."""
 
-    ``path`` is the name of the file for messages, ``file_bytes`` its size (default: that of the file ``path``).
-    """
-
-    def __init__(self, path: str | os.PathLike, file_bytes: int | None = None):
-        self.path = path
-        self.file_bytes = Path(path).stat().st_size if file_bytes is None else file_bytes
+    def __init__(self, path: str | os.PathLike):
+        self.path, self.file_bytes = path, Path(path).stat().st_size
         self.limit, self.taken = allowed(self.file_bytes), 0
 
     def check(self, nbytes: int, content: str) -> None:

@@ -1,8 +1,7 @@
-"""Uses of private interfaces of Mitsuba 3.9 and Dr.Jit 1.5, and what Mitsuba 3.10 does otherwise: one a function.
+"""Uses of private interfaces of Mitsuba 3.9 and Dr.Jit 1.5, one per function.
 
 Each has a test that names the hook which broke (``tests/test_compat.py``). Mitsuba and Dr.Jit are imported when a
-function is called, so that this module may be imported before LLVM is chosen (:mod:`.runtime`). Where Mitsuba 3.10
-differs, functions ask for the newer name; that half was read in its sources and has not run (``docs/next_mitsuba.md``).
+function is called, so that this module may be imported before LLVM is chosen (:mod:`.runtime`).
 """
 
 from __future__ import annotations
@@ -189,22 +188,6 @@ def on_variant_change(callback) -> None:
     """Call ``callback(old, new)`` after each ``mi.set_variant``; the same function is registered once."""
     mi.detail.add_variant_callback(callback)
 
-
-def is_recording() -> bool:
-    """Return whether Dr.Jit records a loop or a call symbolically, as integrators do while they trace a scene."""
-    return dr.flag(dr.JitFlag.SymbolicScope)
-
-
-def is_zero(*values) -> bool:
-    """Return whether Dr.Jit knows of each of these arrays, without an evaluation, that it is zero in all lanes.
-
-    Within a recorded call, inputs stay known if the caller computed them outside of the state of a loop.
-    """
-    return all(value.state == dr.VarState.Literal and value[0] == 0 for value in values)
-
-
-#: Mitsuba's classes of integrators that carry interactions in the state of a loop, of which :func:`is_zero` knows none.
-CARRYING = ("VolumetricPathIntegrator", "VolpathMisIntegratorImpl", "PRBVolpathIntegrator")
 
 #: Mitsuba's class of integrators that intersect rays with the scene beside their nested integrators.
 INTERSECTING = "AOVIntegrator"
@@ -471,70 +454,14 @@ def one_sentence(error: BaseException) -> str:
     return " ".join(text.split())
 
 
-def has_footprints() -> bool:
-    """Return whether hits carry the footprint of a pixel, from ray cones: ``si.footprint`` (Mitsuba 3.10, #1964)."""
-    return hasattr(mi.SurfaceInteraction3f, "footprint")
-
-
-def footprint_of(si) -> tuple | None:
-    """Return ``si.footprint`` as two conjugate diameters of an ellipse in uv, ``mi.Vector2f`` each; ``None`` in 3.9.
-
-    It is zero where no ray cone arrived: after the first bounce, and in scenes without a ``filtered()`` texture.
-    """
-    matrix = getattr(si, "footprint", None)
-    if matrix is None:
-        return None
-    return mi.Vector2f(matrix[0, 0], matrix[1, 0]), mi.Vector2f(matrix[0, 1], matrix[1, 1])
-
-
 def ray_flags(curvature: bool = False) -> int:
-    """Return the ``mi.RayFlags`` for all of an interaction, with the footprint, and with ``curvature`` ``dn_du``."""
-    flags = mi.RayFlags
-    if hasattr(flags, "NormalPartials"):
-        return flags.Default | flags.NormalPartials if curvature else flags.Default
-    return flags.All | flags.dNSdUV if curvature else flags.All
-
-
-def normal_mapped() -> int:
-    """Return the ``mi.BSDFFlags`` of a BSDF whose normals are those of a map, 0 in Mitsuba 3.9, which has none."""
-    return getattr(mi.BSDFFlags, "NormalMapped", 0)
-
-
-def lobe_rates() -> tuple[str, ...]:
-    """Return the parameters of ``principled`` that say how often lobes are sampled; none in Mitsuba 3.10 (#1951)."""
-    names = mi.traverse(mi.load_dict({"type": "principled"})).keys()
-    return tuple(sorted(name for name in names if name.endswith("_sampling_rate")))
-
-
-#: Mitsuba's classes of which ``Field`` shall take the place (#1885, open).
-FIELDS = ("Texture", "Volume")
-
-
-def base_class(name: str) -> type:
-    """Return the class of this name that plugins derive from; ``mi.Field`` where it has taken its place."""
-    return getattr(mi, "Field" if name in FIELDS and not hasattr(mi, name) else name)
-
-
-def object_type(name: str):
-    """Return the ``mi.ObjectType`` of a class's name; that of fields where they have taken its place."""
-    return getattr(mi.ObjectType, "Field" if name in FIELDS and not hasattr(mi.ObjectType, name) else name)
+    """Return the ``mi.RayFlags`` for all of an interaction, with ``curvature`` also the derivatives of normals."""
+    return mi.RayFlags.All | mi.RayFlags.dNSdUV if curvature else mi.RayFlags.All
 
 
 def register(object_type: str, name: str, factory) -> None:
-    """Register a plugin with the variant that is set.
-
-    Mitsuba has no ``register_volume``; in a scene, volumes are looked up among textures, or among fields (#1885).
-    """
-    if object_type in ("texture", "volume"):
-        function = getattr(mi, "register_texture", None) or mi.register_field
-    else:
-        function = getattr(mi, f"register_{object_type}")
-    function(name, factory)
-
-
-def mesh_arguments(props, vertices: int, faces: int) -> tuple:
-    """Return the arguments of ``mi.Mesh`` for a mesh of so many vertices and triangles, to be set afterwards."""
-    return (props,) if hasattr(mi.Mesh, "from_fields") else (props.plugin_name(), vertices, faces, props)
+    """Register a plugin with the variant that is set; Mitsuba looks volumes up among textures."""
+    getattr(mi, f"register_{'texture' if object_type == 'volume' else object_type}")(name, factory)
 
 
 def set_triangles(params, positions, faces) -> None:
@@ -542,18 +469,12 @@ def set_triangles(params, positions, faces) -> None:
     import numpy as np
 
     positions, faces = np.ascontiguousarray(positions, np.float32), np.ascontiguousarray(faces, np.uint32)
-    if "vertex_positions" in params:
-        params["vertex_positions"], params["faces"] = positions.ravel(), faces.ravel()
-    else:
-        params["positions"], params["faces"] = mi.TensorXf(positions), mi.TensorXu(faces)
+    params["vertex_positions"], params["faces"] = positions.ravel(), faces.ravel()
 
 
 def triangles(mesh) -> tuple:
     """Return the places ``(n, 3)`` and the triangles ``(m, 3)`` of a ``mi.Mesh`` as NumPy arrays."""
-    before = ("vertex_positions_buffer", "faces_buffer")
-    names = before if hasattr(mesh, before[0]) else ("positions", "faces")
-    positions, faces = (getattr(mesh, name)().numpy().reshape(-1, 3) for name in names)
-    return positions, faces
+    return mesh.vertex_positions_buffer().numpy().reshape(-1, 3), mesh.faces_buffer().numpy().reshape(-1, 3)
 
 
 def owned(array):

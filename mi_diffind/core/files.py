@@ -80,6 +80,18 @@ def irregular(path: str | os.PathLike, most: int | None = None) -> str:
     return ""
 
 
+def check_scene_file(path: str | os.PathLike) -> None:
+    """Raise :class:`.UsageError` if there is no file ``path``, or if it cannot be a scene."""
+    path = Path(path)
+    fault = irregular(path, MOST_TEXT)
+    if not fault and not path.is_file():
+        fault = "is a folder, a scene file is needed" if path.is_dir() else "no such scene file"
+    elif path.suffix.lower() == ".npz":
+        fault = 'found a table file, a scene is needed: "mi-diffind inspect" prints the lines by which a scene reads it'
+    if fault:
+        raise UsageError(f"{shown(path)}: {fault}")
+
+
 def writable_folder(path: str | os.PathLike, create: bool = False) -> Path:
     """Return the folder ``path``, made if ``create`` is set and its parent exists.
 
@@ -333,44 +345,30 @@ LONGEST_KEY = 40
 class RecordedKeys(dict):
     """Dictionary that records the keys which are asked for, in the set ``read``.
 
-    ``[]``, ``get``, ``pop`` and ``in`` record their key; ``items`` and ``values`` record all keys. Iteration, ``keys``,
-    ``len``, copies and ``{**…}`` record none.
+    ``[]``, ``get`` and ``in`` record their key, ``items`` records all keys. Iteration, ``keys``, ``len``, copies and
+    ``{**…}`` record none.
     """
 
-    __slots__ = ("read",)
+    read = frozenset()
 
-    def __init__(self, *content, **entries):
-        super().__init__(*content, **entries)
-        self.read: set | frozenset = frozenset()  # a set takes 216 bytes, and many objects may be in a file
-
-    def _record(self, keys) -> None:
-        if isinstance(self.read, frozenset):
-            self.read = set()
-        self.read.update(keys)
+    def _record(self, *keys) -> None:
+        self.read = self.read | set(keys)
 
     def __getitem__(self, key):
-        self._record((key,))
+        self._record(key)
         return super().__getitem__(key)
 
     def __contains__(self, key) -> bool:
-        self._record((key,))
+        self._record(key)
         return super().__contains__(key)
 
     def get(self, key, default=None):
-        self._record((key,))
+        self._record(key)
         return super().get(key, default)
 
-    def pop(self, key, *default):
-        self._record((key,))
-        return super().pop(key, *default)
-
     def items(self):
-        self._record(self.keys())
+        self._record(*self)
         return super().items()
-
-    def values(self):
-        self._record(self.keys())
-        return super().values()
 
 
 def unused_keys(content) -> list[str]:

@@ -38,9 +38,6 @@ POLL = 0.2
 #: Seconds until a Dask scheduler counts as out of reach.
 TIMEOUT = 20
 
-#: Seconds after which an idle process of a Dask worker ends.
-IDLE = 60.0
-
 #: Process of each thread that waits for one: of a Dask worker, or of a pool of this process.
 _spare = threading.local()
 
@@ -111,15 +108,14 @@ def _here(function, jobs: Mapping[str, object], stop: threading.Event) -> Iterat
 
 
 class WorkerProcess:
-    """New process of Python that carries out one job at a time, with so many ``threads`` of Dr.Jit.
+    """New process of Python that carries out one job at a time, with so many ``threads`` of Dr.Jit (0: without it).
 
-    It does not run the main script again, ignores Ctrl-C, and ends with this process, or after ``idle`` seconds without
-    a job (``None``: never).
+    It does not run the main script again, ignores Ctrl-C, and ends with this process.
     """
 
-    def __init__(self, threads: int, idle: float | None = None):
+    def __init__(self, threads: int):
         ours, theirs = socket.socketpair()
-        code = f"from {__name__} import serve; serve({theirs.fileno()}, {threads}, {idle})"
+        code = f"from {__name__} import serve; serve({theirs.fileno()}, {threads})"
         path = os.pathsep.join(p or os.getcwd() for p in sys.path)
         with theirs:
             self.process = subprocess.Popen(
@@ -147,7 +143,7 @@ class WorkerProcess:
         return f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
 
 
-def serve(descriptor: int, threads: int, idle: float | None) -> None:
+def serve(descriptor: int, threads: int) -> None:
     """Carry out the jobs that a :class:`WorkerProcess` sends, in its process."""
     pipe, jobs = Connection(descriptor), queue.SimpleQueue()
     if sys.platform == "linux":  # the kernel ends this process with the other one, whatever it is busy with
@@ -162,13 +158,11 @@ def serve(descriptor: int, threads: int, idle: float | None) -> None:
 
     threading.Thread(target=receive, daemon=True).start()
     while True:
-        try:
-            name, function, value = pickle.loads(jobs.get(timeout=idle))
-        except queue.Empty:
-            os._exit(0)
-        from .compat import use_threads
+        name, function, value = pickle.loads(jobs.get())
+        if threads:
+            from .compat import use_threads
 
-        use_threads(threads)
+            use_threads(threads)
         outcome = _attempt(name, function, value)
         try:
             content = pickle.dumps(outcome)
@@ -178,24 +172,22 @@ def serve(descriptor: int, threads: int, idle: float | None) -> None:
 
 
 def _beside(
-    name: str, function, value, threads: int, idle: float | None = None, pool: list[WorkerProcess] | None = None,
-    stop: threading.Event | None = None,
+    name: str, function, value, threads: int, pool: list[WorkerProcess], stop: threading.Event
 ) -> Outcome:  # fmt: skip
     """Carry out a job in the process of this thread, which is begun if need be and then listed in the ``pool``."""
     end = ""
     for _ in range(ATTEMPTS):
         process = getattr(_spare, "process", None)
         if process is None or process.process.poll() is not None:
-            process = _spare.process = WorkerProcess(threads, idle)
-            if pool is not None:
-                pool.append(process)
-            if stop is not None and stop.is_set():  # begun after the others were ended
+            process = _spare.process = WorkerProcess(threads)
+            pool.append(process)
+            if stop.is_set():  # begun after the others were ended
                 process.process.kill()
         try:
             return process.carry_out(name, function, value)
         except (EOFError, OSError):
             end, _spare.process = process.close(), None
-            if stop is not None and stop.is_set():
+            if stop.is_set():
                 break
     return Outcome(name, failure=f"the process of this job ended {ATTEMPTS} times ({end})")
 
@@ -210,7 +202,7 @@ def _in_processes(function, jobs: Mapping[str, object], workers: int, stop: thre
     with concurrent.futures.ThreadPoolExecutor(workers) as pool:
         threads = _threads_a_job(workers)
         futures = {
-            pool.submit(_beside, name, function, value, threads, None, processes, over) for name, value in jobs.items()
+            pool.submit(_beside, name, function, value, threads, processes, over) for name, value in jobs.items()
         }
         try:
             while futures and not stop.is_set():
@@ -231,7 +223,7 @@ def _beside_worker(name: str, function, value, slots: Mapping[str, int]) -> Outc
     import distributed
 
     host = distributed.get_worker().address.rpartition(":")[0]
-    return _beside(name, function, value, _threads_a_job(slots.get(host, 1)), IDLE)
+    return _beside(name, function, value, _threads_a_job(slots.get(host, 1)), [], threading.Event())
 
 
 def _on_cluster(function, jobs: Mapping[str, object], scheduler: str, stop: threading.Event) -> Iterator[Outcome]:

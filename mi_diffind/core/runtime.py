@@ -184,28 +184,22 @@ def _followed_by(action: Callable[[], None]):
 @contextlib.contextmanager
 def _starting_drjit():
     """Surround the import of Dr.Jit, which then uses the library that :func:`choose_llvm` names, or none."""
-    global _problem
-    path, _problem = choose_llvm()
-    with _hidden_llvm() if _problem else contextlib.nullcontext():
-        if _problem is None and path is not None:
-            os.environ[ENV] = path
-        yield
-        running = compat.llvm_version()  # waits for the asynchronous start
-    if _problem is None and 0 <= running[0] < MIN_LLVM:  # only where the search was left to Dr.Jit
-        _problem = f"Dr.Jit found LLVM {running[0]}, with which it aborts: {_ADVICE}."
-        _restart_llvm(None)
+    path, problem = choose_llvm()
+    if problem is None and path is not None:
+        os.environ[ENV] = path
+    yield
+    _correct_llvm()
     threads.settle()
-    _warn()
 
 
 def _correct_llvm() -> None:
-    """Make Dr.Jit, which has been imported already, use the library that :func:`choose_llvm` names.
+    """Make Dr.Jit, which has been imported, use the library that :func:`choose_llvm` names.
 
     Raises ``ImportError`` with one sentence if Dr.Jit already runs kernels on, or holds objects of, an LLVM that would
     abort. Warns (``RuntimeWarning``) and switches the LLVM backend off if there is no usable library.
     """
     global _problem
-    running = compat.llvm_version()
+    running = compat.llvm_version()  # waits for the asynchronous start
     if running[0] >= MIN_LLVM:
         return
     path, _problem = choose_llvm()
@@ -257,7 +251,7 @@ def _restart_llvm(path: str | None) -> None:
     if active:
         if core.launches():
             raise ImportError(too_late.format("has run kernels on it"))
-        variants = sys.modules["mitsuba"].variants() if "mitsuba" in sys.modules else ()
+        variants = getattr(sys.modules.get("mitsuba"), "variants", tuple)()  # which may be about to be imported
         if any(core.holds_objects(v) for v in variants if v.startswith("llvm")):
             raise ImportError(too_late.format("holds scene objects"))
 

@@ -13,7 +13,7 @@ import os
 import sys
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 
 import drjit as dr
 import numpy as np
@@ -26,7 +26,7 @@ from ..core.archives import Archive, ArchiveError, LimitError
 from ..core.errors import reason
 from ..core.files import irregular, replacing, shown, writable_file
 from ..core.progress import Deadline, duration, in_terminal, interruptible, progress_bar
-from .settings import LOSSES, SCHEDULES, FitSettings, FittingError
+from .task import LOSSES, SCHEDULES, FitResult, FitSettings, FittingError
 
 #: Columns that are updated together.
 PACKET = 4
@@ -197,39 +197,9 @@ class Problem:
         """Return figures on held-out data; the first one decides which state is the best (higher is better)."""
         raise NotImplementedError
 
-
-@dataclass
-class FitResult:
-    """Record of a training: the best state and the history.
-
-    ``measured`` are the figures of the best state, reached at ``step`` of ``steps``. ``history`` lists the figures of
-    all measurements with the loss (``None`` if it was not known).
-    """
-
-    measured: dict[str, float]
-    step: int
-    steps: int
-    seconds: float
-    interrupted: bool
-    restarts: int
-    history: list[dict] = field(default_factory=list)
-    asked_to_stop: bool = False  # by Ctrl-C, which may have come too late to interrupt it
-    unfinished: bool = False  # the time was too short
-
-    @property
-    def outcome(self) -> str:
-        """State that was kept and, after Ctrl-C, why it is not the last one: for a sentence."""
-        if not self.interrupted:
-            steps = f"{self.steps} step{'s' if self.steps != 1 else ''}: unfinished, " if self.unfinished else ""
-            return f"{steps}best step {self.step}"
-        name, value = next(iter(self.measured.items()))
-        last = next((h for h in reversed(self.history) if h["step"] == self.steps), None)
-        if self.step == self.steps or last is None:
-            return f"interrupted at step {self.steps}, kept step {self.step}"
-        return (
-            f"interrupted at step {self.steps}, kept step {self.step}, which was better ({name} {value:.2f} against "
-            f"{last[name]:.2f})"
-        )
+    def train(self, settings: FitSettings, *arguments, **options) -> FitResult:
+        """Train :attr:`net` in place: :func:`fit` of this problem."""
+        return fit(self, settings, *arguments, **options)
 
 
 @dataclass
@@ -297,7 +267,7 @@ def fit(
         raise FittingError("resuming (--resume) needs the checkpoint (--checkpoint FILE) of the run to go on with")
     trainer, record = _Trainer(problem, settings), _Record()
     # The settings that a checkpoint has to agree in
-    agreed = {**asdict(settings), **json.loads(json.dumps(dict(problem.identity)))}
+    agreed = {**settings.common, **json.loads(json.dumps(dict(problem.identity)))}
     if resume:
         state, record = _load_checkpoint(checkpoint, agreed, trainer)
         trainer.restore(state)

@@ -20,27 +20,27 @@ import dataclasses
 import functools
 import importlib
 import importlib.util
+import math
+import numbers
 import os
 import sys
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from ..core import discovery
-from ..core.arguments import Argument, check_files
+from ..core.arguments import MOST, MOST_NATURAL, Argument, check_files
 from ..core.compat import backend_module
-from ..core.errors import UsageError
+from ..core.errors import DiffindError, UsageError
 from ..core.files import read_once
 from ..core.progress import Deadline, interruptible
-from ..core.units import figure_lines
-from .settings import FitSettings, within_memory
+from ..core.units import check_memory, figure_lines
 
 if TYPE_CHECKING:
     from ..arrays.indirection import DifferentiableArray
     from ..arrays.tables import Table
-    from .loop import FitResult, Problem
 
 #: Storage forms that a training may end in (:data:`.lookup.STORAGES`, without importing Dr.Jit).
 STORAGES = ("float32", "float16", "uint8")
@@ -52,14 +52,119 @@ OVERRUN = 1.15
 DATA = Path(__file__).resolve().parents[1] / "data"
 
 
+#: Memory that a step takes for each sample of its batch, in bytes: 4 to 80 were measured.
+SAMPLE_BYTES = 64
+
+SCHEDULES = ("constant", "cosine", "plateau")
+LOSSES = ("mae", "mse")
+
+
+class FittingError(DiffindError, RuntimeError):
+    """A training cannot go on; the message is one sentence."""
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """Settings of a training.
+
+    ``lr`` is Adam's learning rate; ``schedule`` changes it: ``"constant"``, ``"cosine"`` (to zero) or ``"plateau"``
+    (halved when the loss has not improved for a tenth of the steps). ``measure_every`` and ``check_every`` are the
+    numbers of steps between two measurements and between two checks of the loss.
+
+    With ``deterministic``, the same settings give the same bytes: the LLVM backend then trains on one core, because the
+    last digits of a sum over several cores depend on their order. It has no effect on CUDA, which sums by atomics.
+
+    A task that has further settings derives a class of its own, whose defaults are those of its first preset.
+    """
+
+    steps: int = 2000
+    batch: int = 65536
+    lr: float = 1e-3
+    schedule: str = "cosine"
+    loss: str = "mae"
+    seed: int = 0
+    measure_every: int = 200
+    check_every: int = 20
+    deterministic: bool = True
+
+    def __post_init__(self):
+        for name, low in (("steps", 1), ("batch", 1), ("measure_every", 1), ("check_every", 1), ("seed", 0)):
+            value, most = getattr(self, name), MOST_NATURAL if name == "seed" else MOST
+            if isinstance(value, bool) or not isinstance(value, numbers.Integral):
+                raise FittingError(f"{name}: found {value!r:.40}, a whole number is needed")
+            if value < low:
+                raise FittingError(f"{name}: found {value}, at least {low} is needed")
+            if value > most:
+                raise FittingError(f"{name}: found {value!s:.40}, at most {most:,} is allowed")
+        if not (isinstance(self.lr, numbers.Real) and math.isfinite(self.lr) and self.lr > 0):
+            raise FittingError(f"lr: found {self.lr}, a positive number is needed")
+        if self.schedule not in SCHEDULES:
+            raise FittingError(f'schedule: found "{self.schedule}", allowed are {SCHEDULES}')
+        if self.loss not in LOSSES:
+            raise FittingError(f'loss: found "{self.loss}", allowed are {LOSSES}')
+
+    @property
+    def common(self) -> dict:
+        """The settings that all tasks share, by name."""
+        return {f.name: getattr(self, f.name) for f in fields(FitSettings)}
+
+    @property
+    def further(self) -> dict:
+        """The settings of the task alone, by name."""
+        return {name: value for name, value in asdict(self).items() if name not in self.common}
+
+
+def within_memory(settings: FitSettings) -> FitSettings:
+    """Return the settings. Raises :class:`.UsageError` if their batch exceeds this machine's memory.
+
+    Dr.Jit ends the process where memory cannot be allocated.
+    """
+    check_memory("batch", settings.batch, SAMPLE_BYTES * settings.batch)
+    return settings
+
+
+@dataclass
+class FitResult:
+    """Record of a training: the best state and the history.
+
+    ``measured`` are the figures of the best state, reached at ``step`` of ``steps``. ``history`` lists the figures of
+    all measurements with the loss (``None`` if it was not known).
+    """
+
+    measured: dict[str, float]
+    step: int
+    steps: int
+    seconds: float
+    interrupted: bool
+    restarts: int
+    history: list[dict] = field(default_factory=list)
+    asked_to_stop: bool = False  # by Ctrl-C, which may have come too late to interrupt it
+    unfinished: bool = False  # the time was too short
+
+    @property
+    def outcome(self) -> str:
+        """State that was kept and, after Ctrl-C, why it is not the last one: for a sentence."""
+        if not self.interrupted:
+            steps = f"{self.steps} step{'s' if self.steps != 1 else ''}: unfinished, " if self.unfinished else ""
+            return f"{steps}best step {self.step}"
+        name, value = next(iter(self.measured.items()))
+        last = next((h for h in reversed(self.history) if h["step"] == self.steps), None)
+        if self.step == self.steps or last is None:
+            return f"interrupted at step {self.steps}, kept step {self.step}"
+        return (
+            f"interrupted at step {self.steps}, kept step {self.step}, which was better ({name} {value:.2f} against "
+            f"{last[name]:.2f})"
+        )
+
+
 @dataclass(frozen=True)
 class Stage:
     """One training of a fit. A fit is a list of stages, which :meth:`FitRequest.run` carries out in turn.
 
     - ``name``: a stage with a ``name`` keeps its checkpoint in the file ``CHECKPOINT.name`` beside that of the request,
       one without in the request's own. ``title`` stands before the progress bar (default: the name).
-    - ``problem``: what is trained (:class:`.Problem`), or a function that returns it when the stage begins, from what
-      earlier stages have trained. The stage is left out if it returns ``None``.
+    - ``problem``: what is trained, a :class:`.loop.Problem`, or a function that returns it when the stage begins, from
+      what earlier stages have trained. The stage is left out if it returns ``None``.
     - ``share``: part of the time that is left when the stage begins, from 0 to 1. Without a limit of time it does
       nothing: the ``settings`` of the stage (default: those of the request) say how many steps there are.
     - ``finish``: what follows the training, such as the measurement of the table, and takes ``times`` as long. With a
@@ -78,7 +183,7 @@ class Stage:
     """
 
     name: str
-    problem: Problem | Callable[[], Problem | None]
+    problem: Any
     share: float = 1.0
     settings: FitSettings | None = None
     title: str | None = None
@@ -142,21 +247,18 @@ class FitRequest:
 
     def train(
         self,
-        problem: Problem,
+        problem,
         title: str | None = None,
         finish: Callable[[], object] | None = None,
         times: float = 1.0,
         least: int = 1,
     ) -> FitResult:
-        """Train one ``problem`` with the settings of this request. Other parameters are those of :class:`Stage`."""
-        from .loop import fit
-
+        """Train one :class:`.loop.Problem` with these settings. Other parameters are those of :class:`Stage`."""
         if self.deadline is not None and finish is not None:
             self.deadline.rehearse(finish, times)
-        return fit(
-            problem, self.settings, self.checkpoint, self.resume, self.progress, title=title, deadline=self.deadline,
-            least=least,
-        )  # fmt: skip
+        return problem.train(
+            self.settings, self.checkpoint, self.resume, self.progress, title=title, deadline=self.deadline, least=least
+        )
 
     def part(self, share: float) -> FitRequest:
         """Return the request for a stage that takes a ``share`` of the time that is left, if time is limited."""
@@ -165,9 +267,9 @@ class FitRequest:
     def recorded(self, result: FitResult | None = None) -> dict:
         """Return the settings as a table file keeps them: with a limit of time, the steps are those of the result."""
         if self.deadline is None:
-            return asdict(self.settings)
+            return self.settings.common
         steps = {} if result is None else {"steps": result.steps}
-        return {**asdict(self.settings), **steps, "seconds": self.deadline.total}
+        return {**self.settings.common, **steps, "seconds": self.deadline.total}
 
     @property
     def folder(self) -> Path:
@@ -364,7 +466,10 @@ class Task:
 
     def settings(self, preset: str, given: Mapping, options: Mapping) -> FitSettings:
         """Return the settings of a preset with the ``given`` ones in place; ``options`` are the task's own."""
-        defaults = self.presets[preset]
+        return self.change_settings(self.presets[preset], given)
+
+    def change_settings(self, defaults: FitSettings, given: Mapping) -> FitSettings:
+        """Return ``defaults`` with the ``given`` settings in place, and so many :attr:`measurements`."""
         if self.measurements:
             steps = given.get("steps", defaults.steps)
             defaults = dataclasses.replace(defaults, measure_every=max(1, steps // self.measurements))
@@ -394,11 +499,11 @@ class Task:
         if check := self._implementation("check", "fit"):
             check(request)
 
-    def problem(self, request: FitRequest) -> Problem:
-        """Return the problem to train, with its arrays allocated."""
+    def problem(self, request: FitRequest):
+        """Return the problem to train (:class:`.loop.Problem`), with its arrays allocated."""
         raise NotImplementedError
 
-    def table(self, problem: Problem, request: FitRequest) -> Table:
+    def table(self, problem, request: FitRequest) -> Table:
         """Return the arrays of a problem as a file holds them: in single precision, or as the task stores them."""
         raise NotImplementedError
 
@@ -596,15 +701,15 @@ def fit(
         given["source"] = source
     deadline = Deadline(seconds) if isinstance(seconds, (int, float)) else seconds
     arguments = {argument.name: argument for argument in chosen.arguments}
-    options, fields = {k: a.default for k, a in arguments.items()}, {f.name for f in dataclasses.fields(FitSettings)}
+    options, names = {k: a.default for k, a in arguments.items()}, {f.name for f in fields(FitSettings)}
     for key, value in given.items():
         if key == "source" and key not in options:
             raise UsageError(f"{task}: found a source, but this task has none")
-        if key not in options and key not in fields:
-            allowed = ", ".join(sorted({*options, *fields}))
+        if key not in options and key not in names:
+            allowed = ", ".join(sorted({*options, *names}))
             raise UsageError(f'{task}: found the argument "{key}", allowed are {allowed}')
         options |= {key: arguments[key].parsed(value)} if key in options else {}
-    settings = within_memory(chosen.settings(preset, {k: v for k, v in given.items() if k in fields}, options))
+    settings = within_memory(chosen.settings(preset, {k: v for k, v in given.items() if k in names}, options))
     output = None if output is None else chosen.output_path(output)
     check_files(chosen.arguments, options, {"-o": output, "--checkpoint": checkpoint})
     if resume and deadline is not None:

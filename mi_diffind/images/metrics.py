@@ -6,15 +6,11 @@ import math
 
 import numpy as np
 
-from ..core.errors import DiffindError
+from ..core.errors import UsageError
 from .srgb import for_display
 
 #: Side of the window of :func:`ssim_published`, pixels.
 WINDOW = 11
-
-
-class NotFiniteError(DiffindError, ValueError):
-    """An image has no error, since pixels of it are NaN or infinite; the message is one sentence."""
 
 
 def nonfinite_pixels(image: np.ndarray) -> int:
@@ -23,17 +19,17 @@ def nonfinite_pixels(image: np.ndarray) -> int:
 
 
 def check_finite(*images: np.ndarray) -> None:
-    """Raise :class:`NotFiniteError` if pixels of an image are NaN or infinite."""
+    """Raise :class:`.UsageError` if pixels of an image are NaN or infinite."""
     for image in images:
         if count := nonfinite_pixels(image):
             pixels = image.size // image.shape[-1]
-            raise NotFiniteError(f"{count:,} of {pixels:,} pixels are not finite, so that the image has no error")
+            raise UsageError(f"{count:,} of {pixels:,} pixels are not finite, so that the image has no error")
 
 
 def psnr(reference: np.ndarray, image: np.ndarray) -> float:
     """Return the peak signal-to-noise ratio in dB of linear values clipped to [0, 1]; infinite for equal images.
 
-    Raises :class:`NotFiniteError`, as :func:`mae` and :func:`flip` do.
+    Raises :class:`.UsageError`, as :func:`mae` and :func:`flip` do.
     """
     check_finite(reference, image)
     mse = float(np.mean((np.clip(reference, 0, 1) - np.clip(image, 0, 1)) ** 2, dtype=np.float64))

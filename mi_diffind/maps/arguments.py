@@ -1,14 +1,10 @@
-"""Arguments of tasks that store maps, and the figures that their fits report."""
+"""Arguments of tasks that store maps."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
-from ..arrays.budget import Budget
 from ..core import units
 from ..core.arguments import Argument, between, checked, decibels, positive
-from ..core.errors import UsageError
-from .source import NONFINITE, Source
+from .source import NONFINITE
 
 _SIZES = (
     ("compression", units.parse_compression, "how many times smaller than the source, uncompressed (default: 12x)"),
@@ -68,49 +64,3 @@ DECODED = (
     Argument("--width", type=positive, help="width in texels (default: the source's)"),
     Argument("--height", type=positive, help="height in texels (default: the source's)"),
 )
-
-
-def requested_bytes(options, source: Source) -> int:
-    """Return the bytes of the options :data:`SIZES`, by default a twelfth of the source's. Raises UsageError."""
-    from ..arrays.tables import MAX_BYTES
-
-    given = {k: options[k] for k in ("compression", "bpp")} | {"nbytes": options["bytes"]}
-    if not any(given.values()):
-        given["compression"] = 12
-    try:
-        wanted = units.parse_size(source.nbytes, source.texels, **given)
-    except ValueError as e:
-        raise UsageError(str(e)) from None
-    if options["bytes"] is not None:
-        units.check_size("--bytes", wanted, MAX_BYTES)
-    return wanted
-
-
-def requested_border(options) -> tuple[str, str] | None:
-    """Return the border along v and u of the options :data:`SOURCES`; ``None`` if it is chosen by the content."""
-    return None if options["border"] == "auto" else (options["border"],) * 2
-
-
-def size_figures(source: Source, table, requested: float | None) -> tuple[dict, list[str]]:
-    """Return the sizes of a trained table for ``--json``, and lines of text; ``requested`` are the bytes wanted."""
-    achieved = source.nbytes / table.nbytes if table.nbytes else None
-    figures = {
-        "source_bytes": source.nbytes,
-        "compression": achieved,
-        "compression_asked": source.nbytes / requested if requested else None,
-        "arrays": {name: list(a.shape) for name, a in table.arrays.items()},
-        "bits": {name: a.bits for name, a in table.arrays.items()},
-    }
-    wanted = f" ({source.nbytes / requested:.2f}x requested)" if requested else ""
-    lines = [(f"{achieved:.2f}x" if achieved else "of one colour") + wanted]
-    if requested and achieved and not Budget(requested).is_met(table.nbytes):
-        asked, actual = f"{round(requested):,} bytes were requested", f"{table.nbytes:,}"
-        lines.append(f"{asked}, but {actual} are the nearest that the arrays of this image allow")
-    return figures, lines
-
-
-def preview_path(request) -> Path | None:
-    """Return the file of :data:`PREVIEW`: the given one, or ``…_preview.png`` beside the output (``None`` without)."""
-    if request.options["preview"] is not None:
-        return Path(request.options["preview"])
-    return None if request.output is None else request.output.with_name(f"{request.output.stem}_preview.png")

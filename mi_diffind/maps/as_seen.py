@@ -15,7 +15,7 @@ from types import ModuleType
 import numpy as np
 
 from ..images import metrics, srgb
-from .compressed import CompressedMaps, decibel
+from .pyramid import CompressedMaps, decibel
 from .source import Map, Source
 
 #: Share of the way from the roughness of the map to 1, by the name of a surface.

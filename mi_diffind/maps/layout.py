@@ -8,11 +8,12 @@ stored channels, each scaled to [0, 1], and the origin of each channel of each m
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
+from ..arrays.pages import page_gain
 from .source import ROLES, Map, Source
 
 #: Least PSNR, in dB, of the third component of a normal that is derived from the other two.
@@ -23,6 +24,12 @@ LARGEST = 1.7e38
 
 #: Linear data of more than 8 bits with a narrower range than this is stored relative to its range.
 NARROW = 0.25
+
+#: Room between the range of components and the ends of [0, 1].
+MARGIN = 0.02
+
+#: Share of texels beyond the range of components at either end.
+OUTSIDE = 1e-3
 
 #: Origin of a channel that follows from the first two channels of a normal map.
 FROM_NORMAL = "z"
@@ -86,7 +93,7 @@ class Layout:
     groups: tuple[str, ...]
 
     @staticmethod
-    def of(
+    def from_source(
         source: Source, once: bool = True, two_channel_normals: bool | None = None, filtered: bool = False
     ) -> Layout:
         """Return the layout of ``source``.
@@ -344,6 +351,42 @@ def neighbour_covariance(values: np.ndarray) -> np.ndarray:
     k = values.shape[-1]
     flat = [np.diff(values, axis=axis).reshape(-1, k).astype(np.float64) for axis in (0, 1)]
     return sum(f.T @ f / max(len(f), 1) for f in flat)
+
+
+def component_range(projected: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lower and upper end of each component in ``projected``, ``(…, n)``, without :data:`OUTSIDE`."""
+    low, high = np.quantile(projected.reshape(-1, projected.shape[-1]), [OUTSIDE, 1 - OUTSIDE], axis=0)
+    return low, np.maximum(high, low + 1e-3)
+
+
+def linear_in_pointer(
+    channels: np.ndarray, directions: np.ndarray, low, high, side: int, axes: Iterable[int], dims: int
+) -> np.ndarray:
+    """Return ``channels`` plus components that grow along ``axes`` of a cascaded array: ``(side, …, k)``.
+
+    Each of the ``directions``, ``(n, k)``, is multiplied by numbers from ``low`` to ``high`` along its axis, with room
+    for :data:`MARGIN` at both ends. The array has ``dims`` axes of ``side`` entries.
+    """
+    grid = (np.linspace(0, 1, side) - MARGIN) / (1 - 2 * MARGIN) if side > 1 else np.array([0.5])
+    for axis, direction, first, last in zip(axes, directions, low, high, strict=True):
+        along = np.reshape(first + grid * (last - first), [-1 if d == axis else 1 for d in range(dims)])
+        channels = channels + along[..., None] * direction
+    return channels
+
+
+def gain_of_pages(values: np.ndarray, dims: int, entries: float, border: tuple[str, str]) -> tuple[float, float]:
+    """Return :func:`.page_gain` of the first ``dims`` components of an image, ``(height, width, k)``, in [0, 1].
+
+    Pages and grid have ``entries`` entries. The PSNR is the mean of the channels.
+    """
+    k = values.shape[-1]
+    mean = values.reshape(-1, k).mean(axis=0, dtype=np.float64)
+    covariance = channel_covariance(values, mean)
+    directions = eigenvectors(covariance, min(dims, k))
+    rest = np.trace(covariance) - np.trace(directions @ covariance @ directions.T)
+    exact = ((values - mean) @ directions.T).astype(np.float32)
+    gain, psnr = page_gain(exact, border, entries, max(float(rest), 0.0))
+    return gain, psnr + 10 * math.log10(k)
 
 
 def eigenvectors(covariance: np.ndarray, count: int) -> np.ndarray:

@@ -5,12 +5,15 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 
+from ..arrays.budget import Budget
 from ..arrays.indirection import DifferentiableArray
 from ..arrays.pages import SIDE_BITS, page_counts, page_shift
-from ..arrays.tables import PAGES, Table, TableError, allocate_pages, page_sides
+from ..arrays.tables import MAX_BYTES, PAGES, Table, TableError, allocate_pages, page_sides
+from ..core import units
 from ..core.errors import UsageError
 from ..core.files import replacing
 from ..core.threads import threads_for_files
@@ -18,8 +21,8 @@ from ..fitting.loop import FitResult, Problem
 from ..fitting.task import FitRequest, Fitted, Model
 from ..images import srgb
 from . import as_seen
-from .arguments import size_figures
-from .compressed import CompressedMaps, map_figure
+from .layout import Layout
+from .pyramid import CompressedMaps, map_figure
 from .source import Source, load_source
 
 
@@ -43,7 +46,36 @@ def allocate_maps(
     return arrays
 
 
-def stored_entries(table: Table, name: str, size: tuple[int, int]) -> int:
+def read_layout(table: Table) -> Layout:
+    """Return the layout of the maps in a table. Raises :class:`TableError` for damaged settings."""
+    try:
+        return Layout.from_json(table.settings["layout"])
+    except (KeyError, TypeError, ValueError, OverflowError) as e:
+        raise TableError(f"{table.path}: its settings describe no {table.task} ({e})") from None
+
+
+def check_arrays(table: Table, shapes: Mapping[str, tuple], pages: Mapping[str, tuple[int, int]]) -> None:
+    """Raise :class:`TableError` unless a table holds arrays of these ``shapes``, of numbers in [0, 1].
+
+    ``None`` in a shape stands for any number. ``pages`` maps the names of arrays of pages to the rows and columns of
+    the image that they cover; the first number of their shapes is that of all their entries.
+    """
+    path, expected = table.path, {*shapes, *(name + PAGES for name in pages)}
+    if set(table.arrays) != expected:
+        names, wanted = (", ".join(sorted(n)) or "none" for n in (table.arrays, expected))
+        raise TableError(f"{path}: holds the arrays {names}, expected {wanted}")
+    for name, shape in shapes.items():
+        array = table.arrays[name]
+        if name in pages:
+            shape = (_page_entries(table, name, pages[name]), shape[-1])
+        if len(array.shape) != len(shape) or any(w not in (None, n) for n, w in zip(array.shape, shape, strict=True)):
+            text = " x ".join("N" if n is None else str(n) for n in shape)
+            raise TableError(f'{path}: array "{name}" has the shape {array.shape}, expected {text}')
+        if not array.is_pointer:
+            raise TableError(f'{path}: array "{name}" has entries outside of [0, 1]')
+
+
+def _page_entries(table: Table, name: str, size: tuple[int, int]) -> int:
     """Return the number of entries of the pages of an array, on an image of ``size``. Raises :class:`TableError`."""
     pages, counts, largest = table.arrays[name + PAGES], page_counts(size), 2 ** SIDE_BITS[1]
     where = f'{table.path}: array "{name}{PAGES}"'
@@ -56,6 +88,84 @@ def stored_entries(table: Table, name: str, size: tuple[int, int]) -> int:
     if sides.max() > largest:
         raise TableError(f"{where} has a page of {sides.max()} entries along an axis, allowed are {largest}")
     return int(sides.prod(axis=2).sum())
+
+
+def requested_bytes(options, source: Source) -> int:
+    """Return the bytes of the options :data:`SIZES`, by default a twelfth of the source's. Raises UsageError."""
+    given = {k: options[k] for k in ("compression", "bpp")} | {"nbytes": options["bytes"]}
+    if not any(given.values()):
+        given["compression"] = 12
+    try:
+        wanted = units.parse_size(source.nbytes, source.texels, **given)
+    except ValueError as e:
+        raise UsageError(str(e)) from None
+    if options["bytes"] is not None:
+        units.check_size("--bytes", wanted, MAX_BYTES)
+    return wanted
+
+
+def requested_border(options) -> tuple[str, str] | None:
+    """Return the border along v and u of the options :data:`SOURCES`; ``None`` if it is chosen by the content."""
+    return None if options["border"] == "auto" else (options["border"],) * 2
+
+
+def size_figures(source: Source, table, requested: float | None) -> tuple[dict, list[str]]:
+    """Return the sizes of a trained table for ``--json``, and lines of text; ``requested`` are the bytes wanted."""
+    achieved = source.nbytes / table.nbytes if table.nbytes else None
+    figures = {
+        "source_bytes": source.nbytes,
+        "compression": achieved,
+        "compression_asked": source.nbytes / requested if requested else None,
+        "arrays": {name: list(a.shape) for name, a in table.arrays.items()},
+        "bits": {name: a.bits for name, a in table.arrays.items()},
+    }
+    wanted = f" ({source.nbytes / requested:.2f}x requested)" if requested else ""
+    lines = [(f"{achieved:.2f}x" if achieved else "of one colour") + wanted]
+    if requested and achieved and not Budget(requested).is_met(table.nbytes):
+        asked, actual = f"{round(requested):,} bytes were requested", f"{table.nbytes:,}"
+        lines.append(f"{asked}, but {actual} are the nearest that the arrays of this image allow")
+    return figures, lines
+
+
+def preview_path(request) -> Path | None:
+    """Return the file of :data:`PREVIEW`: the given one, or ``…_preview.png`` beside the output (``None`` without)."""
+    if request.options["preview"] is not None:
+        return Path(request.options["preview"])
+    return None if request.output is None else request.output.with_name(f"{request.output.stem}_preview.png")
+
+
+class MapsProblem(Problem):
+    """Base class of training problems of maps.
+
+    ``net`` returns the stored channels of ``layout``. ``weights`` are factors of the differences of maps, by name.
+    """
+
+    harmless = 1e-2  # of values in [0, 1]
+
+    def __init__(self, net, layout: Layout, recipe, types: ModuleType, weights: Mapping[str, float] | None = None):
+        self.net, self.layout, self.recipe, self.types = net, layout, recipe, types
+        self.groups, factors = layout.channels_by_map(), weights or {}
+        self.weights = {
+            name: factors.get(name, 1.0) ** 2 * len(channels) / layout.stored for name, channels in self.groups.items()
+        }
+        self.jittered = False
+        self._strata = {}  # by the size of a batch
+
+    def begin(self, step: int, share: float) -> str:
+        """Start a step: decide whether its samples are jittered. Returns a text that names the decision."""
+        jitter = self.recipe.jitter
+        self.jittered = int((step + 1) * jitter) > int(step * jitter)
+        return f"jittered: {self.jittered}"
+
+    def by_map(self, channels: list) -> dict[str, list]:
+        """Return stored channels in groups, by the name of their map."""
+        return {name: [channels[i] for i in indices] for name, indices in self.groups.items()}
+
+
+def strata(texels: int, samples: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first texel, and the number of texels, of each of ``samples`` equal parts of ``texels``."""
+    edges = np.arange(samples + 1, dtype=np.uint64) * np.uint64(texels) // np.uint64(max(1, samples))
+    return edges[:-1], np.maximum(np.diff(edges), 1)
 
 
 def fit_maps(

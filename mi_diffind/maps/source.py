@@ -28,10 +28,8 @@ import numpy as np
 
 from ..core.archives import Allowance, LimitError, json_bytes
 from ..core.errors import DiffindError, reason
-from ..core.files import MOST_TEXT, OutsideError, RecordedKeys, irregular, path_by_name, shown, unused_note
-from ..core.threads import threads_for_files
-from ..core.units import memory
-from ..images.headers import check_picture
+from ..core.files import MOST_TEXT, OutsideError, RecordedKeys, path_by_name, unused_note
+from ..images.reader import DEPTHS, ENCODED, MAX_CHANNELS, Picture, PictureError, read_file, read_picture
 
 #: Roles of maps.
 ROLES = ("albedo", "normal", "roughness", "ao", "metallic", "other")
@@ -102,9 +100,6 @@ def content_of(name: str) -> Content | None:
     return None
 
 
-#: Largest number of channels of all maps together.
-MAX_CHANNELS = 16
-
 COLOR_SPACES = ("srgb", "linear")
 NONFINITE = ("error", "clean")
 
@@ -120,9 +115,6 @@ _NAMED_NORMAL = 0.5
 #: Content of images without a name, and of maps with an unknown one.
 _COLOURS = Content("albedo", colours=True)
 _UNKNOWN = Content("other")
-
-_DEPTHS = {"uint8": 1, "uint16": 2, "uint32": 4, "float16": 2, "float32": 4, "float64": 4}
-_ENCODED = ("uint8", "uint16")  # types whose full range means 0 … 1
 
 
 class SourceError(DiffindError, ValueError):
@@ -201,8 +193,10 @@ def load_source(source, nonfinite: str = "error", named: bool = True) -> Source:
         return source
     if isinstance(source, dict):
         return from_arrays(source, nonfinite=nonfinite)
+    color_space = None
     if not isinstance(source, (str, os.PathLike)):
-        image, where = _in_memory(source, "the image"), "the image"
+        where = "the image"
+        image, color_space = _in_memory(source, where)
     elif (path := Path(source)).suffix.lower() == ".json":
         return _load_manifest(path, nonfinite)
     else:
@@ -210,7 +204,7 @@ def load_source(source, nonfinite: str = "error", named: bool = True) -> Source:
     values, content, notes = image.values[:, :, : image.colors], _COLOURS if image.named else _UNKNOWN, []
     if named and image.named and isinstance(where, Path):
         content, notes = _content_of_image(where, values)
-    maps = [_RawMap("image", _one_of_equal(values, content.role), content, str(where), image.color_space)]
+    maps = [_RawMap("image", _one_of_equal(values, content.role), content, str(where), color_space)]
     if image.has_alpha:
         maps.append(_RawMap("alpha", image.values[:, :, image.colors :], _UNKNOWN, str(where)))
     return _assemble(maps, where, nonfinite, notes)
@@ -248,12 +242,13 @@ def from_arrays(arrays: dict, color_spaces: dict[str, str] | None = None, nonfin
     for name, array in arrays.items():
         where = f'array "{name}"'
         _check_name("arrays", name)
-        image = _read(Path(array)) if isinstance(array, (str, os.PathLike)) else _in_memory(array, where)
-        values = image.opaque(where)
+        file = isinstance(array, (str, os.PathLike))
+        image, stated = (_read(Path(array)), None) if file else _in_memory(array, where)
+        values = _opaque(image, where)
         content = content_of(name)
         if name == "image" and values.shape[2] in (1, 3):
             content = _COLOURS
-        color_space = color_spaces.pop(name, image.color_space)
+        color_space = color_spaces.pop(name, stated)
         if color_space is not None and color_space not in COLOR_SPACES:
             raise SourceError(f'{where}: has the color space "{color_space}", allowed are {COLOR_SPACES}')
         content = content or _UNKNOWN
@@ -265,11 +260,11 @@ def from_arrays(arrays: dict, color_spaces: dict[str, str] | None = None, nonfin
 
 def _load_manifest(path: Path, nonfinite: str) -> Source:
     """Read a manifest and its images. Raises :class:`SourceError`."""
-    data = _read_bytes(path)
     try:
+        data = read_file(path, MOST_TEXT)
         Allowance(path).check(json_bytes(data), "a manifest")
         content = json.loads(data.decode("utf-8-sig"), object_pairs_hook=_unique)
-    except LimitError as e:
+    except (LimitError, PictureError) as e:
         raise SourceError(str(e)) from None
     except (ValueError, RecursionError) as e:
         raise SourceError(f"{path}: is not valid JSON ({reason(e)})") from None
@@ -299,9 +294,9 @@ def _load_manifest(path: Path, nonfinite: str) -> Source:
             images[file] = _read(file)
         content_of_map = content_of(name)
         if "channels" in entry:
-            values = images[file].select(entry["channels"], where)
+            values = _select(images[file], entry["channels"], where)
         else:
-            values = images[file].opaque(where)
+            values = _opaque(images[file], where)
             content_of_map = content_of_map or content_of(file.stem)
             values = _one_of_equal(values, content_of_map.role if content_of_map else "")
         maps.append(_RawMap(name, values, content_of_map or _UNKNOWN, str(file), color_space))
@@ -318,145 +313,58 @@ def _unique(pairs: list) -> dict:
     return result
 
 
-@dataclass(frozen=True, eq=False)
-class _ImageFile:
-    """Content of an image file in its own type, ``(height, width, channels)``: ``colors`` channels, then any alpha."""
-
-    values: np.ndarray
-    colors: int
-    has_alpha: bool
-    named: bool  # grey or RGB, not the channels of a multi-channel EXR
-    color_space: str | None = None  # if the image states it
-
-    @staticmethod
-    def of_pixels(values: np.ndarray, pixels, color_space: str | None = None) -> _ImageFile:
-        """Return the content of a ``mi.Bitmap`` of a pixel format."""
-        formats = type(pixels)
-        has_alpha = pixels in (formats.YA, formats.RGBA)
-        named = has_alpha or pixels in (formats.Y, formats.RGB)
-        return _ImageFile(values, values.shape[2] - has_alpha, has_alpha, named, color_space)
-
-    def select(self, channels, where: str) -> np.ndarray:
-        """Return the values of ``channels`` of a manifest; grey is red, green and blue at once."""
-        count = self.values.shape[2]
-        if isinstance(channels, str) and channels and self.named:
-            letters = {"r": 0, "g": 1 % self.colors, "b": 2 % self.colors}
-            if self.has_alpha:
-                letters["a"] = self.colors
-            indices = [letters.get(letter) for letter in channels]
-            allowed = f"letters among {''.join(letters)}"
-        else:
-            indices = channels if isinstance(channels, list) and channels else [None]
-            indices = [i if type(i) is int and 0 <= i < count else None for i in indices]
-            allowed = f"a list of indices from 0 to {count - 1}"
-        if None in indices:
-            raise SourceError(f"{where} has the channels {channels!r:.40}, allowed for its file are {allowed}")
-        if len(set(channels)) < len(channels):
-            raise SourceError(f"{where} has the channels {channels!r:.40}, one of them twice")
-        return self.values[:, :, indices]
-
-    def opaque(self, where: str) -> np.ndarray:
-        """Return the colours. Raises :class:`SourceError` for transparency, which would be lost."""
-        colors, alpha = self.values[:, :, : self.colors], self.values[:, :, self.colors :]
-        one = np.iinfo(alpha.dtype).max if alpha.dtype.kind == "u" else 1
-        if self.has_alpha and (alpha != one).any():
-            raise SourceError(
-                f'{where} is from a file with transparency: "channels" is needed ("rgb", and "a" for a map of its own)'
-            )
-        return colors
+def _select(picture: Picture, channels, where: str) -> np.ndarray:
+    """Return the values of ``channels`` of a manifest; grey is red, green and blue at once."""
+    count = picture.values.shape[2]
+    if isinstance(channels, str) and channels and picture.named:
+        letters = {"r": 0, "g": 1 % picture.colors, "b": 2 % picture.colors}
+        if picture.has_alpha:
+            letters["a"] = picture.colors
+        indices = [letters.get(letter) for letter in channels]
+        allowed = f"letters among {''.join(letters)}"
+    else:
+        indices = channels if isinstance(channels, list) and channels else [None]
+        indices = [i if type(i) is int and 0 <= i < count else None for i in indices]
+        allowed = f"a list of indices from 0 to {count - 1}"
+    if None in indices:
+        raise SourceError(f"{where} has the channels {channels!r:.40}, allowed for its file are {allowed}")
+    if len(set(channels)) < len(channels):
+        raise SourceError(f"{where} has the channels {channels!r:.40}, one of them twice")
+    return picture.values[:, :, indices]
 
 
-def _read(path: Path) -> _ImageFile:
-    """Read an image file.
-
-    Raises :class:`SourceError` if ``mitsuba.Bitmap`` cannot read it, it is cut short, or it takes more memory than a
-    file of its size may (:mod:`~mi_diffind.core.archives`).
-    """
-    import mitsuba as mi
-
-    _check_complete(path, _read_bytes(path))
-    try:
-        check_picture(path)
-    except LimitError as e:
-        raise SourceError(str(e)) from None
-    # A TGA file has no signature
-    file_format = mi.Bitmap.FileFormat.TGA if path.suffix.lower() == ".tga" else mi.Bitmap.FileFormat.Auto
-    try:
-        with threads_for_files():
-            bitmap = mi.Bitmap(str(path), file_format)
-        values = np.array(bitmap)
-        pixels = bitmap.pixel_format()
-    except (RuntimeError, MemoryError, ValueError) as e:
+def _opaque(picture: Picture, where: str) -> np.ndarray:
+    """Return the colours. Raises :class:`SourceError` for transparency, which would be lost."""
+    colors, alpha = picture.values[:, :, : picture.colors], picture.values[:, :, picture.colors :]
+    one = np.iinfo(alpha.dtype).max if alpha.dtype.kind == "u" else 1
+    if picture.has_alpha and (alpha != one).any():
         raise SourceError(
-            f"{path}: cannot be read as an image, it is damaged, cut short or of an unknown format ({reason(e)})"
-        ) from None
-    if values.size == 0 or values.dtype.name not in _DEPTHS:
-        raise SourceError(f"{path}: has the shape {values.shape} and type {values.dtype}, which is not supported")
-    if values.dtype.name == "uint32" and values.max() > 2**24:
-        raise SourceError(f"{path}: has whole numbers up to {values.max():,}, single precision is exact to {2**24:,}")
-    values = values.reshape(*values.shape[:2], -1)
-    if values.shape[2] > MAX_CHANNELS:
-        raise SourceError(f"{path}: has {values.shape[2]} channels, at most {MAX_CHANNELS} are supported")
-    return _ImageFile.of_pixels(values, pixels)
+            f'{where} is from a file with transparency: "channels" is needed ("rgb", and "a" for a map of its own)'
+        )
+    return colors
 
 
-def _in_memory(array, where: str) -> _ImageFile:
-    """Return an array or a ``mi.Bitmap`` as the content of an image file. Raises :class:`SourceError`."""
-    pixels = array.pixel_format() if hasattr(array, "pixel_format") else None
-    values = array.numpy() if hasattr(array, "numpy") and pixels is None else np.array(array)
-    if values.dtype.name not in _DEPTHS or values.dtype.name == "uint32":
+def _read(path: Path) -> Picture:
+    """Read an image file. Raises :class:`SourceError`."""
+    try:
+        return read_picture(path)
+    except PictureError as e:
+        raise SourceError(str(e)) from None
+
+
+def _in_memory(array, where: str) -> tuple[Picture, str | None]:
+    """Return an array or a ``mi.Bitmap`` as a picture, and its color space if it states one."""
+    bitmap = hasattr(array, "pixel_format")
+    values = array.numpy() if hasattr(array, "numpy") and not bitmap else np.array(array)
+    if values.dtype.name not in DEPTHS or values.dtype.name == "uint32":
         raise SourceError(f"{where}: has the type {values.dtype}, allowed are uint8, uint16 and floats up to float64")
     if values.ndim not in (2, 3) or values.size == 0:
         raise SourceError(f"{where}: has the shape {values.shape}, expected (height, width, channels), none of them 0")
+    if bitmap:
+        # Bitmaps of 8 bits are sRGB unless somebody says otherwise: the map's name decides
+        return Picture.from_bitmap(array), None if array.srgb_gamma() and values.dtype.name in ENCODED else "linear"
     values = values.reshape(*values.shape[:2], -1)
-    if pixels is None:
-        return _ImageFile(values, values.shape[2], False, values.shape[2] in (1, 3))
-    # Bitmaps of 8 bits are sRGB unless somebody says otherwise: the map's name decides
-    encoded = array.srgb_gamma() and values.dtype.name in _ENCODED
-    return _ImageFile.of_pixels(values, pixels, None if encoded else "linear")
-
-
-def _read_bytes(path: Path) -> bytes:
-    """Return the content of a file. Raises :class:`SourceError`, also for pipes, devices and very large files."""
-    most = MOST_TEXT if path.suffix.lower() == ".json" else memory() // 4
-    if fault := irregular(path, most):
-        raise SourceError(f"{shown(path)}: {fault}")
-    try:
-        return path.read_bytes()
-    except FileNotFoundError:
-        raise SourceError(f"{path}: no such file") from None
-    except IsADirectoryError:
-        raise SourceError(f"{path}: is a folder, an image or a manifest (.json) is expected") from None
-    except (OSError, ValueError) as e:
-        raise SourceError(f"{path}: cannot be read ({reason(e)})") from None
-
-
-_JPEG_MARKER = re.compile(rb"\xff+([\x01-\xcf\xd8-\xfe])")  # without the markers inside of compressed data
-
-
-def _check_complete(path: Path, data: bytes) -> None:
-    """Raise :class:`SourceError` for faults that Mitsuba's decoders accept: a missing end, colours of a palette."""
-    if data.startswith(b"\x89PNG\r\n\x1a\n") and b"IEND\xaeB`\x82" not in data:
-        raise SourceError(f"{path}: is cut short, a PNG file ends with an IEND chunk")
-    if data.startswith(b"\xff\xd8\xff") and not _jpeg_ends(data):
-        raise SourceError(f"{path}: is cut short, a JPEG file ends with an end-of-image marker")
-    if data.startswith(b"BM") and data[28:30] == b"\x08\x00":
-        start = 14 + int.from_bytes(data[14:18], "little")
-        entries = min(int.from_bytes(data[46:50], "little") or 256, 256)
-        if any(set(data[start + 4 * i : start + 4 * i + 3]) != {i} for i in range(entries)):
-            raise SourceError(f"{path}: is a BMP file with a palette, which is not supported")
-
-
-def _jpeg_ends(data: bytes) -> bool:
-    """Return whether a JPEG file has its last marker."""
-    position = 0
-    while match := _JPEG_MARKER.search(data, position):
-        position, marker = match.end(), match[1][0]
-        if marker == 0xD9:
-            return True
-        if marker not in (0x01, 0xD8):  # these have no length
-            position += int.from_bytes(data[position : position + 2], "big")
-    return False
+    return Picture(values, ("",) * values.shape[2], named=values.shape[2] in (1, 3)), None
 
 
 @dataclass(frozen=True, eq=False)
@@ -524,7 +432,7 @@ def _assemble(raw: list[_RawMap], where, nonfinite: str, notes: list[str] = ()) 
         number_type = m.values.dtype.name
         color_space = m.color_space
         if color_space is None:
-            srgb = m.content.colours and number_type in _ENCODED and m.values.shape[2] in (1, 3)
+            srgb = m.content.colours and number_type in ENCODED and m.values.shape[2] in (1, 3)
             color_space = "srgb" if srgb else "linear"
         notes += _notes_on(m)
         values = m.values
@@ -535,12 +443,12 @@ def _assemble(raw: list[_RawMap], where, nonfinite: str, notes: list[str] = ()) 
             values[..., 1] = one - values[..., 1]
         with np.errstate(over="ignore"):  # float64 beyond float32 becomes infinite and is reported below
             values = values.astype("<f4", order="C")
-        if number_type in _ENCODED:
+        if number_type in ENCODED:
             values /= np.iinfo(m.values.dtype).max
         else:
             cleaned += _check_finite(values, f'{m.file or where}: map "{m.name}"', nonfinite)
         values.flags.writeable = False
-        depth = _DEPTHS[number_type]
+        depth = DEPTHS[number_type]
         maps.append(Map(m.name, values, color_space, role, depth, m.file))
         layout = [m.name, color_space, role, depth, *values.shape]
         digest.update(json.dumps(layout).encode() + b"\n")
@@ -561,7 +469,7 @@ def _notes_on(m: _RawMap) -> list[str]:
         return [f'map "{m.name}": looks like a normal map, but is taken for other data: call it "normal"']
     if m.content is not _UNKNOWN:
         return [] if content_of(m.name) else [f'map "{m.name}": has the role {m.content.role} by the name of its file']
-    colours = m.color_space is None and m.values.dtype.name in _ENCODED and m.values.shape[2] == 3
+    colours = m.color_space is None and m.values.dtype.name in ENCODED and m.values.shape[2] == 3
     if not colours or _equal(m.values):
         return []
     return [f'map "{m.name}": an unknown name, taken for data, linear: give it "color_space": "srgb" if it is a colour']

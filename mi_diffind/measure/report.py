@@ -165,19 +165,20 @@ def summary(result: dict) -> list[str]:
         lines += ["", f"{case}: ns each, floor subtracted ({floors}); ± half the interquartile range"]
         query = next(iter(queries))
         cells = [["", *queries, "flops", "reads", *([f"ms {PASS}"] if passes else []), "bytes", "accuracy", ""]]
-        for name, t in queries[query].items():
-            c, operations = result["candidates"][name], t["operations"]
+        front = passes if measured["of_passes"] else queries[query]
+        for name in dict.fromkeys((*queries[query], *passes)):
+            c, operations = result["candidates"][name], queries[query].get(name, {}).get("operations", {})
             accuracy = c["errors"].get(measured["accuracy"])
             shown = "exact" if c["is_truth"] else "-" if accuracy is None else f"{accuracy:.1f} dB"
             cells.append([
                 name, *(time_cell(timings.get(name)) for timings in queries.values()),
-                f"{operations['flops']}", f"{operations['gathers']}",
+                *(str(operations.get(key, "")) for key in ("flops", "gathers")),
                 *([time_cell(passes.get(name), 1)] if passes else []), f"{c['bytes']:,}", shown,
-                f"{'*' if t['on_front'] else ' '}{' not converged' * (c['converged'] is False)}",
+                f"{'*' * bool(front.get(name, {}).get('on_front')):1}{' not converged' * (c['converged'] is False)}",
             ])  # fmt: skip
         lines += grid(cells)
     if result["cases"]:
-        lines.append(f"  (* on the Pareto front of accuracy and {query}; flops and reads are those of {query})")
+        lines.append(f"  (* on the Pareto front of accuracy and time; flops and reads are those of {query})")
     for case, measured in result["cases"].items():
         ratios = measured["ratios"]
         pairs = dict.fromkeys(pair for by_pair in ratios.values() for pair in by_pair)

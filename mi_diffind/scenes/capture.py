@@ -7,6 +7,7 @@ the scene's own coordinates. ``capture.json`` records the settings; the same cal
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import hashlib
@@ -26,16 +27,16 @@ import numpy as np
 
 from .. import __version__, plugins
 from ..core import compat
-from ..core.errors import DiffindError, UsageError, reason
+from ..core.errors import UsageError, reason
 from ..core.files import replacing, writable_folder, write_json
 from ..core.jobs import run_jobs
-from ..core.progress import interruptible, progress_bar
 from ..core.runtime import use_variant
 from ..core.threads import threads_for_files
 from ..core.units import check_memory, check_samples
 from ..images import srgb
 from ..plugins.support import footprint
 from . import loading, splats
+from .loading import SceneError
 from .poses import orbit_directions, pose, sphere_directions, upright_frame
 
 #: Samples of the whole image in one pass.
@@ -66,10 +67,6 @@ FORMATS = ("png", "exr")
 RECORD = "capture.json"
 
 
-class CaptureError(DiffindError, RuntimeError):
-    """A scene cannot be captured with these settings, or not in this folder; the message is one sentence."""
-
-
 @dataclass(frozen=True)
 class CaptureSettings:
     """Settings of a capture: number and size of the views, samples, camera path.
@@ -81,7 +78,7 @@ class CaptureSettings:
     the image). ``path``: "sphere", all over it, or "orbit", once around the axis ``up``. ``elevation``: the lowest and
     the highest, degrees above the plane normal to ``up``; an orbit swings between them (default: −90, 90 for a sphere,
     20, 20 for an orbit). ``format``: "png", as displayed, 8 bits, or "exr", linear half floats. ``box``: of 3D
-    Gaussians, the lower and the upper corner of what is captured (default: :meth:`.splats.Splats.cropped`). Other
+    Gaussians, the lower and the upper corner of what is captured (default: :meth:`.splats.Splats.crop`). Other
     values raise :class:`.UsageError`.
     """
 
@@ -175,14 +172,6 @@ class Captured:
         }  # fmt: skip
 
     @property
-    def poses(self) -> np.ndarray:
-        """Camera-to-world matrices ``(views, 4, 4)`` of all ``files``, in this order; cameras look along −z."""
-        lists = [json.loads(path.read_text(encoding="utf-8")) for path in self.folder.glob("transforms_*.json")]
-        frames = [frame for one in lists for frame in one["frames"]]
-        matrices = {frame["file_path"].removeprefix("./"): frame["transform_matrix"] for frame in frames}
-        return np.array([matrices[name] for name in self.files], np.float64).reshape(-1, 4, 4)
-
-    @property
     def images(self) -> list[np.ndarray]:
         """Images of all ``files``, ``(height, width, 4)``, read when asked for: uint8, or of EXR linear floats."""
         with threads_for_files():
@@ -218,8 +207,8 @@ def capture(
     ``path="orbit"``, …; ``defines`` replace the file's ``<default>`` parameters; ``workers`` processes share the views,
     or those of the Dask cluster ``scheduler``. The folder is created if its parent exists. Views of an earlier capture
     with the same settings of the same scene are kept, unless a dictionary holds objects that exist already; after
-    Ctrl-C the current view is the last. Raises :class:`.UsageError` for bad settings, :class:`CaptureError`, also for a
-    folder with other settings, :class:`.SceneError`, :class:`.SplatsError` and :class:`.OutputError`.
+    Ctrl-C the current view is the last. Raises :class:`.UsageError` for bad settings, :class:`.SceneError`, also for a
+    folder with other settings, and :class:`.OutputError`.
     """
     use_variant()
     settings = _settings(scene, given)
@@ -236,69 +225,60 @@ def capture(
     centre = box.mean(axis=0) if settings.centre is None else np.array(settings.centre, np.float64)
     radius = settings.radius or subject.reach(centre) / math.sin(math.radians(settings.fov) / 2)
     if not radius > 0:
-        raise CaptureError(f"{subject.path}: the captured objects have no extent, --radius has to be given")
-    camera = subject.camera(settings)
+        raise SceneError(f"{subject.path}: the captured objects have no extent, --radius has to be given")
+    subject.prepare()
     write_json(folder / RECORD, record)
-    splits, left = _plan(settings, centre, radius), []
-    for split, views in splits.items():
+    poses, start = _plan(settings, centre, radius), time.perf_counter()
+    for split in poses:
         writable_folder(folder / split, create=True)
-        left += [(split, i) for i in range(len(views)) if not (folder / _name(split, i, settings)).is_file()]
-    total, start, rendered, opaque = sum(map(len, splits.values())), time.perf_counter(), 0, bool(left)
-    _write_lists(folder, settings, splits, box)
-    if left and (workers or scheduler):
-        views = _view_jobs(scene, subject, (settings, centre, radius), folder, left)
-        outcomes = run_jobs(
-            render_separately, views, workers, scheduler, progress, "capture", "view", total - len(left)
-        )
+    views = {_name(split, i, settings): (split, i) for split, places in poses.items() for i in range(len(places))}
+    missing = {name: view for name, view in views.items() if not (folder / name).is_file()}
+    _write_lists(folder, settings, poses, box)
+    render, rendered, opaque = functools.partial(_render, subject, poses, folder), 0, bool(missing)
+    if workers or scheduler:
+        render = functools.partial(render_separately, _pickle(scene, subject, centre, radius), folder.resolve())
+    jobs = run_jobs(render, missing, workers, scheduler, progress, "capture", "view", len(views) - len(missing))
+    with contextlib.closing(jobs) as outcomes:
         for outcome in outcomes:
             if outcome.failure:
-                raise CaptureError(f"{outcome.name}: {outcome.failure}")
+                raise SceneError(f"{outcome.name}: {outcome.failure}")
             rendered += 1
             opaque &= outcome.value
-    elif left:
-        bar = progress_bar("capture", total, "view", progress, initial=total - len(left))
-        with interruptible() as stop, bar:
-            for split, i in left:
-                opaque &= _render(camera, splits, folder, split, i)
-                rendered += 1
-                bar.update()
-                if stop.is_set():
-                    break
     seconds = time.perf_counter() - start
-    files = _write_lists(folder, settings, splits, box)
-    return Captured(folder, files, total, rendered, seconds, radius, centre, box, opaque, subject.notes)
+    files = _write_lists(folder, settings, poses, box)
+    return Captured(folder, files, len(views), rendered, seconds, radius, centre, box, opaque, subject.notes)
 
 
-def _render(camera: CaptureCamera, splits: dict, folder: Path, split: str, i: int) -> bool:
+def _render(subject: SceneSubject, poses: dict, folder: Path, view: tuple[str, int]) -> bool:
     """Render a view, write it, and return whether it is opaque everywhere."""
-    settings = camera.settings
-    image = camera.render(splits[split][i], ((settings.seed << 16) + 2 * i + (split == "test")) % 2**32)
-    _write(folder / _name(split, i, settings), image)
+    split, i = view
+    seed = (subject.settings.seed << 16) + 2 * i + (split == "test")
+    image = subject.render(poses[split][i], seed % 2**32)
+    _write(folder / _name(split, i, subject.settings), image)
     return bool((image[..., 3] > 0.999).all())
 
 
-def _view_jobs(scene, subject: SceneSubject, given: tuple, folder: Path, left: list) -> dict[str, tuple]:
-    """Return the jobs of :func:`render_separately`. Raises :class:`.UsageError`."""
+def _pickle(scene, subject: SceneSubject, centre: np.ndarray, radius: float) -> bytes:
+    """Return what another process needs to render views (:func:`render_separately`). Raises :class:`.UsageError`."""
     source = scene if isinstance(scene, dict) else str(subject.path.resolve())
     try:
-        content = pickle.dumps((source, subject.record()["defines"], *given, mi.variant()))
+        return pickle.dumps((source, subject.record()["defines"], subject.settings, centre, radius, mi.variant()))
     except Exception:  # of the objects in a dictionary, each has its own
         raise UsageError("workers: the scene holds objects of this process, a scene file is needed") from None
-    return {_name(split, i, given[0]): (content, str(folder.resolve()), split, i) for split, i in left}
 
 
-def render_separately(view: tuple[bytes, str, str, int]) -> bool:
+def render_separately(content: bytes, folder: Path, view: tuple[str, int]) -> bool:
     """Render a view in this process, which loads the scene once, and write it; return whether it is opaque."""
-    content, folder, split, i = view
-    camera, splits = _cached_camera(content)
-    return _render(camera, splits, Path(folder), split, i)
+    return _render(*_cached_subject(content), folder, view)
 
 
 @functools.lru_cache(maxsize=1)
-def _cached_camera(content: bytes) -> tuple[CaptureCamera, dict]:
+def _cached_subject(content: bytes) -> tuple[SceneSubject, dict]:
     scene, defines, settings, centre, radius, variant = pickle.loads(content)
     use_variant(variant)
-    return _subject(scene, defines, settings).camera(settings), _plan(settings, centre, radius)
+    subject = _subject(scene, defines, settings)
+    subject.prepare()
+    return subject, _plan(settings, centre, radius)
 
 
 def _subject(scene, defines: Mapping | None, settings: CaptureSettings) -> SceneSubject | splats.SplatSubject:
@@ -306,20 +286,20 @@ def _subject(scene, defines: Mapping | None, settings: CaptureSettings) -> Scene
     if not splats.is_splats(scene):
         if settings.box is not None:
             raise UsageError("box: given with a scene, allowed are files of 3D Gaussians; objects names shapes")
-        return SceneSubject(scene, defines, settings.objects)
+        return SceneSubject(scene, defines, settings)
     for name, value in (("defines", defines), ("objects", settings.objects)):
         if value:
             raise UsageError(f"{name}: given with the 3D Gaussians {scene}, allowed are scenes")
-    return splats.SplatSubject(scene, settings.box)
+    return splats.SplatSubject(scene, settings)
 
 
 class SceneSubject:
-    """Scene as the subject of a capture, of which the shapes with the ids ``objects`` are captured."""
+    """Scene as the subject of a capture, seen by a camera beside its own sensors."""
 
     notes = ()
 
-    def __init__(self, scene, defines: Mapping | None, objects: tuple[str, ...] = ()):
-        self.parsed, self.objects = loading.ParsedScene(scene, defines), objects
+    def __init__(self, scene, defines: Mapping | None, settings: CaptureSettings):
+        self.parsed, self.settings = loading.ParsedScene(scene, defines), settings
         self.path = self.parsed.path
 
     @functools.cached_property
@@ -331,19 +311,23 @@ class SceneSubject:
                 if not loading.nests_another(props):  # the nested one follows the paths
                     props["hide_emitters"] = True
 
-        return self.parsed.load(change=hide, merge=False, needs=())
+        parsed = self.parsed.copy()
+        parsed.change(hide)
+        return parsed.load(merge=False, needs=())
 
     def shapes(self) -> list:
-        """Return the captured shapes, without ``objects`` all that are no lights. Raises :class:`CaptureError`."""
+        """Return the captured shapes, without ``objects`` all that are no lights. Raises :class:`.SceneError`."""
         shapes = self.scene.shapes()
         ids = {s.id() for s in shapes}
-        for name in self.objects:
+        for name in self.settings.objects:
             if name not in ids:
                 named = ", ".join(sorted(n for n in ids if n and not n.startswith("_"))) or "none has one"
-                raise CaptureError(f'objects: found "{name}", the ids of the scene\'s shapes are: {named}')
-        shapes = [s for s in shapes if (s.id() in self.objects if self.objects else not s.is_emitter())]
+                raise SceneError(f'objects: found "{name}", the ids of the scene\'s shapes are: {named}')
+        shapes = [
+            s for s in shapes if (s.id() in self.settings.objects if self.settings.objects else not s.is_emitter())
+        ]
         if not shapes:
-            raise CaptureError("the scene has no surfaces but lights, there is nothing to capture")
+            raise SceneError("the scene has no surfaces but lights, there is nothing to capture")
         return shapes
 
     def record(self) -> dict:
@@ -358,10 +342,10 @@ class SceneSubject:
         }
 
     def bounds(self) -> np.ndarray:
-        """Return the corners ``(2, 3)`` of the captured objects' box. Raises :class:`CaptureError`."""
+        """Return the corners ``(2, 3)`` of the captured objects' box. Raises :class:`.SceneError`."""
         box = loading.bounds(self.shapes())
         if not np.isfinite(box).all():
-            raise CaptureError("the box around the captured objects is not finite: name the objects")
+            raise SceneError("the box around the captured objects is not finite: name the objects")
         return box
 
     def reach(self, centre: np.ndarray) -> float:
@@ -376,9 +360,50 @@ class SceneSubject:
             reach = max(reach, float(np.linalg.norm(points - centre, axis=1).max()))
         return reach
 
-    def camera(self, settings: CaptureSettings) -> CaptureCamera:
-        """Return the camera of a capture with these settings."""
-        return CaptureCamera(self, settings)
+    def prepare(self) -> None:
+        """Set up the camera. Raises :class:`.SceneError`."""
+        side, mono = self.settings.resolution, mi.is_monochromatic
+        self.sensor = mi.load_dict({
+            "type": "perspective", "fov": self.settings.fov, "fov_axis": "x", "near_clip": 1e-3, "far_clip": 1e6,
+            "film": {
+                "type": "hdrfilm", "width": side, "height": side, "rfilter": {"type": "box"},
+                "pixel_format": "luminance_alpha" if mono else "rgba", "component_format": "float32",
+            },
+            "sampler": {"type": "multijitter", "sample_count": self.settings.spp},
+        })  # fmt: skip
+        self.parameters = mi.traverse(self.sensor)
+        self.integrator = self.scene.integrator() or mi.load_dict({"type": "path", "hide_emitters": True})
+        if self.settings.objects:
+            self.integrator = _only(self.integrator, self.shapes())
+
+    def render(self, pose: np.ndarray, seed: int) -> np.ndarray:
+        """Render a view, ``(height, width, 4)``, float32: linear colours, multiplied by alpha, and alpha."""
+        matrix = pose @ np.diag([-1.0, 1.0, -1.0, 1.0])  # Mitsuba's cameras look along +z, x to the left
+        sensor, side, spp = self.sensor, self.settings.resolution, self.settings.spp
+        self.parameters["to_world"] = type(self.parameters["to_world"])(mi.ScalarTransform4f(matrix))
+        self.parameters.update()
+        footprint.attach(self.scene, sensor, spp)
+        total, done, passes, bad = 0.0, 0, 0, np.zeros((side, side), bool)
+        most = 1 << (max(1, PASS // side**2).bit_length() - 1)
+        while done < spp:
+            n = min(most, spp - done)
+            if loading.sampler_count(sensor, n) > n:  # multijitter takes powers of four as they are
+                n = 4 ** ((n.bit_length() - 1) // 2)
+            with loading.scene_errors(None):
+                seed_of_pass = (seed * 4096 + passes) % 2**32
+                image = mi.render(self.scene, sensor=sensor, integrator=self.integrator, spp=n, seed=seed_of_pass)
+            image = image.numpy().astype(np.float64)
+            bad |= ~np.isfinite(image).all(axis=-1)
+            total = total + n * np.where(np.isfinite(image), image, 0)
+            done, passes = done + n, passes + 1
+        if bad.any():
+            plugins.warn(
+                f"{int(bad.sum()):,} of {bad.size:,} pixels of a view have NaN or infinite samples, which count 0"
+            )
+        image = total / done
+        colours = 1 if mi.is_monochromatic else 3
+        alpha = np.clip(image[..., colours : colours + 1], 0, 1)
+        return np.concatenate([image[..., :colours].repeat(3 // colours, axis=-1), alpha], axis=-1).astype(np.float32)
 
 
 def _settings(scene, given: dict) -> CaptureSettings:
@@ -404,59 +429,6 @@ def _plan(settings: CaptureSettings, centre: np.ndarray, radius: float) -> dict[
     }
 
 
-class CaptureCamera:
-    """Camera of a capture, beside the sensors of the loaded scene."""
-
-    def __init__(self, subject: SceneSubject, settings: CaptureSettings):
-        self.scene, self.settings = subject.scene, settings
-        side = settings.resolution
-        mono = mi.is_monochromatic
-        self.sensor = mi.load_dict({
-            "type": "perspective", "fov": settings.fov, "fov_axis": "x", "near_clip": 1e-3, "far_clip": 1e6,
-            "film": {
-                "type": "hdrfilm", "width": side, "height": side, "rfilter": {"type": "box"},
-                "pixel_format": "luminance_alpha" if mono else "rgba", "component_format": "float32",
-            },
-            "sampler": {"type": "multijitter", "sample_count": settings.spp},
-        })  # fmt: skip
-        self.parameters = mi.traverse(self.sensor)
-        self.integrator = self.scene.integrator()
-        if self.integrator is None:
-            self.integrator = mi.load_dict({"type": "path", "hide_emitters": True})
-        if settings.objects:
-            self.integrator = _only(self.integrator, subject.shapes())
-
-    def render(self, pose: np.ndarray, seed: int) -> np.ndarray:
-        """Render a view, ``(height, width, 4)``, float32: linear colours, multiplied by alpha, and alpha."""
-        matrix = pose @ np.diag([-1.0, 1.0, -1.0, 1.0])  # Mitsuba's cameras look along +z, x to the left
-        self.parameters["to_world"] = type(self.parameters["to_world"])(mi.ScalarTransform4f(matrix))
-        self.parameters.update()
-        footprint.attach(self.scene, self.sensor, self.settings.spp)
-        total, done, passes = 0.0, 0, 0
-        bad = np.zeros((self.settings.resolution,) * 2, bool)
-        most = 1 << (max(1, PASS // self.settings.resolution**2).bit_length() - 1)
-        while done < self.settings.spp:
-            n = min(most, self.settings.spp - done)
-            if loading.sampler_count(self.sensor, n) > n:  # multijitter takes powers of four as they are
-                n = 4 ** ((n.bit_length() - 1) // 2)
-            with loading.scene_errors(None):
-                image = mi.render(
-                    self.scene, sensor=self.sensor, integrator=self.integrator, spp=n,
-                    seed=(seed * 4096 + passes) % 2**32,
-                ).numpy().astype(np.float64)  # fmt: skip
-            bad |= ~np.isfinite(image).all(axis=-1)
-            total = total + n * np.where(np.isfinite(image), image, 0)
-            done, passes = done + n, passes + 1
-        if bad.any():
-            plugins.warn(
-                f"{int(bad.sum()):,} of {bad.size:,} pixels of a view have NaN or infinite samples, which count 0"
-            )
-        image = total / done
-        colours = 1 if mi.is_monochromatic else 3
-        alpha = np.clip(image[..., colours : colours + 1], 0, 1)
-        return np.concatenate([image[..., :colours].repeat(3 // colours, axis=-1), alpha], axis=-1).astype(np.float32)
-
-
 def _only(inner, shapes: list):
     """Return an integrator whose camera rays see only these ``shapes``, and pass through all others.
 
@@ -465,12 +437,12 @@ def _only(inner, shapes: list):
     """
     for shape in shapes:
         if hasattr(shape, "seen_by"):
-            raise CaptureError(
+            raise SceneError(
                 f'objects: found "{shape.id()}", whose arrays {" and ".join(shape.seen_by)} traces; allowed are meshes '
                 f"and Mitsuba's own shapes"
             )
     if not isinstance(inner, mi.SamplingIntegrator):
-        raise CaptureError(f"objects: the integrator {inner.class_name()} follows no rays from a camera, as path does")
+        raise SceneError(f"objects: the integrator {inner.class_name()} follows no rays from a camera, as path does")
     replays = compat.samples_in_python(inner)
 
     class ObjectsOnly(mi.SamplingIntegrator):
@@ -503,16 +475,16 @@ def _only(inner, shapes: list):
 
 
 def _check_record(folder: Path, record: dict) -> None:
-    """Raise :class:`CaptureError` if a folder holds a capture with other settings, or views of another program."""
+    """Raise :class:`.SceneError` if a folder holds a capture with other settings, or views of another program."""
     path = folder / RECORD
     if not path.is_file():
         if next(folder.glob("transforms*.json"), None) is not None:
-            raise CaptureError(f"{folder}: holds views that were not captured here, a folder of its own is needed")
+            raise SceneError(f"{folder}: holds views that were not captured here, a folder of its own is needed")
         return
     try:
         before, now = _flat(json.loads(path.read_text(encoding="utf-8"))), _flat(record)
     except (ValueError, OSError, AttributeError) as e:
-        raise CaptureError(f"{path}: cannot be read ({reason(e)})") from None
+        raise SceneError(f"{path}: cannot be read ({reason(e)})") from None
     keys = [key for key in dict.fromkeys([*now, *before]) if before.get(key) != now.get(key)]
     if keys:
         changes = [
@@ -521,7 +493,7 @@ def _check_record(folder: Path, record: dict) -> None:
             else f"{key[-1]}: {before.get(key)}, now {now.get(key)}"
             for key in keys
         ]
-        raise CaptureError(
+        raise SceneError(
             f"{folder}: holds a capture with other settings ({'; '.join(changes)}): take those, or another folder"
         )
 

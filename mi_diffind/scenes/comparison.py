@@ -159,6 +159,56 @@ class _Side:
         return (sum(self.halves) / sum(self.samples)).astype(np.float32)
 
 
+@dataclass
+class ComparedScenes:
+    """Scenes that are compared: the one as ``written``, and its ``truths`` by name, the exact one last.
+
+    For each truth, ``put_in`` lists the plugins that replace others, and ``oversampling`` is the multiple of samples
+    that it is rendered with. ``replaced`` and ``learned`` describe the plugins of the scene as written,
+    ``conversions`` what became of Mitsuba's plugins.
+    """
+
+    parsed: loading.ParsedScene
+    written: object
+    truths: dict[str, object]
+    put_in: dict[str, list[str]]
+    oversampling: dict[str, int]
+    replaced: list[dict]
+    learned: list[dict]
+    conversions: list[conversion.Conversion]
+
+
+def load_compared(
+    scene, against: str | None = None, learn: Sequence[str] = (), defines=None, progress: bool = True
+) -> ComparedScenes:
+    """Load a scene as written and with counterparts; arguments and errors as of :func:`compare`."""
+    use_variant()
+    loading.check_counterpart(against or "exact")
+    parsed = loading.ParsedScene(scene, defines)
+    if learn and parsed.description:
+        raise UsageError("learn: given with a scene in memory, allowed are scene files")
+    conversions = conversion.replace_stock(parsed, learn, progress=progress)
+    replaced = parsed.learned_plugins(against or "exact")
+    if not replaced:
+        what = f'plugin that "{against}" can stand for' if against not in (None, "exact") else "learned plugin"
+        names = ", ".join(plugins.with_counterpart(against or "exact"))
+        kept = "".join(f"; kept is {c}" for c in conversions if not c.learned)
+        raise loading.SceneError(f"{parsed.path}: names no {what} ({names}), so there is nothing to compare{kept}")
+    learned = [entry for entry in replaced if entry["plugin"] in plugins.with_counterpart()]
+    declared, truths, put_in, oversampling = plugins.declared(), {}, {}, {}
+    for name, names in ({against: (against,)} if against else _default_truths(replaced)).items():
+        counterparts = [declared[entry["plugin"]].counterpart(names) for entry in replaced]
+        plugins_put_in = [c.name for c in counterparts]
+        if learn and not against and name == "exact":
+            name, plugins_put_in = "stock", [c.stock for c in conversions if c.learned]
+            truths[name] = loading.load(scene, defines)
+        else:  # before the scene as written, since a counterpart may refuse
+            truths[name] = parsed.load(exact=True, against=names)
+        put_in[name] = list(dict.fromkeys(plugins_put_in))
+        oversampling[name] = max(c.oversampling for c in counterparts)
+    return ComparedScenes(parsed, parsed.load(), truths, put_in, oversampling, replaced, learned, conversions)
+
+
 def compare(
     scene: str | os.PathLike | dict,
     spp: int | None = None,
@@ -195,34 +245,13 @@ def compare(
     Ctrl-C ends the comparison after the current pair; ``spp`` and ``passes`` then state how many there were, and
     ``interrupted`` is true. Raises :class:`.SceneError`, also if the scene names no plugin with such a counterpart.
     """
-    use_variant()
-    if against and not plugins.with_counterpart(against):
-        others = dict.fromkeys(c.name for plugin in plugins.declared().values() for c in plugin.others)
-        raise loading.SceneError(f'"{against}": no plugin has this counterpart; there are {", ".join(others)}')
-    parsed = loading.ParsedScene(scene, defines)
-    if learn and parsed.description:
-        raise UsageError("learn: given with a scene in memory, allowed are scene files")
-    conversions = conversion.replace_stock(parsed, learn, progress=progress)
-    replaced = parsed.learned_plugins(against or "exact")
-    if not replaced:
-        what = f'plugin that "{against}" can stand for' if against not in (None, "exact") else "learned plugin"
-        names = ", ".join(plugins.with_counterpart(against or "exact"))
-        kept = "".join(f"; kept is {c}" for c in conversions if not c.learned)
-        raise loading.SceneError(f"{parsed.path}: names no {what} ({names}), so there is nothing to compare{kept}")
-    learned = [entry for entry in replaced if entry["plugin"] in plugins.with_counterpart()]
-    declared, sides, put_in = plugins.declared(), {}, {}
-    for name, names in ({against: (against,)} if against else _default_truths(replaced)).items():
-        counterparts = [declared[entry["plugin"]].counterpart(names) for entry in replaced]
-        plugins_put_in = [c.name for c in counterparts]
-        if learn and not against and name == "exact":
-            name, plugins_put_in = "stock", [c.stock for c in conversions if c.learned]
-            loaded = loading.load(scene, defines)
-        else:  # before the scene as written, since a counterpart may refuse
-            loaded = parsed.load(exact=True, against=names)
-        put_in[name] = list(dict.fromkeys(plugins_put_in))
-        oversampling = max(c.oversampling for c in counterparts)
-        sides[name] = _Side(loaded, oversampling, f"{parsed.path} with {', '.join(put_in[name])}")
-    written = _Side(parsed.load(), name=f"{parsed.path}, as written")
+    compared = load_compared(scene, against, learn, defines, progress)
+    parsed, put_in = compared.parsed, compared.put_in
+    sides = {
+        name: _Side(loaded, compared.oversampling[name], f"{parsed.path} with {', '.join(put_in[name])}")
+        for name, loaded in compared.truths.items()
+    }
+    written = _Side(compared.written, name=f"{parsed.path}, as written")
     spp = spp or written.scene.sensors()[0].sampler().sample_count()
     footprint.check_samples(footprint.textures(written.scene), spp)
     loading.check_size(written.scene, spp)
@@ -249,10 +278,10 @@ def compare(
         "passes": len(written.seconds),
         "interrupted": done < spp,
         "spp_requested": spp,
-        "replaced_plugins": len(replaced),
-        "learned_plugins": len(learned),
-        "table_bytes": parsed.table_bytes(learned),
-        "conversions": [vars(c) for c in conversions],
+        "replaced_plugins": len(compared.replaced),
+        "learned_plugins": len(compared.learned),
+        "table_bytes": parsed.table_bytes(compared.learned),
+        "conversions": [vars(c) for c in compared.conversions],
     }
     first, *further = (
         Comparison(written.image, side.image, {

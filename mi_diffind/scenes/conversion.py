@@ -178,7 +178,7 @@ def _replace_nodes(state, groups: dict[str, plugins.Plugin], folder: Path, progr
         if (before := props.plugin_name()) not in stock:
             continue
         word, plugin = stock[before]
-        if compat.object_type(plugins.OBJECT_TYPES[plugin.object_type]) != types[index]:
+        if getattr(mi.ObjectType, plugins.OBJECT_TYPES[plugin.object_type]) != types[index]:
             continue
         around = list(_around(references, index))
         name = next(filter(None, (nodes[i].id() for i in (index, *around))), "") or compat.parsed_place(state, index)

@@ -79,7 +79,7 @@ class Bounce:
         return self.rest < tolerance and self.rest_in_a_tile < IN_A_TILE * tolerance
 
 
-def probe(scene, integrator, spp: int = SPP, seed: int = 0) -> np.ndarray:
+def probe(scene, integrator, seed: int) -> np.ndarray:
     """Return the luminance of a coarse image by an integrator, ``(height, width)``; what is not finite counts as 0.
 
     A film with a crop window keeps its size. Raises :class:`.SceneError`.
@@ -88,7 +88,7 @@ def probe(scene, integrator, spp: int = SPP, seed: int = 0) -> np.ndarray:
     size = sensor.film().crop_size()
     width, height = (TILE * max(1, round(TILES * n / max(size))) for n in size)
     with loading.scene_errors(None), compat.film_size(sensor, width, height):
-        image = mi.render(scene, integrator=integrator, spp=spp, seed=seed % 2**32).numpy().astype(np.float64)
+        image = mi.render(scene, integrator=integrator, spp=SPP, seed=seed % 2**32).numpy().astype(np.float64)
     image = loading.colour_channels(image)
     luminance = image @ (0.212671, 0.715160, 0.072169) if image.shape[2] == 3 else image[..., 0]
     return np.where(np.isfinite(luminance), luminance, 0)
@@ -138,12 +138,12 @@ def auto_depth(parsed: loading.ParsedScene, tolerance: float = TOLERANCE, seed: 
     last = DEEPEST if max_depth < 0 else min(max_depth, DEEPEST)
     images: list[np.ndarray] = []
     with interruptible() as stop, progress_bar("probe", last, progress=progress) as bar:
-        full = probe(scene, parsed.load_integrator(max_depth), seed=seed)
+        full = probe(scene, parsed.load_integrator(max_depth), seed)
         shares = bounces([full], full)
         for depth in range(1, last + 1):
             if stop.is_set():
                 raise KeyboardInterrupt
-            images.append(full if depth == max_depth else probe(scene, parsed.load_integrator(depth), seed=seed))
+            images.append(full if depth == max_depth else probe(scene, parsed.load_integrator(depth), seed))
             shares = bounces(images, full)
             bar.update()
             if shares[-1].is_enough(tolerance):

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..core.errors import DiffindError, UsageError, reason
+from ..core.errors import UsageError, reason
 from ..core.files import irregular, replacing, shown, writable_folder, write_json
 
 #: Files of the scenes, as patterns: scenes, what they read, and the page that says where each comes from. References of
@@ -38,25 +38,14 @@ def files() -> list[Path]:
 
 @dataclass(frozen=True)
 class Written:
-    """Scenes that were copied to ``folder``: ``scenes`` are their names, ``count`` and ``size`` all files and bytes."""
+    """Files in a ``folder``: ``figures`` are those of the commands' ``--json``, ``text`` is printed."""
 
     folder: Path
-    scenes: tuple[str, ...]
-    count: int
-    size: int
-
-    @property
-    def figures(self) -> dict:
-        """JSON-serialisable dictionary."""
-        return {
-            "folder": str(self.folder),
-            "scenes": [str(self.folder / name) for name in self.scenes],
-            "files": self.count,
-            "bytes": self.size,
-        }
+    figures: dict
+    text: str
 
     def __str__(self) -> str:
-        return f"{self.folder}: {len(self.scenes)} scenes, {self.count} files, {self.size:,} bytes"
+        return self.text
 
 
 def examples(folder: str | os.PathLike) -> Written:
@@ -82,8 +71,10 @@ def examples(folder: str | os.PathLike) -> Written:
             writable_folder(target / parent, create=True)
         with replacing(place) as temporary:
             shutil.copyfile(origin / name, temporary)
-    scenes = tuple(str(name) for name in names if name.suffix == ".xml" and name.parent == Path())
-    return Written(target, scenes, len(names), sum((origin / name).stat().st_size for name in names))
+    scenes = [str(target / name) for name in names if name.suffix == ".xml" and name.parent == Path()]
+    size = sum((origin / name).stat().st_size for name in names)
+    figures = {"folder": str(target), "scenes": scenes, "files": len(names), "bytes": size}
+    return Written(target, figures, f"{target}: {len(scenes)} scenes, {len(names)} files, {size:,} bytes")
 
 
 # -- data of the pages ------------------------------------------------------------------------------------------------
@@ -93,10 +84,6 @@ TIMEOUT = 30.0
 
 #: Schemes of addresses.
 SCHEMES = ("https", "http")
-
-
-class DownloadError(DiffindError):
-    """A file cannot be fetched, or is not the one that is expected; the message is one sentence that names it."""
 
 
 @dataclass(frozen=True)
@@ -172,36 +159,17 @@ DOWNLOADS = {
 }
 
 
-@dataclass(frozen=True)
-class Fetched:
-    """Files of ``names`` in ``folder``; ``loaded`` of them were fetched, the others were there."""
-
-    folder: Path
-    names: tuple[str, ...]
-    files: tuple[Path, ...]
-    loaded: int
-
-    @property
-    def figures(self) -> dict:
-        """JSON-serialisable dictionary."""
-        return {**vars(self), "folder": str(self.folder), "files": [str(path) for path in self.files]}
-
-    def __str__(self) -> str:
-        lines = [f"{self.folder}: {len(self.files)} files, {self.loaded} fetched, SHA-256 as expected"]
-        return "\n".join([*lines, *(str(path) for path in self.files)])
-
-
 def fetch(
     names: str | Iterable[str],
     folder: str | os.PathLike = "data",
     base: str | None = None,
     progress: Callable[[str], None] | None = None,
-) -> Fetched:
+) -> Written:
     """Fetch the files of ``names``, of :data:`DOWNLOADS`, into ``folder/NAME``, and return what is there.
 
     A material gets a manifest, ``NAME.json``. Files that are there and have the right SHA-256 stay. ``base``: another
     address, of a mirror, that ends in a folder of the files of each name. ``progress`` is called with a line for each
-    file to fetch. Raises :class:`UsageError`, :class:`DownloadError` and :class:`.OutputError`; no unfinished file
+    file to fetch. Raises :class:`UsageError` and :class:`.OutputError`; no unfinished file
     stays.
     """
     names = tuple(dict.fromkeys([names] if isinstance(names, str) else names))
@@ -231,16 +199,19 @@ def fetch(
             paths.append(place / f"{name}.json")
             if not os.path.lexists(paths[-1]):
                 write_json(paths[-1], {"maps": each.maps})
-    return Fetched(target, names, tuple(paths), loaded)
+    listed = [str(path) for path in paths]
+    text = f"{target}: {len(listed)} files, {loaded} fetched, SHA-256 as expected"
+    figures = {"folder": str(target), "names": names, "files": listed, "loaded": loaded}
+    return Written(target, figures, "\n".join([text, *listed]))
 
 
 def _load(address: str, sha256: str, path: Path) -> None:
-    """Write the file at an address to ``path``. Raises :class:`DownloadError`."""
+    """Write the file at an address to ``path``. Raises :class:`UsageError`."""
     import pooch
 
     try:
         pooch.HTTPDownloader(timeout=TIMEOUT)(address, str(path), None)
     except (OSError, ValueError) as e:  # of requests
-        raise DownloadError(f"{shown(address)}: cannot be fetched: {reason(e)}") from None
+        raise UsageError(f"{shown(address)}: cannot be fetched: {reason(e)}") from None
     if (digest := pooch.file_hash(str(path))) != sha256:
-        raise DownloadError(f"{shown(address)}: found the SHA-256 {digest[:16]}…, {sha256[:16]}… is expected")
+        raise UsageError(f"{shown(address)}: found the SHA-256 {digest[:16]}…, {sha256[:16]}… is expected")

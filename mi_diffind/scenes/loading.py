@@ -6,6 +6,7 @@ Everything here runs in the variant that is set.
 from __future__ import annotations
 
 import contextlib
+import copy
 import os
 import threading
 import time
@@ -18,7 +19,7 @@ import numpy as np
 from .. import plugins
 from ..core import compat, tensor_files, units
 from ..core.errors import DiffindError, UsageError
-from ..core.files import MOST_TEXT, irregular, replacing, shown
+from ..core.files import check_scene_file, replacing
 from ..core.runtime import use_variant
 from ..core.threads import in_turn, threads_for_files
 from ..fitting.task import tasks
@@ -35,6 +36,13 @@ PIXEL_BYTES = 3 * 4 + 2 * 8
 
 class SceneError(DiffindError, RuntimeError):
     """A scene cannot be loaded or rendered; the message is one sentence that names the file and the fault."""
+
+
+def check_counterpart(name: str) -> None:
+    """Raise :class:`SceneError` if no plugin has the counterpart ``name``."""
+    if not plugins.with_counterpart(name):
+        others = dict.fromkeys(c.name for plugin in plugins.declared().values() for c in plugin.others)
+        raise SceneError(f'against: found "{name}", allowed are exact, {", ".join(others)}')
 
 
 def check_renderable(scene, path: str | os.PathLike = "scene", needs: tuple[str, ...] = NEEDS) -> None:
@@ -60,23 +68,6 @@ def warn_if_black(scene, path: str | os.PathLike, images) -> None:
     """Warn if all ``images`` of a loaded scene are black."""
     if not any(image[..., :3].any() for image in images):
         plugins.warn(f"{path}: the picture is black{'' if scene.emitters() else ', the scene has no emitter'}")
-
-
-def use_slashes(state) -> None:
-    """Write names of files in a parsed scene with slashes where they have backslashes, and only that is a file."""
-    copies = compat.parsed_properties(compat.copy_state(state)[1])  # a parameter that was read counts as known
-    for props, copy in zip(compat.parsed_properties(state), copies, strict=True):
-        for key in copy:
-            text = str(copy[key]) if compat.property_kind(copy, key) == "text" else ""
-            if "\\" in text and not _is_file(text) and _is_file(text.replace("\\", "/")):
-                props[key] = text.replace("\\", "/")
-
-
-def _is_file(name: str) -> bool:
-    """Return whether a name is that of a file, as Mitsuba resolves it."""
-    with contextlib.suppress(OSError, ValueError):
-        return Path(str(mi.file_resolver().resolve(name))).is_file()
-    return False
 
 
 def check_measured(state) -> None:
@@ -118,20 +109,17 @@ class ParsedScene:
         self.path = path = Path.cwd() / name if in_memory else Path(source)
         self.defines = {name: str(value) for name, value in (defines or {}).items()}
         self._resolver = None  # parsing adds the folders of <path> to it
+        try:
+            if not in_memory:
+                check_scene_file(path)
+        except UsageError as e:
+            raise SceneError(str(e)) from None
         with self._errors():
             if in_memory:
                 _, self._state = compat.parse(source)
                 self.description = _description(self._state)
                 return
-            if fault := irregular(path, MOST_TEXT):
-                raise RuntimeError(f"{shown(path)}: {fault}")
-            if not path.is_file():
-                fault = "is a folder, a scene file is needed" if path.is_dir() else "no such scene file"
-                raise RuntimeError(f"{path}: {fault}")
-            if path.suffix.lower() == ".npz":
-                raise RuntimeError(f"{path}: found a table file, a scene is needed: mi_diffind.inspect shows its use")
             _, self._state = compat.parse_file(path, self.defines)
-            use_slashes(self._state)
 
     @contextlib.contextmanager
     def _errors(self):
@@ -144,20 +132,17 @@ class ParsedScene:
         exact: bool = False,
         longest_path: int | None = None,
         against: str | tuple[str, ...] = "exact",
-        change: Callable[[object], object] | None = None,
         merge: bool = True,
         parallel: bool = True,
         needs: tuple[str, ...] = NEEDS,
     ):
         """Return a loaded scene, as :func:`load_file` does.
 
-        With ``exact``, every learned plugin is replaced by its exact counterpart, or by the one that ``against`` names
-        (the first of several that it has).
-        ``longest_path`` replaces the ``max_depth`` of the scene's integrator (1: emitted light, 2: direct light, …; -1:
-        infinite). ``change(state)`` may change the parsed scene (``mi.parser.ParserState``) before anything else does.
-        Without ``merge``, Mitsuba joins no meshes, and each keeps its id. Objects that are not loaded in ``parallel``
-        have the same order in each run, so that the kernels of an earlier run are found again. A scene without what it
-        ``needs`` to be rendered is an error (:func:`check_renderable`).
+        With ``exact``, every plugin that has a counterpart called ``against`` is replaced by it (the first of several
+        names that it has). ``longest_path`` replaces the ``max_depth`` of the scene's integrator (1: emitted light, 2:
+        direct light, …; -1: infinite). Without ``merge``, Mitsuba joins no meshes, and each keeps its id. Without
+        ``parallel``, the order of objects is the same in each run, and the kernels of an earlier run are found again.
+        A scene without what it ``needs`` to be rendered is an error (:func:`check_renderable`).
 
         Shapes whose stored arrays the scene's integrator cannot trace are decoded, with a warning that states the
         memory, unless the scene forbids decoding; then this is an error.
@@ -167,11 +152,8 @@ class ParsedScene:
             if not merge:
                 compat.keep_meshes(config)
             config.parallel = parallel
-            if change is not None:
-                change(state)
-            if exact:
-                for props, plugin in _replaceable(state, against):
-                    plugin.counterpart(against).replace(props)
+            for props, plugin in _replaceable(state, against) if exact else ():
+                plugin.counterpart(against).replace(props)
             if longest_path is not None:
                 _path_integrator(state)["max_depth"] = longest_path
             integrators = _integrators(state) or ["path"]  # used by commands for a scene without an integrator
@@ -185,6 +167,12 @@ class ParsedScene:
         """Change the parsed scene (``mi.parser.ParserState``) for good by ``change(state)``, and return its result."""
         with self._errors():
             return change(self._state)
+
+    def copy(self) -> ParsedScene:
+        """Return a copy, which may be changed."""
+        other = copy.copy(self)
+        other._state = self._copy()
+        return other
 
     def _copy(self):
         """Return a copy of the parsed state to read: Mitsuba takes a parameter that was read once for a known one."""
@@ -207,19 +195,13 @@ class ParsedScene:
             props["max_depth"] = longest_path
             return mi.PluginManager.instance().create_object(props)
 
-    def learned_plugins(
-        self, against: str | tuple[str, ...] = "exact", change: Callable[[object], object] | None = None
-    ) -> list[dict]:
-        """Return the descriptions (:meth:`.plugins.Plugin.described`) of the learned plugins, in the file's order.
+    def learned_plugins(self, against: str | tuple[str, ...] = "exact") -> list[dict]:
+        """Return the descriptions (:meth:`.plugins.Plugin.describe`) of the learned plugins, in the file's order.
 
-        With ``against``, of all plugins that have the counterpart of this name, or of one of these names; after a
-        ``change`` of the scene as of :meth:`load`.
+        With ``against``, of all plugins that have the counterpart of this name, or of one of these names.
         """
         with self._errors():
-            state = self._copy()
-            if change is not None:
-                change(state)
-            return [plugin.described(props) for props, plugin in _replaceable(state, against)]
+            return [plugin.describe(props) for props, plugin in _replaceable(self._copy(), against)]
 
     def tables(self, learned: list[dict]) -> dict[tuple[str, str], object]:
         """Return the distinct tables of learned plugins: ``(file, storage)`` → :class:`.Table`.
@@ -287,9 +269,7 @@ def load_file(path: str | os.PathLike, parallel: bool = True, optimize: bool = T
     if not Path(path).is_file():
         return mi.load_file(str(path))
     with _resolving(path):
-        config, state = compat.parse_file(path, defines)
-        use_slashes(state)
-        return _build_as(config, state, parallel, optimize)
+        return _build_as(*compat.parse_file(path, defines), parallel, optimize)
 
 
 @in_turn

@@ -1,8 +1,7 @@
 """Regression checks of scenes against stored renderings: changes that sampling noise does not explain.
 
 A reference shows the scene as written, learned plugins included. A check finds changes; the distance of an
-approximation from the truth is measured by :mod:`.comparison`. Statistics: :mod:`.block_test`; sentences and pictures:
-:mod:`.regression_report`.
+approximation from the truth is measured by :mod:`.comparison`. Statistics: :mod:`.block_test`.
 
 A reference is kept beside its scene, as ``references/SCENE.VARIANT.exr``, an EXR file of two parts. The first is the
 image in half floats (``R``, ``G``, ``B``, or ``Y`` in mono variants), with the settings of the render in its header.
@@ -16,10 +15,12 @@ import dataclasses
 import json
 import math
 import os
+import tempfile
+import textwrap
 import threading
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -32,10 +33,20 @@ from ..core.errors import UsageError
 from ..core.files import OutputError, replacing, writable_file, writable_folder
 from ..core.progress import interruptible, progress_bar
 from ..core.runtime import use_variant
+from ..measure import plot as figure_grid
 from ..measure.store import fingerprint, sources
 from . import loading
-from .block_test import CHECK_PASSES, GROUPS, REFERENCE_PASSES, TILE, BlockReference, block_means
-from .regression_report import Regression, write_failure
+from .block_test import (
+    CHECK_PASSES,
+    GROUPS,
+    REFERENCE_PASSES,
+    TILE,
+    Block,
+    BlockReference,
+    BlockTest,
+    Level,
+    block_means,
+)
 
 #: Samples of the whole image in a check, by default at most, but at least one a pixel in each pass.
 BUDGET = 2_000_000
@@ -68,10 +79,6 @@ _REMEDY = "remove it and make it again with --update"
 # -- files ------------------------------------------------------------------------------------------------------------
 
 
-class BadReference(loading.SceneError):
-    """A stored reference is missing, damaged, or of another size; the message is one sentence that names it."""
-
-
 @dataclass(frozen=True)
 class Reference:
     """A stored rendering: its ``image``, ``(height, width, channels)``, and its ``blocks``, for the test of a check.
@@ -97,19 +104,16 @@ def reference_path(path: str | os.PathLike, references: str | os.PathLike | None
 def read_reference(path: str | os.PathLike, references: str | os.PathLike | None = None) -> Reference:
     """Return the stored reference of a scene file in the current variant, or in its twin for the other backend.
 
-    ``llvm_…`` and ``cuda_…`` variants render the same. Raises :class:`BadReference`.
+    ``llvm_…`` and ``cuda_…`` variants render the same. Raises :class:`.SceneError`.
     """
     wanted = reference_path(path, references)
     backend, _, mode = mi.variant().partition("_")
     twins = [wanted.with_name(f"{Path(path).stem}.{b}_{mode}.exr") for b in ("llvm", "cuda") if b != backend]
     stored = next((file for file in (wanted, *twins) if file.is_file()), None)
     if stored is None:
-        raise BadReference(f'{path}: has no reference "{wanted}"; run the same command with --update to make it')
+        raise loading.SceneError(f'{path}: has no reference "{wanted}"; run the same command with --update to make it')
     parts = _parts(stored)
-    about = _about(stored, Path(path).stem, parts)
-    if len(parts) != 2:
-        raise BadReference(f"{stored}: is a reference of an earlier version, render it again with --update")
-    return _reference(stored, about, *(channels for _, channels in parts))
+    return _reference(stored, _about(stored, Path(path).stem, parts), parts[0][1], parts[-1][1])
 
 
 def _names(channels: int) -> str:
@@ -160,7 +164,7 @@ def _parts(path: Path) -> list[tuple[dict, dict]]:
                 for part in file.parts
             ]
     except (RuntimeError, ValueError) as e:
-        raise BadReference(f"{path}: cannot be read as an EXR image; {_REMEDY}") from e
+        raise loading.SceneError(f"{path}: cannot be read as an EXR image; {_REMEDY}") from e
 
 
 def _about(path: Path, stem: str, parts: list[tuple[dict, dict]]) -> dict:
@@ -168,11 +172,11 @@ def _about(path: Path, stem: str, parts: list[tuple[dict, dict]]) -> dict:
         about = json.loads(parts[0][0][_ATTRIBUTE])
         good = all(isinstance(about[key], expected) for key, expected in _ABOUT.items())
     except (KeyError, TypeError, ValueError) as e:
-        raise BadReference(f"{path}: is an EXR image, but no reference; {_REMEDY}") from e
+        raise loading.SceneError(f"{path}: is an EXR image, but no reference; {_REMEDY}") from e
     if not (good and about["budget"] > 0 and about["spp"] > 0):
-        raise BadReference(f"{path}: is a damaged reference; {_REMEDY}")
+        raise loading.SceneError(f"{path}: is a damaged reference; {_REMEDY}")
     if (about["scene"], f"{about['scene']}.{about['variant']}.exr") != (stem, path.name):
-        raise BadReference(f'{path}: is the reference of the scene "{about["scene"]}" in {about["variant"]}')
+        raise loading.SceneError(f'{path}: is the reference of the scene "{about["scene"]}" in {about["variant"]}')
     return about
 
 
@@ -196,7 +200,7 @@ def _reference(path: Path, about: dict, image: dict, means: dict) -> Reference:
     except (KeyError, TypeError, ValueError):
         good = False
     if not good:
-        raise BadReference(f"{path}: is a damaged reference; {_REMEDY}")
+        raise loading.SceneError(f"{path}: is a damaged reference; {_REMEDY}")
     return Reference(pixels, BlockReference(passes, mean, stops, *pixels.shape[:2]), about)
 
 
@@ -380,7 +384,7 @@ def regress(
     ``name`` for its reference, ``references/NAME.VARIANT.exr`` in the current folder, and has no ``defines``.
     ``defines`` are the reference's unless given, ``seed`` is 0; every seed is independent of the reference. ``spp`` are
     the reference's; others are refused, since the noise of both sides must be equal. If the check fails and ``out``
-    names a folder, the images are written there (:func:`.regression_report.write_failure`).
+    names a folder, the images are written there (:func:`write_failure`).
 
     With ``update``, the reference is rendered again instead and stored. Settings that are not given are then those of
     the reference that is replaced: ``spp`` of a check (else about two million samples of the image, a power of two per
@@ -394,7 +398,7 @@ def regress(
     (:class:`.block_test.Block`), ``stops``, ``stops_threshold``, ``not_finite`` (pixels), and ``files`` (written
     paths). Of an update: ``budget`` (samples per pixel of a check, which a sampler may have rounded up from
     ``asked_spp``), ``bytes``, ``reused_passes``, and ``partial``, the file of kept passes after Ctrl-C. Raises
-    :class:`.SceneError`, among them :class:`BadReference`, :class:`.UsageError` and :class:`.OutputError`.
+    :class:`.SceneError`, :class:`.UsageError` and :class:`.OutputError`.
     """
     use_variant()
     seed_of_check, path = seed or 0, scene
@@ -412,7 +416,7 @@ def regress(
     _check_size(path, reference, height, width)
     size, start = PassSize.for_check(loaded, spp or about["budget"]), time.perf_counter()
     if size.check_spp != about["budget"]:
-        raise BadReference(
+        raise loading.SceneError(
             f"{path}: a check would have {size.check_spp} samples a pixel, its reference is for {about['budget']}: "
             f"keep --spp and the sampler, or render it again with --update --spp {size.check_spp}"
         )
@@ -444,7 +448,168 @@ def _check_size(path, reference: Reference, height: int, width: int, channels: i
     expected = reference.image.shape
     if (height, width, expected[2] if channels is None else channels) != expected:
         rendered = f"{width} x {height} pixels" + ("" if channels is None else f" of {channels} channel(s)")
-        raise BadReference(
+        raise loading.SceneError(
             f"{path}: renders {rendered}, its reference has {expected[1]} x {expected[0]} of {expected[2]} channel(s); "
             "leave the size to the reference, or render it again with --update"
         )
+
+
+# -- results as sentences, pictures and files -------------------------------------------------------------------------
+
+
+@dataclass
+class Regression:
+    """Result of :func:`.regression.regress`: its ``figures``, and of a check ``image``, ``reference`` and ``test``.
+
+    Images are linear ``(height, width, channels)``; an interrupted check and an update of a reference have none.
+    """
+
+    figures: dict
+    image: np.ndarray | None = field(default=None, repr=False)
+    reference: np.ndarray | None = field(default=None, repr=False)
+    test: BlockTest | None = field(default=None, repr=False)
+
+    @property
+    def passed(self) -> bool | None:
+        """Whether the check passed; ``None`` without a verdict."""
+        return self.figures.get("passed")
+
+    @property
+    def images(self) -> dict[str, np.ndarray]:
+        """The ``image``, the ``reference``, the ``error`` (absolute difference) and ``t`` of :func:`t_map`."""
+        if self.test is None:
+            return {}
+        error = np.abs(self.image - self.reference)
+        t = t_map(self.test.worst_level, self.image.shape)
+        return {"image": self.image, "reference": self.reference, "error": error, "t": np.float32(t)}
+
+    def __str__(self) -> str:
+        return "\n".join(update_summary(self.figures) if "budget" in self.figures else summary([self.figures]))
+
+    def _repr_png_(self) -> bytes | None:
+        if self.test is None:
+            return None
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "check.png"
+            _write_figure(str(path), self)
+            return path.read_bytes()
+
+
+def t_map(level: Level, shape: tuple[int, ...]) -> np.ndarray:
+    """Return t of each pixel and channel, ``shape``: the largest amount of the windows that cover the pixel."""
+    parts, t = level.side // level.stride, level.t
+    rows, columns = (n + parts - 1 for n in t.shape[:2])
+    cells = np.zeros((rows, columns, t.shape[2]))
+    for row in range(parts):
+        for column in range(parts):
+            covered = cells[row : row + t.shape[0], column : column + t.shape[1]]
+            np.copyto(covered, t, where=np.abs(t) > np.abs(covered))
+    pixels = cells.repeat(level.stride, axis=0).repeat(level.stride, axis=1)
+    return pixels[: shape[0], : shape[1]]
+
+
+def write_failure(folder: str | os.PathLike, result: Regression) -> dict[str, str]:
+    """Write the images of a failed check into ``folder``, which is created if its parent exists, and return the paths.
+
+    These are ``SCENE.VARIANT.image.exr``, ``….reference.exr``, ``….error.exr`` (absolute difference), ``….t.exr`` and a
+    picture of all, ``….png``. Raises :class:`.OutputError`.
+    """
+    folder = writable_folder(folder, create=True)
+    stem = f"{Path(result.figures['scene']).stem}.{result.figures['variant']}"
+    images = result.images
+    paths = {name: str(folder / f"{stem}.{name}.exr") for name in images}
+    for name, content in images.items():
+        loading.write_image(paths[name], content)
+    paths["figure"] = str(folder / f"{stem}.png")
+    _write_figure(paths["figure"], result)
+    return paths
+
+
+def verdict(figures: dict) -> str:
+    """Return the outcome of a check in one word: ``passed``, ``FAILED`` or ``interrupted``."""
+    return "interrupted" if figures["interrupted"] else "passed" if figures["passed"] else "FAILED"
+
+
+def power(figures: dict) -> str:
+    """Return the change that a check finds nine times of ten, as the end of a sentence."""
+    width, height = (min(figures["tile"], figures[side]) for side in ("width", "height"))
+    change = figures["visible_change"]
+    amount = "no change" if change is None else f"{100 * change:.2g}%"
+    return f"{amount} of brightness in a tile of {width} x {height} nine times of ten"
+
+
+def reasons(figures: dict) -> list[str]:
+    """Return the reasons for which a check failed, as parts of a sentence."""
+    parts = []
+    if figures["not_finite"]:
+        parts.append(f"{figures['not_finite']} pixel(s) are not finite")
+    if figures["failing_blocks"]:
+        worst = figures["worst"]
+        parts.append(f"block of {Block(**worst)}, t = {worst['t']:.1f}, {worst['channel']}")
+    if figures["stops"] > figures["stops_threshold"]:
+        measured, threshold = figures["stops"], figures["stops_threshold"]
+        parts.append(f"off by {measured:.3g} stops on average, noise by {threshold:.3g} at most")
+    return parts
+
+
+def summary(results: list[dict]) -> list[str]:
+    """Return the results of checks as lines of text: one for each scene, and the picture of each failure."""
+    names = [Path(r["scene"]).stem for r in results]
+    width = max((len(n) for n in names), default=0)
+    lines = []
+    for name, r in zip(names, results, strict=True):
+        line = f"{verdict(r):11} {name:{width}}  {r['variant']}, {r['width']} x {r['height']}, {r['spp']} spp"
+        if not r["interrupted"]:
+            line += f": would have seen {power(r)}" if r["passed"] else f": {'; '.join(reasons(r))}"
+        lines.append(line)
+        if r["files"]:
+            lines.append(f"{'':11} {'':{width}}  see {r['files']['figure']}")
+    return lines
+
+
+def update_summary(figures: dict) -> list[str]:
+    """Return the result of :func:`.regression.update_reference` as lines of text."""
+    if figures["interrupted"]:
+        return ["{partial}: {spp} samples a pixel are kept, the same command goes on".format(**figures)]
+    asked = "" if figures["asked_spp"] == figures["budget"] else f" (asked for {figures['asked_spp']})"
+    text = "{reference}: {width} x {height}, {spp} spp, {bytes:,} bytes; a check has {budget} spp" + asked
+    return [f"{text.format(**figures)} and would see {power(figures)}"]
+
+
+def _wrap(title: str, text: str) -> list[str]:
+    return textwrap.wrap(f"{title:11} {text}", 58, subsequent_indent=" " * 12)
+
+
+def _write_figure(path: str, result: Regression) -> None:
+    """Write one picture: image, reference and figures above; error, t and failing blocks below."""
+    figures, images, test = result.figures, result.images, result.test
+    worst, level = test.worst, test.worst_level
+    marked = np.repeat(np.clip(images["reference"], 0, 1).mean(axis=-1, keepdims=True) * 0.3, 3, axis=-1)
+    failing = (np.abs(images["t"]) > level.threshold) | ~np.isfinite(images["image"])
+    marked[failing.any(axis=-1)] = (1, 0.1, 0.6)
+    largest = np.abs(images["t"]).argmax(axis=-1)[..., None]
+    lines = [
+        f"scene       {Path(figures['scene']).name}, {figures['width']} x {figures['height']}",
+        f"variant     {figures['variant']}",
+        f"samples     {figures['spp']} a pixel in {CHECK_PASSES} passes, seed {figures['seed']}",
+        f"reference   {figures['reference_spp']} samples a pixel",
+        "",
+        f"{verdict(figures):11} {figures['failing_blocks']} of {figures['blocks']} blocks of all sizes fail",
+        *_wrap("", "; ".join(reasons(figures))),
+        *_wrap("power", f"finds {power(figures)}"),
+    ]
+    blocks = f"blocks of {level.side} x {level.side}"
+    frame = (worst.x, worst.y, worst.width, worst.height)
+    cells = [
+        figure_grid.picture("image", images["image"]),
+        figure_grid.picture("reference", images["reference"], frame),
+        figure_grid.text(lines),
+        figure_grid.error_map(np.nan_to_num(images["error"].mean(axis=-1))),
+        figure_grid.colour_map(
+            f"t of {blocks}, red: brighter (threshold {level.threshold:.1f})",
+            np.take_along_axis(images["t"], largest, axis=-1)[..., 0],
+            "both", cmap="RdBu_r", vmin=-2 * level.threshold, vmax=2 * level.threshold,
+        ),
+        figure_grid.picture(f"{blocks} that fail, over the reference; frame: the worst", marked, frame),
+    ]  # fmt: skip
+    figure_grid.write(path, cells, 3, images["image"].shape)

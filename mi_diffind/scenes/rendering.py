@@ -140,26 +140,26 @@ def render(
         raise UsageError("centre: given without orbit, whose middle it is")
     if depth_tolerance is not None and depth != "auto":
         raise UsageError('depth_tolerance: given without depth="auto"')
+    if output is not None:
+        image_path(output, bool(orbit))
     start = time.perf_counter()
-    parsed = None
+    parsed, chosen, conversions = None, None, []
     if isinstance(scene, (str, os.PathLike)):
         parsed = loading.ParsedScene(scene, dict(defines or {}))
         conversions = conversion.replace_stock(parsed, learn, progress=progress)
         chosen = _choose_depth(parsed, depth, depth_tolerance, seed)
         changed = chosen["chosen"] != chosen["scene"]
         loaded = parsed.load(longest_path=chosen["chosen"] if changed else None)
+    elif learn or depth != "scene" or defines:
+        raise UsageError("learn, depth, defines: given with a scene in memory, allowed are scene files")
     else:
-        if learn:
-            raise UsageError("learn: given with a scene in memory, allowed are scene files")
-        if depth != "scene" or defines:
-            raise UsageError("depth, defines: given with a scene in memory, allowed are scene files")
-        chosen, conversions, loaded = None, [], loading.load_dict(scene) if isinstance(scene, dict) else scene
+        loaded = loading.load_dict(scene) if isinstance(scene, dict) else scene
         if not isinstance(loaded, mi.Scene):
             raise UsageError(f"scene: found a {type(loaded).__name__}, expected a scene, its file or its dictionary")
     name = str(parsed.path) if parsed else "scene"
     loading.check_renderable(loaded, name)
     if output is not None:
-        _check_channels(image_path(output, bool(orbit)), channel_count(loaded))
+        _check_channels(Path(output), channel_count(loaded))
     ready = time.perf_counter()
     spp = spp or loaded.sensors()[0].sampler().sample_count()
     footprint.check_samples(footprint.textures(loaded), spp)
@@ -186,7 +186,7 @@ def render(
     figures = {
         "interrupted": interrupted,
         "nonfinite_pixels": bad,
-        "scene": str(parsed.path) if parsed else None,
+        "scene": name if parsed else None,
         "variant": mi.variant(),
         "width": frames[0].shape[1],
         "height": frames[0].shape[0],
@@ -278,9 +278,9 @@ def middle(scene) -> np.ndarray:
     return box.mean(axis=0) if np.isfinite(box).all() else np.zeros(3)
 
 
-def strip(frames: Sequence[np.ndarray], columns: int = COLUMNS) -> np.ndarray:
-    """Return one image of all frames, at most ``columns`` in a row; missing cells are 0."""
-    columns = min(columns, len(frames))
+def strip(frames: Sequence[np.ndarray]) -> np.ndarray:
+    """Return one image of all frames, at most :data:`COLUMNS` in a row; missing cells are 0."""
+    columns = min(COLUMNS, len(frames))
     rows = -(-len(frames) // columns)
     height, width, channels = frames[0].shape
     grid = np.zeros((rows * columns, height, width, channels), np.float32)

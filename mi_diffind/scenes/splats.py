@@ -1,13 +1,10 @@
 """3D Gaussians of "3D Gaussian Splatting" (Kerbl et al. 2023), and views of them for a field.
 
-PLY files are those of the reference implementation, text or binary. SOG (version 2, PlayCanvas: "Spatially Ordered
-Gaussians") holds 8-bit images and a ``meta.json`` with their ranges and codebooks, in a folder or in a ZIP archive
-``NAME.sog``.
-
-Mitsuba traces the Gaussians: the shape ``ellipsoidsmesh`` orders them along a ray, and the integrator
-``volprim_rf_basic`` gives the transmittance and the colour of each. Two things are added to that integrator. It has an
-alpha of 1 everywhere, here rays keep their transmittance. And its rays go on 1e-4 behind each hit, whatever the scene's
-size, which skips Gaussians of a small scene; here all scenes are traced at one size.
+Files are PLY as the reference implementation writes it, text or binary. Mitsuba traces the Gaussians: the shape
+``ellipsoidsmesh`` orders them along a ray, and the integrator ``volprim_rf_basic`` gives the transmittance and the
+colour of each. Two things are added to that integrator. It has an alpha of 1 everywhere, here rays keep their
+transmittance. And its rays go on 1e-4 behind each hit, whatever the scene's size, which skips Gaussians of a small
+scene; here all scenes are traced at one size.
 """
 
 from __future__ import annotations
@@ -15,12 +12,10 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import io
-import json
 import os
 import re
-import zipfile
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -28,8 +23,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..core import compat
-from ..core.errors import DiffindError, reason
-from ..core.files import RecordedKeys, irregular, shown, unused_note
+from ..core.errors import UsageError, reason
+from ..core.files import irregular, shown, unused_note
 from ..core.units import check_memory, memory
 from ..images.srgb import to_linear
 
@@ -43,23 +38,11 @@ ARRAYS = ("centres", "scales", "quaternions", "opacities", "colours")
 #: Numbers of further coefficients ``f_rest_*``: spherical harmonics of degree 0 to 3.
 REST = (0, 9, 24, 45)
 
+#: Ends of the names of files of 3D Gaussians. Only PLY is read.
+EXTENSIONS = (".ply", ".sog", ".spz", ".splat", ".ksplat", ".lcc", "meta.json")
+
 #: Largest coordinate and standard deviation.
 FARTHEST = 1e18
-
-#: Name of the file that describes a SOG folder or archive, and the most bytes that it may have.
-META, META_BYTES = "meta.json", 1 << 20
-
-#: End of a file's name → format of 3D Gaussians that is not read.
-OTHER_FORMATS = {
-    ".spz": "SPZ (Niantic)", ".splat": ".splat (antimatter15)", ".ksplat": ".ksplat (GaussianSplats3D)",
-    ".lcc": "LCC (XGRIDS)", "lod-meta.json": "streamed SOG (PlayCanvas)",
-}  # fmt: skip
-
-#: Colours in a row of the palette of a SOG file.
-PALETTE_WIDTH = 64
-
-#: Most Gaussians of a SOG file, whose images are compressed.
-MOST = 1 << 25
 
 #: Opacity below which a Gaussian is left out: it changes no 8-bit value.
 FAINT = 1 / 255
@@ -73,8 +56,11 @@ STRAY = 0.01
 #: Part of the sides of the box of most Gaussians by which it is widened.
 WIDER = 0.25
 
-#: Half diagonal of the box of all Gaussians while they are traced, and the step behind a hit.
-SIZE, STEP = 100.0, 1e-4
+#: Half diagonal of the box of all Gaussians while they are traced.
+SIZE = 100.0
+
+#: Step behind a hit, at that size.
+STEP = 1e-4
 
 #: Transmittance at which a ray ends, and counts as stopped.
 OPAQUE = 0.01
@@ -89,26 +75,9 @@ GAUSSIAN_BYTES = 4096
 SPP = 4
 
 
-class SplatsError(DiffindError, ValueError):
-    """Error for a file that holds no usable Gaussians; the message is one sentence that names the file."""
-
-
-def _other_format(path: Path) -> str:
-    """Return the format of a file of Gaussians that is not read, by its name, else ""."""
-    return next((name for end, name in OTHER_FORMATS.items() if path.name.lower().endswith(end)), "")
-
-
-def _advice(path: Path) -> str:
-    return f'PlayCanvas\' splat-transform converts it ("splat-transform {path.name} OUTPUT.ply")'
-
-
 def is_splats(source) -> bool:
-    """Return whether a source is the name of a file of Gaussians: ``*.ply``, ``*.sog`` or ``meta.json``.
-
-    Names of :data:`OTHER_FORMATS` count, too: :meth:`Splats.read` says what to do with them.
-    """
-    path = Path(source) if isinstance(source, (str, os.PathLike)) else Path()
-    return path.suffix.lower() in (".ply", ".sog") or path.name.lower() == META or bool(_other_format(path))
+    """Return whether a source is the name of a file of Gaussians (:data:`EXTENSIONS`)."""
+    return isinstance(source, (str, os.PathLike)) and os.fspath(source).lower().endswith(EXTENSIONS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,41 +104,39 @@ class Splats:
 
     @staticmethod
     def read(path: str | os.PathLike) -> Splats:
-        """Read a PLY file, or SOG: an archive, or the ``meta.json`` of a folder. Raises :class:`SplatsError`."""
+        """Read a PLY file. Raises :class:`.UsageError`."""
         path = Path(path)
         if fault := irregular(path, memory() // 4) or ("" if path.exists() else "no such file"):
-            raise SplatsError(f"{shown(path)}: {fault}")
+            raise UsageError(f"{shown(path)}: {fault}")
         try:
-            if other := _other_format(path):
-                raise SplatsError(f"holds Gaussians in the format {other}, PLY or SOG is needed: {_advice(path)}")
-            arrays, digest, note = (_ply if path.suffix.lower() == ".ply" else _sog)(path)
-            return Splats(path, *_checked(arrays), digest, (note,) if note else ())
-        except SplatsError as e:
-            raise SplatsError(f"{path}: {e}") from None
-        except Exception as e:  # each decoder raises errors of its own for a damaged file
-            raise SplatsError(f"{path}: cannot be read as 3D Gaussians, or is damaged ({reason(e)})") from None
+            return _read_ply(path)
+        except UsageError as e:
+            raise UsageError(f"{path}: {e}") from None
+        except Exception as e:  # trimesh and NumPy raise errors of their own for a damaged file
+            raise UsageError(f"{path}: cannot be read as 3D Gaussians, or is damaged ({reason(e)})") from None
 
-    def chosen(self, which: np.ndarray) -> Splats:
+    def select(self, which: np.ndarray) -> Splats:
         """Return the Gaussians of a mask ``(N,)``."""
         return dataclasses.replace(self, **{name: getattr(self, name)[which] for name in ARRAYS})
 
-    def cropped(self, box=None) -> Splats:
+    def crop(self, box=None) -> Splats:
         """Return the visible Gaussians whose centres lie in a ``box``: lower corner, upper corner.
 
         The default box holds 98% of the opacity along each axis, and a quarter more on both sides. Raises
-        :class:`SplatsError` if none is left.
+        :class:`UsageError` if none is left.
         """
-        visible = self.chosen(self.opacities >= FAINT)
+        visible = self.select(self.opacities >= FAINT)
         if not len(visible):
-            raise SplatsError(f"{self.path}: has {len(self):,} Gaussians, none with an opacity of 1/255 or more")
-        box = visible.most() if box is None else np.array(box, np.float64).reshape(2, 3)
+            raise UsageError(f"{self.path}: has {len(self):,} Gaussians, none with an opacity of 1/255 or more")
+        most = visible._box_without_strays()
+        box = most if box is None else np.array(box, np.float64).reshape(2, 3)
         inside = ((visible.centres >= box[0]) & (visible.centres <= box[1])).all(axis=1)
         if not inside.any():
-            text = " to ".join("(" + ", ".join(f"{x:.4g}" for x in corner) + ")" for corner in visible.most())
-            raise SplatsError(f"box: holds none of the {len(self):,} Gaussians of {self.path}, most lie in {text}")
-        return visible.chosen(inside)
+            text = " to ".join("(" + ", ".join(f"{x:.4g}" for x in corner) + ")" for corner in most)
+            raise UsageError(f"box: holds none of the {len(self):,} Gaussians of {self.path}, most lie in {text}")
+        return visible.select(inside)
 
-    def most(self) -> np.ndarray:
+    def _box_without_strays(self) -> np.ndarray:
         """Return the box ``(2, 3)`` outside of which Gaussians count as strays."""
         box = []
         for values in self.centres.T.astype(np.float64):
@@ -191,145 +158,65 @@ class Splats:
         return np.stack([(self.centres - extents).min(axis=0), (self.centres + extents).max(axis=0)])
 
 
-def _checked(arrays: list[np.ndarray]) -> list[np.ndarray]:
-    """Return arrays as :class:`Splats` holds them, given logarithms of the scales and quaternions of any length."""
-    for name, array in zip(ARRAYS, arrays, strict=True):
-        if not np.isfinite(array).all():
-            raise SplatsError(f"has {np.count_nonzero(~np.isfinite(array)):,} {name} that are NaN or infinite")
-    centres, scales, quaternions, *others = arrays
-    if not len(centres):
-        raise SplatsError("holds no Gaussians")
-    lengths = np.linalg.norm(quaternions, axis=1, keepdims=True)
-    if not lengths.all():
-        raise SplatsError(f"has {np.count_nonzero(lengths == 0):,} rotations of length 0")
-    with np.errstate(over="ignore"):
-        scales = np.exp(scales)
-    if scales.max() > FARTHEST or np.abs(centres).max() > FARTHEST:
-        raise SplatsError("has places or scales above 1e18, are the scales logarithms?")
-    return [array.astype(np.float32) for array in (centres, scales, quaternions / lengths, *others)]
-
-
-def _ply(path: Path) -> tuple[list[np.ndarray], str, str | None]:
-    """Return the arrays of a PLY file for :func:`_checked`, its SHA-256, and a note on what is not used of it."""
+def _read_ply(path: Path) -> Splats:
+    """Return the Gaussians of a PLY file, which holds logarithms of scales and quaternions of any length."""
     from trimesh.exchange.ply import load_ply
 
     content = path.read_bytes()
-    if re.search(rb"property\s+\w+\s+packed_position\s", content.partition(b"end_header")[0]):
-        raise SplatsError(f"holds compressed Gaussians, an uncompressed PLY file or SOG is needed: {_advice(path)}")
+    packed = re.search(rb"property\s+\w+\s+packed_position\s", content.partition(b"end_header")[0])
+    if packed or path.suffix.lower() != ".ply":
+        fault = "compressed Gaussians" if packed else "Gaussians in another format"
+        advice = f'PlayCanvas\' splat-transform converts it ("splat-transform {path.name} OUTPUT.ply")'
+        raise UsageError(f"holds {fault}, an uncompressed PLY file is needed: {advice}")
     elements = load_ply(io.BytesIO(content))["metadata"]["_ply_raw"]
     vertices = elements["vertex"]["data"]
     names = vertices.dtype.names if isinstance(vertices, np.ndarray) else tuple(vertices)
     rest = sum(name.startswith("f_rest_") for name in names)
     if rest not in REST:
-        raise SplatsError(f"has {rest} properties f_rest_*, allowed are {', '.join(map(str, REST))}")
+        raise UsageError(f"has {rest} properties f_rest_*, allowed are {', '.join(map(str, REST))}")
     used = (*NAMES, *(f"f_rest_{i}" for i in range(rest)))
     if missing := [name for name in used if name not in names]:
-        raise SplatsError(f"holds no 3D Gaussians, its vertices lack {', '.join(missing)}")
+        raise UsageError(f"holds no 3D Gaussians, its vertices lack {', '.join(missing)}")
     columns = np.stack([np.asarray(vertices[name], np.float64).reshape(-1) for name in used], axis=1)
+    if not len(columns):
+        raise UsageError("holds no Gaussians")
+    for name, values in zip(used, columns.T, strict=True):
+        if not np.isfinite(values).all():
+            raise UsageError(f"has {np.count_nonzero(~np.isfinite(values)):,} {name} that are NaN or infinite")
     centres, scales, quaternions, opacities, first, others = np.split(columns, (3, 6, 10, 11, 14), axis=1)
+    lengths = np.linalg.norm(quaternions, axis=1, keepdims=True)
+    if not lengths.all():
+        raise UsageError(f"has {np.count_nonzero(lengths == 0):,} rotations of length 0")
     with np.errstate(over="ignore"):
-        opacities = 1 / (1 + np.exp(-opacities[:, 0]))
+        scales, opacities = np.exp(scales), 1 / (1 + np.exp(-opacities[:, 0]))
+    if scales.max() > FARTHEST or np.abs(centres).max() > FARTHEST:
+        raise UsageError("has places or scales above 1e18, are the scales logarithms?")
     others = others.reshape(len(others), 3, rest // 3).swapaxes(1, 2)  # all of red first
+    colours = np.concatenate([first[:, None], others], axis=1)
     # Normals are 0 in the files of the reference implementation
     unused = [name for name in names if name not in used and np.any(vertices[name])]
     note = unused_note(path, [], (*unused, *(name for name in elements if name != "vertex")))
-    colours = np.concatenate([first[:, None], others], axis=1)
-    return [centres, scales, quaternions, opacities, colours], hashlib.sha256(content).hexdigest(), note
-
-
-def _sog(path: Path) -> tuple[list[np.ndarray], str, str | None]:
-    """Return the arrays of a SOG archive or folder for :func:`_checked`, its SHA-256, and a note, as :func:`_ply`."""
-    archived, digest = path.suffix.lower() == ".sog", hashlib.sha256()
-    folder = zipfile.Path(path) if archived else path.parent
-
-    def content(name: str, most: int) -> bytes:
-        with (folder / name).open("rb") as file:
-            data = file.read(most + 1)
-        if len(data) > most:
-            raise SplatsError(f"{name} has more than {most:,} bytes")
-        digest.update(data)
-        return data
-
-    def number(part: dict, name: str, least: int, most: int) -> int:
-        value = part[name]
-        if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
-            raise SplatsError(f'"{name}" in {META} is {value!s:.20}, allowed is {least} to {most:,}')
-        return value
-
-    def numbers(name: str, key: str, count: int) -> np.ndarray:
-        values = np.array(meta[name][key], np.float64)
-        if values.shape != (count,) or not np.isfinite(values).all():
-            raise SplatsError(f'"{key}" of "{name}" in {META} is no list of {count} finite numbers')
-        return values
-
-    def picture(name: str, which: int, count: int) -> np.ndarray:
-        """Return an image of a property, ``(height, width, 4)``, of at least ``count`` pixels, and not many more."""
-        from PIL import Image
-
-        file, most = meta[name]["files"][which], 4 * count + (1 << 16)
-        if not isinstance(file, str) or PurePosixPath(file).name != file or not file.isprintable():
-            raise SplatsError(f'"{name}" in {META} names no file {which} beside it')
-        with Image.open(io.BytesIO(content(file, 8 * most)), formats=("WEBP", "PNG")) as image:
-            if not count <= image.width * image.height <= most:
-                raise SplatsError(f"{file} has {image.width} x {image.height} pixels for {count:,} items")
-            return np.array(image.convert("RGBA"))
-
-    def pixels(name: str, which: int = 0) -> np.ndarray:
-        return picture(name, which, count).reshape(-1, 4)[:count]
-
-    meta = json.loads(content(META if archived else path.name, META_BYTES), object_hook=RecordedKeys)
-    if meta["version"] != 2:
-        raise SplatsError(f"has the SOG version {meta['version']!s:.20}, only 2 is read")
-    count = number(meta, "count", 1, MOST)
-    low, high = (pixels("means", which)[:, :3].astype(np.float64) for which in (0, 1))
-    ends = [numbers("means", name, 3) for name in ("mins", "maxs")]
-    places = ends[0] + (ends[1] - ends[0]) * (low + 256 * high) / 65535
-    with np.errstate(over="ignore"):
-        centres = np.sign(places) * np.expm1(np.abs(places))
-    scales = numbers("scales", "codebook", 256)[pixels("scales")[:, :3]]
-    quaternions, base = _quaternions(pixels("quats")), pixels("sh0")
-    colours = numbers("sh0", "codebook", 256)[base[:, None, :3]]
-    if "shN" in meta:
-        entries, bands = number(meta["shN"], "count", 1, 1 << 16), number(meta["shN"], "bands", 1, 3)
-        width, rows = PALETTE_WIDTH * ((bands + 1) ** 2 - 1), -(-entries // PALETTE_WIDTH)
-        palette = picture("shN", 0, width * rows)
-        if palette.shape[1] != width:
-            raise SplatsError(f'the palette of "shN" is {palette.shape[1]} pixels wide, for the degree {bands} {width}')
-        labels = pixels("shN", 1).astype(int) @ [1, 256, 0, 0]
-        if labels.max() >= entries:
-            raise SplatsError(f"has the label {labels.max():,}, the palette has {entries:,} colours")
-        further = palette.reshape(-1, width // PALETTE_WIDTH, 4)[labels, :, :3]
-        colours = np.concatenate([colours, numbers("shN", "codebook", 256)[further]], axis=1)
-    arrays = [centres, scales, quaternions, base[:, 3] / 255, colours]
-    return arrays, digest.hexdigest(), unused_note(path, meta)
-
-
-def _quaternions(pixels: np.ndarray) -> np.ndarray:
-    """Return quaternions (x, y, z, w): alpha − 252 names the largest of (w, x, y, z), which is left out."""
-    largest = pixels[:, 3].astype(int) - 252
-    if (largest < 0).any():
-        raise SplatsError(f"has {np.count_nonzero(largest < 0):,} rotations without a largest component")
-    others = (2 * pixels[:, :3].astype(np.float64) / 255 - 1) / np.sqrt(2)
-    last = np.sqrt(np.maximum(0, 1 - np.square(others).sum(axis=1)))
-    # Columns of x, y, z and w, by the place of the largest among (w, x, y, z)
-    columns = np.array([(0, 1, 2, 3), (3, 1, 2, 0), (1, 3, 2, 0), (1, 2, 3, 0)])[largest]
-    return np.take_along_axis(np.column_stack([others, last]), columns, axis=1)
+    arrays = (centres, scales, quaternions / lengths, opacities, colours)
+    digest = hashlib.sha256(content).hexdigest()
+    return Splats(path, *(array.astype(np.float32) for array in arrays), digest, (note,) if note else ())
 
 
 class SplatSubject:
-    """Gaussians of a file as the subject of a capture, cropped to a ``box`` (default: :meth:`Splats.cropped`).
+    """Gaussians of a file as the subject of a capture, cropped to the ``box`` of the settings.
 
-    Raises :class:`SplatsError`, also in a variant without RGB, and :class:`.UsageError` if the
-    Gaussians need more memory than there is.
+    ``settings`` are :class:`.capture.CaptureSettings`. Raises :class:`.UsageError`, also in a variant without RGB, and
+    if the Gaussians need more memory than there is.
     """
 
-    def __init__(self, path: str | os.PathLike, box=None):
-        self.path = Path(path)
+    def __init__(self, path: str | os.PathLike, settings):
+        self.path, self.settings = Path(path), settings
         if not mi.is_rgb:
-            raise SplatsError(f"{path}: the variant {mi.variant()} shows no Gaussians, one with rgb is needed")
+            raise UsageError(f"{path}: the variant {mi.variant()} shows no Gaussians, one with rgb is needed")
         splats = Splats.read(path)
-        self.splats, self.notes = splats.cropped(box), splats.notes
+        self.splats, self.notes = splats.crop(settings.box), splats.notes
         check_memory(f"{path}: Gaussians", len(self.splats), GAUSSIAN_BYTES * len(self.splats))
+        box = self.splats.box()
+        self.centre, self.scale = box.mean(axis=0), SIZE / max(np.linalg.norm(box[1] - box[0]) / 2, 1e-30)
 
     def record(self) -> dict:
         """Return what the images depend on beside the settings."""
@@ -343,18 +230,9 @@ class SplatSubject:
         """Return the radius of a sphere around a point that holds the Gaussians' box."""
         return float(np.linalg.norm(np.abs(self.bounds() - centre).max(axis=0)))
 
-    def camera(self, settings) -> SplatCamera:
-        """Return the camera of a capture with these settings."""
-        return SplatCamera(self.splats, settings)
-
-
-class SplatCamera:
-    """Camera that sees Gaussians, ``settings`` (:class:`.capture.CaptureSettings`) as for a scene."""
-
-    def __init__(self, splats: Splats, settings):
-        self.settings = settings
-        box = splats.box()
-        self.centre, self.scale = box.mean(axis=0), SIZE / max(np.linalg.norm(box[1] - box[0]) / 2, 1e-30)
+    def prepare(self) -> None:
+        """Load the scene of the Gaussians, at the traced size."""
+        splats = self.splats
         centres = (splats.centres - self.centre) * self.scale
         data = np.concatenate([centres, splats.scales * self.scale, splats.quaternions], axis=1)
         arrays = {

@@ -12,8 +12,7 @@ import functools
 
 import mitsuba as mi
 
-from ..fitting.settings import FitSettings
-from ..fitting.task import fit, load_model
+from ..fitting.task import FitSettings, fit, load_model
 from ..measure.renders import bsdf_queries, directions
 from ..measure.store import fingerprint, package_files
 from ..measure.study import Candidate, Case, Measure, Plan, Study

@@ -19,7 +19,7 @@ import numpy as np
 
 from ..arrays.lookup import STORAGES
 from ..core.runtime import array_module
-from ..fitting.settings import FitSettings
+from ..fitting.task import FitSettings
 from ..measure.clock import Operations, count_query
 from ..measure.renders import QUERIES, bsdf_queries, directions, noise_texture
 from ..measure.store import fingerprint, package_files

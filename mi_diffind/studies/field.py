@@ -5,8 +5,7 @@ All contenders begin with one trained grid and are trained through the same imag
 The *hash grid* is that of ``drjit.nn`` with a network. *Paper* and *ours* are presets of ``fit field``. Cells that no
 ray sees are removed from the grid.
 
-Bytes are those in memory of all that a read needs, the index included. Grids are as fine as the budget allows; the
-network, whose steps take longer, has the time ``--seconds``.
+Bytes are those in memory of all that a read needs, the index included. Grids are as fine as the budget allows.
 
 Errors are PSNR of sRGB values before white in held-out views: of the pixels of the foreground
 (``psnr_foreground_db``) and of all pixels (``psnr_white_db``), which flatters.
@@ -25,7 +24,6 @@ import mitsuba as mi
 import numpy as np
 
 from ..arrays.sparse_grid import complete_cells
-from ..core.progress import Deadline
 from ..core.runtime import array_module
 from ..core.units import parse_compression
 from ..fitting.loop import FitSettings, fit
@@ -37,7 +35,6 @@ from ..tasks.radiance import dense_bytes
 from ..tasks.radiance import grid as grids
 from ..tasks.radiance.compression import Importance, importance
 from ..tasks.radiance.files import grid_of, load
-from ..tasks.radiance.march import march
 from ..tasks.radiance.session import FieldSession, ImagesProblem, displayed
 from ..tasks.radiance.views import load_views
 from ..tasks.radiance.volume_field import VolumeField
@@ -81,10 +78,10 @@ WHITE = "psnr_white_db"
 
 
 class RadianceStudy(Study):
-    """Study of radiance fields in equal bytes: errors in held-out views, and the times of reads and renders."""
+    """Study of radiance fields in equal bytes: errors in held-out views, and times of reads."""
 
     name = "field"
-    title = "the radiance field of a capture, in equal bytes, views, reads and renders"
+    title = "the radiance field of a capture, in equal bytes, views and reads"
     example = "views"
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
@@ -105,10 +102,6 @@ class RadianceStudy(Study):
         parser.add_argument(
             "--steps", type=int, default=0, metavar="N", help="steps of each training through the images (default: 500)"
         )
-        parser.add_argument(
-            "--seconds", type=float, default=0.0, metavar="S",
-            help="seconds of the training of the network, whose steps take long (default: 90)",
-        )  # fmt: skip
 
     def check(self, arguments) -> None:
         """Check the options and read the views; raise :class:`~mi_diffind.tasks.radiance.views.ViewsError`."""
@@ -119,8 +112,6 @@ class RadianceStudy(Study):
             value = getattr(arguments, name)
             if value and value < least:
                 raise ValueError(f"--{name}: found {value}, at least {least} is needed")
-        if not 0 <= arguments.seconds < float("inf"):
-            raise ValueError(f"--seconds: found {arguments.seconds:g}, allowed are numbers that are not negative")
         if arguments.source == DEFAULT and not Path(DEFAULT).exists():
             raise ValueError(f'there is no folder "{DEFAULT}": make it by mi-diffind capture {SCENE} -o {DEFAULT}')
         arguments.views = tuple(load_views(arguments.source, split) for split in ("train", "test"))
@@ -133,8 +124,6 @@ class RadianceStudy(Study):
             resolution=arguments.resolution or (24 if quick else 128),
             grid_steps=60 if quick else 0,  # of the initial grid; 0: as its preset says
             steps=arguments.steps or (40 if quick else 500),
-            seconds=arguments.seconds or (3.0 if quick else 90.0),
-            film=48 if quick else 200,  # pixels on a side of the timed picture
         )
         session = FieldSession(array_module(mi.variant()), *arguments.views)
         return plan(session, arguments.source, settings)
@@ -213,20 +202,19 @@ def rival_contender(context: RadianceStudyContext, fields: dict) -> Contender:
     rival = rivals.HashVolumeFit if fields["method"] == "hash" else rivals.NodesFit
 
     def train(job: Contender, progress: bool) -> dict | None:
-        nbytes, steps, rate, deadline = context.dense_bytes / job.budget, settings.steps, SETTINGS.lr, None
+        nbytes, rate = context.dense_bytes / job.budget, HASH_RATE
         if job.method == "hash":
             grid = grids.refine(context.trained, context.cells)
-            trained, rate, steps = rival(grid, context.importance(grid), nbytes), HASH_RATE, 10**6
-            deadline = Deadline(settings.seconds)
+            trained = rival(grid, context.importance(grid), nbytes)
         else:
             entries = min(ENTRIES, int(nbytes / 64)) if job.method == "codebook" else 0
             grid = rivals.fitting_grid(context.trained, context.cells, nbytes, entries)
             trained = rival(grid, context.importance(grid), entries)
-            rate = COARSER_RATE if grid.nodes.spacing > context.trained.nodes.spacing else rate
+            rate = COARSER_RATE if grid.nodes.spacing > context.trained.nodes.spacing else SETTINGS.lr
         problem = ImagesProblem(context.session, trained.net, trained.field_of)
         problem.measure = lambda net: {"step": 0.0}  # the last step counts for all contenders
-        options = replace(SETTINGS, lr=rate, steps=steps, measure_every=steps)
-        result = fit(problem, options, progress=progress, title=job.name, deadline=deadline)
+        options = replace(SETTINGS, lr=rate, steps=settings.steps, measure_every=settings.steps)
+        result = fit(problem, options, progress=progress, title=job.name)
         if result.interrupted:
             return None
         trained.net = problem.net
@@ -268,7 +256,7 @@ def plan(session: FieldSession, source: str, settings: SimpleNamespace) -> Plan:
         title=f"Radiance field: {Path(source).name}",
         candidates=candidates,
         cases=[
-            Case("reads", lambda lanes: _reads(context, timed, lanes), lambda: _renders(context, timed)),
+            Case("reads", lambda lanes: _reads(context, timed, lanes)),
         ],
         ratios=[(ours, n) for n in shown if jobs[n].method in AGAINST] if ours else [],
         details={
@@ -311,25 +299,6 @@ def _reads(context: RadianceStudyContext, names, lanes: int) -> dict:
         queries["density"][name] = lambda f=model: [f.density_at(p)[0]]
         queries["both"][name] = lambda f=model: both(f)
     return queries
-
-
-def _renders(context: RadianceStudyContext, names) -> dict:
-    """Return renders of the first held-out view, one ray a pixel in tiles of 4 × 4."""
-    types, side = context.types, context.settings.film
-    images = context.session.held_out_images
-    lane = dr.arange(types.UInt32, side * side)
-    tile, pixel = lane // 16, lane % 16
-    x, y = (tile % (side // 4)) * 4 + pixel % 4, (tile // (side // 4)) * 4 + pixel // 4
-    height, width = images.views.sizes[0].tolist()
-    place = [(types.Float(v) + 0.5) * (size / side) - 0.5 for v, size in ((x, width), (y, height))]
-    o, d = images.rays(types.UInt32(0), *place)
-    dr.make_opaque(o, d)
-
-    def render(model):
-        seen = march(model, o, d, 0, dr.inf)
-        return [*seen.colour, seen.transmittance]
-
-    return {name: lambda k, f=context.jobs[name].model: render(f) for name in names}
 
 
 def draw_views(context: RadianceStudyContext, names: list[str], result: dict):

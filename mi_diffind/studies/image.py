@@ -32,8 +32,7 @@ from ..core.units import parse_compression
 from ..fitting.loop import FitSettings, fit
 from ..images import metrics
 from ..maps import as_seen
-from ..maps.compressed import decibel
-from ..maps.pyramid import Pyramid
+from ..maps.pyramid import Pyramid, decibel
 from ..maps.source import Source, load_source
 from ..measure.study import FLOOR, Candidate, Case, Measure, Plan, Study
 from ..measure.training import Contender, halve

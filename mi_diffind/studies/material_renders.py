@@ -31,8 +31,7 @@ from ..arrays.tables import Table
 from ..core.compat import use_threads
 from ..core.runtime import array_module
 from ..fitting import task
-from ..maps.compressed import decibel
-from ..maps.pyramid import Pyramid
+from ..maps.pyramid import Pyramid, decibel
 from ..maps.source import Source
 from ..measure import clock, plot
 from ..measure.renders import TextureScene, still_scenes, to_uv, zoom_scene
@@ -154,7 +153,7 @@ class RenderedMaterial:
 
 def mip_maps(source: Source, nbytes: int) -> dict[str, tuple[Pyramid, int]]:
     """Return uncompressed levels of a material, those of LEAN, and these in ASTC in ``nbytes``, with their bytes."""
-    pyramid = Pyramid.of(source, types=array_module(mi.variant()), border=("repeat", "repeat"))
+    pyramid = Pyramid.from_source(source, types=array_module(mi.variant()), border=("repeat", "repeat"))
     lean = normals.with_roughness(pyramid, normals.lean_levels(pyramid))
     pyramids = {"mip maps": (pyramid, pyramid.nbytes), "LEAN mip maps": (lean, lean.nbytes)}
     if "astc" in codecs.available():

@@ -14,14 +14,12 @@ against renders of exact plugins. The noise of both renders is not counted: the 
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import gc
-import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
@@ -33,7 +31,7 @@ from ..core.files import writable_folder
 from ..fitting import task
 from ..images import metrics
 from ..images.srgb import for_display
-from ..maps.compressed import decibel
+from ..maps.pyramid import decibel
 from ..maps.source import load_source
 from ..measure import plot
 from ..measure.report import figure_caption
@@ -42,9 +40,9 @@ from ..measure.study import Measure, Plan, Study
 from ..measure.training import Contender
 from ..scenes import loading
 from ..scenes.training.options import SceneRecipe, ViewDistribution
-from ..scenes.training.problem import exposure_of
+from ..scenes.training.problem import estimate_exposure
 from ..scenes.training.references import ReferenceRenders
-from ..scenes.training.trained_scene import TrainedScene, original_of, texture_file
+from ..scenes.training.trained_scene import TrainedScene, find_source, texture_file
 from ..tasks.texture.compressed import load
 
 #: Names of the runs.
@@ -75,40 +73,21 @@ SHOWN = ("start", "hemisphere", "scene", AFTER)
 SEED = 1000
 
 
-@dataclass(frozen=True)
-class SceneTrainingSettings:
-    """Settings of the study.
+#: Settings of the study. ``lambdas``: weights of the loss of renders. ``counts``: samples a pixel of trainings.
+#: ``steps`` of a training inside a scene, on ``views`` views, of which ``held_out`` others choose the state; ``tests``
+#: views are measured. Renders are ``width`` pixels wide and 9/16 of this high, with paths of ``depth``.
+#: ``reference_spp`` and ``spp``: samples a pixel of references, and of a measured render. ``hemisphere_steps``: steps
+#: of a training over the hemisphere to its end; ``texture_steps``: those of the texture of another material.
+FULL = {
+    "lambdas": [0.5, 0.9, 1.0], "counts": [1, 4], "steps": 400, "views": 16, "held_out": 4, "tests": 8, "width": 96,
+    "depth": 3, "reference_spp": 512, "spp": 128, "hemisphere_steps": 1500, "texture_steps": 200,
+}  # fmt: skip
 
-    ``lambdas``: weights of the loss of renders. ``counts``: samples a pixel of trainings. ``steps`` of a training
-    inside a scene, on ``views`` views, of which ``held_out`` others choose the state; ``tests`` views are measured.
-    Renders are ``width`` pixels wide and 9/16 of this high, with paths of ``depth``. ``reference_spp`` and ``spp``:
-    samples a pixel of references, and of a measured render. ``hemisphere_steps``: steps of a training over the
-    hemisphere to its end; ``texture_steps``: those of the texture of another material.
-    """
-
-    lambdas: tuple[float, ...] = (0.5, 0.9, 1.0)
-    counts: tuple[int, ...] = (1, 4)
-    steps: int = 400
-    views: int = 16
-    held_out: int = 4
-    tests: int = 8
-    width: int = 96
-    depth: int = 3
-    reference_spp: int = 512
-    spp: int = 128
-    hemisphere_steps: int = 1500
-    texture_steps: int = 200
-
-    @classmethod
-    def quick(cls) -> SceneTrainingSettings:
-        """Return the settings of a smoke run."""
-        small = {"views": 2, "held_out": 1, "tests": 1, "width": 16, "depth": 2, "reference_spp": 8, "spp": 8}
-        return cls((0.9,), (1,), steps=2, hemisphere_steps=2, texture_steps=2, **small)
-
-    @property
-    def defines(self) -> dict[str, int]:
-        """Values of a scene's ``<default>`` parameters."""
-        return {"width": self.width, "height": self.width * 9 // 16, "max_depth": self.depth}
+#: Settings of a quick study.
+QUICK = {
+    "lambdas": [0.9], "counts": [1], "steps": 2, "views": 2, "held_out": 1, "tests": 1, "width": 16, "depth": 2,
+    "reference_spp": 8, "spp": 8, "hemisphere_steps": 2, "texture_steps": 2,
+}  # fmt: skip
 
 
 class SceneTrainingStudy(Study):
@@ -147,15 +126,9 @@ class SceneTrainingStudy(Study):
         arguments.paths = scene_files(arguments.scenes, arguments.quick)
 
     def plan(self, arguments) -> Plan:
-        settings = SceneTrainingSettings.quick() if arguments.quick else SceneTrainingSettings()
-        settings = dataclasses.replace(
-            settings,
-            lambdas=tuple(sorted(set(arguments.lambdas or settings.lambdas))),
-            counts=tuple(sorted(set(arguments.counts or settings.counts))),
-            steps=arguments.steps or settings.steps,
-            width=arguments.width or settings.width,
-        )
-        return plan(arguments.paths, settings)
+        given = {name: value for name in ("steps", "width") if (value := getattr(arguments, name))}
+        given |= {name: sorted(set(value)) for name in ("lambdas", "counts") if (value := getattr(arguments, name))}
+        return plan(arguments.paths, SimpleNamespace(**{**(QUICK if arguments.quick else FULL), **given}))
 
 
 STUDY = SceneTrainingStudy()
@@ -173,13 +146,14 @@ def scene_files(paths: Sequence[str], quick: bool) -> list[Path]:
 class SceneTrainingContext:
     """A scene, its references, and the measurement of tables in it."""
 
-    def __init__(self, path: Path, settings: SceneTrainingSettings):
+    def __init__(self, path: Path, settings: SimpleNamespace):
         self.path, self.name, self.settings = path, path.stem.removeprefix("training_"), settings
         self.ranges = RANGES.get(path.stem, RANGES["training_balls"])
-        self.parsed = loading.ParsedScene(path, settings.defines)
+        self.defines = {"width": settings.width, "height": settings.width * 9 // 16, "max_depth": settings.depth}
+        self.parsed = loading.ParsedScene(path, self.defines)
         self.file, given = texture_file(self.parsed)
         self.start = load(self.file)
-        self.source = original_of(self.start, self.file, given)
+        self.source = find_source(self.start, self.file, given)
 
     @staticmethod
     def references(folder: Path) -> Path:
@@ -215,7 +189,7 @@ def measured_views(context: SceneTrainingContext, folder: Path) -> tuple:
     distribution = ViewDistribution(1, context.settings.tests, seed=SEED, **context.ranges)
     spp, views = context.settings.reference_spp, distribution.measured()
     images = ReferenceRenders(context.parsed, distribution, spp, folder, without=(context.file,)).images(views)
-    return distribution, views, images, exposure_of(images)
+    return distribution, views, images, estimate_exposure(images)
 
 
 def picture(contexts: Sequence[SceneTrainingContext], runs: Sequence[Contender], result: dict):
@@ -267,7 +241,7 @@ def training_run(
         given = {} if after is None else {"start": after.file}
         ranges = {name: tuple(map(float, limits)) for name, limits in context.ranges.items()}
         return task.fit(
-            "scene", context.path, defines=list(settings.defines.items()), steps=settings.steps,
+            "scene", context.path, defines=list(context.defines.items()), steps=settings.steps,
             measure_every=max(1, settings.steps // 8), views=settings.views, held_out=settings.held_out,
             reference_spp=settings.reference_spp, references=context.references(job.folder), spp=spp, share=share,
             **ranges, **given, **options, **common,
@@ -330,7 +304,7 @@ def planned_runs(context: SceneTrainingContext) -> list[Contender]:
     ]  # fmt: skip
 
 
-def plan(paths: Sequence[Path], settings: SceneTrainingSettings) -> Plan:
+def plan(paths: Sequence[Path], settings: SimpleNamespace) -> Plan:
     """Return the plan for scene files in the current variant."""
     contexts = [SceneTrainingContext(path, settings) for path in paths]
     runs = [run for context in contexts for run in planned_runs(context)]
@@ -343,10 +317,10 @@ def plan(paths: Sequence[Path], settings: SceneTrainingSettings) -> Plan:
             Measure("PSNR of held-out views and lights, dB", "psnr_db"),
             Measure("FLIP", "flip", ".3f", False),
         ),
-        details={"scenes": [c.name for c in contexts], "request": json.loads(json.dumps(asdict(settings)))},
+        details={"scenes": [c.name for c in contexts], "request": vars(settings)},
         notes=[
             f"{settings.steps} steps, {settings.views} views of {settings.width} × {settings.width * 9 // 16} pixels; "
-            f"errors: {settings.tests} other views and lights against {settings.reference_spp} spp"
+            f"errors: {settings.tests} other views and lights against {settings.reference_spp} spp."
         ],
         jobs=runs,
         jobs_fingerprint=fingerprint(file for c in contexts for file in (c.file, *c.parsed.files())),

@@ -283,7 +283,7 @@ def plan(mesh: Mesh, name: str, settings: SimpleNamespace) -> Plan:
         candidates=candidates,
         cases=[
             Case("reads", reads),
-            Case("rays", rays),
+            *([Case("rays", rays)] if traced else []),
         ],
         ratios=[(timed["ours"].name, other) for other in compared] if "ours" in timed else [],
         details={
@@ -340,7 +340,7 @@ def camera_rays(film: tuple[int, int], count: int | None = None):
 
 def mesh_scene(mesh: Mesh) -> mi.Scene:
     """Return a scene of a mesh in the unit frame."""
-    shape = mi.Mesh(*compat.mesh_arguments(mi.Properties("mesh"), len(mesh.vertices), len(mesh.faces)))
+    shape = mi.Mesh("mesh", len(mesh.vertices), len(mesh.faces), mi.Properties("mesh"))
     buffers = mi.traverse(shape)
     compat.set_triangles(buffers, mesh.vertices, mesh.faces)
     buffers.update()

@@ -43,10 +43,9 @@ from ..core.progress import Deadline
 from ..core.runtime import array_module
 from ..fitting import task
 from ..fitting.loop import FitResult
-from ..fitting.settings import FitSettings, FittingError
+from ..fitting.task import FitSettings, FittingError
 from ..images import srgb
-from ..maps.compressed import decibel
-from ..maps.pyramid import Pyramid
+from ..maps.pyramid import Pyramid, decibel
 from ..maps.source import Source, SourceError, load_source
 from ..measure import plot
 from ..measure.renders import POINTS, MovingView
@@ -58,11 +57,11 @@ from ..tasks import texture as texture_task
 from ..tasks.disney.model import Effects
 from ..tasks.shading import fit as shading_fit
 from ..tasks.shading.evaluation import ShadedEvaluation, ShadedReader, reader, reference
-from ..tasks.shading.material import effects_of, frozen_decoder
-from ..tasks.shading.training import ShadingProblem, fit_shading, start_of
-from ..tasks.texture import training as textures
+from ..tasks.shading.material import frozen_decoder, material_effects
+from ..tasks.shading.training import ShadingProblem, fit_shading, trainable_arrays
+from ..tasks.texture import fit as textures
 from ..tasks.texture.compressed import CompressedTexture
-from ..tasks.texture.fit import size_of
+from ..tasks.texture.fit import find_size
 from .baselines import codecs, normals
 from .example_maps import MATERIALS, generated_source
 from .material_renders import RenderSettings, run_renders
@@ -279,8 +278,8 @@ class ShadingContenders:
         types, quick = array_module(mi.variant()), self.settings.quick
         self.preset = shading_task.PRESETS[self.settings.preset]
         self.recipe = texture_task.PRESETS[self.preset.texture]
-        self.pyramid = Pyramid.of(self.source, textures.layout_of(self.source, self.recipe), types)
-        self.effects = effects_of(self.pyramid.layout)[0]
+        self.pyramid = Pyramid.from_source(self.source, textures.source_layout(self.source, self.recipe), types)
+        self.effects = material_effects(self.pyramid.layout)[0]
         self.zoom = ShadedZoom(self.pyramid, self.effects, self.settings.frames, 32 if quick else 96)
 
     @cached_property
@@ -387,12 +386,12 @@ class ShadingContenders:
 
         With ``extras``, the arrays leave room for them.
         """
-        request = self.request(texture_task.PRESETS["ours"].settings, length, seed, progress)
-        recipe = dataclasses.replace(self.recipe, settings=request.settings)
+        request = self.request(texture_task.PRESETS["ours"], length, seed, progress)
+        recipe = dataclasses.replace(self.recipe, **request.settings.common)
         nbytes = self.source.nbytes / COMPRESSION
         nbytes = shading_fit.bytes_beside_extras(nbytes, pyramid) if extras else nbytes
-        size = size_of(self.source, pyramid, nbytes, recipe, request.options)
-        problem = textures.problem_of(self.source, size, recipe, pyramid)
+        size = find_size(self.source, pyramid, nbytes, recipe, request.options)
+        problem = textures.build_problem(self.source, size, recipe, pyramid)
         result = request.train(problem, f"{self.name}: texture, seed {seed}")
         stored = CompressedTexture(pyramid.layout, textures.stored_form(problem.net))
         trained = textures.to_table(stored, {**request.recorded(), "source": self.source.digest, "steps": result.steps})
@@ -455,16 +454,16 @@ class ShadingContenders:
 
         def train(progress: bool) -> tuple:
             preset = self.preset
-            settings = dataclasses.replace(preset.settings, schedule="cosine" if schedule else "constant")
+            settings = dataclasses.replace(preset, schedule="cosine" if schedule else "constant")
             request = self.request(settings, self.settings.length, seed, progress)
             recipe = dataclasses.replace(
                 preset, share=share, clip=(preset.clip or CLIP) if clip else None, extras=extras,
-                level_bias=preset.level_bias if share else 0.0, settings=request.settings,
+                level_bias=preset.level_bias if share else 0.0, **request.settings.common,
             )  # fmt: skip
             before = self.table(start)
             try:
                 fit = fit_shading if preset.bounded else fit_to_the_end
-                net = start_of(before, self.pyramid)
+                net = trainable_arrays(before, self.pyramid)
                 table, result = fit(self.source, net, recipe, request, self.pyramid, self.evaluation)
             except FittingError:  # diverged repeatedly: the result is the start
                 table, result = before, FitResult({}, 0, 0, 0.0, False, 0, [])

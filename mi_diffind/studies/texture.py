@@ -33,9 +33,8 @@ from ..core.arguments import positive
 from ..core.runtime import array_module
 from ..core.units import parse_compression
 from ..fitting import task
-from ..fitting.settings import FitSettings
-from ..maps.compressed import FilteredMaps, decibel
-from ..maps.pyramid import Pyramid
+from ..fitting.task import FitSettings
+from ..maps.pyramid import FilteredMaps, Pyramid, decibel
 from ..maps.source import Map, Source, load_source
 from ..measure import plot, renders
 from ..measure.renders import TextureReader, TextureScene, TextureZoom
@@ -45,7 +44,7 @@ from ..measure.study import FLOOR, Candidate, Case, Job, Measure, Plan, Study
 from ..measure.training import Contender, NetworkContender, load_arrays
 from ..plugins.support.image_files import PYRAMIDS
 from ..scenes.loading import footprint
-from ..tasks.texture import nets, training
+from ..tasks.texture import compressed, fit
 from . import equal_memory
 from .baselines import codecs, networks
 
@@ -240,7 +239,7 @@ class TextureContenders:
     @cached_property
     def pyramid(self) -> Pyramid:
         """The uncompressed levels, repeated as bitmaps are."""
-        return Pyramid.of(self.source, types=array_module(mi.variant()), border=("repeat", "repeat"))
+        return Pyramid.from_source(self.source, types=array_module(mi.variant()), border=("repeat", "repeat"))
 
     @cached_property
     def truth_levels(self) -> dict[str, list[np.ndarray]]:
@@ -501,7 +500,7 @@ def _case(context: TextureContenders, scene: TextureScene, candidates: list[Cand
         index = np.arange(lanes)
         si = scene.hits(loaded, (index % width + 0.5) / width, (index // width + 0.5) / -(-lanes // width))
         dr.make_opaque(si.uv, si.p, si.dp_du, si.dp_dv, si.wi, si.sh_frame, si.duv_dx, si.duv_dy)
-        cone = footprint.Cone.of(loaded.sensors()[0])
+        cone = footprint.Cone.from_sensor(loaded.sensors()[0])
         functions = {FLOOR: lambda: [si.uv.x, si.uv.y]}
         for c in candidates:
             if c.name == BASE or c.setting in FILTERS:
@@ -571,8 +570,8 @@ def draw_levels(context: TextureContenders, result: dict):
     """
     count, panels = context.pyramid.levels, {}
     if context.settings.footprints:
-        shares = {"by level (ours)": training.shares(count)}
-        shares |= {name: nets.footprint_histogram(name, count) for name in nets.FOOTPRINTS}
+        shares = {"by level (ours)": fit.shares(count)}
+        shares |= {name: compressed.footprint_histogram(name, count) for name in compressed.FOOTPRINTS}
         panels["% of the samples of a training"] = [
             plot.Curve(name, range(count), 100 * np.asarray(share)) for name, share in shares.items()
         ]

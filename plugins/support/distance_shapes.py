@@ -2,21 +2,16 @@
 
 Mitsuba 3.9 has no shapes written in Python but meshes. A *distance shape* (:func:`distance_shape`) is therefore a mesh
 of eight triangles without area, at the corners of the field's box: the scene knows its extent, its material and its
-parameters, and no ray ever hits it. Integrators that support these shapes (:func:`distance_shapes_in`) trace the fields
-themselves (:func:`intersect`, :func:`occluded`) and compute the surface interaction that Mitsuba would
-(:func:`interaction`).
+parameters, and no ray ever hits it. Integrators that support these shapes trace their fields (:class:`Solids`).
 
 Once Mitsuba has Python shapes (``mi.Shape`` with ``bbox``, ``ray_intersect_preliminary``,
-``compute_surface_interaction``), a distance shape becomes one of these, the functions its methods, and any
-integrator sees it.
+``compute_surface_interaction``), a distance shape becomes one of these, and any integrator sees it.
 """
 
 from __future__ import annotations
 
-import atexit
 import functools
 import hashlib
-import shutil
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,13 +26,13 @@ from mi_diffind.core import compat
 from mi_diffind.core.errors import DiffindError
 from mi_diffind.core.files import is_within, stamp
 from mi_diffind.tasks.sdf import TASK, marching
-from mi_diffind.tasks.sdf.mesh import Mesh, edge_balance, load_mesh, read_serialized, split_part
+from mi_diffind.tasks.sdf.mesh import edge_balance, load_mesh, read_serialized, split_part
 
 from .. import warn
 from . import omissions, properties
-from .placement import Placement, PlacementParameter
+from .placement import Placement
 from .properties import Kept
-from .tables import arrays_of
+from .tables import Entries, arrays_of
 
 #: Distance of secondary rays' origins from the surface: three shortest steps of a ray.
 OFFSET = 3 * marching.SHORTEST_STEP
@@ -65,16 +60,18 @@ def distance_shape(mesh: type) -> type:
     class DistanceShape(mesh):
         """Shape of a distance ``field``'s surface, placed in the world by ``placement``.
 
-        ``smooth``: shading normals are the field's smooth ones.
+        ``smooth``: shading normals are the field's smooth ones. A class whose field can be optimised overrides
+        :meth:`entries`.
         """
 
         #: Integrators that trace it.
         seen_by = SEEN_BY
 
         def __init__(self, props: mi.Properties, field, placement: Placement, smooth: bool):
-            self.field, self.smooth, self.position = field, smooth, PlacementParameter(placement)
+            self.field, self.smooth, self.placement = field, smooth, placement
             self.ready, self.differentiated = False, False
-            super().__init__(*compat.mesh_arguments(props, CORNERS, CORNERS))
+            self._accepted = Entries(self.entries())
+            super().__init__(props.plugin_name(), CORNERS, CORNERS, props)
             if self.is_emitter():
                 raise RuntimeError("emitter: found one, signed distance fields emit no light")
             if self.is_medium_transition():
@@ -84,15 +81,10 @@ def distance_shape(mesh: type) -> type:
             self.add_attribute(UNMERGED, 1, [0.0] * CORNERS)
             omissions.watch(self)
 
-        @property
-        def placement(self) -> Placement:
-            """Placement of the unit frame in the world."""
-            return self.position.placement
-
         def _place(self) -> None:
             """Move the triangles to the corners of the field's box in the world, and the frame with them."""
             # Attributes of their own, where frozen functions (``dr.freeze``) look for arrays
-            self.axes, self.origin, self.size = self.position.axes, self.position.origin, self.position.size
+            self.axes, self.origin, self.size = self.placement.axes, self.placement.origin, self.placement.size
             box = np.array([self.field.lower, self.field.upper], np.float64)
             corners = np.stack(np.meshgrid(*box.T, indexing="ij"), -1).reshape(-1, 3)
             self.ready = False
@@ -111,14 +103,21 @@ def distance_shape(mesh: type) -> type:
                 super().traverse(cb)
                 return
             cb.put("bsdf", self.bsdf(), mi.ParamFlags.Differentiable)
-            cb.put("to_world", self.position.transform, mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous)
+            cb.put("to_world", self.placement.transform, mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous)
+            for name, values in self.tensors().items():
+                cb.put(f"tables.{name}", values, mi.ParamFlags.Differentiable)
 
         def parameters_changed(self, keys=()) -> None:
             if not self.ready:
                 super().parameters_changed(keys)
-            elif not keys or "to_world" in keys:
-                self.position.update()
+                return
+            if not keys or "to_world" in keys:
+                self.placement.update()
                 self._place()
+            self._accepted.accept()
+            if self.optimisable() and (not keys or any(key.startswith("tables.") for key in keys)):
+                self.field.update_bound()
+                self._hold()
 
         def omitted(self, integrators: list, sensor) -> str:
             """Return a sentence if these integrators do not trace the shape; see :mod:`.omissions`."""
@@ -135,11 +134,20 @@ def distance_shape(mesh: type) -> type:
 
         def optimisable(self) -> bool:
             """Return whether the field's arrays are kept in a form that can be optimised."""
-            return False
+            return bool(self.entries())
+
+        def entries(self) -> dict:
+            """Return the arrays that can be optimised by name: tensors, or ``DifferentiableArray``."""
+            return {}
+
+        def tensors(self) -> dict:
+            """Return the tensors that can be optimised, by name."""
+            return {name: v if dr.is_tensor_v(v) else v.data for name, v in self.entries().items()}
 
         def attached(self) -> list:
             """Return the arrays of the field and the transform whose derivatives are tracked."""
-            return [self.position.transform.matrix] if self.position.moving() else []
+            moved = [self.placement.transform.matrix] if self.placement.moving() else []
+            return moved + [values for values in self.tensors().values() if compat.has_gradient(values)]
 
         def optimised(self) -> bool:
             """Return whether derivatives with respect to the field or its place are enabled."""
@@ -183,7 +191,7 @@ def distance_shape(mesh: type) -> type:
             slope = dr.detach(slope)
             along = dr.dot(slope, direction)
             along = dr.copysign(dr.maximum(dr.abs(along), dr.maximum(GRAZING * dr.norm(slope), 1e-6)), along)
-            moving = self.position.moving()
+            moving = self.placement.moving()
             if moving:
                 # The frame moves, this place of the world does not
                 place = dr.detach(self.to_world(p))
@@ -214,23 +222,157 @@ def distance_shape(mesh: type) -> type:
     return DistanceShape
 
 
-class DistanceShapes:
-    """Sequence of distance shapes that loops do not traverse: no arrays of a shape are part of a loop's state.
+@dataclass  # a type that loops of Dr.Jit accept as state
+class ShapeHit:
+    """Hit of a distance shape: its ``number`` from 1, or 0; ``t``, ``p`` (unit frame), and the ray's direction ``d``.
 
-    In a list, they would be: Dr.Jit looks for arrays in the attributes of Mitsuba's objects.
+    Without a hit, ``t`` is the length of the ray.
     """
 
-    def __init__(self, shapes: list):
-        self._shapes = tuple(shapes)
-
-    def __len__(self) -> int:
-        return len(self._shapes)
-
-    def __getitem__(self, i: int):
-        return self._shapes[i]
+    number: mi.UInt32
+    t: mi.Float
+    p: mi.Point3f
+    d: mi.Vector3f
 
 
-def distance_shapes_in(scene: mi.Scene) -> DistanceShapes:
+@dataclass
+class SolidHit:
+    """Hit of one of Mitsuba's shapes, ``pi``, or of a distance shape, ``solid``: one of them is not valid.
+
+    ``previous`` is ``solid`` of the vertex before.
+    """
+
+    pi: mi.PreliminaryIntersection3f
+    solid: ShapeHit
+    previous: ShapeHit
+
+    @property
+    def t(self):
+        """Distance to the hit, the length of the ray without one."""
+        return self.solid.t
+
+
+class Solids:
+    """Distance ``shapes`` among those of Mitsuba, as paths meet them; see :class:`.path_footprint.Surfaces`.
+
+    Loops of Dr.Jit do not traverse this object: no arrays of a shape are part of a loop's state.
+    """
+
+    def __init__(self, shapes):
+        self.shapes = tuple(shapes)
+
+    def optimised(self) -> bool:
+        return any(shape.optimised() for shape in self.shapes)
+
+    def _each(self, hit: ShapeHit, active):
+        """Iterate over the shapes and the rays that hit each of them."""
+        return ((shape, (hit.number == i) & active) for i, shape in enumerate(self.shapes, 1))
+
+    def intersect(self, o, d, maxt, active=True, rest=0) -> ShapeHit:
+        """Return the first hit before ``maxt`` of rays that start at ``o`` + ``rest`` (:meth:`spawn`)."""
+        nearest = ShapeHit(mi.UInt32(0), mi.Float(maxt), mi.Point3f(0), mi.Vector3f(d))
+        for i, shape in enumerate(self.shapes, 1):
+            start, direction = shape.local_ray(o, d, rest)
+            result = marching.intersect(shape.field, start, direction, nearest.t / shape.size, active)
+            nearest.number = dr.select(result.hit, i, nearest.number)
+            nearest.t = dr.select(result.hit, result.t * shape.size, nearest.t)
+            nearest.p = dr.select(result.hit, mi.Point3f(result.p), nearest.p)
+        return nearest
+
+    def nearest(self, ray, pi, active, rest=0, before=None) -> SolidHit:
+        solid = self.intersect(ray.o, ray.d, dr.minimum(pi.t, ray.maxt), active, rest)
+        pi.t = dr.select(solid.number > 0, dr.inf, pi.t)
+        return SolidHit(pi, solid, dr.zeros(ShapeHit) if before is None else before.solid)
+
+    def interaction(self, ray, hit: SolidHit, flags, active, moving=False):
+        with dr.suspend_grad():  # ordinary shapes are constants
+            si = hit.pi.compute_surface_interaction(ray, ray_flags=flags, active=active)
+        for shape, here in self._each(hit.solid, active):
+            p, normal, shading = shape.surface(hit.solid.p, ray.d, here)
+            at = dr.zeros(mi.SurfaceInteraction3f)
+            at.t, at.time, at.wavelengths = hit.solid.t, ray.time, ray.wavelengths
+            at.p, at.n = p, mi.Normal3f(normal)
+            at.sh_frame = mi.Frame3f(shading)
+            at.dp_du, at.dp_dv = at.sh_frame.s, at.sh_frame.t
+            at.wi = at.sh_frame.to_local(-ray.d)
+            at.shape = mi.ShapePtr(shape)
+            at.duv_dx, at.duv_dy = si.duv_dx, si.duv_dy
+            si = dr.select(here, at, si)
+        if moving:
+            # Seen from the vertex before, which also moves
+            aside = mi.Vector3f(0)
+            for shape, here in self._each(hit.previous, active & si.is_valid()):
+                _, place = shape.move_along(hit.previous.p, hit.previous.d, here)
+                aside = dr.select(here, place - dr.detach(place), aside)
+            turn = aside - ray.d * dr.dot(aside, ray.d)
+            si.wi += dr.detach(si.sh_frame).to_local(turn) * dr.rcp(dr.select(si.is_valid(), si.t, 1))
+        return si
+
+    def spawn(self, hit: SolidHit, si, d) -> tuple:
+        # The origin of a ray from a distance shape is off the surface by OFFSET, in the unit frame
+        with dr.suspend_grad():
+            ray = si.spawn_ray(d)
+            o, rest = mi.Point3f(ray.o), mi.Vector3f(0)
+            for shape, here in self._each(hit.solid, True):
+                away = dr.copysign(mi.Float(OFFSET), dr.dot(si.n, d))
+                place, low = shape.split_world(dr.fma(shape.axes.to_local(mi.Vector3f(si.n)), away, hit.solid.p))
+                o, rest = dr.select(here, place, o), dr.select(here, low, rest)
+            ray.o = dr.detach(o)
+            return ray, dr.detach(rest)
+
+    def occluded(self, hit: SolidHit, si, ds, active):
+        ray, rest = self.spawn(hit, si, ds.d)
+        to = mi.Vector3f(ds.p - ray.o) - rest
+        distance = dr.norm(to)
+        # Places on infinite emitters are as far as the scene is large, and rounded far from the world's origin
+        infinite = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+        d, distance = dr.select(infinite, ds.d, to / distance), dr.select(infinite, ds.dist, distance)
+        blocked, maxt = mi.Bool(False), distance * (1 - mi.math.ShadowEpsilon)
+        for shape in self.shapes:
+            start, direction = shape.local_ray(ray.o, d, rest)
+            blocked |= marching.occluded(shape.field, start, direction, maxt / shape.size, active & ~blocked)
+        return blocked
+
+    def attach_emitter(self, si, ds):
+        # Points of emitters stay fixed, and so do directions to infinite ones
+        flags = ds.emitter.flags()
+        finite = ~mi.has_flag(flags, mi.EmitterFlags.Infinite)
+        distance = dr.norm(ds.p - si.p)
+        ds.d = dr.replace_grad(ds.d, dr.select(finite, (ds.p - si.p) / distance, ds.d))
+        ds.dist = dr.replace_grad(ds.dist, dr.select(finite, distance, ds.dist))
+        surface = mi.has_flag(flags, mi.EmitterFlags.Surface)
+        return dr.select(surface, dr.relative_grad(_jacobian(si.p, ds.p, ds.n)), 1)
+
+    def attach_direction(self, si, bs, ray, hit: SolidHit, active) -> tuple:
+        # The next vertex stays fixed, or the direction if there is none
+        target = self.interaction(ray, hit, compat.ray_flags(), active)
+        active = active & target.is_valid()
+        with dr.resume_grad():
+            d = dr.select(active, dr.normalize(target.p - si.p), ray.d)
+            wo = dr.replace_grad(bs.wo, si.to_local(d))
+            return wo, dr.select(active, dr.relative_grad(_jacobian(si.p, target.p, target.n)), 1)
+
+    def check_derivatives(self, adjoint: mi.TensorXf) -> None:
+        """Warn of shapes whose first backward pass, with a nonzero ``adjoint`` of the image, gave only zeros."""
+        if dr.flag(dr.JitFlag.FreezingScope):  # nothing can be evaluated
+            return
+        moving = [shape for shape in self.shapes if shape.optimised() and not shape.differentiated]
+        if not moving or not np.array(adjoint).any():
+            return
+        for shape in moving:
+            shape.differentiated = True
+        if not any(np.array(dr.grad(values)).any() for shape in moving for values in shape.attached()):
+            warn(
+                f'the derivatives of the shape "{moving[0].id()}" ({omissions.plugin_of(moving[0])}) are all zero: '
+                "they leave out outlines that move; add a loss on the field, such as masks"
+            )
+
+
+def _jacobian(p, q, n):
+    return mi.ad.integrators.common.solid_angle_to_area_jacobian(p, q, n)
+
+
+def solids_in(scene: mi.Scene) -> Solids:
     """Return the distance shapes of a scene. Raises ``RuntimeError`` if one is in a shape group."""
     shapes = [shape for shape in scene.shapes() if hasattr(shape, "local_ray")]
     hidden = [s for s in compat.scene_objects(scene) if hasattr(s, "local_ray") and s not in shapes]
@@ -239,23 +381,7 @@ def distance_shapes_in(scene: mi.Scene) -> DistanceShapes:
             f'"{hidden[0].id()}": is in a shapegroup, where its arrays cannot be traced; several shapes of one file '
             f'with a "to_world" of their own share its memory, and trace="grid" may be instanced'
         )
-    return DistanceShapes(shapes)
-
-
-def check_derivatives(shapes: DistanceShapes, adjoint: mi.TensorXf) -> None:
-    """Warn of shapes that have only zeros from their first backward pass, with a nonzero ``adjoint`` of the image."""
-    if dr.flag(dr.JitFlag.FreezingScope):  # nothing can be evaluated
-        return
-    moving = [shape for shape in shapes if shape.optimised() and not shape.differentiated]
-    if not moving or not np.array(adjoint).any():
-        return
-    for shape in moving:
-        shape.differentiated = True
-    if not any(np.array(dr.grad(values)).any() for shape in moving for values in shape.attached()):
-        warn(
-            f'the derivatives of the shape "{moving[0].id()}" ({omissions.plugin_of(moving[0])}) are all zero: '
-            "they leave out outlines that move; add a loss on the field, such as masks"
-        )
+    return Solids(shapes)
 
 
 def crop_grid(values: np.ndarray, lower, spacing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -313,93 +439,6 @@ def native_grid(props: mi.Properties, values: np.ndarray, lower, upper, to_world
     return mi.PluginManager.instance().create_object(both), instance
 
 
-@dataclass
-class ShapeHit:
-    """Hits of distance shapes: ``number`` of the shape in the list, from 1, or 0; ``t``; ``p`` (unit frame)."""
-
-    number: mi.UInt32
-    t: mi.Float
-    p: mi.Point3f
-
-
-def intersect(shapes: DistanceShapes, o, d, maxt, active=True, rest=0) -> ShapeHit:
-    """Return the first hit of rays before ``maxt``; without a hit, ``t`` is ``maxt``.
-
-    Rays start at ``o`` + ``rest``, as :func:`spawn` returns them.
-    """
-    nearest = ShapeHit(mi.UInt32(0), mi.Float(maxt), mi.Point3f(0))
-    for i, shape in enumerate(shapes):
-        start, direction = shape.local_ray(o, d, rest)
-        result = marching.intersect(shape.field, start, direction, nearest.t / shape.size, active)
-        nearest.number = dr.select(result.hit, i + 1, nearest.number)
-        nearest.t = dr.select(result.hit, result.t * shape.size, nearest.t)
-        nearest.p = dr.select(result.hit, mi.Point3f(result.p), nearest.p)
-    return nearest
-
-
-def occluded(shapes: DistanceShapes, o, d, maxt, active=True, rest=0):
-    """Return whether rays from ``o`` + ``rest`` hit any distance shape before ``maxt``."""
-    blocked = mi.Bool(False)
-    for shape in shapes:
-        start, direction = shape.local_ray(o, d, rest)
-        blocked |= marching.occluded(shape.field, start, direction, maxt / shape.size, active & ~blocked)
-    return blocked
-
-
-def interaction(shapes: DistanceShapes, hit: ShapeHit, ray, si, active=True):
-    """Replace ``si`` (``mi.SurfaceInteraction3f``) where a distance shape was hit."""
-    for i, shape in enumerate(shapes):
-        here = (hit.number == i + 1) & active
-        p, normal, shading = shape.surface(hit.p, ray.d, here)
-        at = dr.zeros(mi.SurfaceInteraction3f)
-        at.t, at.time, at.wavelengths = hit.t, ray.time, ray.wavelengths
-        at.p, at.n = p, mi.Normal3f(normal)
-        at.sh_frame = mi.Frame3f(shading)
-        at.dp_du, at.dp_dv = at.sh_frame.s, at.sh_frame.t
-        at.wi = at.sh_frame.to_local(-ray.d)
-        at.shape = mi.ShapePtr(shape)
-        at.duv_dx, at.duv_dy = si.duv_dx, si.duv_dy
-        si = dr.select(here, at, si)
-    return si
-
-
-def shift(shapes: DistanceShapes, hit: ShapeHit, d, active=True):
-    """Return zero with the derivative of the hit's place in the world, for rays with the direction ``d``."""
-    change = mi.Vector3f(0)
-    for i, shape in enumerate(shapes):
-        here = (hit.number == i + 1) & active
-        _, place = shape.move_along(hit.p, d, here)
-        change = dr.select(here, place - dr.detach(place), change)
-    return change
-
-
-def spawn(shapes: DistanceShapes, hit: ShapeHit, si, d) -> tuple:
-    """Return the origin of a ray from ``si`` in the direction ``d``, and the rest that single precision rounds off.
-
-    The origin of a ray from a distance shape is off the surface by :data:`OFFSET`, in the unit frame; that from any
-    other shape has no rest.
-    """
-    with dr.suspend_grad():
-        o, rest = mi.Point3f(si.spawn_ray(d).o), mi.Vector3f(0)
-        for i, shape in enumerate(shapes):
-            away = dr.copysign(mi.Float(OFFSET), dr.dot(si.n, d))
-            place, low = shape.split_world(dr.fma(shape.axes.to_local(mi.Vector3f(si.n)), away, hit.p))
-            here = hit.number == i + 1
-            o, rest = dr.select(here, place, o), dr.select(here, low, rest)
-        return dr.detach(o), dr.detach(rest)
-
-
-def occluded_from(shapes: DistanceShapes, hit: ShapeHit, si, ds, active=True):
-    """Return whether a distance shape lies between ``si`` and a sample of an emitter (``mi.DirectionSample3f``)."""
-    start, rest = spawn(shapes, hit, si, ds.d)
-    to = mi.Vector3f(ds.p - start) - rest
-    distance = dr.norm(to)
-    # Places on infinite emitters are as far as the scene is large, and rounded far from the world's origin
-    infinite = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-    d, distance = dr.select(infinite, ds.d, to / distance), dr.select(infinite, ds.dist, distance)
-    return occluded(shapes, start, d, distance * (1 - mi.math.ShadowEpsilon), active, rest)
-
-
 #: Share of open edges up to which a mesh counts as closed: a fit closes holes, but not a surface without an inside.
 OPEN = 0.01
 
@@ -425,9 +464,13 @@ def to_mesh(props: mi.Properties) -> None:
     file, _ = split_part(mesh)
     if not file.is_file():
         raise RuntimeError(f"{file}: no such file, {path.name} was made from it")
-    if not is_within(path.resolve().parent, recorded) and _digest(mesh, stamp(file)) != settings.get("source"):
+    beside = is_within(path.resolve().parent, recorded)
+    if beside and mesh.suffix.lower() == ".ply":
+        props["filename"] = str(mesh)
+        return
+    digest, props["filename"] = _as_ply(mesh, stamp(file))
+    if not beside and digest != settings.get("source"):
         raise RuntimeError(f"{file}: has changed since {path.name} was made from it")
-    props["filename"] = str(mesh) if mesh.suffix.lower() == ".ply" else _as_ply(mesh, stamp(file))
 
 
 def closed_mesh_file(path: Path, folder: Path, index: int = 0) -> Path:
@@ -492,29 +535,20 @@ def _smoothness(mesh: mi.Mesh) -> float:
 
 
 @functools.lru_cache
-def _folder() -> Path:
-    folder = Path(tempfile.mkdtemp(prefix="mi_diffind_"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return folder
+def _folder() -> tempfile.TemporaryDirectory:
+    """Return a folder that is removed when the process ends."""
+    return tempfile.TemporaryDirectory(prefix="mi_diffind_")
 
 
-def _load(path: Path) -> Mesh:
+@functools.lru_cache
+def _as_ply(path: Path, stamp: tuple) -> tuple[str, str]:
+    """Return the digest of a mesh file, and the path of the mesh as a PLY file, kept until the process ends."""
     try:
-        return load_mesh(path)
+        mesh = load_mesh(path)
     except DiffindError as e:
         raise RuntimeError(str(e)) from None
-
-
-@functools.lru_cache
-def _digest(path: Path, stamp: tuple) -> str:
-    """Return the digest of a mesh file."""
-    return _load(path).digest
-
-
-@functools.lru_cache
-def _as_ply(path: Path, stamp: tuple) -> str:
-    """Return a PLY copy of a mesh file, kept until the process ends."""
-    mesh = _load(path)
-    written = _folder() / f"{split_part(path)[0].stem}_{abs(hash((path, stamp))):x}.ply"
+    if path.suffix.lower() == ".ply":
+        return mesh.digest, str(path)
+    written = Path(_folder().name) / f"{split_part(path)[0].stem}_{abs(hash((path, stamp))):x}.ply"
     trimesh.Trimesh(mesh.to_file_frame(mesh.vertices), mesh.faces, process=False).export(written)
-    return str(written)
+    return mesh.digest, str(written)

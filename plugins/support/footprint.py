@@ -1,6 +1,6 @@
 """Footprint of a pixel at a surface hit: two full conjugate diameters of an ellipse in uv, ``ddx`` and ``ddy``.
 
-Both are ``mi.Vector2f``, the columns of ``si.footprint`` in Mitsuba 3.10. Their |det| (:func:`area`) is
+Both are ``mi.Vector2f``. Their |det| (:func:`area`) is
 |ddx(uv) × ddy(uv)| of Datta et al., *Efficient Graphics Representation with Differentiable Indirection*, SIGGRAPH Asia
 2023, task 4.
 
@@ -64,7 +64,7 @@ class Cone:
     corner: mi.Vector3f | None = None
 
     @classmethod
-    def of(cls, sensor: mi.Sensor, spp: int | None = None) -> Cone:
+    def from_sensor(cls, sensor: mi.Sensor, spp: int | None = None) -> Cone:
         """Return the cone of a loaded sensor, at ``spp`` samples per pixel (default: that of its sampler).
 
         The projection is derived from the sensor's rays: all go through one point or one lens, or all are parallel, and
@@ -166,23 +166,16 @@ def _number(props: mi.Properties, name: str, default: float) -> float:
 def footprint(si: mi.SurfaceInteraction3f, cone: Cone | None = None) -> tuple[mi.Vector2f, mi.Vector2f]:
     """Return the footprint at a hit: ``ddx, ddy`` in the surface's uv, before any ``to_uv``. It is always finite.
 
-    In each lane, the first of these sources counts that is neither zero nor infinite nor NaN: ``si.footprint``, which
-    Mitsuba 3.10 has; the partial derivatives ``si.duv_dx`` and ``si.duv_dy``, if an integrator filled them; the
-    ``cone`` (:func:`seen_by`). Without any, infinite values of the last source are limited to :data:`LARGEST`, and NaN
-    or no source at all is 0, the sharpest footprint.
+    In each lane, the first of these sources counts that is neither zero nor infinite nor NaN: the partial derivatives
+    ``si.duv_dx`` and ``si.duv_dy``, if an integrator filled them; the ``cone`` (:func:`seen_by`). Without any, infinite
+    values of the last source are limited to :data:`LARGEST`, and NaN or no source at all is 0, the sharpest footprint.
     """
-    sources = []
-    if (given := compat.footprint_of(si)) is not None:
-        sources.append(given)
-    sources.append((si.duv_dx, si.duv_dy))
     ddx, ddy = (mi.Vector2f(0), mi.Vector2f(0)) if cone is None else seen_by(cone, si)
-    for x, y in reversed(sources):
-        x, y = dr.detach(x), dr.detach(y)
-        size = _size(x, y)
-        valid = (size > 0) & (size < dr.inf)  # NaN: false
-        valid |= _size(ddx, ddy) == 0
-        ddx, ddy = dr.select(valid, _finite(x), ddx), dr.select(valid, _finite(y), ddy)
-    return ddx, ddy
+    x, y = dr.detach(si.duv_dx), dr.detach(si.duv_dy)
+    size = _size(x, y)
+    valid = (size > 0) & (size < dr.inf)  # NaN: false
+    valid |= _size(ddx, ddy) == 0
+    return dr.select(valid, _finite(x), ddx), dr.select(valid, _finite(y), ddy)
 
 
 def seen_by(cone: Cone, si: mi.SurfaceInteraction3f) -> tuple[mi.Vector2f, mi.Vector2f]:
@@ -199,22 +192,10 @@ def seen_by(cone: Cone, si: mi.SurfaceInteraction3f) -> tuple[mi.Vector2f, mi.Ve
     curved mirrors and rough bounces widen the footprint; only after concave mirrors and lenses may the true footprint
     be smaller. If dp_du and dp_dv are parallel or zero, the footprint is zero.
     """
-    p, du, dv = dr.detach(si.p), dr.detach(si.dp_du), dr.detach(si.dp_dv)
+    du, dv = dr.detach(si.dp_du), dr.detach(si.dp_dv)
     unit = dr.normalize(dr.cross(du, dv))
-    if cone.projection == "orthographic":
-        to, distance, depth = cone.axis, mi.Float(1), mi.Float(1)
-        tolerance = mi.Float(STRAIGHT)
-    else:
-        to = p - cone.origin
-        distance, depth = dr.norm(to), dr.dot(to, cone.axis)
-        to = to * dr.rcp(distance)
-        tolerance = STRAIGHT + cone.lens * dr.rcp(distance)
-    # A two-sided material may have flipped si.wi, so that the sign of z has no meaning
-    local, wi = dr.detach(si.sh_frame).to_local(to), dr.detach(si.wi)
-    away = mi.Vector3f(local.x + wi.x, local.y + wi.y, dr.abs(local.z) - dr.abs(wi.z))
-    direct = (dr.squared_norm(away) < dr.square(tolerance)) & (depth > 0)
-
-    last, incident = dr.detach(si.t), dr.detach(si.sh_frame).to_world(wi)
+    direct, to, distance, depth = _line_of_sight(cone, si)
+    last, incident = dr.detach(si.t), dr.detach(si.sh_frame).to_world(dr.detach(si.wi))
     oblique = dr.abs(dr.dot(incident, unit))
     by_last = dr.square(last) > dr.square(distance) * oblique
     if cone.projection == "orthographic":  # a pixel is as wide at any distance
@@ -227,6 +208,24 @@ def seen_by(cone: Cone, si: mi.SurfaceInteraction3f) -> tuple[mi.Vector2f, mi.Ve
     return in_uv(x, y, along, du, dv)
 
 
+def _line_of_sight(cone: Cone, si) -> tuple:
+    """Return whether a sensor sees a hit directly, the direction to the hit, and its distance and depth.
+
+    With an orthographic sensor, distance and depth are 1.
+    """
+    if cone.projection == "orthographic":
+        to, distance, depth, tolerance = cone.axis, mi.Float(1), mi.Float(1), mi.Float(STRAIGHT)
+    else:
+        to = dr.detach(si.p) - cone.origin
+        distance, depth = dr.norm(to), dr.dot(to, cone.axis)
+        to = to * dr.rcp(distance)
+        tolerance = STRAIGHT + cone.lens * dr.rcp(distance)
+    # A two-sided material may have flipped si.wi, so that the sign of z has no meaning
+    local, wi = dr.detach(si.sh_frame).to_local(to), dr.detach(si.wi)
+    away = mi.Vector3f(local.x + wi.x, local.y + wi.y, dr.abs(local.z) - dr.abs(wi.z))
+    return (dr.squared_norm(away) < dr.square(tolerance)) & (depth > 0), to, distance, depth
+
+
 def to_centre(cone: Cone | None, si: mi.SurfaceInteraction3f, ddx, ddy) -> mi.Vector2f:
     """Return the offset in uv from a hit to the place seen at the centre of its pixel.
 
@@ -235,13 +234,8 @@ def to_centre(cone: Cone | None, si: mi.SurfaceInteraction3f, ddx, ddy) -> mi.Ve
     """
     if cone is None or cone.corner is None:
         return mi.Vector2f(0)
-    to = dr.detach(si.p) - cone.origin
-    depth = mi.Float(1) if cone.projection == "orthographic" else dr.dot(to, cone.axis)
-    way = cone.axis if cone.projection == "orthographic" else dr.normalize(to)
-    local, wi = dr.detach(si.sh_frame).to_local(way), dr.detach(si.wi)
-    away = mi.Vector3f(local.x + wi.x, local.y + wi.y, dr.abs(local.z) - dr.abs(wi.z))
-    direct = (dr.squared_norm(away) < STRAIGHT**2) & (depth > 0)
-    place = to * dr.rcp(depth) - cone.corner
+    direct, _, _, depth = _line_of_sight(cone, si)
+    place = (dr.detach(si.p) - cone.origin) * dr.rcp(depth) - cone.corner
     steps = (dr.dot(place, v) * dr.rcp(dr.squared_norm(v)) for v in (cone.dx, cone.dy))
     x, y = (0.5 - (v - dr.floor(v)) for v in steps)
     return dr.select(direct, ddx * x + ddy * y, 0)
@@ -333,8 +327,8 @@ def attach(scene: mi.Scene, sensor: int | mi.Sensor = 0, spp: int | None = None)
     """Set the cone of all textures of a loaded scene that use one (:func:`textures`), and return their number.
 
     ``spp`` is the number of samples per pixel (default: that of the sampler). Call again after a change of the sensor
-    or of the samples. Without a supported sensor (:meth:`Cone.of`) the cone is ``None``, with a warning if there is an
-    unsupported one.
+    or of the samples. Without a supported sensor (:meth:`Cone.from_sensor`) the cone is ``None``, with a warning if
+    there is an unsupported one.
     """
     filtering = textures(scene)
     if not filtering:
@@ -344,7 +338,7 @@ def attach(scene: mi.Scene, sensor: int | mi.Sensor = 0, spp: int | None = None)
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor] if scene.sensors() else None
         if sensor is not None:
-            cone = Cone.of(sensor, spp)
+            cone = Cone.from_sensor(sensor, spp)
     except RuntimeError as e:
         mi.Log(mi.LogLevel.Warn, f"textures are not filtered: {e}")
         omissions.settle(filtering)

@@ -16,7 +16,6 @@ import numpy as np
 
 from mi_diffind.arrays.tables import Table, TableError
 from mi_diffind.core import compat
-from mi_diffind.core.archives import LimitError
 from mi_diffind.core.compat import backend_module
 from mi_diffind.core.errors import DiffindError
 from mi_diffind.core.files import (
@@ -29,16 +28,15 @@ from mi_diffind.core.files import (
     write_json,
 )
 from mi_diffind.fitting.task import Task
-from mi_diffind.images.headers import check_picture
-from mi_diffind.maps.compressed import CompressedMaps
+from mi_diffind.images.reader import PictureError, read_picture
 from mi_diffind.maps.layout import Layout, MapLayout
-from mi_diffind.maps.pyramid import Pyramid
+from mi_diffind.maps.pyramid import CompressedMaps, Pyramid
 from mi_diffind.maps.source import Source, SourceError, from_arrays, load_source
 
 from .. import warn
 from . import properties
 from .properties import Kept
-from .tables import Entries, exposed
+from .tables import Tables
 
 STORAGES = ("uint8", "float32")
 
@@ -64,19 +62,13 @@ class SharedMaps:
     """
 
     def __init__(self, image: CompressedMaps, arrays: dict, table: Table | None = None):
-        self.image, self.arrays, self.table = image, arrays, table
-        self.entries = Entries(exposed(arrays))
+        self.image, self.tables = image, Tables(arrays, table)
         self._loaded = self.state()
         self._transforms = {}
 
-    @property
-    def tables(self) -> dict:
-        """Arrays that can be optimised, by name."""
-        return exposed(self.arrays)
-
     def state(self) -> list:
         """Return the present variables of the arrays; a reference keeps their indices from being used again."""
-        return [dr.detach(array.data.array) for array in self.tables.values()]
+        return [dr.detach(array.data.array) for array in self.tables.exposed.values()]
 
     def unchanged(self, state: list) -> bool:
         """Return whether the arrays are still those of ``state``."""
@@ -84,7 +76,7 @@ class SharedMaps:
 
     def as_loaded(self) -> bool:
         """Return whether the arrays are those of the file, and no gradient of them is enabled."""
-        return self.unchanged(self._loaded) and not any(compat.has_gradient(a.data) for a in self.tables.values())
+        return self.unchanged(self._loaded) and not self.tables.optimised()
 
     def transform(self, matrix: list):
         """Return the transformation by a 3×3 ``matrix``, the same variable for equal matrices."""
@@ -155,13 +147,13 @@ def open_uncompressed(props: mi.Properties, wrap_mode: str) -> tuple[SharedMaps,
 
     def load() -> SharedMaps:
         # A single image without "raw" is colours, whatever its name, as for Mitsuba's "bitmap"
-        source = load_source(path, nonfinite="clean", named=raw) if path else _source_of(props["bitmap"])
+        source = load_source(path, nonfinite="clean", named=raw) if path else _from_bitmap_object(props["bitmap"])
         for note in source.notes if path.lower().endswith(".json") else ():
             warn(note)
         if raw:
             maps = tuple(dataclasses.replace(m, color_space="linear") for m in source.maps)
             source = dataclasses.replace(source, maps=maps)
-        return SharedMaps(Pyramid.of(source, types=types, border=border), {})
+        return SharedMaps(Pyramid.from_source(source, types=types, border=border), {})
 
     try:
         if not path:
@@ -171,7 +163,7 @@ def open_uncompressed(props: mi.Properties, wrap_mode: str) -> tuple[SharedMaps,
         raise RuntimeError(f'parameter "{given[0]}": {e}') from None
 
 
-def _source_of(bitmap) -> Source:
+def _from_bitmap_object(bitmap) -> Source:
     """Return a ``mi.Bitmap`` as a source of one map, ``image``, without alpha."""
     if not isinstance(bitmap, mi.Bitmap):
         raise RuntimeError(f'parameter "bitmap": found a {type(bitmap).__name__}, a Bitmap is needed')
@@ -181,7 +173,7 @@ def _source_of(bitmap) -> Source:
     return from_arrays({"image": values}, {"image": "srgb" if bitmap.srgb_gamma() else "linear"}, nonfinite="clean")
 
 
-def map_of(layout: Layout, channels: str) -> MapLayout:
+def choose_map(layout: Layout, channels: str) -> MapLayout:
     """Return the map called ``channels``; if that is empty, the only map, or the only albedo."""
     names = ", ".join(layout.names)
     candidates = [m for m in layout.maps if m.name == channels or not channels]
@@ -206,7 +198,7 @@ def is_data(layout: MapLayout) -> bool:
 
 def to_bitmap(task: Task, props: mi.Properties) -> None:
     """Add the properties that a ``bitmap`` needs to show the original of the map."""
-    original, layout = original_of(task, props)
+    original, layout = find_original(task, props)
     try:
         values = _values(original, layout)
     except SourceError as e:
@@ -220,7 +212,7 @@ def to_bitmap(task: Task, props: mi.Properties) -> None:
 
 def to_mipmap(task: Task, props: mi.Properties) -> None:
     """Add the properties that a ``mipmap`` needs to show the original of the map."""
-    original, layout = original_of(task, props)
+    original, layout = find_original(task, props)
     manifest = original.suffix.lower() == ".json"
     if not manifest and layout.role == "other":  # linear by the name of its file
         to_bitmap(task, props)
@@ -241,12 +233,12 @@ def remove(props: mi.Properties, *names: str) -> None:
             del props[name]
 
 
-def original_of(task: Task, props: mi.Properties) -> tuple[Path, MapLayout]:
+def find_original(task: Task, props: mi.Properties) -> tuple[Path, MapLayout]:
     """Return the path of the image or manifest that a task's file was made from, and the map that is shown.
 
     The property ``source`` names the original, else the settings of the file do. Raises ``RuntimeError``.
     """
-    chosen = map_of(layout_of(task, props), str(props.get("channels", "")))
+    chosen = choose_map(file_layout(task, props), str(props.get("channels", "")))
     path = Path(properties.filename(props))
     settings = task.load(path).settings
     given, recorded = str(props.get("source", "")), str(settings.get("source_path", ""))
@@ -263,7 +255,7 @@ def original_of(task: Task, props: mi.Properties) -> tuple[Path, MapLayout]:
     return original, chosen
 
 
-def layout_of(task: Task, props: mi.Properties) -> Layout:
+def file_layout(task: Task, props: mi.Properties) -> Layout:
     """Return the layout of the file that the property ``filename`` names."""
     try:
         return Layout.from_json(task.load(properties.filename(props)).settings["layout"])
@@ -271,29 +263,21 @@ def layout_of(task: Task, props: mi.Properties) -> Layout:
         raise RuntimeError(str(e)) from None
 
 
-def manifest_of(image: Path, folder: Path, raw: bool, normal: bool) -> Path:
+def write_manifest(image: Path, folder: Path, raw: bool, normal: bool) -> Path:
     """Write a manifest of an image's colours as ``bitmap`` reads them, and return its path.
 
-    ``raw``: values are left as they are; ``normal``: they are a normal map. Raises ``RuntimeError``, and
-    :class:`~.stock.Kept` for fewer bytes than :data:`LEAST_BYTES`.
+    ``raw``: values are left as they are; ``normal``: they are a normal map. Raises :class:`.Kept` for a picture that
+    cannot be read, and for fewer bytes than :data:`LEAST_BYTES`.
     """
     try:
-        check_picture(image)
-    except LimitError as e:
-        raise RuntimeError(str(e)) from None
-    try:
-        bitmap = mi.Bitmap(str(image))
-    except RuntimeError as e:
-        raise Kept(f"{image.name} cannot be read: {compat.one_sentence(e)}") from None
-    if bitmap.buffer_size() < LEAST_BYTES:
-        raise Kept(f"{image.name} has {bitmap.buffer_size():,} bytes, of which no fit would save any")
-    formats = mi.Bitmap.PixelFormat
-    entry = {
-        "file": relative_path(image, folder),
-        "color_space": "srgb" if bitmap.srgb_gamma() and not raw else "linear",
-    }
-    if bitmap.pixel_format() in (formats.YA, formats.RGBA):
-        entry["channels"] = "rgb" if bitmap.pixel_format() == formats.RGBA else "r"
+        picture = read_picture(image)
+    except PictureError as e:
+        raise Kept(f"{image.name}: {str(e).removeprefix(f'{image}: ')}") from None
+    if picture.values.nbytes < LEAST_BYTES:
+        raise Kept(f"{image.name} has {picture.values.nbytes:,} bytes, of which no fit would save any")
+    entry = {"file": relative_path(image, folder), "color_space": "srgb" if picture.srgb and not raw else "linear"}
+    if picture.has_alpha:
+        entry["channels"] = "rgb" if picture.colors == 3 else "r"
     name = "normal" if normal else "data" if raw else "albedo"
     digest = hashlib.sha256(str([name, entry]).encode()).hexdigest()[:12]
     path = folder / f"{image.stem}_{digest}.json"

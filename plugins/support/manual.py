@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import inspect
 import re
 import textwrap
@@ -70,7 +71,7 @@ PARTS = {
           - --""",
     "footprint": """\
         **The footprint** is that of one sample: that of a pixel, reduced by the square root of the number of samples.
-        It comes from the first of these sources that has it: Mitsuba itself (from version 3.10); an integrator that
+        It comes from the first of these sources that has it: an integrator that
         fills the partial derivatives of uv, such as :monosp:`path_footprint`; the sensor, if the ray comes straight
         from it; otherwise an estimate that is rather too sharp than too blurred. Without any source, for instance
         without a sensor, the footprint is zero and the texture is not filtered: :monosp:`mi.render` warns once. No
@@ -92,7 +93,10 @@ PARTS = {
 
 
 def shared_parts(plugin: type) -> type:
-    """Fill the placeholders ``{NAME}`` (:data:`PARTS`) of a plugin's docstring: a class decorator."""
+    """Fill the placeholders of a plugin's docstring: a class decorator.
+
+    ``{NAME}`` is one of :data:`PARTS`, ``{example TYPE PLUGIN: NAME=VALUE, …}`` the plugin in XML and in Python.
+    """
     plugin.__doc__ = _filled(plugin.__doc__)
     return plugin
 
@@ -113,6 +117,26 @@ def manual_page(module: ModuleType) -> str:
 
 def _filled(text: str) -> str:
     def part(line: re.Match) -> str:
-        return textwrap.indent(textwrap.dedent(PARTS[line[2]]), line[1])
+        text = _example(*line["example"].split(maxsplit=2)) if line["example"] else PARTS[line["name"]]
+        return textwrap.indent(textwrap.dedent(text), line["indent"])
 
-    return re.sub(r"^( *)\{(\w+)\}$", part, text, flags=re.MULTILINE)
+    return re.sub(r"^(?P<indent> *)\{(example (?P<example>.+)|(?P<name>\w+))\}$", part, text, flags=re.MULTILINE)
+
+
+#: Type of an example's value → its tag in XML.
+TAGS = {str: "string", float: "float", list: "rgb"}
+
+
+def _example(object_type: str, name: str, arguments: str) -> str:
+    """Return tabs with a plugin in XML and as a dictionary; ``arguments`` are those of a call in Python."""
+    name, call = name.rstrip(":"), ast.parse(f"example({arguments})", mode="eval").body
+    xml, python = [f'<{object_type} type="{name}">'], [f"'type': '{name}'"]
+    for keyword in call.keywords:
+        value = ast.literal_eval(keyword.value)
+        written = ", ".join(map(str, value)) if isinstance(value, list) else value
+        xml.append(f'    <{TAGS[type(value)]} name="{keyword.arg}" value="{written}"/>')
+        shown = f"{{\n    'type': 'rgb',\n    'value': {value}\n}}" if isinstance(value, list) else repr(value)
+        python.append(f"'{keyword.arg}': {shown}")
+    tabs = {f"xml\n    :name: {name}": [*xml, f"</{object_type}>"], "python": [",\n".join(python)]}
+    blocks = [f".. code-tab:: {tab}\n\n" + textwrap.indent("\n".join(lines), "    ") for tab, lines in tabs.items()]
+    return ".. tabs::\n" + textwrap.indent("\n\n".join(blocks), "    ")

@@ -11,23 +11,22 @@ import numpy as np
 
 from mi_diffind.arrays.boxes import ValueBounds
 from mi_diffind.arrays.lookup import clamp
-from mi_diffind.core import compat
-from mi_diffind.core.compat import base_class
 from mi_diffind.images import srgb
 from mi_diffind.maps.layout import MapLayout
 
-from . import footprint, frozen, omissions, properties, tables, textures
+from . import footprint, omissions, properties, textures
 from .footprint import Cone
-from .image_files import SharedMaps, is_data, map_of
+from .image_files import SharedMaps, choose_map, is_data
+from .tables import frozen_key
 from .textures import (
     WRAP_MODES,
     Filter,
     PositionDistribution,
     anisotropic,
-    cone_of,
     hit_numbers,
     isotropic,
     luminance,
+    shared_cone,
 )
 
 #: Most texels that are decoded for the mean, the maximum and the sampling of positions; larger images are reduced.
@@ -38,8 +37,8 @@ DECODED = 2**22
 BRIGHTEST = 1e9
 
 
-class MapTexture(base_class("Texture")):
-    """Texture of one map of a :class:`~mi_diffind.maps.compressed.CompressedMaps`.
+class MapTexture(mi.Texture):
+    """Texture of one map of a :class:`~mi_diffind.maps.pyramid.CompressedMaps`.
 
     The class implements colours and data, wrapping, transformation, spectra and the sampling of positions. A derived
     class opens the maps in :meth:`_open`, and may override the read in :meth:`_values`. Like the modules of plugins,
@@ -69,11 +68,8 @@ class MapTexture(base_class("Texture")):
 
     def _choose(self, props: mi.Properties) -> tuple[MapLayout, bool]:
         """Return the map to show, and whether its values stay as they are. Raises ``RuntimeError``."""
-        chosen = map_of(self.image.layout, str(props.get("channels", "")))
-        raw = props.get("raw", is_data(chosen))
-        if not isinstance(raw, bool):
-            raise RuntimeError(f'parameter "raw": found {raw}, allowed are true and false')
-        return chosen, raw
+        chosen = choose_map(self.image.layout, str(props.get("channels", "")))
+        return chosen, properties.flag(props, "raw", is_data(chosen))
 
     def _shown(self) -> list[MapLayout]:
         """Return the maps that are read."""
@@ -86,7 +82,7 @@ class MapTexture(base_class("Texture")):
             ends += [m.low, m.high]
         values = np.array(ends, np.float64)
         with np.errstate(over="ignore"):
-            values = srgb.to_linear(values) if self._is_encoded(m) else values
+            values = self._linear(values, m)
         furthest = values[np.argmax(np.abs(values))]
         if not abs(furthest) <= BRIGHTEST:
             where = f"{self._path}: " if self._path else ""
@@ -96,17 +92,17 @@ class MapTexture(base_class("Texture")):
             )
 
     def traverse(self, cb: mi.TraversalCallback):
-        tables.traverse(cb, self._shared.tables)
+        self._shared.tables.traverse(cb)
         cb.put("to_uv", self.to_uv, mi.ParamFlags.NonDifferentiable)
 
     def trained(self) -> tuple:
         """Return the table of the file (``None`` without one), and the arrays that can be optimised, by name."""
-        return self._shared.table, self._shared.tables
+        return self._shared.tables.table, self._shared.tables.exposed
 
     def parameters_changed(self, keys: list[str] = ()):
-        self._shared.entries.accept()
+        self._shared.tables.accept()
         self._update_transformation()
-        emits = self._positions is not None
+        emits = "positions" in self._cached
         self._clear_cache()
         if emits:  # now, since a frozen function could not compute it
             self._sampled()
@@ -121,21 +117,24 @@ class MapTexture(base_class("Texture")):
 
     def _update_key(self) -> None:
         """Tell frozen functions what decides how the texture is read, besides its arrays."""
-        self.key = frozen.key(*self._settings())
+        self.key = frozen_key(*self._settings())
 
     def _settings(self) -> tuple:
-        """Return the settings of :func:`.frozen.key`."""
+        """Return the settings of :func:`.frozen_key`."""
         identity = self._transform is None
-        return self._size, self.map, self.raw, self.wrap_mode, identity, self._permutes, self._shared.entries.shapes()
+        return self._size, self.map, self.raw, self.wrap_mode, identity, self._permutes, self._shared.tables.shapes()
 
     def _clear_cache(self) -> None:
         """Discard the mean, the maximum and the distribution of positions."""
-        self._state, self._mean, self._max, self._positions = self._shared.state(), None, None, None
+        self._state, self._cached = self._shared.state(), {}
 
-    def _check_cache(self) -> None:
-        """Discard cached values if the arrays changed, possibly through another texture."""
+    def _once(self, name: str, compute: Callable):
+        """Return ``compute()``, or its earlier result unless the arrays changed, possibly through another texture."""
         if not self._shared.unchanged(self._state):
             self._clear_cache()
+        if name not in self._cached:
+            self._cached[name] = compute()
+        return self._cached[name]
 
     @property
     def _size(self) -> tuple[int, int]:
@@ -192,41 +191,39 @@ class MapTexture(base_class("Texture")):
         constants = np.array([w[1] for w in m.where if isinstance(w, tuple)])
         if len(constants) < m.channels:
             return ValueBounds(grey=grey)
-        constants = srgb.to_linear(constants) if self._is_encoded(m) else constants
+        constants = self._linear(constants, m)
         return ValueBounds(float(constants.min()), float(constants.max()), grey=grey)
 
     def _is_upsampled(self) -> bool:
         """Return whether the values are colours that are upsampled to spectra."""
         return mi.is_spectral and not self.raw and self.map.channels == 3
 
-    def _refuse(self, method: str, wanted: str):
-        raise RuntimeError(
-            f'{method}: the map "{self.map.name}" was asked for {wanted}, but it is a colour that is converted to a '
-            f"spectrum (raw = false)"
-        )
+    def _check_asked(self, method: str, wanted: str) -> None:
+        """Refuse what the map is not. Raises ``RuntimeError``."""
+        if method == "eval":
+            faulty = mi.is_spectral and self.raw and self.map.channels == 3
+            fault = "conversion is switched off (raw = true)"
+        elif method == "eval_3" and self.map.channels != 3:
+            faulty, fault = True, "it has 1 channel"
+        else:
+            faulty, fault = self._is_upsampled(), "it is a colour that is converted to a spectrum (raw = false)"
+        if faulty:
+            raise RuntimeError(f'{method}: the map "{self.map.name}" was asked for {wanted}, but {fault}')
 
     def eval(self, si, active=True):
-        if mi.is_spectral and self.raw and self.map.channels == 3:
-            raise RuntimeError(
-                f'eval: the map "{self.map.name}" was asked for a spectrum, but conversion is switched off (raw = true)'
-            )
+        self._check_asked("eval", "a spectrum")
         return textures.spectrum(self._values(si), si.wavelengths, self._is_upsampled())
 
     def eval_1(self, si, active=True):
-        if self._is_upsampled():
-            self._refuse("eval_1", "a number")
+        self._check_asked("eval_1", "a number")
         return luminance(self._values(si))
 
     def eval_3(self, si, active=True):
-        if self.map.channels != 3:
-            raise RuntimeError(f'eval_3: the map "{self.map.name}" was asked for a colour, but it has 1 channel')
-        if self._is_upsampled():
-            self._refuse("eval_3", "a colour")
+        self._check_asked("eval_3", "a colour")
         return mi.Color3f(*self._values(si))
 
     def eval_1_grad(self, si, active=True):
-        if self._is_upsampled():
-            self._refuse("eval_1_grad", "a gradient")
+        self._check_asked("eval_1_grad", "a gradient")
         uv, (width, height) = self._uv(si), self._size
         x, y = dr.fma(uv.x, width, -0.5), dr.fma(uv.y, height, -0.5)
         i, j = dr.floor(x), dr.floor(y)
@@ -269,36 +266,32 @@ class MapTexture(base_class("Texture")):
         return width, height
 
     def mean(self):
-        self._check_cache()
-        if self._mean is None:
-            with dr.suspend_grad():
-                self._mean = self._compute_mean()
-        return self._mean
+        return self._once("mean", self._compute_mean)
 
     def _compute_mean(self):
         """Compute the mean without waiting for a kernel, since constructors of materials need it."""
         width, height = self._decoded_size() if self.is_spatially_varying() else (1, 1)
-        index = dr.arange(mi.UInt32, width * height)
-        uv = mi.Point2f((mi.Float(index % width) + 0.5) / width, (mi.Float(index // width) + 0.5) / height)
-        values = self._read(uv)
-        value = textures.upsampled_mean(values) if self._is_upsampled() else luminance(values)
-        return dr.mean(value)
+        with dr.suspend_grad():
+            index = dr.arange(mi.UInt32, width * height)
+            uv = mi.Point2f((mi.Float(index % width) + 0.5) / width, (mi.Float(index // width) + 0.5) / height)
+            values = self._read(uv)
+            return dr.mean(textures.upsampled_mean(values) if self._is_upsampled() else luminance(values))
 
     def max(self):
-        self._check_cache()
-        if self._max is None:
-            largest = self._elsewhere(lambda: self.image.largest(self.map.name))
-            self._max = float(self._decoded().max() if largest is None else self._linear(np.array(largest)))
-        return self._max
+        return self._once("max", self._compute_max)
+
+    def _compute_max(self) -> float:
+        largest = self._elsewhere(lambda: self.image.largest(self.map.name))
+        return float(self._decoded().max() if largest is None else self._linear(np.array(largest)))
 
     def _decoded(self) -> np.ndarray:
         """Return the converted image, float32, ``(height, width, channels)``."""
         name = self.map.name
         return self._linear(self._elsewhere(lambda: self.image.decode([name], *self._decoded_size())[name]))
 
-    def _linear(self, values: np.ndarray) -> np.ndarray:
-        """Return values of the map as they are read: converted, if they are encoded."""
-        return srgb.to_linear(values) if self._is_encoded() else values
+    def _linear(self, values: np.ndarray, m: MapLayout | None = None) -> np.ndarray:
+        """Return values of a map (default: the one that is shown) as they are read: converted, if they are encoded."""
+        return srgb.to_linear(values) if self._is_encoded(m) else values
 
     @staticmethod
     def _elsewhere(compute: Callable):
@@ -312,15 +305,15 @@ class MapTexture(base_class("Texture")):
             return pool.submit(computed).result()
 
     def _sampled(self) -> PositionDistribution:
-        self._check_cache()
-        if self._positions is None:
-            if dr.flag(dr.JitFlag.FreezingScope):
-                raise RuntimeError(
-                    f'the texture "{self.id()}": a frozen function (dr.freeze) cannot compute the distribution of its '
-                    f"light, render the scene once before"
-                )
-            self._positions = PositionDistribution.of(self._decoded(), self.wrap_mode)
-        return self._positions
+        return self._once("positions", self._compute_positions)
+
+    def _compute_positions(self) -> PositionDistribution:
+        if dr.flag(dr.JitFlag.FreezingScope):
+            raise RuntimeError(
+                f'the texture "{self.id()}": a frozen function (dr.freeze) cannot compute the distribution of its '
+                f"light, render the scene once before"
+            )
+        return PositionDistribution.from_image(self._decoded(), self.wrap_mode)
 
     def sample_position(self, sample, active=True):
         if not (self._permutes and self.is_spatially_varying()):
@@ -361,7 +354,7 @@ class MapTexture(base_class("Texture")):
 
     def _storage(self) -> dict:
         """Return the part of :meth:`report` on the arrays."""
-        return tables.described(self._shared.table.preset if self._shared.table else "", self._shared.arrays)
+        return self._shared.tables.report()
 
     def _description(self) -> list[str]:
         """Return the lines of :meth:`to_string`."""
@@ -383,7 +376,7 @@ class MapTexture(base_class("Texture")):
 
 
 class FilteredTexture(MapTexture):
-    """Texture of one map of a :class:`~mi_diffind.maps.compressed.FilteredMaps`, read at the footprint's level.
+    """Texture of one map of a :class:`~mi_diffind.maps.pyramid.FilteredMaps`, read at the footprint's level.
 
     No gradient passes through the footprint at a hit (:func:`.footprint.footprint`). ``cone`` describes the sensor that
     sees the texture (:class:`.footprint.Cone`; ``None``: unknown). A sample that is the only one of its pixel is read
@@ -393,7 +386,7 @@ class FilteredTexture(MapTexture):
 
     def __init__(self, props: mi.Properties):
         self.filter = Filter.from_properties(props)
-        self._cone_of_parameters = cone_of(props)
+        self._cone_of_parameters = shared_cone(props)
         self.cone = self._cone_of_parameters
         super().__init__(props)
         if self.filter.name != "off":
@@ -409,16 +402,16 @@ class FilteredTexture(MapTexture):
         return *super()._settings(), self.filter, cone
 
     def omitted(self, integrators: list, sensor) -> str:
-        """Return a sentence if no footprints reach the texture, or those of another sensor; see :mod:`.omissions`.
-
-        Whether an integrator gives footprints is known of a few only, and of all others to :func:`.omissions.reading`.
-        """
-        names = [compat.integrator_name(integrator) for integrator in integrators]
+        """Return a sentence if no footprints reach the texture, or those of another sensor; see :mod:`.omissions`."""
         attached, name = footprint.attached_sensor(self)
-        if not self.is_spatially_varying() or any(hasattr(i, "gives_footprints") for i in integrators):
+        if not self.is_spatially_varying() or any(getattr(i, "gives_footprints", False) for i in integrators):
             return ""
         if self.cone is None:
-            return self.unfiltered() if set(names) & set(compat.CARRYING) else ""
+            return (
+                f"{self._title()} is not filtered: it does not know the sensor, and the integrator gives no "
+                f"footprints; load the scene with mi_diffind.load_file or load_dict, call mi_diffind.attach(scene), or "
+                f"render with the integrator path_footprint"
+            )
         if sensor is None or attached in (0, id(sensor)):
             return ""
         return (
@@ -426,41 +419,31 @@ class FilteredTexture(MapTexture):
             f"mi_diffind.attach(scene, sensor) before a render of another sensor"
         )
 
-    def unfiltered(self) -> str:
-        """Return a warning that the texture is not filtered."""
-        return (
-            f"{self._title()} is not filtered: it does not know the sensor, and the integrator gives no footprints; "
-            f"load the scene with mi_diffind.load_file or load_dict, call mi_diffind.attach(scene), or render with the "
-            f"integrator path_footprint"
-        )
-
     def _title(self) -> str:
         described = ", ".join(filter(None, (omissions.plugin_of(self), str(self._path or ""))))
         return f'the texture "{self.id()}" ({described})'
 
     def _values(self, si):
-        if self.filter.name == "off" or not self.is_spatially_varying():
+        if not self.filtered():
             return super()._values(si)
         uv, (ddx, ddy) = self._uv(si), self._footprint(si)
         uv = uv + dr.detach(footprint.to_centre(self.cone, si, ddx, ddy)) / mi.Vector2f(*self._size)
         if self.filter.name == "trilinear":
-            return self._used_of(self._filtered(uv, isotropic(ddx, ddy)))
+            return self._decode_mean(self._filtered(uv, isotropic(ddx, ddy)))
         taps = self.filter.taps
         level, axis = anisotropic(ddx, ddy, taps)
         axis = axis / mi.Vector2f(*self._size)
         if self.filter.name == "anisotropic":
             values = [self._filtered(dr.fma(axis, (k + 0.5) / taps - 0.5, uv), level) for k in range(taps)]
             scale = 1 / taps
-            return self._used_of([sum(channel[1:], channel[0]) * scale for channel in zip(*values, strict=True)])
+            return self._decode_mean([sum(channel[1:], channel[0]) * scale for channel in zip(*values, strict=True)])
         choice, rounding = hit_numbers(si)
         if taps > 1:
             uv = dr.fma(axis, (dr.floor(choice * taps) + 0.5) * (1 / taps) - 0.5, uv)
-        return self._used_of(self._rounded(uv, level, rounding))
+        return self._decode_mean(self._rounded(uv, level, rounding))
 
     def _footprint(self, si) -> tuple:
         """Return the footprint in texels of the image, with ``to_uv`` applied."""
-        if self.cone is None:
-            omissions.reading(self, si)
         with dr.suspend_grad():
             ddx, ddy = footprint.footprint(si, self.cone)
             if self._transform is not None:
@@ -470,7 +453,7 @@ class FilteredTexture(MapTexture):
             return ddx * size, ddy * size
 
     def _filtered(self, uv, level) -> list:
-        """Return the values of one place at a level of detail, in a form that can be averaged (:meth:`_used_of`).
+        """Return the values of one place at a level of detail, in a form that can be averaged (:meth:`_decode_mean`).
 
         They are linear colours of maps in sRGB, and stored channels of all other maps.
         """
@@ -483,7 +466,7 @@ class FilteredTexture(MapTexture):
         """Return :meth:`_filtered`; a derived class may round the level at random by ``sample`` in [0, 1)."""
         return self._filtered(uv, level)
 
-    def _used_of(self, values: list) -> list[mi.Float]:
+    def _decode_mean(self, values: list) -> list[mi.Float]:
         """Return the channels of the maps that are read, converted from averaged values of :meth:`_filtered`."""
         remaining, used = iter(values), []
         for m in self._shown():
@@ -511,8 +494,7 @@ class FilteredTexture(MapTexture):
     def eval_1_grad(self, si, active=True):
         if self.filter.name == "off":
             return super().eval_1_grad(si, active)
-        if self._is_upsampled():
-            self._refuse("eval_1_grad", "a gradient")
+        self._check_asked("eval_1_grad", "a gradient")
         uv = self._uv(si)
         level = isotropic(*self._footprint(si))
         side = dr.exp2(self.image.clamped(self.image.biased(level), mi.Float))
@@ -520,13 +502,9 @@ class FilteredTexture(MapTexture):
         for axis, n in enumerate(self._size):
             width = dr.minimum(side * (1 / n), 1)
             step = mi.Vector2f(*(0.5 * width if i == axis else 0 for i in range(2)))
-            ahead, behind = (luminance(self._used_of(self._filtered(p, level))) for p in (uv + step, uv - step))
+            ahead, behind = (luminance(self._decode_mean(self._filtered(p, level))) for p in (uv + step, uv - step))
             gradient.append((ahead - behind) / width)
         return self._before(*gradient)
-
-    def filtered(self) -> bool:
-        """Return whether footprints are read; if no texture says so, Mitsuba 3.10 computes none."""
-        return self.filter.name != "off" and self.is_spatially_varying()
 
     def report(self) -> dict:
         """Return the description of :meth:`.MapTexture.report` and three more keys.
@@ -537,10 +515,10 @@ class FilteredTexture(MapTexture):
         description = super().report()
         left_out = description["effects_left_out"]
         sources = []
-        if self.filter.name == "off" or not self.is_spatially_varying():
+        if not self.filtered():
             left_out["footprint"] = "the filter is off" if self.filter.name == "off" else "the map is constant"
         else:
-            sources = [*(["interaction"] if compat.has_footprints() else []), "uv partials"]
+            sources = ["uv partials"]
             if self.cone is not None:
                 sources.append("sensor" if self.cone is not self._cone_of_parameters else "parameters")
             else:

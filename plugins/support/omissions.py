@@ -1,9 +1,8 @@
 """Warnings of what a render would do wrong in silence: leave out a shape that no integrator sees, or filter no texture.
 
 Scenes that ``mi_diffind`` loads are prepared, or refused. Those of ``mi.load_file``, ``mi.load_dict`` and
-``mi.load_string`` are checked when they are rendered: by ``mi.render`` (:func:`.before_render`), by
-``render`` of integrators of this package, and by textures while an integrator reads them (:func:`reading`). Each scene
-is warned of once.
+``mi.load_string`` are checked when they are rendered: by ``mi.render`` (:func:`.before_render`), and by ``render`` of
+integrators of this package. Each scene is warned of once.
 """
 
 from __future__ import annotations
@@ -18,9 +17,6 @@ from .. import origin, warn
 
 #: Instances not warned of yet (:func:`watch`).
 _watched: weakref.WeakSet = weakref.WeakSet()
-
-#: Instance → those of its plugin in the scene that was checked last.
-_mates: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()
 
 #: Ids of a scene, an integrator and a sensor that were checked together since the last instance was watched.
 _checked: set[tuple[int, int, int]] = set()
@@ -72,22 +68,10 @@ def check(scene, integrator=None, sensor=0) -> None:
         if instance in _watched:
             groups.setdefault(plugin_of(instance), []).append(instance)
     for instances in groups.values():
-        mates = weakref.WeakSet(instances)
-        _mates.update(dict.fromkeys(instances, mates))
         sentences = [sentence for instance in instances if (sentence := instance.omitted(integrators, sensor))]
         if sentences:
             settle(instances)
             warn(f"{sentences[0]} ({len(sentences) - 1} more likewise)" if len(sentences) > 1 else sentences[0])
-
-
-def reading(texture, si) -> None:
-    """Warn of a watched texture that an integrator reads at ``si`` without partial derivatives of uv.
-
-    While ``eval`` is called by hand, outside of a render, Dr.Jit records nothing symbolically, and nothing is checked.
-    """
-    if texture in _watched and compat.is_recording() and compat.is_zero(*si.duv_dx, *si.duv_dy):
-        settle(_mates.get(texture, [texture]))
-        warn(texture.unfiltered())
 
 
 def plugin_of(instance) -> str:

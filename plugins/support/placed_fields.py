@@ -17,14 +17,14 @@ from mi_diffind.tasks.radiance.files import load
 from mi_diffind.tasks.radiance.volume_field import VolumeField
 
 from . import properties, textures
-from .placement import Placement, PlacementParameter
+from .placement import Placement
 from .tables import arrays_of
 
 #: Luminance of linear sRGB, the same as in Mitsuba.
 LUMINANCE = (0.212671, 0.715160, 0.072169)
 
 
-class PlacedField(PlacementParameter):
+class PlacedField(Placement):
     """Radiance field (:class:`mi_diffind.tasks.radiance.volume_field.VolumeField`) in a scene, placed by ``to_world``.
 
     The transform is a similarity. Densities are per unit of length in the field's frame, so that a scaled field keeps
@@ -32,7 +32,7 @@ class PlacedField(PlacementParameter):
     """
 
     def __init__(self, field, to_world):
-        super().__init__(Placement.of(to_world, 1.0, (0, 0, 0)))
+        super().__init__(to_world)
         self.field, self._turn = field, None
 
     def held(self) -> list:
@@ -74,7 +74,7 @@ class PlacedField(PlacementParameter):
     def overlaps(self, other: PlacedField) -> bool:
         """Return whether the boxes of two fields have a volume in common, by the separating axis theorem."""
         points = corners(self), corners(other)
-        axes = [self.placement.rotation.T, other.placement.rotation.T]
+        axes = [self.rotation.T, other.rotation.T]
         crossed = np.cross(axes[0][:, None], axes[1][None]).reshape(-1, 3)
         for axis in (*axes[0], *axes[1], *crossed[np.linalg.norm(crossed, axis=1) > 1e-6]):
             a, b = (p @ axis for p in points)
@@ -141,7 +141,7 @@ class PlacedField(PlacementParameter):
 def corners(placed: PlacedField) -> np.ndarray:
     """Return the corners ``(8, 3)`` of a field's box in the world."""
     field = placed.field
-    return placed.placement.world(np.array(list(product(*zip(field.lower, field.upper, strict=True)))))
+    return placed.world(np.array(list(product(*zip(field.lower, field.upper, strict=True)))))
 
 
 class VariantLight:
@@ -153,7 +153,7 @@ class VariantLight:
     def __init__(self):
         self.illuminant = mi.load_dict({"type": "d65"}, parallel=False) if mi.is_spectral else None
 
-    def of(self, colour, wavelengths, active=True):
+    def convert(self, colour, wavelengths, active=True):
         """Return the light of RGB ``colour`` (three floats)."""
         if mi.is_monochromatic:
             return mi.Spectrum(sum(w * c for w, c in zip(LUMINANCE, colour, strict=True)))
@@ -166,24 +166,24 @@ class VariantLight:
         return mi.Spectrum(spectrum * scale * self.illuminant.eval(at, active))
 
     def adjoint(self, colour, wavelengths, weight, active=True):
-        """Return the derivative of ``dot(weight, of(colour))`` with respect to ``colour``: three floats."""
+        """Return the derivative of ``dot(weight, convert(colour))`` with respect to ``colour``: three floats."""
         if mi.is_monochromatic:
             return mi.Array3f(*(w * weight.x for w in LUMINANCE))
         if not mi.is_spectral:
             return mi.Array3f(*weight)
         with dr.resume_grad():
             free = _attached(colour)
-            dr.backward_from(dr.dot(weight, self.of(free, wavelengths, active)))
+            dr.backward_from(dr.dot(weight, self.convert(free, wavelengths, active)))
             return dr.select(active & _coloured(colour), dr.grad(free), 0)
 
     def tangent(self, colour, change, wavelengths, active=True):
         """Return the derivative of the light of ``colour`` along ``change``."""
         if not mi.is_spectral:
-            return self.of(change, wavelengths, active)
+            return self.convert(change, wavelengths, active)
         with dr.resume_grad():
             free = _attached(colour)
             dr.set_grad(free, mi.Array3f(change))
-            return dr.select(active & _coloured(colour), dr.forward_to(self.of(free, wavelengths, active)), 0)
+            return dr.select(active & _coloured(colour), dr.forward_to(self.convert(free, wavelengths, active)), 0)
 
 
 def _attached(colour):
@@ -234,7 +234,7 @@ class JoinedField(VolumeField):
 
     def __init__(self, members: list):
         points = np.concatenate([corners(placed) for placed in members])
-        voxel = min(placed.field.voxel * placed.placement.size for placed in members)
+        voxel = min(placed.field.voxel * placed.length for placed in members)
         super().__init__(members[0].field.types, points.min(axis=0), points.max(axis=0), voxel, {})
         self.members = members
 
@@ -292,7 +292,7 @@ def _local(placed: PlacedField, p, d) -> tuple:
     return mi.Point3f(axes.to_local(mi.Vector3f(*p) - mi.Vector3f(origin)) / size), axes.to_local(mi.Vector3f(*d))
 
 
-def grouped(fields: list) -> list:
+def join_overlapping(fields: list) -> list:
     """Return placed fields without common volumes; those of ``fields`` whose boxes overlap are joined."""
     groups = [([placed], placed) for placed in fields]
     while True:
@@ -315,71 +315,83 @@ LINES = 1 << 14
 class FieldLight:
     """Radiance fields between surfaces: emitters and occluders on straight segments, and emitters to be sampled.
 
-    ``fields`` are the :class:`.PlacedField` of a scene, without common volumes. Directions are sampled
-    towards :data:`SPHERES` spheres around places that send light: a sphere by its mean radiance times its solid angle,
-    and uniform directions to it. The spheres only guide samples. Light outside of them is left to samples of BSDFs.
+    ``fields`` are the :class:`.PlacedField` of a scene, without common volumes. If they are ``lit``, directions are
+    sampled towards :data:`SPHERES` spheres around places that send light: a sphere by its mean radiance times its solid
+    angle, and uniform directions to it. The spheres only guide samples. Light outside of them is left to samples of
+    BSDFs.
     """
 
-    def __init__(self, fields: list, light: VariantLight):
-        self.fields, self.light = fields, light
+    def __init__(self, fields: list, light: VariantLight, lit: bool):
+        self.fields, self.light, self.lit = fields, light, lit
         self.update()
 
     def update(self) -> None:
         """Follow a change of the fields."""
         rows = []
-        for placed in self.fields:
-            bright, placement = bright_spheres(placed.field, SPHERES // len(self.fields)), placed.placement
-            rows.append(np.column_stack([placement.world(bright[:, :3]), bright[:, 3] * placement.size, bright[:, 4]]))
+        for placed in self.fields if self.lit else ():
+            bright = bright_spheres(placed.field, SPHERES // len(self.fields))
+            rows.append(np.column_stack([placed.world(bright[:, :3]), bright[:, 3] * placed.length, bright[:, 4]]))
         rows = np.concatenate([*rows, np.zeros((SPHERES, 5))])[:SPHERES].astype(np.float32)
         # Always as many, so that a frozen function takes other ones
         self.spheres = mi.Float(np.ascontiguousarray(rows[:, :4]).reshape(-1))
         self.radiances = mi.Float(np.ascontiguousarray(rows[:, 4]))
         dr.eval(self.spheres, self.radiances)
 
-    def cross(self, ray, far, active=True) -> tuple:
-        """Return the light of the fields on rays up to the distance ``far``, and the transmittance of the fields."""
-        light, through = mi.Spectrum(0), mi.Float(1)
-        for placed, crossed in in_order(self.fields, [f.enters(ray, far, active) for f in self.fields]):
-            marched, passed = placed.march(ray, far, crossed)
-            seen = self.light.of(marched.colour, ray.wavelengths, crossed)
-            light += dr.select(crossed, through * seen, 0)
-            through *= passed
-        return light, through
-
     def optimised(self) -> bool:
         """Return whether a derivative with respect to a field is requested."""
         return any(placed.optimised() for placed in self.fields)
 
-    def derive(self, mode, ray, far, active, δL, factor, total):
-        """Propagate the derivatives of the light ``total`` that arrives along rays, up to the distance ``far``.
+    def enters(self, ray, far, active=True) -> list:
+        """Return, for each field, the distance at which rays enter its box, and whether they do so before ``far``."""
+        return [placed.enters(ray, far, active) for placed in self.fields]
 
-        ``total`` is ``factor`` times the light of :meth:`cross`, plus the light from beyond. ``Backward`` propagates
-        the adjoint ``δL`` of ``total`` to the fields. ``Forward`` returns the derivative of ``total``.
+    def cross(self, ray, far, active=True, entered=None) -> tuple:
+        """Return the light of the fields on rays up to the distance ``far``, their transmittance and their depth.
+
+        The depth is the distance to the fields times the share of the light that they stop; ``entered`` is the result
+        of :meth:`enters`.
         """
-        change, before, beyond = mi.Spectrum(0), mi.Float(1), mi.Spectrum(total)
-        for placed, crossed in in_order(self.fields, [f.enters(ray, far, active) for f in self.fields]):
+        L, through, depth = mi.Spectrum(0), mi.Float(1), mi.Float(0)
+        for placed, crossed in in_order(self.fields, entered or self.enters(ray, far, active)):
+            marched, passed = placed.march(ray, far, crossed)
+            Le = self.light.convert(marched.colour, ray.wavelengths, crossed)
+            L += dr.select(crossed, through * Le, 0)
+            depth += through * marched.depth * placed.size
+            through *= passed
+        return L, through, depth
+
+    def derive(self, mode, ray, far, active, δL, factor, total, entered=None, δlog=0, δdepth=0, depth=0) -> tuple:
+        """Propagate derivatives of what rays see up to the distance ``far`` and beyond: ``(change, crossed)``.
+
+        The light ``total`` is ``factor`` times that of :meth:`cross`, plus the light from beyond; ``depth`` likewise.
+        ``Backward`` propagates their adjoints ``δL`` and ``δdepth``, and that of the logarithm of the transmittance,
+        ``δlog``, to the fields. ``Forward`` returns as ``change`` the derivatives of light, logarithm and depth.
+        ``crossed`` is the result of :meth:`cross`.
+        """
+        change, behind = [mi.Spectrum(0), mi.Float(0), mi.Float(0)], mi.Float(depth)
+        L, before, beyond, seen_depth = mi.Spectrum(0), mi.Float(1), mi.Spectrum(total), mi.Float(0)
+        for placed, crossed in in_order(self.fields, entered or self.enters(ray, far, active)):
             marched, through = placed.march(ray, far, crossed)
-            share = mi.Spectrum(factor) * before
-            beyond -= dr.select(crossed, share * self.light.of(marched.colour, ray.wavelengths, crossed), 0)
+            share, at_depth = mi.Spectrum(factor) * before, before * marched.depth * placed.size
+            Le = dr.select(crossed, self.light.convert(marched.colour, ray.wavelengths, crossed), 0)
+            L, beyond = L + before * Le, beyond - share * Le
+            seen_depth, behind = seen_depth + at_depth, behind - at_depth
             if placed.optimised():
                 inverse = dr.select(through > 0, dr.rcp(through), 0)
+                # The derivative by the logarithm of a transmittance is all that is transmitted
                 if mode == dr.ADMode.Backward:
                     d_colour = self.light.adjoint(marched.colour, ray.wavelengths, δL * share, crossed)
-                    d_through = dr.sum(δL * beyond) * inverse
-                    placed.replay(ray, far, crossed, marched, d_colour, d_through, mi.Float(0))
+                    d_through = (dr.sum(δL * beyond) + δlog + δdepth * behind) * inverse
+                    placed.replay(ray, far, crossed, marched, d_colour, d_through, mi.Float(δdepth * before))
                 else:
-                    colour, transmittance, _ = placed.tangent(ray, far, crossed, marched)
-                    seen = self.light.tangent(marched.colour, colour, ray.wavelengths, crossed)
-                    change += dr.select(crossed, share * seen + beyond * transmittance * inverse, 0)
+                    colour, transmittance, d_depth = placed.tangent(ray, far, crossed, marched)
+                    dLe = self.light.tangent(marched.colour, colour, ray.wavelengths, crossed)
+                    d_log = transmittance * inverse
+                    change[0] += dr.select(crossed, share * dLe + beyond * d_log, 0)
+                    change[1] += d_log
+                    change[2] += before * d_depth + behind * d_log
             before *= through
-        return change
-
-    def transmittance(self, ray, far, active=True):
-        """Return the transmittance of the fields on rays up to the distance ``far``."""
-        through = mi.Float(1)
-        for placed in self.fields:
-            through *= placed.march(ray, far, active)[1]
-        return through
+        return change, (L, before, seen_depth)
 
     def _sphere(self, i, p, active) -> tuple:
         """Return the vector from ``p`` to a sphere's centre, its radius, 1 − cos of its cone, and its weight."""

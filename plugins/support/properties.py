@@ -19,6 +19,14 @@ def one_of(props: mi.Properties, name: str, allowed: tuple[str, ...]) -> str:
     return str(value)
 
 
+def flag(props: mi.Properties, name: str, default: bool = False) -> bool:
+    """Return a property that is true or false."""
+    value = props.get(name, default)
+    if not isinstance(value, bool):
+        raise RuntimeError(f'parameter "{name}": found {value}, allowed are true and false')
+    return value
+
+
 def is_number(props: mi.Properties, name: str) -> bool:
     """Return whether the property ``name``, which must exist, is a number."""
     return props.type(name) in (mi.Properties.Type.Float, mi.Properties.Type.Integer)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 import threading
@@ -85,7 +86,7 @@ class PositionDistribution:
     repeats: bool
 
     @classmethod
-    def of(cls, image: np.ndarray, wrap_mode: str) -> PositionDistribution:
+    def from_image(cls, image: np.ndarray, wrap_mode: str) -> PositionDistribution:
         """Return the distribution proportional to the luminance of an image, ``(height, width, channels)``.
 
         It is interpolated as a texture of that ``wrap_mode`` is.
@@ -119,18 +120,12 @@ class PositionDistribution:
         return total * (self.size[0] * self.size[1])
 
 
-_spectral_models: dict = {}
-_model_lock = threading.RLock()
-
-
-def spectral_model():
-    """Return the table for the variant's backend: side, positions along the brightness, coefficients padded to four."""
-    with _model_lock:
-        if mi.Float not in _spectral_models:
-            side, positions, entries = compat.srgb_coefficients()
-            table = DifferentiableArray.from_numpy(entries, mi.TensorXf)  # pads and aligns them
-            _spectral_models[mi.Float] = side, mi.Float(positions.copy()), mi.Float(table.data.array)
-        return _spectral_models[mi.Float]
+@functools.cache
+def spectral_model(dtype: type) -> tuple:
+    """Return the table for ``mi.TensorXf``: side, positions along the brightness, coefficients padded to four."""
+    side, positions, entries = compat.srgb_coefficients()
+    table = DifferentiableArray.from_numpy(entries, dtype)  # pads and aligns them
+    return side, mi.Float(positions.copy()), mi.Float(table.data.array)
 
 
 def spectral_coefficients(rgb):
@@ -138,7 +133,7 @@ def spectral_coefficients(rgb):
 
     They are meaningless for greys, whose spectra are constant.
     """
-    side, positions, table = spectral_model()
+    side, positions, table = spectral_model(mi.TensorXf)
     r, g, b = (clamp(mi.Float(c), 0.0, 1.0) for c in rgb)
     # The largest component, the last one of equals, and the two that follow it in turn
     green, blue = (g >= r), (b >= dr.maximum(r, g))
@@ -239,7 +234,7 @@ class Filter:
         return self.taps if self.name == "anisotropic" else 1
 
 
-def cone_of(props: mi.Properties) -> footprint.Cone | None:
+def shared_cone(props: mi.Properties) -> footprint.Cone | None:
     """Return :meth:`.Cone.from_properties`, the same object for equal properties.
 
     Dr.Jit merges the reads of several textures only if they share their variables.

@@ -84,7 +84,7 @@ def mirrored(si):
 
 
 def refracted(ior: float):
-    """What follows the ray through a boundary, outside of which is vacuum."""
+    """Return a function that follows rays through a boundary with vacuum outside."""
 
     def follow(si):
         _, cosine, _, ratio = mi.fresnel(mi.Frame3f.cos_theta(si.wi), ior)
@@ -123,6 +123,6 @@ def measures(ddx, ddy) -> np.ndarray:
 
 
 def errors(found: np.ndarray, ddx, ddy, where) -> np.ndarray:
-    """Of the side and the major axis, ``(2, 2)``: the median and the 90th percentile of their relative error."""
+    """Return median and 90th percentile of the relative errors of side and major axis, ``(2, 2)``."""
     expected = measures(ddx, ddy)[where]
     return np.percentile(np.abs(found[where] / expected - 1), (50, 90), axis=0).T

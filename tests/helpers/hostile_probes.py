@@ -9,7 +9,6 @@ import contextlib
 import functools
 import inspect
 import io
-import re
 from pathlib import Path
 
 import drjit as dr
@@ -18,8 +17,6 @@ import numpy as np
 from limited_child import Growth, fault_of_sentence
 
 from mi_diffind.arrays.tables import load_table
-from mi_diffind.core import compat
-from mi_diffind.core.errors import DiffindError
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting.task import Model, find_task
 
@@ -37,7 +34,8 @@ def prepare() -> None:
     """Set the variant, and run everything once that is loaded when it is first used."""
     mi.set_variant("llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)
-    mi.render(mi.load_dict(scene_with({"type": "rectangle"})), spp=1).numpy()
+    scene = {"type": "scene", "integrator": {"type": "path"}, "sensor": {"type": "perspective"}}
+    mi.render(mi.load_dict({**scene, "shape": {"type": "rectangle"}, "light": {"type": "constant"}}), spp=1).numpy()
 
 
 def outcome(name: str, message: str) -> dict:
@@ -119,7 +117,9 @@ def table(path: str, original: str, untouched: list[str] | None, evaluate: bool 
         return fault
     if not evaluate:
         return None
-    return finite(decode=decoded(model)) or finite(picture=rendered(find_task(loaded), loaded, path))
+    if fault := finite(decode=decoded(model)):
+        return fault
+    return finite(picture=rendered(path)) if find_task(loaded).plugin else None
 
 
 def opened(path: str) -> tuple:
@@ -145,44 +145,15 @@ def decoded(model) -> object:
         return {name: data[name] for name in data.files}
 
 
-def rendered(task, loaded, path: str) -> np.ndarray | None:
-    """Return a picture of the plugin of a task, ``None`` if it has none. Raises its refusal of the file."""
+def rendered(path: str) -> np.ndarray:
+    """Return a picture of the plugin that reads a table file, as the viewer shows it."""
     from mi_diffind.scenes import loading
+    from mi_diffind.scenes.viewer.session import table_scene
 
-    if not task.plugin:
-        return None
-    tag, name = task.plugin
-    plugin = {"type": name, "filename": path}
-    layout = loaded.settings.get("layout")
-    if isinstance(layout, dict) and len(layout["maps"]) > 1:
-        plugin["channels"] = layout["maps"][0]["name"]
-    scene = {
-        "integrator": lambda: scene_with({"type": "rectangle"}) | {"integrator": plugin},
-        "shape": lambda: scene_with({**plugin, "bsdf": {"type": "diffuse"}}),
-        "texture": lambda: scene_with({"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": plugin}}),
-        "bsdf": lambda: scene_with({"type": "rectangle", "bsdf": plugin}),
-    }[tag]()
-    try:
-        scene = loading.load_dict(scene)
-    except RuntimeError as e:  # Mitsuba wraps the sentence of a plugin in its own
-        raised = re.findall(r"^([\w.]+): (.*)", str(e), re.MULTILINE)
-        if raised and raised[-1][0] == "RuntimeError" and f"{Path(path).name}: " in raised[-1][1]:
-            raise DiffindError(compat.one_sentence(e)) from None
-        raise
-    return mi.render(scene, spp=SAMPLES).numpy()
-
-
-def scene_with(shape: dict) -> dict:
-    """Return a scene of one shape in white surroundings."""
-    look_at = mi.ScalarTransform4f().look_at([0.6, 0.4, 3.5], [0, 0, 0], [0, 1, 0])
-    film = {"type": "hdrfilm", "width": SIDE, "height": SIDE, "rfilter": {"type": "box"}}
-    return {
-        "type": "scene",
-        "integrator": {"type": "path", "max_depth": 3},
-        "emitter": {"type": "constant"},
-        "sensor": {"type": "perspective", "fov": 40, "to_world": look_at, "film": film},
-        "shape": shape,
-    }
+    scene = table_scene(path)
+    scene["sensor"]["film"] |= {"width": SIDE, "height": SIDE}
+    with loading.scene_errors(path):
+        return mi.render(loading.load_dict(scene), spp=SAMPLES).numpy()
 
 
 # -- other files -------------------------------------------------------------------------------------------------------
@@ -217,7 +188,7 @@ def splats(path: str) -> dict | None:
 
     loaded = bounded(lambda: Splats.read(path), path)
     names = ("centres", "scales", "quaternions", "opacities", "colours")
-    return finite(**{name: getattr(loaded, name) for name in names}) or finite(box=loaded.cropped().box())
+    return finite(**{name: getattr(loaded, name) for name in names}) or finite(box=loaded.crop().box())
 
 
 def checkpoint(path: str, write: bool = False) -> dict | None:

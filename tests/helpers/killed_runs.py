@@ -60,7 +60,7 @@ def main(arguments: list[str], moment: str, prepare: str) -> None:
 
 def measure_little() -> None:
     """Measure results at few places."""
-    from mi_diffind.tasks.disney.files import DisneyModel
+    from mi_diffind.tasks.disney.training import DisneyModel
     from mi_diffind.tasks.ggx.training import GGXModel
 
     GGXModel.measure.__defaults__ = DisneyModel.measure.__defaults__ = (2**12,)

@@ -70,11 +70,11 @@ class Bumps(VolumeField):
 
 def haze(types, rng, centre=(0.2, -0.1, 0.3), half=0.7, side=13):
     """A field of random numbers with surroundings, thin enough that rays see the horizon."""
-    from mi_diffind.tasks.radiance.surroundings import ContractedNodes
+    from mi_diffind.tasks.radiance.nodes import Nodes
     from mi_diffind.tasks.radiance.volume_field import NodeField
 
     place = np.subtract(centre, 2 * half), 4 * half / (side - 1), (side,) * 3, np.ones((side,) * 3, bool)
-    nodes = ContractedNodes(types, *place, inner=(*centre, half))
+    nodes = Nodes(types, *place, inner=(*centre, half))
     density, colour = rng.normal(-4, 2, nodes.entries), rng.normal(0, 0.3, (nodes.entries, 12))
     return NodeField(nodes, *(types.TensorXf(np.float32(v)) for v in (density, colour)))
 
@@ -86,7 +86,7 @@ def ball_table(inner=None):
     """
     import drjit.llvm as types
 
-    from mi_diffind.tasks.radiance import files, nodes, surroundings
+    from mi_diffind.tasks.radiance import files, nodes
     from mi_diffind.tasks.radiance.grid import NodeGrid
 
     side, spacing = 25, 0.1
@@ -97,7 +97,7 @@ def ball_table(inner=None):
         stored = nodes.Nodes(*grid, radius < 1)
         raw = np.clip(12 * (0.8 - radius), -6, 4)[stored.stored]
     else:
-        stored = surroundings.ContractedNodes(*grid, np.ones((side,) * 3, bool), inner=inner)
+        stored = nodes.Nodes(*grid, np.ones((side,) * 3, bool), inner=inner)
         raw = np.full(side**3, -5.0)
     colour = np.zeros((stored.count, 12))
     colour[:, 0], colour[:, 4], colour[:, 8] = -place[stored.stored][:, 0], -1, place[stored.stored][:, 0]

@@ -38,7 +38,7 @@ class Ball(DistanceField):
 
 
 class Slab(DistanceField):
-    """What lies within ``thickness`` / 2 of the plane z = 0, up to the sides of the box."""
+    """Plate within ``thickness`` / 2 of the plane z = 0, up to the sides of the box."""
 
     def __init__(self, types, thickness, normal=(0.0, 0.0, 1.0)):
         super().__init__(types, (-0.5,) * 3, (0.5,) * 3, 0.01, 1.0)
@@ -170,7 +170,7 @@ def register(mi, fields: dict, name: str = "test_solid") -> None:
     from mi_diffind.plugins.support.placement import Placement
 
     def make(props):
-        placement = Placement.of(props.get("to_world", mi.ScalarTransform4f()), 1.0, (0, 0, 0))
+        placement = Placement(props.get("to_world"))
         return Held(props, fields[props["field"]], placement, props.get("smooth", False))
 
     class Held(shapes.distance_shape(mi.Mesh)):

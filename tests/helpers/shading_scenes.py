@@ -12,7 +12,7 @@ from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting.task import FitRequest
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import load_source
-from mi_diffind.tasks.texture import PRESETS, training
+from mi_diffind.tasks.texture import PRESETS, fit
 from mi_diffind.tasks.texture.arrays import TextureBudget, parse_structure
 
 #: Maps of a material, and the parameters of the BSDF that read them.
@@ -43,16 +43,14 @@ def material(folder: Path, side=32, seed=0, names=("albedo", "normal", "roughnes
 def fitted(manifest: Path, steps=2, fine="0:2:4", skip=2, cascaded=5, batch=2048, preset="ours", size=None) -> Path:
     """A table file of a material beside its manifest."""
     source, recipe = load_source(manifest), PRESETS[preset]
-    recipe = dataclasses.replace(
-        recipe, settings=dataclasses.replace(recipe.settings, steps=steps, batch=batch, measure_every=steps)
-    )
-    layout = training.layout_of(source, recipe)
+    recipe = dataclasses.replace(recipe, steps=steps, batch=batch, measure_every=steps)
+    layout = fit.source_layout(source, recipe)
     arrays = parse_structure(fine) if fine else ()
     size = size or TextureBudget(source.height, source.width, layout.stored, arrays, skip, 3, cascaded, skip + 1)
     types = array_module("llvm")
-    pyramid = Pyramid.of(source, layout, types, ("repeat", "repeat"))
-    request = FitRequest(preset, recipe.settings, types, progress=False)
-    table, _ = training.fit_texture(source, size, recipe, request, pyramid)
+    pyramid = Pyramid.from_source(source, layout, types, ("repeat", "repeat"))
+    request = FitRequest(preset, recipe, types, progress=False)
+    table, _ = fit.fit_texture(source, size, recipe, request, pyramid)
     table.settings["source_path"] = manifest.name
     output = manifest.with_suffix(".npz")
     save_table(output, table)

@@ -35,12 +35,12 @@ def sphere(rings=16, radius=1.0, centre=(0, 0, 0)):
 
 
 def together(*meshes):
-    """Several meshes as one."""
+    """Join several meshes."""
     return trimesh.util.append_faces(*zip(*meshes, strict=True))
 
 
 def turned(mesh):
-    """Inside out."""
+    """Turn a mesh inside out."""
     return mesh[0], mesh[1][:, ::-1]
 
 
@@ -50,7 +50,7 @@ def without(mesh, dropped):
 
 
 def write(path, mesh):
-    """As the format that the name says."""
+    """Write a mesh in the format of the file's extension."""
     trimesh.Trimesh(*mesh, process=False).export(path)
     return path
 

@@ -9,9 +9,18 @@ from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.tasks import image
 from mi_diffind.tasks.image import arrays as image_arrays
 from mi_diffind.tasks.image import training as image_training
-from mi_diffind.tasks.texture import PRESETS, arrays, training
-from mi_diffind.tasks.texture.compressed import CompressedTexture, to_table
-from mi_diffind.tasks.texture.nets import neutral_extras
+from mi_diffind.tasks.texture import PRESETS, arrays, fit
+from mi_diffind.tasks.texture.compressed import CompressedTexture, neutral_extras, to_table
+
+
+def material(width, height):
+    """Smooth maps of every kind, bytes, that repeat along both axes."""
+    y, x = np.mgrid[0:height, 0:width] / [[[height]], [[width]]]
+    wave = 0.5 + 0.35 * np.sin(2 * np.pi * np.stack([x + k * y for k in range(4)], axis=-1) + np.arange(4))
+    xy = 0.6 * (wave[..., :2] - 0.5)
+    normal = 0.5 + 0.5 * np.concatenate([xy, np.sqrt(1 - (xy**2).sum(axis=-1, keepdims=True))], axis=-1)
+    maps = {"albedo": wave[..., :3], "normal": normal, "roughness": wave[..., 3:]}
+    return {name: np.rint(255 * values).astype(np.uint8) for name, values in maps.items()}
 
 
 def make(path, source, preset="ours", border="repeat", extras=None, **settings):
@@ -20,31 +29,31 @@ def make(path, source, preset="ours", border="repeat", extras=None, **settings):
     ``extras``: a function that returns entries from their shape.
     """
     recipe, types = PRESETS[preset], array_module("llvm")
-    pyramid = Pyramid.of(source, training.layout_of(source, recipe), types, (border, border))
+    pyramid = Pyramid.from_source(source, fit.source_layout(source, recipe), types, (border, border))
     stored = pyramid.layout.stored
     if preset == "paper":
         size = arrays.PaperBudget(9, 12, 4, 4, stored)
     else:
         dims = min(3, stored)
         size = arrays.TextureBudget(source.height, source.width, stored, (arrays.FineArray(0, dims, 8),), 1, dims, 12)
-    net, rng = training.problem_of(source, size, recipe, pyramid).net, np.random.default_rng(7)
+    net, rng = fit.build_problem(source, size, recipe, pyramid).net, np.random.default_rng(7)
     if preset == "paper":
         for array in net.arrays.values():
             array.data = types.TensorXf(aligned(rng.random(array.data.shape)))
     if extras is not None:
         net.extras = neutral_extras(source.height, source.width, net.border).alloc(types.TensorXf)
         net.extras.data = types.TensorXf(aligned(extras(net.extras.numpy().shape)))
-    save_table(path, to_table(CompressedTexture(pyramid.layout, training.stored_form(net)), settings))
+    save_table(path, to_table(CompressedTexture(pyramid.layout, fit.stored_form(net)), settings))
     return str(path)
 
 
 def make_image(path, source, border="repeat"):
     """Write a file of the task ``image`` whose arrays are those at the start of a training, almost without loss."""
     recipe, types = image.PRESETS["ours"], array_module("llvm")
-    stored = image_training.layout_of(source, recipe).stored
+    stored = image_training.source_layout(source, recipe).stored
     dims = min(3, stored)
     size = image_arrays.ImageBudget(source.height, source.width, 8, stored, dims, 8)
-    problem = image_training.problem_of(source, size, recipe, types, border=(border, border))
+    problem = image_training.build_problem(source, size, recipe, types, border=(border, border))
     stored_net = image_training.stored_form(problem.net, problem.bits)
     save_table(path, image_arrays.to_table(image_arrays.CompressedImage(problem.layout, stored_net), {}))
     return str(path)

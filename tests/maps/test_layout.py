@@ -7,17 +7,10 @@ from dataclasses import replace
 import drjit as dr
 import numpy as np
 import pytest
-from variants import BACKENDS
 
-from mi_diffind.core.runtime import array_module
-from mi_diffind.maps.compressed import root
 from mi_diffind.maps.layout import NORMAL_FLOOR_DB, Layout, MapLayout
+from mi_diffind.maps.pyramid import root
 from mi_diffind.maps.source import from_arrays
-
-
-@pytest.fixture(params=BACKENDS)
-def ad(request):
-    return array_module(request.param)
 
 
 def noise(*shape, seed=0, dtype=np.uint8):
@@ -49,7 +42,7 @@ def back(layout, source):
 
 def test_colours_are_stored_as_they_are():
     source = from_arrays({"albedo": noise(5, 4, 3)})
-    layout = Layout.of(source)
+    layout = Layout.from_source(source)
     assert layout.maps[0].where == (0, 1, 2) and layout.groups == ("albedo",) * 3 and layout.initial == (0.5,) * 3
     assert (layout.width, layout.height, layout.stored, layout.names) == (4, 5, 3, ("albedo",))
     np.testing.assert_array_equal(back(layout, source)["albedo"], source.maps[0].values)
@@ -58,7 +51,7 @@ def test_colours_are_stored_as_they_are():
 def test_equal_channels_of_different_maps_are_stored_once():
     albedo = noise(5, 4, 3)
     source = from_arrays({"albedo": albedo, "height": albedo[..., 2], "other": albedo[..., 2] // 2})
-    layout = Layout.of(source)
+    layout = Layout.from_source(source)
     assert [m.where for m in layout.maps] == [(0, 1, 2), (2,), (3,)]
     assert layout.groups == ("albedo", "albedo", "albedo", "other") and layout.needed("height") == (2,)
     found = back(layout, source)
@@ -72,14 +65,14 @@ def test_constant_channels_are_numbers():
     source = from_arrays(
         {"albedo": image, "metallic": np.zeros((5, 4), np.uint8), "ao": np.full((5, 4), 255, np.uint8)}
     )
-    layout = Layout.of(source)
+    layout = Layout.from_source(source)
     value = float(np.float32(77) / np.float32(255))
     assert [m.where for m in layout.maps] == [(0, ("constant", value), 1), (("constant", 0.0),), (("constant", 1.0),)]
     assert layout.needed("albedo") == (0, 1) and layout.needed("ao") == ()
     found = back(layout, source)
     for m in source.maps:
         np.testing.assert_array_equal(found[m.name], m.values)
-    assert Layout.of(source, once=False).stored == 5
+    assert Layout.from_source(source, once=False).stored == 5
 
 
 # -- normals ----------------------------------------------------------------------------------------------------------
@@ -87,10 +80,10 @@ def test_constant_channels_are_numbers():
 
 def test_unit_normals_lose_their_third_component():
     source = from_arrays({"normal": unit_normals()})
-    layout = Layout.of(source)
+    layout = Layout.from_source(source)
     assert layout.maps[0].where == (0, 1, "z") and layout.stored == 2
     np.testing.assert_allclose(back(layout, source)["normal"], source.maps[0].values, atol=1e-6)
-    assert Layout.of(source, two_channel_normals=False).stored == 3
+    assert Layout.from_source(source, two_channel_normals=False).stored == 3
 
 
 def test_normals_of_bytes_keep_their_third_component_if_it_says_more():
@@ -99,25 +92,25 @@ def test_normals_of_bytes_keep_their_third_component_if_it_says_more():
     for decibel, dropped in ((NORMAL_FLOOR_DB + 1, True), (NORMAL_FLOOR_DB - 1, False)):
         normals = exact.copy()
         normals[..., 2] -= np.float32(10 ** (-decibel / 20))
-        assert (Layout.of(from_arrays({"normal": normals})).stored == 2) == dropped
+        assert (Layout.from_source(from_arrays({"normal": normals})).stored == 2) == dropped
     short = (0.5 + 0.8 * (exact - 0.5)).astype(np.float32)  # of length 0.8
     source = from_arrays({"normal": short})
-    assert Layout.of(source).stored == 3
-    np.testing.assert_array_equal(back(Layout.of(source), source)["normal"], short)
-    assert Layout.of(source, two_channel_normals=True).stored == 2
+    assert Layout.from_source(source).stored == 3
+    np.testing.assert_array_equal(back(Layout.from_source(source), source)["normal"], short)
+    assert Layout.from_source(source, two_channel_normals=True).stored == 2
 
 
 def test_other_maps_keep_all_components():
     for name in ("albedo", "height"):
-        assert Layout.of(from_arrays({name: unit_normals()})).stored == 3
+        assert Layout.from_source(from_arrays({name: unit_normals()})).stored == 3
     below = unit_normals()
     below[..., 2] = 1 - below[..., 2]  # the lower hemisphere does not follow from x and y
-    assert Layout.of(from_arrays({"normal": below})).stored == 3
-    assert Layout.of(from_arrays({"normal": 2 * unit_normals() - 1})).stored == 3  # signed: not in [0, 1]
+    assert Layout.from_source(from_arrays({"normal": below})).stored == 3
+    assert Layout.from_source(from_arrays({"normal": 2 * unit_normals() - 1})).stored == 3  # signed: not in [0, 1]
     flat = unit_normals()
     flat[..., 0] = 0.5
     source = from_arrays({"normal": flat})
-    found = back(Layout.of(source), source)["normal"]
+    found = back(Layout.from_source(source), source)["normal"]
     np.testing.assert_allclose(found, flat, atol=1e-6)
 
 
@@ -136,7 +129,7 @@ def hdr(largest, seed=0):
 def test_high_dynamic_range_is_logarithmic(largest):
     values = hdr(largest)
     source = from_arrays({"image": values})
-    layout = Layout.of(source)
+    layout = Layout.from_source(source)
     m = layout.maps[0]
     # Written out again, in double precision: linear below the knee, logarithmic above it
     knee = max(float(np.median(values)), 1e-3 * largest)
@@ -160,7 +153,7 @@ def test_negative_values_span_their_range(low, high):
     values = np.random.default_rng(1).uniform(low, high, (8, 8, 2)).astype(np.float32)
     values[0, 0] = low, high
     source = from_arrays({"height": values})
-    layout = Layout.of(source)
+    layout = Layout.from_source(source)
     assert layout.maps[0].low == values.min() and layout.maps[0].knee == 0
     np.testing.assert_allclose(back(layout, source)["height"], values, atol=1e-6 * max(high - low, 1e-3))
 
@@ -174,7 +167,7 @@ def test_the_largest_floats(sign):
     values = (values * largest).astype(np.float32)
     values[0, 0] = {"positive": largest, "negative": -largest, "both": (largest, -largest, 0)}[sign]
     source = from_arrays({"image": values})
-    found = back(Layout.of(source), source)["image"]
+    found = back(Layout.from_source(source), source)["image"]
     small = np.abs(values) < 1e38
     assert np.isfinite(found).all() and (np.sign(found[small]) == np.sign(values[small])).mean() > 0.9
     assert np.abs(found[small] - values[small]).max() < 1e33
@@ -245,7 +238,7 @@ def test_json_round_trip():
     assert Layout.from_json(json.loads(text)) == LAYOUT
     assert Layout.from_json(LAYOUT.to_json()) == LAYOUT
     source = from_arrays({"normal": unit_normals(), "height": hdr(1e30)[:9, :8, 0], "ao": np.zeros((9, 8), np.uint8)})
-    layout = Layout.of(source)
+    layout = Layout.from_source(source)
     assert Layout.from_json(json.loads(json.dumps(layout.to_json()))) == layout
 
 

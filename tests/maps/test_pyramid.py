@@ -59,7 +59,7 @@ SIZES = [(16, 16), (13, 9), (8, 32), (1, 7), (5, 1), (1, 1)]
 @pytest.mark.parametrize("size", SIZES)
 def test_a_texel_is_the_mean_of_what_it_covers(rng, size):
     source = from_arrays({"data": noise(rng, *size, 2)})
-    pyramid = Pyramid.of(source)
+    pyramid = Pyramid.from_source(source)
     assert [level.shape[:2] for level in pyramid.values] == level_sizes(*size)
     assert pyramid.values[-1].shape[:2] == (1, 1) and pyramid.levels == int(np.log2(max(size))) + 1
     for fine, coarse in zip(pyramid.values, pyramid.values[1:], strict=False):
@@ -74,7 +74,7 @@ def test_a_texel_is_the_mean_of_what_it_covers(rng, size):
 def test_the_coarsest_level_is_the_mean_everywhere(ad, rng):
     for size in SIZES:
         source = from_arrays({"data": noise(rng, *size, 3)})
-        pyramid = Pyramid.of(source, types=ad)
+        pyramid = Pyramid.from_source(source, types=ad)
         if not pyramid.layout.stored:
             continue
         u, v = rng.random((2, 50), dtype=np.float32)
@@ -93,7 +93,7 @@ def test_no_footprint_is_bilinear(ad, rng, border):
     for height, width in ((13, 9), (16, 4)):
         values = noise(rng, height, width, 3)
         source = from_arrays({"data": values})
-        pyramid = Pyramid.of(source, types=ad, border=(border, border))
+        pyramid = Pyramid.from_source(source, types=ad, border=(border, border))
         u, v = 3 * rng.random((2, 400), dtype=np.float32) - 1 if border == "repeat" else rng.random((2, 400))
         place = [np.float64(np.float32(v)) * height - 0.5, np.float64(np.float32(u)) * width - 0.5]
         mode = {"repeat": "grid-wrap", "clamp": "nearest"}[border]
@@ -104,7 +104,7 @@ def test_no_footprint_is_bilinear(ad, rng, border):
 
 
 def test_levels_blend_linearly_and_continuously(ad, rng):
-    pyramid = Pyramid.of(from_arrays({"data": noise(rng, 12, 20, 1)}), types=ad)
+    pyramid = Pyramid.from_source(from_arrays({"data": noise(rng, 12, 20, 1)}), types=ad)
     u, v = rng.random((2, 200), dtype=np.float32)
     whole = [filtered(pyramid, u, v, level) for level in range(pyramid.levels)]
     for level in np.arange(0, pyramid.levels - 1, 0.125):
@@ -123,7 +123,7 @@ def test_constants_stay(ad):
     normal[:] = (128, 128, 255)
     albedo[0, 0, 0], normal[3, 3] = 0, (255, 128, 128)  # or nothing would be stored
     source = from_arrays({"albedo": albedo, "normal": normal})
-    pyramid = Pyramid.of(source, types=ad)
+    pyramid = Pyramid.from_source(source, types=ad)
     assert [m.where[1:] for m in pyramid.layout.maps[:1]] == [(("constant", pytest.approx(30 / 255)),
                                                              ("constant", pytest.approx(3 / 255)))]  # fmt: skip
     for level in range(pyramid.levels):
@@ -131,7 +131,7 @@ def test_constants_stay(ad):
         np.testing.assert_allclose(decoded[..., 1], 30, rtol=1e-6)
         np.testing.assert_allclose(decoded[..., 2], 3, rtol=1e-6)
     source = from_arrays({"albedo": np.full((7, 10, 3), 77, np.uint8)})
-    pyramid = Pyramid.of(source, types=ad)
+    pyramid = Pyramid.from_source(source, types=ad)
     assert pyramid.layout.stored == 0 and pyramid.levels == 4
     assert pyramid.filtered(ad.Float(0.5), ad.Float(0.5), ad.Float(1)) == []
     np.testing.assert_allclose(pyramid.decode(level=2)["albedo"], 77 / 255)
@@ -141,7 +141,7 @@ def test_colours_are_averaged_linearly(ad, rng):
     """And interpolated linearly; the same numbers as data are not."""
     codes = rng.integers(0, 256, (8, 8, 3), dtype=np.uint8)
     source = from_arrays({"albedo": codes, "data": codes[..., :2]})
-    pyramid = Pyramid.of(source, types=ad)
+    pyramid = Pyramid.from_source(source, types=ad)
     assert pyramid.layout.stored == 5  # equal channels, but of different means
     values = codes / 255.0
     block = values.reshape(4, 2, 4, 2, 3)
@@ -161,7 +161,7 @@ def test_channels_of_two_maps_are_linear_if_both_are_colours(ad, rng, first):
     """A channel that an sRGB map shares with data is interpolated as the first map of the two has it."""
     codes = rng.integers(0, 256, (8, 8, 3), dtype=np.uint8)
     source = from_arrays({first: codes, **{name: codes for name in ("albedo", "data") if name != first}})
-    pyramid = Pyramid.of(source, Layout.of(source), ad)
+    pyramid = Pyramid.from_source(source, Layout.from_source(source), ad)
     assert pyramid.layout.stored == 3
     assert pyramid.is_linear("albedo") is (first == "albedo") and not pyramid.is_linear("data")
     u, v = (ad.Float(aligned(x)) for x in centres(8, 8))
@@ -173,7 +173,7 @@ def test_channels_of_two_maps_are_linear_if_both_are_colours(ad, rng, first):
 def test_high_dynamic_range_is_averaged_as_it_is(ad, rng):
     values = (10 ** (4 * noise(rng, 8, 8, 3) - 1)).astype(np.float32)
     source = from_arrays({"image": values})
-    pyramid = Pyramid.of(source, types=ad)
+    pyramid = Pyramid.from_source(source, types=ad)
     mean = values.astype(np.float64).mean(axis=(0, 1))
     np.testing.assert_allclose(pyramid.decode(level=3)["image"][0, 0], mean, rtol=1e-4)
     u, v = centres(8, 8)
@@ -185,7 +185,7 @@ def test_normals_stay_unit_vectors(ad, rng):
     xy = 0.9 * (noise(rng, 16, 16, 2) - 0.5)
     z = np.sqrt(1 - (xy**2).sum(axis=-1, keepdims=True))
     unit = np.concatenate([xy, z], axis=-1)
-    pyramid = Pyramid.of(from_arrays({"normal": (0.5 + 0.5 * unit).astype(np.float32)}), types=ad)
+    pyramid = Pyramid.from_source(from_arrays({"normal": (0.5 + 0.5 * unit).astype(np.float32)}), types=ad)
     assert pyramid.layout.stored == 2  # the third follows at every level
     for level in range(1, pyramid.levels):
         block = 2**level
@@ -193,13 +193,13 @@ def test_normals_stay_unit_vectors(ad, rng):
         expected = mean / np.linalg.norm(mean, axis=-1, keepdims=True)
         np.testing.assert_allclose(pyramid.decode(level=level)["normal"], 0.5 + 0.5 * expected, atol=1e-5)
     # Of vectors half as long the mean is brought to half the length
-    short = Pyramid.of(from_arrays({"normal": (0.5 + 0.25 * unit).astype(np.float32)}), types=ad)
+    short = Pyramid.from_source(from_arrays({"normal": (0.5 + 0.25 * unit).astype(np.float32)}), types=ad)
     last = 2 * short.decode(level=4)["normal"][0, 0] - 1
     assert np.linalg.norm(last) == pytest.approx(0.5, abs=1e-4)
     # What cancels out points up
     opposed = np.zeros((2, 2, 3), np.float32)
     opposed[0, :, 0], opposed[1, :, 0] = 1, -1
-    up = Pyramid.of(from_arrays({"normal": 0.5 + 0.5 * opposed}), types=ad).decode(level=1)["normal"]
+    up = Pyramid.from_source(from_arrays({"normal": 0.5 + 0.5 * opposed}), types=ad).decode(level=1)["normal"]
     np.testing.assert_allclose(up[0, 0], [0.5, 0.5, 1], atol=1e-5)
 
 
@@ -209,16 +209,16 @@ def test_a_flat_component_of_a_normal_is_not_a_constant(ad):
     y = np.where(np.arange(4)[:, None] % 2, 0.6, -0.6) * np.ones((4, 4))
     normal = 0.5 + 0.5 * np.stack([x, y, np.sqrt(1 - x**2 - y**2)], axis=-1)
     source = from_arrays({"normal": normal.astype(np.float32)})
-    pyramid = Pyramid.of(source, types=ad)
+    pyramid = Pyramid.from_source(source, types=ad)
     last = 2 * pyramid.decode(level=2)["normal"][0, 0] - 1
     z = float(np.sqrt(1 - 0.72))
     np.testing.assert_allclose(last, np.array([0.6, 0, z]) / np.hypot(0.6, z), atol=1e-5)
-    assert Layout.of(source).stored < pyramid.layout.stored  # at level 0 alone it is one
+    assert Layout.from_source(source).stored < pyramid.layout.stored  # at level 0 alone it is one
 
 
 @pytest.mark.parametrize("border", ["repeat", "clamp"])
 def test_seams(ad, rng, border):
-    pyramid = Pyramid.of(from_arrays({"data": noise(rng, 12, 10, 2)}), types=ad, border=(border, border))
+    pyramid = Pyramid.from_source(from_arrays({"data": noise(rng, 12, 10, 2)}), types=ad, border=(border, border))
     t = np.float32(rng.random(40))
     for level in (0, 0.7, 2):
         before, after = filtered(pyramid, 1 - 1e-6, t, level), filtered(pyramid, 1e-6, t, level)
@@ -235,7 +235,7 @@ def test_seams(ad, rng, border):
 def test_gradients_are_finite_and_right(ad, rng):
     import drjit as dr
 
-    pyramid = Pyramid.of(from_arrays({"albedo": rng.integers(0, 256, (9, 8, 3), dtype=np.uint8)}), types=ad)
+    pyramid = Pyramid.from_source(from_arrays({"albedo": rng.integers(0, 256, (9, 8, 3), dtype=np.uint8)}), types=ad)
     place = [ad.Float(aligned(rng.uniform(0.05, 0.95, 300))) for _ in range(2)]
     place.append(ad.Float(aligned(rng.integers(0, 3, 300) + rng.uniform(0.05, 0.9, 300))))
     dr.enable_grad(place)
@@ -268,7 +268,7 @@ def test_openimageio_filters_alike(ad, rng, tmp_path, border):
     wrap = {"repeat": "periodic", "clamp": "clamp"}[border]
     config.attribute("wrapmodes", f"{wrap},{wrap}")
     assert oiio.ImageBufAlgo.make_texture(oiio.MakeTxTexture, oiio.ImageBuf(values), name, config), oiio.geterror()
-    pyramid = Pyramid.of(from_arrays({"data": values}), types=ad, border=(border, border))
+    pyramid = Pyramid.from_source(from_arrays({"data": values}), types=ad, border=(border, border))
     for level, own in enumerate(pyramid.values):
         np.testing.assert_allclose(oiio.ImageBuf(name, 0, level).get_pixels(oiio.FLOAT), own, atol=1e-6)
 

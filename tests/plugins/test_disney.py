@@ -220,16 +220,3 @@ def test_diffuse_reflectance_and_text(mi_rgb):
         assert text.startswith("Disney[" if name == "disney" else "NeuralDisney[")
         assert "roughness" in text and "specular = [0.5]" in text
     assert "preset = paper, 12480 bytes as float32" in text and "effects = diffuse, dielectric" in text
-
-
-@pytest.mark.parametrize("kind", ["llvm_ad_spectral", "llvm_ad_mono"])
-def test_white_is_white_in_every_colour_mode(kind):
-    """A grey material has the same luminance in RGB and in other colour modes, tints included."""
-    import mitsuba as mi
-
-    means = []
-    for variant in ("llvm_ad_rgb", kind):
-        mi.set_variant(variant)
-        bsdf = {"type": "disney", "base_color": {"type": "uniform", "value": 0.5}, **RICH}
-        means.append(mi.render(sphere_scene(mi, bsdf), spp=256).numpy()[4:12, 4:12, :3].mean(axis=(0, 1)))
-    assert np.allclose(means[0], means[1], rtol=0.03), means

@@ -96,7 +96,7 @@ def test_a_lamp_lights_a_room_as_its_mesh_does(mi_rgb, fields, lights):
 
 
 def test_a_field_casts_the_shadow_of_its_mesh(mi_rgb, fields):
-    """Under a small lamp, in a dim sky that is hidden from the camera."""
+    """Shadows under a small lamp, in a dim sky that is hidden from the camera."""
     mi = mi_rgb
     at = mi.ScalarTransform4f().translate([-1.2, 0.9, 2.5]).rotate([1, 0, 0], 180).scale(0.1)
     lights = {
@@ -167,7 +167,7 @@ def test_directions_towards_a_field_have_their_density(mi_rgb, fields):
 
 
 def test_directions_towards_a_field_reduce_the_noise(mi_rgb, fields):
-    """With the same mean: spheres only guide samples."""
+    """Spheres only guide samples: the mean without them is the same."""
     mi = mi_rgb
     small = mi.ScalarTransform4f().translate([0, 0, 0.3]).scale(0.2)
     made = scene(mi, field("lamp", to_world=small, max_depth=2), **room(mi, {"type": "diffuse"}))
@@ -218,3 +218,5 @@ def test_what_is_refused_and_warned_of(mi_rgb, fields):
     made = scene(mi, field("lamp"), smoke=smoke, **room(mi))
     assert 'the participating medium of "smoke" is not rendered' in made.integrator()._unseen(made)
     assert made.integrator()._unseen(scene(mi, field("lamp"), **room(mi))) == ""
+    unlit = scene(mi, field("lamp") | {"lit": False}, **room(mi))
+    assert 'not visible through the holes of "leaf", "lit" shows it' in unlit.integrator()._unseen(unlit)

@@ -115,7 +115,7 @@ def test_origins_of_rays_keep_what_single_precision_rounds_off(mi_rgb, shapes, r
     shape = mi.load_dict({**shapes["field"], "to_world": move})
     p = rng.uniform(-0.5, 0.5, (3, 1000)).astype(np.float32)
     place, rest = shape.split_world(mi.Point3f(p))
-    exact = np.array(shape.placement.size) * (shape.placement.rotation @ p.astype(np.float64))
+    exact = shape.placement.length * (shape.placement.rotation @ p.astype(np.float64))
     exact += np.array(shape.origin, np.float64).reshape(3, 1)
     assert np.abs(np.array(place) - exact).max() > 1e-4  # what a point in the world alone is worth
     assert np.abs(np.array(place, np.float64) + np.array(rest, np.float64) - exact).max() < 2e-6
@@ -136,7 +136,7 @@ def test_hits_far_from_the_origin_are_those_near_it(mi_rgb, shapes, rng):
     for far in (0.0, 2.0**13):
         shape = mi.load_dict({**shapes["field"], "to_world": at().translate([far, -far, far])})
         start = o + far * np.array([[1], [-1], [1]])
-        hit = distance_shapes.intersect([shape], mi.Point3f(start), mi.Vector3f(d), mi.Float(dr.inf))
+        hit = distance_shapes.Solids([shape]).intersect(mi.Point3f(start), mi.Vector3f(d), mi.Float(dr.inf))
         results.append([np.array(v) for v in (hit.number, hit.t, hit.p)])
     (near, t, p), (moved, far_t, far_p) = results
     assert (near == moved).all() and near.mean() > 0.5

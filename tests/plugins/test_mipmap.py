@@ -12,7 +12,6 @@ from texture_scenes import linear
 from mi_diffind.core.compat import backend_module
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
-from mi_diffind.measure.clock import count
 from mi_diffind.scenes import loading
 
 SIZE = WIDTH, HEIGHT = 24, 16
@@ -42,7 +41,7 @@ def plugin(file, name="trilinear", **more):
 
 def pyramid(mi, image, border="repeat", color_space="srgb"):
     source = from_arrays({"image": image}, {"image": color_space})
-    return Pyramid.of(source, types=backend_module(mi.TensorXf), border=(border, border))
+    return Pyramid.from_source(source, types=backend_module(mi.TensorXf), border=(border, border))
 
 
 def expected(mi, truth, uv, level):
@@ -73,35 +72,6 @@ def test_off_is_bitmap(mi_rgb, file, image, rng, wrap_mode):
     assert list(ours.resolution()) == [WIDTH, HEIGHT] and ours.is_spatially_varying()
     assert float(ours.mean()[0]) == pytest.approx(float(theirs.mean()[0]), abs=1e-4)
     assert ours.max() == pytest.approx(linear(image.max() / 255), abs=1e-4)
-
-
-def test_off_ignores_footprints(mi_rgb, file, rng):
-    """They are not even computed: no operation more than without, with a sensor, too."""
-    mi = mi_rgb
-    si = texture_scenes.hits(mi, rng.random((2, 100)), *texture_scenes.footprints(rng, 100, SIZE))
-    off, on = (mi.load_dict(plugin(file, name, **SENSOR(mi))) for name in ("off", "trilinear"))
-    without = dr.zeros(mi.SurfaceInteraction3f, 100)
-    without.uv = si.uv
-    a, b, c = (count(lambda t=t, s=s: t.eval(s)) for t, s in ((off, si), (off, without), (on, si)))
-    assert (a.gathers, a.instructions) == (b.gathers, b.instructions)
-    assert a.gathers == 4 and c.gathers == 8 + 2 and c.instructions > a.instructions + 100
-
-
-@pytest.mark.parametrize("wrap_mode", ["repeat", "clamp"])
-def test_trilinear_is_the_pyramid_at_the_level_of_the_area(mi_any, file, image, rng, wrap_mode):
-    mi = mi_any
-    uv, (ddx, ddy) = rng.random((2, 1000)), texture_scenes.footprints(rng, 1000, SIZE)
-    truth = expected(mi, pyramid(mi, image, wrap_mode), uv, texture_scenes.isotropic(ddx, ddy, SIZE))
-    si = texture_scenes.hits(mi, uv, ddx, ddy)
-    texture = mi.load_dict(plugin(file, wrap_mode=wrap_mode))
-    if mi.is_spectral:
-        with pytest.raises(RuntimeError, match="asked for a colour"):
-            texture.eval_3(si)
-        assert np.isfinite(texture.eval(si).numpy()).all()
-        texture = mi.load_dict(plugin(file, wrap_mode=wrap_mode, raw=True))
-        place = [mi.Float(aligned(x)) for x in (*uv, texture_scenes.isotropic(ddx, ddy, SIZE))]
-        truth = numpy_of(pyramid(mi, image, wrap_mode, "linear").filtered(*place)).T
-    np.testing.assert_allclose(texture.eval_3(si).numpy(), truth, atol=2e-4)
 
 
 @pytest.mark.parametrize("taps", [1, 7])
@@ -153,25 +123,6 @@ def test_random_numbers(mi_rgb, rng):
 # -- hard cases --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["trilinear", "anisotropic"])
-def test_seams(mi_rgb, file, rng, name):
-    """Repeated and mirrored images go on with any footprint; a clamped one knows nothing of its other end."""
-    mi = mi_rgb
-    uv, (ddx, ddy) = rng.random((2, 300)), texture_scenes.footprints(rng, 300, SIZE, 3)
-    texture = {w: mi.load_dict(plugin(file, name, wrap_mode=w)) for w in ("repeat", "mirror")}
-    for mode, x in (("repeat", uv - [[1], [2]]), ("repeat", uv - [[-3], [0]]), ("mirror", uv - [[-2], [2]])):
-        a, b = (texture[mode].eval(texture_scenes.hits(mi, y, ddx, ddy)).numpy() for y in (uv, x))
-        np.testing.assert_allclose(a, b, atol=1e-3)
-    a, b = (texture["mirror"].eval(texture_scenes.hits(mi, s * uv, s * ddx, s * ddy)).numpy() for s in (1, -1))
-    np.testing.assert_allclose(a, b, atol=1e-3)
-    halves = np.zeros((16, 16, 3), np.uint8)
-    halves[:, 8:] = 255
-    for mode in ("mirror", "clamp", "repeat"):
-        tall = mi.load_dict({"type": "mipmap", "bitmap": mi.Bitmap(halves), "filter": name, "wrap_mode": mode})
-        ends = tall.eval(texture_scenes.hits(mi, [[0, 1e-3, 1, 0.999], [0.5] * 4], (1e-4, 0), (0, 0.25))).numpy()[0]
-        assert np.abs(ends - [0, 0, 1, 1]).max() < 1e-4 if mode != "repeat" else (np.abs(ends - 0.5) < 0.1).all()
-
-
 # -- gradients ---------------------------------------------------------------------------------------------------------
 
 
@@ -199,7 +150,9 @@ def test_changed_texels_are_those_of_a_new_texture(mi_rgb, rng, role):
     for values in (old, new):
         source = from_arrays({role: values}, {role: space})
         assert source.maps[0].role == role or role != "normal"
-        image_files.PYRAMIDS["texels"] = Pyramid.of(source, types=backend_module(mi.TensorXf), border=("repeat",) * 2)
+        image_files.PYRAMIDS["texels"] = Pyramid.from_source(
+            source, types=backend_module(mi.TensorXf), border=("repeat",) * 2
+        )
         textures.append(mi.load_dict({"type": "mipmap", "pyramid": "texels", "raw": role != "srgb"}))
     del image_files.PYRAMIDS["texels"]
     texture, truth = textures
@@ -263,31 +216,6 @@ def test_gradients_reach_the_texels(mi_rgb, file, rng, name):
         params.update()
         dr.backward(dr.sum(dr.dot(weight, theirs.eval(si))))
         np.testing.assert_allclose(gradient, dr.grad(params["data"]).numpy(), atol=1e-4)
-
-
-def test_texels_seen_minified_are_recovered(mi_rgb, detailed):
-    """By a few steps of Adam, from a render in which a pixel covers several texels: their mean is what it shows."""
-    mi = mi_rgb
-    from mi_diffind.plugins.support import footprint
-
-    true = 0.2 + 0.6 * (detailed[:16, :16] / 255)
-    images, scenes_ = [], []
-    for values in (true, np.full_like(true, 0.5)):
-        bitmap = mi.Bitmap(values.astype(np.float32))
-        texture = {"type": "mipmap", "bitmap": bitmap, "to_uv": mi.ScalarTransform4f().scale(8)}
-        scenes_.append(texture_scenes.plane(mi, texture, size=16, integrator={"type": "prb", "max_depth": 1}))
-        footprint.attach(scenes_[-1])
-        images.append(mi.render(scenes_[-1]))
-    params = mi.traverse(scenes_[1])
-    key = "plane.emitter.radiance.data"
-    optimizer, losses = mi.ad.Adam(lr=0.05, params={key: params[key]}), []
-    for step in range(12):
-        params.update(optimizer)
-        loss = dr.mean(dr.square(mi.render(scenes_[1], params, seed=step) - images[0]), axis=None)
-        dr.backward(loss)
-        optimizer.step()
-        losses.append(loss.array[0])
-    assert losses[-1] < 0.1 * losses[0], losses
 
 
 def test_slope_of_a_filtered_texture(mi_rgb, rng):
@@ -362,64 +290,7 @@ def test_one_sample_a_pixel_on_a_plane(mi_rgb, detailed):
     assert quality["bitmap"] + 5 < quality["trilinear"] < quality["anisotropic"] - 3, quality
 
 
-@pytest.mark.parametrize("kind", ["thinlens", "orthographic", "inside", "grazing", "degenerate"])
-def test_sensors_and_places(mi_rgb, detailed, kind):
-    """Better than a bitmap at one sample, wherever a sensor is; a surface without directions of uv is as with one."""
-    mi, t = mi_rgb, mi_rgb.ScalarTransform4f()
-    from mi_diffind.plugins.support import footprint
-
-    sensor, shape = {"fov": 60}, None
-    if kind == "thinlens":
-        sensor = {**sensor, "type": "thinlens", "aperture_radius": 0.05, "focus_distance": 2.5}
-    elif kind == "orthographic":
-        to_world = t.look_at([0, -6, 1], [0, 0, 0], [0, 0, 1]).scale([2, 2, 1])
-        sensor = {"type": "orthographic", "to_world": to_world}
-    elif kind == "grazing":
-        sensor = {**sensor, "to_world": t.look_at([0, -2, 0.01], [0, 0, 0], [0, 0, 1])}
-    images = []
-    for texture, spp in (("bitmap", 256), ("bitmap", 1), ("anisotropic", 1)):
-        form = {"type": "bitmap"} if texture == "bitmap" else {"type": "mipmap", "filter": texture}
-        emitter = {"type": "area", "radiance": {**form, "bitmap": mi.Bitmap(detailed)}}
-        if kind == "inside":
-            sensor = {"fov": 60, "to_world": t.look_at([0.3, 0, 0], [0, 1, 0.2], [0, 0, 1])}
-            emitter["radiance"]["to_uv"] = t.scale([6, 3, 1])
-            shape = {"type": "sphere", "flip_normals": True, "emitter": emitter}
-        elif kind in ("orthographic", "grazing", "degenerate"):
-            shape = {"type": "rectangle", "to_world": t.scale(6), "emitter": emitter}
-            if kind == "degenerate":
-                emitter["radiance"]["to_uv"] = t.scale([0, 0, 1])
-        else:
-            shape = {"type": "rectangle", "to_world": t.scale(6), "emitter": emitter}
-        loaded = texture_scenes.plane(mi, None, spp, "independent", 24, sensor, shape)
-        footprint.attach(loaded)
-        images.append(mi.render(loaded, spp=spp).numpy())
-    assert all(np.isfinite(image).all() for image in images)
-    if kind == "degenerate":
-        np.testing.assert_allclose(images[2], images[1], atol=1e-5)
-    else:
-        noise, found = (texture_scenes.psnr(image, images[0]) for image in images[1:])
-        assert found > noise + 1, (noise, found)
-
-
 # -- in scenes ---------------------------------------------------------------------------------------------------------
-
-
-def test_frozen_renders(mi_rgb, file, no_garbage_collection):
-    """With the sensor that there was when a function was frozen."""
-    mi = mi_rgb
-    from mi_diffind.plugins.support import footprint
-
-    texture, path = plugin(file, to_uv=mi.ScalarTransform4f().scale(8)), {"type": "path", "max_depth": 1}
-    loaded = texture_scenes.plane(mi, texture, size=16, integrator=path)
-
-    images = []
-    for spp in (1, 64):
-        frozen = dr.freeze(lambda loaded, seed: mi.render(loaded, spp=1, seed=seed))
-        footprint.attach(loaded, spp=spp)
-        for seed in range(5):
-            images.append(frozen(loaded, mi.UInt32(seed)).numpy())
-            np.testing.assert_allclose(images[-1], mi.render(loaded, spp=1, seed=seed).numpy(), atol=1e-5)
-    assert np.abs(images[0] - images[5]).max() > 0.05
 
 
 def test_sources(mi_rgb, tmp_path, image, rng):

@@ -71,7 +71,7 @@ def test_chi2_of_the_library(mi_rgb, path, tmp_path, monkeypatch):
 
 
 def test_both_sides_look_alike(mi_rgb, files, rng):
-    """… with ``two_sided``."""
+    """With ``two_sided``, both sides of a surface have the same values."""
     wi, wo = random_directions(rng, 500, 0.05), random_directions(rng, 500, 0.05)
     bsdf = mi_rgb.load_dict({"type": "neural_bsdf", "filename": files["isotropic"], "two_sided": True})
     front, back = (

@@ -90,7 +90,7 @@ def roughness_of(material):
 
 
 def normals(form):
-    """What the tables of a form say, read by NumPy and SciPy."""
+    """Distribution of normals of a form, read in its tables by NumPy and SciPy."""
     table = shipped(FORMS[form].get("preset", "tables"))
     encoding = table_encoding(table)
     return ggx_formulas.learned(table.to(FORMS[form].get("storage", table.storage)), encoding.inputs, encoding.output)
@@ -226,7 +226,7 @@ def test_energy(mi_rgb, rng, form):
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_gradients_with_respect_to_directions(mi_rgb, rng, preset):
-    """As a moving light or shape asks for them: against differences along great circles, and finite at the extremes."""
+    """Derivatives by directions are differences along great circles, and finite at the extremes."""
     mi, n, alpha, step = mi_rgb, 10_000, 0.2371, 1e-6
     bsdf = mi.load_dict({**FORMS[preset], "alpha": alpha, "eta": 0.6, "k": 2.3})
 
@@ -271,7 +271,7 @@ def test_what_is_left_out_changes_nothing(mi_rgb, rng):
         m = {name: bitmap(mi, np.full((2, 2), v)) if name in unknown else v for name, v in used.items()}
         bsdf = mi.load_dict({**FORMS["tables"], **m})
         if unknown:
-            bsdf._tracked_ior[0].bounds = bsdf._tracked_factor.bounds = ValueBounds
+            bsdf._tracked["eta"].bounds = bsdf._tracked["specular_reflectance"].bounds = ValueBounds
         left_out = bsdf.report()["effects_left_out"]
         assert (left_out == {"fresnel": "eta is 0 and k is 1", "specular_reflectance": "is 1"}) == (not unknown)
         bs, weight = bsdf.sample(mi.BSDFContext(), si, *u)

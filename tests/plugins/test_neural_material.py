@@ -10,7 +10,7 @@ import drjit as dr
 import numpy as np
 import pytest
 import texture_scenes
-from arrays import aligned
+from bsdf_queries import random_directions, uniform, vectors
 from texture_files import make
 
 import mi_diffind
@@ -55,35 +55,18 @@ def neutral(shape):
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
     folder, wave = tmp_path_factory.mktemp("materials"), waves(6)
+    metal = {"albedo": wave[..., :3], "normal": bumps(1.2), "roughness": wave[..., 3:4], "metallic": wave[..., 4:5]}
+    leaf = {"base_color": wave[..., :3], "normal": bumps(0.5), "roughness": wave[..., 3:4], "opacity": wave[..., 4:5]}
+    # Nothing but the roughness varies, and no lobe but the specular one and the diffuse one is possible
+    plain = {"albedo": constant(0.2, 0.2, 0.2), "roughness": wave[..., 3:4], "metallic": constant(0)}
     return {
-        "metal": stored(
-            folder / "metal.npz", albedo=wave[..., :3], normal=bumps(1.2), roughness=wave[..., 3:4],
-            metallic=wave[..., 4:5],
-        ),
-        "shaped": stored(
-            folder / "shaped.npz", shapes, albedo=wave[..., :3], normal=bumps(1.2), roughness=wave[..., 3:4],
-            metallic=wave[..., 4:5],
-        ),
-        "round": stored(
-            folder / "round.npz", neutral, albedo=wave[..., :3], normal=bumps(1.2), roughness=wave[..., 3:4],
-            metallic=wave[..., 4:5],
-        ),
-        "smooth": stored(
-            folder / "smooth.npz", lambda shape: np.rint(shapes(shape)), normal=bumps(1.9), roughness=constant(0),
-            albedo=constant(0, 0, 0),
-        ),
-        "leaf": stored(
-            folder / "leaf.npz", base_color=wave[..., :3], normal=bumps(0.5), roughness=wave[..., 3:4],
-            opacity=wave[..., 4:5], ao=wave[..., 5:],
-        ),
-        # Nothing but the roughness varies, and no lobe but the specular one and the diffuse one is possible
-        "plain": stored(
-            folder / "plain.npz", albedo=constant(0.2, 0.2, 0.2), roughness=wave[..., 3:4], metallic=constant(0),
-            emission=constant(0.5, 0.2, 0.1),
-        ),
-        "steep": stored(folder / "steep.npz", normal=bumps(1.9), roughness=constant(0), albedo=constant(0, 0, 0)),
+        "metal": stored(folder / "metal.npz", **metal),
+        "shaped": stored(folder / "shaped.npz", shapes, **metal),
+        "round": stored(folder / "round.npz", neutral, **metal),
+        "leaf": stored(folder / "leaf.npz", **leaf, ao=wave[..., 5:]),
+        "plain": stored(folder / "plain.npz", **plain, emission=constant(0.5, 0.2, 0.1)),
         "other": stored(folder / "other.npz", albedo=wave[..., :3], height=wave[..., 3:4]),
-    }  # fmt: skip
+    }
 
 
 #: Parameter of ``disney`` → map of ``metal``.
@@ -100,10 +83,10 @@ def separate(file, maps, constants, **reading):
     return {"type": "normalmap", "normalmap": texture("normal"), "inner": inner}
 
 
-def directions(mi, rng, n, below=False, lowest=0.0):
-    z = 2 * rng.random(n) - 1 if below else lowest + (1 - lowest) * rng.random(n)
-    phi, r = 2 * np.pi * rng.random(n), np.sqrt(1 - z * z)
-    return mi.Vector3f(*(aligned(v) for v in (r * np.cos(phi), r * np.sin(phi), z)))
+def directions(mi, rng, n, below=False):
+    w = random_directions(rng, n)
+    w[:, 2] *= rng.choice([-1, 1], n) if below else 1
+    return vectors(mi, w)
 
 
 def hits(mi, rng, n, below=False):
@@ -113,11 +96,6 @@ def hits(mi, rng, n, below=False):
     si.wi, si.sh_frame = directions(mi, rng, n, below), mi.Frame3f(mi.Vector3f(0, 0, 1))
     si.dp_du, si.dp_dv, si.n = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Normal3f(0, 0, 1)
     return si
-
-
-def samples(mi, rng, n):
-    u = [mi.Float(aligned(rng.random(n))) for _ in range(3)]
-    return u[0], mi.Point2f(u[1], u[2])
 
 
 # -- values ------------------------------------------------------------------------------------------------------------
@@ -133,7 +111,7 @@ def assert_close(actual, desired, rtol, atol):
 def assert_equal(mi, rng, ours, theirs, below):
     """Values, densities and samples of two materials are equal up to rounding."""
     n, ctx = 4000, mi.BSDFContext()
-    si, wo, u = hits(mi, rng, n, below), directions(mi, rng, n, below), samples(mi, rng, n)
+    si, wo, u = hits(mi, rng, n, below), directions(mi, rng, n, below), uniform(mi, rng, n)
     results = [(b.eval(ctx, si, wo), b.pdf(ctx, si, wo), b.eval_pdf(ctx, si, wo), *b.sample(ctx, si, *u))
                for b in (ours, theirs)]  # fmt: skip
     dr.eval(results)
@@ -186,7 +164,7 @@ def test_opacity_is_that_of_mask(mi_rgb, files, rng):
     theirs = {"type": "mask", "opacity": opacity, "inner": separate(files["leaf"], maps, {})}
     theirs = mi.load_dict(theirs)
     ours = mi.load_dict({"type": "neural_material", "filename": files["leaf"]})
-    si, wo, u = hits(mi, rng, n, True), directions(mi, rng, n), samples(mi, rng, n)
+    si, wo, u = hits(mi, rng, n, True), directions(mi, rng, n), uniform(mi, rng, n)
     results = [(b.eval(ctx, si, wo), b.pdf(ctx, si, wo), b.eval_null_transmission(si), *b.sample(ctx, si, *u))
                for b in (ours, theirs)]  # fmt: skip
     dr.eval(results)

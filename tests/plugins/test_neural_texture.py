@@ -7,13 +7,11 @@ import numpy as np
 import pytest
 import texture_scenes
 from arrays import aligned, numpy_of
-from texture_files import make
+from texture_files import make, material
 from texture_scenes import linear
 
 from mi_diffind.arrays.tables import load_table, save_table
-from mi_diffind.core.compat import backend_module
 from mi_diffind.maps.layout import Layout
-from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays, load_source
 from mi_diffind.measure.clock import bsdf_operations, count
 from mi_diffind.scenes import loading
@@ -25,20 +23,10 @@ SIZE = WIDTH, HEIGHT = 32, 16
 FILTERS = ("off", "trilinear", "anisotropic", "stochastic")
 
 
-def material(seed=2):
-    """Smooth maps of every kind."""
-    y, x = np.mgrid[0:HEIGHT, 0:WIDTH] / [[[HEIGHT]], [[WIDTH]]]
-    wave = 0.5 + 0.35 * np.sin(2 * np.pi * np.stack([x + k * y for k in range(4)], axis=-1) + np.arange(4))
-    normal = np.stack([0.5 + 0.3 * (wave[..., 0] - 0.5), 0.5 + 0.3 * (wave[..., 1] - 0.5)], axis=-1)
-    z = 0.5 + 0.5 * np.sqrt(1 - ((2 * normal - 1) ** 2).sum(axis=-1, keepdims=True))
-    maps = {"albedo": wave[..., :3], "normal": np.concatenate([normal, z], axis=-1), "roughness": wave[..., 3:]}
-    return {name: np.rint(255 * v).astype(np.uint8) for name, v in maps.items()}
-
-
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
     folder = tmp_path_factory.mktemp("textures")
-    source = from_arrays(material())
+    source = from_arrays(material(WIDTH, HEIGHT))
     found = {preset: make(folder / f"{preset}.npz", source, preset) for preset in ("ours", "paper")}
     return {**found, "clamp": make(folder / "clamp.npz", source, border="clamp")}
 
@@ -73,7 +61,7 @@ def expected(mi, image, name, uv, level):
 def test_counterparts_of_images_with_names(mi_rgb, tmp_path, rng, name):
     """Both counterparts show a single image as its file is read: linear if its name is that of data."""
     mi, path = mi_rgb, tmp_path / f"{name}.png"
-    image = material()["normal" if name == "x_normal" else "albedo"][..., : 1 if name == "x_disp" else 3]
+    image = material(WIDTH, HEIGHT)["normal" if name == "x_normal" else "albedo"][..., : 1 if name == "x_disp" else 3]
     mi.Bitmap(np.ascontiguousarray(image)).write(str(path))
     texture = plugin(make(tmp_path / "a.npz", load_source(path)), "off", "image", source=str(path))
     bsdf = {"type": "diffuse", "reflectance": texture}
@@ -117,27 +105,11 @@ def test_off_is_level_0_and_costs_no_footprint(mi_rgb, files, rng, preset):
     assert reads["off"].instructions < reads["trilinear"].instructions - 100
 
 
-@pytest.mark.parametrize("preset, name", [("ours", "albedo"), ("ours", "normal"), ("paper", "roughness")])
-def test_trilinear_is_the_level_of_the_area(mi_any, files, rng, preset, name):
-    mi = mi_any
-    uv, (ddx, ddy) = rng.random((2, 300)), texture_scenes.footprints(rng, 300, SIZE)
-    truth = expected(mi, opened(mi, files[preset]), name, uv, texture_scenes.isotropic(ddx, ddy, SIZE))
-    si = texture_scenes.hits(mi, uv, ddx, ddy)
-    more = {"raw": True} if mi.is_spectral and name == "albedo" else {}
-    texture = mi.load_dict(plugin(files[preset], channels=name, **more))
-    found = texture.eval_1(si).numpy()[None] if name == "roughness" else texture.eval_3(si).numpy()
-    truth = linear(truth) if name == "albedo" and not more else truth
-    np.testing.assert_allclose(found, truth, atol=2e-3 if preset == "paper" else 5e-4)
-    if more:
-        spectra = mi.load_dict(plugin(files[preset], channels=name)).eval(si).numpy()
-        assert np.isfinite(spectra).all() and spectra.min() >= 0 and spectra.max() <= 1
-
-
 @pytest.mark.parametrize("name", ["trilinear", "anisotropic"])
 def test_a_level_bias_reads_as_a_smaller_footprint(mi_rgb, files, tmp_path, rng, name):
     """One level finer: a footprint of half the side, in colours, gradients, and images that are not repeated."""
     mi = mi_rgb
-    biased = make(tmp_path / "biased.npz", from_arrays(material()), level_bias=-1.0)
+    biased = make(tmp_path / "biased.npz", from_arrays(material(WIDTH, HEIGHT)), level_bias=-1.0)
     uv, (ddx, ddy) = rng.random((2, 200)), (8 * x for x in texture_scenes.footprints(rng, 200, SIZE))
     si = texture_scenes.hits(mi, uv, ddx, ddy)
     for more in ({}, {"wrap_mode": "clamp"}):
@@ -155,48 +127,6 @@ def test_a_level_bias_reads_as_a_smaller_footprint(mi_rgb, files, tmp_path, rng,
             np.testing.assert_allclose(*slopes, atol=1e-3)
 
 
-@pytest.mark.parametrize("border, wrap_mode", [("ours", "clamp"), ("clamp", "repeat")])
-def test_equals_a_mipmap_of_what_it_decodes_to(mi_rgb, files, rng, border, wrap_mode):
-    """At the texel centres of each level, with texels for footprints, of neighbouring images, too."""
-    mi = mi_rgb
-    from mi_diffind.plugins.support import image_files
-
-    image = opened(mi, files[border])
-    layout, along = image.layout, ("repeat" if wrap_mode == "repeat" else "clamp",) * 2
-    levels = []
-    for level in range(image.levels):
-        rows, columns = image.level_size(level)
-        y, x = np.mgrid[0:rows, 0:columns]
-        u, v, at = floats(mi, (x.ravel() + 0.5) / columns, (y.ravel() + 0.5) / rows, np.full(x.size, level))
-        levels.append(numpy_of(image.filtered(u, v, at)).reshape(rows, columns, -1))
-    image_files.PYRAMIDS["decoded"] = Pyramid(layout, levels, backend_module(mi.TensorXf), along)
-    try:
-        ours = mi.load_dict(plugin(files[border], wrap_mode=wrap_mode))
-        theirs = mi.load_dict({"type": "mipmap", "pyramid": "decoded", "channels": "albedo", "wrap_mode": wrap_mode})
-        for level in range(image.levels - 1):  # the last: a texel is higher than the image
-            rows, columns = image.level_size(level)
-            uv = [(rng.integers(-2 * n, 3 * n, 100) + 0.5) / n for n in (columns, rows)]
-            si = texture_scenes.hits(mi, uv, (2**level / WIDTH, 0), (0, 2**level / HEIGHT))
-            a, b = numpy_of(t.eval_1(si) for t in (ours, theirs)).T
-            np.testing.assert_allclose(a, b, atol=5e-4, err_msg=f"level {level}")
-    finally:
-        del image_files.PYRAMIDS["decoded"]
-
-
-def test_clamped_images_know_nothing_of_the_other_end(mi_rgb, tmp_path):
-    """Although the arrays go round: at any level, nothing is read beyond the centre of its outermost texels."""
-    mi = mi_rgb
-    halves = np.zeros((16, 16, 1), np.uint8)
-    halves[:, 8:] = 255
-    path = make(tmp_path / "a.npz", from_arrays({"roughness": halves}))
-    for mode, ends in (("clamp", [0, 0, 1, 1]), ("mirror", [0, 0, 1, 1]), ("repeat", [0.5] * 4)):
-        texture = mi.load_dict(plugin(path, channels="roughness", wrap_mode=mode))
-        for level in (0, 0.5, 1, 1.7, 2):
-            size = 2**level / 16
-            si = texture_scenes.hits(mi, [[0, 1e-4, 1, 0.9999], [0.3] * 4], (size, 0), (0, size))
-            np.testing.assert_allclose(texture.eval_1(si).numpy(), ends, atol=0.02, err_msg=f"{mode} {level}")
-
-
 # -- hard cases --------------------------------------------------------------------------------------------------------
 
 
@@ -204,16 +134,13 @@ def test_no_arrays(mi_rgb, tmp_path):
     """A texture of one colour is a few numbers, and has no footprint."""
     mi = mi_rgb
     source = from_arrays({"albedo": np.full((4, 8, 3), 128, np.uint8)})
-    layout = Layout.of(source, filtered=True)
+    layout = Layout.from_source(source, filtered=True)
     save_table(tmp_path / "a.npz", to_table(CompressedTexture(layout, None), {}))
     for name in FILTERS:
         texture = mi.load_dict(plugin(str(tmp_path / "a.npz"), name))
         si = texture_scenes.hits(mi, [[0.3], [0.6]], (0.1, 0), (0, 0.1))
         np.testing.assert_allclose(texture.eval(si).numpy().ravel(), linear(128 / 255), atol=1e-4)
         assert texture.report()["footprint"] == [] and not texture.is_spatially_varying()
-
-
-# -- optimisation ------------------------------------------------------------------------------------------------------
 
 
 # -- in scenes ---------------------------------------------------------------------------------------------------------
@@ -256,7 +183,7 @@ def test_counterparts(mi_rgb, tmp_path):
     mi = mi_rgb
     from mi_diffind.plugins.support import footprint
 
-    maps = material()
+    maps = material(WIDTH, HEIGHT)
     mi.Bitmap(maps["albedo"]).write(str(tmp_path / "albedo.png"))
     mi.Bitmap(maps["roughness"]).write(str(tmp_path / "roughness.png"))
     (tmp_path / "wall.json").write_text(json.dumps({"albedo": "albedo.png", "roughness": "roughness.png"}))

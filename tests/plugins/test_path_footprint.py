@@ -43,7 +43,7 @@ def trusted(scene, chain: tuple, seen) -> tuple:
 
 
 def check(mi, shapes: dict, chain: tuple, median: float, worst: float, **sensor):
-    """Of side and major axis, the errors are within these (median, 90th percentile)."""
+    """Check the errors of side and major axis against two limits: median, 90th percentile."""
     fp.register_probe()
     scene, found, seen = shown(mi, shapes, **sensor)
     ddx, ddy, where = trusted(scene, chain, seen)
@@ -185,7 +185,7 @@ def test_light_and_derivatives_are_those_of_prb(mi_rgb, footprints):
 
 @pytest.mark.parametrize("forward", [False, True], ids=["backward", "forward"])
 def test_derivatives_are_those_of_finite_differences(mi_rgb, forward):
-    """Also of what is seen in a mirror, and of the mirror itself."""
+    """Texels, also seen in a mirror, and the mirror's own reflectance."""
     mi = mi_rgb
     scene = mi.load_dict(lit(mi, {"type": "conductor", "specular_reflectance": {"type": "rgb", "value": 0.7}}))
     params = mi.traverse(scene)
@@ -220,7 +220,7 @@ def test_derivatives_are_those_of_finite_differences(mi_rgb, forward):
 
 
 def test_light_is_that_of_path(mi_rgb):
-    """Also what ``prb`` does differently: alpha, hidden emitters, environments, surfaces that are not there."""
+    """Alpha, hidden emitters, environments and null surfaces, in which ``prb`` differs."""
     mi = mi_rgb
     rough, mask = BSDFS["rough"], {"type": "mask", "opacity": 0.0, "nested": {"type": "diffuse"}}
     for bsdf, more, given in (

@@ -7,14 +7,13 @@ import textwrap
 from importlib import metadata
 from pathlib import Path
 
-import drjit as dr
 import plugin_examples as examples
 import pytest
 
 from mi_diffind import plugins
 from mi_diffind.scenes import loading
 
-#: A learned shape whose factory returns a native object, another of Mitsuba's, a volume, and factories that fail.
+#: A learned shape whose factory returns a native object, and factories that fail.
 MODULES = {
     "toy_ball": """
         import mitsuba as mi
@@ -34,51 +33,6 @@ MODULES = {
             props["radius"] = float(props.get("size", 0.5))
 
         PLUGIN = Plugin("toy_ball", "shape", make, exact=Counterpart("sphere", ("preset", "size"), convert=to_sphere))
-    """,
-    "toy_field": """
-        import drjit as dr
-        import mitsuba as mi
-        import numpy as np
-        from mi_diffind.plugins import Counterpart, Plugin
-
-        def make(props):
-            native = mi.Properties("sdfgrid")
-            native.set_id(props.id())
-            x = np.stack(np.meshgrid(*[np.linspace(-0.5, 0.5, 8)] * 3, indexing="ij"), -1)
-            for name, child in props.objects():
-                native[name] = child
-            native["grid"] = mi.TensorXf((np.linalg.norm(x, axis=-1) - 0.3).astype(np.float32)[..., None])
-            return mi.PluginManager.instance().create_object(native)
-
-        PLUGIN = Plugin("toy_field", "shape", make, exact=Counterpart("cube"))
-    """,
-    "toy_fog": """
-        import mitsuba as mi
-        from mi_diffind.plugins import Counterpart, Plugin
-
-        class Fog(mi.Volume):
-            def eval(self, it, active=True):
-                return mi.UnpolarizedSpectrum(0.7)
-
-            def eval_1(self, it, active=True):
-                return mi.Float(0.7)
-
-            def max(self):
-                return 0.7
-
-            def max_per_channel(self):
-                return [0.7]
-
-            def traverse(self, cb):
-                pass
-
-            def report(self):
-                return {"preset": "tables"}
-
-            def to_string(self):
-                return "Fog[]"
-
-        PLUGIN = Plugin("toy_fog", "volume", Fog, exact=Counterpart("constvolume", given={"value": 0.7}))
     """,
     "toy_nothing": """
         from mi_diffind.plugins import Plugin
@@ -136,7 +90,6 @@ SCENE = """
     <emitter type="constant"/>
     <shape type="toy_ball" id="ball"><string name="preset" value="paper"/></shape>
     <shape type="toy_ball"><float name="size" value="0.25"/></shape>
-    <shape type="toy_field"><bsdf type="diffuse"/></shape>
 </scene>
 """
 
@@ -167,7 +120,7 @@ def test_manual_pages_are_complete(mi_rgb):
 
 
 def test_program_of_mitsuba_loads_no_plugins(mi_rgb, tmp_path):
-    """As manual pages and the README have it; they change when this fails."""
+    """Mitsuba's program loads no Python plugins; manual pages and the README change when this fails."""
     (tmp_path / "scene.xml").write_text('<scene version="3.0.0"><bsdf type="neural_disney"/></scene>')
     program = Path(mi_rgb.__file__).parent / ("mitsuba.exe" if sys.platform == "win32" else "mitsuba")
     command = [str(program), "-m", "scalar_rgb", str(tmp_path / "scene.xml")]
@@ -203,14 +156,14 @@ def test_after_a_purge_of_modules():
 def test_plugins_of_other_packages(mi_toys, tmp_path):
     """Shapes whose factories return native objects are found, compared and inspected; also by scalar variants."""
     mi = mi_toys
-    assert {"toy_ball", "toy_field", "toy_fog", "neural_disney"} <= set(plugins.declared())
+    assert {"toy_ball", "neural_disney"} <= set(plugins.declared())
     (tmp_path / "scene.xml").write_text(SCENE)
     found = loading.ParsedScene(tmp_path / "scene.xml").learned_plugins()
     assert [(e["plugin"], e["id"], e.get("preset"), e.get("size")) for e in found] == [
-        ("toy_ball", "ball", "paper", None), ("toy_ball", "", None, "0.25"), ("toy_field", "", None, None)
+        ("toy_ball", "ball", "paper", None), ("toy_ball", "", None, "0.25")
     ]  # fmt: skip
     exact = loading.load(tmp_path / "scene.xml", exact=True)
-    assert [shape.class_name() for shape in exact.shapes()] == ["Sphere", "Sphere", "Cube"]
+    assert [shape.class_name() for shape in exact.shapes()] == ["Sphere", "Sphere"]
     assert loading.instances(exact) == []
     if not plugins.supported(mi.variant()):
         with pytest.raises(loading.SceneError, match='"toy_ball" does not run in the variant "scalar_rgb"'):
@@ -218,11 +171,11 @@ def test_plugins_of_other_packages(mi_toys, tmp_path):
         return
     scene = loading.load(tmp_path / "scene.xml")
     reports = loading.reports(scene)
-    assert [(r["plugin"], r["id"], r.get("preset")) for r in reports[:2]] == [
+    assert [(r["plugin"], r["id"], r.get("preset")) for r in reports] == [
         ("toy_ball", "ball", "paper"), ("toy_ball", "", "tables")
     ]  # fmt: skip
-    assert [r["size"] for r in reports[:2]] == [0.5, 0.25] and reports[2]["plugin"] == "toy_field"
-    assert len(reports) == 3 and mi.render(scene, spp=1).numpy().std() >= 0
+    assert [r["size"] for r in reports] == [0.5, 0.25]
+    assert len(reports) == 2 and mi.render(scene, spp=1).numpy().std() >= 0
 
 
 def test_native_objects_are_forgotten(mi_toys):
@@ -238,22 +191,6 @@ def test_native_objects_are_forgotten(mi_toys):
     mi.load_dict({"type": "toy_ball"})
     plugins._forget_dead()
     assert len(plugins._native) == before
-
-
-def test_volumes(mi_toys):
-    """Registered as textures, which is what makes them work in a scene; not at all in scalar variants."""
-    mi = mi_toys
-    medium = {"type": "heterogeneous", "albedo": 0.5, "sigma_t": {"type": "toy_fog"}}
-    scene = {"type": "scene", "shape": {"type": "sphere", "bsdf": {"type": "null"}, "interior": medium}}
-    if not plugins.supported(mi.variant()):
-        with pytest.raises(RuntimeError, match="toy_fog"):
-            mi.load_dict(scene)
-        return
-    loaded = mi.load_dict(scene)
-    (report,) = loading.reports(loaded)
-    assert (report["plugin"], report["kind"], report["preset"]) == ("toy_fog", "volume", "tables")
-    volume = loading.instances(loaded)[0]
-    assert dr.allclose(volume.eval_1(dr.zeros(mi.Interaction3f)), 0.7)
 
 
 @pytest.mark.parametrize("name, found", [("toy_nothing", "nothing"), ("toy_wrong", "a Shape")])
@@ -276,7 +213,7 @@ def test_two_plugins_of_one_name(mi_rgb, monkeypatch):
 
 
 def test_choices_are_the_words_that_plugins_allow(mi_rgb):
-    """As they list them themselves when they refuse another one."""
+    """Declared words of a parameter are those that its plugin lists when it refuses another one."""
     choices = [
         (name, key, words) for name, plugin in plugins.declared().items() for key, words in plugin.choices.items()
     ]

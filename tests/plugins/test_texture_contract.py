@@ -8,20 +8,19 @@ import json
 import math
 import os
 import re
-import threading
 
 import drjit as dr
 import numpy as np
 import pytest
-from arrays import aligned
-from texture_files import make, make_image
-from texture_scenes import WRONG, alive, check_process, footprints, hits, linear, plane, refused
+from arrays import aligned, numpy_of
+from texture_files import make, make_image, material
+from texture_scenes import WRONG, alive, check_process, footprints, hits, isotropic, linear, plane, refused
 from variants import VARIANTS, set_variant
 
 from mi_diffind import plugins
-from mi_diffind.arrays.tables import load_table
+from mi_diffind.arrays.tables import load_table, save_table
 from mi_diffind.fitting.task import find_task
-from mi_diffind.maps import compressed
+from mi_diffind.maps import pyramid
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.tasks.ggx import TASK as GGX
 
@@ -42,25 +41,15 @@ ROUNDING = 5e-4
 RENDERED = [v for v in VARIANTS if v.endswith(("ad_rgb", "ad_mono", "ad_spectral_polarized"))]
 
 
-def material():
-    """Return smooth maps of every kind, bytes, that repeat along both axes."""
-    y, x = np.mgrid[0:HEIGHT, 0:WIDTH] / [[[HEIGHT]], [[WIDTH]]]
-    wave = 0.5 + 0.35 * np.sin(2 * np.pi * np.stack([x + k * y for k in range(4)], axis=-1) + np.arange(4))
-    xy = 0.6 * (wave[..., :2] - 0.5)
-    normal = 0.5 + 0.5 * np.concatenate([xy, np.sqrt(1 - (xy**2).sum(axis=-1, keepdims=True))], axis=-1)
-    maps = {"albedo": wave[..., :3], "normal": normal, "roughness": wave[..., 3:]}
-    return {name: np.rint(255 * values).astype(np.uint8) for name, values in maps.items()}
-
-
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
     """Return the file that each plugin reads; those with ``_clamp`` have arrays that do not repeat."""
     import mitsuba as mi
 
-    folder, source = tmp_path_factory.mktemp("contract"), from_arrays(material())
-    for name, values in material().items():
+    folder, source = tmp_path_factory.mktemp("contract"), from_arrays(material(*SIZE))
+    for name, values in material(*SIZE).items():
         mi.Bitmap(values if values.shape[2] > 1 else np.ascontiguousarray(values[..., 0])).write(f"{folder}/{name}.png")
-    (folder / "wall.json").write_text(json.dumps({name: f"{name}.png" for name in material()}))
+    (folder / "wall.json").write_text(json.dumps({name: f"{name}.png" for name in material(*SIZE)}))
     written = {"mipmap": str(folder / "wall.json")}
     for border in ("repeat", "clamp"):
         end = "" if border == "repeat" else "_clamp"
@@ -81,7 +70,7 @@ def plugin(files, name, channels="albedo", **more):
 def decoded(mi, files, name, **level):
     """Return the images that a file decodes to, by map."""
     if name == "mipmap":
-        return {name: values.astype(np.float32) / 255 for name, values in material().items()}
+        return {name: values.astype(np.float32) / 255 for name, values in material(*SIZE).items()}
     table = load_table(files[name])
     return find_task(table).model(table, mi.TensorXf).image.decode(**level)
 
@@ -148,7 +137,7 @@ def test_reads_as_decoded(mi_rgb, files, rng, name, channels):
 @pytest.mark.parametrize("name", READERS[1:3])
 def test_images_are_decoded_in_parts(mi_rgb, files, monkeypatch, name):
     whole = decoded(mi_rgb, files, name)
-    monkeypatch.setattr(compressed, "CHUNK", 37)
+    monkeypatch.setattr(pyramid, "CHUNK", 37)
     for m, image in decoded(mi_rgb, files, name).items():
         np.testing.assert_array_equal(image, whole[m])
 
@@ -240,7 +229,7 @@ def test_zero_and_huge_footprints(mi_rgb, files, rng, name, filtering):
     np.testing.assert_allclose(values(read, hits(mi, uv)), values(off, hits(mi, uv)), atol=ROUNDING)
     np.testing.assert_array_equal(values(off, huge), values(off, hits(mi, uv)))
     if name == "mipmap":
-        mean = linear(material()["albedo"] / 255).mean(axis=(0, 1))
+        mean = linear(material(*SIZE)["albedo"] / 255).mean(axis=(0, 1))
     else:
         mean = linear(decoded(mi, files, name, level=3)["albedo"])[0, 0]
         half = linear(decoded(mi, files, name, level=1)["albedo"])
@@ -249,6 +238,43 @@ def test_zero_and_huge_footprints(mi_rgb, files, rng, name, filtering):
         if filtering == "trilinear":
             np.testing.assert_allclose(values(read, at), half.reshape(-1, 3).T, atol=2 * ROUNDING)
     np.testing.assert_allclose(values(read, huge), np.broadcast_to(mean[:, None], (3, 100)), atol=2 * ROUNDING)
+
+
+@pytest.mark.parametrize("name", [*FILTERED, "neural_texture_paper"])
+def test_trilinear_is_the_level_of_the_area(mi_any, files, rng, name):
+    """The channels that the levels give there; in spectral variants, colours and spectra."""
+    mi, files, name = mi_any, {name.removesuffix("_paper"): files[name]}, name.removesuffix("_paper")
+    raw = {"raw": True} if mi.is_spectral and name != "neural_material" else {}
+    read, loaded = reader(mi, files, name, filter="trilinear", **raw)
+    uv, (ddx, ddy) = rng.random((2, 300)), footprints(rng, 300, SIZE, 2)
+    place = [mi.Float(aligned(x)) for x in (*uv, isotropic(ddx, ddy, SIZE))]
+    image = getattr(loaded, "maps", loaded).image
+    truth = numpy_of(image.maps(image.filtered(*place), ["albedo"])["albedo"]).T
+    found = values(read, hits(mi, uv, ddx, ddy))
+    np.testing.assert_allclose(found, truth if raw else linear(truth), atol=2e-3)
+    if raw:
+        spectra = mi.load_dict(plugin(files, name, filter="trilinear")).eval(hits(mi, uv, ddx, ddy)).numpy()
+        assert np.isfinite(spectra).all() and spectra.min() >= 0 and spectra.max() <= 1
+
+
+@pytest.mark.parametrize("filtering", FILTERS[:2])
+@pytest.mark.parametrize("name", FILTERED)
+def test_seams(mi_rgb, tmp_path, name, filtering):
+    """A repeated image goes on with any footprint; a mirrored or clamped one knows nothing of its other end."""
+    mi, halves = mi_rgb, np.zeros((16, 16, 3), np.uint8)
+    halves[:, 8:] = 255
+    mi.Bitmap(halves).write(str(tmp_path / "albedo.png"))
+    (tmp_path / "m.json").write_text('{"albedo": "albedo.png"}')
+    files = {"mipmap": str(tmp_path / "m.json")}
+    if name != "mipmap":
+        files[name] = make(tmp_path / "a.npz", from_arrays({"albedo": halves}))
+    for mode, expected in (("clamp", [0, 0, 1, 1]), ("mirror", [0, 0, 1, 1]), ("repeat", [linear(0.5)] * 4)):
+        read, _ = reader(mi, files, name, wrap_mode=mode, filter=filtering)
+        for level in (0, 0.5, 1, 1.7, 2):
+            size = 2**level / 16
+            ends = values(read, hits(mi, [[0, 1e-4, 1, 0.9999], [0.3] * 4], (size, 0), (0, size)))[0]
+            tolerance = 0.05 if mode != "repeat" else 0.3  # colours are averaged linearly, or as they are stored
+            np.testing.assert_allclose(ends, expected, atol=tolerance, err_msg=f"{mode} {level}")
 
 
 @pytest.mark.parametrize("filtering", FILTERS)
@@ -296,7 +322,7 @@ def test_odd_sizes(mi_rgb, tmp_path, rng, name, shape):
 @pytest.mark.parametrize("filtering", ["off", "trilinear"])
 @pytest.mark.parametrize("name", READERS)
 def test_gradients_reach_the_coordinate(mi_rgb, files, rng, name, filtering):
-    """But for the places between two texels, they are finite differences; ``eval_1_grad`` is the same of luminance."""
+    """Gradients are finite differences, except between two texels; ``eval_1_grad`` is the gradient of the luminance."""
     if name == "neural_image" and filtering != "off":
         pytest.skip("has no filter")
     mi, more = mi_rgb, {"filter": filtering} if name in FILTERED else {}
@@ -506,47 +532,14 @@ def test_particle_tracer(variant, files):
 
 
 @pytest.mark.parametrize("name", TEXTURES)
-def test_variants_in_turn_and_threads(files, rng, name):
-    """A texture keeps to the classes of its variant; scenes load in threads."""
-    uv, images, loaded, failed = rng.random((2, 50)), {}, [], []
+def test_variants_in_turn(files, rng, name):
+    """A texture keeps to the classes of its variant."""
+    uv, images = rng.random((2, 50)), {}
     for variant in ("llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"):
         mi = set_variant(variant)
         found = mi.load_dict(plugin(files, name)).eval(hits(mi, uv)).numpy()
         np.testing.assert_array_equal(images.setdefault(variant, found), found)
     assert images["llvm_ad_rgb"].shape == (3, 50) and images["llvm_ad_mono"].shape == (1, 50)
-
-    def load():
-        try:
-            mi.set_variant("llvm_ad_rgb")
-            loaded.append(lamp(mi, plugin(files, name)))
-        except Exception as e:
-            failed.append(e)
-
-    threads = [threading.Thread(target=load) for _ in range(3)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(120)
-    assert not failed and len(loaded) == 3
-
-
-@pytest.mark.parametrize("name", TEXTURES)
-def test_frozen_renders(mi_rgb, files, no_garbage_collection, name):
-    """Changes of parameters show; an emitter has to be rendered once before, as with ``bitmap``."""
-    mi = mi_rgb
-    loaded = lamp(mi, plugin(files, name, **({} if name == "mipmap" else {"storage": "float32"})))
-    params = mi.traverse(loaded)
-    key = next(k for k in params.keys() if k.endswith(("tables.cascaded", "radiance.data")))
-    frozen = dr.freeze(lambda loaded, seed: mi.render(loaded, spp=4, seed=seed))
-    dr.eval(mi.render(loaded, spp=4))
-    for step in range(4):
-        if step == 2:
-            params[key] = params[key] * 0.5
-            params.update()
-            dr.eval(mi.render(loaded, spp=4))
-        image, expected = (f(mi.UInt32(step)).numpy() for f in (
-            lambda seed: frozen(loaded, seed), lambda seed: mi.render(loaded, spp=4, seed=seed)))  # fmt: skip
-        np.testing.assert_allclose(image, expected, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", TEXTURES)
@@ -605,3 +598,71 @@ def test_bad_parameters(mi_rgb, files, name, case):
     if name == "mipmap" and case == "no file name":
         sentence = "exactly one is needed"
     assert sentence in refused(mi_rgb, {**plugin(files, name), **wrong})
+
+
+# ---------------------- Values that single precision cannot carry through a path ----------------------
+
+ALLOWED = "allowed in a scene are -1e+09 to 1e+09"
+
+
+def constants(values, file, folder, name="albedo"):
+    """Return a copy of a file with other settings of a map."""
+    table = load_table(file)
+    (entry,) = (m for m in table.settings["layout"]["maps"] if m["name"] == name)
+    entry.update(values)
+    entry["where"] = [entry["where"]] * 3 if entry["where"][0] == "constant" else entry["where"]
+    save_table(folder / "changed.npz", table)
+    return str(folder / "changed.npz")
+
+
+@pytest.mark.parametrize("values, found", [
+    ({"where": ["constant", 1e30], "color_space": "linear"}, "found values up to 1e+30 in the map"),
+    ({"where": ["constant", 2e9], "color_space": "linear"}, "found values up to 2e+09 in the map"),
+    ({"where": ["constant", -1e300]}, "has the constant -1e+300, allowed are numbers from -1.7e+38 to 1.7e+38"),
+    ({"where": ["constant", 1e4]}, "found values up to 3.5e+09 in the map"),  # sRGB
+    ({"low": -1e30, "color_space": "linear"}, "found values up to -1e+30 in the map"),
+    ({"high": 1e30, "knee": 1e25, "color_space": "linear"}, "found values up to 1e+30 in the map"),
+    ({"where": ["constant", 1e9], "color_space": "linear"}, ""),
+    ({"where": ["constant", 1e3]}, ""),
+])  # fmt: skip
+@pytest.mark.parametrize("name", READERS[1:])
+def test_values_in_files(mi_rgb, files, tmp_path, name, values, found):
+    """Too large ones are refused; the largest are finite along paths of four bounces."""
+    mi = mi_rgb
+    described = plugin({name: constants(values, files[name], tmp_path)}, name)
+    if found:
+        sentence = refused(mi, described)
+        assert 'parameter "filename": ' in sentence and found in sentence
+        assert "constant" in found or f'the map "albedo", {ALLOWED}' in sentence
+        return
+    bsdf = described if name == "neural_material" else {"type": "diffuse", "reflectance": described}
+    inside = {"type": "sphere", "radius": 9, "flip_normals": True, "bsdf": bsdf}
+    lamp = {"type": "point", "position": [0.0, 0.0, 3.0], "intensity": 1.0}
+    sensor = {"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8}}
+    loaded = {"type": "scene", "integrator": {"type": "path", "max_depth": 5}, "lamp": lamp, "sensor": sensor}
+    assert np.isfinite(mi.render(mi.load_dict({**loaded, "room": inside}), spp=4).numpy()).all()
+
+
+def test_every_map_of_a_material_is_checked(mi_rgb, files, tmp_path):
+    path = constants({"where": ["constant", 1e30]}, files["neural_material"], tmp_path, "normal")
+    assert 'in the map "normal"' in refused(mi_rgb, {"type": "neural_material", "filename": path})
+    mi_rgb.load_dict({"type": "neural_material", "filename": path, "ignore": "normal"})
+
+
+@pytest.mark.parametrize("raw", [False, True])
+def test_values_of_bitmaps(mi_rgb, raw):
+    def texture(value):
+        return {"type": "mipmap", "bitmap": mi_rgb.Bitmap(np.full((4, 4, 3), value, np.float32)), "raw": raw}
+
+    for value in (1e30, -1e30, 2e9):
+        assert f'"bitmap": found values up to {value:.3g} in the map "image", {ALLOWED}' in refused(
+            mi_rgb, texture(value)
+        )
+    mi_rgb.load_dict(texture(1e9))
+
+
+@pytest.mark.parametrize("value", [1e30, 1e300, math.nan])
+def test_transformations_beyond_single_precision(mi_rgb, files, value):
+    matrix = mi_rgb.ScalarTransform4f([[value, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    sentence = refused(mi_rgb, plugin(files, "neural_image", to_uv=matrix))
+    assert 'parameter "to_uv": found an entry of ' in sentence and "allowed are up to 1e+18" in sentence

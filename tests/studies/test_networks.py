@@ -133,7 +133,7 @@ def source():
 
 
 def texture_problem(source, mi, nbytes=12000, levels=0):
-    pyramid = Pyramid.of(source, types=array_module(mi.variant()), border=("repeat", "repeat"))
+    pyramid = Pyramid.from_source(source, types=array_module(mi.variant()), border=("repeat", "repeat"))
     net = networks.texture_network(pyramid.layout, nbytes, levels or pyramid.levels)
     return networks.TextureNetworkProblem(net, pyramid, source.digest)
 

@@ -11,7 +11,7 @@ from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.studies.baselines import normals
 from mi_diffind.tasks.shading.evaluation import ShadedEvaluation, reader
-from mi_diffind.tasks.shading.material import effects_of, surface_of
+from mi_diffind.tasks.shading.material import material_effects, surface_of
 
 SIDE = 32
 WI, WO = np.array([0.3, 0.1, 0.95]), np.array([-0.2, 0.35, 0.9])
@@ -41,8 +41,8 @@ def material(slopes, roughness=0.4, metallic=None, seed=5):
 
 
 def prepared(source, types):
-    pyramid = Pyramid.of(source, types=types, border=("repeat", "repeat"))
-    return pyramid, effects_of(pyramid.layout)[0]
+    pyramid = Pyramid.from_source(source, types=types, border=("repeat", "repeat"))
+    return pyramid, material_effects(pyramid.layout)[0]
 
 
 def lanes(types, u, v, level, wi=WI, wo=WO):
@@ -157,7 +157,7 @@ def test_another_roughness_is_stored(types, rng):
     noisy = from_arrays({"roughness": rng.random((8, 8)).astype(np.float32),
                          "albedo": rng.random((8, 8, 3)).astype(np.float32)})  # fmt: skip
     for source in (material(rng.normal(0, 0.2, (8, 8, 2))), noisy):
-        pyramid = Pyramid.of(source, types=types, border=("repeat", "repeat"))
+        pyramid = Pyramid.from_source(source, types=types, border=("repeat", "repeat"))
         levels = [np.full(level.shape[:2], 0.2 + 0.1 * i) for i, level in enumerate(pyramid.values)]
         changed = normals.with_roughness(pyramid, levels)
         place = lanes(types, rng.random(20), rng.random(20), 2)[:3]

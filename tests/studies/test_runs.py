@@ -27,7 +27,7 @@ TRAINED = ["--steps", "2", "--pretrain-steps", "2"]
 RUNS = {
     "bsdf": [],
     "disney": [],
-    "field": ["balls", "--compression", "120", "--resolution", "16", "--steps", "10", "--seconds", "1"],
+    "field": ["balls", "--compression", "120", "--resolution", "16", "--steps", "10"],
     "ggx": [],
     "image": ["m.json", "--seconds", "1"],
     "scene": [str(ROOT / "scenes" / "metals.xml"), "-D", "width=32", "-D", "height=16"],
@@ -198,7 +198,7 @@ def test_maps_of_another_material():
 
 def test_runs_of_a_scene():
     """λ, 0.9 unless it is left out, and samples a pixel are changed one at a time."""
-    context = SimpleNamespace(name="room", settings=scene_training.SceneTrainingSettings())
+    context = SimpleNamespace(name="room", settings=SimpleNamespace(**scene_training.FULL))
     runs = scene_training.planned_runs(context)
     assert len({run.name for run in runs}) == len(runs)
     inside = [(run.details["share"], run.budget) for run in runs if run.method == "scene"]

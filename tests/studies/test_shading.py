@@ -11,7 +11,7 @@ from mi_diffind.core.runtime import array_module
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.studies import example_maps, shading
 from mi_diffind.studies import material_renders as renders
-from mi_diffind.tasks.shading.material import effects_of
+from mi_diffind.tasks.shading.material import material_effects
 
 
 def test_generated_materials():
@@ -60,8 +60,8 @@ def test_trouble(changes, trouble):
 def test_the_zoom_is_what_the_camera_sees(mi_rgb):
     """Pixels of a frame, against a ray of a pinhole camera above the plane; points stay where they are."""
     source = example_maps.generated_source("lacquer", 64)
-    pyramid = Pyramid.of(source, types=array_module(mi_rgb.variant()))
-    view = shading.ShadedZoom(pyramid, effects_of(pyramid.layout)[0], 3, 8)
+    pyramid = Pyramid.from_source(source, types=array_module(mi_rgb.variant()))
+    view = shading.ShadedZoom(pyramid, material_effects(pyramid.layout)[0], 3, 8)
     spacings = [2 ** view.lanes(k)[2].numpy()[0] for k in range(3)]
     assert spacings == pytest.approx([shading.FAR, np.sqrt(shading.FAR * shading.NEAR), shading.NEAR], rel=1e-5)
     u, v, _, wi, wo = view.lanes(2)

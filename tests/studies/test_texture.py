@@ -118,7 +118,7 @@ def test_flicker():
 def test_levels(mi_rgb):
     """Errors of each level, and that what was decoded comes back in a pyramid of the same layout."""
     source = from_arrays({"albedo": smooth(8, 16, 3), "ao": smooth(8, 16, 1, 1)})
-    pyramid = Pyramid.of(source, types=array_module("llvm_ad_rgb"))
+    pyramid = Pyramid.from_source(source, types=array_module("llvm_ad_rgb"))
     truth = texture.level_images(pyramid)
     np.testing.assert_allclose(truth["albedo"][0], source.maps[0].values, atol=1e-6)
     assert [v.shape for v in truth["ao"]] == [(8, 16, 1), (4, 8, 1), (2, 4, 1), (1, 2, 1), (1, 1, 1)]

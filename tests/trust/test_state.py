@@ -4,8 +4,6 @@ The plugins are those of the registry, in each storage form, and the scenes thos
 Films have a box filter: with any other, two renders of one scene differ in the last digits.
 """
 
-import functools
-
 import drjit as dr
 import numpy as np
 import plugin_examples as examples
@@ -54,20 +52,6 @@ def render(mi, scene, seed=3, **more) -> np.ndarray:
     return np.array(mi.render(scene, spp=SPP, seed=mi.UInt32(seed), **more))
 
 
-@functools.cache
-def can_freeze(variant: str) -> bool:
-    """Return whether a scene of Mitsuba's own plugins can be recorded; in spectral variants of 3.9, none can."""
-    mi = set_variant(variant)
-    scene = mi.load_dict({"type": "scene", "sensor": examples.sensor(mi), "ball": {"type": "sphere"},
-                          "sky": {"type": "constant"}, "integrator": {"type": "path"}})  # fmt: skip
-    try:
-        dr.eval(dr.freeze(lambda scene, seed: mi.render(scene, spp=1, seed=seed))(scene, dr.opaque(mi.UInt32, 1)))
-    except RuntimeError as e:
-        assert "recording" in str(e)
-        return False
-    return True
-
-
 def check_back(mi, name: str, image: np.ndarray, fresh: np.ndarray, key: str) -> None:
     """Compare the image after a parameter was set back with that of a fresh scene."""
     if name == "mipmap":
@@ -101,31 +85,6 @@ def test_parameters_set_back(variant, name, storage, together):
             params[key] = before[key]
         params.update()
         check_back(mi, name, render(mi, scene), fresh, str(group))
-
-
-@pytest.mark.parametrize("variant, name, storage", [c for c in CASES if c.marks])  # RGB: plugins/test_frozen.py
-def test_frozen_renders(variant, name, storage, no_garbage_collection):
-    """A recorded render equals one that is not recorded, for other seeds and after a change of all parameters."""
-    mi = loaded(variant, name, storage)
-    if not can_freeze(variant):
-        assert mi.is_spectral
-        pytest.skip("Mitsuba's own scenes cannot be recorded in this variant")
-    scene = examples.load(mi, name, storage)
-    params, keys = examples.exposed(mi, scene, name)
-    dr.eval(mi.render(scene, spp=SPP))
-    frozen = dr.freeze(lambda scene, seed: mi.render(scene, spp=SPP, seed=seed))
-    for changes in (False, True):
-        if changes:
-            for key in keys:
-                params[key] = examples.another(params[key])
-            params.update()
-        for seed in (1, 2):
-            image = np.array(frozen(scene, dr.opaque(mi.UInt32, seed)))
-            again = render(mi, scene, seed)
-            if changes and name == "neural_sdf" and mi.is_polarized:
-                np.testing.assert_allclose(image, again, rtol=RECOMPUTED[name])
-            else:
-                np.testing.assert_array_equal(image, again, err_msg=f"changes: {changes}, seed {seed}")
 
 
 @pytest.mark.parametrize("variant, name, storage", CASES)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import hashlib
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,10 +17,9 @@ from ...core.progress import profiled
 from ...core.units import figure_lines
 from ...fitting.loop import FitResult, cores
 from ...fitting.task import FitRequest, Fitted, Model, find_task, table_path, tasks
-from ...maps.arguments import preview_path
-from ...tasks.texture.training import TextureProblem
+from ...maps.model import preview_path
+from ...tasks.texture.fit import TextureProblem
 from .. import loading
-from ..conversion import cache_folder
 from .options import SceneRecipe, ViewDistribution, recipe_from, views_from
 from .problem import SceneProblem
 from .references import ReferenceRenders
@@ -130,8 +128,7 @@ def fit_scene(
 
     remark, before = "", None
     if request.deadline is not None:
-        compiled = compiled_file(f"{rendered.digest} {recipe.spp}")
-        remark, before = limit(problem, request, compiled is not None and compiled.is_file())
+        remark, before = limit(problem, request)
     elif recipe.start == "file":
         before = problem.measure(problem.net)
     arrays = {name: array.data for name, array in problem.net.arrays.items()}
@@ -141,8 +138,6 @@ def fit_scene(
         for name, data in arrays.items():
             problem.net.arrays[name].data = data
         result.measured, result.step = before, 0
-    if request.deadline is not None and compiled is not None and problem.recipe.share > 0:
-        compiled.touch()
     result.unfinished = result.unfinished or bool(remark)
     more = request.paths(scene_path=None if parsed.description else parsed.path)
     more |= {"kept_start": True} if kept else {}
@@ -182,30 +177,21 @@ def check_output(output: Path | None, files: Sequence[Path]) -> None:
         raise UsageError(f'output "{output}": found the folder of the trained textures ({names}): give another one')
 
 
-def compiled_file(key: str) -> Path | None:
-    """Return the file that is there once a training has compiled the kernels of a scene; ``None`` if it cannot be."""
-    try:
-        folder = writable_folder(cache_folder() / "compiled", create=True)
-    except OSError:
-        return None
-    return folder / hashlib.sha256(key.encode()).hexdigest()[:16]
-
-
-def limit(problem: SceneProblem, request: FitRequest, compiled: bool) -> tuple[str, dict[str, float]]:
+def limit(problem: SceneProblem, request: FitRequest) -> tuple[str, dict[str, float]]:
     """Fit a problem into a limited time.
 
     Returns a sentence if only the texture alone can be trained, else "", and the figures before the training.
 
     A measurement of one render a view is rehearsed. Measurements then have so many samples as fit, and where a step
     would take longer than what is left, renders have no share in the loss. Its kernels are expected to be compiled
-    unless an earlier training of the scene has ``compiled`` them.
+    unless the kernel of the measurement comes from Dr.Jit's cache, as after an earlier training of the scene.
     """
     deadline, spp, most = request.deadline, problem.scene.spp, problem.samples
     problem.samples = spp
     with cores(request.settings.deterministic):
         figures, seconds, history = profiled(lambda: problem.measure(problem.net))
     compiling = compat.compile_seconds(history)
-    if not compiled:
+    if not all(entry.get("cache_hit", True) for entry in history):
         compiling = max(compiling, OPERATION * max((entry.get("operation_count", 0) for entry in history), default=0))
     render = seconds / (2 * len(problem.measured) * spp)
     problem.samples = max(spp, min(most, int(MEASURING * deadline.seconds * spp / seconds)))

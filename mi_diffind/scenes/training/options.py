@@ -12,7 +12,7 @@ import numpy as np
 
 from ...core.arguments import Argument, define, positive, positive_or_none
 from ...core.errors import UsageError
-from ...fitting.settings import FitSettings
+from ...fitting.task import FitSettings
 from ...maps.arguments import PREVIEW
 
 #: Starting points of the arrays: those of the file, or those of an untrained texture.

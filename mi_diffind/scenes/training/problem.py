@@ -25,7 +25,7 @@ from ...core.files import replacing
 from ...fitting.loop import Problem
 from ...images import srgb
 from ...tasks.shading.evaluation import titled
-from ...tasks.texture.training import TextureProblem, rounded
+from ...tasks.texture.fit import TextureProblem, rounded
 from .options import SceneRecipe, View
 from .references import SEEDS
 from .trained_scene import JointProblem, TrainedScene
@@ -40,7 +40,7 @@ MEASURED = 16
 SHOWN = 4
 
 
-def exposure_of(references: Sequence[np.ndarray]) -> float:
+def estimate_exposure(references: Sequence[np.ndarray]) -> float:
     """Return the factor that maps to 1 the channel value that :data:`BRIGHTER` of the pixels exceed (1 if black)."""
     brightest = np.concatenate([image.max(axis=2).ravel() for image in references])
     white = float(np.quantile(brightest, 1 - BRIGHTER))
@@ -70,7 +70,7 @@ class SceneProblem(Problem):
         preview: Path | None = None,
     ):
         self.net, self.texture, self.scene, self.recipe, self.preview = texture.net, texture, scene, recipe, preview
-        self.exposure = recipe.exposure or exposure_of([image for _, image in trained])
+        self.exposure = recipe.exposure or estimate_exposure([image for _, image in trained])
         self.views = [view for view, _ in trained]
         self.references = [mi.TensorXf(np.ascontiguousarray(self.exposure * image)) for _, image in trained]
         self.measured = [(view, self.exposure * image) for view, image in measured]

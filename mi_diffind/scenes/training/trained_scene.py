@@ -22,11 +22,17 @@ from ...maps.layout import Layout
 from ...maps.pyramid import Pyramid
 from ...maps.source import load_source
 from ...plugins.support import footprint
-from ...tasks.texture import PRESETS, TextureRecipe
+from ...tasks.texture import PRESETS, TextureSettings
 from ...tasks.texture.arrays import FineArray, PaperBudget, TextureBudget
-from ...tasks.texture.compressed import CompressedTexture, bias_of, load, structure_of, to_table
-from ...tasks.texture.nets import PaperStructure
-from ...tasks.texture.training import TextureProblem, problem_of, stored_form
+from ...tasks.texture.compressed import (
+    CompressedTexture,
+    PaperStructure,
+    load,
+    read_level_bias,
+    read_structure,
+    to_table,
+)
+from ...tasks.texture.fit import TextureProblem, build_problem, stored_form
 from .. import loading
 from .options import View, ViewDistribution
 from .rig import Rig
@@ -129,7 +135,7 @@ def texture_file(parsed: loading.ParsedScene) -> tuple[Path, str]:
     return next(iter(files.items()))
 
 
-def original_of(table: Table, file: Path, given: str = "") -> Path:
+def find_source(table: Table, file: Path, given: str = "") -> Path:
     """Return the image or manifest of a texture, recorded or ``given``. Raises :class:`TableError`."""
     recorded = str(table.settings.get("source_path", ""))
     if not given and not recorded:
@@ -149,18 +155,18 @@ class SceneTexture:
 
     def __init__(self, file: Path, table: Table, given: str = "", start: Table | None = None, trained: bool = True):
         self.file, self.table = file, start or table
-        self.source_path = original_of(table, file, given)
+        self.source_path = find_source(table, file, given)
         self.source = load_source(self.source_path, nonfinite="clean")
         layout, recipe = Layout.from_json(self.table.settings["layout"]), texture_recipe(self.table)
         if not layout.stored:
             raise UsageError(f"{self.table.path}: holds a texture of one colour, without arrays to train")
-        texture = CompressedTexture.of(self.table, mi.TensorXf, "float32")
-        pyramid = Pyramid.of(self.source, layout, compat.backend_module(mi.TensorXf), texture.border)
+        texture = CompressedTexture.from_table(self.table, mi.TensorXf, "float32")
+        pyramid = Pyramid.from_source(self.source, layout, compat.backend_module(mi.TensorXf), texture.border)
         if trained:
             self.problem = TextureProblem(texture.net, pyramid, recipe, self.source.digest)
         else:
-            self.problem = problem_of(self.source, texture_budget(self.table), recipe, pyramid)
-        self.problem.settings, self.level_bias = recipe.settings, bias_of(self.table.settings)
+            self.problem = build_problem(self.source, texture_budget(self.table), recipe, pyramid)
+        self.problem.settings, self.level_bias = recipe, read_level_bias(self.table.settings)
         if not trained:
             self.table = self.to_table({})
 
@@ -171,7 +177,7 @@ class SceneTexture:
 
     def measure(self, table: Table) -> dict[str, float]:
         """Return the errors of a table against the source (:meth:`.CompressedTexture.measure`)."""
-        return CompressedTexture.of(table, mi.TensorXf).measure(self.source)
+        return CompressedTexture.from_table(table, mi.TensorXf).measure(self.source)
 
     @property
     def identity(self) -> dict:
@@ -210,17 +216,16 @@ def load_textures(
     return [SceneTexture(file, table, given[file], begin.get(file), trained) for file, table in tables.items()]
 
 
-def texture_recipe(table: Table) -> TextureRecipe:
+def texture_recipe(table: Table) -> TextureSettings:
     """Return the recipe by which the arrays of a file were trained as a texture."""
     preset = PRESETS["ours" if table.settings.get("layered", True) else "paper"]
-    names = [f.name for f in dataclasses.fields(TextureRecipe) if f.name != "settings"]
-    return dataclasses.replace(preset, **{n: table.settings[n] for n in names if n in table.settings})
+    return dataclasses.replace(preset, **{n: table.settings[n] for n in preset.further if n in table.settings})
 
 
 def texture_budget(table: Table) -> TextureBudget | PaperBudget:
     """Return the memory budget that the arrays of a texture were made for."""
     layout = Layout.from_json(table.settings["layout"])
-    structure, _ = structure_of(table.settings, layout)
+    structure, _ = read_structure(table.settings, layout)
     shapes = {name: array.shape for name, array in table.arrays.items()}
     if isinstance(structure, PaperStructure):
         rows, columns, _ = shapes["primary0"]
@@ -266,7 +271,9 @@ class TrainedScene:
                         props["max_depth"] = props.get("max_depth", loading.MAX_DEPTHS[name])
                         props.set_plugin_name("prb")
 
-            self.scene = parsed.load(change=change, parallel=False)
+            changed = parsed.copy()
+            changed.change(change)
+            self.scene = changed.load(parallel=False)
         self.spp, self.rig, self._cones = spp, Rig(self.scene, views), {}
         self._seeing = footprint.textures(self.scene)
         #: Name of each array → the parameter of the scene that is set for it.

@@ -93,17 +93,14 @@ class Page:
         self._begin_at(self.server.initial_camera)
         self.server.initial_camera.up = tuple(session.up())
         self._status = gui.add_markdown("Compiling the scene …")
-        self._view = gui.add_dropdown("view", session.views, initial_value=session.view)
+        view = gui.add_dropdown("view", session.views, initial_value=session.view)
         divider = gui.add_slider("divider", 0.0, 1.0, 0.01, session.divider)
         gain = gui.add_slider("gain", 1.0, 100.0, 1.0, session.gain, hint="factor of the difference")
         spp = gui.add_number("samples", session.spp, min=1, max=2**16, step=1, hint="samples per pixel")
-        self._on_update(self._view, lambda view: session.show(view=view))
+        self._on_update(view, lambda view: session.show(view=view))
         self._on_update(divider, lambda value: session.show(divider=value))
         self._on_update(gain, lambda value: session.show(gain=value))
         self._on_update(spp, lambda value: session.samples(int(value)))
-        for name, words in session.choices.items():
-            menu = gui.add_dropdown(name, words, initial_value=words[0], hint="loads the scene again")
-            self._on_update(menu, lambda word, name=name: self._choose(name, word))
         gui.add_button("first view").on_click(lambda event: self._ask(self._first_view))
         self._search = gui.add_text("find", "", hint="part of the names of the parameters to show")
         self._on_update(self._search, lambda text: self._list_parameters())
@@ -113,12 +110,6 @@ class Page:
     def _on_update(self, control, change: Callable[[object], object]) -> None:
         """Call ``change`` with the value of a control whenever that changes, in the loop."""
         control.on_update(lambda event: self._ask(lambda: change(control.value)))
-
-    def _choose(self, name: str, word: str) -> None:
-        self._status.content = "Loading the scene …"
-        self.session.choose(name, word)
-        self._view.options = self.session.views
-        self._view.value = self.session.view
 
     def _begin_at(self, camera) -> None:
         """Give a camera of viser the place and the target of the first view."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import mitsuba as mi
@@ -44,9 +44,6 @@ FAST = 0.04
 #: Factors by which the sides of a picture are smaller while the camera moves.
 REDUCTIONS = (1, 2, 4)
 
-#: Option of a choice that leaves the file's own value.
-AS_WRITTEN = "as written"
-
 #: Maps that a texture's table file shows, the first that the file has; else its first map.
 SHOWN_MAPS = ("base_color", "albedo", "image")
 
@@ -82,10 +79,8 @@ class Session:
         use_variant()
         if not isinstance(width, int) or not NARROWEST <= width <= WIDEST:
             raise UsageError(f"width: found {width}, allowed are whole numbers from {NARROWEST} to {WIDEST}")
-        if against != "exact" and not plugins.with_counterpart(against):
-            others = dict.fromkeys(c.name for plugin in plugins.declared().values() for c in plugin.others)
-            raise UsageError(f'against: found "{against}", allowed are exact, {", ".join(others)}')
-        self.against, self.seed, self._width, self._values, self._chosen = against, seed, width, {}, {}
+        loading.check_counterpart(against)
+        self.against, self.seed, self._values = against, seed, {}
         in_file = isinstance(source, (str, os.PathLike))
         self.name = Path(source).name if in_file else "scene"
         if in_file and Path(source).suffix.lower() == ".npz":
@@ -93,7 +88,7 @@ class Session:
                 raise UsageError(f"{source}: found a table file with defines, which only a scene file has")
             source = table_scene(source)
         self._parsed = loading.ParsedScene(source, dict(defines or {}), self.name)
-        self.learned, self.exact, self.refusal, self.table_bytes = self._load({})
+        self._load(width)
         sensor = self.learned.scene.sensors()[0]
         if "to_world" not in self.learned.placement:
             raise loading.SceneError(f"{self._parsed.path}: the sensor {sensor.class_name()} cannot be moved")
@@ -109,28 +104,25 @@ class Session:
         self.moving, self.reduction, self.pictures = False, REDUCTIONS[0], 0
         self._place()
 
-    def _load(self, chosen: Mapping[str, str]) -> tuple[RenderedSide, RenderedSide | None, str, int]:
-        """Load both sides with the ``chosen`` words; return them, the reason of no exact side, and bytes of tables."""
-
-        def change(state):
-            _resize(state, self._width)
-            for props, name, words in _choices(state):
-                if chosen.get(name) in words:
-                    props[name] = chosen[name]
-
-        names = tuple(dict.fromkeys((self.against, "exact")))
+    def _load(self, width: int) -> None:
+        """Load both sides, with films of a ``width``."""
+        parsed, names = self._parsed, tuple(dict.fromkeys((self.against, "exact")))
+        parsed.change(lambda state: _resize(state, width))
+        self.exact, self.refusal = None, ""
         with no_collection():
-            learned = RenderedSide(self._parsed.load(change=change), 1)
-            nbytes = self._parsed.table_bytes(self._parsed.learned_plugins(change=change))
-            replaced = self._parsed.learned_plugins(names)
+            self.learned = RenderedSide(parsed.load(), 1)
+            self.table_bytes = parsed.table_bytes(parsed.learned_plugins())
+            replaced = parsed.learned_plugins(names)
             if not replaced:
-                return learned, None, "the scene names no learned plugin, so there is nothing to compare", nbytes
+                self.refusal = "the scene names no learned plugin, so there is nothing to compare"
+                return
             counterparts = [plugins.declared()[entry["plugin"]].counterpart(names) for entry in replaced]
             try:
-                exact = self._parsed.load(exact=True, against=names, change=change)
+                exact = parsed.load(exact=True, against=names)
             except DiffindError as e:
-                return learned, None, str(e), nbytes
-            return learned, RenderedSide(exact, max(c.oversampling for c in counterparts)), "", nbytes
+                self.refusal = str(e)
+            else:
+                self.exact = RenderedSide(exact, max(c.oversampling for c in counterparts))
 
     # -- what is shown ------------------------------------------------------------------------------------------------
 
@@ -147,9 +139,6 @@ class Session:
         if view is not None and view not in self.views:
             because = f" ({self.refusal})" if self.refusal else ""
             raise UsageError(f'view: found "{view}", allowed are {", ".join(self.views)}{because}')
-        for name, value, high in (("divider", divider, 1), ("gain", gain, 1e6)):
-            if value is not None and not 0 <= value <= high:
-                raise UsageError(f"{name}: found {value}, allowed are numbers from 0 to {high:g}")
         self.divider = self.divider if divider is None else float(divider)
         self.gain = self.gain if gain is None else float(gain)
         self.view = view or self.view
@@ -289,32 +278,6 @@ class Session:
         """Return whether a parameter changes the exact side, too."""
         return self.exact is None or bool(self.exact.parameters.counterpart(path))
 
-    @property
-    def choices(self) -> dict[str, tuple[str, ...]]:
-        """Parameters of the scene's plugins that are one of a few words (:attr:`.plugins.Plugin.choices`)."""
-        choices: dict[str, tuple[str, ...]] = {}
-        for _, name, words in self._parsed.change(lambda state: list(_choices(state))):
-            choices[name] = tuple(dict.fromkeys((*choices.get(name, (AS_WRITTEN,)), *words)))
-        return choices
-
-    def choose(self, name: str, word: str) -> None:
-        """Give all plugins that have the choice ``name`` this value, and load the scene again with it.
-
-        If the scene refuses it, it stays as it is. Raises :class:`.UsageError` and :class:`.SceneError`.
-        """
-        options = self.choices
-        if name not in options or word not in options[name]:
-            allowed = ", ".join(options.get(name, options)) or "none"
-            raise UsageError(f'{name}: found "{word}", allowed are {allowed}')
-        chosen = {k: v for k, v in {**self._chosen, name: word}.items() if v != AS_WRITTEN}
-        self.learned, self.exact, self.refusal, self.table_bytes = self._load(chosen)
-        self._chosen = chosen
-        self.view = self.view if self.view in self.views else self.views[0]
-        kept = {path: value for path, value in self._values.items() if path in self.learned.parameters}
-        if kept:
-            self._set(kept)
-        self._place()
-
     def samples(self, spp: int) -> None:
         """Choose the samples per pixel of a finished picture. Raises :class:`.UsageError`."""
         self.spp = _check_samples(spp)
@@ -358,7 +321,6 @@ class Session:
             "psnr_db": metrics.psnr(self.exact.image, self.learned.image) if both else None,
             "nonfinite_pixels": bad,
             "table_bytes": self.table_bytes,
-            "choices": dict(self._chosen),
             "values": {k: list(v) if isinstance(v, tuple) else v for k, v in self._values.items()},
             "to_world": (self.pose @ self._residue).tolist(),
         }
@@ -399,18 +361,6 @@ def _resize(state, width: int) -> None:
         if not any(key.startswith("crop_") for key in props):
             props["height"] = max(1, round(width * props.get("height", 576) / props.get("width", 768)))
             props["width"] = width
-
-
-def _choices(state) -> Iterator[tuple]:
-    """Yield ``(properties, name, words)`` for each parameter of a parsed scene's plugins that is one of a few words.
-
-    A preset names a table that ships: there is no such choice beside a file.
-    """
-    for props in compat.parsed_properties(state):
-        plugin = plugins.declared().get(props.plugin_name())
-        for name, words in plugin.choices.items() if plugin else ():
-            if not (name == "preset" and "filename" in props):
-                yield props, name, words
 
 
 # -- table files ------------------------------------------------------------------------------------------------------

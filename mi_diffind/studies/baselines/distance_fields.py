@@ -18,7 +18,7 @@ from ...arrays.lookup import clamp
 from ...arrays.sparse_grid import SparseGrid
 from ...core.units import largest_fitting
 from ...fitting.loop import Problem
-from ...maps.compressed import decibel
+from ...maps.pyramid import decibel
 from ...tasks.sdf import nodes
 from ...tasks.sdf.distances import Distances, sample_box, sample_near
 from ...tasks.sdf.encoding import sample

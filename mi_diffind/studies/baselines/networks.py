@@ -24,9 +24,8 @@ from ...arrays.lookup import clamp
 from ...core.compat import backend_module
 from ...core.runtime import array_module
 from ...fitting.loop import Problem
-from ...maps.compressed import FilteredMaps, decibel, mean_square
 from ...maps.layout import Layout
-from ...maps.pyramid import Pyramid
+from ...maps.pyramid import FilteredMaps, Pyramid, decibel, mean_square
 from ...measure.clock import Operations
 from ...tasks.bsdf import training as bsdf_training
 from ...tasks.bsdf.directions import SphereView
@@ -38,7 +37,7 @@ from ...tasks.disney.decoder import Decoder
 from ...tasks.disney.model import TINY, Factors, compose, geometry
 from ...tasks.disney.training import measure, random_directions, random_materials, shade
 from ...tasks.texture import PRESETS
-from ...tasks.texture.training import TextureProblem
+from ...tasks.texture.fit import TextureProblem
 
 #: Hidden units of a layer of a network after a hash grid.
 WIDTH = 32
@@ -235,7 +234,7 @@ class TextureNetworkProblem(TextureProblem):
 
     def predict(self, net, inputs) -> dict[str, list]:
         u, v, level, _ = inputs
-        return self._grouped(NetworkMaps(net, self.pyramid).filtered(u, v, level))
+        return self.by_map(NetworkMaps(net, self.pyramid).filtered(u, v, level))
 
     def measure(self, net) -> dict[str, float]:
         """Return the PSNR of the stored channels at held-out samples between texels and levels."""

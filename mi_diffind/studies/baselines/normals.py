@@ -28,7 +28,7 @@ import numpy as np
 from ...arrays.indirection import aligned_copy
 from ...arrays.lookup import clamp
 from ...maps.layout import Layout, MapLayout
-from ...maps.pyramid import Pyramid, halved
+from ...maps.pyramid import Pyramid, halve
 from ...tasks.disney.decoder import Decoder, Lobe
 from ...tasks.disney.model import ALPHA_MIN, Effects
 from ...tasks.disney.training import uniform_hemisphere
@@ -80,7 +80,7 @@ def surface_moments(pyramid: Pyramid) -> list[np.ndarray]:
         total = total + np.stack([m.numpy().astype(np.float64) for m in moments], axis=-1)
     levels = [(total / INSIDE**2).reshape(rows, columns, -1)]
     for _ in pyramid.values[1:]:
-        levels.append(halved(levels[-1]))
+        levels.append(halve(levels[-1]))
     return levels
 
 

@@ -157,9 +157,8 @@ class NodesFit:
     @staticmethod
     def field(types, state: dict) -> NodeVolume:
         """Return the field that reads what :meth:`state` returned."""
-        nodes, density, colour, low, step = read_nodes(types, state), *(
-            state[name] for name in ("density", "colour", "low", "step")
-        )  # fmt: skip
+        nodes = read_nodes(types, state)
+        density, colour, low, step = (state[name] for name in ("density", "colour", "low", "step"))
         if "index" not in state:
             return ByteField(nodes, density, colour, low, step)
         palette = StoredArray(colour, (), tuple(step.tolist()), tuple(low.tolist()))

@@ -11,20 +11,13 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 from pathlib import Path
 
-from ...core.arguments import WORKER_ARGUMENTS, Argument, checked, natural, positive
+from ...core.arguments import WORKER_ARGUMENTS, Argument, between, checked, natural, positive
 from ...core.units import parse_bytes
-from ...fitting.settings import FitSettings
-from ...fitting.task import FitRequest, Fitted, Task, table_path
-
-
-def _coordinate(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"found {text!r}, a number is needed") from None
+from ...fitting.task import FitRequest, FitSettings, Fitted, Task, table_path
 
 
 def _range(text: str) -> tuple[str, tuple[float, float]]:
@@ -59,7 +52,7 @@ class BSDFTask(Task):
         ),
         Argument("--material", default="", metavar="ID", help="id of a BSDF of the scene; all: each of them"),
         Argument(
-            "--uv", nargs=2, type=_coordinate, default=(0.5, 0.5), metavar=("U", "V"),
+            "--uv", nargs=2, type=between(-math.inf, math.inf), default=(0.5, 0.5), metavar=("U", "V"),
             help="point of the textures at which the BSDF is fitted (default: 0.5 0.5)",
         ),
         Argument(

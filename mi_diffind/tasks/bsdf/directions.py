@@ -17,12 +17,6 @@ ALPHAS = (0.003, 0.015, 0.06, 0.2, 0.6)
 #: Share of the cosine-weighted directions.
 COSINE = 0.3
 
-#: Share of the directions that the BSDF samples itself, if it can.
-NATIVE = 0.2
-
-#: Least 1 − v at which the density of a lobe with an exponent is not 0.
-SMALLEST_REST = 1e-12
-
 #: Smallest cosine of a direction.
 HORIZON = 1e-4
 
@@ -68,7 +62,7 @@ def density_ggx(wi, wo, alpha_u, alpha_v, gamma=None):
     rest = dr.minimum(half.z * dr.rcp(slope * visible), 1)  # 1 - v of the sample
     q = dr.fma(2 * dr.rcp(gamma), dr.rcp(rest) - 1, 1)
     factor = 2 * (1 - dr.rcp(gamma)) * dr.exp2(-gamma * dr.log2(q)) * dr.rcp(dr.square(rest))
-    return density * dr.select(rest > SMALLEST_REST, factor, 0)
+    return density * dr.select(rest > 1e-12, factor, 0)
 
 
 def shorten_tail(v, gamma):
@@ -122,7 +116,7 @@ def outgoing(rng, types, wi, truth=None) -> Samples:
     """Return directions ``wo``: cosine-weighted, of GGX lobes of five roughnesses, and those that ``truth`` samples."""
     size = dr.width(wi)
     choice, u, v, w = (rng.random(types.Float, size) for _ in range(4))
-    native = NATIVE if truth is not None and truth.samples else 0.0
+    native = 0.2 if truth is not None and truth.samples else 0.0
     share = (1 - COSINE - native) / len(ALPHAS)
     wo = cosine_hemisphere(type(wi), u, v)
     for k, alpha in enumerate(ALPHAS):

@@ -39,9 +39,6 @@ BETWEEN = 3
 #: Corrections of all members of a family.
 SWEEPS = 60
 
-#: Last corrections of all members, by the whole excess.
-LAST_SWEEPS = 20
-
 
 def contributions(
     values: list, truth, types, cos: np.ndarray, azimuth: float = 0.0, seed: int = 5, size: int = SAMPLES
@@ -127,7 +124,7 @@ def fit_family_scale(truth, member_at: Callable, types, azimuths: tuple[float, .
             factors = lowering(weight @ scale[index], limit)
             if factors is not None:
                 is_low = False
-                powers = weight / np.sum(weight**2) if sweep < SWEEPS - LAST_SWEEPS else np.ones(len(weight))
+                powers = weight / np.sum(weight**2) if sweep < SWEEPS - 20 else np.ones(len(weight))
                 scale[index] *= factors ** powers[:, None]
         if is_low:
             break

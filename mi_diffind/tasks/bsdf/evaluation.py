@@ -21,9 +21,6 @@ from .truth import FamilyTruth
 #: Cosines of the angles of incidence at which albedos are compared.
 ALBEDO_COSINES = np.cos(np.radians((0, 15, 30, 45, 60, 70, 80, 85, 89)))
 
-#: Cosines of the angles of incidence at which the weights of samples are measured.
-WEIGHT_COSINES = np.cos(np.radians((0, 45, 80)))
-
 #: Members of a family that are measured.
 MEMBERS = 24
 
@@ -52,9 +49,9 @@ def albedo_excess(truth: Truth, value, types) -> float:
     return float(((learned - source) / np.maximum(source, 1e-3)).max())
 
 
-def weight_moments(truth: Truth, sampling, types, size: int = 2**16) -> list[float]:
-    """Return E[w²]/E[w]² of the weights of samples of a source by a mixture, at :data:`WEIGHT_COSINES`."""
-    return [mixture.second_moment(truth, sampling, types, float(c), size) for c in WEIGHT_COSINES]
+def weight_moments(truth: Truth, sampling, types, *size: int) -> list[float]:
+    """Return :func:`.mixture.second_moment` of samples of a source by a mixture, at 0°, 45° and 80°."""
+    return [mixture.second_moment(truth, sampling, types, float(c), *size) for c in np.cos(np.radians((0, 45, 80)))]
 
 
 def measure(model, truth: Truth, view: SphereView) -> dict[str, float]:

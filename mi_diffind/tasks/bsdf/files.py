@@ -119,21 +119,24 @@ def table_parameters(table: Table) -> list[Parameter]:
 def load(path: str | os.PathLike) -> Table:
     """Read and check a table file of this task. Raises :class:`TableError`."""
     table = load_table(path, "bsdf")
-    form, count = table_form(table), len(table_parameters(table))
-    dims = {"cascaded": (3, None if count else 3), "weights": (count + 1, 3)}
-    if count or "primary_uv" in table.arrays or "primary_vw" in table.arrays:
-        dims |= {"primary_uv": (2, 2), "primary_vw": (2, 1)}
-    if count:
-        dims |= {"mixing": (count, None), "proxy": (count, CHANNELS)}
+    form, family = table_form(table), (None,) * len(table_parameters(table))
+    shapes: dict[str, tuple] = {"cascaded": (None, None, None, None if family else 3), "weights": (None, *family, 3)}
+    if family or "primary_uv" in table.arrays or "primary_vw" in table.arrays:
+        shapes |= {"primary_uv": (None, None, 2), "primary_vw": (None, None, 1)}
+    if family:
+        shapes |= {"mixing": (*family, None), "proxy": (*family, CHANNELS)}
     elif form.terms:
-        dims["proxy"] = (1, 1)
+        shapes["proxy"] = (PARAMETERS, 1)
     if "energy" in table.arrays:
-        dims["energy"] = (count + 1, 1)
-    _check_arrays(table, dims)
-    if not count:
-        _check_lobes(table)
-        if form.terms and table.arrays["proxy"].shape != (PARAMETERS, 1):
-            raise TableError(f'{path}: the array "proxy" has the shape {table.arrays["proxy"].shape}, expected (22, 1)')
+        shapes["energy"] = (None, *family, 1)
+    table = load_table(path, "bsdf", shapes)
+    if not family:
+        lobes, limits = table.settings.get("lobes"), ((1e-3, 1), (1e-3, 1), (2, 200))
+        if not (isinstance(lobes, list) and len(lobes) == 2 and all(_are_numbers(lobe, limits) for lobe in lobes)):
+            raise TableError(
+                f'{path}: its setting "lobes" is {str(lobes)[:80]!r}, expected 2 lists of two roughnesses from 0.001 '
+                "to 1 and an exponent from 2 to 200"
+            )
     else:
         expected, channels = 3 * table.arrays["mixing"].shape[-1], table.arrays["cascaded"].shape[-1]
         if channels != expected:
@@ -145,34 +148,6 @@ def load(path: str | os.PathLike) -> Table:
             raise TableError(f'{path}: its setting "factors" is {factors!r}, expected 2 numbers from 0.1 to 10')
     check_ranges(table, {name: (0.0, 1.0) for name in table.arrays if name != "proxy"})
     return table
-
-
-def _check_arrays(table: Table, dims: dict[str, tuple[int, int | None]]) -> None:
-    """Raise :class:`TableError` unless a table has the arrays ``dims`` and no others.
-
-    ``dims`` maps names to numbers of dimensions and of channels (``None``: any).
-    """
-    for name in dims:
-        if name not in table.arrays:
-            raise TableError(f'{table.path}: the array "{name}" is missing')
-    for name, array in table.arrays.items():
-        if name not in dims:
-            raise TableError(f'{table.path}: has an unexpected array "{name}"')
-        expected, channels = dims[name]
-        if len(array.shape) - 1 != expected or channels not in (None, array.shape[-1]):
-            raise TableError(
-                f'{table.path}: the array "{name}" has the shape {array.shape}, expected {expected} dimension(s)'
-                + (f" and {channels} channel(s)" if channels else "")
-            )
-
-
-def _check_lobes(table: Table) -> None:
-    given, limits = table.settings.get("lobes"), ((1e-3, 1), (1e-3, 1), (2, 200))
-    if not (isinstance(given, list) and len(given) == 2 and all(_are_numbers(lobe, limits) for lobe in given)):
-        raise TableError(
-            f'{table.path}: its setting "lobes" is {str(given)[:80]!r}, expected 2 lists of two roughnesses from 0.001 '
-            "to 1 and an exponent from 2 to 200"
-        )
 
 
 def _are_numbers(values, limits) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from threading import Event
 
 import drjit as dr
@@ -110,9 +111,8 @@ def _fit_single(truth: Truth, request: FitRequest, stop: Event) -> Fitted:
         sampling = {"lobes": [list(dataclasses.astuple(lobe)) for lobe in lobes]}
         recorded = _settings(request, result, truth, symmetries, sizes)
         table = to_table(problem.net, form, sampling, weights, scale, recorded)
-        model = _complete(table, request)
-        figures = evaluation.measure_samples(model, validation) if rows else evaluation.measure(model, truth, view)
-        table.measured = {name: float(f"{figure:.5g}") for name, figure in figures.items()}
+        measure = (evaluation.measure_samples, validation) if rows else (evaluation.measure, truth, view)
+        _complete(table, request, *measure)
         table.settings |= {"remarks": remarks} if remarks else {}
         return table, scale, raw
 
@@ -160,8 +160,7 @@ def _fit_family(truth: FamilyTruth, request: FitRequest, stop: Event) -> Fitted:
         recorded["over"] = {key: [p.low, p.high] for key, p in zip(truth.keys, parameters, strict=True)}
         sampling = {"family": described, "factors": list(factors)}
         table = to_table(problem.net, form, sampling, weights, scale, recorded)
-        figures = evaluation.measure_family(_complete(table, request), truth)
-        table.measured = {name: float(f"{figure:.5g}") for name, figure in figures.items()}
+        _complete(table, request, evaluation.measure_family, truth)
         return table, scale
 
     result = training.train_last(problem, request, finish, stop)
@@ -194,11 +193,12 @@ def _settings(request: FitRequest, result: FitResult | None, truth: Truth, symme
     }  # fmt: skip
 
 
-def _complete(table: Table, request: FitRequest) -> BSDFModel:
-    """Add preset, seed and source to a table, and return its model."""
-    table.preset, table.seed = request.preset, request.settings.seed
+def _complete(table: Table, request: FitRequest, measure: Callable, *truth) -> None:
+    """Add preset, seed, source and the figures ``measure(model, *truth)`` to a table."""
+    table.preset, table.seed, dtype = request.preset, request.settings.seed, request.types.TensorXf
     table.settings |= request.paths(source_path=request.options["source"]) | recorded_source(request.options)
-    return BSDFModel(table, allocate(table, request.types.TensorXf), request.types.TensorXf)
+    figures = measure(BSDFModel(table, allocate(table, dtype), dtype), *truth)
+    table.measured = {name: float(f"{figure:.5g}") for name, figure in figures.items()}
 
 
 def _figures(table: Table, symmetries: dict) -> dict:
@@ -208,20 +208,10 @@ def _figures(table: Table, symmetries: dict) -> dict:
 
 def symmetry_line(symmetries: dict[str, float | None]) -> str:
     """Return the measured symmetries as a line of text."""
-    assumed = {
-        "isotropy": ("isotropic", "anisotropic ({})"),
-        "mirror": ("symmetric about the plane of incidence", "not symmetric about the plane of incidence ({})"),
-        "reciprocity": (
-            "reciprocal",
-            "not reciprocal: {} of the light, weighted by both cosines; no reciprocal model can be nearer than that",
-        ),
-    }
+    names = {"isotropy": "isotropic", "mirror": "symmetric about the plane of incidence", "reciprocity": "reciprocal"}
     parts = []
-    for name, (yes, no) in assumed.items():
+    for name, text in names.items():
         value = symmetries[name]
-        if value is None:
-            parts.append(f"{yes} (assumed: no rows to compare)")
-        else:
-            percent = f"{100 * value:.2g}%"
-            parts.append(f"{yes} ({percent})" if value <= measured.TOLERANCE else no.format(percent))
+        share = "assumed: no rows to compare" if value is None else f"{100 * value:.2g}%"
+        parts.append(f"{'not ' if (value or 0) > measured.TOLERANCE else ''}{text} ({share})")
     return "measured: " + ", ".join(parts)

@@ -27,12 +27,6 @@ from .truth import SUFFIXES, material_ids
 #: Material that stands for all of a scene.
 ALL = "all"
 
-#: Options of ``fit bsdf`` that say where and how a library is fitted, and not what.
-ELSEWHERE = ("source", "material", "workers", "scheduler")
-
-#: File of a library's report, beside its tables.
-REPORT = "report.json"
-
 #: Columns of the printed table: heading → text of a material's record.
 COLUMNS = {
     "bytes": lambda m: f"{m['bytes']:,}",
@@ -172,7 +166,7 @@ def fit_library(request: FitRequest) -> FittedLibrary:
     interrupted = any(r["status"] == "left" for r in records.values())
     library = FittedLibrary(None, None, request=request, folder=folder, materials=records, interrupted=interrupted)
     library.seconds = time.perf_counter() - start
-    write_json(folder / REPORT, library.report)
+    write_json(folder / "report.json", library.report)
     return library
 
 
@@ -190,7 +184,9 @@ def find_materials(request: FitRequest, folder: Path) -> tuple[dict[str, Library
         files = sorted(f for f in source.iterdir() if f.suffix.lower() in SUFFIXES and not f.name.startswith("."))
         if not files:
             raise UsageError(f"{source}: holds no sources, allowed are files that end in {', '.join(SUFFIXES)}")
-    given = {k: v for k, v in request.options.items() if k not in ELSEWHERE} | dataclasses.asdict(request.settings)
+    given = {**request.options, **dataclasses.asdict(request.settings)}
+    for name in ("source", "material", "workers", "scheduler"):  # where and how a library is fitted, and not what
+        del given[name]
     common = [given, request.preset, mi.variant(), __version__, mi.__version__]
     names: set[str] = set()
     materials, broken = {}, {}
@@ -222,25 +218,23 @@ def _free_name(text: str, names: set[str]) -> str:
 
 
 def _identity(file: Path, options: list) -> str:
-    """Return a hash of the content of a source, of the files that it names, and of ``options``; "" on any error."""
-    digest = hashlib.sha256(json.dumps(options, sort_keys=True, default=str).encode())
+    """Return a hash of the content of a source, of the files that XML includes or names, and of ``options``.
+
+    It is "" on any error.
+    """
+    digest, files = hashlib.sha256(json.dumps(options, sort_keys=True, default=str).encode()), [file]
     try:
-        for one in _source_files(file):
+        if file.suffix.lower() == ".xml":
+            _, state = compat.parse_file(file)
+            properties = compat.parsed_properties(state)
+            texts = {props[k] for props in properties for k in props if compat.property_kind(props, k) == "text"}
+            named = (file.parent / text for text in sorted(texts) if 0 < len(text) < 1000)
+            files = [*map(Path, compat.parsed_files(state)), *(path for path in named if path.is_file())]
+        for one in dict.fromkeys(files):
             digest.update(one.name.encode() + b"\0" + one.read_bytes() + b"\0")
     except Exception:  # Mitsuba raises several types; the fit says what is wrong
         return ""
     return digest.hexdigest()
-
-
-def _source_files(file: Path) -> list[Path]:
-    """Return a source and, of XML, the files that it includes or names."""
-    if file.suffix.lower() != ".xml":
-        return [file]
-    _, state = compat.parse_file(file)
-    properties = compat.parsed_properties(state)
-    texts = {props[k] for props in properties for k in props if compat.property_kind(props, k) == "text"}
-    named = (file.parent / text for text in sorted(texts) if 0 < len(text) < 1000)
-    return [*dict.fromkeys([*map(Path, compat.parsed_files(state)), *(path for path in named if path.is_file())])]
 
 
 def _is_fitted(material: LibraryMaterial) -> bool:

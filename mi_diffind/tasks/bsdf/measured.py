@@ -42,15 +42,6 @@ TOLERANCE = 0.01
 #: Azimuth of the axes of a source below which they count as those of the surface, radians.
 TURN = math.radians(0.5)
 
-#: Quantile above which contributions of measured rows count the same in the azimuth of the axes.
-BRIGHT_AXES = 0.999
-
-#: Difference of the azimuths from two halves of the samples beyond which neither counts, radians.
-APART = math.radians(4)
-
-#: Samples that determine the azimuth of the axes.
-AXES_SAMPLES = 2**18
-
 #: Illuminants, the first is the default.
 ILLUMINANTS = ("D65", "E")
 
@@ -81,32 +72,8 @@ DENSITY = 8
 #: Neighbours that a row is compared with.
 NEIGHBOURS = 16
 
-#: Multiple of the usual difference from the neighbours' median, of logarithms, above which a row is an outlier.
-OUTLIER = 6.0
-
-#: Least difference of logarithms of an outlier.
-FAR = 0.4
-
-#: Number of rows whose neighbours measure symmetries.
-PAIRS = 20_000
-
-#: Difference of azimuths that count as equal, radians.
-SAME = math.radians(15)
-
-#: Difference of azimuths that count as different, radians.
-OTHER = math.radians(30)
-
-#: Factors of :func:`places` of an isotropic material that give the mirror image at the plane of incidence.
-MIRROR = np.array([1, 1, -1, 1])
-
 #: Distance of two rows below which they have the same directions.
 EXACT = 1e-4
-
-#: Quantile of f cos θ_i cos θ_o above which rows count the same where symmetries are measured.
-BRIGHT = 0.9
-
-#: Difference under a symmetry that neighbours have, too, relative to that of neighbours without it.
-USUAL = 1.5
 
 
 class Truth:
@@ -168,10 +135,10 @@ def axes_angle(samples: Samples, truth: Truth) -> float:
     """Return the azimuth of the axes of an anisotropic source, radians from −π/4 to π/4.
 
     They are the principal axes of the half vectors, weighted by the squares of contributions, most of which lie in the
-    peak. Of a function, four turned values of each sample are used, so that what is isotropic cancels. The result is 0
-    if it is below :data:`TURN`, or if halves of the samples disagree.
+    peak. The values of a function are averaged over four rotations of each sample, which removes their isotropic part.
+    The result is 0 if it is below :data:`TURN`, or if halves of the samples disagree by more than 4 degrees.
     """
-    index = dr.arange(dr.uint32_array_t(type(samples.weight)), min(AXES_SAMPLES, dr.width(samples.weight)))
+    index = dr.arange(dr.uint32_array_t(type(samples.weight)), min(2**18, dr.width(samples.weight)))
     samples, moments = samples.at(index), 0
     half = samples.wi + samples.wo
     half = half * dr.rsqrt(dr.maximum(dr.squared_norm(half), 1e-20))
@@ -180,13 +147,13 @@ def axes_angle(samples: Samples, truth: Truth) -> float:
         value = truth.value(rotate(samples.wi, angle), rotate(samples.wo, angle)) if k else samples.value
         light, h = samples.weight * dr.square(value[0] + value[1] + value[2]), rotate(half, angle)
         if not truth.function:  # rows may be outliers
-            light = dr.minimum(light, float(np.quantile(light.numpy(), BRIGHT_AXES)))
+            light = dr.minimum(light, float(np.quantile(light.numpy(), 0.999)))
         columns = [light * (dr.square(h.x) - dr.square(h.y)), 2 * light * h.x * h.y]
         moments = moments + np.stack([dr.detach(c).numpy() for c in columns]).astype(np.float64)
     angles = [0.5 * math.atan2(*part.sum(axis=1)[::-1]) for part in (moments, moments[:, ::2], moments[:, 1::2])]
     apart = (angles[1] - angles[2] + math.pi / 2) % math.pi - math.pi / 2
     angle = angles[0] - round(angles[0] / (math.pi / 2)) * (math.pi / 2)
-    return angle if abs(angle) > TURN and abs(apart) < APART else 0.0
+    return angle if abs(angle) > TURN and abs(apart) < math.radians(4) else 0.0
 
 
 def measure_symmetry(truth, types, size: int = 2**16) -> dict[str, float]:
@@ -246,15 +213,6 @@ def colour_weights(wavelengths: np.ndarray, illuminant: str) -> np.ndarray:
     return hats @ density
 
 
-def rgb_fields(fields: dict, illuminant: str) -> dict:
-    """Return the fields of a spectral file of ``measured`` as those of an RGB one."""
-    weights = colour_weights(np.asarray(fields["wavelengths"], np.float64), illuminant)
-    spectra = np.asarray(fields["spectra"])
-    rgb = np.einsum("ptwyx,wc->ptcyx", spectra, weights.astype(np.float32))
-    kept = {name: np.asarray(value) for name, value in fields.items() if name not in ("spectra", "wavelengths")}
-    return {**kept, "rgb": np.ascontiguousarray(rgb, np.float32)}
-
-
 def measured_bsdf(path: Path, illuminant: str):
     """Return Mitsuba's ``measured`` of a file in an RGB variant, and a remark about colours ("" for an RGB file).
 
@@ -266,7 +224,10 @@ def measured_bsdf(path: Path, illuminant: str):
     tensor_files.check(path, fields)
     if "wavelengths" not in fields or mi.is_spectral:
         return mi.load_dict({"type": "measured", "filename": str(path)}), ""
-    fields = rgb_fields(fields, illuminant)
+    fields = {name: np.asarray(value) for name, value in fields.items()}
+    weights = colour_weights(fields.pop("wavelengths").astype(np.float64), illuminant).astype(np.float32)
+    rgb = np.einsum("ptwyx,wc->ptcyx", fields.pop("spectra"), weights)
+    fields["rgb"] = np.ascontiguousarray(rgb, np.float32)
     with tempfile.TemporaryDirectory() as folder:
         converted = os.path.join(folder, path.name)
         tensor_files.write(converted, fields)
@@ -349,7 +310,11 @@ class ScatteredTruth(Truth):
             refuse(wrong, f"{name} is {{{names.index(name)}:g}}, allowed is 0 to {limit}")
         for name in OPTIONAL:
             refuse(columns.get(name, np.zeros(1)) < 0, f"{name} is negative, allowed are numbers ≥ 0")
-        self.wi, self.wo = (_direction(columns[f"theta_{k}"], columns[f"phi_{k}"]) for k in "io")
+        angles = [(columns[f"theta_{k}"], columns[f"phi_{k}"]) for k in "io"]
+        self.wi, self.wo = (
+            np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=1)
+            for theta, phi in angles
+        )
         self.f = np.stack([columns[name] for name in VALUES], axis=1)
         self.weight = columns.get("weight", np.ones(len(rows)))
         self.solid_angle = columns.get("solid_angle")
@@ -397,11 +362,6 @@ def read_rows(path: Path) -> tuple[list[str], np.ndarray, list[int]]:
     return names, np.array(rows), [number for number, _ in body]
 
 
-def _direction(theta: np.ndarray, phi: np.ndarray) -> np.ndarray:
-    sin = np.sin(theta)
-    return np.stack([sin * np.cos(phi), sin * np.sin(phi), np.cos(theta)], axis=1)
-
-
 def along_x(truth: ScatteredTruth) -> np.ndarray:
     """Return ``wo`` after a rotation about the normal that brings ``wi`` to the azimuth 0."""
     x, y = truth.wi[:, 0], truth.wi[:, 1]
@@ -427,9 +387,9 @@ def measure_row_symmetry(truth: ScatteredTruth) -> dict[str, float | None]:
     from scipy.spatial import cKDTree
 
     points, f = places(truth, True), truth.f.mean(axis=1)
-    rows = np.random.default_rng(1).permutation(len(f))[:PAIRS]
+    rows = np.random.default_rng(1).permutation(len(f))[:20_000]  # those that are compared
     light = np.maximum(f * truth.wi[:, 2] * truth.wo[:, 2], 1e-12)
-    bright = np.quantile(light, BRIGHT)
+    bright = np.quantile(light, 0.9)
     tree, azimuth = cKDTree(points), np.arctan2(truth.wi[:, 1], truth.wi[:, 0])
     near, neighbours = (a[:, 1:] for a in tree.query(points[rows], NEIGHBOURS + 1))
     angle = np.abs((azimuth[rows, None] - azimuth[neighbours] + math.pi / 2) % math.pi - math.pi / 2)
@@ -443,7 +403,7 @@ def measure_row_symmetry(truth: ScatteredTruth) -> dict[str, float | None]:
         return float((weight * np.abs(a - b) / (a + b)).sum() / weight.sum())
 
     def difference_beyond(usual: float | None, other: float | None) -> float | None:
-        return None if other is None or usual is None else max(0.0, other - USUAL * usual)
+        return None if other is None or usual is None else max(0.0, other - 1.5 * usual)  # noise, distance
 
     def first(condition: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the nearest neighbour that meets a condition, and whether there is one."""
@@ -456,11 +416,12 @@ def measure_row_symmetry(truth: ScatteredTruth) -> dict[str, float | None]:
         return difference_beyond(difference(neighbours[:, 0], close), difference(nearest, close))
 
     result: dict[str, float | None] = {}
-    same, other = first(angle < SAME), first(angle > OTHER)
+    same, other = first(angle < math.radians(15)), first(angle > math.radians(30))
     both = same[1] & other[1]
     result["isotropy"] = difference_beyond(difference(same[0], both), difference(other[0], both))
     # Rows in the plane of incidence say nothing about the mirror image
-    result["mirror"] = excess(points * MIRROR, np.abs(points[rows, 2]) > 0.02)
+    # The mirror image at the plane of incidence
+    result["mirror"] = excess(points * np.array([1, 1, -1, 1]), np.abs(points[rows, 2]) > 0.02)
     isotropic = (result["isotropy"] or 0) <= TOLERANCE
     if not isotropic:  # the plane of incidence of a row then means another material each time
         result["mirror"] = result["isotropy"]
@@ -591,7 +552,7 @@ def without_outliers(samples: Samples, form: Form, proxy: LearnedBSDF) -> tuple[
     points = np.stack([u, v, 0.25 * w], axis=1)
     median = np.median(ratio[cKDTree(points).query(points, min(NEIGHBOURS, len(points) - 1) + 1)[1][:, 1:]], axis=1)
     difference = np.abs(ratio - median)
-    outlier = difference > max(FAR, OUTLIER * float(np.median(difference)))
+    outlier = difference > max(0.4, 6.0 * float(np.median(difference)))  # of logarithms
     kept = type(samples.weight)(np.ascontiguousarray(~outlier, np.float32))
     return Samples(samples.wi, samples.wo, samples.weight * kept, samples.value), int(outlier.sum())
 

@@ -23,30 +23,18 @@ MEMBER_SAMPLES = 1024
 #: Roughnesses of the lobes that are tried.
 ALPHAS = tuple(float(a) for a in np.geomspace(0.002, 1.0, 16))
 
-#: Exponents of the lobes that are tried.
-EXPONENTS = (2.0, 5.0, 20.0)
-
 #: Factors of the widths of the proxy's lobes that are tried for a family.
 FACTORS = (0.5, 0.7, 1.0, 1.4, 2.0, 3.0)
 
-#: Iterations of the weights of a mixture.
-ITERATIONS = 30
-
 #: Samples of a direction, and iterations, that rank pairs of lobes.
 RANKING = (256, 8)
-
-#: Pairs of lobes that are tried with all samples.
-PAIRS = 6
-
-#: Least weight of the cosine: every direction can be drawn.
-FLOOR = 0.02
 
 
 @dataclass(frozen=True)
 class SampledLobe:
     """Lobe of visible GGX normals of the roughnesses ``alpha_u`` and ``alpha_v``, numbers or arrays.
 
-    ``gamma`` is the exponent of its tails: 2 for those of GGX, larger for shorter ones (:func:`.pool.shorten_tail`).
+    ``gamma`` is the exponent of its tails: 2 for GGX, larger for shorter ones (:func:`.directions.shorten_tail`).
     """
 
     alpha_u: object
@@ -75,7 +63,7 @@ def fit_mixture(truth, types, isotropic: bool, stretch: float = 1.0) -> tuple[tu
     lobes = [
         SampledLobe(*(float(np.clip(a, 1e-3, 1)) for a in (alpha / root, alpha * root)), gamma)
         for alpha in ALPHAS
-        for gamma in EXPONENTS
+        for gamma in (2.0, 5.0, 20.0)  # of the tails
     ]
     densities, square = candidate_densities(truth, types, isotropic, lobes, SAMPLES)
     some = slice(0, RANKING[0])
@@ -84,7 +72,7 @@ def fit_mixture(truth, types, isotropic: bool, stretch: float = 1.0) -> tuple[tu
         _, cost = optimal_weights(densities[[0, 1 + i, 1 + j], :, some], square[:, some], RANKING[1])
         ranked.append((float(np.log(cost).mean()), i, j))
     best = None
-    for _, i, j in sorted(ranked)[:PAIRS]:
+    for _, i, j in sorted(ranked)[:6]:  # tried with all samples
         weights, cost = optimal_weights(densities[[0, 1 + i, 1 + j]].astype(np.float64), square)
         total = float(np.mean(np.log(cost)))
         if best is None or total < best[0]:
@@ -140,7 +128,7 @@ def candidate_densities(truth, types, isotropic: bool, lobes: list, size: int) -
     return np.stack(densities), np.where(means > 0, square / np.where(means > 0, means, 1), 1)  # 1 if black
 
 
-def optimal_weights(densities: np.ndarray, square: np.ndarray, iterations: int = ITERATIONS) -> tuple:
+def optimal_weights(densities: np.ndarray, square: np.ndarray, iterations: int = 30) -> tuple:
     """Return the weights of three densities, ``(NODES, 3)``, that minimise E[f²/p], and that mean."""
     weights = np.full((densities.shape[1], 3), 1 / 3, densities.dtype)
     for _ in range(iterations):
@@ -148,7 +136,7 @@ def optimal_weights(densities: np.ndarray, square: np.ndarray, iterations: int =
         gain = np.einsum("kns,ns->nk", densities, square / np.maximum(density, 1e-12) ** 2)
         weights = weights * np.sqrt(np.maximum(gain, 1e-30))
         weights /= weights.sum(axis=1, keepdims=True)
-        weights[:, 0] = np.maximum(weights[:, 0], FLOOR)
+        weights[:, 0] = np.maximum(weights[:, 0], 0.02)  # every direction can be drawn
         weights /= weights.sum(axis=1, keepdims=True)
     density = np.einsum("nk,kns->ns", weights, densities)
     return weights, (square / np.maximum(density, 1e-12)).mean(axis=1)

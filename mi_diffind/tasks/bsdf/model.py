@@ -52,11 +52,11 @@ from ...arrays.lookup import clamp
 #: Smallest roughness of a lobe, and smallest scale of the coordinate u.
 ALPHA_MIN = 1e-3
 
-#: Least squared cosine of the half vector that counts in the proxy: at 0, lobes with γ < 2 are infinite.
-LEAST_COS2 = 1e-6
-
 #: Parameters of the proxy: 3 of the diffuse colour, 1 edge, and for each of two lobes α_u, α_v, γ/2, F₀ and F₉₀ (RGB).
 DIFFUSE, EDGE, LOBE, PARAMETERS = slice(0, 3), 3, 9, 22
+
+#: Parameters of the proxy that are roughnesses.
+ROUGHNESSES = (4, 5, 4 + LOBE, 5 + LOBE)
 
 #: Names of the proxy's terms.
 TERMS = ("diffuse", "first", "second")
@@ -72,9 +72,6 @@ AZIMUTHS = ("mirror", "half")
 
 #: Most parameters of a family.
 MOST_PARAMETERS = 3
-
-#: Ratio of the ends of a parameter's range from which on its coordinate is logarithmic.
-LOGARITHMIC_RATIO = 4.0
 
 #: Nodes of a coordinate (linear, logarithmic) in the table of a family's proxy, for one, two and three parameters.
 PROXY_NODES = ((9, 9), (5, 9), (3, 8))
@@ -143,7 +140,8 @@ class DirectionPair:
         h2 = dr.squared_norm(half)
         inverse, cos_d = dr.rcp(h2), dr.minimum(0.5 * dr.sqrt(h2), 1)
         x, y, z = (dr.square(c) * inverse for c in half)
-        return cls(wi, wo, half, x, y, z, dr.log2(dr.maximum(z, LEAST_COS2)), cos_d, _fifth(1 - cos_d))
+        # Lobes with γ < 2 are infinite at 0
+        return cls(wi, wo, half, x, y, z, dr.log2(dr.maximum(z, 1e-6)), cos_d, _fifth(1 - cos_d))
 
 
 def half_vector(wi, wo):
@@ -208,11 +206,18 @@ class Proxy:
     def from_logarithms(cls, logarithms: list, form: Form) -> Proxy:
         """Return the proxy of :data:`PARAMETERS` logarithms, arrays."""
         values = [dr.exp(clamp(x, *LOGARITHMS)) for x in logarithms]
+        return cls.from_values(
+            [dr.clip(v, ALPHA_MIN, 1) if k in ROUGHNESSES else v for k, v in enumerate(values)], form
+        )
+
+    @classmethod
+    def from_values(cls, values: list, form: Form) -> Proxy:
+        """Return the proxy of :data:`PARAMETERS` numbers, arrays, within their ranges."""
         lobes = {}
         for k, name in enumerate(TERMS[1:]):
             a = 4 + k * LOBE
             if name in form.terms:
-                alphas = tuple(dr.clip(x, ALPHA_MIN, 1) for x in values[a : a + (1 if form.isotropic else 2)])
+                alphas = tuple(values[a : a + (1 if form.isotropic else 2)])
                 colours = values[a + 3 : a + 6], values[a + 6 : a + 9]
                 lobes[name] = ProxyLobe.from_parameters(alphas, 2 * values[a + 2], *colours)
         return cls.from_parts(values[DIFFUSE] if "diffuse" in form.terms else None, values[EDGE], lobes)
@@ -249,7 +254,7 @@ class Parameter:
     @property
     def is_logarithmic(self) -> bool:
         """Whether the coordinate is logarithmic."""
-        return self.low > 0 and self.high / self.low >= LOGARITHMIC_RATIO
+        return self.low > 0 and self.high / self.low >= 4.0
 
     @property
     def middle(self) -> float:
@@ -444,22 +449,12 @@ def member(form: Form, table, residual, mixing, energy, coordinates: list, activ
 def member_proxy(numbers: list, form: Form) -> tuple[Proxy, tuple]:
     """Return the proxy and the scale (a_x, a_y) of :data:`CHANNELS` numbers of a proxy's table, limited to finite."""
     low, high = (math.exp(x) for x in LOGARITHMS)
-
-    def roughness(channel):
-        channels = (channel,) if form.isotropic else (channel, channel + 1)
-        return tuple(dr.exp(clamp(numbers[c], math.log(ALPHA_MIN), 0.0)) for c in channels)
-
-    def shape(channel):
-        return dr.exp(clamp(numbers[channel], *LOGARITHMS))
-
-    lobes = {}
-    for k, name in enumerate(TERMS[1:]):
-        a = 4 + k * LOBE
-        if name in form.terms:
-            colours = [[clamp(c, low, high) for c in numbers[i : i + 3]] for i in (a + 3, a + 6)]
-            lobes[name] = ProxyLobe.from_parameters(roughness(a), 2 * shape(a + 2), *colours)
-    diffuse = [clamp(c, low, high) for c in numbers[:3]] if "diffuse" in form.terms else None
-    return Proxy.from_parts(diffuse, shape(3), lobes), roughness(SCALE)
+    values = [clamp(x, low, high) for x in numbers]
+    for channel in LOGARITHMIC_CHANNELS:
+        is_roughness = channel in ROUGHNESSES or channel >= SCALE
+        limits = (math.log(ALPHA_MIN), 0.0) if is_roughness else LOGARITHMS
+        values[channel] = dr.exp(clamp(numbers[channel], *limits))
+    return Proxy.from_values(values, form), tuple(values[SCALE : SCALE + (1 if form.isotropic else 2)])
 
 
 def widths(proxy: Proxy, scale: tuple) -> list:

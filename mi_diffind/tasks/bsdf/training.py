@@ -17,8 +17,7 @@ from ...arrays.indirection import DifferentiableArray, device_array
 from ...core.compat import backend_module
 from ...core.progress import interruptible
 from ...fitting.loop import FitResult, Problem
-from ...fitting.settings import FitSettings
-from ...fitting.task import FitRequest, Stage
+from ...fitting.task import FitRequest, FitSettings, Stage
 from .directions import Samples, SphereView, incident, outgoing
 from .model import (
     ALPHA_MIN,
@@ -72,38 +71,17 @@ RATE = 0.3
 #: Share of the residuals that lie within the range of the cascaded array before it is widened.
 QUANTILE = 0.998
 
-#: Widening of the range of residuals, relative to it.
-MARGIN = 0.25
-
 #: Least range of residuals, natural logarithms.
 LEAST_RANGE = 0.01
 
 #: Value, relative to the mean, below which a source counts as black.
 DARK = 1e-3
 
-#: Least value of f relative to the largest where there is no proxy and a channel is black.
-BLACK_CHANNEL = 1e-4
-
 #: Share of the training after which entries are rounded to bytes in each step.
 ROUNDED = 0.5
 
 #: Roughnesses of the lobes from which the proxy starts.
 START_ALPHAS = tuple(float(a) for a in np.geomspace(0.003, 0.9, 13))
-
-#: Exponents of these lobes: of GGX, of a lobe with a shorter tail, and nearly Beckmann's.
-START_EXPONENTS = (2.0, 6.0, 30.0)
-
-#: Roughness below which a lobe is much narrower than those of a start, relative to the narrowest.
-NARROW = 0.4
-
-#: Samples that determine the starts.
-START_SAMPLES = 2**13
-
-#: Sweeps of the least squares over the colours of a start.
-SWEEPS = 60
-
-#: Least colour of a term of a start.
-LEAST_COLOUR = 1e-5
 
 
 def draw(truth, types, size: int, seed: int, isotropic: bool) -> Samples:
@@ -139,10 +117,10 @@ def proxy_starts(samples: Samples, types) -> list[np.ndarray]:
     The second is the best one with a lobe that is much narrower than those of the first, if there is room for one: a
     sharp coat of little light counts little in the error, but is seen.
     """
-    index = dr.arange(types.UInt32, min(START_SAMPLES, dr.width(samples.weight)))
+    index = dr.arange(types.UInt32, min(2**13, dr.width(samples.weight)))
     s = samples.at(index)
     g = DirectionPair.of(s.wi, s.wo)
-    shapes = list(itertools.product(START_ALPHAS, START_EXPONENTS))
+    shapes = list(itertools.product(START_ALPHAS, (2.0, 6.0, 30.0)))  # of GGX, of a shorter tail, and nearly Beckmann's
     columns = [s.wo.z * dr.inv_pi]
     with dr.suspend_grad():
         for alpha, exponent in shapes:
@@ -164,7 +142,7 @@ def proxy_starts(samples: Samples, types) -> list[np.ndarray]:
         ranked.append((error, i, j, colours))
     ranked.sort(key=lambda entry: entry[0])
     narrowest = [min(shapes[i][0], shapes[j][0]) for _, i, j, _ in ranked]
-    narrow = next((k for k, alpha in enumerate(narrowest) if alpha < NARROW * narrowest[0]), 1)
+    narrow = next((k for k, alpha in enumerate(narrowest) if alpha < 0.4 * narrowest[0]), 1)
     ranked.insert(1, ranked.pop(narrow))
     return [_logarithms(shapes[i], shapes[j], colours) for _, i, j, colours in ranked[:STARTS]]
 
@@ -173,7 +151,7 @@ def _non_negative(gram: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Return x ≥ 0, ``(n, 3)``, that minimises |Ax − b|² by sweeps over its entries, from AᵀA and Aᵀb."""
     x = np.zeros_like(right)
     diagonal = np.maximum(np.diag(gram), 1e-30)
-    for _ in range(SWEEPS):
+    for _ in range(60):
         for k in range(len(x)):
             x[k] = np.maximum(x[k] + (right[k] - gram[k] @ x) / diagonal[k], 0)
     return x
@@ -181,7 +159,7 @@ def _non_negative(gram: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 def _logarithms(first: tuple[float, float], second: tuple[float, float], colours: np.ndarray) -> np.ndarray:
     """Return the logarithms of a proxy, ``(22,)``, of lobes (roughness, exponent) and colours of all terms, (5, 3)."""
-    colours, parts = np.log(np.maximum(colours, LEAST_COLOUR)), []
+    colours, parts = np.log(np.maximum(colours, 1e-5)), []
     for k, (alpha, exponent) in enumerate((first, second)):
         parts += [np.log([alpha, alpha, exponent / 2]), colours[1 + 2 * k], colours[2 + 2 * k]]
     return np.concatenate([colours[0], [0.0], *parts])
@@ -355,37 +333,26 @@ def choose_form(
 
 def residual_range(form: Form, logarithms: np.ndarray, samples: Samples) -> tuple[float, float]:
     """Return the range of log(f / proxy) over samples, from quantiles; without a proxy, black channels count, too."""
-    types = backend_module(samples.weight)
-    if form.terms:
-        net = BSDFArrays(None, proxy_array(logarithms, 1.0)).alloc(types.TensorXf)
-        with dr.suspend_grad():
+    types, value = backend_module(samples.weight), [1.0, 1.0, 1.0]
+    with dr.suspend_grad():
+        if form.terms:
+            net = BSDFArrays(None, proxy_array(logarithms, 1.0)).alloc(types.TensorXf)
             value = net.at(form, samples.coordinates).value(samples.wi, samples.wo)
-        return range_above(value, samples)
-    low, high = range_above([1.0, 1.0, 1.0], samples)
-    with dr.suspend_grad():
-        light = [float(dr.mean(samples.weight * t)[0]) for t in samples.value]
-    if not any(light):
+        light, ratios = [float(dr.mean(samples.weight * t)[0]) for t in samples.value], []
+        for v, t in zip(value, samples.value, strict=True):
+            ratio = dr.log(dr.maximum(t, 1e-12) / dr.maximum(v * samples.wo.z, 1e-12))
+            ratios.append(ratio.numpy()[(t * samples.weight).numpy() > DARK * sum(light) / 3])
+    if not (form.terms or any(light)):
         return LOGARITHMS[0] - LEAST_RANGE, LOGARITHMS[0] + LEAST_RANGE
-    return (min(low, high + math.log(BLACK_CHANNEL)) if min(light) < DARK * max(light) else low), high
-
-
-def range_above(value: list, samples: Samples) -> tuple[float, float]:
-    """Return the range of log(f / ``value``) over samples of f, from quantiles; ``value`` has no cosine."""
-    with dr.suspend_grad():
-        least = DARK * sum(float(dr.mean(samples.weight * t)[0]) for t in samples.value) / 3
-        ratios = [
-            (dr.log(dr.maximum(t, 1e-12) / dr.maximum(v * samples.wo.z, 1e-12))).numpy()[
-                (t * samples.weight).numpy() > least
-            ]
-            for v, t in zip(value, samples.value, strict=True)
-        ]
-    ratios = np.concatenate(ratios)
-    if not len(ratios):
-        return -LEAST_RANGE, LEAST_RANGE
-    low, high = np.quantile(ratios, [1 - QUANTILE, QUANTILE])
-    low, high = min(low, -LEAST_RANGE), max(high, LEAST_RANGE)
-    margin = MARGIN * (high - low)
-    return float(low - margin), float(high + margin)
+    ratios, low, high = np.concatenate(ratios), -LEAST_RANGE, LEAST_RANGE
+    if len(ratios):
+        ends = np.quantile(ratios, [1 - QUANTILE, QUANTILE])
+        low, high = min(ends[0], low), max(ends[1], high)
+        margin = 0.25 * (high - low)
+        low, high = float(low - margin), float(high + margin)
+    if not form.terms and min(light) < DARK * max(light):
+        low = min(low, high + math.log(1e-4))  # a black channel, relative to the largest value
+    return low, high
 
 
 def residual_problem(

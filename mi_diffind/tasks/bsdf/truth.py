@@ -24,12 +24,6 @@ from .model import MOST_PARAMETERS, Parameter, points
 #: Extensions of files that are sources.
 SUFFIXES = (".xml", ".bsdf", ".pbsdf", ".binary", ".csv")
 
-#: Relative difference of f below which a parameter of a family has no effect.
-EFFECT = 1e-5
-
-#: Share of the values of a source that may be NaN or infinite: a few are at the horizon.
-MOST_NONFINITE = 0.01
-
 #: Largest value f cos θ that counts; a plugin may exceed it next to the horizon.
 LARGEST = 1e8
 
@@ -77,7 +71,7 @@ class MitsubaTruth(Truth):
             dr.eval(sides)
         front, back = (np.stack([channel.numpy() for channel in side]) for side in sides)
         bad, remarks = float((~np.isfinite(front)).any(axis=0).mean()), []
-        if bad > MOST_NONFINITE:
+        if bad > 0.01:  # a few are at the horizon
             raise UsageError(f"{self.name}: {bad:.1%} of its values are not finite, nothing can be fitted to them")
         if bad:
             remarks.append(f"{bad:.2g} of its values are not finite and count as 0")
@@ -223,7 +217,7 @@ class FamilyTruth:
                 coordinates[k] = end
                 value = self.at(coordinates).value(samples.wi, samples.wo)
                 ends.append(np.stack([(samples.weight * v).numpy() for v in value]))
-            if np.abs(ends[1] - ends[0]).sum() <= EFFECT * np.abs(ends[0]).sum():
+            if np.abs(ends[1] - ends[0]).sum() <= 1e-5 * np.abs(ends[0]).sum():
                 raise UsageError(
                     f"over: {parameter.name} changes nothing of {self.truth.name}, which may need it in the source, too"
                 )
@@ -251,7 +245,7 @@ def truth_of(
         return MitsubaTruth(source, source.class_name(), hashlib.sha256(str(source).encode()).hexdigest(), uv)
     if isinstance(source, dict):
         name, content = str(source.get("type", "dictionary")), repr(sorted(source.items(), key=str)).encode()
-        bsdf = _chosen(_built(name, lambda: mi.load_dict(source)), name, material)
+        bsdf = _choose(_load(name, lambda: mi.load_dict(source)), name, material)
         return MitsubaTruth(bsdf, name, _hash(content), uv)
     path = Path(os.fspath(source))
     if fault := irregular(path, memory() // 4):
@@ -267,14 +261,14 @@ def truth_of(
     if suffix == ".pbsdf":
         return PolarisedTruth(path, illuminant)
     if suffix == ".bsdf":
-        bsdf, remark = _built(path, lambda: measured_bsdf(path, illuminant))
+        bsdf, remark = _load(path, lambda: measured_bsdf(path, illuminant))
         truth = MitsubaTruth(bsdf, path.name, _hash(path.read_bytes() + (illuminant.encode() if remark else b"")), uv)
         truth.remark = remark
         return truth
     if suffix != ".xml":
         raise UsageError(f'{path}: found the extension "{path.suffix}", allowed are {", ".join(SUFFIXES)}')
-    loaded = _built(path, lambda: mi.load_file(str(path), optimize=False))
-    bsdf = _chosen(loaded, path, material)
+    loaded = _load(path, lambda: mi.load_file(str(path), optimize=False))
+    bsdf = _choose(loaded, path, material)
     return MitsubaTruth(bsdf, bsdf.id() or path.name, _hash(path.read_bytes() + material.encode()), uv)
 
 
@@ -317,7 +311,7 @@ def _hash(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-def _built(name, load):
+def _load(name, load):
     try:
         return load()
     except UsageError:
@@ -326,7 +320,7 @@ def _built(name, load):
         raise UsageError(f"{name}: cannot be loaded ({reason(RuntimeError(one_sentence(e)))})") from None
 
 
-def _chosen(loaded, name, material: str):
+def _choose(loaded, name, material: str):
     """Return the BSDF of what was loaded: itself, or that of a scene with the id ``material``."""
     import mitsuba as mi
 
@@ -359,7 +353,7 @@ def material_ids(path) -> list[str]:
     """
     import mitsuba as mi
 
-    loaded = _built(path, lambda: mi.load_file(str(path), optimize=False))
+    loaded = _load(path, lambda: mi.load_file(str(path), optimize=False))
     ids = sorted({b.id() for b in _bsdfs(loaded) if b.id()}) if isinstance(loaded, mi.Scene) else [""]
     if not ids:
         raise UsageError(f"{path}: its materials have no ids")

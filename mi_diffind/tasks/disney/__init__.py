@@ -3,15 +3,13 @@
 - :mod:`.model`: the reference model, parameters, factors and colours, and the parts that a material uses;
 - :mod:`.decoder`: the model in two steps, per material and per direction, with methods that tables can replace;
 - :mod:`.arrays`, :mod:`.factored`, :mod:`.paper_variants`: the tables, their base class and both layouts;
-- :mod:`.files`: table files;
 - :mod:`.sampling`: importance sampling and its density;
-- :mod:`.training`: training distributions and errors.
+- :mod:`.training`: training distributions, errors, and table files.
 """
 
 from __future__ import annotations
 
-from ...fitting.settings import FitSettings
-from ...fitting.task import FitRequest, Task
+from ...fitting.task import FitRequest, FitSettings, Task
 
 
 class DisneyTask(Task):
@@ -26,11 +24,11 @@ class DisneyTask(Task):
         "tables": FitSettings(steps=2000, batch=65536, lr=3e-4, schedule="cosine", seed=1),
         "paper": FitSettings(steps=2000, batch=65536, lr=3e-3, schedule="cosine", seed=1),
     }
+    files = "training"
     shipped = {"tables": "disney_tables.npz", "paper": "disney_paper.npz"}  # noqa: RUF012
 
     def problem(self, request: FitRequest):
-        from .files import LAYOUTS
-        from .training import DisneyProblem
+        from .training import LAYOUTS, DisneyProblem
 
         layout, decoder = LAYOUTS[request.preset]
         return DisneyProblem(layout().alloc(request.types.TensorXf), decoder, request.types)

@@ -165,8 +165,10 @@ class Decoder:
 
     def clearcoat(self, c, g, s, wi, wo):
         """Return the clearcoat lobe with its strength, times ``wo.z``."""
-        # Smith's masking for both directions
-        masked, denominator = 4 * wi.z * wo.z, coat_masking_denominator(wi.z) * coat_masking_denominator(wo.z)
+        # Smith's masking for both directions, each 2c / (c + √(α² + (1 − α²) c²))
+        a2 = model.COAT_MASKING_ALPHA**2
+        roots = [c + dr.sqrt(dr.fma(1 - a2, dr.square(c), a2)) for c in (wi.z, wo.z)]
+        masked, denominator = 4 * wi.z * wo.z, roots[0] * roots[1]
         fresnel = dr.fma(1 - COAT_F0, s, COAT_F0)
         coat = self.coat(c)
         return coat["scale"] * g.h2 * fresnel * wo.z * masked / (coat_quadric(coat["a2"], g) * denominator)
@@ -254,12 +256,6 @@ def masking(alpha2, w):
 def coat_quadric(a2, g):
     """Return ``sin² + α² cos²`` of the half vector, times its squared length."""
     return dr.fma(a2, dr.square(g.h.z), dr.square(g.h.x) + dr.square(g.h.y)) + TINY
-
-
-def coat_masking_denominator(cosine):
-    """Return ``c + √(α² + (1 − α²) c²)``; the clearcoat's G₁ is ``2c`` divided by it."""
-    a2 = model.COAT_MASKING_ALPHA**2
-    return cosine + dr.sqrt(dr.fma(1 - a2, dr.square(cosine), a2))
 
 
 def warp_roughness(roughness):

@@ -39,10 +39,6 @@ from .model import ALPHA_MIN, TINY
 LOWEST_ALPHA = 0.2 * ALPHA_MIN
 
 
-#: Limits of the values that are read: those of roughness and anisotropy between 0 and 1, with a margin.
-LOG_ALPHA, LOG_ASPECT = (-12.0, 0.1), (-1.2, 0.0)
-
-
 class FactoredArrays(DisneyArrays):
     """Encoder and decoder tables of the preset ``tables`` as one trainable module."""
 
@@ -152,11 +148,14 @@ class FactoredDecoder(decoder.Decoder):
         self.arrays, self.read = arrays, tuple(read)
 
     def _alpha(self, encoded, anisotropic: bool) -> list:
-        """Return α_x and α_y of the encoded roughness and anisotropy, or one α for an isotropic material."""
-        mean = clamp(sum(self.arrays.alpha([encoded[0]])), *LOG_ALPHA)
+        """Return α_x and α_y of the encoded roughness and anisotropy, or one α for an isotropic material.
+
+        Logarithms that are read are limited to those of parameters between 0 and 1, with a margin.
+        """
+        mean = clamp(sum(self.arrays.alpha([encoded[0]])), -12.0, 0.1)
         if not anisotropic:
             return [dr.maximum(dr.exp(mean), ALPHA_MIN)]
-        aspect = clamp(sum(self.arrays.aspect([encoded[1]])), *LOG_ASPECT)
+        aspect = clamp(sum(self.arrays.aspect([encoded[1]])), -1.2, 0.0)
         return [dr.maximum(dr.exp(v), ALPHA_MIN) for v in (mean - aspect, mean + aspect)]
 
     def required(self, e):

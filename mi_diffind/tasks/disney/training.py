@@ -1,4 +1,4 @@
-"""Training of the Disney tables: distributions, per-factor targets, errors.
+"""Training of the Disney tables: distributions, per-factor targets, errors, and table files.
 
 Each factor is learned against its own analytic target, because the product of all of them is unbounded and dominated
 by the specular peak (supplemental 1.2). View and light directions are uniform over the hemisphere,
@@ -8,16 +8,22 @@ metallic and roughness exponential-like (many low values), the rest uniform.
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 
+from ...arrays.lookup import STORAGES
+from ...arrays.tables import Table, TableError, check_ranges, load_table
 from ...fitting.loop import Problem, exponential_like
+from ...fitting.task import Model
 from . import model
 from .arrays import DisneyArrays
 from .decoder import Decoder, Lobe
+from .factored import FactoredArrays, FactoredDecoder
 from .model import PARAMETERS, Effects, Material, compose, exact_factors
+from .paper import PaperArrays, PaperDecoder
 
 #: Luminance weights of linear sRGB, as ``mi.luminance``.
 LUMINANCE = (0.212671, 0.715160, 0.072169)
@@ -131,3 +137,41 @@ def measure(
     dr.eval(errors)  # one kernel in place of one for each mean
     means = {name: sum(dr.mean(e)[0] for e in channels) / 3 for name, channels in errors.items()}
     return {name: float(v) if name == "mae" else -10 * math.log10(v) for name, v in means.items()}
+
+
+#: Preset → the layout of its tables, and the decoder that reads them.
+LAYOUTS: dict[str, tuple[type[DisneyArrays], type[Decoder]]] = {
+    "tables": (FactoredArrays, FactoredDecoder),
+    "paper": (PaperArrays, PaperDecoder),
+}
+
+
+class DisneyModel(Model):
+    """A table file as a module ``layout`` of its arrays, and the ``decoder`` that reads it."""
+
+    forms = STORAGES
+
+    def build(self):
+        layout, decoder = LAYOUTS[self.table.preset]
+        self.layout = layout(self.arrays)
+        self.decoder = decoder(self.layout)
+
+    def measure(self, samples: int = 10**6) -> dict[str, float]:
+        """Measure errors (:func:`measure`): for training materials, and (``…_uniform_db``) uniform ones."""
+        trained = measure(self.decoder, self.types, samples)
+        uniform = measure(self.decoder, self.types, samples, "uniform")
+        return {**trained, **{f"{k[:-3]}_uniform_db": v for k, v in uniform.items() if k.endswith("_db")}}
+
+
+def load(path: str | os.PathLike) -> Table:
+    """Read a table file of this task and check its layout, sizes and ranges. Raises :class:`TableError`."""
+    table = load_table(path, task="disney")
+    if table.preset not in LAYOUTS:
+        raise TableError(f'{path}: holds tables of the preset "{table.preset}", allowed are {", ".join(LAYOUTS)}')
+    layout, _ = LAYOUTS[table.preset]
+    table = load_table(path, task="disney", shapes=layout.SHAPES)
+    check_ranges(table, layout.RANGES)
+    return table
+
+
+MODEL = DisneyModel

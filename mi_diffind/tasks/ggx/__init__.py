@@ -5,8 +5,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import asdict
 
-from ...fitting.settings import FitSettings
-from ...fitting.task import Argument, FitRequest, Task
+from ...fitting.task import Argument, FitRequest, FitSettings, Task
 
 
 def _side(text: str) -> int:

@@ -11,8 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from ...core.arguments import Argument, between, checked, positive
-from ...fitting.settings import FitSettings
-from ...fitting.task import Task
+from ...fitting.task import FitSettings, Task
 from ...maps.arguments import DECODED, SIZES, SOURCE, SOURCES
 
 
@@ -44,8 +43,8 @@ PAGED = ("pages of 5 bits", "pages of 6 bits", "pages of 2 + 6 bits")
 
 
 @dataclass(frozen=True)
-class ImageRecipe:
-    """Storage and training of an image.
+class ImageSettings(FitSettings):
+    """Storage and training of an image; the defaults are those of the preset ``ours``.
 
     - ``once``: store equal channels once, and constant channels as numbers (:meth:`.Layout.of`).
     - ``normals``: leave out the third component of normals where it follows from the others.
@@ -53,10 +52,14 @@ class ImageRecipe:
     - ``jitter``: share of the steps whose samples are jittered.
     - ``rounded``: share of the steps, the last ones, that read entries rounded to their stored values.
     - ``structure``: one of :data:`STRUCTURES`, or ``"auto"``; ``dims``: coordinates of a pointer.
-    - ``settings``: steps, batch, rate and loss.
     - ``weights``: name of a map → factor of its differences, wherever errors are compared; 1 for other maps.
     """
 
+    steps: int = 1500
+    batch: int = 2**18
+    lr: float = 3e-2
+    loss: str = "mse"
+    measure_every: int = 150
     once: bool = True
     normals: bool = True
     components: bool = True
@@ -64,26 +67,22 @@ class ImageRecipe:
     rounded: float = 1.0
     structure: str = "auto"
     dims: int = 4
-    settings: FitSettings = dataclasses.field(default_factory=FitSettings)
     weights: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
 
-#: Steps of 262,144 samples of a training without a time limit.
-STEPS = 1500
-
-_OURS = FitSettings(steps=STEPS, batch=2**18, lr=3e-2, schedule="cosine", loss="mse", measure_every=STEPS // 10)
-_PAPER = dataclasses.replace(_OURS, batch=2**20, steps=STEPS // 4, lr=1e-3, schedule="constant", loss="mae")
-
-#: Recipes by name; the first is the default.
+#: Settings by preset; the first is the default.
 PRESETS = {
-    "ours": ImageRecipe(settings=_OURS),
-    "paper": ImageRecipe(False, False, False, 1.0, 0.0, "8 bits", 4, _PAPER),
-}
+    "ours": ImageSettings(),
+    "paper": ImageSettings(
+        steps=375, batch=2**20, lr=1e-3, schedule="constant", loss="mae", once=False, normals=False, components=False,
+        jitter=1.0, rounded=0.0, structure="8 bits",
+    ),
+}  # fmt: skip
 
 #: Largest weight of a map.
 MOST_WEIGHT = 100
 
-#: Improvements over the supplement's recipe that can be switched off.
+#: Improvements over the supplement that can be switched off: most are called like the setting that they change.
 IMPROVEMENTS = {
     "once": "equal and constant channels are stored once",
     "normals": "normals as two channels where the third follows",
@@ -113,27 +112,17 @@ def parse_weights(text: str) -> str | dict[str, float]:
     return weights
 
 
-def without(recipe: ImageRecipe, names) -> ImageRecipe:
-    """Return ``recipe`` with some of :data:`IMPROVEMENTS` switched off. Raises ``ValueError`` for an unknown name."""
-    paper = PRESETS["paper"]
+def without(settings: ImageSettings, names) -> ImageSettings:
+    """Return ``settings`` with some of :data:`IMPROVEMENTS` switched off. Raises ``ValueError`` for an unknown name."""
+    paper, changes = PRESETS["paper"], {}
     for name in names:
         if name not in IMPROVEMENTS:
             raise ValueError(f'found the improvement "{name}", allowed are {", ".join(IMPROVEMENTS)}')
-        if name == "loss":
-            recipe = replaced(recipe, loss=paper.settings.loss)
-        elif name == "rate":
-            recipe = replaced(recipe, lr=paper.settings.lr, schedule=paper.settings.schedule)
-        elif name == "batch":
-            batches = paper.settings.batch // recipe.settings.batch
-            recipe = replaced(recipe, batch=paper.settings.batch, steps=max(1, recipe.settings.steps // batches))
-        else:
-            recipe = dataclasses.replace(recipe, **{name: getattr(paper, name)})
-    return recipe
-
-
-def replaced(recipe: ImageRecipe, **settings) -> ImageRecipe:
-    """Return ``recipe`` with other settings of the training."""
-    return dataclasses.replace(recipe, settings=dataclasses.replace(recipe.settings, **settings))
+        fields = ("lr", "schedule") if name == "rate" else (name,)
+        changes |= {field: getattr(paper, field) for field in fields}
+        if name == "batch":
+            changes["steps"] = max(1, settings.steps // (paper.batch // settings.batch))
+    return dataclasses.replace(settings, **changes)
 
 
 class Image(Task):
@@ -145,8 +134,9 @@ class Image(Task):
     section = "supplemental 1.3"
     example = "material.json --compression 12x"
     plugin = ("texture", "neural_image")
-    presets = {name: recipe.settings for name, recipe in PRESETS.items()}  # noqa: RUF012
+    presets = PRESETS
     storages = ()
+    measurements = 10
     arguments = (
         SOURCE,
         *SIZES,
@@ -179,9 +169,8 @@ class Image(Task):
     decode_arguments = DECODED
 
     def settings(self, preset, given, options):
-        defaults = without(PRESETS[preset], options["without"]).settings
-        steps = given.get("steps", defaults.steps)
-        return dataclasses.replace(defaults, **{"measure_every": max(1, steps // 10), **given})
+        chosen = {name: options[name] for name in ("structure", "dims") if options[name] is not None}
+        return self.change_settings(without(PRESETS[preset], options["without"]), {**chosen, **given})
 
 
 TASK = Image()

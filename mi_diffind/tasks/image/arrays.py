@@ -20,12 +20,21 @@ import numpy as np
 
 from ...arrays.budget import Budget, array_bytes
 from ...arrays.indirection import DifferentiableArray, Indirection, ramp
-from ...arrays.pages import PagedArray, page_counts, page_entries, page_gain, page_positions, page_shift, page_sizes
-from ...arrays.tables import PAGES, Table, TableError, load_table, to_stored_arrays
+from ...arrays.pages import PagedArray, page_counts, page_entries, page_positions, page_shift, page_sizes
+from ...arrays.tables import PAGES, Table, load_table, to_stored_arrays
 from ...core.compat import backend_module
-from ...maps.compressed import CompressedMaps
-from ...maps.layout import Layout, channel_covariance, downscale, eigenvectors, neighbour_covariance
-from ...maps.model import MapsModel, allocate_maps, stored_entries
+from ...maps.layout import (
+    MARGIN,
+    Layout,
+    channel_covariance,
+    component_range,
+    downscale,
+    eigenvectors,
+    linear_in_pointer,
+    neighbour_covariance,
+)
+from ...maps.model import MapsModel, allocate_maps, check_arrays, read_layout
+from ...maps.pyramid import CompressedMaps
 from . import CoarsePrimary
 
 #: Best resolution ratio for compression ratios of RGB textures at 4K (the supplement's table 2).
@@ -49,12 +58,6 @@ CASCADED_STEP = 4
 #: Names of the primary arrays: the second, of lower resolution, is optional. The first may consist of pages.
 PRIMARIES = ("primary", "coarse")
 PRIMARY_PAGES = PRIMARIES[0] + PAGES
-
-#: Room between the range of components and the ends of [0, 1].
-MARGIN = 0.02
-
-#: Share of texels beyond the range of components at either end.
-OUTSIDE = 1e-3
 
 
 def resolution_ratio(compression: float, resolution: float) -> float:
@@ -114,35 +117,6 @@ class ImageBudget:
         return math.sqrt(self.rows * self.columns) / self.cascaded
 
 
-def paper_search(
-    uncompressed_bytes: int,
-    compression: float,
-    channels: int,
-    height: int,
-    width: int,
-    ratio: float,
-    dims: int = 4,
-    bits: int = 8,
-) -> ImageBudget:
-    """Return the result of the paper's search over the sides ``N_c`` = 4, 8, 12, … of the cascaded array.
-
-    The search minimises ``|compression − uncompressed_bytes / bytes|``, with ``N_p = ratio · N_c`` in multiples
-    of 8. Equation 1 has squares only: for a non-square image the ``N_p²`` entries are spread in its proportions, in
-    whole rows and columns. The primary is never larger than the image (square: than the largest multiple of 8 in it, if
-    there is one).
-    """
-    largest = _spread(PRIMARY_STEP * max(height, width), height, width)
-
-    def sized(cascaded: int) -> ImageBudget:
-        side = PRIMARY_STEP * max(1, round(ratio * cascaded / PRIMARY_STEP))
-        rows, columns = _spread(side, height, width)
-        return ImageBudget(rows, columns, cascaded, channels, dims, bits, full=(rows, columns) == largest)
-
-    budget = Budget(uncompressed_bytes / compression)
-    most = int((budget.nbytes / channels) ** (1 / dims)) + 2 * CASCADED_STEP  # takes more than all bytes
-    return sized(budget.nearest(sized, range(CASCADED_STEP, most + 1, CASCADED_STEP), uncompressed_bytes))
-
-
 def search(
     uncompressed_bytes: int,
     compression: float,
@@ -153,23 +127,27 @@ def search(
     bits: int = 8,
     ratio: float | None = None,
 ) -> ImageBudget:
-    """Return :func:`paper_search` with ``ratio``, corrected if it is more than 5% off.
+    """Return the result of the paper's search over the sides of the cascaded array (:meth:`.Budget.paper_side`).
 
-    The default of ``ratio`` is :func:`resolution_ratio`.
+    ``N_p = ratio · N_c`` in multiples of 8, by default of :func:`resolution_ratio`. Equation 1 has squares only: for a
+    non-square image the ``N_p²`` entries are spread in its proportions, in whole rows and columns. The primary is never
+    larger than the image (square: than the largest multiple of 8 in it, if there is one).
 
-    Sides in steps can miss ``compression`` by far (4K RGB at 12x becomes 13.4x at ρ = 80). Then the cascaded array is
-    kept, or reduced until it takes at most half of the bytes, and the primary becomes the largest that fits
-    (:func:`fit_bytes`): 1×1 for images so small that the smallest cascaded array (``N_c`` = 4) is too large.
+    Sides in steps can miss ``compression`` by far (4K RGB at 12x becomes 13.4x at ρ = 80). Then the primary becomes the
+    largest that fits beside the cascaded array (:func:`fit_bytes`): 1×1 for images so small that the smallest cascaded
+    array (``N_c`` = 4) is too large.
     """
     ratio = ratio or resolution_ratio(compression, math.sqrt(height * width))
-    size = paper_search(uncompressed_bytes, compression, channels, height, width, ratio, dims, bits)
-    budget = uncompressed_bytes / compression
-    if Budget(budget).is_met(size.nbytes):
-        return size
-    side = size.cascaded
-    while side > CASCADED_STEP and channels * side**dims > budget / 2:
-        side -= CASCADED_STEP
-    return fit_bytes(budget, channels, height, width, side, dims, bits)
+    largest = _spread(PRIMARY_STEP * max(height, width), height, width)
+
+    def sized(cascaded: int) -> ImageBudget:
+        side = PRIMARY_STEP * max(1, round(ratio * cascaded / PRIMARY_STEP))
+        rows, columns = _spread(side, height, width)
+        return ImageBudget(rows, columns, cascaded, channels, dims, bits, full=(rows, columns) == largest)
+
+    budget = Budget(uncompressed_bytes / compression)
+    side, met = budget.paper_side(sized, channels, dims, uncompressed_bytes, CASCADED_STEP)
+    return sized(side) if met else fit_bytes(budget.nbytes, channels, height, width, side, dims, bits)
 
 
 def cascaded_side(budget: float, channels: int, dims: int = 4, share: float = 0.08) -> int:
@@ -284,15 +262,9 @@ def from_components(values: np.ndarray, size: ImageBudget, border: tuple[str, st
             projected = (downscale(values, rows, columns, border) - mean) @ directions.T
         unit = np.zeros((*projected.shape[:-1], 0))
         if used:
-            low, high = np.quantile(projected.reshape(-1, used), [OUTSIDE, 1 - OUTSIDE], axis=0)
-            high = np.maximum(high, low + 1e-3)
+            low, high = component_range(projected)
             unit = MARGIN + (1 - 2 * MARGIN) * np.clip((projected - low) / (high - low), 0, 1)
-            grid = (np.linspace(0, 1, size.cascaded) - MARGIN) / (1 - 2 * MARGIN)
-        for j in range(used):
-            along = np.reshape(
-                low[j] + grid * (high[j] - low[j]), [-1 if d == axis + j else 1 for d in range(size.dims)]
-            )
-            back = back + along[..., None] * directions[j]
+            back = linear_in_pointer(back, directions, low, high, size.cascaded, range(axis, axis + used), size.dims)
         if dims > used:
             further = range(dims - used)
             if paged:
@@ -309,18 +281,6 @@ def from_components(values: np.ndarray, size: ImageBudget, border: tuple[str, st
     shape = (size.cascaded,) * size.dims
     back = np.clip(np.broadcast_to(back / weights, (*shape, k)), 1e-3, 1 - 1e-3)
     return join_primaries(primaries, DifferentiableArray(shape, k, back.astype(np.float32), fold=True))
-
-
-def gain_of_pages(values: np.ndarray, size: ImageBudget, border: tuple[str, str]) -> tuple[float, float]:
-    """Return :func:`~mi_diffind.arrays.pages.page_gain` of the components of an image, for one primary."""
-    k = values.shape[-1]
-    mean = values.reshape(-1, k).mean(axis=0, dtype=np.float64)
-    covariance = channel_covariance(values, mean)
-    directions = eigenvectors(covariance, min(size.dims, k))
-    rest = np.trace(covariance) - np.trace(directions @ covariance @ directions.T)
-    exact = ((values - mean) @ directions.T).astype(np.float32)
-    gain, psnr = page_gain(exact, border, page_budget(size, values.shape), max(float(rest), 0.0))
-    return gain, psnr + 10 * math.log10(k)
 
 
 def page_budget(size: ImageBudget, shape: Sequence[int]) -> float:
@@ -343,9 +303,9 @@ class CompressedImage(CompressedMaps):
         self.border = ("clamp", "clamp") if net is None else net.primary[0].border
 
     @staticmethod
-    def of(table: Table, dtype, storage: str = "") -> CompressedImage:
+    def from_table(table: Table, dtype, storage: str = "") -> CompressedImage:
         """Return the image of a checked table, in a storage form (:func:`allocate`)."""
-        return assembled(table, allocate(table, dtype, storage))
+        return assemble(table, allocate(table, dtype, storage))
 
     def stored(self, u, v, active=True) -> list:
         """Return the stored channels at (u, v)."""
@@ -358,7 +318,7 @@ def allocate(table: Table, dtype, storage: str = "") -> dict[str, Differentiable
     return allocate_maps(table, dtype, storage, lambda name: (layout.height, layout.width))
 
 
-def assembled(table: Table, arrays: dict[str, DifferentiableArray]) -> CompressedImage:
+def assemble(table: Table, arrays: dict[str, DifferentiableArray]) -> CompressedImage:
     """Return the image of a checked table from its allocated arrays."""
     primaries = [arrays[name] for name in PRIMARIES if name in arrays]
     net = join_primaries(primaries, arrays["cascaded"]) if arrays else None
@@ -377,34 +337,16 @@ def to_table(image: CompressedImage, settings: dict) -> Table:
 def load(path: str | os.PathLike) -> Table:
     """Read and check a table file of this task. Raises :class:`.TableError`."""
     table = load_table(path, "image")
-    try:
-        layout = Layout.from_json(table.settings["layout"])
-    except (KeyError, TypeError, ValueError, OverflowError) as e:
-        raise TableError(f"{path}: its settings describe no image ({e})") from None
-    names = set(table.arrays) - {PRIMARY_PAGES}
-    expected = [{"primary", "cascaded"}, {*PRIMARIES, "cascaded"}] if layout.stored else [set()]
-    if names not in expected:
-        allowed = " or ".join(", ".join(sorted(e)) or "none" for e in expected)
-        raise TableError(f"{path}: holds the arrays {', '.join(sorted(names)) or 'none'}, expected {allowed}")
+    layout, arrays = read_layout(table), table.arrays
     if not layout.stored:
+        check_arrays(table, {}, {})
         return table
-    shapes = {name: array.shape for name, array in table.arrays.items() if name != PRIMARY_PAGES}
-    if PRIMARY_PAGES in table.arrays:
-        entries, size = shapes["primary"], (layout.height, layout.width)
-        count = stored_entries(table, "primary", size)
-        if len(entries) != 2 or entries[0] != count:
-            raise TableError(f'{path}: array "primary" has the shape {entries}, expected {count} entries of its pages')
-        shapes["primary"] = (*page_counts(size), entries[-1])
-    cascaded = shapes.pop("cascaded")
-    pointers = sum(shape[-1] for shape in shapes.values())
-    if any(len(s) != 3 for s in shapes.values()) or len(cascaded) != pointers + 1 or cascaded[-1] != layout.stored:
-        raise TableError(
-            f"{path}: primary arrays of the shapes {', '.join(map(str, shapes.values()))} and a cascaded array of "
-            f"{cascaded} do not fit an image of {layout.stored} stored channel(s)"
-        )
-    for name, array in table.arrays.items():
-        if name != PRIMARY_PAGES and not array.is_pointer:
-            raise TableError(f'{path}: array "{name}" has entries outside of [0, 1]')
+    pages = {"primary": (layout.height, layout.width)} if PRIMARY_PAGES in arrays else {}
+    shapes = {name: (None,) * 3 for name in PRIMARIES if name == "primary" or name in arrays}
+    pointers = sum(arrays[name].shape[-1] for name in shapes if name in arrays)
+    if pages and "primary" in arrays:
+        shapes["primary"] = (None, arrays["primary"].shape[-1])
+    check_arrays(table, {**shapes, "cascaded": (None,) * pointers + (layout.stored,)}, pages)
     return table
 
 
@@ -412,7 +354,7 @@ class ImageModel(MapsModel):
     """Model of an image file; ``image`` is a :class:`CompressedImage`."""
 
     def build(self):
-        self.image = assembled(self.table, self.arrays)
+        self.image = assemble(self.table, self.arrays)
 
 
 MODEL = ImageModel

@@ -12,16 +12,13 @@ from ...arrays.budget import Budget
 from ...arrays.pages import most_entries
 from ...arrays.tables import MAX_BYTES, Table
 from ...core.errors import UsageError
-from ...fitting.loop import FitResult
-from ...fitting.settings import FittingError
-from ...fitting.task import FitRequest, Fitted
+from ...fitting.task import FitRequest, FitResult, Fitted, FittingError
 from ...maps import as_seen
-from ...maps.arguments import requested_border, requested_bytes
-from ...maps.model import complete, rehearse_pictures
+from ...maps.model import complete, rehearse_pictures, requested_border, requested_bytes
 from ...maps.source import Source, load_source
-from . import PAGED, PRESETS, STRUCTURES, CoarsePrimary, ImageRecipe, parse_weights, replaced, without
+from . import PAGED, STRUCTURES, CoarsePrimary, ImageSettings, parse_weights
 from .arrays import CompressedImage, ImageBudget, cascaded_side, fit_bytes, search
-from .training import fit_image, layout_of, pointer_dims, problem_of, structure_of
+from .training import build_problem, choose_structure, fit_image, pointer_dims, source_layout
 
 #: Share of the steps that a candidate of a search is trained for.
 SHORT = 1 / 8
@@ -60,18 +57,6 @@ SAMPLE_SIDE = 512
 SAMPLE_PATCH = 64
 
 
-def recipe_of(preset: str, settings, options) -> ImageRecipe:
-    """Return the recipe of a preset, changed by the options. Raises :class:`UsageError`."""
-    recipe = without(PRESETS[preset], options["without"])
-    given = {k: options[k] for k in ("structure", "dims") if options[k] is not None}
-    recipe = dataclasses.replace(recipe, settings=settings or recipe.settings, **given)
-    if STRUCTURES.get(recipe.structure, (8, None))[1] and recipe.dims < 3:
-        raise UsageError(f'--structure "{recipe.structure}" has two primary arrays, allowed are --dims 3 and 4')
-    if recipe.structure in PAGED and not recipe.components:
-        raise UsageError(f'--structure "{recipe.structure}" starts from components: leave out --without components')
-    return recipe
-
-
 def check(request: FitRequest) -> None:
     """Raise :class:`UsageError` for options that do not go together."""
     options = request.options
@@ -88,7 +73,11 @@ def check(request: FitRequest) -> None:
         raise UsageError("--without: the preset paper has none of our improvements: leave it out")
     if options["source"] is None:
         raise UsageError("source: not given, an image or a manifest of the maps of a material is needed")
-    recipe = recipe_of(request.preset, request.settings, options)
+    recipe = request.settings
+    if STRUCTURES.get(recipe.structure, (8, None))[1] and recipe.dims < 3:
+        raise UsageError(f'--structure "{recipe.structure}" has two primary arrays, allowed are --dims 3 and 4')
+    if recipe.structure in PAGED and not recipe.components:
+        raise UsageError(f'--structure "{recipe.structure}" starts from components: leave out --without components')
     if options["ratio"] is not None:
         if recipe.components or STRUCTURES[recipe.structure][1]:
             raise UsageError("--ratio: for the preset paper with one primary array; ours takes --cascaded")
@@ -104,21 +93,23 @@ def fit(request: FitRequest) -> Fitted:
     """
     options = request.options
     source = load_source(options["source"], nonfinite=options["nonfinite"])
-    recipe = recipe_of(request.preset, request.settings, options)
-    recipe = dataclasses.replace(recipe, weights=_weights(request, source, recipe))
+    recipe = dataclasses.replace(request.settings, weights=_weights(request, source, request.settings))
     rehearse_pictures(request, source)
     fitted, requested = _train(request, source, recipe)
-    return complete(request, source, fitted, CompressedImage.of(fitted.table, request.types.TensorXf), requested)
+    return complete(
+        request, source, fitted, CompressedImage.from_table(fitted.table, request.types.TensorXf), requested
+    )
 
 
-def _train(request: FitRequest, source: Source, recipe: ImageRecipe) -> tuple[Fitted, float | None]:
+def _train(request: FitRequest, source: Source, recipe: ImageSettings) -> tuple[Fitted, float | None]:
     """Return the result of the training or search, and the requested bytes."""
     options = request.options
     border = requested_border(options)
-    if not layout_of(source, recipe).stored:  # all channels are constant
+    if not source_layout(source, recipe).stored:  # all channels are constant
         return Fitted(*fit_image(source, None, recipe, request, border), figures={"tried": []}), None
     if options["psnr"] is not None:
-        return _for_psnr(request, source, recipe, border), None
+        table, result, tried = psnr_search(source, float(options["psnr"]), recipe, request, border)
+        return Fitted(table, result, figures={"tried": tried}), None
     requested = requested_bytes(options, source)
     tried, lines = [], []
     if options["ratio_search"]:
@@ -149,29 +140,16 @@ def _train(request: FitRequest, source: Source, recipe: ImageRecipe) -> tuple[Fi
     return Fitted(*fit_image(source, size, recipe, request, border), lines, {"tried": tried}), requested
 
 
-def _for_psnr(request: FitRequest, source: Source, recipe: ImageRecipe, border) -> Fitted:
-    """Return the smallest file of a wanted quality. Raises :class:`FittingError`."""
-    goal = float(request.options["psnr"])
-    table, result, tried = psnr_search(source, goal, recipe, request, border)
-    if table is None:
-        best = max(tried, key=lambda t: t["psnr_db"])
-        raise FittingError(
-            f"{request.options['source']}: {goal:g} dB were not reached; the best of {len(tried)} sizes had "
-            f"{best['psnr_db']:.2f} dB in {best['bytes']:,} bytes: give more --steps or a lower --psnr"
-        )
-    return Fitted(table, result, figures={"tried": tried})
-
-
 # ---------------------- Sizes ----------------------
 
 
-def default_size(source: Source, nbytes: float, recipe: ImageRecipe, ratio: float | None = None) -> ImageBudget:
+def default_size(source: Source, nbytes: float, recipe: ImageSettings, ratio: float | None = None) -> ImageBudget:
     """Return the default budget of a recipe for ``nbytes`` bytes.
 
     The supplement's search, with ``ratio`` in place of its table if given; or, with ``components`` or two primaries, a
     cascaded array of :func:`.cascaded_side` and the largest primary that fits beside it.
     """
-    stored, structure = max(1, layout_of(source, recipe).stored), structure_of(source, recipe, nbytes)
+    stored, structure = max(1, source_layout(source, recipe).stored), choose_structure(source, recipe, nbytes)
     bits, coarse = STRUCTURES[structure]
     if recipe.components or coarse:
         return sized(source, nbytes, recipe, cascaded_side(nbytes, stored, pointer_dims(recipe, structure, stored)))
@@ -179,9 +157,9 @@ def default_size(source: Source, nbytes: float, recipe: ImageRecipe, ratio: floa
     return search(source.nbytes, source.nbytes / nbytes, stored, *size, recipe.dims, bits, ratio)
 
 
-def sized(source: Source, nbytes: float, recipe: ImageRecipe, cascaded: int) -> ImageBudget:
+def sized(source: Source, nbytes: float, recipe: ImageSettings, cascaded: int) -> ImageBudget:
     """Return the budget for ``nbytes`` bytes with a cascaded array of a given side."""
-    stored, structure = max(1, layout_of(source, recipe).stored), structure_of(source, recipe, nbytes)
+    stored, structure = max(1, source_layout(source, recipe).stored), choose_structure(source, recipe, nbytes)
     (bits, coarse), dims = STRUCTURES[structure], pointer_dims(recipe, structure, stored)
     size = fit_bytes(nbytes, stored, source.height, source.width, cascaded, dims, bits, coarse)
     return dataclasses.replace(size, paged=structure in PAGED)
@@ -195,13 +173,13 @@ class RatioSearch(NamedTuple):
     """
 
     size: ImageBudget
-    recipe: ImageRecipe
+    recipe: ImageSettings
     tried: list[dict]
     best: tuple[Table, FitResult] | None = None
 
 
 def ratio_search(
-    source: Source, nbytes: float, recipe: ImageRecipe, request: FitRequest, free: bool = True, border=None
+    source: Source, nbytes: float, recipe: ImageSettings, request: FitRequest, free: bool = True, border=None
 ) -> RatioSearch:
     """Return the best of several budgets of ``nbytes`` bytes, each trained for :data:`SHORT` of the steps.
 
@@ -209,7 +187,7 @@ def ratio_search(
     and the dimensions. The best mean of the qualities at texels and between them is kept after each. ``request`` and
     ``border`` are those of :func:`.fit_image`.
     """
-    steps, limit = max(20, round(recipe.settings.steps * SHORT)), request.part(SEARCHED).deadline
+    steps, limit = max(20, round(recipe.steps * SHORT)), request.part(SEARCHED).deadline
     tried, best = {}, None
 
     def quality(key: tuple) -> float:
@@ -220,7 +198,7 @@ def ratio_search(
         return max(tried, key=quality, default=None)
 
     start = default_size(source, nbytes, recipe)
-    recipe = dataclasses.replace(recipe, structure=structure_of(source, recipe, nbytes), dims=start.dims)
+    recipe = dataclasses.replace(recipe, structure=choose_structure(source, recipe, nbytes), dims=start.dims)
     for candidate, side in _candidates(recipe, start.cascaded, free, leader):
         size = sized(source, nbytes, candidate, side)
         key = candidate.structure, size.dims, side
@@ -229,7 +207,7 @@ def ratio_search(
         if tried and limit is not None and limit.left() < limit.seconds / CANDIDATES:
             continue
         share = 1.0 if limit is None else limit.seconds / CANDIDATES / limit.left()
-        shortened = replaced(dataclasses.replace(candidate, dims=size.dims), steps=steps, measure_every=steps)
+        shortened = dataclasses.replace(candidate, dims=size.dims, steps=steps, measure_every=steps)
         title = f"try {size.columns}×{size.rows}×{size.dims} of {candidate.structure} → {size.cascaded}"
         limited = request if limit is None else dataclasses.replace(request, deadline=limit.part(share))
         table, result = fit_image(source, size, shortened, limited, border, title)
@@ -250,7 +228,7 @@ def ratio_search(
     return RatioSearch(sized(source, nbytes, recipe, side), recipe, list(tried.values()), best)
 
 
-def _candidates(recipe: ImageRecipe, side: int, free: bool, leader: Callable) -> Iterator[tuple[ImageRecipe, int]]:
+def _candidates(recipe: ImageSettings, side: int, free: bool, leader: Callable) -> Iterator[tuple[ImageSettings, int]]:
     """Yield recipes with sides of the cascaded array to try; later ones depend on the ``leader`` of those before."""
     yield from ((recipe, s) for s in sorted(SIDES[recipe.dims], key=lambda s: abs(math.log(s / side))))
     if not free or leader() is None:
@@ -271,17 +249,16 @@ def _candidates(recipe: ImageRecipe, side: int, free: bool, leader: Callable) ->
 
 
 def psnr_search(
-    source: Source, goal: float, recipe: ImageRecipe, request: FitRequest, border=None, most: int = TRAININGS
-) -> tuple[Table | None, FitResult | None, list[dict]]:
+    source: Source, goal: float, recipe: ImageSettings, request: FitRequest, border=None, most: int = TRAININGS
+) -> tuple[Table, FitResult, list[dict]]:
     """Search the smallest file whose ``psnr_db`` is at least ``goal``, by trainings of full length.
 
     Sizes follow the secant of quality over the logarithm of bytes. The search ends when a sufficient size is within
-    :data:`NEAR` of an insufficient one, or after ``most`` trainings. Returns the table (``None`` if not even the
-    largest primary reaches the goal), the record of its training, and the list of trainings; a line is printed for
-    each. After Ctrl-C the record is marked ``interrupted``; ``KeyboardInterrupt`` is raised if no training had reached
-    the goal.
+    :data:`NEAR` of an insufficient one, or after ``most`` trainings. Returns the table, the record of its training, and
+    the list of trainings; a line is printed for each. After Ctrl-C the record is marked ``interrupted``. Raises
+    :class:`FittingError`, or after Ctrl-C ``KeyboardInterrupt``, if no training has reached the goal.
     """
-    tried, best = [], (None, None)
+    tried, best = [], None
     most = most if request.deadline is None else min(most, LIMITED_TRAININGS)
     nbytes = middle = source.nbytes / 12
     while len(tried) < most:
@@ -294,10 +271,10 @@ def psnr_search(
         psnr = table.measured["psnr_db"]
         tried.append({"bytes": size.nbytes, "psnr_db": psnr, "rows": size.rows, "cascaded": size.cascaded})
         print(f"{size.nbytes:,} bytes: {psnr:.2f} dB")
-        if psnr >= goal and (best[0] is None or table.nbytes < best[0].nbytes):
+        if psnr >= goal and (best is None or table.nbytes < best[0].nbytes):
             best = table, result
         if result.interrupted:
-            if best[0] is None:
+            if best is None:
                 raise KeyboardInterrupt
             best[1].interrupted = True
             break
@@ -315,13 +292,19 @@ def psnr_search(
         octaves = (goal - psnr) / OCTAVE_DB
         octaves = math.copysign(min(max(abs(octaves) * 1.2, 0.25), 3), octaves)
         nbytes = middle = size.nbytes * 2**octaves
+    if best is None:
+        nearest = max(tried, key=lambda t: t["psnr_db"])
+        raise FittingError(
+            f"{request.options['source']}: {goal:g} dB were not reached; the best of {len(tried)} sizes had "
+            f"{nearest['psnr_db']:.2f} dB in {nearest['bytes']:,} bytes: give more --steps or a lower --psnr"
+        )
     return *best, tried
 
 
 # ---------------------- Weights of maps ----------------------
 
 
-def _weights(request: FitRequest, source: Source, recipe: ImageRecipe) -> dict[str, float]:
+def _weights(request: FitRequest, source: Source, recipe: ImageSettings) -> dict[str, float]:
     """Return the weights of maps that differ from 1. Raises :class:`UsageError` for a map that the source lacks."""
     given = request.options["weights"]
     given = parse_weights(given) if isinstance(given, str) else dict(given)
@@ -336,25 +319,25 @@ def _weights(request: FitRequest, source: Source, recipe: ImageRecipe) -> dict[s
     return given
 
 
-def weights_as_seen(source: Source, recipe: ImageRecipe, nbytes: float, types: ModuleType) -> dict[str, float]:
+def weights_as_seen(source: Source, recipe: ImageSettings, nbytes: float, types: ModuleType) -> dict[str, float]:
     """Return weights of maps by what an error of each does to a shaded picture (:func:`balance_weights`).
 
     Returns {} (equal weights) if initial arrays of ``nbytes`` gain less than :data:`GAIN_DB` by them in pictures, if
     pictures do not show the ``source``, or if the recipe does not start from components.
     """
-    if not (as_seen.shows(source) and recipe.components and layout_of(source, recipe).stored):
+    if not (as_seen.shows(source) and recipe.components and source_layout(source, recipe).stored):
         return {}
     share = nbytes / source.nbytes
     maps = [dataclasses.replace(m, values=as_seen.patchwork(m.values, SAMPLE_SIDE, SAMPLE_PATCH)) for m in source.maps]
     sample = Source(tuple(maps), *maps[0].values.shape[:2], f"{source.digest} sample")
-    channels = {name: len(indices) for name, indices in layout_of(sample, recipe).channels_by_map().items()}
+    channels = {name: len(indices) for name, indices in source_layout(sample, recipe).channels_by_map().items()}
     squares = as_seen.sensitivities(sample, types)
     weights = balance_weights({name: squares[name] for name in channels}, channels)
 
     def start_db(weights: dict) -> float:
         """Return the PSNR as seen from near of initial arrays."""
         weighted = dataclasses.replace(recipe, weights=weights)
-        problem = problem_of(sample, default_size(sample, share * sample.nbytes, weighted), weighted, types)
+        problem = build_problem(sample, default_size(sample, share * sample.nbytes, weighted), weighted, types)
         return as_seen.measure(sample, CompressedImage(problem.layout, problem.net), as_seen.NEAR)["seen_db"]
 
     before, after = start_db({}), start_db(weights)

@@ -17,14 +17,12 @@ from ...arrays import lookup
 from ...arrays.indirection import aligned, aligned_copy, rounded, stored_form
 from ...arrays.pages import most_entries, page_counts
 from ...arrays.tables import Table
-from ...fitting.loop import FitResult, Problem
-from ...fitting.task import FitRequest
-from ...maps.compressed import decibel, mean_square
-from ...maps.layout import Layout, choose_borders, smoothness
-from ...maps.model import fit_maps
-from ...maps.pyramid import padded_texels, weighted_sum
+from ...fitting.task import FitRequest, FitResult
+from ...maps.layout import Layout, choose_borders, gain_of_pages, smoothness
+from ...maps.model import MapsProblem, fit_maps, strata
+from ...maps.pyramid import decibel, mean_square, padded_texels
 from ...maps.source import Source
-from . import PAGED, STRUCTURES, ImageRecipe, arrays
+from . import PAGED, STRUCTURES, ImageSettings, arrays
 from .arrays import CompressedImage, ImageBudget, to_table
 
 #: Least smoothness, in dB, of an image for one primary (:func:`~mi_diffind.maps.layout.smoothness`).
@@ -42,18 +40,18 @@ ENTRIES = 3
 _structures: dict[tuple, str] = {}  # structures of "auto" by source and recipe: the choice takes a second
 
 
-def structure_of(source: Source, recipe: ImageRecipe, nbytes: float | None = None) -> str:
+def choose_structure(source: Source, recipe: ImageSettings, nbytes: float | None = None) -> str:
     """Return the structure of a recipe; ``"auto"`` is chosen by the image and ``nbytes`` (default: a twelfth)."""
     if recipe.structure != "auto":
         return recipe.structure
     nbytes = source.nbytes / 12 if nbytes is None else nbytes
     key = (source.digest, recipe.once, recipe.normals, recipe.components, recipe.dims, nbytes)
     if key not in _structures:
-        _structures[key] = _suitable(layout_of(source, recipe).encode(source), recipe, nbytes)
+        _structures[key] = _suitable(source_layout(source, recipe).encode(source), recipe, nbytes)
     return _structures[key]
 
 
-def pointer_dims(recipe: ImageRecipe, structure: str, stored: int) -> int:
+def pointer_dims(recipe: ImageSettings, structure: str, stored: int) -> int:
     """Return the dimensions of the cascaded array for ``stored`` channels.
 
     A single primary of pages has at most ``stored`` (at least 2): more entries gain more than more coordinates.
@@ -62,7 +60,7 @@ def pointer_dims(recipe: ImageRecipe, structure: str, stored: int) -> int:
     return min(recipe.dims, max(stored, 2)) if single else recipe.dims
 
 
-def _suitable(values: np.ndarray, recipe: ImageRecipe, nbytes: float) -> str:
+def _suitable(values: np.ndarray, recipe: ImageSettings, nbytes: float) -> str:
     """Return the structure for an image, ``(height, width, k)``, in ``nbytes`` bytes."""
     height, width, k = values.shape
     smooth = recipe.dims < 3 or smoothness(values) >= SMOOTH_DB
@@ -73,32 +71,31 @@ def _suitable(values: np.ndarray, recipe: ImageRecipe, nbytes: float) -> str:
         side = arrays.cascaded_side(nbytes, k, dims)
         size = arrays.fit_bytes(nbytes, k, height, width, side, dims, STRUCTURES[pages][0])
         fewest = ENTRIES * math.prod(page_counts((height, width)))
-        if fewest <= arrays.page_budget(size, values.shape) <= most_entries(2):
-            gain, psnr = arrays.gain_of_pages(values, size, choose_borders(values))
+        entries = arrays.page_budget(size, values.shape)
+        if fewest <= entries <= most_entries(2):
+            gain, psnr = gain_of_pages(values, size.dims, entries, choose_borders(values))
             if gain >= GAIN_DB:
                 return pages if smooth or psnr >= FINE_DB else "pages of 2 + 6 bits"
     return "6 bits" if smooth else "2 + 6 bits"
 
 
-def layout_of(source: Source, recipe: ImageRecipe) -> Layout:
+def source_layout(source: Source, recipe: ImageSettings) -> Layout:
     """Return the layout of ``source`` by a recipe."""
-    return Layout.of(source, recipe.once, None if recipe.normals else False)
+    return Layout.from_source(source, recipe.once, None if recipe.normals else False)
 
 
-class ImageProblem(Problem):
+class ImageProblem(MapsProblem):
     """Training problem of an image.
 
     ``net`` maps (v, u) to the stored channels; ``bits`` are those of the entries of each primary; ``values`` are the
     stored channels, ``(height, width, stored)``; ``border`` is that of the image along v and u.
     """
 
-    harmless = 1e-2  # of values in [0, 1]
-
     def __init__(
-        self, net, bits, layout: Layout, values: np.ndarray, border, recipe: ImageRecipe, types, digest: str = ""
+        self, net, bits, layout: Layout, values: np.ndarray, border, recipe: ImageSettings, types, digest: str = ""
     ):
-        self.net, self.bits, self.layout, self.types = net, tuple(bits), layout, types
-        self.recipe, self.border = recipe, border
+        super().__init__(net, layout, recipe, types, recipe.weights)
+        self.bits, self.border = tuple(bits), border
         self.height, self.width, self.channels = values.shape
         self.texels = self.height * self.width
         stored = lookup.padded_channels(self.channels)
@@ -106,33 +103,23 @@ class ImageProblem(Problem):
         padded[..., : self.channels] = values
         padded[..., self.channels :] = 0
         self.values = types.TensorXf(padded)
-        self.groups = layout.channels_by_map()
-        self.weights = {
-            name: recipe.weights.get(name, 1.0) ** 2 * len(channels) / self.channels
-            for name, channels in self.groups.items()
-        }
-        recorded = {k: v for k, v in dataclasses.asdict(recipe).items() if k not in ("settings", "weights")}
-        self.identity = {"source": digest, **recorded, **({"weights": recipe.weights} if recipe.weights else {})}
-        self.rounded = self.jittered = False
-        self._stretches = {}  # size of a batch → first texel and number of texels of each stretch
+        recorded = {name: value for name, value in recipe.further.items() if name != "weights" or value}
+        self.identity = {"source": digest, **recorded}
+        self.rounded = False
 
     def begin(self, step: int, share: float) -> str:
         """Start a step: decide whether entries are rounded and samples jittered. Returns a text that names both."""
         self.rounded = share >= 1 - self.recipe.rounded
-        jitter = self.recipe.jitter
-        self.jittered = int((step + 1) * jitter) > int(step * jitter)
-        return f"rounded: {self.rounded}, jittered: {self.jittered}"
+        return f"rounded: {self.rounded}, {super().begin(step, share)}"
 
     def _texel(self, rng, size: int):
         """Return the index of a texel for each sample: one in each of ``size`` equal stretches of the image."""
         UInt32, Float = self.types.UInt32, self.types.Float
         if size % self.texels == 0:
             return dr.arange(UInt32, size) % self.texels
-        if size not in self._stretches:
-            edges = np.arange(size + 1, dtype=np.uint64) * self.texels // size
-            counts = np.maximum(np.diff(edges), 1).astype(np.uint32)
-            self._stretches[size] = UInt32(aligned_copy(edges[:-1], np.uint32)), UInt32(aligned_copy(counts))
-        first, count = self._stretches[size]
+        if size not in self._strata:
+            self._strata[size] = [UInt32(aligned_copy(part, np.uint32)) for part in strata(self.texels, size)]
+        first, count = self._strata[size]
         return first + dr.minimum(UInt32(rng.random(Float, size) * Float(count)), count - 1)
 
     def batch(self, rng, size: int):
@@ -144,9 +131,7 @@ class ImageProblem(Problem):
             target = self.target(y, x)
         else:
             target = self._texels(index)
-        return [y / self.height, x / self.width], {
-            name: [target[i] for i in channels] for name, channels in self.groups.items()
-        }
+        return [y / self.height, x / self.width], self.by_map(target)
 
     def _texels(self, index) -> list:
         """Return the stored channels of texels, given their index row by row."""
@@ -155,7 +140,7 @@ class ImageProblem(Problem):
 
     def target(self, y, x) -> list:
         """Return the stored channels at a place in texels from the corner of the image, bilinear as in ``bitmap``."""
-        UInt32, Int32, Float = self.types.UInt32, self.types.Int32, self.types.Float
+        UInt32, Int32 = self.types.UInt32, self.types.Int32
         corners = []
         for position, n, border in ((y, self.height, self.border[0]), (x, self.width, self.border[1])):
             lower = dr.floor(position - 0.5)
@@ -166,15 +151,11 @@ class ImageProblem(Problem):
             else:
                 both = [dr.clip(i, 0, n - 1), dr.clip(i + 1, 0, n - 1)]
             corners.append([(UInt32(both[0]), 1 - weight), (UInt32(both[1]), weight)])
-        total = [Float(0)] * self.channels
-        for row, a in corners[0]:
-            for column, b in corners[1]:
-                total = weighted_sum(a * b, self._texels(row * self.width + column), total)
-        return total
+        rows, columns = corners
+        return lookup.weighted_sum((a * b, self._texels(row * self.width + x)) for row, a in rows for x, b in columns)
 
     def predict(self, net, inputs) -> dict[str, list]:
-        outputs = (rounded(net, self.bits) if self.rounded else net)(inputs)
-        return {name: [outputs[i] for i in channels] for name, channels in self.groups.items()}
+        return self.by_map((rounded(net, self.bits) if self.rounded else net)(inputs))
 
     def measure(self, net) -> dict[str, float]:
         """Return the PSNR of the stored channels, with rounded entries, at the centres of at most 2¹⁸ texels."""
@@ -187,8 +168,8 @@ class ImageProblem(Problem):
             return {"psnr_db": decibel(mean_square(outputs, self._texels(index)))}
 
 
-def problem_of(
-    source: Source, size: ImageBudget, recipe: ImageRecipe, types, layout: Layout | None = None, border=None
+def build_problem(
+    source: Source, size: ImageBudget, recipe: ImageSettings, types, layout: Layout | None = None, border=None
 ) -> ImageProblem:
     """Return the problem of training ``source`` at a size by a recipe, with initial arrays.
 
@@ -196,7 +177,7 @@ def problem_of(
     """
     if size.paged and not recipe.components:
         raise ValueError("size: found pages, which need a recipe with components")
-    layout = layout or layout_of(source, recipe)
+    layout = layout or source_layout(source, recipe)
     values = layout.encode(source)
     border = border or choose_borders(values)
     if recipe.components:
@@ -211,7 +192,7 @@ def problem_of(
 def fit_image(
     source: Source,
     size: ImageBudget | None,
-    recipe: ImageRecipe,
+    recipe: ImageSettings,
     request: FitRequest,
     border: tuple[str, str] | None = None,
     title: str | None = None,
@@ -222,8 +203,8 @@ def fit_image(
     :func:`.layout.choose_borders`. ``request`` holds the Dr.Jit types, the time and the checkpoint; its settings are
     replaced by those of the ``recipe``. Errors are those of :meth:`.CompressedImage.measure`.
     """
-    request, layout = dataclasses.replace(request, settings=recipe.settings), layout_of(source, recipe)
-    problem = problem_of(source, size, recipe, request.types, layout, border) if layout.stored else None
+    request, layout = dataclasses.replace(request, settings=recipe), source_layout(source, recipe)
+    problem = build_problem(source, size, recipe, request.types, layout, border) if layout.stored else None
     more = {}
     if problem is not None:
         more = {"ratio": size.ratio, "structure": recipe.structure if recipe.structure != "auto" else _name_of(size)}
@@ -231,7 +212,7 @@ def fit_image(
     def stored() -> CompressedImage:
         return CompressedImage(layout, problem and stored_form(problem.net, problem.bits))
 
-    return fit_maps(request, source, problem, stored, to_table, CompressedImage.of, title, **more)
+    return fit_maps(request, source, problem, stored, to_table, CompressedImage.from_table, title, **more)
 
 
 def _name_of(size: ImageBudget) -> str:

@@ -1,37 +1,25 @@
 """Task 7: radiance fields from images of a scene.
 
 - :mod:`.captures`, :mod:`.views`: captured images with cameras, and the space that captured objects may occupy;
-- :mod:`.volume_field`, :mod:`.nodes`, :mod:`.surroundings`, :mod:`.march`: fields, the nodes that hold their numbers,
-  the space around the objects, and ray marching;
+- :mod:`.volume_field`, :mod:`.nodes`, :mod:`.march`: fields, the nodes that hold their numbers, in a box or in all
+  space, and ray marching;
 - :mod:`.session`, :mod:`.grid`: training through images, and the grid that is compressed;
 - :mod:`.compression`, :mod:`.coding`, :mod:`.paper`: our compressed layout, and that of the supplement;
-- :mod:`.fit`, :mod:`.files`, :mod:`.model`, :mod:`.decode`: the steps of ``fit field`` and its result.
+- :mod:`.fit`, :mod:`.files`, :mod:`.model`: the steps of ``fit field`` and its result.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from math import log, prod
 
 from ...core import units
 from ...core.arguments import Argument, between, checked, positive
-from ...fitting.settings import FitSettings
-from ...fitting.task import Task
+from ...fitting.task import FitSettings, Task
 
-#: Voxels per pixel of the views at the distance of the box, and the range of the resolution that follows from them:
-#: nodes along each side of a cube with the volume of the box.
-VOXELS_PER_PIXEL, RESOLUTIONS = 1.25, (32, 352)
-
-#: Stages of the grid from coarse to fine: share of the resolution, and share of the training steps. Between them, cells
-#: that no ray sees are removed.
-STAGES = ((0.25, 0.08), (0.5, 0.12), (0.75, 0.12), (1.0, 0.1), (1.0, 0.58))
-
-#: Most numbers of the nodes of a grid while it is trained, which bounds memory and time: grids with more stay coarser,
-#: unless the resolution is given. In the last stage, a third of them has been removed.
-MOST_NUMBERS = 36_000_000
-
-#: Most steps that follow from the pixels of the views.
-MOST_STEPS = 11_000
+#: Range of the resolution that follows from the pixels of the views: nodes along each side of a cube with the volume of
+#: the box.
+RESOLUTIONS = (32, 352)
 
 #: Ratio ρ of the sides of primary and cascaded array by compression (Table 6 of the supplement).
 RATIOS = {
@@ -39,17 +27,8 @@ RATIOS = {
     "colour": {5: 5.05, 10: 3.42, 25: 4.14, 50: 4.53, 75: 3.58, 100: 5.74},
 }
 
-#: Default compression of the preset ``paper``.
-COMPRESSION = 50.0
-
 #: Colours of a field that a user may choose: with reflections (:mod:`.volume_field`), or twelve numbers of directions.
 COLOURS = ("reflections", "directions")
-
-#: Share of the resolution from which on reflections are trained; before, normals are not known.
-REFLECTING = 0.5
-
-#: Backgrounds of images without alpha that a user may choose (:mod:`.views`).
-BACKGROUNDS = ("white", "black", "scene", "surroundings")
 
 #: Bytes of a node of the uncompressed grid: a density and twelve numbers of colour in float32.
 NODE_BYTES = 52
@@ -60,33 +39,23 @@ def dense_bytes(shape) -> int:
     return NODE_BYTES * prod(map(int, shape))
 
 
-@dataclass(frozen=True)
-class RadianceRecipe:
-    """Layout of the arrays and settings of the training.
-
-    The layout is ``"sparse"`` (:mod:`.compression`), ``"pairs"`` (:mod:`.paper`) or ``"grid"`` (:mod:`.grid`). By
-    default, a training draws ``rays_per_pixel`` rays for each pixel of the training views, but not fewer than the steps
-    of the settings do.
-    """
-
-    layout: str
-    settings: FitSettings = field(default_factory=FitSettings)
-    rays_per_pixel: float = 0.0
-
-    def scaled(self, settings: FitSettings, views) -> FitSettings:
-        """Return ``settings`` with steps for the pixels of all training ``views``, if they have the default steps."""
-        if settings.steps != self.settings.steps:
-            return settings
-        steps = min(MOST_STEPS, round(self.rays_per_pixel * (len(views) * views.mean_pixels) / settings.batch))
-        return replace(settings, steps=max(settings.steps, steps))
-
-
-#: Preset name → recipe; the first is the default.
+#: Preset name → settings of the training; the first is the default.
 PRESETS = {
-    "sparse": RadianceRecipe("sparse", FitSettings(steps=1000, batch=16384, lr=5e-3, loss="mse", check_every=50), 2.0),
-    "paper": RadianceRecipe("pairs", FitSettings(steps=1000, batch=16384, lr=5e-3, loss="mse", check_every=50), 2.0),
-    "grid": RadianceRecipe("grid", FitSettings(steps=2000, batch=16384, lr=4e-2, loss="mse", check_every=50), 20.0),
+    "sparse": FitSettings(steps=1000, batch=16384, lr=5e-3, loss="mse", check_every=50),
+    "paper": FitSettings(steps=1000, batch=16384, lr=5e-3, loss="mse", check_every=50),
+    "grid": FitSettings(steps=2000, batch=16384, lr=4e-2, loss="mse", check_every=50),
 }
+
+
+def scale_steps(preset: str, settings: FitSettings, views) -> FitSettings:
+    """Return ``settings`` with steps for the pixels of all training ``views``, if they have the steps of the preset.
+
+    Two rays are drawn for each pixel, twenty while a grid is trained, but not fewer than the settings say.
+    """
+    if settings.steps != PRESETS[preset].steps:
+        return settings
+    rays = (20 if preset == "grid" else 2) * (len(views) * views.mean_pixels)
+    return replace(settings, steps=max(settings.steps, min(11_000, round(rays / settings.batch))))
 
 
 def ratio_for(quantity: str, compression: float) -> float:
@@ -108,7 +77,7 @@ class RadianceField(Task):
     section = "supplemental 1.7"
     example = "views --bytes 600k"
     plugin = ("integrator", "neural_field")
-    presets = {name: recipe.settings for name, recipe in PRESETS.items()}  # noqa: RUF012
+    presets = PRESETS
     storages = ()
     measurements = 2
     arguments = (
@@ -142,7 +111,7 @@ class RadianceField(Task):
             "0.8 of the width of a pixel (default: auto)",
         ),
         Argument(
-            "--background", choices=BACKGROUNDS,
+            "--background", choices=("white", "black", "scene", "surroundings"),
             help="background of images without alpha: a colour, scene (a box around everything), or surroundings "
             "(coarser with the distance, without an end) (default: the colour of their borders if it is one, else "
             "scene)"

@@ -38,7 +38,7 @@ from ...core.archives import Allowance, LimitError, json_bytes
 from ...core.errors import DiffindError, missing_package, reason
 from ...core.files import MOST_TEXT, OutsideError, RecordedKeys, irregular, path_by_name, shown, unused_note
 from ...core.units import memory
-from ...images.headers import check_picture
+from ...images.reader import ENCODED, Picture, PictureError, read_picture
 from ...images.srgb import from_linear, to_linear
 
 #: Extensions tried in turn for an image name without one.
@@ -94,25 +94,40 @@ def read_image(path: Path) -> tuple[np.ndarray, bool]:
 
     That is uint8, or float32 for EXR. Raises :class:`ViewsError`.
     """
-    encoded = not is_linear(path)
-    try:
-        values = _read_bytes(path) if encoded else _read_exr(path)
-    except (ViewsError, ImportError):
-        raise
-    except LimitError as e:
-        raise ViewsError(str(e)) from None
-    except Exception as e:  # each decoder raises errors of its own for a damaged file
-        raise ViewsError(
-            f"{path}: cannot be read as an image, it is damaged or of an unknown format ({reason(e)})"
-        ) from None
-    if not encoded and not np.isfinite(values).all():
-        raise ViewsError(f"{path}: has {np.count_nonzero(~np.isfinite(values)):,} values that are NaN or infinite")
-    has_alpha = values.shape[2] in (2, 4)
+    picture, encoded = _read(path), not is_linear(path)
+    values = picture.values
+    if encoded:
+        if values.dtype.name not in ENCODED or not picture.named:
+            raise ViewsError(
+                f"{path}: holds {values.shape[2]} channels of {values.dtype}, allowed are bytes of grey or RGB"
+            )
+        values, has_alpha = _as_bytes(values), picture.has_alpha
+    else:
+        places = {name: i for i, name in enumerate(picture.channels)}
+        colours = next((c for c in (("R", "G", "B"), ("Y",)) if set(c) <= set(places)), None)
+        if colours is None or values.dtype.name in ENCODED:
+            raise ViewsError(f"{path}: has the channels {', '.join(sorted(places))}, expected R, G, B or Y, and A")
+        has_alpha = "A" in places
+        values = values[..., [places[name] for name in (*colours, *(("A",) if has_alpha else ()))]].astype(np.float32)
+        if not np.isfinite(values).all():
+            raise ViewsError(f"{path}: has {np.count_nonzero(~np.isfinite(values)):,} values that are NaN or infinite")
     image = np.full((*values.shape[:2], 4), 255 if encoded else 1, values.dtype)
     image[..., :3] = values[..., :-1] if has_alpha else values
     if has_alpha:
         image[..., 3] = values[..., -1] if encoded else np.clip(values[..., -1], 0, 1)
     return image, has_alpha
+
+
+def _read(path: Path) -> Picture:
+    try:
+        return read_picture(path)
+    except PictureError as e:
+        raise ViewsError(str(e)) from None
+
+
+def _as_bytes(values: np.ndarray) -> np.ndarray:
+    """Return numbers of 8 or 16 bits as bytes."""
+    return values if values.dtype == np.uint8 else (values >> 8).astype(np.uint8)
 
 
 def linear_pixels(image: np.ndarray) -> np.ndarray:
@@ -162,77 +177,27 @@ def read_mask(path: Path, image: np.ndarray, image_path: Path) -> tuple[np.ndarr
     Alpha holds the mask if the file has an alpha that is not 1 everywhere, else the luminance does. A pixel counts
     where it is not 0 or, in a JPEG, above :data:`BLACK_OF_JPEG`. Raises :class:`ViewsError`, also if the sizes differ.
     """
-    try:
-        with _opened(path, 4) as opened:
-            alpha = np.array(opened.convert("RGBA"))[..., 3] if opened.has_transparency_data else None
-            if in_alpha := alpha is not None and bool(alpha.min() < 255):
-                mask = alpha > 0
-            else:
-                single = opened.mode in ("1", "L", "I", "F") or opened.mode.startswith("I;")  # of 16 bits, too
-                values = np.array(opened if single else opened.convert("L"))
-                mask = values > (BLACK_OF_JPEG if opened.format == "JPEG" else 0)
-    except LimitError as e:
-        raise ViewsError(str(e)) from None
-    except Exception as e:
-        raise ViewsError(f"{path}: cannot be read as a mask ({reason(e)})") from None
+    picture = _read(path)
+    values, alpha = picture.values[..., : picture.colors], picture.values[..., picture.colors :]
+    if values.dtype.name not in ENCODED or not picture.named:
+        raise ViewsError(f"{path}: cannot be read as a mask, it holds {values.shape[2]} channels of {values.dtype}")
+    if in_alpha := picture.has_alpha and bool(alpha.min() < np.iinfo(alpha.dtype).max):
+        mask = alpha[..., 0] > 0
+    else:
+        luminance = values[..., 0]
+        if values.shape[2] == 3:  # Rec. 601, in 16 bits after the point
+            luminance = (_as_bytes(values).astype(np.uint32) @ np.uint32([19595, 38470, 7471]) + 2**15) >> 16
+        with open(path, "rb") as file:
+            is_jpeg = file.read(2) == b"\xff\xd8"
+        mask = luminance > (BLACK_OF_JPEG if is_jpeg else 0)
     if mask.shape != image.shape[:2]:
         sizes = " × ".join(map(str, mask.shape[::-1])), " × ".join(map(str, image.shape[1::-1]))
         raise ViewsError(f"{path}: has {sizes[0]} pixels, its image {image_path.name} has {sizes[1]}")
     return mask, in_alpha
 
 
-def _opened(path: Path, channels: int):
-    """Return an open image file of Pillow, not yet decoded, that may have so many ``channels`` of a byte.
-
-    Raises :class:`.LimitError` for one that takes more memory than a file of its size may.
-    """
-    from PIL import Image
-
-    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None  # the limit here is the one of all readers
-    try:
-        image = Image.open(path)
-    finally:
-        Image.MAX_IMAGE_PIXELS = limit
-    try:
-        content = f"a picture of {image.width:,} x {image.height:,} pixels"
-        Allowance(path).check(channels * image.width * image.height, content)
-    except LimitError:
-        image.close()
-        raise
-    return image
-
-
-def _read_bytes(path: Path) -> np.ndarray:
-    """Return an image of 8 bits, ``(height, width, 1 to 4)``, uint8."""
-    with _opened(path, 4) as image:
-        if image.mode not in ("RGB", "RGBA", "L", "LA"):
-            if image.mode in ("CMYK", "YCbCr", "LAB", "HSV", "1", "F", "I") or image.mode.startswith("I;"):
-                raise ViewsError(f"{path}: has pixels of the mode {image.mode}, allowed are 8 bits of grey or RGB")
-            image = image.convert("RGBA" if image.has_transparency_data else "RGB")
-        elif image.mode in ("RGB", "L") and image.has_transparency_data:
-            image = image.convert("RGBA")
-        values = np.array(image)
-    return values.reshape(*values.shape[:2], -1)
-
-
-def _read_exr(path: Path) -> np.ndarray:
-    """Return an EXR image, ``(height, width, 1 to 4)``, float32: R, G, B or Y, and A."""
-    import OpenEXR
-
-    check_picture(path)
-    with OpenEXR.File(str(path), separate_channels=True) as file:
-        planes = {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}
-    colours = next((c for c in (("R", "G", "B"), ("Y",)) if set(c) <= set(planes)), None)
-    if colours is None:
-        raise ViewsError(f"{path}: has the channels {', '.join(sorted(planes))}, expected R, G, B or Y, and A")
-    return np.stack([planes[name] for name in (*colours, *(("A",) if "A" in planes else ()))], axis=-1)
-
-
 #: Coefficients of a distortion, in the order in which they are kept.
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-
-#: Radii at which a distortion is tried for the one from which on it turns back.
-RADII = 1024
 
 
 def distort(u: np.ndarray, v: np.ndarray, coefficients) -> tuple[np.ndarray, np.ndarray]:
@@ -260,7 +225,7 @@ def _sources(height: int, width: int, focal, centre, coefficients) -> tuple[np.n
     x, y = distort(u, v, coefficients)
     x, y = x * focal[0] + centre[0] - 0.5, y * focal[1] + centre[1] - 0.5
     r2 = u * u + v * v
-    radii = np.linspace(0, np.sqrt(r2.max()), RADII)
+    radii = np.linspace(0, np.sqrt(r2.max()), 1024)  # radii at which the distortion is tried
     turning = np.flatnonzero(np.diff(radii * _factor(radii**2, coefficients[:6])) <= 0)
     limit = radii[turning[0]] if len(turning) else np.inf
     exists = (np.abs(x - (width - 1) / 2) <= width / 2) & (np.abs(y - (height - 1) / 2) <= height / 2)
@@ -305,9 +270,6 @@ LONGEST = 1e9
 #: Fields of view in radians are larger: those of telescopes.
 SMALLEST_ANGLE = 1e-6
 
-#: Largest ratio of the focal length that a field of view gives to that in pixels, minus 1, without a note.
-AGREEMENT = 5e-3
-
 
 def camera_numbers(where: str, frame: dict, file: dict) -> dict[str, float]:
     """Return the numbers of the camera of a ``frame`` by their names, those that the ``file`` gives for all included.
@@ -348,7 +310,7 @@ def focal_lengths(numbers: dict[str, float], width: int, height: int) -> tuple[t
     for (axis, (pixels, _, angle)), side in zip(FOCAL.items(), (width, height), strict=True):
         by_angle = side / 2 / np.tan(numbers[angle] / 2) if angle in numbers else focal.get("x")
         focal[axis] = numbers.get(pixels, by_angle)
-        if angle in numbers and abs(by_angle / focal[axis] - 1) > AGREEMENT:
+        if angle in numbers and abs(by_angle / focal[axis] - 1) > 5e-3:  # the focal lengths differ by half a percent
             notes.append(
                 f'the field of view {numbers[angle]:.4g} ("{angle}") would be a focal length of {by_angle:.4g} pixels, '
                 f'the "{pixels}" {focal[axis]:.4g} is used'
@@ -411,9 +373,6 @@ SPLITS = ("train", "test", "val")
 #: Tolerance of the columns of a rotation: lengths against 1, and dot products against 0.
 RIGID = 1e-3
 
-#: Interval of the test views in a list without splits, beginning with the first view (as in LLFF's data).
-EVERY = 8
-
 
 @dataclass(frozen=True)
 class Frame:
@@ -455,9 +414,10 @@ def list_frames(folder: Path, split: str) -> FrameList:
 
     Raises :class:`ViewsError`.
     """
-    model = None if any(folder.glob("transforms*.json")) else model_folder(folder)
-    if model is not None:
-        return colmap_frames(folder, model, split)
+    if not any(folder.glob("transforms*.json")):
+        for name in ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse"):
+            if any((folder / name / f"cameras.{suffix}").is_file() for suffix in ("bin", "txt")):
+                return colmap_frames(folder, folder / name, split)
     file, content, frames = _frames(folder, split)
     content["frames"] = frames  # those of other splits are not read
     cameras, box = [_camera(file, content, frame) for frame in frames], _box(file, content)
@@ -468,7 +428,8 @@ def list_frames(folder: Path, split: str) -> FrameList:
 
 def _part(entries: list, split: str) -> list:
     """Return the entries of a split of a list without splits: every eighth one is a test view."""
-    return entries if len(entries) == 1 else [e for i, e in enumerate(entries) if (i % EVERY == 0) == (split == "test")]
+    # Every eighth view, as in LLFF's data
+    return entries if len(entries) == 1 else [e for i, e in enumerate(entries) if (i % 8 == 0) == (split == "test")]
 
 
 def _frames(folder: Path, split: str) -> tuple[Path, dict, list[dict]]:
@@ -571,15 +532,8 @@ def _camera(file: Path, content: dict, frame: dict) -> Frame:
 
 
 def _pose(where: str, frame: dict) -> np.ndarray:
-    """Return the matrix of a frame as a rigid motion, ``(4, 4)``; a camera must stand still."""
+    """Return the matrix of a frame as a rigid motion, ``(4, 4)``."""
     matrix = frame.get("transform_matrix")
-    if matrix is None:
-        matrix, end = (frame.get(f"transform_matrix_{time}") for time in ("start", "end"))
-        if end is not None and end != matrix:
-            raise ViewsError(
-                f'{where} moves while the shutter is open, from the "transform_matrix_start" to another '
-                f'"transform_matrix_end": a "transform_matrix" is needed'
-            )
     if matrix is None:
         raise ViewsError(f'{where} has no "transform_matrix"')
     pose = _numbers(matrix)
@@ -605,9 +559,6 @@ def _pose(where: str, frame: dict) -> np.ndarray:
     return pose
 
 
-#: Folders that may hold a model, the first one first.
-FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
-
 #: Folders of images and masks; the mask of ``a.jpg`` is ``a.jpg.png``, as COLMAP has it.
 IMAGES, MASKS = "images", "masks"
 
@@ -620,15 +571,6 @@ PARAMETERS = {
     "OPENCV": "fl_x fl_y cx cy k1 k2 p1 p2",
     "FULL_OPENCV": "fl_x fl_y cx cy k1 k2 p1 p2 k3 k4 k5 k6",
 }
-
-#: Least images that see a point.
-TRACK = 3
-
-
-def model_folder(folder: Path) -> Path | None:
-    """Return the folder of the COLMAP model of a capture, or ``None``."""
-    files = (folder / name / f"cameras.{suffix}" for name in FOLDERS for suffix in ("bin", "txt"))
-    return next((file.parent for file in files if file.is_file()), None)
 
 
 def colmap_frames(folder: Path, model: Path, split: str) -> FrameList:
@@ -663,23 +605,5 @@ def colmap_frames(folder: Path, model: Path, split: str) -> FrameList:
         pose[:3, 1:3] *= -1  # COLMAP's cameras look along z, with y downwards
         mask_name = str(mask.relative_to(folder)) if mask.is_file() else None
         frames.append(Frame(f"{IMAGES}/{image.name}", pose, numbers, mask_name))
-    points = [p.xyz for p in reconstruction.points3D.values() if p.track.length() >= TRACK]
-    return FrameList(model, folder, frames, points=np.array(points).reshape(-1, 3), notes=_notes(folder, model, images))
-
-
-def _notes(folder: Path, model: Path, images: list) -> tuple[str, ...]:
-    """Return notes on further models and on masks that are not used."""
-    notes, masks = [], (path for path in (folder / MASKS).rglob("*.*") if path.suffix.lower() in EXTENSIONS)
-    others = [path.parent for path in model.parent.glob("*/cameras.*") if path.parent != model and model.name == "0"]
-    if others:
-        notes.append(
-            f"{', '.join(sorted({p.name for p in others}))}: further models beside {model}, which are not used"
-        )
-    names = {path.relative_to(folder / MASKS).as_posix() for path in masks} - {f"{image.name}.png" for image in images}
-    unused = [name for name in names if not (folder / IMAGES / name.removesuffix(".png")).is_file()]
-    if unused:
-        notes.append(
-            f"{folder / MASKS}: {len(unused):,} files are masks of no image, such as {min(unused)}: the mask of a.jpg "
-            f"is a.jpg.png"
-        )
-    return tuple(notes)
+    points = [p.xyz for p in reconstruction.points3D.values() if p.track.length() >= 3]  # images that see it
+    return FrameList(model, folder, frames, points=np.array(points).reshape(-1, 3))

@@ -8,10 +8,8 @@ most lie between coded ones, which are the context of their symbols.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
-from operator import getitem
 
 import numpy as np
 
@@ -32,13 +30,6 @@ LANE_SYMBOLS = 4000
 
 #: Least value of a state after a step; below, 16 more bits are read.
 LOWEST = 1 << 16
-
-
-def probability_codes(counts: np.ndarray) -> np.ndarray:
-    """Return the logarithms of ``counts`` ``(contexts, symbols)`` relative to the largest of a context, as bytes."""
-    largest = np.maximum(counts.max(axis=1, keepdims=True), 1)
-    codes = 255 + np.rint(OCTAVE * np.log2(np.maximum(counts, 1) / largest)).astype(int)
-    return np.where(counts > 0, np.maximum(codes, 1), 0).astype(np.uint8)
 
 
 def frequencies(codes: np.ndarray) -> np.ndarray:
@@ -65,9 +56,9 @@ class SymbolEncoder:
     def __init__(self):
         self.alphabets, self.calls = {}, []
 
-    def code(self, group: str, contexts: int, symbols: int, context: np.ndarray, given: Callable) -> np.ndarray:
-        """Add each symbol (below ``symbols``) that ``given`` returns in its ``context`` (below ``contexts``)."""
-        symbol = np.asarray(given(), np.int64)
+    def code(self, group: str, contexts: int, symbols: int, context: np.ndarray, given: np.ndarray) -> np.ndarray:
+        """Add each ``given`` symbol (below ``symbols``) in its ``context`` (below ``contexts``)."""
+        symbol = np.asarray(given, np.int64)
         self.alphabets[group] = (contexts, symbols)
         self.calls.append((group, np.asarray(context, np.int64), symbol))
         return symbol
@@ -78,7 +69,10 @@ class SymbolEncoder:
         for name, (contexts, symbols) in self.alphabets.items():
             joined = [c * symbols + s for group, c, s in self.calls if group == name]
             counts = np.bincount(np.concatenate(joined), minlength=contexts * symbols).reshape(contexts, symbols)
-            codes = probability_codes(counts)
+            # Logarithms relative to the largest count of a context, as bytes
+            relative = np.maximum(counts, 1) / np.maximum(counts.max(axis=1, keepdims=True), 1)
+            codes = np.maximum(255 + np.rint(OCTAVE * np.log2(relative)).astype(int), 1)
+            codes = np.where(counts > 0, codes, 0).astype(np.uint8)
             share = frequencies(codes)
             tables[name] = codes, share, np.cumsum(share, axis=1) - share
         for group, context, symbol in self.calls:
@@ -296,7 +290,7 @@ def passes_at(places: np.ndarray, shape: tuple, keep: bool = True) -> list[Pass]
     flat, bits = np.empty(len(places), np.int32), {stride: np.empty(len(places), np.uint8) for stride in STRIDES}
     for first in range(0, len(places), PART):
         part = slice(first, first + PART)
-        place = _unravelled(places[part], shape)
+        place = _coordinates(places[part], shape)
         flat[part] = (place + room) @ steps
         for stride in STRIDES:
             # Bits of the coordinates, one above the stride, and all bits below it
@@ -315,7 +309,7 @@ def passes_at(places: np.ndarray, shape: tuple, keep: bool = True) -> list[Pass]
     for stride in STRIDES:
         for rank, parity in enumerate(PARITIES[1:], 1):
             coded = [o for o in _AROUND if rank_of[tuple((np.array(parity) + o) & 1)] < rank]
-            rows = np.flatnonzero(bits[stride] == _bit_of(parity))
+            rows = np.flatnonzero(bits[stride] == _parity_bit(parity))
             add(rows, coded[:NEAR], stride, "coarse" if stride > 1 else str(sum(parity)))
     return result
 
@@ -369,8 +363,9 @@ def _cells(coder, shape: tuple, cells: np.ndarray | None = None, most: int = MOS
         sides.append(tuple(-(-n // 2) for n in sides[-1]))
         masks.append(None if cells is None else coarser(masks[-1]))
     nothing = np.zeros(int(np.prod(sides[-1])), np.int64)
-    occupied = coder.code("blocks", 1, 2, nothing, lambda: masks[-1].reshape(-1)).astype(bool)
-    parents = _unravelled(np.flatnonzero(occupied), sides[-1])
+    given = None if cells is None else masks[-1].reshape(-1)
+    occupied = coder.code("blocks", 1, 2, nothing, given).astype(bool)
+    parents = _coordinates(np.flatnonzero(occupied), sides[-1])
     for level in reversed(range(HALVINGS)):
         inside, room = np.array(sides[level]), np.array(sides[level + 1]) + 2
         steps = np.array([room[1] * room[2], room[2], 1])
@@ -380,75 +375,72 @@ def _cells(coder, shape: tuple, cells: np.ndarray | None = None, most: int = MOS
         halves[flat] = 255
         for rank, parity in enumerate(PARITIES):
             within = (2 * parents + np.int32(parity) < inside).all(axis=1)
-            halves[flat[~within]] &= np.uint8(255 ^ 1 << _bit_of(parity))
+            halves[flat[~within]] &= np.uint8(255 ^ 1 << _parity_bit(parity))
             at = flat[within]
             beside, near = np.zeros(len(at), np.uint8), np.zeros(len(at), np.uint8)
             for o in _AROUND:
                 place = np.array(parity) + o
-                value = halves[at + int((place >> 1) @ steps)] >> np.uint8(_bit_of(place & 1)) & np.uint8(1)
+                value = halves[at + int((place >> 1) @ steps)] >> np.uint8(_parity_bit(place & 1)) & np.uint8(1)
                 if o @ o == 1:
                     beside += value
                 else:
                     near += value
             context = (rank * 7 + beside.astype(np.int64)) * 7 + np.minimum(near // 3, 6)
             place = tuple((2 * parents[within] + parity).T)
-            symbol = coder.code(f"cells {min(level, 2)}", 8 * 49, 2, context, partial(getitem, masks[level], place))
-            halves[at[symbol == 0]] &= np.uint8(255 ^ 1 << _bit_of(parity))
+            given = None if cells is None else masks[level][place]
+            symbol = coder.code(f"cells {min(level, 2)}", 8 * 49, 2, context, given)
+            halves[at[symbol == 0]] &= np.uint8(255 ^ 1 << _parity_bit(parity))
         if (count := int(_COUNTS[halves[flat]].sum())) > most:
             raise TooManyNodes(count, most)
         grid = tuple(n + 1 for n in shape) if level == 0 else sides[level]
         places = []
         for parity in PARITIES:
-            owner = np.flatnonzero(halves[flat] & 1 << _bit_of(parity))
+            owner = np.flatnonzero(halves[flat] & 1 << _parity_bit(parity))
             corner = (2 * parents[owner] + np.int32(parity)).T
             places.append(np.ravel_multi_index(corner, grid).astype(np.int32))
         places = np.concatenate(places)
         places.sort()
         if level:
-            parents = _unravelled(places, grid)
+            parents = _coordinates(places, grid)
     return places
 
 
-def _unravelled(places: np.ndarray, shape: tuple) -> np.ndarray:
+def _coordinates(places: np.ndarray, shape: tuple) -> np.ndarray:
     """Return flat places of a grid as coordinates, (n, 3) int32."""
     return np.stack([x.astype(np.int32) for x in np.unravel_index(places, shape)], axis=1)
 
 
-def _bit_of(parity) -> int:
+def _parity_bit(parity) -> int:
     """Return the bit of a half by its place in the larger cell, three numbers 0 or 1."""
     x, y, z = parity
     return int(4 * x + 2 * y + z)
 
 
 def _numbers(coder, passes: list[Pass], level_count: int, colours: int, levels=None, index=None) -> tuple:
-    """Code the levels and the indices of nodes, each given those of its coded neighbours."""
+    """Code the levels and the indices of nodes, each given those of its coded neighbours; without them, decode them."""
     count = sum(len(part.rows) for part in passes)
     coded_levels, coded_index = np.zeros(count, np.uint8), np.zeros(count, np.uint16)
     for part in passes:
-        context, given = part.level_context(coded_levels, level_count), partial(getitem, levels, part.rows)
+        context, given = part.level_context(coded_levels, level_count), None if levels is None else levels[part.rows]
         symbol = coder.code(f"levels {part.group}", 7 * level_count + 1, level_count, context, given)
         coded_levels[part.rows] = symbol
     upper = ((colours - 1) >> LOW_BITS) + 1
     for part in passes:
         names, context = part.named(coded_index)
-        given = partial(naming, names, index, part.rows)
+        given = None if index is None else naming(names, index, part.rows)
         symbol = coder.code(f"names {part.group}", NAMED_CONTEXTS, NAMED + 1, context, given)
         value = names[np.arange(len(names)), np.minimum(symbol, NAMED - 1)]
         new = np.flatnonzero(symbol == NAMED)
-        fresh, given = fresh_context(names[new], colours), partial(_halves, index, part.rows[new])
-        high = coder.code("upper", PARTS + 1, upper, fresh, partial(given, 0))
-        low = coder.code("lower", upper, 1 << LOW_BITS, high, partial(given, 1))
+        fresh = fresh_context(names[new], colours)
+        given = (None, None) if index is None else divmod(index[part.rows[new]], 1 << LOW_BITS)
+        high = coder.code("upper", PARTS + 1, upper, fresh, given[0])
+        low = coder.code("lower", upper, 1 << LOW_BITS, high, given[1])
         value[new] = high << LOW_BITS | low
         # Before the next pass, whose contexts follow from it
         if value.min(initial=0) < 0 or value.max(initial=0) >= colours:
             raise ValueError("found an index beyond the palette")
         coded_index[part.rows] = value
     return coded_levels, coded_index
-
-
-def _halves(index: np.ndarray, rows: np.ndarray, which: int) -> np.ndarray:
-    """Return the upper (0) or the lower (1) part of the indices of some rows."""
-    return divmod(index[rows], 1 << LOW_BITS)[which]
 
 
 def naming(names: np.ndarray, index: np.ndarray, rows: np.ndarray) -> np.ndarray:

@@ -29,23 +29,14 @@ from .nodes import Nodes
 from .session import FieldSession, ImagesProblem, ViewImages, before
 from .volume_field import NodeField, PaletteArrays
 
-#: Rays of an estimate of importance for each pixel of the training views.
-RAYS_PER_PIXEL = 0.2
-
-#: Rays of an estimate that are followed at a time, and the least number of such batches.
-RAYS, LEAST_BATCHES = 2**16, 8
-
-#: Nearest colours that are tried for a node, and the relative error allowed in finding them.
-NEAREST, SLACK = 8, 0.3
-
-#: Counts that a context of levels has before it occurs, shared by all contexts of a variance.
-PRIOR = 20.0
+#: Rays of an estimate of importance that are followed at a time.
+RAYS = 2**16
 
 #: Count that a symbol has before it occurs.
 LEAST_COUNT = 0.05
 
-#: Rounds of choosing levels, and indices.
-LEVEL_ROUNDS, INDEX_ROUNDS = 3, 2
+#: Rounds of choosing levels.
+LEVEL_ROUNDS = 3
 
 #: Raw densities of the first and the last density level: empty, and opaque.
 EMPTIEST, DENSEST = -7.0, 8.0
@@ -61,41 +52,23 @@ MOST_BITS, INDEX_BITS, DEFAULT_BITS = 14, (6, 8, 10, 12, 14), 12
 #: Weight of a bit for each node against the error of the grid's images: 0.007 is 0.7% of the error a bit.
 SLOPE = 0.007
 
-#: Share of the weight that a bit of the levels counts: errors of neighbouring densities add up.
-LEVEL_SLOPE = 0.1
-
 #: Least and largest slope for a size of the file. Where a larger slope is needed, a coarser grid is better.
 SLOPES = (1e-3, 0.02)
 
-#: Trials of a slope for a size of the file, and nodes of a trial.
-TRIALS, TRIAL_NODES = 6, 100_000
+#: Nodes of the trial of a slope for a size of the file.
+TRIAL_NODES = 100_000
 
 #: Side of the columns of nodes that stay together in a trial.
 COLUMN = 24
 
-#: Share of the bytes of a file that its palette may have.
-PALETTE_SHARE = 0.12
-
-#: Share of the bytes of a file that it may have before its training, which adds to it.
-BEFORE_TRAINING = 0.92
-
 #: Bytes of a file beside its nodes and its palette.
 OTHER_BYTES = 2500
-
-#: Factor of the rate of levels, and how often it is applied, until a trained field has the bytes of its file.
-STEEPER, MOST_STEEPER = 1.5, 12
-
-#: Halvings of the last interval of rates.
-HALVINGS = 3
-
-#: Training steps between updates of the range of the palette's bytes.
-RANGE_INTERVAL = 50
 
 #: Resolution of the smallest grid, as a share of the full resolution.
 SMALLEST = 0.2
 
-#: Nodes per cluster that clusters are computed from, and rounds of Lloyd's algorithm.
-SAMPLES, ROUNDS = 60, 8
+#: Rounds of Lloyd's algorithm.
+ROUNDS = 8
 
 
 @dataclass
@@ -118,7 +91,8 @@ def importance(grid: NodeGrid, session: FieldSession, seed: int, deadline: Deadl
     net = grid.tensors()
     environment = net.pop("environment", None)
     squares = [dr.zeros(types.Float, v.size) for v in (grid.density, grid.colour)]
-    batches = max(LEAST_BATCHES, round(RAYS_PER_PIXEL * len(views) * views.mean_pixels / RAYS))
+    # Rays for each pixel of the training views
+    batches = max(8, round(0.2 * len(views) * views.mean_pixels / RAYS))
     loss, count = 0.0, 0
     for batch in range(batches):
         if deadline is not None and deadline.passed and count:
@@ -165,7 +139,8 @@ def level_costs(levels: np.ndarray, context: np.ndarray, count: int) -> np.ndarr
     known = context < 7 * count
     np.add.at(relative, (context[known] % 7, levels[known] - context[known] // 7 + count), 1.0)
     prior = relative[spread[:, None], np.arange(count) - np.minimum(mean, count - 1)[:, None] + count]
-    return costs(counts + PRIOR * prior / prior.sum(axis=1, keepdims=True))
+    # Counts that a context has before it occurs, shared by all contexts of a variance
+    return costs(counts + 20.0 * prior / prior.sum(axis=1, keepdims=True))
 
 
 def choose_levels(passes: list[Pass], exact: np.ndarray, weight: np.ndarray, rate: float, count: int) -> np.ndarray:
@@ -215,9 +190,9 @@ def choose_index(
     A squared difference counts ``weight`` ``(n,)`` and a bit of the file ``rate``. The search begins with the nearest
     centres.
     """
-    colours, near, index = len(centres), min(NEAREST, len(centres)), None
-    for _ in range(INDEX_ROUNDS):
-        nearest = cKDTree(centres).query(points, k=near, eps=SLACK)[1].reshape(len(points), near)
+    colours, near, index = len(centres), min(8, len(centres)), None  # nearest colours that are tried
+    for _ in range(2):
+        nearest = cKDTree(centres).query(points, k=near, eps=0.3)[1].reshape(len(points), near)
         index = nearest[:, 0].astype(np.int64) if index is None else index
         bits, fresh_bits = index_costs(passes, index, colours)
         for part, named in zip(passes, bits, strict=True):
@@ -273,12 +248,12 @@ class PaletteCoding:
 
         low = high = self.rate
         whole, fits = at(low)
-        for _ in range(MOST_STEEPER):
+        for _ in range(12):  # a bracket of rates, whose last interval is halved
             if fits:
                 break
-            low, high = high, STEEPER * high
+            low, high = high, 1.5 * high
             whole, fits = at(high)
-        for _ in range(HALVINGS if low < high else 0):
+        for _ in range(3 if low < high else 0):
             middle = np.sqrt(low * high)
             smaller, fits = at(middle)
             whole, low, high = (smaller, low, middle) if fits else (whole, middle, high)
@@ -292,18 +267,18 @@ class PaletteCoding:
 
 
 def palette_coding(
-    grid: NodeGrid, importance: Importance, index_bits: int, seed: int, deadline: Deadline | None = None
+    grid: NodeGrid, importance: Importance, deadline: Deadline | None, index_bits: int, seed: int
 ) -> PaletteCoding:
     """Return the initial coding of a grid of visible nodes, with fewer rounds of :func:`clusters` at the deadline.
 
     A bit for each node is worth the share :data:`SLOPE` of the error of the grid's images.
     """
-    palette = sorted_clusters(grid, importance, 2**index_bits, seed, deadline)
-    return coded_by(grid, importance, palette, SLOPE * importance.loss / grid.nodes.count)
+    palette = sorted_clusters(grid, importance, deadline, 2**index_bits, seed)
+    return choose_coding(grid, importance, palette, SLOPE * importance.loss / grid.nodes.count)
 
 
 def sorted_clusters(
-    grid: NodeGrid, importance: Importance, count: int, seed: int, deadline: Deadline | None = None
+    grid: NodeGrid, importance: Importance, deadline: Deadline | None, count: int, seed: int
 ) -> np.ndarray:
     """Return ``count`` weighted clusters of the colours of a grid, in units of its metric, along a line."""
     palette = clusters(grid.colour[1:] * np.sqrt(importance.metric), importance.colour, count, seed, deadline)
@@ -312,7 +287,7 @@ def sorted_clusters(
     return palette[np.argsort(centred @ np.linalg.eigh(centred.T @ centred)[1][:, -1], kind="stable")]
 
 
-def coded_by(grid: NodeGrid, importance: Importance, palette: np.ndarray, rate: float) -> PaletteCoding:
+def choose_coding(grid: NodeGrid, importance: Importance, palette: np.ndarray, rate: float) -> PaletteCoding:
     """Return the coding of a grid by a palette of :func:`sorted_clusters`; a bit of the file counts ``rate``."""
     metric = np.sqrt(importance.metric)
     passes = passes_of(grid.nodes.stored)
@@ -326,7 +301,7 @@ def coded_by(grid: NodeGrid, importance: Importance, palette: np.ndarray, rate: 
         (palette[used] / metric).astype(np.float32),
         passes,
         importance.density * LEVEL_STEP**2,
-        LEVEL_SLOPE * rate,
+        0.1 * rate,  # errors of neighbouring densities add up
         grid.environment,
     )
     coding.levels = (coding.whole_levels(levels) / LAST_LEVEL).astype(np.float32)
@@ -334,28 +309,29 @@ def coded_by(grid: NodeGrid, importance: Importance, palette: np.ndarray, rate: 
 
 
 def coding_in(
-    grid: NodeGrid, importance: Importance, nbytes: float, seed: int, deadline: Deadline | None = None
+    grid: NodeGrid, importance: Importance, deadline: Deadline | None, nbytes: float, seed: int
 ) -> PaletteCoding | None:
     """Return a coding of a grid whose file has at most ``nbytes`` once it is trained, or ``None`` if there is none.
 
     The number of colours follows from ``nbytes``, the slope from trials with a part of the nodes.
     """
-    colours = int(np.clip(PALETTE_SHARE * nbytes / grid.colour.shape[1], 2 ** INDEX_BITS[0], 2**DEFAULT_BITS))
-    palette = sorted_clusters(grid, importance, colours, seed, deadline)
+    # Of the bytes, the palette may have an eighth
+    colours = int(np.clip(0.12 * nbytes / grid.colour.shape[1], 2 ** INDEX_BITS[0], 2**DEFAULT_BITS))
+    palette = sorted_clusters(grid, importance, deadline, colours, seed)
     per_node = importance.loss / grid.nodes.count
     part, weights = trial_part(grid, importance)
     share = part.nodes.count / grid.nodes.count
 
     def fits(slope: float) -> bool:
-        coding = coded_by(part, weights, palette, slope * per_node)
+        coding = choose_coding(part, weights, palette, slope * per_node)
         levels = np.rint(coding.levels[1:] * LAST_LEVEL).astype(int)
-        return coding.estimated_bytes(levels, share) <= BEFORE_TRAINING * nbytes
+        return coding.estimated_bytes(levels, share) <= 0.92 * nbytes  # the training adds to it
 
     low, high = np.log(SLOPES)
     if not fits(np.exp(high)):
         return None
-    slope = np.exp(-largest_fitting(lambda flatness: fits(np.exp(-flatness)), -high, -low, steps=TRIALS))
-    coding = coded_by(grid, importance, palette, slope * per_node)
+    slope = np.exp(-largest_fitting(lambda flatness: fits(np.exp(-flatness)), -high, -low, steps=6))
+    coding = choose_coding(grid, importance, palette, slope * per_node)
     coding.file_bytes = nbytes
     return coding
 
@@ -391,7 +367,7 @@ def clusters(
     chance = np.sqrt(np.maximum(weight, 1e-6 * weight.max()))
     chance /= chance.sum()
     centres = points[rng.choice(len(points), count, replace=False, p=chance)]
-    sample = rng.choice(len(points), min(len(points), SAMPLES * count), replace=False, p=chance)
+    sample = rng.choice(len(points), min(len(points), 60 * count), replace=False, p=chance)  # points for each cluster
     share = weight[sample] / chance[sample]
     for _ in range(ROUNDS):
         if deadline is not None and deadline.passed:
@@ -438,7 +414,7 @@ class PaletteProblem(ImagesProblem):
 
     def begin(self, step, share):
         # Until the next update, numbers beyond the range are rounded to steps outside of it
-        if step % RANGE_INTERVAL == 0:
+        if step % 50 == 0:  # of training
             self._set_ranges()
         return ""
 

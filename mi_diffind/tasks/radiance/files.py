@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from ...arrays.indirection import Indirection, device_array, device_tensor
+from ...arrays.indirection import Indirection, device_array
 from ...arrays.tables import (
     StoredArray,
     Table,
@@ -25,9 +26,8 @@ from . import COLOURS
 from .coding import MOST_STORED, TooManyNodes, decode, encode
 from .compression import INDEX_BITS, MOST_BITS, to_bytes
 from .grid import NodeGrid
-from .nodes import Nodes, layer_count, layers, unpacked
+from .nodes import Nodes, layer_count, layers, unpack_mask
 from .paper import PairsField
-from .surroundings import ContractedNodes
 from .volume_field import COLUMNS, DIRECTIONS, ENTRIES, NodeField, PackedPaletteField, PaletteArrays, VolumeField
 
 #: Numbers of a colour: without and with reflections.
@@ -46,12 +46,6 @@ LAYOUTS = {
 
 #: Most nodes of a grid, counting those that are not stored.
 MOST_NODES = 2**28
-
-#: Bytes of memory for each place of a grid while a file is decoded and its field built, measured.
-PLACE_BYTES = 0.55
-
-#: Bytes of memory for each place of the layers that are processed at a time, measured.
-LAYER_BYTES = 8
 
 #: Bytes of memory for each stored node, measured.
 NODE_BYTES = 30
@@ -101,11 +95,11 @@ def palette_arrays(table: Table) -> tuple[np.ndarray, PaletteArrays]:
     if settings["layout"] == "sparse":
         density, index = arrays["density"], arrays["index"].entries.astype(np.uint32)
         levels = density.entries[:, 0], settings.get("density_bits", SPARSE_BITS), (density.offset[0], density.scale[0])
-        return flags_of(table), PaletteArrays(*levels, index[:, 0] | index[:, 1] << 8, *shared)
+        return stored_flags(table), PaletteArrays(*levels, index[:, 0] | index[:, 1] << 8, *shared)
     bits, colours, shape = settings["density_bits"], len(arrays["palette"].entries), tuple(settings["shape"])
     coding = (arrays[name].entries.tobytes() for name in ("probabilities", "nodes"))
     try:
-        flags, levels, index = decoded(*coding, shape, 2**bits, colours, _most_nodes(table.path, shape))
+        flags, levels, index = decode_once(*coding, shape, 2**bits, colours, _most_nodes(table.path, shape))
     except ValueError as e:
         if isinstance(e, TooManyNodes):
             check_nodes(table, e.count)
@@ -115,7 +109,7 @@ def palette_arrays(table: Table) -> tuple[np.ndarray, PaletteArrays]:
 
 
 @functools.lru_cache(maxsize=1)
-def decoded(probabilities: bytes, data: bytes, *sizes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def decode_once(probabilities: bytes, data: bytes, *sizes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return flags of the stored nodes, eight to a byte, and their levels and indices; the last result is kept.
 
     Levels (uint8) and indices (uint16) have a first entry of 0 for no node. Raises ``ValueError`` as
@@ -146,7 +140,8 @@ def check_nodes(table: Table, nodes: int = 0) -> None:
 
 def _grid_bytes(shape) -> int:
     """Return the bytes of memory of a grid without its stored nodes."""
-    return int(PLACE_BYTES * math.prod(shape) + LAYER_BYTES * (layer_count(shape) + 1) * math.prod(shape[1:]))
+    # Bytes of a place while a file is decoded and its field built, and of the layers that are processed, both measured
+    return int(0.55 * math.prod(shape) + 8 * (layer_count(shape) + 1) * math.prod(shape[1:]))
 
 
 def _most_nodes(path, shape) -> int:
@@ -178,100 +173,84 @@ def pairs_table(nodes: Nodes, arrays: dict, low, high) -> Table:
 def load(path) -> Table:
     """Read and check a table file of a radiance field. Raises :class:`.TableError`."""
     table = load_layout(path, "field", LAYOUTS)
-    settings, arrays = table.settings, table.arrays
-    layout = settings["layout"]
-    if "curve" in arrays:
+    if "curve" in table.arrays:
         raise TableError(
             f"{path}: has a density curve, which this package no longer reads: make the file again with "
             f'"mi-diffind fit field FOLDER -o {Path(path).name}"'
         )
-    _check_colours(table)
     check_numbers(table, "lower", 3)
     check_numbers(table, "spacing", 1, positive=True)
     check_numbers(table, "shape", 3, positive=True, whole=True)
-    _check_place(table)
+    if fault := next(faults(table), ""):
+        raise TableError(f"{path}: is damaged: {fault}")
+    return table
+
+
+def faults(table: Table) -> Iterator[str]:
+    """Yield what is wrong with a table, one after the other: each check relies on those before it.
+
+    Raises :class:`.TableError` for settings that are no numbers, for too much memory, and for damaged coded nodes.
+    """
+    arrays, settings = table.arrays, table.settings
+    layout, shape, spacing = settings["layout"], settings["shape"], settings["spacing"]
+    # The environment that the setting "colours" speaks of
+    colours, environment = settings.get("colours", "directions"), arrays.get("environment")
+    allowed = ("directions",) if layout == "pairs" else COLOURS
+    if colours not in allowed:
+        yield f"found the colours {colours!r}, allowed are {', '.join(allowed)}"
+    numbers = arrays.get("colour", arrays.get("palette"))
+    present = environment and environment.shape, numbers and numbers.shape[-1]
+    expected = ((ENTRIES, 3), COLUMNS) if colours == "reflections" else (None, DIRECTIONS)
+    if layout != "pairs" and present != expected:
+        yield (
+            f"found an environment of the shape {present[0]} and {present[1]} numbers of a colour, the colours "
+            f'"{colours}" have {expected[0]} and {expected[1]}'
+        )
+    # A grid of an allowed size, whose nodes single precision tells apart
+    lower = np.float64(settings["lower"])
+    largest = max(np.abs(lower).max(), np.abs(lower + spacing * np.float64(shape)).max())
+    if not SMALLEST < largest < LARGEST or spacing < np.spacing(np.float32(largest)):
+        yield (
+            f"found nodes at a distance of {spacing:g} from {settings['lower']} on, allowed are coordinates between "
+            f"{SMALLEST:g} and {LARGEST:g} that single precision tells apart"
+        )
+    if "inner" in settings:
+        check_numbers(table, "inner", 4)
+        if (half := settings["inner"][3]) <= 0:
+            yield f"found the half side {half} of the inner cube, allowed are those > 0"
+    if min(shape) < 2 or math.prod(shape) > MOST_NODES:
+        yield f"found a grid of {shape}, allowed are at most {MOST_NODES:,} nodes"
     check_nodes(table)
-    if layout in ("coded", "sparse"):
-        _check_bytes(table, *arrays)
+    for name in arrays if layout in ("coded", "sparse") else ("cells",):
+        if (storage := arrays[name].storage) != "uint8":
+            yield f'its array "{name}" is stored as {storage}, allowed is uint8'
     if layout == "coded":
         check_numbers(table, "density_scale", 1, positive=True)
         check_numbers(table, "density_offset", 1)
         bits, colours = settings.get("density_bits"), len(arrays["palette"].entries)
         if bits not in range(1, MOST_DENSITY_BITS + 1) or colours > 2**MOST_BITS:
-            raise _damaged(table, f"found {bits!r} bits of a density and {colours:,} colours")
+            yield f"found {bits!r} bits of a density and {colours:,} colours"
         palette_arrays(table)
-        return table
-    _check_bytes(table, "cells")
-    if len(arrays["cells"].entries) != -(-math.prod(settings["shape"]) // 8):
-        raise _damaged(table, f'the array "cells" is not that of a grid of {settings["shape"]}')
+        return
+    if len(arrays["cells"].entries) != -(-math.prod(shape) // 8):
+        yield f'the array "cells" is not that of a grid of {shape}'
     if layout == "pairs":
-        for name in ("low", "high"):
-            check_numbers(table, name, 13)
-        return table
-    entries = sum(int(np.count_nonzero(part)) for part in layers(flags_of(table), settings["shape"])) + 1
-    check_nodes(table, entries - 1)
+        check_numbers(table, "low", 13)
+        check_numbers(table, "high", 13)
+        return
+    nodes = sum(int(np.count_nonzero(part)) for part in layers(stored_flags(table), shape))
+    check_nodes(table, nodes)
     for name in ("density", "index" if layout == "sparse" else "colour"):
-        stored = len(arrays[name].entries)
-        if stored != entries:
-            raise _damaged(table, f'the array "{name}" has {stored} entries, expected {entries}')
+        if (entries := len(arrays[name].entries)) != nodes + 1:
+            yield f'the array "{name}" has {entries} entries, expected {nodes + 1}'
     if layout == "sparse":
-        bits = settings.get("index_bits")
-        if bits not in INDEX_BITS:
-            raise _damaged(table, f"found indices of {bits!r} bits, allowed are {INDEX_BITS}")
+        if (bits := settings.get("index_bits")) not in INDEX_BITS:
+            yield f"found indices of {bits!r} bits, allowed are {INDEX_BITS}"
         last, palette = palette_arrays(table)[1].index.max(), len(arrays["palette"].entries)
         if last >= min(palette, 2**bits):
-            raise _damaged(table, f"found the index {last} in a palette of {palette} colours")
+            yield f"found the index {last} in a palette of {palette} colours"
         if arrays["density"].entries.max() >= 2**SPARSE_BITS:
-            raise _damaged(table, f"found a density level that is not a number from 0 to {2**SPARSE_BITS - 1}")
-    return table
-
-
-def _damaged(table: Table, fault: str) -> TableError:
-    return TableError(f"{table.path}: is damaged: {fault}")
-
-
-def _check_place(table: Table) -> None:
-    """Raise :class:`TableError` unless a grid is of an allowed size and single precision tells its nodes apart."""
-    lower, spacing, shape = (np.float64(table.settings[name]) for name in ("lower", "spacing", "shape"))
-    largest = max(np.abs(lower).max(), np.abs(lower + spacing * shape).max())
-    if not SMALLEST < largest < LARGEST or spacing < np.spacing(np.float32(largest)):
-        raise _damaged(
-            table,
-            f"found nodes at a distance of {spacing:g} from {table.settings['lower']} on, allowed are coordinates "
-            f"between {SMALLEST:g} and {LARGEST:g} that single precision tells apart",
-        )
-    if "inner" in table.settings:
-        check_numbers(table, "inner", 4)
-        if (half := table.settings["inner"][3]) <= 0:
-            raise _damaged(table, f"found the half side {half} of the inner cube, allowed are those > 0")
-    shape = table.settings["shape"]
-    if min(shape) < 2 or math.prod(shape) > MOST_NODES:
-        raise _damaged(table, f"found a grid of {shape}, allowed are at most {MOST_NODES:,} nodes")
-
-
-def _check_bytes(table: Table, *names: str) -> None:
-    """Raise :class:`TableError` unless the arrays of these names are bytes."""
-    for name in names:
-        if (storage := table.arrays[name].storage) != "uint8":
-            raise _damaged(table, f'its array "{name}" is stored as {storage}, allowed is uint8')
-
-
-def _check_colours(table: Table) -> None:
-    """Raise :class:`TableError` unless a table has the environment that its setting ``colours`` speaks of."""
-    colours, environment = table.settings.get("colours", "directions"), table.arrays.get("environment")
-    pairs = table.settings["layout"] == "pairs"
-    allowed = ("directions",) if pairs else COLOURS
-    if colours not in allowed:
-        raise _damaged(table, f"found the colours {colours!r}, allowed are {', '.join(allowed)}")
-    numbers = table.arrays.get("colour", table.arrays.get("palette"))
-    present = environment and environment.shape, numbers and numbers.shape[-1]
-    expected = ((ENTRIES, 3), COLUMNS) if colours == "reflections" else (None, DIRECTIONS)
-    if not pairs and present != expected:
-        raise _damaged(
-            table,
-            f"found an environment of the shape {present[0]} and {present[1]} numbers of a colour, the colours "
-            f'"{colours}" have {expected[0]} and {expected[1]}',
-        )
+            yield f"found a density level that is not a number from 0 to {2**SPARSE_BITS - 1}"
 
 
 def stored(table: Table, entries: dict, storage: str = "") -> Table:
@@ -300,34 +279,34 @@ def stored(table: Table, entries: dict, storage: str = "") -> Table:
         if "environment" in values:
             shared["environment"] = to_bytes(values["environment"])
         numbers = replace(numbers, levels=levels.astype(np.uint8), **shared)
-        arrays = coded_arrays(unpacked(flags, table.settings["shape"]), numbers)
+        arrays = coded_arrays(unpack_mask(flags, table.settings["shape"]), numbers)
         settings |= {"layout": "coded", "density_bits": numbers.density_bits}
         settings |= {"density_offset": offset, "density_scale": scale}
     return replace(table, arrays=arrays, settings={**table.settings, **settings}, measured={}, path=None)
 
 
-def flags_of(table: Table) -> np.ndarray:
+def stored_flags(table: Table) -> np.ndarray:
     """Return the flags of stored nodes, eight to a byte."""
     return np.ascontiguousarray(table.arrays["cells"].entries[:, 0])
 
 
-def nodes_of(table: Table, types, flags: np.ndarray, packed: bool = False) -> Nodes:
-    """Return the nodes of a checked table with these ``flags``. Raises :class:`TableError` if there are none."""
-    settings = table.settings
+def read_nodes(table: Table, types, packed: bool = False, flags: np.ndarray | None = None) -> Nodes:
+    """Return the nodes of a checked table, or those with ``flags``. Raises :class:`TableError` if there are none."""
+    settings, flags = table.settings, stored_flags(table) if flags is None else flags
     if not flags.any():
         raise TableError(f"{table.path or 'the field'}: holds no nodes")
-    stored = flags if packed else unpacked(flags, settings["shape"])
-    place = types, settings["lower"], settings["spacing"], settings["shape"], stored, packed
-    return ContractedNodes(*place, inner=settings["inner"]) if "inner" in settings else Nodes(*place)
+    stored = flags if packed else unpack_mask(flags, settings["shape"])
+    place = settings["lower"], settings["spacing"], settings["shape"]
+    return Nodes(types, *place, stored, packed, settings.get("inner"))
 
 
 def grid_of(table: Table, types, packed: bool = False) -> NodeGrid:
     """Return the grid of a checked table of the layout "grid"."""
     density, colour = (table.arrays[name].values for name in ("density", "colour"))
-    return NodeGrid(nodes_of(table, types, flags_of(table), packed), density[:, 0], colour, environment_of(table))
+    return NodeGrid(read_nodes(table, types, packed), density[:, 0], colour, read_environment(table))
 
 
-def environment_of(table: Table) -> np.ndarray | None:
+def read_environment(table: Table) -> np.ndarray | None:
     """Return the environment of a table as :class:`.NodeField` takes it, or ``None``."""
     array = table.arrays.get("environment")
     return None if array is None else np.pad(array.values, ((0, 0), (0, 1)))
@@ -339,21 +318,19 @@ def field_of(table: Table, types, storage: str = "") -> VolumeField:
     It is packed for rendering; with the ``storage`` ``"float32"``, its ``arrays`` can be trained instead.
     """
     settings, layout, arrays = table.settings, table.settings["layout"], table.arrays
-    packed, tensor = storage != "float32", types.TensorXf
+    packed = storage != "float32"
     if layout == "grid":
         return grid_of(table, types, packed).field()
     if layout == "pairs":
-        allocated = {name: arrays[name].allocate(tensor, storage) for name in PairsField.NAMES}
+        allocated = {name: arrays[name].allocate(types.TensorXf, storage) for name in PairsField.NAMES}
         pairs = (
             Indirection([allocated[f"{name}_primary"]], allocated[f"{name}_cascaded"]) for name in ("density", "colour")
         )
-        return PairsField(nodes_of(table, types, flags_of(table), packed), *pairs, settings["low"], settings["high"])
+        return PairsField(read_nodes(table, types, packed), *pairs, settings["low"], settings["high"])
     flags, numbers = palette_arrays(table)
-    nodes = nodes_of(table, types, flags, packed)
+    nodes = read_nodes(table, types, packed, flags)
     if packed:
         return PackedPaletteField(nodes, numbers)
     density = byte_array(numbers.levels[:, None], numbers.density_range[1], numbers.density_range[0]).values[:, 0]
-    environment = environment_of(table)
-    environment = None if environment is None else device_tensor(tensor, environment)
-    colours = device_tensor(tensor, density), device_tensor(tensor, numbers.palette.values)
-    return NodeField(nodes, *colours, device_array(types.UInt32, numbers.index.astype(np.uint32)), environment)
+    tensors = NodeGrid(nodes, density, numbers.palette.values, read_environment(table)).tensors()
+    return NodeField(nodes, **tensors, palette_index=device_array(types.UInt32, numbers.index.astype(np.uint32)))

@@ -17,56 +17,30 @@ from ...arrays.tables import MAX_BYTES, Table, save_table
 from ...core import units
 from ...core.errors import UsageError
 from ...core.files import check_distinct
-from ...core.progress import interruptible
+from ...core.progress import Deadline, interruptible
 from ...fitting.loop import FitResult, FittingError, cores
 from ...fitting.task import FitRequest, Fitted, Stage
-from . import (
-    COLOURS,
-    COMPRESSION,
-    MOST_NUMBERS,
-    PRESETS,
-    REFLECTING,
-    RESOLUTIONS,
-    STAGES,
-    compression,
-    dense_bytes,
-    files,
-    paper,
-    ratio_for,
-)
+from . import COLOURS, PRESETS, RESOLUTIONS, compression, dense_bytes, files, paper, ratio_for, scale_steps
 from . import grid as grids
 from .grid import NodeGrid
 from .session import MOST_WATCHED_LIMITED, SIDE, FieldSession, ImagesProblem
 
-#: Shares of the resolution that ``--disk`` tries in turn.
-SHARES = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2)
+#: Stages of the grid from coarse to fine: share of the resolution, and share of the training steps. Between them, cells
+#: that no ray sees are removed.
+STAGES = ((0.25, 0.08), (0.5, 0.12), (0.75, 0.12), (1.0, 0.1), (1.0, 0.58))
 
-#: Training of pairs on the numbers of the grid, before the images: steps, samples of a step, and learning rate.
-VALUE_STEPS, VALUE_BATCH, VALUE_RATE = 300, 2**15, 1e-2
+#: Most numbers of the nodes of a grid while it is trained, which bounds memory and time: grids with more stay coarser,
+#: unless the resolution is given. In the last stage, a third of them has been removed.
+MOST_NUMBERS = 36_000_000
+
+#: Steps of the training of pairs on the numbers of the grid, before the images.
+VALUE_STEPS = 300
 
 #: Share of the bytes of the supplement's arrays that the density gets.
 DENSITY_SHARE = 0.35
 
-#: Bytes of memory for each node of the dense grid, empty or not, roughly.
-VOXEL_BYTES = 24
-
-#: Share of a limited time that the grid gets.
-GRID_TIME = 0.6
-
-#: Shares of the time left after the grid that the training on its numbers and the clusters of its colours get.
-VALUE_TIME, CLUSTER_TIME = 0.2, 0.25
-
-#: Least steps of the first stage of the grid if time is limited: a field that nobody sees has no second stage.
-FIRST_STEPS = 100
-
-#: Views that a trial of colours needs.
-LEAST_VIEWS = 16
-
 #: Gain in decibels at which a trial chooses reflections.
 WORTH = 0.15
-
-#: Most steps of each colour in a trial.
-TRIAL = 600
 
 #: Pixels of held-out views that are measured, and of training views in which visible cells are sought, for each second
 #: of a limited time.
@@ -106,7 +80,8 @@ def check(request: FitRequest) -> None:
         if options.get(name) is not None:
             units.check_size(f"--{name}", _parsed(options, name), MAX_BYTES)
     _parsed(options, "compression")
-    units.check_memory("--resolution", nodes := options["resolution"] or RESOLUTIONS[0], VOXEL_BYTES * nodes**3)
+    nodes = options["resolution"] or RESOLUTIONS[0]
+    units.check_memory("--resolution", nodes, 24 * nodes**3)  # bytes for each node of the dense grid, roughly
     if request.checkpoint is not None:
         parts = ("grid.npz", *(f"stage{n}" for n in range(len(STAGES))))
         beside = [f"{os.fspath(request.checkpoint)}.{part}" for part in parts]
@@ -131,7 +106,7 @@ def fit(request: FitRequest) -> Fitted:
     pixels = None if request.deadline is None else PIXELS * request.deadline.seconds
     reading = {name: request.options.get(name) for name in ("background", "downscale")}
     session = FieldSession.load(request.types, request.options["source"], pixels, progress=request.progress, **reading)
-    settings = PRESETS[request.preset].scaled(request.settings, session.views)
+    settings = scale_steps(request.preset, request.settings, session.views)
     return FieldFit(dataclasses.replace(request, settings=settings), session).run()
 
 
@@ -155,12 +130,11 @@ class FieldFit:
         start = time.perf_counter()
         grid, grid_result = self.grid()
         grid_seconds = time.perf_counter() - start
-        layout = PRESETS[request.preset].layout
-        if layout == "grid":
+        if request.preset == "grid":
             table, result = self.grid_table(grid), grid_result
         else:
             stopped = grid_result is not None and grid_result.interrupted
-            table, result = (self.sparse if layout == "sparse" else self.pairs)(grid, stopped)
+            table, result = (self.sparse if request.preset == "sparse" else self.pairs)(grid, stopped)
         field = files.field_of(table, request.types)
         measured = session.held_out_images.evaluate(field, ssim=True)
         table.preset, table.seed = request.preset, request.settings.seed
@@ -177,7 +151,7 @@ class FieldFit:
         dense = dense_bytes(grid.nodes.shape)
         seconds = time.perf_counter() - start - grid_seconds
         lines = [f"{grid_seconds:.1f} s for the grid, {seconds:.1f} s for the rest"]
-        if layout != "grid" and grid_result is not None and grid_result.unfinished:
+        if request.preset != "grid" and grid_result is not None and grid_result.unfinished:
             steps = f"{grid_result.steps} step{'s' if grid_result.steps != 1 else ''}"
             lines.append(f"the grid was trained for {steps}: unfinished")
         if request.deadline is not None:
@@ -220,13 +194,12 @@ class FieldFit:
         With a checkpoint, each stage has one of its own beside it, and the grid of the last finished stage is kept in
         ``CHECKPOINT.grid.npz``.
         """
-        request, views, recipe = self.request, self.session.views, PRESETS["grid"]
-        settings = request.settings
+        request, views, settings = self.request, self.session.views, self.request.settings
         if request.preset != "grid":
             same = {name: getattr(settings, name) for name in ("seed", "deterministic")}
-            settings = recipe.scaled(dataclasses.replace(recipe.settings, **same), views)
-            request = request.part(GRID_TIME)
-        nodes = request.options["resolution"] or grids.resolution_of(views)
+            settings = scale_steps("grid", dataclasses.replace(PRESETS["grid"], **same), views)
+            request = request.part(0.6)  # of the time
+        nodes = request.options["resolution"] or grids.resolution(views)
         grid, finished, reached, result = self.kept_grid(nodes)
         for number, (share, part) in enumerate(STAGES[finished:], finished):
             last = number + 1 == len(STAGES)
@@ -241,8 +214,8 @@ class FieldFit:
             schedule, every = "cosine" if last else "constant", max(1, steps // 2)
             stage = dataclasses.replace(settings, steps=steps, schedule=schedule, measure_every=every)
             limited = request.part(part / sum(later for _, later in STAGES[number:]))
-            if share == REFLECTING and self.colours != "directions":
-                tried = dataclasses.replace(stage, steps=min(steps, TRIAL))
+            if share == 0.5 and self.colours != "directions":
+                tried = dataclasses.replace(stage, steps=min(steps, 600))  # steps of each colour
                 grid, chosen = self.with_colours(grid, dataclasses.replace(limited, settings=tried))
                 if chosen is not None:
                     result = chosen
@@ -251,11 +224,11 @@ class FieldFit:
             if steps:
                 problem, grid = grids.GridProblem(grid, self.session, SIDE if last else 1), None
                 if number:
-                    problem.draw_by_errors()
+                    problem.cumulative = self.session.images.cumulative_errors(problem.field_of(problem.net))
                 finish = functools.partial(self.measured, lambda p=problem: self.grid_table(p.grid()))
                 finish = finish if last and request.preset == "grid" else None
                 stage, title = dataclasses.replace(stage, steps=steps), f"grid, {round(nodes * reached)}³"
-                least = 1 if number else FIRST_STEPS
+                least = 1 if number else 100  # a field that nobody sees has no second stage
                 stages = [Stage(f"stage{number}", problem, 1.0, stage, title, finish, self.times, least)]
                 (result,) = limited.run(stages)
                 grid = problem.grid()
@@ -312,7 +285,7 @@ class FieldFit:
     def colours(self) -> str:
         """Colours of :data:`.COLOURS`, or "auto": those that show left-out views best (:meth:`with_colours`)."""
         views, chosen = self.session.views, self.request.options.get("colours")
-        simple = self.request.preset == "paper" or views.surroundings or len(views) < LEAST_VIEWS
+        simple = self.request.preset == "paper" or views.surroundings or len(views) < 16  # views that a trial needs
         return chosen or ("directions" if simple else "auto")
 
     def with_colours(self, grid: NodeGrid, trial: FitRequest) -> tuple[NodeGrid, FitResult | None]:
@@ -398,46 +371,33 @@ class FieldFit:
             except ValueError as e:
                 given = "bytes" if self.request.options["bytes"] is not None else "compression"
                 raise UsageError(f"--{given}: {e}") from None
-            limit, weights = self.cluster_time(), self.importance(grid)
-            coding = compression.palette_coding(grid, weights, bits, seed, limit)
+            coding = compression.palette_coding(grid, *self.importance(grid), bits, seed)
         problem = compression.PaletteProblem(coding, self.session)
         return self.train(problem, lambda: files.palette_table(coding.nodes, problem.numbers()), stopped)
 
-    def cluster_time(self):
-        """Return the deadline of clusters and of the importance of nodes, or ``None``."""
-        return self.request.part(CLUSTER_TIME).deadline
-
-    def importance(self, grid: NodeGrid) -> compression.Importance:
-        """Return the importance of the nodes of a grid."""
-        settings = self.request.settings
+    def importance(self, grid: NodeGrid) -> tuple[compression.Importance, Deadline | None]:
+        """Return the importance of the nodes of a grid, and the deadline of its clusters, if time is limited."""
+        settings, limit = self.request.settings, self.request.part(0.25).deadline
         with cores(settings.deterministic):
-            return compression.importance(grid, self.session, settings.seed, self.cluster_time())
+            return compression.importance(grid, self.session, settings.seed, limit), limit
 
     def coding_in_file(self, grid: NodeGrid, nbytes: int) -> compression.PaletteCoding:
         """Return the coding of a grid in a file of at most ``nbytes``, at the highest resolution that allows it."""
         if nbytes < 2 * compression.OTHER_BYTES:
             raise UsageError(f"--disk: {nbytes:,} bytes are fewer than a file needs")
         cells, seed = grids.visible(grid, self.session.seeing_images), self.request.settings.seed
-        for share in SHARES:
+        for share in (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2):  # of the resolution
             smaller = grids.refine(grid, cells, share)
-            limit, weights = self.cluster_time(), self.importance(smaller)
-            coding = compression.coding_in(smaller, weights, nbytes, seed, limit)
+            coding = compression.coding_in(smaller, *self.importance(smaller), nbytes, seed)
             if coding is not None:
                 return coding
         raise UsageError(f"--disk: {nbytes:,} bytes are fewer than the smallest file of this capture needs")
 
     def pairs(self, grid: NodeGrid, stopped: bool) -> tuple[Table, FitResult]:
         """Compress a grid to the pairs of dense arrays of the supplement."""
-        nbytes = self.wanted_bytes(grid) or dense_bytes(grid.nodes.shape) / COMPRESSION
-        grid = self.visible(grid)
-        problem = self.pairs_problem(grid, nbytes, 0 if stopped else VALUE_STEPS)
-        return self.train(
-            problem, lambda: files.pairs_table(grid.nodes, problem.table_arrays(), problem.low, problem.high), stopped
-        )
-
-    def pairs_problem(self, grid: NodeGrid, nbytes: float, steps: int) -> paper.PairsProblem:
-        """Return the arrays of the supplement in ``nbytes``, trained on the numbers of the grid for ``steps``."""
         request, types = self.request, self.request.types
+        nbytes = self.wanted_bytes(grid) or dense_bytes(grid.nodes.shape) / 50  # as the help says
+        grid = self.visible(grid)
         ratio = dense_bytes(grid.nodes.shape) / nbytes
         extent = np.array(grid.nodes.upper) - np.array(grid.nodes.lower)
         shapes = {}
@@ -446,12 +406,13 @@ class FieldFit:
             shapes[name] = paper.sides(share * nbytes, given, channels, extent)
         density, colour, low, high = paper.initial(paper.dense(grid), shapes, types)
         net = paper.PairsNet(density, colour)
-        if steps:
+        if not stopped:
             values = paper.ValuesProblem(net, paper.PairsField(grid.nodes, density, colour, low, high), grid)
-            settings = {"steps": steps, "batch": VALUE_BATCH, "lr": VALUE_RATE, "measure_every": steps}
+            settings = {"steps": VALUE_STEPS, "batch": 2**15, "lr": 1e-2, "measure_every": VALUE_STEPS}
             settings = dataclasses.replace(request.settings, **settings)
-            request.run([Stage("", values, VALUE_TIME, settings, "the numbers of the grid", resumable=False)])
-        return paper.PairsProblem(net, grid.nodes, low, high, self.session)
+            request.run([Stage("", values, 0.2, settings, "the numbers of the grid", resumable=False)])
+        problem = paper.PairsProblem(net, grid.nodes, low, high, self.session)
+        return self.train(problem, lambda: files.pairs_table(grid.nodes, problem.table_arrays(), low, high), stopped)
 
 
 def five_digits(measured: dict[str, float]) -> dict[str, float]:

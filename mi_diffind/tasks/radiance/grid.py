@@ -15,11 +15,11 @@ from scipy.ndimage import binary_dilation, gaussian_filter, map_coordinates
 
 from ...arrays.indirection import device_array, device_tensor
 from ...arrays.sparse_grid import cell_corners, complete_cells
-from . import RESOLUTIONS, VOXELS_PER_PIXEL, surroundings
+from . import RESOLUTIONS
 from .march import march
 from .nodes import Nodes
 from .session import SIDE, FieldSession, ImagesProblem, ViewImages
-from .views import CapturedViews, box_of, hull, pixel_width
+from .views import CapturedViews, focus, hull, object_box, pixel_width
 from .volume_field import ENTRIES, NodeField, NodeVolume, add_reflections
 
 #: Raw density per unit of the trained parameter, so that one learning rate suits density and colour.
@@ -28,11 +28,14 @@ DENSITY_SCALE = 10.0
 #: Initial raw density and logarithm of the radiance: nearly empty, and dark.
 BEGIN_DENSITY, BEGIN_COLOUR = -4.0, -1.5
 
-#: Weight of the total variation of raw densities, and the square that rounds its kink at 0.
-SMOOTH, ROUND = 5e-5, 1e-2
+#: Weight of the total variation of raw densities, in a box and with surroundings.
+SMOOTH, SMOOTH_SURROUNDINGS = 5e-5, 4e-3
 
-#: Weight of the smoothness of direction coefficients, and the square that rounds its kink at 0.
-SMOOTH_DIRECTIONS, ROUND_DIRECTIONS = 5e-5, 1e-3
+#: Square that rounds the kink of the total variation at 0.
+ROUND = 1e-2
+
+#: Weight of the smoothness of direction coefficients.
+SMOOTH_DIRECTIONS = 5e-5
 
 #: Nodes of a training step whose variation counts.
 VARIED = 2**13
@@ -40,14 +43,15 @@ VARIED = 2**13
 #: Sums of the gradients of few entries: atomic ones, since copies of a whole table would cost more.
 FEW = dr.ReduceMode.Direct
 
-#: Raw density of empty space, and the blur in nodes, for the normals before reflections are trained.
-EMPTY, NORMAL_BLUR = -6.0, 1.5
+#: Raw density of empty space, for the normals before reflections are trained.
+EMPTY = -6.0
 
-#: Largest weight in a ray below which a cell is removed.
-VISIBLE = 0.02
+#: Largest weight in a ray below which a cell is removed, in a box and with surroundings. Far things are seen through
+#: many faint cells: 0.02 lost 4 dB.
+VISIBLE, VISIBLE_SURROUNDINGS = 0.02, 2e-3
 
-#: Least factor by which a grid is refined, unless it asks for less, and factors that are tried.
-LEAST_FACTOR, FACTORS = 1.1, 65
+#: Least factor by which a grid is refined, unless it asks for less.
+LEAST_FACTOR = 1.1
 
 
 @dataclasses.dataclass
@@ -82,7 +86,7 @@ class NodeGrid:
         """Return a grid whose colours have reflections, to be trained; normals point from dense to empty space."""
         dense = np.full(self.nodes.shape, EMPTY, np.float32)
         dense[self.nodes.stored] = np.clip(self.density[1:], EMPTY, -EMPTY)
-        slopes = np.stack(np.gradient(gaussian_filter(dense, NORMAL_BLUR)), axis=-1)[self.nodes.stored]
+        slopes = np.stack(np.gradient(gaussian_filter(dense, 1.5)), axis=-1)[self.nodes.stored]  # in nodes
         normals = np.concatenate([[[0, 0, 1]], -slopes / (np.linalg.norm(slopes, axis=1, keepdims=True) + 1e-6)])
         environment = np.zeros((ENTRIES, 4), np.float32)
         return dataclasses.replace(self, colour=add_reflections(self.colour, normals), environment=environment)
@@ -118,14 +122,14 @@ class GridProblem(ImagesProblem):
         node = dr.minimum(node, self.count - 1)
         here = dr.gather(types.Float, density, node + 1, mode=FEW) * DENSITY_SCALE
         colours = self.directional(net, node + 1)
-        smooth = SMOOTH if self.nodes.contraction is None else surroundings.SMOOTH
+        smooth = SMOOTH if self.nodes.contraction is None else SMOOTH_SURROUNDINGS
         total = types.Float(0)
         for axis in range(3):
             other = dr.gather(types.UInt32, self.neighbours, node * 3 + axis)
             step = here - dr.gather(types.Float, density, other, mode=FEW) * DENSITY_SCALE
             variation = smooth * dr.sqrt(dr.square(step) + ROUND)
             for a, b in zip(colours, self.directional(net, other), strict=True):
-                variation += SMOOTH_DIRECTIONS * dr.sqrt(dr.square(a - b) + ROUND_DIRECTIONS)
+                variation += SMOOTH_DIRECTIONS * dr.sqrt(dr.square(a - b) + 1e-3)
             total += dr.select(other != 0, variation, 0)
         return [super().loss(net, rng, size), total * (1 / VARIED)]
 
@@ -152,25 +156,42 @@ def neighbours(nodes: Nodes) -> np.ndarray:
     return np.stack([numbers[tuple((places + axis).T)] for axis in np.eye(3, dtype=int)], axis=1)
 
 
-def resolution_of(views: CapturedViews) -> int:
-    """Return the resolution at which a pixel, seen at the middle of the box, is :data:`VOXELS_PER_PIXEL` voxels wide.
+def inner_cube(views: CapturedViews) -> tuple[np.ndarray, float]:
+    """Return centre and half side of the cube that is not contracted.
+
+    It is the cube around the ``aabb`` of the capture. Without one, it lies around the point that the cameras look at,
+    and reaches half as far as the nearest of them.
+    """
+    if views.box is not None:
+        lower, upper = np.asarray(views.box, np.float64)
+        return (lower + upper) / 2, float((upper - lower).max() / 2)
+    middle, reach = focus(views)
+    return middle, 0.5 * reach
+
+
+def resolution(views: CapturedViews) -> int:
+    """Return the resolution at which a pixel, seen at the middle of the box, is 1.25 voxels wide.
 
     It is that of :func:`initial_grid`.
     """
     if views.surroundings:
-        nodes = surroundings.resolution_of(views)
+        centre, half = inner_cube(views)
+        nodes = 4 * half / pixel_width(views, centre)
     else:
-        lower, upper = box_of(views)
+        lower, upper = object_box(views)
         nodes = float(np.prod(upper - lower)) ** (1 / 3) / pixel_width(views, (lower + upper) / 2)
-    return int(np.clip(round(nodes * VOXELS_PER_PIXEL), *RESOLUTIONS))
+    return int(np.clip(round(nodes * 1.25), *RESOLUTIONS))
 
 
 def initial_grid(types, views: CapturedViews, nodes: int) -> NodeGrid:
     """Return an empty grid of the visual hull, as fine as a cube of ``nodes``³ nodes with the volume of its box."""
     if views.surroundings:
-        places, density = surroundings.whole_space(types, views, nodes), surroundings.BEGIN_DENSITY
+        # Denser, which keeps haze away that shows each camera a picture of its own
+        (centre, half), density, shape = inner_cube(views), -3.0, (nodes,) * 3
+        place = centre - 2 * half, 4 * half / (nodes - 1), shape, np.ones(shape, bool)
+        places = Nodes(types, *place, inner=(*centre, half))
     else:
-        lower, upper = box_of(views)
+        lower, upper = object_box(views)
         spacing, density = float((np.prod(upper - lower) / nodes**3) ** (1 / 3)), BEGIN_DENSITY
         shape = np.maximum(2, np.ceil((upper - lower) / spacing - 1e-6).astype(int) + 1)
         inside = hull(views, lower, spacing, shape) if views.has_alpha else np.ones(shape, bool)
@@ -203,7 +224,7 @@ def visible(grid: NodeGrid, images: ViewImages) -> np.ndarray:
     In a field that is nearly empty, since its training has just add_reflections, they are those that are seen best.
     """
     largest = weights(grid.field(), images)
-    least = VISIBLE if grid.nodes.contraction is None else surroundings.VISIBLE
+    least = VISIBLE if grid.nodes.contraction is None else VISIBLE_SURROUNDINGS
     return grid.nodes.cells_where((largest > 0) & (largest >= min(least, 0.5 * float(largest.max()))))
 
 
@@ -246,7 +267,7 @@ def largest_factor(grid: NodeGrid, cells: np.ndarray, factor: float, numbers: fl
     cells = cells & complete_cells(grid.nodes.stored)
     inside = np.count_nonzero(cells)
     beside = np.count_nonzero(cell_corners(cells)) - inside  # nodes at the border grow as a surface does
-    tried = np.linspace(factor, 1, FACTORS)
+    tried = np.linspace(factor, 1, 65)
     counts = (inside * tried**3 + beside * tried**2) * (1 + grid.colour.shape[1])
     fits = tried[counts <= numbers]
     return float(fits[0]) if len(fits) and fits[0] >= min(factor, LEAST_FACTOR) else 1.0

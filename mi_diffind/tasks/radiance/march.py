@@ -1,7 +1,7 @@
 """Ray marching: emission and absorption from front to back, the derivatives of both, and counts of the reads.
 
 A ray is divided into steps of a fixed length from the point where it enters the box; the last step is cut where the ray
-leaves. In surroundings, steps grow (:class:`.surroundings.GrowingSteps`). Distances count from the point of
+leaves. In surroundings, steps grow (:class:`.nodes.GrowingSteps`). Distances count from the point of
 entry, since a step might be too short to change a distance from afar. Each step has one density and one radiance, so a
 homogeneous medium is Beer–Lambert exactly. Steps that are certainly empty are skipped, which changes nothing. No
 radiance is read where the density is zero. The ray ends when it is opaque (:data:`OPAQUE`).
@@ -41,7 +41,7 @@ class Marched:
 def box(field, o, d, near, far, active):
     """Return the part of each ray in the field's box: origin, distance, length, and whether it exists.
 
-    A ray with NaN, or without a direction (:func:`.rays.is_direction`), has no part in the box.
+    A ray with NaN, or without a direction (:func:`.boxes.is_direction`), has no part in the box.
     """
     types = field.types
     near, far = types.Float(near), types.Float(far)
@@ -245,15 +245,12 @@ def _follow(field, o, d, near, far, active, offset, marched, adjoint, moving):
     return d_colour, d_through, d_depth
 
 
-#: Component of a direction below which a ray counts as parallel to the sides of the box, when it is differentiated.
-PARALLEL = 1e-10
-
-
 def _attached(field, o, d, near, far, active) -> tuple:
     """Return place of entry, direction, length, and distance of entry of rays, attached; 0 where not ``active``."""
     types = field.types
     o = types.Array3f(*(dr.select(active, x, 0) for x in o))
-    d = types.Array3f(*(dr.select(active & (dr.abs(x) > PARALLEL), x, 0) for x in d))
+    # Else parallel to the sides of the box
+    d = types.Array3f(*(dr.select(active & (dr.abs(x) > 1e-10), x, 0) for x in d))
     entry, near, length, _ = box(field, o, d, near, far, active)
     return dr.select(active, entry, 0), d, dr.select(active, length, 0), dr.select(active, near, 0)
 

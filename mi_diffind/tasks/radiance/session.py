@@ -53,18 +53,8 @@ SAMPLED = np.array([(2 * i + j % 2, 2 * j + i % 2) for j in range(TILE // 2) for
 #: Linear grey before which errors of tiles are measured.
 GREY = 0.2
 
-#: Distance at which training rays of a field with surroundings begin, as a share of the distance from the point that
-#: the cameras look at to the nearest one.
-NEAR = 0.4
-
 #: Most held-out views of measurements during a training, without and with a limit of time.
 MOST_WATCHED, MOST_WATCHED_LIMITED = 20, 8
-
-#: Share of the held-out views that are measured during a training if time is limited.
-WATCHED_SHARE = 0.2
-
-#: Least training views in which visible cells are sought if time is limited.
-LEAST_SEEING = 8
 
 
 class ViewImages:
@@ -98,7 +88,8 @@ class ViewImages:
 
         Close to a camera, nothing but its own view would say what is there.
         """
-        return NEAR * focus(self.views)[1] if self.views.surroundings else 0.0
+        # Nearer, nothing but its own view would say what is there
+        return 0.4 * focus(self.views)[1] if self.views.surroundings else 0.0
 
     def _place(self, view):
         """Return the number of the first pixel of a view, its height and its width."""
@@ -303,7 +294,7 @@ class FieldSession:
     def seeing_images(self) -> ViewImages:
         """Training views in which visible cells are sought, evenly spread in the list."""
         views = self.views
-        most = len(views) if self.pixels is None else max(LEAST_SEEING, round(self.pixels / views.mean_pixels))
+        most = len(views) if self.pixels is None else max(8, round(self.pixels / views.mean_pixels))
         return self.images if most >= len(views) else ViewImages(self.types, views.spread(most))
 
     @functools.cached_property
@@ -316,7 +307,7 @@ class FieldSession:
         """Held-out views for measurements during a training, evenly spread in the list; fewer if time is limited."""
         count, most = len(self.held_out), MOST_WATCHED
         if self.pixels is not None:
-            most = max(1, min(MOST_WATCHED_LIMITED, round(WATCHED_SHARE * count)))
+            most = max(1, min(MOST_WATCHED_LIMITED, round(0.2 * count)))
         return self.held_out_images if count <= most else ViewImages(self.types, self.held_out.spread(most))
 
 
@@ -398,10 +389,6 @@ class ImagesProblem(Problem):
         pairs = before(Marched(colour, transmittance), truth, behind)
         total = sum((dr.square(shown - reference) for shown, reference in pairs), types.Float(0))
         return dr.select(images.counted(view, x, y), total, 0) * (1 / (3 * count))
-
-    def draw_by_errors(self) -> None:
-        """Draw rays by the errors of the present state from now on."""
-        self.cumulative = self.session.images.cumulative_errors(self.field_of(self.net))
 
     def measure(self, net):
         return self.session.watched_images.evaluate(self.field_of(net))

@@ -43,27 +43,11 @@ from .captures import (
     undistort,
 )
 
-#: Level of zlib for images that are kept compressed: the fastest.
-PACKING = 1
-
 #: Largest number in half precision.
 LARGEST = 65504.0
 
 #: Longest side in pixels of images that are not reduced.
 LONGEST = 1600
-
-#: Fewest views for training, since one shows no depth.
-LEAST_VIEWS = 2
-
-#: Names of missing images in a note.
-NAMED_MISSING = 3
-
-#: Largest distance of a principal point from the middle of its image, as a share of the side, without a note.
-OFF_MIDDLE = 0.25
-
-#: Percentiles of points along each axis between which the captured objects lie, and the margin around these, as a share
-#: of the longest side.
-OUTLIERS, POINTS_MARGIN = (1, 99), 0.05
 
 
 @dataclass(eq=False)
@@ -104,7 +88,7 @@ class CapturedViews:
     notes: tuple[str, ...] = ()
     background: tuple[int, int, int] | None = None
     settings: dict = dataclasses.field(default_factory=dict)
-    #: Whether fields have surroundings (:mod:`.surroundings`) instead of a box around everything.
+    #: Whether fields have surroundings (:class:`.nodes.Contraction`) instead of a box around everything.
     surroundings: bool = False
     #: Images of :meth:`compressed` views, by zlib; ``pixels`` is empty then.
     packed: tuple[bytes, ...] | None = None
@@ -126,7 +110,7 @@ class CapturedViews:
 
     def compressed(self) -> CapturedViews:
         """Return the same views with compressed images, which are decoded one at a time."""
-        packed = tuple(zlib.compress(self.stored(view), PACKING) for view in range(len(self)))
+        packed = tuple(zlib.compress(self.stored(view), 1) for view in range(len(self)))  # the fastest level
         return dataclasses.replace(self, pixels=self.pixels[:0].copy(), packed=packed)
 
     def stored(self, view: int) -> np.ndarray:
@@ -260,11 +244,7 @@ def _set_background(views: CapturedViews, opaque: list[int], background) -> None
 
 def _with_images(listed: FrameList, split: str) -> tuple[list[Frame], list[Path], list[str]]:
     """Return the views whose images exist, the paths of these images, and notes on the others."""
-    file, least = listed.file, LEAST_VIEWS if split == "train" else 1
-    if split == "train" and len(listed.frames) < least:
-        raise ViewsError(
-            f"{file}: has {len(listed.frames)} view for training, at least {least} are needed: one shows no depth"
-        )
+    file, least = listed.file, 2 if split == "train" else 1  # one view shows no depth
     if not listed.frames:
         raise ViewsError(f'{file}: has no views for the split "{split}"')
     frames, paths, missing = [], [], []
@@ -273,23 +253,22 @@ def _with_images(listed: FrameList, split: str) -> tuple[list[Frame], list[Path]
             paths.append(image_file(listed.root, frame.image, file))
             frames.append(frame)
         except MissingImageError as e:
-            missing.append((frame.image, e))
-    if not missing:
-        return frames, paths, []
+            missing.append((printable(frame.image), e))
     count = f'{len(missing):,} of {len(listed.frames):,} images of the split "{split}" do not exist'
     if len(frames) < least:
-        raise ViewsError(f"{missing[0][1]}; {count}, at least {least} {'is' if least == 1 else 'are'} needed")
-    names = ", ".join(shortened(printable(name), 60) for name, _ in missing[:NAMED_MISSING])
-    more = f" and {len(missing) - NAMED_MISSING:,} more" if len(missing) > NAMED_MISSING else ""
-    return frames, paths, [f"{listed.name}: {count} and are left out: {names}{more}"]
+        fault = f"{missing[0][1]}; {count}" if missing else f"{file}: has {len(frames)} view for training"
+        raise ViewsError(f"{fault}, at least {least} {'is' if least == 1 else 'are'} needed")
+    if not missing:
+        return frames, paths, []
+    return frames, paths, [f"{listed.name}: {count} and are left out, such as {shortened(missing[0][0], 60)}"]
 
 
 def _box(listed: FrameList, has_alpha: bool) -> np.ndarray | None:
     """Return the box of a list of views or, if no alpha shows where the objects are, that of most of its points."""
     if listed.box is not None or has_alpha or listed.points is None or not len(listed.points):
         return listed.box
-    lower, upper = np.percentile(listed.points, OUTLIERS, axis=0)
-    margin = POINTS_MARGIN * (upper - lower).max()
+    lower, upper = np.percentile(listed.points, (1, 99), axis=0)
+    margin = 0.05 * (upper - lower).max()
     return np.stack([lower - margin, upper + margin])
 
 
@@ -316,7 +295,8 @@ class _Images:
         focal, notes = focal_lengths(numbers, width, height)
         self.notes |= {f"{listed.name}: {note}": None for note in notes}
         centre = numbers.get("cx", width / 2), numbers.get("cy", height / 2)
-        if any(abs(x / side - 0.5) > OFF_MIDDLE for x, side in zip(centre, (width, height), strict=True)):
+        # As a share of the side
+        if any(abs(x / side - 0.5) > 0.25 for x, side in zip(centre, (width, height), strict=True)):
             self.off_middle = self.off_middle or (
                 f"the principal point ({centre[0]:g}, {centre[1]:g}) of {path.name} is far from the middle of its "
                 f"{width} × {height} pixels"
@@ -391,12 +371,6 @@ class _Images:
 #: Name → bytes of sRGB.
 NAMED = {"white": (255, 255, 255), "black": (0, 0, 0)}
 
-#: Largest difference from the background in a byte of its pixels.
-TOLERANCE = 4
-
-#: Least share of the pixels at borders that have one colour if it is the background.
-SHARE_OF_BORDER = 0.9
-
 
 def _shown(image: np.ndarray) -> np.ndarray:
     """Return the bytes of sRGB of an image of bytes or halves, ``(…, 3)``."""
@@ -404,7 +378,7 @@ def _shown(image: np.ndarray) -> np.ndarray:
 
 
 def _near(shown: np.ndarray, colour) -> np.ndarray:
-    return np.abs(shown.astype(np.int16) - np.int16(colour)).max(axis=-1) <= TOLERANCE
+    return np.abs(shown.astype(np.int16) - np.int16(colour)).max(axis=-1) <= 4  # bytes of sRGB
 
 
 def border_colour(views: CapturedViews, chosen: list[int]) -> tuple[int, int, int] | None:
@@ -415,7 +389,7 @@ def border_colour(views: CapturedViews, chosen: list[int]) -> tuple[int, int, in
     if not len(pixels):
         return None
     colour = np.median(pixels, axis=0).astype(int)
-    return tuple(colour.tolist()) if _near(pixels, colour).mean() >= SHARE_OF_BORDER else None
+    return tuple(colour.tolist()) if _near(pixels, colour).mean() >= 0.9 else None
 
 
 def clear(image: np.ndarray, counted: np.ndarray, colour) -> None:
@@ -429,14 +403,11 @@ def clear(image: np.ndarray, counted: np.ndarray, colour) -> None:
 #: Nodes along the longest side of the grid in which the box is searched.
 SEARCH = 64
 
-#: Share of the views that must have a node in sight, so that space out of sight does not count as occupied.
-SIGHTED = 0.34
-
 #: Voxels by which the box is larger than the visual hull.
 MARGIN = 2
 
 
-def box_of(views: CapturedViews) -> tuple[np.ndarray, np.ndarray]:
+def object_box(views: CapturedViews) -> tuple[np.ndarray, np.ndarray]:
     """Return the lower and upper corner of the box of the captured objects.
 
     The box is the ``aabb`` of the capture, cut to the visual hull if the images have alpha. Without an ``aabb``, the
@@ -485,14 +456,14 @@ def focus(views: CapturedViews) -> tuple[np.ndarray, float]:
 def hull(views: CapturedViews, lower, spacing: float, shape) -> np.ndarray:
     """Return the nodes ``lower + spacing · (i, j, k)`` of the visual hull: bool of this ``shape``.
 
-    A node belongs to it if a share :data:`SIGHTED` of the views have it in sight and none of these shows it empty: a
-    pixel within a voxel of its projection has an alpha above 0, or does not count.
+    A node belongs to it if a third of the views have it in sight and none of these shows it empty: a pixel within a
+    voxel of its projection has an alpha above 0, or does not count.
     """
     lower = np.asarray(lower, np.float64)
     axes = [a + spacing * np.arange(n) for a, n in zip(lower, shape, strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     numbers, sights = np.arange(len(points)), np.zeros(len(points), np.int32)
-    needed = max(1, int(SIGHTED * len(views)))
+    needed = max(1, int(0.34 * len(views)))  # views that must have a node in sight: space out of sight is not occupied
     for v in range(len(views)):
         local = (points - views.origins[v]) @ views.poses[v, :3, :3]
         ahead = -local[:, 2]

@@ -26,7 +26,7 @@ import numpy as np
 from ...arrays.indirection import device_array
 from ...arrays.lookup import as_words, pack_bits
 from ...arrays.tables import StoredArray
-from .nodes import Nodes
+from .nodes import HORIZON, EqualSteps, Nodes
 
 #: Sides of the squares of the fine and the coarse table; each holds all directions, by an octahedron that is unfolded.
 SIDES = (64, 16)
@@ -36,9 +36,6 @@ ENTRIES = sum(side**2 for side in SIDES)
 
 #: Columns of the numbers of a node: normal, tint and sharpness follow those of directions; the last is unused.
 DIRECTIONS, NORMAL, TINT, SHARPNESS, COLUMNS = 12, slice(12, 15), slice(15, 18), 18, 20
-
-#: Logarithm of the tint before the training.
-BEGIN_TINT = -3.0
 
 #: Upper limit of the logarithm of a radiance.
 BRIGHTEST = 12.0
@@ -108,42 +105,20 @@ def add_reflections(colour: np.ndarray, normals: np.ndarray) -> np.ndarray:
     numbers = np.zeros((len(colour), COLUMNS), np.float32)
     numbers[:, :DIRECTIONS] = colour
     numbers[:, NORMAL] = normals
-    numbers[:, TINT] = BEGIN_TINT
+    numbers[:, TINT] = -3.0  # as a logarithm
     return numbers
 
 
 #: Optical depth of a voxel below which its density counts as zero.
 FAINT = 2e-3
 
-#: Weight of a step below which its radiance is not read: in pictures, and in training.
-LEAST_WEIGHT, LEAST_TRAINED_WEIGHT = 2e-7, 1e-3
-
-
-class EqualSteps:
-    """Distances along rays as multiples of steps: here, steps are of equal length."""
-
-    @staticmethod
-    def of_steps(s):
-        """Return the distances of a ray at the places ``s`` among its steps."""
-        return s
-
-    @staticmethod
-    def in_steps(t):
-        """Return the places of distances among the steps, the inverse of :meth:`of_steps`."""
-        return t
-
-    @staticmethod
-    def skipped(s, t, free):
-        """Return the length in steps of ``free`` space behind the distance ``t``, which is at ``s``."""
-        return free
-
 
 class VolumeField:
     """Radiance field in the box from ``lower`` to ``upper``: the base class.
 
     ``voxel`` is the side of a voxel. Rays take steps of length ``step``, half a voxel, and read no radiance where a
-    step weighs less than ``least_weight``. ``arrays`` maps names to the tensors that can be differentiated.
-    A field that is ``unbounded`` has surroundings (:mod:`.surroundings`): rays are marched in the larger ``box``.
+    step weighs less than ``least_weight``. ``arrays`` maps names to the tensors that can be differentiated. A field
+    that is ``unbounded`` has surroundings (:class:`.nodes.Contraction`): rays are marched in the larger ``box``.
     """
 
     unbounded = False
@@ -152,7 +127,7 @@ class VolumeField:
         self.types = types
         self.lower, self.upper = tuple(map(float, lower)), tuple(map(float, upper))
         self.voxel, self.step = float(voxel), 0.5 * float(voxel)
-        self.least_weight = LEAST_WEIGHT
+        self.least_weight = 2e-7  # lighter steps read no radiance
         self.arrays = dict(arrays)
         # Opaque: fields of another size use the same kernels
         self.box = tuple(dr.opaque(types.Array3f, corner) for corner in (self.lower, self.upper))
@@ -167,7 +142,7 @@ class VolumeField:
     def for_training(self) -> VolumeField:
         """Return a copy with steps of a voxel, which reads the radiance of steps with a weight of at least 1e-3."""
         result = copy.copy(self)
-        result.step, result.least_weight = self.voxel, LEAST_TRAINED_WEIGHT
+        result.step, result.least_weight = self.voxel, 1e-3
         return result
 
     def density_at(self, p, active=True) -> tuple:
@@ -202,7 +177,7 @@ class NodeVolume(VolumeField):
         super().__init__(nodes.types, lower, upper, nodes.spacing, arrays)
         self.unbounded = contraction is not None
         if self.unbounded:
-            self.box = tuple(dr.opaque(self.types.Array3f, corner) for corner in contraction.box(contraction.horizon))
+            self.box = tuple(dr.opaque(self.types.Array3f, corner) for corner in contraction.box(HORIZON))
 
     def without_surroundings(self) -> NodeVolume:
         """Return a copy of the field in the box from ``lower`` to ``upper`` alone."""

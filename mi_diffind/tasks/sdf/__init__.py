@@ -11,8 +11,7 @@ from __future__ import annotations
 
 from ...core import units
 from ...core.arguments import Argument, between, checked, positive
-from ...fitting.settings import FitSettings
-from ...fitting.task import Task
+from ...fitting.task import FitSettings, Task
 
 #: Bits of a pointer that divide words evenly (:data:`.nodes.POINTERS`, without importing Dr.Jit).
 BITS = (4, 5, 6, 8, 10, 16)

@@ -13,21 +13,16 @@ z. A ``seed`` is a number or a ``numpy.random.Generator``.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import importlib.util
 import math
-import os
-import pickle
-import signal
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 
 from ...arrays.sparse_grid import CORNERS
-from ...core.errors import DiffindError, missing_package, reason
+from ...core.errors import DiffindError, missing_package
+from ...core.jobs import WorkerProcess
+from .distances_child import answer
 from .mesh import NO_VOLUME, Mesh, close_holes, outer_surface
 
 #: Points per request: less than a second of work, so that Ctrl-C is noticed.
@@ -62,8 +57,7 @@ class Distances:
 
     def __init__(self, mesh: Mesh):
         self.mesh = mesh
-        self._child: subprocess.Popen | None = None
-        self._owner = 0
+        self._child: WorkerProcess | None = None
         self._sent: set[str] = set()
         self._doubt = (0.0, 0.0)
 
@@ -78,15 +72,10 @@ class Distances:
 
     def close(self) -> None:
         """End the child process if it runs."""
-        child, self._child = self._child, None
-        self._sent = set()
-        if child is not None and self._owner == os.getpid():  # not the process of a forked copy's parent
-            for stream in (child.stdin, child.stdout):
-                with contextlib.suppress(OSError):
-                    stream.close()
-            with contextlib.suppress(OSError):
-                child.kill()
-            child.wait()
+        child, self._child, self._sent = self._child, None, set()
+        if child is not None:
+            child.process.kill()
+            child.close()
 
     @functools.cached_property
     def solid(self) -> Mesh:
@@ -203,10 +192,10 @@ class Distances:
         points = _check_points(points)
         if not len(points):
             return tuple(array[:0] for array in self._ask(question, np.zeros((1, 3)), name, mesh))
-        if self._owner != os.getpid():
-            self.close()
         if self._child is None:
-            self._start()
+            if importlib.util.find_spec("igl") is None:
+                raise DistancesError(f"{self.mesh.path}: distances need {missing_package('libigl')}")
+            self._child = WorkerProcess(threads=0)
         if name not in self._sent:
             faces = np.ascontiguousarray(mesh.faces, np.int64)
             self._request("mesh", name, (np.ascontiguousarray(mesh.vertices), faces, mesh.watertight))
@@ -216,43 +205,20 @@ class Distances:
 
     def _request(self, *request) -> tuple[np.ndarray, ...]:
         try:
-            pickle.dump(request, self._child.stdin, pickle.HIGHEST_PROTOCOL)
-            self._child.stdin.flush()
-            error, arrays = pickle.load(self._child.stdout)
-        except (OSError, EOFError, pickle.UnpicklingError):
-            self._raise_ended()
+            outcome = self._child.carry_out("distances", answer, request)
+        except (OSError, EOFError):
+            end, self._child, self._sent = self._child.close(), None, set()
+            raise DistancesError(
+                f"{self.mesh.path}: libigl ended while it computed distances to this mesh ({end}); a repaired mesh may "
+                f"work"
+            ) from None
         except BaseException:  # after Ctrl-C the rest of an answer would be read as the next one
             self.close()
             raise
-        if error is not None:
+        if outcome.failure:
             self.close()
-            raise DistancesError(
-                f"{self.mesh.path}: libigl finds no distances to this mesh ({reason(Exception(error))})"
-            )
-        return arrays
-
-    def _start(self) -> None:
-        if importlib.util.find_spec("igl") is None:
-            raise DistancesError(f"{self.mesh.path}: distances need {missing_package('libigl')}")
-        self._owner = os.getpid()
-        script = Path(__file__).with_name("distances_child.py")
-        self._child = subprocess.Popen(
-            [sys.executable, str(script)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, map(os.path.abspath, sys.path)))},
-        )  # fmt: skip
-
-    def _raise_ended(self) -> None:
-        """Raise :class:`DistancesError` with the reason why the child process ended."""
-        code = self._child.wait()
-        cause = f"exit code {code}"
-        if code < 0:
-            with contextlib.suppress(ValueError):
-                cause = signal.Signals(-code).name
-        self.close()
-        raise DistancesError(
-            f"{self.mesh.path}: libigl ended while it computed distances to this mesh ({cause}); a repaired mesh may "
-            f"work"
-        )
+            raise DistancesError(f"{self.mesh.path}: libigl finds no distances to this mesh ({outcome.failure})")
+        return outcome.value
 
 
 def _check_points(points) -> np.ndarray:

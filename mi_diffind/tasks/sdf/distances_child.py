@@ -1,37 +1,47 @@
-"""Child process that runs libigl: a script of its own, since some meshes make libigl abort its process.
+"""Queries to libigl, carried out in a process of their own, since some meshes make libigl abort its process.
 
-Requests arrive on standard input and answers leave on standard output, both as pickles, until the input ends. A request
-is ``(question, name, argument)``: the question ``"mesh"`` registers the arrays of a mesh under a name; any other is a
-method of :class:`MeshQueries` that is called with points. An answer is ``(None, arrays)`` or ``(error, None)``. The
-script imports NumPy and libigl only.
+Importing this imports neither Dr.Jit nor Mitsuba.
 """
 
-import contextlib
-import os
-import pickle
-import signal
-import sys
+from __future__ import annotations
+
+import numpy as np
+
+#: Accuracies of the fast winding number, and the distance from 1/2 below which values are computed once more with the
+#: next accuracy, in the end exactly, which takes ten times as long. The largest errors observed are 0.23 and 0.013.
+ACCURACIES = ((1.0, 0.3), (2.0, 0.05))
+
+#: The same for a watertight mesh, whose winding numbers are whole, so that fewer are in doubt.
+WATERTIGHT_ACCURACIES = ((1.0, 0.15), (2.0, 0.05))
+
+#: Meshes of this process by name.
+_meshes: dict[str, MeshQueries] = {}
+
+
+def answer(request: tuple) -> tuple[np.ndarray, ...]:
+    """Answer ``(question, name, argument)``.
+
+    The question ``"mesh"`` registers vertices, faces and whether they are watertight under a name; any other one is a
+    method of :class:`MeshQueries`, and the argument is points.
+    """
+    question, name, argument = request
+    if question == "mesh":
+        _meshes[name] = MeshQueries(*argument)
+        return ()
+    return getattr(_meshes[name], question)(argument)
 
 
 class MeshQueries:
-    """Queries to libigl about one mesh; its search trees are built on first use."""
+    """Queries about one mesh; its search trees are built on first use."""
 
-    #: Accuracies of the fast winding number, and the distance from 1/2 below which values are computed once more with
-    #: the next accuracy, in the end exactly, which takes ten times as long. The largest errors observed are 0.23 and
-    #: 0.013. Winding numbers of a watertight mesh are whole, so fewer are in doubt.
-    ACCURACIES = ((1.0, 0.3), (2.0, 0.05))
-    WATERTIGHT_ACCURACIES = ((1.0, 0.15), (2.0, 0.05))
-
-    def __init__(self, vertices, faces, watertight):
+    def __init__(self, vertices, faces, watertight: bool):
         import igl
 
         self.igl, self.vertices, self.faces = igl, vertices, faces
-        self.accuracies = self.WATERTIGHT_ACCURACIES if watertight else self.ACCURACIES
+        self.accuracies = WATERTIGHT_ACCURACIES if watertight else ACCURACIES
         self.tree = self.hierarchy = None
 
     def nearest(self, points):
-        import numpy as np
-
         if self.tree is None:
             self.tree = self.igl.AABB()
             self.tree.init(self.vertices, self.faces)
@@ -47,14 +57,12 @@ class MeshQueries:
         return self.nearest(points)[:1]
 
     def winding(self, points):
-        return (self._windings(points, self.ACCURACIES[-1:]),)
+        return (self._windings(points, ACCURACIES[-1:]),)
 
     def inside(self, points):
         return (self._windings(points, self.accuracies) >= 0.5,)
 
     def _windings(self, points, accuracies):
-        import numpy as np
-
         if self.hierarchy is None:
             self.hierarchy = self.igl.FastWindingNumberBVH()
             self.hierarchy.init(self.vertices, self.faces)
@@ -71,38 +79,8 @@ class MeshQueries:
 
 def spatial_order(points):
     """Return Morton's order of points: neighbours follow each other, and trees are searched twice as fast."""
-    import numpy as np
-
     lower, upper = points.min(axis=0), points.max(axis=0)
     cells = ((points - lower) / max(float((upper - lower).max()), 1e-30) * 1023).astype(np.uint64)
     for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
         cells = (cells | (cells << np.uint64(shift))) & np.uint64(mask)
     return np.argsort(cells[:, 0] | (cells[:, 1] << np.uint64(1)) | (cells[:, 2] << np.uint64(2)), kind="stable")
-
-
-def main():
-    """Answer requests until the input ends."""
-    # Ctrl-C is handled by the parent, which ends this process; the end of the input ends it, too
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # Output of libigl must not mix with the answers
-    answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)
-    meshes = {}
-    while True:
-        question, name, argument = pickle.load(sys.stdin.buffer)
-        try:
-            if question == "mesh":
-                meshes[name], arrays = MeshQueries(*argument), ()
-            else:
-                arrays = getattr(meshes[name], question)(argument)
-            answer = None, arrays
-        except Exception as e:
-            answer = f"{type(e).__name__}: {e}", None
-        pickle.dump(answer, answers, pickle.HIGHEST_PROTOCOL)
-        answers.flush()
-
-
-if __name__ == "__main__":
-    del sys.path[0]  # modules of this folder might shadow others
-    with contextlib.suppress(BrokenPipeError, EOFError):
-        main()

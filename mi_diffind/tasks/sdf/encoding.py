@@ -12,7 +12,6 @@ from ...arrays.sparse_grid import SparseGrid
 from .distances import Distances, near_nodes, surface_cells
 from .nodes import (  # fmt: skip
     POINTERS,
-    bernstein,
     decode_to_array,
     entry_scale,
     entry_words,
@@ -29,18 +28,6 @@ WEIGHTS = np.array([5.0, 1, 1])
 
 #: Smallest distance of a node from zero, in spacings.
 LEAST = 0.01
-
-#: Rounds in which nodes are moved to keep the surface within the stored cells.
-REPAIRS = 12
-
-#: Corners of a cell, and its Bernstein coefficients, on each of its six sides: −x, +x, −y, …; (6, 4) and (6, 9).
-FACE_CORNERS, FACE_COEFFICIENTS = (
-    np.stack([np.arange(n**3).reshape(n, n, n).take(end, axis).ravel() for axis in range(3) for end in (0, n - 1)])
-    for n in (2, 3)
-)
-
-#: Values of the Bernstein polynomials of a side at 9 × 9 places of it, (9, 81).
-FACE_BASIS = np.kron(*[np.stack([(1 - u) ** 2, 2 * u * (1 - u), u**2]) for u in [np.linspace(0, 1, 9)] * 2])
 
 
 @dataclass
@@ -178,18 +165,14 @@ def assign(values: np.ndarray, entries: np.ndarray) -> np.ndarray:
 class NodeCoding:
     """Codes of a grid's nodes: ``frames`` of blocks, ``entries`` of the cascaded array, ``pointers`` of nodes.
 
-    No node changes its side, since the stored cells are those in which the signs of nodes change. Nor does the surface
-    leave them: where a stored cell borders on one that is not, nodes are moved until its face has one sign.
+    No node changes its side, since the stored cells are those in which the signs of nodes change.
     """
 
     def __init__(self, sampled: SampledNodes, seed: int = 0):
         self.sampled, self.seed = sampled, seed
-        count = sampled.structure.nodes
         self.frames = self.entries = None
-        self.pointers = np.zeros(count, np.uint32)
+        self.pointers = np.zeros(sampled.structure.nodes, np.uint32)
         self.side = np.where(sampled.distances < 0, -1.0, 1.0)
-        #: Smallest distance of each node on its side, in spacings
-        self.least = np.full(count, LEAST)
 
     def encode(self, values: np.ndarray) -> None:
         """Choose the codes of nodes with the ``values`` (n, 4), distances in spacings and normals."""
@@ -198,14 +181,7 @@ class NodeCoding:
         wanted = exact_entries(nodes, self.frames)
         self.entries = self._choose_entries(wanted)
         self.pointers = assign(wanted, self.entries)
-        self._keep_sides(wanted, np.arange(len(wanted)))
-        before = None
-        for _ in range(REPAIRS):
-            moved = self._hold_borders()
-            if np.array_equal(moved, before):  # as far as their blocks let them
-                break
-            self._keep_sides(wanted, moved)
-            before = moved
+        self._keep_sides(wanted)
 
     def _choose_entries(self, wanted: np.ndarray) -> np.ndarray:
         """Return the cascaded array (K, 3), float32, for nodes with the exact entries ``wanted`` (n, 3)."""
@@ -235,11 +211,11 @@ class NodeCoding:
         plane, scale = (v[nodes, None] for v in self._planes)
         return self.side[nodes, None] * (plane + scale * self.entries[pointers, 0])
 
-    def _keep_sides(self, wanted: np.ndarray, nodes: np.ndarray) -> None:
-        """Give ``nodes`` that are not far enough on their side the nearest entry with which they are."""
+    def _keep_sides(self, wanted: np.ndarray) -> None:
+        """Give nodes that are not far enough on their side the nearest entry with which they are."""
         tree = None
-        for part in np.array_split(nodes, max(1, len(nodes) // 2**18)):
-            wrong = part[self._distances(part, self.pointers[part, None])[:, 0] < self.least[part]]
+        for part in np.array_split(np.arange(len(wanted)), max(1, len(wanted) // 2**18)):
+            wrong = part[self._distances(part, self.pointers[part, None])[:, 0] < LEAST]
             for count in (32, 256, len(self.entries)):
                 if not len(wrong):
                     break
@@ -248,35 +224,11 @@ class NodeCoding:
                 for some in np.array_split(wrong, max(1, len(wrong) * count // 2**24)):
                     near = tree.query(wanted[some] * WEIGHTS, k=count)[1].reshape(len(some), count)
                     far = self._distances(some, near)
-                    good = far >= self.least[some, None]
+                    good = far >= LEAST
                     # If none is far enough, the furthest one on the right side
                     choice = np.where(good.any(axis=1), good.argmax(axis=1), far.argmax(axis=1))
                     self.pointers[some] = near[np.arange(len(some)), choice]
-                wrong = wrong[self._distances(wrong, self.pointers[wrong, None])[:, 0] < self.least[wrong]]
-
-    @functools.cached_property
-    def _borders(self) -> tuple[np.ndarray, np.ndarray]:
-        """Faces of stored cells that border on cells that are not stored: numbers of cells and of sides (0 to 5)."""
-        sampled = self.sampled
-        shape = np.array(sampled.structure.shape) + 2
-        cells = np.ravel_multi_index((sampled.positions[sampled.corners[:, 0]] + 1).T, shape)
-        steps = np.array([shape[1] * shape[2], shape[2], 1])
-        return np.nonzero(~np.isin(cells[:, None] + np.stack([-steps, steps], axis=1).ravel(), cells))
-
-    def _hold_borders(self) -> np.ndarray:
-        """Raise the smallest distances of nodes at border faces on which the sign changes; return these nodes."""
-        cells, sides = self._borders
-        values, moved = self.values().astype(np.float64), [np.zeros(0, int)]
-        for part in np.array_split(np.arange(len(cells)), max(1, len(cells) // 2**14)):
-            corners = self.sampled.corners[cells[part]]
-            face = np.take_along_axis(corners, FACE_CORNERS[sides[part]], axis=1)
-            coefficients = np.take_along_axis(bernstein(values[corners]), FACE_COEFFICIENTS[sides[part]], axis=1)
-            lowest = (self.side[face[:, :1]] * (coefficients @ FACE_BASIS)).min(axis=1)
-            broken = lowest < 0.5 * LEAST
-            nodes, short = face[broken].ravel(), np.repeat(LEAST - lowest[broken], 4)
-            np.maximum.at(self.least, nodes, self._distances(nodes, self.pointers[nodes, None])[:, 0] + short)
-            moved.append(nodes)
-        return np.unique(np.concatenate(moved))
+                wrong = wrong[self._distances(wrong, self.pointers[wrong, None])[:, 0] < LEAST]
 
     @property
     def slope(self) -> float:

@@ -5,7 +5,6 @@ All lengths are relative to the mesh's longest side.
 
 from __future__ import annotations
 
-import functools
 import math
 
 import drjit as dr
@@ -14,7 +13,7 @@ import numpy as np
 from ...arrays.indirection import device_array
 from .distances import Distances, sample_box, sample_near, sample_surface, surface_cells
 from .field import DistanceField
-from .grids import OFF_NODE, components, march, point_array, point_values, to_trimesh
+from .grids import components, point_array, point_values
 from .mesh import Mesh
 
 #: Distance from the surface within which points count as near.
@@ -134,12 +133,11 @@ class SurfaceEvaluation:
         """Compare a decoded ``trimesh.Trimesh`` (units and place of the file) with the solid.
 
         ``chamfer``: mean distance from points uniform on one surface to the other one, averaged over both directions,
-        infinite if one is empty; ``components``: pieces of the decoded surface, ``components_mesh``: those of the
-        mesh's solid. Decode on a grid finer than the field's cells, or the grid's error is measured, too.
+        infinite if one is empty; ``components``: pieces of the decoded surface. Decode on a grid finer than the
+        field's cells, or the grid's error is measured, too.
         """
-        pieces = {"components": len(components(decoded)), "components_mesh": self.components}
         if not len(decoded.faces):
-            return {"chamfer": math.inf, **pieces}
+            return {"chamfer": math.inf, "components": 0}
         vertices = (np.asarray(decoded.vertices) - np.array(self.mesh.centre)) / self.mesh.scale
         other = Mesh(vertices, np.asarray(decoded.faces), True, path="the decoded mesh")
         rng = np.random.default_rng([self.seed, 8])
@@ -148,31 +146,7 @@ class SurfaceEvaluation:
         there = self.distances.unsigned(decoded_points).mean()
         with Distances(other) as distances:
             back = distances.to_triangles(mesh_points).mean()
-        return {"chamfer": float(there + back) / 2, **pieces}
-
-    @functools.cached_property
-    def components(self) -> int:
-        """Number of pieces of the solid's surface.
-
-        They are counted on the mesh itself or, if its pieces overlap or it is open, on a grid of 256 cells of exact
-        distances.
-        """
-        solid = self.distances.surface
-        return solid.components if solid is self.mesh else len(components(self.truth(256)))
-
-    def truth(self, resolution: int):
-        """Extract the solid's surface from exact distances, in units and place of the file."""
-        spacing = 1 / resolution
-        lower = self.mesh.lower - 1.5 * spacing
-        cells = np.ceil((self.mesh.upper - lower) / spacing + 1.5).astype(int)
-
-        def layers(first: int, end: int) -> np.ndarray:
-            nodes = np.argwhere(np.ones((end - first, *(cells[1:] + 1)), bool)) + np.array([first, 0, 0])
-            values = self.distances.signed(lower + spacing * nodes, 2 * spacing)
-            return values.reshape(end - first, *(cells[1:] + 1))
-
-        vertices, faces = march(layers, cells, OFF_NODE * spacing)
-        return to_trimesh(self.mesh.to_file_frame(lower + spacing * vertices), faces)
+        return {"chamfer": float(there + back) / 2, "components": len(components(decoded))}
 
 
 def lost_pieces(field: DistanceField, distances: Distances, count: int = 32, seed: int = 2) -> int:

@@ -15,8 +15,7 @@ from ...arrays.tables import MAX_BYTES, Table
 from ...core import units
 from ...core.errors import UsageError
 from ...fitting.loop import Problem
-from ...fitting.settings import FittingError
-from ...fitting.task import FitRequest, Fitted
+from ...fitting.task import FitRequest, Fitted, FittingError
 from . import TASK, encoding
 from .distances import Distances
 from .evaluation import HELD_OUT, HeldOut, SurfaceEvaluation, lost_pieces

@@ -104,7 +104,6 @@ def node_values(field: DistanceField, lower, spacing: float, shape, where=None) 
     t = field.types
     # Opaque: all grids of all fields use the same kernel
     first, step = dr.opaque(t.Array3f, list(map(float, lower))), dr.opaque(t.Float, spacing)
-    inverse = dr.opaque(t.Float64, 1 / shape[2]), dr.opaque(t.Float64, 1 / shape[1])
     sides = dr.opaque(t.Array3u, [int(n) for n in shape])
     count, values = math.prod(shape) if where is None else len(where), [np.zeros(0, np.float32)]
     with dr.suspend_grad():
@@ -114,10 +113,8 @@ def node_values(field: DistanceField, lower, spacing: float, shape, where=None) 
                 n = dr.arange(t.UInt32, last - start) + dr.opaque(t.UInt32, start)
             else:
                 n = device_array(t.UInt32, where[start:last])
-            # In double precision, the product is never rounded up to the next whole number
-            rows = t.UInt32((t.Float64(n) + 0.5) * inverse[0])
-            layer = t.UInt32((t.Float64(rows) + 0.5) * inverse[1])
-            index = layer, rows - layer * sides.y, n - rows * sides.z
+            rows = n // sides.z
+            index = rows // sides.y, rows % sides.y, n % sides.z
             p = [dr.fma(t.Float(i), step, a) for i, a in zip(index, first, strict=True)]
             values.append(field.value(t.Array3f(*p)).numpy())
     return np.concatenate(values).reshape(shape if where is None else count)
@@ -251,33 +248,20 @@ def extract(field: DistanceField, resolution: int, scale: float = 1.0, centre=(0
     32 layers of cells at a time, and computed near the nodes of a sparse field only. Raises
     :class:`.UsageError` for a resolution outside of 4 … 1024.
     """
+    import trimesh
+    from skimage.measure import marching_cubes
+
     spacing = spacing_for(field, resolution)
     # One more cell on either side, all outside, closes what the box cuts
     lower = np.array(field.lower) - spacing
     cells = np.ceil((np.array(field.upper) - np.array(field.lower)) / spacing - 1e-6).astype(int) + 2
     crossed, layers = grid_layers(field, lower, spacing, cells + 1)
-    vertices, faces = march(
-        lambda a, b: np.nan_to_num(layers(a, b), nan=field.band), cells, OFF_NODE * spacing, crossed
-    )
-    return to_trimesh((lower + spacing * vertices) * scale + np.array(centre), faces)
-
-
-def march(layers, cells, smallest: float, crossed=None) -> tuple[np.ndarray, np.ndarray]:
-    """Run marching cubes over ``cells`` (x, y, z): vertices ``(V, 3)`` float64 in units of cells, faces ``(F, 3)``.
-
-    Faces are counter-clockwise from outside. ``layers(first, end)`` returns the values at nodes of x, ``(end − first,
-    Y, Z)``, which are kept ``smallest`` away from zero. Only cells around ``crossed`` blocks of nodes are processed, by
-    default all.
-    """
-    from skimage.measure import marching_cubes
-
-    vertices, faces, count = [], [], 0
-    crossed = np.ones(-(-cells // BLOCK), bool) if crossed is None else crossed
+    vertices, faces, count, least = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0, OFF_NODE * spacing
     for x in range(0, cells[0], BLOCK):
         if not crossed[x // BLOCK].any():
             continue
-        values = layers(x, min(x + BLOCK, int(cells[0])) + 1)
-        values = np.where(values < 0, np.minimum(values, -smallest), np.maximum(values, smallest)).astype(np.float32)
+        values = np.nan_to_num(layers(x, min(x + BLOCK, int(cells[0])) + 1), nan=field.band)
+        values = np.where(values < 0, np.minimum(values, -least), np.maximum(values, least)).astype(np.float32)
         for y, z in BLOCK * np.argwhere(crossed[x // BLOCK]):
             block = values[:, y : y + BLOCK + 1, z : z + BLOCK + 1]
             if min(block.shape) < 2 or (block.min() < 0) == (block.max() < 0):
@@ -286,9 +270,9 @@ def march(layers, cells, smallest: float, crossed=None) -> tuple[np.ndarray, np.
             vertices.append(v.astype(np.float64) + np.array((x, y, z)))
             faces.append(f.astype(np.int64) + count)
             count += len(v)
-    if not vertices:
-        return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
-    return _merge_vertices(np.concatenate(vertices), np.concatenate(faces))
+    vertices, faces = _merge_vertices(np.concatenate(vertices), np.concatenate(faces))
+    vertices = (lower + spacing * vertices) * scale + np.array(centre)
+    return trimesh.Trimesh(vertices, faces, process=False, validate=False)
 
 
 def _merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -301,19 +285,11 @@ def _merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray
     on = np.abs(vertices - whole) < 1e-5
     middle = np.where(on, 2 * whole, 2 * np.floor(vertices) + 1).astype(np.int64)
     edge = on.sum(axis=1) == 2
-    middle -= middle.min(axis=0)
-    size = middle.max(axis=0) + 1
+    size = middle.max(axis=0, initial=0) + 1
     keys = (middle[:, 0] * size[1] + middle[:, 1]) * size[2] + middle[:, 2]
     keys[~edge] = -1 - np.arange(np.count_nonzero(~edge))
     _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
     return vertices[first], inverse[faces]
-
-
-def to_trimesh(vertices: np.ndarray, faces: np.ndarray):
-    """Return unprocessed triangles as a ``trimesh.Trimesh``."""
-    import trimesh
-
-    return trimesh.Trimesh(vertices, faces, process=False, validate=False)
 
 
 def components(mesh) -> np.ndarray:

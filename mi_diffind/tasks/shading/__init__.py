@@ -10,12 +10,11 @@ a preview; :mod:`.training`: the training problem; :mod:`.fit`: the command ``fi
 
 from __future__ import annotations
 
-import dataclasses
+import math
 from dataclasses import dataclass
 
 from ...core.arguments import Argument, fraction, positive_or_none
-from ...fitting.settings import FitSettings
-from ...fitting.task import Task
+from ...fitting.task import FitSettings, Task
 from ...maps.arguments import LEVEL_BIAS, PREVIEW, SIZES, SOURCES
 
 #: Sample patterns of the reference (:data:`.evaluation.SAMPLES_PER_SIDE`).
@@ -23,8 +22,8 @@ REFERENCES = ("jittered", "prefiltered", "converged")
 
 
 @dataclass(frozen=True)
-class ShadingRecipe:
-    """Recipe of a training for shaded appearance, which starts from a trained texture.
+class ShadingSettings(FitSettings):
+    """Training for shaded appearance, which starts from a trained texture; the defaults are those of ``ours``.
 
     ``share``: λ, the share of the loss of shaded values. ``clip``: bound of the derivatives of a sample's error through
     the specular lobe (``None``: unlimited). ``reference``: sample pattern of the reference. ``bounded``: whether values
@@ -32,11 +31,16 @@ class ShadingRecipe:
     (negative), stored in the file (``None``: chosen by images). ``extras``: whether the shape and weight of the
     specular lobe are tried as coarse extras, which ``neural_material`` alone reads. ``fixed``: whether the
     entries that fine levels read keep their values. ``beta_2``: Adam's decay of squared gradients; highlights are rare,
-    and with 0.999 single ones tilt normals of glossy, flat pages by degrees. ``texture``: recipe of task 4, which
-    trains the start unless one is given, and defines the samples and the loss of the texture. ``settings``: the rest;
-    its ``loss`` is that of shaded values.
+    and with 0.999 single ones tilt normals of glossy, flat pages by degrees. ``texture``: preset of task 4, which
+    trains the start unless one is given, and defines the samples and the loss of the texture; ``loss`` is that of
+    shaded values.
     """
 
+    steps: int = 1500
+    batch: int = 2**16
+    lr: float = 5e-3
+    loss: str = "mse"
+    measure_every: int = 150
     share: float = 0.9
     clip: float | None = 1.0
     reference: str = "jittered"
@@ -46,20 +50,14 @@ class ShadingRecipe:
     fixed: bool = False
     beta_2: float = 0.99
     texture: str = "ours"
-    settings: FitSettings = dataclasses.field(default_factory=FitSettings)
 
-
-#: Steps of a training without a time limit.
-STEPS = 1500
-
-_OURS = FitSettings(steps=STEPS, batch=2**16, lr=5e-3, schedule="cosine", loss="mse", measure_every=STEPS // 10)
 
 #: The first is the default. The paper's λ is 0.1 or 0.25, by its scene.
 PRESETS = {
-    "ours": ShadingRecipe(settings=_OURS),
-    "paper": ShadingRecipe(
-        share=0.25, clip=0.1, reference="prefiltered", bounded=False, level_bias=0.0, beta_2=0.999, texture="paper",
-        settings=dataclasses.replace(_OURS, lr=1e-3, schedule="constant", loss="mae"),
+    "ours": ShadingSettings(),
+    "paper": ShadingSettings(
+        lr=1e-3, schedule="constant", loss="mae", share=0.25, clip=0.1, reference="prefiltered", bounded=False,
+        level_bias=0.0, beta_2=0.999, texture="paper",
     ),
 }  # fmt: skip
 
@@ -71,7 +69,7 @@ class Shading(Task):
     title = "a texture, for what it looks like when it is shaded"
     section = "supplemental 1.5"
     example = "material.json --compression 12x"
-    presets = {name: recipe.settings for name, recipe in PRESETS.items()}  # noqa: RUF012
+    presets = PRESETS
     storages = ()
     measurements = 10
     arguments = (
@@ -107,6 +105,13 @@ class Shading(Task):
         *SOURCES,
         PREVIEW,
     )  # fmt: skip
+
+    def settings(self, preset, given, options):
+        chosen = {name: options[name] for name in ("share", "clip", "reference", "level_bias")}
+        chosen = {name: value for name, value in chosen.items() if value is not None}
+        # Words and numbers that stand for None: a chosen bias, no bound
+        chosen |= {name: None for name, value in chosen.items() if value in ("auto", math.inf)}
+        return self.change_settings(PRESETS[preset], {**chosen, "extras": options["extras"] == "auto", **given})
 
 
 TASK = Shading()

@@ -23,8 +23,7 @@ import numpy as np
 from ...arrays.indirection import aligned_copy
 from ...core.files import replacing
 from ...images import metrics, srgb
-from ...maps.compressed import FilteredMaps, decibel
-from ...maps.pyramid import Pyramid
+from ...maps.pyramid import FilteredMaps, Pyramid, decibel
 from ..disney.decoder import Decoder
 from ..disney.model import Effects
 from ..disney.training import uniform_hemisphere

@@ -10,16 +10,15 @@ from ...arrays.tables import Table
 from ...core.errors import UsageError
 from ...core.units import figure_lines
 from ...fitting.task import FitRequest, Fitted
-from ...maps.arguments import preview_path, requested_border, requested_bytes, size_figures
+from ...maps.model import preview_path, requested_border, requested_bytes, size_figures
 from ...maps.pyramid import Pyramid
 from ...maps.source import load_source
 from ..texture import PRESETS as TEXTURES
 from ..texture import TASK as TEXTURE
 from ..texture import fit as texture_fit
-from ..texture import training as textures
-from ..texture.compressed import bias_of
-from ..texture.nets import neutral_extras
-from . import PRESETS, ShadingRecipe, material, training
+from ..texture import fit as textures
+from ..texture.compressed import neutral_extras, read_level_bias
+from . import ShadingSettings, material, training
 from .evaluation import ShadedEvaluation
 
 #: Number of pairs of view and light of the images that measure. Many, since a few pairs near the mirror direction
@@ -33,18 +32,6 @@ SIDE = 32
 PRETRAINING = 0.4
 
 
-def recipe_of(preset: str, settings, options) -> ShadingRecipe:
-    """Return the recipe of a preset with the given options in place of its own."""
-    recipe = PRESETS[preset]
-    given = {name: options[name] for name in ("share", "reference", "level_bias") if options[name] is not None}
-    if options["level_bias"] == "auto":
-        given["level_bias"] = None
-    if options["clip"] is not None:
-        given["clip"] = None if options["clip"] == math.inf else options["clip"]
-    extras = options["extras"] == "auto"
-    return dataclasses.replace(recipe, settings=settings or recipe.settings, extras=extras, **given)
-
-
 def check(request: FitRequest) -> None:
     """Raise :class:`UsageError` for options that exclude each other."""
     options = request.options
@@ -54,7 +41,7 @@ def check(request: FitRequest) -> None:
         raise UsageError(f"source: found the scene {options['source']}; fit scene trains a texture inside a scene")
     if options["start"] is not None and any(options[name] for name in ("compression", "bytes", "bpp")):
         raise UsageError("--start: the arrays have their size, leave out --compression, --bytes and --bpp")
-    if options["extras"] == "auto" and PRESETS[request.preset].texture == "paper":
+    if options["extras"] == "auto" and request.settings.texture == "paper":
         raise UsageError(f"--extras: found auto, the arrays of the preset {request.preset} have none, allowed is off")
 
 
@@ -67,14 +54,14 @@ def fit(request: FitRequest) -> Fitted:
     """
     options = request.options
     source = load_source(options["source"], nonfinite=options["nonfinite"])
-    recipe = recipe_of(request.preset, request.settings, options)
-    layout = textures.layout_of(source, TEXTURES[recipe.texture])
-    pyramid = Pyramid.of(source, layout, request.types, requested_border(options))
-    effects, reasons = material.effects_of(layout)
+    recipe = request.settings
+    layout = textures.source_layout(source, TEXTURES[recipe.texture])
+    pyramid = Pyramid.from_source(source, layout, request.types, requested_border(options))
+    effects, reasons = material.material_effects(layout)
     if not layout.stored:
         raise UsageError(f"{options['source']}: all of its maps are constant, there is nothing to learn")
     start = None if options["start"] is None else load_start(options["start"], source, request)
-    size = size_of(source, pyramid, recipe, options) if start is None else None
+    size = find_size(source, pyramid, recipe, options) if start is None else None
     # Before any training, which gets a share of the time that is left
     evaluation = ShadedEvaluation(pyramid, effects, pairs=PAIRS, side=SIDE)
     evaluation.another()
@@ -87,12 +74,12 @@ def fit(request: FitRequest) -> Fitted:
         # Without a checkpoint, the training as a texture was interrupted
         resume = request.resume and os.path.exists(request.checkpoint or "")
         try:
-            net = training.start_of(start, pyramid)
+            net = training.trainable_arrays(start, pyramid)
         except ValueError as e:
             raise UsageError(str(e)) from None
         table, result = training.fit_shading(
             source, net, recipe, dataclasses.replace(request, resume=resume), pyramid, evaluation,
-            preview_path(request), bias_of(start.settings),
+            preview_path(request), read_level_bias(start.settings),
         )  # fmt: skip
     settings = table.settings
     settings |= request.paths(source_path=options["source"])
@@ -129,12 +116,12 @@ def load_start(path, source, request: FitRequest) -> Table:
     return table
 
 
-def size_of(source, pyramid: Pyramid, recipe: ShadingRecipe, options):
+def find_size(source, pyramid: Pyramid, recipe: ShadingSettings, options):
     """Return the memory budget of the arrays, beside extras if the recipe has them. Raises :class:`UsageError`."""
     options = {argument.name: argument.default for argument in TEXTURE.arguments} | dict(options)
     nbytes = requested_bytes(options, source)
     nbytes = bytes_beside_extras(nbytes, pyramid) if recipe.extras else nbytes
-    return texture_fit.size_of(source, pyramid, nbytes, TEXTURES[recipe.texture], options)
+    return texture_fit.find_size(source, pyramid, nbytes, TEXTURES[recipe.texture], options)
 
 
 def bytes_beside_extras(nbytes: float, pyramid: Pyramid) -> float:
@@ -146,11 +133,9 @@ def bytes_beside_extras(nbytes: float, pyramid: Pyramid) -> float:
     return nbytes - needed
 
 
-def pretrain(source, pyramid: Pyramid, size, recipe: ShadingRecipe, request: FitRequest) -> tuple:
+def pretrain(source, pyramid: Pyramid, size, recipe: ShadingSettings, request: FitRequest) -> tuple:
     """Train as a texture alone, with a separate checkpoint; return the table and the run's record."""
-    texture = TEXTURES[recipe.texture]
-    seeded = {"seed": recipe.settings.seed, "deterministic": recipe.settings.deterministic}
-    texture = dataclasses.replace(texture, settings=dataclasses.replace(texture.settings, **seeded))
+    texture = dataclasses.replace(TEXTURES[recipe.texture], seed=recipe.seed, deterministic=recipe.deterministic)
     checkpoint = None if request.checkpoint is None else f"{request.checkpoint}.texture"
     first = dataclasses.replace(
         request.part(PRETRAINING), preset=recipe.texture, checkpoint=checkpoint,

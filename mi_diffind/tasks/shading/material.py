@@ -20,13 +20,13 @@ from ...arrays.boxes import ValueBounds
 from ...core.compat import backend_module
 from ...core.errors import UsageError
 from ...images import srgb
-from ...maps.compressed import FilteredMaps
 from ...maps.layout import Layout, MapLayout
+from ...maps.pyramid import FilteredMaps
 from ..disney import TASK as DISNEY
 from ..disney.decoder import Decoder, Lobe
 from ..disney.model import PARAMETERS, Effects, Material, find_effects, sanitize
 from ..disney.training import shade
-from ..texture.nets import NEUTRAL
+from ..texture.compressed import NEUTRAL
 
 #: Values of parameters without a map, the defaults of the plugin ``disney``.
 DEFAULTS = {**dict.fromkeys(PARAMETERS, 0.0), "roughness": 0.5, "specular": 0.5}
@@ -74,7 +74,7 @@ def left_out(layout: Layout) -> dict[str, str]:
     return {m.name: reason for m in layout.maps if m.role not in READ}
 
 
-def effects_of(layout: Layout) -> tuple[Effects, dict[str, str]]:
+def material_effects(layout: Layout) -> tuple[Effects, dict[str, str]]:
     """Return the effects of a material, and the reasons for effects that are left out (:func:`.find_effects`)."""
     bounds = {name: ValueBounds(value, value) for name, value in DEFAULTS.items()}
     for role, m in maps_of(layout).items():
@@ -91,7 +91,7 @@ def effects_of(layout: Layout) -> tuple[Effects, dict[str, str]]:
 SHEAR = 0.95
 
 
-def lobe_of(extra: list) -> Lobe:
+def specular_lobe(extra: list) -> Lobe:
     """Return the shape of a specular lobe from extras, numbers in [0, 1] (:data:`.nets.NEUTRAL`: a round one)."""
     c, s = (2 * (x - n) for x, n in zip(extra[:2], NEUTRAL, strict=False))
     scale = SHEAR * dr.rsqrt(dr.maximum(dr.square(c) + dr.square(s), SHEAR**2))
@@ -120,7 +120,7 @@ def surface_of(maps: FilteredMaps, stored: list, extra: list | None = None) -> S
         signed = by_role["normal"].low < 0
         normal = vector(normal) if signed else 2 * vector(normal) - 1
     numbers = {n: channels[n][0] if n in channels else DEFAULTS[n] for n in ("roughness", "metallic")}
-    return SurfaceParameters(vector(albedo), normal, **numbers, lobe=None if extra is None else lobe_of(extra))
+    return SurfaceParameters(vector(albedo), normal, **numbers, lobe=None if extra is None else specular_lobe(extra))
 
 
 #: Colour of a material without an albedo, the default of the plugin ``disney``.

@@ -27,12 +27,11 @@ from ...maps.pyramid import Pyramid
 from ...maps.source import Source
 from ..disney.training import random_directions
 from ..texture import PRESETS as TEXTURES
-from ..texture import training as textures
-from ..texture.compressed import CompressedTexture, to_table
-from ..texture.nets import neutral_extras
-from . import ShadingRecipe
+from ..texture import fit as textures
+from ..texture.compressed import CompressedTexture, neutral_extras, to_table
+from . import ShadingSettings
 from .evaluation import TRUTHS, ShadedEvaluation, reader, reference, write_preview
-from .material import effects_of, frozen_decoder, shaded, surface_of
+from .material import frozen_decoder, material_effects, shaded, surface_of
 
 #: Factor of the number of shaded samples from one level to the next coarser one, up to level :data:`TOP`.
 FALL = 0.7
@@ -79,7 +78,7 @@ class ShadingProblem(textures.TextureProblem):
     tolerance = 0.02
 
     def __init__(
-        self, net, pyramid: Pyramid, recipe: ShadingRecipe, digest: str = "",
+        self, net, pyramid: Pyramid, recipe: ShadingSettings, digest: str = "",
         evaluation: ShadedEvaluation | None = None, base: Sequence[float] = (),
     ):  # fmt: skip
         super().__init__(net, pyramid, TEXTURES[recipe.texture], digest)
@@ -90,10 +89,9 @@ class ShadingProblem(textures.TextureProblem):
         self.preview: tuple[Path, ShadedEvaluation] | None = None
         #: Gain of each level over ``base`` in the last measurement, dB
         self.level_gains = np.zeros(0)
-        self.effects, _ = effects_of(pyramid.layout)
+        self.effects, _ = material_effects(pyramid.layout)
         self.decoder = frozen_decoder(self.types)
-        recorded = {k: v for k, v in dataclasses.asdict(recipe).items() if k != "settings"}
-        self.identity = {**self.identity, "shading": recorded}
+        self.identity = {**self.identity, "shading": recipe.further}
 
     def loss(self, net, rng, size: int):
         net, share = self.seen(unfolded(net)), self.shading.share
@@ -102,7 +100,7 @@ class ShadingProblem(textures.TextureProblem):
         if share < 1:
             inputs, targets = self.batch(rng, size)
             weights = {name: (1 - share) * weight for name, weight in self.weights.items()}
-            losses += sample_losses(self.read(net, inputs), targets, weights, size, self.recipe.settings.loss)
+            losses += sample_losses(self.read(net, inputs), targets, weights, size, self.recipe.loss)
         if share > 0:
             losses.append(share / size * self.shading_errors(net, rng, size))
         return losses
@@ -165,9 +163,9 @@ def _bounded(x):
     return dr.select(x > 1, 1 + dr.log(dr.maximum(x, 1)), x)
 
 
-def start_of(table: Table, pyramid: Pyramid):
+def trainable_arrays(table: Table, pyramid: Pyramid):
     """Return the arrays of a trained texture for further training. Raises ``ValueError`` for other channels."""
-    texture = CompressedTexture.of(table, pyramid.types.TensorXf, "float32")
+    texture = CompressedTexture.from_table(table, pyramid.types.TensorXf, "float32")
     if texture.layout != pyramid.layout:
         raise ValueError(f"{table.path}: stores other channels than a training of this source would")
     return texture.net
@@ -176,14 +174,14 @@ def start_of(table: Table, pyramid: Pyramid):
 def fit_shading(
     source: Source,
     start,
-    recipe: ShadingRecipe,
+    recipe: ShadingSettings,
     request: FitRequest,
     pyramid: Pyramid,
     evaluation: ShadedEvaluation | None = None,
     preview: Path | None = None,
     start_bias: float = 0.0,
 ) -> tuple[Table, FitResult]:
-    """Train the arrays ``start`` (:func:`start_of`) of ``source`` for shading; return its table and the run's record.
+    """Train arrays (``start``: :func:`trainable_arrays`) of ``source`` for shading; return the table and its record.
 
     The table is of the task ``texture``, with its errors as a texture and as shaded images of the ``evaluation``. Level
     bias and state are chosen by other images, under views and lights that neither training nor evaluation draws. If no
@@ -191,9 +189,9 @@ def fit_shading(
     ``kept_start``). The setting ``before`` has the errors of the start as shaded images, ``level_biases`` the gains by
     which the bias was chosen (:func:`choose`). ``preview`` is a picture that is written at each measurement.
     """
-    request = dataclasses.replace(request, settings=recipe.settings)
+    request = dataclasses.replace(request, settings=recipe)
     validation = None if evaluation is None else evaluation.another()
-    effects, decoder = effects_of(pyramid.layout)[0], frozen_decoder(pyramid.types)
+    effects, decoder = material_effects(pyramid.layout)[0], frozen_decoder(pyramid.types)
     texture = CompressedTexture(pyramid.layout, textures.stored_form(start), start_bias)
     base, before, stopped = [], {}, None
     choice, gains = recorded_choice(request)
@@ -205,7 +203,7 @@ def fit_shading(
         errors = evaluation.measure(reader(texture, effects, decoder), False)
         return {f"shaded_{TRUTHS[k]}_db": f["mean_db"] for k, f in errors.items()}
 
-    def problem_of(choice: Trial) -> ShadingProblem:
+    def build_problem(choice: Trial) -> ShadingProblem:
         net = start.changed(lambda array, bits: array.copy())
         if choice.extras and net.extras is None:
             layout = pyramid.layout
@@ -219,8 +217,8 @@ def fit_shading(
         before = begin(lambda: shaded_errors(texture))
         base = validation.measure(reader(texture, effects, decoder), False)["C"]["psnr_db"]
         if choice is None:
-            choice, gains, stopped = choose(problem_of, request, biases, recipe)
-    problem, result = stopped or (problem_of(choice or Trial(biases[0])), None)
+            choice, gains, stopped = choose(build_problem, request, biases, recipe)
+    problem, result = stopped or (build_problem(choice or Trial(biases[0])), None)
     if result is None:
         problem.identity |= {"level_biases": gains} if gains else {}
         problem.preview = None if preview is None or evaluation is None else (preview, evaluation)
@@ -233,8 +231,8 @@ def fit_shading(
     settings = {**request.recorded(result), **problem.identity, "level_bias": texture.level_bias}
     settings |= {"kept_start": True} if kept else {}
     table = to_table(texture, settings)
-    table.preset, table.seed = request.preset, recipe.settings.seed
-    errors = CompressedTexture.of(table, request.types.TensorXf).measure(source)
+    table.preset, table.seed = request.preset, recipe.seed
+    errors = CompressedTexture.from_table(table, request.types.TensorXf).measure(source)
     if evaluation is not None:
         table.settings["before"] = significant(before)
         errors = {**(before if kept else shaded_errors(texture)), **errors}
@@ -243,7 +241,10 @@ def fit_shading(
 
 
 def choose(
-    problem_of: Callable[[Trial], ShadingProblem], request: FitRequest, biases: Sequence[float], recipe: ShadingRecipe
+    build_problem: Callable[[Trial], ShadingProblem],
+    request: FitRequest,
+    biases: Sequence[float],
+    recipe: ShadingSettings,
 ) -> tuple:
     """Return the best :class:`Trial` after a short training with each, the gains, and ``None``.
 
@@ -274,7 +275,7 @@ def choose(
             yield best()._replace(extras=True)
 
     for choice in choices():
-        problem = problem_of(choice)
+        problem = build_problem(choice)
         measured[choice], measurement = duration(lambda problem=problem: problem.measure(problem.net))
         untrained = problem.level_gains
         trial = dataclasses.replace(request.part(TRIAL), settings=settings, checkpoint=None, resume=False)

@@ -7,20 +7,18 @@ training problem; :mod:`.fit`: the command ``fit texture``.
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from dataclasses import dataclass
 from typing import NamedTuple
 
 from ...core.arguments import Argument, between, checked, natural, positive
-from ...fitting.settings import FitSettings
-from ...fitting.task import Task
+from ...fitting.task import FitSettings, Task
 from ...maps.arguments import BIAS_RANGE, DECODED, SIZES, SOURCE, SOURCES
 
 
 @dataclass(frozen=True)
-class TextureRecipe:
-    """Storage and training of a texture.
+class TextureSettings(FitSettings):
+    """Storage and training of a texture; the defaults are those of the preset ``ours``.
 
     - ``layered``: our arrays, on the grids of levels of detail, which start from principal components; else the
       paper's arrays, which start from ramps.
@@ -31,29 +29,29 @@ class TextureRecipe:
     - ``rounded``: train with entries rounded as they will be stored.
     - ``samples``: distribution of levels of detail, ``"levels"`` (one half on level 0, one quarter on level 1, …) or
       one of :data:`.nets.FOOTPRINTS`.
-    - ``settings``: steps, batch, rate and loss.
     """
 
+    steps: int = 1500
+    batch: int = 2**18
+    lr: float = 3e-2
+    loss: str = "mse"
+    measure_every: int = 150
     layered: bool = True
     once: bool = True
     normals: bool = True
     jitter: float = 0.5
     rounded: bool = True
     samples: str = "levels"
-    settings: FitSettings = dataclasses.field(default_factory=FitSettings)
 
 
-#: Steps of 262,144 samples of a training without a time limit.
-STEPS = 1500
-
-_OURS = FitSettings(steps=STEPS, batch=2**18, lr=3e-2, schedule="cosine", loss="mse", measure_every=STEPS // 10)
-_PAPER = dataclasses.replace(_OURS, batch=2**20, steps=STEPS // 4, lr=1e-3, schedule="constant", loss="mae")
-
-#: Recipes by name; the first is the default.
+#: Settings by preset; the first is the default.
 PRESETS = {
-    "ours": TextureRecipe(settings=_OURS),
-    "paper": TextureRecipe(False, False, False, 1.0, False, "power", _PAPER),
-}
+    "ours": TextureSettings(),
+    "paper": TextureSettings(
+        steps=375, batch=2**20, lr=1e-3, schedule="constant", loss="mae", layered=False, once=False, normals=False,
+        jitter=1.0, rounded=False, samples="power",
+    ),
+}  # fmt: skip
 
 
 class FineArray(NamedTuple):
@@ -90,7 +88,7 @@ class Texture(Task):
     section = "supplemental 1.4"
     example = "material.json --compression 12x"
     plugin = ("texture", "neural_texture")
-    presets = {name: recipe.settings for name, recipe in PRESETS.items()}  # noqa: RUF012
+    presets = PRESETS
     storages = ()
     measurements = 10
     arguments = (
@@ -125,6 +123,10 @@ class Texture(Task):
         *DECODED,
         Argument("--level", type=natural, metavar="N", help="level of detail (default: 0, the source's)"),
     )
+
+    def settings(self, preset, given, options):
+        samples = options["footprint_samples"] or PRESETS[preset].samples
+        return self.change_settings(PRESETS[preset], {"samples": samples, **given})
 
     def usage(self, table, file):
         lines = super().usage(table, file)

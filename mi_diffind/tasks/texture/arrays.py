@@ -24,16 +24,22 @@ from ...arrays.pages import (
     most_entries,
     page_counts,
     page_entries,
-    page_gain,
     page_positions,
     page_shift,
     shared_page_sizes,
 )
-from ...maps.compressed import taps
-from ...maps.layout import Layout, channel_covariance, eigenvectors, neighbour_covariance
-from ...maps.pyramid import level_sizes
+from ...maps.layout import (
+    MARGIN,
+    Layout,
+    channel_covariance,
+    component_range,
+    eigenvectors,
+    linear_in_pointer,
+    neighbour_covariance,
+)
+from ...maps.pyramid import level_sizes, taps
 from . import FineArray, parse_structure
-from .nets import FineLayer, LayeredNet, LayeredStructure, PaperNet, PaperStructure
+from .compressed import FineLayer, LayeredNet, LayeredStructure, PaperNet, PaperStructure
 
 #: Best resolution ratio for compression ratios of RGB textures at 4K (the supplement's table 4).
 RATIOS = {3: 80, 6: 64, 12: 64, 24: 48}
@@ -143,12 +149,10 @@ class PaperBudget:
 def paper_size(
     nbytes: float, source_bytes: int, channels: int, height: int, width: int, rho: float | None = None
 ) -> PaperBudget:
-    """Return the result of the paper's search over the sides ``N_c`` = 4, 8, ….
+    """Return the result of the paper's search over the sides ``N_c`` of the array (:meth:`.Budget.paper_side`).
 
-    The search minimises the difference of compression ratios, with ``N_p0 = ρ N_c`` in multiples of 8 and no larger
-    than the image; ``rho`` is by default :func:`resolution_ratio`. If the best is more than 5% off, primary 0 is
-    resized to fit beside the same ``N_c``, or beside a smaller one if the cascaded array alone takes more than half of
-    the bytes.
+    ``N_p0 = ρ N_c`` in multiples of 8 and no larger than the image; ``rho`` is by default :func:`resolution_ratio`. If
+    the best is more than 5% off, primary 0 is resized to fit beside the cascaded array.
     """
     lods, budget = lod_count(height, width), Budget(nbytes)
     rho = rho or resolution_ratio(max(source_bytes / nbytes, 1e-6), channels)
@@ -157,15 +161,11 @@ def paper_size(
         side = PRIMARY_STEP * max(1, round(rho * cascaded / PRIMARY_STEP))
         return PaperBudget(*_spread(side**2, height, width), lods, cascaded, channels)
 
-    most = int((nbytes / (channels * lods)) ** (1 / 3)) + 2 * CASCADED_STEP  # takes more than all bytes
-    best = sized(budget.nearest(sized, range(CASCADED_STEP, most + 1, CASCADED_STEP), source_bytes))
-    if budget.is_met(best.nbytes):
-        return best
-    cascaded = best.cascaded
-    while cascaded > CASCADED_STEP and channels * cascaded**3 * lods > nbytes / 2:
-        cascaded -= CASCADED_STEP
-    entries = (nbytes - PaperBudget(0, 0, lods, cascaded, channels).nbytes) / 3
-    return PaperBudget(*_spread(max(1, entries), height, width), lods, cascaded, channels)
+    side, met = budget.paper_side(sized, channels * lods, 3, source_bytes, CASCADED_STEP)
+    if met:
+        return sized(side)
+    entries = (nbytes - PaperBudget(0, 0, lods, side, channels).nbytes) / 3
+    return PaperBudget(*_spread(max(1, entries), height, width), lods, side, channels)
 
 
 def _spread(entries: float, height: int, width: int) -> tuple[int, int]:
@@ -322,60 +322,7 @@ def from_ramps(layout: Layout, size: PaperBudget, border: tuple[str, str], level
     return PaperNet(primary0, primary1, cascaded, PaperStructure(levels))
 
 
-@dataclass(frozen=True)
-class PrincipalComponents:
-    """Principal components of a texture, scaled to [0, 1] as pointers of its texels.
-
-    ``mean``, ``(k,)``; ``directions``, ``(dims, k)``, those with the largest differences between neighbours first;
-    ``low`` and ``high``, ``(dims,)``, the range of each component.
-    """
-
-    mean: np.ndarray
-    directions: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-
-    #: Room between the range of components and the ends of [0, 1].
-    MARGIN = 0.02
-
-    #: Share of texels beyond the range of components at either end.
-    OUTSIDE = 1e-3
-
-    @staticmethod
-    def of(values: np.ndarray, dims: int) -> PrincipalComponents:
-        """Return the first ``dims`` components of level 0, ``(height, width, k)``, at most ``k``."""
-        k = values.shape[-1]
-        mean = values.reshape(-1, k).mean(axis=0, dtype=np.float64)
-        covariance = channel_covariance(values, mean)
-        directions = eigenvectors(covariance, min(dims, k))
-        # Rotated within the same space so that the first axes have the most detail: fine arrays hold only these
-        detail = directions @ neighbour_covariance(values) @ directions.T
-        directions = eigenvectors(detail, len(directions)) @ directions
-        projected = (values.reshape(-1, k) - mean) @ directions.T
-        low, high = np.quantile(projected, [PrincipalComponents.OUTSIDE, 1 - PrincipalComponents.OUTSIDE], axis=0)
-        return PrincipalComponents(mean, directions, low, np.maximum(high, low + 1e-3))
-
-    @property
-    def dims(self) -> int:
-        return len(self.directions)
-
-    def pointers(self, values: np.ndarray) -> np.ndarray:
-        """Return the pointers of texels, ``(height, width, dims)`` in [0, 1], float32."""
-        unit = ((values - self.mean) @ self.directions.T - self.low) / (self.high - self.low)
-        return np.clip(self.MARGIN + (1 - 2 * self.MARGIN) * unit, 0, 1).astype(np.float32)
-
-    def back(self, side: int) -> np.ndarray:
-        """Return the channels at the entries of a cascaded array, ``(side, …, k)``: linear in the pointer."""
-        grid = (np.linspace(0, 1, side) - self.MARGIN) / (1 - 2 * self.MARGIN) if side > 1 else np.array([0.5])
-        channels = self.mean
-        for d in range(self.dims):
-            shape = [-1 if axis == d else 1 for axis in range(self.dims)] + [1]
-            along = np.reshape(self.low[d] + grid * (self.high[d] - self.low[d]), shape)
-            channels = channels + along * self.directions[d]
-        return np.clip(channels, 1e-3, 1 - 1e-3).astype(np.float32)
-
-
-def enlarged(values: np.ndarray, rows: int, columns: int, border: Sequence[str]) -> np.ndarray:
+def enlarge(values: np.ndarray, rows: int, columns: int, border: Sequence[str]) -> np.ndarray:
     """Return a level, ``(height, width, k)``, read bilinearly at the texel centres of ``rows`` × ``columns``."""
     for axis, (n, along) in enumerate(zip((rows, columns), border, strict=True)):
         places = (np.arange(n) + 0.5) / n
@@ -392,20 +339,30 @@ def from_components(values: Sequence[np.ndarray], size: TextureBudget, border: t
 
     Each fine array holds the difference between the pointers of its level and the sum of the coarser arrays.
     """
-    basis = PrincipalComponents.of(values[0], size.dims)
-    # A texture has at most as many components as channels: further coordinates start as ramps along u or v
-    pointers = [
-        np.concatenate([basis.pointers(level), _ramps(*level.shape[:2], size.dims - basis.dims)], axis=-1)
-        for level in values
-    ]
+    k = values[0].shape[-1]
+    mean = values[0].reshape(-1, k).mean(axis=0, dtype=np.float64)
+    directions = eigenvectors(channel_covariance(values[0], mean), min(size.dims, k))
+    # Rotated within the same space so that the first axes have the most detail: fine arrays hold only these
+    detail = directions @ neighbour_covariance(values[0]) @ directions.T
+    directions = eigenvectors(detail, len(directions)) @ directions
+    low, high = component_range((values[0].reshape(-1, k) - mean) @ directions.T)
+    used = len(directions)
+
+    def pointer(level: np.ndarray) -> np.ndarray:
+        unit = MARGIN + (1 - 2 * MARGIN) * (((level - mean) @ directions.T - low) / (high - low))
+        # A texture has at most as many components as channels: further coordinates start as ramps along u or v
+        further = _ramps(*level.shape[:2], size.dims - used)
+        return np.concatenate([np.clip(unit, 0, 1).astype(np.float32), further], axis=-1)
+
+    pointers = [pointer(level) for level in values]
     reached, level = pointers[size.skip], size.skip
-    layers, fine = _pages(pointers, basis, size, border)
+    layers, fine = _pages(pointers, high - low, size, border)
     for i in reversed(range(len(size.fine))):
         spec = size.fine[i]
         rows, columns = values[spec.level].shape[:2]
         while level > spec.level:
             level -= 1
-            reached = enlarged(reached, *values[level].shape[:2], border)
+            reached = enlarge(reached, *values[level].shape[:2], border)
         until = (size.fine[i + 1].level if i + 1 < len(size.fine) else size.skip) - 1
         if size.base and i + 1 == len(size.fine):
             reached = np.clip(pointers[level], 1e-3, 1 - 1e-3)
@@ -424,20 +381,21 @@ def from_components(values: Sequence[np.ndarray], size: TextureBudget, border: t
     coarse = np.concatenate([p.reshape(-1, size.dims) for p in pointers[size.skip :]])
     coarse = DifferentiableArray((len(coarse),), size.dims, np.clip(coarse, 1e-3, 1 - 1e-3), fold=True)
     shape = (size.knots,) * (size.knots > 1) + (size.cascaded,) * size.dims
-    back = basis.back(size.cascaded)
-    back = back.reshape(*back.shape[:-1], *[1] * (size.dims - basis.dims), back.shape[-1])
+    back = linear_in_pointer(mean, directions, low, high, size.cascaded, range(used), used)
+    back = np.clip(back, 1e-3, 1 - 1e-3).astype(np.float32)
+    back = back.reshape(*back.shape[:-1], *[1] * (size.dims - used), k)
     cascaded = np.broadcast_to(back, (*shape, size.channels)).astype(np.float32)
     cascaded = DifferentiableArray(shape, size.channels, cascaded, fold=True)
     structure = LayeredStructure(size.height, size.width, tuple(layers), size.skip, size.bits, size.base)
     return LayeredNet(fine, coarse, cascaded, structure, border)
 
 
-def _pages(pointers: list, basis: PrincipalComponents, size: TextureBudget, border) -> tuple[list, list]:
-    """Return the layers of pages and their arrays."""
+def _pages(pointers: list, ranges: np.ndarray, size: TextureBudget, border) -> tuple[list, list]:
+    """Return the layers of pages and their arrays; ``ranges`` are those of the components."""
     if not size.pages:
         return [], []
-    used = basis.dims
-    weighted = [(pointers[level][..., :used] * (basis.high - basis.low)).astype(np.float32) for level in size.pages]
+    used = len(ranges)
+    weighted = [(pointers[level][..., :used] * ranges).astype(np.float32) for level in size.pages]
     layers, fine = [], []
     ends = [*size.pages[1:], size.skip]
     sides = shared_page_sizes(weighted, border, size.page_entries)
@@ -450,16 +408,6 @@ def _pages(pointers: list, basis: PrincipalComponents, size: TextureBudget, bord
         layers.append(FineLayer(level, end - 1, size.page_bits, (1.0,) * size.dims, True))
         fine.append(PagedArray(sizes, size.dims, entries, shift, fold=True, border=border))
     return layers, fine
-
-
-def gain_of_pages(values: Sequence[np.ndarray], size: TextureBudget, border: tuple[str, str]) -> float:
-    """Return the gain of pages over one grid of equal bytes at level 0, in dB (:func:`.page_gain`)."""
-    basis = PrincipalComponents.of(values[0], size.dims)
-    flat = values[0].reshape(-1, values[0].shape[-1]) - basis.mean
-    exact = flat @ basis.directions.T
-    rest = float(np.mean(flat**2, axis=0).sum() - np.mean(exact**2, axis=0).sum())
-    exact = exact.reshape(*values[0].shape[:2], -1).astype(np.float32)
-    return page_gain(exact, border, size.page_entries, max(rest, 0.0))[0]
 
 
 def _ramps(rows: int, columns: int, count: int) -> np.ndarray:

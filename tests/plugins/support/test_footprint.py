@@ -34,7 +34,7 @@ def scene_of(mi, kind: str, camera: str = "perspective", **more):
 def measured(mi, scene, cone=None) -> tuple:
     """Side and major axis of all pixels, ``(n, 2)``, as a texture is told; and what finite differences say."""
     si, *expected = fp.truth(scene)
-    cone = Cone.of(scene.sensors()[0]) if cone is None else cone
+    cone = Cone.from_sensor(scene.sensors()[0]) if cone is None else cone
     found = np.stack([np.array(v).T for v in footprint.footprint(si, cone)])
     return fp.measures(*found), *expected
 
@@ -84,7 +84,7 @@ def test_shapes_and_sensors_that_are_out_of_the_ordinary(mi_rgb, kind):
 
 @pytest.mark.parametrize("integrator", ["path", "prb", "direct"])
 def test_textures_of_stock_integrators_get_it(mi_rgb, integrator):
-    """On both sides of a material, and below a normal map; lit evenly and alone, a diffuse surface shows it."""
+    """Both sides of a material, and a material below a normal map, evenly lit."""
     mi = mi_rgb
     fp.register_probe()
     diffuse = {"type": "diffuse", "reflectance": {"type": "probe"}}
@@ -106,7 +106,7 @@ def test_textures_of_stock_integrators_get_it(mi_rgb, integrator):
 
 
 def test_what_is_not_seen_directly_is_never_blurred_more_than_in_truth(mi_rgb):
-    """In a flat mirror, where the way is longer, and rather sharp beyond it."""
+    """In a flat mirror, beyond which the path is longer, the estimate is below the true footprint."""
     mi = mi_rgb
     mirror = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(3)}
     room = {"type": "cube", "to_world": mi.ScalarTransform4f().scale(6), "flip_normals": True}
@@ -114,7 +114,7 @@ def test_what_is_not_seen_directly_is_never_blurred_more_than_in_truth(mi_rgb):
     scene = mi.load_dict({"type": "scene", "mirror": mirror, "room": room, "sensor": camera})
     si, ddx, ddy, where = fp.truth(scene, (fp.mirrored,))
     where &= np.array(scene.ray_intersect(fp.rays(scene.sensors()[0], 0, 0)).t) < 4.5
-    found = np.stack([np.array(v).T for v in footprint.footprint(si, Cone.of(scene.sensors()[0]))])
+    found = np.stack([np.array(v).T for v in footprint.footprint(si, Cone.from_sensor(scene.sensors()[0]))])
     side, truth = fp.measures(*found)[where, 0], fp.measures(ddx, ddy)[where, 0]
     assert where.sum() > 500 and (side < 1.001 * truth).all() and (side > 0).all()
 
@@ -200,7 +200,9 @@ def test_finite_whatever_the_place(mi_rgb):
         {"dp_du": mi.Vector3f(1e25, 0, 0)}, {"dp_du": mi.Vector3f(0, 0, 1)}, {"dp_du": mi.Vector3f(1e-9, 0, 1)},
     ]  # fmt: skip
     flat = mi.ScalarTransform4f()
-    parallel = Cone.of(mi.load_dict({"type": "orthographic", "to_world": flat, "sampler": {"type": "independent"}}))
+    parallel = Cone.from_sensor(
+        mi.load_dict({"type": "orthographic", "to_world": flat, "sampler": {"type": "independent"}})
+    )
     for cone in (looking_along_z(mi), parallel, None):
         for i, given in enumerate(places):
             ddx, ddy = footprint.footprint(hit(mi, **given), cone)
@@ -249,7 +251,7 @@ def test_parameters_say_the_same_as_the_sensor(mi_rgb):
     mi = mi_rgb
     place = fp.look_at([1, 2, 3], [0, 0.5, 0])
     sensor = mi.load_dict(fp.sensor(to_world=place, fov=70))
-    expected = Cone.of(sensor, 16)
+    expected = Cone.from_sensor(sensor, 16)
     found = looking_along_z(mi, sensor_to_world=place, fov=70.0, resolution=fp.WIDTH, spp=16)
     for name in ("origin", "axis", "dx", "dy", "scale", "spread", "lens"):
         a, b = np.array(getattr(found, name)), np.array(getattr(expected, name))
@@ -278,7 +280,7 @@ def test_sensors_without_pixels_of_a_known_size(mi_rgb):
     one = {"film": {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}}
     for sensor in ({"type": "distant", **one}, {"type": "radiancemeter", **one}, {"type": "batch", "a": a, "b": b}):
         with pytest.raises(RuntimeError, match="has no pixels whose footprint is known, supported are perspective"):
-            Cone.of(mi.load_dict({**sensor, "id": "odd"}))
+            Cone.from_sensor(mi.load_dict({**sensor, "id": "odd"}))
 
 
 SCENE = """

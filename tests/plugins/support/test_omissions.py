@@ -110,22 +110,6 @@ def test_integrators_around_the_one_that_traces(mi_rgb, warned):
     assert (image.numpy()[..., -1] == 0).all() and "AOVIntegrator" in warned()[0]
 
 
-def test_load_file_decodes_for_channels(mi_rgb, warned, tmp_path):
-    path = tmp_path / "scene.xml"
-    path.write_text(f"""<scene version="3.0.0">
-        <shape type="neural_sdf"><string name="filename" value="{SOLID}"/><integer name="resolution" value="24"/>
-        </shape>
-        <sensor type="perspective">
-            <transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform>
-            <film type="hdrfilm"><integer name="width" value="4"/><integer name="height" value="4"/></film>
-        </sensor>
-        <integrator type="aov"><string name="aovs" value="d:depth"/><integrator type="path_sdf"/></integrator>
-    </scene>""")
-    loaded = mi_diffind.load_file(path)
-    assert ["decoded to a grid" in line for line in warned()] == [True]
-    assert render(mi_rgb, loaded).numpy()[..., -1].max() > 2 and not warned()
-
-
 def test_textures_that_nothing_filters(mi_rgb, warned):
     mi = mi_rgb
     loaded = mi.load_dict(scene(mi, **textured(mi)))
@@ -141,7 +125,6 @@ def test_textures_that_are_filtered_or_not_read(mi_rgb, warned):
     mi = mi_rgb
     render(mi, mi.load_dict(scene(mi, **textured(mi))), "path_footprint", max_depth=2)
     render(mi, mi.load_dict(scene(mi, **textured(mi))), "moment", inner={"type": "path_footprint", "max_depth": 2})
-    render(mi, mi.load_dict(scene(mi, **textured(mi))), "depth")
     render(mi, mi.load_dict(scene(mi, **textured(mi, filter="off"))), "direct")
     at = mi.ScalarTransform4f().look_at([0, 0, -4], [0, 0, 0], [0, 1, 0])
     sensor = {"sensor_to_world": at, "fov": 40, "resolution": 4}
@@ -154,12 +137,8 @@ def test_textures_that_are_filtered_or_not_read(mi_rgb, warned):
     assert not warned()
 
 
-def test_parts_that_are_not_filtered(mi_rgb, warned):
-    """Of a render whose image is filtered: the albedo of ``aov``, and all in a scene with a distance field."""
+def test_textures_beside_a_distance_field(mi_rgb, warned):
     mi = mi_rgb
-    inner = {"type": "path_footprint", "max_depth": 2}
-    render(mi, mi.load_dict(scene(mi, **textured(mi))), "aov", aovs="a:albedo", inner=inner)
-    assert len(warned()) == 1
     both = {**textured(mi), "solid": {"type": "neural_sdf", "filename": SOLID}}
     render(mi, mi.load_dict(scene(mi, **both)), "path_sdf", max_depth=2)
     assert len(warned()) == 1

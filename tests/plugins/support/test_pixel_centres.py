@@ -41,7 +41,7 @@ def test_what_the_centre_shows(mi_rgb, rng, kind, slant, tolerance):
     scene = scene_of(mi, kind, slant)
     x, y = (rng.random(400) * n for n in FILM)
     si = hits(mi, scene, x, y)
-    cone = footprint.Cone.of(scene.sensors()[0])
+    cone = footprint.Cone.from_sensor(scene.sensors()[0])
     ddx, ddy = footprint.footprint(si, cone)
     shift = np.array(footprint.to_centre(cone, si, ddx, ddy)).T
     centre = hits(mi, scene, np.floor(x) + 0.5, np.floor(y) + 0.5)
@@ -63,10 +63,10 @@ def test_where_nothing_is_moved(mi_rgb, rng):
     for kind, spp in (("thinlens", 1), ("perspective", 4)):
         scene = scene_of(mi, kind, spp=spp)
         si = hits(mi, scene, x, y)
-        cone = footprint.Cone.of(scene.sensors()[0])
+        cone = footprint.Cone.from_sensor(scene.sensors()[0])
         assert np.abs(np.array(footprint.to_centre(cone, si, *footprint.footprint(si, cone)))).max() == 0
     scene = scene_of(mi, "perspective")
-    si, cone = hits(mi, scene, x, y), footprint.Cone.of(scene.sensors()[0])
+    si, cone = hits(mi, scene, x, y), footprint.Cone.from_sensor(scene.sensors()[0])
     found = footprint.footprint(si, cone)
     assert np.abs(np.array(footprint.to_centre(cone, si, *found))).max() > 0
     assert np.abs(np.array(footprint.to_centre(None, si, *found))).max() == 0

@@ -15,7 +15,7 @@ from mi_diffind.core.errors import UsageError
 from mi_diffind.core.runtime import array_module
 from mi_diffind.tasks.bsdf import TASK, energy, evaluation, mixture, training
 from mi_diffind.tasks.bsdf import fit as fitting
-from mi_diffind.tasks.bsdf.model import Parameter, points, sizes_within
+from mi_diffind.tasks.bsdf.model import Parameter, points
 from mi_diffind.tasks.bsdf.truth import FamilyTruth, truth_of
 
 MEMBERS = ((0.05, 0.0), (0.8, 1.0), (0.13, 0.4), (0.5, 0.9))
@@ -54,14 +54,6 @@ def test_the_formula(types, model, rng):
         expected = formula(member(load_table(model.table.path), roughness, metallic), wi[lanes], wo[lanes])
         np.testing.assert_allclose(values[lanes], expected, rtol=3e-3)
     np.testing.assert_allclose(values, backwards, rtol=1e-4)
-
-
-def test_sizes_follow_the_bytes():
-    parameters = [Parameter("a", 0.01, 1.0), Parameter("b", 0.0, 1.0), Parameter("c", 0.0, 1.0)]
-    for count, nbytes in ((1, 4000), (2, 9000), (3, 12000)):
-        assert 0.75 * nbytes < sizes_within(nbytes, parameters[:count]).nbytes <= nbytes
-    with pytest.raises(ValueError, match="found 10 bytes, the smallest arrays need"):
-        sizes_within(10, parameters)
 
 
 REFUSED = {

@@ -50,10 +50,8 @@ def interrupted(monkeypatch):
 
 
 def fitted(source=SOURCE, **options):
-    steps = {} if "seconds" in options else {"steps": RESIDUAL}
-    return mi_diffind.fit(
-        "bsdf", source, batch=2**11, measure_every=10, energy="raw", progress=False, **steps, **options
-    )
+    short = {"steps": RESIDUAL, "batch": 2**11, "measure_every": 10, "energy": "raw", "progress": False}
+    return mi_diffind.fit("bsdf", source, **short, **options)
 
 
 def test_fits_go_on(short, interrupted, tmp_path):
@@ -73,18 +71,3 @@ def test_fits_go_on(short, interrupted, tmp_path):
         assert again.save(tmp_path / "again.npz").read_bytes() == undisturbed
     with pytest.raises(FittingError, match="is of another source, or the source has changed since"):
         fitted(source={**SOURCE, "alpha": 0.3}, checkpoint=checkpoint, resume=True)
-
-
-def test_a_limited_time_is_shared(short, tmp_path, monkeypatch):
-    """With ``seconds``, starts of the proxy take a part of the time, and what follows the training is rehearsed."""
-    limits, train = [], training.FitRequest.train
-
-    def recorded(self, problem, title=None, finish=None, *more):
-        limits.append((self.deadline.seconds, finish is not None))
-        return train(self, problem, title, finish, *more)
-
-    monkeypatch.setattr(training.FitRequest, "train", recorded)
-    result = fitted(seconds=6)
-    (first, _), (second, _), (whole, rehearsed) = limits
-    assert whole == 6 and rehearsed and first <= 0.5 * 0.3 * 6 and second <= 0.3 * 6
-    assert result.table.settings["seconds"] == 6 and result.table.measured["psnr_db"] > 20

@@ -108,7 +108,7 @@ def test_symmetries_are_measured_from_neighbours(tmp_path, rng, changes, broken)
 
 @pytest.mark.parametrize("every", [1, 3])
 def test_reciprocity_is_measured_from_exact_pairs(tmp_path, every):
-    """Of a grid of angles up to 180°: the light that no reciprocal model reproduces, by quadrature; also of a part."""
+    """The light that no reciprocal model reproduces equals a quadrature over a grid of angles, or a part of it."""
     theta, phi = (np.arange(30) + 0.5) * np.pi / 60, (np.arange(40) + 0.5) * np.pi / 40
     i, o, k = np.meshgrid(theta, theta, phi, indexing="ij")
     rng = np.random.default_rng(2)
@@ -151,7 +151,7 @@ def test_solid_angles(tmp_path, rng):
 
 
 def test_goniometers(tmp_path, rng):
-    """Where there are few directions of incidence, each of them counts the same."""
+    """Each of a few directions of incidence has the same total solid angle."""
     parts = [np.stack([np.full(n, t), 0 * np.ones(n), 1.4 * np.sqrt(rng.random(n)), 6.2 * rng.random(n)], axis=1)
              for t, n in ((0.2, 100), (0.6, 800), (1.1, 300))]  # fmt: skip
     truth = measured.ScatteredTruth(write(tmp_path / "rows.csv", rows_of(np.concatenate(parts), 1.0)))

@@ -112,7 +112,7 @@ def near_the_peak(rng, wi, wo):
 @pytest.mark.parametrize("distribution", ["training", "uniform"])
 @pytest.mark.parametrize("where", [near_the_horizon, near_the_peak])
 def test_accuracy_where_it_is_hardest_to_keep(mi_rgb, rng, distribution, where):
-    """Where it is not next to nothing, 99 of 100 are within a hundredth, and none is much higher than the exact value.
+    """99% of the values above 10⁻³ are within a hundredth, and none is much higher than the exact value.
     The preset ``paper`` is finite."""  # fmt: skip
     import drjit.llvm.ad as types
 

@@ -1,5 +1,6 @@
 """The GGX distribution, its encodings and the tables that stand in for it, against an independent implementation."""
 
+import copy
 import dataclasses
 import os
 
@@ -8,25 +9,19 @@ import ggx_formulas
 import numpy as np
 import pytest
 from arrays import aligned
-from variants import BACKENDS
 
-from mi_diffind import DifferentiableArray, StoredArray, load_model
 from mi_diffind import fit as fit_task
+from mi_diffind import load_model
 from mi_diffind.arrays import lookup
 from mi_diffind.arrays.tables import TableError, save_table
 from mi_diffind.core.runtime import array_module
-from mi_diffind.fitting.loop import EXPONENTIAL_RATE, fit
+from mi_diffind.fitting.loop import EXPONENTIAL_RATE
 from mi_diffind.fitting.task import FitRequest
 from mi_diffind.tasks.ggx import TASK
-from mi_diffind.tasks.ggx.model import ALPHA_FLOOR, ALPHA_MIN, ENCODINGS, Encoding, LearnedGGX, ggx, indirection
-from mi_diffind.tasks.ggx.training import BANDS, GGXProblem, draw, measure, table_encoding
+from mi_diffind.tasks.ggx.model import ALPHA_FLOOR, ALPHA_MIN, ENCODINGS, LearnedGGX, ggx, indirection
+from mi_diffind.tasks.ggx.training import BANDS, draw, measure, table_encoding
 
 PRESETS = tuple(TASK.presets)
-
-
-@pytest.fixture(params=BACKENDS)
-def ad(request):
-    return array_module(request.param)
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +55,7 @@ def evaluate(ad, distribution, sin2, alpha):
 
 
 def evaluated(row):
-    """What depends on a constant roughness, as plugins keep it."""
+    """Terms of a constant roughness, opaque as plugins keep them."""
     dr.make_opaque(row)
     return row
 
@@ -199,7 +194,7 @@ PROMISED = {"float32": (57, 0.001, 0.03), "float16": (56.5, 0.002, 0.03), "uint8
 @pytest.mark.parametrize("storage", lookup.STORAGES)
 @pytest.mark.parametrize("preset", PRESETS)
 def test_accuracy_by_an_independent_reader(ad, shipped, rng, preset, storage):
-    """What NumPy and SciPy read in the same entries, and its PSNR over a million samples of their own."""
+    """Values equal those that NumPy and SciPy read, whose PSNR is that of a million other samples."""
     table, encoding = shipped[preset]
     independent = ggx_formulas.learned(table.to(storage), encoding.inputs, encoding.output)
     sin2, alpha = random_case(rng, 100_000)
@@ -239,28 +234,6 @@ def test_constant_roughness_reads_the_same(ad, shipped, preset, storage):
 
 
 # -- training ----------------------------------------------------------------------------------------------------------
-
-
-def short(preset, **changes):
-    changes = {"steps": 150, "batch": 8192, "measure_every": 50, **changes}
-    return dataclasses.replace(TASK.presets[preset], **changes)
-
-
-def test_indirection_beats_a_single_table_of_equal_bytes():
-    """
-    With plain inputs, by more than 2 dB; both learn the root, at the rates of the study, where it is 13 dB (README).
-    With logarithmic inputs the single table is better, by 3 to 4 dB.
-    """
-    ad = array_module("llvm")
-
-    def psnr(net):
-        settings = short("tables", steps=1000, batch=2048, measure_every=500, lr=5e-2)
-        problem = GGXProblem(net.alloc(ad.TensorXf), ad, "paper", Encoding("plain", "root"))
-        return fit(problem, settings, progress=False).measured["psnr_db"]
-
-    single, found = psnr(DifferentiableArray((24, 24), 1, "constant", 0.5)), psnr(indirection())
-    print(f"indirection {found:.2f} dB, a single table {single:.2f} dB")
-    assert found >= single + 2
 
 
 def run(preset, storage="float32", **changes):
@@ -325,33 +298,21 @@ def test_impossible_sizes_are_refused(name, sides):
 # -- files -------------------------------------------------------------------------------------------------------------
 
 
-def set_entry(name, value):
-    def change(table):
-        entries = table.arrays[name].entries.copy()
-        entries.flat[3] = value
-        table.arrays[name] = StoredArray(entries)
-
-    return change
+def set_pointer(table):
+    table.arrays["primary"].entries.flat[3] = 1.5
 
 
 BROKEN = {
     "no encoding": (lambda t: t.settings.pop("inputs"), "the settings name no known encoding"),
     "an unknown encoding": (lambda t: t.settings.update(output="cube"), "the settings name no known encoding"),
-    "a pointer out of the table": (set_entry("primary", 1.5), r'entries of "primary" lie in \[.*, 1.5\], allowed is'),
-    "a pointer below 0": (set_entry("primary", -0.1), r'entries of "primary" lie in \[-0.1, .*\], allowed is \[0, 1\]'),
-    "an answer out of range": (set_entry("cascaded", 3), r'entries of "cascaded" lie in \[.*, 3\], allowed is'),
-    "a pointer of one channel": (
-        lambda t: t.arrays.update(primary=StoredArray(np.zeros((16, 16, 1), np.float32))),
-        r'array "primary" has the shape \(16, 16, 1\), expected \(None, None, 2\)',
-    ),
+    "a pointer out of the table": (set_pointer, r'entries of "primary" lie in \[.*, 1.5\], allowed is'),
 }
 
 
 @pytest.mark.parametrize("what", BROKEN)
 def test_a_wrong_file_is_refused(tmp_path, shipped, what):
     change, sentence = BROKEN[what]
-    path, table = tmp_path / "own.npz", shipped["tables"][0]
-    table = dataclasses.replace(table, arrays=dict(table.arrays), settings=dict(table.settings))
+    path, table = tmp_path / "own.npz", copy.deepcopy(shipped["tables"][0])
     change(table)
     save_table(path, table)
     dtype = array_module("llvm").TensorXf
@@ -362,7 +323,7 @@ def test_a_wrong_file_is_refused(tmp_path, shipped, what):
 
 
 def test_a_file_that_was_replaced_is_read_again(tmp_path, shipped, ad):
-    """Also within the resolution of its time, if its size is another."""
+    """A replaced file is read again, also within the resolution of its time if its size differs."""
     path = tmp_path / "own.npz"
     found = []
     for i, preset in enumerate(PRESETS):
@@ -387,7 +348,7 @@ def test_a_file_is_read_once(tmp_path, shipped, ad, monkeypatch):
 
 
 def test_entries_an_optimiser_left_out_of_range_are_folded(ad, shipped):
-    """In single precision; the triangle wave maps them to pointers."""
+    """The triangle wave maps single-precision entries out of range to pointers."""
     read = stored(ad, shipped, "tables")
     sin2 = ad.Float(np.linspace(0, 1, 100, dtype=np.float32))
     cos, alpha = dr.sqrt(1 - sin2), ad.Float(0.2)

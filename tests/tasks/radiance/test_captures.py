@@ -130,7 +130,7 @@ REFUSED_FRAMES = [
     ({"mask_path": 3}, 'frame 0 has a "mask_path" that is no name of a file$'),
     ({"mask_path": "mask.png"}, r"mask\.png: no such image"),
     ({"mask_path": "small.png"}, r"small\.png: has 3 × 3 pixels, its image 0\.png has 8 × 6$"),
-    ({"mask_path": "broken.png"}, r"broken\.png: cannot be read as a mask"),
+    ({"mask_path": "broken.png"}, r"broken\.png: cannot be read as an image"),
     ({"transform_matrix": None}, 'frame "images/0.png" has no "transform_matrix"'),
     ({"transform_matrix": pose(np.nan)}, "with NaN or infinite numbers"),
     ({"transform_matrix": pose(0, 0.5)}, r"that scales \(columns of length 0.5, 0.5, 0.5\)"),
@@ -172,9 +172,7 @@ def test_files_that_are_refused(tmp_path):
     data = path.read_bytes()
     for broken in (data[: len(data) // 2], b"", b"not an image", data[:40] + b"\0" * 40 + data[80:]):
         path.write_bytes(broken)
-        refused(tmp_path, r"1\.png: cannot be read as an image")
-    Image.fromarray(np.zeros(SIZE, np.uint16)).save(path)
-    refused(tmp_path, r"1\.png: has pixels of the mode I")
+        refused(tmp_path, r"1\.png: (cannot be read as an image|is cut short)")
     path.unlink()
     path = path.with_suffix(".exr")
     path.write_bytes(b"no")
@@ -225,20 +223,12 @@ def test_spellings_of_poses(tmp_path):
         write_json(tmp_path / "transforms.json", **content)
         return load_views(tmp_path)
 
-    whole, start, end = ({f"transform_matrix{time}": turned.tolist()} for time in ("", "_start", "_end"))
-    for keys in (whole, {"transform_matrix": turned[:3].tolist()}, start, start | end):
-        views = read(**keys)
+    for matrix in (turned, turned[:3]):
+        views = read(transform_matrix=matrix.tolist())
         np.testing.assert_allclose(views.poses[1], turned)
         assert not views.notes
     near = pose(2, 1.0008)  # within the tolerance of lengths, and no shear
     assert np.array_equal(read(transform_matrix=near).poses[1], near)
-    moved = {"transform_matrix_end": pose()}
-    with pytest.raises(
-        ViewsError, match=r'frame "images/1.png" moves while the shutter is open, from the "transform_m'
-    ):
-        read(**start, **moved)
-    (note,) = read(**whole, **moved).notes
-    assert note.endswith("not used: frames.transform_matrix_end")
 
 
 def test_poses_of_mitsuba(tmp_path):
@@ -352,8 +342,7 @@ def test_views_without_images_are_left_out(tmp_path):
     assert views.names == tuple(f"images/{i}.png" for i in (1, 2, 6, 7, 10, 11))
     np.testing.assert_array_equal(views.origins[:, 0], [1, 2, 6, 7, 10, 11])
     assert views.notes == (
-        'transforms.json: 4 of 10 images of the split "train" do not exist and are left out: images/3.png, '
-        "images/4.png, images/5.png and 1 more",
+        'transforms.json: 4 of 10 images of the split "train" do not exist and are left out, such as images/3.png',
     )
     assert load_views(tmp_path, most=3).names == tuple(f"images/{i}.png" for i in (1, 6, 10))
     for i in (0, 8):
@@ -378,7 +367,7 @@ def masked(folder, name="mask.png"):
 
 @pytest.mark.parametrize("colour", [0, 255, None])
 def test_masks_in_an_alpha_channel(tmp_path, colour):
-    """Whatever the colours are, of a cut-out photograph, too."""
+    """The mask is read from alpha for any colours, those of a cut-out photograph included."""
     counts = np.random.default_rng(0).random(SIZE) < 0.6
     image = np.random.default_rng(1).integers(0, 256, (*SIZE, 4), np.uint8)
     if colour is not None:
@@ -415,32 +404,16 @@ def test_masks_of_other_formats(tmp_path):
 
 # -- keys that are not used -------------------------------------------------------------------------------------------
 
-#: Keys of nerfstudio, instant-ngp, BlenderNeRF and Blender's data that change nothing here, and others.
-OF_FILES = {
-    "aabb_scale": 16, "scale": 0.33, "offset": [0.5, 0.5, 0.5], "up": [0, 0, 1], "n_frames": 2, "render_aabb": [[0], 1],
-    "white_transparent": True, "enable_depth_loading": True, "integer_depth_scale": 0.001, "fisheye_crop_radius": 3,
-    "orientation_override": "none", "ply_file_path": "sparse_pc.ply", "rolling_shutter": [0, 0, 0], "from_na": False,
-}  # fmt: skip
-OF_FRAMES = {"sharpness": 20.0, "rotation": 0.01, "colmap_im_id": 3, "depth_file_path": "d.png", "depth_path": "e"}
-
 
 def test_keys_that_are_not_used_are_named(tmp_path):
-    for key, value in OF_FILES.items():
-        assert load_views(studio(tmp_path, PIXELS | {key: value}, {})).notes == (
-            f"transforms.json: keys that are not used: {key}",
-        )
-    for key, value in OF_FRAMES.items():
-        assert load_views(studio(tmp_path, PIXELS, {key: value})).notes == (
-            f"transforms.json: keys that are not used: frames.{key}",
-        )
-    (note,) = load_views(studio(tmp_path, PIXELS | OF_FILES | ZERO | {"k1": 0.2}, OF_FRAMES | LISTED)).notes[:1]
-    assert note.split(": ")[-1].split(", ") == [
-        *(f"frames.{key}" for key in OF_FRAMES), *OF_FILES, "distortion_params", "k1"
-    ]  # fmt: skip
+    """The note names unused keys of the file and of its frames, and lenses that a frame replaces."""
+    unused = {"aabb_scale": 16, "rolling_shutter": [0, 0, 0], "distortion_params": [0] * 6, "k1": 0.2}
+    (note,) = load_views(studio(tmp_path, PIXELS | unused, {"sharpness": 20.0} | LISTED)).notes[:1]
+    assert note == f"transforms.json: keys that are not used: frames.sharpness, {', '.join(unused)}"
     used = PIXELS | ANGLES | CENTRE | LENS | {"w": 8, "h": 6, "camera_model": "OPENCV", "is_fisheye": False}
     used |= {"applied_transform": np.eye(4)[:3].tolist(), "applied_scale": 2.0, "aabb": [[0, 0, 0], [1, 1, 1]]}
     assert load_views(studio(tmp_path, used, {})).notes == ("all images have a lens distortion and were undistorted",)
     # Of a key that only a frame of another split has, nothing is said
-    change(tmp_path, "transforms.json", frame=1, sharpness=3, **dict.fromkeys(["mask_path"]))
+    change(tmp_path, "transforms.json", frame=1, sharpness=3)
     change(tmp_path, "transforms.json", train_filenames=["images/0.png", "images/2.png"])
     assert len(load_views(tmp_path).notes) == 1

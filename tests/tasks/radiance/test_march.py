@@ -35,7 +35,7 @@ def numbers(found):
 
 
 def chord(o, d, half=1.0, far=np.inf):
-    """Where rays enter and leave the box from −``half`` to ``half``, in NumPy."""
+    """Distances at which rays enter and leave the box from −``half`` to ``half``, in NumPy."""
     d = d / np.linalg.norm(d, axis=1, keepdims=True)
     with np.errstate(divide="ignore"):
         a, b = (-half - o) / d, (half - o) / d

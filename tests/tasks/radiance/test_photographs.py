@@ -21,14 +21,14 @@ from mi_diffind.tasks.radiance import grid as grids
 from mi_diffind.tasks.radiance import views as view_files
 from mi_diffind.tasks.radiance.captures import LINEAR
 from mi_diffind.tasks.radiance.session import RAYS, FieldSession, ImagesProblem
-from mi_diffind.tasks.radiance.views import box_of, load_views
+from mi_diffind.tasks.radiance.views import load_views, object_box
 
 LENS = {"k1": -0.12, "k2": 0.03, "p1": 0.004, "p2": -0.003}
 SIDE = 64
 
 
 def shown_at(u, v, k1=0, k2=0, p1=0, p2=0, k3=0, k4=0, k5=0, k6=0):
-    """Where OpenCV says that a lens shows a point: ``cv2.projectPoints``, written out."""
+    """Point at which a lens shows a direction, by the formula of ``cv2.projectPoints``."""
     r2 = u**2 + v**2
     radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
     return (
@@ -68,7 +68,7 @@ def photographs(folder, alpha=None, **lens):
 
 
 def test_large_images_are_reduced(tmp_path, monkeypatch):
-    """By averages of linear colours; rays go through the middles of what the pixels cover."""
+    """Pixels are averages of linear colours, and rays go through the middles of the areas that they cover."""
     blender = write_blender(tmp_path)
     large = write_image(blender / "train" / "r_0.png", 1, size=(7, 11))
     full = load_views(blender, downscale=1)
@@ -180,7 +180,7 @@ def test_a_border_of_one_colour_is_the_background(studio_shots):
     for view, name in enumerate(views.names):
         np.testing.assert_array_equal(views.stored(view), images[name] * (images[name][..., 3:] > 0))
     with_alpha = load_views(captures.write(folder / "alpha", 6, 2))
-    np.testing.assert_allclose(box_of(views), box_of(with_alpha))
+    np.testing.assert_allclose(object_box(views), object_box(with_alpha))
     session = FieldSession.load(llvm, folder)
     assert session.held_out.background == views.background and len(session.held_out) == 2
     # An empty field shows the background: no loss, and PSNR from the bytes of the files
@@ -239,7 +239,7 @@ def test_backgrounds_of_linear_images(studio_shots):
 
 
 def test_masked_borders_are_no_background(studio_shots):
-    """What a mask excludes at the border counts neither for nor against, and lets the background through."""
+    """Masked pixels at the border do not decide on the background, and the background spreads through them."""
     folder, images = studio_shots
     mask = np.full((24, 24), 255, np.uint8)
     mask[:, :3] = mask[:3] = mask[-3:] = mask[:, -3:] = 0
@@ -259,7 +259,7 @@ def test_masked_borders_are_no_background(studio_shots):
 
 
 def test_a_field_records_its_background(studio_shots, monkeypatch, capsys):
-    """And the notes on what was read reach the command line and its JSON, those of the test views, too."""
+    """The file records the background; notes on training and test views are printed and written as JSON."""
     folder, _ = studio_shots
     change(folder, aabb_scale=4)
     change(folder, "transforms_test.json", frame=1, sharpness=3)
@@ -272,7 +272,7 @@ def test_a_field_records_its_background(studio_shots, monkeypatch, capsys):
     notes = [line for line in capsys.readouterr().err.splitlines() if line.startswith("transforms_")]
     assert notes == [
         "transforms_train.json: keys that are not used: aabb_scale",
-        'transforms_train.json: 1 of 6 images of the split "train" do not exist and are left out: train_4.png',
+        'transforms_train.json: 1 of 6 images of the split "train" do not exist and are left out, such as train_4.png',
         "transforms_test.json: keys that are not used: frames.sharpness",
     ]
     assert set(notes) < set(json.loads((folder / "x.json").read_text())["notes"])
@@ -356,34 +356,12 @@ def test_colmap_text_distortion_and_masks(colmap):
     refused(folder, r'transforms\.json: has no "frames"')
 
 
-def test_colmap_models_and_masks_that_are_not_used_are_named(colmap):
-    folder, _ = colmap
-    assert not load_views(folder).notes
-    (folder / "images" / "left" / "3.png").unlink()
-    shutil.copytree(folder / "sparse" / "0", folder / "sparse" / "1")
-    (folder / "masks" / "left").mkdir(parents=True)
-    for name in ("3.png", "4.png.png"):  # the second one is the mask of an image
-        Image.fromarray(np.full(SIZE, 255, np.uint8)).save(folder / "masks" / "left" / name)
-    models, masks, images = load_views(folder).notes
-    assert models.startswith("1: further models beside ") and models.endswith("sparse/0, which are not used")
-    assert masks.endswith("masks: 1 files are masks of no image, such as left/3.png: the mask of a.jpg is a.jpg.png")
-    assert images == 'sparse/0: 1 of 8 images of the split "train" do not exist and are left out: images/left/3.png'
-
-
-@pytest.mark.parametrize(
-    "camera",
-    ["SIMPLE_RADIAL_FISHEYE 8 6 10 4 3 0", "RADIAL_FISHEYE 8 6 10 4 3 0 0", "FOV 8 6 10 10 4 3 0.1",
-     "OPENCV_FISHEYE 8 6 10 11 4.5 3.25 0 0 0 0"],
-)  # fmt: skip
-def test_lenses_of_colmap_that_are_refused(colmap, camera):
-    folder, _ = colmap
-    (folder / "sparse" / "0" / "cameras.txt").write_text(f"1 {camera}\n2 PINHOLE 8 6 9 9 4 3\n")
-    refused(folder, rf'"left/2.png" has the camera model {camera.split()[0]}, .*: undistort the')
-
-
 def test_colmap_models_that_are_refused(colmap, monkeypatch):
     folder, _ = colmap
-    (folder / "sparse" / "0" / "cameras.txt").write_text("1 OPENCV x\n")
+    cameras = folder / "sparse" / "0" / "cameras.txt"
+    cameras.write_text("1 OPENCV_FISHEYE 8 6 10 11 4.5 3.25 0 0 0 0\n2 PINHOLE 8 6 9 9 4 3\n")
+    refused(folder, '"left/2.png" has the camera model OPENCV_FISHEYE, .*: undistort the')
+    cameras.write_text("1 OPENCV x\n")
     refused(folder, r"sparse/0: cannot be read as a COLMAP model \(")
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     refused(folder, r"sparse/0: is a COLMAP model, .*: pip install pycolmap$")

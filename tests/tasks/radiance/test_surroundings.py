@@ -15,8 +15,7 @@ from mi_diffind.arrays.tables import TableError, load_table, save_table
 from mi_diffind.commands.cli import main
 from mi_diffind.core import compat
 from mi_diffind.core.runtime import array_module
-from mi_diffind.fitting.loop import FitSettings
-from mi_diffind.tasks.radiance import files, march, surroundings
+from mi_diffind.tasks.radiance import files, march, nodes
 from mi_diffind.tasks.radiance import fit as field_fit
 from mi_diffind.tasks.radiance import grid as grids
 from mi_diffind.tasks.radiance.views import load_views
@@ -31,7 +30,7 @@ def ad():
 
 
 def contracted_nodes(types, stored):
-    return surroundings.ContractedNodes(
+    return nodes.Nodes(
         types, CENTRE - 2 * HALF, SPACING, (SIDE,) * 3, stored, inner=(*CENTRE, HALF)
     )  # fmt: skip
 
@@ -57,7 +56,7 @@ def field(ad, rng):
 
 def test_steps_grow_with_the_distance(ad, rng):
     o, d, *arrays = rays(ad, rng, 200)
-    along, t = surroundings.Contraction(ad, (*CENTRE, HALF)).along(*arrays), rng.uniform(0, 20, 200)
+    along, t = nodes.Contraction(ad, (*CENTRE, HALF)).along(*arrays), rng.uniform(0, 20, 200)
     s = along.in_steps(ad.Float(np.float32(t)))
     assert np.allclose(along.of_steps(s), t, atol=1e-4) and np.allclose(along.of_steps(ad.Float(0)), 0, atol=1e-6)
     growth = np.sqrt(1 + (np.linalg.norm(o + t[:, None] * d - CENTRE, axis=1) / (2 * HALF)) ** 2)
@@ -112,8 +111,7 @@ def folder(tmp_path_factory):
     for image in path.glob("*.png"):
         grey, picture = Image.new("RGBA", (24, 24), (150, 140, 130, 255)), Image.open(image)
         Image.alpha_composite(grey, picture).convert("RGB").save(image)
-    recipe = field_fit.PRESETS["grid"]
-    short = dataclasses.replace(recipe, settings=FitSettings(**{**vars(recipe.settings), "steps": 80, "batch": 1024}))
+    short = dataclasses.replace(field_fit.PRESETS["grid"], steps=80, batch=1024)
     patch.setitem(field_fit.PRESETS, "grid", short)
     options = ["--steps", "5", "--batch", "1024", "--resolution", "20", "--variant", "llvm_ad_rgb"]
     assert main(["fit", "field", str(path), "-o", str(path / "x.npz"), "--background", "surroundings",
@@ -125,7 +123,7 @@ def folder(tmp_path_factory):
 def test_a_file_keeps_its_surroundings(folder, ad, rng):
     """The cube that is not contracted, in the grid, in its compressed form and in its trainable form."""
     views = load_views(folder, "train", background="surroundings")
-    centre, half = surroundings.inner_cube(views)
+    centre, half = grids.inner_cube(views)
     assert np.allclose(centre, 0, atol=1e-3) and half == pytest.approx(1.1, rel=1e-3)
     table = files.load(folder / "x.npz")
     assert np.allclose(table.settings["inner"], [*centre, half])
@@ -147,7 +145,7 @@ def test_damaged_cubes_are_refused(folder, tmp_path):
 
 
 def test_surroundings_in_a_scene(field, tmp_path, mi_rgb):
-    """They fill the picture, or are left out; sentences for what does not go together."""
+    """Surroundings fill the picture or are switched off; combinations that are not supported are refused."""
     mi = mi_rgb
     density, colour = (values.numpy() for values in field.arrays.values())
     save_table(tmp_path / "x.npz", files.grid_table(grids.NodeGrid(field.nodes, density + 4, colour)))

@@ -19,14 +19,9 @@ from mi_diffind.tasks.radiance.session import TILE, FieldSession, ImagesProblem,
 from mi_diffind.tasks.radiance.views import hull, load_views
 
 
-def test_few_views_of_many_are_evenly_spread(blender):
-    assert load_views(blender, most=2).names == ("train/r_0.png", "train/r_2.png")
-    assert load_views(blender, most=9).digest == load_views(blender).digest
-
-
 @pytest.mark.parametrize("suffix", ["png", "exr"])
 def test_compressed_views_are_the_same(blender, suffix):
-    """Of all views and of some of them, whatever the pixels are."""
+    """Compressed views equal the views that they were made of, and so do some of them, for PNG and EXR."""
     if suffix == "exr":
         image = np.random.default_rng(0).uniform(size=(*SIZE, 4)).astype(np.float32)
         write_exr(blender / "train/r_1.exr", {"RGBA": image})
@@ -93,7 +88,7 @@ def assert_colours_are_images(views):
 
 
 def test_patches_lie_where_something_is_seen(blender):
-    """All but a few, in tiles with something in them or beside them; a mask leaves nothing to be seen."""
+    """Nearly all patches lie in or beside tiles that show something; with a mask of all pixels, they lie anywhere."""
     stored = np.zeros((64, 48, 4), np.uint8)
     stored[30:33, 5:7] = 255  # in the tiles (0, 3) and (0, 4)
     for i in range(4):
@@ -112,7 +107,7 @@ def test_patches_lie_where_something_is_seen(blender):
 
 
 def test_views_of_different_sizes(blender):
-    """Each as in a capture of its own, with the focal length that its width gives."""
+    """Each view keeps its size, and the focal length that its width gives."""
     stored = {i: write_image(blender / "train" / f"r_{i}.png", i, size=s) for i, s in ((1, (9, 4)), (3, (3, 11)))}
     views = load_views(blender)
     assert views.sizes.tolist() == [[6, 8], [9, 4], [6, 8], [3, 11]] and views.offsets.tolist() == [0, 48, 84, 132]
@@ -168,7 +163,7 @@ def test_images_without_alpha_are_opaque(blender):
 
 
 def test_rays_go_through_the_middles_of_pixels(blender):
-    """Against a projection of points: what lies on a ray lands on its pixel."""
+    """Points on a ray are projected onto the pixel of the ray."""
     turn = np.array(pose())
     turn[:3, :3] = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
     turn[:3, :3] *= np.sign(np.linalg.det(turn[:3, :3]))
@@ -231,7 +226,7 @@ def test_masked_pixels_carve_nothing(masked):
 
 
 def test_patches_are_drawn_where_errors_are(blender):
-    """Of the tiles, in proportion to the root of their error before grey; an empty field errs where something is."""
+    """Tiles are drawn in proportion to the root of their error before grey."""
     stored = np.zeros((64, 48, 4), np.uint8)
     stored[8:16, 8:16] = 255  # one tile of white, among eight empty ones that count as seen
     for i in range(4):

@@ -15,7 +15,6 @@ from mi_diffind.arrays.indirection import DifferentiableArray, Indirection, ramp
 from mi_diffind.arrays.tables import StoredArray, TableError, load_table, save_table
 from mi_diffind.commands.cli import main
 from mi_diffind.core.runtime import array_module
-from mi_diffind.fitting.settings import FitSettings
 from mi_diffind.fitting.task import fit, tasks
 from mi_diffind.tasks.sdf import fit as sdf_fit
 from mi_diffind.tasks.sdf import paper
@@ -95,7 +94,7 @@ def test_size_and_accuracy(folder, evaluation, ad):
 
 
 def test_training_earns_its_place(folder, evaluation, ad):
-    """Against nodes as they were sampled, coded likewise: one step of no size."""
+    """Errors are below those of sampled nodes that were coded without training."""
     sampled = fit("sdf", source=str(folder / "solids.ply"), bytes=str(BYTES), steps=1, batch=16384, lr=1e-9,
                   variant="llvm_ad_rgb", progress=False)  # fmt: skip
     before = evaluation.measure(tasks()["sdf"].model(sampled.table, ad.TensorXf).field)
@@ -130,9 +129,9 @@ def test_start_from_nearest_samples(rng):
 
 
 def test_the_bound_of_the_slope_follows_entries(ad, rng):
-    """
-    Against small steps all over the box, as arrays are made and after a change. They are steepest where the pointers of
-    a cell reach neither first nor last.
+    """Bounds before and after a change of the entries, against small steps all over the box.
+
+    Steps are steepest where the pointers of a cell reach neither first nor last.
     """
     arrays = ramp((4, 4, 4), 3, ("clamp",) * 3) + 0.02 * rng.random((4, 4, 4, 3)), 0.05 * rng.random((9, 9, 9, 1))
     arrays[1][4, 4, 4] = 1
@@ -285,7 +284,7 @@ def test_extents_and_scales(tmp_path, ad, extent):
 
 
 def test_one_triangle_and_thin_solids(tmp_path):
-    """Nothing is enclosed, or less than a cell."""
+    """Meshes that enclose no volume, or less than a cell, are refused."""
     write(tmp_path / "one.obj", (np.eye(3), np.array([[0, 1, 2]])))
     write(tmp_path / "sheet.ply", box((1, 1, 1e-4)))
     for name, says in (("one.obj", "one.obj"), ("sheet.ply", "thinner than the cells of 32,768 bytes")):
@@ -293,11 +292,3 @@ def test_one_triangle_and_thin_solids(tmp_path):
             fit("sdf", source=str(tmp_path / name), bytes="32k", steps=2, batch=64, variant="llvm_ad_rgb",
                 progress=False)  # fmt: skip
         assert "\n" not in str(e.value)
-
-
-def test_a_long_training_stays_finite(folder, ad):
-    """Twice as many steps as by default, at ten times the rate."""
-    done = fit("sdf", source=str(folder / "solids.ply"), bytes="16k", steps=500, batch=1024, lr=0.2,
-               variant="llvm_ad_rgb", progress=False)  # fmt: skip
-    assert np.isfinite(list(done.table.measured.values())).all() and done.table.measured["iou"] > 0.97
-    assert done.result.restarts == 0 and FitSettings().lr != 0.2

@@ -30,7 +30,7 @@ from mi_diffind.tasks.shading import PRESETS, material, training
 from mi_diffind.tasks.shading.evaluation import ShadedEvaluation, reader, reference
 from mi_diffind.tasks.texture import PRESETS as TEXTURES
 from mi_diffind.tasks.texture import TASK as TEXTURE
-from mi_diffind.tasks.texture import training as textures
+from mi_diffind.tasks.texture import fit as textures
 from mi_diffind.tasks.texture.compressed import CompressedTexture
 
 OURS = PRESETS["ours"]
@@ -54,7 +54,9 @@ def bumpy(size=32, metallic=1.0, roughness=0.25, seed=3) -> dict:
 
 def pyramid_of(maps, ad):
     source = from_arrays(maps)
-    return source, Pyramid.of(source, textures.layout_of(source, TEXTURES["ours"]), ad, ("repeat", "repeat"))
+    return source, Pyramid.from_source(
+        source, textures.source_layout(source, TEXTURES["ours"]), ad, ("repeat", "repeat")
+    )
 
 
 def directions(ad, rng, n):
@@ -135,7 +137,7 @@ def test_shaded_is_mitsubas_normalmap(mi_rgb, rng):
         ad.Array3f(columns(values["base_color"])), ad.Array3f(columns(normal)), *columns(values["roughness"]),
         *columns(values["metallic"]),
     )  # fmt: skip
-    effects, _ = material.effects_of(pyramid_of(bumpy(8), ad)[1].layout)
+    effects, _ = material.material_effects(pyramid_of(bumpy(8), ad)[1].layout)
     for decoder in (Decoder(), None):
         got = numpy_of(material.shaded(decoder, surface, wi, wo, dataclasses.replace(effects, diffuse=True,
                                                                                      dielectric=True)))  # fmt: skip
@@ -148,7 +150,7 @@ def test_shaded_is_mitsubas_normalmap(mi_rgb, rng):
 def test_effects_follow_the_maps(ad):
     def effects(**changed):
         maps = {k: v for k, v in {**bumpy(8), **changed}.items() if v is not None}
-        return material.effects_of(pyramid_of(maps, ad)[1].layout)
+        return material.material_effects(pyramid_of(maps, ad)[1].layout)
 
     found, reasons = effects()
     assert not found.diffuse and found.metal and not found.dielectric and reasons["diffuse"] == "metallic is 1"
@@ -189,27 +191,11 @@ def lanes(ad, rng, n, level):
     return u, v, dr.full(ad.Float, level, n), *directions(ad, rng, n)
 
 
-def test_references_agree_where_nothing_varies(ad, rng):
-    maps = bumpy(8, metallic=0.0)
-    flat = {name: np.repeat(np.repeat(v[:1, :1], 8, 0), 8, 1) for name, v in maps.items()}
-    flat["roughness"][0, 0] += 1  # one texel differs: something has to be stored
-    _, pyramid = pyramid_of(flat, ad)
-    effects, _ = material.effects_of(pyramid.layout)
-    at = lanes(ad, rng, 64, 0.0)
-    at = (ad.Float(0.6), ad.Float(0.6), *at[2:])
-    at = tuple(x + dr.zeros(ad.Float, 64) if i < 2 else x for i, x in enumerate(at))
-    expected = numpy_of(reader(pyramid, effects)(*at))
-    for kind in ("converged", "prefiltered", "jittered"):
-        got = numpy_of(reference(kind, pyramid, *at, effects, dr.rng(seed=1)))
-        assert np.allclose(got, expected, rtol=1e-4, atol=1e-5)
-    assert expected.max() > 0
-
-
 def test_converged_reference_is_the_mean_of_shaded_texels(ad, rng):
     """Against NumPy: bilinear reads, and the formulas shaded texel by texel."""
     size, n, level = 16, 6, 2.0
     source, pyramid = pyramid_of(bumpy(size, metallic=0.5), ad)
-    effects, _ = material.effects_of(pyramid.layout)
+    effects, _ = material.material_effects(pyramid.layout)
     at = lanes(ad, rng, n, level)
     u, v = at[0].numpy().astype(np.float64), at[1].numpy().astype(np.float64)
     k = (np.arange(16) + 0.5) / 16 - 0.5
@@ -247,7 +233,7 @@ def test_converged_reference_is_the_mean_of_shaded_texels(ad, rng):
 
 def test_jittered_reference_is_right_on_average(ad, rng):
     _, pyramid = pyramid_of(bumpy(16, metallic=0.5, roughness=0.5), ad)
-    effects, _ = material.effects_of(pyramid.layout)
+    effects, _ = material.material_effects(pyramid.layout)
     n, repeats = 16, 512
     at = lanes(ad, rng, n, 3.0)
     truth = numpy_of(reference("converged", pyramid, *at, effects, side=64))
@@ -268,53 +254,49 @@ def test_jittered_reference_is_right_on_average(ad, rng):
 @pytest.fixture(scope="module")
 def start(ad, tmp_path_factory):
     """A metal trained as a texture: source, pyramid, table, the images that measure, its file, and its size."""
-    from mi_diffind.tasks.texture.fit import size_of
+    from mi_diffind.tasks.texture.fit import find_size
 
     source, pyramid = pyramid_of(bumpy(), ad)
     recipe = TEXTURES["ours"]
-    recipe = dataclasses.replace(
-        recipe, settings=dataclasses.replace(recipe.settings, steps=60, batch=4096, measure_every=60)
-    )
+    recipe = dataclasses.replace(recipe, steps=60, batch=4096, measure_every=60)
     options = {argument.name: argument.default for argument in TEXTURE.arguments} | {"structure": "0:1:2,1:2:4"}
     options["skip"] = 2
-    size = size_of(source, pyramid, source.nbytes / 2, recipe, options)
-    request = FitRequest("ours", recipe.settings, ad, progress=False)
+    size = find_size(source, pyramid, source.nbytes / 2, recipe, options)
+    request = FitRequest("ours", recipe, ad, progress=False)
     table, _ = textures.fit_texture(source, size, recipe, request, pyramid)
     path = tmp_path_factory.mktemp("shading") / "start.npz"
     save_table(path, table)
-    effects, _ = material.effects_of(pyramid.layout)
+    effects, _ = material.material_effects(pyramid.layout)
     evaluation = ShadedEvaluation(pyramid, effects, levels=4, pairs=24, side=16)
     return source, pyramid, TEXTURE.load(path), evaluation, path, size
 
 
 def quick(**changed):
-    settings = {"steps": 60, "batch": 4096, "measure_every": 60, "lr": 1e-2}
-    changed = {"level_bias": 0.0, **changed}
-    settings |= {k: changed.pop(k) for k in list(changed) if k in ("steps", "batch", "measure_every", "lr", "loss")}
-    return dataclasses.replace(OURS, settings=dataclasses.replace(OURS.settings, **settings), **changed)
+    settings = {"steps": 60, "batch": 4096, "measure_every": 60, "lr": 1e-2, "level_bias": 0.0}
+    return dataclasses.replace(OURS, **settings | changed)
 
 
 def trained(start, ad, recipe, measured=True, **request):
     source, pyramid, table, evaluation, *_ = start
     evaluation = evaluation if measured else None
-    net = training.start_of(table, pyramid)
-    asked = FitRequest("ours", recipe.settings, ad, progress=False, **request)
+    net = training.trainable_arrays(table, pyramid)
+    asked = FitRequest("ours", recipe, ad, progress=False, **request)
     return training.fit_shading(source, net, recipe, asked, pyramid, evaluation)
 
 
 def test_training_for_shading_gains(start, ad):
     """More than 1.5 dB on coarse levels over what was trained as a texture; and the BRDF's tables stay as they were."""
     _, pyramid, table, evaluation, *_ = start
-    effects, _ = material.effects_of(pyramid.layout)
+    effects, _ = material.material_effects(pyramid.layout)
     decoder = material.frozen_decoder(ad)
     arrays = DISNEY.open(ad.TensorXf, storage="uint8").arrays
     before = {name: array.numpy().copy() for name, array in arrays.items()}
     from mi_diffind.tasks.texture.compressed import CompressedTexture
 
-    old = evaluation.measure(reader(CompressedTexture.of(table, ad.TensorXf), effects, decoder), flip=False)
+    old = evaluation.measure(reader(CompressedTexture.from_table(table, ad.TensorXf), effects, decoder), flip=False)
     found, result = trained(start, ad, quick())
     assert result.restarts == 0
-    new = evaluation.measure(reader(CompressedTexture.of(found, ad.TensorXf), effects, decoder), flip=False)
+    new = evaluation.measure(reader(CompressedTexture.from_table(found, ad.TensorXf), effects, decoder), flip=False)
     assert new["C"]["coarse_db"] > old["C"]["coarse_db"] + 1.5
     assert found.measured["shaded_converged_db"] == pytest.approx(new["C"]["mean_db"], abs=1e-3)
     assert found.settings["before"]["shaded_converged_db"] == pytest.approx(old["C"]["mean_db"], abs=1e-3)
@@ -384,7 +366,7 @@ def test_choice_by_short_trainings(ad, gains, expected):
 
     recipe = dataclasses.replace(OURS, extras=any("extras" in name for name in gains))
     for limit in ({}, {"deadline": Deadline(1e-9)}):
-        trained, settings = [], dataclasses.replace(OURS.settings, steps=100)
+        trained, settings = [], dataclasses.replace(OURS, steps=100)
         request = Request("ours", settings, ad, checkpoint="x", **limit)
         choice, kept, stopped = training.choose(Figures, request, training.BIASES, recipe)
         assert choice.name == expected and stopped is None and trained == ([] if limit else list(gains))
@@ -400,7 +382,7 @@ def test_fixed_fine_levels_keep_their_values(start, ad, monkeypatch):
     _, pyramid, table, *_ = start
     found, _ = trained(start, ad, quick(steps=5, measure_every=5, lr=0.05, level_bias=None))
     assert found.settings["shading"]["fixed"]
-    nets = [CompressedTexture.of(t, ad.TensorXf) for t in (table, found)]
+    nets = [CompressedTexture.from_table(t, ad.TensorXf) for t in (table, found)]
     u, v = (ad.Float(np.random.default_rng(i).random(200, np.float32)) for i in range(2))
     for level, equal in ((0.0, True), (pyramid.levels - 2.0, False)):
         before, after = (np.array(net.filtered(u, v, dr.full(ad.Float, level, 200))) for net in nets)
@@ -444,8 +426,8 @@ def test_training_reads_the_level_that_a_file_is_read_at(start, ad):
     from mi_diffind.tasks.texture.compressed import CompressedTexture
 
     _, pyramid, table, *_ = start
-    problem = training.ShadingProblem(training.start_of(table, pyramid), pyramid, quick(share=1.0))
-    problem.settings, losses = problem.shading.settings, []
+    problem = training.ShadingProblem(training.trainable_arrays(table, pyramid), pyramid, quick(share=1.0))
+    problem.settings, losses = problem.shading, []
     for bias, net in ((-0.5, problem.net), (0.0, CompressedTexture(pyramid.layout, problem.net, -0.5))):
         problem.level_bias = bias
         losses.append(problem.shading_errors(net, dr.rng(seed=dr.opaque(ad.UInt64, 7)), 512).numpy())
@@ -458,10 +440,12 @@ def test_share_zero_is_the_texture_alone(start, ad):
     source, pyramid, table, *_ = start
     recipe = quick(share=0.0, steps=5)
     found, _ = trained(start, ad, recipe, measured=False)  # else the start might be kept
-    problem = textures.TextureProblem(training.start_of(table, pyramid), pyramid, TEXTURES["ours"], source.digest)
+    problem = textures.TextureProblem(
+        training.trainable_arrays(table, pyramid), pyramid, TEXTURES["ours"], source.digest
+    )
     from mi_diffind.fitting.loop import fit
 
-    fit(problem, recipe.settings, progress=False)
+    fit(problem, recipe, progress=False)
     # Settings say "mse" in both, and the samples are those of the same seed
     for name, array in textures.stored_form(problem.net).arrays.items():
         assert np.array_equal(found.arrays[name].entries, array.codes()), name
@@ -471,8 +455,8 @@ def test_gradient_of_the_loss_is_that_of_finite_differences(start, ad):
     """Of the cascaded array's entries, without rounding and without bounds."""
     source, pyramid, table, *_ = start
     recipe = quick(share=1.0, clip=None, reference="converged")
-    problem = training.ShadingProblem(training.start_of(table, pyramid), pyramid, recipe, source.digest)
-    problem.settings = recipe.settings
+    problem = training.ShadingProblem(training.trainable_arrays(table, pyramid), pyramid, recipe, source.digest)
+    problem.settings = recipe
     problem.recipe = dataclasses.replace(problem.recipe, rounded=False)
     net = problem.net
     original = dr.detach(net.cascaded.data)
@@ -523,13 +507,13 @@ def test_command_trains_both_and_the_plugin_reads_it(mi_rgb, start, manifest, tm
     from mi_diffind.tasks.shading import fit as shading_fit
 
     mi = mi_rgb
-    short = dataclasses.replace(TEXTURES["ours"].settings, steps=6, batch=4096, measure_every=6)
-    monkeypatch.setitem(TEXTURES, "ours", dataclasses.replace(TEXTURES["ours"], settings=short))
+    short = dataclasses.replace(TEXTURES["ours"], steps=6, batch=4096, measure_every=6)
+    monkeypatch.setitem(TEXTURES, "ours", dataclasses.replace(TEXTURES["ours"], **short.common))
     monkeypatch.setattr(
         shading_fit, "ShadedEvaluation", functools.partial(ShadedEvaluation, levels=4, pairs=24, side=16)
     )
     # The same arrays as those of other tests, lest everything is compiled anew
-    monkeypatch.setattr(shading_fit.texture_fit, "size_of", lambda *a: start[5])
+    monkeypatch.setattr(shading_fit.texture_fit, "find_size", lambda *a: start[5])
     out, record = tmp_path / "metal.npz", tmp_path / "record.json"
     command = ["fit", "shading", str(manifest), "-o", str(out), "--steps", "6", "--batch", "4096", "--border", "repeat",
                "--json", str(record), "--checkpoint", str(tmp_path / "state")]  # fmt: skip
@@ -576,7 +560,7 @@ def test_sources_that_cannot_be_shaded_are_refused(ad, start, tmp_path):
         ),
     ):
         with pytest.raises(UsageError, match=message):
-            material.effects_of(pyramid_of(maps, ad)[1].layout)
+            material.material_effects(pyramid_of(maps, ad)[1].layout)
     for source, message in (
         ({"albedo": zeros[..., :1]}, "all of its maps are constant, there is nothing to learn"),
         (None, "source: not given, a manifest"),
@@ -590,5 +574,5 @@ def test_sources_that_cannot_be_shaded_are_refused(ad, start, tmp_path):
         load_start(
             start[4],
             from_arrays(bumpy(seed=9)),
-            FitRequest("ours", OURS.settings, ad, options={"source": "other.json"}),
+            FitRequest("ours", OURS, ad, options={"source": "other.json"}),
         )

@@ -11,7 +11,7 @@ from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting.task import FitRequest
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
-from mi_diffind.tasks.texture import PRESETS, TASK, arrays, training
+from mi_diffind.tasks.texture import PRESETS, TASK, arrays, fit
 from mi_diffind.tasks.texture.compressed import CompressedTexture
 
 TYPES = array_module("llvm")
@@ -27,14 +27,13 @@ def sparse(side=64):
 
 def recipe(steps=4):
     own = PRESETS["ours"]
-    settings = dataclasses.replace(own.settings, steps=steps, batch=2048, measure_every=steps)
-    return dataclasses.replace(own, settings=settings)
+    return dataclasses.replace(own, steps=steps, batch=2048, measure_every=steps)
 
 
 def trained(source, size, steps=4):
     own = recipe(steps)
-    pyramid = Pyramid.of(source, training.layout_of(source, own), TYPES, ("repeat", "clamp"))
-    table, _ = training.fit_texture(source, size, own, FitRequest("ours", own.settings, TYPES, progress=False), pyramid)
+    pyramid = Pyramid.from_source(source, fit.source_layout(source, own), TYPES, ("repeat", "clamp"))
+    table, _ = fit.fit_texture(source, size, own, FitRequest("ours", own, TYPES, progress=False), pyramid)
     return table
 
 
@@ -73,7 +72,7 @@ def page_read(table, name, side, u, v):
 
 def test_reading_against_numpy(table):
     """Level 0 reads its pages alone; between levels 1 and 2 the pointers of both arrays are mixed."""
-    texture = CompressedTexture.of(table, TYPES.TensorXf)
+    texture = CompressedTexture.from_table(table, TYPES.TensorXf)
     cascaded = texture.arrays["cascaded"]
     rng = np.random.default_rng(1)
     for level in (0.0, 1.0, 1.25, 2.0):
@@ -92,7 +91,7 @@ def test_reading_against_numpy(table):
 
 
 def test_levels_are_continuous_and_any_is_allowed(table):
-    texture = CompressedTexture.of(table, TYPES.TensorXf, "float32")
+    texture = CompressedTexture.from_table(table, TYPES.TensorXf, "float32")
     u, v = np.random.default_rng(2).random((2, 64)).astype(np.float32)
 
     def read(level):
@@ -139,9 +138,9 @@ def test_which_textures_get_pages():
     source = sparse()
     noise = np.random.default_rng(4).integers(0, 256, (64, 64, 3), np.uint8)
     for maps, more in ((source, True), (from_arrays({"albedo": noise}), False)):
-        pyramid = Pyramid.of(maps, training.layout_of(maps, recipe()), TYPES, ("repeat", "clamp"))
-        gain = arrays.gain_of_pages(pyramid.values, paged(maps), pyramid.border)
-        assert (gain >= training.GAIN_DB) == more, gain
+        pyramid = Pyramid.from_source(maps, fit.source_layout(maps, recipe()), TYPES, ("repeat", "clamp"))
+        gain = fit._page_gain(pyramid, paged(maps))
+        assert (gain >= fit.GAIN_DB) == more, gain
     assert arrays.paged(8, 8, 3, 100) is None and arrays.paged(1024, 1024, 3, 20000) is None
     assert arrays.paged(512, 512, 3, 65536).nbytes <= 65536
 

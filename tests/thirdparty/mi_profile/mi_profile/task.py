@@ -7,8 +7,7 @@ from pathlib import Path
 
 from mi_diffind.core.arguments import Argument, positive
 from mi_diffind.core.errors import UsageError
-from mi_diffind.fitting.settings import FitSettings
-from mi_diffind.fitting.task import FitRequest, Task
+from mi_diffind.fitting.task import FitRequest, FitSettings, Task
 
 _FIT = FitSettings(steps=600, batch=4096, lr=3e-2, loss="mse", seed=1)
 

@@ -1,10 +1,9 @@
-"""Bounds of a texture's values, changes of its arrays and requested derivatives, before anything is rendered."""
+"""Helpers of BSDFs: bounds of parameters, known before anything is rendered, and directions in masked lanes."""
 
 from __future__ import annotations
 
 import math
 import threading
-from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -35,55 +34,33 @@ def when_outermost(work) -> None:
         _waiting.queue = None
 
 
-def tracked(texture, colour: bool = False, is_eta: bool = False) -> TrackedParameter | FixedParameter:
-    """Return the parameter of a BSDF, a texture or a number; :class:`TrackedParameter` has the arguments."""
-    bounds = None if is_eta or not hasattr(texture, "layout_bounds") else texture.layout_bounds()
-    if bounds is None:
-        return TrackedParameter(texture, colour, is_eta)
-    return FixedParameter(bounds, not texture.is_spatially_varying() and not (colour and mi.is_spectral))
-
-
-@dataclass(frozen=True)
-class FixedParameter:
-    """Parameter whose bounds are ``known`` for any entries of its arrays; a constant has no entries.
-
-    The methods are those of :class:`TrackedParameter`.
-    """
-
-    known: ValueBounds
-    constant: bool
-
-    def optimised(self) -> bool:
-        return False
-
-    def changed(self) -> bool:
-        return False
-
-    def update(self) -> None:
-        pass
-
-    def bounds(self) -> ValueBounds:
-        return self.known
-
-
 class TrackedParameter:
     """Parameter of a BSDF, a texture or a number, with bounds of its values.
 
     ``constant``: the value is the same everywhere (a colour in spectral variants is not, since it varies with the
-    wavelengths). ``is_eta``: bounds are those of the reflectance of this index of refraction.
+    wavelengths). ``is_eta``: bounds are those of the reflectance of this index of refraction. ``known``: bounds that
+    hold for any entries of the texture's arrays, by default those of its file if it has one.
     """
 
-    def __init__(self, texture, colour: bool = False, is_eta: bool = False):
+    def __init__(self, texture, colour: bool = False, is_eta: bool = False, known: ValueBounds | None = None):
         self.texture, self.colour, self.is_eta = texture, colour, is_eta
+        if known is None and not is_eta and hasattr(texture, "layout_bounds"):
+            known = texture.layout_bounds()
+        varies = colour and mi.is_spectral
+        self._known, self._parameters = known is not None, None
+        self._arrays, self._bounds = [] if self._known else None, known or ValueBounds()
         if isinstance(texture, dr.ArrayBase):  # a parameter of the BSDF itself, assigned to in place
-            self.constant, self._parameters = True, None
+            self.constant = True
+        elif self._known:
+            self.constant = not texture.is_spatially_varying() and not varies
         else:
-            self.constant = compat.is_constant_texture(texture) and not (colour and mi.is_spectral)
+            self.constant = compat.is_constant_texture(texture) and not varies
             self._parameters = mi.traverse(texture)
-        self._arrays, self._bounds = None, ValueBounds()
 
     def _values(self) -> list:
-        """Return the arrays of the texture at present, children included."""
+        """Return the arrays that decide the bounds at present, those of nested textures included."""
+        if self._known:
+            return []
         if self._parameters is None:
             return [self.texture]
         values = (self._parameters[key] for key in self._parameters.keys())
@@ -99,8 +76,14 @@ class TrackedParameter:
             return True
         return [*map(compat.identity, self._arrays)] != [*map(compat.identity, self._values())]
 
+    def is_fixed(self) -> bool:
+        """Return whether the parameter is constant, and neither changed nor optimised."""
+        return self.constant and not self.optimised() and not self.changed()
+
     def update(self) -> None:
         """Determine the bounds, unless the arrays are unchanged."""
+        if self._known:
+            return
         if dr.flag(dr.JitFlag.FreezingScope) or self.optimised():
             self._arrays, self._bounds = None, ValueBounds()  # values cannot be evaluated, or need not be
         elif self.changed():
@@ -126,14 +109,14 @@ def value_bounds(texture, colour: bool = False) -> ValueBounds:
     Bounds of constants and bitmaps are known, for any filter; those of any other texture are unknown.
     """
     if isinstance(texture, dr.ArrayBase):
-        return _of([texture])
+        return _bounds([texture])
     constant = compat.is_constant_texture(texture)
     if constant and mi.is_spectral and colour:
         # Smooth, and coefficients of a sigmoid: neither black nor without hue, unless it is uniform
-        return _of([mi.traverse(texture)["value"]]) if compat.is_uniform_spectrum(texture) else ValueBounds()
+        return _bounds([mi.traverse(texture)["value"]]) if compat.is_uniform_spectrum(texture) else ValueBounds()
     if constant:
         si = dr.zeros(mi.SurfaceInteraction3f)
-        return _of(list(texture.eval(si)) if colour else [texture.eval_1(si)])
+        return _bounds(list(texture.eval(si)) if colour else [texture.eval_1(si)])
     if not compat.is_bitmap(texture):
         return ValueBounds()
     data = mi.traverse(texture)["data"]
@@ -143,10 +126,10 @@ def value_bounds(texture, colour: bool = False) -> ValueBounds:
     scale = 1 / 255 if dr.type_v(data) == dr.VarType.UInt8 else 1
     flat = mi.Float(data.array) * scale
     index = dr.arange(mi.UInt32, dr.width(flat) // channels) * channels
-    return _of([dr.gather(mi.Float, flat, index + k) for k in range(min(channels, 3))])
+    return _bounds([dr.gather(mi.Float, flat, index + k) for k in range(min(channels, 3))])
 
 
-def _of(channels: list) -> ValueBounds:
+def _bounds(channels: list) -> ValueBounds:
     """Return the bounds of the values of all channels; unknown if one is NaN."""
     arrays = [dr.detach(mi.Float(c)) for c in channels]
     arrays = [dr.select(dr.isnan(a), dr.inf, a) for a in arrays]
@@ -157,3 +140,24 @@ def _of(channels: list) -> ValueBounds:
     if not all(math.isfinite(v) for v in extrema):
         return ValueBounds()
     return ValueBounds(min(extrema[:n]), max(extrema[n : 2 * n]), grey=max(extrema[2 * n :], default=0) == 0)
+
+
+def are_directions(wi, wo):
+    """Return the lanes in which both vectors are about as long as directions, 1: not NaN, infinite, zero or tiny.
+
+    Masked lanes hold such vectors. They have to be replaced before anything is computed: a derivative of 0, multiplied
+    by an infinite one, is NaN.
+    """
+    return dr.abs(dr.squared_norm(wi) + dr.squared_norm(wo) - 2) < 0.5
+
+
+def glossy_directions(ctx, wi, wo, active):
+    """Return both directions, safe to compute with in every lane, and the mask of lanes whose result counts.
+
+    The latter are on the front side, of a BSDF whose only component is glossy.
+    """
+    active = active & (wi.z > 0) & (wo.z > 0) & are_directions(wi, wo)
+    if not ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0):
+        active = mi.Bool(False)
+    up = mi.Vector3f(0, 0, 1)
+    return dr.select(active, wi, up), dr.select(active, wo, up), active

@@ -1,0 +1,270 @@
+"""Error at equal time: a scene as written and its counterparts, each with the samples that fit in the same time."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from ..core.files import writable_folder
+from ..core.progress import interruptible, progress_bar
+from ..images import metrics
+from ..measure import plot
+from ..measure.report import grid
+from ..measure.statistics import spread
+from ..plugins.support import footprint
+from . import comparison, loading
+
+#: Samples of the reference, as a multiple of all samples of the exact scene.
+REFERENCE = 8
+
+#: Added to the squared radiance that a squared error is divided by, as usual for the relative error of renders.
+EPSILON = 0.01
+
+#: Standard errors that a bias exceeds to be stated.
+SEEN = 3.0
+
+#: Largest share by which the times of two contenders may differ and count as equal.
+TOLERANCE = 0.1
+
+#: Pairs of passes whose median ratio of times a correction uses.
+PAIRS = 3
+
+#: Corrections of the samples of a contender after its first measured pass.
+CORRECTIONS = 3
+
+
+@dataclass
+class EqualTime:
+    """Images of one pass of each contender, and of the reference (linear, ``(height, width, 3)``), with the figures."""
+
+    images: dict[str, np.ndarray] = field(repr=False)
+    reference: np.ndarray = field(repr=False)
+    figures: dict
+
+    def save(self, folder: str | os.PathLike) -> dict[str, str]:
+        """Write ``equal_time.png`` into ``folder``, made if its parent exists, and return the paths."""
+        path = writable_folder(folder, create=True) / "equal_time.png"
+        rows = self.figures["contenders"]
+        cells = [
+            plot.picture(f"{name}: {rows[name]['spp']} spp, {rows[name]['seconds']['median']:.2g} s", image)
+            for name, image in self.images.items()
+        ]
+        cells.append(plot.picture(f"reference: {self._reference()}", self.reference))
+        cells += [
+            plot.error_map(
+                np.sqrt(_weighted((image - self.reference) ** 2, self.reference)),
+                f"relative error {rows[name]['error']:.3g}, of it bias {_share(rows[name])}",
+            )
+            for name, image in self.images.items()
+        ]
+        plot.write(path, cells, len(self.images) + 1, self.reference.shape)
+        return {"figure": str(path)}
+
+    def _reference(self) -> str:
+        f = self.figures
+        plugins = ", ".join(f["contenders"][f["reference"]]["plugins"])
+        return f"{f['reference']} ({plugins}), {f['reference_spp']} spp"
+
+    def __str__(self) -> str:
+        f = self.figures
+        rows = [("", "samples", "seconds", "error", "of it noise", "of it bias", "error / exact")]
+        for name, c in f["contenders"].items():
+            ratio = c["error_ratio"]
+            rows.append(
+                (
+                    name,
+                    f"{c['spp']}",
+                    f"{c['seconds']['median']:.3g}",
+                    f"{c['error']:.3g}",
+                    f"{c['noise']:.3g}",
+                    _share(c),
+                    f"{ratio['median']:.2f} ({ratio['q1']:.2f} to {ratio['q3']:.2f})",
+                )
+            )
+        return "\n".join(
+            [
+                f"scene       {Path(f['scene']).name}, {f['width']} x {f['height']}, "
+                f"{f['passes']} pass{'es' if f['passes'] != 1 else ''}{', interrupted' if f['interrupted'] else ''}",
+                f"variant     {f['variant']}",
+                f"reference   {self._reference()}",
+                "error       mean squared error of a pass, over the squared reference + 0.01 (relMSE)",
+                "",
+                *grid(rows),
+                *(f"{name}: {c['remark']}" for name, c in f["contenders"].items() if c["remark"]),
+            ]
+        )
+
+    def _repr_png_(self) -> bytes:
+        with tempfile.TemporaryDirectory() as folder:
+            return Path(self.save(folder)["figure"]).read_bytes()
+
+
+def _share(contender: dict) -> str:
+    bias = contender["bias"]
+    return f"{bias:.3g}" if bias is not None else f"none above {contender['bias_resolution']:.1g}"
+
+
+def _weighted(squared: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Return squared errors over the squared reference + :data:`EPSILON`, the mean of the channels."""
+    return (squared / (reference**2 + EPSILON)).mean(axis=-1)
+
+
+def attach_samples(scene, spp: int) -> int:
+    """Return the largest number of samples a pixel up to ``spp`` that a scene's sampler allows, and filter for it."""
+    sensor = scene.sensors()[0]
+    spp = next((n for n in range(max(1, spp), 0, -1) if loading.sampler_count(sensor, n) == n), 1)
+    footprint.attach(scene, 0, spp)
+    return spp
+
+
+class _EqualSide:
+    """Scene whose passes have ``spp`` samples a pixel."""
+
+    def __init__(self, scene, plugins: list[str], spp: int):
+        self.scene, self.plugins, self.spp = scene, plugins, 0
+        self.images: list[np.ndarray] = []
+        self.seconds: list[float] = []
+        self.choose(spp)
+
+    def choose(self, spp: int) -> bool:
+        """Take the most samples up to ``spp`` that the sampler allows; return whether that is another number."""
+        before, self.spp = self.spp, attach_samples(self.scene, spp)
+        return self.spp != before
+
+    def render(self, seed: int) -> tuple[np.ndarray, float]:
+        """Return an image of one pass, and its seconds."""
+        start = time.perf_counter()
+        image = loading.colour_channels(loading.render_pass(self.scene, self.spp, seed))
+        seconds = time.perf_counter() - start
+        metrics.check_finite(image)
+        return np.repeat(image, 3 // image.shape[-1], -1), seconds
+
+    def fill(self, exact: _EqualSide) -> None:
+        """Choose the samples whose pass takes as long as one of ``exact``, as far as the sampler allows."""
+        for _ in range(CORRECTIONS):
+            pairs = [(self.render(i)[1], exact.render(i)[1]) for i in range(PAIRS + 1)][1:]  # the first ones compile
+            if not self.choose(round(self.spp / np.median([a / b for a, b in pairs]))):
+                break
+
+
+def errors(passes: Sequence[np.ndarray], references: Sequence[np.ndarray]) -> dict:
+    """Return the error of one of several ``passes`` of an image, and the parts of it that are noise and bias.
+
+    ``passes`` are images ``(height, width, channels)`` of independent samples, ``references`` two independent halves of
+    the reference. All are relative mean squared errors without the noise of the reference: ``error`` = ``noise``, the
+    variance of a pass, + ``bias``, the squared error of infinitely many samples, ``None`` if that is below
+    :data:`SEEN` of its standard errors (``bias_resolution``). ``errors`` are those of each pass. All estimates are
+    without bias, so ``error`` may differ from the sum by rounding, and those of small errors may be negative.
+    """
+    reference = sum(references) / len(references)
+    reference_noise = (references[0] - references[1]) ** 2 / 4  # variance of the mean of the halves
+    each = [float(_weighted((image - reference) ** 2 - reference_noise, reference).mean()) for image in passes]
+    mean, variance = np.mean(passes, axis=0), np.var(passes, axis=0, ddof=1)
+    squared = _weighted((mean - reference) ** 2 - variance / len(passes) - reference_noise, reference)
+    bias, resolution = float(squared.mean()), SEEN * float(squared.std()) / squared.size**0.5
+    return {
+        "error": float(np.mean(each)),
+        "noise": float(_weighted(variance, reference).mean()),
+        "bias": bias if bias > resolution else None,
+        "bias_resolution": resolution,
+        "errors": each,
+    }
+
+
+def _remark(contender: _EqualSide, exact: _EqualSide) -> str:
+    """Return a sentence if the times of two contenders differ by more than :data:`TOLERANCE`, else ""."""
+    ratio = float(np.median(np.divide(contender.seconds, exact.seconds)))
+    if abs(ratio - 1) <= TOLERANCE:
+        return ""
+    return f"its passes took {ratio:.2f} of the time of the exact ones, no number of samples came closer"
+
+
+def compare_at_equal_time(
+    scene: str | os.PathLike | dict,
+    spp: int | None = None,
+    seed: int = 0,
+    *,
+    passes: int = 5,
+    against: str | None = None,
+    learn: Sequence[str] = (),
+    defines: Mapping[str, object] | None = None,
+    progress: bool = True,
+) -> EqualTime:
+    """Render a scene as written and its counterparts in the same time, and measure their errors.
+
+    - ``scene``, ``defines``, ``against``, ``learn``: as of :func:`.comparison.compare`; the last truth is the exact
+      scene.
+    - ``spp``: samples a pixel of a pass of the exact scene (``None``: the scene's). Every other contender takes the
+      most samples that its sampler allows in the time of such a pass, measured first.
+    - ``passes``: passes of each contender, rendered in turn, at least two.
+
+    The reference is the exact scene at :data:`REFERENCE` times all its samples. Figures: ``contenders``, by name, have
+    ``spp``, ``seconds`` (median and quartiles of a pass), ``error``, ``noise`` and ``bias`` (:func:`errors`),
+    ``error_ratio`` (median and quartiles of the ratios of a pass's error to that of the exact scene), and a ``remark``
+    if the times are not equal. Raises :class:`.SceneError`, as :func:`.comparison.compare` does.
+    """
+    loaded, passes = comparison.load_compared(scene, against, learn, defines, progress), max(2, passes)
+    spp = spp or loaded.written.sensors()[0].sampler().sample_count()
+    names = list(dict.fromkeys(entry["plugin"] for entry in loaded.replaced))
+    contenders = {"as written": _EqualSide(loaded.written, names, spp)}
+    contenders |= {name: _EqualSide(truth, loaded.put_in[name], spp) for name, truth in loaded.truths.items()}
+    reference_name = list(loaded.truths)[-1]
+    exact = contenders[reference_name]
+    for contender in contenders.values():
+        if contender is not exact:
+            contender.fill(exact)
+
+    count = max(2, REFERENCE * passes)
+    halves, taken, done = [0.0, 0.0], [0, 0], 0
+    total = count + passes * len(contenders)
+    with interruptible() as stop, progress_bar("render", total, progress=progress) as bar:
+        for i in range(count):
+            halves[i % 2] = halves[i % 2] + exact.render((seed << 16) + (1 << 15) + i)[0]
+            taken[i % 2] += 1
+            bar.update()
+            if stop.is_set() and i > 0:
+                break
+        for i in range(passes):
+            for contender in contenders.values() if i % 2 == 0 else reversed(contenders.values()):
+                image, seconds = contender.render((seed << 16) + i)
+                contender.images.append(image)
+                contender.seconds.append(seconds)
+                bar.update()
+            done += 1
+            if stop.is_set() and done >= 2:
+                break
+    halves = [half / n for half, n in zip(halves, taken, strict=True)]
+    reference = (halves[0] + halves[1]) / 2
+    measured = {name: errors(c.images, halves) for name, c in contenders.items()}
+    base = measured[reference_name]["errors"]
+    figures = {
+        "scene": str(loaded.parsed.path),
+        "variant": mi.variant(),
+        "width": reference.shape[1],
+        "height": reference.shape[0],
+        "seed": seed,
+        "passes": done,
+        "interrupted": stop.is_set(),
+        "reference": reference_name,
+        "reference_spp": sum(taken) * exact.spp,
+        "contenders": {
+            name: {
+                "plugins": c.plugins,
+                "spp": c.spp,
+                "seconds": spread(c.seconds),
+                **measured[name],
+                "error_ratio": spread(e / b for e, b in zip(measured[name]["errors"], base, strict=True) if b > 0),
+                "remark": _remark(c, exact),
+            }
+            for name, c in contenders.items()
+        },
+    }
+    return EqualTime({name: c.images[0].astype(np.float32) for name, c in contenders.items()},
+                     reference.astype(np.float32), figures)  # fmt: skip
