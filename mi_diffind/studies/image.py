@@ -141,7 +141,7 @@ class ImageContenders:
     def network(self, compression: float, seconds: float) -> Contender:
         """Return a hash grid and network in half precision; raise ``ValueError`` if the bytes are too few."""
         name = f"hash grid + network {compression:g}x {seconds:g} s"
-        pyramid = Pyramid.of(self.source, types=array_module())
+        pyramid = Pyramid.from_source(self.source, types=array_module())
         net = networks.texture_network(pyramid.layout, self.source.nbytes / compression, levels=1)
 
         def train(job: Contender, progress: bool) -> tuple | None:

@@ -419,7 +419,7 @@ class ShadingContenders:
             return record
 
         def read(job: Contender) -> ShadedReader:
-            texture = CompressedTexture.of(self.table(job), self.pyramid.types.TensorXf)
+            texture = CompressedTexture.from_table(self.table(job), self.pyramid.types.TensorXf)
             return reader(texture, self.effects, frozen_decoder(self.pyramid.types))
 
         return self.add(label, method, fit, read, True)
