@@ -375,5 +375,5 @@ def test_shapes_of_a_scene(mi_rgb, tmp_path):
     assert load_mesh(path).components == 2 and load_mesh(path).scale == pytest.approx(7)
     with pytest.raises(MeshError, match='holds no mesh "round", found "ball", "box"'):
         load_mesh(f"{path}#round")
-    written = distance_shapes._as_ply(tmp_path / "scene.xml#box", (0,))
+    _, written = distance_shapes._as_ply(tmp_path / "scene.xml#box", (0,))
     assert load_mesh(written).digest == load_mesh(f"{path}#box").digest

@@ -48,6 +48,15 @@ def register_probe() -> None:
     mi.register_texture("probe", Probe)
 
 
+def mesh(name: str, **more) -> dict:
+    """Return one of the scenes' meshes as a shape, within a ball of radius 1.5."""
+    shape = {"type": "ply", "filename": str(ASSETS / f"{name}.ply")}
+    box = mi.load_dict(shape).bbox()
+    move = mi.ScalarTransform4f().translate((-np.array(box.center())).tolist())
+    radius = float(np.linalg.norm(np.array(box.extents()))) / 2
+    return {**shape, "to_world": mi.ScalarTransform4f().scale(1.5 / radius) @ move, **more}
+
+
 def sensor(kind="perspective", to_world=None, **more) -> dict:
     film = {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "rfilter": {"type": "box"}}
     lens = {"aperture_radius": 0.01, "focus_distance": 2.0} if kind == "thinlens" else {}

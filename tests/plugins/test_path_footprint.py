@@ -14,15 +14,6 @@ def scaled(mi, *scale):
     return mi.ScalarTransform4f().scale(list(scale) if len(scale) > 1 else scale[0])
 
 
-def mesh(mi, name: str, **more) -> dict:
-    """One of the scenes' meshes, within a ball of radius 1.5."""
-    shape = {"type": "ply", "filename": str(fp.ASSETS / f"{name}.ply")}
-    box = mi.load_dict(shape).bbox()
-    move = (-np.array(box.center())).tolist()
-    radius = float(np.linalg.norm(np.array(box.extents()))) / 2
-    return {**shape, "to_world": scaled(mi, 1.5 / radius) @ mi.ScalarTransform4f().translate(move), **more}
-
-
 def shown(mi, shapes: dict, **sensor) -> tuple:
     """The scene in a room that emits the footprints on its walls, and what is seen of them."""
     room = {"type": "cube", "flip_normals": True, "to_world": scaled(mi, 6)}
@@ -67,7 +58,7 @@ def test_through_mirrors(mi_rgb, kind):
     elif kind == "ball":
         shapes = {"m": {"type": "sphere", "to_world": scaled(mi, 1.4), "bsdf": MIRROR}}
     else:
-        shapes = {"m": mesh(mi, "knot" if kind == "knot" else "vase", bsdf=MIRROR)}
+        shapes = {"m": fp.mesh("knot" if kind == "knot" else "vase", bsdf=MIRROR)}
     place = shapes["m"]["to_world"]
     if kind == "mirrored":
         shapes["m"] |= {"to_world": scaled(mi, -1, 1, 1) @ place, "bsdf": {"type": "twosided", "bsdf": MIRROR}}

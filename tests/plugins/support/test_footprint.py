@@ -15,14 +15,10 @@ from mi_diffind.plugins.support.footprint import LARGEST, Cone
 
 def scene_of(mi, kind: str, camera: str = "perspective", **more):
     """A shape of about radius 1.5 in front of a camera."""
-    move, turn = mi.ScalarTransform4f().translate, mi.ScalarTransform4f().rotate
     if kind in ("vase", "knot"):
-        shape = {"type": "ply", "filename": str(fp.ASSETS / f"{kind}.ply")}
-        box = mi.load_dict(shape).bbox()
-        radius = float(np.linalg.norm(np.array(box.extents()))) / 2
-        shape["to_world"] = mi.ScalarTransform4f().scale(1.5 / radius) @ move((-np.array(box.center())).tolist())
+        shape = fp.mesh(kind)
     elif kind == "plane":
-        shape = {"type": "rectangle", "to_world": turn([1, 0, 0], -80) @ mi.ScalarTransform4f().scale(20)}
+        shape = {"type": "rectangle", "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -80).scale(20)}
     else:
         shape = {"type": "sphere"}
     place = fp.look_at([0.5, 0.8, 3], [0, 0, 0])

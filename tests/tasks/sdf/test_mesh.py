@@ -143,16 +143,6 @@ def test_degenerate_triangles_are_left_out():
     assert "a.ply: 3 triangles without an area were left out" in mesh.warnings
 
 
-def test_zeros_of_either_sign_are_one_position():
-    vertices, faces = solids.box()
-    vertices = vertices + 0.5
-    split = np.where(
-        vertices[faces] == 0, np.where(np.arange(len(faces))[:, None, None] % 2, 0.0, -0.0), vertices[faces]
-    )
-    mesh = make_mesh(split.reshape(-1, 3), np.arange(36).reshape(-1, 3))
-    assert len(mesh.vertices) == 8 and mesh.watertight
-
-
 def test_a_sliver_may_hold_a_mesh_together():
     """A T-junction closed by a triangle without an area: left out, and the mesh is watertight all the same."""
     vertices, faces = solids.box()
