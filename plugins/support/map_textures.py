@@ -506,6 +506,10 @@ class FilteredTexture(MapTexture):
             gradient.append((ahead - behind) / width)
         return self._before(*gradient)
 
+    def filtered(self) -> bool:
+        """Return whether footprints are read."""
+        return self.filter.name != "off" and self.is_spatially_varying()
+
     def report(self) -> dict:
         """Return the description of :meth:`.MapTexture.report` and three more keys.
 
