@@ -115,7 +115,7 @@ class ImageContenders:
                 return None
             maps, nbytes, seconds, more = result
             more = {**more, **details, "ratio": self.source.nbytes / nbytes}
-            return {"bytes": nbytes, "seconds": seconds, "errors": errors_of(self.source, maps), "details": more}
+            return {"bytes": nbytes, "seconds": seconds, "errors": map_errors(self.source, maps), "details": more}
 
         label = method + " (no random access)" * (method in STREAMS)
         return Contender(name, method, budget, fit, read, label, has_file=read is not None, details=details)
@@ -246,7 +246,7 @@ def _clipped(values: np.ndarray) -> np.ndarray:
     return np.clip(values, 0, 1).astype(np.float32)
 
 
-def errors_of(source: Source, maps: dict[str, np.ndarray]) -> dict:
+def map_errors(source: Source, maps: dict[str, np.ndarray]) -> dict:
     """Return the errors of decoded maps, rounded to 8 bits.
 
     ``psnr_db`` is that of all channels together, ``psnr_between_db`` that of bilinear reads, one in each texel, without

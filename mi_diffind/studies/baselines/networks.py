@@ -19,7 +19,6 @@ import numpy as np
 from drjit import nn
 
 from ...arrays.budget import Budget, BudgetError
-from ...arrays.indirection import DifferentiableArray, fold
 from ...arrays.lookup import clamp
 from ...core.compat import backend_module
 from ...core.runtime import array_module
@@ -65,21 +64,20 @@ class Network(nn.Module):
     """Multilayer perceptron from ``inputs`` coordinates to as many numbers as ``outputs``.
 
     There are ``layers`` hidden layers of ``width`` leaky rectified units. With ``grid``, the options of
-    ``nn.HashGridEncoding``, a hash grid encodes the coordinates; ``direct`` further coordinates bypass it. With
-    ``table``, a number of entries on a side, the outputs point into a square :class:`.DifferentiableArray`, as the
-    primary array of an indirection does. A call with a list of coordinates returns a list of arrays. As allocated, the
-    network computes with tensors, the faster form to train; :meth:`cooperative` returns it in cooperative vectors.
+    ``nn.HashGridEncoding``, a hash grid encodes the coordinates; ``direct`` further coordinates bypass it. A call with
+    a list of coordinates returns a list of arrays. As allocated, the network computes with tensors, the faster form to
+    train; :meth:`cooperative` returns it in cooperative vectors.
     """
 
-    DRJIT_STRUCT = {"entries": object, "mlp": nn.Module, "table": object}  # noqa: RUF012
+    DRJIT_STRUCT = {"entries": object, "mlp": nn.Module}  # noqa: RUF012
 
     def __init__(
-        self, inputs: int = 2, width: int = 16, layers: int = 2, grid: dict | None = None, table: int = 0,
-        outputs: int = 1, direct: int = 0,
+        self, inputs: int = 2, width: int = 16, layers: int = 2, grid: dict | None = None, outputs: int = 1,
+        direct: int = 0,
     ):  # fmt: skip
-        self.inputs, self.width, self.layers, self.grid, self.table_size = inputs, width, layers, grid, table
-        self.outputs, self.direct = 2 if table else outputs, direct
-        self.entries = self.mlp = self.table = self.encoding = None
+        self.inputs, self.width, self.layers, self.grid = inputs, width, layers, grid
+        self.outputs, self.direct = outputs, direct
+        self.entries = self.mlp = self.encoding = None
         self.is_cooperative = False
 
     def _alloc(self, dtype, size=-1, rng=None):
@@ -93,8 +91,6 @@ class Network(nn.Module):
         for _ in range(self.layers):
             hidden += [nn.Linear(-1, self.width), nn.LeakyReLU()]
         result.mlp = nn.Sequential(*hidden, nn.Linear(self.width, self.outputs)).alloc(dtype, size, rng)
-        if self.table_size:
-            result.table = DifferentiableArray((self.table_size,) * 2, 1, "constant", 0.5).alloc(dtype)
         return result, self.outputs
 
     def __call__(self, x, active=True):
@@ -103,13 +99,11 @@ class Network(nn.Module):
             self.encoding.data = self.entries.array
             x = [*self.features(list(x)), *x[self.inputs :]]
         if self.is_cooperative:
-            y = list(self.mlp(nn.CoopVec(*x)))
-        else:
-            Tensor = dr.tensor_t(type(x[0]))
-            rows = [Tensor(v, (1, n)) if dr.width(v) == n else dr.full(Tensor, v[0], (1, n)) for v in x]
-            y = self.mlp(dr.concat(rows, axis=0))
-            y = [y.array] if y.shape[0] == 1 else [y[i, :].array for i in range(y.shape[0])]
-        return y if self.table is None else self.table([fold(v) for v in y], active)
+            return list(self.mlp(nn.CoopVec(*x)))
+        Tensor = dr.tensor_t(type(x[0]))
+        rows = [Tensor(v, (1, n)) if dr.width(v) == n else dr.full(Tensor, v[0], (1, n)) for v in x]
+        y = self.mlp(dr.concat(rows, axis=0))
+        return [y.array] if y.shape[0] == 1 else [y[i, :].array for i in range(y.shape[0])]
 
     def features(self, x: list) -> list:
         """Return the features that the hash grid gives to the network at coordinates ``x``."""
