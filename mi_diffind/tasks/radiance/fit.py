@@ -395,9 +395,16 @@ class FieldFit:
 
     def pairs(self, grid: NodeGrid, stopped: bool) -> tuple[Table, FitResult]:
         """Compress a grid to the pairs of dense arrays of the supplement."""
-        request, types = self.request, self.request.types
         nbytes = self.wanted_bytes(grid) or dense_bytes(grid.nodes.shape) / 50  # as the help says
         grid = self.visible(grid)
+        problem = self.pairs_problem(grid, nbytes, 0 if stopped else VALUE_STEPS)
+        return self.train(
+            problem, lambda: files.pairs_table(grid.nodes, problem.table_arrays(), problem.low, problem.high), stopped
+        )
+
+    def pairs_problem(self, grid: NodeGrid, nbytes: float, steps: int) -> paper.PairsProblem:
+        """Return the arrays of the supplement in ``nbytes``, trained on the numbers of the grid for ``steps``."""
+        request, types = self.request, self.request.types
         ratio = dense_bytes(grid.nodes.shape) / nbytes
         extent = np.array(grid.nodes.upper) - np.array(grid.nodes.lower)
         shapes = {}
@@ -406,13 +413,12 @@ class FieldFit:
             shapes[name] = paper.sides(share * nbytes, given, channels, extent)
         density, colour, low, high = paper.initial(paper.dense(grid), shapes, types)
         net = paper.PairsNet(density, colour)
-        if not stopped:
+        if steps:
             values = paper.ValuesProblem(net, paper.PairsField(grid.nodes, density, colour, low, high), grid)
-            settings = {"steps": VALUE_STEPS, "batch": 2**15, "lr": 1e-2, "measure_every": VALUE_STEPS}
+            settings = {"steps": steps, "batch": 2**15, "lr": 1e-2, "measure_every": steps}
             settings = dataclasses.replace(request.settings, **settings)
             request.run([Stage("", values, 0.2, settings, "the numbers of the grid", resumable=False)])
-        problem = paper.PairsProblem(net, grid.nodes, low, high, self.session)
-        return self.train(problem, lambda: files.pairs_table(grid.nodes, problem.table_arrays(), low, high), stopped)
+        return paper.PairsProblem(net, grid.nodes, low, high, self.session)
 
 
 def five_digits(measured: dict[str, float]) -> dict[str, float]:
