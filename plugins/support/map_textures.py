@@ -11,6 +11,7 @@ import numpy as np
 
 from mi_diffind.arrays.boxes import ValueBounds
 from mi_diffind.arrays.lookup import clamp
+from mi_diffind.core import compat
 from mi_diffind.images import srgb
 from mi_diffind.maps.layout import MapLayout
 
