@@ -295,7 +295,7 @@ def test_tradeoff_of_a_scene(tmp_path, capsys):
     arguments = ["tradeoff", "scene", scene_file(tmp_path), "--quick", "--out", str(out)]
     assert main([*arguments, "--json", str(report), "--seed", "3", *SMALL]) == 0
     text, found = capsys.readouterr().out, json.loads(report.read_text())
-    assert "scene.xml, 48 x 28" in text and "bias" in text and found["verdict"] in text
+    assert "scene.xml, 48 x 28" in text and "bias" in text
     files = [str(out / f"tradeoff_scene.{kind}") for kind in ("csv", "json", "png")]
     assert text.endswith("\nwritten     " + ", ".join(files) + "\n")
     assert list(found.pop("files").values()) == files and sorted(map(str, out.iterdir())) == files

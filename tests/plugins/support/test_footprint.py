@@ -1,7 +1,6 @@
 """Footprints of pixels: against finite differences of rays, and where there is nothing to measure."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import drjit as dr
 import footprints as fp
@@ -173,17 +172,6 @@ def test_sources_hand_over_to_the_next_one(mi_rgb):
         alone = columns(footprint.footprint(si))
         np.testing.assert_allclose(alone[:, 0], [0 if np.isnan(bad) else np.sign(bad) * LARGEST, 0])
     assert (columns(footprint.footprint(hit(mi))) == 0).all()
-
-    # The next Mitsuba's, of which the columns are the diameters
-    si = hit(mi, **given)
-    names = ("p", "n", "t", "wi", "dp_du", "dp_dv", "sh_frame", "duv_dx", "duv_dy")
-    for matrix, expected in (
-        (mi.Matrix2f([[1, 2], [3, 4]]), [[1, 2], [3, 4]]),
-        (mi.Matrix2f(0), [[0.1, -0.3], [0.2, 0]]),
-        (mi.Matrix2f(np.nan), [[0.1, -0.3], [0.2, 0]]),
-    ):
-        new = SimpleNamespace(**{name: getattr(si, name) for name in names}, footprint=matrix)
-        np.testing.assert_allclose(columns(footprint.footprint(new, cone)), expected)
 
 
 def test_finite_whatever_the_place(mi_rgb):
