@@ -30,7 +30,7 @@ WIDTH, HEIGHT, LARGEST = 384, 240, 25_000
 CAPTIONS = {
     "disney": "A still life of constant and textured materials, by the formulas.",
     "mipmap": "One sample a pixel: ``bitmap`` on the left, ``mipmap`` with ``filter`` ``anisotropic`` on the right.",
-    "neural_bsdf": "Six materials: left of each pair the source, right a file of four kilobytes.",
+    "neural_bsdf": "Twelve materials: left of each pair the source, right a file of four kilobytes.",
     "neural_disney": "The still life of the picture of ``disney``, from 384 bytes of tables.",
     "neural_field": "A captured field of 0.6 MB on a mirror, among meshes.",
     "neural_ggx": "Metals of many roughnesses, ``scenes/metals.xml``.",
@@ -53,10 +53,10 @@ SCENES = {
     "neural_ggx": ("metals", 96, ""),
     "neural_image": ("tiles", 128, ""),
     "neural_material": ("rust", 64, ""),
-    "neural_sdf": ("solids", 64, ""),
+    "neural_sdf": ("solids", 512, ""),
     "neural_texture": ("horizon", 1, ""),
     "path_footprint": ("horizon", 1, ""),
-    "path_sdf": ("solids", 64, ""),
+    "path_sdf": ("solids", 512, ""),
 }
 
 #: Depth of renders with one sample a pixel, whose error is mostly that of textures, and the column between the halves.

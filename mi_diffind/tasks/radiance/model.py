@@ -265,6 +265,15 @@ class RadianceFieldModel(Model):
         """
         return self._test_views(capture).evaluate(self.field, ssim=True)
 
+    def render_views(self, capture=None, count: int | None = None) -> list[np.ndarray]:
+        """Return pictures of the field from the test views of a capture (default: that which was fitted).
+
+        They are the first ``count`` (default: all), ``(height, width, 4)``: linear colours multiplied by alpha, and
+        alpha.
+        """
+        images = self._test_views(capture)
+        return [images.render(self.field, i) for i in range(min(count or len(images.views), len(images.views)))]
+
     def _test_views(self, capture):
         """Return the test views of a capture. Raises :class:`.TableError` if it is not there."""
         from .session import ViewImages, load_held_out
