@@ -69,7 +69,7 @@ def collect_garbage():
 
 @pytest.fixture
 def few_samples(monkeypatch):
-    """What a training measures of its result in the end is measured at fewer places than for a user."""
+    """Final measurements of a training at fewer places than for a user."""
     from mi_diffind.tasks.disney.training import DisneyModel
     from mi_diffind.tasks.ggx.training import GGXModel
     from mi_diffind.tasks.image.arrays import CompressedImage

@@ -168,54 +168,26 @@ def test_fit_is_interrupted_and_resumed(tmp_path, capsys, few_samples, monkeypat
     assert out.read_bytes() == undisturbed.read_bytes()
 
 
-def interrupted(*commands) -> tuple[list[int], str]:
-    """Run commands, each of which sends itself SIGINT while it renders its second pass; returns codes and output."""
-    command = [sys.executable, "-c", SIGINT_IN_THE_SECOND_PASS, json.dumps(commands)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
-    out, _, codes = done.stdout.rpartition("codes ")
-    return json.loads(codes), out
+def test_interrupted_renders_keep_what_they_have(mi_rgb, tmp_path, monkeypatch, capsys):
+    """Ctrl-C in the second pass of each command."""
+    render, passes = mi_rgb.render, []
 
+    def interrupting(*arguments, **options):
+        passes.append(1)
+        if len(passes) == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+        return render(*arguments, **options)
 
-SIGINT_IN_THE_SECOND_PASS = """
-import json, os, signal, sys, mi_diffind.scenes.loading as scenes
-from mi_diffind.commands.cli import main
-count = [0]
-original = scenes.mi.render
-def render(*args, **kwargs):
-    count[0] += 1
-    if count[0] == 2:
-        os.kill(os.getpid(), signal.SIGINT)
-    return original(*args, **kwargs)
-class Mi:
-    def __getattr__(self, name):
-        return render if name == "render" else getattr(module, name)
-module = scenes.mi
-scenes.mi = Mi()
-codes = []
-for arguments in json.loads(sys.argv[1]):
-    count[0] = 0
-    codes.append(main(arguments))
-print("codes", json.dumps(codes))
-"""
-
-
-def test_interrupted_renders_keep_what_they_have(tmp_path):
-    import mitsuba as mi
-
-    out, report = tmp_path / "image.exr", tmp_path / "report.json"
-    scene = scene_file(tmp_path)
-    folder = tmp_path / "pictures"
-    codes, text = interrupted(
-        ["render", scene, "-o", str(out), "--json", str(report), "--spp", "96"],
-        ["compare", scene, "--out", str(folder), "--spp", "20"],
-    )
-    assert codes == [130, 130]
-    assert "interrupted, kept 32 of 96 spp" in text
+    monkeypatch.setattr(mi_rgb, "render", interrupting)
+    out, report, folder = tmp_path / "image.exr", tmp_path / "report.json", tmp_path / "pictures"
+    scene, variant = scene_file(tmp_path), ["--variant", mi_rgb.variant()]
+    assert main(["render", scene, "-o", str(out), "--json", str(report), "--spp", "96", *variant]) == 130
+    assert "interrupted, kept 32 of 96 spp" in capsys.readouterr().out
     assert json.loads(report.read_text())["spp"] == 32
-    assert np.array(mi.Bitmap(str(out))).mean() > 0.01
-    assert "interrupted, kept 4 of 20 spp" in text
-    assert (folder / "comparison.png").exists()
+    assert np.array(mi_rgb.Bitmap(str(out))).mean() > 0.01
+    passes.clear()
+    assert main(["compare", scene, "--out", str(folder), "--spp", "20", *variant]) == 130
+    assert "interrupted, kept 4 of 20 spp" in capsys.readouterr().out and (folder / "comparison.png").exists()
 
 
 HELP = """
@@ -264,22 +236,10 @@ def test_help_is_light():
     for command, found in text.items():
         assert found.startswith(" ".join(["usage: mi-diffind", *command]) + " [-h]"), command
     assert all(f"\n    {verb} " in text[()] for verb in VERBS)
-    assert not HEAVY & modules and not [m for m in modules if m.endswith((".texture.fit", ".loading", ".loop"))]
+    training = (".texture.fit", ".loading", ".loop", ".model", ".compressed")
+    assert not HEAVY & modules and not [m for m in modules if m.endswith(training)]
     assert "--primary" in text["fit", "ggx"] and "--primary" not in text["fit", "disney"]  # those of the task only
     assert "-D NAME" in text["tradeoff", "scene"] and "-D NAME" not in text["tradeoff", "disney"]
-
-
-def test_help_lists_what_each_task_says(capsys):
-    """Titles, sections, presets and their settings; nothing is written down twice."""
-    text, _ = asked_for_help([["fit"], *(["fit", name] for name in tasks())])
-    for name, task in tasks().items():
-        line = " ".join(text["fit",].split())
-        section = f" ({task.section})" if task.section else ""
-        assert f"{name} train tables of {task.title}{section}" in line
-        own = " ".join(text["fit", name].split())
-        assert "{" + ",".join(task.presets) + "}" in own
-        for preset, settings in task.presets.items():
-            assert f"{settings.lr} for {preset}" in own or f"(default: {settings.lr})" in own
 
 
 def test_json_before_or_after_the_task(tmp_path, few_samples):
@@ -364,21 +324,12 @@ def test_bad_tasks(capsys):
         (["tradeoff", "nothing"], "mi-diffind tradeoff: error: argument STUDY: invalid choice: 'nothing'"),
         (["fit"], "mi-diffind fit: error: the following arguments are required: TASK"),
         (["fit", "disney", "-o", "t.npz", "--primary", "8"], "unrecognized arguments: --primary 8"),
+        (["fit", "ggx", "-o", "t.npz", "--primary", "1"], "--primary: found 1, allowed are 2 to 4096 entries a side"),
         (["tradeoff", "scene"], "mi-diffind tradeoff scene: error: the following arguments are required: SCENE.xml"),
     ):
         with pytest.raises(SystemExit) as caught:
             main(arguments)
         assert caught.value.code == 2 and sentence in capsys.readouterr().err
-
-
-def test_bad_sizes(tmp_path, capsys):
-    fit = ["fit", "ggx", "--steps", "2", "-o", str(tmp_path / "own.npz")]
-    for name, value in (("cascaded", "5000"), *(("primary", value) for value in ("1", "0", "-3", "many"))):
-        with pytest.raises(SystemExit) as caught:
-            main([*fit, f"--{name}={value}"])
-        sentence = f"mi-diffind fit ggx: error: argument --{name}: found {value}, allowed are 2 to 4096 entries a side"
-        assert caught.value.code == 2 and sentence in capsys.readouterr().err
-    assert os.listdir(tmp_path) == []
 
 
 def test_checkpoints_replace_nothing_else(tmp_path, capsys, few_samples):
@@ -421,7 +372,8 @@ def test_bad_output_folders(tmp_path, capsys):
         ["fit", "disney", "-o", str(tmp_path / "own.npz"), "--checkpoint", str(missing / "state.npz")],
     ):
         assert f'output folder "{missing}" does not exist' in refused(capsys, *arguments)
-    assert f'output folder "{missing / "deeper"}"' in refused(capsys, "compare", path, "--out", str(missing / "deeper"))
+    for words in (["compare", path], ["tradeoff", "disney"]):
+        assert f'output folder "{missing / "a"}"' in refused(capsys, *words, "--out", str(missing / "a"))
     assert not missing.exists()
     assert "is not a folder" in refused(capsys, "render", path, "-o", f"{path}/image.exr")
     assert "is a folder" in refused(capsys, "fit", "disney", "-o", _folder(tmp_path / "own.npz"))

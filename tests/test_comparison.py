@@ -127,7 +127,7 @@ def test_times_that_say_nothing_are_refused(written, compiled, text):
 
 @pytest.mark.parametrize("bias", [0.0, 0.1])
 def test_parts_of_an_error(rng, bias):
-    """Of known parts: noise of deviation 0.2 a pass, a bias, and a reference that is noisy itself."""
+    """Known parts: noise of deviation 0.2 a pass, a bias, and a reference that is noisy itself."""
     mean = rng.uniform(0.2, 2, (90, 80, 3))
     weight = np.mean(1 / (mean**2 + equal_time.EPSILON))
     passes = [mean + bias + rng.normal(0, 0.2, mean.shape) for _ in range(4)]

@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 
@@ -14,18 +13,14 @@ from PIL import Image
 
 from mi_diffind.core.errors import UsageError
 from mi_diffind.core.files import (
-    LONGEST_NAME,
     MOST_NAMES,
     OutputError,
     RecordedKeys,
     check_distinct,
-    irregular,
     replacing,
     same_file,
-    shown,
     unused_keys,
     unused_note,
-    writable_file,
 )
 
 #: Process that begins to write a file, says so, and waits to be killed.
@@ -134,31 +129,6 @@ def test_a_cache_that_cannot_be_made_names_its_variable(tmp_path, monkeypatch):
             conversion.cache_folder()
 
 
-def test_names_that_are_too_long(tmp_path):
-    writable_file(tmp_path / ("a" * LONGEST_NAME))
-    for name in ("a" * (LONGEST_NAME + 1), "ä" * 128):
-        with pytest.raises(OutputError, match=f"has a name of 256 bytes, at most {LONGEST_NAME} are allowed"):
-            writable_file(tmp_path / name)
-    with pytest.raises(OutputError, match="File name too long") as error:
-        writable_file(tmp_path / ("a/" * 4000) / "b")
-    assert len(str(error.value)) < 250
-    assert len(shown("a" * 500)) == 120 and shown("a" * 120) == "a" * 120
-
-
-def test_files_that_must_not_be_opened(tmp_path):
-    pipe, file = tmp_path / "pipe", tmp_path / "file"
-    os.mkfifo(pipe)
-    file.write_bytes(bytes(10))
-    assert irregular(pipe) == "is a pipe, a regular file is needed"
-    assert irregular("/dev/zero") == "is a device, a regular file is needed"
-    with socket.socket(socket.AF_UNIX) as server:
-        server.bind(str(tmp_path / "s"))
-        assert irregular(tmp_path / "s") == "is a socket, a regular file is needed"
-    assert irregular(file, 9) == "has 10 bytes, at most 9 are read"
-    assert irregular("a" * 5000) == "cannot be read (file name too long)"
-    assert irregular(file, 10) == irregular(tmp_path) == irregular(tmp_path / "no") == irregular("a\0b") == ""
-
-
 def test_one_file_by_several_names(tmp_path):
     folder, file = tmp_path / "folder", tmp_path / "folder" / "a.npz"
     folder.mkdir()
@@ -262,13 +232,6 @@ def test_keys_of_all_levels():
     for entry in read["e"]:
         assert dict(entry.items())
     assert unused_keys(read) == ["b.c", "j"]
-
-
-@pytest.mark.parametrize("copy", [lambda d: {**d}, dict, list, len, sorted, lambda d: d == {}])
-def test_copies_read_nothing(copy):
-    read = content()
-    copy(read)
-    assert unused_keys(read) == ["a", "b", "e", "j"]
 
 
 def test_the_sentence():

@@ -66,17 +66,6 @@ def test_h264_is_read_back(tmp_path, size):
 
 
 @needs_ffmpeg
-def test_the_same_frames_give_the_same_bytes(tmp_path):
-    frames = smooth_frames(5, 32, 32)
-    for name in ("a.mp4", "b.mp4"):
-        films.write(tmp_path / name, frames)
-    assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
-    films.write(tmp_path / "b.mp4", frames, quality=40)
-    assert (tmp_path / "b.mp4").stat().st_size < (tmp_path / "a.mp4").stat().st_size
-    assert sorted(os.listdir(tmp_path)) == ["a.mp4", "b.mp4"]
-
-
-@needs_ffmpeg
 def test_a_name_like_an_address_is_a_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for count, name in enumerate(("http:film.mp4", "-y.mp4"), 1):  # one frame is a film, too
@@ -90,14 +79,6 @@ def test_a_failed_encoder_leaves_nothing(tmp_path):
     with pytest.raises(OutputError, match=r'output file ".*film\.mp4" cannot be written: .+'):
         films.write(tmp_path / "film.mp4", [np.zeros((0, 0, 3), np.uint8)])
     assert not os.listdir(tmp_path)
-
-
-def test_h264_needs_an_encoder(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(UsageError, match=r"film\.mp4.*needs the package imageio-ffmpeg.*: pip install imageio-ffmpeg$"):
-        films.write(tmp_path / "film.mp4", smooth_frames(2, 8, 8))
-    assert not os.listdir(tmp_path)
-    films.write(tmp_path / "film.webp", smooth_frames(2, 8, 8))
 
 
 def test_refused_frames(tmp_path):

@@ -89,15 +89,6 @@ def test_one_object(mi_rgb):
     assert report["owner"] == "(neural_disney)" and report["learned"] and report["effects_in_use"]
 
 
-def test_a_table_file(mi_rgb):
-    inspection = mi_diffind.inspect(ASSETS / "tiles.npz")
-    assert inspection.figures["task"] == "image" and "primary" in inspection.figures["arrays"]
-    short, long = "\n".join(inspection.lines()), "\n".join(inspection.lines(verbose=True))
-    assert "PSNR albedo 45.75 dB" in " ".join(short.split()) and '<string name="filename" value="tiles.npz"/>' in short
-    assert "gathers a read" not in short and "trained with" not in short
-    assert "gathers a read" in long and "steps 1500" in long
-
-
 def test_what_is_refused(mi_rgb):
     with pytest.raises(UsageError, match="--measure needs a table file"):
         mi_diffind.inspect(scene(), measure=True)

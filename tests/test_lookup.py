@@ -13,7 +13,7 @@ from scipy.interpolate import RegularGridInterpolator
 
 from mi_diffind import DifferentiableArray
 from mi_diffind.arrays import lookup
-from mi_diffind.arrays.lookup import PART, as_words, mask_flags, mask_words, pack_bits, unpack_bits
+from mi_diffind.arrays.lookup import PART, pack_bits, unpack_bits
 from mi_diffind.core.runtime import array_module
 
 CHANNELS = (1, 2, 3, 4, 7, 12)
@@ -153,20 +153,6 @@ def test_special_coordinates(ad, dims, channels, border, storage):
     x = np.concatenate([x, np.repeat(np.float32(SPECIAL)[:, None], dims, axis=1)])
     values = read(array, ad, x)
     assert_interpolated(array, values, x, (border,) * dims)
-
-
-@pytest.mark.parametrize("storage", ["float32", "float16"])
-@pytest.mark.parametrize("dims", [1, 2, 3, 4])
-def test_ends_are_stored_values(ad, dims, storage):
-    """At exactly 0 and exactly 1, what is read are the corner entries, bit by bit; beyond them as well."""
-    table = entries(np.random.default_rng(3), RESOLUTION[:dims], 3)
-    array = DifferentiableArray.from_numpy(table, ad.TensorXf, "clamp", storage)
-    held = array.numpy()
-    for value, index in ((0.0, 0), (-0.0, 0), (-3.0, 0), (-np.inf, 0), (np.nan, 0), (1.0, -1), (9.0, -1), (np.inf, -1)):
-        np.testing.assert_array_equal(read(array, ad, [[value] * dims])[0], held[(index,) * dims], str(value))
-    wrapped = DifferentiableArray.from_numpy(table, ad.TensorXf, "repeat", storage)
-    for value in (0.0, -0.0, 1.0, -4.0, np.nan, np.inf, -np.inf, 1e30):
-        np.testing.assert_array_equal(read(wrapped, ad, [[value] * dims])[0], held[(0,) * dims], str(value))
 
 
 @pytest.mark.parametrize("storage", lookup.STORAGES)
@@ -323,23 +309,6 @@ def kernel_gathers(ad, array) -> int:
     return sum("call" in line and "gather" in line for line in code.splitlines())
 
 
-def test_gathers_that_the_kernel_makes():
-    """
-    The kernel really contains as many gathers as :func:`mi_diffind.arrays.lookup.gathers` says for bytes: a word each.
-    """
-    ad = array_module("llvm")
-    large = (600, 600)
-    for resolution, channels in (
-        *(((5, 7), c) for c in (1, 2, 3, 5, 12, 16)),
-        *((large, c) for c in (1, 2, 3, 5)),
-        ((3, 4, 5), 1),
-        ((3, 4, 5), 7),
-    ):
-        table = entries(np.random.default_rng(0), resolution, channels)
-        array = DifferentiableArray.from_numpy(table, ad.TensorXf, storage="uint8")
-        assert kernel_gathers(ad, array) == lookup.gathers(resolution, channels, "uint8"), (resolution, channels)
-
-
 # -- fewer than 8 bits an entry ----------------------------------------------------------------------------------------
 
 
@@ -416,16 +385,20 @@ def test_few_bits_take_that_memory(ad, bits):
         np.testing.assert_allclose(array.numpy(), held, rtol=1e-6, atol=1e-7)
 
 
-def test_gathers_of_few_bits_that_the_kernel_makes():
-    """A kernel has as many gathers as :func:`.gathers` says: those of pairs, no more than of single entries."""
-    ad = array_module("llvm")
-    for bits, channels, words, pair in (
-        (4, 4, 1, 2), (1, 1, 1, 2), (2, 4, 1, 2), (4, 3, 2, 2), (5, 3, 2, 2), (6, 3, 2, 3), (5, 4, 2, 3), (6, 4, 2, 3),
-        (7, 4, 2, 3), (7, 8, 3, 5),
-    ):  # fmt: skip
-        assert lookup.channels_words(channels, bits) == words, (bits, channels)
-        array, *_ = few_bits(ad, np.random.default_rng(0), (5, 7), channels, bits, "clamp")
-        assert kernel_gathers(ad, array) == 2 * pair == lookup.gathers((5, 7), channels, "uint8", bits), bits
+@pytest.mark.parametrize(
+    "resolution, bits, channels",
+    [*(((5, 7), 8, c) for c in (1, 2, 3, 5, 12, 16)), *(((600, 600), 8, c) for c in (1, 2, 3, 5)),
+     ((3, 4, 5), 8, 1), ((3, 4, 5), 8, 7),
+     *(((5, 7), *b) for b in ((4, 4), (1, 1), (2, 4), (4, 3), (5, 3), (6, 3), (5, 4), (6, 4), (7, 4), (7, 8)))],
+)  # fmt: skip
+def test_gathers_that_the_kernel_makes(resolution, bits, channels):
+    """A kernel has as many gathers as :func:`.gathers` says: a word each, a packet where an entry has more."""
+    ad, rng = array_module("llvm"), np.random.default_rng(0)
+    if bits == 8:
+        array = DifferentiableArray.from_numpy(entries(rng, resolution, channels), ad.TensorXf, storage="uint8")
+    else:
+        array, *_ = few_bits(ad, rng, resolution, channels, bits, "clamp")
+    assert kernel_gathers(ad, array) == lookup.gathers(resolution, channels, "uint8", bits)
 
 
 def test_no_entry_needs_more_words_than_are_read():
@@ -453,21 +426,3 @@ def test_bits_survive_packing(bits, count):
     np.testing.assert_array_equal(unpacked, codes)
     wider = codes | np.uint8(0xFF << bits & 0xFF)  # what lies above is left out
     np.testing.assert_array_equal(pack_bits(wider, bits), packed)
-
-
-def test_words(rng):
-    for count in (1, 4, 5):
-        packed = rng.integers(0, 256, count).astype(np.uint8)
-        for spare in (0, 1):
-            words = as_words(packed, spare)
-            assert words.dtype == np.uint32 and len(words) == -(-count // 4) + spare
-            assert words.tobytes() == packed.tobytes() + bytes(4 * len(words) - count)
-
-
-def test_masks(rng):
-    flags = rng.integers(0, 2, (5, 64)).astype(bool)
-    words = mask_words(flags)
-    assert words.dtype == np.uint32 and words.shape == (5, 2)
-    number = sum(int(flag) << k for k, flag in enumerate(flags[3]))
-    assert int(words[3, 0]) | int(words[3, 1]) << 32 == number
-    np.testing.assert_array_equal(mask_flags(words), flags)

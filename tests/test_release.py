@@ -1,4 +1,4 @@
-"""What a user without a checkout gets: the example scenes, the data of the pages, the wheel and the source archive."""
+"""The package without a checkout: the example scenes, the data of the pages, the wheel and the source archive."""
 
 import functools
 import hashlib

@@ -3,7 +3,6 @@
 import io
 import json
 import os
-import tracemalloc
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -161,14 +160,6 @@ def test_pointers():
     ):  # fmt: skip
         affine = ((1 / 255, scale), (0.0, offset))
         assert StoredArray(codes, (), *affine, bits).is_pointer == expected, (bits, scale, offset)
-
-
-def test_numpy_reads_it(saved):
-    """The format promises that ``numpy.load`` is enough, without pickle."""
-    with np.load(saved, allow_pickle=False) as data:
-        assert set(data.files) == {"meta", *SHAPES}
-        assert json.loads(data["meta"].tobytes())["format_version"] == tables.FORMAT_VERSION
-        assert data["cascaded"].shape == SHAPES["cascaded"]
 
 
 def test_same_content_gives_the_same_bytes(tmp_path, monkeypatch):
@@ -385,49 +376,6 @@ def test_an_encrypted_file(plain):
 # -- reading: sizes ----------------------------------------------------------------------------------------------------
 
 
-def header(shape, descr="<f4", length=None):
-    """The start of an ``.npy`` file that claims the given shape and holds nothing."""
-    text = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}".encode()
-    text += b" " * (length or 0)
-    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text
-
-
-def limited(path, match, **kwargs):
-    """Refused, without a byte more than a few megabytes allocated on the way."""
-    tracemalloc.start()
-    try:
-        refused(path, match, **kwargs)
-        peak = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-    assert peak < 8e6
-
-
-def test_a_header_that_claims_a_huge_shape(plain):
-    """A claimed shape beyond the content is refused, also if the description agrees with it."""
-    shape = (60000, 60000, 7)
-    members = parts(plain)
-    members["cascaded.npy"] = header(shape) + bytes(63 * 4)
-    rebuild(plain, members)
-    limited(plain, "cascaded.*expected")
-    change_meta(plain, lambda meta: meta["arrays"]["cascaded"].update(shape=shape))
-    limited(plain, "claims 100,800,000,000 bytes but the file holds")
-    change_meta(plain, lambda meta: meta["arrays"]["cascaded"].update(shape=(2**63, 2**63, 7)))
-    limited(plain, "expected")
-
-
-def test_a_compression_bomb(plain):
-    members = parts(plain)
-    with zipfile.ZipFile(plain, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-        for name, data in members.items():
-            archive.writestr(name, data)
-        with archive.open("bomb.npy", "w", force_zip64=True) as stream:
-            block = bytes(2**20)
-            for _ in range(1025):
-                stream.write(block)
-    limited(plain, "claims 1,07.* bytes of content")
-
-
 # -- reading: the arrays -----------------------------------------------------------------------------------------------
 
 
@@ -456,6 +404,9 @@ DAMAGED = {
     "missing": (lambda m: {k: v for k, v in m.items() if k != "cascaded.npy"}, '"cascaded" is missing'),
     "no description": (lambda m: {k: v for k, v in m.items() if k != "meta.npy"}, '"meta"'),
     "additional": (lambda m: {**m, "more.npy": npy(np.zeros((3, 1), np.float32))}, 'unexpected array "more"'),
+    "more than it holds": (
+        lambda m: {**m, "cascaded.npy": m["cascaded.npy"].replace(b"(3, 3, 7)", b"(9, 9, 7)")}, "cascaded",
+    ),
     "Fortran order": (
         lambda m: {**m, "cascaded.npy": npy(np.asfortranarray(np.zeros((3, 3, 7), np.float32)))}, "cascaded",
     ),

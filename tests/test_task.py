@@ -2,14 +2,10 @@
 
 import ast
 import dataclasses
-import importlib.util
-import json
 import os
 import signal
-import subprocess
 import sys
 import warnings
-from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -127,24 +123,6 @@ def test_a_name_that_is_taken(install):
     assert sum("is left out: mi_diffind.tasks has" in str(w.message) for w in caught) == 2
 
 
-LIGHT = """
-import json, sys
-import mi_diffind.fitting.task as task
-found = {name: [t.title, list(t.presets), [a.flags for a in t.arguments]] for name, t in task.tasks().items()}
-print(json.dumps(sorted(sys.modules)))
-"""
-
-
-def test_declarations_are_light():
-    """The command line asks all of them whenever it builds its parsers: no Dr.Jit, no Mitsuba, nothing that trains."""
-    done = subprocess.run([sys.executable, "-c", LIGHT], capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0, done.stderr
-    modules = set(json.loads(done.stdout))
-    assert not {"drjit", "mitsuba", "matplotlib", "tqdm", "scipy"} & modules
-    heavy = (".fit", ".fitting.loop", ".model", "texture.compressed")
-    assert not [m for m in modules if m.startswith("mi_diffind.") and m.endswith(heavy)]
-
-
 @pytest.mark.parametrize("name", BUILT_IN)
 def test_what_a_task_declares(name):
     """Enough for the help and the documentation; a file that ships for each preset that says so."""
@@ -163,14 +141,6 @@ def test_what_a_task_declares(name):
     names = [a.name for a in task.arguments]
     assert len(set(names)) == len(names) and not set(names) & {f.name for f in dataclasses.fields(FitSettings)}
     assert all(a.options.get("help") for a in (*task.arguments, *task.decode_arguments))
-
-
-def test_the_documentation_is_as_declared():
-    """The page of all tasks is made from the declarations."""
-    spec = importlib.util.spec_from_file_location("make_tables", ROOT / "docs" / "make_tables.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    assert (ROOT / "docs" / "tasks.md").read_text(encoding="utf-8") == module.page_of_tasks()
 
 
 # -- a small one ------------------------------------------------------------------------------------------------------
@@ -377,34 +347,12 @@ def test_what_can_be_asked_of_the_package():
         mi_diffind.nothing  # noqa: B018
 
 
-@pytest.fixture
-def package(tmp_path, monkeypatch):
-    """A function that makes a package ``its_package`` of modules (name → text) and of entry points (name → module)."""
-
-    def make(modules, points=()):
-        root = tmp_path / "its_package"
-        root.mkdir()
-        for name, text in {"__init__": "", **modules}.items():
-            (root / f"{name}.py").write_text(text)
-        entries = [metadata.EntryPoint(name, value, "its_package") for name, value in dict(points).items()]
-        monkeypatch.setattr(metadata, "entry_points", lambda group: entries if group == "its_package" else [])
-
-    monkeypatch.syspath_prepend(tmp_path)
-    yield make
-    for name in [n for n in sys.modules if n.split(".")[0] == "its_package"]:
-        del sys.modules[name]
-
-
-def test_modules(package):
-    package({"two": "", "one": "1 / 0", "_own": "", "shared": ""}, {"three": "theirs:THING", "two": "its_package.two"})
-    names = discovery.modules("its_package", ignored=("shared",))
-    assert names == {"one": "its_package.one", "two": "its_package.two", "three": "theirs"}
-    assert list(names) == ["one", "two", "three"] and "its_package.two" not in sys.modules
-
-
-def test_what_of_ours_is_broken_is_an_error(package):
+def test_a_broken_module_of_ours_is_an_error(tmp_path, monkeypatch):
     """Left out is only what does not claim to be one, or what is not asked for."""
-    package({"one": "THING = 1", "none": "", "broken": "1 / 0"})
+    (tmp_path / "its_package").mkdir()
+    for name, text in {"__init__": "", "one": "THING = 1", "none": "", "broken": "1 / 0"}.items():
+        (tmp_path / "its_package" / f"{name}.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
     known = {name: f"its_package.{name}" for name in ("one", "none")}
     assert discovery.load("its_package", "THING", known=known, expected=int) == {"one": 1}
     with pytest.raises(ZeroDivisionError):

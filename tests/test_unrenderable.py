@@ -89,13 +89,6 @@ def test_films_beyond_the_memory(tmp_path, capsys, monkeypatch, name):
     assert "film: found 64 x 12 pixels, which takes about 0 GiB of memory" in sentence
 
 
-def test_films_of_any_size(tmp_path, capsys):
-    """A film of 200,000 x 12 pixels fits, one of 2,000,000,000 x 12 does not, before anything is allocated."""
-    path = scene_file(tmp_path, width=2_000_000_000)
-    sentence = refused(capsys, "render", str(path), "-o", str(tmp_path / "a.exr"))
-    assert "film: found 2,000,000,000 x 12 pixels" in sentence
-
-
 @pytest.mark.parametrize("name", ["render", "orbit", "compare"])
 def test_absurd_samples(tmp_path, capsys, name):
     arguments = [*map(str, commands(scene_file(tmp_path), tmp_path)[name]), "--spp", "1000000000"]

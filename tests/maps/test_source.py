@@ -116,40 +116,25 @@ def test_exr_of_whole_numbers(tmp_path, largest):
         assert (load_source(tmp_path / "a.exr").maps[0].values == largest).all()
 
 
-def tga(array):
-    height, width, channels = array.shape
-    header = struct.pack("<3B5x4H2B", 0, 0, 2, 0, 0, width, height, 8 * channels, 0x20)
-    return header + array[..., ::-1].tobytes()
-
-
-def bmp(array, palette=b""):
-    height, width = array.shape[:2]
-    bits = 8 if palette else 24
-    rows = array[::-1] if palette else array[::-1, :, ::-1]
-    data = b"".join(row.tobytes() + bytes(-len(row.tobytes()) % 4) for row in rows)
-    start = 54 + len(palette)
-    info = struct.pack("<I2i2H6I", 40, width, height, 1, bits, 0, len(data), 0, 0, len(palette) // 4, 0)
-    return b"BM" + struct.pack("<I4xI", start + len(data), start) + info + palette + data
-
-
-@pytest.mark.parametrize("form", [tga, bmp])
-def test_tga_and_bmp(tmp_path, form):
-    array = pattern(7, 5, 3)
-    path = tmp_path / f"a.{form.__name__}"
-    path.write_bytes(form(array))
+@pytest.mark.parametrize("name", ["a.tga", "a.bmp"])
+def test_tga_and_bmp(tmp_path, name):
+    array, path = pattern(7, 5, 3), tmp_path / name
+    Image.fromarray(array).save(path)
     assert np.array_equal(np.rint(load_source(path).maps[0].values * 255), array)
-    for length in (0, 1, 17, 60, len(form(array)) - 4):
-        path.write_bytes(form(array)[:length])
+    data = path.read_bytes()
+    for length in (0, 1, 17, 60, len(data) - 40):
+        path.write_bytes(data[:length])
         with pytest.raises(SourceError, match="cannot be read as an image"):
             load_source(path)
 
 
 def test_bmp_with_a_palette(tmp_path):
-    array = pattern(7, 5, 1) // 2
-    grey = b"".join(bytes((i, i, i, 0)) for i in range(256))
-    (tmp_path / "grey.bmp").write_bytes(bmp(array, grey))
-    assert np.array_equal(np.rint(load_source(tmp_path / "grey.bmp").maps[0].values * 255), array)
-    (tmp_path / "colors.bmp").write_bytes(bmp(array, grey[::-1]))
+    array = pattern(7, 5, 1)[..., 0] // 2
+    grey = Image.fromarray(array)
+    grey.save(tmp_path / "grey.bmp")
+    assert np.array_equal(np.rint(load_source(tmp_path / "grey.bmp").maps[0].values[..., 0] * 255), array)
+    grey.putpalette(list(range(256)) * 3)
+    grey.save(tmp_path / "colors.bmp")
     with pytest.raises(SourceError, match=r"colors\.bmp: is a BMP file with a palette"):
         load_source(tmp_path / "colors.bmp")
 
@@ -352,16 +337,6 @@ def test_not_an_image(tmp_path):
         assert sentence(e).startswith(f"{path}: ")
 
 
-def test_damaged_png(tmp_path):
-    path = write(tmp_path / "a.png", pattern(50, 50, 3))
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 0x55
-    path.write_bytes(data)
-    with pytest.raises(SourceError, match="cannot be read as an image") as e:
-        load_source(path)
-    sentence(e)
-
-
 @pytest.mark.parametrize("name", ["", "a b", "1a", "a-b", "ä b"])
 def test_bad_names(tmp_path, name):
     write(tmp_path / "a.png", pattern(5, 7, 3))
@@ -511,18 +486,6 @@ def test_bad_manifests(tmp_path, content, match):
 
 
 # -- arrays -----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "extension, dtype", [("png", np.uint8), ("png", np.uint16), ("exr", np.float16), ("exr", np.float32)]
-)
-@pytest.mark.parametrize("channels", [1, 3])
-def test_arrays_are_the_same_as_files(tmp_path, extension, dtype, channels):
-    array = pattern(7, 5, channels, dtype)
-    source = load_source(write(tmp_path / f"a.{extension}", array))
-    again = from_arrays({"image": array})
-    assert described(again) == described(source) and again.digest == source.digest
-    assert again.nbytes == source.nbytes == array.nbytes
 
 
 def test_the_digest_tells_everything_apart():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mi_diffind.core.files import OutputError
-from mi_diffind.measure.store import Store, fingerprint, models_folder, sources
+from mi_diffind.measure.store import Store, fingerprint, models_folder
 
 KEY = {"settings": {"rounds": 3, "sides": (1, 2)}, "machine": "here", "limit": float("nan")}
 
@@ -85,12 +85,6 @@ def test_fingerprint(tmp_path):
     assert both == fingerprint([tmp_path / "a.py", tmp_path / "b.py"])
     (tmp_path / "a.py").write_text("3")
     assert both != fingerprint([tmp_path / "a.py", tmp_path / "b.py"])
-
-
-def test_sources():
-    names = {path.name for path in sources()}
-    assert {"neural_image.py", "lookup.py", "clock.py", "texture.py", "codecs.py"} < names
-    assert any(name.endswith(".npz") for name in names)
 
 
 def test_folder_is_emptied_for_other_sources(tmp_path):

@@ -3,26 +3,16 @@
 import drjit as dr
 import numpy as np
 import pytest
-from variants import BACKENDS
 
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting.loop import FitSettings, fit
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.measure.training import halve
-from mi_diffind.studies import disney, ggx, texture
+from mi_diffind.studies import disney, texture
 from mi_diffind.studies.baselines import distance_fields as rivals
 from mi_diffind.studies.baselines import networks
 from mi_diffind.studies.baselines.networks import Network
-from mi_diffind.tasks.ggx.model import Encoding
-from mi_diffind.tasks.ggx.training import GGXProblem
-
-GRID = {**ggx.HASH_GRID, "hashmap_size": 64}
-
-
-@pytest.fixture
-def ad():
-    return array_module(BACKENDS[0])
 
 
 def coordinates(ad, rng, n=500):
@@ -45,20 +35,6 @@ def test_network_is_what_numpy_computes(ad, rng, width, layers):
     for form in (net, net.cooperative()):
         (found,) = form(x)
         assert np.allclose(found.numpy(), y[0], atol=1e-5)
-
-
-def test_both_forms_agree(ad, rng):
-    """Tensors and cooperative vectors after a hash grid; an optimiser changes all parameters."""
-    net = Network(2, 8, 1, GRID).alloc(ad.TensorXf, 2, dr.rng(seed=2))
-    before = {key: net[key].numpy().copy() for key in net}
-    assert {"entries", "mlp.layers.0.weights", "mlp.layers.0.bias"} <= set(before)
-    problem = GGXProblem(net, ad, "tables", Encoding())
-    fit(problem, FitSettings(steps=20, batch=4096, lr=1e-2, measure_every=20), progress=False)
-    for key, values in before.items():
-        assert not np.array_equal(net[key].numpy(), values), key
-    _, x = coordinates(ad, rng)
-    found = [form(x)[0].numpy() for form in (net, net.cooperative())]
-    assert np.allclose(found[0], found[1], atol=1e-5) and np.ptp(found[0]) > 0
 
 
 def test_operations_of_products(ad):

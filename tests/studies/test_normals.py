@@ -141,7 +141,7 @@ def test_lean_is_the_mean_of_what_it_filters(types, rng, sigmas):
 
 
 def test_baked_roughness(types, rng):
-    """Of a surface that is flat it is its own, as on level 0; that of slopes is larger on coarser levels."""
+    """A flat surface keeps its roughness, as level 0 does; slopes make it larger on coarser levels."""
     flat = material(rng.normal(0, 1e-3, (16, 16, 2)), 0.42, metallic=1.0)
     pyramid, effects = prepared(flat, types)
     for level in normals.bake(pyramid, effects, 4):
@@ -150,30 +150,6 @@ def test_baked_roughness(types, rng):
     pyramid, effects = prepared(rough, types)
     means = [level.mean() for level in normals.bake(pyramid, effects, 16)]
     assert means[0] == pytest.approx(0.42, abs=1e-5) and 0.425 < means[1] < means[3] < 0.6
-
-
-def test_another_roughness_is_stored(types, rng):
-    """In place of the source's, or beside what else there is."""
-    noisy = from_arrays({"roughness": rng.random((8, 8)).astype(np.float32),
-                         "albedo": rng.random((8, 8, 3)).astype(np.float32)})  # fmt: skip
-    for source in (material(rng.normal(0, 0.2, (8, 8, 2))), noisy):
-        pyramid = Pyramid.from_source(source, types=types, border=("repeat", "repeat"))
-        levels = [np.full(level.shape[:2], 0.2 + 0.1 * i) for i, level in enumerate(pyramid.values)]
-        changed = normals.with_roughness(pyramid, levels)
-        place = lanes(types, rng.random(20), rng.random(20), 2)[:3]
-        before, after = (surface_of(p, p.filtered(*place)) for p in (pyramid, changed))
-        np.testing.assert_allclose(after.roughness.numpy(), 0.4, atol=1e-5)
-        np.testing.assert_allclose(numpy_of(after.albedo), numpy_of(before.albedo), atol=1e-5)
-
-
-def test_biases(types, rng):
-    source = material(rng.normal(0, 0.2, (16, 16, 2)))
-    pyramid, effects = prepared(source, types)
-    place, finer = (lanes(types, rng.random(50), rng.random(50), level) for level in (2, 1.5))
-    finer = (*place[:2], finer[2], *place[3:])
-    plain = reader(pyramid, effects)
-    biased = normals.biased(plain, [0, 0, -0.5, 0, 0])
-    np.testing.assert_allclose(numpy_of(biased(*place)), numpy_of(plain(*finer)), atol=1e-5)
 
 
 def test_a_bias_that_is_known_is_chosen(types, rng):

@@ -84,18 +84,6 @@ def test_bytes_are_read_as_numbers(grid, importance, entries, rng):
     assert rivals.compressed_bytes(state) < stored.nbytes <= rivals.memory_bytes(grid, entries) < stored.nbytes + 16
 
 
-def test_numbers_are_rounded_once(grid, importance):
-    """Rounding is within half a step, and rounded numbers stay."""
-    made = rivals.NodesFit(grid, importance)
-    found = numbers_of(made.state())
-    assert np.abs(found[:, 0] - np.clip(grid.density[1:], -7, 8)).max() <= 0.51 * 15 / 255
-    inner = np.abs(found[:, 1:] - grid.colour[1:]) <= 0.51 * made.step
-    assert inner.mean() > 0.99  # all but the tails
-    colour = np.vstack([np.zeros(12), found[:, 1:]]).astype(np.float32)
-    again = made.field_of({**made.net, "colour": T.TensorXf(colour)}).arrays["colour"].numpy()
-    assert np.abs(again[1:] - colour[1:]).max() < 1e-5
-
-
 def test_a_codebook_has_the_nearest_colours(grid, importance):
     made, scale = rivals.NodesFit(grid, importance, 50), np.sqrt(importance.metric)
     centres, points = made.net["colour"].numpy() * scale, grid.colour[1:] * scale

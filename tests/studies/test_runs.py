@@ -5,7 +5,6 @@ import json
 import math
 import signal
 from pathlib import Path
-from types import SimpleNamespace
 
 import captures
 import numpy as np
@@ -18,7 +17,6 @@ from mi_diffind.fitting import loop
 from mi_diffind.maps.source import from_arrays, load_source
 from mi_diffind.measure import benchmark
 from mi_diffind.studies import image, scene_training, studies
-from mi_diffind.studies.baselines import codecs
 
 ROOT = Path(__file__).resolve().parents[2]
 TRAINED = ["--steps", "2", "--pretrain-steps", "2"]
@@ -159,14 +157,6 @@ def test_bad_options(study, options, message, inputs, tmp_path, capsys):
     assert message in capsys.readouterr().err and not (tmp_path / "out" / f"tradeoff_{study}.json").exists()
 
 
-def test_missing_codecs(mi_rgb, monkeypatch):
-    monkeypatch.setattr(codecs, "available", lambda: ("jpeg", "bicubic"))
-    settings = SimpleNamespace(compressions=(12.0,), seconds=(60.0,), astc="fast")
-    plan = image.plan(from_arrays({"albedo": smooth(32, 32, 3)}), "a.png", settings)
-    assert [c.name for c in plan.candidates if c.name.startswith(("ASTC", "BC7", "WebP"))] == []
-    assert plan.notes[1].startswith("Left out: ASTC, BC7, WebP; needed: the packages astc-encoder-py, ")
-
-
 def test_errors(mi_rgb):
     reference = {"albedo": smooth(32, 32, 3), "normal": smooth(32, 32, 3, 1), "ao": smooth(32, 32, 1, 2)}
     source = from_arrays(reference)
@@ -181,12 +171,6 @@ def test_errors(mi_rgb):
     assert same["psnr_between_db"] == same["psnr_db"] == 120 and same["flip"] == 0
 
 
-def test_names_of_trainings(mi_rgb):
-    contenders = image.ImageContenders(from_arrays({"albedo": smooth(32, 32, 3)}), "a")
-    names = [job.name for job in image.trained_contenders(contenders, (12.0, 6.0), (2.0, 5.0))]
-    assert names == ["ours 12x 2 s", "ours 12x 5 s", "paper 12x 5 s", "ours 6x 2 s"]
-
-
 def test_maps_of_another_material():
     path = ROOT / "scenes" / "assets" / "rust.json"
     other = scene_training.other_maps(path)
@@ -194,12 +178,3 @@ def test_maps_of_another_material():
         values = np.round(255 * entry.values).astype(int)
         turned = values[:, ::-1].swapaxes(0, 1)
         assert np.array_equal(other[entry.name], turned if entry.name == "normal" else 255 - turned)
-
-
-def test_runs_of_a_scene():
-    """λ, 0.9 unless it is left out, and samples a pixel are changed one at a time."""
-    context = SimpleNamespace(name="room", settings=SimpleNamespace(**scene_training.FULL))
-    runs = scene_training.planned_runs(context)
-    assert len({run.name for run in runs}) == len(runs)
-    inside = [(run.details["share"], run.budget) for run in runs if run.method == "scene"]
-    assert inside == [(0.9, 1), (0.5, 1), (1.0, 1), (0.9, 4)]

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mi_diffind.core.files import OutputError
 from mi_diffind.images import metrics
 from mi_diffind.measure import bias
 from mi_diffind.scenes import loading
@@ -200,11 +199,7 @@ def test_values_that_are_not_finite_are_counted(scene, monkeypatch):
     assert "counted as 0" in "\n".join(study.summary(result))
 
 
-def test_bad_input(scene, tmp_path):
-    with pytest.raises(OutputError, match="does not exist"):
-        study.measure(scene, QUICK, tmp_path / "nowhere" / "out", progress=False)
-    with pytest.raises(SceneError, match=r"no-such\.xml: no such scene file"):
-        study.measure(tmp_path / "no-such.xml", QUICK, progress=False)
+def test_scenes_without_a_learned_plugin(mi_rgb, tmp_path):
     plain = tmp_path / "plain.xml"
     plain.write_text(SCENE.replace("MATERIAL", '<bsdf type="diffuse"/>'), encoding="utf-8")
     with pytest.raises(SceneError, match=r"plain\.xml: names no learned plugin \(neural_bsdf, neural_disney"):

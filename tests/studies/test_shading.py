@@ -5,7 +5,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-import mi_diffind
 from mi_diffind.core.errors import UsageError
 from mi_diffind.core.runtime import array_module
 from mi_diffind.maps.pyramid import Pyramid
@@ -28,11 +27,6 @@ def test_generated_materials():
         assert ("metallic" in found) == (name == "hammered")
     assert example_maps.generated_source("lacquer", 64).digest == example_maps.generated_source("lacquer", 64).digest
     assert {m.name: m.values.mean() for m in example_maps.generated_source("lacquer", 64).maps}["roughness"] < 0.35
-
-
-def test_unknown_example():
-    with pytest.raises(UsageError, match='found the material "gold", allowed are hammered, weave, lacquer'):
-        mi_diffind.example_maps("gold")
 
 
 def history(losses, values):

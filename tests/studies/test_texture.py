@@ -38,7 +38,7 @@ def directions(scene, film, x, y):
 
 
 def test_areas_of_pixels(mi_rgb):
-    """Those of the plane, by hand: uv is 1 over the width of the square."""
+    """Areas of the plane, by hand: uv is 1 over the width of the square."""
     scene = renders.still_scenes()["plane"]
     area, inside = scene.pixel_areas(FILM)
     x, y = np.meshgrid(np.arange(FILM[0] + 1) / FILM[0], np.arange(FILM[1] + 1) / FILM[1])

@@ -1,4 +1,4 @@
-"""What is compared: the measurement itself, indirection in each storage form, and a single table of as many entries."""
+"""Contenders: the measurement itself, indirection in each storage form, and a single table of as many entries."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .training import ProfileProblem, arrays, errors, exact
 
 
 def plan(source: str, quick: bool) -> Plan:
-    """What is measured in the variant that is set."""
+    """The measurements in the variant that is set."""
     types, truth = array_module(mi.variant()), measurement.read(source)
     settings = dataclasses.replace(TASK.presets["default"], steps=50 if quick else 600)
     entries = sum(SIZES["default"])

@@ -1,4 +1,4 @@
-"""What a file of tables stands for: a profile that can be read, measured and written as a file again."""
+"""The profile that a file of tables stands for: it can be read, measured and written as a file again."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ class NeuralProfile(Profile):
                 cb.put(f"tables.{name}", array.data, mi.ParamFlags.Differentiable)
 
     def report(self) -> dict:
-        """What it does, for ``mi-diffind inspect``."""
+        """The report for ``mi-diffind inspect``."""
         model = self.model
         return {"preset": model.table.preset, "storage": model.storage, "table_bytes": model.nbytes}
 

@@ -44,7 +44,7 @@ class Profile(mi.Texture):
         self.net = self.opened(props)
 
     def opened(self, props: mi.Properties):
-        """What is read at the angle over 90°, relative to the peak."""
+        """Return the intensity, relative to the peak, as a function of the angle over 90°."""
         source = str(props.get("source", ""))
         if not source:
             raise RuntimeError('parameter "source": not given, a file of angles and intensities is needed')

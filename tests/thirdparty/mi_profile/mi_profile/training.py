@@ -1,4 +1,4 @@
-"""What is trained: a 1D array of pointers into another 1D array, against the measurement at random angles."""
+"""Training of a 1D array of pointers into another 1D array, against the measurement at random angles."""
 
 from __future__ import annotations
 
