@@ -118,8 +118,12 @@ def _weighted(squared: np.ndarray, reference: np.ndarray) -> np.ndarray:
 
 def attach_samples(scene, spp: int) -> int:
     """Return the largest number of samples a pixel up to ``spp`` that a scene's sampler allows, and filter for it."""
-    sensor = scene.sensors()[0]
-    spp = next((n for n in range(max(1, spp), 0, -1) if loading.sampler_count(sensor, n) == n), 1)
+    sensor, level = scene.sensors()[0], mi.log_level()
+    mi.set_log_level(mi.LogLevel.Error)  # the sampler warns of each number that it rounds
+    try:
+        spp = next((n for n in range(max(1, spp), 0, -1) if loading.sampler_count(sensor, n) == n), 1)
+    finally:
+        mi.set_log_level(level)
     footprint.attach(scene, 0, spp)
     return spp
 
