@@ -114,17 +114,6 @@ def test_a_field_casts_the_shadow_of_its_mesh(mi_rgb, fields):
     assert (bright > 1.3 * shadowed + 0.01).sum() > 20
 
 
-def test_a_furnace(mi_rgb, fields):
-    """A white ball, and a mirror, in a thin field of radiance 1, under a sky of 1."""
-    ball = {"type": "sphere", "radius": 0.6, "bsdf": {"type": "diffuse", "reflectance": 1.0}}
-    mirror = {"type": "sphere", "radius": 0.2, "center": [0.6, -0.7, 0.3], "bsdf": {"type": "conductor"}}
-    sky = {"type": "constant"}
-    made = scene(mi_rgb, field("white", rr_depth=1000, max_depth=32), ball=ball, mirror=mirror, sky=sky)
-    image = images(mi_rgb, made, 64, 1)[0, ..., :3]
-    assert np.abs(image - 1).max() < 0.4 and abs(image.mean() - 1) < 2e-3
-    assert abs(image[8:16, 12:20].mean() - 1) < 5e-3
-
-
 def test_light_and_alpha_through_holes(mi_rgb, fields):
     """The expectation over the holes of what is seen without the leaf; nothing is hidden with the lights."""
     mi = mi_rgb

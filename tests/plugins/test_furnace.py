@@ -96,17 +96,6 @@ def test_glass_seen_from_within(mi_rgb, shapes):
         assert np.abs(image / (1.5046 / 1.000277) ** 2 - 1).max() < 1e-4  # bk7 in air
 
 
-def test_limited_depth_loses_light_as_flat_triangles_do(mi_rgb, shapes):
-    """Light that is totally reflected within a ball that is not quite round stays for long, in a mesh as in a field."""
-    mi = mi_rgb
-    flat = {**shapes["mesh"], "face_normals": True}
-    lost = {
-        name: 1 - furnace(mi, shape, "glass", spp=32, max_depth=16).mean()
-        for name, shape in {"field": shapes["field"], "flat": flat}.items()
-    }
-    assert 0 < lost["field"] < lost["flat"] < 5e-3
-
-
 def test_origins_of_rays_keep_what_single_precision_rounds_off(mi_rgb, shapes, rng):
     from mi_diffind.plugins.support import distance_shapes
 

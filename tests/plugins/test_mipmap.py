@@ -119,9 +119,6 @@ def test_random_numbers(mi_rgb, rng):
         np.testing.assert_array_equal(again, a)
 
 
-# -- hard cases --------------------------------------------------------------------------------------------------------
-
-
 # -- gradients ---------------------------------------------------------------------------------------------------------
 
 
@@ -181,35 +178,6 @@ def test_texels_of_other_textures_stay(mi_rgb, file, rng):
     np.testing.assert_array_equal(one.eval(si).numpy(), constant.eval(si).numpy())
     np.testing.assert_array_equal(other.eval(si).numpy(), before)
     assert np.abs(one.eval(si).numpy() - before).max() > 0.1
-
-
-@pytest.mark.parametrize("name", ["trilinear", "anisotropic", "off"])
-def test_gradients_reach_the_texels(mi_rgb, file, rng, name):
-    """From all levels: the texture is linear in its texels, so a gradient times the texels is the sum of its values."""
-    mi = mi_rgb
-    uv, (ddx, ddy) = rng.random((2, 200)), texture_scenes.footprints(rng, 200, SIZE, 5)
-    si = texture_scenes.hits(mi, uv, ddx, ddy)
-    texture = mi.load_dict(plugin(file, name))
-    params = mi.traverse(texture)
-    dr.enable_grad(params["data"])
-    params.update()
-    weight = mi.Color3f(*(mi.Float(aligned(x.astype(np.float32))) for x in rng.random((3, 200))))
-    total = dr.sum(dr.dot(weight, texture.eval(si)))
-    dr.backward(total)
-    gradient, values = dr.grad(params["data"]).numpy(), params["data"].numpy().copy()
-    assert (gradient * values).sum(dtype=np.float64) == pytest.approx(total.array[0], rel=1e-5)
-    for _ in range(3):
-        change = rng.normal(size=values.shape).astype(np.float32)
-        changed(mi, texture, values + change)
-        step = dr.sum(dr.dot(weight, texture.eval(si))).array[0] - total.array[0]
-        assert step == pytest.approx((gradient * change).sum(dtype=np.float64), rel=1e-3, abs=1e-2)
-    if name == "off":
-        theirs = mi.load_dict({"type": "bitmap", "filename": file, "format": "variant"})
-        params = mi.traverse(theirs)
-        dr.enable_grad(params["data"])
-        params.update()
-        dr.backward(dr.sum(dr.dot(weight, theirs.eval(si))))
-        np.testing.assert_allclose(gradient, dr.grad(params["data"]).numpy(), atol=1e-4)
 
 
 def test_slope_of_a_filtered_texture(mi_rgb, rng):

@@ -47,7 +47,9 @@ def test_values_of_families(mi_rgb, files, rng):
     """``eval`` is the formula of the member times the cosine; the default is the middle of the range."""
     mi, ctx = mi_rgb, mi_rgb.BSDFContext()
     wi, wo = random_directions(rng, 500, 0.05), random_directions(rng, 500, 0.05)
-    for given, expected in (({"roughness": 0.1, "metallic": 0.25}, (0.1, 0.25)), ({}, (0.2, 0.5))):
+    members = [(0.05, 0.0), (0.8, 1.0), (0.13, 0.4), (0.5, 0.9)]
+    cases = [({"roughness": roughness, "metallic": metallic}, (roughness, metallic)) for roughness, metallic in members]
+    for given, expected in (*cases, ({}, (0.2, 0.5))):
         bsdf = mi.load_dict({"type": "neural_bsdf", "filename": files["family"], **given})
         value = numpy_of(bsdf.eval(ctx, interactions(mi, wi), vectors(mi, wo)))
         truth = wo[:, 2:] * formula(member(load_table(files["family"]), *expected), wi.astype(float), wo.astype(float))

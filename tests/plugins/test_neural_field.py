@@ -332,18 +332,6 @@ def test_solids_of_path_sdf(mi_rgb, fields):
     assert (np.abs(image - expected).max(-1) < 2e-3).mean() > 0.995
 
 
-@pytest.mark.parametrize("inner", ["path", "volpath", "prb_projective"])
-def test_inner_integrators(mi_rgb, fields, inner):
-    things = {**surfaces(mi_rgb), "glass": mirror(mi_rgb, {"type": "conductor"})}
-    expected, found = (
-        render(mi_rgb, scene(mi_rgb, integrator={"c": {"type": name, "max_depth": 2}}, **things), 256)
-        for name in ("path_footprint", inner)
-    )
-    middle = slice(1, -1), slice(1, -1)
-    assert np.abs(found - expected)[middle].mean() < 0.02
-    assert np.abs(found.mean((0, 1)) / expected.mean((0, 1)) - 1).max() < 0.02
-
-
 def test_rays_of_the_inner_integrator(mi_rgb, fields):
     """Rays that end in the field are not traced further; differentials go with rays, also over mirrors."""
     mi = mi_rgb

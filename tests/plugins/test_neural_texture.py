@@ -106,28 +106,6 @@ def test_off_is_level_0_and_costs_no_footprint(mi_rgb, files, rng, preset):
     assert reads["off"].instructions < reads["trilinear"].instructions - 100
 
 
-@pytest.mark.parametrize("name", ["trilinear", "anisotropic"])
-def test_a_level_bias_reads_as_a_smaller_footprint(mi_rgb, files, tmp_path, rng, name):
-    """One level finer: a footprint of half the side, in colours, gradients, and images that are not repeated."""
-    mi = mi_rgb
-    biased = make(tmp_path / "biased.npz", from_arrays(material(WIDTH, HEIGHT)), level_bias=-1.0)
-    uv, (ddx, ddy) = rng.random((2, 200)), (8 * x for x in texture_scenes.footprints(rng, 200, SIZE))
-    si = texture_scenes.hits(mi, uv, ddx, ddy)
-    for more in ({}, {"wrap_mode": "clamp"}):
-        texture, plain = (mi.load_dict(plugin(f, name, "roughness", **more)) for f in (biased, files["ours"]))
-        if name == "anisotropic":  # the taps stay where they are
-            plain._filtered = lambda uv, level, read=plain._filtered: read(uv, level - 1)
-            smaller = si
-        else:
-            smaller = texture_scenes.hits(mi, uv, ddx / 2, ddy / 2)
-        found, expected = texture.eval_1(si).numpy(), plain.eval_1(smaller).numpy()
-        np.testing.assert_allclose(found, expected, atol=1e-5)
-        assert np.abs(found - plain.eval_1(texture_scenes.hits(mi, uv, 2 * ddx, 2 * ddy)).numpy()).max() > 0.01
-        if name == "trilinear":
-            slopes = texture.eval_1_grad(si).numpy(), plain.eval_1_grad(smaller).numpy()
-            np.testing.assert_allclose(*slopes, atol=1e-3)
-
-
 # -- hard cases --------------------------------------------------------------------------------------------------------
 
 

@@ -93,14 +93,6 @@ def test_the_structure_follows_the_image():
         assert STRUCTURES[chosen][1] is None
 
 
-@pytest.mark.parametrize("dims, side", [(4, 6), (3, 11), (2, 30), (1, 200)])
-def test_sizes_with_a_given_side(dims, side):
-    size = fit.sized(noise(64, 64), 8000, dataclasses.replace(OURS, dims=dims, structure="5 bits"), side)
-    assert (size.cascaded, size.dims, size.bits) == (side, dims, 5)
-    more = dataclasses.replace(size, rows=size.rows + 1, columns=size.columns + 1)
-    assert size.nbytes <= 8000 and (size.full or more.nbytes > 8000)
-
-
 # ---------------------- By short trainings ----------------------
 
 

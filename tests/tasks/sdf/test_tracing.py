@@ -195,23 +195,6 @@ def test_signs_beyond_slabs(coded, rng):
     assert above.mean() > 0.1 and below.any()
 
 
-def test_slabs_keep_the_signs_of_other_cells(coded, rng):
-    """Cells that are not crossed have the sign that they are said to have, whatever the block's plane says."""
-    cells = marching.GridCells(coded)
-    crossed, inside = cells.crossed, cells.inside
-    cell = np.argmax(~crossed, axis=1)
-    block = np.flatnonzero(crossed.any(axis=1) & ~crossed.all(axis=1))
-    cell = cell[block]
-    inside[block, cell] = rng.random(len(block)) < 0.5
-    low, high = bounds(marching.slab_words(cells, coded.decoded(), coded.frames())[block])
-    normals, middles = (v[block] for v in planes(coded))
-    place = np.stack([cell // 16, cell // 4 % 4, cell % 4], axis=1) + rng.random((len(block), 3))
-    height = middles + np.sum(normals * (place - MIDDLE), axis=1)
-    within = inside[block, cell]
-    assert (height <= high)[within].all() and (height >= low)[~within].all()
-    assert 10 < within.sum() < len(block) - 10
-
-
 def test_slabs_change_no_hit(types, coded, rng):
     """Rays from far away, from within the box and from within the solid meet what they meet without slabs."""
     d = unit(rng.normal(size=(3 * COUNT, 3)))

@@ -147,22 +147,6 @@ def test_shaded_is_mitsubas_normalmap(mi_rgb, rng):
     assert not np.allclose(numpy_of(flat), expected, rtol=0.1, atol=0.1)
 
 
-def test_effects_follow_the_maps(ad):
-    def effects(**changed):
-        maps = {k: v for k, v in {**bumpy(8), **changed}.items() if v is not None}
-        return material.material_effects(pyramid_of(maps, ad)[1].layout)
-
-    found, reasons = effects()
-    assert not found.diffuse and found.metal and not found.dielectric and reasons["diffuse"] == "metallic is 1"
-    found, reasons = effects(metallic=None)
-    assert found.diffuse and not found.metal and found.lobes == ("diffuse", "specular")
-    assert reasons["metal"] == "metallic is 0"
-    grey = np.repeat(bumpy(8)["roughness"], 3, axis=2)
-    assert effects(albedo=grey, metallic=None)[0] == found
-    extra = pyramid_of({**bumpy(8), "ao": bumpy(8)["roughness"]}, ad)[1].layout
-    assert list(material.left_out(extra)) == ["ao"]
-
-
 def test_extreme_materials_stay_finite(ad, rng):
     """Roughness 0, black, short and vanishing normals, directions at the horizon: values and derivatives."""
     n = 4096

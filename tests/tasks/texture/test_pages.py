@@ -105,15 +105,6 @@ def test_levels_are_continuous_and_any_is_allowed(table):
     np.testing.assert_array_equal(read(-3), read(0))
 
 
-def test_files_come_back(table, tmp_path):
-    save_table(tmp_path / "t.npz", table)
-    found = TASK.load(tmp_path / "t.npz")
-    assert found.nbytes == table.nbytes <= 3000
-    assert set(found.arrays) == {"level0", "level0_pages", "level2", "level2_pages", "coarse", "cascaded"}
-    for name, array in table.arrays.items():
-        np.testing.assert_array_equal(found.arrays[name].entries, array.entries)
-
-
 @pytest.mark.parametrize(
     "change, message",
     [
