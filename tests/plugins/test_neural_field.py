@@ -571,17 +571,6 @@ def test_derivatives_of_spectra():
 # -- as an object of Mitsuba -------------------------------------------------------------------------------------------
 
 
-def test_parameters(mi_rgb, fields):
-    mi = mi_rgb
-    made = scene(mi, "fog")
-    params = mi.traverse(made)
-    assert {"it.tables.density", "it.tables.colour"} <= set(params.keys())
-    params["it.tables.density"] = mi.TensorXf(np.float32([0.0]))
-    params.update()
-    assert np.abs(render(mi, made)).max() == 0
-    assert "NeuralField[" in str(made.integrator()) and "PathFootprint" in str(made.integrator())
-
-
 def test_frozen_light_of_a_field(mi_rgb, fields, no_garbage_collection):
     """A recorded render sees other arrays and seeds; see also ``test_frozen.py``."""
     mi = mi_rgb

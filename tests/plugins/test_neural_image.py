@@ -4,6 +4,7 @@ import functools
 import itertools
 import json
 import os
+import re
 from dataclasses import replace
 
 import drjit as dr
@@ -15,7 +16,6 @@ from texture_scenes import hits, refused, scene_xml
 from variants import VARIANTS, set_variant, warnings_of
 
 from mi_diffind.arrays.tables import StoredArray, Table, load_table, save_table
-from mi_diffind.core import compat
 from mi_diffind.maps.layout import Layout, MapLayout
 from mi_diffind.maps.source import load_source
 from mi_diffind.scenes import comparison, loading
@@ -43,7 +43,6 @@ LAYOUT = Layout(WIDTH, HEIGHT, MAPS, (0.5,) * 7, ("albedo",) * 3 + ("normal",) *
 ROUNDING = 1e-4
 
 USABLE = tuple(m.name for m in MAPS if m.channels != 2)
-WRAP_MODES = ("repeat", "mirror", "clamp")
 METHODS = ("eval", "eval_1", "eval_3", "eval_1_grad")
 
 #: Each colour mode once, polarised in one of them: a texture returns no Mueller matrix in any.
@@ -215,7 +214,7 @@ def test_gradient_of_the_image(mi_rgb, file, rng):
 
 
 def test_upsampling_is_mitsubas(rng):
-    """The same spectra as from Mitsuba's coefficients, for all colours, with gradients that are their differences."""
+    """The same spectra as from Mitsuba's coefficients, for all colours."""
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_spectral")
@@ -228,7 +227,6 @@ def test_upsampling_is_mitsubas(rng):
     colours = np.concatenate([colours, np.transpose(special)], axis=1).astype(np.float32)
     wavelengths = np.float32([380, 470, 560, 700])
     rgb = [mi.Float(aligned(c)) for c in colours]
-    dr.enable_grad(rgb)
     found = textures.upsampled_spectrum(rgb, mi.UnpolarizedSpectrum(*[float(w) for w in wavelengths]))
     expected = []
     for c in colours.T:
@@ -237,21 +235,6 @@ def test_upsampling_is_mitsubas(rng):
         expected.append(0.5 + 0.5 * x / np.sqrt(1 + x * x))
     error = np.abs(found.numpy() - np.transpose(expected))
     assert error.max() < 2e-3 and error.mean() < 1e-5  # 0 and 1 are 1/8192 off in theirs
-
-    dr.backward(sum(dr.sum(channel) for channel in found))
-    for k in range(3):
-        gradient = rgb[k].grad.numpy()
-        assert np.isfinite(gradient).all()
-        step, values = 1e-3, []
-        for sign in (-1, 1):
-            moved = [mi.Float(aligned(c + (sign * step if i == k else 0))) for i, c in enumerate(colours)]
-            values.append(
-                sum(textures.upsampled_spectrum(moved, mi.UnpolarizedSpectrum(*wavelengths.tolist())).numpy())
-            )
-        difference = (values[1] - values[0]) / (2 * step)
-        inside = (colours[:, :n].min(axis=0) > 0.1) & (colours[:, :n].max(axis=0) < 0.95)
-        error = np.abs(gradient - difference)[:n][inside]
-        assert np.median(error) < 0.02 * np.abs(difference[:n][inside]).mean()
 
 
 # -- in materials ------------------------------------------------------------------------------------------------------
@@ -370,7 +353,6 @@ def test_exact_counterpart(variant, material):
 def test_exact_counterpart_without_a_source(mi_rgb, material, tmp_path):
     folder, _, _ = material
     table = load_table(folder / "wall.npz")
-    cases = []
     for recorded, given, expected in (
         (None, None, 'does not record its original image, give it as the parameter "source"'),
         ("gone.png", None, "gone.png: no such file"),
@@ -378,18 +360,13 @@ def test_exact_counterpart_without_a_source(mi_rgb, material, tmp_path):
         (None, str(folder / "orm.png"), 'has 3 channel(s), the map "roughness" has 1'),
     ):
         table.settings.pop("source_path", None)
-        if recorded:
-            table.settings["source_path"] = recorded
+        table.settings |= {"source_path": recorded} if recorded else {}
         save_table(tmp_path / "wall.npz", table)
-        more = {} if given is None else {"source": given}
-        xml = texture_xml("alpha", "wall.npz", channels="roughness", **more)
+        xml = texture_xml("alpha", "wall.npz", channels="roughness", **({"source": given} if given else {}))
         (tmp_path / "s.xml").write_text(wall_xml("roughconductor", xml))
         loading.load(tmp_path / "s.xml")  # as written it needs none
-        with pytest.raises(loading.SceneError) as e:
+        with pytest.raises(loading.SceneError, match=re.escape(expected)):
             loading.load(tmp_path / "s.xml", exact=True)
-        cases.append((expected, compat.one_sentence(e.value)))
-    for expected, found in cases:
-        assert expected in found
 
 
 def test_exact_counterpart_elsewhere(mi_rgb, material, tmp_path):

@@ -276,8 +276,6 @@ def test_report_and_text(mi_rgb, files):
         ("metal", {"sheen": {"type": "checkerboard"}}, 'parameter "sheen": found a texture, allowed are numbers'),
         ("metal", {"lobes": "paper"}, 'parameter "lobes": found "paper", allowed are exact, tables'),
         ("metal", {"two_sided": 1}, 'parameter "two_sided": found 1, allowed are true and false'),
-        ("metal", {"channels": "albedo"}, '"channels"'),
-        ("metal", {"filename": "no.npz"}, "no.npz: no such file"),
     ],
 )
 def test_refusals(mi_rgb, files, name, parameters, sentence):

@@ -80,19 +80,12 @@ def test_counterparts_of_images_with_names(mi_rgb, tmp_path, rng, name):
 
 
 @pytest.mark.parametrize("preset", ["ours", "paper"])
-def test_off_is_level_0_and_costs_no_footprint(mi_rgb, files, rng, preset):
+def test_off_costs_no_footprint(mi_rgb, files, rng, preset):
     """The arrays of coarser levels and of the footprint are not read."""
     mi = mi_rgb
     uv, (ddx, ddy) = rng.random((2, 200)), texture_scenes.footprints(rng, 200, SIZE)
     image, textures = opened(mi, files[preset]), {n: mi.load_dict(plugin(files[preset], n)) for n in FILTERS}
-    stored = image.stored(*floats(mi, *uv))
-    truth = linear(numpy_of(image.maps(stored, ["albedo"])["albedo"]).T)
-    si, magnified = texture_scenes.hits(mi, uv, ddx, ddy), texture_scenes.hits(mi, uv)
-    np.testing.assert_allclose(textures["off"].eval(si).numpy(), truth, atol=1e-4)
-    found = {n: textures[n].eval(magnified) for n in ("trilinear", "anisotropic", "stochastic")}
-    dr.eval(found)
-    for value in found.values():  # and all are that where nothing is minified
-        np.testing.assert_allclose(value.numpy(), truth, atol=3e-3 if preset == "paper" else 3e-4)
+    si = texture_scenes.hits(mi, uv, ddx, ddy)
     reads = {name: count(lambda t=t: t.eval(si)) for name, t in textures.items()}
     u, v = floats(mi, *uv)
     dr.make_opaque(u, v)

@@ -97,17 +97,14 @@ def test_packed_and_trainable_fields_agree(folder, ad, rng):
     np.testing.assert_allclose(read[0], read[1], rtol=2e-3, atol=2e-3 * read[1][0].max() * 1e-2)
 
 
-def test_bytes_are_kept(folder, tmp_path):
-    for nbytes in (24_000, 40_000):
-        assert run(folder, tmp_path / "f.npz", "--bytes", nbytes, "--steps", 4, "--json", tmp_path / "f.json") == 0
-        assert json.loads((tmp_path / "f.json").read_text())["memory_bytes"] <= nbytes
-
-
-def test_bytes_of_the_file_are_kept(folder, tmp_path):
+@pytest.mark.parametrize("option, limits", [("--bytes", (24_000, 40_000)), ("--disk", (5_000, 9_000))])
+def test_bytes_are_kept(folder, tmp_path, option, limits):
+    """Bytes in memory, or of the file, which more are allowed for."""
     sizes, out = [], tmp_path / "f.npz"
-    for nbytes in (5_000, 9_000):
-        assert run(folder, out, "--disk", nbytes, "--steps", 4) == 0
-        sizes.append(out.stat().st_size)
+    for nbytes in limits:
+        assert run(folder, out, option, nbytes, "--steps", 4, "--json", tmp_path / "f.json") == 0
+        figures = json.loads((tmp_path / "f.json").read_text())
+        sizes.append(out.stat().st_size if option == "--disk" else figures["memory_bytes"])
         assert sizes[-1] <= nbytes
     assert sizes[1] > 1.2 * sizes[0]
 
@@ -439,17 +436,6 @@ def test_views_without_alpha(tmp_path, capsys):
     captures.change(tmp_path, aabb=[[-0.6, -0.8, -0.8], [1, 0.8, 0.8]])
     assert run(tmp_path, tmp_path / "x.npz", "--steps", 5) == 0
     assert "no alpha" in capsys.readouterr().err
-
-
-def test_sizes(folder, ad, monkeypatch):
-    monkeypatch.setattr(compression, "SLOPE", 0.0)  # so that all colours are used
-    grid = files.grid_of(files.load(folder / "grid.npz"), ad)
-    session = FieldSession.load(ad, folder)
-    weights = compression.importance(grid, session, 0)
-    for bits in (6, 8):
-        problem = compression.PaletteProblem(compression.palette_coding(grid, weights, None, bits, 0), session)
-        table = files.palette_table(grid.nodes, problem.numbers())
-        assert files.field_of(table, ad).nbytes == pytest.approx(compression.packed_bytes(grid, bits), rel=0.01)
 
 
 def test_the_layout_of_before(folder, tmp_path, ad):

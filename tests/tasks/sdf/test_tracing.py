@@ -180,21 +180,6 @@ def coded(types, request):
     return model.build_field(table_of(*request.param), {}, types)
 
 
-def test_signs_beyond_slabs(coded, rng):
-    """Above a block's slab everything is outside, below it inside; and slabs are thin where blocks are well coded."""
-    structure, marcher = coded.structure, marching.get_marcher(coded)
-    full = marching.GridCells(coded).crossed.any(axis=1)
-    (low, high), (normals, middles) = bounds(np.array(marcher.slabs)[1::2]), planes(coded)
-    block = rng.choice(np.flatnonzero(full), 50 * COUNT)
-    place = rng.uniform(0, 4, (len(block), 3))
-    p = np.array(structure.lower) + structure.spacing * (structure.block_positions()[block] + place)
-    inside = grids.point_values(coded, p) < 0
-    height = middles[block] + np.sum(normals[block] * (place - MIDDLE), axis=1)
-    above, below = height > high[block], height < low[block]
-    assert not inside[above].any() and inside[below].all()
-    assert above.mean() > 0.1 and below.any()
-
-
 def test_slabs_change_no_hit(types, coded, rng):
     """Rays from far away, from within the box and from within the solid meet what they meet without slabs."""
     d = unit(rng.normal(size=(3 * COUNT, 3)))
