@@ -13,7 +13,7 @@ import pytest
 from arrays import aligned
 from scipy.ndimage import map_coordinates
 from texture_scenes import hits, refused, scene_xml
-from variants import VARIANTS, set_variant, warnings_of
+from variants import VARIANTS, set_variant
 
 from mi_diffind.arrays.tables import StoredArray, Table, load_table, save_table
 from mi_diffind.maps.layout import Layout, MapLayout
@@ -253,28 +253,6 @@ def test_maps_of_other_places_are_not_confused(mi_rgb, file, rng):
 
 
 # -- files -------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("variant", RENDERED)
-def test_no_arrays(variant, tmp_path, rng, monkeypatch):
-    """An image of one colour is a few numbers, none of which can be optimised."""
-    mi = set_variant(variant)
-    warned = warnings_of(mi, monkeypatch)
-    one = MapLayout("image", "albedo", "srgb", 1, (("constant", 0.5), ("constant", 0.2), ("constant", 0.7)))
-    path = make(tmp_path / "a.npz", Layout(WIDTH, HEIGHT, (one,), (), ()))
-    theirs = mi.load_dict(counterpart(mi, path, "image"))
-    si = hits(mi, rng.random((2, 30)))
-    expected = values_of({"": theirs}, si)
-    for storage in ("uint8", "float32"):
-        texture = mi.load_dict({"type": "neural_image", "filename": path, "storage": storage})
-        for key, a in values_of({"": texture}, si).items():
-            b = expected[key]
-            assert (a is None) == (b is None)
-            if a is not None:
-                np.testing.assert_allclose(np.broadcast_to(a, b.shape), b, atol=2e-5)
-        assert not texture.is_spatially_varying()
-        assert (storage == "float32") == any("a.npz is of one colour: it has no arrays" in text for text in warned)
-        assert float(texture.mean()[0]) == pytest.approx(float(theirs.mean()[0]), abs=1e-5)
 
 
 def test_several_maps_and_none_named(mi_rgb, tmp_path):

@@ -10,14 +10,12 @@ from arrays import aligned, numpy_of
 from texture_files import make, material
 from texture_scenes import linear
 
-from mi_diffind.arrays.tables import load_table, save_table
-from mi_diffind.maps.layout import Layout
+from mi_diffind.arrays.tables import load_table
 from mi_diffind.maps.source import from_arrays, load_source
 from mi_diffind.measure.clock import bsdf_operations, count
 from mi_diffind.plugins.support import footprint
 from mi_diffind.scenes import loading
 from mi_diffind.tasks.texture import TASK
-from mi_diffind.tasks.texture.compressed import CompressedTexture, to_table
 
 SIZE = WIDTH, HEIGHT = 32, 16
 
@@ -100,19 +98,6 @@ def test_off_costs_no_footprint(mi_rgb, files, rng, preset):
 
 
 # -- hard cases --------------------------------------------------------------------------------------------------------
-
-
-def test_no_arrays(mi_rgb, tmp_path):
-    """A texture of one colour is a few numbers, and has no footprint."""
-    mi = mi_rgb
-    source = from_arrays({"albedo": np.full((4, 8, 3), 128, np.uint8)})
-    layout = Layout.from_source(source, filtered=True)
-    save_table(tmp_path / "a.npz", to_table(CompressedTexture(layout, None), {}))
-    for name in FILTERS:
-        texture = mi.load_dict(plugin(str(tmp_path / "a.npz"), name))
-        si = texture_scenes.hits(mi, [[0.3], [0.6]], (0.1, 0), (0, 0.1))
-        np.testing.assert_allclose(texture.eval(si).numpy().ravel(), linear(128 / 255), atol=1e-4)
-        assert texture.report()["footprint"] == [] and not texture.is_spatially_varying()
 
 
 # -- in scenes ---------------------------------------------------------------------------------------------------------

@@ -16,14 +16,17 @@ import trust_properties as trust
 from arrays import aligned, numpy_of
 from texture_files import make, make_image, material
 from texture_scenes import WRONG, alive, check_process, footprints, hits, isotropic, linear, plane, refused
-from variants import VARIANTS, set_variant
+from variants import VARIANTS, set_variant, warnings_of
 
 from mi_diffind import plugins
 from mi_diffind.arrays.tables import load_table, save_table
 from mi_diffind.fitting.task import find_task
 from mi_diffind.maps import pyramid
+from mi_diffind.maps.layout import Layout
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.tasks.ggx import TASK as GGX
+from mi_diffind.tasks.image import arrays as image_arrays
+from mi_diffind.tasks.texture import compressed
 
 SIZE = WIDTH, HEIGHT = 12, 10
 TEXTURES = ("mipmap", "neural_image", "neural_texture")
@@ -37,6 +40,12 @@ PARAMETERS = {"albedo": "base_color", "normal": "normal", "roughness": "roughnes
 
 #: Reads of bytes may be 1/64 of a step off; half precision of a third component that is derived.
 ROUNDING = 5e-4
+
+#: Texture → class and function that make a table without arrays.
+EMPTY = {
+    "neural_image": (image_arrays.CompressedImage, image_arrays.to_table),
+    "neural_texture": (compressed.CompressedTexture, compressed.to_table),
+}
 
 #: Each colour mode once.
 RENDERED = [v for v in VARIANTS if v.endswith(("ad_rgb", "ad_mono", "ad_spectral_polarized"))]
@@ -313,6 +322,27 @@ def test_odd_sizes(mi_rgb, tmp_path, rng, name, shape):
         image_of = decoded(mi, files, name)["albedo"] if name != "mipmap" else image / np.float32(255)
         assert found.min() >= linear(image_of).min() - 0.06 and found.max() <= linear(image_of).max() + 0.06
         np.testing.assert_allclose(found[1], linear(77 / 255), rtol=1e-5)
+
+
+@pytest.mark.parametrize("variant", RENDERED)
+@pytest.mark.parametrize("name", TEXTURES[1:])
+def test_no_arrays(variant, tmp_path, rng, monkeypatch, name):
+    """A file of one colour is a few numbers, none of which can be optimised, and has no footprint."""
+    mi, colour = set_variant(variant), np.uint8([128, 51, 179])
+    warned, files = warnings_of(mi, monkeypatch), {name: str(tmp_path / "a.npz")}
+    source = from_arrays({"albedo": np.full((4, 8, 3), colour)})
+    maps, to_table = EMPTY[name]
+    layout = Layout.from_source(source, filtered=name == "neural_texture")
+    save_table(files[name], to_table(maps(layout, None), {}))
+    np.testing.assert_allclose(decoded(mi, files, name)["albedo"][0, 0], colour / 255, atol=1e-6)
+    si, theirs = hits(mi, rng.random((2, 30))), mi.load_dict(bitmap(mi, files, name))
+    for storage, filtering in itertools.product(("uint8", "float32"), FILTERS if name in FILTERED else ("",)):
+        ours = mi.load_dict(plugin(files, name, storage=storage, **({"filter": filtering} if filtering else {})))
+        truth = theirs.eval(si).numpy()
+        np.testing.assert_allclose(np.broadcast_to(ours.eval(si).numpy(), truth.shape), truth, atol=1e-4)
+        assert not ours.is_spatially_varying() and ours.report().get("footprint", []) == []
+        assert float(ours.mean()[0]) == pytest.approx(float(theirs.mean()[0]), abs=1e-5)
+        assert (storage == "float32") == any("a.npz is of one colour: it has no arrays" in text for text in warned)
 
 
 # ---------------------- Derivatives ----------------------

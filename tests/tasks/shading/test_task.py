@@ -10,7 +10,7 @@ import time
 import drjit as dr
 import numpy as np
 import pytest
-from arrays import numpy_of
+from arrays import aligned, numpy_of
 
 import mi_diffind
 from mi_diffind.arrays.tables import TableError, load_table, save_table
@@ -62,6 +62,12 @@ def pyramid_of(maps, ad):
 def directions(ad, rng, n):
     u = [ad.Float(x) for x in rng.random((4, n), dtype=np.float32)]
     return uniform_hemisphere(ad, u[0], u[1]), uniform_hemisphere(ad, u[2], u[3])
+
+
+def shading_surface(ad, *maps):
+    """Parameters of a surface by its albedo, normal, roughness and metallic, ``(n, channels)`` each."""
+    albedo, normal, rough, metal = ([ad.Float(aligned(c)) for c in v.T] for v in maps)
+    return material.SurfaceParameters(ad.Array3f(albedo), ad.Array3f(normal), *rough, *metal)
 
 
 # -- limited derivatives ----------------------------------------------------------------------------------------------
@@ -130,13 +136,7 @@ def test_shaded_is_mitsubas_normalmap(mi_rgb, rng):
     si.wi = mi.Vector3f(*wi)
     expected = np.pi * np.stack([c.numpy() for c in bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(*wo))], -1)
 
-    def columns(v):
-        return [ad.Float(np.ascontiguousarray(c, dtype=np.float32)) for c in v.T]
-
-    surface = material.SurfaceParameters(
-        ad.Array3f(columns(values["base_color"])), ad.Array3f(columns(normal)), *columns(values["roughness"]),
-        *columns(values["metallic"]),
-    )  # fmt: skip
+    surface = shading_surface(ad, values["base_color"], normal, values["roughness"], values["metallic"])
     effects, _ = material.material_effects(pyramid_of(bumpy(8), ad)[1].layout)
     for decoder in (Decoder(), None):
         got = numpy_of(material.shaded(decoder, surface, wi, wo, dataclasses.replace(effects, diffuse=True,
@@ -201,13 +201,7 @@ def test_converged_reference_is_the_mean_of_shaded_texels(ad, rng):
     xy = 2 * read(maps["normal"])[:, :2] - 1
     normal = np.concatenate([xy, np.sqrt(1 - (xy**2).sum(-1, keepdims=True))], -1)
 
-    def columns(values):
-        return [ad.Float(np.ascontiguousarray(c, dtype=np.float32)) for c in values.T]
-
-    surface = material.SurfaceParameters(
-        ad.Array3f(columns(read(decode))), ad.Array3f(columns(normal)), *columns(read(maps["roughness"])),
-        *columns(read(maps["metallic"])),
-    )  # fmt: skip
+    surface = shading_surface(ad, read(decode), normal, read(maps["roughness"]), read(maps["metallic"]))
     index = dr.arange(ad.UInt32, n * 256) // 256
     wi, wo = (dr.gather(type(w), w, index) for w in at[3:])
     expected = numpy_of(material.shaded(None, surface, wi, wo, effects)).reshape(n, 256, 3).mean(axis=1)
