@@ -5,7 +5,6 @@ Energy, reciprocity and derivatives against differences are measured for the tab
 ``trust/test_properties.py``; frozen functions, numbers of threads and sensors in ``trust/test_state.py``.
 """
 
-import gc
 import math
 import subprocess
 import sys
@@ -36,6 +35,7 @@ from bsdf_queries import (
 from gradients import gradients_enabled
 from half_vectors import HalfVectorSampling
 from spheres import key_of, sphere_scene
+from texture_scenes import alive
 from variants import VARIANTS, set_variant
 
 from mi_diffind import plugins
@@ -608,8 +608,7 @@ def test_scenes_are_loaded_in_many_threads():
                 failures.append(repr(e))
 
         def more(name, j):
-            return {"neural_ggx": {"alpha": 0.05 * (j + 1)}, "neural_bsdf": {"scale": 0.05 * (j + 1)}}.get(
-                name, {"clearcoat": 0.05 * (j + 1)})
+            return {{"neural_ggx": "alpha", "neural_bsdf": "scale"}.get(name, "clearcoat"): 0.05 * (j + 1)}
 
         threads = [threading.Thread(target=load, args=(k,)) for k in range(8)]
         [t.start() for t in threads]
@@ -630,16 +629,12 @@ def test_materials_die_with_their_scene(mi_rgb, no_garbage_collection, name):
     render, if instances that nobody holds any more are in its registry.
     """
     mi, kind = mi_rgb, type(load(mi_rgb, name)).__name__
-
-    def alive():
-        return [type(o).__name__ for o in gc.get_objects()].count(kind)
-
-    before = alive()
+    before = alive(kind)
     scene = sphere_scene(mi, described(name))
     mi.render(scene, spp=1)
-    assert alive() == before + 1
+    assert alive(kind) == before + 1
     del scene
-    assert alive() == before
+    assert alive(kind) == before
 
 
 # -- files and mistakes ------------------------------------------------------------------------------------------------

@@ -104,19 +104,13 @@ def test_measure_agrees_with_the_independent_reference(rng):
 
 
 @pytest.mark.parametrize("preset", list(LAYOUTS))
-def test_fit_improves_and_is_repeatable(preset, few_samples):
-    def run(seed):
-        short = {"steps": 30, "batch": 4096, "measure_every": 15, "seed": seed}
-        return fit_task("disney", preset=preset, variant="llvm", progress=False, **short).table
-
+def test_fit_improves(preset, few_samples):
     layout, decoder = LAYOUTS[preset]
     start = measure(decoder(layout().alloc(ad.TensorXf)), ad, 2**16)["psnr_db"]
-    first, second, other = run(1), run(1), run(2)
-    assert first.measured["psnr_db"] > start + 1 and first.preset == preset and first.seed == 1
-    assert {"psnr_db", "psnr_brdf_db", "psnr_uniform_db", "psnr_brdf_uniform_db", "mae"} <= set(first.measured)
-    for name in layout.SHAPES:
-        assert np.array_equal(first.arrays[name].entries, second.arrays[name].entries), name
-    assert not np.array_equal(first.arrays["masking"].entries, other.arrays["masking"].entries)
+    short = {"steps": 30, "batch": 4096, "measure_every": 15, "seed": 1}
+    table = fit_task("disney", preset=preset, variant="llvm", progress=False, **short).table
+    assert table.measured["psnr_db"] > start + 1 and table.preset == preset and table.seed == 1
+    assert {"psnr_db", "psnr_brdf_db", "psnr_uniform_db", "psnr_brdf_uniform_db", "mae"} <= set(table.measured)
 
 
 @pytest.mark.parametrize("preset", list(LAYOUTS))
@@ -131,13 +125,9 @@ def test_masking_is_read_above_its_floor(rng, preset):
     assert np.isfinite(values).all()
 
 
-def test_the_layout_of_a_file_is_that_of_its_preset(tmp_path):
-    """A file of another preset, or with entries out of range, is refused."""
+def test_files_of_no_preset_are_refused(tmp_path):
+    """A file of another preset, and one with entries out of range."""
     table, path = TASK.load(TASK.file()), tmp_path / "own.npz"
-    save_table(path, table)
-    model = TASK.open(ad.TensorXf, path)
-    assert model.table.preset == "tables" and isinstance(model.layout, LAYOUTS["tables"][0])
-    assert isinstance(model.decoder, LAYOUTS["tables"][1])
     table.arrays["masking"] = StoredArray(-table.arrays["masking"].entries)
     for broken, sentence in (
         (dataclasses.replace(table, preset="best"), 'holds tables of the preset "best", allowed are tables, paper'),

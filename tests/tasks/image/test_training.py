@@ -10,7 +10,6 @@ from scipy.ndimage import map_coordinates
 
 from mi_diffind import DifferentiableArray, save_table
 from mi_diffind.core.runtime import array_module
-from mi_diffind.fitting import loop
 from mi_diffind.fitting.task import FitRequest
 from mi_diffind.maps.layout import Layout, choose_borders, downscale, smoothness
 from mi_diffind.maps.source import from_arrays
@@ -295,25 +294,6 @@ def test_rounded_entries_are_the_stored_ones(ad, bits, dims):
     rounded = numpy_of(training.rounded(net, bits)(x))
     np.testing.assert_allclose(rounded, numpy_of(stored(x)), atol=1e-6)
     assert np.abs(rounded - numpy_of(net(x))).max() > 1e-3  # it does something
-
-
-@pytest.mark.parametrize("recipe", ["ours", "paper"])
-@pytest.mark.parametrize("structure", ["6 bits", "2 + 6 bits"])
-def test_a_step_is_one_kernel(ad, recipe, structure):
-    """Samples, targets, rounded reads and the sums of all gradients."""
-    image = np.random.default_rng(2).integers(0, 255, (64, 80, 3), dtype=np.uint8)
-    recipe = dataclasses.replace(dataclasses.replace(PRESETS[recipe], structure=structure), batch=3000)
-    source = from_arrays({"albedo": image})
-    problem = training.build_problem(source, fit.default_size(source, 4000, recipe), recipe, ad)
-    trainer = loop._Trainer(problem, recipe)
-    trainer.share = 0.9
-    for _ in range(4):
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-            dr.eval()
-            dr.kernel_history_clear()
-            dr.eval(trainer.take_step())
-            kernels = [k["size"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
-        assert kernels.count(3000) == 1
 
 
 @pytest.mark.parametrize("bits", [(4,), (2, 5)])
