@@ -9,6 +9,7 @@ import pytest
 from sdf_fields import sparse_table
 
 from mi_diffind.arrays.tables import save_table
+from mi_diffind.plugins.support import distance_shapes
 
 SIZE, FAR = 48, 1e4
 
@@ -98,8 +99,6 @@ def test_glass_seen_from_within(mi_rgb, shapes):
 
 def test_hits_far_from_the_origin_are_those_near_it(mi_rgb, shapes, rng):
     """Distances and places of camera rays: as exact as those of a mesh."""
-    from mi_diffind.plugins.support import distance_shapes
-
     mi, at = mi_rgb, mi_rgb.ScalarTransform4f
     o = np.round(rng.normal(size=(3, 4000)) * 2**8) / 2**8  # exact after the move
     o += np.sign(o) * 2

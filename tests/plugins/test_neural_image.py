@@ -18,6 +18,7 @@ from variants import VARIANTS, set_variant
 from mi_diffind.arrays.tables import StoredArray, Table, load_table, save_table
 from mi_diffind.maps.layout import Layout, MapLayout
 from mi_diffind.maps.source import load_source
+from mi_diffind.plugins.support import textures
 from mi_diffind.scenes import comparison, loading
 from mi_diffind.tasks.image import TASK
 from mi_diffind.tasks.image.arrays import CompressedImage
@@ -215,12 +216,7 @@ def test_gradient_of_the_image(mi_rgb, file, rng):
 
 def test_upsampling_is_mitsubas(rng):
     """The same spectra as from Mitsuba's coefficients, for all colours."""
-    import mitsuba as mi
-
-    mi.set_variant("llvm_ad_spectral")
-    from mi_diffind.plugins.support import textures
-
-    n = 300
+    mi, n = set_variant("llvm_ad_spectral"), 300
     colours = rng.random((3, n)) ** rng.choice([0.3, 1, 6], n)
     special = [(0, 0, 0), (1, 1, 1), (0.5, 0.5, 0.5), (1, 0, 0), (0, 1, 1), (1, 1, 0), (0, 0, 1e-4), (2, -1, 0.5)]
     special += [(1e-7, 2e-7, 0), (0.3, 0.3, 0.1), (0.1, 0.3, 0.3), (0.3, 0.1, 0.3), (1, 1, 0.999999)]

@@ -15,6 +15,7 @@ from variants import warnings_of
 from mi_diffind import plugins
 from mi_diffind.arrays.tables import load_table, save_table
 from mi_diffind.core import compat
+from mi_diffind.plugins.support import distance_shapes
 from mi_diffind.scenes import loading
 from mi_diffind.scenes.loading import SceneError
 from mi_diffind.tasks.sdf import TASK, grids, marching
@@ -261,8 +262,6 @@ def test_grids_of_files_without_a_measured_error(mi_rgb, tmp_path):
 
 
 def test_grids_without_an_inside_are_refused(mi_rgb):
-    from mi_diffind.plugins.support import distance_shapes
-
     with pytest.raises(RuntimeError, match="nothing is inside at 13 cells"):
         distance_shapes.crop_grid(np.ones((12, 10, 14)), np.zeros(3), 0.1)
 

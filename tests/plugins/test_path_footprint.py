@@ -5,6 +5,8 @@ import footprints as fp
 import numpy as np
 import pytest
 
+from mi_diffind.plugins.support.footprint import Differentials
+
 GLASS = {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0, "specular_reflectance": 0.0}
 MIRROR = {"type": "conductor", "material": "none"}
 SIZE = {"type": "hdrfilm", "width": 16, "height": 12, "rfilter": {"type": "box"}}
@@ -106,8 +108,6 @@ def test_rough_bounces_widen_and_samples_share(mi_rgb):
 
 def test_cones_of_rough_bounces_add_up(mi_rgb):
     """The variances of the angles add up over several bounces, each of the solid angle of its sample."""
-    from mi_diffind.plugins.support.footprint import Differentials
-
     mi = mi_rgb
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.n, si.sh_frame = mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Normal3f(0, 0, 1))

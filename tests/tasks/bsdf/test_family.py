@@ -9,6 +9,7 @@ from arrays import aligned, numpy_of
 
 import mi_diffind
 from mi_diffind.arrays.tables import TableError
+from mi_diffind.commands import cli
 from mi_diffind.core.errors import UsageError
 from mi_diffind.core.runtime import array_module
 from mi_diffind.tasks.bsdf import TASK, energy, evaluation, mixture, training
@@ -49,8 +50,6 @@ def test_parameters_that_are_refused(mi_rgb, case):
 
 
 def test_the_command_line_names_ranges(capsys):
-    from mi_diffind.commands import cli
-
     with pytest.raises(SystemExit):
         cli.main(["fit", "bsdf", "a.xml", "--over", "roughness=1", "-o", "a.npz"])
     assert "found 'roughness=1', expected NAME=LOW:HIGH" in capsys.readouterr().err

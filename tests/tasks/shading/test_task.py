@@ -18,6 +18,7 @@ from mi_diffind.commands.cli import main
 from mi_diffind.core.errors import UsageError
 from mi_diffind.core.progress import Deadline
 from mi_diffind.core.runtime import array_module
+from mi_diffind.fitting import loop
 from mi_diffind.fitting.loop import FitResult
 from mi_diffind.fitting.task import FitRequest
 from mi_diffind.maps.pyramid import Pyramid
@@ -27,6 +28,7 @@ from mi_diffind.tasks.disney.decoder import Decoder
 from mi_diffind.tasks.disney.model import Effects
 from mi_diffind.tasks.disney.training import uniform_hemisphere
 from mi_diffind.tasks.shading import PRESETS, material, training
+from mi_diffind.tasks.shading import fit as shading_fit
 from mi_diffind.tasks.shading.evaluation import ShadedEvaluation, reader, reference
 from mi_diffind.tasks.texture import PRESETS as TEXTURES
 from mi_diffind.tasks.texture import TASK as TEXTURE
@@ -232,14 +234,12 @@ def test_jittered_reference_is_right_on_average(ad, rng):
 @pytest.fixture(scope="module")
 def start(ad, tmp_path_factory):
     """A metal trained as a texture: source, pyramid, table, the images that measure, its file, and its size."""
-    from mi_diffind.tasks.texture.fit import find_size
-
     source, pyramid = pyramid_of(bumpy(), ad)
     recipe = TEXTURES["ours"]
     recipe = dataclasses.replace(recipe, steps=60, batch=4096, measure_every=60)
     options = {argument.name: argument.default for argument in TEXTURE.arguments} | {"structure": "0:1:2,1:2:4"}
     options["skip"] = 2
-    size = find_size(source, pyramid, source.nbytes / 2, recipe, options)
+    size = textures.find_size(source, pyramid, source.nbytes / 2, recipe, options)
     request = FitRequest("ours", recipe, ad, progress=False)
     table, _ = textures.fit_texture(source, size, recipe, request, pyramid)
     path = tmp_path_factory.mktemp("shading") / "start.npz"
@@ -269,8 +269,6 @@ def test_training_for_shading_gains(start, ad):
     decoder = material.frozen_decoder(ad)
     arrays = DISNEY.open(ad.TensorXf, storage="uint8").arrays
     before = {name: array.numpy().copy() for name, array in arrays.items()}
-    from mi_diffind.tasks.texture.compressed import CompressedTexture
-
     old = evaluation.measure(reader(CompressedTexture.from_table(table, ad.TensorXf), effects, decoder), flip=False)
     found, result = trained(start, ad, quick())
     assert result.restarts == 0
@@ -401,8 +399,6 @@ def test_extras_are_trained_stored_and_read_by_the_material_alone(mi_rgb, start,
 
 def test_training_reads_the_level_that_a_file_is_read_at(start, ad):
     """Arrays whose levels differ: the loss at a bias is that of the levels that a biased file reads."""
-    from mi_diffind.tasks.texture.compressed import CompressedTexture
-
     _, pyramid, table, *_ = start
     problem = training.ShadingProblem(training.trainable_arrays(table, pyramid), pyramid, quick(share=1.0))
     problem.settings, losses = problem.shading, []
@@ -421,9 +417,7 @@ def test_share_zero_is_the_texture_alone(start, ad):
     problem = textures.TextureProblem(
         training.trainable_arrays(table, pyramid), pyramid, TEXTURES["ours"], source.digest
     )
-    from mi_diffind.fitting.loop import fit
-
-    fit(problem, recipe, progress=False)
+    loop.fit(problem, recipe, progress=False)
     # Settings say "mse" in both, and the samples are those of the same seed
     for name, array in textures.stored_form(problem.net).arrays.items():
         assert np.array_equal(found.arrays[name].entries, array.codes()), name
@@ -482,8 +476,6 @@ def manifest(tmp_path):
 
 
 def test_command_trains_both_and_the_plugin_reads_it(mi_rgb, start, manifest, tmp_path, monkeypatch):
-    from mi_diffind.tasks.shading import fit as shading_fit
-
     mi = mi_rgb
     short = dataclasses.replace(TEXTURES["ours"], steps=6, batch=4096, measure_every=6)
     monkeypatch.setitem(TEXTURES, "ours", dataclasses.replace(TEXTURES["ours"], **short.common))
@@ -546,10 +538,8 @@ def test_sources_that_cannot_be_shaded_are_refused(ad, start, tmp_path):
     ):
         with pytest.raises(UsageError, match=message):
             mi_diffind.fit("shading", source=source, variant="llvm_ad_rgb", progress=False)
-    from mi_diffind.tasks.shading.fit import load_start
-
     with pytest.raises(UsageError, match=r"was made from another source than other\.json"):
-        load_start(
+        shading_fit.load_start(
             start[4],
             from_arrays(bumpy(seed=9)),
             FitRequest("ours", OURS, ad, options={"source": "other.json"}),
