@@ -515,7 +515,7 @@ def test_assigned_tables_are_those_of_one_instance(mi_rgb, rng, name):
 @pytest.mark.parametrize("is_textured", [False, True])
 @pytest.mark.parametrize("name", ["neural_bsdf anisotropic", "neural_bsdf family", "neural_ggx", "neural_ggx paper"])
 def test_gradients_against_differences(mi_rgb, rng, name, is_textured):
-    """By all parameters, numbers or texels, and tables. (Default forms are measured for ``docs/trust.md``.)"""
+    """Derivatives by parameters, numbers or texels, and by tables. (``docs/trust.md`` has the default forms.)"""
     mi, n = mi_rgb, 2**13
     ends = TEXTURED.get(name, {})
     if is_textured and not ends:

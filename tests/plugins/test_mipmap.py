@@ -56,7 +56,7 @@ def expected(mi, truth, uv, level):
 
 @pytest.mark.parametrize("wrap_mode", ["repeat", "mirror", "clamp"])
 def test_off_is_bitmap(mi_rgb, file, image, rng, wrap_mode):
-    """At any place, between texels, too; and so is any filter without a footprint."""
+    """The filter ``off``, and any filter without a footprint, equals ``bitmap`` at and between texels."""
     mi = mi_rgb
     si = texture_scenes.hits(mi, rng.uniform(-2, 3, (2, 500)))
     theirs = mi.load_dict({"type": "bitmap", "filename": file, "wrap_mode": wrap_mode})
@@ -77,7 +77,7 @@ def test_off_is_bitmap(mi_rgb, file, image, rng, wrap_mode):
 
 @pytest.mark.parametrize("taps", [1, 7])
 def test_anisotropic_is_the_mean_along_the_major_axis(mi_rgb, file, image, rng, taps):
-    """By singular values: ``taps`` places, half a level finer than each is wide."""
+    """The axis is that of singular values: ``taps`` places, half a level finer than each is wide."""
     mi = mi_rgb
     uv, (ddx, ddy) = rng.random((2, 300)), texture_scenes.footprints(rng, 300, SIZE)
     major, minor, axis = texture_scenes.ellipse(ddx, ddy, SIZE)
@@ -90,7 +90,7 @@ def test_anisotropic_is_the_mean_along_the_major_axis(mi_rgb, file, image, rng, 
 
 @pytest.mark.parametrize("taps", [1, 4])
 def test_stochastic_is_unbiased(mi_rgb, file, rng, taps):
-    """Over many hits of one place and footprint: linear values have the mean of all taps and both levels."""
+    """Many hits of one place and footprint have the mean of all taps and both levels, in linear values."""
     mi = mi_rgb
     n, cases = 2**14, 6
     uv, (ddx, ddy) = rng.random((2, cases)), texture_scenes.footprints(rng, cases, SIZE, 3)
@@ -132,7 +132,7 @@ def changed(mi, texture, values):
 
 @pytest.mark.parametrize("role", ["srgb", "linear", "normal"])
 def test_changed_texels_are_those_of_a_new_texture(mi_rgb, rng, role):
-    """At all levels, also of odd sizes; ``data`` are the values of ``bitmap``."""
+    """All levels follow, also of odd sizes; ``data`` are the values of ``bitmap``."""
     mi = mi_rgb
     shape = (10, 7, 3)
     old, new = rng.random((2, *shape)).astype(np.float32)
@@ -231,7 +231,7 @@ def detailed():
 
 
 def test_one_sample_a_pixel_on_a_plane(mi_rgb, detailed):
-    """Against many: the order of the filters, centred and jittered; and parameters say what the scene's sensor does."""
+    """Filters are in order of PSNR against many samples; parameters say what the scene's sensor does."""
     mi = mi_rgb
     more = {"bitmap": mi.Bitmap(detailed), "to_uv": mi.ScalarTransform4f().scale([2, 2, 1])}
     truth = mi.render(texture_scenes.plane(mi, {"type": "bitmap", **more}, 256, "multijitter")).numpy()

@@ -25,7 +25,7 @@ from mi_diffind.tasks.image.arrays import CompressedImage
 
 WIDTH, HEIGHT = 12, 10
 
-#: Of each kind that a material may have. ``glow`` is of high dynamic range, ``flat`` constant.
+#: One map of each kind that a material may have. ``glow`` is of high dynamic range, ``flat`` constant.
 MAPS = (
     MapLayout("albedo", "albedo", "srgb", 1, (0, 1, 2)),
     MapLayout("normal", "normal", "linear", 1, (3, 4, "z")),
@@ -135,7 +135,7 @@ def values_of(textures, si, methods=METHODS):
 
 
 def test_equals_a_bitmap_of_what_it_decodes_to(mi_any, file, rng):
-    """At texel centres, every map in every method; and where ``bitmap`` has no answer there is none."""
+    """Every map in every method at texel centres; where ``bitmap`` has no answer there is none."""
     mi = mi_any
     ours = {name: mi.load_dict(plugin(file, name)) for name in USABLE}
     theirs = {name: mi.load_dict(counterpart(mi, file, name)) for name in USABLE}

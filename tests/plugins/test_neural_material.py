@@ -193,7 +193,7 @@ def test_neutral_extras_change_nothing(mi_rgb, files, rng, reading):
 
 
 def test_extras_shape_and_weigh_the_highlight(mi_rgb, files, rng):
-    """Against the matrix of the lobe in NumPy, at the level and the place of the footprint."""
+    """The specular lobe is that of its matrix in NumPy, at the level and the place of the footprint."""
     mi, n = mi_rgb, 2000
     bsdf = mi.load_dict({
         "type": "neural_material", "filename": files["shaped"], "ignore": "albedo, normal", "base_color": 0.0,

@@ -125,7 +125,7 @@ def test_the_contract_has_every_texture(mi_rgb):
 @pytest.mark.parametrize("channels", PARAMETERS)
 @pytest.mark.parametrize("name", READERS)
 def test_reads_as_decoded(mi_rgb, files, rng, name, channels):
-    """At texel centres, in every method; the image's size, mean and largest value."""
+    """Values at texel centres by every method, size, mean and largest value are those of ``bitmap``."""
     mi = mi_rgb
     si = hits(mi, centres(rng, 300))
     read, ours = reader(mi, files, name, channels)
@@ -165,7 +165,7 @@ def test_inactive_lanes_are_zero(mi_rgb, files, rng, name):
 
 @pytest.mark.parametrize("name", [*TEXTURES, "neural_texture_paper"])
 def test_no_value_is_above_the_maximum(mi_rgb, files, rng, name):
-    """At any place and level of detail, also of arrays that hold no picture; and the maximum is not far off."""
+    """The maximum bounds values at any place and level of detail, also of random arrays, and is at most 1."""
     mi, kind = mi_rgb, name.removesuffix("_paper")
     for channels in PARAMETERS:
         more = {"filter": "trilinear"} if kind in FILTERED else {}
@@ -177,7 +177,7 @@ def test_no_value_is_above_the_maximum(mi_rgb, files, rng, name):
 @pytest.mark.parametrize("wrap_mode", WRAP_MODES)
 @pytest.mark.parametrize("name, border", [*((name, "") for name in READERS), *((n, "_clamp") for n in READERS[1:])])
 def test_wrap_modes(mi_rgb, files, rng, name, border, wrap_mode):
-    """At texel centres of neighbouring images, at both ends, and beyond the outermost centres."""
+    """Texel centres of neighbouring images, both ends, and places beyond the outermost centres, as ``bitmap``."""
     mi, more = mi_rgb, {"wrap_mode": wrap_mode}
     files = {name: files[name + border]}
     u, v = (rng.random(50) * 0.5 / n for n in SIZE)
@@ -412,7 +412,7 @@ def test_wrong_tables_and_footprints_leave_finite_gradients(mi_rgb, files, rng, 
 
 @pytest.mark.parametrize("name", READERS)
 def test_a_file_is_read_once(mi_rgb, files, name):
-    """By all textures and materials that name it, as long as one of them lives."""
+    """Textures and materials that name one file share its image."""
     one, two = (mi_rgb.load_dict(plugin(files, n, c)) for n, c in ((name, "albedo"), (name, "roughness")))
     others = [mi_rgb.load_dict(plugin(files, "neural_texture"))] if name == "neural_material" else []
     images = {id(getattr(t, "maps", t).image) for t in (one, two, *others)}

@@ -55,7 +55,7 @@ def test_what_the_centre_shows(mi_rgb, rng, kind, slant, tolerance):
 
 
 def test_where_nothing_is_moved(mi_rgb, rng):
-    """With a lens, with several samples, without a sensor, and where the sensor is not what is looked at."""
+    """The shift is 0 with a lens, with several samples, without a sensor, and off the sensor's line of sight."""
     mi = mi_rgb
     x, y = (rng.random(50) * n for n in FILM)
     for kind, spp in (("thinlens", 1), ("perspective", 4)):

@@ -213,7 +213,7 @@ def test_sources(types, tmp_path):
 
 
 def test_the_mixture_follows_the_source(types):
-    """For a sum of a cosine and a GGX lobe, the squares of the weights are close to their lower bound, the albedo's."""
+    """Squares of weights are near their lower bound, the albedo's, for a sum of a cosine and a GGX lobe."""
     cosine, alpha = 0.4, 0.1
 
     class Sum(Truth):
@@ -257,7 +257,7 @@ def test_the_albedo_is_limited(types):
 
 # -- files and training ------------------------------------------------------------------------------------------------
 
-#: Of files of a BSDF, and of a family; shapes and additional arrays of any file are those of ``test_tables.py``.
+#: File → changes and refusals; shapes and additional arrays of any file are those of ``test_tables.py``.
 DAMAGES = {
     handmade: [
         (lambda t: t.settings.pop("form"), "its setting \"form\" is 'None', which is no form of a BSDF"),
@@ -317,7 +317,7 @@ def test_a_plastic_is_fitted(types, short, tmp_path):
 
 @pytest.mark.parametrize("colour", [(0, 0, 0), (0.5, 0, 0.1)], ids=["black", "channel"])
 def test_black_materials_are_fitted(mi_rgb, types, short, tmp_path, colour):
-    """Their albedo in Mitsuba is that of the source, in each channel, and no training is said to diverge."""
+    """Black materials have the source's albedo in Mitsuba, in each channel, and no training is said to diverge."""
     source = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(colour)}}
     fitted = mi_diffind.fit("bsdf", source, steps=20, batch=2**11, measure_every=20, progress=False)
     assert fitted.result.restarts == 0 and all(map(math.isfinite, fitted.table.measured.values()))

@@ -58,7 +58,7 @@ RECIPES = [pytest.param(dataclasses.replace(OURS, structure=name), id=name) for 
 @pytest.mark.parametrize("recipe", [*RECIPES, pytest.param(PAPER, id="paper")])
 @pytest.mark.parametrize("height, width", [(128, 128), (300, 700), (1, 8192)])
 def test_default_sizes_have_the_requested_bytes(height, width, recipe, monkeypatch):
-    """Within 5% (if few: a row), unless the primary is as large as the image, or it is a single texel already."""
+    """Bytes are within 5% (if few: a row), unless the primary is as large as the image or a single texel."""
     single = recipe.structure in PAGED and STRUCTURES[recipe.structure][1] is None
     for channels in (1, 3, 7):
         layout = training.source_layout(from_arrays({"other": noise(8, 8, channels).maps[0].values}), recipe)
@@ -180,7 +180,7 @@ def test_quality_search_is_small_enough(monkeypatch, capsys, slope, bend, wobble
 
 
 def test_quality_search_ends(monkeypatch):
-    """At a primary as large as the image, after ``most`` trainings, and at the smallest arrays."""
+    """The search ends at a primary as large as the image, after ``most`` trainings, and at the smallest arrays."""
     source = noise(64, 64)
     calls = pretend(by_bytes(2.5), monkeypatch)
     with pytest.raises(FittingError, match=r"x\.png: 100 dB were not reached; the best of \d sizes had"):

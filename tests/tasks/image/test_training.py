@@ -351,7 +351,7 @@ def test_reported_qualities_are_those_of_the_decoded_image(ad):
 
 
 def test_the_quality_between_texels(ad):
-    """At other places than those of the measurement: the same up to what chance makes of it."""
+    """The PSNR between texels is that at other random places, up to chance."""
     values = waves(15, 13)
     source = from_arrays({"image": values})
     for border, mode in (("repeat", "grid-wrap"), ("clamp", "nearest")):
@@ -367,7 +367,7 @@ def test_the_quality_between_texels(ad):
 
 @pytest.mark.parametrize("structure", [name for name in STRUCTURES if name not in PAGED])
 def test_every_structure_makes_a_file(ad, tmp_path, structure):
-    """Its arrays have the shapes and bits of the size, and what is read from the file is what was measured."""
+    """Arrays have the shapes and bits of the size, and the file has the PSNR that was measured."""
     source = from_arrays({"image": np.rint(255 * waves(15, 13)).astype(np.uint8)})
     recipe = short(steps=2, dims=3, structure=structure)
     size = fit.sized(source, 500, recipe, 4)

@@ -196,7 +196,7 @@ def test_slabs_change_no_hit(types, coded, rng):
 
 
 def test_rays_along_the_plane_of_a_block(coded, rng):
-    """Their distances to a slab stay within the range of whole numbers."""
+    """Distances to a slab of rays in its plane stay within the range of whole numbers."""
     types, marcher, structure = coded.types, marching.get_marcher(coded), coded.structure
     normals, middles = planes(coded)
     block = rng.choice(np.flatnonzero(marching.GridCells(coded).crossed.any(axis=1)), COUNT)

@@ -89,7 +89,7 @@ def test_clip_changes_derivatives_only(ad):
 
 
 def test_clip_is_for_the_specular_lobe(ad, rng):
-    """With a bound, values stay, the diffuse lobe's derivatives too; those of a highlight are bounded."""
+    """A bound changes no value and no derivative of the diffuse lobe; those of a highlight are limited."""
     wi, wo = directions(ad, rng, 512)
     effects, results = Effects(**{**dict.fromkeys(("metal", "dielectric", "diffuse"), True),
                                   **dict.fromkeys(("subsurface", "sheen", "sheen_tint", "spec_tint", "anisotropic",
@@ -178,7 +178,7 @@ def lanes(ad, rng, n, level):
 
 
 def test_converged_reference_is_the_mean_of_shaded_texels(ad, rng):
-    """Against NumPy: bilinear reads, and the formulas shaded texel by texel."""
+    """The mean of bilinear reads in NumPy, shaded one by one."""
     size, n, level = 16, 6, 2.0
     source, pyramid = pyramid_of(bumpy(size, metallic=0.5), ad)
     effects, _ = material.material_effects(pyramid.layout)
@@ -283,7 +283,7 @@ def test_training_for_shading_gains(start, ad):
 
 
 def test_a_training_that_loses_keeps_its_start(start, ad):
-    """At a rate that destroys everything, what comes out is what went in."""
+    """A training at a rate that destroys everything returns the arrays that it started with."""
     table = start[2]
     found, result = trained(start, ad, quick(steps=2, measure_every=2, lr=0.3, level_bias=-1.0))
     assert found.settings["kept_start"] and found.settings["level_bias"] == 0

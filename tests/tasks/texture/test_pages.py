@@ -137,7 +137,7 @@ def test_which_textures_get_pages():
 
 
 def test_pages_gain_what_they_are_for():
-    """At equal bytes and steps, on a texture of which a sixteenth has detail; every level, not the first alone."""
+    """Pages gain 3 dB at equal bytes and steps where a sixteenth has detail; the worst level gains, too."""
     source = sparse()
     with_pages = trained(source, paged(source, 5000), 60).measured
     without = trained(source, arrays.choose(64, 64, 3, 5000), 60).measured

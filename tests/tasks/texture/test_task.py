@@ -241,7 +241,7 @@ def psnr(a, b):
 
 
 def test_reported_qualities(made):
-    """Each level at its texel centres against the pyramid, maps at level 0, means."""
+    """PSNR of each level at its texel centres, of maps at level 0, and errors of means, against the pyramid."""
     source, texture, _, table = made
     pyramid, measured = Pyramid.from_source(source, texture.layout), table.measured
     assert next(iter(measured)) == "psnr_db" and measured["psnr_db"] == measured["psnr_l0_db"]
