@@ -5,7 +5,6 @@ Energy, reciprocity and derivatives against differences are measured for the tab
 ``trust/test_properties.py``; frozen functions, numbers of threads and sensors in ``trust/test_state.py``.
 """
 
-import gc
 import math
 import subprocess
 import sys
@@ -36,6 +35,7 @@ from bsdf_queries import (
 from gradients import gradients_enabled
 from half_vectors import HalfVectorSampling
 from spheres import key_of, sphere_scene
+from texture_scenes import alive
 from variants import VARIANTS, set_variant
 
 from mi_diffind import plugins
@@ -515,7 +515,7 @@ def test_assigned_tables_are_those_of_one_instance(mi_rgb, rng, name):
 @pytest.mark.parametrize("is_textured", [False, True])
 @pytest.mark.parametrize("name", ["neural_bsdf anisotropic", "neural_bsdf family", "neural_ggx", "neural_ggx paper"])
 def test_gradients_against_differences(mi_rgb, rng, name, is_textured):
-    """By all parameters, numbers or texels, and tables. (Default forms are measured for ``docs/trust.md``.)"""
+    """Derivatives by parameters, numbers or texels, and by tables. (``docs/trust.md`` has the default forms.)"""
     mi, n = mi_rgb, 2**13
     ends = TEXTURED.get(name, {})
     if is_textured and not ends:
@@ -527,57 +527,6 @@ def test_gradients_against_differences(mi_rgb, rng, name, is_textured):
     keys = [key for key in params.keys() if dr.is_diff_v(params[key])]
     worst, names = trust.compared(lambda: total(bsdf.eval(mi.BSDFContext(), si, towards)), params, keys, rng)
     assert worst <= 0.03 and len(names) >= 4
-
-
-METAL = {"clearcoat_gloss": 0.3, "metallic": 0.5}
-
-#: Case → the exact plugin's material, the optimised one, and parameter → start, target, tolerance and learning rate.
-RECOVERED = {
-    "neural_ggx": ({"type": "roughconductor", "distribution": "ggx"}, {"type": "neural_ggx"},
-                   {"alpha": (0.6, 0.25, 0.0125, 0.06)}),
-    **{name: ({"type": "disney", **METAL}, {"type": name, **METAL}, {
-        "roughness": (0.3, 0.6, 0.05, 0.03), "base_color": ([0.5, 0.5, 0.5], [0.7, 0.2, 0.1], 0.05, 0.03),
-        "clearcoat": (0.0, 0.8, 0.25, 0.15)}) for name in ("disney", "neural_disney")},
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("case", ["neural_ggx", "disney", pytest.param("neural_disney", marks=pytest.mark.slow)])
-def test_parameters_are_recovered_from_an_image(mi_rgb, case):
-    """The image is of the exact plugin; a coat starts at exactly 0, too; no kernel appears after the first steps."""
-    mi, (exact, learned, parameters) = mi_rgb, RECOVERED[case]
-    lamps = {f"lamp{i}": {"type": "point", "position": position, "intensity": 15.0}
-             for i, position in enumerate(([-3.0, 1.0, 3.0], [0.0, -3.0, 4.0]))}  # fmt: skip
-
-    def scene(bsdf, which):
-        given = {name: values[which] for name, values in parameters.items()}
-        given |= {n: {"type": "rgb", "value": v} for n, v in given.items() if isinstance(v, list)}
-        lit = {"size": 16, "light": 0.05} if case == "neural_ggx" else {"size": 24, "light": 0.02, "depth": 2, **lamps}
-        return sphere_scene(mi, {**bsdf, **given}, "prb", **lit)
-
-    image, optimised = mi.render(scene(exact, 1), spp=512), scene(learned, 0)
-    params = mi.traverse(optimised)
-    keys = {key_of(params, f"bsdf.{name}.value"): values for name, values in parameters.items()}
-    opt, history, kernels, steps = mi.ad.Adam(lr=0.01), [], [], 80
-    for key in keys:
-        opt[key] = params[key]
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.kernel_history_clear()
-        for step in range(steps):
-            decay = 0.95**step if case == "neural_ggx" else 1
-            opt.set_learning_rate({key: rate * decay for key, (*_, rate) in keys.items()})
-            for key in keys:
-                opt[key] = dr.clip(opt[key], 1e-3 if case == "neural_ggx" else 0, 1)
-            params.update(opt)
-            difference = mi.render(optimised, params, spp=16, seed=step) - image
-            loss = dr.abs(difference) if case == "neural_ggx" else dr.square(difference)
-            dr.backward(dr.mean(loss, axis=None))
-            opt.step()
-            history.append(np.concatenate([opt[key].numpy().ravel() for key in keys]))
-            kernels.append({k["hash"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT})
-    assert set().union(*kernels[25:]) <= set().union(*kernels[:25])
-    reached = np.mean(history[steps * 3 // 5 :], axis=0)  # the noise of the images makes them wander
-    expected, tolerance = (np.concatenate([np.resize(v[i], np.size(v[1])) for v in keys.values()]) for i in (1, 2))
-    assert (np.abs(reached - expected) <= tolerance).all(), (reached, expected)
 
 
 # -- scenes ------------------------------------------------------------------------------------------------------------
@@ -659,8 +608,7 @@ def test_scenes_are_loaded_in_many_threads():
                 failures.append(repr(e))
 
         def more(name, j):
-            return {"neural_ggx": {"alpha": 0.05 * (j + 1)}, "neural_bsdf": {"scale": 0.05 * (j + 1)}}.get(
-                name, {"clearcoat": 0.05 * (j + 1)})
+            return {{"neural_ggx": "alpha", "neural_bsdf": "scale"}.get(name, "clearcoat"): 0.05 * (j + 1)}
 
         threads = [threading.Thread(target=load, args=(k,)) for k in range(8)]
         [t.start() for t in threads]
@@ -681,16 +629,12 @@ def test_materials_die_with_their_scene(mi_rgb, no_garbage_collection, name):
     render, if instances that nobody holds any more are in its registry.
     """
     mi, kind = mi_rgb, type(load(mi_rgb, name)).__name__
-
-    def alive():
-        return [type(o).__name__ for o in gc.get_objects()].count(kind)
-
-    before = alive()
+    before = alive(kind)
     scene = sphere_scene(mi, described(name))
     mi.render(scene, spp=1)
-    assert alive() == before + 1
+    assert alive(kind) == before + 1
     del scene
-    assert alive() == before
+    assert alive(kind) == before
 
 
 # -- files and mistakes ------------------------------------------------------------------------------------------------

@@ -5,11 +5,10 @@ import drjit as dr
 import numpy as np
 import pytest
 from arrays import aligned
-from bsdf_queries import bitmap, equal_images, interactions, random_directions, texels, vectors
-from disney_materials import FORMS, plugin
+from bsdf_queries import bitmap, interactions, random_directions, texels, vectors
+from disney_materials import FORMS
 from disney_materials import RICH as COLOURED
 from gradients import gradients_enabled
-from spheres import key_of, sphere_scene
 
 from mi_diffind.tasks.disney import TASK
 
@@ -167,22 +166,6 @@ def test_a_narrow_line_of_a_spectrum_is_not_black():
         bsdf = mi.load_dict({**FORMS["disney"], "base_color": line, "effects": effects})
         values.append(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(0, 0, 1)).numpy().ravel())
     assert np.allclose(*values, rtol=1e-4)
-
-
-def test_a_texture_shared_by_materials(mi_rgb):
-    """Mitsuba lists a shared texture once, and tells of its change only one of the materials."""
-    mi, form = mi_rgb, "tables"
-
-    def spheres(clearcoat):
-        return [plugin(mi, form, {"roughness": r, "clearcoat_gloss": 0.3}, clearcoat=clearcoat) for r in (0.3, 0.6)]
-
-    on, off = (mi.render(sphere_scene(mi, spheres(v)), spp=4).numpy() for v in (1.0, 0.0))
-    scene = sphere_scene(mi, spheres(mi.load_dict({"type": "uniform", "value": 0.0})))
-    for value in (1.0, 0.0):
-        params = mi.traverse(scene)
-        params[key_of(params, "clearcoat.value")] = mi.Float(value)
-        params.update()
-        assert equal_images(mi.render(scene, spp=4).numpy(), on if value else off)
 
 
 def test_parameters_may_be_colours(mi_any, rng):

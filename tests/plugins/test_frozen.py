@@ -13,6 +13,7 @@ import numpy as np
 import plugin_examples as examples
 import pytest
 
+import mi_diffind
 from mi_diffind.arrays.tables import save_table
 from mi_diffind.core import compat
 
@@ -271,8 +272,6 @@ def test_numbers_compile_no_kernels(mi_rgb, name):
 
 def test_textures_attached_to_another_sensor(mi_rgb):
     """A sensor of another projection is read in another way, with as many arrays."""
-    import mi_diffind as md
-
     mi = mi_rgb
     parts = examples.scene_parts(mi, "neural_texture")
     pose = mi.ScalarTransform4f().look_at([0, 1, 4], list(examples.CENTRE), [0, 1, 0])
@@ -284,7 +283,7 @@ def test_textures_attached_to_another_sensor(mi_rgb):
     render, _ = frozen(mi)
     seen = []
     for sensor in scene.sensors():
-        md.attach(scene, sensor)
+        mi_diffind.attach(scene, sensor)
         np.testing.assert_allclose(render(scene), picture(mi, scene), atol=1e-6)
         seen.append(render(scene))
     assert np.abs(seen[1] - seen[0]).max() > 1e-3

@@ -9,6 +9,7 @@ import pytest
 from sdf_fields import sparse_table
 
 from mi_diffind.arrays.tables import save_table
+from mi_diffind.plugins.support import distance_shapes
 
 SIZE, FAR = 48, 1e4
 
@@ -96,37 +97,8 @@ def test_glass_seen_from_within(mi_rgb, shapes):
         assert np.abs(image / (1.5046 / 1.000277) ** 2 - 1).max() < 1e-4  # bk7 in air
 
 
-def test_limited_depth_loses_light_as_flat_triangles_do(mi_rgb, shapes):
-    """Light that is totally reflected within a ball that is not quite round stays for long, in a mesh as in a field."""
-    mi = mi_rgb
-    flat = {**shapes["mesh"], "face_normals": True}
-    lost = {
-        name: 1 - furnace(mi, shape, "glass", spp=32, max_depth=16).mean()
-        for name, shape in {"field": shapes["field"], "flat": flat}.items()
-    }
-    assert 0 < lost["field"] < lost["flat"] < 5e-3
-
-
-def test_origins_of_rays_keep_what_single_precision_rounds_off(mi_rgb, shapes, rng):
-    from mi_diffind.plugins.support import distance_shapes
-
-    mi, at = mi_rgb, mi_rgb.ScalarTransform4f
-    move = at().translate([FAR, -3 * FAR, 7.7]).rotate([0.6, 0, 0.8], 50).scale(1.7)
-    shape = mi.load_dict({**shapes["field"], "to_world": move})
-    p = rng.uniform(-0.5, 0.5, (3, 1000)).astype(np.float32)
-    place, rest = shape.split_world(mi.Point3f(p))
-    exact = shape.placement.length * (shape.placement.rotation @ p.astype(np.float64))
-    exact += np.array(shape.origin, np.float64).reshape(3, 1)
-    assert np.abs(np.array(place) - exact).max() > 1e-4  # what a point in the world alone is worth
-    assert np.abs(np.array(place, np.float64) + np.array(rest, np.float64) - exact).max() < 2e-6
-    assert np.abs(np.array(shape.local_point(place, rest)) - p).max() < 5e-7
-    assert distance_shapes.OFFSET > 100 * 5e-7
-
-
 def test_hits_far_from_the_origin_are_those_near_it(mi_rgb, shapes, rng):
     """Distances and places of camera rays: as exact as those of a mesh."""
-    from mi_diffind.plugins.support import distance_shapes
-
     mi, at = mi_rgb, mi_rgb.ScalarTransform4f
     o = np.round(rng.normal(size=(3, 4000)) * 2**8) / 2**8  # exact after the move
     o += np.sign(o) * 2

@@ -56,7 +56,7 @@ def expected(mi, truth, uv, level):
 
 @pytest.mark.parametrize("wrap_mode", ["repeat", "mirror", "clamp"])
 def test_off_is_bitmap(mi_rgb, file, image, rng, wrap_mode):
-    """At any place, between texels, too; and so is any filter without a footprint."""
+    """The filter ``off``, and any filter without a footprint, equals ``bitmap`` at and between texels."""
     mi = mi_rgb
     si = texture_scenes.hits(mi, rng.uniform(-2, 3, (2, 500)))
     theirs = mi.load_dict({"type": "bitmap", "filename": file, "wrap_mode": wrap_mode})
@@ -77,7 +77,7 @@ def test_off_is_bitmap(mi_rgb, file, image, rng, wrap_mode):
 
 @pytest.mark.parametrize("taps", [1, 7])
 def test_anisotropic_is_the_mean_along_the_major_axis(mi_rgb, file, image, rng, taps):
-    """By singular values: ``taps`` places, half a level finer than each is wide."""
+    """The axis is that of singular values: ``taps`` places, half a level finer than each is wide."""
     mi = mi_rgb
     uv, (ddx, ddy) = rng.random((2, 300)), texture_scenes.footprints(rng, 300, SIZE)
     major, minor, axis = texture_scenes.ellipse(ddx, ddy, SIZE)
@@ -90,7 +90,7 @@ def test_anisotropic_is_the_mean_along_the_major_axis(mi_rgb, file, image, rng, 
 
 @pytest.mark.parametrize("taps", [1, 4])
 def test_stochastic_is_unbiased(mi_rgb, file, rng, taps):
-    """Over many hits of one place and footprint: linear values have the mean of all taps and both levels."""
+    """Many hits of one place and footprint have the mean of all taps and both levels, in linear values."""
     mi = mi_rgb
     n, cases = 2**14, 6
     uv, (ddx, ddy) = rng.random((2, cases)), texture_scenes.footprints(rng, cases, SIZE, 3)
@@ -119,9 +119,6 @@ def test_random_numbers(mi_rgb, rng):
         np.testing.assert_array_equal(again, a)
 
 
-# -- hard cases --------------------------------------------------------------------------------------------------------
-
-
 # -- gradients ---------------------------------------------------------------------------------------------------------
 
 
@@ -135,7 +132,7 @@ def changed(mi, texture, values):
 
 @pytest.mark.parametrize("role", ["srgb", "linear", "normal"])
 def test_changed_texels_are_those_of_a_new_texture(mi_rgb, rng, role):
-    """At all levels, also of odd sizes; ``data`` are the values of ``bitmap``."""
+    """All levels follow, also of odd sizes; ``data`` are the values of ``bitmap``."""
     mi = mi_rgb
     shape = (10, 7, 3)
     old, new = rng.random((2, *shape)).astype(np.float32)
@@ -181,35 +178,6 @@ def test_texels_of_other_textures_stay(mi_rgb, file, rng):
     np.testing.assert_array_equal(one.eval(si).numpy(), constant.eval(si).numpy())
     np.testing.assert_array_equal(other.eval(si).numpy(), before)
     assert np.abs(one.eval(si).numpy() - before).max() > 0.1
-
-
-@pytest.mark.parametrize("name", ["trilinear", "anisotropic", "off"])
-def test_gradients_reach_the_texels(mi_rgb, file, rng, name):
-    """From all levels: the texture is linear in its texels, so a gradient times the texels is the sum of its values."""
-    mi = mi_rgb
-    uv, (ddx, ddy) = rng.random((2, 200)), texture_scenes.footprints(rng, 200, SIZE, 5)
-    si = texture_scenes.hits(mi, uv, ddx, ddy)
-    texture = mi.load_dict(plugin(file, name))
-    params = mi.traverse(texture)
-    dr.enable_grad(params["data"])
-    params.update()
-    weight = mi.Color3f(*(mi.Float(aligned(x.astype(np.float32))) for x in rng.random((3, 200))))
-    total = dr.sum(dr.dot(weight, texture.eval(si)))
-    dr.backward(total)
-    gradient, values = dr.grad(params["data"]).numpy(), params["data"].numpy().copy()
-    assert (gradient * values).sum(dtype=np.float64) == pytest.approx(total.array[0], rel=1e-5)
-    for _ in range(3):
-        change = rng.normal(size=values.shape).astype(np.float32)
-        changed(mi, texture, values + change)
-        step = dr.sum(dr.dot(weight, texture.eval(si))).array[0] - total.array[0]
-        assert step == pytest.approx((gradient * change).sum(dtype=np.float64), rel=1e-3, abs=1e-2)
-    if name == "off":
-        theirs = mi.load_dict({"type": "bitmap", "filename": file, "format": "variant"})
-        params = mi.traverse(theirs)
-        dr.enable_grad(params["data"])
-        params.update()
-        dr.backward(dr.sum(dr.dot(weight, theirs.eval(si))))
-        np.testing.assert_allclose(gradient, dr.grad(params["data"]).numpy(), atol=1e-4)
 
 
 def test_slope_of_a_filtered_texture(mi_rgb, rng):
@@ -263,7 +231,7 @@ def detailed():
 
 
 def test_one_sample_a_pixel_on_a_plane(mi_rgb, detailed):
-    """Against many: the order of the filters, centred and jittered; and parameters say what the scene's sensor does."""
+    """Filters are in order of PSNR against many samples; parameters say what the scene's sensor does."""
     mi = mi_rgb
     more = {"bitmap": mi.Bitmap(detailed), "to_uv": mi.ScalarTransform4f().scale([2, 2, 1])}
     truth = mi.render(texture_scenes.plane(mi, {"type": "bitmap", **more}, 256, "multijitter")).numpy()
@@ -319,7 +287,6 @@ def test_report(mi_rgb, file):
     found = mi.load_dict(plugin(file, "anisotropic", max_anisotropy=3)).report()
     assert (found["filter"], found["taps"], found["footprint"]) == ("anisotropic", 3, ["uv partials"])
     assert found["effects_left_out"]["sensor"].startswith("is not known")
-    assert found["storage"] == "float32" and found["table_bytes"] > 16 * WIDTH * HEIGHT
     seen = mi.load_dict(plugin(file, **SENSOR(mi)))
     assert seen.report()["footprint"] == ["uv partials", "parameters"]
     seen.set_cone(mi.load_dict(plugin(file, **SENSOR(mi, spp=4))).cone)
@@ -345,7 +312,6 @@ BAD = {
     "two sources": ({"filename": "a.png", "pyramid": "b"}, 'found "filename" and "pyramid", exactly one is needed'),
     "no such levels": ({"pyramid": "x"}, 'parameter "pyramid": found "x", allowed are the keys of PYRAMIDS: none'),
     "type": ({"filter_type": "nearest"}, 'parameter "filter_type": found "nearest", allowed are bilinear, trilinear'),
-    "half a tap": ({"max_anisotropy": 2.5}, 'parameter "max_anisotropy": found 2.5, allowed are whole numbers'),
 }
 
 

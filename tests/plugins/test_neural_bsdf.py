@@ -4,6 +4,7 @@ from pathlib import Path
 
 import drjit as dr
 import numpy as np
+import plugin_examples as examples
 import pytest
 from arrays import numpy_of
 from bsdf_queries import interactions, random_directions, uniform, vectors
@@ -47,7 +48,9 @@ def test_values_of_families(mi_rgb, files, rng):
     """``eval`` is the formula of the member times the cosine; the default is the middle of the range."""
     mi, ctx = mi_rgb, mi_rgb.BSDFContext()
     wi, wo = random_directions(rng, 500, 0.05), random_directions(rng, 500, 0.05)
-    for given, expected in (({"roughness": 0.1, "metallic": 0.25}, (0.1, 0.25)), ({}, (0.2, 0.5))):
+    members = [(0.05, 0.0), (0.8, 1.0), (0.13, 0.4), (0.5, 0.9)]
+    cases = [({"roughness": roughness, "metallic": metallic}, (roughness, metallic)) for roughness, metallic in members]
+    for given, expected in (*cases, ({}, (0.2, 0.5))):
         bsdf = mi.load_dict({"type": "neural_bsdf", "filename": files["family"], **given})
         value = numpy_of(bsdf.eval(ctx, interactions(mi, wi), vectors(mi, wo)))
         truth = wo[:, 2:] * formula(member(load_table(files["family"]), *expected), wi.astype(float), wo.astype(float))
@@ -173,19 +176,11 @@ def test_compare_shows_the_source(mi_rgb, tmp_path):
     """A comparison puts the source in the file's place."""
     given = recorded(tmp_path, {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.5, 0.1]}})
     del given["evaluate"]
-    transform = mi_rgb.ScalarTransform4f
-    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
+    wall = {"to_world": mi_rgb.ScalarTransform4f().scale(9), "bsdf": {**given, "energy": "raw"}}
     scene = {
-        "type": "scene",
-        "integrator": {"type": "direct"},
-        "light": {"type": "constant"},
-        "sensor": {
-            "type": "perspective",
-            "to_world": transform().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]),
-            "film": film,
-        },
-        "wall": {"type": "rectangle", "to_world": transform().scale(5), "bsdf": {**given, "energy": "raw"}},
-    }
+        "type": "scene", "integrator": {"type": "direct"}, "light": {"type": "constant"},
+        "sensor": examples.sensor(mi_rgb, size=8), "wall": {"type": "rectangle", **wall},
+    }  # fmt: skip
     result = mi_diffind.compare(scene, 64, passes=2, progress=False)
     assert result.figures["counterparts"] == ["source"] and result.figures["learned_plugins"] == 1
     np.testing.assert_allclose(result.reference.mean(axis=(0, 1)), [0.2, 0.5, 0.1], rtol=0.05)

@@ -287,21 +287,14 @@ def test_what_is_left_out_changes_nothing(mi_rgb, rng):
 
 
 def test_report(mi_any):
-    mi = mi_any
+    """Nothing is left out of a tinted metal; Mueller matrices are never left out."""
     effects = ["distribution", "masking", "fresnel", "specular_reflectance"]
-    polarised = mi.is_polarized  # Mueller matrices are not left out
-    bsdf = mi.load_dict(FORMS["tables"])
-    report = bsdf.report()
-    assert report["effects_in_use"] == [e for e in effects[: 3 if polarised else 2]]
+    report = mi_any.load_dict(FORMS["tables"]).report()
+    assert report["effects_in_use"] == effects[: 3 if mi_any.is_polarized else 2]
     assert report["effects_left_out"]["specular_reflectance"] == "is not given"
-    assert report["evaluated_once"] == ["roughness"]
     assert (report["preset"], report["storage"], report["table_bytes"]) == ("tables", "float32", 2304)
-    report = mi.load_dict({**FORMS["tables"], "material": "Cu", "specular_reflectance": 0.5}).report()
+    report = mi_any.load_dict({**FORMS["tables"], "material": "Cu", "specular_reflectance": 0.5}).report()
     assert report["effects_in_use"] == effects and report["effects_left_out"] == {}
-    report = mi.load_dict({**FORMS["tables"], "specular_reflectance": 1.0}).report()
-    assert report["effects_left_out"]["specular_reflectance"] == "is 1"
-    textured = mi.load_dict({**FORMS["tables"], "alpha": bitmap(mi, np.full((2, 2), 0.3))})
-    assert textured.report()["evaluated_once"] == []
 
 
 def test_what_is_constant_is_not_read(mi_rgb):

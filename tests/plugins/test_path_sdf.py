@@ -153,19 +153,6 @@ def test_depths_and_hidden_emitters(mi_rgb, fields, options):
     same_light(mi, {"ball": actual}, {"ball": expected}, view, **options)
 
 
-def test_solids_are_not_hit_by_other_rays(mi_rgb, fields):
-    """The shape that stands for a solid tells its extent, and is nowhere."""
-    mi = mi_rgb
-    loaded = mi.load_dict({"type": "scene", "ball": solid(mi, "ball")})
-    box = loaded.bbox()
-    assert np.allclose([box.min, box.max], [[-1.25] * 3, [1.25] * 3], atol=1e-6)
-    corners = np.stack(np.meshgrid(*[[-1.25, 1.25]] * 3), -1).reshape(-1, 3)
-    towards = np.repeat(corners, 8, 0)
-    d = towards - np.tile(corners * 3 + 0.1, (8, 1))
-    ray = mi.Ray3f(mi.Point3f((towards - d).T), mi.Vector3f(d.T))
-    assert not dr.any(loaded.ray_test(ray)) and not dr.any(loaded.ray_intersect(ray).is_valid())
-
-
 def test_solids_in_groups_are_refused(mi_rgb, fields):
     mi = mi_rgb
     group = {"type": "shapegroup", "ball": solid(mi, "ball")}

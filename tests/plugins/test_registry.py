@@ -179,7 +179,7 @@ def test_plugins_of_other_packages(mi_toys, tmp_path):
 
 
 def test_native_objects_are_forgotten(mi_toys):
-    """They cannot be referenced weakly: what nobody else holds is dropped when the next one is made."""
+    """Native objects cannot be referenced weakly: those that nobody else holds are dropped with the next one."""
     mi = mi_toys
     if not plugins.supported(mi.variant()):
         return
@@ -202,7 +202,7 @@ def test_factories_that_return_something_else(mi_toys, name, found):
 
 
 def test_two_plugins_of_one_name(mi_rgb, monkeypatch):
-    """Ours stays."""
+    """The plugin of this package stays; a warning names the other one."""
     variant, theirs = mi_rgb.variant(), metadata.EntryPoint("disney", "theirs.disney", plugins.__name__)
     monkeypatch.setattr(metadata, "entry_points", lambda group: [theirs] if group == plugins.__name__ else [])
     monkeypatch.setitem(plugins._declared, variant, {})

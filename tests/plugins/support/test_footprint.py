@@ -10,6 +10,7 @@ import pytest
 import mi_diffind
 from mi_diffind.plugins.support import footprint
 from mi_diffind.plugins.support.footprint import LARGEST, Cone
+from mi_diffind.scenes import loading
 
 
 def scene_of(mi, kind: str, camera: str = "perspective", **more):
@@ -289,8 +290,6 @@ def test_scenes_tell_their_textures(mi_rgb, tmp_path):
     fp.register_probe()
     path = tmp_path / "scene.xml"
     path.write_text(SCENE)
-    from mi_diffind.scenes import loading
-
     probe = footprint.textures(mi.load_file(str(path)))[0]
     assert probe.cone is None
     for scene, fov in (

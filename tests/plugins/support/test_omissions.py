@@ -110,14 +110,17 @@ def test_integrators_around_the_one_that_traces(mi_rgb, warned):
     assert (image.numpy()[..., -1] == 0).all() and "AOVIntegrator" in warned()[0]
 
 
-def test_textures_that_nothing_filters(mi_rgb, warned):
+@pytest.mark.parametrize("integrator", ["path", "path_sdf"])
+def test_textures_that_nothing_filters(mi_rgb, warned, integrator):
+    """One warning, at the first render; beside a distance field that is rendered, too."""
     mi = mi_rgb
-    loaded = mi.load_dict(scene(mi, **textured(mi)))
-    render(mi, loaded, "path", max_depth=2)
+    solid = {"solid": {"type": "neural_sdf", "filename": SOLID}} if integrator == "path_sdf" else {}
+    loaded = mi.load_dict(scene(mi, **textured(mi), **solid))
+    render(mi, loaded, integrator, max_depth=2)
     (line,) = warned()
     for words in ("(mipmap) is not filtered", "mi_diffind.load_file", "mi_diffind.attach(scene)", "path_footprint"):
         assert words in line
-    render(mi, loaded, "path", max_depth=2)
+    render(mi, loaded, integrator, max_depth=2)
     assert not warned()
 
 
@@ -136,13 +139,6 @@ def test_textures_that_are_filtered_or_not_read(mi_rgb, warned):
     texture = footprint.textures(mi.load_dict(scene(mi, **textured(mi))))[0]
     texture.eval(dr.zeros(mi.SurfaceInteraction3f, 4))  # by hand
     assert not warned()
-
-
-def test_textures_beside_a_distance_field(mi_rgb, warned):
-    mi = mi_rgb
-    both = {**textured(mi), "solid": {"type": "neural_sdf", "filename": SOLID}}
-    render(mi, mi.load_dict(scene(mi, **both)), "path_sdf", max_depth=2)
-    assert len(warned()) == 1
 
 
 def test_scenes_without_a_sensor(mi_rgb, warned, tmp_path):

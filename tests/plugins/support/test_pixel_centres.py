@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from mi_diffind.plugins.support import footprint
+
 FILM = (20, 12)
 
 SENSORS = {
@@ -35,8 +37,6 @@ def hits(mi, scene, x, y):
 @pytest.mark.parametrize("slant, tolerance", [(0, 5e-3), (-35, 0.06)])
 def test_what_the_centre_shows(mi_rgb, rng, kind, slant, tolerance):
     """The shift leads to where a ray through the centre goes; on a slant, but for the curvature of perspective."""
-    from mi_diffind.scenes.loading import footprint
-
     mi = mi_rgb
     scene = scene_of(mi, kind, slant)
     x, y = (rng.random(400) * n for n in FILM)
@@ -55,9 +55,7 @@ def test_what_the_centre_shows(mi_rgb, rng, kind, slant, tolerance):
 
 
 def test_where_nothing_is_moved(mi_rgb, rng):
-    """With a lens, with several samples, without a sensor, and where the sensor is not what is looked at."""
-    from mi_diffind.scenes.loading import footprint
-
+    """The shift is 0 with a lens, with several samples, without a sensor, and off the sensor's line of sight."""
     mi = mi_rgb
     x, y = (rng.random(50) * n for n in FILM)
     for kind, spp in (("thinlens", 1), ("perspective", 4)):

@@ -6,11 +6,10 @@ import drjit as dr
 import numpy as np
 import pytest
 from arrays import aligned, numpy_of
-from bsdf_queries import random_directions
-from learned_bsdfs import formula, handmade_family, member
 
 import mi_diffind
-from mi_diffind.arrays.tables import TableError, load_table, save_table
+from mi_diffind.arrays.tables import TableError
+from mi_diffind.commands import cli
 from mi_diffind.core.errors import UsageError
 from mi_diffind.core.runtime import array_module
 from mi_diffind.tasks.bsdf import TASK, energy, evaluation, mixture, training
@@ -18,18 +17,10 @@ from mi_diffind.tasks.bsdf import fit as fitting
 from mi_diffind.tasks.bsdf.model import Parameter, points
 from mi_diffind.tasks.bsdf.truth import FamilyTruth, truth_of
 
-MEMBERS = ((0.05, 0.0), (0.8, 1.0), (0.13, 0.4), (0.5, 0.9))
-
 
 @pytest.fixture
 def types(mi_rgb):
     return array_module()
-
-
-@pytest.fixture
-def model(types, tmp_path):
-    save_table(tmp_path / "family.npz", handmade_family())
-    return mi_diffind.open(tmp_path / "family.npz")
 
 
 def test_coordinates(types):
@@ -39,21 +30,6 @@ def test_coordinates(types):
     np.testing.assert_allclose(rough.coordinate(values), [0, 0.5, 1, 1, 0, 1, 0], atol=1e-6)
     np.testing.assert_allclose(metal.coordinate(values), [0.2625, 0.3, 0.45, 1, 0, 1, 0], atol=1e-6)
     assert rough.middle == pytest.approx(0.2) and metal.middle == 1
-
-
-def test_the_formula(types, model, rng):
-    """A member is the learned BSDF of the proxy, residual and energy that its parameters give, lane by lane."""
-    n = 1200
-    wi, wo = (random_directions(rng, n, 0.02) for _ in range(2))
-    given = np.repeat(MEMBERS, n // len(MEMBERS), axis=0)
-    bsdf, _ = model.at([types.Float(aligned(column)) for column in given.T.astype(np.float32)])
-    values = numpy_of(bsdf.value(*(types.Array3f(aligned(w.T)) for w in (wi, wo))))
-    backwards = numpy_of(bsdf.value(*(types.Array3f(aligned(w.T)) for w in (wo, wi))))
-    for roughness, metallic in MEMBERS:
-        lanes = (given == (roughness, metallic)).all(axis=1)
-        expected = formula(member(load_table(model.table.path), roughness, metallic), wi[lanes], wo[lanes])
-        np.testing.assert_allclose(values[lanes], expected, rtol=3e-3)
-    np.testing.assert_allclose(values, backwards, rtol=1e-4)
 
 
 REFUSED = {
@@ -74,8 +50,6 @@ def test_parameters_that_are_refused(mi_rgb, case):
 
 
 def test_the_command_line_names_ranges(capsys):
-    from mi_diffind.commands import cli
-
     with pytest.raises(SystemExit):
         cli.main(["fit", "bsdf", "a.xml", "--over", "roughness=1", "-o", "a.npz"])
     assert "found 'roughness=1', expected NAME=LOW:HIGH" in capsys.readouterr().err

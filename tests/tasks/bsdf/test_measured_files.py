@@ -140,9 +140,7 @@ def test_files_with_a_damaged_field(mi_rgb, tmp_path, name, damage):
     if array is not None or not polarised:
         plugin = "measured_polarized" if polarised else "measured"
         with pytest.raises(UsageError, match=sentence):
-            mi_diffind.load_dict(
-                {"type": "scene", "shape": {"type": "sphere", "b": {"type": plugin, "filename": str(path)}}}
-            )
+            mi_diffind.load_dict({"type": "sphere", "b": {"type": plugin, "filename": str(path)}})
 
 
 def test_a_file_with_an_empty_description(mi_rgb, tmp_path):

@@ -16,7 +16,7 @@ from mi_diffind.fitting.loop import EXPONENTIAL_RATE
 from mi_diffind.tasks.disney import TASK
 from mi_diffind.tasks.disney.decoder import Decoder
 from mi_diffind.tasks.disney.model import PARAMETERS, Effects, Material, ValueBounds, find_effects
-from mi_diffind.tasks.disney.training import LAYOUTS, measure, shade, uniform_hemisphere
+from mi_diffind.tasks.disney.training import LAYOUTS, measure, shade
 
 N = 100_000
 
@@ -39,44 +39,6 @@ def shaded(decoder, case, effects=Effects()):  # noqa: B008
 
 def clipped_psnr(a, b):
     return -10 * np.log10(np.mean((np.clip(a, 0, 1) - np.clip(b, 0, 1)) ** 2))
-
-
-@pytest.mark.parametrize("decoder", [None, Decoder()], ids=["formulas", "rearranged"])
-def test_exact_model_is_burley(rng, decoder):
-    case = disney_formulas.random_case(rng, N, low_cosine=1e-3)
-    # In single precision the inputs themselves are rounded: the reference sees the same roundings
-    case = (
-        case[0].astype("f4"),
-        {k: v.astype("f4") for k, v in case[1].items()},
-        *(aligned(v) for v in case[2:]),
-    )
-    reference = disney_formulas.brdf(*case) * case[3][:, 2:3]
-    found = shaded(decoder, case)
-    error = np.abs(found - reference) / (np.abs(reference) + 1e-3)
-    assert np.quantile(error, 0.999) < 1e-4
-    assert error.max() < 1e-2  # single precision, next to the peak of a nearly smooth surface
-
-
-@pytest.mark.parametrize("decoder", [None, Decoder()], ids=["formulas", "rearranged"])
-def test_gradients_against_finite_differences(rng, decoder):
-    color, m, wi, wo = disney_formulas.random_case(rng, 2000, low_cosine=0.1)
-    m["roughness"] = 0.25 + 0.7 * m["roughness"]  # away from the floor on alpha, where there is a kink
-    case = (color, {k: 0.05 + 0.9 * v for k, v in m.items()}, wi, wo)
-    material, albedo, wi_, wo_ = to_drjit(case)
-    for name in PARAMETERS:
-        dr.enable_grad(getattr(material, name))
-    value = shade(decoder, material, albedo, wi_, wo_)
-    dr.backward(dr.sum(value.x + value.y + value.z))
-    for name in PARAMETERS:
-        step = 1e-5
-
-        def total(delta, name=name):
-            shifted = {**case[1], name: case[1][name] + delta}
-            return (disney_formulas.brdf(case[0], shifted, wi, wo) * wo[:, 2:3]).sum(axis=1)
-
-        expected = (total(step) - total(-step)) / (2 * step)
-        found = getattr(material, name).grad.numpy()
-        assert np.allclose(found, expected, rtol=5e-3, atol=5e-3 * np.abs(expected).max()), name
 
 
 @pytest.mark.parametrize("preset", list(LAYOUTS))
@@ -118,7 +80,7 @@ PROMISED = {
 @pytest.mark.parametrize("distribution", ["training", "uniform"])
 @pytest.mark.parametrize("preset, storage", [(preset, storage) for preset in PROMISED for storage in PROMISED[preset]])
 def test_accuracy_over_a_million_samples(million, preset, storage, distribution):
-    """Over 10⁶ random directions and materials, by the independent reference."""
+    """PSNR over 10⁶ random directions and materials against the independent reference."""
     decoder = decoder_of(preset, storage)
     squared, count = np.zeros(2), 0
     for (material, color, wi, wo), reference, cosine in million[distribution]:
@@ -141,28 +103,14 @@ def test_measure_agrees_with_the_independent_reference(rng):
     assert abs(measure(decoder, ad, 2**18, "uniform")["psnr_db"] - independent) < 1
 
 
-def test_hemisphere(rng):
-    w = uniform_hemisphere(ad, ad.Float(aligned(rng.random(N))), ad.Float(aligned(rng.random(N)))).numpy()
-    assert np.allclose(np.linalg.norm(w, axis=0), 1, atol=1e-5)
-    for t in (0.25, 0.5, 0.75):
-        assert abs(np.mean(w[2] < t) - t) < 0.01
-    assert np.abs(w[:2].mean(axis=1)).max() < 0.01
-
-
 @pytest.mark.parametrize("preset", list(LAYOUTS))
-def test_fit_improves_and_is_repeatable(preset, few_samples):
-    def run(seed):
-        short = {"steps": 30, "batch": 4096, "measure_every": 15, "seed": seed}
-        return fit_task("disney", preset=preset, variant="llvm", progress=False, **short).table
-
+def test_fit_improves(preset, few_samples):
     layout, decoder = LAYOUTS[preset]
     start = measure(decoder(layout().alloc(ad.TensorXf)), ad, 2**16)["psnr_db"]
-    first, second, other = run(1), run(1), run(2)
-    assert first.measured["psnr_db"] > start + 1 and first.preset == preset and first.seed == 1
-    assert {"psnr_db", "psnr_brdf_db", "psnr_uniform_db", "psnr_brdf_uniform_db", "mae"} <= set(first.measured)
-    for name in layout.SHAPES:
-        assert np.array_equal(first.arrays[name].entries, second.arrays[name].entries), name
-    assert not np.array_equal(first.arrays["masking"].entries, other.arrays["masking"].entries)
+    short = {"steps": 30, "batch": 4096, "measure_every": 15, "seed": 1}
+    table = fit_task("disney", preset=preset, variant="llvm", progress=False, **short).table
+    assert table.measured["psnr_db"] > start + 1 and table.preset == preset and table.seed == 1
+    assert {"psnr_db", "psnr_brdf_db", "psnr_uniform_db", "psnr_brdf_uniform_db", "mae"} <= set(table.measured)
 
 
 @pytest.mark.parametrize("preset", list(LAYOUTS))
@@ -177,13 +125,9 @@ def test_masking_is_read_above_its_floor(rng, preset):
     assert np.isfinite(values).all()
 
 
-def test_the_layout_of_a_file_is_that_of_its_preset(tmp_path):
-    """A file of another preset, or with entries out of range, is refused."""
+def test_files_of_no_preset_are_refused(tmp_path):
+    """A file of another preset, and one with entries out of range."""
     table, path = TASK.load(TASK.file()), tmp_path / "own.npz"
-    save_table(path, table)
-    model = TASK.open(ad.TensorXf, path)
-    assert model.table.preset == "tables" and isinstance(model.layout, LAYOUTS["tables"][0])
-    assert isinstance(model.decoder, LAYOUTS["tables"][1])
     table.arrays["masking"] = StoredArray(-table.arrays["masking"].entries)
     for broken, sentence in (
         (dataclasses.replace(table, preset="best"), 'holds tables of the preset "best", allowed are tables, paper'),

@@ -4,6 +4,7 @@ import sys
 from pathlib import Path
 from unittest.mock import Mock
 
+import drjit.llvm.ad as llvm
 import numpy as np
 import pytest
 
@@ -16,9 +17,7 @@ from mi_diffind.tasks.radiance.volume_field import FAINT, NodeField, VolumeField
 
 @pytest.fixture
 def t():
-    import drjit.llvm.ad
-
-    return drjit.llvm.ad
+    return llvm
 
 
 LOWER, VOXEL, SHAPE = (-1.0, 0.5, 2.0), 0.25, (6, 5, 4)

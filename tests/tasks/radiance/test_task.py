@@ -67,7 +67,8 @@ def folder(tmp_path_factory):
     return path
 
 
-def test_fit_meets_views_it_has_not_seen(folder):
+def test_fit_meets_views_it_has_not_seen(folder, ad):
+    """The figures are those of the stored field, which is better than a grey ball."""
     figures = json.loads((folder / "fit.json").read_text())
     table = load_table(folder / "ball.npz", "field")
     assert table.preset == "sparse" and table.settings["capture_path"] == "."
@@ -75,11 +76,8 @@ def test_fit_meets_views_it_has_not_seen(folder):
     # A grey ball in its place, the mean of all pixels, has 13 dB
     assert table.measured["psnr_foreground_db"] > 17.5 and table.measured["psnr_white_db"] > 23
     assert figures["memory_bytes"] < figures["dense_bytes"] / 10
-
-
-def test_the_stored_field_is_what_was_measured(folder, ad):
-    model = tasks()["field"].open(ad.TensorXf, folder / "ball.npz")
-    assert model.measure()["psnr_white_db"] == pytest.approx(model.table.measured["psnr_white_db"], abs=1e-3)
+    measured = tasks()["field"].open(ad.TensorXf, folder / "ball.npz").measure()
+    assert measured["psnr_white_db"] == pytest.approx(table.measured["psnr_white_db"], abs=1e-3)
 
 
 def test_packed_and_trainable_fields_agree(folder, ad, rng):
@@ -97,17 +95,14 @@ def test_packed_and_trainable_fields_agree(folder, ad, rng):
     np.testing.assert_allclose(read[0], read[1], rtol=2e-3, atol=2e-3 * read[1][0].max() * 1e-2)
 
 
-def test_bytes_are_kept(folder, tmp_path):
-    for nbytes in (24_000, 40_000):
-        assert run(folder, tmp_path / "f.npz", "--bytes", nbytes, "--steps", 4, "--json", tmp_path / "f.json") == 0
-        assert json.loads((tmp_path / "f.json").read_text())["memory_bytes"] <= nbytes
-
-
-def test_bytes_of_the_file_are_kept(folder, tmp_path):
+@pytest.mark.parametrize("option, limits", [("--bytes", (24_000, 40_000)), ("--disk", (5_000, 9_000))])
+def test_bytes_are_kept(folder, tmp_path, option, limits):
+    """Bytes in memory, or of the file, which more are allowed for."""
     sizes, out = [], tmp_path / "f.npz"
-    for nbytes in (5_000, 9_000):
-        assert run(folder, out, "--disk", nbytes, "--steps", 4) == 0
-        sizes.append(out.stat().st_size)
+    for nbytes in limits:
+        assert run(folder, out, option, nbytes, "--steps", 4, "--json", tmp_path / "f.json") == 0
+        figures = json.loads((tmp_path / "f.json").read_text())
+        sizes.append(out.stat().st_size if option == "--disk" else figures["memory_bytes"])
         assert sizes[-1] <= nbytes
     assert sizes[1] > 1.2 * sizes[0]
 
@@ -439,17 +434,6 @@ def test_views_without_alpha(tmp_path, capsys):
     captures.change(tmp_path, aabb=[[-0.6, -0.8, -0.8], [1, 0.8, 0.8]])
     assert run(tmp_path, tmp_path / "x.npz", "--steps", 5) == 0
     assert "no alpha" in capsys.readouterr().err
-
-
-def test_sizes(folder, ad, monkeypatch):
-    monkeypatch.setattr(compression, "SLOPE", 0.0)  # so that all colours are used
-    grid = files.grid_of(files.load(folder / "grid.npz"), ad)
-    session = FieldSession.load(ad, folder)
-    weights = compression.importance(grid, session, 0)
-    for bits in (6, 8):
-        problem = compression.PaletteProblem(compression.palette_coding(grid, weights, None, bits, 0), session)
-        table = files.palette_table(grid.nodes, problem.numbers())
-        assert files.field_of(table, ad).nbytes == pytest.approx(compression.packed_bytes(grid, bits), rel=0.01)
 
 
 def test_the_layout_of_before(folder, tmp_path, ad):

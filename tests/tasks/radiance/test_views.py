@@ -196,7 +196,7 @@ def masked(blender):
 
 
 def test_masked_pixels_do_not_count(masked):
-    """Other colours there change neither the loss nor the PSNR; the whole rest does."""
+    """Other colours of masked pixels change neither the loss nor the PSNR; those of other pixels change both."""
     figures = []
     for where in ((slice(0, 0),), (slice(1, 4), slice(2, 7)), (slice(4, 5), slice(2, 7))):
         for path in ("train/r_2.png", "test/r_0.png"):

@@ -69,7 +69,7 @@ def opened(path, ad):
 
 
 def test_size_and_accuracy(folder, evaluation, ad):
-    """Within 3% of the bytes asked for, and better than a dense grid of as many bytes, which is sampled here."""
+    """Bytes are within 3% of those asked for; errors are below those of a dense grid of as many bytes."""
     report = json.loads((folder / "fit.json").read_text())
     model = opened(folder / "solids.npz", ad)
     assert 0.97 * BYTES <= model.memory_nbytes <= BYTES

@@ -10,7 +10,7 @@ import time
 import drjit as dr
 import numpy as np
 import pytest
-from arrays import numpy_of
+from arrays import aligned, numpy_of
 
 import mi_diffind
 from mi_diffind.arrays.tables import TableError, load_table, save_table
@@ -18,6 +18,7 @@ from mi_diffind.commands.cli import main
 from mi_diffind.core.errors import UsageError
 from mi_diffind.core.progress import Deadline
 from mi_diffind.core.runtime import array_module
+from mi_diffind.fitting import loop
 from mi_diffind.fitting.loop import FitResult
 from mi_diffind.fitting.task import FitRequest
 from mi_diffind.maps.pyramid import Pyramid
@@ -27,6 +28,7 @@ from mi_diffind.tasks.disney.decoder import Decoder
 from mi_diffind.tasks.disney.model import Effects
 from mi_diffind.tasks.disney.training import uniform_hemisphere
 from mi_diffind.tasks.shading import PRESETS, material, training
+from mi_diffind.tasks.shading import fit as shading_fit
 from mi_diffind.tasks.shading.evaluation import ShadedEvaluation, reader, reference
 from mi_diffind.tasks.texture import PRESETS as TEXTURES
 from mi_diffind.tasks.texture import TASK as TEXTURE
@@ -64,6 +66,12 @@ def directions(ad, rng, n):
     return uniform_hemisphere(ad, u[0], u[1]), uniform_hemisphere(ad, u[2], u[3])
 
 
+def shading_surface(ad, *maps):
+    """Parameters of a surface by its albedo, normal, roughness and metallic, ``(n, channels)`` each."""
+    albedo, normal, rough, metal = ([ad.Float(aligned(c)) for c in v.T] for v in maps)
+    return material.SurfaceParameters(ad.Array3f(albedo), ad.Array3f(normal), *rough, *metal)
+
+
 # -- limited derivatives ----------------------------------------------------------------------------------------------
 
 
@@ -81,7 +89,7 @@ def test_clip_changes_derivatives_only(ad):
 
 
 def test_clip_is_for_the_specular_lobe(ad, rng):
-    """With a bound, values stay, the diffuse lobe's derivatives too; those of a highlight are bounded."""
+    """A bound changes no value and no derivative of the diffuse lobe; those of a highlight are limited."""
     wi, wo = directions(ad, rng, 512)
     effects, results = Effects(**{**dict.fromkeys(("metal", "dielectric", "diffuse"), True),
                                   **dict.fromkeys(("subsurface", "sheen", "sheen_tint", "spec_tint", "anisotropic",
@@ -130,13 +138,7 @@ def test_shaded_is_mitsubas_normalmap(mi_rgb, rng):
     si.wi = mi.Vector3f(*wi)
     expected = np.pi * np.stack([c.numpy() for c in bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(*wo))], -1)
 
-    def columns(v):
-        return [ad.Float(np.ascontiguousarray(c, dtype=np.float32)) for c in v.T]
-
-    surface = material.SurfaceParameters(
-        ad.Array3f(columns(values["base_color"])), ad.Array3f(columns(normal)), *columns(values["roughness"]),
-        *columns(values["metallic"]),
-    )  # fmt: skip
+    surface = shading_surface(ad, values["base_color"], normal, values["roughness"], values["metallic"])
     effects, _ = material.material_effects(pyramid_of(bumpy(8), ad)[1].layout)
     for decoder in (Decoder(), None):
         got = numpy_of(material.shaded(decoder, surface, wi, wo, dataclasses.replace(effects, diffuse=True,
@@ -145,22 +147,6 @@ def test_shaded_is_mitsubas_normalmap(mi_rgb, rng):
     assert (expected.max(axis=-1) == 0).mean() < 0.3 and (expected > 0.5).any()
     flat = material.shaded(Decoder(), dataclasses.replace(surface, normal=None), wi, wo, effects)
     assert not np.allclose(numpy_of(flat), expected, rtol=0.1, atol=0.1)
-
-
-def test_effects_follow_the_maps(ad):
-    def effects(**changed):
-        maps = {k: v for k, v in {**bumpy(8), **changed}.items() if v is not None}
-        return material.material_effects(pyramid_of(maps, ad)[1].layout)
-
-    found, reasons = effects()
-    assert not found.diffuse and found.metal and not found.dielectric and reasons["diffuse"] == "metallic is 1"
-    found, reasons = effects(metallic=None)
-    assert found.diffuse and not found.metal and found.lobes == ("diffuse", "specular")
-    assert reasons["metal"] == "metallic is 0"
-    grey = np.repeat(bumpy(8)["roughness"], 3, axis=2)
-    assert effects(albedo=grey, metallic=None)[0] == found
-    extra = pyramid_of({**bumpy(8), "ao": bumpy(8)["roughness"]}, ad)[1].layout
-    assert list(material.left_out(extra)) == ["ao"]
 
 
 def test_extreme_materials_stay_finite(ad, rng):
@@ -192,7 +178,7 @@ def lanes(ad, rng, n, level):
 
 
 def test_converged_reference_is_the_mean_of_shaded_texels(ad, rng):
-    """Against NumPy: bilinear reads, and the formulas shaded texel by texel."""
+    """The mean of bilinear reads in NumPy, shaded one by one."""
     size, n, level = 16, 6, 2.0
     source, pyramid = pyramid_of(bumpy(size, metallic=0.5), ad)
     effects, _ = material.material_effects(pyramid.layout)
@@ -217,13 +203,7 @@ def test_converged_reference_is_the_mean_of_shaded_texels(ad, rng):
     xy = 2 * read(maps["normal"])[:, :2] - 1
     normal = np.concatenate([xy, np.sqrt(1 - (xy**2).sum(-1, keepdims=True))], -1)
 
-    def columns(values):
-        return [ad.Float(np.ascontiguousarray(c, dtype=np.float32)) for c in values.T]
-
-    surface = material.SurfaceParameters(
-        ad.Array3f(columns(read(decode))), ad.Array3f(columns(normal)), *columns(read(maps["roughness"])),
-        *columns(read(maps["metallic"])),
-    )  # fmt: skip
+    surface = shading_surface(ad, read(decode), normal, read(maps["roughness"]), read(maps["metallic"]))
     index = dr.arange(ad.UInt32, n * 256) // 256
     wi, wo = (dr.gather(type(w), w, index) for w in at[3:])
     expected = numpy_of(material.shaded(None, surface, wi, wo, effects)).reshape(n, 256, 3).mean(axis=1)
@@ -254,14 +234,12 @@ def test_jittered_reference_is_right_on_average(ad, rng):
 @pytest.fixture(scope="module")
 def start(ad, tmp_path_factory):
     """A metal trained as a texture: source, pyramid, table, the images that measure, its file, and its size."""
-    from mi_diffind.tasks.texture.fit import find_size
-
     source, pyramid = pyramid_of(bumpy(), ad)
     recipe = TEXTURES["ours"]
     recipe = dataclasses.replace(recipe, steps=60, batch=4096, measure_every=60)
     options = {argument.name: argument.default for argument in TEXTURE.arguments} | {"structure": "0:1:2,1:2:4"}
     options["skip"] = 2
-    size = find_size(source, pyramid, source.nbytes / 2, recipe, options)
+    size = textures.find_size(source, pyramid, source.nbytes / 2, recipe, options)
     request = FitRequest("ours", recipe, ad, progress=False)
     table, _ = textures.fit_texture(source, size, recipe, request, pyramid)
     path = tmp_path_factory.mktemp("shading") / "start.npz"
@@ -291,8 +269,6 @@ def test_training_for_shading_gains(start, ad):
     decoder = material.frozen_decoder(ad)
     arrays = DISNEY.open(ad.TensorXf, storage="uint8").arrays
     before = {name: array.numpy().copy() for name, array in arrays.items()}
-    from mi_diffind.tasks.texture.compressed import CompressedTexture
-
     old = evaluation.measure(reader(CompressedTexture.from_table(table, ad.TensorXf), effects, decoder), flip=False)
     found, result = trained(start, ad, quick())
     assert result.restarts == 0
@@ -307,7 +283,7 @@ def test_training_for_shading_gains(start, ad):
 
 
 def test_a_training_that_loses_keeps_its_start(start, ad):
-    """At a rate that destroys everything, what comes out is what went in."""
+    """A training at a rate that destroys everything returns the arrays that it started with."""
     table = start[2]
     found, result = trained(start, ad, quick(steps=2, measure_every=2, lr=0.3, level_bias=-1.0))
     assert found.settings["kept_start"] and found.settings["level_bias"] == 0
@@ -423,8 +399,6 @@ def test_extras_are_trained_stored_and_read_by_the_material_alone(mi_rgb, start,
 
 def test_training_reads_the_level_that_a_file_is_read_at(start, ad):
     """Arrays whose levels differ: the loss at a bias is that of the levels that a biased file reads."""
-    from mi_diffind.tasks.texture.compressed import CompressedTexture
-
     _, pyramid, table, *_ = start
     problem = training.ShadingProblem(training.trainable_arrays(table, pyramid), pyramid, quick(share=1.0))
     problem.settings, losses = problem.shading, []
@@ -443,9 +417,7 @@ def test_share_zero_is_the_texture_alone(start, ad):
     problem = textures.TextureProblem(
         training.trainable_arrays(table, pyramid), pyramid, TEXTURES["ours"], source.digest
     )
-    from mi_diffind.fitting.loop import fit
-
-    fit(problem, recipe, progress=False)
+    loop.fit(problem, recipe, progress=False)
     # Settings say "mse" in both, and the samples are those of the same seed
     for name, array in textures.stored_form(problem.net).arrays.items():
         assert np.array_equal(found.arrays[name].entries, array.codes()), name
@@ -504,8 +476,6 @@ def manifest(tmp_path):
 
 
 def test_command_trains_both_and_the_plugin_reads_it(mi_rgb, start, manifest, tmp_path, monkeypatch):
-    from mi_diffind.tasks.shading import fit as shading_fit
-
     mi = mi_rgb
     short = dataclasses.replace(TEXTURES["ours"], steps=6, batch=4096, measure_every=6)
     monkeypatch.setitem(TEXTURES, "ours", dataclasses.replace(TEXTURES["ours"], **short.common))
@@ -568,10 +538,8 @@ def test_sources_that_cannot_be_shaded_are_refused(ad, start, tmp_path):
     ):
         with pytest.raises(UsageError, match=message):
             mi_diffind.fit("shading", source=source, variant="llvm_ad_rgb", progress=False)
-    from mi_diffind.tasks.shading.fit import load_start
-
     with pytest.raises(UsageError, match=r"was made from another source than other\.json"):
-        load_start(
+        shading_fit.load_start(
             start[4],
             from_arrays(bumpy(seed=9)),
             FitRequest("ours", OURS, ad, options={"source": "other.json"}),
