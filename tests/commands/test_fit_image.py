@@ -185,6 +185,17 @@ def test_options_that_are_refused(folder, capsys, options, sentence):
     assert os.listdir(folder) == ["a.png"]
 
 
+def test_ratio_search(folder, capsys):
+    """The file is of the best of the short trainings that were tried, within the bytes."""
+    write("a.png", waves())
+    assert fit("a.png", "--ratio-search", "--bytes", "1200", "--steps", "8", "--json", "r.json") == 0
+    tried, settings = report()["tried"], report()["settings"]
+    assert len(tried) == capsys.readouterr().out.count("  tried ") >= 2 and settings["steps"] == 8
+    best = max(tried, key=lambda t: t["psnr_db"] + t["psnr_between_db"])
+    assert (settings["structure"], settings["dims"]) == (best["structure"], best["dims"])
+    assert report()["bytes"] == best["bytes"] <= 1260
+
+
 def test_the_smallest_of_a_quality(folder, capsys):
     write("a.png", waves())
     options = ["--psnr", "15", "--steps", "10", "--dims", "3", "--lr", "0.01"]

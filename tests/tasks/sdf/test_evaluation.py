@@ -119,6 +119,18 @@ def test_errors_are_told(held_out):
     assert short == pytest.approx(np.average(np.maximum(np.abs(r - 0.5) - 0.005, 0), weights=r**2), rel=0.05)
 
 
+def test_distances_beyond_the_band_are_truncated(held_out):
+    """A field a hundred times too steep is truncated on both sides of the surface."""
+
+    class Steep(Ball):
+        def value(self, p, active=True):
+            return 100 * super().value(p, active)
+
+    distance = np.linalg.norm(held_out.near.astype(np.float64), axis=1) - 0.5
+    expected = np.abs(np.clip(100 * distance, -BAND, BAND) - distance).mean()
+    assert held_out.measure(Steep(0.5))["mae_near"] == pytest.approx(expected, rel=0.02)
+
+
 def test_iou_knows_what_is_far(held_out):
     """A cavity deep inside and a ball apart count by their volumes."""
     field = Union(Shell(0.5, 0.2), Ball(0.04, (0.45, 0.45, 0.45)))
