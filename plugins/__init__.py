@@ -9,7 +9,7 @@ or when the variant is set (:func:`install`): its classes keep the globals of th
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -73,7 +73,6 @@ class Plugin:
     - ``exact``: the exact counterpart, which makes the plugin a *learned* one; ``others``: further counterparts;
       ``truths``: the counterparts that a comparison takes by default, in order; ``stock``: the plugins of Mitsuba that
       it can stand for;
-    - ``choices``: parameters that are one of a few words, each with all of them;
     - ``seen_by``: for a shape that only some integrators see, these; ``otherwise``: the parameter and the value with
       which all others see it, too.
 
@@ -90,7 +89,6 @@ class Plugin:
     others: tuple[Counterpart, ...] = ()
     truths: tuple[str, ...] = ("exact",)
     stock: Stock | None = None
-    choices: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     seen_by: tuple[str, ...] = ()
     otherwise: tuple[str, str] | None = None
 

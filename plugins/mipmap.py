@@ -13,7 +13,6 @@ from . import Plugin
 from .support.image_files import SharedMaps, open_uncompressed
 from .support.manual import shared_parts
 from .support.map_textures import FilteredTexture
-from .support.textures import FILTERS
 
 
 class Texels:
@@ -168,4 +167,4 @@ class MipMap(FilteredTexture):
         return {"preset": "", "storage": "float32", "table_bytes": self.image.memory_nbytes}
 
 
-PLUGIN = Plugin("mipmap", "texture", MipMap, choices={"filter": FILTERS})
+PLUGIN = Plugin("mipmap", "texture", MipMap)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations  # Delayed parsing of type annotations
 
-from mi_diffind.fitting.task import STORAGES
 from mi_diffind.tasks.disney import TASK
 
 from . import Counterpart, Plugin, Stock
@@ -122,6 +121,5 @@ PLUGIN = Plugin(
     storage=STORAGE,
     exact=Counterpart("disney", ("preset", "filename", "storage")),
     others=(PRINCIPLED,),
-    choices={"preset": tuple(TASK.shipped), "storage": STORAGES, "effects": ("used", "all")},
     stock=Stock("principled", ("principled",), _from_principled),
 )

@@ -5,7 +5,6 @@ from __future__ import annotations  # Delayed parsing of type annotations
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind.fitting.task import STORAGES
 from mi_diffind.tasks.ggx import TASK
 from mi_diffind.tasks.ggx.model import Roughness
 
@@ -351,6 +350,5 @@ PLUGIN = Plugin(
     "bsdf",
     NeuralGGX,
     task="ggx",
-    choices={"preset": tuple(TASK.shipped), "storage": STORAGES},
     exact=Counterpart("roughconductor", ("preset", "filename", "storage"), {"distribution": "ggx"}),
 )

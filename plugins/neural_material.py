@@ -22,8 +22,8 @@ from .support.bsdfs import TrackedParameter
 from .support.image_files import SharedMaps, file_layout, open_compressed, remove, to_bitmap, to_mipmap
 from .support.manual import shared_parts
 from .support.map_textures import FilteredTexture
-from .support.textures import FILTERS, anisotropic, isotropic
 from .support.textures import PROPERTIES as FILTERING
+from .support.textures import anisotropic, isotropic
 
 #: Forms of the lobes.
 LOBES = ("exact", "tables")
@@ -464,6 +464,5 @@ PLUGIN = Plugin(
     task=TASK.name,
     exact=_counterpart("disney", "disney", "bitmap", 8),
     others=(_counterpart("mipmap", "disney", "mipmap", 1), _counterpart("principled", "principled", "bitmap", 8)),
-    choices={"filter": FILTERS},
     truths=("mipmap", "exact"),
 )

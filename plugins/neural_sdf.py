@@ -316,7 +316,6 @@ PLUGIN = Plugin(
     task=TASK.name,
     seen_by=SEEN_BY,
     otherwise=("trace", "grid"),
-    choices={"trace": ("arrays", "grid"), "normals": ("analytic", "smooth")},
     stock=Stock("mesh", ("ply", "obj", "serialized"), _from_mesh),
     exact=Counterpart("ply", ("normals", "trace", "resolution", "storage"), convert=to_mesh),
 )

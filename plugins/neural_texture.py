@@ -13,8 +13,8 @@ from .support.image_files import SharedMaps, open_compressed, remove, to_bitmap,
 from .support.manual import shared_parts
 from .support.map_textures import FilteredTexture
 from .support.properties import Kept, StockNode
-from .support.textures import FILTERS, TYPES
 from .support.textures import PROPERTIES as FILTERING
+from .support.textures import TYPES
 
 
 @shared_parts
@@ -113,7 +113,6 @@ PLUGIN = Plugin(
     task=TASK.name,
     exact=Counterpart("bitmap", ("filename", "channels", "storage", "source"), convert=_to_bitmap, oversampling=8),
     others=(Counterpart("mipmap", ("storage", "source"), convert=functools.partial(to_mipmap, TASK)),),
-    choices={"filter": FILTERS},
     truths=("mipmap", "exact"),
     stock=Stock("bitmap", ("bitmap",), _from_bitmap, advised=True),
 )

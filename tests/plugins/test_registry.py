@@ -7,7 +7,6 @@ import textwrap
 from importlib import metadata
 from pathlib import Path
 
-import plugin_examples as examples
 import pytest
 
 from mi_diffind import plugins
@@ -210,16 +209,3 @@ def test_two_plugins_of_one_name(mi_rgb, monkeypatch):
     with pytest.warns(RuntimeWarning, match=r'"disney" \(theirs.disney\) is left out: .* mi_diffind.plugins.disney'):
         plugins.register(variant)
     assert plugins.declared()["disney"].factory.__module__ == "mi_diffind.plugins.disney"
-
-
-def test_choices_are_the_words_that_plugins_allow(mi_rgb):
-    """Declared words of a parameter are those that its plugin lists when it refuses another one."""
-    choices = [
-        (name, key, words) for name, plugin in plugins.declared().items() for key, words in plugin.choices.items()
-    ]
-    assert len(choices) > 8
-    for name, key, words in choices:
-        with pytest.raises(RuntimeError, match=f'{key}.*"x"') as refused:
-            mi_rgb.load_dict(examples.example(name, **{key: "x"}))
-        listed = str(refused.value).split("allowed are ")[-1].split("\n")[0]
-        assert {word.strip(' "') for word in listed.split(",")} == set(words), (name, key, listed)
