@@ -26,6 +26,7 @@ from bsdf_queries import (
     contexts,
     equal_images,
     extreme_directions,
+    gradients_enabled,
     interactions,
     random_directions,
     texels,
@@ -33,7 +34,6 @@ from bsdf_queries import (
     uniform,
     vectors,
 )
-from gradients import gradients_enabled
 from half_vectors import HalfVectorSampling
 from spheres import key_of, sphere_scene
 from variants import VARIANTS, set_variant
@@ -108,7 +108,7 @@ def load(mi, name, **more):
 
 def intensities(mi, value):
     """Channels of a value without polarisation, (n, channels)."""
-    return numpy_of(trust.spectrum(mi, value))
+    return numpy_of(mi.unpolarized_spectrum(value))
 
 
 def below_horizon(name, wi, wo):
