@@ -108,13 +108,11 @@ def write_fields(folder: Path) -> None:
         save_table(folder / f"{name}.npz", table)
 
 
-def is_wrong(values, negative=False):
-    """Return where one of several arrays is not finite, or (``negative``) below zero."""
+def is_wrong(values, least=-np.inf):
+    """Return where one of several arrays is not finite, or less than ``least``."""
     wrong = mi.Bool(False)
     for value in values:
-        wrong |= ~dr.isfinite(value)
-        if negative:
-            wrong |= value < 0
+        wrong |= ~dr.isfinite(value) | (value < least)
     return wrong
 
 
@@ -281,7 +279,7 @@ def faults(name: str, count: int) -> dict[str, list]:
         for size in parts(count):
             given = queries(rng, size)
             for answer, values in answers(plugin, given).items():
-                where = np.flatnonzero(np.broadcast_to(is_wrong(values, negative=answer != "sample"), size))
+                where = np.flatnonzero(np.broadcast_to(is_wrong(values, -np.inf if answer == "sample" else 0), size))
                 if len(where):
                     at = where[0]
                     numbers = [float(np.broadcast_to(np.array(v), size)[at]) for v in values]

@@ -160,11 +160,11 @@ def chi2(mi, name: str, effort: Effort) -> Cell:
     return judged(len(rejected), 0, reason)
 
 
-def rendered(mi, parts: dict, effort: Effort, seed: int = 0) -> np.ndarray:
+def rendered(mi, parts: dict, effort: Effort) -> np.ndarray:
     """Return the image of a scene with one sensor; all paths end by leaving the scene."""
     parts = {**parts, "sensor": examples.sensor(mi, size=effort.side)}
     scene = mi.load_dict({k: v for k, v in parts.items() if k != "lamp"}, parallel=False)
-    return np.array(mi.render(scene, spp=effort.spp, seed=mi.UInt32(seed)), np.float64)
+    return np.array(mi.render(scene, spp=effort.spp, seed=mi.UInt32(0)), np.float64)
 
 
 def furnace(mi, name: str, effort: Effort) -> Cell:

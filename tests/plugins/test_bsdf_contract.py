@@ -28,14 +28,15 @@ from bsdf_queries import (
     extreme_directions,
     gradients_enabled,
     interactions,
+    key_of,
     random_directions,
+    sphere_scene,
     texels,
     tile,
     uniform,
     vectors,
 )
 from half_vectors import HalfVectorSampling
-from spheres import key_of, sphere_scene
 from variants import VARIANTS, set_variant
 
 from mi_diffind import plugins

@@ -5,10 +5,19 @@ import drjit as dr
 import numpy as np
 import pytest
 from arrays import aligned
-from bsdf_queries import bitmap, equal_images, gradients_enabled, interactions, random_directions, texels, vectors
+from bsdf_queries import (
+    bitmap,
+    equal_images,
+    gradients_enabled,
+    interactions,
+    key_of,
+    random_directions,
+    sphere_scene,
+    texels,
+    vectors,
+)
 from disney_materials import FORMS, plugin
 from disney_materials import RICH as COLOURED
-from spheres import key_of, sphere_scene
 
 from mi_diffind.tasks.disney import TASK
 

@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import shutil
 import struct
 import zipfile
 import zlib
@@ -166,12 +165,8 @@ def views(name, picture=None, **changes):
 
     @case(name)
     def _(folder):
-        shutil.rmtree(folder / "views", ignore_errors=True)
         captures.write(folder / "views", 3, 1, 8)
-        path = folder / "views" / "transforms_train.json"
-        content = json.loads(path.read_text())
-        content["frames"][0] |= changes
-        path.write_text(json.dumps(content))
+        captures.change(folder / "views", frame=0, **changes)
         if picture:
             (folder / "views" / "train_0.png").write_bytes(large_picture(picture))
         return "capture", {"path": "views"}
