@@ -95,7 +95,7 @@ def check_arrays(table, before, untouched: list[str] | None) -> None:
 def table(path: str, original: str, untouched: list[str] | None, evaluate: bool = True) -> None:
     """Read a table file, compare it with the original, describe it, decode it and render the plugin that reads it."""
     loaded, model = bounded(lambda: opened(path), path)
-    check_arrays(load(path), original_table(original), untouched)
+    check_arrays(loaded, original_table(original), untouched)
     figures, lines = model.describe()
     check_finite(figures, "describe")
     for line in lines:
