@@ -1,5 +1,6 @@
 """Films of frames: H.264 that another decoder call reads back, panels with labels, what is refused."""
 
+import importlib.util
 import os
 import subprocess
 import sys
@@ -7,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from film_files import decoded, needs_ffmpeg
 from PIL import Image
 
 from mi_diffind.core.errors import UsageError
@@ -15,6 +15,20 @@ from mi_diffind.core.files import OutputError
 from mi_diffind.images import films
 
 ROOT = Path(__file__).resolve().parents[1]
+
+needs_ffmpeg = pytest.mark.skipif(
+    importlib.util.find_spec("imageio_ffmpeg") is None, reason="imageio-ffmpeg is not installed: pip install '.[film]'"
+)
+
+
+def decoded(path):
+    """Return the frames of a film, ``(frames, height, width, 3)`` bytes."""
+    import imageio_ffmpeg
+
+    exact = ["-vf", "scale=flags=accurate_rnd+full_chroma_int+full_chroma_inp"]
+    stream = imageio_ffmpeg.read_frames(str(path), output_params=exact)
+    width, height = next(stream)["size"]
+    return np.stack([np.frombuffer(frame, np.uint8).reshape(height, width, 3) for frame in stream])
 
 
 def smooth_frames(count, height, width):

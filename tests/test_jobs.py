@@ -1,5 +1,6 @@
 """Jobs in this process, in others, and on a Dask cluster: outcomes, lost processes, Ctrl-C."""
 
+import functools
 import gc
 import os
 import signal
@@ -111,7 +112,8 @@ def test_on_a_cluster(tmp_path):
         address = cluster.scheduler_address
         assert os.getpid() not in check(run(worker_jobs.square, VALUES, scheduler=address))
         assert "ended 3 times" in run(os._exit, {"a": 3}, scheduler=address)["a"].failure
-        killed = run(worker_jobs.kill_parent_once, {"a": str(tmp_path / "mark")}, scheduler=address)
+        kill_parent = functools.partial(worker_jobs.kill_once, process=os.getppid)
+        killed = run(kill_parent, {"a": str(tmp_path / "mark")}, scheduler=address)
         assert (tmp_path / "mark").exists() and killed["a"].value and not killed["a"].failure
 
 

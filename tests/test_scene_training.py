@@ -72,7 +72,7 @@ def one_core():
 def folder(one_core, tmp_path_factory):
     """A material, its table, and a scene of both."""
     found = tmp_path_factory.mktemp("scene")
-    scene_file(fitted(material(found, names=NAMES)), NAMES)
+    scene_file(fitted(material(found)))
     return found
 
 
@@ -477,7 +477,7 @@ def test_a_scene_is_trained(folder, tmp_path, monkeypatch):
     entries = table.arrays["cascaded"]
     table.arrays["cascaded"] = dataclasses.replace(entries, entries=255 - entries.entries)
     save_table(tmp_path / "material.npz", table)
-    scene = scene_file(tmp_path / "material.npz", NAMES)
+    scene = scene_file(tmp_path / "material.npz")
     parsed = loading.ParsedScene(scene)
     recipe = SceneRecipe(share=1.0, reference_spp=16, samples=1)
     changed = {"steps": 12, "measure_every": 6, "batch": 2048, "lr": 0.1, "schedule": "constant"}

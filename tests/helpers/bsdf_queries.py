@@ -1,5 +1,6 @@
-"""Queries of BSDFs: interactions, directions, random numbers, contexts, and textures with a texel for each material."""
+"""Queries of BSDFs: interactions, directions, random numbers, contexts, textures with a texel for each, and scenes."""
 
+import contextlib
 import math
 
 import drjit as dr
@@ -35,9 +36,9 @@ def interactions(mi, wi, texel=None, count=1):
     return si
 
 
-def random_directions(rng, n, low=0.0, high=1.0):
-    """Directions, (n, 3), uniform over the part of the hemisphere with cosines in [low, high]."""
-    return with_cosines(rng, low + (high - low) * rng.random(n))
+def random_directions(rng, n, low=0.0):
+    """Directions, (n, 3), uniform over the part of the hemisphere with cosines in [low, 1]."""
+    return with_cosines(rng, low + (1 - low) * rng.random(n))
 
 
 def with_cosines(rng, cosines):
@@ -87,10 +88,10 @@ def contexts(mi, bsdf):
     return result
 
 
-def close(a, b, rtol=1e-5, scale=1e-5):
+def close(a, b, rtol=1e-5):
     """Whether values are equal up to rounding, relative to the value and to the largest value in its row."""
     a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
-    return np.abs(a - b) <= rtol * np.maximum(np.abs(a), np.abs(b)) + rtol * scale * np.abs(b).max(initial=1e-3)
+    return np.abs(a - b) <= rtol * np.maximum(np.abs(a), np.abs(b)) + rtol * 1e-5 * np.abs(b).max(initial=1e-3)
 
 
 def equal_images(a, b):
@@ -101,3 +102,58 @@ def equal_images(a, b):
 def tile(image, i, columns, size):
     """Square ``i`` of an image of squares with a side of ``size``."""
     return image[size * (i // columns) : size * (i // columns + 1), size * (i % columns) : size * (i % columns + 1)]
+
+
+@contextlib.contextmanager
+def gradients_enabled(mi, params, keys, n):
+    """
+    Of several parameters, to be read in one kernel: numbers and colours are repeated for each of ``n`` lanes, since the
+    gradient of a single number is a sum over all lanes, which is a kernel for each.
+    """
+    for key in keys:
+        dr.enable_grad(params[key])
+    params.update()
+    given = {key: dr.detach(params[key]) for key in keys}
+    for key, value in given.items():
+        if not dr.is_tensor_v(value):
+            params[key] = value + dr.opaque(mi.Float, 0, n)
+            dr.enable_grad(params[key])
+    yield
+    for key, value in given.items():
+        params[key] = value
+    params.update()
+
+
+def sphere_scene(mi, bsdfs, integrator="path", size=16, columns=None, light=0.5, depth=3, **extra):
+    """Spheres in a square grid, one for each BSDF (or a single one), under an even sky and a lamp."""
+    bsdfs = bsdfs if isinstance(bsdfs, list) else [bsdfs]
+    columns = columns or math.ceil(math.sqrt(len(bsdfs)))
+    spheres = {
+        f"shape{i}": {
+            "type": "sphere",
+            "radius": 0.9 / columns,
+            "center": [(2 * (i % columns) + 1) / columns - 1, 1 - (2 * (i // columns) + 1) / columns, 0],
+            "bsdf": bsdf,
+        }
+        for i, bsdf in enumerate(bsdfs)
+    }
+    return mi.load_dict({
+        "type": "scene",
+        "integrator": {"type": integrator, **({"max_depth": depth} if integrator != "direct" else {})},
+        "sensor": {
+            "type": "perspective",
+            "fov": math.degrees(2 * math.atan(1 / 20)),
+            "to_world": mi.ScalarTransform4f().look_at([0, 0, 20], [0, 0, 0], [0, 1, 0]),
+            "film": {
+                "type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}, "pixel_format": "rgb",
+            },
+        },
+        "light": {"type": "constant", "radiance": light},
+        "lamp": {"type": "point", "position": [2.0, 3.0, 4.0], "intensity": 20.0},
+        **spheres,
+        **extra,
+    })  # fmt: skip
+
+
+def key_of(params, end):
+    return next(k for k in params.keys() if k.endswith(end))

@@ -6,9 +6,8 @@ import json
 import shutil
 import zlib
 from collections import Counter
-from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import captures
 import damage
@@ -18,22 +17,21 @@ from hypothesis import given
 from hypothesis.strategies import SearchStrategy
 from limited_child import FAULTS, GOOD, LimitedChild
 from PIL import Image
-from trial_files import all_seeds
+from trial_files import CHECKPOINT, all_seeds
 
 
-@dataclass(frozen=True)
-class Target:
-    """A sort of file: valid ``files`` by name, the probe that reads ``path`` among them, and how they are damaged.
+class Target(NamedTuple):
+    """A sort of file: the probe that reads ``path`` among valid ``files`` (by name), and how they are damaged.
 
     ``mutants``: form ("structured" or "raw") → name of the damaged file, and the strategy of its
     :class:`damage.Mutant`. ``arguments``: further ones of the probe.
     """
 
     probe: str
-    files: dict[str, bytes]
     path: str
+    files: dict[str, bytes]
     mutants: dict[str, tuple[str, SearchStrategy]]
-    arguments: dict = field(default_factory=dict)
+    arguments: dict
 
     def write(self, folder: Path, file: str, mutant: damage.Mutant) -> dict:
         """Write the files, one of them damaged, to ``folder``, and return the arguments of the probe."""
@@ -46,20 +44,18 @@ class Target:
         return {"path": f"mutant/{self.path}", **self.arguments, **untouched}
 
 
-def run(child, name: str, target: Target, form: str, examples: int, spare=lambda: True, share=1, seed=0) -> dict:
-    """Send ``examples`` mutants through the child, as long as ``spare()`` says that there is time; return the figures.
+def run(child, name: str, target: Target, form: str, examples: int, share=1, seed=0) -> dict:
+    """Send ``examples`` mutants through the child; return the figures.
 
     Of the table files that load, one in ``share`` is decoded and rendered. The figures are numbers of outcomes and, by
-    exception and line, the message and the lies of each fault, of the shortest file.
+    exception and line, the message and the lies of the first file of each fault.
     """
-    outcomes, faults, shortest = Counter(), {}, {}
+    outcomes, faults = Counter(), {}
     file, strategy = target.mutants[form]
 
     @damage.hostile(examples, seed)
     @given(mutant=strategy)
     def each(mutant):
-        if not spare():
-            return
         request = target.write(child.folder, file, mutant)
         if target.probe == "table":
             request["evaluate"] = zlib.crc32(mutant.data) % share == 0
@@ -69,34 +65,26 @@ def run(child, name: str, target: Target, form: str, examples: int, spare=lambda
         if outcome in FAULTS:
             end = message.rpartition(" (")[2] if outcome == "traceback" else ""
             key = f"{outcome} {message.partition(':')[0][:40]} {end}".strip()
-            if len(mutant.data) < shortest.get(key, np.inf):
-                shortest[key], faults[key] = len(mutant.data), [message, mutant.lies]
+            faults.setdefault(key, [message, mutant.lies])
 
     each()
     counted = {outcome: outcomes[outcome] for outcome in (*GOOD, *FAULTS)}
     return {"recipes": form, "target": name, "mutants": outcomes.total(), **counted, "faults": faults}
 
 
-def single(probe: str, name: str, data: bytes, structured: SearchStrategy, **arguments) -> Target:
-    """Return a target of one file."""
+def single(probe: str, name: str, data: bytes, structured=None, **arguments) -> Target:
+    """Return a target of one file; ``structured`` is a strategy of mutants, by default of other words."""
+    if structured is None:
+        structured = damage.mutants(data, (damage.other_word,))
     mutants = {"structured": (name, structured), "raw": (name, damage.mutants(data))}
-    return Target(probe, {name: data}, name, mutants, arguments)
+    return Target(probe, name, {name: data}, mutants, arguments)
 
 
-def folder(probe: str, files: dict[str, bytes], path: str, description: str, picture: str) -> Target:
+def folder(probe: str, path: str, files: dict[str, bytes], description: str, picture: str) -> Target:
     """Return a target of a folder, of which a JSON file and a picture are damaged."""
     content = damage.json_mutants(json.loads(files[description]))
     mutants = {"structured": (description, content), "raw": (picture, damage.mutants(files[picture]))}
-    return Target(probe, files, path, mutants)
-
-
-def tables() -> dict[str, Target]:
-    """Return the small table files of all tasks as targets."""
-    return {
-        name: single("table", "table.npz", path.read_bytes(), damage.archive_mutants(path.read_bytes()),
-                     original=str(path))
-        for name, (_, path) in all_seeds().items()
-    }  # fmt: skip
+    return Target(probe, path, files, mutants, {})
 
 
 def views(child: LimitedChild) -> Target:
@@ -106,7 +94,7 @@ def views(child: LimitedChild) -> Target:
     content = json.loads(files["transforms_train.json"])
     content |= {"aabb": [[-1, -1, -1], [1, 1, 1]], "fl_x": 12.0, "fl_y": 12.0, "cx": 4.0, "cy": 4.0, "w": 8, "h": 8}
     files["transforms_train.json"] = damage.dump(content)
-    return folder("capture", files, "", "transforms_train.json", "train_0.png")
+    return folder("capture", "", files, "transforms_train.json", "train_0.png")
 
 
 def manifest(child: LimitedChild) -> Target:
@@ -116,40 +104,44 @@ def manifest(child: LimitedChild) -> Target:
     colour = {"file": "colour.png", "color_space": "srgb"}
     maps = {"base_color": colour, "normal": "normal.png", "roughness": {"file": "colour.png", "channels": [0]}}
     files = {"maps.json": damage.dump({"maps": maps}), **dict.fromkeys(("colour.png", "normal.png"), path.read_bytes())}
-    return folder("manifest", files, "maps.json", "maps.json", "colour.png")
+    return folder("manifest", "maps.json", files, "maps.json", "colour.png")
 
 
-def mesh(child: LimitedChild, suffix: str) -> Target:
-    """Return a ball in a format as a target."""
-    data = solid_meshes.write(child.folder / f"valid{suffix}", solid_meshes.sphere(4, 0.8)).read_bytes()
-    return single("mesh", f"mutant{suffix}", data, damage.mutants(data, (damage.other_word,)))
-
-
-def gaussians(_) -> Target:
-    """Return 8 Gaussians in a PLY file as a target."""
+def gaussians() -> bytes:
+    """Return 8 Gaussians as a PLY file."""
     names = [*"xyz", *(f"f_dc_{i}" for i in range(3)), "opacity", *(f"scale_{i}" for i in range(3))]
     names += [f"rot_{i}" for i in range(4)]
     lines = ["ply", "format binary_little_endian 1.0", "element vertex 8", *(f"property float {n}" for n in names)]
     values = np.random.default_rng(1).normal(0, 0.5, (8, len(names))).astype("<f4")
-    data = "\n".join([*lines, "end_header\n"]).encode() + values.tobytes()
-    return single("splats", "mutant.ply", data, damage.mutants(data, (damage.other_word,)))
+    return "\n".join([*lines, "end_header\n"]).encode() + values.tobytes()
 
 
-def checkpoint(child: LimitedChild) -> Target:
-    """Return the checkpoint of a short training as a target."""
-    child.check("checkpoint", path="valid_checkpoint.npz", write=True)
-    data = (child.folder / "valid_checkpoint.npz").read_bytes()
-    return single("checkpoint", "mutant.npz", data, damage.archive_mutants(data))
-
-
-#: Targets beside table files: name → function of the child.
-OTHERS = {
-    "capture": views, "manifest": manifest,
-    **{f"mesh {suffix}": partial(mesh, suffix=suffix) for suffix in (".obj", ".ply", ".off", ".stl")},
-    "splats": gaussians, "checkpoint": checkpoint,
-}  # fmt: skip
+#: Names of all targets: table files, and others.
+TABLES = list(all_seeds())
+OTHERS = [
+    "capture",
+    "manifest",
+    *(f"mesh .{suffix}" for suffix in ("obj", "ply", "off", "stl")),
+    "splats",
+    "checkpoint",
+]
 
 
 def target(name: str, child: LimitedChild) -> Target:
-    """Return a target by its name."""
-    return OTHERS[name](child) if name in OTHERS else tables()[name]
+    """Return a target by its name: a small table file, one of the other files, or a ball in a format of meshes."""
+    match name.split():
+        case ["capture"]:
+            return views(child)
+        case ["manifest"]:
+            return manifest(child)
+        case ["mesh", suffix]:
+            path = solid_meshes.write(child.folder / f"valid{suffix}", solid_meshes.sphere(4, 0.8))
+            return single("mesh", f"mutant{suffix}", path.read_bytes())
+        case ["splats"]:
+            return single("splats", "mutant.ply", gaussians())
+        case ["checkpoint"]:
+            data = CHECKPOINT.read_bytes()
+            return single("checkpoint", "mutant.npz", data, damage.archive_mutants(data))
+    path = all_seeds()[name]
+    data = path.read_bytes()
+    return single("table", "table.npz", data, damage.archive_mutants(data), original=str(path))

@@ -57,16 +57,13 @@ def ball(pose, side, centre, radius, linear):
 def picture(pose, side):
     """sRGB and alpha, uint8: a red ball with stripes, and a blue one."""
 
-    def shaded(colour):
-        def linear(d, n):
-            light = np.clip(n @ [0.5, 0.7, 0.5], 0, 1)[..., None] * (0.7 + 0.3 * np.sign(np.sin(9 * n[..., 1:2])))
-            return (0.35 + 0.65 * light) * colour
-
-        return linear
+    def shaded(n, colour):
+        light = np.clip(n @ [0.5, 0.7, 0.5], 0, 1)[..., None] * (0.7 + 0.3 * np.sign(np.sin(9 * n[..., 1:2])))
+        return (0.35 + 0.65 * light) * colour
 
     balls = ([-0.25, 0, 0.1], 0.35, [0.9, 0.3, 0.2]), ([0.3, 0.1, -0.1], 0.25, [0.2, 0.4, 0.9])
-    near, far = sorted(balls, key=lambda ball: np.linalg.norm(pose[:3, 3] - ball[0]))
-    near, far = (ball(pose, side, centre, radius, shaded(colour)) for centre, radius, colour in (near, far))
+    balls = sorted(balls, key=lambda ball: np.linalg.norm(pose[:3, 3] - ball[0]))
+    near, far = (ball(pose, side, at, radius, lambda _, n, c=colour: shaded(n, c)) for at, radius, colour in balls)
     return np.where(near[..., 3:] > 0, near, far)
 
 
@@ -83,8 +80,7 @@ def write(folder, views=12, test=3, side=24, picture=picture):
             name = f"{split}_{k}.png"
             Image.fromarray(picture(pose, side)).save(folder / name)
             frames.append({"file_path": name, "transform_matrix": pose.tolist()})
-        content = {"camera_angle_x": ANGLE, "frames": frames}
-        (folder / f"transforms_{split}.json").write_text(json.dumps(content), encoding="utf-8")
+        write_json(folder / f"transforms_{split}.json", camera_angle_x=ANGLE, frames=frames)
     return folder
 
 

@@ -4,6 +4,7 @@ rearrangements of ``mi_diffind.tasks.disney.model``: the independent reference o
 """
 
 import numpy as np
+from bsdf_queries import random_directions
 
 NAMES = (
     "metallic", "roughness", "anisotropic", "specular", "spec_tint", "sheen", "sheen_tint", "flatness", "clearcoat",
@@ -73,14 +74,7 @@ def random_case(rng, n, low_cosine=0.0, rate=0.0):
     Random materials and directions (uniform over the hemisphere, cosines ≥ low_cosine). Parameters are uniform, or
     metallic and roughness of an exponential-like distribution of a ``rate``.
     """
-
-    def directions():
-        z = low_cosine + (1 - low_cosine) * rng.random(n)
-        phi = 2 * np.pi * rng.random(n)
-        r = np.sqrt(1 - z * z)
-        return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1)
-
     color, m = rng.random((n, 3)), {k: rng.random(n) for k in NAMES}
     for name in ("metallic", "roughness") if rate else ():  # the inverse of its cumulative distribution
         m[name] = -np.log(1 - m[name] * (1 - np.exp(-rate))) / rate
-    return color, m, directions(), directions()
+    return color, m, *(random_directions(rng, n, low_cosine) for _ in range(2))

@@ -30,20 +30,8 @@ def register_probe() -> None:
             ddx, ddy = footprint.footprint(si, self.cone)
             return mi.Color3f(dr.sqrt(footprint.area(ddx, ddy)), footprint.axes(ddx, ddy)[0], 1)
 
-        def eval_1(self, si, active=True):
-            return mi.Float(0.5)
-
         def eval_3(self, si, active=True):
             return self.eval(si, active)
-
-        def mean(self):
-            return mi.Float(0.5)
-
-        def is_spatially_varying(self):
-            return True
-
-        def traverse(self, cb):
-            pass
 
     mi.register_texture("probe", Probe)
 
@@ -102,7 +90,7 @@ def refracted(ior: float):
     return follow
 
 
-def truth(scene, chain=(), step: float = 0.5) -> tuple:
+def truth(scene, chain=()) -> tuple:
     """
     The hit of the central rays, and ``ddx, ddy`` as NumPy arrays ``(n, 2)``, and where they are to be trusted: all five
     rays meet the same shapes, and the last within a small piece of the texture. ``chain``: what follows a ray at each
@@ -116,11 +104,11 @@ def truth(scene, chain=(), step: float = 0.5) -> tuple:
 
     centre, valid, _, shapes = hit(0, 0)
     uv = []
-    for place in ((step, 0), (-step, 0), (0, step), (0, -step)):
+    for place in ((0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5)):
         _, there, found, met = hit(*place)
         valid &= there & np.all([a == b for a, b in zip(shapes, met, strict=True)], axis=0)
         uv.append(found)
-    ddx, ddy = (uv[0] - uv[1]) / (2 * step), (uv[2] - uv[3]) / (2 * step)
+    ddx, ddy = uv[0] - uv[1], uv[2] - uv[3]
     valid &= np.maximum(np.abs(ddx).max(axis=1), np.abs(ddy).max(axis=1)) < 0.3
     return centre, ddx, ddy, valid
 

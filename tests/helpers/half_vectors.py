@@ -44,12 +44,6 @@ class HalfVectorSampling:
     def pdf(self, p):
         return self.mapped(p, lambda si, wo: self.bsdf.pdf(self.ctx, si, wo))
 
-    def integral(self, function, side=256):
-        """Integral over directions of ``function(si, wo)``, an array, on a grid of half vectors."""
-        mi = self.mi
-        x = (dr.arange(mi.Float, side) + 0.5) / side
-        return float(dr.mean(self.mapped(mi.Point2f(*dr.meshgrid(x, x)), function))[0])
-
     def mapped(self, p, function):
         """Return ``function(si, wo)``, per solid angle, as a density of the coordinates."""
         q = self.a2 * (dr.exp(p.y * self.log) - 1)

@@ -97,14 +97,23 @@ def rays(rng, count: int, lower, upper, spacing: float):
 def write_fields(folder: Path) -> None:
     """Write small fields, each to a file of ``folder``."""
     from radiance_fields import ball_table
-    from sdf_fields import dense_table, sparse_table
+    from sdf_fields import sparse_table
+    from trial_files import SEEDS
 
     tables = {
-        "sparse": sparse_table(), "sparse_float32": sparse_table(), "dense": dense_table(), "field": ball_table(),
-        "surroundings": ball_table((0, 0, 0, 0.6)),
+        "sparse": sparse_table(), "sparse_float32": sparse_table(), "dense": load_table(SEEDS / "sdf_paper.npz"),
+        "field": ball_table(), "surroundings": ball_table((0, 0, 0, 0.6)),
     }  # fmt: skip
     for name, table in tables.items():
         save_table(folder / f"{name}.npz", table)
+
+
+def is_wrong(values, least=-np.inf):
+    """Return where one of several arrays is not finite, or less than ``least``."""
+    wrong = mi.Bool(False)
+    for value in values:
+        wrong |= ~dr.isfinite(value) | (value < least)
+    return wrong
 
 
 def in_scene(scene: dict):
@@ -174,13 +183,10 @@ def trace(folder: str, count: int) -> dict:
             for size in parts(count):
                 o, d, length = rays(rng, size, *box)
                 met, values = follow(rows(mi.Point3f, o), rows(mi.Vector3f, d), mi.Float(length))
-                finite = mi.Bool(True)
-                for value in values:
-                    finite &= dr.isfinite(value)
-                dr.eval(met, finite)
-                numbers["rays"] += size
-                numbers["met"] += int(dr.count(met)[0])
-                numbers["not_finite"] += int(dr.count(~finite)[0])
+                wrong = is_wrong(values)
+                dr.eval(met, wrong)
+                for key, number in (("rays", size), ("met", dr.count(met)[0]), ("not_finite", dr.count(wrong)[0])):
+                    numbers[key] += int(number)
             report[name] = numbers
     return report
 
@@ -273,12 +279,7 @@ def faults(name: str, count: int) -> dict[str, list]:
         for size in parts(count):
             given = queries(rng, size)
             for answer, values in answers(plugin, given).items():
-                wrong = mi.Bool(False)
-                for value in values:
-                    wrong |= ~dr.isfinite(value)
-                    if answer != "sample":
-                        wrong |= value < 0
-                where = np.flatnonzero(np.broadcast_to(np.array(wrong), size))
+                where = np.flatnonzero(np.broadcast_to(is_wrong(values, -np.inf if answer == "sample" else 0), size))
                 if len(where):
                     at = where[0]
                     numbers = [float(np.broadcast_to(np.array(v), size)[at]) for v in values]

@@ -1,6 +1,6 @@
 """Functions that read a file as a user would; :mod:`limited_child` calls them in a child process.
 
-Each raises what the library raises, or returns its outcome where that is not "loaded".
+Each raises what the library raises, or a fault; it returns further figures of an answer, if there are any.
 """
 
 from __future__ import annotations
@@ -14,9 +14,10 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from limited_child import Growth, fault_of_sentence
+from limited_child import Fault, fault_of_sentence, status
 
 from mi_diffind.arrays.tables import load_table
+from mi_diffind.core.errors import UsageError
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting.task import Model, find_task
 
@@ -38,44 +39,28 @@ def prepare() -> None:
     mi.render(mi.load_dict({**scene, "shape": {"type": "rectangle"}, "light": {"type": "constant"}}), spp=1).numpy()
 
 
-def outcome(name: str, message: str) -> dict:
-    """Return an answer."""
-    return {"outcome": name, "message": message}
-
-
 def bounded(read, path: str):
     """Return the result of a reader. Raises ``MemoryError`` if it takes more than the file or folder allows."""
-    files = [file for file in [Path(path), *Path(path).rglob("*")] if file.is_file()]
-    size = sum(file.stat().st_size for file in files)
+    size = sum(file.stat().st_size for file in [Path(path), *Path(path).rglob("*")] if file.is_file())
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")  # the largest use begins anew
+    before = status("VmHWM")
     try:
-        with Growth() as growth:
-            return read()
+        return read()
     finally:
-        if growth.bytes > MEMORY + TIMES * size:
-            raise MemoryError(f"{growth.bytes / 2**20:,.0f} MB for {size:,} bytes")
+        if (growth := status("VmHWM") - before) > MEMORY + TIMES * size:
+            raise MemoryError(f"{growth / 2**20:,.0f} MB for {size:,} bytes")
 
 
-def finite(**values) -> dict | None:
-    """Return the outcome for a number in nested content that is not finite, ``None`` if all are."""
-    name = nonfinite(values)
-    return outcome("nonfinite", name) if name else None
-
-
-def nonfinite(value, name: str = "") -> str:
-    """Return the name of a number in nested content that is not finite, "" if all are."""
-    if isinstance(value, dict):
-        return next(filter(None, (nonfinite(v, f"{name}.{k}") for k, v in value.items())), "")
-    if isinstance(value, list | tuple):
-        return next(filter(None, (nonfinite(v, f"{name}[{i}]") for i, v in enumerate(value))), "")
-    if hasattr(value, "vertices"):
-        return nonfinite(np.asarray(value.vertices), f"{name}.vertices")
-    number = isinstance(value, float | np.floating) or (isinstance(value, np.ndarray) and value.dtype.kind == "f")
-    return name if number and not np.isfinite(value).all() else ""
-
-
-def printable(lines) -> dict | None:
-    """Return the outcome for a line that a terminal would obey."""
-    return next((outcome("sentence", f"{line!r:.200}") for line in lines if not line.isprintable()), None)
+def check_finite(value, name: str = "") -> None:
+    """Raise a fault for a number in nested content that is not finite."""
+    if isinstance(value, dict | list | tuple):
+        for key, each in value.items() if isinstance(value, dict) else enumerate(value):
+            check_finite(each, f"{name}.{key}")
+        return
+    numbers = np.asarray(getattr(value, "vertices", value))
+    if numbers.dtype.kind == "f" and not np.isfinite(numbers).all():
+        raise Fault("nonfinite", name)
 
 
 # -- table files -------------------------------------------------------------------------------------------------------
@@ -90,36 +75,36 @@ def load(path: str):
 original_table = functools.lru_cache(maxsize=32)(load)
 
 
-def changed_array(table, before, untouched: list[str] | None) -> str:
-    """Return the name of an array that differs from the original's without a reason, "" if none does.
+def check_arrays(table, before, untouched: list[str] | None) -> None:
+    """Raise a fault for an array that differs from the original's without a reason.
 
     ``untouched`` are those that nothing was done to; ``None``: nothing was done to any, nor to the description.
     """
     if untouched is None:
+        untouched = list(before.arrays)
         for name in ("task", "preset", "settings", "seed", "measured"):
             if getattr(table, name) != getattr(before, name):
-                return name
-    for name in before.arrays if untouched is None else untouched:
+                raise Fault("silent", f"{name} differs")
+    for name in untouched:
         both = [t.arrays[name] for t in (table, before) if name in t.arrays]
         about = [(x.entries.dtype, x.shape, x.border, x.scale, x.offset, x.bits, x.entries.tobytes()) for x in both]
         if len(about) == 2 and about[0] != about[1]:
-            return name
-    return ""
+            raise Fault("silent", f"{name} differs")
 
 
-def table(path: str, original: str, untouched: list[str] | None, evaluate: bool = True) -> dict | None:
+def table(path: str, original: str, untouched: list[str] | None, evaluate: bool = True) -> None:
     """Read a table file, compare it with the original, describe it, decode it and render the plugin that reads it."""
     loaded, model = bounded(lambda: opened(path), path)
-    if name := changed_array(load(path), original_table(original), untouched):
-        return outcome("silent", f"{name} differs")
+    check_arrays(loaded, original_table(original), untouched)
     figures, lines = model.describe()
-    if fault := finite(describe=figures) or printable(lines):
-        return fault
-    if not evaluate:
-        return None
-    if fault := finite(decode=decoded(model)):
-        return fault
-    return finite(picture=rendered(path)) if find_task(loaded).plugin else None
+    check_finite(figures, "describe")
+    for line in lines:
+        if not line.isprintable():  # a terminal would obey it
+            raise Fault("sentence", f"{line!r:.200}")
+    if evaluate:
+        check_finite(decoded(model), "decode")
+        if find_task(loaded).plugin:
+            check_finite(rendered(path), "picture")
 
 
 def opened(path: str) -> tuple:
@@ -159,40 +144,40 @@ def rendered(path: str) -> np.ndarray:
 # -- other files -------------------------------------------------------------------------------------------------------
 
 
-def capture(path: str) -> dict | None:
+def capture(path: str) -> None:
     """Read the views of a folder, and one image of them."""
     from mi_diffind.tasks.radiance.views import load_views
 
     views = bounded(lambda: load_views(path), path)
-    return finite(image=views.image(0), poses=views.poses, focal=views.focal, centre=views.centre)
+    check_finite([views.image(0), views.poses, views.focal, views.centre])
 
 
-def manifest(path: str) -> dict | None:
+def manifest(path: str) -> None:
     """Read the maps of a material."""
     from mi_diffind.maps.source import load_source
 
     source = bounded(lambda: load_source(path), str(Path(path).parent))
-    return finite(**{m.name: m.values for m in source.maps})
+    check_finite({m.name: m.values for m in source.maps})
 
 
-def mesh(path: str) -> dict | None:
+def mesh(path: str) -> None:
     """Read a mesh for a distance field."""
     from mi_diffind.tasks.sdf.mesh import load_mesh
 
-    return finite(mesh=bounded(lambda: load_mesh(path), path))
+    check_finite(bounded(lambda: load_mesh(path), path), "mesh")
 
 
-def splats(path: str) -> dict | None:
+def splats(path: str) -> None:
     """Read Gaussians, and crop them."""
     from mi_diffind.scenes.splats import Splats
 
     loaded = bounded(lambda: Splats.read(path), path)
     names = ("centres", "scales", "quaternions", "opacities", "colours")
-    return finite(**{name: getattr(loaded, name) for name in names}) or finite(box=loaded.crop().box())
+    check_finite({name: getattr(loaded, name) for name in names} | {"box": loaded.crop().box()})
 
 
-def checkpoint(path: str, write: bool = False) -> dict | None:
-    """Go on with a short training from a checkpoint; ``write``: make the checkpoint instead."""
+def checkpoint(path: str) -> None:
+    """Go on with a short training from a checkpoint, or begin it where there is none."""
     from mi_diffind.fitting.loop import FitSettings, fit
     from mi_diffind.fitting.task import FitRequest
     from mi_diffind.tasks.ggx import TASK
@@ -202,11 +187,11 @@ def checkpoint(path: str, write: bool = False) -> dict | None:
     request = FitRequest("tables", settings, types, options={"primary": 4, "cascaded": 3})
     problem = TASK.problem(request)
     problem.measure = lambda net: {"psnr_db": 1.0}
-    result = fit(problem, settings, path, not write, False, log=lambda text: None)
-    return finite(**{name: problem.net[name].numpy() for name in problem.net}, measured=result.measured)
+    result = fit(problem, settings, path, Path(path).exists(), False, log=lambda text: None)
+    check_finite([{name: problem.net[name].numpy() for name in problem.net}, result.measured])
 
 
-def command(arguments: list[str]) -> dict | None:
+def command(arguments: list[str]) -> None:
     """Run a command line; it has to end with an exit code and, if it is refused, in one sentence."""
     from mi_diffind.commands import cli
 
@@ -219,23 +204,25 @@ def command(arguments: list[str]) -> dict | None:
     dr.sync_thread()
     printed = out.getvalue() + err.getvalue()
     if any(not (c.isprintable() or c in "\n\r\t") for c in printed):
-        return outcome("sentence", f"control characters: {printed!r:.200}")
+        raise Fault("sentence", f"control characters: {printed!r:.200}")
     if code in (0, 1, None):
-        return None
+        return
     if code != 2:
-        return outcome("traceback", f"exit code {code}")
+        raise Fault("traceback", f"exit code {code}")
     sentences = [line for line in err.getvalue().splitlines() if ": error: " in line]
     if len(sentences) != 1:
-        return outcome("sentence", f"{len(sentences)} sentences: {err.getvalue()[-200:]!r}")
-    fault = fault_of_sentence(sentences[0])
-    return outcome("sentence", f"{fault}: {sentences[0]}") if fault else outcome("refused", sentences[0])
+        raise Fault("sentence", f"{len(sentences)} sentences: {err.getvalue()[-200:]!r}")
+    if fault := fault_of_sentence(sentences[0]):
+        raise Fault("sentence", f"{fault}: {sentences[0]}")
+    raise UsageError(sentences[0])
 
 
-def still_ray(path: str) -> dict | None:
+def still_ray(path: str) -> None:
     """Intersect a distance field with rays that have no direction."""
     shape = mi.load_dict({"type": "scene", "shape": {"type": "neural_sdf", "filename": path}})
     t = shape.ray_intersect(mi.Ray3f(mi.Point3f([0.0, 0.1, 5.0], 0.0, 0.0), mi.Vector3f(0, 0, 0))).t.numpy()
-    return outcome("nonfinite", "t is NaN") if np.isnan(t).any() else None
+    if np.isnan(t).any():
+        raise Fault("nonfinite", "t is NaN")
 
 
 def rays(folder: str, count: int) -> dict:

@@ -116,9 +116,9 @@ def formula(table: Table, wi, wo) -> np.ndarray:
 FAMILY = ({"name": "roughness", "low": 0.05, "high": 0.8}, {"name": "metallic", "low": 0.0, "high": 1.0})
 
 
-def handmade_family(rank=2, **changes) -> Table:
+def handmade_family(**changes) -> Table:
     """Return a table of a family over :data:`FAMILY` with smooth proxies and random bytes; ``changes`` of its form."""
-    rng = np.random.default_rng(6)
+    rng, rank = np.random.default_rng(6), 2
     form = Form(**{"range": (-0.6, 0.5), **changes})
     arrays = {name: byte_array(rng.integers(0, 256, shape), 1 / 255) for name, shape in SIZES.items()}
     arrays["cascaded"] = byte_array(rng.integers(0, 256, (*SIZES["cascaded"][:3], 3 * rank)), 1 / 255)

@@ -27,24 +27,22 @@ FAULTS = ("sentence", "traceback", "silent", "nonfinite", "out of bounds", "memo
 #: Address space beyond that of the started child, in bytes.
 ROOM = 3 << 30
 
-#: Seconds of processor time of one request, which do not depend on what else the machine does.
-BUSY = 20
-
-#: Seconds of the clock after which a request that takes no processor time is ended.
-IDLE = 300
-
 #: Longest sentence, in characters.
 LONGEST = 300
+
+
+class Fault(Exception):
+    """A fault that a probe found: outcome and message."""
 
 
 class LimitedChild:
     """A child process in ``folder``, started by the first request, and again after a request that ended it.
 
-    ``busy`` and ``idle`` are the seconds of a request by the processor and by the clock; ``probes`` is the module of
-    the functions that requests name.
+    ``busy`` are the seconds of processor time of a request, which do not depend on what else the machine does, ``idle``
+    those of the clock; ``probes`` is the module of the functions that requests name.
     """
 
-    def __init__(self, folder: Path, busy: int = BUSY, idle: float = IDLE, probes: str = "hostile_probes"):
+    def __init__(self, folder: Path, busy: int = 20, idle: float = 300, probes: str = "hostile_probes"):
         self.folder, self.busy, self.idle, self.probes = Path(folder), busy, idle, probes
         self.process = None
         self.starts = 0
@@ -53,9 +51,6 @@ class LimitedChild:
         return self
 
     def __exit__(self, *_) -> None:
-        self.stop()
-
-    def stop(self) -> None:
         """End the child."""
         if self.process is not None:
             self.process.kill()
@@ -94,7 +89,7 @@ class LimitedChild:
             code = self.process.exitcode
             name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
             ended = {"outcome": "hang" if name == "SIGXCPU" else "crash", "message": name}
-        self.stop()
+        self.__exit__()
         return ended
 
 
@@ -105,19 +100,6 @@ def status(key: str) -> int:
     """Return a number of bytes in ``/proc/self/status``, such as ``VmHWM``, the largest use of memory."""
     text = Path("/proc/self/status").read_text()
     return 1024 * int(text.partition(f"{key}:")[2].split()[0])
-
-
-class Growth:
-    """Growth of the largest use of memory in a ``with`` block, in bytes."""
-
-    def __enter__(self):
-        with contextlib.suppress(OSError):
-            Path("/proc/self/clear_refs").write_text("5")  # the largest use begins anew
-        self.before = status("VmHWM")
-        return self
-
-    def __exit__(self, *_):
-        self.bytes = status("VmHWM") - self.before
 
 
 def fault_of_sentence(message: str) -> str:
@@ -135,25 +117,26 @@ def answer_to(function, arguments: dict, log) -> dict:
 
     log.seek(0)
     log.truncate()
+    figures = {}
     try:
-        answer = {"outcome": "loaded", "message": "", **(function(**arguments) or {})}
+        figures, outcome, message = function(**arguments) or {}, "loaded", ""
+    except Fault as e:
+        outcome, message = e.args
     except DiffindError as e:
         fault = fault_of_sentence(str(e))
-        answer = {"outcome": "sentence" if fault else "refused", "message": f"{fault}: {e}" if fault else str(e)}
+        outcome, message = ("sentence", f"{fault}: {e}") if fault else ("refused", str(e))
     except MemoryError as e:
-        answer = {"outcome": "memory", "message": f"MemoryError: {e}"}
+        outcome, message = "memory", f"MemoryError: {e}"
     except Exception as e:
         place = traceback.extract_tb(e.__traceback__)[-1]
-        where = f"{Path(place.filename).name}:{place.lineno}"
-        answer = {"outcome": "traceback", "message": f"{type(e).__name__}: {e} ({where})"}
+        outcome, message = "traceback", f"{type(e).__name__}: {e} ({Path(place.filename).name}:{place.lineno})"
     log.seek(0)
     written = log.read().decode(errors="replace")
     # Sums of several threads go to a copy of the array for each, which Dr.Jit reports, too: only reads count
     reads = [line for line in written.splitlines() if "out-of-bounds" in line and " read " in line]
-    if reads and answer["outcome"] in GOOD:
-        answer |= {"outcome": "out of bounds", "message": reads[0]}
-    answer["message"] = answer["message"][:500]
-    return answer
+    if reads and outcome in GOOD:
+        outcome, message = "out of bounds", reads[0]
+    return {"outcome": outcome, "message": message[:500], **figures}
 
 
 def serve(pipe, folder: str, busy: int, module: str) -> None:
@@ -181,7 +164,5 @@ def serve(pipe, folder: str, busy: int, module: str) -> None:
                 probe, arguments = pipe.recv()
             except EOFError:
                 return
-            start = time.process_time()
-            resource.setrlimit(resource.RLIMIT_CPU, (int(start) + busy, resource.RLIM_INFINITY))
-            answer = answer_to(getattr(probes, probe), arguments, log)
-            pipe.send({**answer, "seconds": round(time.process_time() - start, 3)})
+            resource.setrlimit(resource.RLIMIT_CPU, (int(time.process_time()) + busy, resource.RLIM_INFINITY))
+            pipe.send(answer_to(getattr(probes, probe), arguments, log))

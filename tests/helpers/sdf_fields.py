@@ -121,11 +121,12 @@ def coded_table(coding):
     return Table("sdf", arrays, "sparse", settings)
 
 
-def sparse_table(shape=torus, spacing=1 / 40, entries=256, scale=2.0, centre=(0.5, -1.0, 0.25)):
+def sparse_table(shape=torus, entries=256, scale=2.0, centre=(0.5, -1.0, 0.25)):
     """The table of a formula's sparse field, as ``fit sdf`` would write it; pointers have 8 bits."""
     from mi_diffind.arrays.sparse_grid import SparseGrid, cell_corners, complete_cells
     from mi_diffind.tasks.sdf import encoding
 
+    spacing = 1 / 40
     lower = np.array([-0.5, -0.5, -0.5]) - 1.5 * spacing
     n = int(np.ceil((1 + 3 * spacing) / spacing)) + 1
 
@@ -142,26 +143,6 @@ def sparse_table(shape=torus, spacing=1 / 40, entries=256, scale=2.0, centre=(0.
     table = coded_table(coded(sampled, entries))
     table.settings |= {"scale": scale, "centre": list(centre)}
     return table
-
-
-def dense_table(shape=torus, half=(0.6, 0.6, 0.25), resolution=(48, 48, 20), scale=2.0, centre=(0.5, -1.0, 0.25)):
-    """The table of a formula's field in two dense arrays, as ``fit sdf --preset dense`` starts."""
-    from mi_diffind.arrays.tables import StoredArray, Table
-    from mi_diffind.core.runtime import array_module
-    from mi_diffind.tasks.sdf import paper
-
-    upper, band = np.array(half), 0.1
-
-    def distance(sides):
-        axes = [np.linspace(-x, x, n) for x, n in zip(upper, sides, strict=True)]
-        return shape(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3))[0].reshape(sides)
-
-    net = paper.initial("distance", resolution, (4, 4, 4), distance, None, None, band)
-    net = paper.stored_form(net.alloc(array_module("llvm").TensorXf))
-    arrays = {"primary": StoredArray.of(net.primary[0]), "cascaded": StoredArray.of(net.cascaded)}
-    settings = {"layout": "pair", "lower": (-upper).tolist(), "upper": upper.tolist(), "band": band, "scale": scale}
-    settings |= {"slope": paper.slope_bound(net, -upper, upper, band), "centre": list(centre)}
-    return Table("sdf", arrays, "dense", settings)
 
 
 def register(mi, fields: dict, name: str = "test_solid") -> None:

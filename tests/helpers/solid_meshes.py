@@ -3,35 +3,20 @@
 import numpy as np
 import trimesh
 
-CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
-CUBE_FACES = np.array([
-    [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
-    [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
-])  # fmt: skip
-
 
 def box(size=(1, 1, 1), centre=(0, 0, 0)):
     """Vertices and faces of a box."""
-    return (CUBE - 0.5) * np.array(size) + np.array(centre), CUBE_FACES.copy()
+    cube = trimesh.creation.box(size)
+    return np.array(cube.vertices) + centre, np.array(cube.faces)
 
 
 def sphere(rings=16, radius=1.0, centre=(0, 0, 0)):
     """Vertices and faces of a sphere of ``rings`` × 2·``rings`` cells; all vertices lie on it."""
-    columns = 2 * rings
-    theta = np.pi * np.arange(1, rings) / rings
-    phi = 2 * np.pi * np.arange(columns) / columns
-    t, f = np.meshgrid(theta, phi, indexing="ij")
-    ring = np.stack([np.sin(t) * np.cos(f), np.sin(t) * np.sin(f), np.cos(t)], axis=-1).reshape(-1, 3)
-    vertices = np.concatenate([[[0, 0, 1]], ring, [[0, 0, -1]]])
-    last, faces = len(vertices) - 1, []
-    for j in range(columns):
-        k = (j + 1) % columns
-        faces.append([0, 1 + j, 1 + k])
-        faces.append([last, last - columns + k, last - columns + j])
-        for i in range(rings - 2):
-            a, b = 1 + i * columns, 1 + (i + 1) * columns
-            faces += [[a + j, b + j, b + k], [a + j, b + k, a + k]]
-    return vertices * radius + np.array(centre), np.array(faces)
+    angle = np.linspace(-np.pi / 2, np.pi / 2, rings + 1)
+    outline = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    outline[[0, -1], 0] = 0
+    ball = trimesh.creation.revolve(outline, sections=2 * rings)
+    return np.array(ball.vertices) + centre, np.array(ball.faces)
 
 
 def together(*meshes):

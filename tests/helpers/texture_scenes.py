@@ -80,25 +80,22 @@ def emission(mi) -> dict:
             si = scene.ray_intersect(ray, active)
             return si.emitter(scene, active).eval(si, active), si.is_valid(), []
 
-        def to_string(self):
-            return "Emission[]"
-
     mi.register_integrator("emission", Emission)
     return {"type": "emission"}
 
 
-def plane(mi, texture, spp=1, sampler="stratified", size=48, sensor=None, shape=None, integrator=None):
+def plane(mi, texture, spp=1, sampler="stratified", size=48, shape=None):
     """A plane to the horizon that shines as its texture says, without any noise but that of the places in a pixel."""
     t = mi.ScalarTransform4f()
     film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
     jitter = {"jitter": False} if sampler == "stratified" else {}
     return mi.load_dict({
         "type": "scene",
-        "integrator": integrator or emission(mi),
+        "integrator": emission(mi),
         "sensor": {
             "type": "perspective", "film": film,
             "sampler": {"type": sampler, "sample_count": spp, **jitter},
-            "to_world": t.look_at([0, -2.5, 0.5], [0, 0, 0], [0, 0, 1]), **(sensor or {"fov": 60}),
+            "to_world": t.look_at([0, -2.5, 0.5], [0, 0, 0], [0, 0, 1]), "fov": 60,
         },
         "plane": shape or {
             "type": "rectangle", "to_world": t.scale(6), "emitter": {"type": "area", "radiance": texture}
@@ -138,41 +135,39 @@ def alive(name):
     return [type(o).__name__ for o in gc.get_objects()].count(name)
 
 
-def check_process(texture, variants):
+def check_process(texture):
     """
-    In a process of its own: a scalar variant refuses ``texture`` with a sentence; in ``variants``, a lamp and a ball
-    with it are rendered and optimised; and in the end nothing leaks that nanobind and Dr.Jit count.
+    In a process of its own: a scalar variant refuses ``texture`` with a sentence; then a lamp and a ball with it are
+    rendered and optimised; and in the end nothing leaks that nanobind and Dr.Jit count.
     """
     script = f"""
         import drjit as dr, mi_diffind, mitsuba as mi
         mi.set_variant("scalar_rgb")
+        texture = {texture!r}
         try:
-            mi.load_dict({texture!r})
+            mi.load_dict(texture)
         except RuntimeError as e:
             print(e)
-        for variant in {variants!r}:
-            mi.set_variant(variant)
-            from mi_diffind.plugins.support import footprint
-            texture = {texture!r}
-            scene = mi.load_dict({{
-                "type": "scene",
-                "integrator": {{"type": "prb", "max_depth": 3}},
-                "sensor": {{"type": "perspective", "film": {{"type": "hdrfilm", "width": 8, "height": 8}}}},
-                "lamp": {{"type": "sphere", "center": [0, 0, 4], "emitter": {{"type": "area", "radiance": texture}}}},
-                "ball": {{"type": "sphere", "center": [2, 0, 4],
-                         "bsdf": {{"type": "diffuse", "reflectance": texture}}}},
-            }})
-            footprint.attach(scene)
-            params = mi.traverse(scene)
-            key = next(k for k in params.keys() if k.endswith("tables.cascaded"))
-            dr.enable_grad(params[key])
-            params.update()
-            dr.backward(dr.sum(mi.render(scene, params, spp=2).array))
-            print("gradients", dr.width(dr.grad(params[key]).array) > 1)
+        mi.set_variant("llvm_ad_rgb")
+        from mi_diffind.plugins.support import footprint
+        scene = mi.load_dict({{
+            "type": "scene",
+            "integrator": {{"type": "prb", "max_depth": 3}},
+            "sensor": {{"type": "perspective", "film": {{"type": "hdrfilm", "width": 8, "height": 8}}}},
+            "lamp": {{"type": "sphere", "center": [0, 0, 4], "emitter": {{"type": "area", "radiance": texture}}}},
+            "ball": {{"type": "sphere", "center": [2, 0, 4], "bsdf": {{"type": "diffuse", "reflectance": texture}}}},
+        }})
+        footprint.attach(scene)
+        params = mi.traverse(scene)
+        key = next(k for k in params.keys() if k.endswith("tables.cascaded"))
+        dr.enable_grad(params[key])
+        params.update()
+        dr.backward(dr.sum(mi.render(scene, params, spp=2).array))
+        print("gradients", dr.width(dr.grad(params[key]).array) > 1)
         del scene, params
     """
     done = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     refusal = f'"{texture["type"]}" does not run in the variant "scalar_rgb"; use one of llvm_ad_rgb'
-    assert refusal in done.stdout and done.stdout.count("gradients True") == len(variants), done.stdout
+    assert refusal in done.stdout and "gradients True" in done.stdout, done.stdout
     assert "leak" not in done.stderr.lower(), done.stderr

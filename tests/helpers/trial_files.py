@@ -13,7 +13,11 @@ import numpy as np
 
 from mi_diffind.fitting.task import DATA, Task, tasks
 
-SEEDS = Path(__file__).resolve().parents[1] / "trust" / "corpus" / "seeds"
+CORPUS = Path(__file__).resolve().parents[1] / "trust" / "corpus"
+SEEDS = CORPUS / "seeds"
+
+#: Checkpoint of a training of two steps (``checkpoint`` of :mod:`hostile_probes`).
+CHECKPOINT = CORPUS / "checkpoint.npz"
 
 #: Task → name → keywords of :func:`mi_diffind.fit` for a fit of seconds, one for each layout of its files.
 TRIALS = {
@@ -57,9 +61,9 @@ def seeds(task: Task) -> dict[str, Path]:
     return {**trials, **{f"{task.name}_shipped_{name}": DATA / file for name, file in task.shipped.items()}}
 
 
-def all_seeds() -> dict[str, tuple[Task, Path]]:
+def all_seeds() -> dict[str, Path]:
     """Return the small files of all tasks."""
-    return {name: (task, path) for task in tasks().values() if has_files(task) for name, path in seeds(task).items()}
+    return {name: path for task in tasks().values() if has_files(task) for name, path in seeds(task).items()}
 
 
 def sources(folder: Path) -> dict:

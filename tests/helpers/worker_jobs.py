@@ -38,11 +38,6 @@ def kill_once(mark, process=os.getpid):
     return os.getpid()
 
 
-def kill_parent_once(mark):
-    """Kill the parent once, as :func:`kill_once`."""
-    return kill_once(mark, os.getppid)
-
-
 def interrupt(x):
     """Send this process a Ctrl-C if ``x`` is 2, and return it; a word fails after the Ctrl-C."""
     if x == 2 or isinstance(x, str):

@@ -25,14 +25,16 @@ from bsdf_queries import (
     contexts,
     equal_images,
     extreme_directions,
+    gradients_enabled,
     interactions,
+    key_of,
     random_directions,
+    sphere_scene,
     texels,
     tile,
     uniform,
     vectors,
 )
-from gradients import gradients_enabled
 from half_vectors import HalfVectorSampling
 from spheres import key_of, sphere_scene
 from texture_scenes import alive
@@ -108,7 +110,7 @@ def load(mi, name, **more):
 
 def intensities(mi, value):
     """Channels of a value without polarisation, (n, channels)."""
-    return numpy_of(trust.spectrum(mi, value))
+    return numpy_of(mi.unpolarized_spectrum(value))
 
 
 def below_horizon(name, wi, wo):

@@ -17,11 +17,11 @@ from bsdf_queries import (
     extreme_directions,
     interactions,
     random_directions,
+    sphere_scene,
     texels,
     uniform,
     vectors,
 )
-from spheres import sphere_scene
 from variants import VARIANTS, set_variant
 
 from mi_diffind.arrays.boxes import ValueBounds

@@ -30,13 +30,12 @@ def main() -> int:
     """Send them; return 1 if an answer was not finite."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=10**5, help="rays of each field, queries of each (default: 10⁵)")
-    parser.add_argument("--seconds", type=int, default=7200, help="limit of the time of all rays (default: 7200)")
     parser.add_argument("--json", type=Path, default=Path("trust_rays.json"), help="report to write")
     arguments = parser.parse_args()
     mi.set_variant(VARIANT)
     with tempfile.TemporaryDirectory() as folder:
         hostile_inputs.write_fields(Path(folder))
-        with LimitedChild(Path(folder), arguments.seconds, arguments.seconds) as child:
+        with LimitedChild(Path(folder), 7200, 7200) as child:
             answer = child.check("rays", folder=folder, count=arguments.count)
     if answer["outcome"] != "loaded":
         raise SystemExit(answer["message"])

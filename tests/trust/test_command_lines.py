@@ -92,7 +92,7 @@ def option_words(parser):
 def child(tmp_path_factory):
     folder = tmp_path_factory.mktemp("commands")
     (folder / "scene.xml").write_text(SCENE)
-    shutil.copy(all_seeds()["image_indices"][1], folder / "image.npz")
+    shutil.copy(all_seeds()["image_indices"], folder / "image.npz")
     with LimitedChild(folder) as limited:
         yield limited
 

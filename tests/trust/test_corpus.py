@@ -3,18 +3,16 @@
 import json
 import os
 import re
-import shutil
 import struct
 import zipfile
 import zlib
-from pathlib import Path
 
 import captures
 import numpy as np
 import pytest
 from damage import Archive, header, png
 from limited_child import LimitedChild
-from trial_files import all_seeds
+from trial_files import CHECKPOINT, all_seeds
 
 from mi_diffind.tasks.radiance import coding
 
@@ -38,7 +36,7 @@ def table(name, seed, *changes, outcomes=("refused",)):
 
     @case(name, *outcomes)
     def _(folder):
-        archive = Archive(all_seeds()[seed][1].read_bytes())
+        archive = Archive(all_seeds()[seed].read_bytes())
         for change in changes:
             change(archive)
         return mutant(folder, seed, archive.write())
@@ -48,7 +46,7 @@ def mutant(folder, seed="ggx_small", data=None):
     """Write a table file, and return the request that opens it; no array has to be as before."""
     if data is not None:
         (folder / "mutant.npz").write_bytes(data)
-    return "table", {"path": "mutant.npz", "original": str(all_seeds()[seed][1]), "untouched": []}
+    return "table", {"path": "mutant.npz", "original": str(all_seeds()[seed]), "untouched": []}
 
 
 # -- memory and time by small files ------------------------------------------------------------------------------------
@@ -59,7 +57,7 @@ BOMB = 160 << 20
 
 def bomb(folder, name, start, filling, size=BOMB, end=b"", archive=None):
     """Write a table file one of whose members goes on for ``size`` bytes with a repeated ``filling``."""
-    archive = archive or Archive(all_seeds()["ggx_small"][1].read_bytes())
+    archive = archive or Archive(all_seeds()["ggx_small"].read_bytes())
     with zipfile.ZipFile(folder / "mutant.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file:
         for member, data in archive.members().items():
             if member != name:
@@ -74,7 +72,7 @@ def bomb(folder, name, start, filling, size=BOMB, end=b"", archive=None):
 
 @case("entries of one bit")
 def _(folder):
-    archive, sides = Archive(all_seeds()["ggx_small"][1].read_bytes()), [BOMB // 2**10, 2**12, 2]
+    archive, sides = Archive(all_seeds()["ggx_small"].read_bytes()), [BOMB // 2**10, 2**12, 2]
     stored = {"shape": sides, "storage": "uint8", "scale": [1.0, 1.0], "offset": [0.0, 0.0], "bits": 1}
     archive.meta["arrays"]["primary"] |= stored
     return bomb(folder, "primary", header([BOMB], "|u1"), b"\0", archive=archive)
@@ -82,14 +80,14 @@ def _(folder):
 
 @case("a large description")
 def _(folder):
-    archive, size = Archive(all_seeds()["ggx_small"][1].read_bytes()), BOMB // 4
+    archive, size = Archive(all_seeds()["ggx_small"].read_bytes()), BOMB // 4
     text = json.dumps(archive.meta)[:-1] + ', "more": [0'
     return bomb(folder, "meta", header([len(text) + size + 2], "|u1") + text.encode(), b",0", size, b"]}")
 
 
 @case("a large array of zeros")
 def _(folder):
-    archive, sides = Archive(all_seeds()["ggx_small"][1].read_bytes()), [BOMB // 4 // 2**12, 2**11, 2]
+    archive, sides = Archive(all_seeds()["ggx_small"].read_bytes()), [BOMB // 4 // 2**12, 2**11, 2]
     archive.meta["arrays"]["primary"]["shape"] = sides
     return bomb(folder, "primary", header(sides, "<f4"), b"\0", archive=archive)
 
@@ -111,7 +109,7 @@ def _(folder):
 
 @case("a distance field of empty regions")
 def _(folder):
-    archive = Archive(all_seeds()["sdf_sparse"][1].read_bytes())
+    archive = Archive(all_seeds()["sdf_sparse"].read_bytes())
     regions = np.zeros((192, 192, 192, 1), np.uint8)
     regions[:2, :2, :2] = archive.arrays["regions"]
     archive.arrays["regions"], archive.meta["arrays"]["regions"]["shape"] = regions, list(regions.shape)
@@ -120,7 +118,7 @@ def _(folder):
 
 @case("a radiance field of a large empty grid")
 def _(folder):
-    archive, side = Archive(all_seeds()["field_grid"][1].read_bytes()), 600
+    archive, side = Archive(all_seeds()["field_grid"].read_bytes()), 600
     archive.meta["settings"]["shape"] = [side] * 3
     arrays = {name: archive.arrays[name][:1] for name in ("density", "colour")}
     for name, array in {**arrays, "cells": np.zeros((side**3 // 8, 1), np.uint8)}.items():
@@ -130,7 +128,7 @@ def _(folder):
 
 @case("a coded radiance field that claims a large grid")
 def _(folder):
-    archive, shape = Archive(all_seeds()["field_coded"][1].read_bytes()), (60, 60, 60)
+    archive, shape = Archive(all_seeds()["field_coded"].read_bytes()), (60, 60, 60)
     numbers, colours = np.zeros(np.prod(shape), int), len(archive.arrays["palette"])
     codes = coding.encode(np.ones(shape, bool), numbers, numbers, 2 ** archive.meta["settings"]["density_bits"],
                                 colours)  # fmt: skip
@@ -167,12 +165,8 @@ def views(name, picture=None, **changes):
 
     @case(name)
     def _(folder):
-        shutil.rmtree(folder / "views", ignore_errors=True)
         captures.write(folder / "views", 3, 1, 8)
-        path = folder / "views" / "transforms_train.json"
-        content = json.loads(path.read_text())
-        content["frames"][0] |= changes
-        path.write_text(json.dumps(content))
+        captures.change(folder / "views", frame=0, **changes)
         if picture:
             (folder / "views" / "train_0.png").write_bytes(large_picture(picture))
         return "capture", {"path": "views"}
@@ -191,7 +185,7 @@ views("a picture that is an endless file", file_path="/dev/zero")
 
 @case("a ray without a direction", "loaded")
 def _(folder):
-    return "still_ray", {"path": str(all_seeds()["sdf_sparse"][1])}
+    return "still_ray", {"path": str(all_seeds()["sdf_sparse"])}
 
 
 FIT = "fit ggx --steps 1 --primary 4 --cascaded 3 --variant llvm_ad_rgb -o a.npz"
@@ -212,24 +206,6 @@ for option in ("batch", "steps", "seconds", "seed"):
         if (option, value) != ("seed", str(2**31)):  # seeds have 32 bits
             command(f"fit ggx -o a.npz --{option} {value}", f"--{option}: ")
 
-#: Command lines that read or write PATH.
-PATHS = """
-    fit ggx -o PATH.npz
-    fit ggx -o a.npz --json PATH
-    fit ggx -o a.npz --steps 1 --checkpoint PATH
-    fit image PATH.png -o a.npz
-    fit image PATH.json -o a.npz
-    fit sdf PATH.obj -o a.npz
-    fit field PATH -o a.npz
-    fit bsdf PATH.xml -o a.npz
-    inspect PATH.npz
-    render PATH.xml -o a.exr
-    decode PATH.npz -o a.png
-    decode a.npz -o PATH.png
-    compare PATH.xml
-    capture PATH.xml -o views
-"""
-
 #: Command lines that read PATH, or a file of the folder LINK that names it.
 SOURCES = """
     fit image PATH.png -o a.npz
@@ -244,7 +220,21 @@ SOURCES = """
     render PATH.xml
 """
 
-for words in PATHS.strip().splitlines():
+#: Further command lines that read or write PATH.
+PATHS = """
+    fit ggx -o PATH.npz
+    fit ggx -o a.npz --json PATH
+    fit ggx -o a.npz --steps 1 --checkpoint PATH
+    fit image PATH.json -o a.npz
+    fit field PATH -o a.npz
+    fit bsdf PATH.xml -o a.npz
+    decode PATH.npz -o a.png
+    decode a.npz -o PATH.png
+    compare PATH.xml
+    capture PATH.xml -o views
+"""
+
+for words in (SOURCES.strip() + PATHS.rstrip()).splitlines():
     for path in ("a" * 300, "a/" * 2500, "a" * 5000):
         command(words.replace("PATH", path))
 
@@ -346,7 +336,7 @@ def checkpoint(key, value):
 
     @case(f"a checkpoint with {key} {value!r}", *EITHER)
     def _(folder):
-        archive = Archive((Path(__file__).parent / "corpus" / "checkpoint.npz").read_bytes())
+        archive = Archive(CHECKPOINT.read_bytes())
         archive.meta[key] = value
         (folder / "mutant.npz").write_bytes(archive.write())
         return "checkpoint", {"path": "mutant.npz"}

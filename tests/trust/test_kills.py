@@ -1,15 +1,20 @@
 """
 Runs that are killed (SIGKILL) at drawn moments and gone on with: the bytes of an undisturbed run, and no file beside
-them.
+them. Moments do not depend on the speed of the machine.
 """
 
 import json
+import os
 import random
+import signal
+import subprocess
+import sys
+from pathlib import Path
 
-import killed_runs
 import numpy as np
 import trial_files
 
+from mi_diffind.commands import cli
 from mi_diffind.fitting.task import tasks
 
 SCENE = """
@@ -28,6 +33,84 @@ STATE = "state.npz"
 FIT = ["-o", "own.npz", "--checkpoint", STATE, "--variant", "llvm_ad_rgb"]
 
 
+def run_command(arguments: list[str], folder: Path, moment: str = "", prepare: str = "") -> int | None:
+    """Run a command in another process; return its number of calls, ``None`` if it was killed.
+
+    A moment is the number of a call in Python code: ``17`` kills the process in the 17th call of any function,
+    ``replace 2`` before the second file gets its final name. ``prepare`` names a function that is called first.
+    """
+    request = json.dumps({"arguments": arguments, "moment": moment, "prepare": prepare})
+    done = subprocess.run(
+        [sys.executable, __file__, request], cwd=folder, env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        capture_output=True, text=True, errors="replace",
+    )  # fmt: skip
+    if done.returncode == -signal.SIGKILL and moment:
+        return None
+    assert done.returncode == 0, done.stderr[-2000:]
+    return int(done.stdout.splitlines()[-1])
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    """Return the content of all files in a folder, by path."""
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def main(arguments: list[str], moment: str, prepare: str) -> None:
+    """Run one command in this process."""
+    if prepare:
+        globals()[prepare]()
+    *replace, number = moment.split() or ["0"]
+    last, calls, replaced = int(number), 0, 0
+
+    def count(frame, event, argument):
+        nonlocal calls, replaced
+        calls += event in ("call", "c_call")
+        replaced += event == "c_call" and argument is os.replace
+        if last and (replaced if replace else calls) == last:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    sys.setprofile(count)
+    code = cli.main(arguments)
+    sys.setprofile(None)
+    print(calls)
+    sys.exit(code)
+
+
+def measure_little() -> None:
+    """Measure results at few places."""
+    from mi_diffind.tasks.ggx.training import GGXModel
+
+    GGXModel.measure.__defaults__ = (2**12,)
+
+
+def small_study() -> None:
+    """Add a study ``killed``: the small one, with a training to convergence."""
+    from small_study import Log, small_plan
+
+    from mi_diffind.core.runtime import array_module
+    from mi_diffind.fitting.loop import FitSettings
+    from mi_diffind.fitting.task import FitRequest
+    from mi_diffind.measure.study import Study
+    from mi_diffind.measure.training import ConvergenceTraining
+    from mi_diffind.studies import studies
+    from mi_diffind.tasks.ggx import TASK
+
+    measure_little()
+    settings = FitSettings(steps=5, batch=64, lr=1e-2, schedule="constant", seed=3)
+    request = FitRequest("tables", settings, array_module("llvm"), options={"primary": 4, "cascaded": 3})
+
+    class Killed(Study):
+        name, title = "killed", "a small study"
+
+        def plan(self, arguments):
+            plan = small_plan(Log())
+            plan.study = "killed"
+            plan.jobs = [ConvergenceTraining("training", lambda: TASK.problem(request), settings, 40)]
+            return plan
+
+    studies()["killed"] = Killed()
+
+
 def kill_and_go_on(command, folder, kills=1, prepare="", resume=()):
     """Run a command in ``folder / "whole"``; in ``folder / "killed"``, kill it at drawn moments, each time going on.
 
@@ -36,16 +119,16 @@ def kill_and_go_on(command, folder, kills=1, prepare="", resume=()):
     whole, killed = (folder / name for name in ("whole", "killed"))
     for each in (whole, killed):
         each.mkdir()
-    calls, rng = killed_runs.run(command, whole, prepare=prepare), random.Random(1)
+    calls, rng = run_command(command, whole, prepare=prepare), random.Random(1)
 
     def again():  # a run that was killed before its first checkpoint has none to go on from
         return [*command, *(resume if (killed / STATE).exists() else ())]
 
     moments = [str(rng.randrange(calls // 3, calls)) for _ in range(kills)]
-    ended = [killed_runs.run(again(), killed, moment, prepare) for moment in moments]
+    ended = [run_command(again(), killed, moment, prepare) for moment in moments]
     assert None in ended, "the moments lie after the end of the run"
-    killed_runs.run(again(), killed, prepare=prepare)
-    return killed_runs.files(whole), killed_runs.files(killed)
+    run_command(again(), killed, prepare=prepare)
+    return files(whole), files(killed)
 
 
 def assert_same(first, second, differing=()):
@@ -83,7 +166,11 @@ def test_a_study(tmp_path):
 def test_no_temporary_file_outlives_the_next_run(tmp_path):
     """A run that is killed before its file has its name leaves a temporary one, which the next run removes."""
     command = ["inspect", str(next(iter(trial_files.seeds(tasks()["ggx"]).values()))), "--json", "report.json"]
-    assert killed_runs.run(command, tmp_path, "replace 1") is None
+    assert run_command(command, tmp_path, "replace 1") is None
     assert len(list(tmp_path.iterdir())) == 1
-    killed_runs.run(command, tmp_path)
+    run_command(command, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
+
+
+if __name__ == "__main__":
+    main(**json.loads(sys.argv[1]))
