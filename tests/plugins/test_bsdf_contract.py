@@ -36,7 +36,6 @@ from bsdf_queries import (
     vectors,
 )
 from half_vectors import HalfVectorSampling
-from spheres import key_of, sphere_scene
 from texture_scenes import alive
 from variants import VARIANTS, set_variant
 
