@@ -15,7 +15,6 @@ from bsdf_queries import (
 )
 from disney_materials import FORMS
 from disney_materials import RICH as COLOURED
-from gradients import gradients_enabled
 
 from mi_diffind.tasks.disney import TASK
 
