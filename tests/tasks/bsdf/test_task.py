@@ -161,7 +161,8 @@ def test_merl(types, tmp_path, rng):
     grid = numbers(h, d, p)
     content = np.array([90, 90, 180], "<i4").tobytes()
     content += b"".join(
-        (s * grid / f).astype("<f8").tobytes() for s, f in zip((1, 2, 3), MERLTruth.SCALES, strict=True)
+        (s * grid / f).astype("<f8").tobytes()
+        for s, f in zip((1, 2, 3), (1 / 1500, 1.15 / 1500, 1.66 / 1500), strict=True)  # published factors
     )
     path = tmp_path / "made.binary"
     path.write_bytes(content)

@@ -168,3 +168,14 @@ def test_tints_of_a_grey_albedo_are_left_out():
     assert not effects.spec_tint and not effects.sheen_tint and effects.sheen and effects.dielectric
     assert reasons["spec_tint"] == "base_color has no hue"
     assert find_effects({"base_color": ValueBounds(0.1, 0.9, grey=True, optimised=True)})[0].spec_tint
+
+
+@pytest.mark.parametrize("storage", ["float32", "uint8"])
+def test_the_coat_of_the_shipped_tables(storage):
+    """Width and normalisation of GTR1 (Burley 2012), whose tables hold the error of their rounding besides."""
+    gloss = np.linspace(0, 0.9, 181)
+    alpha = 0.1 + gloss * (0.001 - 0.1)
+    expected = alpha, (alpha**2 - 1) / (np.pi * np.log(alpha**2))
+    arrays = TASK.open(ad.TensorXf, "", "tables", storage).decoder.arrays
+    for found, value in zip(arrays.coat_values(ad.Float(aligned(gloss.astype(np.float32)))), expected, strict=True):
+        np.testing.assert_allclose(found.numpy(), value, rtol=1e-3)
