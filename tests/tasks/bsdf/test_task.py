@@ -21,7 +21,7 @@ from mi_diffind.tasks.bsdf import directions as pool
 from mi_diffind.tasks.bsdf.files import BSDFModel, allocate
 from mi_diffind.tasks.bsdf.measured import Truth, rotate_truth
 from mi_diffind.tasks.bsdf.model import TERMS, Parameter, sizes_within
-from mi_diffind.tasks.bsdf.truth import MERLTruth, recorded_source, truth_of
+from mi_diffind.tasks.bsdf.truth import recorded_source, truth_of
 
 FORMS = {
     "isotropic": {},
