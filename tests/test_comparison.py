@@ -157,6 +157,17 @@ def test_equal_time(mi_rgb, tmp_path, capsys):
     assert "of it bias" in out and Path(figures["files"]["figure"]).read_bytes().startswith(b"\x89PNG")
 
 
+def test_equal_time_without_noise(mi_rgb, tmp_path):
+    """Nothing of the scene is random or wrong: no ratio, and no NaN in JSON or text."""
+    path = tmp_path / "scene.xml"
+    seen = TEXTURED.replace("FILE", str(ASSETS / "tiles_filtered.npz"))
+    path.write_text(seen.replace('origin="0,-2,0.4" target="0,0,0"', 'origin="0,0,1" target="0,-1,3"'))
+    result = equal_time.compare_at_equal_time(path, spp=4, passes=2, progress=False)
+    assert {c["error_ratio"]["median"] for c in result.figures["contenders"].values()} == {None}
+    assert all(c["error"] == 0 and c["bias"] is None for c in result.figures["contenders"].values())
+    assert "nan" not in str(result).lower() and "NaN" not in json.dumps(result.figures)
+
+
 def test_a_slow_contender_takes_fewer_samples(mi_rgb, monkeypatch):
     """Four times the time at equal samples: a quarter of the samples, of those that the sampler allows."""
     scene = mi.load_dict({"type": "scene", "sensor": {

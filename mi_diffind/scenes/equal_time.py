@@ -17,7 +17,7 @@ from ..core.progress import interruptible, progress_bar
 from ..images import metrics
 from ..measure import plot
 from ..measure.report import grid
-from ..measure.statistics import spread
+from ..measure.statistics import finite, spread
 from ..plugins.support import footprint
 from . import comparison, loading
 
@@ -60,7 +60,7 @@ class EqualTime:
         cells += [
             plot.error_map(
                 np.sqrt(_weighted((image - self.reference) ** 2, self.reference)),
-                f"relative error {rows[name]['error']:.3g}, of it bias {_share(rows[name])}",
+                f"relative error; relMSE {rows[name]['error']:.3g}, of it bias {_share(rows[name])}",
             )
             for name, image in self.images.items()
         ]
@@ -74,9 +74,9 @@ class EqualTime:
 
     def __str__(self) -> str:
         f = self.figures
-        rows = [("", "samples", "seconds", "error", "of it noise", "of it bias", "error / exact")]
+        rows = [("", "samples", "seconds", "error", "of it noise", "of it bias", f"error / {f['reference']}")]
         for name, c in f["contenders"].items():
-            ratio = c["error_ratio"]
+            median, q1, q3 = c["error_ratio"].values()
             rows.append(
                 (
                     name,
@@ -85,7 +85,7 @@ class EqualTime:
                     f"{c['error']:.3g}",
                     f"{c['noise']:.3g}",
                     _share(c),
-                    f"{ratio['median']:.2f} ({ratio['q1']:.2f} to {ratio['q3']:.2f})",
+                    "-" if median is None else f"{median:.2f} ({q1:.2f} to {q3:.2f})",
                 )
             )
         return "\n".join(
@@ -187,7 +187,7 @@ def _remark(contender: _EqualSide, exact: _EqualSide) -> str:
     ratio = float(np.median(np.divide(contender.seconds, exact.seconds)))
     if abs(ratio - 1) <= TOLERANCE:
         return ""
-    return f"its passes took {ratio:.2f} of the time of the exact ones, no number of samples came closer"
+    return f"its passes took {ratio:.2f} of the time of the others: compare it with care"
 
 
 def compare_at_equal_time(
@@ -211,8 +211,9 @@ def compare_at_equal_time(
 
     The reference is the exact scene at :data:`REFERENCE` times all its samples. Figures: ``contenders``, by name, have
     ``spp``, ``seconds`` (median and quartiles of a pass), ``error``, ``noise`` and ``bias`` (:func:`errors`),
-    ``error_ratio`` (median and quartiles of the ratios of a pass's error to that of the exact scene), and a ``remark``
-    if the times are not equal. Raises :class:`.SceneError`, as :func:`.comparison.compare` does.
+    ``error_ratio`` (median and quartiles of the ratios of a pass's error to that of the exact scene, ``None`` if that
+    has no error), and a ``remark`` if the times are not equal. Raises :class:`.SceneError`, as
+    :func:`.comparison.compare` does.
     """
     loaded, passes = comparison.load_compared(scene, against, learn, defines, progress), max(2, passes)
     spp = spp or loaded.written.sensors()[0].sampler().sample_count()
@@ -221,9 +222,11 @@ def compare_at_equal_time(
     contenders |= {name: _EqualSide(truth, loaded.put_in[name], spp) for name, truth in loaded.truths.items()}
     reference_name = list(loaded.truths)[-1]
     exact = contenders[reference_name]
-    for contender in contenders.values():
-        if contender is not exact:
+    others = [contender for contender in contenders.values() if contender is not exact]
+    with progress_bar("samples", len(others), "contender", progress) as bar:
+        for contender in others:
             contender.fill(exact)
+            bar.update()
 
     count = max(2, REFERENCE * passes)
     halves, taken, done = [0.0, 0.0], [0, 0], 0
@@ -271,4 +274,4 @@ def compare_at_equal_time(
         },
     }
     return EqualTime({name: c.images[0].astype(np.float32) for name, c in contenders.items()},
-                     reference.astype(np.float32), figures)  # fmt: skip
+                     reference.astype(np.float32), finite(figures))  # fmt: skip
