@@ -141,7 +141,7 @@ def fitted_contender(material: str, preset: str, quick: bool) -> Contender:
         return mi.load_dict({"type": "neural_bsdf", "filename": str(job.file)})
 
     name = f"{material}: {preset}"
-    return Contender(name, preset, 0, train, read, preset, "learned", preset, separable=True)
+    return Contender(name, preset, 0, train, read, preset, "learned", preset)
 
 
 def network_contender(material: str, inputs: str, learned: Contender) -> NetworkContender:
@@ -160,7 +160,7 @@ def network_contender(material: str, inputs: str, learned: Contender) -> Network
     settings, label = FitSettings(steps=1000, batch=2**12, lr=2e-2, seed=1), f"network, {inputs}"
     training = (problem, settings, 4000, 20, False, finish)
     network = NetworkContender(f"{material}: {label}", "network", 0, label, "", build, *training)
-    network.family, network.separable = "network", False  # its inputs are those of another job
+    network.family = "network"
     return network
 
 

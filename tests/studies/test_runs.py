@@ -37,8 +37,8 @@ RUNS = {
 
 #: Study → pictures beside accuracy against time or bytes.
 PICTURES = {
-    "sdf": ["shapes", "training"], "field": ["views"], "texture": ["crops", "zoom", "levels"], "ggx": ["training"],
-    "shading": ["levels", "strip", "zoom"], "disney": ["training"],
+    "sdf": ["shapes"], "field": ["views"], "texture": ["crops", "zoom", "levels"],
+    "shading": ["levels", "strip", "zoom"],
 }  # fmt: skip
 
 
