@@ -132,7 +132,6 @@ def test_a_run_goes_on(inputs, tmp_path, capfd, monkeypatch):
     "study, options, message",
     [
         ("bsdf", ["gold"], 'found the material "gold", allowed are'),
-        ("disney", ["--only", "nothing"], "nothing"),
         ("field", ["--compression", "0"], "0"),
         ("field", ["--without", "vq"], '--without: found "vq", allowed are sparse'),
         ("field", ["--resolution", "4"], "--resolution: found 4, at least 8 is needed"),
