@@ -519,7 +519,7 @@ def _case(context: TextureContenders, scene: TextureScene, candidates: list[Cand
         return functions
 
     return Case(
-        scene.name, reads, passes, accuracy=f"psnr_{scene.name}_db", of_passes=True, in_picture=not scene.magnified,
+        scene.name, reads, passes, accuracy=f"psnr_{scene.name}_db", in_picture=not scene.magnified,
         details={"repeats": repeats, "magnified": scene.magnified},
     )  # fmt: skip
 

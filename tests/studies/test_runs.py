@@ -37,8 +37,8 @@ RUNS = {
 
 #: Study → pictures beside accuracy against time or bytes.
 PICTURES = {
-    "sdf": ["shapes", "training"], "field": ["views"], "texture": ["crops", "zoom", "levels"], "ggx": ["training"],
-    "shading": ["levels", "strip", "zoom"], "disney": ["training"],
+    "sdf": ["shapes"], "field": ["views"], "texture": ["crops", "zoom", "levels"],
+    "shading": ["levels", "strip", "zoom"],
 }  # fmt: skip
 
 
@@ -132,7 +132,6 @@ def test_a_run_goes_on(inputs, tmp_path, capfd, monkeypatch):
     "study, options, message",
     [
         ("bsdf", ["gold"], 'found the material "gold", allowed are'),
-        ("disney", ["--only", "nothing"], "nothing"),
         ("field", ["--compression", "0"], "0"),
         ("field", ["--without", "vq"], '--without: found "vq", allowed are sparse'),
         ("field", ["--resolution", "4"], "--resolution: found 4, at least 8 is needed"),
