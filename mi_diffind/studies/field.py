@@ -48,10 +48,10 @@ RATIOS = (75.0, 50.0, 200.0)
 DEFAULT = "captures/group"
 SCENE = "scenes/capture_group.xml"
 
-#: Method → its label, and the group that it belongs to in pictures. Those of :data:`ONCE` have the first budget only.
+#: Method → its label. Those of :data:`ONCE` have the first budget only.
 METHODS = {
-    "sparse": ("sparse grid, 8 bits", "grid"), "codebook": ("codebook", "codes"),
-    "hash": ("hash grid + network", "network"), "paper": ("paper", "supplement's arrays"), "ours": ("ours", "ours"),
+    "sparse": "sparse grid, 8 bits", "codebook": "codebook", "hash": "hash grid + network", "paper": "paper",
+    "ours": "ours",
 }  # fmt: skip
 ONCE = ("hash",)
 
@@ -62,7 +62,7 @@ PRESETS = {"ours": "sparse", "paper": "paper", GRID: "grid"}
 #: Settings of a run: nodes along the side of a cube with the volume of the initial grid, the steps of its training
 #: (0: the preset's own), and those of each training that begins with it.
 FULL = {"resolution": 128, "grid_steps": 0, "steps": 500}
-QUICK = {"resolution": 24, "grid_steps": 60, "steps": 40}
+QUICK = {"resolution": 20, "grid_steps": 60, "steps": 20}
 
 #: Methods by whose times ours is divided.
 AGAINST = ("sparse", "codebook", "paper")
@@ -219,20 +219,22 @@ def plan(session: FieldSession, source: str, settings: SimpleNamespace) -> Plan:
     height, width = views.sizes[0].tolist()
     jobs[GRID] = preset_contender(context, {"name": GRID, "method": GRID, "budget": 1.0})
     for method, ratio in equal_memory.combinations(METHODS, settings.ratios, ONCE, settings.without):
-        label, family = METHODS[method]
-        fields = {"name": f"{label} {ratio:g}×", "method": method, "budget": ratio, "label": label, "family": family}
+        label, setting = METHODS[method], f"{ratio:g}×"
+        fields = {"name": f"{label} {setting}", "method": method, "budget": ratio, "label": label, "setting": setting}
         make = preset_contender if method in PRESETS else rival_contender
-        jobs[fields["name"]] = make(context, fields | {"setting": f"{ratio:g}×"})
+        jobs[fields["name"]] = make(context, fields)
     shown = [name for name, job in jobs.items() if job.budget == first and job.method in METHODS]
     ours = next((n for n in shown if jobs[n].method == "ours"), "")
     timed = (GRID, *shown)
-    candidates = [Candidate(GRID, "reference", job=GRID, is_reference=True, details={"kind": GRID})]
+    candidates = [
+        Candidate(GRID, "reference", job=GRID, is_reference=True, label="initial grid", details={"kind": GRID})
+    ]
     candidates += [job.candidate() for name, job in jobs.items() if name != GRID]
     code = package_files("tasks/radiance/*.py", "fitting/loop.py", "studies/field.py",
                          "studies/baselines/radiance_fields.py")  # fmt: skip
     return Plan(
         study="field",
-        title=f"Radiance field: {Path(source).name}",
+        title=f"Radiance fields of the capture {Path(source).name}: held-out views against bytes and time",
         candidates=candidates,
         cases=[
             Case("reads", lambda lanes: _reads(context, timed, lanes)),
@@ -244,7 +246,7 @@ def plan(session: FieldSession, source: str, settings: SimpleNamespace) -> Plan:
         },
         notes=[
             f"{Path(source).name}, {len(views)} views of {width} × {height} and {len(held_out)} to test. "
-            "Equal bytes in memory, index included.",
+            "Bytes in memory, index included; paper packs corners of cells for reading, in more bytes than asked for.",
         ],
         jobs=list(jobs.values()),
         jobs_fingerprint=fingerprint(code) + views.digest[:16],
@@ -284,11 +286,13 @@ def draw_views(context: RadianceStudyContext, names: list[str], result: dict):
     """Draw the first test view by the fields at the first budget, and the differences to it."""
     truth = context.session.held_out.image(0)
     crop, reference = plot.crop_to(truth[..., 3] > 0), displayed(truth)
-    views, differences = {"test view": reference[crop]}, {"": reference[crop]}
+    views, differences = {"held-out view": reference[crop]}, {"held-out view": reference[crop]}
     for job in (context.jobs[name] for name in names):
         picture = displayed(context.session.held_out_images.render(job.model, 0))
         errors = result["candidates"][job.name]["errors"]
-        views[f"{job.label}\n{errors[WHITE]:.2f} / {errors[FOREGROUND]:.2f} dB"] = picture[crop]
+        views[f"{job.label}\n{errors[FOREGROUND]:.2f} dB"] = picture[crop]
         differences[job.label] = np.abs(picture - reference).mean(axis=-1)[crop]
-    rows, title = {"": views, "difference": differences}, f"{result['title']}, {result['details']['first']:g}×"
-    return plot.draw_images(title, " ".join(result["notes"]), rows, 1.6, "sRGB")
+    rows = {"": views, "difference": differences}
+    title = f"A held-out view by fields {result['details']['first']:g}× smaller than a dense grid, and their errors"
+    notes = ["dB: PSNR of the foreground in all held-out views.", *result["notes"]]
+    return plot.draw_images(title, " ".join(notes), rows, 1.6, "difference of sRGB values")
