@@ -15,7 +15,6 @@ from __future__ import annotations
 import contextlib
 import platform
 import re
-import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
@@ -32,15 +31,13 @@ Query = Callable[[], object]
 
 @dataclass(frozen=True)
 class Timed:
-    """Result and times of a function.
+    """Evaluated ``value`` of a function and ``seconds`` of its kernels.
 
-    ``value``: its evaluated result; ``seconds`` of its kernels, ``seconds_wall`` from beginning to end; ``compiled``:
-    whether a kernel was compiled or read from the cache on disk.
+    ``compiled``: whether a kernel was compiled or read from the cache on disk.
     """
 
     value: object
     seconds: float
-    seconds_wall: float
     compiled: bool
 
 
@@ -49,13 +46,11 @@ def timed(function: Query) -> Timed:
     with dr.suspend_grad(), dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.sync_thread()
         dr.kernel_history_clear()
-        start = time.perf_counter()
         value = function()
         dr.eval(value)
         dr.sync_thread()
-        wall = time.perf_counter() - start
         history = dr.kernel_history()
-    return Timed(value, compat.kernel_seconds(history), wall, compat.was_compiled(history))
+    return Timed(value, compat.kernel_seconds(history), compat.was_compiled(history))
 
 
 def total(values) -> tuple[object, int]:
