@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 import os
 from collections.abc import Callable, Iterable, Sequence
 
@@ -144,30 +143,20 @@ def _against(quantity: str, candidates: Iterable[dict], result: dict, title: str
 
 
 def summary(result: dict) -> list[str]:
-    """Return the result as lines of text: errors of candidates, verdicts in equal bytes, times, ratios, the machine."""
+    """Return the result as lines of text: errors of candidates, verdicts in equal bytes, times and operations."""
     lines = [*_error_table(result), *verdicts(result)]
     for case, measured in result["cases"].items():
-        queries, passes = measured["queries"], measured["passes"].get(PASS, {})
-        floors = ", ".join(f"{q} {next(iter(t.values()))['floor']:.2f}" for q, t in queries.items())
-        lines += ["", f"{case}: ns each, floor subtracted ({floors}); ± half the interquartile range"]
-        cells = [["", *queries, "flops", "reads", *([f"ms {PASS}"] if passes else [])]]
-        first = next(iter(queries.values()))
-        for name in dict.fromkeys((*first, *passes)):
+        timings = {f"{query}, ns": t for query, t in measured["queries"].items()}
+        timings |= {f"{query}, ms": t for query, t in measured["passes"].items()}
+        cells, first = [["", *timings, "flops", "reads"]], next(iter(measured["queries"].values()))
+        for name in dict.fromkeys(name for by_name in timings.values() for name in by_name):
             operations = first.get(name, {}).get("operations", {})
-            cells.append([
-                name, *(time_cell(timings.get(name)) for timings in queries.values()),
-                *(str(operations.get(key, "")) for key in ("flops", "gathers")),
-                *([time_cell(passes.get(name), 1)] if passes else []),
-            ])  # fmt: skip
-        lines += grid(cells)
-        ratios = measured["ratios"]
-        pairs = dict.fromkeys(pair for by_pair in ratios.values() for pair in by_pair)
-        if pairs:
-            cells = [["ratios", *ratios], *([p, *(ratio_cell(r.get(p)) for r in ratios.values())] for p in pairs)]
-            lines += grid(cells)
+            counts = (str(operations.get(key, "")) for key in ("flops", "gathers"))
+            cells.append([name, *(time_cell(by_name.get(name)) for by_name in timings.values()), *counts])
+        lines += ["", f"{case}: floor subtracted; ± half the interquartile range", *grid(cells)]
     s = result["settings"]
     how = f"{s['rounds']} interleaved rounds of {s['lanes']:,} lanes; errors from {s['samples']:,} samples where drawn"
-    return [*lines, "", f"{machine_line(result)} Medians of {how}.", figure_caption(result)]
+    return [*lines, "", f"Medians of {how}.", figure_caption(result)]
 
 
 def _error_table(result: dict) -> list[str]:
@@ -214,20 +203,11 @@ def percent(value: float, digits: int = 3) -> str:
     return f"{value:.{digits}g}%" if value == 0 or abs(value) >= 1e-4 else f"{value:.1e}%"
 
 
-def time_cell(t: dict | None, digits: int = 2) -> str:
+def time_cell(t: dict | None) -> str:
     """Return a time (:func:`.statistics.timing`) ± half its interquartile range, or the bound of a hidden time."""
     if t is None:
         return ""
-    if t["hidden"]:
-        return f"below {t['time']:.{digits}f}"
-    return f"{t['time']:.{digits}f} ±{(t['q3'] - t['q1']) / 2:.{digits}f}"
-
-
-def ratio_cell(r: dict | None) -> str:
-    """Return a ratio of times (:func:`.statistics.ratio`)."""
-    if r is None:
-        return ""
-    return f"{'below ' * r['hidden']}{r['median']:.2f}" if math.isfinite(r["median"]) else "-"
+    return f"below {t['time']:.2f}" if t["hidden"] else f"{t['time']:.2f} ±{(t['q3'] - t['q1']) / 2:.2f}"
 
 
 def grid(rows: Sequence[Sequence[str]], indent: str = "  ") -> list[str]:
@@ -235,17 +215,6 @@ def grid(rows: Sequence[Sequence[str]], indent: str = "  ") -> list[str]:
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ([f"{cell:>{w + 2}}" for cell, w in zip(row[1:], widths[1:], strict=True)] for row in rows)
     return [f"{indent}{row[0]:{widths[0]}}{''.join(line)}".rstrip() for row, line in zip(rows, lines, strict=True)]
-
-
-def machine_line(result: dict) -> str:
-    """Return the machine (:func:`.clock.machine`) and the date of a result as a sentence."""
-    m = result["machine"]
-    device = m["gpu"] if m["variant"].startswith("cuda") else f"{m['cpu']} ({m['instructions']}), {m['cores']} cores"
-    llvm = f", LLVM {m['llvm']}" if m["llvm"] else ""
-    return (
-        f"{device}; {m['variant']}, Mitsuba {m['mitsuba']}, Dr.Jit {m['drjit']}{llvm}, mi_diffind {m['mi-diffind']}; "
-        f"{result['date']}."
-    )
 
 
 def figure_caption(result: dict) -> str:
