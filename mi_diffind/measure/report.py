@@ -97,18 +97,13 @@ def panels(result: dict) -> list[plot.Panel]:
     """Return the panels of a result: accuracy against the plan's quantities, then against time, one panel a case.
 
     Times are those of a pass, or else of the first query. Candidates have labels and quartiles, references vertical
-    lines. If the cases have different candidates, each has its own panel of bytes.
+    lines.
     """
     candidates, cases = result["candidates"], {}
     for case, measured in result["cases"].items():
         if measured["in_picture"]:
             cases[case] = next(iter((measured["passes"] or measured["queries"]).items()))
-    several = len({frozenset(timings) for _, timings in cases.values()}) > 1
-    drawn = [
-        _against(quantity, candidates.values(), result, QUANTITIES[quantity][1])
-        for quantity in result["panels"]
-        if quantity != "bytes" or not several
-    ]
+    drawn = [_against(quantity, candidates.values(), result) for quantity in result["panels"]]
     for case, (query, timings) in cases.items():
         of_passes, accuracy = query == PASS, result["cases"][case]["accuracy"]
         points, lines = [], []
@@ -122,8 +117,6 @@ def panels(result: dict) -> list[plot.Panel]:
             elif accuracy in c["errors"]:
                 points.append(_point(c, accuracy, t["time"], t["q1"], t["q3"]))
         drawn.append(plot.Panel(case, f"time of one {query}, {'ms' if of_passes else 'ns'}", points, lines))
-        if several and "bytes" in result["panels"]:
-            drawn.append(_against("bytes", [candidates[name] for name in timings], result, case))
     return [panel for panel in drawn if len(panel.points) > 1 or panel.lines]
 
 
@@ -131,15 +124,15 @@ def _point(c: dict, accuracy: str, x: float, low: float, high: float) -> plot.Po
     return plot.Point(c["label"], x, low, high, c["errors"][accuracy], c["representation"], c["competes"])
 
 
-def _against(quantity: str, candidates: Iterable[dict], result: dict, title: str) -> plot.Panel:
+def _against(quantity: str, candidates: Iterable[dict], result: dict) -> plot.Panel:
     """Return a panel of accuracy against ``quantity``; candidates equal in both, or of one job, are one point."""
-    distinct: dict[tuple, plot.Point] = {}
+    (x_label, title), distinct = QUANTITIES[quantity], {}
     key = result["measures"][0]["key"]
     for c in candidates:
         accuracy = c["errors"].get(key)
         if accuracy is not None and not (c["is_truth"] or c["is_reference"]) and c["in_picture"] and c[quantity]:
             distinct.setdefault((c[quantity], c["job"] or accuracy), _point(c, key, *[c[quantity]] * 3))
-    return plot.Panel(title, QUANTITIES[quantity][0], list(distinct.values()), [])
+    return plot.Panel(title, x_label, list(distinct.values()), [])
 
 
 def summary(result: dict) -> list[str]:

@@ -158,9 +158,8 @@ class Plan:
     The first of the ``measures`` is the accuracy of pictures; more of it is better, as of a PSNR. ``ratios`` are pairs
     of candidates whose times are divided. Partial results are continued only if ``details`` and the files of this
     package are unchanged, models of ``jobs`` if ``jobs_fingerprint`` is. ``panels``: quantities that the accuracy is
-    drawn against beside time: ``"bytes"`` (for each case, if the cases have different candidates) and
-    ``"training_seconds"``. ``pictures`` maps further names to functions of the result that draw a Matplotlib figure;
-    ``notes`` are sentences below pictures.
+    drawn against beside time, ``"bytes"`` and ``"training_seconds"``. ``pictures`` maps further names to functions of
+    the result that draw a Matplotlib figure; ``notes`` are sentences below pictures.
     """
 
     study: str

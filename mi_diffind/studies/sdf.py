@@ -152,9 +152,9 @@ class DistanceStudyContext:
         return [rivals.pool(self.distances, count, seed) for seed, count in enumerate(self.settings.pools, 1)]
 
     def record(self, model: DistanceField, nbytes: int, file_bytes: int, **details) -> dict:
-        """Return the record of a field with its errors; ``…_db`` are shares that are wrong, in decibels."""
+        """Return the record of a field with its errors; ``iou_near_db`` is the wrong share near the surface, in dB."""
         errors = self.evaluation.measure(model)
-        errors |= {f"{name}_db": -10 * math.log10(max(1 - errors[name], 1e-6)) for name in ("iou", "iou_near")}
+        errors["iou_near_db"] = -10 * math.log10(max(1 - errors["iou_near"], 1e-6))
         errors["index_bytes"] = marching.index_bytes(model)
         details |= {"file_bytes": file_bytes, "spacing": model.spacing}
         return {"bytes": nbytes, "errors": errors, "details": details}
