@@ -1,8 +1,8 @@
 """Study ``tradeoff bsdf``: learned BSDFs against their sources, in accuracy, time, bytes and noise.
 
 Each material is fitted with a proxy times an indirection (``ours``), a proxy times one array (``table``), an
-indirection alone (``paper``), one array alone (``plain``), and networks of 675 weights, for raw and for warped inputs
-(:class:`.NetworkBSDF`). Timed beside them are the material itself and ``principled``.
+indirection alone (``paper``), one array alone (``plain``), and a network of 675 weights (:class:`.NetworkBSDF`). Timed
+beside them are the material itself and ``principled``.
 """
 
 from __future__ import annotations
@@ -77,9 +77,6 @@ QUICK_FIT = {"steps": 40, "batch": 2**11, "measure_every": 40}
 #: Cosines of the angles of incidence at which the noise of sampling is measured.
 COSINES = (1.0, 0.7, 0.2)
 
-#: Inputs of networks.
-INPUTS = ("raw", "warped")
-
 #: Plugin beside which all are timed.
 PEER = {"type": "principled", "roughness": 0.35, "clearcoat": 1.0, "sheen": 0.6}
 
@@ -134,17 +131,17 @@ def fitted_contender(material: str, preset: str, quick: bool) -> Contender:
     return Contender(name, preset, 0, train, read, preset, "learned", preset)
 
 
-def network_contender(material: str, inputs: str, learned: Contender) -> NetworkContender:
+def network_contender(material: str, learned: Contender) -> NetworkContender:
     """Return the contender of a network, trained to convergence for inputs in the scale of a learned BSDF."""
 
     def problem() -> networks.BSDFNetworkProblem:
         scale = load_model(learned.file, mi.TensorXf).form.scale
-        return networks.BSDFNetworkProblem(MATERIALS[material][0], inputs, scale)
+        return networks.BSDFNetworkProblem(MATERIALS[material][0], scale)
 
     def finish(net, record: dict) -> dict:
         return {"bytes": 4 * record["entries"], "errors": {"psnr_db": record["psnr_db"]}}
 
-    settings, label = FitSettings(steps=1000, batch=2**12, lr=2e-2, seed=1), f"network, {inputs}"
+    settings, label = FitSettings(steps=1000, batch=2**12, lr=2e-2, seed=1), "network, warped"
     network = NetworkContender(
         f"{material}: {label}", "network", 0, label, "", lambda net: problem().bsdf(net.cooperative()),
         problem, settings, 4000, 20, False, finish,
@@ -161,7 +158,7 @@ def plan(materials: tuple[str, ...] = (), quick: bool = False) -> Plan:
         learned = [fitted_contender(material, preset, quick) for preset in (PRESETS[:1] if quick else PRESETS)]
         nets = []
         if not quick and nbytes == "2k":
-            nets = [network_contender(material, inputs, learned[0]) for inputs in INPUTS]
+            nets = [network_contender(material, learned[0])]
         references = [
             Candidate(f"{material}: source", "source", is_truth=True, label="source"),
             Candidate(f"{material}: principled", "Mitsuba", is_reference=True, label="principled"),

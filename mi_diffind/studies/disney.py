@@ -1,9 +1,7 @@
 """Study ``tradeoff disney``: accuracy of the Disney BRDF against time, with constant and with textured materials.
 
-``disney`` evaluates formulas; ``neural_disney`` is measured with each preset in each storage. Networks
-(:func:`.disney_network`) have as many bytes as the tables of each preset take in memory, in ``uint8``. Mitsuba's
-``principled`` is timed beside them. Errors are measured against :mod:`~mi_diffind.tasks.disney.model`, formulas that no
-plugin shares.
+``disney`` evaluates formulas; ``neural_disney`` is measured with each preset in each storage. Mitsuba's ``principled``
+is timed beside them. Errors are measured against :mod:`~mi_diffind.tasks.disney.model`, formulas that no plugin shares.
 """
 
 from __future__ import annotations
@@ -18,23 +16,12 @@ import numpy as np
 
 from ..arrays.lookup import STORAGES
 from ..core.runtime import array_module
-from ..fitting.task import FitSettings
-from ..measure.clock import Operations, count_query
 from ..measure.renders import QUERIES, bsdf_queries, directions, noise_texture
-from ..measure.store import fingerprint, package_files
 from ..measure.study import Candidate, Case, Measure, Plan, Study
-from ..measure.training import ConvergenceTraining
 from ..tasks.disney import TASK
 from ..tasks.disney.decoder import Decoder
 from ..tasks.disney.model import PARAMETERS, Material
 from ..tasks.disney.training import measure, shade
-from .baselines import networks
-
-#: Steps of the shortest training of a network, and of the longest; of a quick study (the longest takes twice as many).
-#: The loss of longer ones is so small that a rare highlight in a batch looks like a divergence.
-STEPS = 2000
-LONGEST = 16000
-QUICK_STEPS = 50
 
 #: Name → parameters of a material that uses every part of the model, and of one with the two lobes that most have.
 LOBES = {
@@ -47,10 +34,10 @@ LOBES = {
 
 BASE_COLOR = (0.8, 0.3, 0.2)
 
-#: Name of the truth as a candidate; it and networks are timed in ``eval`` only, with constant materials, in RGB.
+#: Name of the truth as a candidate, which is timed in ``eval`` only, with constant materials, in RGB.
 FORMULAS = "formulas"
 
-#: Presets of ``neural_disney`` that are measured; a quick study trains the network of the first.
+#: Presets of ``neural_disney`` that are measured.
 PRESETS = ("tables", "paper")
 
 #: Cases of a quick study → the plugins that are timed, or all.
@@ -71,7 +58,7 @@ STUDY = DisneyStudy()
 
 
 def plan(quick: bool = False) -> Plan:
-    """Return the plan of the study in the current variant; ``quick``: fewer cases and storages, short trainings."""
+    """Return the plan of the study in the current variant; ``quick``: fewer cases and storages."""
     plugins = {"principled": {"type": "principled"}, "disney": {"type": "disney"}}
     candidates = [
         Candidate("principled", "Mitsuba", is_reference=True),
@@ -84,21 +71,14 @@ def plan(quick: bool = False) -> Plan:
             model = TASK.open(mi.TensorXf, preset=preset, storage=storage)
             candidates.append(Candidate(name, preset, storage, model.nbytes, _errors(lambda m=model: m.decoder)))
             plugins[name] = {"type": "neural_disney", "preset": preset, "storage": storage}
-    trainings = []
-    for preset in PRESETS[:1] if quick else PRESETS:
-        nbytes = TASK.open(mi.TensorXf, preset=preset, storage="uint8").memory_nbytes
-        trainings.append(network_training(f"network, bytes of {preset}", nbytes, quick))
-        candidates.append(_network_candidate(trainings[-1]))
     cases = []
     for material, lobes in itertools.product(("constant", "textured"), LOBES):
         name = f"{material}, {lobes}"
         if quick and name not in QUICK:
             continue
         timed = {n: p for n, p in plugins.items() if not quick or n in (QUICK[name] or plugins)}
-        bare = {FORMULAS: None, **{t.name: t for t in trainings}} if material == "constant" and mi.is_rgb else {}
         details = {"material": material, "lobes": lobes, "base_color": BASE_COLOR, **LOBES[lobes]}
-        cases.append(Case(name, functools.partial(_queries, timed, bare, material, LOBES[lobes]), details=details))
-    code = package_files("fitting/loop.py", "studies/baselines/networks.py", "tasks/disney/*.py")
+        cases.append(Case(name, functools.partial(_queries, timed, material, LOBES[lobes]), details=details))
     return Plan(
         study="disney",
         title="Disney BRDF: accuracy against time",
@@ -114,36 +94,6 @@ def plan(quick: bool = False) -> Plan:
         ],
         notes=["arithmetic: the plugin disney; tables and paper: presets of neural_disney, in single precision unless "
                "named otherwise. constant, textured: the parameters of the material."],
-        jobs=trainings,
-        jobs_fingerprint=fingerprint(code),
-    )  # fmt: skip
-
-
-def network_training(name: str, nbytes: int, quick: bool = False) -> ConvergenceTraining:
-    """Return the training to convergence of the widest network of ``nbytes``, in half precision."""
-    types, steps = array_module(mi.variant()), QUICK_STEPS if quick else STEPS
-    longest = 2 * QUICK_STEPS if quick else LONGEST
-
-    def problem() -> networks.DisneyNetworkProblem:
-        return networks.DisneyNetworkProblem(networks.disney_network(nbytes), types)
-
-    def finish(net, record: dict) -> dict:
-        sizes = {"width": net.width, "layers": net.layers, "steps": record["steps"], "steps_longest": longest}
-        return {"bytes": 2 * record["entries"], "details": sizes}
-
-    settings = FitSettings(steps=steps, batch=2**12, lr=1e-2, loss="mse", seed=1)
-    return ConvergenceTraining(name, problem, settings, longest, 10, True, finish)
-
-
-def _network_candidate(training: ConvergenceTraining) -> Candidate:
-    """Return the candidate of a trained network."""
-
-    def count_operations(query: str) -> Operations:
-        return count_query(_bare_eval(training, LOBES["all lobes"], 64)) + training.net.products()
-
-    return Candidate(
-        training.name, "network", "float16", errors=_errors(lambda: networks.NetworkDecoder(training.net)),
-        job=training.name, operations=count_operations,
     )  # fmt: skip
 
 
@@ -162,11 +112,12 @@ def _errors(decoder: Callable[[], Decoder]) -> Callable[[int], dict[str, float]]
     return measure_errors
 
 
-def _queries(plugins: dict, bare: dict, material: str, parameters: dict, lanes: int) -> dict:
-    """Return the queries of BSDFs, and ``eval`` of the networks of ``bare``; ``None`` stands for the formulas."""
+def _queries(plugins: dict, material: str, parameters: dict, lanes: int) -> dict:
+    """Return the queries of BSDFs and, for constant materials in RGB, ``eval`` of the formulas."""
     bsdfs = {name: _bsdf(plugin, material, parameters) for name, plugin in plugins.items()}
     functions = bsdf_queries(bsdfs, directions(lanes), material == "textured", QUERIES)
-    functions["eval"] |= {name: _bare_eval(training, parameters, lanes) for name, training in bare.items()}
+    if material == "constant" and mi.is_rgb:
+        functions["eval"][FORMULAS] = _formulas(parameters, lanes)
     return functions
 
 
@@ -181,14 +132,10 @@ def _bsdf(plugin: dict, material: str, parameters: dict):
     return mi.load_dict({**plugin, "base_color": color, **parameters})
 
 
-def _bare_eval(training: ConvergenceTraining | None, parameters: dict, lanes: int) -> Callable[[], object]:
-    """Return ``eval`` of a network, or of the formulas, without a plugin.
-
-    Each parameter of the material is one number for all lanes as in a plugin.
-    """
+def _formulas(parameters: dict, lanes: int) -> Callable[[], object]:
+    """Return ``eval`` of the formulas without a plugin; each parameter is one number for all lanes as in a plugin."""
     values = {**dict.fromkeys(PARAMETERS, 0.0), **parameters}
     material, albedo = Material(**{name: dr.opaque(mi.Float, v) for name, v in values.items()}), mi.Color3f(BASE_COLOR)
     dr.make_opaque(albedo)
     si, wo, *_ = directions(lanes)
-    decoder = training and networks.NetworkDecoder(training.net.cooperative())
-    return lambda: shade(decoder, material, albedo, si.wi, wo)
+    return lambda: shade(None, material, albedo, si.wi, wo)

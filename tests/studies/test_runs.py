@@ -25,7 +25,7 @@ TRAINED = ["--steps", "2", "--pretrain-steps", "2"]
 RUNS = {
     "bsdf": [],
     "disney": [],
-    "field": ["balls", "--compression", "120", "--resolution", "16", "--steps", "10"],
+    "field": ["balls", "--compression", "120"],
     "ggx": [],
     "image": ["m.json", "--seconds", "1"],
     "scene": [str(ROOT / "scenes" / "metals.xml"), "-D", "width=32", "-D", "height=16"],
@@ -134,7 +134,6 @@ def test_a_run_goes_on(inputs, tmp_path, capfd, monkeypatch):
         ("bsdf", ["gold"], 'found the material "gold", allowed are'),
         ("field", ["--compression", "0"], "0"),
         ("field", ["--without", "vq"], '--without: found "vq", allowed are sparse'),
-        ("field", ["--resolution", "4"], "--resolution: found 4, at least 8 is needed"),
         ("image", ["--astc", "best"], "best"),
         ("image", ["--variant", "scalar_rgb"], "do not run"),
         ("scene-training", ["nowhere.xml"], "nowhere.xml, which is no file"),
