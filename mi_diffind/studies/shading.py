@@ -140,7 +140,7 @@ def load_materials(names: Sequence[str], side: int) -> dict[str, Source]:
     """Return the sources of manifests and of generated materials, by name. Raises ``SourceError``, ``ValueError``."""
     sources = {}
     for text in names:
-        name = text if text in MATERIALS else Path(text).stem
+        name = Path(text).stem
         if name in sources:
             raise ValueError(f'materials: found "{name}" twice')
         if text not in MATERIALS and not text.endswith(".json"):
@@ -314,8 +314,8 @@ class ShadingContenders:
                     table = self.table(problem, request)
             except FittingError:  # diverged repeatedly: the result is the start
                 result = FitResult({}, 0, 0, 0.0, False, 0, [])
-            chosen = table.settings.get("level_bias", 0.0)
-            return table, result, {"share": share, "way": way, "level_bias": chosen, "trouble": troubles(result)}
+            chosen = {"share": share, "way": way, "level_bias": table.settings.get("level_bias", 0.0)}
+            return table, result, {**chosen, "trouble": troubles(result)}
 
         return self.add_trained(f"lambda {share:g}, {way}, seed {seed}", "run", train)
 
@@ -370,7 +370,6 @@ CROP_SIDE = 48
 def draw_lambdas(contexts: dict[str, ShadingContenders], result: dict):
     """Draw PSNR over λ, with bars over seeds and troubles, beside the best classical filters."""
     settings = next(iter(contexts.values())).settings
-    shares = settings.lambdas
 
     def trained(context: ShadingContenders, letter: str) -> list[plot.Curve]:
         curves = []
@@ -379,26 +378,23 @@ def draw_lambdas(contexts: dict[str, ShadingContenders], result: dict):
             met = sorted({name for seeds in details[1:] for d in seeds for name in d["trouble"]})
             ends = [[end([d[letter]["mean_db"] for d in seeds]) for seeds in details] for end in (np.mean, min, max)]
             text = f"trained, {WAYS[settings.preset][way]} rate ({', '.join(met) or 'no trouble'})"
-            curves.append(plot.Curve(text, range(len(shares)), *ends))
+            curves.append(plot.Curve(text, range(len(runs)), *ends))
         return curves
 
-    ticks = [f"{share:g}" for share in shares]
-    return _draw(contexts, result, "λ, weight of the shading loss", ticks, trained,
-                 lambda figures: [figures["mean_db"]] * len(shares))  # fmt: skip
+    ticks = [f"{share:g}" for share in settings.lambdas]
+    filtered = lambda figures: [figures["mean_db"]] * len(ticks)  # noqa: E731
+    return _draw(contexts, result, "λ, weight of the shading loss", ticks, trained, filtered)
 
 
 def draw_levels(contexts: dict[str, ShadingContenders], result: dict):
     """Draw PSNR by level of detail of λ = 0, the largest λ and the best classical filters."""
 
-    def by_level(figures: dict) -> list[float]:
-        return figures["psnr_db"]
-
     def trained(context: ShadingContenders, letter: str) -> list[plot.Curve]:
-        shown = {text: by_level(job.record["details"][letter]) for text, job in context.shown_runs().items()}
+        shown = {text: job.record["details"][letter]["psnr_db"] for text, job in context.shown_runs().items()}
         return [plot.Curve(text, range(len(psnr)), psnr) for text, psnr in shown.items()]
 
-    levels = max(context.evaluation.levels for context in contexts.values())
-    return _draw(contexts, result, "level of detail", list(map(str, range(levels))), trained, by_level)
+    ticks = [str(level) for level in range(max(context.evaluation.levels for context in contexts.values()))]
+    return _draw(contexts, result, "level of detail", ticks, trained, lambda figures: figures["psnr_db"])
 
 
 def _draw(contexts: dict, result: dict, x_label: str, ticks: Sequence[str], trained: Callable, filtered: Callable):
