@@ -138,9 +138,8 @@ class ShadedEvaluation:
     def measure(self, read: ShadedReader, flip: bool = True) -> dict[str, dict]:
         """Return the errors against each truth, by its letter.
 
-        ``psnr_db``: of values clipped to [0, 1], for each level; ``mean_db``: their mean; ``coarse_db``: their mean
-        from level 2 on; ``flip``, if requested: the mean FLIP of the images as displayed, for each level of 16 pixels
-        or more.
+        ``psnr_db``: of values clipped to [0, 1], for each level; ``mean_db``: their mean; ``flip``, if requested:
+        the mean FLIP of the images as displayed, for each level of 16 pixels or more.
         """
         errors = {letter: {"psnr_db": [], "flip": []} for letter in self.truths}
         for level in range(self.levels):
@@ -153,7 +152,6 @@ class ShadedEvaluation:
                     figures["flip"].append(float(np.mean([metrics.flip(a, b) for a, b in pairs])))
         for figures in errors.values():
             figures["mean_db"] = float(np.mean(figures["psnr_db"]))
-            figures["coarse_db"] = float(np.mean(figures["psnr_db"][2:])) if self.levels > 2 else math.nan
         return errors
 
 
