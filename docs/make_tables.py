@@ -233,26 +233,21 @@ class Claim:
             parts += [phrase_pattern(literal), r"([-+−]?\d+(?:[.,]\d+)*%?)" if name is not None else ""]
         return re.compile("".join(parts))
 
-    def numbers(self) -> list[str]:
-        """Return the numbers of the fields, as the page should have them."""
-        fields = ((name, spec) for _, name, spec, _ in string.Formatter().parse(self.text) if name is not None)
-        return [format(evaluate(self.values[name]), spec) for name, spec in fields]
-
     def matches(self, text: str) -> list[re.Match]:
         """Return where the page has the sentence, with whatever numbers."""
         return list(self.pattern().finditer(text))
 
     def written(self, text: str) -> str:
         """Return the page with the numbers of the JSON in this sentence."""
-        numbers, matches = self.numbers(), self.matches(text)
+        fields = [(name, spec) for _, name, spec, _ in string.Formatter().parse(self.text) if name is not None]
+        numbers, matches = [format(evaluate(self.values[name]), spec) for name, spec in fields], self.matches(text)
         if not matches:
             raise ClaimError(f"{self.page}: no such sentence: “{self.text}”; claims.toml has it, mend either")
         if self.holds is not None and not evaluate(self.holds):
             raise ClaimError(f"{self.page}: “{self.text}” does not hold: {self.holds}")
         for match in reversed(matches):
-            for group in reversed(range(len(numbers))):
-                start, end = match.span(group + 1)
-                text = text[:start] + numbers[group] + text[end:]
+            for (start, end), number in reversed([*zip(match.regs[1:], numbers, strict=True)]):
+                text = text[:start] + number + text[end:]
         return text
 
 

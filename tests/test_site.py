@@ -151,7 +151,7 @@ def test_links_to_files_lead_to_pages_or_to_the_repository(small, url):
 def test_every_plugin_has_a_manual_page_and_a_small_picture(mi_rgb):
     specification = importlib.util.spec_from_file_location("make_plugin_pictures", DOCS / "make_plugin_pictures.py")
     specification.loader.exec_module(maker := importlib.util.module_from_spec(specification))
-    assert sorted(maker.CAPTIONS) == sorted(names())
+    assert sorted(maker.PICTURES) == sorted(names())
     from mi_diffind.plugins.support.manual import manual_page
 
     for name in names():
