@@ -366,6 +366,15 @@ def page_of_tasks() -> str:
     return "\n".join(parts)
 
 
+def machine(name: str) -> str:
+    """Return the processor, its cores and the version of this package that a file of figures records."""
+    m = measured(name).get("machine", {})
+    if "cpu" not in m:
+        return "–"
+    kind = m.get("instructions", "").partition(",")[0]
+    return f"{m.cpu} {kind}".rstrip() + f", cores: {m.cores}, {m['mi-diffind']}"
+
+
 def page_of_figures(pages: dict[Path, str]) -> str:
     """Return the page that names the command of each file, and the files of each sentence of ``pages`` with figures."""
     sentences = []
@@ -375,17 +384,18 @@ def page_of_figures(pages: dict[Path, str]) -> str:
         sentence = re.sub(r"\s+", " ", claim.matches(pages[claim.path])[0][0]).replace("|", "\\|").replace("**", "")
         sentences.append([f"[{claim.page}]({link})", sentence, sources])
     written_by = [
-        [f"[{name}](measured/{name}.json)", "`{}`".format(command.replace("|", "\\|"))]
+        [f"[{name}](measured/{name}.json)", "`{}`".format(command.replace("|", "\\|")), machine(name)]
         for name, command in sorted(commands().items())
     ]
     parts = [
         "# Where the figures come from",
         "Each figure of the README and of the pages is inserted from a file in `docs/measured`, which the command "
-        "below wrote. Files of version 0.1.0 were measured on the way to 0.2.0. A command after `git checkout` is "
+        "below wrote. Machines differ (–: not recorded); files of version 0.1.0 were measured on the way to 0.2.0. "
+        "A command after `git checkout` is "
         "one of that commit: this version has its script, or some of its rivals, no longer.\n"
         "This page is made by `python docs/make_tables.py`; `--list` prints the numbers that no file backs.",
         "## Files and commands",
-        table(["file", "command"], written_by),
+        table(["file", "command", "machine, version of this package"], written_by),
         "## Sentences",
         table(["page", "sentence", "files"], sentences),
     ]
