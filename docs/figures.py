@@ -212,6 +212,14 @@ def scene_runs(study: Entries) -> list[Entries]:
     return rows
 
 
+def groups(rows: Iterable[dict], *keys: str) -> dict[tuple, list[dict]]:
+    """Return rows by the values of some keys."""
+    result = {}
+    for row in rows:
+        result.setdefault(tuple(row[key] for key in keys), []).append(row)
+    return result
+
+
 def with_network(study: Entries, network: Entries) -> Entries:
     """Return a study with the candidates and jobs of another one, whose times are not used."""
     return Entries(study, **{key: Entries(study[key], **network[key]) for key in ("candidates", "jobs")})
@@ -261,9 +269,7 @@ def shading_runs(study: Entries) -> dict[str, dict[tuple[str, float], list[Entri
     materials = [job.details.material for job in study.jobs.values() if "material" in job.get("details", {})]
     result = {}
     for material in dict.fromkeys(materials):
-        runs = {}
-        for d in _of_kind(study, material, "run"):
-            runs.setdefault((d.way, d.share), []).append(d)
+        runs = groups(_of_kind(study, material, "run"), "way", "share")
         bases = {d.schedule: remedy for (remedy, share), ds in runs.items() if share == 0 for d in ds}
         for remedy, (first, *_) in {r: ds for (r, share), ds in runs.items() if share > 0}.items():
             if first.schedule in bases:
@@ -360,14 +366,17 @@ RENDERS = (
 #: Error of a contender that is the reference itself.
 EXACT = math.inf
 
-_BUILT_IN = (min, max, sum, len, round, abs, all, any, sorted, next, iter, zip, map, list, dict, range, tuple, float)
-
-#: Functions and constants of an expression, by name: those of this module and some that are built in.
+#: Functions and constants of an expression, by name.
 FUNCTIONS = {
-    **{f.__name__: f for f in _BUILT_IN},
-    **{name: f for name, f in globals().items() if getattr(f, "__module__", "") == __name__},
-    **{"mean": mean, "median_of": statistics.median, "RENDERS": RENDERS, "EXACT": EXACT},
-}
+    f.__name__: f
+    for f in (
+        min, max, sum, len, round, abs, all, any, sorted, next, iter, zip, map, list, dict, range, tuple, float,
+        Entries, measured, every, one, ratio, time_over, equal_samples, speed, cells, median, quartiles, with_spread,
+        size_text, binary_size, asset_bytes, equal_quality, scene_runs, with_network, budgets, by_label,
+        surface_errors, trust_cell, shading_runs, trouble, shading_best, shading, shading_level, shading_spread, flip,
+        held_out, rendered, shipped, trust_cells,
+    )
+} | {"mean": mean, "median_of": statistics.median, "RENDERS": RENDERS, "EXACT": EXACT}  # fmt: skip
 
 
 # -- evaluation --------------------------------------------------------------------------------------------------------
