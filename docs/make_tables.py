@@ -368,7 +368,7 @@ def page_of_tasks() -> str:
 
 def machine(name: str) -> str:
     """Return the processor, its cores and the version of this package that a file of figures records."""
-    m = measured(name).get("machine", {})
+    m = evaluate(name).get("machine", {})
     if "cpu" not in m:
         return "–"
     kind = m.get("instructions", "").partition(",")[0]
