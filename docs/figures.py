@@ -220,17 +220,18 @@ def with_network(study: Entries, network: Entries) -> Entries:
     return Entries(study, **{key: Entries(study[key], **network[key]) for key in ("candidates", "jobs")})
 
 
-def budgets(study: Entries) -> list[float]:
-    """Return the memory budgets of a study, ascending."""
-    return sorted({c.details.asked for c in study.candidates.values() if c.details.get("asked") and c.errors})
-
-
 def by_label(study: Entries) -> dict[str, dict]:
     """Return the errors of each contender of a study by its label and its budget, from the least budget on."""
-    found = sorted(
-        (c for c in study.candidates.values() if c.details.get("asked") and c.errors), key=lambda c: c.details.asked
-    )
-    return {label: {c.details.asked: c.errors for c in found if c.label == label} for label in (c.label for c in found)}
+    trained = [c for c in study.candidates.values() if c.details.get("asked") and c.errors]
+    errors = {}
+    for c in sorted(trained, key=lambda c: c.details.asked):
+        errors.setdefault(c.label, {})[c.details.asked] = c.errors
+    return errors
+
+
+def budgets(study: Entries) -> list[float]:
+    """Return the memory budgets of a study, ascending."""
+    return sorted(set().union(*by_label(study).values()))
 
 
 def surface_errors(row: dict, size: float) -> str:

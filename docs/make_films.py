@@ -14,9 +14,7 @@ the random numbers of seed ``i``: the same command gives the same films.
 from __future__ import annotations
 
 import argparse
-import math
-import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,24 +35,14 @@ ASSETS = SCENES / "assets"
 #: Frames a second; samples a pixel of the floor, whose light has noise, and of the truth.
 RATE, SAMPLES, TRUTH = 12, 4, 64
 
-#: Colour of a label.
-INK = (32, 32, 32)
+#: Width and height of a panel in pixels.
+SIZE = (288, 162)
 
-#: Colour of the space around panels.
-PAPER = (255, 255, 255)
-
-#: Height of a label over that of its text.
-LABEL = 1.7
-
-#: Settings of panels of the scenes, without "spp".
-FLOOR = {"max_depth": 3}
-METAL = {"sky": 0, "max_depth": 2}
+#: Colours of labels and of the space around panels, height of the text, height of a label, and space between panels.
+INK, PAPER, TEXT, LABEL, GAP = (32, 32, 32), (255, 255, 255), 13, 22, 4
 
 #: Panels of a film: label → frames of bytes.
 Panels = dict[str, list[np.ndarray]]
-
-#: Motions of the camera, a matrix in world space for each frame.
-Motions = Sequence[np.ndarray]
 
 
 @dataclass
@@ -70,30 +58,22 @@ class Film:
     returns: bool = True
 
 
-def times(frames: int) -> list[float]:
+def times(frames: int) -> np.ndarray:
     """Return a number for each frame that goes from 0 to 1, slowly at both ends."""
-    return [(1 - math.cos(math.pi * i / (frames - 1))) / 2 for i in range(frames)]
+    return (1 - np.cos(np.linspace(0, np.pi, frames))) / 2
 
 
-def turned(angles: Sequence[float]) -> Motions:
-    """Return motions about the vertical through the origin by angles in degrees."""
+def rotations(angles: Iterable[float]) -> list[np.ndarray]:
+    """Return motions of the camera about the vertical through the origin by angles in degrees, ``(4, 4)`` each."""
     return [poses.rotation((0, 1, 0), angle) for angle in angles]
 
 
-def swing(degrees: float, frames: int) -> Motions:
+def swing(degrees: float, frames: int) -> list[np.ndarray]:
     """Return motions about the vertical through the origin, from ``-degrees`` to ``degrees``."""
-    return turned([degrees * (2 * t - 1) for t in times(frames)])
+    return rotations(degrees * (2 * times(frames) - 1))
 
 
-def rendered(
-    name: str,
-    motions: Motions,
-    size: tuple[int, int],
-    spp: int = 1,
-    against: str | None = None,
-    scale: int = 1,
-    **defines,
-) -> list[np.ndarray]:
+def rendered(name: str, motions: Sequence[np.ndarray], size=SIZE, spp=1, against="", scale=1, **defines) -> list:
     """Render the frames of one panel: a scene of ``scenes/``, its learned plugins replaced by those of ``against``.
 
     The panel has ``size`` (width, height); each pixel of the render is enlarged to ``scale`` × ``scale`` of it.
@@ -101,9 +81,19 @@ def rendered(
     defines |= {"spp": spp, "width": size[0] // scale, "height": size[1] // scale}
     options = {"exact": True, "against": against} if against else {}
     scene = loading.load(SCENES / f"{name}.xml", defines, **options)
-    with progress_bar(" ".join(filter(None, (name, against))), len(motions), "frame", True) as bar:
+    with progress_bar(f"{name} {against}".rstrip(), len(motions), "frame", True) as bar:
         images = rendering.along(scene, motions, new_seeds=True, on_frame=bar.update)
     return [films.displayed(image).repeat(scale, axis=0).repeat(scale, axis=1) for image in images]
+
+
+def floor(motions: Sequence[np.ndarray], against: str = "", spp: int = SAMPLES, size=SIZE) -> list[np.ndarray]:
+    """Render a panel of ``horizon.xml``."""
+    return rendered("horizon", motions, size, spp, against, max_depth=3)
+
+
+def metal(file: str, frames: int, size=SIZE, **options) -> list[np.ndarray]:
+    """Render a panel of hammered metal in a light without noise, its pixels enlarged."""
+    return rendered("rust", swing(8.0, frames), size, scale=2, metal=file, sky=0, max_depth=2, **options)
 
 
 def suite(frames: int) -> Film:
@@ -111,8 +101,8 @@ def suite(frames: int) -> Film:
     size, back = (288, 172), np.tile(np.eye(4), (frames, 1, 1))
     back[:, :3, 3] = np.outer(times(frames), (0.0, 0.5, 2.2))
     panels = {
-        f"bitmap, {SAMPLES} samples a pixel": rendered("horizon", back, size, SAMPLES, against="exact", **FLOOR),
-        f"neural_texture, {SAMPLES} samples a pixel": rendered("horizon", back, size, SAMPLES, **FLOOR),
+        f"bitmap, {SAMPLES} samples a pixel": floor(back, "exact", size=size),
+        f"neural_texture, {SAMPLES} samples a pixel": floor(back, size=size),
         "neural_field among mirrors and glass": rendered("field", swing(22.0, frames), size, 48, max_depth=6),
         "neural_material, filtered maps": metal("rust_plain.npz", frames, size),
         "neural_material, trained for shading": metal("rust_shaded.npz", frames, size),
@@ -122,65 +112,53 @@ def suite(frames: int) -> Film:
     return Film(panels, 3, ["tiles_filtered.npz", "group.npz", "rust_plain.npz", "rust_shaded.npz", *wall])
 
 
-def metal(file: str, frames: int, size: tuple[int, int], **options) -> list[np.ndarray]:
-    """Render a panel of hammered metal, its pixels enlarged."""
-    return rendered("rust", swing(8.0, frames), size, scale=2, metal=file, **METAL, **options)
-
-
-def floor(frames: int) -> Film:
+def orbit(frames: int) -> Film:
     """Render an orbit through the pillars of ``horizon.xml``, of three times as many frames."""
-    size, around = (288, 162), turned([120 * i / frames for i in range(3 * frames)])
+    around = rotations(120 * i / frames for i in range(3 * frames))
     panels = {
-        f"bitmap, {SAMPLES} samples a pixel": rendered("horizon", around, size, SAMPLES, against="exact", **FLOOR),
-        f"mipmap, {SAMPLES} samples a pixel": rendered("horizon", around, size, SAMPLES, against="mipmap", **FLOOR),
-        f"neural_texture, {SAMPLES} samples a pixel": rendered("horizon", around, size, SAMPLES, **FLOOR),
-        f"truth, {TRUTH} samples a pixel": rendered("horizon", around, size, TRUTH, "exact", **FLOOR),
+        f"bitmap, {SAMPLES} samples a pixel": floor(around, "exact"),
+        f"mipmap, {SAMPLES} samples a pixel": floor(around, "mipmap"),
+        f"neural_texture, {SAMPLES} samples a pixel": floor(around),
+        f"truth, {TRUTH} samples a pixel": floor(around, "exact", TRUTH),
     }
     return Film(panels, 2, ["tiles_filtered.npz"], returns=False)
 
 
 def shading(frames: int) -> Film:
     """Render hammered metal, by textures and by one that is trained for its shading."""
-    size = (288, 162)
     panels = {
-        "bitmap, 1 sample a pixel": metal("rust_plain.npz", frames, size, against="exact"),
-        "filtered maps, 1 sample a pixel": metal("rust_plain.npz", frames, size),
-        "trained for shading, 1 sample a pixel": metal("rust_shaded.npz", frames, size),
-        f"truth, {TRUTH} samples a pixel": metal("rust_plain.npz", frames, size, spp=TRUTH, against="exact"),
+        "bitmap, 1 sample a pixel": metal("rust_plain.npz", frames, against="exact"),
+        "filtered maps, 1 sample a pixel": metal("rust_plain.npz", frames),
+        "trained for shading, 1 sample a pixel": metal("rust_shaded.npz", frames),
+        f"truth, {TRUTH} samples a pixel": metal("rust_plain.npz", frames, spp=TRUTH, against="exact"),
     }
     return Film(panels, 2, ["rust_plain.npz", "rust_shaded.npz"])
 
 
 def zoom(frames: int) -> Film:
     """Render the zoom of the texture study over the tiles."""
-    size, albedo = (288, 162), str(ASSETS / "tiles_albedo.png")
-    with_levels = {"filter": "anisotropic"}
-    textures = {
-        "bitmap, 1 sample a pixel": {"type": "bitmap", "filename": albedo},
-        "mipmap, 1 sample a pixel": {"type": "mipmap", "filename": albedo, **with_levels},
-        "neural_texture, 1 sample a pixel": {
-            "type": "neural_texture", "filename": str(ASSETS / "tiles_filtered.npz"), "channels": "albedo",
-            **with_levels,
-        },
-        f"truth, {TRUTH} samples a pixel": {"type": "bitmap", "filename": albedo},
-    }  # fmt: skip
+    albedo, table = str(ASSETS / "tiles_albedo.png"), str(ASSETS / "tiles_filtered.npz")
+    learned = {"type": "neural_texture", "filename": table, "channels": "albedo", "filter": "anisotropic"}
     side = mi.Bitmap(albedo).size()[0]
-    view = TextureZoom(renders.zoom_scene(), size, (side, side), frames)
-    panels = {}
-    for label, texture in textures.items():
-        truth = label.startswith("truth")
-        reader = renders.TextureReader(
-            lambda repeats, texture=texture: {**texture, "to_uv": renders.to_uv(repeats)},
-            spp=TRUTH if truth else 1,
-            sampler="multijitter" if truth else "independent",
-            prepare=loading.attach,
-        )
-        panels[label] = [np.round(255 * image).astype(np.uint8) for image in view.render(reader)]
+    view = TextureZoom(renders.zoom_scene(), SIZE, (side, side), frames)
+
+    def panel(texture: dict, spp: int = 1, sampler: str = "independent") -> list[np.ndarray]:
+        plugin = lambda repeats: texture | {"to_uv": renders.to_uv(repeats)}  # noqa: E731
+        reader = renders.TextureReader(plugin, spp, sampler, prepare=loading.attach)
+        return [np.round(255 * image).astype(np.uint8) for image in view.render(reader)]
+
+    bitmap = {"type": "bitmap", "filename": albedo}
+    panels = {
+        "bitmap, 1 sample a pixel": panel(bitmap),
+        "mipmap, 1 sample a pixel": panel({"type": "mipmap", "filename": albedo, "filter": "anisotropic"}),
+        "neural_texture, 1 sample a pixel": panel(learned),
+        f"truth, {TRUTH} samples a pixel": panel(bitmap, TRUTH, "multijitter"),
+    }
     return Film(panels, 2, ["tiles_filtered.npz"])
 
 
 #: Films by name.
-FILMS = {"suite": suite, "zoom": zoom, "orbit": floor, "shading": shading}
+FILMS = {"suite": suite, "zoom": zoom, "orbit": orbit, "shading": shading}
 
 
 def psnr(panels: Panels) -> dict[str, float]:
@@ -192,59 +170,44 @@ def psnr(panels: Panels) -> dict[str, float]:
     return {label: float(-10 * np.log10(error)) for label, error in errors.items() if not label.startswith("truth")}
 
 
-def beside(
-    panels: Mapping[str, Sequence[np.ndarray]], columns: int, text_height: int = 13, gap: int = 4
-) -> list[np.ndarray]:
-    """Return the frames of several films of one size and length as one film, ``columns`` panels in a row.
-
-    ``panels``: label → frames of bytes, ``(height, width, 3)``. The label stands above its panel, in text of
-    ``text_height`` pixels; ``gap`` pixels separate columns.
-    """
+def beside(panels: Panels, columns: int) -> list[np.ndarray]:
+    """Return the frames of panels of one size as those of one film, ``columns`` panels in a row, labels above."""
     import matplotlib
     from PIL import Image, ImageDraw, ImageFont
 
-    fonts = Path(matplotlib.get_data_path(), "fonts", "ttf")
+    font = ImageFont.truetype(str(Path(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf")), TEXT)
     height, width, _ = next(iter(panels.values()))[0].shape
-    columns, band = min(columns, len(panels)), round(LABEL * text_height)
     rows = -(-len(panels) // columns)
-    size = (columns * (width + gap) - gap, rows * (height + band))
-    sheet, font = Image.new("RGB", size, PAPER), ImageFont.truetype(str(fonts / "DejaVuSans.ttf"), text_height)
-    corners, draw = [], ImageDraw.Draw(sheet)
-    for i, label in enumerate(panels):
-        x, y = i % columns * (width + gap), i // columns * (height + band)
-        draw.text((x + width / 2, y + band / 2), label, fill=INK, font=font, anchor="mm")
-        corners.append((x, y + band))
-    empty, frames = np.array(sheet), []
+    sheet = Image.new("RGB", (columns * (width + GAP) - GAP, rows * (height + LABEL)), PAPER)
+    corners = [(i % columns * (width + GAP), i // columns * (height + LABEL)) for i in range(len(panels))]
+    for (x, y), label in zip(corners, panels, strict=True):
+        ImageDraw.Draw(sheet).text((x + width / 2, y + LABEL / 2), label, fill=INK, font=font, anchor="mm")
+    frames = []
     for together in zip(*panels.values(), strict=True):
-        frame = empty.copy()
+        frames.append(np.array(sheet))
         for (x, y), image in zip(corners, together, strict=True):
-            frame[y : y + height, x : x + width] = image
-        frames.append(frame)
+            frames[-1][y + LABEL : y + LABEL + height, x : x + width] = image
     return frames
 
 
-def make(name: str, frames: int, out: Path, json_folder: Path | None, quality: float) -> None:
+def make(name: str, frames: int, out: Path, json_folder: Path | None) -> None:
     """Render a film and write it."""
     film = FILMS[name](frames)
     shown = beside(film.panels, film.columns)
     rendered_frames = len(shown)
     if film.returns:
         shown += shown[-2:0:-1]
-    seconds = len(shown) / RATE
-    films.write(out / f"{name}.webp", shown, seconds, quality)
-    films.write(out / f"{name}.mp4", shown, seconds, 23)
-    mi.Bitmap(shown[0]).write(str(out / f"{name}.jpg"), quality=85)
-    files = [out / f"{name}.{extension}" for extension in ("webp", "mp4", "jpg")]
-    with tempfile.TemporaryDirectory() as folder:  # for its size alone
-        films.write(gif := Path(folder) / f"{name}.gif", shown, seconds)
-        sizes = {file.suffix[1:]: file.stat().st_size for file in (*files, gif)}
+    seconds, files = len(shown) / RATE, [out / f"{name}.{extension}" for extension in ("webp", "mp4", "jpg")]
+    films.write(files[0], shown, seconds, quality=60)
+    films.write(files[1], shown, seconds, quality=23)
+    mi.Bitmap(shown[0]).write(str(files[2]), quality=85)
     height, width, _ = shown[0].shape
     figures = {
         "command": f"python docs/make_films.py {name} --frames {frames}",
         "width": width, "height": height, "frames": len(shown), "frames_rendered": rendered_frames,
         "frames_per_second": RATE, "variant": mi.variant(), "psnr_db": psnr(film.panels),
         "table_file_bytes": {file: (ASSETS / file).stat().st_size for file in film.files},
-        "bytes": sizes,
+        "bytes": {file.suffix[1:]: file.stat().st_size for file in files},
     }  # fmt: skip
     print(name, figures["bytes"], figures["psnr_db"])
     if json_folder:
@@ -256,7 +219,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"films: {', '.join(FILMS)} (default: all)")
     parser.add_argument("--frames", type=int, default=20, help="frames that are rendered of each (default: 20)")
-    parser.add_argument("--quality", type=float, default=60, help="quality of WebP (default: 60)")
     parser.add_argument("--out", type=Path, default=DOCS / "films", help="folder of the films (default: docs/films)")
     parser.add_argument("--json", type=Path, metavar="FOLDER", help="folder of the figures, such as docs/measured")
     arguments = parser.parse_args()
@@ -267,7 +229,7 @@ def main() -> None:
     mi.set_variant("llvm_ad_rgb")
     arguments.out.mkdir(parents=True, exist_ok=True)
     for name in arguments.names or FILMS:
-        make(name, arguments.frames, arguments.out, arguments.json, arguments.quality)
+        make(name, arguments.frames, arguments.out, arguments.json)
 
 
 if __name__ == "__main__":

@@ -233,26 +233,21 @@ class Claim:
             parts += [phrase_pattern(literal), r"([-+−]?\d+(?:[.,]\d+)*%?)" if name is not None else ""]
         return re.compile("".join(parts))
 
-    def numbers(self) -> list[str]:
-        """Return the numbers of the fields, as the page should have them."""
-        fields = ((name, spec) for _, name, spec, _ in string.Formatter().parse(self.text) if name is not None)
-        return [format(evaluate(self.values[name]), spec) for name, spec in fields]
-
     def matches(self, text: str) -> list[re.Match]:
         """Return where the page has the sentence, with whatever numbers."""
         return list(self.pattern().finditer(text))
 
     def written(self, text: str) -> str:
         """Return the page with the numbers of the JSON in this sentence."""
-        numbers, matches = self.numbers(), self.matches(text)
+        fields = [(name, spec) for _, name, spec, _ in string.Formatter().parse(self.text) if name is not None]
+        numbers, matches = [format(evaluate(self.values[name]), spec) for name, spec in fields], self.matches(text)
         if not matches:
             raise ClaimError(f"{self.page}: no such sentence: “{self.text}”; claims.toml has it, mend either")
         if self.holds is not None and not evaluate(self.holds):
             raise ClaimError(f"{self.page}: “{self.text}” does not hold: {self.holds}")
         for match in reversed(matches):
-            for group in reversed(range(len(numbers))):
-                start, end = match.span(group + 1)
-                text = text[:start] + numbers[group] + text[end:]
+            for (start, end), number in reversed([*zip(match.regs[1:], numbers, strict=True)]):
+                text = text[:start] + number + text[end:]
         return text
 
 
@@ -371,6 +366,15 @@ def page_of_tasks() -> str:
     return "\n".join(parts)
 
 
+def machine(name: str) -> str:
+    """Return the processor, its cores and the version of this package that a file of figures records."""
+    m = evaluate(name).get("machine", {})
+    if "cpu" not in m:
+        return "–"
+    kind = m.get("instructions", "").partition(",")[0]
+    return f"{m.cpu} {kind}".rstrip() + f", cores: {m.cores}, {m['mi-diffind']}"
+
+
 def page_of_figures(pages: dict[Path, str]) -> str:
     """Return the page that names the command of each file, and the files of each sentence of ``pages`` with figures."""
     sentences = []
@@ -380,17 +384,18 @@ def page_of_figures(pages: dict[Path, str]) -> str:
         sentence = re.sub(r"\s+", " ", claim.matches(pages[claim.path])[0][0]).replace("|", "\\|").replace("**", "")
         sentences.append([f"[{claim.page}]({link})", sentence, sources])
     written_by = [
-        [f"[{name}](measured/{name}.json)", "`{}`".format(command.replace("|", "\\|"))]
+        [f"[{name}](measured/{name}.json)", "`{}`".format(command.replace("|", "\\|")), machine(name)]
         for name, command in sorted(commands().items())
     ]
     parts = [
         "# Where the figures come from",
         "Each figure of the README and of the pages is inserted from a file in `docs/measured`, which the command "
-        "below wrote. Files of version 0.1.0 were measured on the way to 0.2.0. A command after `git checkout` is "
+        "below wrote. Machines differ (–: not recorded); files of version 0.1.0 were measured on the way to 0.2.0. "
+        "A command after `git checkout` is "
         "one of that commit: this version has its script, or some of its rivals, no longer.\n"
         "This page is made by `python docs/make_tables.py`; `--list` prints the numbers that no file backs.",
         "## Files and commands",
-        table(["file", "command"], written_by),
+        table(["file", "command", "machine, version of this package"], written_by),
         "## Sentences",
         table(["page", "sentence", "files"], sentences),
     ]

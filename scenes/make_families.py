@@ -1,4 +1,4 @@
-"""Fit two families of BSDFs, and render families.jpg: both with textured parameters (left) beside their sources.
+"""Fit two families of BSDFs, and render families.jpg: sources (left), families with textured parameters (right).
 
 The upper row is ``principled`` with maps of roughness and metallic. The lower row is ``roughplastic`` with stripes of
 four roughnesses; Mitsuba cannot texture that parameter, so the source is a blend of four plastics.
@@ -96,7 +96,7 @@ def main() -> None:
     arguments = parser.parse_args()
     rows = []
     for learned, source in materials(arguments.folder):
-        pair = [render(bsdf, arguments.spp) for bsdf in (learned, source)]
+        pair = [render(bsdf, arguments.spp) for bsdf in (source, learned)]
         a, b = (np.clip(pair[0][k], 0, 1) - np.clip(pair[1][k], 0, 1) for k in (0, 1))
         error, noise = float(np.mean(a * b)), 2 * float(np.std(a * b)) / math.sqrt(a.size)
         at_least = "at least " if error < noise else ""

@@ -38,9 +38,7 @@ def test_examples(tmp_path, capsys):
     folder, report = tmp_path / "scenes", tmp_path / "report.json"
     assert main(["examples", str(folder), "--json", str(report)]) == 0
     text, written = capsys.readouterr().out, below(folder)
-    assert {f"{name.stem}.xml" for name in (ROOT / "scenes").glob("*.xml")} == {n for n in written if "/" not in n} - {
-        "README.md"
-    }
+    assert {p.name for p in (ROOT / "scenes").glob("*.xml")} | {"README.md"} == {n for n in written if "/" not in n}
     for name, content in written.items():
         assert content == (ROOT / "scenes" / name).read_bytes(), name
     assert not [name for name in written if name.startswith("references") or name.endswith((".py", ".jpg"))]
@@ -140,32 +138,19 @@ def test_fetch(server, tmp_path, capsys):
     assert mirror.figures["loaded"] == 2 and below(tmp_path / "other") == below(folder)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda served: (served / "one.bin").unlink(), "cannot be fetched: 404"),
-        (lambda served: (served / "one.bin").write_bytes(CONTENT["one.bin"][:-1]), "found the SHA-256"),
-        (lambda served: (served / "one.bin").write_bytes(CONTENT["one.bin"][::-1]), "found the SHA-256"),
-    ],
-)
-def test_fetch_of_other_content(server, tmp_path, capsys, change, message):
-    change(tmp_path / "served" / "thing")
-    folder = tmp_path / "data"
-    found = refused(capsys, "fetch", "thing", "-o", str(folder))
-    assert message in found and "/thing/one.bin: " in found
-    assert below(folder) == {}  # no temporary file, and nothing of the second one
-
-
 def test_fetch_that_fails(server, tmp_path, capsys):
-    folder = tmp_path / "data"
-    for word, message in (("moved", "cannot be fetched: "), ("broken", "")):
-        found = refused(capsys, "fetch", "thing", "-o", str(folder), "--from", f"{server}/{word}")
-        assert f"error: {server}/{word}/thing/one.bin: " in found and message in found
-        assert below(folder) == {}
+    """Nothing is left of a file that is gone, differs, is moved, is broken off or is served by nobody."""
+    folder, file = tmp_path / "data", tmp_path / "served" / "thing" / "one.bin"
     with http.server.HTTPServer(("127.0.0.1", 0), Handler) as closed:
         nobody = f"http://127.0.0.1:{closed.server_port}"
-    assert "cannot be fetched: " in refused(capsys, "fetch", "thing", "-o", str(folder), "--from", nobody)
-    assert below(folder) == {}
+    for base, message in ((f"{server}/moved", "cannot be fetched: "), (f"{server}/broken", ""), (nobody, "cannot be")):
+        found = refused(capsys, "fetch", "thing", "-o", str(folder), "--from", base)
+        assert f"error: {base}/thing/one.bin: " in found and message in found and below(folder) == {}
+    for content in (CONTENT["one.bin"][:-1], CONTENT["one.bin"][::-1], None):
+        file.unlink() if content is None else file.write_bytes(content)
+        found = refused(capsys, "fetch", "thing", "-o", str(folder))
+        message = "cannot be fetched: 404" if content is None else "found the SHA-256"
+        assert message in found and "/thing/one.bin: " in found and below(folder) == {}
 
 
 def test_fetch_refuses(server, tmp_path, capsys):
@@ -205,11 +190,15 @@ def test_one_version():
 @pytest.mark.long
 def test_wheel(tmp_path):
     """The wheel, built from the source archive, holds all modules, tables and scenes, and works without a checkout."""
+
+    def run(*command, cwd=tmp_path):
+        done = subprocess.run([sys.executable, *map(str, command)], cwd=cwd, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr[-2000:]
+        return done.stdout
+
     ignored = shutil.ignore_patterns(".*", "out", "build", "dist", "*.egg-info", "__pycache__")
     copy = shutil.copytree(ROOT, tmp_path / "copy", ignore=ignored)  # setuptools works beside the sources
-    command = [sys.executable, "-m", "build", "--outdir", str(tmp_path / "dist"), str(copy)]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr[-2000:]
+    run("-m", "build", "--outdir", tmp_path / "dist", copy)
     (wheel,), (archive,) = (tmp_path / "dist").glob("*.whl"), (tmp_path / "dist").glob("*.tar.gz")
     assert wheel.name.startswith(f"mi_diffind-{mi_diffind.__version__}-py3-none-any")
 
@@ -227,26 +216,15 @@ def test_wheel(tmp_path):
         kept = {name.partition("/")[2] for name in sources.getnames()}
     assert {"CHANGELOG.md", "LICENSE", "scenes/materials.xml", "tests/conftest.py", "docs/trust.md"} <= kept
 
-    installed = tmp_path / "installed"
+    installed, empty = tmp_path / "installed", tmp_path / "empty"
     zipfile.ZipFile(wheel).extractall(installed)
-    empty = tmp_path / "empty"
     empty.mkdir()
-    code = (
-        "import sys; sys.path.insert(0, sys.argv.pop(1)); import mi_diffind; from mi_diffind.commands.cli import main\n"
-    )
-    code += "print(mi_diffind.__file__); sys.exit(main())"
-
-    def run(*arguments):
-        done = subprocess.run(
-            [sys.executable, "-P" if sys.version_info >= (3, 11) else "-s", "-c", code, str(installed), *arguments],
-            cwd=empty, capture_output=True, text=True,
-        )  # fmt: skip
-        assert done.returncode == 0, done.stderr
-        return done.stdout
-
-    assert run("examples", "scenes").startswith(str(installed))
-    small = ("-D", "width=48", "-D", "height=28", "--spp", "2")
-    run("compare", "scenes/materials.xml", "--passes", "2", *small)
+    code = "import sys; sys.path.insert(0, sys.argv.pop(1)); import mi_diffind; from mi_diffind.commands import cli\n"
+    code += "print(mi_diffind.__file__); sys.exit(cli.main())"
+    command = ("-P" if sys.version_info >= (3, 11) else "-s", "-c", code, installed)
+    assert run(*command, "examples", "scenes", cwd=empty).startswith(str(installed))
+    small = ("-D", "width=48", "-D", "height=28", "--spp", "2", "--passes", "2")
+    run(*command, "compare", "scenes/materials.xml", *small, cwd=empty)
     assert (empty / "out" / "comparison.png").stat().st_size > 1000
     points = (installed / f"mi_diffind-{mi_diffind.__version__}.dist-info" / "entry_points.txt").read_text()
     assert "[mitsuba]\nmi_diffind = mi_diffind.plugins.mitsuba_entry" in points

@@ -21,29 +21,22 @@ ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 MANUAL = DOCS / "manual"
 
+#: Heading of a manual page: its title, and the plugin's name.
+HEADING = r"^(.+) \(:monosp:`\w+`\)$"
+
 #: Line of a table of contents that stands for all pages that are not listed.
 OTHER = "(all other pages)"
 
 #: Type of object → the heading of its plugins.
-HEADINGS = {
-    "bsdf": "BSDFs",
-    "texture": "Textures",
-    "shape": "Shapes",
-    "integrator": "Integrators",
-}
+HEADINGS = {"bsdf": "BSDFs", "texture": "Textures", "shape": "Shapes", "integrator": "Integrators"}
 
 
 class Pages:
-    """Generated pages: ``content`` by path, and what settings of the site need to know of them.
-
-    ``origins``: path in the repository → the page that is made from it; ``sources``: the reverse, for pages whose
-    links are relative to their origin.
-    """
+    """Generated pages: ``content`` by path, and ``origins``: path in the repository → the page that is made from it."""
 
     def __init__(self):
         self.content: dict[str, str | bytes] = {}
         self.origins: dict[str, str] = {}
-        self.sources: dict[str, str] = {}
 
     def add(self, path: str, content: str | bytes, origin: str = "") -> None:
         """Add a page at a path below ``docs/manual``, made from a file of the repository if ``origin`` names one."""
@@ -73,6 +66,11 @@ def literal(text: str) -> str:
     return re.sub(r"([\\*`|_]|(?=://))", r"\\\1", text)
 
 
+def shell(command: str) -> list[str]:
+    """Return a listing of a command."""
+    return [".. code-block:: sh", "", f"   {command}", ""]
+
+
 def toctree(names) -> list[str]:
     """Return a table of contents that is shown at the side only."""
     return ["", ".. toctree::", "   :hidden:", "", *(f"   {name}" for name in names), ""]
@@ -99,19 +97,17 @@ def plugin_pages(pages: Pages) -> dict[str, str]:
     from mi_diffind import plugins
     from mi_diffind.plugins.support.manual import manual_page
 
-    declared = {}
-    for name, plugin in plugins.declared().items():
-        module = sys.modules.get(f"{plugins.__name__}.{name}")
-        if module is not None:
-            declared[name] = plugin
-            page = _with_picture(manual_page(module), plugin)
-            pages.add(f"plugins/{name}.rst", page, f"plugins/{name}.py")
+    modules = {name: sys.modules.get(f"{plugins.__name__}.{name}") for name in plugins.declared()}
+    declared = {name: plugin for name, plugin in plugins.declared().items() if modules[name]}
+    for name, plugin in declared.items():
+        page = _with_picture(manual_page(modules[name]), plugin)
+        pages.add(f"plugins/{name}.rst", page, f"plugins/{name}.py")
     index = [*titled("Plugins"), "Each page is the docstring of the plugin's file. The pictures are made by", ""]
-    index += [".. code-block:: sh", "", "   python docs/make_plugin_pictures.py", ""]
+    index += shell("python docs/make_plugin_pictures.py")
     for kind, heading in HEADINGS.items():
-        named = sorted(name for name, plugin in declared.items() if plugin.object_type == kind)
-        if named:
-            cards = [(name, name, _title(pages.content[f"plugins/{name}.rst"]), _picture(name)) for name in named]
+        if named := sorted(name for name, plugin in declared.items() if plugin.object_type == kind):
+            titles = [re.search(HEADING, pages.content[f"plugins/{name}.rst"], re.MULTILINE)[1] for name in named]
+            cards = [(name, name, title, _picture(name)) for name, title in zip(named, titles, strict=True)]
             index += [*titled(heading, "-"), *gallery(cards), *toctree(named)]
     pages.add("plugins/index.rst", "\n".join(index), "plugins")
     return {name: f"manual/plugins/{name}" for name in declared}
@@ -119,11 +115,6 @@ def plugin_pages(pages: Pages) -> dict[str, str]:
 
 def _picture(name: str) -> str:
     return f"/pictures/{name}.jpg" if (DOCS / "pictures" / f"{name}.jpg").is_file() else ""
-
-
-def _title(page: str) -> str:
-    """Return the heading of a manual page without the plugin's name."""
-    return re.search(r"^(.+) \(:monosp:`\w+`\)$", page, re.MULTILINE)[1]
 
 
 def _with_picture(page: str, plugin) -> str:
@@ -141,14 +132,13 @@ def _with_picture(page: str, plugin) -> str:
         facts["Seen by"] = f"{seen}; with ``{plugin.otherwise[0]}`` ``{plugin.otherwise[1]}`` by any integrator"
     lines = [f":{name}: {text}" for name, text in facts.items()]
     if _picture(plugin.name):
-        from make_plugin_pictures import CAPTIONS
+        from make_plugin_pictures import PICTURES
 
-        caption = CAPTIONS.get(plugin.name, "")
         command = f"``python docs/make_plugin_pictures.py {plugin.name}``"
         lines += ["", f".. figure:: {_picture(plugin.name)}", f"   :alt: A render of {plugin.name}"]
-        lines += ["   :class: plugin-picture", "", f"   {caption} Made by {command}."]
-    head = re.search(r"^.+ \(:monosp:`\w+`\)\n-+\n", page, re.MULTILINE)
-    return page[: head.end()] + "\n" + "\n".join(lines) + "\n" + page[head.end() :]
+        lines += ["   :class: plugin-picture", "", f"   {PICTURES[plugin.name][-1]} Made by {command}."]
+    end = re.search(rf"{HEADING}\n-+\n", page, re.MULTILINE).end()
+    return page[:end] + "\n" + "\n".join(lines) + "\n" + page[end:]
 
 
 # Commands
@@ -164,13 +154,11 @@ def command_pages(pages: Pages) -> None:
     index += ["   * - Command", "     - Purpose", "     - Example"]
     for verb in sorted(VERBS):
         module = importlib.import_module(f"mi_diffind.commands.{verb}")
-        parser = argparse.ArgumentParser(prog="mi-diffind")
-        subparsers = parser.add_subparsers()
+        subparsers = argparse.ArgumentParser(prog="mi-diffind").add_subparsers()
         module.add(subparsers)
-        origin = f"mi_diffind/commands/{verb}.py"
-        pages.add(f"commands/{verb}.rst", "\n".join(_command(subparsers.choices[verb], verb)), origin)
-        example = (subparsers.choices[verb].epilog or "").partition("example: ")[2]
-        index += [f"   * - :doc:`{verb}`", f"     - {literal(module.HELP)}", f"     - ``{example}``"]
+        parser = subparsers.choices[verb]
+        pages.add(f"commands/{verb}.rst", "\n".join(_command(parser, verb)), f"mi_diffind/commands/{verb}.py")
+        index += [f"   * - :doc:`{verb}`", f"     - {literal(module.HELP)}", f"     - ``{_example(parser)}``"]
     index += toctree(sorted(VERBS))
     pages.add("commands/index.rst", "\n".join(index), "mi_diffind/commands")
 
@@ -199,11 +187,13 @@ def _shared(parsers) -> list[tuple]:
 def _parser(parser: argparse.ArgumentParser, actions) -> list[str]:
     description = parser.description or ""
     lines = [f"{literal(description[:1].upper() + description[1:])}.", ""]
-    example = (parser.epilog or "").partition("example: ")[2]
-    if example:
-        lines += [".. code-block:: sh", "", f"   {example}", ""]
-    lines += [f".. program:: {parser.prog}", ""]
-    return lines + [line for action in actions for line in _entry(action)]
+    if parser.epilog:
+        lines += shell(_example(parser))
+    return [*lines, f".. program:: {parser.prog}", "", *(line for action in actions for line in _entry(action))]
+
+
+def _example(parser: argparse.ArgumentParser) -> str:
+    return (parser.epilog or "").partition("example: ")[2]
 
 
 def _entry(action: argparse.Action) -> tuple:
@@ -212,13 +202,10 @@ def _entry(action: argparse.Action) -> tuple:
         return ()
     choices = f"{{{','.join(map(str, action.choices))}}}" if action.choices else ""
     metavar = action.metavar or choices or action.dest.upper()
-    value = " ".join(metavar) if isinstance(metavar, tuple) else metavar
-    if action.nargs == 0:
-        value = ""
-    names = [f"{name} {value}".rstrip() for name in action.option_strings] or [value if value else action.dest]
-    text = (action.help or "") % {"default": action.default, "prog": "mi-diffind"} if action.help else ""
-    return (f".. option:: {', '.join(names)}", "", *textwrap.wrap(literal(text), 110, initial_indent="   ",
-            subsequent_indent="   "), "")  # fmt: skip
+    value = "" if action.nargs == 0 else " ".join(metavar) if isinstance(metavar, tuple) else metavar
+    names = [f"{name} {value}".rstrip() for name in action.option_strings] or [value or action.dest]
+    text = literal((action.help or "") % {"default": action.default, "prog": "mi-diffind"})
+    return (f".. option:: {', '.join(names)}", "", *(f"   {line}" for line in textwrap.wrap(text, 107)), "")
 
 
 # Notebooks
@@ -232,14 +219,9 @@ def notebook_pages(pages: Pages) -> None:
         for name, data in pictures.items():
             pages.add(f"notebooks/{name}", data)
         pages.add(f"notebooks/{path.stem}.md", text, f"notebooks/{path.name}")
-        pages.sources[f"manual/notebooks/{path.stem}"] = f"notebooks/{path.name}"
         title = re.search(r"^# (.+)$", text, re.MULTILINE)[1]
         cards.append((path.stem, title, f"``{path.name}``", next(iter(pictures), "")))
-    index = [
-        *titled("Notebooks"),
-        "The files lie in the folder ``notebooks``; their results are those of the last run.",
-        "",
-    ]
+    index = [*titled("Notebooks"), "The files lie in the folder ``notebooks``, with the results of their last run.", ""]
     pages.add("notebooks/index.rst", "\n".join([*index, *gallery(cards), *toctree(c[0] for c in cards)]), "notebooks")
 
 
@@ -275,7 +257,7 @@ def generate(app, config) -> None:
     notebook_pages(pages)
     pages.write()
     config.repository_pages = pages.origins
-    config.repository_sources = pages.sources
+    config.repository_sources = {page: origin for origin, page in pages.origins.items()}
 
 
 def other_pages(app, docname: str, source: list[str]) -> None:

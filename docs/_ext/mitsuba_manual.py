@@ -13,7 +13,7 @@ from docutils import nodes
 from docutils.parsers.rst.directives.tables import ListTable
 from docutils.statemachine import StringList
 from docutils.utils.math.latex2mathml import tex2mathml
-from sphinx import addnodes
+from repository_links import link_to_page
 from sphinx.util.docutils import SphinxRole
 from sphinx_design.tabs import TabItemDirective, TabSetDirective
 
@@ -71,10 +71,7 @@ class Monospaced(SphinxRole):
         page = self.env.config.plugin_pages.get(self.text)
         if page is None or page == self.env.docname:
             return [literal], []
-        # MyST's link to a page keeps the nodes inside of the first child; Sphinx's keeps the text only
-        options = {"refdomain": "doc", "reftype": "myst", "refdoc": self.env.docname, "refexplicit": True}
-        link = addnodes.pending_xref("", nodes.inline("", "", literal), reftarget=page, reftargetid=None, **options)
-        return [link], []
+        return [link_to_page(self.env.docname, page, [nodes.inline("", "", literal)])], []
 
 
 class Flag(SphinxRole):
@@ -98,17 +95,12 @@ def setup(app):
     """Register directives, roles, substitutions and the renderer of formulas."""
     app.setup_extension("sphinx_design")
     app.add_config_value("plugin_pages", {}, "env")
-    app.add_directive("pluginparameters", PluginParameters)
-    app.add_directive("tabs", Tabs)
-    app.add_directive("code-tab", CodeTab)
+    for name, directive in {"pluginparameters": PluginParameters, "tabs": Tabs, "code-tab": CodeTab}.items():
+        app.add_directive(name, directive)
     app.add_role("monosp", Monospaced())
     app.add_role("flag", Flag())
     app.add_html_math_renderer("mathml", (_inline, None), (_displayed, None))
-    app.connect("config-inited", _substitutions)
+    replaced = {name: name for name in TYPES} | {name: f":flag:`{name}`" for name in FLAGS}
+    prolog = "".join(f".. |{name}| replace:: {text}\n" for name, text in replaced.items())
+    app.config.rst_prolog = f"{app.config.rst_prolog or ''}\n{prolog}"
     return {"version": "1", "parallel_read_safe": True, "parallel_write_safe": True}
-
-
-def _substitutions(app, config):
-    replaced = {**{name: name for name in TYPES}, **{name: f":flag:`{name}`" for name in FLAGS}}
-    prolog = "\n".join(f".. |{name}| replace:: {text}" for name, text in replaced.items())
-    config.rst_prolog = f"{config.rst_prolog or ''}\n{prolog}\n"

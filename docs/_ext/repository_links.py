@@ -19,6 +19,12 @@ from sphinx.util import logging
 logger = logging.getLogger(__name__)
 
 
+def link_to_page(docname: str, page: str, children: list, anchor: str | None = None) -> addnodes.pending_xref:
+    """Return a link of a page to another one; MyST's link keeps the nodes inside, Sphinx's their text only."""
+    options = {"refdomain": "doc", "reftype": "myst", "refdoc": docname, "refexplicit": True}
+    return addnodes.pending_xref("", *children, reftarget=page, reftargetid=anchor, **options)
+
+
 class RepositoryLinks(SphinxTransform):
     """Replaces the targets of links that leave the folder of the pages."""
 
@@ -46,14 +52,12 @@ class RepositoryLinks(SphinxTransform):
 
     def _link(self, node, path: str, anchor: str | None):
         """Return the node that takes the place of a link to a path; ``None`` if there is no such file."""
-        config, docname = self.config, self.env.docname
-        found, folder = Path(config.repository_root, path), Path(self.env.srcdir).name
-        page = config.repository_pages.get(path)
-        if page is None and path.startswith(f"{folder}/") and path.endswith(".md"):
-            page = path.removeprefix(f"{folder}/").removesuffix(".md")
+        config, docname, source = self.config, self.env.docname, Path(self.env.srcdir)
+        found, page = Path(config.repository_root, path), config.repository_pages.get(path)
+        if page is None and path.startswith(f"{source.name}/") and path.endswith(".md"):
+            page = path.removeprefix(f"{source.name}/").removesuffix(".md")
         if page is not None:
-            options = {"refdomain": "doc", "reftype": "myst", "refdoc": docname, "refexplicit": True}
-            return addnodes.pending_xref("", *node.children, reftarget=page, reftargetid=anchor, **options)
+            return link_to_page(docname, page, node.children, anchor)
         if not found.exists():
             logger.warning("the repository has no file %r", path, location=node, type="repository", subtype="missing")
             return nodes.inline("", "", *node.children)
@@ -63,16 +67,14 @@ class RepositoryLinks(SphinxTransform):
             return nodes.reference("", "", *node.children, refuri=uri)
         if found.is_dir():
             return nodes.inline("", "", *node.children)
-        copy = os.path.relpath(found, Path(self.env.srcdir, docname).parent)
+        copy = os.path.relpath(found, (source / docname).parent)
         return addnodes.download_reference("", "", *node.children, reftarget=copy, refdoc=docname)
 
 
 def setup(app):
     """Register the transform and its settings."""
-    app.add_config_value("repository_root", "..", "env")
-    app.add_config_value("repository_url", "", "env")
-    app.add_config_value("repository_branch", "main", "env")
-    app.add_config_value("repository_pages", {}, "env")
-    app.add_config_value("repository_sources", {}, "env")
+    defaults = {"root": "..", "url": "", "branch": "main", "pages": {}, "sources": {}}
+    for name, default in defaults.items():
+        app.add_config_value(f"repository_{name}", default, "env")
     app.add_transform(RepositoryLinks)
     return {"version": "1", "parallel_read_safe": True, "parallel_write_safe": True}
