@@ -281,9 +281,6 @@ def test_scenes_that_ship_are_wholly_in_sight(mi_rgb, tmp_path, name):
     assert 0.02 < images[..., :3].mean() < 0.5
 
 
-# -- places -----------------------------------------------------------------------------------------------------------
-
-
 def angles(a, b):
     return np.degrees(np.arccos(np.clip(a @ b.T, -1, 1)))
 

@@ -264,9 +264,6 @@ def test_tradeoff_of_a_scene(tmp_path, capsys):
     assert found["settings"]["quick"] and not found["interrupted"]
 
 
-# -- bad input ---------------------------------------------------------------------------------------------------------
-
-
 def test_missing_files(tmp_path, capsys):
     out = ["--out", str(tmp_path / "o")]
     for words, options in ((["render"], []), (["compare"], out), (["tradeoff", "scene"], out), (["inspect"], [])):

@@ -52,9 +52,6 @@ def luminance(image):
     return float((image @ LUMINANCE if image.shape[-1] == 3 else image[..., 0]).mean(dtype=np.float64))
 
 
-# -- the probe ---------------------------------------------------------------------------------------------------------
-
-
 def auto_depth(file, tolerance=0.005, **options):
     return depth.auto_depth(loading.ParsedScene(file), tolerance, progress=False, **options)
 
@@ -113,9 +110,6 @@ def test_one_bounce_alone_and_no_scattered_light(mi_rgb, tmp_path):
     assert found["chosen"] == 1 and found["left_out"] == 0
 
 
-# -- shares, from given images -----------------------------------------------------------------------------------------
-
-
 def bounces(light):
     """Shares of luminance by depth, ``(depths, height, width)``."""
     images = np.cumsum(light, axis=0)
@@ -166,9 +160,6 @@ def test_tolerance():
     for bad in (0, -0.1, 1, 2, float("nan"), float("inf")):
         with pytest.raises(ValueError, match="allowed is more than 0 and less than 1"):
             auto_depth(SCENES / "tiles.xml", bad)
-
-
-# -- the command -------------------------------------------------------------------------------------------------------
 
 
 def render(tmp_path, *arguments):

@@ -126,9 +126,6 @@ def test_wrong_arguments(mi_rgb, case):
         mi_diffind.fit(*arguments, **options)
 
 
-# -- scenes ------------------------------------------------------------------------------------------------------------
-
-
 def wall(mi, texture):
     """A wall that runs into the distance, in constant light."""
     away = mi.ScalarTransform4f().rotate([1, 0, 0], -80).scale(8)
@@ -177,9 +174,6 @@ def test_a_sensor_that_is_not_there(mi_rgb):
     scene = mi_rgb.load_dict(wall(mi_rgb, texture()))
     with pytest.raises(mi_diffind.DiffindError, match="sensor: found 2, the scene has 1"):
         mi_diffind.attach(scene, sensor=2)
-
-
-# -- saving ------------------------------------------------------------------------------------------------------------
 
 
 def optimised(mi, scene, factor=0.97):
@@ -273,9 +267,6 @@ def test_nothing_to_save(mi_rgb, tmp_path):
     assert not path.with_suffix(".xml").exists()
 
 
-# -- rendering ---------------------------------------------------------------------------------------------------------
-
-
 def test_a_rendering_is_that_of_mitsuba(mi_rgb, tmp_path):
     """A dictionary and a loaded scene give Mitsuba's image; ``save`` and the picture of a notebook show it."""
     mi = mi_rgb
@@ -307,8 +298,6 @@ def test_refused_renderings(mi_rgb, tmp_path):
     with pytest.raises(UsageError, match=r'output "a.webp": found the extension ".webp", allowed are .exr and .png'):
         mi_diffind.render(scene, spp=1, progress=False).save("a.webp")
 
-
-# -- capture, regress, tradeoff ----------------------------------------------------------------------------------------
 
 BALL = """<scene version="3.0.0"><default name="light" value="1"/><integrator type="path"/>
     <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="16"/>
@@ -368,9 +357,6 @@ def test_keywords_of_a_study(monkeypatch, tmp_path, mi_rgb):
         mi_diffind.tradeoff("nerf")
     with pytest.raises(UsageError, match="tradeoff image: the following arguments are required: IMAGE"):
         mi_diffind.tradeoff("image", out=out)
-
-
-# -- what people read --------------------------------------------------------------------------------------------------
 
 
 def test_an_image_that_a_file_cannot_hold_is_not_rendered(mi_rgb, tmp_path, monkeypatch):

@@ -88,9 +88,6 @@ def interrupt(y):
     return y
 
 
-# -- results ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("loss", LOSSES)
 def test_converges(ad, loss):
     problem = Curve(ad)
@@ -115,9 +112,6 @@ def test_the_best_state_is_kept(ad):
     result, _ = run(problem, settings())
     assert result.step == 40 and result.measured == {"psnr_db": 5.0} and result.steps == 60
     assert contents(problem) == problem.states[1] != problem.states[2]
-
-
-# -- repeatability ----------------------------------------------------------------------------------------------------
 
 
 def test_global_state_is_restored(ad):
@@ -172,9 +166,6 @@ def test_resumed_equals_uninterrupted(ad, tmp_path, schedule):
     assert len(os.listdir(tmp_path)) == 2  # nothing temporary
 
 
-# -- Ctrl-C -----------------------------------------------------------------------------------------------------------
-
-
 class Falling(Curve):
     """A problem whose measurements fall: the first measured state is the best."""
 
@@ -217,9 +208,6 @@ def test_second_interrupt_is_a_real_one(ad, usual_interrupts):
     with pytest.raises(KeyboardInterrupt):
         run(problem, settings())
     assert signal.getsignal(signal.SIGINT) is before
-
-
-# -- divergence -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", [Curve, Steps])
@@ -304,9 +292,6 @@ def test_messages_go_to_stderr(ad, capsys, progress):
     assert captured.out == "" and "half the learning rate" in captured.err  # results belong to stdout
 
 
-# -- schedules --------------------------------------------------------------------------------------------------------
-
-
 def rates(ad, **changes):
     """
     The learning rate of every step, measured: with a gradient that never changes, each step of Adam is as long as the
@@ -349,9 +334,6 @@ def test_plateau_schedule(ad):
     improving.net = DifferentiableArray(16, 1, value=50.0).alloc(ad.TensorXf)
     losses = [h["loss"] for h in run(improving, settings(schedule="plateau", lr=0.1, steps=100))[0].history]
     assert losses[0] - losses[-1] == pytest.approx(0.1 * 80, rel=0.05)  # 80 steps at the full rate
-
-
-# -- cost -------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("schedule", SCHEDULES)
@@ -441,9 +423,6 @@ def test_the_loss_and_its_gradient(ad):
     _, _, _, (_, moment, _, _) = trainer.optimizer.state["data"]
     found = np.array(moment).reshape(2, 4)[:, :3] / 0.1  # of Adam's first step: (1 - 0.9) times the gradient
     np.testing.assert_allclose(found, gradient, rtol=1e-4, atol=1e-6)
-
-
-# -- mistakes ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -565,9 +544,6 @@ def test_the_guard_survives_resuming(ad, tmp_path):
     run(Curve(ad, {35: nan, 57: interrupt}), settings(steps=80), checkpoint=path)
     result, messages = run(Curve(ad, {15: nan}), settings(steps=80), checkpoint=path, resume=True)
     assert result.restarts == 2 and "(0.0025)" in messages[0]
-
-
-# -- the optimiser of large tables: Adam for entries with a gradient ---------------------------------------------------
 
 
 def sparse_steps(ad, optimizer, shape, steps=12):

@@ -50,9 +50,6 @@ def pair(ad, seed=0, primary=(5, 6), cascaded=(4, 5), channels=3):
     return net.alloc(ad.TensorXf)
 
 
-# -- fold --------------------------------------------------------------------------------------------------------------
-
-
 def test_fold_values(ad):
     x = np.concatenate([np.linspace(-7, 7, 4001), np.arange(-9, 10), np.random.default_rng(0).normal(0, 50, 4000)])
     x = x.astype(np.float32)
@@ -77,9 +74,6 @@ def test_fold_slope(ad):
     dr.enable_grad(x)
     dr.backward(fold(x))
     np.testing.assert_array_equal(x.grad.numpy(), [1, 1, 1, -1, -1, -1, 1, 1, -1, -1, 1, 1])
-
-
-# -- initialisation ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("border", lookup.BORDERS)
@@ -124,9 +118,6 @@ def test_half_precision_allocation(ad):
     assert DifferentiableArray((3, 3), 3).alloc(ad.TensorXf).nbytes == 4 * 27
     double = DifferentiableArray((3, 3), 3, "ramp").alloc(ad.TensorXf64)  # what ``mi.TensorXf`` is in double variants
     np.testing.assert_allclose(read(double, ad, uniform(0, 9, 2))[:, :2], uniform(0, 9, 2), atol=2e-7)
-
-
-# -- one array read with another ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("storage", lookup.STORAGES)
@@ -255,9 +246,6 @@ def test_several_primaries(ad, storage):
     np.testing.assert_allclose(read(net, ad, x), expected, rtol=1e-5, atol=5e-4 if storage == "uint8" else 0)
 
 
-# -- a coordinate that is known ----------------------------------------------------------------------------------------
-
-
 def known(ad, dims, channels, storage, border="clamp", fold=False):
     """An array of random entries, beyond [0, 1] if they are to be folded."""
     low, high = (-2, 3) if fold else (0.5, 1.5)
@@ -324,9 +312,6 @@ def test_gradients_of_what_remains(ad, dims, border):
     assert coordinate.grad.numpy()[0] == pytest.approx(expected, rel=1e-3, abs=1e-3)
 
 
-# -- what coordinates can be -------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("storage", lookup.STORAGES)
 def test_forms_of_the_coordinate(ad, storage):
     """Lists, tuples, vectors, numbers and other precisions mean the same; results are single precision."""
@@ -375,9 +360,6 @@ def test_composes_with_other_modules(ad):
     np.testing.assert_allclose(np.stack([v.numpy() for v in out], axis=1), expected, rtol=1e-5)
     with pytest.raises(ValueError, match="was given 3 input"):
         net.alloc(ad.TensorXf, 3)
-
-
-# -- behaviour as modules ----------------------------------------------------------------------------------------------
 
 
 def test_a_table_of_the_wrong_shape_is_refused(ad):
@@ -445,8 +427,6 @@ def test_in_a_loop(ad, storage, mode):
     found = repeated(net, x, ad.UInt(0), dr.zeros(ad.Float, 16), mode)
     np.testing.assert_allclose(found.numpy(), expected, rtol=1e-5)
 
-
-# -- mistakes ----------------------------------------------------------------------------------------------------------
 
 MISTAKES = {
     "no dimension": (lambda: DifferentiableArray(()), "1 to 4 dimensions"),

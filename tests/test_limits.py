@@ -168,9 +168,6 @@ def test_a_batch_beyond_memory(tmp_path, capsys, monkeypatch):
             mi_diffind.fit("ggx", seconds=seconds)
 
 
-# -- terminals and paths -----------------------------------------------------------------------------------------------
-
-
 def test_messages_cannot_steer_a_terminal():
     for error in (DiffindError, TableError, OutputError):
         message = str(error("t.npz: \x1b[31m is red\x07,\n \x9b and \u202e turned, α stays"))

@@ -35,9 +35,6 @@ def scene_file(tmp_path, name="scene", reflectance=0.5):
     return str(path)
 
 
-# -- passes ------------------------------------------------------------------------------------------------------------
-
-
 def test_passes_share_no_samples(mi_rgb, monkeypatch, tmp_path):
     """Neither with each other nor with those of the other side, also where a pass takes several renders."""
     taken = []
@@ -77,9 +74,6 @@ def test_samplers_that_round(mi_rgb, tmp_path, capsys):
         assert "--update --spp 128" in message
 
 
-# -- the repository's scenes -------------------------------------------------------------------------------------------
-
-
 def test_passes_of_references_repeat_to_the_last_bit(mi_rgb):
     """Passes of 30 or 54 samples do not on several cores: threads share pixels, and add up in any order."""
     scene = regress.loading.load(TESTS / "lamp.xml")
@@ -108,9 +102,6 @@ def test_scene_renders_as_its_reference(path, variant):
     result = regress.regress(path, progress=False).figures
     assert result["passed"], result
     assert result["reference_spp"] == 16 * result["spp"] and result["spp"] >= 128
-
-
-# -- files -------------------------------------------------------------------------------------------------------------
 
 
 def test_update_stores_what_a_check_needs(tmp_path, capsys):
@@ -282,9 +273,6 @@ def test_references_serve_both_backends(mi_rgb, tmp_path, monkeypatch):
     monkeypatch.setattr(mi, "variant", lambda: "llvm_ad_spectral")
     with pytest.raises(regress.loading.SceneError, match=r'no reference ".*scene.llvm_ad_spectral.exr"; run'):
         regress.read_reference(path)
-
-
-# -- bad input ---------------------------------------------------------------------------------------------------------
 
 
 def test_bad_references(mi_rgb, tmp_path, capsys):

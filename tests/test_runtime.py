@@ -52,9 +52,6 @@ def choose(environ=None, pip=(), system=()):
     return choose_llvm(environ or {}, lambda: list(pip), lambda: list(system), VERSIONS.get)
 
 
-# -- the choice --------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("path", ["/new", "/minimum"])
 def test_explicit_setting_wins(path):
     assert choose({ENV: path}, pip=["/newer"], system=["/newer"]) == (path, None)
@@ -135,9 +132,6 @@ def test_array_module():
         for name in ("cuda", "cuda_ad_rgb"):
             with pytest.raises(DiffindError, match=f'the variant "{name}" needs an NVIDIA GPU'):
                 runtime.array_module(name)
-
-
-# -- in fresh processes ------------------------------------------------------------------------------------------------
 
 
 def python(code, setting=None, arguments=(), **extra):
@@ -418,9 +412,6 @@ except RuntimeError as e:
     done = succeeds(code)
     assert done.stdout.split() == ["refused"]
     assert done.stderr.count("RuntimeWarning") == 1 and "pip install karellen-llvm-core" in done.stderr
-
-
-# -- little of a machine -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores of a process can be limited on Linux only")

@@ -28,8 +28,6 @@ ROOT = Path(__file__).resolve().parents[1]
 BUILT_IN = ("bsdf", "disney", "field", "ggx", "image", "scene", "sdf", "shading", "texture")
 
 
-# -- what is found ----------------------------------------------------------------------------------------------------
-
 LINE = """
 from mi_diffind.fitting.task import FitSettings
 from mi_diffind.fitting.task import Task
@@ -141,9 +139,6 @@ def test_what_a_task_declares(name):
     names = [a.name for a in task.arguments]
     assert len(set(names)) == len(names) and not set(names) & {f.name for f in dataclasses.fields(FitSettings)}
     assert all(a.options.get("help") for a in (*task.arguments, *task.decode_arguments))
-
-
-# -- a small one ------------------------------------------------------------------------------------------------------
 
 
 class LineProblem(Problem):
@@ -308,9 +303,6 @@ def test_a_task_without_storage_forms(line):
     with pytest.raises(UsageError, match='line: found the storage "uint8", allowed are none'):
         run(storage="uint8")
     assert run(preset="short").table.storage == "float32" and line.request.storage == ""
-
-
-# -- errors -----------------------------------------------------------------------------------------------------------
 
 
 def exceptions():

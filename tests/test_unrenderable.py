@@ -97,9 +97,6 @@ def test_absurd_samples(tmp_path, capsys, name):
         units.check_samples(0)
 
 
-# -- NaN --------------------------------------------------------------------------------------------------------------
-
-
 def nan_pixels(path, spp, seed=0):
     """Return how many pixels of a picture are NaN, rendered by Mitsuba itself."""
     import mitsuba as mi

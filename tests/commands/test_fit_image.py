@@ -67,8 +67,6 @@ def decoded(path="out.npz"):
     return model.image.decode(), model.image.layout, model.table
 
 
-# ---------------------- Sources ----------------------
-
 SOURCES = {
     "one texel": ("a.png", noise(1, 1, 3)),
     "a column": ("a.png", noise(300, 1, 1)),
@@ -141,9 +139,6 @@ def test_manifests(folder, capsys):
     assert "gone.png: no such file" in refused(capsys, "fit", "image", "maps/material.json", "-o", "o.npz", *SHORT)
 
 
-# ---------------------- Sizes and options ----------------------
-
-
 def test_sizes_that_cannot_be_met_are_explained(folder, capsys):
     write("a.png", noise(8, 8, 3))
     assert fit("a.png", "--bytes", "20") == 0
@@ -207,9 +202,6 @@ def test_the_smallest_of_a_quality(folder, capsys):
     assert "a.png: 110 dB were not reached; the best of" in message and not (folder / "out.npz").exists()
 
 
-# ---------------------- Interruptions and full disks ----------------------
-
-
 def test_resuming_something_else(folder, capsys):
     """Another texel, and other settings of the training; both files stay."""
     image, run = waves(), ["--checkpoint", "c.npz", "--cascaded", "16", "--bytes", "2000"]
@@ -223,8 +215,6 @@ def test_resuming_something_else(folder, capsys):
     assert "is of another source, or the source has changed since" in refused(capsys, *arguments)
     assert [(folder / name).read_bytes() for name in ("c.npz", "out.npz")] == before
 
-
-# ---------------------- decode and inspect ----------------------
 
 MAPS = (
     MapLayout("albedo", "albedo", "srgb", 1, (0, 1, 2)),

@@ -37,9 +37,6 @@ def back(layout, source):
     }
 
 
-# -- which channels are stored ----------------------------------------------------------------------------------------
-
-
 def test_colours_are_stored_as_they_are():
     source = from_arrays({"albedo": noise(5, 4, 3)})
     layout = Layout.from_source(source)
@@ -73,9 +70,6 @@ def test_constant_channels_are_numbers():
     for m in source.maps:
         np.testing.assert_array_equal(found[m.name], m.values)
     assert Layout.from_source(source, once=False).stored == 5
-
-
-# -- normals ----------------------------------------------------------------------------------------------------------
 
 
 def test_unit_normals_lose_their_third_component():
@@ -112,9 +106,6 @@ def test_other_maps_keep_all_components():
     source = from_arrays({"normal": flat})
     found = back(Layout.from_source(source), source)["normal"]
     np.testing.assert_allclose(found, flat, atol=1e-6)
-
-
-# -- ranges of values -------------------------------------------------------------------------------------------------
 
 
 def hdr(largest, seed=0):
@@ -184,9 +175,6 @@ def test_what_lies_outside_becomes_the_nearest():
     assert (found[:4] == 0).all() and 0 < found[4] < 1 and (found[5:] == 1).all()
 
 
-# -- the same with Dr.Jit ---------------------------------------------------------------------------------------------
-
-
 MAPS = (
     MapLayout("albedo", "albedo", "srgb", 1, (0, 1, 2)),
     MapLayout("normal", "normal", "linear", 1, (3, 4, "z")),
@@ -228,9 +216,6 @@ def test_a_normal_is_of_unit_length_or_flat(ad):
     np.testing.assert_allclose(np.linalg.norm(normal, axis=0)[inside], 1, atol=1e-4)
     assert (normal[2, (2 * x - 1) ** 2 + (2 * y - 1) ** 2 > 1.001] == 0).all()
     assert all(np.isfinite(v.grad.numpy()).all() for v in point)
-
-
-# -- in a file --------------------------------------------------------------------------------------------------------
 
 
 def test_json_round_trip():

@@ -228,9 +228,6 @@ def test_gradients_are_finite_and_right(ad, rng):
         assert np.median(np.abs(slope - g) / np.maximum(np.abs(slope), 0.05)) < 0.01
 
 
-# -- against OpenImageIO ----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("border", ["repeat", "clamp"])
 def test_openimageio_filters_alike(ad, rng, tmp_path, border):
     """

@@ -42,9 +42,6 @@ def sentence(error):
     return text
 
 
-# -- images -----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("height, width", [(1, 1), (7, 5), (1, 4096), (4096, 1)])
 @pytest.mark.parametrize("channels", [1, 2, 3, 4])
 @pytest.mark.parametrize("dtype, depth", [(np.uint8, 1), (np.uint16, 2)])
@@ -286,9 +283,6 @@ def test_no_variant_is_set_or_changed(tmp_path, mi_rgb):
     assert run.stdout.strip() == digest
 
 
-# -- images that cannot be used ---------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "extension, size", [("png", 7), ("png", 200), ("jpg", 7), ("jpg", 200), ("exr", 7), ("exr", 99)]
 )
@@ -344,9 +338,6 @@ def test_bad_names(tmp_path, name):
         load_source(manifest(tmp_path, {name: "a.png"}))
 
 
-# -- NaN and infinity -------------------------------------------------------------------------------------------------
-
-
 def test_nonfinite_values(tmp_path):
     array = pattern(5, 7, 3, np.float32)
     expected = array.copy()
@@ -363,9 +354,6 @@ def test_nonfinite_values(tmp_path):
     assert load_source(write(tmp_path / "b.exr", expected), nonfinite="clean").cleaned == 0
     with pytest.raises(ValueError, match='nonfinite: found "zero", allowed are'):
         load_source(path, nonfinite="zero")
-
-
-# -- manifests --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("flat", [False, True])
@@ -483,9 +471,6 @@ def test_bad_manifests(tmp_path, content, match):
     with pytest.raises(SourceError, match=match) as e:
         load_source(manifest(tmp_path, content))
     sentence(e)
-
-
-# -- arrays -----------------------------------------------------------------------------------------------------------
 
 
 def test_the_digest_tells_everything_apart():
