@@ -1,5 +1,6 @@
 """The package as Python sees it: training from memory, opening, loading, attaching and saving."""
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,9 @@ from PIL import Image
 import mi_diffind
 from mi_diffind.commands.cli import VERBS, main
 from mi_diffind.core.errors import UsageError
+from mi_diffind.maps.source import load_source
+from mi_diffind.scenes import rendering
+from mi_diffind.scenes.loading import ParsedScene
 
 ASSETS = Path(__file__).resolve().parents[1] / "scenes" / "assets"
 TILES = ASSETS / "tiles_filtered.npz"
@@ -30,8 +34,6 @@ def same(a, b):
 
 def test_maps_from_memory_are_those_of_files(mi_rgb, picture, tmp_path):
     """An array, a bitmap and a tensor are the PNG file that holds the same bytes, and give its tables."""
-    from mi_diffind.maps.source import load_source
-
     mi = mi_rgb
     mi.Bitmap(picture).write(str(tmp_path / "a.png"))
     expected = load_source(tmp_path / "a.png")
@@ -46,8 +48,6 @@ def test_maps_from_memory_are_those_of_files(mi_rgb, picture, tmp_path):
 
 
 def test_a_bitmap_keeps_its_alpha_and_its_colour_space(mi_rgb, picture):
-    from mi_diffind.maps.source import load_source
-
     mi = mi_rgb
     transparent = np.concatenate([picture, picture[..., :1]], axis=-1)
     maps = load_source(mi.Bitmap(transparent)).maps
@@ -76,18 +76,12 @@ def test_a_result_measures_saves_and_opens(mi_rgb, picture, tmp_path, monkeypatc
     text = "\n".join(fitted.summary(path))
     assert '<texture type="neural_image">' in text and '"filename" value="a.npz"' in text and " dB" in text
     assert "neural_image" in fitted._repr_html_()
+    with pytest.raises(mi_diffind.TableError, match=r"no source file is recorded, so errors need a source"):
+        mi_diffind.fit("image", picture, compression=3, steps=1, batch=512, progress=False).model.measure()
     decoded = model.decode(tmp_path / "back.png")
     assert [file.name for file, _ in decoded] == ["back.png"]
     with pytest.raises(UsageError, match=r'output "a.exr": found the extension ".exr", allowed is .npz'):
         fitted.save("a.exr")
-
-
-def test_without_a_file_errors_need_a_source(mi_rgb, picture, tmp_path):
-    fitted = mi_diffind.fit("image", picture, compression=3, steps=1, batch=512, progress=False)
-    model = mi_diffind.open(fitted.save(tmp_path / "a.npz"))
-    with pytest.raises(mi_diffind.TableError, match=r"no source file is recorded, so errors need a source"):
-        model.measure()
-    assert model.measure(picture)["psnr_db"] > 10
 
 
 def test_meshes_from_memory(mi_rgb, tmp_path):
@@ -201,14 +195,12 @@ PLUGINS = {
 @pytest.mark.parametrize("name", PLUGINS)
 def test_optimised_tables_render_as_before_when_saved(mi_rgb, tmp_path, name):
     """The picture of the saved file is that of the optimised plugin, not that of the file that it began with."""
-    mi, plugin = mi_rgb, PLUGINS[name]()
+    mi = mi_rgb
 
     def scene(**changes):
-        content = wall(mi, {"type": "rgb", "value": 0.5})
-        if "texture" in name or "image" in name:
-            content["wall"]["bsdf"]["reflectance"] = {**plugin, **changes}
-        else:
-            content["wall"]["bsdf"] = {**plugin, **changes}
+        content, plugin = wall(mi, {"type": "rgb", "value": 0.5}), {**PLUGINS[name](), **changes}
+        is_texture = name in ("neural_texture", "neural_image")
+        content["wall"]["bsdf"] = {"type": "diffuse", "reflectance": plugin} if is_texture else plugin
         return mi_diffind.load_dict(content)
 
     before, loaded = image(mi, scene()), scene()
@@ -295,20 +287,14 @@ def test_refused_renderings(mi_rgb, tmp_path):
             mi_diffind.render(scene, **options)
     with pytest.raises(UsageError, match=r"scene: found a .*, expected a scene, its file or its dictionary"):
         mi_diffind.render({"type": "sphere"})
+    with pytest.raises(mi_diffind.DiffindError, match="found a table file, a scene is needed"):
+        mi_diffind.render(TILES)
     with pytest.raises(UsageError, match=r'output "a.webp": found the extension ".webp", allowed are .exr and .png'):
         mi_diffind.render(scene, spp=1, progress=False).save("a.webp")
 
 
-BALL = """<scene version="3.0.0"><default name="light" value="1"/><integrator type="path"/>
-    <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="16"/>
-        <integer name="height" value="16"/><rfilter type="box"/></film></sensor>
-    <emitter type="constant"><spectrum name="radiance" value="$light"/></emitter>
-    <shape type="sphere"><transform name="to_world"><translate z="4"/></transform><bsdf type="diffuse"/></shape>
-    </scene>"""
-
-
 def ball(light=1.0) -> dict:
-    """Return the scene :data:`BALL` as a dictionary."""
+    """Return a scene of plain values as a dictionary."""
     film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
     return {
         "type": "scene", "integrator": {"type": "path"}, "sensor": {"type": "perspective", "film": film},
@@ -319,12 +305,8 @@ def ball(light=1.0) -> dict:
 
 def test_scenes_in_memory_that_hold_existing_objects_are_known_once(mi_rgb):
     """The content of a bitmap is in no description; two dictionaries of plain values have equal ones."""
-    import mitsuba as mi
-
-    from mi_diffind.scenes.loading import ParsedScene
-
     assert ParsedScene(ball()).description == ParsedScene(ball()).description != ParsedScene(ball(2)).description
-    scene = ball() | {"other": mi.load_dict({"type": "sphere"})}
+    scene = ball() | {"other": mi_rgb.load_dict({"type": "sphere"})}
     assert ParsedScene(scene).description != ParsedScene(scene).description
 
 
@@ -362,31 +344,16 @@ def test_keywords_of_a_study(monkeypatch, tmp_path, mi_rgb):
 def test_an_image_that_a_file_cannot_hold_is_not_rendered(mi_rgb, tmp_path, monkeypatch):
     """The channels that are predicted are those of the render, for each format of the film."""
     mi = mi_rgb
-    from mi_diffind.scenes import rendering
-
-    integrators = {
-        "path": {"type": "path"},
-        "aov": {"type": "aov", "aovs": "d:depth,n:sh_normal", "image": {"type": "path"}},
-        "moment": {"type": "moment", "image": {"type": "path"}},
-    }
-    for name, integrator in integrators.items():
-        for pixel_format in ("rgb", "rgba", "luminance"):
-            content = {**wall(mi, {"type": "rgb", "value": 0.5}), "integrator": integrator}
-            content["sensor"] = {"type": "perspective", "film": {
-                "type": "hdrfilm", "width": 4, "height": 4, "pixel_format": pixel_format}}  # fmt: skip
-            loaded = mi.load_dict(content)
-            if mi.is_rgb:
-                assert rendering.channel_count(loaded) == mi.render(loaded, spp=1).shape[2], (name, pixel_format)
+    path = {"type": "path"}
+    integrators = path, {"type": "aov", "aovs": "d:depth,n:sh_normal", "image": path}, {"type": "moment", "image": path}
+    for integrator, pixel_format in itertools.product(integrators, ("rgb", "rgba", "luminance")):
+        film = {"type": "hdrfilm", "width": 4, "height": 4, "pixel_format": pixel_format}
+        content = wall(mi, {"type": "rgb", "value": 0.5}) | {"integrator": integrator}
+        loaded = mi.load_dict(content | {"sensor": {"type": "perspective", "film": film}})
+        assert rendering.channel_count(loaded) == mi.render(loaded, spp=1).shape[2], (integrator, pixel_format)
     monkeypatch.setattr(rendering.loading, "render", None)  # not reached
     with pytest.raises(UsageError, match=r"the image has 7 channels, PNG holds 4: use .exr"):
         mi_diffind.render(loaded, spp=1, output="a.png", progress=False)
-
-
-def test_a_table_file_is_no_scene(mi_rgb, capsys):
-    with pytest.raises(mi_diffind.DiffindError, match="found a table file, a scene is needed"):
-        mi_diffind.render(TILES)
-    assert main(["render", str(TILES)]) == 2
-    assert "found a table file, a scene is needed" in capsys.readouterr().err
 
 
 def test_a_normal_map_of_one_channel():
