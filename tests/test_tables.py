@@ -324,6 +324,11 @@ DAMAGED = {
     "more than it holds": (
         lambda m: {**m, "cascaded.npy": m["cascaded.npy"].replace(b"(3, 3, 7)", b"(9, 9, 7)")}, "cascaded",
     ),
+    "more after its end": (lambda m: {**m, "cascaded.npy": m["cascaded.npy"] + b"0"}, "holds more"),
+    "fewer bytes": (lambda m: {**m, "cascaded.npy": m["cascaded.npy"][:-1]}, "holds|claims"),
+    "another version of NumPy's": (
+        lambda m: {**m, "cascaded.npy": m["cascaded.npy"].replace(b"NUMPY\x01", b"NUMPY\x02")}, "damaged header",
+    ),
     "Fortran order": (
         lambda m: {**m, "cascaded.npy": npy(np.asfortranarray(np.zeros((3, 3, 7), np.float32)))}, "cascaded",
     ),
