@@ -53,6 +53,12 @@ def scene(tmp_path):
     return path
 
 
+def stopped(capsys, scene, folder, *options):
+    """What a capture that must fail says."""
+    assert run(scene, folder, *options) == 2
+    return capsys.readouterr().err
+
+
 def images(folder):
     return captures.images_of(load_views(folder))
 
@@ -118,16 +124,14 @@ def test_other_settings_are_refused(mi_rgb, scene, tmp_path, capsys):
         (("--seed", "3", "-D", "red=0.5"), "(red: None, now 0.5)"),
         (("--seed", "3", "--variant", "llvm_ad_mono"), "(variant: llvm_ad_rgb, now llvm_ad_mono)"),
     ):
-        assert run(scene, folder, *options) == 2
-        assert message in capsys.readouterr().err
+        assert message in stopped(capsys, scene, folder, *options)
     scene.write_text(scene.read_text().replace('"0.3"', '"0.2"'))
-    assert run(scene, folder, "--seed", "3") == 2 and "(the scene's files have changed)" in capsys.readouterr().err
+    assert "(the scene's files have changed)" in stopped(capsys, scene, folder, "--seed", "3")
     assert (folder / "capture.json").read_text() == record
     (folder / "capture.json").write_text("{")
-    assert run(scene, folder) == 2 and "capture.json: cannot be read" in capsys.readouterr().err
+    assert "capture.json: cannot be read" in stopped(capsys, scene, folder)
     (folder / "capture.json").unlink()
-    assert run(scene, folder) == 2
-    assert "holds views that were not captured here, a folder of its own is needed" in capsys.readouterr().err
+    assert "holds views that were not captured here" in stopped(capsys, scene, folder)
 
 
 def test_an_interrupted_capture_is_gone_on_with(mi_rgb, scene, tmp_path, monkeypatch, capsys):
@@ -168,8 +172,7 @@ def test_views_of_other_processes(mi_rgb, scene, tmp_path, monkeypatch, capsys):
         assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes(), file
     (tmp_path / "two" / "train" / "r_000.png").unlink()
     monkeypatch.setattr(capture, "run_jobs", lambda *_: (o for o in [Outcome("train/r_000.png", failure="disk full")]))
-    assert run(scene, tmp_path / "two", "-D", "red=0.5", "--workers", "1") == 2
-    assert "train/r_000.png: disk full" in capsys.readouterr().err
+    assert "train/r_000.png: disk full" in stopped(capsys, scene, tmp_path / "two", "-D", "red=0.5", "--workers", "1")
 
 
 @pytest.mark.parametrize("integrator", ["direct", "prb"])
@@ -197,9 +200,8 @@ def test_objects_alone_are_seen(mi_rgb, scene, tmp_path, capsys, integrator):
         assert (inside[-1][:, :3].argmax(axis=1) == 1).mean() > 0.97  # but where nothing arrived
     # Beside a wall, and below another sphere, it is not as bright everywhere as alone in this light
     assert np.concatenate(inside)[:, 1].min() < 0.6 < np.concatenate(inside)[:, 1].max()
-    assert run(scene, tmp_path / "two", "--objects", "s1", "other") == 2
     message = 'objects: found "other", the ids of the scene\'s shapes are: s0, s1, s2'
-    assert message in capsys.readouterr().err
+    assert message in stopped(capsys, scene, tmp_path / "two", "--objects", "s1", "other")
 
 
 def test_meshes_of_one_material_keep_their_ids(mi_rgb, tmp_path):
@@ -227,14 +229,10 @@ def test_integrators_that_nest_another_leave_lights_to_it(mi_rgb, scene, tmp_pat
 
 def test_a_field_of_distances_is_captured_whole_only(mi_rgb, scene, tmp_path, capsys):
     """Its shape in the scene is a box, which the integrator alone knows what to do with."""
-    knot = (
-        f'<shape type="neural_sdf" id="knot"><string name="filename" value="{SCENES / "assets" / "knot.npz"}"/></shape>'
-    )
-    spheres = scene.read_text()
-    first, last = spheres.index('<shape type="sphere"'), spheres.index('<shape type="rectangle"')
-    scene.write_text((spheres[:first] + knot + spheres[last:]).replace("direct", "path_sdf"))
-    assert run(scene, tmp_path / "views", "--objects", "knot") == 2
-    assert 'objects: found "knot", ' in capsys.readouterr().err
+    file = f'<string name="filename" value="{SCENES / "assets" / "knot.npz"}"/>'
+    knot = f'<shape type="neural_sdf" id="knot">{file}</shape>'
+    scene.write_text(SCENE.replace("SPHERES", knot).replace("direct", "path_sdf"))
+    assert 'objects: found "knot", ' in stopped(capsys, scene, tmp_path / "views", "--objects", "knot")
     assert run(scene, tmp_path / "views", "--spp", "1") == 0
     assert 0.05 < images(tmp_path / "views")[..., 3].mean() < 0.4
 
@@ -260,8 +258,7 @@ def test_what_hides_nothing_is_said(mi_rgb, scene, tmp_path, capsys):
     ],
 )
 def test_options_that_are_refused(mi_rgb, scene, tmp_path, capsys, options, message):
-    assert run(scene, tmp_path / "views", *options) == 2
-    assert message in capsys.readouterr().err and not (tmp_path / "views").exists()
+    assert message in stopped(capsys, scene, tmp_path / "views", *options) and not (tmp_path / "views").exists()
 
 
 @pytest.mark.parametrize("name", ["group", "thin", "glossy"])

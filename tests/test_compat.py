@@ -9,8 +9,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from mi_diffind.core import compat, runtime, threads
-from mi_diffind.core.compat import ray_flags
+from mi_diffind.core import compat, runtime
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENE = ROOT / "tests" / "lamp.xml"
@@ -139,25 +138,6 @@ def test_callback_of_variants(mi_rgb):
     assert seen == [(here, "scalar_rgb"), ("scalar_rgb", here)]
 
 
-def test_callback_of_renders(mi_rgb, monkeypatch):
-    """Under both names of ``mi.render``, which stays what it was, in another variant, too."""
-    mi, calls = mi_rgb, []
-    monkeypatch.setattr(mi.util, "render", mi.util.render)
-    monkeypatch.setattr(mi, "render", mi.render)
-    threads.before_render(lambda *arguments: calls.append(arguments))
-    scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective"}})
-    tracer = mi.load_dict({"type": "depth"})
-    for arguments, more in (((scene, None, 0, tracer, 3), {}), ((), {"integrator": tracer, "scene": scene})):
-        assert mi.render(*arguments, spp=1, **more).shape == (576, 768, 3)
-        assert calls.pop() == (scene, tracer, 0) and not calls
-    here = mi.render
-    try:
-        mi.set_variant("llvm_ad_mono")
-        assert mi.render is mi.util.render is here
-    finally:
-        mi.set_variant("llvm_ad_rgb")
-
-
 def test_classes_of_textures(mi_any):
     bitmap = {"type": "bitmap", "raw": True}
     grey = {"type": "uniform", "value": 0.5}
@@ -227,116 +207,6 @@ def test_properties(mi_rgb):
     props.set_plugin_name("conductor")
     del props["flag"]
     assert props.plugin_name() == "conductor" and "flag" not in props and "number" in props
-
-
-def test_errors_in_one_sentence(mi_rgb, tmp_path):
-    """Real ones: of a plugin's constructor in a file, of a render, of the parser."""
-    path = tmp_path / "scene.xml"
-    start = '<scene version="3.0.0"><shape type="sphere"><bsdf type="neural_ggx">'
-    path.write_text(f'{start}<string name="storage" value="int3"/></bsdf></shape></scene>')
-    with pytest.raises(Exception) as caught:
-        compat.instantiate(*compat.parse_file(path))
-    text = compat.one_sentence(caught.value)
-    assert "int3" in text and "scene.xml" in text and "\n" not in text
-    assert not any(noise in text for noise in ("Traceback", ".cpp:", "RuntimeError", "failed to instantiate"))
-    path.write_text('<scene version="3.0.0"><shape/></scene>')
-    with pytest.raises(Exception) as caught:
-        compat.parse_file(path)
-    text = compat.one_sentence(caught.value)
-    assert "scene.xml" in text and '"type"' in text and "[" not in text
-
-    class Failing(mi_rgb.SamplingIntegrator):
-        def sample(self, *arguments, **others):
-            raise RuntimeError("the lamp is broken")
-
-    scene = mi_rgb.load_dict({"type": "scene", "sensor": {"type": "perspective"}})
-    with pytest.raises(Exception) as caught:
-        mi_rgb.render(scene, integrator=Failing(mi_rgb.Properties()), spp=1)
-    assert compat.one_sentence(caught.value) == "the lamp is broken"
-
-
-def test_edges_of_shading_normals(mi_rgb):
-    """Normals of a mesh and of a sphere change along these edges as between neighbouring rays."""
-    mesh = {"type": "ply", "filename": str(Path(__file__).resolve().parents[1] / "scenes" / "assets" / "vase.ply")}
-    vase = mi_rgb.load_dict({"type": "scene", "mesh": mesh})
-    box = vase.bbox()
-    centre, size = np.array(box.center()), np.array(box.extents())
-    for scene, middle, radius in (
-        (vase, centre, size.max() / 2),
-        (mi_rgb.load_dict({"type": "scene", "ball": {"type": "sphere"}}), np.zeros(3), 1.0),
-    ):
-        found = []
-        for step in (0, 1e-3):
-            x = mi_rgb.Float(np.linspace(-0.5, 0.5, 200, dtype=np.float32)) * float(radius)
-            o = mi_rgb.Point3f(middle.tolist()) + mi_rgb.Vector3f(x + step * float(radius), 0.3 * x, 0)
-            ray = mi_rgb.Ray3f(o + mi_rgb.Vector3f(0, 0, 3 * float(radius)), mi_rgb.Vector3f(0, 0, -1))
-            pi = scene.ray_intersect_preliminary(ray)
-            found.append((pi, pi.compute_surface_interaction(ray, ray_flags(curvature=True)), ray))
-        (pi, si, ray), (other, moved, _) = found
-        edges = compat.normal_edges(pi, si, ray, mi_rgb.Bool(True))
-        basis = np.stack([np.array(v).T for v in edges], axis=-1)
-        uv = np.linalg.pinv(basis) @ np.array(moved.p - si.p).T[:, :, None]
-        expected = np.array(moved.sh_frame.n - si.sh_frame.n).T
-        predicted = np.array(si.dn_du).T * uv[:, 0] + np.array(si.dn_dv).T * uv[:, 1]
-        same = np.array(si.is_valid() & moved.is_valid() & (pi.prim_index == other.prim_index))
-        error = np.linalg.norm(predicted - expected, axis=1) / np.linalg.norm(expected, axis=1).clip(1e-9)
-        assert same.sum() > 20 and np.median(error[same]) < 0.02
-
-
-def test_base_of_integrators(mi_any):
-    """It is of the variant that is set, takes rays with differentials, and draws the place in a pixel first."""
-    base = compat.replay_integrator()
-    assert issubclass(base, mi_any.CppADIntegrator) and hasattr(base, "skip_area_emitters")
-    scene = mi_any.load_dict({"type": "scene", "sensor": {"type": "perspective"}})
-    drawn = []
-
-    class Sampler:
-        def sample_count(self):
-            return 1
-
-        def next_1d(self, active=True):
-            drawn.append(1)
-            return mi_any.Float(0.5)
-
-        def next_2d(self, active=True):
-            drawn.append(2)
-            return mi_any.Point2f(0.5)
-
-    ray, _, _ = base(mi_any.Properties()).sample_rays(scene, scene.sensors()[0], Sampler())
-    assert ray.has_differentials and drawn[0] == 2
-
-
-def test_objects_of_scenes(mi_rgb):
-    bsdf = {"type": "twosided", "inner": {"type": "diffuse", "reflectance": {"type": "checkerboard"}}}
-    group = {"type": "shapegroup", "ball": {"type": "sphere", "bsdf": bsdf}}
-    ref = {"type": "ref", "id": "group"}
-    scene = mi_rgb.load_dict({
-        "type": "scene", "group": group, "one": {"type": "instance", "group": ref},
-        "two": {"type": "instance", "group": ref}, "rectangle": {"type": "rectangle"},
-    })  # fmt: skip
-    objects = compat.scene_objects(scene)
-    names = [node.class_name() for node in objects]
-    assert len({id(node) for node in objects}) == len(objects) and names.count("Checkerboard") == 1
-    assert sorted(compat.is_instance(shape) for shape in scene.shapes()) == [False, True, True]
-
-
-def test_references(mi_rgb):
-    holder = [mi_rgb.load_dict({"type": "sphere"})]
-    assert not compat.is_shared(holder)
-    scene = mi_rgb.load_dict({"type": "scene", "ball": holder[0]})
-    assert compat.is_shared(holder) and scene is not None
-    del scene
-    assert not compat.is_shared(holder)
-    name = holder[0]
-    assert compat.is_shared(holder) and name is not None
-
-
-def test_integrators_in_python(mi_rgb):
-    assert compat.samples_in_python(mi_rgb.load_dict({"type": "prb"}))
-    assert not compat.samples_in_python(mi_rgb.load_dict({"type": "path"}))
-    channels = mi_rgb.load_dict({"type": "aov", "aovs": "d:depth", "inner": {"type": "prb"}})
-    names = [compat.integrator_name(integrator) for integrator in compat.scene_objects(channels)]
-    assert names == [compat.INTERSECTING, "PRBIntegrator"]
 
 
 @pytest.mark.parametrize("name", ["Float", "UInt32"])

@@ -3,6 +3,7 @@
 import json
 import socket
 import sys
+import unittest.mock
 from pathlib import Path
 
 import numpy as np
@@ -116,9 +117,8 @@ def test_while_it_moves_each_side_renders_its_part(mi_rgb):
 
 
 def test_an_oversampled_truth_has_more_samples_unless_the_camera_moves(mi_rgb):
-    square = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": {
-        "type": "neural_texture", "filename": str(ASSETS / "tiles_filtered.npz"), "channels": "albedo",
-    }}}  # fmt: skip
+    texture = {"type": "neural_texture", "filename": str(ASSETS / "tiles_filtered.npz"), "channels": "albedo"}
+    square = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": texture}}
     shown = Session(content(mi_rgb) | {"ball": square}, WIDTH)
     shown.moving_picture()
     assert shown.exact.samples == shown.learned.samples == 1
@@ -183,13 +183,8 @@ def test_refused_values_leave_the_scene(mi_rgb, values, sentence):
 
 
 def test_renders_that_cannot_be_recorded_are_traced_each_time(mi_rgb, monkeypatch):
-    def refuse(function):
-        def recorded(*arguments):
-            raise RuntimeError("cannot be recorded")
-
-        return recorded
-
-    monkeypatch.setattr(passes.dr, "freeze", refuse)
+    recorded = unittest.mock.Mock(side_effect=RuntimeError("cannot be recorded"))
+    monkeypatch.setattr(passes.dr, "freeze", lambda function: recorded)
     shown = session(mi_rgb)
     check(shown, mi_rgb, atol=2e-6)
     assert not shown.learned.recordable
@@ -208,13 +203,10 @@ def test_a_scene_that_cannot_be_rendered_is_one_sentence(mi_rgb, monkeypatch):
     assert shown.figures["samples"] == 1 and shown.learned.recordable
 
 
-@pytest.mark.parametrize(
-    "file",
-    [
-        "tiles_filtered.npz", "tiles.npz", "library/chrome.npz", "knot.npz", "group.npz",
-        ROOT / "mi_diffind/data/ggx_tables.npz",
-    ],
-)  # fmt: skip
+FILES = ("tiles_filtered.npz", "tiles.npz", "library/chrome.npz", "knot.npz", "group.npz")
+
+
+@pytest.mark.parametrize("file", [*FILES, ROOT / "mi_diffind/data/ggx_tables.npz"])
 def test_table_files_are_shown(mi_rgb, file):
     """Texture, image, BSDF, distance field, radiance field, GGX: something in the middle, and not everywhere."""
     shown = Session(ASSETS / file, 32)
