@@ -225,7 +225,10 @@ def test_help_is_light():
     }
     text |= of_studies | asked_for_help([["tradeoff", "scene"]])[0]
     for command, found in text.items():
-        assert found.startswith(" ".join(["usage: mi-diffind", *command]) + " [-h]"), command
+        words = " ".join(["mi-diffind", *command])
+        assert found.startswith(f"usage: {words} [-h]"), command
+        example = " ".join(found.rpartition("example: ")[2].split())
+        assert not command or example.startswith(words), command
     assert all(f"\n    {verb} " in text[()] for verb in VERBS)
     training = (".texture.fit", ".loading", ".loop", ".model", ".compressed")
     assert not HEAVY & modules and not [m for m in modules if m.endswith(training)]

@@ -72,18 +72,6 @@ def test_scopes(mi_rgb, history):
     assert first.index == same.index != other.index
 
 
-def test_sums_and_threads():
-    before = dr.expand_threshold()
-    with compat.room_for_sums(2**30):
-        assert dr.expand_threshold() == max(before, 2**30 // dr.thread_count())
-    assert dr.expand_threshold() == before
-    threads = dr.thread_count()
-    compat.use_threads(1)
-    assert dr.thread_count() == 1
-    compat.use_threads(threads)
-    assert dr.thread_count() == threads
-
-
 def test_arrays(mi_rgb):
     module = compat.backend_module(mi_rgb.TensorXf)
     assert module is compat.backend_module(mi_rgb.Float(1)) and module.Float is mi_rgb.Float and module.Array4f
@@ -100,26 +88,6 @@ def test_arrays(mi_rgb):
         with dr.suspend_grad():
             assert compat.has_gradient(value)
     assert not compat.has_gradient(mi_rgb.UInt32(1))
-
-
-def test_state_of_adam(mi_rgb):
-    """An optimiser that is given the state of another one goes the same way."""
-
-    def step(optimizer):
-        dr.backward(dr.sum(dr.square(optimizer["x"] - 3), axis=None))
-        optimizer.step()
-
-    first, second = mi_rgb.ad.Adam(lr=0.1), mi_rgb.ad.Adam(lr=0.1)
-    for optimizer in (first, second):
-        optimizer["x"] = mi_rgb.TensorXf(np.zeros((2, 3)))
-    for _ in range(3):
-        step(first)
-    value, t, m, v = compat.adam_state(first)["x"]
-    assert int(t[0]) == 3 and m.numpy().shape == v.numpy().shape == (6,) and (v.numpy() > 0).all()
-    compat.set_adam_state(second, "x", value.numpy(), int(t[0]), m.numpy(), v.numpy())
-    for optimizer in (first, second):
-        step(optimizer)
-    assert np.array_equal(first["x"].numpy(), second["x"].numpy()) and (first["x"].numpy() > 0.3).all()
 
 
 def test_callback_of_variants(mi_rgb):

@@ -9,7 +9,6 @@ import trimesh
 from PIL import Image
 
 import mi_diffind
-from mi_diffind.commands.cli import VERBS, main
 from mi_diffind.core.errors import UsageError
 from mi_diffind.maps.source import load_source
 from mi_diffind.scenes import rendering
@@ -354,19 +353,3 @@ def test_an_image_that_a_file_cannot_hold_is_not_rendered(mi_rgb, tmp_path, monk
     monkeypatch.setattr(rendering.loading, "render", None)  # not reached
     with pytest.raises(UsageError, match=r"the image has 7 channels, PNG holds 4: use .exr"):
         mi_diffind.render(loaded, spp=1, output="a.png", progress=False)
-
-
-def test_a_normal_map_of_one_channel():
-    with pytest.raises(mi_diffind.DiffindError, match='arrays: the normal map "normal" has 1 channel, 3 are needed'):
-        mi_diffind.from_arrays({"normal": np.zeros((4, 4), np.uint8)})
-    assert mi_diffind.from_arrays({"normal": np.zeros((4, 4, 2), np.uint8)}).channels == 2
-
-
-@pytest.mark.parametrize(
-    "words", [[verb] for verb in VERBS] + [["fit", "sdf"], ["fit", "scene"], ["tradeoff", "scene"]]
-)
-def test_help_ends_with_an_example(words, capsys):
-    with pytest.raises(SystemExit):
-        main([*words, "--help"])
-    example = " ".join(capsys.readouterr().out.rpartition("example: ")[2].split())
-    assert example.startswith(" ".join(["mi-diffind", *words]))

@@ -455,6 +455,7 @@ def test_the_digest_tells_everything_apart():
         ({"a": np.zeros((2, 2), np.int32)}, "has the type int32, allowed are"),
         ({"a": np.zeros((2, 2), bool)}, "has the type bool, allowed are"),
         ({"a": np.zeros((2, 2), object)}, "has the type object, allowed are"),
+        ({"normal": np.zeros((4, 4))}, 'the normal map "normal" has 1 channel, 3 are needed'),
         ({"a": np.zeros((2, 2, 17))}, "has 17 channels in all, at most 16"),
         ({"a b": np.zeros((2, 2))}, "a map is called 'a b'"),
         ({3: np.zeros((2, 2))}, "a map is called 3"),
