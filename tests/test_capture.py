@@ -37,18 +37,14 @@ SCENE = """
 """
 
 
-def sphere(centre, radius, colour, name):
-    return (
-        f'<shape type="sphere" id="{name}"><point name="center" value="{", ".join(map(str, centre))}"/>'
-        f'<float name="radius" value="{radius}"/><bsdf type="diffuse"><rgb name="reflectance" value="{colour}"/>'
-        f"</bsdf></shape>"
-    )
+SPHERE = """<shape type="sphere" id="s{}"><point name="center" value="{}"/><float name="radius" value="{}"/>
+    <bsdf type="diffuse"><rgb name="reflectance" value="{}"/></bsdf></shape>"""
 
 
 @pytest.fixture
 def scene(tmp_path):
     path = tmp_path / "scene.xml"
-    spheres = [sphere(*s, name=f"s{i}") for i, s in enumerate(SPHERES)]
+    spheres = [SPHERE.format(i, f"{x}, {y}, {z}", *s) for i, ((x, y, z), *s) in enumerate(SPHERES)]
     path.write_text(SCENE.replace("SPHERES", "".join(spheres)).replace("0.8, 0.05, 0.05", "$red, 0.05, 0.05"))
     return path
 

@@ -90,22 +90,6 @@ def test_arrays(mi_rgb):
     assert not compat.has_gradient(mi_rgb.UInt32(1))
 
 
-def test_callback_of_variants(mi_rgb):
-    seen, here = [], mi_rgb.variant()
-
-    def callback(old, new):
-        seen.append((old, new))
-
-    try:
-        compat.on_variant_change(callback)
-        compat.on_variant_change(callback)
-        mi_rgb.set_variant("scalar_rgb")
-    finally:
-        mi_rgb.set_variant(here)
-        mi_rgb.detail.remove_variant_callback(callback)
-    assert seen == [(here, "scalar_rgb"), ("scalar_rgb", here)]
-
-
 def test_classes_of_textures(mi_any):
     bitmap = {"type": "bitmap", "raw": True}
     grey = {"type": "uniform", "value": 0.5}
@@ -141,40 +125,19 @@ def test_table_of_spectra(mi_rgb):
     assert np.allclose(coefficients[(k * side + j) * side + i], expected, rtol=1e-3)
 
 
-def test_parsed_scenes(mi_rgb):
-    config, state = compat.parse_file(SCENE, {"width": "20", "height": "12"})
-    assert [Path(f).name for f in compat.parsed_files(state)] == ["lamp.xml"]
-    sensors = compat.parsed_properties(state, mi_rgb.ObjectType.Sensor)
-    assert [p.plugin_name() for p in sensors] == ["orthographic"]
-    names = [p.plugin_name() for p in compat.parsed_properties(state)]
-    assert "hdrfilm" in names
-    film = compat.parsed_properties(state)[names.index("hdrfilm")]
-    film["height"] = 10
-    scene = compat.instantiate(config, state)
-    assert isinstance(scene, mi_rgb.Scene) and tuple(scene.sensors()[0].film().size()) == (20, 10)
-    sensor = scene.sensors()[0]
-    before = mi_rgb.render(scene, spp=1, seed=1).numpy()
-    with compat.film_size(sensor, 10, 5) as possible:
-        assert possible and mi_rgb.render(scene, spp=1).shape[:2] == (5, 10)
-    assert np.array_equal(mi_rgb.render(scene, spp=1, seed=1).numpy(), before)
-    cropped = {"type": "hdrfilm", "width": 8, "height": 8, "crop_width": 4, "crop_height": 4}
-    with compat.film_size(mi_rgb.load_dict({"type": "perspective", "film": cropped}), 2, 2) as possible:
+def test_films(mi_rgb):
+    """The size of a film is a parameter, which is set back; one with a crop window keeps its own."""
+    film, sensor = {"type": "hdrfilm", "width": 20, "height": 12}, {"type": "perspective"}
+    scene = mi_rgb.load_dict({"type": "scene", "sensor": {**sensor, "film": film}, "light": {"type": "constant"}})
+    with compat.film_size(scene.sensors()[0], 10, 5) as possible:
+        assert possible and mi_rgb.render(scene, spp=1, integrator=mi_rgb.load_dict({"type": "path"})).shape[:2] == (
+            5,
+            10,
+        )
+    assert tuple(scene.sensors()[0].film().size()) == (20, 12)
+    cropped = {**film, "crop_width": 4, "crop_height": 4}
+    with compat.film_size(mi_rgb.load_dict({**sensor, "film": cropped}), 2, 2) as possible:
         assert not possible
-
-
-def test_properties(mi_rgb):
-    props = mi_rgb.Properties("diffuse")
-    props["number"], props["whole"], props["text"] = 0.5, 3, "grey"
-    props["colour"] = mi_rgb.ScalarColor3f(0.1, 0.2, 0.3)
-    props["flag"] = True
-    kinds = {key: compat.property_kind(props, key) for key in ("number", "whole", "text", "colour", "flag")}
-    assert kinds == {"number": "number", "whole": "number", "text": "text", "colour": "colour", "flag": "other"}
-    _, state = compat.parse_file(SCENE)
-    found = [compat.property_kind(p, key) for p in compat.parsed_properties(state) for key in p]
-    assert "object" in found
-    props.set_plugin_name("conductor")
-    del props["flag"]
-    assert props.plugin_name() == "conductor" and "flag" not in props and "number" in props
 
 
 @pytest.mark.parametrize("name", ["Float", "UInt32"])

@@ -9,8 +9,10 @@ import trimesh
 from PIL import Image
 
 import mi_diffind
+from mi_diffind import studies
 from mi_diffind.core.errors import UsageError
 from mi_diffind.maps.source import load_source
+from mi_diffind.measure.study import Tradeoff
 from mi_diffind.scenes import rendering
 from mi_diffind.scenes.loading import ParsedScene
 
@@ -311,26 +313,20 @@ def test_scenes_in_memory_that_hold_existing_objects_are_known_once(mi_rgb):
 
 def test_keywords_of_a_study(monkeypatch, tmp_path, mi_rgb):
     """They become the arguments of the command, checked by its parser; the result shows its picture."""
-    from mi_diffind import studies
-    from mi_diffind.measure.study import Tradeoff
-
     asked = []
 
-    class Recorded(studies.studies()["image"].__class__):
+    class Recorded(type(studies.studies()["image"])):
         def run(self, arguments):
             asked.append(arguments)
-            picture = Path(arguments.out) / "tradeoff_image.png"
-            picture.write_bytes(b"\x89PNG")
-            return Tradeoff({"quick": arguments.quick}, ["a line"], {"png": str(picture), "csv": "a.csv"})
+            (out / "a.png").write_bytes(b"\x89PNG")
+            return Tradeoff({"quick": arguments.quick}, ["a line"], {"png": str(out / "a.png"), "csv": "a.csv"})
 
     monkeypatch.setattr(studies, "studies", lambda: {"image": Recorded()})
-    source = tmp_path / "a.png"
+    source, out = tmp_path / "a.png", tmp_path / "out"
     Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(source)
-    out = tmp_path / "out"
     result = mi_diffind.tradeoff("image", source, out=out, quick=True, compression=["6x", "12x"])
-    (arguments,) = asked
-    assert arguments.compression == ["6x", "12x"] and arguments.source == str(source)
-    assert result.figures == {"quick": True} and result.pictures == {"png": str(out / "tradeoff_image.png")}
+    assert (asked[0].compression, asked[0].source) == (["6x", "12x"], str(source))
+    assert result.figures == {"quick": True} and result.pictures == {"png": str(out / "a.png")}
     assert result._repr_png_() == b"\x89PNG" and str(result).startswith("a line\n")
     with pytest.raises(UsageError, match="tradeoff image: unrecognized arguments: --ratio=6"):
         mi_diffind.tradeoff("image", source, out=out, ratio=6)

@@ -398,32 +398,25 @@ def test_in_a_loop(ad, storage, mode):
     np.testing.assert_allclose(found.numpy(), expected, rtol=1e-5)
 
 
+Array, Pair = DifferentiableArray, Indirection
+
 MISTAKES = {
-    "no dimension": (lambda: DifferentiableArray(()), "1 to 4 dimensions"),
-    "five dimensions": (lambda: DifferentiableArray((2,) * 5), "1 to 4 dimensions"),
-    "no entries": (lambda: DifferentiableArray((4, 0)), "at least 1 entry"),
-    "negative entries": (lambda: DifferentiableArray(-3), "at least 1 entry"),
-    "no channel": (lambda: DifferentiableArray(4, 0), "channels: found 0"),
-    "unknown border": (lambda: DifferentiableArray(4, border="mirror"), "mirror"),
-    "too few borders": (lambda: DifferentiableArray((4, 4), border=("clamp",)), "one for each axis"),
-    "unknown initialisation": (lambda: DifferentiableArray(4, init="noise"), '"noise"'),
-    "wrong shape": (lambda: DifferentiableArray((4, 4), 2, np.zeros((4, 4))), r"expected \(4, 4, 2\)"),
-    "not a range": (lambda: DifferentiableArray(4, 1, "random", 0.5), "pair"),
-    "values for other channels": (lambda: DifferentiableArray(4, 3, value=(1, 2)), "one a channel"),
-    "pointer too short": (
-        lambda: Indirection(DifferentiableArray((4, 4), 2), DifferentiableArray((4, 4, 4))),
-        "2 channel.* 3 dimension",
-    ),
-    "pointer too long": (lambda: Indirection(DifferentiableArray(4, 2), DifferentiableArray(4)), "2 channel"),
-    "no primary": (lambda: Indirection([], DifferentiableArray(4)), "0 channel"),
-    "inputs do not fit": (
-        lambda: Indirection(DifferentiableArray((4, 4), 2), DifferentiableArray((4, 4)), [(0,)]),
-        "inputs: found",
-    ),
-    "negative input": (
-        lambda: Indirection(DifferentiableArray((4, 4), 2), DifferentiableArray((4, 4)), [(-1, 0)]),
-        "at least 0",
-    ),
+    "no dimension": (lambda: Array(()), "1 to 4 dimensions"),
+    "five dimensions": (lambda: Array((2,) * 5), "1 to 4 dimensions"),
+    "no entries": (lambda: Array((4, 0)), "at least 1 entry"),
+    "negative entries": (lambda: Array(-3), "at least 1 entry"),
+    "no channel": (lambda: Array(4, 0), "channels: found 0"),
+    "unknown border": (lambda: Array(4, border="mirror"), "mirror"),
+    "too few borders": (lambda: Array((4, 4), border=("clamp",)), "one for each axis"),
+    "unknown initialisation": (lambda: Array(4, init="noise"), '"noise"'),
+    "wrong shape": (lambda: Array((4, 4), 2, np.zeros((4, 4))), r"expected \(4, 4, 2\)"),
+    "not a range": (lambda: Array(4, 1, "random", 0.5), "pair"),
+    "values for other channels": (lambda: Array(4, 3, value=(1, 2)), "one a channel"),
+    "pointer too short": (lambda: Pair(Array((4, 4), 2), Array((4, 4, 4))), "2 channel.* 3 dimension"),
+    "pointer too long": (lambda: Pair(Array(4, 2), Array(4)), "2 channel"),
+    "no primary": (lambda: Pair([], Array(4)), "0 channel"),
+    "inputs do not fit": (lambda: Pair(Array((4, 4), 2), Array((4, 4)), [(0,)]), "inputs: found"),
+    "negative input": (lambda: Pair(Array((4, 4), 2), Array((4, 4)), [(-1, 0)]), "at least 0"),
 }
 
 

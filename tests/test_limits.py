@@ -3,7 +3,6 @@
 import json
 import os
 import tracemalloc
-import zipfile
 import zlib
 from pathlib import Path
 
@@ -15,7 +14,8 @@ from commands import refused
 from PIL import Image
 
 import mi_diffind
-from mi_diffind import DiffindError, TableError, load_table
+from mi_diffind import DiffindError, TableError, load_table, save_table
+from mi_diffind.arrays.tables import Table, byte_array
 from mi_diffind.core.archives import FACTOR, FREE, VARIABLE, Allowance, LimitError, allowed, json_bytes
 from mi_diffind.core.errors import LONGEST_MESSAGE, UsageError
 from mi_diffind.core.files import PATHS, OutputError
@@ -26,26 +26,6 @@ from mi_diffind.maps.pyramid import map_figure
 from mi_diffind.maps.source import SourceError, load_source
 from mi_diffind.scenes.inspection import Inspection
 from mi_diffind.tasks.radiance.captures import ViewsError, image_file
-
-
-def archive(path, members: dict) -> Path:
-    """Write an archive of members in bytes, deflated."""
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as file:
-        for name, content in members.items():
-            file.writestr(f"{name}.npy", content)
-    return path
-
-
-def meta_of(arrays: dict, settings=(), task="a task", **more) -> np.ndarray:
-    meta = {"format_version": 2, "task": task, "preset": "", "arrays": arrays, "settings": dict(settings), "seed": 0}
-    return np.frombuffer(json.dumps({**meta, "measured": {}, **more}).encode(), np.uint8)
-
-
-def described(shape, bits=8) -> dict:
-    return {
-        "shape": list(shape), "border": ["clamp"] * (len(shape) - 1), "storage": "uint8", "scale": [1.0] * shape[-1],
-        "offset": [0.0] * shape[-1], "bits": bits,
-    }  # fmt: skip
 
 
 def png(path, width: int, height: int, depth: int, colour: int = 0) -> Path:
@@ -74,8 +54,8 @@ def test_the_limit_and_how_to_raise_it(tmp_path, monkeypatch):
 
 
 def test_a_raised_limit_reads_the_file(tmp_path, monkeypatch):
-    meta = damage.npy(meta_of({"a": described((2**24, 1))}))
-    path = archive(tmp_path / "t.npz", {"meta": meta, "a": damage.npy(np.zeros((2**24, 1), np.uint8))})
+    path = tmp_path / "t.npz"
+    save_table(path, Table("a task", {"a": byte_array(np.zeros((2**24, 1), np.uint8))}))
     with pytest.raises(TableError, match=VARIABLE):
         load_table(path)
     monkeypatch.setenv(VARIABLE, "200M")

@@ -179,32 +179,22 @@ def test_what_it_refuses(commands, fitted, tmp_path):
     assert sorted(os.listdir(tmp_path)) == ["odd.csv"]
 
 
-SCENE = """<scene version="3.0.0">
-    <default name="spp" value="4"/>
-    <integrator type="direct"/>
+SCENE = """<scene version="3.0.0"><integrator type="direct"/>
     <sensor type="perspective">
         <float name="fov" value="60"/>
         <transform name="to_world"><lookat origin="0, 0, 3" target="0, 0, 0" up="0, 1, 0"/></transform>
         <film type="hdrfilm">
             <integer name="width" value="32"/><integer name="height" value="32"/><rfilter type="box"/>
         </film>
-        <sampler type="independent"><integer name="sample_count" value="$spp"/></sampler>
+        <sampler type="independent"><integer name="sample_count" value="4"/></sampler>
     </sensor>
-    <shape type="rectangle">
-        <transform name="to_world"><scale value="4"/></transform>
-        <bsdf type="diffuse"/>
-    </shape>
+    <shape type="rectangle"><transform name="to_world"><scale value="4"/></transform><bsdf type="diffuse"/></shape>
     <emitter type="projector">
-        <float name="fov" value="100"/>
-        <float name="scale" value="20"/>
+        <float name="fov" value="100"/><float name="scale" value="20"/>
         <transform name="to_world"><lookat origin="0, 0, 1.5" target="0, 0, 0" up="0, 1, 0"/></transform>
-        <texture name="irradiance" type="neural_profile" id="lamp">
-            <string name="filename" value="downlight.npz"/>
-            <string name="source" value="downlight.csv"/>
-            <float name="fov" value="100"/>
-        </texture>
-    </emitter>
-</scene>
+        <texture name="irradiance" type="neural_profile" id="lamp"><float name="fov" value="100"/>
+            <string name="filename" value="downlight.npz"/><string name="source" value="downlight.csv"/></texture>
+    </emitter></scene>
 """
 
 

@@ -149,7 +149,6 @@ def test_sizes_that_cannot_be_met_are_explained(folder, capsys):
         (["--checkpoint", "c.npz", "--ratio-search"], "--checkpoint: for one training"),
         (["--ratio-search", "--cascaded", "8"], "leave out --psnr and --cascaded"),
         (["--psnr", "30", "--cascaded", "8"], "leave out --cascaded"),
-        (["--ratio", "8"], "--ratio: for the preset paper"),
         (["--preset", "paper", "--without", "jitter"], "leave it out"),
         (["-o", "out.png"], "allowed is .npz"),
     ],

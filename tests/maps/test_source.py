@@ -136,28 +136,22 @@ def test_bmp_with_a_palette(tmp_path):
     refused("is a BMP file with a palette", tmp_path / "colors.bmp")
 
 
-@pytest.mark.parametrize(
-    "name, role",
-    [("albedo", "albedo"), ("baseColor", "albedo"), ("base_color_map", "albedo"), ("diffuse", "albedo"),
-     ("Color", "albedo"), ("normalTexture", "normal"), ("occlusion", "ao"), ("AO", "ao"), ("metalness", "metallic"),
-     ("roughness", "roughness"), ("alpha", "other"), ("height", "other"),
-     # Poly Haven
-     ("diff", "albedo"), ("nor_gl", "normal"), ("nor_dx", "normal"), ("rough", "roughness"), ("arm", "other"),
-     ("metal", "metallic"), ("ao", "ao"), ("disp", "other"), ("spec", "other"), ("rough_wood_diff_1k", "albedo"),
-     # ambientCG
-     ("NormalGL", "normal"), ("NormalDX", "normal"), ("AmbientOcclusion", "ao"), ("Displacement", "other"),
-     ("Wood051_1K-JPG_Color", "albedo"), ("Wood051_1K-JPG_NormalGL", "normal"),
-     ("Metal003_2K-PNG_Metalness", "metallic"),
-     # Quixel, Substance, Unity, Poliigon
-     ("vhlmdg_4K_Albedo", "albedo"), ("vhlmdg_4K_Normal_LOD0", "normal"), ("Wall_Base_Color.1001", "albedo"),
-     ("Wall_Normal_OpenGL", "normal"), ("Wall_Mixed_AO", "ao"), ("Wall_BaseMap", "albedo"), ("Wall_MaskMap", "other"),
-     ("MainTex", "albedo"), ("MetallicSmoothness", "other"), ("Wall_NormalMap_GL", "normal"),
-     ("Planks_COL_VAR1_3K", "albedo"),
-     ("Planks_NRM_3K", "normal"),
-     # Further lobes of glTF, MaterialX and OpenPBR
-     ("clearcoat_normal", "other"), ("coat_roughness", "other"), ("specular_roughness", "roughness"),
-     ("sheenColorTexture", "other")],
-)  # fmt: skip
+#: Names as programs and libraries of textures write them: Poly Haven, ambientCG, Quixel, Substance, Unity, Poliigon,
+#: and further lobes of glTF, MaterialX and OpenPBR, which are other maps.
+ROLES = {
+    "albedo": "albedo baseColor base_color_map diffuse Color diff rough_wood_diff_1k Wood051_1K-JPG_Color "
+    "vhlmdg_4K_Albedo Wall_Base_Color.1001 Wall_BaseMap MainTex Planks_COL_VAR1_3K",
+    "normal": "normalTexture nor_gl nor_dx NormalGL NormalDX Wood051_1K-JPG_NormalGL vhlmdg_4K_Normal_LOD0 "
+    "Wall_Normal_OpenGL Wall_NormalMap_GL Planks_NRM_3K",
+    "ao": "occlusion AO ao AmbientOcclusion Wall_Mixed_AO",
+    "metallic": "metalness metal Metal003_2K-PNG_Metalness",
+    "roughness": "roughness rough specular_roughness",
+    "other": "alpha height arm disp spec Displacement Wall_MaskMap MetallicSmoothness clearcoat_normal coat_roughness "
+    "sheenColorTexture",
+}
+
+
+@pytest.mark.parametrize("name, role", [(name, role) for role, names in ROLES.items() for name in names.split()])
 def test_roles(name, role):
     assert content_of(name).role == role
 
