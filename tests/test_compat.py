@@ -30,12 +30,9 @@ def history():
     return record
 
 
-def test_llvm_version():
-    assert len(compat.llvm_version()) == 3 and compat.llvm_version()[0] >= runtime.MIN_LLVM
-
-
 def test_functions_of_the_library(mi_rgb):
     """Starting LLVM again itself is tested in processes of their own (``test_runtime.py``)."""
+    assert len(compat.llvm_version()) == 3 and compat.llvm_version()[0] >= runtime.MIN_LLVM
     assert Path(compat.core_library()).is_file(), compat.core_library()
     core = compat.JitCore()
     before = core.launches()

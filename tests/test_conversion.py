@@ -56,6 +56,12 @@ def folder(tmp_path, monkeypatch):
     return tmp_path, fits
 
 
+def textured(name, image, filter_type="bilinear"):
+    """A diffuse material with an id that shows an image."""
+    return f"""<bsdf type="diffuse" id="{name}"><texture type="bitmap" name="reflectance"><string name="filename"
+        value="{image}"/><string name="filter_type" value="{filter_type}"/></texture></bsdf>"""
+
+
 def parsed(folder, objects, name="scene.xml"):
     (folder / name).write_text(SCENE.replace("OBJECTS", objects))
     return loading.ParsedScene(folder / name)
@@ -101,13 +107,9 @@ def test_a_converted_scene_shows_the_same(mi_rgb, folder):
          'principled "Glass"', "transmits light"),
         ("principled", '<bsdf type="twosided" id="Gem"><bsdf type="principled"><float name="eta" value="4"/></bsdf>'
          "</bsdf>", 'principled "Gem"', 'the parameter "eta" 4, the Disney BRDF allows 1 to 3'),
-        ("bitmap", '<bsdf type="diffuse" id="Sharp"><texture type="bitmap" name="reflectance"><string name="filename" '
-         'value="image.png"/><string name="filter_type" value="nearest"/></texture></bsdf>',
-         'bitmap "Sharp"', 'the filter_type "nearest", allowed are bilinear'),
-        ("bitmap", '<bsdf type="diffuse" id="Webp"><texture type="bitmap" name="reflectance"><string name="filename" '
-         'value="leaf.webp"/></texture></bsdf>', 'bitmap "Webp"', "leaf.webp: cannot be read"),
-        ("bitmap", '<bsdf type="diffuse" id="Lost"><texture type="bitmap" name="reflectance"><string name="filename" '
-         'value="none.png"/></texture></bsdf>', 'bitmap "Lost"', "names no file that exists"),
+        ("bitmap", textured("Sharp", "image.png", "nearest"), 'bitmap "Sharp"', 'the filter_type "nearest", allowed'),
+        ("bitmap", textured("Webp", "leaf.webp"), 'bitmap "Webp"', "leaf.webp: cannot be read"),
+        ("bitmap", textured("Lost", "none.png"), 'bitmap "Lost"', "names no file that exists"),
         *(
             ("principled", f'<bsdf type="principled" id="Gold"><float name="metallic" value="{metal}"/>'
              f'<float name="{name}" value="{value}"/></bsdf>', 'principled "Gold"', f'is a metal with "{name}" {value}')
@@ -156,8 +158,7 @@ def test_a_fit_that_ends_early_leaves_no_files(mi_rgb, folder, monkeypatch, faul
         raise fault
 
     monkeypatch.setattr(conversion, "fit", failing)
-    image = '<texture type="bitmap" name="reflectance"><string name="filename" value="image.png"/></texture>'
-    parsed(folder[0], f'<shape type="sphere"><bsdf type="diffuse">{image}</bsdf></shape>')
+    parsed(folder[0], f'<shape type="sphere">{textured("m", "image.png")}</shape>')
     before = sorted(folder[0].iterdir())
     (folder[0] / "new").mkdir()
     with pytest.raises(KeyboardInterrupt) if isinstance(fault, KeyboardInterrupt) else contextlib.nullcontext():
@@ -224,9 +225,8 @@ def test_the_command_and_a_comparison_with_the_stock_scene(mi_rgb, tmp_path, cap
 def test_by_default_only_textures_are_learned(mi_rgb, folder):
     """Formulas stay formulas and meshes stay meshes unless they are asked for."""
     folder, fits = folder
-    textured = """<shape type="rectangle"><bsdf type="diffuse" id="card"><texture type="bitmap" name="reflectance">
-        <string name="filename" value="image.png"/></texture></bsdf></shape>"""
-    parsed(folder, BALL.replace("MORE", "") + textured)
+    card = f'<shape type="rectangle">{textured("card", "image.png")}</shape>'
+    parsed(folder, BALL.replace("MORE", "") + card)
     result = conversion.convert(folder / "scene.xml", folder / "new.xml", defines={"rough": 0.4}, progress=False)
     assert [(c.stock, c.learned, c.name) for c in result] == [("bitmap", "neural_texture", "card")]
     assert [task for task, _ in fits] == ["texture"] and str(result).splitlines()[-1] == f"check       {result.check}"
@@ -244,9 +244,7 @@ def test_small_and_noisy_images_stay(mi_rgb, folder):
     sizes = {f"small{i}": size for i, size in enumerate([(1, 1, 3), (1, 64, 4), (7, 3, 1), (36, 37, 3), (63, 64, 1)])}
     for name, size in [*sizes.items(), ("noise", (64, 64, 3))]:
         mi_rgb.Bitmap(rng.integers(0, 256, size).astype(np.uint8)).write(str(folder / f"{name}.png"))
-    material = """<bsdf type="diffuse" id="m{0}"><texture type="bitmap" name="reflectance">
-        <string name="filename" value="{0}.png"/></texture></bsdf>"""
-    scene = parsed(folder, "".join(map(material.format, [*sizes, "noise"])))
+    scene = parsed(folder, "".join(textured(f"m{name}", f"{name}.png") for name in [*sizes, "noise"]))
     *small, noise = conversion.replace_stock(scene, ["bitmap"], folder / "tables", progress=False)
     for (name, size), one in zip(sizes.items(), small, strict=True):
         assert str(one) == f'bitmap "m{name}": {name}.png has {np.prod(size):,} bytes, of which no fit would save any'

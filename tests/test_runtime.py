@@ -415,18 +415,9 @@ def test_kernels_that_cannot_be_stored(tmp_path):
     assert done.stdout.split() == ["loaded"] and "I/O error while writing" in done.stderr
 
 
-def scene() -> dict:
-    film = {"type": "hdrfilm", "width": 8, "height": 8}
-    ball = {"type": "sphere", "center": [0, 0, 5], "bsdf": {"type": "disney", "roughness": 0.4}}
-    return {
-        "type": "scene", "integrator": {"type": "path"}, "sky": {"type": "constant"},
-        "sensor": {"type": "perspective", "film": film}, "ball": ball,
-    }  # fmt: skip
-
-
 def test_loads_and_renders_wait(mi_rgb):
-    loaded = md.load_dict(scene())
-    for work in (lambda: mi_rgb.render(loaded, spp=1), lambda: md.load_dict(scene())):
+    loaded = md.load_dict(mi_rgb.cornell_box())
+    for work in (lambda: mi_rgb.render(loaded, spp=1), lambda: md.load_dict(mi_rgb.cornell_box())):
         done = threading.Event()
         thread = threading.Thread(target=lambda work=work, done=done: (work(), done.set()))
         with threads.LOCK:
@@ -440,22 +431,20 @@ def test_loads_and_renders_wait(mi_rgb):
 def test_scenes_of_threads_end_in_a_turn(mi_rgb):
     """A scene of a thread that nothing refers to ends at the next load or render; one of the main thread at once."""
     kept = []
-    with threads.turn():
-        pass
-    before = len(threads._scenes)
 
     def load():
-        kept.append(md.load_dict(scene()))
+        kept.append(md.load_dict(mi_rgb.cornell_box()))
         mi_rgb.render(kept[-1], spp=1)
 
+    with threads.turn():
+        before = len(threads._scenes)
     load()
     assert len(threads._scenes) == before
     thread = threading.Thread(target=load)
     thread.start()
     thread.join()
-    with threads.turn():
-        assert len(threads._scenes) == before + 1
-    kept.clear()
-    assert len(threads._scenes) == before + 1
-    with threads.turn():
-        assert len(threads._scenes) == before
+    for count in (before + 1, before):
+        with threads.turn():
+            assert len(threads._scenes) == count
+        kept.clear()
+        assert len(threads._scenes) == count

@@ -46,7 +46,10 @@ def commands(path, folder):
     }
 
 
-@pytest.mark.parametrize("name", ["render", "orbit", "compare", "view", "regress", "tradeoff"])
+COMMANDS = ["render", "orbit", "compare", "view", "regress", "tradeoff"]
+
+
+@pytest.mark.parametrize("name", COMMANDS)
 @pytest.mark.parametrize("missing", ["integrator", "sensor"])
 def test_scenes_without_a_part(tmp_path, capsys, name, missing):
     path = scene_file(tmp_path, missing)
@@ -81,7 +84,7 @@ def test_scenes_in_memory(mi_rgb):
         render(mi_rgb.load_dict(scene), 1)
 
 
-@pytest.mark.parametrize("name", ["render", "orbit", "compare", "view", "regress", "tradeoff"])
+@pytest.mark.parametrize("name", COMMANDS)
 def test_films_beyond_the_memory(tmp_path, capsys, monkeypatch, name):
     """On a machine of 32 kB; the film of the viewer has the width that it is asked for."""
     monkeypatch.setattr(units, "memory", lambda: 2**15)

@@ -330,11 +330,9 @@ def test_nonfinite_values(tmp_path):
 @pytest.mark.parametrize("flat", [False, True])
 def test_manifest(tmp_path, flat):
     (tmp_path / "textures").mkdir()
-    orm = pattern(5, 7, 3)
-    base = pattern(5, 7, 3, np.uint16)
-    write(tmp_path / "textures" / "orm.png", orm)
-    write(tmp_path / "base.png", base)
-    write(tmp_path / "n.png", pattern(5, 7, 3, seed=2))
+    orm, base, normal = pattern(5, 7, 3), pattern(5, 7, 3, np.uint16), pattern(5, 7, 3, seed=2)
+    for name, array in (("textures/orm.png", orm), ("base.png", base), ("n.png", normal)):
+        write(tmp_path / name, array)
     maps = {
         "albedo": "base.png",
         "normal": {"file": "n.png", "color_space": "linear"},
@@ -348,11 +346,9 @@ def test_manifest(tmp_path, flat):
         ("roughness", "roughness", "linear", 1, 1),
         ("ao", "ao", "linear", 1, 1),
     ]
-    assert np.array_equal(np.rint(source.maps[2].values * 255), orm[..., 1:2])
-    assert np.array_equal(np.rint(source.maps[3].values * 255), orm[..., :1])
     assert source.maps[3].file == str(tmp_path / "textures" / "orm.png")
     assert source.nbytes == 35 * (3 * 2 + 3 + 1 + 1) and source.channels == 8
-    arrays = {"albedo": base, "normal": pattern(5, 7, 3, seed=2), "roughness": orm[..., 1], "ao": orm[..., 0]}
+    arrays = {"albedo": base, "normal": normal, "roughness": orm[..., 1], "ao": orm[..., 0]}
     assert from_arrays(arrays).digest == source.digest
 
 
