@@ -69,24 +69,6 @@ def test_scopes(mi_rgb, history):
     assert first.index == same.index != other.index
 
 
-def test_arrays(mi_rgb):
-    module = compat.backend_module(mi_rgb.TensorXf)
-    assert module is compat.backend_module(mi_rgb.Float(1)) and module.Float is mi_rgb.Float and module.Array4f
-    a, tensor = mi_rgb.Float(1, 2), mi_rgb.TensorXf(np.ones((2, 2)))
-    colour = mi_rgb.Color3f(a, a + 1, 0)
-    assert compat.identity(a) == compat.identity(mi_rgb.Float(a)) != compat.identity(a + 1)
-    assert len(compat.identity(colour)) == 3 and compat.identity(tensor) == compat.identity(tensor.array)
-    kept = compat.identity(tensor), dr.detach(tensor)
-    tensor[:] = 2
-    assert compat.identity(tensor) != kept[0]
-    for value in (mi_rgb.Float(1, 2), mi_rgb.Color3f(1, 2, 3), mi_rgb.TensorXf(np.ones((2, 2)))):
-        assert not compat.has_gradient(value)
-        dr.enable_grad(value)
-        with dr.suspend_grad():
-            assert compat.has_gradient(value)
-    assert not compat.has_gradient(mi_rgb.UInt32(1))
-
-
 def test_classes_of_textures(mi_any):
     bitmap = {"type": "bitmap", "raw": True}
     grey = {"type": "uniform", "value": 0.5}
@@ -107,19 +89,6 @@ def test_classes_of_textures(mi_any):
         pass
 
     assert compat.texture_class(UniformSpectrum(mi_any.Properties())) == ""
-
-
-def test_table_of_spectra(mi_rgb):
-    side, positions, coefficients = compat.srgb_coefficients()
-    assert positions.shape == (side,) and coefficients.shape == (3 * side**3, 3)
-    assert positions[0] == 0 and positions[-1] == 1 and (np.diff(positions) > 0).all()
-    assert np.isfinite(coefficients).all()
-    # A grid point: red is largest, green and blue of it a part
-    k, i, j = side // 2, side // 4, side // 3
-    z = float(positions[k])
-    rgb = [z, z * i / (side - 1), z * j / (side - 1)]
-    expected = np.array(mi_rgb.srgb_model_fetch(mi_rgb.ScalarColor3f(rgb))).ravel()
-    assert np.allclose(coefficients[(k * side + j) * side + i], expected, rtol=1e-3)
 
 
 def test_films(mi_rgb):
@@ -152,23 +121,6 @@ def test_copies_are_not_numpys_memory(mi_rgb, name):
     np.testing.assert_array_equal(copy.numpy().view("u4"), kept.view("u4"))
     computed = array + 1
     assert compat.owned(computed) is computed
-
-
-def test_derivatives_pass_through(mi_rgb):
-    """A copy is the same node: also gradients of an array that is no leaf stay where they were."""
-    array = mi_rgb.Float(np.arange(3, dtype=np.float32))
-    dr.enable_grad(array)
-    copy = compat.owned(array)
-    dr.backward(dr.sum(dr.square(copy)))
-    np.testing.assert_array_equal(dr.grad(array).numpy(), [0, 2, 4])
-    np.testing.assert_array_equal(dr.grad(copy).numpy(), [0, 2, 4])
-
-
-def test_assignments_are_seen_by_all(mi_rgb):
-    tensor = mi_rgb.TensorXf(np.zeros((2, 2), np.float32))
-    same = tensor
-    compat.assign(tensor, mi_rgb.TensorXf(np.ones((1, 3), np.float32)))
-    assert same.shape == (1, 3) and same.array.numpy().tolist() == [1, 1, 1]
 
 
 def test_declared_entry_point():

@@ -16,8 +16,8 @@ from mi_diffind.core.errors import UsageError
 from mi_diffind.images import srgb
 from mi_diffind.scenes import loading
 from mi_diffind.scenes.viewer import passes
-from mi_diffind.scenes.viewer.page import Page, pad, server, status_lines, to_world
-from mi_diffind.scenes.viewer.session import Session, combine, rigid
+from mi_diffind.scenes.viewer.page import Page, pad, server, status_lines
+from mi_diffind.scenes.viewer.session import Session, combine
 
 ROOT = Path(__file__).resolve().parents[1]
 ASSETS = ROOT / "scenes" / "assets"
@@ -258,14 +258,6 @@ def test_refused_input(mi_rgb, tmp_path):
         shown.show("both")
     with pytest.raises(UsageError, match="camera: found a position or a direction that is not finite"):
         shown.move_camera(shown.pose * np.nan)
-
-
-def test_pose_of_the_page():
-    """viser's camera looks along +z with y down; Mitsuba's looks along +z with y up and x to the left."""
-    half = np.sqrt(0.5)  # a quarter turn about y: z becomes x, x becomes −z
-    pose = to_world(np.array([half, 0, half, 0]), np.array([1.0, 2.0, 3.0]))
-    np.testing.assert_allclose(pose[:3], [[0, 0, 1, 1], [0, -1, 0, 2], [1, 0, 0, 3]], atol=1e-12)
-    np.testing.assert_allclose(rigid(pose @ np.diag([-3, 3, 3, 1])), pose, atol=1e-12)
 
 
 def test_bars_beside_a_picture(rng):
