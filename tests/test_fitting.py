@@ -361,31 +361,32 @@ def test_a_step_is_one_kernel(ad, problem):
             assert kernels.count(1000) == 1 and max(k for k in kernels if k != 1000) <= 8 * 8
 
 
+class Linear(Several):
+    """Two targets of one array of two rows; the first has a weight, and channels that come twice."""
+
+    weights = {"y": 3.0}  # noqa: RUF012
+
+    def __init__(self, ad):
+        super().__init__(ad)
+        self.net = DifferentiableArray(2, 3, np.array([[0.2, 0.9, 0.4], [0.7, 0.1, 0.3]])).alloc(ad.TensorXf)
+
+    def predict(self, net, inputs):
+        a, b, c = net(inputs)
+        return {"y": [a, b, a, b], "z": [c]}
+
+
 def test_the_loss_and_its_gradient(ad):
     """A step of gradient descent on both targets, in NumPy; weights and numbers of channels count."""
-
-    class Linear(Several):
-        def __init__(self, ad):
-            super().__init__(ad)
-            self.weights = {"y": 3.0}
-            self.net = DifferentiableArray(2, 3, np.array([[0.2, 0.9, 0.4], [0.7, 0.1, 0.3]])).alloc(ad.TensorXf)
-
-        def predict(self, net, inputs):
-            a, b, c = net(inputs)
-            return {"y": [a, b, a, b], "z": [c]}
-
     problem = Linear(ad)
     problem.settings = settings(batch=1000, loss="mse")
     trainer = loop._Trainer(problem, problem.settings)
     entries = problem.net.numpy().astype(np.float64)
-    seed = dr.opaque(ad.UInt64, 0)
-    x = np.array(problem.batch(dr.rng(seed=seed), 1000)[0][0]).astype(np.float64)
+    x = np.array(problem.batch(dr.rng(seed=dr.opaque(ad.UInt64, 0)), 1000)[0][0]).astype(np.float64)
     weights = np.stack([1 - x, x])
     errors = np.einsum("is,ic->cs", weights, entries) - np.stack([*[0.5 + 0.3 * np.sin(6 * x)] * 2, x**2])
     scale = np.array([[3 / 2], [3 / 2], [1]])
     gradient = np.einsum("cs,is->ic", 2 * scale * errors, weights) / 1000
-    loss = trainer.take_step()
-    assert float(loss[0]) == pytest.approx(float((scale * errors**2).sum() / 1000), rel=1e-4)
+    assert float(trainer.take_step()[0]) == pytest.approx(float((scale * errors**2).sum() / 1000), rel=1e-4)
     _, _, _, (_, moment, _, _) = trainer.optimizer.state["data"]
     found = np.array(moment).reshape(2, 4)[:, :3] / 0.1  # of Adam's first step: (1 - 0.9) times the gradient
     np.testing.assert_allclose(found, gradient, rtol=1e-4, atol=1e-6)

@@ -302,7 +302,8 @@ def test_requests_of_the_page(mi_rgb):
         before = page._picture
         page._camera = (np.array([0.0, 1.0, 0.0, 0.0]), np.array([0.2, 0.0, 4.0]))
         assert page._step() and shown.moving
-        np.testing.assert_allclose(shown.pose[:3, 2:], [[0, 0.2], [0, 0], [-1, 4]], atol=1e-12)
+        # viser's camera looks along +z with y down; Mitsuba's along +z with y up and x to the left
+        np.testing.assert_allclose(shown.pose[:3], [[-1, 0, 0, 0.2], [0, 1, 0, 0], [0, 0, -1, 4]], atol=1e-12)
         assert (page._picture != before).any()
         page._change("ball.bsdf.roughness", 0.7)
         page._change("ball.bsdf.roughness", 0.8)  # the newest counts
