@@ -123,6 +123,13 @@ def test_copies_are_not_numpys_memory(mi_rgb, name):
     assert compat.owned(computed) is computed
 
 
+def test_assignments_are_seen_by_all(mi_rgb):
+    tensor = mi_rgb.TensorXf(np.zeros((2, 2), np.float32))
+    same = tensor
+    compat.assign(tensor, mi_rgb.TensorXf(np.ones((1, 3), np.float32)))
+    assert same.shape == (1, 3) and same.array.numpy().tolist() == [1, 1, 1]
+
+
 def test_declared_entry_point():
     """The one that Mitsuba finds in an installation; a checkout that is not installed has ``pyproject.toml`` only."""
     text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")

@@ -56,6 +56,12 @@ def folder(tmp_path, monkeypatch):
     return tmp_path, fits
 
 
+def principled(name, **numbers):
+    """A material with an id."""
+    listed = "".join(f'<float name="{key}" value="{value}"/>' for key, value in numbers.items())
+    return f'<bsdf type="principled" id="{name}">{listed}</bsdf>'
+
+
 def textured(name, image, filter_type="bilinear"):
     """A diffuse material with an id that shows an image."""
     return f"""<bsdf type="diffuse" id="{name}"><texture type="bitmap" name="reflectance"><string name="filename"
@@ -103,21 +109,20 @@ def test_a_converted_scene_shows_the_same(mi_rgb, folder):
 @pytest.mark.parametrize(
     "group, objects, name, reason",
     [
-        ("principled", '<bsdf type="principled" id="Glass"><float name="spec_trans" value="0.9"/></bsdf>',
-         'principled "Glass"', "transmits light"),
-        ("principled", '<bsdf type="twosided" id="Gem"><bsdf type="principled"><float name="eta" value="4"/></bsdf>'
-         "</bsdf>", 'principled "Gem"', 'the parameter "eta" 4, the Disney BRDF allows 1 to 3'),
+        ("principled", principled("Glass", spec_trans=0.9), 'principled "Glass"', "transmits light"),
+        ("principled", f'<bsdf type="twosided" id="Gem">{principled("Inner", eta=4)}</bsdf>', 'principled "',
+         'the parameter "eta" 4, the Disney BRDF allows 1 to 3'),
         ("bitmap", textured("Sharp", "image.png", "nearest"), 'bitmap "Sharp"', 'the filter_type "nearest", allowed'),
         ("bitmap", textured("Webp", "leaf.webp"), 'bitmap "Webp"', "leaf.webp: cannot be read"),
         ("bitmap", textured("Lost", "none.png"), 'bitmap "Lost"', "names no file that exists"),
         *(
-            ("principled", f'<bsdf type="principled" id="Gold"><float name="metallic" value="{metal}"/>'
-             f'<float name="{name}" value="{value}"/></bsdf>', 'principled "Gold"', f'is a metal with "{name}" {value}')
+            ("principled", principled("Gold", metallic=metal, **{name: value}), 'principled "Gold"',
+             f'is a metal with "{name}" {value}')
             for metal, name, value in ((1, "specular", 0), (0.5, "eta", 1))
         ),
         *(
-            ("principled", f'<bsdf type="principled" id="Floor"><float name="{name}" value="{value}"/></bsdf>',
-             'principled "Floor"', f'has the "{name}" {value}, below {least} the Disney BRDF reflects more at grazing')
+            ("principled", principled("Floor", **{name: value}), 'principled "Floor"',
+             f'has the "{name}" {value}, below {least} the Disney BRDF reflects more at grazing')
             for name, value, least in (("specular", 0, 0.1), ("specular", 0.09, 0.1), ("eta", 1.1, 1.2))
         ),
         ("mesh", BALL.replace("MORE", '<emitter type="area"/>'), 'ply "ball"', "emits light"),
@@ -181,8 +186,7 @@ def test_albedos_at_grazing_angles_of_what_is_replaced(mi_rgb, folder, metal, sp
     """A polished floor seen at 11° is up to 15% brighter at the limit of ``specular``, and 3% by default."""
     mi, n = mi_rgb, 1 << 16
     numbers = {"roughness": 0.1, "metallic": float(metal), "specular": specular}
-    listed = "".join(f'<float name="{name}" value="{value}"/>' for name, value in numbers.items())
-    scene = parsed(folder[0], f'<bsdf type="principled" id="Floor">{listed}</bsdf>')
+    scene = parsed(folder[0], principled("Floor", **numbers))
     (one,) = conversion.replace_stock(scene, ["principled"], folder[0] / "tables")
     albedo, si = [], dr.zeros(mi.SurfaceInteraction3f, n)
     si.wi = mi.Vector3f(0.96**0.5, 0, 0.2)
@@ -196,9 +200,8 @@ def test_albedos_at_grazing_angles_of_what_is_replaced(mi_rgb, folder, metal, sp
 
 
 def test_the_command_and_a_comparison_with_the_stock_scene(mi_rgb, tmp_path, capsys):
-    materials = '<bsdf type="principled" id="Clay"/><bsdf type="principled" id="Glass"><float name="spec_trans" '
-    ball = 'value="1"/></bsdf><shape type="sphere"><ref id="Clay"/></shape>'
-    parsed(tmp_path, materials + ball)
+    ball = '<shape type="sphere"><ref id="Clay"/></shape>'
+    parsed(tmp_path, principled("Clay") + principled("Glass", spec_trans=1) + ball)
     scene, new = str(tmp_path / "scene.xml"), tmp_path / "new.xml"
     arguments = ["-o", str(new), "--json", str(tmp_path / "a.json"), "--variant", mi_rgb.variant()]
     assert main(["convert", scene, *arguments, "--learn", "principled"]) == 0
@@ -302,8 +305,7 @@ def test_shading_normals(mi_rgb, tmp_path):
 
 def test_misspelt_groups_and_parameters_stay_errors(mi_rgb, folder):
     """Conversion reads the properties of the scene, which must not make them known to a plugin."""
-    scene = parsed(folder[0], '<bsdf type="principled" id="a"><float name="rougness" value="0.9"/></bsdf>'
-                   '<shape type="sphere"><ref id="a"/></shape>')  # fmt: skip
+    scene = parsed(folder[0], principled("a", rougness=0.9) + '<shape type="sphere"><ref id="a"/></shape>')
     with pytest.raises(UsageError, match='found "glass", allowed are principled, mesh, bitmap'):
         conversion.replace_stock(scene, ["glass"], folder[0])
     (one,) = conversion.replace_stock(scene, ["principled"], folder[0])
