@@ -138,8 +138,6 @@ def test_values_that_are_not_finite_fail_alone(rng, truth):
     assert block_test.mean_stops(np.array([-1.0, 1.0]), np.array([0.0, 3.0]), 1.0) == pytest.approx(0.5)
 
 
-# -- pictures before and after ----------------------------------------------------------------------------------------
-
 SCENE = """<scene version="3.0.0"><integrator type="direct"/>
     <sensor type="perspective"><float name="fov" value="60"/><transform name="to_world">
         <lookat origin="0,0,2" target="0,0,0" up="0,1,0"/></transform>

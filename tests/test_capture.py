@@ -1,8 +1,7 @@
 """``mi-diffind capture``: where the cameras are, what their images show, and going on with a folder."""
 
-import contextlib
 import json
-import threading
+import signal
 from pathlib import Path
 
 import captures
@@ -38,20 +37,26 @@ SCENE = """
 """
 
 
-def sphere(centre, radius, colour, name):
-    return (
-        f'<shape type="sphere" id="{name}"><point name="center" value="{", ".join(map(str, centre))}"/>'
-        f'<float name="radius" value="{radius}"/><bsdf type="diffuse"><rgb name="reflectance" value="{colour}"/>'
-        f"</bsdf></shape>"
-    )
+SPHERE = """<shape type="sphere" id="s{}"><point name="center" value="{}"/><float name="radius" value="{}"/>
+    <bsdf type="diffuse"><rgb name="reflectance" value="{}"/></bsdf></shape>"""
 
 
 @pytest.fixture
 def scene(tmp_path):
     path = tmp_path / "scene.xml"
-    spheres = [sphere(*s, name=f"s{i}") for i, s in enumerate(SPHERES)]
+    spheres = [SPHERE.format(i, f"{x}, {y}, {z}", *s) for i, ((x, y, z), *s) in enumerate(SPHERES)]
     path.write_text(SCENE.replace("SPHERES", "".join(spheres)).replace("0.8, 0.05, 0.05", "$red, 0.05, 0.05"))
     return path
+
+
+def stopped(capsys, scene, folder, *options):
+    """What a capture that must fail says."""
+    assert run(scene, folder, *options) == 2
+    return capsys.readouterr().err
+
+
+def images(folder):
+    return captures.images_of(load_views(folder))
 
 
 def run(scene, folder, *options):
@@ -81,17 +86,17 @@ def test_images_show_what_rays_of_their_poses_meet(mi_rgb, scene, tmp_path, caps
     for split, count in (("train", 4), ("test", 2)):
         views = load_views(folder, split)
         assert len(views) == count and views.has_alpha and (views.sizes == 24).all()
-        images = captures.images_of(views)
+        seen_images = captures.images_of(views)
         edges = np.arange(25) - 0.5
         numbers = np.stack([nearest(*captures.rays_of(views, v, *np.meshgrid(edges, edges))) for v in range(count)])
         corners = np.stack([numbers[:, :-1, :-1], numbers[:, 1:, :-1], numbers[:, :-1, 1:], numbers[:, 1:, 1:]])
         same = (corners == corners[0]).all(axis=0)
         for i in range(3):  # the colour that a sphere is of is the largest, nowhere else
-            seen = images[same & (corners[0] == i)]
+            seen = seen_images[same & (corners[0] == i)]
             assert len(seen) > 20 and (seen[:, :3].argmax(axis=1) == i).all() and seen[:, 3].min() == 1
-        nothing = images[same & (corners[0] == -1)]
+        nothing = seen_images[same & (corners[0] == -1)]
         assert len(nothing) > 200 and nothing.max() < 0.3 and np.mean(nothing == 0) > 0.97
-        assert not images[:, 0, 0].any()
+        assert not seen_images[:, 0, 0].any()
         assert views.box[0] == pytest.approx([-0.5 - 0.018, -0.5 - 0.019, -0.5 - 0.018], abs=0.003)
         assert views.box[1] == pytest.approx([1.3 + 0.018, 1.4 + 0.019, 0.8 + 0.018], abs=0.003)
 
@@ -100,7 +105,7 @@ def test_formats_agree(mi_rgb, scene, tmp_path):
     assert run(scene, tmp_path / "png") == run(scene, tmp_path / "exr", "--format", "exr") == 0
     png, exr = (load_views(tmp_path / name) for name in ("png", "exr"))
     assert exr.names[0] == "train/r_000.exr" and np.array_equal(png.poses, exr.poses)
-    png, exr = (captures.images_of(views) for views in (png, exr))
+    png, exr = images(tmp_path / "png"), images(tmp_path / "exr")
     assert np.abs(png - np.minimum(exr, exr[..., 3:])).max() < 0.006
     assert len(np.unique(exr)) > len(np.unique(png))
 
@@ -115,30 +120,26 @@ def test_other_settings_are_refused(mi_rgb, scene, tmp_path, capsys):
         (("--seed", "3", "-D", "red=0.5"), "(red: None, now 0.5)"),
         (("--seed", "3", "--variant", "llvm_ad_mono"), "(variant: llvm_ad_rgb, now llvm_ad_mono)"),
     ):
-        assert run(scene, folder, *options) == 2
-        assert message in capsys.readouterr().err
+        assert message in stopped(capsys, scene, folder, *options)
     scene.write_text(scene.read_text().replace('"0.3"', '"0.2"'))
-    assert run(scene, folder, "--seed", "3") == 2 and "(the scene's files have changed)" in capsys.readouterr().err
+    assert "(the scene's files have changed)" in stopped(capsys, scene, folder, "--seed", "3")
     assert (folder / "capture.json").read_text() == record
     (folder / "capture.json").write_text("{")
-    assert run(scene, folder) == 2 and "capture.json: cannot be read" in capsys.readouterr().err
+    assert "capture.json: cannot be read" in stopped(capsys, scene, folder)
     (folder / "capture.json").unlink()
-    assert run(scene, folder) == 2
-    assert "holds views that were not captured here, a folder of its own is needed" in capsys.readouterr().err
+    assert "holds views that were not captured here" in stopped(capsys, scene, folder)
 
 
 def test_an_interrupted_capture_is_gone_on_with(mi_rgb, scene, tmp_path, monkeypatch, capsys):
-    stop, render = threading.Event(), capture.SceneSubject.render
+    render, calls = capture.SceneSubject.render, []
 
     def third(self, *arguments):
-        third.calls += 1
-        if third.calls == 3:
-            stop.set()
+        calls.append(1)
+        if len(calls) == 3:
+            signal.raise_signal(signal.SIGINT)
         return render(self, *arguments)
 
-    third.calls = 0
     with monkeypatch.context() as patch:
-        patch.setattr("mi_diffind.core.jobs.interruptible", lambda: contextlib.nullcontext(stop))
         patch.setattr(capture.SceneSubject, "render", third)
         assert run(scene, tmp_path / "views") == 130
     assert "3 of 6 views, 3 rendered now" in capsys.readouterr().out
@@ -167,8 +168,7 @@ def test_views_of_other_processes(mi_rgb, scene, tmp_path, monkeypatch, capsys):
         assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes(), file
     (tmp_path / "two" / "train" / "r_000.png").unlink()
     monkeypatch.setattr(capture, "run_jobs", lambda *_: (o for o in [Outcome("train/r_000.png", failure="disk full")]))
-    assert run(scene, tmp_path / "two", "-D", "red=0.5", "--workers", "1") == 2
-    assert "train/r_000.png: disk full" in capsys.readouterr().err
+    assert "train/r_000.png: disk full" in stopped(capsys, scene, tmp_path / "two", "-D", "red=0.5", "--workers", "1")
 
 
 @pytest.mark.parametrize("integrator", ["direct", "prb"])
@@ -196,9 +196,8 @@ def test_objects_alone_are_seen(mi_rgb, scene, tmp_path, capsys, integrator):
         assert (inside[-1][:, :3].argmax(axis=1) == 1).mean() > 0.97  # but where nothing arrived
     # Beside a wall, and below another sphere, it is not as bright everywhere as alone in this light
     assert np.concatenate(inside)[:, 1].min() < 0.6 < np.concatenate(inside)[:, 1].max()
-    assert run(scene, tmp_path / "two", "--objects", "s1", "other") == 2
     message = 'objects: found "other", the ids of the scene\'s shapes are: s0, s1, s2'
-    assert message in capsys.readouterr().err
+    assert message in stopped(capsys, scene, tmp_path / "two", "--objects", "s1", "other")
 
 
 def test_meshes_of_one_material_keep_their_ids(mi_rgb, tmp_path):
@@ -220,22 +219,18 @@ def test_integrators_that_nest_another_leave_lights_to_it(mi_rgb, scene, tmp_pat
     other = tmp_path / "other.xml"
     other.write_text(scene.read_text().replace('<integrator type="direct"/>', nested))
     assert run(scene, tmp_path / "plain") == run(other, tmp_path / "nested") == 0
-    plain, found = (captures.images_of(load_views(tmp_path / name)) for name in ("plain", "nested"))
+    plain, found = images(tmp_path / "plain"), images(tmp_path / "nested")
     assert not found[:, 0, 0].any() and np.abs(found - plain).mean() < 0.01
 
 
 def test_a_field_of_distances_is_captured_whole_only(mi_rgb, scene, tmp_path, capsys):
     """Its shape in the scene is a box, which the integrator alone knows what to do with."""
-    knot = (
-        f'<shape type="neural_sdf" id="knot"><string name="filename" value="{SCENES / "assets" / "knot.npz"}"/></shape>'
-    )
-    spheres = scene.read_text()
-    first, last = spheres.index('<shape type="sphere"'), spheres.index('<shape type="rectangle"')
-    scene.write_text((spheres[:first] + knot + spheres[last:]).replace("direct", "path_sdf"))
-    assert run(scene, tmp_path / "views", "--objects", "knot") == 2
-    assert 'objects: found "knot", ' in capsys.readouterr().err
+    file = f'<string name="filename" value="{SCENES / "assets" / "knot.npz"}"/>'
+    knot = f'<shape type="neural_sdf" id="knot">{file}</shape>'
+    scene.write_text(SCENE.replace("SPHERES", knot).replace("direct", "path_sdf"))
+    assert 'objects: found "knot", ' in stopped(capsys, scene, tmp_path / "views", "--objects", "knot")
     assert run(scene, tmp_path / "views", "--spp", "1") == 0
-    assert 0.05 < captures.images_of(load_views(tmp_path / "views"))[..., 3].mean() < 0.4
+    assert 0.05 < images(tmp_path / "views")[..., 3].mean() < 0.4
 
 
 def test_what_hides_nothing_is_said(mi_rgb, scene, tmp_path, capsys):
@@ -259,8 +254,7 @@ def test_what_hides_nothing_is_said(mi_rgb, scene, tmp_path, capsys):
     ],
 )
 def test_options_that_are_refused(mi_rgb, scene, tmp_path, capsys, options, message):
-    assert run(scene, tmp_path / "views", *options) == 2
-    assert message in capsys.readouterr().err and not (tmp_path / "views").exists()
+    assert message in stopped(capsys, scene, tmp_path / "views", *options) and not (tmp_path / "views").exists()
 
 
 @pytest.mark.parametrize("name", ["group", "thin", "glossy"])
@@ -268,20 +262,18 @@ def test_scenes_that_ship_are_wholly_in_sight(mi_rgb, tmp_path, name):
     """From below, from the side and from above, from the distance that is taken by default."""
     options = ("--views", "3", "--test", "0", "--resolution", "40", "--spp", "4")
     assert cli.main(["capture", str(SCENES / f"capture_{name}.xml"), "-o", str(tmp_path / "views"), *options]) == 0
-    content = json.loads((tmp_path / "views" / "transforms_train.json").read_text())
-    write = {**content, "frames": content["frames"] + content["frames"][:1]}
-    (tmp_path / "views" / "transforms_train.json").write_text(json.dumps(write))
-    images = captures.images_of(load_views(tmp_path / "views"))
-    alpha = images[..., 3]
+    file = tmp_path / "views" / "transforms_train.json"
+    content = json.loads(file.read_text())
+    # The first view of a capture without test views is held out
+    file.write_text(json.dumps({**content, "frames": content["frames"] + content["frames"][:1]}))
+    seen = images(tmp_path / "views")
+    alpha = seen[..., 3]
     border = np.concatenate([alpha[:, [0, -1]].ravel(), alpha[:, :, [0, -1]].ravel()])
     assert border.max() < 1 and border.mean() < 0.03  # touched, not crossed
     assert 0.1 < alpha.mean() < 0.6
     rows, columns = np.nonzero(alpha.any(axis=0))
     assert np.ptp(rows) > 28 and np.ptp(columns) > 28  # and they fill the images
-    assert 0.02 < images[..., :3].mean() < 0.5
-
-
-# -- places -----------------------------------------------------------------------------------------------------------
+    assert 0.02 < seen[..., :3].mean() < 0.5
 
 
 def angles(a, b):

@@ -15,6 +15,7 @@ from mi_diffind.fitting.loop import FitSettings, Problem, fit
 from mi_diffind.fitting.task import FitRequest, tasks
 from mi_diffind.maps.model import requested_bytes
 from mi_diffind.maps.source import from_arrays
+from mi_diffind.scenes.capture import CaptureSettings
 
 
 class Clock:
@@ -129,18 +130,17 @@ def test_short_and_quiet_jobs_write_no_line(clock, log, shown):
 
 
 #: What asks for too much of a machine of 16 GiB, and the sentence.
-TOO_MUCH = {
-    "sdf, bytes": (lambda: started("sdf", bytes="100G"), "--bytes: found 107,374,182,400 bytes, a table file holds"),
-    "sdf, memory": (lambda: started("sdf", bytes="512M"), "--bytes: found 536,870,912, which takes about 32 GiB"),
-    "field": (
-        lambda: started("field", resolution=100_000),
-        "--resolution: found 100,000, which takes about 22,351,742",
-    ),
-    "field, bytes": (lambda: started("field", bytes="100G"), "--bytes: found 107,374,182,400 bytes"),
-    "image": (lambda: image("100G"), "--bytes: found 107,374,182,400 bytes, a table file holds at most 1,073,741,824"),
-    "capture": (lambda: capture(resolution=100_000), "resolution: found 100,000, which takes about"),
-    "views": (lambda: capture(views=10**9), "views: found 1,000,000,"),
-}
+TOO_MUCH = [
+    (lambda: started("sdf", bytes="100G"), "--bytes: found 107,374,182,400 bytes, a table file holds"),
+    (lambda: started("sdf", bytes="512M"), "--bytes: found 536,870,912, which takes about 32 GiB"),
+    (lambda: started("field", resolution=100_000), "--resolution: found 100,000, which takes about 22,351,742"),
+    (lambda: started("field", bytes="100G"), "--bytes: found 107,374,182,400 bytes"),
+    (lambda: requested_bytes({"compression": None, "bpp": None, "bytes": "100G"}, IMAGE),
+     "--bytes: found 107,374,182,400 bytes, a table file holds at most 1,073,741,824"),
+    (lambda: CaptureSettings(resolution=100_000), "resolution: found 100,000, which takes about"),
+    (lambda: CaptureSettings(views=10**9), "views: found 1,000,000,"),
+]  # fmt: skip
+IMAGE = from_arrays({"image": np.zeros((4, 4, 3), np.float32)})
 
 
 def started(task, **options):
@@ -149,21 +149,9 @@ def started(task, **options):
     chosen.check(FitRequest(next(iter(chosen.presets)), settings(), types, options=options))
 
 
-def capture(**options):
-    from mi_diffind.scenes.capture import CaptureSettings
-
-    CaptureSettings(**options)
-
-
-def image(nbytes):
-    source = from_arrays({"image": np.zeros((4, 4, 3), np.float32)})
-    requested_bytes({"compression": None, "bpp": None, "bytes": nbytes}, source)
-
-
-@pytest.mark.parametrize("name", TOO_MUCH)
-def test_what_takes_too_much_is_refused(name, monkeypatch):
+@pytest.mark.parametrize(("action", "sentence"), TOO_MUCH)
+def test_what_takes_too_much_is_refused(action, sentence, monkeypatch):
     monkeypatch.setattr("mi_diffind.core.units.memory", lambda: 2**34)
-    action, sentence = TOO_MUCH[name]
     with pytest.raises((UsageError, ValueError)) as error:
         action()
     assert str(error.value).startswith(sentence)

@@ -1,5 +1,6 @@
 """The package as Python sees it: training from memory, opening, loading, attaching and saving."""
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -8,8 +9,12 @@ import trimesh
 from PIL import Image
 
 import mi_diffind
-from mi_diffind.commands.cli import VERBS, main
+from mi_diffind import studies
 from mi_diffind.core.errors import UsageError
+from mi_diffind.maps.source import load_source
+from mi_diffind.measure.study import Tradeoff
+from mi_diffind.scenes import rendering
+from mi_diffind.scenes.loading import ParsedScene
 
 ASSETS = Path(__file__).resolve().parents[1] / "scenes" / "assets"
 TILES = ASSETS / "tiles_filtered.npz"
@@ -30,8 +35,6 @@ def same(a, b):
 
 def test_maps_from_memory_are_those_of_files(mi_rgb, picture, tmp_path):
     """An array, a bitmap and a tensor are the PNG file that holds the same bytes, and give its tables."""
-    from mi_diffind.maps.source import load_source
-
     mi = mi_rgb
     mi.Bitmap(picture).write(str(tmp_path / "a.png"))
     expected = load_source(tmp_path / "a.png")
@@ -46,8 +49,6 @@ def test_maps_from_memory_are_those_of_files(mi_rgb, picture, tmp_path):
 
 
 def test_a_bitmap_keeps_its_alpha_and_its_colour_space(mi_rgb, picture):
-    from mi_diffind.maps.source import load_source
-
     mi = mi_rgb
     transparent = np.concatenate([picture, picture[..., :1]], axis=-1)
     maps = load_source(mi.Bitmap(transparent)).maps
@@ -76,18 +77,12 @@ def test_a_result_measures_saves_and_opens(mi_rgb, picture, tmp_path, monkeypatc
     text = "\n".join(fitted.summary(path))
     assert '<texture type="neural_image">' in text and '"filename" value="a.npz"' in text and " dB" in text
     assert "neural_image" in fitted._repr_html_()
+    with pytest.raises(mi_diffind.TableError, match=r"no source file is recorded, so errors need a source"):
+        mi_diffind.fit("image", picture, compression=3, steps=1, batch=512, progress=False).model.measure()
     decoded = model.decode(tmp_path / "back.png")
     assert [file.name for file, _ in decoded] == ["back.png"]
     with pytest.raises(UsageError, match=r'output "a.exr": found the extension ".exr", allowed is .npz'):
         fitted.save("a.exr")
-
-
-def test_without_a_file_errors_need_a_source(mi_rgb, picture, tmp_path):
-    fitted = mi_diffind.fit("image", picture, compression=3, steps=1, batch=512, progress=False)
-    model = mi_diffind.open(fitted.save(tmp_path / "a.npz"))
-    with pytest.raises(mi_diffind.TableError, match=r"no source file is recorded, so errors need a source"):
-        model.measure()
-    assert model.measure(picture)["psnr_db"] > 10
 
 
 def test_meshes_from_memory(mi_rgb, tmp_path):
@@ -126,9 +121,6 @@ def test_wrong_arguments(mi_rgb, case):
         mi_diffind.fit(*arguments, **options)
 
 
-# -- scenes ------------------------------------------------------------------------------------------------------------
-
-
 def wall(mi, texture):
     """A wall that runs into the distance, in constant light."""
     away = mi.ScalarTransform4f().rotate([1, 0, 0], -80).scale(8)
@@ -153,33 +145,19 @@ def image(mi, scene):
     return mi.render(scene, spp=16, seed=3).numpy()
 
 
-def test_every_way_to_load_tells_textures_their_sensor(mi_rgb, tmp_path):
-    """Dictionary, text, file, and a scene that Mitsuba loaded: the same filtered picture; without it, another."""
+def test_loads_tell_textures_their_sensor(mi_rgb):
+    """A dictionary, and a scene that Mitsuba loaded: the same filtered picture; without it, another."""
     mi = mi_rgb
     scene = wall(mi, small(mi))
     expected = image(mi, mi_diffind.load_dict(scene))
     assert np.abs(image(mi, mi.load_dict(scene)) - expected).mean() > 0.01
     np.testing.assert_allclose(image(mi, mi_diffind.attach(mi.load_dict(scene))), expected, atol=1e-5)
-    text = f"""<scene version="3.0.0"><integrator type="direct"/><emitter type="constant"/>
-        <sensor type="perspective"><transform name="to_world"><lookat origin="0,1,6" target="0,0,0" up="0,1,0"/>
-        </transform><film type="hdrfilm"><integer name="width" value="$width"/><integer name="height" value="16"/>
-        </film></sensor><shape type="rectangle"><transform name="to_world"><scale value="8"/>
-        <rotate x="1" angle="-80"/></transform><bsdf type="diffuse"><texture name="reflectance" type="neural_texture">
-        <string name="filename" value="{TILES}"/><string name="channels" value="albedo"/>
-        <transform name="to_uv"><scale value="8"/></transform></texture></bsdf></shape>
-        </scene>"""
-    (tmp_path / "wall.xml").write_text(text)
-    for loaded in (mi_diffind.load_string(text, width=24), mi_diffind.load_file(tmp_path / "wall.xml", width=24)):
-        np.testing.assert_allclose(image(mi, loaded), expected, atol=1e-5)
 
 
 def test_a_sensor_that_is_not_there(mi_rgb):
     scene = mi_rgb.load_dict(wall(mi_rgb, texture()))
     with pytest.raises(mi_diffind.DiffindError, match="sensor: found 2, the scene has 1"):
         mi_diffind.attach(scene, sensor=2)
-
-
-# -- saving ------------------------------------------------------------------------------------------------------------
 
 
 def optimised(mi, scene, factor=0.97):
@@ -207,14 +185,12 @@ PLUGINS = {
 @pytest.mark.parametrize("name", PLUGINS)
 def test_optimised_tables_render_as_before_when_saved(mi_rgb, tmp_path, name):
     """The picture of the saved file is that of the optimised plugin, not that of the file that it began with."""
-    mi, plugin = mi_rgb, PLUGINS[name]()
+    mi = mi_rgb
 
     def scene(**changes):
-        content = wall(mi, {"type": "rgb", "value": 0.5})
-        if "texture" in name or "image" in name:
-            content["wall"]["bsdf"]["reflectance"] = {**plugin, **changes}
-        else:
-            content["wall"]["bsdf"] = {**plugin, **changes}
+        content, plugin = wall(mi, {"type": "rgb", "value": 0.5}), {**PLUGINS[name](), **changes}
+        is_texture = name in ("neural_texture", "neural_image")
+        content["wall"]["bsdf"] = {"type": "diffuse", "reflectance": plugin} if is_texture else plugin
         return mi_diffind.load_dict(content)
 
     before, loaded = image(mi, scene()), scene()
@@ -273,9 +249,6 @@ def test_nothing_to_save(mi_rgb, tmp_path):
     assert not path.with_suffix(".xml").exists()
 
 
-# -- rendering ---------------------------------------------------------------------------------------------------------
-
-
 def test_a_rendering_is_that_of_mitsuba(mi_rgb, tmp_path):
     """A dictionary and a loaded scene give Mitsuba's image; ``save`` and the picture of a notebook show it."""
     mi = mi_rgb
@@ -304,22 +277,14 @@ def test_refused_renderings(mi_rgb, tmp_path):
             mi_diffind.render(scene, **options)
     with pytest.raises(UsageError, match=r"scene: found a .*, expected a scene, its file or its dictionary"):
         mi_diffind.render({"type": "sphere"})
+    with pytest.raises(mi_diffind.DiffindError, match="found a table file, a scene is needed"):
+        mi_diffind.render(TILES)
     with pytest.raises(UsageError, match=r'output "a.webp": found the extension ".webp", allowed are .exr and .png'):
         mi_diffind.render(scene, spp=1, progress=False).save("a.webp")
 
 
-# -- capture, regress, tradeoff ----------------------------------------------------------------------------------------
-
-BALL = """<scene version="3.0.0"><default name="light" value="1"/><integrator type="path"/>
-    <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="16"/>
-        <integer name="height" value="16"/><rfilter type="box"/></film></sensor>
-    <emitter type="constant"><spectrum name="radiance" value="$light"/></emitter>
-    <shape type="sphere"><transform name="to_world"><translate z="4"/></transform><bsdf type="diffuse"/></shape>
-    </scene>"""
-
-
 def ball(light=1.0) -> dict:
-    """Return the scene :data:`BALL` as a dictionary."""
+    """Return a scene of plain values as a dictionary."""
     film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
     return {
         "type": "scene", "integrator": {"type": "path"}, "sensor": {"type": "perspective", "film": film},
@@ -330,37 +295,27 @@ def ball(light=1.0) -> dict:
 
 def test_scenes_in_memory_that_hold_existing_objects_are_known_once(mi_rgb):
     """The content of a bitmap is in no description; two dictionaries of plain values have equal ones."""
-    import mitsuba as mi
-
-    from mi_diffind.scenes.loading import ParsedScene
-
     assert ParsedScene(ball()).description == ParsedScene(ball()).description != ParsedScene(ball(2)).description
-    scene = ball() | {"other": mi.load_dict({"type": "sphere"})}
+    scene = ball() | {"other": mi_rgb.load_dict({"type": "sphere"})}
     assert ParsedScene(scene).description != ParsedScene(scene).description
 
 
 def test_keywords_of_a_study(monkeypatch, tmp_path, mi_rgb):
     """They become the arguments of the command, checked by its parser; the result shows its picture."""
-    from mi_diffind import studies
-    from mi_diffind.measure.study import Tradeoff
-
     asked = []
 
-    class Recorded(studies.studies()["image"].__class__):
+    class Recorded(type(studies.studies()["image"])):
         def run(self, arguments):
             asked.append(arguments)
-            picture = Path(arguments.out) / "tradeoff_image.png"
-            picture.write_bytes(b"\x89PNG")
-            return Tradeoff({"quick": arguments.quick}, ["a line"], {"png": str(picture), "csv": "a.csv"})
+            (out / "a.png").write_bytes(b"\x89PNG")
+            return Tradeoff({"quick": arguments.quick}, ["a line"], {"png": str(out / "a.png"), "csv": "a.csv"})
 
     monkeypatch.setattr(studies, "studies", lambda: {"image": Recorded()})
-    source = tmp_path / "a.png"
+    source, out = tmp_path / "a.png", tmp_path / "out"
     Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(source)
-    out = tmp_path / "out"
     result = mi_diffind.tradeoff("image", source, out=out, quick=True, compression=["6x", "12x"])
-    (arguments,) = asked
-    assert arguments.compression == ["6x", "12x"] and arguments.source == str(source)
-    assert result.figures == {"quick": True} and result.pictures == {"png": str(out / "tradeoff_image.png")}
+    assert (asked[0].compression, asked[0].source) == (["6x", "12x"], str(source))
+    assert result.figures == {"quick": True} and result.pictures == {"png": str(out / "a.png")}
     assert result._repr_png_() == b"\x89PNG" and str(result).startswith("a line\n")
     with pytest.raises(UsageError, match="tradeoff image: unrecognized arguments: --ratio=6"):
         mi_diffind.tradeoff("image", source, out=out, ratio=6)
@@ -370,48 +325,16 @@ def test_keywords_of_a_study(monkeypatch, tmp_path, mi_rgb):
         mi_diffind.tradeoff("image", out=out)
 
 
-# -- what people read --------------------------------------------------------------------------------------------------
-
-
 def test_an_image_that_a_file_cannot_hold_is_not_rendered(mi_rgb, tmp_path, monkeypatch):
     """The channels that are predicted are those of the render, for each format of the film."""
     mi = mi_rgb
-    from mi_diffind.scenes import rendering
-
-    integrators = {
-        "path": {"type": "path"},
-        "aov": {"type": "aov", "aovs": "d:depth,n:sh_normal", "image": {"type": "path"}},
-        "moment": {"type": "moment", "image": {"type": "path"}},
-    }
-    for name, integrator in integrators.items():
-        for pixel_format in ("rgb", "rgba", "luminance"):
-            content = {**wall(mi, {"type": "rgb", "value": 0.5}), "integrator": integrator}
-            content["sensor"] = {"type": "perspective", "film": {
-                "type": "hdrfilm", "width": 4, "height": 4, "pixel_format": pixel_format}}  # fmt: skip
-            loaded = mi.load_dict(content)
-            if mi.is_rgb:
-                assert rendering.channel_count(loaded) == mi.render(loaded, spp=1).shape[2], (name, pixel_format)
+    path = {"type": "path"}
+    integrators = path, {"type": "aov", "aovs": "d:depth,n:sh_normal", "image": path}, {"type": "moment", "image": path}
+    for integrator, pixel_format in itertools.product(integrators, ("rgb", "rgba", "luminance")):
+        film = {"type": "hdrfilm", "width": 4, "height": 4, "pixel_format": pixel_format}
+        content = wall(mi, {"type": "rgb", "value": 0.5}) | {"integrator": integrator}
+        loaded = mi.load_dict(content | {"sensor": {"type": "perspective", "film": film}})
+        assert rendering.channel_count(loaded) == mi.render(loaded, spp=1).shape[2], (integrator, pixel_format)
     monkeypatch.setattr(rendering.loading, "render", None)  # not reached
     with pytest.raises(UsageError, match=r"the image has 7 channels, PNG holds 4: use .exr"):
         mi_diffind.render(loaded, spp=1, output="a.png", progress=False)
-
-
-def test_a_table_file_is_no_scene(mi_rgb, capsys):
-    with pytest.raises(mi_diffind.DiffindError, match="found a table file, a scene is needed"):
-        mi_diffind.render(TILES)
-    assert main(["render", str(TILES)]) == 2
-    assert "found a table file, a scene is needed" in capsys.readouterr().err
-
-
-def test_a_normal_map_of_one_channel():
-    with pytest.raises(mi_diffind.DiffindError, match='arrays: the normal map "normal" has 1 channel, 3 are needed'):
-        mi_diffind.from_arrays({"normal": np.zeros((4, 4), np.uint8)})
-    assert mi_diffind.from_arrays({"normal": np.zeros((4, 4, 2), np.uint8)}).channels == 2
-
-
-@pytest.mark.parametrize("words", [[verb] for verb in VERBS] + [["fit", "sdf"], ["fit", "scene"], ["tradeoff", "sdf"]])
-def test_help_ends_with_an_example(words, capsys):
-    with pytest.raises(SystemExit):
-        main([*words, "--help"])
-    example = " ".join(capsys.readouterr().out.rpartition("example: ")[2].split())
-    assert example.startswith(" ".join(["mi-diffind", *words]))

@@ -45,6 +45,8 @@ def test_owners_are_the_paths_of_parameters(mi_rgb):
     keys = list(mi_rgb.traverse(loaded).keys())
     for owner in reports:
         assert owner == "integrator" or any(key.startswith(f"{owner}.") for key in keys), owner
+    (report,) = mi_diffind.inspect(mi_rgb.load_dict({"type": "neural_disney"})).figures["reports"]
+    assert report["owner"] == "(neural_disney)" and report["learned"] and report["effects_in_use"]
     assert {owner for owner, r in reports.items() if r["learned"]} == {o for o in reports if o.startswith("mat.")}
 
 
@@ -82,11 +84,6 @@ def test_a_file_and_its_scene_in_memory_agree(mi_rgb, tmp_path, capsys):
     written = json.loads((tmp_path / "a.json").read_text())
     written["reports"].sort(key=lambda report: report["owner"])
     assert written == json.loads(json.dumps(of_file.figures))
-
-
-def test_one_object(mi_rgb):
-    (report,) = mi_diffind.inspect(mi_rgb.load_dict({"type": "neural_disney"})).figures["reports"]
-    assert report["owner"] == "(neural_disney)" and report["learned"] and report["effects_in_use"]
 
 
 def test_what_is_refused(mi_rgb):

@@ -2,58 +2,30 @@
 
 import json
 import os
-import zipfile
+import tracemalloc
 import zlib
 from pathlib import Path
 
 import damage
+import mitsuba as mi
 import numpy as np
 import pytest
 from commands import refused
+from PIL import Image
 
 import mi_diffind
-from mi_diffind import DiffindError, TableError, load_table
-from mi_diffind.core.archives import (
-    FACTOR,
-    FREE,
-    VARIABLE,
-    Allowance,
-    Archive,
-    ArchiveError,
-    LimitError,
-    allowed,
-    json_bytes,
-)
+from mi_diffind import DiffindError, TableError, load_table, save_table
+from mi_diffind.arrays.tables import Table, byte_array
+from mi_diffind.core.archives import FACTOR, FREE, VARIABLE, Allowance, LimitError, allowed, json_bytes
 from mi_diffind.core.errors import LONGEST_MESSAGE, UsageError
 from mi_diffind.core.files import PATHS, OutputError
 from mi_diffind.core.units import figure_lines
-from mi_diffind.fitting.loop import checkpoint_settings
 from mi_diffind.fitting.task import FitSettings, within_memory
 from mi_diffind.images.reader import picture_size
 from mi_diffind.maps.pyramid import map_figure
 from mi_diffind.maps.source import SourceError, load_source
 from mi_diffind.scenes.inspection import Inspection
 from mi_diffind.tasks.radiance.captures import ViewsError, image_file
-
-
-def archive(path, members: dict) -> Path:
-    """Write an archive of members in bytes, deflated."""
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as file:
-        for name, content in members.items():
-            file.writestr(f"{name}.npy", content)
-    return path
-
-
-def meta_of(arrays: dict, settings=(), task="a task", **more) -> np.ndarray:
-    meta = {"format_version": 2, "task": task, "preset": "", "arrays": arrays, "settings": dict(settings), "seed": 0}
-    return np.frombuffer(json.dumps({**meta, "measured": {}, **more}).encode(), np.uint8)
-
-
-def described(shape, bits=8) -> dict:
-    return {
-        "shape": list(shape), "border": ["clamp"] * (len(shape) - 1), "storage": "uint8", "scale": [1.0] * shape[-1],
-        "offset": [0.0] * shape[-1], "bits": bits,
-    }  # fmt: skip
 
 
 def png(path, width: int, height: int, depth: int, colour: int = 0) -> Path:
@@ -82,10 +54,8 @@ def test_the_limit_and_how_to_raise_it(tmp_path, monkeypatch):
 
 
 def test_a_raised_limit_reads_the_file(tmp_path, monkeypatch):
-    path = archive(
-        tmp_path / "t.npz",
-        {"meta": damage.npy(meta_of({"a": described((2**24, 1))})), "a": damage.npy(np.zeros((2**24, 1), np.uint8))},
-    )
+    path = tmp_path / "t.npz"
+    save_table(path, Table("a task", {"a": byte_array(np.zeros((2**24, 1), np.uint8))}))
     with pytest.raises(TableError, match=VARIABLE):
         load_table(path)
     monkeypatch.setenv(VARIABLE, "200M")
@@ -94,17 +64,8 @@ def test_a_raised_limit_reads_the_file(tmp_path, monkeypatch):
 
 def test_the_bound_of_json_holds():
     """Against the memory that parsing takes, for the texts that take the most."""
-    import tracemalloc
-
-    for part in (
-        b"[],",
-        b"{},",
-        b'{"a":1},',
-        b"1.5,",
-        b'"\xc3\xa9",',
-        "\U0001f600".join(('"', '",')).encode(),
-        b"[[]],",
-    ):
+    emoji = "\U0001f600".join(('"', '",')).encode()
+    for part in (b"[],", b"{},", b'{"a":1},', b"1.5,", b'"\xc3\xa9",', emoji, b"[[]],"):
         text = b"[" + part * 20_000 + b"0]"
         tracemalloc.start()
         content = json.loads(text)
@@ -113,30 +74,8 @@ def test_the_bound_of_json_holds():
         assert len(content) == 20_001 and peak <= json_bytes(text), part
 
 
-def read_arrays(path) -> dict:
-    with Archive(path) as archive:
-        return {name: archive.array(name) for name in archive.members}
-
-
-def test_archives_hold_plain_numbers(tmp_path):
-    path = archive(tmp_path / "a.npz", {"x": damage.npy(np.arange(3)), "y": damage.npy(np.float64(2))})
-    assert {n: a.tolist() for n, a in read_arrays(path).items()} == {"x": [0, 1, 2], "y": 2.0}
-    for members, fault in (
-        ({"x": damage.npy(np.array(["a"]))}, "allowed are numbers"),
-        ({"x": damage.npy(np.zeros(3))[:-1]}, "holds 23 bytes|claims"),
-        ({"x": damage.npy(np.zeros(3)) + b"0"}, "holds more"),
-        ({"x": damage.npy(np.zeros(3)).replace(b"NUMPY\x01", b"NUMPY\x02")}, "damaged header"),
-    ):
-        with pytest.raises(ArchiveError, match=fault):
-            read_arrays(archive(tmp_path / "b.npz", members))
-    assert checkpoint_settings(tmp_path / "b.npz") == {}
-
-
 def test_sizes_of_pictures(tmp_path, rng):
     """Against what Mitsuba decodes."""
-    import mitsuba as mi
-    from PIL import Image
-
     values = rng.integers(0, 255, (13, 17, 3)).astype(np.uint8)
     for name in ("x.png", "x.jpg", "x.bmp", "x.tga", "x.ppm"):
         Image.fromarray(values).save(tmp_path / name)
@@ -166,9 +105,6 @@ def test_a_batch_beyond_memory(tmp_path, capsys, monkeypatch):
     for seconds in (0, -1, 10**400, float("nan"), float("inf")):
         with pytest.raises(UsageError, match="seconds: found"):
             mi_diffind.fit("ggx", seconds=seconds)
-
-
-# -- terminals and paths -----------------------------------------------------------------------------------------------
 
 
 def test_messages_cannot_steer_a_terminal():

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+import OpenEXR
 import pytest
 from commands import refused
 from variants import set_variant
@@ -35,7 +36,30 @@ def scene_file(tmp_path, name="scene", reflectance=0.5):
     return str(path)
 
 
-# -- passes ------------------------------------------------------------------------------------------------------------
+def interrupt_at(number, monkeypatch):
+    """Ctrl-C in the pass with a number; the list of the passes that were rendered."""
+    original, taken = regress.loading.render_pass, []
+
+    def interrupting(*arguments):
+        taken.append(1)
+        if len(taken) == number:
+            os.kill(os.getpid(), signal.SIGINT)
+        return original(*arguments)
+
+    monkeypatch.setattr(regress.loading, "render_pass", interrupting)
+    return taken
+
+
+@pytest.fixture
+def check(tmp_path):
+    """A function that runs the command and returns its exit code and the figures of the first scene."""
+
+    def run(*arguments):
+        report = tmp_path / "report.json"
+        code = main(["regress", *map(str, arguments), "--json", str(report)])
+        return code, json.loads(report.read_text())["scenes"][0] if report.exists() else None
+
+    return run
 
 
 def test_passes_share_no_samples(mi_rgb, monkeypatch, tmp_path):
@@ -58,26 +82,21 @@ def test_passes_share_no_samples(mi_rgb, monkeypatch, tmp_path):
         taken.clear()
 
 
-def test_samplers_that_round(mi_rgb, tmp_path, capsys):
+def test_samplers_that_round(mi_rgb, tmp_path, capsys, check):
     """Reports state the rendered samples; a check has the samples of its reference, or is refused."""
-    path, report = scene_file(tmp_path), tmp_path / "report.json"
+    path = scene_file(tmp_path)
     rounded = {"independent": 24, "stratified": 32, "multijitter": 24, "orthogonal": 32, "ldsampler": 32}
     for sampler, spp in rounded.items():
         scene = regress.loading.load(path, {"sampler": sampler})
         assert regress.PassSize.for_check(scene, 20).check_spp == spp
-    assert main(["regress", path, "--update", "--json", str(report), "-D", "sampler=stratified", "--spp", "20"]) == 0
+    _, stored = check(path, "--update", "-D", "sampler=stratified", "--spp", "20")
     assert "a check has 32 spp (asked for 20) and would see" in capsys.readouterr().out
-    stored = json.loads(report.read_text())["scenes"][0]
     assert (stored["asked_spp"], stored["budget"], stored["spp"]) == (20, 32, 512)
-    assert main(["regress", path, "--json", str(report)]) == 0
-    assert json.loads(report.read_text())["scenes"][0]["spp"] == 32
+    code, checked = check(path)
+    assert (code, checked["spp"]) == (0, 32)
     for wrong in (["--spp", "100"], ["--spp", "128", "-D", "sampler=independent"]):
         message = refused(capsys, "regress", path, *wrong)
-        assert "samples a pixel, its reference is for 32: keep --spp and the sampler, or render it again" in message
-        assert "--update --spp 128" in message
-
-
-# -- the repository's scenes -------------------------------------------------------------------------------------------
+        assert "samples a pixel, its reference is for 32: keep --spp" in message and "--update --spp 128" in message
 
 
 def test_passes_of_references_repeat_to_the_last_bit(mi_rgb):
@@ -110,21 +129,15 @@ def test_scene_renders_as_its_reference(path, variant):
     assert result["reference_spp"] == 16 * result["spp"] and result["spp"] >= 128
 
 
-# -- files -------------------------------------------------------------------------------------------------------------
-
-
-def test_update_stores_what_a_check_needs(tmp_path, capsys):
-    import OpenEXR
-
-    path, report = scene_file(tmp_path), tmp_path / "report.json"
-    update = ["regress", path, "--update", "--json", str(report)]
-    assert main([*update, "--spp", "20", "--seed", "7", "-D", "width=10"]) == 0
-    assert "10 x 12, 384 spp" in capsys.readouterr().out  # 128 passes of 3
-    folder = tmp_path / "references"
+def test_update_stores_what_a_check_needs(tmp_path, capsys, check):
+    path, folder = scene_file(tmp_path), tmp_path / "references"
+    code, _ = check(path, "--update", "--spp", "20", "--seed", "7", "-D", "width=10")
+    assert code == 0 and "10 x 12, 384 spp" in capsys.readouterr().out  # 128 passes of 3
     assert os.listdir(folder) == ["scene.llvm_ad_rgb.exr"]
-    with OpenEXR.File(str(folder / "scene.llvm_ad_rgb.exr"), separate_channels=True) as file:
-        about = json.loads(file.header()["mi_diffind"])
-        image, blocks = ({k: v.pixels.copy() for k, v in part.channels.items()} for part in file.parts)
+    file = folder / "scene.llvm_ad_rgb.exr"
+    with OpenEXR.File(str(file), separate_channels=True) as content:
+        about = json.loads(content.header()["mi_diffind"])
+        image, blocks = ({k: v.pixels.copy() for k, v in part.channels.items()} for part in content.parts)
     assert sorted(image) == ["B", "G", "R"]
     assert sorted(blocks) == sorted(f"{n}.{c}" for c in "RGB" for n in ("mean", *(f"pass{i:02}" for i in range(16))))
     assert all(c.shape == (12, 10) and c.dtype == np.float16 for c in image.values())
@@ -135,17 +148,16 @@ def test_update_stores_what_a_check_needs(tmp_path, capsys):
     expected = {"scene": "scene", "variant": "llvm_ad_rgb", "budget": 24, "spp": 384, "seed": 7}
     assert about == {**expected, "defines": {"width": "10"}}
 
-    assert main([*update, "--spp", "16"]) == 0
-    first = (folder / "scene.llvm_ad_rgb.exr").read_bytes()
-    assert main(update) == 0  # the same size, samples and seed again
-    assert (folder / "scene.llvm_ad_rgb.exr").read_bytes() == first
-    assert main([*update, "--seed", "8"]) == 0
-    assert (folder / "scene.llvm_ad_rgb.exr").read_bytes() != first
-    assert main(["regress", path, "--json", str(report)]) == 0
-    result = json.loads(report.read_text())["scenes"][0]
+    files = []
+    for options in (["--spp", "16"], [], ["--seed", "8"]):  # the second: size, samples and seed as before
+        assert check(path, "--update", *options)[0] == 0
+        files.append(file.read_bytes())
+    assert files[0] == files[1] != files[2]
+    code, result = check(path)
+    assert code == 0
     assert (result["width"], result["height"], result["spp"], result["reference_spp"]) == (10, 12, 16, 256)
-    assert main(["regress", path, "--spp", "16", "--seed", "5", "--json", str(report)]) == 0
-    assert json.loads(report.read_text())["scenes"][0]["seed"] == 5
+    code, result = check(path, "--spp", "16", "--seed", "5")
+    assert (code, result["seed"]) == (0, 5)
 
 
 def test_every_scene_is_checked(tmp_path, capsys):
@@ -163,42 +175,23 @@ def test_every_scene_is_checked(tmp_path, capsys):
     assert len(os.listdir(tmp_path / "out")) == 5
 
 
-def test_an_update_that_does_not_end_changes_nothing(mi_rgb, tmp_path, capsys, monkeypatch):
-    import OpenEXR
-
-    path = scene_file(tmp_path)
-    assert main(["regress", path, "--update", "--spp", "8"]) == 0
-    file = tmp_path / "references" / "scene.llvm_ad_rgb.exr"
+def test_an_update_that_does_not_end_changes_nothing(mi_rgb, tmp_path, capsys, monkeypatch, check):
+    path, file = scene_file(tmp_path), tmp_path / "references" / "scene.llvm_ad_rgb.exr"
+    assert check(path, "--update", "--spp", "8")[0] == 0
     before = file.read_bytes()
 
-    def write(self, name):
-        Path(name).write_bytes(b"half")
-        raise RuntimeError("disk full")
-
     class Failing(OpenEXR.File):
-        pass
+        def write(self, name):
+            Path(name).write_bytes(b"half")
+            raise RuntimeError("disk full")
 
-    Failing.write = write
     with monkeypatch.context() as patch:
         patch.setattr(OpenEXR, "File", Failing)
         assert "cannot be written: disk full" in refused(capsys, "regress", path, "--update", "--seed", "1")
     assert file.read_bytes() == before and os.listdir(file.parent) == [file.name]
-
-    original = regress.loading.render_pass
-
-    def interrupting(scene, spp, seed):
-        os.kill(os.getpid(), signal.SIGINT)
-        return original(scene, spp, seed)
-
-    monkeypatch.setattr(regress.loading, "render_pass", interrupting)
-    report = tmp_path / "report.json"
-    assert main(["regress", path, "--update", "--seed", "1", "--json", str(report)]) == 130
-    assert json.loads(report.read_text())["interrupted"]
-    assert file.read_bytes() == before and sorted(os.listdir(file.parent))[0] == file.name
-    capsys.readouterr()
-    assert main(["regress", path, "--json", str(report)]) == 130
-    assert "interrupted" in capsys.readouterr().out
-    assert json.loads(report.read_text())["scenes"][0]["passed"] is None
+    interrupt_at(1, monkeypatch)
+    code, result = check(path)
+    assert (code, result["passed"]) == (130, None) and "interrupted" in capsys.readouterr().out
 
 
 def test_a_reference_that_would_fail_unchanged_is_refused(mi_rgb, rng, tmp_path, capsys, monkeypatch):
@@ -236,41 +229,31 @@ def test_pixels_that_are_not_finite(mi_rgb, tmp_path, capsys, monkeypatch):
     assert "2 pixel(s) are not finite, so this cannot be a reference" in message
 
 
-def test_an_interrupted_update_goes_on(mi_rgb, tmp_path, capsys, monkeypatch):
+def test_an_interrupted_update_goes_on(mi_rgb, tmp_path, capsys, monkeypatch, check):
     """From where it was: the bytes of the reference are those of one that was never interrupted."""
-    path, report = scene_file(tmp_path), tmp_path / "report.json"
-    update = ["regress", path, "--update", "--spp", "16", "--json", str(report), "--references"]
-    assert main([*update, str(tmp_path / "undisturbed")]) == 0
-    original, taken = regress.loading.render_pass, []
-
-    def interrupting(*arguments):
-        taken.append(1)
-        if len(taken) == 50:
-            os.kill(os.getpid(), signal.SIGINT)
-        return original(*arguments)
-
-    monkeypatch.setattr(regress.loading, "render_pass", interrupting)
-    folder = tmp_path / "own"
+    path, name = scene_file(tmp_path), "scene.llvm_ad_rgb.exr"
+    folder, partial = tmp_path / "own", tmp_path / "own" / "scene.llvm_ad_rgb.partial.npz"
+    update = [path, "--update", "--spp", "16", "--references"]
+    assert check(*update, tmp_path / "undisturbed")[0] == 0
+    taken = interrupt_at(50, monkeypatch)
     capsys.readouterr()
-    assert main([*update, str(folder)]) == 130
-    partial = folder / "scene.llvm_ad_rgb.partial.npz"
+    assert check(*update, folder)[0] == 130
     assert f"{partial}: 100 samples a pixel are kept, the same command goes on" in capsys.readouterr().out
     assert os.listdir(folder) == [partial.name]
     before = len(taken)
-    assert main([*update, str(folder)]) == 0
-    assert len(taken) - before == 128 - 50 + 8  # and the check
-    assert json.loads(report.read_text())["scenes"][0]["reused_passes"] == 50
-    name = "scene.llvm_ad_rgb.exr"
-    assert (folder / name).read_bytes() == (tmp_path / "undisturbed" / name).read_bytes()
-    assert os.listdir(folder) == [name]
+    code, result = check(*update, folder)
+    assert (code, result["reused_passes"], len(taken) - before) == (0, 50, 128 - 50 + 8)  # and the check
+    content = (folder / name).read_bytes()
+    assert content == (tmp_path / "undisturbed" / name).read_bytes() and os.listdir(folder) == [name]
 
     taken.clear()
-    assert main([*update, str(folder)]) == 130
+    assert check(*update, folder)[0] == 130
+    assert (folder / name).read_bytes() == content
     scene_file(tmp_path, reflectance=0.3)  # another scene: nothing of it is used
-    assert main([*update, str(folder)]) == 0
-    assert json.loads(report.read_text())["scenes"][0]["reused_passes"] == 0
+    code, result = check(*update, folder)
+    assert (code, result["reused_passes"]) == (0, 0)
     partial.write_bytes(b"damaged")
-    assert main([*update, str(folder)]) == 0
+    assert check(*update, folder)[0] == 0
 
 
 def test_references_serve_both_backends(mi_rgb, tmp_path, monkeypatch):
@@ -282,9 +265,6 @@ def test_references_serve_both_backends(mi_rgb, tmp_path, monkeypatch):
     monkeypatch.setattr(mi, "variant", lambda: "llvm_ad_spectral")
     with pytest.raises(regress.loading.SceneError, match=r'no reference ".*scene.llvm_ad_spectral.exr"; run'):
         regress.read_reference(path)
-
-
-# -- bad input ---------------------------------------------------------------------------------------------------------
 
 
 def test_bad_references(mi_rgb, tmp_path, capsys):

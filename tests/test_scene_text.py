@@ -92,50 +92,46 @@ def test_ids_aliases_references_and_both_sides(mi_rgb, tmp_path):
     assert {k for k in keys[0] if not k.startswith(back)} == {k for k in keys[1] if not k.startswith(back)}
 
 
-@pytest.mark.parametrize("folder", ["a", "b"])
+#: What stands for the names of files in two folders: that of the scene, and another.
+NAMES = {
+    "NUMBERED": ("l&#101;a&#x66;.png", "../a/leaf.png"), "UP": ("", "../a/"), "FILE": ("$f", "../a/leaf.png"),
+    "DOLLAR": ("$p.png", "../a/leaf.png"), "QUOTED": ('"ä &amp; &quot;b&quot;.png"', "'../a/ä &amp; \"b\".png'"),
+}  # fmt: skip
+LEAF = '<texture type="bitmap" name="base_color"><string name="filename" value="UPleaf.png"/></texture></bsdf>'
+FILE = '<texture type="bitmap"><string name="filename" value={}/></texture>'.format
+METAL = '<bsdf type="{}"><float name="metallic" value="$m"/></bsdf>'.format
+VALUES = '<include filename="UPparts/values.xml"/>'
+
+
+@pytest.mark.parametrize("folder", [0, 1])
 @pytest.mark.parametrize(
     "body, expected",
     [
-        ('<include filename="parts/plain.xml"/>', '<include filename="UPparts/plain.xml"/>'),
-        ('<include filename="parts/paint.xml"/>', '<bsdf type="neural_disney" id="paint"><texture type="bitmap" '
-         'name="base_color"><string name="filename" value="UPleaf.png"/></texture></bsdf>'),
+        ('<include filename="UPparts/plain.xml"/>', ""),
+        ('<include filename="parts/paint.xml"/>', f'<bsdf type="neural_disney" id="paint">{LEAF}'),
         ('<shape type="sphere"><include name="m" filename="parts/lone.xml"/></shape>',
-         '<shape type="sphere"><bsdf name="m"  type="neural_disney"  id="lone"><texture type="bitmap" '
-         'name="base_color"><string name="filename" value="UPleaf.png"/></texture></bsdf></shape>'),
-        ('<include filename="parts/values.xml"/><bsdf type="principled"><float name="metallic" value="$m"/></bsdf>',
-         '<include filename="UPparts/values.xml"/><bsdf type="neural_disney"><float name="metallic" value="$m"/>'
-         "</bsdf>"),
-        ('<include filename="parts/values.xml"/><texture type="bitmap"><string name="filename" value="$p.png"/>'
-         "</texture>",
-         '<include filename="UPparts/values.xml"/><texture type="bitmap"><string name="filename" value="DOLLAR"/>'
-         "</texture>"),
-        ('<default name="n" value="leaf"/><default name="f" value="$n.png"/><texture type="bitmap">\n'
-         '<string name="filename" value="$f"/></texture>',
-         '<default name="n" value="leaf"/><default name="f" value="$n.png"/><texture type="bitmap">\n'
-         '<string name="filename" value="FILE"/></texture>'),
-        ('<texture type="bitmap"><string name="filename" value="ä &amp; &quot;b&quot;.png"/></texture>',
-         '<texture type="bitmap"><string name="filename" value=QUOTED/></texture>'),
-        ('<texture type="bitmap"><string name="filename" value="l&#101;a&#x66;.png"/></texture>',
-         '<texture type="bitmap"><string name="filename" value="NUMBERED"/></texture>'),
-        ('<path value="parts"/><texture type="bitmap"><string name="filename" value="parts/leaf.png"/></texture>',
-         '<path value="UPparts"/><texture type="bitmap"><string name="filename" value="UPparts/leaf.png"/></texture>'),
-        ('<emitter type="constant"><spectrum name="radiance" filename="lamp.spd"/></emitter>',
-         '<emitter type="constant"><spectrum name="radiance" filename="UPlamp.spd"/></emitter>'),
-        ('<emitter type="constant"><string name="word" value="leaf"/><string name="file" value="none.png"/></emitter>',
-         '<emitter type="constant"><string name="word" value="leaf"/><string name="file" value="none.png"/></emitter>'),
+         f'<shape type="sphere"><bsdf name="m"  type="neural_disney"  id="lone">{LEAF}</shape>'),
+        (VALUES + METAL("principled"), VALUES + METAL("neural_disney")),
+        (VALUES + FILE('"DOLLAR"'), ""),
+        ('<default name="n" value="leaf"/><default name="f" value="$n.png"/>\n' + FILE('"FILE"'), ""),
+        (FILE("QUOTED"), ""),
+        (FILE('"NUMBERED"'), ""),
+        ('<path value="UPparts"/>' + FILE('"UPparts/leaf.png"'), ""),
+        ('<emitter type="constant"><spectrum name="radiance" filename="UPlamp.spd"/></emitter>', ""),
+        ('<emitter type="constant"><string name="w" value="leaf"/><string name="file" value="no.jpg"/></emitter>', ""),
     ],
 )  # fmt: skip
 def test_files_includes_and_parameters(mi_rgb, folders, body, expected, folder):
     """Files are found from the new folder; an included file that changes takes the place of its include."""
+
+    def text(names, folder):
+        for name, values in NAMES.items():
+            names = names.replace(name, values[folder])
+        return f"{HEAD}{names}</scene>"
+
     a, _ = folders
-    new = written(a / "scene.xml", f"{HEAD}{body}</scene>", a.parent / folder / "new.xml")
-    values = {
-        "a": ("l&#101;a&#x66;.png", "", "$f", "$p.png", '"ä &amp; &quot;b&quot;.png"'),
-        "b": ("../a/leaf.png", "../a/", "../a/leaf.png", "../a/leaf.png", "'../a/ä &amp; \"b\".png'"),
-    }
-    for name, value in zip(("NUMBERED", "UP", "FILE", "DOLLAR", "QUOTED"), values[folder], strict=True):
-        expected = expected.replace(name, value)
-    assert new == f"{HEAD}{expected}</scene>"
+    new = written(a / "scene.xml", text(body, 0), a.parent / "ab"[folder] / "new.xml")
+    assert new == text(expected or body, folder)
 
 
 def test_values_of_defines_become_defaults(mi_rgb, folders):

@@ -1,5 +1,6 @@
 """The scenes of the repository, and swapping learned plugins for exact ones."""
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -114,13 +115,11 @@ def test_what_cannot_be_compared(mi_rgb, tmp_path, plugin, parameters, against, 
 @pytest.mark.parametrize("name", ["library", "materials", "metals"])
 def test_scenes_are_what_their_scripts_write(tmp_path, name):
     """Both files of a pair are in the repository: they must not drift apart."""
-    text = (SCENES / f"{name}.xml").read_bytes()
     (tmp_path / "scenes").mkdir()
-    copy = tmp_path / "scenes" / f"make_{name}.py"
-    copy.write_text((SCENES / f"make_{name}.py").read_text())
-    (tmp_path / "scenes" / "scene_xml.py").write_text((SCENES / "scene_xml.py").read_text())
-    subprocess.run([sys.executable, str(copy)], check=True, cwd=tmp_path)
-    assert (tmp_path / "scenes" / f"{name}.xml").read_bytes() == text
+    for file in (f"make_{name}.py", "scene_xml.py"):
+        shutil.copy(SCENES / file, tmp_path / "scenes")
+    subprocess.run([sys.executable, str(tmp_path / "scenes" / f"make_{name}.py")], check=True, cwd=tmp_path)
+    assert (tmp_path / "scenes" / f"{name}.xml").read_bytes() == (SCENES / f"{name}.xml").read_bytes()
 
 
 def test_same_arguments_same_image(mi_rgb):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from mi_diffind.arrays import sparse_grid
-from mi_diffind.arrays.lookup import mask_words
 from mi_diffind.arrays.sparse_grid import CORNERS, GridIndex, SparseGrid
 from mi_diffind.core.runtime import array_module
 
@@ -26,22 +25,6 @@ def ball():
         return ((np.asarray(points) * 2 - [9, 10, 8.5]) ** 2).sum(-1) < 30
 
     return inside, crossed, SparseGrid.from_nodes(nodes, inside[tuple(nodes.T)], SHAPE, (0, 0, 0), 0.5, sign)
-
-
-def test_ranks(rng):
-    types = array_module("llvm")
-    flags = rng.random((50, 64)) < 0.4
-    low, high = (types.UInt32(v) for v in mask_words(flags).T)
-    assert np.array_equal(sparse_grid.mask_ranks(mask_words(flags)), np.r_[0, flags.sum(1).cumsum()[:-1]])
-    for bit in (0, 1, 31, 32, 33, 63):
-        found, rank = sparse_grid.bit_and_rank(low, high, types.UInt32(bit))
-        assert np.array_equal(found.numpy(), flags[:, bit]) and np.array_equal(rank.numpy(), flags[:, :bit].sum(1))
-
-
-def test_places_and_bits():
-    place = np.argwhere(np.ones((4, 4, 4)))
-    assert np.array_equal(sparse_grid.bit_of_place(place), np.arange(64))
-    assert np.array_equal(sparse_grid.place_of_bit(np.arange(64)), place)
 
 
 @pytest.mark.parametrize("most", [None, 1, 3, 15])

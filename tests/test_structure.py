@@ -111,36 +111,31 @@ def test_imports_point_down():
 MADE_OF = {"shading": ("texture", "disney")}
 
 
+def task_of(name: str) -> str:
+    """The task in whose folder a module is, "" for those that tasks share, and for others."""
+    room, folder = [*name.split("."), "", ""][1:3]
+    return folder if room == "tasks" and (ROOT / "mi_diffind" / "tasks" / folder).is_dir() else ""
+
+
 def test_tasks_know_nothing_of_each_other():
     """A task may use the tasks' common modules, and no other task but those that it is made of."""
-    known = graph()
-    folders = {name.split(".")[2] for name in known if name.startswith("mi_diffind.tasks.") and name.count(".") > 2}
+    pairs = [(name, other) for name, others in graph().items() for other in others if task_of(name) and task_of(other)]
     wrong = [
         f"{name} imports {other}"
-        for name, others in known.items()
-        for other in others
-        if name.startswith("mi_diffind.tasks.") and other.startswith("mi_diffind.tasks.")
-        and other.split(".")[2] in folders and name.split(".")[2] != other.split(".")[2]
-        and other.split(".")[2] not in MADE_OF.get(name.split(".")[2], ())
-    ]  # fmt: skip
-    assert len(folders) >= 3 and not wrong, "\n".join(sorted(wrong))
+        for name, other in pairs
+        if task_of(other) not in (task_of(name), *MADE_OF.get(task_of(name), ()))
+    ]
+    assert len({task_of(name) for name, _ in pairs}) >= 3 and not wrong, "\n".join(sorted(wrong))
 
 
 def test_general_rooms_know_no_task():
     """Nothing outside of a task's folder, its plugins and its study names it: tasks are found."""
-    known = graph()
-    folders = {name.split(".")[2] for name in known if name.startswith("mi_diffind.tasks.") and name.count(".") > 2}
     rooms = {"core", "arrays", "images", "fitting", "measure", "scenes", "commands"}
-    general = [name for name in known if name.split(".")[1] in rooms]
     # The task that is fitted through renders of a scene trains the arrays of others
-    general = [name for name in general if not name.startswith("mi_diffind.scenes.training")]
+    training = "mi_diffind.scenes.training"
+    general = [n for n in graph() if n.split(".")[1] in rooms and not n.startswith(training)]
     general += ["mi_diffind.plugins", "mi_diffind.studies"]
-    wrong = [
-        f"{name} imports {other}"
-        for name in general
-        for other in known[name]
-        if other.startswith("mi_diffind.tasks.") and other.split(".")[2] in folders
-    ]
+    wrong = [f"{name} imports {other}" for name in general for other in graph()[name] if task_of(other)]
     assert len(general) > 20 and not wrong, "\n".join(sorted(wrong))
 
 
@@ -210,28 +205,22 @@ def test_flows_pass_through_few_files(flow):
 
 def names_given(syntax: ast.AST) -> list[tuple[str, int]]:
     """The names that a file gives, with their lines: variables, attributes, parameters, functions and classes."""
-    names = []
+    fields, names = {ast.arg: "arg", ast.Name: "id", ast.Attribute: "attr"}, []
+    fields |= dict.fromkeys((ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef), "name")
     for node in ast.walk(syntax):
-        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
-            names.append((node.name, node.lineno))
-        elif isinstance(node, ast.arg):
-            names.append((node.arg, node.lineno))
-        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
-            names.append((node.id, node.lineno))
-        elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
-            names.append((node.attr, node.lineno))
+        if type(node) in fields and isinstance(getattr(node, "ctx", ast.Store()), ast.Store):
+            names.append((getattr(node, fields[type(node)]), node.lineno))
     return names
 
 
 def test_names_say_what_things_are():
-    wrong = []
-    for module, path in modules().items():
-        for name, line in names_given(tree(path)):
-            if name.strip("_").lower() in FORBIDDEN:
-                wrong.append(f"{module}, line {line}: {name}")
-    assert not wrong, "\n".join(wrong)
+    def wrong(syntax):
+        return [(name, line) for name, line in names_given(syntax) if name.strip("_").lower() in FORBIDDEN]
+
+    given = [f"{module}, line {line}: {name}" for module, path in modules().items() for name, line in wrong(tree(path))]
+    assert not given, "\n".join(given)
     example = "found = 1\nclass Course:\n    def look(self, own, *said, kind=0):\n        self._made, x = own, told"
-    names = [name for name, _ in names_given(ast.parse(example)) if name.strip("_").lower() in FORBIDDEN]
+    names = [name for name, _ in wrong(ast.parse(example))]
     assert sorted(names) == ["Course", "_made", "found", "kind", "look", "own", "said"]
 
 
@@ -249,7 +238,7 @@ def test_a_wrong_import_would_be_noticed(tmp_path):
     """The reader of imports: relative and absolute ones, of modules and of names, in functions, for types, by name."""
     names = ("arrays.tables", "arrays.lookup", "tasks", "tasks.ggx", "tasks.task", "commands.cli", "scenes")
     known = {f"mi_diffind.{name}": tmp_path for name in names}
-    file = tmp_path / "file.py"
+    file, package = tmp_path / "file.py", tmp_path / "__init__.py"
     file.write_text(
         "from __future__ import annotations\nimport importlib\nfrom typing import TYPE_CHECKING\nimport numpy\n"
         "from ..arrays.lookup import clamp\nfrom . import task\n"
@@ -257,11 +246,7 @@ def test_a_wrong_import_would_be_noticed(tmp_path):
         "def f():\n    from mi_diffind.arrays import tables\n    import mi_diffind.commands.cli\n"
         "    return importlib.import_module('..scenes', __package__)\n"
     )
-    assert imports("mi_diffind.tasks.file", file, known) == {
-        f"mi_diffind.{name}"
-        for name in ("arrays.tables", "arrays.lookup", "tasks.ggx", "tasks.task", "commands.cli", "scenes")
-    }
-    package = tmp_path / "__init__.py"
+    assert imports("mi_diffind.tasks.file", file, known) == known.keys() - {"mi_diffind.tasks"}
     package.write_text("from .task import Task\nfrom ..arrays import lookup\n")
     assert imports("mi_diffind.tasks", package, known) == {"mi_diffind.arrays.lookup", "mi_diffind.tasks.task"}
     rising = ("core.files", "arrays.lookup", "fitting.loop", "maps.layout", "tasks.ggx.model", "plugins.disney",

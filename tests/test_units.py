@@ -17,9 +17,6 @@ IMAGES = [(1, 1), (1, 4096), (4096, 1), (7, 5), (64, 64), (100, 100), (333, 1000
 @pytest.mark.parametrize("side, cascaded, channels", [(8, 4, 1), (960, 12, 3), (2048, 16, 7), (1, 1, 16)])
 def test_bytes_are_equation_1(side, cascaded, channels):
     assert ImageBudget(side, side, cascaded, channels).nbytes == 4 * side**2 + channels * cascaded**4
-
-
-def test_bytes_of_other_dimensions_and_bits():
     assert ImageBudget(10, 10, 8, 3, dims=3).nbytes == 3 * 100 + 3 * 8**3
     assert ImageBudget(4, 25, 8, 3, dims=2, bits=16).nbytes == 2 * 2 * 100 + 3 * 8**2
     assert ImageBudget(1, 3, 4, 1, dims=3, bits=5).nbytes == 6 + 64  # 45 bits
@@ -30,9 +27,6 @@ def test_ratio_is_table_2_at_4k():
     assert arrays.resolution_ratio(math.sqrt(12 * 24), 4096) == pytest.approx(76)  # half-way in log2
     assert arrays.resolution_ratio(1, 4096) == arrays.resolution_ratio(0.1, 8192) == 128
     assert arrays.resolution_ratio(1000, 4096) == 72
-
-
-def test_ratio_falls_with_resolution_within_the_useful_range():
     assert [arrays.resolution_ratio(3, n) for n in (1, 1024, 2048)] == pytest.approx([128 * 64 / 80] * 3)
     assert arrays.resolution_ratio(3, 2048 * math.sqrt(2)) == pytest.approx(128 * 0.9)
     assert [arrays.resolution_ratio(12, n) for n in (1024, 2048)] == pytest.approx([64] * 2)  # the safe default
@@ -75,6 +69,9 @@ def test_search_keeps_the_proportions():
     assert (wide.rows, wide.columns) == (tall.columns, tall.rows)
     assert wide.columns / wide.rows == pytest.approx(4, rel=0.01)
     assert wide.nbytes == pytest.approx(square.nbytes, rel=0.01)
+    size = search(256**2 * 3, 12, 3, 256, 256)  # of a small image, the primary shrinks
+    assert size.cascaded == 4 and 256**2 * 3 / size.nbytes == pytest.approx(12, rel=0.05)
+    assert search(1, 12, 1, 1, 1) == ImageBudget(1, 1, 4, 1)
 
 
 @pytest.mark.parametrize("dims", [2, 3, 4])
@@ -84,12 +81,6 @@ def test_search_stays_within_the_image(height, width, compression, dims):
     size = search(height * width * 3, compression, 3, height, width, dims)
     assert 1 <= size.rows <= height and 1 <= size.columns <= width
     assert size.cascaded >= 4 and size.cascaded % 4 == 0 and size.dims == dims
-
-
-def test_search_shrinks_the_primary_of_a_small_image():
-    size = search(256**2 * 3, 12, 3, 256, 256)
-    assert size.cascaded == 4 and 256**2 * 3 / size.nbytes == pytest.approx(12, rel=0.05)
-    assert search(1, 12, 1, 1, 1) == ImageBudget(1, 1, 4, 1)
 
 
 @pytest.mark.parametrize("dims, bits", [(4, 8), (3, 8), (2, 8), (4, 5), (4, 16)])

@@ -46,7 +46,10 @@ def commands(path, folder):
     }
 
 
-@pytest.mark.parametrize("name", ["render", "orbit", "compare", "view", "regress", "equal time"])
+COMMANDS = ["render", "orbit", "compare", "view", "regress", "equal time"]
+
+
+@pytest.mark.parametrize("name", COMMANDS)
 @pytest.mark.parametrize("missing", ["integrator", "sensor"])
 def test_scenes_without_a_part(tmp_path, capsys, name, missing):
     path = scene_file(tmp_path, missing)
@@ -81,7 +84,7 @@ def test_scenes_in_memory(mi_rgb):
         render(mi_rgb.load_dict(scene), 1)
 
 
-@pytest.mark.parametrize("name", ["render", "orbit", "compare", "view", "regress", "equal time"])
+@pytest.mark.parametrize("name", COMMANDS)
 def test_films_beyond_the_memory(tmp_path, capsys, monkeypatch, name):
     """On a machine of 32 kB; the film of the viewer has the width that it is asked for."""
     monkeypatch.setattr(units, "memory", lambda: 2**15)
@@ -95,9 +98,6 @@ def test_absurd_samples(tmp_path, capsys, name):
     assert "spp: found 1,000,000,000 samples per pixel, allowed are 1 to 1,048,576" in refused(capsys, *arguments)
     with pytest.raises(UsageError, match="spp: found 0"):
         units.check_samples(0)
-
-
-# -- NaN --------------------------------------------------------------------------------------------------------------
 
 
 def nan_pixels(path, spp, seed=0):

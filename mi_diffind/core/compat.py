@@ -1,6 +1,6 @@
 """Uses of private interfaces of Mitsuba 3.9 and Dr.Jit 1.5, one per function.
 
-Each has a test that names the hook which broke (``tests/test_compat.py``). Mitsuba and Dr.Jit are imported when a
+Each has a test, in ``tests/test_compat.py`` or of its callers. Mitsuba and Dr.Jit are imported when a
 function is called, so that this module may be imported before LLVM is chosen (:mod:`.runtime`).
 """
 

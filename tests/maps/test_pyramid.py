@@ -1,9 +1,12 @@
 """The truth that textures are compared with: a mip pyramid, read as graphics hardware reads it."""
 
+import drjit as dr
 import numpy as np
 import pytest
 from arrays import aligned, numpy_of
+from scipy.ndimage import map_coordinates
 
+from mi_diffind.images import srgb
 from mi_diffind.maps.layout import Layout
 from mi_diffind.maps.pyramid import Pyramid, level_sizes
 from mi_diffind.maps.source import from_arrays
@@ -29,24 +32,6 @@ def noise(rng, *shape) -> np.ndarray:
     return rng.random(shape, dtype=np.float32)
 
 
-def to_linear(s):
-    """sRGB, as the standard has it, in double precision."""
-    s = np.asarray(s, np.float64)
-    return np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
-
-
-def to_srgb(v):
-    v = np.asarray(v, np.float64)
-    return np.where(v <= 0.0031308, 12.92 * v, 1.055 * np.maximum(v, 1e-12) ** (1 / 2.4) - 0.055)
-
-
-def area_mean(values: np.ndarray, half: int) -> np.ndarray:
-    """Each of ``half`` equal parts of an axis (the first), by integrating the step function of its texels finely."""
-    n = len(values)
-    fine = np.repeat(values.astype(np.float64), half, axis=0)  # n · half pieces, n to a part
-    return fine.reshape(half, n, *values.shape[1:]).mean(axis=1)
-
-
 SIZES = [(16, 16), (13, 9), (8, 32), (1, 7), (5, 1), (1, 1)]
 
 
@@ -57,8 +42,10 @@ def test_a_texel_is_the_mean_of_what_it_covers(rng, size):
     assert [level.shape[:2] for level in pyramid.values] == level_sizes(*size)
     assert pyramid.values[-1].shape[:2] == (1, 1) and pyramid.levels == int(np.log2(max(size))) + 1
     for fine, coarse in zip(pyramid.values, pyramid.values[1:], strict=False):
-        expected = area_mean(fine, coarse.shape[0])
-        expected = area_mean(expected.swapaxes(0, 1), coarse.shape[1]).swapaxes(0, 1)
+        # By integrating the step function of the texels finely
+        (n, m), (rows, columns) = fine.shape[:2], coarse.shape[:2]
+        pieces = np.repeat(np.repeat(fine.astype(np.float64), rows, 0), columns, 1)
+        expected = pieces.reshape(rows, n, columns, m, -1).mean(axis=(1, 3))
         np.testing.assert_allclose(coarse, expected, atol=1e-6)
     # The mean of all is kept through all levels, odd sizes or not
     if size != (1, 1):
@@ -82,8 +69,6 @@ def test_the_coarsest_level_is_the_mean_everywhere(ad, rng):
 @pytest.mark.parametrize("border", ["repeat", "clamp"])
 def test_no_footprint_is_bilinear(ad, rng, border):
     """Against SciPy; level 0, everything below, and NaN."""
-    from scipy.ndimage import map_coordinates
-
     for height, width in ((13, 9), (16, 4)):
         values = noise(rng, height, width, 3)
         source = from_arrays({"data": values})
@@ -139,14 +124,18 @@ def test_colours_are_averaged_linearly(ad, rng):
     assert pyramid.layout.stored == 5  # equal channels, but of different means
     values = codes / 255.0
     block = values.reshape(4, 2, 4, 2, 3)
-    np.testing.assert_allclose(pyramid.values[1][..., :3], to_srgb(to_linear(block).mean(axis=(1, 3))), atol=1e-6)
+    np.testing.assert_allclose(
+        pyramid.values[1][..., :3], srgb.from_linear(srgb.to_linear(block).mean(axis=(1, 3))), atol=1e-6
+    )
     np.testing.assert_allclose(pyramid.values[1][..., 3:], block.mean(axis=(1, 3))[..., :2], atol=1e-6)
-    np.testing.assert_allclose(pyramid.values[-1][0, 0, :3], to_srgb(to_linear(values).mean(axis=(0, 1))), atol=1e-6)
+    np.testing.assert_allclose(
+        pyramid.values[-1][0, 0, :3], srgb.from_linear(srgb.to_linear(values).mean(axis=(0, 1))), atol=1e-6
+    )
     assert np.abs(pyramid.values[-1][0, 0, :2] - pyramid.values[-1][0, 0, 3:]).min() > 0.02
     # Half way between two texels
     found = stored(pyramid, [2 / 8], [0.5 / 8])[0]
-    between = to_linear(values[0, 1:3]).mean(axis=0)
-    np.testing.assert_allclose(found[:3], to_srgb(between), atol=1e-5)
+    between = srgb.to_linear(values[0, 1:3]).mean(axis=0)
+    np.testing.assert_allclose(found[:3], srgb.from_linear(between), atol=1e-5)
     np.testing.assert_allclose(found[3:], values[0, 1:3, :2].mean(axis=0), atol=1e-5)
 
 
@@ -160,7 +149,7 @@ def test_channels_of_two_maps_are_linear_if_both_are_colours(ad, rng, first):
     assert pyramid.is_linear("albedo") is (first == "albedo") and not pyramid.is_linear("data")
     u, v = (ad.Float(aligned(x)) for x in centres(8, 8))
     found = numpy_of(pyramid.interpolated(u, v, ad.Float(0))).reshape(8, 8, 3)
-    expected = to_linear(codes / 255) if pyramid.is_linear("albedo") else codes / 255
+    expected = srgb.to_linear(codes / 255) if pyramid.is_linear("albedo") else codes / 255
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
@@ -211,8 +200,6 @@ def test_a_flat_component_of_a_normal_is_not_a_constant(ad):
 
 
 def test_gradients_are_finite_and_right(ad, rng):
-    import drjit as dr
-
     pyramid = Pyramid.from_source(from_arrays({"albedo": rng.integers(0, 256, (9, 8, 3), dtype=np.uint8)}), types=ad)
     place = [ad.Float(aligned(rng.uniform(0.05, 0.95, 300))) for _ in range(2)]
     place.append(ad.Float(aligned(rng.integers(0, 3, 300) + rng.uniform(0.05, 0.9, 300))))
@@ -226,39 +213,3 @@ def test_gradients_are_finite_and_right(ad, rng):
         low, high = (filtered(pyramid, *m).sum(axis=-1) for m in moved)
         slope = (high - low) / (2 * step)
         assert np.median(np.abs(slope - g) / np.maximum(np.abs(slope), 0.05)) < 0.01
-
-
-# -- against OpenImageIO ----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("border", ["repeat", "clamp"])
-def test_openimageio_filters_alike(ad, rng, tmp_path, border):
-    """
-    Its levels and its trilinear reads. It blends two levels by 2r − 1, where r in [½, 1] is the footprint in texels of
-    the coarser one, in place of our log2(r) + 1: the same at whole levels, so the footprint is chosen to fit. (Sizes
-    are powers of two: of odd ones it takes point samples.)
-    """
-    oiio = pytest.importorskip("OpenImageIO", reason="openimageio is not installed: pip install openimageio")
-    side, name = 16, str(tmp_path / "t.tx")
-    values = noise(rng, side, side, 3)
-    config = oiio.ImageSpec()
-    config.attribute("maketx:filtername", "box")
-    wrap = {"repeat": "periodic", "clamp": "clamp"}[border]
-    config.attribute("wrapmodes", f"{wrap},{wrap}")
-    assert oiio.ImageBufAlgo.make_texture(oiio.MakeTxTexture, oiio.ImageBuf(values), name, config), oiio.geterror()
-    pyramid = Pyramid.from_source(from_arrays({"data": values}), types=ad, border=(border, border))
-    for level, own in enumerate(pyramid.values):
-        np.testing.assert_allclose(oiio.ImageBuf(name, 0, level).get_pixels(oiio.FLOAT), own, atol=1e-6)
-
-    textures, options = oiio.TextureSystem(), oiio.TextureOpt()
-    options.interpmode, options.mipmode = oiio.InterpMode.Bilinear, oiio.MipMode.Trilinear
-    options.swrap = options.twrap = {"repeat": oiio.Wrap.Periodic, "clamp": oiio.Wrap.Clamp}[border]
-    u, v = rng.random((2, 20), dtype=np.float32)
-    for level in (0, 0.25, 0.5, 1, 1.5, 2, 2.75, 3, 4):
-        coarser = max(1, int(np.ceil(level)))
-        footprint = (1 + level - (coarser - 1)) / 2 / (side >> coarser)
-        expected = [
-            textures.texture(name, options, float(a), float(b), footprint, 0, 0, footprint, 3)
-            for a, b in zip(u, v, strict=True)
-        ]
-        np.testing.assert_allclose(filtered(pyramid, u, v, level), expected, atol=1e-5)
