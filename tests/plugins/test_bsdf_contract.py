@@ -36,12 +36,11 @@ from bsdf_queries import (
     vectors,
 )
 from half_vectors import HalfVectorSampling
-from texture_scenes import alive
+from texture_scenes import refused
 from variants import VARIANTS, set_variant
 
 from mi_diffind import plugins
 from mi_diffind.arrays.tables import save_table
-from mi_diffind.core import compat
 from mi_diffind.tasks.disney import TASK as DISNEY
 from mi_diffind.tasks.ggx import TASK as GGX
 
@@ -268,10 +267,13 @@ FROM = np.array([(a, b) for a in NONE for b in (*DIRECTIONS, *NONE)])
 TO = np.array([(b, a) for a in NONE for b in DIRECTIONS])
 RIGHT = np.array([(a, b) for a in DIRECTIONS for b in DIRECTIONS])
 
-SMOOTHEST = {"disney": {"roughness": 0.0, "clearcoat_gloss": 1.0, "metallic": 1.0}, "neural_ggx": {"alpha": 0.0}}
+HARDEST = [
+    ("disney", {"roughness": 0.0, "clearcoat_gloss": 1.0, "metallic": 1.0}), ("neural_ggx", {"alpha": 0.0}),
+    ("neural_ggx", {"alpha": 1.0, "eta": 0.0, "k": 0.0}),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize("name, more", [*((name, {}) for name in BSDFS), *SMOOTHEST.items()])
+@pytest.mark.parametrize("name, more", [*((name, {}) for name in BSDFS), *HARDEST])
 def test_vectors_that_are_no_directions(mi_rgb, name, more):
     """Vectors of masked lanes: values and derivatives are 0, beside those of the pairs of directions."""
     mi, pairs, wrong = mi_rgb, np.concatenate([FROM, TO, RIGHT]), len(FROM) + len(TO)
@@ -623,21 +625,6 @@ def test_scenes_are_loaded_in_many_threads():
     assert done.returncode == 0 and done.stdout.strip() == "24", done.stderr[-2000:]
 
 
-@pytest.mark.parametrize("name", BSDFS)
-def test_materials_die_with_their_scene(mi_rgb, no_garbage_collection, name):
-    """
-    Without waiting for the garbage collector: Dr.Jit refuses to freeze a function, and may crash in the middle of a
-    render, if instances that nobody holds any more are in its registry.
-    """
-    mi, kind = mi_rgb, type(load(mi_rgb, name)).__name__
-    before = alive(kind)
-    scene = sphere_scene(mi, described(name))
-    mi.render(scene, spp=1)
-    assert alive(kind) == before + 1
-    del scene
-    assert alive(kind) == before
-
-
 # -- files and mistakes ------------------------------------------------------------------------------------------------
 
 
@@ -714,19 +701,8 @@ def test_mistakes_are_refused(mi_rgb, folder, plugin, parameters, sentence):
     """One sentence that names the parameter, what was found and what is allowed."""
     if (folder / parameters.get("filename", "none")).is_file():
         parameters = {**parameters, "filename": str(folder / parameters["filename"])}
-    with pytest.raises(RuntimeError) as caught:
-        mi_rgb.load_dict({"type": plugin, **parameters})
-    refusal = compat.one_sentence(caught.value)
-    assert sentence in refusal and "\n" not in refusal and len(refusal.split(": parameter", 1)[-1]) < 300
+    assert sentence in refused(mi_rgb, {"type": plugin, **parameters})
 
 
-def test_scalar_variants_are_refused():
-    import mitsuba as mi
-
-    mi.set_variant("scalar_rgb")
-    bsdfs = [name for name, plugin in plugins.declared().items() if plugin.object_type == "bsdf"]
-    assert set(bsdfs) == set(PLUGINS)
-    for name in bsdfs:
-        refusal = f'"{name}" does not run in the variant "scalar_rgb"; use one of llvm_ad'
-        with pytest.raises(RuntimeError, match=refusal):
-            mi.load_dict({"type": name})
+def test_the_contract_has_every_bsdf(mi_rgb):
+    assert {name for name, plugin in plugins.declared().items() if plugin.object_type == "bsdf"} == set(PLUGINS)

@@ -22,15 +22,13 @@ SEED = 3
 
 NAMES = [*examples.names(), "family"]
 
-CASES = [(name, storage) for name in NAMES for storage in ("", "float32")]
+CASES = [*((name, storage) for name in NAMES for storage in ("", "float32")), ("lit field", "float32")]
 
 #: Plugins that expose numbers or a place of their own.
-NUMBERS = [
-    name for name in (*examples.names(), "family") if name not in ("path_footprint", "path_sdf", "neural_texture")
-]
+NUMBERS = [name for name in NAMES if name not in ("path_footprint", "path_sdf", "neural_texture")]
 
-#: Arguments of an example: a family of ``neural_bsdf`` has a file of its own.
-EXAMPLES = {"family": {"name": "neural_bsdf"}}
+#: Arguments of further examples: a family of ``neural_bsdf`` has a file of its own.
+EXAMPLES = {"family": {"name": "neural_bsdf"}, "lit field": {"name": "neural_field", "lit": True}}
 
 pytestmark = pytest.mark.usefixtures("no_garbage_collection")
 

@@ -4,6 +4,8 @@ The plugins are those of the registry, in each storage form, and the scenes thos
 Films have a box filter: with any other, two renders of one scene differ in the last digits.
 """
 
+import gc
+
 import drjit as dr
 import numpy as np
 import plugin_examples as examples
@@ -109,6 +111,40 @@ def test_numbers_of_threads(variant, name, storage):
         dr.set_thread_count(before)
     for image in images[1:]:
         np.testing.assert_array_equal(image, images[0])
+
+
+def alive() -> int:
+    """Return the number of objects of this package's plugins."""
+    return sum(type(o).__module__.startswith(plugins.__name__) for o in gc.get_objects())
+
+
+@pytest.mark.parametrize("name", examples.names())
+def test_objects_die_with_their_scene(mi_rgb, no_garbage_collection, name):
+    """
+    Without waiting for the garbage collector: Dr.Jit refuses to freeze a function, and may crash in the middle of a
+    render, if instances that nobody holds any more are in its registry.
+    """
+    mi, storage = mi_rgb, "float32" if plugins.declared()[name].task else ""
+    examples.load(mi, name, storage)  # arrays of files are kept
+    before = alive()
+    scene = examples.load(mi, name, storage)
+    params, keys = examples.exposed(mi, scene, name)
+    for key in keys[:1]:
+        dr.enable_grad(params[key])
+    params.update()
+    loss = dr.sum(mi.render(scene, params, spp=1).array)
+    if dr.grad_enabled(loss):
+        dr.backward(loss)
+    assert alive() > before
+    del scene, params, loss
+    assert alive() == before
+
+
+def test_scalar_variants_are_refused():
+    mi = set_variant("scalar_rgb")
+    for name in plugins.declared():
+        with pytest.raises(RuntimeError, match=f'"{name}" does not run in the variant "scalar_rgb"; use one of llvm'):
+            mi.load_dict({"type": name})
 
 
 def test_each_plugin_has_an_example():
