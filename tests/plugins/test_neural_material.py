@@ -1,7 +1,7 @@
 """
 The BSDF ``neural_material`` inside Mitsuba: against ``normalmap``, ``disney``, ``mask`` and ``twosided`` with a
 ``neural_texture`` for each map of the same file. (The lobes themselves: ``test_disney.py``; the maps:
-``test_neural_texture.py``.)
+``test_texture_contract.py``.)
 """
 
 import gc

@@ -15,7 +15,7 @@ import pytest
 import trust_properties as trust
 from arrays import aligned, numpy_of
 from texture_files import make, make_image, material
-from texture_scenes import WRONG, footprints, hits, isotropic, linear, refused
+from texture_scenes import WRONG, footprints, hits, isotropic, linear, plane, refused
 from variants import VARIANTS, set_variant, warnings_of
 
 from mi_diffind import plugins
@@ -24,6 +24,8 @@ from mi_diffind.fitting.task import find_task
 from mi_diffind.maps import pyramid
 from mi_diffind.maps.layout import Layout
 from mi_diffind.maps.source import from_arrays
+from mi_diffind.measure.clock import bsdf_operations, count
+from mi_diffind.plugins.support import footprint
 from mi_diffind.tasks.ggx import TASK as GGX
 from mi_diffind.tasks.image import arrays as image_arrays
 from mi_diffind.tasks.texture import compressed
@@ -438,6 +440,48 @@ def test_textures_of_one_file_share_their_parameters(mi_rgb, files, rng, name):
     params["tables.cascaded"] = mi.TensorXf(aligned(np.zeros((2, 2, 7), "f4")))
     with pytest.raises(RuntimeError, match=re.escape('parameter "tables.cascaded": "data" has the shape (2, 2, 7)')):
         params.update()
+
+
+# ---------------------- Work ----------------------
+
+
+@pytest.mark.parametrize("name", ["neural_texture", "neural_texture_paper"])
+def test_off_costs_no_footprint(mi_rgb, files, rng, name):
+    """The arrays of coarser levels and of the footprint are not read."""
+    mi = mi_rgb
+    file, si = {"neural_texture": files[name]}, hits(mi, rng.random((2, 200)), *footprints(rng, 200, SIZE))
+    textures = {f: mi.load_dict(plugin(file, "neural_texture", filter=f)) for f in ("off", *FILTERS)}
+    reads = {f: count(lambda t=t: t.eval(si)) for f, t in textures.items()}
+    image = textures["off"].image
+    needed = image.layout.needed("albedo")
+    assert reads["off"].gathers == count(lambda: [image.stored(*si.uv)[i] for i in needed]).gathers
+    if name.endswith("paper"):  # the footprint's array is one more, of one dimension
+        assert reads["trilinear"].gathers == reads["off"].gathers + 1
+        assert reads["anisotropic"].gathers == 4 * reads["off"].gathers + 1
+    assert reads["off"].gathers < reads["trilinear"].gathers == reads["stochastic"].gathers
+    assert 3 * reads["trilinear"].gathers < reads["anisotropic"].gathers <= 4 * reads["trilinear"].gathers
+    assert reads["off"].instructions < reads["trilinear"].instructions - 100
+
+
+@pytest.mark.parametrize("filtering", ["off", "anisotropic"])
+def test_maps_of_one_file_are_read_once(mi_rgb, files, filtering):
+    """In one material, seen by a sensor: all of its maps at one place of one level, of one footprint.
+
+    Only the words of a further map's channels are read in addition.
+    """
+    mi, found = mi_rgb, []
+    albedo, roughness = (plugin(files, "neural_texture", m, filter=filtering) for m in ("albedo", "roughness"))
+    for bsdf in (
+        {"type": "diffuse", "reflectance": albedo},
+        {"type": "principled", "base_color": albedo, "roughness": roughness},
+        {"type": "neural_disney", "base_color": albedo, "roughness": roughness},
+    ):
+        loaded = plane(mi, None, shape={"type": "rectangle", "bsdf": bsdf})
+        footprint.attach(loaded)
+        found.append(bsdf_operations(loaded.shapes()[0].bsdf(), ("eval",))["eval"].gathers)
+    other = {"base_color": {"type": "checkerboard"}, "roughness": {"type": "checkerboard"}}  # which gathers nothing
+    tables = bsdf_operations(mi.load_dict({"type": "neural_disney", **other}), ("eval",))["eval"].gathers
+    assert found[0] <= found[1] == found[2] - tables < 2 * found[0]
 
 
 # ---------------------- Spectra and emitters ----------------------

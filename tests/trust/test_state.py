@@ -115,7 +115,7 @@ def test_numbers_of_threads(variant, name, storage):
 
 def alive() -> int:
     """Return the number of objects of this package's plugins."""
-    return sum(type(o).__module__.startswith(plugins.__name__) for o in gc.get_objects())
+    return sum(str(type(o).__module__).startswith(plugins.__name__) for o in gc.get_objects())
 
 
 @pytest.mark.parametrize("name", examples.names())
