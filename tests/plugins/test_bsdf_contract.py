@@ -212,35 +212,35 @@ CHI2_COUNT = 3 * len(LOBES)
 
 @pytest.mark.parametrize("angle", [5, 60, 89])
 @pytest.mark.parametrize("case", LOBES)
-def test_chi2(mi_rgb, case, angle, in_folder):
+def test_chi2(mi, case, angle, in_folder):
     """``sample`` draws from ``pdf``, in coordinates in which a lobe of any width is smooth."""
-    messages, valid = lobe_sampling(mi_rgb, case, angle).faults(CHI2_COUNT)
+    messages, valid = lobe_sampling(mi, case, angle).faults(CHI2_COUNT)
     assert not messages, messages
     assert valid > 1e5, "hardly a sample is valid, the test says nothing"
 
 
 @pytest.mark.parametrize("component", range(3))
-def test_chi2_of_one_lobe(mi_rgb, component, in_folder):
+def test_chi2_of_one_lobe(mi, component, in_folder):
     """``sample`` draws from ``pdf`` in a context of one of several components, too."""
-    ctx = mi_rgb.BSDFContext()
+    ctx = mi.BSDFContext()
     ctx.component = component
     alpha = disney_materials.smallest_alpha(disney_materials.RICH)
-    bsdf = mi_rgb.load_dict(disney_materials.plugin(mi_rgb, "disney", disney_materials.RICH))
-    messages, _ = HalfVectorSampling(mi_rgb, bsdf, 60, alpha, ctx).faults(3)
+    bsdf = mi.load_dict(disney_materials.plugin(mi, "disney", disney_materials.RICH))
+    messages, _ = HalfVectorSampling(mi, bsdf, 60, alpha, ctx).faults(3)
     assert not messages, messages
 
 
 @pytest.mark.parametrize("name", PLUGINS)
-def test_chi2_on_the_sphere(mi_rgb, name, in_folder):
+def test_chi2_on_the_sphere(mi, name, in_folder):
     """``sample`` draws from ``pdf``: nothing is hidden by the choice of coordinates."""
-    cell = trust.chi2(mi_rgb, BSDFS[name][0], trust.Effort(chi2_samples=300_000, angles=(20, 80)))
+    cell = trust.chi2(mi, BSDFS[name][0], trust.Effort(chi2_samples=300_000, angles=(20, 80)))
     assert cell.result == trust.HOLDS, cell
 
 
 @pytest.mark.parametrize("case, angle", [("neural_ggx 0.001", 60), ("disney rich", 85), ("family", 5)])
-def test_chi2_has_power(mi_rgb, case, angle, in_folder):
+def test_chi2_has_power(mi, case, angle, in_folder):
     """Densities that are 3% too high or too low, or seen from 1° beside, are rejected at the same level."""
-    right, beside = (lobe_sampling(mi_rgb, case, a) for a in (angle, angle + 1))
+    right, beside = (lobe_sampling(mi, case, a) for a in (angle, angle + 1))
     seen = beside.interactions
     for what, pdf in {
         "high": lambda p: 1.03 * right.pdf(p),
@@ -274,9 +274,9 @@ HARDEST = [
 
 
 @pytest.mark.parametrize("name, more", [*((name, {}) for name in BSDFS), *HARDEST])
-def test_vectors_that_are_no_directions(mi_rgb, name, more):
+def test_vectors_that_are_no_directions(mi, name, more):
     """Vectors of masked lanes: values and derivatives are 0, beside those of the pairs of directions."""
-    mi, pairs, wrong = mi_rgb, np.concatenate([FROM, TO, RIGHT]), len(FROM) + len(TO)
+    pairs, wrong = np.concatenate([FROM, TO, RIGHT]), len(FROM) + len(TO)
     bsdf, n = load(mi, name, **more), len(pairs)
     si, towards = interactions(mi, pairs[:, 0], np.full(n, 0.3)), vectors(mi, pairs[:, 1])
     params = mi.traverse(bsdf)
@@ -343,9 +343,9 @@ def test_extreme_inputs(rng, name, polarised):
 
 
 @pytest.mark.parametrize("name", [name for name in TEXTURED if name != "neural_disney paper"])
-def test_texels_are_read_as_numbers_in_their_range(mi_rgb, rng, name):
+def test_texels_are_read_as_numbers_in_their_range(mi, rng, name):
     """Texels beyond the range count as its ends, NaN as the lower one: each by itself, whatever its neighbours are."""
-    mi, n = mi_rgb, 3000
+    n = 3000
     low, high = (0.05, 0.8) if "family" in name else (0.0, 1.0)
     given = [2.0, math.inf, -1.0, 0.3, math.nan, -math.inf, 0.7]
     used = [high, high, low, 0.3, low, low, 0.7]
@@ -365,9 +365,9 @@ def test_texels_are_read_as_numbers_in_their_range(mi_rgb, rng, name):
 
 
 @pytest.mark.parametrize("name", TRAINED)
-def test_entries_of_any_value_are_harmless(mi_rgb, rng, name):
+def test_entries_of_any_value_are_harmless(mi, rng, name):
     """Each table in turn, all of it and one entry in four: answers are finite, and derivatives if the entries are."""
-    mi, n = mi_rgb, 2000
+    n = 2000
     bsdf = load(mi, name)
     params, before, changed = mi.traverse(bsdf), None, set()
     tables = {key: np.array(params[key].numpy()) for key in params.keys() if "tables." in key}
@@ -396,12 +396,12 @@ def test_entries_of_any_value_are_harmless(mi_rgb, rng, name):
 
 @pytest.mark.parametrize("kind", ["number", "bitmap", "texture"])
 @pytest.mark.parametrize("name", [name for name in TEXTURED if "paper" not in name])
-def test_updated_parameters_show(mi_rgb, rng, name, kind):
+def test_updated_parameters_show(mi, rng, name, kind):
     """
     Values are those of a BSDF loaded so: of numbers, of bitmaps, and of a texture that is updated by itself, of which
     nobody tells the material; also what was left out, or evaluated once.
     """
-    mi, n = mi_rgb, 1000
+    n = 1000
     si, wo = interactions(mi, random_directions(rng, n, 0.1), np.zeros(n)), vectors(mi, random_directions(rng, n, 0.1))
     base = {"eta": 0.5} if "ggx" in name else {"base_color": {"type": "rgb", "value": [0.6, 0.3, 0.2]}}
     base = {} if "family" in name else base
@@ -428,9 +428,9 @@ def test_updated_parameters_show(mi_rgb, rng, name, kind):
 
 
 @pytest.mark.parametrize("name, parameter", [("disney", "clearcoat"), ("neural_ggx", "alpha")])
-def test_textures_that_vary_without_saying_so(mi_rgb, name, parameter):
+def test_textures_that_vary_without_saying_so(mi, name, parameter):
     """Mitsuba's ``mesh_attribute`` calls itself constant: its value at no mesh at all is not that of the material."""
-    mi, images = mi_rgb, []
+    images = []
     for value in ({"type": "mesh_attribute", "name": "vertex_value"}, 0.5):
         mesh = mi.Mesh("quad", 4, 2)
         params = mi.traverse(mesh)
@@ -454,9 +454,9 @@ LEFT_OUT["neural_disney"] = LEFT_OUT["disney"]
 
 @pytest.mark.parametrize("update", [False, True])
 @pytest.mark.parametrize("name", LEFT_OUT)
-def test_an_optimised_parameter_keeps_its_effect(mi_rgb, name, update):
+def test_an_optimised_parameter_keeps_its_effect(mi, name, update):
     """An optimised parameter at the value at which its effect is left out has a gradient, through the renderer, too."""
-    mi, (values, effects) = mi_rgb, LEFT_OUT[name]
+    values, effects = LEFT_OUT[name]
     scene = sphere_scene(mi, described(name, **values), "prb", size=8)
     params, bsdf = mi.traverse(scene), scene.shapes()[0].bsdf()
     keys = [key_of(params, f"{parameter}.value") for parameter in values]
@@ -479,9 +479,9 @@ def test_an_optimised_parameter_keeps_its_effect(mi_rgb, name, update):
 
 @pytest.mark.parametrize("update", [False, True])
 @pytest.mark.parametrize("name", ["neural_disney", "neural_disney paper", "neural_ggx", "neural_bsdf family"])
-def test_tables_keep_their_gradients_where_parameters_are_constant(mi_rgb, rng, name, update):
+def test_tables_keep_their_gradients_where_parameters_are_constant(mi, rng, name, update):
     """Constant parameters are evaluated once, and yet tables that are trained get derivatives."""
-    mi, n, gradients = mi_rgb, 1000, []
+    n, gradients = 1000, []
     si, wo = interactions(mi, random_directions(rng, n, 0.1), np.zeros(n)), vectors(mi, random_directions(rng, n, 0.1))
     constants = {p: ends[1] for p, ends in TEXTURED[name].items()}
     for given in (constants, {p: bitmap(mi, np.full((2, 2), v)) for p, v in constants.items()}):
@@ -501,9 +501,9 @@ def test_tables_keep_their_gradients_where_parameters_are_constant(mi_rgb, rng, 
 
 
 @pytest.mark.parametrize("name", TRAINED[:-1])  # the maps of one file are shared by all that read it
-def test_assigned_tables_are_those_of_one_instance(mi_rgb, rng, name):
+def test_assigned_tables_are_those_of_one_instance(mi, rng, name):
     """Tables of two instances of one file are apart."""
-    mi, n = mi_rgb, 500
+    n = 500
     si, wo = interactions(mi, random_directions(rng, n), np.full(n, 0.3)), vectors(mi, random_directions(rng, n))
     first, second = (load(mi, name) for _ in range(2))
     before = intensities(mi, second.eval(mi.BSDFContext(), si, wo))
@@ -517,9 +517,9 @@ def test_assigned_tables_are_those_of_one_instance(mi_rgb, rng, name):
 
 @pytest.mark.parametrize("is_textured", [False, True])
 @pytest.mark.parametrize("name", ["neural_bsdf anisotropic", "neural_bsdf family", "neural_ggx", "neural_ggx paper"])
-def test_gradients_against_differences(mi_rgb, rng, name, is_textured):
+def test_gradients_against_differences(mi, rng, name, is_textured):
     """Derivatives by parameters, numbers or texels, and by tables. (``docs/trust.md`` has the default forms.)"""
-    mi, n = mi_rgb, 2**13
+    n = 2**13
     ends = TEXTURED.get(name, {})
     if is_textured and not ends:
         pytest.skip("none of its parameters may be a texture")
@@ -548,9 +548,9 @@ def test_every_variant_renders(mi_any):
 
 
 @pytest.mark.parametrize("integrator", ["path", "prb", "direct"])
-def test_several_materials_in_one_loop(mi_rgb, integrator):
+def test_several_materials_in_one_loop(mi, integrator):
     """Each sphere looks as it does where it is the only one that is not black: other plugins, tables and storage."""
-    mi, names = mi_rgb, list(BSDFS)
+    names = list(BSDFS)
     black = {"type": "diffuse", "reflectance": 0.0}
 
     def image(chosen):
@@ -565,12 +565,12 @@ def test_several_materials_in_one_loop(mi_rgb, integrator):
 
 
 @pytest.mark.parametrize("name, count", [("neural_disney", 600), ("neural_ggx", 300), ("neural_bsdf family", 200)])
-def test_many_materials_are_loaded_while_a_render_is_running(mi_rgb, name, count):
+def test_many_materials_are_loaded_while_a_render_is_running(mi, name, count):
     """
     Mitsuba constructs objects in parallel. A constructor that waits for a kernel lets its thread start on the next
     object in the meantime, one inside the other, until Python's stack is full.
     """
-    mi, parameter = mi_rgb, "alpha" if name == "neural_ggx" else "roughness"
+    parameter = "alpha" if name == "neural_ggx" else "roughness"
     running = sphere_scene(mi, {"type": "diffuse"})
     mi.render(running, spp=16).numpy()
     image = mi.render(running, spp=10_000)
@@ -629,9 +629,9 @@ def test_scenes_are_loaded_in_many_threads():
 
 
 @pytest.mark.parametrize("plugin, task", [("neural_ggx", GGX), ("neural_disney", DISNEY)])
-def test_own_tables(mi_rgb, rng, tmp_path, plugin, task):
+def test_own_tables(mi, rng, tmp_path, plugin, task):
     """``filename`` is read, relative to the scene, in the form that is asked for or its own."""
-    mi, n = mi_rgb, 500
+    n = 500
     si, wo = interactions(mi, random_directions(rng, n)), vectors(mi, random_directions(rng, n))
     for preset in task.presets:
         save_table(tmp_path / "own.npz", task.load(task.file(preset=preset)).to("uint8"))
@@ -697,12 +697,12 @@ MISTAKES = [
 
 
 @pytest.mark.parametrize("plugin, parameters, sentence", MISTAKES)
-def test_mistakes_are_refused(mi_rgb, folder, plugin, parameters, sentence):
+def test_mistakes_are_refused(mi, folder, plugin, parameters, sentence):
     """One sentence that names the parameter, what was found and what is allowed."""
     if (folder / parameters.get("filename", "none")).is_file():
         parameters = {**parameters, "filename": str(folder / parameters["filename"])}
-    assert sentence in refused(mi_rgb, {"type": plugin, **parameters})
+    assert sentence in refused(mi, {"type": plugin, **parameters})
 
 
-def test_the_contract_has_every_bsdf(mi_rgb):
+def test_the_contract_has_every_bsdf(mi):
     assert {name for name, plugin in plugins.declared().items() if plugin.object_type == "bsdf"} == set(PLUGINS)

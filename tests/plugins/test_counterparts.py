@@ -84,9 +84,9 @@ def test_exact_counterparts(variant, folder, name):
 
 
 @pytest.mark.parametrize("name", ["x_diff", "x_normal", "x_disp", "x_arm"])
-def test_counterparts_of_images_with_names(mi_rgb, tmp_path, rng, name):
+def test_counterparts_of_images_with_names(mi, tmp_path, rng, name):
     """Both counterparts show a single image as its file is read: linear if its name is that of data."""
-    mi, path = mi_rgb, tmp_path / f"{name}.png"
+    path = tmp_path / f"{name}.png"
     image = material(*SIZE)["normal" if name == "x_normal" else "albedo"][..., : 1 if name == "x_disp" else 3]
     mi.Bitmap(np.ascontiguousarray(image)).write(str(path))
     texture = {"type": "neural_texture", "filename": make(tmp_path / "a.npz", load_source(path)), "source": str(path)}
@@ -113,9 +113,9 @@ SOURCES = [
 
 @pytest.mark.parametrize("recorded, given, sentence", SOURCES)
 @pytest.mark.parametrize("name", MAKE)
-def test_sources_of_counterparts(mi_rgb, folder, tmp_path, name, recorded, given, sentence):
+def test_sources_of_counterparts(mi, folder, tmp_path, name, recorded, given, sentence):
     """A recorded source outside of the file's folder is shown only if it is what the file was made from."""
-    mi, table = mi_rgb, load_table(folder / f"{name}.npz")
+    table = load_table(folder / f"{name}.npz")
     texts = {"OUTSIDE": os.path.relpath(folder, tmp_path), "DIGEST": load_source(folder / "wall.json").digest}
     for old, new in texts.items():
         recorded, given = ({k: v.replace(old, new) for k, v in d.items()} for d in (recorded, given))

@@ -26,7 +26,6 @@ from variants import VARIANTS, set_variant
 
 from mi_diffind.arrays.boxes import ValueBounds
 from mi_diffind.measure.clock import bsdf_operations
-from mi_diffind.scenes import comparison
 from mi_diffind.tasks.ggx import TASK
 from mi_diffind.tasks.ggx.model import ALPHA_FLOOR
 from mi_diffind.tasks.ggx.training import table_encoding
@@ -162,9 +161,9 @@ def test_the_exact_plugin_times_what_the_table_says(variant, rng, material):
 
 @pytest.mark.parametrize("form", list(FORMS))
 @pytest.mark.parametrize("textured", [False, True])
-def test_the_independent_conductor(mi_rgb, rng, form, textured):
+def test_the_independent_conductor(mi, rng, form, textured):
     """Many roughnesses, as texels or one after the other, against Walter's formulas with the table read by SciPy."""
-    mi, n = mi_rgb, 4000
+    n = 4000
     alphas = [0.01, 0.0437, 0.2, 0.55, 1.0]
     eta, k = 0.3, 2.7
     wi, wo = (np.concatenate(v) for v in zip(*(directions(rng, n, a) for a in alphas), strict=True))
@@ -191,13 +190,13 @@ def test_the_independent_conductor(mi_rgb, rng, form, textured):
 
 
 @pytest.mark.parametrize("form", ["tables", "tables float16", "tables uint8", "paper"])
-def test_energy(mi_rgb, rng, form):
+def test_energy(mi, rng, form):
     """
     Against the exact weights of the same samples, which are Smith's masking, from no roughness to all of it and down to
     the horizon: their mean is within 0.012 (of bytes 0.016) of the exact albedo, and next to the horizon not 0.02
     (0.035) above it; no single weight is higher by more than a tenth.
     """
-    mi, side = mi_rgb, 128
+    side = 128
     alphas = [0.0, 1e-4, 2e-4, 5e-4, 7e-4, 1e-3, 0.0015, 0.003, 0.005, 0.01, 0.0133, 0.05, 0.132, 0.3, 0.6, 1.0]
     angles = (0, 30, 60, 75, 84, 88, 89, 89.9, 89.99, 89.999, 90 - 1e-5, 90 - 1e-9)
     x, y = (np.minimum((v.ravel() + rng.random(side**2)) / side, 1 - 2**-24) for v in np.mgrid[:side, :side])
@@ -225,9 +224,9 @@ def test_energy(mi_rgb, rng, form):
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_gradients_with_respect_to_directions(mi_rgb, rng, preset):
+def test_gradients_with_respect_to_directions(mi, rng, preset):
     """Derivatives by directions are differences along great circles, and finite at the extremes."""
-    mi, n, alpha, step = mi_rgb, 10_000, 0.2371, 1e-6
+    n, alpha, step = 10_000, 0.2371, 1e-6
     bsdf = mi.load_dict({**FORMS[preset], "alpha": alpha, "eta": 0.6, "k": 2.3})
 
     def gradients(wi, wo):
@@ -260,9 +259,9 @@ def test_gradients_with_respect_to_directions(mi_rgb, rng, preset):
 # -- only what is in use -----------------------------------------------------------------------------------------------
 
 
-def test_what_is_left_out_changes_nothing(mi_rgb, rng):
+def test_what_is_left_out_changes_nothing(mi, rng):
     """The Fresnel term of what reflects all, a factor of 1: as numbers, and as texels, of which nothing is known."""
-    mi, n = mi_rgb, 2000
+    n = 2000
     wi, wo = directions(rng, n, 0.3, 0.0)
     si, wo, u = interactions(mi, vectors(mi, wi), np.zeros(n)), vectors(mi, wo), uniform(mi, rng, n)
     used = {"eta": 0.0, "k": 1.0, "specular_reflectance": 1.0, "alpha": 0.3}
@@ -297,9 +296,8 @@ def test_report(mi_any):
     assert report["effects_in_use"] == effects and report["effects_left_out"] == {}
 
 
-def test_what_is_constant_is_not_read(mi_rgb):
+def test_what_is_constant_is_not_read(mi):
     """Reads and flops of an evaluation: a row instead of the primary array, no Fresnel term, no factor."""
-    mi = mi_rgb
 
     def cost(**m):
         return bsdf_operations(mi.load_dict({"type": "neural_ggx", **m}))
@@ -318,15 +316,6 @@ def test_what_is_constant_is_not_read(mi_rgb):
 
 
 # -- scenes ------------------------------------------------------------------------------------------------------------
-
-
-def test_comparison(mi_rgb):
-    """All metals and roughnesses; ``compare`` names the distribution of the exact plugin."""
-    defines = {"width": 96, "height": 50}
-    result = comparison.compare(SCENES / "metals.xml", spp=32, passes=1, progress=False, defines=defines)
-    assert result.figures["psnr_db"] >= 57  # 59.0 is reached
-    assert result.figures["flip"] < 0.007
-    assert result.figures["learned_plugins"] == 19 and result.figures["table_bytes"] == 2304
 
 
 def test_changing_type_from_roughconductor_is_all_it_takes(mi_any):

@@ -122,9 +122,8 @@ def test_equals_a_bitmap_of_what_it_decodes_to(mi_any, file, rng):
 
 
 @pytest.mark.parametrize("border, coarse", [(("repeat", "clamp"), False), (("clamp", "repeat"), True)])
-def test_reads_as_an_independent_implementation_does(mi_rgb, tmp_path, rng, border, coarse):
+def test_reads_as_an_independent_implementation_does(mi, tmp_path, rng, border, coarse):
     """Anywhere, by SciPy in double precision; of one primary array and of two."""
-    mi = mi_rgb
     path = make(tmp_path / "a.npz", border=border, coarse=coarse)
     arrays = TASK.load(path).arrays
     u, v = rng.random((2, 3000)).astype(np.float32).astype(np.float64)
@@ -151,9 +150,8 @@ def test_reads_as_an_independent_implementation_does(mi_rgb, tmp_path, rng, bord
     assert normal.max() <= 1 + 1e-6 and glow.max() > 1
 
 
-def test_gradient_of_the_image(mi_rgb, file, rng):
+def test_gradient_of_the_image(mi, file, rng):
     """``eval_1_grad``: differences of the texels around, per unit of uv, for sides that differ."""
-    mi = mi_rgb
     for name in ("height", "albedo"):
         image = mi.load_dict(plugin(file, name))
         x, y = rng.integers(0, WIDTH - 1, 200), rng.integers(0, HEIGHT - 1, 200)
@@ -196,8 +194,7 @@ def test_upsampling_is_mitsubas(rng):
 # -- in materials ------------------------------------------------------------------------------------------------------
 
 
-def test_maps_of_other_places_are_not_confused(mi_rgb, file, rng):
-    mi = mi_rgb
+def test_maps_of_other_places_are_not_confused(mi, file, rng):
     forms = [{}, {"to_uv": mi.ScalarTransform4f().scale(2)}, {"wrap_mode": "clamp"}, {"storage": "float32"}]
     si = hits(mi, rng.uniform(-1, 2, (2, 200)))
     alone = [mi.load_dict(plugin(file, **f)).eval(si).numpy() for f in forms]
@@ -211,8 +208,8 @@ def test_maps_of_other_places_are_not_confused(mi_rgb, file, rng):
 # -- files -------------------------------------------------------------------------------------------------------------
 
 
-def test_several_maps_and_none_named(mi_rgb, tmp_path):
+def test_several_maps_and_none_named(mi, tmp_path):
     path = make(tmp_path / "a.npz", replace(LAYOUT, maps=MAPS[1:]))
-    assert '"pair" has 2 channels, a texture has 1 or 3' in refused(mi_rgb, plugin(path, "pair"))
+    assert '"pair" has 2 channels, a texture has 1 or 3' in refused(mi, plugin(path, "pair"))
     with pytest.raises(RuntimeError, match="not given, and the file holds several maps: normal, roughness"):
-        mi_rgb.load_dict({"type": "neural_image", "filename": path})
+        mi.load_dict({"type": "neural_image", "filename": path})

@@ -138,8 +138,8 @@ def assert_equal(mi, rng, ours, theirs, below):
     "reading", [{}, {"filter": "anisotropic", "wrap_mode": "mirror"}, {"filter": "off", "storage": "float32"}]
 )
 @pytest.mark.parametrize("two_sided", [False, True])
-def test_equals_separate_plugins(mi_rgb, files, rng, reading, two_sided):
-    mi, constants = mi_rgb, {"clearcoat": 0.6, "anisotropic": 0.4, "specular": 0.7}
+def test_equals_separate_plugins(mi, files, rng, reading, two_sided):
+    constants = {"clearcoat": 0.6, "anisotropic": 0.4, "specular": 0.7}
     reading = {**reading, "to_uv": mi.ScalarTransform4f().scale([2, 3, 1]).rotate([0, 0, 1], 30)}
     theirs = separate(files["metal"], METAL, constants, **reading)
     ours = {"type": "neural_material", "filename": files["metal"], "two_sided": two_sided, **constants, **reading}
@@ -157,8 +157,8 @@ def test_equals_separate_plugins_in_every_variant(mi_any, files, rng):
     )
 
 
-def test_opacity_is_that_of_mask(mi_rgb, files, rng):
-    mi, ctx, n = mi_rgb, mi_rgb.BSDFContext(), 4000
+def test_opacity_is_that_of_mask(mi, files, rng):
+    ctx, n = mi.BSDFContext(), 4000
     maps = {"base_color": "base_color", "roughness": "roughness"}
     opacity = {"type": "neural_texture", "filename": files["leaf"], "channels": "opacity"}
     theirs = {"type": "mask", "opacity": opacity, "inner": separate(files["leaf"], maps, {})}
@@ -186,15 +186,15 @@ def test_opacity_is_that_of_mask(mi_rgb, files, rng):
 
 
 @pytest.mark.parametrize("reading", [{}, {"filter": "off", "lobes": "tables"}])
-def test_neutral_extras_change_nothing(mi_rgb, files, rng, reading):
-    ours, theirs = (mi_rgb.load_dict({"type": "neural_material", "filename": files[name], **reading})
+def test_neutral_extras_change_nothing(mi, files, rng, reading):
+    ours, theirs = (mi.load_dict({"type": "neural_material", "filename": files[name], **reading})
                     for name in ("round", "metal"))  # fmt: skip
-    assert_equal(mi_rgb, rng, ours, theirs, False)
+    assert_equal(mi, rng, ours, theirs, False)
 
 
-def test_extras_shape_and_weigh_the_highlight(mi_rgb, files, rng):
+def test_extras_shape_and_weigh_the_highlight(mi, files, rng):
     """The specular lobe is that of its matrix in NumPy, at the level and the place of the footprint."""
-    mi, n = mi_rgb, 2000
+    n = 2000
     bsdf = mi.load_dict({
         "type": "neural_material", "filename": files["shaped"], "ignore": "albedo, normal", "base_color": 0.0,
         "specular": 1.0, "filter": "trilinear",
@@ -222,9 +222,9 @@ def test_extras_shape_and_weigh_the_highlight(mi_rgb, files, rng):
 # -- parameters --------------------------------------------------------------------------------------------------------
 
 
-def test_what_the_file_rules_out_is_not_traced(mi_rgb, files):
+def test_what_the_file_rules_out_is_not_traced(mi, files):
     """Lobes that a constant map rules out are not traced, here and in ``disney`` with textures of the same file."""
-    mi, file = mi_rgb, files["plain"]
+    file = files["plain"]
     ours = mi.load_dict({"type": "neural_material", "filename": file, "spec_tint": 0.5, "storage": "float32"})
     names = {"base_color": "albedo", "roughness": "roughness", "metallic": "metallic"}
     textures = separate(file, names, {"spec_tint": 0.5}, storage="float32")["inner"]
@@ -248,17 +248,17 @@ def test_what_the_file_rules_out_is_not_traced(mi_rgb, files):
     assert counted[0] <= 1.1 * counted[1]
 
 
-def test_report_and_text(mi_rgb, files):
-    bsdf = mi_rgb.load_dict({"type": "neural_material", "filename": files["leaf"], "lobes": "tables"})
+def test_report_and_text(mi, files):
+    bsdf = mi.load_dict({"type": "neural_material", "filename": files["leaf"], "lobes": "tables"})
     (report,) = mi_diffind.inspect(bsdf).figures["reports"]
     assert report["learned"] and report["lobes"] == "tables" and report["table_bytes"] > 0
     assert report["maps"] == {name: name for name in ("base_color", "normal", "roughness", "opacity")}
     assert report["effects_left_out"]["ao"] == "the BRDF has no such parameter"
     assert {"normal", "opacity", "diffuse"} <= set(report["effects_in_use"]) and 7 in report["channels_left_out"]
     assert "filter = trilinear" in str(bsdf) and "lobes = tables" in str(bsdf)
-    shaped = mi_rgb.load_dict({"type": "neural_material", "filename": files["shaped"]})
+    shaped = mi.load_dict({"type": "neural_material", "filename": files["shaped"]})
     assert shaped.report()["extras"] and "extras" in shaped.report()["effects_in_use"] and not report["extras"]
-    assert mi_rgb.has_flag(shaped.flags(1), mi_rgb.BSDFFlags.Anisotropic)
+    assert mi.has_flag(shaped.flags(1), mi.BSDFFlags.Anisotropic)
     assert mi_diffind.inspect(files["shaped"]).figures["extras"] and "extras" in str(
         mi_diffind.inspect(files["shaped"])
     )
@@ -278,8 +278,8 @@ def test_report_and_text(mi_rgb, files):
         ("metal", {"two_sided": 1}, 'parameter "two_sided": found 1, allowed are true and false'),
     ],
 )
-def test_refusals(mi_rgb, files, name, parameters, sentence):
-    refusal = texture_scenes.refused(mi_rgb, {"type": "neural_material", "filename": files[name], **parameters})
+def test_refusals(mi, files, name, parameters, sentence):
+    refusal = texture_scenes.refused(mi, {"type": "neural_material", "filename": files[name], **parameters})
     assert sentence in refusal
 
 
@@ -296,10 +296,9 @@ def wall(mi, bsdf):
     }  # fmt: skip
 
 
-def test_footprints_reach_it(mi_rgb, files, capsys):
+def test_footprints_reach_it(mi, files, capsys):
     """The sensor of a scene is attached, and shows in the picture; plain Mitsuba warns once."""
     gc.collect()  # what other tests left would be traced, too
-    mi = mi_rgb
     bsdf = {"type": "neural_material", "filename": files["metal"], "to_uv": mi.ScalarTransform4f().scale(8)}
     theirs = separate(files["metal"], METAL, {}, to_uv=mi.ScalarTransform4f().scale(8))
     scene = mi_diffind.load_dict(wall(mi, bsdf))
@@ -315,9 +314,8 @@ def test_footprints_reach_it(mi_rgb, files, capsys):
     assert error < 0.1 * unfiltered and unfiltered > 0.005
 
 
-def test_counterparts(mi_rgb, rng, tmp_path):
+def test_counterparts(mi, rng, tmp_path):
     """Constants are exact in the file: pictures equal those of Mitsuba's plugins with the source."""
-    mi = mi_rgb
     normal = np.array([0.25, -0.15, 1]) / np.linalg.norm([0.25, -0.15, 1])
     maps = {
         "albedo": constant(0.8, 0.4, 0.2), "normal": constant(*(0.5 + 0.5 * normal)), "roughness": constant(0.6),

@@ -93,7 +93,7 @@ SCENE = """
 """
 
 
-def test_plugins_of_this_package_say_what_they_are(mi_rgb):
+def test_plugins_of_this_package_say_what_they_are(mi):
     declared = plugins.declared()
     assert {name: p.object_type for name, p in declared.items()} == {
         "disney": "bsdf", "mipmap": "texture", "neural_bsdf": "bsdf", "neural_disney": "bsdf", "neural_ggx": "bsdf",
@@ -106,7 +106,7 @@ def test_plugins_of_this_package_say_what_they_are(mi_rgb):
     assert plugins.with_counterpart("principled") == ("disney", "neural_disney", "neural_material")
 
 
-def test_manual_pages_are_complete(mi_rgb):
+def test_manual_pages_are_complete(mi):
     """Shared parts are filled in; each page names the program that cannot load the plugin, and the one that can."""
     folder = Path(plugins.__file__).parent
     for name, plugin in plugins.declared().items():
@@ -118,10 +118,10 @@ def test_manual_pages_are_complete(mi_rgb):
         assert not re.search(r"^ *\{\w+\}$", page, re.MULTILINE), plugin.name
 
 
-def test_program_of_mitsuba_loads_no_plugins(mi_rgb, tmp_path):
+def test_program_of_mitsuba_loads_no_plugins(mi, tmp_path):
     """Mitsuba's program loads no Python plugins; manual pages and the README change when this fails."""
     (tmp_path / "scene.xml").write_text('<scene version="3.0.0"><bsdf type="neural_disney"/></scene>')
-    program = Path(mi_rgb.__file__).parent / ("mitsuba.exe" if sys.platform == "win32" else "mitsuba")
+    program = Path(mi.__file__).parent / ("mitsuba.exe" if sys.platform == "win32" else "mitsuba")
     command = [str(program), "-m", "scalar_rgb", str(tmp_path / "scene.xml")]
     output = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert 'Plugin "neural_disney" not found!' in output.stdout + output.stderr
@@ -200,9 +200,9 @@ def test_factories_that_return_something_else(mi_toys, name, found):
             mi_toys.load_dict({"type": name})
 
 
-def test_two_plugins_of_one_name(mi_rgb, monkeypatch):
+def test_two_plugins_of_one_name(mi, monkeypatch):
     """The plugin of this package stays; a warning names the other one."""
-    variant, theirs = mi_rgb.variant(), metadata.EntryPoint("disney", "theirs.disney", plugins.__name__)
+    variant, theirs = mi.variant(), metadata.EntryPoint("disney", "theirs.disney", plugins.__name__)
     monkeypatch.setattr(metadata, "entry_points", lambda group: [theirs] if group == plugins.__name__ else [])
     monkeypatch.setitem(plugins._declared, variant, {})
     plugins._declared.pop(variant)

@@ -164,7 +164,7 @@ def test_undamaged_files_load(child, name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", trial_files.NAMES)
-def test_trials_have_the_arrays_of_the_kept_files(mi_rgb, tmp_path, name):
+def test_trials_have_the_arrays_of_the_kept_files(mi, tmp_path, name):
     """The files in ``corpus/seeds`` are what the trials still give."""
     task, trial = name.split("/")
     trained = trial_files.make(tasks()[task], trial, tmp_path, tmp_path / "trial.npz")
