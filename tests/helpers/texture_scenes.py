@@ -36,19 +36,6 @@ def hits(mi, uv, ddx=(0, 0), ddy=(0, 0), p=None):
     return si
 
 
-def seen(mi, n):
-    """Hits on the plane of :func:`plane`, whose footprints only its sensor knows."""
-    rng = np.random.default_rng(4)
-    uv = rng.random((2, n))
-    si = hits(mi, uv, p=np.stack([*(12 * uv - 6), np.zeros(n)]))
-    si.dp_du, si.dp_dv, si.n = mi.Vector3f(12, 0, 0), mi.Vector3f(0, 12, 0), mi.Normal3f(0, 0, 1)
-    si.sh_frame = mi.Frame3f(mi.Vector3f(0, 0, 1))
-    si.wi = dr.normalize(mi.Point3f(0, -2.5, 0.5) - si.p)
-    si.duv_dx, si.duv_dy = mi.Vector2f(0), mi.Vector2f(0)
-    dr.make_opaque(si.wi, si.dp_du, si.dp_dv, si.sh_frame)
-    return si
-
-
 def footprints(rng, n, size, largest=5.0):
     """Footprints in uv, from a fraction of a texel of ``size`` (width, height) to ``2^largest`` of them."""
     scale = 2 ** rng.uniform(-1, largest, n)
@@ -101,20 +88,6 @@ def plane(mi, texture, spp=1, sampler="stratified", size=48, shape=None):
 
 def psnr(a, b):
     return -10 * np.log10(np.mean((a - b) ** 2, dtype=np.float64))
-
-
-def scene_xml(content, size=16, depth=3):
-    """A scene file: a camera that looks along -z at the origin from 3 units away, and ``content``."""
-    return f"""<scene version="3.0.0">
-    <integrator type="path"><integer name="max_depth" value="{depth}"/></integrator>
-    <sensor type="perspective">
-        <transform name="to_world"><lookat origin="0,0,3" target="0,0,0" up="0,1,0"/></transform>
-        <sampler type="independent"><integer name="sample_count" value="8"/></sampler>
-        <film type="hdrfilm"><integer name="width" value="{size}"/><integer name="height" value="{size}"/>
-            <rfilter type="box"/></film>
-    </sensor>
-    {content}
-</scene>"""
 
 
 def refused(mi, wrong):

@@ -26,9 +26,6 @@ def directions(mi, rng, n, low=0.0):
     return vectors(mi, random_directions(rng, n, low))
 
 
-# -- values ------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name, decibels", [("disney", 120), ("tables", 84), ("paper", 34)])
 def test_values_are_burleys(mi, rng, name, decibels):
     """Values for random texels; densities are those of the exact plugin."""
@@ -89,9 +86,6 @@ def one_value(mi, bsdf, wi, wo, **si_fields):
 
 
 TILTED = (0.0, 0.6, 0.8), (0.6, 0.0, 0.8)
-
-
-# -- parameters --------------------------------------------------------------------------------------------------------
 
 
 def test_changing_type_from_principled_is_all_it_takes(mi):

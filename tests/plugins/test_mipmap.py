@@ -50,9 +50,6 @@ def expected(mi, truth, uv, level):
     return linear(numpy_of(truth.filtered(u, v, level)).T)
 
 
-# -- what is read ------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("taps", [1, 7])
 def test_anisotropic_is_the_mean_along_the_major_axis(mi, file, image, rng, taps):
     """The axis is that of singular values: ``taps`` places, half a level finer than each is wide."""
@@ -92,9 +89,6 @@ def test_random_numbers(mi, rng):
             assert ((counts - len(x) / 256) ** 2 / (len(x) / 256)).sum() < 255 + 5 * math.sqrt(2 * 255)
         again = textures.hit_numbers(texture_scenes.hits(mi, uv, p=p))[0].numpy()
         np.testing.assert_array_equal(again, a)
-
-
-# -- gradients ---------------------------------------------------------------------------------------------------------
 
 
 def changed(mi, texture, values):
@@ -185,9 +179,6 @@ def test_names_of_images_change_no_values(mi, tmp_path, rng, name, raw):
     np.testing.assert_allclose(np.broadcast_to(ours, theirs.shape), theirs, atol=1e-3)
 
 
-# -- sensors -----------------------------------------------------------------------------------------------------------
-
-
 def SENSOR(mi, spp=1, size=48):
     """The parameters of a texture for the sensor of :func:`texture_scenes.plane`."""
     to_world = mi.ScalarTransform4f().look_at([0, -2.5, 0.5], [0, 0, 0], [0, 0, 1])
@@ -219,9 +210,6 @@ def test_one_sample_a_pixel_on_a_plane(mi, detailed):
     assert quality["off"] == pytest.approx(quality["bitmap"], abs=0.05)
     assert quality["bitmap"] + 0.5 < quality["stochastic"] < quality["trilinear"] - 1, quality
     assert quality["bitmap"] + 5 < quality["trilinear"] < quality["anisotropic"] - 3, quality
-
-
-# -- in scenes ---------------------------------------------------------------------------------------------------------
 
 
 def test_sources(mi, tmp_path, image, rng):

@@ -378,9 +378,6 @@ def test_within_aov(mi, fields):
     assert np.abs(image[..., :3].mean((0, 1)) - expected[..., :3].mean((0, 1))).max() < 0.01
 
 
-# -- variants ----------------------------------------------------------------------------------------------------------
-
-
 def test_variants(mi_any):
     """``mono`` shows the luminance, spectra have the colour that was asked for."""
     mi = mi_any
@@ -401,9 +398,6 @@ def test_variants(mi_any):
     else:
         assert np.abs(image[..., 3] - expected[..., 3]).max() < 1e-5
         assert np.abs(image - expected).max() < 0.15 and np.abs((image - expected).mean((0, 1))).max() < 0.01
-
-
-# -- derivatives -------------------------------------------------------------------------------------------------------
 
 
 def lit(mi, field="bumps", **more):
@@ -559,9 +553,6 @@ def test_derivatives_of_spectra():
     check(mi, made, "tables.colour", spp=16, tolerance=0.03)
 
 
-# -- as an object of Mitsuba -------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "more, message",
     [
@@ -580,9 +571,6 @@ def test_what_is_refused(mi, fields, more, message):
     if "to_world" in more:
         more = {"to_world": mi.ScalarTransform4f().scale(more["to_world"])}
     assert message in refused(mi, {"type": "test_field", "field": "fog", **more})
-
-
-# -- files -------------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

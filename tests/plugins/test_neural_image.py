@@ -40,8 +40,6 @@ ROUNDING = 1e-4
 USABLE = tuple(m.name for m in MAPS if m.channels != 2)
 METHODS = ("eval", "eval_1", "eval_3", "eval_1_grad")
 
-# -- helpers -----------------------------------------------------------------------------------------------------------
-
 
 def make(path, layout=LAYOUT, border=("repeat", "clamp"), coarse=False):
     """A file of random arrays, the primary of 6 bits; ``coarse``: one of its two channels is in an array of its own."""
@@ -88,9 +86,6 @@ def values_of(textures, si, methods=METHODS):
             values[name, method] = None
     dr.eval([v for v in values.values() if v is not None])
     return {key: None if v is None else v.numpy() for key, v in values.items()}
-
-
-# -- the same as a bitmap ----------------------------------------------------------------------------------------------
 
 
 def test_equals_a_bitmap_of_what_it_decodes_to(mi_any, file, rng):
@@ -169,9 +164,6 @@ def test_gradient_of_the_image(mi, file, rng):
         np.testing.assert_allclose(image.eval_1_grad(hits(mi, uv)).numpy(), expected, atol=2e-3)
 
 
-# -- spectra -----------------------------------------------------------------------------------------------------------
-
-
 def test_upsampling_is_mitsubas(rng):
     """The same spectra as from Mitsuba's coefficients, for all colours."""
     mi, n = set_variant("llvm_ad_spectral"), 300
@@ -191,9 +183,6 @@ def test_upsampling_is_mitsubas(rng):
     assert error.max() < 2e-3 and error.mean() < 1e-5  # 0 and 1 are 1/8192 off in theirs
 
 
-# -- in materials ------------------------------------------------------------------------------------------------------
-
-
 def test_maps_of_other_places_are_not_confused(mi, file, rng):
     forms = [{}, {"to_uv": mi.ScalarTransform4f().scale(2)}, {"wrap_mode": "clamp"}, {"storage": "float32"}]
     si = hits(mi, rng.uniform(-1, 2, (2, 200)))
@@ -203,9 +192,6 @@ def test_maps_of_other_places_are_not_confused(mi, file, rng):
     dr.eval(together)
     for a, b in zip(alone, together, strict=True):
         np.testing.assert_allclose(a, b.numpy(), atol=1e-6)
-
-
-# -- files -------------------------------------------------------------------------------------------------------------
 
 
 def test_several_maps_and_none_named(mi, tmp_path):

@@ -98,9 +98,6 @@ def hits(mi, rng, n, below=False):
     return si
 
 
-# -- values ------------------------------------------------------------------------------------------------------------
-
-
 def assert_close(actual, desired, rtol, atol):
     """All but two lanes of a thousand are within the tolerances, and all within 100 times of them."""
     np.testing.assert_allclose(actual, desired, rtol=100 * rtol, atol=100 * atol)
@@ -219,9 +216,6 @@ def test_extras_shape_and_weigh_the_highlight(mi, files, rng):
     np.testing.assert_allclose(values, expected, rtol=2e-3, atol=1e-5)
 
 
-# -- parameters --------------------------------------------------------------------------------------------------------
-
-
 def test_what_the_file_rules_out_is_not_traced(mi, files):
     """Lobes that a constant map rules out are not traced, here and in ``disney`` with textures of the same file."""
     file = files["plain"]
@@ -281,9 +275,6 @@ def test_report_and_text(mi, files):
 def test_refusals(mi, files, name, parameters, sentence):
     refusal = texture_scenes.refused(mi, {"type": "neural_material", "filename": files[name], **parameters})
     assert sentence in refusal
-
-
-# -- scenes ------------------------------------------------------------------------------------------------------------
 
 
 def wall(mi, bsdf):

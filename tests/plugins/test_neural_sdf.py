@@ -223,9 +223,6 @@ def test_a_moved_shape_is_that_of_a_new_scene(mi, folder):
     np.testing.assert_array_equal(np.array(mi.render(loaded, spp=4)), before)
 
 
-# -- how fine a grid is ------------------------------------------------------------------------------------------------
-
-
 def grid_report(mi, path, error=None, **more):
     """Report of the torus as a grid, from a file that records this error of its arrays (``None``: none)."""
     table = sparse_table(scale=SCALE, centre=CENTRE)
@@ -259,9 +256,6 @@ def test_grids_of_files_without_a_measured_error(mi, tmp_path):
 def test_grids_without_an_inside_are_refused(mi):
     with pytest.raises(RuntimeError, match="nothing is inside at 13 cells"):
         distance_shapes.crop_grid(np.ones((12, 10, 14)), np.zeros(3), 0.1)
-
-
-# -- what cannot be ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

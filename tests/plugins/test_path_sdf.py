@@ -173,9 +173,6 @@ def test_what_solids_cannot_be(mi, fields, more, message):
         mi.load_dict({"type": "test_solid", "field": "ball", **more})
 
 
-# -- derivatives -------------------------------------------------------------------------------------------------------
-
-
 def interior(mi):
     """A sensor that sees the middle of the ball only."""
     film = {"type": "hdrfilm", "width": 12, "height": 8, "rfilter": {"type": "box"}}
