@@ -1,7 +1,5 @@
 """The texture ``mipmap``: filters against NumPy and many samples, texels, sensors; see ``test_texture_contract``."""
 
-import math
-
 import numpy as np
 import pytest
 import texture_scenes
@@ -11,7 +9,7 @@ from texture_scenes import linear
 from mi_diffind.core.compat import backend_module
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
-from mi_diffind.plugins.support import footprint, image_files, textures
+from mi_diffind.plugins.support import footprint, image_files
 from mi_diffind.scenes import loading
 
 SIZE = WIDTH, HEIGHT = 24, 16
@@ -74,21 +72,6 @@ def test_stochastic_is_unbiased(mi, file, rng, taps):
     error = found.std(axis=-1) / np.sqrt(n)
     assert (np.abs(found.mean(axis=-1) - truth) < 4.5 * error + 2e-5).all()
     assert error.max() > 1e-4
-
-
-def test_random_numbers(mi, rng):
-    """Uniform, and independent of each other and of where the hits are, for places on a line or in a small patch."""
-    n = 2**16
-    line = np.linspace(0, 1, n)
-    patch = np.mgrid[0:256, 0:256].reshape(2, -1) * 1e-3
-    for uv, p in ((np.stack([line, 0 * line]), np.stack([line, line, 0 * line])), (patch, np.zeros((3, n)))):
-        a, b = (x.numpy() for x in textures.hit_numbers(texture_scenes.hits(mi, uv, p=p)))
-        assert min(a.min(), b.min()) >= 0 and max(a.max(), b.max()) < 1
-        for x, y in ((a, b), (a[:-1], a[1:]), (b[:-1], b[1:]), (a[:-256], a[256:])):
-            counts = np.histogram2d(x, y, bins=16, range=[[0, 1]] * 2)[0]
-            assert ((counts - len(x) / 256) ** 2 / (len(x) / 256)).sum() < 255 + 5 * math.sqrt(2 * 255)
-        again = textures.hit_numbers(texture_scenes.hits(mi, uv, p=p))[0].numpy()
-        np.testing.assert_array_equal(again, a)
 
 
 def changed(mi, texture, values):

@@ -33,28 +33,27 @@ def files(tmp_path_factory):
     return {path.stem: str(path) for path in folder.glob("*.npz")}
 
 
-@pytest.mark.parametrize("name", ["isotropic", "anisotropic", "beckmann"])
-def test_values(mi, files, rng, name):
+#: File, parameters, and the member of a family, by default the middle of its range.
+VALUES = [
+    *((name, {"scale": 0.5}, None) for name in ("isotropic", "anisotropic", "beckmann")),
+    *(
+        ("family", {"roughness": r, "metallic": m}, (r, m))
+        for r, m in ((0.05, 0.0), (0.8, 1.0), (0.13, 0.4), (0.5, 0.9))
+    ),
+    ("family", {}, (0.2, 0.5)),
+]
+
+
+@pytest.mark.parametrize("name, given, of_family", VALUES)
+def test_values(mi, files, rng, name, given, of_family):
     """``eval`` is the formula times the cosine."""
-    n = 4000
-    bsdf = mi.load_dict({"type": "neural_bsdf", "filename": files[name], "scale": 0.5})
-    wi, wo = random_directions(rng, n, 0.05), random_directions(rng, n, 0.05)
-    expected = 0.5 * wo[:, 2:] * formula(load_table(files[name]), wi.astype(float), wo.astype(float))
+    bsdf = mi.load_dict({"type": "neural_bsdf", "filename": files[name], **given})
+    wi, wo = random_directions(rng, 2000, 0.05), random_directions(rng, 2000, 0.05)
+    table = load_table(files[name])
+    table = member(table, *of_family) if of_family else table
+    expected = given.get("scale", 1) * wo[:, 2:] * formula(table, wi.astype(float), wo.astype(float))
     value = numpy_of(bsdf.eval(mi.BSDFContext(), interactions(mi, wi), vectors(mi, wo)))
     np.testing.assert_allclose(value, expected, rtol=5e-3, atol=1e-6)
-
-
-def test_values_of_families(mi, files, rng):
-    """``eval`` is the formula of the member times the cosine; the default is the middle of the range."""
-    ctx = mi.BSDFContext()
-    wi, wo = random_directions(rng, 500, 0.05), random_directions(rng, 500, 0.05)
-    members = [(0.05, 0.0), (0.8, 1.0), (0.13, 0.4), (0.5, 0.9)]
-    cases = [({"roughness": roughness, "metallic": metallic}, (roughness, metallic)) for roughness, metallic in members]
-    for given, expected in (*cases, ({}, (0.2, 0.5))):
-        bsdf = mi.load_dict({"type": "neural_bsdf", "filename": files["family"], **given})
-        value = numpy_of(bsdf.eval(ctx, interactions(mi, wi), vectors(mi, wo)))
-        truth = wo[:, 2:] * formula(member(load_table(files["family"]), *expected), wi.astype(float), wo.astype(float))
-        np.testing.assert_allclose(value, truth, rtol=5e-3)
 
 
 @pytest.mark.slow

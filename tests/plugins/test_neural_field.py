@@ -581,32 +581,28 @@ def file(tmp_path_factory):
     return path
 
 
-def test_a_file_in_a_scene(mi, file, tmp_path):
+def test_a_file_in_a_scene(mi, file):
     """Images are those of the field in the file; commands know path depths and the nested integrator."""
-    text = """<scene version="3.0.0">
-        <integrator type="neural_field" id="it"><string name="filename" value="ball.npz"/>INNER</integrator>
-        <sensor type="perspective"><float name="fov" value="40"/>
-            <transform name="to_world"><lookat origin="0,-4,0" target="0,0,0" up="0,0,1"/></transform>
-            <film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="16"/>
-                <string name="pixel_format" value="rgba"/><rfilter type="box"/></film></sensor>
-    </scene>"""
-    (tmp_path / "ball.npz").write_bytes(file.read_bytes())
-    (tmp_path / "scene.xml").write_text(text.replace("INNER", ""))
-    inner = '<integrator type="prb"><integer name="max_depth" value="3"/></integrator>'
-    (tmp_path / "nested.xml").write_text(text.replace("INNER", inner))
-    inner = """<integrator type="neural_field"><string name="filename" value="ball.npz"/>
-        <transform name="to_world"><translate y="4"/></transform></integrator>"""
-    (tmp_path / "two.xml").write_text(text.replace("INNER", inner))
-    assert loading.ParsedScene(tmp_path / "two.xml").path_integrator() == ("neural_field", -1)
-    assert len(loading.load(tmp_path / "two.xml", longest_path=3).integrator().fields) == 2
-    assert loading.ParsedScene(tmp_path / "scene.xml").path_integrator() == ("neural_field", -1)
-    assert loading.ParsedScene(tmp_path / "nested.xml").path_integrator() == ("prb", 3)
-    loaded = loading.load(tmp_path / "scene.xml", longest_path=2)
-    assert loaded.integrator().surfaces.max_depth == 2
+    tracer = {"type": "neural_field", "filename": str(file), "id": "it"}
+    at = mi.ScalarTransform4f().look_at([0, -4, 0], [0, 0, 0], [0, 0, 1])
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "pixel_format": "rgba", "rfilter": {"type": "box"}}
+    sensor = {"type": "perspective", "fov": 40, "to_world": at, "film": film}
+    inner = {
+        "alone": {},
+        "nested": {"inner": {"type": "prb", "max_depth": 3}},
+        "two": {"inner": {**tracer, "id": "other", "to_world": mi.ScalarTransform4f().translate([0, 4, 0])}},
+    }
+    parsed = {name: loading.ParsedScene({"type": "scene", "integrator": {**tracer, **more}, "sensor": sensor})
+              for name, more in inner.items()}  # fmt: skip
+    found = {name: scene.path_integrator() for name, scene in parsed.items()}
+    assert found == {"alone": ("neural_field", -1), "nested": ("prb", 3), "two": ("neural_field", -1)}
+    loaded, two = (parsed[name].load(longest_path=2) for name in ("alone", "two"))
+    nested = parsed["nested"].load()
+    assert loaded.integrator().surfaces.max_depth == 2 and len(two.integrator().fields) == 2
     image = render(mi, loaded, 4)
     assert image[8, 8, 3] > 0.99 and image[0, 0, 3] == 0
     assert image[8, 5, 0] > 2 * image[8, 5, 2] > 0 and image[8, 10, 2] > 2 * image[8, 10, 0] > 0
-    assert np.abs(render(mi, loading.load(tmp_path / "nested.xml"), 4) - image).max() < 1e-5
+    assert np.abs(render(mi, nested, 4) - image).max() < 1e-5
     report = plugins.report(loaded.integrator())
     assert report["table_bytes"] > 0 and report["surfaces"] == "PathFootprint"
     register(mi, {"file": TASK.open(mi.TensorXf, file).field})

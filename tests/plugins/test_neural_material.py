@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import texture_scenes
 from bsdf_queries import random_directions, uniform, vectors
-from texture_files import make
+from texture_files import make, material
 
 import mi_diffind
 from mi_diffind import plugins
@@ -23,24 +23,13 @@ from mi_diffind.scenes import loading
 WIDTH, HEIGHT = 32, 16
 
 
-def waves(count):
-    """Smooth numbers in [0.15, 0.85], ``(HEIGHT, WIDTH, count)``."""
-    y, x = np.mgrid[0:HEIGHT, 0:WIDTH] / [[[HEIGHT]], [[WIDTH]]]
-    return 0.5 + 0.35 * np.sin(2 * np.pi * np.stack([x + k * y for k in range(count)], axis=-1) + np.arange(count))
-
-
 def constant(*values):
     return np.full((HEIGHT, WIDTH, len(values)), values)
 
 
-def bumps(strength):
-    xy = strength * (waves(2) - 0.5)
-    return 0.5 + 0.5 * np.concatenate([xy, np.sqrt(1 - (xy**2).sum(-1, keepdims=True))], axis=-1)
-
-
 def stored(path, extras=None, **maps):
-    maps = from_arrays({name: np.rint(255 * v).astype(np.uint8) for name, v in maps.items()})
-    return make(path, maps, extras=extras)
+    maps = {name: v if v.dtype == np.uint8 else np.rint(255 * v).astype(np.uint8) for name, v in maps.items()}
+    return make(path, from_arrays(maps), extras=extras)
 
 
 def shapes(shape):
@@ -54,18 +43,19 @@ def neutral(shape):
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    folder, wave = tmp_path_factory.mktemp("materials"), waves(6)
-    metal = {"albedo": wave[..., :3], "normal": bumps(1.2), "roughness": wave[..., 3:4], "metallic": wave[..., 4:5]}
-    leaf = {"base_color": wave[..., :3], "normal": bumps(0.5), "roughness": wave[..., 3:4], "opacity": wave[..., 4:5]}
+    folder, maps = tmp_path_factory.mktemp("materials"), material(WIDTH, HEIGHT)
+    other = np.roll(maps["roughness"], 5, axis=1)
+    metal = {**maps, "metallic": other}
+    leaf = {"base_color": maps["albedo"], "normal": maps["normal"], "roughness": maps["roughness"], "opacity": other}
     # Nothing but the roughness varies, and no lobe but the specular one and the diffuse one is possible
-    plain = {"albedo": constant(0.2, 0.2, 0.2), "roughness": wave[..., 3:4], "metallic": constant(0)}
+    plain = {"albedo": constant(0.2, 0.2, 0.2), "roughness": maps["roughness"], "metallic": constant(0)}
     return {
         "metal": stored(folder / "metal.npz", **metal),
         "shaped": stored(folder / "shaped.npz", shapes, **metal),
         "round": stored(folder / "round.npz", neutral, **metal),
-        "leaf": stored(folder / "leaf.npz", **leaf, ao=wave[..., 5:]),
+        "leaf": stored(folder / "leaf.npz", **leaf, ao=other[::-1]),
         "plain": stored(folder / "plain.npz", **plain, emission=constant(0.5, 0.2, 0.1)),
-        "other": stored(folder / "other.npz", albedo=wave[..., :3], height=wave[..., 3:4]),
+        "other": stored(folder / "other.npz", albedo=maps["albedo"], height=maps["roughness"]),
     }
 
 
@@ -318,17 +308,13 @@ def test_counterparts(mi, rng, tmp_path):
     names = ", ".join(f'"{name}": "{name}.png"' for name in maps)
     (tmp_path / "paint.json").write_text(f'{{"maps": {{{names}}}}}')
     mi_diffind.fit("texture", tmp_path / "paint.json", steps=1, progress=False).save(tmp_path / "paint.npz")
-    (tmp_path / "scene.xml").write_text("""<scene version="3.0.0"><integrator type="path"><integer name="max_depth"
-        value="4"/></integrator><emitter type="constant"/><emitter type="point"><point name="position" x="1" y="-1"
-        z="2"/></emitter><sensor type="perspective"><transform name="to_world"><lookat origin="0,-1.5,3"
-        target="0,0,0" up="0,1,0"/></transform><film type="hdrfilm"><integer name="width" value="4"/><integer
-        name="height" value="4"/></film></sensor><shape type="rectangle"><bsdf type="neural_material"><string
-        name="filename" value="paint.npz"/><boolean name="two_sided" value="true"/><float name="clearcoat"
-        value="0.5"/><float name="clearcoat_sampling_rate" value="2"/></bsdf></shape></scene>""")
-    written = mi.render(loading.load(tmp_path / "scene.xml"), spp=64).numpy()
+    given = {"type": "neural_material", "filename": str(tmp_path / "paint.npz"), "two_sided": True, "clearcoat": 0.5}
+    lamp = {"type": "point", "position": [1, -1, 2], "intensity": 1.0}
+    scene = {**wall(mi, {**given, "clearcoat_sampling_rate": 2.0}), "lamp": lamp}
+    written = mi.render(loading.load_dict(scene), spp=64).numpy()
     for against in ("exact", "mipmap", "principled"):
-        scene = loading.load(tmp_path / "scene.xml", exact=True, against=against)
-        assert not [r for r in loading.reports(scene) if r["plugin"].startswith("neural")]
-        image = mi.render(scene, spp=64).numpy()
+        loaded = loading.ParsedScene(scene).load(exact=True, against=against)
+        assert not [r for r in loading.reports(loaded) if r["plugin"].startswith("neural")]
+        image = mi.render(loaded, spp=64).numpy()
         np.testing.assert_allclose(image, written, rtol=0.05 if against == "principled" else 2e-3)
     assert plugins.declared()["neural_material"].counterpart().oversampling == 8
