@@ -13,6 +13,7 @@ import pytest
 from variants import VARIANTS, set_variant
 
 from mi_diffind import plugins
+from mi_diffind.plugins.support import footprint
 
 #: Variants of the tests that always run.
 QUICK = tuple(variant for variant in VARIANTS if variant.endswith("_ad_rgb"))
@@ -86,6 +87,7 @@ def test_objects_die_with_their_scene(mi, no_garbage_collection, name):
     examples.load(mi, name, storage)  # arrays of files are kept
     before = alive()
     scene = examples.load(mi, name, storage)
+    footprint.attach(scene)
     params, keys = examples.exposed(mi, scene, name)
     for key in keys[:1]:
         dr.enable_grad(params[key])
