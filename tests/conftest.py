@@ -49,6 +49,12 @@ def mi_rgb(request):
     return set_variant(request.param)
 
 
+@pytest.fixture
+def mi(mi_rgb):
+    """``mitsuba`` with an RGB variant set, by its usual name."""
+    return mi_rgb
+
+
 @pytest.fixture(params=VARIANTS)
 def mi_any(request):
     """``mitsuba`` with each supported variant set in turn."""

@@ -335,7 +335,7 @@ def _integrators(state) -> list[str]:
 def integrator_properties(state) -> list:
     """Return the properties of all integrators of a parsed scene, nested ones included."""
     names = {name for name, plugin in plugins.declared().items() if plugin.object_type == "integrator"}
-    return compat.parsed_properties(state, mi.ObjectType.Integrator, names)
+    return compat.parsed_properties(state, mi.ObjectType.Integrator, names | set(MAX_DEPTHS))
 
 
 def _path_integrator(state):

@@ -47,12 +47,6 @@ def conductor(wi, wo, alpha, eta=0.0, k=1.0, normals=distribution):
     return fresnel(cosine, eta, k) * d * masking / (4 * wi[..., 2])
 
 
-def density(wi, wo, alpha):
-    """Solid angle density of ``wo`` where normals are sampled as seen from ``wi``; equations 14 and 24."""
-    wi = np.asarray(wi, np.float64)
-    return distribution(half_sin2(wi, wo), alpha) * smith(wi[..., 2], alpha) / (4 * wi[..., 2])
-
-
 def learned(table, inputs, output):
     """
     The distribution that a ``Table`` holds, a function of sin²θ and α, under an encoding of the given names: two

@@ -6,7 +6,6 @@ Each raises what the library raises, or a fault; it returns further figures of a
 from __future__ import annotations
 
 import contextlib
-import functools
 import inspect
 import io
 from pathlib import Path
@@ -71,10 +70,6 @@ def load(path: str):
     return find_task(load_table(path)).load(path)
 
 
-#: Checked table of an original file.
-original_table = functools.lru_cache(maxsize=32)(load)
-
-
 def check_arrays(table, before, untouched: list[str] | None) -> None:
     """Raise a fault for an array that differs from the original's without a reason.
 
@@ -95,7 +90,7 @@ def check_arrays(table, before, untouched: list[str] | None) -> None:
 def table(path: str, original: str, untouched: list[str] | None, evaluate: bool = True) -> None:
     """Read a table file, compare it with the original, describe it, decode it and render the plugin that reads it."""
     loaded, model = bounded(lambda: opened(path), path)
-    check_arrays(loaded, original_table(original), untouched)
+    check_arrays(loaded, load(original), untouched)
     figures, lines = model.describe()
     check_finite(figures, "describe")
     for line in lines:

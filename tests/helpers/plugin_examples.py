@@ -126,14 +126,3 @@ def exposed(mi, scene, name: str):
 def copied(value):
     """Return a copy of the value of a parameter. (A tensor made of ``numpy()`` would use memory that Dr.Jit frees.)"""
     return type(value)(aligned(value.numpy())) if dr.is_tensor_v(value) else type(value)(value)
-
-
-def another(value):
-    """Return another valid value of a parameter: smaller numbers, or an example that is moved, turned and scaled."""
-    if dr.is_tensor_v(value):
-        return type(value)(aligned(np.float32(0.9) * value.numpy()))
-    if not hasattr(value, "inverse_transpose"):
-        return type(value)(value * 0.7)
-    if dr.size_v(type(value.matrix)) == 4:
-        return type(value)().translate([0.1, 0.05, -0.1]).rotate([0, 1, 0], 30) @ value
-    return type(value)().translate([0.2, 0.1]).scale(1.5) @ value

@@ -47,7 +47,7 @@ def make(path, source, preset="ours", border="repeat", extras=None, **settings):
     return str(path)
 
 
-def make_image(path, source, border="repeat"):
+def make_image(path, source, border="repeat", **settings):
     """Write a file of the task ``image`` whose arrays are those at the start of a training, almost without loss."""
     recipe, types = image.PRESETS["ours"], array_module("llvm")
     stored = image_training.source_layout(source, recipe).stored
@@ -55,5 +55,5 @@ def make_image(path, source, border="repeat"):
     size = image_arrays.ImageBudget(source.height, source.width, 8, stored, dims, 8)
     problem = image_training.build_problem(source, size, recipe, types, border=(border, border))
     stored_net = image_training.stored_form(problem.net, problem.bits)
-    save_table(path, image_arrays.to_table(image_arrays.CompressedImage(problem.layout, stored_net), {}))
+    save_table(path, image_arrays.to_table(image_arrays.CompressedImage(problem.layout, stored_net), settings))
     return str(path)

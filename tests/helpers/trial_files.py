@@ -1,12 +1,14 @@
 """Small valid files of every task, from fits of seconds (:data:`TRIALS`).
 
 Some of these fits take minutes: their files are kept in ``tests/trust/corpus/seeds``, which ``python
-tests/trust/run.py --seeds`` writes anew.
+tests/helpers/trial_files.py TASK/NAME...`` writes anew.
 """
 
 from __future__ import annotations
 
 import contextlib
+import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -94,3 +96,10 @@ def make(task: Task, name: str, folder: Path, output: Path) -> Path:
     for key in [key for key in fitted.table.settings if key.endswith("_path")]:
         del fitted.table.settings[key]  # a folder of this machine
     return fitted.save(output)
+
+
+if __name__ == "__main__":
+    for trial in sys.argv[1:] or NAMES:
+        task, name = trial.split("/")
+        with tempfile.TemporaryDirectory() as folder:
+            print(make(tasks()[task], name, Path(folder), SEEDS / f"{task}_{name}.npz"))

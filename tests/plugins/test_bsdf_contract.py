@@ -36,12 +36,11 @@ from bsdf_queries import (
     vectors,
 )
 from half_vectors import HalfVectorSampling
-from texture_scenes import alive
+from texture_scenes import refused
 from variants import VARIANTS, set_variant
 
 from mi_diffind import plugins
 from mi_diffind.arrays.tables import save_table
-from mi_diffind.core import compat
 from mi_diffind.tasks.disney import TASK as DISNEY
 from mi_diffind.tasks.ggx import TASK as GGX
 
@@ -197,6 +196,7 @@ LOBES = {
     "neural_bsdf": ("neural_bsdf anisotropic", {}, 0.1),
     "family": ("neural_bsdf family", {"roughness": 0.3, "metallic": 0.1}, 0.1),
     "rough family": ("neural_bsdf family", {"roughness": 0.75, "metallic": 0.9}, 0.5),
+    **{f"component {c}": ("disney", disney_materials.RICH, None) for c in range(3)},
 }  # fmt: skip
 
 
@@ -205,43 +205,39 @@ def lobe_sampling(mi, case, angle):
     alpha = alpha or disney_materials.smallest_alpha(parameters)
     bsdf = mi.load_dict(disney_materials.plugin(mi, described(name), {**disney_materials.PLAIN, **parameters})
                         if "disney" in name else described(name, **parameters))  # fmt: skip
-    return HalfVectorSampling(mi, bsdf, angle, alpha)
+    ctx = mi.BSDFContext()
+    if case.startswith("component"):
+        ctx.component = int(case[-1])
+    return HalfVectorSampling(mi, bsdf, angle, alpha, ctx)
 
 
 CHI2_COUNT = 3 * len(LOBES)
 
 
-@pytest.mark.parametrize("angle", [5, 60, 89])
-@pytest.mark.parametrize("case", LOBES)
-def test_chi2(mi_rgb, case, angle, in_folder):
-    """``sample`` draws from ``pdf``, in coordinates in which a lobe of any width is smooth."""
-    messages, valid = lobe_sampling(mi_rgb, case, angle).faults(CHI2_COUNT)
+@pytest.mark.parametrize(
+    "case, angle", [(case, angle) for case in LOBES for angle in (5, 60, 89) if angle == 60 or "component" not in case]
+)
+def test_chi2(mi, case, angle, in_folder):
+    """
+    ``sample`` draws from ``pdf``, also in a context of one of several components, in coordinates in which a lobe of any
+    width is smooth.
+    """
+    messages, valid = lobe_sampling(mi, case, angle).faults(CHI2_COUNT)
     assert not messages, messages
     assert valid > 1e5, "hardly a sample is valid, the test says nothing"
 
 
-@pytest.mark.parametrize("component", range(3))
-def test_chi2_of_one_lobe(mi_rgb, component, in_folder):
-    """``sample`` draws from ``pdf`` in a context of one of several components, too."""
-    ctx = mi_rgb.BSDFContext()
-    ctx.component = component
-    alpha = disney_materials.smallest_alpha(disney_materials.RICH)
-    bsdf = mi_rgb.load_dict(disney_materials.plugin(mi_rgb, "disney", disney_materials.RICH))
-    messages, _ = HalfVectorSampling(mi_rgb, bsdf, 60, alpha, ctx).faults(3)
-    assert not messages, messages
-
-
 @pytest.mark.parametrize("name", PLUGINS)
-def test_chi2_on_the_sphere(mi_rgb, name, in_folder):
+def test_chi2_on_the_sphere(mi, name, in_folder):
     """``sample`` draws from ``pdf``: nothing is hidden by the choice of coordinates."""
-    cell = trust.chi2(mi_rgb, BSDFS[name][0], trust.Effort(chi2_samples=300_000, angles=(20, 80)))
+    cell = trust.chi2(mi, BSDFS[name][0], trust.Effort(chi2_samples=300_000, angles=(20, 80)))
     assert cell.result == trust.HOLDS, cell
 
 
 @pytest.mark.parametrize("case, angle", [("neural_ggx 0.001", 60), ("disney rich", 85), ("family", 5)])
-def test_chi2_has_power(mi_rgb, case, angle, in_folder):
+def test_chi2_has_power(mi, case, angle, in_folder):
     """Densities that are 3% too high or too low, or seen from 1° beside, are rejected at the same level."""
-    right, beside = (lobe_sampling(mi_rgb, case, a) for a in (angle, angle + 1))
+    right, beside = (lobe_sampling(mi, case, a) for a in (angle, angle + 1))
     seen = beside.interactions
     for what, pdf in {
         "high": lambda p: 1.03 * right.pdf(p),
@@ -268,13 +264,16 @@ FROM = np.array([(a, b) for a in NONE for b in (*DIRECTIONS, *NONE)])
 TO = np.array([(b, a) for a in NONE for b in DIRECTIONS])
 RIGHT = np.array([(a, b) for a in DIRECTIONS for b in DIRECTIONS])
 
-SMOOTHEST = {"disney": {"roughness": 0.0, "clearcoat_gloss": 1.0, "metallic": 1.0}, "neural_ggx": {"alpha": 0.0}}
+HARDEST = [
+    ("disney", {"roughness": 0.0, "clearcoat_gloss": 1.0, "metallic": 1.0}), ("neural_ggx", {"alpha": 0.0}),
+    ("neural_ggx", {"alpha": 1.0, "eta": 0.0, "k": 0.0}),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize("name, more", [*((name, {}) for name in BSDFS), *SMOOTHEST.items()])
-def test_vectors_that_are_no_directions(mi_rgb, name, more):
+@pytest.mark.parametrize("name, more", [*((name, {}) for name in BSDFS), *HARDEST])
+def test_vectors_that_are_no_directions(mi, name, more):
     """Vectors of masked lanes: values and derivatives are 0, beside those of the pairs of directions."""
-    mi, pairs, wrong = mi_rgb, np.concatenate([FROM, TO, RIGHT]), len(FROM) + len(TO)
+    pairs, wrong = np.concatenate([FROM, TO, RIGHT]), len(FROM) + len(TO)
     bsdf, n = load(mi, name, **more), len(pairs)
     si, towards = interactions(mi, pairs[:, 0], np.full(n, 0.3)), vectors(mi, pairs[:, 1])
     params = mi.traverse(bsdf)
@@ -341,9 +340,9 @@ def test_extreme_inputs(rng, name, polarised):
 
 
 @pytest.mark.parametrize("name", [name for name in TEXTURED if name != "neural_disney paper"])
-def test_texels_are_read_as_numbers_in_their_range(mi_rgb, rng, name):
+def test_texels_are_read_as_numbers_in_their_range(mi, rng, name):
     """Texels beyond the range count as its ends, NaN as the lower one: each by itself, whatever its neighbours are."""
-    mi, n = mi_rgb, 3000
+    n = 3000
     low, high = (0.05, 0.8) if "family" in name else (0.0, 1.0)
     given = [2.0, math.inf, -1.0, 0.3, math.nan, -math.inf, 0.7]
     used = [high, high, low, 0.3, low, low, 0.7]
@@ -363,9 +362,9 @@ def test_texels_are_read_as_numbers_in_their_range(mi_rgb, rng, name):
 
 
 @pytest.mark.parametrize("name", TRAINED)
-def test_entries_of_any_value_are_harmless(mi_rgb, rng, name):
+def test_entries_of_any_value_are_harmless(mi, rng, name):
     """Each table in turn, all of it and one entry in four: answers are finite, and derivatives if the entries are."""
-    mi, n = mi_rgb, 2000
+    n = 2000
     bsdf = load(mi, name)
     params, before, changed = mi.traverse(bsdf), None, set()
     tables = {key: np.array(params[key].numpy()) for key in params.keys() if "tables." in key}
@@ -394,12 +393,12 @@ def test_entries_of_any_value_are_harmless(mi_rgb, rng, name):
 
 @pytest.mark.parametrize("kind", ["number", "bitmap", "texture"])
 @pytest.mark.parametrize("name", [name for name in TEXTURED if "paper" not in name])
-def test_updated_parameters_show(mi_rgb, rng, name, kind):
+def test_updated_parameters_show(mi, rng, name, kind):
     """
     Values are those of a BSDF loaded so: of numbers, of bitmaps, and of a texture that is updated by itself, of which
     nobody tells the material; also what was left out, or evaluated once.
     """
-    mi, n = mi_rgb, 1000
+    n = 1000
     si, wo = interactions(mi, random_directions(rng, n, 0.1), np.zeros(n)), vectors(mi, random_directions(rng, n, 0.1))
     base = {"eta": 0.5} if "ggx" in name else {"base_color": {"type": "rgb", "value": [0.6, 0.3, 0.2]}}
     base = {} if "family" in name else base
@@ -426,9 +425,9 @@ def test_updated_parameters_show(mi_rgb, rng, name, kind):
 
 
 @pytest.mark.parametrize("name, parameter", [("disney", "clearcoat"), ("neural_ggx", "alpha")])
-def test_textures_that_vary_without_saying_so(mi_rgb, name, parameter):
+def test_textures_that_vary_without_saying_so(mi, name, parameter):
     """Mitsuba's ``mesh_attribute`` calls itself constant: its value at no mesh at all is not that of the material."""
-    mi, images = mi_rgb, []
+    images = []
     for value in ({"type": "mesh_attribute", "name": "vertex_value"}, 0.5):
         mesh = mi.Mesh("quad", 4, 2)
         params = mi.traverse(mesh)
@@ -452,9 +451,9 @@ LEFT_OUT["neural_disney"] = LEFT_OUT["disney"]
 
 @pytest.mark.parametrize("update", [False, True])
 @pytest.mark.parametrize("name", LEFT_OUT)
-def test_an_optimised_parameter_keeps_its_effect(mi_rgb, name, update):
+def test_an_optimised_parameter_keeps_its_effect(mi, name, update):
     """An optimised parameter at the value at which its effect is left out has a gradient, through the renderer, too."""
-    mi, (values, effects) = mi_rgb, LEFT_OUT[name]
+    values, effects = LEFT_OUT[name]
     scene = sphere_scene(mi, described(name, **values), "prb", size=8)
     params, bsdf = mi.traverse(scene), scene.shapes()[0].bsdf()
     keys = [key_of(params, f"{parameter}.value") for parameter in values]
@@ -477,9 +476,9 @@ def test_an_optimised_parameter_keeps_its_effect(mi_rgb, name, update):
 
 @pytest.mark.parametrize("update", [False, True])
 @pytest.mark.parametrize("name", ["neural_disney", "neural_disney paper", "neural_ggx", "neural_bsdf family"])
-def test_tables_keep_their_gradients_where_parameters_are_constant(mi_rgb, rng, name, update):
+def test_tables_keep_their_gradients_where_parameters_are_constant(mi, rng, name, update):
     """Constant parameters are evaluated once, and yet tables that are trained get derivatives."""
-    mi, n, gradients = mi_rgb, 1000, []
+    n, gradients = 1000, []
     si, wo = interactions(mi, random_directions(rng, n, 0.1), np.zeros(n)), vectors(mi, random_directions(rng, n, 0.1))
     constants = {p: ends[1] for p, ends in TEXTURED[name].items()}
     for given in (constants, {p: bitmap(mi, np.full((2, 2), v)) for p, v in constants.items()}):
@@ -499,9 +498,9 @@ def test_tables_keep_their_gradients_where_parameters_are_constant(mi_rgb, rng, 
 
 
 @pytest.mark.parametrize("name", TRAINED[:-1])  # the maps of one file are shared by all that read it
-def test_assigned_tables_are_those_of_one_instance(mi_rgb, rng, name):
+def test_assigned_tables_are_those_of_one_instance(mi, rng, name):
     """Tables of two instances of one file are apart."""
-    mi, n = mi_rgb, 500
+    n = 500
     si, wo = interactions(mi, random_directions(rng, n), np.full(n, 0.3)), vectors(mi, random_directions(rng, n))
     first, second = (load(mi, name) for _ in range(2))
     before = intensities(mi, second.eval(mi.BSDFContext(), si, wo))
@@ -515,9 +514,9 @@ def test_assigned_tables_are_those_of_one_instance(mi_rgb, rng, name):
 
 @pytest.mark.parametrize("is_textured", [False, True])
 @pytest.mark.parametrize("name", ["neural_bsdf anisotropic", "neural_bsdf family", "neural_ggx", "neural_ggx paper"])
-def test_gradients_against_differences(mi_rgb, rng, name, is_textured):
+def test_gradients_against_differences(mi, rng, name, is_textured):
     """Derivatives by parameters, numbers or texels, and by tables. (``docs/trust.md`` has the default forms.)"""
-    mi, n = mi_rgb, 2**13
+    n = 2**13
     ends = TEXTURED.get(name, {})
     if is_textured and not ends:
         pytest.skip("none of its parameters may be a texture")
@@ -546,9 +545,9 @@ def test_every_variant_renders(mi_any):
 
 
 @pytest.mark.parametrize("integrator", ["path", "prb", "direct"])
-def test_several_materials_in_one_loop(mi_rgb, integrator):
+def test_several_materials_in_one_loop(mi, integrator):
     """Each sphere looks as it does where it is the only one that is not black: other plugins, tables and storage."""
-    mi, names = mi_rgb, list(BSDFS)
+    names = list(BSDFS)
     black = {"type": "diffuse", "reflectance": 0.0}
 
     def image(chosen):
@@ -563,12 +562,12 @@ def test_several_materials_in_one_loop(mi_rgb, integrator):
 
 
 @pytest.mark.parametrize("name, count", [("neural_disney", 600), ("neural_ggx", 300), ("neural_bsdf family", 200)])
-def test_many_materials_are_loaded_while_a_render_is_running(mi_rgb, name, count):
+def test_many_materials_are_loaded_while_a_render_is_running(mi, name, count):
     """
     Mitsuba constructs objects in parallel. A constructor that waits for a kernel lets its thread start on the next
     object in the meantime, one inside the other, until Python's stack is full.
     """
-    mi, parameter = mi_rgb, "alpha" if name == "neural_ggx" else "roughness"
+    parameter = "alpha" if name == "neural_ggx" else "roughness"
     running = sphere_scene(mi, {"type": "diffuse"})
     mi.render(running, spp=16).numpy()
     image = mi.render(running, spp=10_000)
@@ -595,26 +594,19 @@ def test_scenes_are_loaded_in_many_threads():
         mi.set_variant("llvm_ad_rgb")
         # As long as a scene exists, threads do not create and free Embree's device at once
         kept = mi.load_dict({"type": "scene", "sphere": {"type": "sphere"}})
-        loaded, failures, names = [], [], ("neural_ggx", "disney", "neural_disney", "neural_bsdf", "neural_material")
+        loaded, plugins = [], ("neural_ggx", "disney", "neural_disney", "neural_bsdf", "neural_material")
+        number = {"neural_ggx": "alpha", "neural_bsdf": "scale"}
 
         def load(k):
             mi.set_variant("llvm_ad_rgb")
-            try:
-                for i in range(3):
-                    spheres = {f"s{j}": {"type": "sphere", "center": [j, i, k],
-                                         "bsdf": examples.example(names[j % 5], **more(names[j % 5], j))}
-                               for j in range(15)}
-                    loaded.append(mi.load_dict({"type": "scene", **spheres}))
-            except BaseException as e:
-                failures.append(repr(e))
-
-        def more(name, j):
-            return {{"neural_ggx": "alpha", "neural_bsdf": "scale"}.get(name, "clearcoat"): 0.05 * (j + 1)}
+            for i in range(3):
+                bsdfs = [examples.example(n, **{number.get(n, "clearcoat"): 0.1}) for n in 3 * plugins]
+                spheres = [{"type": "sphere", "center": [j, i, k], "bsdf": bsdf} for j, bsdf in enumerate(bsdfs)]
+                loaded.append(mi.load_dict({"type": "scene", **{f"s{j}": s for j, s in enumerate(spheres)}}))
 
         threads = [threading.Thread(target=load, args=(k,)) for k in range(8)]
         [t.start() for t in threads]
         [t.join() for t in threads]
-        assert not failures, failures[0]
         assert all(len(scene.shapes()) == 15 and all(s.bsdf().report() for s in scene.shapes()) for scene in loaded)
         print(len(loaded))
         """
@@ -623,28 +615,13 @@ def test_scenes_are_loaded_in_many_threads():
     assert done.returncode == 0 and done.stdout.strip() == "24", done.stderr[-2000:]
 
 
-@pytest.mark.parametrize("name", BSDFS)
-def test_materials_die_with_their_scene(mi_rgb, no_garbage_collection, name):
-    """
-    Without waiting for the garbage collector: Dr.Jit refuses to freeze a function, and may crash in the middle of a
-    render, if instances that nobody holds any more are in its registry.
-    """
-    mi, kind = mi_rgb, type(load(mi_rgb, name)).__name__
-    before = alive(kind)
-    scene = sphere_scene(mi, described(name))
-    mi.render(scene, spp=1)
-    assert alive(kind) == before + 1
-    del scene
-    assert alive(kind) == before
-
-
 # -- files and mistakes ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("plugin, task", [("neural_ggx", GGX), ("neural_disney", DISNEY)])
-def test_own_tables(mi_rgb, rng, tmp_path, plugin, task):
+def test_own_tables(mi, rng, tmp_path, plugin, task):
     """``filename`` is read, relative to the scene, in the form that is asked for or its own."""
-    mi, n = mi_rgb, 500
+    n = 500
     si, wo = interactions(mi, random_directions(rng, n)), vectors(mi, random_directions(rng, n))
     for preset in task.presets:
         save_table(tmp_path / "own.npz", task.load(task.file(preset=preset)).to("uint8"))
@@ -710,23 +687,12 @@ MISTAKES = [
 
 
 @pytest.mark.parametrize("plugin, parameters, sentence", MISTAKES)
-def test_mistakes_are_refused(mi_rgb, folder, plugin, parameters, sentence):
+def test_mistakes_are_refused(mi, folder, plugin, parameters, sentence):
     """One sentence that names the parameter, what was found and what is allowed."""
     if (folder / parameters.get("filename", "none")).is_file():
         parameters = {**parameters, "filename": str(folder / parameters["filename"])}
-    with pytest.raises(RuntimeError) as caught:
-        mi_rgb.load_dict({"type": plugin, **parameters})
-    refusal = compat.one_sentence(caught.value)
-    assert sentence in refusal and "\n" not in refusal and len(refusal.split(": parameter", 1)[-1]) < 300
+    assert sentence in refused(mi, {"type": plugin, **parameters})
 
 
-def test_scalar_variants_are_refused():
-    import mitsuba as mi
-
-    mi.set_variant("scalar_rgb")
-    bsdfs = [name for name, plugin in plugins.declared().items() if plugin.object_type == "bsdf"]
-    assert set(bsdfs) == set(PLUGINS)
-    for name in bsdfs:
-        refusal = f'"{name}" does not run in the variant "scalar_rgb"; use one of llvm_ad'
-        with pytest.raises(RuntimeError, match=refusal):
-            mi.load_dict({"type": name})
+def test_the_contract_has_every_bsdf(mi):
+    assert {name for name, plugin in plugins.declared().items() if plugin.object_type == "bsdf"} == set(PLUGINS)

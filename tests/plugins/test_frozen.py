@@ -22,15 +22,13 @@ SEED = 3
 
 NAMES = [*examples.names(), "family"]
 
-CASES = [(name, storage) for name in NAMES for storage in ("", "float32")]
+CASES = [*((name, storage) for name in NAMES for storage in ("", "float32")), ("lit field", "float32")]
 
 #: Plugins that expose numbers or a place of their own.
-NUMBERS = [
-    name for name in (*examples.names(), "family") if name not in ("path_footprint", "path_sdf", "neural_texture")
-]
+NUMBERS = [name for name in NAMES if name not in ("path_footprint", "path_sdf", "neural_texture")]
 
-#: Arguments of an example: a family of ``neural_bsdf`` has a file of its own.
-EXAMPLES = {"family": {"name": "neural_bsdf"}}
+#: Arguments of further examples: a family of ``neural_bsdf`` has a file of its own.
+EXAMPLES = {"family": {"name": "neural_bsdf"}, "lit field": {"name": "neural_field", "lit": True}}
 
 pytestmark = pytest.mark.usefixtures("no_garbage_collection")
 
@@ -85,10 +83,9 @@ def from_drjit(value, factor):
 
 
 @pytest.mark.parametrize(("name", "storage"), CASES)
-def test_frozen_pictures_follow_every_parameter(mi_rgb, name, storage):
-    """Three values in each of three ways. All parameters change at once, each in another way, and in the end each
-    table alone, from NumPy: a function that records anew would hide what it does not see."""
-    mi = mi_rgb
+def test_frozen_pictures_follow_every_parameter(mi, name, storage):
+    """Three values in each of three ways. All parameters change at once, each in another way, then each table alone,
+    from NumPy: a function that records anew would hide what it does not see. Set back, the picture is the first."""
     scene, params, keys = load(mi, name, storage)
     other = load(mi, name, storage)[1]  # as loaded
     first = picture(mi, scene)
@@ -110,13 +107,17 @@ def test_frozen_pictures_follow_every_parameter(mi_rgb, name, storage):
             np.testing.assert_allclose(render(scene), picture(mi, scene), atol=1e-6, err_msg=f"{key} {factor}")
             recordings.append(function.n_recordings)
         assert recordings[1] == recordings[2], f"{key} is recorded with each change"
+    for key in keys:
+        params[key] = examples.copied(other[key])
+    params.update()
+    # Levels of ``mipmap`` are computed by NumPy when a file is read, on the device after texels were assigned
+    np.testing.assert_allclose(picture(mi, scene), first, rtol=2e-6 if name == "mipmap" else 0)
     assert np.isfinite(first).all()
 
 
 @pytest.mark.parametrize(("name", "storage"), [case for case in CASES if case[1] or case[0] == "neural_ggx"])
-def test_other_shapes_are_refused(mi_rgb, name, storage):
+def test_other_shapes_are_refused(mi, name, storage):
     """One sentence, and the picture of before, frozen or not: nothing is read beyond an array's end."""
-    mi = mi_rgb
     scene, params, keys = load(mi, name, storage)
     render, _ = frozen(mi)
     before = render(scene)
@@ -136,30 +137,29 @@ def test_other_shapes_are_refused(mi_rgb, name, storage):
 
 
 @pytest.mark.parametrize("name", examples.names())  # of a family, the table of the proxy always is
-def test_tables_of_floats_alone_are_parameters(mi_rgb, name):
+def test_tables_of_floats_alone_are_parameters(mi, name):
     for storage in ("float32", "uint8"):
-        keys = load(mi_rgb, name, storage)[2]
+        keys = load(mi, name, storage)[2]
         assert any(".tables." in f".{key}" for key in keys) == (storage == "float32"), keys
 
 
 @pytest.mark.parametrize("name", ["disney", "neural_bsdf"])
-def test_several_numbers_are_refused(mi_rgb, name):
-    scene, params, keys = load(mi_rgb, name)
+def test_several_numbers_are_refused(mi, name):
+    scene, params, keys = load(mi, name)
     numbers = [key for key in keys if not key.endswith(".value")]
     assert len(numbers) >= 4
     for key in numbers:
-        before = picture(mi_rgb, scene)
+        before = picture(mi, scene)
         value = params[key]
-        params[key] = type(value)(mi_rgb.Float(value.numpy().ravel()[0], 0.5))
+        params[key] = type(value)(mi.Float(value.numpy().ravel()[0], 0.5))
         with pytest.raises(RuntimeError, match=f'parameter "{key.split("bsdf.")[1]}": found 2 values, allowed is one'):
             params.update()
         assert dr.width(params[key]) == 1
-        assert np.isfinite(picture(mi_rgb, scene)).all() and np.isfinite(before).all()
+        assert np.isfinite(picture(mi, scene)).all() and np.isfinite(before).all()
 
 
-def test_images_of_other_sizes(mi_rgb, rng):
+def test_images_of_other_sizes(mi, rng):
     """``mipmap`` takes data of any size, and is what a new texture of these texels is; others are refused."""
-    mi = mi_rgb
     scene, params, keys = load(mi, "mipmap")
     key = next(k for k in keys if k.endswith("data"))
     render, function = frozen(mi)
@@ -180,9 +180,8 @@ def test_images_of_other_sizes(mi_rgb, rng):
 
 
 @pytest.mark.parametrize(("name", "storage"), [("neural_image", "float32"), ("mipmap", "")])
-def test_light_of_textures(mi_rgb, name, storage):
+def test_light_of_textures(mi, name, storage):
     """An emitter's distribution of positions follows its texture; inside a frozen function, none can be computed."""
-    mi = mi_rgb
     texture = examples.example(name, storage)
     down = mi.ScalarTransform4f().translate([0, 0, 2]).rotate([1, 0, 0], 180)
     scene = mi.load_dict({
@@ -211,9 +210,9 @@ def test_light_of_textures(mi_rgb, name, storage):
     ("name", "storage", "parameter"),
     [("mipmap", "", "data"), ("neural_image", "float32", "tables.cascaded"), ("neural_bsdf", "", "first.f0")],
 )
-def test_frozen_training(mi_rgb, name, storage, parameter):
+def test_frozen_training(mi, name, storage, parameter):
     """Render and backward frozen, ``params.update`` outside: the losses and the values are those without freezing."""
-    mi, runs = mi_rgb, []
+    runs = []
 
     def step(scene, params, seed):
         image = mi.render(scene, params, spp=2, seed=seed)
@@ -238,9 +237,8 @@ def test_frozen_training(mi_rgb, name, storage, parameter):
 
 
 @pytest.mark.parametrize("name", NUMBERS)
-def test_numbers_compile_no_kernels(mi_rgb, name):
+def test_numbers_compile_no_kernels(mi, name):
     """Numbers of Python assigned to all parameters that are numbers, colours or places: the first kernels serve."""
-    mi = mi_rgb
     scene, params, keys = load(mi, name)
     places = [key for key in keys if hasattr(params[key], "inverse_transpose")]
     numbers = [key for key in keys if key not in places and not dr.is_tensor_v(params[key])]
@@ -270,9 +268,8 @@ def test_numbers_compile_no_kernels(mi_rgb, name):
             raise AssertionError(f"kernels compiled for three values: {counts}")
 
 
-def test_textures_attached_to_another_sensor(mi_rgb):
+def test_textures_attached_to_another_sensor(mi):
     """A sensor of another projection is read in another way, with as many arrays."""
-    mi = mi_rgb
     parts = examples.scene_parts(mi, "neural_texture")
     pose = mi.ScalarTransform4f().look_at([0, 1, 4], list(examples.CENTRE), [0, 1, 0])
     parallel = mi.ScalarTransform4f().look_at([0, 1, 40], list(examples.CENTRE), [0, 1, 0])

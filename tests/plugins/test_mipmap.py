@@ -1,8 +1,5 @@
 """The texture ``mipmap``: filters against NumPy and many samples, texels, sensors; see ``test_texture_contract``."""
 
-import math
-
-import drjit as dr
 import numpy as np
 import pytest
 import texture_scenes
@@ -12,7 +9,7 @@ from texture_scenes import linear
 from mi_diffind.core.compat import backend_module
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
-from mi_diffind.plugins.support import footprint, image_files, textures
+from mi_diffind.plugins.support import footprint, image_files
 from mi_diffind.scenes import loading
 
 SIZE = WIDTH, HEIGHT = 24, 16
@@ -51,34 +48,9 @@ def expected(mi, truth, uv, level):
     return linear(numpy_of(truth.filtered(u, v, level)).T)
 
 
-# -- what is read ------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("wrap_mode", ["repeat", "mirror", "clamp"])
-def test_off_is_bitmap(mi_rgb, file, image, rng, wrap_mode):
-    """The filter ``off``, and any filter without a footprint, equals ``bitmap`` at and between texels."""
-    mi = mi_rgb
-    si = texture_scenes.hits(mi, rng.uniform(-2, 3, (2, 500)))
-    theirs = mi.load_dict({"type": "bitmap", "filename": file, "wrap_mode": wrap_mode})
-    names = ("off", "trilinear", "anisotropic", "stochastic") if wrap_mode == "repeat" else ("off",)
-    textures = {name: mi.load_dict(plugin(file, name, wrap_mode=wrap_mode)) for name in names}
-    ours = textures["off"]
-    values = {name: t.eval(si) for name, t in textures.items()}
-    slopes = ours.eval_1_grad(si), theirs.eval_1_grad(si)
-    truth = theirs.eval(si)
-    dr.eval(values, slopes, truth)
-    for name, value in values.items():
-        np.testing.assert_allclose(value.numpy(), truth.numpy(), atol=2e-5, err_msg=name)
-    np.testing.assert_allclose(*(slope.numpy() for slope in slopes), atol=2e-2)
-    assert list(ours.resolution()) == [WIDTH, HEIGHT] and ours.is_spatially_varying()
-    assert float(ours.mean()[0]) == pytest.approx(float(theirs.mean()[0]), abs=1e-4)
-    assert ours.max() == pytest.approx(linear(image.max() / 255), abs=1e-4)
-
-
 @pytest.mark.parametrize("taps", [1, 7])
-def test_anisotropic_is_the_mean_along_the_major_axis(mi_rgb, file, image, rng, taps):
+def test_anisotropic_is_the_mean_along_the_major_axis(mi, file, image, rng, taps):
     """The axis is that of singular values: ``taps`` places, half a level finer than each is wide."""
-    mi = mi_rgb
     uv, (ddx, ddy) = rng.random((2, 300)), texture_scenes.footprints(rng, 300, SIZE)
     major, minor, axis = texture_scenes.ellipse(ddx, ddy, SIZE)
     level = np.log2(np.maximum(np.maximum(minor, major / taps) / np.sqrt(2), 1))
@@ -89,9 +61,8 @@ def test_anisotropic_is_the_mean_along_the_major_axis(mi_rgb, file, image, rng, 
 
 
 @pytest.mark.parametrize("taps", [1, 4])
-def test_stochastic_is_unbiased(mi_rgb, file, rng, taps):
+def test_stochastic_is_unbiased(mi, file, rng, taps):
     """Many hits of one place and footprint have the mean of all taps and both levels, in linear values."""
-    mi = mi_rgb
     n, cases = 2**14, 6
     uv, (ddx, ddy) = rng.random((2, cases)), texture_scenes.footprints(rng, cases, SIZE, 3)
     one, all_ = (mi.load_dict(plugin(file, x, max_anisotropy=taps)) for x in ("stochastic", "anisotropic"))
@@ -103,25 +74,6 @@ def test_stochastic_is_unbiased(mi_rgb, file, rng, taps):
     assert error.max() > 1e-4
 
 
-def test_random_numbers(mi_rgb, rng):
-    """Uniform, and independent of each other and of where the hits are, for places on a line or in a small patch."""
-    mi = mi_rgb
-    n = 2**16
-    line = np.linspace(0, 1, n)
-    patch = np.mgrid[0:256, 0:256].reshape(2, -1) * 1e-3
-    for uv, p in ((np.stack([line, 0 * line]), np.stack([line, line, 0 * line])), (patch, np.zeros((3, n)))):
-        a, b = (x.numpy() for x in textures.hit_numbers(texture_scenes.hits(mi, uv, p=p)))
-        assert min(a.min(), b.min()) >= 0 and max(a.max(), b.max()) < 1
-        for x, y in ((a, b), (a[:-1], a[1:]), (b[:-1], b[1:]), (a[:-256], a[256:])):
-            counts = np.histogram2d(x, y, bins=16, range=[[0, 1]] * 2)[0]
-            assert ((counts - len(x) / 256) ** 2 / (len(x) / 256)).sum() < 255 + 5 * math.sqrt(2 * 255)
-        again = textures.hit_numbers(texture_scenes.hits(mi, uv, p=p))[0].numpy()
-        np.testing.assert_array_equal(again, a)
-
-
-# -- gradients ---------------------------------------------------------------------------------------------------------
-
-
 def changed(mi, texture, values):
     """Set ``data`` from an array; return the parameters."""
     params = mi.traverse(texture)
@@ -131,9 +83,8 @@ def changed(mi, texture, values):
 
 
 @pytest.mark.parametrize("role", ["srgb", "linear", "normal"])
-def test_changed_texels_are_those_of_a_new_texture(mi_rgb, rng, role):
+def test_changed_texels_are_those_of_a_new_texture(mi, rng, role):
     """All levels follow, also of odd sizes; ``data`` are the values of ``bitmap``."""
-    mi = mi_rgb
     shape = (10, 7, 3)
     old, new = rng.random((2, *shape)).astype(np.float32)
     if role == "normal":
@@ -159,9 +110,8 @@ def test_changed_texels_are_those_of_a_new_texture(mi_rgb, rng, role):
     assert texture.max() == pytest.approx(truth.max(), abs=1e-4)
 
 
-def test_texels_of_other_textures_stay(mi_rgb, file, rng):
+def test_texels_of_other_textures_stay(mi, file, rng):
     """Reading ``data`` changes nothing; changing it changes one texture, of another size and with colours, too."""
-    mi = mi_rgb
     si = texture_scenes.hits(mi, rng.random((2, 100)), *texture_scenes.footprints(rng, 100, SIZE))
     grey = {"type": "mipmap", "bitmap": mi.Bitmap(np.full((4, 4, 3), 128, np.uint8))}
     one, other, constant = mi.load_dict(plugin(file)), mi.load_dict(plugin(file)), mi.load_dict(grey)
@@ -180,9 +130,8 @@ def test_texels_of_other_textures_stay(mi_rgb, file, rng):
     assert np.abs(one.eval(si).numpy() - before).max() > 0.1
 
 
-def test_slope_of_a_filtered_texture(mi_rgb, rng):
+def test_slope_of_a_filtered_texture(mi, rng):
     """``eval_1_grad`` is the slope of a ramp at any level, through ``to_uv``; of the whole image it is 0."""
-    mi = mi_rgb
     x, y = np.meshgrid((np.arange(64) + 0.5) / 64, (np.arange(32) + 0.5) / 32)
     bitmap = mi.Bitmap((0.3 * x + 0.5 * y)[..., None].astype(np.float32))
     uv = rng.uniform(0.4, 0.6, (2, 100))
@@ -201,19 +150,16 @@ def test_slope_of_a_filtered_texture(mi_rgb, rng):
 
 @pytest.mark.parametrize("raw", [False, True])
 @pytest.mark.parametrize("name", ["x_normal", "x_nor_dx", "x_Roughness", "x_arm"])
-def test_names_of_images_change_no_values(mi_rgb, tmp_path, rng, name, raw):
+def test_names_of_images_change_no_values(mi, tmp_path, rng, name, raw):
     """A single image is what ``bitmap`` shows, whatever its name; a manifest is read by names."""
     path = str(tmp_path / f"{name}.png")
     image = rng.integers(0, 255, (8, 8, 1 if name == "x_Roughness" else 3), np.uint8)
-    mi_rgb.Bitmap(image.repeat(3, 2) if image.shape[2] == 1 else image).write(path)
+    mi.Bitmap(image.repeat(3, 2) if image.shape[2] == 1 else image).write(path)
     given = {"filename": path, "raw": raw}
-    si = texture_scenes.hits(mi_rgb, rng.random((2, 200)))
-    ours = mi_rgb.load_dict({"type": "mipmap", "filter": "off", **given}).eval(si).numpy()
-    theirs = mi_rgb.load_dict({"type": "bitmap", **given}).eval(si).numpy()
+    si = texture_scenes.hits(mi, rng.random((2, 200)))
+    ours = mi.load_dict({"type": "mipmap", "filter": "off", **given}).eval(si).numpy()
+    theirs = mi.load_dict({"type": "bitmap", **given}).eval(si).numpy()
     np.testing.assert_allclose(np.broadcast_to(ours, theirs.shape), theirs, atol=1e-3)
-
-
-# -- sensors -----------------------------------------------------------------------------------------------------------
 
 
 def SENSOR(mi, spp=1, size=48):
@@ -230,9 +176,8 @@ def detailed():
     return np.rint(255 * total / total.max()).astype(np.uint8)
 
 
-def test_one_sample_a_pixel_on_a_plane(mi_rgb, detailed):
+def test_one_sample_a_pixel_on_a_plane(mi, detailed):
     """Filters are in order of PSNR against many samples; parameters say what the scene's sensor does."""
-    mi = mi_rgb
     more = {"bitmap": mi.Bitmap(detailed), "to_uv": mi.ScalarTransform4f().scale([2, 2, 1])}
     truth = mi.render(texture_scenes.plane(mi, {"type": "bitmap", **more}, 256, "multijitter")).numpy()
     found = {}
@@ -250,12 +195,8 @@ def test_one_sample_a_pixel_on_a_plane(mi_rgb, detailed):
     assert quality["bitmap"] + 5 < quality["trilinear"] < quality["anisotropic"] - 3, quality
 
 
-# -- in scenes ---------------------------------------------------------------------------------------------------------
-
-
-def test_sources(mi_rgb, tmp_path, image, rng):
+def test_sources(mi, tmp_path, image, rng):
     """A manifest's maps, an image with alpha, an object, named levels; data are averaged as they are."""
-    mi = mi_rgb
     mi.Bitmap(image).write(str(tmp_path / "a.png"))
     (tmp_path / "wall.json").write_text('{"albedo": "a.png", "roughness": {"file": "a.png", "channels": "g"}}')
     alpha = np.concatenate([image, image[..., :1]], axis=-1)
@@ -282,8 +223,7 @@ def test_sources(mi_rgb, tmp_path, image, rng):
     np.testing.assert_allclose(mi.load_dict({"type": "mipmap", **grey}).eval_1(si), truth, atol=1e-5)
 
 
-def test_report(mi_rgb, file):
-    mi = mi_rgb
+def test_report(mi, file):
     found = mi.load_dict(plugin(file, "anisotropic", max_anisotropy=3)).report()
     assert (found["filter"], found["taps"], found["footprint"]) == ("anisotropic", 3, ["uv partials"])
     assert found["effects_left_out"]["sensor"].startswith("is not known")
@@ -300,8 +240,7 @@ def test_report(mi_rgb, file):
     assert loading.learned_instances(texture_scenes.plane(mi, plugin(file))) == []
 
 
-def test_words_of_bitmap(mi_rgb, file):
-    mi = mi_rgb
+def test_words_of_bitmap(mi, file):
     for word, name in (("bilinear", "off"), ("trilinear", "trilinear"), ("anisotropic", "anisotropic")):
         for more in ({}, {"filter": name}):
             assert mi.load_dict({"type": "mipmap", "filename": file, "filter_type": word, **more}).filter.name == name
@@ -316,6 +255,6 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", list(BAD))
-def test_bad_parameters(mi_rgb, case):
+def test_bad_parameters(mi, case):
     wrong, sentence = BAD[case]
-    assert sentence in texture_scenes.refused(mi_rgb, {"type": "mipmap", **wrong})
+    assert sentence in texture_scenes.refused(mi, {"type": "mipmap", **wrong})

@@ -33,33 +33,32 @@ def files(tmp_path_factory):
     return {path.stem: str(path) for path in folder.glob("*.npz")}
 
 
-@pytest.mark.parametrize("name", ["isotropic", "anisotropic", "beckmann"])
-def test_values(mi_rgb, files, rng, name):
+#: File, parameters, and the member of a family, by default the middle of its range.
+VALUES = [
+    *((name, {"scale": 0.5}, None) for name in ("isotropic", "anisotropic", "beckmann")),
+    *(
+        ("family", {"roughness": r, "metallic": m}, (r, m))
+        for r, m in ((0.05, 0.0), (0.8, 1.0), (0.13, 0.4), (0.5, 0.9))
+    ),
+    ("family", {}, (0.2, 0.5)),
+]
+
+
+@pytest.mark.parametrize("name, given, of_family", VALUES)
+def test_values(mi, files, rng, name, given, of_family):
     """``eval`` is the formula times the cosine."""
-    mi, n = mi_rgb, 4000
-    bsdf = mi.load_dict({"type": "neural_bsdf", "filename": files[name], "scale": 0.5})
-    wi, wo = random_directions(rng, n, 0.05), random_directions(rng, n, 0.05)
-    expected = 0.5 * wo[:, 2:] * formula(load_table(files[name]), wi.astype(float), wo.astype(float))
+    bsdf = mi.load_dict({"type": "neural_bsdf", "filename": files[name], **given})
+    wi, wo = random_directions(rng, 2000, 0.05), random_directions(rng, 2000, 0.05)
+    table = load_table(files[name])
+    table = member(table, *of_family) if of_family else table
+    expected = given.get("scale", 1) * wo[:, 2:] * formula(table, wi.astype(float), wo.astype(float))
     value = numpy_of(bsdf.eval(mi.BSDFContext(), interactions(mi, wi), vectors(mi, wo)))
     np.testing.assert_allclose(value, expected, rtol=5e-3, atol=1e-6)
 
 
-def test_values_of_families(mi_rgb, files, rng):
-    """``eval`` is the formula of the member times the cosine; the default is the middle of the range."""
-    mi, ctx = mi_rgb, mi_rgb.BSDFContext()
-    wi, wo = random_directions(rng, 500, 0.05), random_directions(rng, 500, 0.05)
-    members = [(0.05, 0.0), (0.8, 1.0), (0.13, 0.4), (0.5, 0.9)]
-    cases = [({"roughness": roughness, "metallic": metallic}, (roughness, metallic)) for roughness, metallic in members]
-    for given, expected in (*cases, ({}, (0.2, 0.5))):
-        bsdf = mi.load_dict({"type": "neural_bsdf", "filename": files["family"], **given})
-        value = numpy_of(bsdf.eval(ctx, interactions(mi, wi), vectors(mi, wo)))
-        truth = wo[:, 2:] * formula(member(load_table(files["family"]), *expected), wi.astype(float), wo.astype(float))
-        np.testing.assert_allclose(value, truth, rtol=5e-3)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("path", sorted(LIBRARY.glob("*.npz")), ids=lambda path: path.stem)
-def test_chi2_of_the_library(mi_rgb, path, tmp_path, monkeypatch):
+def test_chi2_of_the_library(mi, path, tmp_path, monkeypatch):
     """Samples of the materials of scenes/library.xml follow their density at six angles of incidence."""
     from mitsuba.chi2 import BSDFAdapter, ChiSquareTest, SphericalDomain
 
@@ -67,53 +66,45 @@ def test_chi2_of_the_library(mi_rgb, path, tmp_path, monkeypatch):
     xml = f'<string name="filename" value="{path}"/>'
     for angle in (1, 20, 40, 60, 75, 85):
         theta = np.radians(angle)
-        wi = dr.opaque(mi_rgb.Vector3f, [np.sin(theta), 0, np.cos(theta)])
+        wi = dr.opaque(mi.Vector3f, [np.sin(theta), 0, np.cos(theta)])
         sample, pdf = BSDFAdapter("neural_bsdf", xml, wi=wi)
         test = ChiSquareTest(SphericalDomain(), sample, pdf, sample_dim=3, sample_count=500_000, res=201, ires=32)
         assert test.run(test_count=72, quiet=True), f"{angle} degrees: {test.messages}"
 
 
-def test_both_sides_look_alike(mi_rgb, files, rng):
+def test_both_sides_look_alike(mi, files, rng):
     """With ``two_sided``, both sides of a surface have the same values."""
     wi, wo = random_directions(rng, 500, 0.05), random_directions(rng, 500, 0.05)
-    bsdf = mi_rgb.load_dict({"type": "neural_bsdf", "filename": files["isotropic"], "two_sided": True})
+    bsdf = mi.load_dict({"type": "neural_bsdf", "filename": files["isotropic"], "two_sided": True})
     front, back = (
-        numpy_of(bsdf.eval(mi_rgb.BSDFContext(), interactions(mi_rgb, wi * side), vectors(mi_rgb, wo * side)))
+        numpy_of(bsdf.eval(mi.BSDFContext(), interactions(mi, wi * side), vectors(mi, wo * side)))
         for side in np.float32([[1, 1, 1], [1, 1, -1]])
     )
     assert front.min() > 0
     np.testing.assert_array_equal(front, back)
 
 
-def test_changed_parameters_are_saved(mi_rgb, files, tmp_path):
-    """An optimised proxy is written to a file, and read back."""
-    mi = mi_rgb
+def test_changes_are_saved(mi, files, tmp_path):
+    """An optimised proxy, or the table of a family, is written to a file, and read back."""
     bsdf = mi.load_dict({"type": "neural_bsdf", "filename": files["isotropic"]})
     params = mi.traverse(bsdf)
-    params["first.alpha_u"] = mi.Float(0.31)
-    params["second.f0"] = mi.Color3f(0.5, 0.25, 0.125)
-    params.update()
+    given = {"first.alpha_u": mi.Float(0.31), "second.f0": mi.Color3f(0.5, 0.25, 0.125)}
+    params.update(given)
     mi_diffind.save(bsdf, tmp_path / "saved.npz")
     again = mi.traverse(mi.load_dict({"type": "neural_bsdf", "filename": str(tmp_path / "saved.npz")}))
-    assert float(again["first.alpha_u"][0]) == pytest.approx(0.31)
-    np.testing.assert_allclose(np.ravel(again["second.f0"]), [0.5, 0.25, 0.125], rtol=1e-5)
-    np.testing.assert_allclose(np.ravel(again["diffuse"]), np.ravel(params["diffuse"]), rtol=1e-5)
-
-
-def test_changed_tables_of_families_are_saved(mi_rgb, files, tmp_path):
-    mi = mi_rgb
-    bsdf = mi.load_dict({"type": "neural_bsdf", "filename": files["family"], "storage": "float32"})
-    params = mi.traverse(bsdf)
-    params["tables.proxy"] = params["tables.proxy"] - 0.05
-    params.update()
-    mi_diffind.save(bsdf, tmp_path / "saved.npz")
+    for key, value in {**given, "diffuse": params["diffuse"]}.items():
+        np.testing.assert_allclose(np.ravel(again[key]), np.ravel(value), rtol=1e-5)
+    family = mi.load_dict({"type": "neural_bsdf", "filename": files["family"], "storage": "float32"})
+    params = mi.traverse(family)
+    params.update({"tables.proxy": params["tables.proxy"] - 0.05})
+    mi_diffind.save(family, tmp_path / "saved.npz")
     before, after = (load_table(path).arrays["proxy"].values for path in (files["family"], tmp_path / "saved.npz"))
     np.testing.assert_allclose(after, before - 0.05, atol=5e-3)
 
 
-def test_reports(mi_rgb, files):
+def test_reports(mi, files):
     """A report names the terms in use, and those left out with the reason."""
-    load = mi_rgb.load_dict
+    load = mi.load_dict
     report = load({"type": "neural_bsdf", "filename": files["anisotropic"]}).report()
     assert report["effects_in_use"] == ["residual", "first", "second", "energy"]
     assert report["effects_left_out"] == {"diffuse": "the source does not need it"}
@@ -132,9 +123,9 @@ def recorded(folder, source, **settings):
 CHECKER = {"type": "checkerboard", "color0": {"type": "rgb", "value": 0.1}, "color1": {"type": "rgb", "value": 0.8}}
 
 
-def test_sources_in_the_place_of_files(mi_rgb, tmp_path, rng):
+def test_sources_in_the_place_of_files(mi, tmp_path, rng):
     """``evaluate="source"`` is the source: Mitsuba's own object, or of textures the point that was fitted."""
-    mi, ctx = mi_rgb, mi_rgb.BSDFContext()
+    ctx = mi.BSDFContext()
     wi, wo = random_directions(rng, 64, 0.05), random_directions(rng, 64, 0.05)
     plastic = {"type": "roughplastic", "alpha": 0.2}
     given = recorded(tmp_path, plastic)
@@ -162,24 +153,24 @@ def test_sources_in_the_place_of_files(mi_rgb, tmp_path, rng):
     assert numpy_of([pdf]).min() > 0
 
 
-def test_sources_that_cannot_stand_for_files(mi_rgb, files, tmp_path):
+def test_sources_that_cannot_stand_for_files(mi, files, tmp_path):
     plastic = {"type": "roughplastic"}
     for given, message in (
         ({"type": "neural_bsdf", "filename": files["isotropic"], "evaluate": "source"}, "cannot be opened again"),
         ({**recorded(tmp_path, plastic), "scale": 0.5}, r'parameter "scale": found 0.5, the source of .* has none'),
     ):
         with pytest.raises(RuntimeError, match=message):
-            mi_rgb.load_dict(given)
+            mi.load_dict(given)
 
 
-def test_compare_shows_the_source(mi_rgb, tmp_path):
+def test_compare_shows_the_source(mi, tmp_path):
     """A comparison puts the source in the file's place."""
     given = recorded(tmp_path, {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.5, 0.1]}})
     del given["evaluate"]
-    wall = {"to_world": mi_rgb.ScalarTransform4f().scale(9), "bsdf": {**given, "energy": "raw"}}
+    wall = {"to_world": mi.ScalarTransform4f().scale(9), "bsdf": {**given, "energy": "raw"}}
     scene = {
         "type": "scene", "integrator": {"type": "direct"}, "light": {"type": "constant"},
-        "sensor": examples.sensor(mi_rgb, size=8), "wall": {"type": "rectangle", **wall},
+        "sensor": examples.sensor(mi, size=8), "wall": {"type": "rectangle", **wall},
     }  # fmt: skip
     result = mi_diffind.compare(scene, 64, passes=2, progress=False)
     assert result.figures["counterparts"] == ["source"] and result.figures["learned_plugins"] == 1

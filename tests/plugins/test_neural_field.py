@@ -6,6 +6,7 @@ import pytest
 import sdf_fields
 from radiance_fields import Bumps, Fog, ball_table, register
 from scipy.ndimage import gaussian_filter
+from texture_scenes import refused
 
 from mi_diffind import plugins
 from mi_diffind.arrays.tables import save_table
@@ -20,8 +21,8 @@ AXIS = [0.36, 0.48, 0.8]
 
 
 @pytest.fixture
-def fields(mi_rgb):
-    return registered(mi_rgb)
+def fields(mi):
+    return registered(mi)
 
 
 def registered(mi):
@@ -101,12 +102,12 @@ def seen(made, ray, throughput=1.0):
     return throughput * light, np.where(hit, 1, 1 - through), depth, 1 - through
 
 
-def test_surfaces_within_before_and_behind(mi_rgb, fields):
+def test_surfaces_within_before_and_behind(mi, fields):
     """Light, alpha and further channels are composited as by the formula."""
-    made = scene(mi_rgb, integrator={"aovs": "depth, opacity"}, **surfaces(mi_rgb))
+    made = scene(mi, integrator={"aovs": "depth, opacity"}, **surfaces(mi))
     assert made.integrator().aov_names() == ["depth", "opacity"]
-    image = render(mi_rgb, made).reshape(-1, 6)
-    light, alpha, depth, opacity = seen(made, pixel_rays(mi_rgb, made))
+    image = render(mi, made).reshape(-1, 6)
+    light, alpha, depth, opacity = seen(made, pixel_rays(mi, made))
     assert len(np.unique(np.round(alpha, 2))) > 10 and (alpha == 1).sum() > 100
     assert np.abs(image[:, :3] - light).max() < 1e-4
     assert np.abs(image[:, 3] - alpha).max() < 1e-4
@@ -115,9 +116,9 @@ def test_surfaces_within_before_and_behind(mi_rgb, fields):
 
 
 @pytest.mark.parametrize("turn", ["turned", "mirrored"])
-def test_to_world(mi_rgb, fields, turn):
+def test_to_world(mi, fields, turn):
     """A field that is moved, turned, made larger, or reflected: densities are per length of its own frame."""
-    mi, at = mi_rgb, mi_rgb.ScalarTransform4f
+    at = mi.ScalarTransform4f
     found = {
         "turned": at().translate([0.3, 1.0, -0.2]).rotate(AXIS, 40).scale(1.3),
         "mirrored": at().translate([-0.4, 0.5, 0.1]).rotate([0, 0, 1], 30) @ at().scale([-0.6, 0.6, 0.6]),
@@ -149,9 +150,8 @@ def mirrored(mi, si):
     return np.array(si.is_valid()) & np.array(si.shape.bsdf().flags() & int(mi.BSDFFlags.DeltaReflection) != 0)
 
 
-def test_field_in_a_mirror(mi_rgb, fields):
+def test_field_in_a_mirror(mi, fields):
     """The mirror's image of the field and of what lies within, by the formula along the reflected rays."""
-    mi = mi_rgb
     glass = mirror(mi, {"type": "conductor", "specular_reflectance": 0.8})
     made = scene(mi, glass=glass, **surfaces(mi))
     ray = pixel_rays(mi, made)
@@ -171,8 +171,7 @@ def test_field_in_a_mirror(mi_rgb, fields):
     assert differs[met].mean() > 0.5 and not differs[~met].any()
 
 
-def test_mirrors_of_a_group(mi_rgb, fields):
-    mi = mi_rgb
+def test_mirrors_of_a_group(mi, fields):
     group = {"type": "shapegroup", "id": "group", "glass": mirror(mi, {"type": "conductor"})}
     one = {"type": "instance", "group": {"type": "ref", "id": "group"}}
     expected = render(mi, scene(mi, glass=group["glass"]))
@@ -180,11 +179,11 @@ def test_mirrors_of_a_group(mi_rgb, fields):
 
 
 @pytest.mark.parametrize("bsdf", ["null", "dielectric"])
-def test_panes_that_do_nothing(mi_rgb, fields, bsdf):
+def test_panes_that_do_nothing(mi, fields, bsdf):
     more = {"int_ior": 1.0, "ext_ior": 1.0} if bsdf == "dielectric" else {}
-    pane = mirror(mi_rgb, {"type": bsdf, **more}, place=(0, -2, 0), angle=10)
-    found = render(mi_rgb, scene(mi_rgb, pane=pane, **surfaces(mi_rgb)))
-    expected = render(mi_rgb, scene(mi_rgb, **surfaces(mi_rgb)))
+    pane = mirror(mi, {"type": bsdf, **more}, place=(0, -2, 0), angle=10)
+    found = render(mi, scene(mi, pane=pane, **surfaces(mi)))
+    expected = render(mi, scene(mi, **surfaces(mi)))
     # Rays go on from beside the surface, 3e-4 along its normal
     assert np.abs(found[..., :3] - expected[..., :3]).max() < 5e-4
     changed = np.abs(found[..., 3] - expected[..., 3]) > 1e-3
@@ -192,9 +191,9 @@ def test_panes_that_do_nothing(mi_rgb, fields, bsdf):
     assert changed.any() == (bsdf == "dielectric") and (found[..., 3][changed] == 1).all()
 
 
-def test_through_glass_as_volpath(mi_rgb, fields):
+def test_through_glass_as_volpath(mi, fields):
     """A field that only absorbs is Mitsuba's absorbing medium, in front of and behind a ball of glass."""
-    mi, at = mi_rgb, mi_rgb.ScalarTransform4f
+    at = mi.ScalarTransform4f
     ball = {"type": "sphere", "center": [0.5, -2.2, 0.2], "radius": 0.5, "bsdf": {"type": "dielectric"}}
     glass = mirror(mi, {"type": "conductor"}, place=(-1.3, 1.3, 0), angle=35)
     sky = {"type": "constant", "radiance": {"type": "rgb", "value": [0.4, 0.7, 1.0]}}
@@ -212,9 +211,8 @@ def test_through_glass_as_volpath(mi_rgb, fields):
     assert np.abs(z).max() < 6 and abs(a.mean() / b.mean() - 1) < 5e-3
 
 
-def test_hidden_emitters(mi_rgb, fields):
+def test_hidden_emitters(mi, fields):
     """Emitters are hidden from the camera, in light and alpha, and visible in mirrors."""
-    mi = mi_rgb
     sky = {"type": "constant", "radiance": {"type": "rgb", "value": [0.4, 0.7, 1.0]}}
     glass = mirror(mi, {"type": "conductor", "material": "none"})
     more = {"glass": glass, "sky": sky, **surfaces(mi)}
@@ -236,9 +234,8 @@ def beside(mi, place, angle=0.0, **more):
     return {"type": "test_field", "field": "bumps", "to_world": to_world, **more}
 
 
-def test_several_fields(mi_rgb, fields):
+def test_several_fields(mi, fields):
     """One after the other, whichever is in front, as seen one at a time."""
-    mi = mi_rgb
     inner = {"type": "path_footprint", "jitter": False}
     alone = {"aovs": "depth,opacity", "c": inner}
     front, back = beside(mi, [0.3, -1.7, 0.5], 20), beside(mi, [-0.9, 2.0, -0.6], 50, c=inner)
@@ -262,9 +259,8 @@ def test_several_fields(mi_rgb, fields):
     assert np.abs(image[..., 4] - depth)[~before].max() < 2e-3
 
 
-def test_fields_that_overlap(mi_rgb, fields):
+def test_fields_that_overlap(mi, fields):
     """Densities and emissions add up: a Riemann sum in NumPy, with surfaces before, within and behind."""
-    mi = mi_rgb
     types = compat.backend_module(mi.Float)
     colours = np.array([[0.2, 0.5, 0.8], [0.9, 0.3, 0.1]])
     register(mi, {"fine": Fog(types, 0.8, colours[0], voxel=0.02), "dense": Fog(types, 1.5, colours[1], voxel=0.05)})
@@ -295,8 +291,7 @@ def test_fields_that_overlap(mi_rgb, fields):
 
 
 @pytest.mark.parametrize("distance", [0.6, 2.0])
-def test_derivatives_of_two_fields(mi_rgb, fields, distance):
-    mi = mi_rgb
+def test_derivatives_of_two_fields(mi, fields, distance):
     place = mi.ScalarTransform4f().translate([0, distance, 0]).scale(0.8)
     bumps = {"type": "test_field", "field": "bumps", "to_world": place}
     made = scene(
@@ -322,8 +317,7 @@ def hits_of(mi, made):
     return ~hit.reshape(height, width), (hit & (y < -1)).reshape(height, width)
 
 
-def test_solids_of_path_sdf(mi_rgb, fields):
-    mi = mi_rgb
+def test_solids_of_path_sdf(mi, fields):
     sdf_fields.register(mi, {"ball": sdf_fields.Ball(compat.backend_module(mi.Float))})
     ball = {"type": "test_solid", "field": "ball", "to_world": mi.ScalarTransform4f().scale(1.5)}
     integrator = {"aovs": "opacity,depth", "c": {"type": "path_sdf", "jitter": False, "max_depth": 2}}
@@ -334,14 +328,13 @@ def test_solids_of_path_sdf(mi_rgb, fields):
     assert (np.abs(image - expected).max(-1) < 2e-3).mean() > 0.995
 
 
-def test_rays_of_the_inner_integrator(mi_rgb, fields):
+def test_rays_of_the_inner_integrator(mi, fields):
     """Rays that end in the field are not traced further; differentials go with rays, also over mirrors."""
-    mi = mi_rgb
     asked = []
 
     class Inner(mi.ad.integrators.common.RBIntegrator):
         def sample(self, mode, scene, sampler, ray, active=True, **kwargs):
-            asked.append([np.array(v) for v in (active, ray.o, ray.o_x - ray.o, ray.d_x - ray.d)])
+            asked.extend(np.array(v) for v in (active, ray.o, ray.d_x - ray.d))
             return mi.Spectrum(1), mi.Bool(active), [], None
 
         def sample_rays(self, scene, sensor, sampler):
@@ -350,27 +343,23 @@ def test_rays_of_the_inner_integrator(mi_rgb, fields):
             return ray, weight, place
 
     mi.register_integrator("test_inner", Inner)
-    dense = Fog(compat.backend_module(mi.Float), 20.0)
-    register(mi, {"dense": dense}, "test_dense")
+    register(mi, {"dense": Fog(compat.backend_module(mi.Float), 20.0)}, "test_dense")
     made = scene(mi, glass=mirror(mi, {"type": "conductor"}, place=(1.6, 0.5, 0)))
     integrator = mi.load_dict({"type": "test_dense", "field": "dense", "c": {"type": "test_inner"}})
-    image = render(mi, made, integrator=integrator, seed=1)
-    active, o, o_x, d_x = asked[0]
-    active = active.reshape(image.shape[:2])
-    assert 0.3 < active.mean() < 0.9 and not active[12, 12] and active[0, 0]
-    assert (np.abs(image[~active][:, :3] - HUE) < 2e-3).all()
+    render(mi, made, integrator=integrator, seed=1)
+    active, o, d_x = asked
+    assert 0.3 < active.mean() < 0.9
     turned = np.abs(o - o[:, :1]).max(0) > 1
     assert 20 < turned.sum() < active.sum() / 2
     # A plane mirror turns the differences between the directions of pixels, and keeps their lengths
     length = np.linalg.norm(d_x, axis=0)
     assert np.abs(length[turned] / length[~turned].mean() - 1).max() < 0.2
-    assert np.linalg.norm(o_x[:, ~turned], axis=0).max() < 1e-3 < np.linalg.norm(o_x[:, turned], axis=0).min()
 
 
-def test_counts(mi_rgb, fields):
-    found = scene(mi_rgb, **surfaces(mi_rgb))
+def test_counts(mi, fields):
+    found = scene(mi, **surfaces(mi))
     counts = found.integrator().counts(found)
-    ray = pixel_rays(mi_rgb, found)
+    ray = pixel_rays(mi, found)
     si = found.ray_intersect(ray)
     _, length = inside(ray, np.where(np.array(si.is_valid()), np.array(si.t), np.inf))
     steps = np.ceil(length / fields["fog"].step)
@@ -378,18 +367,15 @@ def test_counts(mi_rgb, fields):
     assert counts["steps"] == pytest.approx(steps.sum(), rel=0.01) and counts["looks"] == counts["steps"]
 
 
-def test_within_aov(mi_rgb, fields):
-    made = scene(mi_rgb, integrator={"aovs": "depth,opacity"}, **surfaces(mi_rgb))
-    outer = mi_rgb.load_dict({
+def test_within_aov(mi, fields):
+    made = scene(mi, integrator={"aovs": "depth,opacity"}, **surfaces(mi))
+    outer = mi.load_dict({
         "type": "aov", "aovs": "dd:depth", "n": {"type": "test_field", "field": "fog", "aovs": "opacity"}
     })  # fmt: skip
-    image = render(mi_rgb, made, 64, integrator=outer)
-    expected = render(mi_rgb, made, 64)
+    image = render(mi, made, 64, integrator=outer)
+    expected = render(mi, made, 64)
     assert image.shape[2] >= 6
     assert np.abs(image[..., :3].mean((0, 1)) - expected[..., :3].mean((0, 1))).max() < 0.01
-
-
-# -- variants ----------------------------------------------------------------------------------------------------------
 
 
 def test_variants(mi_any):
@@ -412,9 +398,6 @@ def test_variants(mi_any):
     else:
         assert np.abs(image[..., 3] - expected[..., 3]).max() < 1e-5
         assert np.abs(image - expected).max() < 0.15 and np.abs((image - expected).mean((0, 1))).max() < 0.01
-
-
-# -- derivatives -------------------------------------------------------------------------------------------------------
 
 
 def lit(mi, field="bumps", **more):
@@ -475,17 +458,17 @@ def check(mi, made, ending, spp=4, step=1e-2, tolerance=0.01):
     return check_along(mi, made, key, moved, spp, step, tolerance)
 
 
-def test_derivatives_of_the_field(mi_rgb, fields):
+def test_derivatives_of_the_field(mi, fields):
     """Light, alpha and further channels, seen directly, before surfaces, and in a mirror."""
-    made = lit(mi_rgb, integrator={"aovs": "depth,opacity", "max_depth": 3, "hide_emitters": True})
-    found = check(mi_rgb, made, "tables.density")
+    made = lit(mi, integrator={"aovs": "depth,opacity", "max_depth": 3, "hide_emitters": True})
+    found = check(mi, made, "tables.density")
     assert (np.abs(found).max((0, 1)) > 1e-3).all()
 
 
-def test_derivatives_before_an_integrator_in_cpp(mi_rgb, fields):
+def test_derivatives_before_an_integrator_in_cpp(mi, fields):
     """The inner integrator is constant."""
-    made = lit(mi_rgb, integrator={"aovs": "opacity", "c": {"type": "path", "max_depth": 3, "hide_emitters": True}})
-    found = check(mi_rgb, made, "tables.colour")
+    made = lit(mi, integrator={"aovs": "opacity", "c": {"type": "path", "max_depth": 3, "hide_emitters": True}})
+    found = check(mi, made, "tables.colour")
     assert np.abs(found[..., 3:]).max() == 0
 
 
@@ -501,9 +484,9 @@ def check_place(mi, made, key):
     assert np.sqrt((check_along(mi, made, key, moved, 1, 1e-3, 5e-3) ** 2).mean((0, 1))).min() > 1e-2
 
 
-def test_derivatives_of_the_place(mi_rgb, fields):
+def test_derivatives_of_the_place(mi, fields):
     """Fields before surfaces and in a mirror, whose box cuts bumps, and one of two fields."""
-    mi, at = mi_rgb, mi_rgb.ScalarTransform4f
+    at = mi.ScalarTransform4f
     place = at().translate([0.1, 0.2, -0.1]).rotate([0.8, 0.6, 0], 30).scale(0.9)
     options = {"aovs": "depth,opacity", "hide_emitters": True, "to_world": place}
     made = lit(mi, integrator={**options, "max_depth": 3})
@@ -515,9 +498,9 @@ def test_derivatives_of_the_place(mi_rgb, fields):
         check_place(mi, two, key)
 
 
-def test_a_moved_field_is_that_of_a_new_scene(mi_rgb, fields):
+def test_a_moved_field_is_that_of_a_new_scene(mi, fields):
     """Images are equal to the last bit, also if fields come to overlap; a refused transform changes nothing."""
-    mi, at = mi_rgb, mi_rgb.ScalarTransform4f
+    at = mi.ScalarTransform4f
     turn = at().translate([0.3, 0.2, -0.1]).rotate([0.6, 0, 0.8], 40).scale([-0.7, 0.7, 0.7])
     new, made = (scene(mi, "bumps", size=(16, 12), integrator=more) for more in ({"to_world": turn}, {}))
     expected, before = render(mi, new), render(mi, made)
@@ -547,17 +530,17 @@ def test_a_moved_field_is_that_of_a_new_scene(mi_rgb, fields):
         ("sky.radiance.value", {"hide_emitters": True}), ("bsdf.reflectance.value", {"lit": True}),
     ],
 )  # fmt: skip
-def test_derivatives_of_surfaces(mi_rgb, fields, ending, more):
+def test_derivatives_of_surfaces(mi, fields, ending, more):
     """Surfaces behind the field and lit by it, mirrors, and lights that rays are followed to."""
-    check(mi_rgb, lit(mi_rgb, integrator={"max_depth": 3, **more}), ending)
+    check(mi, lit(mi, integrator={"max_depth": 3, **more}), ending)
 
 
-def test_derivatives_of_light_and_shadow(mi_rgb, fields):
+def test_derivatives_of_light_and_shadow(mi, fields):
     """Directions towards a field that lights and shadows are constants, as the derivatives take them."""
-    made = lit(mi_rgb, integrator={"max_depth": 3, "lit": True, "hide_emitters": True})
+    made = lit(mi, integrator={"max_depth": 3, "lit": True, "hide_emitters": True})
     made.integrator()._group = made.integrator().field_light.update = lambda: None
-    check(mi_rgb, made, "tables.density")
-    check_place(mi_rgb, made, "it.to_world")
+    check(mi, made, "tables.density")
+    check_place(mi, made, "it.to_world")
 
 
 def test_derivatives_of_spectra():
@@ -568,24 +551,6 @@ def test_derivatives_of_spectra():
     made = scene(mi, "bumps", size=(12, 8))
     # The table of spectra has a kink at each of its entries
     check(mi, made, "tables.colour", spp=16, tolerance=0.03)
-
-
-# -- as an object of Mitsuba -------------------------------------------------------------------------------------------
-
-
-def test_frozen_light_of_a_field(mi_rgb, fields, no_garbage_collection):
-    """A recorded render sees other arrays and seeds; see also ``test_frozen.py``."""
-    mi = mi_rgb
-    things = {"glass": mirror(mi, {"type": "conductor"}), "wall": mirror(mi, {"type": "diffuse"}, place=(-1.2, 1.2, 0))}
-    made = scene(mi, "bumps", integrator={"lit": True}, **things)
-    params = mi.traverse(made)
-    frozen = dr.freeze(lambda loaded, seed: mi.render(loaded, spp=1, seed=seed))
-    for seed in range(5):
-        params["it.tables.density"] = mi.TensorXf(params["it.tables.density"].numpy() * np.float32(0.7))
-        params.update()
-        found, expected = np.array(frozen(made, dr.opaque(mi.UInt32, seed))), render(mi, made, 1, seed)
-        assert np.abs(found - expected).max() < 1e-5
-    assert frozen.n_recordings < 5
 
 
 @pytest.mark.parametrize(
@@ -602,15 +567,10 @@ def test_frozen_light_of_a_field(mi_rgb, fields, no_garbage_collection):
         ({"mistake": 1}, "mistake"),
     ],
 )
-def test_what_is_refused(mi_rgb, fields, more, message):
+def test_what_is_refused(mi, fields, more, message):
     if "to_world" in more:
-        more = {"to_world": mi_rgb.ScalarTransform4f().scale(more["to_world"])}
-    with pytest.raises(RuntimeError) as raised:
-        mi_rgb.load_dict({"type": "test_field", "field": "fog", **more})
-    assert message in compat.one_sentence(raised.value)
-
-
-# -- files -------------------------------------------------------------------------------------------------------------
+        more = {"to_world": mi.ScalarTransform4f().scale(more["to_world"])}
+    assert message in refused(mi, {"type": "test_field", "field": "fog", **more})
 
 
 @pytest.fixture(scope="module")
@@ -621,33 +581,28 @@ def file(tmp_path_factory):
     return path
 
 
-def test_a_file_in_a_scene(mi_rgb, file, tmp_path):
+def test_a_file_in_a_scene(mi, file):
     """Images are those of the field in the file; commands know path depths and the nested integrator."""
-    mi = mi_rgb
-    text = """<scene version="3.0.0">
-        <integrator type="neural_field" id="it"><string name="filename" value="ball.npz"/>INNER</integrator>
-        <sensor type="perspective"><float name="fov" value="40"/>
-            <transform name="to_world"><lookat origin="0,-4,0" target="0,0,0" up="0,0,1"/></transform>
-            <film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="16"/>
-                <string name="pixel_format" value="rgba"/><rfilter type="box"/></film></sensor>
-    </scene>"""
-    (tmp_path / "ball.npz").write_bytes(file.read_bytes())
-    (tmp_path / "scene.xml").write_text(text.replace("INNER", ""))
-    inner = '<integrator type="prb"><integer name="max_depth" value="3"/></integrator>'
-    (tmp_path / "nested.xml").write_text(text.replace("INNER", inner))
-    inner = """<integrator type="neural_field"><string name="filename" value="ball.npz"/>
-        <transform name="to_world"><translate y="4"/></transform></integrator>"""
-    (tmp_path / "two.xml").write_text(text.replace("INNER", inner))
-    assert loading.ParsedScene(tmp_path / "two.xml").path_integrator() == ("neural_field", -1)
-    assert len(loading.load(tmp_path / "two.xml", longest_path=3).integrator().fields) == 2
-    assert loading.ParsedScene(tmp_path / "scene.xml").path_integrator() == ("neural_field", -1)
-    assert loading.ParsedScene(tmp_path / "nested.xml").path_integrator() == ("prb", 3)
-    loaded = loading.load(tmp_path / "scene.xml", longest_path=2)
-    assert loaded.integrator().surfaces.max_depth == 2
+    tracer = {"type": "neural_field", "filename": str(file), "id": "it"}
+    at = mi.ScalarTransform4f().look_at([0, -4, 0], [0, 0, 0], [0, 0, 1])
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "pixel_format": "rgba", "rfilter": {"type": "box"}}
+    sensor = {"type": "perspective", "fov": 40, "to_world": at, "film": film}
+    inner = {
+        "alone": {},
+        "nested": {"inner": {"type": "prb", "max_depth": 3}},
+        "two": {"inner": {**tracer, "id": "other", "to_world": mi.ScalarTransform4f().translate([0, 4, 0])}},
+    }
+    parsed = {name: loading.ParsedScene({"type": "scene", "integrator": {**tracer, **more}, "sensor": sensor})
+              for name, more in inner.items()}  # fmt: skip
+    found = {name: scene.path_integrator() for name, scene in parsed.items()}
+    assert found == {"alone": ("neural_field", -1), "nested": ("prb", 3), "two": ("neural_field", -1)}
+    loaded, two = (parsed[name].load(longest_path=2) for name in ("alone", "two"))
+    nested = parsed["nested"].load()
+    assert loaded.integrator().surfaces.max_depth == 2 and len(two.integrator().fields) == 2
     image = render(mi, loaded, 4)
     assert image[8, 8, 3] > 0.99 and image[0, 0, 3] == 0
     assert image[8, 5, 0] > 2 * image[8, 5, 2] > 0 and image[8, 10, 2] > 2 * image[8, 10, 0] > 0
-    assert np.abs(render(mi, loading.load(tmp_path / "nested.xml"), 4) - image).max() < 1e-5
+    assert np.abs(render(mi, nested, 4) - image).max() < 1e-5
     report = plugins.report(loaded.integrator())
     assert report["table_bytes"] > 0 and report["surfaces"] == "PathFootprint"
     register(mi, {"file": TASK.open(mi.TensorXf, file).field})
@@ -655,9 +610,8 @@ def test_a_file_in_a_scene(mi_rgb, file, tmp_path):
     assert np.abs(render(mi, loaded, 4, integrator=same) - image).max() < 1e-6
 
 
-def test_reflections_of_a_file(mi_rgb, fields, file, tmp_path):
+def test_reflections_of_a_file(mi, fields, file, tmp_path):
     """Derivatives reach the environment, the normals, and the place of the field."""
-    mi = mi_rgb
     rng = np.random.default_rng(8)
     grid = files.grid_of(files.load(file), compat.backend_module(mi.Float)).with_reflections()
     place = grid.nodes.positions() - (np.array(grid.nodes.shape) - 1) / 2

@@ -1,10 +1,6 @@
-"""The texture ``neural_image``: maps of every kind, arrays, spectra, counterparts; see ``test_texture_contract``."""
+"""The texture ``neural_image``: maps of every kind, arrays, spectra; see ``test_texture_contract``."""
 
-import functools
 import itertools
-import json
-import os
-import re
 from dataclasses import replace
 
 import drjit as dr
@@ -12,14 +8,12 @@ import numpy as np
 import pytest
 from arrays import aligned
 from scipy.ndimage import map_coordinates
-from texture_scenes import hits, refused, scene_xml
-from variants import VARIANTS, set_variant
+from texture_scenes import hits, refused
+from variants import set_variant
 
-from mi_diffind.arrays.tables import StoredArray, Table, load_table, save_table
+from mi_diffind.arrays.tables import StoredArray, Table, save_table
 from mi_diffind.maps.layout import Layout, MapLayout
-from mi_diffind.maps.source import load_source
 from mi_diffind.plugins.support import textures
-from mi_diffind.scenes import comparison, loading
 from mi_diffind.tasks.image import TASK
 from mi_diffind.tasks.image.arrays import CompressedImage
 
@@ -46,47 +40,23 @@ ROUNDING = 1e-4
 USABLE = tuple(m.name for m in MAPS if m.channels != 2)
 METHODS = ("eval", "eval_1", "eval_3", "eval_1_grad")
 
-#: Each colour mode once, polarised in one of them: a texture returns no Mueller matrix in any.
-RENDERED = [v for v in VARIANTS if v.endswith(("ad_rgb", "ad_mono", "ad_spectral_polarized"))]
 
-
-# -- helpers -----------------------------------------------------------------------------------------------------------
-
-
-def make(path, layout=LAYOUT, border=("repeat", "clamp"), seed=1, shape=(8, 9), side=4, spread=(0, 255), coarse=False):
+def make(path, layout=LAYOUT, border=("repeat", "clamp"), coarse=False):
     """A file of random arrays, the primary of 6 bits; ``coarse``: one of its two channels is in an array of its own."""
-    rng = np.random.default_rng(seed)
-    table = Table("image", {}, settings={"layout": layout.to_json()})
-    if layout.stored:
-        arrays = {
-            "primary": rng.integers(0, 63, (*shape, 2), np.uint8, endpoint=True),
-            "cascaded": rng.integers(*spread, (side, side, layout.stored), np.uint8, endpoint=True),
-        }
-        if coarse:
-            arrays["coarse"] = arrays["primary"][::2, ::2, 1:].copy()
-            arrays["primary"] = arrays["primary"][..., :1].copy()
-        for name, array in arrays.items():
-            around, bits = (("clamp", "clamp"), 8) if name == "cascaded" else (border, 6)
-            affine = ((1 / (2**bits - 1),) * array.shape[-1], (0.0,) * array.shape[-1])
-            table.arrays[name] = StoredArray(array, around, *affine, bits)
+    rng, table = np.random.default_rng(3), Table("image", {}, settings={"layout": layout.to_json()})
+    arrays = {
+        "primary": rng.integers(0, 63, (8, 9, 2), np.uint8, endpoint=True),
+        "cascaded": rng.integers(0, 255, (4, 4, layout.stored), np.uint8, endpoint=True),
+    }
+    if coarse:
+        arrays["coarse"] = arrays["primary"][::2, ::2, 1:].copy()
+        arrays["primary"] = arrays["primary"][..., :1].copy()
+    for name, array in arrays.items():
+        around, bits = (("clamp", "clamp"), 8) if name == "cascaded" else (border, 6)
+        affine = ((1 / (2**bits - 1),) * array.shape[-1], (0.0,) * array.shape[-1])
+        table.arrays[name] = StoredArray(array, around, *affine, bits)
     save_table(path, table)
     return str(path)
-
-
-def tabulated(path, layout, values, **settings):
-    """A file whose primary is uv, and whose cascaded array has the channels ``values(y, x)`` of places in [0, 1]."""
-    y, x = np.mgrid[0:129, 0:129] / 128
-    ramp = np.stack(np.meshgrid([0, 255], [0, 255], indexing="ij"), axis=-1).astype(np.uint8)
-    table = Table("image", {}, settings={"layout": layout.to_json(), **settings})
-    for name, entries in (("primary", ramp), ("cascaded", np.rint(255 * values(y, x)).astype(np.uint8))):
-        scale, offset = (1 / 255,) * entries.shape[-1], (0.0,) * entries.shape[-1]
-        table.arrays[name] = StoredArray(entries, ("clamp", "clamp"), scale, offset, 8)
-    save_table(path, table)
-    return str(path)
-
-
-def layout_of(file):
-    return Layout.from_json(TASK.load(file).settings["layout"])
 
 
 @pytest.fixture(scope="module")
@@ -98,25 +68,12 @@ def plugin(file, channels="albedo", **more):
     return {"type": "neural_image", "filename": file, "channels": channels, **more}
 
 
-@functools.lru_cache
-def decoded(dtype, file, stamp):
-    return CompressedImage.from_table(TASK.load(file), dtype).decode()
-
-
-def counterpart(mi, file, channels="albedo", **more):
+def counterpart(mi, image, name, **more):
     """``bitmap`` with the image that the file decodes to."""
-    layout = layout_of(file)
-    bitmap = mi.Bitmap(np.ascontiguousarray(decoded(mi.TensorXf, file, os.stat(file).st_mtime_ns)[channels]))
-    bitmap.set_srgb_gamma(layout[channels].color_space == "srgb")
-    raw = {"raw": True} if channels in ("normal", "roughness", "metallic") else {}
+    bitmap = mi.Bitmap(np.ascontiguousarray(image))
+    bitmap.set_srgb_gamma(LAYOUT[name].color_space == "srgb")
+    raw = {"raw": True} if name in ("normal", "roughness", "metallic") else {}
     return {"type": "bitmap", "bitmap": bitmap, "format": "variant", **raw, **more}
-
-
-def centres(rng, n, tiles=0):
-    """Coordinates of texel centres, of ``tiles`` images to either side, too."""
-    x = rng.integers(-tiles * WIDTH, (tiles + 1) * WIDTH, n)
-    y = rng.integers(-tiles * HEIGHT, (tiles + 1) * HEIGHT, n)
-    return (x + 0.5) / WIDTH, (y + 0.5) / HEIGHT
 
 
 def values_of(textures, si, methods=METHODS):
@@ -131,15 +88,13 @@ def values_of(textures, si, methods=METHODS):
     return {key: None if v is None else v.numpy() for key, v in values.items()}
 
 
-# -- the same as a bitmap ----------------------------------------------------------------------------------------------
-
-
 def test_equals_a_bitmap_of_what_it_decodes_to(mi_any, file, rng):
     """Every map in every method at texel centres; where ``bitmap`` has no answer there is none."""
     mi = mi_any
+    images = CompressedImage.from_table(TASK.load(file), mi.TensorXf).decode()
     ours = {name: mi.load_dict(plugin(file, name)) for name in USABLE}
-    theirs = {name: mi.load_dict(counterpart(mi, file, name)) for name in USABLE}
-    si = hits(mi, centres(rng, 400))
+    theirs = {name: mi.load_dict(counterpart(mi, images[name], name)) for name in USABLE}
+    si = hits(mi, [(rng.integers(0, size, 400) + 0.5) / size for size in (WIDTH, HEIGHT)])
     found = values_of(ours, si)
     for (name, method), b in values_of(theirs, si).items():
         a = found[name, method]
@@ -155,17 +110,16 @@ def test_equals_a_bitmap_of_what_it_decodes_to(mi_any, file, rng):
         # Both clamp the spectra of bright colours, but only one of them at the same brightness
         if not (name == "glow" and mi.is_spectral):
             assert abs(float(a.mean()[0]) - float(b.mean()[0])) < 2e-5, name
-        largest = dr.max(mi.traverse(mi.load_dict(counterpart(mi, file, name, raw=True)))["data"].array)[0]
-        if not (a.raw or layout_of(file)[name].color_space == "linear"):
+        largest = dr.max(mi.traverse(mi.load_dict(counterpart(mi, images[name], name, raw=True)))["data"].array)[0]
+        if not (a.raw or LAYOUT[name].color_space == "linear"):
             largest = dr.srgb_to_linear(largest)
         assert a.max() >= float(largest) * (1 - 1e-5), name
 
 
 @pytest.mark.parametrize("border, coarse", [(("repeat", "clamp"), False), (("clamp", "repeat"), True)])
-def test_reads_as_an_independent_implementation_does(mi_rgb, tmp_path, rng, border, coarse):
+def test_reads_as_an_independent_implementation_does(mi, tmp_path, rng, border, coarse):
     """Anywhere, by SciPy in double precision; of one primary array and of two."""
-    mi = mi_rgb
-    path = make(tmp_path / "a.npz", border=border, seed=3, coarse=coarse)
+    path = make(tmp_path / "a.npz", border=border, coarse=coarse)
     arrays = TASK.load(path).arrays
     u, v = rng.random((2, 3000)).astype(np.float32).astype(np.float64)
     pointer = []
@@ -191,9 +145,8 @@ def test_reads_as_an_independent_implementation_does(mi_rgb, tmp_path, rng, bord
     assert normal.max() <= 1 + 1e-6 and glow.max() > 1
 
 
-def test_gradient_of_the_image(mi_rgb, file, rng):
+def test_gradient_of_the_image(mi, file, rng):
     """``eval_1_grad``: differences of the texels around, per unit of uv, for sides that differ."""
-    mi = mi_rgb
     for name in ("height", "albedo"):
         image = mi.load_dict(plugin(file, name))
         x, y = rng.integers(0, WIDTH - 1, 200), rng.integers(0, HEIGHT - 1, 200)
@@ -209,9 +162,6 @@ def test_gradient_of_the_image(mi_rgb, file, rng):
         ]
         uv = np.stack([(x + 0.5 + a) / WIDTH, (y + 0.5 + b) / HEIGHT])
         np.testing.assert_allclose(image.eval_1_grad(hits(mi, uv)).numpy(), expected, atol=2e-3)
-
-
-# -- spectra -----------------------------------------------------------------------------------------------------------
 
 
 def test_upsampling_is_mitsubas(rng):
@@ -233,11 +183,7 @@ def test_upsampling_is_mitsubas(rng):
     assert error.max() < 2e-3 and error.mean() < 1e-5  # 0 and 1 are 1/8192 off in theirs
 
 
-# -- in materials ------------------------------------------------------------------------------------------------------
-
-
-def test_maps_of_other_places_are_not_confused(mi_rgb, file, rng):
-    mi = mi_rgb
+def test_maps_of_other_places_are_not_confused(mi, file, rng):
     forms = [{}, {"to_uv": mi.ScalarTransform4f().scale(2)}, {"wrap_mode": "clamp"}, {"storage": "float32"}]
     si = hits(mi, rng.uniform(-1, 2, (2, 200)))
     alone = [mi.load_dict(plugin(file, **f)).eval(si).numpy() for f in forms]
@@ -248,116 +194,8 @@ def test_maps_of_other_places_are_not_confused(mi_rgb, file, rng):
         np.testing.assert_allclose(a, b.numpy(), atol=1e-6)
 
 
-# -- files -------------------------------------------------------------------------------------------------------------
-
-
-def test_several_maps_and_none_named(mi_rgb, tmp_path):
+def test_several_maps_and_none_named(mi, tmp_path):
     path = make(tmp_path / "a.npz", replace(LAYOUT, maps=MAPS[1:]))
-    assert '"pair" has 2 channels, a texture has 1 or 3' in refused(mi_rgb, plugin(path, "pair"))
+    assert '"pair" has 2 channels, a texture has 1 or 3' in refused(mi, plugin(path, "pair"))
     with pytest.raises(RuntimeError, match="not given, and the file holds several maps: normal, roughness"):
-        mi_rgb.load_dict({"type": "neural_image", "filename": path})
-
-
-# -- the exact counterpart ---------------------------------------------------------------------------------------------
-
-
-def wall_xml(bsdf, textures):
-    content = f'<shape type="rectangle"><bsdf type="{bsdf}">{textures}</bsdf></shape>'
-    return scene_xml(f'<emitter type="constant"/>{content}')
-
-
-def texture_xml(slot, filename, more="", **strings):
-    inner = "".join(f'<string name="{k}" value="{v}"/>' for k, v in {"filename": filename, **strings}.items())
-    return f'<texture type="neural_image" name="{slot}">{inner}{more}</texture>'
-
-
-@pytest.fixture(scope="module")
-def material(tmp_path_factory):
-    """A compressed material with the files that it stands for, a scene of it, and the images."""
-    import mitsuba as mi
-
-    folder = tmp_path_factory.mktemp("material")
-
-    def wave(y, x):
-        return 0.5 + 0.4 * np.sin(2 * np.pi * np.stack([x, y, x + y], axis=-1))
-
-    def stored(y, x):
-        values = wave(y, x)
-        return np.concatenate([values, 0.8 * values[..., 1:2]], axis=-1)
-
-    image = wave(*(np.mgrid[0:16, 0:16] + 0.5) / 16)
-    albedo, orm = (np.rint(255 * v).astype(np.uint8) for v in (image, image[..., ::-1] * 0.8))
-    mi.Bitmap(albedo).write(str(folder / "albedo.png"))
-    mi.Bitmap(orm).write(str(folder / "orm.png"))
-    maps = {"albedo": "albedo.png", "roughness": {"file": "orm.png", "channels": "g"}}
-    (folder / "wall.json").write_text(json.dumps(maps))
-    layout = Layout.from_source(load_source(folder / "wall.json"))
-    tabulated(folder / "wall.npz", layout, stored, source_path="wall.json")
-    textures = texture_xml("base_color", "wall.npz", channels="albedo") + texture_xml(
-        "roughness", "wall.npz", channels="roughness", wrap_mode="mirror"
-    )
-    (folder / "scene.xml").write_text(wall_xml("principled", textures))
-    return folder, albedo, orm
-
-
-@pytest.mark.parametrize("variant", RENDERED)
-def test_exact_counterpart(variant, material):
-    """The same scene as with the images themselves, where there is a file for each; and it can be compared."""
-    mi = set_variant(variant)
-    folder, _, orm = material
-    exact = loading.load(folder / "scene.xml", exact=True)
-    mi.Bitmap(np.ascontiguousarray(orm[..., 1:2])).write(str(folder / "roughness.png"))
-    textures = (
-        '<texture type="bitmap" name="base_color"><string name="filename" value="albedo.png"/></texture>'
-        '<texture type="bitmap" name="roughness"><string name="filename" value="roughness.png"/>'
-        '<boolean name="raw" value="true"/><string name="wrap_mode" value="mirror"/></texture>'
-    )
-    (folder / "stock.xml").write_text(wall_xml("principled", textures))
-    stock = loading.load(folder / "stock.xml")
-    np.testing.assert_array_equal(mi.render(exact, spp=8).numpy(), mi.render(stock, spp=8).numpy())
-    if not mi.is_rgb:
-        return
-
-    result = comparison.compare(folder / "scene.xml", spp=8, passes=1, progress=False)
-    assert result.figures["psnr_db"] > 40
-    assert result.figures["learned_plugins"] == 2
-    assert result.figures["table_bytes"] == load_table(folder / "wall.npz").nbytes
-
-
-def test_exact_counterpart_without_a_source(mi_rgb, material, tmp_path):
-    folder, _, _ = material
-    table = load_table(folder / "wall.npz")
-    for recorded, given, expected in (
-        (None, None, 'does not record its original image, give it as the parameter "source"'),
-        ("gone.png", None, "gone.png: no such file"),
-        ("wall.json", "gone.png", "gone.png: no such file"),
-        (None, str(folder / "orm.png"), 'has 3 channel(s), the map "roughness" has 1'),
-    ):
-        table.settings.pop("source_path", None)
-        table.settings |= {"source_path": recorded} if recorded else {}
-        save_table(tmp_path / "wall.npz", table)
-        xml = texture_xml("alpha", "wall.npz", channels="roughness", **({"source": given} if given else {}))
-        (tmp_path / "s.xml").write_text(wall_xml("roughconductor", xml))
-        loading.load(tmp_path / "s.xml")  # as written it needs none
-        with pytest.raises(loading.SceneError, match=re.escape(expected)):
-            loading.load(tmp_path / "s.xml", exact=True)
-
-
-def test_exact_counterpart_elsewhere(mi_rgb, material, tmp_path):
-    """A recorded source outside of the file's folder is shown only if it is what the file was made from."""
-    folder, albedo, _ = material
-    table = load_table(folder / "wall.npz")
-    table.settings["source_path"] = os.path.relpath(folder / "wall.json", tmp_path)
-    (tmp_path / "s.xml").write_text(wall_xml("diffuse", texture_xml("reflectance", "elsewhere.npz", channels="albedo")))
-    digest = load_source(folder / "wall.json").digest
-    for recorded in (None, "0" * 64, digest):
-        table.settings["source"] = recorded
-        save_table(tmp_path / "elsewhere.npz", table)
-        if recorded == digest:
-            exact = loading.load(tmp_path / "s.xml", exact=True).shapes()[0].bsdf()
-            bitmap = mi_rgb.load_dict({"type": "bitmap", "bitmap": mi_rgb.Bitmap(albedo)})
-            si = hits(mi_rgb, [[0.2, 0.7], [0.4, 0.1]])
-            np.testing.assert_array_equal(exact.eval_diffuse_reflectance(si).numpy(), bitmap.eval(si).numpy())
-        else:
-            with pytest.raises(loading.SceneError, match="has changed since"):
-                loading.load(tmp_path / "s.xml", exact=True)
+        mi.load_dict({"type": "neural_image", "filename": path})

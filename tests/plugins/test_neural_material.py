@@ -1,7 +1,7 @@
 """
 The BSDF ``neural_material`` inside Mitsuba: against ``normalmap``, ``disney``, ``mask`` and ``twosided`` with a
 ``neural_texture`` for each map of the same file. (The lobes themselves: ``test_disney.py``; the maps:
-``test_neural_texture.py``.)
+``test_texture_contract.py``.)
 """
 
 import gc
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import texture_scenes
 from bsdf_queries import random_directions, uniform, vectors
-from texture_files import make
+from texture_files import make, material
 
 import mi_diffind
 from mi_diffind import plugins
@@ -23,24 +23,13 @@ from mi_diffind.scenes import loading
 WIDTH, HEIGHT = 32, 16
 
 
-def waves(count):
-    """Smooth numbers in [0.15, 0.85], ``(HEIGHT, WIDTH, count)``."""
-    y, x = np.mgrid[0:HEIGHT, 0:WIDTH] / [[[HEIGHT]], [[WIDTH]]]
-    return 0.5 + 0.35 * np.sin(2 * np.pi * np.stack([x + k * y for k in range(count)], axis=-1) + np.arange(count))
-
-
 def constant(*values):
     return np.full((HEIGHT, WIDTH, len(values)), values)
 
 
-def bumps(strength):
-    xy = strength * (waves(2) - 0.5)
-    return 0.5 + 0.5 * np.concatenate([xy, np.sqrt(1 - (xy**2).sum(-1, keepdims=True))], axis=-1)
-
-
 def stored(path, extras=None, **maps):
-    maps = from_arrays({name: np.rint(255 * v).astype(np.uint8) for name, v in maps.items()})
-    return make(path, maps, extras=extras)
+    maps = {name: v if v.dtype == np.uint8 else np.rint(255 * v).astype(np.uint8) for name, v in maps.items()}
+    return make(path, from_arrays(maps), extras=extras)
 
 
 def shapes(shape):
@@ -54,18 +43,19 @@ def neutral(shape):
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    folder, wave = tmp_path_factory.mktemp("materials"), waves(6)
-    metal = {"albedo": wave[..., :3], "normal": bumps(1.2), "roughness": wave[..., 3:4], "metallic": wave[..., 4:5]}
-    leaf = {"base_color": wave[..., :3], "normal": bumps(0.5), "roughness": wave[..., 3:4], "opacity": wave[..., 4:5]}
+    folder, maps = tmp_path_factory.mktemp("materials"), material(WIDTH, HEIGHT)
+    other = np.roll(maps["roughness"], 5, axis=1)
+    metal = {**maps, "metallic": other}
+    leaf = {"base_color": maps["albedo"], "normal": maps["normal"], "roughness": maps["roughness"], "opacity": other}
     # Nothing but the roughness varies, and no lobe but the specular one and the diffuse one is possible
-    plain = {"albedo": constant(0.2, 0.2, 0.2), "roughness": wave[..., 3:4], "metallic": constant(0)}
+    plain = {"albedo": constant(0.2, 0.2, 0.2), "roughness": maps["roughness"], "metallic": constant(0)}
     return {
         "metal": stored(folder / "metal.npz", **metal),
         "shaped": stored(folder / "shaped.npz", shapes, **metal),
         "round": stored(folder / "round.npz", neutral, **metal),
-        "leaf": stored(folder / "leaf.npz", **leaf, ao=wave[..., 5:]),
+        "leaf": stored(folder / "leaf.npz", **leaf, ao=other[::-1]),
         "plain": stored(folder / "plain.npz", **plain, emission=constant(0.5, 0.2, 0.1)),
-        "other": stored(folder / "other.npz", albedo=wave[..., :3], height=wave[..., 3:4]),
+        "other": stored(folder / "other.npz", albedo=maps["albedo"], height=maps["roughness"]),
     }
 
 
@@ -96,9 +86,6 @@ def hits(mi, rng, n, below=False):
     si.wi, si.sh_frame = directions(mi, rng, n, below), mi.Frame3f(mi.Vector3f(0, 0, 1))
     si.dp_du, si.dp_dv, si.n = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Normal3f(0, 0, 1)
     return si
-
-
-# -- values ------------------------------------------------------------------------------------------------------------
 
 
 def assert_close(actual, desired, rtol, atol):
@@ -138,8 +125,8 @@ def assert_equal(mi, rng, ours, theirs, below):
     "reading", [{}, {"filter": "anisotropic", "wrap_mode": "mirror"}, {"filter": "off", "storage": "float32"}]
 )
 @pytest.mark.parametrize("two_sided", [False, True])
-def test_equals_separate_plugins(mi_rgb, files, rng, reading, two_sided):
-    mi, constants = mi_rgb, {"clearcoat": 0.6, "anisotropic": 0.4, "specular": 0.7}
+def test_equals_separate_plugins(mi, files, rng, reading, two_sided):
+    constants = {"clearcoat": 0.6, "anisotropic": 0.4, "specular": 0.7}
     reading = {**reading, "to_uv": mi.ScalarTransform4f().scale([2, 3, 1]).rotate([0, 0, 1], 30)}
     theirs = separate(files["metal"], METAL, constants, **reading)
     ours = {"type": "neural_material", "filename": files["metal"], "two_sided": two_sided, **constants, **reading}
@@ -157,8 +144,8 @@ def test_equals_separate_plugins_in_every_variant(mi_any, files, rng):
     )
 
 
-def test_opacity_is_that_of_mask(mi_rgb, files, rng):
-    mi, ctx, n = mi_rgb, mi_rgb.BSDFContext(), 4000
+def test_opacity_is_that_of_mask(mi, files, rng):
+    ctx, n = mi.BSDFContext(), 4000
     maps = {"base_color": "base_color", "roughness": "roughness"}
     opacity = {"type": "neural_texture", "filename": files["leaf"], "channels": "opacity"}
     theirs = {"type": "mask", "opacity": opacity, "inner": separate(files["leaf"], maps, {})}
@@ -186,15 +173,15 @@ def test_opacity_is_that_of_mask(mi_rgb, files, rng):
 
 
 @pytest.mark.parametrize("reading", [{}, {"filter": "off", "lobes": "tables"}])
-def test_neutral_extras_change_nothing(mi_rgb, files, rng, reading):
-    ours, theirs = (mi_rgb.load_dict({"type": "neural_material", "filename": files[name], **reading})
+def test_neutral_extras_change_nothing(mi, files, rng, reading):
+    ours, theirs = (mi.load_dict({"type": "neural_material", "filename": files[name], **reading})
                     for name in ("round", "metal"))  # fmt: skip
-    assert_equal(mi_rgb, rng, ours, theirs, False)
+    assert_equal(mi, rng, ours, theirs, False)
 
 
-def test_extras_shape_and_weigh_the_highlight(mi_rgb, files, rng):
+def test_extras_shape_and_weigh_the_highlight(mi, files, rng):
     """The specular lobe is that of its matrix in NumPy, at the level and the place of the footprint."""
-    mi, n = mi_rgb, 2000
+    n = 2000
     bsdf = mi.load_dict({
         "type": "neural_material", "filename": files["shaped"], "ignore": "albedo, normal", "base_color": 0.0,
         "specular": 1.0, "filter": "trilinear",
@@ -219,12 +206,9 @@ def test_extras_shape_and_weigh_the_highlight(mi_rgb, files, rng):
     np.testing.assert_allclose(values, expected, rtol=2e-3, atol=1e-5)
 
 
-# -- parameters --------------------------------------------------------------------------------------------------------
-
-
-def test_what_the_file_rules_out_is_not_traced(mi_rgb, files):
+def test_what_the_file_rules_out_is_not_traced(mi, files):
     """Lobes that a constant map rules out are not traced, here and in ``disney`` with textures of the same file."""
-    mi, file = mi_rgb, files["plain"]
+    file = files["plain"]
     ours = mi.load_dict({"type": "neural_material", "filename": file, "spec_tint": 0.5, "storage": "float32"})
     names = {"base_color": "albedo", "roughness": "roughness", "metallic": "metallic"}
     textures = separate(file, names, {"spec_tint": 0.5}, storage="float32")["inner"]
@@ -248,17 +232,17 @@ def test_what_the_file_rules_out_is_not_traced(mi_rgb, files):
     assert counted[0] <= 1.1 * counted[1]
 
 
-def test_report_and_text(mi_rgb, files):
-    bsdf = mi_rgb.load_dict({"type": "neural_material", "filename": files["leaf"], "lobes": "tables"})
+def test_report_and_text(mi, files):
+    bsdf = mi.load_dict({"type": "neural_material", "filename": files["leaf"], "lobes": "tables"})
     (report,) = mi_diffind.inspect(bsdf).figures["reports"]
     assert report["learned"] and report["lobes"] == "tables" and report["table_bytes"] > 0
     assert report["maps"] == {name: name for name in ("base_color", "normal", "roughness", "opacity")}
     assert report["effects_left_out"]["ao"] == "the BRDF has no such parameter"
     assert {"normal", "opacity", "diffuse"} <= set(report["effects_in_use"]) and 7 in report["channels_left_out"]
     assert "filter = trilinear" in str(bsdf) and "lobes = tables" in str(bsdf)
-    shaped = mi_rgb.load_dict({"type": "neural_material", "filename": files["shaped"]})
+    shaped = mi.load_dict({"type": "neural_material", "filename": files["shaped"]})
     assert shaped.report()["extras"] and "extras" in shaped.report()["effects_in_use"] and not report["extras"]
-    assert mi_rgb.has_flag(shaped.flags(1), mi_rgb.BSDFFlags.Anisotropic)
+    assert mi.has_flag(shaped.flags(1), mi.BSDFFlags.Anisotropic)
     assert mi_diffind.inspect(files["shaped"]).figures["extras"] and "extras" in str(
         mi_diffind.inspect(files["shaped"])
     )
@@ -278,12 +262,9 @@ def test_report_and_text(mi_rgb, files):
         ("metal", {"two_sided": 1}, 'parameter "two_sided": found 1, allowed are true and false'),
     ],
 )
-def test_refusals(mi_rgb, files, name, parameters, sentence):
-    refusal = texture_scenes.refused(mi_rgb, {"type": "neural_material", "filename": files[name], **parameters})
+def test_refusals(mi, files, name, parameters, sentence):
+    refusal = texture_scenes.refused(mi, {"type": "neural_material", "filename": files[name], **parameters})
     assert sentence in refusal
-
-
-# -- scenes ------------------------------------------------------------------------------------------------------------
 
 
 def wall(mi, bsdf):
@@ -296,10 +277,9 @@ def wall(mi, bsdf):
     }  # fmt: skip
 
 
-def test_footprints_reach_it(mi_rgb, files, capsys):
+def test_footprints_reach_it(mi, files, capsys):
     """The sensor of a scene is attached, and shows in the picture; plain Mitsuba warns once."""
     gc.collect()  # what other tests left would be traced, too
-    mi = mi_rgb
     bsdf = {"type": "neural_material", "filename": files["metal"], "to_uv": mi.ScalarTransform4f().scale(8)}
     theirs = separate(files["metal"], METAL, {}, to_uv=mi.ScalarTransform4f().scale(8))
     scene = mi_diffind.load_dict(wall(mi, bsdf))
@@ -315,9 +295,8 @@ def test_footprints_reach_it(mi_rgb, files, capsys):
     assert error < 0.1 * unfiltered and unfiltered > 0.005
 
 
-def test_counterparts(mi_rgb, rng, tmp_path):
+def test_counterparts(mi, rng, tmp_path):
     """Constants are exact in the file: pictures equal those of Mitsuba's plugins with the source."""
-    mi = mi_rgb
     normal = np.array([0.25, -0.15, 1]) / np.linalg.norm([0.25, -0.15, 1])
     maps = {
         "albedo": constant(0.8, 0.4, 0.2), "normal": constant(*(0.5 + 0.5 * normal)), "roughness": constant(0.6),
@@ -329,17 +308,13 @@ def test_counterparts(mi_rgb, rng, tmp_path):
     names = ", ".join(f'"{name}": "{name}.png"' for name in maps)
     (tmp_path / "paint.json").write_text(f'{{"maps": {{{names}}}}}')
     mi_diffind.fit("texture", tmp_path / "paint.json", steps=1, progress=False).save(tmp_path / "paint.npz")
-    (tmp_path / "scene.xml").write_text("""<scene version="3.0.0"><integrator type="path"><integer name="max_depth"
-        value="4"/></integrator><emitter type="constant"/><emitter type="point"><point name="position" x="1" y="-1"
-        z="2"/></emitter><sensor type="perspective"><transform name="to_world"><lookat origin="0,-1.5,3"
-        target="0,0,0" up="0,1,0"/></transform><film type="hdrfilm"><integer name="width" value="4"/><integer
-        name="height" value="4"/></film></sensor><shape type="rectangle"><bsdf type="neural_material"><string
-        name="filename" value="paint.npz"/><boolean name="two_sided" value="true"/><float name="clearcoat"
-        value="0.5"/><float name="clearcoat_sampling_rate" value="2"/></bsdf></shape></scene>""")
-    written = mi.render(loading.load(tmp_path / "scene.xml"), spp=64).numpy()
+    given = {"type": "neural_material", "filename": str(tmp_path / "paint.npz"), "two_sided": True, "clearcoat": 0.5}
+    lamp = {"type": "point", "position": [1, -1, 2], "intensity": 1.0}
+    scene = {**wall(mi, {**given, "clearcoat_sampling_rate": 2.0}), "lamp": lamp}
+    written = mi.render(loading.load_dict(scene), spp=64).numpy()
     for against in ("exact", "mipmap", "principled"):
-        scene = loading.load(tmp_path / "scene.xml", exact=True, against=against)
-        assert not [r for r in loading.reports(scene) if r["plugin"].startswith("neural")]
-        image = mi.render(scene, spp=64).numpy()
+        loaded = loading.ParsedScene(scene).load(exact=True, against=against)
+        assert not [r for r in loading.reports(loaded) if r["plugin"].startswith("neural")]
+        image = mi.render(loaded, spp=64).numpy()
         np.testing.assert_allclose(image, written, rtol=0.05 if against == "principled" else 2e-3)
     assert plugins.declared()["neural_material"].counterpart().oversampling == 8

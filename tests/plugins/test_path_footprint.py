@@ -45,15 +45,14 @@ def check(mi, shapes: dict, chain: tuple, median: float, worst: float, **sensor)
     assert (errors[:, 0] < median).all() and (errors[:, 1] < worst).all(), errors
 
 
-def test_directly_seen_from_a_far_near_plane_and_in_a_crop(mi_rgb):
+def test_directly_seen_from_a_far_near_plane_and_in_a_crop(mi):
     crop = {"crop_width": fp.WIDTH, "crop_height": fp.HEIGHT, "crop_offset_x": 20, "crop_offset_y": 5}
     film = {"type": "hdrfilm", "width": 3 * fp.WIDTH, "height": 2 * fp.HEIGHT, "rfilter": {"type": "box"}, **crop}
-    check(mi_rgb, {}, (), 0.005, 0.01, near_clip=1.0, film=film)
+    check(mi, {}, (), 0.005, 0.01, near_clip=1.0, film=film)
 
 
 @pytest.mark.parametrize("kind", ["plane", "ball", "knot", "vase", "mirrored", "instance"])
-def test_through_mirrors(mi_rgb, kind):
-    mi = mi_rgb
+def test_through_mirrors(mi, kind):
     if kind == "plane":
         turn = mi.ScalarTransform4f().rotate([1, 0, 0], -60) @ scaled(mi, 2)
         shapes = {"m": {"type": "rectangle", "to_world": turn, "bsdf": MIRROR}}
@@ -73,8 +72,7 @@ def test_through_mirrors(mi_rgb, kind):
     check(mi, shapes, (fp.mirrored,), median, worst)
 
 
-def test_through_hollow_mirrors_and_glass(mi_rgb):
-    mi = mi_rgb
+def test_through_hollow_mirrors_and_glass(mi):
     lamp = {"type": "area", "radiance": {"type": "probe"}}
     place = mi.ScalarTransform4f().translate([0.5, 2.0, 1.5]) @ scaled(mi, 1.2)
     hollow = {"type": "sphere", "to_world": scaled(mi, 7), "flip_normals": True, "bsdf": MIRROR}
@@ -83,9 +81,8 @@ def test_through_hollow_mirrors_and_glass(mi_rgb):
     check(mi, {"m": {"type": "sphere", "bsdf": GLASS}}, (follow, follow), 0.02, 0.1)
 
 
-def test_rough_bounces_widen_and_samples_share(mi_rgb):
+def test_rough_bounces_widen_and_samples_share(mi):
     """The rougher, the larger; of many samples, each covers less; straight on through a mask, nothing changes."""
-    mi = mi_rgb
     fp.register_probe()
 
     def side(bsdf, spp=1):
@@ -106,9 +103,8 @@ def test_rough_bounces_widen_and_samples_share(mi_rgb):
     assert side(MIRROR, 256) == pytest.approx(smooth / 8, rel=0.02)
 
 
-def test_cones_of_rough_bounces_add_up(mi_rgb):
+def test_cones_of_rough_bounces_add_up(mi):
     """The variances of the angles add up over several bounces, each of the solid angle of its sample."""
-    mi = mi_rgb
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.n, si.sh_frame = mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Normal3f(0, 0, 1))
     ray, still = mi.Ray3f(mi.Point3f(0), mi.Vector3f(0, 0, -1)), mi.Vector3f(0)
@@ -146,9 +142,8 @@ BSDFS = {
 
 
 @pytest.mark.parametrize("footprints", [False, True])
-def test_light_and_derivatives_are_those_of_prb(mi_rgb, footprints):
+def test_light_and_derivatives_are_those_of_prb(mi, footprints):
     """The same random numbers lead to the same paths: images agree sample by sample, with footprints or without."""
-    mi = mi_rgb
     fp.register_probe()
     balls = {
         f"ball{i or ''}": {"type": "sphere", "center": [1.6 * i - 1.6, 0, 0], "radius": 0.75, "bsdf": bsdf}
@@ -174,9 +169,8 @@ def test_light_and_derivatives_are_those_of_prb(mi_rgb, footprints):
     np.testing.assert_allclose(*gradients, rtol=2e-2, atol=1e-3 * np.abs(gradients[0]).max())
 
 
-def test_light_is_that_of_path(mi_rgb):
+def test_light_is_that_of_path(mi):
     """Alpha, hidden emitters, environments and null surfaces, in which ``prb`` differs."""
-    mi = mi_rgb
     rough, mask = BSDFS["rough"], {"type": "mask", "opacity": 0.0, "nested": {"type": "diffuse"}}
     for bsdf, more, given in (
         (BSDFS["mask"], {}, {"hide_emitters": True}),
@@ -196,9 +190,9 @@ def test_light_is_that_of_path(mi_rgb):
         assert (np.abs(a.mean(0) - b.mean(0)) < 5 * error + 1e-6).all(), (bsdf, given, a.mean(0), b.mean(0), error)
 
 
-def test_spheres_behind_hidden_emitters(mi_rgb):
+def test_spheres_behind_hidden_emitters(mi):
     """Shaded where they are: with a hidden lamp that sends no light before the camera as without it."""
-    mi, images = mi_rgb, []
+    images = []
     place = mi.ScalarTransform4f().translate([0, -4, 0]).rotate([1, 0, 0], 90)
     dark = {"type": "area", "radiance": {"type": "rgb", "value": 0}}
     lamp = {"type": "rectangle", "to_world": place, "emitter": dark}
@@ -211,8 +205,7 @@ def test_spheres_behind_hidden_emitters(mi_rgb):
     assert images[0].mean() > 0.01 and np.abs(images[0] - images[1]).mean() < 0.1 * images[0].mean()
 
 
-def test_centres_of_pixels_and_parameters(mi_rgb):
-    mi = mi_rgb
+def test_centres_of_pixels_and_parameters(mi):
     scene = mi.load_dict(lit(mi, {"type": "diffuse"}))
     centred = mi.load_dict({"type": "path_footprint", "jitter": False, "max_depth": 1})
     images = [np.array(mi.render(scene, spp=1, seed=s, integrator=centred)) for s in (0, 1)]

@@ -42,11 +42,11 @@ def render(mi, loaded, integrator="path_sdf", spp=16, seed=0, **options):
 
 
 @pytest.fixture
-def fields(mi_rgb):
+def fields(mi):
     """The fields that a ``test_solid`` may name."""
-    types = compat.backend_module(mi_rgb.Float)
+    types = compat.backend_module(mi.Float)
     by_name = {"ball": Ball(types), "aside": Ball(types, 0.3, (0.15, 0.1, -0.05))}
-    register(mi_rgb, by_name)
+    register(mi, by_name)
     return by_name
 
 
@@ -74,16 +74,16 @@ def same_light(mi, actual: dict, expected: dict, view=((0, -5, 2.5), (0, 0, 0)),
     assert abs(difference.mean()) < 4 * np.sqrt((error**2).sum()) / error.size + 1e-5
 
 
-def test_scenes_without_solids(mi_rgb):
+def test_scenes_without_solids(mi):
     """Rendered by ``path_footprint``, whose loop it is."""
-    loaded = scene(mi_rgb, {"ball": {"type": "sphere", "bsdf": BSDFS["rough"]}})
-    np.testing.assert_array_equal(*(render(mi_rgb, loaded, name) for name in ("path_sdf", "path_footprint")))
+    loaded = scene(mi, {"ball": {"type": "sphere", "bsdf": BSDFS["rough"]}})
+    np.testing.assert_array_equal(*(render(mi, loaded, name) for name in ("path_sdf", "path_footprint")))
 
 
 @pytest.mark.parametrize("names", [("diffuse", "rough"), ("glass", "mask")], ids="-".join)
-def test_balls_are_spheres(mi_rgb, fields, names):
+def test_balls_are_spheres(mi, fields, names):
     """Light, shadows, reflections and refractions of solids are those of Mitsuba's spheres, two materials a scene."""
-    mi, (first, second) = mi_rgb, (BSDFS[name] for name in names)
+    (first, second) = (BSDFS[name] for name in names)
     other = {"other": {"type": "sphere", "center": [1.6, 1.0, -0.4], "radius": 0.6, "bsdf": BSDFS["diffuse"]}}
     beside = {"to_world": mi.ScalarTransform4f().translate([-1.4, -1.2, 0.2]).scale(2.0), "bsdf": second}
     actual = {"ball": solid(mi, "ball", bsdf=first), "beside": {**solid(mi, "ball"), **beside}, **other}
@@ -91,9 +91,9 @@ def test_balls_are_spheres(mi_rgb, fields, names):
     same_light(mi, actual, {"ball": {"type": "sphere", "bsdf": first}, "beside": sphere, **other})
 
 
-def test_several_solids_turned_scaled_and_overlapping(mi_rgb, fields):
+def test_several_solids_turned_scaled_and_overlapping(mi, fields):
     """Three solids of two fields, one of them a reflection, beside a mesh that one of them cuts."""
-    mi, at = mi_rgb, mi_rgb.ScalarTransform4f
+    at = mi.ScalarTransform4f
     turns = {
         "a": at().translate([-0.8, 0.2, 0.1]).rotate([0.6, 0, 0.8], 70).scale(2.0),
         "b": at().translate([0.1, -0.3, 0]).rotate([0, 1, 0], 200).scale(2.4),
@@ -119,16 +119,16 @@ def test_several_solids_turned_scaled_and_overlapping(mi_rgb, fields):
     ],
     ids=["within glass", "behind glass", "in the box"],
 )
-def test_where_the_camera_is(mi_rgb, fields, name, pane, view):
-    mi, bsdf = mi_rgb, {"bsdf": BSDFS[name]}
+def test_where_the_camera_is(mi, fields, name, pane, view):
+    bsdf = {"bsdf": BSDFS[name]}
     place = mi.ScalarTransform4f().translate([0, -2, 0]).scale([1.5, 0.1, 1.5])
     panes = {"pane": {"type": "cube", "to_world": place, "bsdf": BSDFS["glass"]}} if pane else {}
     same_light(mi, {"ball": solid(mi, "ball", **bsdf), **panes}, {"ball": {"type": "sphere", **bsdf}, **panes}, view)
 
 
-def test_shadows_of_a_sky_far_from_the_origin(mi_rgb, fields):
+def test_shadows_of_a_sky_far_from_the_origin(mi, fields):
     """Directions to a sky count, since its places are rounded far away: from between two balls."""
-    mi, count, far = mi_rgb, 4000, 1e7
+    count, far = 4000, 1e7
     at = mi.ScalarTransform4f().translate
     small = {**solid(mi, "ball"), "to_world": at([far, 3, 0])}
     large = {**solid(mi, "ball"), "to_world": at([far, 0, 0]).scale(2.5)}
@@ -147,14 +147,13 @@ def test_shadows_of_a_sky_far_from_the_origin(mi_rgb, fields):
 
 
 @pytest.mark.parametrize("options", [{"max_depth": 1}, {"max_depth": 2, "hide_emitters": True}, {"rr_depth": 1}])
-def test_depths_and_hidden_emitters(mi_rgb, fields, options):
-    mi, view = mi_rgb, ((0, -5, 8.0), (0, 0, 1))
+def test_depths_and_hidden_emitters(mi, fields, options):
+    view = ((0, -5, 8.0), (0, 0, 1))
     actual, expected = solid(mi, "ball", bsdf=BSDFS["rough"]), {"type": "sphere", "bsdf": BSDFS["rough"]}
     same_light(mi, {"ball": actual}, {"ball": expected}, view, **options)
 
 
-def test_solids_in_groups_are_refused(mi_rgb, fields):
-    mi = mi_rgb
+def test_solids_in_groups_are_refused(mi, fields):
     group = {"type": "shapegroup", "ball": solid(mi, "ball")}
     loaded = scene(mi, {"group": group, "one": {"type": "instance", "group": {"type": "ref", "id": "group"}}})
     with pytest.raises(RuntimeError) as raised:
@@ -169,12 +168,9 @@ def test_solids_in_groups_are_refused(mi_rgb, fields):
         ({"interior": {"type": "homogeneous"}}, "hold none"),
     ],
 )
-def test_what_solids_cannot_be(mi_rgb, fields, more, message):
+def test_what_solids_cannot_be(mi, fields, more, message):
     with pytest.raises(RuntimeError, match=message):
-        mi_rgb.load_dict({"type": "test_solid", "field": "ball", **more})
-
-
-# -- derivatives -------------------------------------------------------------------------------------------------------
+        mi.load_dict({"type": "test_solid", "field": "ball", **more})
 
 
 def interior(mi):
@@ -211,9 +207,8 @@ def both_modes(mi, loaded, ball, depth, spp=64, seed=3):
 
 
 @pytest.mark.parametrize("name, depth", [("diffuse", 2), ("rough", 2), ("rough", 5)])
-def test_derivatives_are_those_of_prb(mi_rgb, fields, name, depth):
+def test_derivatives_are_those_of_prb(mi, fields, name, depth):
     """The same random numbers lead to the same derivatives as for Mitsuba's own sphere, at all vertices of a path."""
-    mi = mi_rgb
     loaded = scene(mi, {"ball": solid(mi, "ball", bsdf=BSDFS[name]), **OTHER}, **interior(mi))
     actual, _ = both_modes(mi, loaded, fields["ball"], depth)
     loaded = scene(mi, {"ball": {"type": "sphere", "bsdf": BSDFS[name]}, **OTHER}, **interior(mi))
@@ -249,8 +244,8 @@ def of_place(mi, loaded, integrator, move, mode="forward", spp=64, seed=3):
 
 
 @pytest.mark.parametrize("move, depth", [("translation", 2), ("rotation", 4), ("scale", 2)])
-def test_derivatives_of_the_place_are_those_of_prb(mi_rgb, fields, move, depth):
-    mi, at = mi_rgb, mi_rgb.ScalarTransform4f
+def test_derivatives_of_the_place_are_those_of_prb(mi, fields, move, depth):
+    at = mi.ScalarTransform4f
     ours = solid(mi, "aside", bsdf=BSDFS["rough"])
     sphere = {"type": "sphere", "to_world": at().scale(2.5).translate([0.15, 0.1, -0.05]).scale(0.3)}
     loaded = scene(mi, {"ball": ours, **OTHER}, **interior(mi))
@@ -264,9 +259,9 @@ def test_derivatives_of_the_place_are_those_of_prb(mi_rgb, fields, move, depth):
 
 
 @pytest.mark.parametrize("moved", ["field", "place"])
-def test_derivatives_that_are_zero_are_said(mi_rgb, fields, monkeypatch, moved):
+def test_derivatives_that_are_zero_are_said(mi, fields, monkeypatch, moved):
     """One warning for a black ball, of which only the outline shows, and none for a lit ball."""
-    mi, ball, warned = mi_rgb, fields["ball"], warnings_of(mi_rgb, monkeypatch)
+    ball, warned = fields["ball"], warnings_of(mi, monkeypatch)
     integrator = mi.load_dict({"type": "path_sdf", "max_depth": 2})
     for reflectance, count in ((0.5, 0), (0.0, 1)):
         bsdf = {"type": "diffuse", "reflectance": reflectance}

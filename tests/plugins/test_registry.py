@@ -80,20 +80,7 @@ def mi_toys(request, package):
     return mi
 
 
-SCENE = """
-<scene version="3.0.0">
-    <integrator type="direct"/>
-    <sensor type="perspective">
-        <film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="8"/></film>
-    </sensor>
-    <emitter type="constant"/>
-    <shape type="toy_ball" id="ball"><string name="preset" value="paper"/></shape>
-    <shape type="toy_ball"><float name="size" value="0.25"/></shape>
-</scene>
-"""
-
-
-def test_plugins_of_this_package_say_what_they_are(mi_rgb):
+def test_plugins_of_this_package_say_what_they_are(mi):
     declared = plugins.declared()
     assert {name: p.object_type for name, p in declared.items()} == {
         "disney": "bsdf", "mipmap": "texture", "neural_bsdf": "bsdf", "neural_disney": "bsdf", "neural_ggx": "bsdf",
@@ -106,7 +93,7 @@ def test_plugins_of_this_package_say_what_they_are(mi_rgb):
     assert plugins.with_counterpart("principled") == ("disney", "neural_disney", "neural_material")
 
 
-def test_manual_pages_are_complete(mi_rgb):
+def test_manual_pages_are_complete(mi):
     """Shared parts are filled in; each page names the program that cannot load the plugin, and the one that can."""
     folder = Path(plugins.__file__).parent
     for name, plugin in plugins.declared().items():
@@ -118,10 +105,10 @@ def test_manual_pages_are_complete(mi_rgb):
         assert not re.search(r"^ *\{\w+\}$", page, re.MULTILINE), plugin.name
 
 
-def test_program_of_mitsuba_loads_no_plugins(mi_rgb, tmp_path):
+def test_program_of_mitsuba_loads_no_plugins(mi, tmp_path):
     """Mitsuba's program loads no Python plugins; manual pages and the README change when this fails."""
     (tmp_path / "scene.xml").write_text('<scene version="3.0.0"><bsdf type="neural_disney"/></scene>')
-    program = Path(mi_rgb.__file__).parent / ("mitsuba.exe" if sys.platform == "win32" else "mitsuba")
+    program = Path(mi.__file__).parent / ("mitsuba.exe" if sys.platform == "win32" else "mitsuba")
     command = [str(program), "-m", "scalar_rgb", str(tmp_path / "scene.xml")]
     output = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert 'Plugin "neural_disney" not found!' in output.stdout + output.stderr
@@ -152,29 +139,25 @@ def test_after_a_purge_of_modules():
     assert done.stdout.split() == ["Disney", "NeuralDisney"], done.stderr
 
 
-def test_plugins_of_other_packages(mi_toys, tmp_path):
+def test_plugins_of_other_packages(mi_toys):
     """Shapes whose factories return native objects are found, compared and inspected; also by scalar variants."""
-    mi = mi_toys
     assert {"toy_ball", "neural_disney"} <= set(plugins.declared())
-    (tmp_path / "scene.xml").write_text(SCENE)
-    found = loading.ParsedScene(tmp_path / "scene.xml").learned_plugins()
-    assert [(e["plugin"], e["id"], e.get("preset"), e.get("size")) for e in found] == [
-        ("toy_ball", "ball", "paper", None), ("toy_ball", "", None, "0.25")
+    balls = {"ball": {"type": "toy_ball", "preset": "paper"}, "other": {"type": "toy_ball", "size": 0.25}}
+    parsed = loading.ParsedScene({"type": "scene", "sky": {"type": "constant"}, **balls})
+    assert [(e["plugin"], e["id"], e.get("preset")) for e in parsed.learned_plugins()] == [
+        ("toy_ball", "ball", "paper"), ("toy_ball", "other", None)
     ]  # fmt: skip
-    exact = loading.load(tmp_path / "scene.xml", exact=True)
+    exact = parsed.load(exact=True, needs=())
     assert [shape.class_name() for shape in exact.shapes()] == ["Sphere", "Sphere"]
     assert loading.instances(exact) == []
-    if not plugins.supported(mi.variant()):
+    if not plugins.supported(mi_toys.variant()):
         with pytest.raises(loading.SceneError, match='"toy_ball" does not run in the variant "scalar_rgb"'):
-            loading.load(tmp_path / "scene.xml")
+            parsed.load(needs=())
         return
-    scene = loading.load(tmp_path / "scene.xml")
-    reports = loading.reports(scene)
-    assert [(r["plugin"], r["id"], r.get("preset")) for r in reports] == [
-        ("toy_ball", "ball", "paper"), ("toy_ball", "", "tables")
+    reports = loading.reports(parsed.load(needs=()))
+    assert [(r["plugin"], r["id"], r["preset"], r["size"]) for r in reports] == [
+        ("toy_ball", "ball", "paper", 0.5), ("toy_ball", "other", "tables", 0.25)
     ]  # fmt: skip
-    assert [r["size"] for r in reports] == [0.5, 0.25]
-    assert len(reports) == 2 and mi.render(scene, spp=1).numpy().std() >= 0
 
 
 def test_native_objects_are_forgotten(mi_toys):
@@ -200,9 +183,9 @@ def test_factories_that_return_something_else(mi_toys, name, found):
             mi_toys.load_dict({"type": name})
 
 
-def test_two_plugins_of_one_name(mi_rgb, monkeypatch):
+def test_two_plugins_of_one_name(mi, monkeypatch):
     """The plugin of this package stays; a warning names the other one."""
-    variant, theirs = mi_rgb.variant(), metadata.EntryPoint("disney", "theirs.disney", plugins.__name__)
+    variant, theirs = mi.variant(), metadata.EntryPoint("disney", "theirs.disney", plugins.__name__)
     monkeypatch.setattr(metadata, "entry_points", lambda group: [theirs] if group == plugins.__name__ else [])
     monkeypatch.setitem(plugins._declared, variant, {})
     plugins._declared.pop(variant)

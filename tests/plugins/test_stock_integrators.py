@@ -76,9 +76,9 @@ INTEGRATORS = {
 
 
 @pytest.fixture
-def squares(mi_rgb):
+def squares(mi):
     """Squares side by side, in uniform light: the plugins in the upper row, Mitsuba's in the lower one."""
-    at = mi_rgb.ScalarTransform4f
+    at = mi.ScalarTransform4f
     shapes = {}
     for i, pair in enumerate(PAIRS.values()):
         for row, parts in zip(("upper", "lower"), pair, strict=True):
@@ -97,9 +97,8 @@ def squares(mi_rgb):
 
 
 @pytest.mark.parametrize("name", INTEGRATORS)
-def test_pictures_are_right_or_warned_of(mi_rgb, squares, capsys, name):
+def test_pictures_are_right_or_warned_of(mi, squares, capsys, name):
     """Each square equals that of Mitsuba's plugin; of what is left out, a shape and filters, one warning each tells."""
-    mi = mi_rgb
     integrator = mi.load_dict({"type": name, **INTEGRATORS[name]})
     samples, limit = (1024, 0.08) if name == "ptracer" else (256, 0.01)
     image = np.array(mi.render(mi.load_dict(squares), integrator=integrator, spp=samples), np.float64)
@@ -134,9 +133,9 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", INTEGRATORS)
-def test_radiance_fields_around_each_integrator(mi_rgb, name):
+def test_radiance_fields_around_each_integrator(mi, name):
     """Uniform fog before a sky: what is seen is the formula's mixture of both."""
-    mi, colour, density = mi_rgb, np.array([0.2, 0.5, 0.8]), 0.8
+    colour, density = np.array([0.2, 0.5, 0.8]), 0.8
     register(mi, {"fog": Fog(compat.backend_module(mi.Float), density, colour)})
     field = {"type": "test_field", "field": "fog", "surfaces": {"type": name, **INTEGRATORS[name]}}
     if name in REFUSED:

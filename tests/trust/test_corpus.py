@@ -4,7 +4,6 @@ import json
 import os
 import re
 import struct
-import zipfile
 import zlib
 
 import captures
@@ -31,22 +30,54 @@ def case(name, *outcomes, says=""):
     return add
 
 
-def table(name, seed, *changes, outcomes=("refused",)):
-    """Add changes of the :class:`Archive` of a small valid file."""
+def table(name, seed, *changes, outcomes=("refused",), patch=lambda data: data):
+    """Add changes of the :class:`Archive` of a small valid table file or checkpoint; no array has to be as before."""
 
     @case(name, *outcomes)
     def _(folder):
-        archive = Archive(all_seeds()[seed].read_bytes())
+        path = CHECKPOINT if seed == "checkpoint" else all_seeds()[seed]
+        archive = Archive(path.read_bytes())
         for change in changes:
             change(archive)
-        return mutant(folder, seed, archive.write())
+        (folder / "mutant.npz").write_bytes(patch(archive.write()))
+        if seed == "checkpoint":
+            return seed, {"path": "mutant.npz"}
+        return "table", {"path": "mutant.npz", "original": str(path), "untouched": []}
 
 
-def mutant(folder, seed="ggx_small", data=None):
-    """Write a table file, and return the request that opens it; no array has to be as before."""
-    if data is not None:
-        (folder / "mutant.npz").write_bytes(data)
-    return "table", {"path": "mutant.npz", "original": str(all_seeds()[seed]), "untouched": []}
+def put(*path):
+    """Return a change that puts the last of these in the description, at the path of the others."""
+    *above, key, value = path
+
+    def change(archive):
+        content = archive.meta
+        for step in above:
+            content = content[step]
+        content[key] = value
+
+    return change
+
+
+def edit(name, function):
+    """Return a change of the entries of an array, its shape and type described as they are then."""
+
+    def change(archive):
+        array = archive.arrays[name] = function(archive.arrays[name])
+        described = archive.meta["arrays"][name]
+        if array.dtype.kind == "f":
+            described["storage"] = str(array.dtype)
+        if "bits" not in described or described["bits"] == 8:
+            described["shape"] = list(array.shape)
+
+    return change
+
+
+def as_type(name, dtype):
+    return edit(name, lambda array: array.astype(dtype))
+
+
+def one_entry(axes):
+    return edit("primary", lambda array: np.resize(array, (1,) * axes + array.shape[axes:]))
 
 
 # -- memory and time by small files ------------------------------------------------------------------------------------
@@ -55,87 +86,56 @@ def mutant(folder, seed="ggx_small", data=None):
 BOMB = 160 << 20
 
 
-def bomb(folder, name, start, filling, size=BOMB, end=b"", archive=None):
-    """Write a table file one of whose members goes on for ``size`` bytes with a repeated ``filling``."""
-    archive = archive or Archive(all_seeds()["ggx_small"].read_bytes())
-    with zipfile.ZipFile(folder / "mutant.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file:
-        for member, data in archive.members().items():
-            if member != name:
-                file.writestr(f"{member}.npy", data)
-        with file.open(f"{name}.npy", "w", force_zip64=True) as stream:
-            stream.write(start)
-            for _ in range(size >> 20):
-                stream.write(filling * ((1 << 20) // len(filling)))
-            stream.write(end)
-    return mutant(folder)
+def fill(name, start, filling, size=BOMB, end=b""):
+    """Return a change: a member goes on for ``size`` bytes with a repeated ``filling``."""
+    return lambda archive: archive.raw.update({name: start + filling * (size // len(filling)) + end})
 
 
-@case("entries of one bit")
-def _(folder):
-    archive, sides = Archive(all_seeds()["ggx_small"].read_bytes()), [BOMB // 2**10, 2**12, 2]
-    stored = {"shape": sides, "storage": "uint8", "scale": [1.0, 1.0], "offset": [0.0, 0.0], "bits": 1}
-    archive.meta["arrays"]["primary"] |= stored
-    return bomb(folder, "primary", header([BOMB], "|u1"), b"\0", archive=archive)
+def fill_text(before, filling, end):
+    """Return a change: the description is ``before``, a repeated ``filling`` of BOMB / 4 bytes, and ``end``."""
+
+    def change(archive):
+        text = before(archive.meta)
+        size = len(text) + BOMB // 4 // len(filling) * len(filling) + len(end)
+        fill("meta", header([size], "|u1") + text, filling, BOMB // 4, end)(archive)
+
+    return change
 
 
-@case("a large description")
-def _(folder):
-    archive, size = Archive(all_seeds()["ggx_small"].read_bytes()), BOMB // 4
-    text = json.dumps(archive.meta)[:-1] + ', "more": [0'
-    return bomb(folder, "meta", header([len(text) + size + 2], "|u1") + text.encode(), b",0", size, b"]}")
+def smaller_claim(data):
+    """Return an archive whose records claim a member of 400 bytes in place of BOMB."""
+    return data.replace(*(struct.pack("<I", n + len(header([400], "|u1"))) for n in (BOMB, 400)))
 
 
-@case("a large array of zeros")
-def _(folder):
-    archive, sides = Archive(all_seeds()["ggx_small"].read_bytes()), [BOMB // 4 // 2**12, 2**11, 2]
-    archive.meta["arrays"]["primary"]["shape"] = sides
-    return bomb(folder, "primary", header(sides, "<f4"), b"\0", archive=archive)
-
-
-@case("an array that is larger than its archive says")
-def _(folder):
-    bomb(folder, "primary", header([400], "|u1"), b"\0")
-    data = (folder / "mutant.npz").read_bytes()
-    sizes = [struct.pack("<I", n + len(header([400], "|u1"))) for n in (BOMB, 400)]
-    return mutant(folder, data=data.replace(*sizes))
-
-
-@case("a long history of a checkpoint", "refused", "loaded")
-def _(folder):
-    text = b'{"lr_scale": 1, "settings": {}, "history": ['
-    bomb(folder, "meta", header([len(text) + BOMB // 4 + 3], "|u1") + text, b"[],", BOMB // 4, b"0]}")
-    return "checkpoint", {"path": "mutant.npz"}
-
-
-@case("a distance field of empty regions")
-def _(folder):
-    archive = Archive(all_seeds()["sdf_sparse"].read_bytes())
-    regions = np.zeros((192, 192, 192, 1), np.uint8)
-    regions[:2, :2, :2] = archive.arrays["regions"]
-    archive.arrays["regions"], archive.meta["arrays"]["regions"]["shape"] = regions, list(regions.shape)
-    return mutant(folder, "sdf_sparse", archive.write())
-
-
-@case("a radiance field of a large empty grid")
-def _(folder):
-    archive, side = Archive(all_seeds()["field_grid"].read_bytes()), 600
-    archive.meta["settings"]["shape"] = [side] * 3
-    arrays = {name: archive.arrays[name][:1] for name in ("density", "colour")}
-    for name, array in {**arrays, "cells": np.zeros((side**3 // 8, 1), np.uint8)}.items():
-        archive.arrays[name], archive.meta["arrays"][name]["shape"] = array, list(array.shape)
-    return mutant(folder, "field_grid", archive.write())
-
-
-@case("a coded radiance field that claims a large grid")
-def _(folder):
-    archive, shape = Archive(all_seeds()["field_coded"].read_bytes()), (60, 60, 60)
+def coded_grid(archive):
+    """Claim a grid of 600³ nodes for the codes of one of 60³."""
+    shape, settings = (60, 60, 60), archive.meta["settings"]
     numbers, colours = np.zeros(np.prod(shape), int), len(archive.arrays["palette"])
-    codes = coding.encode(np.ones(shape, bool), numbers, numbers, 2 ** archive.meta["settings"]["density_bits"],
-                                colours)  # fmt: skip
-    archive.meta["settings"]["shape"] = [600] * 3
+    codes = coding.encode(np.ones(shape, bool), numbers, numbers, 2 ** settings["density_bits"], colours)
+    settings["shape"] = [600] * 3
     for name, array in zip(("probabilities", "nodes"), codes, strict=True):
-        archive.arrays[name], archive.meta["arrays"][name]["shape"] = array[:, None], [len(array), 1]
-    return mutant(folder, "field_coded", archive.write())
+        edit(name, lambda _, array=array: array[:, None])(archive)
+
+
+ZEROS = [BOMB // 4 // 2**12, 2**11, 2]
+ONE_BIT = {"shape": [BOMB // 2**10, 2**12, 2], "storage": "uint8", "scale": [1.0] * 2, "offset": [0.0] * 2, "bits": 1}
+table("entries of one bit", "ggx_small", lambda a: a.meta["arrays"]["primary"].update(ONE_BIT),
+      fill("primary", header([BOMB], "|u1"), b"\0"))  # fmt: skip
+table("a large description", "ggx_small",
+      fill_text(lambda meta: (json.dumps(meta)[:-1] + ', "more": [0').encode(), b",0", b"]}"))  # fmt: skip
+table("a large array of zeros", "ggx_small", put("arrays", "primary", "shape", ZEROS),
+      fill("primary", header(ZEROS, "<f4"), b"\0"))  # fmt: skip
+table("an array that is larger than its archive says", "ggx_small", fill("primary", header([400], "|u1"), b"\0"),
+      patch=smaller_claim)  # fmt: skip
+table("a long history of a checkpoint", "checkpoint",
+      fill_text(lambda meta: b'{"lr_scale": 1, "settings": {}, "history": [', b"[],", b"0]}"),
+      outcomes=("refused", "loaded"))  # fmt: skip
+table("a distance field of empty regions", "sdf_sparse",
+      edit("regions", lambda array: np.pad(array, [(0, 192 - n) for n in array.shape[:3]] + [(0, 0)])))  # fmt: skip
+table("a radiance field of a large empty grid", "field_grid", put("settings", "shape", [600] * 3),
+      *(edit(name, lambda array: array[:1]) for name in ("density", "colour")),
+      edit("cells", lambda _: np.zeros((600**3 // 8, 1), np.uint8)))  # fmt: skip
+table("a coded radiance field that claims a large grid", "field_coded", coded_grid)
 
 
 def large_picture(side):
@@ -260,44 +260,9 @@ for target in ("pipe", "device"):
         command(words, f"is a {target}|holds no views", special_files(target))
 
 
-def put(*path):
-    """Return a change that puts the last of these in the description, at the path of the others."""
-    *above, key, value = path
-
-    def change(archive):
-        content = archive.meta
-        for step in above:
-            content = content[step]
-        content[key] = value
-
-    return change
-
-
-def edit(name, function):
-    """Return a change of the entries of an array, its shape and type described as they are then."""
-
-    def change(archive):
-        array = archive.arrays[name] = function(archive.arrays[name])
-        described = archive.meta["arrays"][name]
-        if array.dtype.kind == "f":
-            described["storage"] = str(array.dtype)
-        if "bits" not in described or described["bits"] == 8:
-            described["shape"] = list(array.shape)
-
-    return change
-
-
 def rename(archive):
     archive.arrays["x" * 5000] = archive.arrays.pop("primary")
     archive.meta["arrays"]["x" * 5000] = archive.meta["arrays"].pop("primary")
-
-
-def as_type(name, dtype):
-    return edit(name, lambda array: array.astype(dtype))
-
-
-def one_entry(axes):
-    return edit("primary", lambda array: np.resize(array, (1,) * axes + array.shape[axes:]))
 
 
 EITHER = ("refused", "loaded")
@@ -331,21 +296,10 @@ for method in (12, 14):
     table(f"a member compressed by method {method}", "ggx_small", lambda a, m=method: a.methods.update(primary=m))
 
 
-def checkpoint(key, value):
-    """Add the checkpoint of a short training with another value."""
-
-    @case(f"a checkpoint with {key} {value!r}", *EITHER)
-    def _(folder):
-        archive = Archive(CHECKPOINT.read_bytes())
-        archive.meta[key] = value
-        (folder / "mutant.npz").write_bytes(archive.write())
-        return "checkpoint", {"path": "mutant.npz"}
-
-
 for key in ("step", "lr_scale", "best_measured", "best_step", "history", "restarts", "seconds", "plateau", "references",
             "settings"):  # fmt: skip
     for value in (None, "x", [1], {"a": "b"}, 3, -1, 2**70):
-        checkpoint(key, value)
+        table(f"a checkpoint with {key} {value!r}", "checkpoint", put(key, value), outcomes=EITHER)
 
 
 def mesh(name, text):

@@ -11,7 +11,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import trial_files
 
 from mi_diffind.commands import cli
@@ -83,34 +82,6 @@ def measure_little() -> None:
     GGXModel.measure.__defaults__ = (2**12,)
 
 
-def small_study() -> None:
-    """Add a study ``killed``: the small one, with a training to convergence."""
-    from small_study import Log, small_plan
-
-    from mi_diffind.core.runtime import array_module
-    from mi_diffind.fitting.loop import FitSettings
-    from mi_diffind.fitting.task import FitRequest
-    from mi_diffind.measure.study import Study
-    from mi_diffind.measure.training import ConvergenceTraining
-    from mi_diffind.studies import studies
-    from mi_diffind.tasks.ggx import TASK
-
-    measure_little()
-    settings = FitSettings(steps=5, batch=64, lr=1e-2, schedule="constant", seed=3)
-    request = FitRequest("tables", settings, array_module("llvm"), options={"primary": 4, "cascaded": 3})
-
-    class Killed(Study):
-        name, title = "killed", "a small study"
-
-        def plan(self, arguments):
-            plan = small_plan(Log())
-            plan.study = "killed"
-            plan.jobs = [ConvergenceTraining("training", lambda: TASK.problem(request), settings, 40)]
-            return plan
-
-    studies()["killed"] = Killed()
-
-
 def kill_and_go_on(command, folder, kills=1, prepare="", resume=()):
     """Run a command in ``folder / "whole"``; in ``folder / "killed"``, kill it at drawn moments, each time going on.
 
@@ -148,19 +119,6 @@ def test_a_capture(tmp_path):
     command = ["capture", "../scene.xml", "-o", "views", "--views", "3", "--test", "1", "--resolution", "8",
                "--spp", "2", "--variant", "llvm_ad_rgb"]  # fmt: skip
     assert_same(*kill_and_go_on(command, tmp_path))
-
-
-def test_a_study(tmp_path):
-    """Times differ from run to run, trained parameters and their errors do not."""
-    command = ["tradeoff", "killed", "--quick", "--out", "out", "--variant", "llvm_ad_rgb"]
-    first, second = kill_and_go_on(command, tmp_path, prepare="small_study")
-    assert list(first) == list(second)
-    records = [json.loads(files["out/tradeoff_killed.json"])["jobs"]["training"] for files in (first, second)]
-    for key in ("steps", "psnr_db", "gain_db", "converged", "entries"):
-        assert records[0][key] == records[1][key]
-    models = [next(p for p in (tmp_path / n).rglob("training.npz")) for n in ("whole", "killed")]
-    with np.load(models[0]) as a, np.load(models[1]) as b:
-        assert a.files and all(a[name].tobytes() == b[name].tobytes() for name in a.files)
 
 
 def test_no_temporary_file_outlives_the_next_run(tmp_path):

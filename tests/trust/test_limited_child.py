@@ -9,21 +9,19 @@ PROBES = """
 import os, signal, time
 import numpy as np
 from hostile_probes import *
+from mi_diffind.core.errors import UsageError
 
 def crashed(): os.kill(os.getpid(), signal.SIGSEGV)
 def slept(): time.sleep(600)
 def worked():
     while True: pass
 def failed(): raise KeyError("x")
-def refusing(text):
-    from mi_diffind.core.errors import UsageError
-    raise UsageError(text)
+def refusing(text): raise UsageError(text)
 def gathered():
     import drjit as dr
     from drjit.llvm.ad import Float, UInt32
     dr.eval(dr.gather(Float, Float([1, 2, 3]), dr.opaque(UInt32, 7)))
-def grew():
-    return bounded(lambda: np.ones(1 << 25), __file__) and None
+def grew(): return bounded(lambda: np.ones(1 << 25), __file__) and None
 """
 
 

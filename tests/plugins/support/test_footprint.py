@@ -37,8 +37,7 @@ def measured(mi, scene, cone=None) -> tuple:
 
 @pytest.mark.parametrize("kind", ["plane", "plane90", "sphere", "vase", "knot"])
 @pytest.mark.parametrize("camera", ["perspective", "thinlens", "orthographic"])
-def test_as_finite_differences(mi_rgb, kind, camera):
-    mi = mi_rgb
+def test_as_finite_differences(mi, kind, camera):
     shape, place, more = scene_of(mi, kind.removesuffix("90"), camera, **({"fov": 90} if "90" in kind else {}))
     scene = mi.load_dict({"type": "scene", "shape": shape, "sensor": fp.sensor(camera, place, **more)})
     found, ddx, ddy, where = measured(mi, scene)
@@ -50,8 +49,7 @@ def test_as_finite_differences(mi_rgb, kind, camera):
 
 
 @pytest.mark.parametrize("kind", ["instance", "scaled", "mirrored", "inside", "crop", "near", "principal"])
-def test_shapes_and_sensors_that_are_out_of_the_ordinary(mi_rgb, kind):
-    mi = mi_rgb
+def test_shapes_and_sensors_that_are_out_of_the_ordinary(mi, kind):
     scaled, turned = mi.ScalarTransform4f().scale, mi.ScalarTransform4f().rotate
     shape, place, more = scene_of(mi, "sphere" if kind == "inside" else "vase")
     shapes = {"shape": shape}
@@ -79,9 +77,8 @@ def test_shapes_and_sensors_that_are_out_of_the_ordinary(mi_rgb, kind):
 
 
 @pytest.mark.parametrize("integrator", ["path", "prb", "direct"])
-def test_textures_of_stock_integrators_get_it(mi_rgb, integrator):
+def test_textures_of_stock_integrators_get_it(mi, integrator):
     """Both sides of a material, and a material below a normal map, evenly lit."""
-    mi = mi_rgb
     fp.register_probe()
     diffuse = {"type": "diffuse", "reflectance": {"type": "probe"}}
     flat = {"type": "bitmap", "raw": True, "data": mi.TensorXf(np.full((2, 2, 3), (0.5, 0.5, 1.0), np.float32))}
@@ -101,9 +98,8 @@ def test_textures_of_stock_integrators_get_it(mi_rgb, integrator):
         assert (errors[:, 0] < 0.05).all() and (errors[:, 1] < 0.2).all(), errors
 
 
-def test_what_is_not_seen_directly_is_never_blurred_more_than_in_truth(mi_rgb):
+def test_what_is_not_seen_directly_is_never_blurred_more_than_in_truth(mi):
     """In a flat mirror, beyond which the path is longer, the estimate is below the true footprint."""
-    mi = mi_rgb
     mirror = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(3)}
     room = {"type": "cube", "to_world": mi.ScalarTransform4f().scale(6), "flip_normals": True}
     camera = fp.sensor(to_world=fp.look_at([1, 0.5, 3], [0, 0, 0]), fov=50)
@@ -139,9 +135,8 @@ def columns(found) -> np.ndarray:
     return np.array([[float(v.x[0]), float(v.y[0])] for v in found]).T
 
 
-def test_places_that_a_lens_sees_from_its_rim(mi_rgb):
+def test_places_that_a_lens_sees_from_its_rim(mi):
     """Directly seen, as from the middle of the lens; a pinhole there does not see the place along this line."""
-    mi = mi_rgb
     pinhole = looking_along_z(mi)
     lens = replace(pinhole, projection="thinlens", lens=dr.opaque(mi.Float, 0.3))
     si = hit(mi)
@@ -151,17 +146,16 @@ def test_places_that_a_lens_sees_from_its_rim(mi_rgb):
 
 
 @pytest.mark.parametrize(("t", "cosine"), [(1.5, 0.3), (1, 0.3), (1.9, 0.9), (3, 0.9)])
-def test_the_larger_estimate_of_what_is_not_seen_directly(mi_rgb, t, cosine):
+def test_the_larger_estimate_of_what_is_not_seen_directly(mi, t, cosine):
     """Along the last segment onto a surface oblique to it, or from the sensor, 2 away, onto one that faces it."""
-    mi, cone = mi_rgb, looking_along_z(mi_rgb)
+    cone = looking_along_z(mi)
     si = hit(mi, wi=mi.Vector3f(float(np.sqrt(1 - cosine**2)), 0, cosine), t=t)
     corner = 0.02 * 3**-0.75  # a pixel at the film's corner, at 90° of view
     expected = corner**2 * max(t**2 / cosine, 2**2)
     assert footprint.area(*footprint.footprint(si, cone))[0] == pytest.approx(expected, rel=1e-4)
 
 
-def test_sources_hand_over_to_the_next_one(mi_rgb):
-    mi = mi_rgb
+def test_sources_hand_over_to_the_next_one(mi):
     cone = looking_along_z(mi)
     of_cone = np.diag([-0.04, -0.04])  # 2 tan 45° / 100, 2 away; Mitsuba's x points to the left, and y up
     np.testing.assert_allclose(columns(footprint.footprint(hit(mi), cone)), of_cone, atol=1e-6)
@@ -175,8 +169,7 @@ def test_sources_hand_over_to_the_next_one(mi_rgb):
     assert (columns(footprint.footprint(hit(mi))) == 0).all()
 
 
-def test_finite_whatever_the_place(mi_rgb):
-    mi = mi_rgb
+def test_finite_whatever_the_place(mi):
     nan, inf, zero = mi.Vector3f(np.nan), mi.Vector3f(np.inf, 0, 0), mi.Vector3f(0)
     places = [
         {"dp_du": zero}, {"dp_dv": zero}, {"dp_du": zero, "dp_dv": zero}, {"dp_du": mi.Vector3f(0, 3, 0)},
@@ -202,8 +195,7 @@ def test_finite_whatever_the_place(mi_rgb):
     assert on_edge[0][0] == LARGEST or on_edge[0][0] > 1e3
 
 
-def test_axes_are_those_of_the_singular_values(mi_rgb, rng):
-    mi = mi_rgb
+def test_axes_are_those_of_the_singular_values(mi, rng):
     n = 2000
     matrix = rng.normal(size=(n, 2, 2)) * 10.0 ** rng.uniform(-3, 3, (n, 1, 1)) * 10.0 ** rng.uniform(-2, 2, (n, 2, 1))
     matrix = matrix.astype(np.float32)
@@ -232,8 +224,7 @@ def test_axes_are_those_of_the_singular_values(mi_rgb, rng):
     np.testing.assert_allclose(both @ both.transpose(0, 2, 1) / scale, sums / scale, atol=1e-4)
 
 
-def test_parameters_say_the_same_as_the_sensor(mi_rgb):
-    mi = mi_rgb
+def test_parameters_say_the_same_as_the_sensor(mi):
     place = fp.look_at([1, 2, 3], [0, 0.5, 0])
     sensor = mi.load_dict(fp.sensor(to_world=place, fov=70))
     expected = Cone.from_sensor(sensor, 16)
@@ -259,8 +250,7 @@ def test_parameters_say_the_same_as_the_sensor(mi_rgb):
             looking_along_z(mi, **given)
 
 
-def test_sensors_without_pixels_of_a_known_size(mi_rgb):
-    mi = mi_rgb
+def test_sensors_without_pixels_of_a_known_size(mi):
     a, b = fp.sensor(to_world=fp.look_at([1, 2, 3], [0, 0, 0])), fp.sensor(to_world=fp.look_at([3, 2, 1], [0, 0, 0]))
     one = {"film": {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}}
     for sensor in ({"type": "distant", **one}, {"type": "radiancemeter", **one}, {"type": "batch", "a": a, "b": b}):
@@ -285,8 +275,7 @@ SCENE = """
 """
 
 
-def test_scenes_tell_their_textures(mi_rgb, tmp_path):
-    mi = mi_rgb
+def test_scenes_tell_their_textures(mi, tmp_path):
     fp.register_probe()
     path = tmp_path / "scene.xml"
     path.write_text(SCENE)
@@ -305,8 +294,7 @@ def test_scenes_tell_their_textures(mi_rgb, tmp_path):
     assert footprint.attach(mi.load_dict({"type": "scene"})) == 0
 
 
-def test_another_sensor_compiles_nothing_anew(mi_rgb):
-    mi = mi_rgb
+def test_another_sensor_compiles_nothing_anew(mi):
     fp.register_probe()
     shape, _, _ = scene_of(mi, "sphere")
     shape["emitter"] = {"type": "area", "radiance": {"type": "probe"}}

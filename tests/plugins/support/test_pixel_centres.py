@@ -35,9 +35,8 @@ def hits(mi, scene, x, y):
 
 @pytest.mark.parametrize("kind", ["perspective", "orthographic"])
 @pytest.mark.parametrize("slant, tolerance", [(0, 5e-3), (-35, 0.06)])
-def test_what_the_centre_shows(mi_rgb, rng, kind, slant, tolerance):
+def test_what_the_centre_shows(mi, rng, kind, slant, tolerance):
     """The shift leads to where a ray through the centre goes; on a slant, but for the curvature of perspective."""
-    mi = mi_rgb
     scene = scene_of(mi, kind, slant)
     x, y = (rng.random(400) * n for n in FILM)
     si = hits(mi, scene, x, y)
@@ -54,9 +53,8 @@ def test_what_the_centre_shows(mi_rgb, rng, kind, slant, tolerance):
     assert np.linalg.norm(shift, axis=1)[both].max() > 0.4 * size.min()
 
 
-def test_where_nothing_is_moved(mi_rgb, rng):
+def test_where_nothing_is_moved(mi, rng):
     """The shift is 0 with a lens, with several samples, without a sensor, and off the sensor's line of sight."""
-    mi = mi_rgb
     x, y = (rng.random(50) * n for n in FILM)
     for kind, spp in (("thinlens", 1), ("perspective", 4)):
         scene = scene_of(mi, kind, spp=spp)
