@@ -144,11 +144,6 @@ def median(entry: dict | None) -> str:
     return f"{entry['median']:.2f}" if entry else "–"
 
 
-def quartiles(entry: dict) -> str:
-    """Return a ratio as text: its median and quartiles."""
-    return "{median:.2f} ({q1:.2f} to {q3:.2f})".format_map(entry)
-
-
 def with_spread(values: list[float]) -> str:
     """Return a mean with half the range, if there are several values."""
     return f"{mean(values):.2f}" + (f" ± {(max(values) - min(values)) / 2:.2f}" if len(values) > 1 else "")
@@ -259,22 +254,14 @@ def trust_cell(results: list[Entries]) -> str:
 
 
 def _of_kind(study: Entries, material: str, kind: str) -> list[Entries]:
-    details = [job.details for job in study.jobs.values() if "material" in job.get("details", {})]
+    details = [job.details for job in study.jobs.values()]
     return [d for d in details if d.material == material and d.kind == kind]
 
 
 def shading_runs(study: Entries) -> dict[str, dict[tuple[str, float], list[Entries]]]:
-    """Return the trainings of each material by remedies and λ; those of λ = 0 stand under all they are a base of."""
-    materials = [job.details.material for job in study.jobs.values() if "material" in job.get("details", {})]
-    result = {}
-    for material in dict.fromkeys(materials):
-        runs = groups(_of_kind(study, material, "run"), "way", "share")
-        bases = {d.schedule: remedy for (remedy, share), ds in runs.items() if share == 0 for d in ds}
-        for remedy, (first, *_) in {r: ds for (r, share), ds in runs.items() if share > 0}.items():
-            if first.schedule in bases:
-                runs[remedy, 0.0] = runs[bases[first.schedule], 0.0]
-        result[material] = runs
-    return result
+    """Return the trainings of each material by way and λ."""
+    materials = dict.fromkeys(job.details.material for job in study.jobs.values())
+    return {material: groups(_of_kind(study, material, "run"), "way", "share") for material in materials}
 
 
 def trouble(runs: list[Entries]) -> str:
@@ -338,11 +325,6 @@ def held_out(study: Entries, run: str) -> float:
     return study.jobs[f"{scene}, {run}"].details.psnr_db
 
 
-def rendered(study: Entries, scene: str, name: str, spp: int = 1) -> float:
-    """Return the PSNR in dB of a whole render."""
-    return one(study.scenes[scene].points, name=name, spp=spp).psnr_db
-
-
 def shipped(task: str, preset: str) -> float:
     """Return the PSNR in dB that is stored in the file that ships for a preset of a task."""
     task = tasks()[task]
@@ -370,10 +352,10 @@ FUNCTIONS = {
     f.__name__: f
     for f in (
         min, max, sum, len, round, abs, all, any, sorted, next, iter, zip, map, list, dict, range, tuple, float,
-        Entries, measured, every, one, ratio, time_over, equal_samples, speed, cells, median, quartiles, with_spread,
+        Entries, measured, every, one, ratio, time_over, equal_samples, speed, cells, median, with_spread,
         size_text, binary_size, asset_bytes, equal_quality, scene_runs, with_network, budgets, by_label,
         surface_errors, trust_cell, shading_runs, trouble, shading_best, shading, shading_level, shading_spread, flip,
-        held_out, rendered, shipped, trust_cells,
+        held_out, shipped, trust_cells,
     )
 } | {"mean": mean, "median_of": statistics.median, "RENDERS": RENDERS, "EXACT": EXACT}  # fmt: skip
 

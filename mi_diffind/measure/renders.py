@@ -1,4 +1,4 @@
-"""Renders and reads that studies measure: textured scenes without noise, moving cameras, queries of BSDFs.
+"""Renders and reads that studies measure: textured scenes without noise, a moving camera, queries of BSDFs.
 
 The material of a :class:`TextureScene` is ``diffuse`` under a ``directional`` light, which a path tracer samples
 deterministically: samples of a pixel differ only in the position at which the texture is read. The irradiance is such
@@ -10,13 +10,12 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.ndimage import map_coordinates
 
 from ..core.compat import ray_flags
 from ..images import srgb
@@ -224,61 +223,6 @@ class TextureZoom:
             reader.prepare(loaded)
             images.append(displayed(mi.render(loaded, spp=reader.spp, seed=k)))
         return np.stack(images)
-
-
-#: Points of a moving view along x and along y at which flicker is measured.
-POINTS = 96
-
-#: Frames in a row of a picture.
-SHOWN_FRAMES = 5
-
-
-class MovingView:
-    """A number of ``frames`` that a camera renders while it moves towards a plane; the base class of zooms.
-
-    The frames are aligned by reprojection: a grid of points of the plane, visible in every frame, is projected into
-    each frame, where the image is read with bilinear interpolation. *Flicker* is the variance of a point's displayed
-    values over the frames, averaged over points and channels. The truth's flicker is not zero, since a point shows more
-    detail the nearer the camera is; the flicker of the difference to the truth's frames is therefore measured, too.
-    """
-
-    frames: int
-
-    def places(self, frame: int) -> np.ndarray:
-        """Return the positions in a frame of the :data:`POINTS` × :data:`POINTS` points, row by row, ``(n, 2)``.
-
-        Positions are x and y in pixels; the centre of the first pixel is at 0.5.
-        """
-        raise NotImplementedError
-
-    def aligned(self, images: np.ndarray) -> np.ndarray:
-        """Return the values of the points in each frame, ``(frames, n, channels)``."""
-        return np.stack([bilinear(image, self.places(k)) for k, image in enumerate(images)])
-
-    def errors(self, images: np.ndarray, truth: np.ndarray) -> dict[str, float]:
-        """Return ``flicker`` of the frames, and ``flicker_error`` of their difference to the truth's frames."""
-        points = self.aligned(images)
-        return {"flicker": flicker(points), "flicker_error": flicker(points - self.aligned(truth))}
-
-    def rows(self, strips: Mapping[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
-        """Return rows of pictures (:func:`.plot.draw_images`): some frames of each strip."""
-        shown = np.unique(np.linspace(0, self.frames - 1, SHOWN_FRAMES).round().astype(int))
-        return {
-            f"{name}\nflicker {flicker(self.aligned(images)):.1e}": {f"frame {k + 1}": images[k] for k in shown}
-            for name, images in strips.items()
-        }
-
-
-def flicker(points: np.ndarray) -> float:
-    """Return the variance over frames of aligned ``points``, ``(frames, n, channels)``, averaged over the rest."""
-    return float(np.var(points, axis=0, dtype=np.float64).mean())
-
-
-def bilinear(image: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Return the values of an image, ``(height, width, channels)``, at ``places`` in pixels, ``(n, 2)``; clamped."""
-    x, y = places.T - 0.5
-    channels = np.moveaxis(image.astype(np.float64), -1, 0)
-    return np.stack([map_coordinates(channel, (y, x), order=1, mode="nearest") for channel in channels], -1)
 
 
 #: Methods of a BSDF that are timed.

@@ -125,17 +125,6 @@ def colour_map(source: Source) -> Map:
     return min(fitting, key=lambda m: m.role != "albedo")
 
 
-def load_tables(paths, source: Source) -> list:
-    """Return trained tables. Raises :class:`.TableError`, ``ValueError`` for another source."""
-    from ..fitting import task
-
-    tables = [task.tasks()["texture"].load(path) for path in paths]
-    for trained in tables:
-        if trained.settings.get("source") != source.digest:
-            raise ValueError(f"--table: {trained.path} was not trained on this source")
-    return tables
-
-
 def source_details(source: Source, name: str) -> dict:
     """Return what a result's ``details`` record about a source, read from the file ``name``."""
     return {

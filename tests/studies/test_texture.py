@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.ndimage import gaussian_filter
 
 from mi_diffind.core.runtime import array_module
 from mi_diffind.maps.pyramid import Pyramid
@@ -93,18 +93,6 @@ def test_zoom(mi_rgb):
     assert (frames[2] != still).any()
     distances = np.linalg.norm(zoom.origins() - zoom.scene.target, axis=1)
     np.testing.assert_allclose(distances / distances[0], [1, 0.5**0.5, 0.5])
-
-
-def test_flicker():
-    """Bilinear reads against SciPy's; the variance of what is known."""
-    image = np.random.default_rng(2).random((9, 7, 3))
-    places = np.random.default_rng(3).uniform([0.5, 0.5], [6.5, 8.5], (50, 2))
-    expected = [map_coordinates(image[..., c], [places[:, 1] - 0.5, places[:, 0] - 0.5], order=1) for c in range(3)]
-    np.testing.assert_allclose(renders.bilinear(image, places), np.stack(expected, -1), atol=1e-12)
-    frames = np.zeros((8, 4, 3))
-    assert renders.flicker(frames + image[0, :4]) < 1e-30
-    frames[::2, 1] = 0.2  # one point of four, half of the time
-    assert renders.flicker(frames) == pytest.approx(0.01 / 4)
 
 
 def test_levels(mi_rgb):

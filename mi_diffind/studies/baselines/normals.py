@@ -8,7 +8,7 @@ shades a pyramid of filtered parameters, with normals brought to length 1.
   2005);
 - :func:`lean`: first and second moments of slopes, filtered linearly, make an anisotropic lobe (Olano and Baker, *LEAN
   Mapping*, 2010), a GGX one in place of their Beckmann's (Dupuy et al., *Linear Efficient Antialiased Displacement and
-  Reflectance Mapping*, 2013); :func:`lean_levels`: the roughness of an isotropic one;
+  Reflectance Mapping*, 2013);
 - :func:`bake`: each texel of each level has the roughness with which it looks most like the converged truth;
 - :func:`biased`: any of these at other levels of detail; its gain is due to the filter's kernel, not to shading.
 
@@ -100,15 +100,6 @@ def toksvig_levels(pyramid: Pyramid) -> list[np.ndarray]:
     lengths = [np.clip(np.linalg.norm(m[..., 6:], axis=-1), 1e-3, 1) for m in surface_moments(pyramid)]
     alpha2s = [np.maximum(r.astype(np.float64) ** 2, ALPHA_MIN) ** 2 for r in roughness_levels(pyramid)]
     return [toksvig_alpha2(a, r) ** 0.25 for a, r in zip(alpha2s, lengths, strict=True)]
-
-
-def lean_levels(pyramid: Pyramid) -> list[np.ndarray]:
-    """Return the roughness of the isotropic lobe with the mean variance of :func:`lean`'s, ``(height, width)``."""
-    levels = []
-    for bx, by, xx, yy, _, a2, *_ in (np.moveaxis(m, -1, 0) for m in surface_moments(pyramid)):
-        variance = np.maximum(xx - bx**2, 0) + np.maximum(yy - by**2, 0)
-        levels.append(np.clip(a2 + variance / (1 + bx**2 + by**2), 0, 1) ** 0.25)
-    return levels
 
 
 def lean(pyramid: Pyramid, effects: Effects) -> ShadedReader:

@@ -365,6 +365,16 @@ def test_fixed_fine_levels_keep_their_values(start, ad, monkeypatch):
         assert np.array_equal(before, after) == equal
 
 
+def test_arrays_leave_room_for_extras(ad):
+    """Extras and the smaller arrays beside them take at most the bytes of the arrays alone, or a sentence says why."""
+    source, pyramid = pyramid_of(bumpy(64), ad)
+    recipes = [dataclasses.replace(OURS, extras=extras) for extras in (False, True)]
+    alone, beside = (shading_fit.find_size(source, pyramid, recipe, {}).nbytes for recipe in recipes)
+    assert beside < alone <= source.nbytes / 12 and beside + 4 * 8 * 8 * 3 <= source.nbytes / 12
+    with pytest.raises(UsageError, match="--extras: found 100 bytes for all arrays, extras alone need"):
+        shading_fit.find_size(source, pyramid, recipes[1], {"bytes": 100})
+
+
 def test_extras_are_trained_stored_and_read_by_the_material_alone(mi_rgb, start, ad, tmp_path, monkeypatch):
     monkeypatch.setattr(training, "choose", lambda *a: (training.Trial(0.0, extras=True), {"0, extras": 1.0}, None))
     found, _ = trained(start, ad, quick(steps=30, measure_every=30, extras=True))
