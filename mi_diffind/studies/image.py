@@ -68,7 +68,7 @@ class ImageStudy(Study):
     def plan(self, arguments) -> Plan:
         quick = arguments.quick
         settings = SimpleNamespace(
-            compressions=arguments.compressions[:1] if quick else arguments.compressions,
+            compressions=arguments.compressions,
             seconds=float(arguments.seconds or (2 if quick else 60)),
             astc="fast" if quick else codecs.QUALITY,
             network_steps=(10, 20) if quick else NETWORK_STEPS,  # of the first and of the longest training

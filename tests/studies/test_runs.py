@@ -108,7 +108,7 @@ def test_quick_runs(study, inputs, tmp_path, monkeypatch, capsys):
 @pytest.mark.long
 def test_a_run_goes_on(inputs, tmp_path, capfd, monkeypatch):
     """After Ctrl-C in the second training, the first is not trained again if its file exists."""
-    step, seen = loop._Trainer.take_step, []
+    step, seen, ratios = loop._Trainer.take_step, [], ["--compression", "12", "--compression", "6"]
 
     def interrupted(self, *args):
         seen.append(self.problem)
@@ -119,10 +119,10 @@ def test_a_run_goes_on(inputs, tmp_path, capfd, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(loop._Trainer, "take_step", interrupted)
-        assert run("image", inputs, tmp_path) == 130
+        assert run("image", inputs, tmp_path, *ratios) == 130
     assert (tmp_path / "tradeoff_image.partial.json").exists()
     assert len(list((tmp_path / "tradeoff_image_models").glob("*.npz"))) == 1
-    assert run("image", inputs, tmp_path) == 0
+    assert run("image", inputs, tmp_path, *ratios) == 0
     err = capfd.readouterr().err.rsplit("continuing from", 1)[1]
     assert "1 of " not in err and "2 of " in err
 
