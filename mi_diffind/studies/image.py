@@ -82,8 +82,9 @@ STUDY = ImageStudy()
 # -- Contenders --------------------------------------------------------------------------------------------------------
 
 
-def record(source: Source, maps: dict, nbytes: int, seconds: float | None = None, **details) -> dict:
-    """Return the record of decoded ``maps``, with their errors."""
+def record(source: Source, nbytes: int, seconds: float | None, maps: dict, **details) -> dict:
+    """Return the record of decoded ``maps``, name → resolutions, with the errors of the finest."""
+    maps = {name: levels[0] for name, levels in maps.items()}
     details |= {"ratio": source.nbytes / nbytes}
     return {"bytes": nbytes, "seconds": seconds, "errors": map_errors(source, maps), "details": details}
 
@@ -99,20 +100,11 @@ def trained(source: Source, name: str, compression: float, seconds: float) -> Co
         model, fitted = outcome
         table, result = fitted.table, fitted.result
         details = {"structure": table.settings["structure"], "steps": result.steps}
-        return record(source, model.image.decode(), table.nbytes, result.seconds, **details)
+        maps = {name: [values] for name, values in model.image.decode().items()}
+        return record(source, table.nbytes, result.seconds, maps, **details)
 
     read = partial(equal_memory.open_preset, task_name="image")
     return Contender(f"ours {compression:g}x", "ours", compression, fit, read)
-
-
-def network(source: Source, compression: float, steps: tuple[int, int]) -> Contender:
-    """Return the contender of a hash grid and network; raise ``ValueError`` if the bytes are too few."""
-    pyramid = Pyramid.from_source(source, types=array_module())
-
-    def finish(maps, nbytes: int, seconds: float, **details) -> dict:
-        return record(source, maps.decode(), nbytes, seconds, **details)
-
-    return network_contender(source, pyramid, 1, compression, steps, finish, lambda maps: maps)
 
 
 def encoded(source: Source, codec: str, compression: float, quality: str, cache: dict) -> Contender:
@@ -139,8 +131,8 @@ def encoded(source: Source, codec: str, compression: float, quality: str, cache:
     def fit(job: Contender, progress: bool) -> dict:
         result = encode()
         how = ", ".join(f"{name} {e.codec}" for name, e in result.items())
-        maps = {name: e.image for name, e in result.items()}
-        return record(source, maps, sum(e.nbytes for e in result.values()), how=how)
+        maps = {name: e.levels for name, e in result.items()}
+        return record(source, sum(e.nbytes for e in result.values()), None, maps, how=how)
 
     name, budget = (title, 0.0) if codec == "bc7" else (f"{title} {compression:g}x", compression)
     return Contender(name, title, budget, fit, lambda job: None, label, has_file=False)
@@ -155,7 +147,8 @@ def plan(source: Source, name: str, settings: SimpleNamespace) -> Plan:
     ours = [trained(source, name, compression, settings.seconds) for compression in compressions]
     rivals = []
     with contextlib.suppress(ValueError):  # too few bytes for a network
-        rivals.append(network(source, compressions[0], settings.network_steps))
+        pyramid, finish = Pyramid.from_source(source, types=array_module()), partial(record, source)
+        rivals.append(network_contender(source, pyramid, 1, compressions[0], settings.network_steps, finish))
     if all(m.channels <= 4 for m in source.maps):
         for codec in codecs.available():
             ratios = compressions[:1] if codec == "bc7" else compressions

@@ -209,9 +209,6 @@ class TextureContenders:
         """Width and height of the texture."""
         return self.source.width, self.source.height
 
-    def counted(self, scene: TextureScene) -> np.ndarray:
-        return scene.counted(self.settings.film, self.size)
-
     def render(self, read: TextureReader, scene: TextureScene, seed: int = 0) -> np.ndarray:
         return read.render(scene, self.settings.film, self.size, seed)
 
@@ -219,7 +216,7 @@ class TextureContenders:
         """Return the errors of a reader, ``psnr_SCENE_db`` and ``flip_SCENE``: those of the means over seeds."""
         errors = {}
         for name, scene in self.scenes.items():
-            counted, truth = self.counted(scene), self.truths[name]
+            counted, truth = scene.counted(self.settings.film, self.size), self.truths[name]
             each = [renders.errors(truth, self.render(read, scene, k), counted) for k in range(self.settings.seeds)]
             errors[f"psnr_{name}_db"] = decibel(float(np.mean([e["mse"] for e in each])))
             errors[f"flip_{name}"] = float(np.mean([e["flip"] for e in each]))
@@ -290,40 +287,30 @@ class TextureContenders:
         name = equal_to.name.replace("ours", "ASTC")
         return Contender(name, ASTC, equal_to.budget, fit, read, has_file=False)
 
-    def network(self, compression: float) -> Contender:
-        """Return the contender of a network, whose model is the pyramid of its levels, decoded."""
-
-        def finish(maps: networks.NetworkMaps, nbytes: int, seconds: float, **details) -> dict:
-            return self.record(nbytes, seconds, level_images(maps), **details)
-
-        return network_contender(
-            self.source, self.pyramid, self.pyramid.levels, compression, self.settings.network_steps, finish,
-            lambda maps: level_pyramid(level_images(maps), self.pyramid),
-        )  # fmt: skip
-
 
 def network_contender(
-    source: Source, pyramid: Pyramid, levels: int, compression: float, steps: tuple[int, int], finish: Callable,
-    build: Callable,
-) -> NetworkContender:  # fmt: skip
+    source: Source, pyramid: Pyramid, levels: int, compression: float, steps: tuple[int, int], record: Callable
+) -> NetworkContender:
     """Return the contender of a hash grid and network in half precision, trained to convergence.
 
-    ``steps`` are those of the first and of the longest training, ``levels`` the number of levels of detail of the
-    ``pyramid`` that it holds. ``finish(maps, nbytes, seconds, **details)`` returns the record of the trained maps,
-    ``build(maps)`` the model. Raises ``ValueError`` if the bytes are too few.
+    The network has ``levels`` levels of detail of the ``pyramid``; the contender's model is that of its decoded levels.
+    ``steps`` are those of the first and of the longest training. ``record(nbytes, seconds, maps, **details)`` returns
+    the record of decoded levels by map. Raises ``ValueError`` if the bytes are too few.
     """
     net = networks.texture_network(pyramid.layout, source.nbytes / compression, levels)
     settings = FitSettings(steps=steps[0], batch=2**14, lr=1e-2, schedule="cosine", loss="mse", seed=1)
 
-    def finished(trained, record: dict) -> dict:
-        seconds = sum(run["seconds"] for run in record["runs"])
-        maps = networks.NetworkMaps(trained, pyramid)
-        return finish(maps, 2 * record["entries"], seconds, steps=record["steps"], steps_longest=steps[1])
+    def decode(trained) -> dict[str, list[np.ndarray]]:
+        return level_images(networks.NetworkMaps(trained, pyramid))
+
+    def finish(trained, trainings: dict) -> dict:
+        seconds, details = sum(run["seconds"] for run in trainings["runs"]), {"steps_longest": steps[1]}
+        return record(2 * trainings["entries"], seconds, decode(trained), steps=trainings["steps"], **details)
 
     return NetworkContender(
         f"network {compression:g}x", NETWORK, compression, NETWORK, "",
-        lambda trained: build(networks.NetworkMaps(trained, pyramid)),
-        lambda: networks.TextureNetworkProblem(net, pyramid, source.digest), settings, steps[1], 5, True, finished,
+        lambda trained: level_pyramid(decode(trained), pyramid),
+        lambda: networks.TextureNetworkProblem(net, pyramid, source.digest), settings, steps[1], 5, True, finish,
     )  # fmt: skip
 
 
@@ -358,7 +345,9 @@ def plan(source: Source, name: str, settings: SimpleNamespace) -> Plan:
         if "astc" in codecs.available():
             context.add_job(context.encoded(ours, cache), in_picture=i == 0)
     with contextlib.suppress(ValueError):  # too few bytes for a network
-        context.add_job(context.network(settings.compressions[0]), filters=("trilinear",), in_picture=False)
+        levels, compression = context.pyramid.levels, settings.compressions[0]
+        trained = (source, context.pyramid, levels, compression, settings.network_steps, context.record)
+        context.add_job(network_contender(*trained), filters=("trilinear",), in_picture=False)
     measures = [(Measure(f"PSNR ({s}), dB", f"psnr_{s}_db"), Measure(f"FLIP {s}", f"flip_{s}", ".4f", False))
                 for s in context.scenes]  # fmt: skip
     note = (
@@ -376,7 +365,7 @@ def plan(source: Source, name: str, settings: SimpleNamespace) -> Plan:
             **source_details(source, name),
             "request": vars(settings),
             "codecs": list(codecs.available()),
-            "counted": {n: float(context.counted(s).mean()) for n, s in context.scenes.items()},
+            "counted": {n: float(s.counted(settings.film, context.size).mean()) for n, s in context.scenes.items()},
         },
         notes=[note, *codecs.install_notes(["astc"])],
         jobs=context.jobs,
@@ -431,13 +420,13 @@ def draw_crops(context: TextureContenders, result: dict):
         if c["setting"] == "anisotropic, centred":
             shown.setdefault(c["representation"], name)
     for name, scene in context.scenes.items():
-        truth = context.truths[name]
+        truth, counted = context.truths[name], scene.counted(context.settings.film, context.size)
         images = {
             f"{n}\n{result['candidates'][n]['errors'][f'psnr_{name}_db']:.1f} dB":
             context.render(context.readers[n](), scene) for n in shown.values()
         }  # fmt: skip
         images[f"truth\n{context.settings.truth_spp} spp, multijittered"] = truth
-        error = ((next(iter(images.values())) - truth) ** 2).sum(axis=-1) * context.counted(scene)
+        error = ((next(iter(images.values())) - truth) ** 2).sum(axis=-1) * counted
         total = uniform_filter(error, side, mode="constant")
         middle = np.unravel_index(np.argmax(total), total.shape)
         top, left = (int(np.clip(m - side // 2, 0, max(n - side, 0))) for m, n in zip(middle, total.shape, strict=True))
