@@ -11,7 +11,7 @@ from .support.manual import shared_parts
 from .support.properties import Kept, StockNode
 from .support.tables import Tables, open_tables
 
-#: Default storage form: the fastest to read, and within 82 dB of the formulas.
+#: Default storage form: the fastest to read; 82 dB against the formulas, for uniform materials.
 STORAGE = "uint8"
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from ..core.arguments import WORKER_ARGUMENTS, add_arguments
 from ..core.files import check_scene_file
 from ..studies import run as run_study
 from ..studies import studies
@@ -38,7 +37,6 @@ def add(commands) -> None:
             scene_options(sub, rendering=False)
         else:
             variant_option(sub)
-            add_arguments(sub, WORKER_ARGUMENTS)
         study.add_arguments(sub)
 
 

@@ -9,32 +9,24 @@ candidates is the median of the ratios of the rounds.
 
 from __future__ import annotations
 
-import functools
 import json
 import math
 import os
-import pickle
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
-from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 from tqdm import tqdm
 
-from ..core.jobs import run_jobs
 from ..core.progress import interruptible
-from ..core.runtime import use_variant
 from .clock import count_query, machine, timed, total
-from .statistics import pareto, ratio, spread, timing
+from .statistics import ratio, spread, timing
 from .store import Store, fingerprint, models_folder, sources
-from .study import FLOOR, PASS, Case, Plan, in_competition
-
-#: Times that differ by a smaller factor count as equal on the Pareto front.
-SAME_TIME = 1.05
+from .study import FLOOR, PASS, Case, Plan
 
 SECTIONS = ("jobs", "errors", "operations", "queries", "passes")
 
@@ -57,54 +49,23 @@ class BenchmarkSettings:
         return cls(lanes // 4, 3, 2, 2**17, True) if quick else cls(lanes)
 
 
-@dataclass(frozen=True)
-class Workers:
-    """Other processes for the jobs of a plan: a number of ``workers``, or those of the Dask cluster ``scheduler``.
-
-    ``plan()`` makes the plan there; it can be pickled.
-    """
-
-    plan: Callable[[], Plan]
-    workers: int | None = None
-    scheduler: str = ""
-
-
-@functools.lru_cache(maxsize=1)
-def _load_plan(plan: bytes) -> Plan:
-    return pickle.loads(plan)()
-
-
-def run_separately(job: tuple[bytes, str, str, str]) -> dict | None:
-    """Run a job in this process; ``job``: its pickled plan, its name, the folder of models, and the variant."""
-    plan, name, folder, variant = job
-    use_variant(variant)
-    chosen = next(j for j in _load_plan(plan).jobs if j.name == name)
-    return chosen.cached_record(Path(folder), None) or chosen.run(Path(folder), False)
-
-
 class Stopped(Exception):
     """The first Ctrl-C stopped the measurement."""
 
 
 def measure(
-    plan: Plan,
-    settings: BenchmarkSettings,
-    folder: str | os.PathLike | None = None,
-    progress: bool = True,
-    workers: Workers | None = None,
+    plan: Plan, settings: BenchmarkSettings, folder: str | os.PathLike | None = None, progress: bool = True
 ) -> dict:
     """Measure a plan, or the rest of it if ``folder`` holds partial results of an interrupted run.
-
-    ``workers`` do the jobs that are separable; all that is timed runs in this process, one after the other.
 
     Partial results stay in ``folder`` until :func:`.report.write` has written the result.
 
     Returns the result, a tree of numbers and strings (JSON): ``task`` (the study), ``interrupted``, ``resumed``,
     ``machine``, ``settings``, ``details``; ``candidates``: name → description and ``errors``; ``cases``: name →
     ``queries``: name → candidate → ``time``, ``q1``, ``q3`` (ns a lane, floor subtracted), ``with_floor``, ``floor``,
-    ``rounds``, ``hidden`` (``time`` is only a bound), ``operations``, ``on_front``; ``passes``: candidate → likewise in
-    ms; ``ratios``: query → ``"a / b"`` → ``median``, ``q1``, ``q3``, ``with_floor``, ``hidden``; ``jobs``: their
-    records. After Ctrl-C the result is incomplete.
+    ``rounds``, ``hidden`` (``time`` is only a bound), ``operations``; ``passes``: candidate → likewise in ms;
+    ``ratios``: query → ``"a / b"`` → ``median``, ``q1``, ``q3``, ``hidden``; ``jobs``: their records. After Ctrl-C the
+    result is incomplete.
 
     Raises :class:`.OutputError` if the folder cannot be written.
     """
@@ -120,7 +81,7 @@ def measure(
     with interruptible() as stop:
         steps = BenchmarkSteps(plan, settings, store, stop, progress)
         try:
-            steps.jobs(workers)
+            steps.jobs()
             steps.errors()
             for case in plan.cases:
                 steps.queries(case)
@@ -140,7 +101,13 @@ def measure(
         "settings": asdict(settings),
         "measures": [asdict(measure) for measure in plan.measures],
         **{name: getattr(plan, name) for name in ("panels", "details", "notes")},
-        **_assemble(plan, settings, store.data),
+        "candidates": _candidates(plan, store.data),
+        "cases": {
+            case.name: _times(plan, settings, case, store.data)
+            for case in plan.cases
+            if store.data["queries"].get(case.name)
+        },
+        "jobs": {job.name: store.data["jobs"][job.name] for job in plan.jobs if job.name in store.data["jobs"]},
     }
 
 
@@ -151,25 +118,21 @@ class BenchmarkSteps:
         self.plan, self.settings, self.store, self.stop, self.progress = plan, settings, store, stop, progress
         self.operations = {c.name: c.operations for c in plan.candidates}
 
-    def _bar(self, title: str, total: int) -> tqdm:
-        """Return a progress bar; :meth:`_tick` after each of its steps."""
-        disable = None if self.progress else True
-        return tqdm(total=total, desc=title, unit="step", smoothing=0.02, disable=disable)
+    def _each(self, title: str, steps: Iterable[Callable[[], None]]) -> None:
+        """Take steps with a progress bar, and store the results of each."""
+        steps, disable = list(steps), None if self.progress else True
+        for step in tqdm(steps, title, unit="step", smoothing=0.02, disable=disable):
+            step()
+            self.store.save(5)
+            if self.stop.is_set():
+                raise Stopped
 
-    def _tick(self, bar: tqdm) -> None:
-        bar.update(1)
-        if self.stop.is_set():
-            raise Stopped
-
-    def jobs(self, workers: Workers | None = None) -> None:
-        """Run the jobs: with ``workers`` first those that are separable, then the rest, each with a progress bar."""
-        plan, done = self.plan, self.store.data["jobs"]
-        folder = None
+    def jobs(self) -> None:
+        """Run the jobs, each with a progress bar of its own."""
+        plan, done, folder = self.plan, self.store.data["jobs"], None
         if self.store.folder is not None and plan.jobs:
             key = f"{plan.jobs_fingerprint} {json.dumps(self.store.key['details'])} {self.settings.quick}"
             folder = models_folder(self.store.folder, plan.study, key)
-        if workers is not None and folder is not None:
-            self._separate_jobs(workers, folder)
         for i, job in enumerate(plan.jobs):
             record = job.cached_record(folder, done.get(job.name))
             if record is None:
@@ -182,34 +145,15 @@ class BenchmarkSteps:
             if record is None or self.stop.is_set():
                 raise Stopped
 
-    def _separate_jobs(self, workers: Workers, folder: Path) -> None:
-        """Have separable jobs run elsewhere. What fails there is left to this process, where its error is raised."""
-        done = self.store.data["jobs"]
-        plan, path = pickle.dumps(workers.plan), str(folder.resolve())
-        todo = {
-            job.name: (plan, job.name, path, mi.variant())
-            for job in self.plan.jobs
-            if job.separable and job.cached_record(folder, done.get(job.name)) is None
-        }
-        run = (run_separately, todo, workers.workers, workers.scheduler, self.progress, "jobs")
-        for outcome in run_jobs(*run, finished=len(self.plan.jobs) - len(todo)) if todo else ():
-            if outcome.failure and self.progress:
-                print(f"{outcome.name}: {outcome.failure}", file=sys.stderr)
-            if outcome.value is not None:
-                done[outcome.name] = outcome.value
-                self.store.save()
-        if self.stop.is_set():
-            raise Stopped
-
     def errors(self) -> None:
         """Measure the errors of the candidates that have a function for them."""
-        done = self.store.data["errors"]
+        done, samples = self.store.data["errors"], self.settings.samples
+
+        def measure_one(candidate) -> None:
+            done[candidate.name] = candidate.errors(samples)
+
         todo = [c for c in self.plan.candidates if c.errors is not None and c.name not in done]
-        with self._bar("errors", len(todo)) as bar:
-            for candidate in todo:
-                done[candidate.name] = candidate.errors(self.settings.samples)
-                self.store.save(5)
-                self._tick(bar)
+        self._each("errors", [lambda c=c: measure_one(c) for c in todo])
 
     def queries(self, case: Case) -> None:
         """Count operations, which compiles the kernels, then time the queries in rounds."""
@@ -224,15 +168,14 @@ class BenchmarkSteps:
         }
         operations = self.store.data["operations"].setdefault(case.name, {})
 
-        def compile_kernel(key) -> None:
-            query, name = key
+        def compile_kernel(query: str, name: str) -> None:
             counted, known = operations.setdefault(query, {}), self.operations.get(name)
             if name not in counted:
-                in_kernel = count_query(functions[key])
+                in_kernel = count_query(functions[query, name])
                 counted[name] = (known(query) if known else in_kernel).asdict()
 
-        def seconds(key) -> float:
-            return timed(lambda: total(functions[key]())[0]).seconds
+        def seconds(query: str, name: str) -> float:
+            return timed(lambda: total(functions[query, name]())[0]).seconds
 
         self._rounds(case.name, times, list(functions), self.settings.rounds, compile_kernel, seconds)
 
@@ -241,88 +184,68 @@ class BenchmarkSteps:
         times = self.store.data["passes"].setdefault(case.name, [])
         if len(times) >= self.settings.passes:
             return
-        functions = {(PASS, name): f for name, f in case.passes().items() if name in self.operations}
+        functions = {name: f for name, f in case.passes().items() if name in self.operations}
 
-        def seconds(key, number: int | None = None) -> float:
-            return timed(lambda: functions[key](1 + len(times) if number is None else number)).seconds
+        def compile_kernel(query: str, name: str) -> None:
+            timed(lambda: functions[name](0))
 
-        title = f"{case.name}, {PASS}"
-        self._rounds(title, times, list(functions), self.settings.passes, lambda key: seconds(key, 0), seconds)
+        def seconds(query: str, name: str) -> float:
+            return timed(lambda: functions[name](1 + len(times))).seconds
 
-    def _rounds(self, title: str, times: list, keys: list, number: int, compile_kernel, seconds) -> None:
+        keys = [(PASS, name) for name in functions]
+        self._rounds(f"{case.name}, {PASS}", times, keys, self.settings.passes, compile_kernel, seconds)
+
+    def _rounds(
+        self, title: str, times: list, keys: list[tuple[str, str]], number: int,
+        compile_kernel: Callable[[str, str], None], seconds: Callable[[str, str], float],
+    ) -> None:  # fmt: skip
         """Append the missing rounds to ``times``: query → name → seconds; every other round runs backwards."""
-        with self._bar(title, len(keys) * (1 + number - len(times))) as bar:
-            for key in keys:
-                compile_kernel(key)
-                self._tick(bar)
-            while len(times) < number:
-                this_round: dict[str, dict[str, float]] = {}
-                for key in keys if len(times) % 2 == 0 else reversed(keys):
-                    this_round.setdefault(key[0], {})[key[1]] = seconds(key)
-                    self._tick(bar)
-                times.append(this_round)
-                self.store.save(5)
+        this_round: dict[str, dict[str, float]] = {}
+
+        def time_one(query: str, name: str) -> None:
+            this_round.setdefault(query, {})[name] = seconds(query, name)
+            if sum(map(len, this_round.values())) == len(keys):
+                times.append(dict(this_round))
+                this_round.clear()
+
+        steps = [lambda key=key: compile_kernel(*key) for key in keys]
+        for i in range(len(times), number):
+            steps += [lambda key=key: time_one(*key) for key in (keys if i % 2 == 0 else reversed(keys))]
+        self._each(title, steps)
 
 
-def _assemble(plan: Plan, settings: BenchmarkSettings, data: dict) -> dict:
-    candidates, records = {}, data["jobs"]
+def _candidates(plan: Plan, data: dict) -> dict:
+    """Return the candidates of a result, without those whose jobs have not run yet."""
+    candidates = {}
     for c in plan.candidates:
-        record = records.get(c.job, {})
-        if c.job and not record and c.errors is None:
-            continue  # its job has not run yet
-        candidates[c.name] = {
-            **{k: getattr(c, k) for k in ("representation", "setting", "job", "is_truth", "is_reference", "competes")},
-            **{"label": c.label or c.name, "in_picture": c.in_picture},
-            "bytes": record.get("bytes", c.bytes),
-            "training_seconds": record.get("seconds"),
-            "converged": record.get("converged"),
-            "details": {**c.details, **record.get("details", {})},
-            "errors": {**record.get("errors", {}), **data["errors"].get(c.name, {})},
-        }
-    measured_cases = {}
-    for case in plan.cases:
-        rounds, passes = data["queries"].get(case.name, []), data["passes"].get(case.name, [])
-        if not rounds:
-            continue
-        accuracy = case.accuracy or plan.measures[0].key
-        measured = {"details": case.details, "in_picture": case.in_picture, "accuracy": accuracy,
-                    "of_passes": case.of_passes, "queries": {}, "passes": {}, "ratios": {}}  # fmt: skip
-        for query in data["operations"][case.name]:
-            ns = _by_name(rounds, query, 1e9 / settings.lanes)
-            floor = spread(ns.pop(FLOOR))["median"]
-            counted = data["operations"][case.name][query]
-            measured["queries"][query] = {
-                name: timing(values, floor) | {"operations": counted[name]} for name, values in ns.items()
+        record = data["jobs"].get(c.job, {})
+        if record or not c.job or c.errors is not None:
+            candidates[c.name] = {
+                **{k: getattr(c, k) for k in ("representation", "setting", "job", "is_truth", "is_reference")},
+                **{"competes": c.competes, "label": c.label or c.name, "in_picture": c.in_picture},
+                "bytes": record.get("bytes", c.bytes),
+                "training_seconds": record.get("seconds"),
+                "converged": record.get("converged"),
+                "details": {**c.details, **record.get("details", {})},
+                "errors": {**record.get("errors", {}), **data["errors"].get(c.name, {})},
             }
-            _mark_front(measured["queries"][query], candidates, accuracy)
-            measured["ratios"][query] = _ratios(plan.ratios, ns, floor)
-        if passes:
-            ms = _by_name(passes, PASS, 1e3)
-            measured["passes"][PASS] = {name: timing(values) for name, values in ms.items()}
-            if case.of_passes:
-                _mark_front(measured["passes"][PASS], candidates, accuracy)
-            measured["ratios"][PASS] = _ratios(plan.ratios, ms, 0.0)
-        measured_cases[case.name] = measured
-    in_order = {job.name: records[job.name] for job in plan.jobs if job.name in records}
-    return {"candidates": candidates, "cases": measured_cases, "jobs": in_order}
+    return candidates
 
 
-def _by_name(rounds: list[dict], query: str, scale: float) -> dict[str, list[float]]:
-    """Return the scaled times of all rounds by name, in the order of the plan, which the first round has."""
-    return {name: [r[query][name] * scale for r in rounds] for name in rounds[0][query]}
-
-
-def _mark_front(timings: dict, candidates: dict, accuracy: str) -> None:
-    """Set ``on_front``: ``None`` for candidates that do not compete, such as references and the truth."""
-    competing = {
-        name: (math.log(max(timings[name]["time"], 1e-6)), -c["errors"][accuracy])
-        for name, c in candidates.items()
-        if name in timings and accuracy in c["errors"] and in_competition(c)
-    }
-    front = dict(zip(competing, pareto(list(competing.values()), (math.log(SAME_TIME), 0)), strict=True))
-    for name in timings:
-        timings[name]["on_front"] = front.get(name)
-
-
-def _ratios(pairs: list[tuple[str, str]], values: dict[str, list[float]], floor: float) -> dict:
-    return {f"{a} / {b}": ratio(values[a], values[b], floor) for a, b in pairs if a in values and b in values}
+def _times(plan: Plan, settings: BenchmarkSettings, case: Case, data: dict) -> dict:
+    """Return the times, operations and ratios of a case: queries in ns of a lane, passes in ms."""
+    accuracy = case.accuracy or plan.measures[0].key
+    measured = {"details": case.details, "in_picture": case.in_picture, "accuracy": accuracy}
+    measured |= {"queries": {}, "passes": {}, "ratios": {}}
+    for section, scale in (("queries", 1e9 / settings.lanes), ("passes", 1e3)):
+        rounds = data[section].get(case.name) or [{}]
+        for query, names in rounds[0].items():  # in the order of the plan, which the first round has
+            times = {name: [r[query][name] * scale for r in rounds] for name in names}
+            floor = spread(times.pop(FLOOR))["median"] if FLOOR in times else 0.0
+            measured[section][query] = {name: timing(values, floor) for name, values in times.items()}
+            for name, counted in data["operations"][case.name].get(query, {}).items():
+                if name in times:
+                    measured[section][query][name]["operations"] = counted
+            pairs = ((a, b) for a, b in plan.ratios if a in times and b in times)
+            measured["ratios"][query] = {f"{a} / {b}": ratio(times[a], times[b], floor) for a, b in pairs}
+    return measured

@@ -15,8 +15,8 @@ from __future__ import annotations
 import contextlib
 import platform
 import re
-import time
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from importlib import metadata
 from pathlib import Path
@@ -31,15 +31,13 @@ Query = Callable[[], object]
 
 @dataclass(frozen=True)
 class Timed:
-    """Result and times of a function.
+    """Evaluated ``value`` of a function and ``seconds`` of its kernels.
 
-    ``value``: its evaluated result; ``seconds`` of its kernels, ``seconds_wall`` from beginning to end; ``compiled``:
-    whether a kernel was compiled or read from the cache on disk.
+    ``compiled``: whether a kernel was compiled or read from the cache on disk.
     """
 
     value: object
     seconds: float
-    seconds_wall: float
     compiled: bool
 
 
@@ -48,13 +46,11 @@ def timed(function: Query) -> Timed:
     with dr.suspend_grad(), dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.sync_thread()
         dr.kernel_history_clear()
-        start = time.perf_counter()
         value = function()
         dr.eval(value)
         dr.sync_thread()
-        wall = time.perf_counter() - start
         history = dr.kernel_history()
-    return Timed(value, compat.kernel_seconds(history), wall, compat.was_compiled(history))
+    return Timed(value, compat.kernel_seconds(history), compat.was_compiled(history))
 
 
 def total(values) -> tuple[object, int]:
@@ -174,20 +170,12 @@ def count_query(function: Query) -> Operations:
     return operations + Operations(add=-added, instructions=-added)
 
 
-def count_ir(text: str) -> Operations:
-    """Count the operations of one kernel in LLVM's intermediate representation."""
-    counts = dict.fromkeys((f.name for f in fields(Operations)), 0)
-    for names, size in _llvm(text):
-        counts["instructions"] += 1
-        counts["bytes_gathered"] += size
-        for name in names:
-            counts[name] += 1
-    return Operations(**counts)
-
-
-_LLVM_OPS = {"fadd": ("add",), "fsub": ("add",), "fmul": ("mul",), "fdiv": ("div",)}
-_LLVM_CALLS = {"fma": ("add", "mul"), "fmuladd": ("add", "mul"), "sqrt": ("sqrt",)}
-_LLVM_CALLS |= dict.fromkeys(("exp", "exp2", "log", "log2", "pow", "sin", "cos", "tanh"), ("log",))
+#: Instruction of LLVM, or its function, → the counts that it adds one to.
+_LLVM_OPS = {
+    "fadd": ("add",), "fsub": ("add",), "fmul": ("mul",), "fdiv": ("div",), "fma": ("add", "mul"),
+    "fmuladd": ("add", "mul"), "sqrt": ("sqrt",),
+    **dict.fromkeys(("exp", "exp2", "log", "log2", "pow", "sin", "cos", "tanh"), ("log",)),
+}  # fmt: skip
 
 #: Instructions that are neither arithmetic nor a gather: constants, addresses, input and output, flow of control.
 _LLVM_IGNORED = {
@@ -201,9 +189,9 @@ _LLVM_LANES = re.compile(r"add <\d+ x i32> %r\d+_2, <|icmp ult <\d+ x i32> %r\d+
 _BYTES = {"float": 4, "half": 2, "double": 8}
 
 
-def _llvm(text: str) -> Iterator[tuple[tuple[str, ...], int]]:
-    """Yield for each instruction the counts that it adds one to, and the bytes that it gathers."""
-    counted = False
+def count_ir(text: str) -> Operations:
+    """Count the operations of one kernel in LLVM's intermediate representation."""
+    counts, counted = Counter(), False
     for line in text.splitlines():
         if line.startswith("define"):
             # Kernels and the functions that they call; helpers of Dr.Jit (packet gathers) count at their call
@@ -215,24 +203,22 @@ def _llvm(text: str) -> Iterator[tuple[tuple[str, ...], int]]:
         name, rest = instruction.groups()
         if name in _LLVM_IGNORED or _LLVM_LANES.match(name + rest):
             continue
-        if name != "call":
-            yield _LLVM_OPS.get(name, ()), 0
-            continue
-        called = re.search(r"@([\w.]+)\(", rest)
-        if called is None:  # a virtual function: it is counted itself
-            continue
-        called = called[1]
-        if packet := re.fullmatch(r"gather_(\d+)x[a-z](\d+)", called):
-            yield ("gathers",), int(packet[1]) * int(packet[2]) // 8
-        elif called.startswith("llvm.masked.gather"):
+        if name == "call":
+            called = re.search(r"@([\w.]+)\(", rest)
+            if called is None:  # a virtual function: it is counted itself
+                continue
+            name = called[1].removeprefix("llvm.")
+        counts["instructions"] += 1
+        if packet := re.fullmatch(r"gather_(\d+)x[a-z](\d+)", name):
+            counts.update(gathers=1, bytes_gathered=int(packet[1]) * int(packet[2]) // 8)
+        elif name.startswith("masked.gather"):
             type_name = re.search(r"x (\w+)>", rest)[1]
-            yield ("gathers",), _BYTES.get(type_name) or max(int(type_name[1:]) // 8, 1)
-        elif "rsqrt" in called:
-            yield ("sqrt",), 0
-        elif "rcp" in called:
-            yield ("div",), 0
+            counts.update(gathers=1, bytes_gathered=_BYTES.get(type_name) or max(int(type_name[1:]) // 8, 1))
+        elif "rsqrt" in name or "rcp" in name:
+            counts["sqrt" if "rsqrt" in name else "div"] += 1
         else:
-            yield _LLVM_CALLS.get(called.split(".")[1] if called.startswith("llvm.") else "", ()), 0
+            counts.update(_LLVM_OPS.get(name.split(".")[0], ()))
+    return Operations(**counts)
 
 
 def bsdf_operations(bsdf, methods: tuple[str, ...] = ("eval", "pdf", "sample")) -> dict[str, Operations]:

@@ -16,12 +16,16 @@ import numpy as np
 
 from ..core.files import replacing
 from ..images import srgb
+from .statistics import pareto
 
 #: Colour and marker of each representation, in order of appearance; markers differ for prints without colour.
 STYLES = (
     ("#b2182b", "o"), ("#2166ac", "s"), ("#c47a00", "D"), ("#1b7837", "^"), ("#762a83", "v"), ("#4d4d4d", "P"),
     ("#12908e", "X"), ("#8c564b", "*"),
 )  # fmt: skip
+
+#: Times or bytes that differ by a smaller factor count as equal on the Pareto front.
+SAME = 1.05
 
 #: Distances from an anchor to the nearest edge of its label that are tried, in points (1/72 inch).
 LABEL_DISTANCES = (6, 9, 12, 18, 26, 36, 48, 62, 80)
@@ -35,15 +39,18 @@ LABEL_DIRECTIONS = 16
 
 @dataclass(frozen=True)
 class Point:
-    """Point of a panel: time (median and quartiles) and accuracy of a candidate, and whether it is on the front."""
+    """Point of a panel: time or bytes ``x`` (median and quartiles) and accuracy of a candidate.
+
+    ``competes``: the point may be on the Pareto front.
+    """
 
     name: str
-    time: float
-    q1: float
-    q3: float
+    x: float
+    low: float
+    high: float
     accuracy: float
     representation: str
-    on_front: bool
+    competes: bool = True
 
 
 @dataclass(frozen=True)
@@ -57,6 +64,12 @@ class Panel:
     x_label: str
     points: Sequence[Point]
     lines: Sequence[tuple[str, float, bool]]
+
+    def front(self) -> list[Point]:
+        """Return the points of the Pareto front, from left to right; ``x`` within :data:`SAME` counts as equal."""
+        competing = [p for p in self.points if p.competes]
+        marks = pareto([(math.log(max(p.x, 1e-6)), -p.accuracy) for p in competing], (math.log(SAME), 0))
+        return sorted((p for p, mark in zip(competing, marks, strict=True) if mark), key=lambda p: p.x)
 
 
 @dataclass(frozen=True)
@@ -133,15 +146,14 @@ def crop_to(mask: np.ndarray) -> tuple[slice, slice]:
 def draw_panels(title: str, panels: Sequence[Panel], y_label: str, caption: str):
     """Return a Matplotlib figure with up to two panels a row; time or bytes are on a logarithmic axis.
 
-    If there are several representations, a legend names them.
+    If there are several representations, a legend names them. Points of the Pareto front are filled.
     """
     from matplotlib.lines import Line2D
 
     columns = min(2, len(panels))
     rows = -(-len(panels) // columns)
-    styles: dict[str, tuple[str, str]] = {}
-    for point in (x for panel in panels for x in panel.points):
-        styles.setdefault(point.representation, STYLES[len(styles) % len(STYLES)])
+    names = dict.fromkeys(point.representation for panel in panels for point in panel.points)
+    styles = {name: STYLES[i % len(STYLES)] for i, name in enumerate(names)}
     lines = -(-len(styles) // (4 * columns))  # of the legend
     plot = figure(title, caption, 6.4 * columns, 4.6 * rows, 0.33 + 0.22 * lines if len(styles) > 1 else 0.3)
     if len(styles) > 1:
@@ -158,47 +170,48 @@ def draw_panels(title: str, panels: Sequence[Panel], y_label: str, caption: str)
         axes = plot.add_subplot(rows, columns, k + 1)
         axes.set_ylim(min(accuracies) - 1.2 * margin, max(accuracies) + 2.2 * margin)
         _draw_panel(axes, panel, styles)
-        axes.set_title(panel.title, fontsize=10)
         finish(axes, panel.x_label, y_label)
     plot.draw_without_rendering()
     plot.set_layout_engine("none")  # labels are placed in the final layout
     for axes, panel in zip(plot.axes, panels, strict=True):
         top = axes.transData.inverted().transform((axes.bbox.x0, axes.bbox.y1 - 9 * axes.figure.dpi / 72))[1]
         labels = [
-            (f"{name}{' (exact)' * is_truth}", (time, top), {"color": "0.1" if is_truth else "0.4"})
-            for name, time, is_truth in panel.lines
+            (f"{name}{' (exact)' * is_truth}", (x, top), {"color": "0.1" if is_truth else "0.4"})
+            for name, x, is_truth in panel.lines
         ]
-        for p in sorted(panel.points, key=lambda p: (not p.on_front, -p.accuracy, p.time)):
-            style = {"color": styles[p.representation][0], "fontweight": "bold" if p.on_front else "normal"}
-            labels.append((p.name, (p.time, p.accuracy), style))
-        place_labels(axes, labels, [(p.time, p.accuracy) for p in panel.points])
+        front = panel.front()
+        for p in sorted(panel.points, key=lambda p: (p not in front, -p.accuracy, p.x)):
+            style = {"color": styles[p.representation][0], "fontweight": "bold" if p in front else "normal"}
+            labels.append((p.name, (p.x, p.accuracy), style))
+        place_labels(axes, labels, [(p.x, p.accuracy) for p in panel.points])
     return plot
 
 
 def _draw_panel(axes, panel: Panel, styles: dict) -> None:
     """Draw a panel without its labels."""
+    axes.set_title(panel.title, fontsize=10)
     axes.set_xscale("log")
-    times = [*(x.time for x in panel.points), *(time for _, time, _ in panel.lines)]
-    room = (max(times) / min(times)) ** 0.12 * 1.25  # for labels beside points
-    low, high = min(times) / room, max(times) * room
+    xs = [*(p.x for p in panel.points), *(x for _, x, _ in panel.lines)]
+    room = (max(xs) / min(xs)) ** 0.12 * 1.25  # for labels beside points
+    low, high = min(xs) / room, max(xs) * room
     axes.set_xlim(low, high)
     log_ticks(axes.xaxis, low, high)
-    front = sorted((p for p in panel.points if p.on_front), key=lambda p: p.time)
+    front = panel.front()
     if front:
-        xs = [front[0].time, *(p.time for p in front), high]
+        xs = [front[0].x, *(p.x for p in front), high]
         ys = [axes.get_ylim()[0], *(p.accuracy for p in front), front[-1].accuracy]
         axes.step(xs, ys, where="post", color="0.35", linewidth=1.0, zorder=2)
         axes.fill_between(xs, ys, ys[0], step="post", color="0.5", alpha=0.05, linewidth=0, zorder=1)
         axes.annotate("Pareto front", (1, front[-1].accuracy), (-4, -3), xycoords=axes.get_yaxis_transform(),
                       textcoords="offset points", fontsize=7, color="0.35", ha="right", va="top")  # fmt: skip
-    for _, time, is_truth in panel.lines:
+    for _, x, is_truth in panel.lines:
         dashes = {"color": "0.1", "linestyle": (0, (5, 2))} if is_truth else {"color": "0.55", "linestyle": ":"}
-        axes.axvline(time, linewidth=1.0, zorder=2, **dashes)
+        axes.axvline(x, linewidth=1.0, zorder=2, **dashes)
     for p in panel.points:
         colour, marker = styles[p.representation]
-        error = [[max(p.time - max(p.q1, 1e-6), 0)], [max(p.q3 - p.time, 0)]]
-        axes.errorbar(p.time, p.accuracy, xerr=error, fmt=marker, color=colour, elinewidth=0.9, markersize=6.5,
-                      markerfacecolor=colour if p.on_front else "white", markeredgewidth=1.3, capsize=2,
+        error = [[max(p.x - max(p.low, 1e-6), 0)], [max(p.high - p.x, 0)]]
+        axes.errorbar(p.x, p.accuracy, xerr=error, fmt=marker, color=colour, elinewidth=0.9, markersize=6.5,
+                      markerfacecolor=colour if p in front else "white", markeredgewidth=1.3, capsize=2,
                       zorder=3)  # fmt: skip
 
 
@@ -283,26 +296,6 @@ def draw_curves(
             axes.legend(fontsize=6.5, ncols=2)
             explained = labels
     return plot
-
-
-def draw_training_curves(title: str, records: dict[str, dict], caption: str):
-    """Draw PSNR over steps of trainings (records of :class:`.training.ConvergenceTraining`).
-
-    Each training has a panel, each of its runs a line, from the shortest (light) to the longest (dark). The title of a
-    training says whether it has converged.
-    """
-    panels = {}
-    for name, record in records.items():
-        gain = "" if record["gain_db"] is None else f", last doubling {record['gain_db']:+.1f} dB"
-        state = "converged" if record["converged"] else "NOT converged"
-        runs = record["runs"]
-        panels[f"{name}: {record['psnr_db']:.1f} dB\n{state}{gain}"] = [
-            Curve(f"{run['steps']:,} steps", run["curve_steps"], run["curve_psnr_db"],
-                  style={"color": str(0.75 * (1 - (i + 1) / len(runs))), "marker": ""})
-            for i, run in enumerate(runs)
-        ]  # fmt: skip
-    about = "PSNR in dB over training steps; each line is a separate run, twice as long as the previous one."
-    return draw_curves(title, f"{about} {caption}", panels, "training steps", "PSNR, dB", "x", columns=4, height=2.6)
 
 
 # -- Pictures ----------------------------------------------------------------------------------------------------------

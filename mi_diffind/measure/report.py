@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 import os
 from collections.abc import Callable, Iterable, Sequence
 
 from ..core.files import replacing, writable_folder, write_json
 from . import plot
-from .statistics import finite, pareto
+from .statistics import finite
 from .store import Store
-from .study import PASS, Plan, Tradeoff, in_competition
+from .study import PASS, Plan, Tradeoff
 
 #: Quantities beside time that accuracy may be drawn against: the label of the axis, and the title of the panel.
 QUANTITIES = {"bytes": ("bytes", "bytes"), "training_seconds": ("seconds of training", "training")}
@@ -57,18 +56,14 @@ def publish(result: dict, paths: dict[str, str], lines: list[str]) -> Tradeoff:
 def write(result: dict, folder: str | os.PathLike, plan: Plan | None = None) -> dict[str, str]:
     """Write the files (:func:`write_files`) of a result of :func:`.benchmark.measure`, and return their paths.
 
-    The pictures are the panels, training curves, and those of the ``plan`` if the run is complete.
+    The pictures are the panels, and those of the ``plan`` if the run is complete.
     """
     pictures = {}
-    trainings = {name: record for name, record in result["jobs"].items() if "runs" in record}
     drawn = panels(result)
     if drawn:
         of_cases = {case["accuracy"] for case in result["cases"].values()}
         label = result["measures"][0]["label"] if len(of_cases) < 2 else "PSNR, dB"
         pictures["png"] = lambda: plot.draw_panels(result["title"], drawn, label, figure_caption(result))
-    if trainings:
-        title = f"{result['title']}: training"
-        pictures["training"] = lambda: plot.draw_training_curves(title, trainings, figure_caption(result))
     if plan is not None and not result["interrupted"]:
         pictures |= {word: (lambda draw=draw: draw(result)) for word, draw in plan.pictures.items()}
     return write_files(result["task"], folder, result, rows(result), pictures)
@@ -101,21 +96,21 @@ def _cells(result: dict, name: str) -> dict:
 def panels(result: dict) -> list[plot.Panel]:
     """Return the panels of a result: accuracy against the plan's quantities, then against time, one panel a case.
 
-    Times are those of the first query, or of a pass. Candidates have labels and quartiles, references vertical lines.
-    If the cases have different candidates, each has its own panel of bytes.
+    Times are those of a pass, or else of the first query. Candidates have labels and quartiles, references vertical
+    lines. If the cases have different candidates, each has its own panel of bytes.
     """
-    candidates, cases, drawn = result["candidates"], [], []
+    candidates, cases = result["candidates"], {}
     for case, measured in result["cases"].items():
         if measured["in_picture"]:
-            timings = next(iter(measured["passes" if measured["of_passes"] else "queries"].values()), {})
-            cases.append((case, measured, timings))
-    several = len({frozenset(timings) for _, _, timings in cases}) > 1
-    for quantity in result["panels"]:
-        if quantity != "bytes" or not several:
-            drawn.append(_against(quantity, candidates.values(), result, QUANTITIES[quantity][1]))
-    for case, measured, timings in cases:
-        of_passes, accuracy = measured["of_passes"], measured["accuracy"]
-        query = next(iter(measured["queries"]))
+            cases[case] = next(iter((measured["passes"] or measured["queries"]).items()))
+    several = len({frozenset(timings) for _, timings in cases.values()}) > 1
+    drawn = [
+        _against(quantity, candidates.values(), result, QUANTITIES[quantity][1])
+        for quantity in result["panels"]
+        if quantity != "bytes" or not several
+    ]
+    for case, (query, timings) in cases.items():
+        of_passes, accuracy = query == PASS, result["cases"][case]["accuracy"]
         points, lines = [], []
         for name, t in timings.items():
             c = candidates[name]
@@ -125,83 +120,61 @@ def panels(result: dict) -> list[plot.Panel]:
                 label = f"{c['label']}, below {t['time']:.2g} ns" if t["hidden"] else c["label"]
                 lines.append((label, t["time"], c["is_truth"]))
             elif accuracy in c["errors"]:
-                points.append(_point(c, accuracy, t["time"], t["q1"], t["q3"], bool(t["on_front"])))
-        unit = f"{PASS}, ms" if of_passes else f"{query}, ns"
-        drawn.append(plot.Panel(case, f"time of one {unit}", points, lines))
+                points.append(_point(c, accuracy, t["time"], t["q1"], t["q3"]))
+        drawn.append(plot.Panel(case, f"time of one {query}, {'ms' if of_passes else 'ns'}", points, lines))
         if several and "bytes" in result["panels"]:
             drawn.append(_against("bytes", [candidates[name] for name in timings], result, case))
     return [panel for panel in drawn if len(panel.points) > 1 or panel.lines]
 
 
-def _point(c: dict, accuracy: str, x: float, low: float, high: float, on_front: bool) -> plot.Point:
-    return plot.Point(c["label"], x, low, high, c["errors"][accuracy], c["representation"], on_front)
+def _point(c: dict, accuracy: str, x: float, low: float, high: float) -> plot.Point:
+    return plot.Point(c["label"], x, low, high, c["errors"][accuracy], c["representation"], c["competes"])
 
 
 def _against(quantity: str, candidates: Iterable[dict], result: dict, title: str) -> plot.Panel:
     """Return a panel of accuracy against ``quantity``; candidates equal in both, or of one job, are one point."""
-    distinct: dict[tuple, dict] = {}
+    distinct: dict[tuple, plot.Point] = {}
     key = result["measures"][0]["key"]
     for c in candidates:
         accuracy = c["errors"].get(key)
         if accuracy is not None and not (c["is_truth"] or c["is_reference"]) and c["in_picture"] and c[quantity]:
-            distinct.setdefault((c[quantity], c["job"] or accuracy), c)
-    values = [
-        (math.log(c[quantity]), -c["errors"][key]) if in_competition(c) else (math.nan, math.nan)
-        for c in distinct.values()
-    ]
-    points = [
-        _point(c, key, *[c[quantity]] * 3, on_front)
-        for c, on_front in zip(distinct.values(), pareto(values), strict=True)
-    ]
-    return plot.Panel(title, QUANTITIES[quantity][0], points, [])
+            distinct.setdefault((c[quantity], c["job"] or accuracy), _point(c, key, *[c[quantity]] * 3))
+    return plot.Panel(title, QUANTITIES[quantity][0], list(distinct.values()), [])
 
 
 def summary(result: dict) -> list[str]:
-    """Return the result as lines of text: errors of candidates, verdicts in equal bytes, times, ratios, the machine."""
+    """Return the result as lines of text: errors of candidates, verdicts in equal bytes, times and operations."""
     lines = [*_error_table(result), *verdicts(result)]
     for case, measured in result["cases"].items():
-        queries, passes = measured["queries"], measured["passes"].get(PASS, {})
-        floors = ", ".join(f"{q} {next(iter(t.values()))['floor']:.2f}" for q, t in queries.items())
-        lines += ["", f"{case}: ns each, floor subtracted ({floors}); ± half the interquartile range"]
-        query = next(iter(queries))
-        cells = [["", *queries, "flops", "reads", *([f"ms {PASS}"] if passes else []), "bytes", "accuracy", ""]]
-        front = passes if measured["of_passes"] else queries[query]
-        for name in dict.fromkeys((*queries[query], *passes)):
-            c, operations = result["candidates"][name], queries[query].get(name, {}).get("operations", {})
-            accuracy = c["errors"].get(measured["accuracy"])
-            shown = "exact" if c["is_truth"] else "-" if accuracy is None else f"{accuracy:.1f} dB"
-            cells.append([
-                name, *(time_cell(timings.get(name)) for timings in queries.values()),
-                *(str(operations.get(key, "")) for key in ("flops", "gathers")),
-                *([time_cell(passes.get(name), 1)] if passes else []), f"{c['bytes']:,}", shown,
-                f"{'*' * bool(front.get(name, {}).get('on_front')):1}{' not converged' * (c['converged'] is False)}",
-            ])  # fmt: skip
-        lines += grid(cells)
-    if result["cases"]:
-        lines.append(f"  (* on the Pareto front of accuracy and time; flops and reads are those of {query})")
-    for case, measured in result["cases"].items():
-        ratios = measured["ratios"]
-        pairs = dict.fromkeys(pair for by_pair in ratios.values() for pair in by_pair)
-        if pairs:
-            lines += ["", f"{case}: ratios, medians of the rounds, floor subtracted [with the floor]"]
-            cells = [[ratio_cell(r.get(pair), q in measured["queries"]) for q, r in ratios.items()] for pair in pairs]
-            lines += grid([["", *ratios], *([pair, *row] for pair, row in zip(pairs, cells, strict=True))])
+        timings = {f"{query}, ns": t for query, t in measured["queries"].items()}
+        timings |= {f"{query}, ms": t for query, t in measured["passes"].items()}
+        cells, first = [["", *timings, "flops", "reads"]], next(iter(measured["queries"].values()))
+        for name in dict.fromkeys(name for by_name in timings.values() for name in by_name):
+            operations = first.get(name, {}).get("operations", {})
+            counts = (str(operations.get(key, "")) for key in ("flops", "gathers"))
+            cells.append([name, *(time_cell(by_name.get(name)) for by_name in timings.values()), *counts])
+        lines += ["", f"{case}: floor subtracted; ± half the interquartile range", *grid(cells)]
     s = result["settings"]
     how = f"{s['rounds']} interleaved rounds of {s['lanes']:,} lanes; errors from {s['samples']:,} samples where drawn"
-    return [*lines, "", f"{machine_line(result)} Medians of {how}.", figure_caption(result)]
+    return [*lines, "", f"Medians of {how}.", figure_caption(result)]
 
 
 def _error_table(result: dict) -> list[str]:
-    """Return the plan's measures of all candidates as lines of text."""
-    measures = result["measures"]
-    cells = [["", "bytes", "seconds", *(m["label"] for m in measures)]]
+    """Return bytes, seconds of training and the plan's measures of all candidates as lines of text."""
+    measures, cells = result["measures"], []
     for name, c in result["candidates"].items():
         errors = [c["errors"].get(m["key"]) for m in measures]
         if any(e is not None for e in errors):
             texts = ["-" if e is None else f"{e:{m['form']}}" for e, m in zip(errors, measures, strict=True)]
             seconds = "-" if c["training_seconds"] is None else f"{c['training_seconds']:.1f}"
-            cells.append([name, f"{c['bytes']:,}", seconds, *texts])
-    return grid(cells, "") if len(cells) > 1 else []
+            cells.append([name, f"{c['bytes']:,}", seconds, *texts, convergence(result, c)])
+    return grid([["", "bytes", "seconds", *(m["label"] for m in measures), ""], *cells], "") if cells else []
+
+
+def convergence(result: dict, candidate: dict) -> str:
+    """Return "" for a candidate that has converged or needs no training, else why it has not."""
+    gain = result["jobs"].get(candidate["job"], {}).get("gain_db")
+    return "" if candidate["converged"] is not False else "twice the steps lose" if (gain or 0) < 0 else "not converged"
 
 
 def verdicts(result: dict) -> list[str]:
@@ -230,21 +203,11 @@ def percent(value: float, digits: int = 3) -> str:
     return f"{value:.{digits}g}%" if value == 0 or abs(value) >= 1e-4 else f"{value:.1e}%"
 
 
-def time_cell(t: dict | None, digits: int = 2) -> str:
+def time_cell(t: dict | None) -> str:
     """Return a time (:func:`.statistics.timing`) ± half its interquartile range, or the bound of a hidden time."""
     if t is None:
         return ""
-    if t["hidden"]:
-        return f"below {t['time']:.{digits}f}"
-    return f"{t['time']:.{digits}f} ±{(t['q3'] - t['q1']) / 2:.{digits}f}"
-
-
-def ratio_cell(r: dict | None, floor: bool = True) -> str:
-    """Return a ratio of times (:func:`.statistics.ratio`); with ``floor`` in brackets the ratio with the floor."""
-    if r is None:
-        return ""
-    median = f"{'below ' * r['hidden']}{r['median']:.2f}" if math.isfinite(r["median"]) else "-"
-    return f"{median} [{r['with_floor']:.2f}]" if floor else median
+    return f"below {t['time']:.2f}" if t["hidden"] else f"{t['time']:.2f} ±{(t['q3'] - t['q1']) / 2:.2f}"
 
 
 def grid(rows: Sequence[Sequence[str]], indent: str = "  ") -> list[str]:
@@ -252,17 +215,6 @@ def grid(rows: Sequence[Sequence[str]], indent: str = "  ") -> list[str]:
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ([f"{cell:>{w + 2}}" for cell, w in zip(row[1:], widths[1:], strict=True)] for row in rows)
     return [f"{indent}{row[0]:{widths[0]}}{''.join(line)}".rstrip() for row, line in zip(rows, lines, strict=True)]
-
-
-def machine_line(result: dict) -> str:
-    """Return the machine (:func:`.clock.machine`) and the date of a result as a sentence."""
-    m = result["machine"]
-    device = m["gpu"] if m["variant"].startswith("cuda") else f"{m['cpu']} ({m['instructions']}), {m['cores']} cores"
-    llvm = f", LLVM {m['llvm']}" if m["llvm"] else ""
-    return (
-        f"{device}; {m['variant']}, Mitsuba {m['mitsuba']}, Dr.Jit {m['drjit']}{llvm}, mi_diffind {m['mi-diffind']}; "
-        f"{result['date']}."
-    )
 
 
 def figure_caption(result: dict) -> str:

@@ -32,27 +32,22 @@ def timing(values: Iterable[float], floor: float = 0.0) -> dict:
     and ``rounds`` are as given; ``hidden``: ``time`` is only an upper bound.
     """
     values = list(values)
-    s, least = spread(values), HIDDEN * floor
-    time, q1, q3 = (max(s[key] - floor, least) for key in ("median", "q1", "q3"))
-    hidden = floor > 0 and s["median"] - floor < least
-    return {"time": time, "q1": q1, "q3": q3, "with_floor": s["median"], "floor": floor, "rounds": len(values),
-            "hidden": hidden}  # fmt: skip
+    median, q1, q3 = spread(values).values()
+    least = HIDDEN * floor
+    times = {name: max(value - floor, least) for name, value in (("time", median), ("q1", q1), ("q3", q3))}
+    return {**times, "with_floor": median, "floor": floor, "rounds": len(values), "hidden": median - floor < least}
 
 
 def ratio(a: Sequence[float], b: Sequence[float], floor: float = 0.0) -> dict:
     """Return the ratio ``a / b`` of times, round by round, without the ``floor``.
 
-    ``median``, ``q1``, ``q3`` are NaN if ``b`` is hidden behind the floor; ``with_floor`` is the median of the ratios
-    with it; ``hidden``: ``a`` is hidden, so that the median is only an upper bound.
+    ``median``, ``q1``, ``q3`` are NaN if ``b`` is hidden behind the floor; ``hidden``: ``a`` is hidden, so that the
+    median is only an upper bound.
     """
-    both = list(zip(a, b, strict=True))
     least = HIDDEN * floor
-    if floor > 0 and spread(b)["median"] - floor < least:
-        ratios = spread([])
-    else:
-        ratios = spread(max(x - floor, least) / (y - floor) if y > floor else math.nan for x, y in both)
-    with_floor = spread(x / y if y > 0 else math.nan for x, y in both)["median"]
-    return {**ratios, "with_floor": with_floor, "hidden": floor > 0 and spread(a)["median"] - floor < least}
+    a_hidden, b_hidden = (spread(values)["median"] - floor < least for values in (a, b))
+    rounds = [] if b_hidden else [(x, y) for x, y in zip(a, b, strict=True) if y > floor]
+    return {**spread(max(x - floor, least) / (y - floor) for x, y in rounds), "hidden": a_hidden}
 
 
 def pareto(points: Sequence[Sequence[float]], slack: Sequence[float] | float = 0.0) -> list[bool]:

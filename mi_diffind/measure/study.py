@@ -81,11 +81,10 @@ class Candidate:
     """Candidate of a comparison: a representation at a setting.
 
     ``errors(samples)`` measures its errors against the truth. Without it, the errors are those of its job's record, or
-    it has none: the truth (``is_truth``), or a candidate that computes something else.
-    ``is_reference``: others are compared with it, and it does not compete, like the truth. ``competes``: it may be on
-    the Pareto front. ``bytes`` are those of its job's record, if any. ``job``: name of the job that trains it;
-    ``operations(query)`` counts operations that a kernel does not show; ``label`` is its name in pictures; ``details``
-    go to the result.
+    it has none: the truth (``is_truth``), or a candidate that computes something else. Pictures show the truth, and
+    candidates that others are compared with (``is_reference``), as lines. ``competes``: it may be on the Pareto front.
+    ``bytes`` are those of its job's record, if any. ``job``: name of the job that trains it; ``operations(query)``
+    counts operations that a kernel does not show; ``label`` is its name in pictures; ``details`` go to the result.
     """
 
     name: str
@@ -106,15 +105,10 @@ class Candidate:
 class Job:
     """Work that is done before the measurement, such as a training; shared by the candidates that name it.
 
-    Its record is a tree for JSON: ``seconds``, and optionally ``bytes``, ``errors``, ``converged``, ``details``, and
-    ``runs``, the curves of trainings (:mod:`.training`).
-
-    A job that is ``separable`` may run in another process, where its plan is made anew, beside other jobs: it depends
-    on no other job and on no clock, and :meth:`cached_record` then gives what :meth:`run` left in the folder.
+    Its record is a tree for JSON: ``seconds``, and optionally ``bytes``, ``errors``, ``converged`` and ``details``.
     """
 
     name: str
-    separable = False
 
     def cached_record(self, folder: Path | None, record: dict | None) -> dict | None:
         """Return the record if the work is done: ``record`` is that of the store, ``folder`` holds models."""
@@ -132,8 +126,8 @@ class Case:
     ``queries(lanes)`` returns query → name of a candidate, or :data:`FLOOR` → function. ``passes()``, if given, returns
     name of a candidate → function of the pass number that does one whole pass, such as a render. Both are called when
     they are needed; names that are no candidates are left out. ``in_picture``: the case has a panel, of the error
-    ``accuracy`` (default: the plan's first measure) against the time of its first query, or of a pass if ``of_passes``;
-    the Pareto front uses the same two. ``details`` go to the result.
+    ``accuracy`` (default: the plan's first measure) against the time of a pass, or without ``passes`` of its first
+    query. ``details`` go to the result.
     """
 
     name: str
@@ -142,7 +136,6 @@ class Case:
     details: dict = field(default_factory=dict)
     in_picture: bool = True
     accuracy: str = ""
-    of_passes: bool = False
 
 
 @dataclass(frozen=True)
@@ -162,12 +155,12 @@ class Measure:
 class Plan:
     """Plan of a measurement: candidates, cases, jobs, and the reports of a study.
 
-    The first of the ``measures`` is the accuracy of pictures and of the Pareto front; more of it is better, as of a
-    PSNR. ``ratios`` are pairs of candidates whose times are divided. Partial results are continued only if ``details``
-    and the files of this package are unchanged, models of ``jobs`` if ``jobs_fingerprint`` is.
-    ``panels``: quantities that the accuracy is drawn against beside time: ``"bytes"`` (for each case, if the cases have
-    different candidates) and ``"training_seconds"``. ``pictures`` maps further names to functions of the
-    result that draw a Matplotlib figure; ``notes`` are sentences below pictures.
+    The first of the ``measures`` is the accuracy of pictures; more of it is better, as of a PSNR. ``ratios`` are pairs
+    of candidates whose times are divided. Partial results are continued only if ``details`` and the files of this
+    package are unchanged, models of ``jobs`` if ``jobs_fingerprint`` is. ``panels``: quantities that the accuracy is
+    drawn against beside time: ``"bytes"`` (for each case, if the cases have different candidates) and
+    ``"training_seconds"``. ``pictures`` maps further names to functions of the result that draw a Matplotlib figure;
+    ``notes`` are sentences below pictures.
     """
 
     study: str
@@ -182,8 +175,3 @@ class Plan:
     jobs_fingerprint: str = ""
     panels: tuple[str, ...] = ()
     pictures: dict[str, Callable[[dict], object]] = field(default_factory=dict)
-
-
-def in_competition(candidate: dict) -> bool:
-    """Return whether a candidate of a result may be on the Pareto front."""
-    return candidate["competes"] and not (candidate["is_reference"] or candidate["is_truth"])

@@ -1,8 +1,9 @@
 """Contenders of studies: representations that are trained once, whose models and records are kept in a folder.
 
 Only representations that are trained to convergence can be compared (:class:`ConvergenceTraining`). A representation
-has converged if a run of twice as many steps, with the same schedule stretched to them, gained less than :data:`GAIN`
-dB; if the longest run gained more, the record says so. The records keep the curves of all runs.
+has converged if a run of twice as many steps, with the same schedule stretched to them, changed the result by less than
+:data:`GAIN` dB. Trainings also end where twice the steps lose more, or at the longest run: the best run counts, and the
+record says that it has not converged.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from ..fitting.loop import FitSettings, Problem, fit
 from .store import file_name
 from .study import Candidate, Job
 
-#: Gain of a run of twice as many steps, in dB, below which a training has converged.
+#: Change by a run of twice as many steps, in dB, below which a training has converged.
 GAIN = 0.5
 
 
@@ -62,7 +63,6 @@ class Contender(Job):
     family: str = ""
     setting: str = ""
     has_file: bool = True
-    separable: bool = False
     details: dict = field(default_factory=dict)
     file: Path | None = None
     folder: Path | None = None
@@ -126,7 +126,7 @@ class ConvergenceTraining(Contender):
         self, name: str, problem: Callable[[], Problem], settings: FitSettings, longest: int, measurements: int = 20,
         half: bool = False, finish: Callable[[object, dict], dict] = lambda net, record: {},
     ):  # fmt: skip
-        super().__init__(name, "", 0.0, ConvergenceTraining.train, lambda job: job.net, separable=True)
+        super().__init__(name, "", 0.0, ConvergenceTraining.train, lambda job: job.net)
         self.problem, self.settings, self.longest = problem, settings, longest
         self.measurements, self.half, self.finish = measurements, half, finish
 
@@ -151,9 +151,9 @@ class ConvergenceTraining(Contender):
 
         Returns the record, or ``None`` after Ctrl-C: ``name``, ``steps``, ``seconds`` and ``psnr_db`` of the best run,
         ``gain_db`` of the last doubling (``None``: there was none), ``converged``, ``entries`` (numbers trained), and
-        ``runs``: of each run its ``steps``, ``seconds``, and for each measurement ``curve_steps``, ``curve_psnr_db``.
+        ``steps``, ``seconds`` and ``psnr_db`` of each of the ``runs``.
         """
-        runs, best, steps = [], None, self.settings.steps
+        runs, best, gain, steps = [], None, None, self.settings.steps
         while True:
             settings = dataclasses.replace(self.settings, steps=steps, measure_every=max(1, steps // self.measurements))
             problem = self.problem()
@@ -163,26 +163,19 @@ class ConvergenceTraining(Contender):
             result = fit(problem, settings, checkpoint, resume, progress, title=title)
             if result.interrupted:
                 return None
-            first = next(iter(result.measured))
-            runs.append({
-                "steps": steps,
-                "seconds": result.seconds,
-                "psnr_db": result.measured[first],
-                "curve_steps": [h["step"] for h in result.history],
-                "curve_psnr_db": [h[first] for h in result.history],
-            })  # fmt: skip
-            if best is None or runs[-1]["psnr_db"] >= best["psnr_db"]:
-                best, self.net = runs[-1], problem.net
-            gain = runs[-1]["psnr_db"] - runs[-2]["psnr_db"] if len(runs) > 1 else None
-            converged = gain is not None and gain < GAIN
-            if converged or 2 * steps > self.longest:
+            run = {"steps": steps, "seconds": result.seconds, "psnr_db": next(iter(result.measured.values()))}
+            gain = run["psnr_db"] - runs[-1]["psnr_db"] if runs else None
+            runs.append(run)
+            if best is None or run["psnr_db"] >= best["psnr_db"]:
+                best, self.net = run, problem.net
+            if (gain is not None and gain < GAIN) or 2 * steps > self.longest:
                 break
             steps *= 2
         record = {
             "name": self.name,
-            **{key: best[key] for key in ("steps", "seconds", "psnr_db")},
+            **best,
             "gain_db": gain,
-            "converged": converged,
+            "converged": gain is not None and abs(gain) < GAIN,
             "entries": sum(int(np.prod(self.net[key].shape)) for key in self.net),
             "settings": self._settings(),
             "runs": runs,

@@ -22,7 +22,7 @@ from ..core import discovery
 from ..core.errors import UsageError
 from ..core.files import writable_folder
 from ..core.runtime import use_variant
-from ..measure.study import Plan, Study, Tradeoff
+from ..measure.study import Study, Tradeoff
 
 
 @dataclass
@@ -70,8 +70,6 @@ def tradeoff(
     out: str | os.PathLike = "out",
     quick: bool = False,
     defines: Mapping[str, object] | None = None,
-    workers: int | None = None,
-    scheduler: str = "",
     **options,
 ) -> Tradeoff:
     """Measure time against accuracy, in the variant that is set: ``mi-diffind tradeoff`` in Python.
@@ -80,7 +78,6 @@ def tradeoff(
       positional arguments, as an image, a mesh or a scene file.
     - ``out``: folder for the table and the pictures; ``quick``: less of everything, times not to be quoted.
     - ``defines``: values of a scene's ``<default>`` parameters.
-    - ``workers``, ``scheduler``: number of processes, or address of a Dask cluster, that do the trainings of the study.
     - ``options``: options of the command as keywords, one of several values as a list (``compression=[6, 12]``). An
       option that is a word of Python ends in an underscore (``lambda_=0.5``).
 
@@ -93,15 +90,12 @@ def tradeoff(
     chosen = studies()[study]
     if defines and not chosen.of_scene:
         raise UsageError(f"defines: given to the study {study}, which has no scene file")
-    if (workers or scheduler) and chosen.of_scene:
-        raise UsageError(f"workers: given to the study {study}, whose renders are timed one after the other")
     parser = _Keywords(prog=f"tradeoff {study}", allow_abbrev=False, add_help=False)
     if chosen.of_scene:
         parser.add_argument("scene", metavar="SCENE.xml")
     chosen.add_arguments(parser)
     arguments = parser.parse_args([*map(str, sources), *_words(options)])
     arguments.out, arguments.quick, arguments.defines = str(out), quick, {k: str(v) for k, v in (defines or {}).items()}
-    arguments.workers, arguments.scheduler = workers, scheduler
     return run(chosen, arguments)
 
 
@@ -137,28 +131,14 @@ def run(study: Study, arguments, set_variant: Callable[[], object] = use_variant
     import mitsuba as mi
 
     from .. import plugins
+    from ..measure import benchmark, report
 
     if not plugins.supported(mi.variant()):
         usable = ", ".join(v for v in mi.variants() if plugins.supported(v))
         raise UsageError(f'the plugins do not run in the variant "{mi.variant()}"; use one of {usable}')
-    return study.run(arguments) or _measure(study, arguments)
-
-
-def _plan(name: str, arguments) -> Plan:
-    """Return the plan of a study, also in another process."""
-    return studies()[name].plan(arguments)
-
-
-def _measure(study: Study, arguments) -> Tradeoff:
-    from ..measure import benchmark, report
-
-    plan, workers = study.plan(arguments), None
-    count, scheduler = getattr(arguments, "workers", None), getattr(arguments, "scheduler", "")
-    if count or scheduler:
-        if not any(job.separable for job in plan.jobs):
-            raise UsageError(f"workers: the study {study.name} has no jobs that could run in other processes")
-        make = functools.partial(_plan, study.name, arguments)
-        workers = benchmark.Workers(make, count, scheduler)
-    settings = benchmark.BenchmarkSettings.choose(arguments.quick)
-    result = benchmark.measure(plan, settings, arguments.out, workers=workers)
-    return report.publish(result, report.write(result, arguments.out, plan), report.summary(result))
+    result = study.run(arguments)
+    if result is None:
+        plan, settings = study.plan(arguments), benchmark.BenchmarkSettings.choose(arguments.quick)
+        figures = benchmark.measure(plan, settings, arguments.out)
+        result = report.publish(figures, report.write(figures, arguments.out, plan), report.summary(figures))
+    return result

@@ -48,16 +48,21 @@ RATIOS = (75.0, 50.0, 200.0)
 DEFAULT = "captures/group"
 SCENE = "scenes/capture_group.xml"
 
-#: Method → its label, and the group that it belongs to in pictures. Those of :data:`ONCE` have the first budget only.
+#: Method → its label. Those of :data:`ONCE` have the first budget only.
 METHODS = {
-    "sparse": ("sparse grid, 8 bits", "grid"), "codebook": ("codebook", "codes"),
-    "hash": ("hash grid + network", "network"), "paper": ("paper", "supplement's arrays"), "ours": ("ours", "ours"),
+    "sparse": "sparse grid, 8 bits", "codebook": "codebook", "hash": "hash grid + network", "paper": "paper",
+    "ours": "ours",
 }  # fmt: skip
 ONCE = ("hash",)
 
 #: Method → preset of ``fit field``; the grid is that which all begin with.
 GRID = "grid"
 PRESETS = {"ours": "sparse", "paper": "paper", GRID: "grid"}
+
+#: Settings of a run: nodes along the side of a cube with the volume of the initial grid, the steps of its training
+#: (0: the preset's own), and those of each training that begins with it.
+FULL = {"resolution": 128, "grid_steps": 0, "steps": 500}
+QUICK = {"resolution": 20, "grid_steps": 60, "steps": 20}
 
 #: Methods by whose times ours is divided.
 AGAINST = ("sparse", "codebook", "paper")
@@ -95,36 +100,19 @@ class RadianceStudy(Study):
             f"{', '.join(f'{r:g}' for r in RATIOS)}; --quick: 75); all methods are trained and timed at the first one",
         )  # fmt: skip
         equal_memory.add_without_option(parser)
-        parser.add_argument(
-            "--resolution", type=int, default=0, metavar="N",
-            help="nodes along the side of a cube of the same volume, of the initial grid (default: 128; --quick: 24)",
-        )  # fmt: skip
-        parser.add_argument(
-            "--steps", type=int, default=0, metavar="N", help="steps of each training through the images (default: 500)"
-        )
 
     def check(self, arguments) -> None:
         """Check the options and read the views; raise :class:`~mi_diffind.tasks.radiance.views.ViewsError`."""
         default = ("75",) if arguments.quick else map(str, RATIOS)
         arguments.ratios = tuple(dict.fromkeys(map(parse_compression, arguments.compression or default)))
         equal_memory.check_without(arguments.without, METHODS)
-        for name, least in (("resolution", 8), ("steps", 2)):
-            value = getattr(arguments, name)
-            if value and value < least:
-                raise ValueError(f"--{name}: found {value}, at least {least} is needed")
         if arguments.source == DEFAULT and not Path(DEFAULT).exists():
             raise ValueError(f'there is no folder "{DEFAULT}": make it by mi-diffind capture {SCENE} -o {DEFAULT}')
         arguments.views = tuple(load_views(arguments.source, split) for split in ("train", "test"))
 
     def plan(self, arguments) -> Plan:
-        quick = arguments.quick
-        settings = SimpleNamespace(
-            ratios=arguments.ratios,
-            without=tuple(arguments.without),
-            resolution=arguments.resolution or (24 if quick else 128),
-            grid_steps=60 if quick else 0,  # of the initial grid; 0: as its preset says
-            steps=arguments.steps or (40 if quick else 500),
-        )
+        given = {"ratios": arguments.ratios, "without": tuple(arguments.without)}
+        settings = SimpleNamespace(**given, **(QUICK if arguments.quick else FULL))
         session = FieldSession(array_module(mi.variant()), *arguments.views)
         return plan(session, arguments.source, settings)
 
@@ -144,15 +132,10 @@ class RadianceStudyContext:
     settings: SimpleNamespace
     jobs: dict[str, Contender] = field(default_factory=dict)
 
-    @property
-    def types(self):
-        """The module of Dr.Jit types."""
-        return self.session.types
-
     @functools.cached_property
     def trained(self) -> grids.NodeGrid:
         """The trained grid."""
-        return grid_of(load(self.jobs[GRID].file), self.types)
+        return grid_of(load(self.jobs[GRID].file), self.session.types)
 
     @functools.cached_property
     def cells(self) -> np.ndarray:
@@ -163,14 +146,13 @@ class RadianceStudyContext:
         """Return the weights of the nodes of a grid in the training views."""
         return importance(grid, self.session, SETTINGS.seed)
 
-    @functools.cached_property
-    def dense_bytes(self) -> int:
-        """Bytes of the dense float32 grid, to which ratios refer."""
-        return dense_bytes(self.trained.nodes.shape)
+    def nbytes(self, ratio: float) -> float:
+        """Return the bytes of a compression of the dense float32 grid."""
+        return dense_bytes(self.trained.nodes.shape) / ratio
 
     def record(self, job: Contender, model: VolumeField, nbytes: int, file_bytes: int, **details) -> dict:
         """Return the record of a contender, with its errors."""
-        details |= {"memory_bytes": nbytes, "file_bytes": file_bytes, "dense_bytes": self.dense_bytes}
+        details |= {"memory_bytes": nbytes, "file_bytes": file_bytes}
         return {"bytes": nbytes, "errors": self.session.held_out_images.evaluate(model), "details": details}
 
 
@@ -184,7 +166,7 @@ def preset_contender(context: RadianceStudyContext, fields: dict) -> Contender:
             arguments |= {"resolution": settings.resolution, "colours": "directions"}
             arguments |= {"steps": settings.grid_steps} if settings.grid_steps else {}
         else:
-            nbytes = str(round(context.dense_bytes / job.budget))
+            nbytes = str(round(context.nbytes(job.budget)))
             arguments |= {"grid": str(context.jobs[GRID].file), "bytes": nbytes, "steps": settings.steps}
         trained = equal_memory.fit_preset(job, progress, "field", "field", PRESETS[job.method], arguments)
         if trained is None:
@@ -202,7 +184,7 @@ def rival_contender(context: RadianceStudyContext, fields: dict) -> Contender:
     rival = rivals.HashVolumeFit if fields["method"] == "hash" else rivals.NodesFit
 
     def train(job: Contender, progress: bool) -> dict | None:
-        nbytes, rate = context.dense_bytes / job.budget, HASH_RATE
+        nbytes, rate = context.nbytes(job.budget), HASH_RATE
         if job.method == "hash":
             grid = grids.refine(context.trained, context.cells)
             trained = rival(grid, context.importance(grid), nbytes)
@@ -220,14 +202,11 @@ def rival_contender(context: RadianceStudyContext, fields: dict) -> Contender:
         trained.net = problem.net
         state = trained.state()
         job.save_arrays(**state)
-        job.model = rival.field(context.types, state)
+        job.model = rival.field(context.session.types, state)
         details = {"steps": result.steps, "nodes": grid.nodes.count}
         return context.record(job, job.model, job.model.nbytes, rivals.compressed_bytes(state), **details)
 
-    def read(job: Contender) -> VolumeField:
-        return rival.field(context.types, load_arrays(job.file))
-
-    return Contender(fit=train, read=read, **fields)
+    return Contender(fit=train, read=lambda job: rival.field(context.session.types, load_arrays(job.file)), **fields)
 
 
 # -- The plan ----------------------------------------------------------------------------------------------------------
@@ -240,20 +219,22 @@ def plan(session: FieldSession, source: str, settings: SimpleNamespace) -> Plan:
     height, width = views.sizes[0].tolist()
     jobs[GRID] = preset_contender(context, {"name": GRID, "method": GRID, "budget": 1.0})
     for method, ratio in equal_memory.combinations(METHODS, settings.ratios, ONCE, settings.without):
-        label, family = METHODS[method]
-        fields = {"name": f"{label} {ratio:g}×", "method": method, "budget": ratio, "label": label, "family": family}
+        label, setting = METHODS[method], f"{ratio:g}×"
+        fields = {"name": f"{label} {setting}", "method": method, "budget": ratio, "label": label, "setting": setting}
         make = preset_contender if method in PRESETS else rival_contender
-        jobs[fields["name"]] = make(context, fields | {"setting": f"{ratio:g}×"})
+        jobs[fields["name"]] = make(context, fields)
     shown = [name for name, job in jobs.items() if job.budget == first and job.method in METHODS]
     ours = next((n for n in shown if jobs[n].method == "ours"), "")
     timed = (GRID, *shown)
-    candidates = [Candidate(GRID, "reference", job=GRID, is_reference=True, details={"kind": GRID})]
+    candidates = [
+        Candidate(GRID, "reference", job=GRID, is_reference=True, label="initial grid", details={"kind": GRID})
+    ]
     candidates += [job.candidate() for name, job in jobs.items() if name != GRID]
     code = package_files("tasks/radiance/*.py", "fitting/loop.py", "studies/field.py",
                          "studies/baselines/radiance_fields.py")  # fmt: skip
     return Plan(
         study="field",
-        title=f"Radiance field: {Path(source).name}",
+        title=f"Radiance fields of the capture {Path(source).name}: held-out views against bytes and time",
         candidates=candidates,
         cases=[
             Case("reads", lambda lanes: _reads(context, timed, lanes)),
@@ -265,7 +246,7 @@ def plan(session: FieldSession, source: str, settings: SimpleNamespace) -> Plan:
         },
         notes=[
             f"{Path(source).name}, {len(views)} views of {width} × {height} and {len(held_out)} to test. "
-            "Equal bytes in memory, index included.",
+            "Bytes in memory, index included; paper packs corners of cells for reading, in more bytes than asked for.",
         ],
         jobs=list(jobs.values()),
         jobs_fingerprint=fingerprint(code) + views.digest[:16],
@@ -277,7 +258,7 @@ def plan(session: FieldSession, source: str, settings: SimpleNamespace) -> Plan:
 
 def _reads(context: RadianceStudyContext, names, lanes: int) -> dict:
     """Return queries of density, and of density and colour, at random points of the visible cells."""
-    types, nodes = context.types, context.trained.nodes
+    types, nodes = context.session.types, context.trained.nodes
     rng = np.random.default_rng(1)
     cells = np.argwhere(context.cells & complete_cells(nodes.stored))
     places = cells[rng.integers(len(cells), size=lanes)] + rng.random((lanes, 3))
@@ -305,11 +286,13 @@ def draw_views(context: RadianceStudyContext, names: list[str], result: dict):
     """Draw the first test view by the fields at the first budget, and the differences to it."""
     truth = context.session.held_out.image(0)
     crop, reference = plot.crop_to(truth[..., 3] > 0), displayed(truth)
-    views, differences = {"test view": reference[crop]}, {"": reference[crop]}
+    views, differences = {"held-out view": reference[crop]}, {"held-out view": reference[crop]}
     for job in (context.jobs[name] for name in names):
         picture = displayed(context.session.held_out_images.render(job.model, 0))
         errors = result["candidates"][job.name]["errors"]
-        views[f"{job.label}\n{errors[WHITE]:.2f} / {errors[FOREGROUND]:.2f} dB"] = picture[crop]
+        views[f"{job.label}\n{errors[FOREGROUND]:.2f} dB"] = picture[crop]
         differences[job.label] = np.abs(picture - reference).mean(axis=-1)[crop]
-    rows, title = {"": views, "difference": differences}, f"{result['title']}, {result['details']['first']:g}×"
-    return plot.draw_images(title, " ".join(result["notes"]), rows, 1.6, "sRGB")
+    rows = {"": views, "difference": differences}
+    title = f"A held-out view by fields {result['details']['first']:g}× smaller than a dense grid, and their errors"
+    notes = ["dB: PSNR of the foreground in all held-out views.", *result["notes"]]
+    return plot.draw_images(title, " ".join(notes), rows, 1.6, "difference of sRGB values")

@@ -14,7 +14,6 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -39,24 +38,29 @@ PRIMARY = 16
 CASCADED = 8
 ENTRIES = 2 * PRIMARY**2 + CASCADED**2
 
-#: Indirection of the paper's sizes, which ratios are to.
-REFERENCE = f"{PRIMARY}→{CASCADED}"
-
-#: Names of the cases, one for each parametrisation of the inputs.
-PLAIN = "inputs as in the paper"
-LOGARITHMIC = "logarithmic inputs"
+#: Parametrisation of the inputs → the name of its case, and the end of the names of its candidates.
+INPUTS = {"plain": ("inputs as in the paper", ""), "logarithmic": ("logarithmic inputs", ", log")}
 
 #: Sides of the primary arrays, with cascaded ones half as long (ρ = 2).
-SIZES = (8, 16, 32, 64)
-
+SIZES = {"plain": (8, 16, 32, 64), "logarithmic": (16, 32)}
 
 #: Sizes of single tables, as multiples of ``ENTRIES``; the paper needs 512 for equal quality.
-MULTIPLES = (1, 4, 16, 64, 512)
+MULTIPLES = {"plain": (1, 4, 16, 64, 512), "logarithmic": (1, 4)}
 
+#: Options of the hash grid in front of a network.
+HASH_GRID = {
+    "n_levels": 4, "n_features_per_level": 2, "hashmap_size": 2**12, "base_resolution": 4, "per_level_scale": 2,
+    "align_corners": True, "init_scale": 1e-2,
+}  # fmt: skip
 
-#: Width and hidden layers of the networks. The last has about as many parameters as the paper's.
-NETWORKS = ((8, 2), (16, 2), (32, 3))
+#: Label → network. The last has about as many parameters as the paper's.
+NETWORKS = {
+    "MLP 8x2": Network(2, 8, 2), "grid + MLP 16": Network(2, 16, 1, HASH_GRID), "MLP 16x2": Network(2, 16, 2),
+    "MLP 32x3": Network(2, 32, 3),
+}  # fmt: skip
 
+#: Trainings of a quick study.
+QUICK = ("8→4", "16→8", "24²", "48²", "MLP 8x2", "grid + MLP 16", "16→8, log", "24², log")
 
 #: Training settings of each representation, chosen by experiment: indirection with plain inputs gains from a high
 #: learning rate, networks from many small steps. ``steps`` is the length of the first run, ``longest`` of the longest.
@@ -69,23 +73,14 @@ SETTINGS = {
     "wide network": {"lr": 5e-3, "batch": 1024, "steps": 8000, "longest": 32000},
 }
 
-
 #: Steps of the first run of a quick study; the longest run takes twice as many.
 QUICK_STEPS = 80
 
-
-#: Options of the hash grid in front of a network.
-HASH_GRID = {
-    "n_levels": 4, "n_features_per_level": 2, "hashmap_size": 2**12, "base_resolution": 4, "per_level_scale": 2,
-    "align_corners": True, "init_scale": 1e-2,
-}  # fmt: skip
-
-
-#: How networks are read.
+#: Storage of networks: how they are read.
 COOPERATIVE = "cooperative vectors"
 
-#: Storage → its suffix in labels, bytes of an entry of four.
-READ_AS = {"float32": ("", 4), "float16": (" f16", 2), "uint8": (" u8", 1), COOPERATIVE: ("", 4)}
+#: Storage → its suffix in labels.
+SUFFIXES = {"float32": "", "float16": " f16", "uint8": " u8", COOPERATIVE: ""}
 
 
 class GGXStudy(Study):
@@ -101,117 +96,93 @@ class GGXStudy(Study):
 STUDY = GGXStudy()
 
 
-@dataclass(frozen=True)
-class GGXForm:
-    """Representation of one size for one kind of ``inputs``, before its training.
+class GGXTraining(ConvergenceTraining):
+    """Training of a ``representation`` for one parametrisation of the ``inputs``, which is read in some ``storages``.
 
-    ``net`` is the module, not yet allocated, ``nbytes`` its bytes as it is trained, ``settings_key`` the key of
-    :data:`SETTINGS`. It is read in each of the ``storages`` (:data:`READ_AS`).
+    ``net`` is the module, not yet allocated; ``settings_key`` the key of :data:`SETTINGS`; ``output`` what it learns
+    (:class:`~mi_diffind.tasks.ggx.model.Encoding`).
     """
 
-    label: str
-    representation: str
-    inputs: str
-    net: object
-    nbytes: int
-    settings_key: str
-    storages: tuple[str, ...] = (COOPERATIVE,)
-    output: str = "root"
-
-    def name(self, suffix: str = "") -> str:
-        """Return the name of the training, or of the candidate with a suffix."""
-        return self.label + suffix + ", log" * (self.inputs == "logarithmic")
-
-    def training(self, types, quick: bool, quick_steps: int) -> ConvergenceTraining:
-        """Return the training to convergence."""
-        options = dict(SETTINGS[self.settings_key])
+    def __init__(
+        self, label: str, inputs: str, representation: str, net, settings_key: str, quick: bool,
+        storages: tuple[str, ...] = (COOPERATIVE,), output: str = "root",
+    ):  # fmt: skip
+        self.types, self.encoding = array_module(mi.variant()), Encoding(inputs, output)
+        self.representation, self.storages, self.end = representation, storages, INPUTS[inputs][1]
+        samples = "tables" if inputs == "logarithmic" else "paper"
+        options = dict(SETTINGS[settings_key])
         longest = options.pop("longest")
         settings = FitSettings(seed=1, schedule="cosine", deterministic=False, **options)
         if quick:
-            settings, longest = dataclasses.replace(settings, steps=quick_steps), 2 * quick_steps
-        samples, encoding = "tables" if self.inputs == "logarithmic" else "paper", Encoding(self.inputs, self.output)
+            settings, longest = dataclasses.replace(settings, steps=QUICK_STEPS), 2 * QUICK_STEPS
 
         def problem() -> GGXProblem:
-            return GGXProblem(self.net.alloc(types.TensorXf, 2, dr.rng(seed=1)), types, samples, encoding)
+            untrained = net.alloc(self.types.TensorXf, 2, dr.rng(seed=1))
+            return GGXProblem(untrained, self.types, samples, self.encoding)
 
-        return ConvergenceTraining(self.name(), problem, settings, longest, 4 if quick else 20)
+        super().__init__(label + self.end, problem, settings, longest, 4 if quick else 20)
 
-    def candidates(self, training: ConvergenceTraining, types) -> Iterator[tuple[Candidate, Callable]]:
-        """Yield a candidate for each storage, with a function that returns the reader of the trained module."""
+    def reader(self, storage: str) -> LearnedGGX:
+        """Return the trained module, read in a storage."""
+        net = self.net.cooperative() if storage == COOPERATIVE else self.net.to(storage)
+        return LearnedGGX(net, self.encoding, tail=False)
 
-        @functools.cache
-        def reader(storage: str) -> LearnedGGX:
-            net = training.net.cooperative() if storage == COOPERATIVE else training.net.to(storage)
-            return LearnedGGX(net, Encoding(self.inputs, self.output), tail=False)
+    def candidates(self) -> Iterator[tuple[Candidate, Callable]]:
+        """Yield a candidate for each storage, with a function that returns its reader."""
 
         def count_operations(query: str) -> Operations:
-            inputs = _inputs(types, 64)
-            return count_query(lambda: [reader(COOPERATIVE)(*inputs)]) + training.net.products()
+            inputs = _inputs(self.types, 64)
+            return count_query(lambda: [self.reader(COOPERATIVE)(*inputs)]) + self.net.products()
 
+        untrained = self.problem().net
         for storage in self.storages:
-            suffix, size = READ_AS[storage]
+            label = self.name.removesuffix(self.end) + SUFFIXES[storage]
+            reader = functools.cache(functools.partial(self.reader, storage))
             yield Candidate(
-                self.name(suffix), self.representation, storage, self.nbytes * size // 4,
-                errors=lambda samples, storage=storage: measure(reader(storage), types, samples),
-                label=self.label + suffix, job=training.name,
-                operations=count_operations if storage == COOPERATIVE else None,
-            ), functools.partial(reader, storage)  # fmt: skip
+                label + self.end, self.representation, storage,
+                untrained.nbytes if storage == COOPERATIVE else untrained.to(storage).nbytes,
+                errors=lambda samples, reader=reader: measure(reader(), self.types, samples),
+                label=label, job=self.name, operations=count_operations if storage == COOPERATIVE else None,
+            ), reader  # fmt: skip
 
 
-def forms(inputs: str, quick: bool) -> list[GGXForm]:
-    """Return the representations for ``inputs``: indirection and single tables, networks; ``quick``: fewer."""
+def trainings(inputs: str, quick: bool) -> list[GGXTraining]:
+    """Return the trainings for ``inputs``: indirection, single tables, networks; ``quick``: fewer and shorter ones."""
     plain = inputs == "plain"
-    sizes, multiples = (SIZES, MULTIPLES) if plain else ((PRIMARY, 2 * PRIMARY), (1, 4))
-    if quick:
-        sizes, multiples = (sizes[:2], multiples[:2]) if plain else (sizes[:1], multiples[:1])
-
-    def cascade(side: int) -> tuple:
-        return f"{side}→{side // 2}", inputs, indirection(side, side // 2), 4 * (2 * side**2 + (side // 2) ** 2)
-
-    def single(side: int) -> tuple:
-        return f"{side}²", inputs, DifferentiableArray((side, side), 1, "constant", 0.5), 4 * side**2
-
-    def form(representation: str, described: tuple, *options) -> GGXForm:
-        label, *rest = described
-        return GGXForm(label + " raw" * (representation == "raw"), representation, *rest, *options)
-
-    chosen = [form("indirection", cascade(side), f"indirection, {inputs}", STORAGES) for side in sizes]
-    for multiple in multiples:
-        storages = STORAGES[: None if multiple == 1 else 1]
-        chosen.append(form("single table", single(math.isqrt(ENTRIES * multiple)), "single table", storages))
-    if plain and not quick:  # learn D as it is, at the paper's learning rate
-        for described in (cascade(PRIMARY), single(math.isqrt(ENTRIES))):
-            chosen.append(form("raw", described, "raw", STORAGES[:1], "raw"))
-    nets = [(f"MLP {w}x{n}", "network", Network(2, w, n)) for w, n in (NETWORKS if plain else NETWORKS[1:])]
-    if plain:
-        nets.append(("grid + MLP 16", "hash grid + network", Network(2, 16, 1, HASH_GRID)))
-    if quick:
-        nets = [nets[0], nets[-1]] if plain else []
-    for label, representation, network in nets:
-        nbytes = network.alloc(array_module(mi.variant()).TensorXf, 2, dr.rng(seed=1)).nbytes
-        key = "network" if network.width < 32 else "wide network"
-        chosen.append(GGXForm(label, representation, inputs, network, nbytes, key))
-    return chosen
+    cascades = {f"{side}→{side // 2}": indirection(side, side // 2) for side in SIZES[inputs]}
+    sides = [math.isqrt(ENTRIES * multiple) for multiple in MULTIPLES[inputs]]
+    tables = {f"{side}²": DifferentiableArray((side, side), 1, "constant", 0.5) for side in sides}
+    rows = [(label, "indirection", net, f"indirection, {inputs}", STORAGES) for label, net in cascades.items()]
+    for i, (label, net) in enumerate(tables.items()):
+        rows.append((label, "single table", net, "single table", STORAGES[: 1 if i else None]))
+    if plain:  # learn D as it is, at the paper's learning rate
+        for label, net in ((f"{PRIMARY}→{CASCADED}", cascades), (f"{sides[0]}²", tables)):
+            rows.append((f"{label} raw", "raw", net[label], "raw", STORAGES[:1], "raw"))
+    for label, net in NETWORKS.items():
+        if plain or label in ("MLP 16x2", "MLP 32x3"):
+            family = "hash grid + network" if net.grid else "network"
+            rows.append((label, family, net, "network" if net.width < 32 else "wide network"))
+    return [
+        GGXTraining(label, inputs, representation, net, key, quick, *more)
+        for label, representation, net, key, *more in rows
+        if not quick or label + INPUTS[inputs][1] in QUICK
+    ]
 
 
-def plan(quick: bool = False, quick_steps: int = QUICK_STEPS) -> Plan:
-    """Return the plan of the study in the current variant.
-
-    ``quick``: fewer candidates, whose first training takes ``quick_steps`` steps and whose longest twice as many.
-    """
+def plan(quick: bool = False) -> Plan:
+    """Return the plan of the study in the current variant; ``quick``: fewer candidates, short trainings."""
     types = array_module(mi.variant())
-    candidates, trainings, cases, ratios = [], [], [], []
-    for inputs, case in {"plain": PLAIN, "logarithmic": LOGARITHMIC}.items():
+    candidates, jobs, cases, ratios = [], [], [], []
+    for inputs, (case, end) in INPUTS.items():
         readers = {}
-        for form in forms(inputs, quick):
-            training = form.training(types, quick, quick_steps)
-            trainings.append(training)
-            for candidate, reader in form.candidates(training, types):
+        for training in trainings(inputs, quick):
+            jobs.append(training)
+            for candidate, reader in training.candidates():
                 candidates.append(candidate)
                 readers[candidate.name] = reader
-        end = ", log" * (inputs == "logarithmic")
-        reference, names = f"{REFERENCE}{end}", [f"{REFERENCE} f16", f"{REFERENCE} u8", f"{math.isqrt(ENTRIES)}²"]
-        ratios += [*((name + end, reference) for name in names), (reference, "formula")]
+        reference = f"{PRIMARY}→{CASCADED}"
+        names = [f"{reference} f16", f"{reference} u8", f"{math.isqrt(ENTRIES)}²"]
+        ratios += [*((name + end, reference + end) for name in names), (reference + end, "formula")]
         readers["formula"] = lambda: lambda cos, sin2, alpha: ggx(sin2, alpha)
         cases.append(Case(case, functools.partial(_reads, types, readers)))
     candidates += [
@@ -236,7 +207,11 @@ def plan(quick: bool = False, quick_steps: int = QUICK_STEPS) -> Plan:
         cases=cases,
         measures=(Measure("PSNR of D clipped to [0, 1], dB", "psnr_db"),),
         ratios=ratios,
-        jobs=trainings,
+        notes=[
+            "16→8: 16 × 16 pointers into a table of 8 × 8; 24²: one table of 24 × 24; MLP 32x3: a network of three "
+            "layers of 32 units; f16, u8: entries of two bytes and of one."
+        ],
+        jobs=jobs,
         jobs_fingerprint=fingerprint(code),
         panels=("bytes",),
     )

@@ -3,7 +3,8 @@
 *Dense* and *sparse grids* hold exact distances in 8 bits, sparse ones at each node of a cell that the surface crosses.
 *Ours* and *paper* are presets of ``fit sdf`` (:mod:`mi_diffind.tasks.sdf`). *Hash grid + network* is that of
 ``drjit.nn``, in half precision, trained until twice as many steps gain little. Each method is as fine as the memory
-budget allows; the search for the spacing is part of the seconds. All bytes count that a read needs, the index included.
+budget allows; the search for the spacing is part of the seconds. All bytes count that a read needs. Rays of sparse
+fields need an index in addition, which has a column of its own.
 
 Errors are those of :class:`~mi_diffind.tasks.sdf.evaluation.SurfaceEvaluation`; lengths are relative to the longest
 side. Times: reads at random points within 0.01 of the surface; primary rays, beside Embree on the mesh and Mitsuba's
@@ -58,11 +59,7 @@ PRESETS = {"ours": "", "paper": "paper"}
 #: Methods whose errors are shown; ours is compared with the first two.
 SHOWN = ("dense", "distances", "ours")
 
-#: How much finer than its cells a field is decoded to measure its surface.
-FINER = 1.5
-
-#: Points that the network is trained on, and its training.
-POOL = 2**20
+#: Training of the network.
 HASH_SETTINGS = {"seed": 1, "schedule": "cosine", "deterministic": False, "lr": 1e-2, "batch": 2**13, "loss": "mae"}
 
 #: Candidate that rays are compared with, beside ``sdfgrid``.
@@ -75,17 +72,17 @@ MEASURES = (
     Measure("normals, °", "normal_deg", ".2f", False),
     Measure("normals, 95%, °", "normal_p95_deg", ".1f", False),
     Measure("distances near", "mae_near", ".1e", False),
-    Measure("Chamfer", "chamfer", ".1e", False),
+    Measure("index of rays, bytes", "index_bytes", ",", False),
 )
 
-#: Settings of a run: held-out points; steps of trainings by presets (0: the preset's own), and of the shortest and the
-#: longest of the network; width and height of pictures; cells of ``sdfgrid`` along the longest side, and of the finest
-#: decoding whose Chamfer distance is measured.
+#: Settings of a run: held-out points; points that the network is trained on, and measured at; steps of trainings by
+#: presets (0: the preset's own), and of the shortest and the longest of the network; width and height of pictures;
+#: cells of ``sdfgrid`` along the longest side.
 FULL = {
-    "points": 2**20, "steps": 0, "hash_steps": (500, 4000), "film": (480, 320), "grid": 256, "decoded": 768,
+    "points": 2**20, "pools": (2**20, 2**16), "steps": 0, "hash_steps": (500, 4000), "film": (480, 320), "grid": 256,
 }  # fmt: skip
 QUICK = {
-    "points": 2**14, "steps": 20, "hash_steps": (40, 80), "film": (96, 64), "grid": 32, "decoded": 96,
+    "points": 2**14, "pools": (2**14, 2**10), "steps": 20, "hash_steps": (40, 80), "film": (96, 64), "grid": 32,
 }  # fmt: skip
 
 
@@ -152,25 +149,15 @@ class DistanceStudyContext:
     @functools.cached_property
     def pools(self):
         """Points with distances, those that a network is trained on and those that it is measured at."""
-        lower, upper = (self.mesh.lower - rivals.PADDING, self.mesh.upper + rivals.PADDING)
-        counts = (POOL, 2**16) if self.settings.points >= 2**18 else (2**14, 2**10)
-        return [rivals.pool(self.distances, lower, upper, n, seed) for seed, n in enumerate(counts, 1)]
-
-    def errors(self, model: DistanceField) -> dict[str, float]:
-        """Return all errors of a field; ``iou_db`` and ``iou_near_db`` are the wrong shares in decibels."""
-        errors = self.evaluation.measure(model)
-        errors |= {f"{name}_db": -10 * math.log10(max(1 - errors[name], 1e-6)) for name in ("iou", "iou_near")}
-        resolution = math.ceil(FINER / model.spacing)
-        if resolution <= self.settings.decoded:
-            resolution = max(resolution, self.settings.decoded // 3)
-            surface = grids.extract(model, resolution, self.mesh.scale, self.mesh.centre)
-            errors |= self.evaluation.chamfer(surface, max(2**10, self.settings.points // 4))
-        return errors
+        return [rivals.pool(self.distances, count, seed) for seed, count in enumerate(self.settings.pools, 1)]
 
     def record(self, model: DistanceField, nbytes: int, file_bytes: int, **details) -> dict:
-        """Return the record of a field, errors included."""
-        details |= {"file_bytes": file_bytes, "spacing": model.spacing, "slope": model.slope}
-        return {"bytes": nbytes, "errors": self.errors(model), "details": details}
+        """Return the record of a field with its errors; ``…_db`` are shares that are wrong, in decibels."""
+        errors = self.evaluation.measure(model)
+        errors |= {f"{name}_db": -10 * math.log10(max(1 - errors[name], 1e-6)) for name in ("iou", "iou_near")}
+        errors["index_bytes"] = marching.index_bytes(model)
+        details |= {"file_bytes": file_bytes, "spacing": model.spacing}
+        return {"bytes": nbytes, "errors": errors, "details": details}
 
 
 def preset_contender(context: DistanceStudyContext, fields: dict) -> Contender:
@@ -193,20 +180,17 @@ def preset_contender(context: DistanceStudyContext, fields: dict) -> Contender:
 
 def grid_contender(context: DistanceStudyContext, fields: dict) -> Contender:
     """Return the contender of a grid of exact distances, which is computed anew when it is read."""
-    types = context.types
     make = rivals.dense_grid if fields["method"] == "dense" else rivals.distance_nodes
+    finest = rivals.finest_dense_grid if fields["method"] == "dense" else rivals.finest_distance_nodes
 
     def fit(job: Contender, progress: bool) -> dict:
         start = time.perf_counter()
-        if job.method == "dense":
-            job.model = make(types, context.distances, rivals.dense_spacing(context.mesh, job.budget))
-        else:
-            job.model = rivals.sparse_nodes(types, context.distances, job.budget)
+        job.model = finest(context.types, context.distances, job.budget)
         seconds = time.perf_counter() - start
         return {**context.record(job.model, job.model.nbytes, job.model.file_bytes), "seconds": seconds}
 
     def read(job: Contender) -> DistanceField:
-        return make(types, context.distances, job.record["details"]["spacing"])
+        return make(context.types, context.distances, job.record["details"]["spacing"])
 
     return Contender(fit=fit, read=read, has_file=False, **fields)
 
@@ -223,7 +207,7 @@ def hash_contender(context: DistanceStudyContext, fields: dict) -> NetworkConten
 
     def finish(net, record: dict) -> dict:
         model = build(net)
-        return context.record(model, model.nbytes, model.file_bytes, steps=record["steps"])
+        return context.record(model, model.nbytes, model.nbytes, steps=record["steps"])
 
     settings = FitSettings(**HASH_SETTINGS, steps=steps)
     return NetworkContender(*fields.values(), build, problem, settings, longest, 8, True, finish)
@@ -279,7 +263,7 @@ def plan(mesh: Mesh, name: str, settings: SimpleNamespace) -> Plan:
                          "studies/baselines/distance_fields.py", "studies/baselines/networks.py")  # fmt: skip
     return Plan(
         study="sdf",
-        title=f"Signed distance field: {Path(name).stem}",
+        title=f"Distance fields of {Path(name).stem} in equal bytes: accuracy against time and bytes",
         candidates=candidates,
         cases=[
             Case("reads", reads),
@@ -292,7 +276,7 @@ def plan(mesh: Mesh, name: str, settings: SimpleNamespace) -> Plan:
         },
         notes=[
             f"{Path(name).name}, {len(mesh.faces):,} triangles. IoU near: within 0.01 of the longest side. Bytes are "
-            "those of all that a read needs.",
+            "those of all that a read needs; rays of sparse fields need an index in addition.",
             *(f"{w[:1].upper()}{w[1:]}." for w in warnings),
         ],
         jobs=jobs,
@@ -313,6 +297,9 @@ FOV = 32.0
 
 #: Rays end there.
 FAR = 1e3
+
+#: Direction of the light on the mesh, not normalised.
+LIGHT = (-0.4, 0.7, 0.6)
 
 
 def camera_rays(film: tuple[int, int], count: int | None = None):
@@ -371,21 +358,18 @@ def draw_normals(context: DistanceStudyContext, jobs: list[Contender], result: d
     width, height = context.settings.film
     (o, d), scene = camera_rays((width, height)), mesh_scene(context.mesh)
     si = scene.ray_intersect(mi.Ray3f(o, d))
-    hit, normals = si.is_valid().numpy(), np.array(si.n).T
-    light = np.array([-0.4, 0.7, 0.6]) / np.linalg.norm([-0.4, 0.7, 0.6])
-    grey = np.where(hit, 0.25 + 0.65 * np.clip(normals @ light, 0, 1), 1.0).reshape(height, width)
-    row = {"mesh": np.repeat(grey[..., None], 3, axis=2)}
+    hit = si.is_valid().numpy().reshape(height, width)
+    grey = dr.select(si.is_valid(), 0.25 + 0.65 * dr.clip(dr.dot(si.n, dr.normalize(mi.Vector3f(LIGHT))), 0, 1), 1)
+    row = {"mesh": np.repeat(grey.numpy().reshape(height, width, 1), 3, axis=2)}
     for job in jobs:
         with dr.suspend_grad():
             t = field_distance(job.model, o, d)
             met = dr.isfinite(t)
-            slope = np.array(job.model.gradient(dr.fma(d, dr.select(met, t, 0), o))[1]).T.astype(np.float64)
-        slope /= np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)
-        angles = np.degrees(np.arccos(np.clip(np.sum(slope * normals, axis=1), -1, 1)))
-        angles[met.numpy() != hit] = 90
-        angles[~met.numpy() & ~hit] = np.nan
+            slope = job.model.gradient(dr.fma(d, dr.select(met, t, 0), o))[1]
+            angle = dr.rad2deg(dr.safe_acos(dr.dot(dr.normalize(slope), si.n)))
+            angle = dr.select(met == si.is_valid(), dr.select(met, angle, dr.nan), 90)
         error = result["candidates"][job.name]["errors"]["normal_deg"]
-        row[f"{job.name}\n{error:.2f}°"] = angles.reshape(height, width)
-    crop = plot.crop_to(hit.reshape(height, width))
-    row = {name: image[crop] for name, image in row.items()}
-    return plot.draw_images(result["title"], " ".join(result["notes"]), {"": row}, 2.6, "error of the normal, degrees")
+        row[f"{job.name}\nmean error {error:.2f}°"] = angle.numpy().reshape(height, width)
+    row = {name: image[plot.crop_to(hit)] for name, image in row.items()}
+    title = f"{Path(context.name).stem}: angle between the normals of a field and of the mesh"
+    return plot.draw_images(title, " ".join(result["notes"]), {"": row}, 2.6, "error of the normal, degrees")

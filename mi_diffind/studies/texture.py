@@ -401,8 +401,7 @@ def _case(context: TextureContenders, scene: TextureScene) -> Case:
             functions[name] = lambda k, s=loaded, spp=spp: mi.render(s, spp=spp, seed=k)
         return functions
 
-    accuracy, in_picture = f"psnr_{scene.name}_db", not scene.magnified
-    return Case(scene.name, reads, passes, accuracy=accuracy, of_passes=True, in_picture=in_picture)
+    return Case(scene.name, reads, passes, accuracy=f"psnr_{scene.name}_db", in_picture=not scene.magnified)
 
 
 # -- Pictures ----------------------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from variants import BACKENDS
 
 from mi_diffind.core.runtime import array_module
 from mi_diffind.measure.benchmark import BenchmarkSettings
-from mi_diffind.measure.study import FLOOR, Candidate, Case, Job, Measure, Plan
+from mi_diffind.measure.study import FLOOR, Candidate, Case, Measure, Plan
 
 SETTINGS = BenchmarkSettings(lanes=1024, rounds=4, passes=3, samples=100)
 
@@ -69,26 +69,3 @@ def small_plan(log, details=None):
 
 KERNELS = 2 * (3 + 1)  # queries × (candidates and the floor)
 CALLS = 2 + 2 * KERNELS * (1 + SETTINGS.rounds) + 2 * (1 + SETTINGS.passes)
-
-
-class SeparableTraining(Job):
-    """A job that writes its process to the folder; the one called "here" fails in other processes than ``process``."""
-
-    separable = True
-
-    def __init__(self, name, process):
-        self.name, self.process = name, process
-
-    def run(self, folder, progress):
-        if self.name == "here" and os.getpid() != self.process:
-            raise ValueError("not in this process")
-        (folder / self.name).write_text(str(os.getpid()))
-        return {"seconds": 1.0, "details": {"name": self.name}}
-
-
-def separable_plan(process):
-    """A plan of three jobs without cases."""
-    study = small_plan(Log())
-    study.candidates, study.cases = [], []
-    study.jobs = [SeparableTraining(name, process) for name in ("first", "here", "second")]
-    return study

@@ -108,19 +108,18 @@ def test_gradients_are_those_of_the_values(field, rng):
 
 
 def test_grids_are_as_fine_as_the_bytes_allow():
-    field = rivals.sparse_nodes(T, Ball(), 60000)
+    field = rivals.finest_distance_nodes(T, Ball(), 60000)
     assert 0.97 * 60000 <= field.nbytes <= 60000
     with pytest.raises(BudgetError):
-        rivals.sparse_nodes(T, Ball(), 10)
-    grid = rivals.dense_grid(T, Ball(), rivals.dense_spacing(Ball.mesh, 50000))
+        rivals.finest_distance_nodes(T, Ball(), 10)
+    grid = rivals.finest_dense_grid(T, Ball(), 50000)
     assert 0.8 * 50000 < grid.nbytes == np.prod([n + 1 for n in grid.cells]) <= 50000
     assert 0 < grid.file_bytes < grid.nbytes and 0 < field.file_bytes < field.nbytes
 
 
 def test_hash_grid(rng):
     net = rivals.network(40000)
-    lower, upper = Ball.mesh.lower - 0.01, Ball.mesh.upper + 0.01
-    pools = [rivals.pool(Ball(), lower, upper, n, n) for n in (2**13, 2**10)]
+    pools = [rivals.pool(Ball(), n, n) for n in (2**13, 2**10)]
     radius = np.linalg.norm(pools[0][0], axis=1)
     assert 0.72 < (np.abs(radius - 0.5) < 0.04).mean() < 0.9  # three quarters are near the surface
     problem = rivals.HashProblem(net, T, Ball.mesh, *pools)

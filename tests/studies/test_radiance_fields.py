@@ -121,7 +121,7 @@ def test_all_outputs_of_a_network_are_trained(grid, importance, rng):
     gradients, net = dr.grad(net), dr.detach(net)
     gradient = gradients["weights"].numpy().astype(np.float64)
     assert np.abs(gradients["entries"].numpy()).max() > 0
-    bias = made.network.layers[-1].bias
+    bias = made.network.mlp.layers[-1].bias
     for row in range(13):
         place, sums = bias.offset + row * bias.stride, []
         for sign in (1, -1):

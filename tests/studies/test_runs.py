@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[2]
 RUNS = {
     "bsdf": [],
     "disney": [],
-    "field": ["balls", "--compression", "120", "--resolution", "16", "--steps", "10"],
+    "field": ["balls", "--compression", "120"],
     "ggx": [],
     "image": ["m.json", "--seconds", "1"],
     "scene": [str(ROOT / "scenes" / "metals.xml"), "-D", "width=32", "-D", "height=16"],
@@ -36,8 +36,7 @@ RUNS = {
 
 #: Study → pictures beside accuracy against time or bytes.
 PICTURES = {
-    "sdf": ["shapes", "training"], "field": ["views"], "texture": ["crops", "levels"], "ggx": ["training"],
-    "shading": ["levels", "strip"], "disney": ["training"],
+    "sdf": ["shapes"], "field": ["views"], "texture": ["crops", "levels"], "shading": ["levels", "strip"],
 }  # fmt: skip
 
 
@@ -131,10 +130,8 @@ def test_a_run_goes_on(inputs, tmp_path, capfd, monkeypatch):
     "study, options, message",
     [
         ("bsdf", ["gold"], 'found the material "gold", allowed are'),
-        ("disney", ["--only", "nothing"], "nothing"),
         ("field", ["--compression", "0"], "0"),
         ("field", ["--without", "vq"], '--without: found "vq", allowed are sparse'),
-        ("field", ["--resolution", "4"], "--resolution: found 4, at least 8 is needed"),
         ("image", ["--compression", "0"], "0"),
         ("image", ["--variant", "scalar_rgb"], "do not run"),
         ("scene-training", ["nowhere.xml"], "nowhere.xml, which is no file"),

@@ -1,7 +1,7 @@
 """Networks of ``drjit.nn`` that tables are compared with, alone or after a hash grid.
 
-Here are the networks in place of tables of images and textures (hash grids of uv), of the Disney BRDF (its factors) and
-of measured and layered BSDFs. Those of fields are in :mod:`.distance_fields` and :mod:`.radiance_fields`.
+Here are the networks in place of tables of images and textures (hash grids of uv) and of measured and layered BSDFs.
+Those of fields are in :mod:`.distance_fields` and :mod:`.radiance_fields`.
 
 Sources: Müller et al., *Instant Neural Graphics Primitives with a Multiresolution Hash Encoding*, 2022; Barron et al.,
 *Zip-NeRF: Anti-Aliased Grid-Based Neural Radiance Fields*, 2023, for features that fade with the footprint; Sztrajman
@@ -22,7 +22,6 @@ from ...arrays.budget import Budget, BudgetError
 from ...arrays.lookup import clamp
 from ...core.compat import backend_module
 from ...core.runtime import array_module
-from ...fitting.loop import Problem
 from ...maps.layout import Layout
 from ...maps.pyramid import FilteredMaps, Pyramid, decibel, mean_square
 from ...measure.clock import Operations
@@ -31,10 +30,6 @@ from ...tasks.bsdf.directions import SphereView
 from ...tasks.bsdf.model import DirectionPair, Form, coordinate_u, coordinate_w
 from ...tasks.bsdf.training import BSDFProblem
 from ...tasks.bsdf.truth import truth_of
-from ...tasks.disney import model
-from ...tasks.disney.decoder import Decoder
-from ...tasks.disney.model import TINY, Factors, compose, geometry
-from ...tasks.disney.training import measure, random_directions, random_materials, shade
 from ...tasks.texture import PRESETS
 from ...tasks.texture.fit import TextureProblem
 
@@ -97,7 +92,7 @@ class Network(nn.Module):
         n = max(dr.width(v) for v in x)
         if self.encoding is not None:
             self.encoding.data = self.entries.array
-            x = [*self.features(list(x)), *x[self.inputs :]]
+            x = [*self.features(list(x), active), *x[self.inputs :]]
         if self.is_cooperative:
             return list(self.mlp(nn.CoopVec(*x)))
         Tensor = dr.tensor_t(type(x[0]))
@@ -105,14 +100,14 @@ class Network(nn.Module):
         y = self.mlp(dr.concat(rows, axis=0))
         return [y.array] if y.shape[0] == 1 else [y[i, :].array for i in range(y.shape[0])]
 
-    def features(self, x: list) -> list:
+    def features(self, x: list, active) -> list:
         """Return the features that the hash grid gives to the network at coordinates ``x``."""
-        return list(self.encoding(x[: self.inputs]))
+        return list(self.encoding(x[: self.inputs], active))
 
-    def cooperative(self) -> Network:
-        """Return a copy in cooperative vectors, for inference only."""
+    def cooperative(self, layout: str = "inference") -> Network:
+        """Return a copy in cooperative vectors, for ``"inference"`` or ``"training"``."""
         result = copy.copy(self)
-        result.mlp, result.is_cooperative = nn.pack(self.mlp, layout="inference"), True
+        result.mlp, result.is_cooperative = nn.pack(self.mlp, layout=layout), True
         return result
 
     @property
@@ -173,8 +168,8 @@ class FilteredNetwork(Network):
         super().__init__(2, WIDTH, LAYERS, grid, outputs=outputs, direct=1)
         self.size, self.levels = size, levels
 
-    def features(self, x: list) -> list:
-        features, level = super().features(x), x[2] * (self.levels - 1)
+    def features(self, x: list, active) -> list:
+        features, level = super().features(x, active), x[2] * (self.levels - 1)
         count = self.grid["n_features_per_level"]
         for i in range(self.grid["n_levels"]):
             side = self.grid["base_resolution"] * self.grid["per_level_scale"] ** i
@@ -242,116 +237,12 @@ class TextureNetworkProblem(TextureProblem):
         return result
 
 
-# -- Disney BRDF -------------------------------------------------------------------------------------------------------
-
-#: Inputs and outputs of a network in place of the Disney BRDF's factors, and its hidden layers.
-DISNEY_INPUTS = 10
-DISNEY_OUTPUTS = 4
-DISNEY_LAYERS = 2
-
-#: Scale of inputs that are logarithms.
-LOGARITHM_SCALE = 0.2
-
-
-def disney_network(nbytes: int) -> Network:
-    """Return the widest network of ``nbytes``, 2 bytes a parameter, not yet allocated.
-
-    It returns the four factors (:class:`~mi_diffind.tasks.disney.model.Factors`) that are no polynomial of cosines and
-    parameters: specular and clearcoat as logarithms, both diffuse terms as they are. The model composes the colour of
-    them. In trials of 1000 steps, networks that return the three scalars of the colour or RGB were 9 and 13 dB worse.
-    """
-
-    def parameters(width: int) -> int:
-        hidden = (DISNEY_LAYERS - 1) * (width + 1) * width
-        return (DISNEY_INPUTS + 1) * width + hidden + (width + 1) * DISNEY_OUTPUTS
-
-    width = Budget(nbytes).largest(lambda width: 2 * parameters(width), range(4096), strict=False)
-    if not width:
-        raise ValueError(f"{nbytes:,} bytes are too few for a network of {DISNEY_LAYERS} hidden layers")
-    return Network(DISNEY_INPUTS, width, DISNEY_LAYERS, outputs=DISNEY_OUTPUTS)
-
-
-def coordinates(p, wi, wo) -> list:
-    """Return the inputs of a network: numbers that the formulas contain.
-
-    They are roughness, clearcoat gloss, cos θ_i, cos θ_o and cos θ_d; the logarithms of the denominators of both
-    distributions (h stretched by α_x and α_y; sin² θ_h + α² cos² θ_h of the clearcoat) and of α_x α_y; and the
-    logarithm of the masking denominator of each direction.
-    """
-    g = geometry(wi, wo)
-    h = g.h * dr.rsqrt(g.h2 + TINY)
-    ax, ay = model.roughness_to_alpha(p.roughness, p.anisotropic)
-    sine2, cosine2 = dr.square(h.x) + dr.square(h.y), dr.square(h.z)
-    stretched = dr.square(h.x / ax) + dr.square(h.y / ay) + cosine2
-    coat = sine2 + dr.square(model.coat_alpha(p.clearcoat_gloss)) * cosine2
-    logarithms = [LOGARITHM_SCALE * dr.log(x + TINY) for x in (stretched, ax * ay, coat)]
-    masking = [dr.log(model.masking_denominator(w, ax, ay)) for w in (wi, wo)]
-    return [p.roughness, p.clearcoat_gloss, wi.z, wo.z, g.cos_d, *logarithms, *masking]
-
-
-class NetworkDecoder(Decoder):
-    """Form of the model whose factors a ``network`` returns; it needs no coefficients."""
-
-    def __init__(self, network: Network):
-        self.network = network
-
-    def required(self, e):
-        return ()
-
-    def value(self, c, e, lobes, p, wi, wo, active=True):
-        specular, diffuse, flat, clearcoat = self.network(coordinates(p, wi, wo))
-        s = model.schlick(geometry(wi, wo).cos_d)
-        specular, clearcoat = (dr.exp(clamp(v, *LIMITS)) for v in (specular, clearcoat))
-        factors = Factors(
-            specular=specular,
-            metal_base=p.metallic * (1 - s),
-            base=(1 - p.metallic) * (1 - s),
-            sheen=(1 - p.metallic) * s * wo.z,
-            grazing=s,
-            diffuse=diffuse * wo.z,
-            flat=flat * wo.z,
-            clearcoat=clearcoat * wo.z,
-        )
-        return model.colour(compose(p, factors, lobes).values(), p.albedo, p.luminance)
-
-
-def squared_errors(value, truth) -> list:
-    """Return the squared errors of each channel, for training.
-
-    Truth above 1 counts as 1, as in the measurement; values above 1 count as 1 there and as 1 + log(value) elsewhere,
-    so that their gradients stay finite and do not vanish.
-    """
-    errors = []
-    for v, t in zip(value, truth, strict=True):
-        compressed = dr.select(v > 1, 1 + dr.log(dr.maximum(v, 1)), v)
-        errors.append(dr.select(t >= 1, dr.minimum(v, 1) - 1, compressed - t))
-    return [dr.square(error) for error in errors]
-
-
-class DisneyNetworkProblem(Problem):
-    """Training problem of a network: BRDF · cosine in RGB, of the materials and directions of tables' trainings."""
-
-    def __init__(self, net: Network, types):
-        self.net = net.alloc(types.TensorXf, rng=dr.rng(seed=dr.opaque(types.UInt64, 1)))
-        self.types, self.identity = types, {"width": net.width, "layers": net.layers}
-
-    def loss(self, net, rng, size: int):
-        m, (wi, wo) = random_materials(rng, self.types, size), random_directions(rng, self.types, size)
-        albedo = self.types.Array3f([rng.random(self.types.Float, size) for _ in range(3)])
-        value = shade(NetworkDecoder(net), m, albedo, wi, wo)
-        return sum(squared_errors(value, shade(None, m, albedo, wi, wo))) * (1 / (3 * size))
-
-    def measure(self, net) -> dict[str, float]:
-        with dr.suspend_grad():
-            return measure(NetworkDecoder(net), self.types, MEASURED)
-
-
 # -- BSDFs -------------------------------------------------------------------------------------------------------------
 
 #: Hidden units of both layers of a network in place of a BSDF; weights and biases of 6 inputs and 3 outputs are 675.
 BSDF_WIDTH = 21
 
-#: Share of a training in which errors are those of logarithms; raw inputs stay near their start without it.
+#: Share of a training in which errors are those of logarithms.
 LOGARITHMIC = 0.3
 
 #: Least f cos θ in errors of logarithms.
@@ -364,32 +255,21 @@ def bsdf_network() -> Network:
 
 
 class NetworkBSDF:
-    """BSDF of a network for ``inputs``, ``"raw"`` or ``"warped"``, with ``value`` and, for timing, Mitsuba's ``eval``.
+    """BSDF of a network, with ``value`` and, for timing, Mitsuba's ``eval``.
 
-    Raw inputs are the half vector and the difference vector; warped ones u, v, w of :mod:`...tasks.bsdf.model`, cos
-    θ_h, cos θ_d and cos θ_i cos θ_o. The output is added to ``mean``.
+    Inputs are u, v, w of :mod:`...tasks.bsdf.model`, cos θ_h, cos θ_d and cos θ_i cos θ_o; with the half vector and the
+    difference vector as they are, networks were 24 dB worse or more. The output is added to ``mean``.
     """
 
-    def __init__(self, network: Network, inputs: str, mean: float, form: Form):
-        self.network, self.inputs, self.mean, self.form = network, inputs, mean, form
-
-    def coordinates(self, wi, wo) -> list:
-        """Return the inputs of the network, six arrays."""
-        g = DirectionPair.of(wi, wo)
-        h = g.half * dr.rsqrt(dr.squared_norm(g.half))
-        if self.inputs == "warped":
-            u = coordinate_u(g, self.form.scale)
-            return [u, dr.sqrt(1 - g.cos_d), clamp(coordinate_w(g, self.form), 0, 1), h.z, g.cos_d, wi.z * wo.z]
-        # wi in the frame of h whose first axis lies in the plane of the normal: turned about z, then about y
-        r = dr.rsqrt(dr.maximum(dr.square(h.x) + dr.square(h.y), 1e-12))
-        cos, sin = h.x * r, h.y * r
-        x, y = dr.fma(cos, wi.x, sin * wi.y), dr.fma(cos, wi.y, -sin * wi.x)
-        sin_h = dr.sqrt(dr.maximum(1 - dr.square(h.z), 0))
-        return [h.x, h.y, h.z, dr.fma(h.z, x, -sin_h * wi.z), y, g.cos_d]
+    def __init__(self, network: Network, mean: float, form: Form):
+        self.network, self.mean, self.form = network, mean, form
 
     def value(self, wi, wo) -> list:
         """Return f without the cosine, three arrays."""
-        logarithms = self.network(self.coordinates(wi, wo))
+        g = DirectionPair.of(wi, wo)
+        cos_h = g.half.z * dr.rsqrt(dr.squared_norm(g.half))
+        u, w = coordinate_u(g, self.form.scale), clamp(coordinate_w(g, self.form), 0, 1)
+        logarithms = self.network([u, dr.sqrt(1 - g.cos_d), w, cos_h, g.cos_d, wi.z * wo.z])
         return [dr.exp(clamp(v + self.mean, *LIMITS)) for v in logarithms]
 
     def eval(self, context, si, wo, active=True):
@@ -401,18 +281,19 @@ class NetworkBSDF:
 class BSDFNetworkProblem(BSDFProblem):
     """Training problem of a network on samples of a source: errors of logarithms, then the loss of learned BSDFs."""
 
-    def __init__(self, source: dict, inputs: str, scale: tuple[float, float]):
+    def __init__(self, source: dict, scale: tuple[float, float]):
         types = array_module(mi.variant())
         truth = truth_of(source, types)
         samples = bsdf_training.draw(truth, types, bsdf_training.SAMPLES, 2, True)
         network = bsdf_network().alloc(mi.TensorXf, rng=dr.rng(seed=dr.opaque(mi.UInt64, 1)))
         super().__init__(network, Form(scale=scale), samples, bsdf_training.view_psnr([((), SphereView(truth, types))]))
-        self.inputs, self.mean = inputs, mean_logarithm(samples)
-        self.identity = {"source": truth.digest, "inputs": inputs, "scale": list(scale)}
+        cos = dr.maximum(samples.wo.z, 1e-3)
+        self.mean = sum(float(dr.mean(dr.log(dr.maximum(v, DARK) / cos))[0]) for v in samples.value) / 3
+        self.identity = {"source": truth.digest, "scale": list(scale)}
 
     def bsdf(self, net: Network) -> NetworkBSDF:
         """Return the BSDF of a network."""
-        return NetworkBSDF(net, self.inputs, self.mean, self.form)
+        return NetworkBSDF(net, self.mean, self.form)
 
     def begin(self, step: int, share: float) -> str:
         self._share = share
@@ -430,9 +311,3 @@ class BSDFNetworkProblem(BSDFProblem):
     def measure(self, net) -> dict[str, float]:
         with dr.suspend_grad():
             return self._measure(lambda coordinates: self.bsdf(net))
-
-
-def mean_logarithm(samples) -> float:
-    """Return the mean of the logarithms of f over samples."""
-    cos = dr.maximum(samples.wo.z, 1e-3)
-    return sum(float(dr.mean(dr.log(dr.maximum(v, DARK) / cos))[0]) for v in samples.value) / 3

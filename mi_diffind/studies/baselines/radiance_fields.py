@@ -33,7 +33,7 @@ from ...tasks.radiance.volume_field import (  # fmt: skip
     colour_of,
     density_of,
 )
-from .networks import LAYERS, WIDTH, hash_grid
+from .networks import LAYERS, WIDTH, Network, hash_grid
 
 #: Coefficients of a colour by direction: four for red, green and blue each.
 COEFFICIENTS = 12
@@ -110,6 +110,11 @@ def fitting_grid(grid: NodeGrid, cells: np.ndarray, nbytes: float, entries: int 
     return refine(grid, cells, largest_fitting(fits, SMALLEST, 1.0, steps=7))
 
 
+def steps(values, low, step, functions):
+    """Return the steps from 0 to 255 that are nearest to ``values``; ``functions`` are NumPy's or Dr.Jit's."""
+    return functions.clip(functions.round((values - low) / step), 0, 255)
+
+
 class NodesFit:
     """Training of a ``grid`` of bytes, each node with a colour of its own or, with ``entries``, a row of a codebook."""
 
@@ -131,24 +136,19 @@ class NodesFit:
 
     def field_of(self, net) -> NodeField:
         """Return the field of the trained parameters, rounded as they are stored, with straight-through gradients."""
-        types = self.nodes.types
 
-        def rounded(tensor, low, step):
-            low, step = (types.TensorXf(np.atleast_2d(np.float32(v))) for v in (low, step))
+        def rounded(tensor, *scale):
+            low, step = (self.nodes.types.TensorXf(np.atleast_2d(np.float32(v))) for v in scale)
             exact = dr.detach(tensor)
-            return tensor + (dr.clip(dr.round((exact - low) / step), 0, 255) * step + low - exact)
+            return tensor + (steps(exact, low, step, dr) * step + low - exact)
 
         density = rounded(net["density"] * DENSITY_SCALE, *DENSITY_RANGE)
         return NodeField(self.nodes, density, rounded(net["colour"], self.low, self.step), self.rows)
 
     def state(self) -> dict[str, np.ndarray]:
         """Return the arrays of a file by name."""
-
-        def codes(values, low, step):
-            return np.clip(np.rint((values - low) / step), 0, 255).astype(np.uint8)
-
-        density = codes(self.net["density"].numpy()[1:, 0] * DENSITY_SCALE, *DENSITY_RANGE)
-        colour = codes(self.net["colour"].numpy(), self.low, self.step)
+        density = steps(self.net["density"].numpy()[1:, 0] * DENSITY_SCALE, *DENSITY_RANGE, np).astype(np.uint8)
+        colour = steps(self.net["colour"].numpy(), self.low, self.step, np).astype(np.uint8)
         state = {**nodes_state(self.nodes), "density": density, "low": self.low, "step": self.step}
         if self.index is None:
             return state | {"colour": colour[1:]}
@@ -191,18 +191,19 @@ def occupancy(nodes: Nodes) -> Nodes:
 class HashVolumeField(VolumeField):
     """Field of a hash grid and a network, which returns a raw density and twelve coefficients.
 
-    The arrays ``entries`` and ``weights`` are flat. The field is empty outside of the occupied cells.
+    The ``arrays`` are ``entries`` and ``weights``, which take the place of those of ``net``. The field is empty outside
+    of the occupied cells.
     """
-
-    def __init__(self, nodes: Nodes, arrays: dict, encoding, network):
-        super().__init__(nodes.types, nodes.lower, nodes.upper, nodes.spacing, arrays)
-        self.encoding, self.network, self.occupancy = encoding, network, occupancy(nodes)
-
-    def free_distance(self, p, d, active=True):
-        return self.occupancy.free_distance(p, d, active)
 
     #: The marching of rays differentiates colours by what :meth:`radiance_at` computes, not by ``point_data``.
     reads_again = False
+
+    def __init__(self, nodes: Nodes, arrays: dict, net: Network):
+        super().__init__(nodes.types, nodes.lower, nodes.upper, nodes.spacing, arrays)
+        self.net, self.occupancy = net, occupancy(nodes)
+
+    def free_distance(self, p, d, active=True):
+        return self.occupancy.free_distance(p, d, active)
 
     def for_training(self):
         field = super().for_training()
@@ -214,37 +215,35 @@ class HashVolumeField(VolumeField):
         raw, *numbers = self._outputs(p, active)
         return dr.select(active, density_of(raw + BEGIN, self.per_voxel), 0), [] if self.reads_again else numbers
 
+    def radiance_at(self, point_data, p, d, active=True):
+        return colour_of(self._outputs(p, active)[1:] if self.reads_again else point_data, d)
+
     def _outputs(self, p, active):
         """Return the outputs of the network: a raw density and twelve coefficients."""
         longest = max(b - a for a, b in zip(self.lower, self.upper, strict=True))
-        self.encoding.data = self.arrays["entries"].array
-        for layer in self.network.layers:
+        self.net.entries = self.arrays["entries"]
+        for layer in self.net.mlp.layers:
             if isinstance(layer, nn.Linear):
                 layer.weights.buffer = layer.bias.buffer = self.arrays["weights"].array
-        features = self.encoding([(x - a) * (1 / longest) for x, a in zip(p, self.lower, strict=True)], active)
-        return list(self.network(nn.CoopVec(*features)))
-
-    def radiance_at(self, point_data, p, d, active=True):
-        return colour_of(self._outputs(p, active)[1:] if self.reads_again else point_data, d)
+        return self.net([(x - a) * (1 / longest) for x, a in zip(p, self.lower, strict=True)], active)
 
 
 class HashVolumeFit:
     """Training of the largest hash grid and network of ``nbytes``, with cells as fine as those of a ``grid``."""
 
-    def __init__(self, grid: NodeGrid, importance: Importance, nbytes: float, seed: int = 1):
+    def __init__(self, grid: NodeGrid, importance: Importance, nbytes: float):
         self.nodes, self.nbytes, types = grid.nodes, nbytes, grid.nodes.types
-        self.encoding, self.network = modules(self.nodes, nbytes, seed)
-        weights = types.TensorXf(dr.detach(self.network["weights"])).numpy()
+        self.network = volume_network(self.nodes, nbytes)
+        weights = types.TensorXf(dr.detach(self.network.mlp["weights"])).numpy()
         # The last layer begins with an empty field of the mean colour
-        bias = self.network.layers[-1].bias
+        bias = self.network.mlp.layers[-1].bias
         mean = np.average(grid.colour[1:], axis=0, weights=importance.colour + 1e-9 * importance.colour.max())
         weights[bias.offset : bias.offset + 13 * bias.stride : bias.stride] = [0.0, *mean]
-        self.net = {"entries": types.TensorXf(dr.detach(self.encoding.params)), "weights": types.TensorXf(weights)}
+        self.net = {"entries": types.TensorXf(dr.detach(self.network.entries)), "weights": types.TensorXf(weights)}
 
     def field_of(self, net) -> HashVolumeField:
         """Return the field of the trained parameters."""
-        arrays = {"entries": net["entries"], "weights": net["weights"]}
-        return HashVolumeField(self.nodes, arrays, self.encoding, self.network)
+        return HashVolumeField(self.nodes, {name: net[name] for name in ("entries", "weights")}, self.network)
 
     def state(self) -> dict[str, np.ndarray]:
         """Return the arrays of a file by name; numbers are in half precision."""
@@ -256,17 +255,13 @@ class HashVolumeFit:
         """Return the field of what :meth:`state` returned, which computes in single precision."""
         nodes = read_nodes(types, state)
         arrays = {name: device_tensor(types.TensorXf, state[name]) for name in ("entries", "weights")}
-        field = HashVolumeField(nodes, arrays, *modules(nodes, float(state["nbytes"]), 1))
+        field = HashVolumeField(nodes, arrays, volume_network(nodes, float(state["nbytes"])))
         field.nbytes = state["entries"].nbytes + state["weights"].nbytes + field.occupancy.nbytes
         return field
 
 
-def modules(nodes: Nodes, nbytes: float, seed: int) -> tuple:
-    """Return the untrained hash grid and network; raises as :func:`.hash_grid`."""
-    types = nodes.types
+def volume_network(nodes: Nodes, nbytes: float) -> Network:
+    """Return the untrained hash grid and network, in cooperative vectors; raises as :func:`.hash_grid`."""
     options = hash_grid(3, nbytes - occupancy(nodes).nbytes, max(nodes.shape), 13) | {"init_scale": 1e-2}
-    encoding = nn.HashGridEncoding(types.Float, 3, rng=dr.rng(seed=seed), **options)
-    hidden = [part for _ in range(LAYERS) for part in (nn.Linear(-1, WIDTH), nn.ReLU())]
-    features = options["n_levels"] * options["n_features_per_level"]
-    layers = nn.Sequential(*hidden, nn.Linear(WIDTH, 13)).alloc(types.TensorXf, features, dr.rng(seed=seed + 1))
-    return encoding, nn.pack(layers, layout="training")
+    network = Network(3, WIDTH, LAYERS, options, outputs=13)
+    return network.alloc(nodes.types.TensorXf, rng=dr.rng(seed=1)).cooperative("training")

@@ -5,15 +5,13 @@ All lengths are relative to the mesh's longest side.
 
 from __future__ import annotations
 
-import math
-
 import drjit as dr
 import numpy as np
 
 from ...arrays.indirection import device_array
 from .distances import Distances, sample_box, sample_near, sample_surface, surface_cells
 from .field import DistanceField
-from .grids import components, point_array, point_values
+from .grids import point_array, point_values
 from .mesh import Mesh
 
 #: Distance from the surface within which points count as near.
@@ -128,25 +126,6 @@ class SurfaceEvaluation:
         far = ~self.uniform_near
         total = float(np.prod(side)) / self.count * _overlap(uniform[far], self.uniform_inside[far])
         return _ratio(*(total + self.band_volume / self.count * _overlap(near, self.near_distance < 0)))
-
-    def chamfer(self, decoded, count: int = 2**18) -> dict[str, float]:
-        """Compare a decoded ``trimesh.Trimesh`` (units and place of the file) with the solid.
-
-        ``chamfer``: mean distance from points uniform on one surface to the other one, averaged over both directions,
-        infinite if one is empty; ``components``: pieces of the decoded surface. Decode on a grid finer than the
-        field's cells, or the grid's error is measured, too.
-        """
-        if not len(decoded.faces):
-            return {"chamfer": math.inf, "components": 0}
-        vertices = (np.asarray(decoded.vertices) - np.array(self.mesh.centre)) / self.mesh.scale
-        other = Mesh(vertices, np.asarray(decoded.faces), True, path="the decoded mesh")
-        rng = np.random.default_rng([self.seed, 8])
-        decoded_points, _ = sample_surface(other, count, rng)
-        mesh_points, _ = sample_surface(self.distances.surface, count, rng)
-        there = self.distances.unsigned(decoded_points).mean()
-        with Distances(other) as distances:
-            back = distances.to_triangles(mesh_points).mean()
-        return {"chamfer": float(there + back) / 2, "components": len(components(decoded))}
 
 
 def lost_pieces(field: DistanceField, distances: Distances, count: int = 32, seed: int = 2) -> int:

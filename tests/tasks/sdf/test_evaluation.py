@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import sdf_fields
 import solid_meshes as solids
-import trimesh
 from scipy.ndimage import map_coordinates
 from sdf_fields import TrilinearField
 
@@ -283,27 +282,6 @@ def test_interpolable_grids():
     errors = [np.abs(map_coordinates(v.astype(np.float64), place, order=1)).mean() for v in (values, moved)]
     assert errors[1] < 0.6 * errors[0]
     assert errors[1] == pytest.approx(grids.trilinear_error(field, points, 24), rel=1e-3)
-
-
-# -- chamfer ----------------------------------------------------------------------------------------------------------
-
-
-def test_chamfer(ball, held_out):
-    """For concentric spheres it is the difference of the radii; for half a sphere one direction counts."""
-    mesh, _ = ball
-    for radius in (0.49, 0.5):
-        decoded = grids.extract(Ball(radius), 150, mesh.scale, mesh.centre)
-        measured = held_out.chamfer(decoded, 2**14)
-        assert measured["chamfer"] == pytest.approx(0.5 - radius, abs=2e-4) and measured["components"] == 1
-    vertices, faces = solids.sphere(96)
-    half = trimesh.Trimesh(*solids.without((vertices, faces), vertices[faces][:, :, 2].max(1) > 1e-6))
-    measured = held_out.chamfer(half, 2**14)["chamfer"]
-    # From the missing half's points to the equator
-    z = np.linspace(0, 1, 2001)
-    away = 0.5 * 2 * np.sin(np.arcsin(z) / 2)
-    assert measured == pytest.approx((away.mean() / 2) / 2, rel=0.03)
-    nothing = trimesh.Trimesh(np.zeros((0, 3)), np.zeros((0, 3), int))
-    assert held_out.chamfer(nothing) == {"chamfer": math.inf, "components": 0}
 
 
 def test_lost_pieces():
