@@ -155,7 +155,7 @@ def test_commands_are_accepted_today():
         arguments = cli._parser(each).parse_args(each)
         if each[0] == "tradeoff":
             assert isinstance(studies()[arguments.study], Study)
-    assert len(words) > 40
+    assert len(words) > 30
 
 
 def test_numbers_that_no_file_backs():

@@ -8,8 +8,7 @@ Filtered textures take one sample per pixel: trilinear at a random position, or 
 pixel's centre.
 
 *Errors* are those of displayed values in pixels entirely on the surface; a scene counts those that are minified, or
-magnified. *Levels*: the error of each level of detail at its texel centres, of all maps. *Time*: kernels that read the
-map where a scene shows it, and renders.
+magnified. *Levels*: the error of each level of detail at its texel centres, of all maps. *Time*: that of renders.
 """
 
 from __future__ import annotations
@@ -24,7 +23,6 @@ from functools import cached_property, partial
 from pathlib import Path
 from types import SimpleNamespace
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -37,7 +35,7 @@ from ..maps.source import Map, Source, load_source
 from ..measure import plot, renders
 from ..measure.renders import TextureReader, TextureScene
 from ..measure.report import figure_caption
-from ..measure.study import FLOOR, Candidate, Case, Job, Measure, Plan, Study
+from ..measure.study import Candidate, Case, Job, Measure, Plan, Study
 from ..measure.training import Contender, NetworkContender
 from ..plugins.support.image_files import PYRAMIDS
 from ..scenes.loading import footprint
@@ -376,32 +374,17 @@ def plan(source: Source, name: str, settings: SimpleNamespace) -> Plan:
 
 
 def _case(context: TextureContenders, scene: TextureScene) -> Case:
-    """Return the case of a scene: reads of the map where the scene shows it, and whole renders."""
-    film, size = context.settings.film, context.size
-
-    def reads(lanes: int) -> dict:
-        loaded = context.readers[BASE]().loaded(scene, film, size)
-        width, index = max(1, round((1.5 * lanes) ** 0.5)), np.arange(lanes)
-        si = scene.hits(loaded, (index % width + 0.5) / width, (index // width + 0.5) / -(-lanes // width))
-        dr.make_opaque(si.uv, si.p, si.dp_du, si.dp_dv, si.wi, si.sh_frame, si.duv_dx, si.duv_dy)
-        cone = footprint.Cone.from_sensor(loaded.sensors()[0])
-        functions = {FLOOR: lambda: [si.uv.x, si.uv.y]}
-        for c in context.candidates:
-            if c.name == BASE or c.setting in FILTERS:
-                texture = mi.load_dict(context.readers[c.name]().texture(scene.repeats(film, size)))
-                if hasattr(texture, "set_cone"):
-                    texture.set_cone(cone)
-                functions[c.name] = lambda t=texture: t.eval(si)
-        return {"read": functions}
+    """Return the case of a scene: whole renders. ``bench_texture.py`` times reads."""
 
     def passes() -> dict:
         functions = {}
         for name, once in context.readers.items():
-            loaded, spp = once().loaded(scene, film, size), once().spp
+            loaded, spp = once().loaded(scene, context.settings.film, context.size), once().spp
             functions[name] = lambda k, s=loaded, spp=spp: mi.render(s, spp=spp, seed=k)
         return functions
 
-    return Case(scene.name, reads, passes, accuracy=f"psnr_{scene.name}_db", in_picture=not scene.magnified)
+    accuracy, in_picture = f"psnr_{scene.name}_db", not scene.magnified
+    return Case(scene.name, lambda lanes: {}, passes, accuracy=accuracy, in_picture=in_picture)
 
 
 # -- Pictures ----------------------------------------------------------------------------------------------------------
