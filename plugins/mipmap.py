@@ -76,9 +76,9 @@ class MipMap(FilteredTexture):
     :monosp:`neural_texture`, and useful in scenes of Mitsuba 3.9, whose :monosp:`bitmap` has no levels of detail. **The
     bitmap of Mitsuba 3.10 has these filters itself** (``filter_type``), and is to be preferred there.
 
-    Levels are kept in single precision, four channels to a texel: 21 bytes per texel of a colour image. With ``filter``
-    ``off`` the values are those of :monosp:`bitmap`, also between texels, except for spectra, which are upsampled from
-    the filtered colour.
+    Levels are kept in single precision: 37 bytes per texel of a colour image, 21 in the arrays that are read, with four
+    channels to a texel, and 16 in those that they are packed from. With ``filter`` ``off`` the values are those of
+    :monosp:`bitmap`, also between texels, except for spectra, which are upsampled from the filtered colour.
 
     **Optimisation.** A change of ``data`` gives this texture levels of its own, computed from ``data`` with each
     :monosp:`update()`; derivatives of all levels reach ``data``, so texels seen minified are optimised, too. Values are
