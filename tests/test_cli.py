@@ -232,14 +232,13 @@ def test_help_is_light():
     assert {m for m in of_disney if m.startswith("mi_diffind.studies.") and ".baselines" not in m} == {
         "mi_diffind.studies.disney"
     }
-    text |= of_studies | asked_for_help([["tradeoff", "scene"]])[0]
+    text |= of_studies
     for command, found in text.items():
         assert found.startswith(" ".join(["usage: mi-diffind", *command]) + " [-h]"), command
     assert all(f"\n    {verb} " in text[()] for verb in VERBS)
     training = (".texture.fit", ".loading", ".loop", ".model", ".compressed")
     assert not HEAVY & modules and not [m for m in modules if m.endswith(training)]
     assert "--primary" in text["fit", "ggx"] and "--primary" not in text["fit", "disney"]  # those of the task only
-    assert "-D NAME" in text["tradeoff", "scene"] and "-D NAME" not in text["tradeoff", "disney"]
 
 
 def test_json_before_or_after_the_task(tmp_path, few_samples):
@@ -250,26 +249,12 @@ def test_json_before_or_after_the_task(tmp_path, few_samples):
         assert json.loads((tmp_path / name).read_text())["bytes"] == 4 * entries("disney")
 
 
-def test_tradeoff_of_a_scene(tmp_path, capsys):
-    out, report = tmp_path / "out", tmp_path / "report.json"
-    arguments = ["tradeoff", "scene", scene_file(tmp_path), "--quick", "--out", str(out)]
-    assert main([*arguments, "--json", str(report), "--seed", "3", *SMALL]) == 0
-    text, found = capsys.readouterr().out, json.loads(report.read_text())
-    assert "scene.xml, 48 x 28" in text and "bias" in text
-    files = [str(out / f"tradeoff_scene.{kind}") for kind in ("csv", "json", "png")]
-    assert text.endswith("\nwritten     " + ", ".join(files) + "\n")
-    assert list(found.pop("files").values()) == files and sorted(map(str, out.iterdir())) == files
-    assert json.loads((out / "tradeoff_scene.json").read_text()) == found
-    assert found["counts"][-1] == 4 and found["seed"] == 3 and found["defines"] == {"width": "48", "height": "28"}
-    assert found["settings"]["quick"] and not found["interrupted"]
-
-
 # -- bad input ---------------------------------------------------------------------------------------------------------
 
 
 def test_missing_files(tmp_path, capsys):
     out = ["--out", str(tmp_path / "o")]
-    for words, options in ((["render"], []), (["compare"], out), (["tradeoff", "scene"], out), (["inspect"], [])):
+    for words, options in ((["render"], []), (["compare"], out), (["inspect"], [])):
         assert "nowhere.xml: no such scene file" in refused(capsys, *words, "nowhere.xml", *options)
     assert not (tmp_path / "o").exists()
     assert "nowhere.npz: no such file" in refused(capsys, "inspect", "nowhere.npz")
@@ -325,7 +310,6 @@ def test_bad_tasks(capsys):
         (["fit"], "mi-diffind fit: error: the following arguments are required: TASK"),
         (["fit", "disney", "-o", "t.npz", "--primary", "8"], "unrecognized arguments: --primary 8"),
         (["fit", "ggx", "-o", "t.npz", "--primary", "1"], "--primary: found 1, allowed are 2 to 4096 entries a side"),
-        (["tradeoff", "scene"], "mi-diffind tradeoff scene: error: the following arguments are required: SCENE.xml"),
     ):
         with pytest.raises(SystemExit) as caught:
             main(arguments)

@@ -1,6 +1,7 @@
 """Comparisons of scenes: the noise in an error, the worst place, the truths, and refusals to state a time."""
 
 import json
+import signal
 from pathlib import Path
 
 import mitsuba as mi
@@ -137,6 +138,85 @@ def test_parts_of_an_error(rng, bias):
     assert found["error"] == pytest.approx(weight * (0.2**2 + bias**2), rel=0.05)
     assert found["bias"] is None if bias == 0 else found["bias"] == pytest.approx(weight * bias**2, rel=0.15)
     assert found["bias_resolution"] < 0.1 * found["error"] and len(found["errors"]) == 4
+
+
+def contender(rng, spp, seconds, bias, passes=6, deviation=0.4):
+    """Passes of known noise a sample and bias, with their parts as ``compare_at_equal_time`` has them."""
+    mean = np.linspace(0.2, 2, 24_000).reshape(100, 80, 3)
+    images = [mean + bias + rng.normal(0, deviation / np.sqrt(spp), mean.shape) for _ in range(passes)]
+    return {"spp": spp, "seconds": {"median": seconds}, **equal_time.errors(images, [mean, mean])}
+
+
+def test_crossover(rng):
+    """The exact scene takes 4 samples in the time of 16: 0.4² / n = 0.05² at 64, the sides are equal at 24 s."""
+    fast, exact = contender(rng, 16, 2.0, 0.05), contender(rng, 4, 2.0, 0.0)
+    at = equal_time.crossover(fast, exact)
+    assert at["spp"] == pytest.approx(64, rel=0.1) and at["seconds"] == pytest.approx(64 / 8, rel=0.1)
+    expected = 0.4**2 * (2 / 4 - 2 / 16) / 0.05**2
+    assert at["reference_better_seconds"] == pytest.approx(expected, rel=0.1) and at["spp_above"] is None
+    assert at["reference_better_spp"] == pytest.approx(8 * expected, rel=0.1)
+    # Passes of so many samples: half of the error is bias, and both errors are equal
+    half = contender(rng, round(at["spp"]), 1, 0.05)
+    assert half["bias"] == pytest.approx(half["error"] / 2, rel=0.2)
+    long = [contender(rng, round(n * at["reference_better_seconds"]), 1, b)["error"] for n, b in ((8, 0.05), (2, 0.0))]
+    assert long[0] == pytest.approx(long[1], rel=0.1)
+    # A slow contender is never better, one without a bias never worse
+    slow = {**fast, "crossover": equal_time.crossover(fast, {**exact, "noise": 0})}
+    text = equal_time._crossover_text(slow, "exact")
+    assert text.startswith("bias equals noise at ") and text.endswith("better at equal time from the first sample on")
+    none = contender(rng, 16, 2.0, 0.0)
+    at = equal_time.crossover(none, exact)
+    assert at.pop("spp_above") > 1000 and set(at.values()) == {None}
+    assert "no bias above" in equal_time._crossover_text({**none, "crossover": {**at, "spp_above": 1234}}, "exact")
+
+
+PAPER = """
+<scene version="3.0.0">
+    <integrator type="path"><integer name="max_depth" value="2"/></integrator>
+    <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="48"/>
+        <integer name="height" value="36"/><rfilter type="box"/></film>
+        <transform name="to_world"><lookat origin="0,1,5" target="0,0,0" up="0,1,0"/></transform></sensor>
+    <emitter type="constant"/>
+    <shape type="sphere"><bsdf type="neural_disney"><string name="preset" value="paper"/>
+        <rgb name="base_color" value="0.5,0.3,0.2"/><float name="roughness" value="0.4"/>
+        <float name="metallic" value="1"/><float name="anisotropic" value="0.9"/></bsdf></shape>
+</scene>
+"""
+
+
+def test_bias_of_a_scene(mi_rgb, tmp_path):
+    """The bias is that of converged renders; a pass with the samples of the crossover has twice the bias as error."""
+    path = tmp_path / "ball.xml"
+    path.write_text(PAPER)
+    result = equal_time.compare_at_equal_time(path, spp=16, passes=8, progress=False)
+    written = result.figures["contenders"]["as written"]
+    images = [loading.render(loading.load(path, exact=exact), 2**11, 77)[0] for exact in (False, True)]
+    bias = equal_time._weighted((images[0] - images[1]) ** 2, images[1]).mean()
+    assert written["bias"] == pytest.approx(bias, rel=0.3)
+    spp = round(written["crossover"]["spp"])
+    assert f"as written: bias equals noise at {spp} samples a pixel" in str(result)
+    image = loading.render(loading.load(path), spp, 78)[0]
+    assert equal_time._weighted((image - images[1]) ** 2, images[1]).mean() == pytest.approx(2 * bias, rel=0.4)
+
+
+@pytest.mark.parametrize("stop_at, spp, passes", [(3, 3 * 2, 2), (37, 32 * 2, 3)])
+def test_equal_time_is_interrupted(mi_rgb, tmp_path, monkeypatch, stop_at, spp, passes):
+    """Ctrl-C in the reference, which then has so many samples, after which two passes are made; and in the passes."""
+    path, original, seeds = tmp_path / "ball.xml", loading.render_pass, []
+    path.write_text(PAPER)
+
+    def render_pass(scene, spp, seed):
+        seeds.append(seed)
+        if len(seeds) == stop_at:
+            signal.raise_signal(signal.SIGINT)
+        return original(scene, spp, seed)
+
+    monkeypatch.setattr(loading, "render_pass", render_pass)
+    monkeypatch.setattr(equal_time._EqualSide, "fill", lambda contender, exact: None)
+    result = equal_time.compare_at_equal_time(path, spp=2, passes=4, progress=False)
+    figures = result.figures
+    assert (figures["interrupted"], figures["reference_spp"], figures["passes"]) == (True, spp, passes)
+    assert "interrupted" in str(result)
 
 
 def test_equal_time(mi_rgb, tmp_path, capsys):

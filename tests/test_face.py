@@ -409,9 +409,7 @@ def test_a_normal_map_of_one_channel():
     assert mi_diffind.from_arrays({"normal": np.zeros((4, 4, 2), np.uint8)}).channels == 2
 
 
-@pytest.mark.parametrize(
-    "words", [[verb] for verb in VERBS] + [["fit", "sdf"], ["fit", "scene"], ["tradeoff", "scene"]]
-)
+@pytest.mark.parametrize("words", [[verb] for verb in VERBS] + [["fit", "sdf"], ["fit", "scene"], ["tradeoff", "sdf"]])
 def test_help_ends_with_an_example(words, capsys):
     with pytest.raises(SystemExit):
         main([*words, "--help"])

@@ -42,11 +42,11 @@ def commands(path, folder):
         "compare": ["compare", path, "--spp", "2", "--out", folder / "out"],
         "view": ["view", path, "--port", "0", "--seconds", "1", "--width", "64"],
         "regress": ["regress", path, "--update", "--references", folder / "references"],
-        "tradeoff": ["tradeoff", "scene", path, "--quick", "--spp", "1", "--out", folder / "out"],
+        "equal time": ["compare", path, "--equal-time", "--spp", "1", "--out", folder / "out"],
     }
 
 
-@pytest.mark.parametrize("name", ["render", "orbit", "compare", "view", "regress", "tradeoff"])
+@pytest.mark.parametrize("name", ["render", "orbit", "compare", "view", "regress", "equal time"])
 @pytest.mark.parametrize("missing", ["integrator", "sensor"])
 def test_scenes_without_a_part(tmp_path, capsys, name, missing):
     path = scene_file(tmp_path, missing)
@@ -81,7 +81,7 @@ def test_scenes_in_memory(mi_rgb):
         render(mi_rgb.load_dict(scene), 1)
 
 
-@pytest.mark.parametrize("name", ["render", "orbit", "compare", "view", "regress", "tradeoff"])
+@pytest.mark.parametrize("name", ["render", "orbit", "compare", "view", "regress", "equal time"])
 def test_films_beyond_the_memory(tmp_path, capsys, monkeypatch, name):
     """On a machine of 32 kB; the film of the viewer has the width that it is asked for."""
     monkeypatch.setattr(units, "memory", lambda: 2**15)
@@ -89,7 +89,7 @@ def test_films_beyond_the_memory(tmp_path, capsys, monkeypatch, name):
     assert "film: found 64 x 12 pixels, which takes about 0 GiB of memory" in sentence
 
 
-@pytest.mark.parametrize("name", ["render", "orbit", "compare"])
+@pytest.mark.parametrize("name", ["render", "orbit", "compare", "equal time"])
 def test_absurd_samples(tmp_path, capsys, name):
     arguments = [*map(str, commands(scene_file(tmp_path), tmp_path)[name]), "--spp", "1000000000"]
     assert "spp: found 1,000,000,000 samples per pixel, allowed are 1 to 1,048,576" in refused(capsys, *arguments)
@@ -118,8 +118,9 @@ def test_render_counts_what_is_not_finite(tmp_path, capsys):
     assert render(scene_file(tmp_path), 2, progress=False).figures["nonfinite_pixels"] == 0
 
 
-def test_compare_refuses_what_is_not_finite(tmp_path, capsys):
-    sentence = refused(capsys, "compare", str(scene_file(tmp_path, more=NAN)), "--spp", "2", "--out", str(tmp_path))
+@pytest.mark.parametrize("name", ["compare", "equal time"])
+def test_compare_refuses_what_is_not_finite(tmp_path, capsys, name):
+    sentence = refused(capsys, *map(str, commands(scene_file(tmp_path, more=NAN), tmp_path)[name]))
     assert "pixels are not finite" in sentence and "of 192" in sentence
 
 

@@ -1,16 +1,15 @@
-"""``mi-diffind tradeoff``: time against accuracy of the contenders of a task, or of a scene."""
+"""``mi-diffind tradeoff``: time against accuracy of the contenders of a task."""
 
 from __future__ import annotations
 
-from ..core.files import check_scene_file
 from ..studies import run as run_study
 from ..studies import studies
-from .common import alternative, alternatives, say, scene_options, set_variant, variant_option, verb
+from .common import alternative, alternatives, say, set_variant, variant_option, verb
 
-HELP = "measure time against accuracy of the contenders of a task, or of a scene"
+HELP = "measure time against accuracy of the contenders of a task"
 
 #: Arguments of studies that are files, as far as a study has them.
-READS = ("source", "scene", "scenes", "materials", "table", "renders", "errors_of")
+READS = ("source", "scenes", "materials", "table", "renders", "errors_of")
 
 EXAMPLE = "mi-diffind tradeoff ggx --quick --out out"
 
@@ -32,11 +31,7 @@ def add(commands) -> None:
         sub = alternative(parsers, name, title, words)
         sub.add_argument("--out", default="out", metavar="DIR", help="folder for table and plot (default: out)")
         sub.add_argument("--quick", action="store_true", help="smoke run: less of everything, times not to be quoted")
-        if study.of_scene:
-            sub.add_argument("scene", metavar="SCENE.xml")
-            scene_options(sub, rendering=False)
-        else:
-            variant_option(sub)
+        variant_option(sub)
         study.add_arguments(sub)
 
 
@@ -45,10 +40,6 @@ def run(arguments) -> dict:
 
     Raises as :func:`mi_diffind.tradeoff` does.
     """
-    study = studies()[arguments.study]
-    if study.of_scene:
-        check_scene_file(arguments.scene)
-        arguments.defines = dict(arguments.defines)
-    result = run_study(study, arguments, lambda: set_variant(arguments.variant))
+    result = run_study(studies()[arguments.study], arguments, lambda: set_variant(arguments.variant))
     say(result)
     return result.figures

@@ -262,14 +262,14 @@ def _overlap(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 def draw_curves(
     title: str, caption: str, panels: Mapping[str, Sequence[Curve]], x_label: str, y_label: str, log: str = "",
-    ticks: Sequence[str] = (), columns: int = 2, height: float = 3.6,
+    ticks: Sequence[str] = (), height: float = 3.6,
 ):  # fmt: skip
     """Return a Matplotlib figure with a panel of curves for each title, with a legend where labels change.
 
-    There are up to ``columns`` panels a row. The axes in ``log`` (``"x"``, ``"xy"``) are logarithmic; ``ticks`` are
+    There are up to two panels a row. The axes in ``log`` (``"x"``, ``"xy"``) are logarithmic; ``ticks`` are
     labels at 0, 1, 2, …
     """
-    columns = min(columns, len(panels))
+    columns = min(2, len(panels))
     rows = -(-len(panels) // columns)
     plot, explained = figure(title, caption, 6.0 * columns, height * rows), []
     for k, (name, curves) in enumerate(panels.items()):

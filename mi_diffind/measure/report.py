@@ -199,12 +199,6 @@ def verdicts(result: dict) -> list[str]:
     return ["", *grid(cells, "")] if len(cells) > 1 else []
 
 
-def percent(value: float, digits: int = 3) -> str:
-    """Return a share as text, ``0.0123`` → ``"1.23%"``; very small shares are written with a power of ten."""
-    value = 100 * value
-    return f"{value:.{digits}g}%" if value == 0 or abs(value) >= 1e-4 else f"{value:.1e}%"
-
-
 def time_cell(t: dict | None) -> str:
     """Return a time (:func:`.statistics.timing`) ± half its interquartile range, or the bound of a hidden time."""
     if t is None:

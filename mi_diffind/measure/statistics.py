@@ -19,12 +19,6 @@ def spread(values: Iterable[float]) -> dict[str, float]:
     return {"median": float(median), "q1": float(q1), "q3": float(q3)}
 
 
-def flat_spread(name: str, values: Iterable[float]) -> dict[str, float]:
-    """Return :func:`spread` with flat names: the median as ``NAME``, the quartiles as ``NAME_q1``, ``NAME_q3``."""
-    median, q1, q3 = spread(values).values()
-    return {name: median, f"{name}_q1": q1, f"{name}_q3": q3}
-
-
 def timing(values: Iterable[float], floor: float = 0.0) -> dict:
     """Return the time of rounds without the ``floor``, in the unit of ``values``.
 

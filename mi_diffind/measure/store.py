@@ -1,7 +1,7 @@
 """Store of partial results in the output folder: the same command continues an interrupted run.
 
-Partial results stay until the result is written. A run is continued only if its key is unchanged. The files are
-``tradeoff_NAME.partial.json``, and ``tradeoff_NAME.partial.ARRAYS.npz`` for each group of arrays.
+Partial results stay until the result is written, in ``tradeoff_NAME.partial.json``. A run is continued only if its
+key is unchanged.
 """
 
 from __future__ import annotations
@@ -16,17 +16,14 @@ import time
 from collections.abc import Iterable
 from pathlib import Path
 
-import numpy as np
-
-from ..core.files import replacing, writable_folder, write_json
+from ..core.files import writable_folder, write_json
 from .statistics import finite
 
 
 class Store:
     """Partial results of the study ``name`` under a ``key`` (a tree for JSON).
 
-    ``data``: section → tree for JSON; ``arrays``: name → group of NumPy arrays by name. ``folder`` is made if its
-    parent exists; ``None`` writes nothing.
+    ``data``: section → tree for JSON. ``folder`` is made if its parent exists; ``None`` writes nothing.
 
     Partial results in the folder are read if their key is the same (``resumed``), else removed. With ``progress``, a
     line on stderr tells which, and which parts of the key differ or that a file is damaged. Raises
@@ -39,7 +36,6 @@ class Store:
         self.folder = None if folder is None else writable_folder(folder, create=True)
         self.key, self.name = json.loads(json.dumps(finite(key))), name
         self.data: dict[str, dict] = {section: {} for section in sections}
-        self.arrays: dict[str, dict[str, np.ndarray]] = {}
         self.resumed, self._saved = False, time.monotonic()
         if self.folder is None or not self.path.is_file():
             return
@@ -61,42 +57,26 @@ class Store:
         return self.folder / f"tradeoff_{self.name}.partial.json"
 
     def _read(self) -> str:
-        """Read the files; return why they cannot be used, "" if they can."""
+        """Read the file; return why it cannot be used, "" if it can."""
         stored = json.loads(self.path.read_text(encoding="utf-8"))
         other = [k for k in {**self.key, **stored["key"]} if self.key.get(k) != stored["key"].get(k)]
         if other:
             return f"is of a run with other {', '.join(other)}"
         if set(stored["data"]) != set(self.data) or not all(type(v) is dict for v in stored["data"].values()):
             raise ValueError("the sections are not those of this study")
-        arrays = {}
-        for name in stored["arrays"]:
-            with np.load(self._array_path(name), allow_pickle=False) as file:
-                arrays[name] = {key: file[key] for key in file}
-        self.data, self.arrays = stored["data"], arrays
+        self.data = stored["data"]
         return ""
-
-    def _array_path(self, name: str) -> Path:
-        return self.path.with_suffix(f".{name}.npz")
-
-    def keep(self, name: str, **arrays: np.ndarray) -> None:
-        """Add a group of arrays; a run that is continued has it from the next :meth:`save` on."""
-        self.arrays[name] = arrays
-        if self.folder is not None:
-            with replacing(self._array_path(name)) as temporary:
-                np.savez(temporary, **arrays)
 
     def save(self, every: float = 0.0) -> None:
         """Write ``data``, unless it was written less than ``every`` seconds ago."""
         if self.folder is not None and time.monotonic() - self._saved >= every:
-            write_json(self.path, {"key": self.key, "data": self.data, "arrays": list(self.arrays)})
+            write_json(self.path, {"key": self.key, "data": self.data})
             self._saved = time.monotonic()
 
     @staticmethod
     def remove(folder: str | os.PathLike, name: str) -> None:
         """Remove the partial results of the study ``name``."""
-        for path in (*Path(folder).glob(f"tradeoff_{name}.partial.json"),
-                     *Path(folder).glob(f"tradeoff_{name}.partial.*.npz")):  # fmt: skip
-            path.unlink(missing_ok=True)
+        (Path(folder) / f"tradeoff_{name}.partial.json").unlink(missing_ok=True)
 
 
 def models_folder(parent: str | os.PathLike, name: str, key: str) -> Path:

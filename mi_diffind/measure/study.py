@@ -47,16 +47,13 @@ class Study:
     ``name``: the word of the command and of the files (``tradeoff_NAME.…``); ``title``: a phrase for the help;
     ``example``: arguments of the example in the help.
 
-    A study that compares candidates has a :meth:`plan`; any other study overrides :meth:`run`. A study ``of_scene``
-    measures a scene file: its command has the argument ``scene`` and the options of scenes, and ``arguments.defines``
-    is a dictionary. ``arguments`` holds all arguments of the command: ``out`` (the folder), ``quick``, and those of
-    :meth:`add_arguments`.
+    A study that compares candidates has a :meth:`plan`; any other study overrides :meth:`run`. ``arguments`` holds all
+    arguments of the command: ``out`` (the folder), ``quick``, and those of :meth:`add_arguments`.
     """
 
     name = ""
     title = ""
     example = ""
-    of_scene = False
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """Add the study's own arguments to the parser of its command."""

@@ -1,7 +1,12 @@
-"""Error at equal time: a scene as written and its counterparts, each with the samples that fit in the same time."""
+"""Error at equal time: a scene as written and its counterparts, each with the samples that fit in the same time.
+
+*The law*: a pass of n samples a pixel has the error noise(n) + bias. The noise is that of a measured pass times its
+samples over n, the time is in proportion to n, and the bias is that of the approximation, which no time reduces.
+"""
 
 from __future__ import annotations
 
+import itertools
 import os
 import tempfile
 import time
@@ -39,6 +44,9 @@ PAIRS = 3
 #: Corrections of the samples of a contender after its first measured pass.
 CORRECTIONS = 3
 
+#: Largest multiple of the time of a measured pass that curves of the picture reach.
+REACH = 1000
+
 
 @dataclass
 class EqualTime:
@@ -64,8 +72,35 @@ class EqualTime:
             )
             for name, image in self.images.items()
         ]
+        cells.append(self._draw_law)
         plot.write(path, cells, len(self.images) + 1, self.reference.shape)
         return {"figure": str(path)}
+
+    def _draw_law(self, figure, axes) -> None:
+        """Draw the error of each contender against the seconds of a pass: the law, and the measured passes."""
+        drawn = {name: c for name, c in self.figures["contenders"].items() if c["noise"] > 0 and c["seconds"]["median"]}
+        if not drawn:
+            return
+        axes.set_axis_on()
+        axes.set(xscale="log", yscale="log", xlabel="seconds of a pass", ylabel="error of a pass (relMSE)")
+        axes.set_title("error against time; lines are noise / samples + bias")
+        first = min(c["seconds"]["median"] / c["spp"] for c in drawn.values())
+        longest = max(c["seconds"]["median"] for c in drawn.values())
+        crossovers = [c["crossover"]["seconds"] for c in drawn.values() if c["crossover"] and c["crossover"]["seconds"]]
+        last = min(4 * max(longest, *crossovers, 0.0), REACH * longest)
+        for (name, c), (colour, marker) in zip(drawn.items(), itertools.cycle(plot.STYLES)):
+            seconds, bias, at = c["seconds"]["median"], c["bias"] or 0.0, c["crossover"] or {}
+            times = np.geomspace(first, last, 200)
+            axes.plot(times, c["noise"] * seconds / times + bias, color=colour)
+            style = {"color": colour, "marker": marker, "markersize": 8, "linestyle": ""}
+            axes.plot(seconds, c["noise"] + bias, label=f"{name}, {c['spp']} spp", **style)
+            if at.get("seconds") and first < at["seconds"] < last:
+                label = f"{name}: noise = bias at {_rounded(at['spp'])} spp"
+                axes.plot(at["seconds"], 2 * bias, label=label, markerfacecolor="white", **style)
+        plot.log_ticks(axes.xaxis, *axes.get_xlim())
+        plot.log_ticks(axes.yaxis, *axes.get_ylim())
+        axes.grid(color="0.92")
+        axes.legend()
 
     def _reference(self) -> str:
         f = self.figures
@@ -97,6 +132,8 @@ class EqualTime:
                 "error       mean squared error of a pass, over the squared reference + 0.01 (relMSE)",
                 "",
                 *grid(rows),
+                "",
+                *(f"{n}: {_crossover_text(c, f['reference'])}" for n, c in f["contenders"].items() if c["crossover"]),
                 *(f"{name}: {c['remark']}" for name, c in f["contenders"].items() if c["remark"]),
             ]
         )
@@ -109,6 +146,25 @@ class EqualTime:
 def _share(contender: dict) -> str:
     bias = contender["bias"]
     return f"{bias:.3g}" if bias is not None else f"none above {contender['bias_resolution']:.1g}"
+
+
+def _rounded(value: float) -> str:
+    """Return a number of samples or seconds with two significant digits."""
+    value = float(f"{value:.2g}")
+    return f"{value:,.0f}" if value >= 10 else f"{value:g}"
+
+
+def _crossover_text(contender: dict, reference: str) -> str:
+    at = contender["crossover"]
+    if at["spp"] is None:
+        up_to = f": no crossover seen up to {_rounded(at['spp_above'])} samples a pixel" if at["spp_above"] else ""
+        return f"no bias above {contender['bias_resolution']:.1g}{up_to}"
+    equal, better = (
+        "the first sample" if spp <= 1 else f"{_rounded(spp)} samples a pixel ({_rounded(seconds)} s)"
+        for spp, seconds in ((at["spp"], at["seconds"]), (at["reference_better_spp"], at["reference_better_seconds"]))
+    )
+    verb = "exceeds" if at["spp"] <= 1 else "equals"
+    return f"bias {verb} noise at {equal}; {reference} is better at equal time from {better} on"
 
 
 def _weighted(squared: np.ndarray, reference: np.ndarray) -> np.ndarray:
@@ -182,6 +238,32 @@ def errors(passes: Sequence[np.ndarray], references: Sequence[np.ndarray]) -> di
     }
 
 
+def crossover(contender: Mapping, exact: Mapping) -> dict:
+    """Return the samples a pixel, and the seconds of a pass, from which the bias of a contender decides its error.
+
+    ``contender`` and ``exact`` have ``spp``, the median ``seconds`` of a pass, and the parts of its error
+    (:func:`errors`); the law is that of the module. ``spp`` and ``seconds``: noise and bias are equal.
+    ``reference_better_spp`` (of the contender) and ``reference_better_seconds``: from here the exact scene has the
+    smaller error at equal time, 0 if always. Without a bias they are ``None``, and the noise exceeds what was not seen
+    up to ``spp_above`` samples.
+    """
+    noise, bias, resolution = (contender[key] for key in ("noise", "bias", "bias_resolution"))
+    spp, seconds = contender["spp"], contender["seconds"]["median"]
+    equal = better = above = None
+    if bias is None:
+        above = spp * noise / resolution if resolution > 0 else None
+    else:  # in passes of the contender
+        equal = noise / bias
+        better = max(0.0, exact["noise"] * exact["seconds"]["median"] / seconds - noise) / bias
+    return {
+        "spp": None if equal is None else spp * equal,
+        "seconds": None if equal is None else seconds * equal,
+        "reference_better_spp": None if better is None else spp * better,
+        "reference_better_seconds": None if better is None else seconds * better,
+        "spp_above": above,
+    }
+
+
 def _remark(contender: _EqualSide, exact: _EqualSide) -> str:
     """Return a sentence if the times of two contenders differ by more than :data:`TOLERANCE`, else ""."""
     ratio = float(np.median(np.divide(contender.seconds, exact.seconds)))
@@ -212,11 +294,13 @@ def compare_at_equal_time(
     The reference is the exact scene at :data:`REFERENCE` times all its samples. Figures: ``contenders``, by name, have
     ``spp``, ``seconds`` (median and quartiles of a pass), ``error``, ``noise`` and ``bias`` (:func:`errors`),
     ``error_ratio`` (median and quartiles of the ratios of a pass's error to that of the exact scene, ``None`` if that
-    has no error), and a ``remark`` if the times are not equal. Raises :class:`.SceneError`, as
+    has no error), ``crossover`` (:func:`crossover`, ``None`` of the exact scene), and a ``remark`` if the times are not
+    equal. Raises :class:`.SceneError`, as
     :func:`.comparison.compare` does.
     """
     loaded, passes = comparison.load_compared(scene, against, learn, defines, progress), max(2, passes)
     spp = spp or loaded.written.sensors()[0].sampler().sample_count()
+    loading.check_size(loaded.written, spp)
     names = list(dict.fromkeys(entry["plugin"] for entry in loaded.replaced))
     contenders = {"as written": _EqualSide(loaded.written, names, spp)}
     contenders |= {name: _EqualSide(truth, loaded.put_in[name], spp) for name, truth in loaded.truths.items()}
@@ -251,6 +335,8 @@ def compare_at_equal_time(
     reference = (halves[0] + halves[1]) / 2
     measured = {name: errors(c.images, halves) for name, c in contenders.items()}
     base = measured[reference_name]["errors"]
+    for name, c in contenders.items():
+        measured[name] |= {"plugins": c.plugins, "spp": c.spp, "seconds": spread(c.seconds)}
     figures = {
         "scene": str(loaded.parsed.path),
         "variant": mi.variant(),
@@ -263,11 +349,9 @@ def compare_at_equal_time(
         "reference_spp": sum(taken) * exact.spp,
         "contenders": {
             name: {
-                "plugins": c.plugins,
-                "spp": c.spp,
-                "seconds": spread(c.seconds),
                 **measured[name],
                 "error_ratio": spread(e / b for e, b in zip(measured[name]["errors"], base, strict=True) if b > 0),
+                "crossover": None if c is exact else crossover(measured[name], measured[reference_name]),
                 "remark": _remark(c, exact),
             }
             for name, c in contenders.items()

@@ -14,7 +14,7 @@ import importlib
 import os
 import re
 from collections import UserDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -69,15 +69,13 @@ def tradeoff(
     *sources: str | os.PathLike,
     out: str | os.PathLike = "out",
     quick: bool = False,
-    defines: Mapping[str, object] | None = None,
     **options,
 ) -> Tradeoff:
     """Measure time against accuracy, in the variant that is set: ``mi-diffind tradeoff`` in Python.
 
-    - ``study``: ``"disney"``, ``"image"``, ``"scene"``, … (``mi-diffind tradeoff --help``); ``sources``: its
-      positional arguments, as an image, a mesh or a scene file.
+    - ``study``: ``"disney"``, ``"image"``, ``"sdf"``, … (``mi-diffind tradeoff --help``); ``sources``: its
+      positional arguments, as an image or a mesh.
     - ``out``: folder for the table and the pictures; ``quick``: less of everything, times not to be quoted.
-    - ``defines``: values of a scene's ``<default>`` parameters.
     - ``options``: options of the command as keywords, one of several values as a list (``compression=[6, 12]``). An
       option that is a word of Python ends in an underscore (``lambda_=0.5``).
 
@@ -88,14 +86,10 @@ def tradeoff(
     if study not in studies():
         raise UsageError(f'found the study "{study}", allowed are {", ".join(studies())}')
     chosen = studies()[study]
-    if defines and not chosen.of_scene:
-        raise UsageError(f"defines: given to the study {study}, which has no scene file")
     parser = _Keywords(prog=f"tradeoff {study}", allow_abbrev=False, add_help=False)
-    if chosen.of_scene:
-        parser.add_argument("scene", metavar="SCENE.xml")
     chosen.add_arguments(parser)
     arguments = parser.parse_args([*map(str, sources), *_words(options)])
-    arguments.out, arguments.quick, arguments.defines = str(out), quick, {k: str(v) for k, v in (defines or {}).items()}
+    arguments.out, arguments.quick = str(out), quick
     return run(chosen, arguments)
 
 

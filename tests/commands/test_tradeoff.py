@@ -13,7 +13,7 @@ from mi_diffind.measure.study import Study
 from mi_diffind.studies import studies
 
 #: Studies that ship.
-STUDIES = ["bsdf", "disney", "field", "ggx", "image", "scene", "scene-training", "sdf", "shading", "texture"]
+STUDIES = ["bsdf", "disney", "field", "ggx", "image", "scene-training", "sdf", "shading", "texture"]
 
 
 class SmallStudy(Study):

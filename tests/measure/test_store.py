@@ -3,7 +3,6 @@
 import json
 import os
 
-import numpy as np
 import pytest
 
 from mi_diffind.core.files import OutputError
@@ -21,7 +20,6 @@ def interrupted(tmp_path):
     """A folder with the partial results of a run."""
     store = store_in(tmp_path)
     store.data["errors"]["a"] = {"db": 20.0}
-    store.keep("image", exact=np.arange(6.0).reshape(2, 3), learned=np.ones(2))
     store.save()
     (tmp_path / "other.txt").write_text("stays")
     return tmp_path
@@ -30,7 +28,6 @@ def interrupted(tmp_path):
 def test_continued(interrupted, capsys):
     store = store_in(interrupted, progress=True)
     assert store.resumed and store.data == {"errors": {"a": {"db": 20.0}}, "rounds": {}}
-    assert np.array_equal(store.arrays["image"]["exact"], np.arange(6.0).reshape(2, 3))
     assert capsys.readouterr().err == f"continuing from {interrupted / 'tradeoff_small.partial.json'}\n"
     Store.remove(interrupted, "small")
     assert os.listdir(interrupted) == ["other.txt"]
@@ -44,8 +41,6 @@ DAMAGES = {
         json.dumps({**json.loads(path.read_text()), "data": {"errors": 3, "rounds": {}}})
     ),
     "no text": lambda path: path.write_bytes(b"\xff\x00\xfe"),
-    "no array": lambda path: path.with_suffix(".image.npz").unlink(),
-    "array": lambda path: path.with_suffix(".image.npz").write_bytes(b"nothing"),
 }
 
 
@@ -54,7 +49,7 @@ def test_damaged_results_are_discarded(interrupted, damage, capsys):
     path = interrupted / "tradeoff_small.partial.json"
     DAMAGES[damage](path)
     store = store_in(interrupted, progress=True)
-    assert not store.resumed and store.data == {"errors": {}, "rounds": {}} and not store.arrays
+    assert not store.resumed and store.data == {"errors": {}, "rounds": {}}
     assert capsys.readouterr().err == f"{path} is damaged: starting anew\n"
     assert os.listdir(interrupted) == ["other.txt"]
 
@@ -71,9 +66,8 @@ def test_another_key_is_named(interrupted, change, capsys):
 def test_without_a_folder_nothing_is_written(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     store = store_in(None)
-    store.keep("image", exact=np.ones(2))
     store.save()
-    assert os.listdir(tmp_path) == [] and store.arrays["image"]["exact"].size == 2
+    assert os.listdir(tmp_path) == []
     with pytest.raises(OutputError, match="does not exist"):
         store_in(tmp_path / "nowhere" / "out")
 

@@ -27,7 +27,6 @@ RUNS = {
     "field": ["balls", "--compression", "120"],
     "ggx": [],
     "image": ["m.json", "--seconds", "1"],
-    "scene": [str(ROOT / "scenes" / "metals.xml"), "-D", "width=32", "-D", "height=16"],
     "scene-training": [str(ROOT / "scenes" / "training_floor.xml")],
     "sdf": ["ball.ply", "--bytes", "24k", "--without", "paper"],
     "shading": ["m.json", "--steps", "2", "--pretrain-steps", "2", "--lambda", "1"],
@@ -94,8 +93,6 @@ def test_quick_runs(study, inputs, tmp_path, monkeypatch, capsys):
     with open(files["csv"], encoding="utf-8", newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert rows and capsys.readouterr().out.endswith(", ".join(files.values()) + "\n")
-    if study == "scene":
-        return
     assert {row["candidate"] for row in rows} == set(result["candidates"])
     for name, c in result["candidates"].items():
         assert all(v is None or math.isfinite(v) for v in c["errors"].values()), name
