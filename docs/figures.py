@@ -114,21 +114,6 @@ def equal_samples(study: Entries, stage: str, name: str, sampling: str = "") -> 
     return count
 
 
-def speed(study: Entries, case: str, name: str, against: str) -> str:
-    """Return the time of a bitmap with the error of a candidate over the candidate's time; "> " before a lower bound.
-
-    ``against`` is the sampling of the bitmap.
-    """
-    accuracy, times = study.cases[case].accuracy, study.cases[case].passes.render
-    curve = sorted(
-        (times[n].time, c.errors[accuracy])
-        for n, c in study.candidates.items()
-        if n in times and accuracy in c.errors and (c.representation == against or n == "bitmap, 1 spp")
-    )
-    time = reach(curve, study.candidates[name].errors[accuracy])
-    return f"{time / times[name].time:.1f}" if time else f"> {curve[-1][0] / times[name].time:.1f}"
-
-
 def every(pattern: str) -> list[Entries]:
     """Return the files whose names match a pattern, in the order of their names."""
     return [measured(path.stem) for path in sorted((DOCS / "measured").glob(f"{pattern}.json"))]
@@ -353,7 +338,7 @@ FUNCTIONS = {
     f.__name__: f
     for f in (
         min, max, sum, len, round, abs, all, any, sorted, next, iter, zip, map, list, dict, range, tuple, float,
-        Entries, measured, every, one, ratio, time_over, equal_samples, speed, cells, median, with_spread,
+        Entries, measured, every, one, ratio, time_over, equal_samples, cells, median, with_spread,
         size_text, binary_size, asset_bytes, equal_quality, scene_runs, with_network, budgets, by_label,
         surface_errors, trust_cell, shading_runs, trouble, shading_best, shading, shading_level, shading_spread, flip,
         held_out, shipped, trust_cells,

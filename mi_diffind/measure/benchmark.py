@@ -105,7 +105,7 @@ def measure(
         "cases": {
             case.name: _times(plan, settings, case, store.data)
             for case in plan.cases
-            if store.data["queries"].get(case.name)
+            if store.data["queries"].get(case.name) or store.data["passes"].get(case.name)
         },
         "jobs": {job.name: store.data["jobs"][job.name] for job in plan.jobs if job.name in store.data["jobs"]},
     }

@@ -1,4 +1,4 @@
-"""Renders and reads that studies measure: textured scenes without noise, moving cameras, queries of BSDFs.
+"""Renders and reads that studies measure: textured scenes without noise, a moving camera, queries of BSDFs.
 
 The material of a :class:`TextureScene` is ``diffuse`` under a ``directional`` light, which a path tracer samples
 deterministically: samples of a pixel differ only in the position at which the texture is read. The irradiance is such
@@ -10,13 +10,12 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.ndimage import map_coordinates
 
 from ..core.compat import ray_flags
 from ..images import srgb
@@ -89,18 +88,13 @@ class TextureScene:
         """Return each pixel's area in uv², ``(height, width)``, and whether its corners are on the surface."""
         width, height = film
         x, y = np.meshgrid(np.arange(width + 1) / width, np.arange(height + 1) / height)
-        uv, hit = self.trace(film, x.ravel(), y.ravel())
-        uv, hit = uv.reshape(height + 1, width + 1, 2), hit.reshape(height + 1, width + 1)
+        si = self.hits(mi.load_dict(self.scene({"type": "rgb", "value": 0.5}, film)), x.ravel(), y.ravel())
+        uv, hit = np.array(si.uv, np.float64).T.reshape(height + 1, width + 1, 2), np.array(si.is_valid())
+        hit = hit.reshape(height + 1, width + 1)
         inside = hit[:-1, :-1] & hit[1:, :-1] & hit[:-1, 1:] & hit[1:, 1:]
         a, b = uv[1:, 1:] - uv[:-1, :-1], uv[1:, :-1] - uv[:-1, 1:]  # the diagonals
         area = 0.5 * np.abs(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
         return np.where(inside, area, 0), inside
-
-    def trace(self, film: tuple[int, int], x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the surface's uv, ``(n, 2)``, at image positions in [0, 1], and whether a ray hits the surface."""
-        scene = mi.load_dict(self.scene({"type": "rgb", "value": 0.5}, film))
-        si = self.hits(scene, x, y)
-        return np.array(si.uv, np.float64).T, np.array(si.is_valid())
 
     @staticmethod
     def hits(scene, x: np.ndarray, y: np.ndarray):
@@ -162,7 +156,7 @@ class TextureReader:
     scenes: dict = field(default_factory=dict)
 
     def loaded(self, scene: TextureScene, film: tuple[int, int], texture: tuple[int, int]):
-        """Return the Mitsuba scene, loaded once."""
+        """Return the Mitsuba scene, loaded once; the ``texture`` has (width, height) texels."""
         key = (scene.name, film)
         if key not in self.scenes:
             plugin = self.texture(scene.repeats(film, texture))
@@ -200,54 +194,12 @@ def errors(truth: np.ndarray, image: np.ndarray, counted: np.ndarray) -> dict[st
     return {"mse": float(np.mean(difference**2)), "flip": float(np.asarray(values)[..., 0][counted].mean())}
 
 
-#: Points of the plane along x and along y at which flicker is measured.
-POINTS = 96
-
-#: Frames in a row of a picture.
-SHOWN_FRAMES = 5
-
 #: Ratio of the distances of :class:`TextureZoom`'s camera to the plane in the first and in the last frame.
 NEARER = 2.0
 
 
-class MovingView:
-    """A number of ``frames`` that a camera renders while it moves towards a plane; the base class of zooms.
-
-    The frames are aligned by reprojection: a grid of points of the plane, visible in every frame, is projected into
-    each frame, where the image is read with bilinear interpolation. *Flicker* is the variance of a point's displayed
-    values over the frames, averaged over points and channels. The truth's flicker is not zero, since a point shows more
-    detail the nearer the camera is; the flicker of the difference to the truth's frames is therefore measured, too.
-    """
-
-    frames: int
-
-    def places(self, frame: int) -> np.ndarray:
-        """Return the positions in a frame of the :data:`POINTS` × :data:`POINTS` points, row by row, ``(n, 2)``.
-
-        Positions are x and y in pixels; the centre of the first pixel is at 0.5.
-        """
-        raise NotImplementedError
-
-    def aligned(self, images: np.ndarray) -> np.ndarray:
-        """Return the values of the points in each frame, ``(frames, n, channels)``."""
-        return np.stack([bilinear(image, self.places(k)) for k, image in enumerate(images)])
-
-    def errors(self, images: np.ndarray, truth: np.ndarray) -> dict[str, float]:
-        """Return ``flicker`` of the frames, and ``flicker_error`` of their difference to the truth's frames."""
-        points = self.aligned(images)
-        return {"flicker": flicker(points), "flicker_error": flicker(points - self.aligned(truth))}
-
-    def rows(self, strips: Mapping[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
-        """Return rows of pictures (:func:`.plot.draw_images`): some frames of each strip."""
-        shown = np.unique(np.linspace(0, self.frames - 1, SHOWN_FRAMES).round().astype(int))
-        return {
-            f"{name}\nflicker {flicker(self.aligned(images)):.1e}": {f"frame {k + 1}": images[k] for k in shown}
-            for name, images in strips.items()
-        }
-
-
 @dataclass(frozen=True)
-class TextureZoom(MovingView):
+class TextureZoom:
     """A zoom into a scene: ``frames`` of a ``film`` (width, height), with a ``texture`` of (width, height) texels."""
 
     scene: TextureScene
@@ -261,51 +213,16 @@ class TextureZoom(MovingView):
         distance = NEARER ** (-np.arange(self.frames) / max(self.frames - 1, 1))
         return target + distance[:, None] * (start - target)
 
-    def render(self, reader: TextureReader, seed: int = 0) -> np.ndarray:
+    def render(self, reader: TextureReader) -> np.ndarray:
         """Return the frames as displayed, ``(frames, height, width, 3)``, each with its own random numbers."""
         loaded = reader.loaded(self.scene, self.film, self.texture)
         parameters, images = mi.traverse(loaded), []
-
-        def move(origin) -> None:
+        for k, origin in enumerate(self.origins()):
             parameters["sensor.to_world"] = mi.Transform4f(self.scene.camera_at(origin))
             parameters.update()
             reader.prepare(loaded)
-
-        for k, origin in enumerate(self.origins()):
-            move(origin)
-            images.append(displayed(mi.render(loaded, spp=reader.spp, seed=(seed << 12) + k)))
-        move(self.scene.origin)
+            images.append(displayed(mi.render(loaded, spp=reader.spp, seed=k)))
         return np.stack(images)
-
-    def points(self) -> np.ndarray:
-        """Return points of the plane, ``(n, 3)``, well within the last frame, and so within all."""
-        last = self.origins()[-1]
-        x, y = np.meshgrid(*[np.linspace(0.06, 0.94, POINTS)] * 2)
-        axes = np.array(self.scene.camera_at(last).matrix, float)[:3, :3].T  # rows: right to left, up, forward
-        tangent = np.tan(np.radians(self.scene.fov) / 2)
-        width, height = tangent, tangent * self.film[1] / self.film[0]
-        rays = np.stack([(1 - 2 * x) * width, (1 - 2 * y) * height, np.ones_like(x)], -1).reshape(-1, 3) @ axes
-        return last + rays * (-last[1] / rays[:, 1:2])  # the plane is y = 0
-
-    def places(self, frame: int) -> np.ndarray:
-        origin = self.origins()[frame]
-        axes = np.array(self.scene.camera_at(origin).matrix, float)[:3, :3]
-        local = (self.points() - origin) @ axes
-        slope = local[:, :2] / local[:, 2:] / np.tan(np.radians(self.scene.fov) / 2)
-        slope[:, 1] *= self.film[0] / self.film[1]
-        return (1 - slope) / 2 * self.film
-
-
-def flicker(points: np.ndarray) -> float:
-    """Return the variance over frames of aligned ``points``, ``(frames, n, channels)``, averaged over the rest."""
-    return float(np.var(points, axis=0, dtype=np.float64).mean())
-
-
-def bilinear(image: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Return the values of an image, ``(height, width, channels)``, at ``places`` in pixels, ``(n, 2)``; clamped."""
-    x, y = places.T - 0.5
-    channels = np.moveaxis(image.astype(np.float64), -1, 0)
-    return np.stack([map_coordinates(channel, (y, x), order=1, mode="nearest") for channel in channels], -1)
 
 
 #: Methods of a BSDF that are timed.

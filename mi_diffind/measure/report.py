@@ -141,10 +141,12 @@ def summary(result: dict) -> list[str]:
     for case, measured in result["cases"].items():
         timings = {f"{query}, ns": t for query, t in measured["queries"].items()}
         timings |= {f"{query}, ms": t for query, t in measured["passes"].items()}
-        cells, first = [["", *timings, "flops", "reads"]], next(iter(measured["queries"].values()))
+        first = next(iter(measured["queries"].values()), {})
+        counted = {"flops": "flops", "reads": "gathers"} if first else {}
+        cells = [["", *timings, *counted]]
         for name in dict.fromkeys(name for by_name in timings.values() for name in by_name):
             operations = first.get(name, {}).get("operations", {})
-            counts = (str(operations.get(key, "")) for key in ("flops", "gathers"))
+            counts = (str(operations.get(key, "")) for key in counted.values())
             cells.append([name, *(time_cell(by_name.get(name)) for by_name in timings.values()), *counts])
         lines += ["", f"{case}: floor subtracted; ± half the interquartile range", *grid(cells)]
     s = result["settings"]

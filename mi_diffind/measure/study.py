@@ -122,9 +122,9 @@ class Case:
 
     ``queries(lanes)`` returns query → name of a candidate, or :data:`FLOOR` → function. ``passes()``, if given, returns
     name of a candidate → function of the pass number that does one whole pass, such as a render. Both are called when
-    they are needed; names that are no candidates are left out. ``in_picture``: the case has a panel, of the error
-    ``accuracy`` (default: the plan's first measure) against the time of a pass, or without ``passes`` of its first
-    query. ``details`` go to the result.
+    they are needed; names that are no candidates are left out. A case of passes may have no queries. ``in_picture``:
+    the case has a panel, of the error ``accuracy`` (default: the plan's first measure) against the time of a pass, or
+    without ``passes`` of its first query. ``details`` go to the result.
     """
 
     name: str

@@ -8,8 +8,7 @@ Filtered textures take one sample per pixel: trilinear at a random position, or 
 pixel's centre.
 
 *Errors* are those of displayed values in pixels entirely on the surface; a scene counts those that are minified, or
-magnified. *Levels*: the error of each level of detail at its texel centres, of all maps. *Flicker*:
-:class:`~mi_diffind.measure.renders.MovingView`. *Time*: kernels that read the map where a scene shows it, and renders.
+magnified. *Levels*: the error of each level of detail at its texel centres, of all maps. *Time*: that of renders.
 """
 
 from __future__ import annotations
@@ -18,33 +17,28 @@ import argparse
 import contextlib
 import functools
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 from types import SimpleNamespace
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..arrays.tables import Table
 from ..core.arguments import positive
 from ..core.runtime import array_module
 from ..core.units import parse_compression
-from ..fitting import task
 from ..fitting.task import FitSettings
 from ..maps.pyramid import FilteredMaps, Pyramid, decibel
 from ..maps.source import Map, Source, load_source
 from ..measure import plot, renders
-from ..measure.renders import TextureReader, TextureScene, TextureZoom
+from ..measure.renders import TextureReader, TextureScene
 from ..measure.report import figure_caption
-from ..measure.store import fingerprint
-from ..measure.study import FLOOR, Candidate, Case, Job, Measure, Plan, Study
-from ..measure.training import Contender, NetworkContender, load_arrays
+from ..measure.study import Candidate, Case, Job, Measure, Plan, Study
+from ..measure.training import Contender, NetworkContender
 from ..plugins.support.image_files import PYRAMIDS
 from ..scenes.loading import footprint
-from ..tasks.texture import compressed, fit
 from . import equal_memory
 from .baselines import codecs, networks
 
@@ -53,50 +47,35 @@ BITMAP = "bitmap"
 MULTIJITTERED = "bitmap, multijittered"
 MIPMAP = "mip maps, uncompressed"
 OURS = "ours"
-PAPER = "paper's preset"
 ASTC = "ASTC with mip maps"
 NETWORK = "network"
-METHODS = (BITMAP, MULTIJITTERED, MIPMAP, OURS, PAPER, ASTC, NETWORK)
 
 #: The bitmap that ratios refer to.
 BASE = "bitmap, 1 spp"
 
-#: Samples per pixel of bitmaps.
-COUNTS = (1, 4, 16, 64)
+#: Sampler of bitmaps → name of the method, and samples per pixel.
+SAMPLERS = {"independent": (BITMAP, (1, 4, 16, 64)), "multijitter": (MULTIJITTERED, (4, 16, 64))}
 
-#: Filter of a candidate → parameters of the plugin, and whether samples are at the centres of pixels.
+#: Filter of a candidate → parameters of the plugin, and options of its :func:`reader`.
 FILTERS = {
-    "trilinear": ({"filter": "trilinear"}, False),
-    "anisotropic, centred": ({"filter": "anisotropic", "max_anisotropy": 4}, True),
-}
-
-#: Presets with the distributions of footprints that they are trained with beside their own (ours: by level; the
-#: paper's: powers).
-FOOTPRINTS = (("ours", "power"), ("ours", "exponential"), ("paper", "exponential"))
-
-#: Multijittered samples per pixel of the zoom's truth; its noise is below 1% of any flicker that filtering leaves.
-ZOOM_SPP = 64
-
-#: Seed of the truth, far from those of candidates.
-TRUTH_SEED = 1 << 20
+    "trilinear": ({"filter": "trilinear"}, {}),
+    "anisotropic, centred": (
+        {"filter": "anisotropic", "max_anisotropy": 4}, {"path": {"type": "path_footprint", "jitter": False}}
+    ),
+}  # fmt: skip
 
 #: Steps of the first and of the longest training of a network.
 NETWORK_STEPS = (1000, 16000)
 
-
-def add_astc_option(parser: argparse.ArgumentParser) -> None:
-    """Add the option ``--astc``, the preset of the encoder."""
-    parser.add_argument(
-        "--astc", choices=("fast", "medium", "thorough", "exhaustive"), default="exhaustive",
-        help="preset of the ASTC encoder (default: exhaustive; faster ones are up to several dB worse)",
-    )  # fmt: skip
+#: Seed of the truth, far from those of candidates.
+TRUTH_SEED = 1 << 20
 
 
 class TextureStudy(Study):
     """Error and time of renders with filtered, compressed textures against supersampled bitmaps."""
 
     name = "texture"
-    title = "a texture that filters itself, in renders, levels and flicker"
+    title = "a texture that filters itself, in renders and levels of detail"
     example = "material.json"
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
@@ -106,50 +85,31 @@ class TextureStudy(Study):
         )  # fmt: skip
         parser.add_argument(
             "--compression", action="append", default=[], metavar="N",
-            help="compression ratio; may be repeated (default: 12x, 3x, 6x and 24x; --quick: 12x)",
-        )  # fmt: skip
-        parser.add_argument(
-            "--table", action="append", default=[], metavar="FILE.npz",
-            help="use a trained table of the source (trained with --border repeat, as in the renders) in place of a "
-            "training; may be repeated; nothing is trained unless --compression is given, too",
+            help="compression ratio; may be repeated (default: 12x, 3x and 24x; --quick: 12x)",
         )  # fmt: skip
         parser.add_argument("--seconds", type=positive, metavar="N",
                             help="seconds of each training (default: 60; --quick: 2)")  # fmt: skip
-        add_astc_option(parser)
-        parser.add_argument("--footprints", action="store_true",
-                            help="also train with each distribution of footprints and draw both")  # fmt: skip
-        parser.add_argument("--only", action="append", default=[], choices=METHODS, metavar="METHOD",
-                            help=f"measure only one method ({'; '.join(METHODS)}); may be repeated")  # fmt: skip
-        parser.add_argument("--frames", type=positive, metavar="N", help="frames of the zoom (default: 60; --quick: 6)")
-        parser.add_argument("--width", type=positive, metavar="N",
-                            help="width of the stills; the height is 2/3 (default: 480; --quick: 96)")  # fmt: skip
 
     def check(self, arguments) -> None:
-        """Check the options and load the source and tables; raise as :func:`.load_source` does."""
-        default = () if arguments.table else (12.0,) if arguments.quick else (12.0, 3.0, 6.0, 24.0)
+        """Check the options and load the source; raise as :func:`.load_source` does."""
+        default = (12.0,) if arguments.quick else (12.0, 3.0, 24.0)
         arguments.compressions = tuple(map(parse_compression, arguments.compression)) or default
         arguments.loaded = load_source(arguments.source)
         colour_map(arguments.loaded)
-        arguments.tables = load_tables(arguments.table, arguments.loaded)
 
     def plan(self, arguments) -> Plan:
         quick = arguments.quick
-        width = arguments.width or (96 if quick else 480)
         settings = SimpleNamespace(
             compressions=arguments.compressions,
             seconds=float(arguments.seconds or (2 if quick else 60)),
-            astc="fast" if quick else arguments.astc,
-            film=(width, max(2, width * 2 // 3)),
-            zoom_film=(max(2, width // 2), max(2, width // 3)),
-            frames=arguments.frames or (6 if quick else 60),
+            astc="fast" if quick else codecs.QUALITY,
+            film=(96, 64) if quick else (300, 200),
             truth_spp=64 if quick else 256,  # square numbers
             seeds=1 if quick else 4,  # renders that errors are averaged over
             scenes=1 if quick else 3,  # number of stills
-            footprints=arguments.footprints,
-            network_steps=(10, 20) if quick else NETWORK_STEPS,  # of the first and of the longest training
-            only=tuple(arguments.only),
+            network_steps=(10, 20) if quick else NETWORK_STEPS,
         )
-        return plan(arguments.loaded, arguments.source, settings, arguments.tables)
+        return plan(arguments.loaded, arguments.source, settings)
 
 
 STUDY = TextureStudy()
@@ -163,21 +123,17 @@ def colour_map(source: Source) -> Map:
     return min(fitting, key=lambda m: m.role != "albedo")
 
 
-def load_tables(paths: Sequence[str], source: Source) -> list[Table]:
-    """Return trained tables. Raises :class:`.TableError`, ``ValueError`` for another source."""
-    tables = [task.tasks()["texture"].load(path) for path in paths]
-    for trained in tables:
-        if trained.settings.get("source") != source.digest:
-            raise ValueError(f"--table: {trained.path} was not trained on this source")
-    return tables
-
-
 def source_details(source: Source, name: str) -> dict:
     """Return what a result's ``details`` record about a source, read from the file ``name``."""
     return {
         "source": name, "source_digest": source.digest, "source_bytes": source.nbytes, "width": source.width,
         "height": source.height, "maps": {m.name: m.channels for m in source.maps},
     }  # fmt: skip
+
+
+def normal_maps(source: Source) -> list[str]:
+    """Return the names of the normal maps of a source."""
+    return [m.name for m in source.maps if m.role == "normal"]
 
 
 # -- Levels of detail as images ----------------------------------------------------------------------------------------
@@ -200,18 +156,17 @@ def level_pyramid(maps: dict[str, list[np.ndarray]], like: Pyramid) -> Pyramid:
     return Pyramid(like.layout, levels, like.types, like.border)
 
 
-def level_errors(truth: dict[str, list[np.ndarray]], maps: dict[str, list[np.ndarray]]) -> dict[str, list[float]]:
-    """Return the PSNR, in dB, of each level at its texel centres: of ``all`` channels together and of each map.
+def level_errors(truth: dict[str, list[np.ndarray]], maps: dict[str, list[np.ndarray]]) -> list[float]:
+    """Return the PSNR of all channels together, in dB, of each level at its texel centres.
 
     Values are those of the source's files, in [0, 1].
     """
-    mse = {
-        name: [float(np.mean((a.astype(np.float64) - b) ** 2)) for a, b in zip(levels, maps[name], strict=True)]
+    mse = [
+        [float(np.mean((a.astype(np.float64) - b) ** 2)) for a, b in zip(levels, maps[name], strict=True)]
         for name, levels in truth.items()
-    }
-    weights = [levels[0].shape[-1] for levels in truth.values()]
-    mse["all"] = np.average(list(mse.values()), axis=0, weights=weights)
-    return {name: [decibel(float(e)) for e in errors] for name, errors in mse.items()}
+    ]
+    mean = np.average(mse, axis=0, weights=[levels[0].shape[-1] for levels in truth.values()])
+    return [decibel(float(e)) for e in mean]
 
 
 # -- Contenders --------------------------------------------------------------------------------------------------------
@@ -233,10 +188,6 @@ class TextureContenders:
         return dict(itertools.islice(renders.still_scenes().items(), self.settings.scenes))
 
     @cached_property
-    def zoom(self) -> TextureZoom:
-        return TextureZoom(renders.zoom_scene(), self.settings.zoom_film, self.size, self.settings.frames)
-
-    @cached_property
     def pyramid(self) -> Pyramid:
         """The uncompressed levels, repeated as bitmaps are."""
         return Pyramid.from_source(self.source, types=array_module(mi.variant()), border=("repeat", "repeat"))
@@ -247,194 +198,128 @@ class TextureContenders:
 
     @cached_property
     def truths(self) -> dict[str, np.ndarray]:
-        """The converged pictures of the scenes, and of the zoom."""
-        bitmap, zoom = self.bitmap(self.settings.truth_spp, "multijitter"), self.bitmap(ZOOM_SPP, "multijitter")
-        truths = {name: self.render(bitmap, scene, TRUTH_SEED) for name, scene in self.scenes.items()}
-        return {**truths, "zoom": self.zoom.render(zoom, TRUTH_SEED >> 12)}
+        """The converged pictures of the scenes."""
+        bitmap = reader(self.bitmap(), self.settings.truth_spp, "multijitter")
+        return {name: self.render(bitmap, scene, TRUTH_SEED) for name, scene in self.scenes.items()}
 
     @property
     def size(self) -> tuple[int, int]:
         """Width and height of the texture."""
         return self.source.width, self.source.height
 
-    def counted(self, scene: TextureScene) -> np.ndarray:
-        return scene.counted(self.settings.film, self.size)
+    def render(self, read: TextureReader, scene: TextureScene, seed: int = 0) -> np.ndarray:
+        return read.render(scene, self.settings.film, self.size, seed)
 
-    def render(self, reader: TextureReader, scene: TextureScene, seed: int = 0) -> np.ndarray:
-        return reader.render(scene, self.settings.film, self.size, seed)
-
-    def errors(self, reader: TextureReader) -> dict[str, float]:
-        """Return the errors of a reader.
-
-        ``psnr_SCENE_db`` and ``flip_SCENE`` are those of the means over seeds; ``flicker`` and ``flicker_error`` those
-        of the zoom.
-        """
+    def errors(self, read: TextureReader) -> dict[str, float]:
+        """Return the errors of a reader, ``psnr_SCENE_db`` and ``flip_SCENE``: those of the means over seeds."""
         errors = {}
         for name, scene in self.scenes.items():
-            counted, truth = self.counted(scene), self.truths[name]
-            each = [renders.errors(truth, self.render(reader, scene, k), counted) for k in range(self.settings.seeds)]
+            counted, truth = scene.counted(self.settings.film, self.size), self.truths[name]
+            each = [renders.errors(truth, self.render(read, scene, k), counted) for k in range(self.settings.seeds)]
             errors[f"psnr_{name}_db"] = decibel(float(np.mean([e["mse"] for e in each])))
             errors[f"flip_{name}"] = float(np.mean([e["flip"] for e in each]))
-        return {**errors, **self.zoom.errors(self.zoom.render(reader), self.truths["zoom"])}
+        return errors
 
-    # -- Candidates
+    def add(self, name: str, method: str, texture: Callable[[], dict], render: dict, **fields) -> None:
+        """Register a candidate; its texture is created once, after the jobs. ``render``: options of its reader."""
+        once = self.readers[name] = functools.cache(lambda: reader(texture(), **render))
+        self.candidates.append(Candidate(name, method, errors=lambda samples: self.errors(once()), **fields))
 
-    def add(self, name: str, method: str, reader: Callable[[], TextureReader], **fields) -> None:
-        """Register a candidate; its reader is created once, after the jobs."""
-        once = self.readers[name] = functools.cache(reader)
-        errors = lambda samples: self.errors(once())  # noqa: E731
-        self.candidates.append(Candidate(name, method, errors=errors, **fields))
+    def add_filtered(self, name: str, method: str, texture: Callable[[], dict], filters=tuple(FILTERS), **fields):
+        """Register a candidate for each filter of a texture that filters itself, at one sample per pixel."""
+        for setting in filters:
+            options, render = FILTERS[setting]
+            more = {**options, "channels": colour_map(self.source).name}
+            plugin = lambda more=more: {**texture(), **more}  # noqa: E731
+            self.add(f"{name}, {setting}", method, plugin, render, setting=setting, **fields)
 
-    def add_filtered(self, name: str, method: str, plugin: Callable[[], dict], filters=tuple(FILTERS), **fields):
-        """Register a candidate for each filter of a plugin that filters itself, at one sample per pixel."""
+    def add_job(self, job: Contender, texture: Callable[[], dict] | None = None, **fields) -> None:
+        """Register a contender with a candidate for each filter, by default of the pyramid that is its model."""
+        self.jobs.append(job)
+        self.add_filtered(job.name, job.method, texture or (lambda: mipmap(job.model)), job=job.name, **fields)
 
-        def reader(filter_name: str) -> TextureReader:
-            options, centred = FILTERS[filter_name]
-            texture = {**plugin(), **options, "channels": colour_map(self.source).name}
-            return TextureReader(
-                lambda repeats: {**texture, "to_uv": renders.to_uv(repeats)},
-                path={"type": "path_footprint", "jitter": False} if centred else None,
-                prepare=footprint.attach,
-            )
-
-        for filter_name in filters:
-            self.add(f"{name}, {filter_name}", method, partial(reader, filter_name), setting=filter_name, **fields)
-
-    def add_bitmaps(self) -> None:
-        """Register Mitsuba's texture with 8 bits at several sample counts."""
-        for sampler, method in (("independent", BITMAP), ("multijitter", MULTIJITTERED)):
-            for spp in COUNTS if sampler == "independent" else COUNTS[1:]:
-                name = f"bitmap, {spp} spp{method.removeprefix(BITMAP)}"
-                self.add(name, method, partial(self.bitmap, spp, sampler), bytes=self.source.nbytes,
-                         setting=f"{spp} spp")  # fmt: skip
-
-    def add_textures(self, tables: Sequence[Table]) -> None:
-        """Register trained textures, those of ``tables`` first, and ASTC in the bytes of each of ours."""
-        settings, cache, textures = self.settings, {}, []
-        for stored in tables:
-            ratio = self.source.nbytes / stored.nbytes
-            method = PAPER if stored.preset == "paper" else OURS
-            textures.append(self.texture(f"{stored.preset} {ratio:.3g}x", method, ratio, table=stored))
-        for compression in settings.compressions:
-            textures.append(self.texture(f"ours {compression:g}x", OURS, compression))
-            if compression == settings.compressions[0]:
-                textures.append(self.texture(f"paper {compression:g}x", PAPER, compression, "paper"))
-        for i, job in enumerate(textures):
-            self.jobs.append(job)
-            fields = {"job": job.name, "in_picture": i == 0 or job.method == OURS}
-            plugin = lambda job=job: {"type": "neural_texture", "filename": str(job.model.table.path)}  # noqa: E731
-            if job.method != OURS:
-                self.add_filtered(job.name, job.method, plugin, ("trilinear",), **fields)
-                continue
-            self.add_filtered(job.name, OURS, plugin, **fields)
-            if "astc" in codecs.available():
-                encoded = self.encoded(job.name.replace("ours", "ASTC"), job, cache)
-                self.jobs.append(encoded)
-                plugin = partial(mipmap, lambda job=encoded: job.model)
-                self.add_filtered(encoded.name, ASTC, plugin, **{**fields, "job": encoded.name, "in_picture": i == 0})
-        for preset, samples in FOOTPRINTS if settings.footprints and settings.compressions else ():
-            name = f"{preset} {settings.compressions[0]:g}x, {samples} footprints"
-            self.jobs.append(self.texture(name, "footprints", settings.compressions[0], preset, samples=samples))
-
-    def add_network(self) -> None:
-        """Register a network in the bytes of our texture at the first ratio, unless they are too few for one."""
-        for compression in self.settings.compressions[:1]:
-            with contextlib.suppress(ValueError):
-                job = self.network(compression)
-                self.jobs.append(job)
-                plugin = partial(mipmap, lambda job=job: job.model)
-                self.add_filtered(job.name, NETWORK, plugin, ("trilinear",), job=job.name)
+    def bitmap(self) -> dict:
+        """Return Mitsuba's texture with 8 bits."""
+        m = colour_map(self.source)
+        data = mi.Bitmap(np.ascontiguousarray(np.rint(m.values * 255).astype(np.uint8)))
+        return {"type": "bitmap", "bitmap": data, "raw": m.color_space != "srgb"}
 
     # -- Jobs
 
-    def bitmap(self, spp: int = 1, sampler: str = "independent") -> TextureReader:
-        """Return the reader of Mitsuba's texture with 8 bits."""
-        m = colour_map(self.source)
-        data = mi.Bitmap(np.ascontiguousarray(np.rint(m.values * 255).astype(np.uint8)))
-        bitmap = {"type": "bitmap", "bitmap": data, "raw": m.color_space != "srgb"}
-        return TextureReader(lambda repeats: {**bitmap, "to_uv": renders.to_uv(repeats)}, spp, sampler)
-
-    def record(self, method: str, budget: float, nbytes: int, seconds: float | None, maps: dict, **details) -> dict:
+    def record(self, nbytes: int, seconds: float | None, maps: dict, **details) -> dict:
         """Return the record of compressed ``maps``, name → decoded levels, with the errors of levels."""
-        details |= {"compression": budget, "ratio": self.source.nbytes / nbytes, "kind": method}
-        details["levels"] = level_errors(self.truth_levels, maps)
+        details |= {"ratio": self.source.nbytes / nbytes, "levels": {"all": level_errors(self.truth_levels, maps)}}
         return {"bytes": nbytes, "seconds": seconds, "details": details}
 
-    def texture(self, name: str, method: str, budget: float, preset: str = "", table: Table | None = None,
-                samples: str | None = None) -> Contender:  # fmt: skip
-        """Return the contender of a texture that a preset of ``fit texture`` trains, or that is in a ``table``.
-
-        ``samples`` is a distribution of footprints. Its model has the attribute ``image``.
-        """
+    def trained(self, compression: float) -> Contender:
+        """Return the contender that ``fit texture`` trains."""
 
         def fit(job: Contender, progress: bool) -> dict | None:
-            seconds = None if table is None else table.settings.get("seconds")
-            if table is None:
-                arguments = {
-                    "source": self.name, "compression": budget, "seconds": self.settings.seconds,
-                    "footprint_samples": samples, "border": "repeat",  # as the scenes repeat it
-                }  # fmt: skip
-                trained = equal_memory.fit_preset(job, progress, "texture", "image", preset, arguments)
-                if trained is None:
-                    return None
-                job.model, fitted = trained
-                seconds = fitted.result.seconds
-            stored, maps = job.model.table, level_images(job.model.image)
-            return self.record(method, budget, stored.nbytes, seconds, maps, file=Path(stored.path or job.file).name,
-                               preset=stored.preset, steps=stored.settings.get("steps"))  # fmt: skip
+            arguments = {"source": self.name, "compression": compression, "seconds": self.settings.seconds,
+                         "border": "repeat"}  # fmt: skip
+            outcome = equal_memory.fit_preset(job, progress, "texture", "image", "", arguments)
+            if outcome is None:
+                return None
+            model, fitted = outcome
+            seconds, steps = fitted.result.seconds, fitted.result.steps
+            return self.record(model.table.nbytes, seconds, level_images(model.image), steps=steps)
 
-        def read(job: Contender):
-            return task.tasks()["texture"].open(mi.TensorXf, str(job.file if table is None else table.path))
+        name = f"ours {compression:g}x"
+        return Contender(name, OURS, compression, fit, lambda job: equal_memory.open_preset(job, "texture").image)
 
-        return Contender(name, method, budget, fit, read, has_file=table is None)
-
-    def encoded(self, name: str, equal_to: Contender, cache: dict) -> Contender:
+    def encoded(self, equal_to: Contender, cache: dict) -> Contender:
         """Return the contender of all levels in ASTC, in the bytes of another; ``cache`` is shared by all budgets."""
 
+        def encode() -> tuple[dict[str, codecs.Encoded], int]:
+            nbytes, normals = equal_to.record["bytes"], normal_maps(self.source)
+            return codecs.astc_levels(self.truth_levels, nbytes, self.settings.astc, normals, cache=cache)
+
         def fit(job: Contender, progress: bool) -> dict:
-            normals = [m.name for m in self.source.maps if m.role == "normal"]
-            nbytes = equal_to.model.table.nbytes
-            encoded, nbytes = codecs.astc_levels(self.truth_levels, nbytes, self.settings.astc, normals, cache=cache)
-            maps = {name: e.levels for name, e in encoded.items()}
-            job.model = level_pyramid(maps, self.pyramid)
-            job.save_arrays(**{f"level_{i}": values for i, values in enumerate(job.model.values)})
-            how = ", ".join(f"{name} {e.codec}" for name, e in encoded.items())
-            return self.record(ASTC, job.budget, nbytes, None, maps, how=how)
+            maps, nbytes = encode()
+            how = ", ".join(f"{name} {e.codec}" for name, e in maps.items())
+            return self.record(nbytes, None, {name: e.levels for name, e in maps.items()}, how=how)
 
         def read(job: Contender) -> Pyramid:
-            arrays, like = load_arrays(job.file), self.pyramid
-            return Pyramid(like.layout, [arrays[f"level_{i}"] for i in range(like.levels)], like.types, like.border)
+            return level_pyramid({name: e.levels for name, e in encode()[0].items()}, self.pyramid)
 
-        return Contender(name, ASTC, equal_to.budget, fit, read, details={"equal_to": equal_to.name})
-
-    def network(self, budget: float) -> NetworkContender:
-        """Return the contender of a hash grid and network in half precision, trained to convergence.
-
-        Its model is the pyramid of its levels, decoded. Raises ``ValueError`` if the bytes are too few.
-        """
-        pyramid, (first, longest) = self.pyramid, self.settings.network_steps
-        net = networks.texture_network(pyramid.layout, self.source.nbytes / budget, pyramid.levels)
-
-        def levels(trained) -> dict[str, list[np.ndarray]]:
-            return level_images(networks.NetworkMaps(trained, pyramid))
-
-        def finish(trained, record: dict) -> dict:
-            return self.record(
-                NETWORK, budget, 2 * record["entries"], sum(run["seconds"] for run in record["runs"]), levels(trained),
-                steps=record["steps"], steps_first=first, steps_longest=longest, batch=settings.batch,
-            )  # fmt: skip
-
-        settings = FitSettings(steps=first, batch=2**14, lr=1e-2, schedule="cosine", loss="mse", seed=1)
-        return NetworkContender(
-            f"network {budget:g}x", NETWORK, budget, NETWORK, "", lambda net: level_pyramid(levels(net), pyramid),
-            lambda: networks.TextureNetworkProblem(net, pyramid, self.source.digest), settings, longest, 5, True,
-            finish,
-        )  # fmt: skip
+        name = equal_to.name.replace("ours", "ASTC")
+        return Contender(name, ASTC, equal_to.budget, fit, read, has_file=False)
 
 
-def mipmap(model: Callable[[], Pyramid]) -> dict:
+def network_contender(
+    source: Source, pyramid: Pyramid, levels: int, compression: float, steps: tuple[int, int], record: Callable
+) -> NetworkContender:
+    """Return the contender of a hash grid and network in half precision, trained to convergence.
+
+    The network has ``levels`` levels of detail of the ``pyramid``; the contender's model is that of its decoded levels.
+    ``steps`` are those of the first and of the longest training. ``record(nbytes, seconds, maps, **details)`` returns
+    the record of decoded levels by map. Raises ``ValueError`` if the bytes are too few.
+    """
+    net = networks.texture_network(pyramid.layout, source.nbytes / compression, levels)
+    settings = FitSettings(steps=steps[0], batch=2**14, lr=1e-2, schedule="cosine", loss="mse", seed=1)
+
+    def decode(trained) -> dict[str, list[np.ndarray]]:
+        return level_images(networks.NetworkMaps(trained, pyramid))
+
+    def finish(trained, trainings: dict) -> dict:
+        seconds, details = sum(run["seconds"] for run in trainings["runs"]), {"steps_longest": steps[1]}
+        return record(2 * trainings["entries"], seconds, decode(trained), steps=trainings["steps"], **details)
+
+    return NetworkContender(
+        f"network {compression:g}x", NETWORK, compression, NETWORK, "",
+        lambda trained: level_pyramid(decode(trained), pyramid),
+        lambda: networks.TextureNetworkProblem(net, pyramid, source.digest), settings, steps[1], 5, True, finish,
+    )  # fmt: skip
+
+
+def reader(texture: dict, spp: int = 1, sampler: str = "independent", path: dict | None = None) -> TextureReader:
+    """Return the reader of a texture that is repeated in scenes."""
+    plugin = lambda repeats: {**texture, "to_uv": renders.to_uv(repeats)}  # noqa: E731
+    return TextureReader(plugin, spp, sampler, path, footprint.attach)
+
+
+def mipmap(pyramid: Pyramid) -> dict:
     """Return the plugin of a pyramid."""
-    pyramid = model()
     name = f"study {id(pyramid)}"
     PYRAMIDS[name] = pyramid
     return {"type": "mipmap", "pyramid": name}
@@ -443,111 +328,87 @@ def mipmap(model: Callable[[], Pyramid]) -> dict:
 # -- The plan ----------------------------------------------------------------------------------------------------------
 
 
-def plan(source: Source, name: str, settings: SimpleNamespace, tables: Sequence[Table] = ()) -> Plan:
-    """Return the plan for ``source``, read from the file ``name``, in the current variant; ``tables`` are trained."""
-    context = TextureContenders(source, name, settings)
-    context.add_bitmaps()
-    context.add_filtered("mipmap", MIPMAP, partial(mipmap, lambda: context.pyramid), bytes=context.pyramid.nbytes)
-    context.add_textures(tables)
-    context.add_network()
-    candidates, jobs = context.candidates, context.jobs
-    if settings.only:
-        candidates = [c for c in candidates if c.representation in settings.only]
-        needed = {c.job for c in candidates}
-        needed |= {job.details.get("equal_to") for job in jobs if job.name in needed}
-        jobs = [job for job in jobs if job.name in needed]
+def plan(source: Source, name: str, settings: SimpleNamespace) -> Plan:
+    """Return the plan for ``source``, read from the file ``name``, in the current variant."""
+    context, cache = TextureContenders(source, name, settings), {}
+    for sampler, (method, counts) in SAMPLERS.items():
+        for spp in counts:
+            title = f"bitmap, {spp} spp{method.removeprefix(BITMAP)}"
+            render = {"spp": spp, "sampler": sampler}
+            context.add(title, method, context.bitmap, render, bytes=source.nbytes, setting=f"{spp} spp")
+    context.add_filtered("mipmap", MIPMAP, lambda: mipmap(context.pyramid), bytes=4 * context.pyramid.nbytes)
+    for i, compression in enumerate(settings.compressions):
+        ours = context.trained(compression)
+        context.add_job(ours, lambda job=ours: {"type": "neural_texture", "filename": str(job.file)})
+        if "astc" in codecs.available():
+            context.add_job(context.encoded(ours, cache), in_picture=i == 0)
+    with contextlib.suppress(ValueError):  # too few bytes for a network
+        levels, compression = context.pyramid.levels, settings.compressions[0]
+        trained = (source, context.pyramid, levels, compression, settings.network_steps, context.record)
+        context.add_job(network_contender(*trained), filters=("trilinear",), in_picture=False)
+    measures = [(Measure(f"PSNR ({s}), dB", f"psnr_{s}_db"), Measure(f"FLIP {s}", f"flip_{s}", ".4f", False))
+                for s in context.scenes]  # fmt: skip
     note = (
         f"{name}, {source.width} × {source.height}, {len(source.maps)} map(s), of which {colour_map(source).name} is "
-        "rendered. PSNR of displayed values. Bytes are those of all maps, with mip maps but for bitmaps."
+        "rendered. PSNR of displayed values. spp: samples a pixel; filtered textures take one. Bytes are those of all "
+        "maps, with mip maps but for bitmaps; uncompressed mip maps are held as floats."
     )
-    digests = [fingerprint([t.path]) for t in tables]
-    measures = [(Measure(f"PSNR {s}", f"psnr_{s}_db"), Measure(f"FLIP {s}", f"flip_{s}", ".4f", False))
-                for s in context.scenes]  # fmt: skip
-    flicker = (Measure("flicker", "flicker", ".3e", False), Measure("beside truth", "flicker_error", ".3e", False))
     return Plan(
         study="texture",
-        title=f"Filtered texture: {Path(name).stem}",
-        candidates=candidates,
-        cases=[_case(context, scene, candidates) for scene in context.scenes.values()],
-        ratios=[(c.name, BASE) for c in candidates if c.name != BASE],
+        title=f"Filtered texture {Path(name).stem} beside bitmaps",
+        candidates=context.candidates,
+        cases=[_case(context, scene) for scene in context.scenes.values()],
+        ratios=[(c.name, BASE) for c in context.candidates if c.name != BASE],
         details={
             **source_details(source, name),
             "request": vars(settings),
-            "tables": digests,
             "codecs": list(codecs.available()),
-            "counted": {n: float(context.counted(s).mean()) for n, s in context.scenes.items()},
+            "counted": {n: float(s.counted(settings.film, context.size).mean()) for n, s in context.scenes.items()},
         },
         notes=[note, *codecs.install_notes(["astc"])],
-        jobs=jobs,
-        jobs_fingerprint=f"{source.digest} {vars(settings)} {digests}",
-        pictures={
-            "crops": partial(draw_crops, context),
-            "zoom": partial(draw_zoom, context),
-            "levels": partial(draw_levels, context),
-        },
-        measures=(*itertools.chain(*measures), *flicker),
+        jobs=context.jobs,
+        jobs_fingerprint=f"{source.digest} {vars(settings)}",
+        pictures={"crops": partial(draw_crops, context), "levels": draw_levels},
+        measures=tuple(itertools.chain(*measures)),
     )
 
 
-def _case(context: TextureContenders, scene: TextureScene, candidates: list[Candidate]) -> Case:
-    """Return the case of a scene: reads of the map where the scene shows it, and whole renders."""
-    film, readers = context.settings.film, context.readers
-    repeats = scene.repeats(film, context.size)
-
-    def reads(lanes: int) -> dict:
-        loaded = readers[BASE]().loaded(scene, film, context.size)
-        width = max(1, round((1.5 * lanes) ** 0.5))
-        index = np.arange(lanes)
-        si = scene.hits(loaded, (index % width + 0.5) / width, (index // width + 0.5) / -(-lanes // width))
-        dr.make_opaque(si.uv, si.p, si.dp_du, si.dp_dv, si.wi, si.sh_frame, si.duv_dx, si.duv_dy)
-        cone = footprint.Cone.from_sensor(loaded.sensors()[0])
-        functions = {FLOOR: lambda: [si.uv.x, si.uv.y]}
-        for c in candidates:
-            if c.name == BASE or c.setting in FILTERS:
-                texture = mi.load_dict(readers[c.name]().texture(repeats))
-                if hasattr(texture, "set_cone"):
-                    texture.set_cone(cone)
-                functions[c.name] = lambda t=texture: t.eval(si)
-        return {"read": functions}
+def _case(context: TextureContenders, scene: TextureScene) -> Case:
+    """Return the case of a scene: whole renders. ``bench_texture.py`` times reads."""
 
     def passes() -> dict:
         functions = {}
-        for c in candidates:
-            reader = readers[c.name]()
-            loaded = reader.loaded(scene, film, context.size)
-            functions[c.name] = lambda k, s=loaded, spp=reader.spp: mi.render(s, spp=spp, seed=k)
+        for name, once in context.readers.items():
+            loaded, spp = once().loaded(scene, context.settings.film, context.size), once().spp
+            functions[name] = lambda k, s=loaded, spp=spp: mi.render(s, spp=spp, seed=k)
         return functions
 
-    return Case(
-        scene.name, reads, passes, accuracy=f"psnr_{scene.name}_db", in_picture=not scene.magnified,
-        details={"repeats": repeats, "magnified": scene.magnified},
-    )  # fmt: skip
+    accuracy, in_picture = f"psnr_{scene.name}_db", not scene.magnified
+    return Case(scene.name, lambda lanes: {}, passes, accuracy=accuracy, in_picture=in_picture)
 
 
 # -- Pictures ----------------------------------------------------------------------------------------------------------
 
 
-def shown_readers(context: TextureContenders, result: dict) -> dict[str, TextureReader]:
-    """Return the readers in pictures: bitmaps, uncompressed mip maps, and ours and ASTC at the first budget."""
-    names = list(result["candidates"])
-    centred = [next((n for n in names if n.startswith(s) and n.endswith("centred")), "")
-               for s in ("mipmap", "ours", "ASTC")]  # fmt: skip
-    return {n: context.readers[n]() for n in (BASE, "bitmap, 64 spp", *centred) if n in names}
-
-
 def draw_crops(context: TextureContenders, result: dict):
-    """Draw an enlarged part of each still, that with the largest error of the first reader, by each and the truth."""
+    """Draw an enlarged part of each still, that with the largest error of the first candidate, and the truth.
+
+    Candidates are bitmaps, and the first with anisotropic filtering of each method.
+    """
     from scipy.ndimage import uniform_filter
 
-    side, rows, readers = max(8, context.settings.film[1] * 2 // 5), {}, shown_readers(context, result)
+    side, rows, shown = max(8, context.settings.film[1] * 2 // 5), {}, {"": BASE, "64": "bitmap, 64 spp"}
+    for name, c in result["candidates"].items():
+        if c["setting"] == "anisotropic, centred":
+            shown.setdefault(c["representation"], name)
     for name, scene in context.scenes.items():
-        truth = context.truths[name]
+        truth, counted = context.truths[name], scene.counted(context.settings.film, context.size)
         images = {
-            f"{reader}\n{result['candidates'][reader]['errors'][f'psnr_{name}_db']:.1f} dB":
-            context.render(read, scene) for reader, read in readers.items()
+            f"{n}\n{result['candidates'][n]['errors'][f'psnr_{name}_db']:.1f} dB":
+            context.render(context.readers[n](), scene) for n in shown.values()
         }  # fmt: skip
         images[f"truth\n{context.settings.truth_spp} spp, multijittered"] = truth
-        error = ((next(iter(images.values())) - truth) ** 2).sum(axis=-1) * context.counted(scene)
+        error = ((next(iter(images.values())) - truth) ** 2).sum(axis=-1) * counted
         total = uniform_filter(error, side, mode="constant")
         middle = np.unravel_index(np.argmax(total), total.shape)
         top, left = (int(np.clip(m - side // 2, 0, max(n - side, 0))) for m, n in zip(middle, total.shape, strict=True))
@@ -555,28 +416,9 @@ def draw_crops(context: TextureContenders, result: dict):
     return plot.draw_images(f"{result['title']}: parts of the stills", figure_caption(result), rows)
 
 
-def draw_zoom(context: TextureContenders, result: dict):
-    """Draw frames of the zoom, by each of the readers and of the truth."""
-    strips = {name: context.zoom.render(reader) for name, reader in shown_readers(context, result).items()}
-    rows = context.zoom.rows({**strips, "truth": context.truths["zoom"]})
-    title = f"{result['title']}: a zoom of {context.zoom.frames} frames"
-    return plot.draw_images(title, figure_caption(result), rows, 2.0)
-
-
-def draw_levels(context: TextureContenders, result: dict):
-    """Draw the PSNR of each level of all compressed textures.
-
-    If distributions of footprints are compared, another panel shows the share of samples on each level.
-    """
-    count, panels = context.pyramid.levels, {}
-    if context.settings.footprints:
-        shares = {"by level (ours)": fit.shares(count)}
-        shares |= {name: compressed.footprint_histogram(name, count) for name in compressed.FOOTPRINTS}
-        panels["% of the samples of a training"] = [
-            plot.Curve(name, range(count), 100 * np.asarray(share)) for name, share in shares.items()
-        ]
-    panels["PSNR of all maps at texel centres, dB"] = [
-        plot.Curve(name, range(count), record["details"]["levels"]["all"])
-        for name, record in result["jobs"].items() if "levels" in record.get("details", {})
-    ]  # fmt: skip
-    return plot.draw_curves(f"{result['title']}: levels of detail", figure_caption(result), panels, "level", "")
+def draw_levels(result: dict):
+    """Draw the PSNR of each level of all compressed textures."""
+    levels = {n: job["details"]["levels"]["all"] for n, job in result["jobs"].items()}
+    curves = [plot.Curve(name, range(len(psnr)), psnr) for name, psnr in levels.items()]
+    title, label = f"{result['title']}: error of each level", "level of detail (0: finest)"
+    return plot.draw_curves(title, figure_caption(result), {"All maps, at texel centres": curves}, label, "PSNR, dB")

@@ -1,7 +1,7 @@
 """
 What a filtered read of a texture costs, as a multiple of a bitmap's bilinear read: run it, it only measures.
 
-    python tests/benchmarks/bench_texture.py [--table FILE.npz] [--json FILE] [--variant VARIANT]
+    python tests/benchmarks/bench_texture.py [--table FILE.npz] [--json FILE]
 
 Read are the maps of a material, each by a texture, from hits that lie in memory: position in uv and its derivatives for
 a pixel. The hits are ``random`` (any place, any footprint up to the whole image), or those of a ``plane`` to the
@@ -125,24 +125,18 @@ def renders(path: Path, number: int) -> dict[str, dict]:
 def main() -> None:
     command = parser(__doc__, rounds=101)
     command.add_argument("--table", action="append", type=Path, metavar="FILE", help="texture (default: tiles)")
-    command.add_argument("--variant", default=VARIANT)
-    command.add_argument("--only", choices=("reads", "renders"))
     options = command.parse_args()
-    mi.set_variant(options.variant)
+    mi.set_variant(VARIANT)
     use_threads(1)
-    result = {"machine": machine(options.variant), "rounds": options.rounds}
-    parts = {
-        "reads": lambda: [row for path in options.table or [TILES] for row in reads(path, options.rounds)],
-        "renders": lambda: renders(TILES, options.rounds),
-    }
+    result = {"machine": machine(VARIANT), "rounds": options.rounds}
     with dr.suspend_grad():
-        result |= {name: part() for name, part in parts.items() if options.only in (None, name)}
-    for row in result.get("reads", []):
+        result["reads"] = [row for path in options.table or [TILES] for row in reads(path, options.rounds)]
+        result["renders"] = renders(TILES, options.rounds)
+    for row in result["reads"]:
         print(f"{row['table']}, {row['hits']}, {row['maps']} map(s)")
         show(row["textures"])
-    if "renders" in result:
-        print("renders")
-        show(result["renders"])
+    print("renders")
+    show(result["renders"])
     write(options.json, result)
 
 

@@ -30,13 +30,12 @@ RUNS = {
     "scene-training": [str(ROOT / "scenes" / "training_floor.xml")],
     "sdf": ["ball.ply", "--bytes", "24k", "--without", "paper"],
     "shading": ["m.json", "--steps", "2", "--pretrain-steps", "2", "--lambda", "1"],
-    "texture": ["m.json", "--seconds", "1", "--width", "24", "--frames", "2", "--compression", "2x"],
+    "texture": ["m.json", "--seconds", "1", "--compression", "2x"],
 }
 
 #: Study → pictures beside accuracy against time or bytes.
 PICTURES = {
-    "sdf": ["shapes"], "field": ["views"], "texture": ["crops", "zoom", "levels"],
-    "shading": ["levels", "strip"],
+    "sdf": ["shapes"], "field": ["views"], "texture": ["crops", "levels"], "shading": ["levels", "strip"],
 }  # fmt: skip
 
 
@@ -105,7 +104,7 @@ def test_quick_runs(study, inputs, tmp_path, monkeypatch, capsys):
 @pytest.mark.long
 def test_a_run_goes_on(inputs, tmp_path, capfd, monkeypatch):
     """After Ctrl-C in the second training, the first is not trained again if its file exists."""
-    step, seen = loop._Trainer.take_step, []
+    step, seen, ratios = loop._Trainer.take_step, [], ["--compression", "12", "--compression", "6"]
 
     def interrupted(self, *args):
         seen.append(self.problem)
@@ -116,10 +115,10 @@ def test_a_run_goes_on(inputs, tmp_path, capfd, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(loop._Trainer, "take_step", interrupted)
-        assert run("image", inputs, tmp_path) == 130
+        assert run("image", inputs, tmp_path, *ratios) == 130
     assert (tmp_path / "tradeoff_image.partial.json").exists()
     assert len(list((tmp_path / "tradeoff_image_models").glob("*.npz"))) == 1
-    assert run("image", inputs, tmp_path) == 0
+    assert run("image", inputs, tmp_path, *ratios) == 0
     err = capfd.readouterr().err.rsplit("continuing from", 1)[1]
     assert "1 of " not in err and "2 of " in err
 
@@ -130,15 +129,14 @@ def test_a_run_goes_on(inputs, tmp_path, capfd, monkeypatch):
         ("bsdf", ["gold"], 'found the material "gold", allowed are'),
         ("field", ["--compression", "0"], "0"),
         ("field", ["--without", "vq"], '--without: found "vq", allowed are sparse'),
-        ("image", ["--astc", "best"], "best"),
+        ("image", ["--compression", "0"], "0"),
         ("image", ["--variant", "scalar_rgb"], "do not run"),
         ("scene-training", ["nowhere.xml"], "nowhere.xml, which is no file"),
         ("sdf", ["--without", "bricks"], '--without: found "bricks", allowed are dense, distances'),
         ("shading", ["--lambda", "1.5"], "1.5"),
         ("shading", ["granite"], "hammered, weave, lacquer"),
         ("shading", ["weave", "weave"], "twice"),
-        ("texture", ["--table", str(ROOT / "scenes" / "assets" / "tiles_filtered.npz")], "not trained on this source"),
-        ("texture", ["--only", "nothing"], "nothing"),
+        ("texture", ["--compression", "much"], "much"),
     ],
 )
 def test_bad_options(study, options, message, inputs, tmp_path, capsys):
@@ -156,7 +154,6 @@ def test_errors(mi_rgb):
     found = image.map_errors(source, maps)
     difference = np.rint(255 * maps["ao"]) / 255 - reference["ao"] / 255
     mse = np.mean(difference**2)
-    assert found["psnr_albedo_db"] == 120 and found["psnr_ao_db"] == pytest.approx(-10 * math.log10(mse), abs=1e-3)
     assert found["psnr_db"] == pytest.approx(-10 * math.log10(mse / 7), abs=1e-3) and 0.01 < found["flip"] < 0.2
     assert found["psnr_between_db"] == pytest.approx(found["psnr_db"], abs=1)  # a nearly constant difference
     same = image.map_errors(source, {n: v / 255 for n, v in reference.items()})

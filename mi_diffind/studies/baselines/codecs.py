@@ -1,4 +1,4 @@
-"""Image codecs that learned textures are compared with: ASTC, BC7, JPEG, WebP and bicubic scaling.
+"""Image codecs that learned textures are compared with: ASTC, BC7, JPEG and WebP.
 
 An image is float32, ``(height, width, channels)`` with 1 to 4 channels and values in [0, 1], and is rounded to 8 bits
 before it is encoded. Decoded values are the stored ones, without any transfer function; errors are meant to be measured
@@ -28,11 +28,14 @@ ASTC_BLOCKS = (
     "4x4", "5x4", "5x5", "6x5", "6x6", "8x5", "8x6", "10x5", "10x6", "8x8", "10x8", "10x10", "12x10", "12x12",
 )  # fmt: skip
 
+#: Preset of the ASTC encoder in studies; the next one, ``exhaustive``, takes many times as long.
+QUALITY = "thorough"
+
 #: Most levels that :func:`astc_levels` leaves out at the fine end of a map.
 DROPPED = 2
 
 #: Codec → its name in notes and legends.
-TITLES = {"astc": "ASTC", "bc7": "BC7", "jpeg": "JPEG", "webp": "WebP", "bicubic": "bicubic"}
+TITLES = {"astc": "ASTC", "bc7": "BC7", "jpeg": "JPEG", "webp": "WebP"}
 
 #: Codec → its optional packages, each as a distribution and a module.
 _PACKAGES = {
@@ -49,8 +52,8 @@ class CodecError(DiffindError, RuntimeError):
 class Encoded:
     """Result of encoding and decoding with ``codec``, for example ``"ASTC 8x8"``.
 
-    ``nbytes`` counts the payload of blocks or samples, or whole files; ``levels`` are decoded, float32 in [0, 1], of
-    the input's shapes: an image, or an image and its mip maps.
+    ``nbytes`` counts the payload of blocks, or whole files; ``levels`` are decoded, float32 in [0, 1], of the input's
+    shapes: an image, or an image and its mip maps.
     """
 
     codec: str
@@ -64,7 +67,7 @@ class Encoded:
 
 
 def available() -> tuple[str, ...]:
-    """Return the codecs whose packages are installed, of ``astc``, ``bc7``, ``jpeg``, ``webp``, ``bicubic``."""
+    """Return the codecs whose packages are installed, of :data:`TITLES`."""
     names = []
     for codec in TITLES:
         with contextlib.suppress(CodecError):
@@ -95,7 +98,7 @@ def _modules(codec: str) -> list:
 # -- Blocks ------------------------------------------------------------------------------------------------------------
 
 
-def astc(image: np.ndarray, block: str = "8x8", quality: str = "exhaustive", normal: bool = False) -> Encoded:
+def astc(image: np.ndarray, block: str, quality: str, normal: bool = False) -> Encoded:
     """Encode an image with ASTC, linear LDR profile, on one core.
 
     One channel, or three equal ones, are stored as luminance, two as luminance and alpha with equal weights. ``block``
@@ -168,10 +171,9 @@ AstcChoice = tuple[int, float, tuple[tuple[str, bool, str, int], ...]]
 def astc_levels(
     maps: Mapping[str, Sequence[np.ndarray]],
     nbytes: float,
-    quality: str = "exhaustive",
-    normals: Collection[str] = ("normal",),
+    quality: str,
+    normals: Collection[str] = (),
     mip_maps: bool = True,
-    uniform: bool = False,
     cache: dict | None = None,
 ) -> tuple[dict[str, Encoded], int]:
     """Encode the ``maps`` of a material, name → levels, finest first, in ``nbytes`` together, with the least error.
@@ -179,8 +181,7 @@ def astc_levels(
     Each map has its own block size and may drop up to :data:`DROPPED` of its finest levels, which are then read from
     the first stored level with bicubic filtering; maps named in ``normals`` are stored with or without z. The squared
     error of the finest levels, of all texels and channels, is minimised. Without ``mip_maps``, only the first stored
-    level is kept, and coarser ones are other resolutions to choose from. With ``uniform``, all maps share the best
-    block size and level.
+    level is kept, and coarser ones are other resolutions to choose from.
 
     The choice is optimal for errors with the preset ``medium`` of the encoder, or a faster ``quality``, which is the
     preset of the result. A ``cache``, for calls with the same maps only, avoids encoding twice. Returns the encoded
@@ -191,8 +192,8 @@ def astc_levels(
     choosing = quality if quality in ("fastest", "fast") else "medium"
     rounded = {name: [_texels(level) / np.float32(255) for level in levels] for name, levels in maps.items()}
 
-    def coded(name: str, level: int, normal: bool, block: str, quality: str) -> Encoded:
-        key = (name, level, normal, block, quality)
+    def coded(*key) -> Encoded:
+        name, level, normal, block, quality = key
         if key not in cache:
             cache[key] = astc(rounded[name][level], block, quality, normal)
         return cache[key]
@@ -203,35 +204,31 @@ def astc_levels(
     def finer(name: str, level: int, stored: Encoded) -> np.ndarray:
         return resized(stored.image, *rounded[name][level].shape[:2], Image.Resampling.BICUBIC)
 
-    def choices(name: str, settings) -> Iterable[AstcChoice]:
+    def choices(name: str) -> Iterable[AstcChoice]:
         finest = rounded[name][0]
         both = (False, True) if name in normals and finest.shape[2] == 3 else (False,)
-        for normal, (block, drop) in itertools.product(both, settings):
-            if drop < len(rounded[name]):
-                size = sum(astc_bytes(rounded[name][i].shape, block) for i in kept(name, drop))
-                if size <= nbytes:
-                    stored = coded(name, drop, normal, block, choosing)
-                    image = finer(name, 0, stored) if drop else stored.image
-                    yield size, _squared(finest, image), ((name, normal, block, drop),)
+        drops = range(min(DROPPED + 1, len(rounded[name])))
+        for normal, block, drop in itertools.product(both, ASTC_BLOCKS, drops):
+            size = sum(astc_bytes(rounded[name][i].shape, block) for i in kept(name, drop))
+            if size <= nbytes:
+                stored = coded(name, drop, normal, block, choosing)
+                image = finer(name, 0, stored) if drop else stored.image
+                yield size, _squared(finest, image), ((name, normal, block, drop),)
 
-    settings = list(itertools.product(ASTC_BLOCKS, range(DROPPED + 1)))
-    fitting: list[AstcChoice] = []
-    for group in [[setting] for setting in settings] if uniform else [settings]:
-        front: list[AstcChoice] = [(0, 0.0, ())]  # choices that no other beats in bytes and error
-        for name in maps:
-            pairs = itertools.product(front, list(choices(name, group)))
-            joined = sorted(((a[0] + b[0], a[1] + b[1], a[2] + b[2]) for a, b in pairs), key=lambda c: c[:2])
-            front, least = [], math.inf
-            for choice in joined:
-                if choice[0] <= nbytes and choice[1] < least:
-                    front.append(choice)
-                    least = choice[1]
-        fitting += front
-    if not fitting:
+    front: list[AstcChoice] = [(0, 0.0, ())]  # choices that no other beats in bytes and error
+    for name in maps:
+        pairs = itertools.product(front, list(choices(name)))
+        joined = sorted(((a[0] + b[0], a[1] + b[1], a[2] + b[2]) for a, b in pairs), key=lambda c: c[:2])
+        front, least = [], math.inf
+        for choice in joined:
+            if choice[0] <= nbytes and choice[1] < least:
+                front.append(choice)
+                least = choice[1]
+    if not front:
         text = " with mip maps" if mip_maps else ""
         raise CodecError(f"ASTC cannot store {', '.join(maps)}{text} in {nbytes:,.0f} bytes")
     result = {}
-    for name, normal, block, drop in min(fitting, key=lambda choice: choice[1])[2]:
+    for name, normal, block, drop in min(front, key=lambda choice: choice[1])[2]:
         stored = [coded(name, i, normal, block, quality) for i in kept(name, drop)]
         levels = [*(finer(name, i, stored[0]) for i in range(drop)), *(e.image for e in stored)]
         codec = stored[0].codec + (f" from level {drop} on" if drop else "")
@@ -239,55 +236,27 @@ def astc_levels(
     return result, sum(e.nbytes for e in result.values())
 
 
-# -- Files and scaled images -------------------------------------------------------------------------------------------
+# -- Files -------------------------------------------------------------------------------------------------------------
 
 
-def at_bytes(codec: str, image: np.ndarray, nbytes: float) -> Encoded:
-    """Encode an image in at most ``nbytes`` with a codec other than ASTC; BC7 has one size only."""
-    return bc7(image) if codec == "bc7" else {"jpeg": jpeg, "webp": webp, "bicubic": bicubic}[codec](image, nbytes)
+def image_file(codec: str, image: np.ndarray, nbytes: float) -> Encoded:
+    """Encode an image in at most ``nbytes``, as progressive JPEG (``"jpeg"``) or lossy WebP (``"webp"``).
 
-
-def jpeg(image: np.ndarray, nbytes: float) -> Encoded:
-    """Encode an image as progressive JPEG with optimised Huffman tables, in at most ``nbytes``.
-
-    The quality is the highest that fits, else the lowest; colours are halved in resolution if the error is smaller
-    then. Two channels become two files, four channels one file of three and one of one; their bytes are added.
+    The quality is the highest that fits, else the lowest. JPEG has optimised Huffman tables and halves the resolution
+    of colours if the error is smaller then; WebP always does. Two channels become two files, four channels one file of
+    three and one of one; their bytes are added.
     """
-    options = {"progressive": True, "optimize": True}
-    both = [_largest_file("JPEG", image, nbytes, range(1, 101), subsampling=s, **options) for s in ("4:4:4", "4:2:0")]
-    reference = _texels(image) / np.float32(255)
-    fitting = [e for e in both if e.nbytes <= nbytes] or [min(both, key=lambda e: e.nbytes)]
-    return min(fitting, key=lambda e: _squared(reference, e.image))
+    texels, qualities, options = _texels(image), range(101), [{"method": 6}]
+    if codec == "jpeg":
+        qualities = range(1, 101)
+        options = [{"progressive": True, "optimize": True, "subsampling": s} for s in ("4:4:4", "4:2:0")]
+    coded = [_largest_file(TITLES[codec], texels, nbytes, qualities, each) for each in options]
+    fitting = [e for e in coded if e.nbytes <= nbytes] or [min(coded, key=lambda e: e.nbytes)]
+    return min(fitting, key=lambda e: _squared(texels / np.float32(255), e.image))
 
 
-def webp(image: np.ndarray, nbytes: float) -> Encoded:
-    """Encode an image as lossy WebP, which halves the resolution of colour, by the slowest method.
-
-    Quality and files are as in :func:`jpeg`.
-    """
-    return _largest_file("WebP", image, nbytes, range(101), method=6)
-
-
-def bicubic(image: np.ndarray, nbytes: float) -> Encoded:
-    """Scale an image down until its 8-bit samples fit into ``nbytes`` (1×1 if none does), and up by bicubic filtering.
-
-    The aspect ratio is kept; a Lanczos filter scales down.
-    """
-    samples = _texels(image) / np.float32(255)
-    height, width, channels = samples.shape
-    scales = np.unique(np.concatenate([np.arange(1, n + 1) / n for n in (height, width)]))
-    sizes = np.maximum(1, np.floor(np.outer(scales, (height, width)) + 1e-9)).astype(int)
-    fitting = sizes[sizes.prod(1) * channels <= nbytes]
-    h, w = map(int, fitting[-1]) if len(fitting) else (1, 1)
-    if (h, w) != (height, width):
-        small = _texels(resized(samples, h, w, Image.Resampling.LANCZOS)) / np.float32(255)
-        samples = resized(small, height, width, Image.Resampling.BICUBIC)
-    return Encoded(f"bicubic {w}x{h}", h * w * channels, [samples])
-
-
-def _largest_file(name: str, image: np.ndarray, nbytes: float, qualities: range, **options) -> Encoded:
-    """Encode an image as one or two files of Pillow, with the highest of the ``qualities`` that fits, or the lowest."""
-    texels = _texels(image)
+def _largest_file(name: str, texels: np.ndarray, nbytes: float, qualities: range, options: dict) -> Encoded:
+    """Encode texels as one or two files of Pillow, with the highest of the ``qualities`` that fits, or the lowest."""
     height, width, channels = texels.shape
 
     @functools.cache
@@ -307,6 +276,9 @@ def _largest_file(name: str, image: np.ndarray, nbytes: float, qualities: range,
         return Encoded(f"{name} {quality}", size, [decoded])
 
     return encoded(Budget(nbytes).largest(encoded, qualities, strict=False))
+
+
+# -- Images ------------------------------------------------------------------------------------------------------------
 
 
 def resized(image: np.ndarray, height: int, width: int, resampling: Image.Resampling) -> np.ndarray:
