@@ -92,9 +92,6 @@ def trained(folder, path):
     return scene, problem
 
 
-# -- views ------------------------------------------------------------------------------------------------------------
-
-
 def test_views_lie_in_their_ranges_and_repeat():
     views = dataclasses.replace(ORBIT, count=200, distance=(2, 3))
     drawn = views.trained()
@@ -220,6 +217,10 @@ def test_camera_and_lights_are_where_a_view_has_them():
     rig.place(View())
     np.testing.assert_allclose(matrix(scene.sensors()[0]), look, atol=1e-5)
     np.testing.assert_allclose(matrix(emitters(scene)["sun"])[:3, 2], before["sun"][:3, 2], atol=1e-5)
+    # A camera in a box looks at the target
+    Rig(scene, ViewDistribution(origins=((0, 0, 0), (1, 1, 1)), target=(0, 0, 0))).place(View(origin=(3, 4, 5)))
+    expected = np.array(t.look_at([3, 4, 5], [0, 0, 0], [0, 1, 0]).matrix)
+    np.testing.assert_allclose(matrix(scene.sensors()[0])[:3, 2:], expected[:3, 2:], atol=1e-5)
 
 
 @pytest.fixture
@@ -291,14 +292,6 @@ def test_the_sun_of_a_sky_is_where_a_view_has_it():
         np.testing.assert_allclose(matrix(emitter), (t().rotate([0, 1, 0], azimuth) @ upright).matrix, atol=1e-5)
 
 
-def test_a_camera_in_a_box_looks_at_the_target():
-    scene = lit("sun")
-    Rig(scene, ViewDistribution(origins=((0, 0, 0), (1, 1, 1)), target=(0, 0, 0))).place(View(origin=(3, 4, 5)))
-    expected = mi.ScalarTransform4f().look_at([3, 4, 5], [0, 0, 0], [0, 1, 0]).matrix
-    look = matrix(scene.sensors()[0])
-    np.testing.assert_allclose(look[:3, 2:], np.array(expected)[:3, 2:], atol=1e-5)
-
-
 def test_rigs_that_cannot_be():
     turn = ViewDistribution(light_azimuth=(0, 90))
     with pytest.raises(loading.SceneError, match=r"light_azimuth: no light .* \(ConstantBackgroundEmitter\)"):
@@ -311,8 +304,6 @@ def test_rigs_that_cannot_be():
     with pytest.raises(loading.SceneError, match="target: not given, and the middle"):
         Rig(lit("sky"), ViewDistribution(azimuth=(0, 9)))
 
-
-# -- references -------------------------------------------------------------------------------------------------------
 
 #: Samples of an image in passes of four samples a pixel.
 FOUR = 4 * 24 * 24
@@ -368,8 +359,8 @@ def test_references_are_rendered_once(path, tmp_path, passes):
     np.testing.assert_array_equal(images, rendered().images(views))
 
 
-def test_references_of_other_processes(path, tmp_path, passes):
-    """Workers render equal images and keep them in the same files."""
+def test_references_of_other_processes_and_after_an_interruption(path, tmp_path, passes):
+    """Workers render equal images and keep them in the same files; an interrupted one goes on after its last pass."""
     views = ORBIT.trained()[:3]
     alone = references_of(path, ORBIT, 10, pass_samples=FOUR).images(views)
     seeds = list(passes.seeds)
@@ -377,20 +368,16 @@ def test_references_of_other_processes(path, tmp_path, passes):
         shared = references_of(path, ORBIT, 10, tmp_path, pass_samples=FOUR, **options)
         np.testing.assert_array_equal(shared.images(views), alone)
         assert (shared.rendered, shared.reused) == counts and passes.seeds == seeds
-
-
-def test_references_go_on_after_an_interruption(path, tmp_path, passes):
-    view = ORBIT.trained()[0]
-    expected = references_of(path, ORBIT, 10, pass_samples=FOUR).images([view])[0]
-    seeds = list(passes.seeds)
-    kept = references_of(path, ORBIT, 10, tmp_path, pass_samples=FOUR)
+    kept = references_of(path, ORBIT, 10, tmp_path / "own", pass_samples=FOUR)
     passes.stop = len(seeds) + 2
     with pytest.raises(KeyboardInterrupt):
-        kept.images([view])
-    assert [file.name for file in tmp_path.iterdir()] == [kept.path(view).name]  # nothing half-written beside it
+        kept.images(views[:1])
+    assert [f.name for f in (tmp_path / "own").iterdir()] == [
+        kept.path(views[0]).name
+    ]  # nothing half-written beside it
     passes.stop = 0
-    again = references_of(path, ORBIT, 10, tmp_path, pass_samples=FOUR)
-    np.testing.assert_array_equal(again.images([view])[0], expected)
+    again = references_of(path, ORBIT, 10, tmp_path / "own", pass_samples=FOUR)
+    np.testing.assert_array_equal(again.images(views[:1])[0], alone[0])
     assert again.reused == 1 and again.rendered == 2
     assert passes.seeds[-4:] == [seeds[0], seeds[1], seeds[1], seeds[2]]
 
@@ -404,17 +391,6 @@ def test_references_are_the_exact_scene(path):
         image = references_of(file, ViewDistribution(), 64).images([View()])[0]
         assert image.shape == (24, 24, 3) and not np.array_equal(image, expected)
         assert np.abs(image - expected).mean() < 0.05 * expected.mean()
-
-
-def test_a_scene_may_be_a_dictionary(folder, trained):
-    """The texture and its parameters are those of the file."""
-    file = (folder / "material.npz").resolve()
-    texture = {"type": "neural_texture", "filename": str(file), "channels": "albedo"}
-    floor = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": texture}}
-    scene = {"type": "scene", "integrator": {"type": "path"}, "sensor": {"type": "perspective"}, "floor": floor}
-    parsed = loading.ParsedScene(scene)
-    assert texture_file(parsed) == (file, "")
-    assert TrainedScene(parsed, {file: load(file)}, ViewDistribution(), 1).keys.keys() == trained[0].keys.keys()
 
 
 class Timed:
@@ -461,9 +437,6 @@ def test_renders_that_fit_into_a_limited_time(monkeypatch, seconds, compiling, k
     assert bool(sentence) == bool(remark) == (problem.recipe.share == 0)
     assert problem.samples == samples and problem.identity["shading"]["share"] == problem.recipe.share
     assert request.deadline.reserve == pytest.approx(0.2 * samples)
-
-
-# -- training, while no other scene is there ---------------------------------------------------------------------------
 
 
 def test_a_scene_is_trained(folder, tmp_path, monkeypatch):
@@ -538,16 +511,21 @@ def test_a_scene_is_trained(folder, tmp_path, monkeypatch):
     assert -10 * np.log10(error) == pytest.approx(result.measured["psnr_db"], abs=0.3)
 
 
-# -- the scene with its arrays as parameters --------------------------------------------------------------------------
-
-
 def opaque(seed):
     return dr.opaque(mi.UInt32, seed)
 
 
 def test_the_scene_reads_what_it_is_given(path, trained):
-    """Against the scene as it is written, which reads bytes; also from another view, with its footprints."""
+    """Against the scene as it is written, which reads bytes; also from another view. No other scene reads them."""
     scene, problem = trained
+    floats = loading.ParsedScene(path)
+    floats.change(lambda state: [
+        props.__setitem__("storage", "float32") for props in loading.compat.parsed_properties(state)
+        if props.plugin_name() == "neural_texture"
+    ])  # fmt: skip
+    others = mi.traverse(floats.load(needs=()))
+    coarse = next(key for key in others.keys() if key.endswith("tables.coarse"))
+    before = others[coarse].numpy()
     scene.hold(rounded(problem.net))
     plain = loading.load(path)
     rig = Rig(plain, ORBIT)
@@ -566,20 +544,7 @@ def test_the_scene_reads_what_it_is_given(path, trained):
     values = [everything[key].numpy() for key in named]
     np.testing.assert_array_equal(values[0], values[1])
     assert values[0].max() <= 0.5
-
-
-def test_no_other_scene_reads_the_same_arrays(path, trained):
-    scene, problem = trained
-    parsed = loading.ParsedScene(path)
-    parsed.change(lambda state: [
-        props.__setitem__("storage", "float32") for props in loading.compat.parsed_properties(state)
-        if props.plugin_name() == "neural_texture"
-    ])  # fmt: skip
-    other = parsed.load(needs=())
-    key = next(key for key in mi.traverse(other).keys() if key.endswith("tables.coarse"))
-    before = mi.traverse(other)[key].numpy()
-    scene.hold(problem.net.changed(lambda array, bits: array.unfolded(lambda entries: 0.5 * entries)))
-    np.testing.assert_array_equal(mi.traverse(other)[key].numpy(), before)
+    np.testing.assert_array_equal(others[coarse].numpy(), before)
 
 
 def inside(net):
@@ -671,7 +636,15 @@ def test_gradients_against_differences(trained, weights):
         array.data = before
 
 
-def test_which_textures(path, folder):
+def test_which_textures(path, folder, trained):
+    """Those of a file, also of a scene that is a dictionary, whose parameters are those of the file."""
+    file = (folder / "material.npz").resolve()
+    texture = {"type": "neural_texture", "filename": str(file), "channels": "albedo"}
+    floor = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": texture}}
+    scene = {"type": "scene", "integrator": {"type": "path"}, "sensor": {"type": "perspective"}, "floor": floor}
+    parsed = loading.ParsedScene(scene)
+    assert texture_file(parsed) == (file, "")
+    assert TrainedScene(parsed, {file: load(file)}, ViewDistribution(), 1).keys.keys() == trained[0].keys.keys()
     parsed = loading.ParsedScene(path)
     assert texture_files(parsed) == texture_files(parsed, [folder / "material.npz"]) == {folder / "material.npz": ""}
     with pytest.raises(
@@ -682,9 +655,6 @@ def test_which_textures(path, folder):
     plain.write_text('<scene version="3.0.0"><shape type="sphere"/></scene>')
     with pytest.raises(UsageError, match="names no file of neural_texture or neural_material"):
         texture_files(loading.ParsedScene(plain))
-
-
-# -- several textures -------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -787,9 +757,6 @@ def test_several_files_that_cannot_be(pair, monkeypatch, change, match):
     monkeypatch.chdir(pair.parent)
     with pytest.raises(UsageError, match=match):
         mi_diffind.fit("scene", pair, progress=False, **change)
-
-
-# -- its parts --------------------------------------------------------------------------------------------------------
 
 
 def test_errors_of_pixels():

@@ -65,8 +65,11 @@ RANGES = {
 }  # fmt: skip
 
 
-#: Runs in the picture.
-SHOWN = ("start", "hemisphere", "scene", AFTER)
+#: Runs in the picture, and their titles.
+SHOWN = {
+    "start": "before the training", "hemisphere": "trained over the hemisphere", "scene": "trained inside the scene",
+    AFTER: "over the hemisphere, then inside",
+}  # fmt: skip
 
 
 #: Seed of the views that errors are measured on; trainings have seed 0.
@@ -79,14 +82,14 @@ SEED = 1000
 #: ``reference_spp`` and ``spp``: samples a pixel of references, and of a measured render. ``hemisphere_steps``: steps
 #: of a training over the hemisphere to its end; ``texture_steps``: those of the texture of another material.
 FULL = {
-    "lambdas": [0.5, 0.9, 1.0], "counts": [1, 4], "steps": 400, "views": 16, "held_out": 4, "tests": 8, "width": 96,
-    "depth": 3, "reference_spp": 512, "spp": 128, "hemisphere_steps": 1500, "texture_steps": 200,
+    "lambdas": [0.25, 0.5, 0.9, 1.0], "counts": [1, 4], "steps": 60, "views": 16, "held_out": 4, "tests": 8,
+    "width": 64, "depth": 3, "reference_spp": 512, "spp": 128, "hemisphere_steps": 1500, "texture_steps": 200,
 }  # fmt: skip
 
-#: Settings of a quick study.
+#: Settings of a quick study, of the runs in the picture: both trainings take a few steps, not the same seconds.
 QUICK = {
-    "lambdas": [0.9], "counts": [1], "steps": 2, "views": 2, "held_out": 1, "tests": 1, "width": 16, "depth": 2,
-    "reference_spp": 8, "spp": 8, "hemisphere_steps": 2, "texture_steps": 2,
+    "lambdas": [0.9], "counts": [1], "steps": 2, "views": 2, "held_out": 1, "tests": 1, "width": 64, "depth": 2,
+    "reference_spp": 128, "spp": 32, "hemisphere_steps": 20, "texture_steps": 0,
 }  # fmt: skip
 
 
@@ -106,7 +109,7 @@ class SceneTrainingStudy(Study):
             type=fraction,
             dest="lambdas",
             metavar="X",
-            help="weight of the loss of renders; may be repeated (default: 0.5, 0.9, 1; --quick: 0.9)",
+            help="weight of the loss of renders; may be repeated (default: 0.25, 0.5, 0.9, 1; --quick: 0.9)",
         )
         parser.add_argument(
             "--spp",
@@ -116,18 +119,13 @@ class SceneTrainingStudy(Study):
             metavar="N",
             help="samples a pixel of trainings; may be repeated (default: 1, 4; --quick: 1)",
         )
-        parser.add_argument("--steps", type=positive, metavar="N",
-                            help="steps of each training inside a scene (default: 400; --quick: 2)")  # fmt: skip
-        parser.add_argument("--width", type=positive, metavar="N",
-                            help="pixels of a row of renders (default: 96; --quick: 16)")  # fmt: skip
 
     def check(self, arguments) -> None:
         """Check that the scenes exist."""
         arguments.paths = scene_files(arguments.scenes, arguments.quick)
 
     def plan(self, arguments) -> Plan:
-        given = {name: value for name in ("steps", "width") if (value := getattr(arguments, name))}
-        given |= {name: sorted(set(value)) for name in ("lambdas", "counts") if (value := getattr(arguments, name))}
+        given = {name: sorted(set(value)) for name in ("lambdas", "counts") if (value := getattr(arguments, name))}
         return plan(arguments.paths, SimpleNamespace(**{**(QUICK if arguments.quick else FULL), **given}))
 
 
@@ -205,10 +203,11 @@ def picture(contexts: Sequence[SceneTrainingContext], runs: Sequence[Contender],
                     scene.place(views[0])
                     image = scene.render(0, 1, context.settings.spp).numpy()
                 names.append(run.method)
-                images[f"{run.method}\n{run.record['errors']['psnr_db']:.1f} dB"] = image
-        images["truth"] = references[0]
+                images[f"{SHOWN[run.method]}\nPSNR {run.record['errors']['psnr_db']:.1f} dB"] = image
+        images[f"exact plugins\n{context.settings.reference_spp} samples a pixel"] = references[0]
         rows[context.name] = {title: for_display(exposure * image) for title, image in images.items()}
-    return plot.draw_images(result["title"], figure_caption(result), rows)
+    title = "Renders from a view that no training has seen, with the PSNR of all such views"
+    return plot.draw_images(title, figure_caption(result), rows)
 
 
 def training_run(
@@ -291,12 +290,15 @@ def planned_runs(context: SceneTrainingContext) -> list[Contender]:
     def inside(method: str, after: Contender | None = None, **fields) -> Contender:
         return run(method, "scene", **{"share": share, "after": after, **fields})
 
-    scene, other = inside("scene"), run(OTHER, "texture")
-    long = {"limit": lambda: {"seconds": max(1.0, scene.record["details"]["training_seconds"])}}
     end = {"limit": lambda: {"steps": settings.hemisphere_steps}}
+    start, scene = [run("start", spp=spp) for spp in settings.counts], inside("scene")
+    if not settings.texture_steps:
+        return [*start, scene, run("hemisphere", "shading", **end)]
+    long = {"limit": lambda: {"seconds": max(1.0, scene.record["details"]["training_seconds"])}}
+    other = run(OTHER, "texture")
     hemisphere, mended = run("hemisphere", "shading", **long), run(MENDED, "shading", after=other, **long)
     return [
-        *(run("start", spp=spp) for spp in settings.counts), scene, hemisphere, run(LONGER, "shading", **end),
+        *start, scene, hemisphere, run(LONGER, "shading", **end),
         inside(AFTER, hemisphere), inside("untrained, then scene", begin="untrained"), inside(FEW, samples=1),
         other, inside(f"{OTHER}, then scene", other), mended, inside(f"{MENDED}, then scene", mended),
         *(inside("scene", share=s) for s in settings.lambdas if s != share),
