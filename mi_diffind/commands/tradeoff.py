@@ -11,7 +11,7 @@ from .common import alternative, alternatives, say, scene_options, set_variant, 
 HELP = "measure time against accuracy of the contenders of a task, or of a scene"
 
 #: Arguments of studies that are files, as far as a study has them.
-READS = ("source", "scene", "scenes", "materials", "table", "renders", "errors_of")
+READS = ("source", "scene", "scenes", "materials", "table", "renders", "errors_of", "measured")
 
 EXAMPLE = "mi-diffind tradeoff ggx --quick --out out"
 

@@ -24,6 +24,7 @@ TRAINED = ["--steps", "2", "--pretrain-steps", "2"]
 #: Study → arguments beside ``--quick``; files are those of the fixture ``inputs``.
 RUNS = {
     "bsdf": [],
+    "cost": ["bsdf"],
     "disney": [],
     "field": ["balls", "--compression", "120", "--resolution", "16", "--steps", "10"],
     "ggx": [],
@@ -96,7 +97,7 @@ def test_quick_runs(study, inputs, tmp_path, monkeypatch, capsys):
     with open(files["csv"], encoding="utf-8", newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert rows and capsys.readouterr().out.endswith(", ".join(files.values()) + "\n")
-    if study == "scene":
+    if "candidates" not in result:
         return
     assert {row["candidate"] for row in rows} == set(result["candidates"])
     for name, c in result["candidates"].items():
@@ -132,6 +133,8 @@ def test_a_run_goes_on(inputs, tmp_path, capfd, monkeypatch):
     "study, options, message",
     [
         ("bsdf", ["gold"], 'found the material "gold", allowed are'),
+        ("cost", ["glass"], 'found the row "glass", allowed are disney'),
+        ("cost", ["--measured", "nowhere.bsdf"], "nowhere.bsdf: no such file"),
         ("disney", ["--only", "nothing"], "nothing"),
         ("field", ["--compression", "0"], "0"),
         ("field", ["--without", "vq"], '--without: found "vq", allowed are sparse'),
