@@ -40,16 +40,12 @@ from typing import Any
 
 from figures import (
     DOCS,
-    EXACT,
     ROOT,
     ClaimError,
-    Entries,
     commands,
     evaluate,
     files,
     formatted,
-    measured,
-    size_text,
     toml,
 )
 
