@@ -361,63 +361,18 @@ RENDERS = (
     "ASTC 12x, anisotropic, centred", "network 12x, trilinear",
 )  # fmt: skip
 
+#: Error of a contender that is the reference itself.
 #: Functions and constants of an expression, by name.
 FUNCTIONS = {
     f.__name__: f
     for f in (
-        min,
-        max,
-        sum,
-        len,
-        round,
-        abs,
-        all,
-        any,
-        sorted,
-        next,
-        iter,
-        zip,
-        map,
-        list,
-        dict,
-        range,
-        tuple,
-        float,
-        Entries,
-        measured,
-        every,
-        one,
-        ratio,
-        time_over,
-        equal_samples,
-        speed,
-        cells,
-        median,
-        quartiles,
-        with_spread,
-        size_text,
-        binary_size,
-        asset_bytes,
-        equal_quality,
-        scene_runs,
-        with_network,
-        budgets,
-        by_label,
-        surface_errors,
-        trust_cell,
-        shading_runs,
-        trouble,
-        shading_best,
-        shading,
-        shading_level,
-        shading_spread,
-        flip,
-        held_out,
-        rendered,
-        shipped,
-        trust_cells,
+        min, max, sum, len, round, abs, all, any, sorted, next, iter, zip, map, list, dict, range, tuple, float,
+        Entries, measured, every, one, ratio, time_over, equal_samples, speed, cells, median, quartiles, with_spread,
+        size_text, binary_size, asset_bytes, equal_quality, scene_runs, with_network, budgets, by_label,
+        surface_errors, trust_cell, shading_runs, trouble, shading_best, shading, shading_level, shading_spread, flip,
+        held_out, rendered, shipped, trust_cells,
     )
-} | {"mean": mean, "RENDERS": RENDERS}
+} | {"mean": mean, "RENDERS": RENDERS}  # fmt: skip
 
 
 # -- evaluation --------------------------------------------------------------------------------------------------------

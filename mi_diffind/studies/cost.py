@@ -34,9 +34,11 @@ from ..measure import plot, report
 from ..measure.clock import machine
 from ..measure.statistics import spread
 from ..measure.study import Study, Tradeoff
-from ..plugins.support.distance_shapes import CELL_BYTES
+from ..plugins.support.distance_shapes import CELL_BYTES, crop_grid
 from ..scenes import equal_time, loading
 from ..tasks.sdf import marching
+from ..tasks.sdf.distances import Distances
+from ..tasks.sdf.mesh import load_mesh
 
 #: Folder of the scenes' files in a checkout.
 ASSETS = Path("scenes/assets")
@@ -224,7 +226,9 @@ def plugin(description: dict, storage: str = "") -> dict:
     result = {key: plugin(value, storage) if isinstance(value, dict) else value for key, value in description.items()}
     name = result.get("type", "")
     if name == "sdfgrid":
-        return {**grid_of_mesh(str(ASSETS / result.pop("mesh"))), **result}
+        values, lower, size = grid_of_mesh(str(ASSETS / result.pop("mesh")))
+        place = mi.ScalarTransform4f().translate(lower.tolist()).scale(size.tolist())
+        return {**result, "grid": mi.TensorXf(values), "to_world": place}
     if "filename" in result:
         result["filename"] = str(ASSETS / result["filename"])
     if name in ("bitmap", "mipmap", "neural_image", "neural_texture", "neural_material"):
@@ -236,12 +240,8 @@ def plugin(description: dict, storage: str = "") -> dict:
     return result
 
 
-def grid_of_mesh(path: str) -> dict:
-    """Return the exact distances of a mesh at the corners of :data:`CELLS` cells, and their place, for ``sdfgrid``."""
-    from ..plugins.support.distance_shapes import crop_grid
-    from ..tasks.sdf.distances import Distances
-    from ..tasks.sdf.mesh import load_mesh
-
+def grid_of_mesh(path: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the exact distances of a mesh at the corners of :data:`CELLS` cells, their lower corner and size."""
     mesh = load_mesh(path)
     spacing = float((mesh.upper - mesh.lower).max()) / CELLS
     lower = mesh.lower - 3 * spacing
@@ -249,11 +249,7 @@ def grid_of_mesh(path: str) -> dict:
     z, y, x = np.meshgrid(*(np.arange(n) for n in counts[::-1]), indexing="ij")
     values = Distances(mesh).signed(lower + spacing * np.stack([x, y, z], -1).reshape(-1, 3)).reshape(x.shape)
     values, lower, upper = crop_grid(values, lower, spacing)
-    lower, upper = (np.array(mesh.centre) + mesh.scale * corner for corner in (lower, upper))
-    return {
-        "grid": mi.TensorXf(np.float32(values[..., None] * mesh.scale)),
-        "to_world": mi.ScalarTransform4f().translate(lower.tolist()).scale((upper - lower).tolist()),
-    }
+    return np.float32(values[..., None] * mesh.scale), mesh.centre + mesh.scale * lower, mesh.scale * (upper - lower)
 
 
 def load_scene(row: Row, name: str, step: bool, settings: CostSettings):
