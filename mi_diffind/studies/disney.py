@@ -1,7 +1,9 @@
 """Study ``tradeoff disney``: accuracy of the Disney BRDF against time, with constant and with textured materials.
 
-``disney`` evaluates formulas; ``neural_disney`` is measured with each preset in each storage. Mitsuba's ``principled``
-is timed beside them. Errors are measured against :mod:`~mi_diffind.tasks.disney.model`, formulas that no plugin shares.
+``disney`` evaluates formulas; ``neural_disney`` is measured with each preset in each storage. Networks
+(:func:`.disney_network`) have as many bytes as the tables of each preset take in memory, in ``uint8``. Mitsuba's
+``principled`` is timed beside them. Errors are measured against :mod:`~mi_diffind.tasks.disney.model`, formulas that no
+plugin shares.
 """
 
 from __future__ import annotations
@@ -17,22 +19,32 @@ import numpy as np
 
 from ..arrays.lookup import STORAGES
 from ..core.runtime import array_module
-from ..measure.clock import Operations
+from ..fitting.task import FitSettings
+from ..measure.clock import Operations, count_query
 from ..measure.renders import QUERIES, bsdf_queries, directions, noise_texture
+from ..measure.store import fingerprint, package_files
 from ..measure.study import Candidate, Case, Measure, Plan, Study
+from ..measure.training import ConvergenceTraining
 from ..tasks.disney import TASK
 from ..tasks.disney.decoder import Decoder
 from ..tasks.disney.model import PARAMETERS, Material
 from ..tasks.disney.training import measure, shade
+from .baselines import networks
 
 #: Representations of the candidates.
-REPRESENTATIONS = ("Mitsuba", "formulas", "arithmetic", "tables", "paper")
+REPRESENTATIONS = ("Mitsuba", "formulas", "arithmetic", "tables", "paper", "network")
 
 #: The paper's count of operations of one evaluation (supplement, 1.2.1).
 PAPER = {
     "exact, the paper's": Operations(add=92, mul=150, div=17, sqrt=5, log=1),
     "tables, the paper's": Operations(add=11, mul=26, div=2, gathers=5),
 }
+
+#: Steps of the shortest training of a network, and of the longest; of a quick study (the longest takes twice as many).
+#: The loss of longer ones is so small that a rare highlight in a batch looks like a divergence.
+STEPS = 2000
+LONGEST = 16000
+QUICK_STEPS = 50
 
 #: Name → parameters of a material that uses every part of the model, and of one with the two lobes that most have.
 LOBES = {
@@ -45,10 +57,10 @@ LOBES = {
 
 BASE_COLOR = (0.8, 0.3, 0.2)
 
-#: Name of the truth as a candidate, which is timed in ``eval`` only, with constant materials, in RGB.
+#: Name of the truth as a candidate; it and networks are timed in ``eval`` only, with constant materials, in RGB.
 FORMULAS = "formulas"
 
-#: Presets of ``neural_disney`` that are measured.
+#: Presets of ``neural_disney`` that are measured; a quick study trains the network of the first.
 PRESETS = ("tables", "paper")
 
 #: Candidates of a quick study that are rendered, and measured with textured materials.
@@ -77,7 +89,7 @@ STUDY = DisneyStudy()
 def plan(quick: bool = False, only: Sequence[str] = ()) -> Plan:
     """Return the plan of the study in the current variant.
 
-    ``quick``: fewer cases, fewer and smaller renders. ``only``: representations that are measured
+    ``quick``: fewer cases, fewer and smaller renders, short trainings. ``only``: representations that are measured
     (default: all).
     """
     plugins = {"principled": {"type": "principled"}, "disney": {"type": "disney"}}
@@ -94,6 +106,12 @@ def plan(quick: bool = False, only: Sequence[str] = ()) -> Plan:
                 Candidate(name, preset, storage, model.nbytes, _errors(lambda m=model: m.decoder))
             )  # fmt: skip
             plugins[name] = {"type": "neural_disney", "preset": preset, "storage": storage}
+    trainings = {}
+    for preset in PRESETS[:1] if quick else PRESETS:
+        nbytes = TASK.open(mi.TensorXf, preset=preset, storage="uint8").memory_nbytes
+        training = network_training(f"network, bytes of {preset}", nbytes, quick)
+        trainings[training.name] = training
+        candidates.append(_network_candidate(training))
     candidates = [c for c in candidates if not only or c.representation in only]
     names = [c.name for c in candidates]
     cases = []
@@ -102,13 +120,14 @@ def plan(quick: bool = False, only: Sequence[str] = ()) -> Plan:
         if quick and lobes != ("diffuse + specular" if small else "all lobes"):
             continue
         timed = {n: plugin for n, plugin in plugins.items() if n in names and (not small or n in QUICK)}
-        formulas = FORMULAS in names and material == "constant" and mi.is_rgb
+        bare = {n: trainings.get(n) for n in names if n not in plugins} if material == "constant" and mi.is_rgb else {}
         rendered = {n: plugin for n, plugin in timed.items() if not quick or n in QUICK}
-        if timed or formulas:
+        if timed or bare:
             details = {"material": material, "lobes": lobes, "base_color": BASE_COLOR, **LOBES[lobes]}
-            queries = functools.partial(_queries, timed, formulas, material, LOBES[lobes])
+            queries = functools.partial(_queries, timed, bare, material, LOBES[lobes])
             passes = functools.partial(_passes, rendered, material, LOBES[lobes], quick)
             cases.append(Case(f"{material}, {lobes}", queries, passes if rendered and not small else None, details))
+    code = package_files("fitting/loop.py", "studies/baselines/networks.py", "tasks/disney/*.py")
     return Plan(
         study="disney",
         title="Disney BRDF: accuracy against time",
@@ -123,7 +142,39 @@ def plan(quick: bool = False, only: Sequence[str] = ()) -> Plan:
             *((name, "disney") for name in ("tables", "tables, uint8", "paper", "paper, uint8", FORMULAS)),
         ],
         details={"paper_operations": {name: o.asdict() for name, o in PAPER.items()}},
+        jobs=[training for name, training in trainings.items() if name in names],
+        jobs_fingerprint=fingerprint(code),
     )
+
+
+def network_training(name: str, nbytes: int, quick: bool = False) -> ConvergenceTraining:
+    """Return the training to convergence of the widest network of ``nbytes``, in half precision."""
+    types, steps = array_module(mi.variant()), QUICK_STEPS if quick else STEPS
+    longest = 2 * QUICK_STEPS if quick else LONGEST
+
+    def problem() -> networks.DisneyNetworkProblem:
+        return networks.DisneyNetworkProblem(networks.disney_network(nbytes), types)
+
+    def finish(net, record: dict) -> dict:
+        sizes = {"width": net.width, "layers": net.layers, "steps": record["steps"], "steps_longest": longest}
+        return {"bytes": 2 * record["entries"], "details": sizes}
+
+    settings = FitSettings(steps=steps, batch=2**12, lr=1e-2, loss="mse", seed=1)
+    return ConvergenceTraining(name, problem, settings, longest, 10, True, finish)
+
+
+def _network_candidate(training: ConvergenceTraining) -> Candidate:
+    """Return the candidate of a trained network."""
+
+    def count_operations(query: str) -> Operations:
+        material, albedo, wi, wo = _constants(LOBES["all lobes"], 64)
+        decoder = networks.NetworkDecoder(training.net.cooperative())
+        return count_query(lambda: shade(decoder, material, albedo, wi, wo)) + training.net.products()
+
+    return Candidate(
+        training.name, "network", "float16", errors=_errors(lambda: networks.NetworkDecoder(training.net)),
+        job=training.name, operations=count_operations,
+    )  # fmt: skip
 
 
 def _errors(decoder: Callable[[], Decoder]) -> Callable[[int], dict[str, float]]:
@@ -152,13 +203,14 @@ def _bsdf(plugin: dict, material: str, parameters: dict):
     return mi.load_dict({**plugin, "base_color": color, **parameters})
 
 
-def _queries(plugins: dict, formulas: bool, material: str, parameters: dict, lanes: int) -> dict:
-    """Return the queries of BSDFs and, if asked for, ``eval`` of the ``formulas``."""
+def _queries(plugins: dict, bare: dict, material: str, parameters: dict, lanes: int) -> dict:
+    """Return the queries of BSDFs, and ``eval`` of the networks of ``bare``; ``None`` stands for the formulas."""
     bsdfs = {name: _bsdf(plugin, material, parameters) for name, plugin in plugins.items()}
     functions = bsdf_queries(bsdfs, directions(lanes), material == "textured", QUERIES if plugins else ("eval",))
-    if formulas:
-        constant, albedo, wi, wo = _constants(parameters, lanes)
-        functions["eval"][FORMULAS] = lambda: shade(None, constant, albedo, wi, wo)
+    constant, albedo, wi, wo = _constants(parameters, lanes)
+    for name, training in bare.items():
+        decoder = training and networks.NetworkDecoder(training.net.cooperative())
+        functions["eval"][name] = lambda d=decoder: shade(d, constant, albedo, wi, wo)
     return functions
 
 

@@ -9,7 +9,7 @@ from mi_diffind.fitting.loop import FitSettings, fit
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.measure.training import halve
-from mi_diffind.studies import texture
+from mi_diffind.studies import disney, texture
 from mi_diffind.studies.baselines import distance_fields as rivals
 from mi_diffind.studies.baselines import networks
 from mi_diffind.studies.baselines.networks import Network
@@ -41,6 +41,62 @@ def test_operations_of_products(ad):
     net = Network(2, 16, 2).alloc(ad.TensorXf, 2)
     n = net.products()
     assert n.add == n.mul == 2 * 16 + 16 * 16 + 16 and n.bytes_gathered == 4 * net.parameters
+
+
+def draw(types, count=64):
+    """Return random materials, directions and albedos."""
+    import drjit as dr
+
+    from mi_diffind.tasks.disney.training import random_directions, random_materials
+
+    rng = dr.rng(seed=5)
+    m, (wi, wo) = random_materials(rng, types, count), random_directions(rng, types, count)
+    return m, types.Array3f([rng.random(types.Float, count) for _ in range(3)]), wi, wo
+
+
+def test_exact_factors_give_the_published_formulas(mi_rgb):
+    """A function that returns exact factors in place of a network gives BRDF · cosine of the model."""
+    import drjit as dr
+
+    from mi_diffind.tasks.disney.model import exact_factors
+    from mi_diffind.tasks.disney.training import shade
+
+    m, albedo, wi, wo = draw(array_module(mi_rgb.variant()))
+    f = exact_factors(m, wi, wo)
+
+    def exact(x):
+        return [dr.log(f.specular), f.diffuse / wo.z, f.flat / wo.z, dr.log(f.clearcoat / wo.z)]
+
+    decoded, truth = (np.array(shade(d, m, albedo, wi, wo)) for d in (networks.NetworkDecoder(exact), None))
+    np.testing.assert_allclose(decoded, truth, rtol=1e-4, atol=1e-6)
+
+
+def test_coordinates_hold_the_specular_lobe(mi_rgb):
+    """The specular factor is a product of powers of the inputs: D · G · cos θ_o / (4 cos θ_i cos θ_o)."""
+    from mi_diffind.tasks.disney.model import exact_factors
+
+    m, _, wi, wo = draw(array_module(mi_rgb.variant()))
+    x = [np.array(v) for v in networks.coordinates(m, wi, wo)]
+    assert len(x) == networks.DISNEY_INPUTS
+    stretched, roughness, _ = (v / networks.LOGARITHM_SCALE for v in x[5:8])
+    expected = np.exp(-2 * stretched - roughness - x[8] - x[9]) / np.pi * np.array(wo.z)
+    np.testing.assert_allclose(expected, np.array(exact_factors(m, wi, wo).specular), rtol=2e-3)
+
+
+def test_errors_of_training():
+    """Truth above 1 counts as 1, and values above 1 have errors, and gradients, that grow with their logarithms."""
+    import drjit as dr
+
+    Float = array_module("llvm_ad_rgb").Float
+    value, truth = Float(0.5, 3, 0.5, 2, 1000), Float(0.25, 7, 7, 0.5, 1)
+    dr.enable_grad(value)
+    (error,) = networks.squared_errors([value], [truth])
+    expected = np.array([0.25, 0, -0.5, 0.5 + np.log(2), 0]) ** 2
+    np.testing.assert_allclose(error.numpy(), expected, atol=1e-6)
+    dr.backward(error)
+    gradient = dr.grad(value).numpy()
+    assert (gradient[[1, 4]] == 0).all() and gradient[2] == pytest.approx(-1)
+    assert gradient[3] == pytest.approx((0.5 + np.log(2)), rel=1e-5)
 
 
 @pytest.fixture
@@ -102,10 +158,26 @@ def test_reads_of_a_network(mi_rgb, source):
 def test_networks_take_no_more_than_their_bytes(mi_rgb, source, nbytes):
     """Two bytes a parameter, counted on the allocated network, are at most the bytes asked for, and most of them."""
     types = array_module(mi_rgb.variant())
-    for net in (texture_problem(source, mi_rgb, nbytes).net, rivals.network(nbytes).alloc(types.TensorXf)):
+    nets = [texture_problem(source, mi_rgb, nbytes).net, networks.disney_network(nbytes).alloc(types.TensorXf)]
+    for net in (*nets, rivals.network(nbytes).alloc(types.TensorXf)):
         assert 0.8 * nbytes < 2 * net.parameters <= nbytes
 
 
 def test_too_few_bytes_are_refused(mi_rgb, source):
-    with pytest.raises(ValueError, match="200 bytes are too few"):
-        texture_problem(source, mi_rgb, 200)
+    for build in (lambda: texture_problem(source, mi_rgb, 200), lambda: networks.disney_network(20)):
+        with pytest.raises(ValueError, match="0 bytes are too few"):
+            build()
+
+
+def test_a_trained_network_of_factors(mi_rgb, tmp_path):
+    """Parameters are half-precision numbers, measured as such; a file brings them back."""
+    training = disney.network_training("network", 832, quick=True)
+    record = training.run(tmp_path, False)
+    assert record["bytes"] == 2 * training.net.parameters <= 832
+    again = disney.network_training("network", 832, quick=True)
+    assert again.cached_record(tmp_path) == record
+    for key in training.net:
+        value = training.net[key].numpy()
+        np.testing.assert_array_equal(value, value.astype(np.float16).astype(np.float32))
+        np.testing.assert_array_equal(again.net[key].numpy(), value)
+    assert disney.network_training("network", 700, quick=True).cached_record(tmp_path) is None
