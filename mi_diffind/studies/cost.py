@@ -16,8 +16,10 @@ from __future__ import annotations
 import argparse
 import math
 import multiprocessing
+import signal
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -83,21 +85,17 @@ class Row:
         return self.references.get(name, self.first)
 
 
-def _material(material: str, bsdf: str = "principled", texture: str = "bitmap", file: str = "", **more) -> dict:
+def _material(material: str, bsdf: str = "principled", texture: str = "bitmap", file: str = "") -> dict:
     """Return a normal map around a BSDF, with textures of bitmaps, or of a file of tables."""
 
     def read(role: str) -> dict:
         if file:
-            return {"type": texture, "filename": file, "channels": role, **more}
-        return {"type": texture, "filename": f"{material}_{role}.png", "raw": role != "albedo", **more}
+            return {"type": texture, "filename": file, "channels": role}
+        return {"type": texture, "filename": f"{material}_{role}.png", "raw": role != "albedo"}
 
     roles = {"base_color": "albedo", "roughness": "roughness", "metallic": "metallic"}
     inner = {name: read(role) for name, role in roles.items() if (material, role) != ("tiles", "metallic")}
     return {"type": "normalmap", "normalmap": read("normal"), "bsdf": {"type": bsdf, **inner}}
-
-
-def _conductor(type: str, **more) -> dict:
-    return {"type": type, **METAL, **more}
 
 
 #: Name → row.
@@ -112,8 +110,9 @@ ROWS = {
     ),
     "ggx": Row(
         "GGX metal", "ball",
-        {"roughconductor": _conductor("roughconductor", distribution="ggx"), "neural_ggx": _conductor("neural_ggx"),
-         "neural_ggx, paper": _conductor("neural_ggx", preset="paper")},
+        {"roughconductor": {"type": "roughconductor", "distribution": "ggx", **METAL},
+         "neural_ggx": {"type": "neural_ggx", **METAL},
+         "neural_ggx, paper": {"type": "neural_ggx", "preset": "paper", **METAL}},
         r".*ball\.bsdf\.(alpha|eta|k)\b.*",
     ),
     "bsdf": Row(
@@ -282,73 +281,56 @@ def load_scene(row: Row, name: str, step: bool, settings: CostSettings):
 
 
 class ContenderProcess:
-    """Process of the scene of a contender, which renders or steps on demand, on one core."""
+    """Process of the scene of a contender, which renders or steps on demand, on one core.
+
+    ``nbytes``: the bytes of the contender's arrays in its scene.
+    """
 
     def __init__(self, row: Row, name: str, step: bool, settings: CostSettings):
-        context = multiprocessing.get_context("spawn")
         self.spp = row.samples.get(name, settings.spp)
-        self.pipe, other = context.Pipe()
-        arguments = (other, row, name, step, settings, mi.variant())
-        self.process = context.Process(target=_serve, args=arguments, daemon=True)
-        self.process.start()
-        other.close()  # so that the end of the process is seen
-        self.nbytes = self._answer()
+        self.pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"))
+        self.nbytes = self.pool.submit(_load, row, name, step, settings, mi.variant()).result()
 
-    def render(self, spp: int, seed: int) -> tuple[float, int, np.ndarray | None]:
-        """Return the processor's seconds, the samples a pixel that were allowed, and the image of a pass.
+    def run(self, seed: int, spp: int = 0) -> tuple[float, int, np.ndarray | None]:
+        """Return the processor's seconds, the samples a pixel that were allowed, and the image of a render.
 
-        The seconds of a step are NaN if there is nothing to derive. Raises ``RuntimeError`` with the sentence of a
-        process that failed.
+        ``spp``: samples a pixel (0: those of the row). The seconds of a step are NaN if there is nothing to derive.
         """
-        self.pipe.send((spp, seed))
-        return self._answer()
-
-    def _answer(self):
-        try:
-            answer = self.pipe.recv()
-        except EOFError:
-            answer = f"the process of a contender ended ({self.process.exitcode})"
-        if isinstance(answer, str):
-            raise RuntimeError(answer)
-        return answer
-
-    def seconds(self, seed: int) -> float:
-        """Return the seconds of a pass with the samples of the row."""
-        return self.render(self.spp, seed)[0]
+        return self.pool.submit(_run, spp or self.spp, seed).result()
 
     def close(self) -> None:
         """End the process."""
-        self.process.terminate()
-        self.process.join()
+        self.pool.shutdown(cancel_futures=True)
 
 
-def _serve(pipe, row: Row, name: str, step: bool, settings: CostSettings, variant: str) -> None:
-    """Tell the bytes of the contender's arrays in its scene, then answer requests until the pipe is closed."""
+#: Of the process of a contender: its scene, and the function of a step, if it steps.
+_loaded: list = []
+
+
+def _load(row: Row, name: str, step: bool, settings: CostSettings, variant: str) -> int:
+    """Load the scene of this process, and return the bytes of the contender's arrays."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
     mi.set_variant(variant)
     mi.set_log_level(mi.LogLevel.Error)
     compat.use_threads(1)
-    try:
-        scene = load_scene(row, name, step, settings)
-        run = _step(scene, row.keys) if step else lambda spp, seed: mi.render(scene, spp=spp, seed=seed)
-        pipe.send(array_bytes(scene, row.place))
-        while True:
-            spp, seed = pipe.recv()
-            if run is None:
-                pipe.send((math.nan, spp, None))
-                continue
-            if not step:
-                spp = equal_time.attach_samples(scene, spp)
-            dr.sync_thread()
-            start = time.process_time()
-            result = run(spp, dr.opaque(mi.UInt32, seed))
-            dr.eval(result)
-            dr.sync_thread()
-            seconds = time.process_time() - start
-            pipe.send((seconds, spp, None if step else np.array(result)))
-    except (EOFError, KeyboardInterrupt):
-        return
-    except Exception as e:  # told to the parent, which cannot see it
-        pipe.send(f"{name}: " + (compat.one_sentence(e) if isinstance(e, RuntimeError) else repr(e)))
+    scene = load_scene(row, name, step, settings)
+    _loaded[:] = scene, step, _step(scene, row.keys) if step else None
+    return array_bytes(scene, row.place)
+
+
+def _run(spp: int, seed: int) -> tuple[float, int, np.ndarray | None]:
+    """Render or step (:meth:`ContenderProcess.run`)."""
+    scene, step, take_step = _loaded
+    if step and take_step is None:
+        return math.nan, spp, None
+    spp = spp if step else equal_time.attach_samples(scene, spp)
+    dr.sync_thread()
+    start = time.process_time()
+    seed = dr.opaque(mi.UInt32, seed)
+    result = take_step(spp, seed) if step else mi.render(scene, spp=spp, seed=seed)
+    dr.eval(result)
+    dr.sync_thread()
+    return time.process_time() - start, spp, None if step else np.array(result)
 
 
 def _step(scene, keys: str) -> Callable | None:
@@ -392,7 +374,7 @@ def measure(rows: dict[str, Row], settings: CostSettings, progress: bool = True)
     A contender has ``spp``, ``reference`` (a contender), ``error``, ``noise``, ``bias`` (:func:`.equal_time.errors`),
     ``render`` and ``step`` (``seconds`` and the ``ratio`` to the first contender, with quartiles), ``memory_bytes``,
     ``disk_bytes``, and ``equal_time``: ``spp``, ``seconds``, ``error`` and its ``ratio`` to the first contender's, of
-    passes that take as long as one of it. Raises ``RuntimeError`` if the process of a contender fails.
+    passes that take as long as one of it. Raises what the process of a contender raises.
     """
     measured, interrupted = {}, False
     total = sum(
@@ -424,7 +406,7 @@ def _measure_row(row: Row, settings: CostSettings, passed: Callable) -> dict:
     try:
         for seed in range(WARM):
             for process in processes.values():
-                process.seconds(seed)
+                process.run(seed)
         equal = {name: _equal_samples(process, processes[row.first]) for name, process in processes.items()}
         halves = {
             name: _reference(processes[name], settings, passed)
@@ -433,8 +415,8 @@ def _measure_row(row: Row, settings: CostSettings, passed: Callable) -> dict:
         passes, timely = ({name: [] for name in processes} for _ in range(2))
         for i in range(settings.rounds):
             for name, process in _turns(processes, i):
-                passes[name].append(process.render(process.spp, 2 * i))
-                timely[name].append(process.render(equal[name], 2 * i + 1))
+                passes[name].append(process.run(2 * i))
+                timely[name].append(process.run(2 * i + 1, equal[name]))
                 passed(2)
         counted = {name: process.nbytes for name, process in processes.items()}
     finally:
@@ -468,7 +450,7 @@ def _reference(process: ContenderProcess, settings: CostSettings, passed: Callab
     """Return two independent halves of a picture of many samples."""
     halves, count = [0.0, 0.0], REFERENCE * settings.rounds
     for i in range(count):
-        halves[i % 2] = halves[i % 2] + process.render(settings.spp, REFERENCE_SEED + i)[2]
+        halves[i % 2] = halves[i % 2] + process.run(REFERENCE_SEED + i, settings.spp)[2]
         passed()
     return [half / (count / 2) for half in halves]
 
@@ -484,7 +466,7 @@ def _measure_steps(row: Row, settings: CostSettings, passed: Callable) -> dict[s
     try:
         for i in range(WARM + settings.rounds):
             for name, process in _turns(processes, i):
-                seconds[name].append(process.seconds(i))
+                seconds[name].append(process.run(i)[0])
             passed(len(row.contenders) if i >= WARM else 0)
     finally:
         for process in processes.values():
@@ -497,7 +479,7 @@ def _equal_samples(process: ContenderProcess, first: ContenderProcess) -> int:
     """Return the samples of a contender whose pass takes as long as one of the first contender."""
     spp = process.spp
     for _ in range(equal_time.CORRECTIONS):
-        pairs = [(process.render(spp, i)[0], first.seconds(i)) for i in range(equal_time.PAIRS)]
+        pairs = [(process.run(i, spp)[0], first.run(i)[0]) for i in range(equal_time.PAIRS)]
         before, spp = spp, max(1, round(spp / float(np.median([a / b for a, b in pairs]))))
         if spp == before or process is first:
             break
@@ -516,7 +498,9 @@ def file_sizes(description: dict, counted: int) -> dict[str, int]:
     files = {ASSETS / part[key] for part in parts for key in ("filename", "mesh") if key in part}
     learned = next((part for part in parts if part["type"].startswith("neural_")), None)
     if learned is None:
-        return {"memory_bytes": counted, "disk_bytes": sum(path.stat().st_size for path in files)}
+        nbytes = sum(path.stat().st_size for path in files)
+        hidden = description["type"] == "measured"  # its arrays, those of the file, are no parameters
+        return {"memory_bytes": nbytes if hidden else counted, "disk_bytes": nbytes}
     declared = plugins.declared()[learned["type"]]
     path = task.tasks()[declared.task].file(next(iter(files), ""), learned.get("preset", ""))
     if learned.get("trace") != "grid":
