@@ -11,7 +11,6 @@ import ast
 import itertools
 import json
 import math
-import statistics
 import sys
 from collections.abc import Iterable
 from functools import cache
@@ -331,8 +330,6 @@ RENDERS = (
 )  # fmt: skip
 
 #: Error of a contender that is the reference itself.
-EXACT = math.inf
-
 #: Functions and constants of an expression, by name.
 FUNCTIONS = {
     f.__name__: f
@@ -343,7 +340,7 @@ FUNCTIONS = {
         surface_errors, trust_cell, shading_runs, trouble, shading_best, shading, shading_level, shading_spread, flip,
         held_out, shipped, trust_cells,
     )
-} | {"mean": mean, "median_of": statistics.median, "RENDERS": RENDERS, "EXACT": EXACT}  # fmt: skip
+} | {"mean": mean, "RENDERS": RENDERS}  # fmt: skip
 
 
 # -- evaluation --------------------------------------------------------------------------------------------------------

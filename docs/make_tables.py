@@ -8,7 +8,6 @@ get them by expressions (``figures.py``) in three files:
 
 - ``tables.toml``: tables, which stand between ``<!-- table NAME -->`` and ``<!-- end -->``. A table that shows some of
   its rows has all of them in ``docs/measured/NAME.csv``.
-- ``cost.toml``: the rows of ``cost.md`` and of its picture (``make_cost.py``).
 - ``claims.toml``: figures in sentences. Each entry names a page (the README, a page of ``docs``, or the file of a
   plugin, whose docstring is a page of the manual), a part of a sentence with fields as of ``str.format``, and an
   expression for each field. ``holds`` is an expression that must be true, for a sentence in words:
@@ -41,16 +40,12 @@ from typing import Any
 
 from figures import (
     DOCS,
-    EXACT,
     ROOT,
     ClaimError,
-    Entries,
     commands,
     evaluate,
     files,
     formatted,
-    measured,
-    size_text,
     toml,
 )
 
@@ -126,82 +121,11 @@ def declared(entry: dict, study: str = "") -> Table:
 @cache
 def tables() -> dict[str, Table]:
     """Return all tables by name."""
-    result = {"cost": cost(), "cost_sources": cost_sources()}
+    result = {}
     for name, entry in toml("tables.toml").items():
         for ending, study in entry.get("study", {"": ""}).items():
             result[name + ending] = declared(entry, study)
     return result
-
-
-# -- cost.md -----------------------------------------------------------------------------------------------------------
-
-#: Columns of figures of a row.
-FIGURES = ("error", "render", "step", "memory", "disk")
-
-
-def time_ratio(size: str, task: str, name: str, base: str) -> float | None:
-    """Return the time of a contender of ``bench_backward`` over that of ``base``, or the first one's without a base.
-
-    A step without a finite derivative that differs from zero is not measured.
-    """
-    study = measured("bench_backward").tasks[task][size]
-    if not name or (size == "step" and not study[name].get("parameters")):
-        return None
-    if base:
-        return study[name].cpu_ms.median / study[base].cpu_ms.median if base in study else None
-    return study[name].ratio.median if "ratio" in study[name] else None
-
-
-@cache
-def cost_rows() -> list[Entries]:
-    """Return the rows of ``cost.toml``: each figure is a text, or three values of which ``None`` is not measured."""
-    rows = []
-    for entry in toml("cost.toml")["row"]:
-        known = named(entry, {})
-        row, task = Entries(entry, note=evaluate(formatted(entry.get("note", "")), **known)), entry.get("bench", "")
-        for key in FIGURES:
-            if isinstance(entry.get(key), list):
-                row[key] = [evaluate(text, **known) if text else None for text in entry[key]]
-            elif key in ("render", "step") and key not in entry:
-                row[key] = [time_ratio(key, task, name, entry.get("base", "")) for name in entry["names"]]
-            elif key not in entry:
-                sizes = measured("bench_backward").bytes[task]
-                row[key] = [sizes.get(name, {}).get(key) for name in entry["names"]]
-        texts = [formatted(entry.get("note", "")), *entry.get("let", {}).values()]
-        texts += [text for key in FIGURES if isinstance(entry.get(key), list) for text in entry[key] if text]
-        read = set().union(*map(files, texts)) | ({"bench_backward"} if task else set())
-        rows.append(Entries(row, files=sorted(read & commands().keys())))
-    return rows
-
-
-def cost() -> Table:
-    """Return errors, times and bytes of all tasks: ours, what a user would take instead, the paper's recipe."""
-
-    def text(key: str, value, row: Entries) -> str:
-        if value is None:
-            return "–"
-        if key == "error":
-            return "exact" if value == EXACT else f"{value:.1f}" if row.measure.endswith("dB") else f"{value:.2f}°"
-        return (f"{value:.2f}" if key in ("render", "step") else size_text(value)).replace(" ", "\N{NO-BREAK SPACE}")
-
-    def cell(key: str, row: Entries) -> str:
-        return row[key] if isinstance(row[key], str) else "<br>".join(text(key, value, row) for value in row[key])
-
-    return table(
-        ["task", "instead", "measure", "", "error", "a render", "a step", "in memory", "on disk"],
-        [[f"[{row.task}]({row.page}.md)", row.instead, row.measure, "**ours**<br>instead<br>paper",
-          *(cell(key, row) for key in FIGURES)] for row in cost_rows()],
-    )  # fmt: skip
-
-
-def cost_sources() -> Table:
-    """Return the commands behind each row, and why cells are missing."""
-
-    def command(name: str) -> str:
-        return f"`{re.sub(r' --json docs/measured/[^ ]+', '', commands()[name])}`"
-
-    rows = [[f"{row.task} beside {row.instead}", "; ".join(map(command, row.files)), row.note] for row in cost_rows()]
-    return table(["task", "commands", "notes"], rows)
 
 
 # -- claims ------------------------------------------------------------------------------------------------------------

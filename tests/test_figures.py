@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 
 #: Tables of more than ten rows in a page: each task or plugin has a row, or shorter ones would hide what ours loses.
-LONG = {"cost", "cost_sources", "trust", "shading_best"}
+LONG = {"trust", "shading_best"}
 
 
 def test_pages_are_as_the_files_say():
@@ -184,21 +184,3 @@ def test_long_tables_are_shortened():
         assert (f"measured/{name}.csv" in text) == (len(table.shown) < len(table.rows)), name
         assert table.csv().count("\n") == len(table.rows) + 1
         assert {len(row) for row in table.rows} <= {len(table.head)} or name.startswith("texture_levels")
-
-
-def page_table(name: str) -> list[list[str]]:
-    """Return the cells of a table of the page of costs, without its head."""
-    text = (DOCS / "cost.md").read_text(encoding="utf-8")
-    lines = text.split(f"<!-- table {name} -->\n")[1].split("<!-- end -->")[0].splitlines()
-    return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines[2:]]
-
-
-def test_missing_costs_have_a_reason():
-    """Rows of the page of costs with a cell that is not measured say why; each row names the commands of its files."""
-    commands = make_tables.commands()
-    for row, cells, sources in zip(
-        make_tables.cost_rows(), page_table("cost"), page_table("cost_sources"), strict=True
-    ):
-        assert row.files and all(commands[name].split(" --json")[0] in sources[1] for name in row.files)
-        if any("not measured" in cell or "–" in cell.split("<br>") for cell in cells):
-            assert any(reason in sources[2] for reason in ("not measured", "no plugin", "no file on disk")), cells[0]

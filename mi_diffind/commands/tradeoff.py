@@ -9,7 +9,7 @@ from .common import alternative, alternatives, say, set_variant, variant_option,
 HELP = "measure time against accuracy of the contenders of a task"
 
 #: Arguments of studies that are files, as far as a study has them.
-READS = ("source", "scenes", "materials", "table", "renders", "errors_of")
+READS = ("source", "scenes", "materials", "measured")
 
 EXAMPLE = "mi-diffind tradeoff ggx --quick --out out"
 

@@ -8,13 +8,9 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
-import time
 from collections.abc import Callable
 from pathlib import Path
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 
 from mi_diffind.core.files import write_json
@@ -58,44 +54,3 @@ def by_turns(functions: dict[str, Callable], rounds: int, warm: int = 1) -> dict
             if i >= warm:
                 results[name].append(value)
     return results
-
-
-def timed_pass(run: Callable, seed: int) -> tuple[float, float]:
-    """Return the milliseconds of ``run(seed)`` by the clock and by the processor; its result is evaluated."""
-    dr.sync_thread()
-    start, start_cpu = time.perf_counter(), time.process_time()
-    dr.eval(run(seed))
-    dr.sync_thread()
-    return 1e3 * (time.perf_counter() - start), 1e3 * (time.process_time() - start_cpu)
-
-
-def answer_passes(pipe, run: Callable) -> None:
-    """Answer each request of :func:`in_processes` by the times of a pass, with another seed each time."""
-    i = 0
-    while pipe.recv():
-        i += 1
-        pipe.send(timed_pass(run, dr.opaque(mi.UInt32, i)))
-
-
-def in_processes(worker: Callable, names: list[str], rounds: int, *arguments) -> dict[str, dict]:
-    """Return what the process of each contender reports and, by turns, the times of its passes.
-
-    ``worker(name, *arguments, pipe)`` sends a dictionary, then calls :func:`answer_passes`. Each contender has a
-    process of its own, because Dr.Jit compiles the materials of all scenes that a process holds into each kernel. One
-    that reports an ``error`` is left out. To its dictionary are added ``ms``, ``cpu_ms``: rows of times.
-    """
-    context, pipes, reports = multiprocessing.get_context("spawn"), {}, {}
-    for name in names:
-        pipes[name], other = context.Pipe()
-        context.Process(target=worker, args=(name, *arguments, other), daemon=True).start()
-        reports[name] = pipes[name].recv()
-
-    def ask(pipe):
-        pipe.send(True)
-        return pipe.recv()
-
-    running = {name: lambda pipe=pipes[name]: ask(pipe) for name in names if "error" not in reports[name]}
-    for name, times in by_turns(running, rounds, 0).items():
-        pipes[name].send(False)
-        reports[name] |= dict(zip(("ms", "cpu_ms"), np.array(times).T, strict=True))
-    return reports

@@ -23,6 +23,7 @@ ROOT = Path(__file__).resolve().parents[2]
 #: Study → arguments beside ``--quick``; files are those of the fixture ``inputs``.
 RUNS = {
     "bsdf": [],
+    "cost": ["bsdf"],
     "disney": [],
     "field": ["balls", "--compression", "120"],
     "ggx": [],
@@ -93,6 +94,8 @@ def test_quick_runs(study, inputs, tmp_path, monkeypatch, capsys):
     with open(files["csv"], encoding="utf-8", newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert rows and capsys.readouterr().out.endswith(", ".join(files.values()) + "\n")
+    if "candidates" not in result:
+        return
     assert {row["candidate"] for row in rows} == set(result["candidates"])
     for name, c in result["candidates"].items():
         assert all(v is None or math.isfinite(v) for v in c["errors"].values()), name
@@ -127,6 +130,8 @@ def test_a_run_goes_on(inputs, tmp_path, capfd, monkeypatch):
     "study, options, message",
     [
         ("bsdf", ["gold"], 'found the material "gold", allowed are'),
+        ("cost", ["glass"], 'found the row "glass", allowed are disney'),
+        ("cost", ["--measured", "nowhere.bsdf"], "nowhere.bsdf: no such file"),
         ("field", ["--compression", "0"], "0"),
         ("field", ["--without", "vq"], '--without: found "vq", allowed are sparse'),
         ("image", ["--compression", "0"], "0"),
