@@ -185,13 +185,17 @@ class CostStudy(Study):
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         parser.add_argument("rows", nargs="*", metavar="ROW", help=f"{', '.join(ROWS)} (default: all; --quick: disney)")
-        parser.add_argument("--rounds", type=positive, metavar="N", help="passes of each contender (default: 9)")
+        parser.add_argument(
+            "--rounds", type=positive, metavar="N", help="passes of each contender, at least 2 (default: 9)"
+        )
         parser.add_argument("--measured", metavar="FILE.bsdf", help="add a measured copper to the row bsdf")
 
     def check(self, arguments) -> None:
         """Raise ``ValueError`` for a row that does not exist, or without the files of the scenes."""
         if unknown := [name for name in arguments.rows if name not in ROWS]:
             raise ValueError(f'found the row "{unknown[0]}", allowed are {", ".join(ROWS)}')
+        if arguments.rounds == 1:
+            raise ValueError("--rounds: found 1, at least 2 are needed to tell noise from bias")
         for path in (ASSETS / "forest.exr", *([Path(arguments.measured)] if arguments.measured else [])):
             if not path.is_file():
                 raise ValueError(f"{path}: no such file; run the study in a checkout, with files that exist")
