@@ -569,14 +569,16 @@ def picture(result: dict):
     figure = plot.figure("What accuracy costs: error against render time", caption, 4.2 * columns, 3.4 * rows)
     for k, row in enumerate(result["rows"].values()):
         axes = figure.add_subplot(rows, columns, k + 1, xscale="log", yscale="log")
-        first = next(iter(row["contenders"].values()))["render"]["seconds"]["median"]
+        first = next(iter(row["contenders"]))
+        base = row["contenders"][first]["render"]["seconds"]["median"]
         for (name, c), (colour, marker) in zip(row["contenders"].items(), plot.STYLES, strict=False):
-            at = c["render"]["seconds"]["median"] / first
+            at = c["render"]["seconds"]["median"] / base
             times = np.geomspace(min(at, 1) / 4, 16, 60)
             axes.plot(times, c["noise"] * at / times + (c["bias"] or 0), color=colour, linewidth=1.1)
-            measured = [(at, c["error"]), (c["equal_time"]["seconds"]["median"] / first, c["equal_time"]["error"])]
+            measured = [(at, c["error"]), (c["equal_time"]["seconds"]["median"] / base, c["equal_time"]["error"])]
             axes.plot(*zip(*measured, strict=True), marker, color=colour, label=name, markersize=5)
+        plot.log_ticks(axes.xaxis, *axes.get_xlim())
         axes.set_title(row["title"], fontsize=10)
         axes.legend(fontsize=7, frameon=False)
-        plot.finish(axes, "time of a render / the first contender's", "relative mean squared error")
+        plot.finish(axes, f"time of a render / that of {first}", "relative mean squared error")
     return figure
