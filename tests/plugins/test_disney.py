@@ -15,6 +15,7 @@ from bsdf_queries import (
 )
 from disney_materials import FORMS
 from disney_materials import RICH as COLOURED
+from variants import set_variant
 
 from mi_diffind.tasks.disney import TASK
 
@@ -150,9 +151,7 @@ def test_a_texture_of_ones_own_is_not_taken_for_a_bitmap(mi):
 
 
 def test_a_narrow_line_of_a_spectrum_is_not_black():
-    import mitsuba as mi
-
-    mi.set_variant("llvm_ad_spectral")
+    mi = set_variant("llvm_ad_spectral")
     line = {"type": "irregular", "wavelengths": "400, 553, 555, 557, 700", "values": "0, 0, 1, 0, 0"}
     values = []
     for effects in ("all", "used"):

@@ -7,6 +7,7 @@ import sdf_fields
 from radiance_fields import Bumps, Fog, ball_table, register
 from scipy.ndimage import gaussian_filter
 from texture_scenes import refused
+from variants import set_variant
 
 from mi_diffind import plugins
 from mi_diffind.arrays.tables import save_table
@@ -544,9 +545,7 @@ def test_derivatives_of_light_and_shadow(mi, fields):
 
 
 def test_derivatives_of_spectra():
-    import mitsuba as mi
-
-    mi.set_variant("llvm_ad_spectral")
+    mi = set_variant("llvm_ad_spectral")
     registered(mi)
     made = scene(mi, "bumps", size=(12, 8))
     # The table of spectra has a kink at each of its entries

@@ -4,6 +4,7 @@ import drjit as dr
 import footprints as fp
 import numpy as np
 import pytest
+from variants import set_variant
 
 from mi_diffind.plugins.support.footprint import Differentials
 
@@ -219,9 +220,7 @@ def test_centres_of_pixels_and_parameters(mi):
 
 @pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral", "llvm_ad_mono_polarized"])
 def test_other_variants(variant):
-    import mitsuba as mi
-
-    mi.set_variant(variant)
+    mi = set_variant(variant)
     fp.register_probe()
     if "polarized" in variant:
         with pytest.raises(RuntimeError, match="does not run in polarised variants"):
