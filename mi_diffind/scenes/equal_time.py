@@ -93,7 +93,7 @@ class EqualTime:
             times = np.geomspace(first, last, 200)
             axes.plot(times, c["noise"] * seconds / times + bias, color=colour)
             style = {"color": colour, "marker": marker, "markersize": 8, "linestyle": ""}
-            axes.plot(seconds, c["noise"] + bias, label=f"{name}, {c['spp']} spp", **style)
+            axes.plot(seconds, c["error"], label=f"{name}, {c['spp']} spp", **style)
             if at.get("seconds") and first < at["seconds"] < last:
                 label = f"{name}: noise = bias at {_rounded(at['spp'])} spp"
                 axes.plot(at["seconds"], 2 * bias, label=label, markerfacecolor="white", **style)
