@@ -193,9 +193,14 @@ class ShadingContenders:
         """Register classical filters: uncompressed, and by ASTC in the bytes of the trainings."""
         pyramid, effects = self.pyramid, self.effects
         moments = 6 * sum(v[..., 0].size for v in pyramid.values)
-        toksvig = cache(lambda: normals.with_roughness(pyramid, normals.toksvig_levels(pyramid)))
+        pairs = 4 if self.settings.quick else normals.PAIRS
+        pyramids = {
+            "filtered": lambda: pyramid,
+            "Toksvig": cache(lambda: normals.with_roughness(pyramid, normals.toksvig_levels(pyramid))),
+            "baked": cache(lambda: normals.with_roughness(pyramid, normals.bake(pyramid, effects, pairs))),
+        }
         self.add_filter("LEAN", "classical", lambda: (normals.lean(pyramid, effects), pyramid.nbytes + moments))
-        for name, make in {"filtered": lambda: pyramid, "Toksvig": toksvig}.items():
+        for name, make in pyramids.items():
             self.add_filter(name, "classical", lambda make=make: (reader(make(), effects), make().nbytes))
             if "astc" in codecs.available():
                 self.add_filter(f"{name}, ASTC", "compressed", partial(self.encoded, make))

@@ -138,6 +138,18 @@ def test_lean_is_the_mean_of_what_it_filters(types, rng, sigmas):
     assert error < 0.1 and error < 0.5 * without
 
 
+def test_baked_roughness(types, rng):
+    """A flat surface keeps its roughness, as level 0 does; slopes make it larger on coarser levels."""
+    flat = material(rng.normal(0, 1e-3, (16, 16, 2)), 0.42, metallic=1.0)
+    pyramid, effects = prepared(flat, types)
+    for level in normals.bake(pyramid, effects, 4):
+        np.testing.assert_allclose(level, 0.42, atol=0.01)
+    rough = material(rng.normal(0, 0.15, (16, 16, 2)), 0.42, metallic=1.0)
+    pyramid, effects = prepared(rough, types)
+    means = [level.mean() for level in normals.bake(pyramid, effects, 16)]
+    assert means[0] == pytest.approx(0.42, abs=1e-5) and 0.425 < means[1] < means[3] < 0.6
+
+
 def test_a_bias_that_is_known_is_chosen(types, rng):
     """A reader that is a quarter of a level off needs biases that are a quarter less, but on level 0."""
     pyramid, effects = prepared(material(rng.normal(0, 0.02, (32, 32, 2))), types)

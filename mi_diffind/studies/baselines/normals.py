@@ -9,6 +9,7 @@ shades a pyramid of filtered parameters, with normals brought to length 1.
 - :func:`lean`: first and second moments of slopes, filtered linearly, make an anisotropic lobe (Olano and Baker, *LEAN
   Mapping*, 2010), a GGX one in place of their Beckmann's (Dupuy et al., *Linear Efficient Antialiased Displacement and
   Reflectance Mapping*, 2013);
+- :func:`bake`: each texel of each level has the roughness with which it looks most like the converged truth;
 - :func:`biased`: any of these at other levels of detail; its gain is due to the filter's kernel, not to shading.
 
 A roughness by level becomes part of a pyramid by :func:`with_roughness`. The variance of slopes of a GGX lobe is
@@ -30,7 +31,8 @@ from ...maps.layout import Layout, MapLayout
 from ...maps.pyramid import Pyramid, halve
 from ...tasks.disney.decoder import Decoder, Lobe
 from ...tasks.disney.model import ALPHA_MIN, Effects
-from ...tasks.shading.evaluation import ShadedEvaluation, ShadedReader
+from ...tasks.disney.training import uniform_hemisphere
+from ...tasks.shading.evaluation import ShadedEvaluation, ShadedReader, reference
 from ...tasks.shading.material import DEFAULTS, frame, maps_of, shaded, surface_of
 
 #: Least third component in the slope of a normal: a slope of 10.
@@ -39,8 +41,21 @@ STEEPEST = 0.1
 #: Biases of the level of detail that :func:`choose_biases` tries.
 BIASES = tuple(float(bias) for bias in np.arange(-8, 5) / 8)
 
+#: Shares of the way from a texel's filtered roughness (0) to 1 that :func:`bake` tries; a parabola through the errors
+#: of three of them refines the best one.
+TRIED = np.linspace(0, 1, 28)
+
+#: Pairs of a view and a light that :func:`bake` averages over.
+PAIRS = 32
+
+#: Seed of pairs; trainings and evaluations use others.
+SEED = 20050711
+
 #: Places along each side of a texel at which moments are averaged.
 INSIDE = 4
+
+#: Lanes of one evaluation in :func:`bake`.
+CHUNK = 2**22
 
 
 def surface_moments(pyramid: Pyramid) -> list[np.ndarray]:
@@ -131,6 +146,82 @@ def lobe(covariance, alpha2, s, t, n) -> tuple:
     p, q, r = projected(s, s) + 0.5 * alpha2, projected(t, t) + 0.5 * alpha2, projected(s, t)
     scale = dr.rcp(p + q)
     return dr.sqrt(dr.sqrt(p + q)), Lobe((p - q) * scale, 2 * r * scale, type(p)(1))
+
+
+def directions(types, count: int = PAIRS, seed: int = SEED) -> list[tuple]:
+    """Return pairs of a view and a light, uniform over the hemisphere, each with stratified cosines."""
+    rng = np.random.default_rng(seed)
+    numbers = rng.random((4, count))
+    for row in (0, 2):
+        numbers[row] = (rng.permutation(count) + numbers[row]) / count
+    columns = [[dr.opaque(types.Float, float(x)) for x in column] for column in numbers.T]
+    return [(uniform_hemisphere(types, a, b), uniform_hemisphere(types, c, d)) for a, b, c, d in columns]
+
+
+def bake(pyramid: Pyramid, effects: Effects, pairs: int = PAIRS) -> list[np.ndarray]:
+    """Return the roughness, ``(height, width)`` for each level, that minimises the error against the converged truth.
+
+    The error is that of filtered parameters at a texel's centre: the squared error of values clipped to [0, 1], over
+    ``pairs`` of a view and a light. The roughness is never below the filtered one (where light is lost, least squares
+    would have no highlight at all), and equal to it on level 0.
+    """
+    types, filtered_levels = pyramid.types, roughness_levels(pyramid)
+    baked_levels = [np.array(filtered_levels[0])]
+    Float, UInt32 = types.Float, types.UInt32
+    view_lights, tried = directions(types, pairs), len(TRIED)
+    shares = Float(aligned_copy(TRIED, np.float32))
+    for level, texels in enumerate(pyramid.values[1:], 1):
+        rows, columns, _ = texels.shape
+        side = _side(level)
+        step = max(1, CHUNK // max(side * side, tried))
+        errors = []
+        for start in range(0, rows * columns, step):
+            count = min(step, rows * columns - start)
+            index = dr.arange(UInt32, count) + dr.opaque(UInt32, start)
+            n, m = dr.opaque(UInt32, columns), dr.opaque(UInt32, rows)
+            place = (Float(index % n) + 0.5) / Float(n), (Float(index // n) + 0.5) / Float(m)
+            place = (*place, dr.opaque(Float, level, count))
+            lane, n = dr.arange(UInt32, count * tried), dr.opaque(UInt32, tried)
+            texel, trial = lane // n, lane % n
+            surface = surface_of(pyramid, pyramid.filtered(*(dr.gather(Float, x, texel) for x in place)))
+            roughness = dr.lerp(Float(surface.roughness), 1, dr.gather(Float, shares, trial))
+            surface = replace(surface, roughness=roughness)
+            dr.eval(surface.albedo, surface.normal, surface.roughness, surface.metallic)
+            total = dr.zeros(Float, count * tried)
+            for wi, wo in view_lights:
+                truth = reference("converged", pyramid, *place, *_wide(count, wi, wo), effects, side=side)
+                truth = dr.gather(types.Array3f, dr.clip(truth, 0, 1), texel)
+                value = dr.clip(shaded(None, surface, *_wide(count * tried, wi, wo), effects), 0, 1)
+                total += dr.squared_norm(value - truth)
+                dr.eval(total)
+            errors.append(total.numpy().reshape(count, tried))
+        share = _refined_minimum(np.concatenate(errors)).reshape(rows, columns)
+        base = filtered_levels[level]
+        baked_levels.append((base + share * (1 - base)).astype(np.float32))
+    return baked_levels
+
+
+def _side(level: int) -> int:
+    """Return the samples along the side of a footprint: at least two for each texel.
+
+    With one, all samples might lie at centres of texels, or all at corners, where normals vary less.
+    """
+    return min(max(8, 2 << level), 128)
+
+
+def _wide(count: int, *directions) -> list:
+    """Return directions repeated for ``count`` lanes."""
+    return [dr.gather(type(w), w, dr.zeros(dr.uint32_array_t(type(w.x)), count)) for w in directions]
+
+
+def _refined_minimum(errors: np.ndarray) -> np.ndarray:
+    """Return the minimum of a parabola around the best of :data:`TRIED` (equidistant), for each row of errors."""
+    best = errors.argmin(axis=1)
+    middle, lane = np.clip(best, 1, len(TRIED) - 2), np.arange(len(errors))
+    before, at, after = (errors[lane, middle + i].astype(np.float64) for i in (-1, 0, 1))
+    bend = before - 2 * at + after
+    shift = np.where((bend > 1e-12) & (best == middle), 0.5 * (before - after) / np.maximum(bend, 1e-12), best - middle)
+    return TRIED[middle] + shift * (TRIED[1] - TRIED[0])
 
 
 def roughness_levels(pyramid: Pyramid) -> list[np.ndarray]:
