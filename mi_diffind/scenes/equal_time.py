@@ -44,9 +44,6 @@ PAIRS = 3
 #: Corrections of the samples of a contender after its first measured pass.
 CORRECTIONS = 3
 
-#: Largest multiple of the time of a measured pass that curves of the picture reach.
-REACH = 1000
-
 
 @dataclass
 class EqualTime:
@@ -59,21 +56,15 @@ class EqualTime:
     def save(self, folder: str | os.PathLike) -> dict[str, str]:
         """Write ``equal_time.png`` into ``folder``, made if its parent exists, and return the paths."""
         path = writable_folder(folder, create=True) / "equal_time.png"
-        rows = self.figures["contenders"]
-        cells = [
-            plot.picture(f"{name}: {rows[name]['spp']} spp, {rows[name]['seconds']['median']:.2g} s", image)
-            for name, image in self.images.items()
-        ]
-        cells.append(plot.picture(f"reference: {self._reference()}", self.reference))
-        cells += [
-            plot.error_map(
-                np.sqrt(_weighted((image - self.reference) ** 2, self.reference)),
-                f"relative error; relMSE {rows[name]['error']:.3g}, of it bias {_share(rows[name])}",
-            )
-            for name, image in self.images.items()
-        ]
-        cells.append(self._draw_law)
-        plot.write(path, cells, len(self.images) + 1, self.reference.shape)
+        pictures, error_maps = [], []
+        for name, image in self.images.items():
+            c, error = self.figures["contenders"][name], _weighted((image - self.reference) ** 2, self.reference)
+            title = f"{name} ({', '.join(c['plugins'])}): {c['spp']} samples a pixel, {c['seconds']['median']:.2g} s"
+            pictures.append(plot.picture(title, image))
+            title = f"relative error; mean square {c['error']:.3g}, of it bias {_share(c)}"
+            error_maps.append(plot.error_map(np.sqrt(error), title))
+        pictures.append(plot.picture(f"reference: {self._reference()}", self.reference))
+        plot.write(path, [*pictures, *error_maps, self._draw_law], len(pictures), self.reference.shape)
         return {"figure": str(path)}
 
     def _draw_law(self, figure, axes) -> None:
@@ -82,21 +73,20 @@ class EqualTime:
         if not drawn:
             return
         axes.set_axis_on()
-        axes.set(xscale="log", yscale="log", xlabel="seconds of a pass", ylabel="error of a pass (relMSE)")
+        axes.set(xscale="log", yscale="log", xlabel="seconds of a pass", ylabel="relative mean squared error of a pass")
         axes.set_title("error against time; lines are noise / samples + bias")
         first = min(c["seconds"]["median"] / c["spp"] for c in drawn.values())
-        longest = max(c["seconds"]["median"] for c in drawn.values())
-        crossovers = [c["crossover"]["seconds"] for c in drawn.values() if c["crossover"] and c["crossover"]["seconds"]]
-        last = min(4 * max(longest, *crossovers, 0.0), REACH * longest)
+        equal = {name: c["crossover"]["seconds"] or 0.0 for name, c in drawn.items() if c["crossover"]}
+        last = max([*(c["seconds"]["median"] for c in drawn.values()), *equal.values()])
+        times = np.geomspace(first, 4 * last, 200)
         for (name, c), (colour, marker) in zip(drawn.items(), itertools.cycle(plot.STYLES)):
-            seconds, bias, at = c["seconds"]["median"], c["bias"] or 0.0, c["crossover"] or {}
-            times = np.geomspace(first, last, 200)
+            seconds, bias = c["seconds"]["median"], c["bias"] or 0.0
             axes.plot(times, c["noise"] * seconds / times + bias, color=colour)
             style = {"color": colour, "marker": marker, "markersize": 8, "linestyle": ""}
-            axes.plot(seconds, c["error"], label=f"{name}, {c['spp']} spp", **style)
-            if at.get("seconds") and first < at["seconds"] < last:
-                label = f"{name}: noise = bias at {_rounded(at['spp'])} spp"
-                axes.plot(at["seconds"], 2 * bias, label=label, markerfacecolor="white", **style)
+            axes.plot(seconds, c["error"], label=f"{name}, {c['spp']} samples a pixel", **style)
+            if equal.get(name, 0.0) > first:
+                label = f"{name}: noise = bias at {_rounded(c['crossover']['spp'])} samples a pixel"
+                axes.plot(equal[name], 2 * bias, label=label, markerfacecolor="white", **style)
         plot.log_ticks(axes.xaxis, *axes.get_xlim())
         plot.log_ticks(axes.yaxis, *axes.get_ylim())
         axes.grid(color="0.92")
@@ -105,38 +95,29 @@ class EqualTime:
     def _reference(self) -> str:
         f = self.figures
         plugins = ", ".join(f["contenders"][f["reference"]]["plugins"])
-        return f"{f['reference']} ({plugins}), {f['reference_spp']} spp"
+        return f"{f['reference']} ({plugins}), {f['reference_spp']} samples a pixel"
 
     def __str__(self) -> str:
-        f = self.figures
+        f, remarks = self.figures, []
         rows = [("", "samples", "seconds", "error", "of it noise", "of it bias", f"error / {f['reference']}")]
         for name, c in f["contenders"].items():
             median, q1, q3 = c["error_ratio"].values()
-            rows.append(
-                (
-                    name,
-                    f"{c['spp']}",
-                    f"{c['seconds']['median']:.3g}",
-                    f"{c['error']:.3g}",
-                    f"{c['noise']:.3g}",
-                    _share(c),
-                    "-" if median is None else f"{median:.2f} ({q1:.2f} to {q3:.2f})",
-                )
-            )
-        return "\n".join(
-            [
-                f"scene       {Path(f['scene']).name}, {f['width']} x {f['height']}, "
-                f"{f['passes']} pass{'es' if f['passes'] != 1 else ''}{', interrupted' if f['interrupted'] else ''}",
-                f"variant     {f['variant']}",
-                f"reference   {self._reference()}",
-                "error       mean squared error of a pass, over the squared reference + 0.01 (relMSE)",
-                "",
-                *grid(rows),
-                "",
-                *(f"{n}: {_crossover_text(c, f['reference'])}" for n, c in f["contenders"].items() if c["crossover"]),
-                *(f"{name}: {c['remark']}" for name, c in f["contenders"].items() if c["remark"]),
-            ]
-        )
+            numbers = (f"{value:.3g}" for value in (c["seconds"]["median"], c["error"], c["noise"]))
+            ratio = "-" if median is None else f"{median:.2f} ({q1:.2f} to {q3:.2f})"
+            rows.append((name, str(c["spp"]), *numbers, _share(c), ratio))
+            time_ratio = c["seconds"]["median"] / f["contenders"][f["reference"]]["seconds"]["median"]
+            if abs(time_ratio - 1) > TOLERANCE:
+                remarks.append(f"{name}: its passes took {time_ratio:.2f} of the time of {f['reference']}")
+            if c["crossover"]:
+                remarks.append(f"{name}: {_crossover_text(c, f['reference'])}")
+        head = [
+            f"scene       {Path(f['scene']).name}, {f['width']} x {f['height']}, "
+            f"{f['passes']} passes{', interrupted' * f['interrupted']}",
+            f"variant     {f['variant']}",
+            f"reference   {self._reference()}",
+            "error       mean squared error of a pass, over the squared reference + 0.01 (relMSE)",
+        ]
+        return "\n".join([*head, "", *grid(rows), "", *remarks])
 
     def _repr_png_(self) -> bytes:
         with tempfile.TemporaryDirectory() as folder:
@@ -188,15 +169,9 @@ class _EqualSide:
     """Scene whose passes have ``spp`` samples a pixel."""
 
     def __init__(self, scene, plugins: list[str], spp: int):
-        self.scene, self.plugins, self.spp = scene, plugins, 0
+        self.scene, self.plugins, self.spp = scene, plugins, attach_samples(scene, spp)
         self.images: list[np.ndarray] = []
         self.seconds: list[float] = []
-        self.choose(spp)
-
-    def choose(self, spp: int) -> bool:
-        """Take the most samples up to ``spp`` that the sampler allows; return whether that is another number."""
-        before, self.spp = self.spp, attach_samples(self.scene, spp)
-        return self.spp != before
 
     def render(self, seed: int) -> tuple[np.ndarray, float]:
         """Return an image of one pass, and its seconds."""
@@ -210,7 +185,9 @@ class _EqualSide:
         """Choose the samples whose pass takes as long as one of ``exact``, as far as the sampler allows."""
         for _ in range(CORRECTIONS):
             pairs = [(self.render(i)[1], exact.render(i)[1]) for i in range(PAIRS + 1)][1:]  # the first ones compile
-            if not self.choose(round(self.spp / np.median([a / b for a, b in pairs]))):
+            before = self.spp
+            self.spp = attach_samples(self.scene, round(before / np.median([a / b for a, b in pairs])))
+            if self.spp == before:
                 break
 
 
@@ -249,27 +226,18 @@ def crossover(contender: Mapping, exact: Mapping) -> dict:
     """
     noise, bias, resolution = (contender[key] for key in ("noise", "bias", "bias_resolution"))
     spp, seconds = contender["spp"], contender["seconds"]["median"]
-    equal = better = above = None
     if bias is None:
-        above = spp * noise / resolution if resolution > 0 else None
-    else:  # in passes of the contender
-        equal = noise / bias
-        better = max(0.0, exact["noise"] * exact["seconds"]["median"] / seconds - noise) / bias
+        unknown = dict.fromkeys(("spp", "seconds", "reference_better_spp", "reference_better_seconds"))
+        return {**unknown, "spp_above": spp * noise / resolution if resolution > 0 else None}
+    equal = noise / bias  # in passes of the contender
+    better = max(0.0, exact["noise"] * exact["seconds"]["median"] / seconds - noise) / bias
     return {
-        "spp": None if equal is None else spp * equal,
-        "seconds": None if equal is None else seconds * equal,
-        "reference_better_spp": None if better is None else spp * better,
-        "reference_better_seconds": None if better is None else seconds * better,
-        "spp_above": above,
+        "spp": spp * equal,
+        "seconds": seconds * equal,
+        "reference_better_spp": spp * better,
+        "reference_better_seconds": seconds * better,
+        "spp_above": None,
     }
-
-
-def _remark(contender: _EqualSide, exact: _EqualSide) -> str:
-    """Return a sentence if the times of two contenders differ by more than :data:`TOLERANCE`, else ""."""
-    ratio = float(np.median(np.divide(contender.seconds, exact.seconds)))
-    if abs(ratio - 1) <= TOLERANCE:
-        return ""
-    return f"its passes took {ratio:.2f} of the time of the others: compare it with care"
 
 
 def compare_at_equal_time(
@@ -294,8 +262,7 @@ def compare_at_equal_time(
     The reference is the exact scene at :data:`REFERENCE` times all its samples. Figures: ``contenders``, by name, have
     ``spp``, ``seconds`` (median and quartiles of a pass), ``error``, ``noise`` and ``bias`` (:func:`errors`),
     ``error_ratio`` (median and quartiles of the ratios of a pass's error to that of the exact scene, ``None`` if that
-    has no error), ``crossover`` (:func:`crossover`, ``None`` of the exact scene), and a ``remark`` if the times are not
-    equal. Raises :class:`.SceneError`, as
+    has no error), and ``crossover`` (:func:`crossover`, ``None`` of the exact scene). Raises :class:`.SceneError`, as
     :func:`.comparison.compare` does.
     """
     loaded, passes = comparison.load_compared(scene, against, learn, defines, progress), max(2, passes)
@@ -311,16 +278,13 @@ def compare_at_equal_time(
         for contender in others:
             contender.fill(exact)
             bar.update()
-
-    count = max(2, REFERENCE * passes)
-    halves, taken, done = [0.0, 0.0], [0, 0], 0
-    total = count + passes * len(contenders)
-    with interruptible() as stop, progress_bar("render", total, progress=progress) as bar:
+    halves, count = [0.0, 0.0], REFERENCE * passes
+    with interruptible() as stop, progress_bar("render", count + passes * len(contenders), progress=progress) as bar:
         for i in range(count):
             halves[i % 2] = halves[i % 2] + exact.render((seed << 16) + (1 << 15) + i)[0]
-            taken[i % 2] += 1
             bar.update()
             if stop.is_set() and i > 0:
+                count = i + 1
                 break
         for i in range(passes):
             for contender in contenders.values() if i % 2 == 0 else reversed(contenders.values()):
@@ -328,34 +292,29 @@ def compare_at_equal_time(
                 contender.images.append(image)
                 contender.seconds.append(seconds)
                 bar.update()
-            done += 1
-            if stop.is_set() and done >= 2:
+            if stop.is_set() and i > 0:
                 break
-    halves = [half / n for half, n in zip(halves, taken, strict=True)]
+    halves = [halves[0] / ((count + 1) // 2), halves[1] / (count // 2)]
     reference = (halves[0] + halves[1]) / 2
-    measured = {name: errors(c.images, halves) for name, c in contenders.items()}
-    base = measured[reference_name]["errors"]
-    for name, c in contenders.items():
-        measured[name] |= {"plugins": c.plugins, "spp": c.spp, "seconds": spread(c.seconds)}
+    measured = {
+        name: {"plugins": c.plugins, "spp": c.spp, "seconds": spread(c.seconds), **errors(c.images, halves)}
+        for name, c in contenders.items()
+    }
+    base = measured[reference_name]
+    for c in measured.values():
+        c["error_ratio"] = spread(e / b for e, b in zip(c["errors"], base["errors"], strict=True) if b > 0)
+        c["crossover"] = None if c is base else crossover(c, base)
     figures = {
         "scene": str(loaded.parsed.path),
         "variant": mi.variant(),
         "width": reference.shape[1],
         "height": reference.shape[0],
         "seed": seed,
-        "passes": done,
+        "passes": len(exact.images),
         "interrupted": stop.is_set(),
         "reference": reference_name,
-        "reference_spp": sum(taken) * exact.spp,
-        "contenders": {
-            name: {
-                **measured[name],
-                "error_ratio": spread(e / b for e, b in zip(measured[name]["errors"], base, strict=True) if b > 0),
-                "crossover": None if c is exact else crossover(measured[name], measured[reference_name]),
-                "remark": _remark(c, exact),
-            }
-            for name, c in contenders.items()
-        },
+        "reference_spp": count * exact.spp,
+        "contenders": measured,
     }
-    return EqualTime({name: c.images[0].astype(np.float32) for name, c in contenders.items()},
-                     reference.astype(np.float32), finite(figures))  # fmt: skip
+    images = {name: c.images[0].astype(np.float32) for name, c in contenders.items()}
+    return EqualTime(images, reference.astype(np.float32), finite(figures))

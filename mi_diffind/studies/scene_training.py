@@ -1,9 +1,9 @@
 """Study ``tradeoff scene-training``: training inside a scene against training for shading over the hemisphere.
 
 *Runs*: the file that the scene names (*start*); training for shading over the hemisphere (``fit shading``) from it, for
-as many seconds as the largest λ at one sample a pixel takes inside the scene (*hemisphere*), and to its end
-(*hemisphere, longer*); training inside the scene (``fit scene``) from the start (*scene*; also with other λ, other
-samples a pixel, and without samples beyond these), from the result of the hemisphere, and from an untrained start.
+as many seconds as training inside the scene takes (*hemisphere*), and to its end (*hemisphere, longer*); training
+inside the scene (``fit scene``) from the start (*scene*; also without samples beyond one a pixel), from the result of
+the hemisphere, and from an untrained start.
 *Another material* is a texture of the same maps turned by 90° and inverted; training inside the scene starts from it,
 too, and from what hemisphere training makes of it.
 
@@ -15,9 +15,8 @@ from __future__ import annotations
 
 import argparse
 import gc
-import time
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -26,7 +25,6 @@ import mitsuba as mi
 import numpy as np
 
 from ..arrays.tables import Table
-from ..core.arguments import fraction, positive
 from ..core.files import writable_folder
 from ..fitting import task
 from ..images import metrics
@@ -47,11 +45,8 @@ from ..tasks.texture.compressed import load
 
 #: Names of the runs.
 AFTER = "hemisphere, then scene"
-LONGER = "hemisphere, longer"
-FEW = "scene, few samples"
 OTHER = "another material"
 MENDED = f"{OTHER}, then hemisphere"
-
 
 #: Ranges of camera and lights of the scenes that ship, by the name of the file.
 RANGES = {
@@ -64,32 +59,32 @@ RANGES = {
     },
 }  # fmt: skip
 
-
 #: Runs in the picture, and their titles.
 SHOWN = {
     "start": "before the training", "hemisphere": "trained over the hemisphere", "scene": "trained inside the scene",
     AFTER: "over the hemisphere, then inside",
 }  # fmt: skip
 
-
 #: Seed of the views that errors are measured on; trainings have seed 0.
 SEED = 1000
 
+#: λ of the trainings inside a scene.
+SHARE = SceneRecipe().share
 
-#: Settings of the study. ``lambdas``: weights of the loss of renders. ``counts``: samples a pixel of trainings.
-#: ``steps`` of a training inside a scene, on ``views`` views, of which ``held_out`` others choose the state; ``tests``
-#: views are measured. Renders are ``width`` pixels wide and 9/16 of this high, with paths of ``depth``.
-#: ``reference_spp`` and ``spp``: samples a pixel of references, and of a measured render. ``hemisphere_steps``: steps
-#: of a training over the hemisphere to its end; ``texture_steps``: those of the texture of another material.
+#: Settings of the study. A training inside a scene has ``steps`` on ``views`` views; ``held_out`` others choose its
+#: state, and ``tests`` others are measured. Renders are ``width`` pixels wide and 9/16 of this high, with paths of
+#: ``depth``. ``reference_spp`` and ``spp``: samples a pixel of references, and of a measured render.
+#: ``hemisphere_steps``: steps of a training over the hemisphere to its end; ``texture_steps``: those of the texture of
+#: another material.
 FULL = {
-    "lambdas": [0.25, 0.5, 0.9, 1.0], "counts": [1, 4], "steps": 60, "views": 16, "held_out": 4, "tests": 8,
-    "width": 64, "depth": 3, "reference_spp": 512, "spp": 128, "hemisphere_steps": 1500, "texture_steps": 200,
+    "steps": 60, "views": 16, "held_out": 4, "tests": 8, "width": 64, "depth": 3, "reference_spp": 512, "spp": 128,
+    "hemisphere_steps": 1500, "texture_steps": 200,
 }  # fmt: skip
 
 #: Settings of a quick study, of the runs in the picture: both trainings take a few steps, not the same seconds.
 QUICK = {
-    "lambdas": [0.9], "counts": [1], "steps": 2, "views": 2, "held_out": 1, "tests": 1, "width": 64, "depth": 2,
-    "reference_spp": 128, "spp": 32, "hemisphere_steps": 20, "texture_steps": 0,
+    "steps": 2, "views": 2, "held_out": 1, "tests": 1, "width": 64, "depth": 2, "reference_spp": 128, "spp": 32,
+    "hemisphere_steps": 20, "texture_steps": 0,
 }  # fmt: skip
 
 
@@ -103,42 +98,41 @@ class SceneTrainingStudy(Study):
         parser.add_argument("scenes", nargs="*", metavar="SCENE.xml",
                             help="scenes that read one compressed material, seen as training_balls is "
                             "unless it ships (default: scenes/training_*.xml; --quick: the first)")  # fmt: skip
-        parser.add_argument(
-            "--lambda",
-            action="append",
-            type=fraction,
-            dest="lambdas",
-            metavar="X",
-            help="weight of the loss of renders; may be repeated (default: 0.25, 0.5, 0.9, 1; --quick: 0.9)",
-        )
-        parser.add_argument(
-            "--spp",
-            action="append",
-            type=positive,
-            dest="counts",
-            metavar="N",
-            help="samples a pixel of trainings; may be repeated (default: 1, 4; --quick: 1)",
-        )
 
     def check(self, arguments) -> None:
         """Check that the scenes exist."""
-        arguments.paths = scene_files(arguments.scenes, arguments.quick)
+        shipped = [f"scenes/{name}.xml" for name in RANGES][: 1 if arguments.quick else None]
+        arguments.paths = list(map(Path, arguments.scenes or shipped))
+        for path in arguments.paths:
+            if not path.is_file():
+                raise ValueError(f"scenes: found {path}, which is no file; give SCENE.xml, or run in the repository")
 
     def plan(self, arguments) -> Plan:
-        given = {name: sorted(set(value)) for name in ("lambdas", "counts") if (value := getattr(arguments, name))}
-        return plan(arguments.paths, SimpleNamespace(**{**(QUICK if arguments.quick else FULL), **given}))
+        settings = SimpleNamespace(**(QUICK if arguments.quick else FULL))
+        contexts = [SceneTrainingContext(path, settings) for path in arguments.paths]
+        runs = [run for context in contexts for run in planned_runs(context)]
+        size = f"{settings.width} × {settings.width * 9 // 16}"
+        return Plan(
+            study="scene-training",
+            title="Training inside a scene",
+            candidates=[run.candidate(label=run.name) for run in runs],
+            cases=[],
+            measures=(
+                Measure("PSNR of held-out views and lights, dB", "psnr_db"),
+                Measure("FLIP", "flip", ".3f", False),
+            ),
+            details={"scenes": [c.name for c in contexts], "request": vars(settings)},
+            notes=[
+                f"{settings.steps} steps, {settings.views} views of {size} pixels; "
+                f"errors: {settings.tests} other views and lights against {settings.reference_spp} spp."
+            ],
+            jobs=runs,
+            jobs_fingerprint=fingerprint(file for c in contexts for file in (c.file, *c.parsed.files())),
+            pictures={"png": lambda result: picture(contexts, runs, result)},
+        )
 
 
 STUDY = SceneTrainingStudy()
-
-
-def scene_files(paths: Sequence[str], quick: bool) -> list[Path]:
-    """Return the scene files, by default those that ship. Raises ``ValueError`` if one does not exist."""
-    chosen = list(map(Path, paths or [f"scenes/{name}.xml" for name in [*RANGES][: 1 if quick else None]]))
-    for path in chosen:
-        if not path.is_file():
-            raise ValueError(f"scenes: found {path}, which is no file; give SCENE.xml, or run in the repository")
-    return chosen
 
 
 class SceneTrainingContext:
@@ -158,10 +152,10 @@ class SceneTrainingContext:
         """Return the folder that keeps references, in the folder of models."""
         return writable_folder(folder / "references", create=True)
 
-    def measure(self, table: Table, spp: int, folder: Path) -> dict[str, float]:
-        """Return ``psnr_db`` and ``flip`` of a table in renders with footprints of ``spp`` samples a pixel."""
+    def measure(self, table: Table, folder: Path) -> dict[str, float]:
+        """Return ``psnr_db`` and ``flip`` of a table in renders with footprints of one sample a pixel."""
         distribution, views, references, exposure = measured_views(self, folder)
-        scene = TrainedScene(self.parsed, {self.file: table}, distribution, spp)
+        scene = TrainedScene(self.parsed, {self.file: table}, distribution, 1)
         errors, flips = [], []
         with dr.suspend_grad():
             for i, (view, reference) in enumerate(zip(views, references, strict=True)):
@@ -194,15 +188,14 @@ def picture(contexts: Sequence[SceneTrainingContext], runs: Sequence[Contender],
     """Draw the first measured view of each scene: after each of the :data:`SHOWN` runs, and the truth."""
     rows = {}
     for context in contexts:
-        images, names = {}, []
+        images = {}
         for run in runs:
-            if run.details["context"] == context.name and run.method in SHOWN and run.method not in names:
+            if run.details["context"] == context.name and run.method in SHOWN:
                 distribution, views, references, exposure = measured_views(context, context.references(run.folder))
-                scene = TrainedScene(context.parsed, {context.file: run.model}, distribution, int(run.budget))
+                scene = TrainedScene(context.parsed, {context.file: run.model}, distribution, 1)
                 with dr.suspend_grad():
                     scene.place(views[0])
                     image = scene.render(0, 1, context.settings.spp).numpy()
-                names.append(run.method)
                 images[f"{SHOWN[run.method]}\nPSNR {run.record['errors']['psnr_db']:.1f} dB"] = image
         images[f"exact plugins\n{context.settings.reference_spp} samples a pixel"] = references[0]
         rows[context.name] = {title: for_display(exposure * image) for title, image in images.items()}
@@ -214,16 +207,14 @@ def training_run(
     context: SceneTrainingContext,
     method: str,
     task_name: str = "",
-    spp: int = 1,
-    share: float | None = None,
     after: Contender | None = None,
     limit: Callable[[], dict] = dict,
     **options,
 ) -> Contender:
     """Return the run ``method``: a file that is measured in a scene after a training of the task, ``""`` for none.
 
-    ``spp``: samples a pixel. ``share``: λ of a training inside the scene. ``after``: the run it starts from (``None``:
-    the file); ``limit()`` returns its steps or seconds; ``options`` are further ones of ``fit scene``.
+    ``after``: the run it starts from (``None``: the file). ``limit()`` returns the steps or seconds of a training over
+    the hemisphere; ``options`` are further ones of ``fit scene``.
     """
     settings = context.settings
 
@@ -242,12 +233,12 @@ def training_run(
         return task.fit(
             "scene", context.path, defines=list(context.defines.items()), steps=settings.steps,
             measure_every=max(1, settings.steps // 8), views=settings.views, held_out=settings.held_out,
-            reference_spp=settings.reference_spp, references=context.references(job.folder), spp=spp, share=share,
+            reference_spp=settings.reference_spp, references=context.references(job.folder), spp=1, share=SHARE,
             **ranges, **given, **options, **common,
         )  # fmt: skip
 
     def fit(job: Contender, progress: bool) -> dict | None:
-        processor, figures = time.process_time(), {}
+        figures = {}
         if not task_name:
             job.model = context.start
             job.file.write_bytes(Path(context.file).read_bytes())
@@ -258,16 +249,20 @@ def training_run(
             job.model = fitted.table
             fitted.save(job.file)
             figures = {"steps": fitted.result.steps, "training_seconds": fitted.result.seconds,
-                       "processor_seconds": time.process_time() - processor,
                        "level_bias": job.model.settings.get("level_bias", 0.0)}  # fmt: skip
-        errors = context.measure(job.model, spp, context.references(job.folder))
-        details = {"scene": context.name, "way": method, "lambda": share, "spp": spp, **figures, **errors}
+        errors = context.measure(job.model, context.references(job.folder))
+        details = {
+            "scene": context.name,
+            "way": method,
+            "lambda": SHARE if task_name == "scene" else None,
+            "spp": 1,
+            **figures,
+            **errors,
+        }
         return {"bytes": job.model.nbytes, "errors": errors, "details": details}
 
-    text = "" if share is None else f", λ {share:g}"
-    name = f"{context.name}, {method}{text}, {spp} spp"
-    return Contender(name, method, spp, fit, lambda job: load(job.file), method, setting=f"{spp} spp",
-                     details={"context": context.name, "share": share})  # fmt: skip
+    name = f"{context.name}, {method}{f', λ {SHARE:g}' * (task_name == 'scene')}, 1 spp"
+    return Contender(name, method, 1, fit, lambda job: load(job.file), method, details={"context": context.name})
 
 
 def other_maps(source: Path) -> dict[str, np.ndarray]:
@@ -281,50 +276,18 @@ def other_maps(source: Path) -> dict[str, np.ndarray]:
 
 def planned_runs(context: SceneTrainingContext) -> list[Contender]:
     """Return the runs of a scene in their order."""
-    settings, default = context.settings, SceneRecipe().share
-    share = default if default in settings.lambdas else settings.lambdas[-1]
-
-    def run(method: str, task: str = "", spp: int = settings.counts[0], **fields) -> Contender:
-        return training_run(context, method, task, spp, **fields)
-
-    def inside(method: str, after: Contender | None = None, **fields) -> Contender:
-        return run(method, "scene", **{"share": share, "after": after, **fields})
-
+    settings, run = context.settings, partial(training_run, context)
+    inside = partial(run, task_name="scene")
     end = {"limit": lambda: {"steps": settings.hemisphere_steps}}
-    start, scene = [run("start", spp=spp) for spp in settings.counts], inside("scene")
+    start, scene = run("start"), inside("scene")
     if not settings.texture_steps:
-        return [*start, scene, run("hemisphere", "shading", **end)]
-    long = {"limit": lambda: {"seconds": max(1.0, scene.record["details"]["training_seconds"])}}
+        return [start, scene, run("hemisphere", "shading", **end)]
+    equal = {"limit": lambda: {"seconds": max(1.0, scene.record["details"]["training_seconds"])}}
     other = run(OTHER, "texture")
-    hemisphere, mended = run("hemisphere", "shading", **long), run(MENDED, "shading", after=other, **long)
+    hemisphere, mended = run("hemisphere", "shading", **equal), run(MENDED, "shading", after=other, **equal)
     return [
-        *start, scene, hemisphere, run(LONGER, "shading", **end),
-        inside(AFTER, hemisphere), inside("untrained, then scene", begin="untrained"), inside(FEW, samples=1),
-        other, inside(f"{OTHER}, then scene", other), mended, inside(f"{MENDED}, then scene", mended),
-        *(inside("scene", share=s) for s in settings.lambdas if s != share),
-        *(inside("scene", spp=spp) for spp in settings.counts[1:]),
+        start, scene, hemisphere, run("hemisphere, longer", "shading", **end),
+        inside(AFTER, after=hemisphere), inside("untrained, then scene", begin="untrained"),
+        inside("scene, few samples", samples=1),
+        other, inside(f"{OTHER}, then scene", after=other), mended, inside(f"{MENDED}, then scene", after=mended),
     ]  # fmt: skip
-
-
-def plan(paths: Sequence[Path], settings: SimpleNamespace) -> Plan:
-    """Return the plan for scene files in the current variant."""
-    contexts = [SceneTrainingContext(path, settings) for path in paths]
-    runs = [run for context in contexts for run in planned_runs(context)]
-    return Plan(
-        study="scene-training",
-        title="Training inside a scene",
-        candidates=[run.candidate(label=run.name) for run in runs],
-        cases=[],
-        measures=(
-            Measure("PSNR of held-out views and lights, dB", "psnr_db"),
-            Measure("FLIP", "flip", ".3f", False),
-        ),
-        details={"scenes": [c.name for c in contexts], "request": vars(settings)},
-        notes=[
-            f"{settings.steps} steps, {settings.views} views of {settings.width} × {settings.width * 9 // 16} pixels; "
-            f"errors: {settings.tests} other views and lights against {settings.reference_spp} spp."
-        ],
-        jobs=runs,
-        jobs_fingerprint=fingerprint(file for c in contexts for file in (c.file, *c.parsed.files())),
-        pictures={"png": lambda result: picture(contexts, runs, result)},
-    )

@@ -1,13 +1,11 @@
 """Study ``tradeoff shading``: textures trained for their shading at several weights λ of the shading loss.
 
-For each material, a texture is trained as task 4 trains it, and then by task 5 at several weights λ of the shading
-loss; λ = 0 continues task 4 (the paper's figure 2). The preset ``paper`` is trained at a falling and at a constant
-learning rate, without validation: its last state counts. All trainings are repeated for several seeds.
+For each material and seed, a texture is trained as task 4 trains it, and then by task 5 at several weights λ of the
+shading loss; λ = 0 continues task 4 (the paper's figure 2).
 
 Classical filters of normals (:mod:`.baselines.normals`) are measured uncompressed; those that an ordinary texture can
-hold, Toksvig's and baked roughness, also compressed as λ = 0 is, in as many steps, and by ASTC in equal bytes. LEAN's
-moments have no limits, which encoders of bytes need. Each is also read at other levels of detail, those with the
-smallest error: the *kernel*.
+hold, Toksvig's roughness too, also by ASTC in equal bytes. LEAN's moments have no limits, which encoders of bytes need.
+Each is also read at other levels of detail, those with the smallest error: the *kernel*.
 
 *Errors* are those of :class:`~mi_diffind.tasks.shading.evaluation.ShadedEvaluation`: PSNR of shaded values and FLIP,
 under views and lights of no training, against C, the converged truth, and P, the paper's reference.
@@ -16,8 +14,6 @@ under views and lights of no training, against C, the converged truth, and P, th
 from __future__ import annotations
 
 import argparse
-import dataclasses
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property, partial
@@ -30,8 +26,8 @@ import numpy as np
 from ..arrays.tables import Table, save_table
 from ..core.arguments import fraction, positive
 from ..core.runtime import array_module
+from ..fitting import task
 from ..fitting.loop import FitResult
-from ..fitting.task import FitRequest, FitSettings, FittingError
 from ..images import srgb
 from ..maps.pyramid import Pyramid, decibel
 from ..maps.source import Source, SourceError, load_source
@@ -42,11 +38,10 @@ from ..measure.training import Contender
 from ..tasks import shading as shading_task
 from ..tasks import texture as texture_task
 from ..tasks.shading.evaluation import TRUTHS, ShadedEvaluation, ShadedReader, reader
-from ..tasks.shading.fit import find_size
 from ..tasks.shading.material import frozen_decoder, material_effects
-from ..tasks.shading.training import ShadingProblem, fit_shading, trainable_arrays
-from ..tasks.texture import fit as textures
+from ..tasks.shading.training import fit_shading, trainable_arrays
 from ..tasks.texture.compressed import CompressedTexture
+from ..tasks.texture.fit import source_layout
 from .baselines import codecs, normals
 from .example_maps import MATERIALS, generated_source
 from .texture import level_images, level_pyramid
@@ -57,14 +52,8 @@ LAMBDAS = (0.1, 0.5, 0.9, 1.0)
 #: Compression ratio of all trainings.
 COMPRESSION = 12.0
 
-#: Preset → way of its trainings → schedule of the learning rate. Derivatives through the specular lobe are clipped.
-WAYS = {
-    "ours": {"clip, schedule": "cosine"},
-    "paper": {"clip, schedule": "cosine", "clip, no schedule": "constant"},
-}
-
-#: dB by which a training may end below its best state.
-DRIFT = 0.2
+#: Name of the trainings in records: derivatives through the specular lobe are clipped, the learning rate falls.
+WAY = "clip, schedule"
 
 
 class ShadingStudy(Study):
@@ -83,14 +72,10 @@ class ShadingStudy(Study):
         parser.add_argument("--lambda", action="append", type=fraction, dest="lambdas", metavar="X",
                             help="weight of the shading loss; may be repeated; 0 is always among them (default: "
                             "0, 0.1, 0.5, 0.9, 1; --quick: 0, 0.9)")  # fmt: skip
-        for option, text in (
-            ("--seeds", "number of seeds of each training (default: 1)"),
-            ("--steps", "steps of training for shading (default: 600; --quick: 20)"),
-            ("--pretrain-steps", "steps of training as a texture before (default: 300; --quick: 20)"),
-        ):
-            parser.add_argument(option, type=positive, metavar="N", help=text)
-        parser.add_argument("--preset", choices=tuple(WAYS), default="ours",
-                            help="preset of the trainings (default: ours); the paper's has no validation")  # fmt: skip
+        parser.add_argument("--seeds", type=positive, default=1, metavar="N",
+                            help="number of seeds of each training (default: 1)")  # fmt: skip
+        parser.add_argument("--steps", type=positive, metavar="N",
+                            help="steps of training for shading (default: 600; --quick: 20)")  # fmt: skip
 
     def check(self, arguments) -> None:
         """Load the materials; raise as :func:`.load_source` does."""
@@ -100,11 +85,10 @@ class ShadingStudy(Study):
     def plan(self, arguments) -> Plan:
         quick = arguments.quick
         settings = SimpleNamespace(
-            preset=arguments.preset,
             lambdas=sorted({0.0, *(arguments.lambdas or ((0.9,) if quick else LAMBDAS))}),
-            seeds=arguments.seeds or 1,
+            seeds=arguments.seeds,
             steps=arguments.steps or (20 if quick else 600),
-            pretrain_steps=arguments.pretrain_steps or (20 if quick else 300),
+            texture_steps=20 if quick else 300,
             quick=quick,
         )
         contexts = {name: ShadingContenders(name, source, settings) for name, source in arguments.loaded.items()}
@@ -119,8 +103,9 @@ class ShadingStudy(Study):
             details=details,
             notes=[
                 *codecs.install_notes(["astc"]),
-                f"{sizes}; {COMPRESSION:g}x, {settings.pretrain_steps} steps of training as a texture, "
-                f"then {settings.steps} steps for shading; C: converged truth, P: the paper's reference.",
+                f"{sizes}; {COMPRESSION:g}x, {settings.texture_steps} steps of training as a texture, "
+                f"then {settings.steps} steps for shading; C: converged truth, P: the paper's reference; kernel: read "
+                "at the levels of detail with the smallest error.",
             ],
             jobs=jobs,
             jobs_fingerprint=str(details),
@@ -158,23 +143,24 @@ class ShadingContenders:
 
     Methods are ``classical`` (uncompressed filters), ``compressed`` (filters in the bytes of the trainings), ``start``
     (a texture trained as task 4 trains it) and ``run`` (its training for shading). ``runs`` has the runs of all seeds
-    by way, then by λ.
+    by λ.
     """
 
     name: str
     source: Source
     settings: SimpleNamespace
     jobs: dict[str, Contender] = field(default_factory=dict)
-    runs: dict[str, dict[float, list[Contender]]] = field(default_factory=dict)
+    runs: dict[float, list[Contender]] = field(default_factory=dict)
 
     def __post_init__(self):
-        self.preset = shading_task.PRESETS[self.settings.preset]
-        self.recipe = texture_task.PRESETS[self.preset.texture]
-        layout = textures.source_layout(self.source, self.recipe)
+        layout = source_layout(self.source, texture_task.PRESETS["ours"])
         self.pyramid = Pyramid.from_source(self.source, layout, array_module(mi.variant()))
         self.effects = material_effects(layout)[0]
         self.add_filters()
-        self.add_runs()
+        for seed in range(self.settings.seeds):
+            start = self.add_start(seed)
+            for share in self.settings.lambdas:
+                self.runs.setdefault(share, []).append(self.add_run(start, share, seed))
         self.add_kernels()
 
     @cached_property
@@ -204,10 +190,10 @@ class ShadingContenders:
         self.add(label, method, lambda job, progress: self.record(job, once()[1]), lambda job: once()[0])
 
     def add_filters(self) -> None:
-        """Register classical filters: uncompressed, and for our preset in equal bytes."""
-        settings, pyramid, effects = self.settings, self.pyramid, self.effects
-        pairs = 4 if settings.quick else normals.PAIRS
+        """Register classical filters: uncompressed, and by ASTC in the bytes of the trainings."""
+        pyramid, effects = self.pyramid, self.effects
         moments = 6 * sum(v[..., 0].size for v in pyramid.values)
+        pairs = 4 if self.settings.quick else normals.PAIRS
         pyramids = {
             "filtered": lambda: pyramid,
             "Toksvig": cache(lambda: normals.with_roughness(pyramid, normals.toksvig_levels(pyramid))),
@@ -216,11 +202,8 @@ class ShadingContenders:
         self.add_filter("LEAN", "classical", lambda: (normals.lean(pyramid, effects), pyramid.nbytes + moments))
         for name, make in pyramids.items():
             self.add_filter(name, "classical", lambda make=make: (reader(make(), effects), make().nbytes))
-            if settings.preset == "ours" and "astc" in codecs.available():
+            if "astc" in codecs.available():
                 self.add_filter(f"{name}, ASTC", "compressed", partial(self.encoded, make))
-            if settings.preset == "ours" and name != "filtered":  # that is λ = 0
-                steps = settings.pretrain_steps + settings.steps
-                self.add_texture(f"{name}, compressed", "compressed", make, steps)
 
     def encoded(self, pyramid: Callable[[], Pyramid]) -> tuple[ShadedReader, int]:
         """Return the reader of a pyramid that ASTC stores in the bytes of the trainings, and its bytes."""
@@ -236,7 +219,7 @@ class ShadingContenders:
             return normals.biased(job.model, biases), job.record["bytes"]
 
         jobs = {job.label: job for job in self.jobs.values() if job.method in ("classical", "compressed")}
-        jobs["filtered, compressed"] = next(iter(self.runs.values()))[0.0][0]
+        jobs["filtered, compressed"] = self.runs[0.0][0]
         for label, job in jobs.items():
             name, *storage = label.split(", ")
             label = ", ".join([*([] if name == "filtered" else [name]), "kernel", *storage])
@@ -244,30 +227,18 @@ class ShadingContenders:
 
     # -- Trainings
 
-    def request(self, settings: FitSettings, steps: int, seed: int, progress: bool) -> FitRequest:
-        """Return the request for a training with ``settings``, of a number of steps."""
-        every = max(1, steps // 10)
-        settings = dataclasses.replace(settings, steps=steps, seed=seed, deterministic=True, measure_every=every)
-        return FitRequest(self.settings.preset, settings, self.pyramid.types, progress=progress)
-
-    def table(self, problem, request: FitRequest) -> Table:
-        """Return the table of the arrays of a problem."""
-        texture = CompressedTexture(problem.pyramid.layout, textures.stored_form(problem.net))
-        return textures.to_table(texture, {**request.recorded(), "source": self.source.digest})
-
-    def add_trained(self, label: str, method: str, train: Callable[[bool], tuple[Table, FitResult, dict]]) -> Contender:
-        """Register a texture that ``train(progress)`` trains: it returns the table, the training's record, and details.
-
-        The table stays in the folder of models.
-        """
+    def add_trained(
+        self, label: str, method: str, train: Callable[[Contender, bool], tuple[Table, FitResult]], **details
+    ) -> Contender:
+        """Register a texture that ``train(job, progress)`` trains; its table stays in the folder of models."""
         types = self.pyramid.types
 
         def fit(job: Contender, progress: bool) -> dict | None:
-            table, result, details = train(progress)
+            table, result = train(job, progress)
             if result.interrupted:
                 return None
             save_table(job.file, table)
-            return self.record(job, table.nbytes, **details)
+            return self.record(job, table.nbytes, level_bias=table.settings.get("level_bias", 0.0), **details)
 
         def read(job: Contender) -> ShadedReader:
             texture = CompressedTexture.from_table(texture_task.TASK.load(job.file), types.TensorXf)
@@ -275,60 +246,30 @@ class ShadingContenders:
 
         return self.add(label, method, fit, read, True)
 
-    def add_texture(
-        self, label: str, method: str, pyramid: Callable[[], Pyramid], steps: int, seed: int = 0
-    ) -> Contender:
-        """Register a texture trained on a pyramid in place of the source's, at our rate: it converges soonest."""
+    def add_start(self, seed: int) -> Contender:
+        """Register a texture that task 4 trains."""
 
-        def train(progress: bool) -> tuple[Table, FitResult, dict]:
-            request = self.request(texture_task.PRESETS["ours"], steps, seed, progress)
-            recipe = dataclasses.replace(self.recipe, **request.settings.common)
-            size = find_size(self.source, pyramid(), self.preset, {"compression": COMPRESSION})
-            problem = textures.build_problem(self.source, size, recipe, pyramid())
-            result = request.train(problem, f"{self.name}: {label}")
-            return self.table(problem, request), result, {}
+        def train(job: Contender, progress: bool) -> tuple[Table, FitResult]:
+            fitted = task.fit("texture", self.source, compression=COMPRESSION, steps=self.settings.texture_steps,
+                              seed=seed, variant=mi.variant(), progress=progress, output=job.file)  # fmt: skip
+            return fitted.table, fitted.result
 
-        return self.add_trained(label, method, train)
+        return self.add_trained(f"texture, seed {seed}", "start", train)
 
-    def add_run(self, start: Contender, way: str, share: float, seed: int) -> Contender:
+    def add_run(self, start: Contender, share: float, seed: int) -> Contender:
         """Register a training for shading with weight ``share``.
 
-        λ = 0 is read at the level of the footprint; for other λ, our training chooses the level bias.
+        λ = 0 is read at the level of the footprint; for other λ, the training chooses the level bias.
         """
-        schedule, bias = WAYS[self.settings.preset][way], self.preset.level_bias if share else 0.0
 
-        def train(progress: bool) -> tuple[Table, FitResult, dict]:
-            recipe = dataclasses.replace(self.preset, schedule=schedule, share=share, level_bias=bias)
-            request = self.request(recipe, self.settings.steps, seed, progress)
-            table = texture_task.TASK.load(start.file)
-            net = trainable_arrays(table, self.pyramid)
-            try:
-                if self.preset.bounded:
-                    arguments = (self.source, net, request.settings, request, self.pyramid, self.evaluation)
-                    table, result = fit_shading(*arguments)
-                else:  # as the paper: the last state counts
-                    validation = self.evaluation.another()
-                    problem = ShadingProblem(net, self.pyramid, request.settings, self.source.digest, validation)
-                    problem.tolerance = math.inf
-                    result = request.train(problem, "shading")
-                    table = self.table(problem, request)
-            except FittingError:  # diverged repeatedly: the result is the start
-                result = FitResult({}, 0, 0, 0.0, False, 0, [])
-            chosen = {"share": share, "way": way, "level_bias": table.settings.get("level_bias", 0.0)}
-            return table, result, {**chosen, "trouble": troubles(result)}
+        def train(job: Contender, progress: bool) -> tuple[Table, FitResult]:
+            given = {"steps": self.settings.steps, "seed": seed, "share": share, "level_bias": None if share else 0.0}
+            recipe = shading_task.TASK.change_settings(shading_task.PRESETS["ours"], given)
+            request = task.FitRequest("ours", recipe, self.pyramid.types, progress=progress)
+            arrays = trainable_arrays(texture_task.TASK.load(start.file), self.pyramid)
+            return fit_shading(self.source, arrays, recipe, request, self.pyramid, self.evaluation)
 
-        return self.add_trained(f"lambda {share:g}, {way}, seed {seed}", "run", train)
-
-    def add_runs(self) -> None:
-        """Register the trainings of all seeds."""
-        settings = self.settings
-        for seed in range(settings.seeds):
-            name = f"texture, seed {seed}"
-            start = self.add_texture(name, "start", lambda: self.pyramid, settings.pretrain_steps, seed)
-            for way in WAYS[settings.preset]:
-                for share in settings.lambdas:
-                    runs = self.runs.setdefault(way, {}).setdefault(share, [])
-                    runs.append(self.add_run(start, way, share, seed))
+        return self.add_trained(f"lambda {share:g}, {WAY}, seed {seed}", "run", train, share=share, way=WAY)
 
     # -- Results
 
@@ -342,20 +283,8 @@ class ShadingContenders:
         return shown
 
     def shown_runs(self) -> dict[str, Contender]:
-        """Return the trainings in pictures, of the first way and seed: with the smallest and with the largest λ."""
-        runs = next(iter(self.runs.values()))
-        return {f"trained, λ {share:g}": runs[share][0] for share in (min(runs), max(runs))}
-
-
-def troubles(result: FitResult) -> list[str]:
-    """Return the troubles of a training.
-
-    ``diverged``: given up, its result is the start; ``restarts``: the loss became NaN or exploded, and the training
-    went on from an earlier state; ``drift``: its end is more than :data:`DRIFT` dB below its best state.
-    """
-    psnr = [next(v for key, v in h.items() if key not in ("step", "loss")) for h in result.history]
-    applying = {"diverged": not psnr, "restarts": result.restarts, "drift": psnr and max(psnr) - psnr[-1] > DRIFT}
-    return [name for name, applies in applying.items() if applies]
+        """Return the trainings in pictures, of the first seed: with the smallest and with the largest λ."""
+        return {f"trained, λ {share:g}": self.runs[share][0] for share in (min(self.runs), max(self.runs))}
 
 
 # -- Pictures ----------------------------------------------------------------------------------------------------------
@@ -368,18 +297,13 @@ CROP_SIDE = 48
 
 
 def draw_lambdas(contexts: dict[str, ShadingContenders], result: dict):
-    """Draw PSNR over λ, with bars over seeds and troubles, beside the best classical filters."""
+    """Draw PSNR over λ, with bars over seeds, beside the best classical filters."""
     settings = next(iter(contexts.values())).settings
 
     def trained(context: ShadingContenders, letter: str) -> list[plot.Curve]:
-        curves = []
-        for way, runs in context.runs.items():
-            details = [[job.record["details"] for job in jobs] for jobs in runs.values()]
-            met = sorted({name for seeds in details[1:] for d in seeds for name in d["trouble"]})
-            ends = [[end([d[letter]["mean_db"] for d in seeds]) for seeds in details] for end in (np.mean, min, max)]
-            text = f"trained, {WAYS[settings.preset][way]} rate ({', '.join(met) or 'no trouble'})"
-            curves.append(plot.Curve(text, range(len(runs)), *ends))
-        return curves
+        seeds = [[job.record["details"][letter]["mean_db"] for job in jobs] for jobs in context.runs.values()]
+        ends = [[end(values) for values in seeds] for end in (np.mean, min, max)]
+        return [plot.Curve("trained", range(len(seeds)), *ends)]
 
     ticks = [f"{share:g}" for share in settings.lambdas]
     filtered = lambda figures: [figures["mean_db"]] * len(ticks)  # noqa: E731
@@ -424,7 +348,9 @@ def draw_crops(contexts: dict[str, ShadingContenders], result: dict):
         images = {text: evaluation.images(job.model, level).clip(0, 1) for text, job in shown.items()}
         first = images["parameters filtered"]
         pair = int(np.argmax(((first - truths) ** 2).mean(axis=(1, 2, 3))))  # with the largest error of the filter
-        texts = {f"{t}\n{decibel(float(np.mean((i[pair] - truths[pair]) ** 2))):.1f} dB": i for t, i in images.items()}
+        texts = {
+            f"{t}\nPSNR {decibel(float(np.mean((i[pair] - truths[pair]) ** 2))):.1f} dB": i for t, i in images.items()
+        }
         crops = {t: srgb.for_display(i[pair, :CROP_SIDE, :CROP_SIDE]) for t, i in {**texts, "truth": truths}.items()}
         rows[f"{name}, level {level}"] = crops
     return plot.draw_images(f"{result['title']}: crops of shaded images", figure_caption(result), rows)

@@ -30,7 +30,7 @@ RUNS = {
     "image": ["m.json", "--seconds", "1"],
     "scene-training": [str(ROOT / "scenes" / "training_floor.xml")],
     "sdf": ["ball.ply", "--bytes", "24k", "--without", "paper"],
-    "shading": ["m.json", "--steps", "2", "--pretrain-steps", "2", "--lambda", "1"],
+    "shading": ["m.json", "--steps", "2", "--lambda", "1"],
     "texture": ["m.json", "--seconds", "1", "--compression", "2x"],
 }
 

@@ -1,10 +1,9 @@
-"""``tradeoff shading``: materials and trouble of trainings."""
+"""Generated materials of ``tradeoff shading``."""
 
 import numpy as np
 import pytest
 
-from mi_diffind.fitting.task import FitResult
-from mi_diffind.studies import example_maps, shading
+from mi_diffind.studies import example_maps
 
 
 def test_generated_materials():
@@ -21,18 +20,3 @@ def test_generated_materials():
         assert ("metallic" in found) == (name == "hammered")
     assert example_maps.generated_source("lacquer", 64).digest == example_maps.generated_source("lacquer", 64).digest
     assert {m.name: m.values.mean() for m in example_maps.generated_source("lacquer", 64).maps}["roughness"] < 0.35
-
-
-@pytest.mark.parametrize(
-    "psnr, restarts, expected",
-    [
-        ([20, 21, 22], 0, []),
-        ([20, 22.1, 22], 0, []),
-        ([20, 23, 22], 0, ["drift"]),
-        ([20, 21, 22], 2, ["restarts"]),
-        ([], 0, ["diverged"]),
-    ],
-)
-def test_troubles(psnr, restarts, expected):
-    history = [{"step": i, "loss": 50.0, "shaded_converged_db": v, "texture_psnr_db": -v} for i, v in enumerate(psnr)]
-    assert shading.troubles(FitResult({}, 0, 0, 0.0, False, restarts, history)) == expected
