@@ -136,7 +136,7 @@ def shading(frames: int) -> Film:
 
 
 def zoom(frames: int) -> Film:
-    """Render the zoom of the texture study over the tiles."""
+    """Render a zoom over the tiles."""
     albedo, table = str(ASSETS / "tiles_albedo.png"), str(ASSETS / "tiles_filtered.npz")
     learned = {"type": "neural_texture", "filename": table, "channels": "albedo", "filter": "anisotropic"}
     side = mi.Bitmap(albedo).size()[0]

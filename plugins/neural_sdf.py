@@ -182,7 +182,7 @@ class NeuralSDF(distance_shape(mi.Mesh)):
     surface, and the coarsest one is taken whose mean distance to the arrays' surface is at most the arrays' mean
     distance to the mesh when they were fitted. Values beside the surface are corrected for the error of
     interpolation. Mitsuba takes 40 bytes for each cell of the box around the surface, crossed or not: hundreds of
-    megabytes for a field of 256 kB, gigabytes for one of 1 MB; ``resolution`` requests a coarser grid.
+    megabytes for a field of 256 KiB, gigabytes for one of 1 MiB; ``resolution`` requests a coarser grid.
     Where 512 cells or 3.2 GB do not suffice, a warning states the errors; ``mi-diffind inspect`` states
     them for any scene. Each shape has its own grid. A rotated grid is an instance; derivatives and parameters are those
     of :monosp:`sdfgrid`.

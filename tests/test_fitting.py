@@ -304,10 +304,7 @@ def test_plateau_schedule(ad):
 
 @pytest.mark.parametrize("schedule", SCHEDULES)
 def test_no_compilation_after_the_first_steps(ad, schedule):
-    """
-    A step that changes a literal would compile a new kernel each time. The cache on disk could hide that, so distinct
-    kernels are counted.
-    """
+    """A step that changes a literal would compile a new kernel each time, which the cache on disk could hide."""
     seen, growth = set(), []
 
     class Counting(Curve):

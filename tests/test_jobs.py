@@ -130,5 +130,4 @@ def test_clusters_out_of_reach(monkeypatch, no_garbage_collection):
         with pytest.raises(UsageError, match=f'scheduler: "{address}" cannot be reached'):
             run(worker_jobs.square, VALUES, scheduler=address)
     # A client that the garbage collector would close stops the process for ever if another one starts just then
-    clients = [found for found in gc.get_objects() if isinstance(found, distributed.Client)]
-    assert {client.status for client in clients} <= {"closed"}
+    assert {c.status for c in gc.get_objects() if isinstance(c, distributed.Client)} <= {"closed"}

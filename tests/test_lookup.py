@@ -1,8 +1,7 @@
-"""
-Multilinear reads against an independent interpolation: SciPy's, in float64, one channel block at a time.
+"""Multilinear reads against an independent interpolation: SciPy's, in float64.
 
-SciPy knows neither of our borders, so the reference does by hand what they mean: a clamped axis has its entries at
-``i / (N − 1)`` and the coordinate is clipped, a repeating one at ``i / N`` with the first entry appended once more.
+SciPy does not know our borders: a clamped axis has its entries at ``i / (N − 1)`` and the coordinate is clipped, a
+repeating one at ``i / N`` with the first entry appended once more.
 """
 
 import itertools
@@ -73,10 +72,7 @@ def read(array, ad, x, **kwargs):
 
 
 def assert_interpolated(array, values, x, border):
-    """
-    ``values`` are what the reference makes of the entries that ``array`` holds, to a relative error of 1e-5; packed
-    reads in 1D and 2D, whose bytes have only 7 bits below them, may be off by 1/64 of a quantisation step more.
-    """
+    """To a relative error of 1e-5; packed reads in 1D and 2D, with 7 bits below bytes, by 1/64 of a byte more."""
     slack = np.asarray(array.scale) / 64 if array.storage == "uint8" and array.dims <= 2 else 0
     expected = reference(array.numpy(), x, border)
     assert (np.abs(values - expected) <= 1e-5 * np.abs(expected) + slack).all()

@@ -1,7 +1,4 @@
-"""
-The choice of LLVM: as a function, and in fresh processes, where a wrong one would abort (which no ``try`` can catch, so
-only a process of its own can show that it does not happen).
-"""
+"""The choice of LLVM: as a function, and in fresh processes, which alone show that a wrong one does not abort."""
 
 import glob
 import os
@@ -349,10 +346,7 @@ KERNEL_THAT_RUNS = (
     ],
 )
 def test_too_late(aborting, begun, fault):
-    """
-    A kernel has run on an old LLVM (one that it can compile), and its code cannot be taken back, or there are objects:
-    importing says so, as an exception.
-    """
+    """A kernel has run on an old LLVM, whose code cannot be taken back, or there are objects: importing says so."""
     # Without a setting, Dr.Jit would have to find the old library by itself: the setting is removed after its start.
     code = f"import os, drjit; drjit.detail.llvm_version(); del os.environ['{ENV}']\n"
     done = python(f"{code}{begun}\nprint('ran')\nimport mi_diffind\n", aborting)

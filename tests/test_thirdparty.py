@@ -66,10 +66,7 @@ def site(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def commands(site, tmp_path_factory):
-    """A function that runs commands, one after the other, and returns their codes and what they printed.
-
-    The command ``python`` runs code, with arguments.
-    """
+    """A function that runs commands (``python``: code with arguments) and returns their codes and what they printed."""
     errors = tmp_path_factory.mktemp("errors") / "stderr.txt"
     paths = [str(site), str(PACKAGE), str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
     environ = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}

@@ -25,7 +25,7 @@ class Log(list):
             os.kill(os.getpid(), signal.SIGINT)
 
 
-def small_plan(log, details=None):
+def small_plan(log):
     """Candidates ``slow`` (20 dB), ``good`` (30 dB), ``exact`` (the truth); a case with passes and one without."""
     mi.set_variant(f"{BACKENDS[0]}_ad_rgb")
     ad = array_module(BACKENDS[0])
@@ -63,7 +63,6 @@ def small_plan(log, details=None):
         ],
         measures=(Measure("PSNR, dB", "db"),),
         ratios=[("slow", "good"), ("good", "exact"), ("slow", "nobody")],
-        details=details or {},
     )
 
 
