@@ -30,9 +30,6 @@ MEASURES = (
     Measure("as seen", "seen_db"),
 )
 
-#: Codecs of files, of which no single texel can be read.
-FILES = ("jpeg", "webp")
-
 
 class ImageStudy(MaterialStudy):
     """Quality of a compressed image or material against bytes."""
@@ -89,7 +86,7 @@ class ImageContenders(MaterialContenders):
 
         title, budget = codecs.TITLES[codec], 0.0 if codec == "bc7" else compression
         name = f"{title} {budget:g}x" if budget else title
-        return self.encoded(name, title, budget, encode, title + " (no random access)" * (codec in FILES))
+        return self.encoded(name, title, budget, encode, title + " (no random access)" * (codec in ("jpeg", "webp")))
 
 
 def map_errors(source: Source, maps: dict[str, np.ndarray]) -> dict:

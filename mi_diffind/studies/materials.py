@@ -61,7 +61,7 @@ class MaterialStudy(Study):
         return SimpleNamespace(
             compressions=arguments.ratios,
             seconds=float(arguments.seconds or (2 if quick else 60)),
-            astc="fast" if quick else codecs.QUALITY,
+            astc="fast" if quick else "thorough",  # "exhaustive" takes many times as long
             network_steps=(10, 20) if quick else (1000, 16000),
         )
 
@@ -115,9 +115,8 @@ class MaterialContenders:
     border = "auto"
 
     def __post_init__(self):
-        maps = self.source.maps
-        self.normals = [m.name for m in maps if m.role == "normal"]
-        self.codecs = codecs.available() if all(m.channels <= 4 for m in maps) else ()
+        self.normals = [m.name for m in self.source.maps if m.role == "normal"]
+        self.codecs = codecs.available() if all(m.channels <= 4 for m in self.source.maps) else ()
         self.encodings = {}  # of ASTC, shared by all ratios
 
     @cached_property
@@ -135,8 +134,8 @@ class MaterialContenders:
     def details(self) -> dict:
         """What a result's ``details`` record about the source and the settings."""
         s = self.source
-        request = vars(self.settings)
-        return {"source": self.name, "source_digest": s.digest, "source_bytes": s.nbytes, "request": request}
+        sizes = {"source_digest": s.digest, "source_bytes": s.nbytes}
+        return {"source": self.name, **sizes, "request": vars(self.settings)}
 
     @property
     def note(self) -> str:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -34,10 +34,7 @@ from ..scenes.loading import footprint
 from .baselines import codecs
 from .materials import Levels, MaterialContenders, MaterialStudy, level_errors
 
-#: Setting of a texture → parameters of the plugin, and options of its :func:`reader`.
-Settings = Mapping[str, tuple[dict, dict]]
-
-#: Settings of bitmaps, by the sampler.
+#: Settings of bitmaps, by the sampler: parameters of the plugin, and options of its :func:`reader`.
 INDEPENDENT = {f"{n} spp": ({}, {"spp": n}) for n in (1, 4, 16, 64)}
 MULTIJITTERED = {f"{n} spp, multijittered": ({}, {"spp": n, "sampler": "multijitter"}) for n in (4, 16, 64)}
 
@@ -48,9 +45,6 @@ FILTERED = TRILINEAR | {
         {"filter": "anisotropic", "max_anisotropy": 4}, {"path": {"type": "path_footprint", "jitter": False}}
     ),
 }  # fmt: skip
-
-#: Seed of the truth, far from those of candidates.
-TRUTH_SEED = 1 << 20
 
 
 class TextureStudy(MaterialStudy):
@@ -135,7 +129,7 @@ class TextureContenders(MaterialContenders):
         for network in self.network_contenders(self.pyramid.levels):
             self.add_job(network, settings=TRILINEAR, in_picture=False)
 
-    def add(self, name: str, method: str, texture: Callable[[], dict], settings: Settings, **fields) -> None:
+    def add(self, name: str, method: str, texture: Callable[[], dict], settings: dict, **fields) -> None:
         """Register a candidate for each setting of a ``texture``, whose plugin is created after the jobs."""
         for setting, (options, render) in settings.items():
             once = functools.cache(lambda options=options, render=render: reader({**texture(), **options}, **render))
@@ -164,9 +158,9 @@ class TextureContenders(MaterialContenders):
 
     @cached_property
     def truths(self) -> dict[str, np.ndarray]:
-        """The converged pictures of the scenes."""
+        """The converged pictures of the scenes, with a seed far from those of candidates."""
         bitmap = reader(self.bitmap(), self.settings.truth_spp, "multijitter")
-        return {name: self.render(bitmap, scene, TRUTH_SEED) for name, scene in self.scenes.items()}
+        return {name: self.render(bitmap, scene, 1 << 20) for name, scene in self.scenes.items()}
 
     def record(self, nbytes: int, seconds: float | None, levels: Levels, **details) -> dict:
         details |= {"ratio": self.source.nbytes / nbytes, "levels": {"all": level_errors(self.levels, levels)}}
@@ -195,8 +189,8 @@ class TextureContenders(MaterialContenders):
                 functions[name] = lambda k, s=loaded, spp=spp: mi.render(s, spp=spp, seed=k)
             return functions
 
-        accuracy, in_picture = f"psnr_{scene.name}_db", not scene.magnified
-        return Case(scene.name, lambda lanes: {}, passes, accuracy=accuracy, in_picture=in_picture)
+        shown = {"accuracy": f"psnr_{scene.name}_db", "in_picture": not scene.magnified}
+        return Case(scene.name, lambda lanes: {}, passes, **shown)
 
 
 def reader(texture: dict, spp: int = 1, sampler: str = "independent", path: dict | None = None) -> TextureReader:

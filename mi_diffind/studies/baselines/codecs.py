@@ -27,9 +27,6 @@ ASTC_BLOCKS = (
     "4x4", "5x4", "5x5", "6x5", "6x6", "8x5", "8x6", "10x5", "10x6", "8x8", "10x8", "10x10", "12x10", "12x12",
 )  # fmt: skip
 
-#: Preset of the ASTC encoder in studies; the next one, ``exhaustive``, takes many times as long.
-QUALITY = "thorough"
-
 #: Most levels that :func:`astc_levels` leaves out at the fine end of a map.
 DROPPED = 2
 
@@ -195,8 +192,7 @@ def astc_levels(
                 front.append(choice)
                 least = choice[1]
     if not front:
-        text = " with mip maps" if mip_maps else ""
-        raise UsageError(f"ASTC cannot store {', '.join(maps)}{text} in {nbytes:,.0f} bytes")
+        raise UsageError(f"ASTC cannot store {', '.join(maps)} in {nbytes:,.0f} bytes")
     result = {}
     for name, normal, block, drop in min(front, key=lambda choice: choice[1])[2]:
         stored = [coded(name, i, normal, block, quality) for i in kept(name, drop)]
