@@ -7,15 +7,10 @@ coat.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from ..core.errors import UsageError
-from ..maps.source import Source, from_arrays
-
-#: Texels along each side.
-SIDE = 512
+from ..images.srgb import for_display
 
 
 def noise(rng, side: int, slope: float, low: float = 1.0, high: float = 1e9) -> np.ndarray:
@@ -93,19 +88,15 @@ def lacquer(side: int, seed: int = 3) -> dict[str, np.ndarray]:
 
 
 #: Name → function that returns the maps, linear floats, for a side.
-MATERIALS: dict[str, Callable[[int], dict[str, np.ndarray]]] = {
-    "hammered": hammered, "weave": weave, "lacquer": lacquer,
-}  # fmt: skip
+MATERIALS = {"hammered": hammered, "weave": weave, "lacquer": lacquer}
 
 
-def example_maps(name: str = "hammered", side: int = SIDE) -> dict[str, np.ndarray]:
+def example_maps(name: str = "hammered", side: int = 512) -> dict[str, np.ndarray]:
     """Return the maps of one of :data:`MATERIALS`: name → ``(side, side, channels)`` or ``(side, side)``, bytes.
 
     Albedos are sRGB-encoded, normals are (n + 1)/2. Maps repeat. The same arguments give the same bytes. Raises
     :class:`.UsageError` for another name.
     """
-    from ..images.srgb import for_display
-
     if name not in MATERIALS:
         raise UsageError(f'name: found the material "{name}", allowed are {", ".join(MATERIALS)}')
     maps = {}
@@ -113,8 +104,3 @@ def example_maps(name: str = "hammered", side: int = SIDE) -> dict[str, np.ndarr
         values = for_display(values) if key == "albedo" else 0.5 + 0.5 * values if key == "normal" else values
         maps[key] = np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)
     return maps
-
-
-def generated_source(name: str, side: int = SIDE) -> Source:
-    """Return one of :data:`MATERIALS` as a source of 8-bit maps."""
-    return from_arrays(example_maps(name, side))

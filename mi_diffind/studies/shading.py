@@ -43,8 +43,8 @@ from ..tasks.shading.training import fit_shading, trainable_arrays
 from ..tasks.texture.compressed import CompressedTexture
 from ..tasks.texture.fit import source_layout
 from .baselines import codecs, normals
-from .example_maps import MATERIALS, generated_source
-from .texture import level_images, level_pyramid
+from .example_maps import MATERIALS, example_maps
+from .materials import level_images, level_pyramid
 
 #: Weights λ of the shading loss; 0 is always among them.
 LAMBDAS = (0.1, 0.5, 0.9, 1.0)
@@ -130,7 +130,7 @@ def load_materials(names: Sequence[str], side: int) -> dict[str, Source]:
             raise ValueError(f'materials: found "{name}" twice')
         if text not in MATERIALS and not text.endswith(".json"):
             raise SourceError(f'materials: found "{text}", allowed are manifests (.json) and {", ".join(MATERIALS)}')
-        sources[name] = generated_source(text, side) if text in MATERIALS else load_source(text)
+        sources[name] = load_source(example_maps(text, side) if text in MATERIALS else text)
     return sources
 
 

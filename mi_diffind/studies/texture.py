@@ -13,103 +13,78 @@ magnified. *Levels*: the error of each level of detail at its texel centres, of 
 
 from __future__ import annotations
 
-import argparse
-import contextlib
 import functools
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
-from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
 
-from ..core.arguments import positive
-from ..core.runtime import array_module
-from ..core.units import parse_compression
-from ..fitting.task import FitSettings
-from ..maps.pyramid import FilteredMaps, Pyramid, decibel
-from ..maps.source import Map, Source, load_source
+from ..maps.pyramid import Pyramid, decibel
+from ..maps.source import Map, Source
 from ..measure import plot, renders
 from ..measure.renders import TextureReader, TextureScene
 from ..measure.report import figure_caption
-from ..measure.study import Candidate, Case, Job, Measure, Plan, Study
-from ..measure.training import Contender, NetworkContender
+from ..measure.study import Candidate, Case, Measure, Plan
+from ..measure.training import Contender
 from ..plugins.support.image_files import PYRAMIDS
 from ..scenes.loading import footprint
-from . import equal_memory
-from .baselines import codecs, networks
+from .baselines import codecs
+from .materials import Levels, MaterialContenders, MaterialStudy, level_errors
 
-#: Names of methods in legends.
-BITMAP = "bitmap"
-MULTIJITTERED = "bitmap, multijittered"
-MIPMAP = "mip maps, uncompressed"
-OURS = "ours"
-ASTC = "ASTC with mip maps"
-NETWORK = "network"
+#: Settings of bitmaps, by the sampler: parameters of the plugin, and options of its :func:`reader`.
+INDEPENDENT = {f"{n} spp": ({}, {"spp": n}) for n in (1, 4, 16, 64)}
+MULTIJITTERED = {f"{n} spp, multijittered": ({}, {"spp": n, "sampler": "multijitter"}) for n in (4, 16, 64)}
 
-#: The bitmap that ratios refer to.
-BASE = "bitmap, 1 spp"
-
-#: Sampler of bitmaps → name of the method, and samples per pixel.
-SAMPLERS = {"independent": (BITMAP, (1, 4, 16, 64)), "multijitter": (MULTIJITTERED, (4, 16, 64))}
-
-#: Filter of a candidate → parameters of the plugin, and options of its :func:`reader`.
-FILTERS = {
-    "trilinear": ({"filter": "trilinear"}, {}),
+#: Settings of textures that filter themselves, at one sample per pixel.
+TRILINEAR = {"trilinear": ({"filter": "trilinear"}, {})}
+FILTERED = TRILINEAR | {
     "anisotropic, centred": (
         {"filter": "anisotropic", "max_anisotropy": 4}, {"path": {"type": "path_footprint", "jitter": False}}
     ),
 }  # fmt: skip
 
-#: Steps of the first and of the longest training of a network.
-NETWORK_STEPS = (1000, 16000)
 
-#: Seed of the truth, far from those of candidates.
-TRUTH_SEED = 1 << 20
-
-
-class TextureStudy(Study):
+class TextureStudy(MaterialStudy):
     """Error and time of renders with filtered, compressed textures against supersampled bitmaps."""
 
     name = "texture"
     title = "a texture that filters itself, in renders and levels of detail"
-    example = "material.json"
-
-    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        parser.add_argument(
-            "source", nargs="?", default="scenes/assets/tiles.json", metavar="IMAGE|MATERIAL.json",
-            help="8-bit maps, one of which has colours (default: scenes/assets/tiles.json)",
-        )  # fmt: skip
-        parser.add_argument(
-            "--compression", action="append", default=[], metavar="N",
-            help="compression ratio; may be repeated (default: 12x, 3x and 24x; --quick: 12x)",
-        )  # fmt: skip
-        parser.add_argument("--seconds", type=positive, metavar="N",
-                            help="seconds of each training (default: 60; --quick: 2)")  # fmt: skip
+    ratios = (12.0, 3.0, 24.0)
 
     def check(self, arguments) -> None:
-        """Check the options and load the source; raise as :func:`.load_source` does."""
-        default = (12.0,) if arguments.quick else (12.0, 3.0, 24.0)
-        arguments.compressions = tuple(map(parse_compression, arguments.compression)) or default
-        arguments.loaded = load_source(arguments.source)
+        super().check(arguments)
         colour_map(arguments.loaded)
 
     def plan(self, arguments) -> Plan:
-        quick = arguments.quick
-        settings = SimpleNamespace(
-            compressions=arguments.compressions,
-            seconds=float(arguments.seconds or (2 if quick else 60)),
-            astc="fast" if quick else codecs.QUALITY,
-            film=(96, 64) if quick else (300, 200),
-            truth_spp=64 if quick else 256,  # square numbers
-            seeds=1 if quick else 4,  # renders that errors are averaged over
-            scenes=1 if quick else 3,  # number of stills
-            network_steps=(10, 20) if quick else NETWORK_STEPS,
+        quick, settings = arguments.quick, self.settings(arguments)
+        settings.film = (96, 64) if quick else (300, 200)
+        settings.truth_spp = 64 if quick else 256  # square numbers
+        settings.seeds = 1 if quick else 4  # renders that errors are averaged over
+        settings.scenes = 1 if quick else 3  # number of stills
+        context = TextureContenders(arguments.loaded, arguments.source, settings)
+        measures = [(Measure(f"PSNR ({s}), dB", f"psnr_{s}_db"), Measure(f"FLIP {s}", f"flip_{s}", ".4f", False))
+                    for s in context.scenes]  # fmt: skip
+        note = (
+            f"{context.note} Rendered: {colour_map(context.source).name}. PSNR of displayed values. spp: samples a "
+            "pixel; filtered textures take one. Bytes are those of all maps, with mip maps but for bitmaps; mipmap "
+            "holds floats."
         )
-        return plan(arguments.loaded, arguments.source, settings)
+        counted = {n: float(s.counted(settings.film, context.size).mean()) for n, s in context.scenes.items()}
+        return Plan(
+            study=self.name,
+            title=f"Filtered texture {Path(context.name).stem} beside bitmaps",
+            candidates=context.candidates,
+            cases=[context.case(scene) for scene in context.scenes.values()],
+            details={**context.details, "counted": counted},
+            notes=[note, *codecs.install_notes(["astc"])],
+            jobs=context.jobs,
+            jobs_fingerprint=f"{context.source.digest} {vars(settings)}",
+            pictures={"crops": partial(draw_crops, context), "levels": draw_levels},
+            measures=tuple(itertools.chain(*measures)),
+        )
 
 
 STUDY = TextureStudy()
@@ -123,89 +98,73 @@ def colour_map(source: Source) -> Map:
     return min(fitting, key=lambda m: m.role != "albedo")
 
 
-def source_details(source: Source, name: str) -> dict:
-    """Return what a result's ``details`` record about a source, read from the file ``name``."""
-    return {
-        "source": name, "source_digest": source.digest, "source_bytes": source.nbytes, "width": source.width,
-        "height": source.height, "maps": {m.name: m.channels for m in source.maps},
-    }  # fmt: skip
-
-
-def normal_maps(source: Source) -> list[str]:
-    """Return the names of the normal maps of a source."""
-    return [m.name for m in source.maps if m.role == "normal"]
-
-
-# -- Levels of detail as images ----------------------------------------------------------------------------------------
-
-
-def level_images(maps: FilteredMaps) -> dict[str, list[np.ndarray]]:
-    """Return all levels of each map, ``(height, width, channels)``, clipped to the [0, 1] of 8-bit codecs."""
-    levels = [maps.decode(level=level) for level in range(maps.levels)]
-    return {name: [np.clip(decoded[name], 0, 1) for decoded in levels] for name in maps.layout.names}
-
-
-def level_pyramid(maps: dict[str, list[np.ndarray]], like: Pyramid) -> Pyramid:
-    """Return the pyramid of decoded levels, with the layout and border of ``like``."""
-    levels = [np.zeros_like(values) for values in like.values]
-    for m in like.layout.maps:
-        for c, channel in enumerate(m.where):
-            if isinstance(channel, int):
-                for values, decoded_level in zip(levels, maps[m.name], strict=True):
-                    values[..., channel] = m.encode(decoded_level[..., c])
-    return Pyramid(like.layout, levels, like.types, like.border)
-
-
-def level_errors(truth: dict[str, list[np.ndarray]], maps: dict[str, list[np.ndarray]]) -> list[float]:
-    """Return the PSNR of all channels together, in dB, of each level at its texel centres.
-
-    Values are those of the source's files, in [0, 1].
-    """
-    mse = [
-        [float(np.mean((a.astype(np.float64) - b) ** 2)) for a, b in zip(levels, maps[name], strict=True)]
-        for name, levels in truth.items()
-    ]
-    mean = np.average(mse, axis=0, weights=[levels[0].shape[-1] for levels in truth.values()])
-    return [decibel(float(e)) for e in mean]
-
-
 # -- Contenders --------------------------------------------------------------------------------------------------------
 
 
-@dataclass
-class TextureContenders:
-    """Contenders of a source, read from the file ``name``, in the scenes of the stills."""
+class TextureContenders(MaterialContenders):
+    """Contenders of a material whose colours are rendered, in the scenes of the stills."""
 
-    source: Source
-    name: str
-    settings: SimpleNamespace
-    jobs: list[Job] = field(default_factory=list)
-    candidates: list[Candidate] = field(default_factory=list)
-    readers: dict[str, Callable[[], TextureReader]] = field(default_factory=dict)
+    task = "texture"
+    border = "repeat"
 
-    @cached_property
-    def scenes(self) -> dict[str, TextureScene]:
-        return dict(itertools.islice(renders.still_scenes().items(), self.settings.scenes))
+    def __post_init__(self):
+        super().__post_init__()
+        self.jobs: list[Contender] = []
+        self.candidates: list[Candidate] = []
+        self.readers: dict[str, Callable[[], TextureReader]] = {}
+        self.size = self.source.width, self.source.height
+        self.scenes = dict(itertools.islice(renders.still_scenes().items(), self.settings.scenes))
+        for name, settings in (("bitmap", INDEPENDENT), ("bitmap, multijittered", MULTIJITTERED)):
+            self.add("bitmap", name, self.bitmap, settings, bytes=self.source.nbytes)
+        uncompressed = 4 * self.pyramid.nbytes
+        self.add("mipmap", "mip maps, uncompressed", lambda: self.mipmap(self.pyramid), FILTERED, bytes=uncompressed)
+        for i, compression in enumerate(self.settings.compressions):
+            ours = self.trained(compression)
+            plugin = {"type": "neural_texture", "channels": colour_map(self.source).name}
+            self.add_job(ours, lambda plugin=plugin, job=ours: {**plugin, "filename": str(job.file)})
+            if "astc" in self.codecs:
+                encode = lambda job=ours: self.astc(self.levels, job.record["bytes"], True)  # noqa: E731
+                name = f"ASTC {compression:g}x"
+                self.add_job(self.encoded(name, "ASTC with mip maps", compression, encode), in_picture=i == 0)
+        for network in self.network_contenders(self.pyramid.levels):
+            self.add_job(network, settings=TRILINEAR, in_picture=False)
 
-    @cached_property
-    def pyramid(self) -> Pyramid:
-        """The uncompressed levels, repeated as bitmaps are."""
-        return Pyramid.from_source(self.source, types=array_module(mi.variant()), border=("repeat", "repeat"))
+    def add(self, name: str, method: str, texture: Callable[[], dict], settings: dict, **fields) -> None:
+        """Register a candidate for each setting of a ``texture``, whose plugin is created after the jobs."""
+        for setting, (options, render) in settings.items():
+            once = functools.cache(lambda options=options, render=render: reader({**texture(), **options}, **render))
+            self.readers[f"{name}, {setting}"] = once
+            errors = lambda samples, once=once: self.errors(once())  # noqa: E731
+            self.candidates.append(Candidate(f"{name}, {setting}", method, setting, errors=errors, **fields))
 
-    @cached_property
-    def truth_levels(self) -> dict[str, list[np.ndarray]]:
-        return level_images(self.pyramid)
+    def add_job(self, job: Contender, texture: Callable[[], dict] | None = None, settings=FILTERED, **fields) -> None:
+        """Register a contender and its candidates, by default of the pyramid that is its model."""
+        self.jobs.append(job)
+        self.add(job.name, job.method, texture or (lambda: self.mipmap(job.model)), settings, job=job.name, **fields)
+
+    def bitmap(self) -> dict:
+        """Return Mitsuba's texture with 8 bits."""
+        m = colour_map(self.source)
+        data = mi.Bitmap(np.ascontiguousarray(np.rint(m.values * 255).astype(np.uint8)))
+        return {"type": "bitmap", "bitmap": data, "raw": m.color_space != "srgb"}
+
+    def mipmap(self, pyramid: Pyramid) -> dict:
+        """Return the plugin of a pyramid."""
+        name = f"study {id(pyramid)}"
+        PYRAMIDS[name] = pyramid
+        return {"type": "mipmap", "pyramid": name, "channels": colour_map(self.source).name}
+
+    # -- Measurements
 
     @cached_property
     def truths(self) -> dict[str, np.ndarray]:
-        """The converged pictures of the scenes."""
+        """The converged pictures of the scenes, with a seed far from those of candidates."""
         bitmap = reader(self.bitmap(), self.settings.truth_spp, "multijitter")
-        return {name: self.render(bitmap, scene, TRUTH_SEED) for name, scene in self.scenes.items()}
+        return {name: self.render(bitmap, scene, 1 << 20) for name, scene in self.scenes.items()}
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height of the texture."""
-        return self.source.width, self.source.height
+    def record(self, nbytes: int, seconds: float | None, levels: Levels, **details) -> dict:
+        details |= {"ratio": self.source.nbytes / nbytes, "levels": {"all": level_errors(self.levels, levels)}}
+        return {"bytes": nbytes, "seconds": seconds, "details": details}
 
     def render(self, read: TextureReader, scene: TextureScene, seed: int = 0) -> np.ndarray:
         return read.render(scene, self.settings.film, self.size, seed)
@@ -220,171 +179,24 @@ class TextureContenders:
             errors[f"flip_{name}"] = float(np.mean([e["flip"] for e in each]))
         return errors
 
-    def add(self, name: str, method: str, texture: Callable[[], dict], render: dict, **fields) -> None:
-        """Register a candidate; its texture is created once, after the jobs. ``render``: options of its reader."""
-        once = self.readers[name] = functools.cache(lambda: reader(texture(), **render))
-        self.candidates.append(Candidate(name, method, errors=lambda samples: self.errors(once()), **fields))
+    def case(self, scene: TextureScene) -> Case:
+        """Return the case of a scene: whole renders. ``bench_texture.py`` times reads."""
 
-    def add_filtered(self, name: str, method: str, texture: Callable[[], dict], filters=tuple(FILTERS), **fields):
-        """Register a candidate for each filter of a texture that filters itself, at one sample per pixel."""
-        for setting in filters:
-            options, render = FILTERS[setting]
-            more = {**options, "channels": colour_map(self.source).name}
-            plugin = lambda more=more: {**texture(), **more}  # noqa: E731
-            self.add(f"{name}, {setting}", method, plugin, render, setting=setting, **fields)
+        def passes() -> dict:
+            functions = {}
+            for name, once in self.readers.items():
+                loaded, spp = once().loaded(scene, self.settings.film, self.size), once().spp
+                functions[name] = lambda k, s=loaded, spp=spp: mi.render(s, spp=spp, seed=k)
+            return functions
 
-    def add_job(self, job: Contender, texture: Callable[[], dict] | None = None, **fields) -> None:
-        """Register a contender with a candidate for each filter, by default of the pyramid that is its model."""
-        self.jobs.append(job)
-        self.add_filtered(job.name, job.method, texture or (lambda: mipmap(job.model)), job=job.name, **fields)
-
-    def bitmap(self) -> dict:
-        """Return Mitsuba's texture with 8 bits."""
-        m = colour_map(self.source)
-        data = mi.Bitmap(np.ascontiguousarray(np.rint(m.values * 255).astype(np.uint8)))
-        return {"type": "bitmap", "bitmap": data, "raw": m.color_space != "srgb"}
-
-    # -- Jobs
-
-    def record(self, nbytes: int, seconds: float | None, maps: dict, **details) -> dict:
-        """Return the record of compressed ``maps``, name → decoded levels, with the errors of levels."""
-        details |= {"ratio": self.source.nbytes / nbytes, "levels": {"all": level_errors(self.truth_levels, maps)}}
-        return {"bytes": nbytes, "seconds": seconds, "details": details}
-
-    def trained(self, compression: float) -> Contender:
-        """Return the contender that ``fit texture`` trains."""
-
-        def fit(job: Contender, progress: bool) -> dict | None:
-            arguments = {"source": self.name, "compression": compression, "seconds": self.settings.seconds,
-                         "border": "repeat"}  # fmt: skip
-            outcome = equal_memory.fit_preset(job, progress, "texture", "image", "", arguments)
-            if outcome is None:
-                return None
-            model, fitted = outcome
-            seconds, steps = fitted.result.seconds, fitted.result.steps
-            return self.record(model.table.nbytes, seconds, level_images(model.image), steps=steps)
-
-        name = f"ours {compression:g}x"
-        return Contender(name, OURS, compression, fit, lambda job: equal_memory.open_preset(job, "texture").image)
-
-    def encoded(self, equal_to: Contender, cache: dict) -> Contender:
-        """Return the contender of all levels in ASTC, in the bytes of another; ``cache`` is shared by all budgets."""
-
-        def encode() -> tuple[dict[str, codecs.Encoded], int]:
-            nbytes, normals = equal_to.record["bytes"], normal_maps(self.source)
-            return codecs.astc_levels(self.truth_levels, nbytes, self.settings.astc, normals, cache=cache)
-
-        def fit(job: Contender, progress: bool) -> dict:
-            maps, nbytes = encode()
-            how = ", ".join(f"{name} {e.codec}" for name, e in maps.items())
-            return self.record(nbytes, None, {name: e.levels for name, e in maps.items()}, how=how)
-
-        def read(job: Contender) -> Pyramid:
-            return level_pyramid({name: e.levels for name, e in encode()[0].items()}, self.pyramid)
-
-        name = equal_to.name.replace("ours", "ASTC")
-        return Contender(name, ASTC, equal_to.budget, fit, read, has_file=False)
-
-
-def network_contender(
-    source: Source, pyramid: Pyramid, levels: int, compression: float, steps: tuple[int, int], record: Callable
-) -> NetworkContender:
-    """Return the contender of a hash grid and network in half precision, trained to convergence.
-
-    The network has ``levels`` levels of detail of the ``pyramid``; the contender's model is that of its decoded levels.
-    ``steps`` are those of the first and of the longest training. ``record(nbytes, seconds, maps, **details)`` returns
-    the record of decoded levels by map. Raises ``ValueError`` if the bytes are too few.
-    """
-    net = networks.texture_network(pyramid.layout, source.nbytes / compression, levels)
-    settings = FitSettings(steps=steps[0], batch=2**14, lr=1e-2, schedule="cosine", loss="mse", seed=1)
-
-    def decode(trained) -> dict[str, list[np.ndarray]]:
-        return level_images(networks.NetworkMaps(trained, pyramid))
-
-    def finish(trained, trainings: dict) -> dict:
-        seconds, details = sum(run["seconds"] for run in trainings["runs"]), {"steps_longest": steps[1]}
-        return record(2 * trainings["entries"], seconds, decode(trained), steps=trainings["steps"], **details)
-
-    return NetworkContender(
-        f"network {compression:g}x", NETWORK, compression, NETWORK, "",
-        lambda trained: level_pyramid(decode(trained), pyramid),
-        lambda: networks.TextureNetworkProblem(net, pyramid, source.digest), settings, steps[1], 5, True, finish,
-    )  # fmt: skip
+        shown = {"accuracy": f"psnr_{scene.name}_db", "in_picture": not scene.magnified}
+        return Case(scene.name, lambda lanes: {}, passes, **shown)
 
 
 def reader(texture: dict, spp: int = 1, sampler: str = "independent", path: dict | None = None) -> TextureReader:
     """Return the reader of a texture that is repeated in scenes."""
     plugin = lambda repeats: {**texture, "to_uv": renders.to_uv(repeats)}  # noqa: E731
     return TextureReader(plugin, spp, sampler, path, footprint.attach)
-
-
-def mipmap(pyramid: Pyramid) -> dict:
-    """Return the plugin of a pyramid."""
-    name = f"study {id(pyramid)}"
-    PYRAMIDS[name] = pyramid
-    return {"type": "mipmap", "pyramid": name}
-
-
-# -- The plan ----------------------------------------------------------------------------------------------------------
-
-
-def plan(source: Source, name: str, settings: SimpleNamespace) -> Plan:
-    """Return the plan for ``source``, read from the file ``name``, in the current variant."""
-    context, cache = TextureContenders(source, name, settings), {}
-    for sampler, (method, counts) in SAMPLERS.items():
-        for spp in counts:
-            title = f"bitmap, {spp} spp{method.removeprefix(BITMAP)}"
-            render = {"spp": spp, "sampler": sampler}
-            context.add(title, method, context.bitmap, render, bytes=source.nbytes, setting=f"{spp} spp")
-    context.add_filtered("mipmap", MIPMAP, lambda: mipmap(context.pyramid), bytes=4 * context.pyramid.nbytes)
-    for i, compression in enumerate(settings.compressions):
-        ours = context.trained(compression)
-        context.add_job(ours, lambda job=ours: {"type": "neural_texture", "filename": str(job.file)})
-        if "astc" in codecs.available():
-            context.add_job(context.encoded(ours, cache), in_picture=i == 0)
-    with contextlib.suppress(ValueError):  # too few bytes for a network
-        levels, compression = context.pyramid.levels, settings.compressions[0]
-        trained = (source, context.pyramid, levels, compression, settings.network_steps, context.record)
-        context.add_job(network_contender(*trained), filters=("trilinear",), in_picture=False)
-    measures = [(Measure(f"PSNR ({s}), dB", f"psnr_{s}_db"), Measure(f"FLIP {s}", f"flip_{s}", ".4f", False))
-                for s in context.scenes]  # fmt: skip
-    note = (
-        f"{name}, {source.width} × {source.height}, {len(source.maps)} map(s), of which {colour_map(source).name} is "
-        "rendered. PSNR of displayed values. spp: samples a pixel; filtered textures take one. Bytes are those of all "
-        "maps, with mip maps but for bitmaps; uncompressed mip maps are held as floats."
-    )
-    return Plan(
-        study="texture",
-        title=f"Filtered texture {Path(name).stem} beside bitmaps",
-        candidates=context.candidates,
-        cases=[_case(context, scene) for scene in context.scenes.values()],
-        ratios=[(c.name, BASE) for c in context.candidates if c.name != BASE],
-        details={
-            **source_details(source, name),
-            "request": vars(settings),
-            "codecs": list(codecs.available()),
-            "counted": {n: float(s.counted(settings.film, context.size).mean()) for n, s in context.scenes.items()},
-        },
-        notes=[note, *codecs.install_notes(["astc"])],
-        jobs=context.jobs,
-        jobs_fingerprint=f"{source.digest} {vars(settings)}",
-        pictures={"crops": partial(draw_crops, context), "levels": draw_levels},
-        measures=tuple(itertools.chain(*measures)),
-    )
-
-
-def _case(context: TextureContenders, scene: TextureScene) -> Case:
-    """Return the case of a scene: whole renders. ``bench_texture.py`` times reads."""
-
-    def passes() -> dict:
-        functions = {}
-        for name, once in context.readers.items():
-            loaded, spp = once().loaded(scene, context.settings.film, context.size), once().spp
-            functions[name] = lambda k, s=loaded, spp=spp: mi.render(s, spp=spp, seed=k)
-        return functions
-
-    accuracy, in_picture = f"psnr_{scene.name}_db", not scene.magnified
-    return Case(scene.name, lambda lanes: {}, passes, accuracy=accuracy, in_picture=in_picture)
 
 
 # -- Pictures ----------------------------------------------------------------------------------------------------------
@@ -397,22 +209,20 @@ def draw_crops(context: TextureContenders, result: dict):
     """
     from scipy.ndimage import uniform_filter
 
-    side, rows, shown = max(8, context.settings.film[1] * 2 // 5), {}, {"": BASE, "64": "bitmap, 64 spp"}
-    for name, c in result["candidates"].items():
-        if c["setting"] == "anisotropic, centred":
-            shown.setdefault(c["representation"], name)
-    for name, scene in context.scenes.items():
-        truth, counted = context.truths[name], scene.counted(context.settings.film, context.size)
-        images = {
-            f"{n}\n{result['candidates'][n]['errors'][f'psnr_{name}_db']:.1f} dB":
-            context.render(context.readers[n](), scene) for n in shown.values()
-        }  # fmt: skip
-        images[f"truth\n{context.settings.truth_spp} spp, multijittered"] = truth
-        error = ((next(iter(images.values())) - truth) ** 2).sum(axis=-1) * counted
-        total = uniform_filter(error, side, mode="constant")
-        middle = np.unravel_index(np.argmax(total), total.shape)
-        top, left = (int(np.clip(m - side // 2, 0, max(n - side, 0))) for m, n in zip(middle, total.shape, strict=True))
-        rows[name] = {text: image[top : top + side, left : left + side] for text, image in images.items()}
+    candidates, rows = result["candidates"], {}
+    shown = {c["representation"]: n for n, c in reversed(candidates.items()) if c["setting"] == "anisotropic, centred"}
+    names = ["bitmap, 1 spp", "bitmap, 64 spp", *(n for n in candidates if n in shown.values())]
+    half = max(4, context.settings.film[1] // 5)
+    for scene in context.scenes.values():
+        truth, counted = context.truths[scene.name], scene.counted(context.settings.film, context.size)
+        images = [context.render(context.readers[name](), scene) for name in names]
+        error = uniform_filter(((images[0] - truth) ** 2).sum(axis=-1) * counted, 2 * half, mode="constant")
+        inside = error[half : 1 - half, half : 1 - half]  # centres of parts that lie in the picture
+        top, left = np.unravel_index(np.argmax(inside), inside.shape)
+        titles = [f"{name}\n{candidates[name]['errors'][f'psnr_{scene.name}_db']:.1f} dB" for name in names]
+        titles.append(f"truth\n{context.settings.truth_spp} spp, multijittered")
+        parts = [image[top : top + 2 * half, left : left + 2 * half] for image in (*images, truth)]
+        rows[scene.name] = dict(zip(titles, parts, strict=True))
     return plot.draw_images(f"{result['title']}: parts of the stills", figure_caption(result), rows)
 
 

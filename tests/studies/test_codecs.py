@@ -7,9 +7,10 @@ import sys
 import numpy as np
 import pytest
 
+from mi_diffind.core.errors import UsageError
 from mi_diffind.images.metrics import psnr
 from mi_diffind.studies.baselines import codecs
-from mi_diffind.studies.baselines.codecs import ASTC_BLOCKS, CodecError
+from mi_diffind.studies.baselines.codecs import ASTC_BLOCKS
 
 MODULES = {"astc": ("astc_encoder",), "bc7": ("ispc_texcomp", "texture2ddecoder")}
 
@@ -43,21 +44,6 @@ def test_channels(codec, channels):
     assert psnr(image, coded.image) > (27 if codec == "webp" else 31)
     for c in range(channels):
         assert psnr(image[..., c], coded.image[..., c]) > 25  # the channels are in their order
-
-
-@pytest.mark.parametrize(
-    ("image", "match"),
-    [
-        (np.zeros((4, 4)), r"found the shape \(4, 4\)"),
-        (np.zeros((4, 4, 5)), "1 to 4 channels"),
-        (np.zeros((0, 4, 3)), "found the shape"),
-        (np.full((4, 4, 1), 1.5), "values from 1.5 to 1.5, 0 to 1 is needed"),
-        (np.full((4, 4, 1), np.nan), "values from nan"),
-    ],
-)
-def test_refused(image, match):
-    with pytest.raises(ValueError, match=match):
-        codecs.image_file("jpeg", image.astype(np.float32), 100)
 
 
 @needs("astc")
@@ -115,7 +101,7 @@ def test_astc_with_mip_maps():
             np.testing.assert_array_equal(e.levels[drop + 1], alone.image)
         errors.append(sum(float(((e.image - maps[n][0]) ** 2).sum()) for n, e in found.items()))
     assert errors == sorted(errors) and errors[0] < errors[-1]
-    with pytest.raises(CodecError, match="100 bytes"):
+    with pytest.raises(UsageError, match="100 bytes"):
         codecs.astc_levels(maps, 100, "fast", cache=cache)
 
 
@@ -125,6 +111,4 @@ def test_astc_with_mip_maps():
 def test_missing_package(monkeypatch, codec, module, package):
     monkeypatch.setitem(sys.modules, module, None)
     assert codec not in codecs.available() and {"jpeg", "webp"} <= set(codecs.available())
-    assert package in codecs.install_notes()[0]
-    with pytest.raises(CodecError, match=rf"needs the package {package}, .*: pip install {package}$"):
-        encode(codec, picture(8, 8))
+    assert any(package in note for note in codecs.install_notes([codec]))

@@ -9,7 +9,7 @@ from mi_diffind.fitting.loop import FitSettings, fit
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.measure.training import halve
-from mi_diffind.studies import texture
+from mi_diffind.studies import materials
 from mi_diffind.studies.baselines import distance_fields as rivals
 from mi_diffind.studies.baselines import networks
 from mi_diffind.studies.baselines.networks import Network
@@ -65,9 +65,9 @@ def test_a_network_learns_all_levels(mi_rgb, source, levels):
     before = problem.measure(problem.net)["psnr_db"]
     result = fit(problem, FitSettings(steps=150, batch=2048, lr=1e-2, loss="mse", measure_every=50), progress=False)
     assert result.measured["psnr_db"] > before + 10
-    decoded = texture.level_images(networks.NetworkMaps(problem.net, problem.pyramid))
-    truth = {name: values[: levels or None] for name, values in texture.level_images(problem.pyramid).items()}
-    errors = texture.level_errors(truth, decoded)
+    decoded = materials.level_images(networks.NetworkMaps(problem.net, problem.pyramid))
+    truth = {name: values[: levels or None] for name, values in materials.level_images(problem.pyramid).items()}
+    errors = materials.level_errors(truth, decoded)
     assert min(errors[:3]) > 28 and min(errors) > 10  # coarse levels have few samples
     assert len(errors) == (levels or problem.pyramid.levels)
 

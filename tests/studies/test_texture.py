@@ -10,7 +10,7 @@ from mi_diffind.core.runtime import array_module
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.measure import renders
-from mi_diffind.studies import texture
+from mi_diffind.studies import materials
 
 FILM = (24, 16)
 
@@ -99,15 +99,15 @@ def test_levels(mi_rgb):
     """Errors of each level by hand; decoded levels come back in a pyramid of the same layout."""
     source = from_arrays({"albedo": smooth(8, 16, 3), "ao": smooth(8, 16, 1, 1)})
     pyramid = Pyramid.from_source(source, types=array_module("llvm_ad_rgb"))
-    truth = texture.level_images(pyramid)
+    truth = materials.level_images(pyramid)
     np.testing.assert_allclose(truth["albedo"][0], source.maps[0].values, atol=1e-6)
     assert [v.shape for v in truth["ao"]] == [(8, 16, 1), (4, 8, 1), (2, 4, 1), (1, 2, 1), (1, 1, 1)]
     changed = {name: [v.copy() for v in values] for name, values in truth.items()}
     changed["albedo"][1][..., 2] = np.clip(changed["albedo"][1][..., 2] * 0.9, 0, 1)
-    found = texture.level_errors(truth, changed)
+    found = materials.level_errors(truth, changed)
     mse = np.mean((changed["albedo"][1][..., 2] - truth["albedo"][1][..., 2]) ** 2)
     assert found[1] == pytest.approx(-10 * math.log10(mse / 4), abs=1e-3) and found[0] == found[2] == 120
-    decoded = texture.level_images(texture.level_pyramid(changed, pyramid))
+    decoded = materials.level_images(materials.level_pyramid(changed, pyramid))
     for name, values in changed.items():
         for a, b in zip(values, decoded[name], strict=True):
             np.testing.assert_allclose(a, b, atol=1e-5)
