@@ -209,10 +209,10 @@ class CostStudy(Study):
             contenders = {"roughconductor": COPPER, "measured": measured, **rows["bsdf"].contenders}
             rows["bsdf"] = replace(rows["bsdf"], contenders=contenders)
         result = measure(rows, settings)
-        table = [{"row": row["title"], "contender": name, **flat(c)}
-                 for row in result["rows"].values() for name, c in row["contenders"].items()]  # fmt: skip
         pictures = {"png": lambda: picture(result)} if result["rows"] else {}
-        return report.publish(result, report.write_files("cost", arguments.out, result, table, pictures), lines(result))
+        return report.publish(
+            result, report.write_files("cost", arguments.out, result, table(result), pictures), lines(result)
+        )
 
 
 STUDY = CostStudy()
@@ -524,34 +524,27 @@ def _plugins(description: dict) -> Iterator[dict]:
 # -- Report ------------------------------------------------------------------------------------------------------------
 
 
-def flat(contender: dict, before: str = "") -> dict:
-    """Return the figures of a contender with one name each."""
-    result = {}
-    for key, value in contender.items():
-        result |= flat(value, f"{before}{key}_") if isinstance(value, dict) else {f"{before}{key}": value}
-    return result
+def table(result: dict) -> list[dict]:
+    """Return one row for each contender; times and the error at equal time are ratios to the first one of its row."""
+    return [
+        {
+            "row": row["title"], "contender": name, "spp": c["spp"], "error": c["error"], "bias": c["bias"],
+            "render": c["render"]["ratio"]["median"], "step": c["step"]["ratio"]["median"] if c["step"] else None,
+            "memory_bytes": c["memory_bytes"], "disk_bytes": c["disk_bytes"],
+            "error_at_equal_time": c["equal_time"]["ratio"],
+        }
+        for row in result["rows"].values() for name, c in row["contenders"].items()
+    ]  # fmt: skip
 
 
 def lines(result: dict) -> list[str]:
     """Return the table of a result as lines of text."""
-    head = ("", "spp", "error", "of it bias", "render", "step", "memory", "disk", "spp", "error at equal time")
-    cells = [head]
-    for row in result["rows"].values():
-        cells.append((row["title"], *[""] * (len(head) - 1)))
-        for name, c in row["contenders"].items():
-            bias, equal = c["bias"], c["equal_time"]
-            cells.append((
-                f"  {name}", str(c["spp"]), f"{c['error']:.2e}", "none seen" if bias is None else f"{bias:.1e}",
-                _ratio(c["render"]), _ratio(c["step"]), f"{c['memory_bytes']:,}", f"{c['disk_bytes']:,}",
-                str(equal["spp"]), f"{equal['ratio']:.2f}",
-            ))  # fmt: skip
+    rows = table(result)
+    forms = ["", "", "", ".2e", ".1e", ".2f", ".2f", ",", ",", ".2f"]
+    cells = [[key.replace("_", " ") for key in rows[0]]] if rows else []
+    cells += [["-" if v is None else format(v, f) for v, f in zip(row.values(), forms, strict=True)] for row in rows]
     note = f"error: relative mean squared error at {result['spp']} samples a pixel, against many samples of the first"
     return [*report.grid(cells), "", note, "times, error at equal time: ratios to the first contender of a row"]
-
-
-def _ratio(times: dict) -> str:
-    ratio = times["ratio"]["median"] if times else math.nan
-    return "-" if math.isnan(ratio) else f"{ratio:.2f}"
 
 
 def picture(result: dict):
