@@ -55,9 +55,9 @@ GRID = "grid"
 PRESETS = {"ours": "sparse", "paper": "paper", GRID: "grid"}
 
 #: Settings of a run: nodes along the side of a cube with the volume of the initial grid, the steps of its training
-#: (0: the preset's own), and those of each training that begins with it.
-FULL = {"resolution": 128, "grid_steps": 0, "steps": 500}
-QUICK = {"resolution": 20, "grid_steps": 30, "steps": 10}
+#: (0: the preset's own), those of each training that begins with it, and further options of ``fit field``.
+FULL = {"resolution": 128, "grid_steps": 0, "steps": 500, "options": {}}
+QUICK = {"resolution": 20, "grid_steps": 30, "steps": 10, "options": {"downscale": 2}}
 
 #: Settings of the training through images.
 SETTINGS = FitSettings(seed=1, batch=8192, lr=2e-3, loss="mse", schedule="cosine", check_every=50, deterministic=False)
@@ -97,12 +97,13 @@ class RadianceStudy(Study):
         arguments.ratios = tuple(dict.fromkeys(map(parse_compression, arguments.compression or default)))
         if arguments.source == DEFAULT and not Path(DEFAULT).exists():
             raise ValueError(f'there is no folder "{DEFAULT}": make it by mi-diffind capture {SCENE} -o {DEFAULT}')
-        arguments.views = tuple(load_views(arguments.source, split) for split in ("train", "test"))
+        arguments.settings = SimpleNamespace(ratios=arguments.ratios, **(QUICK if arguments.quick else FULL))
+        downscale = arguments.settings.options.get("downscale")
+        arguments.views = [load_views(arguments.source, split, downscale=downscale) for split in ("train", "test")]
 
     def plan(self, arguments) -> Plan:
-        settings = SimpleNamespace(ratios=arguments.ratios, **(QUICK if arguments.quick else FULL))
         session = FieldSession(array_module(mi.variant()), *arguments.views)
-        return plan(session, arguments.source, settings)
+        return plan(session, arguments.source, arguments.settings)
 
 
 STUDY = RadianceStudy()
@@ -149,7 +150,7 @@ def preset_contender(context: RadianceStudyContext, fields: dict) -> Contender:
     settings = context.settings
 
     def fit_field(job: Contender, progress: bool) -> dict | None:
-        arguments = {"source": context.source}
+        arguments = {"source": context.source, **settings.options}
         if job.method == GRID:  # the other methods store numbers of directions
             arguments |= {"resolution": settings.resolution, "colours": "directions"}
             arguments |= {"steps": settings.grid_steps} if settings.grid_steps else {}
