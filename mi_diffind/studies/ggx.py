@@ -204,7 +204,7 @@ def plan(quick: bool = False) -> Plan:
         ratios=ratios,
         notes=[
             "16→8: 16 × 16 pointers into a table of 8 × 8; 24²: one table of 24 × 24; MLP 32x3: a network of three "
-            "layers of 32 units; f16, u8: entries of two bytes and of one."
+            "layers of 32 units; f16, u8: entries of two bytes and of one; log: logarithmic inputs."
         ],
         jobs=jobs,
         jobs_fingerprint=fingerprint(code),
