@@ -1,8 +1,8 @@
 """Study ``tradeoff bsdf``: learned BSDFs against their sources, in accuracy, time, bytes and noise.
 
 Each material is fitted with a proxy times an indirection (``ours``), a proxy times one array (``table``), an
-indirection alone (``paper``), one array alone (``plain``), and a network of 675 weights (:class:`.NetworkBSDF`). Timed
-beside them are the material itself and ``principled``.
+indirection alone (``paper``) and one array alone (``plain``). Timed beside them are the material itself and
+``principled``.
 """
 
 from __future__ import annotations
@@ -12,16 +12,15 @@ import functools
 
 import mitsuba as mi
 
-from ..fitting.task import FitSettings, fit, load_model
+from ..fitting.task import fit, load_model
 from ..measure.renders import bsdf_queries, directions
 from ..measure.store import fingerprint, package_files
 from ..measure.study import Candidate, Case, Measure, Plan, Study
-from ..measure.training import Contender, NetworkContender
+from ..measure.training import Contender
 from ..tasks.bsdf import mixture
 from ..tasks.bsdf.directions import SphereView
 from ..tasks.bsdf.model import LearnedBSDF
 from ..tasks.bsdf.truth import truth_of
-from .baselines import networks
 
 
 def _rgb(*value):
@@ -65,7 +64,7 @@ MATERIALS = {
 #: Materials of a quick study.
 QUICK_MATERIALS = ("plastic, nonlinear",)
 
-#: Presets, the first is compared with the others.
+#: Presets of ``fit bsdf``.
 PRESETS = ("ours", "table", "paper", "plain")
 
 #: Methods that are timed.
@@ -131,43 +130,20 @@ def fitted_contender(material: str, preset: str, quick: bool) -> Contender:
     return Contender(name, preset, 0, train, read, preset, "learned", preset)
 
 
-def network_contender(material: str, learned: Contender) -> NetworkContender:
-    """Return the contender of a network, trained to convergence for inputs in the scale of a learned BSDF."""
-
-    def problem() -> networks.BSDFNetworkProblem:
-        scale = load_model(learned.file, mi.TensorXf).form.scale
-        return networks.BSDFNetworkProblem(MATERIALS[material][0], scale)
-
-    def finish(net, record: dict) -> dict:
-        return {"bytes": 4 * record["entries"], "errors": {"psnr_db": record["psnr_db"]}}
-
-    settings, label = FitSettings(steps=1000, batch=2**12, lr=2e-2, seed=1), "network, warped"
-    network = NetworkContender(
-        f"{material}: {label}", "network", 0, label, "", lambda net: problem().bsdf(net.cooperative()),
-        problem, settings, 4000, 20, False, finish,
-    )  # fmt: skip
-    network.family = "network"
-    return network
-
-
 def plan(materials: tuple[str, ...] = (), quick: bool = False) -> Plan:
     """Return the plan for some materials (default: all), in the current variant."""
     candidates, cases, jobs, ratios = [], [], [], []
     for material in materials or (QUICK_MATERIALS if quick else MATERIALS):
-        source, nbytes = MATERIALS[material]
-        learned = [fitted_contender(material, preset, quick) for preset in (PRESETS[:1] if quick else PRESETS)]
-        nets = []
-        if not quick and nbytes == "2k":
-            nets = [network_contender(material, learned[0])]
+        learned = [fitted_contender(material, preset, quick) for preset in (PRESETS[:2] if quick else PRESETS)]
         references = [
             Candidate(f"{material}: source", "source", is_truth=True, label="source"),
             Candidate(f"{material}: principled", "Mitsuba", is_reference=True, label="principled"),
         ]
-        queries = functools.partial(_queries, material, learned, nets)
-        cases.append(Case(material, queries, details={"material": source}))
-        candidates += [*references, *(job.candidate() for job in (*learned, *nets))]
-        ratios += [(job.name, reference.name) for job in (*learned, *nets) for reference in references]
-        jobs += [*learned, *nets]
+        queries = functools.partial(_queries, material, learned)
+        cases.append(Case(material, queries, details={"material": MATERIALS[material][0]}))
+        candidates += [*references, *(job.candidate() for job in learned)]
+        ratios += [(job.name, reference.name) for job in learned for reference in references]
+        jobs += learned
     code = package_files("arrays/lookup.py", "arrays/indirection.py", "fitting/loop.py", "tasks/bsdf/*.py",
                          "studies/bsdf.py")  # fmt: skip
     return Plan(
@@ -190,11 +166,7 @@ def plan(materials: tuple[str, ...] = (), quick: bool = False) -> Plan:
     )  # fmt: skip
 
 
-def _queries(material: str, learned: list[Contender], nets: list[NetworkContender], lanes: int) -> dict:
-    """Return the queries of the source, ``principled`` and the contenders; networks have ``eval`` alone."""
+def _queries(material: str, learned: list[Contender], lanes: int) -> dict:
+    """Return the queries of the source, ``principled`` and the contenders."""
     bsdfs = {f"{material}: source": mi.load_dict(MATERIALS[material][0]), f"{material}: principled": mi.load_dict(PEER)}
-    bsdfs |= {job.name: job.model for job in learned}
-    inputs = directions(lanes)
-    functions = bsdf_queries(bsdfs, inputs, False, QUERIES)
-    functions["eval"] |= bsdf_queries(bsdfs | {job.name: job.model for job in nets}, inputs, False, ("eval",))["eval"]
-    return functions
+    return bsdf_queries(bsdfs | {job.name: job.model for job in learned}, directions(lanes), False, QUERIES)

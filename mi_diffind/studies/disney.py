@@ -10,18 +10,16 @@ import functools
 import itertools
 from collections.abc import Callable
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..arrays.lookup import STORAGES
 from ..core.runtime import array_module
-from ..measure.renders import QUERIES, bsdf_queries, directions, noise_texture
+from ..measure.renders import bsdf_queries, directions, noise_texture
 from ..measure.study import Candidate, Case, Measure, Plan, Study
 from ..tasks.disney import TASK
 from ..tasks.disney.decoder import Decoder
-from ..tasks.disney.model import PARAMETERS, Material
-from ..tasks.disney.training import measure, shade
+from ..tasks.disney.training import measure
 
 #: Name → parameters of a material that uses every part of the model, and of one with the two lobes that most have.
 LOBES = {
@@ -34,14 +32,11 @@ LOBES = {
 
 BASE_COLOR = (0.8, 0.3, 0.2)
 
-#: Name of the truth as a candidate, which is timed in ``eval`` only, with constant materials, in RGB.
-FORMULAS = "formulas"
-
 #: Presets of ``neural_disney`` that are measured.
 PRESETS = ("tables", "paper")
 
-#: Cases of a quick study → the plugins that are timed, or all.
-QUICK = {"constant, all lobes": None, "textured, diffuse + specular": ("principled", "disney", "tables")}
+#: Cases of a quick study.
+QUICK = ("constant, all lobes", "textured, diffuse + specular")
 
 
 class DisneyStudy(Study):
@@ -62,7 +57,6 @@ def plan(quick: bool = False) -> Plan:
     plugins = {"principled": {"type": "principled"}, "disney": {"type": "disney"}}
     candidates = [
         Candidate("principled", "Mitsuba", is_reference=True),
-        Candidate(FORMULAS, "formulas", is_truth=True),
         Candidate("disney", "arithmetic", errors=_errors(Decoder)),
     ]
     for preset in PRESETS:
@@ -76,9 +70,8 @@ def plan(quick: bool = False) -> Plan:
         name = f"{material}, {lobes}"
         if quick and name not in QUICK:
             continue
-        timed = {n: p for n, p in plugins.items() if not quick or n in (QUICK[name] or plugins)}
         details = {"material": material, "lobes": lobes, "base_color": BASE_COLOR, **LOBES[lobes]}
-        cases.append(Case(name, functools.partial(_queries, timed, material, LOBES[lobes]), details=details))
+        cases.append(Case(name, functools.partial(_queries, plugins, material, LOBES[lobes]), details=details))
     return Plan(
         study="disney",
         title="Disney BRDF: accuracy against time",
@@ -90,7 +83,7 @@ def plan(quick: bool = False) -> Plan:
         ),
         ratios=[
             *(("principled", name) for name in ("disney", "tables", "tables, uint8")),
-            *((name, "disney") for name in ("tables", "tables, uint8", "paper", "paper, uint8", FORMULAS)),
+            *((name, "disney") for name in ("tables", "tables, uint8", "paper", "paper, uint8")),
         ],
         notes=["arithmetic: the plugin disney; tables and paper: presets of neural_disney, in single precision unless "
                "named otherwise. constant, textured: the parameters of the material."],
@@ -113,12 +106,9 @@ def _errors(decoder: Callable[[], Decoder]) -> Callable[[int], dict[str, float]]
 
 
 def _queries(plugins: dict, material: str, parameters: dict, lanes: int) -> dict:
-    """Return the queries of BSDFs and, for constant materials in RGB, ``eval`` of the formulas."""
+    """Return the queries of BSDFs with a constant or a textured material."""
     bsdfs = {name: _bsdf(plugin, material, parameters) for name, plugin in plugins.items()}
-    functions = bsdf_queries(bsdfs, directions(lanes), material == "textured", QUERIES)
-    if material == "constant" and mi.is_rgb:
-        functions["eval"][FORMULAS] = _formulas(parameters, lanes)
-    return functions
+    return bsdf_queries(bsdfs, directions(lanes), material == "textured")
 
 
 def _bsdf(plugin: dict, material: str, parameters: dict):
@@ -130,12 +120,3 @@ def _bsdf(plugin: dict, material: str, parameters: dict):
         # `principled` takes no texture for `specular`, so it is a number for all
         parameters = {n: v if n == "specular" else noise_texture([v], rng) for n, v in parameters.items()}
     return mi.load_dict({**plugin, "base_color": color, **parameters})
-
-
-def _formulas(parameters: dict, lanes: int) -> Callable[[], object]:
-    """Return ``eval`` of the formulas without a plugin; each parameter is one number for all lanes as in a plugin."""
-    values = {**dict.fromkeys(PARAMETERS, 0.0), **parameters}
-    material, albedo = Material(**{name: dr.opaque(mi.Float, v) for name, v in values.items()}), mi.Color3f(BASE_COLOR)
-    dr.make_opaque(albedo)
-    si, wo, *_ = directions(lanes)
-    return lambda: shade(None, material, albedo, si.wi, wo)

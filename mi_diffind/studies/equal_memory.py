@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterable, Sequence
 
 import mitsuba as mi
@@ -12,26 +11,8 @@ from ..fitting import task
 from ..measure.training import Contender
 
 
-def add_without_option(parser: argparse.ArgumentParser) -> None:
-    """Add the option ``--without``, which leaves methods out."""
-    parser.add_argument(
-        "--without", action="append", default=[], metavar="METHOD",
-        help="leave out a method, named as in the table without its budget; may be repeated",
-    )  # fmt: skip
-
-
-def check_without(without: Iterable[str], methods: Iterable[str]) -> None:
-    """Raise ``ValueError`` if ``without`` names something else than one of the ``methods``."""
-    unknown = [name for name in without if name not in methods]
-    if unknown:
-        raise ValueError(f'--without: found "{unknown[0]}", allowed are {", ".join(methods)}')
-
-
-def combinations(
-    methods: Iterable[str], budgets: Sequence, first_only: Iterable[str], without: Iterable[str]
-) -> list[tuple]:
+def combinations(methods: Iterable[str], budgets: Sequence, first_only: Iterable[str]) -> list[tuple]:
     """Return the pairs ``(method, budget)`` to train; those in ``first_only`` are trained at the first budget only."""
-    methods = [method for method in methods if method not in without]
     return [(m, budget) for budget in budgets for m in methods if budget == budgets[0] or m not in first_only]
 
 

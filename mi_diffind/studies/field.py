@@ -2,8 +2,7 @@
 
 All contenders begin with one trained grid and are trained through the same images for the same number of steps. A
 *sparse grid* has thirteen numbers of 8 bits at a node, a *codebook* holds colours found by k-means (the idea of VQRF).
-The *hash grid* is that of ``drjit.nn`` with a network. *Paper* and *ours* are presets of ``fit field``. Cells that no
-ray sees are removed from the grid.
+*Paper* and *ours* are presets of ``fit field``. Cells that no ray sees are removed from the grid.
 
 Bytes are those in memory of all that a read needs, the index included. Grids are as fine as the budget allows.
 
@@ -15,7 +14,7 @@ from __future__ import annotations
 
 import argparse
 import functools
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -33,7 +32,7 @@ from ..measure.study import FLOOR, Candidate, Case, Measure, Plan, Study
 from ..measure.training import Contender, load_arrays
 from ..tasks.radiance import dense_bytes
 from ..tasks.radiance import grid as grids
-from ..tasks.radiance.compression import Importance, importance
+from ..tasks.radiance.compression import importance
 from ..tasks.radiance.files import grid_of, load
 from ..tasks.radiance.session import FieldSession, ImagesProblem, displayed
 from ..tasks.radiance.views import load_views
@@ -48,31 +47,23 @@ RATIOS = (75.0, 50.0, 200.0)
 DEFAULT = "captures/group"
 SCENE = "scenes/capture_group.xml"
 
-#: Method → its label. Those of :data:`ONCE` have the first budget only.
-METHODS = {
-    "sparse": "sparse grid, 8 bits", "codebook": "codebook", "hash": "hash grid + network", "paper": "paper",
-    "ours": "ours",
-}  # fmt: skip
-ONCE = ("hash",)
+#: Method → its label.
+METHODS = {"sparse": "sparse grid, 8 bits", "codebook": "codebook", "paper": "paper", "ours": "ours"}
 
 #: Method → preset of ``fit field``; the grid is that which all begin with.
 GRID = "grid"
 PRESETS = {"ours": "sparse", "paper": "paper", GRID: "grid"}
 
 #: Settings of a run: nodes along the side of a cube with the volume of the initial grid, the steps of its training
-#: (0: the preset's own), and those of each training that begins with it.
-FULL = {"resolution": 128, "grid_steps": 0, "steps": 500}
-QUICK = {"resolution": 20, "grid_steps": 60, "steps": 20}
-
-#: Methods by whose times ours is divided.
-AGAINST = ("sparse", "codebook", "paper")
+#: (0: the preset's own), those of each training that begins with it, and further options of ``fit field``.
+FULL = {"resolution": 128, "grid_steps": 0, "steps": 500, "options": {}}
+QUICK = {"resolution": 20, "grid_steps": 30, "steps": 10, "options": {"downscale": 2}}
 
 #: Settings of the training through images.
 SETTINGS = FitSettings(seed=1, batch=8192, lr=2e-3, loss="mse", schedule="cosine", check_every=50, deterministic=False)
 
-#: Learning rates of contenders that begin far from their optimum. At these, a trained grid gets worse in test views.
+#: Learning rate of grids that are coarser than the initial one. At this rate, a trained grid gets worse in test views.
 COARSER_RATE = 5e-3
-HASH_RATE = 1e-2
 
 #: Largest number of entries of a codebook, which takes at most a quarter of the budget.
 ENTRIES = 2**12
@@ -99,22 +90,20 @@ class RadianceStudy(Study):
             help="compression against a dense float32 grid; may be repeated (default: "
             f"{', '.join(f'{r:g}' for r in RATIOS)}; --quick: 75); all methods are trained and timed at the first one",
         )  # fmt: skip
-        equal_memory.add_without_option(parser)
 
     def check(self, arguments) -> None:
         """Check the options and read the views; raise :class:`~mi_diffind.tasks.radiance.views.ViewsError`."""
         default = ("75",) if arguments.quick else map(str, RATIOS)
         arguments.ratios = tuple(dict.fromkeys(map(parse_compression, arguments.compression or default)))
-        equal_memory.check_without(arguments.without, METHODS)
         if arguments.source == DEFAULT and not Path(DEFAULT).exists():
             raise ValueError(f'there is no folder "{DEFAULT}": make it by mi-diffind capture {SCENE} -o {DEFAULT}')
-        arguments.views = tuple(load_views(arguments.source, split) for split in ("train", "test"))
+        arguments.settings = SimpleNamespace(ratios=arguments.ratios, **(QUICK if arguments.quick else FULL))
+        downscale = arguments.settings.options.get("downscale")
+        arguments.views = [load_views(arguments.source, split, downscale=downscale) for split in ("train", "test")]
 
     def plan(self, arguments) -> Plan:
-        given = {"ratios": arguments.ratios, "without": tuple(arguments.without)}
-        settings = SimpleNamespace(**given, **(QUICK if arguments.quick else FULL))
         session = FieldSession(array_module(mi.variant()), *arguments.views)
-        return plan(session, arguments.source, settings)
+        return plan(session, arguments.source, arguments.settings)
 
 
 STUDY = RadianceStudy()
@@ -130,27 +119,27 @@ class RadianceStudyContext:
     session: FieldSession
     source: str
     settings: SimpleNamespace
-    jobs: dict[str, Contender] = field(default_factory=dict)
+
+    @functools.cached_property
+    def grid(self) -> Contender:
+        """Contender of the grid."""
+        return preset_contender(self, {"name": GRID, "method": GRID, "budget": 1.0})
 
     @functools.cached_property
     def trained(self) -> grids.NodeGrid:
         """The trained grid."""
-        return grid_of(load(self.jobs[GRID].file), self.session.types)
+        return grid_of(load(self.grid.file), self.session.types)
 
     @functools.cached_property
     def cells(self) -> np.ndarray:
         """The cells of the trained grid that some ray sees."""
         return grids.visible(self.trained, self.session.images)
 
-    def importance(self, grid: grids.NodeGrid) -> Importance:
-        """Return the weights of the nodes of a grid in the training views."""
-        return importance(grid, self.session, SETTINGS.seed)
-
     def nbytes(self, ratio: float) -> float:
         """Return the bytes of a compression of the dense float32 grid."""
         return dense_bytes(self.trained.nodes.shape) / ratio
 
-    def record(self, job: Contender, model: VolumeField, nbytes: int, file_bytes: int, **details) -> dict:
+    def record(self, model: VolumeField, nbytes: int, file_bytes: int, **details) -> dict:
         """Return the record of a contender, with its errors."""
         details |= {"memory_bytes": nbytes, "file_bytes": file_bytes}
         return {"bytes": nbytes, "errors": self.session.held_out_images.evaluate(model), "details": details}
@@ -161,38 +150,33 @@ def preset_contender(context: RadianceStudyContext, fields: dict) -> Contender:
     settings = context.settings
 
     def fit_field(job: Contender, progress: bool) -> dict | None:
-        arguments = {"source": context.source}
+        arguments = {"source": context.source, **settings.options}
         if job.method == GRID:  # the other methods store numbers of directions
             arguments |= {"resolution": settings.resolution, "colours": "directions"}
             arguments |= {"steps": settings.grid_steps} if settings.grid_steps else {}
         else:
             nbytes = str(round(context.nbytes(job.budget)))
-            arguments |= {"grid": str(context.jobs[GRID].file), "bytes": nbytes, "steps": settings.steps}
+            arguments |= {"grid": str(context.grid.file), "bytes": nbytes, "steps": settings.steps}
         trained = equal_memory.fit_preset(job, progress, "field", "field", PRESETS[job.method], arguments)
         if trained is None:
             return None
         model, fitted = trained
         details = {"steps": fitted.result.steps, "nodes": model.field.nodes.count}
-        return context.record(job, job.model, model.memory_nbytes, job.file.stat().st_size, **details)
+        return context.record(job.model, model.memory_nbytes, job.file.stat().st_size, **details)
 
     return Contender(fit=fit_field, read=lambda job: equal_memory.open_preset(job, "field").field, **fields)
 
 
 def rival_contender(context: RadianceStudyContext, fields: dict) -> Contender:
     """Return a rival that is trained through the images as it is stored, and as fine as the budget allows."""
-    settings = context.settings
-    rival = rivals.HashVolumeFit if fields["method"] == "hash" else rivals.NodesFit
+    settings, types = context.settings, context.session.types
 
     def train(job: Contender, progress: bool) -> dict | None:
-        nbytes, rate = context.nbytes(job.budget), HASH_RATE
-        if job.method == "hash":
-            grid = grids.refine(context.trained, context.cells)
-            trained = rival(grid, context.importance(grid), nbytes)
-        else:
-            entries = min(ENTRIES, int(nbytes / 64)) if job.method == "codebook" else 0
-            grid = rivals.fitting_grid(context.trained, context.cells, nbytes, entries)
-            trained = rival(grid, context.importance(grid), entries)
-            rate = COARSER_RATE if grid.nodes.spacing > context.trained.nodes.spacing else SETTINGS.lr
+        nbytes = context.nbytes(job.budget)
+        entries = min(ENTRIES, int(nbytes / 64)) if job.method == "codebook" else 0
+        grid = rivals.fitting_grid(context.trained, context.cells, nbytes, entries)
+        trained = rivals.NodesFit(grid, importance(grid, context.session, SETTINGS.seed), entries)
+        rate = COARSER_RATE if grid.nodes.spacing > context.trained.nodes.spacing else SETTINGS.lr
         problem = ImagesProblem(context.session, trained.net, trained.field_of)
         problem.measure = lambda net: {"step": 0.0}  # the last step counts for all contenders
         options = replace(SETTINGS, lr=rate, steps=settings.steps, measure_every=settings.steps)
@@ -202,11 +186,11 @@ def rival_contender(context: RadianceStudyContext, fields: dict) -> Contender:
         trained.net = problem.net
         state = trained.state()
         job.save_arrays(**state)
-        job.model = rival.field(context.session.types, state)
+        job.model = rivals.NodesFit.field(types, state)
         details = {"steps": result.steps, "nodes": grid.nodes.count}
-        return context.record(job, job.model, job.model.nbytes, rivals.compressed_bytes(state), **details)
+        return context.record(job.model, job.model.nbytes, rivals.compressed_bytes(state), **details)
 
-    return Contender(fit=train, read=lambda job: rival.field(context.session.types, load_arrays(job.file)), **fields)
+    return Contender(fit=train, read=lambda job: rivals.NodesFit.field(types, load_arrays(job.file)), **fields)
 
 
 # -- The plan ----------------------------------------------------------------------------------------------------------
@@ -214,49 +198,39 @@ def rival_contender(context: RadianceStudyContext, fields: dict) -> Contender:
 
 def plan(session: FieldSession, source: str, settings: SimpleNamespace) -> Plan:
     """Return the plan of the study for a session of the capture in the folder ``source``."""
-    context = RadianceStudyContext(session, source, settings)
-    views, held_out, first, jobs = session.views, session.held_out, settings.ratios[0], context.jobs
-    height, width = views.sizes[0].tolist()
-    jobs[GRID] = preset_contender(context, {"name": GRID, "method": GRID, "budget": 1.0})
-    for method, ratio in equal_memory.combinations(METHODS, settings.ratios, ONCE, settings.without):
+    context, views, jobs = RadianceStudyContext(session, source, settings), session.views, []
+    for method, ratio in equal_memory.combinations(METHODS, settings.ratios, ()):
         label, setting = METHODS[method], f"{ratio:g}×"
         fields = {"name": f"{label} {setting}", "method": method, "budget": ratio, "label": label, "setting": setting}
-        make = preset_contender if method in PRESETS else rival_contender
-        jobs[fields["name"]] = make(context, fields)
-    shown = [name for name, job in jobs.items() if job.budget == first and job.method in METHODS]
-    ours = next((n for n in shown if jobs[n].method == "ours"), "")
-    timed = (GRID, *shown)
+        jobs.append((preset_contender if method in PRESETS else rival_contender)(context, fields))
+    shown = jobs[: len(METHODS)]
     candidates = [
         Candidate(GRID, "reference", job=GRID, is_reference=True, label="initial grid", details={"kind": GRID})
     ]
-    candidates += [job.candidate() for name, job in jobs.items() if name != GRID]
     code = package_files("tasks/radiance/*.py", "fitting/loop.py", "studies/field.py",
                          "studies/baselines/radiance_fields.py")  # fmt: skip
     return Plan(
         study="field",
         title=f"Radiance fields of the capture {Path(source).name}: held-out views against bytes and time",
-        candidates=candidates,
-        cases=[
-            Case("reads", lambda lanes: _reads(context, timed, lanes)),
-        ],
-        ratios=[(ours, n) for n in shown if jobs[n].method in AGAINST] if ours else [],
+        candidates=candidates + [job.candidate() for job in jobs],
+        cases=[Case("reads", functools.partial(_reads, context, [context.grid, *shown]))],
+        ratios=[(shown[-1].name, job.name) for job in shown[:-1]],
         details={
-            "source": source, "source_digest": views.digest + held_out.digest, "views": [len(views), len(held_out)],
-            "pixels": [width, height], "request": vars(settings), "first": first,
+            "source": source, "source_digest": views.digest + session.held_out.digest, "request": vars(settings)
         },
         notes=[
-            f"{Path(source).name}, {len(views)} views of {width} × {height} and {len(held_out)} to test. "
+            f"{Path(source).name}, {len(views)} views and {len(session.held_out)} to test. "
             "Bytes in memory, index included; paper packs corners of cells for reading, in more bytes than asked for.",
         ],
-        jobs=list(jobs.values()),
-        jobs_fingerprint=fingerprint(code) + views.digest[:16],
+        jobs=[context.grid, *jobs],
+        jobs_fingerprint=fingerprint(code),
         panels=("bytes",),
         pictures={"views": functools.partial(draw_views, context, shown)},
         measures=(Measure("PSNR of the foreground, dB", FOREGROUND), Measure("of all pixels", WHITE)),
     )  # fmt: skip
 
 
-def _reads(context: RadianceStudyContext, names, lanes: int) -> dict:
+def _reads(context: RadianceStudyContext, jobs: list[Contender], lanes: int) -> dict:
     """Return queries of density, and of density and colour, at random points of the visible cells."""
     types, nodes = context.session.types, context.trained.nodes
     rng = np.random.default_rng(1)
@@ -275,24 +249,23 @@ def _reads(context: RadianceStudyContext, names, lanes: int) -> dict:
         return [density, *model.radiance_at(point_data, p, d)]
 
     queries = {query: {FLOOR: lambda: [*p, *d]} for query in ("density", "both")}
-    for name in names:
-        model = context.jobs[name].model
-        queries["density"][name] = lambda f=model: [f.density_at(p)[0]]
-        queries["both"][name] = lambda f=model: both(f)
+    for job in jobs:
+        queries["density"][job.name] = lambda f=job.model: [f.density_at(p)[0]]
+        queries["both"][job.name] = lambda f=job.model: both(f)
     return queries
 
 
-def draw_views(context: RadianceStudyContext, names: list[str], result: dict):
+def draw_views(context: RadianceStudyContext, jobs: list[Contender], result: dict):
     """Draw the first test view by the fields at the first budget, and the differences to it."""
     truth = context.session.held_out.image(0)
     crop, reference = plot.crop_to(truth[..., 3] > 0), displayed(truth)
     views, differences = {"held-out view": reference[crop]}, {"held-out view": reference[crop]}
-    for job in (context.jobs[name] for name in names):
+    for job in jobs:
         picture = displayed(context.session.held_out_images.render(job.model, 0))
         errors = result["candidates"][job.name]["errors"]
         views[f"{job.label}\n{errors[FOREGROUND]:.2f} dB"] = picture[crop]
         differences[job.label] = np.abs(picture - reference).mean(axis=-1)[crop]
     rows = {"": views, "difference": differences}
-    title = f"A held-out view by fields {result['details']['first']:g}× smaller than a dense grid, and their errors"
+    title = f"A held-out view by fields {context.settings.ratios[0]:g}× smaller than a dense grid, and their errors"
     notes = ["dB: PSNR of the foreground in all held-out views.", *result["notes"]]
     return plot.draw_images(title, " ".join(notes), rows, 1.6, "difference of sRGB values")

@@ -3,9 +3,8 @@
 Indirection at several sizes and in each storage form, single tables, networks and the formula are measured with two
 parametrisations of their *inputs*: the plain one, (cos θ_h, α) as in the paper, and the logarithmic one of
 ``neural_ggx`` (:class:`~mi_diffind.tasks.ggx.model.Encoding`). All learn the same output, the bounded root of D, from
-the same samples with the same error measure; candidates marked *raw* learn D itself, as the paper's recipe does. All
-are trained until they converge (:mod:`~mi_diffind.measure.training`). The rough conductor that is built from the
-distribution is timed beside Mitsuba's.
+the same samples with the same error measure, until they converge (:mod:`~mi_diffind.measure.training`). The rough
+conductor that is built from the distribution is timed beside Mitsuba's.
 """
 
 from __future__ import annotations
@@ -68,7 +67,6 @@ SETTINGS = {
     "indirection, plain": {"lr": 5e-2, "batch": 16384, "steps": 2000, "longest": 16000},
     "indirection, logarithmic": {"lr": 1e-2, "batch": 16384, "steps": 2000, "longest": 16000},
     "single table": {"lr": 1e-2, "batch": 65536, "steps": 1000, "longest": 8000},
-    "raw": {"lr": 1e-3, "batch": 65536, "steps": 2000, "longest": 8000},
     "network": {"lr": 1e-2, "batch": 1024, "steps": 8000, "longest": 32000},
     "wide network": {"lr": 5e-3, "batch": 1024, "steps": 8000, "longest": 32000},
 }
@@ -99,15 +97,14 @@ STUDY = GGXStudy()
 class GGXTraining(ConvergenceTraining):
     """Training of a ``representation`` for one parametrisation of the ``inputs``, which is read in some ``storages``.
 
-    ``net`` is the module, not yet allocated; ``settings_key`` the key of :data:`SETTINGS`; ``output`` what it learns
-    (:class:`~mi_diffind.tasks.ggx.model.Encoding`).
+    ``net`` is the module, not yet allocated; ``settings_key`` the key of :data:`SETTINGS`.
     """
 
     def __init__(
         self, label: str, inputs: str, representation: str, net, settings_key: str, quick: bool,
-        storages: tuple[str, ...] = (COOPERATIVE,), output: str = "root",
+        storages: tuple[str, ...] = (COOPERATIVE,),
     ):  # fmt: skip
-        self.types, self.encoding = array_module(mi.variant()), Encoding(inputs, output)
+        self.types, self.encoding = array_module(mi.variant()), Encoding(inputs)
         self.representation, self.storages, self.end = representation, storages, INPUTS[inputs][1]
         samples = "tables" if inputs == "logarithmic" else "paper"
         options = dict(SETTINGS[settings_key])
@@ -136,30 +133,28 @@ class GGXTraining(ConvergenceTraining):
 
         untrained = self.problem().net
         for storage in self.storages:
-            label = self.name.removesuffix(self.end) + SUFFIXES[storage]
+            name = self.name.removesuffix(self.end) + SUFFIXES[storage] + self.end
             reader = functools.cache(functools.partial(self.reader, storage))
             yield Candidate(
-                label + self.end, self.representation, storage,
+                name, self.representation, storage,
                 untrained.nbytes if storage == COOPERATIVE else untrained.to(storage).nbytes,
                 errors=lambda samples, reader=reader: measure(reader(), self.types, samples),
-                label=label, job=self.name, operations=count_operations if storage == COOPERATIVE else None,
+                job=self.name, operations=count_operations if storage == COOPERATIVE else None,
             ), reader  # fmt: skip
 
 
 def trainings(inputs: str, quick: bool) -> list[GGXTraining]:
     """Return the trainings for ``inputs``: indirection, single tables, networks; ``quick``: fewer and shorter ones."""
-    plain = inputs == "plain"
-    cascades = {f"{side}→{side // 2}": indirection(side, side // 2) for side in SIZES[inputs]}
-    sides = [math.isqrt(ENTRIES * multiple) for multiple in MULTIPLES[inputs]]
-    tables = {f"{side}²": DifferentiableArray((side, side), 1, "constant", 0.5) for side in sides}
-    rows = [(label, "indirection", net, f"indirection, {inputs}", STORAGES) for label, net in cascades.items()]
-    for i, (label, net) in enumerate(tables.items()):
-        rows.append((label, "single table", net, "single table", STORAGES[: 1 if i else None]))
-    if plain:  # learn D as it is, at the paper's learning rate
-        for label, net in ((f"{PRIMARY}→{CASCADED}", cascades), (f"{sides[0]}²", tables)):
-            rows.append((f"{label} raw", "raw", net[label], "raw", STORAGES[:1], "raw"))
+    rows = []
+    for side in SIZES[inputs]:
+        net = indirection(side, side // 2)
+        rows.append((f"{side}→{side // 2}", "indirection", net, f"indirection, {inputs}", STORAGES))
+    for multiple in MULTIPLES[inputs]:
+        side = math.isqrt(ENTRIES * multiple)
+        net = DifferentiableArray((side, side), 1, "constant", 0.5)
+        rows.append((f"{side}²", "single table", net, "single table", STORAGES[: 1 if multiple > 1 else None]))
     for label, net in NETWORKS.items():
-        if plain or label in ("MLP 16x2", "MLP 32x3"):
+        if inputs == "plain" or label in ("MLP 16x2", "MLP 32x3"):
             family = "hash grid + network" if net.grid else "network"
             rows.append((label, family, net, "network" if net.width < 32 else "wide network"))
     return [
@@ -209,7 +204,7 @@ def plan(quick: bool = False) -> Plan:
         ratios=ratios,
         notes=[
             "16→8: 16 × 16 pointers into a table of 8 × 8; 24²: one table of 24 × 24; MLP 32x3: a network of three "
-            "layers of 32 units; f16, u8: entries of two bytes and of one."
+            "layers of 32 units; f16, u8: entries of two bytes and of one; log: logarithmic inputs."
         ],
         jobs=jobs,
         jobs_fingerprint=fingerprint(code),

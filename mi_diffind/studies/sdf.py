@@ -39,6 +39,7 @@ from ..tasks.sdf.distances import Distances
 from ..tasks.sdf.evaluation import SurfaceEvaluation
 from ..tasks.sdf.field import DistanceField
 from ..tasks.sdf.mesh import Mesh, load_mesh
+from ..tasks.sdf.paper import PairProblem
 from . import equal_memory
 from .baselines import distance_fields as rivals
 
@@ -76,14 +77,10 @@ MEASURES = (
 )
 
 #: Settings of a run: held-out points; points that the network is trained on, and measured at; steps of trainings by
-#: presets (0: the preset's own), and of the shortest and the longest of the network; width and height of pictures;
+#: presets (0: the preset's own), and of the shortest and the longest of the network; pixels along a side of pictures;
 #: cells of ``sdfgrid`` along the longest side.
-FULL = {
-    "points": 2**20, "pools": (2**20, 2**16), "steps": 0, "hash_steps": (500, 4000), "film": (480, 320), "grid": 256,
-}  # fmt: skip
-QUICK = {
-    "points": 2**14, "pools": (2**14, 2**10), "steps": 20, "hash_steps": (40, 80), "film": (96, 64), "grid": 32,
-}  # fmt: skip
+FULL = {"points": 2**20, "samples": (2**20, 2**16), "steps": 0, "hash_steps": (500, 4000), "side": 400, "grid": 256}
+QUICK = {"points": 2**14, "samples": (2**14, 2**10), "steps": 20, "hash_steps": (40, 80), "side": 160, "grid": 32}
 
 
 def size_text(nbytes: int) -> str:
@@ -108,18 +105,15 @@ class SdfStudy(Study):
             help=f"memory budget; may be repeated (default: {', '.join(SIZES)}; --quick: 64k); at the first one "
             "all methods are trained, and reads and rays are timed",
         )  # fmt: skip
-        equal_memory.add_without_option(parser)
 
     def check(self, arguments) -> None:
         """Check the arguments and read the mesh; raises :class:`~mi_diffind.tasks.sdf.mesh.MeshError`."""
         default = ("64k",) if arguments.quick else SIZES
         arguments.sizes = tuple(dict.fromkeys(map(parse_bytes, arguments.bytes or default)))
-        equal_memory.check_without(arguments.without, METHODS)
         arguments.loaded = load_mesh(arguments.source)
 
     def plan(self, arguments) -> Plan:
-        given = {"sizes": arguments.sizes, "without": tuple(arguments.without)}
-        settings = SimpleNamespace(**given, **(QUICK if arguments.quick else FULL))
+        settings = SimpleNamespace(sizes=arguments.sizes, **(QUICK if arguments.quick else FULL))
         return plan(arguments.loaded, arguments.source, settings)
 
 
@@ -147,17 +141,16 @@ class DistanceStudyContext:
         return SurfaceEvaluation(self.mesh, self.distances, self.settings.points)
 
     @functools.cached_property
-    def pools(self):
-        """Points with distances, those that a network is trained on and those that it is measured at."""
-        return [rivals.pool(self.distances, count, seed) for seed, count in enumerate(self.settings.pools, 1)]
+    def samples(self) -> PairProblem:
+        """Points that a network is trained on and measured at, and the frame of its field."""
+        return rivals.network_samples(self.distances, self.types, *self.settings.samples)
 
-    def record(self, model: DistanceField, nbytes: int, file_bytes: int, **details) -> dict:
+    def record(self, model: DistanceField, nbytes: int, **details) -> dict:
         """Return the record of a field with its errors; ``iou_near_db`` is the wrong share near the surface, in dB."""
         errors = self.evaluation.measure(model)
         errors["iou_near_db"] = -10 * math.log10(max(1 - errors["iou_near"], 1e-6))
         errors["index_bytes"] = marching.index_bytes(model)
-        details |= {"file_bytes": file_bytes, "spacing": model.spacing}
-        return {"bytes": nbytes, "errors": errors, "details": details}
+        return {"bytes": nbytes, "errors": errors, "details": {"spacing": model.spacing, **details}}
 
 
 def preset_contender(context: DistanceStudyContext, fields: dict) -> Contender:
@@ -172,7 +165,7 @@ def preset_contender(context: DistanceStudyContext, fields: dict) -> Contender:
         model, fitted = trained
         result = fitted.result
         details = {"steps": result.steps, "trained_seconds": result.seconds}
-        record = context.record(model.field, model.nbytes, job.file.stat().st_size, **details)
+        record = context.record(model.field, model.nbytes, **details)
         return {**record, "seconds": fitted.figures["prepared_seconds"] + result.seconds}
 
     return Contender(fit=fit, read=lambda job: equal_memory.open_preset(job, "sdf").field, **fields)
@@ -187,7 +180,7 @@ def grid_contender(context: DistanceStudyContext, fields: dict) -> Contender:
         start = time.perf_counter()
         job.model = finest(context.types, context.distances, job.budget)
         seconds = time.perf_counter() - start
-        return {**context.record(job.model, job.model.nbytes, job.model.file_bytes), "seconds": seconds}
+        return {**context.record(job.model, job.model.nbytes), "seconds": seconds}
 
     def read(job: Contender) -> DistanceField:
         return make(context.types, context.distances, job.record["details"]["spacing"])
@@ -200,14 +193,14 @@ def hash_contender(context: DistanceStudyContext, fields: dict) -> NetworkConten
     steps, longest = context.settings.hash_steps
 
     def problem():
-        return rivals.HashProblem(rivals.network(fields["budget"]), context.types, context.mesh, *context.pools)
+        return rivals.HashProblem(context.samples, fields["budget"])
 
     def build(net) -> DistanceField:
-        return rivals.HashDistanceField(context.types, net, context.mesh)
+        return rivals.HashDistanceField(net, context.samples.field)
 
     def finish(net, record: dict) -> dict:
         model = build(net)
-        return context.record(model, model.nbytes, model.nbytes, steps=record["steps"])
+        return context.record(model, model.nbytes, steps=record["steps"])
 
     settings = FitSettings(**HASH_SETTINGS, steps=steps)
     return NetworkContender(*fields.values(), build, problem, settings, longest, 8, True, finish)
@@ -227,15 +220,12 @@ def contender(method: str, nbytes: int, context: DistanceStudyContext) -> Conten
 def plan(mesh: Mesh, name: str, settings: SimpleNamespace) -> Plan:
     """Return the plan for a ``mesh``, of the file ``name``, in the variant that is set."""
     context = DistanceStudyContext(mesh, name, settings, array_module(mi.variant()))
-    chosen = equal_memory.combinations(METHODS, settings.sizes, FIRST_ONLY, settings.without)
-    jobs = [contender(method, nbytes, context) for method, nbytes in chosen]
+    jobs = [contender(*chosen, context) for chosen in equal_memory.combinations(METHODS, settings.sizes, FIRST_ONLY)]
     timed = {job.method: job for job in jobs if job.budget == settings.sizes[0]}
-    traced = {job.name: job for method, job in timed.items() if method != "hash"}
     grid = f"sdfgrid {settings.grid}³"
 
     def reads(lanes: int) -> dict:
-        points = np.resize(context.evaluation.near, (lanes, 3)).T
-        p = context.types.Array3f(*(context.types.Float(np.ascontiguousarray(v)) for v in points))
+        p = grids.point_array(timed["ours"].model, np.resize(context.evaluation.near, (lanes, 3)))
         dr.make_opaque(p)
         value, normal = {FLOOR: lambda: list(p)}, {FLOOR: lambda: list(p)}
         for job in timed.values():
@@ -244,82 +234,63 @@ def plan(mesh: Mesh, name: str, settings: SimpleNamespace) -> Plan:
         return {"value": value, "normal": normal}
 
     def rays(lanes: int) -> dict:
-        o, d = camera_rays(settings.film, lanes)
+        o, d = camera_rays(lanes)
         queries = {FLOOR: lambda: [*o, *d]}
-        queries |= {name: (lambda f=job.model: [field_distance(f, o, d)]) for name, job in traced.items()}
-        decoded = min(traced.values(), key=lambda job: job.method != "ours").model
-        scenes = {MESH: mesh_scene(mesh), grid: grid_scene(decoded, settings.grid)}
-        queries |= {name: (lambda s=scene: [scene_distance(s, o, d)]) for name, scene in scenes.items()}
-        return {"ray": queries}
+        for method, job in timed.items():
+            if method != "hash":  # no bound of its slope is known
+                queries[job.name] = lambda f=job.model: [marching.trace(f, o, d, dr.inf)[0]]
+        scenes = {MESH: mesh_scene(mesh), grid: grid_scene(timed["ours"].model, settings.grid)}
+        return {"ray": queries | {n: (lambda s=scene: [scene_distance(s, o, d)]) for n, scene in scenes.items()}}
 
-    candidates = [job.candidate() for job in jobs]
-    nbytes = 12 * (len(mesh.vertices) + len(mesh.faces))
-    candidates.append(Candidate(MESH, "mesh", bytes=nbytes, is_reference=True,
-                                details={"file_bytes": Path(name).stat().st_size}))  # fmt: skip
-    candidates.append(Candidate(grid, "sdfgrid", bytes=4 * settings.grid**3, is_reference=True))
-    compared = [timed[m].name for m in SHOWN[:2] if m in timed] + [MESH, grid]
-    warnings = [w.removeprefix(f"{mesh.path}: ") for w in (*mesh.warnings, *context.distances.warnings)]
+    nbytes = {MESH: 12 * (len(mesh.vertices) + len(mesh.faces)), grid: 4 * settings.grid**3}
+    compared = [timed[method].name for method in SHOWN[:2]]
     code = package_files("tasks/sdf/*.py", "fitting/loop.py", "arrays/indirection.py", "studies/sdf.py",
                          "studies/baselines/distance_fields.py", "studies/baselines/networks.py")  # fmt: skip
     return Plan(
         study="sdf",
         title=f"Distance fields of {Path(name).stem} in equal bytes: accuracy against time and bytes",
-        candidates=candidates,
-        cases=[
-            Case("reads", reads),
-            *([Case("rays", rays)] if traced else []),
+        candidates=[
+            *(job.candidate() for job in jobs),
+            *(Candidate(n, n.split()[0], bytes=size, is_reference=True) for n, size in nbytes.items()),
         ],
-        ratios=[(timed["ours"].name, other) for other in compared] if "ours" in timed else [],
+        cases=[Case("reads", reads), Case("rays", rays)],
+        ratios=[(timed["ours"].name, other) for other in (*compared, *nbytes)],
         details={
             "source": name, "source_digest": mesh.digest, "triangles": len(mesh.faces), "request": vars(settings),
-            "first": settings.sizes[0], "film": list(settings.film),
         },
         notes=[
             f"{Path(name).name}, {len(mesh.faces):,} triangles. IoU near: within 0.01 of the longest side. Bytes are "
-            "those of all that a read needs; rays of sparse fields need an index in addition.",
-            *(f"{w[:1].upper()}{w[1:]}." for w in warnings),
+            "those of all that a read needs; rays of sparse fields need an index in addition."
         ],
         jobs=jobs,
-        jobs_fingerprint=f"{fingerprint(code)}{mesh.digest[:16]}-{settings.steps}-{settings.hash_steps[-1]}-"
-        f"{settings.points}",
+        jobs_fingerprint=fingerprint(code),
         panels=("bytes",),
-        pictures={"shapes": lambda result: draw_normals(context, [timed[m] for m in SHOWN if m in timed], result)},
+        pictures={"shapes": lambda result: draw_normals(context, [timed[m] for m in SHOWN], result)},
         measures=MEASURES,
     )  # fmt: skip
 
 
 # -- Views -------------------------------------------------------------------------------------------------------------
 
-#: Direction of the camera from the origin, its distance, and its field of view in degrees, of the longer side.
+#: Direction of the camera from the origin, its distance, and its field of view in degrees.
 DIRECTION = (0.45, 0.3, 1.0)
 DISTANCE = 2.6
 FOV = 32.0
 
-#: Rays end there.
-FAR = 1e3
 
-#: Direction of the light on the mesh, not normalised.
-LIGHT = (-0.4, 0.7, 0.6)
+def camera_rays(count: int):
+    """Return origins and directions of ``count`` rays of a camera, which sees all of a mesh in a square film.
 
-
-def camera_rays(film: tuple[int, int], count: int | None = None):
-    """Return origins and directions of the rays of a camera, which sees all of a mesh, through its pixels' centres.
-
-    Rays are those of a ``film`` of (width, height) pixels, row by row from the top, or so many of a film of the same
-    shape as ``count`` says; they are evaluated.
+    Rays go through the centres of pixels, row by row from the top; they are evaluated.
     """
-    width, height = film
-    if count is not None:
-        width = max(1, round(math.sqrt(count * width / height)))
-        height = -(-count // width)
+    side = math.isqrt(count - 1) + 1
     origin = (DISTANCE * np.array(DIRECTION) / np.linalg.norm(DIRECTION)).tolist()
     sensor = mi.load_dict({
-        "type": "perspective", "fov": FOV, "fov_axis": "larger",
-        "to_world": mi.ScalarTransform4f().look_at(origin, [0, 0, 0], [0, 1, 0]),
-        "film": {"type": "hdrfilm", "width": width, "height": height},
+        "type": "perspective", "fov": FOV, "to_world": mi.ScalarTransform4f().look_at(origin, [0, 0, 0], [0, 1, 0]),
+        "film": {"type": "hdrfilm", "width": side, "height": side},
     })  # fmt: skip
-    i = dr.arange(mi.UInt32, count or width * height)
-    place = mi.Point2f((i % width + 0.5) / width, (i // width + 0.5) / height)
+    i = dr.arange(mi.UInt32, count)
+    place = mi.Point2f((i % side + 0.5) / side, (i // side + 0.5) / side)
     ray, _ = sensor.sample_ray(0, 0, place, mi.Point2f(0.5))
     dr.make_opaque(ray.o, ray.d)
     return ray.o, ray.d
@@ -343,11 +314,6 @@ def grid_scene(field: DistanceField, resolution: int) -> mi.Scene:
     return mi.load_dict({"type": "scene", "shape": {"type": "sdfgrid", "grid": grid, "to_world": to_world}})
 
 
-def field_distance(field: DistanceField, o, d):
-    """Return the length of rays until they meet a field, infinite if they miss it."""
-    return marching.trace(field, o, d, FAR)[0]
-
-
 def scene_distance(scene, o, d):
     """Return the length of rays until they meet a scene, which has to live until the result is evaluated."""
     return scene.ray_intersect_preliminary(mi.Ray3f(o, d), coherent=True).t
@@ -355,21 +321,20 @@ def scene_distance(scene, o, d):
 
 def draw_normals(context: DistanceStudyContext, jobs: list[Contender], result: dict):
     """Draw the errors of normals of contenders on the shape, where rays meet mesh and fields."""
-    width, height = context.settings.film
-    (o, d), scene = camera_rays((width, height)), mesh_scene(context.mesh)
+    shape = (context.settings.side,) * 2
+    (o, d), scene = camera_rays(math.prod(shape)), mesh_scene(context.mesh)
     si = scene.ray_intersect(mi.Ray3f(o, d))
-    hit = si.is_valid().numpy().reshape(height, width)
-    grey = dr.select(si.is_valid(), 0.25 + 0.65 * dr.clip(dr.dot(si.n, dr.normalize(mi.Vector3f(LIGHT))), 0, 1), 1)
-    row = {"mesh": np.repeat(grey.numpy().reshape(height, width, 1), 3, axis=2)}
+    hit = si.is_valid().numpy().reshape(shape)
+    grey = dr.select(si.is_valid(), 0.25 + 0.65 * dr.clip(-dr.dot(si.n, d), 0, 1), 1)
+    row = {"mesh": np.repeat(grey.numpy().reshape(*shape, 1), 3, axis=2)}
     for job in jobs:
         with dr.suspend_grad():
-            t = field_distance(job.model, o, d)
-            met = dr.isfinite(t)
+            t, met = marching.trace(job.model, o, d, dr.inf)
             slope = job.model.gradient(dr.fma(d, dr.select(met, t, 0), o))[1]
             angle = dr.rad2deg(dr.safe_acos(dr.dot(dr.normalize(slope), si.n)))
             angle = dr.select(met == si.is_valid(), dr.select(met, angle, dr.nan), 90)
         error = result["candidates"][job.name]["errors"]["normal_deg"]
-        row[f"{job.name}\nmean error {error:.2f}°"] = angle.numpy().reshape(height, width)
+        row[f"{job.name}\nmean error {error:.2f}°"] = angle.numpy().reshape(shape)
     row = {name: image[plot.crop_to(hit)] for name, image in row.items()}
     title = f"{Path(context.name).stem}: angle between the normals of a field and of the mesh"
     return plot.draw_images(title, " ".join(result["notes"]), {"": row}, 2.6, "error of the normal, degrees")

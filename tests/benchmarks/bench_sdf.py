@@ -35,7 +35,7 @@ MESH, GRID, ARRAYS = "Embree, the mesh", "sdfgrid {}³", "the arrays"
 def rays(ray_set: str):
     """Return origins and directions in the unit frame."""
     if ray_set == "primary":
-        return camera_rays((SIDE, SIDE))
+        return camera_rays(SIDE * SIDE)
     rng = np.random.default_rng(1)
     start, end = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in rng.normal(size=(2, SIDE * SIDE, 3)))
     o, d = 0.8 * start, 0.3 * end - 0.8 * start

@@ -1,22 +1,17 @@
-"""Rivals of radiance fields against trilinear interpolation by NumPy and finite differences."""
+"""Rivals of radiance fields against trilinear interpolation by NumPy."""
 
-import drjit as dr
 import drjit.llvm.ad as T
 import numpy as np
 import pytest
 
 from mi_diffind.arrays.sparse_grid import cell_corners, complete_cells
 from mi_diffind.studies.baselines import radiance_fields as rivals
-from mi_diffind.tasks.radiance import march
 from mi_diffind.tasks.radiance.compression import Importance
 from mi_diffind.tasks.radiance.grid import NodeGrid
 from mi_diffind.tasks.radiance.nodes import Nodes
 from mi_diffind.tasks.radiance.volume_field import FAINT
 
 LOWER, SPACING, SHAPE = (-0.5, -0.3, 0.1), 0.05, (11, 9, 14)
-
-#: Bytes of a hash grid and its network.
-BYTES = 20_000
 
 
 @pytest.fixture
@@ -101,32 +96,3 @@ def test_grids_are_as_fine_as_the_bytes_allow(grid):
         assert rivals.fitting_grid(grid, cells, whole, entries).nodes.shape == SHAPE
         part = rivals.fitting_grid(grid, cells, 0.7 * whole, entries)
         assert part.nodes.spacing > SPACING and 0.4 * whole < rivals.memory_bytes(part, entries) <= 0.7 * whole
-
-
-def test_all_outputs_of_a_network_are_trained(grid, importance, rng):
-    """Derivatives of rays reach the density and all coefficients of the colours, as finite differences do."""
-    made = rivals.HashVolumeFit(grid, importance, BYTES)
-    assert 0.8 * BYTES < made.field(T, made.state()).nbytes <= BYTES
-    made.net["weights"] = made.net["weights"] * 1.5  # some density
-    _, _, o, d = rays(rng, 500)
-
-    def total(net):
-        march_field = made.field_of(net).for_training()
-        colours = march.differentiable(march_field, o, d, T.Float(0), T.Float(dr.inf)).colour
-        return sum(w * dr.sum(colour) for w, colour in zip((1, 2, 3), colours, strict=True))
-
-    net = {name: T.TensorXf(value) for name, value in made.net.items()}
-    dr.enable_grad(net)
-    dr.backward(total(net))
-    gradients, net = dr.grad(net), dr.detach(net)
-    gradient = gradients["weights"].numpy().astype(np.float64)
-    assert np.abs(gradients["entries"].numpy()).max() > 0
-    bias = made.network.mlp.layers[-1].bias
-    for row in range(13):
-        place, sums = bias.offset + row * bias.stride, []
-        for sign in (1, -1):
-            weights = net["weights"].numpy().copy()
-            weights[place] += sign * 1e-2
-            sums.append(float(total({**net, "weights": T.TensorXf(weights)})[0]))
-        assert gradient[place] == pytest.approx((sums[0] - sums[1]) / 2e-2, rel=0.03, abs=1e-3), row
-    assert np.abs(gradient[bias.offset + bias.stride :: bias.stride][:3]).min() > 0.01

@@ -8,38 +8,24 @@ and index.
 from __future__ import annotations
 
 import math
-import zlib
 
 import drjit as dr
 import numpy as np
 
 from ...arrays.budget import Budget
-from ...arrays.indirection import device_array
-from ...arrays.lookup import clamp
-from ...core.units import largest_fitting
+from ...arrays.lookup import corners, read_floats
 from ...fitting.loop import Problem
-from ...maps.pyramid import decibel
-from ...tasks.sdf.distances import Distances, sample_box, sample_near
+from ...tasks.sdf.distances import Distances
 from ...tasks.sdf.encoding import SampledNodes, fit_frames, sample
 from ...tasks.sdf.field import DistanceField
+from ...tasks.sdf.fit import COARSEST_SPACING, FINEST_SPACING, FIRST_SPACING
 from ...tasks.sdf.mesh import Mesh
 from ...tasks.sdf.nodes import SparseNodes, pointer_at, pointer_words
-from ...tasks.sdf.paper import edge_steps
+from ...tasks.sdf.paper import PairProblem, edge_steps
 from .networks import LAYERS, WIDTH, Network, hash_grid
 
 #: Largest distance, in cells, between the surface and a corner of a cell that the surface crosses.
 NEAREST = 1.75
-
-#: Spacing, of the longest side, that :func:`finest_distance_nodes` tries first, and its limits.
-FIRST_SPACING = 1 / 64
-FINEST_SPACING = 1 / 2048
-COARSEST_SPACING = 1 / 12
-
-#: Largest distance that a network learns.
-BAND = 0.02
-
-#: Padding of the mesh's box, of which the field of a network is defined.
-PADDING = 0.01
 
 #: Finest resolution of a hash grid of 1 MiB.
 FINEST = 256
@@ -88,51 +74,36 @@ class ByteGrid(LimitedField):
     """Dense grid of ``codes``, uint8 ``(X, Y, Z)``, the first of which is at ``lower``, interpolated trilinearly."""
 
     def __init__(self, types, codes: np.ndarray, lower, spacing: float, band: float):
-        self.cells = tuple(n - 1 for n in codes.shape)
-        upper = [a + n * spacing for a, n in zip(lower, self.cells, strict=True)]
-        super().__init__(types, lower, upper, spacing, band)
-        self.nodes, self.nbytes = types.UInt8(np.ascontiguousarray(codes.ravel())), codes.size
-        self.file_bytes = len(zlib.compress(codes.tobytes(), 9))
-        # Slabs of 32 cells that share their ends, to save memory
-        slabs = (codes[i : i + 33] for i in range(0, codes.shape[0] - 1, 32))
-        self.slope = max(slope_bound(dequantise(slab, band), spacing) for slab in slabs)
+        self.shape, self.nbytes = codes.shape, codes.size
+        super().__init__(types, lower, lower + spacing * (np.array(codes.shape) - 1), spacing, band)
+        self.nodes = types.UInt8(np.ascontiguousarray(codes.ravel()))
+        self.slope = slope_bound(dequantise(codes, band), spacing)
 
     def distance(self, p, active):
-        Float, first, (_, ny, nz), place = self.types.Float, 0, (n + 1 for n in self.cells), []
-        for x, a, n, side in zip(p, self.lower, self.cells, (1, ny, nz), strict=True):
-            t = clamp((x - a) / self.spacing, 0.0, float(n))
-            i = dr.minimum(self.types.UInt32(dr.detach(t)), n - 1)
-            first = first * side + i
-            place.append(t - Float(i))
-        offsets = [(a * ny + b) * nz + c for a in (0, 1) for b in (0, 1) for c in (0, 1)]
-        codes = [Float(dr.gather(self.types.UInt8, self.nodes, first + offset, active)) for offset in offsets]
-        for t in reversed(place):  # interpolate along z, then y, then x
-            codes = [dr.lerp(a, b, t) for a, b in zip(codes[::2], codes[1::2], strict=True)]
-        step = self.band / 128
-        return dr.fma(codes[0], step, -127.5 * step)
+        place = [(x - a) / (b - a) for x, a, b in zip(p, self.lower, self.upper, strict=True)]
+        (code,) = read_floats(self.nodes, 1, 1, corners(place, self.shape, ("clamp",) * 3), active)
+        return (code - 127.5) * (self.band / 128)
+
+
+def dense_shape(mesh: Mesh, spacing: float) -> np.ndarray:
+    """Return the nodes along the axes of a dense grid around a mesh, half a cell or more away from it."""
+    return np.ceil((mesh.upper - mesh.lower) / spacing + 2).astype(int)
 
 
 def dense_grid(types, distances: Distances, spacing: float) -> ByteGrid:
     """Return a dense grid of this spacing around the mesh."""
-    mesh = distances.mesh
-    cells = _dense_cells(mesh, spacing)
-    lower, band = (mesh.lower + mesh.upper) / 2 - cells * spacing / 2, NEAREST * spacing
-    places = np.stack(np.meshgrid(*map(np.arange, cells + 1), indexing="ij"), -1).reshape(-1, 3)
+    mesh, band = distances.mesh, NEAREST * spacing
+    shape = dense_shape(mesh, spacing)
+    lower = (mesh.lower + mesh.upper - (shape - 1) * spacing) / 2
+    places = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1).reshape(-1, 3)
     values = distances.signed(lower + places * spacing, 3 * spacing)
-    return ByteGrid(types, quantise(values.reshape(cells + 1), band), lower, spacing, band)
+    return ByteGrid(types, quantise(values.reshape(shape), band), lower, spacing, band)
 
 
 def finest_dense_grid(types, distances: Distances, nbytes: int) -> ByteGrid:
-    """Return the finest :func:`dense_grid` of ``nbytes``."""
-
-    def fits(fineness: float) -> bool:
-        return np.prod(_dense_cells(distances.mesh, math.exp(-fineness)) + 1.0) <= nbytes
-
-    return dense_grid(types, distances, math.exp(-largest_fitting(fits, 0.0, math.log(1e4), steps=40)))
-
-
-def _dense_cells(mesh: Mesh, spacing: float) -> np.ndarray:
-    return np.ceil((mesh.upper - mesh.lower) / spacing + 1).astype(int)
+    """Return the finest :func:`dense_grid` of ``nbytes``; raises :class:`.BudgetError` if none fits."""
+    cells = Budget(nbytes).largest(lambda n: np.prod(dense_shape(distances.mesh, 1 / n)), range(4, 4096))
+    return dense_grid(types, distances, 1 / cells)
 
 
 class DistanceNodes(SparseNodes):
@@ -144,9 +115,6 @@ class DistanceNodes(SparseNodes):
         corners = np.moveaxis(dequantise(self.codes, NEAREST)[sampled.corners].reshape(-1, 2, 2, 2), 0, -1)
         super().__init__(types, structure, slope_bound(corners, 1.0), pointers=pointer_words(self.codes, 8), bits=8)
         self._frames = fit_frames(sampled)  # the rays' index bounds the distance of the surface from their planes
-        masks = (structure.regions, structure.region_masks, structure.region_signs, structure.block_masks,
-                 structure.block_signs)  # fmt: skip
-        self.file_bytes = sum(len(zlib.compress(array.tobytes(), 9)) for array in (self.codes, *masks))
 
     @property
     def nbytes(self) -> int:
@@ -178,8 +146,9 @@ def finest_distance_nodes(types, distances: Distances, nbytes: int) -> DistanceN
     def following(spacing: float, field: DistanceNodes) -> float:
         return float(np.clip(spacing * math.sqrt(field.nbytes / (0.985 * nbytes)), FINEST_SPACING, COARSEST_SPACING))
 
-    budget = Budget(nbytes, 0.03)
-    return budget.approach(lambda spacing: distance_nodes(types, distances, spacing), FIRST_SPACING, following)
+    return Budget(nbytes, 0.03).approach(
+        lambda spacing: distance_nodes(types, distances, spacing), FIRST_SPACING, following
+    )
 
 
 # -- Hash grid and network ---------------------------------------------------------------------------------------------
@@ -190,60 +159,46 @@ def network(nbytes: int) -> Network:
     return Network(3, WIDTH, LAYERS, hash_grid(3, nbytes, FINEST * math.sqrt(nbytes / 2**20), 1))
 
 
-class HashDistanceField(LimitedField):
-    """Field of a trained ``net`` with distances divided by :data:`BAND`; no bound of its slope is known."""
+def network_samples(distances: Distances, types, count: int, held_out: int) -> PairProblem:
+    """Return the training of the supplement's arrays whose ``count`` samples and ``held_out`` points networks share.
 
-    def __init__(self, types, net: Network, mesh: Mesh):
+    Samples reach as far from the surface as those of arrays with :data:`FINEST` / 2 entries along each side.
+    """
+    return PairProblem(distances, ((FINEST // 2,) * 3, (2,) * 3), "constant", types, 1, count, held_out)
+
+
+class HashDistanceField(LimitedField):
+    """Field of a trained ``net`` in the box of a ``frame``; no bound of its slope is known.
+
+    The outputs of the network stand for distances as those of arrays do (:class:`.PairField`).
+    """
+
+    def __init__(self, net: Network, frame: DistanceField):
         finest = net.grid["base_resolution"] * net.grid["per_level_scale"] ** (net.grid["n_levels"] - 1)
-        super().__init__(types, mesh.lower - PADDING, mesh.upper + PADDING, 1 / finest, BAND)
+        super().__init__(frame.types, frame.lower, frame.upper, 1 / finest, frame.band)
         self.net, self.nbytes = net, 2 * net.parameters
 
     def distance(self, p, active):
-        return self.outputs(self.net, p)[0] * BAND
-
-    def outputs(self, net: Network, p) -> list:
-        """Return the output of a network at points, in a list."""
-        return net([x - a for x, a in zip(p, self.lower, strict=True)])
+        place = [(x - a) / (b - a) for x, a, b in zip(p, self.lower, self.upper, strict=True)]
+        return dr.fma(self.net(place)[0], 2 * self.band, -self.band)
 
     def safe_step(self, p, d, active=True):
         raise NotImplementedError("no bound of the slope of a network is known")
 
 
 class HashProblem(Problem):
-    """Training of a :class:`Network` on a ``pool`` of points with distances, measured on another (:func:`pool`)."""
+    """Training of the largest :func:`network` of ``nbytes`` on the ``samples`` of :func:`network_samples`."""
 
-    def __init__(self, net: Network, types, mesh: Mesh, pool: tuple, held: tuple):
-        self.net, self.types = net.alloc(types.TensorXf, 3, dr.rng(seed=1)), types
-        self.field = HashDistanceField(types, self.net, mesh)
-        self.pool, self.held = (
-            [device_array(types.Float, v) for v in (*points.T, np.clip(distances / BAND, -1, 1))]
-            for points, distances in (pool, held)
-        )
-        self.identity = {"mesh": mesh.digest, "count": len(pool[1]), "seed": 1}
-
-    def batch(self, rng, size: int):
-        count = dr.width(self.pool)
-        index = dr.minimum(self.types.UInt32(rng.random(self.types.Float, size) * count), count - 1)
-        *p, d = (dr.gather(self.types.Float, v, index) for v in self.pool)
-        return p, {"d": [d]}
+    def __init__(self, samples: PairProblem, nbytes: int):
+        self.samples, self.batch, self.identity = samples, samples.batch, samples.identity
+        self.net = network(nbytes).alloc(samples.types.TensorXf, 3, dr.rng(seed=1))
 
     def predict(self, net, inputs) -> dict[str, list]:
-        return {"d": self.field.outputs(net, inputs)}
+        return {"d": net(inputs)}
 
     def measure(self, net) -> dict[str, float]:
-        *p, d = self.held
-        error = dr.clip(self.field.outputs(net, p)[0], -1, 1) - d
-        return {"psnr_db": decibel(float(dr.mean(dr.square(error))[0]))}
-
-
-def pool(distances: Distances, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``count`` points in the padded box of the mesh and their distances, ``(count, 3)`` and ``(count,)``.
-
-    Three quarters are near the surface (normal distributions of 0.002 and 0.01), the others uniform.
-    """
-    rng, mesh = np.random.default_rng(seed), distances.mesh
-    lower, upper = mesh.lower - PADDING, mesh.upper + PADDING
-    near = [sample_near(mesh, 3 * count // 8, width, rng) for width in (0.002, 0.01)]
-    rest = sample_box(lower, upper, count - sum(map(len, near)), rng)
-    points = np.clip(np.concatenate([*near, rest]), lower, upper)[rng.permutation(count)].astype(np.float32)
-    return points, distances.signed(points, 2 * BAND)
+        """Return the share of held-out points near the surface whose sign is wrong, in decibels."""
+        held_out = self.samples.held_out
+        with dr.suspend_grad():
+            inside = HashDistanceField(net, self.samples.field).value(held_out.near).numpy() < 0
+        return {"agree_db": -10 * math.log10(max(np.mean(inside != held_out.inside), 1e-6))}

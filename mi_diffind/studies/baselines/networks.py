@@ -1,11 +1,10 @@
 """Networks of ``drjit.nn`` that tables are compared with, alone or after a hash grid.
 
-Here are the networks in place of tables of images and textures (hash grids of uv) and of measured and layered BSDFs.
-Those of fields are in :mod:`.distance_fields` and :mod:`.radiance_fields`.
+Here are the networks in place of tables of textures (hash grids of uv). That of distance fields is in
+:mod:`.distance_fields`.
 
 Sources: Müller et al., *Instant Neural Graphics Primitives with a Multiresolution Hash Encoding*, 2022; Barron et al.,
-*Zip-NeRF: Anti-Aliased Grid-Based Neural Radiance Fields*, 2023, for features that fade with the footprint; Sztrajman
-et al., *Neural BRDF Representation and Importance Sampling*, 2021, for the size of networks of BSDFs.
+*Zip-NeRF: Anti-Aliased Grid-Based Neural Radiance Fields*, 2023, for features that fade with the footprint.
 """
 
 from __future__ import annotations
@@ -14,22 +13,15 @@ import copy
 import math
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 from drjit import nn
 
 from ...arrays.budget import Budget, BudgetError
 from ...arrays.lookup import clamp
 from ...core.compat import backend_module
-from ...core.runtime import array_module
 from ...maps.layout import Layout
 from ...maps.pyramid import FilteredMaps, Pyramid, decibel, mean_square
 from ...measure.clock import Operations
-from ...tasks.bsdf import training as bsdf_training
-from ...tasks.bsdf.directions import SphereView
-from ...tasks.bsdf.model import DirectionPair, Form, coordinate_u, coordinate_w
-from ...tasks.bsdf.training import BSDFProblem
-from ...tasks.bsdf.truth import truth_of
 from ...tasks.texture import PRESETS
 from ...tasks.texture.fit import TextureProblem
 
@@ -50,9 +42,6 @@ COARSEST = 8
 
 #: Samples of a measurement during training.
 MEASURED = 2**17
-
-#: Limits of a logarithm before its exponential.
-LIMITS = (-30.0, 20.0)
 
 
 class Network(nn.Module):
@@ -104,10 +93,10 @@ class Network(nn.Module):
         """Return the features that the hash grid gives to the network at coordinates ``x``."""
         return list(self.encoding(x[: self.inputs], active))
 
-    def cooperative(self, layout: str = "inference") -> Network:
-        """Return a copy in cooperative vectors, for ``"inference"`` or ``"training"``."""
+    def cooperative(self) -> Network:
+        """Return a copy in cooperative vectors, for reading."""
         result = copy.copy(self)
-        result.mlp, result.is_cooperative = nn.pack(self.mlp, layout=layout), True
+        result.mlp, result.is_cooperative = nn.pack(self.mlp, layout="inference"), True
         return result
 
     @property
@@ -154,7 +143,7 @@ def hash_grid(dimensions: int, nbytes: float, finest: float, outputs: int, direc
             "init_scale": 1e-4}  # fmt: skip
 
 
-# -- Images and filtered textures --------------------------------------------------------------------------------------
+# -- Filtered textures -------------------------------------------------------------------------------------------------
 
 
 class FilteredNetwork(Network):
@@ -235,79 +224,3 @@ class TextureNetworkProblem(TextureProblem):
             result = {"psnr_db": decibel(mean_square(values, truth))}
         self.jittered = jittered
         return result
-
-
-# -- BSDFs -------------------------------------------------------------------------------------------------------------
-
-#: Hidden units of both layers of a network in place of a BSDF; weights and biases of 6 inputs and 3 outputs are 675.
-BSDF_WIDTH = 21
-
-#: Share of a training in which errors are those of logarithms.
-LOGARITHMIC = 0.3
-
-#: Least f cos θ in errors of logarithms.
-DARK = 1e-6
-
-
-def bsdf_network() -> Network:
-    """Return the network of a BSDF, not yet allocated."""
-    return Network(6, BSDF_WIDTH, 2, outputs=3)
-
-
-class NetworkBSDF:
-    """BSDF of a network, with ``value`` and, for timing, Mitsuba's ``eval``.
-
-    Inputs are u, v, w of :mod:`...tasks.bsdf.model`, cos θ_h, cos θ_d and cos θ_i cos θ_o; with the half vector and the
-    difference vector as they are, networks were 24 dB worse or more. The output is added to ``mean``.
-    """
-
-    def __init__(self, network: Network, mean: float, form: Form):
-        self.network, self.mean, self.form = network, mean, form
-
-    def value(self, wi, wo) -> list:
-        """Return f without the cosine, three arrays."""
-        g = DirectionPair.of(wi, wo)
-        cos_h = g.half.z * dr.rsqrt(dr.squared_norm(g.half))
-        u, w = coordinate_u(g, self.form.scale), clamp(coordinate_w(g, self.form), 0, 1)
-        logarithms = self.network([u, dr.sqrt(1 - g.cos_d), w, cos_h, g.cos_d, wi.z * wo.z])
-        return [dr.exp(clamp(v + self.mean, *LIMITS)) for v in logarithms]
-
-    def eval(self, context, si, wo, active=True):
-        """Return f cos θ_o, as a BSDF of Mitsuba."""
-        valid = (si.wi.z > 0) & (wo.z > 0)
-        return dr.select(valid, wo.z * mi.Color3f(self.value(si.wi, wo)), 0)
-
-
-class BSDFNetworkProblem(BSDFProblem):
-    """Training problem of a network on samples of a source: errors of logarithms, then the loss of learned BSDFs."""
-
-    def __init__(self, source: dict, scale: tuple[float, float]):
-        types = array_module(mi.variant())
-        truth = truth_of(source, types)
-        samples = bsdf_training.draw(truth, types, bsdf_training.SAMPLES, 2, True)
-        network = bsdf_network().alloc(mi.TensorXf, rng=dr.rng(seed=dr.opaque(mi.UInt64, 1)))
-        super().__init__(network, Form(scale=scale), samples, bsdf_training.view_psnr([((), SphereView(truth, types))]))
-        cos = dr.maximum(samples.wo.z, 1e-3)
-        self.mean = sum(float(dr.mean(dr.log(dr.maximum(v, DARK) / cos))[0]) for v in samples.value) / 3
-        self.identity = {"source": truth.digest, "scale": list(scale)}
-
-    def bsdf(self, net: Network) -> NetworkBSDF:
-        """Return the BSDF of a network."""
-        return NetworkBSDF(net, self.mean, self.form)
-
-    def begin(self, step: int, share: float) -> str:
-        self._share = share
-        return "logarithms" if share < LOGARITHMIC else ""
-
-    def value(self, net, s) -> list:
-        return self.bsdf(net).value(s.wi, s.wo)
-
-    def error(self, value: list, s):
-        if self._share >= LOGARITHMIC:
-            return super().error(value, s)
-        pairs = zip(value, s.value, strict=True)
-        return sum(dr.abs(dr.log(dr.maximum(v * s.wo.z, DARK)) - dr.log(dr.maximum(t, DARK))) for v, t in pairs)
-
-    def measure(self, net) -> dict[str, float]:
-        with dr.suspend_grad():
-            return self._measure(lambda coordinates: self.bsdf(net))
