@@ -35,7 +35,7 @@ from ..maps.source import Map, Source, load_source
 from ..measure import plot, renders
 from ..measure.renders import TextureReader, TextureScene
 from ..measure.report import figure_caption
-from ..measure.study import Candidate, Case, Job, Measure, Plan, Study
+from ..measure.study import Candidate, Case, Measure, Plan, Study
 from ..measure.training import Contender, NetworkContender
 from ..plugins.support.image_files import PYRAMIDS
 from ..scenes.loading import footprint
@@ -179,7 +179,7 @@ class TextureContenders:
     source: Source
     name: str
     settings: SimpleNamespace
-    jobs: list[Job] = field(default_factory=list)
+    jobs: list[Contender] = field(default_factory=list)
     candidates: list[Candidate] = field(default_factory=list)
     readers: dict[str, Callable[[], TextureReader]] = field(default_factory=dict)
 

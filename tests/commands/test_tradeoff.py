@@ -5,7 +5,7 @@ from mi_diffind.measure.study import Study
 from mi_diffind.studies import studies
 
 #: Studies that ship; those of others are found by ``test_thirdparty.py``, the rules by ``test_task.py``.
-STUDIES = ["bsdf", "disney", "field", "ggx", "image", "scene-training", "sdf", "shading", "texture"]
+STUDIES = ["bsdf", "cost", "disney", "field", "ggx", "image", "scene-training", "sdf", "shading", "texture"]
 
 
 class Refusing(Study):
