@@ -31,14 +31,10 @@ Query = Callable[[], object]
 
 @dataclass(frozen=True)
 class Timed:
-    """Evaluated ``value`` of a function and ``seconds`` of its kernels.
-
-    ``compiled``: whether a kernel was compiled or read from the cache on disk.
-    """
+    """Evaluated ``value`` of a function and ``seconds`` of its kernels."""
 
     value: object
     seconds: float
-    compiled: bool
 
 
 def timed(function: Query) -> Timed:
@@ -50,7 +46,7 @@ def timed(function: Query) -> Timed:
         dr.eval(value)
         dr.sync_thread()
         history = dr.kernel_history()
-    return Timed(value, compat.kernel_seconds(history), compat.was_compiled(history))
+    return Timed(value, compat.kernel_seconds(history))
 
 
 def total(values) -> tuple[object, int]:
@@ -158,16 +154,15 @@ def count(function: Callable[[], object]) -> Operations:
 
 def count_query(function: Query) -> Operations:
     """Count the operations of a query, without the additions of :func:`.clock.total`."""
+    additions = []
+
+    def summed():
+        result, added = total(function())
+        additions.append(added)
+        return result
+
     with dr.suspend_grad():
-        added = 0
-
-        def summed():
-            nonlocal added
-            result, added = total(function())
-            return result
-
-        operations = count(summed)
-    return operations + Operations(add=-added, instructions=-added)
+        return count(summed) + Operations(add=-additions[0], instructions=-additions[0])
 
 
 #: Instruction of LLVM, or its function, → the counts that it adds one to.

@@ -90,7 +90,7 @@ class Curve:
     style: Mapping = field(default_factory=dict)
 
 
-def figure(title: str, caption: str, width: float, height: float, above: float = 0.3, dpi: int = 200):
+def figure(title: str, caption: str, width: float, height: float, above: float = 0.3):
     """Return a Matplotlib figure with ``width`` × ``height`` inches for axes, a title above and a caption below.
 
     The title takes ``above`` inches. The layout is constrained.
@@ -101,7 +101,7 @@ def figure(title: str, caption: str, width: float, height: float, above: float =
     width = max(width, 0.105 * len(title))  # few small pictures may be narrower than their title
     text = "\n".join(textwrap.wrap(caption, int(17.3 * width)))
     below = 0.16 * (text.count("\n") + 1) + 0.15
-    framed = Figure(figsize=(width, height + above + below), dpi=dpi, layout="constrained")
+    framed = Figure(figsize=(width, height + above + below), dpi=200, layout="constrained")
     FigureCanvasAgg(framed)
     whole = framed.get_figheight()
     framed.get_layout_engine().set(rect=(0, below / whole, 1, 1 - (above + below) / whole), w_pad=0.08, h_pad=0.08)
@@ -116,15 +116,14 @@ def save(figure, path: str | os.PathLike) -> None:
         figure.savefig(temporary, format=Path(path).suffix[1:])
 
 
-def log_ticks(axis, low: float, high: float, shown: Callable[[float], str] | None = None) -> None:
-    """Set ticks of a logarithmic axis from ``low`` to ``high``, written by ``shown``, finer for shorter ranges."""
+def log_ticks(axis, low: float, high: float) -> None:
+    """Set ticks of a logarithmic axis from ``low`` to ``high``, finer for shorter ranges."""
     decades = math.log10(high / low)
     fine: Sequence[float] = (1, *np.arange(1.2, 9.8, 0.4))
     for limit, ticks in ((0.6, (1, 1.5, 2, 3, 4, 5, 7)), (1.1, (1, 2, 5)), (2.5, (1, 3)), (4, (1,))):
         fine = ticks if decades > limit else fine
     axis.set_ticks([m * 10.0**e for e in range(-12, 12) for m in fine if low <= m * 10.0**e <= high])
-    shown = shown or (lambda value: f"{value:,.0f}" if value >= 1000 else f"{value:g}")
-    axis.set_major_formatter(lambda value, _: shown(value))
+    axis.set_major_formatter(lambda value, _: f"{value:,.0f}" if value >= 1000 else f"{value:g}")
     axis.minorticks_off()
 
 

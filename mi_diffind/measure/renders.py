@@ -83,23 +83,16 @@ class TextureScene:
         """Return each pixel's area in uv², ``(height, width)``, and whether its corners are on the surface."""
         width, height = film
         x, y = np.meshgrid(np.arange(width + 1) / width, np.arange(height + 1) / height)
-        si = self.hits(mi.load_dict(self.scene({"type": "rgb", "value": 0.5}, film)), x.ravel(), y.ravel())
+        scene = mi.load_dict(self.scene({"type": "rgb", "value": 0.5}, film))
+        place = mi.Point2f(*(mi.Float(np.float32(v.ravel())) for v in (x, y)))
+        ray, _ = scene.sensors()[0].sample_ray_differential(0.0, 0.5, place, mi.Point2f(0.5, 0.5))
+        si = scene.ray_intersect(ray, ray_flags(), coherent=True)
         uv, hit = np.array(si.uv, np.float64).T.reshape(height + 1, width + 1, 2), np.array(si.is_valid())
         hit = hit.reshape(height + 1, width + 1)
         inside = hit[:-1, :-1] & hit[1:, :-1] & hit[:-1, 1:] & hit[1:, 1:]
         a, b = uv[1:, 1:] - uv[:-1, :-1], uv[1:, :-1] - uv[:-1, 1:]  # the diagonals
         area = 0.5 * np.abs(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
         return np.where(inside, area, 0), inside
-
-    @staticmethod
-    def hits(scene, x: np.ndarray, y: np.ndarray):
-        """Return the surface interactions, with all fields, of a loaded scene at image positions in [0, 1]."""
-        sensor = scene.sensors()[0]
-        place = mi.Point2f(mi.Float(np.asarray(x, np.float32)), mi.Float(np.asarray(y, np.float32)))
-        ray, _ = sensor.sample_ray_differential(0.0, 0.5, place, mi.Point2f(0.5, 0.5))
-        si = scene.ray_intersect(ray, ray_flags(), coherent=True)
-        dr.eval(si)  # while the scene exists
-        return si
 
     def counted(self, film: tuple[int, int], texture: tuple[int, int]) -> np.ndarray:
         """Return the mask of the pixels whose errors count, ``(height, width)``."""

@@ -35,13 +35,12 @@ def timing(values: Iterable[float], floor: float = 0.0) -> dict:
 def ratio(a: Sequence[float], b: Sequence[float], floor: float = 0.0) -> dict:
     """Return the ratio ``a / b`` of times, round by round, without the ``floor``.
 
-    ``median``, ``q1``, ``q3`` are NaN if ``b`` is hidden behind the floor; ``hidden``: ``a`` is hidden, so that the
-    median is only an upper bound.
+    ``median``, ``q1``, ``q3`` are NaN if ``b`` is hidden behind the floor.
     """
     least = HIDDEN * floor
-    a_hidden, b_hidden = (spread(values)["median"] - floor < least for values in (a, b))
-    rounds = [] if b_hidden else [(x, y) for x, y in zip(a, b, strict=True) if y > floor]
-    return {**spread(max(x - floor, least) / (y - floor) for x, y in rounds), "hidden": a_hidden}
+    hidden = spread(b)["median"] - floor < least
+    rounds = [] if hidden else [(x, y) for x, y in zip(a, b, strict=True) if y > floor]
+    return spread(max(x - floor, least) / (y - floor) for x, y in rounds)
 
 
 def finite(value):
