@@ -14,6 +14,7 @@ the random numbers of seed ``i``: the same command gives the same films.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +26,6 @@ from mi_diffind.core.files import write_json
 from mi_diffind.core.progress import progress_bar
 from mi_diffind.images import films
 from mi_diffind.measure import renders
-from mi_diffind.measure.renders import TextureZoom
 from mi_diffind.scenes import loading, poses, rendering
 
 DOCS = Path(__file__).resolve().parent
@@ -136,16 +136,27 @@ def shading(frames: int) -> Film:
 
 
 def zoom(frames: int) -> Film:
-    """Render a zoom over the tiles."""
+    """Render a zoom into the tiles: the distance of the camera decreases by the same factor each frame, to its half."""
     albedo, table = str(ASSETS / "tiles_albedo.png"), str(ASSETS / "tiles_filtered.npz")
     learned = {"type": "neural_texture", "filename": table, "channels": "albedo", "filter": "anisotropic"}
     side = mi.Bitmap(albedo).size()[0]
-    view = TextureZoom(renders.zoom_scene(), SIZE, (side, side), frames)
+    origin, up = np.array([0.0, 2.0, 2.0]), (0.0, 1.0, 0.0)
+    scene = dataclasses.replace(
+        renders.still_scenes()["plane"], name="zoom", origin=tuple(origin), target=(0.0, 0.0, 0.0), fov=40.0,
+        texels=100.0, anchor=(0.5, 0.5),
+    )  # fmt: skip
 
     def panel(texture: dict, spp: int = 1, sampler: str = "independent") -> list[np.ndarray]:
         plugin = lambda repeats: texture | {"to_uv": renders.to_uv(repeats)}  # noqa: E731
-        reader = renders.TextureReader(plugin, spp, sampler, prepare=loading.attach)
-        return [np.round(255 * image).astype(np.uint8) for image in view.render(reader)]
+        loaded = renders.TextureReader(plugin, spp, sampler).loaded(scene, SIZE, (side, side))
+        parameters, images = mi.traverse(loaded), []
+        for k in range(frames):
+            place = (origin * 2 ** (-k / max(frames - 1, 1))).tolist()
+            parameters["sensor.to_world"] = mi.Transform4f().look_at(origin=place, target=scene.target, up=up)
+            parameters.update()
+            loading.attach(loaded)
+            images.append(renders.displayed(mi.render(loaded, spp=spp, seed=k)))
+        return [np.round(255 * image).astype(np.uint8) for image in images]
 
     bitmap = {"type": "bitmap", "filename": albedo}
     panels = {

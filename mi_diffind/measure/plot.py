@@ -16,7 +16,6 @@ import numpy as np
 
 from ..core.files import replacing
 from ..images import srgb
-from .statistics import pareto
 
 #: Colour and marker of each representation, in order of appearance; markers differ for prints without colour.
 STYLES = (
@@ -68,8 +67,12 @@ class Panel:
     def front(self) -> list[Point]:
         """Return the points of the Pareto front, from left to right; ``x`` within :data:`SAME` counts as equal."""
         competing = [p for p in self.points if p.competes]
-        marks = pareto([(math.log(max(p.x, 1e-6)), -p.accuracy) for p in competing], (math.log(SAME), 0))
-        return sorted((p for p, mark in zip(competing, marks, strict=True) if mark), key=lambda p: p.x)
+
+        def beats(a: Point, b: Point) -> bool:
+            better = SAME * a.x < b.x or a.accuracy > b.accuracy
+            return better and a.x <= SAME * b.x and a.accuracy >= b.accuracy
+
+        return sorted((p for p in competing if not any(beats(q, p) for q in competing)), key=lambda p: p.x)
 
 
 @dataclass(frozen=True)
@@ -87,7 +90,7 @@ class Curve:
     style: Mapping = field(default_factory=dict)
 
 
-def figure(title: str, caption: str, width: float, height: float, above: float = 0.3, dpi: int = 200):
+def figure(title: str, caption: str, width: float, height: float, above: float = 0.3):
     """Return a Matplotlib figure with ``width`` × ``height`` inches for axes, a title above and a caption below.
 
     The title takes ``above`` inches. The layout is constrained.
@@ -98,7 +101,7 @@ def figure(title: str, caption: str, width: float, height: float, above: float =
     width = max(width, 0.105 * len(title))  # few small pictures may be narrower than their title
     text = "\n".join(textwrap.wrap(caption, int(17.3 * width)))
     below = 0.16 * (text.count("\n") + 1) + 0.15
-    framed = Figure(figsize=(width, height + above + below), dpi=dpi, layout="constrained")
+    framed = Figure(figsize=(width, height + above + below), dpi=200, layout="constrained")
     FigureCanvasAgg(framed)
     whole = framed.get_figheight()
     framed.get_layout_engine().set(rect=(0, below / whole, 1, 1 - (above + below) / whole), w_pad=0.08, h_pad=0.08)
@@ -113,15 +116,14 @@ def save(figure, path: str | os.PathLike) -> None:
         figure.savefig(temporary, format=Path(path).suffix[1:])
 
 
-def log_ticks(axis, low: float, high: float, shown: Callable[[float], str] | None = None) -> None:
-    """Set ticks of a logarithmic axis from ``low`` to ``high``, written by ``shown``, finer for shorter ranges."""
+def log_ticks(axis, low: float, high: float) -> None:
+    """Set ticks of a logarithmic axis from ``low`` to ``high``, finer for shorter ranges."""
     decades = math.log10(high / low)
     fine: Sequence[float] = (1, *np.arange(1.2, 9.8, 0.4))
     for limit, ticks in ((0.6, (1, 1.5, 2, 3, 4, 5, 7)), (1.1, (1, 2, 5)), (2.5, (1, 3)), (4, (1,))):
         fine = ticks if decades > limit else fine
     axis.set_ticks([m * 10.0**e for e in range(-12, 12) for m in fine if low <= m * 10.0**e <= high])
-    shown = shown or (lambda value: f"{value:,.0f}" if value >= 1000 else f"{value:g}")
-    axis.set_major_formatter(lambda value, _: shown(value))
+    axis.set_major_formatter(lambda value, _: f"{value:,.0f}" if value >= 1000 else f"{value:g}")
     axis.minorticks_off()
 
 
@@ -261,33 +263,24 @@ def _overlap(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 
 def draw_curves(
-    title: str, caption: str, panels: Mapping[str, Sequence[Curve]], x_label: str, y_label: str, log: str = "",
-    ticks: Sequence[str] = (), height: float = 3.6,
+    title: str, caption: str, panels: Mapping[str, Sequence[Curve]], x_label: str, y_label: str,
+    ticks: Sequence[str] = (),
 ):  # fmt: skip
     """Return a Matplotlib figure with a panel of curves for each title, with a legend where labels change.
 
-    There are up to two panels a row. The axes in ``log`` (``"x"``, ``"xy"``) are logarithmic; ``ticks`` are
-    labels at 0, 1, 2, …
+    There are up to two panels a row. ``ticks`` are labels at 0, 1, 2, …
     """
     columns = min(2, len(panels))
     rows = -(-len(panels) // columns)
-    plot, explained = figure(title, caption, 6.0 * columns, height * rows), []
+    plot, explained = figure(title, caption, 6.0 * columns, 3.6 * rows), []
     for k, (name, curves) in enumerate(panels.items()):
         axes = plot.add_subplot(rows, columns, k + 1)
         for i, curve in enumerate(curves):
             colour, marker = STYLES[i % len(STYLES)]
-            bars = (
-                None
-                if curve.low is None
-                else np.maximum([np.subtract(curve.y, curve.low), np.subtract(curve.high, curve.y)], 0)
-            )
+            bars = None if curve.low is None else np.abs(np.subtract((curve.low, curve.high), curve.y))
             style = {"color": colour, "marker": marker, "markersize": 4, "linewidth": 1.1, "capsize": 2, **curve.style}
             axes.errorbar(curve.x, curve.y, bars, label=curve.label, **style)
         axes.set_title(name, fontsize=9)
-        for name, axis, limits in (("x", axes.xaxis, axes.get_xlim), ("y", axes.yaxis, axes.get_ylim)):
-            if name in log:
-                axes.set(**{f"{name}scale": "log"})
-                log_ticks(axis, *limits())
         if ticks:
             axes.set_xticks(range(len(ticks)), ticks)
         finish(axes, x_label, y_label)

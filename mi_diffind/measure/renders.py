@@ -1,4 +1,4 @@
-"""Renders and reads that studies measure: textured scenes without noise, a moving camera, queries of BSDFs.
+"""Renders and reads that studies measure: textured scenes without noise, queries of BSDFs.
 
 The material of a :class:`TextureScene` is ``diffuse`` under a ``directional`` light, which a path tracer samples
 deterministically: samples of a pixel differ only in the position at which the texture is read. The irradiance is such
@@ -42,6 +42,7 @@ class TextureScene:
     texels: float
     anchor: tuple[float, float] = (0.5, 0.5)
     magnified: bool = False
+    up: tuple[float, float, float] = (0.0, 1.0, 0.0)
 
     def scene(
         self, texture: dict, film: tuple[int, int], spp: int = 1, sampler: str = "independent", path: dict | None = None
@@ -56,7 +57,7 @@ class TextureScene:
                 "fov_axis": "x",
                 "fov": self.fov,
                 "near_clip": 1e-3,
-                "to_world": self.camera_at(self.origin),
+                "to_world": mi.ScalarTransform4f().look_at(origin=self.origin, target=self.target, up=self.up),
                 "sampler": {"type": sampler, "sample_count": spp},
                 "film": {
                     "type": "hdrfilm", "width": film[0], "height": film[1], "pixel_format": "rgb",
@@ -67,12 +68,6 @@ class TextureScene:
                       "irradiance": {"type": "rgb", "value": math.pi}},
             "surface": {**self.shape, "bsdf": {"type": "diffuse", "reflectance": texture}},
         }  # fmt: skip
-
-    def camera_at(self, origin) -> mi.ScalarTransform4f:
-        """Return the camera's ``to_world`` at another position, with the same direction of view."""
-        direction = np.asarray(self.target, float) - np.asarray(self.origin, float)
-        origin, up = np.asarray(origin, float), [0, 1, 0] if abs(direction[1]) < 0.999 else [0, 0, -1]
-        return mi.ScalarTransform4f().look_at(origin=origin.tolist(), target=(origin + direction).tolist(), up=up)
 
     def repeats(self, film: tuple[int, int], texture: tuple[int, int]) -> tuple[float, float]:
         """Return how often a texture of (width, height) texels repeats along u and v: the scale of ``to_uv``."""
@@ -88,23 +83,16 @@ class TextureScene:
         """Return each pixel's area in uv², ``(height, width)``, and whether its corners are on the surface."""
         width, height = film
         x, y = np.meshgrid(np.arange(width + 1) / width, np.arange(height + 1) / height)
-        si = self.hits(mi.load_dict(self.scene({"type": "rgb", "value": 0.5}, film)), x.ravel(), y.ravel())
+        scene = mi.load_dict(self.scene({"type": "rgb", "value": 0.5}, film))
+        place = mi.Point2f(*(mi.Float(np.float32(v.ravel())) for v in (x, y)))
+        ray, _ = scene.sensors()[0].sample_ray_differential(0.0, 0.5, place, mi.Point2f(0.5, 0.5))
+        si = scene.ray_intersect(ray, ray_flags(), coherent=True)
         uv, hit = np.array(si.uv, np.float64).T.reshape(height + 1, width + 1, 2), np.array(si.is_valid())
         hit = hit.reshape(height + 1, width + 1)
         inside = hit[:-1, :-1] & hit[1:, :-1] & hit[:-1, 1:] & hit[1:, 1:]
         a, b = uv[1:, 1:] - uv[:-1, :-1], uv[1:, :-1] - uv[:-1, 1:]  # the diagonals
         area = 0.5 * np.abs(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
         return np.where(inside, area, 0), inside
-
-    @staticmethod
-    def hits(scene, x: np.ndarray, y: np.ndarray):
-        """Return the surface interactions, with all fields, of a loaded scene at image positions in [0, 1]."""
-        sensor = scene.sensors()[0]
-        place = mi.Point2f(mi.Float(np.asarray(x, np.float32)), mi.Float(np.asarray(y, np.float32)))
-        ray, _ = sensor.sample_ray_differential(0.0, 0.5, place, mi.Point2f(0.5, 0.5))
-        si = scene.ray_intersect(ray, ray_flags(), coherent=True)
-        dr.eval(si)  # while the scene exists
-        return si
 
     def counted(self, film: tuple[int, int], texture: tuple[int, int]) -> np.ndarray:
         """Return the mask of the pixels whose errors count, ``(height, width)``."""
@@ -126,17 +114,10 @@ def still_scenes() -> dict[str, TextureScene]:
         TextureScene("plane", _plane(1000.0), (1.0, 1.0), (0.0, 1.0, 0.0), (0.35, 0.72, -1.0), 60.0, above, 0.5,
                      (0.5, 0.999)),
         TextureScene("magnified", _plane(1000.0), (1.0, 1.0), (0.0, 1.0, 0.0), (0.35, 0.0, -0.6), 40.0, above, 1 / 16,
-                     magnified=True),
+                     magnified=True, up=(0.0, 0.0, -1.0)),
         TextureScene("sphere", {"type": "sphere"}, (2.0, 1.0), (0.0, 0.8, 3.0), (0.0, 0.0, 0.0), 42.0, side, 8.0),
     ]  # fmt: skip
     return {scene.name: scene for scene in scenes}
-
-
-def zoom_scene() -> TextureScene:
-    """Return the first frame of the moving camera: a slanted plane, 100 texels per pixel in the middle."""
-    return TextureScene(
-        "zoom", _plane(1000.0), (1.0, 1.0), (0.0, 2.0, 2.0), (0.0, 0.0, 0.0), 40.0, (0.0, 1.0, 0.0), 100.0
-    )
 
 
 @dataclass
@@ -145,7 +126,7 @@ class TextureReader:
 
     ``texture(repeats)`` returns the plugin's dictionary for ``mi.load_dict``, given the number of repetitions. ``spp``,
     ``sampler`` and the integrator ``path`` are those of its renders. ``prepare(scene)`` is called with each loaded
-    scene, and whenever its camera has moved.
+    scene.
     """
 
     texture: Callable[[tuple[float, float]], dict]
@@ -192,37 +173,6 @@ def errors(truth: np.ndarray, image: np.ndarray, counted: np.ndarray) -> dict[st
     pair = [np.ascontiguousarray(i, np.float32) for i in (truth, filled)]
     values, _, _ = flip_evaluator.evaluate(*pair, "LDR", applyMagma=False)
     return {"mse": float(np.mean(difference**2)), "flip": float(np.asarray(values)[..., 0][counted].mean())}
-
-
-#: Ratio of the distances of :class:`TextureZoom`'s camera to the plane in the first and in the last frame.
-NEARER = 2.0
-
-
-@dataclass(frozen=True)
-class TextureZoom:
-    """A zoom into a scene: ``frames`` of a ``film`` (width, height), with a ``texture`` of (width, height) texels."""
-
-    scene: TextureScene
-    film: tuple[int, int]
-    texture: tuple[int, int]
-    frames: int
-
-    def origins(self) -> np.ndarray:
-        """Return the camera's positions, ``(frames, 3)``; its distance decreases by the same factor each frame."""
-        start, target = (np.asarray(v, float) for v in (self.scene.origin, self.scene.target))
-        distance = NEARER ** (-np.arange(self.frames) / max(self.frames - 1, 1))
-        return target + distance[:, None] * (start - target)
-
-    def render(self, reader: TextureReader) -> np.ndarray:
-        """Return the frames as displayed, ``(frames, height, width, 3)``, each with its own random numbers."""
-        loaded = reader.loaded(self.scene, self.film, self.texture)
-        parameters, images = mi.traverse(loaded), []
-        for k, origin in enumerate(self.origins()):
-            parameters["sensor.to_world"] = mi.Transform4f(self.scene.camera_at(origin))
-            parameters.update()
-            reader.prepare(loaded)
-            images.append(displayed(mi.render(loaded, spp=reader.spp, seed=k)))
-        return np.stack(images)
 
 
 #: Methods of a BSDF that are timed.

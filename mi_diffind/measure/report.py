@@ -5,17 +5,12 @@ from __future__ import annotations
 import csv
 import io
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 
 from ..core.files import replacing, writable_folder, write_json
 from . import plot
 from .statistics import finite
-from .store import Store
 from .study import PASS, Plan, Tradeoff
-
-#: Quantities beside time that accuracy may be drawn against: the label of the axis, and the title of the panel.
-QUANTITIES = {"bytes": ("bytes", "bytes"), "training_seconds": ("seconds of training", "training")}
-
 
 #: Methods of contenders that are ours.
 OURS = ("ours", "indirection")
@@ -27,8 +22,7 @@ def write_files(
     """Write ``tradeoff_NAME.csv`` (``rows``), ``.json`` (``result``) and pictures, and return the paths.
 
     ``pictures`` maps ``"png"`` (``tradeoff_NAME.png``) or another word (``tradeoff_NAME_WORD.png``) to a function that
-    draws a Matplotlib figure. Partial results of a complete run are removed from ``folder``. Raises
-    :class:`.OutputError`.
+    draws a Matplotlib figure. Raises :class:`.OutputError`.
     """
     folder = writable_folder(folder, create=True)
     start = str(folder / f"tradeoff_{name}")
@@ -43,8 +37,6 @@ def write_files(
     for word, draw in pictures.items():
         paths[word] = f"{start}.png" if word == "png" else f"{start}_{word}.png"
         plot.save(draw(), paths[word])
-    if not result["interrupted"]:
-        Store.remove(folder, name)
     return paths
 
 
@@ -94,18 +86,22 @@ def _cells(result: dict, name: str) -> dict:
 
 
 def panels(result: dict) -> list[plot.Panel]:
-    """Return the panels of a result: accuracy against the plan's quantities, then against time, one panel a case.
+    """Return the panels of a result: accuracy against bytes if the plan says so, then against time, one panel a case.
 
     Times are those of a pass, or else of the first query. Candidates have labels and quartiles, references vertical
-    lines.
+    lines. Candidates of equal bytes and accuracy, or of one job, are one point against bytes.
     """
-    candidates, cases = result["candidates"], {}
+    candidates, key, by_bytes, drawn = result["candidates"], result["measures"][0]["key"], {}, []
+    for c in candidates.values() if result["panels"] else ():
+        accuracy = c["errors"].get(key)
+        if accuracy is not None and not (c["is_truth"] or c["is_reference"]) and c["in_picture"] and c["bytes"]:
+            by_bytes.setdefault((c["bytes"], c["job"] or accuracy), _point(c, key, *[c["bytes"]] * 3))
+    drawn.append(plot.Panel("bytes", "bytes", list(by_bytes.values()), []))
     for case, measured in result["cases"].items():
-        if measured["in_picture"]:
-            cases[case] = next(iter((measured["passes"] or measured["queries"]).items()))
-    drawn = [_against(quantity, candidates.values(), result) for quantity in result["panels"]]
-    for case, (query, timings) in cases.items():
-        of_passes, accuracy = query == PASS, result["cases"][case]["accuracy"]
+        if not measured["in_picture"]:
+            continue
+        query, timings = next(iter((measured["passes"] or measured["queries"]).items()))
+        of_passes, accuracy = query == PASS, measured["accuracy"]
         points, lines = [], []
         for name, t in timings.items():
             c = candidates[name]
@@ -122,17 +118,6 @@ def panels(result: dict) -> list[plot.Panel]:
 
 def _point(c: dict, accuracy: str, x: float, low: float, high: float) -> plot.Point:
     return plot.Point(c["label"], x, low, high, c["errors"][accuracy], c["representation"], c["competes"])
-
-
-def _against(quantity: str, candidates: Iterable[dict], result: dict) -> plot.Panel:
-    """Return a panel of accuracy against ``quantity``; candidates equal in both, or of one job, are one point."""
-    (x_label, title), distinct = QUANTITIES[quantity], {}
-    key = result["measures"][0]["key"]
-    for c in candidates:
-        accuracy = c["errors"].get(key)
-        if accuracy is not None and not (c["is_truth"] or c["is_reference"]) and c["in_picture"] and c[quantity]:
-            distinct.setdefault((c[quantity], c["job"] or accuracy), _point(c, key, *[c[quantity]] * 3))
-    return plot.Panel(title, x_label, list(distinct.values()), [])
 
 
 def summary(result: dict) -> list[str]:
@@ -162,14 +147,8 @@ def _error_table(result: dict) -> list[str]:
         if any(e is not None for e in errors):
             texts = ["-" if e is None else f"{e:{m['form']}}" for e, m in zip(errors, measures, strict=True)]
             seconds = "-" if c["training_seconds"] is None else f"{c['training_seconds']:.1f}"
-            cells.append([name, f"{c['bytes']:,}", seconds, *texts, convergence(result, c)])
+            cells.append([name, f"{c['bytes']:,}", seconds, *texts, "not converged" * (c["converged"] is False)])
     return grid([["", "bytes", "seconds", *(m["label"] for m in measures), ""], *cells], "") if cells else []
-
-
-def convergence(result: dict, candidate: dict) -> str:
-    """Return "" for a candidate that has converged or needs no training, else why it has not."""
-    gain = result["jobs"].get(candidate["job"], {}).get("gain_db")
-    return "" if candidate["converged"] is not False else "twice the steps lose" if (gain or 0) < 0 else "not converged"
 
 
 def verdicts(result: dict) -> list[str]:
@@ -209,5 +188,5 @@ def grid(rows: Sequence[Sequence[str]], indent: str = "  ") -> list[str]:
 def figure_caption(result: dict) -> str:
     """Return the sentences below a figure: the notes of a result, and whether the run is quick or interrupted."""
     quick = "A smoke run (--quick): times are not to be quoted." * result["settings"]["quick"]
-    interrupted = "Interrupted: the same command continues the run." * result["interrupted"]
+    interrupted = "Interrupted: the same command trains the rest and measures again." * result["interrupted"]
     return " ".join(filter(None, (*result["notes"], quick, interrupted)))

@@ -1,4 +1,4 @@
-"""Statistics of measurements: medians and quartiles, times and ratios without the floor, the Pareto front."""
+"""Statistics of measurements: medians and quartiles, times and ratios without the floor."""
 
 from __future__ import annotations
 
@@ -35,30 +35,12 @@ def timing(values: Iterable[float], floor: float = 0.0) -> dict:
 def ratio(a: Sequence[float], b: Sequence[float], floor: float = 0.0) -> dict:
     """Return the ratio ``a / b`` of times, round by round, without the ``floor``.
 
-    ``median``, ``q1``, ``q3`` are NaN if ``b`` is hidden behind the floor; ``hidden``: ``a`` is hidden, so that the
-    median is only an upper bound.
+    ``median``, ``q1``, ``q3`` are NaN if ``b`` is hidden behind the floor.
     """
     least = HIDDEN * floor
-    a_hidden, b_hidden = (spread(values)["median"] - floor < least for values in (a, b))
-    rounds = [] if b_hidden else [(x, y) for x, y in zip(a, b, strict=True) if y > floor]
-    return {**spread(max(x - floor, least) / (y - floor) for x, y in rounds), "hidden": a_hidden}
-
-
-def pareto(points: Sequence[Sequence[float]], slack: Sequence[float] | float = 0.0) -> list[bool]:
-    """Return for each of ``points`` whether it is on the Pareto front; smaller coordinates are better.
-
-    A point is on the front if no other point is better in one coordinate and at least equal in all. Coordinates that
-    differ by at most ``slack`` (for each coordinate, or for all) are equal; a point with a NaN is not on the front.
-    """
-    p = np.asarray(points, dtype=np.float64)
-    if p.size == 0:
-        return [False] * len(p)
-    slack = np.asarray(slack)
-    front = []
-    for point in p:
-        beaten = (p <= point + slack).all(axis=1) & (p < point - slack).any(axis=1)
-        front.append(not np.isnan(point).any() and not beaten.any())
-    return front
+    hidden = spread(b)["median"] - floor < least
+    rounds = [] if hidden else [(x, y) for x, y in zip(a, b, strict=True) if y > floor]
+    return spread(max(x - floor, least) / (y - floor) for x, y in rounds)
 
 
 def finite(value):

@@ -1,4 +1,4 @@
-"""Declaration of studies: a study, its plan, and the candidates, jobs and cases of the plan.
+"""Declaration of studies: a study, its plan, and the candidates and cases of the plan.
 
 A module of :mod:`mi_diffind.studies`, or one that an entry point of the group ``mi_diffind.studies`` names, has a
 :class:`Study` as its ``STUDY``. The command ``tradeoff`` imports the one
@@ -99,23 +99,6 @@ class Candidate:
     details: dict = field(default_factory=dict)
 
 
-class Job:
-    """Work that is done before the measurement, such as a training; shared by the candidates that name it.
-
-    Its record is a tree for JSON: ``seconds``, and optionally ``bytes``, ``errors``, ``converged`` and ``details``.
-    """
-
-    name: str
-
-    def cached_record(self, folder: Path | None, record: dict | None) -> dict | None:
-        """Return the record if the work is done: ``record`` is that of the store, ``folder`` holds models."""
-        return record
-
-    def run(self, folder: Path | None, progress: bool) -> dict | None:
-        """Do the work, write models to ``folder``, and return the record, or ``None`` after Ctrl-C."""
-        raise NotImplementedError
-
-
 @dataclass
 class Case:
     """Situation in which candidates are timed.
@@ -153,10 +136,10 @@ class Plan:
     """Plan of a measurement: candidates, cases, jobs, and the reports of a study.
 
     The first of the ``measures`` is the accuracy of pictures; more of it is better, as of a PSNR. ``ratios`` are pairs
-    of candidates whose times are divided. Partial results are continued only if ``details`` and the files of this
-    package are unchanged, models of ``jobs`` if ``jobs_fingerprint`` is. ``panels``: quantities that the accuracy is
-    drawn against beside time, ``"bytes"`` and ``"training_seconds"``. ``pictures`` maps further names to functions of
-    the result that draw a Matplotlib figure; ``notes`` are sentences below pictures.
+    of candidates whose times are divided. ``jobs`` (:class:`.training.Contender`) train candidates before the
+    measurement; a study that is run again reads their models if ``details`` and ``jobs_fingerprint`` are unchanged.
+    ``panels``: ``("bytes",)`` if the accuracy is drawn against bytes, too. ``pictures`` maps further names to functions
+    of the result that draw a Matplotlib figure; ``notes`` are sentences below pictures.
     """
 
     study: str
@@ -167,7 +150,7 @@ class Plan:
     ratios: list[tuple[str, str]] = field(default_factory=list)
     details: dict = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
-    jobs: list[Job] = field(default_factory=list)
+    jobs: list = field(default_factory=list)
     jobs_fingerprint: str = ""
     panels: tuple[str, ...] = ()
     pictures: dict[str, Callable[[dict], object]] = field(default_factory=dict)

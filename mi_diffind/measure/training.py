@@ -22,7 +22,7 @@ import numpy as np
 from ..core.files import replacing, write_json
 from ..fitting.loop import FitSettings, Problem, fit
 from .store import file_name
-from .study import Candidate, Job
+from .study import Candidate
 
 #: Change by a run of twice as many steps, in dB, below which a training has converged.
 GAIN = 0.5
@@ -41,14 +41,14 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 @dataclass
-class Contender(Job):
+class Contender:
     """A ``method`` at one memory ``budget``: the job that trains or encodes it, and the candidate that is measured.
 
-    The record lies beside the model in the folder of models, so that a study that is run again trains nothing twice.
-
     ``fit(contender, progress)`` trains or encodes: it sets :attr:`model`, writes ``file`` unless it is ``None``, and
-    returns the record (:class:`.Job`), or ``None`` after Ctrl-C. ``read(contender)`` returns the model of ``file``; if
-    nothing is in a file, ``has_file`` is false and ``read`` builds the model anew.
+    returns the record, or ``None`` after Ctrl-C. The record is a tree for JSON: ``seconds``, and optionally ``bytes``,
+    ``errors``, ``converged`` and ``details``. It lies beside ``file``, so that a study that is run again trains nothing
+    twice. ``read(contender)`` returns the model of ``file``; if nothing is in a file, ``has_file`` is false and
+    ``read`` builds the model anew.
 
     ``label`` is the name of the method in tables, ``family`` the group that it belongs to in pictures, ``setting`` the
     budget as text.
@@ -64,9 +64,13 @@ class Contender(Job):
     setting: str = ""
     has_file: bool = True
     details: dict = field(default_factory=dict)
-    file: Path | None = None
     folder: Path | None = None
     record: dict | None = None
+
+    @property
+    def file(self) -> Path | None:
+        """File of the model, ``None`` without a folder for models."""
+        return self.folder / f"{file_name(self.name)}.npz" if self.folder and self.has_file else None
 
     def candidate(self, **fields) -> Candidate:
         """Return the candidate to measure; ``fields`` are further ones of :class:`Candidate`."""
@@ -74,17 +78,11 @@ class Contender(Job):
         given = {"label": label, "details": {"kind": self.method, "asked": self.budget, **self.details}, **fields}
         return Candidate(self.name, self.family or label, self.setting, job=self.name, **given)
 
-    def _locate(self, folder: Path | None) -> None:
+    def cached_record(self, folder: Path | None) -> dict | None:
+        """Return the record that :meth:`run` wrote to ``folder``, if its model is there."""
         self.folder = folder
-        self.file = folder / f"{file_name(self.name)}.npz" if folder and self.has_file else None
-
-    def cached_record(self, folder: Path | None, record: dict | None = None) -> dict | None:
-        self._locate(folder)
-        self.__dict__.pop("model", None)
-        if record is None and folder and self._record_file.is_file():
-            record = json.loads(self._record_file.read_text(encoding="utf-8"))
-        is_there = not self.has_file or (self.file is not None and self.file.is_file())
-        self.record = record if is_there else None
+        if folder and self._record_file.is_file() and (self.file is None or self.file.is_file()):
+            self.record = json.loads(self._record_file.read_text(encoding="utf-8"))
         return self.record
 
     @property
@@ -92,8 +90,8 @@ class Contender(Job):
         return self.folder / f"{file_name(self.name)}.json"
 
     def run(self, folder: Path | None = None, progress: bool = True) -> dict | None:
-        self._locate(folder)
-        start = time.perf_counter()
+        """Train or encode, write the model to ``folder``, and return the record, or ``None`` after Ctrl-C."""
+        self.folder, start = folder, time.perf_counter()
         self.record = self.fit(self, progress)
         if self.record is not None:
             self.record.setdefault("seconds", time.perf_counter() - start)
@@ -130,11 +128,10 @@ class ConvergenceTraining(Contender):
         self.problem, self.settings, self.longest = problem, settings, longest
         self.measurements, self.half, self.finish = measurements, half, finish
 
-    def cached_record(self, folder: Path | None, record: dict | None = None) -> dict | None:
+    def cached_record(self, folder: Path | None) -> dict | None:
         """Return the record that :meth:`run` wrote to ``folder``, if its settings are the same."""
-        self.__dict__.pop("net", None)
-        self.record = super().cached_record(folder, record)
-        if self.record and self.record["settings"] != json.loads(json.dumps(self._settings())):
+        record = super().cached_record(folder)
+        if record and record["settings"] != json.loads(json.dumps(self._settings())):
             self.record = None
         return self.record
 

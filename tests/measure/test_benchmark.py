@@ -14,34 +14,16 @@ from small_study import CALLS, KERNELS, SETTINGS, Log, small_plan
 from mi_diffind.measure import plot, report
 from mi_diffind.measure.benchmark import measure
 from mi_diffind.measure.clock import Operations
-from mi_diffind.measure.statistics import finite, pareto
-from mi_diffind.measure.study import Job
+from mi_diffind.measure.statistics import finite
 
 FILES = ["tradeoff_small.csv", "tradeoff_small.json", "tradeoff_small.png"]
 
 
-# -- the Pareto front -------------------------------------------------------------------------------------------------
-
-
-def brute_force(points):
-    def beats(a, b):
-        return all(x <= y for x, y in zip(a, b, strict=True)) and any(x < y for x, y in zip(a, b, strict=True))
-
-    return [not any(beats(q, p) for q in points) for p in points]
-
-
-@pytest.mark.parametrize("dims", [1, 2, 3])
-def test_front_against_brute_force(rng, dims):
-    for size in (0, 1, 2, 30):
-        points = rng.integers(0, 6, (size, dims)).astype(float).tolist()  # ties included
-        assert pareto(points) == brute_force(points)
-
-
 def test_front_of_a_panel():
-    """Times within 5% count as equal; what does not compete is on no front and beats nothing."""
-    points = [plot.Point(n, x, x, x, db, "", n != "d") for n, x, db in
-              (("a", 3.0, 50), ("b", 1.0, 30), ("c", 0.98, 20), ("d", 0.1, 99), ("e", 2.0, 29))]  # fmt: skip
-    assert [p.name for p in plot.Panel("", "", points, []).front()] == ["b", "a"]
+    """Times within 5% count as equal; what does not compete is on no front and beats nothing; equal points stay."""
+    values = {"a": (3.0, 50), "b": (1.0, 30), "c": (0.98, 20), "d": (0.1, 99), "e": (2.0, 29), "f": (3.0, 50)}
+    points = [plot.Point(name, x, x, x, db, "", name != "d") for name, (x, db) in values.items()]
+    assert [p.name for p in plot.Panel("", "", points, []).front()] == ["b", "a", "f"]
 
 
 # -- a small study ----------------------------------------------------------------------------------------------------
@@ -50,7 +32,7 @@ def test_front_of_a_panel():
 def test_everything_is_measured_in_turn(tmp_path):
     log = Log()
     result = measure(small_plan(log), SETTINGS, tmp_path, progress=False)
-    assert len(log) == CALLS and not result["interrupted"] and not result["resumed"]
+    assert len(log) == CALLS and not result["interrupted"]
     rounds = [entry[2:] for entry in log if entry[:2] == ("query", "first")][KERNELS:]
     for k in range(SETTINGS.rounds):  # each round has each once, every other one backwards
         this = rounds[k * KERNELS : (k + 1) * KERNELS]
@@ -70,7 +52,6 @@ def test_everything_is_measured_in_turn(tmp_path):
     assert passes == ["slow", "exact", "slow", "exact", "exact", "slow", "slow", "exact"]  # the first compiles
     # A different random number in each pass, the same for all candidates
     assert [e[3] for e in log if e[0] == "pass" and e[2] == "slow"] == [0, 1, 2, 3]
-    assert os.listdir(tmp_path) == ["tradeoff_small.partial.json"]  # until it is written
 
 
 def test_operations(tmp_path):
@@ -116,41 +97,19 @@ STOPS = {
 
 
 @pytest.mark.parametrize("where", STOPS)
-def test_interruption_keeps_what_is_done_and_the_same_command_goes_on(tmp_path, monkeypatch, where):
+def test_interruption_keeps_what_is_done(tmp_path, monkeypatch, where):
     monkeypatch.setattr(plot, "draw_panels", lambda *arguments: None)
     monkeypatch.setattr(plot, "save", lambda sheet, path: Path(path).touch())
     log = Log()
     log.stop_at = STOPS[where]
     result = measure(small_plan(log), SETTINGS, tmp_path, progress=False)
     assert result["interrupted"] and len(log) == STOPS[where]  # it stops at once
-    assert os.listdir(tmp_path) == ["tradeoff_small.partial.json"]
     if where in ("passes", "last"):
         assert result["cases"]["first"]["queries"]["eval"]["slow"]["rounds"] == SETTINGS.rounds
-    if where == "rounds":  # one round and a part of the next: the part does not count
+    if where == "rounds":  # two rounds and a part of the next: the part does not count
         assert result["cases"]["first"]["queries"]["pdf"]["good"]["rounds"] == 2
     assert len(report.summary(result)) > 1
     report.write(result, tmp_path)  # with whatever there is
-
-    again = Log()
-    finished = measure(small_plan(again), SETTINGS, tmp_path, progress=False)
-    assert finished["resumed"] and not finished["interrupted"]
-    done = {e for e in log if e[0] == "errors"}
-    assert not done & set(again)  # an error is not measured twice
-    assert len(log) + len(again) <= CALLS + 2 * KERNELS + 2  # what was begun, and kernels of the case compiled again
-    for case in finished["cases"].values():
-        assert all(t["rounds"] == SETTINGS.rounds for q in case["queries"].values() for t in q.values())
-        assert all(t["rounds"] == SETTINGS.passes for q in case["passes"].values() for t in q.values())
-    report.write(finished, tmp_path)
-    assert not list(tmp_path.glob("*.partial.json"))
-
-
-def test_an_error_keeps_what_is_done(tmp_path):
-    study = small_plan(Log())
-    study.cases[1].queries = lambda lanes: 1 / 0
-    with pytest.raises(ZeroDivisionError):
-        measure(study, SETTINGS, tmp_path, progress=False)
-    result = measure(small_plan(Log()), SETTINGS, tmp_path, progress=False)
-    assert result["resumed"]
 
 
 # -- the picture ------------------------------------------------------------------------------------------------------
@@ -197,27 +156,29 @@ def test_some_cases_have_fewer_candidates_and_other_queries(tmp_path):
     assert "good" in text and "slow  " not in text
 
 
-class FakeTraining(Job):
-    """A training that is interrupted once, whose last doubling gained ``gain_db``."""
+class FakeTraining:
+    """A training that is interrupted once and has not converged."""
 
     name = "model"
 
-    def __init__(self, log, gain_db):
-        self.log, self.gain_db, self.interrupted = log, gain_db, 1
+    def __init__(self, log):
+        self.log, self.interrupted = log, 1
+
+    def cached_record(self, folder):
+        return None
 
     def run(self, folder, progress):
         self.log("train", self.name)
         if self.interrupted:
             self.interrupted -= 1
             return None
-        return {"psnr_db": 20.0, "seconds": 3.0, "converged": False, "gain_db": self.gain_db}
+        return {"psnr_db": 20.0, "seconds": 3.0, "converged": False}
 
 
-@pytest.mark.parametrize("gain_db, state", [(1.5, "not converged"), (-6.2, "twice the steps lose")])
-def test_jobs_come_first_and_can_be_interrupted(tmp_path, gain_db, state):
+def test_jobs_come_first_and_can_be_interrupted(tmp_path):
     log = Log()
     study = small_plan(log)
-    study.jobs, study.panels = [FakeTraining(log, gain_db)], ("bytes",)
+    study.jobs, study.panels = [FakeTraining(log)], ("bytes",)
     study.candidates[0] = replace(study.candidates[0], job="model", label="s")
     result = measure(study, SETTINGS, tmp_path, progress=False)
     assert result["interrupted"] and log == [("train", "model")] and not result["cases"]
@@ -227,4 +188,4 @@ def test_jobs_come_first_and_can_be_interrupted(tmp_path, gain_db, state):
     slow = result["candidates"]["slow"]
     assert (slow["training_seconds"], slow["converged"], slow["label"]) == (3.0, False, "s")
     assert result["candidates"]["good"]["converged"] is None
-    assert state in "\n".join(report.summary(result))
+    assert "not converged" in "\n".join(report.summary(result))

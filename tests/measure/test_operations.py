@@ -109,8 +109,3 @@ def test_reads_of_tables(mi_rgb, preset):
         small = bsdf_operations(load(mi_rgb, type="neural_disney", preset=preset, storage="uint8"), methods=("eval",))
         assert list(small) == ["eval"]
         assert small["eval"].bytes_gathered < found["eval"].bytes_gathered
-
-
-def test_bad_method(mi_rgb):
-    with pytest.raises(ValueError, match='found the method "shade", allowed are eval, pdf, sample'):
-        bsdf_operations(load(mi_rgb), methods=("shade",))

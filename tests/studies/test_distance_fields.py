@@ -166,8 +166,8 @@ def test_grids_are_computed_anew(mi_rgb, tmp_path):
     jobs = [job for job in sdf.plan(Ball.mesh, str(tmp_path / "ball.ply"), settings).jobs if not job.has_file]
     assert [job.name for job in jobs] == [f"{m} grid {n} KiB" for n in (24, 32) for m in ("dense", "sparse")]
     job = jobs[0]
-    assert job.cached_record(tmp_path, None) is None
+    assert job.cached_record(tmp_path) is None
     record = job.run(tmp_path, False)
     assert 0.8 * 24576 < record["bytes"] <= 24576 and record["errors"]["iou"] > 0.9
-    assert job.cached_record(None, record) is record
+    assert job.cached_record(tmp_path) == record
     assert (job.model.spacing, job.model.nbytes) == (record["details"]["spacing"], record["bytes"])

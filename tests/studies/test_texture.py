@@ -83,18 +83,6 @@ def test_errors_are_those_of_counted_pixels():
     assert found["mse"] == pytest.approx(0.25**2 / (24 * 3), rel=1e-4) and found["flip"] > 0
 
 
-def test_zoom(mi_rgb):
-    """The first frame is the still; the camera ends at half of the distance, in equal steps of its logarithm."""
-    texture = {"type": "checkerboard"}
-    reader = renders.TextureReader(lambda repeats: {**texture, "to_uv": renders.to_uv(repeats)})
-    zoom = renders.TextureZoom(renders.zoom_scene(), FILM, (8, 8), 3)
-    still, frames = reader.render(zoom.scene, FILM, (8, 8), 0), zoom.render(reader)
-    np.testing.assert_array_equal(frames[0], still)
-    assert (frames[2] != still).any()
-    distances = np.linalg.norm(zoom.origins() - zoom.scene.target, axis=1)
-    np.testing.assert_allclose(distances / distances[0], [1, 0.5**0.5, 0.5])
-
-
 def test_levels(mi_rgb):
     """Errors of each level by hand; decoded levels come back in a pyramid of the same layout."""
     source = from_arrays({"albedo": smooth(8, 16, 3), "ao": smooth(8, 16, 1, 1)})
