@@ -26,7 +26,7 @@ from ..core.files import writable_folder
 from ..core.progress import interruptible
 from .clock import count_query, machine, timed, total
 from .statistics import finite, ratio, spread, timing
-from .store import models_folder
+from .store import fingerprint, models_folder, sources
 from .study import FLOOR, PASS, Case, Plan
 
 
@@ -119,7 +119,8 @@ class Benchmark:
         plan = self.plan
         if folder is not None:
             folder = writable_folder(folder, create=True)
-            key = f"{plan.jobs_fingerprint} {json.dumps(finite(plan.details))} {self.settings.quick}"
+            details = json.dumps(finite(plan.details))
+            key = f"{fingerprint(sources())} {plan.jobs_fingerprint} {details} {self.settings.quick}"
             folder = models_folder(folder, plan.study, key) if plan.jobs else None
         for i, job in enumerate(plan.jobs):
             record = job.cached_record(folder)

@@ -34,14 +34,9 @@ def fingerprint(paths: Iterable[str | os.PathLike]) -> str:
     return digest.hexdigest()[:16]
 
 
-def package_files(*patterns: str) -> set[Path]:
-    """Return the files of this package that match ``patterns``, as ``"tasks/ggx/*.py"``, relative to its folder."""
-    package = Path(__file__).resolve().parents[1]
-    return {path for pattern in patterns for path in package.glob(pattern)}
-
-
 def sources() -> set[Path]:
     """Return the files that a measurement may depend on: modules, plugins (elsewhere in a checkout), tables."""
     plugins = importlib.util.find_spec("mi_diffind.plugins").submodule_search_locations
     modules = {path for folder in plugins for path in Path(folder).rglob("*.py")}
-    return modules | package_files("**/*.py", "data/*.npz")
+    package = Path(__file__).resolve().parents[1]
+    return modules | set(package.rglob("*.py")) | set(package.glob("data/*.npz"))

@@ -137,7 +137,8 @@ class Plan:
 
     The first of the ``measures`` is the accuracy of pictures; more of it is better, as of a PSNR. ``ratios`` are pairs
     of candidates whose times are divided. ``jobs`` (:class:`.training.Contender`) train candidates before the
-    measurement; a study that is run again reads their models if ``details`` and ``jobs_fingerprint`` are unchanged.
+    measurement; a study that is run again reads their models if this package, ``details`` and ``jobs_fingerprint`` are
+    unchanged.
     ``panels``: ``("bytes",)`` if the accuracy is drawn against bytes, too. ``pictures`` maps further names to functions
     of the result that draw a Matplotlib figure; ``notes`` are sentences below pictures.
     """

@@ -14,7 +14,6 @@ import mitsuba as mi
 
 from ..fitting.task import fit, load_model
 from ..measure.renders import bsdf_queries, directions
-from ..measure.store import fingerprint, package_files
 from ..measure.study import Candidate, Case, Measure, Plan, Study
 from ..measure.training import Contender
 from ..tasks.bsdf import mixture
@@ -144,8 +143,6 @@ def plan(materials: tuple[str, ...] = (), quick: bool = False) -> Plan:
         candidates += [*references, *(job.candidate() for job in learned)]
         ratios += [(job.name, reference.name) for job in learned for reference in references]
         jobs += learned
-    code = package_files("arrays/lookup.py", "arrays/indirection.py", "fitting/loop.py", "tasks/bsdf/*.py",
-                         "studies/bsdf.py")  # fmt: skip
     return Plan(
         study="bsdf",
         title="Learned BSDFs: accuracy against time of eval",
@@ -162,7 +159,6 @@ def plan(materials: tuple[str, ...] = (), quick: bool = False) -> Plan:
         notes=["Files of about equal bytes. ours: an analytic proxy times an indirection; table: the proxy times one "
                "array; paper, plain: an indirection and one array without a proxy. source: the material itself."],
         jobs=jobs,
-        jobs_fingerprint=fingerprint(code),
     )  # fmt: skip
 
 

@@ -18,8 +18,9 @@ import math
 import multiprocessing
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -150,9 +151,6 @@ ROWS = {
     ),
 }  # fmt: skip
 
-#: Passes → side of the film.
-SIDES = {"render": 320, "step": 160}
-
 #: Passes of a reference, as a multiple of those of a contender.
 REFERENCE = 8
 
@@ -165,15 +163,12 @@ REFERENCE_SEED = 1 << 16
 
 @dataclass(frozen=True)
 class CostSettings:
-    """Settings: ``spp`` samples a pixel, ``rounds`` passes of each contender, and the ``scale`` of films."""
+    """Settings: ``spp`` samples a pixel, ``rounds`` passes of each contender, sides of the films in pixels."""
 
     spp: int = 16
     rounds: int = 9
-    scale: float = 1.0
-
-    def side(self, passes: str) -> int:
-        """Return the side of the film of ``"render"`` or ``"step"`` in pixels."""
-        return max(8, round(SIDES[passes] * self.scale))
+    render: int = 320
+    step: int = 160
 
 
 class CostStudy(Study):
@@ -202,7 +197,7 @@ class CostStudy(Study):
 
     def run(self, arguments) -> Tradeoff:
         quick = arguments.quick
-        settings = CostSettings(4, 2, 0.2) if quick else CostSettings(rounds=arguments.rounds or CostSettings.rounds)
+        settings = CostSettings(4, 2, 64, 32) if quick else CostSettings(rounds=arguments.rounds or CostSettings.rounds)
         rows = {name: ROWS[name] for name in arguments.rows or (["disney"] if quick else ROWS)}
         if arguments.measured and "bsdf" in rows:
             measured = {"type": "measured", "filename": str(Path(arguments.measured).resolve())}
@@ -257,7 +252,7 @@ def grid_of_mesh(path: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def load_scene(row: Row, name: str, step: bool, settings: CostSettings):
     """Return the scene of a contender: a floor and a ball or a solid, under an environment light."""
-    part, side = plugin(row.contenders[name], "float32" if step else ""), settings.side("step" if step else "render")
+    part, side = plugin(row.contenders[name], "float32" if step else ""), settings.step if step else settings.render
     parts = {
         "ball": {"ball": {"type": "sphere", "center": [0, 0.8, 0], "radius": 0.8, "bsdf": part}},
         "shape": {"shape": part},
@@ -284,27 +279,23 @@ def load_scene(row: Row, name: str, step: bool, settings: CostSettings):
 # -- Processes ---------------------------------------------------------------------------------------------------------
 
 
-class ContenderProcess:
+class ContenderProcess(ProcessPoolExecutor):
     """Process of the scene of a contender, which renders or steps on demand, on one core.
 
     ``nbytes``: the bytes of the contender's arrays in its scene.
     """
 
     def __init__(self, row: Row, name: str, step: bool, settings: CostSettings):
+        super().__init__(1, multiprocessing.get_context("spawn"))
         self.spp = row.samples.get(name, settings.spp)
-        self.pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"))
-        self.nbytes = self.pool.submit(_load, row, name, step, settings, mi.variant()).result()
+        self.nbytes = self.submit(_load, row, name, step, settings, mi.variant()).result()
 
     def run(self, seed: int, spp: int = 0) -> tuple[float, int, np.ndarray | None]:
         """Return the processor's seconds, the samples a pixel that were allowed, and the image of a render.
 
         ``spp``: samples a pixel (0: those of the row). The seconds of a step are NaN if there is nothing to derive.
         """
-        return self.pool.submit(_run, spp or self.spp, seed).result()
-
-    def close(self) -> None:
-        """End the process."""
-        self.pool.shutdown(cancel_futures=True)
+        return self.submit(_run, spp or self.spp, seed).result()
 
 
 #: Of the process of a contender: its scene, and the function of a step, if it steps.
@@ -399,18 +390,15 @@ def measure(rows: dict[str, Row], settings: CostSettings, progress: bool = True)
             interrupted = True
     return {
         "task": "cost", "title": "What accuracy costs", "machine": machine(mi.variant()), "spp": settings.spp,
-        "rounds": settings.rounds, "sides": {name: settings.side(name) for name in SIDES}, "rows": measured,
+        "rounds": settings.rounds, "sides": {"render": settings.render, "step": settings.step}, "rows": measured,
         "interrupted": interrupted,
     }  # fmt: skip
 
 
 def _measure_row(row: Row, settings: CostSettings, passed: Callable) -> dict:
     steps = _measure_steps(row, settings, passed)
-    processes = {name: ContenderProcess(row, name, False, settings) for name in row.contenders}
-    try:
-        for seed in range(WARM):
-            for process in processes.values():
-                process.run(seed)
+    with ExitStack() as stack:
+        processes = _processes(stack, row, row.contenders, False, settings)
         equal = {name: _equal_samples(process, processes[row.first]) for name, process in processes.items()}
         halves = {
             name: _reference(processes[name], settings, passed)
@@ -422,10 +410,6 @@ def _measure_row(row: Row, settings: CostSettings, passed: Callable) -> dict:
                 passes[name].append(process.run(2 * i))
                 timely[name].append(process.run(2 * i + 1, equal[name]))
                 passed(2)
-        counted = {name: process.nbytes for name, process in processes.items()}
-    finally:
-        for process in processes.values():
-            process.close()
     contenders = {}
     for name, description in row.contenders.items():
         reference = halves[row.reference(name)]
@@ -439,11 +423,20 @@ def _measure_row(row: Row, settings: CostSettings, passed: Callable) -> dict:
             "step": steps.get(name),
             "equal_time": {"spp": equal_spps[0], "seconds": spread(equal_seconds),
                            "error": equal_time.errors(equal_images, reference)["error"]},
-            **file_sizes(description, counted[name]),
+            **file_sizes(description, processes[name].nbytes),
         }  # fmt: skip
     for c in contenders.values():
         c["equal_time"]["ratio"] = c["equal_time"]["error"] / contenders[row.first]["equal_time"]["error"]
     return {"title": row.title, "contenders": contenders}
+
+
+def _processes(stack: ExitStack, row: Row, names: Iterable[str], step: bool, settings: CostSettings) -> dict:
+    """Return the processes of contenders, with their kernels compiled; they end with the ``stack``."""
+    processes = {name: stack.enter_context(ContenderProcess(row, name, step, settings)) for name in names}
+    for process in processes.values():
+        for seed in range(WARM):
+            process.run(seed)
+    return processes
 
 
 def _turns(processes: dict, i: int) -> Iterator[tuple[str, ContenderProcess]]:
@@ -465,18 +458,14 @@ def _measure_steps(row: Row, settings: CostSettings, passed: Callable) -> dict[s
     A grid that is decoded from tables has none: Mitsuba would build its tree anew, for minutes.
     """
     names = [name for name, description in row.contenders.items() if description.get("trace") != "grid"]
-    processes = {name: ContenderProcess(row, name, True, settings) for name in names}
-    seconds = {name: [] for name in processes}
-    try:
-        for i in range(WARM + settings.rounds):
+    seconds = {name: [] for name in names}
+    with ExitStack() as stack:
+        processes = _processes(stack, row, names, True, settings)
+        for i in range(settings.rounds):
             for name, process in _turns(processes, i):
-                seconds[name].append(process.run(i)[0])
-            passed(len(row.contenders) if i >= WARM else 0)
-    finally:
-        for process in processes.values():
-            process.close()
-    first = next(iter(seconds.values()))[WARM:]
-    return {name: _times(taken[WARM:], first) for name, taken in seconds.items()}
+                seconds[name].append(process.run(WARM + i)[0])
+            passed(len(row.contenders))
+    return {name: _times(taken, seconds[row.first]) for name, taken in seconds.items()}
 
 
 def _equal_samples(process: ContenderProcess, first: ContenderProcess) -> int:

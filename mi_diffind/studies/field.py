@@ -27,7 +27,6 @@ from ..core.runtime import array_module
 from ..core.units import parse_compression
 from ..fitting.loop import FitSettings, fit
 from ..measure import plot
-from ..measure.store import fingerprint, package_files
 from ..measure.study import FLOOR, Candidate, Case, Measure, Plan, Study
 from ..measure.training import Contender, load_arrays
 from ..tasks.radiance import dense_bytes
@@ -207,8 +206,6 @@ def plan(session: FieldSession, source: str, settings: SimpleNamespace) -> Plan:
     candidates = [
         Candidate(GRID, "reference", job=GRID, is_reference=True, label="initial grid", details={"kind": GRID})
     ]
-    code = package_files("tasks/radiance/*.py", "fitting/loop.py", "studies/field.py",
-                         "studies/baselines/radiance_fields.py")  # fmt: skip
     return Plan(
         study="field",
         title=f"Radiance fields of the capture {Path(source).name}: held-out views against bytes and time",
@@ -223,7 +220,6 @@ def plan(session: FieldSession, source: str, settings: SimpleNamespace) -> Plan:
             "Bytes in memory, index included; paper packs corners of cells for reading, in more bytes than asked for.",
         ],
         jobs=[context.grid, *jobs],
-        jobs_fingerprint=fingerprint(code),
         panels=("bytes",),
         pictures={"views": functools.partial(draw_views, context, shown)},
         measures=(Measure("PSNR of the foreground, dB", FOREGROUND), Measure("of all pixels", WHITE)),

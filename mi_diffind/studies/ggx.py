@@ -24,7 +24,6 @@ from ..core.runtime import array_module
 from ..fitting.loop import FitSettings
 from ..measure.clock import Operations, count_query
 from ..measure.renders import bsdf_queries, directions, noise_texture
-from ..measure.store import fingerprint, package_files
 from ..measure.study import FLOOR, Candidate, Case, Measure, Plan, Study
 from ..measure.training import ConvergenceTraining
 from ..tasks.ggx import TASK
@@ -193,8 +192,6 @@ def plan(quick: bool = False) -> Plan:
     for roughness in ("constant",) if quick else ("constant", "textured"):
         queries = functools.partial(_conductor_queries, conductors, roughness)
         cases.append(Case(f"conductor, {roughness} roughness", queries, in_picture=False))
-    code = package_files("arrays/lookup.py", "arrays/indirection.py", "fitting/loop.py", "tasks/*.py",
-                         "tasks/ggx/*.py", "studies/baselines/networks.py")  # fmt: skip
     return Plan(
         study="ggx",
         title="GGX distribution of normals: accuracy against time and bytes",
@@ -207,7 +204,6 @@ def plan(quick: bool = False) -> Plan:
             "layers of 32 units; f16, u8: entries of two bytes and of one; log: logarithmic inputs."
         ],
         jobs=jobs,
-        jobs_fingerprint=fingerprint(code),
         panels=("bytes",),
     )
 

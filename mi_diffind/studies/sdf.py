@@ -30,7 +30,6 @@ from ..core.runtime import array_module
 from ..core.units import parse_bytes
 from ..fitting.loop import FitSettings
 from ..measure import plot
-from ..measure.store import fingerprint, package_files
 from ..measure.study import FLOOR, Candidate, Case, Measure, Plan, Study
 from ..measure.training import Contender, NetworkContender
 from ..plugins.support.distance_shapes import crop_grid
@@ -244,8 +243,6 @@ def plan(mesh: Mesh, name: str, settings: SimpleNamespace) -> Plan:
 
     nbytes = {MESH: 12 * (len(mesh.vertices) + len(mesh.faces)), grid: 4 * settings.grid**3}
     compared = [timed[method].name for method in SHOWN[:2]]
-    code = package_files("tasks/sdf/*.py", "fitting/loop.py", "arrays/indirection.py", "studies/sdf.py",
-                         "studies/baselines/distance_fields.py", "studies/baselines/networks.py")  # fmt: skip
     return Plan(
         study="sdf",
         title=f"Distance fields of {Path(name).stem} in equal bytes: accuracy against time and bytes",
@@ -263,7 +260,6 @@ def plan(mesh: Mesh, name: str, settings: SimpleNamespace) -> Plan:
             "those of all that a read needs; rays of sparse fields need an index in addition."
         ],
         jobs=jobs,
-        jobs_fingerprint=fingerprint(code),
         panels=("bytes",),
         pictures={"shapes": lambda result: draw_normals(context, [timed[m] for m in SHOWN], result)},
         measures=MEASURES,

@@ -7,7 +7,7 @@ import pytest
 from mi_diffind import inspect
 from mi_diffind.studies import cost
 
-SMALL = cost.CostSettings(1, 1, 0.05)
+SMALL = cost.CostSettings(1, 1, 16, 8)
 
 
 @pytest.mark.long
