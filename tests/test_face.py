@@ -321,8 +321,6 @@ def test_keywords_of_a_study(monkeypatch, tmp_path, mi_rgb):
         mi_diffind.tradeoff("image", source, out=out, ratio=6)
     with pytest.raises(UsageError, match='found the study "nerf", allowed are image'):
         mi_diffind.tradeoff("nerf")
-    with pytest.raises(UsageError, match="tradeoff image: the following arguments are required: IMAGE"):
-        mi_diffind.tradeoff("image", out=out)
 
 
 def test_an_image_that_a_file_cannot_hold_is_not_rendered(mi_rgb, tmp_path, monkeypatch):
