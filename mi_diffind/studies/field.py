@@ -58,6 +58,9 @@ PRESETS = {"ours": "sparse", "paper": "paper", GRID: "grid"}
 FULL = {"resolution": 128, "grid_steps": 0, "steps": 500, "options": {}}
 QUICK = {"resolution": 20, "grid_steps": 30, "steps": 10, "options": {"downscale": 2}}
 
+#: Sides of images in pixels that a quick run reduces larger ones to; all are at least halved.
+QUICK_SIDE = 80
+
 #: Settings of the training through images.
 SETTINGS = FitSettings(seed=1, batch=8192, lr=2e-3, loss="mse", schedule="cosine", check_every=50, deterministic=False)
 
@@ -97,6 +100,9 @@ class RadianceStudy(Study):
         if arguments.source == DEFAULT and not Path(DEFAULT).exists():
             raise ValueError(f'there is no folder "{DEFAULT}": make it by mi-diffind capture {SCENE} -o {DEFAULT}')
         arguments.settings = SimpleNamespace(ratios=arguments.ratios, **(QUICK if arguments.quick else FULL))
+        if arguments.quick:
+            side = int(load_views(arguments.source, "test", most=1, downscale=1).sizes.max())
+            arguments.settings.options = {"downscale": max(2, side // QUICK_SIDE)}
         downscale = arguments.settings.options.get("downscale")
         arguments.views = [load_views(arguments.source, split, downscale=downscale) for split in ("train", "test")]
 
