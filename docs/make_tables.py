@@ -295,8 +295,8 @@ def machine(name: str) -> str:
     m = evaluate(name).get("machine", {})
     if "cpu" not in m:
         return "–"
-    kind = m.get("instructions", "").partition(",")[0]
-    return f"{m.cpu} {kind}".rstrip() + f", cores: {m.cores}, {m['mi-diffind']}"
+    processor = m.get("instructions", "").partition(",")[0]
+    return f"{m.cpu} {processor}".rstrip() + f", cores: {m.cores}, {m['mi-diffind']}"
 
 
 def page_of_figures(pages: dict[Path, str]) -> str:

@@ -132,7 +132,7 @@ class MaterialContenders:
 
     @property
     def details(self) -> dict:
-        """What a result's ``details`` record about the source and the settings."""
+        """Source and settings, for the ``details`` of a result."""
         s = self.source
         sizes = {"source_digest": s.digest, "source_bytes": s.nbytes}
         return {"source": self.name, **sizes, "request": vars(self.settings)}
