@@ -1,14 +1,14 @@
-"""Study ``tradeoff shading``: textures trained for their shading at several weights λ of the shading loss.
+"""Study ``tradeoff shading``: textures trained for their shading, beside plain ones and classical filters of normals.
 
-For each material and seed, a texture is trained as task 4 trains it, and then by task 5 at several weights λ of the
-shading loss; λ = 0 continues task 4 (the paper's figure 2).
+For each material and seed, a texture is trained as ``fit texture`` trains it without shading (*plain*), and then for
+its shading (*ours*), also with other weights λ of the shading loss (the paper's figure 2).
 
-Classical filters of normals (:mod:`.baselines.normals`) are measured uncompressed; those that an ordinary texture can
-hold, Toksvig's roughness too, also by ASTC in equal bytes. LEAN's moments have no limits, which encoders of bytes need.
-Each is also read at other levels of detail, those with the smallest error: the *kernel*.
+Classical filters (:mod:`.baselines.normals`) are measured uncompressed, and in the bytes of ours: compressed by our
+arrays, and by ASTC. Each is also read at other levels of detail, those with the smallest error: the *kernel*.
 
 *Errors* are those of :class:`~mi_diffind.tasks.shading.evaluation.ShadedEvaluation`: PSNR of shaded values and FLIP,
-under views and lights of no training, against C, the converged truth, and P, the paper's reference.
+under views and lights of no training, against C, the converged truth, and P, the paper's reference; and those of whole
+renders (:mod:`.shaded_scenes`) of plain, ours, and the best filter in equal bytes.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from ..core.runtime import array_module
 from ..fitting import task
 from ..fitting.loop import FitResult
 from ..images import srgb
-from ..maps.pyramid import Pyramid, decibel
+from ..maps.pyramid import FilteredMaps, Pyramid, decibel
 from ..maps.source import Source, SourceError, load_source
 from ..measure import plot
 from ..measure.report import figure_caption
@@ -37,30 +37,34 @@ from ..measure.study import Measure, Plan, Study
 from ..measure.training import Contender
 from ..tasks import shading as shading_task
 from ..tasks import texture as texture_task
-from ..tasks.shading.evaluation import TRUTHS, ShadedEvaluation, ShadedReader, reader
-from ..tasks.shading.material import frozen_decoder, material_effects
+from ..tasks.shading.evaluation import TRUTHS, ShadedEvaluation, reader
+from ..tasks.shading.material import material_effects
 from ..tasks.shading.training import fit_shading, trainable_arrays
-from ..tasks.texture.compressed import CompressedTexture
-from ..tasks.texture.fit import source_layout
+from ..tasks.texture import fit as texture_fit
+from ..tasks.texture.compressed import CompressedTexture, to_table
 from .baselines import codecs, normals
 from .example_maps import MATERIALS, example_maps
 from .materials import level_images, level_pyramid
-
-#: Weights λ of the shading loss; 0 is always among them.
-LAMBDAS = (0.1, 0.5, 0.9, 1.0)
+from .shaded_scenes import LIGHTS, VIEWS, FloorScenes, RenderedFile, SceneQuality
 
 #: Compression ratio of all trainings.
 COMPRESSION = 12.0
 
-#: Name of the trainings in records: derivatives through the specular lobe are clipped, the learning rate falls.
-WAY = "clip, schedule"
+#: Weight λ of the shading loss by default.
+SHARE = shading_task.PRESETS["ours"].share
+
+#: Options of the arrays, which ``fit texture`` chooses.
+SIZES = ("structure", "skip", "cascaded")
+
+#: Levels of detail whose errors are measured.
+LEVELS = 6
 
 
 class ShadingStudy(Study):
-    """Quality of shaded images against the weight of the shading loss, beside classical filters."""
+    """Quality of shaded images and of renders, beside classical filters."""
 
     name = "shading"
-    title = "textures trained for their shading, by the weight of that, and classical filters of normals"
+    title = "textures trained for their shading, beside plain ones and classical filters of normals"
     example = "material.json"
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
@@ -69,13 +73,10 @@ class ShadingStudy(Study):
             help="manifests of maps, or names of generated materials: hammered, weave, lacquer (default: these; "
             "--quick: hammered)",
         )  # fmt: skip
-        parser.add_argument("--lambda", action="append", type=fraction, dest="lambdas", metavar="X",
-                            help="weight of the shading loss; may be repeated; 0 is always among them (default: "
-                            "0, 0.1, 0.5, 0.9, 1; --quick: 0, 0.9)")  # fmt: skip
+        parser.add_argument("--lambda", action="append", default=[], type=fraction, dest="lambdas", metavar="X",
+                            help=f"further weight of the shading loss beside {SHARE:g}; may be repeated")  # fmt: skip
         parser.add_argument("--seeds", type=positive, default=1, metavar="N",
-                            help="number of seeds of each training (default: 1)")  # fmt: skip
-        parser.add_argument("--steps", type=positive, metavar="N",
-                            help="steps of training for shading (default: 600; --quick: 20)")  # fmt: skip
+                            help="number of seeds of plain and ours (default: 1)")  # fmt: skip
 
     def check(self, arguments) -> None:
         """Load the materials; raise as :func:`.load_source` does."""
@@ -85,10 +86,9 @@ class ShadingStudy(Study):
     def plan(self, arguments) -> Plan:
         quick = arguments.quick
         settings = SimpleNamespace(
-            lambdas=sorted({0.0, *(arguments.lambdas or ((0.9,) if quick else LAMBDAS))}),
+            lambdas=sorted({SHARE, *arguments.lambdas}),
             seeds=arguments.seeds,
-            steps=arguments.steps or (20 if quick else 600),
-            texture_steps=20 if quick else 300,
+            steps={"steps": 20} if quick else {},
             quick=quick,
         )
         contexts = {name: ShadingContenders(name, source, settings) for name, source in arguments.loaded.items()}
@@ -98,23 +98,31 @@ class ShadingStudy(Study):
         return Plan(
             study="shading",
             title="Textures trained for their shading",
-            candidates=[job.candidate() for job in jobs],
+            candidates=[job.candidate(is_reference=job.method == "renders") for job in jobs],
             cases=[],
             details=details,
             notes=[
                 *codecs.install_notes(["astc"]),
-                f"{sizes}; {COMPRESSION:g}x, {settings.texture_steps} steps of training as a texture, "
-                f"then {settings.steps} steps for shading; C: converged truth, P: the paper's reference; kernel: read "
-                "at the levels of detail with the smallest error.",
+                f"{sizes}; equal bytes: {COMPRESSION:g}x; C: dB against the converged truth, L0 to L5: of each level of "
+                "detail; kernel: read at the levels of detail with the smallest error.",
             ],
             jobs=jobs,
             jobs_fingerprint=str(details),
             pictures={
-                "png": partial(draw_lambdas, contexts),
-                "levels": partial(draw_levels, contexts),
-                "strip": partial(draw_crops, contexts),
+                "png": partial(draw_levels, contexts),
+                "strip": partial(draw_renders, contexts),
+                **({"lambda": partial(draw_lambdas, contexts)} if len(settings.lambdas) > 1 else {}),
             },
-            measures=(Measure("C", "c_mean_db"), Measure("P", "p_mean_db"), Measure("FLIP", "c_flip", ".4f", False)),
+            measures=(
+                Measure("C", "c_mean_db"),
+                *(Measure(f"L{level}", f"c_l{level}_db", ".1f") for level in range(LEVELS)),
+                Measure("FLIP", "c_flip", ".4f", False),
+                Measure("over best", "over_best_db", "+.2f"),
+                Measure("over LEAN", "over_lean_db", "+.2f"),
+                Measure("renders", "renders_gain_db", "+.2f"),
+                Measure("at worst", "renders_worst_db", "+.2f"),
+                Measure("brightness", "brightness_error", ".3f", False),
+            ),
         )
 
 
@@ -139,11 +147,11 @@ def load_materials(names: Sequence[str], side: int) -> dict[str, Source]:
 
 @dataclass
 class ShadingContenders:
-    """Contenders of a material, by label; the model of each is a reader of shaded values.
+    """Contenders of a material, by label; the model of each is :class:`.FilteredMaps`.
 
-    Methods are ``classical`` (uncompressed filters), ``compressed`` (filters in the bytes of the trainings), ``start``
-    (a texture trained as task 4 trains it) and ``run`` (its training for shading). ``runs`` has the runs of all seeds
-    by λ.
+    Methods are ``classical`` (uncompressed filters), ``compressed`` (filters in the bytes of ours), ``plain`` (a
+    texture), ``run`` (a texture trained for its shading) and ``renders`` (whole renders of ours, with a record of the
+    gains alone). ``runs`` has the runs of all seeds by λ.
     """
 
     name: str
@@ -153,19 +161,25 @@ class ShadingContenders:
     runs: dict[float, list[Contender]] = field(default_factory=dict)
 
     def __post_init__(self):
-        layout = source_layout(self.source, texture_task.PRESETS["ours"])
+        layout = texture_fit.source_layout(self.source, texture_task.PRESETS["ours"])
         self.pyramid = Pyramid.from_source(self.source, layout, array_module(mi.variant()))
         self.effects = material_effects(layout)[0]
+        for seed in range(self.settings.seeds):
+            plain = self.add_plain(seed)
+            for share in self.settings.lambdas:
+                self.runs.setdefault(share, []).append(self.add_run(plain, share, seed))
         self.add_filters()
         for seed in range(self.settings.seeds):
-            start = self.add_start(seed)
-            for share in self.settings.lambdas:
-                self.runs.setdefault(share, []).append(self.add_run(start, share, seed))
-        self.add_kernels()
+            self.add_renders(seed)
 
     @cached_property
     def evaluation(self) -> ShadedEvaluation:
-        return ShadedEvaluation(self.pyramid, self.effects, *((3, 2, 16) if self.settings.quick else ()))
+        return ShadedEvaluation(self.pyramid, self.effects, *((3, 2, 16) if self.settings.quick else (LEVELS,)))
+
+    @cached_property
+    def scenes(self) -> FloorScenes:
+        quality = SceneQuality(64, 32, 8, 1) if self.settings.quick else SceneQuality()
+        return FloorScenes(self.source, "repeat" if set(self.pyramid.border) == {"repeat"} else "mirror", quality)
 
     def add(self, label: str, method: str, fit: Callable, read: Callable, has_file: bool = False) -> Contender:
         """Register a contender."""
@@ -175,55 +189,13 @@ class ShadingContenders:
 
     def record(self, job: Contender, nbytes: int, **details) -> dict:
         """Measure the model of a job; return its record."""
-        measured = self.evaluation.measure(job.model)
+        measured = self.evaluation.measure(reader(job.model, self.effects))
         errors = {f"{letter.lower()}_mean_db": figures["mean_db"] for letter, figures in measured.items()}
+        errors |= {f"c_l{level}_db": value for level, value in enumerate(measured["C"]["psnr_db"])}
         if measured["C"]["flip"]:  # that of small images is not measured
             errors["c_flip"] = float(np.mean(measured["C"]["flip"]))
         details |= {"material": self.name, "kind": job.method, "label": job.label, **measured}
         return {"bytes": nbytes, "errors": errors, "details": details}
-
-    # -- Classical filters
-
-    def add_filter(self, label: str, method: str, build: Callable[[], tuple[ShadedReader, int]]) -> None:
-        """Register a filter that nothing is trained for; ``build()`` returns its reader and its bytes."""
-        once = cache(build)
-        self.add(label, method, lambda job, progress: self.record(job, once()[1]), lambda job: once()[0])
-
-    def add_filters(self) -> None:
-        """Register classical filters: uncompressed, and by ASTC in the bytes of the trainings."""
-        pyramid, effects = self.pyramid, self.effects
-        moments = 6 * sum(v[..., 0].size for v in pyramid.values)
-        pairs = 4 if self.settings.quick else normals.PAIRS
-        pyramids = {
-            "filtered": lambda: pyramid,
-            "Toksvig": cache(lambda: normals.with_roughness(pyramid, normals.toksvig_levels(pyramid))),
-            "baked": cache(lambda: normals.with_roughness(pyramid, normals.bake(pyramid, effects, pairs))),
-        }
-        self.add_filter("LEAN", "classical", lambda: (normals.lean(pyramid, effects), pyramid.nbytes + moments))
-        for name, make in pyramids.items():
-            self.add_filter(name, "classical", lambda make=make: (reader(make(), effects), make().nbytes))
-            if "astc" in codecs.available():
-                self.add_filter(f"{name}, ASTC", "compressed", partial(self.encoded, make))
-
-    def encoded(self, pyramid: Callable[[], Pyramid]) -> tuple[ShadedReader, int]:
-        """Return the reader of a pyramid that ASTC stores in the bytes of the trainings, and its bytes."""
-        names = [m.name for m in pyramid().layout.maps if m.role == "normal"]
-        coded, nbytes = codecs.astc_levels(level_images(pyramid()), self.source.nbytes / COMPRESSION, "thorough", names)
-        return reader(level_pyramid({name: e.levels for name, e in coded.items()}, pyramid()), self.effects), nbytes
-
-    def add_kernels(self) -> None:
-        """Register each filter, and λ = 0 as that of parameters, at the levels of detail with the smallest error."""
-
-        def build(job: Contender) -> tuple[ShadedReader, int]:
-            biases = normals.choose_biases(job.model, self.evaluation.another())
-            return normals.biased(job.model, biases), job.record["bytes"]
-
-        jobs = {job.label: job for job in self.jobs.values() if job.method in ("classical", "compressed")}
-        jobs["filtered, compressed"] = self.runs[0.0][0]
-        for label, job in jobs.items():
-            name, *storage = label.split(", ")
-            label = ", ".join([*([] if name == "filtered" else [name]), "kernel", *storage])
-            self.add_filter(label, "classical" if job.method == "classical" else "compressed", partial(build, job))
 
     # -- Trainings
 
@@ -231,126 +203,199 @@ class ShadingContenders:
         self, label: str, method: str, train: Callable[[Contender, bool], tuple[Table, FitResult]], **details
     ) -> Contender:
         """Register a texture that ``train(job, progress)`` trains; its table stays in the folder of models."""
-        types = self.pyramid.types
 
         def fit(job: Contender, progress: bool) -> dict | None:
             table, result = train(job, progress)
             if result.interrupted:
                 return None
             save_table(job.file, table)
-            return self.record(job, table.nbytes, level_bias=table.settings.get("level_bias", 0.0), **details)
+            chosen = {name: table.settings.get(name) for name in ("level_bias", "kept_start")}
+            return self.record(job, table.nbytes, seconds=result.seconds, **chosen, **details)
 
-        def read(job: Contender) -> ShadedReader:
-            texture = CompressedTexture.from_table(texture_task.TASK.load(job.file), types.TensorXf)
-            return reader(texture, self.effects, frozen_decoder(types))
+        def read(job: Contender) -> FilteredMaps:
+            maps = CompressedTexture.from_table(texture_task.TASK.load(job.file), self.pyramid.types.TensorXf)
+            return normals.ReadMaps(maps) if method == "compressed" else maps
 
         return self.add(label, method, fit, read, True)
 
-    def add_start(self, seed: int) -> Contender:
-        """Register a texture that task 4 trains."""
+    def add_plain(self, seed: int) -> Contender:
+        """Register a texture that is not trained for its shading."""
 
         def train(job: Contender, progress: bool) -> tuple[Table, FitResult]:
-            fitted = task.fit("texture", self.source, compression=COMPRESSION, steps=self.settings.texture_steps,
-                              seed=seed, variant=mi.variant(), progress=progress, output=job.file)  # fmt: skip
+            fitted = task.fit("texture", self.source, compression=COMPRESSION, seed=seed, variant=mi.variant(),
+                              progress=progress, output=job.file, **self.settings.steps)  # fmt: skip
             return fitted.table, fitted.result
 
-        return self.add_trained(f"texture, seed {seed}", "start", train)
+        return self.add_trained(f"plain, seed {seed}", "plain", train)
 
-    def add_run(self, start: Contender, share: float, seed: int) -> Contender:
+    def add_run(self, plain: Contender, share: float, seed: int) -> Contender:
         """Register a training for shading with weight ``share``.
 
         λ = 0 is read at the level of the footprint; for other λ, the training chooses the level bias.
         """
 
         def train(job: Contender, progress: bool) -> tuple[Table, FitResult]:
-            given = {"steps": self.settings.steps, "seed": seed, "share": share, "level_bias": None if share else 0.0}
+            given = {"seed": seed, "share": share, **({} if share else {"level_bias": 0.0}), **self.settings.steps}
             recipe = shading_task.TASK.change_settings(shading_task.PRESETS["ours"], given)
             request = task.FitRequest("ours", recipe, self.pyramid.types, progress=progress)
-            arrays = trainable_arrays(texture_task.TASK.load(start.file), self.pyramid)
+            arrays = trainable_arrays(texture_task.TASK.load(plain.file), self.pyramid)
             return fit_shading(self.source, arrays, recipe, request, self.pyramid, self.evaluation)
 
-        return self.add_trained(f"lambda {share:g}, {WAY}, seed {seed}", "run", train, share=share, way=WAY)
+        label = "ours" if share == SHARE else f"lambda {share:g}"
+        return self.add_trained(f"{label}, seed {seed}", "run", train, share=share, way="clip, schedule")
 
-    # -- Results
+    # -- Classical filters
 
-    def shown_filters(self) -> dict[str, Contender]:
-        """Return the filters in pictures: filtered parameters, the best uncompressed, and the best in equal bytes."""
-        shown = {"parameters filtered": self.jobs["filtered"]}
-        for text, method in (("uncompressed", "classical"), ("equal bytes", "compressed")):
-            jobs = [job for job in self.jobs.values() if job.method == method]
-            best = max(jobs, key=lambda job: job.record["errors"]["c_mean_db"])
-            shown[f"{best.label.removesuffix(', compressed')}, {text}"] = best
-        return shown
+    def add_filters(self) -> None:
+        """Register classical filters: uncompressed, and in the bytes of ours by our arrays and by ASTC."""
+        pyramid = self.pyramid
+        pairs = 4 if self.settings.quick else normals.PAIRS
+        filters = {
+            "plain": lambda: pyramid,
+            "Toksvig": lambda: normals.with_roughness(pyramid, normals.toksvig_levels(pyramid)),
+            "LEAN": lambda: normals.lean_pyramid(pyramid),
+            "baked": lambda: normals.with_roughness(pyramid, normals.bake(pyramid, self.effects, pairs)),
+        }
+        for name, build in filters.items():
+            build = cache(build)
+            self.add_filter(name, "classical", lambda build=build: (build(), build().nbytes))
+            stored = self.jobs["plain, seed 0"]
+            if name != "plain":
+                stored = self.add_trained(f"{name}, compressed", "compressed", partial(self.train_filter, build))
+            self.add_kernel(f"{name}, kernel", self.jobs[name])
+            self.add_kernel(f"{name}, kernel, compressed", stored)
+            if "astc" in codecs.available():
+                self.add_filter(f"{name}, ASTC", "compressed", partial(self.encoded, build))
+                self.add_kernel(f"{name}, kernel, ASTC", self.jobs[f"{name}, ASTC"])
 
-    def shown_runs(self) -> dict[str, Contender]:
-        """Return the trainings in pictures, of the first seed: with the smallest and with the largest λ."""
-        return {f"trained, λ {share:g}": self.runs[share][0] for share in (min(self.runs), max(self.runs))}
+    def add_filter(self, label: str, method: str, build: Callable[[], tuple[FilteredMaps, int]]) -> None:
+        """Register maps that nothing is trained for; ``build()`` returns them and their bytes."""
+        once = cache(build)
+        read = lambda job: normals.ReadMaps(once()[0])  # noqa: E731
+        self.add(label, method, lambda job, progress: self.record(job, once()[1]), read)
+
+    def add_kernel(self, label: str, job: Contender) -> None:
+        """Register the maps of a job, read at the levels of detail with the smallest error."""
+        choose = partial(normals.choose_biases, effects=self.effects)
+        read = lambda _: normals.ReadMaps(job.model, choose(job.model, evaluation=self.evaluation.another()))  # noqa: E731
+        method = "compressed" if job.method == "plain" else job.method
+        self.add(label, method, lambda kernel, progress: self.record(kernel, job.record["bytes"]), read)
+
+    def train_filter(self, build: Callable[[], Pyramid], job: Contender, progress: bool) -> tuple[Table, FitResult]:
+        """Train our arrays for the pyramid of a filter, as ``fit texture`` does for that of the source."""
+        recipe = texture_task.TASK.change_settings(texture_task.PRESETS["ours"], self.settings.steps)
+        request, options = task.FitRequest("ours", recipe, self.pyramid.types, progress=progress), dict.fromkeys(SIZES)
+        size = texture_fit.find_size(self.source, build(), self.source.nbytes / COMPRESSION, recipe, options)
+        problem = texture_fit.build_problem(self.source, size, recipe, build())
+        result = request.train(problem, f"train {job.name}")
+        maps = CompressedTexture(build().layout, texture_fit.stored_form(problem.net))
+        return to_table(maps, {**request.recorded(result), **problem.identity}), result
+
+    def encoded(self, build: Callable[[], Pyramid]) -> tuple[Pyramid, int]:
+        """Return the pyramid of a filter as ASTC stores it in the bytes of ours, and its bytes."""
+        names = [m.name for m in build().layout.maps if m.role == "normal"]
+        quality = "fast" if self.settings.quick else "thorough"
+        coded, nbytes = codecs.astc_levels(level_images(build()), self.source.nbytes / COMPRESSION, quality, names)
+        return level_pyramid({name: e.levels for name, e in coded.items()}, build()), nbytes
+
+    def best(self, method: str, name: str = "") -> Contender:
+        """Return the contender of a method, of the filter ``name`` if it is given, with the smallest error."""
+        jobs = [job for job in self.jobs.values() if job.method == method and job.label.startswith(name)]
+        return max(jobs, key=lambda job: job.record["errors"]["c_mean_db"])
+
+    # -- Renders
+
+    def rendered(self, job: Contender) -> RenderedFile:
+        """Return what is rendered of a texture, or of a filter in equal bytes."""
+        if job.method in ("plain", "run"):
+            return RenderedFile(job.file)
+        name = job.label.split(",")[0]
+        file = self.jobs["plain, seed 0" if name == "plain" else f"{name}, compressed"].file
+        return RenderedFile(file, job.model)
+
+    def add_renders(self, seed: int) -> None:
+        """Register the renders of plain and ours, and for the first seed of the best filter in equal bytes."""
+
+        def fit(job: Contender, progress: bool) -> dict:
+            plain, ours = self.jobs[f"plain, seed {seed}"], self.runs[SHARE][seed]
+            best, lean = self.best("compressed"), self.best("classical", "LEAN")
+            shown = {"plain": plain, "ours": ours, **({} if seed else {"best": best})}
+            renders = {name: self.scenes.measure(self.rendered(shown_job)) for name, shown_job in shown.items()}
+            each = {name: [f for by_spp in r.values() for f in by_spp.values()] for name, r in renders.items()}
+            psnr = {name: np.concatenate([f["psnr_db"] for f in figures]) for name, figures in each.items()}
+            ratios = [ratio for f in each["ours"] for view in f["brightness"] for ratio in view.values()]
+            gains, mean_db = psnr["ours"] - psnr["plain"], lambda job: job.record["errors"]["c_mean_db"]
+            errors = {
+                "over_best_db": mean_db(ours) - mean_db(best),
+                "over_lean_db": mean_db(ours) - mean_db(lean),
+                "renders_gain_db": float(gains.mean()),
+                "renders_worst_db": float(gains.min()),
+                "brightness_error": max(abs(ratio - 1) for ratio in ratios),
+            }
+            details = {"material": self.name, "kind": job.method, "label": job.label, "best": best.label}
+            return {"errors": errors, "details": {**details, "lean": lean.label, "renders": renders}}
+
+        self.add(f"renders, seed {seed}", "renders", fit, lambda job: None)
 
 
 # -- Pictures ----------------------------------------------------------------------------------------------------------
 
-#: Level of detail of the crops.
-CROP_LEVEL = 3
 
-#: Largest side of the crops, in texels.
-CROP_SIDE = 48
+def draw_levels(contexts: dict[str, ShadingContenders], result: dict):
+    """Draw PSNR by level of detail of plain, ours, the best filter in equal bytes and uncompressed LEAN."""
+    panels = {}
+    for name, context in contexts.items():
+        best, lean = context.best("compressed"), context.best("classical", "LEAN")
+        shown = {
+            "ours": context.runs[SHARE][0],
+            "plain": context.jobs["plain, seed 0"],
+            f"best filter in equal bytes: {best.label}": best,
+            f"{lean.label}, uncompressed": lean,
+        }
+        values = {text: job.record["details"]["C"]["psnr_db"] for text, job in shown.items()}
+        panels[name] = [plot.Curve(text, range(len(psnr)), psnr) for text, psnr in values.items()]
+    title = f"{result['title']}: quality of shaded images by level of detail"
+    return plot.draw_curves(title, figure_caption(result), panels, "level of detail", "PSNR of shaded values, dB")
 
 
 def draw_lambdas(contexts: dict[str, ShadingContenders], result: dict):
-    """Draw PSNR over λ, with bars over seeds, beside the best classical filters."""
-    settings = next(iter(contexts.values())).settings
-
-    def trained(context: ShadingContenders, letter: str) -> list[plot.Curve]:
-        seeds = [[job.record["details"][letter]["mean_db"] for job in jobs] for jobs in context.runs.values()]
-        ends = [[end(values) for values in seeds] for end in (np.mean, min, max)]
-        return [plot.Curve("trained", range(len(seeds)), *ends)]
-
-    ticks = [f"{share:g}" for share in settings.lambdas]
-    filtered = lambda figures: [figures["mean_db"]] * len(ticks)  # noqa: E731
-    return _draw(contexts, result, "λ, weight of the shading loss", ticks, trained, filtered)
-
-
-def draw_levels(contexts: dict[str, ShadingContenders], result: dict):
-    """Draw PSNR by level of detail of λ = 0, the largest λ and the best classical filters."""
-
-    def trained(context: ShadingContenders, letter: str) -> list[plot.Curve]:
-        shown = {text: job.record["details"][letter]["psnr_db"] for text, job in context.shown_runs().items()}
-        return [plot.Curve(text, range(len(psnr)), psnr) for text, psnr in shown.items()]
-
-    ticks = [str(level) for level in range(max(context.evaluation.levels for context in contexts.values()))]
-    return _draw(contexts, result, "level of detail", ticks, trained, lambda figures: figures["psnr_db"])
-
-
-def _draw(contexts: dict, result: dict, x_label: str, ticks: Sequence[str], trained: Callable, filtered: Callable):
-    """Return a figure with a row for each material and a column for each truth.
-
-    ``trained(context, letter)`` returns the curves of trainings, ``filtered(figures)`` the values of a filter.
-    """
-    panels = {}
+    """Draw PSNR over λ, with bars over seeds, against both references."""
+    panels, ticks = {}, [f"{share:g}" for share in next(iter(contexts.values())).runs]
     for name, context in contexts.items():
         for letter, truth in TRUTHS.items():
-            curves = panels[f"{name}, against the {truth} reference ({letter})"] = trained(context, letter)
-            for (text, job), line in zip(context.shown_filters().items(), (":", "--", "-."), strict=True):
-                values, style = filtered(job.record["details"][letter]), {"color": "0.3", "marker": ""}
-                curves.append(plot.Curve(text, range(len(values)), values, style={**style, "linestyle": line}))
-    title, label = f"{result['title']}: quality by {x_label.split(',')[0]}", "PSNR of shaded values, dB"
-    return plot.draw_curves(title, figure_caption(result), panels, x_label, label, ticks=ticks)
+            seeds = [[job.record["details"][letter]["mean_db"] for job in jobs] for jobs in context.runs.values()]
+            ends = [[end(values) for values in seeds] for end in (np.mean, min, max)]
+            panels[f"{name}, against the {truth} reference ({letter})"] = [plot.Curve("", range(len(seeds)), *ends)]
+    title, label = f"{result['title']}: quality by λ", "PSNR of shaded values, dB"
+    return plot.draw_curves(title, figure_caption(result), panels, "λ, weight of the shading loss", label, ticks=ticks)
 
 
-def draw_crops(contexts: dict[str, ShadingContenders], result: dict):
-    """Draw crops of a minified level, by each of the contenders shown and of the truth."""
+def draw_renders(contexts: dict[str, ShadingContenders], result: dict):
+    """Draw a render under the sun of plain, the best filter in equal bytes, ours and the truth, with a part enlarged."""
     rows = {}
     for name, context in contexts.items():
-        evaluation = context.evaluation
-        level = min(CROP_LEVEL, evaluation.levels - 1)
-        truths = evaluation.truths["C"][level].clip(0, 1)
-        shown = {**context.shown_filters(), **context.shown_runs()}
-        images = {text: evaluation.images(job.model, level).clip(0, 1) for text, job in shown.items()}
-        first = images["parameters filtered"]
-        pair = int(np.argmax(((first - truths) ** 2).mean(axis=(1, 2, 3))))  # with the largest error of the filter
-        texts = {
-            f"{t}\nPSNR {decibel(float(np.mean((i[pair] - truths[pair]) ** 2))):.1f} dB": i for t, i in images.items()
-        }
-        crops = {t: srgb.for_display(i[pair, :CROP_SIDE, :CROP_SIDE]) for t, i in {**texts, "truth": truths}.items()}
-        rows[f"{name}, level {level}"] = crops
-    return plot.draw_images(f"{result['title']}: crops of shaded images", figure_caption(result), rows)
+        lights, view, scenes = LIGHTS[0], VIEWS[0], context.scenes
+        truth, exposure, masks = scenes.truth(lights, view)
+        best, images = context.best("compressed"), {}
+        shown = {"plain texture": context.jobs["plain, seed 0"], f"best filter, {best.label}": best,
+                 "ours, trained for its shading": context.runs[SHARE][0]}  # fmt: skip
+        renders = {text: scenes.images(context.rendered(job), lights, view, [1])[1] for text, job in shown.items()}
+        for text, halves in {**renders, "truth": truth}.items():
+            a, b = np.clip(exposure * halves, 0, 1) - np.clip(exposure * truth, 0, 1)
+            ratio = halves[:, masks["far"]].mean() / truth[:, masks["far"]].mean()
+            errors = (
+                "" if halves is truth else f"PSNR {decibel(float(np.mean(a * b))):.1f} dB, far {ratio - 1:+.1%} light"
+            )
+            whole = srgb.for_display(exposure * halves.mean(axis=0))
+            images[f"{text}\n{errors}"] = np.concatenate([whole, enlarged(whole, masks["far"])])
+        rows[name] = images
+    title = "Renders with the footprint of one sample a pixel, and their far part three times as large"
+    return plot.draw_images(title, figure_caption(result), rows, 3.4)
+
+
+def enlarged(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Return a third of the columns of an image, the rows of a mask, three times as large."""
+    height, width = mask.shape
+    first = min(int(np.flatnonzero(mask.any(axis=1))[0]), height - height // 4)
+    part = image[first : first + height // 4, 2 * width // 3 :]
+    return part.repeat(3, axis=0).repeat(3, axis=1)[:, :width]

@@ -1,25 +1,24 @@
 """Classical filters of normal maps that shading-aware textures are compared with.
 
-Each takes the maps of a material at every level of detail, uncompressed. A reader is a function
-``(u, v, level, wi, wo) → Array3f`` of shaded values, as in :mod:`mi_diffind.tasks.shading.evaluation`, whose ``reader``
-shades a pyramid of filtered parameters, with normals brought to length 1.
+Each filter is a pyramid of maps, which a texture can store in any form, and which :func:`.evaluation.reader` shades as
+it shades filtered parameters.
 
 - :func:`toksvig_levels`: roughness increased by the length of the mean normal (Toksvig, *Mipmapping Normal Maps*,
   2005);
-- :func:`lean`: first and second moments of slopes, filtered linearly, make an anisotropic lobe (Olano and Baker, *LEAN
-  Mapping*, 2010), a GGX one in place of their Beckmann's (Dupuy et al., *Linear Efficient Antialiased Displacement and
-  Reflectance Mapping*, 2013);
+- :func:`lean_pyramid`: first and second moments of slopes, filtered linearly, make an anisotropic lobe (Olano and
+  Baker, *LEAN Mapping*, 2010), a GGX one in place of their Beckmann's (Dupuy et al., *Linear Efficient Antialiased
+  Displacement and Reflectance Mapping*, 2013);
 - :func:`bake`: each texel of each level has the roughness with which it looks most like the converged truth;
-- :func:`biased`: any of these at other levels of detail; its gain is due to the filter's kernel, not to shading.
+- :class:`ReadMaps`: any of these at other levels of detail; its gain is due to the filter's kernel, not to shading.
 
-A roughness by level becomes part of a pyramid by :func:`with_roughness`. The variance of slopes of a GGX lobe is
-infinite; in its place stands that of the Beckmann lobe of the same α, which is α²/2 along each axis.
+The variance of slopes of a GGX lobe is infinite; in its place stands that of the Beckmann lobe of the same α, which is
+α²/2 along each axis.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import drjit as dr
@@ -27,16 +26,20 @@ import numpy as np
 
 from ...arrays.indirection import aligned_copy
 from ...arrays.lookup import clamp
-from ...maps.layout import Layout, MapLayout
-from ...maps.pyramid import Pyramid, halve
-from ...tasks.disney.decoder import Decoder, Lobe
+from ...images import srgb
+from ...maps.layout import FROM_NORMAL, Layout, MapLayout
+from ...maps.pyramid import FilteredMaps, Pyramid, halve
 from ...tasks.disney.model import ALPHA_MIN, Effects
 from ...tasks.disney.training import uniform_hemisphere
-from ...tasks.shading.evaluation import ShadedEvaluation, ShadedReader, reference
-from ...tasks.shading.material import DEFAULTS, frame, maps_of, shaded, surface_of
+from ...tasks.shading.evaluation import ShadedEvaluation, reader, reference
+from ...tasks.shading.material import DEFAULT_ALBEDO, DEFAULTS, READ, maps_of, shaded, surface_of
+from ...tasks.texture.compressed import NEUTRAL
 
 #: Least third component in the slope of a normal: a slope of 10.
 STEEPEST = 0.1
+
+#: Name of the map of LEAN's lobes: (c, s) of :class:`~mi_diffind.tasks.disney.decoder.Lobe`, in the form of extras.
+LOBE = "lobe"
 
 #: Biases of the level of detail that :func:`choose_biases` tries.
 BIASES = tuple(float(bias) for bias in np.arange(-8, 5) / 8)
@@ -102,50 +105,49 @@ def toksvig_levels(pyramid: Pyramid) -> list[np.ndarray]:
     return [toksvig_alpha2(a, r) ** 0.25 for a, r in zip(alpha2s, lengths, strict=True)]
 
 
-def lean(pyramid: Pyramid, effects: Effects) -> ShadedReader:
-    """Return the reader of an anisotropic lobe around the normal of the mean slope (:func:`lobe`).
+def lean_pyramid(pyramid: Pyramid) -> Pyramid:
+    """Return the pyramid of LEAN's lobes: normals of the mean slope, roughness, and the map :data:`LOBE` of the shape.
 
     All other lobes are those of filtered parameters, times the length of the mean normal: a cosine is linear in the
-    normal, and so is its mean (worth 0.8 dB on bricks and cloth).
+    normal, and so is its mean (worth 0.8 dB on bricks and cloth). The albedo holds that factor, but not for metal.
     """
-    levels = surface_moments(pyramid)
-    height, width, count = levels[0].shape
-    maps = (MapLayout("moments", "other", "linear", 1, tuple(range(count))),)
-    layout = Layout(width, height, maps, (0.5,) * count, ("moments",) * count)
-    moments = Pyramid(layout, levels, pyramid.types, pyramid.border)
-    specular = replace(effects, diffuse=False, subsurface=False, sheen=False, clearcoat=False)
-
-    def read(u, v, level, wi, wo):
-        surface = surface_of(pyramid, pyramid.filtered(u, v, level))
-        bx, by, xx, yy, xy, a2, *mean = moments.filtered(u, v, level)
-        covariance = (dr.maximum(xx - bx * bx, 0), dr.maximum(yy - by * by, 0), xy - bx * by)
-        normal = pyramid.types.Array3f(bx, by, 1)
-        roughness, shape = lobe(covariance, a2, *frame(normal, wi))
-        highlight = replace(surface, normal=normal, roughness=roughness, lobe=shape)
-        value = shaded(Decoder(), highlight, wi, wo, specular)
-        if effects.lobes == specular.lobes:
-            return value
-        rest = replace(surface, lobe=Lobe(*[type(u)(0)] * 3))  # without a specular lobe
-        return value + dr.norm(pyramid.types.Array3f(mean)) * shaded(Decoder(), rest, wi, wo, effects)
-
-    return read
+    albedo, metallic = (maps_of(pyramid.layout).get(role) for role in ("albedo", "metallic"))
+    levels = {"albedo": [], "normal": [], "roughness": [], LOBE: []}
+    for level, moments in enumerate(surface_moments(pyramid)):
+        bx, by, xx, yy, xy, alpha2, *mean = np.moveaxis(moments, -1, 0)
+        n = np.stack([bx, by, np.ones_like(bx)], axis=-1)
+        n /= np.linalg.norm(n, axis=-1, keepdims=True)
+        roughness, shape = lobe((np.maximum(xx - bx * bx, 0), np.maximum(yy - by * by, 0), xy - bx * by), alpha2, n)
+        linear = np.full((*bx.shape, 1), DEFAULT_ALBEDO)
+        if albedo is not None:
+            linear = pyramid.decode([albedo.name], level=level)[albedo.name]
+            linear = srgb.to_linear(linear) if albedo.color_space == "srgb" else linear
+        metal = 0.0 if metallic is None else pyramid.decode([metallic.name], level=level)[metallic.name]
+        length = np.linalg.norm(mean, axis=0)[..., None]
+        levels["albedo"].append(srgb.from_linear(linear * (length + metal * (1 - length))))
+        levels["normal"].append(0.5 + 0.5 * n)
+        levels["roughness"].append(roughness[..., None])
+        levels[LOBE].append(NEUTRAL[:2] + 0.5 * shape)
+    return with_maps(pyramid, levels)
 
 
-def lobe(covariance, alpha2, s, t, n) -> tuple:
-    """Return roughness and shape of a lobe about a normal ``n`` with tangents ``s``, ``t``.
+def lobe(covariance, alpha2, n) -> tuple[np.ndarray, np.ndarray]:
+    """Return roughness, ``(…)``, and shape (c, s), ``(…, 2)``, of lobes about normals ``n``, ``(…, 3)``.
 
     ``covariance`` is that of the slopes in the surface's tangent plane, ``(xx, yy, xy)``, ``alpha2`` the α² of facets
     on them. In the frame of a tilted normal n, slopes are, to first order, n_z times their projections onto the frame's
     tangents. GGX's matrix A (:class:`~mi_diffind.tasks.disney.decoder.Lobe`) is α² plus twice their covariance.
     """
     xx, yy, xy = covariance
+    x, y, z = np.moveaxis(n, -1, 0)
+    s = np.stack([1 - x * x, -x * y, -x * z]) / np.sqrt(np.maximum(1 - x * x, 1e-12))
+    t = np.stack([y * s[2] - z * s[1], z * s[0] - x * s[2], x * s[1] - y * s[0]])
 
     def projected(a, b):
-        return dr.square(n.z) * (xx * a.x * b.x + yy * a.y * b.y + xy * (a.x * b.y + a.y * b.x))
+        return z * z * (xx * a[0] * b[0] + yy * a[1] * b[1] + xy * (a[0] * b[1] + a[1] * b[0]))
 
     p, q, r = projected(s, s) + 0.5 * alpha2, projected(t, t) + 0.5 * alpha2, projected(s, t)
-    scale = dr.rcp(p + q)
-    return dr.sqrt(dr.sqrt(p + q)), Lobe((p - q) * scale, 2 * r * scale, type(p)(1))
+    return (p + q) ** 0.25, np.stack([p - q, 2 * r], axis=-1) / (p + q)[..., None]
 
 
 def directions(types, count: int = PAIRS, seed: int = SEED) -> list[tuple]:
@@ -232,45 +234,72 @@ def roughness_levels(pyramid: Pyramid) -> list[np.ndarray]:
     return [pyramid.decode([m.name], level=level)[m.name][..., 0] for level in range(pyramid.levels)]
 
 
-def with_roughness(pyramid: Pyramid, levels: Sequence[np.ndarray]) -> Pyramid:
-    """Return a pyramid with another roughness, ``(height, width)`` for each level, in a stored channel of its own.
+def with_maps(pyramid: Pyramid, maps: Mapping[str, Sequence[np.ndarray]]) -> Pyramid:
+    """Return a pyramid with other ``maps``: role → levels, ``(height, width, channels)`` in [0, 1].
 
-    The pyramid is meant to be compressed in place of the source's.
+    They have stored channels of their own. A role that shading does not read is the name of a further map. Colours are
+    sRGB-encoded; z of normals follows from x and y. The pyramid is meant to be compressed in place of the source's.
     """
-    layout = pyramid.layout
-    old = maps_of(layout).get("roughness")
-    where = layout.stored
-    if old is not None and isinstance(old.where[0], int) and sum(old.where[0] in m.where for m in layout.maps) == 1:
-        where = old.where[0]
-    name = old.name if old is not None else "roughness"
-    new = MapLayout(name, "roughness", "linear", 1, (where,))
-    maps = tuple(new if m is old else m for m in layout.maps) + ((new,) if old is None else ())
-    initial, groups = layout.initial, layout.groups
-    if where == layout.stored:
-        initial, groups = (*initial, 0.5), (*groups, name)
-    values = []
-    for level, roughness in zip(pyramid.values, levels, strict=True):
-        value = np.clip(roughness, 0, 1)[..., None].astype(np.float32)
-        values.append(np.concatenate([level[..., :where], value, level[..., where + 1 :]], axis=-1))
-    changed = Layout(layout.width, layout.height, maps, initial, groups)
+    layout, old = pyramid.layout, maps_of(pyramid.layout)
+    kept = [m for m in layout.maps if m not in [old.get(role) for role in maps]]
+    channels = sorted({w for m in kept for w in m.where if isinstance(w, int)})
+    entries = [replace(m, where=tuple(channels.index(w) if w in channels else w for w in m.where)) for m in kept]
+    initial, groups = [layout.initial[c] for c in channels], [layout.groups[c] for c in channels]
+    values = [level[..., channels] for level in pyramid.values]
+    for role, levels in maps.items():
+        name, first = old[role].name if role in old else role, len(groups)
+        count = 2 if role == "normal" else levels[0].shape[-1]
+        where = (*range(first, first + count), *[FROM_NORMAL] * (role == "normal"))
+        space = "srgb" if role == "albedo" else "linear"
+        entries.append(MapLayout(name, role if role in READ else "other", space, 1, where))
+        initial, groups = [*initial, *[0.5] * count], [*groups, *[name] * count]
+        values = [
+            np.concatenate([a, b[..., :count].clip(0, 1).astype(np.float32)], axis=-1)
+            for a, b in zip(values, levels, strict=True)
+        ]
+    changed = Layout(layout.width, layout.height, tuple(entries), tuple(initial), tuple(groups))
     return Pyramid(changed, values, pyramid.types, pyramid.border)
 
 
-def biased(read: ShadedReader, biases: Sequence[float]) -> ShadedReader:
-    """Return ``read`` with ``biases`` added to the level of detail, one for each whole level, interpolated between."""
+def with_roughness(pyramid: Pyramid, levels: Sequence[np.ndarray]) -> Pyramid:
+    """Return a pyramid with another roughness, ``(height, width)`` for each level (:func:`with_maps`)."""
+    return with_maps(pyramid, {"roughness": [level[..., None] for level in levels]})
 
-    def at(u, v, level, wi, wo):
-        Float = type(u)
-        table = Float(aligned_copy(np.append(biases, biases[-1]), np.float32))
-        position = clamp(level, 0.0, float(len(biases) - 1))
+
+class ReadMaps(FilteredMaps):
+    """Maps of a filter as they are meant to be read.
+
+    ``biases`` are added to the level of detail, one for each whole level, interpolated between. A map :data:`LOBE` is
+    the shape of the specular lobe, in the form of extras.
+    """
+
+    def __init__(self, maps: FilteredMaps, biases: Sequence[float] = (0.0,)):
+        self.inner, self.biases = maps, biases
+        self.layout, self.types, self.border, self.levels = maps.layout, maps.types, maps.border, maps.levels
+        self.has_extras = LOBE in self.layout.names
+
+    def stored(self, u, v, active=True) -> list:
+        return self.inner.stored(u, v, active)
+
+    def biased(self, level):
+        Float = type(level)
+        table = Float(aligned_copy(np.append(self.biases, self.biases[-1]), np.float32))
+        position = clamp(level, 0.0, float(len(self.biases) - 1))
         lower = dr.uint32_array_t(Float)(position)
         a, b = dr.gather(Float, table, lower), dr.gather(Float, table, lower + 1)
-        return read(u, v, dr.maximum(level + dr.lerp(a, b, position - Float(lower)), 0), wi, wo)
+        return dr.maximum(level + dr.lerp(a, b, position - Float(lower)), 0)
 
-    return at
+    def filtered(self, u, v, level, active=True) -> list:
+        return self.inner.filtered(u, v, self.biased(level), active)
+
+    def extra(self, u, v, level, active=True) -> list | None:
+        if not self.has_extras:
+            return None
+        return [*self.maps(self.filtered(u, v, level, active), [LOBE])[LOBE], type(u)(1)]
 
 
-def choose_biases(read: ShadedReader, evaluation: ShadedEvaluation) -> list[float]:
-    """Return, for each level, the one of :data:`BIASES` with which ``read`` is nearest to the converged truth."""
-    psnr = [evaluation.measure(biased(read, [bias]), False)["C"]["psnr_db"] for bias in BIASES]
+def choose_biases(maps: FilteredMaps, effects: Effects, evaluation: ShadedEvaluation) -> list[float]:
+    """Return, for each level, the one of :data:`BIASES` with which ``maps`` are nearest to the converged truth."""
+    readers = (reader(ReadMaps(maps, [bias]), effects) for bias in BIASES)
+    psnr = [evaluation.measure(read, False)["C"]["psnr_db"] for read in readers]
     return [BIASES[i] for i in np.argmax(psnr, axis=0)]
