@@ -8,7 +8,6 @@ the truth's pixels are brighter; brightness is that of the unclipped values.
 
 from __future__ import annotations
 
-import gc
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -64,18 +63,13 @@ PARTS = ("whole", "near", "middle", "far")
 PASS = 2**22
 
 
-@dataclass(frozen=True)
-class SceneQuality:
-    """Film ``width`` (the height is 9/16 of it), samples a pixel of the truth and of other renders, number of views."""
+class SceneQuality(NamedTuple):
+    """Width and height of the film, samples a pixel of the truth and of other renders, and number of views."""
 
-    width: int = 320
+    film: tuple[int, int] = (320, 180)
     truth_spp: int = 512
-    spp: int = 64
+    spp: int = 128
     views: int = 3
-
-    @property
-    def film(self) -> tuple[int, int]:
-        return self.width, self.width * 9 // 16
 
 
 #: Function of how often maps repeat along u and v that returns a material for ``mi.load_dict``.
@@ -177,7 +171,8 @@ def parts(scene, film: tuple[int, int]) -> dict[str, np.ndarray]:
 def halves(scene, spp: int) -> np.ndarray:
     """Return two independent renders with half of the samples each, ``(2, height, width, 3)``."""
     width, height = scene.sensors()[0].film().size()
-    each = max(1, min(spp // 2, PASS // (width * height)))
+    most = max(1, min(spp // 2, PASS // (width * height)))
+    each = 4 ** int(math.log(most, 4) + 1e-9)  # the sampler rounds up to squares
     passes = max(1, spp // 2 // each)
     with dr.suspend_grad():
         images = [np.array(mi.render(scene, spp=each, seed=seed), np.float64) for seed in range(2 * passes)]
@@ -214,23 +209,25 @@ class FloorScenes:
         for spp in samples:
             footprint.attach(scene, 0, spp)
             images[spp] = halves(scene, self.quality.spp)
-        del scene
-        gc.collect()
         return images
 
     def measure(self, rendered: RenderedFile) -> dict[str, dict[str, dict]]:
         """Return the errors by lights and samples a pixel, one number a view.
 
-        ``psnr_db``, and ``brightness``: part → ratio of the brightness to that of the truth (``None``: not in view).
+        ``psnr_db``, and ``brightness``: part → ratio of the brightness to that of the truth.
         """
         figures = {lights: {str(n): {"psnr_db": [], "brightness": []} for n in SAMPLES} for lights in LIGHTS}
         for lights in LIGHTS:
             for view in VIEWS[: self.quality.views]:
                 truth, exposure, masks = self.truth(lights, view)
                 for spp, images in self.images(rendered, lights, view).items():
-                    a, b = np.clip(exposure * images, 0, 1) - np.clip(exposure * truth, 0, 1)
-                    of_view = figures[lights][str(spp)]
-                    of_view["psnr_db"].append(decibel(float(np.mean(a * b))))
-                    light = {part: (images[:, m].mean(), truth[:, m].mean()) for part, m in masks.items() if m.any()}
-                    of_view["brightness"].append({part: float(x / y) for part, (x, y) in light.items()})
+                    figures[lights][str(spp)]["psnr_db"].append(psnr(truth, images, exposure))
+                    ratios = {part: float(images[:, m].mean() / truth[:, m].mean()) for part, m in masks.items()}
+                    figures[lights][str(spp)]["brightness"].append(ratios)
         return figures
+
+
+def psnr(truth: np.ndarray, images: np.ndarray, exposure: float) -> float:
+    """Return the PSNR in dB of exposed and clipped values, without the noise of both pairs of halves."""
+    a, b = np.clip(exposure * images, 0, 1) - np.clip(exposure * truth, 0, 1)
+    return decibel(float(np.mean(a * b)))

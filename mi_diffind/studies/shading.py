@@ -29,7 +29,7 @@ from ..core.runtime import array_module
 from ..fitting import task
 from ..fitting.loop import FitResult
 from ..images import srgb
-from ..maps.pyramid import FilteredMaps, Pyramid, decibel
+from ..maps.pyramid import FilteredMaps, Pyramid
 from ..maps.source import Source, SourceError, load_source
 from ..measure import plot
 from ..measure.report import figure_caption
@@ -45,7 +45,7 @@ from ..tasks.texture.compressed import CompressedTexture, to_table
 from .baselines import codecs, normals
 from .example_maps import MATERIALS, example_maps
 from .materials import level_images, level_pyramid
-from .shaded_scenes import LIGHTS, VIEWS, FloorScenes, RenderedFile, SceneQuality
+from .shaded_scenes import LIGHTS, VIEWS, FloorScenes, RenderedFile, SceneQuality, psnr
 
 #: Compression ratio of all trainings.
 COMPRESSION = 12.0
@@ -103,8 +103,7 @@ class ShadingStudy(Study):
             details=details,
             notes=[
                 *codecs.install_notes(["astc"]),
-                f"{sizes}; equal bytes: {COMPRESSION:g}x; C: dB against the converged truth, L0 to L5: of each level of "
-                "detail; kernel: read at the levels of detail with the smallest error.",
+                f"{sizes}; equal bytes: {COMPRESSION:g}x; kernel: read at the levels of detail with the least error.",
             ],
             jobs=jobs,
             jobs_fingerprint=str(details),
@@ -178,7 +177,7 @@ class ShadingContenders:
 
     @cached_property
     def scenes(self) -> FloorScenes:
-        quality = SceneQuality(64, 32, 8, 1) if self.settings.quick else SceneQuality()
+        quality = SceneQuality((64, 36), 32, 8, 1) if self.settings.quick else SceneQuality()
         return FloorScenes(self.source, "repeat" if set(self.pyramid.border) == {"repeat"} else "mirror", quality)
 
     def add(self, label: str, method: str, fit: Callable, read: Callable, has_file: bool = False) -> Contender:
@@ -322,9 +321,9 @@ class ShadingContenders:
             shown = {"plain": plain, "ours": ours, **({} if seed else {"best": best})}
             renders = {name: self.scenes.measure(self.rendered(shown_job)) for name, shown_job in shown.items()}
             each = {name: [f for by_spp in r.values() for f in by_spp.values()] for name, r in renders.items()}
-            psnr = {name: np.concatenate([f["psnr_db"] for f in figures]) for name, figures in each.items()}
+            errors_db = {name: np.concatenate([f["psnr_db"] for f in figures]) for name, figures in each.items()}
             ratios = [ratio for f in each["ours"] for view in f["brightness"] for ratio in view.values()]
-            gains, mean_db = psnr["ours"] - psnr["plain"], lambda job: job.record["errors"]["c_mean_db"]
+            gains, mean_db = errors_db["ours"] - errors_db["plain"], lambda job: job.record["errors"]["c_mean_db"]
             errors = {
                 "over_best_db": mean_db(ours) - mean_db(best),
                 "over_lean_db": mean_db(ours) - mean_db(lean),
@@ -340,6 +339,9 @@ class ShadingContenders:
 
 # -- Pictures ----------------------------------------------------------------------------------------------------------
 
+#: Factor of the exposure in pictures, so that highlights are not white.
+DISPLAYED = 0.5
+
 
 def draw_levels(contexts: dict[str, ShadingContenders], result: dict):
     """Draw PSNR by level of detail of plain, ours, the best filter in equal bytes and uncompressed LEAN."""
@@ -353,7 +355,7 @@ def draw_levels(contexts: dict[str, ShadingContenders], result: dict):
             f"{lean.label}, uncompressed": lean,
         }
         values = {text: job.record["details"]["C"]["psnr_db"] for text, job in shown.items()}
-        panels[name] = [plot.Curve(text, range(len(psnr)), psnr) for text, psnr in values.items()]
+        panels[name] = [plot.Curve(text, range(len(by_level)), by_level) for text, by_level in values.items()]
     title = f"{result['title']}: quality of shaded images by level of detail"
     return plot.draw_curves(title, figure_caption(result), panels, "level of detail", "PSNR of shaded values, dB")
 
@@ -371,31 +373,32 @@ def draw_lambdas(contexts: dict[str, ShadingContenders], result: dict):
 
 
 def draw_renders(contexts: dict[str, ShadingContenders], result: dict):
-    """Draw a render under the sun of plain, the best filter in equal bytes, ours and the truth, with a part enlarged."""
+    """Draw a render under the sun of plain, the best filter in equal bytes, ours and the truth, a far part enlarged."""
     rows = {}
     for name, context in contexts.items():
         lights, view, scenes = LIGHTS[0], VIEWS[0], context.scenes
         truth, exposure, masks = scenes.truth(lights, view)
-        best, images = context.best("compressed"), {}
-        shown = {"plain texture": context.jobs["plain, seed 0"], f"best filter, {best.label}": best,
+        best, far = context.best("compressed"), masks["far"]
+        shown = {"plain texture": context.jobs["plain, seed 0"], f"best filter: {best.label}": best,
                  "ours, trained for its shading": context.runs[SHARE][0]}  # fmt: skip
         renders = {text: scenes.images(context.rendered(job), lights, view, [1])[1] for text, job in shown.items()}
+        window, rows[name] = far_window(renders["plain texture"].mean(axis=0) - truth.mean(axis=0), far), {}
         for text, halves in {**renders, "truth": truth}.items():
-            a, b = np.clip(exposure * halves, 0, 1) - np.clip(exposure * truth, 0, 1)
-            ratio = halves[:, masks["far"]].mean() / truth[:, masks["far"]].mean()
-            errors = (
-                "" if halves is truth else f"PSNR {decibel(float(np.mean(a * b))):.1f} dB, far {ratio - 1:+.1%} light"
-            )
-            whole = srgb.for_display(exposure * halves.mean(axis=0))
-            images[f"{text}\n{errors}"] = np.concatenate([whole, enlarged(whole, masks["far"])])
-        rows[name] = images
-    title = "Renders with the footprint of one sample a pixel, and their far part three times as large"
+            light = halves[:, far].mean() / truth[:, far].mean() - 1
+            errors = f"{psnr(truth, halves, exposure):.1f} dB, light of the far floor {light:+.1%}"
+            whole = srgb.for_display(DISPLAYED * exposure * halves.mean(axis=0))
+            part = whole[window].repeat(3, axis=0).repeat(3, axis=1)[:, : whole.shape[1]]
+            title = f"{text}\n{'' if halves is truth else errors}"
+            rows[name][title] = np.concatenate([whole, np.ones_like(whole[:2]), part])
+    title = "Renders with the footprint of one sample a pixel; below, a part of the far floor, three times as large"
     return plot.draw_images(title, figure_caption(result), rows, 3.4)
 
 
-def enlarged(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Return a third of the columns of an image, the rows of a mask, three times as large."""
+def far_window(difference: np.ndarray, mask: np.ndarray) -> tuple[slice, slice]:
+    """Return a third of the columns and a fifth of the rows at the top of a mask, where a difference is largest."""
     height, width = mask.shape
-    first = min(int(np.flatnonzero(mask.any(axis=1))[0]), height - height // 4)
-    part = image[first : first + height // 4, 2 * width // 3 :]
-    return part.repeat(3, axis=0).repeat(3, axis=1)[:, :width]
+    first, columns = int(np.flatnonzero(mask.any(axis=1))[0]), -(-width // 3)
+    rows = slice(first, first + height // 5)
+    error = np.abs(difference[rows]).mean(axis=-1) * mask[rows]
+    start = int(np.convolve(error.sum(axis=0), np.ones(columns), "valid").argmax())
+    return rows, slice(start, start + columns)
