@@ -340,7 +340,7 @@ class ShadingContenders:
 # -- Pictures ----------------------------------------------------------------------------------------------------------
 
 #: Factor of the exposure in pictures, so that highlights are not white.
-DISPLAYED = 0.5
+DISPLAYED = 0.7
 
 
 def draw_levels(contexts: dict[str, ShadingContenders], result: dict):

@@ -30,13 +30,13 @@ RUNS = {
     "image": ["m.json", "--seconds", "1"],
     "scene-training": [str(ROOT / "scenes" / "training_floor.xml")],
     "sdf": ["ball.ply", "--bytes", "24k"],
-    "shading": ["m.json", "--steps", "2", "--lambda", "1"],
+    "shading": ["m.json", "--lambda", "1"],
     "texture": ["m.json", "--seconds", "1", "--compression", "2x"],
 }
 
 #: Study → pictures beside accuracy against time or bytes.
 PICTURES = {
-    "sdf": ["shapes"], "field": ["views"], "texture": ["crops", "levels"], "shading": ["levels", "strip"],
+    "sdf": ["shapes"], "field": ["views"], "texture": ["crops", "levels"], "shading": ["lambda", "strip"],
 }  # fmt: skip
 
 

@@ -1,0 +1,68 @@
+"""Renders of a material from near to far: errors without noise, parts of the floor, and maps in place of a file."""
+
+import numpy as np
+import pytest
+
+from mi_diffind.maps.pyramid import Pyramid
+from mi_diffind.maps.source import from_arrays
+from mi_diffind.studies import shaded_scenes
+from mi_diffind.studies.baselines import normals
+from mi_diffind.studies.shaded_scenes import VIEWS, FloorScenes, RenderedFile, SceneQuality
+
+QUALITY = SceneQuality((48, 27), 512, 64, 1)
+
+
+@pytest.fixture(scope="module")
+def bumpy():
+    """A source of 32 × 32 texels: a rough surface with slopes, without metal."""
+    rng = np.random.default_rng(3)
+    n = np.concatenate([rng.normal(0, 0.15, (32, 32, 2)), np.ones((32, 32, 1))], axis=-1)
+    n /= np.linalg.norm(n, axis=-1, keepdims=True)
+    maps = {"albedo": rng.random((32, 32, 3)), "normal": 0.5 + 0.5 * n, "roughness": 0.4 + 0.2 * rng.random((32, 32))}
+    return from_arrays({name: np.rint(255 * values).astype(np.uint8) for name, values in maps.items()})
+
+
+@pytest.fixture
+def file(bumpy, mi_rgb, tmp_path):
+    from mi_diffind.fitting import task
+
+    fitted = task.fit("texture", bumpy, compression=2, steps=1, progress=False)
+    fitted.save(tmp_path / "m.npz")
+    return tmp_path / "m.npz"
+
+
+def test_errors_without_noise(rng):
+    """The noise of both pairs of halves is not counted."""
+    truth = np.full((2, 300, 300, 3), 0.4)
+    noise = rng.normal(0, 0.05, (2, *truth.shape))
+    assert shaded_scenes.psnr(0.5 * truth, 0.5 * (truth + 0.01), 2.0) == pytest.approx(40)
+    assert shaded_scenes.psnr(truth + noise[0], truth + 0.01 + noise[1], 1.0) == pytest.approx(40, abs=1)
+
+
+def test_parts_of_the_floor(bumpy, mi_rgb):
+    """Near lies below far in the picture, and no part is empty."""
+    scenes = FloorScenes(bumpy, "repeat", SceneQuality((48, 27), 2, 2, 3))
+    for view in VIEWS:
+        _, exposure, masks = scenes.truth("sun", view)
+        heights = [np.flatnonzero(masks[part].any(axis=1)).mean() for part in ("near", "middle", "far")]
+        assert heights[0] > heights[1] > heights[2] and exposure > 0
+        assert (masks["near"].astype(int) + masks["middle"] + masks["far"] <= masks["whole"]).all()
+
+
+def test_exact_maps_approach_the_truth(bumpy, file, mi_rgb):
+    """Uncompressed maps in place of the file's, at level 0 and without its footprints, are the truth."""
+    from mi_diffind.core.runtime import array_module
+    from mi_diffind.tasks import texture
+    from mi_diffind.tasks.texture.fit import source_layout
+
+    layout = source_layout(bumpy, texture.PRESETS["ours"])
+    pyramid = Pyramid.from_source(bumpy, layout, array_module(mi_rgb.variant()), ("repeat", "repeat"))
+    scenes = FloorScenes(bumpy, "repeat", QUALITY)
+    level_0, footprints = (
+        scenes.measure(RenderedFile(file, normals.ReadMaps(pyramid, [bias]))) for bias in (-20.0, 0.0)
+    )
+    for lights in shaded_scenes.LIGHTS:
+        for spp in ("4", "16"):  # the read of a single sample is that of the pixel's centre
+            assert level_0[lights][spp]["psnr_db"][0] > max(35, 5 + footprints[lights][spp]["psnr_db"][0])
+            for ratio in level_0[lights][spp]["brightness"][0].values():
+                assert ratio == pytest.approx(1, abs=0.02)
