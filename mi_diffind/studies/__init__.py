@@ -3,7 +3,7 @@
 Each module here that has a ``STUDY`` (:class:`mi_diffind.measure.study.Study`), and each that an entry point of the
 group ``mi_diffind.studies`` names, declares one. Studies load plugins, so this package lies above them.
 :mod:`.baselines` are the methods that tables compete with, :mod:`.equal_memory` and :mod:`.materials` the contenders of
-comparisons in equal bytes.
+comparisons in equal bytes, :mod:`.shaded_scenes` the renders of a study.
 """
 
 from __future__ import annotations
