@@ -53,9 +53,6 @@ COMPRESSION = 12.0
 #: Weight λ of the shading loss by default.
 SHARE = shading_task.PRESETS["ours"].share
 
-#: Options of the arrays, which ``fit texture`` chooses.
-SIZES = ("structure", "skip", "cascaded")
-
 #: Levels of detail whose errors are measured.
 LEVELS = 6
 
@@ -283,7 +280,8 @@ class ShadingContenders:
     def train_filter(self, build: Callable[[], Pyramid], job: Contender, progress: bool) -> tuple[Table, FitResult]:
         """Train our arrays for the pyramid of a filter, as ``fit texture`` does for that of the source."""
         recipe = texture_task.TASK.change_settings(texture_task.PRESETS["ours"], self.settings.steps)
-        request, options = task.FitRequest("ours", recipe, self.pyramid.types, progress=progress), dict.fromkeys(SIZES)
+        request = task.FitRequest("ours", recipe, self.pyramid.types, progress=progress)
+        options = dict.fromkeys(("structure", "skip", "cascaded"))  # chosen by content
         size = texture_fit.find_size(self.source, build(), self.source.nbytes / COMPRESSION, recipe, options)
         problem = texture_fit.build_problem(self.source, size, recipe, build())
         result = request.train(problem, f"train {job.name}")
@@ -319,17 +317,24 @@ class ShadingContenders:
             plain, ours = self.jobs[f"plain, seed {seed}"], self.runs[SHARE][seed]
             best, lean = self.best("compressed"), self.best("classical", "LEAN")
             shown = {"plain": plain, "ours": ours, **({} if seed else {"best": best})}
-            renders = {name: self.scenes.measure(self.rendered(shown_job)) for name, shown_job in shown.items()}
-            each = {name: [f for by_spp in r.values() for f in by_spp.values()] for name, r in renders.items()}
-            errors_db = {name: np.concatenate([f["psnr_db"] for f in figures]) for name, figures in each.items()}
-            ratios = [ratio for f in each["ours"] for view in f["brightness"] for ratio in view.values()]
-            gains, mean_db = errors_db["ours"] - errors_db["plain"], lambda job: job.record["errors"]["c_mean_db"]
+            renders = {name: self.scenes.measure(self.rendered(contender)) for name, contender in shown.items()}
+            gains, ratios = {}, {"plain": [], "ours": []}
+            for lights, by_spp in renders["ours"].items():
+                for spp, figures in by_spp.items():
+                    before = renders["plain"][lights][spp]
+                    gains[f"{lights}_{spp}_gain_db"] = np.subtract(figures["psnr_db"], before["psnr_db"])
+                    for name in ratios:
+                        views = renders[name][lights][spp]["brightness"]
+                        ratios[name] += [abs(ratio - 1) for view in views for ratio in view.values()]
+            mean_db = lambda contender: contender.record["errors"]["c_mean_db"]  # noqa: E731
             errors = {
                 "over_best_db": mean_db(ours) - mean_db(best),
                 "over_lean_db": mean_db(ours) - mean_db(lean),
-                "renders_gain_db": float(gains.mean()),
-                "renders_worst_db": float(gains.min()),
-                "brightness_error": max(abs(ratio - 1) for ratio in ratios),
+                "renders_gain_db": float(np.mean([*gains.values()])),
+                "renders_worst_db": float(np.min([*gains.values()])),
+                "brightness_error": max(ratios["ours"]),
+                "plain_brightness_error": max(ratios["plain"]),
+                **{name: float(gain.mean()) for name, gain in gains.items()},
             }
             details = {"material": self.name, "kind": job.method, "label": job.label, "best": best.label}
             return {"errors": errors, "details": {**details, "lean": lean.label, "renders": renders}}
