@@ -384,8 +384,11 @@ def draw_renders(contexts: dict[str, ShadingContenders], result: dict):
         lights, view, scenes = LIGHTS[0], VIEWS[0], context.scenes
         truth, exposure, masks = scenes.truth(lights, view)
         best, far = context.best("compressed"), masks["far"]
-        shown = {"plain texture": context.jobs["plain, seed 0"], f"best filter: {best.label}": best,
-                 "ours, trained for its shading": context.runs[SHARE][0]}  # fmt: skip
+        shown = {
+            "plain texture": context.jobs["plain, seed 0"],
+            f"classical filter in equal bytes ({best.label})": best,
+            "ours, trained for its shading": context.runs[SHARE][0],
+        }
         renders = {text: scenes.images(context.rendered(job), lights, view, [1])[1] for text, job in shown.items()}
         window, rows[name] = far_window(renders["plain texture"].mean(axis=0) - truth.mean(axis=0), far), {}
         for text, halves in {**renders, "truth": truth}.items():
@@ -395,7 +398,7 @@ def draw_renders(contexts: dict[str, ShadingContenders], result: dict):
             part = whole[window].repeat(3, axis=0).repeat(3, axis=1)[:, : whole.shape[1]]
             title = f"{text}\n{'' if halves is truth else errors}"
             rows[name][title] = np.concatenate([whole, np.ones_like(whole[:2]), part])
-    title = "Renders with the footprint of one sample a pixel; below, a part of the far floor, three times as large"
+    title = "A sunlit floor from near to far, one sample a pixel; below, a part of the far floor, three times as large"
     return plot.draw_images(title, figure_caption(result), rows, 3.4)
 
 
