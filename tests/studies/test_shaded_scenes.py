@@ -1,13 +1,24 @@
 """Renders of a material from near to far: errors without noise, parts of the floor, and maps in place of a file."""
 
+import drjit as dr
 import numpy as np
 import pytest
+from arrays import numpy_of
 
+from mi_diffind.arrays.tables import save_table
+from mi_diffind.core.runtime import array_module
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
+from mi_diffind.measure.renders import directions
 from mi_diffind.studies import shaded_scenes
 from mi_diffind.studies.baselines import normals
 from mi_diffind.studies.shaded_scenes import VIEWS, FloorScenes, RenderedFile, SceneQuality
+from mi_diffind.tasks import texture
+from mi_diffind.tasks.shading.evaluation import reader
+from mi_diffind.tasks.shading.material import material_effects
+from mi_diffind.tasks.texture import fit
+from mi_diffind.tasks.texture.compressed import CompressedTexture, to_table
+from mi_diffind.tasks.texture.fit import source_layout
 
 QUALITY = SceneQuality((48, 27), 512, 64, 1)
 
@@ -49,12 +60,31 @@ def test_parts_of_the_floor(bumpy, mi_rgb):
         assert (masks["near"].astype(int) + masks["middle"] + masks["far"] <= masks["whole"]).all()
 
 
+def test_lean_in_a_material(bumpy, mi_rgb, tmp_path):
+    """The plugin with LEAN's maps in place of those of a file, against the shading of the same maps."""
+    mi, layout = mi_rgb, source_layout(bumpy, texture.PRESETS["ours"])
+    pyramid = Pyramid.from_source(bumpy, layout, array_module(mi.variant()), ("repeat", "repeat"))
+    lean, recipe = normals.lean_pyramid(pyramid), texture.PRESETS["ours"]
+    size = fit.find_size(bumpy, lean, bumpy.nbytes / 2, recipe, dict.fromkeys(("structure", "skip", "cascaded")))
+    net = fit.stored_form(fit.build_problem(bumpy, size, recipe, lean).net)
+    save_table(tmp_path / "lean.npz", to_table(CompressedTexture(lean.layout, net), {}))
+    maps = normals.ReadMaps(lean)
+    bsdf = mi.load_dict(RenderedFile(tmp_path / "lean.npz", maps).material(bumpy, "repeat")((1, 1)))
+    bsdf.maps.image = maps
+    si, wo, _, _ = directions(256)
+    for level in (0, 3):
+        side = 2.0**level / 32
+        si.duv_dx, si.duv_dy = mi.Vector2f(side, 0), mi.Vector2f(0, side)
+        value = numpy_of(np.pi * bsdf.eval(mi.BSDFContext(), si, wo))
+        lanes = dr.opaque(mi.Float, level, 256), mi.Vector3f(si.wi), mi.Vector3f(wo)
+        expected = numpy_of(reader(maps, material_effects(layout)[0])(si.uv.x, si.uv.y, *lanes))
+        np.testing.assert_allclose(value, expected, rtol=2e-3, atol=1e-4)
+        plain = numpy_of(reader(pyramid, material_effects(layout)[0])(si.uv.x, si.uv.y, *lanes))
+        assert np.abs(expected - plain).max() > 0.01
+
+
 def test_exact_maps_approach_the_truth(bumpy, file, mi_rgb):
     """Uncompressed maps in place of the file's, at level 0 and without its footprints, are the truth."""
-    from mi_diffind.core.runtime import array_module
-    from mi_diffind.tasks import texture
-    from mi_diffind.tasks.texture.fit import source_layout
-
     layout = source_layout(bumpy, texture.PRESETS["ours"])
     pyramid = Pyramid.from_source(bumpy, layout, array_module(mi_rgb.variant()), ("repeat", "repeat"))
     scenes = FloorScenes(bumpy, "repeat", QUALITY)
