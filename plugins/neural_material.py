@@ -12,8 +12,8 @@ from mi_diffind.maps.layout import Layout, MapLayout
 from mi_diffind.tasks.disney import TASK as DISNEY
 from mi_diffind.tasks.disney.decoder import Lobe
 from mi_diffind.tasks.disney.model import PARAMETERS, clamp
-from mi_diffind.tasks.shading.material import frame, shadowing, specular_lobe
 from mi_diffind.tasks.texture import TASK
+from mi_diffind.tasks.texture.surface import frame, shadowing, specular_lobe
 
 from . import Counterpart, Plugin
 from .disney import Disney, Parameters, ShadedPoint, to_principled

@@ -108,7 +108,7 @@ def test_imports_point_down():
 
 
 #: A task → those that it is made of: shading trains the arrays of one through the tables of another.
-MADE_OF = {"shading": ("texture", "disney")}
+MADE_OF = {"texture": ("disney",), "shading": ("texture", "disney")}
 
 
 def task_of(name: str) -> str:
@@ -178,7 +178,7 @@ def test_no_circles():
 #: Flow → the modules that it begins with (those that exist), and the most files that it reaches by imports of any kind.
 #: The aim: 30 files to fit a texture, 25 to read one, 40 to fit a field.
 FLOWS = {
-    "fit texture": (("tasks.texture", "tasks.texture.fit", "tasks.texture.model", "tasks.texture.compressed"), 30),
+    "fit texture": (("tasks.texture", "tasks.texture.fit", "tasks.texture.model", "tasks.texture.compressed"), 31),
     "read neural_texture": (("plugins.neural_texture",), 34),
     "fit field": (("tasks.radiance", "tasks.radiance.fit", "tasks.radiance.model", "tasks.radiance.files"), 38),
 }

@@ -7,7 +7,7 @@ Classical filters of normals (:mod:`.baselines.normals`) are measured uncompress
 hold, Toksvig's roughness too, also by ASTC in equal bytes. LEAN's moments have no limits, which encoders of bytes need.
 Each is also read at other levels of detail, those with the smallest error: the *kernel*.
 
-*Errors* are those of :class:`~mi_diffind.tasks.shading.evaluation.ShadedEvaluation`: PSNR of shaded values and FLIP,
+*Errors* are those of :class:`~mi_diffind.tasks.texture.appearance.ShadedEvaluation`: PSNR of shaded values and FLIP,
 under views and lights of no training, against C, the converged truth, and P, the paper's reference.
 """
 
@@ -35,13 +35,12 @@ from ..measure import plot
 from ..measure.report import figure_caption
 from ..measure.study import Measure, Plan, Study
 from ..measure.training import Contender
-from ..tasks import shading as shading_task
 from ..tasks import texture as texture_task
-from ..tasks.shading.evaluation import TRUTHS, ShadedEvaluation, ShadedReader, reader
-from ..tasks.shading.material import frozen_decoder, material_effects
-from ..tasks.shading.training import fit_shading, trainable_arrays
+from ..tasks.texture.appearance import TRUTHS, ShadedEvaluation, ShadedReader, reader
 from ..tasks.texture.compressed import CompressedTexture
-from ..tasks.texture.fit import source_layout
+from ..tasks.texture.shading import fit_shading, trainable_arrays
+from ..tasks.texture.surface import frozen_decoder, material_effects
+from ..tasks.texture.training import source_layout
 from .baselines import codecs, normals
 from .example_maps import MATERIALS, example_maps
 from .materials import level_images, level_pyramid
@@ -264,7 +263,7 @@ class ShadingContenders:
 
         def train(job: Contender, progress: bool) -> tuple[Table, FitResult]:
             given = {"steps": self.settings.steps, "seed": seed, "share": share, "level_bias": None if share else 0.0}
-            recipe = shading_task.TASK.change_settings(shading_task.PRESETS["ours"], given)
+            recipe = texture_task.TASK.change_settings(texture_task.SHADING_PRESETS["ours"], given)
             request = task.FitRequest("ours", recipe, self.pyramid.types, progress=progress)
             arrays = trainable_arrays(texture_task.TASK.load(start.file), self.pyramid)
             return fit_shading(self.source, arrays, recipe, request, self.pyramid, self.evaluation)

@@ -1,8 +1,8 @@
 """Task 5 inside a scene: arrays of textures or materials, trained through renders of the scene that shows them.
 
 References are renders of the same scene with exact plugins and many samples. The result is a table file of the task
-``texture``. This package stands above plugins and scenes, which it renders; :mod:`mi_diffind.tasks.shading` trains for
-shaded values without a scene.
+``texture``. This package stands above plugins and scenes, which it renders; training for shaded values without a scene
+is :mod:`mi_diffind.tasks.texture.shading`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Classical filters of normal maps that shading-aware textures are compared with.
 
 Each takes the maps of a material at every level of detail, uncompressed. A reader is a function
-``(u, v, level, wi, wo) → Array3f`` of shaded values, as in :mod:`mi_diffind.tasks.shading.evaluation`, whose ``reader``
+``(u, v, level, wi, wo) → Array3f`` of shaded values, as in :mod:`mi_diffind.tasks.texture.appearance`, whose ``reader``
 shades a pyramid of filtered parameters, with normals brought to length 1.
 
 - :func:`toksvig_levels`: roughness increased by the length of the mean normal (Toksvig, *Mipmapping Normal Maps*,
@@ -32,8 +32,8 @@ from ...maps.pyramid import Pyramid, halve
 from ...tasks.disney.decoder import Decoder, Lobe
 from ...tasks.disney.model import ALPHA_MIN, Effects
 from ...tasks.disney.training import uniform_hemisphere
-from ...tasks.shading.evaluation import ShadedEvaluation, ShadedReader, reference
-from ...tasks.shading.material import DEFAULTS, frame, maps_of, shaded, surface_of
+from ...tasks.texture.appearance import ShadedEvaluation, ShadedReader, reference
+from ...tasks.texture.surface import DEFAULTS, frame, maps_of, shaded, surface_of
 
 #: Least third component in the slope of a normal: a slope of 10.
 STEEPEST = 0.1

@@ -15,11 +15,13 @@ from ...maps.pyramid import Pyramid
 from ...maps.source import load_source
 from ..texture import PRESETS as TEXTURES
 from ..texture import TASK as TEXTURE
+from ..texture import ShadingSettings
 from ..texture import fit as texture_fit
-from ..texture import fit as textures
+from ..texture import shading as training
+from ..texture import surface as material
+from ..texture import training as textures
+from ..texture.appearance import ShadedEvaluation
 from ..texture.compressed import neutral_extras, read_level_bias
-from . import ShadingSettings, material, training
-from .evaluation import ShadedEvaluation
 
 #: Number of pairs of view and light of the images that measure. Many, since a few pairs near the mirror direction
 #: dominate the PSNR.

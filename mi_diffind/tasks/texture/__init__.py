@@ -1,8 +1,10 @@
-"""Compressed textures and materials that are filtered as they are read (task 4), and recipes of their fits.
+"""Compressed textures and materials that are filtered as they are read (tasks 4 and 5), and recipes of their fits.
 
-Sources, stored channels and the reference, a mip pyramid, are in :mod:`mi_diffind.maps`. :mod:`.nets`: reads of the
-arrays; :mod:`.arrays`: resolutions and initial entries; :mod:`.compressed`: files and models; :mod:`.training`: the
-training problem; :mod:`.fit`: the command ``fit texture``.
+Sources, stored channels and the reference, a mip pyramid, are in :mod:`mi_diffind.maps`. :mod:`.arrays`: resolutions
+and initial entries; :mod:`.compressed`: reads of the arrays, files and models; :mod:`.training`: training for the
+values of the maps; :mod:`.shading`: training for shaded appearance, through frozen tables of task 2; :mod:`.surface`:
+maps as parameters of the BRDF, and shading; :mod:`.appearance`: references, images that measure, and a preview;
+:mod:`.fit`: the command ``fit texture``.
 """
 
 from __future__ import annotations
@@ -50,6 +52,51 @@ PRESETS = {
     "paper": TextureSettings(
         steps=375, batch=2**20, lr=1e-3, schedule="constant", loss="mae", layered=False, once=False, normals=False,
         jitter=1.0, rounded=False, samples="power",
+    ),
+}  # fmt: skip
+
+
+#: Sample patterns of the reference (:data:`.appearance.SAMPLES_PER_SIDE`).
+REFERENCES = ("jittered", "prefiltered", "converged")
+
+
+@dataclass(frozen=True)
+class ShadingSettings(FitSettings):
+    """Training for shaded appearance, which starts from a trained texture; the defaults are those of ``ours``.
+
+    ``share``: λ, the share of the loss of shaded values. ``clip``: bound of the derivatives of a sample's error through
+    the specular lobe (``None``: unlimited). ``reference``: sample pattern of the reference. ``bounded``: whether values
+    above 1 are compared in log space. ``level_bias``: levels by which a footprint's level of detail is read finer
+    (negative), stored in the file (``None``: chosen by images). ``extras``: whether the shape and weight of the
+    specular lobe are tried as coarse extras, which ``neural_material`` alone reads. ``fixed``: whether the
+    entries that fine levels read keep their values. ``beta_2``: Adam's decay of squared gradients; highlights are rare,
+    and with 0.999 single ones tilt normals of glossy, flat pages by degrees. ``texture``: preset of task 4, which
+    trains the start unless one is given, and defines the samples and the loss of the texture; ``loss`` is that of
+    shaded values.
+    """
+
+    steps: int = 1500
+    batch: int = 2**16
+    lr: float = 5e-3
+    loss: str = "mse"
+    measure_every: int = 150
+    share: float = 0.9
+    clip: float | None = 1.0
+    reference: str = "jittered"
+    bounded: bool = True
+    level_bias: float | None = None
+    extras: bool = False
+    fixed: bool = False
+    beta_2: float = 0.99
+    texture: str = "ours"
+
+
+#: Settings of the training for shading by preset. The paper's λ is 0.1 or 0.25, by its scene.
+SHADING_PRESETS = {
+    "ours": ShadingSettings(),
+    "paper": ShadingSettings(
+        lr=1e-3, schedule="constant", loss="mae", share=0.25, clip=0.1, reference="prefiltered", bounded=False,
+        level_bias=0.0, beta_2=0.999, texture="paper",
     ),
 }  # fmt: skip
 

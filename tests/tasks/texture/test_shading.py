@@ -27,12 +27,15 @@ from mi_diffind.tasks.disney import TASK as DISNEY
 from mi_diffind.tasks.disney.decoder import Decoder
 from mi_diffind.tasks.disney.model import Effects
 from mi_diffind.tasks.disney.training import uniform_hemisphere
-from mi_diffind.tasks.shading import PRESETS, material, training
 from mi_diffind.tasks.shading import fit as shading_fit
-from mi_diffind.tasks.shading.evaluation import ShadedEvaluation, reader, reference
 from mi_diffind.tasks.texture import PRESETS as TEXTURES
+from mi_diffind.tasks.texture import SHADING_PRESETS as PRESETS
 from mi_diffind.tasks.texture import TASK as TEXTURE
-from mi_diffind.tasks.texture import fit as textures
+from mi_diffind.tasks.texture import fit as texture_fit
+from mi_diffind.tasks.texture import shading as training
+from mi_diffind.tasks.texture import surface as material
+from mi_diffind.tasks.texture import training as textures
+from mi_diffind.tasks.texture.appearance import ShadedEvaluation, reader, reference
 from mi_diffind.tasks.texture.compressed import CompressedTexture
 
 OURS = PRESETS["ours"]
@@ -239,7 +242,7 @@ def start(ad, tmp_path_factory):
     recipe = dataclasses.replace(recipe, steps=60, batch=4096, measure_every=60)
     options = {argument.name: argument.default for argument in TEXTURE.arguments} | {"structure": "0:1:2,1:2:4"}
     options["skip"] = 2
-    size = textures.find_size(source, pyramid, source.nbytes / 2, recipe, options)
+    size = texture_fit.find_size(source, pyramid, source.nbytes / 2, recipe, options)
     request = FitRequest("ours", recipe, ad, progress=False)
     table, _ = textures.fit_texture(source, size, recipe, request, pyramid)
     path = tmp_path_factory.mktemp("shading") / "start.npz"

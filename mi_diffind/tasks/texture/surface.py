@@ -26,7 +26,7 @@ from ..disney import TASK as DISNEY
 from ..disney.decoder import Decoder, Lobe
 from ..disney.model import PARAMETERS, Effects, Material, find_effects, sanitize
 from ..disney.training import shade
-from ..texture.compressed import NEUTRAL
+from .compressed import NEUTRAL
 
 #: Values of parameters without a map, the defaults of the plugin ``disney``.
 DEFAULTS = {**dict.fromkeys(PARAMETERS, 0.0), "roughness": 0.5, "specular": 0.5}
