@@ -10,12 +10,13 @@ maps as parameters of the BRDF, and shading; :mod:`.appearance`: references, ima
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from ...core.arguments import Argument, between, checked, natural, positive
+from ...core.arguments import Argument, between, checked, fraction, natural, positive
 from ...fitting.task import FitSettings, Task
-from ...maps.arguments import BIAS_RANGE, DECODED, SIZES, SOURCE, SOURCES
+from ...maps.arguments import BIAS_RANGE, DECODED, PREVIEW, SIZES, SOURCE, SOURCES
 
 
 @dataclass(frozen=True)
@@ -126,13 +127,23 @@ def parse_structure(text: str) -> tuple[FineArray, ...]:
     return fine
 
 
+def bias_or_auto(text: str) -> float | str:
+    """Return a bias of the level of detail (:data:`.BIAS_RANGE`), or ``auto``. Raises ``ArgumentTypeError``."""
+    return text if text == "auto" else between(*BIAS_RANGE)(text)
+
+
 class Texture(Task):
-    """Task of filtered textures; presets are :data:`PRESETS`, entries have 8 bits or fewer."""
+    """Task of filtered textures; presets are :data:`PRESETS`, entries have 8 bits or fewer.
+
+    The training has two stages: for the values of the maps (:class:`TextureSettings`), and for the shading of materials
+    (:class:`ShadingSettings`).
+    """
 
     name = "texture"
     title = "a texture or the maps of a material at every level of detail"
     files = "compressed"
-    section = "supplemental 1.4"
+    section = "supplemental 1.4 and 1.5"
+    former = {"shading": "materials are trained for their shading by fit texture, see its --shading"}  # noqa: RUF012
     example = "material.json --compression 12x"
     plugin = ("texture", "neural_texture")
     presets = PRESETS
@@ -161,10 +172,31 @@ class Texture(Task):
             help="distribution of levels of detail in training (default: levels for ours, power for paper)",
         ),
         Argument(
-            "--level-bias", type=between(*BIAS_RANGE), default=0.0, metavar="N",
-            help="levels by which the texture is read finer than the footprint, as in -0.5 (default: 0)",
+            "--shading", choices=("auto", "on", "off"), default="auto",
+            help="a last stage that trains a material for its shaded appearance; auto: with a map of normals or "
+            "roughness, but not for paper (default: auto)",
+        ),
+        Argument(
+            "--start", file="read", metavar="FILE.npz",
+            help="arrays that the last stage begins with, as written by fit texture, in place of the first stage",
+        ),
+        Argument(
+            "--lambda", dest="share", type=fraction, metavar="L",
+            help="share of the loss of shaded values in the last stage, 0 to 1 "
+            f"(default: {', '.join(f'{r.share} for {name}' for name, r in SHADING_PRESETS.items())})",
+        ),
+        Argument(
+            "--extras", choices=("auto", "off"), default="auto",
+            help="shape and weight of the highlight in coarse grids beside the maps, read by neural_material alone; "
+            "auto keeps them if shaded images gain (default: auto)",
+        ),
+        Argument(
+            "--level-bias", type=bias_or_auto, default="auto", metavar="auto|N",
+            help="levels by which the texture is read finer than the footprint, as in -0.5 (default: auto, chosen by "
+            "shaded images in the last stage, 0 without it and for paper)",
         ),
         *SOURCES,
+        PREVIEW,
     )  # fmt: skip
     decode_arguments = (
         *DECODED,
@@ -174,6 +206,18 @@ class Texture(Task):
     def settings(self, preset, given, options):
         samples = options["footprint_samples"] or PRESETS[preset].samples
         return self.change_settings(PRESETS[preset], {"samples": samples, **given})
+
+    def shading_settings(self, preset: str, settings: TextureSettings, options: Mapping) -> ShadingSettings:
+        """Return the settings of the training for shading beside those of the texture.
+
+        Number of steps, unless it is that of the preset, and seed are those of the texture's ``settings``.
+        """
+        given = {"seed": settings.seed, "deterministic": settings.deterministic, "share": options["share"]}
+        given["steps"] = settings.steps if settings.steps != PRESETS[preset].steps else None
+        given["level_bias"] = options["level_bias"] if options["level_bias"] != "auto" else None
+        given["extras"] = options["extras"] == "auto" and PRESETS[preset].layered
+        given = {name: value for name, value in given.items() if value is not None}
+        return self.change_settings(SHADING_PRESETS[preset], given)
 
     def usage(self, table, file):
         lines = super().usage(table, file)

@@ -68,6 +68,12 @@ def maps_of(layout: Layout) -> dict[str, MapLayout]:
     return by_role
 
 
+def varies_shading(layout: Layout) -> bool:
+    """Return whether footprints show another shading than the mean of their maps: normals or roughness vary."""
+    varying = [m for m in layout.maps if any(isinstance(channel, int) for channel in m.where)]
+    return any(m.role in ("normal", "roughness") for m in varying)
+
+
 def left_out(layout: Layout) -> dict[str, str]:
     """Return the names of maps that are not shaded, each with the reason."""
     reason = "the BRDF has no such parameter, its loss is that of a texture"

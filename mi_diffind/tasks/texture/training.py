@@ -145,12 +145,14 @@ def fit_texture(
     request: FitRequest,
     pyramid: Pyramid,
     level_bias: float = 0.0,
+    title: str | None = None,
 ) -> tuple[Table, FitResult]:
     """Train the arrays of ``source`` and return the table, with its errors, and the record of the training.
 
     ``size`` is ``None`` for a texture of one colour, which needs no arrays. ``request`` holds the Dr.Jit types, the
     time and the checkpoint; its settings are replaced by those of the ``recipe``. ``level_bias`` is stored in the file;
-    levels are trained as they are stored. Errors are those of :meth:`.CompressedTexture.measure`.
+    levels are trained as they are stored. ``title`` stands before the progress bar. Errors are those of
+    :meth:`.CompressedTexture.measure`.
     """
     request = dataclasses.replace(request, settings=recipe)
     problem = None if size is None else build_problem(source, size, recipe, pyramid)
@@ -158,7 +160,7 @@ def fit_texture(
     def stored() -> CompressedTexture:
         return CompressedTexture(pyramid.layout, problem and stored_form(problem.net), (problem and level_bias) or 0.0)
 
-    return fit_maps(request, source, problem, stored, to_table, CompressedTexture.from_table)
+    return fit_maps(request, source, problem, stored, to_table, CompressedTexture.from_table, title)
 
 
 def stored_form(net):
