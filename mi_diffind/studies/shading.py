@@ -249,8 +249,9 @@ class ShadingContenders:
         """Register a texture that task 4 trains."""
 
         def train(job: Contender, progress: bool) -> tuple[Table, FitResult]:
-            fitted = task.fit("texture", self.source, compression=COMPRESSION, steps=self.settings.texture_steps,
-                              seed=seed, variant=mi.variant(), progress=progress, output=job.file)  # fmt: skip
+            fitted = task.fit("texture", self.source, compression=COMPRESSION, shading="off",
+                              steps=self.settings.texture_steps, seed=seed,
+                              variant=mi.variant(), progress=progress, output=job.file)  # fmt: skip
             return fitted.table, fitted.result
 
         return self.add_trained(f"texture, seed {seed}", "start", train)

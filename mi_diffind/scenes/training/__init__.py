@@ -42,7 +42,7 @@ class SceneTraining(Task):
     def check(self, request: FitRequest) -> None:
         source = request.options["source"]
         if isinstance(source, (str, os.PathLike, type(None))) and not str(source).lower().endswith(".xml"):
-            raise UsageError(f"source: found {source}, a scene file (.xml) is needed; fit shading trains maps")
+            raise UsageError(f"source: found {source}, a scene file (.xml) is needed; fit texture trains maps")
 
     def output_path(self, path: str | os.PathLike) -> Path:
         """Return the path of the output: a table file, or a folder for several, which exists or has no extension."""

@@ -576,8 +576,6 @@ def test_training_goes_on_from_a_file(start, small, manifest, tmp_path):
     assert both.table.settings["before"] == last.table.settings["before"]
     for name, array in both.table.arrays.items():
         assert np.array_equal(array.entries, last.table.arrays[name].entries), name
-    paper = dict(load_table(plain).arrays)
-    paper["primary0"] = paper.pop("coarse")
     request = FitRequest("ours", TEXTURES["ours"], ad, options={"source": "other.json"})
     with pytest.raises(UsageError, match=r"was made from another source than other\.json"):
         texture_fit.load_start(plain, from_arrays(bumpy(seed=9)), request)
@@ -586,7 +584,7 @@ def test_training_goes_on_from_a_file(start, small, manifest, tmp_path):
         texture_fit.load_start(plain, from_arrays(bumpy()), paper)
 
 
-def test_auto_is_for_materials_whose_shading_changes(manifest, tmp_path):
+def test_auto_is_for_materials_whose_shading_changes(ad, tmp_path):
     """Other sources are trained as without the last stage, to the byte, and a line says why."""
     maps = bumpy(16)
     smooth = np.full((16, 16, 1), 90, np.uint8)
@@ -606,8 +604,10 @@ def test_auto_is_for_materials_whose_shading_changes(manifest, tmp_path):
         assert line.startswith(f"not trained for its shading: {reason}")
         with pytest.raises(UsageError, match=f"--lambda: found 0.5, but nothing is trained for its shading: {reason}"):
             mi_diffind.fit("texture", source, share=0.5, **given)
-    fitted = mi_diffind.fit("texture", bumpy(32), preset="paper", **given)
-    assert "not trained for its shading: the preset paper does so with --shading on" in fitted.lines
+    layout, options = pyramid_of(maps, ad)[1].layout, {"shading": "auto"}
+    for preset, reason in (("ours", ""), ("paper", "the preset paper does so with --shading on")):
+        request = FitRequest(preset, TEXTURES[preset], ad, options=options)
+        assert texture_fit.reason_without_shading(layout, request) == reason
 
 
 @pytest.mark.parametrize(
@@ -619,9 +619,9 @@ def test_auto_is_for_materials_whose_shading_changes(manifest, tmp_path):
         (["--start", "x.npz", "--skip", "3", "--structure", "auto"], "their size, leave out --structure, --skip"),
         (
             ["--start", "x.npz", "--shading", "off"],
-            "--start: found x.npz, but nothing is trained for its shading: --sh",
+            "--start: found x.npz, but nothing is trained for its shading",
         ),
-        (["--lambda", "0.5", "--shading", "off"], "--lambda: found 0.5, but nothing is trained for its shading: --sh"),
+        (["--lambda", "0.5", "--shading", "off"], "--lambda: found 0.5, but nothing is trained for its shading"),
         (["--preview", "x.png", "--shading", "off"], "--preview: found x.png, but nothing is trained for its shading"),
         (["--level-bias", "0.5"], "argument --level-bias: found '0.5', allowed are numbers from -4 to 0"),
         (["--spp", "4"], "unrecognized arguments: --spp 4"),
@@ -635,9 +635,7 @@ def test_bad_arguments_are_one_sentence(manifest, tmp_path, capsys, changed, mes
 
 @pytest.mark.parametrize("words", [["shading"], ["shading", "m.json", "-o", "m.npz", "--compression", "12x", "--help"]])
 def test_the_former_task_says_what_to_use(words, capsys):
-    sentence = (
-        'the task "shading" is no more: materials are trained for their shading by fit texture, see its --shading'
-    )
+    sentence = 'task "shading" is no more: materials are trained for their shading by fit texture, see its --shading'
     with pytest.raises(SystemExit) as refused:
         main(["fit", *words])
     assert refused.value.code == 2 and capsys.readouterr().err.splitlines()[-1].endswith(sentence)
