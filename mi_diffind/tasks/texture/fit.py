@@ -91,7 +91,7 @@ def fit(request: FitRequest) -> Fitted:
     options, recipe = request.options, request.settings
     source = load_source(options["source"], nonfinite=options["nonfinite"])
     pyramid = Pyramid.from_source(source, source_layout(source, recipe), request.types, requested_border(options))
-    reason = "" if options["shading"] == "on" else reason_without_shading(pyramid.layout, request)
+    reason, spare = "" if options["shading"] == "on" else reason_without_shading(pyramid.layout, request), 0
     if reason:
         check_last(options, reason)
         requested, size = requested_bytes(options, source), None
@@ -101,10 +101,9 @@ def fit(request: FitRequest) -> Fitted:
         fitted = Fitted(*fit_texture(source, size, recipe, request, pyramid, level_bias(options)))
         fitted.lines += [f"not trained for its shading: {reason}"] * (options["shading"] == "auto")
     else:
-        fitted, requested = fit_stages(request, source, pyramid)
-    return complete(
-        request, source, fitted, CompressedTexture.from_table(fitted.table, request.types.TensorXf), requested
-    )
+        fitted, requested, spare = fit_stages(request, source, pyramid)
+    texture = CompressedTexture.from_table(fitted.table, request.types.TensorXf)
+    return complete(request, source, fitted, texture, requested, spare)
 
 
 def level_bias(options: Mapping) -> float:
@@ -129,12 +128,12 @@ def reason_without_shading(layout: Layout, request: FitRequest) -> str:
     return ""
 
 
-def fit_stages(request: FitRequest, source: Source, pyramid: Pyramid) -> tuple[Fitted, float | None]:
+def fit_stages(request: FitRequest, source: Source, pyramid: Pyramid) -> tuple[Fitted, float | None, int]:
     """Train for the values of the maps, unless arrays are given, then for their shading.
 
-    Returns the result and the bytes that its arrays were to have (``None``: those of the arrays that are given). If
-    time is limited, the first stage takes :data:`FIRST` of it. A stage that Ctrl-C ends is the last one. Errors are
-    those of :func:`fit`.
+    Returns the result, the bytes that its arrays were to have (``None``: those of the arrays that are given), and how
+    many of them extras would have taken that it lacks. If time is limited, the first stage takes :data:`FIRST` of it. A
+    stage that Ctrl-C ends is the last one. Errors are those of :func:`fit`.
     """
     options, layout = request.options, pyramid.layout
     recipe, effects = TASK.shading_settings(request.preset, request.settings, options), material_effects(layout)[0]
@@ -155,7 +154,7 @@ def fit_stages(request: FitRequest, source: Source, pyramid: Pyramid) -> tuple[F
             table, result = fit_texture(source, size, request.settings, part, pyramid, level_bias(options), "maps")
         if stop.is_set() or result.interrupted:
             lines = ["not trained for its shading: interrupted"]
-            return Fitted(table, dataclasses.replace(result, interrupted=True), lines), requested - room
+            return Fitted(table, dataclasses.replace(result, interrupted=True), lines), requested, room
         lines += [f"the training for its maps: {result.outcome}"] * result.unfinished
     try:
         net = trainable_arrays(table, pyramid)
@@ -167,7 +166,7 @@ def fit_stages(request: FitRequest, source: Source, pyramid: Pyramid) -> tuple[F
     )  # fmt: skip
     fitted = Fitted(table, result, *shading_report(table, layout))
     fitted.lines[:0] = lines
-    return fitted, requested and requested - room * ("extras" not in table.arrays)
+    return fitted, requested, room * ("extras" not in table.arrays)
 
 
 def load_start(path, source: Source, request: FitRequest) -> Table:

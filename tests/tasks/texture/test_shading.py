@@ -7,6 +7,7 @@ import json
 import re
 import signal
 import time
+from types import SimpleNamespace
 
 import drjit as dr
 import numpy as np
@@ -22,6 +23,7 @@ from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting import loop, task
 from mi_diffind.fitting.loop import FitResult
 from mi_diffind.fitting.task import FitRequest
+from mi_diffind.maps.model import size_figures
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.tasks.disney import TASK as DISNEY
@@ -376,6 +378,9 @@ def test_arrays_leave_room_for_extras(ad):
     assert texture_fit.room_for_extras(recipe, pyramid, nbytes) == (recipe, 4 * 8 * 8 * 3)
     assert texture_fit.room_for_extras(recipe, pyramid, nbytes - 1) == (OURS, 0)
     assert texture_fit.room_for_extras(OURS, pyramid, nbytes) == (OURS, 0)
+    # A file without the extras that it has room for is not said to have missed its size
+    source, table = from_arrays(bumpy(64)), SimpleNamespace(nbytes=9000, arrays={})
+    assert len(size_figures(source, table, 10_000, 1000)[1]) == 1 and len(size_figures(source, table, 10_000)[1]) == 2
 
 
 def test_extras_are_trained_stored_and_read_by_the_material_alone(mi_rgb, start, ad, tmp_path, monkeypatch):
