@@ -12,8 +12,8 @@ from mi_diffind.maps.layout import Layout, MapLayout
 from mi_diffind.tasks.disney import TASK as DISNEY
 from mi_diffind.tasks.disney.decoder import Lobe
 from mi_diffind.tasks.disney.model import PARAMETERS, clamp
-from mi_diffind.tasks.shading.material import frame, shadowing, specular_lobe
 from mi_diffind.tasks.texture import TASK
+from mi_diffind.tasks.texture.surface import frame, shadowing, specular_lobe
 
 from . import Counterpart, Plugin
 from .disney import Disney, Parameters, ShadedPoint, to_principled
@@ -168,8 +168,8 @@ class NeuralMaterial(Disney):
 
      * - filename
        - |string|
-       - The maps of a material, written by ``mi-diffind fit texture`` or ``mi-diffind fit shading``. A map with linear
-         values beyond :math:`\pm 10^9` is refused.
+       - The maps of a material, written by ``mi-diffind fit texture``. A map with linear values beyond
+         :math:`\pm 10^9` is refused.
        - --
 
      * - ignore
@@ -180,7 +180,7 @@ class NeuralMaterial(Disney):
      * - lobes
        - |string|
        - ``exact``: the formulas of :ref:`disney <bsdf-disney>`; ``tables``: the tables of
-         :ref:`neural_disney <bsdf-neural_disney>`, which ``fit shading`` trains with. (Default: ``exact``)
+         :ref:`neural_disney <bsdf-neural_disney>`, which ``fit texture`` trains with. (Default: ``exact``)
        - --
 
      * - two_sided
@@ -227,7 +227,7 @@ class NeuralMaterial(Disney):
     above the surface and above the turned horizon. A normal that faces away from the viewer is mirrored at the
     surface's normal. The AOV ``sh_normal`` is the surface's normal: Mitsuba 3.9 asks its own plugins alone for another.
 
-    **Extras**, which ``mi-diffind fit shading --extras auto`` may add to a file, shape the highlight at each level of
+    **Extras**, which ``mi-diffind fit texture`` may add to a file, shape the highlight at each level of
     detail: α² of the specular lobe becomes a symmetric 2×2 matrix, and a weight from 0 to 1 multiplies its values.
     ``anisotropic`` is then not allowed. No other plugin reads them.
 

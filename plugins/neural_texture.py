@@ -55,8 +55,8 @@ class NeuralTexture(FilteredTexture):
     all maps of a material: one chain of lookups decompresses and filters. Any BSDF and emitter can use the texture. Its
     exact counterpart is :monosp:`bitmap` with the original image, which needs many samples to filter. At equal samples
     the texture approximates :monosp:`mipmap`, which is its second counterpart. ``mi-diffind compare`` shows a scene
-    beside both, :monosp:`bitmap` with 8 times the samples. A file of ``mi-diffind fit shading`` may be read at a finer
-    level of detail than the footprint's; the file says by how much.
+    beside both, :monosp:`bitmap` with 8 times the samples. A file that was trained for its shading may be read at a
+    finer level of detail than the footprint's; the file says by how much.
 
     The paragraphs of :monosp:`neural_image` on shared files, values between texels, spectra and positions on emitters
     hold for this texture, too.

@@ -1,7 +1,7 @@
 """Write rust.xml and the maps of its metal: a plate and balls of hammered metal with rust, seen from afar.
 
 ``-D metal=rust_plain.npz`` shows the same with the texture that is not trained for its shading. The maps are compressed
-by ``mi-diffind fit texture`` and ``mi-diffind fit shading``, see README.md.
+by ``mi-diffind fit texture``, see README.md.
 
 ``--picture`` renders rust.jpg instead, the picture of the page on shading, and ``--json FILE`` writes its errors.
 """

@@ -175,8 +175,8 @@ def folder(tmp_path, monkeypatch):
         ("fit ggx -o new.npz --checkpoint here/new.npz", "the same file as -o"),
         ("fit ggx -o new.npz --checkpoint ck --json ./ck", "the same file as --checkpoint"),
         ("fit image a.png -o new.npz --checkpoint here/a.png", "the same file as source"),
-        ("fit shading m.json -o new.npz --preview m.json", "--preview: found"),
-        ("fit shading m.json -o t.npz --start hard.npz", "the same file as --start"),
+        ("fit texture m.json -o new.npz --preview m.json", "--preview: found"),
+        ("fit texture m.json -o t.npz --start hard.npz", "the same file as --start"),
         ("fit field . -o t.npz --grid here/t.npz", "--grid: found"),
         ("fit sdf scene.xml#ball -o new.npz --json scene.xml", "the same file as source"),
         ("fit scene scene.xml -o t.npz --start soft.npz", "the same file as --start"),
@@ -200,7 +200,7 @@ def test_a_file_is_not_written_over_another_one(folder, capsys, command, sentenc
 
 def test_the_function_refuses_as_the_command_does(folder):
     with pytest.raises(UsageError, match=r"-o: found .* the same file as --start"):
-        mi_diffind.fit("shading", "m.json", start="t.npz", output="hard.npz")
+        mi_diffind.fit("texture", "m.json", start="t.npz", output="hard.npz")
     with pytest.raises(UsageError, match=r"--checkpoint: found .* the same file as source"):
         mi_diffind.fit("image", "a.png", checkpoint="here/a.png")
 

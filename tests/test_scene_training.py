@@ -49,7 +49,7 @@ from mi_diffind.scenes.training.trained_scene import (
 from mi_diffind.tasks.texture import PRESETS
 from mi_diffind.tasks.texture.arrays import PaperBudget, TextureBudget, parse_structure
 from mi_diffind.tasks.texture.compressed import CompressedTexture, load, to_table
-from mi_diffind.tasks.texture.fit import build_problem, rounded, source_layout, stored_form
+from mi_diffind.tasks.texture.training import build_problem, rounded, source_layout, stored_form
 
 NAMES = ("albedo", "roughness")
 ORBIT = ViewDistribution(

@@ -26,7 +26,7 @@ from mi_diffind.fitting.loop import FitSettings, Problem
 from mi_diffind.fitting.task import FitRequest, Model, Stage, Task, find_task, fit, tasks
 
 ROOT = Path(__file__).resolve().parents[1]
-BUILT_IN = ("bsdf", "disney", "field", "ggx", "image", "scene", "sdf", "shading", "texture")
+BUILT_IN = ("bsdf", "disney", "field", "ggx", "image", "scene", "sdf", "texture")
 
 
 LINE = """

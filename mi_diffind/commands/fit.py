@@ -5,7 +5,7 @@ from __future__ import annotations
 from ..core.arguments import add_arguments, natural, positive
 from ..core.files import writable_file, writable_folder
 from ..core.progress import Deadline
-from ..fitting.task import LOSSES, SCHEDULES, FittingError, Task, fit, tasks
+from ..fitting.task import LOSSES, SCHEDULES, FittingError, Task, fit, former_tasks, tasks
 from .common import alternative, alternatives, say, set_variant, variant_option, verb
 
 #: Settings of a training that every task has: what they are, and the options of their parsers.
@@ -24,7 +24,11 @@ EXAMPLE = "mi-diffind fit image photo.png -o photo.npz"
 
 def add(commands) -> None:
     """Add the verb, its tasks and their options to ``commands``, the subparsers of the command line."""
-    parsers = alternatives(verb(commands, "fit", run, HELP, EXAMPLE), "task")
+    sub = verb(commands, "fit", run, HELP, EXAMPLE)
+    for word in [word for word in getattr(commands, "words", ()) if not word.startswith("-")][1:2]:
+        if word in former_tasks():
+            sub.error(f'the task "{word}" is no more: {former_tasks()[word]}')
+    parsers = alternatives(sub, "task")
     for task in tasks().values():
         section = f" ({task.section})" if task.section else ""
         words = " ".join(filter(None, ("mi-diffind fit", task.name, task.example, f"-o {task.name}.npz")))

@@ -458,6 +458,8 @@ class Task:
     files: str = "files"
     #: Measurements during a training; 0: one each ``measure_every`` steps of the preset.
     measurements: int = 0
+    #: Former names of tasks that this one carries out → a sentence that says how.
+    former: Mapping[str, str] = {}
     #: Object type and name of the plugin that reads the tables ("texture", "neural_image"); none: no plugin does.
     plugin: tuple[str, str] | None = None
 
@@ -612,6 +614,11 @@ def tasks() -> dict[str, Task]:
     return discovery.load("mi_diffind.tasks", "TASK", expected=Task)
 
 
+def former_tasks() -> dict[str, str]:
+    """Return the names of tasks that are parts of others now, each with a sentence that says what to use."""
+    return {name: sentence for task in tasks().values() for name, sentence in task.former.items()}
+
+
 def find_task(table: Table) -> Task:
     """Return the task of a table that was read.
 
@@ -667,8 +674,8 @@ def fit(
     """Train the tables of a ``task`` (``"texture"``, ``"sdf"``, …): ``mi-diffind fit`` in Python.
 
     - ``source``: what the tables are fitted to, as a file or as an object in memory. Of ``bsdf``: a scene or BSDF as a
-      file, a dictionary as of ``mi.load_dict``, a ``mi.BSDF``, or a measured file. Of ``image``, ``texture`` and
-      ``shading``: an image file or a manifest, an array ``(height, width, channels)``, a ``mi.Bitmap``, or a dictionary
+      file, a dictionary as of ``mi.load_dict``, a ``mi.BSDF``, or a measured file. Of ``image`` and
+      ``texture``: an image file or a manifest, an array ``(height, width, channels)``, a ``mi.Bitmap``, or a dictionary
       of such maps by name. Of ``sdf``: a mesh file, a ``trimesh.Trimesh`` or a ``mi.Mesh``. Of ``field``: a folder of
       views. Of ``scene``: a scene file or dictionary. ``ggx`` and ``disney`` have none.
     - ``preset``: layout and training ("": the task's default).
@@ -687,6 +694,8 @@ def fit(
     from ..core.runtime import array_module
 
     if task not in tasks():
+        if task in former_tasks():
+            raise UsageError(f'the task "{task}" is no more: {former_tasks()[task]}')
         raise UsageError(f'found the task "{task}", installed are {", ".join(tasks())}')
     chosen = tasks()[task]
     preset = preset or next(iter(chosen.presets))

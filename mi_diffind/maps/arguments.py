@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ..core import units
-from ..core.arguments import Argument, between, checked, decibels, positive
+from ..core.arguments import Argument, checked, decibels, positive
 from .source import NONFINITE
 
 _SIZES = (
@@ -44,19 +44,6 @@ PREVIEW = Argument(
 
 #: Least and largest bias of the level of detail that a file may hold, in levels; a negative one reads finer.
 BIAS_RANGE = (-4.0, 0.0)
-
-
-def bias_or_auto(text: str) -> float | str:
-    """Return a bias of the level of detail (:data:`BIAS_RANGE`), or ``auto``. Raises ``ArgumentTypeError``."""
-    return text if text == "auto" else between(*BIAS_RANGE)(text)
-
-
-#: Bias of the level of detail at which a texture is read.
-LEVEL_BIAS = Argument(
-    "--level-bias", type=bias_or_auto, metavar="auto|N",
-    help="levels by which the texture is read finer than the footprint, as in -0.5; auto tries several and compares "
-    "shaded images (default: auto, 0 for paper)",
-)  # fmt: skip
 
 #: Options of decoding maps.
 DECODED = (

@@ -109,8 +109,11 @@ def requested_border(options) -> tuple[str, str] | None:
     return None if options["border"] == "auto" else (options["border"],) * 2
 
 
-def size_figures(source: Source, table, requested: float | None) -> tuple[dict, list[str]]:
-    """Return the sizes of a trained table for ``--json``, and lines of text; ``requested`` are the bytes wanted."""
+def size_figures(source: Source, table, requested: float | None, spare: float = 0) -> tuple[dict, list[str]]:
+    """Return the sizes of a trained table for ``--json``, and lines of text; ``requested`` are the bytes wanted.
+
+    ``spare`` bytes of these were for arrays that the table could have had.
+    """
     achieved = source.nbytes / table.nbytes if table.nbytes else None
     figures = {
         "source_bytes": source.nbytes,
@@ -121,7 +124,7 @@ def size_figures(source: Source, table, requested: float | None) -> tuple[dict, 
     }
     wanted = f" ({source.nbytes / requested:.2f}x requested)" if requested else ""
     lines = [(f"{achieved:.2f}x" if achieved else "of one colour") + wanted]
-    if requested and achieved and not Budget(requested).is_met(table.nbytes):
+    if requested and achieved and not Budget(requested).is_met(table.nbytes + spare):
         asked, actual = f"{round(requested):,} bytes were requested", f"{table.nbytes:,}"
         lines.append(f"{asked}, but {actual} are the nearest that the arrays of this image allow")
     return figures, lines
@@ -205,12 +208,13 @@ def rehearse_pictures(request: FitRequest, source: Source) -> None:
 
 
 def complete(
-    request: FitRequest, source: Source, fitted: Fitted, image: CompressedMaps, requested: float | None
-) -> Fitted:
-    """Add to the result of a training what pictures, sizes and the source say; ``requested`` are the bytes wanted."""
+    request: FitRequest, source: Source, fitted: Fitted, image: CompressedMaps, requested: float | None,
+    spare: float = 0,
+) -> Fitted:  # fmt: skip
+    """Add to the result of a training what pictures, sizes (:func:`size_figures`) and the source say."""
     fitted.table.measured |= significant(as_seen.measure(source, image))
     fitted.table.settings |= request.paths(source_path=request.options["source"])
-    figures, lines = size_figures(source, fitted.table, requested)
+    figures, lines = size_figures(source, fitted.table, requested, spare)
     fitted.lines += [*lines, *source.notes]
     fitted.figures = {**figures, **fitted.figures}
     return fitted

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 
@@ -104,7 +105,8 @@ def level_errors(truth: Levels, maps: Levels) -> list[float]:
 class MaterialContenders:
     """Contenders of a ``source``, read from the file ``name``.
 
-    Subclasses name the ``task`` that trains ours and the ``border`` of the maps, and define :meth:`record`.
+    Subclasses name the ``task`` that trains ours, further ``options`` of it and the ``border`` of the maps, and define
+    :meth:`record`.
     """
 
     source: Source
@@ -112,6 +114,7 @@ class MaterialContenders:
     settings: SimpleNamespace
 
     task = ""
+    options: ClassVar[dict] = {}
     border = "auto"
 
     def __post_init__(self):
@@ -151,7 +154,7 @@ class MaterialContenders:
 
         def fit(job: Contender, progress: bool) -> dict | None:
             arguments = {"source": self.name, "compression": compression, "seconds": self.settings.seconds,
-                         "border": self.border}  # fmt: skip
+                         "border": self.border, **self.options}  # fmt: skip
             trained = equal_memory.fit_preset(job, progress, self.task, "image", "", arguments)
             if trained is None:
                 return None

@@ -1,6 +1,6 @@
 """Study ``tradeoff scene-training``: training inside a scene against training for shading over the hemisphere.
 
-*Runs*: the file that the scene names (*start*); training for shading over the hemisphere (``fit shading``) from it, for
+*Runs*: the file that the scene names (*start*); training for shading over the hemisphere (``fit texture``) from it, for
 as many seconds as training inside the scene takes (*hemisphere*), and to its end (*hemisphere, longer*); training
 inside the scene (``fit scene``) from the start (*scene*; also without samples beyond one a pixel), from the result of
 the hemisphere, and from an untrained start.
@@ -221,13 +221,14 @@ def training_run(
     def train(job: Contender, progress: bool) -> task.Fitted:
         common = {"progress": progress, "output": job.file, "variant": mi.variant(), "deterministic": False}
         if task_name == "texture":
-            fitted = task.fit("texture", other_maps(context.source), bytes=context.start.nbytes,
+            fitted = task.fit("texture", other_maps(context.source), bytes=context.start.nbytes, shading="off",
                               steps=settings.texture_steps, **common)  # fmt: skip
             fitted.table.settings["source"] = context.start.settings["source"]
             return fitted
         if task_name == "shading":
             start = context.file if after is None else after.file
-            return task.fit("shading", context.source, start=start, **limit(), **common)
+            given = {"start": start, "shading": "on", "extras": "off"}
+            return task.fit("texture", context.source, **given, **limit(), **common)
         given = {} if after is None else {"start": after.file}
         ranges = {name: tuple(map(float, limits)) for name, limits in context.ranges.items()}
         return task.fit(

@@ -25,7 +25,7 @@ from ..measure.renders import to_uv
 from ..plugins.support import footprint
 from ..scenes import examples, loading
 from ..scenes.training.problem import estimate_exposure
-from ..tasks.shading.material import READ
+from ..tasks.texture.surface import READ
 from .baselines.normals import LOBE, ReadMaps
 
 

@@ -6,7 +6,7 @@ its shading (*ours*), also with other weights λ of the shading loss (the paper'
 Classical filters (:mod:`.baselines.normals`) are measured uncompressed, and in the bytes of ours: compressed by our
 arrays, and by ASTC. Each is also read at other levels of detail, those with the smallest error: the *kernel*.
 
-*Errors* are those of :class:`~mi_diffind.tasks.shading.evaluation.ShadedEvaluation`: PSNR of shaded values and FLIP,
+*Errors* are those of :class:`~mi_diffind.tasks.texture.appearance.ShadedEvaluation`: PSNR of shaded values and FLIP,
 under views and lights of no training, against C, the converged truth, and P, the paper's reference; and those of whole
 renders (:mod:`.shaded_scenes`) of plain, ours, and the best filter in equal bytes.
 """
@@ -35,13 +35,12 @@ from ..measure import plot
 from ..measure.report import figure_caption
 from ..measure.study import Measure, Plan, Study
 from ..measure.training import Contender
-from ..tasks import shading as shading_task
 from ..tasks import texture as texture_task
-from ..tasks.shading.evaluation import TRUTHS, ShadedEvaluation, reader
-from ..tasks.shading.material import material_effects
-from ..tasks.shading.training import fit_shading, trainable_arrays
-from ..tasks.texture import fit as texture_fit
+from ..tasks.texture import training
+from ..tasks.texture.appearance import TRUTHS, ShadedEvaluation, reader
 from ..tasks.texture.compressed import CompressedTexture, to_table
+from ..tasks.texture.fit import find_size
+from ..tasks.texture.surface import material_effects
 from .baselines import codecs, normals
 from .example_maps import MATERIALS, example_maps
 from .materials import level_images, level_pyramid
@@ -51,7 +50,7 @@ from .shaded_scenes import LIGHTS, VIEWS, FloorScenes, RenderedFile, SceneQualit
 COMPRESSION = 12.0
 
 #: Weight λ of the shading loss by default.
-SHARE = shading_task.PRESETS["ours"].share
+SHARE = texture_task.SHADING_PRESETS["ours"].share
 
 #: Levels of detail whose errors are measured.
 LEVELS = 6
@@ -157,13 +156,17 @@ class ShadingContenders:
     runs: dict[float, list[Contender]] = field(default_factory=dict)
 
     def __post_init__(self):
-        layout = texture_fit.source_layout(self.source, texture_task.PRESETS["ours"])
+        layout = training.source_layout(self.source, texture_task.PRESETS["ours"])
         self.pyramid = Pyramid.from_source(self.source, layout, array_module(mi.variant()))
         self.effects = material_effects(layout)[0]
         for seed in range(self.settings.seeds):
-            plain = self.add_plain(seed)
+            plain = self.add_fit("plain", "plain", seed, shading="off")
             for share in self.settings.lambdas:
-                self.runs.setdefault(share, []).append(self.add_run(plain, share, seed))
+                label, options = "ours", {}
+                if share != SHARE:  # λ = 0 is read at the level of the footprint
+                    label, options = f"lambda {share:g}", {"start": plain, "shading": "on", "share": share}
+                    options |= {} if share else {"level_bias": 0.0}
+                self.runs.setdefault(share, []).append(self.add_fit(label, "run", seed, **options))
         self.add_filters()
         for seed in range(self.settings.seeds):
             self.add_renders(seed)
@@ -214,31 +217,18 @@ class ShadingContenders:
 
         return self.add(label, method, fit, read, True)
 
-    def add_plain(self, seed: int) -> Contender:
-        """Register a texture that is not trained for its shading."""
+    def add_fit(self, label: str, method: str, seed: int, **options) -> Contender:
+        """Register the result of ``fit texture`` with the given options, and with defaults for all others."""
 
         def train(job: Contender, progress: bool) -> tuple[Table, FitResult]:
-            fitted = task.fit("texture", self.source, compression=COMPRESSION, seed=seed, variant=mi.variant(),
-                              progress=progress, output=job.file, **self.settings.steps)  # fmt: skip
+            given = {**options, "start": options["start"].file} if "start" in options else options
+            size = {} if "start" in options else {"compression": COMPRESSION}
+            fitted = task.fit("texture", self.source, seed=seed, variant=mi.variant(), progress=progress,
+                              output=job.file, **self.settings.steps, **size, **given)  # fmt: skip
             return fitted.table, fitted.result
 
-        return self.add_trained(f"plain, seed {seed}", "plain", train)
-
-    def add_run(self, plain: Contender, share: float, seed: int) -> Contender:
-        """Register a training for shading with weight ``share``.
-
-        λ = 0 is read at the level of the footprint; for other λ, the training chooses the level bias.
-        """
-
-        def train(job: Contender, progress: bool) -> tuple[Table, FitResult]:
-            given = {"seed": seed, "share": share, **({} if share else {"level_bias": 0.0}), **self.settings.steps}
-            recipe = shading_task.TASK.change_settings(shading_task.PRESETS["ours"], given)
-            request = task.FitRequest("ours", recipe, self.pyramid.types, progress=progress)
-            arrays = trainable_arrays(texture_task.TASK.load(plain.file), self.pyramid)
-            return fit_shading(self.source, arrays, recipe, request, self.pyramid, self.evaluation)
-
-        label = "ours" if share == SHARE else f"lambda {share:g}"
-        return self.add_trained(f"{label}, seed {seed}", "run", train, share=share, way="clip, schedule")
+        details = {"share": options.get("share", SHARE), "way": "clip, schedule"} if method == "run" else {}
+        return self.add_trained(f"{label}, seed {seed}", method, train, **details)
 
     # -- Classical filters
 
@@ -282,10 +272,10 @@ class ShadingContenders:
         recipe = texture_task.TASK.change_settings(texture_task.PRESETS["ours"], self.settings.steps)
         request = task.FitRequest("ours", recipe, self.pyramid.types, progress=progress)
         options = dict.fromkeys(("structure", "skip", "cascaded"))  # chosen by content
-        size = texture_fit.find_size(self.source, build(), self.source.nbytes / COMPRESSION, recipe, options)
-        problem = texture_fit.build_problem(self.source, size, recipe, build())
+        size = find_size(self.source, build(), self.source.nbytes / COMPRESSION, recipe, options)
+        problem = training.build_problem(self.source, size, recipe, build())
         result = request.train(problem, f"train {job.name}")
-        maps = CompressedTexture(build().layout, texture_fit.stored_form(problem.net))
+        maps = CompressedTexture(build().layout, training.stored_form(problem.net))
         return to_table(maps, {**request.recorded(result), **problem.identity}), result
 
     def encoded(self, build: Callable[[], Pyramid]) -> tuple[Pyramid, int]:

@@ -18,6 +18,7 @@ import itertools
 from collections.abc import Callable
 from functools import cached_property, partial
 from pathlib import Path
+from typing import ClassVar
 
 import mitsuba as mi
 import numpy as np
@@ -105,6 +106,7 @@ class TextureContenders(MaterialContenders):
     """Contenders of a material whose colours are rendered, in the scenes of the stills."""
 
     task = "texture"
+    options: ClassVar[dict] = {"shading": "off"}  # what is measured are maps
     border = "repeat"
 
     def __post_init__(self):

@@ -12,7 +12,7 @@ from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting.task import FitRequest
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import load_source
-from mi_diffind.tasks.texture import PRESETS, fit
+from mi_diffind.tasks.texture import PRESETS, training
 from mi_diffind.tasks.texture.arrays import TextureBudget, parse_structure
 
 
@@ -37,10 +37,10 @@ def fitted(manifest: Path) -> Path:
     """A table file of a material beside its manifest, after two steps."""
     source, types = load_source(manifest), array_module("llvm")
     recipe = dataclasses.replace(PRESETS["ours"], steps=2, batch=2048, measure_every=2)
-    layout = fit.source_layout(source, recipe)
+    layout = training.source_layout(source, recipe)
     size = TextureBudget(source.height, source.width, layout.stored, parse_structure("0:2:4"), 2, 3, 5, 3)
     pyramid = Pyramid.from_source(source, layout, types, ("repeat", "repeat"))
-    table, _ = fit.fit_texture(source, size, recipe, FitRequest("ours", recipe, types, progress=False), pyramid)
+    table, _ = training.fit_texture(source, size, recipe, FitRequest("ours", recipe, types, progress=False), pyramid)
     table.settings["source_path"] = manifest.name
     output = manifest.with_suffix(".npz")
     save_table(output, table)

@@ -9,7 +9,7 @@ from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.tasks import image
 from mi_diffind.tasks.image import arrays as image_arrays
 from mi_diffind.tasks.image import training as image_training
-from mi_diffind.tasks.texture import PRESETS, arrays, fit
+from mi_diffind.tasks.texture import PRESETS, arrays, training
 from mi_diffind.tasks.texture.compressed import CompressedTexture, neutral_extras, to_table
 
 
@@ -29,21 +29,21 @@ def make(path, source, preset="ours", border="repeat", extras=None, **settings):
     ``extras``: a function that returns entries from their shape.
     """
     recipe, types = PRESETS[preset], array_module("llvm")
-    pyramid = Pyramid.from_source(source, fit.source_layout(source, recipe), types, (border, border))
+    pyramid = Pyramid.from_source(source, training.source_layout(source, recipe), types, (border, border))
     stored = pyramid.layout.stored
     if preset == "paper":
         size = arrays.PaperBudget(9, 12, 4, 4, stored)
     else:
         dims = min(3, stored)
         size = arrays.TextureBudget(source.height, source.width, stored, (arrays.FineArray(0, dims, 8),), 1, dims, 12)
-    net, rng = fit.build_problem(source, size, recipe, pyramid).net, np.random.default_rng(7)
+    net, rng = training.build_problem(source, size, recipe, pyramid).net, np.random.default_rng(7)
     if preset == "paper":
         for array in net.arrays.values():
             array.data = types.TensorXf(aligned(rng.random(array.data.shape)))
     if extras is not None:
         net.extras = neutral_extras(source.height, source.width, net.border).alloc(types.TensorXf)
         net.extras.data = types.TensorXf(aligned(extras(net.extras.numpy().shape)))
-    save_table(path, to_table(CompressedTexture(pyramid.layout, fit.stored_form(net)), settings))
+    save_table(path, to_table(CompressedTexture(pyramid.layout, training.stored_form(net)), settings))
     return str(path)
 
 

@@ -10,8 +10,8 @@ from scipy.ndimage import map_coordinates
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.studies.baselines import normals
-from mi_diffind.tasks.shading.evaluation import ShadedEvaluation, reader
-from mi_diffind.tasks.shading.material import material_effects, specular_lobe, surface_of
+from mi_diffind.tasks.texture.appearance import ShadedEvaluation, reader
+from mi_diffind.tasks.texture.surface import material_effects, specular_lobe, surface_of
 
 SIDE = 32
 WI, WO = np.array([0.3, 0.1, 0.95]), np.array([-0.2, 0.35, 0.9])

@@ -14,11 +14,11 @@ from mi_diffind.studies import shaded_scenes
 from mi_diffind.studies.baselines import normals
 from mi_diffind.studies.shaded_scenes import VIEWS, FloorScenes, RenderedFile, SceneQuality
 from mi_diffind.tasks import texture
-from mi_diffind.tasks.shading.evaluation import reader
-from mi_diffind.tasks.shading.material import material_effects
 from mi_diffind.tasks.texture import fit
+from mi_diffind.tasks.texture.appearance import reader
 from mi_diffind.tasks.texture.compressed import CompressedTexture, to_table
 from mi_diffind.tasks.texture.fit import source_layout
+from mi_diffind.tasks.texture.surface import material_effects
 
 QUALITY = SceneQuality((48, 27), 512, 64, 1)
 

@@ -1,8 +1,8 @@
 """Task 5 inside a scene: arrays of textures or materials, trained through renders of the scene that shows them.
 
 References are renders of the same scene with exact plugins and many samples. The result is a table file of the task
-``texture``. This package stands above plugins and scenes, which it renders; :mod:`mi_diffind.tasks.shading` trains for
-shaded values without a scene.
+``texture``. This package stands above plugins and scenes, which it renders; training for shaded values without a scene
+is :mod:`mi_diffind.tasks.texture.shading`.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class SceneTraining(Task):
     def check(self, request: FitRequest) -> None:
         source = request.options["source"]
         if isinstance(source, (str, os.PathLike, type(None))) and not str(source).lower().endswith(".xml"):
-            raise UsageError(f"source: found {source}, a scene file (.xml) is needed; fit shading trains maps")
+            raise UsageError(f"source: found {source}, a scene file (.xml) is needed; fit texture trains maps")
 
     def output_path(self, path: str | os.PathLike) -> Path:
         """Return the path of the output: a table file, or a folder for several, which exists or has no extension."""

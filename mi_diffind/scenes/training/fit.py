@@ -18,7 +18,7 @@ from ...core.units import figure_lines
 from ...fitting.loop import FitResult, cores
 from ...fitting.task import FitRequest, Fitted, Model, find_task, table_path, tasks
 from ...maps.model import preview_path
-from ...tasks.texture.fit import TextureProblem
+from ...tasks.texture.training import TextureProblem
 from .. import loading
 from .options import SceneRecipe, ViewDistribution, recipe_from, views_from
 from .problem import SceneProblem

@@ -251,7 +251,7 @@ SCENE_ARGUMENTS = (
     ),
     Argument(
         "--start", action="append", file="read", metavar="FILE.npz",
-        help="arrays to start from, of the same maps, such as those of fit shading; may be repeated, once for each "
+        help="arrays to start from, of the same maps, such as those of fit texture; may be repeated, once for each "
         "texture (default: the scene's files)",
     ),
     Argument(

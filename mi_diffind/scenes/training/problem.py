@@ -24,8 +24,8 @@ from ...arrays.indirection import unfolded
 from ...core.files import replacing
 from ...fitting.loop import Problem
 from ...images import srgb
-from ...tasks.shading.evaluation import titled
-from ...tasks.texture.fit import TextureProblem, rounded
+from ...tasks.texture.appearance import titled
+from ...tasks.texture.training import TextureProblem, rounded
 from .options import SceneRecipe, View
 from .references import SEEDS
 from .trained_scene import JointProblem, TrainedScene

@@ -32,7 +32,7 @@ from ...tasks.texture.compressed import (
     read_structure,
     to_table,
 )
-from ...tasks.texture.fit import TextureProblem, build_problem, stored_form
+from ...tasks.texture.training import TextureProblem, build_problem, stored_form
 from .. import loading
 from .options import View, ViewDistribution
 from .rig import Rig

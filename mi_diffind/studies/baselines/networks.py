@@ -23,7 +23,7 @@ from ...maps.layout import Layout
 from ...maps.pyramid import FilteredMaps, Pyramid, decibel, mean_square
 from ...measure.clock import Operations
 from ...tasks.texture import PRESETS
-from ...tasks.texture.fit import TextureProblem
+from ...tasks.texture.training import TextureProblem
 
 #: Hidden units of a layer of a network after a hash grid.
 WIDTH = 32

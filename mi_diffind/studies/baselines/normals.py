@@ -31,9 +31,9 @@ from ...maps.layout import FROM_NORMAL, Layout, MapLayout
 from ...maps.pyramid import FilteredMaps, Pyramid, halve
 from ...tasks.disney.model import ALPHA_MIN, Effects
 from ...tasks.disney.training import uniform_hemisphere
-from ...tasks.shading.evaluation import ShadedEvaluation, reader, reference
-from ...tasks.shading.material import DEFAULT_ALBEDO, DEFAULTS, READ, maps_of, shaded, surface_of
+from ...tasks.texture.appearance import ShadedEvaluation, reader, reference
 from ...tasks.texture.compressed import NEUTRAL
+from ...tasks.texture.surface import DEFAULT_ALBEDO, DEFAULTS, READ, maps_of, shaded, surface_of
 
 #: Least third component in the slope of a normal: a slope of 10.
 STEEPEST = 0.1

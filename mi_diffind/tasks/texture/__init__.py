@@ -1,19 +1,22 @@
-"""Compressed textures and materials that are filtered as they are read (task 4), and recipes of their fits.
+"""Compressed textures and materials that are filtered as they are read (tasks 4 and 5), and recipes of their fits.
 
-Sources, stored channels and the reference, a mip pyramid, are in :mod:`mi_diffind.maps`. :mod:`.nets`: reads of the
-arrays; :mod:`.arrays`: resolutions and initial entries; :mod:`.compressed`: files and models; :mod:`.training`: the
-training problem; :mod:`.fit`: the command ``fit texture``.
+Sources, stored channels and the reference, a mip pyramid, are in :mod:`mi_diffind.maps`. :mod:`.arrays`: resolutions
+and initial entries; :mod:`.compressed`: reads of the arrays, files and models; :mod:`.training`: training for the
+values of the maps; :mod:`.shading`: training for shaded appearance, through frozen tables of task 2; :mod:`.surface`:
+maps as parameters of the BRDF, and shading; :mod:`.appearance`: references, images that measure, and a preview;
+:mod:`.fit`: the command ``fit texture``.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from ...core.arguments import Argument, between, checked, natural, positive
+from ...core.arguments import Argument, between, checked, fraction, natural, positive
 from ...fitting.task import FitSettings, Task
-from ...maps.arguments import BIAS_RANGE, DECODED, SIZES, SOURCE, SOURCES
+from ...maps.arguments import BIAS_RANGE, DECODED, PREVIEW, SIZES, SOURCE, SOURCES
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,51 @@ PRESETS = {
 }  # fmt: skip
 
 
+#: Sample patterns of the reference (:data:`.appearance.SAMPLES_PER_SIDE`).
+REFERENCES = ("jittered", "prefiltered", "converged")
+
+
+@dataclass(frozen=True)
+class ShadingSettings(FitSettings):
+    """Training for shaded appearance, which starts from a trained texture; the defaults are those of ``ours``.
+
+    ``share``: λ, the share of the loss of shaded values. ``clip``: bound of the derivatives of a sample's error through
+    the specular lobe (``None``: unlimited). ``reference``: sample pattern of the reference. ``bounded``: whether values
+    above 1 are compared in log space. ``level_bias``: levels by which a footprint's level of detail is read finer
+    (negative), stored in the file (``None``: chosen by images). ``extras``: whether the shape and weight of the
+    specular lobe are tried as coarse extras, which ``neural_material`` alone reads. ``fixed``: whether the
+    entries that fine levels read keep their values. ``beta_2``: Adam's decay of squared gradients; highlights are rare,
+    and with 0.999 single ones tilt normals of glossy, flat pages by degrees. ``texture``: preset of task 4, which
+    trains the start unless one is given, and defines the samples and the loss of the texture; ``loss`` is that of
+    shaded values.
+    """
+
+    steps: int = 1500
+    batch: int = 2**16
+    lr: float = 5e-3
+    loss: str = "mse"
+    measure_every: int = 150
+    share: float = 0.9
+    clip: float | None = 1.0
+    reference: str = "jittered"
+    bounded: bool = True
+    level_bias: float | None = None
+    extras: bool = False
+    fixed: bool = False
+    beta_2: float = 0.99
+    texture: str = "ours"
+
+
+#: Settings of the training for shading by preset. The paper's λ is 0.1 or 0.25, by its scene.
+SHADING_PRESETS = {
+    "ours": ShadingSettings(),
+    "paper": ShadingSettings(
+        lr=1e-3, schedule="constant", loss="mae", share=0.25, clip=0.1, reference="prefiltered", bounded=False,
+        level_bias=0.0, beta_2=0.999, texture="paper",
+    ),
+}  # fmt: skip
+
+
 class FineArray(NamedTuple):
     """A fine array on the grid of a ``level`` of detail, with so many ``channels`` of ``bits`` bits."""
 
@@ -79,13 +127,23 @@ def parse_structure(text: str) -> tuple[FineArray, ...]:
     return fine
 
 
+def bias_or_auto(text: str) -> float | str:
+    """Return a bias of the level of detail (:data:`.BIAS_RANGE`), or ``auto``. Raises ``ArgumentTypeError``."""
+    return text if text == "auto" else between(*BIAS_RANGE)(text)
+
+
 class Texture(Task):
-    """Task of filtered textures; presets are :data:`PRESETS`, entries have 8 bits or fewer."""
+    """Task of filtered textures; presets are :data:`PRESETS`, entries have 8 bits or fewer.
+
+    The training has two stages: for the values of the maps (:class:`TextureSettings`), and for the shading of materials
+    (:class:`ShadingSettings`).
+    """
 
     name = "texture"
     title = "a texture or the maps of a material at every level of detail"
     files = "compressed"
-    section = "supplemental 1.4"
+    section = "supplemental 1.4 and 1.5"
+    former = {"shading": "materials are trained for their shading by fit texture, see its --shading"}  # noqa: RUF012
     example = "material.json --compression 12x"
     plugin = ("texture", "neural_texture")
     presets = PRESETS
@@ -114,10 +172,31 @@ class Texture(Task):
             help="distribution of levels of detail in training (default: levels for ours, power for paper)",
         ),
         Argument(
-            "--level-bias", type=between(*BIAS_RANGE), default=0.0, metavar="N",
-            help="levels by which the texture is read finer than the footprint, as in -0.5 (default: 0)",
+            "--shading", choices=("auto", "on", "off"), default="auto",
+            help="a last stage that trains a material for its shaded appearance; auto: with a map of normals or "
+            "roughness, but not for paper (default: auto)",
+        ),
+        Argument(
+            "--start", file="read", metavar="FILE.npz",
+            help="arrays that the last stage begins with, as written by fit texture, in place of the first stage",
+        ),
+        Argument(
+            "--lambda", dest="share", type=fraction, metavar="L",
+            help="share of the loss of shaded values in the last stage, 0 to 1 "
+            f"(default: {', '.join(f'{r.share} for {name}' for name, r in SHADING_PRESETS.items())})",
+        ),
+        Argument(
+            "--extras", choices=("auto", "off"), default="auto",
+            help="shape and weight of the highlight in coarse grids beside the maps, read by neural_material alone; "
+            "auto keeps them if shaded images gain (default: auto)",
+        ),
+        Argument(
+            "--level-bias", type=bias_or_auto, default="auto", metavar="auto|N",
+            help="levels by which the texture is read finer than the footprint, as in -0.5 (default: auto, chosen by "
+            "shaded images in the last stage, 0 without it and for paper)",
         ),
         *SOURCES,
+        PREVIEW,
     )  # fmt: skip
     decode_arguments = (
         *DECODED,
@@ -127,6 +206,18 @@ class Texture(Task):
     def settings(self, preset, given, options):
         samples = options["footprint_samples"] or PRESETS[preset].samples
         return self.change_settings(PRESETS[preset], {"samples": samples, **given})
+
+    def shading_settings(self, preset: str, settings: TextureSettings, options: Mapping) -> ShadingSettings:
+        """Return the settings of the training for shading beside those of the texture.
+
+        Number of steps, unless it is that of the preset, and seed are those of the texture's ``settings``.
+        """
+        given = {"seed": settings.seed, "deterministic": settings.deterministic, "share": options["share"]}
+        given["steps"] = settings.steps if settings.steps != PRESETS[preset].steps else None
+        given["level_bias"] = options["level_bias"] if options["level_bias"] != "auto" else None
+        given["extras"] = options["extras"] == "auto" and PRESETS[preset].layered
+        given = {name: value for name, value in given.items() if value is not None}
+        return self.change_settings(SHADING_PRESETS[preset], given)
 
     def usage(self, table, file):
         lines = super().usage(table, file)

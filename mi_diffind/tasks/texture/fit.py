@@ -1,190 +1,53 @@
-"""``fit texture``: checks of options, the choice of a memory budget, and a training."""
+"""``fit texture``: checks of options, the choice of a memory budget, and a training of one or two stages."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
+import os
+from collections.abc import Mapping
 
-import drjit as dr
-import numpy as np
-
-from ...arrays import lookup
-from ...arrays.indirection import aligned_copy, unfolded
 from ...arrays.tables import MAX_BYTES, Table
 from ...core.errors import UsageError
-from ...fitting.task import FitRequest, FitResult, Fitted
+from ...core.progress import interruptible
+from ...core.units import figure_lines
+from ...fitting.task import FitRequest, Fitted
 from ...maps.layout import Layout, gain_of_pages, smoothness
-from ...maps.model import (
-    MapsProblem,
-    complete,
-    fit_maps,
-    rehearse_pictures,
-    requested_border,
-    requested_bytes,
-    strata,
-)
-from ...maps.pyramid import Pyramid, decibel, mean_square
+from ...maps.model import complete, preview_path, rehearse_pictures, requested_border, requested_bytes
+from ...maps.pyramid import Pyramid
 from ...maps.source import Source, load_source
-from . import TextureSettings, arrays, parse_structure
-from .arrays import PaperBudget, TextureBudget
-from .compressed import CompressedTexture, PaperNet, footprint_level, footprints, to_table
+from . import PRESETS, TASK, ShadingSettings, TextureSettings, arrays, parse_structure
+from .appearance import ShadedEvaluation
+from .arrays import TextureBudget
+from .compressed import CompressedTexture, neutral_extras, read_level_bias
+from .shading import fit_shading, trainable_arrays
+from .surface import left_out, maps_of, material_effects, varies_shading
+from .training import fit_texture, source_layout
 
 #: Least gain of pages, in dB before training, over one grid of equal bytes. (0.7 on bricks, where pages lose 0.4.)
 GAIN_DB = 1.0
 
+#: Number of pairs of view and light of the images that measure. Many, since a few pairs near the mirror direction
+#: dominate the PSNR.
+PAIRS = 32
 
-def source_layout(source: Source, recipe: TextureSettings) -> Layout:
-    """Return the layout of ``source`` by a recipe."""
-    return Layout.from_source(source, recipe.once, None if recipe.normals else False, filtered=True)
+#: Largest side of these images, in texels.
+SIDE = 32
 
+#: Share of the time of the first of two stages, if time is limited.
+FIRST = 0.5
 
-def shares(levels: int) -> np.ndarray:
-    """Return the share of samples on each level: one half, one quarter, …, but at least 0.02 / ``levels``."""
-    halves = np.maximum(0.5 ** np.arange(1, levels + 1), 0.02 / levels)
-    return halves / halves.sum()
-
-
-class TextureProblem(MapsProblem):
-    """Training problem of a texture: ``net`` (:mod:`.nets`) against the reference ``pyramid``."""
-
-    tolerance = 0.02
-
-    def __init__(self, net, pyramid: Pyramid, recipe: TextureSettings, digest: str = ""):
-        super().__init__(net, pyramid.layout, recipe, pyramid.types)
-        self.pyramid = pyramid
-        self.sizes = [level.shape[:2] for level in pyramid.values]
-        self.starts = np.cumsum([0] + [rows * columns for rows, columns in self.sizes])
-        self.identity = {"source": digest, **recipe.further, **self.form(net)}
-
-    @staticmethod
-    def form(net) -> dict:
-        """Return what identifies the arrays to train, as JSON."""
-        return {"structure": dataclasses.asdict(net.structure), "border": list(net.border)}
-
-    def _stratum(self, size: int) -> tuple:
-        """Return the stratum of each of ``size`` samples, as arrays of whole numbers.
-
-        Level of detail; first texel, and number of texels, that the sample may be in; columns and rows of the level;
-        index of the level's first texel among those of all levels.
-        """
-        if size not in self._strata:
-            share = shares(len(self.sizes)) if self.recipe.samples == "levels" else np.array([1.0])
-            counts = np.floor(share * size).astype(np.int64)
-            counts[0] += size - counts.sum()
-            parts = []
-            for level, count in enumerate(counts):
-                rows, columns = self.sizes[level]
-                ones, start = np.ones(count, np.int64), int(self.starts[level])
-                parts.append((level * ones, *strata(rows * columns, count), columns * ones, rows * ones, start * ones))
-            merged = (np.concatenate(part).astype(np.uint32) for part in zip(*parts, strict=True))
-            self._strata = {size: tuple(self.types.UInt32(aligned_copy(part)) for part in merged)}
-            dr.eval(self._strata)
-        return self._strata[size]
-
-    def batch(self, rng, size: int):
-        Float, UInt32 = self.types.Float, self.types.UInt32
-        level, first, count, columns, rows, start = self._stratum(size)
-        index = first + dr.minimum(UInt32(rng.random(Float, size) * Float(count)), count - 1)
-        # Lanes of a packet beyond the last sample hold zeros, and an integer division by zero ends the process
-        columns, rows = dr.maximum(columns, 1), dr.maximum(rows, 1)
-        x, y = Float(index % columns) + 0.5, Float(index // columns) + 0.5
-        if self.recipe.samples != "levels":
-            x, y = x + rng.random(Float, size) - 0.5, y + rng.random(Float, size) - 0.5
-            layout, samples = self.layout, self.recipe.samples
-            base = max(layout.height, layout.width)
-            footprint = footprints(1 - rng.random(Float, size), samples, base)  # uniform in (0, 1]
-            level = footprint_level(footprint, len(self.sizes))
-            u, v = x / layout.width, y / layout.height
-            return [u, v, level, footprint], self.by_map(self.pyramid.filtered(u, v, level))
-        level = Float(level)
-        if not self.jittered:
-            target = self.pyramid.texels(start + index)
-            return [x / Float(columns), y / Float(rows), level, None], self.by_map(target)
-        x, y = x + rng.random(Float, size) - 0.5, y + rng.random(Float, size) - 0.5
-        level = lookup.clamp(level + rng.random(Float, size) - 0.5, 0.0, float(len(self.sizes) - 1))
-        u, v = x / Float(columns), y / Float(rows)
-        return [u, v, level, None], self.by_map(self.pyramid.filtered(u, v, level))
-
-    def predict(self, net, inputs) -> dict[str, list]:
-        return self.read(self.seen(net), inputs)
-
-    def seen(self, net):
-        """Return the folded arrays as training reads them, rounded if the recipe says so."""
-        return rounded(net) if self.recipe.rounded else net
-
-    def read(self, net, inputs) -> dict[str, list]:
-        """Return the outputs of arrays (:meth:`seen`) for the inputs of a batch, by map."""
-        u, v, level, footprint = inputs
-        if isinstance(net, PaperNet) and footprint is not None:
-            return self.by_map(net.at_footprint(u, v, footprint))
-        return self.by_map(net.filtered(u, v, level))
-
-    def measure(self, net) -> dict[str, float]:
-        """Return the PSNR of the stored channels at the centres of at most 2¹⁶ texels a level, entries rounded."""
-        types, decibels = self.types, []
-        net = rounded(unfolded(net))
-        with dr.suspend_grad():
-            for level, (rows, columns) in enumerate(self.sizes):
-                texels = rows * columns
-                count = min(texels, 2**16)
-                index = np.random.default_rng(level).choice(texels, count, replace=False) if count < texels else None
-                index = types.UInt32(aligned_copy(np.arange(texels) if index is None else index, np.uint32))
-                # Opaque, so that one kernel reads all levels
-                start, rows, columns = (dr.opaque(types.UInt32, int(n)) for n in (self.starts[level], rows, columns))
-                u = (types.Float(index % columns) + 0.5) / types.Float(columns)
-                v = (types.Float(index // columns) + 0.5) / types.Float(rows)
-                actual = net.filtered(u, v, dr.opaque(types.Float, level, count))
-                expected = self.pyramid.texels(index + start)
-                decibels.append(decibel(mean_square(actual, expected)))
-        return {"psnr_db": decibels[0], "psnr_worst_db": min(decibels)}
-
-
-def build_problem(
-    source: Source, size: TextureBudget | PaperBudget, recipe: TextureSettings, pyramid: Pyramid
-) -> TextureProblem:
-    """Return the problem of training ``source`` at a size by a recipe, with initial arrays."""
-    if isinstance(size, PaperBudget):
-        net = arrays.from_ramps(pyramid.layout, size, pyramid.border, pyramid.levels)
-    else:
-        net = arrays.from_components(pyramid.values, size, pyramid.border)
-    net = net.changed(lambda array, bits: array.alloc(pyramid.types.TensorXf))
-    return TextureProblem(net, pyramid, recipe, source.digest)
-
-
-def fit_texture(
-    source: Source,
-    size: TextureBudget | PaperBudget | None,
-    recipe: TextureSettings,
-    request: FitRequest,
-    pyramid: Pyramid,
-    level_bias: float = 0.0,
-) -> tuple[Table, FitResult]:
-    """Train the arrays of ``source`` and return the table, with its errors, and the record of the training.
-
-    ``size`` is ``None`` for a texture of one colour, which needs no arrays. ``request`` holds the Dr.Jit types, the
-    time and the checkpoint; its settings are replaced by those of the ``recipe``. ``level_bias`` is stored in the file;
-    levels are trained as they are stored. Errors are those of :meth:`.CompressedTexture.measure`.
-    """
-    request = dataclasses.replace(request, settings=recipe)
-    problem = None if size is None else build_problem(source, size, recipe, pyramid)
-
-    def stored() -> CompressedTexture:
-        return CompressedTexture(pyramid.layout, problem and stored_form(problem.net), (problem and level_bias) or 0.0)
-
-    return fit_maps(request, source, problem, stored, to_table, CompressedTexture.from_table)
-
-
-def stored_form(net):
-    """Return the arrays as they are stored, each entry rounded to its bits."""
-    return net.changed(lambda array, bits: array.quantised(bits))
-
-
-def rounded(net):
-    """Return a copy of ``net`` whose reads round each entry (:meth:`.DifferentiableArray.rounded`)."""
-    return net.changed(lambda array, bits: array.rounded(bits))
-
+#: Largest share of the bytes that extras take; smaller arrays have none.
+EXTRAS_SHARE = 1 / 16
 
 #: Least smoothness of a smooth texture, in dB (:func:`~mi_diffind.maps.layout.smoothness`).
 SMOOTH_DB = 30.0
+
+#: Options that say how the arrays of the first stage are laid out.
+SIZES = ("compression", "bytes", "bpp", "structure", "skip", "cascaded", "ratio", "footprint_samples")
+
+#: Options of the last stage alone.
+LAST = {"start": "--start", "share": "--lambda", "preview": "--preview"}
 
 
 def check(request: FitRequest) -> None:
@@ -192,6 +55,13 @@ def check(request: FitRequest) -> None:
     options = request.options
     if options["source"] is None:
         raise UsageError("source: not given, an image or a manifest of the maps of a material is needed")
+    if str(options["source"]).lower().endswith(".xml"):
+        raise UsageError(f"source: found the scene {options['source']}; fit scene trains a texture inside a scene")
+    if options["shading"] == "off":
+        check_last(options, "--shading is off")
+    if options["start"] is not None and any(options[name] is not None for name in SIZES):
+        given = ", ".join(f"--{name.replace('_', '-')}" for name in SIZES if options[name] is not None)
+        raise UsageError(f"--start: the arrays have their size, leave out {given}")
     if request.preset == "paper":
         for name in ("structure", "skip", "cascaded"):
             if options[name] is not None:
@@ -205,24 +75,153 @@ def check(request: FitRequest) -> None:
         raise UsageError(f"--skip: not for the structure pages, whose coarse array starts at level {first}")
 
 
-def fit(request: FitRequest) -> Fitted:
-    """Choose sizes, train, and measure.
+def check_last(options: Mapping, reason: str) -> None:
+    """Raise :class:`UsageError` if ``options`` hold one of the last stage, which is left out for a ``reason``."""
+    for name, flag in LAST.items():
+        if options[name] is not None:
+            raise UsageError(f"{flag}: found {options[name]}, but nothing is trained for its shading: {reason}")
 
-    Raises :class:`UsageError`, :class:`~mi_diffind.maps.source.SourceError` and
+
+def fit(request: FitRequest) -> Fitted:
+    """Choose sizes, train in one or two stages, and measure.
+
+    Raises :class:`UsageError`, :class:`~mi_diffind.maps.source.SourceError`, :class:`.TableError` and
     :class:`.FittingError`.
     """
-    options = request.options
+    options, recipe = request.options, request.settings
     source = load_source(options["source"], nonfinite=options["nonfinite"])
-    recipe = request.settings
     pyramid = Pyramid.from_source(source, source_layout(source, recipe), request.types, requested_border(options))
-    requested, size = requested_bytes(options, source), None
-    if pyramid.layout.stored:
-        size = find_size(source, pyramid, requested, recipe, options)
+    reason, spare = "" if options["shading"] == "on" else reason_without_shading(pyramid.layout, request), 0
+    if reason:
+        check_last(options, reason)
+        requested, size = requested_bytes(options, source), None
+        if pyramid.layout.stored:
+            size = find_size(source, pyramid, requested, recipe, options)
+        rehearse_pictures(request, source)
+        fitted = Fitted(*fit_texture(source, size, recipe, request, pyramid, level_bias(options)))
+        fitted.lines += [f"not trained for its shading: {reason}"] * (options["shading"] == "auto")
+    else:
+        fitted, requested, spare = fit_stages(request, source, pyramid)
+    texture = CompressedTexture.from_table(fitted.table, request.types.TensorXf)
+    return complete(request, source, fitted, texture, requested, spare)
+
+
+def level_bias(options: Mapping) -> float:
+    """Return the level bias that is asked for, 0 if the last stage chooses one."""
+    return 0.0 if options["level_bias"] == "auto" else options["level_bias"]
+
+
+def reason_without_shading(layout: Layout, request: FitRequest) -> str:
+    """Return why ``--shading off`` or ``auto`` leaves out the training for shading, "" if it does not."""
+    if request.options["shading"] == "off":
+        return "--shading is off"
+    if request.preset == "paper":
+        return "the preset paper does so with --shading on"
+    if not varies_shading(layout):
+        return "no map of normals or roughness, or a constant one"
+    if len(layout.maps) == 1:
+        return "one map alone is no material"
+    try:
+        maps_of(layout)
+    except UsageError as e:
+        return str(e)
+    return ""
+
+
+def fit_stages(request: FitRequest, source: Source, pyramid: Pyramid) -> tuple[Fitted, float | None, int]:
+    """Train for the values of the maps, unless arrays are given, then for their shading.
+
+    Returns the result, the bytes that its arrays were to have (``None``: those of the arrays that are given), and how
+    many of them extras would have taken that it lacks. If time is limited, the first stage takes :data:`FIRST` of it. A
+    stage that Ctrl-C ends is the last one. Errors are those of :func:`fit`.
+    """
+    options, layout = request.options, pyramid.layout
+    recipe, effects = TASK.shading_settings(request.preset, request.settings, options), material_effects(layout)[0]
+    if not layout.stored:
+        raise UsageError(f"{options['source']}: all of its maps are constant, there is nothing to learn")
+    start = None if options["start"] is None else load_start(options["start"], source, request)
+    requested = None if start is not None else requested_bytes(options, source)
+    recipe, room = room_for_extras(recipe, pyramid, start.nbytes if start is not None else requested)
+    size = None if start is not None else find_size(source, pyramid, requested - room, request.settings, options)
+    # Before any training, which gets a share of the time that is left
     rehearse_pictures(request, source)
-    fitted = Fitted(*fit_texture(source, size, recipe, request, pyramid, options["level_bias"]))
-    return complete(
-        request, source, fitted, CompressedTexture.from_table(fitted.table, request.types.TensorXf), requested
-    )
+    evaluation = ShadedEvaluation(pyramid, effects, pairs=PAIRS, side=SIDE)
+    evaluation.another()
+    lines, table, result = [], start, None
+    if start is None:
+        part = request.part(FIRST)
+        with interruptible() as stop:
+            table, result = fit_texture(source, size, request.settings, part, pyramid, level_bias(options), "maps")
+        if stop.is_set() or result.interrupted:
+            lines = ["not trained for its shading: interrupted"]
+            return Fitted(table, dataclasses.replace(result, interrupted=True), lines), requested, room
+        lines += [f"the training for its maps: {result.outcome}"] * result.unfinished
+    try:
+        net = trainable_arrays(table, pyramid)
+    except ValueError as e:
+        raise UsageError(str(e)) from None
+    table, result = fit_shading(
+        source, net, recipe, last_request(request), pyramid, evaluation, preview_path(request),
+        read_level_bias(table.settings),
+    )  # fmt: skip
+    fitted = Fitted(table, result, *shading_report(table, layout))
+    fitted.lines[:0] = lines
+    return fitted, requested, room * ("extras" not in table.arrays)
+
+
+def load_start(path, source: Source, request: FitRequest) -> Table:
+    """Return the texture to start from. Raises :class:`UsageError` for a texture of another source or preset."""
+    table = TASK.load(path)
+    if table.settings.get("source", source.digest) != source.digest:
+        raise UsageError(f"{path}: was made from another source than {request.options['source']}")
+    layered = "coarse" in table.arrays
+    if layered != request.settings.layered:
+        preset = next(name for name, recipe in PRESETS.items() if recipe.layered == layered)
+        raise UsageError(f"--start: found arrays of the preset {preset}, {request.preset} is needed")
+    return table
+
+
+def last_request(request: FitRequest) -> FitRequest:
+    """Return the request for the last stage, whose checkpoint is a file of its own, ``CHECKPOINT.shading``."""
+    if request.checkpoint is None:
+        return request
+    checkpoint = f"{request.checkpoint}.shading"
+    # Without that file, the first stage was interrupted
+    resume = request.resume and (os.path.exists(checkpoint) or request.options["start"] is not None)
+    return dataclasses.replace(request, checkpoint=checkpoint, resume=resume)
+
+
+def room_for_extras(recipe: ShadingSettings, pyramid: Pyramid, nbytes: float) -> tuple[ShadingSettings, int]:
+    """Return the recipe, and the bytes of extras: none if they take more than :data:`EXTRAS_SHARE` of ``nbytes``."""
+    extras = neutral_extras(pyramid.layout.height, pyramid.layout.width, pyramid.border)
+    needed = math.prod(extras.resolution) * extras.channels
+    if not recipe.extras or needed > EXTRAS_SHARE * nbytes:
+        return dataclasses.replace(recipe, extras=False), 0
+    return recipe, needed
+
+
+def shading_report(table: Table, layout: Layout) -> tuple[list[str], dict]:
+    """Return what a table says of its training for shading: lines of text, and figures for ``--json``."""
+    settings, (effects, reasons), not_shaded = table.settings, material_effects(layout), left_out(layout)
+    before, kept = settings.get("before", {}), settings.get("kept_start")
+    figures_before = ", ".join(" ".join(x.split()) for x in figure_lines(before))
+    remarks = [
+        (before, f"before the training for the shading: {figures_before}"),
+        (True, f"effects that are shaded: {', '.join(effects.names)}"),
+        (settings.get("level_bias"), f"read {-settings.get('level_bias', 0):g} levels finer than the footprint"),
+        (settings.get("shading", {}).get("fixed") and not kept,
+         "fine levels keep the values of the texture: any training of theirs made some level worse"),
+        (kept, "training for the shading gained nothing: these are the arrays that it started from"),
+        (reasons, "left out: " + ", ".join(f"{effect} ({reason})" for effect, reason in reasons.items())),
+        *((True, f"not shaded: {name} ({reason})") for name, reason in not_shaded.items()),
+    ]  # fmt: skip
+    figures = {
+        "before": before,
+        "effects_in_use": list(effects.names),
+        "effects_left_out": reasons,
+        "maps_not_shaded": not_shaded,
+    }
+    return [line for applies, line in remarks if applies], figures
 
 
 def find_size(source: Source, pyramid: Pyramid, nbytes: float, recipe: TextureSettings, options):

@@ -11,7 +11,7 @@ from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting.task import FitRequest
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
-from mi_diffind.tasks.texture import PRESETS, TASK, arrays, fit
+from mi_diffind.tasks.texture import PRESETS, TASK, arrays, fit, training
 from mi_diffind.tasks.texture.compressed import CompressedTexture
 
 TYPES = array_module("llvm")
@@ -32,8 +32,8 @@ def recipe(steps=4):
 
 def trained(source, size, steps=4):
     own = recipe(steps)
-    pyramid = Pyramid.from_source(source, fit.source_layout(source, own), TYPES, ("repeat", "clamp"))
-    table, _ = fit.fit_texture(source, size, own, FitRequest("ours", own, TYPES, progress=False), pyramid)
+    pyramid = Pyramid.from_source(source, training.source_layout(source, own), TYPES, ("repeat", "clamp"))
+    table, _ = training.fit_texture(source, size, own, FitRequest("ours", own, TYPES, progress=False), pyramid)
     return table
 
 
@@ -129,7 +129,7 @@ def test_which_textures_get_pages():
     source = sparse()
     noise = np.random.default_rng(4).integers(0, 256, (64, 64, 3), np.uint8)
     for maps, more in ((source, True), (from_arrays({"albedo": noise}), False)):
-        pyramid = Pyramid.from_source(maps, fit.source_layout(maps, recipe()), TYPES, ("repeat", "clamp"))
+        pyramid = Pyramid.from_source(maps, training.source_layout(maps, recipe()), TYPES, ("repeat", "clamp"))
         gain = fit._page_gain(pyramid, paged(maps))
         assert (gain >= fit.GAIN_DB) == more, gain
     assert arrays.paged(8, 8, 3, 100) is None and arrays.paged(1024, 1024, 3, 20000) is None

@@ -20,7 +20,7 @@ from mi_diffind.fitting.task import FitRequest
 from mi_diffind.maps.layout import Layout
 from mi_diffind.maps.pyramid import Pyramid, level_sizes
 from mi_diffind.maps.source import from_arrays
-from mi_diffind.tasks.texture import PRESETS, TASK, FineArray, arrays, compressed, fit, parse_structure
+from mi_diffind.tasks.texture import PRESETS, TASK, FineArray, arrays, compressed, parse_structure, training
 from mi_diffind.tasks.texture.arrays import PaperBudget, TextureBudget, choose, paper_size
 from mi_diffind.tasks.texture.compressed import CompressedTexture
 
@@ -58,9 +58,9 @@ def trained(source, size, recipe, **request):
     types = array_module("llvm")
     # Of one size and one border, mostly: what differs has to be compiled anew
     border = request.pop("border", ("repeat", "clamp"))
-    pyramid = Pyramid.from_source(source, fit.source_layout(source, recipe), types, border)
+    pyramid = Pyramid.from_source(source, training.source_layout(source, recipe), types, border)
     request = FitRequest("ours" if recipe.layered else "paper", recipe, types, progress=False, **request)
-    return fit.fit_texture(source, size, recipe, request, pyramid)
+    return training.fit_texture(source, size, recipe, request, pyramid)
 
 
 def sized(source, layout=None, fine="0:1:2,1:2:4", skip=2, dims=3, cascaded=5):

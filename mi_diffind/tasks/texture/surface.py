@@ -26,7 +26,7 @@ from ..disney import TASK as DISNEY
 from ..disney.decoder import Decoder, Lobe
 from ..disney.model import PARAMETERS, Effects, Material, find_effects, sanitize
 from ..disney.training import shade
-from ..texture.compressed import NEUTRAL
+from .compressed import NEUTRAL
 
 #: Values of parameters without a map, the defaults of the plugin ``disney``.
 DEFAULTS = {**dict.fromkeys(PARAMETERS, 0.0), "roughness": 0.5, "specular": 0.5}
@@ -66,6 +66,12 @@ def maps_of(layout: Layout) -> dict[str, MapLayout]:
     if not by_role:
         raise UsageError(f"source: found no map that shading reads, these are {', '.join(READ)}")
     return by_role
+
+
+def varies_shading(layout: Layout) -> bool:
+    """Return whether footprints show another shading than the mean of their maps: normals or roughness vary."""
+    varying = [m for m in layout.maps if any(isinstance(channel, int) for channel in m.where)]
+    return any(m.role in ("normal", "roughness") for m in varying)
 
 
 def left_out(layout: Layout) -> dict[str, str]:

@@ -1,11 +1,13 @@
-"""``fit shading``, in sample mode: what a material looks like, references, limited derivatives, training, command."""
+"""``fit texture --shading``: what a material looks like, references, limited derivatives, training, command."""
 
 import contextlib
 import dataclasses
 import functools
 import json
 import re
+import signal
 import time
+from types import SimpleNamespace
 
 import drjit as dr
 import numpy as np
@@ -18,21 +20,24 @@ from mi_diffind.commands.cli import main
 from mi_diffind.core.errors import UsageError
 from mi_diffind.core.progress import Deadline
 from mi_diffind.core.runtime import array_module
-from mi_diffind.fitting import loop
+from mi_diffind.fitting import loop, task
 from mi_diffind.fitting.loop import FitResult
 from mi_diffind.fitting.task import FitRequest
+from mi_diffind.maps.model import size_figures
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.tasks.disney import TASK as DISNEY
 from mi_diffind.tasks.disney.decoder import Decoder
 from mi_diffind.tasks.disney.model import Effects
 from mi_diffind.tasks.disney.training import uniform_hemisphere
-from mi_diffind.tasks.shading import PRESETS, material, training
-from mi_diffind.tasks.shading import fit as shading_fit
-from mi_diffind.tasks.shading.evaluation import ShadedEvaluation, reader, reference
 from mi_diffind.tasks.texture import PRESETS as TEXTURES
+from mi_diffind.tasks.texture import SHADING_PRESETS as PRESETS
 from mi_diffind.tasks.texture import TASK as TEXTURE
-from mi_diffind.tasks.texture import fit as textures
+from mi_diffind.tasks.texture import fit as texture_fit
+from mi_diffind.tasks.texture import shading as training
+from mi_diffind.tasks.texture import surface as material
+from mi_diffind.tasks.texture import training as textures
+from mi_diffind.tasks.texture.appearance import ShadedEvaluation, reader, reference
 from mi_diffind.tasks.texture.compressed import CompressedTexture
 
 OURS = PRESETS["ours"]
@@ -239,7 +244,7 @@ def start(ad, tmp_path_factory):
     recipe = dataclasses.replace(recipe, steps=60, batch=4096, measure_every=60)
     options = {argument.name: argument.default for argument in TEXTURE.arguments} | {"structure": "0:1:2,1:2:4"}
     options["skip"] = 2
-    size = textures.find_size(source, pyramid, source.nbytes / 2, recipe, options)
+    size = texture_fit.find_size(source, pyramid, source.nbytes / 2, recipe, options)
     request = FitRequest("ours", recipe, ad, progress=False)
     table, _ = textures.fit_texture(source, size, recipe, request, pyramid)
     path = tmp_path_factory.mktemp("shading") / "start.npz"
@@ -366,13 +371,16 @@ def test_fixed_fine_levels_keep_their_values(start, ad, monkeypatch):
 
 
 def test_arrays_leave_room_for_extras(ad):
-    """Extras and the smaller arrays beside them take at most the bytes of the arrays alone, or a sentence says why."""
-    source, pyramid = pyramid_of(bumpy(64), ad)
-    recipes = [dataclasses.replace(OURS, extras=extras) for extras in (False, True)]
-    alone, beside = (shading_fit.find_size(source, pyramid, recipe, {}).nbytes for recipe in recipes)
-    assert beside < alone <= source.nbytes / 12 and beside + 4 * 8 * 8 * 3 <= source.nbytes / 12
-    with pytest.raises(UsageError, match="--extras: found 100 bytes for all arrays, extras alone need"):
-        shading_fit.find_size(source, pyramid, recipes[1], {"bytes": 100})
+    """Extras have four levels of 8 x 8 x 3 bytes, and none where these are more than a small part of all bytes."""
+    _, pyramid = pyramid_of(bumpy(64), ad)
+    recipe = dataclasses.replace(OURS, extras=True)
+    nbytes = 4 * 8 * 8 * 3 / texture_fit.EXTRAS_SHARE
+    assert texture_fit.room_for_extras(recipe, pyramid, nbytes) == (recipe, 4 * 8 * 8 * 3)
+    assert texture_fit.room_for_extras(recipe, pyramid, nbytes - 1) == (OURS, 0)
+    assert texture_fit.room_for_extras(OURS, pyramid, nbytes) == (OURS, 0)
+    # A file without the extras that it has room for is not said to have missed its size
+    source, table = from_arrays(bumpy(64)), SimpleNamespace(nbytes=9000, arrays={})
+    assert len(size_figures(source, table, 10_000, 1000)[1]) == 1 and len(size_figures(source, table, 10_000)[1]) == 2
 
 
 def test_extras_are_trained_stored_and_read_by_the_material_alone(mi_rgb, start, ad, tmp_path, monkeypatch):
@@ -471,38 +479,47 @@ def test_gradient_of_the_loss_is_that_of_finite_differences(start, ad):
 # -- the command ------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def manifest(tmp_path):
+def write_manifest(folder, maps):
     import mitsuba as mi
 
-    names = {}
-    for name, values in bumpy().items():
-        file = f"{name}.png"
-        mi.Bitmap(np.ascontiguousarray(values if values.shape[2] == 3 else values[..., 0])).write(str(tmp_path / file))
-        names[name] = file
-    path = tmp_path / "metal.json"
-    path.write_text(json.dumps({"maps": names}))
+    folder.mkdir(exist_ok=True)
+    for name, values in maps.items():
+        image = np.ascontiguousarray(values if values.shape[2] == 3 else values[..., 0])
+        mi.Bitmap(image).write(str(folder / f"{name}.png"))
+    path = folder / "metal.json"
+    path.write_text(json.dumps({"maps": {name: f"{name}.png" for name in maps}}))
     return path
 
 
-def test_command_trains_both_and_the_plugin_reads_it(mi_rgb, start, manifest, tmp_path, monkeypatch):
+@pytest.fixture
+def manifest(tmp_path):
+    return write_manifest(tmp_path, bumpy())
+
+
+@pytest.fixture
+def small(start, monkeypatch):
+    """Few images that measure, and the arrays of other tests, lest everything is compiled anew."""
+    evaluation = functools.partial(ShadedEvaluation, levels=4, pairs=24, side=16)
+    monkeypatch.setattr(texture_fit, "ShadedEvaluation", evaluation)
+    monkeypatch.setattr(texture_fit, "find_size", lambda *a: start[5])
+
+
+SHORT = ["--steps", "6", "--batch", "4096", "--border", "repeat", "--variant", "llvm_ad_rgb"]
+
+
+def test_command_trains_both_and_the_plugin_reads_it(mi_rgb, small, manifest, tmp_path):
     mi = mi_rgb
-    short = dataclasses.replace(TEXTURES["ours"], steps=6, batch=4096, measure_every=6)
-    monkeypatch.setitem(TEXTURES, "ours", dataclasses.replace(TEXTURES["ours"], **short.common))
-    monkeypatch.setattr(
-        shading_fit, "ShadedEvaluation", functools.partial(ShadedEvaluation, levels=4, pairs=24, side=16)
-    )
-    # The same arrays as those of other tests, lest everything is compiled anew
-    monkeypatch.setattr(shading_fit.texture_fit, "find_size", lambda *a: start[5])
     out, record = tmp_path / "metal.npz", tmp_path / "record.json"
-    command = ["fit", "shading", str(manifest), "-o", str(out), "--steps", "6", "--batch", "4096", "--border", "repeat",
-               "--json", str(record), "--checkpoint", str(tmp_path / "state")]  # fmt: skip
+    command = ["fit", "texture", str(manifest), "-o", str(out), *SHORT, "--json", str(record),
+               "--checkpoint", str(tmp_path / "state")]  # fmt: skip
     assert main(command) == 0
     said = json.loads(record.read_text())
-    assert said["task"] == "shading" and said["settings"]["shading"]["share"] == OURS.share
+    assert said["task"] == "texture" and said["settings"]["shading"]["share"] == OURS.share
+    assert said["settings"]["steps"] == 6 and said["settings"]["lr"] == OURS.lr  # of the last stage
     assert set(said["settings"]["level_biases"]) == {"0", "-0.5", "-1"}
     assert said["settings"]["level_bias"] in (training.BIASES if not said["settings"].get("kept_start") else (0,))
     assert said["effects_left_out"]["diffuse"] == "metallic is 1" and said["measured"]["shaded_converged_db"] > 10
+    assert said["before"]["shaded_converged_db"] > 10 and {"psnr_db", "seen_db"} <= set(said["measured"])
     assert np.array(mi.Bitmap(str(tmp_path / "metal_preview.png"))).shape == (2 * (16 + 192), 3 * 192, 3)
     texture = mi.load_dict({"type": "neural_texture", "filename": str(out), "channels": "roughness"})
     si = dr.zeros(mi.SurfaceInteraction3f, 4)
@@ -512,45 +529,139 @@ def test_command_trains_both_and_the_plugin_reads_it(mi_rgb, start, manifest, tm
     assert load_table(out).task == "texture"
 
 
+@pytest.mark.parametrize("stage", ["maps", "shading"])
+def test_an_interrupted_training_goes_on_in_its_stage(small, manifest, tmp_path, monkeypatch, stage):
+    """Ctrl-C in one stage keeps the texture so far; resumed, both stages give the bytes of a run without it."""
+    titles = []
+
+    class Interrupted(FitRequest):
+        """Request whose training of the stage with the title ``stop`` ends at its first measurement."""
+
+        stop = ""
+
+        def train(self, problem, title=None, *arguments, **options):
+            titles.append(title)
+            if title != self.stop:
+                return super().train(problem, title, *arguments, **options)
+            measure = type(problem).measure
+
+            def interrupt(net):
+                signal.raise_signal(signal.SIGINT)
+                return measure(problem, net)
+
+            problem.measure = interrupt
+            return super().train(problem, title, *arguments, **options)
+
+    monkeypatch.setattr(task, "FitRequest", Interrupted)
+    given = {"steps": 20, "batch": 2048, "border": "repeat", "level_bias": 0, "extras": "off", "progress": False,
+             "variant": "llvm_ad_rgb", "measure_every": 5}  # fmt: skip
+    run = functools.partial(mi_diffind.fit, "texture", str(manifest), **given)
+    expected, checkpoint = run(), tmp_path / "state"
+    assert titles == ["maps", "shading"]
+    Interrupted.stop = stage
+    stopped = run(checkpoint=checkpoint)
+    assert stopped.result.interrupted and stopped.table.measured["psnr_db"] > 5
+    assert ("not trained for its shading: interrupted" in stopped.lines) == (stage == "maps")
+    assert (tmp_path / "state.shading").exists() == (stage == "shading")
+    Interrupted.stop = ""
+    resumed = run(checkpoint=checkpoint, resume=True)
+    assert not resumed.result.interrupted
+    for name, array in expected.table.arrays.items():
+        assert np.array_equal(array.entries, resumed.table.arrays[name].entries), name
+
+
+def test_training_goes_on_from_a_file(start, small, manifest, tmp_path):
+    """The last stage alone, from arrays that fit texture wrote: those of one run with both stages."""
+    run = functools.partial(
+        mi_diffind.fit, "texture", str(manifest), steps=6, border="repeat", extras="off", variant="llvm_ad_rgb",
+        progress=False,
+    )  # fmt: skip
+    plain = run(shading="off", batch=2048).save(tmp_path / "plain.npz")
+    both, last = run(batch=2048), run(start=str(plain))
+    assert both.table.settings["before"] == last.table.settings["before"]
+    for name, array in both.table.arrays.items():
+        assert np.array_equal(array.entries, last.table.arrays[name].entries), name
+    request = FitRequest("ours", TEXTURES["ours"], ad, options={"source": "other.json"})
+    with pytest.raises(UsageError, match=r"was made from another source than other\.json"):
+        texture_fit.load_start(plain, from_arrays(bumpy(seed=9)), request)
+    paper = dataclasses.replace(request, preset="paper", settings=TEXTURES["paper"])
+    with pytest.raises(UsageError, match="--start: found arrays of the preset ours, paper is needed"):
+        texture_fit.load_start(plain, from_arrays(bumpy()), paper)
+
+
+def test_auto_is_for_materials_whose_shading_changes(ad, tmp_path):
+    """Other sources are trained as without the last stage, to the byte, and a line says why."""
+    maps = bumpy(16)
+    smooth = np.full((16, 16, 1), 90, np.uint8)
+    sources = (
+        ({"image": maps["albedo"]}, "no map of normals or roughness, or a constant one"),
+        ({"albedo": maps["albedo"], "roughness": smooth}, "no map of normals or roughness, or a constant one"),
+        ({"normal": maps["normal"]}, "one map alone is no material"),
+        ({**maps, "diffuse": maps["albedo"]}, 'map "diffuse": found a second albedo'),
+        ({"albedo": smooth}, "no map of normals or roughness, or a constant one"),
+    )
+    given = {"steps": 2, "batch": 1024, "border": "repeat", "variant": "llvm_ad_rgb", "progress": False}
+    for source, reason in sources:
+        auto, off = (mi_diffind.fit("texture", source, shading=shading, **given) for shading in ("auto", "off"))
+        auto.save(tmp_path / "auto.npz"), off.save(tmp_path / "off.npz")
+        assert (tmp_path / "auto.npz").read_bytes() == (tmp_path / "off.npz").read_bytes()
+        (line,) = [line for line in auto.lines if line not in off.lines]
+        assert line.startswith(f"not trained for its shading: {reason}")
+        with pytest.raises(UsageError, match=f"--lambda: found 0.5, but nothing is trained for its shading: {reason}"):
+            mi_diffind.fit("texture", source, share=0.5, **given)
+    layout, options = pyramid_of(maps, ad)[1].layout, {"shading": "auto"}
+    for preset, reason in (("ours", ""), ("paper", "the preset paper does so with --shading on")):
+        request = FitRequest(preset, TEXTURES[preset], ad, options=options)
+        assert texture_fit.reason_without_shading(layout, request) == reason
+
+
 @pytest.mark.parametrize(
     "changed, message",
     [
         (["--lambda", "1.5"], "argument --lambda: found '1.5', allowed are numbers from 0 to 1"),
-        (["--clip", "-1"], "argument --clip: found '-1', allowed are numbers above 0 and none"),
-        (["--start", "x.npz", "--compression", "3x"], "--start: the arrays have their size"),
-        (["--extras", "auto", "--preset", "paper"], "--extras: found auto, the arrays of the preset paper have none"),
+        (["--shading", "maybe"], "argument --shading: invalid choice"),
+        (["--start", "x.npz", "--compression", "3x"], "--start: the arrays have their size, leave out --compression"),
+        (["--start", "x.npz", "--skip", "3", "--structure", "auto"], "their size, leave out --structure, --skip"),
+        (
+            ["--start", "x.npz", "--shading", "off"],
+            "--start: found x.npz, but nothing is trained for its shading",
+        ),
+        (["--lambda", "0.5", "--shading", "off"], "--lambda: found 0.5, but nothing is trained for its shading"),
+        (["--preview", "x.png", "--shading", "off"], "--preview: found x.png, but nothing is trained for its shading"),
         (["--level-bias", "0.5"], "argument --level-bias: found '0.5', allowed are numbers from -4 to 0"),
         (["--spp", "4"], "unrecognized arguments: --spp 4"),
     ],
 )
 def test_bad_arguments_are_one_sentence(manifest, tmp_path, capsys, changed, message):
     with pytest.raises(SystemExit) if "argument " in message or "arguments" in message else contextlib.nullcontext():
-        assert main(["fit", "shading", str(manifest), "-o", str(tmp_path / "x.npz"), *changed]) == 2
+        assert main(["fit", "texture", str(manifest), "-o", str(tmp_path / "x.npz"), *changed]) == 2
     assert message in capsys.readouterr().err
 
 
-def test_sources_that_cannot_be_shaded_are_refused(ad, start, tmp_path):
+@pytest.mark.parametrize("words", [["shading"], ["shading", "m.json", "-o", "m.npz", "--compression", "12x", "--help"]])
+def test_the_former_task_says_what_to_use(words, capsys):
+    sentence = 'task "shading" is no more: materials are trained for their shading by fit texture, see its --shading'
+    with pytest.raises(SystemExit) as refused:
+        main(["fit", *words])
+    assert refused.value.code == 2 and capsys.readouterr().err.splitlines()[-1].endswith(sentence)
+    with pytest.raises(UsageError, match=sentence):
+        mi_diffind.fit("shading", "m.json")
+
+
+def test_sources_that_cannot_be_shaded_are_refused(ad):
     small, zeros = bumpy(8), np.zeros((4, 4, 2), np.uint8)
     for maps, message in (
         ({"height": small["roughness"]}, "found no map that shading reads, these are albedo, normal"),
         ({"albedo": zeros}, 'map "albedo": found 2 channels, allowed for albedo are 1 or 3'),
-        (
-            {"albedo": small["albedo"], "diffuse": small["albedo"]},
-            'map "diffuse": found a second albedo',
-        ),
+        ({"albedo": small["albedo"], "diffuse": small["albedo"]}, 'map "diffuse": found a second albedo'),
     ):
         with pytest.raises(UsageError, match=message):
             material.material_effects(pyramid_of(maps, ad)[1].layout)
     for source, message in (
+        ({"height": small["roughness"]}, "found no map that shading reads"),
         ({"albedo": zeros[..., :1]}, "all of its maps are constant, there is nothing to learn"),
-        (None, "source: not given, a manifest"),
+        (None, "source: not given, an image"),
         ("scene.xml", r"found the scene scene\.xml; fit scene trains"),
     ):
         with pytest.raises(UsageError, match=message):
-            mi_diffind.fit("shading", source=source, variant="llvm_ad_rgb", progress=False)
-    with pytest.raises(UsageError, match=r"was made from another source than other\.json"):
-        shading_fit.load_start(
-            start[4],
-            from_arrays(bumpy(seed=9)),
-            FitRequest("ours", OURS, ad, options={"source": "other.json"}),
-        )
+            mi_diffind.fit("texture", source=source, shading="on", variant="llvm_ad_rgb", progress=False)

@@ -2,7 +2,7 @@
 
 The loss is (1 − λ) · texture + λ · shading. The first term is the loss of task 4, in the units of its own recipe. The
 second compares shaded values, for views and lights uniform over the hemisphere: the arrays, shaded by frozen tables of
-the Disney BRDF, against a reference that shades first and filters afterwards (:mod:`.reference`).
+the Disney BRDF, against a reference that shades first and filters afterwards (:func:`.reference`).
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from ...maps.model import significant
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source
 from ..disney.training import random_directions
-from ..texture import PRESETS as TEXTURES
-from ..texture import fit as textures
-from ..texture.compressed import CompressedTexture, neutral_extras, to_table
+from . import PRESETS as TEXTURES
 from . import ShadingSettings
-from .evaluation import TRUTHS, ShadedEvaluation, reader, reference, write_preview
-from .material import frozen_decoder, material_effects, shaded, surface_of
+from . import training as textures
+from .appearance import TRUTHS, ShadedEvaluation, reader, reference, write_preview
+from .compressed import CompressedTexture, neutral_extras, to_table
+from .surface import frozen_decoder, material_effects, shaded, surface_of
 
 #: Factor of the number of shaded samples from one level to the next coarser one, up to level :data:`TOP`.
 FALL = 0.7

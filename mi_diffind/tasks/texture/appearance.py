@@ -27,7 +27,7 @@ from ...maps.pyramid import FilteredMaps, Pyramid, decibel
 from ..disney.decoder import Decoder
 from ..disney.model import Effects
 from ..disney.training import uniform_hemisphere
-from .material import shaded, surface_of
+from .surface import shaded, surface_of
 
 #: Function ``(u, v, level, wi, wo) → Array3f`` of shaded values.
 ShadedReader = Callable[[Any, Any, Any, Any, Any], Any]
@@ -171,7 +171,7 @@ CHUNK = 2**22
 
 
 def reference(pattern: str, pyramid: Pyramid, u, v, level, wi, wo, effects: Effects, rng=None, side: int = 0):
-    """Return the shaded value (:func:`.material.shaded`) of footprints around (u, v), ``Array3f``, without derivatives.
+    """Return the shaded value (:func:`.surface.shaded`) of footprints around (u, v), ``Array3f``, without derivatives.
 
     ``level`` is the level of detail, a real number; each footprint is seen along ``wi`` and lit along ``wo``. ``rng``
     jitters the samples (``"jittered"`` needs one; without, samples are the centres of strata). ``side``, a power of
