@@ -14,10 +14,10 @@ from mi_diffind.studies import shaded_scenes
 from mi_diffind.studies.baselines import normals
 from mi_diffind.studies.shaded_scenes import VIEWS, FloorScenes, RenderedFile, SceneQuality
 from mi_diffind.tasks import texture
-from mi_diffind.tasks.texture import fit
+from mi_diffind.tasks.texture import training
 from mi_diffind.tasks.texture.appearance import reader
 from mi_diffind.tasks.texture.compressed import CompressedTexture, to_table
-from mi_diffind.tasks.texture.fit import source_layout
+from mi_diffind.tasks.texture.fit import find_size
 from mi_diffind.tasks.texture.surface import material_effects
 
 QUALITY = SceneQuality((48, 27), 512, 64, 1)
@@ -62,11 +62,11 @@ def test_parts_of_the_floor(bumpy, mi_rgb):
 
 def test_lean_in_a_material(bumpy, mi_rgb, tmp_path):
     """The plugin with LEAN's maps in place of those of a file, against the shading of the same maps."""
-    mi, layout = mi_rgb, source_layout(bumpy, texture.PRESETS["ours"])
+    mi, layout = mi_rgb, training.source_layout(bumpy, texture.PRESETS["ours"])
     pyramid = Pyramid.from_source(bumpy, layout, array_module(mi.variant()), ("repeat", "repeat"))
     lean, recipe = normals.lean_pyramid(pyramid), texture.PRESETS["ours"]
-    size = fit.find_size(bumpy, lean, bumpy.nbytes / 2, recipe, dict.fromkeys(("structure", "skip", "cascaded")))
-    net = fit.stored_form(fit.build_problem(bumpy, size, recipe, lean).net)
+    size = find_size(bumpy, lean, bumpy.nbytes / 2, recipe, dict.fromkeys(("structure", "skip", "cascaded")))
+    net = training.stored_form(training.build_problem(bumpy, size, recipe, lean).net)
     save_table(tmp_path / "lean.npz", to_table(CompressedTexture(lean.layout, net), {}))
     maps = normals.ReadMaps(lean)
     bsdf = mi.load_dict(RenderedFile(tmp_path / "lean.npz", maps).material(bumpy, "repeat")((1, 1)))
@@ -85,7 +85,7 @@ def test_lean_in_a_material(bumpy, mi_rgb, tmp_path):
 
 def test_exact_maps_approach_the_truth(bumpy, file, mi_rgb):
     """Uncompressed maps in place of the file's, at level 0 and without its footprints, are the truth."""
-    layout = source_layout(bumpy, texture.PRESETS["ours"])
+    layout = training.source_layout(bumpy, texture.PRESETS["ours"])
     pyramid = Pyramid.from_source(bumpy, layout, array_module(mi_rgb.variant()), ("repeat", "repeat"))
     scenes = FloorScenes(bumpy, "repeat", QUALITY)
     level_0, footprints = (
