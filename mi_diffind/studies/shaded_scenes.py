@@ -3,7 +3,7 @@
 Each file is rendered with the footprints of 1, 4 or 16 samples a pixel, but with many samples: its errors are bias, not
 noise. *The truth* is ``normalmap`` around ``disney`` with bitmaps of the source. The noise that is left is not counted:
 the errors of two independent halves are multiplied. PSNR is that of values clipped to [0, 1], exposed such that 5% of
-the truth's pixels are brighter; brightness is that of the unclipped values.
+the truth's pixels are brighter; brightness is that of values up to 16, so that no single mirror of the sun decides it.
 """
 
 from __future__ import annotations
@@ -58,6 +58,9 @@ EDGES = (3.5, 6.5)
 
 #: Parts of a picture whose brightness is measured.
 PARTS = ("whole", "near", "middle", "far")
+
+#: Limit of exposed values whose mean is a brightness. Where roughness is 0, a pixel that mirrors the sun has 10,000.
+BRIGHTEST = 16.0
 
 #: Most samples of one pass.
 PASS = 2**22
@@ -222,7 +225,7 @@ class FloorScenes:
                 truth, exposure, masks = self.truth(lights, view)
                 for spp, images in self.images(rendered, lights, view).items():
                     figures[lights][str(spp)]["psnr_db"].append(psnr(truth, images, exposure))
-                    ratios = {part: float(images[:, m].mean() / truth[:, m].mean()) for part, m in masks.items()}
+                    ratios = {part: brightness(truth[:, m], images[:, m], exposure) for part, m in masks.items()}
                     figures[lights][str(spp)]["brightness"].append(ratios)
         return figures
 
@@ -231,3 +234,9 @@ def psnr(truth: np.ndarray, images: np.ndarray, exposure: float) -> float:
     """Return the PSNR in dB of exposed and clipped values, without the noise of both pairs of halves."""
     a, b = np.clip(exposure * images, 0, 1) - np.clip(exposure * truth, 0, 1)
     return decibel(float(np.mean(a * b)))
+
+
+def brightness(truth: np.ndarray, images: np.ndarray, exposure: float) -> float:
+    """Return the ratio of the means of exposed values, each at most :data:`BRIGHTEST`."""
+    light, expected = (np.minimum(exposure * values, BRIGHTEST).mean() for values in (images, truth))
+    return float(light / expected)

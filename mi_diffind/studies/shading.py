@@ -44,7 +44,7 @@ from ..tasks.texture.surface import material_effects
 from .baselines import codecs, normals
 from .example_maps import MATERIALS, example_maps
 from .materials import level_images, level_pyramid
-from .shaded_scenes import LIGHTS, VIEWS, FloorScenes, RenderedFile, SceneQuality, psnr
+from .shaded_scenes import LIGHTS, VIEWS, FloorScenes, RenderedFile, SceneQuality, brightness, psnr
 
 #: Compression ratio of all trainings.
 COMPRESSION = 12.0
@@ -382,7 +382,7 @@ def draw_renders(contexts: dict[str, ShadingContenders], result: dict):
         renders = {text: scenes.images(context.rendered(job), lights, view, [1])[1] for text, job in shown.items()}
         window, rows[name] = far_window(renders["plain texture"].mean(axis=0) - truth.mean(axis=0), far), {}
         for text, halves in {**renders, "truth": truth}.items():
-            light = halves[:, far].mean() / truth[:, far].mean() - 1
+            light = brightness(truth[:, far], halves[:, far], exposure) - 1
             errors = f"{psnr(truth, halves, exposure):.1f} dB, light of the far floor {light:+.1%}"
             whole = srgb.for_display(DISPLAYED * exposure * halves.mean(axis=0))
             part = whole[window].repeat(3, axis=0).repeat(3, axis=1)[:, : whole.shape[1]]

@@ -50,6 +50,15 @@ def test_errors_without_noise(rng):
     assert shaded_scenes.psnr(truth + noise[0], truth + 0.01 + noise[1], 1.0) == pytest.approx(40, abs=1)
 
 
+def test_brightness():
+    """The mean of values up to 16: one brighter pixel counts as 16."""
+    truth = np.full((2, 10, 10, 3), 0.5)
+    images = 1.1 * truth
+    assert shaded_scenes.brightness(truth, images, 2.0) == pytest.approx(1.1)
+    images[:, 0, 0] = 1e4
+    assert shaded_scenes.brightness(truth, images, 2.0) == pytest.approx(1.1 * 0.99 + 0.16)
+
+
 def test_parts_of_the_floor(bumpy, mi_rgb):
     """Near lies below far in the picture, and no part is empty."""
     scenes = FloorScenes(bumpy, "repeat", SceneQuality((48, 27), 2, 2, 3))
