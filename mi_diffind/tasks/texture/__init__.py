@@ -69,25 +69,29 @@ class ShadingSettings(FitSettings):
     the specular lobe (``None``: unlimited). ``reference``: sample pattern of the reference. ``bounded``: whether values
     above 1 are compared in log space. ``level_bias``: levels by which a footprint's level of detail is read finer
     (negative), stored in the file (``None``: chosen by images). ``extras``: whether the shape and weight of the
-    specular lobe are tried as coarse extras, which ``neural_material`` alone reads. ``fixed``: whether the
-    entries that fine levels read keep their values. ``beta_2``: Adam's decay of squared gradients; highlights are rare,
-    and with 0.999 single ones tilt normals of glossy, flat pages by degrees. ``texture``: preset of task 4, which
+    specular lobe are tried as coarse extras, which ``neural_material`` alone reads. ``mirrored``: share of the lights
+    that are drawn about the mirror direction. ``quarters``: whether each second step is of pixels with four samples.
+    ``tables``: whether arrays are shaded by the frozen tables of task 2, in
+    place of the formulas that ``neural_material`` evaluates by default. ``beta_2``: Adam's decay of squared gradients;
+    highlights are rare, and with 0.999 single ones tilt normals of glossy, flat pages by degrees. ``texture``: preset of task 4, which
     trains the start unless one is given, and defines the samples and the loss of the texture; ``loss`` is that of
     shaded values.
     """
 
-    steps: int = 1500
+    steps: int = 1000
     batch: int = 2**16
-    lr: float = 5e-3
+    lr: float = 1e-3
     loss: str = "mse"
     measure_every: int = 150
-    share: float = 0.9
-    clip: float | None = 1.0
+    share: float = 0.5
+    clip: float | None = None
     reference: str = "jittered"
     bounded: bool = True
     level_bias: float | None = None
     extras: bool = False
-    fixed: bool = False
+    mirrored: float = 0.5
+    quarters: bool = True
+    tables: bool = False
     beta_2: float = 0.99
     texture: str = "ours"
 
@@ -97,7 +101,7 @@ SHADING_PRESETS = {
     "ours": ShadingSettings(),
     "paper": ShadingSettings(
         lr=1e-3, schedule="constant", loss="mae", share=0.25, clip=0.1, reference="prefiltered", bounded=False,
-        level_bias=0.0, beta_2=0.999, texture="paper",
+        level_bias=0.0, mirrored=0.0, quarters=False, tables=True, beta_2=0.999, texture="paper",
     ),
 }  # fmt: skip
 

@@ -77,8 +77,7 @@ class ShadedEvaluation:
         stream: int = 0,
     ):  # fmt: skip
         self.pyramid, self.effects, self.types = pyramid, effects, pyramid.types
-        self._another: ShadedEvaluation | None = None
-        self.levels, self.form = min(levels, pyramid.levels), (levels, pairs, side)
+        self.levels = min(levels, pyramid.levels)
         rng = np.random.default_rng((SEED, stream))
         numbers = rng.random((4, pairs))
         # Strata of the cosine, one view and one light in each
@@ -92,18 +91,6 @@ class ShadedEvaluation:
         shifts = rng.random((self.levels, pairs, 2))
         self.origins = np.floor(rng.random(shifts.shape) * (spare[:, None] + 1)).clip(0, spare[:, None]) + shifts
         self.truths = {letter: [self._truth(TRUTHS[letter], i) for i in range(self.levels)] for letter in truths}
-
-    def another(self) -> ShadedEvaluation:
-        """Return small images under many other views and lights, with the converged truth alone.
-
-        Their errors choose bias and state of a training. With few pairs, a single highlight would decide. They are
-        rendered once.
-        """
-        if self._another is None:
-            levels, pairs, side = self.form
-            pairs = max(1, min(CHOOSING, pairs * side * side) // PART**2)
-            self._another = ShadedEvaluation(self.pyramid, self.effects, levels, pairs, PART, "C", stream=1)
-        return self._another
 
     def _lanes(self, level: int, pairs=None) -> tuple:
         """Return ``(u, v, level, wi, wo)`` of all pixels of the images of a level, and their shape."""
@@ -192,8 +179,20 @@ def reference(pattern: str, pyramid: Pyramid, u, v, level, wi, wo, effects: Effe
         return total
 
 
+def places_in_footprints(pyramid: Pyramid, u, v, level, x, y) -> tuple:
+    """Return the places (x, y), from 0 to 1 along the sides, of footprints of a level of detail around (u, v).
+
+    They are wrapped in a repeating texture, else clamped to the edge.
+    """
+    extent = dr.exp2(level)
+    u = dr.fma((x - 0.5) * extent, 1 / pyramid.layout.width, u)
+    v = dr.fma((y - 0.5) * extent, 1 / pyramid.layout.height, v)
+    borders = zip((u, v), reversed(pyramid.border), strict=True)
+    return tuple(x - dr.floor(x) if border == "repeat" else dr.clip(x, 0, 1) for x, border in borders)
+
+
 def _averaged(pattern, pyramid: Pyramid, u, v, level, wi, wo, effects: Effects, rng, side: int):
-    types, layout, samples = pyramid.types, pyramid.layout, side * side
+    types, samples = pyramid.types, side * side
     Float, UInt32, size = types.Float, types.UInt32, dr.width(u)
     lane = dr.arange(UInt32, size * samples)
     # Power of two: shifts and masks in place of divisions. Opaque, so that one kernel serves all numbers of samples
@@ -203,12 +202,7 @@ def _averaged(pattern, pyramid: Pyramid, u, v, level, wi, wo, effects: Effects, 
     x, y = Float(sample & mask), Float(sample >> shift)
     x, y = (x + (0.5 if rng is None else rng.random(Float, size * samples)) for x in (x, y))
     u, v, level, wi, wo = (dr.gather(type(a), a, place) for a in (u, v, level, wi, wo))
-    extent = dr.exp2(level)
-    u = dr.fma((x / width - 0.5) * extent, 1 / layout.width, u)
-    v = dr.fma((y / width - 0.5) * extent, 1 / layout.height, v)
-    # Wrapped in a repeating texture, else clamped to the edge
-    borders = zip((u, v), reversed(pyramid.border), strict=True)
-    u, v = (x - dr.floor(x) if border == "repeat" else dr.clip(x, 0, 1) for x, border in borders)
+    u, v = places_in_footprints(pyramid, u, v, level, x / width, y / width)
     finer = dr.maximum(level - FINER, 0)
     stored = pyramid.filtered(u, v, finer) if pattern == "prefiltered" else pyramid.stored(u, v)
     value = shaded(Decoder(), surface_of(pyramid, stored), wi, wo, effects)

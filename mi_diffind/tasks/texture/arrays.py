@@ -334,11 +334,16 @@ def enlarge(values: np.ndarray, rows: int, columns: int, border: Sequence[str]) 
     return values.astype(np.float32)
 
 
-def from_components(values: Sequence[np.ndarray], size: TextureBudget, border: tuple[str, str]) -> LayeredNet:
+def from_components(
+    values: Sequence[np.ndarray], size: TextureBudget, border: tuple[str, str], weights: np.ndarray | None = None
+) -> LayeredNet:
     """Return initial arrays from the levels ``values`` of a texture, each ``(height, width, k)`` in [0, 1].
 
     Each fine array holds the difference between the pointers of its level and the sum of the coarser arrays.
+    ``weights``, ``(k,)``, are those of squared errors of channels: components are those of weighted channels.
     """
+    factors = channel_scale(weights, values[0].shape[-1])
+    values = [level * factors for level in values]
     k = values[0].shape[-1]
     mean = values[0].reshape(-1, k).mean(axis=0, dtype=np.float64)
     directions = eigenvectors(channel_covariance(values[0], mean), min(size.dims, k))
@@ -382,12 +387,19 @@ def from_components(values: Sequence[np.ndarray], size: TextureBudget, border: t
     coarse = DifferentiableArray((len(coarse),), size.dims, np.clip(coarse, 1e-3, 1 - 1e-3), fold=True)
     shape = (size.knots,) * (size.knots > 1) + (size.cascaded,) * size.dims
     back = linear_in_pointer(mean, directions, low, high, size.cascaded, range(used), used)
-    back = np.clip(back, 1e-3, 1 - 1e-3).astype(np.float32)
+    back = np.clip(back / factors, 1e-3, 1 - 1e-3).astype(np.float32)
     back = back.reshape(*back.shape[:-1], *[1] * (size.dims - used), k)
     cascaded = np.broadcast_to(back, (*shape, size.channels)).astype(np.float32)
     cascaded = DifferentiableArray(shape, size.channels, cascaded, fold=True)
     structure = LayeredStructure(size.height, size.width, tuple(layers), size.skip, size.bits, size.base)
     return LayeredNet(fine, coarse, cascaded, structure, border)
+
+
+def channel_scale(weights: np.ndarray | None, channels: int) -> np.ndarray:
+    """Return the factors of channels, ``(channels,)``, at most 1, by which weighted squared errors become plain ones."""
+    if weights is None:
+        return np.ones(channels, np.float32)
+    return np.sqrt(np.asarray(weights) / np.max(weights)).astype(np.float32)
 
 
 def _pages(pointers: list, ranges: np.ndarray, size: TextureBudget, border) -> tuple[list, list]:

@@ -7,6 +7,8 @@ import math
 import os
 from collections.abc import Mapping
 
+import numpy as np
+
 from ...arrays.tables import MAX_BYTES, Table
 from ...core.errors import UsageError
 from ...core.progress import interruptible
@@ -22,7 +24,7 @@ from .arrays import TextureBudget
 from .compressed import CompressedTexture, neutral_extras, read_level_bias
 from .shading import fit_shading, trainable_arrays
 from .surface import left_out, maps_of, material_effects, varies_shading
-from .training import fit_texture, source_layout
+from .training import TextureProblem, build_problem, channel_weights, fit_texture, source_layout
 
 #: Least gain of pages, in dB before training, over one grid of equal bytes. (0.7 on bricks, where pages lose 0.4.)
 GAIN_DB = 1.0
@@ -146,7 +148,6 @@ def fit_stages(request: FitRequest, source: Source, pyramid: Pyramid) -> tuple[F
     # Before any training, which gets a share of the time that is left
     rehearse_pictures(request, source)
     evaluation = ShadedEvaluation(pyramid, effects, pairs=PAIRS, side=SIDE)
-    evaluation.another()
     lines, table, result = [], start, None
     if start is None:
         part = request.part(FIRST)
@@ -160,9 +161,16 @@ def fit_stages(request: FitRequest, source: Source, pyramid: Pyramid) -> tuple[F
         net = trainable_arrays(table, pyramid)
     except ValueError as e:
         raise UsageError(str(e)) from None
+    nbytes = table.nbytes
+
+    def build(weights: Mapping[str, float]) -> TextureProblem:
+        scale = arrays.channel_scale(channel_weights(layout, weights), layout.stored)
+        size = find_size(source, pyramid, nbytes, request.settings, options, scale)
+        return build_problem(source, size, request.settings, pyramid, weights)
+
     table, result = fit_shading(
         source, net, recipe, last_request(request), pyramid, evaluation, preview_path(request),
-        read_level_bias(table.settings),
+        read_level_bias(table.settings), build if request.settings.layered else None,
     )  # fmt: skip
     fitted = Fitted(table, result, *shading_report(table, layout))
     fitted.lines[:0] = lines
@@ -205,12 +213,12 @@ def shading_report(table: Table, layout: Layout) -> tuple[list[str], dict]:
     settings, (effects, reasons), not_shaded = table.settings, material_effects(layout), left_out(layout)
     before, kept = settings.get("before", {}), settings.get("kept_start")
     figures_before = ", ".join(" ".join(x.split()) for x in figure_lines(before))
+    gains = ", ".join(f"{name} {gain:+.2f} dB" for name, gain in settings.get("states", {}).items())
     remarks = [
         (before, f"before the training for the shading: {figures_before}"),
         (True, f"effects that are shaded: {', '.join(effects.names)}"),
         (settings.get("level_bias"), f"read {-settings.get('level_bias', 0):g} levels finer than the footprint"),
-        (settings.get("shading", {}).get("fixed") and not kept,
-         "fine levels keep the values of the texture: any training of theirs made some level worse"),
+        (settings.get("states"), f"gain of held-out footprints: {gains}; kept: {settings.get('state')}"),
         (kept, "training for the shading gained nothing: these are the arrays that it started from"),
         (reasons, "left out: " + ", ".join(f"{effect} ({reason})" for effect, reason in reasons.items())),
         *((True, f"not shaded: {name} ({reason})") for name, reason in not_shaded.items()),
@@ -224,10 +232,14 @@ def shading_report(table: Table, layout: Layout) -> tuple[list[str], dict]:
     return [line for applies, line in remarks if applies], figures
 
 
-def find_size(source: Source, pyramid: Pyramid, nbytes: float, recipe: TextureSettings, options):
-    """Return the memory budget of the arrays for ``nbytes`` bytes. Raises :class:`UsageError`."""
+def find_size(source: Source, pyramid: Pyramid, nbytes: float, recipe: TextureSettings, options, scale=1.0):
+    """Return the memory budget of the arrays for ``nbytes`` bytes. Raises :class:`UsageError`.
+
+    ``scale`` are factors of the channels, ``(channels,)``, by which their errors count.
+    """
     if recipe.layered:
-        size = _layered_size(pyramid, nbytes, options["structure"] or "auto", options["skip"], options["cascaded"])
+        structure = options["structure"] or "auto"
+        size = _layered_size(pyramid, nbytes, structure, options["skip"], options["cascaded"], scale)
     else:
         shape = pyramid.values[0].shape
         size = arrays.paper_size(nbytes, source.nbytes, shape[2], *shape[:2], options["ratio"])
@@ -236,12 +248,14 @@ def find_size(source: Source, pyramid: Pyramid, nbytes: float, recipe: TextureSe
     return size
 
 
-def _page_gain(pyramid: Pyramid, size: TextureBudget) -> float:
+def _page_gain(pyramid: Pyramid, size: TextureBudget, scale=1.0) -> float:
     """Return the gain of pages over one grid of equal bytes at level 0, in dB."""
-    return gain_of_pages(pyramid.values[0], size.dims, size.page_entries, pyramid.border)[0]
+    return gain_of_pages((pyramid.values[0] * scale).astype(np.float32), size.dims, size.page_entries, pyramid.border)[
+        0
+    ]
 
 
-def _layered_size(pyramid: Pyramid, nbytes: float, structure: str, skip: int | None, cascaded: int | None):
+def _layered_size(pyramid: Pyramid, nbytes: float, structure: str, skip: int | None, cascaded: int | None, scale=1.0):
     """Return the budget of pages or fine arrays: those of a ``structure``, or the best for the texture."""
     shape, fine = pyramid.values[0].shape, parse_structure(structure) or None
     if fine is not None:
@@ -254,7 +268,7 @@ def _layered_size(pyramid: Pyramid, nbytes: float, structure: str, skip: int | N
         size = arrays.paged(*shape, nbytes, cascaded)
         if size is None and structure == "pages":
             raise UsageError("--structure: found pages, for which the texture or its bytes are too small or too large")
-        if size is not None and (structure == "pages" or _page_gain(pyramid, size) >= GAIN_DB):
+        if size is not None and (structure == "pages" or _page_gain(pyramid, size, scale) >= GAIN_DB):
             return size
     try:
         smooth = smoothness(pyramid.values[0]) >= SMOOTH_DB

@@ -1,15 +1,18 @@
 """Training of task 5: arrays of a texture, trained for their shaded appearance.
 
-The loss is (1 − λ) · texture + λ · shading. The first term is the loss of task 4, in the units of its own recipe. The
-second compares shaded values, for views and lights uniform over the hemisphere: the arrays, shaded by frozen tables of
-the Disney BRDF, against a reference that shades first and filters afterwards (:func:`.reference`).
+- **Weights.** Shading multiplies an error of a normal by more than one of a colour. :func:`sensitivities` measures by how
+  much, and arrays are laid out and trained anew for weighted maps (:data:`POWERS`).
+- **Appearance.** The loss is (1 − λ) · texture + λ · shading. The first term is the loss of task 4, in the units of its
+  recipe. The second compares shaded values with a reference that shades first and filters afterwards
+  (:mod:`.appearance`).
+- **Choice.** Held-out footprints (:mod:`.heldout`) decide which arrays are kept, and at which level bias they are read.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,61 +20,100 @@ import drjit as dr
 import numpy as np
 
 from ...arrays import lookup
-from ...arrays.indirection import unfolded
+from ...arrays.indirection import aligned_copy, unfolded
 from ...arrays.tables import Table
-from ...core.progress import duration
-from ...fitting.loop import FitResult, checkpoint_settings, sample_losses
-from ...fitting.task import FitRequest
+from ...fitting.loop import FitResult, sample_losses
+from ...fitting.task import FitRequest, FitSettings, Stage
 from ...maps.model import significant
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source
+from ..disney.decoder import Decoder
 from ..disney.training import random_directions
 from . import PRESETS as TEXTURES
 from . import ShadingSettings
 from . import training as textures
-from .appearance import TRUTHS, ShadedEvaluation, reader, reference, write_preview
+from .appearance import TRUTHS, ShadedEvaluation, places_in_footprints, reader, reference, write_preview
 from .compressed import CompressedTexture, neutral_extras, to_table
-from .surface import frozen_decoder, material_effects, shaded, surface_of
+from .heldout import HeldOutFootprints, compared, loss_or_gain, mirrored_pairs
+from .surface import frozen_decoder, maps_of, material_effects, shaded, surface_of
 
 #: Factor of the number of shaded samples from one level to the next coarser one, up to level :data:`TOP`.
 FALL = 0.7
 TOP = 9
 
-#: Level biases that are tried.
-BIASES = (0.0, -0.5, -1.0)
+#: Level biases that are compared.
+BIASES = (0.0, -0.25, -0.5, -0.75, -1.0)
 
-#: Share of the steps, or of the time that is left, for which each of them is trained.
-TRIAL = 0.08
+#: Level bias of the training for appearance, and of the comparison of arrays to begin it with.
+TRAINED_BIAS = -0.5
 
-#: Level biases that are tried with the finest arrays as they are, if each of :data:`BIASES` loses at some level.
-FIXED_BIASES = (0.0, -0.25, -0.5)
+#: Powers of the maps' sensitivities that are tried as weights, and the share of the steps of each short training.
+POWERS = (0.5, 1.0)
+TRIAL = 0.1
 
-#: Loss of a level that is none, dB.
-ROUNDING = 1e-4
+#: Share of the steps of the training for weighted maps, if there is one; the rest is that for appearance.
+WEIGHTED = 0.5
 
-#: Least time of such a trial, in measurements; in less time, the biases of the start itself are compared.
-SHORTEST = 4
+#: Shares of the way from the arrays before to those after the training for appearance that are compared.
+WAYS = (0.25, 0.5, 0.75, 1.0)
+
+#: Reads along each side of a pixel with four samples.
+QUARTERS = 2
+
+#: Least weight of a map: errors of maps that hardly matter would grow beyond small ones.
+LEAST_WEIGHT = 0.01
+
+#: Pairs of a texel and of directions by which sensitivities are measured, and the difference of a value.
+TRIED = 2**19
+DIFFERENCE = 0.02
+
+#: Seed of sensitivities.
+SEED = 20231214
 
 
-class Trial(NamedTuple):
-    """A short training, and what it decides: level bias, whether there are extras, whether fine levels are fixed."""
+def sensitivities(pyramid: Pyramid, exposure: float = 1.0) -> dict[str, float]:
+    """Return the mean squared change of a shaded value by the change of a map's value, by map, at level 0.
 
-    bias: float
-    extras: bool = False
-    fixed: bool = False
+    Exposed values are compared up to 1, under views and lights of :func:`.heldout.mirrored_pairs`; maps that shading does not
+    read are left out.
+    """
+    types, layout, effects = pyramid.types, pyramid.layout, material_effects(pyramid.layout)[0]
+    rng = np.random.default_rng(SEED)
+    u, v, *numbers = (types.Float(aligned_copy(rng.random(TRIED, dtype=np.float32))) for _ in range(7))
+    wi, wo, weight = mirrored_pairs(types, numbers)
+    stored = [x + dr.zeros(types.Float, TRIED) for x in pyramid.stored(u, v)]
+    dr.eval(stored, wi, wo, weight)
 
-    @property
-    def name(self) -> str:
-        return f"{self.bias:g}{', extras' * self.extras}{', fine levels fixed' * self.fixed}"
+    def value(channels: list):
+        return dr.minimum(exposure * shaded(Decoder(), surface_of(pyramid, channels), wi, wo, effects), 1)
+
+    result, before = {}, value(stored)
+    for m in maps_of(layout).values():
+        channels = {i for i in m.where if isinstance(i, int)}
+        # Channels of a normal are independent, those of other maps change together
+        groups = [{i} for i in sorted(channels)] if m.role == "normal" else [channels]
+        changes = [[x + DIFFERENCE if i in group else x for i, x in enumerate(stored)] for group in groups if group]
+        squared = [weight * dr.squared_norm(value(changed) - before) for changed in changes]
+        if squared:
+            result[m.name] = float(np.mean([x.numpy().mean(dtype=np.float64) for x in squared])) / DIFFERENCE**2
+    return result
+
+
+def map_weights(measured: dict[str, float], layout, power: float) -> dict[str, float]:
+    """Return weights of maps, with a mean of 1: ``power`` of sensitivities; maps without one have the least weight."""
+    mean = max(np.mean([*measured.values()]), 1e-12)
+    weights = {name: max(value / mean, LEAST_WEIGHT) ** power for name, value in measured.items()}
+    weights = {name: weights.get(name, min(weights.values())) for name in layout.names}
+    return {name: float(value / np.mean([*weights.values()])) for name, value in weights.items()}
 
 
 class ShadingProblem(textures.TextureProblem):
     """Training problem of shaded appearance.
 
-    ``net`` reads the stored channels, ``pyramid`` is the truth of the maps. The images of ``evaluation`` decide which
-    state is the best (``None``: the PSNR of the texture decides). Shaded values are read with the recipe's level bias,
-    the texture's loss is that of the levels as they are stored. ``base`` is the PSNR of each level of the images that
-    no state may fall below.
+    ``net`` reads the stored channels, ``pyramid`` is the truth of the maps. The gain of ``held_out`` footprints over
+    ``base``, their errors before the training, decides which state is the best (``None``: the PSNR of the texture
+    decides). Shaded values are read with the recipe's level bias, the texture's loss is that of the levels as they are
+    stored.
     """
 
     #: Tolerance of the PSNR of shaded images, dB.
@@ -79,23 +121,21 @@ class ShadingProblem(textures.TextureProblem):
 
     def __init__(
         self, net, pyramid: Pyramid, recipe: ShadingSettings, digest: str = "",
-        evaluation: ShadedEvaluation | None = None, base: Sequence[float] = (),
+        held_out: HeldOutFootprints | None = None, base: np.ndarray | None = None,
     ):  # fmt: skip
         super().__init__(net, pyramid, TEXTURES[recipe.texture], digest)
-        self.shading, self.evaluation, self.base = recipe, evaluation, base
+        self.shading, self.held_out, self.base = recipe, held_out, base
         self.level_bias = recipe.level_bias or 0.0
         self.beta_2 = recipe.beta_2 if recipe.share > 0 else self.beta_2
         #: Picture that is written at each measurement, and the images that it shows a part of
         self.preview: tuple[Path, ShadedEvaluation] | None = None
-        #: Gain of each level over ``base`` in the last measurement, dB
-        self.level_gains = np.zeros(0)
         self.effects, _ = material_effects(pyramid.layout)
-        self.decoder = frozen_decoder(self.types)
+        self.exposure = 1.0 if held_out is None or recipe.tables else held_out.exposure
+        self.decoder = frozen_decoder(self.types) if recipe.tables else Decoder()
         self.identity = {**self.identity, "shading": recipe.further}
 
     def loss(self, net, rng, size: int):
         net, share = self.seen(unfolded(net)), self.shading.share
-        net = net.fixed_fine() if self.shading.fixed else net
         losses = []
         if share < 1:
             inputs, targets = self.batch(rng, size)
@@ -106,21 +146,44 @@ class ShadingProblem(textures.TextureProblem):
         return losses
 
     def shading_errors(self, net, rng, size: int):
-        """Return the error of ``size`` shaded samples, the mean over colours; ``net`` is as training sees it."""
+        """Return the errors of ``size`` shaded reads, the mean over colours; ``net`` is as training sees it.
+
+        They are of footprints that are read at their centre. In each second step, if the recipe's ``quarters`` say so,
+        they are of pixels with four samples: each is the mean of reads a level finer, one in each quarter.
+        """
         recipe, types = self.shading, self.types
-        (u, v, level), (wi, wo) = self.places(rng, size), random_directions(rng, types, size)
+        reads = QUARTERS**2 if recipe.quarters and self.jittered else 1
+        count, weight = size // reads, 1
+        u, v, level = self.places(rng, count)
+        if recipe.mirrored:
+            numbers = [rng.random(types.Float, count) for _ in range(5)]
+            wi, wo, weight = mirrored_pairs(types, numbers, recipe.mirrored)
+        else:
+            wi, wo = random_directions(rng, types, count)
         truth = reference(recipe.reference, self.pyramid, u, v, level, wi, wo, self.effects, rng)
-        dr.eval(u, v, level, wi, wo, truth)
-        if self.level_bias:  # opaque, so that one kernel serves all
+        dr.eval(u, v, level, wi, wo, weight, truth)
+        if reads > 1:
+            lane = dr.arange(types.UInt32, count * reads)
+            pixel, read = lane // reads, lane % reads
+            u, v, level, wi, wo = (dr.gather(type(x), x, pixel) for x in (u, v, level, wi, wo))
+            inside = [
+                (types.Float(n) + rng.random(types.Float, count * reads)) / QUARTERS
+                for n in (read % QUARTERS, read // QUARTERS)
+            ]
+            u, v = places_in_footprints(self.pyramid, u, v, level, *inside)
+            level = level - math.log2(QUARTERS)
+        if self.level_bias or reads > 1:  # opaque, so that one kernel serves all
             bias = dr.opaque(types.Float, self.level_bias)
             level = lookup.clamp(level + bias, 0.0, float(len(self.sizes) - 1))
         surface = surface_of(self.pyramid, net.filtered(u, v, level), net.extra(u, v, level))
         limit = None if recipe.clip is None else recipe.clip * recipe.share / size
         value = shaded(self.decoder, surface, wi, wo, self.effects, limit)
+        if reads > 1:
+            value = [dr.block_reduce(dr.ReduceOp.Add, c, reads) / reads for c in value]
         bounded = _bounded if recipe.bounded else (lambda x: x)
-        errors = [bounded(a) - bounded(b) for a, b in zip(value, truth, strict=True)]
+        errors = [bounded(a * self.exposure) - bounded(b * self.exposure) for a, b in zip(value, truth, strict=True)]
         squared = self.settings.loss == "mse"
-        return sum(dr.square(e) if squared else dr.abs(e) for e in errors) / 3
+        return reads * weight * sum(dr.square(e) if squared else dr.abs(e) for e in errors) / 3
 
     def places(self, rng, size: int) -> tuple:
         """Draw ``(u, v, level)``, uniform in uv; the density falls by :data:`FALL` from one level to the next."""
@@ -130,32 +193,16 @@ class ShadingProblem(textures.TextureProblem):
         return u, v, dr.log(1 - (1 - lowest) * level) * (1 / math.log(FALL))
 
     def measure(self, net) -> dict[str, float]:
-        """Return the PSNR of shaded images, entries rounded, and the PSNR of the texture.
-
-        With a ``base``, the first figure is ``gain_db``: the mean gain of all levels, if no level loses, else the
-        largest loss of a level, negative.
-        """
+        """Return the gain of held-out footprints (:func:`.heldout.loss_or_gain`), entries rounded, and the PSNR of the texture."""
         texture = super().measure(net)
-        if self.evaluation is None:
+        if self.held_out is None:
             return texture
         maps = CompressedTexture(self.pyramid.layout, textures.rounded(unfolded(net)), self.level_bias)
-        read = reader(maps, self.effects, self.decoder)
+        read = reader(maps, self.effects)
         if self.preview is not None:
             write_preview(*self.preview, read)
-        errors = self.evaluation.measure(read, False)
-        if self.base:
-            self.level_gains = np.subtract(errors["C"]["psnr_db"], self.base)
-        gain = {"gain_db": mean_gain(self.level_gains)} if self.base else {}
-        shading = {f"shaded_{TRUTHS[k]}_db": f["mean_db"] for k, f in errors.items()}
-        return {**gain, **shading, **{f"texture_{name}": value for name, value in texture.items()}}
-
-
-def mean_gain(gains: np.ndarray) -> float:
-    """Return the mean gain of levels, in dB, if no level loses, else the largest loss, negative.
-
-    Losses up to :data:`ROUNDING` are those of sums in another order.
-    """
-    return float(gains.mean() if gains.min() >= -ROUNDING else gains.min())
+        gain = compared(self.base, self.held_out.errors(read))[0].mean()
+        return {"gain_db": float(gain), **{f"texture_{name}": value for name, value in texture.items()}}
 
 
 def _bounded(x):
@@ -171,6 +218,18 @@ def trainable_arrays(table: Table, pyramid: Pyramid):
     return texture.net
 
 
+class State(NamedTuple):
+    """Arrays that may be kept: their name, the texture with its level bias, and its gain over the start.
+
+    ``gain`` and ``mean`` are those of :func:`.heldout.loss_or_gain`.
+    """
+
+    name: str
+    texture: CompressedTexture
+    gain: float
+    mean: float
+
+
 def fit_shading(
     source: Source,
     start,
@@ -180,119 +239,114 @@ def fit_shading(
     evaluation: ShadedEvaluation | None = None,
     preview: Path | None = None,
     start_bias: float = 0.0,
+    build: Callable[[dict[str, float]], textures.TextureProblem] | None = None,
 ) -> tuple[Table, FitResult]:
     """Train arrays (``start``: :func:`trainable_arrays`) of ``source`` for shading; return the table and its record.
 
-    The table is of the task ``texture``, with its errors as a texture and as shaded images of the ``evaluation``. Level
-    bias and state are chosen by other images, under views and lights that neither training nor evaluation draws. If no
-    state gains without a loss at some level, the table holds the start, read with its own ``start_bias`` (setting
-    ``kept_start``). The setting ``before`` has the errors of the start as shaded images, ``level_biases`` the gains by
-    which the bias was chosen (:func:`choose`). ``preview`` is a picture that is written at each measurement.
+    The table is of the task ``texture``, with its errors as a texture and as shaded images of the ``evaluation``.
+    ``build(weights)`` returns the problem of training arrays of the same bytes anew for weighted maps (``None``: that
+    is not tried). Held-out footprints choose state and level bias. If no state gains without a loss somewhere, the
+    table holds the start, read with its ``start_bias`` (setting ``kept_start``). The setting ``before`` has the errors
+    of the start as shaded images, ``states`` the gains of all states. ``preview`` is a picture that is written at each
+    measurement.
     """
-    request = dataclasses.replace(request, settings=recipe)
-    validation = None if evaluation is None else evaluation.another()
-    effects, decoder = material_effects(pyramid.layout)[0], frozen_decoder(pyramid.types)
-    texture = CompressedTexture(pyramid.layout, textures.stored_form(start), start_bias)
-    base, before, stopped = [], {}, None
-    choice, gains = recorded_choice(request)
+    effects, layout = material_effects(pyramid.layout)[0], pyramid.layout
+    first = CompressedTexture(layout, textures.stored_form(start), start_bias)
+    held_out = HeldOutFootprints(pyramid, effects)
+    base = held_out.errors(reader(first, effects))
     biases = BIASES if recipe.level_bias is None else (recipe.level_bias,)
-    if choice is None and recipe.level_bias is not None and not recipe.extras:
-        choice = Trial(recipe.level_bias)
+    trained_bias = TRAINED_BIAS if recipe.level_bias is None else recipe.level_bias
+    states, begin = [State("start", first, 0.0, 0.0)], []
 
-    def shaded_errors(texture: CompressedTexture) -> dict[str, float]:
-        errors = evaluation.measure(reader(texture, effects, decoder), False)
-        return {f"shaded_{TRUTHS[k]}_db": f["mean_db"] for k, f in errors.items()}
+    def errors(texture: CompressedTexture) -> dict[str, float]:
+        measured = {} if evaluation is None else evaluation.measure(reader(texture, effects), False)
+        return {f"shaded_{TRUTHS[k]}_db": f["mean_db"] for k, f in measured.items()}
 
-    def build_problem(choice: Trial) -> ShadingProblem:
-        net = start.changed(lambda array, bits: array.copy())
-        if choice.extras and net.extras is None:
-            layout = pyramid.layout
+    def add(name: str, net) -> None:
+        """Add the state of arrays at the level bias of its largest gain."""
+        tried, stored = [], textures.stored_form(net)
+        for bias in biases:
+            texture = CompressedTexture(layout, stored, bias)
+            tried.append(State(name, texture, *loss_or_gain(base, held_out.errors(reader(texture, effects)))))
+        states.append(max(tried, key=lambda state: state.gain))
+        begin.append(min(tried, key=lambda state: abs(state.texture.level_bias - trained_bias)))
+
+    def stages() -> Iterator[Stage]:
+        add("finer level", start)
+        rest, chosen, weights = 1.0, begin[0], None
+        if build is not None:
+            measured, trials = sensitivities(pyramid, held_out.exposure), []
+            for power in POWERS:
+                problem = build(map_weights(measured, layout, power))
+                yield Stage("trial", problem, TRIAL, part_of(problem.recipe, TRIAL), resumable=False)
+                trials.append((mean_gain(problem.net), power))
+            weights, rest = map_weights(measured, layout, max(trials)[1]), 1 - WEIGHTED
+            problem = build(weights)
+            yield Stage("weights", problem, WEIGHTED, part_of(problem.recipe, WEIGHTED))
+            add("weights", problem.net)
+            chosen = max(begin, key=lambda state: state.mean)
+        for name, state in {"appearance": chosen, "appearance of the start": begin[0]}.items():
+            problem = appearance_problem(state.texture)
+            if state.name == "weights":
+                problem.weights = build(weights).weights
+            initial = problem.net.changed(lambda array, bits: array.copy())
+            yield Stage(name, problem, 1.0, part_of(recipe, rest), finish=lambda: errors(first))
+            for way in WAYS:
+                add(f"{name} {way:.0%}", between(initial, problem.net, way))
+            # Anew only if weighted maps lost somewhere that shading did not win back
+            if chosen is begin[0] or choose(states) is not states[0]:
+                break
+
+    def part_of(settings: FitSettings, share: float) -> FitSettings:
+        steps = max(1, round(share * recipe.steps))
+        every = max(1, min(recipe.measure_every, steps // 2))
+        return dataclasses.replace(
+            settings, steps=steps, measure_every=every, seed=recipe.seed, deterministic=recipe.deterministic
+        )
+
+    def mean_gain(net) -> float:
+        texture = CompressedTexture(layout, textures.stored_form(net), trained_bias)
+        return loss_or_gain(base, held_out.errors(reader(texture, effects)))[1]
+
+    def appearance_problem(texture: CompressedTexture) -> ShadingProblem:
+        net = CompressedTexture.from_table(to_table(texture, {}), pyramid.types.TensorXf, "float32").net
+        if recipe.extras and net.extras is None:
             net.extras = neutral_extras(layout.height, layout.width, net.border).alloc(pyramid.types.TensorXf)
-        changed = dataclasses.replace(recipe, level_bias=choice.bias, extras=choice.extras, fixed=choice.fixed)
-        return ShadingProblem(net, pyramid, changed, source.digest, validation, base)
-
-    if evaluation is not None:
-        # The measurement of the result takes as long
-        begin = request.deadline.rehearse if request.deadline is not None else lambda measure: measure()
-        before = begin(lambda: shaded_errors(texture))
-        base = validation.measure(reader(texture, effects, decoder), False)["C"]["psnr_db"]
-        if choice is None:
-            choice, gains, stopped = choose(build_problem, request, biases)
-    problem, result = stopped or (build_problem(choice or Trial(biases[0])), None)
-    if result is None:
-        problem.identity |= {"level_biases": gains} if gains else {}
+        changed = dataclasses.replace(recipe, level_bias=trained_bias)
+        problem = ShadingProblem(net, pyramid, changed, source.digest, held_out, base)
         problem.preview = None if preview is None or evaluation is None else (preview, evaluation)
-        result = request.train(problem, "shading")
-    kept = bool(base) and result.measured["gain_db"] <= 0
-    if kept:
-        result = dataclasses.replace(result, step=0, measured={"gain_db": 0.0})
-    else:
-        texture = CompressedTexture(pyramid.layout, textures.stored_form(problem.net), problem.level_bias)
-    settings = {**request.recorded(result), **problem.identity, "level_bias": texture.level_bias}
-    settings |= {"kept_start": True} if kept else {}
-    table = to_table(texture, settings)
+        return problem
+
+    before = errors(first)
+    results = request.run(stages())
+    best = choose(states)
+    result = dataclasses.replace(results[-1], measured={"gain_db": best.mean})
+    kept = best is states[0]
+    identity = {"source": source.digest, **TEXTURES[recipe.texture].further, "shading": recipe.further}
+    gains = {state.name: round(state.gain, 3) for state in states}
+    settings = {**request.recorded(result), **identity, "level_bias": best.texture.level_bias, "state": best.name}
+    settings |= {"states": gains, **({"kept_start": True} if kept else {})}
+    table = to_table(best.texture, settings)
     table.preset, table.seed = request.preset, recipe.seed
-    errors = CompressedTexture.from_table(table, request.types.TensorXf).measure(source)
-    if evaluation is not None:
-        table.settings["before"] = significant(before)
-        errors = {**(before if kept else shaded_errors(texture)), **errors}
-    table.measured = significant(errors)
+    texture = CompressedTexture.from_table(table, request.types.TensorXf)
+    table.settings["before"] = significant(before)
+    table.measured = significant({**(before if kept else errors(texture)), **texture.measure(source)})
     return table, result
 
 
-def choose(
-    build_problem: Callable[[Trial], ShadingProblem], request: FitRequest, biases: Sequence[float]
-) -> tuple[Trial, dict, tuple | None]:
-    """Return the best :class:`Trial` after a short training with each, the gains, and ``None``.
+def between(first, second, share: float):
+    """Return arrays that are a ``share`` of the way from ``first`` to ``second``, arrays of the same shapes."""
+    others = iter(second.arrays.values())
 
-    The best has the largest mean of levels among those that lose at no level, or among all if each loses somewhere. If
-    each of ``biases`` does, :data:`FIXED_BIASES` follow, with fixed fine levels, unless the settings have a bias. One
-    of these with a level whose loss the short training leaves as it is comes last. If the settings have extras, the
-    best so far is trained with them, too. The gains are ``gain_db`` by the name of a choice. If Ctrl-C ends a training,
-    its problem and record are returned in place of ``None``. If the time is too short (:data:`SHORTEST`), the untrained
-    arrays are compared.
-    """
-    recipe, measured, constant, short = request.settings, {}, set(), None
-    steps = max(1, round(TRIAL * recipe.steps))
-    settings = dataclasses.replace(recipe, steps=steps, measure_every=steps)
+    def mixed(array, bits):
+        result = array.copy()
+        result.data = dr.lerp(array.data, next(others).data, share)
+        return result
 
-    def best() -> Trial:
-        def rank(choice: Trial) -> tuple:
-            figures = measured[choice]
-            return figures["gain_db"] >= 0, choice not in constant, figures["shaded_converged_db"]
-
-        return max(measured, key=rank)
-
-    def choices() -> Iterator[Trial]:
-        yield from map(Trial, biases)
-        if measured[best()]["gain_db"] < 0 and TEXTURES[recipe.texture].layered:
-            fixed = FIXED_BIASES if recipe.level_bias is None else biases
-            yield from (Trial(bias, fixed=True) for bias in fixed)
-        if recipe.extras:
-            yield best()._replace(extras=True)
-
-    for choice in choices():
-        problem = build_problem(choice)
-        measured[choice], measurement = duration(lambda problem=problem: problem.measure(problem.net))
-        untrained = problem.level_gains
-        trial = dataclasses.replace(request.part(TRIAL), settings=settings, checkpoint=None, resume=False)
-        limit = None if trial.deadline is None else trial.deadline.left()
-        short = limit is not None and limit < SHORTEST * measurement if short is None else short
-        if not short:
-            result = trial.train(problem, f"level bias {choice.name}")
-            if result.interrupted:
-                return choice, {}, (problem, result)
-            if choice.fixed and np.any((untrained < -ROUNDING) & (abs(problem.level_gains - untrained) < ROUNDING)):
-                constant.add(choice)
-            measured[choice] = result.measured
-    return best(), {c.name: float(f"{m['gain_db']:.4g}") for c, m in measured.items()}, None
+    return first.changed(mixed)
 
 
-def recorded_choice(request: FitRequest) -> tuple[Trial | None, dict]:
-    """Return the choice of the training that is resumed, or ``None``, and the gains that it was made by."""
-    recorded = checkpoint_settings(request.checkpoint) if request.resume and request.checkpoint is not None else {}
-    shading = recorded.get("shading", {})
-    if "level_bias" not in shading:
-        return None, {}
-    choice = Trial(shading["level_bias"], *(bool(shading.get(name)) for name in ("extras", "fixed")))
-    return choice, recorded.get("level_biases", {})
+def choose(states: list[State]) -> State:
+    """Return the state with the largest gain, the first one if none gains."""
+    best = max(states, key=lambda state: state.gain)
+    return best if best.gain > 0 else states[0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 
 import drjit as dr
 import numpy as np
@@ -32,12 +33,19 @@ def shares(levels: int) -> np.ndarray:
 
 
 class TextureProblem(MapsProblem):
-    """Training problem of a texture: ``net`` (:mod:`.nets`) against the reference ``pyramid``."""
+    """Training problem of a texture: ``net`` (:mod:`.nets`) against the reference ``pyramid``.
+
+    ``weights`` are factors of the squared errors of maps, by name.
+    """
 
     tolerance = 0.02
 
-    def __init__(self, net, pyramid: Pyramid, recipe: TextureSettings, digest: str = ""):
-        super().__init__(net, pyramid.layout, recipe, pyramid.types)
+    def __init__(
+        self, net, pyramid: Pyramid, recipe: TextureSettings, digest: str = "",
+        weights: Mapping[str, float] | None = None,
+    ):  # fmt: skip
+        factors = {name: weight**0.5 for name, weight in (weights or {}).items()}
+        super().__init__(net, pyramid.layout, recipe, pyramid.types, factors)
         self.pyramid = pyramid
         self.sizes = [level.shape[:2] for level in pyramid.values]
         self.starts = np.cumsum([0] + [rows * columns for rows, columns in self.sizes])
@@ -127,15 +135,32 @@ class TextureProblem(MapsProblem):
 
 
 def build_problem(
-    source: Source, size: TextureBudget | PaperBudget, recipe: TextureSettings, pyramid: Pyramid
+    source: Source,
+    size: TextureBudget | PaperBudget,
+    recipe: TextureSettings,
+    pyramid: Pyramid,
+    weights: Mapping[str, float] | None = None,
 ) -> TextureProblem:
-    """Return the problem of training ``source`` at a size by a recipe, with initial arrays."""
+    """Return the problem of training ``source`` at a size by a recipe, with initial arrays.
+
+    ``weights`` are factors of the squared errors of maps, by name; initial arrays know them, too.
+    """  # fmt: skip
     if isinstance(size, PaperBudget):
         net = arrays.from_ramps(pyramid.layout, size, pyramid.border, pyramid.levels)
     else:
-        net = arrays.from_components(pyramid.values, size, pyramid.border)
+        net = arrays.from_components(pyramid.values, size, pyramid.border, channel_weights(pyramid.layout, weights))
     net = net.changed(lambda array, bits: array.alloc(pyramid.types.TensorXf))
-    return TextureProblem(net, pyramid, recipe, source.digest)
+    return TextureProblem(net, pyramid, recipe, source.digest, weights)
+
+
+def channel_weights(layout: Layout, weights: Mapping[str, float] | None) -> np.ndarray | None:
+    """Return the weights of stored channels, ``(channels,)``, from those of maps by name."""
+    if weights is None:
+        return None
+    result = np.ones(layout.stored)
+    for name, channels in layout.channels_by_map().items():
+        result[list(channels)] = weights[name]
+    return result
 
 
 def fit_texture(
