@@ -19,13 +19,13 @@ from mi_diffind.core.compat import use_threads, was_compiled
 from mi_diffind.core.errors import UsageError
 from mi_diffind.core.progress import Deadline
 from mi_diffind.core.runtime import array_module
-from mi_diffind.fitting.task import FitRequest, FitSettings
+from mi_diffind.fitting.task import FitRequest, FitResult, FitSettings
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import load_source
 from mi_diffind.plugins.support import footprint
 from mi_diffind.scenes import loading
 from mi_diffind.scenes.training import references
-from mi_diffind.scenes.training.fit import fit_scene, joint_problem, limit
+from mi_diffind.scenes.training.fit import fit_scene, joint_problem, limit, score_lines
 from mi_diffind.scenes.training.options import (
     FOOTPRINTS,
     SCENE_ARGUMENTS,
@@ -37,7 +37,7 @@ from mi_diffind.scenes.training.options import (
 )
 from mi_diffind.scenes.training.problem import SceneProblem, estimate_exposure
 from mi_diffind.scenes.training.references import ReferenceRenders
-from mi_diffind.scenes.training.rig import Rig
+from mi_diffind.scenes.training.rig import Rig, small_ranges
 from mi_diffind.scenes.training.trained_scene import (
     SceneTexture,
     TrainedScene,
@@ -109,7 +109,7 @@ def test_views_lie_in_their_ranges_and_repeat():
 
 
 def test_views_without_ranges_and_in_a_box():
-    assert ViewDistribution().trained() == ViewDistribution().measured() == [View()]
+    assert ViewDistribution().trained() == ViewDistribution().measured() == [View()] and not ViewDistribution().moves
     boxed = ViewDistribution(50, origins=((-1, 2, 3), (1, 2, 5))).trained()
     origins = np.array([view.origin for view in boxed])
     assert (origins >= [-1, 2, 3]).all() and (origins <= [1, 2, 5]).all() and np.ptp(origins, axis=0)[2] > 1.8
@@ -304,6 +304,36 @@ def test_rigs_that_cannot_be():
     Rig(lit("sky"), turn)
     with pytest.raises(loading.SceneError, match="target: not given, and the middle"):
         Rig(lit("sky"), ViewDistribution(azimuth=(0, 9)))
+
+
+def test_small_ranges_around_the_camera_and_lights():
+    """In the open as far as they may be; in a narrow room camera and lamp stay between the walls."""
+    origin, t = np.array([1.0, -3, 1.5]), mi.ScalarTransform4f
+    sensor = {"type": "perspective", "to_world": t().look_at(list(origin), [0, 0, 0], [0, 0, 1])}
+
+    def ranges(**objects):
+        scene = mi.load_dict({"type": "scene", "sensor": sensor, **objects})
+        return small_ranges(scene, ViewDistribution(9, 3)), scene
+
+    floor = {"type": "rectangle", "to_world": t().scale(9)}
+    views, scene = ranges(floor=floor, sun=LIGHTS["sun"])
+    assert (views.azimuth, views.light_azimuth, views.up) == ((-15, 15), (-20, 20), (0, 0, 1))
+    assert np.linalg.norm(np.cross(views.target, origin)) < 1e-5  # on the axis
+    offset = origin - views.target
+    height = np.degrees(np.arcsin(offset[2] / np.linalg.norm(offset)))
+    np.testing.assert_allclose(views.elevation, [max(height - 10, height / 2), height + 10], atol=1e-3)
+    assert len({*views.trained(), *views.measured()}) == 12
+    narrow = {"type": "cube", "to_world": t().translate([0.7, 0, 0]).scale([0.6, 4, 3])}
+    views, scene = ranges(room=narrow, lamp={"type": "point", "position": [1.2, 1, 2.0]})
+    rig = Rig(scene, views)
+    (lamp,) = rig.lights
+    for view in (*views.trained(), *views.measured()):
+        for place in (rig.camera(view)[:3, 3], (rig.turn(lamp, view) @ [*lamp.centre, 1])[:3]):
+            assert (np.abs(place - [0.7, 0, 0]) < [0.6, 4, 3]).all()
+    assert 0 < views.azimuth[1] < 15 and 0 < views.light_azimuth[1] < 20
+    # A light that cannot turn stays, and so does all where nothing can be seen
+    assert ranges(floor=floor, sky=LIGHTS["ambient"])[0].light_azimuth is None
+    assert ranges(sun=LIGHTS["sun"])[0] == ViewDistribution(9, 3)
 
 
 #: Samples of an image in passes of four samples a pixel.
@@ -636,6 +666,17 @@ def test_gradients_against_differences(trained, weights):
         array.data = before
 
 
+def test_samples_of_a_training_lie_anywhere_in_a_pixel(trained):
+    """A render of one sample reads the centre of its pixel, whatever its random numbers; a trained one does not."""
+    scene, _ = trained
+    spread = {}
+    for jittered in (False, True):
+        scene.place(View(), 1, jittered)
+        images = [scene.render(opaque(seed), opaque(99), 1).numpy()[8:16, 8:16] for seed in range(8)]
+        spread[jittered] = np.std(images, axis=0).mean() / np.mean(images)
+    assert spread[False] < 0.2 * spread[True], spread
+
+
 def test_which_textures(path, folder, trained):
     """Those of a file, also of a scene that is a dictionary, whose parameters are those of the file."""
     file = (folder / "material.npz").resolve()
@@ -784,6 +825,34 @@ def test_exposure():
     assert estimate_exposure([np.zeros((2, 2, 3))]) == 1
 
 
+def test_lines_of_the_score():
+    """A figure of trained views is called so; one of held-out views says which they are."""
+    result = FitResult({"psnr_db": 30.0}, 4, 4, 1.0, False, 0, [{"step": 0, "loss": None, "psnr_db": 24.0}])
+    (_, line) = score_lines(ViewDistribution(1), SceneRecipe(), result)
+    assert line == "training score: trained and measured on the same view"
+    ranges, line = score_lines(ViewDistribution(12, 3, azimuth=(-15, 15), light_azimuth=(0, 9)), SceneRecipe(), result)
+    assert ranges == "12 views: azimuth -15:15, light-azimuth 0:9"
+    assert line == "3 held-out views: 24.00 → 30.00 dB, mean of footprints of 1 and 4 samples a pixel"
+
+
+def test_a_state_that_loses_at_a_footprint_is_no_gain():
+    problem = object.__new__(SceneProblem)
+    problem.footprints = [1, 4]
+    before, figures = (
+        {"psnr_db": 25.0, "psnr_1_spp_db": 24.0, "psnr_4_spp_db": 26.0},
+        ("psnr_1_spp_db", "psnr_4_spp_db"),
+    )
+    for one, four, gains in (
+        (25, 27, True),
+        (25, 25.95, True),
+        (28, 25.8, False),
+        (24, 26, False),
+        (23.95, 25.9, False),
+    ):
+        after = {"psnr_db": (one + four) / 2, **dict(zip(figures, (one, four), strict=True))}
+        assert problem.gains(before, after) == gains
+
+
 @pytest.mark.parametrize("preset", ["ours", "paper"])
 def test_arrays_of_the_same_size(folder, preset, tmp_path):
     """A file says all that is needed to begin anew."""
@@ -802,6 +871,40 @@ def test_arrays_of_the_same_size(folder, preset, tmp_path):
     assert texture_recipe(table) == recipe
 
 
+def test_the_figure_holds_for_views_that_it_has_not_seen(folder, path):
+    """
+    Without ranges, small ones are drawn, and the figure is that of renders of other views of them, by Mitsuba alone,
+    with other samples. Beside it stands the figure of the start, in the same views.
+    """
+    settings = FitSettings(steps=6, batch=512, lr=0.01, measure_every=6, deterministic=True)
+    recipe, parsed = SceneRecipe(reference_spp=256, samples=4096, settings=settings), loading.ParsedScene(path)
+    request = FitRequest("ours", settings, array_module("llvm"), progress=False, output=folder / "after.npz")
+    tables, result = fit_scene(parsed, ViewDistribution(4, 12), recipe, request)
+    table = tables["material.npz"]
+    views = ViewDistribution(**table.settings["views"])
+    assert views.moves_camera and views.moves_light and views.up == (0, 0, 1) and len(views.measured()) == 12
+    assert [entry["step"] for entry in result.history] == [0, 6]
+    save_table(folder / "after.npz", table)
+    (folder / "after.xml").write_text(path.read_text().replace("material.npz", "after.npz"))
+    others, exposure = dataclasses.replace(views, seed=7, held_out=12).measured(), table.settings["exposure"]
+
+    def halves(exact, spp, footprints):
+        """Renders of all other views, each twice."""
+        scene = loading.load(folder / "after.xml", exact=exact)
+        rig, images = Rig(scene, views), []
+        for number, view in enumerate(others):
+            rig.place(view)
+            footprint.attach(scene, 0, footprints)
+            pair = [mi.render(scene, spp=spp, seed=2 * number + half + 1000 * exact).numpy() for half in range(2)]
+            images.append([np.clip(exposure * image, 0, 1) for image in pair])
+        return np.array(images)
+
+    truth = halves(True, 64, 64)
+    for spp in (1, 4):
+        error = np.mean(np.prod(halves(False, 16, spp) - truth, axis=1))
+        assert -10 * np.log10(error) == pytest.approx(table.measured[f"psnr_scene_{spp}_spp_db"], abs=0.5)
+
+
 def test_a_training_that_gains_nothing_keeps_its_start(folder, path):
     """With a rate that ruins the arrays; and a start of another source is refused."""
     settings = FitSettings(steps=4, batch=64, lr=5.0, measure_every=4, deterministic=True)
@@ -810,7 +913,7 @@ def test_a_training_that_gains_nothing_keeps_its_start(folder, path):
     parsed, views = loading.ParsedScene(path, {"film": 4}), ViewDistribution(1, 1)
     tables, result = fit_scene(parsed, views, recipe, request)
     table = tables["material.npz"]
-    assert table.settings["kept_start"] and result.step == 0
+    assert table.settings["kept_start"] and result.step == 0 and result.measured.items() <= result.history[0].items()
     for name, array in table.arrays.items():
         np.testing.assert_array_equal(array.values, before.arrays[name].values)
     other = load(folder / "material.npz")

@@ -56,7 +56,7 @@ class SceneRecipe:
     start: str = "file"
     settings: FitSettings = dataclasses.field(
         default_factory=lambda: FitSettings(
-            steps=STEPS, batch=2**16, lr=3e-3, schedule="cosine", loss="mse", measure_every=STEPS // 10
+            steps=STEPS, batch=2**16, lr=1e-2, schedule="cosine", loss="mse", measure_every=STEPS // 4
         )
     )
 
