@@ -28,10 +28,10 @@ from .rig import small_ranges
 from .trained_scene import JointProblem, SceneTexture, TrainedScene, load_textures
 
 #: Samples of a trained view's reference for each of a held-out view's, whose noise the measurement does not count.
-FEWER = 8
+FEWER = 4
 
 #: Smallest number of samples of a held-out view's reference, if a trained view's has not fewer.
-LEAST = 64
+LEAST = 128
 
 #: Share of a limited time for the references.
 REFERENCES = 0.25

@@ -38,8 +38,8 @@ class SceneRecipe:
     a trained render; a small film gets more than ``spp`` a pixel, with the same footprints, since a step takes little
     longer and its gradient has less noise.
     ``bound``: limit of an error, in units of ``exposure``, beyond which its derivative grows no further (``None``:
-    unlimited). ``reference_spp``: samples a pixel of a trained view's reference; those of held-out views have an
-    eighth, since the measurement does not count their noise. ``against``: counterpart of learned plugins in
+    unlimited). ``reference_spp``: samples a pixel of a trained view's reference; those of held-out views have a
+    quarter, since the measurement does not count their noise. ``against``: counterpart of learned plugins in
     references, ``"exact"`` or the name of another one. ``exposure``: factor of all radiance that maps white to 1
     (``None``: maps the value that 5% of the references' pixels exceed). ``start``: one of :data:`STARTS`.
     ``settings``: the rest; its ``loss`` is that of images (:mod:`.problem`), its ``batch`` the texture samples of a
@@ -263,7 +263,7 @@ SCENE_ARGUMENTS = (
     ),
     Argument(
         "--reference-spp", type=positive, metavar="N",
-        help="samples a pixel of the references; those of held-out views have an eighth (default: "
+        help="samples a pixel of the references; those of held-out views have a quarter (default: "
         f"{_DEFAULT.reference_spp})",
     ),
     Argument(

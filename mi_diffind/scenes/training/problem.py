@@ -50,9 +50,16 @@ SHOWN = 4
 def product_error(halves: Sequence[np.ndarray], references: Sequence[np.ndarray]) -> float:
     """Return the mean squared error of an image in [0, 1], of which there are two halves, as of its reference.
 
-    The errors of the halves are multiplied, so that the noise of neither image counts. Values are clipped to [0, 1].
+    The errors of the halves are multiplied, so that the noise of neither image counts. The mean of clipped values is
+    not the clipped mean: halves are clipped where their mean is, which is out of [0, 1] by noise in fewer pixels.
     """
-    a, b = (np.clip(i, 0, 1) - np.clip(r, 0, 1) for i, r in zip(halves, references, strict=True))
+
+    def clip(pair) -> list[np.ndarray]:
+        mean = np.mean(pair, axis=0)
+        inside = (mean > 0) & (mean < 1)
+        return [np.clip(mean, 0, 1) + inside * (half - mean) for half in pair]
+
+    a, b = (image - truth for image, truth in zip(clip(halves), clip(references), strict=True))
     return float(np.mean(a * b, dtype=np.float64))
 
 
