@@ -22,7 +22,7 @@ from ...maps.model import preview_path
 from ...tasks.texture.fit import TextureProblem
 from .. import loading
 from .options import FOOTPRINTS, SceneRecipe, ViewDistribution, recipe_from, views_from
-from .problem import SceneProblem
+from .problem import FINER, SceneProblem
 from .references import ReferenceRenders
 from .rig import small_ranges
 from .trained_scene import JointProblem, SceneTexture, TrainedScene, load_textures
@@ -158,11 +158,13 @@ def fit_scene(
     remark, before = "", {}
     if request.deadline is not None:
         remark = limit(problem, request)
+    factor = FINER if request.deadline is None else 1
     if recipe.start == "file":  # after the limit, which changes the samples of a measurement
-        with cores(recipe.settings.deterministic):
-            before = problem.measure(problem.net)
+        before = problem.measure_finely(factor)
     arrays = {name: array.data for name, array in problem.net.arrays.items()}
     result = request.train(problem, finish=lambda: [to_table(texture, {}, {}) for texture in textures])
+    if factor > 1:
+        result.measured = problem.measure_finely(factor)
     if before:
         result.history.insert(0, {"step": 0, "loss": None, **before})
     kept = bool(before) and not problem.gains(before, result.measured)
