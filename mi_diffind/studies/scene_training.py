@@ -15,7 +15,7 @@ import argparse
 import dataclasses
 import gc
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
 from types import SimpleNamespace
@@ -46,14 +46,13 @@ AFTER = "hemisphere, then scene"
 
 #: Ranges of camera and lights of the scenes that ship, by the name of the file. Others have small ranges of their own.
 RANGES = {
-    "training_balls": {
-        "azimuth": (-40, 40), "elevation": (15, 50), "light_azimuth": (-90, 90), "light_elevation": (20, 70),
-    },
-    "training_floor": {"azimuth": (-40, 40), "elevation": (12, 45), "light_azimuth": (-90, 90)},
-    "training_corner": {
-        "azimuth": (-25, 25), "elevation": (12, 35), "light_azimuth": (-35, 35), "light_elevation": (30, 70),
-    },
-}  # fmt: skip
+    name: dict(zip(("azimuth", "elevation", "light_azimuth", "light_elevation"), ranges, strict=False))
+    for name, *ranges in (
+        ("training_balls", (-40, 40), (15, 50), (-90, 90), (20, 70)),
+        ("training_floor", (-40, 40), (12, 45), (-90, 90)),
+        ("training_corner", (-25, 25), (12, 35), (-35, 35), (30, 70)),
+    )
+}
 
 #: Titles of the runs in the picture.
 SHOWN = {
@@ -66,11 +65,10 @@ SEED = 1000
 
 #: Settings of the study. A training inside a scene has ``steps`` on ``views`` views; ``held_out`` others choose its
 #: state, and ``tests`` others are measured. Renders are ``width`` pixels wide and 9/16 of this high, with paths of
-#: ``depth``, where the scene has a <default> for that. ``reference_spp``: samples a pixel of references of trained
-#: views; ``spp``: of measured renders and their references. ``hemisphere_steps``: steps of a training over the
-#: hemisphere; 0: it takes the seconds of the training inside the scene.
+#: ``depth``, where the scene has a <default> for that. ``reference_spp`` and ``spp``: samples a pixel of references,
+#: and of a measured render. ``hemisphere_steps``: steps of a training over the hemisphere; 0: equal seconds.
 FULL = {
-    "steps": 120, "views": 16, "held_out": 16, "tests": 32, "width": 64, "depth": 3, "reference_spp": 512, "spp": 128,
+    "steps": 120, "views": 16, "held_out": 16, "tests": 32, "width": 64, "depth": 3, "reference_spp": 512, "spp": 256,
     "hemisphere_steps": 0,
 }  # fmt: skip
 
@@ -137,16 +135,16 @@ class SceneTrainingContext:
         self.file, given = texture_file(self.parsed)
         self.start = load(self.file)
         self.source = find_source(self.start, self.file, given)
-        ranges = RANGES.get(path.stem)
-        self.views = ViewDistribution(settings.views, settings.tests, seed=SEED, **(ranges or {}))
-        if ranges is None:
+        self.views = ViewDistribution(settings.views, settings.tests, seed=SEED, **RANGES.get(path.stem, {}))
+        if not self.views.moves:
             self.views = small_ranges(self.parsed.load(parallel=False), self.views)
 
     @cached_property
     def references(self) -> list[np.ndarray]:
         """Both halves of the references of the measured views."""
-        renders = ReferenceRenders(self.parsed, self.views, self.settings.spp, without=(self.file,))
-        return renders.halves([(view, self.settings.spp) for view in self.views.measured()])
+        spp = self.settings.reference_spp
+        renders = ReferenceRenders(self.parsed, self.views, spp, without=(self.file,))
+        return renders.halves([(view, spp) for view in self.views.measured()])
 
     @cached_property
     def exposure(self) -> float:
@@ -204,26 +202,16 @@ def picture(contexts: Sequence[SceneTrainingContext], runs: Sequence[Contender],
     return plot.draw_images(title, figure_caption(result), rows)
 
 
-def training_run(context: SceneTrainingContext, method: str, task_name: str = "", after=None, equal=None) -> Contender:
-    """Return the run ``method``: a file that is measured in a scene after a training of the task, ``""`` for none.
-
-    ``after``: the run it starts from (``None``: the file); ``equal``: the run whose seconds a training over the
-    hemisphere takes, unless the settings give its steps.
-    """
-    steps = context.settings.hemisphere_steps
-
-    def train(job: Contender, progress: bool) -> task.Fitted:
-        start = context.file if after is None else after.file
-        common = {"start": start, "progress": progress, "output": job.file, "variant": mi.variant()}
-        if task_name == "scene":
-            return task.fit("scene", context.path, **context.training_options(), **common, deterministic=False)
-        limit = {"steps": steps} if steps else {"seconds": max(1.0, equal.record["details"]["training_seconds"])}
-        return task.fit("shading", context.source, **limit, **common, deterministic=False)
+def training_run(context: SceneTrainingContext, method: str, train: Callable[..., task.Fitted] | None) -> Contender:
+    """Return the run ``method``: the file of ``train(…)``, by default the scene's own, is measured in the scene."""
 
     def fit(job: Contender, progress: bool) -> dict | None:
         details = {"scene": context.name, "way": method, "lambda": None, "spp": 1}
-        if task_name:
-            fitted = train(job, progress)
+        if train is None:
+            job.model = context.start
+            job.file.write_bytes(Path(context.file).read_bytes())
+        else:
+            fitted = train(progress=progress, output=job.file, variant=mi.variant(), deterministic=False)
             result, settings = fitted.result, fitted.table.settings
             if result.interrupted:
                 return None
@@ -231,9 +219,6 @@ def training_run(context: SceneTrainingContext, method: str, task_name: str = ""
             fitted.save(job.file)
             details |= {"steps": result.steps, "training_seconds": result.seconds, "printed": result.measured}
             details |= {"level_bias": settings.get("level_bias", 0.0), "kept_start": "kept_start" in settings}
-        else:
-            job.model = context.start
-            job.file.write_bytes(Path(context.file).read_bytes())
         errors = context.measure(job.model)
         details |= errors
         return {"bytes": job.model.nbytes, "errors": {k: errors[k] for k in errors if k != "view"}, "details": details}
@@ -243,9 +228,17 @@ def training_run(context: SceneTrainingContext, method: str, task_name: str = ""
 
 
 def planned_runs(context: SceneTrainingContext) -> list[Contender]:
-    """Return the runs of a scene in their order."""
-    start, scene = training_run(context, "start"), training_run(context, "scene", "scene")
-    hemisphere = training_run(context, "hemisphere", "shading", equal=scene)
-    if context.settings.hemisphere_steps:
-        return [start, scene, hemisphere]
-    return [start, scene, hemisphere, training_run(context, AFTER, "scene", after=hemisphere)]
+    """Return the runs of a scene in their order; a training over the hemisphere has the seconds of that inside."""
+
+    def inside(start=context.file, **options):
+        return task.fit("scene", context.path, start=start, **context.training_options(), **options)
+
+    def over_hemisphere(**options):
+        steps = context.settings.hemisphere_steps
+        limit = {"steps": steps} if steps else {"seconds": max(1.0, scene.record["details"]["training_seconds"])}
+        return task.fit("shading", context.source, start=context.file, **limit, **options)
+
+    start, scene = training_run(context, "start", None), training_run(context, "scene", inside)
+    hemisphere = training_run(context, "hemisphere", over_hemisphere)
+    after = training_run(context, AFTER, lambda **options: inside(hemisphere.file, **options))
+    return [start, scene, hemisphere] + ([] if context.settings.hemisphere_steps else [after])

@@ -33,6 +33,9 @@ FEWER = 4
 #: Smallest number of samples of a held-out view's reference, if a trained view's has not fewer.
 LEAST = 128
 
+#: Largest number of held-out views if time is limited: their references and measurements have more samples.
+HELD_OUT_WHEN_TIMED = 8
+
 #: Share of a limited time for the references.
 REFERENCES = 0.25
 
@@ -68,7 +71,10 @@ def fit(request: FitRequest) -> Fitted:
     if table.settings.get("kept_start"):
         lines.append("training inside the scene gained nothing: these are the arrays that it started from")
     if (samples := table.settings.get("reference_samples", recipe.reference_spp)) < recipe.reference_spp:
-        lines.append(f"the time allowed references of {samples} samples a pixel in place of {recipe.reference_spp}")
+        lines.append(
+            f"the time allowed references of {samples} samples a pixel in place of {recipe.reference_spp}: figures in "
+            "the scene are rough"
+        )
     if len(tables) > 1:
         return FittedFiles(table, result, lines, {"views": dataclasses.asdict(views)}, tables=tables)
     return Fitted(table, result, lines, {**array_figures(table), "views": dataclasses.asdict(views)})
@@ -132,6 +138,8 @@ def fit_scene(
     if views.count > 1 and not views.moves:
         views = small_ranges(parsed.load(parallel=False), views)
         gc.collect()  # the loaded scene: Dr.Jit compiles the materials of all loaded scenes into every kernel
+    if request.deadline is not None:
+        views = dataclasses.replace(views, held_out=min(views.held_out, HELD_OUT_WHEN_TIMED))
     rendered = ReferenceRenders(
         parsed, views, recipe.reference_spp, references, recipe.against,
         without=[texture.file for texture in textures], inputs=[texture.source.digest for texture in textures],

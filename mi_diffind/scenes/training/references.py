@@ -36,7 +36,7 @@ PASS = 1 << 23
 #: First seed of references; trained renders use smaller ones.
 SEEDS = 1 << 31
 
-#: Samples per pixel of a pass if time is limited.
+#: Samples per pixel of the first passes if time is limited; later ones are half as long as all before.
 SHORT = 2
 
 
@@ -151,15 +151,17 @@ class ReferenceRenders:
             scene, rig, samples = self._scene()
             deadline = None if self.deadline is None else self.deadline.part(1 / left)
             if deadline is not None:
-                path, samples, total, done = None, min(samples, SHORT), None, [0, 0]
+                path, total, done = None, None, [0, 0]
             rig.place(view)
             footprint.attach(scene, 0, spp)
             seed = int(self._key(view, spp)[:8], 16) % 2**19 << 12
             while min(done) < half and not (deadline is not None and deadline.passed and done[0] == done[1] > 0):
                 i = int(done[0] > done[1])
-                n = min(samples, half - done[i])
+                n, unit = min(samples, half - done[i]), samples
+                if deadline is not None:
+                    n, unit = min(n, max(SHORT, done[i] // 2)), SHORT
                 # The pass number follows from the finished samples: the same after an interruption
-                image = loading.render_pass(scene, n, SEEDS + seed + (2 * (done[i] // samples) + i) % 2**12)
+                image = loading.render_pass(scene, n, SEEDS + seed + (2 * (done[i] // unit) + i) % 2**12)
                 total = np.zeros((2, *image.shape), image.dtype) if total is None else total
                 total[i] += n * np.where(np.isfinite(image), image, 0)
                 done[i] += n

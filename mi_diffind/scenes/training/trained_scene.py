@@ -259,7 +259,8 @@ class TrainedScene:
             # Files in another folder, so that no other scene reads the same arrays
             copies = {file: Path(temporary).resolve() / file.name for file in tables}
             for file, table in tables.items():
-                save_table(copies[file], table)
+                untrained = {name: value for name, value in table.settings.items() if name != "shading"}
+                save_table(copies[file], dataclasses.replace(table, settings=untrained))  # any samples are right
 
             def change(state):
                 for props in compat.parsed_properties(state):
