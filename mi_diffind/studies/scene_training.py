@@ -68,7 +68,7 @@ SEED = 1000
 #: ``depth``, where the scene has a <default> for that. ``reference_spp`` and ``spp``: samples a pixel of references,
 #: and of a measured render. ``hemisphere_steps``: steps of a training over the hemisphere; 0: equal seconds.
 FULL = {
-    "steps": 120, "views": 16, "held_out": 16, "tests": 32, "width": 64, "depth": 3, "reference_spp": 512, "spp": 256,
+    "steps": 200, "views": 16, "held_out": 16, "tests": 32, "width": 64, "depth": 3, "reference_spp": 512, "spp": 256,
     "hemisphere_steps": 0,
 }  # fmt: skip
 
