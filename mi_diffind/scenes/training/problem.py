@@ -145,7 +145,7 @@ class SceneProblem(Problem):
         seeds = rng.integers(mi.UInt32, 2, 0, SEEDS - 1)
         value, derivative = (dr.gather(mi.UInt32, seeds, i) for i in range(2))
         self.scene.hold(self.texture.seen(unfolded(net)))
-        self.scene.place(self.views[self._view], self._footprint, jittered=True)
+        self.scene.place(self.views[self._view], self._footprint)
         error = self.exposure * self.scene.render(value, derivative, self.drawn) - self.references[self._view]
         return self.errors(error.array) * (1 / math.prod(error.shape))
 

@@ -307,21 +307,16 @@ class TrainedScene:
             self.parameters[self.keys[name]] = array.data
         self.parameters.update()
 
-    def place(self, view: View, spp: int, jittered: bool = False) -> None:
+    def place(self, view: View, spp: int) -> None:
         """Move camera and lights to a view, and set the footprints of ``spp`` samples a pixel.
 
-        A texture reads the only sample of a pixel at the pixel's centre. ``jittered``: it reads the samples where they
-        are, spread over the pixel; otherwise training would see the texels below the centres alone.
+        As in renders, a texture reads the only sample of a pixel at the pixel's centre, and several where they are.
         """
         self.rig.place(view)
-        key = view, spp, jittered
-        if key not in self._cones:
+        if (view, spp) not in self._cones:
             footprint.attach(self.scene, 0, spp)
-            cones = [texture.cone for texture in self._seeing]
-            if jittered:
-                cones = [cone and dataclasses.replace(cone, corner=None) for cone in cones]
-            self._cones[key] = cones
-        for texture, cone in zip(self._seeing, self._cones[key], strict=True):
+            self._cones[view, spp] = [texture.cone for texture in self._seeing]
+        for texture, cone in zip(self._seeing, self._cones[view, spp], strict=True):
             texture.set_cone(cone)
 
     def render(self, seed, seed_grad, spp: int):
