@@ -1,22 +1,22 @@
 """Study ``tradeoff scene-training``: training inside a scene against training for shading over the hemisphere.
 
-*Runs*: the file that the scene names (*start*); training for shading over the hemisphere (``fit texture``) from it, for
-as many seconds as training inside the scene takes (*hemisphere*), and to its end (*hemisphere, longer*); training
-inside the scene (``fit scene``) from the start (*scene*; also without samples beyond one a pixel), from the result of
-the hemisphere, and from an untrained start.
-*Another material* is a texture of the same maps turned by 90° and inverted; training inside the scene starts from it,
-too, and from what hemisphere training makes of it.
+*Runs*: the file that the scene names (*start*); training inside the scene (``fit scene``) from it (*scene*); training
+for shading over the hemisphere (``fit texture``) from it, for as many seconds (*hemisphere*); and training inside the
+scene from the result of the hemisphere.
 
 *Errors*: renders of views and lights that neither training nor its validation draws (the same ranges, another seed)
-against renders of exact plugins. The noise of both renders is not counted: the errors of two halves are multiplied.
+against renders of exact plugins, with the footprints of one and of four samples a pixel. The noise of both renders is
+not counted (:func:`.product_error`). All trainings inside a scene have the exposure of the measurement.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import gc
+import re
 from collections.abc import Callable, Sequence
-from functools import cache, partial
+from functools import cached_property
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -25,41 +25,36 @@ import mitsuba as mi
 import numpy as np
 
 from ..arrays.tables import Table
-from ..core.files import writable_folder
 from ..fitting import task
 from ..images import metrics
 from ..images.srgb import for_display
-from ..maps.pyramid import decibel
-from ..maps.source import load_source
 from ..measure import plot
 from ..measure.report import figure_caption
 from ..measure.store import fingerprint
 from ..measure.study import Measure, Plan, Study
 from ..measure.training import Contender
 from ..scenes import loading
-from ..scenes.training.options import SceneRecipe, ViewDistribution
-from ..scenes.training.problem import estimate_exposure
+from ..scenes.training.options import FOOTPRINTS, ViewDistribution
+from ..scenes.training.problem import decibels, estimate_exposure, product_error
 from ..scenes.training.references import ReferenceRenders
+from ..scenes.training.rig import small_ranges
 from ..scenes.training.trained_scene import TrainedScene, find_source, texture_file
 from ..tasks.texture.compressed import load
 
-#: Names of the runs.
+#: Name of the run that trains twice.
 AFTER = "hemisphere, then scene"
-OTHER = "another material"
-MENDED = f"{OTHER}, then hemisphere"
 
-#: Ranges of camera and lights of the scenes that ship, by the name of the file.
+#: Ranges of camera and lights of the scenes that ship, by the name of the file. Others have small ranges of their own.
 RANGES = {
-    "training_balls": {
-        "azimuth": (-40, 40), "elevation": (15, 50), "light_azimuth": (-90, 90), "light_elevation": (20, 70),
-    },
-    "training_floor": {"azimuth": (-40, 40), "elevation": (12, 45), "light_azimuth": (-90, 90)},
-    "training_corner": {
-        "azimuth": (-25, 25), "elevation": (12, 35), "light_azimuth": (-35, 35), "light_elevation": (30, 70),
-    },
-}  # fmt: skip
+    name: dict(zip(("azimuth", "elevation", "light_azimuth", "light_elevation"), ranges, strict=False))
+    for name, *ranges in (
+        ("training_balls", (-40, 40), (15, 50), (-90, 90), (20, 70)),
+        ("training_floor", (-40, 40), (12, 45), (-90, 90)),
+        ("training_corner", (-25, 25), (12, 35), (-35, 35), (30, 70)),
+    )
+}
 
-#: Runs in the picture, and their titles.
+#: Titles of the runs in the picture.
 SHOWN = {
     "start": "before the training", "hemisphere": "trained over the hemisphere", "scene": "trained inside the scene",
     AFTER: "over the hemisphere, then inside",
@@ -68,23 +63,19 @@ SHOWN = {
 #: Seed of the views that errors are measured on; trainings have seed 0.
 SEED = 1000
 
-#: λ of the trainings inside a scene.
-SHARE = SceneRecipe().share
-
 #: Settings of the study. A training inside a scene has ``steps`` on ``views`` views; ``held_out`` others choose its
 #: state, and ``tests`` others are measured. Renders are ``width`` pixels wide and 9/16 of this high, with paths of
-#: ``depth``. ``reference_spp`` and ``spp``: samples a pixel of references, and of a measured render.
-#: ``hemisphere_steps``: steps of a training over the hemisphere to its end; ``texture_steps``: those of the texture of
-#: another material.
+#: ``depth``, where the scene has a <default> for that. ``reference_spp`` and ``spp``: samples a pixel of references,
+#: and of a measured render. ``hemisphere_steps``: steps of a training over the hemisphere; 0: equal seconds.
 FULL = {
-    "steps": 60, "views": 16, "held_out": 4, "tests": 8, "width": 64, "depth": 3, "reference_spp": 512, "spp": 128,
-    "hemisphere_steps": 1500, "texture_steps": 200,
+    "steps": 200, "views": 16, "held_out": 16, "tests": 32, "width": 64, "depth": 3, "reference_spp": 512, "spp": 256,
+    "hemisphere_steps": 0,
 }  # fmt: skip
 
-#: Settings of a quick study, of the runs in the picture: both trainings take a few steps, not the same seconds.
+#: Settings of a quick study, without a second training.
 QUICK = {
-    "steps": 2, "views": 2, "held_out": 1, "tests": 1, "width": 64, "depth": 2, "reference_spp": 128, "spp": 32,
-    "hemisphere_steps": 20, "texture_steps": 0,
+    "steps": 3, "views": 2, "held_out": 1, "tests": 2, "width": 64, "depth": 2, "reference_spp": 64, "spp": 64,
+    "hemisphere_steps": 10,
 }  # fmt: skip
 
 
@@ -96,8 +87,8 @@ class SceneTrainingStudy(Study):
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         parser.add_argument("scenes", nargs="*", metavar="SCENE.xml",
-                            help="scenes that read one compressed material, seen as training_balls is "
-                            "unless it ships (default: scenes/training_*.xml; --quick: the first)")  # fmt: skip
+                            help="scenes that read one compressed material, such as your own, which is seen from close "
+                            "to its camera (default: scenes/training_*.xml; --quick: the first)")  # fmt: skip
 
     def check(self, arguments) -> None:
         """Check that the scenes exist."""
@@ -111,21 +102,18 @@ class SceneTrainingStudy(Study):
         settings = SimpleNamespace(**(QUICK if arguments.quick else FULL))
         contexts = [SceneTrainingContext(path, settings) for path in arguments.paths]
         runs = [run for context in contexts for run in planned_runs(context)]
-        size = f"{settings.width} × {settings.width * 9 // 16}"
         return Plan(
             study="scene-training",
             title="Training inside a scene",
             candidates=[run.candidate(label=run.name) for run in runs],
             cases=[],
             measures=(
-                Measure("PSNR of held-out views and lights, dB", "psnr_db"),
+                Measure("PSNR of held-out views and lights, footprints of 1 sample, dB", "psnr_db"),
+                Measure("of 4 samples, dB", "psnr_4_spp_db"),
                 Measure("FLIP", "flip", ".3f", False),
             ),
             details={"scenes": [c.name for c in contexts], "request": vars(settings)},
-            notes=[
-                f"{settings.steps} steps, {settings.views} views of {size} pixels; "
-                f"errors: {settings.tests} other views and lights against {settings.reference_spp} spp."
-            ],
+            notes=[f"{settings.steps} steps, {settings.views} views; errors: {settings.tests} other views and lights."],
             jobs=runs,
             jobs_fingerprint=fingerprint(file for c in contexts for file in (c.file, *c.parsed.files())),
             pictures={"png": lambda result: picture(contexts, runs, result)},
@@ -140,155 +128,117 @@ class SceneTrainingContext:
 
     def __init__(self, path: Path, settings: SimpleNamespace):
         self.path, self.name, self.settings = path, path.stem.removeprefix("training_"), settings
-        self.ranges = RANGES.get(path.stem, RANGES["training_balls"])
-        self.defines = {"width": settings.width, "height": settings.width * 9 // 16, "max_depth": settings.depth}
+        sizes = {"width": settings.width, "height": settings.width * 9 // 16, "max_depth": settings.depth}
+        defaults = re.findall(r'<default\s+name="(\w+)"', path.read_text(encoding="utf-8"))
+        self.defines = {name: value for name, value in sizes.items() if name in defaults}
         self.parsed = loading.ParsedScene(path, self.defines)
         self.file, given = texture_file(self.parsed)
         self.start = load(self.file)
         self.source = find_source(self.start, self.file, given)
+        self.views = ViewDistribution(settings.views, settings.tests, seed=SEED, **RANGES.get(path.stem, {}))
+        if not self.views.moves:
+            self.views = small_ranges(self.parsed.load(parallel=False), self.views)
 
-    @staticmethod
-    def references(folder: Path) -> Path:
-        """Return the folder that keeps references, in the folder of models."""
-        return writable_folder(folder / "references", create=True)
+    @cached_property
+    def references(self) -> list[np.ndarray]:
+        """Both halves of the references of the measured views."""
+        spp = self.settings.reference_spp
+        renders = ReferenceRenders(self.parsed, self.views, spp, without=(self.file,))
+        return renders.halves([(view, spp) for view in self.views.measured()])
 
-    def measure(self, table: Table, folder: Path) -> dict[str, float]:
-        """Return ``psnr_db`` and ``flip`` of a table in renders with footprints of one sample a pixel."""
-        distribution, views, references, exposure = measured_views(self, folder)
-        scene = TrainedScene(self.parsed, {self.file: table}, distribution, 1)
-        errors, flips = [], []
-        with dr.suspend_grad():
-            for i, (view, reference) in enumerate(zip(views, references, strict=True)):
-                scene.place(view)
-                seeds = (dr.opaque(mi.UInt32, 2 * i + half) for half in range(2))
-                halves = [
-                    exposure * np.nan_to_num(scene.render(s, s + 2**30, self.settings.spp // 2).numpy()) for s in seeds
-                ]
-                truth = np.clip(exposure * reference, 0, 1)
-                a, b = (np.clip(half, 0, 1) - truth for half in halves)
-                errors.append(float(np.mean(a * b, dtype=np.float64)))
-                flips.append(metrics.flip(truth, np.clip(sum(halves) / 2, 0, 1)))
+    @cached_property
+    def exposure(self) -> float:
+        """Factor of all radiance that maps white to 1, in measurements and in trainings inside the scene."""
+        return estimate_exposure([halves.mean(axis=0) for halves in self.references])
+
+    def training_options(self) -> dict:
+        """Return the options of ``fit scene``: the ranges and the exposure of the measurement."""
+        settings, ranges = self.settings, dataclasses.asdict(self.views)
+        ranges = {k: v for k, v in ranges.items() if v is not None and k not in ("count", "held_out", "seed")}
+        return {
+            **ranges, "views": settings.views, "held_out": settings.held_out, "steps": settings.steps,
+            "measure_every": max(1, settings.steps // 8), "reference_spp": settings.reference_spp,
+            "defines": list(self.defines.items()), "exposure": self.exposure,
+        }  # fmt: skip
+
+    def measure(self, table: Table) -> dict[str, float]:
+        """Return the errors of a table, and the number of the ``view`` with the median one."""
+        scene = TrainedScene(self.parsed, {self.file: table}, self.views)
+        errors, flips = {spp: [] for spp in FOOTPRINTS}, []
+        for i, reference in enumerate(self.references):
+            truth = self.exposure * reference
+            for spp in FOOTPRINTS:
+                halves = self.render(scene, i, spp)
+                errors[spp].append(product_error(halves, truth))
+                if spp == FOOTPRINTS[0]:
+                    flips.append(metrics.flip(*(np.clip(np.mean(image, axis=0), 0, 1) for image in (truth, halves))))
         gc.collect()
-        return {"psnr_db": decibel(float(np.mean(errors))), "flip": float(np.mean(flips))}
+        one, four = errors.values()
+        figures = {"psnr_db": decibels(one), "psnr_4_spp_db": decibels(four), "flip": float(np.mean(flips))}
+        return {**figures, "view": int(np.argsort(one)[len(one) // 2])}
 
-
-@cache
-def measured_views(context: SceneTrainingContext, folder: Path) -> tuple:
-    """Return the distribution of the measured views, the views, their references and the exposure.
-
-    ``folder`` keeps references.
-    """
-    distribution = ViewDistribution(1, context.settings.tests, seed=SEED, **context.ranges)
-    spp, views = context.settings.reference_spp, distribution.measured()
-    images = ReferenceRenders(context.parsed, distribution, spp, folder, without=(context.file,)).images(views)
-    return distribution, views, images, estimate_exposure(images)
+    def render(self, scene: TrainedScene, number: int, spp: int) -> list[np.ndarray]:
+        """Return both halves of a render of a measured view with the footprints of ``spp`` samples a pixel."""
+        with dr.suspend_grad():
+            scene.place(self.views.measured()[number], spp)
+            seeds = (dr.opaque(mi.UInt32, 2 * number + half) for half in range(2))
+            halves = [scene.render(seed, seed + 2**30, self.settings.spp // 2).numpy() for seed in seeds]
+        return [self.exposure * np.nan_to_num(half) for half in halves]
 
 
 def picture(contexts: Sequence[SceneTrainingContext], runs: Sequence[Contender], result: dict):
-    """Draw the first measured view of each scene: after each of the :data:`SHOWN` runs, and the truth."""
+    """Draw the measured view of each scene that has the median error at the start: after each run, and the truth."""
     rows = {}
     for context in contexts:
-        images = {}
-        for run in runs:
-            if run.details["context"] == context.name and run.method in SHOWN:
-                distribution, views, references, exposure = measured_views(context, context.references(run.folder))
-                scene = TrainedScene(context.parsed, {context.file: run.model}, distribution, 1)
-                with dr.suspend_grad():
-                    scene.place(views[0])
-                    image = scene.render(0, 1, context.settings.spp).numpy()
-                images[f"{SHOWN[run.method]}\nPSNR {run.record['errors']['psnr_db']:.1f} dB"] = image
-        images[f"exact plugins\n{context.settings.reference_spp} samples a pixel"] = references[0]
-        rows[context.name] = {title: for_display(exposure * image) for title, image in images.items()}
-    title = "Renders from a view that no training has seen, with the PSNR of all such views"
+        images, trained = {}, [run for run in runs if run.details["context"] == context.name]
+        number = trained[0].record["details"]["view"]
+        for run in trained:
+            scene = TrainedScene(context.parsed, {context.file: run.model}, context.views)
+            title = f"{SHOWN[run.method]}\nPSNR {run.record['errors']['psnr_db']:.1f} dB"
+            images[title] = np.mean(context.render(scene, number, FOOTPRINTS[0]), axis=0)
+        images["exact plugins"] = context.exposure * context.references[number].mean(axis=0)
+        rows[context.name] = {title: for_display(image) for title, image in images.items()}
+    title = "Renders from views that no training has seen, with the PSNR of all such views"
     return plot.draw_images(title, figure_caption(result), rows)
 
 
-def training_run(
-    context: SceneTrainingContext,
-    method: str,
-    task_name: str = "",
-    after: Contender | None = None,
-    limit: Callable[[], dict] = dict,
-    **options,
-) -> Contender:
-    """Return the run ``method``: a file that is measured in a scene after a training of the task, ``""`` for none.
-
-    ``after``: the run it starts from (``None``: the file). ``limit()`` returns the steps or seconds of a training over
-    the hemisphere; ``options`` are further ones of ``fit scene``.
-    """
-    settings = context.settings
-
-    def train(job: Contender, progress: bool) -> task.Fitted:
-        common = {"progress": progress, "output": job.file, "variant": mi.variant(), "deterministic": False}
-        if task_name == "texture":
-            fitted = task.fit("texture", other_maps(context.source), bytes=context.start.nbytes, shading="off",
-                              steps=settings.texture_steps, **common)  # fmt: skip
-            fitted.table.settings["source"] = context.start.settings["source"]
-            return fitted
-        if task_name == "shading":
-            start = context.file if after is None else after.file
-            given = {"start": start, "shading": "on", "extras": "off"}
-            return task.fit("texture", context.source, **given, **limit(), **common)
-        given = {} if after is None else {"start": after.file}
-        ranges = {name: tuple(map(float, limits)) for name, limits in context.ranges.items()}
-        return task.fit(
-            "scene", context.path, defines=list(context.defines.items()), steps=settings.steps,
-            measure_every=max(1, settings.steps // 8), views=settings.views, held_out=settings.held_out,
-            reference_spp=settings.reference_spp, references=context.references(job.folder), spp=1, share=SHARE,
-            **ranges, **given, **options, **common,
-        )  # fmt: skip
+def training_run(context: SceneTrainingContext, method: str, train: Callable[..., task.Fitted] | None) -> Contender:
+    """Return the run ``method``: the file of ``train(…)``, by default the scene's own, is measured in the scene."""
 
     def fit(job: Contender, progress: bool) -> dict | None:
-        figures = {}
-        if not task_name:
+        details = {"scene": context.name, "way": method, "lambda": None, "spp": 1}
+        if train is None:
             job.model = context.start
             job.file.write_bytes(Path(context.file).read_bytes())
         else:
-            fitted = train(job, progress)
-            if fitted.result.interrupted:
+            fitted = train(progress=progress, output=job.file, variant=mi.variant(), deterministic=False)
+            result, settings = fitted.result, fitted.table.settings
+            if result.interrupted:
                 return None
             job.model = fitted.table
             fitted.save(job.file)
-            figures = {"steps": fitted.result.steps, "training_seconds": fitted.result.seconds,
-                       "level_bias": job.model.settings.get("level_bias", 0.0)}  # fmt: skip
-        errors = context.measure(job.model, context.references(job.folder))
-        details = {
-            "scene": context.name,
-            "way": method,
-            "lambda": SHARE if task_name == "scene" else None,
-            "spp": 1,
-            **figures,
-            **errors,
-        }
-        return {"bytes": job.model.nbytes, "errors": errors, "details": details}
+            details |= {"steps": result.steps, "training_seconds": result.seconds, "printed": result.measured}
+            details |= {"level_bias": settings.get("level_bias", 0.0), "kept_start": "kept_start" in settings}
+        errors = context.measure(job.model)
+        details |= errors
+        return {"bytes": job.model.nbytes, "errors": {k: errors[k] for k in errors if k != "view"}, "details": details}
 
-    name = f"{context.name}, {method}{f', λ {SHARE:g}' * (task_name == 'scene')}, 1 spp"
+    name = f"{context.name}, {method}"
     return Contender(name, method, 1, fit, lambda job: load(job.file), method, details={"context": context.name})
 
 
-def other_maps(source: Path) -> dict[str, np.ndarray]:
-    """Return the maps of another material: those of ``source`` turned by 90°, and inverted but for normals, bytes."""
-    maps = {}
-    for entry in load_source(source).maps:
-        values = np.rot90(entry.values)
-        maps[entry.name] = np.rint(255 * (values if entry.role == "normal" else 1 - values)).astype(np.uint8)
-    return maps
-
-
 def planned_runs(context: SceneTrainingContext) -> list[Contender]:
-    """Return the runs of a scene in their order."""
-    settings, run = context.settings, partial(training_run, context)
-    inside = partial(run, task_name="scene")
-    end = {"limit": lambda: {"steps": settings.hemisphere_steps}}
-    start, scene = run("start"), inside("scene")
-    if not settings.texture_steps:
-        return [start, scene, run("hemisphere", "shading", **end)]
-    equal = {"limit": lambda: {"seconds": max(1.0, scene.record["details"]["training_seconds"])}}
-    other = run(OTHER, "texture")
-    hemisphere, mended = run("hemisphere", "shading", **equal), run(MENDED, "shading", after=other, **equal)
-    return [
-        start, scene, hemisphere, run("hemisphere, longer", "shading", **end),
-        inside(AFTER, after=hemisphere), inside("untrained, then scene", begin="untrained"),
-        inside("scene, few samples", samples=1),
-        other, inside(f"{OTHER}, then scene", after=other), mended, inside(f"{MENDED}, then scene", after=mended),
-    ]  # fmt: skip
+    """Return the runs of a scene in their order; a training over the hemisphere has the seconds of that inside."""
+
+    def inside(start=context.file, **options):
+        return task.fit("scene", context.path, start=start, **context.training_options(), **options)
+
+    def over_hemisphere(**options):
+        steps = context.settings.hemisphere_steps
+        limit = {"steps": steps} if steps else {"seconds": max(1.0, scene.record["details"]["training_seconds"])}
+        return task.fit("texture", context.source, start=context.file, shading="on", **limit, **options)
+
+    start, scene = training_run(context, "start", None), training_run(context, "scene", inside)
+    hemisphere = training_run(context, "hemisphere", over_hemisphere)
+    after = training_run(context, AFTER, lambda **options: inside(hemisphere.file, **options))
+    return [start, scene, hemisphere] + ([] if context.settings.hemisphere_steps else [after])

@@ -176,6 +176,11 @@ class ShadingContenders:
         return ShadedEvaluation(self.pyramid, self.effects, *((3, 2, 16) if self.settings.quick else (LEVELS,)))
 
     @cached_property
+    def choosing(self) -> ShadedEvaluation:
+        """Small images under many other views and lights, which choose the levels of rivals."""
+        return ShadedEvaluation(self.pyramid, self.effects, self.evaluation.levels, 1024, 4, "C", stream=1)
+
+    @cached_property
     def scenes(self) -> FloorScenes:
         quality = SceneQuality((64, 36), 32, 8, 1) if self.settings.quick else SceneQuality()
         return FloorScenes(self.source, "repeat" if set(self.pyramid.border) == {"repeat"} else "mirror", quality)
@@ -263,7 +268,7 @@ class ShadingContenders:
     def add_kernel(self, label: str, job: Contender) -> None:
         """Register the maps of a job, read at the levels of detail with the smallest error."""
         choose = partial(normals.choose_biases, effects=self.effects)
-        read = lambda _: normals.ReadMaps(job.model, choose(job.model, evaluation=self.evaluation.another()))  # noqa: E731
+        read = lambda _: normals.ReadMaps(job.model, choose(job.model, evaluation=self.choosing))  # noqa: E731
         method = "compressed" if job.method == "plain" else job.method
         self.add(label, method, lambda kernel, progress: self.record(kernel, job.record["bytes"]), read)
 

@@ -357,7 +357,8 @@ def check_samples(textures, spp: int) -> None:
         table = texture.trained()[0] if hasattr(texture, "trained") else None
         settings = {} if table is None or table.settings.get("kept_start") else table.settings.get("shading", {})
         trained = settings.get("spp", spp) if isinstance(settings, dict) else spp
-        if trained != spp and (key := (table.path, trained, spp)) not in _warned:
+        most = settings["footprints"][-1] if "footprints" in settings else trained
+        if not trained <= spp <= most and (key := (table.path, trained, spp)) not in _warned:
             _warned.add(key)
             warn(f"{table.path}: was trained for spp={trained}, found spp={spp}: fit scene --spp {spp} trains for that")
 

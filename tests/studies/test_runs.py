@@ -14,9 +14,9 @@ from scipy.ndimage import gaussian_filter
 
 from mi_diffind.commands.cli import main
 from mi_diffind.fitting import loop
-from mi_diffind.maps.source import from_arrays, load_source
+from mi_diffind.maps.source import from_arrays
 from mi_diffind.measure import benchmark
-from mi_diffind.studies import image, scene_training, studies
+from mi_diffind.studies import image, studies
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -162,12 +162,3 @@ def test_errors(mi_rgb):
     assert found["psnr_between_db"] == pytest.approx(found["psnr_db"], abs=1)  # a nearly constant difference
     same = image.map_errors(source, {n: v / 255 for n, v in reference.items()})
     assert same["psnr_between_db"] == same["psnr_db"] == 120 and same["flip"] == 0
-
-
-def test_maps_of_another_material():
-    path = ROOT / "scenes" / "assets" / "rust.json"
-    other = scene_training.other_maps(path)
-    for entry in load_source(path).maps:
-        values = np.round(255 * entry.values).astype(int)
-        turned = values[:, ::-1].swapaxes(0, 1)
-        assert np.array_equal(other[entry.name], turned if entry.name == "normal" else 255 - turned)

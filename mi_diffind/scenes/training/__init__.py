@@ -25,7 +25,7 @@ class SceneTraining(Task):
     example = "scene.xml"
     presets = {"ours": SceneRecipe().settings}  # noqa: RUF012
     storages = ()
-    measurements = 10
+    measurements = 4
     arguments = (
         Argument(
             "source", file="read", metavar="SCENE.xml",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import gc
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,10 +21,20 @@ from ...fitting.task import FitRequest, Fitted, Model, find_task, table_path, ta
 from ...maps.model import preview_path
 from ...tasks.texture.training import TextureProblem
 from .. import loading
-from .options import SceneRecipe, ViewDistribution, recipe_from, views_from
-from .problem import SceneProblem
+from .options import FOOTPRINTS, SceneRecipe, ViewDistribution, recipe_from, views_from
+from .problem import FINER, SceneProblem
 from .references import ReferenceRenders
+from .rig import small_ranges
 from .trained_scene import JointProblem, SceneTexture, TrainedScene, load_textures
+
+#: Samples of a trained view's reference for each of a held-out view's, whose noise the measurement does not count.
+FEWER = 4
+
+#: Smallest number of samples of a held-out view's reference, if a trained view's has not fewer.
+LEAST = 128
+
+#: Largest number of held-out views if time is limited: their references and measurements have more samples.
+HELD_OUT_WHEN_TIMED = 8
 
 #: Share of a limited time for the references.
 REFERENCES = 0.25
@@ -55,18 +66,36 @@ def fit(request: FitRequest) -> Fitted:
         as_list(options["start"]),
     )  # fmt: skip
     table = next(iter(tables.values()))
-    count = len(views.trained())
-    lines = [
-        f"{count} view{'s' if count != 1 else ''}, {recipe.spp} sample{'s' if recipe.spp != 1 else ''} a pixel",
-        *filter(None, [table.settings.get("remark")]),
-    ]
+    views = ViewDistribution(**table.settings["views"])
+    lines = [*score_lines(views, recipe, result), *filter(None, [table.settings.get("remark")])]
     if table.settings.get("kept_start"):
         lines.append("training inside the scene gained nothing: these are the arrays that it started from")
     if (samples := table.settings.get("reference_samples", recipe.reference_spp)) < recipe.reference_spp:
-        lines.append(f"the time allowed references of {samples} samples a pixel in place of {recipe.reference_spp}")
+        lines.append(
+            f"the time allowed references of {samples} samples a pixel in place of {recipe.reference_spp}: figures in "
+            "the scene are rough"
+        )
     if len(tables) > 1:
         return FittedFiles(table, result, lines, {"views": dataclasses.asdict(views)}, tables=tables)
     return Fitted(table, result, lines, {**array_figures(table), "views": dataclasses.asdict(views)})
+
+
+def score_lines(views: ViewDistribution, recipe: SceneRecipe, result: FitResult) -> list[str]:
+    """Return the lines that say where training took place, and which views its figure was measured on."""
+    if not views.moves:
+        return ["the scene's own view", "training score: trained and measured on the same view"]
+    count, others = len(views.trained()), len(views.measured())
+    drawn = {name: getattr(views, name) for name in ("azimuth", "elevation", "distance", "light_azimuth",
+                                                      "light_elevation")}  # fmt: skip
+    ranges = [f"{name.replace('_', '-')} {span[0]:.3g}:{span[1]:.3g}" for name, span in drawn.items() if span]
+    ranges += ["origins in a box"] if views.origins else []
+    before = f"{result.history[0]['psnr_db']:.2f} → " if result.history and result.history[0]["step"] == 0 else ""
+    footprints = " and ".join(str(factor * recipe.spp) for factor in FOOTPRINTS)
+    return [
+        f"{count} view{'s' if count != 1 else ''}: {', '.join(ranges)}",
+        f"{others} held-out view{'s' if others != 1 else ''}: {before}{result.measured['psnr_db']:.2f} dB, "
+        f"mean of footprints of {footprints} samples a pixel",
+    ]
 
 
 def array_figures(table: Table) -> dict[str, dict]:
@@ -96,8 +125,9 @@ def fit_scene(
     by default all that the scene reads and that hold arrays. They are trained together, through the same renders.
     ``request`` gives duration and checkpoint; its settings are those of the ``recipe``. ``references`` is a folder that
     keeps the reference images; ``preview`` a picture that is written at each measurement; ``starts`` files whose arrays
-    and level bias the training starts from, in place of the textures'. If no state renders the held-out views better
-    than the start, the tables hold the start (setting ``kept_start``). Runs in the variant that is set.
+    and level bias the training starts from, in place of the textures'. Several ``views`` without any range get small
+    ones (:func:`.rig.small_ranges`). If no state renders the held-out views better than the start
+    (:meth:`.SceneProblem.gains`), the tables hold the start (setting ``kept_start``). Runs in the variant that is set.
 
     Raises :class:`.SceneError`, :class:`.UsageError`, :class:`.TableError`,
     :class:`~mi_diffind.maps.source.SourceError`, :class:`.FittingError` and :class:`.OutputError`.
@@ -105,6 +135,11 @@ def fit_scene(
     request = dataclasses.replace(request, settings=recipe.settings)
     textures = load_textures(parsed, files, starts, recipe.start == "file")
     check_output(request.output, [texture.file for texture in textures])
+    if views.count > 1 and not views.moves:
+        views = small_ranges(parsed.load(parallel=False), views)
+        gc.collect()  # the loaded scene: Dr.Jit compiles the materials of all loaded scenes into every kernel
+    if request.deadline is not None:
+        views = dataclasses.replace(views, held_out=min(views.held_out, HELD_OUT_WHEN_TIMED))
     rendered = ReferenceRenders(
         parsed, views, recipe.reference_spp, references, recipe.against,
         without=[texture.file for texture in textures], inputs=[texture.source.digest for texture in textures],
@@ -112,11 +147,13 @@ def fit_scene(
         workers=request.options.get("workers"), scheduler=request.options.get("scheduler", ""),
     )  # fmt: skip
     trained, measured = views.trained(), views.measured()
-    images = rendered.images([*trained, *measured])
-    scene = TrainedScene(parsed, {texture.file: texture.table for texture in textures}, views, recipe.spp)
+    most = recipe.reference_spp
+    fewer = min(most, max(LEAST, most // FEWER)) if views.moves else most
+    halves = rendered.halves([*((view, most) for view in trained), *((view, fewer) for view in measured)])
+    scene = TrainedScene(parsed, {texture.file: texture.table for texture in textures}, views)
     problem = SceneProblem(
         joint_problem({texture.file.name: texture.problem for texture in textures}), scene,
-        [*zip(trained, images, strict=False)], [*zip(measured, images[len(trained) :], strict=True)],
+        [*zip(trained, halves, strict=False)], [*zip(measured, halves[len(trained) :], strict=True)],
         recipe, rendered.digest, preview,
     )  # fmt: skip
     problem.common |= {"views": dataclasses.asdict(views)}
@@ -126,14 +163,19 @@ def fit_scene(
         table = texture.to_table({**recorded, **texture.identity, **problem.common, **more})
         return table, texture.measure(table)
 
-    remark, before = "", None
+    remark, before = "", {}
     if request.deadline is not None:
-        remark, before = limit(problem, request)
-    elif recipe.start == "file":
-        before = problem.measure(problem.net)
+        remark = limit(problem, request)
+    factor = FINER if request.deadline is None else 1
+    if recipe.start == "file":  # after the limit, which changes the samples of a measurement
+        before = problem.measure_finely(factor)
     arrays = {name: array.data for name, array in problem.net.arrays.items()}
     result = request.train(problem, finish=lambda: [to_table(texture, {}, {}) for texture in textures])
-    kept = recipe.start == "file" and before["psnr_db"] > result.measured["psnr_db"]
+    if factor > 1:
+        result.measured = problem.measure_finely(factor)
+    if before:
+        result.history.insert(0, {"step": 0, "loss": None, **before})
+    kept = bool(before) and not problem.gains(before, result.measured)
     if kept:
         for name, data in arrays.items():
             problem.net.arrays[name].data = data
@@ -149,7 +191,7 @@ def fit_scene(
         table, errors = to_table(texture, request.recorded(result), more)
         table.settings |= request.paths(source_path=texture.source_path)
         table.preset, table.seed = request.preset, recipe.settings.seed
-        errors["psnr_scene_db"] = result.measured["psnr_db"]
+        errors |= {f"psnr_scene_{spp}_spp_db": result.measured[f"psnr_{spp}_spp_db"] for spp in problem.footprints}
         table.measured = {k: float(f"{v:.5g}") for k, v in errors.items()}
         tables[texture.file.name] = table
     return tables, result
@@ -177,37 +219,34 @@ def check_output(output: Path | None, files: Sequence[Path]) -> None:
         raise UsageError(f'output "{output}": found the folder of the trained textures ({names}): give another one')
 
 
-def limit(problem: SceneProblem, request: FitRequest) -> tuple[str, dict[str, float]]:
-    """Fit a problem into a limited time.
-
-    Returns a sentence if only the texture alone can be trained, else "", and the figures before the training.
+def limit(problem: SceneProblem, request: FitRequest) -> str:
+    """Fit a problem into a limited time, and return a sentence if only the texture alone can be trained, else "".
 
     A measurement of one render a view is rehearsed. Measurements then have so many samples as fit, and where a step
     would take longer than what is left, renders have no share in the loss. Its kernels are expected to be compiled
     unless the kernel of the measurement comes from Dr.Jit's cache, as after an earlier training of the scene.
     """
-    deadline, spp, most = request.deadline, problem.scene.spp, problem.samples
+    deadline, spp, most = request.deadline, problem.recipe.spp, problem.samples
     problem.samples = spp
     with cores(request.settings.deterministic):
-        figures, seconds, history = profiled(lambda: problem.measure(problem.net))
+        _, seconds, history = profiled(lambda: problem.measure(problem.net))
     compiling = compat.compile_seconds(history)
     if not all(entry.get("cache_hit", True) for entry in history):
         compiling = max(compiling, OPERATION * max((entry.get("operation_count", 0) for entry in history), default=0))
-    render = seconds / (2 * len(problem.measured) * spp)
+    render = seconds / (2 * len(FOOTPRINTS) * len(problem.measured) * spp)
     problem.samples = max(spp, min(most, int(MEASURING * deadline.seconds * spp / seconds)))
     deadline.reserve += seconds * problem.samples / spp
     step = STEP_RENDERS * spp * render + STEP_KERNELS * compiling
     if problem.recipe.share == 0 or step < deadline.left():
-        return "", figures
+        return ""
     problem.recipe = dataclasses.replace(problem.recipe, share=0.0)
     problem.identity["shading"]["share"] = 0.0
     kernels = f", {STEP_KERNELS * compiling:.0f} s of it to compile its kernels" if compiling > 1 else ""
     enough = deadline.seconds + 2 * step
-    sentence = (
+    return (
         f"no step through renders: one takes about {step:.0f} s{kernels}; the texture was trained alone; give "
         f"--seconds {enough:.0f} or more, or a smaller film"
     )
-    return sentence, figures
 
 
 @dataclass(repr=False)

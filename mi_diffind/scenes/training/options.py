@@ -21,6 +21,9 @@ STARTS = ("file", "untrained")
 #: Steps of a training without a time limit.
 STEPS = 400
 
+#: Footprints that are trained and measured, in samples a pixel, as multiples of ``spp``.
+FOOTPRINTS = (1, 4)
+
 #: Dimensions of the sequence of views: azimuth, elevation and distance (or a place), and two of the light.
 DIMENSIONS = 5
 
@@ -30,11 +33,13 @@ class SceneRecipe:
     """Recipe of a training inside a scene.
 
     ``share``: λ, the share of the loss of rendered images; the rest is the loss of the texture. ``spp``: samples a
-    pixel of the trained renders, at least 1, and of their footprints: choose the number with which the result will
-    be rendered. ``samples``: smallest number of samples of a trained render; a small film gets more than ``spp`` a
-    pixel, with the footprints of ``spp``, since a step takes little longer and its gradient has less noise.
+    pixel of the trained renders, at least 1: choose the number with which the result will be rendered. Footprints are
+    those of ``spp`` and of four times as many (:data:`FOOTPRINTS`) in turn. ``samples``: smallest number of samples of
+    a trained render; a small film gets more than ``spp`` a pixel, with the same footprints, since a step takes little
+    longer and its gradient has less noise.
     ``bound``: limit of an error, in units of ``exposure``, beyond which its derivative grows no further (``None``:
-    unlimited). ``reference_spp``: samples a pixel of a reference. ``against``: counterpart of learned plugins in
+    unlimited). ``reference_spp``: samples a pixel of a trained view's reference; those of held-out views have a
+    quarter, since the measurement does not count their noise. ``against``: counterpart of learned plugins in
     references, ``"exact"`` or the name of another one. ``exposure``: factor of all radiance that maps white to 1
     (``None``: maps the value that 5% of the references' pixels exceed). ``start``: one of :data:`STARTS`.
     ``settings``: the rest; its ``loss`` is that of images (:mod:`.problem`), its ``batch`` the texture samples of a
@@ -51,7 +56,7 @@ class SceneRecipe:
     start: str = "file"
     settings: FitSettings = dataclasses.field(
         default_factory=lambda: FitSettings(
-            steps=STEPS, batch=2**16, lr=3e-3, schedule="cosine", loss="mse", measure_every=STEPS // 10
+            steps=STEPS, batch=2**16, lr=1e-2, schedule="cosine", loss="mse", measure_every=STEPS // 4
         )
     )
 
@@ -89,25 +94,29 @@ class ViewDistribution:
     """Distribution of views and lights: ranges ``(low, high)``; ``None`` leaves a value as in the scene.
 
     The camera orbits ``target`` (``None``: the surface in the middle of the scene's image): ``azimuth`` is its turn
-    about the direction ``up``, ``elevation`` its height above the plane through the target, both in degrees, and
-    ``distance`` its distance to the target. Alternatively, ``origins`` are two corners of a box that contains the
-    camera, which looks at the target. ``light_azimuth`` is the turn of all movable lights about the same axis,
-    environments included; ``light_elevation`` the height of all lights but environments, and of the sun of a sunsky.
-    Area lights move with their shapes.
+    about the direction ``up`` (``None``: the y axis), ``elevation`` its height above the plane through the target, both
+    in degrees, and ``distance`` its distance to the target. Alternatively, ``origins`` are two corners of a box that
+    contains the camera, which looks at the target. ``light_azimuth`` is the turn of all movable lights about the same
+    axis, environments included; ``light_elevation`` the height of all lights but environments, and of the sun of a
+    sunsky. Area lights move with their shapes.
 
     ``count`` views are trained and ``held_out`` others measured. They are points of a low-discrepancy sequence
-    (Roberts' R₅) with a random offset from the ``seed``: the first views of a large set are those of a small one.
-    Without any range there is one view, the scene's own, for training and measurement.
+    (Roberts' R₅) with a random offset from the ``seed``: the first views of a large set are those of a small one. The
+    errors of views differ by 10 dB, so that few of them measure little.
+
+    Without any range, ``fit scene`` draws small ones around the scene's own camera and lights
+    (:func:`.rig.small_ranges`). With a ``count`` of 1, it trains the scene's own view alone and measures that view: its
+    figure is then a training score.
     """
 
     count: int = 16
-    held_out: int = 4
+    held_out: int = 32
     azimuth: tuple[float, float] | None = None
     elevation: tuple[float, float] | None = None
     distance: tuple[float, float] | None = None
     origins: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
     target: tuple[float, float, float] | None = None
-    up: tuple[float, float, float] = (0.0, 1.0, 0.0)
+    up: tuple[float, float, float] | None = None
     light_azimuth: tuple[float, float] | None = None
     light_elevation: tuple[float, float] | None = None
     seed: int = 0
@@ -130,8 +139,13 @@ class ViewDistribution:
                 )
         if self.origins is not None and any(getattr(self, n) for n in ("azimuth", "elevation", "distance")):
             raise UsageError("origins: a camera in a box has neither azimuth, elevation nor distance")
-        if not any(self.up):
+        if self.up is not None and not any(self.up):
             raise UsageError("up: found 0, 0, 0, a direction is needed")
+
+    @property
+    def moves(self) -> bool:
+        """Whether views differ from the scene's own."""
+        return self.moves_camera or self.moves_light
 
     @property
     def moves_camera(self) -> bool:
@@ -152,7 +166,7 @@ class ViewDistribution:
         return self._views(self.held_out, 1)
 
     def _views(self, count: int, stream: int) -> list[View]:
-        if not (self.moves_camera or self.moves_light):
+        if not self.moves:
             return [View()]
         root = 2.0
         for _ in range(64):  # x^(d + 1) = x + 1
@@ -200,10 +214,16 @@ def box(text: str) -> tuple:
 
 _DEFAULT = SceneRecipe()
 
-#: All arguments of ``fit scene`` but the scene and the share. Ranges that are not given leave the scene as it is.
+#: All arguments of ``fit scene`` but the scene and the share. Without any range, ``fit scene`` draws small ones;
+#: otherwise, ranges that are not given leave the scene as it is.
 SCENE_ARGUMENTS = (
-    Argument("--views", type=positive, metavar="N", help="number of views for training (default: 16)"),
-    Argument("--held-out", type=positive, metavar="N", help="number of other views, for measurement (default: 4)"),
+    Argument(
+        "--views", type=positive, metavar="N",
+        help="number of views for training (default: 16); without a range of camera or lights they lie close around "
+        "the scene's own: azimuth ±15°, elevation ±10°, lights turned by ±20°, less where a surface is in the way; "
+        "1: the scene's own view alone, whose figure is a training score",
+    ),
+    Argument("--held-out", type=positive, metavar="N", help="number of other views, for measurement (default: 32)"),
     Argument(
         "--azimuth", type=span, metavar="A:B",
         help="degrees by which the camera turns about the target (if the first number is negative, write "
@@ -219,7 +239,10 @@ SCENE_ARGUMENTS = (
         "--target", type=point, metavar="X,Y,Z",
         help="point that the camera looks at (default: the middle of the image)",
     ),
-    Argument("--up", type=point, metavar="X,Y,Z", help="the vertical of all angles (default: 0,1,0)"),
+    Argument(
+        "--up", type=point, metavar="X,Y,Z",
+        help="the vertical of all angles (default: 0,1,0; without any range, the axis closest to the camera's)",
+    ),
     Argument(
         "--light-azimuth", type=span, metavar="A:B",
         help="degrees by which lights and environments turn; area lights take their shapes along",
@@ -228,15 +251,20 @@ SCENE_ARGUMENTS = (
         "--light-elevation", type=span, metavar="A:B",
         help="degrees of lights, and of the sun of a sunsky, above the target; environments stay",
     ),
-    Argument("--spp", type=positive, metavar="N", help="samples a pixel of renders with the result (default: 1)"),
+    Argument(
+        "--spp", type=positive, metavar="N",
+        help="samples a pixel of renders with the result; footprints of four times as many are trained, too (default: "
+        "1)",
+    ),
     Argument(
         "--samples", type=positive, metavar="N",
         help="smallest number of samples of a trained render: a small film gets more than --spp a pixel, with the "
-        f"footprints of --spp (default: {_DEFAULT.samples})",
+        f"same footprints (default: {_DEFAULT.samples})",
     ),
     Argument(
         "--reference-spp", type=positive, metavar="N",
-        help=f"samples a pixel of the references (default: {_DEFAULT.reference_spp})",
+        help="samples a pixel of the references; those of held-out views have a quarter (default: "
+        f"{_DEFAULT.reference_spp})",
     ),
     Argument(
         "--bound", type=positive_or_none, metavar="X",

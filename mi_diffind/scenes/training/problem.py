@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import statistics
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -22,22 +23,53 @@ import numpy as np
 
 from ...arrays.indirection import unfolded
 from ...core.files import replacing
-from ...fitting.loop import Problem
+from ...fitting.loop import Problem, cores
 from ...images import srgb
 from ...tasks.texture.appearance import titled
 from ...tasks.texture.training import TextureProblem, rounded
-from .options import SceneRecipe, View
+from .options import FOOTPRINTS, SceneRecipe, View
 from .references import SEEDS
 from .trained_scene import JointProblem, TrainedScene
 
 #: Share of the references' pixels that may be brighter than white.
 BRIGHTER = 0.05
 
-#: Smallest number of samples per pixel of a measured render, in two halves.
-MEASURED = 16
+#: Samples of each half of a measured render during the training, if :data:`MOST_MEASURED` a pixel are not fewer.
+MEASURED = 2**14
+
+#: Largest number of samples per pixel of each half of a measured render during the training.
+MOST_MEASURED = 16
+
+#: Samples of a measurement before and after the training for each of one during the training. Noisy values that are
+#: clipped make errors look smaller, by the same amount for all states, but in a figure that is printed.
+FINER = 8
+
+#: Loss of the PSNR at any footprint, in dB, up to which a state that gains in the mean is better than the start.
+LOSS = 0.1
 
 #: Factor by which differences are amplified in the preview.
 SHOWN = 4
+
+
+def product_error(halves: Sequence[np.ndarray], references: Sequence[np.ndarray]) -> float:
+    """Return the mean squared error of an image in [0, 1], of which there are two halves, as of its reference.
+
+    The errors of the halves are multiplied, so that the noise of neither image counts. The mean of clipped values is
+    not the clipped mean: halves are clipped where their mean is, which is out of [0, 1] by noise in fewer pixels.
+    """
+
+    def clip(pair) -> list[np.ndarray]:
+        mean = np.mean(pair, axis=0)
+        inside = (mean > 0) & (mean < 1)
+        return [np.clip(mean, 0, 1) + inside * (half - mean) for half in pair]
+
+    a, b = (image - truth for image, truth in zip(clip(halves), clip(references), strict=True))
+    return float(np.mean(a * b, dtype=np.float64))
+
+
+def decibels(errors: Sequence[float]) -> float:
+    """Return the PSNR in dB of the mean of squared errors."""
+    return -10 * math.log10(max(float(np.mean(errors)), 1e-12))
 
 
 def estimate_exposure(references: Sequence[np.ndarray]) -> float:
@@ -51,9 +83,9 @@ class SceneProblem(Problem):
     """Training problem (:mod:`mi_diffind.fitting.loop`) of a texture in a scene.
 
     ``texture`` is the problem of the same arrays without a scene, of one texture or several, whose ``net`` is trained;
-    ``scene`` reads the arrays. ``trained`` and ``measured`` are pairs of a view and its reference, ``(height, width,
-    channels)``. ``preview`` is a picture of the first measured view, written at each measurement: reference | render |
-    :data:`SHOWN` times their difference.
+    ``scene`` reads the arrays. ``trained`` and ``measured`` are pairs of a view and both halves of its reference,
+    ``(2, height, width, channels)``. ``preview`` is a picture of the first measured view, written at each measurement:
+    reference | render | :data:`SHOWN` times their difference.
     """
 
     #: Tolerance of the PSNR of renders, dB.
@@ -70,26 +102,35 @@ class SceneProblem(Problem):
         preview: Path | None = None,
     ):
         self.net, self.texture, self.scene, self.recipe, self.preview = texture.net, texture, scene, recipe, preview
-        self.exposure = recipe.exposure or estimate_exposure([image for _, image in trained])
+        images = [halves.mean(axis=0) for _, halves in (*trained, *measured)]
+        self.exposure = recipe.exposure or estimate_exposure(images)
         self.views = [view for view, _ in trained]
-        self.references = [mi.TensorXf(np.ascontiguousarray(self.exposure * image)) for _, image in trained]
-        self.measured = [(view, self.exposure * image) for view, image in measured]
+        self.references = [mi.TensorXf(self.exposure * image) for image in images[: len(trained)]]
+        self.measured = [(view, self.exposure * halves) for view, halves in measured]
+        #: Trained and measured footprints, in samples a pixel.
+        self.footprints = [factor * recipe.spp for factor in FOOTPRINTS]
+        pixels = math.prod(self.references[0].shape[:2])
         recorded = {k: v for k, v in dataclasses.asdict(recipe).items() if k != "settings"}
+        recorded["footprints"] = self.footprints
         #: Samples per pixel of each half of a measured render.
-        self.samples = max(MEASURED // 2, scene.spp)
+        self.samples = max(recipe.spp, min(MOST_MEASURED, MEASURED // pixels))
         #: Samples per pixel of a trained render.
-        self.drawn = max(scene.spp, math.ceil(recipe.samples / math.prod(self.references[0].shape[:2])))
+        self.drawn = max(recipe.spp, math.ceil(recipe.samples / pixels))
         #: What the settings of all trained files have in common.
         self.common = {"scene": digest, "shading": recorded, "exposure": self.exposure}
         self.identity = {**texture.identity, **self.common}
-        self._view = 0
+        self._view, self._footprint = 0, recipe.spp
 
     def begin(self, step: int, share: float) -> str:
-        """Choose the view of a step: each once per round, in a new random order each round."""
+        """Choose the view of a step: each once per round, in a new random order each round, and its footprints.
+
+        A view has the next footprints in the next round.
+        """
         texture_step, n = self.texture.begin(step, share), len(self.views)
         order = np.random.default_rng((self.settings.seed, 2, step // n)).permutation(n)
         self._view = int(order[step % n])
-        return f"{texture_step}, view {self._view}"
+        self._footprint = self.footprints[(self._view + step // n) % len(self.footprints)]
+        return f"{texture_step}, view {self._view}, footprints of {self._footprint} samples"
 
     def loss(self, net, rng, size: int):
         share, losses = self.recipe.share, []
@@ -104,7 +145,7 @@ class SceneProblem(Problem):
         seeds = rng.integers(mi.UInt32, 2, 0, SEEDS - 1)
         value, derivative = (dr.gather(mi.UInt32, seeds, i) for i in range(2))
         self.scene.hold(self.texture.seen(unfolded(net)))
-        self.scene.place(self.views[self._view])
+        self.scene.place(self.views[self._view], self._footprint)
         error = self.exposure * self.scene.render(value, derivative, self.drawn) - self.references[self._view]
         return self.errors(error.array) * (1 / math.prod(error.shape))
 
@@ -118,26 +159,42 @@ class SceneProblem(Problem):
         return dr.select(size < bound, dr.square(error), bound * (2 * size - bound))
 
     def measure(self, net) -> dict[str, float]:
-        """Return ``psnr_db`` of renders of the measured views, with rounded entries, and the PSNR of the texture.
+        """Return the PSNR of renders of the measured views, with rounded entries, and the PSNR of the texture.
 
-        Values are clipped to [0, 1]. The errors of two halves of the samples are multiplied, so that their variance
-        does not count.
+        ``psnr_db`` is the mean of ``psnr_N_spp_db``, those with the footprints of N samples a pixel, of which the first
+        are as renders have them. The noise of renders and references does not count (:func:`product_error`).
         """
+        figures = {}
         with dr.suspend_grad():
             self.scene.hold(rounded(unfolded(net)))
-            errors = []
-            for i, (view, reference) in enumerate(self.measured):
-                self.scene.place(view)
-                seeds = (dr.opaque(mi.UInt32, SEEDS - 1 - number) for number in (2 * i, 2 * i + 1))
-                halves = (self.scene.render(seed, seed + SEEDS, self.samples).numpy() for seed in seeds)
-                a, b = (self.exposure * np.nan_to_num(half) for half in halves)
-                truth = np.clip(reference, 0, 1)
-                errors.append(float(np.mean((np.clip(a, 0, 1) - truth) * (np.clip(b, 0, 1) - truth), dtype=np.float64)))
-                if i == 0 and self.preview is not None:
-                    self._write(reference, (a + b) / 2)
+            for spp in self.footprints:
+                errors = []
+                for i, (view, references) in enumerate(self.measured):
+                    self.scene.place(view, spp)
+                    seeds = (dr.opaque(mi.UInt32, SEEDS - 1 - number) for number in (2 * i, 2 * i + 1))
+                    halves = [self.scene.render(seed, seed + SEEDS, self.samples).numpy() for seed in seeds]
+                    halves = [self.exposure * np.nan_to_num(half) for half in halves]
+                    errors.append(product_error(halves, references))
+                    if i == 0 and spp == self.footprints[0] and self.preview is not None:
+                        self._write(references.mean(axis=0), sum(halves) / 2)
+                figures[f"psnr_{spp}_spp_db"] = decibels(errors)
             texture = self.texture.measure(net)
-        decibels = -10 * math.log10(max(float(np.mean(errors)), 1e-12))
-        return {"psnr_db": decibels, **{f"texture_{name}": value for name, value in texture.items()}}
+        mean = statistics.fmean(figures.values())
+        return {"psnr_db": mean, **figures, **{f"texture_{name}": value for name, value in texture.items()}}
+
+    def measure_finely(self, factor: int = FINER) -> dict[str, float]:
+        """Return :meth:`measure` of the current state with ``factor`` times as many samples."""
+        samples, self.samples = self.samples, factor * self.samples
+        try:
+            with cores(self.recipe.settings.deterministic):
+                return self.measure(self.net)
+        finally:
+            self.samples = samples
+
+    def gains(self, before: dict[str, float], after: dict[str, float]) -> bool:
+        """Return whether figures are better than those ``before``: in the mean, with a :data:`LOSS` at no footprint."""
+        losses = [before[name] - after[name] for name in (f"psnr_{spp}_spp_db" for spp in self.footprints)]
+        return after["psnr_db"] > before["psnr_db"] and max(losses) <= LOSS
 
     def _write(self, reference: np.ndarray, image: np.ndarray) -> None:
         difference = SHOWN * np.abs(image - reference)

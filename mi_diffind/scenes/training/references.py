@@ -1,4 +1,4 @@
-"""Reference images of a scene: each view rendered once by exact plugins, and kept in a folder."""
+"""Reference images of a scene: each view rendered once by exact plugins, in two halves, and kept in a folder."""
 
 from __future__ import annotations
 
@@ -36,13 +36,16 @@ PASS = 1 << 23
 #: First seed of references; trained renders use smaller ones.
 SEEDS = 1 << 31
 
-#: Samples per pixel of a pass if time is limited.
-SHORT = 4
+#: Samples per pixel of the first passes if time is limited; later ones are half as long as all before.
+SHORT = 2
 
 
 @dataclass
 class ReferenceRenders:
     """Images of the views of a scene, rendered with exact plugins at ``spp`` samples a pixel.
+
+    Each image is the mean of two halves of the samples. An error that is measured with one half is independent of the
+    noise of the other.
 
     ``against`` names other counterparts than the exact ones. ``folder`` (created if its parent exists; ``None``: keep
     nothing) holds one file for each image. The name of a file depends on everything that the image depends on: the
@@ -51,7 +54,7 @@ class ReferenceRenders:
     rig. Files are replaced in one piece, after each pass. ``pass_samples``: samples of the whole image in one pass.
 
     With a ``deadline``, each view gets an equal part of the time, and as many samples as fit; such images are not
-    kept. ``samples`` is the number of samples that all images have.
+    kept. ``samples`` is the number of samples that all images of ``spp`` have.
 
     ``workers`` processes share the views of a scene file, or those of the Dask cluster ``scheduler``.
 
@@ -86,7 +89,7 @@ class ReferenceRenders:
         code.append(Path(inspect.getfile(Rig)))
         common = {
             "defines": dict(sorted(self.scene.defines.items())), "against": self.against, "inputs": list(self.inputs),
-            "spp": self.spp, "target": self.views.target, "up": self.views.up, "variant": mi.variant(),
+            "target": self.views.target, "up": self.views.up, "variant": mi.variant(),
             "versions": [mi.__version__, __version__, fingerprint(code)], "pass": self.pass_samples,
         }  # fmt: skip
         digest = hashlib.sha256((json.dumps(common) + self.scene.description).encode())
@@ -95,34 +98,38 @@ class ReferenceRenders:
                 digest.update(file.name.encode() + b"\0" + file.read_bytes() + b"\0")
         return digest.hexdigest()
 
-    def path(self, view: View) -> Path | None:
-        """Return the file of a view, ``None`` if files are not kept."""
-        return None if self.folder is None else self.folder / f"{self._key(view)[:24]}.npz"
+    def path(self, view: View, spp: int | None = None) -> Path | None:
+        """Return the file of a view at ``spp`` samples, ``None`` if files are not kept."""
+        return None if self.folder is None else self.folder / f"{self._key(view, spp or self.spp)[:24]}.npz"
 
-    def _key(self, view: View) -> str:
-        return hashlib.sha256((self.digest + json.dumps(asdict(view))).encode()).hexdigest()
+    def _key(self, view: View, spp: int) -> str:
+        return hashlib.sha256((self.digest + json.dumps([asdict(view), spp])).encode()).hexdigest()
 
     def images(self, views: Sequence[View]) -> list[np.ndarray]:
-        """Return the linear images, ``(height, width, channels)``, float32; missing ones are rendered.
+        """Return the linear images, ``(height, width, channels)``, float32; missing ones are rendered."""
+        return [halves.mean(axis=0) for halves in self.halves([(view, self.spp) for view in views])]
+
+    def halves(self, views: Sequence[tuple[View, int]]) -> list[np.ndarray]:
+        """Return both halves of the images of pairs (view, samples a pixel), ``(2, height, width, channels)``.
 
         The exact scene is dropped afterwards: Dr.Jit compiles the materials of all loaded scenes into every kernel.
         """
         if (self.workers or self.scheduler) and self.deadline is None and not self.scene.description:
-            return self._images_by_workers(views)
-        bar = progress_bar("references", len(views) * self.spp, "spp", self.progress)
+            return self._halves_by_workers(views)
+        bar = progress_bar("references", sum(spp for _, spp in views), "spp", self.progress)
         try:
             with bar:
-                return [self._image(view, bar, len(views) - i) for i, view in enumerate(views)]
+                return [self._halves(*pair, bar, len(views) - i) for i, pair in enumerate(views)]
         finally:
             self._loaded = None
             gc.collect()
 
-    def _images_by_workers(self, views: Sequence[View]) -> list[np.ndarray]:
-        """Return the images, rendered by other processes. Raises :class:`.errors.DiffindError` if one fails."""
+    def _halves_by_workers(self, views: Sequence[tuple[View, int]]) -> list[np.ndarray]:
+        """Return :meth:`halves`, rendered by other processes. Raises :class:`.errors.DiffindError` if one fails."""
         given = {name: getattr(self, name) for name in SHARED}
         given["folder"] = self.folder and self.folder.resolve()
         content = pickle.dumps((str(self.scene.path.resolve()), self.scene.defines, mi.variant(), given))
-        jobs = {self._key(view): (content, view) for view in views}
+        jobs = {self._key(*pair): (content, *pair) for pair in views}
         images = {}
         options = (self.workers, self.scheduler, self.progress, "references", "view")
         for outcome in run_jobs(render_separately, jobs, *options):
@@ -132,44 +139,49 @@ class ReferenceRenders:
             self.rendered, self.reused = self.rendered + rendered, self.reused + reused
         if len(images) < len(jobs):
             raise KeyboardInterrupt
-        return [images[self._key(view)] for view in views]
+        return [images[self._key(*pair)] for pair in views]
 
-    def _image(self, view: View, bar, left: int) -> np.ndarray:
-        """Return the image of a view; ``left`` views, this one included, share the time that is left."""
-        path = self.path(view)
-        total, done = self._kept(path)
-        self.reused += done > 0
-        bar.update(done)
-        if done < self.spp:
+    def _halves(self, view: View, spp: int, bar, left: int) -> np.ndarray:
+        """Return both halves of the image of a view; ``left`` views, this one included, share the time that is left."""
+        path, half = self.path(view, spp), -(-spp // 2)
+        total, done = self._kept(path, half)
+        self.reused += done[0] > 0
+        bar.update(sum(done))
+        if min(done) < half:
             scene, rig, samples = self._scene()
             deadline = None if self.deadline is None else self.deadline.part(1 / left)
             if deadline is not None:
-                path, samples, total, done = None, min(samples, SHORT), 0.0, 0
+                path, total, done = None, None, [0, 0]
             rig.place(view)
-            footprint.attach(scene, 0, self.spp)
-            seed = int(self._key(view)[:8], 16) % 2**19 << 12
-            while done < self.spp and not (done and deadline is not None and deadline.passed):
-                n = min(samples, self.spp - done)
+            footprint.attach(scene, 0, spp)
+            seed = int(self._key(view, spp)[:8], 16) % 2**19 << 12
+            while min(done) < half and not (deadline is not None and deadline.passed and done[0] == done[1] > 0):
+                i = int(done[0] > done[1])
+                n, unit = min(samples, half - done[i]), samples
+                if deadline is not None:
+                    n, unit = min(n, max(SHORT, done[i] // 2)), SHORT
                 # The pass number follows from the finished samples: the same after an interruption
-                image = loading.render_pass(scene, n, SEEDS + seed + done // samples % 2**12)
-                total = total + n * np.where(np.isfinite(image), image, 0)
-                done += n
+                image = loading.render_pass(scene, n, SEEDS + seed + (2 * (done[i] // unit) + i) % 2**12)
+                total = np.zeros((2, *image.shape), image.dtype) if total is None else total
+                total[i] += n * np.where(np.isfinite(image), image, 0)
+                done[i] += n
                 self.rendered += 1
                 bar.update(n)
                 if path is not None:
                     with replacing(path) as temporary:
-                        np.savez(temporary, total=total, done=np.int64(done))
-        self.samples = min(self.samples, done)
-        return loading.colour_channels((total / done).astype(np.float32))
+                        np.savez(temporary, total=total, done=np.array(done))
+        if spp == self.spp:
+            self.samples = min(self.samples, sum(done))
+        return np.stack([loading.colour_channels((total[i] / done[i]).astype(np.float32)) for i in range(2)])
 
-    def _kept(self, path: Path | None) -> tuple:
-        """Return the sum of the kept samples of a view, and their number; a damaged file counts as none."""
+    def _kept(self, path: Path | None, half: int) -> tuple[np.ndarray | None, list[int]]:
+        """Return the sums of the kept samples of both halves, and their numbers; a damaged file counts as none."""
         if path is not None and path.is_file():
             with contextlib.suppress(Exception), Archive(path) as archive:  # zipfile and numpy each have their own
-                total, done = archive.array("total"), int(archive.array("done"))
-                if total.ndim == 3 and 0 < done <= self.spp:
-                    return total, done
-        return 0.0, 0
+                total, done = archive.array("total"), [int(n) for n in archive.array("done")]
+                if total.ndim == 4 and len(total) == len(done) == 2 and 0 < done[0] <= half and 0 <= done[1] <= half:
+                    return np.array(total), done
+        return None, [0, 0]
 
     def _scene(self) -> tuple:
         """Return the exact scene, loaded on the first call, its rig, and the samples per pixel of one pass."""
@@ -184,13 +196,16 @@ class ReferenceRenders:
 SHARED = ("views", "spp", "folder", "against", "without", "inputs", "pass_samples")
 
 
-def render_separately(job: tuple[bytes, View]) -> tuple[np.ndarray, int, int]:
-    """Return the image of a view, and the numbers of passes and kept images, in a process that loads the scene once."""
-    content, view = job
+def render_separately(job: tuple[bytes, View, int]) -> tuple[np.ndarray, int, int]:
+    """Return both halves of the image of a view, and the numbers of passes and kept images, in another process.
+
+    The process loads the scene once.
+    """
+    content, view, spp = job
     references = _references(content)
     references.rendered = references.reused = 0
-    image = references._image(view, progress_bar(None, references.spp, progress=False), 1)
-    return image, references.rendered, references.reused
+    halves = references._halves(view, spp, progress_bar(None, spp, progress=False), 1)
+    return halves, references.rendered, references.reused
 
 
 @functools.lru_cache(maxsize=1)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -16,6 +19,15 @@ PARALLEL = 1e-4
 #: Bit of a parameter that cannot be set.
 READ_ONLY = mi.ParamFlags.ReadOnly.value
 
+#: Small ranges (:func:`small_ranges`), degrees to both sides of the scene's camera and lights.
+AZIMUTH, ELEVATION, LIGHT_AZIMUTH = 15.0, 10.0, 20.0
+
+#: Shares of the small ranges that are tried, until no surface is in the way.
+SHARES = (1.0, 0.5, 0.25, 0.125)
+
+#: Rows and columns of the rays that look for surfaces in the image.
+RAYS = 32
+
 
 class Rig:
     """First sensor and lights of a loaded scene, moved through scene parameters: nothing is loaded or compiled again.
@@ -27,7 +39,8 @@ class Rig:
         self.scene, self.views = scene, views
         if not scene.sensors():
             raise SceneError("the scene has no sensor, views need one")
-        self.up = np.array(views.up, np.float64) / np.linalg.norm(views.up)
+        up = np.array(views.up or (0, 1, 0), np.float64)
+        self.up = up / np.linalg.norm(up)
         self.sensor = _Movable(scene.sensors()[0], scene)
         if views.moves_camera and self.sensor.parameter != "to_world":
             raise SceneError(f"the sensor {scene.sensors()[0].class_name()} cannot be moved")
@@ -60,12 +73,13 @@ class Rig:
     def place(self, view: View) -> None:
         """Move camera and lights to a view."""
         if self.views.moves_camera:
-            self.sensor.move(self._camera(view))
+            self.sensor.move(self.camera(view))
         for light in self.lights:
-            turn = self._turn(light, view)
+            turn = self.turn(light, view)
             light.move(turn @ light.before, None if light.sun is None else self._sun(light, turn, view))
 
-    def _camera(self, view: View) -> np.ndarray:
+    def camera(self, view: View) -> np.ndarray:
+        """Return the 4×4 matrix of the camera in a view."""
         before = self.sensor.before
         origin = before[:3, 3]
         if view.origin is not None:
@@ -75,7 +89,7 @@ class Rig:
         # Roll, scale and the angle to the target of the scene's own camera are preserved
         return self._look_at(to) @ np.linalg.inv(self._look_at(origin)) @ before
 
-    def _turn(self, light: _Movable, view: View) -> np.ndarray:
+    def turn(self, light: _Movable, view: View) -> np.ndarray:
         """Return the 4×4 matrix that moves a light from its place in the scene to that of a view."""
         centre = self.target
         if light.environment:
@@ -172,3 +186,99 @@ class _Movable:
         self.parameters.update()
         if self.scene:
             self.scene.parameters_changed()  # rays are to find the shape at its place
+
+
+def small_ranges(scene: mi.Scene, views: ViewDistribution) -> ViewDistribution:
+    """Return a distribution of as many views with small ranges around the camera and the lights of a loaded scene.
+
+    The camera turns by ± :data:`AZIMUTH` and rises and sinks by :data:`ELEVATION`, at most to half of its own height
+    above the horizon; lights turn by ± :data:`LIGHT_AZIMUTH`. A target that is not given is the point on the camera's
+    axis at the median depth of the visible surfaces, and the vertical the axis that is closest to the camera's. Ranges
+    are halved until the straight ways of camera and lights to all views cross no surface, so that they stay inside a
+    room and outside of objects. A camera or lights that cannot be moved stay. If both stay, the views are returned.
+    """
+    if not scene.sensors():
+        return views
+    target = views.target or _middle(scene)
+    if target is None:
+        return views
+    around = dataclasses.replace(views, target=target, up=views.up or _vertical(scene))
+    ranges = {}
+    for draw in (_camera_ranges, _light_ranges):
+        for share in SHARES:
+            drawn = draw(scene, around, share)
+            if drawn is None:
+                break
+            part, ways, passable = drawn
+            if not _is_blocked(scene, ways, passable):
+                ranges |= part
+                break
+    return dataclasses.replace(around, **ranges) if ranges else views
+
+
+def _camera_ranges(scene: mi.Scene, views: ViewDistribution, share: float) -> tuple | None:
+    """Return a share of the camera's small ranges, and its ways to all views; ``None``: it cannot be moved."""
+    azimuth = share * AZIMUTH
+    try:
+        rig = Rig(scene, dataclasses.replace(views, azimuth=(-azimuth, azimuth)))
+    except SceneError:
+        return None
+    origin = rig.sensor.before[:3, 3]
+    offset = origin - rig.target
+    height = float(np.degrees(np.arcsin(np.clip(offset @ rig.up / np.linalg.norm(offset), -1, 1))))
+    low, high = height - share * ELEVATION, height + share * ELEVATION
+    low = max(low, height / 2 if height > 0 else -89.0)
+    ranges = {"azimuth": (-azimuth, azimuth), "elevation": (min(low, 89.0), min(high, 89.0))}
+    drawn = dataclasses.replace(views, **ranges)
+    return ranges, [(origin, rig.camera(view)[:3, 3]) for view in (*drawn.trained(), *drawn.measured())], False
+
+
+def _light_ranges(scene: mi.Scene, views: ViewDistribution, share: float) -> tuple | None:
+    """Return a share of the lights' small range, and the ways of lights at finite distances to all views."""
+    ranges = {"light_azimuth": (-share * LIGHT_AZIMUTH, share * LIGHT_AZIMUTH)}
+    drawn = dataclasses.replace(views, **ranges)
+    try:
+        rig = Rig(scene, drawn)
+    except SceneError:
+        return None
+    views = [*drawn.trained(), *drawn.measured()]
+    lights = [light for light in rig.lights if not light.at_infinity]
+    ways = [(x.centre, (rig.turn(x, view) @ [*x.centre, 1])[:3]) for x in lights for view in views]
+    return ranges, ways, True
+
+
+def _is_blocked(scene: mi.Scene, ways: Sequence[tuple[np.ndarray, np.ndarray]], lights_pass: bool) -> bool:
+    """Return whether a surface crosses a straight way; lights may pass surfaces that shine, which are their own."""
+    if not ways:
+        return False
+    starts, ends = (np.array(points, np.float32).T for points in zip(*ways, strict=True))
+    start, end = mi.Point3f(starts), mi.Point3f(ends)
+    ray = mi.Ray3f(start, dr.normalize(end - start))
+    ray.maxt = dr.norm(end - start)
+    hit = scene.ray_intersect(ray)
+    blocked = hit.is_valid()
+    if lights_pass:
+        blocked &= ~hit.shape.is_emitter()
+    return bool(dr.any(blocked))
+
+
+def _middle(scene: mi.Scene) -> tuple[float, float, float] | None:
+    """Return the point on the camera's axis at the median depth of visible surfaces; ``None``: nothing is visible."""
+    sensor = scene.sensors()[0]
+    matrix = np.array(sensor.world_transform().matrix, np.float64).reshape(4, 4)
+    places = (np.stack(np.meshgrid(*2 * [np.arange(RAYS)])).reshape(2, -1) + 0.5) / RAYS
+    rays, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, mi.Point2f(places.astype(np.float32)), mi.Point2f(0.5))
+    hit = scene.ray_intersect(rays)
+    points = np.array(hit.p, np.float64).T[np.array(hit.is_valid())]
+    axis = matrix[:3, 2] / np.linalg.norm(matrix[:3, 2])
+    if not len(points):
+        return None
+    return tuple((matrix[:3, 3] + np.median((points - matrix[:3, 3]) @ axis) * axis).tolist())
+
+
+def _vertical(scene: mi.Scene) -> tuple[float, float, float]:
+    """Return the axis closest to the camera's vertical, of those that are at right angles to its horizontal."""
+    matrix = np.array(scene.sensors()[0].world_transform().matrix, np.float64).reshape(4, 4)
+    left, up = (matrix[:3, i] / np.linalg.norm(matrix[:3, i]) for i in (0, 1))
+    candidates = [i for i in (1, 2, 0) if abs(left[i]) < 0.1] or [1]
+    return tuple(np.eye(3)[max(candidates, key=lambda i: round(up[i], 3))].tolist())

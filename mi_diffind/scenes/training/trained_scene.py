@@ -250,16 +250,17 @@ class TrainedScene:
     integrator ``prb`` in place of ``path``, the same estimator: paths are sampled *detached*, without derivatives of
     the sampling decisions, and the values along them are differentiated. The gradient is right on average, since
     neither visible surfaces nor the places of samples depend on a texture's values; the choice of a lobe does, but the
-    density divides it out. Footprints are those of ``spp`` samples a pixel.
+    density divides it out.
     """
 
-    def __init__(self, parsed: loading.ParsedScene, tables: Mapping[Path, Table], views: ViewDistribution, spp: int):
+    def __init__(self, parsed: loading.ParsedScene, tables: Mapping[Path, Table], views: ViewDistribution):
         folder = parsed.path.resolve().parent
         with tempfile.TemporaryDirectory() as temporary:
             # Files in another folder, so that no other scene reads the same arrays
             copies = {file: Path(temporary).resolve() / file.name for file in tables}
             for file, table in tables.items():
-                save_table(copies[file], table)
+                untrained = {name: value for name, value in table.settings.items() if name != "shading"}
+                save_table(copies[file], dataclasses.replace(table, settings=untrained))  # any samples are right
 
             def change(state):
                 for props in compat.parsed_properties(state):
@@ -274,7 +275,7 @@ class TrainedScene:
             changed = parsed.copy()
             changed.change(change)
             self.scene = changed.load(parallel=False)
-        self.spp, self.rig, self._cones = spp, Rig(self.scene, views), {}
+        self.rig, self._cones = Rig(self.scene, views), {}
         self._seeing = footprint.textures(self.scene)
         #: Name of each array → the parameter of the scene that is set for it.
         self.keys = {}
@@ -306,21 +307,23 @@ class TrainedScene:
             self.parameters[self.keys[name]] = array.data
         self.parameters.update()
 
-    def place(self, view: View) -> None:
-        """Move camera and lights to a view, and update the footprints."""
+    def place(self, view: View, spp: int) -> None:
+        """Move camera and lights to a view, and set the footprints of ``spp`` samples a pixel.
+
+        As in renders, a texture reads the only sample of a pixel at the pixel's centre, and several where they are.
+        """
         self.rig.place(view)
-        if view not in self._cones:
-            footprint.attach(self.scene, 0, self.spp)
-            self._cones[view] = [texture.cone for texture in self._seeing]
-        for texture, cone in zip(self._seeing, self._cones[view], strict=True):
+        if (view, spp) not in self._cones:
+            footprint.attach(self.scene, 0, spp)
+            self._cones[view, spp] = [texture.cone for texture in self._seeing]
+        for texture, cone in zip(self._seeing, self._cones[view, spp], strict=True):
             texture.set_cone(cone)
 
-    def render(self, seed, seed_grad, spp: int | None = None):
+    def render(self, seed, seed_grad, spp: int):
         """Return the image of the current view, a tensor that is differentiable by the arrays.
 
         Values come from the samples of ``seed``, derivatives from those of ``seed_grad`` (:mod:`.problem` says why).
-        ``spp`` (``None``: the scene's) changes no footprints.
+        ``spp`` changes no footprints.
         """
-        spp = spp or self.spp
         image = mi.render(self.scene, self.parameters, spp=spp, spp_grad=spp, seed=seed, seed_grad=seed_grad)
         return loading.colour_channels(image)

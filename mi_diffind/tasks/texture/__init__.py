@@ -65,17 +65,22 @@ REFERENCES = ("jittered", "prefiltered", "converged")
 class ShadingSettings(FitSettings):
     """Training for shaded appearance, which starts from a trained texture; the defaults are those of ``ours``.
 
-    ``share``: λ, the share of the loss of shaded values. ``clip``: bound of the derivatives of a sample's error through
-    the specular lobe (``None``: unlimited). ``reference``: sample pattern of the reference. ``bounded``: whether values
-    above 1 are compared in log space. ``level_bias``: levels by which a footprint's level of detail is read finer
-    (negative), stored in the file (``None``: chosen by images). ``extras``: whether the shape and weight of the
-    specular lobe are tried as coarse extras, which ``neural_material`` alone reads. ``mirrored``: share of the lights
-    that are drawn about the mirror direction. ``quarters``: whether each second step is of pixels with four samples.
-    ``tables``: whether arrays are shaded by the frozen tables of task 2, in
-    place of the formulas that ``neural_material`` evaluates by default. ``beta_2``: Adam's decay of squared gradients;
-    highlights are rare, and with 0.999 single ones tilt normals of glossy, flat pages by degrees. ``texture``: preset of task 4, which
-    trains the start unless one is given, and defines the samples and the loss of the texture; ``loss`` is that of
-    shaded values.
+    - ``steps``: those of all its trainings together (:mod:`.shading`); ``loss``: that of shaded values.
+    - ``share``: λ, the share of the loss of shaded values.
+    - ``clip``: bound of the derivatives of a sample's error through the specular lobe (``None``: unlimited).
+    - ``reference``: sample pattern of the reference.
+    - ``bounded``: whether values above white are compared in log space.
+    - ``level_bias``: levels by which a footprint's level of detail is read finer (negative), stored in the file
+      (``None``: chosen by held-out footprints).
+    - ``extras``: whether the shape and weight of the specular lobe are trained as coarse extras, which
+      ``neural_material`` alone reads.
+    - ``mirrored``: share of the lights that are drawn about the mirror direction.
+    - ``quarters``: whether each second step is of pixels with four samples.
+    - ``tables``: whether arrays are shaded by the frozen tables of task 2, in place of the formulas that
+      ``neural_material`` evaluates by default.
+    - ``beta_2``: Adam's decay of squared gradients. Highlights are rare: with 0.999, single ones tilt normals of
+      glossy, flat pages by degrees.
+    - ``texture``: preset of task 4 that defines the samples and the loss of the texture.
     """
 
     steps: int = 1000
@@ -190,7 +195,7 @@ class Texture(Task):
             f"(default: {', '.join(f'{r.share} for {name}' for name, r in SHADING_PRESETS.items())})",
         ),
         Argument(
-            "--extras", choices=("auto", "off"), default="auto",
+            "--extras", choices=("auto", "off"), default="off",
             help="shape and weight of the highlight in coarse grids beside the maps, read by neural_material alone; "
             "auto keeps them if shaded images gain (default: auto)",
         ),

@@ -42,12 +42,6 @@ PER_TEXEL = 4
 #: reference is at 36 dB on level 5 of a glossy material.
 LARGEST = 64
 
-#: Side of the images of :meth:`ShadedEvaluation.another`, in texels.
-PART = 4
-
-#: Most pixels of these images on a level.
-CHOOSING = 2**14
-
 #: Seed of the views and lights; trainings use other generators.
 SEED = 20231212
 

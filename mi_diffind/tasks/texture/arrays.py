@@ -396,7 +396,7 @@ def from_components(
 
 
 def channel_scale(weights: np.ndarray | None, channels: int) -> np.ndarray:
-    """Return the factors of channels, ``(channels,)``, at most 1, by which weighted squared errors become plain ones."""
+    """Return the square roots of weights over the largest, ``(channels,)``; 1 without weights."""
     if weights is None:
         return np.ones(channels, np.float32)
     return np.sqrt(np.asarray(weights) / np.max(weights)).astype(np.float32)

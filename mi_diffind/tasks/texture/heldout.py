@@ -1,7 +1,8 @@
 """Held-out footprints of a material: single pixels under views and lights that decide what a training keeps.
 
-Footprints are drawn for each level of detail. Each is read as a renderer with N samples a pixel reads it (:data:`CASES`):
-the mean of reads at places within the pixel, a level finer for each factor of four in N; or once, at its centre.
+Footprints are drawn for each level of detail. Each is read as a renderer with N samples a pixel reads it
+(:data:`CASES`): the mean of reads at places within the pixel, a level finer for each factor of four in N; or once, at
+its centre.
 Differences of two readers have a standard error, so that chance decides nothing.
 """
 
@@ -103,7 +104,7 @@ class HeldOutFootprints:
         return (sum(truth) / 3).numpy(), weight.numpy()
 
     def errors(self, read: ShadedReader) -> np.ndarray:
-        """Return the weighted squared error of each footprint, ``(levels, cases, count)``, of exposed values up to 1."""
+        """Return the weighted squared error of exposed values up to 1, ``(levels, cases, count)``."""
         return np.stack([[self._error(read, level, samples) for samples in CASES] for level in range(self.levels)])
 
     def brightness(self, read: ShadedReader) -> np.ndarray:
@@ -154,7 +155,7 @@ class _Numbers:
 
 
 def compared(base: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return gains over ``base`` and their standard errors, in dB, ``(levels, cases)``, of errors of the same footprints."""
+    """Return the gains of ``errors`` over ``base`` and their standard errors, in dB, ``(levels, cases)``."""
     means = [np.maximum(e.mean(axis=-1, dtype=np.float64), 1e-12) for e in (base, errors)]
     relative = base / means[0][..., None] - errors / means[1][..., None]
     scale = 10 / np.log(10)

@@ -1,7 +1,7 @@
 """Training of task 5: arrays of a texture, trained for their shaded appearance.
 
-- **Weights.** Shading multiplies an error of a normal by more than one of a colour. :func:`sensitivities` measures by how
-  much, and arrays are laid out and trained anew for weighted maps (:data:`POWERS`).
+- **Weights.** Shading multiplies an error of a normal by more than one of a colour: by how much,
+  :func:`sensitivities` measures. Arrays are laid out and trained anew for weighted maps.
 - **Appearance.** The loss is (1 − λ) · texture + λ · shading. The first term is the loss of task 4, in the units of its
   recipe. The second compares shaded values with a reference that shades first and filters afterwards
   (:mod:`.appearance`).
@@ -74,8 +74,8 @@ SEED = 20231214
 def sensitivities(pyramid: Pyramid, exposure: float = 1.0) -> dict[str, float]:
     """Return the mean squared change of a shaded value by the change of a map's value, by map, at level 0.
 
-    Exposed values are compared up to 1, under views and lights of :func:`.heldout.mirrored_pairs`; maps that shading does not
-    read are left out.
+    Exposed values are compared up to 1, under views and lights of :func:`.heldout.mirrored_pairs`. Maps that shading
+    does not read are left out.
     """
     types, layout, effects = pyramid.types, pyramid.layout, material_effects(pyramid.layout)[0]
     rng = np.random.default_rng(SEED)
@@ -193,7 +193,7 @@ class ShadingProblem(textures.TextureProblem):
         return u, v, dr.log(1 - (1 - lowest) * level) * (1 / math.log(FALL))
 
     def measure(self, net) -> dict[str, float]:
-        """Return the gain of held-out footprints (:func:`.heldout.loss_or_gain`), entries rounded, and the PSNR of the texture."""
+        """Return the mean gain of held-out footprints, entries rounded, and the PSNR of the texture."""
         texture = super().measure(net)
         if self.held_out is None:
             return texture
