@@ -197,12 +197,12 @@ class Texture(Task):
         Argument(
             "--extras", choices=("auto", "off"), default="off",
             help="shape and weight of the highlight in coarse grids beside the maps, read by neural_material alone; "
-            "auto keeps them if shaded images gain (default: auto)",
+            "auto keeps them if held-out footprints gain (default: off)",
         ),
         Argument(
             "--level-bias", type=bias_or_auto, default="auto", metavar="auto|N",
             help="levels by which the texture is read finer than the footprint, as in -0.5 (default: auto, chosen by "
-            "shaded images in the last stage, 0 without it and for paper)",
+            "held-out footprints in the last stage, 0 without it and for paper)",
         ),
         *SOURCES,
         PREVIEW,
