@@ -16,6 +16,8 @@ from scene_xml import ball, element, head, lying, plugin, ref, repeated, sun, wr
 
 import mi_diffind as md
 from mi_diffind import metrics, scenes
+from mi_diffind.images.srgb import for_display
+from mi_diffind.tasks.texture.appearance import titled
 
 ABOUT = """Hammered metal with rust, minified: what a texture that is trained for its shading is for. Written by
 make_rust.py: change that file.
@@ -40,13 +42,21 @@ def write_maps() -> None:
 
 def metal(repeats: float, id: str):
     """Return the material, its maps repeated the given number of times."""
-    return plugin("bsdf", "neural_material", repeated(repeats), id=id, filename="assets/$metal", lobes="tables",
+    return plugin("bsdf", "neural_material", repeated(repeats), id=id, filename="assets/$metal",
                   storage="$storage", filter="$filter")  # fmt: skip
 
 
 #: Settings of the picture, its first row and column that are shown, and the zoomed rows and columns.
 PICTURE = {"sky": 0, "max_depth": 2, "width": 640, "height": 360}
 CROP, ZOOM = (slice(60, 300), slice(250, 640)), (slice(45, 135), slice(500, 630))
+
+#: Exposure of the picture, and the titles of its columns.
+EXPOSURE = 1.6
+TITLES = (
+    "trained for its maps, 1 sample a pixel",
+    "trained for its shading, 1 sample a pixel",
+    "truth: bitmaps, 256 samples a pixel",
+)
 
 
 def picture(json_file: str | None) -> None:
@@ -67,9 +77,9 @@ def picture(json_file: str | None) -> None:
         figures[file] = {"bytes": md.open(FOLDER / "assets" / file).table.nbytes, "brightness": brightness,
                          **metrics.compare(truth, image)}  # fmt: skip
     columns = [[image[CROP], image[ZOOM].repeat(3, axis=0).repeat(3, axis=1)] for image in (*images.values(), truth)]
-    shown = mi.Bitmap(np.concatenate([np.concatenate(column) for column in columns], axis=1))
-    shown = shown.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True)
-    shown.write(str(FOLDER / "rust.jpg"), quality=85)
+    shown = np.concatenate([np.concatenate(column) for column in columns], axis=1)
+    shown = titled(for_display(EXPOSURE * shown), TITLES)
+    mi.Bitmap(shown).write(str(FOLDER / "rust.jpg"), quality=85)
     text = json.dumps(figures, indent=2) + "\n"
     print(text, end="")
     if json_file:
