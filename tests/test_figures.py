@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 
 #: Tables of more than ten rows in a page: each task or plugin has a row, or shorter ones would hide what ours loses.
-LONG = {"trust", "shading_best"}
+LONG = {"trust", "shading_levels"}
 
 
 def test_pages_are_as_the_files_say():
