@@ -238,70 +238,75 @@ def trust_cell(results: list[Entries]) -> str:
 # -- training for shaded values ----------------------------------------------------------------------------------------
 
 
-def _of_kind(study: Entries, material: str, kind: str) -> list[Entries]:
+def shading_runs(study: Entries, material: str, letter: str) -> dict[float, list[float]]:
+    """Return the mean PSNR in dB of the trainings of a material, one a seed, by λ; ``letter`` is that of the truth."""
     details = [job.details for job in study.jobs.values()]
-    return [d for d in details if d.material == material and d.kind == kind]
+    runs = [d for d in details if d.material == material and d.kind == "run" and d.way == "clip, schedule"]
+    return {share: [d[letter]["mean_db"] for d in rows] for (share,), rows in groups(runs, "share").items()}
 
 
-def shading_runs(study: Entries) -> dict[str, dict[tuple[str, float], list[Entries]]]:
-    """Return the trainings of each material by way and λ."""
-    materials = dict.fromkeys(job.details.material for job in study.jobs.values())
-    return {material: groups(_of_kind(study, material, "run"), "way", "share") for material in materials}
+def shaded_materials(*studies: Entries) -> dict[str, dict[str, list[Entries]]]:
+    """Return the records of each material by their kind; studies without renders are left out."""
+    records = [[job.details for job in study.jobs.values()] for study in studies]
+    details = [d for study in records if any(d.kind == "renders" for d in study) for d in study]
+    materials = groups(details, "material").items()
+    return {material: {kind: d for (kind,), d in groups(rows, "kind").items()} for (material,), rows in materials}
 
 
-def trouble(runs: list[Entries]) -> str:
-    """Return the names of troubles, each with the number of runs."""
-    names = [name for d in runs for name in d.get("trouble", [])]
-    return ", ".join(f"{name} {names.count(name)}" for name in dict.fromkeys(names)) or "none"
+def shaded_renders(*studies: Entries) -> list[Entries]:
+    """Return a row for each material and each light of renders.
 
-
-def shading_best(study: Entries) -> list[Entries]:
-    """Return for each material the best filter uncompressed and in equal bytes, and the trainings of λ = 0.9."""
+    ``before`` and ``after``: PSNR in dB of plain and ours by samples a pixel, the mean of views and seeds; ``gain`` and
+    ``worst``, of all views and samples; ``brightness``: of plain and ours, the largest deviation of a patch.
+    """
     rows = []
-    for material in shading_runs(study):
-        for which, label in (("uncompressed", "uncompressed"), ("equal bytes", "equal bytes"), ("trained", "")):
-            runs = _runs(study, material, which)
-            label = f"{runs[0].label.removesuffix(', compressed')}, {label}" if label else "trained, λ = 0.9"
-            rows.append(Entries(material=material, label=label, runs=runs))
+    for material, kinds in shaded_materials(*studies).items():
+        for lights in kinds["renders"][0].renders.ours:
+            shown = {name: [d.renders[name][lights] for d in kinds["renders"]] for name in ("plain", "ours")}
+            psnr = {
+                name: {spp: [x for seed in seeds for x in seed[spp].psnr_db] for spp in seeds[0]}
+                for name, seeds in shown.items()
+            }
+            gains = [b - a for spp in psnr["ours"] for a, b in zip(*(psnr[n][spp] for n in shown), strict=True)]
+            patches = {
+                name: [x - 1 for seed in seeds for figures in seed.values() for view in figures.brightness
+                       for x in view.values()]
+                for name, seeds in shown.items()
+            }  # fmt: skip
+            before, after = ({spp: mean(values) for spp, values in psnr[name].items()} for name in shown)
+            brightness = {name: max(values, key=abs) for name, values in patches.items()}
+            rows.append(Entries(material=material, lights=lights, before=before, after=after, gain=mean(gains),
+                                worst=min(gains), brightness=Entries(brightness)))  # fmt: skip
     return rows
 
 
-def _runs(study: Entries, material: str, which: str) -> list[Entries]:
-    """Return the records of a material: of a filter by its name, of the best one, or of all seeds of a training.
+def shaded_levels(*studies: Entries) -> list[Entries]:
+    """Return for each material the best filter in equal bytes, the best LEAN uncompressed, plain and ours.
 
-    ``which`` is the name of a filter, ``uncompressed`` or ``equal bytes`` for the best of either, ``trained`` for the
-    weight λ = 0.9, or another weight as ``λ 0.5``; ``, no schedule`` after it names that way of a study with several.
+    ``mean_db``, one a seed, and ``levels``, the means of seeds, are PSNR of shaded values against the converged truth.
     """
-    filters = {d.label: d for kind in ("classical", "compressed") for d in _of_kind(study, material, kind)}
-    if which in filters:
-        return [filters[which]]
-    if which in ("uncompressed", "equal bytes"):
-        kind = "classical" if which == "uncompressed" else "compressed"
-        return [max(_of_kind(study, material, kind), key=lambda d: d.C.mean_db)]
-    way = "clip, no schedule" if which.endswith(", no schedule") else "clip, schedule"
-    weight = which.removesuffix(", no schedule")
-    return shading_runs(study)[material][way, 0.9 if weight == "trained" else float(weight.removeprefix("λ "))]
+    rows = []
+    for material, kinds in shaded_materials(*studies).items():
+        ours = [d for d in kinds["run"] if d.label.startswith("ours")]
+        lean = max((d for d in kinds["classical"] if d.label.startswith("LEAN")), key=lambda d: d.C.mean_db)
+        best = max(kinds["compressed"], key=lambda d: d.C.mean_db)
+        contenders = {
+            f"{best.label} (best filter in equal bytes)": [best], f"{lean.label} (uncompressed)": [lean],
+            "plain": kinds["plain"], "ours": ours,
+        }  # fmt: skip
+        for label, runs in contenders.items():
+            levels = [mean(values) for values in zip(*(d.C.psnr_db for d in runs), strict=True)]
+            rows.append(Entries(material=material, label=label, mean_db=[d.C.mean_db for d in runs], levels=levels))
+    return rows
 
 
-def shading(study: Entries, material: str, which: str, letter: str = "C") -> float:
-    """Return the PSNR in dB of a material in the mean of levels and seeds, ``which`` as of :func:`_runs`."""
-    return mean(d[letter]["mean_db"] for d in _runs(study, material, which))
-
-
-def shading_level(study: Entries, material: str, which: str, level: int) -> float:
-    """Return the PSNR in dB of a material at one level against the converged truth, in the mean of seeds."""
-    return mean(d["C"]["psnr_db"][level] for d in _runs(study, material, which))
-
-
-def shading_spread(study: Entries, material: str, which: str) -> float:
-    """Return the range in dB of the mean PSNR of the seeds."""
-    values = [d["C"]["mean_db"] for d in _runs(study, material, which)]
-    return max(values) - min(values)
-
-
-def flip(study: Entries, material: str, which: str) -> float:
-    """Return the mean FLIP of a material against the converged truth, ``which`` as of :func:`_runs`."""
-    return mean(mean(d["C"]["flip"]) for d in _runs(study, material, which))
+def over_filters(label: str, *studies: Entries) -> list[float]:
+    """Return the gain of ours in dB over the contender of :func:`shaded_levels` whose name has a text, by material."""
+    gains = []
+    for rows in groups(shaded_levels(*studies), "material").values():
+        other = one(row for row in rows if label in row.label)
+        gains.append(mean(rows[-1].mean_db) - mean(other.mean_db))
+    return gains
 
 
 def held_out(study: Entries, run: str) -> float:
@@ -337,8 +342,8 @@ FUNCTIONS = {
         min, max, sum, len, round, abs, all, any, sorted, next, iter, zip, map, list, dict, range, tuple, float,
         Entries, measured, every, one, ratio, time_over, equal_samples, cells, median, with_spread,
         size_text, binary_size, asset_bytes, equal_quality, scene_runs, with_network, budgets, by_label,
-        surface_errors, trust_cell, shading_runs, trouble, shading_best, shading, shading_level, shading_spread, flip,
-        held_out, shipped, trust_cells,
+        surface_errors, trust_cell, shading_runs, shaded_renders, shaded_levels, over_filters, held_out, shipped,
+        trust_cells,
     )
 } | {"mean": mean, "RENDERS": RENDERS}  # fmt: skip
 

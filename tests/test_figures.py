@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 
 #: Tables of more than ten rows in a page: each task or plugin has a row, or shorter ones would hide what ours loses.
-LONG = {"trust", "shading_best"}
+LONG = {"trust", "shading_levels"}
 
 
 def test_pages_are_as_the_files_say():
@@ -107,6 +107,38 @@ def test_samples_at_equal_error():
     assert figures.equal_samples(study, "plane", "as four", "multijittered") == pytest.approx(4**0.6)
     with pytest.raises(ValueError, match="no sample count"):
         figures.equal_samples(study, "plane", "best")
+
+
+def test_rows_of_shaded_renders_and_levels():
+    """Means of seeds and views, the worst of these, the darkest patch, and the best of several filters."""
+
+    def job(kind, label, levels=(), **details):
+        levels = {"C": {"mean_db": sum(levels) / 2, "psnr_db": levels}} if levels else {}
+        return {"details": {"material": "oak", "kind": kind, "label": label, **levels, **details}}
+
+    def rendered(plain, ours):
+        views = {"plain": (plain, 0.8), "ours": (ours, 0.98)}
+        figures = {n: {"psnr_db": v, "brightness": [{"near": 1.01, "far": b}]} for n, (v, b) in views.items()}
+        return job("renders", "renders", renders={n: {"sun": {"1": f}} for n, f in figures.items()})
+
+    jobs = [
+        job("plain", "plain, seed 0", [20, 30]), job("run", "lambda 1, seed 0", [50, 50]),
+        job("run", "ours, seed 0", [24, 34]), job("run", "ours, seed 1", [26, 36]),
+        job("compressed", "Toksvig, ASTC", [21, 31]), job("compressed", "baked, ASTC", [22, 29]),
+        job("classical", "LEAN", [40, 20]), job("classical", "baked", [50, 50]),
+        rendered([20, 22], [23, 22.5]), rendered([20, 22], [24, 21]),
+    ]  # fmt: skip
+    study, other = (study_of({"jobs": dict(enumerate(rows))}) for rows in (jobs, jobs[:1]))
+    (row,) = figures.shaded_renders(study, other)
+    assert (row.before, row.after) == ({"1": 21}, {"1": 22.625})
+    assert (row.gain, row.worst) == (1.625, -1)
+    assert row.brightness == pytest.approx({"plain": -0.2, "ours": -0.02})
+    rows = {row.label: (row.mean_db, row.levels) for row in figures.shaded_levels(study, other)}
+    assert rows == {
+        "Toksvig, ASTC (best filter in equal bytes)": ([26], [21, 31]), "LEAN (uncompressed)": ([30], [40, 20]),
+        "plain": ([25], [20, 30]), "ours": ([29, 31], [25, 35]),
+    }  # fmt: skip
+    assert figures.over_filters("equal bytes", study) == [4]
 
 
 def test_ratios_are_medians_in_either_order():
