@@ -20,9 +20,11 @@ from mi_diffind.core.errors import UsageError
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting import loop, task
 from mi_diffind.fitting.task import FitRequest
+from mi_diffind.maps import as_seen
 from mi_diffind.maps.model import size_figures
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
+from mi_diffind.tasks.disney import TASK as DISNEY
 from mi_diffind.tasks.disney.decoder import Decoder
 from mi_diffind.tasks.disney.model import Effects
 from mi_diffind.tasks.disney.training import uniform_hemisphere
@@ -30,10 +32,12 @@ from mi_diffind.tasks.texture import PRESETS as TEXTURES
 from mi_diffind.tasks.texture import SHADING_PRESETS as PRESETS
 from mi_diffind.tasks.texture import TASK as TEXTURE
 from mi_diffind.tasks.texture import fit as texture_fit
+from mi_diffind.tasks.texture import heldout
 from mi_diffind.tasks.texture import shading as training
 from mi_diffind.tasks.texture import surface as material
 from mi_diffind.tasks.texture import training as textures
 from mi_diffind.tasks.texture.appearance import ShadedEvaluation, reader, reference
+from mi_diffind.tasks.texture.arrays import PaperBudget
 from mi_diffind.tasks.texture.compressed import CompressedTexture
 from mi_diffind.tasks.texture.heldout import HeldOutFootprints
 
@@ -259,8 +263,15 @@ def quick(**changed):
 @pytest.fixture(autouse=True)
 def few_footprints(monkeypatch):
     """Fewer footprints and samples than by default, which tests do without."""
-    monkeypatch.setattr(training, "HeldOutFootprints", functools.partial(HeldOutFootprints, count=1024))
+    monkeypatch.setattr(training, "HeldOutFootprints", functools.partial(HeldOutFootprints, count=512))
+    monkeypatch.setattr(heldout, "CASES", (0, 4))
     monkeypatch.setattr(training, "TRIED", 2**12)
+
+
+@pytest.fixture
+def unseen(monkeypatch):
+    """No renders of the results."""
+    monkeypatch.setattr(as_seen, "measure", lambda *a: {})
 
 
 def trained(start, ad, recipe, measured=True, **request):
@@ -462,7 +473,7 @@ def test_command_trains_both_and_the_plugin_reads_it(mi_rgb, small, manifest, tm
     assert load_table(out).task == "texture"
 
 
-def test_an_interrupted_training_goes_on_in_its_stage(small, manifest, tmp_path, monkeypatch):
+def test_an_interrupted_training_goes_on_in_its_stage(small, unseen, manifest, tmp_path, monkeypatch):
     """Ctrl-C in a stage keeps the texture so far; resumed, all stages give the arrays of a run without it."""
     titles = []
 
@@ -510,14 +521,14 @@ def test_an_interrupted_training_goes_on_in_its_stage(small, manifest, tmp_path,
             assert np.array_equal(array.entries, resumed.table.arrays[name].entries), (stage, name)
 
 
-def test_training_goes_on_from_a_file(start, small, manifest, tmp_path):
+def test_training_goes_on_from_a_file(start, small, unseen, manifest, tmp_path):
     """The last stage alone, from arrays that fit texture wrote: those of one run with both stages."""
     run = functools.partial(
-        mi_diffind.fit, "texture", str(manifest), steps=6, border="repeat", extras="off", variant="llvm_ad_rgb",
+        mi_diffind.fit, "texture", str(manifest), steps=6, batch=2048, border="repeat", variant="llvm_ad_rgb",
         progress=False,
     )  # fmt: skip
-    plain = run(shading="off", batch=2048).save(tmp_path / "plain.npz")
-    both, last = run(batch=2048), run(start=str(plain))
+    plain = run(shading="off").save(tmp_path / "plain.npz")
+    both, last = run(), run(start=str(plain))
     assert both.table.settings["before"] == last.table.settings["before"]
     for name, array in both.table.arrays.items():
         assert np.array_equal(array.entries, last.table.arrays[name].entries), name
@@ -529,7 +540,48 @@ def test_training_goes_on_from_a_file(start, small, manifest, tmp_path):
         texture_fit.load_start(plain, from_arrays(bumpy()), paper)
 
 
-def test_auto_is_for_materials_whose_shading_changes(ad, tmp_path):
+def test_the_whole_stage_is_seeded_and_never_below_its_start(ad, unseen, tmp_path):
+    """A glossy material: the same bytes twice; what is kept gains on held-out footprints, by its own figures."""
+    maps = bumpy(64, roughness=0.2)
+    run = functools.partial(
+        mi_diffind.fit, "texture", maps, steps=20, batch=4096, border="repeat", structure="0:1:2,1:2:4", skip=2,
+        compression=6, variant="llvm_ad_rgb", progress=False,
+    )  # fmt: skip
+    first, second = (run().save(tmp_path / f"{name}.npz") for name in ("first", "second"))
+    assert first.read_bytes() == second.read_bytes()
+    table, plain = load_table(first), run(shading="off").table
+    states, state = table.settings["states"], table.settings["state"]
+    assert states["start"] == 0 and states[state] == max(states.values())
+    assert ("kept_start" in table.settings) == (state == "start")
+    _, pyramid = pyramid_of(maps, ad)
+    effects, _ = material.material_effects(pyramid.layout)
+    held_out = HeldOutFootprints(pyramid, effects, 512)
+    base, errors = (
+        held_out.errors(reader(CompressedTexture.from_table(t, ad.TensorXf), effects)) for t in (plain, table)
+    )
+    gain, _ = heldout.loss_or_gain(base, errors)
+    assert gain == pytest.approx(states[state], abs=1e-3) and gain >= 0
+
+
+def test_the_papers_training(ad, small, unseen, tmp_path, monkeypatch):
+    """Its tables shade, which stay as they are, lights are uniform, levels are read as they are stored."""
+    lights, shares = [], training.random_directions
+    monkeypatch.setattr(training, "random_directions", lambda *a: lights.append(1) or shares(*a))
+    monkeypatch.setattr(training, "mirrored_pairs", None)
+    arrays = DISNEY.open(ad.TensorXf, storage="uint8").arrays
+    before = {name: array.numpy().copy() for name, array in arrays.items()}
+    monkeypatch.setattr(texture_fit, "find_size", lambda *a: PaperBudget(8, 8, 5, 4, 6))
+    fitted = mi_diffind.fit("texture", bumpy(), preset="paper", shading="on", steps=4, batch=2048, border="repeat",
+                            variant="llvm_ad_rgb", progress=False)  # fmt: skip
+    settings = fitted.table.settings
+    assert settings["shading"]["tables"] and settings["level_bias"] == 0 and lights
+    assert [*settings["states"]] == ["start", "finer level", *(f"appearance {way:.0%}" for way in training.WAYS)]
+    assert "primary0" in fitted.table.arrays and np.isfinite(fitted.table.measured["shaded_converged_db"])
+    arrays = DISNEY.open(ad.TensorXf, storage="uint8").arrays
+    assert all(np.array_equal(arrays[name].numpy(), values) for name, values in before.items())
+
+
+def test_auto_is_for_materials_whose_shading_changes(ad, unseen, tmp_path):
     """Other sources are trained as without the last stage, to the byte, and a line says why."""
     maps = bumpy(16)
     smooth = np.full((16, 16, 1), 90, np.uint8)
