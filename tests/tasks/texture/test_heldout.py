@@ -265,6 +265,7 @@ def test_initial_arrays_of_weighted_channels(ad, rng, fine):
     weights[4] = 1000
     weighted = errors(initial(weights))
     assert weighted[4] < 0.5 * errors(plain)[4] and weighted[4] == weighted.min()
+    assert (weighted < 1.1 * levels[0].var(axis=(0, 1))).all()  # others are near their means at worst
 
 
 # -- trainings --------------------------------------------------------------------------------------------------------
