@@ -360,7 +360,7 @@ PAPER = ("primary0", "primary1", "cascaded")
 class CompressedTexture(FilteredMaps):
     """A compressed texture or material, read at any level of detail.
 
-    ``layout`` lists the maps, ``net`` reads the arrays (:mod:`.nets`). ``net`` is ``None`` if all channels are
+    ``layout`` lists the maps, ``net`` reads the arrays. ``net`` is ``None`` if all channels are
     constant. ``level_bias`` is added to a footprint's level of detail; negative
     ones (:data:`.arguments.BIAS_RANGE`) read finer levels.
     """

@@ -23,6 +23,7 @@ import numpy as np
 from ...arrays import lookup
 from ...arrays.indirection import aligned_copy, unfolded
 from ...arrays.tables import Table
+from ...core.progress import interruptible
 from ...fitting.loop import FitResult, sample_losses
 from ...fitting.task import FitRequest, FitSettings, Stage
 from ...maps.model import significant
@@ -253,12 +254,10 @@ def fit_shading(
     """
     effects, layout = material_effects(pyramid.layout)[0], pyramid.layout
     first = CompressedTexture(layout, textures.stored_form(start), start_bias)
-    held_out = HeldOutFootprints(pyramid, effects)
     # Every second one if time is limited: comparisons take it from trainings
     every = 1 if request.deadline is None else 2
     biases = BIASES[::every] if recipe.level_bias is None else (recipe.level_bias,)
     ways = WAYS[every - 1 :: every]
-    base = request.rehearse(lambda: held_out.errors(reader(first, effects)), len(biases) * len(ways))
     trained_bias = TRAINED_BIAS if recipe.level_bias is None else recipe.level_bias
     states, begin = [TrainedState("start", first, 0.0, 0.0)], []
     #: What adds the states of the training in progress, which Ctrl-C may end
@@ -279,6 +278,8 @@ def fit_shading(
 
     def stages() -> Iterator[Stage]:
         add("finer level", start)
+        if stop.is_set():
+            return
         rest, chosen, weights = 1.0, begin[0], None
         if build is not None:
             measured, trials = sensitivities(pyramid, held_out.exposure), []
@@ -327,8 +328,11 @@ def fit_shading(
         problem.preview = None if preview is None or evaluation is None else (preview, evaluation)
         return problem
 
-    before = errors(first)
-    results = request.run(stages())
+    with interruptible() as stop:
+        held_out = HeldOutFootprints(pyramid, effects)
+        base = request.rehearse(lambda: held_out.errors(reader(first, effects)), len(biases) * len(ways))
+        before = errors(first)
+        results = request.run(stages()) or [FitResult({}, 0, 0, 0.0, interrupted=True, restarts=0)]
     for add_states in adding:
         add_states()
     best = choose(states)

@@ -313,6 +313,17 @@ def test_a_training_that_gains_nothing_keeps_its_start(start, ad, changed):
     assert states.pop("start") == 0 and all((gain < 0) == (changed["lr"] == 0.3) for gain in states.values() if gain)
 
 
+def test_ctrl_c_before_the_first_step_keeps_the_start(start, ad, monkeypatch):
+    def interrupted(*arguments):
+        signal.raise_signal(signal.SIGINT)
+        return HeldOutFootprints(*arguments, 64)
+
+    monkeypatch.setattr(training, "HeldOutFootprints", interrupted)
+    found, result = trained(start, ad, quick(level_bias=0.0))
+    assert result.interrupted and result.outcome == "interrupted at step 0, kept step 0"
+    assert found.settings["kept_start"] and not result.history
+
+
 def test_arrays_leave_room_for_extras(ad):
     """Extras have four levels of 8 x 8 x 3 bytes, and none where these are more than a small part of all bytes."""
     _, pyramid = pyramid_of(bumpy(64), ad)
