@@ -144,17 +144,6 @@ class DifferentiableArray(nn.Module):
         entries = entries if change is None else change(entries)
         return self._replace(data=type(self.data)(entries, self.data.shape), folded=False)
 
-    def fixed(self, count: int | None = None) -> DifferentiableArray:
-        """Return a copy without gradients of the first ``count`` entries along the first axis (``None``: of all)."""
-        self._require_entries()
-        entries = self.data.array
-        constant = dr.detach(entries)
-        if count is not None:
-            first = count * (len(entries) // self.resolution[0])
-            index = dr.arange(dr.uint32_array_t(type(entries)), len(entries))
-            constant = dr.select(index < first, constant, entries)
-        return self._replace(data=type(self.data)(constant, self.data.shape))
-
     def rounded(self, bits: int) -> DifferentiableArray:
         """Return a copy whose entries in [0, 1], after the fold, are rounded as :meth:`quantised` stores them.
 

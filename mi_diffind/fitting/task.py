@@ -257,6 +257,10 @@ class FitRequest:
             self.settings, self.checkpoint, self.resume, self.progress, title=title, deadline=self.deadline, least=least
         )
 
+    def rehearse(self, finish: Callable[[], Any], times: float = 1.0) -> Any:
+        """Carry out ``finish`` and return its result; with a limit of time, ``times`` as long is kept for it."""
+        return finish() if self.deadline is None else self.deadline.rehearse(finish, times)
+
     def part(self, share: float) -> FitRequest:
         """Return the request for a stage that takes a ``share`` of the time that is left, if time is limited."""
         return self if self.deadline is None else dataclasses.replace(self, deadline=self.deadline.part(share))

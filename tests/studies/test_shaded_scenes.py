@@ -37,7 +37,7 @@ def bumpy():
 def file(bumpy, mi_rgb, tmp_path):
     from mi_diffind.fitting import task
 
-    fitted = task.fit("texture", bumpy, compression=2, steps=1, progress=False)
+    fitted = task.fit("texture", bumpy, compression=2, steps=1, shading="off", progress=False)
     fitted.save(tmp_path / "m.npz")
     return tmp_path / "m.npz"
 

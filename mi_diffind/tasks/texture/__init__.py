@@ -2,9 +2,9 @@
 
 Sources, stored channels and the reference, a mip pyramid, are in :mod:`mi_diffind.maps`. :mod:`.arrays`: resolutions
 and initial entries; :mod:`.compressed`: reads of the arrays, files and models; :mod:`.training`: training for the
-values of the maps; :mod:`.shading`: training for shaded appearance, through frozen tables of task 2; :mod:`.surface`:
-maps as parameters of the BRDF, and shading; :mod:`.appearance`: references, images that measure, and a preview;
-:mod:`.fit`: the command ``fit texture``.
+values of the maps; :mod:`.shading`: training for shaded appearance; :mod:`.heldout`: footprints that decide what it
+keeps; :mod:`.surface`: maps as parameters of the BRDF, and shading; :mod:`.appearance`: references, images that
+measure, and a preview; :mod:`.fit`: the command ``fit texture``.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class TextureSettings(FitSettings):
       whole levels.
     - ``rounded``: train with entries rounded as they will be stored.
     - ``samples``: distribution of levels of detail, ``"levels"`` (one half on level 0, one quarter on level 1, …) or
-      one of :data:`.nets.FOOTPRINTS`.
+      one of :data:`.compressed.FOOTPRINTS`.
     """
 
     steps: int = 1500

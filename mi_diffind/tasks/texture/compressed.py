@@ -256,28 +256,12 @@ class LayeredNet(nn.Module):
         return {**fine, "coarse": self.coarse, "cascaded": self.cascaded, **extras}
 
     def changed(self, change) -> LayeredNet:
-        """Return a copy with ``change(array, bits)`` in place of each array."""
+        """Return a copy with ``change(array, bits)`` in place of each array, in the order of :attr:`arrays`."""
         structure = self.structure
         fine = [change(a, x.bits) for a, x in zip(self.fine, structure.layers, strict=True)]
-        extras = None if self.extras is None else change(self.extras, 8)
         coarse, cascaded = change(self.coarse, structure.bits), change(self.cascaded, 8)
+        extras = None if self.extras is None else change(self.extras, 8)
         return LayeredNet(fine, coarse, cascaded, structure, self.border, extras)
-
-    def fixed_fine(self) -> LayeredNet:
-        """Return a copy without gradients of the entries that level 0 reads, nor of colours of the levels they serve.
-
-        Its fine levels keep their values in a training.
-        """
-        layers = self.structure.layers
-        pointers = [i for i, x in enumerate(layers) if self.structure.is_pointer(x)]
-        count = pointers[0] + 1 if pointers else len(layers)
-        result = LayeredNet(self.fine, self.coarse, self.cascaded, self.structure, self.border, self.extras)
-        result.fine = tuple(a.fixed(None) if i < count else a for i, a in enumerate(self.fine))
-        if not pointers:
-            result.coarse = self.coarse.fixed(None)
-        by_level = self.cascaded.dims > self.coarse.channels
-        result.cascaded = self.cascaded.fixed(layers[count - 1].until + 1 if by_level and count else None)
-        return result
 
     def extra(self, u, v, level, active=True) -> list | None:
         """Return the ``extras`` at (u, v) and a level of detail, numbers in [0, 1], or ``None`` without them."""
@@ -376,7 +360,7 @@ PAPER = ("primary0", "primary1", "cascaded")
 class CompressedTexture(FilteredMaps):
     """A compressed texture or material, read at any level of detail.
 
-    ``layout`` lists the maps, ``net`` reads the arrays (:mod:`.nets`). ``net`` is ``None`` if all channels are
+    ``layout`` lists the maps, ``net`` reads the arrays. ``net`` is ``None`` if all channels are
     constant. ``level_bias`` is added to a footprint's level of detail; negative
     ones (:data:`.arguments.BIAS_RANGE`) read finer levels.
     """

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
 from collections.abc import Mapping
 
 import numpy as np
@@ -190,13 +189,10 @@ def load_start(path, source: Source, request: FitRequest) -> Table:
 
 
 def last_request(request: FitRequest) -> FitRequest:
-    """Return the request for the last stage, whose checkpoint is a file of its own, ``CHECKPOINT.shading``."""
+    """Return the request for the last stage, whose trainings keep their checkpoints in ``CHECKPOINT.shading.…``."""
     if request.checkpoint is None:
         return request
-    checkpoint = f"{request.checkpoint}.shading"
-    # Without that file, the first stage was interrupted
-    resume = request.resume and (os.path.exists(checkpoint) or request.options["start"] is not None)
-    return dataclasses.replace(request, checkpoint=checkpoint, resume=resume)
+    return dataclasses.replace(request, checkpoint=f"{request.checkpoint}.shading")
 
 
 def room_for_extras(recipe: ShadingSettings, pyramid: Pyramid, nbytes: float) -> tuple[ShadingSettings, int]:

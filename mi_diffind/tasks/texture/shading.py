@@ -11,6 +11,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -22,6 +23,7 @@ import numpy as np
 from ...arrays import lookup
 from ...arrays.indirection import aligned_copy, unfolded
 from ...arrays.tables import Table
+from ...core.progress import interruptible
 from ...fitting.loop import FitResult, sample_losses
 from ...fitting.task import FitRequest, FitSettings, Stage
 from ...maps.model import significant
@@ -218,7 +220,7 @@ def trainable_arrays(table: Table, pyramid: Pyramid):
     return texture.net
 
 
-class State(NamedTuple):
+class TrainedState(NamedTuple):
     """Arrays that may be kept: their name, the texture with its level bias, and its gain over the start.
 
     ``gain`` and ``mean`` are those of :func:`.heldout.loss_or_gain`.
@@ -252,11 +254,14 @@ def fit_shading(
     """
     effects, layout = material_effects(pyramid.layout)[0], pyramid.layout
     first = CompressedTexture(layout, textures.stored_form(start), start_bias)
-    held_out = HeldOutFootprints(pyramid, effects)
-    base = held_out.errors(reader(first, effects))
-    biases = BIASES if recipe.level_bias is None else (recipe.level_bias,)
+    # Every second one if time is limited: comparisons take it from trainings
+    every = 1 if request.deadline is None else 2
+    biases = BIASES[::every] if recipe.level_bias is None else (recipe.level_bias,)
+    ways = WAYS[every - 1 :: every]
     trained_bias = TRAINED_BIAS if recipe.level_bias is None else recipe.level_bias
-    states, begin = [State("start", first, 0.0, 0.0)], []
+    states, begin = [TrainedState("start", first, 0.0, 0.0)], []
+    #: What adds the states of the training in progress, which Ctrl-C may end
+    adding: list[Callable[[], None]] = []
 
     def errors(texture: CompressedTexture) -> dict[str, float]:
         measured = {} if evaluation is None else evaluation.measure(reader(texture, effects), False)
@@ -267,12 +272,14 @@ def fit_shading(
         tried, stored = [], textures.stored_form(net)
         for bias in biases:
             texture = CompressedTexture(layout, stored, bias)
-            tried.append(State(name, texture, *loss_or_gain(base, held_out.errors(reader(texture, effects)))))
+            tried.append(TrainedState(name, texture, *loss_or_gain(base, held_out.errors(reader(texture, effects)))))
         states.append(max(tried, key=lambda state: state.gain))
         begin.append(min(tried, key=lambda state: abs(state.texture.level_bias - trained_bias)))
 
     def stages() -> Iterator[Stage]:
         add("finer level", start)
+        if stop.is_set():
+            return
         rest, chosen, weights = 1.0, begin[0], None
         if build is not None:
             measured, trials = sensitivities(pyramid, held_out.exposure), []
@@ -290,12 +297,16 @@ def fit_shading(
             if state.name == "weights":
                 problem.weights = build(weights).weights
             initial = problem.net.changed(lambda array, bits: array.copy())
-            yield Stage(name, problem, 1.0, part_of(recipe, rest), finish=lambda: errors(first))
-            for way in WAYS:
-                add(f"{name} {way:.0%}", between(initial, problem.net, way))
-            # Anew only if weighted maps lost somewhere that shading did not win back
-            if chosen is begin[0] or choose(states) is not states[0]:
+            adding.append(functools.partial(add_ways, name, initial, problem))
+            yield Stage(name.replace(" ", "-"), problem, 1.0, part_of(recipe, rest), name, lambda: errors(first))
+            adding.pop()()
+            # Anew only if weighted maps lost somewhere that shading did not win back, and time is not over
+            if chosen is begin[0] or choose(states) is not states[0] or request.deadline is not None:
                 break
+
+    def add_ways(name: str, initial, problem: ShadingProblem) -> None:
+        for way in ways:
+            add(f"{name} {way:.0%}", between(initial, problem.net, way))
 
     def part_of(settings: FitSettings, share: float) -> FitSettings:
         steps = max(1, round(share * recipe.steps))
@@ -317,14 +328,24 @@ def fit_shading(
         problem.preview = None if preview is None or evaluation is None else (preview, evaluation)
         return problem
 
-    before = errors(first)
-    results = request.run(stages())
+    with interruptible() as stop:
+        held_out = HeldOutFootprints(pyramid, effects)
+        base = request.rehearse(lambda: held_out.errors(reader(first, effects)), len(biases) * len(ways))
+        before = errors(first)
+        results = request.run(stages()) or [FitResult({}, 0, 0, 0.0, interrupted=True, restarts=0)]
+    for add_states in adding:
+        add_states()
     best = choose(states)
-    result = dataclasses.replace(results[-1], measured={"gain_db": best.mean})
     kept = best is states[0]
+    result = results[-1]
+    result = dataclasses.replace(
+        result, measured={"gain_db": best.mean}, step=result.step * best.name.startswith("appearance"),
+        history=[figures for figures in result.history if "gain_db" in figures],
+    )  # fmt: skip
     identity = {"source": source.digest, **TEXTURES[recipe.texture].further, "shading": recipe.further}
     gains = {state.name: round(state.gain, 3) for state in states}
-    settings = {**request.recorded(result), **identity, "level_bias": best.texture.level_bias, "state": best.name}
+    recorded = dataclasses.replace(request, settings=recipe).recorded(result)
+    settings = {**recorded, **identity, "level_bias": best.texture.level_bias, "state": best.name}
     settings |= {"states": gains, **({"kept_start": True} if kept else {})}
     table = to_table(best.texture, settings)
     table.preset, table.seed = request.preset, recipe.seed
@@ -346,7 +367,6 @@ def between(first, second, share: float):
     return first.changed(mixed)
 
 
-def choose(states: list[State]) -> State:
-    """Return the state with the largest gain, the first one if none gains."""
-    best = max(states, key=lambda state: state.gain)
-    return best if best.gain > 0 else states[0]
+def choose(states: list[TrainedState]) -> TrainedState:
+    """Return the state with the largest gain: the first one, the start with a gain of 0, if none gains."""
+    return max(states, key=lambda state: state.gain)

@@ -98,7 +98,7 @@ SHEAR = 0.95
 
 
 def specular_lobe(extra: list) -> Lobe:
-    """Return the shape of a specular lobe from extras, numbers in [0, 1] (:data:`.nets.NEUTRAL`: a round one)."""
+    """Return the shape of a specular lobe from extras, numbers in [0, 1] (:data:`.compressed.NEUTRAL`: a round one)."""
     c, s = (2 * (x - n) for x, n in zip(extra[:2], NEUTRAL, strict=False))
     scale = SHEAR * dr.rsqrt(dr.maximum(dr.square(c) + dr.square(s), SHEAR**2))
     return Lobe(c * scale, s * scale, extra[2])

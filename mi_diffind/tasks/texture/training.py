@@ -33,7 +33,7 @@ def shares(levels: int) -> np.ndarray:
 
 
 class TextureProblem(MapsProblem):
-    """Training problem of a texture: ``net`` (:mod:`.nets`) against the reference ``pyramid``.
+    """Training problem of a texture: ``net`` (:mod:`.compressed`) against the reference ``pyramid``.
 
     ``weights`` are factors of the squared errors of maps, by name.
     """

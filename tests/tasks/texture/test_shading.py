@@ -6,7 +6,6 @@ import functools
 import json
 import re
 import signal
-import time
 from types import SimpleNamespace
 
 import drjit as dr
@@ -18,11 +17,10 @@ import mi_diffind
 from mi_diffind.arrays.tables import TableError, load_table, save_table
 from mi_diffind.commands.cli import main
 from mi_diffind.core.errors import UsageError
-from mi_diffind.core.progress import Deadline
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting import loop, task
-from mi_diffind.fitting.loop import FitResult
 from mi_diffind.fitting.task import FitRequest
+from mi_diffind.maps import as_seen
 from mi_diffind.maps.model import size_figures
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
@@ -34,11 +32,14 @@ from mi_diffind.tasks.texture import PRESETS as TEXTURES
 from mi_diffind.tasks.texture import SHADING_PRESETS as PRESETS
 from mi_diffind.tasks.texture import TASK as TEXTURE
 from mi_diffind.tasks.texture import fit as texture_fit
+from mi_diffind.tasks.texture import heldout
 from mi_diffind.tasks.texture import shading as training
 from mi_diffind.tasks.texture import surface as material
 from mi_diffind.tasks.texture import training as textures
 from mi_diffind.tasks.texture.appearance import ShadedEvaluation, reader, reference
+from mi_diffind.tasks.texture.arrays import PaperBudget
 from mi_diffind.tasks.texture.compressed import CompressedTexture
+from mi_diffind.tasks.texture.heldout import HeldOutFootprints
 
 OURS = PRESETS["ours"]
 
@@ -259,7 +260,23 @@ def quick(**changed):
     return dataclasses.replace(OURS, **settings | changed)
 
 
+@pytest.fixture(autouse=True)
+def few_footprints(monkeypatch):
+    """Fewer footprints and samples than by default, which tests do without."""
+    monkeypatch.setattr(training, "HeldOutFootprints", functools.partial(HeldOutFootprints, count=512))
+    monkeypatch.setattr(heldout, "CASES", (0, 4))
+    monkeypatch.setattr(training, "BIASES", (0.0, -0.5))
+    monkeypatch.setattr(training, "TRIED", 2**12)
+
+
+@pytest.fixture
+def unseen(monkeypatch):
+    """No renders of the results."""
+    monkeypatch.setattr(as_seen, "measure", lambda *a: {})
+
+
 def trained(start, ad, recipe, measured=True, **request):
+    """The table of the last stage without trainings for weighted maps, and its record."""
     source, pyramid, table, evaluation, *_ = start
     evaluation = evaluation if measured else None
     net = training.trainable_arrays(table, pyramid)
@@ -268,106 +285,43 @@ def trained(start, ad, recipe, measured=True, **request):
 
 
 def test_training_for_shading_gains(start, ad):
-    """More than 1.5 dB on coarse levels over what was trained as a texture; and the BRDF's tables stay as they were."""
+    """More than 1.5 dB on coarse levels over what was trained as a texture."""
     _, pyramid, table, evaluation, *_ = start
     effects, _ = material.material_effects(pyramid.layout)
-    decoder = material.frozen_decoder(ad)
-    arrays = DISNEY.open(ad.TensorXf, storage="uint8").arrays
-    before = {name: array.numpy().copy() for name, array in arrays.items()}
-    old = evaluation.measure(reader(CompressedTexture.from_table(table, ad.TensorXf), effects, decoder), flip=False)
+    old = evaluation.measure(reader(CompressedTexture.from_table(table, ad.TensorXf), effects), flip=False)
     found, result = trained(start, ad, quick())
-    assert result.restarts == 0
-    new = evaluation.measure(reader(CompressedTexture.from_table(found, ad.TensorXf), effects, decoder), flip=False)
+    assert result.restarts == 0 and result.step > 0
+    new = evaluation.measure(reader(CompressedTexture.from_table(found, ad.TensorXf), effects), flip=False)
     assert np.mean(np.subtract(new["C"]["psnr_db"], old["C"]["psnr_db"])[2:]) > 1.5
     assert found.measured["shaded_converged_db"] == pytest.approx(new["C"]["mean_db"], abs=1e-3)
     assert found.settings["before"]["shaded_converged_db"] == pytest.approx(old["C"]["mean_db"], abs=1e-3)
-    assert found.task == "texture" and found.settings["shading"]["share"] == 0.9
-    arrays = DISNEY.open(ad.TensorXf, storage="uint8").arrays
-    for name, values in before.items():
-        assert np.array_equal(arrays[name].numpy(), values)
+    assert found.task == "texture" and found.settings["shading"]["share"] == OURS.share
+    assert "kept_start" not in found.settings and found.settings["state"].startswith("appearance")
 
 
-def test_a_training_that_loses_keeps_its_start(start, ad):
-    """A training at a rate that destroys everything returns the arrays that it started with."""
+@pytest.mark.parametrize("changed", [{"lr": 0.3}, {"lr": 1e-12}])
+def test_a_training_that_gains_nothing_keeps_its_start(start, ad, changed):
+    """Trainings at a rate that destroys everything, or that changes nothing, return what they started with."""
     table = start[2]
-    found, result = trained(start, ad, quick(steps=2, measure_every=2, lr=0.3, level_bias=-1.0))
-    assert found.settings["kept_start"] and found.settings["level_bias"] == 0
+    found, result = trained(start, ad, quick(steps=1, measure_every=1, **changed))
+    assert found.settings["kept_start"] and found.settings["state"] == "start" and found.settings["level_bias"] == 0
     assert result.step == 0 and result.measured == {"gain_db": 0}  # those of what was kept
     assert found.measured["shaded_converged_db"] == pytest.approx(found.settings["before"]["shaded_converged_db"])
     for name, array in table.arrays.items():
         assert np.array_equal(found.arrays[name].entries, array.entries)
+    states = found.settings["states"]
+    assert states.pop("start") == 0 and all((gain < 0) == (changed["lr"] == 0.3) for gain in states.values() if gain)
 
 
-def test_a_level_that_loses_outweighs_all_that_gain():
-    assert training.mean_gain(np.array([1, 2, 3])) == 2
-    assert training.mean_gain(np.array([0, 0, 3])) == 1
-    assert training.mean_gain(np.array([-0.1, 10, 10])) == pytest.approx(-0.1)
+def test_ctrl_c_before_the_first_step_keeps_the_start(start, ad, monkeypatch):
+    def interrupted(*arguments):
+        signal.raise_signal(signal.SIGINT)
+        return HeldOutFootprints(*arguments, 64)
 
-
-@pytest.mark.parametrize(
-    "gains, expected",
-    [
-        # The best that loses nowhere
-        ({"0": (1.0, 30), "-0.5": (2.0, 31), "-1": (-0.1, 32)}, "-0.5"),
-        ({"0": (0.0, 30), "-0.5": (-2.0, 31), "-1": (-0.1, 29)}, "0"),
-        # With fixed fine levels, if all lose somewhere; the best mean if these do, too
-        ({"0": (-3.0, 30), "-0.5": (-2.0, 31), "-1": (-0.1, 29), "0, fine levels fixed": (0.1, 28),
-          "-0.25, fine levels fixed": (0.2, 28.5), "-0.5, fine levels fixed": (-0.1, 29)}, "-0.25, fine levels fixed"),
-        ({"0": (-3.0, 30), "-0.5": (-2.0, 31), "-1": (-0.1, 29), "0, fine levels fixed": (-0.1, 28),
-          "-0.25, fine levels fixed": (-0.2, 28.5), "-0.5, fine levels fixed": (-0.1, 29)}, "-0.5"),
-        # Fixed levels that lose as much after the training as before (third figure) come last
-        ({"0": (-3.0, 30), "-0.5": (-2.0, 31), "-1": (-0.1, 29), "0, fine levels fixed": (-0.3, 33, 0.0),
-          "-0.25, fine levels fixed": (-0.2, 34), "-0.5, fine levels fixed": (-0.9, 35)}, "0, fine levels fixed"),
-        # Extras, only if they gain
-        ({"0": (1.0, 30), "-0.5": (2.0, 31), "-1": (3.0, 29), "-0.5, extras": (2.1, 31.1)}, "-0.5, extras"),
-        ({"0": (1.0, 30), "-0.5": (2.0, 31), "-1": (3.0, 29), "-0.5, extras": (-0.1, 32)}, "-0.5"),
-    ],
-)  # fmt: skip
-def test_choice_by_short_trainings(ad, gains, expected):
-    """Figures that are made up for the images that choose; a training of each choice, unless the time is too short."""
-
-    class Figures(training.ShadingProblem):
-        def __init__(self, choice):
-            self.choice = choice
-
-        net = property(lambda self: None)
-
-        def measure(self, net):
-            time.sleep(1e-3)  # longer than the limits below
-            gain, mean, *untrained = gains[self.choice.name]
-            gain = untrained[0] if untrained and net is None else gain
-            self.level_gains = np.array([gain])
-            return {"gain_db": gain, "shaded_converged_db": mean}
-
-    class Request(FitRequest):
-        def train(self, problem, title):
-            assert self.settings.steps == 8 and self.checkpoint is None
-            trained.append(problem.choice.name)
-            return FitResult(problem.measure("trained"), 8, 8, 0.0, False, 0)
-
-    settings = dataclasses.replace(OURS, steps=100, extras=any("extras" in name for name in gains))
-    for limit in ({}, {"deadline": Deadline(1e-9)}):
-        trained = []
-        request = Request("ours", settings, ad, checkpoint="x", **limit)
-        choice, kept, stopped = training.choose(Figures, request, training.BIASES)
-        assert choice.name == expected and stopped is None and trained == ([] if limit else list(gains))
-        which = {name: 2 if limit and len(figures) > 2 else 0 for name, figures in gains.items()}
-        assert kept == {name: pytest.approx(gains[name][k]) for name, k in which.items()}
-
-
-def test_fixed_fine_levels_keep_their_values(start, ad, monkeypatch):
-    """Level 0 is that of the start, to the byte; coarse levels are trained."""
-    fixed = training.Trial(0.0, fixed=True)
-    monkeypatch.setattr(training, "choose", lambda *a: (fixed, {fixed.name: 1.0}, None))
-    monkeypatch.setattr(training, "mean_gain", lambda *a: 1.0)
-    _, pyramid, table, *_ = start
-    found, _ = trained(start, ad, quick(steps=5, measure_every=5, lr=0.05, level_bias=None))
-    assert found.settings["shading"]["fixed"]
-    nets = [CompressedTexture.from_table(t, ad.TensorXf) for t in (table, found)]
-    u, v = (ad.Float(np.random.default_rng(i).random(200, np.float32)) for i in range(2))
-    for level, equal in ((0.0, True), (pyramid.levels - 2.0, False)):
-        before, after = (np.array(net.filtered(u, v, dr.full(ad.Float, level, 200))) for net in nets)
-        assert np.array_equal(before, after) == equal
+    monkeypatch.setattr(training, "HeldOutFootprints", interrupted)
+    found, result = trained(start, ad, quick(level_bias=0.0))
+    assert result.interrupted and result.outcome == "interrupted at step 0, kept step 0"
+    assert found.settings["kept_start"] and not result.history
 
 
 def test_arrays_leave_room_for_extras(ad):
@@ -384,11 +338,11 @@ def test_arrays_leave_room_for_extras(ad):
 
 
 def test_extras_are_trained_stored_and_read_by_the_material_alone(mi_rgb, start, ad, tmp_path, monkeypatch):
-    monkeypatch.setattr(training, "choose", lambda *a: (training.Trial(0.0, extras=True), {"0, extras": 1.0}, None))
+    monkeypatch.setattr(training, "choose", lambda states: states[-1])  # whether it gains or not
     found, _ = trained(start, ad, quick(steps=30, measure_every=30, extras=True))
     extras = found.arrays["extras"]
     assert extras.shape == (3, 8, 8, 3) and found.settings["shading"]["extras"] and "kept_start" not in found.settings
-    assert found.settings["level_biases"] == {"0, extras": 1.0}
+    assert found.settings["state"] == "appearance 100%"
     assert all(np.ptp(extras.entries[..., k].astype(float)) > 3 for k in range(3))
     path, plain = str(tmp_path / "extras.npz"), str(tmp_path / "plain.npz")
     save_table(path, found)
@@ -427,11 +381,12 @@ def test_training_reads_the_level_that_a_file_is_read_at(start, ad):
     assert not np.allclose(losses[0], problem.shading_errors(problem.net, dr.rng(seed=dr.opaque(ad.UInt64, 7)), 512))
 
 
-def test_share_zero_is_the_texture_alone(start, ad):
+def test_share_zero_is_the_texture_alone(start, ad, monkeypatch):
     """λ = 0 trains as task 4 does, entry by entry."""
     source, pyramid, table, *_ = start
-    recipe = quick(share=0.0, steps=5)
-    found, _ = trained(start, ad, recipe, measured=False)  # else the start might be kept
+    monkeypatch.setattr(training, "choose", lambda states: states[-1])  # else the start might be kept
+    recipe = quick(share=0.0, steps=5, measure_every=5)
+    found, _ = trained(start, ad, recipe, measured=False)
     problem = textures.TextureProblem(
         training.trainable_arrays(table, pyramid), pyramid, TEXTURES["ours"], source.digest
     )
@@ -498,10 +453,12 @@ def manifest(tmp_path):
 
 @pytest.fixture
 def small(start, monkeypatch):
-    """Few images that measure, and the arrays of other tests, lest everything is compiled anew."""
+    """Few images that measure, small batches, and the arrays of other tests, lest everything is compiled anew."""
     evaluation = functools.partial(ShadedEvaluation, levels=4, pairs=24, side=16)
     monkeypatch.setattr(texture_fit, "ShadedEvaluation", evaluation)
     monkeypatch.setattr(texture_fit, "find_size", lambda *a: start[5])
+    for name, recipe in PRESETS.items():
+        monkeypatch.setitem(PRESETS, name, dataclasses.replace(recipe, batch=4096))
 
 
 SHORT = ["--steps", "6", "--batch", "4096", "--border", "repeat", "--variant", "llvm_ad_rgb"]
@@ -516,8 +473,9 @@ def test_command_trains_both_and_the_plugin_reads_it(mi_rgb, small, manifest, tm
     said = json.loads(record.read_text())
     assert said["task"] == "texture" and said["settings"]["shading"]["share"] == OURS.share
     assert said["settings"]["steps"] == 6 and said["settings"]["lr"] == OURS.lr  # of the last stage
-    assert set(said["settings"]["level_biases"]) == {"0", "-0.5", "-1"}
-    assert said["settings"]["level_bias"] in (training.BIASES if not said["settings"].get("kept_start") else (0,))
+    ways = {f"appearance {way:.0%}" for way in training.WAYS}
+    assert {"start", "finer level", "weights"} | ways <= set(said["settings"]["states"])
+    assert said["settings"]["state"] in said["settings"]["states"] and said["settings"]["level_bias"] in training.BIASES
     assert said["effects_left_out"]["diffuse"] == "metallic is 1" and said["measured"]["shaded_converged_db"] > 10
     assert said["before"]["shaded_converged_db"] > 10 and {"psnr_db", "seen_db"} <= set(said["measured"])
     assert np.array(mi.Bitmap(str(tmp_path / "metal_preview.png"))).shape == (2 * (16 + 192), 3 * 192, 3)
@@ -529,9 +487,8 @@ def test_command_trains_both_and_the_plugin_reads_it(mi_rgb, small, manifest, tm
     assert load_table(out).task == "texture"
 
 
-@pytest.mark.parametrize("stage", ["maps", "shading"])
-def test_an_interrupted_training_goes_on_in_its_stage(small, manifest, tmp_path, monkeypatch, stage):
-    """Ctrl-C in one stage keeps the texture so far; resumed, both stages give the bytes of a run without it."""
+def test_an_interrupted_training_goes_on_in_its_stage(small, unseen, manifest, tmp_path, monkeypatch):
+    """Ctrl-C in a stage keeps the texture so far; resumed, all stages give the arrays of a run without it."""
     titles = []
 
     class Interrupted(FitRequest):
@@ -553,31 +510,39 @@ def test_an_interrupted_training_goes_on_in_its_stage(small, manifest, tmp_path,
             return super().train(problem, title, *arguments, **options)
 
     monkeypatch.setattr(task, "FitRequest", Interrupted)
-    given = {"steps": 20, "batch": 2048, "border": "repeat", "level_bias": 0, "extras": "off", "progress": False,
+    given = {"steps": 20, "batch": 2048, "border": "repeat", "level_bias": 0, "progress": False,
              "variant": "llvm_ad_rgb", "measure_every": 5}  # fmt: skip
     run = functools.partial(mi_diffind.fit, "texture", str(manifest), **given)
-    expected, checkpoint = run(), tmp_path / "state"
-    assert titles == ["maps", "shading"]
-    Interrupted.stop = stage
-    stopped = run(checkpoint=checkpoint)
-    assert stopped.result.interrupted and stopped.table.measured["psnr_db"] > 5
-    assert ("not trained for its shading: interrupted" in stopped.lines) == (stage == "maps")
-    assert (tmp_path / "state.shading").exists() == (stage == "shading")
-    Interrupted.stop = ""
-    resumed = run(checkpoint=checkpoint, resume=True)
-    assert not resumed.result.interrupted
-    for name, array in expected.table.arrays.items():
-        assert np.array_equal(array.entries, resumed.table.arrays[name].entries), name
+    expected, stages = run(), ["maps", "trial", "trial", "weights", "appearance"]
+    assert titles[:5] == stages
+    files = {"maps": [""], "trial": [""], "weights": ["", ".shading.weights"]}
+    files["appearance"] = [*files["weights"], ".shading.appearance"]
+    for stage, suffixes in files.items():
+        checkpoint = tmp_path / stage
+        Interrupted.stop = stage
+        titles.clear()
+        stopped = run(checkpoint=checkpoint)
+        assert titles == stages[: stages.index(stage) + 1]
+        assert stopped.result.interrupted and stopped.table.measured["psnr_db"] > 5
+        assert "interrupted" in stopped.result.outcome and stopped.summary()
+        assert ("not trained for its shading: interrupted" in stopped.lines) == (stage == "maps")
+        assert ("appearance 100%" in stopped.table.settings.get("states", {})) == (stage == "appearance")
+        assert {file.name for file in tmp_path.glob(f"{stage}*")} == {f"{stage}{suffix}" for suffix in suffixes}
+        Interrupted.stop = ""
+        resumed = run(checkpoint=checkpoint, resume=True)
+        assert not resumed.result.interrupted and resumed.table.settings == expected.table.settings
+        for name, array in expected.table.arrays.items():
+            assert np.array_equal(array.entries, resumed.table.arrays[name].entries), (stage, name)
 
 
-def test_training_goes_on_from_a_file(start, small, manifest, tmp_path):
+def test_training_goes_on_from_a_file(start, small, unseen, manifest, tmp_path):
     """The last stage alone, from arrays that fit texture wrote: those of one run with both stages."""
     run = functools.partial(
-        mi_diffind.fit, "texture", str(manifest), steps=6, border="repeat", extras="off", variant="llvm_ad_rgb",
+        mi_diffind.fit, "texture", str(manifest), steps=6, batch=2048, border="repeat", variant="llvm_ad_rgb",
         progress=False,
     )  # fmt: skip
-    plain = run(shading="off", batch=2048).save(tmp_path / "plain.npz")
-    both, last = run(batch=2048), run(start=str(plain))
+    plain = run(shading="off").save(tmp_path / "plain.npz")
+    both, last = run(), run(start=str(plain))
     assert both.table.settings["before"] == last.table.settings["before"]
     for name, array in both.table.arrays.items():
         assert np.array_equal(array.entries, last.table.arrays[name].entries), name
@@ -589,7 +554,47 @@ def test_training_goes_on_from_a_file(start, small, manifest, tmp_path):
         texture_fit.load_start(plain, from_arrays(bumpy()), paper)
 
 
-def test_auto_is_for_materials_whose_shading_changes(ad, tmp_path):
+def test_the_whole_stage_is_seeded_and_never_below_its_start(ad, small, unseen, tmp_path):
+    """A glossy material: the same bytes twice; what is kept gains on held-out footprints, by its own figures."""
+    maps = bumpy(roughness=0.2)
+    run = functools.partial(
+        mi_diffind.fit, "texture", maps, steps=20, batch=2048, border="repeat", variant="llvm_ad_rgb", progress=False
+    )  # fmt: skip
+    first, second = (run().save(tmp_path / f"{name}.npz") for name in ("first", "second"))
+    assert first.read_bytes() == second.read_bytes()
+    table, plain = load_table(first), run(shading="off").table
+    states, state = table.settings["states"], table.settings["state"]
+    assert states["start"] == 0 and states[state] == max(states.values())
+    assert ("kept_start" in table.settings) == (state == "start")
+    _, pyramid = pyramid_of(maps, ad)
+    effects, _ = material.material_effects(pyramid.layout)
+    held_out = HeldOutFootprints(pyramid, effects, 512)
+    base, errors = (
+        held_out.errors(reader(CompressedTexture.from_table(t, ad.TensorXf), effects)) for t in (plain, table)
+    )
+    gain, _ = heldout.loss_or_gain(base, errors)
+    assert gain == pytest.approx(states[state], abs=1e-3) and gain >= 0
+
+
+def test_the_papers_training(ad, small, unseen, tmp_path, monkeypatch):
+    """Its tables shade, which stay as they are, lights are uniform, levels are read as they are stored."""
+    lights, shares = [], training.random_directions
+    monkeypatch.setattr(training, "random_directions", lambda *a: lights.append(1) or shares(*a))
+    monkeypatch.setattr(training, "mirrored_pairs", None)
+    arrays = DISNEY.open(ad.TensorXf, storage="uint8").arrays
+    before = {name: array.numpy().copy() for name, array in arrays.items()}
+    monkeypatch.setattr(texture_fit, "find_size", lambda *a: PaperBudget(8, 8, 5, 4, 6))
+    fitted = mi_diffind.fit("texture", bumpy(), preset="paper", shading="on", steps=4, batch=2048, border="repeat",
+                            variant="llvm_ad_rgb", progress=False)  # fmt: skip
+    settings = fitted.table.settings
+    assert settings["shading"]["tables"] and settings["level_bias"] == 0 and lights
+    assert [*settings["states"]] == ["start", "finer level", *(f"appearance {way:.0%}" for way in training.WAYS)]
+    assert "primary0" in fitted.table.arrays and np.isfinite(fitted.table.measured["shaded_converged_db"])
+    arrays = DISNEY.open(ad.TensorXf, storage="uint8").arrays
+    assert all(np.array_equal(arrays[name].numpy(), values) for name, values in before.items())
+
+
+def test_auto_is_for_materials_whose_shading_changes(ad, unseen, tmp_path):
     """Other sources are trained as without the last stage, to the byte, and a line says why."""
     maps = bumpy(16)
     smooth = np.full((16, 16, 1), 90, np.uint8)

@@ -355,7 +355,8 @@ def test_fit_inspect_decode(tmp_path, monkeypatch, capsys):
         write(f"{name}.png", values if values.shape[2] > 1 else values[..., 0])
     (tmp_path / "m.json").write_text(json.dumps({name: f"{name}.png" for name in ("albedo", "normal", "roughness")}))
     short = ["--steps", "3", "--batch", "2048", "--border", "clamp", "--variant", "llvm_ad_rgb"]
-    assert main(["fit", "texture", "m.json", "-o", "m.npz", "--compression", "4x", "--level-bias", "-0.5", *short]) == 0
+    assert main(["fit", "texture", "m.json", "-o", "m.npz", "--compression", "4x", "--level-bias", "-0.5", *short,
+                 "--shading", "off"]) == 0  # fmt: skip
     table = load_table("m.npz")
     assert table.task == "texture" and table.preset == "ours" and table.settings["source_path"] == "m.json"
     assert table.nbytes <= 32 * 24 * 5 / 4 and table.settings["level_bias"] == -0.5
