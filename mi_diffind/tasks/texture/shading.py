@@ -11,7 +11,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -252,107 +251,137 @@ def fit_shading(
     of the start as shaded images, ``states`` the gains of all states. ``preview`` is a picture that is written at each
     measurement.
     """
-    effects, layout = material_effects(pyramid.layout)[0], pyramid.layout
-    first = CompressedTexture(layout, textures.stored_form(start), start_bias)
-    # Every second one if time is limited: comparisons take it from trainings
-    every = 1 if request.deadline is None else 2
-    biases = BIASES[::every] if recipe.level_bias is None else (recipe.level_bias,)
-    ways = WAYS[every - 1 :: every]
-    trained_bias = TRAINED_BIAS if recipe.level_bias is None else recipe.level_bias
-    states, begin = [TrainedState("start", first, 0.0, 0.0)], []
-    #: What adds the states of the training in progress, which Ctrl-C may end
-    adding: list[Callable[[], None]] = []
-
-    def errors(texture: CompressedTexture) -> dict[str, float]:
-        measured = {} if evaluation is None else evaluation.measure(reader(texture, effects), False)
-        return {f"shaded_{TRUTHS[k]}_db": f["mean_db"] for k, f in measured.items()}
-
-    def add(name: str, net) -> None:
-        """Add the state of arrays at the level bias of its largest gain."""
-        tried, stored = [], textures.stored_form(net)
-        for bias in biases:
-            texture = CompressedTexture(layout, stored, bias)
-            tried.append(TrainedState(name, texture, *loss_or_gain(base, held_out.errors(reader(texture, effects)))))
-        states.append(max(tried, key=lambda state: state.gain))
-        begin.append(min(tried, key=lambda state: abs(state.texture.level_bias - trained_bias)))
-
-    def stages() -> Iterator[Stage]:
-        add("finer level", start)
-        if stop.is_set():
-            return
-        rest, chosen, weights = 1.0, begin[0], None
-        if build is not None:
-            measured, trials = sensitivities(pyramid, held_out.exposure), []
-            for power in POWERS:
-                problem = build(map_weights(measured, layout, power))
-                yield Stage("trial", problem, TRIAL, part_of(problem.recipe, TRIAL), resumable=False)
-                trials.append((mean_gain(problem.net), power))
-            weights, rest = map_weights(measured, layout, max(trials)[1]), 1 - WEIGHTED
-            problem = build(weights)
-            yield Stage("weights", problem, WEIGHTED, part_of(problem.recipe, WEIGHTED))
-            add("weights", problem.net)
-            chosen = max(begin, key=lambda state: state.mean)
-        for name, state in {"appearance": chosen, "appearance of the start": begin[0]}.items():
-            problem = appearance_problem(state.texture)
-            if state.name == "weights":
-                problem.weights = build(weights).weights
-            initial = problem.net.changed(lambda array, bits: array.copy())
-            adding.append(functools.partial(add_ways, name, initial, problem))
-            yield Stage(name.replace(" ", "-"), problem, 1.0, part_of(recipe, rest), name, lambda: errors(first))
-            adding.pop()()
-            # Anew only if weighted maps lost somewhere that shading did not win back, and time is not over
-            if chosen is begin[0] or choose(states) is not states[0] or request.deadline is not None:
-                break
-
-    def add_ways(name: str, initial, problem: ShadingProblem) -> None:
-        for way in ways:
-            add(f"{name} {way:.0%}", between(initial, problem.net, way))
-
-    def part_of(settings: FitSettings, share: float) -> FitSettings:
-        steps = max(1, round(share * recipe.steps))
-        every = max(1, min(recipe.measure_every, steps // 2))
-        return dataclasses.replace(
-            settings, steps=steps, measure_every=every, seed=recipe.seed, deterministic=recipe.deterministic
-        )
-
-    def mean_gain(net) -> float:
-        texture = CompressedTexture(layout, textures.stored_form(net), trained_bias)
-        return loss_or_gain(base, held_out.errors(reader(texture, effects)))[1]
-
-    def appearance_problem(texture: CompressedTexture) -> ShadingProblem:
-        net = CompressedTexture.from_table(to_table(texture, {}), pyramid.types.TensorXf, "float32").net
-        if recipe.extras and net.extras is None:
-            net.extras = neutral_extras(layout.height, layout.width, net.border).alloc(pyramid.types.TensorXf)
-        changed = dataclasses.replace(recipe, level_bias=trained_bias)
-        problem = ShadingProblem(net, pyramid, changed, source.digest, held_out, base)
-        problem.preview = None if preview is None or evaluation is None else (preview, evaluation)
-        return problem
-
-    with interruptible() as stop:
-        held_out = HeldOutFootprints(pyramid, effects)
-        base = request.rehearse(lambda: held_out.errors(reader(first, effects)), len(biases) * len(ways))
-        before = errors(first)
-        results = request.run(stages()) or [FitResult({}, 0, 0, 0.0, interrupted=True, restarts=0)]
-    for add_states in adding:
-        add_states()
-    best = choose(states)
-    kept = best is states[0]
-    result = results[-1]
-    result = dataclasses.replace(
-        result, measured={"gain_db": best.mean}, step=result.step * best.name.startswith("appearance"),
-        history=[figures for figures in result.history if "gain_db" in figures],
-    )  # fmt: skip
+    training = ShadingTraining(start, recipe, request, pyramid, evaluation, preview, start_bias, build, source.digest)
+    result, best, kept = training.run()
     identity = {"source": source.digest, **TEXTURES[recipe.texture].further, "shading": recipe.further}
-    gains = {state.name: round(state.gain, 3) for state in states}
+    gains = {state.name: round(state.gain, 3) for state in training.states}
     recorded = dataclasses.replace(request, settings=recipe).recorded(result)
     settings = {**recorded, **identity, "level_bias": best.texture.level_bias, "state": best.name}
     settings |= {"states": gains, **({"kept_start": True} if kept else {})}
     table = to_table(best.texture, settings)
     table.preset, table.seed = request.preset, recipe.seed
     texture = CompressedTexture.from_table(table, request.types.TensorXf)
-    table.settings["before"] = significant(before)
-    table.measured = significant({**(before if kept else errors(texture)), **texture.measure(source)})
+    table.settings["before"] = significant(training.before)
+    after = training.before if kept else training.errors(texture)
+    table.measured = significant({**after, **texture.measure(source)})
     return table, result
+
+
+class ShadingTraining:
+    """Trainings for shading, one after the other, and the ``states`` among which held-out footprints choose.
+
+    Parameters are those of :func:`fit_shading`; ``digest`` is that of the source.
+    """
+
+    def __init__(
+        self, start, recipe: ShadingSettings, request: FitRequest, pyramid: Pyramid,
+        evaluation: ShadedEvaluation | None, preview: Path | None, start_bias: float, build, digest: str,
+    ):  # fmt: skip
+        self.start, self.recipe, self.request, self.pyramid = start, recipe, request, pyramid
+        self.evaluation, self.preview, self.build, self.digest = evaluation, preview, build, digest
+        self.effects, self.layout = material_effects(pyramid.layout)[0], pyramid.layout
+        self.first = CompressedTexture(self.layout, textures.stored_form(start), start_bias)
+        # Every second one if time is limited: comparisons take it from trainings
+        every, bias = 1 if request.deadline is None else 2, recipe.level_bias
+        self.biases = BIASES[::every] if bias is None else (bias,)
+        self.ways = WAYS[every - 1 :: every]
+        self.trained_bias = TRAINED_BIAS if bias is None else bias
+        self.states, self.begin = [TrainedState("start", self.first, 0.0, 0.0)], []
+        #: Name, first arrays and problem of the training in progress, which Ctrl-C may end
+        self.in_progress: tuple | None = None
+
+    def run(self) -> tuple[FitResult, TrainedState, bool]:
+        """Carry out all trainings; return the record, the best state, and whether that is the start."""
+        with interruptible() as self.stop:
+            self.held_out = HeldOutFootprints(self.pyramid, self.effects)
+            count = len(self.biases) * len(self.ways)
+            self.base = self.request.rehearse(lambda: self.footprint_errors(self.first), count)
+            self.before = self.errors(self.first)
+            results = self.request.run(self.stages())
+        result = results[-1] if results else FitResult({}, 0, 0, 0.0, interrupted=True, restarts=0)
+        if self.in_progress is not None:
+            self.add_ways()
+        best = choose(self.states)
+        result = dataclasses.replace(
+            result, measured={"gain_db": best.mean}, step=result.step * best.name.startswith("appearance"),
+            history=[figures for figures in result.history if "gain_db" in figures],
+        )  # fmt: skip
+        return result, best, best is self.states[0]
+
+    def stages(self) -> Iterator[Stage]:
+        """Yield the trainings: short ones for weights, the one for weighted maps, and the one for appearance."""
+        self.add("finer level", self.start)
+        if self.stop.is_set():
+            return
+        rest, chosen, weighted = 1.0, self.begin[0], None
+        if self.build is not None:
+            measured, trials = sensitivities(self.pyramid, self.held_out.exposure), []
+            for power in POWERS:
+                problem = self.build(map_weights(measured, self.layout, power))
+                yield Stage("trial", problem, TRIAL, self.part(problem.recipe, TRIAL), resumable=False)
+                texture = CompressedTexture(self.layout, textures.stored_form(problem.net), self.trained_bias)
+                trials.append((loss_or_gain(self.base, self.footprint_errors(texture))[1], power))
+            weighted, rest = self.build(map_weights(measured, self.layout, max(trials)[1])), 1 - WEIGHTED
+            yield Stage("weights", weighted, WEIGHTED, self.part(weighted.recipe, WEIGHTED))
+            self.add("weights", weighted.net)
+            chosen = max(self.begin, key=lambda state: state.mean)
+        for name, state in {"appearance": chosen, "appearance of the start": self.begin[0]}.items():
+            problem = self.appearance_problem(state.texture)
+            if state.name == "weights":
+                problem.weights = weighted.weights
+            self.in_progress = name, problem.net.changed(lambda array, bits: array.copy()), problem
+            settings = self.part(self.recipe, rest)
+            yield Stage(name.replace(" ", "-"), problem, 1.0, settings, name, lambda: self.errors(self.first))
+            self.add_ways()
+            # Anew only if weighted maps lost somewhere that shading did not win back, and time is not over
+            gained = choose(self.states) is not self.states[0]
+            if chosen is self.begin[0] or gained or self.request.deadline is not None:
+                break
+
+    def part(self, settings: FitSettings, share: float) -> FitSettings:
+        """Return ``settings`` with a ``share`` of the steps."""
+        steps, recipe = max(1, round(share * self.recipe.steps)), self.recipe
+        every = max(1, min(recipe.measure_every, steps // 2))
+        return dataclasses.replace(
+            settings, steps=steps, measure_every=every, seed=recipe.seed, deterministic=recipe.deterministic
+        )
+
+    def footprint_errors(self, texture: CompressedTexture) -> np.ndarray:
+        """Return the errors of held-out footprints (:meth:`.HeldOutFootprints.errors`)."""
+        return self.held_out.errors(reader(texture, self.effects))
+
+    def errors(self, texture: CompressedTexture) -> dict[str, float]:
+        """Return the errors of shaded images, ``shaded_TRUTH_db``; none without an evaluation."""
+        evaluation = self.evaluation
+        measured = {} if evaluation is None else evaluation.measure(reader(texture, self.effects), False)
+        return {f"shaded_{TRUTHS[k]}_db": f["mean_db"] for k, f in measured.items()}
+
+    def add(self, name: str, net) -> None:
+        """Add the state of arrays at the level bias of its largest gain."""
+        tried, stored = [], textures.stored_form(net)
+        for bias in self.biases:
+            texture = CompressedTexture(self.layout, stored, bias)
+            tried.append(TrainedState(name, texture, *loss_or_gain(self.base, self.footprint_errors(texture))))
+        self.states.append(max(tried, key=lambda state: state.gain))
+        self.begin.append(min(tried, key=lambda state: abs(state.texture.level_bias - self.trained_bias)))
+
+    def add_ways(self) -> None:
+        """Add states between the arrays before and after the training for appearance."""
+        name, first, problem = self.in_progress
+        for way in self.ways:
+            self.add(f"{name} {way:.0%}", between(first, problem.net, way))
+        self.in_progress = None
+
+    def appearance_problem(self, texture: CompressedTexture) -> ShadingProblem:
+        """Return the problem of training a texture for its appearance, with neutral extras if it is to have some."""
+        recipe, layout, types = self.recipe, self.layout, self.pyramid.types
+        net = CompressedTexture.from_table(to_table(texture, {}), types.TensorXf, "float32").net
+        if recipe.extras and net.extras is None:
+            net.extras = neutral_extras(layout.height, layout.width, net.border).alloc(types.TensorXf)
+        changed = dataclasses.replace(recipe, level_bias=self.trained_bias)
+        problem = ShadingProblem(net, self.pyramid, changed, self.digest, self.held_out, self.base)
+        problem.preview = None if None in (self.preview, self.evaluation) else (self.preview, self.evaluation)
+        return problem
 
 
 def between(first, second, share: float):

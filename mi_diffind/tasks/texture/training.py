@@ -50,6 +50,7 @@ class TextureProblem(MapsProblem):
         self.sizes = [level.shape[:2] for level in pyramid.values]
         self.starts = np.cumsum([0] + [rows * columns for rows, columns in self.sizes])
         self.identity = {"source": digest, **recipe.further, **self.form(net)}
+        self.identity |= {"weights": {k: round(w, 6) for k, w in weights.items()}} if weights else {}
 
     @staticmethod
     def form(net) -> dict:
