@@ -12,12 +12,11 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
 from scene_xml import ball, element, head, lying, plugin, ref, repeated, sun, write
 
 import mi_diffind as md
 from mi_diffind import metrics, scenes
-from mi_diffind.images.srgb import for_display
-from mi_diffind.tasks.texture.appearance import titled
 
 ABOUT = """Hammered metal with rust, minified: what a texture that is trained for its shading is for. Written by
 make_rust.py: change that file.
@@ -78,8 +77,12 @@ def picture(json_file: str | None) -> None:
                          **metrics.compare(truth, image)}  # fmt: skip
     columns = [[image[CROP], image[ZOOM].repeat(3, axis=0).repeat(3, axis=1)] for image in (*images.values(), truth)]
     shown = np.concatenate([np.concatenate(column) for column in columns], axis=1)
-    shown = titled(for_display(EXPOSURE * shown), TITLES)
-    mi.Bitmap(shown).write(str(FOLDER / "rust.jpg"), quality=85)
+    shown = mi.Bitmap(EXPOSURE * shown).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True)
+    strip = Image.new("RGB", (shown.width(), 18), "white")
+    for i, title in enumerate(TITLES):
+        place = i * shown.width() // len(TITLES) + 2, 1
+        ImageDraw.Draw(strip).text(place, title, "black", ImageFont.load_default(size=12))
+    mi.Bitmap(np.concatenate([strip, shown])).write(str(FOLDER / "rust.jpg"), quality=85)
     text = json.dumps(figures, indent=2) + "\n"
     print(text, end="")
     if json_file:

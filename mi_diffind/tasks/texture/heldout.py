@@ -20,16 +20,16 @@ from ..disney.training import uniform_hemisphere
 from .appearance import ShadedReader, places_in_footprints, reference
 
 #: Samples a pixel, at places within it; 0 stands for one read at its centre.
-CASES = (0, 1, 4, 16, 64)
+CASES = (0, 1, 4, 16)
 
 #: Footprints of each level.
-COUNT = 2**13
+COUNT = 2**12
 
 #: Most levels, from level 0 on.
 LEVELS = 8
 
-#: Places of reads along each side of a pixel.
-PLACES = 4
+#: Places of reads along each side of a pixel, by the samples a pixel: the mean over them is that of many samples.
+PLACES = {1: 4, 4: 4, 16: 8}
 
 #: Samples of the truth along each side of a footprint.
 SIDE = 16
@@ -131,11 +131,12 @@ class HeldOutFootprints:
                 value = read(u, v, dr.opaque(Float, level, self.count), wi, wo)
                 dr.eval(value)
                 return value
-            places = PLACES**2
+            side = PLACES[samples]
+            places = side**2
             lane = dr.arange(UInt32, self.count * places)
             pixel, place = lane // places, lane % places
             u, v, wi, wo = (dr.gather(type(x), x, pixel) for x in (u, v, wi, wo))
-            inside = ((Float(n) + 0.5) / PLACES for n in (place % PLACES, place // PLACES))
+            inside = ((Float(n) + 0.5) / side for n in (place % side, place // side))
             u, v = places_in_footprints(self.pyramid, u, v, dr.opaque(Float, level), *inside)
             finer = max(0.0, level - 0.5 * float(np.log2(samples)))
             value = read(u, v, dr.opaque(Float, finer, len(lane)), wi, wo)

@@ -19,7 +19,15 @@ from mi_diffind.tasks.texture import PRESETS, SHADING_PRESETS, parse_structure, 
 from mi_diffind.tasks.texture.appearance import reader
 from mi_diffind.tasks.texture.arrays import TextureBudget, from_components
 from mi_diffind.tasks.texture.compressed import neutral_extras
-from mi_diffind.tasks.texture.heldout import CASES, LOSS, SINGLE, HeldOutFootprints, loss_or_gain, mirrored_pairs
+from mi_diffind.tasks.texture.heldout import (
+    CASES,
+    LOSS,
+    PLACES,
+    SINGLE,
+    HeldOutFootprints,
+    loss_or_gain,
+    mirrored_pairs,
+)
 from mi_diffind.tasks.texture.surface import material_effects
 
 SIDE = 16
@@ -131,9 +139,10 @@ def test_reads_of_a_pixel_with_samples(ad):
                 expected, factor = level, 1.0
             else:
                 expected = max(0, level - math.log2(math.sqrt(samples)))
-                # Mean of a cosine over four places along a side
-                step = np.pi * 2**level / SIDE / 4
-                factor = np.sin(4 * step) / (4 * np.sin(step))
+                # Mean of a cosine over places along a side
+                places = PLACES[samples]
+                step = np.pi * 2**level / SIDE / places
+                factor = np.sin(places * step) / (places * np.sin(step))
             np.testing.assert_allclose(value[:, 0], expected, atol=1e-5)
             np.testing.assert_allclose(value[:, 1:], factor * centre, atol=1e-4)
 
