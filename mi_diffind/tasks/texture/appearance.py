@@ -151,41 +151,45 @@ FINER = 2
 CHUNK = 2**22
 
 
-def reference(pattern: str, pyramid: Pyramid, u, v, level, wi, wo, effects: Effects, rng=None, side: int = 0):
+def reference(
+    pattern: str, pyramid: Pyramid, u, v, level, wi, wo, effects: Effects, rng=None, side: int = 0, stretch=None
+):  # fmt: skip
     """Return the shaded value (:func:`.surface.shaded`) of footprints around (u, v), ``Array3f``, without derivatives.
 
     ``level`` is the level of detail, a real number; each footprint is seen along ``wi`` and lit along ``wo``. ``rng``
     jitters the samples (``"jittered"`` needs one; without, samples are the centres of strata). ``side``, a power of
-    two, replaces the number of samples along a side.
+    two, replaces the number of samples along a side. ``stretch``: see :func:`places_in_footprints`.
     """
+    stretch = dr.full(type(u), 1, dr.width(u)) if stretch is None else stretch
     side, size = side or SAMPLES_PER_SIDE[pattern], dr.width(u)
     with dr.suspend_grad():
         if size * side * side <= CHUNK:
-            return _averaged(pattern, pyramid, u, v, level, wi, wo, effects, rng, side)
+            return _averaged(pattern, pyramid, u, v, level, wi, wo, stretch, effects, rng, side)
         types, step = pyramid.types, max(1, CHUNK // (side * side))
         total = dr.zeros(types.Array3f, size)
         for start in range(0, size, step):
             index = dr.opaque(types.UInt32, start) + dr.arange(types.UInt32, min(step, size - start))
-            parts = [dr.gather(type(x), x, index) for x in (u, v, level, wi, wo)]
+            parts = [dr.gather(type(x), x, index) for x in (u, v, level, wi, wo, stretch)]
             means = _averaged(pattern, pyramid, *parts, effects, rng, side)
             dr.scatter(total, means, index)
             dr.eval(total)
         return total
 
 
-def places_in_footprints(pyramid: Pyramid, u, v, level, x, y) -> tuple:
+def places_in_footprints(pyramid: Pyramid, u, v, level, x, y, stretch=1) -> tuple:
     """Return the places (x, y), from 0 to 1 along the sides, of footprints of a level of detail around (u, v).
 
+    ``stretch`` multiplies their width, and divides their height: their area, which defines the level, is the same.
     They are wrapped in a repeating texture, else clamped to the edge.
     """
     extent = dr.exp2(level)
-    u = dr.fma((x - 0.5) * extent, 1 / pyramid.layout.width, u)
-    v = dr.fma((y - 0.5) * extent, 1 / pyramid.layout.height, v)
+    u = dr.fma((x - 0.5) * extent * stretch, 1 / pyramid.layout.width, u)
+    v = dr.fma((y - 0.5) * extent / stretch, 1 / pyramid.layout.height, v)
     borders = zip((u, v), reversed(pyramid.border), strict=True)
     return tuple(x - dr.floor(x) if border == "repeat" else dr.clip(x, 0, 1) for x, border in borders)
 
 
-def _averaged(pattern, pyramid: Pyramid, u, v, level, wi, wo, effects: Effects, rng, side: int):
+def _averaged(pattern, pyramid: Pyramid, u, v, level, wi, wo, stretch, effects: Effects, rng, side: int):
     types, samples = pyramid.types, side * side
     Float, UInt32, size = types.Float, types.UInt32, dr.width(u)
     lane = dr.arange(UInt32, size * samples)
@@ -195,8 +199,8 @@ def _averaged(pattern, pyramid: Pyramid, u, v, level, wi, wo, effects: Effects, 
     place, sample, width = lane >> (2 * shift), lane & count, Float(width)
     x, y = Float(sample & mask), Float(sample >> shift)
     x, y = (x + (0.5 if rng is None else rng.random(Float, size * samples)) for x in (x, y))
-    u, v, level, wi, wo = (dr.gather(type(a), a, place) for a in (u, v, level, wi, wo))
-    u, v = places_in_footprints(pyramid, u, v, level, x / width, y / width)
+    u, v, level, wi, wo, stretch = (dr.gather(type(a), a, place) for a in (u, v, level, wi, wo, stretch))
+    u, v = places_in_footprints(pyramid, u, v, level, x / width, y / width, stretch)
     finer = dr.maximum(level - FINER, 0)
     stored = pyramid.filtered(u, v, finer) if pattern == "prefiltered" else pyramid.stored(u, v)
     value = shaded(Decoder(), surface_of(pyramid, stored), wi, wo, effects)

@@ -41,6 +41,9 @@ ALPHAS = (0.05, 0.2, 0.5)
 #: Share of the values of the truth that are white or brighter in the exposure of errors.
 WHITE = 0.05
 
+#: Largest binary logarithm of the stretch of a footprint.
+STRETCH = 1.5
+
 #: Seed of the footprints; trainings use other generators.
 SEED = 20231213
 
@@ -49,36 +52,32 @@ LOSS = 0.1
 ERRORS = 2.0
 
 #: Largest loss of a single case on a single level, dB.
-SINGLE = 0.5
+SINGLE = 1.0
 
 
 def mirrored_pairs(types, numbers, share: float = MIRRORED) -> tuple:
-    """Return views, lights and weights of five arrays of uniform ``numbers``.
+    """Return views, lights and weights, 0 or 1, of five arrays of uniform ``numbers``.
 
     Views are uniform over the hemisphere. A ``share`` of the lights is drawn about the mirror direction, by GGX lobes
-    of :data:`ALPHAS` about the surface's normal; others are uniform. Weighted means are those of uniform lights.
+    of :data:`ALPHAS` about the surface's normal; others are uniform. Lights below the horizon have the weight 0.
     """
     a, b, c, d, e = numbers
     Array3f, wi, uniform = types.Array3f, uniform_hemisphere(types, a, b), uniform_hemisphere(types, c, d)
-    lobe = e * (len(ALPHAS) / share)
+    lobe = e * (len(ALPHAS) / max(share, 1e-9))
     alpha = dr.select(lobe < 1, ALPHAS[0], dr.select(lobe < 2, ALPHAS[1], ALPHAS[2]))
     cos = dr.sqrt((1 - c) / (1 + (dr.square(alpha) - 1) * c))
     sin, (s, t) = dr.safe_sqrt(1 - cos * cos), dr.sincos(2 * dr.pi * d)
     h = Array3f(sin * t, sin * s, cos)
     wo = dr.select(e < share, 2 * dr.dot(wi, h) * h - wi, uniform)
     above = wo.z > 0
-    h = dr.normalize(wi + dr.select(above, wo, wi))
-    jacobian = h.z / (4 * dr.maximum(dr.dot(h, wi), 1e-4))
-    ggx = sum(dr.square(x) / (dr.pi * dr.square(1 + (x * x - 1) * dr.square(h.z))) for x in ALPHAS) / len(ALPHAS)
-    density = (1 - share) / (2 * dr.pi) + share * ggx * jacobian
-    return wi, dr.select(above, wo, Array3f(0, 0, 1)), dr.select(above, 1 / (2 * dr.pi * density), 0)
+    return wi, dr.select(above, wo, Array3f(0, 0, 1)), dr.select(above, types.Float(1), 0)
 
 
 class HeldOutFootprints:
-    """Footprints of a ``pyramid`` with the converged truth, ``count`` for each of at most :data:`LEVELS` levels.
+    """Footprints of a ``pyramid`` with the converged truth, ``count``, even, for each of at most :data:`LEVELS` levels.
 
-    ``exposure`` is the factor by which a share :data:`WHITE` of the truth is 1 or brighter: errors of dark materials
-    count as they are seen.
+    ``exposure`` is the factor by which a share :data:`WHITE` of the truth is 1 or brighter under uniform lights: errors
+    of dark materials count as they are seen. Footprints are stretched along u or v, as those at grazing angles are.
     """
 
     def __init__(self, pyramid: Pyramid, effects: Effects, count: int = COUNT):
@@ -87,13 +86,20 @@ class HeldOutFootprints:
         rng, types = np.random.default_rng(SEED), self.types
         self.footprints = []
         for level in range(self.levels):
-            numbers = [types.Float(aligned_copy(rng.random(count, dtype=np.float32))) for _ in range(7)]
-            u, v, (wi, wo, weight) = *numbers[:2], mirrored_pairs(types, numbers[2:])
+            numbers = rng.random((8, count), dtype=np.float32)
+            # Lights of the first half are uniform, those of the second half are drawn about the mirror direction
+            numbers[7] *= MIRRORED
+            numbers[7, : count // 2] += MIRRORED
+            u, v, stretch, *numbers = (types.Float(aligned_copy(x)) for x in numbers)
+            wi, wo, weight = mirrored_pairs(types, numbers)
+            stretch = dr.exp2((stretch - 0.5) * (2 * STRETCH))
             at = dr.opaque(types.Float, level, count)
-            truth = reference("jittered", pyramid, u, v, at, wi, wo, effects, _Numbers(rng), SIDE)
-            dr.eval(u, v, wi, wo, weight, truth)
-            self.footprints.append((u, v, wi, wo, weight, truth))
-        values, weights = (np.concatenate(x) for x in zip(*map(self._luminance, self.footprints), strict=True))
+            drawn = _Numbers(rng)
+            truth = reference("jittered", pyramid, u, v, at, wi, wo, effects, drawn, SIDE, stretch)
+            dr.eval(u, v, stretch, wi, wo, weight, truth)
+            self.footprints.append((u, v, stretch, wi, wo, weight, truth))
+        halves = [[x[: count // 2] for x in self._luminance(footprint)] for footprint in self.footprints]
+        values, weights = (np.concatenate(x) for x in zip(*halves, strict=True))
         order = np.argsort(values)
         brighter = 1 - np.cumsum(weights[order]) / weights.sum()
         self.exposure = float(1 / max(values[order][np.searchsorted(-brighter, -WHITE)], 1e-3))
@@ -104,13 +110,17 @@ class HeldOutFootprints:
         return (sum(truth) / 3).numpy(), weight.numpy()
 
     def errors(self, read: ShadedReader) -> np.ndarray:
-        """Return the weighted squared error of exposed values up to 1, ``(levels, cases, count)``."""
-        return np.stack([[self._error(read, level, samples) for samples in CASES] for level in range(self.levels)])
+        """Return the squared errors of exposed values up to 1, ``(levels, cases, count / 2)``.
+
+        There are two cases for each of :data:`CASES`: uniform lights, and lights about the mirror direction.
+        """
+        errors = [[self._error(read, level, samples) for samples in CASES] for level in range(self.levels)]
+        return np.reshape(errors, (self.levels, 2 * len(CASES), self.count // 2))
 
     def brightness(self, read: ShadedReader) -> np.ndarray:
         """Return the weighted mean of shaded values over that of the truth, ``(levels,)``, one read at the centre."""
         ratios = []
-        for level, (_, _, _, _, weight, truth) in enumerate(self.footprints):
+        for level, (*_, weight, truth) in enumerate(self.footprints):
             value = self._read(read, level, 0)
             ratios.append([np.mean((weight * sum(x)).numpy(), dtype=np.float64) for x in (value, truth)])
         return np.array([a / max(b, 1e-12) for a, b in ratios])
@@ -124,7 +134,7 @@ class HeldOutFootprints:
     def _read(self, read: ShadedReader, level: int, samples: int) -> Any:
         """Return the value of a pixel as a renderer with ``samples`` a pixel shows it on average."""
         types = self.types
-        u, v, wi, wo, *_ = self.footprints[level]
+        u, v, stretch, wi, wo, *_ = self.footprints[level]
         Float, UInt32 = types.Float, types.UInt32
         with dr.suspend_grad():
             if not samples:
@@ -135,9 +145,9 @@ class HeldOutFootprints:
             places = side**2
             lane = dr.arange(UInt32, self.count * places)
             pixel, place = lane // places, lane % places
-            u, v, wi, wo = (dr.gather(type(x), x, pixel) for x in (u, v, wi, wo))
+            u, v, stretch, wi, wo = (dr.gather(type(x), x, pixel) for x in (u, v, stretch, wi, wo))
             inside = ((Float(n) + 0.5) / side for n in (place % side, place // side))
-            u, v = places_in_footprints(self.pyramid, u, v, dr.opaque(Float, level), *inside)
+            u, v = places_in_footprints(self.pyramid, u, v, dr.opaque(Float, level), *inside, stretch)
             finer = max(0.0, level - 0.5 * float(np.log2(samples)))
             value = read(u, v, dr.opaque(Float, finer, len(lane)), wi, wo)
             dr.eval(value)

@@ -43,10 +43,10 @@ FALL = 0.7
 TOP = 9
 
 #: Level biases that are compared.
-BIASES = (0.0, -0.25, -0.5, -0.75, -1.0)
+BIASES = (0.0, -0.25)
 
 #: Level bias of the training for appearance, and of the comparison of arrays to begin it with.
-TRAINED_BIAS = -0.5
+TRAINED_BIAS = -0.25
 
 #: Powers of the maps' sensitivities that are tried as weights, and the share of the steps of each short training.
 POWERS = (0.5, 1.0)
