@@ -2,8 +2,7 @@
 
 Footprints are drawn for each level of detail. Each is read as a renderer with N samples a pixel reads it
 (:data:`CASES`): the mean of reads at places within the pixel, a level finer for each factor of four in N; or once, at
-its centre.
-Differences of two readers have a standard error, so that chance decides nothing.
+its centre. Differences of two readers have a standard error, so that chance decides nothing.
 """
 
 from __future__ import annotations

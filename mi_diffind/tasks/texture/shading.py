@@ -35,7 +35,7 @@ from . import ShadingSettings
 from . import training as textures
 from .appearance import TRUTHS, ShadedEvaluation, places_in_footprints, reader, reference, write_preview
 from .compressed import CompressedTexture, neutral_extras, to_table
-from .heldout import HeldOutFootprints, compared, loss_or_gain, mirrored_pairs
+from .heldout import MIRRORED, HeldOutFootprints, compared, loss_or_gain, mirrored_pairs
 from .surface import frozen_decoder, maps_of, material_effects, shaded, surface_of
 
 #: Factor of the number of shaded samples from one level to the next coarser one, up to level :data:`TOP`.
@@ -72,7 +72,7 @@ DIFFERENCE = 0.02
 SEED = 20231214
 
 
-def sensitivities(pyramid: Pyramid, exposure: float = 1.0) -> dict[str, float]:
+def sensitivities(pyramid: Pyramid, exposure: float = 1.0, mirrored: float = MIRRORED) -> dict[str, float]:
     """Return the mean squared change of a shaded value by the change of a map's value, by map, at level 0.
 
     Exposed values are compared up to 1, under views and lights of :func:`.heldout.mirrored_pairs`. Maps that shading
@@ -81,7 +81,7 @@ def sensitivities(pyramid: Pyramid, exposure: float = 1.0) -> dict[str, float]:
     types, layout, effects = pyramid.types, pyramid.layout, material_effects(pyramid.layout)[0]
     rng = np.random.default_rng(SEED)
     u, v, *numbers = (types.Float(aligned_copy(rng.random(TRIED, dtype=np.float32))) for _ in range(7))
-    wi, wo, weight = mirrored_pairs(types, numbers)
+    wi, wo, weight = mirrored_pairs(types, numbers, mirrored)
     stored = [x + dr.zeros(types.Float, TRIED) for x in pyramid.stored(u, v)]
     dr.eval(stored, wi, wo, weight)
 

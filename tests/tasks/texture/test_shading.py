@@ -399,7 +399,7 @@ def test_share_zero_is_the_texture_alone(start, ad, monkeypatch):
 def test_gradient_of_the_loss_is_that_of_finite_differences(start, ad):
     """The gradient of the cascaded array's entries, without rounding and without bounds."""
     source, pyramid, table, *_ = start
-    recipe = quick(share=1.0, clip=None, reference="converged")
+    recipe = quick(share=1.0, clip=None, reference="converged", mirrored=0.0)
     problem = training.ShadingProblem(training.trainable_arrays(table, pyramid), pyramid, recipe, source.digest)
     problem.settings = recipe
     problem.recipe = dataclasses.replace(problem.recipe, rounded=False)
