@@ -28,6 +28,7 @@ from ..arrays.tables import Table
 from ..fitting import task
 from ..images import metrics
 from ..images.srgb import for_display
+from ..maps.pyramid import decibel
 from ..measure import plot
 from ..measure.report import figure_caption
 from ..measure.store import fingerprint
@@ -35,7 +36,7 @@ from ..measure.study import Measure, Plan, Study
 from ..measure.training import Contender
 from ..scenes import loading
 from ..scenes.training.options import FOOTPRINTS, ViewDistribution
-from ..scenes.training.problem import decibels, estimate_exposure, product_error
+from ..scenes.training.problem import estimate_exposure, product_error
 from ..scenes.training.references import ReferenceRenders
 from ..scenes.training.rig import small_ranges
 from ..scenes.training.trained_scene import TrainedScene, find_source, texture_file
@@ -174,7 +175,11 @@ class SceneTrainingContext:
                     flips.append(metrics.flip(*(np.clip(np.mean(image, axis=0), 0, 1) for image in (truth, halves))))
         gc.collect()
         one, four = errors.values()
-        figures = {"psnr_db": decibels(one), "psnr_4_spp_db": decibels(four), "flip": float(np.mean(flips))}
+        figures = {
+            "psnr_db": decibel(float(np.mean(one))),
+            "psnr_4_spp_db": decibel(float(np.mean(four))),
+            "flip": float(np.mean(flips)),
+        }
         return {**figures, "view": int(np.argsort(one)[len(one) // 2])}
 
     def render(self, scene: TrainedScene, number: int, spp: int) -> list[np.ndarray]:

@@ -25,6 +25,7 @@ from ...arrays.indirection import unfolded
 from ...core.files import replacing
 from ...fitting.loop import Problem, cores
 from ...images import srgb
+from ...maps.pyramid import decibel
 from ...tasks.texture.appearance import titled
 from ...tasks.texture.training import TextureProblem, rounded
 from .options import FOOTPRINTS, SceneRecipe, View
@@ -65,11 +66,6 @@ def product_error(halves: Sequence[np.ndarray], references: Sequence[np.ndarray]
 
     a, b = (image - truth for image, truth in zip(clip(halves), clip(references), strict=True))
     return float(np.mean(a * b, dtype=np.float64))
-
-
-def decibels(errors: Sequence[float]) -> float:
-    """Return the PSNR in dB of the mean of squared errors."""
-    return -10 * math.log10(max(float(np.mean(errors)), 1e-12))
 
 
 def estimate_exposure(references: Sequence[np.ndarray]) -> float:
@@ -177,7 +173,7 @@ class SceneProblem(Problem):
                     errors.append(product_error(halves, references))
                     if i == 0 and spp == self.footprints[0] and self.preview is not None:
                         self._write(references.mean(axis=0), sum(halves) / 2)
-                figures[f"psnr_{spp}_spp_db"] = decibels(errors)
+                figures[f"psnr_{spp}_spp_db"] = decibel(float(np.mean(errors)))
             texture = self.texture.measure(net)
         mean = statistics.fmean(figures.values())
         return {"psnr_db": mean, **figures, **{f"texture_{name}": value for name, value in texture.items()}}

@@ -281,10 +281,10 @@ class ShadingTraining:
         self.evaluation, self.preview, self.build, self.digest = evaluation, preview, build, digest
         self.effects, self.layout = material_effects(pyramid.layout)[0], pyramid.layout
         self.first = CompressedTexture(self.layout, textures.stored_form(start), start_bias)
+        bias = recipe.level_bias
+        self.biases = BIASES if bias is None else (bias,)
         # Every second one if time is limited: comparisons take it from trainings
-        every, bias = 1 if request.deadline is None else 2, recipe.level_bias
-        self.biases = BIASES[::every] if bias is None else (bias,)
-        self.ways = WAYS[every - 1 :: every]
+        self.ways = WAYS if request.deadline is None else WAYS[1::2]
         self.trained_bias = TRAINED_BIAS if bias is None else bias
         self.states, self.begin = [TrainedState("start", self.first, 0.0, 0.0)], []
         #: Name, first arrays and problem of the training in progress, which Ctrl-C may end
