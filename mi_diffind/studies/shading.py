@@ -4,11 +4,14 @@ For each material and seed, a texture is trained as ``fit texture`` trains it wi
 its shading (*ours*), also with other weights λ of the shading loss (the paper's figure 2).
 
 Classical filters (:mod:`.baselines.normals`) are measured uncompressed, and in the bytes of ours: compressed by our
-arrays, and by ASTC. Each is also read at other levels of detail, those with the smallest error: the *kernel*.
+arrays, and by ASTC. Each is also read at other levels of detail, those with the smallest error: the *kernel*. Held-out
+footprints (:class:`~mi_diffind.tasks.texture.heldout.HeldOutFootprints`) choose them, as they choose ours.
 
-*Errors* are those of :class:`~mi_diffind.tasks.texture.appearance.ShadedEvaluation`: PSNR of shaded values and FLIP,
-under views and lights of no training, against C, the converged truth, and P, the paper's reference; and those of whole
-renders (:mod:`.shaded_scenes`) of plain, ours, and the best filter in equal bytes.
+*Errors* are those of other such footprints, which no choice sees: PSNR of exposed values, the mean of one read at the
+centre and of 1, 4 and 16 samples a pixel, of all lights and stretches. Beside them, those of
+:class:`~mi_diffind.tasks.texture.appearance.ShadedEvaluation`, one read at the centre of square footprints: PSNR and
+FLIP against C, the converged truth, and P, the paper's reference. Last, whole renders (:mod:`.shaded_scenes`) of plain,
+ours, and the best filter in equal bytes.
 """
 
 from __future__ import annotations
@@ -40,6 +43,7 @@ from ..tasks.texture import training
 from ..tasks.texture.appearance import TRUTHS, ShadedEvaluation, reader
 from ..tasks.texture.compressed import CompressedTexture, to_table
 from ..tasks.texture.fit import find_size
+from ..tasks.texture.heldout import COUNT, SEED, HeldOutFootprints
 from ..tasks.texture.surface import material_effects
 from .baselines import codecs, normals
 from .example_maps import MATERIALS, example_maps
@@ -54,6 +58,9 @@ SHARE = texture_task.SHADING_PRESETS["ours"].share
 
 #: Levels of detail whose errors are measured.
 LEVELS = 6
+
+#: Held-out footprints of a group of a quick study.
+QUICK = 64
 
 
 class ShadingStudy(Study):
@@ -109,8 +116,9 @@ class ShadingStudy(Study):
                 **({"lambda": partial(draw_lambdas, contexts)} if len(settings.lambdas) > 1 else {}),
             },
             measures=(
+                Measure("footprints", "footprints_db"),
+                *(Measure(f"L{level}", f"l{level}_db", ".1f") for level in range(LEVELS)),
                 Measure("C", "c_mean_db"),
-                *(Measure(f"L{level}", f"c_l{level}_db", ".1f") for level in range(LEVELS)),
                 Measure("FLIP", "c_flip", ".4f", False),
                 Measure("over best", "over_best_db", "+.2f"),
                 Measure("over LEAN", "over_lean_db", "+.2f"),
@@ -176,9 +184,10 @@ class ShadingContenders:
         return ShadedEvaluation(self.pyramid, self.effects, *((3, 2, 16) if self.settings.quick else (LEVELS,)))
 
     @cached_property
-    def choosing(self) -> ShadedEvaluation:
-        """Small images under many other views and lights, which choose the levels of rivals."""
-        return ShadedEvaluation(self.pyramid, self.effects, self.evaluation.levels, 1024, 4, "C", stream=1)
+    def footprints(self) -> tuple[HeldOutFootprints, HeldOutFootprints]:
+        """Held-out footprints that choose levels, those that choose ours; and others, of which errors are measured."""
+        count = QUICK if self.settings.quick else COUNT
+        return tuple(HeldOutFootprints(self.pyramid, self.effects, count, seed) for seed in (SEED, SEED + 1))
 
     @cached_property
     def scenes(self) -> FloorScenes:
@@ -193,9 +202,11 @@ class ShadingContenders:
 
     def record(self, job: Contender, nbytes: int, **details) -> dict:
         """Measure the model of a job; return its record."""
-        measured = self.evaluation.measure(reader(job.model, self.effects))
-        errors = {f"{letter.lower()}_mean_db": figures["mean_db"] for letter, figures in measured.items()}
-        errors |= {f"c_l{level}_db": value for level, value in enumerate(measured["C"]["psnr_db"])}
+        read = reader(job.model, self.effects)
+        measured, by_level = self.evaluation.measure(read), self.footprints[1].psnr(read)[:LEVELS]
+        errors = {"footprints_db": float(by_level.mean())}
+        errors |= {f"l{level}_db": float(value) for level, value in enumerate(by_level)}
+        errors |= {f"{letter.lower()}_mean_db": figures["mean_db"] for letter, figures in measured.items()}
         if measured["C"]["flip"]:  # that of small images is not measured
             errors["c_flip"] = float(np.mean(measured["C"]["flip"]))
         details |= {"material": self.name, "kind": job.method, "label": job.label, **measured}
@@ -267,8 +278,10 @@ class ShadingContenders:
 
     def add_kernel(self, label: str, job: Contender) -> None:
         """Register the maps of a job, read at the levels of detail with the smallest error."""
-        choose = partial(normals.choose_biases, effects=self.effects)
-        read = lambda _: normals.ReadMaps(job.model, choose(job.model, evaluation=self.choosing))  # noqa: E731
+
+        def read(_) -> normals.ReadMaps:
+            return normals.ReadMaps(job.model, normals.choose_biases(job.model, self.effects, self.footprints[0]))
+
         method = "compressed" if job.method == "plain" else job.method
         self.add(label, method, lambda kernel, progress: self.record(kernel, job.record["bytes"]), read)
 
@@ -293,7 +306,7 @@ class ShadingContenders:
     def best(self, method: str, name: str = "") -> Contender:
         """Return the contender of a method, of the filter ``name`` if it is given, with the smallest error."""
         jobs = [job for job in self.jobs.values() if job.method == method and job.label.startswith(name)]
-        return max(jobs, key=lambda job: job.record["errors"]["c_mean_db"])
+        return max(jobs, key=lambda job: job.record["errors"]["footprints_db"])
 
     # -- Renders
 
@@ -321,7 +334,7 @@ class ShadingContenders:
                     for name in ratios:
                         views = renders[name][lights][spp]["brightness"]
                         ratios[name] += [abs(ratio - 1) for view in views for ratio in view.values()]
-            mean_db = lambda contender: contender.record["errors"]["c_mean_db"]  # noqa: E731
+            mean_db = lambda contender: contender.record["errors"]["footprints_db"]  # noqa: E731
             errors = {
                 "over_best_db": mean_db(ours) - mean_db(best),
                 "over_lean_db": mean_db(ours) - mean_db(lean),
@@ -348,13 +361,14 @@ def draw_levels(contexts: dict[str, ShadingContenders], result: dict):
     panels = {}
     for name, context in contexts.items():
         best, lean = context.best("compressed"), context.best("classical", "LEAN")
+        levels = min(LEVELS, context.footprints[1].levels)
         shown = {
             "ours": context.runs[SHARE][0],
             "plain": context.jobs["plain, seed 0"],
             f"best filter in equal bytes: {best.label}": best,
             f"{lean.label}, uncompressed": lean,
         }
-        values = {text: job.record["details"]["C"]["psnr_db"] for text, job in shown.items()}
+        values = {text: [job.record["errors"][f"l{i}_db"] for i in range(levels)] for text, job in shown.items()}
         panels[name] = [plot.Curve(text, range(len(by_level)), by_level) for text, by_level in values.items()]
     title = f"{result['title']}: quality of shaded images by level of detail"
     return plot.draw_curves(title, figure_caption(result), panels, "level of detail", "PSNR of shaded values, dB")

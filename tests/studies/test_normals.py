@@ -10,7 +10,8 @@ from scipy.ndimage import map_coordinates
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.studies.baselines import normals
-from mi_diffind.tasks.texture.appearance import ShadedEvaluation, reader
+from mi_diffind.tasks.texture.appearance import reader
+from mi_diffind.tasks.texture.heldout import HeldOutFootprints
 from mi_diffind.tasks.texture.surface import material_effects, specular_lobe, surface_of
 
 SIDE = 32
@@ -148,10 +149,10 @@ def test_baked_roughness(types, rng):
 def test_a_bias_that_is_known_is_chosen(types, rng):
     """A reader that is a quarter of a level off needs biases that are a quarter less, but on level 0."""
     pyramid, effects = prepared(material(rng.normal(0, 0.02, (32, 32, 2))), types)
-    evaluation = ShadedEvaluation(pyramid, effects, 4, 16, 16, "C")
-    own = normals.choose_biases(pyramid, effects, evaluation)
-    shifted = normals.choose_biases(normals.ReadMaps(pyramid, [0.25]), effects, evaluation)
-    assert len(own) == 4 and set(own) <= set(normals.BIASES)
+    footprints = HeldOutFootprints(pyramid, effects, 256)
+    own = normals.choose_biases(pyramid, effects, footprints)
+    shifted = normals.choose_biases(normals.ReadMaps(pyramid, [0.25]), effects, footprints)
+    assert set(own) <= set(normals.BIASES)
     assert shifted[1:] == [bias - 0.25 for bias in own[1:]]
 
 

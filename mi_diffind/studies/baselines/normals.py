@@ -31,8 +31,9 @@ from ...maps.layout import FROM_NORMAL, Layout, MapLayout
 from ...maps.pyramid import FilteredMaps, Pyramid, halve
 from ...tasks.disney.model import ALPHA_MIN, Effects
 from ...tasks.disney.training import uniform_hemisphere
-from ...tasks.texture.appearance import ShadedEvaluation, reader, reference
+from ...tasks.texture.appearance import reader, reference
 from ...tasks.texture.compressed import NEUTRAL
+from ...tasks.texture.heldout import HeldOutFootprints
 from ...tasks.texture.surface import DEFAULT_ALBEDO, DEFAULTS, READ, maps_of, shaded, surface_of
 
 #: Least third component in the slope of a normal: a slope of 10.
@@ -298,8 +299,7 @@ class ReadMaps(FilteredMaps):
         return [*self.maps(self.filtered(u, v, level, active), [LOBE])[LOBE], type(u)(1)]
 
 
-def choose_biases(maps: FilteredMaps, effects: Effects, evaluation: ShadedEvaluation) -> list[float]:
-    """Return, for each level, the one of :data:`BIASES` with which ``maps`` are nearest to the converged truth."""
-    readers = (reader(ReadMaps(maps, [bias]), effects) for bias in BIASES)
-    psnr = [evaluation.measure(read, False)["C"]["psnr_db"] for read in readers]
+def choose_biases(maps: FilteredMaps, effects: Effects, footprints: HeldOutFootprints) -> list[float]:
+    """Return, for each level, the one of :data:`BIASES` with which ``maps`` are nearest to the truth of footprints."""
+    psnr = [footprints.psnr(reader(ReadMaps(maps, [bias]), effects)) for bias in BIASES]
     return [BIASES[i] for i in np.argmax(psnr, axis=0)]

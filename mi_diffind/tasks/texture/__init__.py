@@ -75,6 +75,7 @@ class ShadingSettings(FitSettings):
     - ``extras``: whether the shape and weight of the specular lobe are trained as coarse extras, which
       ``neural_material`` alone reads.
     - ``mirrored``: share of the lights that are drawn about the mirror direction.
+    - ``skies``: share of the pairs that are of a uniform sky.
     - ``quarters``: whether each second step is of pixels with four samples.
     - ``tables``: whether arrays are shaded by the frozen tables of task 2, in place of the formulas that
       ``neural_material`` evaluates by default.
@@ -83,7 +84,7 @@ class ShadingSettings(FitSettings):
     - ``texture``: preset of task 4 that defines the samples and the loss of the texture.
     """
 
-    steps: int = 1000
+    steps: int = 2000
     batch: int = 2**16
     lr: float = 1e-3
     loss: str = "mse"
@@ -95,6 +96,7 @@ class ShadingSettings(FitSettings):
     level_bias: float | None = None
     extras: bool = False
     mirrored: float = 0.5
+    skies: float = 0.25
     quarters: bool = True
     tables: bool = False
     beta_2: float = 0.99
@@ -106,7 +108,7 @@ SHADING_PRESETS = {
     "ours": ShadingSettings(),
     "paper": ShadingSettings(
         lr=1e-3, schedule="constant", loss="mae", share=0.25, clip=0.1, reference="prefiltered", bounded=False,
-        level_bias=0.0, mirrored=0.0, quarters=False, tables=True, beta_2=0.999, texture="paper",
+        level_bias=0.0, mirrored=0.0, skies=0.0, quarters=False, tables=True, beta_2=0.999, texture="paper",
     ),
 }  # fmt: skip
 

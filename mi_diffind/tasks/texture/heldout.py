@@ -2,11 +2,14 @@
 
 Footprints are drawn for each level of detail. Each is read as a renderer with N samples a pixel reads it
 (:data:`CASES`): the mean of reads at places within the pixel, a level finer for each factor of four in N; or once, at
-its centre. Differences of two readers have a standard error, so that chance decides nothing.
+its centre. Those of one kind of light and of one range of stretches are a case of their own: grain that runs along u
+is lost where pixels are stretched along v alone. Differences of two readers have a standard error, so that chance
+decides nothing.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
@@ -21,8 +24,21 @@ from .appearance import ShadedReader, places_in_footprints, reference
 #: Samples a pixel, at places within it; 0 stands for one read at its centre.
 CASES = (0, 1, 4, 16)
 
-#: Footprints of each level.
-COUNT = 2**12
+#: Kinds of lights: uniform, about the mirror direction, and a uniform sky, which is the mean of so many lights.
+LIGHTS, SKY = 3, 8
+
+#: Step of the azimuth from one light of a sky to the next, in turns.
+GOLDEN = 0.618034
+
+#: Largest weight of the errors under skies.
+MOST = 100.0
+
+#: Equal ranges of the logarithm of the stretch; a range and a kind of light are a group of footprints.
+RANGES = 3
+
+#: Pairs of a footprint and a light of each group and level that are read once, and those that are read several times.
+COUNT = 2**13
+SEVERAL = 2**11
 
 #: Most levels, from level 0 on.
 LEVELS = 8
@@ -40,18 +56,15 @@ ALPHAS = (0.05, 0.2, 0.5)
 #: Share of the values of the truth that are white or brighter in the exposure of errors.
 WHITE = 0.05
 
-#: Largest binary logarithm of the stretch of a footprint.
-STRETCH = 1.5
+#: Largest binary logarithm of the stretch of a footprint: it is up to 16 times as long as wide.
+STRETCH = 2.0
 
 #: Seed of the footprints; trainings use other generators.
 SEED = 20231213
 
-#: Largest loss that may be due to chance, dB, and the number of standard errors that are.
+#: Losses in dB that are none: of a mean over levels or cases, and of a single level, case and range of stretches.
 LOSS = 0.1
-ERRORS = 2.0
-
-#: Largest loss of a single case on a single level, dB.
-SINGLE = 1.0
+SINGLE = 0.3
 
 
 def mirrored_pairs(types, numbers, share: float = MIRRORED) -> tuple:
@@ -72,83 +85,117 @@ def mirrored_pairs(types, numbers, share: float = MIRRORED) -> tuple:
     return wi, dr.select(above, wo, Array3f(0, 0, 1)), dr.select(above, types.Float(1), 0)
 
 
+def under_skies(types, sky, numbers: Sequence) -> list:
+    """Return arrays of uniform ``numbers``, changed where ``sky`` is true, by blocks of :data:`SKY` lanes.
+
+    Lanes of a block share all numbers but those of their lights, the last three of :func:`mirrored_pairs`: lights are
+    stratified over the hemisphere.
+    """
+    lane = dr.arange(types.UInt32, dr.width(numbers))
+    place = lane % SKY
+    shared = [dr.gather(types.Float, x, dr.select(sky, lane - place, lane)) for x in numbers]
+    for i, step in ((-3, 1 / SKY), (-2, GOLDEN)):
+        moved = dr.select(sky, shared[i] + step * types.Float(place), shared[i])
+        shared[i] = moved - dr.floor(moved)
+    shared[-1] = dr.select(sky, 1, shared[-1])
+    return shared
+
+
 class HeldOutFootprints:
-    """Footprints of a ``pyramid`` with the converged truth, ``count``, even, for each of at most :data:`LEVELS` levels.
+    """Footprints of a ``pyramid`` with the converged truth, ``count`` of each group for at most :data:`LEVELS` levels.
 
     ``exposure`` is the factor by which a share :data:`WHITE` of the truth is 1 or brighter under uniform lights: errors
     of dark materials count as they are seen. Footprints are stretched along u or v, as those at grazing angles are.
     """
 
-    def __init__(self, pyramid: Pyramid, effects: Effects, count: int = COUNT):
+    def __init__(self, pyramid: Pyramid, effects: Effects, count: int = COUNT, seed: int = SEED):
         self.pyramid, self.types, self.count = pyramid, pyramid.types, count
         self.levels = min(LEVELS, pyramid.levels)
-        rng, types = np.random.default_rng(SEED), self.types
+        rng, types = np.random.default_rng(seed), self.types
         self.footprints = []
         for level in range(self.levels):
-            numbers = rng.random((8, count), dtype=np.float32)
-            # Lights of the first half are uniform, those of the second half are drawn about the mirror direction
-            numbers[7] *= MIRRORED
-            numbers[7, : count // 2] += MIRRORED
-            u, v, stretch, *numbers = (types.Float(aligned_copy(x)) for x in numbers)
+            # Pairs of a group are neighbours; groups of uniform lights come first, those of a sky last
+            numbers = rng.random((9, LIGHTS, RANGES, count), dtype=np.float32)
+            numbers[3] = (numbers[3] + np.arange(RANGES)[:, None]) / RANGES
+            numbers[8] *= MIRRORED
+            numbers[8, ::2] += 1 - MIRRORED
+            numbers = [types.Float(aligned_copy(x.ravel())) for x in numbers]
+            sky = dr.arange(types.UInt32, dr.width(numbers)) >= (LIGHTS - 1) * RANGES * count
+            u, v, at, stretch, *numbers = under_skies(types, sky, numbers)
             wi, wo, weight = mirrored_pairs(types, numbers)
-            stretch = dr.exp2((stretch - 0.5) * (2 * STRETCH))
-            at = dr.opaque(types.Float, level, count)
-            drawn = _Numbers(rng)
-            truth = reference("jittered", pyramid, u, v, at, wi, wo, effects, drawn, SIDE, stretch)
-            dr.eval(u, v, stretch, wi, wo, weight, truth)
-            self.footprints.append((u, v, stretch, wi, wo, weight, truth))
-        halves = [[x[: count // 2] for x in self._luminance(footprint)] for footprint in self.footprints]
-        values, weights = (np.concatenate(x) for x in zip(*halves, strict=True))
+            at, stretch = at + level, dr.exp2((stretch - 0.5) * (2 * STRETCH))
+            truth = reference("jittered", pyramid, u, v, at, wi, wo, effects, _Numbers(rng), SIDE, stretch)
+            dr.eval(u, v, at, stretch, wi, wo, weight, truth)
+            self.footprints.append((u, v, at, stretch, wi, wo, weight, truth))
+        uniform = slice(RANGES * count)
+        seen = [((sum(truth) / 3).numpy()[uniform], w.numpy()[uniform]) for *_, w, truth in self.footprints]
+        values, weights = (np.concatenate(x) for x in zip(*seen, strict=True))
         order = np.argsort(values)
         brighter = 1 - np.cumsum(weights[order]) / weights.sum()
         self.exposure = float(1 / max(values[order][np.searchsorted(-brighter, -WHITE)], 1e-3))
 
-    @staticmethod
-    def _luminance(footprint: tuple) -> tuple[np.ndarray, np.ndarray]:
-        *_, weight, truth = footprint
-        return (sum(truth) / 3).numpy(), weight.numpy()
+    def errors(self, read: ShadedReader) -> list[list[np.ndarray]]:
+        """Return the squared errors of exposed values up to 1, ``(levels, groups, pixels)``.
 
-    def errors(self, read: ShadedReader) -> np.ndarray:
-        """Return the squared errors of exposed values up to 1, ``(levels, cases, count / 2)``.
-
-        There are two cases for each of :data:`CASES`: uniform lights, and lights about the mirror direction.
+        For each of :data:`CASES`, there is an array for groups of single lights (uniform, then about the mirror
+        direction), and one for those of a sky.
         """
-        errors = [[self._error(read, level, samples) for samples in CASES] for level in range(self.levels)]
-        return np.reshape(errors, (self.levels, 2 * len(CASES), self.count // 2))
+        errors = []
+        for samples in CASES:
+            levels = zip(*(self._error(read, level, samples) for level in range(self.levels)), strict=True)
+            errors.append([np.stack(x) for x in levels])
+        return errors
+
+    def psnr(self, read: ShadedReader) -> np.ndarray:
+        """Return the PSNR of levels in dB, ``(levels,)``, the mean over cases and groups."""
+        means = [np.hstack([x.mean(axis=-1, dtype=np.float64) for x in case]) for case in self.errors(read)]
+        return -10 * np.log10(np.maximum(np.hstack(means), 1e-12)).mean(axis=1)
 
     def brightness(self, read: ShadedReader) -> np.ndarray:
         """Return the weighted mean of shaded values over that of the truth, ``(levels,)``, one read at the centre."""
         ratios = []
         for level, (*_, weight, truth) in enumerate(self.footprints):
-            value = self._read(read, level, 0)
+            value = self._read(read, self.footprints[level], 0)
             ratios.append([np.mean((weight * sum(x)).numpy(), dtype=np.float64) for x in (value, truth)])
         return np.array([a / max(b, 1e-12) for a, b in ratios])
 
-    def _error(self, read: ShadedReader, level: int, samples: int) -> np.ndarray:
-        *_, weight, truth = self.footprints[level]
-        value, exposure = self._read(read, level, samples), dr.opaque(self.types.Float, self.exposure)
-        shown = [[dr.minimum(exposure * c, 1) for c in colour] for colour in (value, truth)]
-        return (weight * sum(dr.square(a - b) for a, b in zip(*shown, strict=True)) / 3).numpy()
+    def _error(self, read: ShadedReader, level: int, samples: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the squared errors of a level, ``(groups, pixels)``, of single lights and of skies."""
+        footprints, count = self.footprints[level], self.count
+        if samples:
+            count = min(count, SEVERAL)
+            lane = dr.arange(self.types.UInt32, LIGHTS * RANGES * count)
+            lane += lane // count * (self.count - count)
+            footprints = [dr.gather(type(x), x, lane) for x in footprints]
+        *_, weight, truth = footprints
+        value = self._read(read, footprints, samples)
+        values, truths = (np.array(weight * x).reshape(3, LIGHTS * RANGES, count) for x in (value, truth))
+        result = []
+        for group, lights in ((slice(-RANGES), 1), (slice(-RANGES, None), SKY)):
+            means = (x[:, group].reshape(3, -1, count // lights, lights).mean(axis=-1) for x in (values, truths))
+            a, b = (np.minimum(self.exposure * x, 1) for x in means)
+            result.append(np.square(a - b).mean(axis=0))
+        return tuple(result)
 
-    def _read(self, read: ShadedReader, level: int, samples: int) -> Any:
-        """Return the value of a pixel as a renderer with ``samples`` a pixel shows it on average."""
+    def _read(self, read: ShadedReader, footprints: Sequence, samples: int) -> Any:
+        """Return the values of pixels as a renderer with ``samples`` a pixel shows them on average."""
         types = self.types
-        u, v, stretch, wi, wo, *_ = self.footprints[level]
+        u, v, at, stretch, wi, wo, *_ = footprints
         Float, UInt32 = types.Float, types.UInt32
         with dr.suspend_grad():
             if not samples:
-                value = read(u, v, dr.opaque(Float, level, self.count), wi, wo)
+                value = read(u, v, at, wi, wo)
                 dr.eval(value)
                 return value
             side = PLACES[samples]
             places = side**2
-            lane = dr.arange(UInt32, self.count * places)
+            lane = dr.arange(UInt32, dr.width(u) * places)
             pixel, place = lane // places, lane % places
-            u, v, stretch, wi, wo = (dr.gather(type(x), x, pixel) for x in (u, v, stretch, wi, wo))
+            u, v, at, stretch, wi, wo = (dr.gather(type(x), x, pixel) for x in (u, v, at, stretch, wi, wo))
             inside = ((Float(n) + 0.5) / side for n in (place % side, place // side))
-            u, v = places_in_footprints(self.pyramid, u, v, dr.opaque(Float, level), *inside, stretch)
-            finer = max(0.0, level - 0.5 * float(np.log2(samples)))
-            value = read(u, v, dr.opaque(Float, finer, len(lane)), wi, wo)
+            u, v = places_in_footprints(self.pyramid, u, v, at, *inside, stretch)
+            finer = dr.maximum(at - dr.opaque(Float, 0.5 * float(np.log2(samples))), 0)
+            value = read(u, v, finer, wi, wo)
             dr.eval(value)
             return types.Array3f([dr.block_sum(c, places) / places for c in value])
 
@@ -164,25 +211,37 @@ class _Numbers:
         return dtype(aligned_copy(self.rng.random(size, dtype=np.float32)))
 
 
-def compared(base: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the gains of ``errors`` over ``base`` and their standard errors, in dB, ``(levels, cases)``."""
-    means = [np.maximum(e.mean(axis=-1, dtype=np.float64), 1e-12) for e in (base, errors)]
-    relative = base / means[0][..., None] - errors / means[1][..., None]
+def compared(base: list[list[np.ndarray]], errors: list[list[np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the gains of ``errors`` over ``base`` and their standard errors, in dB, ``(levels, cases, groups)``."""
     scale = 10 / np.log(10)
-    return scale * np.log(means[0] / means[1]), scale * relative.std(axis=-1) / np.sqrt(base.shape[-1])
+
+    def group(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        means = [np.maximum(e.mean(axis=-1, dtype=np.float64), 1e-12) for e in (before, after)]
+        relative = before / means[0][..., None] - after / means[1][..., None]
+        return scale * np.log(means[0] / means[1]), scale * relative.std(axis=-1) / np.sqrt(before.shape[-1])
+
+    cases = [zip(*map(group, *pair), strict=True) for pair in zip(base, errors, strict=True)]
+    return tuple(np.stack(x, axis=1) for x in zip(*(map(np.hstack, case) for case in cases), strict=True))
 
 
-def loss_or_gain(base: np.ndarray, errors: np.ndarray) -> tuple[float, float]:
-    """Return the gain over ``base`` in dB, and the mean of all levels and cases.
+def sky_weight(base: list[list[np.ndarray]]) -> float:
+    """Return the weight by which errors under skies count as much as those under single lights."""
+    single, of_sky = (np.mean([errors[i].mean() for errors in base]) for i in range(2))
+    return float(np.clip(single / max(of_sky, 1e-12), 1, MOST))
 
-    The gain is that mean, unless the mean of a level or of a case loses, or one case on one level loses more than
-    :data:`SINGLE`: then it is the largest such loss, negative. A loss of a mean within :data:`ERRORS` standard errors,
-    up to :data:`LOSS`, is none.
+
+def loss_or_gain(base: list[list[np.ndarray]], errors: list[list[np.ndarray]]) -> tuple[float, float]:
+    """Return the gain over ``base`` in dB, and the mean of all levels, cases and groups.
+
+    The gain is that mean, unless the mean of a level, of a case and group, or of a level, case and range of stretches
+    loses: then it is the largest such loss, negative. Up to :data:`LOSS`, or its standard error, is no loss; up to
+    :data:`SINGLE`, if that of a level, case and range.
     """
-    gains, doubts = compared(base, errors)
-    losses = [float(gains.min()) + SINGLE]
-    for axis in (0, 1):
-        doubt = ERRORS * np.sqrt(np.mean(doubts**2, axis=axis) / gains.shape[axis])
-        losses.append(float((gains.mean(axis=axis) + np.minimum(doubt + 1e-4, LOSS)).min()))
+    gains, doubts = (x.reshape(len(x), len(CASES), LIGHTS, RANGES) for x in compared(base, errors))
+    losses = []
+    for axes, most in (((1, 2, 3), LOSS), (0, LOSS), (2, SINGLE)):
+        means = gains.mean(axis=axes)
+        doubt = np.sqrt(np.mean(doubts**2, axis=axes) * means.size / gains.size)
+        losses.append(float((means + np.clip(doubt, most, SINGLE)).min()))
     mean = float(gains.mean())
     return (mean if min(losses) >= 0 else min(losses)), mean

@@ -29,13 +29,12 @@ from ...maps.model import significant
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source
 from ..disney.decoder import Decoder
-from ..disney.training import random_directions
 from . import PRESETS as TEXTURES
 from . import ShadingSettings
 from . import training as textures
 from .appearance import TRUTHS, ShadedEvaluation, places_in_footprints, reader, reference, write_preview
 from .compressed import CompressedTexture, neutral_extras, to_table
-from .heldout import MIRRORED, HeldOutFootprints, compared, loss_or_gain, mirrored_pairs
+from .heldout import SKY, STRETCH, HeldOutFootprints, compared, loss_or_gain, mirrored_pairs, sky_weight, under_skies
 from .surface import frozen_decoder, maps_of, material_effects, shaded, surface_of
 
 #: Factor of the number of shaded samples from one level to the next coarser one, up to level :data:`TOP`.
@@ -43,7 +42,7 @@ FALL = 0.7
 TOP = 9
 
 #: Level biases that are compared.
-BIASES = (0.0, -0.25)
+BIASES = (0.0, -0.125, -0.25)
 
 #: Level bias of the training for appearance, and of the comparison of arrays to begin it with.
 TRAINED_BIAS = -0.25
@@ -72,31 +71,38 @@ DIFFERENCE = 0.02
 SEED = 20231214
 
 
-def sensitivities(pyramid: Pyramid, exposure: float = 1.0, mirrored: float = MIRRORED) -> dict[str, float]:
+def sensitivities(pyramid: Pyramid, exposure: float = 1.0, skies: float = 1.0) -> dict[str, float]:
     """Return the mean squared change of a shaded value by the change of a map's value, by map, at level 0.
 
-    Exposed values are compared up to 1, under views and lights of :func:`.heldout.mirrored_pairs`. Maps that shading
-    does not read are left out.
+    Exposed values are compared up to 1, under single lights and, with the weight ``skies``, under uniform skies, as
+    those of held-out footprints. Maps that shading does not read are left out.
     """
     types, layout, effects = pyramid.types, pyramid.layout, material_effects(pyramid.layout)[0]
     rng = np.random.default_rng(SEED)
-    u, v, *numbers = (types.Float(aligned_copy(rng.random(TRIED, dtype=np.float32))) for _ in range(7))
-    wi, wo, weight = mirrored_pairs(types, numbers, mirrored)
+    numbers = [types.Float(aligned_copy(rng.random(TRIED, dtype=np.float32))) for _ in range(7)]
+    u, v, *numbers = under_skies(types, dr.arange(types.UInt32, TRIED) < TRIED // 2, numbers)
+    wi, wo, weight = mirrored_pairs(types, numbers)
     stored = [x + dr.zeros(types.Float, TRIED) for x in pyramid.stored(u, v)]
     dr.eval(stored, wi, wo, weight)
 
-    def value(channels: list):
-        return dr.minimum(exposure * shaded(Decoder(), surface_of(pyramid, channels), wi, wo, effects), 1)
+    def values(channels: list) -> list:
+        value = weight * shaded(Decoder(), surface_of(pyramid, channels), wi, wo, effects)
+        half = np.split(np.array(value), 2, axis=1)
+        of_sky = half[0].reshape(3, -1, SKY).mean(axis=2)
+        return [np.minimum(exposure * x, 1) for x in (of_sky, half[1])]
 
-    result, before = {}, value(stored)
+    result, before = {}, values(stored)
     for m in maps_of(layout).values():
         channels = {i for i in m.where if isinstance(i, int)}
         # Channels of a normal are independent, those of other maps change together
         groups = [{i} for i in sorted(channels)] if m.role == "normal" else [channels]
         changes = [[x + DIFFERENCE if i in group else x for i, x in enumerate(stored)] for group in groups if group]
-        squared = [weight * dr.squared_norm(value(changed) - before) for changed in changes]
+        squared = []
+        for changed in changes:
+            of_sky, single = (np.square(a - b).sum(axis=0).mean() for a, b in zip(values(changed), before, strict=True))
+            squared.append(single + skies * of_sky)
         if squared:
-            result[m.name] = float(np.mean([x.numpy().mean(dtype=np.float64) for x in squared])) / DIFFERENCE**2
+            result[m.name] = float(np.mean(squared)) / DIFFERENCE**2
     return result
 
 
@@ -122,7 +128,7 @@ class ShadingProblem(textures.TextureProblem):
 
     def __init__(
         self, net, pyramid: Pyramid, recipe: ShadingSettings, digest: str = "",
-        held_out: HeldOutFootprints | None = None, base: np.ndarray | None = None,
+        held_out: HeldOutFootprints | None = None, base: list | None = None,
     ):  # fmt: skip
         super().__init__(net, pyramid, TEXTURES[recipe.texture], digest)
         self.shading, self.held_out, self.base = recipe, held_out, base
@@ -132,6 +138,7 @@ class ShadingProblem(textures.TextureProblem):
         self.preview: tuple[Path, ShadedEvaluation] | None = None
         self.effects, _ = material_effects(pyramid.layout)
         self.exposure = 1.0 if held_out is None or recipe.tables else held_out.exposure
+        self.sky_weight = 1.0 if base is None else sky_weight(base)
         self.decoder = frozen_decoder(self.types) if recipe.tables else Decoder()
         self.identity = {**self.identity, "shading": recipe.further}
 
@@ -155,23 +162,22 @@ class ShadingProblem(textures.TextureProblem):
         recipe, types = self.shading, self.types
         reads = QUARTERS**2 if recipe.quarters and self.jittered else 1
         count, weight = size // reads, 1
-        u, v, level = self.places(rng, count)
-        if recipe.mirrored:
-            numbers = [rng.random(types.Float, count) for _ in range(5)]
-            wi, wo, weight = mirrored_pairs(types, numbers, recipe.mirrored)
-        else:
-            wi, wo = random_directions(rng, types, count)
-        truth = reference(recipe.reference, self.pyramid, u, v, level, wi, wo, self.effects, rng)
-        dr.eval(u, v, level, wi, wo, weight, truth)
+        sky = dr.arange(types.UInt32, count) < int(recipe.skies * count / SKY) * SKY
+        numbers = under_skies(types, sky, [rng.random(types.Float, count) for _ in range(9)])
+        u, v, level = self.places(*numbers[:3])
+        stretch = dr.exp2((numbers[3] - 0.5) * (2 * STRETCH * recipe.quarters))
+        wi, wo, weight = mirrored_pairs(types, numbers[4:], recipe.mirrored)
+        truth = reference(recipe.reference, self.pyramid, u, v, level, wi, wo, self.effects, rng, stretch=stretch)
+        dr.eval(u, v, level, stretch, wi, wo, weight, truth)
         if reads > 1:
             lane = dr.arange(types.UInt32, count * reads)
             pixel, read = lane // reads, lane % reads
-            u, v, level, wi, wo = (dr.gather(type(x), x, pixel) for x in (u, v, level, wi, wo))
+            u, v, level, stretch, wi, wo = (dr.gather(type(x), x, pixel) for x in (u, v, level, stretch, wi, wo))
             inside = [
                 (types.Float(n) + rng.random(types.Float, count * reads)) / QUARTERS
                 for n in (read % QUARTERS, read // QUARTERS)
             ]
-            u, v = places_in_footprints(self.pyramid, u, v, level, *inside)
+            u, v = places_in_footprints(self.pyramid, u, v, level, *inside, stretch)
             level = level - math.log2(QUARTERS)
         if self.level_bias or reads > 1:  # opaque, so that one kernel serves all
             bias = dr.opaque(types.Float, self.level_bias)
@@ -181,15 +187,23 @@ class ShadingProblem(textures.TextureProblem):
         value = shaded(self.decoder, surface, wi, wo, self.effects, limit)
         if reads > 1:
             value = [dr.block_reduce(dr.ReduceOp.Add, c, reads) / reads for c in value]
+        if recipe.skies:
+            block = dr.arange(types.UInt32, count) // SKY
+            value, truth = (
+                [
+                    dr.select(sky, dr.gather(types.Float, dr.block_reduce(dr.ReduceOp.Add, c, SKY), block) / SKY, c)
+                    for c in x
+                ]
+                for x in (value, truth)
+            )
+            weight = dr.select(sky, dr.opaque(types.Float, self.sky_weight), weight)
         bounded = _bounded if recipe.bounded else (lambda x: x)
         errors = [bounded(a * self.exposure) - bounded(b * self.exposure) for a, b in zip(value, truth, strict=True)]
         squared = self.settings.loss == "mse"
         return reads * weight * sum(dr.square(e) if squared else dr.abs(e) for e in errors) / 3
 
-    def places(self, rng, size: int) -> tuple:
-        """Draw ``(u, v, level)``, uniform in uv; the density falls by :data:`FALL` from one level to the next."""
-        Float = self.types.Float
-        u, v, level = (rng.random(Float, size) for _ in range(3))
+    def places(self, u, v, level) -> tuple:
+        """Return ``(u, v, level)`` of uniform numbers; the density falls by :data:`FALL` from one level to the next."""
         lowest = FALL ** min(len(self.sizes) - 1, TOP)
         return u, v, dr.log(1 - (1 - lowest) * level) * (1 / math.log(FALL))
 
@@ -315,7 +329,7 @@ class ShadingTraining:
             return
         rest, chosen, weighted = 1.0, self.begin[0], None
         if self.build is not None:
-            measured, trials = sensitivities(self.pyramid, self.held_out.exposure), []
+            measured, trials = sensitivities(self.pyramid, self.held_out.exposure, sky_weight(self.base)), []
             for power in POWERS:
                 problem = self.build(map_weights(measured, self.layout, power))
                 yield Stage("trial", problem, TRIAL, self.part(problem.recipe, TRIAL), resumable=False)
@@ -330,7 +344,7 @@ class ShadingTraining:
             if state.name == "weights":
                 problem.weights = weighted.weights
             self.in_progress = name, problem.net.changed(lambda array, bits: array.copy()), problem
-            settings = self.part(self.recipe, rest)
+            settings = self.part(self.recipe, rest if state is chosen else rest / 2)
             yield Stage(name.replace(" ", "-"), problem, 1.0, settings, name, lambda: self.errors(self.first))
             self.add_ways()
             # Anew only if weighted maps lost somewhere that shading did not win back, and time is not over
@@ -346,7 +360,7 @@ class ShadingTraining:
             settings, steps=steps, measure_every=every, seed=recipe.seed, deterministic=recipe.deterministic
         )
 
-    def footprint_errors(self, texture: CompressedTexture) -> np.ndarray:
+    def footprint_errors(self, texture: CompressedTexture) -> list[list[np.ndarray]]:
         """Return the errors of held-out footprints (:meth:`.HeldOutFootprints.errors`)."""
         return self.held_out.errors(reader(texture, self.effects))
 
