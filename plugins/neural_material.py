@@ -131,8 +131,8 @@ class MaterialMaps(FilteredTexture):
         uv, level = self._uv(si), mi.Float(0)
         if self.filter.name != "off":
             ddx, ddy = self._footprint(si)
-            taps = self.filter.taps
-            level = isotropic(ddx, ddy) if self.filter.name == "trilinear" else anisotropic(ddx, ddy, taps)[0]
+            taps, bias = self.filter.taps, self.image.level_bias
+            level = isotropic(ddx, ddy, bias) if self.filter.name == "trilinear" else anisotropic(ddx, ddy, taps)[0]
         return specular_lobe(self.image.extra(*self._wrapped_at(uv, self.image.biased(level)), level))
 
     def is_constant(self, parameter: str) -> bool:

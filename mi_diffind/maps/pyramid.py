@@ -152,7 +152,7 @@ class FilteredMaps(CompressedMaps):
 
     levels: int
 
-    #: Levels by which a footprint's level of detail is read finer (negative): :meth:`biased`.
+    #: Levels by which a round footprint's level of detail is read finer (negative): :meth:`biased`, :func:`bias_share`.
     level_bias: float = 0.0
 
     def filtered(self, u, v, level, active=True) -> list:
@@ -221,6 +221,14 @@ def mean_square(values: list, truth: list) -> float:
 def decibel(mse: float) -> float:
     """Return the PSNR of a mean squared error, for a peak of 1, at most 120 dB."""
     return -10 * math.log10(max(mse, 1e-12))
+
+
+def bias_share(ratio):
+    """Return the share of a level bias that counts, by the ratio of a footprint's area to ½ (‖ddx‖² + ‖ddy‖²).
+
+    The ratio is 2/(a + 1/a) of an aspect a: 1 of a circle, 0.47 where it is four times as long as wide.
+    """
+    return dr.square(ratio)
 
 
 def level_sizes(height: int, width: int) -> list[tuple[int, int]]:

@@ -432,7 +432,7 @@ class FilteredTexture(MapTexture):
         uv, (ddx, ddy) = self._uv(si), self._footprint(si)
         uv = uv + dr.detach(footprint.to_centre(self.cone, si, ddx, ddy)) / mi.Vector2f(*self._size)
         if self.filter.name == "trilinear":
-            return self._decode_mean(self._filtered(uv, isotropic(ddx, ddy)))
+            return self._decode_mean(self._filtered(uv, isotropic(ddx, ddy, self.image.level_bias)))
         taps = self.filter.taps
         level, axis = anisotropic(ddx, ddy, taps)
         axis = axis / mi.Vector2f(*self._size)
@@ -499,7 +499,7 @@ class FilteredTexture(MapTexture):
             return super().eval_1_grad(si, active)
         self._check_asked("eval_1_grad", "a gradient")
         uv = self._uv(si)
-        level = isotropic(*self._footprint(si))
+        level = isotropic(*self._footprint(si), self.image.level_bias)
         side = dr.exp2(self.image.clamped(self.image.biased(level), mi.Float))
         gradient = []
         for axis, n in enumerate(self._size):

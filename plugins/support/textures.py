@@ -14,7 +14,7 @@ import numpy as np
 from mi_diffind.arrays.indirection import DifferentiableArray, fold
 from mi_diffind.arrays.lookup import clamp
 from mi_diffind.core import compat
-from mi_diffind.maps.pyramid import around
+from mi_diffind.maps.pyramid import around, bias_share
 
 from . import footprint, properties
 from .tables import shared
@@ -243,9 +243,18 @@ def shared_cone(props: mi.Properties) -> footprint.Cone | None:
     return shared(("cone", *key), lambda: cone)
 
 
-def isotropic(ddx: mi.Vector2f, ddy: mi.Vector2f) -> mi.Float:
-    """Return the level whose texels have the area of a footprint, which is given in texels of the image."""
-    return 0.5 * _log2(footprint.area(ddx, ddy))
+def isotropic(ddx: mi.Vector2f, ddy: mi.Vector2f, bias: float = 0.0) -> mi.Float:
+    """Return the level whose texels have the area of a footprint, which is given in texels of the image.
+
+    A level ``bias`` that will be added is taken back in part where the footprint is elongated (:func:`.bias_share`): a
+    finer level would alias along the major axis.
+    """
+    area = footprint.area(ddx, ddy)
+    level = 0.5 * _log2(area)
+    if not bias:
+        return level
+    mean = 0.5 * (dr.squared_norm(ddx) + dr.squared_norm(ddy))
+    return level - bias * (1 - bias_share(area * dr.rcp(dr.maximum(mean, 1e-30))))
 
 
 def anisotropic(ddx: mi.Vector2f, ddy: mi.Vector2f, taps: int) -> tuple[mi.Float, mi.Vector2f]:

@@ -23,14 +23,14 @@ import numpy as np
 from ...arrays.indirection import aligned_copy
 from ...core.files import replacing
 from ...images import metrics, srgb
-from ...maps.pyramid import FilteredMaps, Pyramid, decibel
+from ...maps.pyramid import FilteredMaps, Pyramid, bias_share, decibel
 from ..disney.decoder import Decoder
 from ..disney.model import Effects
 from ..disney.training import uniform_hemisphere
 from .surface import shaded, surface_of
 
-#: Function ``(u, v, level, wi, wo) → Array3f`` of shaded values.
-ShadedReader = Callable[[Any, Any, Any, Any, Any], Any]
+#: Function ``(u, v, level, wi, wo[, share of a level bias that counts]) → Array3f`` of shaded values.
+ShadedReader = Callable[..., Any]
 
 #: References of the images: letter → sample pattern.
 TRUTHS = {"C": "converged", "P": "prefiltered"}
@@ -50,7 +50,9 @@ def reader(maps: FilteredMaps, effects: Effects, decoder: Decoder | None = None)
     """Return a function that shades filtered parameters: by ``decoder``, or by the analytic model."""
     decoder = decoder or Decoder()
 
-    def read(u, v, level, wi, wo):
+    def read(u, v, level, wi, wo, share=None):
+        if maps.level_bias and share is not None:
+            level = level - maps.level_bias * (1 - share)
         surface = surface_of(maps, maps.filtered(u, v, level), maps.extra(u, v, level))
         return shaded(decoder, surface, wi, wo, effects)
 
@@ -187,6 +189,12 @@ def places_in_footprints(pyramid: Pyramid, u, v, level, x, y, stretch=1) -> tupl
     v = dr.fma((y - 0.5) * extent / stretch, 1 / pyramid.layout.height, v)
     borders = zip((u, v), reversed(pyramid.border), strict=True)
     return tuple(x - dr.floor(x) if border == "repeat" else dr.clip(x, 0, 1) for x, border in borders)
+
+
+def share_of_bias(stretch):
+    """Return :func:`.bias_share` of footprints of :func:`places_in_footprints`."""
+    squared = dr.square(stretch)
+    return bias_share(2 * dr.rcp(squared + dr.rcp(squared)))
 
 
 def _averaged(pattern, pyramid: Pyramid, u, v, level, wi, wo, stretch, effects: Effects, rng, side: int):

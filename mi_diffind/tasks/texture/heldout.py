@@ -19,7 +19,7 @@ from ...arrays.indirection import aligned_copy
 from ...maps.pyramid import Pyramid
 from ..disney.model import Effects
 from ..disney.training import uniform_hemisphere
-from .appearance import ShadedReader, places_in_footprints, reference
+from .appearance import ShadedReader, places_in_footprints, reference, share_of_bias
 
 #: Samples a pixel, at places within it; 0 stands for one read at its centre.
 CASES = (0, 1, 4, 16)
@@ -184,7 +184,7 @@ class HeldOutFootprints:
         Float, UInt32 = types.Float, types.UInt32
         with dr.suspend_grad():
             if not samples:
-                value = read(u, v, at, wi, wo)
+                value = read(u, v, at, wi, wo, share_of_bias(stretch))
                 dr.eval(value)
                 return value
             side = PLACES[samples]
@@ -195,7 +195,7 @@ class HeldOutFootprints:
             inside = ((Float(n) + 0.5) / side for n in (place % side, place // side))
             u, v = places_in_footprints(self.pyramid, u, v, at, *inside, stretch)
             finer = dr.maximum(at - dr.opaque(Float, 0.5 * float(np.log2(samples))), 0)
-            value = read(u, v, finer, wi, wo)
+            value = read(u, v, finer, wi, wo, share_of_bias(stretch))
             dr.eval(value)
             return types.Array3f([dr.block_sum(c, places) / places for c in value])
 
@@ -230,18 +230,18 @@ def sky_weight(base: list[list[np.ndarray]]) -> float:
     return float(np.clip(single / max(of_sky, 1e-12), 1, MOST))
 
 
-def loss_or_gain(base: list[list[np.ndarray]], errors: list[list[np.ndarray]]) -> tuple[float, float]:
-    """Return the gain over ``base`` in dB, and the mean of all levels, cases and groups.
+def loss_or_gain(base: list[list[np.ndarray]], after: list[list[np.ndarray]]) -> tuple[float, float]:
+    """Return the gain of errors ``after`` over ``base`` in dB, and the mean of all levels, cases and groups.
 
     The gain is that mean, unless the mean of a level, of a case and group, or of a level, case and range of stretches
-    loses: then it is the largest such loss, negative. Up to :data:`LOSS`, or its standard error, is no loss; up to
-    :data:`SINGLE`, if that of a level, case and range.
+    loses: then it is the largest such loss, negative. Up to :data:`LOSS`, or a standard error, is no loss; up to
+    :data:`SINGLE`, or two standard errors, if that of a level, case and range.
     """
-    gains, doubts = (x.reshape(len(x), len(CASES), LIGHTS, RANGES) for x in compared(base, errors))
+    gains, doubts = (x.reshape(len(x), len(CASES), LIGHTS, RANGES) for x in compared(base, after))
     losses = []
-    for axes, most in (((1, 2, 3), LOSS), (0, LOSS), (2, SINGLE)):
+    for axes, least, errors in (((1, 2, 3), LOSS, 1), (0, LOSS, 1), (2, SINGLE, 2)):
         means = gains.mean(axis=axes)
         doubt = np.sqrt(np.mean(doubts**2, axis=axes) * means.size / gains.size)
-        losses.append(float((means + np.clip(doubt, most, SINGLE)).min()))
+        losses.append(float((means + np.maximum(errors * doubt, least)).min()))
     mean = float(gains.mean())
     return (mean if min(losses) >= 0 else min(losses)), mean

@@ -32,7 +32,7 @@ from ..disney.decoder import Decoder
 from . import PRESETS as TEXTURES
 from . import ShadingSettings
 from . import training as textures
-from .appearance import TRUTHS, ShadedEvaluation, places_in_footprints, reader, reference, write_preview
+from .appearance import TRUTHS, ShadedEvaluation, places_in_footprints, reader, reference, share_of_bias, write_preview
 from .compressed import CompressedTexture, neutral_extras, to_table
 from .heldout import SKY, STRETCH, HeldOutFootprints, compared, loss_or_gain, mirrored_pairs, sky_weight, under_skies
 from .surface import frozen_decoder, maps_of, material_effects, shaded, surface_of
@@ -42,10 +42,10 @@ FALL = 0.7
 TOP = 9
 
 #: Level biases that are compared.
-BIASES = (0.0, -0.125, -0.25)
+BIASES = (0.0, -0.25, -0.5)
 
 #: Level bias of the training for appearance, and of the comparison of arrays to begin it with.
-TRAINED_BIAS = -0.25
+TRAINED_BIAS = -0.5
 
 #: Powers of the maps' sensitivities that are tried as weights, and the share of the steps of each short training.
 POWERS = (0.5, 1.0)
@@ -180,7 +180,7 @@ class ShadingProblem(textures.TextureProblem):
             u, v = places_in_footprints(self.pyramid, u, v, level, *inside, stretch)
             level = level - math.log2(QUARTERS)
         if self.level_bias or reads > 1:  # opaque, so that one kernel serves all
-            bias = dr.opaque(types.Float, self.level_bias)
+            bias = dr.opaque(types.Float, self.level_bias) * share_of_bias(stretch)
             level = lookup.clamp(level + bias, 0.0, float(len(self.sizes) - 1))
         surface = surface_of(self.pyramid, net.filtered(u, v, level), net.extra(u, v, level))
         limit = None if recipe.clip is None else recipe.clip * recipe.share / size
@@ -348,7 +348,7 @@ class ShadingTraining:
             yield Stage(name.replace(" ", "-"), problem, 1.0, settings, name, lambda: self.errors(self.first))
             self.add_ways()
             # Anew only if weighted maps lost somewhere that shading did not win back, and time is not over
-            gained = choose(self.states) is not self.states[0]
+            gained = choose(self.states) not in self.states[:2]
             if chosen is self.begin[0] or gained or self.request.deadline is not None:
                 break
 

@@ -263,7 +263,7 @@ def quick(**changed):
 @pytest.fixture(autouse=True)
 def few_footprints(monkeypatch):
     """Fewer footprints and samples than by default, which tests do without."""
-    monkeypatch.setattr(training, "HeldOutFootprints", functools.partial(HeldOutFootprints, count=512))
+    monkeypatch.setattr(training, "HeldOutFootprints", functools.partial(HeldOutFootprints, count=256))
     monkeypatch.setattr(heldout, "CASES", (0, 4))
     monkeypatch.setattr(training, "BIASES", (0.0, -0.5))
     monkeypatch.setattr(training, "TRIED", 2**12)
@@ -568,7 +568,7 @@ def test_the_whole_stage_is_seeded_and_never_below_its_start(ad, small, unseen, 
     assert ("kept_start" in table.settings) == (state == "start")
     _, pyramid = pyramid_of(maps, ad)
     effects, _ = material.material_effects(pyramid.layout)
-    held_out = HeldOutFootprints(pyramid, effects, 512)
+    held_out = HeldOutFootprints(pyramid, effects, 256)
     base, errors = (
         held_out.errors(reader(CompressedTexture.from_table(t, ad.TensorXf), effects)) for t in (plain, table)
     )
@@ -578,16 +578,17 @@ def test_the_whole_stage_is_seeded_and_never_below_its_start(ad, small, unseen, 
 
 def test_the_papers_training(ad, small, unseen, tmp_path, monkeypatch):
     """Its tables shade, which stay as they are, lights are uniform, levels are read as they are stored."""
-    lights, shares = [], training.random_directions
-    monkeypatch.setattr(training, "random_directions", lambda *a: lights.append(1) or shares(*a))
-    monkeypatch.setattr(training, "mirrored_pairs", None)
+    lights, pairs, training_numbers = [], training.mirrored_pairs, training.under_skies
+    monkeypatch.setattr(training, "mirrored_pairs", lambda *a: lights.append(a[2]) or pairs(*a))
+    skies = lambda types, sky, numbers: lights.append(dr.any(sky)[0]) or training_numbers(types, sky, numbers)  # noqa: E731
+    monkeypatch.setattr(training, "under_skies", skies)
     arrays = DISNEY.open(ad.TensorXf, storage="uint8").arrays
     before = {name: array.numpy().copy() for name, array in arrays.items()}
     monkeypatch.setattr(texture_fit, "find_size", lambda *a: PaperBudget(8, 8, 5, 4, 6))
     fitted = mi_diffind.fit("texture", bumpy(), preset="paper", shading="on", steps=4, batch=2048, border="repeat",
                             variant="llvm_ad_rgb", progress=False)  # fmt: skip
     settings = fitted.table.settings
-    assert settings["shading"]["tables"] and settings["level_bias"] == 0 and lights
+    assert settings["shading"]["tables"] and settings["level_bias"] == 0 and lights and not any(lights)
     assert [*settings["states"]] == ["start", "finer level", *(f"appearance {way:.0%}" for way in training.WAYS)]
     assert "primary0" in fitted.table.arrays and np.isfinite(fitted.table.measured["shaded_converged_db"])
     arrays = DISNEY.open(ad.TensorXf, storage="uint8").arrays
