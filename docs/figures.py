@@ -247,7 +247,10 @@ def shading_runs(study: Entries, material: str, letter: str) -> dict[float, list
 
 def shaded_materials(*studies: Entries) -> dict[str, dict[str, list[Entries]]]:
     """Return the records of each material by their kind; studies without renders are left out."""
-    records = [[job.details for job in study.jobs.values()] for study in studies]
+    records = [
+        [Entries(job.details, errors=job.errors) for job in study.jobs.values() if "material" in job.details]
+        for study in studies
+    ]
     details = [d for study in records if any(d.kind == "renders" for d in study) for d in study]
     materials = groups(details, "material").items()
     return {material: {kind: d for (kind,), d in groups(rows, "kind").items()} for (material,), rows in materials}
@@ -283,20 +286,24 @@ def shaded_renders(*studies: Entries) -> list[Entries]:
 def shaded_levels(*studies: Entries) -> list[Entries]:
     """Return for each material the best filter in equal bytes, the best LEAN uncompressed, plain and ours.
 
-    ``mean_db``, one a seed, and ``levels``, the means of seeds, are PSNR of shaded values against the converged truth.
+    ``mean_db``, one a seed, and ``levels``, the means of seeds, are PSNR of held-out footprints.
     """
+
+    def psnr(record: Entries) -> float:
+        return record.errors.footprints_db
+
     rows = []
     for material, kinds in shaded_materials(*studies).items():
         ours = [d for d in kinds["run"] if d.label.startswith("ours")]
-        lean = max((d for d in kinds["classical"] if d.label.startswith("LEAN")), key=lambda d: d.C.mean_db)
-        best = max(kinds["compressed"], key=lambda d: d.C.mean_db)
+        lean = max((d for d in kinds["classical"] if d.label.startswith("LEAN")), key=psnr)
+        best = max(kinds["compressed"], key=psnr)
         contenders = {
             f"{best.label} (best filter in equal bytes)": [best], f"{lean.label} (uncompressed)": [lean],
             "plain": kinds["plain"], "ours": ours,
         }  # fmt: skip
         for label, runs in contenders.items():
-            levels = [mean(values) for values in zip(*(d.C.psnr_db for d in runs), strict=True)]
-            rows.append(Entries(material=material, label=label, mean_db=[d.C.mean_db for d in runs], levels=levels))
+            levels = [mean(d.errors[f"l{level}_db"] for d in runs) for level in range(6)]
+            rows.append(Entries(material=material, label=label, mean_db=[*map(psnr, runs)], levels=levels))
     return rows
 
 

@@ -69,11 +69,11 @@ def measure(material: str, file: str) -> dict:
     effects = material_effects(pyramid.layout)[0]
     held_out = HeldOutFootprints(pyramid, effects)
 
-    def errors(maps: FilteredMaps) -> np.ndarray:
+    def errors(maps: FilteredMaps) -> list:
         return held_out.errors(reader(maps, effects))
 
-    def gains(base: np.ndarray, maps: FilteredMaps) -> np.ndarray:
-        return compared(base, errors(maps))[0].mean(axis=1)
+    def gains(base: list, maps: FilteredMaps) -> np.ndarray:
+        return compared(base, errors(maps))[0].mean(axis=(1, 2))
 
     base, uncompressed = errors(texture), errors(pyramid)
     return {

@@ -15,7 +15,7 @@ import pytest
 import trust_properties as trust
 from arrays import aligned, numpy_of
 from texture_files import make, make_image, material
-from texture_scenes import WRONG, footprints, hits, isotropic, linear, plane, refused
+from texture_scenes import WRONG, ellipse, footprints, hits, isotropic, linear, plane, refused
 from variants import VARIANTS, set_variant, warnings_of
 
 from mi_diffind import plugins
@@ -267,6 +267,25 @@ def test_trilinear_is_the_level_of_the_area(mi_any, files, rng, name):
     if raw:
         spectra = mi.load_dict(plugin(files, name, filter="trilinear")).eval(hits(mi, uv, ddx, ddy)).numpy()
         assert np.isfinite(spectra).all() and spectra.min() >= 0 and spectra.max() <= 1
+
+
+@pytest.mark.parametrize("name", FILTERED[1:])
+def test_level_bias_of_elongated_footprints(mi, files, tmp_path, rng, name):
+    """A part of the bias counts: area over half of the squared axes, squared; all of it where a footprint is round."""
+    table, path = load_table(files[name]), tmp_path / "biased.npz"
+    table.settings["level_bias"] = -0.75
+    save_table(path, table)
+    (read, _), (_, plain) = (reader(mi, {name: str(file)}, name, filter="trilinear") for file in (path, files[name]))
+    uv, (ddx, ddy) = rng.random((2, 300)), footprints(rng, 300, SIZE, 2)
+    ddx[:, :30], ddy[:, :30] = [[2 / WIDTH], [0]], [[0], [2 / HEIGHT]]
+    major, minor, _ = ellipse(ddx, ddy, SIZE)
+    share = (2 * major * minor / (major**2 + minor**2)) ** 2
+    assert share[:30].min() > 0.999 and share.min() < 0.1
+    level = np.maximum(isotropic(ddx, ddy, SIZE) - 0.75 * share, 0)
+    image = getattr(plain, "maps", plain).image
+    place = [mi.Float(aligned(x)) for x in (*uv, level)]
+    truth = linear(numpy_of(image.maps(image.filtered(*place), ["albedo"])["albedo"]).T)
+    np.testing.assert_allclose(values(read, hits(mi, uv, ddx, ddy)), truth, atol=2e-3)
 
 
 @pytest.mark.parametrize("filtering", FILTERS[:2])

@@ -203,8 +203,8 @@ class Texture(Task):
         ),
         Argument(
             "--level-bias", type=bias_or_auto, default="auto", metavar="auto|N",
-            help="levels by which the texture is read finer than the footprint, as in -0.5 (default: auto, chosen by "
-            "held-out footprints in the last stage, 0 without it and for paper)",
+            help="levels by which the texture is read finer than a round footprint, as in -0.5 (default: auto, chosen "
+            "by held-out footprints in the last stage, 0 without it and for paper)",
         ),
         *SOURCES,
         PREVIEW,

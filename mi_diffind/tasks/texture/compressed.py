@@ -593,7 +593,7 @@ class TextureModel(MapsModel):
             listed = ", ".join(f"{value:.1f}" for value in by_level)
             lines.append(f"  {image.levels} levels of detail: {listed} dB")
         if image.level_bias:
-            lines.append(f"  read {-image.level_bias:g} levels finer than the footprint")
+            lines.append(f"  read {-image.level_bias:g} levels finer than a round footprint")
         if image.has_extras:
             lines.append("  extras: shape and weight of the highlight, read by neural_material alone")
         return {**figures, "extras": image.has_extras}, lines

@@ -213,7 +213,7 @@ def shading_report(table: Table, layout: Layout) -> tuple[list[str], dict]:
     remarks = [
         (before, f"before the training for the shading: {figures_before}"),
         (True, f"effects that are shaded: {', '.join(effects.names)}"),
-        (settings.get("level_bias"), f"read {-settings.get('level_bias', 0):g} levels finer than the footprint"),
+        (settings.get("level_bias"), f"read {-settings.get('level_bias', 0):g} levels finer than a round footprint"),
         (settings.get("states"), f"gain of held-out footprints: {gains}; kept: {settings.get('state')}"),
         (kept, "training for the shading gained nothing: these are the arrays that it started from"),
         (reasons, "left out: " + ", ".join(f"{effect} ({reason})" for effect, reason in reasons.items())),

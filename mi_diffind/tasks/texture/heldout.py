@@ -151,14 +151,6 @@ class HeldOutFootprints:
         means = [np.hstack([x.mean(axis=-1, dtype=np.float64) for x in case]) for case in self.errors(read)]
         return -10 * np.log10(np.maximum(np.hstack(means), 1e-12)).mean(axis=1)
 
-    def brightness(self, read: ShadedReader) -> np.ndarray:
-        """Return the weighted mean of shaded values over that of the truth, ``(levels,)``, one read at the centre."""
-        ratios = []
-        for level, (*_, weight, truth) in enumerate(self.footprints):
-            value = self._read(read, self.footprints[level], 0)
-            ratios.append([np.mean((weight * sum(x)).numpy(), dtype=np.float64) for x in (value, truth)])
-        return np.array([a / max(b, 1e-12) for a, b in ratios])
-
     def _error(self, read: ShadedReader, level: int, samples: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the squared errors of a level, ``(groups, pixels)``, of single lights and of skies."""
         footprints, count = self.footprints[level], self.count
