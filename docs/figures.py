@@ -256,8 +256,8 @@ def shaded_materials(*studies: Entries) -> dict[str, dict[str, list[Entries]]]:
     return {material: {kind: d for (kind,), d in groups(rows, "kind").items()} for (material,), rows in materials}
 
 
-def shaded_renders(*studies: Entries) -> list[Entries]:
-    """Return a row for each material and each light of renders.
+def shaded_renders(*studies: Entries, name: str = "ours") -> list[Entries]:
+    """Return a row for each material and each light of renders; ``best`` is another ``name``, of one seed.
 
     ``before`` and ``after``: PSNR in dB of plain and ours by samples a pixel, the mean of views and seeds; ``gain`` and
     ``worst``, of all views and samples; ``brightness``: of plain and ours, the largest deviation of a patch.
@@ -265,21 +265,19 @@ def shaded_renders(*studies: Entries) -> list[Entries]:
     rows = []
     for material, kinds in shaded_materials(*studies).items():
         for lights in kinds["renders"][0].renders.ours:
-            shown = {name: [d.renders[name][lights] for d in kinds["renders"]] for name in ("plain", "ours")}
-            psnr = {
-                name: {spp: [x for seed in seeds for x in seed[spp].psnr_db] for spp in seeds[0]}
-                for name, seeds in shown.items()
-            }
-            gains = [b - a for spp in psnr["ours"] for a, b in zip(*(psnr[n][spp] for n in shown), strict=True)]
-            patches = {
-                name: [x - 1 for seed in seeds for figures in seed.values() for view in figures.brightness
-                       for x in view.values()]
-                for name, seeds in shown.items()
-            }  # fmt: skip
-            before, after = ({spp: mean(values) for spp, values in psnr[name].items()} for name in shown)
-            brightness = {name: max(values, key=abs) for name, values in patches.items()}
+            records = [d.renders for d in kinds["renders"] if name in d.renders]
+            shown = [[renders[label][lights] for renders in records] for label in ("plain", name)]
+            psnr = [{spp: [x for seed in seeds for x in seed[spp].psnr_db] for spp in seeds[0]} for seeds in shown]
+            gains = [b - a for spp in psnr[0] for a, b in zip(*(values[spp] for values in psnr), strict=True)]
+            patches = [
+                [x - 1 for seed in seeds for figures in seed.values() for view in figures.brightness
+                 for x in view.values()]
+                for seeds in shown
+            ]  # fmt: skip
+            before, after = ({spp: mean(values) for spp, values in by_spp.items()} for by_spp in psnr)
+            plain, ours = (max(values, key=abs) for values in patches)
             rows.append(Entries(material=material, lights=lights, before=before, after=after, gain=mean(gains),
-                                worst=min(gains), brightness=Entries(brightness)))  # fmt: skip
+                                worst=min(gains), brightness=Entries(plain=plain, ours=ours)))  # fmt: skip
     return rows
 
 

@@ -101,6 +101,13 @@ def under_skies(types, sky, numbers: Sequence) -> list:
     return shared
 
 
+def mean_of_skies(sky, value):
+    """Return values, where ``sky`` is true their means over blocks of :data:`SKY` lanes."""
+    UInt32 = dr.uint32_array_t(type(value))
+    means = dr.block_reduce(dr.ReduceOp.Add, value, SKY) / SKY
+    return dr.select(sky, dr.gather(type(value), means, dr.arange(UInt32, dr.width(value)) // SKY), value)
+
+
 class HeldOutFootprints:
     """Footprints of a ``pyramid`` with the converged truth, ``count`` of each group for at most :data:`LEVELS` levels.
 

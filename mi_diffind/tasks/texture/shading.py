@@ -34,7 +34,17 @@ from . import ShadingSettings
 from . import training as textures
 from .appearance import TRUTHS, ShadedEvaluation, places_in_footprints, reader, reference, share_of_bias, write_preview
 from .compressed import CompressedTexture, neutral_extras, to_table
-from .heldout import SKY, STRETCH, HeldOutFootprints, compared, loss_or_gain, mirrored_pairs, sky_weight, under_skies
+from .heldout import (
+    SKY,
+    STRETCH,
+    HeldOutFootprints,
+    compared,
+    loss_or_gain,
+    mean_of_skies,
+    mirrored_pairs,
+    sky_weight,
+    under_skies,
+)
 from .surface import frozen_decoder, maps_of, material_effects, shaded, surface_of
 
 #: Factor of the number of shaded samples from one level to the next coarser one, up to level :data:`TOP`.
@@ -157,11 +167,12 @@ class ShadingProblem(textures.TextureProblem):
         """Return the errors of ``size`` shaded reads, the mean over colours; ``net`` is as training sees it.
 
         They are of footprints that are read at their centre. In each second step, if the recipe's ``quarters`` say so,
-        they are of pixels with four samples: each is the mean of reads a level finer, one in each quarter.
+        they are of pixels with four samples: each is the mean of reads a level finer, one in each quarter. The first
+        lanes are of skies.
         """
         recipe, types = self.shading, self.types
         reads = QUARTERS**2 if recipe.quarters and self.jittered else 1
-        count, weight = size // reads, 1
+        count = size // reads
         sky = dr.arange(types.UInt32, count) < int(recipe.skies * count / SKY) * SKY
         numbers = under_skies(types, sky, [rng.random(types.Float, count) for _ in range(9)])
         u, v, level = self.places(*numbers[:3])
@@ -188,14 +199,7 @@ class ShadingProblem(textures.TextureProblem):
         if reads > 1:
             value = [dr.block_reduce(dr.ReduceOp.Add, c, reads) / reads for c in value]
         if recipe.skies:
-            block = dr.arange(types.UInt32, count) // SKY
-            value, truth = (
-                [
-                    dr.select(sky, dr.gather(types.Float, dr.block_reduce(dr.ReduceOp.Add, c, SKY), block) / SKY, c)
-                    for c in x
-                ]
-                for x in (value, truth)
-            )
+            value, truth = ([mean_of_skies(sky, c) for c in x] for x in (value, truth))
             weight = dr.select(sky, dr.opaque(types.Float, self.sky_weight), weight)
         bounded = _bounded if recipe.bounded else (lambda x: x)
         errors = [bounded(a * self.exposure) - bounded(b * self.exposure) for a, b in zip(value, truth, strict=True)]
