@@ -64,17 +64,15 @@ class ShadedEvaluation:
 
     There are ``levels`` levels, from level 0 on, and ``pairs`` pairs; images are at most ``side`` texels wide and high.
     Each image shows another part of the material; its pixels are shifted by a part of a texel, as in a render.
-    References are ``truths[letter][level]``, ``(pairs, rows, columns, 3)``, linear. Another ``stream`` gives other
-    views, lights and parts.
+    References are ``truths[letter][level]``, ``(pairs, rows, columns, 3)``, linear.
     """
 
     def __init__(
-        self, pyramid: Pyramid, effects: Effects, levels: int = 6, pairs: int = 16, side: int = 64, truths="CP",
-        stream: int = 0,
+        self, pyramid: Pyramid, effects: Effects, levels: int = 6, pairs: int = 16, side: int = 64, truths="CP"
     ):  # fmt: skip
         self.pyramid, self.effects, self.types = pyramid, effects, pyramid.types
         self.levels = min(levels, pyramid.levels)
-        rng = np.random.default_rng((SEED, stream))
+        rng = np.random.default_rng(SEED)
         numbers = rng.random((4, pairs))
         # Strata of the cosine, one view and one light in each
         order = [rng.permutation(pairs) for _ in range(2)]
