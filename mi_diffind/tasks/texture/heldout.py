@@ -111,8 +111,9 @@ def mean_of_skies(sky, value):
 class HeldOutFootprints:
     """Footprints of a ``pyramid`` with the converged truth, ``count`` of each group for at most :data:`LEVELS` levels.
 
-    ``exposure`` is the factor by which a share :data:`WHITE` of the truth is 1 or brighter under uniform lights: errors
-    of dark materials count as they are seen. Footprints are stretched along u or v, as those at grazing angles are.
+    ``exposures`` are the factors by which a share :data:`WHITE` of the truth is 1 or brighter: under single, uniform
+    lights, lights about the mirror direction, and skies. So errors of dark materials and in highlights count as they
+    are seen. Footprints are stretched along u or v, as those at grazing angles are.
     """
 
     def __init__(self, pyramid: Pyramid, effects: Effects, count: int = COUNT, seed: int = SEED):
@@ -134,12 +135,12 @@ class HeldOutFootprints:
             truth = reference("jittered", pyramid, u, v, at, wi, wo, effects, _Numbers(rng), SIDE, stretch)
             dr.eval(u, v, at, stretch, wi, wo, weight, truth)
             self.footprints.append((u, v, at, stretch, wi, wo, weight, truth))
-        uniform = slice(RANGES * count)
-        seen = [((sum(truth) / 3).numpy()[uniform], w.numpy()[uniform]) for *_, w, truth in self.footprints]
-        values, weights = (np.concatenate(x) for x in zip(*seen, strict=True))
-        order = np.argsort(values)
-        brighter = 1 - np.cumsum(weights[order]) / weights.sum()
-        self.exposure = float(1 / max(values[order][np.searchsorted(-brighter, -WHITE)], 1e-3))
+        lit = [(w * sum(truth) / 3).numpy().reshape(LIGHTS, -1, SKY) for *_, w, truth in self.footprints]
+        lit = [
+            np.concatenate([x[i].mean(axis=-1) if i == LIGHTS - 1 else x[i].ravel() for x in lit])
+            for i in range(LIGHTS)
+        ]
+        self.exposures = [float(1 / max(np.quantile(x[x > 0], 1 - WHITE), 1e-3)) if (x > 0).any() else 1.0 for x in lit]
 
     def errors(self, read: ShadedReader) -> list[list[np.ndarray]]:
         """Return the squared errors of exposed values up to 1, ``(levels, groups, pixels)``.
@@ -169,10 +170,10 @@ class HeldOutFootprints:
         *_, weight, truth = footprints
         value = self._read(read, footprints, samples)
         values, truths = (np.array(weight * x).reshape(3, LIGHTS * RANGES, count) for x in (value, truth))
-        result = []
+        exposures, result = np.repeat(self.exposures, RANGES)[:, None], []
         for group, lights in ((slice(-RANGES), 1), (slice(-RANGES, None), SKY)):
             means = (x[:, group].reshape(3, -1, count // lights, lights).mean(axis=-1) for x in (values, truths))
-            a, b = (np.minimum(self.exposure * x, 1) for x in means)
+            a, b = (np.minimum(exposures[group] * x, 1) for x in means)
             result.append(np.square(a - b).mean(axis=0))
         return tuple(result)
 

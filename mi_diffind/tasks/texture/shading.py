@@ -147,7 +147,7 @@ class ShadingProblem(textures.TextureProblem):
         #: Picture that is written at each measurement, and the images that it shows a part of
         self.preview: tuple[Path, ShadedEvaluation] | None = None
         self.effects, _ = material_effects(pyramid.layout)
-        self.exposure = 1.0 if held_out is None or recipe.tables else held_out.exposure
+        self.exposure = 1.0 if held_out is None or recipe.tables else held_out.exposures[0]
         self.sky_weight = 1.0 if base is None else sky_weight(base)
         self.decoder = frozen_decoder(self.types) if recipe.tables else Decoder()
         self.identity = {**self.identity, "shading": recipe.further}
@@ -333,7 +333,7 @@ class ShadingTraining:
             return
         rest, chosen, weighted = 1.0, self.begin[0], None
         if self.build is not None:
-            measured, trials = sensitivities(self.pyramid, self.held_out.exposure, sky_weight(self.base)), []
+            measured, trials = sensitivities(self.pyramid, self.held_out.exposures[0], sky_weight(self.base)), []
             for power in POWERS:
                 problem = self.build(map_weights(measured, self.layout, power))
                 yield Stage("trial", problem, TRIAL, self.part(problem.recipe, TRIAL), resumable=False)
