@@ -76,6 +76,7 @@ class ShadingSettings(FitSettings):
       ``neural_material`` alone reads.
     - ``mirrored``: share of the lights that are drawn about the mirror direction.
     - ``skies``: share of the pairs that are of a uniform sky.
+    - ``stretched``: whether footprints are stretched, and views follow from it, as on flat surfaces.
     - ``quarters``: whether each second step is of pixels with four samples.
     - ``tables``: whether arrays are shaded by the frozen tables of task 2, in place of the formulas that
       ``neural_material`` evaluates by default.
@@ -97,6 +98,7 @@ class ShadingSettings(FitSettings):
     extras: bool = False
     mirrored: float = 0.5
     skies: float = 0.25
+    stretched: bool = True
     quarters: bool = True
     tables: bool = False
     beta_2: float = 0.99
@@ -108,7 +110,8 @@ SHADING_PRESETS = {
     "ours": ShadingSettings(),
     "paper": ShadingSettings(
         lr=1e-3, schedule="constant", loss="mae", share=0.25, clip=0.1, reference="prefiltered", bounded=False,
-        level_bias=0.0, mirrored=0.0, skies=0.0, quarters=False, tables=True, beta_2=0.999, texture="paper",
+        level_bias=0.0, mirrored=0.0, skies=0.0, stretched=False, quarters=False, tables=True, beta_2=0.999,
+        texture="paper",
     ),
 }  # fmt: skip
 

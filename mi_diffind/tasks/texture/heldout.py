@@ -59,6 +59,9 @@ WHITE = 0.05
 #: Largest binary logarithm of the stretch of a footprint: it is up to 16 times as long as wide.
 STRETCH = 2.0
 
+#: Share of the footprints whose views do not follow from their stretch, as on curved surfaces.
+CURVED = 0.25
+
 #: Seed of the footprints; trainings use other generators.
 SEED = 20231213
 
@@ -83,6 +86,20 @@ def mirrored_pairs(types, numbers, share: float = MIRRORED) -> tuple:
     wo = dr.select(e < share, 2 * dr.dot(wi, h) * h - wi, uniform)
     above = wo.z > 0
     return wi, dr.select(above, wo, Array3f(0, 0, 1)), dr.select(above, types.Float(1), 0)
+
+
+def stretched_views(types, stretch, a, b) -> tuple:
+    """Return stretches and the first two numbers of :func:`mirrored_pairs` of uniform numbers ``stretch``, a and b.
+
+    A flat surface stretches footprints by the view: a pixel is 1/cos θ times as long as wide, along the view. Views of
+    a share :data:`CURVED` are uniform, those of other pixels lie within 45° of the axis that is stretched.
+    """
+    logarithm = (stretch - 0.5) * (2 * STRETCH)
+    turns = 2 * b
+    azimuth = 0.5 * dr.floor(turns) + dr.select(logarithm > 0, 0, 0.25) + 0.25 * (turns - dr.floor(turns) - 0.5)
+    curved = a < CURVED
+    cosine = dr.select(curved, a / CURVED, dr.exp2(-2 * dr.abs(logarithm)))
+    return dr.exp2(logarithm), cosine, dr.select(curved, b, azimuth - dr.floor(azimuth))
 
 
 def under_skies(types, sky, numbers: Sequence) -> list:
@@ -129,9 +146,10 @@ class HeldOutFootprints:
             numbers[8, ::2] += 1 - MIRRORED
             numbers = [types.Float(aligned_copy(x.ravel())) for x in numbers]
             sky = dr.arange(types.UInt32, dr.width(numbers)) >= (LIGHTS - 1) * RANGES * count
-            u, v, at, stretch, *numbers = under_skies(types, sky, numbers)
-            wi, wo, weight = mirrored_pairs(types, numbers)
-            at, stretch = at + level, dr.exp2((stretch - 0.5) * (2 * STRETCH))
+            u, v, at, stretch, a, b, *lights = under_skies(types, sky, numbers)
+            stretch, *views = stretched_views(types, stretch, a, b)
+            wi, wo, weight = mirrored_pairs(types, [*views, *lights])
+            at = at + level
             truth = reference("jittered", pyramid, u, v, at, wi, wo, effects, _Numbers(rng), SIDE, stretch)
             dr.eval(u, v, at, stretch, wi, wo, weight, truth)
             self.footprints.append((u, v, at, stretch, wi, wo, weight, truth))

@@ -36,13 +36,13 @@ from .appearance import TRUTHS, ShadedEvaluation, places_in_footprints, reader, 
 from .compressed import CompressedTexture, neutral_extras, to_table
 from .heldout import (
     SKY,
-    STRETCH,
     HeldOutFootprints,
     compared,
     loss_or_gain,
     mean_of_skies,
     mirrored_pairs,
     sky_weight,
+    stretched_views,
     under_skies,
 )
 from .surface import frozen_decoder, maps_of, material_effects, shaded, surface_of
@@ -176,8 +176,9 @@ class ShadingProblem(textures.TextureProblem):
         sky = dr.arange(types.UInt32, count) < int(recipe.skies * count / SKY) * SKY
         numbers = under_skies(types, sky, [rng.random(types.Float, count) for _ in range(9)])
         u, v, level = self.places(*numbers[:3])
-        stretch = dr.exp2((numbers[3] - 0.5) * (2 * STRETCH * recipe.quarters))
-        wi, wo, weight = mirrored_pairs(types, numbers[4:], recipe.mirrored)
+        stretch, *views = stretched_views(types, *numbers[3:6]) if recipe.stretched else (1, *numbers[4:6])
+        stretch += dr.zeros(types.Float, count)
+        wi, wo, weight = mirrored_pairs(types, [*views, *numbers[6:]], recipe.mirrored)
         truth = reference(recipe.reference, self.pyramid, u, v, level, wi, wo, self.effects, rng, stretch=stretch)
         dr.eval(u, v, level, stretch, wi, wo, weight, truth)
         if reads > 1:

@@ -23,6 +23,7 @@ from mi_diffind.tasks.texture.compressed import neutral_extras
 from mi_diffind.tasks.texture.heldout import (
     ALPHAS,
     CASES,
+    CURVED,
     LIGHTS,
     LOSS,
     PLACES,
@@ -34,6 +35,7 @@ from mi_diffind.tasks.texture.heldout import (
     loss_or_gain,
     mirrored_pairs,
     sky_weight,
+    stretched_views,
     under_skies,
 )
 from mi_diffind.tasks.texture.surface import material_effects
@@ -143,8 +145,8 @@ def test_errors_of_a_constant_material(ad):
     assert len(errors) == len(CASES)
     for single, of_sky in errors:
         assert single.shape == (5, 2 * RANGES, 128) and of_sky.shape == (5, RANGES, 128 // SKY)
-        assert all(np.sqrt(x.mean(axis=-1)).max() < 5e-3 for x in (single, of_sky))
-    assert (held_out.psnr(read) > 46).all()
+        assert all(np.sqrt(x.mean(axis=-1)).max() < 1e-2 for x in (single, of_sky))
+    assert (held_out.psnr(read) > 55).all()
     darker = lambda *lanes: 0.8 * read(*lanes)  # noqa: E731
     # Errors of exposed values: those that are white in both count 0, others a fifth of the truth
     errors, total = held_out.errors(darker), np.zeros((5, 3 * RANGES))
@@ -159,8 +161,26 @@ def test_errors_of_a_constant_material(ad):
                 np.testing.assert_allclose(found[level].mean(axis=-1), mean, rtol=0.05, atol=1e-6)
         total[level] = np.hstack(expected)
     np.testing.assert_allclose(held_out.psnr(darker), -10 * np.log10(total).mean(axis=1), atol=0.1)
-    expected = np.mean(total[:, : 2 * RANGES]) / np.mean(total[:, 2 * RANGES :])
+    expected = max(np.mean(total[:, : 2 * RANGES]) / np.mean(total[:, 2 * RANGES :]), 1)
     assert sky_weight(errors) == pytest.approx(expected, rel=0.05)
+
+
+def test_views_of_stretched_footprints(ad, rng):
+    """A flat surface that is seen at the aspect of the footprint, along its longer side; a quarter is uniform."""
+    n = 2**14
+    drawn = rng.random((3, n), dtype=np.float32)
+    stretch, *views = stretched_views(ad, *(ad.Float(aligned(x)) for x in drawn))
+    wi = numpy_of(
+        mirrored_pairs(ad, [*views, *[ad.Float(aligned(x)) for x in rng.random((3, n), dtype=np.float32)]])[0]
+    )
+    flat, s = drawn[1] >= CURVED, stretch.numpy()
+    np.testing.assert_allclose(np.log2(s), (drawn[0] - 0.5) * 2 * STRETCH, atol=1e-4)
+    np.testing.assert_allclose(wi[flat, 2], np.minimum(s**2, s**-2)[flat], atol=1e-4)
+    longer = np.where(s > 1, np.abs(wi[:, 0]), np.abs(wi[:, 1]))
+    assert (longer >= math.sqrt(0.499) * np.hypot(wi[:, 0], wi[:, 1]) - 1e-5)[flat].all()
+    for axis in (0, 1):  # from both sides
+        assert abs(np.mean(wi[flat, axis] > 0) - 0.5) < 0.02
+    assert abs(wi[~flat, 2].mean() - 0.5) < 0.02 and abs((longer**2)[~flat].mean() - 1 / 3) < 0.02
 
 
 def test_groups_of_footprints(ad):

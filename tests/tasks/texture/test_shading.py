@@ -369,11 +369,11 @@ def test_extras_are_trained_stored_and_read_by_the_material_alone(mi_rgb, start,
             TEXTURE.load(path)
 
 
-def test_training_reads_the_level_that_a_file_is_read_at(start, ad, monkeypatch):
+def test_training_reads_the_level_that_a_file_is_read_at(start, ad):
     """Arrays whose levels differ: the loss of round footprints at a bias is that of what a biased file reads."""
     _, pyramid, table, *_ = start
-    monkeypatch.setattr(training, "STRETCH", 0.0)
-    problem = training.ShadingProblem(training.trainable_arrays(table, pyramid), pyramid, quick(share=1.0))
+    recipe = quick(share=1.0, stretched=False)
+    problem = training.ShadingProblem(training.trainable_arrays(table, pyramid), pyramid, recipe)
     problem.settings, losses = problem.shading, []
     for bias, net in ((-0.5, problem.net), (0.0, CompressedTexture(pyramid.layout, problem.net, -0.5))):
         problem.level_bias = bias
