@@ -248,7 +248,7 @@ def shading_runs(study: Entries, material: str, letter: str) -> dict[float, list
 def shaded_materials(*studies: Entries) -> dict[str, dict[str, list[Entries]]]:
     """Return the records of each material by their kind; studies without renders are left out."""
     records = [
-        [Entries(job.details, errors=job.errors) for job in study.jobs.values() if "material" in job.details]
+        [Entries(job.details, errors=job.get("errors")) for job in study.jobs.values() if "material" in job.details]
         for study in studies
     ]
     details = [d for study in records if any(d.kind == "renders" for d in study) for d in study]
@@ -300,7 +300,7 @@ def shaded_levels(*studies: Entries) -> list[Entries]:
             "plain": kinds["plain"], "ours": ours,
         }  # fmt: skip
         for label, runs in contenders.items():
-            levels = [mean(d.errors[f"l{level}_db"] for d in runs) for level in range(6)]
+            levels = [mean(d.errors[key] for d in runs) for key in runs[0].errors if key.startswith("l")]
             rows.append(Entries(material=material, label=label, mean_db=[*map(psnr, runs)], levels=levels))
     return rows
 

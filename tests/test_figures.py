@@ -113,8 +113,8 @@ def test_rows_of_shaded_renders_and_levels():
     """Means of seeds and views, the worst of these, the darkest patch, and the best of several filters."""
 
     def job(kind, label, levels=(), **details):
-        levels = {"C": {"mean_db": sum(levels) / 2, "psnr_db": levels}} if levels else {}
-        return {"details": {"material": "oak", "kind": kind, "label": label, **levels, **details}}
+        errors = {"footprints_db": sum(levels) / 2, **{f"l{i}_db": level for i, level in enumerate(levels)}}
+        return {"errors": errors, "details": {"material": "oak", "kind": kind, "label": label, **details}}
 
     def rendered(plain, ours):
         views = {"plain": (plain, 0.8), "ours": (ours, 0.98)}
