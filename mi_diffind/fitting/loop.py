@@ -599,10 +599,25 @@ LARGEST_SUMS = 2**28
 @contextlib.contextmanager
 def cores(deterministic: bool):
     """Compute on one core in this context if the result is to be ``deterministic``."""
-    before = dr.thread_count()
+    _outside.append(dr.thread_count())
     if deterministic:
         compat.use_threads(1)
     try:
         yield
     finally:
+        compat.use_threads(_outside.pop())
+
+
+@contextlib.contextmanager
+def all_cores():
+    """Compute on as many cores as outside of :func:`cores` in this context, whose kernels must not sum gradients."""
+    before = dr.thread_count()
+    compat.use_threads(_outside[0] if _outside else before)
+    try:
+        yield
+    finally:
         compat.use_threads(before)
+
+
+#: Numbers of cores outside of the contexts in progress
+_outside: list[int] = []

@@ -23,7 +23,7 @@ from ...arrays import lookup
 from ...arrays.indirection import aligned_copy, unfolded
 from ...arrays.tables import Table
 from ...core.progress import interruptible
-from ...fitting.loop import FitResult, sample_losses
+from ...fitting.loop import FitResult, all_cores, sample_losses
 from ...fitting.task import FitRequest, FitSettings, Stage
 from ...maps.model import significant
 from ...maps.pyramid import Pyramid
@@ -179,8 +179,9 @@ class ShadingProblem(textures.TextureProblem):
         stretch, *views = stretched_views(types, *numbers[3:6]) if recipe.stretched else (1, *numbers[4:6])
         stretch += dr.zeros(types.Float, count)
         wi, wo, weight = mirrored_pairs(types, [*views, *numbers[6:]], recipe.mirrored)
-        truth = reference(recipe.reference, self.pyramid, u, v, level, wi, wo, self.effects, rng, stretch=stretch)
-        dr.eval(u, v, level, stretch, wi, wo, weight, truth)
+        with all_cores():
+            truth = reference(recipe.reference, self.pyramid, u, v, level, wi, wo, self.effects, rng, stretch=stretch)
+            dr.eval(u, v, level, stretch, wi, wo, weight, truth)
         if reads > 1:
             lane = dr.arange(types.UInt32, count * reads)
             pixel, read = lane // reads, lane % reads
@@ -197,6 +198,8 @@ class ShadingProblem(textures.TextureProblem):
         surface = surface_of(self.pyramid, net.filtered(u, v, level), net.extra(u, v, level))
         limit = None if recipe.clip is None else recipe.clip * recipe.share / size
         value = shaded(self.decoder, surface, wi, wo, self.effects, limit)
+        with all_cores():
+            dr.eval(value)  # all three at once: a sum over blocks evaluates what it is given
         if reads > 1:
             value = [dr.block_reduce(dr.ReduceOp.Add, c, reads) / reads for c in value]
         if recipe.skies:
@@ -358,12 +361,14 @@ class ShadingTraining:
                 break
 
     def part(self, settings: FitSettings, share: float) -> FitSettings:
-        """Return ``settings`` with a ``share`` of the steps."""
+        """Return ``settings`` with a ``share`` of the steps, and a batch that is not larger than the recipe's."""
         steps, recipe = max(1, round(share * self.recipe.steps)), self.recipe
         every = max(1, min(recipe.measure_every, steps // 2))
+        batch = min(settings.batch, recipe.batch)
         return dataclasses.replace(
-            settings, steps=steps, measure_every=every, seed=recipe.seed, deterministic=recipe.deterministic
-        )
+            settings, steps=steps, batch=batch, measure_every=every, seed=recipe.seed,
+            deterministic=recipe.deterministic,
+        )  # fmt: skip
 
     def footprint_errors(self, texture: CompressedTexture) -> list[list[np.ndarray]]:
         """Return the errors of held-out footprints (:meth:`.HeldOutFootprints.errors`)."""
