@@ -76,8 +76,9 @@ class ShadingSettings(FitSettings):
       ``neural_material`` alone reads.
     - ``mirrored``: share of the lights that are drawn about the mirror direction.
     - ``skies``: share of the pairs that are of a uniform sky.
-    - ``stretched``: whether footprints are stretched, and views follow from it, as on flat surfaces.
-    - ``quarters``: whether each second step is of pixels with four samples.
+    - ``rendered``: whether pairs are drawn as renders read them: footprints are stretched, and views follow from it,
+      as on flat surfaces; each second step is of pixels with four samples; exposures are those of held-out footprints,
+      and errors of levels and kinds of lights, relative to those of the start, count the same.
     - ``tables``: whether arrays are shaded by the frozen tables of task 2, in place of the formulas that
       ``neural_material`` evaluates by default.
     - ``beta_2``: Adam's decay of squared gradients. Highlights are rare: with 0.999, single ones tilt normals of
@@ -98,8 +99,7 @@ class ShadingSettings(FitSettings):
     extras: bool = False
     mirrored: float = 0.5
     skies: float = 0.25
-    stretched: bool = True
-    quarters: bool = True
+    rendered: bool = True
     tables: bool = False
     beta_2: float = 0.99
     texture: str = "ours"
@@ -110,7 +110,7 @@ SHADING_PRESETS = {
     "ours": ShadingSettings(),
     "paper": ShadingSettings(
         lr=1e-3, schedule="constant", loss="mae", share=0.25, clip=0.1, reference="prefiltered", bounded=False,
-        level_bias=0.0, mirrored=0.0, skies=0.0, stretched=False, quarters=False, tables=True, beta_2=0.999,
+        level_bias=0.0, mirrored=0.0, skies=0.0, rendered=False, tables=True, beta_2=0.999,
         texture="paper",
     ),
 }  # fmt: skip

@@ -248,6 +248,22 @@ def sky_weight(base: list[list[np.ndarray]]) -> float:
     return float(np.clip(single / max(of_sky, 1e-12), 1, MOST))
 
 
+def relative_weights(base: list[list[np.ndarray]], shares: Sequence[float], fall: float) -> np.ndarray:
+    """Return weights of errors, ``(2, levels, kinds of lights)``, read at the centre and with four samples a pixel.
+
+    They are inverse to the errors ``base``, so that a step lowers all errors by as many decibels. The mean error of
+    pairs is unchanged whose kinds of lights have the ``shares``, and whose density falls by ``fall`` from one level to
+    the next.
+    """
+    errors = []
+    for single, of_sky in (base[CASES.index(n)] for n in (0, 4)):
+        means = [x.mean(axis=-1, dtype=np.float64) for x in (single, of_sky)]
+        errors.append(np.hstack(means).reshape(-1, LIGHTS, RANGES).mean(axis=-1))
+    errors = np.maximum(errors, 1e-7)
+    density = fall ** np.arange(errors.shape[1])[:, None] * shares
+    return (errors * density).sum() / (2 * density.sum()) / errors
+
+
 def loss_or_gain(base: list[list[np.ndarray]], after: list[list[np.ndarray]]) -> tuple[float, float]:
     """Return the gain of errors ``after`` over ``base`` in dB, and the mean of all levels, cases and groups.
 

@@ -20,7 +20,7 @@ import drjit as dr
 import numpy as np
 
 from ...arrays import lookup
-from ...arrays.indirection import aligned_copy, unfolded
+from ...arrays.indirection import aligned_copy, device_array, unfolded
 from ...arrays.tables import Table
 from ...core.progress import interruptible
 from ...fitting.loop import FitResult, all_cores, sample_losses
@@ -35,12 +35,14 @@ from . import training as textures
 from .appearance import TRUTHS, ShadedEvaluation, places_in_footprints, reader, reference, share_of_bias, write_preview
 from .compressed import CompressedTexture, neutral_extras, to_table
 from .heldout import (
+    LIGHTS,
     SKY,
     HeldOutFootprints,
     compared,
     loss_or_gain,
     mean_of_skies,
     mirrored_pairs,
+    relative_weights,
     sky_weight,
     stretched_views,
     under_skies,
@@ -65,7 +67,7 @@ TRIAL = 0.1
 WEIGHTED = 0.5
 
 #: Shares of the way from the arrays before to those after the training for appearance that are compared.
-WAYS = (0.25, 0.5, 0.75, 1.0)
+WAYS = tuple(n / 8 for n in range(1, 9))
 
 #: Reads along each side of a pixel with four samples.
 QUARTERS = 2
@@ -129,8 +131,8 @@ class ShadingProblem(textures.TextureProblem):
 
     ``net`` reads the stored channels, ``pyramid`` is the truth of the maps. The gain of ``held_out`` footprints over
     ``base``, their errors before the training, decides which state is the best (``None``: the PSNR of the texture
-    decides). Shaded values are read with the recipe's level bias, the texture's loss is that of the levels as they are
-    stored.
+    decides). They also weight the errors of a ``rendered`` recipe. Shaded values are read with the recipe's level bias,
+    the texture's loss is that of the levels as they are stored.
     """
 
     #: Tolerance of the PSNR of shaded images, dB.
@@ -147,8 +149,11 @@ class ShadingProblem(textures.TextureProblem):
         #: Picture that is written at each measurement, and the images that it shows a part of
         self.preview: tuple[Path, ShadedEvaluation] | None = None
         self.effects, _ = material_effects(pyramid.layout)
-        self.exposure = 1.0 if held_out is None or recipe.tables else held_out.exposures[0]
-        self.sky_weight = 1.0 if base is None else sky_weight(base)
+        self.exposures, self.error_weights = np.ones(LIGHTS), np.ones((2, 1, LIGHTS))
+        if held_out is not None and recipe.rendered:
+            single = 1 - recipe.skies
+            shares = single * (1 - recipe.mirrored), single * recipe.mirrored, recipe.skies
+            self.exposures, self.error_weights = held_out.exposures, relative_weights(base, shares, FALL)
         self.decoder = frozen_decoder(self.types) if recipe.tables else Decoder()
         self.identity = {**self.identity, "shading": recipe.further}
 
@@ -166,22 +171,27 @@ class ShadingProblem(textures.TextureProblem):
     def shading_errors(self, net, rng, size: int):
         """Return the errors of ``size`` shaded reads, the mean over colours; ``net`` is as training sees it.
 
-        They are of footprints that are read at their centre. In each second step, if the recipe's ``quarters`` say so,
-        they are of pixels with four samples: each is the mean of reads a level finer, one in each quarter. The first
-        lanes are of skies.
+        They are of footprints that are read at their centre. In each second step of a ``rendered`` recipe, they are of
+        pixels with four samples: each is the mean of reads a level finer, one in each quarter. The first lanes are of
+        skies.
         """
         recipe, types = self.shading, self.types
-        reads = QUARTERS**2 if recipe.quarters and self.jittered else 1
+        reads = QUARTERS**2 if recipe.rendered and self.jittered else 1
         count = size // reads
         sky = dr.arange(types.UInt32, count) < int(recipe.skies * count / SKY) * SKY
         numbers = under_skies(types, sky, [rng.random(types.Float, count) for _ in range(9)])
         u, v, level = self.places(*numbers[:3])
-        stretch, *views = stretched_views(types, *numbers[3:6]) if recipe.stretched else (1, *numbers[4:6])
+        stretch, *views = stretched_views(types, *numbers[3:6]) if recipe.rendered else (1, *numbers[4:6])
         stretch += dr.zeros(types.Float, count)
         wi, wo, weight = mirrored_pairs(types, [*views, *numbers[6:]], recipe.mirrored)
+        lights = dr.select(sky, LIGHTS - 1, types.UInt32(numbers[-1] < recipe.mirrored))
+        weights = self.error_weights[int(reads > 1)]
+        row = dr.minimum(types.UInt32(level), len(weights) - 1)
+        weight *= dr.gather(types.Float, device_array(types.Float, weights), row * LIGHTS + lights)
+        exposure = dr.gather(types.Float, device_array(types.Float, self.exposures), lights)
         with all_cores():
             truth = reference(recipe.reference, self.pyramid, u, v, level, wi, wo, self.effects, rng, stretch=stretch)
-            dr.eval(u, v, level, stretch, wi, wo, weight, truth)
+            dr.eval(u, v, level, stretch, wi, wo, weight, exposure, truth)
         if reads > 1:
             lane = dr.arange(types.UInt32, count * reads)
             pixel, read = lane // reads, lane % reads
@@ -204,9 +214,8 @@ class ShadingProblem(textures.TextureProblem):
             value = [dr.block_reduce(dr.ReduceOp.Add, c, reads) / reads for c in value]
         if recipe.skies:
             value, truth = ([mean_of_skies(sky, c) for c in x] for x in (value, truth))
-            weight = dr.select(sky, dr.opaque(types.Float, self.sky_weight), weight)
         bounded = _bounded if recipe.bounded else (lambda x: x)
-        errors = [bounded(a * self.exposure) - bounded(b * self.exposure) for a, b in zip(value, truth, strict=True)]
+        errors = [bounded(a * exposure) - bounded(b * exposure) for a, b in zip(value, truth, strict=True)]
         squared = self.settings.loss == "mse"
         return reads * weight * sum(dr.square(e) if squared else dr.abs(e) for e in errors) / 3
 
@@ -305,8 +314,8 @@ class ShadingTraining:
         self.first = CompressedTexture(self.layout, textures.stored_form(start), start_bias)
         bias = recipe.level_bias
         self.biases = BIASES if bias is None else (bias,)
-        # Every second one if time is limited: comparisons take it from trainings
-        self.ways = WAYS if request.deadline is None else WAYS[1::2]
+        # Every fourth one if time is limited: comparisons take it from trainings
+        self.ways = WAYS if request.deadline is None else WAYS[3::4]
         self.trained_bias = TRAINED_BIAS if bias is None else bias
         self.states, self.begin = [TrainedState("start", self.first, 0.0, 0.0)], []
         #: Name, first arrays and problem of the training in progress, which Ctrl-C may end

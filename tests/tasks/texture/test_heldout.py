@@ -34,6 +34,7 @@ from mi_diffind.tasks.texture.heldout import (
     HeldOutFootprints,
     loss_or_gain,
     mirrored_pairs,
+    relative_weights,
     sky_weight,
     stretched_views,
     under_skies,
@@ -398,11 +399,25 @@ def bumpy(ad):
     return pyramid_of(ad, {name: np.rint(255 * values).astype(np.uint8) for name, values in maps.items()})
 
 
+def test_relative_weights():
+    """Weighted errors of the start are equal by level and light, and their mean over the drawn pairs is unchanged."""
+    rng = np.random.default_rng(2)
+    base = [
+        [scale * rng.random((3, 2 * RANGES, 50)), 9 * scale * rng.random((3, RANGES, 8))] for scale in (1, 2, 0.1, 4)
+    ]
+    weights = relative_weights(base, (0.5, 0.2, 0.3), 0.6)
+    means = [np.hstack([x.mean(axis=-1) for x in base[i]]).reshape(3, 3, RANGES).mean(axis=-1) for i in (0, 2)]
+    weighted = weights * means
+    np.testing.assert_allclose(weighted, weighted[0, 0, 0])
+    shares = 0.6 ** np.arange(3)[:, None] * (0.5, 0.2, 0.3)
+    np.testing.assert_allclose((shares * weighted).sum(), (shares * means).sum())
+
+
 @pytest.mark.parametrize("jittered", [False, True])
 def test_pixels_with_four_samples(ad, monkeypatch, jittered):
     """The loss of each second step is that of the mean of a read in each quarter, a level finer; else of one read.
 
-    Half of the pairs are of skies: the mean of their lights counts.
+    Half of the pairs are of skies: the mean of their lights counts. Weights and exposures are those of level and light.
     """
     pyramid, drawn = bumpy(ad), {}
     effects, _ = material_effects(pyramid.layout)
@@ -411,7 +426,8 @@ def test_pixels_with_four_samples(ad, monkeypatch, jittered):
     size = TextureBudget(SIDE, SIDE, pyramid.layout.stored, parse_structure("0:1:2,1:2:4"), 2, 3, 5, 3)
     net = from_components(pyramid.values, size, ("repeat", "repeat"))
     problem = shading.ShadingProblem(net.changed(lambda a, bits: a.alloc(ad.TensorXf)), pyramid, recipe)
-    problem.jittered, problem.settings, problem.exposure, problem.sky_weight = jittered, recipe, 1.0, 3.0
+    problem.jittered, problem.settings, problem.exposures = jittered, recipe, [2.0, 5.0, 3.0]
+    weights = problem.error_weights = np.arange(12.0).reshape(2, 2, 3) + 1  # level 1 and coarser
 
     def keep(name, function):
         def kept(*arguments, **named):
@@ -443,7 +459,9 @@ def test_pixels_with_four_samples(ad, monkeypatch, jittered):
             total = total + numpy_of(read(ad.Float(aligned(x)), ad.Float(aligned(y)), finer, wi, wo)) / 4
     sky, single = np.split(total, 2)
     sky = np.repeat(sky.reshape(-1, SKY, 3).mean(axis=1), SKY, axis=0)
-    expected = np.concatenate([3 * sky, single]).sum(axis=1) / 3
+    expected = np.concatenate([3 * sky, 2 * single]).sum(axis=1) / 3
+    lights = np.where(np.arange(pixels) < pixels // 2, 2, 0)
+    expected *= weights[int(jittered), np.minimum(level.numpy().astype(int), 1), lights]
     # Times the number of reads: a step draws as many fewer pixels
     np.testing.assert_allclose(errors, (4 if jittered else 1) * expected, rtol=2e-3, atol=2e-5)
 

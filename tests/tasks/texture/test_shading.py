@@ -372,7 +372,7 @@ def test_extras_are_trained_stored_and_read_by_the_material_alone(mi_rgb, start,
 def test_training_reads_the_level_that_a_file_is_read_at(start, ad):
     """Arrays whose levels differ: the loss of round footprints at a bias is that of what a biased file reads."""
     _, pyramid, table, *_ = start
-    recipe = quick(share=1.0, stretched=False)
+    recipe = quick(share=1.0, rendered=False)
     problem = training.ShadingProblem(training.trainable_arrays(table, pyramid), pyramid, recipe)
     problem.settings, losses = problem.shading, []
     for bias, net in ((-0.5, problem.net), (0.0, CompressedTexture(pyramid.layout, problem.net, -0.5))):
