@@ -238,13 +238,6 @@ def trust_cell(results: list[Entries]) -> str:
 # -- training for shaded values ----------------------------------------------------------------------------------------
 
 
-def shading_runs(study: Entries, material: str, letter: str) -> dict[float, list[float]]:
-    """Return the mean PSNR in dB of the trainings of a material, one a seed, by λ; ``letter`` is that of the truth."""
-    details = [job.details for job in study.jobs.values()]
-    runs = [d for d in details if d.material == material and d.kind == "run" and d.way == "clip, schedule"]
-    return {share: [d[letter]["mean_db"] for d in rows] for (share,), rows in groups(runs, "share").items()}
-
-
 def shaded_materials(*studies: Entries) -> dict[str, dict[str, list[Entries]]]:
     """Return the records of each material by their kind; studies without renders are left out."""
     records = [
@@ -347,7 +340,7 @@ FUNCTIONS = {
         min, max, sum, len, round, abs, all, any, sorted, next, iter, zip, map, list, dict, range, tuple, float,
         Entries, measured, every, one, ratio, time_over, equal_samples, cells, median, with_spread,
         size_text, binary_size, asset_bytes, equal_quality, scene_runs, with_network, budgets, by_label,
-        surface_errors, trust_cell, shading_runs, shaded_renders, shaded_levels, over_filters, held_out, shipped,
+        surface_errors, trust_cell, shaded_renders, shaded_levels, over_filters, held_out, shipped,
         trust_cells,
     )
 } | {"mean": mean, "RENDERS": RENDERS}  # fmt: skip
