@@ -17,11 +17,12 @@ get them by expressions (``figures.py``) in three files:
       grid = "nerf_scenes.rows[0].psnr_white_db"
       minutes = "nerf_scenes.rows[0].minutes"
 
-``tasks.md`` is made from the declarations of tasks. With ``--check`` nothing is written, and the exit code is 1 if a
-page or a CSV file would change. ``--list`` prints the numbers of pages that no file backs: those that neither a table
-nor a sentence inserts and that are no settings. A *setting* says what was chosen and not what came out: bits, samples,
-steps, sides, ratios such as 12x, and the phrases of ``settings.toml``. Code, addresses, versions, years, numbers of
-sections and digits of a name (``float32``) are not numbers.
+``docs/measured/files.csv`` lists the command of each file, ``sentences.csv`` the files of each sentence. With
+``--check`` nothing is written, and the exit code is 1 if a page or a CSV file would change. ``--list`` prints the
+numbers of pages that no file backs: those that neither a table nor a sentence inserts and that are no settings. A
+*setting* says what was chosen and not what came out: bits, samples, steps, sides, ratios such as 12x, and the phrases
+of ``settings.toml``. Code, addresses, versions, years, numbers of sections and digits of a name (``float32``) are not
+numbers.
 """
 
 from __future__ import annotations
@@ -50,7 +51,6 @@ from figures import (
 )
 
 import mi_diffind
-from mi_diffind.fitting.task import tasks
 
 # -- tables ------------------------------------------------------------------------------------------------------------
 
@@ -247,7 +247,7 @@ def unbacked(page: str, text: str) -> list[str]:
 def pages() -> dict[str, str]:
     """Return the text of the README, of each page that is written by hand, and of each notebook, by its name."""
     paths = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
-    texts = {p.name: p.read_text(encoding="utf-8") for p in paths if p.name not in ("tasks.md", "figures.md")}
+    texts = {p.name: p.read_text(encoding="utf-8") for p in paths}
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
         cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
         texts[path.name] = "\n\n".join("".join(c["source"]) for c in cells if c["cell_type"] == "markdown")
@@ -255,39 +255,6 @@ def pages() -> dict[str, str]:
 
 
 # -- pages -------------------------------------------------------------------------------------------------------------
-
-
-def page_of_tasks() -> str:
-    """Return the page of all tasks: their presets, and the files that ship."""
-    parts = [
-        "# All tasks and presets\n\nMade from the declarations of the tasks by `python docs/make_tables.py`: "
-        "change those, not this page.\n"
-    ]
-    for task in tasks().values():
-        page = {"scene": "shading"}.get(task.name, task.name)
-        section = f"Paper: {task.section}. " if task.section else ""
-        parts.append(f"## `{task.name}`: {task.title}\n\n{section}Page: [{page}]({page}.md).\n")
-        rows = [
-            [f"`{name}`" + (" (default)" if i == 0 else ""), s.steps, f"{s.batch:,}", f"{s.lr:g}", s.schedule, s.loss]
-            for i, (name, s) in enumerate(task.presets.items())
-        ]
-        parts.append(f"{table(['preset', 'steps', 'samples a step', 'learning rate', 'schedule', 'loss'], rows)}\n")
-        if task.shipped:
-            rows = []
-            for preset in task.shipped:
-                shipped = task.load(task.file(preset=preset))
-                rows.append([
-                    f"`{shipped.path.name}`", f"`{preset}`", f"{shipped.nbytes:,}",
-                    f"{shipped.measured['psnr_db']:.1f}",
-                    f"`mi-diffind fit {task.name} --preset {preset} -o {shipped.path.name}`",
-                ])  # fmt: skip
-            parts.append(f"{table(['file that ships', 'preset', 'bytes of entries', 'PSNR, dB', 'made by'], rows)}\n")
-        if task.arguments:
-            parts.append(
-                "Arguments of its own: " + ", ".join(f"`{a.flags[0]}`" for a in task.arguments) + "; see "
-                f"`mi-diffind fit {task.name} --help`.\n"
-            )
-    return "\n".join(parts)
 
 
 def machine(name: str) -> str:
@@ -299,36 +266,26 @@ def machine(name: str) -> str:
     return f"{m.cpu} {processor}".rstrip() + f", cores: {m.cores}, {m['mi-diffind']}"
 
 
-def page_of_figures(pages: dict[Path, str]) -> str:
-    """Return the page that names the command of each file, and the files of each sentence of ``pages`` with figures."""
-    sentences = []
-    for claim in claims():
-        link = claim.page if claim.path.parent == DOCS else f"../{claim.page}"
-        sources = ", ".join(f"[{n}](measured/{n}.json)" for n in claim.files) or "files that ship"
-        sentence = re.sub(r"\s+", " ", claim.matches(pages[claim.path])[0][0]).replace("|", "\\|").replace("**", "")
-        sentences.append([f"[{claim.page}]({link})", sentence, sources])
-    written_by = [
-        [f"[{name}](measured/{name}.json)", "`{}`".format(command.replace("|", "\\|")), machine(name)]
-        for name, command in sorted(commands().items())
+#: Files that :func:`lists` writes.
+LISTS = (DOCS / "measured" / "files.csv", DOCS / "measured" / "sentences.csv")
+
+
+def lists(pages: dict[Path, str]) -> dict[Path, str]:
+    """Return CSV files with the command of each JSON file, and with the files of each sentence with figures."""
+    written_by = [[name, command, machine(name)] for name, command in sorted(commands().items())]
+    sentences = [
+        [claim.page, re.sub(r"\s+", " ", claim.matches(pages[claim.path])[0][0]), " ".join(claim.files)]
+        for claim in claims()
     ]
-    parts = [
-        "# Where the figures come from",
-        "Each figure of the README and of the pages is inserted from a file in `docs/measured`, which the command "
-        "below wrote. Machines differ (–: not recorded); files of version 0.1.0 were measured on the way to 0.2.0. "
-        "A command after `git checkout` is "
-        "one of that commit: this version has its script, or some of its rivals, no longer.\n"
-        "This page is made by `python docs/make_tables.py`; `--list` prints the numbers that no file backs.",
-        "## Files and commands",
-        table(["file", "command", "machine, version of this package"], written_by),
-        "## Sentences",
-        table(["page", "sentence", "files"], sentences),
-    ]
-    return "\n\n".join(map(str, parts)) + "\n"
+    return {
+        LISTS[0]: table(["file", "command", "machine, version"], written_by).csv(),
+        LISTS[1]: table(["page", "sentence", "files"], sentences).csv(),
+    }
 
 
 def written() -> tuple[dict[Path, str], list[str]]:
     """Return all pages and CSV files with the figures of the JSON, and a sentence for each that cannot be written."""
-    pages, csv_files, troubles = {DOCS / "tasks.md": page_of_tasks()}, {}, []
+    pages, csv_files, troubles = {}, {}, []
 
     def block(match: re.Match) -> str:
         begin, name, end = match.groups()
@@ -338,7 +295,7 @@ def written() -> tuple[dict[Path, str], list[str]]:
         return f"{begin}{content.page_text(name)}\n{end}"
 
     for path in sorted(DOCS.glob("*.md")):
-        text = pages.get(path) or path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8")
         pages[path] = re.sub(r"(<!-- table (\w+) -->\n)(?:(?:\|.*|All \d.*)?\n)*(<!-- end -->)", block, text)
     for claim in claims():
         try:
@@ -349,8 +306,8 @@ def written() -> tuple[dict[Path, str], list[str]]:
         except ClaimError as error:
             troubles.append(str(error))
     if not troubles:
-        pages[DOCS / "figures.md"] = page_of_figures(pages)
-    for path in sorted(set((DOCS / "measured").glob("*.csv")) - csv_files.keys()):
+        csv_files |= lists(pages)
+    for path in sorted(set((DOCS / "measured").glob("*.csv")) - csv_files.keys() - {*LISTS}):
         troubles.append(f"measured/{path.name}: no page has a shortened table of this name; remove the file")
     return pages | csv_files, troubles
 
