@@ -122,8 +122,7 @@ class _Reader:
 
     def _image(self, texture: str, info: dict) -> str:
         """Return the path or name of the image of a texture, "" if its format is not read."""
-        extensions = info.get("extensions", {})
-        self.notes += [f"{texture}: {name} is not used" for name in extensions]
+        self.notes += [f"{texture}: {name} is not used" for name in info.pop("extensions", {})]
         if info.get("texCoord", 0):
             self.notes.append(f"{texture}: its texture coordinates, set {info['texCoord']}, are not used")
         source = self.content["textures"][info["index"]]

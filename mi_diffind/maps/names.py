@@ -192,7 +192,7 @@ def _candidates(folder: Path, name: str, images: ImageFiles) -> tuple[list[_Fold
         target = "roughness" if part == "smoothness" else part
         entry = MapEntry(
             target, file, content if content.role == target else None, letter if content.packed else None,
-            inverted=part == "smoothness", opaque=True, single=True,
+            inverted=part == "smoothness", opaque=True, single=target not in ("albedo", "normal"),
         )  # fmt: skip
         rank = 2 * content.packed + (entry.inverted or content.y_down)
         candidates += [] if part == "-" else [_FolderImage(entry, rank, max(sizes, default=0), words)]
