@@ -350,6 +350,10 @@ def test_the_table_says_what_was_changed(tmp_path):
 
 
 REFUSALS = {}
+NO_MAPS = (
+    "is a folder without an image that has the name of a map: write a manifest there, as in "
+    '{"maps": {"albedo": "FILE.png"}}'
+)
 
 
 def refusal(sentence):
@@ -374,13 +378,12 @@ def maps_of_two_materials(folder):
     return write(folder, brick_Color__png=COLOR, wood_Normal__png=NORMAL)
 
 
-@refusal('DIR: holds no image with the name of a map: write a manifest there, as in {"maps": {"albedo": "FILE.png"}}')
+@refusal(f"DIR: {NO_MAPS}")
 def unknown_names(folder):
     return write(folder, one__png=COLOR, two__png=NORMAL)
 
 
-@refusal('DIR: holds no image with the name of a map: write a manifest there, as in {"maps": {"albedo": "FILE.png"}}, '
-         "or name m.gltf")  # fmt: skip
+@refusal(f"DIR: {NO_MAPS}, or name m.gltf")
 def a_folder_of_a_model(folder):
     return gltf(write(folder, one__png=COLOR), name="m.gltf").parent
 

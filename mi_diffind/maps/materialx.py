@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from xml.etree import ElementTree
 
 from ..core.errors import reason
 from ..core.files import irregular, shown
@@ -73,6 +72,8 @@ def read_materialx(path: Path, name: str, images: ImageFiles) -> tuple[list[MapE
 
 def _check(path: Path) -> None:
     """Raise :class:`SourceError` for a file that is no XML, or too large or deep for the package's own reader."""
+    from xml.etree import ElementTree
+
     if fault := irregular(path, MOST_BYTES):
         raise SourceError(f"{shown(path)}: {fault}")
     depth = 0

@@ -153,7 +153,7 @@ def _check_material(folder: Path, chosen: list[_FolderImage]) -> None:
     """Raise :class:`SourceError` if there are no maps, or the names before them are those of several materials."""
     if not chosen:
         advice = _advice([MapEntry("albedo", "FILE.png")])
-        raise SourceError(f"{shown(folder)}: holds no image with the name of a map: {advice}")
+        raise SourceError(f"{shown(folder)}: is a folder without an image that has the name of a map: {advice}")
     materials = sorted({candidate.words[0] for candidate in chosen}, key=lambda words: (len(words), words))
     for shorter, longer in itertools.pairwise(materials):
         if longer[: len(shorter)] != shorter:

@@ -303,7 +303,7 @@ def test_not_an_image(tmp_path):
     (tmp_path / "text.png").write_text("This is text, and not an image. " * 3)
     for name, match in {
         "missing.png": "no such file",
-        "folder": "holds no image",
+        "folder": "is a folder",
         "text.png": "cannot be read",
     }.items():
         refused(match, tmp_path / name)
