@@ -447,6 +447,16 @@ def gltf_with_a_wrong_index(folder):
     return gltf(three(folder), normalTexture={"index": 9})
 
 
+@refusal("DIR/m.gltf: is no valid glTF file (ValueError: could not convert string to float: 'red')")
+def gltf_with_a_word_for_a_number(folder):
+    return gltf(three(folder), pbrMetallicRoughness=pbr(metallicFactor="red"))
+
+
+@refusal('DIR/m.gltf: map "roughness" has the factors (inf,), allowed are numbers up to 1e+06')
+def gltf_with_an_infinite_factor(folder):
+    return gltf(three(folder), pbrMetallicRoughness=pbr(roughnessFactor=float("inf")))
+
+
 @refusal("DIR/m.gltf: is cut short, buffer view 0 ends behind its buffer")
 def gltf_with_a_short_buffer(folder):
     views = {"bufferViews": [{"buffer": 0, "byteLength": 99}], "buffers": [{"uri": "data:;base64,AAAA"}]}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import binascii
 import json
+import os
 import struct
 from pathlib import Path
 from urllib.parse import unquote_to_bytes
@@ -40,9 +41,9 @@ def read_gltf(path: Path, name: str, images: ImageFiles) -> tuple[list[MapEntry]
         names = [material.get("name", f"material{i}") for i, material in enumerate(materials)]
         material = materials[choose_material(path, names, name)]
         return _Reader(path, content, binary, images).entries(material)
-    except (LimitError, PictureError) as e:
+    except (SourceError, LimitError, PictureError) as e:
         raise SourceError(str(e)) from None
-    except (AttributeError, IndexError, KeyError, TypeError, struct.error) as e:
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, struct.error) as e:
         raise SourceError(f"{shown(path)}: is no valid glTF file ({type(e).__name__}: {reason(e)})") from None
 
 
@@ -149,7 +150,7 @@ class _Reader:
             raise SourceError(f"{shown(self.path)}: names {uri!r:.80}, allowed are files and data")
         decoded = unquote_to_bytes(uri).decode(errors="replace")
         path = self.images.find(self.path.parent, decoded, self.path)
-        return path if Path(path).exists() else self.images.find(self.path.parent, uri, self.path)
+        return path if os.path.exists(path) else self.images.find(self.path.parent, uri, self.path)
 
     def _decoded(self, data: str, encoded: bool) -> bytes:
         """Return the data of a URI."""

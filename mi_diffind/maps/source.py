@@ -177,6 +177,8 @@ def _load(path: Path, entries: list[MapEntry], notes: list[str], images: ImageFi
     maps = []
     for entry in entries:
         where, content = f'{path}: map "{entry.name}"', entry.content or content_of(entry.name)
+        if not all(abs(factor) <= MOST_FACTOR for factor in entry.factor):  # NaN, too
+            raise SourceError(f"{where} has the factors {entry.factor}, allowed are numbers up to {MOST_FACTOR:,g}")
         if entry.constant:
             values = np.array(entry.factor, np.float32).reshape(1, 1, -1)
             maps.append(_RawMap(values, replace(entry, content=content, factor=())))
