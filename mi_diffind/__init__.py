@@ -25,6 +25,7 @@ _NAMES = {
     "open": "fitting.task:open_model",
     "save": "scenes.conversion",
     "from_arrays": "maps.source",
+    "load_source": "maps.source",
     "example_maps": "studies.example_maps",
     # Scenes
     "load_file": "scenes.loading",

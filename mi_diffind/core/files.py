@@ -306,14 +306,15 @@ def path_within(folder: str | os.PathLike, name: str, file: str | os.PathLike) -
     return Path(folder) / name
 
 
-def path_by_name(folder: str | os.PathLike, name: str, file: str | os.PathLike) -> Path:
+def path_by_name(folder: str | os.PathLike, name: str, file: str | os.PathLike, outside: bool = False) -> Path:
     """Return :func:`path_within` of a ``name`` that may have been written on another system.
 
     Where there is no such file, backslashes are slashes, and a name that differs in upper and lower case alone is taken
-    if it is the only one. Raises :class:`OutsideError`.
+    if it is the only one. ``outside``: any path is allowed, for a ``file`` that the user has named. Raises
+    :class:`OutsideError`.
     """
     for spelling in (name, name.replace("\\", "/")):
-        path = path_within(folder, spelling, file)
+        path = Path(folder) / spelling if outside else path_within(folder, spelling, file)
         if os.path.lexists(path):
             return path
     if os.path.isabs(spelling):

@@ -14,7 +14,10 @@ _SIZES = (
 )
 
 SOURCE = Argument(
-    "source", file="read", metavar="IMAGE|MATERIAL.json", help="an image, or a manifest of the maps of a material"
+    "source",
+    file="read",
+    metavar="IMAGE|FOLDER|MATERIAL",
+    help="an image, a folder of maps, a manifest (.json), or FILE.gltf, .glb or .mtlx with #NAME of a material",
 )
 
 #: Ways to give the size of the arrays, of which at most one is allowed.

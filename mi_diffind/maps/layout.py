@@ -14,7 +14,8 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from ..arrays.pages import page_gain
-from .source import ROLES, Map, Source
+from .entries import ROLES
+from .source import Map, Source
 
 #: Least PSNR, in dB, of the third component of a normal that is derived from the other two.
 NORMAL_FLOOR_DB = 45.0
@@ -218,7 +219,7 @@ class Layout:
             role, color_space = str(entry["kind"]), str(entry["color_space"])
             low, high, knee = (float(entry[k]) for k in ("low", "high", "knee"))
             depth = int(entry["depth"])
-            if not where or role not in ROLES or color_space not in ("srgb", "linear") or depth not in (1, 2, 4):
+            if not where or role not in ROLES or color_space not in ("srgb", "linear") or depth not in (0, 1, 2, 4):
                 raise ValueError(f'the map "{entry["name"]}" has an unknown role, color space or depth')
             if FROM_NORMAL in where and (where.index(FROM_NORMAL) != 2 or where.count(FROM_NORMAL) != 1):
                 raise ValueError(f'the map "{entry["name"]}" derives another channel than the third from a normal')

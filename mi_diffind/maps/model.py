@@ -14,7 +14,7 @@ from ..arrays.indirection import DifferentiableArray
 from ..arrays.pages import SIDE_BITS, page_counts, page_shift
 from ..arrays.tables import MAX_BYTES, PAGES, Table, TableError, allocate_pages, page_sides
 from ..core import units
-from ..core.errors import UsageError
+from ..core.errors import UsageError, printable
 from ..core.files import replacing
 from ..core.threads import threads_for_files
 from ..fitting.loop import FitResult, Problem
@@ -123,7 +123,14 @@ def size_figures(source: Source, table, requested: float | None, spare: float = 
         "bits": {name: a.bits for name, a in table.arrays.items()},
     }
     wanted = f" ({source.nbytes / requested:.2f}x requested)" if requested else ""
-    lines = [(f"{achieved:.2f}x" if achieved else "of one colour") + wanted]
+    figures["bits_per_texel"] = 8 * table.nbytes / source.texels
+    size = f"{achieved:.2f}x" if achieved else "of one colour"
+    lines = [f"{size}{wanted}, {figures['bits_per_texel']:.2f} bits a texel"]
+    if 0 < source.file_nbytes < table.nbytes:
+        lines.append(
+            f"the files of the source have {source.file_nbytes:,} bytes, fewer than these arrays ({table.nbytes:,}); "
+            f"in the memory of a renderer they take {source.nbytes:,}"
+        )
     if requested and achieved and not Budget(requested).is_met(table.nbytes + spare):
         asked, actual = f"{round(requested):,} bytes were requested", f"{table.nbytes:,}"
         lines.append(f"{asked}, but {actual} are the nearest that the arrays of this image allow")
@@ -201,6 +208,21 @@ def fit_maps(
     return table, result
 
 
+def load_maps(request: FitRequest) -> Source:
+    """Load the source of a request, and print of which files its maps are made. Raises :class:`.SourceError`."""
+    source = load_source(request.options["source"], nonfinite=request.options["nonfinite"], outside=True)
+    if request.progress and isinstance(request.options["source"], (str, os.PathLike)) and len(source.maps) > 1:
+        print("\n".join(map(printable, origin_lines(source))))
+    return source
+
+
+def origin_lines(source: Source) -> list[str]:
+    """Return a table of the file, channels, color space, factor and change of each map of a source."""
+    rows = [[name.replace("_", " ") for name in source.origins[0]], *(list(row.values()) for row in source.origins)]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(f"{cell:{n}}" for cell, n in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
 def rehearse_pictures(request: FitRequest, source: Source) -> None:
     """Render the pictures of a source before a training whose time is limited: their measurement takes as long."""
     if request.deadline is not None and as_seen.shows(source):
@@ -216,7 +238,7 @@ def complete(
     fitted.table.settings |= request.paths(source_path=request.options["source"])
     figures, lines = size_figures(source, fitted.table, requested, spare)
     fitted.lines += [*lines, *source.notes]
-    fitted.figures = {**figures, **fitted.figures}
+    fitted.figures = {**figures, "origins": list(source.origins), **fitted.figures}
     return fitted
 
 

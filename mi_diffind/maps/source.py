@@ -1,14 +1,17 @@
-"""Sources of a compression: one image, or the maps of a material that a JSON manifest lists.
+"""Sources of a compression: one image, or the maps of a material.
 
-A manifest gives the name and the file of each map, relative to the manifest's folder::
+A material is a folder of maps (:mod:`.names`), a material of a glTF (:mod:`.gltf`) or MaterialX file
+(:mod:`.materialx`), or a manifest, which gives the name and the file of each map, relative to its folder::
 
     {"maps": {"albedo": "base.png",
               "normal": {"file": "n.png", "color_space": "linear"},
-              "roughness": {"file": "orm.png", "channels": "g"},
+              "roughness": {"file": "gloss.png", "invert": true},
+              "metallic": {"file": "orm.png", "channels": "b", "factor": 0.5},
               "ao": {"file": "orm.png", "channels": "r"}}}
 
 or is the content of ``"maps"`` alone. ``channels`` are letters among ``r``, ``g``, ``b`` and ``a``, or a list of
-indices (needed for a multi-channel EXR). Images are read by ``mitsuba.Bitmap``: PNG, JPEG, EXR, HDR, PFM, BMP, TGA. No
+indices (needed for a multi-channel EXR); ``invert`` takes 1 minus the values; ``factor`` multiplies them, colours in
+linear light, of a normal map x and y. Images are read by ``mitsuba.Bitmap``: PNG, JPEG, EXR, HDR, PFM, BMP, TGA. No
 variant of Mitsuba has to be set.
 
 The name of a map, or if it is unknown that of its file, tells its role and color space (:mod:`.names`). What had to be
@@ -19,88 +22,34 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
-import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from ..core.archives import Allowance, LimitError, json_bytes
-from ..core.errors import DiffindError, reason
-from ..core.files import MOST_TEXT, OutsideError, RecordedKeys, path_by_name, unused_note
-from ..images.reader import DEPTHS, ENCODED, MAX_CHANNELS, Picture, PictureError, read_file, read_picture
+from ..core.errors import reason
+from ..core.files import MOST_TEXT, RecordedKeys, unused_note
+from ..images import srgb
+from ..images.reader import DEPTHS, ENCODED, MAX_CHANNELS, Picture, PictureError, read_file
+from .entries import (
+    COLOR_SPACES,
+    COLOURS,
+    UNKNOWN,
+    Content,
+    ImageFiles,
+    MapEntry,
+    SourceError,
+    equal,
+    split_material,
+    transparent,
+)  # fmt: skip
+from .gltf import read_gltf
+from .materialx import read_materialx
+from .names import content_of, read_folder
 
-#: Roles of maps.
-ROLES = ("albedo", "normal", "roughness", "ao", "metallic", "other")
-
-#: Words before the others that name a further lobe: its colour is no albedo, its roughness not that of the material.
-LOBES = {
-    *("sheen", "specular", "spec", "coat", "clearcoat", "emission", "emissive", "subsurface", "transmission", "detail"),
-    *("fuzz", "edge", "attenuation", "iridescence", "film", "volume"),
-}
-
-#: Words at the end that say nothing of the content, beside numbers and resolutions.
-IGNORED = {"map", "texture", "tex", "jpg", "jpeg", "png", "exr", "tif", "tiff", "tga", "lod", "var", "udim"}
-
-_WORD = re.compile(r"\d+[kK](?![a-zA-Z])|[dD]3[dD]|[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
-
-
-@dataclass(frozen=True)
-class Content:
-    """Content of a map: its ``role`` (:data:`ROLES`).
-
-    ``colours``: values are colours, sRGB in images of 8 and 16 bits; ``packed``: channels are maps of their own;
-    ``y_down``: normals of DirectX.
-    """
-
-    role: str
-    colours: bool = False
-    packed: bool = False
-    y_down: bool = False
-
-
-_NORMALS = ("normal", "normals", "normalmap", "nrm", "nor", "norm")
-
-#: Content → names of maps. Normal maps may have an end that tells whether y points down, as in DirectX.
-_NAMES = {
-    Content("albedo", colours=True): "albedo basecolor basecolour base basemap diff diffuse diffusecolor diffusecolour "
-    "color colour col maintex albedotransparency",
-    Content("roughness"): "roughness rough specularroughness",
-    Content("ao"): "ao occlusion ambientocclusion mixedao",
-    Content("metallic"): "metallic metalness metal basemetalness",
-    Content("other", colours=True): "emissive emission emit translucency speccolor specularcolor",
-    Content("other"): "data alpha opacity mask height disp displacement bump cavity curvature thickness spec specular "
-    "gloss glossiness smoothness anisotropy transmission parallax refl",
-    Content("other", packed=True): "arm orm rma mra mro metallicroughness metalrough occlusionroughnessmetallic "
-    "metallicsmoothness metallicgloss maskmap",
-    **{
-        Content("normal", y_down=down): " ".join(name + end for name in _NORMALS for end in ends)
-        for down, ends in ((False, ("", "gl", "ogl", "opengl")), (True, ("dx", "directx", "d3d")))
-    },
-}
-_CONTENTS = {name: content for content, names in _NAMES.items() for name in names.split()}
-
-#: Most words of a name of :data:`_CONTENTS`.
-_LONGEST = 3
-
-
-def content_of(name: str) -> Content | None:
-    """Return the content of a map by its name, or by the name of its file without an extension; ``None`` if unknown."""
-    words = [word.lower() for word in _WORD.findall(name)]
-    for ignored in (False, True):  # "maskmap" is a name, the "map" of "normal_map" is not
-        while ignored and words and (words[-1] in IGNORED or words[-1][0].isdigit()):
-            words.pop()
-        for count in range(min(_LONGEST, len(words)), 0, -1):
-            text = "".join(words[-count:])
-            content = _CONTENTS.get(text) or _CONTENTS.get(text.removesuffix("texture").removesuffix("map"))
-            if content is not None:
-                further = LOBES.intersection(words[:-count])
-                return Content("other", content.colours) if further else content
-    return None
-
-
-COLOR_SPACES = ("srgb", "linear")
 NONFINITE = ("error", "clean")
 
 #: Largest distance of a normal's length from 1.
@@ -112,13 +61,11 @@ _LOOKS_NORMAL = 0.95
 #: Least share of normals among the texels of an image that has the name of a normal map.
 _NAMED_NORMAL = 0.5
 
-#: Content of images without a name, and of maps with an unknown one.
-_COLOURS = Content("albedo", colours=True)
-_UNKNOWN = Content("other")
+#: Largest magnitude of a factor.
+MOST_FACTOR = 1e6
 
-
-class SourceError(DiffindError, ValueError):
-    """A source cannot be used; the message is one sentence that names the file and the fault."""
+#: Keys of a map in a manifest.
+KEYS = ("file", "channels", "color_space", "invert", "factor")
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +75,8 @@ class Map:
     - ``values``: ``(height, width, channels)``, float32, in the encoding of ``file`` (bytes divided by 255, 16-bit
       numbers by 65535).
     - ``color_space``: ``"srgb"`` if they carry the sRGB transfer function, else ``"linear"``.
-    - ``role``: one of :data:`ROLES`; ``depth``: bytes of a channel in the source (1, 2 or 4).
+    - ``role``: one of :data:`.entries.ROLES`; ``depth``: bytes of a channel in the source: 1, 2 or 4, 0 for a constant
+      without an image.
     """
 
     name: str
@@ -148,7 +96,8 @@ class Source:
     """The ``maps`` of an image or material, all of ``height`` × ``width`` texels, with at most 16 channels together.
 
     ``digest`` is a SHA-256 over their names, layout and values; ``cleaned`` counts the NaN and infinite values that
-    were replaced. ``notes`` are sentences about what was guessed, changed or not used, for people.
+    were replaced. ``notes`` are sentences about what was guessed, changed or not used, for people; ``origins`` say of
+    which file and channels each map is made, and how; ``file_nbytes`` are the bytes of these files (0: none).
     """
 
     maps: tuple[Map, ...]
@@ -157,6 +106,8 @@ class Source:
     digest: str
     cleaned: int = 0
     notes: tuple[str, ...] = ()
+    origins: tuple[dict[str, str], ...] = ()
+    file_nbytes: int = 0
 
     @property
     def channels(self) -> int:
@@ -173,18 +124,21 @@ class Source:
         return self.texels * sum(m.channels * m.depth for m in self.maps)
 
 
-def load_source(source, nonfinite: str = "error", named: bool = True) -> Source:
-    """Read an image or a manifest (``.json``), or take the maps that ``source`` holds in memory.
+def load_source(source, nonfinite: str = "error", named: bool = True, outside: bool = False) -> Source:
+    """Read an image or a material, or take the maps that ``source`` holds in memory.
 
-    In memory, ``source`` is a :class:`Source`, an image (an array ``(height, width, channels)`` or a ``mi.Bitmap``), or
-    a dictionary of such images and of image files by the name of the map (:func:`from_arrays`).
+    A material is a manifest (``.json``), a folder of maps, or a material of a glTF or MaterialX file (``.gltf``,
+    ``.glb``, ``.mtlx``), ``FILE#NAME`` if there are several. In memory, ``source`` is a :class:`Source`, an image (an
+    array ``(height, width, channels)`` or a ``mi.Bitmap``), or a dictionary of such images and of image files by the
+    name of the map (:func:`from_arrays`). Images of a material may lie anywhere with ``outside``, for a file that the
+    user has named, else in the folder of the file that names them.
 
     An image is a map called ``"image"`` and, if it has an alpha channel, a map ``"alpha"``. It is sRGB if it is grey or
     RGB of 8 or 16 bits, unless the name of its file is that of data, such as normals (``named``: names of images count,
-    else they are colours). A map of a manifest is by default sRGB if its name is that of colours and it has 8 or 16
-    bits and 1 or 3 channels. Its alpha channel is left out if it is 1 everywhere, else ``channels`` is needed. A
-    roughness, AO or metallic map with three equal channels keeps one. Normals of DirectX in a manifest become those of
-    OpenGL.
+    else they are colours). A map of a material is by default sRGB if its name is that of colours and it has 8 or 16
+    bits and 1 or 3 channels. In a manifest, its alpha channel is left out if it is 1 everywhere, else ``channels`` is
+    needed. A roughness, AO or metallic map with three equal channels keeps one. Normals of DirectX become those of
+    OpenGL. Smaller maps get the size of the largest by linear interpolation, colours in linear light.
 
     NaN and infinite values are an error. With ``nonfinite="clean"`` NaN becomes 0 and infinity the largest (negative:
     the smallest) finite value of the channel, 0 if there is none. Raises :class:`SourceError`.
@@ -193,21 +147,56 @@ def load_source(source, nonfinite: str = "error", named: bool = True) -> Source:
         return source
     if isinstance(source, dict):
         return from_arrays(source, nonfinite=nonfinite)
-    color_space = None
+    images, notes, content = ImageFiles(outside), [], COLOURS
     if not isinstance(source, (str, os.PathLike)):
         where = "the image"
         image, color_space = _in_memory(source, where)
-    elif (path := Path(source)).suffix.lower() == ".json":
-        return _load_manifest(path, nonfinite)
+        content = COLOURS if image.named else UNKNOWN
     else:
-        image, where = _read(path), path
-    values, content, notes = image.values[:, :, : image.colors], _COLOURS if image.named else _UNKNOWN, []
-    if named and image.named and isinstance(where, Path):
-        content, notes = _content_of_image(where, values)
-    maps = [_RawMap("image", _one_of_equal(values, content.role), content, str(where), color_space)]
+        where, name = split_material(source)
+        readers = {".json": _read_manifest, ".gltf": read_gltf, ".glb": read_gltf, ".mtlx": read_materialx}
+        if os.path.isdir(where):
+            return _load(where, *read_folder(where, images), images, nonfinite)
+        if where.suffix.lower() in readers:
+            return _load(where, *readers[where.suffix.lower()](where, name, images), images, nonfinite)
+        image, color_space = images.read(str(where)), None
+        values, content = image.values[:, :, : image.colors], COLOURS if image.named else UNKNOWN
+        if named and image.named:
+            content, notes = _content_of_image(where, values)
+    values = _one_of_equal(image.values[:, :, : image.colors], content.role)
+    maps = [_RawMap(values, MapEntry("image", str(where), content, color_space=color_space))]
     if image.has_alpha:
-        maps.append(_RawMap("alpha", image.values[:, :, image.colors :], _UNKNOWN, str(where)))
-    return _assemble(maps, where, nonfinite, notes)
+        maps.append(_RawMap(image.values[:, :, image.colors :], MapEntry("alpha", str(where), UNKNOWN)))
+    return _assemble(maps, where, nonfinite, notes, images.nbytes)
+
+
+def _load(path: Path, entries: list[MapEntry], notes: list[str], images: ImageFiles, nonfinite: str) -> Source:
+    """Read the images of a material. Raises :class:`SourceError`."""
+    if len(entries) > MAX_CHANNELS:  # of one channel or more, each an image in memory
+        raise SourceError(f"{path}: has {len(entries):,} maps, at most {MAX_CHANNELS} channels in all are supported")
+    maps = []
+    for entry in entries:
+        where, content = f'{path}: map "{entry.name}"', entry.content or content_of(entry.name)
+        if not all(abs(factor) <= MOST_FACTOR for factor in entry.factor):  # NaN, too
+            raise SourceError(f"{where} has the factors {entry.factor}, allowed are numbers up to {MOST_FACTOR:,g}")
+        if entry.constant:
+            values = np.array(entry.factor, np.float32).reshape(1, 1, -1)
+            maps.append(_RawMap(values, replace(entry, content=content, factor=())))
+            continue
+        picture = images.read(entry.file)
+        if entry.channels is not None:
+            values = _select(picture, entry.channels, where)
+        else:
+            values = picture.values[:, :, : picture.colors] if entry.opaque else _opaque(picture, where)
+            content = content or content_of(Path(entry.file).stem)
+        content = content or UNKNOWN
+        if entry.channels is None or entry.single:
+            values = _one_of_equal(values, "roughness" if entry.single else content.role)
+        if len(entry.factor) not in (0, 1, 1 if content.role == "normal" else values.shape[2]):
+            count = 1 if content.role == "normal" else values.shape[2]
+            raise SourceError(f"{where} has {len(entry.factor)} factors, allowed are 1 or {count}")
+        maps.append(_RawMap(values, replace(entry, content=content)))
+    return _assemble(maps, path, nonfinite, notes, images.nbytes)
 
 
 def _content_of_image(path: Path, values: np.ndarray) -> tuple[Content, list[str]]:
@@ -215,16 +204,16 @@ def _content_of_image(path: Path, values: np.ndarray) -> tuple[Content, list[str
 
     A name of data counts only where the values can be that: three equal channels, or unit normals.
     """
-    content, share = content_of(path.stem) or _COLOURS, _share_of_normals(values)
+    content, share = content_of(path.stem) or COLOURS, _share_of_normals(values)
     if content.colours:
         looks = f'{path.name}: looks like a normal map, but is taken for colours: a manifest may call it "normal"'
-        return _COLOURS, [looks] if share > _LOOKS_NORMAL else []
+        return COLOURS, [looks] if share > _LOOKS_NORMAL else []
     described = {"other": "data", "ao": "an AO map"}.get(content.role, f"a {content.role} map")
     fits = (
-        share > _NAMED_NORMAL if content.role == "normal" else content.packed or values.shape[2] == 1 or _equal(values)
+        share > _NAMED_NORMAL if content.role == "normal" else content.packed or values.shape[2] == 1 or equal(values)
     )
     if not fits:
-        return _COLOURS, [f"{path.name}: has the name of {described}, but the values of colours, which it is taken for"]
+        return COLOURS, [f"{path.name}: has the name of {described}, but the values of colours, which it is taken for"]
     down = "; y points down (DirectX), Mitsuba expects OpenGL" if content.y_down else ""
     return content, [f"{path.name}: taken for {described} by its name, linear{down}"]
 
@@ -238,28 +227,29 @@ def from_arrays(arrays: dict, color_spaces: dict[str, str] | None = None, nonfin
     is that of :func:`load_source`. Raises :class:`SourceError`.
     """
     color_spaces = dict(color_spaces or {})
-    maps = []
+    maps, images = [], ImageFiles()
     for name, array in arrays.items():
         where = f'array "{name}"'
         _check_name("arrays", name)
         file = isinstance(array, (str, os.PathLike))
-        image, stated = (_read(Path(array)), None) if file else _in_memory(array, where)
+        image, stated = (images.read(str(array)), None) if file else _in_memory(array, where)
         values = _opaque(image, where)
         content = content_of(name)
         if name == "image" and values.shape[2] in (1, 3):
-            content = _COLOURS
+            content = COLOURS
         color_space = color_spaces.pop(name, stated)
         if color_space is not None and color_space not in COLOR_SPACES:
             raise SourceError(f'{where}: has the color space "{color_space}", allowed are {COLOR_SPACES}')
-        content = content or _UNKNOWN
-        maps.append(_RawMap(name, _one_of_equal(values, content.role), content, "", color_space))
+        content = content or UNKNOWN
+        entry = MapEntry(name, content=content, color_space=color_space)
+        maps.append(_RawMap(_one_of_equal(values, content.role), entry))
     if color_spaces:
         raise SourceError(f'arrays: a color space is given for "{next(iter(color_spaces))}", which is not among them')
     return _assemble(maps, "arrays", nonfinite)
 
 
-def _load_manifest(path: Path, nonfinite: str) -> Source:
-    """Read a manifest and its images. Raises :class:`SourceError`."""
+def _read_manifest(path: Path, _: str, images: ImageFiles) -> tuple[list[MapEntry], list[str]]:
+    """Return the maps of a manifest, and notes on its content. Raises :class:`SourceError`."""
     try:
         data = read_file(path, MOST_TEXT)
         Allowance(path).check(json_bytes(data), "a manifest")
@@ -268,40 +258,35 @@ def _load_manifest(path: Path, nonfinite: str) -> Source:
         raise SourceError(str(e)) from None
     except (ValueError, RecursionError) as e:
         raise SourceError(f"{path}: is not valid JSON ({reason(e)})") from None
-    entries = content["maps"] if isinstance(content, dict) and "maps" in content else content
-    if not isinstance(entries, dict) or not entries:
+    maps = content["maps"] if isinstance(content, dict) and "maps" in content else content
+    if not isinstance(maps, dict) or not maps:
         raise SourceError(f"{path}: has no maps, expected an object that gives each map's name a file")
-
-    if len(entries) > MAX_CHANNELS:  # of one channel or more, each an image in memory
-        raise SourceError(f"{path}: has {len(entries):,} maps, at most {MAX_CHANNELS} channels in all are supported")
-    maps, images = [], {}
-    for name, entry in entries.items():
+    entries = []
+    for name, entry in maps.items():
         _check_name(path, name)
         where = f'{path}: map "{name}"'
         entry = {"file": entry} if isinstance(entry, str) else entry
-        known = isinstance(entry, dict) and entry.keys() <= {"file", "channels", "color_space"}
+        known = isinstance(entry, dict) and entry.keys() <= set(KEYS)
         if not known or not isinstance(entry.get("file"), str) or not entry["file"]:
-            allowed = 'a file name, or an object with "file" and perhaps "channels" and "color_space"'
+            further = ", ".join(f'"{key}"' for key in KEYS[1:])
+            allowed = f'a file name, or an object with "file" and perhaps {further}'
             raise SourceError(f"{where} is {entry!r:.80}, expected {allowed}")
-        color_space = entry.get("color_space")
+        color_space, inverted = entry.get("color_space"), entry.get("invert", False)
         if color_space is not None and color_space not in COLOR_SPACES:
             raise SourceError(f"{where} has the color space {color_space!r:.40}, allowed are {COLOR_SPACES}")
-        try:
-            file = path_by_name(path.parent, entry["file"], path)
-        except OutsideError as e:
-            raise SourceError(str(e)) from None
-        if file not in images:
-            images[file] = _read(file)
-        content_of_map = content_of(name)
-        if "channels" in entry:
-            values = _select(images[file], entry["channels"], where)
-        else:
-            values = _opaque(images[file], where)
-            content_of_map = content_of_map or content_of(file.stem)
-            values = _one_of_equal(values, content_of_map.role if content_of_map else "")
-        maps.append(_RawMap(name, values, content_of_map or _UNKNOWN, str(file), color_space))
+        if not isinstance(inverted, bool):
+            raise SourceError(f"{where} has invert {inverted!r:.40}, allowed are true and false")
+        factor = entry.get("factor", [])
+        factor = factor if isinstance(factor, list) else [factor]
+        if not all(type(f) in (int, float) and abs(f) <= MOST_FACTOR for f in factor):
+            raise SourceError(f"{where} has the factor {entry['factor']!r:.40}, allowed are finite numbers")
+        channels = entry.get("channels")
+        if channels is None and "channels" in entry:
+            raise SourceError(f"{where} has the channels null, allowed are letters or a list of indices")
+        file = images.find(path.parent, entry["file"], path)
+        entries.append(MapEntry(name, file, None, channels, color_space, inverted, tuple(map(float, factor))))
     note = unused_note(path, content)
-    return _assemble(maps, path, nonfinite, [note] if note else [])
+    return entries, [note] if note else []
 
 
 def _unique(pairs: list) -> dict:
@@ -335,21 +320,11 @@ def _select(picture: Picture, channels, where: str) -> np.ndarray:
 
 def _opaque(picture: Picture, where: str) -> np.ndarray:
     """Return the colours. Raises :class:`SourceError` for transparency, which would be lost."""
-    colors, alpha = picture.values[:, :, : picture.colors], picture.values[:, :, picture.colors :]
-    one = np.iinfo(alpha.dtype).max if alpha.dtype.kind == "u" else 1
-    if picture.has_alpha and (alpha != one).any():
+    if transparent(picture):
         raise SourceError(
             f'{where} is from a file with transparency: "channels" is needed ("rgb", and "a" for a map of its own)'
         )
-    return colors
-
-
-def _read(path: Path) -> Picture:
-    """Read an image file. Raises :class:`SourceError`."""
-    try:
-        return read_picture(path)
-    except PictureError as e:
-        raise SourceError(str(e)) from None
+    return picture.values[:, :, : picture.colors]
 
 
 def _in_memory(array, where: str) -> tuple[Picture, str | None]:
@@ -369,24 +344,19 @@ def _in_memory(array, where: str) -> tuple[Picture, str | None]:
 
 @dataclass(frozen=True, eq=False)
 class _RawMap:
-    """A map in the number type of its file; without a color space it gets the default."""
+    """Values of a map in the number type of its file, and its ``entry``, which has a content."""
 
-    name: str
     values: np.ndarray
-    content: Content
-    file: str
-    color_space: str | None = None
+    entry: MapEntry
+
+    @property
+    def content(self) -> Content:
+        return self.entry.content
 
 
 def _one_of_equal(values: np.ndarray, role: str) -> np.ndarray:
     """Return ``values``, or one of three equal channels where the role has one channel."""
-    return values[:, :, :1] if role in ("roughness", "ao", "metallic") and _equal(values) else values
-
-
-def _equal(values: np.ndarray) -> bool:
-    """Return whether ``values`` have three equal channels."""
-    nan = values.dtype.kind == "f"
-    return values.shape[2] == 3 and all(np.array_equal(values[:, :, 0], values[:, :, i], equal_nan=nan) for i in (1, 2))
+    return values[:, :, :1] if role in ("roughness", "ao", "metallic") and equal(values) else values
 
 
 def _share_of_normals(values: np.ndarray) -> float:
@@ -403,76 +373,149 @@ def _share_of_normals(values: np.ndarray) -> float:
     return float((unit & (normals[..., 2] > 0)).mean())
 
 
-def _assemble(raw: list[_RawMap], where, nonfinite: str, notes: list[str] = ()) -> Source:
+def _assemble(raw: list[_RawMap], where, nonfinite: str, notes: list[str] = (), file_nbytes: int = 0) -> Source:
     """Return the source of some maps. Raises :class:`SourceError` if they do not go together."""
     if nonfinite not in NONFINITE:
         raise ValueError(f'nonfinite: found "{nonfinite}", allowed are {NONFINITE}')
     if not raw:
         raise SourceError(f"{where}: has no maps")
-    first = raw[0]
-    for other in raw[1:]:
-        if other.values.shape[:2] != first.values.shape[:2]:
-            sizes = ["{1}×{0}".format(*m.values.shape) for m in (first, other)]
-            raise SourceError(
-                f'{where}: map "{first.name}" has {sizes[0]} texels and map "{other.name}" {sizes[1]}, '
-                f"all maps need the same size"
-            )
+    largest = max(raw, key=lambda m: math.prod(m.values.shape[:2]) - m.entry.constant)
+    height, width = largest.values.shape[:2]
+    for other in raw:
+        rows, columns = other.values.shape[:2]
+        if rows * width != columns * height and rows * columns > 1:
+            both = [
+                'map "{}" has {}×{} texels'.format(m.entry.name, *m.values.shape[1::-1])
+                for m in raw
+                if m is largest or m is other
+            ]
+            raise SourceError(f"{where}: {' and '.join(both)}, all maps need the same ratio of width and height")
     channels = sum(m.values.shape[2] for m in raw)
     if channels > MAX_CHANNELS:
         raise SourceError(f"{where}: has {channels} channels in all, at most {MAX_CHANNELS} are supported")
 
-    maps, notes, cleaned = [], list(notes), 0
+    maps, notes, origins, cleaned = [], list(notes), [], 0
     digest = hashlib.sha256()
     for m in raw:
-        role = m.content.role
+        entry, role = m.entry, m.content.role
         if role == "normal" and m.values.shape[2] == 1:
             raise SourceError(
-                f'{m.file or where}: the normal map "{m.name}" has 1 channel, 3 are needed (x, y, z), or x and y alone'
+                f'{entry.file or where}: the normal map "{entry.name}" has 1 channel, 3 are needed (x, y, z), or x and '
+                f"y alone"
             )
         number_type = m.values.dtype.name
-        color_space = m.color_space
+        color_space = entry.color_space
         if color_space is None:
-            srgb = m.content.colours and number_type in ENCODED and m.values.shape[2] in (1, 3)
-            color_space = "srgb" if srgb else "linear"
+            srgb_encoded = m.content.colours and number_type in ENCODED and m.values.shape[2] in (1, 3)
+            color_space = "srgb" if srgb_encoded else "linear"
         notes += _notes_on(m)
-        values = m.values
-        if m.content.y_down and m.name != "image":
-            # Normals of integers or floats, signed or stored as (n + 1)/2
-            one = np.iinfo(values.dtype).max if values.dtype.kind == "u" else 0 if (values < 0).any() else 1
-            values = values.copy()
-            values[..., 1] = one - values[..., 1]
+        flipped = m.content.y_down and entry.name != "image"
+        values = _inverted(m.values, [1] if flipped else range(m.values.shape[2]) if entry.inverted else [])
         with np.errstate(over="ignore"):  # float64 beyond float32 becomes infinite and is reported below
             values = values.astype("<f4", order="C")
         if number_type in ENCODED:
             values /= np.iinfo(m.values.dtype).max
         else:
-            cleaned += _check_finite(values, f'{m.file or where}: map "{m.name}"', nonfinite)
+            cleaned += _check_finite(values, f'{entry.file or where}: map "{entry.name}"', nonfinite)
+        values = _scaled(values, entry, color_space)
+        if entry.constant:
+            values = np.broadcast_to(values, (height, width, values.shape[2]))
+        elif values.shape[:2] != (height, width):
+            size = "{1} × {0}".format(*values.shape)
+            notes.append(
+                f'map "{entry.name}": {size} texels, interpolated to {width} × {height}, which the compression counts'
+            )
+            values = _resampled(values, (height, width), role, color_space)
+        values = np.ascontiguousarray(values, "<f4")
         values.flags.writeable = False
-        depth = DEPTHS[number_type]
-        maps.append(Map(m.name, values, color_space, role, depth, m.file))
-        layout = [m.name, color_space, role, depth, *values.shape]
+        depth = 0 if entry.constant else DEPTHS[number_type]
+        maps.append(Map(entry.name, values, color_space, role, depth, entry.file))
+        layout = [entry.name, color_space, role, depth, *values.shape]
         digest.update(json.dumps(layout).encode() + b"\n")
         digest.update(values)
-    height, width = first.values.shape[:2]
-    return Source(tuple(maps), height, width, digest.hexdigest(), cleaned, tuple(notes))
+        origins.append(_origin(entry, color_space, flipped, values[0, 0]))
+    return Source(
+        tuple(maps), height, width, digest.hexdigest(), cleaned, tuple(notes), tuple(origins), file_nbytes
+    )  # fmt: skip
+
+
+def _inverted(values: np.ndarray, channels) -> np.ndarray:
+    """Return ``values`` with 1 − x in some channels, −x if they are signed."""
+    if not len(channels):
+        return values
+    one = np.iinfo(values.dtype).max if values.dtype.kind == "u" else 0 if (values < 0).any() else 1
+    values = values.copy()
+    values[..., channels] = one - values[..., channels]
+    return values
+
+
+def _scaled(values: np.ndarray, entry: MapEntry, color_space: str) -> np.ndarray:
+    """Return ``values`` with the factor and the cutoff of an entry."""
+    factor = np.array(entry.factor, np.float32)
+    if factor.size and entry.content.role == "normal":
+        signed = (values < 0).any()
+        normals = (values if signed else 2 * values - 1) * np.append(np.repeat(factor, 2), np.ones(values.shape[2] - 2))
+        values = _unit(normals) if signed else 0.5 + 0.5 * _unit(normals)
+    elif factor.size:
+        linear = (srgb.to_linear(values) if color_space == "srgb" else values) * factor
+        values = srgb.from_linear(linear) if color_space == "srgb" else linear
+    return values if entry.cutoff is None else (values >= entry.cutoff).astype(np.float32)
+
+
+def _unit(normals: np.ndarray) -> np.ndarray:
+    """Return normals of length 1; those of two channels or of length 0 stay."""
+    length = np.linalg.norm(normals, axis=2, keepdims=True)
+    return normals if normals.shape[2] != 3 else normals / np.where(length > 1e-6, length, 1)
+
+
+def _resampled(values: np.ndarray, size: tuple[int, int], role: str, color_space: str) -> np.ndarray:
+    """Return a map of another size, as a bitmap that repeats is interpolated: linearly, colours in linear light."""
+    from scipy.ndimage import zoom
+
+    signed = (values < 0).any()
+    if role == "normal":
+        values = values if signed else 2 * values - 1
+    values = srgb.to_linear(values) if color_space == "srgb" else values
+    factors = (size[0] / values.shape[0], size[1] / values.shape[1], 1)
+    values = zoom(values, factors, order=1, mode="grid-wrap", grid_mode=True)
+    if role == "normal":
+        values = _unit(values) if signed else 0.5 + 0.5 * _unit(values)
+    return srgb.from_linear(values) if color_space == "srgb" else values
+
+
+def _origin(entry: MapEntry, color_space: str, flipped: bool, first: np.ndarray) -> dict[str, str]:
+    """Return a row of the table that says of what a map is made; ``first`` is its first texel."""
+    channels = entry.channels if isinstance(entry.channels, list) else [entry.channels or "all"]
+    factor = first if entry.constant else entry.factor
+    changes = ("y inverted" if flipped else "", "inverted (1 − x)" if entry.inverted else "")
+    cutoff = f"1 from {entry.cutoff:g} on" if entry.cutoff is not None else ""
+    return {
+        "map": entry.name,
+        "file": "constant" if entry.constant else Path(entry.file).name,
+        "channels": ", ".join(map(str, channels)),
+        "color_space": color_space,
+        "factor": ", ".join(f"{value:.4g}" for value in factor) or "1",
+        "change": ", ".join(filter(None, (*changes, cutoff))),
+    }
 
 
 def _notes_on(m: _RawMap) -> list[str]:
     """Return what has to be said about a map of a manifest or of a dictionary."""
-    if m.name == "image":
+    name, color_space = m.entry.name, m.entry.color_space
+    if name == "image":
         return []
     if m.content.y_down:
-        return [f'map "{m.name}": normals of DirectX, y is inverted to that of OpenGL, which Mitsuba expects']
+        return [f'map "{name}": normals of DirectX, y is inverted to that of OpenGL, which Mitsuba expects']
     if m.content.packed and m.values.shape[2] > 1:
-        return [f'map "{m.name}": holds several maps, which are kept as one: "channels" gives each a map of its own']
+        return [f'map "{name}": holds several maps, which are kept as one: "channels" gives each a map of its own']
     if m.content.role == "other" and not m.content.colours and _share_of_normals(m.values) > _LOOKS_NORMAL:
-        return [f'map "{m.name}": looks like a normal map, but is taken for other data: call it "normal"']
-    if m.content is not _UNKNOWN:
-        return [] if content_of(m.name) else [f'map "{m.name}": has the role {m.content.role} by the name of its file']
-    colours = m.color_space is None and m.values.dtype.name in ENCODED and m.values.shape[2] == 3
-    if not colours or _equal(m.values):
+        return [f'map "{name}": looks like a normal map, but is taken for other data: call it "normal"']
+    if m.content is not UNKNOWN:
+        return [] if content_of(name) else [f'map "{name}": has the role {m.content.role} by the name of its file']
+    colours = color_space is None and m.values.dtype.name in ENCODED and m.values.shape[2] == 3
+    if not colours or equal(m.values):
         return []
-    return [f'map "{m.name}": an unknown name, taken for data, linear: give it "color_space": "srgb" if it is a colour']
+    return [f'map "{name}": an unknown name, taken for data, linear: give it "color_space": "srgb" if it is a colour']
 
 
 def _check_finite(values: np.ndarray, where: str, nonfinite: str) -> int:

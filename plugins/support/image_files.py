@@ -25,6 +25,7 @@ from mi_diffind.core.files import (
 )
 from mi_diffind.fitting.task import Task
 from mi_diffind.images.reader import PictureError, read_picture
+from mi_diffind.maps.entries import has_maps, split_material
 from mi_diffind.maps.layout import Layout, MapLayout
 from mi_diffind.maps.pyramid import CompressedMaps, Pyramid
 from mi_diffind.maps.source import Source, from_arrays, load_source
@@ -129,7 +130,7 @@ def open_uncompressed(props: mi.Properties, wrap_mode: str) -> tuple[SharedMaps,
     def load() -> SharedMaps:
         # A single image without "raw" is colours, whatever its name, as for Mitsuba's "bitmap"
         source = load_source(path, nonfinite="clean", named=raw) if path else _from_bitmap_object(props["bitmap"])
-        for note in source.notes if path.lower().endswith(".json") else ():
+        for note in source.notes if has_maps(path) else ():
             warn(note)
         if raw:
             maps = tuple(dataclasses.replace(m, color_space="linear") for m in source.maps)
@@ -137,7 +138,7 @@ def open_uncompressed(props: mi.Properties, wrap_mode: str) -> tuple[SharedMaps,
         return SharedMaps(Pyramid.from_source(source, types=types, border=border), {})
 
     with refused_as(given[0]):
-        key = str(Path(path).resolve()), *stamp(path), raw, border, mi.TensorXf
+        key = str(Path(path).resolve()), *stamp(split_material(path)[0]), raw, border, mi.TensorXf
         return shared(key, load, SharedMaps.as_loaded) if path else load(), path
 
 
@@ -188,7 +189,7 @@ def to_bitmap(task: Task, props: mi.Properties) -> None:
 def to_mipmap(task: Task, props: mi.Properties) -> None:
     """Add the properties that a ``mipmap`` needs to show the original of the map."""
     original, layout = find_original(task, props)
-    manifest = original.suffix.lower() == ".json"
+    manifest = has_maps(original)
     if not manifest and layout.role == "other":  # linear by the name of its file
         to_bitmap(task, props)
         remove(props, "filename", "channels")
@@ -220,7 +221,7 @@ def find_original(task: Task, props: mi.Properties) -> tuple[Path, MapLayout]:
     if not given and not recorded:
         raise RuntimeError(f'{path}: does not record its original image, give it as the parameter "source"')
     original = Path(str(mi.file_resolver().resolve(given))) if given else path.parent / recorded
-    if not original.is_file():
+    if not split_material(original)[0].exists():
         advice = "" if given else '; if it was moved, give its path as the parameter "source"'
         raise RuntimeError(f"{original}: no such file, {path.name} was made from it{advice}")
     # A stranger's file must not show any file of this machine
@@ -284,7 +285,7 @@ def _values(original: Path, layout: MapLayout) -> np.ndarray:
     with refused_as():
         maps = load_source(original, nonfinite="clean").maps
     named = [m for m in maps if m.name == layout.name]
-    if original.suffix.lower() == ".json" and not named:
+    if has_maps(original) and not named:
         raise RuntimeError(f'{original}: holds no map "{layout.name}", only {", ".join(m.name for m in maps)}')
     values = (named or maps)[0].values
     if layout.channels == 1 and values.shape[2] == 3 and (values == values[..., :1]).all():

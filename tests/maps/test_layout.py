@@ -227,7 +227,7 @@ DAMAGE = [
     *((("maps", 0, "name"), v) for v in (None, 3, "", "a b", "../albedo", "a/b", "normal", ["albedo"])),
     *((("maps", 0, "kind"), v) for v in (None, "colour", 3)),
     *((("maps", 0, "color_space"), v) for v in (None, "rec709", 3)),
-    *((("maps", 0, "depth"), v) for v in (None, 0, 3, 8, "x", INFINITY)),
+    *((("maps", 0, "depth"), v) for v in (None, -1, 3, 8, "x", INFINITY)),
     *((("maps", 0, "where"), v) for v in (None, [], 3, [5], [-1], [0.5], [True], ["x"], ["z", 0, 1], [0, 1, 2, "z"])),
     *((("maps", 1, "where"), v) for v in ([0, "z"], [0, 1, "z", "z"], [[], 1, 2], [["constant"], 1, 2])),
     *((("maps", 2, "where", 0), ["constant", v]) for v in (None, "x", INFINITY, float("nan"), HUGE)),

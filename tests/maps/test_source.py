@@ -301,7 +301,11 @@ def test_jpeg_with_a_thumbnail_is_not_taken_for_whole(tmp_path):
 def test_not_an_image(tmp_path):
     (tmp_path / "folder").mkdir()
     (tmp_path / "text.png").write_text("This is text, and not an image. " * 3)
-    for name, match in {"missing.png": "no such file", "folder": "is a folder", "text.png": "cannot be read"}.items():
+    for name, match in {
+        "missing.png": "no such file",
+        "folder": "is a folder",
+        "text.png": "cannot be read",
+    }.items():
         refused(match, tmp_path / name)
 
 
@@ -409,7 +413,7 @@ def test_bad_channels(tmp_path, channels):
         ({"a": "missing.png"}, r"missing\.png: no such file"),
         ({"a": "."}, "is a folder"),
         ({"a": "a\0.png"}, "cannot be read|no such file"),
-        ({"albedo": "a.png", "normal": "b.png"}, 'map "albedo" has 7×5 texels and map "normal" 5×7'),
+        ({"albedo": "a.png", "normal": "b.png"}, 'map "albedo" has 7×5 texels and map "normal" has 5×7'),
     ],
 )
 def test_bad_manifests(tmp_path, content, match):
@@ -449,7 +453,7 @@ def test_the_digest_tells_everything_apart():
         ({"a": np.zeros((2, 2, 17))}, "has 17 channels in all, at most 16"),
         ({"a b": np.zeros((2, 2))}, "a map is called 'a b'"),
         ({3: np.zeros((2, 2))}, "a map is called 3"),
-        ({"a": np.zeros((2, 2)), "b": np.zeros((2, 3))}, 'map "a" has 2×2 texels and map "b" 3×2'),
+        ({"a": np.zeros((2, 2)), "b": np.zeros((2, 3))}, 'map "a" has 2×2 texels and map "b" has 3×2'),
         ({"a": np.full((2, 2), 1e300)}, 'map "a" has 4 values that are NaN or infinite'),
     ],
 )

@@ -18,6 +18,7 @@ from ...arrays.tables import PAGES, Table, TableError, save_table
 from ...core import compat
 from ...core.errors import UsageError
 from ...fitting.loop import Problem
+from ...maps.entries import split_material
 from ...maps.layout import Layout
 from ...maps.pyramid import Pyramid
 from ...maps.source import load_source
@@ -141,7 +142,7 @@ def find_source(table: Table, file: Path, given: str = "") -> Path:
     if not given and not recorded:
         raise TableError(f'{file}: does not record its source; the parameter "source" of the texture may name it')
     original = Path(given) if given else file.parent / recorded
-    if not original.is_file():
+    if not split_material(original)[0].exists():
         raise TableError(f"{original}: no such file, {file.name} was made from it")
     return original.resolve()
 

@@ -13,8 +13,8 @@ from ...arrays.tables import MAX_BYTES, Table
 from ...core.errors import UsageError
 from ...fitting.task import FitRequest, FitResult, Fitted, FittingError
 from ...maps import as_seen
-from ...maps.model import complete, rehearse_pictures, requested_border, requested_bytes
-from ...maps.source import Source, load_source
+from ...maps.model import complete, load_maps, rehearse_pictures, requested_border, requested_bytes
+from ...maps.source import Source
 from . import PAGED, STRUCTURES, CoarsePrimary, ImageSettings, parse_weights
 from .arrays import CompressedImage, ImageBudget, cascaded_side, fit_bytes, search
 from .training import build_problem, choose_structure, fit_image, pointer_dims, source_layout
@@ -71,7 +71,9 @@ def check(request: FitRequest) -> None:
     if request.preset == "paper" and options["without"]:
         raise UsageError("--without: the preset paper has none of our improvements: leave it out")
     if options["source"] is None:
-        raise UsageError("source: not given, an image or a manifest of the maps of a material is needed")
+        raise UsageError(
+            "source: not given, an image, a folder of maps, a manifest, or a glTF or MaterialX file is needed"
+        )
     recipe = request.settings
     if STRUCTURES.get(recipe.structure, (8, None))[1] and recipe.dims < 3:
         raise UsageError(f'--structure "{recipe.structure}" has two primary arrays, allowed are --dims 3 and 4')
@@ -90,8 +92,7 @@ def fit(request: FitRequest) -> Fitted:
     Raises :class:`UsageError`, :class:`~mi_diffind.maps.source.SourceError` and
     :class:`.FittingError`.
     """
-    options = request.options
-    source = load_source(options["source"], nonfinite=options["nonfinite"])
+    source = load_maps(request)
     recipe = dataclasses.replace(request.settings, weights=_weights(request, source, request.settings))
     rehearse_pictures(request, source)
     fitted, requested = _train(request, source, recipe)

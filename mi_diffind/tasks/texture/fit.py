@@ -14,9 +14,9 @@ from ...core.progress import interruptible
 from ...core.units import figure_lines
 from ...fitting.task import FitRequest, Fitted
 from ...maps.layout import Layout, gain_of_pages, smoothness
-from ...maps.model import complete, preview_path, rehearse_pictures, requested_border, requested_bytes
+from ...maps.model import complete, load_maps, preview_path, rehearse_pictures, requested_border, requested_bytes
 from ...maps.pyramid import Pyramid
-from ...maps.source import Source, load_source
+from ...maps.source import Source
 from . import PRESETS, TASK, ShadingSettings, TextureSettings, arrays, parse_structure
 from .appearance import ShadedEvaluation
 from .arrays import TextureBudget
@@ -55,7 +55,9 @@ def check(request: FitRequest) -> None:
     """Raise :class:`UsageError` for options that do not go together."""
     options = request.options
     if options["source"] is None:
-        raise UsageError("source: not given, an image or a manifest of the maps of a material is needed")
+        raise UsageError(
+            "source: not given, an image, a folder of maps, a manifest, or a glTF or MaterialX file is needed"
+        )
     if str(options["source"]).lower().endswith(".xml"):
         raise UsageError(f"source: found the scene {options['source']}; fit scene trains a texture inside a scene")
     if options["shading"] == "off":
@@ -90,7 +92,7 @@ def fit(request: FitRequest) -> Fitted:
     :class:`.FittingError`.
     """
     options, recipe = request.options, request.settings
-    source = load_source(options["source"], nonfinite=options["nonfinite"])
+    source = load_maps(request)
     pyramid = Pyramid.from_source(source, source_layout(source, recipe), request.types, requested_border(options))
     reason, spare = "" if options["shading"] == "on" else reason_without_shading(pyramid.layout, request), 0
     if reason:
