@@ -180,17 +180,6 @@ def equal_quality(study: Entries) -> list[Entries]:
     return rows
 
 
-def scene_runs(study: Entries) -> list[Entries]:
-    """Return the trainings of a study inside a scene, each with its name ``run``."""
-    runs = [job.details for job in study.jobs.values()]
-    weights = [d["lambda"] for d in runs if d["lambda"] is not None]
-    rows = []
-    for d in runs:
-        run = d.way + (f", λ {d['lambda']:g}" if d["lambda"] not in (None, *weights[:1]) else "")
-        rows.append(Entries(d, run=run + (f", {d.spp} samples a pixel" if d.spp != runs[0].spp else "")))
-    return rows
-
-
 def groups(rows: Iterable[dict], *keys: str) -> dict[tuple, list[dict]]:
     """Return rows by the values of some keys."""
     result = {}
@@ -307,12 +296,6 @@ def over_filters(label: str, *studies: Entries) -> list[float]:
     return gains
 
 
-def held_out(study: Entries, run: str) -> float:
-    """Return the PSNR in dB of held-out views and lights after a training inside a scene."""
-    (scene,) = study.details.scenes
-    return study.jobs[f"{scene}, {run}"].details.psnr_db
-
-
 def shipped(task: str, preset: str) -> float:
     """Return the PSNR in dB that is stored in the file that ships for a preset of a task."""
     task = tasks()[task]
@@ -339,8 +322,8 @@ FUNCTIONS = {
     for f in (
         min, max, sum, len, round, abs, all, any, sorted, next, iter, zip, map, list, dict, range, tuple, float,
         Entries, measured, every, one, ratio, time_over, equal_samples, cells, median, with_spread,
-        size_text, binary_size, asset_bytes, equal_quality, scene_runs, with_network, budgets, by_label,
-        surface_errors, trust_cell, shaded_renders, shaded_levels, over_filters, held_out, shipped,
+        size_text, binary_size, asset_bytes, equal_quality, with_network, budgets, by_label,
+        surface_errors, trust_cell, shaded_renders, shaded_levels, over_filters, shipped,
         trust_cells,
     )
 } | {"mean": mean, "RENDERS": RENDERS}  # fmt: skip
