@@ -379,7 +379,8 @@ def test_entries_of_any_value_are_harmless(mi, rng, name):
                 params.update()
                 found = answers(mi, bsdf, si, wo, u)
                 check_finite(found, (key, wrong, share))
-                if not np.array_equal(found[0], before[0]):
+                # Beyond the rounding of another kernel: entries decide which lobes are traced
+                if not np.allclose(found[0], before[0], rtol=1e-4, atol=1e-5):
                     changed.add(key)
         params[key] = mi.TensorXf(aligned(entries))
         params.update()
