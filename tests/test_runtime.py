@@ -195,6 +195,9 @@ with fitting.cores(True):
     bitmap = {"type": "bitmap", "filename": "ours.exr", "raw": True}
     assert scenes.load_dict({"type": "diffuse", "reflectance": bitmap}, parallel=False) is not None
     assert dr.thread_count() == 1
+    with fitting.all_cores():
+        assert dr.thread_count() == 2
+    assert dr.thread_count() == 1
 assert dr.thread_count() == 2
 assert cli.main(["render", scene, "-D", "width=8", "-D", "height=8", "--spp", "1", "-o", "render.exr"]) == 0
 assert cli.main(["decode", table, "-o", "decoded.exr", "--map", "roughness"]) == 0

@@ -259,7 +259,7 @@ def relative_weights(base: list[list[np.ndarray]], shares: Sequence[float], fall
     for single, of_sky in (base[CASES.index(n)] for n in (0, 4)):
         means = [x.mean(axis=-1, dtype=np.float64) for x in (single, of_sky)]
         errors.append(np.hstack(means).reshape(-1, LIGHTS, RANGES).mean(axis=-1))
-    errors = np.maximum(errors, 1e-7)
+    errors = np.maximum(errors, 1e-7)  # 70 dB: smaller errors count no more
     density = fall ** np.arange(errors.shape[1])[:, None] * shares
     return (errors * density).sum() / (2 * density.sum()) / errors
 

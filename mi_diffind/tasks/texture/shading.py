@@ -149,11 +149,14 @@ class ShadingProblem(textures.TextureProblem):
         #: Picture that is written at each measurement, and the images that it shows a part of
         self.preview: tuple[Path, ShadedEvaluation] | None = None
         self.effects, _ = material_effects(pyramid.layout)
-        self.exposures, self.error_weights = np.ones(LIGHTS), np.ones((2, 1, LIGHTS))
+        exposures, weights = np.ones(LIGHTS), np.ones((2, 1, LIGHTS))
         if held_out is not None and recipe.rendered:
             single = 1 - recipe.skies
             shares = single * (1 - recipe.mirrored), single * recipe.mirrored, recipe.skies
-            self.exposures, self.error_weights = held_out.exposures, relative_weights(base, shares, FALL)
+            exposures, weights = held_out.exposures, relative_weights(base, shares, FALL)
+        #: Exposures by kind of light, and weights of errors by level and kind of light, of one and of four reads
+        self.exposures = device_array(self.types.Float, exposures)
+        self.error_weights = [device_array(self.types.Float, w) for w in weights]
         self.decoder = frozen_decoder(self.types) if recipe.tables else Decoder()
         self.identity = {**self.identity, "shading": recipe.further}
 
@@ -186,9 +189,9 @@ class ShadingProblem(textures.TextureProblem):
         wi, wo, weight = mirrored_pairs(types, [*views, *numbers[6:]], recipe.mirrored)
         lights = dr.select(sky, LIGHTS - 1, types.UInt32(numbers[-1] < recipe.mirrored))
         weights = self.error_weights[int(reads > 1)]
-        row = dr.minimum(types.UInt32(level), len(weights) - 1)
-        weight *= dr.gather(types.Float, device_array(types.Float, weights), row * LIGHTS + lights)
-        exposure = dr.gather(types.Float, device_array(types.Float, self.exposures), lights)
+        row = dr.minimum(types.UInt32(level), len(weights) // LIGHTS - 1)
+        weight *= dr.gather(types.Float, weights, row * LIGHTS + lights)
+        exposure = dr.gather(types.Float, self.exposures, lights)
         with all_cores():
             truth = reference(recipe.reference, self.pyramid, u, v, level, wi, wo, self.effects, rng, stretch=stretch)
             dr.eval(u, v, level, stretch, wi, wo, weight, exposure, truth)

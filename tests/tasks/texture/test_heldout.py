@@ -426,8 +426,9 @@ def test_pixels_with_four_samples(ad, monkeypatch, jittered):
     size = TextureBudget(SIDE, SIDE, pyramid.layout.stored, parse_structure("0:1:2,1:2:4"), 2, 3, 5, 3)
     net = from_components(pyramid.values, size, ("repeat", "repeat"))
     problem = shading.ShadingProblem(net.changed(lambda a, bits: a.alloc(ad.TensorXf)), pyramid, recipe)
-    problem.jittered, problem.settings, problem.exposures = jittered, recipe, [2.0, 5.0, 3.0]
-    weights = problem.error_weights = np.arange(12.0).reshape(2, 2, 3) + 1  # level 1 and coarser
+    problem.jittered, problem.settings, problem.exposures = jittered, recipe, ad.Float(2, 5, 3)
+    weights = np.arange(12.0).reshape(2, 2, 3) + 1  # level 1 and coarser
+    problem.error_weights = [ad.Float(aligned(w.ravel())) for w in weights]
 
     def keep(name, function):
         def kept(*arguments, **named):
