@@ -188,11 +188,6 @@ def groups(rows: Iterable[dict], *keys: str) -> dict[tuple, list[dict]]:
     return result
 
 
-def with_network(study: Entries, network: Entries) -> Entries:
-    """Return a study with the candidates and jobs of another one, whose times are not used."""
-    return Entries(study, **{key: Entries(study[key], **network[key]) for key in ("candidates", "jobs")})
-
-
 def by_label(study: Entries) -> dict[str, dict]:
     """Return the errors of each contender of a study by its label and its budget, from the least budget on."""
     trained = [c for c in study.candidates.values() if c.details.get("asked") and c.errors]
@@ -310,9 +305,8 @@ def trust_cells(study: Entries) -> tuple[int, int]:
 
 #: Rows of the pages' tables of renders with filtered textures.
 RENDERS = (
-    "bitmap, 1 spp", "bitmap, 4 spp", "bitmap, 4 spp, multijittered", "bitmap, 16 spp, multijittered",
-    "mipmap, trilinear", "ours 12x, trilinear", "ours 12x, anisotropic, centred", "ASTC 12x, trilinear",
-    "ASTC 12x, anisotropic, centred", "network 12x, trilinear",
+    "bitmap, 1 spp", "bitmap, 4 spp, multijittered", "bitmap, 16 spp, multijittered", "mipmap, trilinear",
+    "ours 12x, trilinear", "ours 12x, anisotropic, centred", "ASTC 12x, anisotropic, centred",
 )  # fmt: skip
 
 #: Error of a contender that is the reference itself.
@@ -322,7 +316,7 @@ FUNCTIONS = {
     for f in (
         min, max, sum, len, round, abs, all, any, sorted, next, iter, zip, map, list, dict, range, tuple, float,
         Entries, measured, every, one, ratio, time_over, equal_samples, cells, median, with_spread,
-        size_text, binary_size, asset_bytes, equal_quality, with_network, budgets, by_label,
+        size_text, binary_size, asset_bytes, equal_quality, budgets, by_label,
         surface_errors, trust_cell, shaded_renders, shaded_levels, over_filters, shipped,
         trust_cells,
     )

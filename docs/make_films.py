@@ -1,7 +1,7 @@
 """
 Render the films of the documentation.
 
-    python docs/make_films.py [suite] [zoom] [orbit] [shading] [--frames 20] [--out docs/films] [--json docs/measured]
+    python docs/make_films.py [flight] [zoom] [orbit] [shading] [--frames 20] [--out docs/films] [--json docs/measured]
 
 Each film is written as NAME.webp, which pages show, as NAME.mp4 (H.264; it needs the package imageio-ffmpeg), and its
 first frame as NAME.jpg. JSON named film_NAME.json holds the settings, the bytes of the films and of the table files,
@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,6 +31,19 @@ from mi_diffind.scenes import loading, poses, rendering
 DOCS = Path(__file__).resolve().parent
 SCENES = DOCS.parent / "scenes"
 ASSETS = SCENES / "assets"
+TILES = ASSETS / "tiles_albedo.png"
+
+#: Width of the plane of ``renders.still_scenes``.
+PLANE = 2000.0
+
+#: Textures of the tiles.
+BITMAP = {"type": "bitmap", "filename": str(TILES)}
+LEARNED = {
+    "type": "neural_texture",
+    "filename": str(ASSETS / "tiles_filtered.npz"),
+    "channels": "albedo",
+    "filter": "anisotropic",
+}
 
 #: Frames a second; samples a pixel of the floor, whose light has noise, and of the truth.
 RATE, SAMPLES, TRUTH = 12, 4, 64
@@ -86,30 +99,14 @@ def rendered(name: str, motions: Sequence[np.ndarray], size=SIZE, spp=1, against
     return [films.displayed(image).repeat(scale, axis=0).repeat(scale, axis=1) for image in images]
 
 
-def floor(motions: Sequence[np.ndarray], against: str = "", spp: int = SAMPLES, size=SIZE) -> list[np.ndarray]:
+def floor(motions: Sequence[np.ndarray], against: str = "", spp: int = SAMPLES) -> list[np.ndarray]:
     """Render a panel of ``horizon.xml``."""
-    return rendered("horizon", motions, size, spp, against, max_depth=3)
+    return rendered("horizon", motions, SIZE, spp, against, max_depth=3)
 
 
-def metal(file: str, frames: int, size=SIZE, **options) -> list[np.ndarray]:
+def metal(file: str, frames: int, **options) -> list[np.ndarray]:
     """Render a panel of hammered metal in a light without noise, its pixels enlarged."""
-    return rendered("rust", swing(8.0, frames), size, scale=2, metal=file, sky=0, max_depth=2, **options)
-
-
-def suite(frames: int) -> Film:
-    """Render the README's film."""
-    size, back = (288, 172), np.tile(np.eye(4), (frames, 1, 1))
-    back[:, :3, 3] = np.outer(times(frames), (0.0, 0.5, 2.2))
-    panels = {
-        f"bitmap, {SAMPLES} samples a pixel": floor(back, "exact", size=size),
-        f"neural_texture, {SAMPLES} samples a pixel": floor(back, size=size),
-        "neural_field among mirrors and glass": rendered("field", swing(22.0, frames), size, 48, max_depth=6),
-        "neural_material, filtered maps": metal("rust_plain.npz", frames, size),
-        "neural_material, trained for shading": metal("rust_shaded.npz", frames, size),
-        "neural_bsdf: left exact, right learned": rendered("library", swing(14.0, frames), size, 64),
-    }
-    wall = [f"library/{path.name}" for path in sorted((ASSETS / "library").glob("*.npz"))]
-    return Film(panels, 3, ["tiles_filtered.npz", "group.npz", "rust_plain.npz", "rust_shaded.npz", *wall])
+    return rendered("rust", swing(8.0, frames), scale=2, metal=file, sky=0, max_depth=2, **options)
 
 
 def orbit(frames: int) -> Film:
@@ -135,41 +132,69 @@ def shading(frames: int) -> Film:
     return Film(panels, 2, ["rust_plain.npz", "rust_shaded.npz"])
 
 
-def zoom(frames: int) -> Film:
-    """Render a zoom into the tiles: the distance of the camera decreases by the same factor each frame, to its half."""
-    albedo, table = str(ASSETS / "tiles_albedo.png"), str(ASSETS / "tiles_filtered.npz")
-    learned = {"type": "neural_texture", "filename": table, "channels": "albedo", "filter": "anisotropic"}
-    side = mi.Bitmap(albedo).size()[0]
-    origin, up = np.array([0.0, 2.0, 2.0]), (0.0, 1.0, 0.0)
-    scene = dataclasses.replace(
-        renders.still_scenes()["plane"], name="zoom", origin=tuple(origin), target=(0.0, 0.0, 0.0), fov=40.0,
-        texels=100.0, anchor=(0.5, 0.5),
-    )  # fmt: skip
+def tiled_plane(
+    scene: renders.TextureScene, size, poses_at: Callable[[tuple], list], textures: dict[str, tuple]
+) -> Panels:
+    """Render panels of tiles on a plane in a light without noise.
 
-    def panel(texture: dict, spp: int = 1, sampler: str = "independent") -> list[np.ndarray]:
-        plugin = lambda repeats: texture | {"to_uv": renders.to_uv(repeats)}  # noqa: E731
-        loaded = renders.TextureReader(plugin, spp, sampler).loaded(scene, SIZE, (side, side))
-        parameters, images = mi.traverse(loaded), []
-        for k in range(frames):
-            place = (origin * 2 ** (-k / max(frames - 1, 1))).tolist()
-            parameters["sensor.to_world"] = mi.Transform4f().look_at(origin=place, target=scene.target, up=up)
+    ``poses_at(repeats)`` returns (origin, target) of the camera in each frame, given how often the tiles repeat along u
+    and v. ``textures`` holds (plugin, samples a pixel, sampler) by label.
+    """
+    side, panels = mi.Bitmap(str(TILES)).size()[0], {}
+    repeats = scene.repeats(size, (side, side))
+    for label, (texture, spp, sampler) in textures.items():
+        plugin = lambda repeats, texture=texture: texture | {"to_uv": renders.to_uv(repeats)}  # noqa: E731
+        loaded = renders.TextureReader(plugin, spp, sampler).loaded(scene, size, (side, side))
+        parameters, panels[label] = mi.traverse(loaded), []
+        for k, (origin, target) in enumerate(poses_at(repeats)):
+            parameters["sensor.to_world"] = mi.Transform4f().look_at(origin=origin, target=target, up=(0.0, 1.0, 0.0))
             parameters.update()
             loading.attach(loaded)
-            images.append(renders.displayed(mi.render(loaded, spp=spp, seed=k)))
-        return [np.round(255 * image).astype(np.uint8) for image in images]
+            image = renders.displayed(mi.render(loaded, spp=spp, seed=k))
+            panels[label].append(np.round(255 * image).astype(np.uint8))
+    return panels
 
-    bitmap = {"type": "bitmap", "filename": albedo}
-    panels = {
-        "bitmap, 1 sample a pixel": panel(bitmap),
-        "mipmap, 1 sample a pixel": panel({"type": "mipmap", "filename": albedo, "filter": "anisotropic"}),
-        "neural_texture, 1 sample a pixel": panel(learned),
-        f"truth, {TRUTH} samples a pixel": panel(bitmap, TRUTH, "multijitter"),
+
+def flight(frames: int) -> Film:
+    """Render the README's film, a flight over one repetition of the tiles, of twice as many frames."""
+    scene = dataclasses.replace(
+        renders.still_scenes()["plane"], name="flight", target=(0.0, 0.7, -1.0), fov=50.0, texels=1.0
+    )
+
+    def poses_at(repeats) -> list:
+        steps = np.linspace(0, PLANE / repeats[1], 2 * frames, endpoint=False).tolist()
+        return [((0.0, 1.0, -z), (0.0, 0.7, -1.0 - z)) for z in steps]
+
+    maps = [mi.Bitmap(str(path)) for path in sorted(ASSETS.glob("tiles_*.png"))]
+    raw = sum(np.array(bitmap).size for bitmap in maps)
+    size = (ASSETS / "tiles_filtered.npz").stat().st_size
+    textures = {
+        f"bitmap, 1 sample a pixel, maps of {raw / 1e6:.2f} MB": (BITMAP, 1, "independent"),
+        f"neural_texture, 1 sample a pixel, file of {size / 1e6:.2f} MB": (LEARNED, 1, "independent"),
     }
+    return Film(tiled_plane(scene, (400, 225), poses_at, textures), 2, ["tiles_filtered.npz"], returns=False)
+
+
+def zoom(frames: int) -> Film:
+    """Render a zoom into the tiles: the distance of the camera decreases by the same factor each frame, to its half."""
+    origin, target = np.array([0.0, 2.0, 2.0]), (0.0, 0.0, 0.0)
+    scene = dataclasses.replace(
+        renders.still_scenes()["plane"], name="zoom", origin=tuple(origin), target=target, fov=40.0, texels=100.0,
+        anchor=(0.5, 0.5),
+    )  # fmt: skip
+    textures = {
+        "bitmap, 1 sample a pixel": (BITMAP, 1, "independent"),
+        "mipmap, 1 sample a pixel": (BITMAP | {"type": "mipmap", "filter": "anisotropic"}, 1, "independent"),
+        "neural_texture, 1 sample a pixel": (LEARNED, 1, "independent"),
+        f"truth, {TRUTH} samples a pixel": (BITMAP, TRUTH, "multijitter"),
+    }
+    places = [(origin * 2 ** (-k / max(frames - 1, 1))).tolist() for k in range(frames)]
+    panels = tiled_plane(scene, SIZE, lambda repeats: [(place, target) for place in places], textures)
     return Film(panels, 2, ["tiles_filtered.npz"])
 
 
 #: Films by name.
-FILMS = {"suite": suite, "zoom": zoom, "orbit": orbit, "shading": shading}
+FILMS = {"flight": flight, "zoom": zoom, "orbit": orbit, "shading": shading}
 
 
 def psnr(panels: Panels) -> dict[str, float]:

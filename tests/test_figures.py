@@ -58,7 +58,7 @@ def test_changes_by_hand_are_refused(copy):
     assert result.returncode == 1
     for name in ("README.md", "sdf.md", "field_errors.csv"):
         assert f"{name}: would change" in result.stdout
-    assert "README.md: no such sentence: “a grid of" in result.stderr
+    assert "README.md: no such sentence: “NeRF's lego" in result.stderr
     assert "measured/nothing.csv: no page has" in result.stderr
 
 
