@@ -258,36 +258,33 @@ def shaded_renders(*studies: Entries, name: str = "ours") -> list[Entries]:
     return rows
 
 
-def shaded_levels(*studies: Entries) -> list[Entries]:
-    """Return for each material the best filter in equal bytes, the best LEAN uncompressed, plain and ours.
+def shaded_contenders(*studies: Entries) -> list[Entries]:
+    """Return for each material plain, ours, the best filter in equal bytes and the best LEAN without compression.
 
-    ``mean_db``, one a seed, and ``levels``, the means of seeds, are PSNR of held-out footprints.
+    ``converged`` and ``single`` are PSNR in dB of held-out footprints, of many places in a pixel and of single renders:
+    the mean of seeds, or the best filter of each.
     """
-
-    def psnr(record: Entries) -> float:
-        return record.errors.footprints_db
-
     rows = []
     for material, kinds in shaded_materials(*studies).items():
-        ours = [d for d in kinds["run"] if d.label.startswith("ours")]
-        lean = max((d for d in kinds["classical"] if d.label.startswith("LEAN")), key=psnr)
-        best = max(kinds["compressed"], key=psnr)
         contenders = {
-            f"{best.label} (best filter in equal bytes)": [best], f"{lean.label} (uncompressed)": [lean],
-            "plain": kinds["plain"], "ours": ours,
-        }  # fmt: skip
-        for label, runs in contenders.items():
-            levels = [mean(d.errors[key] for d in runs) for key in runs[0].errors if key.startswith("l")]
-            rows.append(Entries(material=material, label=label, mean_db=[*map(psnr, runs)], levels=levels))
+            "plain": kinds["plain"],
+            "ours": [d for d in kinds["run"] if d.label.startswith("ours")],
+            "best filter, equal bytes": kinds["compressed"],
+            "LEAN, uncompressed": [d for d in kinds["classical"] if d.label.startswith("LEAN")],
+        }
+        for label, records in contenders.items():
+            pick = mean if label in ("plain", "ours") else max
+            converged, single = (pick(d.errors[error] for d in records) for error in ("footprints_db", "with_noise_db"))
+            rows.append(Entries(material=material, label=label, converged=converged, single=single))
     return rows
 
 
-def over_filters(label: str, *studies: Entries) -> list[float]:
-    """Return the gain of ours in dB over the contender of :func:`shaded_levels` whose name has a text, by material."""
+def over_filters(label: str, error: str, *studies: Entries) -> list[float]:
+    """Return the gain of ours in dB over a contender of :func:`shaded_contenders`, by material."""
     gains = []
-    for rows in groups(shaded_levels(*studies), "material").values():
-        other = one(row for row in rows if label in row.label)
-        gains.append(mean(rows[-1].mean_db) - mean(other.mean_db))
+    for rows in groups(shaded_contenders(*studies), "material").values():
+        ours, other = (one(row for row in rows if row.label == name) for name in ("ours", label))
+        gains.append(ours[error] - other[error])
     return gains
 
 
@@ -317,7 +314,7 @@ FUNCTIONS = {
         min, max, sum, len, round, abs, all, any, sorted, next, iter, zip, map, list, dict, range, tuple, float,
         Entries, measured, every, one, ratio, time_over, equal_samples, cells, median, with_spread,
         size_text, binary_size, asset_bytes, equal_quality, budgets, by_label,
-        surface_errors, trust_cell, shaded_renders, shaded_levels, over_filters, shipped,
+        surface_errors, trust_cell, shaded_renders, shaded_contenders, over_filters, shipped,
         trust_cells,
     )
 } | {"mean": mean, "RENDERS": RENDERS}  # fmt: skip

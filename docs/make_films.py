@@ -15,12 +15,16 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scenes"))
+from make_rust import EXPOSURE, LIGHTS
 
 from mi_diffind.core.files import write_json
 from mi_diffind.core.progress import progress_bar
@@ -86,27 +90,28 @@ def swing(degrees: float, frames: int) -> list[np.ndarray]:
     return rotations(degrees * (2 * times(frames) - 1))
 
 
-def rendered(name: str, motions: Sequence[np.ndarray], size=SIZE, spp=1, against="", scale=1, **defines) -> list:
+def linear(name: str, motions: Sequence[np.ndarray], size: tuple, spp: int, against: str, **defines) -> list:
     """Render the frames of one panel: a scene of ``scenes/``, its learned plugins replaced by those of ``against``.
 
-    The panel has ``size`` (width, height); each pixel of the render is enlarged to ``scale`` × ``scale`` of it.
+    Returns linear images of ``size`` (width, height).
     """
-    defines |= {"spp": spp, "width": size[0] // scale, "height": size[1] // scale}
+    defines |= {"spp": spp, "width": size[0], "height": size[1]}
     options = {"exact": True, "against": against} if against else {}
     scene = loading.load(SCENES / f"{name}.xml", defines, **options)
     with progress_bar(f"{name} {against}".rstrip(), len(motions), "frame", True) as bar:
-        images = rendering.along(scene, motions, new_seeds=True, on_frame=bar.update)
-    return [films.displayed(image).repeat(scale, axis=0).repeat(scale, axis=1) for image in images]
+        return rendering.along(scene, motions, new_seeds=True, on_frame=bar.update)
 
 
 def floor(motions: Sequence[np.ndarray], against: str = "", spp: int = SAMPLES) -> list[np.ndarray]:
     """Render a panel of ``horizon.xml``."""
-    return rendered("horizon", motions, SIZE, spp, against, max_depth=3)
+    return [films.displayed(image) for image in linear("horizon", motions, SIZE, spp, against, max_depth=3)]
 
 
-def metal(file: str, frames: int, **options) -> list[np.ndarray]:
-    """Render a panel of hammered metal in a light without noise, its pixels enlarged."""
-    return rendered("rust", swing(8.0, frames), scale=2, metal=file, sky=0, max_depth=2, **options)
+def metal(file: str, frames: int, spp: int = 1, against: str = "") -> list[np.ndarray]:
+    """Render a panel of hammered metal under lights without noise, the sum of a render under each; enlarged pixels."""
+    small, options = (SIZE[0] // 2, SIZE[1] // 2), {"metal": file, "sky": 0, "max_depth": 2}
+    lit = (np.array(linear("rust", swing(8.0, frames), small, spp, against, **options, **light)) for light in LIGHTS)
+    return [films.displayed(EXPOSURE * image).repeat(2, axis=0).repeat(2, axis=1) for image in sum(lit)]
 
 
 def orbit(frames: int) -> Film:

@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 
 #: Tables of more than ten rows in a page: each task or plugin has a row, or shorter ones would hide what ours loses.
-LONG = {"trust", "shading_levels"}
+LONG = {"trust", "shading_contenders"}
 
 
 def test_pages_are_as_the_files_say():
@@ -109,11 +109,11 @@ def test_samples_at_equal_error():
         figures.equal_samples(study, "plane", "best")
 
 
-def test_rows_of_shaded_renders_and_levels():
+def test_rows_of_shaded_renders_and_contenders():
     """Means of seeds and views, the worst of these, the darkest patch, and the best of several filters."""
 
-    def job(kind, label, levels=(), **details):
-        errors = {"footprints_db": sum(levels) / 2, **{f"l{i}_db": level for i, level in enumerate(levels)}}
+    def job(kind, label, psnr=(0, 0), **details):
+        errors = dict(zip(("footprints_db", "with_noise_db"), psnr, strict=True))
         return {"errors": errors, "details": {"material": "oak", "kind": kind, "label": label, **details}}
 
     def rendered(plain, ours):
@@ -133,12 +133,10 @@ def test_rows_of_shaded_renders_and_levels():
     assert (row.before, row.after) == ({"1": 21}, {"1": 22.625})
     assert (row.gain, row.worst) == (1.625, -1)
     assert row.brightness == pytest.approx({"plain": -0.2, "ours": -0.02})
-    rows = {row.label: (row.mean_db, row.levels) for row in figures.shaded_levels(study, other)}
-    assert rows == {
-        "Toksvig, ASTC (best filter in equal bytes)": ([26], [21, 31]), "LEAN (uncompressed)": ([30], [40, 20]),
-        "plain": ([25], [20, 30]), "ours": ([29, 31], [25, 35]),
-    }  # fmt: skip
-    assert figures.over_filters("equal bytes", study) == [4]
+    rows = {row.label: (row.converged, row.single) for row in figures.shaded_contenders(study, other)}
+    best = {"best filter, equal bytes": (22, 31), "LEAN, uncompressed": (40, 20)}
+    assert rows == {"plain": (20, 30), "ours": (25, 35), **best}
+    assert figures.over_filters("best filter, equal bytes", "single", study) == [4]
 
 
 def test_ratios_are_medians_in_either_order():

@@ -117,11 +117,14 @@ class ShadingStudy(Study):
             },
             measures=(
                 Measure("footprints", "footprints_db"),
+                Measure("noisy", "with_noise_db"),
                 *(Measure(f"L{level}", f"l{level}_db", ".1f") for level in range(LEVELS)),
                 Measure("C", "c_mean_db"),
                 Measure("FLIP", "c_flip", ".4f", False),
                 Measure("over best", "over_best_db", "+.2f"),
+                Measure("over best, noisy", "over_best_with_noise_db", "+.2f"),
                 Measure("over LEAN", "over_lean_db", "+.2f"),
+                Measure("over LEAN, noisy", "over_lean_with_noise_db", "+.2f"),
                 Measure("renders", "renders_gain_db", "+.2f"),
                 Measure("at worst", "renders_worst_db", "+.2f"),
                 Measure("brightness", "brightness_error", ".3f", False),
@@ -204,7 +207,8 @@ class ShadingContenders:
         """Measure the model of a job; return its record."""
         read = reader(job.model, self.effects)
         measured, by_level = self.evaluation.measure(read), self.footprints[1].psnr(read)[:LEVELS]
-        errors = {"footprints_db": float(by_level.mean())}
+        noisy = self.footprints[1].psnr(read, noise=True)[:LEVELS]
+        errors = {"footprints_db": float(by_level.mean()), "with_noise_db": float(noisy.mean())}
         errors |= {f"l{level}_db": float(value) for level, value in enumerate(by_level)}
         errors |= {f"{letter.lower()}_mean_db": figures["mean_db"] for letter, figures in measured.items()}
         if measured["C"]["flip"]:  # that of small images is not measured
@@ -303,10 +307,10 @@ class ShadingContenders:
         coded, nbytes = codecs.astc_levels(level_images(build()), self.source.nbytes / COMPRESSION, quality, names)
         return level_pyramid({name: e.levels for name, e in coded.items()}, build()), nbytes
 
-    def best(self, method: str, name: str = "") -> Contender:
-        """Return the contender of a method, of the filter ``name`` if it is given, with the smallest error."""
+    def best(self, method: str, name: str = "", error: str = "footprints_db") -> Contender:
+        """Return the contender of a method, of the filter ``name`` if it is given, with the smallest ``error``."""
         jobs = [job for job in self.jobs.values() if job.method == method and job.label.startswith(name)]
-        return max(jobs, key=lambda job: job.record["errors"]["footprints_db"])
+        return max(jobs, key=lambda job: job.record["errors"][error])
 
     # -- Renders
 
@@ -334,10 +338,14 @@ class ShadingContenders:
                     for name in ratios:
                         views = renders[name][lights][spp]["brightness"]
                         ratios[name] += [abs(ratio - 1) for view in views for ratio in view.values()]
-            mean_db = lambda contender: contender.record["errors"]["footprints_db"]  # noqa: E731
+            over = {}
+            for suffix in ("db", "with_noise_db"):
+                error = suffix if suffix != "db" else "footprints_db"
+                rivals = {"best": self.best("compressed", error=error), "lean": self.best("classical", "LEAN", error)}
+                for name, rival in rivals.items():
+                    over[f"over_{name}_{suffix}"] = ours.record["errors"][error] - rival.record["errors"][error]
             errors = {
-                "over_best_db": mean_db(ours) - mean_db(best),
-                "over_lean_db": mean_db(ours) - mean_db(lean),
+                **over,
                 "renders_gain_db": float(np.mean([*gains.values()])),
                 "renders_worst_db": float(np.min([*gains.values()])),
                 "brightness_error": max(ratios["ours"]),

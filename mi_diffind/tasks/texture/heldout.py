@@ -160,24 +160,27 @@ class HeldOutFootprints:
         ]
         self.exposures = [float(1 / max(np.quantile(x[x > 0], 1 - WHITE), 1e-3)) if (x > 0).any() else 1.0 for x in lit]
 
-    def errors(self, read: ShadedReader) -> list[list[np.ndarray]]:
+    def errors(self, read: ShadedReader, noise: bool = False) -> list[list[np.ndarray]]:
         """Return the squared errors of exposed values up to 1, ``(levels, groups, pixels)``.
 
         For each of :data:`CASES`, there is an array for groups of single lights (uniform, then about the mirror
-        direction), and one for those of a sky.
+        direction), and one for those of a sky. Values are means over many places within a pixel; with ``noise``, the
+        errors are those of a single render, whose samples lie at a few random places.
         """
         errors = []
         for samples in CASES:
-            levels = zip(*(self._error(read, level, samples) for level in range(self.levels)), strict=True)
+            levels = zip(*(self._error(read, level, samples, noise) for level in range(self.levels)), strict=True)
             errors.append([np.stack(x) for x in levels])
         return errors
 
-    def psnr(self, read: ShadedReader) -> np.ndarray:
-        """Return the PSNR of levels in dB, ``(levels,)``, the mean over cases and groups."""
-        means = [np.hstack([x.mean(axis=-1, dtype=np.float64) for x in case]) for case in self.errors(read)]
+    def psnr(self, read: ShadedReader, noise: bool = False) -> np.ndarray:
+        """Return the PSNR of levels in dB, ``(levels,)``, the mean over cases and groups (:meth:`errors`)."""
+        means = [np.hstack([x.mean(axis=-1, dtype=np.float64) for x in case]) for case in self.errors(read, noise)]
         return -10 * np.log10(np.maximum(np.hstack(means), 1e-12)).mean(axis=1)
 
-    def _error(self, read: ShadedReader, level: int, samples: int) -> tuple[np.ndarray, np.ndarray]:
+    def _error(
+        self, read: ShadedReader, level: int, samples: int, noise: bool = False
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return the squared errors of a level, ``(groups, pixels)``, of single lights and of skies."""
         footprints, count = self.footprints[level], self.count
         if samples:
@@ -186,17 +189,26 @@ class HeldOutFootprints:
             lane += lane // count * (self.count - count)
             footprints = [dr.gather(type(x), x, lane) for x in footprints]
         *_, weight, truth = footprints
-        value = self._read(read, footprints, samples)
+        reads = self._reads(read, footprints, samples)
+        places = dr.width(reads) // dr.width(weight)
+        value = self.types.Array3f([dr.block_sum(c, places) / places for c in reads]) if samples else reads
         values, truths = (np.array(weight * x).reshape(3, LIGHTS * RANGES, count) for x in (value, truth))
+        if noise and samples:
+            singles = weight.numpy()[:, None] * np.array(reads).reshape(3, -1, places)
+            singles = singles.reshape(3, LIGHTS * RANGES, count, places)
         exposures, result = np.repeat(self.exposures, RANGES)[:, None], []
         for group, lights in ((slice(-RANGES), 1), (slice(-RANGES, None), SKY)):
             means = (x[:, group].reshape(3, -1, count // lights, lights).mean(axis=-1) for x in (values, truths))
             a, b = (np.minimum(exposures[group] * x, 1) for x in means)
-            result.append(np.square(a - b).mean(axis=0))
+            squared = np.square(a - b)
+            if noise and samples:
+                single = singles[:, group].reshape(*squared.shape, lights, places).mean(axis=3)
+                squared += np.minimum(exposures[group][..., None] * single, 1).var(axis=-1) / samples
+            result.append(squared.mean(axis=0))
         return tuple(result)
 
-    def _read(self, read: ShadedReader, footprints: Sequence, samples: int) -> Any:
-        """Return the values of pixels as a renderer with ``samples`` a pixel shows them on average."""
+    def _reads(self, read: ShadedReader, footprints: Sequence, samples: int) -> Any:
+        """Return the values that a renderer with ``samples`` a pixel reads at places of pixels, one after the other."""
         types = self.types
         u, v, at, stretch, wi, wo, *_ = footprints
         Float, UInt32 = types.Float, types.UInt32
@@ -215,7 +227,7 @@ class HeldOutFootprints:
             finer = dr.maximum(at - dr.opaque(Float, 0.5 * float(np.log2(samples))), 0)
             value = read(u, v, finer, wi, wo, share_of_bias(stretch))
             dr.eval(value)
-            return types.Array3f([dr.block_sum(c, places) / places for c in value])
+            return value
 
 
 class _Numbers:

@@ -54,7 +54,7 @@ FALL = 0.7
 TOP = 9
 
 #: Level biases that are compared.
-BIASES = (0.0, -0.25, -0.5)
+BIASES = (0.0, -0.5)
 
 #: Level bias of the training for appearance, and of the comparison of arrays to begin it with.
 TRAINED_BIAS = -0.5
@@ -234,9 +234,10 @@ class ShadingProblem(textures.TextureProblem):
             return texture
         maps = CompressedTexture(self.pyramid.layout, textures.rounded(unfolded(net)), self.level_bias)
         read = reader(maps, self.effects)
-        if self.preview is not None:
-            write_preview(*self.preview, read)
-        gain = compared(self.base, self.held_out.errors(read))[0].mean()
+        with all_cores():
+            if self.preview is not None:
+                write_preview(*self.preview, read)
+            gain = compared(self.base, self.held_out.errors(read))[0].mean()
         return {"gain_db": float(gain), **{f"texture_{name}": value for name, value in texture.items()}}
 
 
