@@ -8,9 +8,10 @@ get them by expressions (``figures.py``) in three files:
 
 - ``tables.toml``: tables, which stand between ``<!-- table NAME -->`` and ``<!-- end -->``. A table that shows some of
   its rows has all of them in ``docs/measured/NAME.csv``.
-- ``claims.toml``: figures in sentences. Each entry names a page (the README, a page of ``docs``, or the file of a
-  plugin, whose docstring is a page of the manual), a part of a sentence with fields as of ``str.format``, and an
-  expression for each field. ``holds`` is an expression that must be true, for a sentence in words:
+- ``claims.toml``: figures in sentences. Each entry names a page (the README, a page of ``docs``, as ``sdf.md`` or
+  ``studies/sdf.md``, or the file of a plugin, whose docstring is a page of the manual), a part of a sentence with
+  fields as of ``str.format``, and an expression for each field. ``holds`` is an expression that must be true, for a
+  sentence in words:
 
       [["README.md"]]
       text = "a grid of {grid:.1f} dB in {minutes:.0f} minutes"
@@ -52,6 +53,17 @@ from figures import (
 
 import mi_diffind
 
+
+def page_paths() -> list[Path]:
+    """Return the files of the pages that are written by hand, but the README: pages of ``docs``, and its studies."""
+    return sorted([*DOCS.glob("*.md"), *DOCS.glob("studies/*.md")])
+
+
+def page_name(path: Path) -> str:
+    """Return the name of a page in ``claims.toml`` and ``settings.toml``: ``sdf.md``, ``studies/sdf.md``."""
+    return path.relative_to(DOCS).as_posix() if DOCS in path.parents else path.name
+
+
 # -- tables ------------------------------------------------------------------------------------------------------------
 
 
@@ -68,9 +80,9 @@ class Table:
         lines = [self.head, ["---"] * len(self.head), *self.shown]
         return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
 
-    def page_text(self, name: str) -> str:
+    def page_text(self, name: str, measured: str = "measured") -> str:
         """Return the rows that the page shows and, if these are not all, a link to ``measured/NAME.csv``."""
-        link = f"\n\nAll {len(self.rows)} rows: [{name}.csv](measured/{name}.csv)"
+        link = f"\n\nAll {len(self.rows)} rows: [{name}.csv]({measured}/{name}.csv)"
         return f"{self}{link if len(self.shown) < len(self.rows) else ''}"
 
     def csv(self) -> str:
@@ -142,8 +154,8 @@ class Claim:
 
     @property
     def path(self) -> Path:
-        """The file of the page: the README, a page of ``docs``, or the source of a plugin with its docstring."""
-        return ROOT / self.page if self.page == "README.md" or "/" in self.page else DOCS / self.page
+        """The file of the page: a page of ``docs``, the README, or the source of a plugin with its docstring."""
+        return (DOCS if (DOCS / self.page).is_file() else ROOT) / self.page
 
     @property
     def files(self) -> list[str]:
@@ -235,7 +247,7 @@ def unbacked(page: str, text: str) -> list[str]:
     spans = [m.span() for pattern in SETTINGS for m in re.finditer(pattern, bare.replace("\n", " "))]
     phrases = toml("settings.toml").get(page, ())
     spans += [m.span() for phrase in phrases for m in re.finditer(phrase_pattern(phrase), text)]
-    spans += [span for c in claims() if c.path.name == page for m in c.matches(text) for span in m.regs[1:]]
+    spans += [span for c in claims() if page_name(c.path) == page for m in c.matches(text) for span in m.regs[1:]]
     return [
         f"{page}:{text.count(chr(10), 0, m.start()) + 1}: {m[0]}  …"
         + re.sub(r"\s+", " ", text[max(0, m.start() - 45) : m.end() + 35])
@@ -246,8 +258,7 @@ def unbacked(page: str, text: str) -> list[str]:
 
 def pages() -> dict[str, str]:
     """Return the text of the README, of each page that is written by hand, and of each notebook, by its name."""
-    paths = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
-    texts = {p.name: p.read_text(encoding="utf-8") for p in paths}
+    texts = {page_name(p): p.read_text(encoding="utf-8") for p in (ROOT / "README.md", *page_paths())}
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
         cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
         texts[path.name] = "\n\n".join("".join(c["source"]) for c in cells if c["cell_type"] == "markdown")
@@ -292,9 +303,10 @@ def written() -> tuple[dict[Path, str], list[str]]:
         content = tables()[name]
         if len(content.shown) < len(content.rows):
             csv_files[DOCS / "measured" / f"{name}.csv"] = content.csv()
-        return f"{begin}{content.page_text(name)}\n{end}"
+        return f"{begin}{content.page_text(name, measured)}\n{end}"
 
-    for path in sorted(DOCS.glob("*.md")):
+    for path in page_paths():
+        measured = "../measured" if path.parent != DOCS else "measured"
         text = path.read_text(encoding="utf-8")
         pages[path] = re.sub(r"(<!-- table (\w+) -->\n)(?:(?:\|.*|All \d.*)?\n)*(<!-- end -->)", block, text)
     for claim in claims():
@@ -323,7 +335,7 @@ def main(arguments: list[str]) -> int:
     for trouble in troubles:
         print(trouble, file=sys.stderr)
     for path in differing:
-        print(f"{path.name}: {'would change' if check else 'written'} ({mi_diffind.__version__})")
+        print(f"{page_name(path)}: {'would change' if check else 'written'} ({mi_diffind.__version__})")
         if not check:
             path.write_text(contents[path], encoding="utf-8")
     return int(bool(troubles) or (check and bool(differing)))
