@@ -178,7 +178,7 @@ class Claim:
         fields = [(name, spec) for _, name, spec, _ in string.Formatter().parse(self.text) if name is not None]
         numbers, matches = [format(evaluate(self.values[name]), spec) for name, spec in fields], self.matches(text)
         if not matches:
-            raise ClaimError(f"{self.page}: no such sentence: “{self.text}”; claims.toml has it, mend either")
+            raise ClaimError(f"{self.page}: no such sentence: “{self.text}”; claims.toml has it, correct either")
         if self.holds is not None and not evaluate(self.holds):
             raise ClaimError(f"{self.page}: “{self.text}” does not hold: {self.holds}")
         for match in reversed(matches):
