@@ -123,11 +123,6 @@ def cells(values: Iterable) -> str:
     return " | ".join(map(str, values))
 
 
-def median(entry: dict | None) -> str:
-    """Return the median of a ratio as text, "–" if it is not measured."""
-    return f"{entry['median']:.2f}" if entry else "–"
-
-
 def with_spread(values: list[float]) -> str:
     """Return a mean with half the range, if there are several values."""
     return f"{mean(values):.2f}" + (f" ± {(max(values) - min(values)) / 2:.2f}" if len(values) > 1 else "")
@@ -312,7 +307,7 @@ FUNCTIONS = {
     f.__name__: f
     for f in (
         min, max, sum, len, round, abs, all, any, sorted, next, iter, zip, map, list, dict, range, tuple, float,
-        Entries, measured, every, one, ratio, time_over, equal_samples, cells, median, with_spread,
+        Entries, measured, every, one, ratio, time_over, equal_samples, cells, with_spread,
         size_text, binary_size, asset_bytes, equal_quality, budgets, by_label,
         surface_errors, trust_cell, shaded_renders, shaded_contenders, over_filters, shipped,
         trust_cells,
