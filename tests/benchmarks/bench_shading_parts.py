@@ -1,5 +1,4 @@
-"""
-Parts of the error of compressed materials as they are shaded, in dB: run it, it only measures.
+"""Parts of the error of compressed materials as they are shaded, in dB: run it, it only measures.
 
     python tests/benchmarks/bench_shading_parts.py MATERIAL.json FILE.npz [MATERIAL.json FILE.npz …] [--json FILE]
 

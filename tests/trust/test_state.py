@@ -79,8 +79,7 @@ def alive() -> int:
 
 @pytest.mark.parametrize("name", examples.names())
 def test_objects_die_with_their_scene(mi, no_garbage_collection, name):
-    """
-    Without waiting for the garbage collector: Dr.Jit refuses to freeze a function, and may crash in the middle of a
+    """Without waiting for the garbage collector: Dr.Jit refuses to freeze a function, and may crash in the middle of a
     render, if instances that nobody holds any more are in its registry.
     """
     storage = "float32" if plugins.declared()[name].task else ""
