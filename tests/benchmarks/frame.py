@@ -7,6 +7,7 @@ else the machine does, and its clock, then hit all of them alike.
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -29,6 +30,11 @@ def write(path: Path | None, result: dict) -> None:
     """Write the result of a benchmark, if there is a file for it."""
     if path:
         write_json(path, result)
+
+
+def earlier(path: Path | None, **empty) -> dict:
+    """Return what an earlier run has written to a file, or ``empty``."""
+    return json.loads(path.read_text(encoding="utf-8")) if path and path.is_file() else empty
 
 
 def by_turns(functions: dict[str, Callable], rounds: int, warm: int = 1) -> dict[str, list]:
