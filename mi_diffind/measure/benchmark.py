@@ -61,8 +61,7 @@ def measure(
     ``settings``, ``details``; ``candidates``: name → description and ``errors``; ``cases``: name → ``queries``: name →
     candidate → ``time``, ``q1``, ``q3`` (ns a lane, floor subtracted), ``with_floor``, ``floor``, ``rounds``,
     ``hidden`` (``time`` is only a bound), ``operations``; ``passes``: candidate → likewise in ms; ``ratios``: query →
-    ``"a / b"`` → ``median``, ``q1``, ``q3``; ``jobs``: their records. After Ctrl-C the result is
-    incomplete.
+    ``"a / b"`` → ``median``, ``q1``, ``q3``; ``jobs``: their records. After Ctrl-C the result is incomplete.
 
     Raises :class:`.OutputError` if the folder cannot be written.
     """
