@@ -6,21 +6,7 @@ that one sample a pixel shows what becomes of the textures.
 
 from pathlib import Path
 
-from scene_xml import (
-    Whole,
-    element,
-    head,
-    lying,
-    place,
-    plugin,
-    principled,
-    ref,
-    repeated,
-    sun,
-    transform,
-    turn,
-    write,
-)  # fmt: skip
+from scene_xml import Whole, element, head, lying, place, plugin, principled, ref, repeated, sun, transform, turn, write
 
 ABOUT = """Tiles to the horizon, with textures that filter themselves. Written by make_horizon.py: change that file.
 

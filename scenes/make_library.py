@@ -24,11 +24,6 @@ def blend(weight: float, first: ET.Element, second: ET.Element):
     return plugin("bsdf", "blendbsdf", first, second, weight=weight)
 
 
-def brushed(material: str, alpha_u: float, alpha_v: float):
-    """Return an anisotropic conductor."""
-    return plugin("bsdf", "roughconductor", material=material, alpha_u=alpha_u, alpha_v=alpha_v, distribution="ggx")
-
-
 #: Name → BSDF, row by row.
 MATERIALS = {
     "lacquer": principled(base_color=(0.7, 0.2, 0.08), roughness=0.35, metallic=0.2, clearcoat=1.0),
@@ -42,7 +37,7 @@ MATERIALS = {
     "copper": metal("Cu", 0.03),
     "chrome": metal("Cr", 0.1, "beckmann"),
     "rubber": plastic(0.4, (0.03, 0.03, 0.035)),
-    "aluminium": brushed("Al", 0.08, 0.3),
+    "aluminium": plugin("bsdf", "roughconductor", material="Al", alpha_u=0.08, alpha_v=0.3, distribution="ggx"),
     "ceramic": principled(base_color=(0.75, 0.72, 0.65), roughness=0.6, clearcoat=1.0, clearcoat_gloss=0.95),
     "pearl": blend(0.35, principled(base_color=(0.8, 0.74, 0.76), roughness=0.45), metal("Ag", 0.2)),
     "bronze": principled(base_color=(0.55, 0.36, 0.16), roughness=0.4, metallic=1.0),

@@ -6,20 +6,7 @@
 from pathlib import Path
 
 import mitsuba as mi
-from scene_xml import (
-    Whole,
-    environment,
-    head,
-    lying,
-    place,
-    plugin,
-    principled,
-    ref,
-    softbox,
-    transform,
-    turn,
-    write,
-)  # fmt: skip
+from scene_xml import Whole, environment, head, lying, place, plugin, principled, ref, softbox, transform, turn, write
 
 ABOUT = """Signed distance fields beside and in the place of meshes: Suzanne as a mesh (left) and as a field (right, the
 same clay), a knot of gold that casts a shadow on the latter, one behind a pane of glass, one of glass. Written by

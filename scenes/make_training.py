@@ -19,11 +19,6 @@ def material(repeats: float, **parameters):
                   filter="anisotropic", **parameters)  # fmt: skip
 
 
-def warm_sun(x: float, y: float, z: float, irradiance: float):
-    """Return a directional light of a warm colour."""
-    return sun(x, y, z, (irradiance, 0.94 * irradiance, 0.85 * irradiance))
-
-
 def save(name: str, what: str, file: str, fov: float, camera: tuple, content: list) -> None:
     """Write one scene; ``camera`` is its place and its target."""
     start = head(96, 54, {"material": file}, fov, camera)
@@ -37,7 +32,7 @@ def main() -> None:
     balls = [ball(x, z, radius, material(repeats)) for x, z, radius, repeats in places]
     plate = [lying(5, 5, material(24.0)), *balls]
     save("balls", "The plate and balls of rust.xml in one plugin a material", "rust_plain.npz", 36.0,
-         ((0, 4.2, 7.5), (0, 0.35, 0.2)), [warm_sun(-0.55, -0.6, 0.35, 3.2), sky, *plate])  # fmt: skip
+         ((0, 4.2, 7.5), (0, 0.35, 0.2)), [sun(-0.55, -0.6, 0.35, (3.2, 3.008, 2.72)), sky, *plate])  # fmt: skip
 
     white = plugin("bsdf", "diffuse", reflectance=(0.7, 0.68, 0.64))
     floor = [environment("interior.exr", 0.9, 20), lying(6, 6, material(10.0, ignore="ao")),

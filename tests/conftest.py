@@ -20,9 +20,8 @@ def pytest_runtest_setup(item):
 
 
 def pytest_collection_modifyitems(items):
-    """
-    Notebooks and tests of a finished run of a study are long. Within a file, tests of one variant follow each other: a
-    switch costs a tenth of a second.
+    """Notebooks and tests of a finished run of a study are long. Within a file, tests of one variant follow each other:
+    a switch costs a tenth of a second.
     """
     for item in items:
         if item.path.suffix == ".ipynb" or "finished" in getattr(item, "fixturenames", ()):

@@ -470,9 +470,8 @@ def test_renders_that_fit_into_a_limited_time(monkeypatch, seconds, compiling, k
 
 
 def test_a_scene_is_trained(folder, tmp_path, monkeypatch):
-    """
-    From arrays that say something else, towards the references, as far as few steps go; what comes out is an ordinary
-    file, and a run that was interrupted ends where one that was not does.
+    """From arrays that say something else, towards the references, as far as few steps go; what comes out is an
+    ordinary file, and a run that was interrupted ends where one that was not does.
     """
     for name in ("material.json", "albedo.png", "roughness.png"):
         (tmp_path / name).write_bytes((folder / name).read_bytes())
@@ -638,9 +637,8 @@ def test_a_material_is_trained_as_its_maps_are(folder, path, trained, weights):
 
 
 def test_gradients_against_differences(trained, weights):
-    """
-    Of a weighted sum of all pixels with respect to entries of each array, seven of those with the largest gradients and
-    three others, by central differences at equal samples. The sun's direction is no random number, so nothing is
+    """Of a weighted sum of all pixels with respect to entries of each array, seven of those with the largest gradients
+    and three others, by central differences at equal samples. The sun's direction is no random number, so nothing is
     sampled that would depend on the entries.
     """
     scene, problem = trained
@@ -872,8 +870,7 @@ def test_arrays_of_the_same_size(folder, preset, tmp_path):
 
 
 def test_the_figure_holds_for_views_that_it_has_not_seen(folder, path):
-    """
-    Without ranges, small ones are drawn, and the figure is that of renders of other views of them, by Mitsuba alone,
+    """Without ranges, small ones are drawn, and the figure is that of renders of other views of them, by Mitsuba alone,
     with other samples. Beside it stands the figure of the start, in the same views.
     """
     settings = FitSettings(steps=6, batch=512, lr=0.01, measure_every=6, deterministic=True)

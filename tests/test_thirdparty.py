@@ -1,5 +1,4 @@
-"""
-A task in one folder: a package of somebody else's, ``thirdparty/mi_profile``, adds a task, textures and a study by
+"""A task in one folder: a package of somebody else's, ``thirdparty/mi_profile``, adds a task, textures and a study by
 entry points. Every command knows it, in processes in which it is installed, and nothing of this package names it.
 """
 

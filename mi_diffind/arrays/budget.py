@@ -79,11 +79,8 @@ class Budget:
         """
         size = self.largest(family, sizes, strict=False)
         following = sizes[sizes.index(size) + 1 :][:1]
-
-        def difference(size: Size) -> float:
-            return abs(source_bytes / self.nbytes - source_bytes / _nbytes(family(size)))
-
-        return min((size, *following), key=difference)
+        wanted = source_bytes / self.nbytes
+        return min((size, *following), key=lambda size: abs(wanted - source_bytes / _nbytes(family(size))))
 
     def paper_side(
         self, family: Callable[[int], Member], cells: int, dims: int, source_bytes: float, step: int = 4

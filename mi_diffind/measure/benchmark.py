@@ -61,8 +61,7 @@ def measure(
     ``settings``, ``details``; ``candidates``: name → description and ``errors``; ``cases``: name → ``queries``: name →
     candidate → ``time``, ``q1``, ``q3`` (ns a lane, floor subtracted), ``with_floor``, ``floor``, ``rounds``,
     ``hidden`` (``time`` is only a bound), ``operations``; ``passes``: candidate → likewise in ms; ``ratios``: query →
-    ``"a / b"`` → ``median``, ``q1``, ``q3``; ``jobs``: their records. After Ctrl-C the result is
-    incomplete.
+    ``"a / b"`` → ``median``, ``q1``, ``q3``; ``jobs``: their records. After Ctrl-C the result is incomplete.
 
     Raises :class:`.OutputError` if the folder cannot be written.
     """
@@ -163,12 +162,8 @@ class Benchmark:
         """Time whole passes in rounds; the pass before compiles the kernels."""
         names = {c.name for c in self.plan.candidates}
         passes = {name: function for name, function in case.passes().items() if name in names}
-
-        def seconds(query: str, name: str, i: int) -> float:
-            return timed(lambda: passes[name](i)).seconds
-
-        keys = [(PASS, name) for name in passes]
-        self._time(case, f"{case.name}, {PASS}", keys, self.settings.passes, seconds)
+        keys, title = [(PASS, name) for name in passes], f"{case.name}, {PASS}"
+        self._time(case, title, keys, self.settings.passes, lambda _, name, i: timed(lambda: passes[name](i)).seconds)
 
     def _time(
         self, case: Case, title: str, keys: list[tuple[str, str]], rounds: int,

@@ -169,8 +169,7 @@ def fetch(
 
     A material gets a manifest, ``NAME.json``. Files that are there and have the right SHA-256 stay. ``base``: another
     address, of a mirror, that ends in a folder of the files of each name. ``progress`` is called with a line for each
-    file to fetch. Raises :class:`UsageError` and :class:`.OutputError`; no unfinished file
-    stays.
+    file to fetch. Raises :class:`UsageError` and :class:`.OutputError`; no unfinished file stays.
     """
     names = tuple(dict.fromkeys([names] if isinstance(names, str) else names))
     if unknown := next((name for name in names if name not in DOWNLOADS), None):

@@ -80,8 +80,7 @@ def tradeoff(
       option that is a word of Python ends in an underscore (``lambda_=0.5``).
 
     The result holds figures, lines of text and the paths of the files, and notebooks show its picture. After Ctrl-C, it
-    is incomplete. Raises :class:`.UsageError`, :class:`.OutputError`, and what the
-    study's own input raises.
+    is incomplete. Raises :class:`.UsageError`, :class:`.OutputError`, and what the study's own input raises.
     """
     if study not in studies():
         raise UsageError(f'found the study "{study}", allowed are {", ".join(studies())}')

@@ -122,11 +122,8 @@ def fitted_contender(material: str, preset: str, quick: bool) -> Contender:
             errors[f"moment_{name}"] = sum(moments) / len(moments)
         return {"bytes": model.table.nbytes, "errors": errors, "details": {"steps": model.table.settings["steps"]}}
 
-    def read(job: Contender):
-        return mi.load_dict({"type": "neural_bsdf", "filename": str(job.file)})
-
-    name = f"{material}: {preset}"
-    return Contender(name, preset, 0, train, read, preset, "learned", preset)
+    read = lambda job: mi.load_dict({"type": "neural_bsdf", "filename": str(job.file)})  # noqa: E731
+    return Contender(f"{material}: {preset}", preset, 0, train, read, preset, "learned", preset)
 
 
 def plan(materials: tuple[str, ...] = (), quick: bool = False) -> Plan:

@@ -189,10 +189,7 @@ def grid_contender(context: DistanceStudyContext, fields: dict) -> Contender:
 
 def hash_contender(context: DistanceStudyContext, fields: dict) -> NetworkContender:
     """Return the contender of a hash grid with a network."""
-    steps, longest = context.settings.hash_steps
-
-    def problem():
-        return rivals.HashProblem(context.samples, fields["budget"])
+    (steps, longest), budget = context.settings.hash_steps, fields["budget"]
 
     def build(net) -> DistanceField:
         return rivals.HashDistanceField(net, context.samples.field)
@@ -201,7 +198,7 @@ def hash_contender(context: DistanceStudyContext, fields: dict) -> NetworkConten
         model = build(net)
         return context.record(model, model.nbytes, steps=record["steps"])
 
-    settings = FitSettings(**HASH_SETTINGS, steps=steps)
+    settings, problem = FitSettings(**HASH_SETTINGS, steps=steps), lambda: rivals.HashProblem(context.samples, budget)
     return NetworkContender(*fields.values(), build, problem, settings, longest, 8, True, finish)
 
 

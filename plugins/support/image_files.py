@@ -14,15 +14,7 @@ import numpy as np
 from mi_diffind.arrays.tables import Table
 from mi_diffind.core import compat
 from mi_diffind.core.compat import backend_module
-from mi_diffind.core.files import (
-    OutsideError,
-    is_within,
-    path_within,
-    read_once,
-    relative_path,
-    stamp,
-    write_json,
-)
+from mi_diffind.core.files import OutsideError, is_within, path_within, read_once, relative_path, stamp, write_json
 from mi_diffind.fitting.task import Task
 from mi_diffind.images.reader import PictureError, read_picture
 from mi_diffind.maps.entries import has_maps, split_material

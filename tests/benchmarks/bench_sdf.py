@@ -1,5 +1,4 @@
-"""
-A ray through the arrays of signed distance fields, beside Embree on their meshes and Mitsuba's ``sdfgrid``:
+"""A ray through the arrays of signed distance fields, beside Embree on their meshes and Mitsuba's ``sdfgrid``:
 
     mi-diffind fit sdf armadillo.off -o out/armadillo.npz
     python tests/benchmarks/bench_sdf.py out/armadillo.npz --json docs/measured/bench_sdf.json
@@ -18,10 +17,11 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from frame import VARIANT, by_turns, parser, spread, write
+from frame import VARIANT, by_turns, parser, write
 
 import mi_diffind  # noqa: F401
 from mi_diffind.measure.clock import machine, timed
+from mi_diffind.measure.statistics import spread
 from mi_diffind.studies.sdf import camera_rays, grid_scene, mesh_scene
 from mi_diffind.tasks.sdf import TASK, marching
 from mi_diffind.tasks.sdf.mesh import load_mesh

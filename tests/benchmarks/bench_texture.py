@@ -1,5 +1,4 @@
-"""
-What a filtered read of a texture costs, as a multiple of a bitmap's bilinear read: run it, it only measures.
+"""What a filtered read of a texture costs, as a multiple of a bitmap's bilinear read: run it, it only measures.
 
     python tests/benchmarks/bench_texture.py [--table FILE.npz] [--json FILE]
 
@@ -18,11 +17,12 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from frame import ASSETS, VARIANT, by_turns, parser, spread, write
+from frame import ASSETS, VARIANT, by_turns, parser, write
 
 import mi_diffind
 from mi_diffind.core.compat import use_threads
 from mi_diffind.measure.clock import count_query, machine, timed, total
+from mi_diffind.measure.statistics import spread
 
 TILES = ASSETS / "tiles_filtered.npz"
 WIDTH, HEIGHT = 128, 128

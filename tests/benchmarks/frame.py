@@ -1,4 +1,4 @@
-"""Frame of the benchmarks: arguments, rounds by turns, medians and quartiles, processes, JSON.
+"""Frame of the benchmarks: arguments, rounds by turns, JSON.
 
 Contenders are measured in turn, one of each before the next of any, in the other direction in each second round: what
 else the machine does, and its clock, then hit all of them alike.
@@ -10,8 +10,6 @@ import argparse
 import json
 from collections.abc import Callable
 from pathlib import Path
-
-import numpy as np
 
 from mi_diffind.core.files import write_json
 
@@ -37,12 +35,6 @@ def write(path: Path | None, result: dict) -> None:
 def earlier(path: Path | None, **empty) -> dict:
     """Return what an earlier run has written to a file, or ``empty``."""
     return json.loads(path.read_text(encoding="utf-8")) if path and path.is_file() else empty
-
-
-def spread(values) -> dict[str, float]:
-    """Return the median and the quartiles."""
-    low, median, high = np.quantile(values, (0.25, 0.5, 0.75))
-    return {"median": float(median), "q1": float(low), "q3": float(high)}
 
 
 def by_turns(functions: dict[str, Callable], rounds: int, warm: int = 1) -> dict[str, list]:

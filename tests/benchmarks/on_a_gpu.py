@@ -1,5 +1,4 @@
-"""
-Everything that a person with a GPU can run for this project, by one command, as one file that can be sent back.
+"""Everything that a person with a GPU can run for this project, by one command, as one file that can be sent back.
 
     python tests/benchmarks/on_a_gpu.py [-o on_a_gpu.json] [--quick] [--variant cuda_ad_rgb] [--skip tests,trust,times]
 

@@ -5,8 +5,7 @@ import numpy as np
 
 
 def aligned(values, dtype=np.float32) -> np.ndarray:
-    """
-    Return a contiguous copy whose memory starts at a multiple of 64 bytes.
+    """Return a contiguous copy whose memory starts at a multiple of 64 bytes.
 
     Dr.Jit uses NumPy's memory as it is, and compiles another kernel for each combination of aligned and other inputs.
     NumPy aligns at random, so without this helper a repeated computation is compiled several times.
@@ -20,8 +19,7 @@ def aligned(values, dtype=np.float32) -> np.ndarray:
 
 
 def numpy_of(channels) -> np.ndarray:
-    """
-    Return Dr.Jit arrays as columns of one NumPy array, float64.
+    """Return Dr.Jit arrays as columns of one NumPy array, float64.
 
     They are computed together: NumPy asks for one after the other, and each would be a kernel.
     """

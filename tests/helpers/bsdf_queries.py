@@ -106,9 +106,8 @@ def tile(image, i, columns, size):
 
 @contextlib.contextmanager
 def gradients_enabled(mi, params, keys, n):
-    """
-    Of several parameters, to be read in one kernel: numbers and colours are repeated for each of ``n`` lanes, since the
-    gradient of a single number is a sum over all lanes, which is a kernel for each.
+    """Of several parameters, to be read in one kernel: numbers and colours are repeated for each of ``n`` lanes, since
+    the gradient of a single number is a sum over all lanes, which is a kernel for each.
     """
     for key in keys:
         dr.enable_grad(params[key])

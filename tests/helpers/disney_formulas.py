@@ -1,6 +1,5 @@
-"""
-Burley's model in float64 NumPy, written from the course notes and METHOD.md alone, term by term and without any of the
-rearrangements of ``mi_diffind.tasks.disney.model``: the independent reference of the tests.
+"""Burley's model in float64 NumPy, written from the course notes and METHOD.md alone, term by term and without any of
+the rearrangements of ``mi_diffind.tasks.disney.model``: the independent reference of the tests.
 """
 
 import numpy as np
@@ -17,9 +16,7 @@ def mix(a, b, t):
 
 
 def brdf(base_color, m, wi, wo):
-    """
-    BRDF without the cosine: ``base_color`` (n, 3), ``m`` dict of (n,), directions (n, 3) → (n, 3), float64.
-    """
+    """BRDF without the cosine: ``base_color`` (n, 3), ``m`` dict of (n,), directions (n, 3) → (n, 3), float64."""
     base_color, wi, wo = (np.asarray(a, np.float64) for a in (base_color, wi, wo))
     m = {k: np.asarray(v, np.float64) for k, v in m.items()}
     n_v, n_l = wi[:, 2], wo[:, 2]
@@ -70,8 +67,7 @@ def brdf(base_color, m, wi, wo):
 
 
 def random_case(rng, n, low_cosine=0.0, rate=0.0):
-    """
-    Random materials and directions (uniform over the hemisphere, cosines ≥ low_cosine). Parameters are uniform, or
+    """Random materials and directions (uniform over the hemisphere, cosines ≥ low_cosine). Parameters are uniform, or
     metallic and roughness of an exponential-like distribution of a ``rate``.
     """
     color, m = rng.random((n, 3)), {k: rng.random(n) for k in NAMES}

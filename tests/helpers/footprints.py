@@ -1,5 +1,4 @@
-"""
-Footprints by finite differences: rays through a pixel's centre and half a pixel to each side, followed along a whole
+"""Footprints by finite differences: rays through a pixel's centre and half a pixel to each side, followed along a whole
 specular chain, and what their uv differ by. And a texture that shows the footprint it is given.
 """
 
@@ -91,10 +90,9 @@ def refracted(ior: float):
 
 
 def truth(scene, chain=()) -> tuple:
-    """
-    The hit of the central rays, and ``ddx, ddy`` as NumPy arrays ``(n, 2)``, and where they are to be trusted: all five
-    rays meet the same shapes, and the last within a small piece of the texture. ``chain``: what follows a ray at each
-    hit before the last.
+    """The hit of the central rays, and ``ddx, ddy`` as NumPy arrays ``(n, 2)``, and where they are to be trusted: all
+    five rays meet the same shapes, and the last within a small piece of the texture. ``chain``: what follows a ray at
+    each hit before the last.
     """
 
     def hit(dx, dy):

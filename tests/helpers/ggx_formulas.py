@@ -1,5 +1,4 @@
-"""
-The rough conductor of Walter et al. 2007 in float64 NumPy, and the same with its distribution read from a table by
+"""The rough conductor of Walter et al. 2007 in float64 NumPy, and the same with its distribution read from a table by
 SciPy: the independent reference of the tests of GGX, written from the paper and the table format alone.
 """
 
@@ -48,8 +47,7 @@ def conductor(wi, wo, alpha, eta=0.0, k=1.0, normals=distribution):
 
 
 def learned(table, inputs, output):
-    """
-    The distribution that a ``Table`` holds, a function of sin²θ and α, under an encoding of the given names: two
+    """The distribution that a ``Table`` holds, a function of sin²θ and α, under an encoding of the given names: two
     bilinear reads, one at the result of the other.
     """
     arrays = {name: array.values.astype(np.float64) for name, array in table.arrays.items()}

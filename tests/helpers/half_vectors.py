@@ -11,8 +11,7 @@ COARSE_CELLS, BLOCK = 9, 6
 
 
 class HalfVectorSampling:
-    """
-    What :class:`mi.chi2.ChiSquareTest` needs, in coordinates of the half vector: its azimuth, and of its polar angle
+    """What :class:`mi.chi2.ChiSquareTest` needs, in coordinates of the half vector: its azimuth, and of its polar angle
     ``v = ln(1 + q/a²) / ln(1 + 1/a²)`` with ``q = tan²(θ/2)`` and ``a = α/2``. A lobe of any width is smooth there,
     from α = 10⁻³ to a cosine: cells grow in proportion to the distance from the peak, and a lobe ten times as long as
     wide is a matter of azimuth.
@@ -64,10 +63,9 @@ class HalfVectorSampling:
         return ChiSquareTest(domain, self.sample, pdf or self.pdf, 3, 1_000_000, cells, points)
 
     def faults(self, test_count, pdf=None):
-        """
-        Messages of the test in fine cells, which find what is wrong in a place, and in coarse ones, which find a little
-        that is wrong everywhere; none if both accept. Also the number of samples that are valid. A coarse cell is a
-        block of fine ones: the same samples and the same integrals of the density.
+        """Messages of the test in fine cells, which find what is wrong in a place, and in coarse ones, which find a
+        little that is wrong everywhere; none if both accept. Also the number of samples that are valid. A coarse cell
+        is a block of fine ones: the same samples and the same integrals of the density.
         """
         fine, coarse = self.test(pdf, COARSE_CELLS * BLOCK, 24), self.test(pdf, COARSE_CELLS, 2)
         fine.tabulate_histogram()

@@ -8,8 +8,7 @@ from mi_diffind.tasks.radiance.volume_field import VolumeField
 
 
 class Fog(VolumeField):
-    """
-    A box from −1 to 1 that is the same everywhere: ``density``, and a radiance ``colour``, both of which may be
+    """A box from −1 to 1 that is the same everywhere: ``density``, and a radiance ``colour``, both of which may be
     optimised.
     """
 

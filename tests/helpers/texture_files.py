@@ -2,6 +2,7 @@
 
 import numpy as np
 from arrays import aligned
+from scipy.ndimage import gaussian_filter
 
 from mi_diffind.arrays.tables import save_table
 from mi_diffind.core.runtime import array_module
@@ -11,6 +12,14 @@ from mi_diffind.tasks.image import arrays as image_arrays
 from mi_diffind.tasks.image import training as image_training
 from mi_diffind.tasks.texture import PRESETS, arrays, training
 from mi_diffind.tasks.texture.compressed import CompressedTexture, neutral_extras, to_table
+
+
+def smooth(height, width, channels, seed=0):
+    """Return bytes of an image that repeats, without edges."""
+    random = np.random.default_rng(seed).random((height, width, channels))
+    values = gaussian_filter(random, (3, 3, 0), mode="wrap")
+    values = (values - values.min()) / (values.max() - values.min())
+    return np.rint(255 * values).astype(np.uint8)
 
 
 def material(width, height):

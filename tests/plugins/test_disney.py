@@ -5,14 +5,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from arrays import aligned
-from bsdf_queries import (
-    bitmap,
-    gradients_enabled,
-    interactions,
-    random_directions,
-    texels,
-    vectors,
-)
+from bsdf_queries import bitmap, gradients_enabled, interactions, random_directions, texels, vectors
 from disney_materials import FORMS
 from disney_materials import RICH as COLOURED
 from variants import set_variant

@@ -37,17 +37,13 @@ def room(mi, floor=None):
     """A floor, a wall that mirrors roughly, and a leaf with holes."""
     at = mi.ScalarTransform4f
     leaf = {"type": "mask", "opacity": 0.4, "nested": {"type": "diffuse", "reflectance": 0.9}}
-    metal = {"type": "roughconductor", "alpha": 0.2}
+    metal, plastic = {"type": "roughconductor", "alpha": 0.2}, {"type": "plastic", "diffuse_reflectance": 0.7}
     wall = at().translate([0, 1.4, 0]).rotate([1, 0, 0], 90).scale(2)
     return {
-        "floor": {"type": "rectangle", "to_world": at().translate([0, 0, -0.6]).scale(2), "bsdf": floor or plastic()},
+        "floor": {"type": "rectangle", "to_world": at().translate([0, 0, -0.6]).scale(2), "bsdf": floor or plastic},
         "wall": {"type": "rectangle", "to_world": wall, "bsdf": metal},
         "leaf": {"type": "rectangle", "to_world": at().translate([0.3, -0.6, 0.9]).scale(0.4), "bsdf": leaf},
     }
-
-
-def plastic():
-    return {"type": "plastic", "diffuse_reflectance": 0.7}
 
 
 def turned(mi, offset=(0.1, 0, 0)):

@@ -1,6 +1,5 @@
-"""
-White furnace: a ball that absorbs nothing, under a sky of radiance 1, is invisible. The ball is a ``neural_sdf`` and,
-beside it, a mesh; here, and moved by 10⁴ times its size.
+"""White furnace: a ball that absorbs nothing, under a sky of radiance 1, is invisible. The ball is a ``neural_sdf``
+and, beside it, a mesh; here, and moved by 10⁴ times its size.
 """
 
 import drjit as dr

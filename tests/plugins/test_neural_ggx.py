@@ -1,6 +1,5 @@
-"""
-The plugin ``neural_ggx`` inside Mitsuba: against its exact counterpart and an independent implementation, and what it
-leaves out. (What holds of every BSDF: ``test_bsdf_contract.py``.)
+"""The plugin ``neural_ggx`` inside Mitsuba: against its exact counterpart and an independent implementation, and what
+it leaves out. (What holds of every BSDF: ``test_bsdf_contract.py``.)
 """
 
 import itertools
@@ -81,21 +80,11 @@ def directions(rng, n, alpha, low=0.05):
     return wi, np.where((np.arange(n) % 2 == 0)[:, None], random_directions(rng, n, low), mirrored(rng, wi, alpha))
 
 
-def roughness_of(material):
-    alpha = material.get("alpha", 0.1)
-    value = alpha.get("value", 0.0437) if isinstance(alpha, dict) else alpha
-    return max(float(np.mean(value)), ALPHA_FLOOR)
-
-
 def normals(form):
     """Distribution of normals of a form, read in its tables by NumPy and SciPy."""
-    table = shipped(FORMS[form].get("preset", "tables"))
+    table = TASK.load(TASK.file(preset=FORMS[form].get("preset", "tables")))
     encoding = table_encoding(table)
     return ggx_formulas.learned(table.to(FORMS[form].get("storage", table.storage)), encoding.inputs, encoding.output)
-
-
-def shipped(preset):
-    return TASK.load(TASK.file(preset=preset))
 
 
 #: A colour in the place of a number, which would depend on the wavelength; and whether the variant is spectral.
@@ -115,12 +104,12 @@ COLOURED = ("white", "copper", "a coloured index", "tinted", "a grey roughness")
     ],
 )  # fmt: skip
 def test_the_exact_plugin_times_what_the_table_says(variant, rng, material, form):
-    """
-    Value and weight are those of ``roughconductor`` times D̂/D, which NumPy and SciPy read in the table file: everything
-    but the distribution is equal up to rounding, Mueller matrices included. Samples and densities are equal.
+    """Value and weight are those of ``roughconductor`` times D̂/D, which NumPy and SciPy read in the table file:
+    everything but the distribution is equal up to rounding, Mueller matrices included. Samples and densities are equal.
     """
     mi, m, n = set_variant(variant), MATERIALS[material], 10_000
-    alpha = roughness_of(m)
+    alpha = m.get("alpha", 0.1)
+    alpha = max(float(np.mean(alpha.get("value", 0.0437) if isinstance(alpha, dict) else alpha)), ALPHA_FLOOR)
     wi, wo = directions(rng, n, alpha)
     si, u = interactions(mi, vectors(mi, wi)), uniform(mi, rng, n)
     exact, learned = mi.load_dict({**EXACT, **m}), mi.load_dict({**FORMS[form], **m})
@@ -160,9 +149,8 @@ def test_the_exact_plugin_times_what_the_table_says(variant, rng, material, form
 
 @pytest.mark.parametrize("form", ["tables", "tables float16", "tables uint8", "paper"])
 def test_energy(mi, rng, form):
-    """
-    Against the exact weights of the same samples, which are Smith's masking, from no roughness to all of it and down to
-    the horizon: their mean is within 0.012 (of bytes 0.016) of the exact albedo, and next to the horizon not 0.02
+    """Against the exact weights of the same samples, which are Smith's masking, from no roughness to all of it and down
+    to the horizon: their mean is within 0.012 (of bytes 0.016) of the exact albedo, and next to the horizon not 0.02
     (0.035) above it; no single weight is higher by more than a tenth.
     """
     side = 128

@@ -285,9 +285,8 @@ OURS = [TRACED, integrator("moment", TRACED)]
 
 @pytest.mark.parametrize("xml", [*STOCK, *OURS, ""])
 def test_integrators_see_a_grid_or_arrays(mi, folder, tmp_path, monkeypatch, xml):
-    """
-    For other integrators, shapes without ``trace`` are decoded, and one line states the memory. Without an integrator,
-    commands take ``path``; in Python, another one may be meant.
+    """For other integrators, shapes without ``trace`` are decoded, and one line states the memory. Without an
+    integrator, commands take ``path``; in Python, another one may be meant.
     """
     warned = warnings_of(mi, monkeypatch)
     path = written(folder, tmp_path, '<integer name="resolution" value="40"/>' if xml in STOCK else "", xml)

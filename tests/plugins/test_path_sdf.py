@@ -55,9 +55,8 @@ def solid(mi, name, scale=2.5, **more):
 
 
 def same_light(mi, actual: dict, expected: dict, view=((0, -5, 2.5), (0, 0, 0)), passes=16, **options):
-    """
-    Scenes of these shapes, traced by ``path_sdf`` and by ``path``, have images with the same mean, as far as the noise
-    of as many passes, all in one render, lets one see.
+    """Scenes of these shapes, traced by ``path_sdf`` and by ``path``, have images with the same mean, as far as the
+    noise of as many passes, all in one render, lets one see.
     """
     a, b = (scene(mi, shapes, view=view, passes=passes) for shapes in (actual, expected))
     a, b = (render(mi, *v, **options) for v in ((a, "path_sdf", 16, 0), (b, "path", 16, 100)))

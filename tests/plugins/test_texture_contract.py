@@ -37,6 +37,12 @@ FILTERED = ("mipmap", "neural_texture", "neural_material")
 WRAP_MODES = ("repeat", "mirror", "clamp")
 FILTERS = ("trilinear", "anisotropic", "stochastic")
 
+
+def readings(first: str, *others: str) -> list[tuple[str, str]]:
+    """Readers with each of these filters; ``neural_image``, which has none, with the first."""
+    return [(name, filter_) for name in READERS for filter_ in (first, *(others if name in FILTERED else ()))]
+
+
 #: Name of a map → parameter of ``neural_material``.
 PARAMETERS = {"albedo": "base_color", "normal": "normal", "roughness": "roughness"}
 
@@ -196,12 +202,9 @@ def test_wrap_modes(mi, files, rng, name, border, wrap_mode):
         np.testing.assert_allclose(found, truth, atol=0.05)
 
 
-@pytest.mark.parametrize("filtering", ["off", "trilinear", "anisotropic"])
-@pytest.mark.parametrize("name", READERS)
+@pytest.mark.parametrize("name, filtering", readings("off", "trilinear", "anisotropic"))
 def test_to_uv(mi, files, rng, name, filtering):
     """A texture with a transformation is the one without it at places and footprints that went through it."""
-    if name == "neural_image" and filtering != "off":
-        pytest.skip("has no filter")
     more = {"filter": filtering} if name in FILTERED else {}
     to_uv = mi.ScalarTransform4f().translate([0.3, -0.2, 0]).rotate([0, 0, 1], 30).scale([1.5, -0.4, 1])
     m = np.array([[float(to_uv.matrix[i, j]) for j in (0, 1, 3)] for i in (0, 1)])
@@ -308,11 +311,8 @@ def test_seams(mi, tmp_path, name, filtering):
             np.testing.assert_allclose(ends, expected, atol=tolerance, err_msg=f"{mode} {level}")
 
 
-@pytest.mark.parametrize("filtering", FILTERS)
-@pytest.mark.parametrize("name", READERS)
+@pytest.mark.parametrize("name, filtering", readings(*FILTERS))
 def test_any_place_and_footprint_gives_a_finite_value(mi, files, rng, name, filtering):
-    if name == "neural_image" and filtering != FILTERS[0]:
-        pytest.skip("has no filter")
     wrap_mode = WRAP_MODES[FILTERS.index(filtering)]
     parts = np.stack(np.meshgrid(*[WRONG[::2]] * 4)).reshape(4, -1)
     uv = rng.choice([0, 1, 0.3, -7.5, 1e20, math.nan, math.inf, -math.inf], (2, parts.shape[1]))
@@ -371,12 +371,9 @@ def test_no_arrays(variant, tmp_path, rng, monkeypatch, name):
 # ---------------------- Derivatives ----------------------
 
 
-@pytest.mark.parametrize("filtering", ["off", "trilinear"])
-@pytest.mark.parametrize("name", READERS)
+@pytest.mark.parametrize("name, filtering", readings("off", "trilinear"))
 def test_gradients_reach_the_coordinate(mi, files, rng, name, filtering):
     """Gradients are finite differences, except between two texels; ``eval_1_grad`` is the gradient of the luminance."""
-    if name == "neural_image" and filtering != "off":
-        pytest.skip("has no filter")
     more = {"filter": filtering} if name in FILTERED else {}
     uv, (ddx, ddy) = rng.random((2, 300)), footprints(rng, 300, SIZE, 2)
     read, loaded = reader(mi, files, name, "roughness", **more)

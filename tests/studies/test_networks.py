@@ -15,15 +15,11 @@ from mi_diffind.studies.baselines import networks
 from mi_diffind.studies.baselines.networks import Network
 
 
-def coordinates(ad, rng, n=500):
-    x = rng.random((2, n)).astype(np.float32)
-    return x, [ad.Float(v) for v in x]
-
-
 @pytest.mark.parametrize(("width", "layers"), [(8, 1), (16, 2)])
 def test_network_is_what_numpy_computes(ad, rng, width, layers):
     net = Network(2, width, layers).alloc(ad.TensorXf, 2, dr.rng(seed=2))
-    values, x = coordinates(ad, rng)
+    values = rng.random((2, 500)).astype(np.float32)
+    x = [ad.Float(v) for v in values]
     weights = [net[k].numpy() for k in net if k.endswith("weights")]
     biases = [net[k].numpy() for k in net if k.endswith("bias")]
     y = values

@@ -101,8 +101,7 @@ def test_slopes_about_a_tilted_normal(rng):
 
 @pytest.mark.parametrize("sigmas", [(0.1, 0.1), (0.2, 0.02)])
 def test_lean_is_the_mean_of_what_it_filters(types, rng, sigmas):
-    """
-    Brute force in NumPy: facets of a rough metal with Gaussian slopes, interpolated, each shaded in its own frame,
+    """Brute force in NumPy: facets of a rough metal with Gaussian slopes, interpolated, each shaded in its own frame,
     averaged. A GGX lobe under Gaussian slopes is no GGX lobe, so only nearly: filtered parameters err twice as much.
     """
     alpha, side = 0.2, 64

@@ -10,7 +10,7 @@ import captures
 import numpy as np
 import pytest
 import solid_meshes as solids
-from scipy.ndimage import gaussian_filter
+from texture_files import smooth
 
 from mi_diffind.commands.cli import main
 from mi_diffind.fitting import loop
@@ -38,13 +38,6 @@ RUNS = {
 PICTURES = {
     "sdf": ["shapes"], "field": ["views"], "texture": ["crops", "levels"], "shading": ["lambda", "strip"],
 }  # fmt: skip
-
-
-def smooth(height, width, channels, seed=0):
-    random = np.random.default_rng(seed).random((height, width, channels))
-    values = gaussian_filter(random, (3, 3, 0), mode="wrap")
-    values = (values - values.min()) / (values.max() - values.min())
-    return np.rint(255 * values).astype(np.uint8)
 
 
 @pytest.fixture(scope="module")

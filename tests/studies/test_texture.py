@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
+from texture_files import smooth
 
 from mi_diffind.core.runtime import array_module
 from mi_diffind.maps.pyramid import Pyramid
@@ -13,13 +13,6 @@ from mi_diffind.measure import renders
 from mi_diffind.studies import materials
 
 FILM = (24, 16)
-
-
-def smooth(height, width, channels, seed=0):
-    random = np.random.default_rng(seed).random((height, width, channels))
-    values = gaussian_filter(random, (2, 2, 0), mode="wrap")
-    values = (values - values.min()) / (values.max() - values.min())
-    return np.rint(255 * values).astype(np.uint8)
 
 
 def directions(scene, film, x, y):

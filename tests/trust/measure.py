@@ -1,5 +1,4 @@
-"""
-Measure what docs/trust.md promises: every plugin, in every variant, for every property, as one table in JSON.
+"""Measure what docs/trust.md promises: every plugin, in every variant, for every property, as one table in JSON.
 
     python tests/trust/measure.py -o docs/measured/trust.json [--variants llvm_ad_rgb,llvm_ad_mono] [--quick]
 

@@ -1,5 +1,4 @@
-"""
-Command lines with numbers of extreme size, unknown words and control characters: each ends with an exit code, and a
+"""Command lines with numbers of extreme size, unknown words and control characters: each ends with an exit code, and a
 refusal is one sentence. Verbs, tasks and options are those of the parsers, so that a new option is attacked, too.
 """
 

@@ -1,7 +1,6 @@
-"""
-Damaged files of every task and every reader: each is refused in one sentence, or it loads, and then arrays that nothing
-was done to are unchanged and everything that is computed from it is finite. No read leaves an array, no mutant takes
-more memory or time than its size allows.
+"""Damaged files of every task and every reader: each is refused in one sentence, or it loads, and then arrays that
+nothing was done to are unchanged and everything that is computed from it is finite. No read leaves an array, no mutant
+takes more memory or time than its size allows.
 
 A task gets its part of this suite by fits of seconds, whose files are damaged (``trial_files.TRIALS``).
 """

@@ -1,5 +1,4 @@
-"""
-Runs that are killed (SIGKILL) at drawn moments and gone on with: the bytes of an undisturbed run, and no file beside
+"""Runs that are killed (SIGKILL) at drawn moments and gone on with: the bytes of an undisturbed run, and no file beside
 them. Moments do not depend on the speed of the machine.
 """
 

@@ -235,10 +235,9 @@ def _sources(height: int, width: int, focal, centre, coefficients) -> tuple[np.n
 def undistort(image: np.ndarray, mask: np.ndarray | None, focal, centre, coefficients) -> tuple:
     """Return a photograph as a pinhole of the same ``focal`` lengths and ``centre`` sees it, and its mask.
 
-    ``image`` ``(height, width, 4)`` and the result are as :func:`read_image` returns them; colours are
-    interpolated linearly, as linear values multiplied by alpha. ``mask`` ``(height, width)``, bool, is true where a
-    pixel counts (``None``: everywhere). The returned mask excludes pixels that the photograph does not show,
-    which are 0.
+    ``image`` ``(height, width, 4)`` and the result are as :func:`read_image` returns them; colours are interpolated
+    linearly, as linear values multiplied by alpha. ``mask`` ``(height, width)``, bool, is true where a pixel counts
+    (``None``: everywhere). The returned mask excludes pixels that the photograph does not show, which are 0.
     """
     places, exists = _sources(*image.shape[:2], tuple(focal), tuple(centre), tuple(coefficients))
     values = linear_pixels(image)

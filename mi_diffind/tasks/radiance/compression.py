@@ -266,17 +266,6 @@ class PaletteCoding:
         return len(data) / share + len(zlib.compress(probabilities, 9)) + shared + OTHER_BYTES
 
 
-def palette_coding(
-    grid: NodeGrid, importance: Importance, deadline: Deadline | None, index_bits: int, seed: int
-) -> PaletteCoding:
-    """Return the initial coding of a grid of visible nodes, with fewer rounds of :func:`clusters` at the deadline.
-
-    A bit for each node is worth the share :data:`SLOPE` of the error of the grid's images.
-    """
-    palette = sorted_clusters(grid, importance, deadline, 2**index_bits, seed)
-    return choose_coding(grid, importance, palette, SLOPE * importance.loss / grid.nodes.count)
-
-
 def sorted_clusters(
     grid: NodeGrid, importance: Importance, deadline: Deadline | None, count: int, seed: int
 ) -> np.ndarray:

@@ -371,7 +371,10 @@ class FieldFit:
             except ValueError as e:
                 given = "bytes" if self.request.options["bytes"] is not None else "compression"
                 raise UsageError(f"--{given}: {e}") from None
-            coding = compression.palette_coding(grid, *self.importance(grid), bits, seed)
+            importance, limit = self.importance(grid)
+            palette = compression.sorted_clusters(grid, importance, limit, 2**bits, seed)
+            rate = compression.SLOPE * importance.loss / grid.nodes.count
+            coding = compression.choose_coding(grid, importance, palette, rate)
         problem = compression.PaletteProblem(coding, self.session)
         return self.train(problem, lambda: files.palette_table(coding.nodes, problem.numbers()), stopped)
 

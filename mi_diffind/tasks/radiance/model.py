@@ -288,8 +288,6 @@ class RadianceFieldModel(Model):
 
     def decode(self, output: Path, resolution: int | None = None):
         """Write density and colour on a dense grid (:func:`decode`)."""
-        pass
-
         return decode(self.field, Path(output), resolution)
 
 

@@ -169,11 +169,10 @@ def load_views(
 ) -> CapturedViews:
     """Read the views of a ``split``: "train", "test" or "val".
 
-    The file is ``transforms_SPLIT.json``, or ``transforms.json`` with the lists ``train_filenames``,
-    ``test_filenames`` and ``val_filenames``, or, without these, a model of COLMAP. If no file or list names the test
-    views, they are those for a validation or, without such, every eighth view. Views whose images do not exist are left
-    out, with a note. Of more than ``most`` views, so many are read, evenly spread in the list. ``progress`` shows a bar
-    on stderr.
+    The file is ``transforms_SPLIT.json``, or ``transforms.json`` with the lists ``train_filenames``, ``test_filenames``
+    and ``val_filenames``, or, without these, a model of COLMAP. If no file or list names the test views, they are those
+    for a validation or, without such, every eighth view. Views whose images do not exist are left out, with a note. Of
+    more than ``most`` views, so many are read, evenly spread in the list. ``progress`` shows a bar on stderr.
 
     ``background`` is that of images without alpha: "white", "black", bytes of sRGB, or "scene" or "surroundings" if
     what is around the objects is part of the capture. ``None``: the colour of their borders if it is one, else "scene".

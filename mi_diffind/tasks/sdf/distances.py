@@ -132,10 +132,6 @@ class Distances:
         """Return |d|, ``(N,)`` float64."""
         return self._ask("distance", points, "surface", self.surface)[0]
 
-    def to_triangles(self, points) -> np.ndarray:
-        """Return the distance to all triangles of the mesh, whether they bound a solid or not, ``(N,)`` float64."""
-        return self._ask("distance", points, "mesh", self.mesh)[0]
-
     def winding(self, points) -> np.ndarray:
         """Return the winding number of the unclosed mesh, ``(N,)``: within about 0.01, and exact near 1/2."""
         return self._ask("winding", points, "mesh", self.mesh)[0]

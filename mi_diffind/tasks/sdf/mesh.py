@@ -189,9 +189,8 @@ def load_mesh(mesh) -> Mesh:
     """Read a mesh file, or take a ``trimesh.Trimesh``, a ``trimesh.Scene``, a ``mi.Mesh`` or ``(vertices, faces)``.
 
     The meshes of a scene file are joined where its transforms place them. ``SCENE.xml#ID`` names one shape of a Mitsuba
-    scene, ``FILE.serialized#N`` one mesh, counted from 0. Equal vertices are merged, degenerate
-    triangles left out, and triangles wound against their neighbours or around their solid the wrong way are turned.
-    Raises :class:`MeshError`.
+    scene, ``FILE.serialized#N`` one mesh, counted from 0. Equal vertices are merged, degenerate triangles left out, and
+    triangles wound against their neighbours or around their solid the wrong way are turned. Raises :class:`MeshError`.
     """
     if not isinstance(mesh, (str, os.PathLike)):
         return make_mesh(*_in_memory(mesh))

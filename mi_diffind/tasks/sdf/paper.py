@@ -93,14 +93,14 @@ def resolutions(nbytes: int, ratio: float, extent) -> tuple[tuple[int, ...], tup
     :class:`.UsageError` if even the smallest arrays are larger.
     """
 
-    def family(n: int) -> list:
-        return [((*proportional_shape(n, extent), 3), 8), (proportional_shape(n / ratio, extent), 8)]
+    def shapes(n: int) -> tuple:
+        return proportional_shape(n, extent), proportional_shape(n / ratio, extent)
 
     try:
-        n = Budget(nbytes).largest(family, range(4, max(5, nbytes)))
+        sides = range(4, max(5, nbytes))
+        return shapes(Budget(nbytes).largest(lambda n: [((*shapes(n)[0], 3), 8), (shapes(n)[1], 8)], sides))
     except BudgetError as e:
         raise UsageError(f"--bytes: {e}") from None
-    return proportional_shape(n, extent), proportional_shape(n / ratio, extent)
 
 
 def initial(start: str, primary, cascaded, grid_distance, samples, distances, band: float) -> Indirection:

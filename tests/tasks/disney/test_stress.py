@@ -1,6 +1,5 @@
-"""
-The Disney plugins where it is hardest: what is left out because a material does not use it, energy and accuracy at the
-horizon and at the peak, and derivatives at the ends of parameters.
+"""The Disney plugins where it is hardest: what is left out because a material does not use it, energy and accuracy at
+the horizon and at the peak, and derivatives at the ends of parameters.
 """
 
 import itertools
@@ -23,8 +22,7 @@ from mi_diffind.tasks.disney.model import Material, find_effects
 
 
 def distinct_effects():
-    """
-    A material for every set of parts that can be in use together: each parameter absent (0), present, or, where this
+    """A material for every set of parts that can be in use together: each parameter absent (0), present, or, where this
     turns something else off, full; each with a coloured, a grey and a black albedo.
     """
     full = {"flatness": (0.0, 0.5, 1.0), "metallic": (0.0, 0.5, 1.0)}
@@ -53,8 +51,7 @@ def evaluated(mi, bsdf, si, wo, u):
     "form, every", [("disney", 6), pytest.param("disney", 1, marks=pytest.mark.slow), ("tables", 40), ("paper", 40)]
 )
 def test_what_is_left_out_changes_nothing(mi_rgb, rng, form, every):
-    """
-    Each material as a constant, with only its effects, against all of them as texels, with all effects; in batches,
+    """Each material as a constant, with only its effects, against all of them as texels, with all effects; in batches,
     since a kernel costs more than what it computes.
     """
     distinct = distinct_effects()
@@ -152,8 +149,7 @@ def gradient_cases():
     [("disney", 1), ("tables", 3), ("paper", 3), *(pytest.param(p, 1, marks=pytest.mark.slow) for p in PRESETS)],
 )
 def test_gradients_at_the_ends_against_finite_differences(mi_rgb, rng, form, every):
-    """
-    One-sided differences of second order, from texels, so that nothing is left out of them; the gradient from a
+    """One-sided differences of second order, from texels, so that nothing is left out of them; the gradient from a
     material of constants in which only the gradient that is asked for keeps the effect in use. Each second one has its
     gradient enabled without an update afterwards.
     """

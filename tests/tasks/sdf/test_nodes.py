@@ -271,10 +271,9 @@ def test_empty_blocks_are_left_out_of_decoding(ad, shapes, monkeypatch):
 
 
 def shoot(ad, distances, field, count, seed):
-    """
-    ``count`` rays that start outside, from a sphere around the solid, from afar, along axes and from places in the box,
-    each at a place that lies deeper inside than the field's cells are wide: how many go through, how many end elsewhere
-    than on the surface.
+    """``count`` rays that start outside, from a sphere around the solid, from afar, along axes and from places in the
+    box, each at a place that lies deeper inside than the field's cells are wide: how many go through, how many end
+    elsewhere than on the surface.
     """
     rng = np.random.default_rng(seed)
     h = field.spacing

@@ -163,17 +163,6 @@ def table_of(shape, entries):
     return sparse_table(shape, entries=entries)
 
 
-def bounds(words):
-    """The heights, in spacings, between which the slabs of blocks lie."""
-    return (v * (2 * marching.SLAB / marching.STEPS) - marching.SLAB for v in (words & 0xFFFF, words >> 16))
-
-
-def planes(field):
-    """The normals (B, 3) of a field's blocks and the distances of their middles (B,)."""
-    axes, middles, _ = nodes.unpack_frames(field.frames())
-    return np.stack(axes, axis=1), middles
-
-
 @pytest.fixture(params=[(torus, 16), (torus, 256), (shell, 256)], ids=lambda v: f"{v[0].__name__}-{v[1]}")
 def coded(types, request):
     """The sparse field of a torus, well coded or badly, and of a thin wall."""
@@ -198,7 +187,8 @@ def test_slabs_change_no_hit(types, coded, rng):
 def test_rays_along_the_plane_of_a_block(coded, rng):
     """Distances to a slab of rays in its plane stay within the range of whole numbers."""
     types, marcher, structure = coded.types, marching.get_marcher(coded), coded.structure
-    normals, middles = planes(coded)
+    axes, middles, _ = nodes.unpack_frames(coded.frames())
+    normals = np.stack(axes, axis=1)
     block = rng.choice(np.flatnonzero(marching.GridCells(coded).crossed.any(axis=1)), COUNT)
     aside = unit(np.cross(normals[block], rng.normal(size=(COUNT, 3))))
     middle = structure.block_positions()[block] + MIDDLE
@@ -210,7 +200,7 @@ def test_rays_along_the_plane_of_a_block(coded, rng):
     first, last, below = marcher.slab(ray, t, number, cell, True)
     dr.eval(first, last, below)
     assert np.abs(np.array(first)).max() < 2**31 and np.abs(np.array(last)).max() < 2**31
-    low, _ = bounds(np.array(marcher.slabs)[1::2][block])
+    low = (np.array(marcher.slabs)[1::2][block] & 0xFFFF) * (2 * marching.SLAB / marching.STEPS) - marching.SLAB
     off = (np.array(first) > 0) | (np.array(last) < 0)
     above = middles[block] + height
     clear = off & (np.abs(above - low) > 1e-3)

@@ -1,6 +1,5 @@
-"""
-Write ``data/downlight.csv``: intensities of a downlight that does not exist, over the angle from its axis. They are the
-values of a formula, in the public domain (CC0): a reflector's lobe with a ripple, its cut-off, and stray light.
+"""Write ``data/downlight.csv``: intensities of a downlight that does not exist, over the angle from its axis. They are
+the values of a formula, in the public domain (CC0): a reflector's lobe with a ripple, its cut-off, and stray light.
 
     python -m mi_profile.make_downlight
 """

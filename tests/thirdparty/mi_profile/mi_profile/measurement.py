@@ -20,8 +20,7 @@ class ProfileError(DiffindError):
 
 @dataclass(frozen=True)
 class Measurement:
-    """
-    ``intensity`` in cd at equally spaced angles from 0° to 90° from the axis, float64, and linear in between;
+    """``intensity`` in cd at equally spaced angles from 0° to 90° from the axis, float64, and linear in between;
     ``digest`` tells whether another one is the same.
     """
 
@@ -43,8 +42,7 @@ class Measurement:
 
 
 def read(path: str | os.PathLike) -> Measurement:
-    """
-    Read a CSV file of two columns, ``angle_deg,intensity_cd``, that may have comments (``#``). Raises
+    """Read a CSV file of two columns, ``angle_deg,intensity_cd``, that may have comments (``#``). Raises
     :class:`ProfileError`.
     """
     try:

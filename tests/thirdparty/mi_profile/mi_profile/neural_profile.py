@@ -12,8 +12,7 @@ from .task import TASK
 
 
 class NeuralProfile(Profile):
-    r"""
-    .. _texture-neural_profile:
+    r""".. _texture-neural_profile:
 
     Learned goniometric profile (:monosp:`neural_profile`)
     ------------------------------------------------------

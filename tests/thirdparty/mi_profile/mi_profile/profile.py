@@ -14,8 +14,7 @@ from .training import exact
 
 
 class Profile(mi.Texture):
-    r"""
-    .. _texture-profile:
+    r""".. _texture-profile:
 
     Goniometric profile (:monosp:`profile`)
     ---------------------------------------

@@ -26,9 +26,8 @@ def exact(truth: Measurement, dtype) -> DifferentiableArray:
 
 
 def errors(read, truth: Measurement, types) -> dict[str, float]:
-    """
-    Of a function of a list of one coordinate, the angle over 90°, against ``truth``: ``psnr_db`` for a peak of 1, and
-    the largest difference, in cd.
+    """Of a function of a list of one coordinate, the angle over 90°, against ``truth``: ``psnr_db`` for a peak of 1,
+    and the largest difference, in cd.
     """
     x = np.linspace(0, 1, 8 * len(truth.intensity), dtype=np.float32)
     found = np.asarray(read([types.Float(x)])[0].numpy(), np.float64)
