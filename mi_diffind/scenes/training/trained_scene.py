@@ -237,7 +237,7 @@ def texture_budget(table: Table) -> TextureBudget | PaperBudget:
     names = [f"level{x.level}" for x in paged]
     nbytes = sum(table.arrays[name].nbytes + table.arrays[name + PAGES].nbytes for name in names)
     return TextureBudget(
-        layout.height, layout.width, layout.stored, fine, structure.skip, dims, shapes["cascaded"][-2],
+        layout.height, layout.width, layout.stored, fine, structure.skip, dims, shapes["cascaded"][-1 - dims : -1],
         structure.skip + 1 if axes > dims else 1, structure.bits, tuple(x.level for x in paged), nbytes,
         paged[0].bits if paged else 5,
     )  # fmt: skip

@@ -165,7 +165,7 @@ class Texture(Task):
     measurements = 10
     arguments = (
         SOURCE,
-        *(size for size in SIZES if size.name != "psnr"),
+        *SIZES,
         Argument(
             "--structure", type=checked(parse_structure), metavar="L:C:B,…",
             help="pages, or level, channels and bits of each fine array, as in 0:1:2,1:2:4 (default: auto)",

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations_with_replacement
 
 import numpy as np
 
@@ -91,6 +92,9 @@ CASCADED_LIMITS = (128, 32, 16)
 #: Least share of the bytes that a cascaded array takes, until its side reaches :data:`CASCADED_SIDE`.
 CASCADED_SHARE = 0.05
 CASCADED_SIDE = 12
+
+#: Largest difference between a side of a cascaded array and that of the cube of as many entries.
+SIDES_APART = 3
 
 #: Levels with pages, and the first level of the coarse array behind them.
 PAGES = (0, 2)
@@ -186,8 +190,8 @@ class TextureBudget:
 
     - ``fine``: the fine arrays, the finest first.
     - ``skip``: first level of detail of the coarse array, whose pointers have ``dims`` coordinates of ``bits`` bits.
-    - ``cascaded``: side of the cascaded array, which has ``channels`` channels and ``knots`` entries along the level of
-      detail (1: no such axis).
+    - ``cascaded``: sides of the cascaded array along the coordinates, or one number for all; it has ``channels``
+      channels and ``knots`` entries along the level of detail (1: no such axis).
     - ``pages``: levels with arrays of pages, which share ``page_bytes``, entries of ``page_bits`` bits.
     """
 
@@ -197,7 +201,7 @@ class TextureBudget:
     fine: tuple[FineArray, ...]
     skip: int
     dims: int
-    cascaded: int
+    cascaded: int | tuple[int, ...]
     knots: int = 1
     bits: int = 8
     pages: tuple[int, ...] = ()
@@ -223,8 +227,13 @@ class TextureBudget:
         ])  # fmt: skip
 
     @property
+    def sides(self) -> tuple[int, ...]:
+        """Sides of the cascaded array, one for each coordinate of a pointer."""
+        return self.cascaded if isinstance(self.cascaded, tuple) else (self.cascaded,) * self.dims
+
+    @property
     def _cascaded(self) -> tuple[int, ...]:
-        return (self.knots, *(self.cascaded,) * self.dims, self.channels)
+        return (self.knots, *self.sides, self.channels)
 
     @property
     def page_entries(self) -> int:
@@ -247,9 +256,10 @@ def choose(
     """Return our arrays for a texture of ``channels`` stored channels and at most ``nbytes`` bytes.
 
     The structure is that of :data:`LADDER` (:data:`SMOOTH_LADDER` for a ``smooth`` texture) with the most bytes that
-    fits, moved to coarser levels if none does; the cascaded array takes the rest. ``skip``, ``fine`` and ``cascaded``
-    replace what is chosen. Pointers have three coordinates, fewer where the smallest arrays of three do not fit. If
-    nothing fits, the result is the smallest budget. Raises ``ValueError`` for fine arrays that do not go together.
+    fits, moved to coarser levels if none does; the cascaded array takes the rest. Bytes beyond its largest sides become
+    bits of the fine arrays. ``skip``, ``fine`` and ``cascaded`` replace what is chosen. Pointers have three
+    coordinates, fewer where the smallest arrays of three do not fit. If nothing fits, the result is the smallest
+    budget. Raises ``ValueError`` for fine arrays that do not go together.
     """
     ladder = SMOOTH_LADDER if smooth else LADDER
     for dims in (3, 2, 1):
@@ -258,7 +268,9 @@ def choose(
             sizes = [_sized(nbytes, height, width, channels, *where, dims, cascaded) for where in group]
             fitting = [size for size in sizes if size.nbytes <= nbytes]
             if fitting:
-                return max(fitting, key=lambda size: size.nbytes - math.prod(size._cascaded))
+                size = max(fitting, key=lambda size: size.nbytes - math.prod(size._cascaded))
+                size = size if fine is not None else _with_bits(size, nbytes)
+                return size if cascaded is not None else _with_sides(size, nbytes)
             too_large += sizes
         if fine is not None and dims <= max(f.channels for f in fine):
             break
@@ -293,6 +305,28 @@ def _sized(nbytes, height, width, channels, fine, skip, dims, cascaded) -> Textu
 
     least = min(max(2 + (dims > 1), side(CASCADED_SHARE * nbytes)), CASCADED_SIDE)
     return sized(min(max(side(nbytes - sized(0).nbytes), least), CASCADED_LIMITS[dims - 1]))
+
+
+def _with_bits(size: TextureBudget, nbytes: float) -> TextureBudget:
+    """Return the budget with more bits in its fine arrays as far as these fit, the finest first."""
+    for i, array in enumerate(size.fine):
+        for bits in range(array.bits + 1, 9):
+            richer = replace(size, fine=(*size.fine[:i], array._replace(bits=bits), *size.fine[i + 1 :]))
+            if richer.nbytes <= nbytes and richer.base == size.base:
+                size = richer
+    return size
+
+
+def _with_sides(size: TextureBudget, nbytes: float) -> TextureBudget:
+    """Return the budget whose cascaded array has the most entries that fit.
+
+    Sides differ by a few, the first are longer. None is much longer than three times :data:`CASCADED_LIMITS`.
+    """
+    rest = (nbytes - replace(size, cascaded=0).nbytes) / (size.knots * size.channels)
+    side = min(int(rest ** (1 / size.dims) + 1e-9), 3 * CASCADED_LIMITS[size.dims - 1])
+    nearby = range(max(2, side - SIDES_APART), side + SIDES_APART + 1)
+    fitting = [s for s in combinations_with_replacement(reversed(nearby), size.dims) if math.prod(s) <= rest]
+    return replace(size, cascaded=max(fitting, key=lambda s: (math.prod(s), s[-1]))) if fitting else size
 
 
 def paged(height: int, width: int, channels: int, nbytes: float, cascaded: int | None = None) -> TextureBudget | None:
@@ -385,8 +419,8 @@ def from_components(
         reached[..., : spec.channels] += ((entries - layer.zero) * layer.scale).astype(np.float32)
     coarse = np.concatenate([p.reshape(-1, size.dims) for p in pointers[size.skip :]])
     coarse = DifferentiableArray((len(coarse),), size.dims, np.clip(coarse, 1e-3, 1 - 1e-3), fold=True)
-    shape = (size.knots,) * (size.knots > 1) + (size.cascaded,) * size.dims
-    back = linear_in_pointer(mean, directions, low, high, size.cascaded, range(used), used)
+    shape = (size.knots,) * (size.knots > 1) + size.sides
+    back = linear_in_pointer(mean, directions, low, high, size.sides[:used], range(used))
     back = np.clip(back / factors, 1e-3, 1 - 1e-3).astype(np.float32)
     back = back.reshape(*back.shape[:-1], *[1] * (size.dims - used), k)
     cascaded = np.broadcast_to(back, (*shape, size.channels)).astype(np.float32)
