@@ -356,7 +356,8 @@ def neighbour_covariance(values: np.ndarray) -> np.ndarray:
 
 def component_range(projected: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the lower and upper end of each component in ``projected``, ``(…, n)``, without :data:`OUTSIDE`."""
-    low, high = np.quantile(projected.reshape(-1, projected.shape[-1]), [OUTSIDE, 1 - OUTSIDE], axis=0)
+    *places, count = projected.shape
+    low, high = np.quantile(projected.reshape(math.prod(places), count), [OUTSIDE, 1 - OUTSIDE], axis=0)
     return low, np.maximum(high, low + 1e-3)
 
 

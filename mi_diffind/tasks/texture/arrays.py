@@ -86,6 +86,19 @@ SMOOTH_LADDER: tuple[tuple[str, int], ...] = (
     *LADDER[5:],
 )
 
+#: Structures of constant textures, whose arrays are to be optimised: fine arrays hold all coordinates of a pointer.
+BLANK_LADDER: tuple[tuple[str, int], ...] = (
+    ("0:1:6,1:3:8", 2),
+    ("0:3:5", 1),
+    ("0:3:6", 1),
+    ("0:3:7", 1),
+    ("0:3:8", 1),
+)
+
+#: Least smoothness of a smooth and of a constant texture, in dB (:func:`~mi_diffind.maps.layout.smoothness`).
+SMOOTH_DB = 30.0
+BLANK_DB = 119.0
+
 #: Largest sides of a cascaded array of 1 to 3 dimensions that are chosen.
 CASCADED_LIMITS = (128, 32, 16)
 
@@ -110,8 +123,12 @@ PAGES_SIDE = 12
 #: Share of the differences between two levels that lies within the range of an entry, by its bits.
 WITHIN = {1: 0.7, 2: 0.97, 3: 0.99, 4: 0.998, 5: 0.998, 6: 0.998, 7: 0.998, 8: 0.998}
 
-#: Least range of a difference, so that a flat component can still be trained.
+#: Least range of a difference, so that a flat component can still be trained, and range if all components are flat.
 SMALLEST = 0.02
+BLANK_RANGE = 1.0
+
+#: Variance of all channels together below which a texture is constant.
+FLAT = 1e-10
 
 
 # ---------------------- The paper's resolutions ----------------------
@@ -243,6 +260,11 @@ class TextureBudget:
         return int((self.page_bytes - index) * 8 / (self.page_bits * self.dims))
 
 
+def ladder(smoothness_db: float) -> tuple[tuple[str, int], ...]:
+    """Return the structures to choose from for a texture of a smoothness (:func:`.layout.smoothness`)."""
+    return BLANK_LADDER if smoothness_db >= BLANK_DB else SMOOTH_LADDER if smoothness_db >= SMOOTH_DB else LADDER
+
+
 def choose(
     height: int,
     width: int,
@@ -251,17 +273,16 @@ def choose(
     skip: int | None = None,
     fine: tuple[FineArray, ...] | None = None,
     cascaded: int | None = None,
-    smooth: bool = False,
+    ladder: tuple[tuple[str, int], ...] = LADDER,
 ) -> TextureBudget:
     """Return our arrays for a texture of ``channels`` stored channels and at most ``nbytes`` bytes.
 
-    The structure is that of :data:`LADDER` (:data:`SMOOTH_LADDER` for a ``smooth`` texture) with the most bytes that
-    fits, moved to coarser levels if none does; the cascaded array takes the rest. Bytes beyond its largest sides become
-    bits of the fine arrays. ``skip``, ``fine`` and ``cascaded`` replace what is chosen. Pointers have three
-    coordinates, fewer where the smallest arrays of three do not fit. If nothing fits, the result is the smallest
-    budget. Raises ``ValueError`` for fine arrays that do not go together.
+    The structure is that of a :func:`ladder` with the most bytes that fits, moved to coarser levels if none does; the
+    cascaded array takes the rest. Bytes beyond its largest sides become bits of the fine arrays. ``skip``, ``fine`` and
+    ``cascaded`` replace what is chosen. Pointers have three coordinates, fewer where the smallest arrays of three do
+    not fit. If nothing fits, the result is the smallest budget. Raises ``ValueError`` for fine arrays that do not go
+    together.
     """
-    ladder = SMOOTH_LADDER if smooth else LADDER
     for dims in (3, 2, 1):
         too_large = []
         for group in [[(fine, skip)]] if fine is not None else _structures(height, width, dims, skip, ladder):
@@ -380,12 +401,15 @@ def from_components(
     values = [level * factors for level in values]
     k = values[0].shape[-1]
     mean = values[0].reshape(-1, k).mean(axis=0, dtype=np.float64)
-    directions = eigenvectors(channel_covariance(values[0], mean), min(size.dims, k))
-    # Rotated within the same space so that the first axes have the most detail: fine arrays hold only these
-    detail = directions @ neighbour_covariance(values[0]) @ directions.T
-    directions = eigenvectors(detail, len(directions)) @ directions
+    covariance = channel_covariance(values[0], mean)
+    # A constant texture starts as a read at (u, v), which can be trained
+    used = min(size.dims, k) if np.trace(covariance) > FLAT else 0
+    directions = eigenvectors(covariance, used)
+    if used:
+        # Rotated within the same space so that the first axes have the most detail: fine arrays hold only these
+        detail = directions @ neighbour_covariance(values[0]) @ directions.T
+        directions = eigenvectors(detail, used) @ directions
     low, high = component_range((values[0].reshape(-1, k) - mean) @ directions.T)
-    used = len(directions)
 
     def pointer(level: np.ndarray) -> np.ndarray:
         unit = MARGIN + (1 - 2 * MARGIN) * (((level - mean) @ directions.T - low) / (high - low))
@@ -410,7 +434,7 @@ def from_components(
             continue
         rest = (pointers[level] - reached)[..., : spec.channels]
         within = np.quantile(np.abs(rest).reshape(-1, spec.channels), WITHIN[spec.bits], axis=0)
-        scale = np.maximum(2 * within, SMALLEST)
+        scale = np.maximum(2 * within, SMALLEST if used else BLANK_RANGE)
         layer = FineLayer(level, until, spec.bits, tuple(float(f"{s:.6g}") for s in scale))
         entries = np.clip(rest / np.array(layer.scale) + layer.zero, 0, 1).astype(np.float32)
         layers.insert(0, layer)

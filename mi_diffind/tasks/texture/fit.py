@@ -42,9 +42,6 @@ FIRST = 0.5
 #: Largest share of the bytes that extras take; smaller arrays have none.
 EXTRAS_SHARE = 1 / 16
 
-#: Least smoothness of a smooth texture, in dB (:func:`~mi_diffind.maps.layout.smoothness`).
-SMOOTH_DB = 30.0
-
 #: Options that say how the arrays of the first stage are laid out.
 SIZES = ("compression", "bytes", "bpp", "psnr", "structure", "skip", "cascaded", "ratio", "footprint_samples")
 
@@ -66,6 +63,8 @@ def check(request: FitRequest) -> None:
     check_psnr(request, "structure", "skip", "cascaded", "ratio")
     if options["psnr"] is not None and options["shading"] == "on":
         raise UsageError("--psnr: asks for the values of the maps, which --shading on gives up for those of shading")
+    if not request.settings.steps and (options["psnr"] is not None or options["shading"] == "on"):
+        raise UsageError("--steps: found 0, but --psnr and --shading on need a training")
     if options["start"] is not None and any(options[name] is not None for name in SIZES):
         given = ", ".join(f"--{name.replace('_', '-')}" for name in SIZES if options[name] is not None)
         raise UsageError(f"--start: the arrays have their size, leave out {given}")
@@ -138,6 +137,8 @@ def reason_without_shading(layout: Layout, request: FitRequest) -> str:
     """Return why ``--shading off`` or ``auto`` leaves out the training for shading, "" if it does not."""
     if request.options["shading"] == "off":
         return "--shading is off"
+    if not request.settings.steps:
+        return "--steps is 0"
     if request.options["psnr"] is not None:
         return "--psnr asks for the values of the maps"
     if request.preset == "paper":
@@ -291,7 +292,6 @@ def _layered_size(pyramid: Pyramid, nbytes: float, structure: str, skip: int | N
         if size is not None and (structure == "pages" or _page_gain(pyramid, size, scale) >= GAIN_DB):
             return size
     try:
-        smooth = smoothness(pyramid.values[0]) >= SMOOTH_DB
-        return arrays.choose(*shape, nbytes, skip, fine, cascaded, smooth)
+        return arrays.choose(*shape, nbytes, skip, fine, cascaded, arrays.ladder(smoothness(pyramid.values[0])))
     except ValueError as e:
         raise UsageError(f"--structure: {e}") from None

@@ -21,7 +21,15 @@ from mi_diffind.maps.layout import Layout
 from mi_diffind.maps.pyramid import Pyramid, level_sizes
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.tasks.texture import PRESETS, TASK, FineArray, arrays, compressed, parse_structure, training
-from mi_diffind.tasks.texture.arrays import PaperBudget, TextureBudget, choose, paper_size
+from mi_diffind.tasks.texture.arrays import (
+    BLANK_LADDER,
+    LADDER,
+    SMOOTH_LADDER,
+    PaperBudget,
+    TextureBudget,
+    choose,
+    paper_size,
+)
 from mi_diffind.tasks.texture.compressed import CompressedTexture
 
 OURS, PAPER = PRESETS["ours"], PRESETS["paper"]
@@ -145,11 +153,11 @@ def test_the_papers_sizes_are_near_what_is_asked_for(height, width, compression)
 
 @pytest.mark.parametrize("height, width", [(1024, 1024), (300, 1000), (17, 5), (1, 9), (1, 1)])
 def test_our_sizes_fit(height, width):
-    for channels, smooth in ((1, False), (3, False), (8, False), (8, True)):
+    for channels, ladder in ((1, LADDER), (3, LADDER), (8, LADDER), (8, SMOOTH_LADDER), (8, BLANK_LADDER)):
         before = math.inf
         for compression in (1, 3, 6, 12, 24, 100):
             nbytes = height * width * channels / compression
-            size = choose(height, width, channels, nbytes, smooth=smooth)
+            size = choose(height, width, channels, nbytes, ladder=ladder)
             assert size.nbytes <= before, "less asked for, more found"
             before = size.nbytes
             if size.nbytes > nbytes:
