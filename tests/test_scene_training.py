@@ -860,7 +860,7 @@ def test_arrays_of_the_same_size(folder, preset, tmp_path):
     layout = source_layout(source, recipe)
     wanted = PaperBudget(16, 24, 4, 5, layout.stored)
     if preset == "ours":
-        wanted = TextureBudget(32, 32, layout.stored, parse_structure("0:2:4,1:3:6"), 2, 3, 6, 3)
+        wanted = TextureBudget(32, 32, layout.stored, parse_structure("0:2:4,1:3:6"), 2, 3, (7, 6, 5), 3)
     pyramid = Pyramid.from_source(source, layout, array_module("llvm"))
     net = build_problem(source, wanted, recipe, pyramid).net
     own = recipe.further

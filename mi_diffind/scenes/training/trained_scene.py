@@ -234,10 +234,11 @@ def texture_budget(table: Table) -> TextureBudget | PaperBudget:
     paged = [layer for layer in structure.layers if layer.paged]
     fine = tuple(FineArray(x.level, x.channels, x.bits) for x in structure.layers if not x.paged)
     dims, axes = shapes["coarse"][-1], len(shapes["cascaded"]) - 1
+    sides = tuple(shapes["cascaded"][axes - dims : axes])
     names = [f"level{x.level}" for x in paged]
     nbytes = sum(table.arrays[name].nbytes + table.arrays[name + PAGES].nbytes for name in names)
     return TextureBudget(
-        layout.height, layout.width, layout.stored, fine, structure.skip, dims, shapes["cascaded"][-1 - dims : -1],
+        layout.height, layout.width, layout.stored, fine, structure.skip, dims, sides,
         structure.skip + 1 if axes > dims else 1, structure.bits, tuple(x.level for x in paged), nbytes,
         paged[0].bits if paged else 5,
     )  # fmt: skip

@@ -65,6 +65,8 @@ def check(request: FitRequest) -> None:
         raise UsageError("--psnr: asks for the values of the maps, which --shading on gives up for those of shading")
     if not request.settings.steps and (options["psnr"] is not None or options["shading"] == "on"):
         raise UsageError("--steps: found 0, but --psnr and --shading on need a training")
+    if not request.settings.steps and request.checkpoint is not None:
+        raise UsageError("--checkpoint: nothing is trained with --steps 0: leave one of them out")
     if options["start"] is not None and any(options[name] is not None for name in SIZES):
         given = ", ".join(f"--{name.replace('_', '-')}" for name in SIZES if options[name] is not None)
         raise UsageError(f"--start: the arrays have their size, leave out {given}")

@@ -84,6 +84,8 @@ def test_what_needs_a_training():
     for options in ({"psnr": 30}, {"shading": "on"}):
         with pytest.raises(UsageError, match="--steps: found 0, but --psnr and --shading on need a training"):
             md.fit("texture", BLANK, steps=0, progress=False, **options)
+    with pytest.raises(UsageError, match="--checkpoint: nothing is trained with --steps 0"):
+        md.fit("texture", BLANK, steps=0, checkpoint="c.npz")
     with pytest.raises(Exception, match="steps: found 0, a whole number from 1"):
         md.fit("image", BLANK, steps=0, progress=False)
     assert [ladder(db) for db in (20, 50, 120)] == [LADDER, SMOOTH_LADDER, BLANK_LADDER]
