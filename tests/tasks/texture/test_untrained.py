@@ -67,7 +67,7 @@ def test_a_start_of_maps_with_content():
     one, two = (untrained({**BLANK, "albedo": wave}) for _ in range(2))
     assert one.table.measured["psnr_albedo_db"] > 25 and one.table.settings["layout"]["maps"][1]["where"] == [3]
     for name, array in one.table.arrays.items():
-        np.testing.assert_array_equal(array.data, two.table.arrays[name].data)
+        np.testing.assert_array_equal(array.entries, two.table.arrays[name].entries)
     grey = untrained({"albedo": wave[..., :1].repeat(3, axis=2)})
     assert grey.table.settings["layout"]["maps"][0]["where"] == [0, 1, 2], "equal channels may become different"
 
