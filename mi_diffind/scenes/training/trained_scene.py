@@ -247,12 +247,11 @@ def texture_budget(table: Table) -> TextureBudget | PaperBudget:
 class TrainedScene:
     """Loaded scene in which textures of the files in ``tables`` read the arrays of these, which can be replaced.
 
-    All maps of a file read the same arrays. Each array has one parameter for each map; setting one of them sets the
-    array for all maps. Arrays of several files are called as in :class:`JointNet`. Renders use the
-    integrator ``prb`` in place of ``path``, the same estimator: paths are sampled *detached*, without derivatives of
-    the sampling decisions, and the values along them are differentiated. The gradient is right on average, since
-    neither visible surfaces nor the places of samples depend on a texture's values; the choice of a lobe does, but the
-    density divides it out.
+    All maps of a file read the same arrays, each of which is one parameter. Arrays of several files are called as in
+    :class:`JointNet`. Renders use the integrator ``prb`` in place of ``path``, the same estimator: paths are sampled
+    *detached*, without derivatives of the sampling decisions, and the values along them are differentiated. The
+    gradient is right on average, since neither visible surfaces nor the places of samples depend on a texture's values;
+    the choice of a lobe does, but the density divides it out.
     """
 
     def __init__(self, parsed: loading.ParsedScene, tables: Mapping[Path, Table], views: ViewDistribution):
