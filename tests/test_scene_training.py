@@ -52,7 +52,6 @@ from mi_diffind.tasks.texture.arrays import PaperBudget, TextureBudget, parse_st
 from mi_diffind.tasks.texture.compressed import CompressedTexture, load, to_table
 from mi_diffind.tasks.texture.training import build_problem, rounded, source_layout, stored_form
 
-NAMES = ("albedo", "roughness")
 ORBIT = ViewDistribution(
     3, 1, azimuth=(-60, 60), elevation=(30, 60), light_azimuth=(-90, 90), light_elevation=(40, 80), up=(0, 0, 1)
 )
