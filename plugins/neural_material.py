@@ -217,6 +217,10 @@ class NeuralMaterial(Disney):
     computed once, and one chain of lookups reads all maps. Its exact counterpart are these two plugins with bitmaps of
     the file's source, :monosp:`principled` is another; ``mi-diffind compare`` shows a scene beside them.
 
+    With ``storage`` ``float32`` all maps are one set of parameters, which other textures of the file share. Maps that
+    are constants in the file have no entries there; ``mi-diffind fit texture --separate``, or ``--steps 0`` without a
+    training, gives them some.
+
     **Maps** are recognised by their names: ``base_color`` (``albedo``, ``diffuse``, ``color``), ``normal``,
     ``roughness``, ``metallic`` (``metalness``), ``opacity`` (``alpha``), and the constants above. A map that is
     constant in the file is a constant here, and **lobes that it rules out are not traced**: without clearcoat, without

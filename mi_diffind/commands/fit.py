@@ -49,7 +49,9 @@ def _add(sub, task: Task) -> None:
         sub.add_argument("--storage", choices=task.storages, default=default, help=f"storage form (default: {default})")
     variant_option(sub)
     length = sub.add_mutually_exclusive_group()
-    length.add_argument("--steps", type=positive, help=f"optimisation steps (default: {_default(task, 'steps')})")
+    untrained = not task.presets[preset].fewest_steps
+    steps = f"optimisation steps{', 0: no training' * untrained} (default: {_default(task, 'steps')})"
+    length.add_argument("--steps", type=natural if untrained else positive, help=steps)
     length.add_argument("--seconds", type=positive, help="duration of the command in seconds, in place of steps")
     for name, text, options in SETTINGS:
         sub.add_argument(f"--{name}", **options, help=f"{text} (default: {_default(task, name)})")

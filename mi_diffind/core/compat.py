@@ -300,6 +300,11 @@ def nodes_of(params) -> list:
     return list({id(node): node for node in params.hierarchy}.values())
 
 
+def visited_objects(cb) -> list:
+    """Return the objects that ``mi.traverse`` has visited so far; none of a traversal by Mitsuba itself."""
+    return list(getattr(cb, "hierarchy", ()))
+
+
 def is_instance(shape) -> bool:
     """Return whether a shape is an ``instance`` of a ``shapegroup``."""
     return shape.class_name() == "Instance"

@@ -28,7 +28,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from ..core import discovery
 from ..core.arguments import MOST, MOST_NATURAL, Argument, check_files
@@ -87,9 +87,13 @@ class FitSettings:
     check_every: int = 20
     deterministic: bool = True
 
+    #: Fewest steps: 0 for a task that writes the arrays that a training begins with.
+    fewest_steps: ClassVar[int] = 1
+
     def __post_init__(self):
+        least = {"seed": 0, "steps": self.fewest_steps}
         for name in ("steps", "batch", "measure_every", "check_every", "seed"):
-            value, low, most = getattr(self, name), int(name != "seed"), MOST_NATURAL if name == "seed" else MOST
+            value, low, most = getattr(self, name), least.get(name, 1), MOST_NATURAL if name == "seed" else MOST
             whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
             if not whole or not low <= value <= most:
                 raise FittingError(f"{name}: found {value!s:.40}, a whole number from {low} to {most:,} is needed")
@@ -141,6 +145,8 @@ class FitResult:
     @property
     def outcome(self) -> str:
         """State that was kept and, after Ctrl-C, why it is not the last one: for a sentence."""
+        if not self.steps and not self.interrupted:
+            return "untrained"
         if not self.interrupted:
             steps = f"{self.steps} step{'s' if self.steps != 1 else ''}: unfinished, " if self.unfinished else ""
             return f"{steps}best step {self.step}"

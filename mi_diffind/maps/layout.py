@@ -356,21 +356,23 @@ def neighbour_covariance(values: np.ndarray) -> np.ndarray:
 
 def component_range(projected: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the lower and upper end of each component in ``projected``, ``(…, n)``, without :data:`OUTSIDE`."""
-    low, high = np.quantile(projected.reshape(-1, projected.shape[-1]), [OUTSIDE, 1 - OUTSIDE], axis=0)
+    *places, count = projected.shape
+    low, high = np.quantile(projected.reshape(math.prod(places), count), [OUTSIDE, 1 - OUTSIDE], axis=0)
     return low, np.maximum(high, low + 1e-3)
 
 
 def linear_in_pointer(
-    channels: np.ndarray, directions: np.ndarray, low, high, side: int, axes: Iterable[int], dims: int
+    channels: np.ndarray, directions: np.ndarray, low, high, sides: Sequence[int], axes: Iterable[int]
 ) -> np.ndarray:
-    """Return ``channels`` plus components that grow along ``axes`` of a cascaded array: ``(side, …, k)``.
+    """Return ``channels`` plus components that grow along ``axes`` of a cascaded array: ``(*sides, k)``.
 
     Each of the ``directions``, ``(n, k)``, is multiplied by numbers from ``low`` to ``high`` along its axis, with room
-    for :data:`MARGIN` at both ends. The array has ``dims`` axes of ``side`` entries.
+    for :data:`MARGIN` at both ends.
     """
-    grid = (np.linspace(0, 1, side) - MARGIN) / (1 - 2 * MARGIN) if side > 1 else np.array([0.5])
     for axis, direction, first, last in zip(axes, directions, low, high, strict=True):
-        along = np.reshape(first + grid * (last - first), [-1 if d == axis else 1 for d in range(dims)])
+        side = sides[axis]
+        grid = (np.linspace(0, 1, side) - MARGIN) / (1 - 2 * MARGIN) if side > 1 else np.array([0.5])
+        along = np.reshape(first + grid * (last - first), [-1 if d == axis else 1 for d in range(len(sides))])
         channels = channels + along[..., None] * direction
     return channels
 

@@ -201,7 +201,9 @@ def fit_maps(
     if problem is None:
         table, result = to_table(stored(), {"source": source.digest}), FitResult({}, 0, 0, 0.0, False, 0)
     else:
-        result = request.train(problem, title, lambda: errors(to_table(stored(), problem.identity)))
+        result = FitResult({}, 0, 0, 0.0, False, 0)
+        if request.settings.steps:
+            result = request.train(problem, title, lambda: errors(to_table(stored(), problem.identity)))
         table = to_table(stored(), {**request.recorded(result), **problem.identity, **more})
     table.preset, table.seed = request.preset, request.settings.seed
     table.measured = significant(errors(table))

@@ -29,6 +29,9 @@ from .tables import Tables, lock, shared
 
 STORAGES = ("uint8", "float32")
 
+#: Task → the option that makes arrays of constants.
+HOW_TO_SEPARATE = {"texture": ": fit texture --separate makes some"}
+
 #: Kinds of maps that hold data, not colours.
 DATA_ROLES = ("normal", "roughness", "ao", "metallic")
 
@@ -87,8 +90,12 @@ def open_compressed(task: Task, props: mi.Properties) -> tuple[SharedMaps, str]:
 
     def load() -> SharedMaps:
         model = task.read(path, mi.TensorXf, storage)
-        if storage == "float32" and not model.arrays:
-            warn(f'parameter "storage": found "float32", but {path} is of one colour: it has no arrays to optimise')
+        constant = [m.name for m in model.image.layout.maps if all(isinstance(where, tuple) for where in m.where)]
+        if storage == "float32" and constant:
+            warn(
+                f'parameter "storage": found "float32", but {path} has constants in place of the maps '
+                f"{', '.join(constant)}, no arrays to optimise{HOW_TO_SEPARATE.get(task.name, '')}"
+            )
         return SharedMaps(model.image, model.arrays, model.table)
 
     with refused_as("filename"):

@@ -93,7 +93,10 @@ class MapTexture(mi.Texture):
             )
 
     def traverse(self, cb: mi.TraversalCallback):
-        self._shared.tables.traverse(cb)
+        # Arrays of a file are parameters of the first texture that reads them: set twice, the last value would count
+        others = (node for node in compat.visited_objects(cb) if node is not self)
+        if all(getattr(node, "_shared", None) is not self._shared for node in others):
+            self._shared.tables.traverse(cb)
         cb.put("to_uv", self.to_uv, mi.ParamFlags.NonDifferentiable)
 
     def trained(self) -> tuple:

@@ -20,7 +20,7 @@ from variants import VARIANTS, set_variant, warnings_of
 
 from mi_diffind import plugins
 from mi_diffind.arrays.tables import load_table, save_table
-from mi_diffind.fitting.task import find_task
+from mi_diffind.fitting.task import find_task, load_model
 from mi_diffind.maps import pyramid
 from mi_diffind.maps.layout import Layout
 from mi_diffind.maps.source import from_arrays
@@ -365,10 +365,34 @@ def test_no_arrays(variant, tmp_path, rng, monkeypatch, name):
         np.testing.assert_allclose(np.broadcast_to(ours.eval(si).numpy(), truth.shape), truth, atol=1e-4)
         assert not ours.is_spatially_varying() and ours.report().get("footprint", []) == []
         assert float(ours.mean()[0]) == pytest.approx(float(theirs.mean()[0]), abs=1e-5)
-        assert (storage == "float32") == any("a.npz is of one colour: it has no arrays" in text for text in warned)
+        assert (storage == "float32") == any(
+            "has constants in place of the maps albedo, no arrays" in text for text in warned
+        )
 
 
 # ---------------------- Derivatives ----------------------
+
+
+@pytest.mark.parametrize("name", ["neural_image", "neural_texture"])
+def test_arrays_of_a_file_are_one_set_of_parameters(mi, files, rng, name):
+    """They are those of the first texture that reads them; assigned values count for all textures of the file."""
+    maps = {"base_color": "albedo", "roughness": "roughness"}
+    nested = {p: plugin(files, name, channels, storage="float32") for p, channels in maps.items()}
+    material = mi.load_dict({"type": "principled", **nested})
+    params = mi.traverse(material)
+    keys = [key for key in params.keys() if ".tables." in key]
+    assert len({key.split(".")[0] for key in keys}) == 1
+    assert sorted(key.split(".")[-1] for key in keys) == sorted(load_model(files[name], mi.TensorXf).arrays)
+    si = hits(mi, rng.random((2, 20)))
+    ctx, si.wi, wo = mi.BSDFContext(), mi.Vector3f(0.48, 0, 0.877), mi.Vector3f(0, 0.6, 0.8)
+    cascaded = next(key for key in keys if key.endswith("cascaded"))
+    params[cascaded] = 0 * params[cascaded] + 0.5
+    params.update()
+    half = {"base_color": {"type": "rgb", "value": 0.21404}, "roughness": 0.5}
+    expected = mi.load_dict({"type": "principled", **half}).eval(ctx, si, wo).numpy()
+    assert expected.min() > 0.01
+    actual = material.eval(ctx, si, wo).numpy()
+    np.testing.assert_allclose(actual, np.broadcast_to(expected, actual.shape), rtol=1e-3)
 
 
 @pytest.mark.parametrize("name, filtering", readings("off", "trilinear"))

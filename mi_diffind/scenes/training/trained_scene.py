@@ -234,10 +234,11 @@ def texture_budget(table: Table) -> TextureBudget | PaperBudget:
     paged = [layer for layer in structure.layers if layer.paged]
     fine = tuple(FineArray(x.level, x.channels, x.bits) for x in structure.layers if not x.paged)
     dims, axes = shapes["coarse"][-1], len(shapes["cascaded"]) - 1
+    sides = tuple(shapes["cascaded"][axes - dims : axes])
     names = [f"level{x.level}" for x in paged]
     nbytes = sum(table.arrays[name].nbytes + table.arrays[name + PAGES].nbytes for name in names)
     return TextureBudget(
-        layout.height, layout.width, layout.stored, fine, structure.skip, dims, shapes["cascaded"][-2],
+        layout.height, layout.width, layout.stored, fine, structure.skip, dims, sides,
         structure.skip + 1 if axes > dims else 1, structure.bits, tuple(x.level for x in paged), nbytes,
         paged[0].bits if paged else 5,
     )  # fmt: skip
@@ -246,12 +247,11 @@ def texture_budget(table: Table) -> TextureBudget | PaperBudget:
 class TrainedScene:
     """Loaded scene in which textures of the files in ``tables`` read the arrays of these, which can be replaced.
 
-    All maps of a file read the same arrays. Each array has one parameter for each map; setting one of them sets the
-    array for all maps. Arrays of several files are called as in :class:`JointNet`. Renders use the
-    integrator ``prb`` in place of ``path``, the same estimator: paths are sampled *detached*, without derivatives of
-    the sampling decisions, and the values along them are differentiated. The gradient is right on average, since
-    neither visible surfaces nor the places of samples depend on a texture's values; the choice of a lobe does, but the
-    density divides it out.
+    All maps of a file read the same arrays, each of which is one parameter. Arrays of several files are called as in
+    :class:`JointNet`. Renders use the integrator ``prb`` in place of ``path``, the same estimator: paths are sampled
+    *detached*, without derivatives of the sampling decisions, and the values along them are differentiated. The
+    gradient is right on average, since neither visible surfaces nor the places of samples depend on a texture's values;
+    the choice of a lobe does, but the density divides it out.
     """
 
     def __init__(self, parsed: loading.ParsedScene, tables: Mapping[Path, Table], views: ViewDistribution):

@@ -264,7 +264,8 @@ def from_components(values: np.ndarray, size: ImageBudget, border: tuple[str, st
         if used:
             low, high = component_range(projected)
             unit = MARGIN + (1 - 2 * MARGIN) * np.clip((projected - low) / (high - low), 0, 1)
-            back = linear_in_pointer(back, directions, low, high, size.cascaded, range(axis, axis + used), size.dims)
+            sides = (size.cascaded,) * size.dims
+            back = linear_in_pointer(back, directions, low, high, sides, range(axis, axis + used))
         if dims > used:
             further = range(dims - used)
             if paged:

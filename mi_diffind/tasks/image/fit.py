@@ -11,16 +11,14 @@ from ...arrays.budget import Budget
 from ...arrays.pages import most_entries
 from ...arrays.tables import MAX_BYTES, Table
 from ...core.errors import UsageError
-from ...fitting.task import FitRequest, FitResult, Fitted, FittingError
+from ...fitting.task import FitRequest, FitResult, Fitted
 from ...maps import as_seen
 from ...maps.model import complete, load_maps, rehearse_pictures, requested_border, requested_bytes
+from ...maps.search import SHORT, TRAININGS, check_psnr, search_by_psnr, search_lines
 from ...maps.source import Source
 from . import PAGED, STRUCTURES, CoarsePrimary, ImageSettings, parse_weights
 from .arrays import CompressedImage, ImageBudget, cascaded_side, fit_bytes, search
 from .training import build_problem, choose_structure, fit_image, pointer_dims, source_layout
-
-#: Share of the steps that a candidate of a search is trained for.
-SHORT = 1 / 8
 
 #: Share of a limited time for such a search; the best candidate is trained in the rest.
 SEARCHED = 2 / 3
@@ -28,21 +26,11 @@ SEARCHED = 2 / 3
 #: Number of candidates that share a limited time.
 CANDIDATES = 16
 
-#: Most trainings of a search by quality, and most if its time is limited.
-TRAININGS = 8
-LIMITED_TRAININGS = 4
-
 #: Sides of the cascaded array that a search tries, by its dimensions.
 SIDES = {1: (64, 256), 2: (16, 32, 64), 3: (8, 16, 32), 4: (4, 8, 12, 16)}
 
 #: Structures of the primary that a search tries.
 TRIED = ("8 bits", "6 bits", "4 bits", "4 + 8 bits", "3 + 6 bits", "2 + 6 bits", *PAGED)
-
-#: Largest ratio of the smallest sufficient and the largest insufficient file at which a search by quality ends.
-NEAR = 1.06
-
-#: Gain by twice the bytes that a search by quality expects at first, in dB.
-OCTAVE_DB = 2.5
 
 #: Least weights of maps that pictures show, and of others such as ambient occlusion, in dB.
 SHOWN_DB = -1.0
@@ -60,14 +48,11 @@ def check(request: FitRequest) -> None:
     """Raise :class:`UsageError` for options that do not go together."""
     options = request.options
     several = options["ratio_search"] or options["psnr"]
-    if request.checkpoint is not None and several:
-        raise UsageError(
-            "--checkpoint: for one training, but --ratio-search and --psnr make several: give only one of them"
-        )
+    check_psnr(request, "cascaded")
+    if request.checkpoint is not None and options["ratio_search"]:
+        raise UsageError("--checkpoint: for one training, but --ratio-search makes several: leave one of them out")
     if options["ratio_search"] and (options["psnr"] or options["cascaded"]):
         raise UsageError("--ratio-search: chooses the sides of arrays of a given size: leave out --psnr and --cascaded")
-    if options["psnr"] and options["cascaded"]:
-        raise UsageError("--psnr: chooses the sides of the arrays: leave out --cascaded")
     if request.preset == "paper" and options["without"]:
         raise UsageError("--without: the preset paper has none of our improvements: leave it out")
     if options["source"] is None:
@@ -109,7 +94,7 @@ def _train(request: FitRequest, source: Source, recipe: ImageSettings) -> tuple[
         return Fitted(*fit_image(source, None, recipe, request, border), figures={"tried": []}), None
     if options["psnr"] is not None:
         table, result, tried = psnr_search(source, float(options["psnr"]), recipe, request, border)
-        return Fitted(table, result, figures={"tried": tried}), None
+        return Fitted(table, result, search_lines(tried), {"tried": tried}), None
     requested = requested_bytes(options, source)
     tried, lines = [], []
     if options["ratio_search"]:
@@ -240,54 +225,13 @@ def _candidates(recipe: ImageSettings, side: int, free: bool, leader: Callable) 
 def psnr_search(
     source: Source, goal: float, recipe: ImageSettings, request: FitRequest, border=None, most: int = TRAININGS
 ) -> tuple[Table, FitResult, list[dict]]:
-    """Search the smallest file whose ``psnr_db`` is at least ``goal``, by trainings of full length.
+    """Search the smallest file whose ``psnr_db`` is at least ``goal``: :func:`.search_by_psnr` over default sizes."""
 
-    Sizes follow the secant of quality over the logarithm of bytes. The search ends when a sufficient size is within
-    :data:`NEAR` of an insufficient one, or after ``most`` trainings. Returns the table, the record of its training, and
-    the list of trainings; a line is printed for each. After Ctrl-C the record is marked ``interrupted``. Raises
-    :class:`FittingError`, or after Ctrl-C ``KeyboardInterrupt``, if no training has reached the goal.
-    """
-    tried, best = [], None
-    most = most if request.deadline is None else min(most, LIMITED_TRAININGS)
-    nbytes = middle = source.nbytes / 12
-    while len(tried) < most:
-        sizes = [default_size(source, n, recipe) for n in (nbytes, middle)]
-        size = next((s for s in sizes if all(t["bytes"] != s.nbytes for t in tried)), None)
-        if size is None:
-            break
-        limited = request.part(1 / (most - len(tried)))
-        table, result = fit_image(source, size, recipe, limited, border, f"try {size.nbytes:,} bytes")
-        psnr = table.measured["psnr_db"]
-        tried.append({"bytes": size.nbytes, "psnr_db": psnr, "rows": size.rows, "cascaded": size.cascaded})
-        print(f"{size.nbytes:,} bytes: {psnr:.2f} dB")
-        if psnr >= goal and (best is None or table.nbytes < best[0].nbytes):
-            best = table, result
-        if result.interrupted:
-            if best is None:
-                raise KeyboardInterrupt
-            best[1].interrupted = True
-            break
-        enough = min((t for t in tried if t["psnr_db"] >= goal), key=lambda t: t["bytes"], default=None)
-        short = max((t for t in tried if t["psnr_db"] < goal), key=lambda t: t["bytes"], default=None)
-        if enough and short:
-            if enough["bytes"] <= NEAR * short["bytes"]:
-                break
-            share = (goal - short["psnr_db"]) / max(enough["psnr_db"] - short["psnr_db"], 1e-6)
-            nbytes = short["bytes"] * (enough["bytes"] / short["bytes"]) ** min(max(share, 0.15), 0.85)
-            middle = math.sqrt(enough["bytes"] * short["bytes"])  # the secant may lead to a size that was tried
-            continue
-        if short and size.full:
-            break
-        octaves = (goal - psnr) / OCTAVE_DB
-        octaves = math.copysign(min(max(abs(octaves) * 1.2, 0.25), 3), octaves)
-        nbytes = middle = size.nbytes * 2**octaves
-    if best is None:
-        nearest = max(tried, key=lambda t: t["psnr_db"])
-        raise FittingError(
-            f"{request.options['source']}: {goal:g} dB were not reached; the best of {len(tried)} sizes had "
-            f"{nearest['psnr_db']:.2f} dB in {nearest['bytes']:,} bytes: give more --steps or a lower --psnr"
-        )
-    return *best, tried
+    def train(size: ImageBudget, steps: int, limited: FitRequest, title: str) -> tuple[Table, FitResult]:
+        changed = dataclasses.replace(recipe, steps=steps, measure_every=min(recipe.measure_every, steps))
+        return fit_image(source, size, changed, limited, border, title)
+
+    return search_by_psnr(source, goal, request, recipe, lambda n: default_size(source, n, recipe), train, most)
 
 
 # ---------------------- Weights of maps ----------------------

@@ -12,7 +12,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 from ...core.arguments import Argument, between, checked, fraction, natural, positive
 from ...fitting.task import FitSettings, Task
@@ -25,7 +25,8 @@ class TextureSettings(FitSettings):
 
     - ``layered``: our arrays, on the grids of levels of detail, which start from principal components; else the
       paper's arrays, which start from ramps.
-    - ``once``: store channels only once that are equal or constant at every level.
+    - ``once``: store channels only once that are equal or constant at every level; not so without a training, whose
+      arrays are to be optimised in a scene.
     - ``normals``: leave out the third component of normals where it follows from the others.
     - ``jitter``: share of the steps whose samples lie between texels and levels; the others lie at texel centres of
       whole levels.
@@ -45,6 +46,8 @@ class TextureSettings(FitSettings):
     jitter: float = 0.5
     rounded: bool = True
     samples: str = "levels"
+
+    fewest_steps: ClassVar[int] = 0
 
 
 #: Settings by preset; the first is the default.
@@ -165,7 +168,7 @@ class Texture(Task):
     measurements = 10
     arguments = (
         SOURCE,
-        *(size for size in SIZES if size.name != "psnr"),
+        *SIZES,
         Argument(
             "--structure", type=checked(parse_structure), metavar="L:C:B,…",
             help="pages, or level, channels and bits of each fine array, as in 0:1:2,1:2:4 (default: auto)",
@@ -184,6 +187,11 @@ class Texture(Task):
         Argument(
             "--footprint-samples", choices=["levels", "power", "exponential"],
             help="distribution of levels of detail in training (default: levels for ours, power for paper)",
+        ),
+        Argument(
+            "--separate", action="store_true",
+            help="constant and equal channels have entries of their own, to be optimised in a scene (always so without "
+            "a training, --steps 0)",
         ),
         Argument(
             "--shading", choices=("auto", "on", "off"), default="auto",
@@ -219,7 +227,8 @@ class Texture(Task):
 
     def settings(self, preset, given, options):
         samples = options["footprint_samples"] or PRESETS[preset].samples
-        return self.change_settings(PRESETS[preset], {"samples": samples, **given})
+        once = PRESETS[preset].once and not options["separate"] and given.get("steps") != 0
+        return self.change_settings(PRESETS[preset], {"samples": samples, "once": once, **given})
 
     def shading_settings(self, preset: str, settings: TextureSettings, options: Mapping) -> ShadingSettings:
         """Return the settings of the training for shading beside those of the texture.

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations_with_replacement
 
 import numpy as np
 
@@ -85,12 +86,28 @@ SMOOTH_LADDER: tuple[tuple[str, int], ...] = (
     *LADDER[5:],
 )
 
+#: Structures of constant textures, whose arrays are to be optimised: fine arrays hold all coordinates of a pointer.
+BLANK_LADDER: tuple[tuple[str, int], ...] = (
+    ("0:1:6,1:3:8", 2),
+    ("0:3:5", 1),
+    ("0:3:6", 1),
+    ("0:3:7", 1),
+    ("0:3:8", 1),
+)
+
+#: Least smoothness of a smooth and of a constant texture, in dB (:func:`~mi_diffind.maps.layout.smoothness`).
+SMOOTH_DB = 30.0
+BLANK_DB = 119.0
+
 #: Largest sides of a cascaded array of 1 to 3 dimensions that are chosen.
 CASCADED_LIMITS = (128, 32, 16)
 
 #: Least share of the bytes that a cascaded array takes, until its side reaches :data:`CASCADED_SIDE`.
 CASCADED_SHARE = 0.05
 CASCADED_SIDE = 12
+
+#: Largest difference between a side of a cascaded array and that of the cube of as many entries.
+SIDES_APART = 3
 
 #: Levels with pages, and the first level of the coarse array behind them.
 PAGES = (0, 2)
@@ -106,8 +123,12 @@ PAGES_SIDE = 12
 #: Share of the differences between two levels that lies within the range of an entry, by its bits.
 WITHIN = {1: 0.7, 2: 0.97, 3: 0.99, 4: 0.998, 5: 0.998, 6: 0.998, 7: 0.998, 8: 0.998}
 
-#: Least range of a difference, so that a flat component can still be trained.
+#: Least range of a difference, so that a flat component can still be trained, and range if all components are flat.
 SMALLEST = 0.02
+BLANK_RANGE = 1.0
+
+#: Variance of all channels together below which a texture is constant.
+FLAT = 1e-10
 
 
 # ---------------------- The paper's resolutions ----------------------
@@ -186,8 +207,8 @@ class TextureBudget:
 
     - ``fine``: the fine arrays, the finest first.
     - ``skip``: first level of detail of the coarse array, whose pointers have ``dims`` coordinates of ``bits`` bits.
-    - ``cascaded``: side of the cascaded array, which has ``channels`` channels and ``knots`` entries along the level of
-      detail (1: no such axis).
+    - ``cascaded``: sides of the cascaded array along the coordinates, or one number for all; it has ``channels``
+      channels and ``knots`` entries along the level of detail (1: no such axis).
     - ``pages``: levels with arrays of pages, which share ``page_bytes``, entries of ``page_bits`` bits.
     """
 
@@ -197,7 +218,7 @@ class TextureBudget:
     fine: tuple[FineArray, ...]
     skip: int
     dims: int
-    cascaded: int
+    cascaded: int | tuple[int, ...]
     knots: int = 1
     bits: int = 8
     pages: tuple[int, ...] = ()
@@ -223,8 +244,13 @@ class TextureBudget:
         ])  # fmt: skip
 
     @property
+    def sides(self) -> tuple[int, ...]:
+        """Sides of the cascaded array, one for each coordinate of a pointer."""
+        return self.cascaded if isinstance(self.cascaded, tuple) else (self.cascaded,) * self.dims
+
+    @property
     def _cascaded(self) -> tuple[int, ...]:
-        return (self.knots, *(self.cascaded,) * self.dims, self.channels)
+        return (self.knots, *self.sides, self.channels)
 
     @property
     def page_entries(self) -> int:
@@ -232,6 +258,11 @@ class TextureBudget:
         sizes = level_sizes(self.height, self.width)
         index = array_bytes([((2, *page_counts(sizes[level])), SIDE_BITS[1]) for level in self.pages])
         return int((self.page_bytes - index) * 8 / (self.page_bits * self.dims))
+
+
+def ladder(smoothness_db: float) -> tuple[tuple[str, int], ...]:
+    """Return the structures to choose from for a texture of a smoothness (:func:`.layout.smoothness`)."""
+    return BLANK_LADDER if smoothness_db >= BLANK_DB else SMOOTH_LADDER if smoothness_db >= SMOOTH_DB else LADDER
 
 
 def choose(
@@ -242,23 +273,25 @@ def choose(
     skip: int | None = None,
     fine: tuple[FineArray, ...] | None = None,
     cascaded: int | None = None,
-    smooth: bool = False,
+    ladder: tuple[tuple[str, int], ...] = LADDER,
 ) -> TextureBudget:
     """Return our arrays for a texture of ``channels`` stored channels and at most ``nbytes`` bytes.
 
-    The structure is that of :data:`LADDER` (:data:`SMOOTH_LADDER` for a ``smooth`` texture) with the most bytes that
-    fits, moved to coarser levels if none does; the cascaded array takes the rest. ``skip``, ``fine`` and ``cascaded``
-    replace what is chosen. Pointers have three coordinates, fewer where the smallest arrays of three do not fit. If
-    nothing fits, the result is the smallest budget. Raises ``ValueError`` for fine arrays that do not go together.
+    The structure is that of a :func:`ladder` with the most bytes that fits, moved to coarser levels if none does; the
+    cascaded array takes the rest. Bytes beyond its largest sides become bits of the fine arrays. ``skip``, ``fine`` and
+    ``cascaded`` replace what is chosen. Pointers have three coordinates, fewer where the smallest arrays of three do
+    not fit. If nothing fits, the result is the smallest budget. Raises ``ValueError`` for fine arrays that do not go
+    together.
     """
-    ladder = SMOOTH_LADDER if smooth else LADDER
     for dims in (3, 2, 1):
         too_large = []
         for group in [[(fine, skip)]] if fine is not None else _structures(height, width, dims, skip, ladder):
             sizes = [_sized(nbytes, height, width, channels, *where, dims, cascaded) for where in group]
             fitting = [size for size in sizes if size.nbytes <= nbytes]
             if fitting:
-                return max(fitting, key=lambda size: size.nbytes - math.prod(size._cascaded))
+                size = max(fitting, key=lambda size: size.nbytes - math.prod(size._cascaded))
+                size = size if fine is not None else _with_bits(size, nbytes)
+                return size if cascaded is not None else _with_sides(size, nbytes)
             too_large += sizes
         if fine is not None and dims <= max(f.channels for f in fine):
             break
@@ -293,6 +326,28 @@ def _sized(nbytes, height, width, channels, fine, skip, dims, cascaded) -> Textu
 
     least = min(max(2 + (dims > 1), side(CASCADED_SHARE * nbytes)), CASCADED_SIDE)
     return sized(min(max(side(nbytes - sized(0).nbytes), least), CASCADED_LIMITS[dims - 1]))
+
+
+def _with_bits(size: TextureBudget, nbytes: float) -> TextureBudget:
+    """Return the budget with more bits in its fine arrays as far as these fit, the finest first."""
+    for i, array in enumerate(size.fine):
+        for bits in range(array.bits + 1, 9):
+            richer = replace(size, fine=(*size.fine[:i], array._replace(bits=bits), *size.fine[i + 1 :]))
+            if richer.nbytes <= nbytes and richer.base == size.base:
+                size = richer
+    return size
+
+
+def _with_sides(size: TextureBudget, nbytes: float) -> TextureBudget:
+    """Return the budget whose cascaded array has the most entries that fit.
+
+    Sides differ by a few, the first are longer. None is much longer than three times :data:`CASCADED_LIMITS`.
+    """
+    rest = (nbytes - replace(size, cascaded=0).nbytes) / (size.knots * size.channels)
+    side = min(int(rest ** (1 / size.dims) + 1e-9), 3 * CASCADED_LIMITS[size.dims - 1])
+    nearby = range(max(2, side - SIDES_APART), side + SIDES_APART + 1)
+    fitting = [s for s in combinations_with_replacement(reversed(nearby), size.dims) if math.prod(s) <= rest]
+    return replace(size, cascaded=max(fitting, key=lambda s: (math.prod(s), s[-1]))) if fitting else size
 
 
 def paged(height: int, width: int, channels: int, nbytes: float, cascaded: int | None = None) -> TextureBudget | None:
@@ -346,12 +401,15 @@ def from_components(
     values = [level * factors for level in values]
     k = values[0].shape[-1]
     mean = values[0].reshape(-1, k).mean(axis=0, dtype=np.float64)
-    directions = eigenvectors(channel_covariance(values[0], mean), min(size.dims, k))
-    # Rotated within the same space so that the first axes have the most detail: fine arrays hold only these
-    detail = directions @ neighbour_covariance(values[0]) @ directions.T
-    directions = eigenvectors(detail, len(directions)) @ directions
+    covariance = channel_covariance(values[0], mean)
+    # A constant texture starts as a read at (u, v), which can be trained
+    used = min(size.dims, k) if np.trace(covariance) > FLAT else 0
+    directions = eigenvectors(covariance, used)
+    if used:
+        # Rotated within the same space so that the first axes have the most detail: fine arrays hold only these
+        detail = directions @ neighbour_covariance(values[0]) @ directions.T
+        directions = eigenvectors(detail, used) @ directions
     low, high = component_range((values[0].reshape(-1, k) - mean) @ directions.T)
-    used = len(directions)
 
     def pointer(level: np.ndarray) -> np.ndarray:
         unit = MARGIN + (1 - 2 * MARGIN) * (((level - mean) @ directions.T - low) / (high - low))
@@ -376,7 +434,7 @@ def from_components(
             continue
         rest = (pointers[level] - reached)[..., : spec.channels]
         within = np.quantile(np.abs(rest).reshape(-1, spec.channels), WITHIN[spec.bits], axis=0)
-        scale = np.maximum(2 * within, SMALLEST)
+        scale = np.maximum(2 * within, SMALLEST if used else BLANK_RANGE)
         layer = FineLayer(level, until, spec.bits, tuple(float(f"{s:.6g}") for s in scale))
         entries = np.clip(rest / np.array(layer.scale) + layer.zero, 0, 1).astype(np.float32)
         layers.insert(0, layer)
@@ -385,8 +443,8 @@ def from_components(
         reached[..., : spec.channels] += ((entries - layer.zero) * layer.scale).astype(np.float32)
     coarse = np.concatenate([p.reshape(-1, size.dims) for p in pointers[size.skip :]])
     coarse = DifferentiableArray((len(coarse),), size.dims, np.clip(coarse, 1e-3, 1 - 1e-3), fold=True)
-    shape = (size.knots,) * (size.knots > 1) + (size.cascaded,) * size.dims
-    back = linear_in_pointer(mean, directions, low, high, size.cascaded, range(used), used)
+    shape = (size.knots,) * (size.knots > 1) + size.sides
+    back = linear_in_pointer(mean, directions, low, high, size.sides[:used], range(used))
     back = np.clip(back / factors, 1e-3, 1 - 1e-3).astype(np.float32)
     back = back.reshape(*back.shape[:-1], *[1] * (size.dims - used), k)
     cascaded = np.broadcast_to(back, (*shape, size.channels)).astype(np.float32)

@@ -12,14 +12,15 @@ from ...arrays.tables import MAX_BYTES, Table
 from ...core.errors import UsageError
 from ...core.progress import interruptible
 from ...core.units import figure_lines
-from ...fitting.task import FitRequest, Fitted
+from ...fitting.task import FitRequest, FitResult, Fitted
 from ...maps.layout import Layout, gain_of_pages, smoothness
 from ...maps.model import complete, load_maps, preview_path, rehearse_pictures, requested_border, requested_bytes
 from ...maps.pyramid import Pyramid
+from ...maps.search import check_psnr, search_by_psnr, search_lines
 from ...maps.source import Source
 from . import PRESETS, TASK, ShadingSettings, TextureSettings, arrays, parse_structure
 from .appearance import ShadedEvaluation
-from .arrays import TextureBudget
+from .arrays import PaperBudget, TextureBudget
 from .compressed import CompressedTexture, neutral_extras, read_level_bias
 from .shading import fit_shading, trainable_arrays
 from .surface import left_out, maps_of, material_effects, varies_shading
@@ -41,11 +42,8 @@ FIRST = 0.5
 #: Largest share of the bytes that extras take; smaller arrays have none.
 EXTRAS_SHARE = 1 / 16
 
-#: Least smoothness of a smooth texture, in dB (:func:`~mi_diffind.maps.layout.smoothness`).
-SMOOTH_DB = 30.0
-
 #: Options that say how the arrays of the first stage are laid out.
-SIZES = ("compression", "bytes", "bpp", "structure", "skip", "cascaded", "ratio", "footprint_samples")
+SIZES = ("compression", "bytes", "bpp", "psnr", "structure", "skip", "cascaded", "ratio", "footprint_samples")
 
 #: Options of the last stage alone.
 LAST = {"start": "--start", "share": "--lambda", "preview": "--preview"}
@@ -62,6 +60,13 @@ def check(request: FitRequest) -> None:
         raise UsageError(f"source: found the scene {options['source']}; fit scene trains a texture inside a scene")
     if options["shading"] == "off":
         check_last(options, "--shading is off")
+    check_psnr(request, "structure", "skip", "cascaded", "ratio")
+    if options["psnr"] is not None and options["shading"] == "on":
+        raise UsageError("--psnr: asks for the values of the maps, which --shading on gives up for those of shading")
+    if not request.settings.steps and (options["psnr"] is not None or options["shading"] == "on"):
+        raise UsageError("--steps: found 0, but --psnr and --shading on need a training")
+    if not request.settings.steps and request.checkpoint is not None:
+        raise UsageError("--checkpoint: nothing is trained with --steps 0: leave one of them out")
     if options["start"] is not None and any(options[name] is not None for name in SIZES):
         given = ", ".join(f"--{name.replace('_', '-')}" for name in SIZES if options[name] is not None)
         raise UsageError(f"--start: the arrays have their size, leave out {given}")
@@ -97,16 +102,32 @@ def fit(request: FitRequest) -> Fitted:
     reason, spare = "" if options["shading"] == "on" else reason_without_shading(pyramid.layout, request), 0
     if reason:
         check_last(options, reason)
-        requested, size = requested_bytes(options, source), None
-        if pyramid.layout.stored:
-            size = find_size(source, pyramid, requested, recipe, options)
         rehearse_pictures(request, source)
-        fitted = Fitted(*fit_texture(source, size, recipe, request, pyramid, level_bias(options)))
+        fitted, requested = fit_maps_alone(request, source, pyramid)
         fitted.lines += [f"not trained for its shading: {reason}"] * (options["shading"] == "auto")
     else:
         fitted, requested, spare = fit_stages(request, source, pyramid)
     texture = CompressedTexture.from_table(fitted.table, request.types.TensorXf)
     return complete(request, source, fitted, texture, requested, spare)
+
+
+def fit_maps_alone(request: FitRequest, source: Source, pyramid: Pyramid) -> tuple[Fitted, float | None]:
+    """Train for the values of the maps alone; return the result, and the bytes that were requested, if any."""
+    options, recipe, bias = request.options, request.settings, level_bias(request.options)
+
+    def sized(nbytes: float) -> TextureBudget | PaperBudget:
+        return find_size(source, pyramid, nbytes, recipe, options)
+
+    def train(size, steps: int, limited: FitRequest, title: str) -> tuple[Table, FitResult]:
+        changed = dataclasses.replace(recipe, steps=steps, measure_every=min(recipe.measure_every, steps))
+        return fit_texture(source, size, changed, limited, pyramid, bias, title)
+
+    requested = None if options["psnr"] is not None else requested_bytes(options, source)
+    if pyramid.layout.stored and requested is None:
+        table, result, tried = search_by_psnr(source, float(options["psnr"]), request, recipe, sized, train)
+        return Fitted(table, result, search_lines(tried), {"tried": tried}), None
+    size = sized(requested) if pyramid.layout.stored else None
+    return Fitted(*fit_texture(source, size, recipe, request, pyramid, bias)), requested
 
 
 def level_bias(options: Mapping) -> float:
@@ -118,6 +139,10 @@ def reason_without_shading(layout: Layout, request: FitRequest) -> str:
     """Return why ``--shading off`` or ``auto`` leaves out the training for shading, "" if it does not."""
     if request.options["shading"] == "off":
         return "--shading is off"
+    if not request.settings.steps:
+        return "--steps is 0"
+    if request.options["psnr"] is not None:
+        return "--psnr asks for the values of the maps"
     if request.preset == "paper":
         return "the preset paper does so with --shading on"
     if not varies_shading(layout):
@@ -269,7 +294,6 @@ def _layered_size(pyramid: Pyramid, nbytes: float, structure: str, skip: int | N
         if size is not None and (structure == "pages" or _page_gain(pyramid, size, scale) >= GAIN_DB):
             return size
     try:
-        smooth = smoothness(pyramid.values[0]) >= SMOOTH_DB
-        return arrays.choose(*shape, nbytes, skip, fine, cascaded, smooth)
+        return arrays.choose(*shape, nbytes, skip, fine, cascaded, arrays.ladder(smoothness(pyramid.values[0])))
     except ValueError as e:
         raise UsageError(f"--structure: {e}") from None

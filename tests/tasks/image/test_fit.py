@@ -11,7 +11,7 @@ import mi_diffind as md
 from mi_diffind.core.errors import UsageError
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting.loop import FitResult
-from mi_diffind.fitting.task import FitRequest, FittingError
+from mi_diffind.fitting.task import FitRequest
 from mi_diffind.maps import as_seen
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.tasks.image import PAGED, PRESETS, STRUCTURES, fit, parse_weights, training
@@ -145,68 +145,6 @@ def test_ratio_search_is_interrupted(monkeypatch, interrupt):
     assert (size.dims, size.cascaded) == (best["dims"], best["cascaded"])
     assert chosen.common == short(steps=400).common and kept[0].measured["psnr_db"] == best["psnr_db"]
     assert all(one.nbytes <= 3150 and recipe.steps == 50 for one, recipe in calls)
-
-
-# ---------------------- By quality ----------------------
-
-
-def by_bytes(slope, bend=0.0, wobble=0.0):
-    """Return a quality by bytes: so many dB an octave, fewer the more there are, and not quite monotonic."""
-
-    def quality(size, recipe):
-        octaves = math.log2(size.nbytes / 1000)
-        return 25 + slope * octaves - bend * octaves**2 + wobble * math.sin(9 * octaves)
-
-    return quality
-
-
-@pytest.mark.parametrize("slope, bend, wobble", [(2.5, 0, 0), (0.8, 0, 0), (6, 0, 0), (2.5, 0.15, 0), (2, 0, 0.4)])
-@pytest.mark.parametrize("goal", [20, 25.001, 31.5])
-def test_quality_search_is_small_enough(monkeypatch, capsys, slope, bend, wobble, goal):
-    quality = by_bytes(slope, bend, wobble)
-    calls = pretend(quality, monkeypatch)
-    try:
-        table, result, tried = fit.psnr_search(noise(256, 256), goal, short(), REQUEST)
-    except FittingError:
-        assert calls[-1][0].full or len(calls) == 8
-        return
-    assert len(tried) == len(calls) == len(capsys.readouterr().out.splitlines()) <= 8
-    assert [t["bytes"] for t in tried] == [size.nbytes for size, _ in calls]
-    reached = [t["bytes"] for t in tried if t["psnr_db"] >= goal]
-    assert table.measured["psnr_db"] >= goal and table.nbytes == min(reached) and not result.interrupted
-    missed = [t["bytes"] for t in tried if t["psnr_db"] < goal and t["bytes"] < table.nbytes]
-    if wobble == 0 and missed:
-        assert table.nbytes <= (1.1 if len(tried) < 8 else 2) * max(missed)  # a row is more than NEAR of a small file
-
-
-def test_quality_search_ends(monkeypatch):
-    """The search ends at a primary as large as the image, after ``most`` trainings, and at the smallest arrays."""
-    source = noise(64, 64)
-    calls = pretend(by_bytes(2.5), monkeypatch)
-    with pytest.raises(FittingError, match=r"x\.png: 100 dB were not reached; the best of \d sizes had"):
-        fit.psnr_search(source, 100, short(), REQUEST)
-    assert calls[-1][0].full
-    assert not any(size.full for size, _ in calls[:-1])
-    calls = pretend(by_bytes(0), monkeypatch)
-    with pytest.raises(FittingError, match="best of 1 sizes"):
-        fit.psnr_search(source, 100, short(), REQUEST, most=1)
-    calls = pretend(by_bytes(0), monkeypatch)
-    table, _, tried = fit.psnr_search(source, 1, short(), REQUEST)
-    smallest = fit.sized(source, 1, short(), 4)
-    assert table.nbytes == smallest.nbytes == min(t["bytes"] for t in tried) and len(calls) < 8
-
-
-def test_quality_search_is_interrupted(monkeypatch):
-    """A file that reached the goal before is kept."""
-    source = noise(256, 256)
-    start = by_bytes(2.5)(fit.default_size(source, source.nbytes / 12, short()), None)
-    calls = pretend(by_bytes(2.5), monkeypatch, interrupt=2)
-    table, result, tried = fit.psnr_search(source, start - 5, short(), REQUEST)
-    assert len(tried) == len(calls) == 2 and result.interrupted
-    assert table.nbytes == min(t["bytes"] for t in tried if t["psnr_db"] >= start - 5)
-    pretend(by_bytes(2.5), monkeypatch, interrupt=1)
-    with pytest.raises(KeyboardInterrupt):
-        fit.psnr_search(source, start + 5, short(), REQUEST)
 
 
 # ---------------------- Weights of maps ----------------------
