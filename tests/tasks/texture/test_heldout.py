@@ -225,7 +225,8 @@ def test_reads_of_a_pixel_with_samples(ad):
         u, v, level, stretch = (x.numpy() for x in footprint[:4])
         centre = np.stack([np.cos(2 * np.pi * x) for x in (u, v)], axis=-1)
         for samples in CASES:
-            value = numpy_of(held_out._read(look, footprint, samples))
+            reads = numpy_of(held_out._reads(look, footprint, samples))
+            value = reads.reshape(len(level), -1, 3).mean(axis=1)
             if not samples:
                 expected, factor = level, 1.0
             else:
@@ -240,6 +241,31 @@ def test_reads_of_a_pixel_with_samples(ad):
             share = (2 / (stretch**2 + stretch**-2)) ** 2
             repeated = np.repeat(share, PLACES[samples] ** 2 if samples else 1)
             np.testing.assert_allclose(shares[-1], repeated, rtol=1e-4, atol=1e-6)
+
+
+def test_noise_of_a_single_render(ad):
+    """The variance of reads at places, over the number of samples, is added to the squared error of their mean."""
+    pyramid, n = almost_constant(ad), 64
+    held_out = HeldOutFootprints(pyramid, material_effects(pyramid.layout)[0], n)
+    held_out.exposures = [1.0] * LIGHTS
+
+    def look(u, v, level, wi, wo, share):
+        return ad.Array3f(0.3 + 0.2 * dr.cos(2 * dr.pi * u))
+
+    mean, single = (held_out.errors(look, noise) for noise in (False, True))
+    for level, footprint in enumerate(held_out.footprints):
+        u, stretch, lit = (groups_of(footprint[i].numpy(), n)[:-1].reshape(-1, n) for i in (0, 3, 6))
+        for case, samples in enumerate(CASES):
+            variance = 0 * u
+            if samples:
+                step = np.pi * 2.0 ** groups_of(footprint[2].numpy(), n)[:-1].reshape(-1, n) / SIDE
+                step *= stretch / PLACES[samples]
+                once, twice = (
+                    np.sin(PLACES[samples] * k * step) / (PLACES[samples] * np.sin(k * step)) for k in (1, 2)
+                )
+                variance = 0.04 * (0.5 + 0.5 * twice * np.cos(4 * np.pi * u) - (once * np.cos(2 * np.pi * u)) ** 2)
+            expected = lit * variance / max(samples, 1)
+            np.testing.assert_allclose(single[case][0][level] - mean[case][0][level], expected, atol=2e-6)
 
 
 def errors_of(gains, noise=0.0, count=1000):
