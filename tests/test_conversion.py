@@ -53,6 +53,7 @@ def folder(tmp_path, monkeypatch):
         return fit(task, **{**options, **less})
 
     monkeypatch.setattr(conversion, "fit", short)
+    monkeypatch.setattr(conversion, "_cores", lambda: 1)  # other processes know nothing of this fit
     return tmp_path, fits
 
 
@@ -83,10 +84,10 @@ def test_a_converted_scene_shows_the_same(mi_rgb, folder):
     ball = BALL.replace("MORE", '<boolean name="face_normals" value="true"/>')
     scene = parsed(folder, ball + floor)
     stock = loading.render(scene.load(), 16)[0]
-    conversions = conversion.replace_stock(scene, ["principled", "bitmap", "mesh"], folder / "tables")
+    conversions = conversion.replace_stock(scene, ["disney", "bitmap", "mesh"], folder / "tables")
     assert [(c.stock, c.learned, c.name) for c in conversions] == [
-        ("ply", "neural_sdf", "ball"), ("principled", "neural_disney", "ball"),
-        ("principled", "neural_disney", "floor"), ("bitmap", "neural_texture", "floor"),
+        ("ply", "neural_sdf", "ball"), ("principled", "disney", "ball"),
+        ("principled", "disney", "floor"), ("bitmap", "neural_texture", "floor"),
         ("path", "path_sdf", "path"),
     ]  # fmt: skip
     assert [task for task, _ in fits] == ["sdf", "texture"]
@@ -109,19 +110,19 @@ def test_a_converted_scene_shows_the_same(mi_rgb, folder):
 @pytest.mark.parametrize(
     "group, objects, name, reason",
     [
-        ("principled", principled("Glass", spec_trans=0.9), 'principled "Glass"', "transmits light"),
-        ("principled", f'<bsdf type="twosided" id="Gem">{principled("Inner", eta=4)}</bsdf>', 'principled "',
+        ("disney", principled("Glass", spec_trans=0.9), 'principled "Glass"', "transmits light"),
+        ("disney", f'<bsdf type="twosided" id="Gem">{principled("Inner", eta=4)}</bsdf>', 'principled "',
          'the parameter "eta" 4, the Disney BRDF allows 1 to 3'),
         ("bitmap", textured("Sharp", "image.png", "nearest"), 'bitmap "Sharp"', 'the filter_type "nearest", allowed'),
         ("bitmap", textured("Webp", "leaf.webp"), 'bitmap "Webp"', "leaf.webp: cannot be read"),
         ("bitmap", textured("Lost", "none.png"), 'bitmap "Lost"', "names no file that exists"),
         *(
-            ("principled", principled("Gold", metallic=metal, **{name: value}), 'principled "Gold"',
+            ("disney", principled("Gold", metallic=metal, **{name: value}), 'principled "Gold"',
              f'is a metal with "{name}" {value}')
             for metal, name, value in ((1, "specular", 0), (0.5, "eta", 1))
         ),
         *(
-            ("principled", principled("Floor", **{name: value}), 'principled "Floor"',
+            ("disney", principled("Floor", **{name: value}), 'principled "Floor"',
              f'has the "{name}" {value}, below {least} the Disney BRDF reflects more at grazing')
             for name, value, least in (("specular", 0, 0.1), ("specular", 0.09, 0.1), ("eta", 1.1, 1.2))
         ),
@@ -187,7 +188,7 @@ def test_albedos_at_grazing_angles_of_what_is_replaced(mi_rgb, folder, metal, sp
     mi, n = mi_rgb, 1 << 16
     numbers = {"roughness": 0.1, "metallic": float(metal), "specular": specular}
     scene = parsed(folder[0], principled("Floor", **numbers))
-    (one,) = conversion.replace_stock(scene, ["principled"], folder[0] / "tables")
+    (one,) = conversion.replace_stock(scene, ["disney"], folder[0] / "tables")
     albedo, si = [], dr.zeros(mi.SurfaceInteraction3f, n)
     si.wi = mi.Vector3f(0.96**0.5, 0, 0.2)
     for plugin in (one.stock, one.learned):
@@ -204,21 +205,21 @@ def test_the_command_and_a_comparison_with_the_stock_scene(mi_rgb, tmp_path, cap
     parsed(tmp_path, principled("Clay") + principled("Glass", spec_trans=1) + ball)
     scene, new = str(tmp_path / "scene.xml"), tmp_path / "new.xml"
     arguments = ["-o", str(new), "--json", str(tmp_path / "a.json"), "--variant", mi_rgb.variant()]
-    assert main(["convert", scene, *arguments, "--learn", "principled"]) == 0
+    assert main(["convert", scene, *arguments, "--learn", "disney"]) == 0
     printed = capsys.readouterr().out.splitlines()
     assert printed == [
-        "replaced    1 x principled → neural_disney",
+        "replaced    1 x principled → disney",
         'kept        principled "Glass": transmits light (spec_trans), which the Disney BRDF does not',
         printed[2], f"scene       {new}",
     ]  # fmt: skip
     assert printed[2].startswith("check       equal within noise (24 x 16 pixels, 64 spp), which would have shown")
-    assert [c["learned"] for c in json.loads((tmp_path / "a.json").read_text())["conversions"]] == ["neural_disney", ""]
-    assert new.read_text().count("neural_disney") == 1 and not (tmp_path / "new_tables").exists()
+    assert [c["learned"] for c in json.loads((tmp_path / "a.json").read_text())["conversions"]] == ["disney", ""]
+    assert new.read_text().count("disney") == 1 and not (tmp_path / "new_tables").exists()
     for output, fault in (("scene.xml", "the same file as the scene"), ("new.json", "allowed is .xml")):
         assert main(["convert", scene, "-o", str(tmp_path / output)]) == 2 and fault in capsys.readouterr().err
-    result = mi_diffind.compare(scene, 8, learn=["principled"], progress=False)
+    result = mi_diffind.compare(scene, 8, learn=["disney"], progress=False)
     assert result.truth == "stock (principled), 8 spp" and result.further == ()
-    assert main(["convert", scene, "-o", str(new), "--learn", "principled", "--no-check"]) == 0
+    assert main(["convert", scene, "-o", str(new), "--learn", "disney", "--no-check"]) == 0
     assert "check" not in capsys.readouterr().out
     assert printed[:2] == str(result).splitlines()[3:5] and result.figures["psnr_db"] > 25
     same = mi_diffind.compare(new, 8, against="principled", progress=False)
@@ -306,9 +307,9 @@ def test_shading_normals(mi_rgb, tmp_path):
 def test_misspelt_groups_and_parameters_stay_errors(mi_rgb, folder):
     """Conversion reads the properties of the scene, which must not make them known to a plugin."""
     scene = parsed(folder[0], principled("a", rougness=0.9) + '<shape type="sphere"><ref id="a"/></shape>')
-    with pytest.raises(UsageError, match='found "glass", allowed are principled, mesh, bitmap'):
+    with pytest.raises(UsageError, match='found "glass", allowed are disney, material, mesh, bitmap'):
         conversion.replace_stock(scene, ["glass"], folder[0])
-    (one,) = conversion.replace_stock(scene, ["principled"], folder[0])
+    (one,) = conversion.replace_stock(scene, ["disney"], folder[0])
     assert one.reason == 'has the parameter "rougness", which the learned plugin lacks'
     with pytest.raises(loading.SceneError, match="rougness"):
         scene.load()

@@ -18,7 +18,7 @@ def add(commands) -> None:
     sub.add_argument("scene", metavar="SCENE.xml")
     sub.add_argument("-o", "--output", required=True, metavar="NEW.xml", help="scene file to write")
     sub.add_argument("--tables", metavar="DIR", help="folder of the table files (default: NEW_tables beside NEW.xml)")
-    learn_option(sub, "bitmap")
+    learn_option(sub, "material,bitmap")
     sub.add_argument(
         "--no-check",
         dest="check",
