@@ -2,9 +2,11 @@
 
 import contextlib
 import json
+import os
 import re
 import struct
 import zlib
+from pathlib import Path
 
 import drjit as dr
 import numpy as np
@@ -113,7 +115,7 @@ def test_a_converted_scene_shows_the_same(mi_rgb, folder):
         ("disney", principled("Glass", spec_trans=0.9), 'principled "Glass"', "transmits light"),
         ("disney", f'<bsdf type="twosided" id="Gem">{principled("Inner", eta=4)}</bsdf>', 'principled "',
          'the parameter "eta" 4, the Disney BRDF allows 1 to 3'),
-        ("bitmap", textured("Sharp", "image.png", "nearest"), 'bitmap "Sharp"', 'the filter_type "nearest", allowed'),
+        ("bitmap", textured("Sharp", "image.png", "nearest"), 'bitmap "Sharp"', '"nearest" and fewer than 256'),
         ("bitmap", textured("Webp", "leaf.webp"), 'bitmap "Webp"', "leaf.webp: cannot be read"),
         ("bitmap", textured("Lost", "none.png"), 'bitmap "Lost"', "names no file that exists"),
         *(
@@ -239,6 +241,119 @@ def test_by_default_only_textures_are_learned(mi_rgb, folder):
     same = conversion.convert(folder / "scene.xml", folder / "same.xml", learn=[])
     assert same.check is None and str(same) == "replaced    nothing"
     assert (folder / "same.xml").read_bytes() == (folder / "scene.xml").read_bytes()
+
+
+def image(name, role, scale=2, raw=True):
+    """A bitmap for a parameter, ``scale`` times over the surface."""
+    return f"""<texture type="bitmap" name="{role}"><string name="filename" value="{name}.png"/><boolean name="raw"
+        value="{str(raw).lower()}"/><transform name="to_uv"><scale x="{scale}" y="2"/></transform></texture>"""
+
+
+def paint(*more):
+    """A ``principled`` of two images and a number."""
+    color, rough = image("image", "base_color", raw=False), image("rough", "roughness")
+    return f'<bsdf type="principled">{color}{rough}{"".join(more)}<float name="metallic" value="0.25"/></bsdf>'
+
+
+def bumpy(inner):
+    return f'<bsdf type="normalmap">{image("bumps", "normalmap")}{inner}</bsdf>'
+
+
+@pytest.fixture
+def maps(folder, mi_rgb):
+    """Images of a material beside the image of the folder."""
+    y, x = np.mgrid[:64, :64] / 64
+    bumps = np.stack([0.3 * np.cos(4 * np.pi * x), 0.2 * np.sin(4 * np.pi * y), np.ones_like(x)], axis=2)
+    bumps = 0.5 + 0.5 * bumps / np.linalg.norm(bumps, axis=2, keepdims=True)
+    for name, values in (("bumps", bumps), ("rough", 0.5 + 0.3 * np.sin(4 * np.pi * y)), ("holes", np.rint(x))):
+        mi_rgb.Bitmap(np.rint(255 * values).astype(np.uint8)).write(str(folder[0] / f"{name}.png"))
+    return folder
+
+
+def test_a_material_of_nested_plugins(mi_rgb, maps):
+    """One file for a mask, both sides, normals and images; with the images again, it shows what the scene showed."""
+    folder, fits = maps
+    leaf = (
+        f'<bsdf type="mask" id="leaf">{image("holes", "opacity")}<bsdf type="twosided">{bumpy(paint())}</bsdf></bsdf>'
+    )
+    floor = '<transform name="to_world"><rotate x="1" angle="-90"/><scale value="2"/></transform>'
+    shared = '<texture type="bitmap" id="shared"><string name="filename" value="image.png"/></texture>'
+    cloth = """<bsdf type="twosided" id="ID"><bsdf type="principled"><ref name="base_color" id="shared"/>
+        <float name="roughness" value="ROUGH"/></bsdf></bsdf>"""
+    cloths = [cloth.replace("ID", name).replace("ROUGH", rough) for name, rough in (("silk", "0.3"), ("wool", "0.9"))]
+    balls = "".join(
+        f'<shape type="sphere"><point name="center" x="{x}"/><float name="radius" value="0.8"/>{bsdf}</shape>'
+        for x, bsdf in ((-2, '<ref id="wool"/>'), (0, bumpy(paint())), (2, principled("plain", roughness=0.4)))
+    )
+    objects = f'{shared}{leaf}{"".join(cloths)}<shape type="rectangle">{floor}<ref id="leaf"/></shape>{balls}'
+    stock = loading.render(parsed(folder, objects).load(), 16)[0]
+    (folder / "other").mkdir()
+    new = folder / "other" / "new.xml"
+    result = conversion.convert(folder / "scene.xml", new, check=False, progress=False)
+    assert [(c.stock, c.learned, c.name) for c in result[:3]] == [
+        ("mask", "neural_material", "leaf"), ("twosided", "neural_material", "silk"),
+        ("twosided", "neural_material", "wool"),
+    ]  # fmt: skip
+    assert [(c.stock, c.learned) for c in result[3:]] == [("normalmap", "neural_material")]
+    text = new.read_text()
+    assert len(fits) == 3 and text.count('"neural_material"') == 4 and text.count('"principled"') == 1
+    assert text.count('name="two_sided"') == 3 and "bitmap" not in text and 'id="shared"' not in text
+    exact = loading.render(loading.ParsedScene(new).load(exact=True, against="principled"), 16)[0]
+    assert stock.std() > 0.1 and np.abs(exact - stock).mean() < 0.01
+    learned = loading.render(loading.load(new), 16)[0]
+    assert np.abs(learned - stock).mean() < 0.05
+    conversion.convert(folder / "scene.xml", new, check=False, progress=False)
+    assert len(fits) == 3
+
+
+@pytest.mark.parametrize(
+    "material, reason",
+    [
+        (bumpy(f'<bsdf type="twosided">{paint()}</bsdf>'), "has a twosided within, allowed is the order mask"),
+        (paint(image("image", "sheen")), 'has the image image.png with colours for "sheen", which is a number'),
+        (paint(image("holes", "sheen", scale=3)), 'has images that differ in "to_uv"'),
+        (paint('<texture type="checkerboard" name="sheen"/>'), 'has the texture "checkerboard" for "sheen"'),
+        (paint('<float name="spec_trans" value="0.5"/>'), "transmits light (spec_trans)"),
+        (f'<bsdf type="mask"><float name="opacity" value="0.5"/>{paint()}</bsdf>', 'has a number for "opacity"'),
+    ],
+)  # fmt: skip
+def test_materials_that_stay(mi_rgb, maps, material, reason):
+    folder, fits = maps
+    scene = parsed(folder, f'<shape type="sphere">{material}</shape>')
+    (one,) = conversion.replace_stock(scene, ["material"], folder / "tables", progress=False)
+    assert one.learned == "" and reason in one.reason and not fits
+
+
+def test_equal_images_are_fitted_once(mi_rgb, maps):
+    """Two names of one content share a table; a failed fit is told for both."""
+    folder, fits = maps
+    (folder / "copy.png").write_bytes((folder / "image.png").read_bytes())
+    scene = parsed(folder, textured("a", "image.png") + textured("b", "copy.png"))
+    a, b = conversion.replace_stock(scene, ["bitmap"], folder / "tables", progress=False)
+    assert len(fits) == 1 and a.reason == b.reason and a.learned == b.learned == "neural_texture"
+    assert len(list((folder / "tables").glob("*.json"))) == 1
+
+
+#: A scene by other people, beside the checkout; it does not ship.
+MODERN_HALL = Path(os.environ.get("MI_DIFFIND_DATA", Path(__file__).parents[2] / "shared/data")) / "scenes/modern_hall"
+
+
+@pytest.mark.skipif(not MODERN_HALL.is_dir(), reason="the scene Modern Hall is not on this machine")
+def test_modern_hall(mi_rgb, folder):
+    """A scene as people have it: 32 shapes, 8 materials, 3 images; converted, compared and checked for regressions."""
+    folder, fits = folder
+    new, defines = folder / "new.xml", {"resx": 32, "resy": 32, "spp": 4, "integrator": "path", "max_depth": 3}
+    result = conversion.convert(MODERN_HALL / "scene.xml", new, defines=defines, progress=False)
+    assert {(c.stock, c.learned, c.name) for c in result} == {
+        ("bitmap", "neural_texture", "WoodBSDF"), ("bitmap", "neural_texture", "WallpaperBSDF"),
+        ("twosided", "neural_material", "FloorTilesBSDF"),
+    }  # fmt: skip
+    assert len(fits) == 3 and result.disk_bytes and result.memory_bytes[1] < result.memory_bytes[0]
+    assert result.check is not None and result.check.difference < 0.1
+    compared = comparison.compare(new, 4, progress=False)
+    assert compared.figures["learned_plugins"] == 3 and compared.figures["psnr_db"] > 20
+    assert main(["regress", str(new), "--update", "--references", str(folder / "references")]) == 0
+    assert main(["regress", str(new), "--references", str(folder / "references")]) == 0
 
 
 def test_small_and_noisy_images_stay(mi_rgb, folder):

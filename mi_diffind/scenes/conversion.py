@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -23,17 +24,15 @@ from .. import plugins
 from ..arrays.tables import Table, move_paths, save_table
 from ..core import compat
 from ..core.errors import UsageError
-from ..core.files import OutputError, relative_path, replacing, shown, writable_file, writable_folder
+from ..core.files import cache_folder, check_scene_file, relative_path, replacing, writable_file, writable_folder
 from ..core.jobs import run_jobs
 from ..core.runtime import use_variant
 from ..fitting.task import STORAGES, find_task, fit, table_path, tasks
 from ..plugins.support.properties import Kept, StockNode
-from .block_test import PictureCheck, check_picture
+from .block_test import PICTURE_SAMPLES, PictureCheck, check_picture
 from .loading import ParsedScene, SceneError
+from .models import is_model, model_scene
 from .scene_text import absolute_paths, difference, edit_text
-
-#: Environment variable with the folder of fits for scenes that are rendered and not written.
-FOLDER = "MI_DIFFIND_CACHE"
 
 #: Integrator whose estimator those of ``Plugin.seen_by`` share.
 TRACER = "path"
@@ -66,14 +65,22 @@ class Conversion:
 class Conversions(list):
     """List of all :class:`Conversion`, and the ``check`` of the pictures before and after, ``None`` without one.
 
-    ``unchecked`` is the reason why there is none although there should be.
+    ``unchecked`` is the reason why there is none although there should be. ``disk_bytes`` and ``memory_bytes`` are
+    those of the scene before and after: of all its files, and of its meshes, images and tables as loaded.
     """
 
     check: PictureCheck | None = None
     unchecked: str = ""
+    disk_bytes: tuple[int, int] | None = None
+    memory_bytes: tuple[int, int] | None = None
 
     def __str__(self) -> str:
         lines = summary(self) if any(c.learned for c in self) else ["replaced    nothing", *summary(self)]
+        for name, pair in (("disk", self.disk_bytes), ("memory", self.memory_bytes)):
+            lines += [f"{name:12}{pair[0]:,} → {pair[1]:,} bytes"] if pair else []
+        if self.check and self.check.seconds:
+            before, after = self.check.seconds
+            lines.append(f"render      {before:.3f} → {after:.3f} s for {PICTURE_SAMPLES} spp of the small picture")
         if self.check or self.unchecked:
             lines.append(f"check       {self.check or self.unchecked}")
         return "\n".join(lines)
@@ -82,20 +89,6 @@ class Conversions(list):
 def words() -> dict[str, plugins.Plugin]:
     """Return the groups of stock plugins that learned ones can stand for, and the learned plugin of each."""
     return {plugin.stock.word: plugin for plugin in plugins.declared().values() if plugin.stock}
-
-
-def cache_folder() -> Path:
-    """Return the folder of fits of this user, which is created: ``$MI_DIFFIND_CACHE``, or in ``~/.cache``.
-
-    Raises :class:`.OutputError`.
-    """
-    folder = Path(os.environ.get(FOLDER) or Path.home() / ".cache" / "mi_diffind")
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        return writable_folder(folder, create=True)
-    except OSError as e:
-        fault = str(e) if isinstance(e, OutputError) else f'folder "{shown(folder)}" cannot be made: {e.strerror}'
-        raise OutputError(f"{fault}; the environment variable {FOLDER} names another folder") from None
 
 
 def convert(
@@ -110,7 +103,8 @@ def convert(
 ) -> Conversions:
     """Write a scene with learned plugins in place of Mitsuba's: ``mi-diffind convert`` in Python.
 
-    - ``scene``: a scene file; ``output``: the scene file to write (:func:`write_scene`).
+    - ``scene``: a scene file, or a glTF model, which is first written as a scene into ``NEW_model`` beside ``NEW.xml``
+      (:func:`.model_scene`); ``output``: the scene file to write (:func:`write_scene`).
     - ``learn``: groups of plugins to replace (:func:`words`; ``None``: those of which a scene gains, textures).
     - ``tables``: folder of the table files (``None``: ``NEW_tables`` beside ``NEW.xml``).
     - ``defines``: values of the file's ``<default>`` parameters.
@@ -125,6 +119,9 @@ def convert(
         raise UsageError(f'output "{output}": is the scene itself')
     writable_file(output)
     use_variant()
+    if is_model(scene):
+        check_scene_file(scene)
+        scene = model_scene(scene, output.with_name(f"{output.stem}_model"))
     parsed = ParsedScene(scene, dict(defines or {}))
     folder = Path(tables or output.with_name(f"{output.stem}_tables"))
     groups = [word for word, plugin in words().items() if plugin.stock.advised] if learn is None else learn
@@ -134,7 +131,10 @@ def convert(
         def render(written: ParsedScene) -> None:
             if not check or not any(c.learned for c in conversions):
                 return
-            pair = ParsedScene(scene, parsed.defines).load(), written.load()
+            sides = ParsedScene(scene, parsed.defines), written
+            pair = tuple(side.load(needs=()) for side in sides)
+            conversions.disk_bytes = tuple(sum(file.stat().st_size for file in side.files()) for side in sides)
+            conversions.memory_bytes = tuple(map(_memory_bytes, sides, pair))
             if all(loaded.sensors() and loaded.integrator() for loaded in pair):
                 conversions.check = check_picture(*pair)
             else:
@@ -145,6 +145,13 @@ def convert(
         with contextlib.suppress(OSError):  # does not exist, or is not empty
             folder.rmdir()
     return conversions
+
+
+def _memory_bytes(parsed: ParsedScene, scene) -> int:
+    """Return the bytes of the arrays of a loaded scene, and of the tables that it reads."""
+    arrays = [v.array if dr.is_tensor_v(v) else v for _, v in mi.traverse(scene) if isinstance(v, dr.ArrayBase)]
+    arrays = {compat.identity(v): dr.width(v) * dr.itemsize_v(v) for v in arrays if dr.depth_v(v) == 1}
+    return sum(arrays.values()) + parsed.table_bytes(parsed.learned_plugins())
 
 
 def replace_stock(

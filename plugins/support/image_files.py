@@ -47,6 +47,9 @@ STEPS = 300
 #: Least PSNR of that fit, in dB: an RMS error of 5.6% of the range of values.
 LEAST_DB = 25.0
 
+#: Least texels along a side of an image with the filter "nearest": edges of fewer texels are seen in pictures.
+LEAST_NEAREST = 256
+
 #: Bytes of an image below which a scene's bitmap is kept: a table file takes 1 to 3 kB itself, and the training of so
 #: few texels ends anywhere between 6 and 32 dB.
 LEAST_BYTES = 2**12
@@ -251,34 +254,40 @@ def fit_images(
 
     The properties ``wrap_mode`` of all are equal. Maps of ``numbers`` have one channel. Raises :class:`.Kept`.
     """
-    for image in images.values():
+    maps, nearest = {}, False
+    for name, image in images.items():
         image.allow("filename", "raw", "to_uv", "wrap_mode", "filter_type", "format", "accel")
-        if str(image.props.get("filter_type", "bilinear")) not in TYPES:
-            raise Kept(f'has the filter_type "{image.props["filter_type"]}", allowed are {", ".join(TYPES)}')
-    maps = {name: (image.file(), image.props.get("raw", False) is True) for name, image in images.items()}
+        filter_type = str(image.props.get("filter_type", "bilinear"))
+        if filter_type not in (*TYPES, "nearest"):
+            raise Kept(f'has the filter_type "{filter_type}", allowed are {", ".join(TYPES)}')
+        least = LEAST_NEAREST if filter_type == "nearest" else 1
+        maps[name] = image.file(), image.props.get("raw", False) is True, least
+        nearest |= least > 1
     source, first = write_manifest(node.folder, maps, numbers), next(iter(images.values())).props
     border = "repeat" if str(first.get("wrap_mode", "repeat")) == "repeat" else "clamp"
     table = node.fit(task.name, source, steps=STEPS, border=border, **options)
-    quality = f"{table.measured['psnr_db']:.1f} dB"
+    quality = f"{table.measured['psnr_db']:.1f} dB{', nearest texels are interpolated' if nearest else ''}"
     if table.measured["psnr_db"] < LEAST_DB:
-        names = ", ".join(dict.fromkeys(file.name for file, _ in maps.values()))
+        names = ", ".join(dict.fromkeys(file.name for file, *_ in maps.values()))
         raise Kept(f"{names} would have {quality}, at least {LEAST_DB:g} are needed: fit it by hand, with more bytes")
     return table, f"{table.path.name}, {quality}"
 
 
-def write_manifest(folder: Path, maps: dict[str, tuple[Path, bool]], numbers: tuple[str, ...] = ()) -> Path:
+def write_manifest(folder: Path, maps: dict[str, tuple[Path, bool, int]], numbers: tuple[str, ...] = ()) -> Path:
     """Write a manifest of images as ``bitmap`` reads them, and return its path.
 
-    ``maps``: name of a map → its image, and whether its values are left as they are (``raw``); those of
-    ``numbers`` have one channel. Raises :class:`.Kept` for a picture that cannot be read, for colours in place of
-    numbers, and for fewer bytes than :data:`LEAST_BYTES`.
+    ``maps``: name of a map → its image, whether its values are left as they are (``raw``), and the least number of
+    texels along a side; maps of ``numbers`` have one channel. Raises :class:`.Kept` for a picture that cannot be read,
+    for colours in place of numbers, and for fewer bytes than :data:`LEAST_BYTES`.
     """
     entries, nbytes = {}, 0
-    for name, (image, raw) in maps.items():
+    for name, (image, raw, least) in maps.items():
         try:
             picture = read_picture(image)
         except PictureError as e:
             raise Kept(f"{image.name}: {str(e).removeprefix(f'{image}: ')}") from None
+        if min(picture.values.shape[:2]) < least:
+            raise Kept(f'has the filter_type "nearest" and fewer than {least} texels a side, whose edges would be lost')
         nbytes += picture.values.nbytes
         space = "srgb" if picture.srgb and not raw else "linear"
         entries[name] = {"file": relative_path(image, folder), "color_space": space}
