@@ -487,9 +487,6 @@ def _from_stock(node: StockNode) -> str | None:
     for child in (inner, *filter(None, images.values())):
         if child.shared:
             raise Kept(f"holds a {child.name} to which other objects refer")
-    for child in (inner, *filter(None, images.values())):
-        if child.shared:
-            raise Kept(f"holds a {child.name} to which other objects refer")
     for name, image in images.items():
         if image is None or image.name != "bitmap":
             described = f'the texture "{image.name}"' if image else "a number"

@@ -317,7 +317,7 @@ class _Fits:
         values, missing = {name: (*job, alone) for name, job in jobs.items()}, set(jobs)
         try:
             for outcome in run_jobs(
-                _fit, values, workers, progress=self.progress and not alone, title="fits", unit="fit"
+                _fit, values, workers, progress=self.progress and not alone, title="fit", unit="tables"
             ):
                 missing.discard(outcome.name)
                 if outcome.failure:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import logging
 import os
@@ -15,7 +16,7 @@ import numpy as np
 
 from .. import plugins
 from ..core import compat
-from ..core.errors import missing_package, reason
+from ..core.errors import DiffindError, missing_package, reason
 from ..core.files import cache_folder, shown, writable_folder
 from ..core.units import check_memory
 from ..maps.entries import SourceError
@@ -69,6 +70,9 @@ LIGHTS = {
     "rim": ((-1.5, 3.0, -4.0), 2.0, 8.0),
 }
 
+#: Ids of other objects of a scene.
+RESERVED = ("camera", "sky", *LIGHTS)
+
 
 def is_model(path) -> bool:
     """Return whether a path is that of a model."""
@@ -85,18 +89,23 @@ def model_scene(path: str | os.PathLike, folder: str | os.PathLike | None = None
     """
     path = Path(path)
     content, _ = read_content(path)
-    _check(path, content)
-    if folder is None:
-        target = cache_folder() / f"{_name(path.stem)}_{_digest(path, content)}"
-        if (target / "scene.xml").is_file():
+    target = Path(folder) if folder is not None else None
+    try:
+        _check(path, content)
+        target = target or cache_folder() / f"{_name(path.stem)}_{_digest(path, content)}"
+        if folder is None and (target / "scene.xml").is_file():
             return target / "scene.xml"
-    else:
-        target = Path(folder)
-    target = writable_folder(target, create=True)
-    with tempfile.TemporaryDirectory(dir=target, prefix=".unfinished") as temporary:
-        written = _Writer(path, content, Path(temporary)).write()
-        for file in written:  # the scene last
-            os.replace(file, target / file.name)
+        with tempfile.TemporaryDirectory(dir=writable_folder(target, create=True), prefix=".unfinished") as temporary:
+            for file in _Writer(path, content, Path(temporary)).write():  # the scene last
+                os.replace(file, target / file.name)
+    except DiffindError:
+        raise
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as e:
+        raise SourceError(f"{shown(path)}: is no valid glTF file ({type(e).__name__}: {reason(e)})") from None
+    finally:
+        if target is not None:
+            with contextlib.suppress(OSError):  # does not exist, or is not empty
+                target.rmdir()
     return target / "scene.xml"
 
 
@@ -150,6 +159,8 @@ class _Writer:
         self.path, self.content, self.folder = path, content, folder
         self.files: list[Path] = []
         self.images: dict[bytes, str] = {}
+        #: Name of a material → its id in the scene.
+        self.ids: dict[str, str] = {}
 
     def write(self) -> list[Path]:
         """Write all files, and return their paths, that of the scene last."""
@@ -159,7 +170,7 @@ class _Writer:
             if material not in materials:
                 materials[material] = self._material(material)
             boxes.append(self._mesh(mesh, matrix, f"{name}.ply"))
-            reference = quoteattr(_name(material)) if material else '"default"'
+            reference = quoteattr(self.ids[material])
             flat = "" if "vertex_normals" in mesh._cache.cache else '<boolean name="face_normals" value="true"/>'
             file = f'<string name="filename" value="{name}.ply"/>'
             shapes.append(f'    <shape type="ply" id="{name}">{file}{flat}<ref id={reference}/></shape>\n')
@@ -249,8 +260,13 @@ class _Writer:
 
     def _material(self, name: str) -> str:
         """Return the element of a material; "" is the default one of glTF."""
+        self.ids[name] = _name(name or "default")
+        while self.ids[name] in [*RESERVED, *(other for key, other in self.ids.items() if key != name)]:
+            self.ids[name] += "_"
         if not name:
-            return '    <bsdf type="principled" id="default"><rgb name="base_color" value="1"/></bsdf>\n'
+            numbers = "".join(f'<float name="{key}" value="1"/>' for key in ("metallic", "roughness"))
+            color = '<rgb name="base_color" value="1"/>'
+            return f'    <bsdf type="principled" id="{self.ids[name]}">{color}{numbers}</bsdf>\n'
         source = load_source(f"{self.path}#{name}", constant=True)
         for note in source.notes:
             plugins.warn(f"{self.path}#{name}: {note}")
@@ -265,7 +281,7 @@ class _Writer:
             inner = f'<bsdf type="twosided">{inner}</bsdf>'
         if "opacity" in maps:
             inner = f'<bsdf type="mask">{self._map(maps["opacity"], "opacity", name)}{inner}</bsdf>'
-        return f"    {inner.replace('>', f' id={quoteattr(_name(name))}>', 1)}\n"
+        return f"    {inner.replace('>', f' id={quoteattr(self.ids[name])}>', 1)}\n"
 
     def _map(self, m: Map, parameter: str, material: str) -> str:
         """Return the element of a map: numbers if it is constant, else an image, which is written."""
@@ -276,7 +292,7 @@ class _Writer:
         values = np.rint(255 * np.clip(m.values, 0, 1)).astype(np.uint8)
         key = hashlib.sha256(values.tobytes() + str(values.shape).encode()).digest()
         if key not in self.images:
-            self.images[key] = f"{_name(material)}_{m.name}.png"
+            self.images[key] = f"{self.ids[material]}_{m.name}.png"
             mi.Bitmap(values).write(str(self._add(self.images[key])))
         raw = "" if m.color_space == "srgb" else '<boolean name="raw" value="true"/>'
         file = f'<string name="filename" value="{self.images[key]}"/>'
