@@ -212,9 +212,10 @@ def test_the_command_and_a_comparison_with_the_stock_scene(mi_rgb, tmp_path, cap
     assert printed == [
         "replaced    1 x principled → disney",
         'kept        principled "Glass": transmits light (spec_trans), which the Disney BRDF does not',
-        printed[2], f"scene       {new}",
+        *printed[2:6], f"scene       {new}",
     ]  # fmt: skip
-    assert printed[2].startswith("check       equal within noise (24 x 16 pixels, 64 spp), which would have shown")
+    assert [line.split()[0] for line in printed[2:5]] == ["disk", "memory", "render"]
+    assert printed[5].startswith("check       equal within noise (24 x 16 pixels, 64 spp), which would have shown")
     assert [c["learned"] for c in json.loads((tmp_path / "a.json").read_text())["conversions"]] == ["disney", ""]
     assert new.read_text().count("disney") == 1 and not (tmp_path / "new_tables").exists()
     for output, fault in (("scene.xml", "the same file as the scene"), ("new.json", "allowed is .xml")):
@@ -283,7 +284,7 @@ def test_a_material_of_nested_plugins(mi_rgb, maps):
         <float name="roughness" value="ROUGH"/></bsdf></bsdf>"""
     cloths = [cloth.replace("ID", name).replace("ROUGH", rough) for name, rough in (("silk", "0.3"), ("wool", "0.9"))]
     balls = "".join(
-        f'<shape type="sphere"><point name="center" x="{x}"/><float name="radius" value="0.8"/>{bsdf}</shape>'
+        f'<shape type="sphere"><point name="center" value="{x}, 0, 0"/><float name="radius" value="0.8"/>{bsdf}</shape>'
         for x, bsdf in ((-2, '<ref id="wool"/>'), (0, bumpy(paint())), (2, principled("plain", roughness=0.4)))
     )
     objects = f'{shared}{leaf}{"".join(cloths)}<shape type="rectangle">{floor}<ref id="leaf"/></shape>{balls}'
@@ -352,7 +353,7 @@ def test_modern_hall(mi_rgb, folder):
     assert len(fits) == 3 and result.disk_bytes and result.memory_bytes[1] < result.memory_bytes[0]
     assert result.check is not None and result.check.difference < 0.1
     compared = comparison.compare(new, 4, progress=False)
-    assert compared.figures["learned_plugins"] == 3 and compared.figures["psnr_db"] > 20
+    assert compared.figures["learned_plugins"] == 3 and compared.figures["brightness"] == pytest.approx(1, abs=0.1)
     assert main(["regress", str(new), "--update", "--references", str(folder / "references")]) == 0
     assert main(["regress", str(new), "--references", str(folder / "references")]) == 0
 

@@ -297,7 +297,7 @@ class _Fits:
             _discard(self.folder, source)
             raise Kept(f"cannot be fitted: {self._failures[path]}")
         if not path.is_file():
-            self._jobs[path.name] = (task, str(source), options, path, mi.variant())
+            self._jobs.setdefault(path.name, (task, str(source), options, path, mi.variant()))
             raise _Waiting
         return tasks()[task].load(path)  # raises for a damaged file
 

@@ -165,8 +165,8 @@ class _Writer:
     def write(self) -> list[Path]:
         """Write all files, and return their paths, that of the scene last."""
         placed, materials, shapes, boxes = self._placed(), {}, [], []
-        for number, (mesh, matrix, material) in enumerate(placed):
-            name = f"{_name(str(mesh.metadata.get('name') or 'mesh'))}_{number}"
+        for number, (geometry, mesh, matrix, material) in enumerate(placed):
+            name = f"{_name(geometry)}_{number}"
             if material not in materials:
                 materials[material] = self._material(material)
             boxes.append(self._mesh(mesh, matrix, f"{name}.ply"))
@@ -198,7 +198,7 @@ class _Writer:
         return self.files[-1]
 
     def _placed(self) -> list[tuple]:
-        """Return the meshes with their matrices, ``(4, 4)``, and the names of their materials."""
+        """Return the names of meshes, the meshes, their matrices, ``(4, 4)``, and the names of their materials."""
         import trimesh
 
         loaded, placed, left_out = _load(self.path), [], 0
@@ -211,12 +211,12 @@ class _Writer:
             if not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
                 raise SourceError(f'{shown(self.path)}: a triangle of "{name}" names a vertex that does not exist')
             material = getattr(getattr(mesh.visual, "material", None), "name", None)
-            placed.append((mesh, np.asarray(matrix, np.float64), material or self._only_unnamed(mesh)))
+            placed.append((str(name), mesh, np.asarray(matrix, np.float64), material or self._only_unnamed(mesh)))
         if left_out:
             plugins.warn(f"{self.path}: {left_out} of its parts have no triangles, they are left out")
         if not placed:
             raise SourceError(f"{shown(self.path)}: has no triangles")
-        check_memory("model", "its meshes", ELEMENT_BYTES * sum(len(mesh.vertices) for mesh, *_ in placed))
+        check_memory("model", "its meshes", ELEMENT_BYTES * sum(len(mesh.vertices) for _, mesh, *_ in placed))
         return placed
 
     def _only_unnamed(self, mesh) -> str:
@@ -236,7 +236,8 @@ class _Writer:
         has_normals, faces = "vertex_normals" in mesh._cache.cache, np.asarray(mesh.faces)
         faces = faces[:, ::-1] if np.linalg.det(linear) < 0 else faces
         uv = uv if uv is not None and len(uv) == len(points) else None
-        shape = mi.Mesh(name, len(points), len(faces), has_normals, uv is not None)
+        attributes = {"has_vertex_normals": has_normals, "has_vertex_texcoords": uv is not None}
+        shape = mi.Mesh(name, len(points), len(faces), **attributes)
         params = mi.traverse(shape)
         compat.set_triangles(params, points, faces)
         if has_normals:
@@ -269,7 +270,9 @@ class _Writer:
             return f'    <bsdf type="principled" id="{self.ids[name]}">{color}{numbers}</bsdf>\n'
         source = load_source(f"{self.path}#{name}", constant=True)
         for note in source.notes:
-            plugins.warn(f"{self.path}#{name}: {note}")
+            note = re.sub(r" doubleSided(,|$)", "", note)  # the scene uses it
+            if not note.endswith(":"):
+                plugins.warn(f"{self.path}#{name}: {note}")
         content = next(m for i, m in enumerate(self.content["materials"]) if m.get("name", f"material{i}") == name)
         maps = {m.name: m for m in source.maps}
         known = {key: parameter for key, parameter in PARAMETERS.items() if key in maps}
