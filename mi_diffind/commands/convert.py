@@ -44,5 +44,5 @@ def run(arguments) -> dict:
     say(conversions)
     say(f"scene       {arguments.output}")
     check = conversions.check and dataclasses.asdict(conversions.check)
-    sizes = {name: getattr(conversions, name) for name in ("disk_bytes", "memory_bytes")}
+    sizes = {name: getattr(conversions, name) for name in ("disk_bytes", "memory_bytes", "image_bytes")}
     return {"output": arguments.output, "conversions": [vars(c) for c in conversions], "check": check, **sizes}

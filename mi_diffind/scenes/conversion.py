@@ -65,19 +65,22 @@ class Conversion:
 class Conversions(list):
     """List of all :class:`Conversion`, and the ``check`` of the pictures before and after, ``None`` without one.
 
-    ``unchecked`` is the reason why there is none although there should be. ``disk_bytes`` and ``memory_bytes`` are
-    those of the scene before and after: of all its files, and of its meshes, images and tables as loaded.
+    ``unchecked`` is the reason why there is none although there should be. ``disk_bytes``, ``memory_bytes`` and
+    ``image_bytes`` are those of the scene before and after: of all its files; of meshes, images and tables as loaded;
+    of images and tables alone.
     """
 
     check: PictureCheck | None = None
     unchecked: str = ""
     disk_bytes: tuple[int, int] | None = None
     memory_bytes: tuple[int, int] | None = None
+    image_bytes: tuple[int, int] | None = None
 
     def __str__(self) -> str:
         lines = summary(self) if any(c.learned for c in self) else ["replaced    nothing", *summary(self)]
-        for name, pair in (("disk", self.disk_bytes), ("memory", self.memory_bytes)):
-            lines += [f"{name:12}{pair[0]:,} → {pair[1]:,} bytes"] if pair else []
+        for name in ("disk", "memory", "image"):
+            pair, label = getattr(self, f"{name}_bytes"), {"image": "  of images"}.get(name, name)
+            lines += [f"{label:12}{pair[0]:,} → {pair[1]:,} bytes"] if pair else []
         if self.check and self.check.seconds:
             before, after = self.check.seconds
             lines.append(f"render      {before:.3f} → {after:.3f} s for {PICTURE_SAMPLES} spp of the small picture")
@@ -134,7 +137,8 @@ def convert(
             sides = ParsedScene(scene, parsed.defines), written
             pair = tuple(side.load(needs=()) for side in sides)
             conversions.disk_bytes = tuple(sum(file.stat().st_size for file in side.files()) for side in sides)
-            conversions.memory_bytes = tuple(map(_memory_bytes, sides, pair))
+            memory = map(_memory_bytes, sides, pair)
+            conversions.memory_bytes, conversions.image_bytes = zip(*memory, strict=True)
             if all(loaded.sensors() and loaded.integrator() for loaded in pair):
                 conversions.check = check_picture(*pair)
             else:
@@ -147,11 +151,16 @@ def convert(
     return conversions
 
 
-def _memory_bytes(parsed: ParsedScene, scene) -> int:
-    """Return the bytes of the arrays of a loaded scene, and of the tables that it reads."""
-    arrays = [v.array if dr.is_tensor_v(v) else v for _, v in mi.traverse(scene) if isinstance(v, dr.ArrayBase)]
-    arrays = {compat.identity(v): dr.width(v) * dr.itemsize_v(v) for v in arrays if dr.depth_v(v) == 1}
-    return sum(arrays.values()) + parsed.table_bytes(parsed.learned_plugins())
+def _memory_bytes(parsed: ParsedScene, scene) -> tuple[int, int]:
+    """Return the bytes of a loaded scene with the tables that it reads, and those of its images and tables alone."""
+    arrays = {}
+    for key, value in mi.traverse(scene):
+        value = value.array if dr.is_tensor_v(value) else value
+        if isinstance(value, dr.ArrayBase) and dr.depth_v(value) == 1:
+            arrays[compat.identity(value)] = dr.width(value) * dr.itemsize_v(value), key.endswith("data")
+    tables = parsed.table_bytes(parsed.learned_plugins())
+    images = sum(nbytes for nbytes, is_image in arrays.values() if is_image)
+    return sum(nbytes for nbytes, _ in arrays.values()) + tables, images + tables
 
 
 def replace_stock(

@@ -35,6 +35,9 @@ ELEMENT_BYTES = 64
 #: Field of view of the camera, degrees, and the direction from the model to it; glTF has y up and z in front.
 FOV, VIEW = 30.0, (0.45, 0.3, 1.0)
 
+#: Least share of triangles with mirrored texture coordinates that a warning names.
+LEAST_MIRRORED = 0.005
+
 #: Name of a map → the parameter of ``principled``.
 PARAMETERS = {"albedo": "base_color", "roughness": "roughness", "metallic": "metallic"}
 
@@ -248,7 +251,7 @@ class _Writer:
             corners = uv[faces]
             a, b = (corners[:, i] - corners[:, 0] for i in (1, 2))
             mirrored = float(np.mean(a[:, 0] * b[:, 1] < a[:, 1] * b[:, 0]))
-            if mirrored and self._has_normals(mesh):
+            if mirrored >= LEAST_MIRRORED and self._has_normals(mesh):
                 plugins.warn(f"{self.path}: {mirrored:.0%} of {name} show their normal map mirrored, along y")
             texels = np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1)  # v is 0 in the first row of an image
             params["vertex_texcoords"] = mi.Float(texels.ravel().astype(np.float32))
