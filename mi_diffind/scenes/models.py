@@ -41,7 +41,7 @@ LEAST_MIRRORED = 0.005
 #: Name of a map → the parameter of ``principled``.
 PARAMETERS = {"albedo": "base_color", "roughness": "roughness", "metallic": "metallic"}
 
-#: Text of a scene.
+#: Text of a scene. The lights are for a model in a sphere of radius 1 about the origin, and are moved with it.
 SCENE = """<scene version="3.0.0">
     <!-- {name} -->
     <default name="spp" value="64"/>
@@ -55,26 +55,17 @@ SCENE = """<scene version="3.0.0">
         <film type="hdrfilm"><integer name="width" value="$width"/><integer name="height" value="$height"/></film>
     </sensor>
     <emitter type="constant" id="sky"><rgb name="radiance" value="0.5"/></emitter>
-{lights}{objects}</scene>
+    <shape type="rectangle" id="key"><transform name="to_world"><lookat origin="2.5, 3.5, 3" target="0, 0, 0"
+        up="0, 1, 0"/>{place}</transform><emitter type="area"><rgb name="radiance" value="10"/></emitter></shape>
+    <shape type="rectangle" id="fill"><transform name="to_world"><lookat origin="-4, 1.5, 2" target="0, 0, 0"
+        up="0, 1, 0"/>{place}</transform><emitter type="area"><rgb name="radiance" value="2"/></emitter></shape>
+    <shape type="rectangle" id="rim"><transform name="to_world"><lookat origin="-1.5, 3, -4" target="0, 0, 0"
+        up="0, 1, 0"/>{place}</transform><emitter type="area"><rgb name="radiance" value="8"/></emitter></shape>
+{objects}</scene>
 """
-
-#: Light of a scene.
-LIGHT = """    <shape type="rectangle" id="{name}">
-        <transform name="to_world"><scale value="{scale}"/>
-            <lookat origin="{eye}" target="{centre}" up="0, 1, 0"/></transform>
-        <emitter type="area"><rgb name="radiance" value="{radiance}"/></emitter>
-    </shape>
-"""
-
-#: Lights, rectangles: position and side for a model in a sphere of radius 1 about the origin, and radiance.
-LIGHTS = {
-    "key": ((2.5, 3.5, 3.0), 2.0, 10.0),
-    "fill": ((-4.0, 1.5, 2.0), 2.0, 2.0),
-    "rim": ((-1.5, 3.0, -4.0), 2.0, 8.0),
-}
 
 #: Ids of other objects of a scene.
-RESERVED = ("camera", "sky", *LIGHTS)
+RESERVED = ("camera", "sky", "key", "fill", "rim")
 
 
 def is_model(path) -> bool:
@@ -123,7 +114,7 @@ def _check(path: Path, content: dict) -> None:
 
 def _digest(path: Path, content: dict) -> str:
     """Return a digest of a file, and of the times and sizes of the files that it names."""
-    digest = hashlib.sha256(path.read_bytes())
+    digest = hashlib.sha256(SCENE.encode() + path.read_bytes())
     for part in (*content.get("buffers", []), *content.get("images", [])):
         file = path.parent / part.get("uri", "")
         if len(part.get("uri", "")) < 256 and file.is_file():
@@ -182,16 +173,10 @@ class _Writer:
         centre, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
         distance = radius / np.sin(np.radians(FOV / 2))
         eye = centre + distance * np.array(VIEW) / np.linalg.norm(VIEW)
-        lights = "".join(
-            LIGHT.format(
-                name=name, scale=radius * side / 2, eye=_listed(centre + radius * np.array(place)),
-                centre=_listed(centre), radiance=radiance,
-            )
-            for name, (place, side, radiance) in LIGHTS.items()
-        )  # fmt: skip
+        place = f'<scale value="{radius:.9g}"/><translate value="{_listed(centre)}"/>'
         text = SCENE.format(
             name=re.sub("--+", "-", self.path.name), fov=FOV, near=distance / 1000, far=distance * 100,
-            eye=_listed(eye), centre=_listed(centre), lights=lights, objects="".join([*materials.values(), *shapes]),
+            eye=_listed(eye), centre=_listed(centre), place=place, objects="".join([*materials.values(), *shapes]),
         )  # fmt: skip
         self._add("scene.xml").write_text(text, encoding="utf-8")
         return self.files
@@ -251,16 +236,13 @@ class _Writer:
             corners = uv[faces]
             a, b = (corners[:, i] - corners[:, 0] for i in (1, 2))
             mirrored = float(np.mean(a[:, 0] * b[:, 1] < a[:, 1] * b[:, 0]))
-            if mirrored >= LEAST_MIRRORED and self._has_normals(mesh):
+            if mirrored >= LEAST_MIRRORED and getattr(mesh.visual.material, "normalTexture", None) is not None:
                 plugins.warn(f"{self.path}: {mirrored:.0%} of {name} show their normal map mirrored, along y")
             texels = np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1)  # v is 0 in the first row of an image
             params["vertex_texcoords"] = mi.Float(texels.ravel().astype(np.float32))
         params.update()
         shape.write_ply(str(self._add(name)))
         return np.stack([points.min(axis=0), points.max(axis=0)])
-
-    def _has_normals(self, mesh) -> bool:
-        return getattr(getattr(mesh.visual, "material", None), "normalTexture", None) is not None
 
     def _material(self, name: str) -> str:
         """Return the element of a material; "" is the default one of glTF."""
