@@ -336,6 +336,37 @@ def test_equal_images_are_fitted_once(mi_rgb, maps):
     assert len(list((folder / "tables").glob("*.json"))) == 1
 
 
+def test_a_bump_map_stays_around_its_material(mi_rgb, maps):
+    """Its slope depends on the shape, which no file of a material knows."""
+    folder, _ = maps
+    bump = f'<bsdf type="bumpmap" id="hide">{image("rough", "arbitrary")}{paint()}</bsdf>'
+    parsed(folder, f'<shape type="sphere">{bump}</shape>')
+    conversions = conversion.convert(folder / "scene.xml", folder / "new.xml", check=False, progress=False)
+    assert [(c.stock, c.learned) for c in conversions] == [
+        ("bitmap", "neural_texture"), ("principled", "neural_material")
+    ]  # fmt: skip
+    assert loading.load(folder / "new.xml").shapes() and "bumpmap" in (folder / "new.xml").read_text()
+
+
+def test_what_ended_before_ctrl_c_is_kept(mi_rgb, maps, monkeypatch, capsys):
+    """The same command then fits the others alone."""
+    folder, fits = maps
+    parsed(folder, textured("a", "image.png") + textured("b", "bumps.png"))
+    fit, arguments = conversion.fit, (folder / "scene.xml", folder / "new.xml")
+
+    def interrupted(task, **options):
+        if fits:
+            raise KeyboardInterrupt
+        return fit(task, **options)
+
+    monkeypatch.setattr(conversion, "fit", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        conversion.convert(*arguments, check=False)
+    assert "kept 1 of 2 fits in" in capsys.readouterr().err and not (folder / "new.xml").exists()
+    monkeypatch.setattr(conversion, "fit", fit)
+    assert len(conversion.convert(*arguments, check=False, progress=False)) == 2 and len(fits) == 2
+
+
 #: A scene by other people, beside the checkout; it does not ship.
 MODERN_HALL = Path(os.environ.get("MI_DIFFIND_DATA", Path(__file__).parents[2] / "shared/data")) / "scenes/modern_hall"
 
