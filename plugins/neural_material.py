@@ -491,6 +491,9 @@ def _from_stock(node: StockNode) -> str | None:
         if image is None or image.name != "bitmap":
             described = f'the texture "{image.name}"' if image else "a number"
             raise Kept(f'has {described} for "{name}", allowed are bitmaps')
+    for key in inner.props:
+        if compat.property_kind(inner.props, key) not in ("number", "colour", "object"):
+            raise Kept(f'has a spectrum for "{key}", allowed are numbers, colours and bitmaps')
     first = next(iter(images.values())).props
     for key in ("to_uv", "wrap_mode"):
         pair = {str(image.props.get(key, "repeat" if key == "wrap_mode" else "")) for image in images.values()}

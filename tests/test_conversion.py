@@ -315,6 +315,7 @@ def test_a_material_of_nested_plugins(mi_rgb, maps):
         (paint(image("image", "sheen")), 'has the image image.png with colours for "sheen", which is a number'),
         (paint(image("holes", "sheen", scale=3)), 'has images that differ in "to_uv"'),
         (paint('<texture type="checkerboard" name="sheen"/>'), 'has the texture "checkerboard" for "sheen"'),
+        (paint('<spectrum name="sheen" value="400:0.1, 700:0.2"/>'), 'has a spectrum for "sheen"'),
         (paint('<float name="spec_trans" value="0.5"/>'), "transmits light (spec_trans)"),
         (f'<bsdf type="mask"><float name="opacity" value="0.5"/>{paint()}</bsdf>', 'has a number for "opacity"'),
     ],
