@@ -54,12 +54,13 @@ class Stock:
 
     ``word``: the name of all of them for users; ``names``: their types in a scene. ``convert(node)`` changes the
     properties of a :class:`.StockNode`, without the type, and returns what was fitted and how well, or "", or raises
-    :class:`.Kept`. ``advised``: a scene gains from the learned plugin, so that it is put in without being asked for.
+    :class:`.Kept`; it returns ``None`` for a plugin that is none of these, such as a part of another. ``advised``: a
+    scene gains from the learned plugin, so that it is put in without being asked for.
     """
 
     word: str
     names: tuple[str, ...]
-    convert: Callable[[Any], str]
+    convert: Callable[[Any], str | None]
     advised: bool = False
 
 

@@ -15,13 +15,14 @@ from mi_diffind.tasks.disney.model import PARAMETERS, clamp
 from mi_diffind.tasks.texture import TASK
 from mi_diffind.tasks.texture.surface import frame, shadowing, specular_lobe
 
-from . import Counterpart, Plugin
-from .disney import Disney, Parameters, ShadedPoint, to_principled
+from . import Counterpart, Plugin, Stock
+from .disney import Disney, Parameters, ShadedPoint, check_principled, to_principled
 from .support import properties, textures
 from .support.bsdfs import TrackedParameter
-from .support.image_files import SharedMaps, file_layout, open_compressed, remove, to_bitmap, to_mipmap
+from .support.image_files import SharedMaps, file_layout, fit_images, open_compressed, remove, to_bitmap, to_mipmap
 from .support.manual import shared_parts
 from .support.map_textures import FilteredTexture
+from .support.properties import Kept, StockNode
 from .support.textures import PROPERTIES as FILTERING
 from .support.textures import anisotropic, isotropic
 
@@ -461,6 +462,56 @@ def _counterpart(name: str, bsdf: str, texture: str, oversampling: int) -> Count
     return Counterpart(name, learned_only, convert=convert, oversampling=oversampling)
 
 
+#: Plugins around a ``principled`` that a material takes in, from the outermost to the innermost one, and the parameters
+#: that they may have, each a map.
+AROUND = {"mask": "opacity", "twosided": "", "normalmap": "normalmap"}
+
+
+def _from_stock(node: StockNode) -> str | None:
+    """Replace a ``principled`` with images, and what is around it, by a material of one file."""
+    if node.parents and all(parent.plugin_name() in AROUND for parent in node.parents):
+        return None
+    images, around, inner, constants = {}, list(AROUND), node, {}
+    while inner.name != "principled":
+        nested = [child for child in inner.children.values() if child.object_type == mi.ObjectType.BSDF]
+        if inner.name not in AROUND or len(nested) != 1:
+            return None
+        if inner.name not in around:
+            raise Kept(f"has a {inner.name} within, allowed is the order {', '.join((*AROUND, 'principled'))}")
+        around = around[around.index(inner.name) + 1 :]
+        constants |= {"two_sided": True} if inner.name == "twosided" else {}
+        if parameter := AROUND[inner.name]:
+            images[{"normalmap": "normal"}.get(parameter, parameter)] = inner.children.get(parameter)
+        inner.allow(parameter)
+        (inner,) = nested
+    images = {**inner.children, **images}
+    if "bitmap" not in [child.name for child in images.values() if child]:
+        return None
+    check_principled(inner)
+    for child in (inner, *filter(None, images.values())):
+        if child.shared:
+            raise Kept(f"holds a {child.name} to which other objects refer")
+    for name, image in images.items():
+        if image is None or image.name != "bitmap":
+            described = f'the texture "{image.name}"' if image else "a number"
+            raise Kept(f'has {described} for "{name}", allowed are bitmaps')
+    for key in inner.props:
+        if compat.property_kind(inner.props, key) not in ("number", "colour", "object"):
+            raise Kept(f'has a spectrum for "{key}", allowed are numbers, colours and bitmaps')
+    first = next(iter(images.values())).props
+    for key in ("to_uv", "wrap_mode"):
+        pair = {str(image.props.get(key, "repeat" if key == "wrap_mode" else "")) for image in images.values()}
+        if len(pair) > 1:
+            raise Kept(f'has images that differ in "{key}", which are of one file')
+    table, quality = fit_images(TASK, node, images, (*PARAMETERS, "opacity"), shading="off")
+    constants |= {key: inner.props[key] for key in inner.props if key not in (*inner.children, "spec_trans")}
+    constants |= {key: first[key] for key in ("to_uv", "wrap_mode") if key in first}
+    remove(node.props, *list(node.props))
+    for key, value in {"filename": str(table.path), **constants}.items():
+        node.props[key] = value
+    return quality
+
+
 PLUGIN = Plugin(
     "neural_material",
     "bsdf",
@@ -469,4 +520,5 @@ PLUGIN = Plugin(
     exact=_counterpart("disney", "disney", "bitmap", 8),
     others=(_counterpart("mipmap", "disney", "mipmap", 1), _counterpart("principled", "principled", "bitmap", 8)),
     truths=("mipmap", "exact"),
+    stock=Stock("material", (*AROUND, "principled"), _from_stock, advised=True),
 )

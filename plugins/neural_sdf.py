@@ -287,7 +287,8 @@ def _from_mesh(node: StockNode) -> str:
         raise Kept("emits light, distance fields emit none")
     if "interior" in props or "exterior" in props:
         raise Kept("borders on a medium, distance fields hold none")
-    if textures := node.nested_types(mi.ObjectType.Texture):
+    materials = [name for name in node.nested_types(mi.ObjectType.BSDF) if name == "neural_material"]
+    if textures := materials + node.nested_types(mi.ObjectType.Texture):
         raise Kept(f"has a material with textures ({', '.join(textures)}), distance fields have no texture coordinates")
     node.allow("filename", "shape_index", "face_normals", "flip_normals", "flip_tex_coords", "to_world", "bsdf")
     try:

@@ -9,12 +9,11 @@ import mitsuba as mi
 from mi_diffind.tasks.texture import TASK
 
 from . import Counterpart, Plugin, Stock
-from .support.image_files import SharedMaps, open_compressed, remove, to_bitmap, to_mipmap, write_manifest
+from .support.image_files import SharedMaps, fit_images, open_compressed, remove, to_bitmap, to_mipmap
 from .support.manual import shared_parts
 from .support.map_textures import FilteredTexture
-from .support.properties import Kept, StockNode
+from .support.properties import StockNode
 from .support.textures import PROPERTIES as FILTERING
-from .support.textures import TYPES
 
 
 @shared_parts
@@ -80,30 +79,15 @@ def _to_bitmap(props: mi.Properties) -> None:
     remove(props, *FILTERING)
 
 
-#: Steps of the fit that a scene's bitmap gets without a file of its own: within 2 dB of the default training.
-STEPS = 300
-
-
-#: Least PSNR of that fit, in dB: an RMS error of 5.6% of the range of values.
-LEAST_DB = 25.0
-
-
 def _from_bitmap(node: StockNode) -> str:
     """Replace the image of a ``bitmap`` by a compressed one."""
     props = node.props
-    node.allow("filename", "raw", "to_uv", "wrap_mode", "filter_type", "format", "accel")
-    if str(props.get("filter_type", "bilinear")) not in TYPES:
-        raise Kept(f'has the filter_type "{props["filter_type"]}", allowed are {", ".join(TYPES)}')
     normal = any(parent.plugin_name() == "normalmap" for parent in node.parents)
-    source = write_manifest(node.file(), node.folder, props.get("raw", False) is True, normal)
-    border = "repeat" if str(props.get("wrap_mode", "repeat")) == "repeat" else "clamp"
-    table = node.fit(TASK.name, source, steps=STEPS, border=border)
-    if table.measured["psnr_db"] < LEAST_DB:
-        quality = f"{node.file().name} would have {table.measured['psnr_db']:.1f} dB"
-        raise Kept(f"{quality}, at least {LEAST_DB:g} are needed: fit it by hand, with more bytes")
+    raw = props.get("raw", False) is True
+    table, quality = fit_images(TASK, node, {"normal" if normal else "data" if raw else "albedo": node})
     props["filename"] = str(table.path)
     remove(props, "filter_type", "format", "accel")  # a bitmap's "bilinear" would switch filtering off
-    return f"{table.path.name}, {table.measured['psnr_db']:.1f} dB"
+    return quality
 
 
 PLUGIN = Plugin(

@@ -14,16 +14,17 @@ from PIL import Image
 import mi_diffind
 from mi_diffind.core.errors import UsageError
 from mi_diffind.core.files import (
+    CACHE,
     MOST_NAMES,
     OutputError,
     RecordedKeys,
+    cache_folder,
     check_distinct,
     replacing,
     same_file,
     unused_keys,
     unused_note,
 )
-from mi_diffind.scenes import conversion
 
 #: Process that begins to write a file, says so, and waits to be killed.
 WRITER = """
@@ -124,9 +125,9 @@ def test_a_link_is_written_through(tmp_path):
 def test_a_cache_that_cannot_be_made_names_its_variable(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     for name, fault in (("file/a/cache", "cannot be made: Not a directory"), ("file", "is not a folder")):
-        monkeypatch.setenv(conversion.FOLDER, str(tmp_path / name))
+        monkeypatch.setenv(CACHE, str(tmp_path / name))
         with pytest.raises(OutputError, match=f"{fault}; the environment variable MI_DIFFIND_CACHE names another"):
-            conversion.cache_folder()
+            cache_folder()
 
 
 def test_one_file_by_several_names(tmp_path):

@@ -12,7 +12,7 @@ from mi_diffind.scenes import conversion, loading, scene_text
 HEAD = '<scene version="3.0.0">'
 
 
-def written(source, text, output, learn=("principled",), **defines):
+def written(source, text, output, learn=("disney",), **defines):
     """Convert a text without pictures; return the new text."""
     source.write_text(text)
     conversion.convert(source, output, learn=learn, defines=defines, check=False, progress=False)
@@ -83,7 +83,7 @@ def test_ids_aliases_references_and_both_sides(mi_rgb, tmp_path):
     </bsdf></shape>
 </scene>"""
     new = written(tmp_path / "scene.xml", text, tmp_path / "new.xml")
-    assert new == text.replace('<bsdf type="principled" id="back"', '<bsdf type="neural_disney" id="back"')
+    assert new == text.replace('<bsdf type="principled" id="back"', '<bsdf type="disney" id="back"')
     a, b = (loading.load_file(tmp_path / f, optimize=False) for f in ("scene.xml", "new.xml"))
     assert [shape.id() for shape in a.shapes()] == [shape.id() for shape in b.shapes()]
     assert [str(shape.bsdf()) for shape in a.shapes()[:2]] == [str(shape.bsdf()) for shape in b.shapes()[:2]]
@@ -108,10 +108,10 @@ VALUES = '<include filename="UPparts/values.xml"/>'
     "body, expected",
     [
         ('<include filename="UPparts/plain.xml"/>', ""),
-        ('<include filename="parts/paint.xml"/>', f'<bsdf type="neural_disney" id="paint">{LEAF}'),
+        ('<include filename="parts/paint.xml"/>', f'<bsdf type="disney" id="paint">{LEAF}'),
         ('<shape type="sphere"><include name="m" filename="parts/lone.xml"/></shape>',
-         f'<shape type="sphere"><bsdf name="m"  type="neural_disney"  id="lone">{LEAF}</shape>'),
-        (VALUES + METAL("principled"), VALUES + METAL("neural_disney")),
+         f'<shape type="sphere"><bsdf name="m"  type="disney"  id="lone">{LEAF}</shape>'),
+        (VALUES + METAL("principled"), VALUES + METAL("disney")),
         (VALUES + FILE('"DOLLAR"'), ""),
         ('<default name="n" value="leaf"/><default name="f" value="$n.png"/>\n' + FILE('"FILE"'), ""),
         (FILE("QUOTED"), ""),
@@ -142,7 +142,7 @@ def test_values_of_defines_become_defaults(mi_rgb, folders):
     new = written(a / "scene.xml", f"{HEAD}{body}</scene>", b / "new.xml", rough=0.1, m="0.25")
     assert re.findall(r'<default name="(\w+)" value="([\d.]+)"/>', new) == [("m", "0.25"), ("rough", "0.1")]
     read = loading.ParsedScene(b / "new.xml", {"rough": 0.7}).change(lambda s: s.nodes[1].props)
-    assert (read.plugin_name(), read["roughness"], read["metallic"]) == ("neural_disney", 0.7, 0.25)
+    assert (read.plugin_name(), read["roughness"], read["metallic"]) == ("disney", 0.7, 0.25)
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le", "latin-1"])
@@ -154,11 +154,11 @@ def test_encodings(mi_rgb, tmp_path, encoding):
     source.write_bytes(("\ufeff" * (encoding == "utf-16-le") + head + text).encode(encoding))
     if encoding == "latin-1":
         with pytest.raises(loading.SceneError, match=r"scene\.xml: found text in another encoding, needed is UTF-8"):
-            conversion.convert(source, new, learn=["principled"], check=False)
+            conversion.convert(source, new, learn=["disney"], check=False)
         assert not new.exists()
         return
-    conversion.convert(source, new, learn=["principled"], check=False)
-    assert new.read_bytes().decode().endswith(text.replace("principled", "neural_disney"))
+    conversion.convert(source, new, learn=["disney"], check=False)
+    assert new.read_bytes().decode().endswith(text.replace("principled", "disney"))
 
 
 @pytest.mark.parametrize(
@@ -167,7 +167,7 @@ def test_encodings(mi_rgb, tmp_path, encoding):
         ((b'value="1000"', b'value="1296"'), "has to_world"),
         ((b'value="0.5"', b'value="0.50000001"'), "has roughness 0.50000001 in place of 0.5"),
         ((b' id="lamp"', b""), 'in place of point "lamp"'),
-        ((b'type="neural_disney"', b'type="disney"'), 'disney "m" in place of neural_disney "m"'),
+        ((b'type="disney"', b'type="neural_disney"'), 'neural_disney "m" in place of disney "m"'),
         ((b'<ref id="m"/>', b""), 'cube "box" lacks "_arg_0"'),
         ((b'<ref id="m"/>', b'<ref id="n"/>'), "objects that refer to others than before"),
         ((b"</scene>", b'<bsdf type="diffuse"/></scene>'), '"_arg_4"'),
@@ -193,7 +193,7 @@ def test_a_text_that_reads_differently_is_not_written(mi_rgb, folders, monkeypat
 
     monkeypatch.setattr(conversion, "edit_text", wrong)
     with pytest.raises(loading.SceneError, match=fault):
-        conversion.convert(a / "scene.xml", a / "new.xml", learn=["principled"], check=False)
+        conversion.convert(a / "scene.xml", a / "new.xml", learn=["disney"], check=False)
     assert set(a.iterdir()) == before
 
 

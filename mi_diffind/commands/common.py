@@ -77,7 +77,7 @@ def learn_option(sub: argparse.ArgumentParser, default: str) -> None:
         default=[],
         metavar="GROUP,…",
         help="replace Mitsuba's plugins of these groups by learned ones, fitted if need be and kept for the next time: "
-        f"principled, bitmap, mesh (default: {default})",
+        f"material, bitmap, mesh, disney (default: {default})",
     )
 
 

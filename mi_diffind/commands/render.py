@@ -9,7 +9,7 @@ from ..core.arguments import proper_fraction
 from ..core.files import check_scene_file, writable_file
 from .common import learn_option, positive, say, scene_options, set_variant, verb
 
-HELP = "render a scene that names learned plugins"
+HELP = "render a scene that names learned plugins, or a glTF model"
 
 EXAMPLE = "mi-diffind render scene.xml -o image.png --spp 64"
 
@@ -17,7 +17,7 @@ EXAMPLE = "mi-diffind render scene.xml -o image.png --spp 64"
 def add(commands) -> None:
     """Add the verb and its options to ``commands``, the subparsers of the command line."""
     sub = verb(commands, "render", run, HELP, EXAMPLE, reads=("scene",), writes=("output",))
-    sub.add_argument("scene", metavar="SCENE.xml")
+    sub.add_argument("scene", metavar="SCENE.xml|MODEL.glb")
     sub.add_argument(
         "-o", "--output", metavar="FILE",
         help="image, .exr or .png, or with --orbit a film, .mp4, .webp or .gif (default: SCENE.exr)",

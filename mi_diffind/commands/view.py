@@ -16,7 +16,7 @@ EXAMPLE = "mi-diffind view scene.xml"
 def add(commands) -> None:
     """Add the verb and its options to ``commands``, the subparsers of the command line."""
     sub = verb(commands, "view", run, HELP, EXAMPLE, reads=("file",))
-    sub.add_argument("file", metavar="SCENE.xml|FILE.npz")
+    sub.add_argument("file", metavar="SCENE.xml|MODEL.glb|FILE.npz")
     sub.add_argument("--host", default="127.0.0.1", help="address to serve the page at (default: 127.0.0.1)")
     sub.add_argument("--port", type=natural, default=8080, help="port of the page, 0: a free one (default: 8080)")
     sub.add_argument("--width", type=positive, default=320, metavar="N", help="of the picture, pixels (default: 320)")

@@ -379,20 +379,33 @@ def parsed_types(state) -> list:
     return [node.type for node in state.nodes]
 
 
-def parsed_references(state) -> list[list[int]]:
+def parsed_references(state) -> list[dict[str, int]]:
     """Return for each object of a parsed scene, in the order of :func:`parsed_properties`, those it nests or refers to.
 
-    They are indices in that order. References are resolved only when a scene is built. Raises ``RuntimeError`` for an
-    id that does not exist.
+    They are indices in that order, by the name of the parameter. References are resolved only when a scene is built.
+    Raises ``RuntimeError`` for an id that does not exist.
     """
     types, result = mi.Properties.Type, []
     for props in parsed_properties(state):
-        values = [props[key] for key in props if props.type(key) in (types.Reference, types.ResolvedReference)]
-        for value in values:
+        values = {key: props[key] for key in props if props.type(key) in (types.Reference, types.ResolvedReference)}
+        for value in values.values():
             if not hasattr(value, "index") and value.id() not in state.id_to_index:
                 raise RuntimeError(f'refers to the id "{value.id()}", which no object has')
-        result.append([v.index() if hasattr(v, "index") else state.id_to_index[v.id()] for v in values])
+        result.append({k: v.index() if hasattr(v, "index") else state.id_to_index[v.id()] for k, v in values.items()})
     return result
+
+
+def parsed_walk(state) -> list[int]:
+    """Return the objects that belong to a parsed scene, from its root on, each before those it nests or refers to.
+
+    Objects that nothing refers to any more are left out.
+    """
+    references, reached, waiting = parsed_references(state), {}, [0]
+    while waiting:
+        if (index := waiting.pop()) not in reached:
+            reached[index] = None
+            waiting += reversed(references[index].values())
+    return list(reached)
 
 
 def parsed_place(state, index: int) -> str:

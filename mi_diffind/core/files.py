@@ -48,6 +48,10 @@ _TYPES = (
 PATHS = "MI_DIFFIND_PATHS"
 
 
+#: Environment variable with the folder of fits and models for scenes that are rendered and not written.
+CACHE = "MI_DIFFIND_CACHE"
+
+
 class OutsideError(DiffindError, ValueError):
     """A file names another one outside of its folder; the message is one sentence that names both."""
 
@@ -83,7 +87,7 @@ def irregular(path: str | os.PathLike, most: int | None = None) -> str:
 def check_scene_file(path: str | os.PathLike) -> None:
     """Raise :class:`.UsageError` if there is no file ``path``, or if it cannot be a scene."""
     path = Path(path)
-    fault = irregular(path, MOST_TEXT)
+    fault = irregular(path, None if path.suffix.lower() == ".glb" else MOST_TEXT)
     if not fault and not path.is_file():
         fault = "is a folder, a scene file is needed" if path.is_dir() else "no such scene file"
     elif path.suffix.lower() == ".npz":
@@ -112,6 +116,20 @@ def writable_folder(path: str | os.PathLike, create: bool = False) -> Path:
     except OSError as e:
         raise OutputError(f'output folder "{shown(path)}" cannot be written: {e.strerror or e}') from None
     return path
+
+
+def cache_folder() -> Path:
+    """Return the folder of this user for fits and models of scenes, which is created.
+
+    It is ``$MI_DIFFIND_CACHE``, or lies in ``~/.cache``. Raises :class:`.OutputError`.
+    """
+    folder = Path(os.environ.get(CACHE) or Path.home() / ".cache" / "mi_diffind")
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        return writable_folder(folder, create=True)
+    except OSError as e:
+        fault = str(e) if isinstance(e, OutputError) else f'folder "{shown(folder)}" cannot be made: {e.strerror}'
+        raise OutputError(f"{fault}; the environment variable {CACHE} names another folder") from None
 
 
 def _target(path: Path) -> Path:

@@ -36,7 +36,7 @@ def read_gltf(path: Path, name: str, images: ImageFiles) -> tuple[list[MapEntry]
     a map of opacity. Raises :class:`SourceError`.
     """
     try:
-        content, binary = _read(path)
+        content, binary = read_content(path)
         materials = content.get("materials", [])
         names = [material.get("name", f"material{i}") for i, material in enumerate(materials)]
         material = materials[choose_material(path, names, name)]
@@ -47,8 +47,8 @@ def read_gltf(path: Path, name: str, images: ImageFiles) -> tuple[list[MapEntry]
         raise SourceError(f"{shown(path)}: is no valid glTF file ({type(e).__name__}: {reason(e)})") from None
 
 
-def _read(path: Path) -> tuple[dict, bytes]:
-    """Return the JSON of a file and the binary chunk of a ``.glb`` file."""
+def read_content(path: Path) -> tuple[dict, bytes]:
+    """Return the JSON of a file and the binary chunk of a ``.glb`` file. Raises :class:`SourceError`."""
     data, binary = read_file(path, memory() // 4), b""
     if data[:4] == b"glTF":
         _, version, _, length, chunk = struct.unpack("<5I", data[:20])
@@ -98,8 +98,6 @@ class _Reader:
                     entries.append(entry)
                 elif name not in left_out and name not in ("normal", "ao"):
                     entries.append(MapEntry(name, color_space="linear", factor=factor, constant=True))
-        if not files:
-            raise SourceError(f"{shown(self.path)}: its material has no images that are read, there is nothing to fit")
         entries += self._opacity(material, files.get("albedo"), alpha)
         strength = (material.get("occlusionTexture") or {}).get("strength", 1)
         self.notes += [f"occlusionTexture: its strength {strength:g} is not used"] if strength != 1 else []

@@ -108,8 +108,6 @@ def _entries(path: Path, shader, images: ImageFiles) -> tuple[list[MapEntry], li
                 entries.append(MapEntry(name, color_space="linear", factor=values, constant=True))
         if name == "albedo" and entries and weights not in ((), (1.0,)):
             entries[-1] = _times(entries[-1], weights)
-    if not any(entry.file for entry in entries):
-        raise SourceError(f"{path}: its material has no images that are read, there is nothing to fit")
     known = {port for port, _ in inputs.values()} | {weight}
     unused = [port.getName() for port in shader.getInputs() if port.getName() not in known]
     return entries, notes + ([f"{path.name}: inputs that are not used: {', '.join(unused)}"] if unused else [])

@@ -31,7 +31,7 @@ import numpy as np
 
 from ..core.archives import Allowance, LimitError, json_bytes
 from ..core.errors import reason
-from ..core.files import MOST_TEXT, RecordedKeys, unused_note
+from ..core.files import MOST_TEXT, RecordedKeys, shown, unused_note
 from ..images import srgb
 from ..images.reader import DEPTHS, ENCODED, MAX_CHANNELS, Picture, PictureError, read_file
 from .entries import (
@@ -124,14 +124,17 @@ class Source:
         return self.texels * sum(m.channels * m.depth for m in self.maps)
 
 
-def load_source(source, nonfinite: str = "error", named: bool = True, outside: bool = False) -> Source:
+def load_source(
+    source, nonfinite: str = "error", named: bool = True, outside: bool = False, constant: bool = False
+) -> Source:
     """Read an image or a material, or take the maps that ``source`` holds in memory.
 
     A material is a manifest (``.json``), a folder of maps, or a material of a glTF or MaterialX file (``.gltf``,
     ``.glb``, ``.mtlx``), ``FILE#NAME`` if there are several. In memory, ``source`` is a :class:`Source`, an image (an
     array ``(height, width, channels)`` or a ``mi.Bitmap``), or a dictionary of such images and of image files by the
     name of the map (:func:`from_arrays`). Images of a material may lie anywhere with ``outside``, for a file that the
-    user has named, else in the folder of the file that names them.
+    user has named, else in the folder of the file that names them. A material without images is refused, unless it may
+    be ``constant``: its maps then have one texel.
 
     An image is a map called ``"image"`` and, if it has an alpha channel, a map ``"alpha"``. It is sRGB if it is grey or
     RGB of 8 or 16 bits, unless the name of its file is that of data, such as normals (``named``: names of images count,
@@ -158,7 +161,10 @@ def load_source(source, nonfinite: str = "error", named: bool = True, outside: b
         if os.path.isdir(where):
             return _load(where, *read_folder(where, images), images, nonfinite)
         if where.suffix.lower() in readers:
-            return _load(where, *readers[where.suffix.lower()](where, name, images), images, nonfinite)
+            entries, notes = readers[where.suffix.lower()](where, name, images)
+            if not constant and all(entry.constant for entry in entries):
+                raise SourceError(f"{shown(where)}: its material has no images that are read, there is nothing to fit")
+            return _load(where, entries, notes, images, nonfinite)
         image, color_space = images.read(str(where)), None
         values, content = image.values[:, :, : image.colors], COLOURS if image.named else UNKNOWN
         if named and image.named:

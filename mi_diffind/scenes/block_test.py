@@ -8,6 +8,7 @@ per cent hides in the noise of each pixel, but not in the mean of a block that i
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -323,7 +324,7 @@ class PictureCheck:
     ``differs``: the ``worst`` block differs by more than noise explains; ``difference``: root mean square over blocks
     of 4 × 4, without noise; ``noise``: their standard error; ``seen``: changes that nine of ten checks see, of a tile
     of 16 × 16 and of the whole picture, ``None`` if too dark; ``width``, ``height``, ``spp`` of the pictures;
-    ``not_finite``: pixels that are not finite, before and after.
+    ``not_finite``: pixels that are not finite, before and after; ``seconds``: median time of a pass of each.
     """
 
     differs: bool
@@ -335,6 +336,7 @@ class PictureCheck:
     height: int
     spp: int
     not_finite: tuple[int, int]
+    seconds: tuple[float, float] | None = None
 
     def __str__(self) -> str:
         picture = f"{self.width} x {self.height} pixels, {self.spp} spp"
@@ -355,8 +357,18 @@ class PictureCheck:
 
 
 def check_picture(before, after) -> PictureCheck:
-    """Render two loaded scenes by the first sensor, small and with independent random numbers, and compare them."""
-    return compare_passes(_passes(before, 0), _passes(after, PICTURE_PASSES))
+    """Render two loaded scenes by the first sensor, small and with independent random numbers, and compare them.
+
+    Their passes take turns, so that a slow phase of the machine slows both.
+    """
+    passes, seconds = ([], []), ([], [])
+    for index in range(PICTURE_PASSES):
+        for side, scene in enumerate((before, after)):
+            start = time.perf_counter()
+            passes[side].append(_small_pass(scene, side * PICTURE_PASSES + index))
+            seconds[side].append(time.perf_counter() - start)
+    medians = tuple(float(np.median(times[1:])) for times in seconds)  # the first pass compiles
+    return replace(compare_passes(*map(np.stack, passes)), seconds=medians)
 
 
 def compare_passes(old: np.ndarray, new: np.ndarray) -> PictureCheck:
@@ -386,11 +398,10 @@ def compare_passes(old: np.ndarray, new: np.ndarray) -> PictureCheck:
     )
 
 
-def _passes(scene, first: int) -> np.ndarray:
-    """Return the brightness of each pass, ``(passes, height, width)``; ``first`` is the seed of the first one."""
+def _small_pass(scene, seed: int) -> np.ndarray:
+    """Return the brightness of a pass, ``(height, width)``."""
     width, height = loading.film_size(scene)
     shrink = min(1.0, PICTURE_SIDE / max(width, height))
     size = (max(1, round(shrink * n)) for n in (width, height))
     with compat.film_size(scene.sensors()[0], *size):
-        images = [loading.render_pass(scene, PICTURE_SAMPLES, first + i) for i in range(PICTURE_PASSES)]
-    return np.stack([loading.colour_channels(image).mean(axis=-1) for image in images])
+        return loading.colour_channels(loading.render_pass(scene, PICTURE_SAMPLES, seed)).mean(axis=-1)

@@ -189,14 +189,14 @@ def load_compared(
         raise UsageError("learn: given with a scene in memory, allowed are scene files")
     conversions = conversion.replace_stock(parsed, learn, progress=progress)
     replaced = parsed.learned_plugins(against or "exact")
-    if not replaced:
+    if not replaced and (against or not any(c.learned for c in conversions)):
         what = f'plugin that "{against}" can stand for' if against not in (None, "exact") else "learned plugin"
         names = ", ".join(plugins.with_counterpart(against or "exact"))
         kept = "".join(f"; kept is {c}" for c in conversions if not c.learned)
         raise loading.SceneError(f"{parsed.path}: names no {what} ({names}), so there is nothing to compare{kept}")
     learned = [entry for entry in replaced if entry["plugin"] in plugins.with_counterpart()]
     declared, truths, put_in, oversampling = plugins.declared(), {}, {}, {}
-    for name, names in ({against: (against,)} if against else _default_truths(replaced)).items():
+    for name, names in ({against: (against,)} if against else _default_truths(replaced, learn)).items():
         counterparts = [declared[entry["plugin"]].counterpart(names) for entry in replaced]
         plugins_put_in = [c.name for c in counterparts]
         if learn and not against and name == "exact":
@@ -205,7 +205,7 @@ def load_compared(
         else:  # before the scene as written, since a counterpart may refuse
             truths[name] = parsed.load(exact=True, against=names)
         put_in[name] = list(dict.fromkeys(plugins_put_in))
-        oversampling[name] = max(c.oversampling for c in counterparts)
+        oversampling[name] = max((c.oversampling for c in counterparts), default=1)
     return ComparedScenes(parsed, parsed.load(), truths, put_in, oversampling, replaced, learned, conversions)
 
 
@@ -298,9 +298,13 @@ def compare(
     return first
 
 
-def _default_truths(learned: list[dict]) -> dict[str, tuple[str, ...]]:
-    """Return, by name, the counterparts that learned plugins are replaced by without a choice, ``exact`` last."""
+def _default_truths(learned: list[dict], learn: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """Return, by name, the counterparts that learned plugins are replaced by without a choice, ``exact`` last.
+
+    With ``learn``, the scene of the file is in the place of the exact one.
+    """
     names = dict.fromkeys(name for entry in learned for name in plugins.declared()[entry["plugin"]].truths)
+    names |= dict.fromkeys(["exact"] if learn else [])
     return {name: tuple(dict.fromkeys((name, "exact"))) for name in sorted(names, key="exact".__eq__)}
 
 

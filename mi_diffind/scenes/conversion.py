@@ -7,7 +7,6 @@ a name that contains a digest of the source, its place and the options, and is n
 from __future__ import annotations
 
 import contextlib
-import functools
 import glob
 import hashlib
 import json
@@ -17,23 +16,23 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from .. import plugins
 from ..arrays.tables import Table, move_paths, save_table
 from ..core import compat
-from ..core.errors import DiffindError, UsageError
-from ..core.files import OutputError, relative_path, replacing, shown, writable_file, writable_folder
+from ..core.errors import UsageError
+from ..core.files import cache_folder, check_scene_file, relative_path, replacing, writable_file, writable_folder
+from ..core.jobs import run_jobs
 from ..core.runtime import use_variant
 from ..fitting.task import STORAGES, find_task, fit, table_path, tasks
 from ..plugins.support.properties import Kept, StockNode
-from .block_test import PictureCheck, check_picture
+from .block_test import PICTURE_SAMPLES, PictureCheck, check_picture
 from .loading import ParsedScene, SceneError
+from .models import is_model, model_scene
 from .scene_text import absolute_paths, difference, edit_text
-
-#: Environment variable with the folder of fits for scenes that are rendered and not written.
-FOLDER = "MI_DIFFIND_CACHE"
 
 #: Integrator whose estimator those of ``Plugin.seen_by`` share.
 TRACER = "path"
@@ -66,14 +65,25 @@ class Conversion:
 class Conversions(list):
     """List of all :class:`Conversion`, and the ``check`` of the pictures before and after, ``None`` without one.
 
-    ``unchecked`` is the reason why there is none although there should be.
+    ``unchecked`` is the reason why there is none although there should be. ``disk_bytes``, ``memory_bytes`` and
+    ``image_bytes`` are those of the scene before and after: of all its files; of meshes, images and tables as loaded;
+    of images and tables alone.
     """
 
     check: PictureCheck | None = None
     unchecked: str = ""
+    disk_bytes: tuple[int, int] | None = None
+    memory_bytes: tuple[int, int] | None = None
+    image_bytes: tuple[int, int] | None = None
 
     def __str__(self) -> str:
         lines = summary(self) if any(c.learned for c in self) else ["replaced    nothing", *summary(self)]
+        for name in ("disk", "memory", "image"):
+            pair, label = getattr(self, f"{name}_bytes"), {"image": "  of images"}.get(name, name)
+            lines += [f"{label:12}{pair[0]:,} → {pair[1]:,} bytes"] if pair else []
+        if self.check and self.check.seconds:
+            before, after = self.check.seconds
+            lines.append(f"render      {before:.3f} → {after:.3f} s for {PICTURE_SAMPLES} spp of the small picture")
         if self.check or self.unchecked:
             lines.append(f"check       {self.check or self.unchecked}")
         return "\n".join(lines)
@@ -82,20 +92,6 @@ class Conversions(list):
 def words() -> dict[str, plugins.Plugin]:
     """Return the groups of stock plugins that learned ones can stand for, and the learned plugin of each."""
     return {plugin.stock.word: plugin for plugin in plugins.declared().values() if plugin.stock}
-
-
-def cache_folder() -> Path:
-    """Return the folder of fits of this user, which is created: ``$MI_DIFFIND_CACHE``, or in ``~/.cache``.
-
-    Raises :class:`.OutputError`.
-    """
-    folder = Path(os.environ.get(FOLDER) or Path.home() / ".cache" / "mi_diffind")
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        return writable_folder(folder, create=True)
-    except OSError as e:
-        fault = str(e) if isinstance(e, OutputError) else f'folder "{shown(folder)}" cannot be made: {e.strerror}'
-        raise OutputError(f"{fault}; the environment variable {FOLDER} names another folder") from None
 
 
 def convert(
@@ -110,7 +106,8 @@ def convert(
 ) -> Conversions:
     """Write a scene with learned plugins in place of Mitsuba's: ``mi-diffind convert`` in Python.
 
-    - ``scene``: a scene file; ``output``: the scene file to write (:func:`write_scene`).
+    - ``scene``: a scene file, or a glTF model, which is first written as a scene into ``NEW_model`` beside ``NEW.xml``
+      (:func:`.model_scene`); ``output``: the scene file to write (:func:`write_scene`).
     - ``learn``: groups of plugins to replace (:func:`words`; ``None``: those of which a scene gains, textures).
     - ``tables``: folder of the table files (``None``: ``NEW_tables`` beside ``NEW.xml``).
     - ``defines``: values of the file's ``<default>`` parameters.
@@ -125,6 +122,9 @@ def convert(
         raise UsageError(f'output "{output}": is the scene itself')
     writable_file(output)
     use_variant()
+    if is_model(scene):
+        check_scene_file(scene)
+        scene = model_scene(scene, output.with_name(f"{output.stem}_model"))
     parsed = ParsedScene(scene, dict(defines or {}))
     folder = Path(tables or output.with_name(f"{output.stem}_tables"))
     groups = [word for word, plugin in words().items() if plugin.stock.advised] if learn is None else learn
@@ -134,7 +134,11 @@ def convert(
         def render(written: ParsedScene) -> None:
             if not check or not any(c.learned for c in conversions):
                 return
-            pair = ParsedScene(scene, parsed.defines).load(), written.load()
+            sides = ParsedScene(scene, parsed.defines), written
+            pair = tuple(side.load(needs=()) for side in sides)
+            conversions.disk_bytes = tuple(sum(file.stat().st_size for file in side.files()) for side in sides)
+            memory = map(_memory_bytes, sides, pair)
+            conversions.memory_bytes, conversions.image_bytes = zip(*memory, strict=True)
             if all(loaded.sensors() and loaded.integrator() for loaded in pair):
                 conversions.check = check_picture(*pair)
             else:
@@ -145,6 +149,18 @@ def convert(
         with contextlib.suppress(OSError):  # does not exist, or is not empty
             folder.rmdir()
     return conversions
+
+
+def _memory_bytes(parsed: ParsedScene, scene) -> tuple[int, int]:
+    """Return the bytes of a loaded scene with the tables that it reads, and those of its images and tables alone."""
+    arrays = {}
+    for key, value in mi.traverse(scene):
+        value = value.array if dr.is_tensor_v(value) else value
+        if isinstance(value, dr.ArrayBase) and dr.depth_v(value) == 1:
+            arrays[compat.identity(value)] = dr.width(value) * dr.itemsize_v(value), key.endswith("data")
+    tables = parsed.table_bytes(parsed.learned_plugins())
+    images = sum(nbytes for nbytes, is_image in arrays.values() if is_image)
+    return sum(nbytes for nbytes, _ in arrays.values()) + tables, images + tables
 
 
 def replace_stock(
@@ -170,49 +186,79 @@ def replace_stock(
 
 
 def _replace_nodes(state, groups: dict[str, plugins.Plugin], folder: Path, progress: bool) -> list[Conversion]:
-    nodes, types = compat.parsed_properties(state), compat.parsed_types(state)
-    references = compat.parsed_references(state)
-    stock = {name: (word, plugin) for word, plugin in groups.items() for name in plugin.stock.names}
-    conversions = []
-    for index, props in enumerate(nodes):
-        if (before := props.plugin_name()) not in stock:
-            continue
-        word, plugin = stock[before]
-        if getattr(mi.ObjectType, plugins.OBJECT_TYPES[plugin.object_type]) != types[index]:
-            continue
-        around = list(_around(references, index))
-        name = next(filter(None, (nodes[i].id() for i in (index, *around))), "") or compat.parsed_place(state, index)
-        parents = [i for i in around if index in references[i]]
-        node = StockNode(
-            props, tuple(nodes[i] for i in parents), tuple((types[i], nodes[i]) for i in _below(references, index)),
-            folder, functools.partial(_fit_table, folder, progress),
-        )  # fmt: skip
-        try:
-            fitted = plugin.stock.convert(node)
-        except Kept as e:
-            conversions.append(Conversion(word, name, before, "", str(e)))
-        else:
-            props.set_plugin_name(plugin.name)
-            conversions.append(Conversion(word, name, before, plugin.name, fitted))
-        for key in props:
-            props.mark_queried(key, False)  # else Mitsuba takes what was read here for known to the plugin
+    types, fits, conversions, waiting = compat.parsed_types(state), _Fits(folder, progress), {}, {0}
+    nodes, references = compat.parsed_properties(state), _references(state)
+    while waiting:  # for fits, which are carried out together
+        fits.run()
+        waiting = set()
+        # A plugin that stands for several nested ones comes before those that stand for one of them
+        for word, plugin in sorted(groups.items(), key=lambda item: -len(item[1].stock.names)):
+            object_type = getattr(mi.ObjectType, plugins.OBJECT_TYPES[plugin.object_type])
+            for index, props in enumerate(nodes):
+                before = props.plugin_name()
+                if before not in plugin.stock.names or object_type != types[index]:
+                    continue
+                around = list(_around(references, index))
+                in_use = any(index in others.values() for others in references)  # not a part of a material until now
+                if not in_use or waiting & {index, *around}:
+                    continue
+                if index in conversions and (conversions[index].learned or conversions[index].word == word):
+                    continue
+                name = next(filter(None, (nodes[i].id() for i in (index, *around))), "")
+                name = name or compat.parsed_place(state, index)
+                try:
+                    fitted = plugin.stock.convert(_stock_node(nodes, types, references, index, fits))
+                except _Waiting:
+                    waiting.add(index)
+                except Kept as e:
+                    conversions.setdefault(index, Conversion(word, name, before, "", str(e)))
+                else:
+                    if fitted is not None:
+                        props.set_plugin_name(plugin.name)
+                        conversions[index] = Conversion(word, name, before, plugin.name, fitted)
+                        below, references = _below(references, index), _references(state)
+                        _drop_unused(nodes[0], references, below)
+                        references = _references(state)
+                for key in props:
+                    props.mark_queried(key, False)  # else Mitsuba takes what was read here for known to the plugin
+    result = [conversions[index] for index in sorted(conversions)]
     for plugin in groups.values():
-        if plugin.seen_by and any(c.learned == plugin.name for c in conversions):
-            conversions += _trace_by(plugin.seen_by, compat.parsed_properties(state, mi.ObjectType.Integrator))
-    return conversions
+        if plugin.seen_by and any(c.learned == plugin.name for c in result):
+            result += _trace_by(plugin.seen_by, compat.parsed_properties(state, mi.ObjectType.Integrator))
+    return result
 
 
-def _around(references: list[list[int]], index: int) -> Iterator[int]:
+def _stock_node(nodes: list, types: list, references: list[dict[str, int]], index: int, fits: _Fits) -> StockNode:
+    parents = [nodes[i] for i, others in enumerate(references) if i and index in others.values()]
+    children = {k: _stock_node(nodes, types, references, i, fits) for k, i in references[index].items()}
+    shared = len(parents) > 1 and index not in references[0].values()
+    return StockNode(types[index], nodes[index], tuple(parents), children, shared, fits.folder, fits.table)
+
+
+def _references(state) -> list[dict[str, int]]:
+    """Return :func:`.compat.parsed_references`, without those of objects that nothing refers to any more."""
+    walk = set(compat.parsed_walk(state))
+    return [others if index in walk else {} for index, others in enumerate(compat.parsed_references(state))]
+
+
+def _drop_unused(scene, references: list[dict[str, int]], below: list[int]) -> None:
+    """Remove from the scene those of the objects ``below`` a former plugin that nothing else refers to."""
+    for key, other in references[0].items():
+        if other in below and not any(other in others.values() for others in references[1:]):
+            del scene[key]
+
+
+def _around(references: list[dict[str, int]], index: int) -> Iterator[int]:
     """Yield the objects that refer to one, then those that refer to these, …; the scene has index 0 and is left out."""
     level = [index]
     while level:
-        level = [i for i, others in enumerate(references) if i and set(others) & set(level)]
+        level = [i for i, others in enumerate(references) if i and set(others.values()) & set(level)]
         yield from level
 
 
-def _below(references: list[list[int]], index: int) -> list[int]:
+def _below(references: list[dict[str, int]], index: int) -> list[int]:
     """Return all objects that one nests or refers to, directly or not."""
-    return sorted({i for other in references[index] for i in (other, *_below(references, other))})
+    return sorted({i for other in references[index].values() for i in (other, *_below(references, other))})
 
 
 def _trace_by(seen_by: tuple[str, ...], integrators: list) -> list[Conversion]:
@@ -232,41 +278,102 @@ def _trace_by(seen_by: tuple[str, ...], integrators: list) -> list[Conversion]:
     return conversions
 
 
-def _fit_table(folder: Path, progress: bool, task: str, source: Path, **options) -> Table:
-    """Return the table of a fit, of this call or an earlier one, as its file holds it.
+class _Waiting(Exception):
+    """A table is asked for that has to be fitted first."""
 
-    Raises :class:`~.plugins.support.properties.Kept` for a source that the task refuses.
-    """
-    key = [task, sorted(options.items()), relative_path(source, folder)]  # the file records its source by that path
-    path = folder / f"{source.stem}_{_digest(source, key)}.npz"
-    if not path.is_file():
-        if progress:
-            print(f"fit {task} to {source.name}: {path}", file=sys.stderr, flush=True)
+
+class _Fits:
+    """Fits of a conversion, kept in a ``folder``, and those that wait to be carried out together."""
+
+    def __init__(self, folder: Path, progress: bool):
+        self.folder, self.progress = folder, progress
+        self._jobs: dict[str, tuple] = {}
+        self._failures: dict[Path, str] = {}
+        self._paths: dict[str, Path] = {}
+
+    def table(self, task: str, source: Path, **options) -> Table:
+        """Return the table of a fit, of this call or an earlier one, as its file holds it.
+
+        Equal content is fitted once. Raises :class:`_Waiting` for a table that is not there, and
+        :class:`~.plugins.support.properties.Kept` for a source that the task refuses.
+        """
+        content = _digest([task, sorted(options.items()), _content(source)])
+        place = _digest([content, relative_path(source, self.folder)])  # the file records its source by that path
+        path = self._paths.setdefault(content, self.folder / f"{source.stem}_{place}.npz")
+        if not path.name.startswith(f"{source.stem}_"):
+            _discard(self.folder, source)
+        if path in self._failures:
+            _discard(self.folder, source)
+            raise Kept(f"cannot be fitted: {self._failures[path]}")
+        if not path.is_file():
+            self._jobs.setdefault(path.name, (task, str(source), options, path, mi.variant()))
+            raise _Waiting
+        return tasks()[task].load(path)  # raises for a damaged file
+
+    def run(self) -> None:
+        """Carry out the fits that wait, side by side on the processor's cores, each on one; after Ctrl-C, keep those.
+
+        Raises ``KeyboardInterrupt`` if some are missing.
+        """
+        if not self._jobs:
+            return
+        jobs, self._jobs, cores = self._jobs, {}, _cores()
+        workers = min(len(jobs), cores) if len(jobs) > 1 and cores > 1 and not mi.variant().startswith("cuda") else None
+        alone = self.progress and len(jobs) == 1
+        if self.progress:
+            for task, source, _, path, _ in jobs.values():
+                print(f"fit {task} to {Path(source).name}: {path}", file=sys.stderr, flush=True)
+        values, missing = {name: (*job, alone) for name, job in jobs.items()}, set(jobs)
         try:
-            fitted = fit(task, variant=mi.variant(), output=path, progress=progress, source=str(source), **options)
-            if fitted.result.interrupted:
-                raise KeyboardInterrupt
-            save_table(path, fitted.table)
-        except DiffindError as e:
-            raise Kept(f"cannot be fitted: {e}") from None
+            for outcome in run_jobs(
+                _fit, values, workers, progress=self.progress and not alone, title="fit", unit="tables"
+            ):
+                missing.discard(outcome.name)
+                if outcome.failure:
+                    self._failures[self.folder / outcome.name] = outcome.failure
         finally:
-            if source.suffix == ".json" and not any(folder.glob(f"{glob.escape(source.stem)}_*.npz")):
-                for file in folder.glob(f"{glob.escape(source.stem)}.*"):
-                    if file == source or file.is_symlink():  # the manifest, and its link to the image
-                        file.unlink()
-    return tasks()[task].load(path)  # raises for a damaged file
+            for name, (_, source, *_) in jobs.items():
+                if not (self.folder / name).is_file():
+                    _discard(self.folder, Path(source))
+        if missing:
+            if self.progress and len(missing) < len(jobs):
+                kept = f"kept {len(jobs) - len(missing)} of {len(jobs)} fits in {self.folder}"
+                print(f"{kept}: the same command goes on from there", file=sys.stderr, flush=True)
+            raise KeyboardInterrupt
 
 
-def _digest(source: Path, options) -> str:
-    """Return a digest of a file, of the files that it names if it is JSON, and of options; ten hexadecimal digits."""
-    files = [source]
-    if source.suffix == ".json":
-        maps = json.loads(source.read_text(encoding="utf-8"))["maps"]
-        files += [source.parent / entry["file"] for entry in maps.values()]
-    content = hashlib.sha256(json.dumps(options).encode())
-    for file in files:
-        content.update(hashlib.sha256(file.read_bytes()).digest())
-    return content.hexdigest()[:10]
+def _cores() -> int:
+    return os.cpu_count() or 1
+
+
+def _fit(job: tuple) -> None:
+    """Carry out a fit and write its table. Raises ``KeyboardInterrupt`` after Ctrl-C."""
+    task, source, options, path, variant, progress = job
+    fitted = fit(task, variant=variant, output=path, progress=progress, source=source, **options)
+    if fitted.result.interrupted:
+        raise KeyboardInterrupt
+    save_table(path, fitted.table)
+
+
+def _discard(folder: Path, source: Path) -> None:
+    """Remove a manifest without a table, and its links to images."""
+    if source.suffix == ".json" and not any(folder.glob(f"{glob.escape(source.stem)}_*.npz")):
+        for file in folder.glob(f"{glob.escape(source.stem)}*"):
+            if file == source or file.is_symlink():
+                file.unlink()
+
+
+def _content(source: Path) -> list:
+    """Return what a file holds: a digest, or if it is a manifest, its maps, with a digest in place of each image."""
+    if source.suffix != ".json":
+        return [hashlib.sha256(source.read_bytes()).hexdigest()]
+    maps = json.loads(source.read_text(encoding="utf-8"))["maps"]
+    return [[name, {**entry, "file": _content(source.parent / entry["file"])}] for name, entry in maps.items()]
+
+
+def _digest(value) -> str:
+    """Return a digest of plain data; ten hexadecimal digits."""
+    return hashlib.sha256(json.dumps(value).encode()).hexdigest()[:10]
 
 
 def write_scene(

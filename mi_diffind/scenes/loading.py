@@ -23,8 +23,10 @@ from ..core.files import check_scene_file, replacing
 from ..core.runtime import use_variant
 from ..core.threads import in_turn, threads_for_files
 from ..fitting.task import tasks
+from ..maps.entries import SourceError
 from ..measure.clock import bsdf_operations
 from ..plugins.support import footprint, omissions
+from .models import is_model, model_scene
 
 #: Parts that a scene needs to be rendered, beside objects and lights.
 NEEDS = ("integrator", "sensor")
@@ -87,7 +89,9 @@ MAX_DEPTHS = {
 
 
 class ParsedScene:
-    """Scene file ``source``, parsed once, with ``defines`` (name → value) in place of its ``<default>`` values.
+    """Scene file or model (:mod:`.models`) ``source``, parsed once.
+
+    ``defines`` (name → value) take the place of its ``<default>`` values.
 
     Answers questions about the file, and builds any number of scenes from it: each from a copy of the parsed state.
     The source may also be a dictionary, as of ``mi.load_dict``: ``path`` is then a name in the current folder, beside
@@ -112,7 +116,8 @@ class ParsedScene:
         try:
             if not in_memory:
                 check_scene_file(path)
-        except UsageError as e:
+                self.path = path = model_scene(path) if is_model(path) else path
+        except (UsageError, SourceError) as e:
             raise SceneError(str(e)) from None
         with self._errors():
             if in_memory:

@@ -35,6 +35,9 @@ _NUMBERED = re.compile(r"&#(?:x([0-9a-fA-F]+)|([0-9]+));")
 _PARAMETERS = {bool: "boolean", int: "integer", float: "float", str: "string"}
 
 
+#: Begin of the names of parameters that are objects without a name.
+UNNAMED = "_arg_"
+
 #: First and last place, and the text that takes the place of what is between them.
 _Edit = tuple[int, int, str]
 
@@ -111,6 +114,8 @@ class _Editor:
         self.changes = {
             place: (a, b) for place, (a, b) in zip(compat.parsed_offsets(before), properties, strict=True) if a != b
         }
+        kept, places = compat.parsed_walk(after), compat.parsed_offsets(before)
+        self.dropped = {places[index] for index in compat.parsed_walk(before)} - {places[index] for index in kept}
 
     def text(self) -> str:
         """Return the scene's text, one character a byte."""
@@ -143,6 +148,11 @@ class _Editor:
         self.next_file += 1
         for element in root.walk():
             if element.start in replaced:
+                continue
+            if (number, element.start + 1) in self.dropped:
+                edits.append((element.start, element.end, ""))
+                self.changes.pop((number, element.start + 1), None)
+                needed = True
                 continue
             if (change := self.changes.pop((number, element.start + 1), None)) is not None:
                 edits += self.change(element, *change, replaced)
@@ -213,6 +223,13 @@ class _Editor:
         for key in dict.fromkeys([*before, *after]):
             if key in before and key in after and _is_equal(key, before, after):
                 continue
+            if key in before and key not in after and compat.property_kind(before, key) == "object":
+                references = [child for child in element.children if child.tag == "ref"]  # the others are dropped
+                for child in references:
+                    if self.value(child, "name") == ("" if key.startswith(UNNAMED) else key):
+                        edits.append((child.start, child.end, ""))
+                        replaced.add(child.start)
+                continue
             written = self.parameter(key, after[key]) if key in after else ""
             if key in before:
                 edits.append((children[key].start, children[key].end, written))
@@ -226,6 +243,11 @@ class _Editor:
 
     def parameter(self, name: str, value) -> str:
         """Return the element of a parameter, with the path from the target of a file that has an absolute one."""
+        if hasattr(value, "matrix"):
+            numbers = " ".join(repr(float(number)) for row in value.matrix for number in row)
+            return f'<transform name={_quote(name)}><matrix value="{numbers}"/></transform>'
+        if type(value) not in _PARAMETERS:
+            return f'<rgb name={_quote(name)} value="{", ".join(repr(float(number)) for number in value)}"/>'
         shown = str(value).lower() if isinstance(value, bool) else str(value)  # of a float, its shortest text
         if isinstance(value, str) and Path(value).is_absolute():
             shown = relative_path(value, self.target)
@@ -246,7 +268,7 @@ def _apply(text: str, edits: list[_Edit], start: int, end: int) -> str:
     """Return a part of a text with the edits in it. A line that they leave empty is dropped."""
     parts, place = [], start
     for first, last, new in sorted(edits, key=lambda edit: edit[:2]):
-        if not start <= first <= last <= end:
+        if not max(start, place) <= first <= last <= end:  # elsewhere, or in what was dropped
             continue
         before, after = text.rfind("\n", start, first), text.find("\n", last, end)
         if not new and before >= place and after >= 0 and not (text[before:first] + text[last:after]).strip():
@@ -260,7 +282,7 @@ def edit_text(before, after, defines: dict[str, str], target: Path) -> bytes:
     """Return the content of a scene file to which a change of its parsed form is carried over.
 
     - ``before``: the form as the file is parsed with ``defines``; ``after``: the same objects with other plugins, or
-      other parameters that are numbers or text.
+      other parameters that are numbers, text, colours or transforms, or without some that they nest or refer to.
     - ``target``: the folder of the new file; names of files are changed to those that it needs.
 
     An included file that has to change takes the place of its ``<include>``, and values of ``defines`` that of their
@@ -293,27 +315,53 @@ def absolute_paths(state):
     return state
 
 
+def _objects(state) -> list[tuple]:
+    """Return the objects of a parsed scene in the order of the file: index, properties, and those it refers to.
+
+    The latter are places in this list, by the parameter; those without a name are numbered without a gap.
+    """
+    order, nodes = sorted(compat.parsed_walk(state)), compat.parsed_properties(state)
+    references = compat.parsed_references(state)
+    places, objects = {index: place for place, index in enumerate(order)}, []
+    for index in order:
+        nested, unnamed = {}, 0
+        for key, other in references[index].items():
+            nested[f"{UNNAMED}{unnamed}" if key.startswith(UNNAMED) else key] = places[other]
+            unnamed += key.startswith(UNNAMED)
+        objects.append((index, nodes[index], nested))
+    return objects
+
+
+def _values(props) -> list[str]:
+    """Return the names of the parameters that are no objects."""
+    return [key for key in props if compat.property_kind(props, key) != "object"]
+
+
 def difference(before, after) -> str:
     """Return the first difference of two parsed scenes in words, "" if there is none.
 
     Compared are the objects, their order, ids, plugins and parameters, with transforms and colours to the last bit, and
     to which other objects they refer, by any alias.
     """
-    pairs = list(zip(compat.parsed_properties(before), compat.parsed_properties(after), strict=False))
-    for index, (a, b) in enumerate(pairs):
+    sides = _objects(before), _objects(after)
+    for (_, a, nested), (index, b, others) in zip(*sides, strict=False):
         name = f'{b.plugin_name()} "{b.id() or Path(compat.parsed_place(after, index)).name}"'
         if (a.plugin_name(), a.id()) != (b.plugin_name(), b.id()):
             return f'{name} in place of {a.plugin_name()} "{a.id()}"'
-        for key in dict.fromkeys([*a, *b]) if a != b else ():
-            if key not in a or key not in b:
-                return f'{name} {"lacks" if key in a else "has"} "{key}"'
-            if not _is_equal(key, a, b) and compat.property_kind(a, key) != "object":
+        for key in dict.fromkeys([*_values(a), *nested, *_values(b), *others]):
+            both = [key in objects or key in _values(props) for props, objects in ((a, nested), (b, others))]
+            if not all(both):
+                return f'{name} {"lacks" if both[0] else "has"} "{key}"'
+            if key not in nested and not _is_equal(key, a, b):
                 return f"{name} has {key} {_shown(b[key])} in place of {_shown(a[key])}"
-    counts = [len(compat.parsed_properties(state)) for state in (before, after)]
+    counts = [len(side) for side in sides]
     if counts[0] != counts[1]:
         return f"{counts[1]} objects in place of {counts[0]}"
-    if compat.parsed_types(before) != compat.parsed_types(after):
+    types = [
+        [compat.parsed_types(state)[i] for i, *_ in side] for state, side in zip((before, after), sides, strict=True)
+    ]
+    if types[0] != types[1]:
         return "objects of other types"
-    if compat.parsed_references(before) != compat.parsed_references(after):
+    if [nested for *_, nested in sides[0]] != [nested for *_, nested in sides[1]]:
         return "objects that refer to others than before"
     return ""

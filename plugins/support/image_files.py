@@ -17,15 +17,16 @@ from mi_diffind.core.compat import backend_module
 from mi_diffind.core.files import OutsideError, is_within, path_within, read_once, relative_path, stamp, write_json
 from mi_diffind.fitting.task import Task
 from mi_diffind.images.reader import PictureError, read_picture
-from mi_diffind.maps.entries import has_maps, split_material
+from mi_diffind.maps.entries import equal, has_maps, split_material
 from mi_diffind.maps.layout import Layout, MapLayout
 from mi_diffind.maps.pyramid import CompressedMaps, Pyramid
 from mi_diffind.maps.source import Source, from_arrays, load_source
 
 from .. import warn
 from . import properties
-from .properties import Kept, refused_as
+from .properties import Kept, StockNode, refused_as
 from .tables import Tables, lock, shared
+from .textures import TYPES
 
 STORAGES = ("uint8", "float32")
 
@@ -34,6 +35,15 @@ HOW_TO_SEPARATE = {"texture": ": fit texture --separate makes some"}
 
 #: Kinds of maps that hold data, not colours.
 DATA_ROLES = ("normal", "roughness", "ao", "metallic")
+
+#: Steps of the fit that images of a scene get: within 2 dB of the default training.
+STEPS = 300
+
+#: Least PSNR of that fit, in dB: an RMS error of 5.6% of the range of values.
+LEAST_DB = 25.0
+
+#: Least texels along a side of an image with the filter "nearest": edges of fewer texels are seen in pictures.
+LEAST_NEAREST = 256
 
 #: Bytes of an image below which a scene's bitmap is kept: a table file takes 1 to 3 kB itself, and the training of so
 #: few texels ends anywhere between 6 and 32 dB.
@@ -236,31 +246,68 @@ def file_layout(task: Task, props: mi.Properties) -> Layout:
         return Layout.from_json(task.load(properties.filename(props)).settings["layout"])
 
 
-def write_manifest(image: Path, folder: Path, raw: bool, normal: bool) -> Path:
-    """Write a manifest of an image's colours as ``bitmap`` reads them, and return its path.
+def fit_images(
+    task: Task, node: StockNode, images: dict[str, StockNode], numbers: tuple[str, ...] = (), **options
+) -> tuple[Table, str]:
+    """Fit the ``bitmap`` of each map, by its name, together; return the table and a text about it.
 
-    ``raw``: values are left as they are; ``normal``: they are a normal map. Raises :class:`.Kept` for a picture that
-    cannot be read, and for fewer bytes than :data:`LEAST_BYTES`.
+    The properties ``wrap_mode`` of all are equal. Maps of ``numbers`` have one channel. Raises :class:`.Kept`.
     """
-    try:
-        picture = read_picture(image)
-    except PictureError as e:
-        raise Kept(f"{image.name}: {str(e).removeprefix(f'{image}: ')}") from None
-    if picture.values.nbytes < LEAST_BYTES:
-        raise Kept(f"{image.name} has {picture.values.nbytes:,} bytes, of which no fit would save any")
-    entry = {"file": relative_path(image, folder), "color_space": "srgb" if picture.srgb and not raw else "linear"}
-    if picture.has_alpha:
-        entry["channels"] = "rgb" if picture.colors == 3 else "r"
-    name = "normal" if normal else "data" if raw else "albedo"
-    digest = hashlib.sha256(str([name, entry]).encode()).hexdigest()[:12]
+    maps, nearest = {}, False
+    for name, image in images.items():
+        image.allow("filename", "raw", "to_uv", "wrap_mode", "filter_type", "format", "accel")
+        filter_type = str(image.props.get("filter_type", "bilinear"))
+        if filter_type not in (*TYPES, "nearest"):
+            raise Kept(f'has the filter_type "{filter_type}", allowed are {", ".join(TYPES)}')
+        least = LEAST_NEAREST if filter_type == "nearest" else 1
+        maps[name] = image.file(), image.props.get("raw", False) is True, least
+        nearest |= least > 1
+    source, first = write_manifest(node.folder, maps, numbers), next(iter(images.values())).props
+    border = "repeat" if str(first.get("wrap_mode", "repeat")) == "repeat" else "clamp"
+    table = node.fit(task.name, source, steps=STEPS, border=border, **options)
+    quality = f"{table.measured['psnr_db']:.1f} dB{', nearest texels are interpolated' if nearest else ''}"
+    if table.measured["psnr_db"] < LEAST_DB:
+        names = ", ".join(dict.fromkeys(file.name for file, *_ in maps.values()))
+        raise Kept(f"{names} would have {quality}, at least {LEAST_DB:g} are needed: fit it by hand, with more bytes")
+    return table, f"{table.path.name}, {quality}"
+
+
+def write_manifest(folder: Path, maps: dict[str, tuple[Path, bool, int]], numbers: tuple[str, ...] = ()) -> Path:
+    """Write a manifest of images as ``bitmap`` reads them, and return its path.
+
+    ``maps``: name of a map → its image, whether its values are left as they are (``raw``), and the least number of
+    texels along a side; maps of ``numbers`` have one channel. Raises :class:`.Kept` for a picture that cannot be read,
+    for colours in place of numbers, and for fewer bytes than :data:`LEAST_BYTES`.
+    """
+    entries, nbytes = {}, 0
+    for name, (image, raw, least) in maps.items():
+        try:
+            picture = read_picture(image)
+        except PictureError as e:
+            raise Kept(f"{image.name}: {str(e).removeprefix(f'{image}: ')}") from None
+        if min(picture.values.shape[:2]) < least:
+            raise Kept(f'has the filter_type "nearest" and fewer than {least} texels a side, whose edges would be lost')
+        nbytes += picture.values.nbytes
+        space = "srgb" if picture.srgb and not raw else "linear"
+        entries[name] = {"file": relative_path(image, folder), "color_space": space}
+        colours = picture.values[:, :, : picture.colors]
+        if name in numbers and picture.colors > 1 and not equal(colours):
+            raise Kept(f'has the image {image.name} with colours for "{name}", which is a number')
+        if picture.has_alpha or name in numbers:
+            entries[name]["channels"] = "rgb" if picture.colors == 3 and name not in numbers else "r"
+    image = next(iter(maps.values()))[0]
+    if nbytes < LEAST_BYTES:
+        raise Kept(f"{image.name} has {nbytes:,} bytes, of which no fit would save any")
+    digest = hashlib.sha256(str(entries).encode()).hexdigest()[:12]
     path = folder / f"{image.stem}_{digest}.json"
-    try:
-        path_within(folder, entry["file"], path)
-    except OutsideError:
-        link = folder / f"{image.stem}_{digest}{image.suffix}"
-        _link(link, entry["file"])
-        entry["file"] = link.name
-    write_json(path, {"maps": {name: entry}})
+    for name, entry in entries.items():
+        try:
+            path_within(folder, entry["file"], path)
+        except OutsideError:
+            link = folder / f"{image.stem}_{digest}_{name}{maps[name][0].suffix}"
+            _link(link, entry["file"])
+            entry["file"] = link.name
+    write_json(path, {"maps": entries})
     return path
 
 

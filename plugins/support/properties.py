@@ -68,21 +68,32 @@ class Kept(RuntimeError):
 class StockNode:
     """Stock plugin of a parsed scene.
 
-    ``props``: its properties, which a conversion changes; ``parents``: those of the objects that refer to it;
-    ``nested``: type and properties of all objects below it; ``folder``: where files may be written.
-    ``fit(task, source, **options)`` returns the table of the task, read from its file ``table.path``, that was fitted
-    to the file ``source``, or before to the same content.
+    ``props``: its properties, which a conversion changes; ``parents``: those of the objects that refer to it, the scene
+    left out; ``children``: the objects that it nests or refers to, by parameter; ``shared``: it is nested in one
+    object and others refer to it; ``folder``: where files may be written. ``fit(task, source, **options)`` returns the
+    table of the task, read from its file ``table.path``, that was fitted to the file ``source``, or before to the same
+    content.
     """
 
+    object_type: mi.ObjectType
     props: mi.Properties
     parents: tuple[mi.Properties, ...]
-    nested: tuple[tuple[mi.ObjectType, mi.Properties], ...]
+    children: dict[str, StockNode]
+    shared: bool
     folder: Path
     fit: Callable[..., Table]
 
+    @property
+    def name(self) -> str:
+        """Name of the plugin."""
+        return self.props.plugin_name()
+
     def nested_types(self, object_type: mi.ObjectType) -> list[str]:
         """Return the plugin names of all nested objects of one type, each once."""
-        return sorted({props.plugin_name() for other, props in self.nested if other == object_type})
+        return sorted({name for child in self.children.values() for name in child._types(object_type)})
+
+    def _types(self, object_type: mi.ObjectType) -> list[str]:
+        return [*self.nested_types(object_type), *([self.name] if self.object_type == object_type else [])]
 
     def allow(self, *names: str) -> None:
         """Raise :class:`Kept` if a parameter is none of ``names``; nested objects without a name are allowed."""

@@ -1,0 +1,136 @@
+"""glTF models as scenes: places, images the right way up, factors, both sides, and files that are refused."""
+
+import base64
+import json
+import struct
+from io import BytesIO
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mi_diffind.commands.cli import main
+from mi_diffind.core.files import CACHE
+from mi_diffind.scenes import conversion, loading
+from mi_diffind.scenes.models import model_scene
+
+#: Colours of the quarters of an image: above, below; left, right.
+COLORS = np.array([[[200, 30, 30], [30, 200, 30]], [[30, 30, 200], [200, 200, 30]]], np.uint8)
+
+#: Corners of a card in the plane z = 0 that faces +z, and their texture coordinates as glTF has them: v points down.
+CORNERS = np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]], np.float32)
+TEXCOORDS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+TRIANGLES = np.array([[0, 3, 2], [0, 2, 1]], np.uint16)
+
+
+def card(**change):
+    """Return the JSON and the buffer of a card with a material, whose keys ``change`` replaces."""
+    image = BytesIO()
+    Image.fromarray(COLORS.repeat(32, axis=0).repeat(32, axis=1)).save(image, "PNG")
+    parts = [CORNERS.tobytes(), TEXCOORDS.tobytes(), TRIANGLES.tobytes(), image.getvalue()]
+    starts = np.cumsum([0, *map(len, parts)])
+    material = {
+        "name": "Card / ä", "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicFactor": 0.25}, **change
+    }  # fmt: skip
+    accessors = [
+        {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3", "min": [-1, -1, 0], "max": [1, 1, 0]},
+        {"bufferView": 1, "componentType": 5126, "count": 4, "type": "VEC2"},
+        {"bufferView": 2, "componentType": 5123, "count": 6, "type": "SCALAR"},
+    ]
+    primitive = {"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": 0}
+    content = {
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "translation": [10, 20, 30], "scale": [2, 2, 2]}],
+        "meshes": [{"name": "Card", "primitives": [primitive]}], "accessors": accessors, "materials": [material],
+        "images": [{"bufferView": 3, "mimeType": "image/png"}], "textures": [{"source": 0}],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": int(a), "byteLength": len(p)} for a, p in zip(starts[:-1], parts, strict=True)
+        ],
+        "buffers": [{"byteLength": sum(map(len, parts))}],
+    }  # fmt: skip
+    return content, b"".join(parts)
+
+
+def write(path, content, data):
+    """Write a model, as text with its data inside or as a binary file."""
+    if path.suffix == ".gltf":
+        content["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(data).decode()
+        path.write_text(json.dumps(content))
+        return path
+    text, data = (part + pad * (-len(part) % 4) for part, pad in ((json.dumps(content).encode(), b" "), (data, b"\0")))
+    chunks = struct.pack("<2I", len(text), 0x4E4F534A) + text + struct.pack("<2I", len(data), 0x004E4942) + data
+    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+    return path
+
+
+@pytest.mark.parametrize("extension", ["glb", "gltf"])
+def test_a_card_is_seen_the_right_way_up(mi_rgb, tmp_path, monkeypatch, extension):
+    """Quarters of its image where a viewer in front sees them, from a camera that frames it."""
+    monkeypatch.setenv(CACHE, str(tmp_path / "cache"))
+    path = write(tmp_path / f"card.{extension}", *card(doubleSided=True))
+    scene = loading.load(path, {"width": 32, "height": 32, "spp": 16})
+    picture = loading.render(scene)[0][..., :3]
+    (shape,) = [s for s in scene.shapes() if "PLY" in s.class_name()]
+    assert np.allclose(shape.bbox().min, [8, 18, 30]) and np.allclose(shape.bbox().max, [12, 22, 30])
+    for row, column in np.ndindex(2, 2):
+        seen = picture[12 + 8 * row, 12 + 8 * column]
+        assert (seen > 0.6 * seen.max()).tolist() == (COLORS[row, column] > 100).tolist()
+    before = sorted((tmp_path / "cache").rglob("*"))
+    assert main(["render", str(path), "-o", str(tmp_path / "a.exr"), "-D", "width=16", "-D", "spp=1"]) == 0
+    assert sorted((tmp_path / "cache").rglob("*")) == before and len(before) == 4
+
+
+def test_factors_and_materials_without_images(mi_rgb, tmp_path):
+    """Numbers of a material, opacity, both sides and the default material, as the file has them."""
+    content, data = card(alphaMode="BLEND", doubleSided=True)
+    content["materials"][0]["pbrMetallicRoughness"] = {
+        "baseColorFactor": [0.5, 0.25, 0.125, 0.75], "roughnessFactor": 0.6, "metallicFactor": 0.1
+    }  # fmt: skip
+    content["meshes"].append({"primitives": [{"attributes": {"POSITION": 0}, "indices": 2}]})
+    content["nodes"].append({"mesh": 1})
+    content["scenes"][0]["nodes"].append(1)
+    scene = loading.ParsedScene(model_scene(write(tmp_path / "m.gltf", content, data), tmp_path / "parts"))
+    nodes = {n.props.plugin_name(): n.props for n in scene.change(lambda state: list(state.nodes))[::-1]}
+    assert nodes["mask"]["opacity"] == 0.75 and "twosided" in nodes
+    inner = [n for n in scene.change(lambda state: list(state.nodes)) if n.props.plugin_name() == "principled"]
+    colors = [np.allclose(list(n.props["base_color"]), [0.5, 0.25, 0.125]) for n in inner]
+    assert sorted(colors) == [False, True]
+    painted = inner[colors.index(True)].props
+    assert (painted["roughness"], painted["metallic"]) == pytest.approx((0.6, 0.1))
+    assert scene.load().shapes()
+
+
+def test_a_model_is_converted(mi_rgb, tmp_path, monkeypatch):
+    """Its parts beside the new scene, one material of a file, and nothing in the user's cache."""
+    monkeypatch.setenv(CACHE, str(tmp_path / "cache"))
+    fit = conversion.fit
+    monkeypatch.setattr(conversion, "fit", lambda task, **given: fit(task, **{**given, "steps": 40, "batch": 2**12}))
+    path, new = write(tmp_path / "card.glb", *card()), tmp_path / "new.xml"
+    (one,) = result = conversion.convert(path, new, defines={"width": 16, "height": 16}, progress=False)
+    assert (one.stock, one.learned, one.name) == ("principled", "neural_material", "Card_ä")
+    assert result.disk_bytes[0] > 0 and result.check is not None and not (tmp_path / "cache").exists()
+    names = {file.name for file in (tmp_path / "new_model").iterdir()}
+    assert names == {"scene.xml", "Card_0.ply", "Card_ä_albedo.png"}
+    assert len(list(tmp_path.glob("new_tables/*.npz"))) == 1
+    assert loading.load(new).shapes()
+
+
+@pytest.mark.parametrize(
+    "change, fault",
+    [
+        ({"extensionsRequired": ["KHR_draco_mesh_compression"]}, "requires the extension KHR_draco_mesh_compression"),
+        ({"nodes": [{}]}, "has no triangles"),
+        ({"accessors": [{"count": 10**15}]}, "memory"),
+        ({"materials": [{}, {}]}, "has 2 materials without a name"),
+        ({"meshes": [{"primitives": [{"attributes": {"POSITION": 9}}]}]}, "m.gltf"),
+    ],
+)
+def test_models_that_are_refused(mi_rgb, tmp_path, monkeypatch, capsys, change, fault):
+    """In one sentence, without files that stay."""
+    monkeypatch.setenv(CACHE, str(tmp_path / "cache"))
+    content, data = card()
+    path = write(tmp_path / "m.gltf", {**content, **change}, data)
+    assert main(["convert", str(path), "-o", str(tmp_path / "new.xml")]) == 2
+    error = capsys.readouterr().err
+    assert fault in error and error.count("\n") == 1
+    assert not list(tmp_path.rglob("*.ply")) and not (tmp_path / "new.xml").exists()
