@@ -90,13 +90,12 @@ def import_function(source: str) -> PythonTruth:
     Raises :class:`UsageError`.
     """
     module, _, name = source.partition(":")
-    sys.path.insert(0, os.getcwd())
+    if os.getcwd() not in sys.path:  # at the end, where it hides no other module, and stays for what f imports
+        sys.path.append(os.getcwd())
     try:
         call = getattr(importlib.import_module(module), name, None)
     except Exception as e:  # any: importing runs the user's code
         raise UsageError(f"{source}: the module {module} cannot be imported ({reason(e)})") from None
-    finally:
-        sys.path.remove(os.getcwd())
     if not callable(call):
         raise UsageError(f"{source}: the module {module} has no function {name}")
     return PythonTruth(call, source)

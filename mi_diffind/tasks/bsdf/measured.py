@@ -408,7 +408,8 @@ class GridTruth(ScatteredTruth):
             raise UsageError(f"{path}: is no measured BSDF of MDL that reflects (.mbsdf, version 1)")
         colours, polar, azimuths = (int(n) for n in np.frombuffer(content, "<u4", 3, ends[0]))
         count, channels = polar * polar * azimuths, 3 if colours else 1
-        if colours > 1 or not count or len(content) < ends[0] + 12 + 4 * channels * count:
+        end = ends[0] + 12 + 4 * channels * count
+        if colours > 1 or not count or len(content) < end:
             sizes = f"{polar} x {polar} x {azimuths} cells of type {colours}"
             raise UsageError(f"{path}: claims {sizes}, which its {len(content):,} bytes do not hold")
         Allowance(path).take(self.ROW_BYTES * count, f"{count:,} cells")
@@ -423,6 +424,7 @@ class GridTruth(ScatteredTruth):
         self.incidence = np.sin(2 * i) / np.sin(2 * theta).mean()
         self.weight, self.left_out = np.ones(count), 0
         self.name, self.digest = path.name, hashlib.sha256(content).hexdigest()
+        self.remark = "the part that transmits light is left out" if len(content) > end else ""
 
 
 def unit_vectors(theta: np.ndarray, phi: np.ndarray) -> np.ndarray:
