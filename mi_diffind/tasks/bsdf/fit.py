@@ -24,7 +24,7 @@ from .model import BYTES, TERMS, ResidualSizes, points, sizes_within
 from .pairs import error_floor
 from .truth import FamilyTruth, is_function, parameter_ranges, recorded_source, truth_of
 
-#: Irreciprocal share of a function beyond which the file says how near its symmetric part comes.
+#: Irreciprocal share of a function beyond which its symmetric part is fitted, and the file says how near that comes.
 ASYMMETRY = 1e-3
 
 #: Members of a family whose pictures are compared during the training.
@@ -77,20 +77,21 @@ def _fit_single(truth: Truth, request: FitRequest, stop: Event) -> Fitted:
     isotropic, azimuth = _assumed_symmetry(symmetries)
     lines = [*filter(None, [truth.remark]), symmetry_line(symmetries)]
     sizes = _sizes(request, plain=request.preset in ("table", "plain"))
+    limit, trained = {}, truth
     if rows:
         samples, validation, smooth = measured.split(truth, types, isotropic, training.LIMIT, settings.seed)
-        view, limit = None, {}
+        view = None
         if not any(dr.any(v > 0) for v in samples.value):
             raise UsageError(f"{truth.name}: all of its values are 0, which measures no material")
     else:
-        samples = training.draw(truth, types, training.SAMPLES, settings.seed + 1, isotropic)
-        validation = training.draw(truth, types, training.VALIDATION, settings.seed + 2, isotropic)
-        view, smooth = SphereView(truth, types), validation
-        asymmetry = max(symmetries["reciprocity"], symmetries["mirror"] if azimuth == "mirror" else 0)
-        symmetric = measured.symmetric_part(truth, azimuth == "mirror")
-        limit = {"psnr_symmetric_part_db": view.psnr(symmetric)} if asymmetry > ASYMMETRY else {}
+        view = SphereView(truth, types)
+        if max(symmetries["reciprocity"], symmetries["mirror"] if azimuth == "mirror" else 0) > ASYMMETRY:
+            trained = measured.symmetric_part(truth, azimuth == "mirror")
+            limit = {"psnr_symmetric_part_db": view.psnr(trained.value)}
+        samples = training.draw(trained, types, training.SAMPLES, settings.seed + 1, isotropic)
+        smooth = validation = training.draw(trained, types, training.VALIDATION, settings.seed + 2, isotropic)
     lines += (remarks := truth.remarks(validation))
-    angle = 0.0 if isotropic else measured.axes_angle(samples, truth)
+    angle = 0.0 if isotropic else measured.axes_angle(samples, trained)
     if angle:
         lines.append(f"axes at {math.degrees(angle):.1f} degrees")
     first, identity = request.part(training.PRETRAINING), {"source": truth.digest}

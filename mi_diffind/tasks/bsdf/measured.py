@@ -178,10 +178,11 @@ def reflect(w, wi):
     return type(w)(along * wi.x + across * wi.y, along * wi.y - across * wi.x, w.z)
 
 
-def symmetric_part(truth: Truth, mirror: bool) -> Callable:
-    """Return the reciprocal part of a source, f cos θ_o, with ``mirror`` symmetric about the plane of incidence, too.
+def symmetric_part(truth: Truth, mirror: bool) -> FunctionTruth:
+    """Return the reciprocal part of a source, with ``mirror`` symmetric about the plane of incidence, too.
 
-    It is the mean over exchanged, and over mirrored directions.
+    It is the mean over exchanged, and over mirrored directions. A training by absolute errors that sees both values
+    would approach any value between them.
     """
 
     def value(wi, wo) -> list:
@@ -190,7 +191,7 @@ def symmetric_part(truth: Truth, mirror: bool) -> Callable:
         terms += [[v * wo.z / wi.z for v in truth.value(o, i)] for i, o in pairs]
         return [sum(channel) / len(terms) for channel in zip(*terms, strict=True)]
 
-    return value
+    return FunctionTruth(truth.name, value, truth if truth.samples else None)
 
 
 def measure_symmetry(truth, types, size: int = 2**16) -> dict[str, float]:
