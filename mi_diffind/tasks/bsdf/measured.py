@@ -172,10 +172,10 @@ def axes_angle(samples: Samples, truth: Truth) -> float:
 
 
 def reflect(w, wi):
-    """Return directions after a reflection at the plane of ``wi`` and the normal."""
-    r2 = dr.maximum(dr.square(wi.x) + dr.square(wi.y), 1e-12)
-    along, across = (w.x * wi.x + w.y * wi.y) / r2, (w.y * wi.x - w.x * wi.y) / r2
-    return type(w)(along * wi.x + across * wi.y, along * wi.y - across * wi.x, w.z)
+    """Return directions after a reflection at the plane of ``wi`` and the normal; none at normal incidence."""
+    r2 = dr.square(wi.x) + dr.square(wi.y)
+    along, across = ((a / dr.maximum(r2, 1e-12)) for a in (w.x * wi.x + w.y * wi.y, w.y * wi.x - w.x * wi.y))
+    return dr.select(r2 > 1e-12, type(w)(along * wi.x + across * wi.y, along * wi.y - across * wi.x, w.z), w)
 
 
 def symmetric_part(truth: Truth, mirror: bool) -> FunctionTruth:

@@ -56,6 +56,24 @@ def test_python_functions(types, rng):
             truth_of(wrong, types)
 
 
+def test_the_symmetric_part(types, rng):
+    """It is the mean over both orders and over mirrored directions, also at normal incidence."""
+    wi, wo = (random_directions(rng, 200, 0.05) for _ in range(2))
+    wi[:3] = 0, 0, 1
+
+    def skewed(i, o):
+        return lobe(i, o) * (1 + 0.5 * (i[:, 0] * o[:, 1] - i[:, 1] * o[:, 0]))
+
+    def mirrored(w):
+        n = np.stack([-wi[:, 1], wi[:, 0]], axis=1) / np.maximum(np.hypot(wi[:, 0], wi[:, 1]), 1e-9)[:, None]
+        return np.concatenate([w[:, :2] - 2 * n * np.einsum("ij,ij->i", n, w[:, :2])[:, None], w[:, 2:]], axis=1)
+
+    pairs_of = [(wi, wo), (wo, wi), (wi, mirrored(wo)), (mirrored(wo), wi)]
+    expected = np.mean([skewed(i, o) for i, o in pairs_of], axis=0) * wo[:, 2]
+    symmetric = measured.symmetric_part(truth_of(skewed, types), True)
+    np.testing.assert_allclose(values(symmetric, types, wi, wo)[:, 0], expected, rtol=1e-4, atol=1e-6)
+
+
 MODULE = """
 import numpy as np
 
