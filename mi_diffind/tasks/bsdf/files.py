@@ -291,7 +291,9 @@ class BSDFModel(Model):
         truth = self.source()
         if not truth.function:
             rows = measured.split(truth, self.types, self.form.isotropic, LIMIT, self.table.seed or 0)[1]
-            return evaluation.measure_samples(self, measured.without_outliers(rows, self.form, self.bsdf)[0])
+            if truth.scattered:
+                rows, _ = measured.without_outliers(rows, self.form, self.bsdf)
+            return evaluation.measure_samples(self, rows)
         return evaluation.measure(self, truth, SphereView(truth, self.types))
 
     def decode(self, output: str | os.PathLike | None = None, rows: int | None = None, seed: int | None = None):

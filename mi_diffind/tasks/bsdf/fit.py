@@ -99,9 +99,10 @@ def _fit_single(truth: Truth, request: FitRequest, stop: Event) -> Fitted:
     logarithms = training.fit_proxy(samples, validation, types, isotropic, first, identity, smooth, angle, judge)
     has_proxy = request.preset not in ("paper", "plain")  # there it gives the scale of u alone
     form = training.choose_form(logarithms, validation, isotropic, azimuth, angle, has_proxy)
-    if rows:
+    if rows and truth.scattered:
         (samples, validation), form, line = measured.remove_outliers(truth, [samples, validation], form, logarithms)
         lines.append(line)
+    if rows:
         floor = error_floor([samples, validation], isotropic, azimuth == "mirror")
         limit = {} if floor is None else {"relative_error_floor": floor}
     identity = {"source": truth.digest, "structure": sizes.to_json(), "form": form.to_json()}

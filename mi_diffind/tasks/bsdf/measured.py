@@ -341,10 +341,10 @@ class ScatteredTruth(Truth):
 
     ``wi``, ``wo`` and ``f`` are arrays ``(n, 3)``; ``solid_angle``: that for which each row stands (``None``: not
     given); ``weight``: factor on it; ``incidence``: projected solid angle of ``wi``. ``angles``: unit of the angles
-    ("": that of the file).
+    ("": that of the file). ``scattered``: rows may be unlike their neighbours by accident, and are then left out.
     """
 
-    function, incidence = False, 1.0
+    function, incidence, scattered = False, 1.0, True
 
     def __init__(self, path: Path, angles: str = ""):
         names, rows, lines = read_rows(path)
@@ -389,9 +389,10 @@ class GridTruth(ScatteredTruth):
     The file has a header of text (MDL Specification, appendix on measured BSDFs), a line that ends in ``=``, three
     numbers (1: RGB, 0: grey; cells of both polar angles up to 90°; cells of the azimuth up to 180°), and the values of
     f without the cosine, the azimuth fastest, the polar angle of incidence slowest. Directions are the centres of
-    cells, which count by the projected solid angles of both.
+    cells, which count by the projected solid angles of both. None is left out: highlights are a few cells wide.
     """
 
+    scattered = False
     MAGIC, MARKS = b"NVIDIA ARC MBSDF V1\n", (b"MBSDF_DATA=\n", b"MBSDF_DATA_REFLECTION=\n")
     #: Longest header, bytes.
     HEADER = 2**16
