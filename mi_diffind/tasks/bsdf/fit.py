@@ -103,7 +103,8 @@ def _fit_single(truth: Truth, request: FitRequest, stop: Event) -> Fitted:
         (samples, validation), form, line = measured.remove_outliers(truth, [samples, validation], form, logarithms)
         lines.append(line)
     if rows:
-        floor = error_floor([samples, validation], isotropic, azimuth == "mirror")
+        counted = [samples, validation] if truth.scattered else [validation]  # all cells of a grid measure
+        floor = error_floor(counted, isotropic, azimuth == "mirror")
         limit = {} if floor is None else {"relative_error_floor": floor}
     identity = {"source": truth.digest, "structure": sizes.to_json(), "form": form.to_json()}
     judge = judge or training.proxy_loss(validation)

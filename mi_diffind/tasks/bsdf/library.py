@@ -199,8 +199,7 @@ def find_materials(request: FitRequest, folder: Path) -> tuple[dict[str, Library
     materials, broken = {}, {}
     for file in files:
         try:
-            suffix = file.suffix.lower()
-            ids = material_ids(file) if suffix == ".npz" or (every and suffix == ".xml") else [""]
+            ids = material_ids(file) if file.suffix.lower() in (".npz", ".xml" if every else "") else [""]
         except DiffindError as e:
             broken[_free_name(file.stem, names)] = str(e)
             continue

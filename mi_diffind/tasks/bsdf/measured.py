@@ -181,8 +181,7 @@ def reflect(w, wi):
 def symmetric_part(truth: Truth, mirror: bool) -> FunctionTruth:
     """Return the reciprocal part of a source, with ``mirror`` symmetric about the plane of incidence, too.
 
-    It is the mean over exchanged, and over mirrored directions. A training by absolute errors that sees both values
-    would approach any value between them.
+    It is the mean over exchanged, and over mirrored directions: absolute errors alone allow any value between both.
     """
 
     def value(wi, wo) -> list:
@@ -389,7 +388,7 @@ class GridTruth(ScatteredTruth):
     The file has a header of text (MDL Specification, appendix on measured BSDFs), a line that ends in ``=``, three
     numbers (1: RGB, 0: grey; cells of both polar angles up to 90°; cells of the azimuth up to 180°), and the values of
     f without the cosine, the azimuth fastest, the polar angle of incidence slowest. Directions are the centres of
-    cells, which count by the projected solid angles of both. None is left out: highlights are a few cells wide.
+    cells, which count by the projected solid angles of both. All train and measure: highlights are a few cells wide.
     """
 
     scattered = False
@@ -548,8 +547,8 @@ def solid_angles(truth: ScatteredTruth, isotropic: bool) -> np.ndarray:
 def split(truth: ScatteredTruth, types, isotropic: bool, limit: float, seed: int) -> tuple[Samples, Samples, Samples]:
     """Return the rows for training, those that measure, and smoothed ones for the starts of the proxy.
 
-    Their weights are solid angles, limited so that a row contributes at most ``limit``. Smoothed values are medians of
-    three neighbours: a start is found by least squares, which outliers would rule.
+    Cells of a grid do both. Weights are solid angles, limited so that a row contributes at most ``limit``. Smoothed
+    values are medians of three neighbours: a start is found by least squares, which outliers would rule.
     """
     from scipy.spatial import cKDTree
 
@@ -564,7 +563,7 @@ def split(truth: ScatteredTruth, types, isotropic: bool, limit: float, seed: int
         wi = np.stack([np.sqrt(np.maximum(1 - wi[:, 2] ** 2, 0)), 0 * wi[:, 2], wi[:, 2]], axis=1)
         wo = along_x(truth)
     order = np.random.default_rng(seed).permutation(len(value))
-    measured = max(1, round(VALIDATION * len(value)))
+    measured = max(1, round(VALIDATION * len(value))) if truth.scattered else 0
 
     def samples(rows: np.ndarray, values: np.ndarray) -> Samples:
         def columns(a):
@@ -574,7 +573,7 @@ def split(truth: ScatteredTruth, types, isotropic: bool, limit: float, seed: int
             types.Array3f(*columns(wi)), types.Array3f(*columns(wo)), columns(weight[:, None])[0], columns(values)
         )
 
-    return samples(order[measured:], value), samples(order[:measured], value), samples(order, smooth)
+    return samples(order[measured:], value), samples(order[: measured or None], value), samples(order, smooth)
 
 
 def without_outliers(samples: Samples, form: Form, proxy: LearnedBSDF) -> tuple[Samples, int]:

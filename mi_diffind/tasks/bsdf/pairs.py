@@ -116,7 +116,7 @@ def error_floor(samples: list, isotropic: bool, mirror: bool) -> float | None:
     which rows with the same directions, or with images of them, differ, too. ``None``: too few rows have others.
     """
     columns = [np.stack([c.numpy() for c in (*s.wi, *s.wo, s.weight, *s.value)], axis=1) for s in samples]
-    table = np.concatenate(columns).astype(np.float64)
+    table = np.concatenate(columns, dtype=np.float64)
     table = table[table[:, 6] > 0]
     rows = SimpleNamespace(wi=table[:, :3], wo=table[:, 3:6])
     orbits = Orbits(rows, isotropic, mirror)

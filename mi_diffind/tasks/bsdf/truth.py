@@ -115,8 +115,7 @@ class MeasuredTruth(MitsubaTruth):
         r2 = dr.square(wi.x) + dr.square(wi.y)
         inverse = -math.sqrt(0.5) * dr.rsqrt(dr.maximum(r2, 1e-20))
         sin, cos = (wi.x - wi.y) * inverse, (wi.x + wi.y) * inverse
-        defined = r2 > 1e-20
-        sin, cos = dr.select(defined, sin, 0), dr.select(defined, cos, 1)
+        sin, cos = dr.select(r2 > 1e-20, sin, 0), dr.select(r2 > 1e-20, cos, 1)
         return turn(w, -sin if back else sin, cos)
 
     def _colour(self, wi, wo):
