@@ -26,6 +26,9 @@ POLARISED = {"theta_h": 2, "theta_d": 2, "phi_d": 2, "wvls": 1, "M": 6}
 #: Fields that increase.
 ANGLES = ("phi_i", "theta_i", "theta_h", "theta_d", "phi_d")
 
+#: Largest polar angle and azimuth of a file, radians; Mitsuba would read angles in degrees as the last ones.
+LARGEST_ANGLES = {"theta": 1.6, "phi": 6.3}
+
 #: Fields of densities.
 POSITIVE = ("ndf", "sigma", "vndf")
 
@@ -90,6 +93,9 @@ def check(path: Path, fields: dict) -> None:
             refuse(f'the field "{name}" has {finite.size - np.count_nonzero(finite):,} values that are not finite')
         if name in ANGLES and (np.diff(np.ravel(fields[name])) <= 0).any():
             refuse(f'the field "{name}" does not increase')
+        most = LARGEST_ANGLES.get(name.partition("_")[0], np.inf)
+        if (largest := np.abs(fields[name]).max() if name in ANGLES else 0) > most:
+            refuse(f'the field "{name}" has angles up to {largest:.4g}, radians up to {most} are needed')
         if name in POSITIVE and not (np.min(fields[name]) >= 0 and np.max(fields[name]) > 0):
             refuse(f'the field "{name}" has negative values, or none above 0')
 

@@ -2,6 +2,7 @@
 
 - :mod:`.model`: the form of a learned BSDF, and of a family that depends on parameters;
 - :mod:`.truth`: sources: plugins of Mitsuba, scenes, measured files; :mod:`.measured`: symmetries, spectra, rows;
+  :mod:`.functions`: Python functions and networks; :mod:`.pairs`: the error that symmetries impose on measurements;
 - :mod:`.directions`: directions at which a source is sampled, and the picture that measures;
 - :mod:`.training`: samples, proxy and residual; :mod:`.fit`: ``fit bsdf``; :mod:`.library`: many sources at once;
 - :mod:`.mixture`: importance sampling; :mod:`.energy`: the limit of the albedo;
@@ -47,10 +48,12 @@ class BSDFTask(Task):
     arguments = (
         Argument(
             "source", file="read", metavar="SOURCE",
-            help="scene or BSDF (.xml), measured file (.bsdf, .pbsdf, .binary), table of measurements (.csv), or a "
-            "folder of such files",
+            help="scene or BSDF (.xml), measured file (.bsdf, .pbsdf, .mbsdf, .binary), table of measurements (.csv), "
+            "networks of Neural-BRDF (.npz), a folder of such files, or a Python function (module:function)",
         ),
-        Argument("--material", default="", metavar="ID", help="id of a BSDF of the scene; all: each of them"),
+        Argument(
+            "--material", default="", metavar="ID", help="id of a BSDF of the scene, or name of a network; all: each"
+        ),
         Argument(
             "--uv", nargs=2, type=between(-math.inf, math.inf), default=(0.5, 0.5), metavar=("U", "V"),
             help="point of the textures at which the BSDF is fitted (default: 0.5 0.5)",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import os
 from pathlib import Path
@@ -186,8 +187,12 @@ class BSDFModel(Model):
             return
         proxy = self.arrays.get("proxy")
         proxy = None if proxy is None else Proxy.from_logarithms(BSDFArrays(None, proxy).logarithms(), self.form)
-        self.bsdf = LearnedBSDF(self.form, self._residual(), proxy, self.arrays.get("energy"))
-        lobes = tuple(SampledLobe(*map(float, lobe)) for lobe in self.table.settings["lobes"])
+        numbers, opaque = self.form.numbers(self.types.Float), functools.partial(dr.opaque, self.types.Float)
+        self.bsdf = LearnedBSDF(self.form, self._residual(), proxy, self.arrays.get("energy"), numbers=numbers)
+        lobes = tuple(
+            SampledLobe(opaque(float(u)), opaque(float(v)), 2.0 if gamma == 2 else opaque(float(gamma)))
+            for u, v, gamma in self.table.settings["lobes"]
+        )
         self.mixture = Mixture(self.arrays["weights"], lobes)
         if self.form.angle:
             self.mixture = TurnedMixture(self.mixture, self.form.angle)
@@ -286,7 +291,9 @@ class BSDFModel(Model):
         truth = self.source()
         if not truth.function:
             rows = measured.split(truth, self.types, self.form.isotropic, LIMIT, self.table.seed or 0)[1]
-            return evaluation.measure_samples(self, measured.without_outliers(rows, self.form, self.bsdf)[0])
+            if truth.scattered:
+                rows, _ = measured.without_outliers(rows, self.form, self.bsdf)
+            return evaluation.measure_samples(self, rows)
         return evaluation.measure(self, truth, SphereView(truth, self.types))
 
     def decode(self, output: str | os.PathLike | None = None, rows: int | None = None, seed: int | None = None):

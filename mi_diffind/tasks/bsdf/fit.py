@@ -21,7 +21,11 @@ from .directions import SphereView
 from .files import BSDFModel, allocate, to_table
 from .measured import WHITE, FunctionTruth, Truth
 from .model import BYTES, TERMS, ResidualSizes, points, sizes_within
-from .truth import FamilyTruth, parameter_ranges, recorded_source, truth_of
+from .pairs import error_floor
+from .truth import FamilyTruth, is_function, parameter_ranges, recorded_source, truth_of
+
+#: Irreciprocal share of a function beyond which its symmetric part is fitted, and the file says how near that comes.
+ASYMMETRY = 1e-3
 
 #: Members of a family whose pictures are compared during the training.
 VIEWS = 8
@@ -73,17 +77,21 @@ def _fit_single(truth: Truth, request: FitRequest, stop: Event) -> Fitted:
     isotropic, azimuth = _assumed_symmetry(symmetries)
     lines = [*filter(None, [truth.remark]), symmetry_line(symmetries)]
     sizes = _sizes(request, plain=request.preset in ("table", "plain"))
+    limit, trained = {}, truth
     if rows:
         samples, validation, smooth = measured.split(truth, types, isotropic, training.LIMIT, settings.seed)
-        view, remarks = None, []
+        view = None
         if not any(dr.any(v > 0) for v in samples.value):
             raise UsageError(f"{truth.name}: all of its values are 0, which measures no material")
     else:
-        samples = training.draw(truth, types, training.SAMPLES, settings.seed + 1, isotropic)
-        validation = training.draw(truth, types, training.VALIDATION, settings.seed + 2, isotropic)
-        lines += (remarks := truth.remarks(validation))
-        view, smooth = SphereView(truth, types), validation
-    angle = 0.0 if isotropic else measured.axes_angle(samples, truth)
+        view = SphereView(truth, types)
+        if max(symmetries["reciprocity"], symmetries["mirror"] if azimuth == "mirror" else 0) > ASYMMETRY:
+            trained = measured.symmetric_part(truth, azimuth == "mirror")
+            limit = {"psnr_symmetric_part_db": view.psnr(trained.value)}
+        samples = training.draw(trained, types, training.SAMPLES, settings.seed + 1, isotropic)
+        smooth = validation = training.draw(trained, types, training.VALIDATION, settings.seed + 2, isotropic)
+    lines += (remarks := truth.remarks(validation))
+    angle = 0.0 if isotropic else measured.axes_angle(samples, trained)
     if angle:
         lines.append(f"axes at {math.degrees(angle):.1f} degrees")
     first, identity = request.part(training.PRETRAINING), {"source": truth.digest}
@@ -91,9 +99,13 @@ def _fit_single(truth: Truth, request: FitRequest, stop: Event) -> Fitted:
     logarithms = training.fit_proxy(samples, validation, types, isotropic, first, identity, smooth, angle, judge)
     has_proxy = request.preset not in ("paper", "plain")  # there it gives the scale of u alone
     form = training.choose_form(logarithms, validation, isotropic, azimuth, angle, has_proxy)
-    if rows:
+    if rows and truth.scattered:
         (samples, validation), form, line = measured.remove_outliers(truth, [samples, validation], form, logarithms)
         lines.append(line)
+    if rows:
+        counted = [samples, validation] if truth.scattered else [validation]  # all cells of a grid measure
+        floor = error_floor(counted, isotropic, azimuth == "mirror")
+        limit = {} if floor is None else {"relative_error_floor": floor}
     identity = {"source": truth.digest, "structure": sizes.to_json(), "form": form.to_json()}
     judge = judge or training.proxy_loss(validation)
     problem = training.residual_problem(logarithms, form, sizes, samples, judge, identity)
@@ -112,7 +124,7 @@ def _fit_single(truth: Truth, request: FitRequest, stop: Event) -> Fitted:
         recorded = _settings(request, result, truth, symmetries, sizes)
         table = to_table(problem.net, form, sampling, weights, scale, recorded)
         measure = (evaluation.measure_samples, validation) if rows else (evaluation.measure, truth, view)
-        _complete(table, request, *measure)
+        _complete(table, request, *measure, limit=limit)
         table.settings |= {"remarks": remarks} if remarks else {}
         return table, scale, raw
 
@@ -193,11 +205,14 @@ def _settings(request: FitRequest, result: FitResult | None, truth: Truth, symme
     }  # fmt: skip
 
 
-def _complete(table: Table, request: FitRequest, measure: Callable, *truth) -> None:
-    """Add preset, seed, source and the figures ``measure(model, *truth)`` to a table."""
+def _complete(table: Table, request: FitRequest, measure: Callable, *truth, limit: dict | None = None) -> None:
+    """Add preset, seed, source and the figures ``measure(model, *truth)`` to a table; ``limit`` follows the first."""
     table.preset, table.seed, dtype = request.preset, request.settings.seed, request.types.TensorXf
-    table.settings |= request.paths(source_path=request.options["source"]) | recorded_source(request.options)
-    figures = measure(BSDFModel(table, allocate(table, dtype), dtype), *truth)
+    source = request.options["source"]
+    paths = {} if is_function(source) else request.paths(source_path=source)
+    table.settings |= paths | recorded_source(request.options)
+    figures = list(measure(BSDFModel(table, allocate(table, dtype), dtype), *truth).items())
+    figures = {**dict(figures[:1]), **(limit or {}), **dict(figures[1:])}
     table.measured = {name: float(f"{figure:.5g}") for name, figure in figures.items()}
 
 

@@ -22,6 +22,7 @@ from ...fitting.task import FitRequest, Fitted, Model, fit, load_model
 from ...measure.report import grid
 from .files import load
 from .fit import use_rgb_variant
+from .functions import is_table
 from .truth import SUFFIXES, material_ids
 
 #: Material that stands for all of a scene.
@@ -31,10 +32,14 @@ ALL = "all"
 COLUMNS = {
     "bytes": lambda m: f"{m['bytes']:,}",
     "accuracy": lambda m: f"{m['psnr_db']:.1f} dB" if "psnr_db" in m else f"error {100 * m['relative_error']:.2g}%",
+    "floor": lambda m: (
+        f"{m['psnr_symmetric_part_db']:.1f} dB" if "psnr_symmetric_part_db" in m
+        else f"{100 * m['relative_error_floor']:.2g}%" if "relative_error_floor" in m else "–"
+    ),
     "albedo": lambda m: f"{100 * m['albedo_excess']:+.2f}%" if "albedo_excess" in m else "–",
     "moment": lambda m: f"{m['sample_weight_moment']:.2f}",
     "seconds": lambda m: "" if m["seconds"] is None else f"{m['seconds']:.0f}",
-}
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -173,7 +178,8 @@ def fit_library(request: FitRequest) -> FittedLibrary:
 def find_materials(request: FitRequest, folder: Path) -> tuple[dict[str, LibraryMaterial], dict[str, str]]:
     """Return the materials of a library by name, and the sentences of sources without any.
 
-    Names are those of the files, of the ids of a scene's materials, or of both, in letters that all file systems take.
+    Names are those of the files, of the ids of a scene's materials or of networks, or of both, in letters that all file
+    systems take. Table files in a folder are no sources.
     Raises :class:`UsageError` if there are none.
     """
     import mitsuba as mi
@@ -181,7 +187,8 @@ def find_materials(request: FitRequest, folder: Path) -> tuple[dict[str, Library
     source, every = Path(request.options["source"]), request.options["material"] == ALL
     files = [source]
     if source.is_dir():
-        files = sorted(f for f in source.iterdir() if f.suffix.lower() in SUFFIXES and not f.name.startswith("."))
+        files = (f for f in source.iterdir() if f.suffix.lower() in SUFFIXES and not f.name.startswith("."))
+        files = sorted(f for f in files if not (f.suffix.lower() == ".npz" and is_table(f)))
         if not files:
             raise UsageError(f"{source}: holds no sources, allowed are files that end in {', '.join(SUFFIXES)}")
     given = {**request.options, **dataclasses.asdict(request.settings)}
@@ -192,7 +199,7 @@ def find_materials(request: FitRequest, folder: Path) -> tuple[dict[str, Library
     materials, broken = {}, {}
     for file in files:
         try:
-            ids = material_ids(file) if every and file.suffix.lower() == ".xml" else [""]
+            ids = material_ids(file) if file.suffix.lower() in (".npz", ".xml" if every else "") else [""]
         except DiffindError as e:
             broken[_free_name(file.stem, names)] = str(e)
             continue

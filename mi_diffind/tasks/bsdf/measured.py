@@ -15,7 +15,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import hashlib
 import math
@@ -29,11 +28,13 @@ import numpy as np
 
 from ...arrays.lookup import clamp
 from ...core import tensor_files
+from ...core.archives import Allowance
 from ...core.compat import backend_module
 from ...core.errors import UsageError, reason
 from .directions import Samples, incident, outgoing
 from .mixture import TurnedMixture
 from .model import BSDFArrays, DirectionPair, Form, LearnedBSDF, rotate, turn
+from .pairs import LEAST_ROWS, along_x, exchange, irreciprocal_share, places
 from .training import proxy_array, residual_range
 
 #: Relative difference up to which a symmetry is assumed.
@@ -41,6 +42,9 @@ TOLERANCE = 0.01
 
 #: Azimuth of the axes of a source below which they count as those of the surface, radians.
 TURN = math.radians(0.5)
+
+#: Largest value f cos θ that counts; a source may exceed it next to the horizon.
+LARGEST = 1e8
 
 #: Illuminants, the first is the default.
 ILLUMINANTS = ("D65", "E")
@@ -57,9 +61,6 @@ VALUES = ("r", "g", "b")
 #: Columns that a file may have.
 OPTIONAL = ("solid_angle", "weight")
 
-#: Smallest number of rows.
-LEAST_ROWS = 200
-
 #: Share of the rows that measure the result.
 VALIDATION = 0.1
 
@@ -71,9 +72,6 @@ DENSITY = 8
 
 #: Neighbours that a row is compared with.
 NEIGHBOURS = 16
-
-#: Distance of two rows below which they have the same directions.
-EXACT = 1e-4
 
 
 class Truth:
@@ -104,6 +102,23 @@ class Truth:
     def density(self, wi, wo):
         """Return the density of :meth:`sample` per solid angle."""
         raise NotImplementedError
+
+
+def value_remarks(name: str, values: np.ndarray) -> list[str]:
+    """Return sentences about values that are not finite or negative; ``values``: (3, n).
+
+    Raises :class:`UsageError` if more than 1% are not finite.
+    """
+    if not values.size:
+        raise UsageError(f"{name}: none of its values is valid")
+    bad, remarks = float((~np.isfinite(values)).any(axis=0).mean()), []
+    if bad > 0.01:  # a few are at the horizon
+        raise UsageError(f"{name}: {bad:.1%} of its values are not finite, nothing can be fitted to them")
+    if bad:
+        remarks.append(f"{bad:.2g} of its values are not finite and count as 0")
+    if negative := float((values < 0).mean()):
+        remarks.append(f"{100 * negative:.2g}% of its values are negative, a learned BSDF has 0 there")
+    return remarks
 
 
 class FunctionTruth(Truth):
@@ -156,6 +171,28 @@ def axes_angle(samples: Samples, truth: Truth) -> float:
     return angle if abs(angle) > TURN and abs(apart) < math.radians(4) else 0.0
 
 
+def reflect(w, wi):
+    """Return directions after a reflection at the plane of ``wi`` and the normal; none at normal incidence."""
+    r2 = dr.square(wi.x) + dr.square(wi.y)
+    along, across = ((a / dr.maximum(r2, 1e-12)) for a in (w.x * wi.x + w.y * wi.y, w.y * wi.x - w.x * wi.y))
+    return dr.select(r2 > 1e-12, type(w)(along * wi.x + across * wi.y, along * wi.y - across * wi.x, w.z), w)
+
+
+def symmetric_part(truth: Truth, mirror: bool) -> FunctionTruth:
+    """Return the reciprocal part of a source, with ``mirror`` symmetric about the plane of incidence, too.
+
+    It is the mean over exchanged, and over mirrored directions: absolute errors alone allow any value between both.
+    """
+
+    def value(wi, wo) -> list:
+        pairs = [(wi, wo), *([(wi, reflect(wo, wi))] if mirror else [])]
+        terms = [truth.value(i, o) for i, o in pairs]
+        terms += [[v * wo.z / wi.z for v in truth.value(o, i)] for i, o in pairs]
+        return [sum(channel) / len(terms) for channel in zip(*terms, strict=True)]
+
+    return FunctionTruth(truth.name, value, truth if truth.samples else None)
+
+
 def measure_symmetry(truth, types, size: int = 2**16) -> dict[str, float]:
     """Return the relative difference of f that each symmetry would hide.
 
@@ -170,15 +207,10 @@ def measure_symmetry(truth, types, size: int = 2**16) -> dict[str, float]:
     weight = dr.select(dr.minimum(wi.z, wo.z) > 0.087, samples.weight, 0)
     sin, cos = dr.sincos(2 * dr.pi * rng.random(types.Float, size))
 
-    def mirrored(w):  # at the plane of wi and the normal
-        r2 = dr.maximum(dr.square(wi.x) + dr.square(wi.y), 1e-12)
-        along, across = (w.x * wi.x + w.y * wi.y) / r2, (w.y * wi.x - w.x * wi.y) / r2
-        return types.Array3f(along * wi.x + across * wi.y, along * wi.y - across * wi.x, w.z)
-
     value = truth.value(wi, wo)
     others = {
         "isotropy": truth.value(turn(wi, sin, cos), turn(wo, sin, cos)),
-        "mirror": truth.value(wi, mirrored(wo)),
+        "mirror": truth.value(wi, reflect(wo, wi)),
         "reciprocity": [v * wo.z / wi.z for v in truth.value(wo, wi)],
     }
     total = sum(dr.sum(weight * wi.z * v) for v in value)
@@ -234,6 +266,25 @@ def measured_bsdf(path: Path, illuminant: str):
         return mi.load_dict({"type": "measured", "filename": converted}), REMARK.format(illuminant)
 
 
+def has_one_azimuth(path: Path) -> bool:
+    """Return whether a file of ``measured`` holds one azimuth of incidence, or two with the same values.
+
+    Mitsuba takes such files for isotropic. Raises :class:`UsageError` for one of two azimuths with different values,
+    which it takes for isotropic, too.
+    """
+    fields = tensor_files.read(path)
+    count = len(fields["phi_i"])
+    if count == 2:
+        for name in ("vndf", "luminance", "spectra", "rgb"):
+            first, second = np.asarray(fields[name], np.float64) if name in fields else (0, 0)
+            if np.abs(first - second).sum() > TOLERANCE * np.abs(first).sum():
+                raise UsageError(
+                    f'{path}: the field "{name}" differs between 2 azimuths, and Mitsuba takes files of at most 2 '
+                    "azimuths for isotropic: one azimuth, or at least 3, are needed"
+                )
+    return count <= 2
+
+
 class PolarisedTruth(Truth):
     """Isotropic measurement of Mueller matrices, as of unpolarised light: their first entry.
 
@@ -253,6 +304,7 @@ class PolarisedTruth(Truth):
         nodes = fields["M"].shape
         weights = colour_weights(np.asarray(fields["wvls"], np.float64), illuminant)
         colours = np.asarray(fields["M"][..., 0, 0], np.float32) @ weights.astype(np.float32)
+        self._remarks = value_remarks(path.name, colours[~np.isnan(colours).any(axis=-1)].T)
         grid = np.zeros((*nodes[:3], 2, 2), np.float32)  # Mitsuba interpolates pictures, here of 2 x 2 numbers
         grid.reshape(*nodes[:3], 4)[..., :3] = colours
         angles = [np.ravel(fields[name]).astype(float).tolist() for name in ("phi_d", "theta_d", "theta_h")]
@@ -274,7 +326,10 @@ class PolarisedTruth(Truth):
         angles = [dr.atan2(across, along), dr.acos(cos_d), dr.atan2(sin, half.z)]
         corners = ((0, 0), (1, 0), (0, 1))
         values = [self.grid.eval(self.mi.Point2f(x, y), angles) for x, y in corners]
-        return [wo.z * dr.select(dr.isnan(v), 0, clamp(v, 0, 1e8)) for v in values]
+        return [wo.z * dr.select(dr.isnan(v), 0, clamp(v, 0, LARGEST)) for v in values]
+
+    def remarks(self, samples):
+        return self._remarks
 
 
 # -- rows of values ----------------------------------------------------------------------------------------------------
@@ -284,10 +339,11 @@ class ScatteredTruth(Truth):
     """Rows of a ``.csv`` file. Raises :class:`UsageError`, with file and line.
 
     ``wi``, ``wo`` and ``f`` are arrays ``(n, 3)``; ``solid_angle``: that for which each row stands (``None``: not
-    given); ``weight``: factor on it. ``angles``: unit of the angles ("": that of the file).
+    given); ``weight``: factor on it; ``incidence``: projected solid angle of ``wi``. ``angles``: unit of the angles
+    ("": that of the file). ``scattered``: rows may be unlike their neighbours by accident, and are then left out.
     """
 
-    function = False
+    function, incidence, scattered = False, 1.0, True
 
     def __init__(self, path: Path, angles: str = ""):
         names, rows, lines = read_rows(path)
@@ -310,11 +366,7 @@ class ScatteredTruth(Truth):
             refuse(wrong, f"{name} is {{{names.index(name)}:g}}, allowed is 0 to {limit}")
         for name in OPTIONAL:
             refuse(columns.get(name, np.zeros(1)) < 0, f"{name} is negative, allowed are numbers ≥ 0")
-        angles = [(columns[f"theta_{k}"], columns[f"phi_{k}"]) for k in "io"]
-        self.wi, self.wo = (
-            np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=1)
-            for theta, phi in angles
-        )
+        self.wi, self.wo = (unit_vectors(columns[f"theta_{k}"], columns[f"phi_{k}"]) for k in "io")
         self.f = np.stack([columns[name] for name in VALUES], axis=1)
         self.weight = columns.get("weight", np.ones(len(rows)))
         self.solid_angle = columns.get("solid_angle")
@@ -325,6 +377,60 @@ class ScatteredTruth(Truth):
         self.wi, self.wo, self.f, self.weight = (a[counts] for a in (self.wi, self.wo, self.f, self.weight))
         self.solid_angle = None if self.solid_angle is None else self.solid_angle[counts]
         self.name, self.digest = path.name, hashlib.sha256(path.read_bytes() + unit.encode()).hexdigest()
+
+    def remarks(self, samples):
+        return value_remarks(self.name, self.f.T)
+
+
+class GridTruth(ScatteredTruth):
+    """Isotropic measurement as a ``.mbsdf`` file of NVIDIA's MDL, whose cells are rows. Raises :class:`UsageError`.
+
+    The file has a header of text (MDL Specification, appendix on measured BSDFs), a line that ends in ``=``, three
+    numbers (1: RGB, 0: grey; cells of both polar angles up to 90°; cells of the azimuth up to 180°), and the values of
+    f without the cosine, the azimuth fastest, the polar angle of incidence slowest. Directions are the centres of
+    cells, which count by the projected solid angles of both. All train and measure: highlights are a few cells wide.
+    """
+
+    scattered = False
+    MAGIC, MARKS = b"NVIDIA ARC MBSDF V1\n", (b"MBSDF_DATA=\n", b"MBSDF_DATA_REFLECTION=\n")
+    #: Longest header, bytes.
+    HEADER = 2**16
+    #: Memory of a row: directions, values, solid angle and weight as double precision.
+    ROW_BYTES = 88
+
+    def __init__(self, path: Path):
+        try:
+            content = path.read_bytes()
+        except OSError as e:
+            raise UsageError(f"{path}: cannot be read ({reason(e)})") from None
+        ends = [content.find(b"\n" + mark, 0, self.HEADER) + 1 + len(mark) for mark in self.MARKS]
+        ends = [end for end, mark in zip(ends, self.MARKS, strict=True) if end > len(mark)]
+        if not content.startswith(self.MAGIC) or not ends or len(content) < ends[0] + 12:
+            raise UsageError(f"{path}: is no measured BSDF of MDL that reflects (.mbsdf, version 1)")
+        colours, polar, azimuths = (int(n) for n in np.frombuffer(content, "<u4", 3, ends[0]))
+        count, channels = polar * polar * azimuths, 3 if colours else 1
+        end = ends[0] + 12 + 4 * channels * count
+        if colours > 1 or not count or len(content) < end:
+            sizes = f"{polar} x {polar} x {azimuths} cells of type {colours}"
+            raise UsageError(f"{path}: claims {sizes}, which its {len(content):,} bytes do not hold")
+        Allowance(path).take(self.ROW_BYTES * count, f"{count:,} cells")
+        f = np.frombuffer(content, "<f4", channels * count, ends[0] + 12).reshape(count, channels)
+        if not np.isfinite(f).all():
+            raise UsageError(f"{path}: has {f.size - np.isfinite(f).sum():,} values that are not finite")
+        theta = (np.arange(polar) + 0.5) * (math.pi / 2 / polar)
+        phi = (np.arange(azimuths) + 0.5) * (math.pi / azimuths)
+        i, o, phi = (a.ravel() for a in np.meshgrid(theta, theta, phi, indexing="ij"))
+        self.wi, self.wo, self.f = unit_vectors(i, 0 * i), unit_vectors(o, phi), np.broadcast_to(f, (count, 3))
+        self.solid_angle = np.sin(o) * (2 * math.pi / np.sin(theta).mean())
+        self.incidence = np.sin(2 * i) / np.sin(2 * theta).mean()
+        self.weight, self.left_out = np.ones(count), 0
+        self.name, self.digest = path.name, hashlib.sha256(content).hexdigest()
+        self.remark = "the part that transmits light is left out" if len(content) > end else ""
+
+
+def unit_vectors(theta: np.ndarray, phi: np.ndarray) -> np.ndarray:
+    """Return directions ``(n, 3)`` of polar angles and azimuths, radians."""
+    return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=1)
 
 
 def read_rows(path: Path) -> tuple[list[str], np.ndarray, list[int]]:
@@ -360,21 +466,6 @@ def read_rows(path: Path) -> tuple[list[str], np.ndarray, list[int]]:
     if not rows:
         raise UsageError(f"{path}: has no rows below its header")
     return names, np.array(rows), [number for number, _ in body]
-
-
-def along_x(truth: ScatteredTruth) -> np.ndarray:
-    """Return ``wo`` after a rotation about the normal that brings ``wi`` to the azimuth 0."""
-    x, y = truth.wi[:, 0], truth.wi[:, 1]
-    r = np.hypot(x, y)
-    cos, sin, wo = np.where(r > 1e-9, x / np.maximum(r, 1e-9), 1), y / np.maximum(r, 1e-9), truth.wo
-    return np.stack([cos * wo[:, 0] + sin * wo[:, 1], cos * wo[:, 1] - sin * wo[:, 0], wo[:, 2]], axis=1)
-
-
-def places(truth: ScatteredTruth, isotropic: bool) -> np.ndarray:
-    """Return points whose distances are those of rows, ``(n, 4)`` of isotropic and ``(n, 6)`` of other materials."""
-    if not isotropic:
-        return np.concatenate([truth.wi, truth.wo], axis=1)
-    return np.concatenate([np.arccos(np.clip(truth.wi[:, 2:], -1, 1)), along_x(truth)], axis=1)
 
 
 def measure_row_symmetry(truth: ScatteredTruth) -> dict[str, float | None]:
@@ -430,54 +521,6 @@ def measure_row_symmetry(truth: ScatteredTruth) -> dict[str, float | None]:
     return result
 
 
-def exchange(truth: ScatteredTruth) -> ScatteredTruth:
-    """Return the rows with their directions exchanged."""
-    exchanged = copy.copy(truth)
-    exchanged.wi, exchanged.wo = truth.wo, truth.wi
-    return exchanged
-
-
-def irreciprocal_share(truth: ScatteredTruth, isotropic: bool, mirror: bool) -> float | None:
-    """Return the share of the light that no reciprocal model can reproduce; ``None`` if too few rows have images.
-
-    It is the sum of ``|f(i, o) − f(o, i)| / 2`` over that of ``|f|``, weighted by both solid angles and cosines, of
-    all rows whose directions exchanged are those of another row. Rows that are their own images (mirror directions)
-    count as they do among all rows. With ``mirror``, images at the plane of incidence count, too.
-    """
-    from scipy.spatial import cKDTree
-
-    points, images = places(truth, isotropic), places(exchange(truth), isotropic)
-    if isotropic and mirror:
-        points[:, 2], images[:, 2] = np.abs(points[:, 2]), np.abs(images[:, 2])
-    symmetric = np.linalg.norm(points - images, axis=1) < EXACT
-    image = cKDTree(points).query(images, distance_upper_bound=EXACT)[1]
-    image[symmetric] = np.flatnonzero(symmetric)
-    paired = image < len(points)
-    others = (paired & ~symmetric).sum()
-    if others < LEAST_ROWS:
-        return None
-    rows = np.flatnonzero(paired)
-    image, wi, wo = image[rows], truth.wi[rows], truth.wo[rows]
-    if truth.solid_angle is None:
-        weight = cells(np.arccos(np.stack([wi[:, 2], wo[:, 2]], axis=1)))
-        weight *= np.prod(np.hypot(*np.stack([wi, wo])[:, :, :2].T), axis=1)
-        azimuths = [np.arctan2(w[:, 1], w[:, 0]) for w in ([along_x(truth)[rows]] if isotropic else [wi, wo])]
-        weight *= cells(np.abs(np.stack(azimuths, axis=1)))
-    else:
-        weight = truth.solid_angle[rows] * truth.solid_angle[image]
-    weight *= np.where(symmetric[rows], 1, (~symmetric).sum() / others)
-    weight = (weight * (truth.weight[rows] + truth.weight[image]) * wi[:, 2] * wo[:, 2])[:, None]
-    difference = (weight * np.abs(truth.f[rows] - truth.f[image])).sum() / 2
-    return float(difference / max((weight * np.abs(truth.f[rows])).sum(), 1e-20))
-
-
-def cells(angles: np.ndarray) -> np.ndarray:
-    """Return products of the widths for which angles ``(n, k)`` stand on the axis that their ``k`` columns share."""
-    values, index = np.unique(np.round(angles, 5), return_inverse=True)
-    widths = np.gradient(values) if len(values) > 1 else np.ones(1)
-    return widths[index.reshape(angles.shape)].prod(axis=1)
-
-
 def solid_angles(truth: ScatteredTruth, isotropic: bool) -> np.ndarray:
     """Return the solid angles for which rows stand, 2π in the mean, from the distances of their neighbours.
 
@@ -504,13 +547,13 @@ def solid_angles(truth: ScatteredTruth, isotropic: bool) -> np.ndarray:
 def split(truth: ScatteredTruth, types, isotropic: bool, limit: float, seed: int) -> tuple[Samples, Samples, Samples]:
     """Return the rows for training, those that measure, and smoothed ones for the starts of the proxy.
 
-    Their weights are solid angles, limited so that a row contributes at most ``limit``. Smoothed values are medians of
-    three neighbours: a start is found by least squares, which outliers would rule.
+    Cells of a grid do both. Weights are solid angles, limited so that a row contributes at most ``limit``. Smoothed
+    values are medians of three neighbours: a start is found by least squares, which outliers would rule.
     """
     from scipy.spatial import cKDTree
 
     weight = solid_angles(truth, isotropic) if truth.solid_angle is None else truth.solid_angle
-    weight = weight * truth.weight / truth.weight.mean()
+    weight = weight * (truth.weight / truth.weight.mean()) * truth.incidence
     value = truth.f * truth.wo[:, 2:]
     weight = np.minimum(weight, limit / np.maximum(value.max(axis=1), 1e-6))
     points = places(truth, isotropic)
@@ -520,7 +563,7 @@ def split(truth: ScatteredTruth, types, isotropic: bool, limit: float, seed: int
         wi = np.stack([np.sqrt(np.maximum(1 - wi[:, 2] ** 2, 0)), 0 * wi[:, 2], wi[:, 2]], axis=1)
         wo = along_x(truth)
     order = np.random.default_rng(seed).permutation(len(value))
-    measured = max(1, round(VALIDATION * len(value)))
+    measured = max(1, round(VALIDATION * len(value))) if truth.scattered else 0
 
     def samples(rows: np.ndarray, values: np.ndarray) -> Samples:
         def columns(a):
@@ -530,7 +573,7 @@ def split(truth: ScatteredTruth, types, isotropic: bool, limit: float, seed: int
             types.Array3f(*columns(wi)), types.Array3f(*columns(wo)), columns(weight[:, None])[0], columns(values)
         )
 
-    return samples(order[measured:], value), samples(order[:measured], value), samples(order, smooth)
+    return samples(order[measured:], value), samples(order[: measured or None], value), samples(order, smooth)
 
 
 def without_outliers(samples: Samples, form: Form, proxy: LearnedBSDF) -> tuple[Samples, int]:

@@ -111,6 +111,16 @@ class Form:
     range: tuple[float, float] = (-1.0, 1.0)
     angle: float = 0.0
 
+    def numbers(self, Float) -> list:
+        """Return (1/a_x², 1/a_y², 1/log₂(1 + 1/a²)) of u, and start and step of the factors, as opaque numbers.
+
+        Kernels then do not contain them, so that all fits and materials of a form share their kernels.
+        """
+        x, y = (a**-2 for a in self.scale)
+        low, high = self.range
+        start, step = fourth_roots(self.range) if self.terms else (low, high - low)
+        return [dr.opaque(Float, float(v)) for v in (x, y, 1 / math.log2(1 + max(x, y)), start, step)]
+
     def to_json(self) -> dict:
         """Return the form as JSON."""
         return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
@@ -377,11 +387,16 @@ class LearnedBSDF:
     ``residual`` is any function of a list of three coordinates, or ``None``; ``proxy`` may be ``None``, too. ``energy``
     is an array of s(θ) ≤ 1, read at √cos θ: f is multiplied by s(θ_i) s(θ_o), which limits the albedo and keeps
     reciprocity (``None``: 1). Of a family's members, ``scale`` has the roughnesses that scale u, (a_x, a_y) or one for
-    both, arrays (``None``: those of the form).
+    both, arrays (``None``: those of the form). ``numbers`` are those of the form (:meth:`Form.numbers`; ``None``: made
+    when they are needed, which a symbolic loop does not allow).
     """
 
-    def __init__(self, form: Form, residual, proxy: Proxy | None, energy=None, scale: tuple | None = None):
+    def __init__(
+        self, form: Form, residual, proxy: Proxy | None, energy=None, scale: tuple | None = None,
+        numbers: Sequence | None = None,
+    ):  # fmt: skip
         self.form, self.residual, self.proxy, self.energy, self.scale = form, residual, proxy, energy, scale
+        self.numbers = numbers
         #: Terms of u that the scale of a member determines.
         self.terms = None
         if scale is not None:
@@ -390,12 +405,13 @@ class LearnedBSDF:
 
     def coordinates(self, g: DirectionPair) -> list:
         """Return u, v and w."""
-        if self.terms is None:
-            u = coordinate_u(g, self.form.scale)
-        else:
-            x, y, inverse = self.terms
-            u = dr.minimum(dr.log2(1 + dr.fma(g.hx2, x, g.hy2 * y)) * inverse, 1)
+        x, y, inverse = self.terms or self._form_numbers(type(g.cos_d))[:3]
+        u = dr.minimum(dr.log2(1 + dr.fma(g.hx2, x, g.hy2 * y)) * inverse, 1)
         return [u, dr.sqrt(1 - g.cos_d), coordinate_w(g, self.form)]
+
+    def _form_numbers(self, Float) -> Sequence:
+        self.numbers = self.numbers or self.form.numbers(Float)
+        return self.numbers
 
     def cosine_value(self, wi, wo) -> list:
         """Return f cos θ_o, three arrays, for unit directions above the surface."""
@@ -410,13 +426,11 @@ class LearnedBSDF:
             result = [scale * v for v in result]
         if self.residual is None:
             return result
-        numbers = self.residual(self.coordinates(g), active)
-        if self.proxy is None:  # a wide range, of which a fourth power would leave few steps to small values
-            low, high = self.form.range
-            factors = [dr.exp(dr.fma(x, high - low, low)) for x in numbers]
-        else:
-            low, step = fourth_roots(self.form.range)
-            factors = [dr.square(dr.square(dr.fma(x, step, low))) for x in numbers]
+        # Of families, range and factors are part of kernels
+        low, step = fourth_roots(self.form.range) if self.terms else self._form_numbers(type(wi.z))[3:]
+        numbers = [dr.fma(x, step, low) for x in self.residual(self.coordinates(g), active)]
+        # Without a proxy a wide range, of which a fourth power would leave few steps to small values
+        factors = [dr.exp(x) if self.proxy is None else dr.square(dr.square(x)) for x in numbers]
         return [a * b for a, b in zip(result, factors, strict=True)]
 
 
@@ -483,12 +497,6 @@ def fourth_roots(limits: tuple[float, float]) -> tuple[float, float]:
     """Return the fourth root of the least factor, and how much larger that of the largest is."""
     low, high = (math.exp(x / 4) for x in limits)
     return low, high - low
-
-
-def coordinate_u(g: DirectionPair, scale: tuple[float, float]):
-    """Return u, the coordinate of the half vector; at most 1 but for rounding."""
-    t = dr.fma(g.hx2, scale[0] ** -2, g.hy2 * scale[1] ** -2)
-    return dr.log2(1 + t) * (1 / math.log2(1 + min(scale) ** -2))
 
 
 def coordinate_w(g: DirectionPair, form: Form):

@@ -18,14 +18,23 @@ from ...core.errors import UsageError, reason
 from ...core.files import irregular, shown
 from ...core.units import memory
 from .directions import incident, outgoing
-from .measured import ILLUMINANTS, PolarisedTruth, ScatteredTruth, Truth, measure_symmetry, measured_bsdf
-from .model import MOST_PARAMETERS, Parameter, points
+from .functions import FUNCTION, NetworkTruth, PythonTruth, import_function, open_networks
+from .measured import (
+    ILLUMINANTS,
+    LARGEST,
+    GridTruth,
+    PolarisedTruth,
+    ScatteredTruth,
+    Truth,
+    has_one_azimuth,
+    measure_symmetry,
+    measured_bsdf,
+    value_remarks,
+)
+from .model import MOST_PARAMETERS, Parameter, points, turn
 
 #: Extensions of files that are sources.
-SUFFIXES = (".xml", ".bsdf", ".pbsdf", ".binary", ".csv")
-
-#: Largest value f cos θ that counts; a plugin may exceed it next to the horizon.
-LARGEST = 1e8
+SUFFIXES = (".xml", ".bsdf", ".pbsdf", ".mbsdf", ".binary", ".csv", ".npz")
 
 
 class MitsubaTruth(Truth):
@@ -70,11 +79,7 @@ class MitsubaTruth(Truth):
             sides = [list(self._colour(*pair)) for pair in ((wi, wo), below)]
             dr.eval(sides)
         front, back = (np.stack([channel.numpy() for channel in side]) for side in sides)
-        bad, remarks = float((~np.isfinite(front)).any(axis=0).mean()), []
-        if bad > 0.01:  # a few are at the horizon
-            raise UsageError(f"{self.name}: {bad:.1%} of its values are not finite, nothing can be fitted to them")
-        if bad:
-            remarks.append(f"{bad:.2g} of its values are not finite and count as 0")
+        remarks = value_remarks(self.name, front)
         front, back = np.nan_to_num(front), np.nan_to_num(back)
         if np.abs(back).max() > 0:
             other = np.abs(back - front).mean() > 1e-3 * np.abs(front).mean()
@@ -90,6 +95,37 @@ class MitsubaTruth(Truth):
 
     def density(self, wi, wo):
         return clamp(self.bsdf.pdf(self.context, self._interaction(wi), self.mi.Vector3f(wo)), 0, LARGEST)
+
+
+class MeasuredTruth(MitsubaTruth):
+    """Mitsuba's ``measured`` of a file with one azimuth of incidence, which is isotropic.
+
+    Mitsuba 3.9 leaves a number unset for such files, by which it may mirror the directions of some quadrants
+    (mitsuba3#1850). Directions are therefore turned until the azimuth of ``wi`` is −135°, where nothing is mirrored.
+    """
+
+    isotropic = True
+
+    def _interaction(self, wi):
+        return super()._interaction(self._turn(wi, wi))
+
+    @staticmethod
+    def _turn(wi, w, back: bool = False):
+        """Return ``w`` after the rotation about the normal that turns ``wi``, or ``back``."""
+        r2 = dr.square(wi.x) + dr.square(wi.y)
+        inverse = -math.sqrt(0.5) * dr.rsqrt(dr.maximum(r2, 1e-20))
+        sin, cos = (wi.x - wi.y) * inverse, (wi.x + wi.y) * inverse
+        sin, cos = dr.select(r2 > 1e-20, sin, 0), dr.select(r2 > 1e-20, cos, 1)
+        return turn(w, -sin if back else sin, cos)
+
+    def _colour(self, wi, wo):
+        return super()._colour(wi, self._turn(wi, wo))
+
+    def sample(self, wi, w, u, v):
+        return self._turn(wi, super().sample(wi, w, u, v), back=True)
+
+    def density(self, wi, wo):
+        return super().density(wi, self._turn(wi, wo))
 
 
 class MERLTruth(Truth):
@@ -110,9 +146,13 @@ class MERLTruth(Truth):
         if len(content) != 12 + 24 * count or tuple(np.frombuffer(content, "<i4", 3)) != self.SIZES:
             raise UsageError(f"{path}: is no measurement of the MERL database, which has {12 + 24 * count:,} bytes")
         numbers = np.frombuffer(content, "<f8", offset=12).reshape(3, count)
+        self._remarks = value_remarks(path.name, numbers)
         scaled = np.maximum(numbers * np.array(self.SCALES)[:, None], 0).astype(np.float32)
         self.name, self.digest = path.name, hashlib.sha256(content).hexdigest()
         self.channels = [types.Float(np.ascontiguousarray(c)) for c in scaled]
+
+    def remarks(self, samples):
+        return self._remarks
 
     def value(self, wi, wo):
         half = wi + wo
@@ -234,9 +274,10 @@ def truth_of(
     """Return the source of a BSDF.
 
     ``source`` is a scene or a single BSDF as a file (``.xml``) or as a dictionary of ``mi.load_dict``, a ``mi.BSDF``,
-    a measured file (``.bsdf``, ``.pbsdf``, ``.binary``), or a table of measurements (``.csv``), whose ``angles`` are
-    degrees or radians ("": as its angles say). ``material`` is the id of a BSDF of a scene. Spectra of
-    measured files have colours under an ``illuminant`` (:mod:`.measured`; "": D65). Raises
+    a Python function or its name ``module:function``, a file of networks (``.npz``, :mod:`.functions`), a measured file
+    (``.bsdf``, ``.pbsdf``, ``.mbsdf``, ``.binary``), or a table of measurements (``.csv``), whose ``angles`` are
+    degrees or radians ("": as its angles say). ``material`` is the id of a BSDF of a scene, or the name of a network.
+    Spectra of measured files have colours under an ``illuminant`` (:mod:`.measured`; "": D65). Raises
     :class:`.UsageError`.
     """
     import mitsuba as mi
@@ -247,6 +288,10 @@ def truth_of(
         name, content = str(source.get("type", "dictionary")), repr(sorted(source.items(), key=str)).encode()
         bsdf = _choose(_load(name, lambda: mi.load_dict(source)), name, material)
         return MitsubaTruth(bsdf, name, _hash(content), uv)
+    if callable(source):
+        return PythonTruth(source)
+    if is_function(source):
+        return import_function(source)
     path = Path(os.fspath(source))
     if fault := irregular(path, memory() // 4):
         raise UsageError(f"{shown(path)}: {fault}")
@@ -257,12 +302,18 @@ def truth_of(
         return MERLTruth(path, types)
     if suffix == ".csv":
         return ScatteredTruth(path, angles)
+    if suffix == ".mbsdf":
+        return GridTruth(path)
+    if suffix == ".npz":
+        return NetworkTruth(path, material, types)
     illuminant = illuminant or ILLUMINANTS[0]
     if suffix == ".pbsdf":
         return PolarisedTruth(path, illuminant)
     if suffix == ".bsdf":
         bsdf, remark = _load(path, lambda: measured_bsdf(path, illuminant))
-        truth = MitsubaTruth(bsdf, path.name, _hash(path.read_bytes() + (illuminant.encode() if remark else b"")), uv)
+        truth = (MeasuredTruth if has_one_azimuth(path) else MitsubaTruth)(
+            bsdf, path.name, _hash(path.read_bytes() + (illuminant.encode() if remark else b"")), uv
+        )
         truth.remark = remark
         return truth
     if suffix != ".xml":
@@ -272,8 +323,16 @@ def truth_of(
     return MitsubaTruth(bsdf, bsdf.id() or path.name, _hash(path.read_bytes() + material.encode()), uv)
 
 
+def is_function(source) -> bool:
+    """Return whether a source is the name of a Python function, ``module:function``, and no file."""
+    return isinstance(source, str) and bool(FUNCTION.fullmatch(source)) and not os.path.exists(source)
+
+
 def recorded_source(options) -> dict:
-    """Return what a table file keeps of a source beside the path of its file, so that it can be opened again."""
+    """Return what a table file keeps of a source beside the path of its file, so that it can be opened again.
+
+    The name of a Python function is not kept: opening a file would import what it names.
+    """
     source, recorded = options["source"], {name: options[name] for name in ("material", "uv", "angles", "illuminant")}
     recorded["uv"] = [float(x) for x in recorded["uv"]]
     try:
@@ -347,11 +406,15 @@ def _bsdfs(scene) -> list:
 
 
 def material_ids(path) -> list[str]:
-    """Return the ids of the materials of a scene file, sorted, or ``[""]`` for a file of one BSDF.
+    """Return the ids of the materials of a scene file, sorted, the names of networks, or ``[""]`` for a single BSDF.
 
     Raises :class:`.UsageError`.
     """
     import mitsuba as mi
+
+    if path.suffix.lower() == ".npz":
+        with open_networks(path) as archive:
+            return list(archive.members)
 
     loaded = _load(path, lambda: mi.load_file(str(path), optimize=False))
     ids = sorted({b.id() for b in _bsdfs(loaded) if b.id()}) if isinstance(loaded, mi.Scene) else [""]

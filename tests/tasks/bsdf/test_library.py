@@ -106,14 +106,20 @@ def test_names_and_identities(mi_rgb, tmp_path, monkeypatch):
 
 def test_reports_of_measurements(tmp_path):
     """Materials that are known by samples alone have no PSNR, and materials that failed no figures."""
-    figures = {"relative_error": 0.0123, "albedo_largest": 0.7, "sample_weight_moment": 1.1, "seconds": None}
+    figures = {
+        "relative_error": 0.0123,
+        "relative_error_floor": 0.011,
+        "albedo_largest": 0.7,
+        "sample_weight_moment": 1.1,
+        "seconds": None,
+    }
     records = {
         "cloth": {"status": "kept", "failure": "", "file": "cloth.npz", "bytes": 2148, **figures},
         "glass": {"status": "failed", "failure": "glass: transmits light", "file": "", "bytes": 0},
     }
     lines = library.FittedLibrary(None, None, folder=tmp_path, materials=records).summary()
     assert [line.split() for line in lines[2:4]] == [
-        ["cloth", "kept", "2,148", "error", "1.2%", "–", "1.10"], ["glass", "failed", *"–––––"],
+        ["cloth", "kept", "2,148", "error", "1.2%", "1.1%", "–", "1.10"], ["glass", "failed", *"––––––"],
     ]  # fmt: skip
     assert lines[4] == "  glass: glass: transmits light"
 

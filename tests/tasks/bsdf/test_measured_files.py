@@ -165,3 +165,35 @@ def test_damaged_files(mi_rgb, tmp_path):
     )
     with pytest.raises(UsageError, match=r"a.bsdf: is no file of measured spectra"):
         truth_of(tmp_path / "a.bsdf", array_module())
+
+
+def test_measured_files_of_one_azimuth_are_isotropic(mi_rgb, tmp_path, rng):
+    """Values do not depend on the quadrant, nor does the density of samples."""
+    fields = measured_fields("rgb", 3)
+    fields["vndf"] = np.ascontiguousarray(0.5 + np.random.default_rng(4).random((1, 8, 8, 8)), np.float32)
+    tensor_files.write(tmp_path / "a.bsdf", fields)
+    types = array_module()
+    truth = truth_of(tmp_path / "a.bsdf", types)
+    assert truth.isotropic
+    wi, wo = random_directions(rng, 300, 0.1), random_directions(rng, 300, 0.1)
+    first = numpy_of(truth.value(*(types.Array3f(aligned(w.T)) for w in (wi, wo))))
+    for angle in (0.7, 2.0, 3.5, 5.0):
+        c, s = np.cos(angle), np.sin(angle)
+        turned = [(w @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])).astype(np.float32) for w in (wi, wo)]
+        value = numpy_of(truth.value(*(types.Array3f(aligned(w.T)) for w in turned)))
+        np.testing.assert_allclose(value, first, rtol=0.02, atol=1e-3)
+    two = {name: np.repeat(a, 2, axis=0) if name in ("vndf", "luminance", "rgb") else a for name, a in fields.items()}
+    tensor_files.write(tmp_path / "b.bsdf", {**two, "phi_i": np.array([-1, 1], np.float32)})
+    assert truth_of(tmp_path / "b.bsdf", types).isotropic
+    two["rgb"] = two["rgb"] * np.array([1, 2], np.float32)[:, None, None, None, None]
+    tensor_files.write(tmp_path / "c.bsdf", {**two, "phi_i": np.array([-1, 1], np.float32)})
+    with pytest.raises(UsageError, match=r'c.bsdf: the field "rgb" differs between 2 azimuths'):
+        truth_of(tmp_path / "c.bsdf", types)
+
+
+def test_files_in_degrees(mi_rgb, tmp_path):
+    polarised_file(tmp_path / "whole.pbsdf")
+    fields = {name: np.array(array) for name, array in tensor_files.read(tmp_path / "whole.pbsdf").items()}
+    tensor_files.write(tmp_path / "a.pbsdf", {**fields, "theta_h": np.degrees(fields["theta_h"])})
+    with pytest.raises(UsageError, match=r'the field "theta_h" has angles up to 90, radians up to 1.6 are needed'):
+        truth_of(tmp_path / "a.pbsdf", array_module())

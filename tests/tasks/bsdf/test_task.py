@@ -202,7 +202,7 @@ def test_sources(types, tmp_path):
         (scene, "glass"): "glass: transmits light, only BSDFs that reflect can be fitted",
         (scene, "mirror"): "mirror: reflects into single directions, only BSDFs without delta lobes can be fitted",
         (tmp_path / "none.xml", ""): "none.xml: no such file",
-        (tmp_path / "lamp.txt", ""): r'found the extension ".txt", allowed are .xml, .bsdf, .pbsdf, .binary, .csv',
+        (tmp_path / "lamp.txt", ""): r'found the extension ".txt", allowed are .xml, .bsdf, .pbsdf, .mbsdf, .binary',
     }
     (tmp_path / "lamp.txt").write_text("")
     for (source, material), message in refused.items():
