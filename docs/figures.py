@@ -307,7 +307,7 @@ FUNCTIONS = {
     f.__name__: f
     for f in (
         min, max, sum, len, round, abs, all, any, sorted, next, iter, zip, map, list, dict, range, tuple, float,
-        Entries, measured, every, one, ratio, time_over, equal_samples, cells, with_spread,
+        Entries, measured, every, one, groups, ratio, time_over, equal_samples, cells, with_spread,
         size_text, binary_size, asset_bytes, equal_quality, budgets, by_label,
         surface_errors, trust_cell, shaded_renders, shaded_contenders, over_filters, shipped,
         trust_cells,
