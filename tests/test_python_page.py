@@ -19,6 +19,7 @@ MAKERS = sorted((ROOT / "scenes").glob("*.py"))
 WRITTEN = {
     "Compress a material and render it filtered": ("tiles.npz", "floor.png"),
     "Recover maps from pictures": ("base_color.exr", "roughness.exr"),
+    "Begin untrained": ("blank.npz",),
     "Freeze the steps of an optimisation": ("wall.exr",),
 }
 
