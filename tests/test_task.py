@@ -305,7 +305,7 @@ def test_all_errors_have_one_base_class():
     def derives(name):
         return name == "DiffindError" or any(derives(base) for base in bases.get(name, []))
 
-    # No errors, but how a loop is left, what keeps a plugin as it is or waits for a fit, and what a decoder tells its reader
+    # No errors: how a loop is left, what keeps a plugin or waits for a fit, and what a decoder tells its reader
     assert {name for name in errors if not derives(name)} <= {
         "Stopped",
         "Kept",
