@@ -228,6 +228,10 @@ def shaded_materials(*studies: Entries) -> dict[str, dict[str, list[Entries]]]:
     return {material: {kind: d for (kind,), d in groups(rows, "kind").items()} for (material,), rows in materials}
 
 
+#: PSNR in dB beyond which the error of a render is not told from its noise.
+CONVERGED = 60.0
+
+
 def shaded_renders(*studies: Entries, name: str = "ours") -> list[Entries]:
     """Return a row for each material and each light of renders; ``best`` is another ``name``, of one seed.
 
@@ -239,7 +243,10 @@ def shaded_renders(*studies: Entries, name: str = "ours") -> list[Entries]:
         for lights in kinds["renders"][0].renders.ours:
             records = [d.renders for d in kinds["renders"] if name in d.renders]
             shown = [[renders[label][lights] for renders in records] for label in ("plain", name)]
-            psnr = [{spp: [x for seed in seeds for x in seed[spp].psnr_db] for spp in seeds[0]} for seeds in shown]
+            psnr = [
+                {spp: [min(x, CONVERGED) for seed in seeds for x in seed[spp].psnr_db] for spp in seeds[0]}
+                for seeds in shown
+            ]
             gains = [b - a for spp in psnr[0] for a, b in zip(*(values[spp] for values in psnr), strict=True)]
             patches = [
                 [x - 1 for seed in seeds for figures in seed.values() for view in figures.brightness
