@@ -11,6 +11,8 @@ from PIL import Image
 
 from mi_diffind.commands.cli import main
 from mi_diffind.core.files import CACHE
+from mi_diffind.maps.entries import SourceError
+from mi_diffind.maps.source import load_source
 from mi_diffind.scenes import conversion, loading
 from mi_diffind.scenes.models import model_scene
 
@@ -115,13 +117,77 @@ def test_a_model_is_converted(mi_rgb, tmp_path, monkeypatch):
     assert loading.load(new).shapes()
 
 
+def test_names_that_are_missing_long_or_taken(mi_rgb, tmp_path):
+    """Each primitive has the material that its file gives it by number, and each object an id of its own."""
+    content, data = card()
+    names = [None, "", "A", "A", "Card_0", "a" * 300, 'q"&<$spp>', 7]
+    content["materials"] = [
+        {"pbrMetallicRoughness": {"roughnessFactor": i / 8}, **({} if name is None else {"name": name})}
+        for i, name in enumerate(names)
+    ]
+    part = content["meshes"][0]["primitives"][0]
+    content["meshes"][0]["primitives"] = [{**part, "material": i} for i in reversed(range(len(names)))]
+    content["meshes"][0]["name"] = "Card_0"
+    scene = loading.load(model_scene(write(tmp_path / "m.glb", content, data), tmp_path / "parts"))
+    bsdfs = [s.bsdf() for s in scene.shapes() if "PLY" in s.class_name()]
+    assert len({b.id() for b in bsdfs}) == len(names) and load_source(f"{tmp_path}/m.glb#A3", constant=True)
+    assert {float(mi_rgb.traverse(b)["roughness.value"][0]) for b in bsdfs} == {i / 8 for i in range(len(names))}
+
+
+def test_parts_that_are_not_used_are_named(mi_rgb, tmp_path, capfd):
+    """Skins, morph targets, colours of vertices, fans, animations, cameras, lights and borders of images."""
+    content, data = card()
+    part = content["meshes"][0]["primitives"][0]
+    part["targets"], part["attributes"]["COLOR_0"] = [{"POSITION": 0}], 0
+    content["meshes"][0]["primitives"].append({**part, "mode": 6})
+    content["nodes"][0]["skin"], content["textures"][0]["sampler"] = 0, 0
+    content |= {
+        "animations": [],
+        "cameras": [],
+        "extensions": {"KHR_lights_punctual": {}},
+        "samplers": [{"wrapS": 33071}],
+    }
+    model_scene(write(tmp_path / "m.glb", content, data), tmp_path / "parts")
+    said = capfd.readouterr()
+    said = said.out + said.err
+    assert "skins, morph targets, colours of vertices, fans" in said and "animations, cameras, lights" in said
+    assert "beyond the border is not used" in said
+
+
+def test_numbers_that_would_be_read_wrong(mi_rgb, tmp_path):
+    """Sparse accessors, whole texture coordinates and a file that is cut short are refused."""
+    for index, change, fault in ((0, {"sparse": {}}, "sparse"), (1, {"componentType": 5123}, "whole numbers")):
+        content, data = card()
+        content["accessors"][index].update(change)
+        with pytest.raises(SourceError, match=fault):
+            model_scene(write(tmp_path / "m.glb", content, data), tmp_path / "parts")
+    (tmp_path / "m.glb").write_bytes((tmp_path / "m.glb").read_bytes()[:15])
+    with pytest.raises(SourceError, match="cut short"):
+        model_scene(tmp_path / "m.glb", tmp_path / "parts")
+
+
+def test_a_changed_image_is_read_again(mi_rgb, tmp_path, monkeypatch):
+    """Also one whose name is encoded in the file."""
+    monkeypatch.setenv(CACHE, str(tmp_path / "cache"))
+    content, data = card()
+    content["images"][0] = {"uri": "an%20image.png"}
+    path = write(tmp_path / "m.gltf", content, data)
+    scenes = []
+    for side in (8, 16):
+        Image.fromarray(COLORS.repeat(side, axis=0)).save(tmp_path / "an image.png")
+        scenes.append(model_scene(path))
+    assert scenes[0] != scenes[1]
+
+
 @pytest.mark.parametrize(
     "change, fault",
     [
         ({"extensionsRequired": ["KHR_draco_mesh_compression"]}, "requires the extension KHR_draco_mesh_compression"),
         ({"nodes": [{}]}, "has no triangles"),
+        ({}, "bogus"),
         ({"accessors": [{"count": 10**15}]}, "memory"),
-        ({"materials": [{}, {}]}, "has 2 materials without a name"),
+        ({"nodes": [{"mesh": 0, "camera": 0}]}, "a node with a camera"),
+        ({"nodes": [{"mesh": 0, "scale": [1e30] * 3}]}, "has coordinates beyond 1e+18"),
         ({"meshes": [{"primitives": [{"attributes": {"POSITION": 9}}]}]}, "m.gltf"),
     ],
 )
@@ -130,7 +196,8 @@ def test_models_that_are_refused(mi_rgb, tmp_path, monkeypatch, capsys, change, 
     monkeypatch.setenv(CACHE, str(tmp_path / "cache"))
     content, data = card()
     path = write(tmp_path / "m.gltf", {**content, **change}, data)
-    assert main(["convert", str(path), "-o", str(tmp_path / "new.xml")]) == 2
+    more = ["-D", "bogus=1"] if not change else []
+    assert main(["convert", str(path), "-o", str(tmp_path / "new.xml"), *more]) == 2
     error = capsys.readouterr().err
     assert fault in error and error.count("\n") == 1
     assert not list(tmp_path.rglob("*.ply")) and not (tmp_path / "new.xml").exists()

@@ -1,7 +1,9 @@
 """The choice of LLVM: as a function, and in fresh processes, which alone show that a wrong one does not abort."""
 
+import contextlib
 import glob
 import os
+import signal
 import subprocess
 import sys
 import textwrap
@@ -441,3 +443,16 @@ def test_scenes_of_threads_end_in_a_turn(mi_rgb):
             assert len(threads._scenes) == count
         kept.clear()
         assert len(threads._scenes) == count
+
+
+def test_ctrl_c_while_a_variant_is_imported(monkeypatch):
+    """Mitsuba's import loses the exception: the command ends all the same, with one sentence."""
+
+    def import_variant(name):
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(runtime.mi, "variant", lambda: None)
+    monkeypatch.setattr(runtime.mi, "set_variant", import_variant)
+    with pytest.raises(KeyboardInterrupt):
+        runtime.use_variant("llvm_ad_rgb")

@@ -30,6 +30,7 @@ from pathlib import Path
 from . import compat, threads
 from .compat import dr, mi
 from .errors import UsageError
+from .progress import interruptible
 
 ENV = "DRJIT_LIBLLVM_PATH"
 
@@ -279,10 +280,13 @@ def use_variant(name: str | None = None) -> str:
         raise UsageError(llvm_problem())
     if name.startswith("cuda"):
         _require_gpu(name)
-    try:
-        mi.set_variant(name)
-    except ImportError as e:
-        raise UsageError(f'the variant "{name}" cannot run here: {e}') from None
+    with interruptible() as stop:  # the native import loses a KeyboardInterrupt
+        try:
+            mi.set_variant(name)
+        except ImportError as e:
+            raise UsageError(f'the variant "{name}" cannot run here: {e}') from None
+    if stop.is_set():
+        raise KeyboardInterrupt
     return name
 
 

@@ -133,7 +133,7 @@ def figure_lines(figures: Mapping[str, float]) -> list[str]:
         end = next((end for end in _FIGURE_UNITS if name.endswith(end)), "")
         unit, digits = _FIGURE_UNITS.get(end, ("", None))
         words = ["of levels" if re.fullmatch(r"l\d+", word) else word for word in name.removesuffix(end).split("_")]
-        label = " ".join(_WORDS.get(word, word) for word in words)
+        label = " ".join(_WORDS.get(word, word) for word in words).rstrip(",")
         if name.startswith("psnr_map_"):  # a map that is called as another figure
             label = "PSNR map " + name.removeprefix("psnr_map_").removesuffix(end)
         label = re.sub(r"(\d[\d.]*) (\d[\d.]*)$", r"\1 to \2", label)  # a range

@@ -7,6 +7,7 @@ import binascii
 import json
 import os
 import struct
+from collections import Counter
 from pathlib import Path
 from urllib.parse import unquote_to_bytes
 
@@ -19,6 +20,9 @@ from .entries import ImageFiles, MapEntry, SourceError, choose_material, transpa
 
 #: Types of images that are read.
 READ = ("image/png", "image/jpeg", "")
+
+#: Code of an image that is repeated beyond its border, the default.
+REPEAT = 10497
 
 #: Name of a texture of a material → the maps that it holds, with their channels (``None``: the colours).
 TEXTURES = {
@@ -37,9 +41,7 @@ def read_gltf(path: Path, name: str, images: ImageFiles) -> tuple[list[MapEntry]
     """
     try:
         content, binary = read_content(path)
-        materials = content.get("materials", [])
-        names = [material.get("name", f"material{i}") for i, material in enumerate(materials)]
-        material = materials[choose_material(path, names, name)]
+        material = content.get("materials", [])[choose_material(path, material_names(content), name)]
         return _Reader(path, content, binary, images).entries(material)
     except (SourceError, LimitError, PictureError) as e:
         raise SourceError(str(e)) from None
@@ -47,10 +49,19 @@ def read_gltf(path: Path, name: str, images: ImageFiles) -> tuple[list[MapEntry]
         raise SourceError(f"{shown(path)}: is no valid glTF file ({type(e).__name__}: {reason(e)})") from None
 
 
+def material_names(content: dict) -> list[str]:
+    """Return the names of all materials; those without a name, or with that of another one, get their number."""
+    names = [str(material.get("name") or "") for material in content.get("materials", [])]
+    count = Counter(names)
+    return [name if name and count[name] == 1 else f"{name or 'material'}{i}" for i, name in enumerate(names)]
+
+
 def read_content(path: Path) -> tuple[dict, bytes]:
     """Return the JSON of a file and the binary chunk of a ``.glb`` file. Raises :class:`SourceError`."""
     data, binary = read_file(path, memory() // 4), b""
     if data[:4] == b"glTF":
+        if len(data) < 20:
+            raise SourceError(f"{shown(path)}: is cut short, it has {len(data)} bytes")
         _, version, _, length, chunk = struct.unpack("<5I", data[:20])
         if version != 2 or chunk != 0x4E4F534A:
             raise SourceError(f"{shown(path)}: is of version {version} of glTF, allowed is 2, with JSON first")
@@ -101,6 +112,7 @@ class _Reader:
         entries += self._opacity(material, files.get("albedo"), alpha)
         strength = (material.get("occlusionTexture") or {}).get("strength", 1)
         self.notes += [f"occlusionTexture: its strength {strength:g} is not used"] if strength != 1 else []
+        self.notes += [f"{name} is not used" for name in material.pop("extensions", {})]
         note = unused_note(self.path, material)
         return entries, self.notes + ([note] if note else [])
 
@@ -125,6 +137,9 @@ class _Reader:
         if info.get("texCoord", 0):
             self.notes.append(f"{texture}: its texture coordinates, set {info['texCoord']}, are not used")
         source = self.content["textures"][info["index"]]
+        sampler = self.content["samplers"][source["sampler"]] if "sampler" in source else {}
+        if {sampler.get(f"wrap{axis}", REPEAT) for axis in "ST"} != {REPEAT}:
+            self.notes.append(f"{texture}: how its image goes on beyond the border is not used")
         if "source" not in source:
             self.notes.append(f"{texture}: not used, images of {', '.join(source.get('extensions', ()))} are not read")
             return ""

@@ -11,6 +11,7 @@ import glob
 import hashlib
 import json
 import os
+import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,7 +24,7 @@ import numpy as np
 from .. import plugins
 from ..arrays.tables import Table, move_paths, save_table
 from ..core import compat
-from ..core.errors import UsageError
+from ..core.errors import DiffindError, UsageError
 from ..core.files import cache_folder, check_scene_file, relative_path, replacing, writable_file, writable_folder
 from ..core.jobs import run_jobs
 from ..core.runtime import use_variant
@@ -122,13 +123,14 @@ def convert(
         raise UsageError(f'output "{output}": is the scene itself')
     writable_file(output)
     use_variant()
-    if is_model(scene):
-        check_scene_file(scene)
-        scene = model_scene(scene, output.with_name(f"{output.stem}_model"))
-    parsed = ParsedScene(scene, dict(defines or {}))
-    folder = Path(tables or output.with_name(f"{output.stem}_tables"))
+    folder, model = (output.with_name(f"{output.stem}_{part}") for part in ("tables", "model"))
+    folder, is_new = Path(tables or folder), not model.exists()
     groups = [word for word, plugin in words().items() if plugin.stock.advised] if learn is None else learn
     try:
+        if is_model(scene):
+            check_scene_file(scene)
+            scene = model_scene(scene, model)
+        parsed = ParsedScene(scene, dict(defines or {}))
         conversions = Conversions(replace_stock(parsed, groups, folder, progress))
 
         def render(written: ParsedScene) -> None:
@@ -145,6 +147,10 @@ def convert(
                 conversions.unchecked = "none: the scene has no sensor or no integrator"
 
         write_scene(parsed, output, render)
+    except DiffindError:
+        if is_new:
+            shutil.rmtree(model, ignore_errors=True)
+        raise
     finally:
         with contextlib.suppress(OSError):  # does not exist, or is not empty
             folder.rmdir()

@@ -9,6 +9,7 @@ import os
 import re
 import tempfile
 from pathlib import Path
+from urllib.parse import unquote
 from xml.sax.saxutils import quoteattr
 
 import mitsuba as mi
@@ -20,7 +21,7 @@ from ..core.errors import DiffindError, missing_package, reason
 from ..core.files import cache_folder, shown, writable_folder
 from ..core.units import check_memory
 from ..maps.entries import SourceError
-from ..maps.gltf import read_content
+from ..maps.gltf import material_names, read_content
 from ..maps.source import Map, load_source
 
 #: Extensions of files of models.
@@ -37,6 +38,15 @@ FOV, VIEW = 30.0, (0.45, 0.3, 1.0)
 
 #: Least share of triangles with mirrored texture coordinates that a warning names.
 LEAST_MIRRORED = 0.005
+
+#: Code of numbers of single precision.
+FLOAT = 5126
+
+#: Modes of primitives that trimesh reads: points, lines, triangles, strips of triangles.
+MODES = (0, 1, 4, 5)
+
+#: Largest coordinate whose square single precision holds, and longest part of a name, in characters.
+LARGEST, LONGEST = 1e18, 40
 
 #: Name of a map → the parameter of ``principled``.
 PARAMETERS = {"albedo": "base_color", "roughness": "roughness", "metallic": "metallic"}
@@ -104,27 +114,51 @@ def model_scene(path: str | os.PathLike, folder: str | os.PathLike | None = None
 
 
 def _check(path: Path, content: dict) -> None:
-    """Refuse a file that trimesh cannot read, or not within the memory of this machine."""
+    """Refuse a file that trimesh cannot read, or not within the memory of this machine; warn of unused parts."""
     required = [name for name in content.get("extensionsRequired", []) if not str(name).startswith(EXTENSIONS)]
     if required:
         raise SourceError(f"{shown(path)}: requires the extension {required[0]}, which is not read")
-    counts = [accessor.get("count", 0) for accessor in content.get("accessors", [])]
+    nodes, accessors = content.get("nodes", []), content.get("accessors", [])
+    counts = [accessor.get("count", 0) for accessor in accessors]
     check_memory("model", f"{sum(counts):,} elements", ELEMENT_BYTES * sum(counts))
+    primitives = _primitives(content)
+    if any("camera" in node and ("mesh" in node or "children" in node) for node in nodes):
+        raise SourceError(f"{shown(path)}: a node with a camera holds meshes or other nodes, which is not read")
+    coordinates = {part["attributes"].get("TEXCOORD_0") for part in primitives} - {None}
+    if any(accessors[index]["componentType"] != FLOAT for index in coordinates):
+        raise SourceError(f"{shown(path)}: has texture coordinates in whole numbers, allowed are floats")
+    if any("sparse" in accessor for accessor in accessors):
+        raise SourceError(f"{shown(path)}: has sparse accessors, which are not read")
+    unused = [
+        (any("skin" in node for node in nodes), "skins"),
+        (any("targets" in part for part in primitives), "morph targets"),
+        (any("COLOR_0" in part["attributes"] for part in primitives), "colours of vertices"),
+        (any(part.get("mode", 4) not in MODES for part in primitives), "fans of triangles and loops of lines"),
+        *((key in content, key) for key in ("animations", "cameras")),
+        ("KHR_lights_punctual" in content.get("extensions", {}), "lights"),
+    ]
+    if names := ", ".join(name for is_there, name in unused if is_there):
+        plugins.warn(f"{path}: not used: {names}")
+
+
+def _primitives(content: dict) -> list[dict]:
+    return [part for mesh in content.get("meshes", []) for part in mesh["primitives"]]
 
 
 def _digest(path: Path, content: dict) -> str:
     """Return a digest of a file, and of the times and sizes of the files that it names."""
     digest = hashlib.sha256(SCENE.encode() + path.read_bytes())
     for part in (*content.get("buffers", []), *content.get("images", [])):
-        file = path.parent / part.get("uri", "")
-        if len(part.get("uri", "")) < 256 and file.is_file():
-            digest.update(f"{file} {file.stat().st_size} {file.stat().st_mtime_ns}".encode())
+        names = {part.get("uri", ""), unquote(part.get("uri", ""))}
+        for file in sorted(path.parent / name for name in names if len(name) < 256):
+            if file.is_file():
+                digest.update(f"{file} {file.stat().st_size} {file.stat().st_mtime_ns}".encode())
     return digest.hexdigest()[:10]
 
 
 def _name(text: str) -> str:
     """Return a text as part of the name of a file or of an object."""
-    return re.sub(r"[^\w-]+", "_", text) or "unnamed"
+    return re.sub(r"[^\w-]+", "_", text)[:LONGEST] or "unnamed"
 
 
 def _load(path: Path):
@@ -153,14 +187,16 @@ class _Writer:
         self.path, self.content, self.folder = path, content, folder
         self.files: list[Path] = []
         self.images: dict[bytes, str] = {}
-        #: Name of a material → its id in the scene.
-        self.ids: dict[str, str] = {}
+        #: Number of a material → its id in the scene.
+        self.ids: dict[int | None, str] = {}
+        self.taken = {*RESERVED}
 
     def write(self) -> list[Path]:
         """Write all files, and return their paths, that of the scene last."""
         placed, materials, shapes, boxes = self._placed(), {}, [], []
-        for number, (geometry, mesh, matrix, material) in enumerate(placed):
-            name = f"{_name(geometry)}_{number}"
+        names = [f"{_name(geometry)}_{number}" for number, (geometry, *_) in enumerate(placed)]
+        self.taken.update(names)
+        for name, (_, mesh, matrix, material) in zip(names, placed, strict=True):
             if material not in materials:
                 materials[material] = self._material(material)
             boxes.append(self._mesh(mesh, matrix, f"{name}.ply"))
@@ -186,10 +222,12 @@ class _Writer:
         return self.files[-1]
 
     def _placed(self) -> list[tuple]:
-        """Return the names of meshes, the meshes, their matrices, ``(4, 4)``, and the names of their materials."""
+        """Return the names of meshes, the meshes, their matrices, ``(4, 4)``, and the numbers of their materials."""
         import trimesh
 
         loaded, placed, left_out = _load(self.path), [], 0
+        parts = [part for part in _primitives(self.content) if part.get("mode", 4) in MODES]
+        materials = {name: part.get("material") for name, part in zip(loaded.geometry, parts, strict=True)}
         for node in sorted(loaded.graph.nodes_geometry):
             matrix, name = loaded.graph[node]
             mesh = loaded.geometry[name]
@@ -198,8 +236,7 @@ class _Writer:
                 continue
             if not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
                 raise SourceError(f'{shown(self.path)}: a triangle of "{name}" names a vertex that does not exist')
-            material = getattr(getattr(mesh.visual, "material", None), "name", None)
-            placed.append((str(name), mesh, np.asarray(matrix, np.float64), material or self._only_unnamed(mesh)))
+            placed.append((str(name), mesh, np.asarray(matrix, np.float64), materials[name]))
         if left_out:
             plugins.warn(f"{self.path}: {left_out} of its parts have no triangles, they are left out")
         if not placed:
@@ -207,20 +244,14 @@ class _Writer:
         check_memory("model", "its meshes", ELEMENT_BYTES * sum(len(mesh.vertices) for _, mesh, *_ in placed))
         return placed
 
-    def _only_unnamed(self, mesh) -> str:
-        """Return the name by which :func:`.load_source` knows the material without a name, "" if there is none."""
-        materials = self.content.get("materials", [])
-        unnamed = [f"material{i}" for i, material in enumerate(materials) if not material.get("name")]
-        if len(unnamed) > 1 and hasattr(mesh.visual, "material"):
-            raise SourceError(f"{shown(self.path)}: has {len(unnamed)} materials without a name, at most 1 is allowed")
-        return unnamed[0] if unnamed and hasattr(mesh.visual, "material") else ""
-
     def _mesh(self, mesh, matrix: np.ndarray, name: str) -> np.ndarray:
         """Write a mesh, and return its box, ``(2, 3)``."""
         linear, uv = matrix[:3, :3], getattr(mesh.visual, "uv", None)
         points = np.asarray(mesh.vertices, np.float64) @ linear.T + matrix[:3, 3]
-        if not np.isfinite(points).all():
-            raise SourceError(f'{shown(self.path)}: the mesh "{name}" has places that are not finite')
+        if not (np.abs(points) < LARGEST).all():
+            raise SourceError(
+                f'{shown(self.path)}: the mesh "{name}" has coordinates beyond {LARGEST:g}, or not finite'
+            )
         has_normals, faces = "vertex_normals" in mesh._cache.cache, np.asarray(mesh.faces)
         faces = faces[:, ::-1] if np.linalg.det(linear) < 0 else faces
         uv = uv if uv is not None and len(uv) == len(points) else None
@@ -244,34 +275,37 @@ class _Writer:
         shape.write_ply(str(self._add(name)))
         return np.stack([points.min(axis=0), points.max(axis=0)])
 
-    def _material(self, name: str) -> str:
-        """Return the element of a material; "" is the default one of glTF."""
-        self.ids[name] = _name(name or "default")
-        while self.ids[name] in [*RESERVED, *(other for key, other in self.ids.items() if key != name)]:
-            self.ids[name] += "_"
-        if not name:
+    def _material(self, number: int | None) -> str:
+        """Return the element of a material; ``None`` is the default one of glTF."""
+        name = "default" if number is None else material_names(self.content)[number]
+        own_id = _name(name)
+        while own_id in self.taken:
+            own_id += "_"
+        self.ids[number] = own_id
+        self.taken.add(own_id)
+        if number is None:
             numbers = "".join(f'<float name="{key}" value="1"/>' for key in ("metallic", "roughness"))
             color = '<rgb name="base_color" value="1"/>'
-            return f'    <bsdf type="principled" id="{self.ids[name]}">{color}{numbers}</bsdf>\n'
+            return f'    <bsdf type="principled" id="{own_id}">{color}{numbers}</bsdf>\n'
         source = load_source(f"{self.path}#{name}", constant=True)
         for note in source.notes:
             note = re.sub(r" doubleSided(,|$)", "", note)  # the scene uses it
             if not note.endswith(":"):
                 plugins.warn(f"{self.path}#{name}: {note}")
-        content = next(m for i, m in enumerate(self.content["materials"]) if m.get("name", f"material{i}") == name)
+        content = self.content["materials"][number]
         maps = {m.name: m for m in source.maps}
         known = {key: parameter for key, parameter in PARAMETERS.items() if key in maps}
-        values = "".join(self._map(maps[key], parameter, name) for key, parameter in known.items())
+        values = "".join(self._map(maps[key], parameter, own_id) for key, parameter in known.items())
         inner = f'<bsdf type="principled">{values}</bsdf>'
         if "normal" in maps:
-            inner = f'<bsdf type="normalmap">{self._map(maps["normal"], "normalmap", name)}{inner}</bsdf>'
+            inner = f'<bsdf type="normalmap">{self._map(maps["normal"], "normalmap", own_id)}{inner}</bsdf>'
         if content.get("doubleSided"):
             inner = f'<bsdf type="twosided">{inner}</bsdf>'
         if "opacity" in maps:
-            inner = f'<bsdf type="mask">{self._map(maps["opacity"], "opacity", name)}{inner}</bsdf>'
-        return f"    {inner.replace('>', f' id={quoteattr(self.ids[name])}>', 1)}\n"
+            inner = f'<bsdf type="mask">{self._map(maps["opacity"], "opacity", own_id)}{inner}</bsdf>'
+        return f"    {inner.replace('>', f' id={quoteattr(own_id)}>', 1)}\n"
 
-    def _map(self, m: Map, parameter: str, material: str) -> str:
+    def _map(self, m: Map, parameter: str, material_id: str) -> str:
         """Return the element of a map: numbers if it is constant, else an image, which is written."""
         if not m.depth:
             numbers = np.clip(m.values[0, 0], 0, 1)
@@ -280,7 +314,7 @@ class _Writer:
         values = np.rint(255 * np.clip(m.values, 0, 1)).astype(np.uint8)
         key = hashlib.sha256(values.tobytes() + str(values.shape).encode()).digest()
         if key not in self.images:
-            self.images[key] = f"{self.ids[material]}_{m.name}.png"
+            self.images[key] = f"{material_id}_{m.name}.png"
             mi.Bitmap(values).write(str(self._add(self.images[key])))
         raw = "" if m.color_space == "srgb" else '<boolean name="raw" value="true"/>'
         file = f'<string name="filename" value="{self.images[key]}"/>'
