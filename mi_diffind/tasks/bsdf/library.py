@@ -203,13 +203,14 @@ def find_materials(request: FitRequest, folder: Path) -> tuple[dict[str, Library
         except DiffindError as e:
             broken[_free_name(file.stem, names)] = str(e)
             continue
+        content = _content(file)
         for material in ids:
             parts = [file.stem] if len(files) > 1 or not material else []
             name = _free_name("_".join([*parts, *filter(None, [material])]), names)
             chosen = material or (request.options["material"] if not every else "")
             materials[name] = LibraryMaterial(
                 str(file.resolve()), chosen, str(folder.resolve() / f"{name}.npz"), request.preset, mi.variant(),
-                given, _identity(file, [chosen, *common]),
+                given, _identity(content, [chosen, *common]),
             )  # fmt: skip
     return materials, broken
 
@@ -224,12 +225,15 @@ def _free_name(text: str, names: set[str]) -> str:
     return name
 
 
-def _identity(file: Path, options: list) -> str:
-    """Return a hash of the content of a source, of the files that XML includes or names, and of ``options``.
+def _identity(content: str, options: list) -> str:
+    """Return a hash of a ``content`` and of ``options``, "" for none."""
+    text = json.dumps([content, *options], sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest() if content else ""
 
-    It is "" on any error.
-    """
-    digest, files = hashlib.sha256(json.dumps(options, sort_keys=True, default=str).encode()), [file]
+
+def _content(file: Path) -> str:
+    """Return a hash of the content of a source, and of the files that XML includes or names, "" on any error."""
+    digest, files = hashlib.sha256(), [file]
     try:
         if file.suffix.lower() == ".xml":
             _, state = compat.parse_file(file)
