@@ -29,6 +29,8 @@ from ...arrays.indirection import device_array
 from ...arrays.lookup import clamp
 from ...core.archives import Archive
 from ...core.errors import DiffindError, UsageError, reason
+from ...core.files import irregular
+from ...core.units import memory
 from .measured import LARGEST, Truth, value_remarks
 
 #: Name of a function on the command line.
@@ -176,6 +178,8 @@ def open_networks(path: Path) -> Archive:
 def is_table(path: Path) -> bool:
     """Return whether a file is a table file."""
     try:
+        if irregular(path, memory() // 4):  # a pipe would block
+            return False
         with Archive(path) as archive:
             return "meta" in archive.members
     except (OSError, BadZipFile, DiffindError):

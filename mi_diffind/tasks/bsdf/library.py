@@ -15,9 +15,10 @@ from ... import __version__
 from ...arrays.tables import load_table
 from ...core import compat
 from ...core.errors import DiffindError, UsageError
-from ...core.files import relative_path, writable_folder, write_json
+from ...core.files import irregular, relative_path, shown, writable_folder, write_json
 from ...core.jobs import run_jobs
 from ...core.runtime import use_variant
+from ...core.units import memory
 from ...fitting.task import FitRequest, Fitted, Model, fit, load_model
 from ...measure.report import grid
 from .files import load
@@ -188,7 +189,7 @@ def find_materials(request: FitRequest, folder: Path) -> tuple[dict[str, Library
     files = [source]
     if source.is_dir():
         files = (f for f in source.iterdir() if f.suffix.lower() in SUFFIXES and not f.name.startswith("."))
-        files = sorted(f for f in files if not (f.suffix.lower() == ".npz" and is_table(f)))
+        files = sorted(f for f in files if not (f.is_dir() or (f.suffix.lower() == ".npz" and is_table(f))))
         if not files:
             raise UsageError(f"{source}: holds no sources, allowed are files that end in {', '.join(SUFFIXES)}")
     given = {**request.options, **dataclasses.asdict(request.settings)}
@@ -199,6 +200,8 @@ def find_materials(request: FitRequest, folder: Path) -> tuple[dict[str, Library
     materials, broken = {}, {}
     for file in files:
         try:
+            if fault := irregular(file, memory() // 4):
+                raise UsageError(f"{shown(file)}: {fault}")
             ids = material_ids(file) if file.suffix.lower() in (".npz", ".xml" if every else "") else [""]
         except DiffindError as e:
             broken[_free_name(file.stem, names)] = str(e)

@@ -1,5 +1,6 @@
 """Sources that are functions, networks and grids of measurements, and the error that symmetries impose on them."""
 
+import os
 import struct
 import sys
 
@@ -173,12 +174,16 @@ def test_networks(types, tmp_path, rng):
     ):
         with pytest.raises(UsageError, match=message):
             truth_of(tmp_path / f"{name}.npz", types, material)
+    os.mkfifo(tmp_path / "pipe.npz")
+    (tmp_path / "folder.xml").mkdir()
     task = mi_diffind.fitting.task.tasks()["bsdf"]
     options = {argument.name: argument.default for argument in task.arguments} | {"source": tmp_path}
     request = mi_diffind.fitting.task.FitRequest("ours", task.presets["ours"], types, options=options)
     materials, broken = library.find_materials(request, tmp_path)
     names = {"nets_x_first", "nets_second", *(f"{file}_weights" for file in ("one", "short", "flipped", "large"))}
-    assert set(materials) == names and materials["nets_x_first"].material == "x/first" and set(broken) == {"text"}
+    assert (
+        set(materials) == names and materials["nets_x_first"].material == "x/first" and set(broken) == {"text", "pipe"}
+    )
 
 
 # -- grids -------------------------------------------------------------------------------------------------------------
