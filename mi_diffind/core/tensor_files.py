@@ -29,6 +29,9 @@ ANGLES = ("phi_i", "theta_i", "theta_h", "theta_d", "phi_d")
 #: Largest polar angle and azimuth of a file, radians; Mitsuba would read angles in degrees as the last ones.
 LARGEST_ANGLES = {"theta": 1.6, "phi": 6.3}
 
+#: Fields of wavelengths, nm.
+WAVELENGTHS = ("wavelengths", "wvls")
+
 #: Fields of densities.
 POSITIVE = ("ndf", "sigma", "vndf")
 
@@ -96,6 +99,10 @@ def check(path: Path, fields: dict) -> None:
         most = LARGEST_ANGLES.get(name.partition("_")[0], np.inf)
         if (largest := np.abs(fields[name]).max() if name in ANGLES else 0) > most:
             refuse(f'the field "{name}" has angles up to {largest:.4g}, radians up to {most} are needed')
+        if name.startswith("theta") and (smallest := np.min(fields[name])) < -1e-3:
+            refuse(f'the field "{name}" has angles down to {smallest:.4g}, at least 0 are needed')
+        if name in WAVELENGTHS and not ((fields[name] > 300) & (fields[name] < 1000)).any():
+            refuse(f'the field "{name}" has no wavelength between 300 and 1000 nm')
         if name in POSITIVE and not (np.min(fields[name]) >= 0 and np.max(fields[name]) > 0):
             refuse(f'the field "{name}" has negative values, or none above 0')
 

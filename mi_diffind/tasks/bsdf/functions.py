@@ -13,9 +13,11 @@ from __future__ import annotations
 import hashlib
 import importlib
 import itertools
+import operator
 import os
 import re
 import sys
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from zipfile import BadZipFile
@@ -27,10 +29,12 @@ from ...arrays.indirection import device_array
 from ...arrays.lookup import clamp
 from ...core.archives import Archive
 from ...core.errors import DiffindError, UsageError, reason
+from ...core.files import irregular
+from ...core.units import memory
 from .measured import LARGEST, Truth, value_remarks
 
 #: Name of a function on the command line.
-FUNCTION = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
+FUNCTION = re.compile(r"[^\W\d][\w.]*:[^\W\d]\w*(\.\w+)*")
 
 #: Units of the layers of a network.
 LAYERS = (6, 21, 21, 3)
@@ -61,13 +65,16 @@ class PythonTruth(Truth):
             pair = wi[k : k + CHUNK].copy(), wo[k : k + CHUNK].copy()  # a function may write into its arguments
             count = len(pair[0])
             try:
-                value = np.asarray(self.call(*pair), np.float32)
-            except Exception as e:  # any: it is the user's
+                value = np.asarray(self.call(*pair))
+            except (Exception, SystemExit) as e:  # any: it is the user's
                 fault = f"raised {type(e).__name__} ({reason(e)})"
                 raise UsageError(f"{self.name}: {fault} for two arrays of directions, ({count}, 3)") from e
+            if value.dtype.kind not in "biuf":
+                raise UsageError(f"{self.name}: returned values of the type {value.dtype}, real numbers are needed")
             if value.shape not in ((count, 3), (count, 1), (count,)):
                 raise UsageError(f"{self.name}: returned the shape {value.shape}, ({count}, 3) or ({count},) is needed")
-            parts.append(np.broadcast_to(value.reshape(count, -1), (count, 3)))
+            with np.errstate(over="ignore"):  # infinite values are counted
+                parts.append(np.broadcast_to(value.reshape(count, -1), (count, 3)).astype(np.float32))
         return np.concatenate(parts)
 
     def _columns(self, wi, wo) -> list:
@@ -81,7 +88,11 @@ class PythonTruth(Truth):
         return [clamp(v, 0, LARGEST) for v in self._columns(wi, wo)]
 
     def remarks(self, samples):
-        return value_remarks(self.name, np.stack([v.numpy() for v in self._columns(samples.wi, samples.wo)]))
+        values, again = (np.stack([v.numpy() for v in self._columns(samples.wi, samples.wo)]) for _ in range(2))
+        lines = value_remarks(self.name, values)
+        if not np.allclose(values, again, rtol=1e-3, atol=1e-6, equal_nan=True):
+            lines.append("its values differ from call to call: the fit is to noise, and does not repeat")
+        return lines
 
 
 def import_function(source: str) -> PythonTruth:
@@ -93,11 +104,16 @@ def import_function(source: str) -> PythonTruth:
     if os.getcwd() not in sys.path:  # at the end, where it hides no other module, and stays for what f imports
         sys.path.append(os.getcwd())
     try:
-        call = getattr(importlib.import_module(module), name, None)
-    except Exception as e:  # any: importing runs the user's code
-        raise UsageError(f"{source}: the module {module} cannot be imported ({reason(e)})") from None
-    if not callable(call):
-        raise UsageError(f"{source}: the module {module} has no function {name}")
+        code = importlib.import_module(module)
+    except (Exception, SystemExit) as e:  # any: importing runs the user's code
+        fault = f"{type(e).__name__}: {reason(e)}"
+        raise UsageError(f"{source}: the module {module} cannot be imported ({fault})") from None
+    try:
+        call = operator.attrgetter(name)(code)
+    except AttributeError:
+        call = None
+    if not callable(call):  # the file shows which module hides another of its name
+        raise UsageError(f"{source}: the module {module} ({getattr(code, '__file__', None)}) has no function {name}")
     return PythonTruth(call, source)
 
 
@@ -114,8 +130,12 @@ class NetworkTruth(Truth):
                 raise UsageError(f"{path}: has {len(names)} networks: name one (material), they are {shown}")
             if name and name not in names:
                 raise UsageError(f'material: found "{name}", {path} has no such network')
-            weights = archive.array(name or names[0])
-        if weights.shape != (WEIGHTS,) or weights.dtype.kind != "f" or not np.isfinite(weights).all():
+            try:
+                weights = archive.array(name or names[0])
+            except (OSError, EOFError, BadZipFile, zlib.error) as e:
+                raise UsageError(f"{path}: the array {name or names[0]} is damaged ({reason(e)})") from None
+        finite = weights.dtype.kind == "f" and (np.abs(weights) <= np.finfo(np.float32).max).all()
+        if weights.shape != (WEIGHTS,) or not finite:
             array = f"the array {name or names[0]} has the shape {weights.shape}"
             raise UsageError(f"{path}: is no network of Neural-BRDF: {array}, {WEIGHTS} finite floats are needed")
         self.name = name or path.stem
@@ -158,6 +178,8 @@ def open_networks(path: Path) -> Archive:
 def is_table(path: Path) -> bool:
     """Return whether a file is a table file."""
     try:
+        if irregular(path, memory() // 4):  # a pipe would block
+            return False
         with Archive(path) as archive:
             return "meta" in archive.members
     except (OSError, BadZipFile, DiffindError):

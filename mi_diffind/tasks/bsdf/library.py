@@ -15,9 +15,10 @@ from ... import __version__
 from ...arrays.tables import load_table
 from ...core import compat
 from ...core.errors import DiffindError, UsageError
-from ...core.files import relative_path, writable_folder, write_json
+from ...core.files import irregular, relative_path, shown, writable_folder, write_json
 from ...core.jobs import run_jobs
 from ...core.runtime import use_variant
+from ...core.units import memory
 from ...fitting.task import FitRequest, Fitted, Model, fit, load_model
 from ...measure.report import grid
 from .files import load
@@ -188,7 +189,7 @@ def find_materials(request: FitRequest, folder: Path) -> tuple[dict[str, Library
     files = [source]
     if source.is_dir():
         files = (f for f in source.iterdir() if f.suffix.lower() in SUFFIXES and not f.name.startswith("."))
-        files = sorted(f for f in files if not (f.suffix.lower() == ".npz" and is_table(f)))
+        files = sorted(f for f in files if not (f.is_dir() or (f.suffix.lower() == ".npz" and is_table(f))))
         if not files:
             raise UsageError(f"{source}: holds no sources, allowed are files that end in {', '.join(SUFFIXES)}")
     given = {**request.options, **dataclasses.asdict(request.settings)}
@@ -199,17 +200,20 @@ def find_materials(request: FitRequest, folder: Path) -> tuple[dict[str, Library
     materials, broken = {}, {}
     for file in files:
         try:
+            if fault := irregular(file, memory() // 4):
+                raise UsageError(f"{shown(file)}: {fault}")
             ids = material_ids(file) if file.suffix.lower() in (".npz", ".xml" if every else "") else [""]
         except DiffindError as e:
             broken[_free_name(file.stem, names)] = str(e)
             continue
+        content = _content(file)
         for material in ids:
             parts = [file.stem] if len(files) > 1 or not material else []
             name = _free_name("_".join([*parts, *filter(None, [material])]), names)
             chosen = material or (request.options["material"] if not every else "")
             materials[name] = LibraryMaterial(
                 str(file.resolve()), chosen, str(folder.resolve() / f"{name}.npz"), request.preset, mi.variant(),
-                given, _identity(file, [chosen, *common]),
+                given, _identity(content, [chosen, *common]),
             )  # fmt: skip
     return materials, broken
 
@@ -224,12 +228,15 @@ def _free_name(text: str, names: set[str]) -> str:
     return name
 
 
-def _identity(file: Path, options: list) -> str:
-    """Return a hash of the content of a source, of the files that XML includes or names, and of ``options``.
+def _identity(content: str, options: list) -> str:
+    """Return a hash of a ``content`` and of ``options``, "" for none."""
+    text = json.dumps([content, *options], sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest() if content else ""
 
-    It is "" on any error.
-    """
-    digest, files = hashlib.sha256(json.dumps(options, sort_keys=True, default=str).encode()), [file]
+
+def _content(file: Path) -> str:
+    """Return a hash of the content of a source, and of the files that XML includes or names, "" on any error."""
+    digest, files = hashlib.sha256(), [file]
     try:
         if file.suffix.lower() == ".xml":
             _, state = compat.parse_file(file)

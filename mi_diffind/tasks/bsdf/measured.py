@@ -117,7 +117,9 @@ def value_remarks(name: str, values: np.ndarray) -> list[str]:
     if bad:
         remarks.append(f"{bad:.2g} of its values are not finite and count as 0")
     if negative := float((values < 0).mean()):
-        remarks.append(f"{100 * negative:.2g}% of its values are negative, a learned BSDF has 0 there")
+        if not (values > 0).any():
+            raise UsageError(f"{name}: none of its values is above 0, nothing can be fitted to them")
+        remarks.append(f"{min(100 * negative, 99):.2g}% of its values are negative, a learned BSDF has 0 there")
     return remarks
 
 
@@ -413,6 +415,8 @@ class GridTruth(ScatteredTruth):
         if colours > 1 or not count or len(content) < end:
             sizes = f"{polar} x {polar} x {azimuths} cells of type {colours}"
             raise UsageError(f"{path}: claims {sizes}, which its {len(content):,} bytes do not hold")
+        if count < LEAST_ROWS:
+            raise UsageError(f"{path}: has {count} cells, at least {LEAST_ROWS} are needed")
         Allowance(path).take(self.ROW_BYTES * count, f"{count:,} cells")
         f = np.frombuffer(content, "<f4", channels * count, ends[0] + 12).reshape(count, channels)
         if not np.isfinite(f).all():

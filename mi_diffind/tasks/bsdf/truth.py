@@ -6,6 +6,7 @@ import hashlib
 import json
 import math
 import os
+import re
 from pathlib import Path
 
 import drjit as dr
@@ -35,6 +36,9 @@ from .model import MOST_PARAMETERS, Parameter, points, turn
 
 #: Extensions of files that are sources.
 SUFFIXES = (".xml", ".bsdf", ".pbsdf", ".mbsdf", ".binary", ".csv", ".npz")
+
+#: Beginning of an error of ``mi.load_dict``, which names the plugin of a source.
+NODE = re.compile(r'At dictionary node "root": failed to instantiate bsdf plugin of type "\w+": ')
 
 
 class MitsubaTruth(Truth):
@@ -296,7 +300,8 @@ def truth_of(
     if fault := irregular(path, memory() // 4):
         raise UsageError(f"{shown(path)}: {fault}")
     if not path.is_file():
-        raise UsageError(f"{path}: no such file")
+        hint = ", and no Python function, module:function" if ":" in str(source) else ""
+        raise UsageError(f"{path}: no such file{hint}")
     suffix = path.suffix.lower()
     if suffix == ".binary":
         return MERLTruth(path, types)
@@ -376,7 +381,7 @@ def _load(name, load):
     except UsageError:
         raise
     except Exception as e:  # Mitsuba raises several types
-        raise UsageError(f"{name}: cannot be loaded ({reason(RuntimeError(one_sentence(e)))})") from None
+        raise UsageError(f"{name}: cannot be loaded ({reason(RuntimeError(NODE.sub('', one_sentence(e))))})") from None
 
 
 def _choose(loaded, name, material: str):

@@ -1,6 +1,8 @@
 """Sources that are functions, networks and grids of measurements, and the error that symmetries impose on them."""
 
+import os
 import struct
+import sys
 
 import drjit as dr
 import numpy as np
@@ -51,9 +53,18 @@ def test_python_functions(types, rng):
     assert share == [f"{expected:.2g}% of its values are negative, a learned BSDF has 0 there"]
     with pytest.raises(UsageError, match=r"<lambda>: \d.*% of its values are not finite"):
         truth_of(lambda i, o: np.where(o[:, 0] > 0.5, np.nan, lobe(i, o)), types).remarks(samples)
-    for wrong, message in ((lambda i, o: i[0], r"returned the shape \(3,\)"), (lambda i: i, "raised TypeError")):
+    for wrong, message in (
+        (lambda i, o: i[0], r"returned the shape \(3,\)"),
+        (lambda i: i, "raised TypeError"),
+        (lambda i, o: None, "values of the type object, real numbers are needed"),
+        (lambda i, o: lobe(i, o) + 1j, "values of the type complex64, real numbers are needed"),
+        (lambda i, o: sys.exit(3), r"<lambda>: raised SystemExit \(3\)"),
+    ):
         with pytest.raises(UsageError, match=message):
             truth_of(wrong, types)
+    with pytest.raises(UsageError, match="<lambda>: none of its values is above 0"):
+        truth_of(lambda i, o: -lobe(i, o), types).remarks(samples)
+    assert "differ from call to call" in truth_of(lambda i, o: rng.random(len(i)), types).remarks(samples)[0]
 
 
 def test_the_symmetric_part(types, rng):
@@ -79,6 +90,12 @@ import numpy as np
 
 def leaning(wi, wo):
     return 0.2 + 0.1 * (wi[:, 2] - wo[:, 2])
+
+class Network:
+    def forward(self, wi, wo):
+        return leaning(wi, wo)
+
+network = Network()
 """
 
 
@@ -89,12 +106,16 @@ def test_functions_by_name(types, tmp_path, monkeypatch):
     """
     (tmp_path / "lobes_of_a_test.py").write_text(MODULE)
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "leaves_a_test.py").write_text("raise SystemExit(0)")
     for source, message in (
-        ("lobes_of_a_test:red", "the module lobes_of_a_test has no function red"),
+        ("lobes_of_a_test:red", r"the module lobes_of_a_test \(.*lobes_of_a_test.py\) has no function red"),
         ("no_such_module_here:f", "the module no_such_module_here cannot be imported"),
+        ("leaves_a_test:f", r"the module leaves_a_test cannot be imported \(SystemExit: 0\)"),
+        ("leaves-a-test:f", "leaves-a-test:f: no such file, and no Python function"),
     ):
         with pytest.raises(UsageError, match=message):
             truth_of(source, types)
+    assert truth_of("lobes_of_a_test:network.forward", types).name == "lobes_of_a_test:network.forward"
     monkeypatch.setattr(training, "STARTS", 1)
     for (module, name), value in worker_jobs.QUICK.items():
         monkeypatch.setattr(module, name, value)
@@ -137,23 +158,32 @@ def test_networks(types, tmp_path, rng):
     np.savez(tmp_path / "one.npz", weights=b)
     assert truth_of(tmp_path / "one.npz", types).name == "one" and truth.name == "x/first"
     np.savez(tmp_path / "short.npz", weights=b[:600])
+    content = (tmp_path / "one.npz").read_bytes()
+    (tmp_path / "flipped.npz").write_bytes(content[:900] + bytes([content[900] ^ 1]) + content[901:])
+    np.savez(tmp_path / "large.npz", weights=1e300 * b.astype(float))
     save_table(tmp_path / "table.npz", handmade())
     (tmp_path / "text.npz").write_text("no archive")
     for name, material, message in (
         ("nets", "", "has 2 networks: name one .material., they are x/first, second"),
         ("nets", "third", 'found "third", .*nets.npz has no such network'),
         ("short", "", r"the array weights has the shape \(600,\), 675 finite floats are needed"),
+        ("flipped", "", "flipped.npz: the array weights is damaged .Bad CRC-32"),
+        ("large", "", "675 finite floats are needed"),
         ("table", "", "is a table file, which was fitted already"),
         ("text", "", "is no file of networks"),
     ):
         with pytest.raises(UsageError, match=message):
             truth_of(tmp_path / f"{name}.npz", types, material)
+    os.mkfifo(tmp_path / "pipe.npz")
+    (tmp_path / "folder.xml").mkdir()
     task = mi_diffind.fitting.task.tasks()["bsdf"]
     options = {argument.name: argument.default for argument in task.arguments} | {"source": tmp_path}
     request = mi_diffind.fitting.task.FitRequest("ours", task.presets["ours"], types, options=options)
     materials, broken = library.find_materials(request, tmp_path)
-    names = {"nets_x_first", "nets_second", "one_weights", "short_weights"}
-    assert set(materials) == names and materials["nets_x_first"].material == "x/first" and set(broken) == {"text"}
+    names = {"nets_x_first", "nets_second", *(f"{file}_weights" for file in ("one", "short", "flipped", "large"))}
+    assert (
+        set(materials) == names and materials["nets_x_first"].material == "x/first" and set(broken) == {"text", "pipe"}
+    )
 
 
 # -- grids -------------------------------------------------------------------------------------------------------------
@@ -208,6 +238,7 @@ GRID_FAULTS = {
     "other mark": ({"mark": b"MBSDF_DATA_TRANSMISSION=\n"}, "is no measured BSDF of MDL that reflects"),
     "type": ({"sizes": (2, 6, 10)}, "claims 6 x 6 x 10 cells of type 2"),
     "large": ({"sizes": (1, 2**20, 2**20)}, "which its .* bytes do not hold"),
+    "few": ({"sizes": (1, 2, 10)}, "has 40 cells, at least 200 are needed"),
     "empty": ({"sizes": (1, 6, 0)}, "claims 6 x 6 x 0 cells"),
 }
 

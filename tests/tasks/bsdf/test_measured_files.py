@@ -109,12 +109,15 @@ def changed(array, damage):
         "nan": np.full_like(array, np.nan) if array.dtype.kind == "f" else None,
         "falling": array[..., ::-1].copy(),
         "dark": 0 * array,
+        "below": array - array.max() / 2,
+        "micrometres": array / 1000,
     }[damage]
 
 
 DAMAGED = {
     "theta_i": {"missing": 'no field "theta_i"', "flat": "1 dimensions are needed", "short": "is needed",
-                "empty": "has the shape", "nan": "8 values that are not finite", "falling": "does not increase"},
+                "empty": "has the shape", "nan": "8 values that are not finite", "falling": "does not increase",
+                "below": "angles down to -0.[0-9]+, at least 0 are needed"},
     "ndf": {"missing": 'no field "ndf"', "flat": "2 dimensions are needed", "nan": "not finite",
             "dark": "or none above 0"},
     "vndf": {"nan": "not finite", "empty": "has the shape"},
@@ -123,13 +126,14 @@ DAMAGED = {
     "phi_d": {"missing": 'no field "phi_d"', "falling": "does not increase", "empty": "has the shape",
               "nan": "not finite"},
     "M": {"short": "is needed", "nan": "not finite"},
+    "wvls": {"micrometres": "no wavelength between 300 and 1000 nm"},
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name, damage", [(name, damage) for name, damages in DAMAGED.items() for damage in damages])
 def test_files_with_a_damaged_field(mi_rgb, tmp_path, name, damage):
     """The sentence names file and field, of a source and of a scene; Mitsuba reads some of the files as they are."""
-    polarised = name in ("phi_d", "M")
+    polarised = name in ("phi_d", "M", "wvls")
     fields = fields_of(tmp_path, polarised)
     array = changed(fields.pop(name), damage)
     path = tmp_path / ("a.pbsdf" if polarised else "a.bsdf")
@@ -164,6 +168,10 @@ def test_damaged_files(mi_rgb, tmp_path):
         tmp_path / "a.bsdf", {"wavelengths": np.zeros(3, np.float32), "spectra": np.zeros(4, np.float32)}
     )
     with pytest.raises(UsageError, match=r"a.bsdf: is no file of measured spectra"):
+        truth_of(tmp_path / "a.bsdf", array_module())
+    fields = fields_of(tmp_path)
+    tensor_files.write(tmp_path / "a.bsdf", {**fields, "rgb": fields["rgb"].astype(np.float64)})
+    with pytest.raises(UsageError, match=r"a.bsdf: cannot be loaded \(\[Measured\] Invalid file structure"):
         truth_of(tmp_path / "a.bsdf", array_module())
 
 
