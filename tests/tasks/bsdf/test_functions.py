@@ -62,6 +62,8 @@ def test_python_functions(types, rng):
     ):
         with pytest.raises(UsageError, match=message):
             truth_of(wrong, types)
+    share = truth_of(lambda i, o: np.where(o[:, 0] > 0.2, 1e30, lobe(i, o)), types).remarks(samples)
+    assert share == [f"{expected:.2g}% of its values are above 1e+08 and count as that"]
     with pytest.raises(UsageError, match="<lambda>: none of its values is above 0"):
         truth_of(lambda i, o: -lobe(i, o), types).remarks(samples)
     assert "differ from call to call" in truth_of(lambda i, o: rng.random(len(i)), types).remarks(samples)[0]
