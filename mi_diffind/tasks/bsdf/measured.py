@@ -116,6 +116,8 @@ def value_remarks(name: str, values: np.ndarray) -> list[str]:
         raise UsageError(f"{name}: {bad:.1%} of its values are not finite, nothing can be fitted to them")
     if bad:
         remarks.append(f"{bad:.2g} of its values are not finite and count as 0")
+    if large := float((values > LARGEST).mean()):
+        remarks.append(f"{min(100 * large, 99):.2g}% of its values are above {LARGEST:g} and count as that")
     if negative := float((values < 0).mean()):
         if not (values > 0).any():
             raise UsageError(f"{name}: none of its values is above 0, nothing can be fitted to them")
